@@ -25,7 +25,12 @@ from pebble.errors import PebbleError
 
 FOLDER: Final = Path("bench-results")
 #: Those that are not in the module of their name.
-_ELSEWHERE: Final = {"video": "wire.video", "sound": "wire.sound", "impair": "impair.trials"}
+_ELSEWHERE: Final = {
+    "control": "control.cells",
+    "video": "wire.video",
+    "sound": "wire.sound",
+    "impair": "impair.trials",
+}
 _NAMES: Final = (
     "control", "bridge", "startup", "cost", "frames", "video", "sound", "estop", "fleet", "traffic", "page", "impair",
 )  # fmt: skip

@@ -217,10 +217,11 @@ class Transport(ABC):
     #: Whether the other end had older values of what only we publish when the newest connection began: it was restored
     #: from an earlier save, or is another one. A backend that cannot notice it leaves it False.
     went_back: bool = False
-    #: Whether the other end closed the newest connection and, at each try to connect since, was gone: then no client
-    #: could publish there meanwhile, unless we would have received it.
+    #: Whether the newest connection ended because the other end went down, and it was down at every try since: then no
+    #: client can have published there meanwhile without our receiving it.
     was_ended: bool = True
-    #: Deliver retained messages also after a live one of their topic (T8): it may have been our own. The owner decides.
+    #: Deliver a retained message also after a live one of its topic (T8): the live one may have been our own. The owner
+    #: then decides which of them counts.
     delivers_late: bool = False
     #: Whether retained messages of a topic (UTF-8) may be discarded before anything else is done with them: strangers
     #: plant 100,000. Called with locks held: it must neither wait nor publish. A backend may ignore it.
@@ -235,13 +236,14 @@ class Transport(ABC):
     #: Whether the way to the other end is slow: keep little in the kernel, where nothing can go ahead of what waits,
     #: and wait longer for answers, with fewer questions. Set by :meth:`suit_link`; a backend may ignore it.
     is_slow: bool = False
-    #: A retained topic of ours whose values differ: while `is_slow`, if the other end has the newest one after an
-    #: outage, it has kept the others. Empty: each is asked for.
+    #: A retained topic of ours whose value changes often. On a slow link one question is enough after an outage: if the
+    #: other end still has its newest value, it has kept our other topics as well. Empty: each of them is asked for.
     proof: str = ""
     #: For how many seconds nothing was done that a change of host would disturb; the owner knows. At 0 one with several
     #: hosts stays where it is as long as it can.
     idle_s: Callable[[], float] = staticmethod(lambda: 0.0)
-    #: What is published in place of a message, in this order; the first one counts as it. None: the message itself.
+    #: What is published in place of a message, in this order; the outcome of the first is that of :meth:`publish`.
+    #: None: the message itself.
     forms: Callable[[Message], Iterable[Message]] | None = None
 
     def __init__(self, client_id: str, *, will: Message | None = None) -> None:
@@ -257,7 +259,6 @@ class Transport(ABC):
         self._subscriptions = Subscriptions()
         self._publishing = threading.RLock()  # one publish at a time: the order of calls is the order per topic (T3)
         self._own = OwnRetained(self.counters)
-        self._syncing = False  # guarded by _publishing
 
     # -- what services call
 
@@ -454,18 +455,13 @@ class Transport(ABC):
     def _sync_retained(self, known: Collection[str]) -> None:
         """Send the pending retained messages, then our others that are not in ``known`` (T9)."""
         with self._publishing:
-            self._syncing = True
-            try:
-                for message in self._own.to_send(known):
-                    self._own.remember(message, sent=self._send(message, False))
-            finally:
-                self._syncing = False
+            self._own.send_again(known, lambda message: self._send(message, False))
 
     def _initial_sync(self, known: Collection[str]) -> None:
         """Finish a new connection that has its subscriptions: send the retained messages it lacks, and be connected.
 
-        Until then the ``_send`` of a backend that calls this accepts messages only while ``_syncing``: retained ones
-        that are published meanwhile are pending, and sent last.
+        Until then the ``_send`` of a backend that calls this accepts messages only while ``_own.syncing``: retained
+        ones that are published meanwhile are pending, and sent last.
         """
         self._sync_retained(known)
         self._set_state(State.CONNECTED)

@@ -1,6 +1,6 @@
 """The retained messages that one transport has published, to be sent again to a broker or hub that lacks them."""
 
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 
 from pebble.transports.bounds import BoundedTable
 from pebble.transports.counters import Counters
@@ -17,6 +17,7 @@ class OwnRetained(BoundedTable[Message]):
         super().__init__(LIMIT, BYTES, lambda message: len(message.payload))
         self.pending: dict[str, None] = {}  # topics whose message is not sent yet, oldest first
         self.shared: set[str] = set()  # topics that others publish on, too
+        self.syncing = False  # while these are sent again
         self._counters = counters
 
     def remember(self, message: Message, *, sent: bool, shared: bool | None = None) -> bool:
@@ -39,7 +40,13 @@ class OwnRetained(BoundedTable[Message]):
             self.pending[message.topic] = None
         return True
 
-    def to_send(self, known: Collection[str]) -> list[Message]:
+    def send_again(self, known: Collection[str], send: Callable[[Message], bool]) -> None:
         """The pending ones, then the others that are not in ``known``."""
         changed = [self[topic] for topic in self.pending]
-        return changed + [m for topic, m in self.items() if topic not in self.pending and topic not in known]
+        others = [m for topic, m in self.items() if topic not in self.pending and topic not in known]
+        self.syncing = True
+        try:
+            for message in changed + others:
+                self.remember(message, sent=send(message))
+        finally:
+            self.syncing = False

@@ -4,9 +4,9 @@ from machine import ADC, Pin, SoftI2C
 from micropython import const
 
 from benjr import motor_shield, pins
-from common.network_robot import NetworkRobot
 from common.payload import mix
 from common.settings import get
+from net.network_robot import NetworkRobot
 
 _I2C_HZ = const(100_000)
 _I2C_TIMEOUT_US = const(2000)  # for a shield that stretches the clock

@@ -4,11 +4,11 @@ from machine import ADC, Pin
 from micropython import const
 
 from common.drv8833 import Motor
-from common.network_robot import NetworkRobot
 from common.payload import mix
 from common.settings import get
-from common.tls import Wrapper
 from minilamp import pins
+from net.network_robot import NetworkRobot
+from net.tls import Wrapper
 
 _THRESHOLD = const(0.25)  # below it a motor stays off
 

@@ -20,13 +20,7 @@ def hub_states(settings: ZenohSettings) -> list[HubState]:
     except zenoh.ZError:
         return []
     try:
-        replies = session.get(
-            f"{wire.STATE}*",
-            target=zenoh.QueryTarget.ALL,
-            consolidation=zenoh.ConsolidationMode.NONE,
-            timeout=ANSWER_S,
-        )
-        states = [decode_state(reply.ok.payload.to_bytes()) for reply in replies if reply.ok is not None]
+        states = [decode_state(answer) for answer in wire.ask(session, f"{wire.STATE}*", b"", ANSWER_S)]
     finally:
         close_session(session)
     return sorted(states, key=lambda one: one.name)

@@ -44,7 +44,7 @@ def echo(
     url: Annotated[str, typer.Argument(help="mqtt://HOST[:PORT] or mqtts://HOST[:PORT]", show_default=False)],
 ) -> int:
     """Send back what `pebble bench control --far` sends, until Ctrl-C. Runs on the other machine."""
-    from pebble.bench.control_far import serve
+    from pebble.bench.control.far import serve
 
     return serve(url)
 

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Annotated, NamedTuple
 import typer
 
 from pebble.config import Config, Mqtt, load, resolved
-from pebble.config.doors import places_of
 from pebble.config.neighbours import Neighbours
+from pebble.config.rules.doors import places_of
 from pebble.config.secret_text import shown_user, without_secrets
 from pebble.config.visible import shown
 from pebble.contract import CHANNELS, MEDIA_STATUS, STATUS, TOUCH_SENSORS, Channel

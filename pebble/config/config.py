@@ -9,12 +9,12 @@ from typing import Any
 
 from msgspec.structs import asdict
 
-from pebble.config.checks import CHECKS
-from pebble.config.exposure import warn_if_readable
 from pebble.config.home import in_home
 from pebble.config.masking import holds_secret, masked
 from pebble.config.raw import Pairs, decode, inherit, plain, read_text
 from pebble.config.reader import Reader
+from pebble.config.rules.between_keys import CHECKS
+from pebble.config.rules.exposure import warn_if_readable
 from pebble.config.tree import Root, SerialBridge, SerialBridges
 from pebble.contract.identity import Identity
 from pebble.contract.serial_protocols import SERIAL_PROTOCOLS

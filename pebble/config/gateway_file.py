@@ -5,13 +5,13 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated
 
-from pebble.config.checks import CHECKS
 from pebble.config.config import default_run_folder
-from pebble.config.doors import places_of
 from pebble.config.neighbours import Neighbours
 from pebble.config.problems import Notes
 from pebble.config.raw import decode, plain, read_text
 from pebble.config.reader import Reader
+from pebble.config.rules.between_keys import CHECKS
+from pebble.config.rules.doors import places_of
 from pebble.config.transport import Mqtt, ZenohSection
 from pebble.config.types import EMPTY, Account, Level, Section, doc
 from pebble.contract.identity import GATEWAYS, SERVERS, Identity

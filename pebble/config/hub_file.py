@@ -7,10 +7,10 @@ from typing import Annotated
 
 from msgspec import Meta
 
-from pebble.config.checks import CHECKS
 from pebble.config.config import default_run_folder
 from pebble.config.raw import decode, plain, read_text
 from pebble.config.reader import Reader
+from pebble.config.rules.between_keys import CHECKS
 from pebble.config.transport import ZenohSection
 from pebble.config.types import CommonName, File, doc
 from pebble.errors import ConfigError

@@ -395,7 +395,6 @@ def some_of(names: Iterable[object], most: int = _SHOWN) -> str:
     return ", ".join(found[:most]) + more
 
 
-_LIVE = (drives, free, commanded)
 _STOP = (stops, free, commanded)
 
 CHECKS: tuple[Check[Component], ...] = (

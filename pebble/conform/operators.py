@@ -44,7 +44,7 @@ def _asks(robot: StandIn, text: str, done: Callable[[], object]) -> str:
 
 
 def _moves_now(robot: StandIn) -> bool:
-    return bool(robot.moving(time.monotonic() - _SOON_S))
+    return bool(robot.inbox.moving(time.monotonic() - _SOON_S))
 
 
 def _rests(robot: StandIn, text: str = LET_GO) -> str:
@@ -54,14 +54,14 @@ def _rests(robot: StandIn, text: str = LET_GO) -> str:
         robot.look(_SOON_S)
         return ""
     began = time.monotonic()
-    return _asks(robot, text, lambda: [one for one in robot.of(c.DRIVE, began) if one.value and not one.moves])
+    return _asks(robot, text, lambda: [one for one in robot.inbox.of(c.DRIVE, began) if one.value and not one.moves])
 
 
 def _drives(robot: StandIn, text: str = DRIVE) -> str:
     if text == DRIVE and _moves_now(robot):
         return ""
     began = robot.look(0.0)
-    return _asks(robot, text, lambda: robot.moving(began))
+    return _asks(robot, text, lambda: robot.inbox.moving(began))
 
 
 def _while_driving(test: Callable[[StandIn], CheckResult]) -> Callable[[StandIn], CheckResult]:
@@ -87,7 +87,7 @@ def _at_rest_again(robot: StandIn) -> None:
 
 def idle(robot: StandIn) -> CheckResult:
     began = robot.look(_LOOKS_S)
-    found = sorted({one.metric for one in robot.sent if one.at >= began and one.channel not in _HARMLESS})
+    found = sorted({one.metric for one in robot.inbox.sent if one.at >= began and one.channel not in _HARMLESS})
     if found:
         return failed(f"it publishes {some_of(found)}", "publish commands only while a person gives some")
     return ok("it waits for its person")
@@ -98,12 +98,12 @@ def idle(robot: StandIn) -> CheckResult:
 
 def control(robot: StandIn) -> CheckResult:
     since = robot.look(_LOOKS_S)
-    wrong = [one for one in robot.moving() if one.raw.get("key") in (None, "")]
+    wrong = [one for one in robot.inbox.moving() if one.raw.get("key") in (None, "")]
     if wrong:
         return failed(
             f"{len(wrong)} commands without a key", "move nothing before outgoing/control has your id and a key"
         )
-    foreign = [one for one in robot.moving(since) if robot.control.key not in one.value.key.split()]
+    foreign = [one for one in robot.inbox.moving(since) if robot.control.key not in one.value.key.split()]
     if foreign:
         return failed(f"{len(foreign)} commands with another key", "take the newest key of outgoing/control/{owner}")
     return ok("it asks first, and drives with its key")
@@ -113,30 +113,30 @@ def requests(robot: StandIn) -> CheckResult:
     """One that asks by many ids gets no key that it could drive with."""
     why = _drives(robot)
     began = robot.look(0.0 if why else 2 * _LOOKS_S)
-    found = [one.value for one in robot.of(c.CONTROL) if one.value]
+    found = [one.value for one in robot.inbox.of(c.CONTROL) if one.value]
     ids = {one.id for one in found}
     if len(ids) > 1:
         return failed(f"its ids: {some_of(sorted(ids))}", "make 8 hex digits when it starts, and keep them")
     if why:
         return failed(why, _DRIVE_FIX)
-    if not robot.of(c.CONTROL, began):
+    if not robot.inbox.of(c.CONTROL, began):
         return failed(f"none in {2 * _LOOKS_S:g} s of driving", 'repeat {"want": "hold"} every second')
-    takes = robot.of(c.CONTROL_TAKE)
+    takes = robot.inbox.of(c.CONTROL_TAKE)
     if takes:
         return failed("it takes control where it is free", "take only when a person wants it taken from another")
     return ok("one id, repeated")
 
 
 def payloads(robot: StandIn) -> CheckResult:
-    wrong = [one.wrong for one in robot.sent if one.wrong]
-    unknown = sorted({one.metric for one in robot.sent if one.channel is None})
+    wrong = [one.wrong for one in robot.inbox.sent if one.wrong]
+    unknown = sorted({one.metric for one in robot.inbox.sent if one.channel is None})
     if wrong or unknown:
         return failed(some_of(wrong or unknown), "docs/topics.md has each topic and payload")
-    return ok(f"{len({one.metric for one in robot.sent})} kinds of messages")
+    return ok(f"{len({one.metric for one in robot.inbox.sent})} kinds of messages")
 
 
 def numbers(robot: StandIn) -> CheckResult:
-    for one in robot.sent:
+    for one in robot.inbox.sent:
         if (one.channel is c.DRIVE or b"NaN" in one.payload) and not _numbers(one):
             return failed(f"{one.payload[:60]!r}", "x and z are finite numbers, as JSON has them")
     return ok("all are numbers")
@@ -159,7 +159,7 @@ def clamps(robot: StandIn) -> CheckResult:
     if why := _drives(robot, FULL):
         return failed(why, _DRIVE_FIX)
     robot.look(_SOON_S)
-    axes: list[float] = [one.raw.get(axis, 0) for one in robot.moving(began) for axis in ("x", "z")]
+    axes: list[float] = [one.raw.get(axis, 0) for one in robot.inbox.moving(began) for axis in ("x", "z")]
     largest = max(map(abs, axes))
     if largest > 1:
         return failed(f"it sends {largest:g}", "clamp both axes to -1..1: some robots do not")
@@ -168,7 +168,7 @@ def clamps(robot: StandIn) -> CheckResult:
 
 def rate(robot: StandIn) -> CheckResult:
     began = robot.look(_LOOKS_S)
-    times = [began, *(one.at for one in robot.moving(began)), time.monotonic()]
+    times = [began, *(one.at for one in robot.inbox.moving(began)), time.monotonic()]
     hz, gap = (len(times) - 2) / _LOOKS_S, max(after - before for before, after in pairwise(times))
     if gap > _GAP_S:
         return failed(f"a gap of {gap:.2f} s", f"repeat it at 20 Hz: wheels stop {_GAP_S:g} s after the last command")
@@ -178,7 +178,7 @@ def rate(robot: StandIn) -> CheckResult:
 
 
 def stamps(robot: StandIn) -> CheckResult:
-    drives = robot.moving()
+    drives = robot.inbox.moving()
     times = [one.value.t for one in drives if isinstance(one.value.t, int)]
     if not times:
         return ok("it sends none")
@@ -197,7 +197,7 @@ def thin(robot: StandIn) -> CheckResult:
     level = LEVELS["thin"]
     robot.look(1.0)
     began = robot.look(2 * _LOOKS_S)
-    found = robot.moving(began)
+    found = robot.inbox.moving(began)
     robot.link("wide")
     hz = len(found) / (2 * _LOOKS_S)
     if hz > level.drive_hz * _SLOWER:
@@ -220,13 +220,13 @@ def zero(robot: StandIn) -> CheckResult:
     if why := _rests(robot):
         return failed(why, "publish a zero at once when the stick is let go")
     began = robot.look(_SOON_S)
-    last = [one for one in robot.of(c.DRIVE) if one.value][-1]
-    if robot.moving(began) or last.moves:
+    last = [one for one in robot.inbox.of(c.DRIVE) if one.value][-1]
+    if robot.inbox.moving(began) or last.moves:
         return failed("it moves after its zero", "nothing follows a zero until the stick is pushed again")
     if last.qos < 1:
         return failed("its zero has QoS 0", "publish a zero with QoS 1: it must not be lost")
-    before = robot.moving()[-1].at
-    first = next(one for one in robot.of(c.DRIVE, before) if not one.moves)
+    before = robot.inbox.moving()[-1].at
+    first = next(one for one in robot.inbox.of(c.DRIVE, before) if not one.moves)
     if first.at > before + _SOON_S:
         return failed(f"its zero came {first.at - before:.1f} s after the last command", "publish it at once")
     return ok("a zero at once")
@@ -235,7 +235,7 @@ def zero(robot: StandIn) -> CheckResult:
 def _gives_up(robot: StandIn, after_s: float, state: str, fix: str) -> CheckResult:
     """Whether it moves nothing any more, once the robot has been in this state for so long."""
     robot.look(after_s)
-    moved = robot.moving(robot.look(1.0))
+    moved = robot.inbox.moving(robot.look(1.0))
     _at_rest_again(robot)
     return failed(f"it drives a robot that is {state}", fix) if moved else ok(f"it ends when the robot is {state}")
 
@@ -254,7 +254,7 @@ def taken(robot: StandIn) -> CheckResult:
     robot.give_to(_OTHER)
     robot.look(_SOON_S)
     began = robot.look(_LOOKS_S)
-    moved, took = robot.moving(began), robot.of(c.CONTROL_TAKE, began)
+    moved, took = robot.inbox.moving(began), robot.inbox.of(c.CONTROL_TAKE, began)
     _at_rest_again(robot)
     if moved or took:
         return failed(
@@ -267,9 +267,9 @@ def refused(robot: StandIn) -> CheckResult:
     robot.look(_SOON_S)
     robot.give_to(_OTHER)
     began = time.monotonic()
-    why = _asks(robot, DRIVE, lambda: robot.of(c.CONTROL, began) or robot.of(c.CONTROL_TAKE, began))
+    why = _asks(robot, DRIVE, lambda: robot.inbox.of(c.CONTROL, began) or robot.inbox.of(c.CONTROL_TAKE, began))
     robot.look(_LOOKS_S)
-    moved, took = robot.moving(began), robot.of(c.CONTROL_TAKE, began)
+    moved, took = robot.inbox.moving(began), robot.inbox.of(c.CONTROL_TAKE, began)
     _at_rest_again(robot)
     if moved or took:
         return failed(
@@ -287,12 +287,12 @@ def refused(robot: StandIn) -> CheckResult:
 
 def stop(robot: StandIn) -> CheckResult:
     robot.confirms, began = False, time.monotonic()
-    why = _asks(robot, STOP, lambda: robot.of(c.ESTOP, began))
+    why = _asks(robot, STOP, lambda: robot.inbox.of(c.ESTOP, began))
     robot.look(_CONFIRMS_S)
     robot.confirms = True
     if why:
         return failed(why, "publish incoming/estop")
-    names = [str(one.raw.get("stop")) if isinstance(one.raw, dict) else "" for one in robot.of(c.ESTOP, began)]
+    names = [str(one.raw.get("stop")) if isinstance(one.raw, dict) else "" for one in robot.inbox.of(c.ESTOP, began)]
     if not all(_NAME.fullmatch(one) for one in names):
         return failed("it has no name", 'give it {"stop": <16 hex digits>}')
     if len(set(names)) > 1:
@@ -301,7 +301,7 @@ def stop(robot: StandIn) -> CheckResult:
         return failed("it is not repeated", "repeat it every 0.5 s until each owner has its name in recent")
     confirmed = robot.wait(lambda: robot.stop.latched, _CONFIRMS_S)
     robot.look(_SOON_S)
-    more = robot.of(c.ESTOP, robot.look(_LOOKS_S))
+    more = robot.inbox.of(c.ESTOP, robot.look(_LOOKS_S))
     if more or not confirmed:
         return failed("it is repeated after it was confirmed", "end when each owner has its name in recent")
     return ok("repeated until it is confirmed")
@@ -313,7 +313,7 @@ def stopped(robot: StandIn) -> CheckResult:
     began = robot.look(0.0)
     robot.ask(DRIVE)
     robot.look(2 * _LOOKS_S)
-    moved, resets = robot.moving(began), robot.of(c.ESTOP_RESET)
+    moved, resets = robot.inbox.moving(began), robot.inbox.of(c.ESTOP_RESET)
     still = robot.stop.latched
     robot.ask(LET_GO)
     robot.look(_SOON_S)
@@ -333,7 +333,7 @@ def _latched(robot: StandIn) -> None:
 def reset(robot: StandIn) -> CheckResult:
     _latched(robot)
     began, count = time.monotonic(), robot.stop.count
-    why = _asks(robot, RESET, lambda: robot.of(c.ESTOP_RESET, began))
+    why = _asks(robot, RESET, lambda: robot.inbox.of(c.ESTOP_RESET, began))
     robot.wait(lambda: not robot.stop.latched, _SOON_S)
     is_free = not robot.stop.latched
     _at_rest_again(robot)
@@ -348,10 +348,12 @@ def reset(robot: StandIn) -> CheckResult:
 
 
 def names(robot: StandIn) -> CheckResult:
-    plain = sorted({one.metric for one in robot.sent if not one.account and one.channel is not c.ESTOP and _acts(one)})
+    plain = sorted(
+        {one.metric for one in robot.inbox.sent if not one.account and one.channel is not c.ESTOP and _acts(one)}
+    )
     if plain:
         return failed(f"without a name: {some_of(plain)}", "publish on incoming/by/{account}/…")
-    bare = [one for one in robot.of(c.ESTOP) if not one.account]
+    bare = [one for one in robot.inbox.of(c.ESTOP) if not one.account]
     if not bare:
         return failed("its stop needs a name", "publish a stop on incoming/estop, too: it counts from everyone")
     return ok("its commands have its name")
@@ -378,7 +380,7 @@ def release(robot: StandIn) -> CheckResult:
     began = time.monotonic()
     robot.ask(END)
     released = robot.wait(lambda: not robot.control.key and _released(robot, began), _LOOKS_S)
-    drives = [one for one in robot.of(c.DRIVE) if one.value]
+    drives = [one for one in robot.inbox.of(c.DRIVE) if one.value]
     if not released:
         return failed("control is kept until it ends by itself", 'publish {"want": "release"} when it ends')
     return (
@@ -387,7 +389,7 @@ def release(robot: StandIn) -> CheckResult:
 
 
 def _released(robot: StandIn, since: float) -> bool:
-    return any(one.value and one.value.want == "release" for one in robot.of(c.CONTROL, since))
+    return any(one.value and one.value.want == "release" for one in robot.inbox.of(c.CONTROL, since))
 
 
 OPERATOR: tuple[Check[StandIn], ...] = (

@@ -66,6 +66,51 @@ class Sent:
         return isinstance(self.value, Drive) and self.value.moves
 
 
+class Inbox:
+    """Everything that a robot is sent, by its base topic; the newest of it is kept."""
+
+    def __init__(self, base: str) -> None:
+        self.sent: deque[Sent] = deque(maxlen=_MOST)
+        self._base = base
+        self._arrived: deque[tuple[Message, float]] = deque(maxlen=_MOST)
+
+    def take(self, message: Message) -> None:
+        """Keep it until it is read. Safe from any thread."""
+        self._arrived.append((message, time.monotonic()))
+
+    def read(self) -> Iterator[tuple[Message, Sent]]:
+        """What has arrived since the last time."""
+        while self._arrived:
+            message, at = self._arrived.popleft()
+            one = self._parsed(message, at)
+            self.sent.append(one)
+            yield message, one
+
+    def of(self, channel: c.Channel, since: float = 0.0) -> list[Sent]:
+        return [one for one in self.sent if one.channel is channel and one.at >= since]
+
+    def moving(self, since: float = 0.0) -> list[Sent]:
+        """The commands that would turn wheels."""
+        return [one for one in self.of(c.DRIVE, since) if one.moves]
+
+    def _parsed(self, message: Message, at: float) -> Sent:
+        named = without_name(message.topic)
+        topic = message.topic if named is None else named.topic
+        metric = topic.removeprefix(f"{self._base}/")
+        channel = channel_of(metric)
+        value: Any = None
+        raw: Any = None
+        wrong = ""
+        try:
+            raw = json.loads(message.payload)
+            raw = raw["value"] if isinstance(raw, dict) and isinstance(raw.get("value"), dict) else raw
+            value = None if channel is None else codec.decode(channel, message.payload)
+        except (PayloadError, ValueError, RecursionError) as error:
+            wrong = f"{metric}: {error}"
+        account = "" if named is None else named.account
+        return Sent(at, metric, account, message.payload, message.qos, channel, value, raw, wrong)
+
+
 class StandIn:
     """The robot. Its checks let time pass by :meth:`wait`, which also takes what has arrived and sends heartbeats."""
 
@@ -73,7 +118,7 @@ class StandIn:
         self.base, self.named = base, named
         self.ask = ask_person
         self.person_s = 180.0  # until a person has done it
-        self.sent: deque[Sent] = deque(maxlen=_MOST)
+        self.inbox = Inbox(base)
         self.stalled_s = 0.0  # is not measured: a person would have to do all again
         self.alive = True  # whether heartbeats are sent
         self.other = ""  # who has control instead of the client under test
@@ -82,8 +127,7 @@ class StandIn:
         self.control = ControlState(by="", id="", key="", named=named, boot=self.stop.boot)
         self._ends = self._heartbeat_at = 0.0
         self._target, self._transport = target, transport
-        self._arrived: deque[tuple[Message, float]] = deque(maxlen=_MOST)
-        transport.subscribe(f"{base}/{c.INCOMING}/#", self._take, qos=QoS.DELIVERED, direct=True)
+        transport.subscribe(f"{base}/{c.INCOMING}/#", self.inbox.take, qos=QoS.DELIVERED, direct=True)
         self._publish(
             c.CAPABILITIES, Capabilities(t=_ms(), schema="pebble-capabilities/v1", value=self._capabilities())
         )
@@ -100,15 +144,12 @@ class StandIn:
 
     # -- time
 
-    def _take(self, message: Message) -> None:
-        self._arrived.append((message, time.monotonic()))
-
     def wait(self, condition: Callable[[], object], seconds: float) -> bool:
         """Be a robot until ``condition``; False: not within ``seconds``."""
         end = time.monotonic() + seconds
         while True:
-            while self._arrived:
-                self._receive(*self._arrived.popleft())
+            for message, one in self.inbox.read():
+                self._receive(message, one)
             now = time.monotonic()
             if self.alive and now >= self._heartbeat_at:
                 self._heartbeat_at = now + _HEARTBEAT_S
@@ -127,13 +168,6 @@ class StandIn:
         self.wait(lambda: False, seconds)
         return began
 
-    def of(self, channel: c.Channel, since: float = 0.0) -> list[Sent]:
-        return [one for one in self.sent if one.channel is channel and one.at >= since]
-
-    def moving(self, since: float = 0.0) -> list[Sent]:
-        """The commands that would turn wheels."""
-        return [one for one in self.of(c.DRIVE, since) if one.moves]
-
     def retained(self) -> list[str]:
         """The topics of commands that the broker has retained."""
         found: deque[Message] = deque(maxlen=_MOST)
@@ -144,23 +178,9 @@ class StandIn:
 
     # -- what the robot does
 
-    def _receive(self, message: Message, at: float) -> None:
-        named = without_name(message.topic)
-        topic = message.topic if named is None else named.topic
-        metric = topic.removeprefix(f"{self.base}/")
-        channel = channel_of(metric)
-        value: Any = None
-        raw: Any = None
-        wrong = ""
-        try:
-            raw = json.loads(message.payload)
-            raw = raw["value"] if isinstance(raw, dict) and isinstance(raw.get("value"), dict) else raw
-            value = None if channel is None else codec.decode(channel, message.payload)
-        except (PayloadError, ValueError, RecursionError) as error:
-            wrong = f"{metric}: {error}"
-        account = "" if named is None else named.account
-        self.sent.append(Sent(at, metric, account, message.payload, message.qos, channel, value, raw, wrong))
-        if message.retain or wrong:
+    def _receive(self, message: Message, one: Sent) -> None:
+        channel, value = one.channel, one.value
+        if message.retain or one.wrong:
             return
         if channel is c.ESTOP and isinstance(value, EstopCommand):
             self.latch(str(value.stop))
@@ -169,7 +189,7 @@ class StandIn:
         elif channel in (c.CONTROL, c.CONTROL_TAKE):
             self._lease(value, take=channel is c.CONTROL_TAKE)
         elif channel is c.DRIVE and value.key == self.control.key:
-            self._ends = max(self._ends, at + 1.0)
+            self._ends = max(self._ends, one.at + 1.0)
 
     def latch(self, name: str) -> None:
         """A stop of this name has arrived."""

@@ -5,7 +5,7 @@ from pathlib import Path
 
 from pebble.check_result import CheckResult
 from pebble.config import Config
-from pebble.config.doors import warning_of_open
+from pebble.config.rules.doors import warning_of_open
 from pebble.doctor import ok, warn
 from pebble.fleet.folder import FLEET, Fleet, FleetError, load
 from pebble.fleet.roles import ProgramRole, Right, rights

@@ -7,7 +7,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from pebble.config import Config
-from pebble.config.doors import warning_of_open
+from pebble.config.rules.doors import warning_of_open
 from pebble.errors import ConfigError, PebbleError
 from pebble.launcher.child import Child
 from pebble.launcher.config_watch import ConfigWatch

@@ -17,7 +17,7 @@ from pebble.client.connection import Target, connected, put_names
 from pebble.client.names import Names
 from pebble.client.robot_view import RobotView
 from pebble.config import Config
-from pebble.config.exposure import is_near
+from pebble.config.rules.exposure import is_near
 from pebble.config.web import is_loopback
 from pebble.contract import codec
 from pebble.contract.identity import parse_topic

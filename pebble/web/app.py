@@ -57,9 +57,10 @@ def create_app(settings: WebSettings) -> Starlette:
         archive = None if settings.recordings is None else Recordings(settings.recordings)
         server = Server(settings, people, audit)
         state = app.state
-        state.server, state.audit, state.driving, state.stops = server, audit, server.driving, server.stops
+        state.server, state.audit, state.driving, state.stops = server, audit, server.drivers.driving, server.stops
         state.recordings = archive
-        state.robots, state.broker, state.media, state.sound = server.robots, server.broker, server.media, server.sound
+        state.robots, state.broker = server.robots, server.broker
+        state.media, state.sound = server.media.pictures, server.media.sound
         await server.open()
         try:
             yield
@@ -161,7 +162,7 @@ async def _estop(request: Request) -> Response:
     except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
         return PlainTextResponse(str(error), 400)
     address = "" if request.client is None else request.client.host
-    await asyncio.sleep(_server_of(request).stop_waits_s(session.user))
+    await asyncio.sleep(_server_of(request).stops.waits_s(session.user, time.monotonic()))
     request.app.state.server.stop(op.ref, op.stop, session, "", op.why, address)
     return PlainTextResponse("sent", 202)
 

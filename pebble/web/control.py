@@ -10,7 +10,6 @@ from contextlib import suppress
 from typing import Any
 
 import msgspec
-from msgspec.structs import replace
 from starlette.websockets import WebSocket, WebSocketDisconnect, WebSocketState
 
 from pebble.client.estop_states import Reset
@@ -20,7 +19,7 @@ from pebble.transports.clock import since_boot as clock
 from pebble.web import messages as m
 from pebble.web import robot_commands
 from pebble.web.access.login import named, printable
-from pebble.web.driving import Tab
+from pebble.web.drive.driving import Tab
 from pebble.web.log_lines import LogReader
 from pebble.web.pace import STOP_WAITS_S, Pace
 from pebble.web.page_clock import PING_S, ClockJumpError
@@ -129,7 +128,7 @@ class Control:
             )
         )
         if "drive" in self._rights():
-            server.restore(hello.token, self._tab, lambda: None, lambda _why: None)
+            server.drivers.restore(hello.token, self._tab, lambda: None, lambda _why: None)
         server.robots.join(self._interest)
         self._interest.dirty |= {(ref, "web/driver") for ref in server.robots.components}
         self._post(self._ping())
@@ -137,7 +136,7 @@ class Control:
     def _end(self) -> None:
         self._server.robots.leave(self._interest)
         try:
-            self._server.closed(self._tab)
+            self._server.drivers.closed(self._tab)
         finally:
             if self._interest.watched:
                 self._server.unwatch(self._interest.watched)
@@ -151,7 +150,7 @@ class Control:
             pass  # it has gone already
 
     def _end_leases(self) -> None:
-        self._server.closed(self._tab, for_good=True)
+        self._server.drivers.closed(self._tab, for_good=True)
 
     def _is_secure(self) -> bool:
         client = self._websocket.client
@@ -187,7 +186,7 @@ class Control:
             case m.DriveOp():
                 self._drive(op)
             case m.StopOp():
-                self._stop(op)
+                self._server.drivers.stop(op.ref, self._session.user)
             case m.EstopOp():
                 self._server.stop(op.ref, op.stop, self._session, self._tab.device, op.why, self._address())
             case m.EstopEndOp():
@@ -205,7 +204,7 @@ class Control:
                 self._lease(op)
             case m.EncodingOp():
                 if self._may("drive", op):
-                    self._server.media.pin(op.ref, op.encoding)
+                    self._server.media.pictures.pin(op.ref, op.encoding)
             case m.PictureFromOp():
                 if self._may("drive", op):
                     self._server.sources.choose_picture(op.ref, op.source)
@@ -230,7 +229,7 @@ class Control:
         """Publish what is asked of a robot, once: nothing repeats it, and the robot's states tell what came of it."""
         if not self._may(robot_commands.right(op), op):
             return
-        if why := (self._why_not if robot_commands.moves(op) else "") or self._server.refusals.of_op(op):
+        if why := (self._why_not if robot_commands.moves(op) else "") or self._server.drivers.refusals.of_op(op):
             self._refuse(op, why)
             return
         message = robot_commands.publication(op, self._server.robots.topic)
@@ -251,25 +250,16 @@ class Control:
     def _drive(self, op: m.DriveOp) -> None:
         if not self._may("drive", op):
             return
-        server, now = self._server, clock()
+        server = self._server
         if op.ref not in server.robots.components:
             self._refuse(op, "unknown component")
             return
-        outcome = server.driving.drive(self._tab, op, now, self._why_not or server.refusals.of_driving(op.ref))
-        accepted = server.publish(outcome.commands, self._session.user)
-        if outcome.refused:
-            self._refuse(op, outcome.refused)
-        elif not accepted:
-            server.publish(server.driving.stop(op.ref, now))
-            self._refuse(op, "The server cannot reach the broker")
-        elif outcome.commands and outcome.commands[0].drive.moves and op.ref not in self._moved:
+        moves, why = server.drivers.drive(self._tab, op, self._why_not)
+        if why:
+            self._refuse(op, why)
+        elif moves and op.ref not in self._moved:
             self._moved.add(op.ref)
             self._audit("drive", op.ref)
-
-    def _stop(self, op: m.StopOp) -> None:
-        component = self._server.robots.components.get(op.ref)
-        if component is not None and (component.robot.drives or not component.robot.capabilities):
-            self._server.publish(self._server.driving.stop(op.ref, clock()), self._session.user)
 
     def _end_stop(self, op: m.EstopEndOp) -> None:
         """One's own, or with the right to reset: a viewer must not end the stop of another person."""
@@ -278,10 +268,10 @@ class Control:
             self._server.stops.end(op.stop)
 
     def _reset(self, op: m.EstopResetOp) -> None:
-        component = self._server.robots.components.get(op.ref)
-        if not self._may("reset", op) or component is None:
+        robot = self._server.robots.view(op.ref)
+        if not self._may("reset", op) or robot is None:
             return
-        reset = Reset(component.robot.estop, self._session.user)
+        reset = Reset(robot.estop, self._session.user)
         shown = {one.owner: (one.boot, one.count) for one in op.owners}
         reset.shown = {
             owner: msgspec.structs.replace(state, boot=shown[owner][0], count=shown[owner][1])
@@ -308,14 +298,14 @@ class Control:
         server = self._server
         self._moved.discard(op.ref)
         if not op.take:
-            if server.release(self._tab, op.ref):
+            if server.drivers.release(self._tab, op.ref):
                 self._audit("release", op.ref)
             return
-        component = server.robots.components.get(op.ref)
-        right = "take" if op.over and server.keeps_control(op.ref) else "drive"
+        robot = server.robots.view(op.ref)
+        right = "take" if op.over and server.drivers.keeps_control(op.ref) else "drive"
         if not self._may(right, op):
             return
-        if self._why_not or component is None:
+        if self._why_not or robot is None:
             self._refuse(op, self._why_not or "unknown component")
             return
 
@@ -323,9 +313,9 @@ class Control:
             server.operated(op.ref)
             self._audit("take over" if op.over else "take", op.ref)
 
-        if not op.over and (state := server.controls.state(op.ref)) is not None and state.id:
+        if not op.over and (state := server.drivers.controls.state(op.ref)) is not None and state.id:
             self._audit("ask", op.ref)
-        server.take(self._tab, component.robot, granted, lambda why: self._refuse(op, why), over=op.over)
+        server.drivers.take(self._tab, robot, granted, lambda why: self._refuse(op, why), over=op.over)
 
     def _rights(self, ref: str = "") -> frozenset[str]:
         return page_rights(self._session.role, self._server.level(ref))
@@ -387,7 +377,9 @@ class Control:
         self._large_due = self._large_due and not large
         if self._interest.more:
             self._wake.set()
-        values = found + tuple((ref, "web/driver", self._driver(ref), 0.0) for ref, _ in drivers)
+        values = found + tuple(
+            (ref, "web/driver", self._server.drivers.view(self._tab, ref), 0.0) for ref, _ in drivers
+        )
         gone, self._interest.gone = tuple(self._interest.gone), set()
         if values or gone:
             await self._websocket.send_text(encode(m.State(now=1000 * time.time(), set=values, gone=gone)))
@@ -413,23 +405,6 @@ class Control:
         round_trip = self._tab.clock.round_trip_s
         number = self._tab.clock.ping(clock())
         return m.Ping(n=number, now=1000 * time.time(), round_trip_ms=-1 if round_trip is None else 1000 * round_trip)
-
-    def _driver(self, ref: str) -> m.DriverView:
-        driving, controls, now = self._server.driving, self._server.controls, clock()
-        state = controls.state(ref)
-        asking = controls.asks(self._tab, ref)
-        view = m.DriverView(keeps=self._server.keeps_control(ref), asking=asking)
-        if state is not None:
-            asks = (state.asks or "somebody") if state.asks_id else ""
-            view = replace(view, asks=asks, checked=state.named, others=state.others)
-        if (other := driving.elsewhere(ref, now)) is not None:
-            return replace(view, by=other.by, device=other.device, server=other.server)
-        lease = driving.leases.get(ref)
-        if lease is None:
-            return view
-        tab = lease.tab
-        idle = None if tab.live is not None and tab.live_ref == ref else now - lease.idle_from
-        return replace(view, by=tab.user, device=tab.device, you=tab is self._tab, idle_s=idle)
 
 
 def _tag(op: m.FromPage) -> str:

@@ -120,7 +120,6 @@ class Robots:
         self.before: Collection[str] = ()  # robots that are known from before
         self.omitted = 0  # messages of components, metrics and values beyond the limits
         self.interests: set[Interest] = set()
-        self.on_message: list[Callable[[Message, float], None]] = []  # of every component, before it is interpreted
         self.on_forget: Callable[[str], object] = lambda _: None
         self.logs: dict[str, LogLines] = {}  # of watched components
         self.recent = Recent()
@@ -130,6 +129,10 @@ class Robots:
         self._bytes = 0
 
     # -- reading
+
+    def view(self, ref: str) -> RobotView | None:
+        component = self.components.get(ref)
+        return None if component is None else component.robot
 
     def capabilities(self, ref: str) -> dict[str, Any]:
         """Empty until they are known."""
@@ -392,6 +395,12 @@ class Robots:
         for interest in self.interests:
             if interest.watched == component.ref:
                 interest.notify()
+
+    def mark_drivers(self, refs: Collection[str]) -> None:
+        """Let all pages see who drives these."""
+        for interest in self.interests if refs else ():
+            interest.dirty |= {(ref, "web/driver") for ref in refs}
+            interest.notify()
 
     def _mark(self, ref: str, metric: str, *, everybody: bool = False) -> None:
         channel = _channel(metric)

@@ -12,6 +12,7 @@ from pebble.contract.identity import parse_topic
 from pebble.runtime.robot_estop import RobotEstop
 from pebble.transports import Message
 from pebble.web import messages as m
+from pebble.web.pace import STOP_WAITS_S, Pace
 
 MAX_STOPS = 512  # that are being sent at once: more than one of each robot that is known from before
 MAX_SAME = 64  # of them for the same robot, or for all: the newest are sent,
@@ -39,6 +40,7 @@ class Stops:
         self._users: dict[str, str] = {}  # who has pressed each of them
         self._refs: dict[str, str] = {}  # for which robot; "": all
         self._shown: dict[str, tuple[str, str]] = {}  # by robot: progress and words, as pages see them
+        self._paces: dict[str, Pace] = {}  # by person
 
     def press(
         self,
@@ -68,6 +70,10 @@ class Stops:
                     sender.receive(message, now)
         self.changed |= set(sender.robots)
         return self.tick(now)
+
+    def waits_s(self, user: str, now: float) -> float:
+        """How long a stop of this person waits that comes without a control socket, as it would on one."""
+        return min(self._paces.setdefault(user, Pace(now)).take(1, now), STOP_WAITS_S)
 
     def end(self, name: str) -> None:
         """Send this stop no more."""

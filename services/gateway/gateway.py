@@ -9,8 +9,7 @@ state, over the connection of the heartbeats, where nothing else holds it up: it
 import logging
 import threading
 import time
-from collections.abc import Callable, Mapping, Sequence
-from functools import partial
+from collections.abc import Callable, Sequence
 
 import msgspec
 
@@ -18,12 +17,13 @@ from pebble.contract import ESTOP, ONLINE, Kind
 from pebble.contract.identity import GATEWAYS, parse_topic
 from pebble.contract.names import with_name
 from pebble.contract.payloads import GatewayHeartbeat
-from pebble.forwarding.cycles import PROBE_PERIOD_S, Cycles, Finding
-from pebble.forwarding.retained_window import INITIAL_SYNC_S
+from pebble.forwarding.cycles import Cycles, Finding
 from pebble.forwarding.routing import Side
 from pebble.forwarding.subjects import Subject
 from pebble.runtime.rate_limit import RateLimitedLog
 from pebble.services.gateway.carried import Carried
+from pebble.services.gateway.carried_robots import CarriedRobots, is_stop
+from pebble.services.gateway.connections import Connections
 from pebble.services.gateway.heartbeats import OwnHeartbeats, PresentRobots
 from pebble.services.gateway.ownership import MAX_ROBOTS, Ownership
 from pebble.transports import Message, QoS, State, Transport
@@ -32,7 +32,6 @@ from pebble.transports.counters import Counters
 log = logging.getLogger(__name__)
 
 TICK_S = 0.1
-BEGINNING_S = 0.1  # in one turn: taking many robots must not hold up the end of others
 _STOP = Subject(Kind.COMMAND, ESTOP)
 _ANY = f"+/{GATEWAYS}/+"
 
@@ -56,21 +55,21 @@ class Gateway:
         self.ownership = Ownership(name)
         self.counters = Counters()
         self._robots, self._clock = tuple(robots), clock
-        self._hub, self._broker, self._presence = hub, broker, presence
+        self._connections = Connections(hub, broker, presence)
         self._heartbeats, self._present = OwnHeartbeats(name, broker), PresentRobots()
-        self._carried: dict[str, Carried] = {}
-        self._synchronize: dict[str, float] = {}  # when what is retained of it has arrived
+        self._carried = CarriedRobots(self._connections, self.ownership, clock)
         self._stops = Cycles(clock)
         self._quiet_log = RateLimitedLog(log, period_s=60.0)
-        self._probed_at = float("-inf")
-        self._states = threading.Lock()
-        self._at_broker, self._at_hub = False, False
         self._wake, self._heartbeat_due = threading.Event(), threading.Event()
         self._running = True
 
     @property
     def carries(self) -> frozenset[str]:
-        return frozenset(self._carried)
+        return self._carried.bases
+
+    def carried(self, base: str) -> Carried | None:
+        """What carries that robot now."""
+        return self._carried.of(ONLINE.topic(base))
 
     # -- the life of the program
 
@@ -102,33 +101,35 @@ class Gateway:
         self._heartbeat_due.set()
 
     def open(self) -> None:
-        for transport in (self._hub, self._broker, self._presence):
-            transport.judge_topics(is_stop=_is_stop, may_leave=self._may_leave)
+        hub, broker, presence = self._connections
+        for transport in self._connections:
+            transport.judge_topics(is_stop=is_stop, may_leave=self._may_leave)
             transport.on_state(self._on_state)
-        self._hub.judge_topics(is_invented=self._is_invented)
-        self._broker.judge_topics(skips_retained=self._skips_retained, delivers_late=True)
-        for transport in (self._hub, self._broker, self._presence):
+        hub.judge_topics(is_invented=self._is_invented)
+        broker.judge_topics(skips_retained=self._skips_retained, delivers_late=True)
+        for transport in self._connections:
             transport.open(timeout=0.0)
         for base in self._robots:
             stop = ESTOP.topic(base)
-            self._hub.subscribe(ONLINE.topic(base), self._on_robot, echo=False, direct=True)
+            hub.subscribe(ONLINE.topic(base), self._on_robot, echo=False, direct=True)
             for topic in (stop, with_name(stop, "+")):
-                self._presence.subscribe(topic, self._on_stop, direct=True)
-        self._presence.subscribe(ONLINE.filter(_ANY), self._on_gateway, direct=True)
+                presence.subscribe(topic, self._on_stop, direct=True)
+        presence.subscribe(ONLINE.filter(_ANY), self._on_gateway, direct=True)
 
     def close(self) -> None:
         """Stop forwarding, and only then tell the others."""
         self.ownership.lost()
-        for robot in list(self._carried):
-            self._end(robot)
-        for transport in (self._broker, self._presence, self._hub):
+        self._carried.follow({})
+        hub, broker, presence = self._connections
+        for transport in (broker, presence, hub):
             transport.close()
 
     def publish_heartbeat(self) -> None:
         """Publish a heartbeat if one is due."""
         now = self._clock()
-        if self._broker.state is State.CONNECTED and self._heartbeats.due(now, TICK_S):
-            self._heartbeats.publish(self._present.robots(now) if self._hub.state is State.CONNECTED else (), now)
+        at_broker = self._connections.broker.state is State.CONNECTED
+        if at_broker and self._heartbeats.due(now, TICK_S):
+            self._heartbeats.publish(self._present.robots(now) if self._connections.at_hub else (), now)
 
     def _publish_heartbeats(self) -> None:
         try:
@@ -143,64 +144,21 @@ class Gateway:
         """A turn: who carries what, what is due."""
         now = self._clock()
         self.ownership.judge(now)
-        held = self.ownership.held(now)
-        for robot, one in list(self._carried.items()):
-            if held.get(robot) != one.since:
-                self._end(robot)
-        self._begin({robot: since for robot, since in held.items() if robot not in self._carried})
-        for robot, due in list(self._synchronize.items()):
-            if self._clock() >= due:
-                del self._synchronize[robot]
-                if robot in self._carried:
-                    self._carried[robot].synchronize()
-        if now - self._probed_at >= PROBE_PERIOD_S:
-            self._probed_at = now
-            for one in self._carried.values():
-                one.probe()
-
-    def _begin(self, robots: Mapping[str, float]) -> None:
-        end = self._clock() + BEGINNING_S
-        for robot, since in robots.items():
-            one = Carried(robot, since, self._hub, self._broker, partial(self._holds, robot, since), self._clock)
-            for transport in (self._hub, self._broker):
-                transport.judge_topics(is_stop=_is_stop)  # of all robots, not of this one
-            self._carried[robot] = one
-            if one.begin():
-                self._synchronize[robot] = self._clock() + INITIAL_SYNC_S
-                log.info("carries %s", robot)
-            else:  # it was not the owner any more before it had begun
-                self._end(robot, begun=False)
-            if self._clock() >= end:
-                self._wake.set()
-                return
-
-    def _end(self, robot: str, *, begun: bool = True) -> None:
-        self._synchronize.pop(robot, None)
-        self._carried.pop(robot).end()
-        log.info("carries %s no more" if begun else "was to carry %s, and is no more", robot)
-
-    def _holds(self, robot: str, since: float) -> bool:
-        return self.ownership.since(robot, self._clock()) == since
+        if not self._carried.follow(self.ownership.held(now)):
+            self._wake.set()
+        self._carried.tick(now)
 
     # -- the transports' threads
 
     def _on_state(self, _state: State) -> None:
-        """Both connections to the broker are needed: one carries, the other shows whether the others hear this one."""
-        with self._states:
-            at_broker = all(one.state is State.CONNECTED for one in (self._broker, self._presence))
-            if at_broker is not self._at_broker:
-                self._at_broker = at_broker
-                if at_broker:
-                    self.ownership.connected(self._clock())
-                else:
-                    self.ownership.lost()
-            at_hub = self._hub.state is State.CONNECTED
-            if at_hub is not self._at_hub:
-                self._at_hub = at_hub
-                for robot, one in list(self._carried.items()):
-                    one.hub_changed(self._hub.state)
-                    self._synchronize[robot] = self._clock() + INITIAL_SYNC_S
+        self._connections.look(self._on_broker, self._carried.hub_changed)
         self._wake.set()
+
+    def _on_broker(self, connected: bool) -> None:
+        if connected:
+            self.ownership.connected(self._clock())
+        else:
+            self.ownership.lost()
 
     def _on_robot(self, message: Message) -> None:
         address = parse_topic(message.topic)
@@ -208,7 +166,7 @@ class Gateway:
             return
         if not message.retain:
             self._present.note(address.identity.base, self._clock())
-        elif self._hub.as_published:
+        elif self._connections.hub.as_published:
             self._present.note_copy(address.identity.base, message.payload, self._clock())
 
     def _on_gateway(self, message: Message) -> None:
@@ -239,32 +197,22 @@ class Gateway:
         if message.retain or self._stops.examine(Side.REMOTE, _STOP, message) is not Finding.PASS:
             return
         self.counters.add("stops")
-        self._hub.publish(message.topic, message.payload, qos=QoS.DELIVERED, urgent=True)
+        self._connections.hub.publish(message.topic, message.payload, qos=QoS.DELIVERED, urgent=True)
 
     def _may_leave(self, topic: str) -> bool:
         """Whether it is a stop, or of a robot that is carried at this moment, or no robot's: a heartbeat."""
         address = parse_topic(topic)
-        if _is_stop(topic) or address is None or address.identity.is_server:
+        if is_stop(topic) or address is None or address.identity.is_server:
             return True
-        one = self._carried.get(address.identity.base)
-        return one is not None and self._holds(one.base, one.since)
+        return self._carried.may_leave(address.identity.base)
 
     def _is_invented(self, topic: str) -> bool:
-        one = self._of(topic)
+        one = self._carried.of(topic)
         return one is None or one.subjects.invented(topic.encode()) is not None
 
     def _skips_retained(self, topic: bytes) -> bool:
-        one = self._of(topic.decode(errors="replace"))
+        one = self._carried.of(topic.decode(errors="replace"))
         return one is not None and not topic.endswith(_STOP_END) and one.forwarder.skips_retained(Side.REMOTE, topic)
-
-    def _of(self, topic: str) -> Carried | None:
-        address = parse_topic(topic)
-        return None if address is None else self._carried.get(address.identity.base)
 
 
 _STOP_END = f"/{ESTOP.metric}".encode()
-
-
-def _is_stop(topic: str) -> bool:
-    """Whether it is a stop, with the name of a sender or without."""
-    return f"/{ESTOP.direction}/" in topic and topic.endswith(f"/{ESTOP.metric}")

@@ -26,7 +26,7 @@ class _Request(Struct):
 
     clip: Clip
     times: float
-    starts: int = 0
+    starts: int = 0  # how often its player was started
 
 
 class SoundboardHandler(Service):

@@ -5,8 +5,8 @@ import random
 
 import pytest
 
-from pebble.bench.control_far import DRIFT, LEAST, estimate
-from pebble.bench.control_worker import Exchange
+from pebble.bench.control.ends import Exchange
+from pebble.bench.control.far import DRIFT, LEAST, estimate
 
 SECOND = 10**9
 SEEDS = range(300)

@@ -12,11 +12,12 @@ from typing import Any
 import pytest
 from rich.console import Console
 
-from pebble.bench import control_far, engine
+from pebble.bench import engine
 from pebble.bench.comparison import Case, Comparison
-from pebble.bench.control import CONTROL, CONTROL_FAR, VARIANTS, Participants
-from pebble.bench.control_far import BACK, THERE, Offset
-from pebble.bench.control_worker import ONE_WAY, ROUND_TRIP, Exchange, Slice, SliceSpec
+from pebble.bench.control import far as control_far
+from pebble.bench.control.cells import CONTROL, CONTROL_FAR, VARIANTS, Participants
+from pebble.bench.control.ends import ONE_WAY, ROUND_TRIP, Exchange, Slice, SliceSpec
+from pebble.bench.control.far import BACK, THERE, Offset
 from pebble.bench.results import Cell, load
 from pebble.errors import PebbleError
 from pebble.rig.processes import children
@@ -25,7 +26,7 @@ from tests.support import ROOT, Broker, Child, until
 SHIFT_NS = 1_500_000_000
 ECHO = f"""
 import sys
-from pebble.bench.control_far import serve, wall_clock
+from pebble.bench.control.far import serve, wall_clock
 wall = wall_clock()
 serve(sys.argv[1], lambda: wall() + {SHIFT_NS})
 """

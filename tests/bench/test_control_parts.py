@@ -11,10 +11,11 @@ from typing import Any, ClassVar, Self
 import pytest
 from rich.console import Console
 
-from pebble.bench import control, engine
+from pebble.bench import engine
 from pebble.bench.comparison import Case, Comparison
-from pebble.bench.control import CONTROL, CONTROL_NULL, VARIANTS, assessment
-from pebble.bench.control_worker import (
+from pebble.bench.control import cells as control
+from pebble.bench.control.cells import CONTROL, CONTROL_NULL, VARIANTS, assessment
+from pebble.bench.control.ends import (
     ONE_WAY,
     REPLIES,
     REQUESTS,

@@ -236,8 +236,8 @@ def test_invented_owners_keep_no_capabilities_from_a_later_stop() -> None:
     cab.receive(*(outgoing(GOOB, f"estop/fake{number}", {}) for number in range(100)))
     cab.ready()
     cab.driver.press(["escape", "escape"], cab.now)
-    assert cab.driver.stopping is not None
-    assert cab.driver.stopping.robots[GOOB].estop.has_capabilities
+    assert cab.driver.stop.newest is not None
+    assert cab.driver.stop.newest.robots[GOOB].estop.has_capabilities
 
 
 def test_escape_once_is_no_emergency_stop() -> None:

@@ -8,8 +8,8 @@ from typing import Any
 import pytest
 
 from pebble.config import load, parse
-from pebble.config.doors import warning_of_open
 from pebble.config.raw import deep_merge
+from pebble.config.rules.doors import warning_of_open
 from pebble.errors import ConfigError
 from tests.support import ROOT
 

@@ -8,8 +8,8 @@ from typing import Any
 import pytest
 
 from pebble.config import parse
-from pebble.config.checks import MOST_METRICS, MOST_NEIGHBOURS
 from pebble.config.raw import deep_merge
+from pebble.config.rules.between_keys import MOST_METRICS, MOST_NEIGHBOURS
 from pebble.errors import ConfigError
 
 LAN = {"connect": ["tls/hub.lab:7447"]}

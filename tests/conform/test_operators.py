@@ -115,9 +115,9 @@ def driven(command: Command, target: Target) -> Iterator[StandIn]:
         try:
             robot.ask, robot.person_s = ask, 10.0
             ask(operators.LET_GO)
-            robot.wait(lambda: robot.sent, 10.0)
+            robot.wait(lambda: robot.inbox.sent, 10.0)
             robot.look(1.0)  # until it has seen a heartbeat
-            robot.sent.clear()
+            robot.inbox.sent.clear()
             yield robot
         finally:
             process.kill()

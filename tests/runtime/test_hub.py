@@ -15,13 +15,11 @@ from pebble.config import parse
 from pebble.runtime.connections import hub_settings
 from pebble.runtime.hub import WILLS
 from pebble.transports import Message, QoS, ZenohSettings, create
-from pebble.transports.counters import Counters
 from pebble.transports.zenoh import wire
-from pebble.transports.zenoh.hub import ASKED_BYTES, HELLOS, HubWorker
 from pebble.transports.zenoh.hub.admission import Admission
+from pebble.transports.zenoh.hub.intake import ASKED_BYTES, HELLOS, Intake
 from pebble.transports.zenoh.hub.journal import Journal
 from pebble.transports.zenoh.hub.records import StoredWill
-from pebble.transports.zenoh.hub.store import HubStore
 from pebble.transports.zenoh.wire import Will
 from tests.support import ROOT, Child, until
 from tests.transports.zenoh_net import HubProcess
@@ -141,20 +139,19 @@ class Asked:
 
 
 def test_hellos_of_one_account_that_wait_are_few_and_short() -> None:
-    hub = HubWorker("hub", HubStore(), Admission(WILLS), None, Counters())
+    intake = Intake()
     greeted: list[Asked] = []
 
     def greet(account: str, size: int = 1) -> bool:
         asked: Any = Asked(f"@hub/hello/{account}", size)
-        hub._greeted(greeted.append, asked)
+        intake.greet(greeted.append, asked)
         return not asked.dropped
 
     assert [greet("vera") for _ in range(HELLOS + 2)] == [True] * HELLOS + [False] * 2
     assert greet("otto", ASKED_BYTES)
     assert not greet("otto", ASKED_BYTES + 1)
-    hub.close()
-    hub._turns.end()
-    while (task := hub._turns.take(0)) is not None:
+    intake.end()
+    while (task := intake.take(0)) is not None:
         task()
     assert len(greeted) == HELLOS + 1
     assert greet("vera"), "there is room again"
@@ -165,16 +162,15 @@ def test_a_query_that_no_one_waits_for_any_more_is_not_answered(
     monkeypatch: pytest.MonkeyPatch, waits_s: float, works: bool
 ) -> None:
     monkeypatch.setattr(wire, "RETAINED_ANSWER_S", waits_s)
-    hub = HubWorker("hub", HubStore(), Admission(WILLS), None, Counters())
+    intake = Intake()
     worked: list[Any] = []
-    monkeypatch.setattr(hub, "_query", worked.append)
     asked: Any = Asked("@retain/**", 1)
-    hub._ask(asked)
-    task = hub._turns.take(0)
+    intake.ask(worked.append, asked)
+    task = intake.take(0)
     assert task is not None
     task()
     assert (asked.dropped, worked == [asked]) == (not works, works)
-    assert hub._asking._taken == dict.fromkeys([""] * works, 1), "it holds its place until it is answered"
+    assert intake.asked == works, "it holds its place until it is answered"
 
 
 def test_each_client_is_logged_once_and_a_flood_of_them_not_without_end(caplog: pytest.LogCaptureFixture) -> None:

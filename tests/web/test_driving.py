@@ -11,7 +11,7 @@ from pebble.client.pace_of_link import WIDE, pace_of
 from pebble.contract.levels import LEVELS
 from pebble.contract.payloads import Drive, LinkLevel, LinkState
 from pebble.transports import QoS
-from pebble.web.driving import LET_GO, Command, Driving, Tab
+from pebble.web.drive.driving import LET_GO, Command, Driving, Tab
 from pebble.web.messages import DriveOp
 
 REF, OTHER = "pebble/robots/goob", "pebble/robots/fred"

@@ -107,7 +107,7 @@ class MemoryTransport(Transport):
         self._hub = settings
         self._inbox: deque[_Delivery] = deque()
         self._changed = threading.Condition(settings.lock)
-        self._attached: int | None = None  # the era of the hub we are connected in
+        self._attached: int | None = None  # the era of the hub we are connected in; None: not connected
         self._stopping = False
         self._thread: threading.Thread | None = None
 
@@ -149,7 +149,7 @@ class MemoryTransport(Transport):
 
     def _send(self, message: Message, urgent: bool) -> bool:  # noqa: ARG002  (nothing to overtake)
         with self._hub.lock:
-            if not (self._present and (self._state is State.CONNECTED or self._syncing)):
+            if not (self._present and (self._state is State.CONNECTED or self._own.syncing)):
                 return False
             self._hub.distribute(message, self)
             return True

@@ -133,7 +133,7 @@ class MqttTransport(Transport):
 
     def _send(self, message: Message, urgent: bool) -> bool:
         connection = self._connection
-        if connection is None or not (self._state is State.CONNECTED or self._syncing):
+        if connection is None or not (self._state is State.CONNECTED or self._own.syncing):
             return False
         if not connection.takes(message):
             why = f"{len(message.payload)} bytes, but it takes packets of {connection.max_packet} at most"

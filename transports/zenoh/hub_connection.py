@@ -83,24 +83,12 @@ class HubConnection:
 
     def greet(self, session: zenoh.Session, hello: bytes, timeout: float) -> set[str] | None:
         """The topics that the hub lacks; None: no hub answers in time."""
-        answers = self._ask(session, wire.asked(wire.HELLO, self._account), hello, timeout)
+        answers = wire.ask(session, wire.asked(wire.HELLO, self._account), hello, timeout)
         return {key_to_topic(key) for answer in answers for key in wire.decode_keys(answer)} if answers else None
 
     def leave(self, session: zenoh.Session) -> None:
         """Have our will forgotten."""
-        self._ask(session, wire.asked(wire.BYE, self._account), wire.encode(self.name), GOODBYE_S)
-
-    def _ask(self, session: zenoh.Session, what: str, payload: bytes, timeout: float) -> list[bytes]:
-        replies = session.get(
-            what,
-            zenoh.handlers.FifoChannel(16),
-            target=zenoh.QueryTarget.ALL,
-            consolidation=zenoh.ConsolidationMode.NONE,
-            timeout=timeout,
-            payload=payload,
-            **wire.BLOCK,
-        )
-        return [reply.ok.payload.to_bytes() for reply in replies if reply.ok is not None]
+        wire.ask(session, wire.asked(wire.BYE, self._account), wire.encode(self.name), GOODBYE_S)
 
     def fetch(self, session: zenoh.Session, subscriptions: Iterable[Subscription], counts: dict[str, int]) -> None:
         """Query retained messages and wait for them, so that none comes among messages published after we returned.

@@ -316,8 +316,8 @@ class ZenohTransport(Transport):
             return False
         try:
             if message.retain:
-                self._hub.put(session, message, again=self._syncing)
-            if not self._syncing:
+                self._hub.put(session, message, again=self._own.syncing)
+            if not self._own.syncing:
                 self._publishers.put(session, message, urgent)
             elif self.settings.client and message.topic in self._own.pending:  # others hear it through the hub only
                 self._publishers.put_late(session, message)

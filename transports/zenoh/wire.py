@@ -151,6 +151,20 @@ def asked(what: str, account: str) -> str:
     return f"{what}/{account}" if account else what
 
 
+def ask(session: zenoh.Session, key: str, payload: bytes, timeout: float) -> list[bytes]:
+    """What all that have this key answer within ``timeout`` seconds."""
+    replies = session.get(
+        key,
+        zenoh.handlers.FifoChannel(256),
+        target=zenoh.QueryTarget.ALL,
+        consolidation=zenoh.ConsolidationMode.NONE,
+        timeout=timeout,
+        payload=payload,
+        **BLOCK,
+    )
+    return [reply.ok.payload.to_bytes() for reply in replies if reply.ok is not None]
+
+
 def account_of(key: str, what: str) -> str:
     """The account that a query to the hub is of; empty: this machine. Raises ValueError for what no account asks."""
     account = key.removeprefix(what).removeprefix("/")

@@ -11,12 +11,12 @@ import msgspec
 from pebble.client.control import IDLE_S, UNANSWERED, ControlClient
 from pebble.client.drive_reasons import SLOW_S, SLOW_SPEED, Code, Situation, first_reason
 from pebble.client.driver_lease import FILTER, LISTEN_S, DriverLease
-from pebble.client.estop import Progress, StopSender, new_name
 from pebble.client.names import id_of
 from pebble.client.pace_of_link import WIDE, Pace
 from pebble.client.robot_view import RobotView
-from pebble.client.terminal.key_decoder import ESCAPE, SPACE
+from pebble.client.terminal.key_decoder import SPACE
 from pebble.client.terminal.key_gesture import AXES, KeyGesture
+from pebble.client.terminal.stop_keys import StopKeys
 from pebble.contract import (
     AUTONOMY_STATUS,
     CAPABILITIES,
@@ -32,7 +32,6 @@ from pebble.contract import (
 from pebble.contract.payloads import Drive
 from pebble.transports import Message
 
-TWICE_S = 0.6  # between two presses of Escape
 _WANTS_S = 1.0  # after a key that drives
 
 TAKE, TAKE_OVER, LET, KEEP = "t", "o", "l", "k"  # keys
@@ -71,12 +70,11 @@ class TerminalDriver:
         self.control = ControlClient(
             self.robot.control, by=by.partition("@")[0], device=lease.device, pace_of=lambda: self._pace
         )
-        self.stopping: StopSender | None = None  # the newest emergency stop from here
-        self._by, self._take_over, self._heartbeat = by, take_over, heartbeat
+        self.stop = StopKeys(self.robot, by)
+        self._take_over, self._heartbeat = take_over, heartbeat
         self._began = self._used_at = now
         self._wants_until = float("inf")  # until then control is taken as soon as it is free
         self._decided = ""  # the key of control, as far as the gesture knows of it
-        self._escape_at = float("-inf")
         self._reason = "connecting"
         self._connected = False
         self._key = ""  # where the robot has given none; another one with each connection
@@ -105,16 +103,13 @@ class TerminalDriver:
             if channel not in (CONTROL_STATE, LINK):
                 self.robot.remember(message)
             self._check_control(now)
-        if self.stopping is not None:
-            self.stopping.receive(message, now)
+        self.stop.receive(message, now)
 
     def press(self, keys: Sequence[str], now: float) -> None:
         for key in keys:
-            twice = key == ESCAPE and now - self._escape_at <= TWICE_S
-            if key == ESCAPE:
-                self._escape_at = now
-            if key == "!" or twice:
-                self._estop(now)
+            if self.stop.pressed(key, now):
+                self._out += self.stop.stop(now)
+                self._drive(self.gesture.stop(now), now)
             elif key == SPACE:
                 self._drive(self.gesture.stop(now), now)
             elif self.robot.controlled:
@@ -147,8 +142,7 @@ class TerminalDriver:
                 self.lease.take(now, int(1000 * wall))
             self.lease.use(now)
         self._out += self.lease.tick(now, int(1000 * wall))
-        if self.stopping is not None:
-            self._out += self.stopping.tick(now)
+        self._out += self.stop.tick(now)
         out, self._out = self._out, []
         return out
 
@@ -176,13 +170,13 @@ class TerminalDriver:
     @property
     def unconfirmed(self) -> bool:
         """Whether an emergency stop from here is not confirmed."""
-        return self.stopping is not None and not self.stopping.confirmed
+        return self.stop.unconfirmed
 
     # -- what is shown
 
     def status(self) -> str:
         """One line: what is sent, or why nothing is, and what is known of the robot. Parts of it come from others."""
-        parts = [self.name, self._doing(), self._stop_text(), *self._others(), self._battery(), self._latency()]
+        parts = [self.name, self._doing(), self.stop.text(), *self._others(), self._battery(), self._latency()]
         return " · ".join(part for part in parts if part)
 
     def _doing(self) -> str:
@@ -193,15 +187,6 @@ class TerminalDriver:
         if self._reason:
             return self._reason
         return "let go first" if self.gesture.must_release else "ready"
-
-    def _stop_text(self) -> str:
-        """How far the stop from here is, else nothing: the reason names another one."""
-        if self.stopping is None or not self.stopping.robots:
-            return ""
-        stop = self.stopping.robots[self.robot.base]
-        if stop.progress is Progress.CONFIRMED:
-            return "" if stop.estop.latched else "it was reset since"
-        return f"EMERGENCY STOP {'sent, ' if stop.sending else ''}NOT CONFIRMED: {stop.why}"
 
     def _others(self) -> list[str]:
         """Who else wants to drive, or does."""
@@ -240,7 +225,7 @@ class TerminalDriver:
         return situation._replace(
             problem=problem,
             online=situation.online if self._heartbeat else True,
-            stopping=self.stopping is not None and not self.stopping.finished,
+            stopping=self.stop.sending,
             driven=driven,
             listening=listening,
             late_s=max(late_s, lease.late_s(now), lease.round_trip_s or 0.0),
@@ -324,14 +309,6 @@ class TerminalDriver:
         if self.control.decided != self._decided:
             self._decided, self._wants_until = self.control.decided, now
             self._drive(self.gesture.interrupt(now, repeat=False), now)
-
-    def _estop(self, now: float) -> None:
-        if self.stopping is None or self.stopping.finished:
-            self.stopping = StopSender(new_name(), by=self._by, why="", now=now, robots=[self.robot.base])
-            for message in self.robot.remembered.values():
-                self.stopping.receive(message, now)
-            self._out += self.stopping.tick(now)
-        self._drive(self.gesture.stop(now), now)
 
     def _drive(self, commands: Sequence[Drive], now: float) -> None:
         self._out += [self._message(command, now) for command in commands]

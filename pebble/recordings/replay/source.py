@@ -85,10 +85,6 @@ class ReplaySource:
         ]
 
 
-def _overlaps(covered: Span, since_ns: int, until_ns: int) -> bool:
-    return covered.first_ns < until_ns and covered.last_ns >= since_ns
-
-
 def _is_state(channel: Channel) -> bool:
     """Whether a subscriber would be sent its newest message at once."""
     suffix = _suffix(channel)

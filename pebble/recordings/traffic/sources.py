@@ -4,7 +4,6 @@ import os
 from collections.abc import Callable, Collection, Iterable
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Final
 
 from msgspec import Struct, field
 
@@ -15,8 +14,6 @@ from pebble.recordings.traffic.index import FOLDER, NO_ROBOT, Entry, Index, arch
 
 #: Called with what is done now, and the share of all that is done.
 Progress = Callable[[str, float], None]
-
-_DAY_NS: Final = 86_400 * 10**9
 
 
 class Sources(Struct):

@@ -2,8 +2,8 @@
 
 import struct
 
-from common.sntp import WallClock, epoch_ms, request
 from common.ticks import add
+from net.sntp import WallClock, epoch_ms, request
 
 NONCE = b"abcdefgh"
 LAST = (1 << 30) - 1  # the highest tick

@@ -105,9 +105,11 @@ MUTATIONS = {
     ),
     # -- the gate
     "the gate signs without the run": Mutation(
-        f"{_GATE}.signature", '{"source": SCRIPT, "run": run}', '{"source": "page", "run": run}'
+        f"{_GATE}.drive_outlet", '{"source": SCRIPT, "run": run}', '{"source": "page", "run": run}'
     ),
-    "the gate lets the script sign": Mutation(f"{_GATE}.signature", "else plain | signature", "else signature | plain"),
+    "the gate lets the script sign": Mutation(
+        f"{_GATE}.drive_outlet", "else plain | signature", "else signature | plain"
+    ),
     "the gate passes commands after the stop": Mutation(
         f"{_GATE}.gate",
         "            self._halted = True\n        if self._server is not None:\n",

@@ -12,7 +12,7 @@ import pytest
 
 from pebble.contract import ONLINE
 from pebble.forwarding.routing import Side
-from pebble.services.gateway import gateway as module
+from pebble.services.gateway import carried_robots as module
 from pebble.services.gateway.gateway import Gateway
 from pebble.services.gateway.heartbeats import PresentRobots, will
 from pebble.services.gateway.ownership import FRESH_S, TAKING_S
@@ -245,7 +245,9 @@ def test_what_it_has_in_hand_while_it_stands_still_does_not_leave(
     monkeypatch: pytest.MonkeyPatch, alone: World, stood_s: float
 ) -> None:
     """It passed when it came; another gateway may have carried the robot since."""
-    forwarder = alone.running["a"].gateway._carried[GOOB].forwarder
+    carried = alone.running["a"].gateway.carried(GOOB)
+    assert carried is not None
+    forwarder = carried.forwarder
     receive = forwarder.receive
 
     def stand_still(side: Side, message: Message) -> None:

@@ -66,7 +66,7 @@ def test_of_each_name_so_much_waits_and_a_number_of_senders() -> None:
     senders = [threading.Thread(target=lambda: entered.append(places.take("fred", 5))) for _ in range(2)]
     for one in senders:
         one.start()
-    assert until(lambda: places._outside.get("fred") == 2)
+    assert until(lambda: places.outside.get("fred") == 2)
     assert not places.take("fred"), "a third sender"
     assert places.take("goob", 11), "another name, and what is larger than all the room"
     assert not entered
@@ -79,4 +79,4 @@ def test_of_each_name_so_much_waits_and_a_number_of_senders() -> None:
     places.leave("fred", 5)
     places.leave("fred", 5)
     places.leave("goob", 11)
-    assert (places._taken, places._outside) == ({}, {})
+    assert (places.taken, places.outside) == ({}, {})

@@ -233,13 +233,13 @@ def test_a_hub_that_does_not_see_another_one_it_is_connected_to_begins_anew(monk
     monkeypatch.setattr(mesh_module.time, "monotonic", lambda: clock[0])
     hub_: Any = None
     made = mesh_module.Mesh("m", hub_, wills)
-    made._routers.add("z1")
+    made.routers.add("z1")
     clock[0] = 50.0
     assert not made.is_cut(), "it is connected to what is no hub of ours"
     wills.on_hub("n", present=True)
     clock[0] = 100.0
     assert not made.is_cut(), "each is seen"
-    made._routers.add("z2")
+    made.routers.add("z2")
     renewed = []
     for second in range(100, 100 + 2 * 3600):
         clock[0] = float(second)

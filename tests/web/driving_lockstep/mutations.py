@@ -21,8 +21,8 @@ def mutated(mutation: Mutation) -> Iterator[Path]:
             yield CORE
 
 
-_DRIVING, _CLOCK, _SERVER, _CONTROLS = (
-    f"pebble.web.{name}" for name in ("driving", "page_clock", "server", "controls")
+_DRIVING, _CLOCK, _DRIVERS, _CONTROLS = (
+    f"pebble.web.{name}" for name in ("drive.driving", "page_clock", "drive.drivers", "drive.controls")
 )
 _DRIVER, _INPUTS, _GESTURE, _REASONS, _SOCKET = (
     f"core/{name}.js" for name in ("driver", "inputs", "gesture", "reasons", "control-socket")
@@ -61,10 +61,8 @@ MUTATIONS = {
     ),
     "a stop does not end the gesture": Mutation(
         _DRIVING,
-        "        if lease is not None and lease.tab.live is not None and lease.tab.live_ref == ref:\n"
-        "            self._end_gesture",
-        "        if lease is not None and lease.tab.live is not None and lease.tab.live_ref != ref:\n"
-        "            self._end_gesture",
+        "        self.interrupt(ref, now)\n        return self._final_zero(ref, now)\n",
+        "        return self._final_zero(ref, now)\n",
     ),
     "nobody needs the lease": Mutation(
         _DRIVING,
@@ -72,7 +70,7 @@ MUTATIONS = {
         "        lease = self.leases.get(op.ref)\n        if lease is None:\n",
     ),
     "a lost connection stops nothing": Mutation(
-        _SERVER, "            self.publish(end(tab, clock()))\n", "            end(tab, clock())\n"
+        _DRIVERS, "            self._publish(end(tab, now))\n", "            end(tab, now)\n"
     ),
     "zeros are not forwarded": Mutation(
         _DRIVING,
@@ -81,7 +79,7 @@ MUTATIONS = {
     ),
     "commands are valid for long": Mutation(
         _DRIVING,
-        "y=op.y, valid_ms=pace.valid_ms)",
+        "y=op.y, valid_ms=WIDE.valid_ms)",
         "y=op.y, valid_ms=5000)",
     ),
     "another server's driver is ignored": Mutation(

@@ -18,7 +18,9 @@ from pebble.contract import DRIVE, codec
 from pebble.fleet.roles import Role, Session
 from pebble.transports import MqttSettings
 from pebble.transports import clock as message_clock
-from pebble.web import control, refusals, robots, server
+from pebble.web import control, robots, server
+from pebble.web.drive import drivers, refusals
+from pebble.web.media import pictures_and_sound
 from tests.robot.lockstep.network import Connection, Network
 from tests.robot.lockstep.processes import Process
 from tests.web.driving_lockstep.pages import EPOCH
@@ -74,13 +76,14 @@ def virtual() -> Iterator[None]:
         token_hex=lambda size: f"{next(numbers):0{2 * size}x}", token_urlsafe=lambda _: f"token-{next(numbers)}"
     )
     with ExitStack() as stack:
-        for module in (server, refusals, robots, control, broker):
+        for module in (server, drivers, refusals, robots, control, broker):
             stack.enter_context(patch.object(module, "time", TIME))
-        for module, name in ((server, "clock"), (refusals, "clock"), (control, "clock"), (message_clock, "since_boot")):
-            stack.enter_context(patch.object(module, name, TIME.monotonic))
+        for module in (server, drivers, refusals, control):
+            stack.enter_context(patch.object(module, "clock", TIME.monotonic))
+        stack.enter_context(patch.object(message_clock, "since_boot", TIME.monotonic))
         for module in (server, control, broker):
             stack.enter_context(patch.object(module, "secrets", secrets))
-        stack.enter_context(patch.object(server, "MediaHub", _Nothing))
+        stack.enter_context(patch.object(pictures_and_sound, "MediaHub", _Nothing))
         yield
 
 
@@ -163,8 +166,8 @@ class WebServer(Process):
             self.server = server.Server(
                 WebSettings(broker=MqttSettings(host="fair"), server="fair"), _Nothing(), _Nothing()
             )  # type: ignore[arg-type]
-        self.server.driving.announced = self._announced(self.server.driving)
-        self.server.driving.revoke = self._revoked(self.server.driving)
+        driving = self.server.drivers.driving
+        driving.announced, driving.revoke = self._announced(driving), self._revoked(driving)
         self.loop.create_task(self.server.open())
         self.wake()
 
@@ -174,7 +177,7 @@ class WebServer(Process):
         def announced(server: str, robots: dict[str, Any], now: float) -> Any:
             for ref, (_, _, since_ms) in robots.items():
                 lease = driving.leases.get(ref)
-                if lease is not None and (lease.since_ms, driving._server) < (since_ms, server):
+                if lease is not None and (lease.since_ms, driving.server) < (since_ms, server):
                     self.lease_moved(lease.tab)
             return take(server, robots, now)
 

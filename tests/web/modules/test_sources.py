@@ -54,8 +54,8 @@ def test_no_other_host_is_named() -> None:
 
 
 def test_what_is_safety_or_media_needs_no_framework() -> None:
-    imports = r'from "(?!\./|\.\./core/browser)([^"]+)"'
-    sources = [path for folder in ("core", "media") for path in (STATIC / folder).glob("*.js")]
+    imports = r'(?:from|import) "(?!\./|(?:\.\./)+core/browser|\.\./[\w-]+\.js)([^"]+)"'
+    sources = [path for folder in ("core", "media") for path in (STATIC / folder).rglob("*.js")]
     assert found(imports, ((path, path.read_text()) for path in sources)) == {}
 
 

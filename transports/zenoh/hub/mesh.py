@@ -85,7 +85,7 @@ class Mesh:
         self._names: dict[str, set[str]] = {}  # under which each other hub is there
         self._compared: dict[str, float] = {}  # when another hub got our table
         self._taken: dict[str, int] = {}  # values of another hub, in the parts so far
-        self._routers: set[str] = set()  # hubs that this one has a connection to, by Zenoh's ids
+        self.routers: set[str] = set()  # hubs that this one has a connection to, by Zenoh's ids
         # Two that miss each other do not begin anew at one instant.
         self._patience_s = CUT_S * random.uniform(1, 2)  # noqa: S311  (not a secret)
         self._whole_at = time.monotonic()  # when it last saw as many hubs as it has connections to
@@ -101,7 +101,7 @@ class Mesh:
 
         self._session = session
         self._names.clear()
-        self._hub.post(self._routers.clear)
+        self._hub.post(self.routers.clear)
         others = zenoh.Locality.REMOTE
         session.declare_subscriber(wire.PUBLISHED, queued(self._on_published), allowed_origin=others)
         session.declare_queryable(wire.MERGE + self._name, queued(self._on_merge))
@@ -118,7 +118,7 @@ class Mesh:
         (measured: once in some ten times, in one direction of one connection, which it had not lost).
         """
         now = time.monotonic()
-        if len(self._wills.hubs) >= len(self._routers) or not self._wills.met_others:  # a router may be no hub of ours
+        if len(self._wills.hubs) >= len(self.routers) or not self._wills.met_others:  # a router may be no hub of ours
             self._whole_at = now
         times = self._renewed_at
         if now - self._whole_at < self._patience_s or (len(times) == RENEWALS and now - times[0] < RENEWALS_S):
@@ -172,7 +172,7 @@ class Mesh:
         present, session = event.kind == zenoh.SampleKind.PUT, str(event.transport.zid)
         self._wills.on_link(session, time.monotonic(), present=present)
         if event.transport.whatami == zenoh.WhatAmI.ROUTER:
-            (self._routers.add if present else self._routers.discard)(session)
+            (self.routers.add if present else self.routers.discard)(session)
 
     def _on_published(self, sample: zenoh.Sample) -> None:
         name = wire.decode_name(sample.payload.to_bytes())
@@ -221,7 +221,8 @@ class Mesh:
     def _ask_table(self, session: zenoh.Session, name: str) -> merge.Table | None:
         """The parts of its table as one; None: it does not answer."""
         for _ in range(ASKED):
-            parts = [merge.decode_table(data) for data in _ask(session, wire.MERGE + name, self._name.encode(), ASK_S)]
+            answers = wire.ask(session, wire.MERGE + name, self._name.encode(), ASK_S)
+            parts = [merge.decode_table(data) for data in answers]
             if parts:
                 if parts.pop().rows:
                     raise ValueError("its table was cut off")
@@ -261,7 +262,7 @@ class Mesh:
             older = {key: age_s + waited for key, age_s in some.items()}
             want, forget = (decided.want, decided.they_forget) if last else ([], None)
             asked = merge.encode(merge.Exchange(self._name, want, give, older, forget))
-            answers = [merge.decode_values(data) for data in _ask(session, wire.MERGE + name, asked, VALUES_S)]
+            answers = [merge.decode_values(data) for data in wire.ask(session, wire.MERGE + name, asked, VALUES_S)]
             if not answers or answers.pop():
                 raise ValueError("its answer was cut off")
             got += chain.from_iterable(answers)
@@ -358,16 +359,3 @@ def _named(token: zenoh.Sample) -> tuple[str, str]:
 
 def _size(value: merge.Value) -> int:
     return len(value.payload)
-
-
-def _ask(session: zenoh.Session, key: str, payload: bytes, timeout: float) -> list[bytes]:
-    replies = session.get(
-        key,
-        zenoh.handlers.FifoChannel(256),
-        target=zenoh.QueryTarget.ALL,
-        consolidation=zenoh.ConsolidationMode.NONE,
-        timeout=timeout,
-        payload=payload,
-        **wire.BLOCK,
-    )
-    return [reply.ok.payload.to_bytes() for reply in replies if reply.ok is not None]

@@ -79,30 +79,30 @@ class Places:
 
     def __init__(self, most: int, senders: int = 0) -> None:
         self._most, self._senders = most, senders
-        self._taken: dict[str, int] = {}
-        self._outside: dict[str, int] = {}
+        self.taken: dict[str, int] = {}  # places, by name
+        self.outside: dict[str, int] = {}  # senders that wait, by name
         self._changed = threading.Condition()
 
     def take(self, name: str = "", size: int = 1) -> bool:
         """Whether there is room. What is larger than all of it has it to itself."""
         with self._changed:
             if self._is_full(name, size):
-                if self._outside.get(name, 0) >= self._senders:
+                if self.outside.get(name, 0) >= self._senders:
                     return False
-                _add(self._outside, name, 1)
+                _add(self.outside, name, 1)
                 self._changed.wait_for(lambda: not self._is_full(name, size))
-                _add(self._outside, name, -1)
-            _add(self._taken, name, size)
+                _add(self.outside, name, -1)
+            _add(self.taken, name, size)
             return True
 
     def leave(self, name: str = "", size: int = 1) -> None:
         with self._changed:
-            _add(self._taken, name, -size)
-            if self._outside:
+            _add(self.taken, name, -size)
+            if self.outside:
                 self._changed.notify_all()
 
     def _is_full(self, name: str, size: int) -> bool:
-        taken = self._taken.get(name, 0)
+        taken = self.taken.get(name, 0)
         return bool(taken) and taken + size > self._most
 
 

@@ -44,7 +44,8 @@ export function outletsOf(offers) {
 }
 
 /**
- * Why this one cannot be switched; "" it can. What is not reported is no obstacle; to switch off, no report is one.
+ * Why this one cannot be switched ``on`` or off; "" where it can. Only what its report says counts against it, and only
+ * against switching on.
  * @param {string} name @param {boolean} controls @param {Record<string, unknown>} report @param {boolean} on
  */
 export function obstacle(name, controls, report, on) {

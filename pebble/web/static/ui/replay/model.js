@@ -7,8 +7,8 @@ import { Heartbeats } from "../../core/replay/liveness.js";
 import { Player, SPEEDS } from "../../core/replay/player.js";
 import { View, dayOf, extentOf, stretchOf } from "../../core/replay/timeline.js";
 import { Store } from "../../core/store.js";
-import { ReplayPictures } from "../../media/replay-pictures.js";
-import { ReplaySound } from "../../media/replay-sound.js";
+import { ReplayPictures } from "../../media/replay/pictures.js";
+import { ReplaySound } from "../../media/replay/sound.js";
 import { LogBook } from "../../core/logs.js";
 import { logViewOf } from "../parts/log-view.js";
 import { Model } from "../parts/models.js";
@@ -331,7 +331,7 @@ export class Replay extends Model {
     this.store.set(this.ref, "web/liveness", view);
   }
 
-  /** @param {ImageBitmap} bitmap @param {import("../../media/replay-pictures.js").RecordedInfo} info */
+  /** @param {ImageBitmap} bitmap @param {import("../../media/replay/pictures.js").RecordedInfo} info */
   draw(bitmap, info) {
     this.video.draw(bitmap, info);
     this.sound.drew(info.receivedMs, info.capturedMs);

@@ -1,7 +1,7 @@
 // The sound of a recording, at the speed at which it was recorded, together with its pictures.
 
-import * as browser from "../core/browser.js";
-import { makeSpeaker } from "./speaker.js";
+import * as browser from "../../core/browser.js";
+import { makeSpeaker } from "../speaker.js";
 
 const BUFFERED_MS = 65; // in the jitter buffer, and at the loudspeaker: see playout.js
 const LATEST_MS = 500; // sound is not shifted further
@@ -19,7 +19,7 @@ export class ReplaySound {
     this.lead = BUFFERED_MS;
     this.pictureDelay = NaN; // ms from its capture to its reception
     this.soundDelay = NaN;
-    /** @type {import("./playout.js").Stats | null} */
+    /** @type {import("../playout.js").Stats | null} */
     this.stats = null;
     /** @type {AudioContext | null} */
     this.context = null;
@@ -82,7 +82,7 @@ export class ReplaySound {
     this.worker.postMessage({ op: "begin", port: port1, rate: this.context.sampleRate }, [port1]);
   }
 
-  /** @param {import("../core/replay/frames.js").Frame} frame */
+  /** @param {import("../../core/replay/frames.js").Frame} frame */
   take({ at, payload }) {
     this.packets++;
     this.soundDelay = smoothed(this.soundDelay, at - capturedOf(payload));
@@ -112,7 +112,7 @@ export class ReplaySound {
   }
 
   open() {
-    const worker = browser.worker(new URL("./replay-sound-worker.js", import.meta.url));
+    const worker = browser.worker(new URL("./sound-worker.js", import.meta.url));
     worker.onmessage = ({ data }) => {
       this.stats = data.stats;
       const { received, refused } = data.stats;

@@ -1,9 +1,9 @@
-// The worker of replay-pictures.js: video-worker.js, but a bitmap of a frame of H.264 is made of its copied pixels.
+// The worker of pictures.js: ../video-worker.js, but a bitmap of a frame of H.264 is made of its copied pixels.
 // Else it is the graphics processor's, and of pictures that come one at a time Chromium 150 takes 4 MB for every three,
 // up to half a gigabyte. Where pictures follow one another that memory is used again.
 
-import * as browser from "../core/browser.js";
-import "./video-worker.js";
+import * as browser from "../../core/browser.js";
+import "../video-worker.js";
 
 const OPTIONS = /** @type {any} */ ({ format: "RGBA" });
 const bitmapOf = browser.find("createImageBitmap").bind(self);

@@ -9,7 +9,7 @@ from pebble.client.pace_of_link import WIDE
 from pebble.client.robot_view import RobotView
 from pebble.contract.payloads import ControlState
 from pebble.transports import Message
-from pebble.web.driving import Command, Driving, Elsewhere, Tab
+from pebble.web.drive.driving import Command, Driving, Elsewhere, Tab
 
 MOST_WISHES = 16  # of one tab: robots of which it has control, or asks for it
 

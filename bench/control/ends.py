@@ -3,7 +3,7 @@
 A service handles a drive command on the transport's thread that brings it, if it is idle; else its inbox keeps the
 command for its own thread (decision 24). The ends do the same. Stock paho calls its handler on its network thread.
 
-``python -m pebble.bench.control_worker echo|sender paho|mqtt|zenoh SETTINGS`` (JSON, of the transport). A sender
+``python -m pebble.bench.control.ends echo|sender paho|mqtt|zenoh SETTINGS`` (JSON, of the transport). A sender
 receives slices as JSON and answers each.
 """
 

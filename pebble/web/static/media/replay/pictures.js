@@ -1,11 +1,11 @@
 // The pictures of a recording: recorded payloads in, bitmaps out, by the same worker as live ones.
 
-import * as browser from "../core/browser.js";
+import * as browser from "../../core/browser.js";
 
 const HEAD_BYTES = 5; // u32 number, u8 kind: as the messages of the server
 const MOST_PENDING = 24; // pictures at the worker; the replay waits for it
 
-/** @typedef {import("./pictures.js").Info & {receivedMs: number}} RecordedInfo */
+/** @typedef {import("../pictures.js").Info & {receivedMs: number}} RecordedInfo */
 
 export class ReplayPictures {
   /**
@@ -38,14 +38,14 @@ export class ReplayPictures {
     this.change("");
   }
 
-  /** Pictures that are due together, in order: only the last one is shown. @param {import("../core/replay/frames.js").Frame[]} frames */
+  /** Pictures that are due together, in order: only the last one is shown. @param {import("../../core/replay/frames.js").Frame[]} frames */
   take(frames) {
     if (!this.metric && frames.length) this.metric = frames[0].metric;
     const shown = frames.filter(({ metric }) => metric === this.metric);
     shown.forEach((frame, index) => this.send(frame, index < shown.length - 1));
   }
 
-  /** @param {import("../core/replay/frames.js").Frame} frame @param {boolean} quiet */
+  /** @param {import("../../core/replay/frames.js").Frame} frame @param {boolean} quiet */
   send({ at, payload }, quiet) {
     const number = ++this.number >>> 0;
     const message = new Uint8Array(HEAD_BYTES + payload.length);
@@ -63,7 +63,7 @@ export class ReplayPictures {
   }
 
   start() {
-    const worker = browser.worker(new URL("./replay-video-worker.js", import.meta.url));
+    const worker = browser.worker(new URL("./video-worker.js", import.meta.url));
     worker.onmessage = ({ data }) => this.made(data);
     worker.onerror = (event) => this.change(`Pictures cannot be decoded here: ${event.message}`);
     return worker;

@@ -103,7 +103,7 @@ class Driving:
         self.held_elsewhere: Callable[[str], Elsewhere | None] = lambda _ref: None  # as robots tell it themselves
         self.pace_of: Callable[[str], Pace] = lambda _ref: WIDE
         self.renew_key()
-        self._server = server
+        self.server = server
         self._announced: dict[str, Announced] = {}
         self._reserved: dict[str, tuple[str, Lease, float]] = {}  # by token: the robot, and until when
         self._repeats: dict[str, list[float]] = {}  # by robot: when to send a zero again
@@ -188,7 +188,7 @@ class Driving:
             self.changed.add(ref)
         for ref, (by, device, since_ms) in robots.items():
             lease = self.leases.get(ref)
-            if lease is not None and (since_ms, server) < (lease.since_ms, self._server):
+            if lease is not None and (since_ms, server) < (lease.since_ms, self.server):
                 continue  # that server will learn of ours, and give way
             if lease is not None:
                 commands += self._end_lease(ref, now)

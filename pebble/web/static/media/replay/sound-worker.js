@@ -1,6 +1,6 @@
-// The worker of replay-sound.js: recorded packets in, samples to the loudspeaker.
+// The worker of sound.js: recorded packets in, samples to the loudspeaker.
 
-import { Playout } from "./playout.js";
+import { Playout } from "../playout.js";
 
 const STATS_MS = 250;
 

@@ -17,9 +17,9 @@ from typing import NamedTuple
 
 from rich.console import Console
 
-from pebble.bench import control_worker as ends
 from pebble.bench.comparison import Case, Run
-from pebble.bench.control_worker import ROUND_TRIP, Clock, Desk, Exchange, Sender, SliceSpec
+from pebble.bench.control import ends
+from pebble.bench.control.ends import ROUND_TRIP, Clock, Desk, Exchange, Sender, SliceSpec
 from pebble.bench.results import Cell, percentile, rounded
 from pebble.bench.tables import LOST, Grid, percentile_column, single_column
 from pebble.client.connection import password

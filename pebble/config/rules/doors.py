@@ -3,9 +3,9 @@
 import re
 from collections.abc import Iterator
 
-from pebble.config.exposure import brokers
 from pebble.config.problems import Notes, Path
-from pebble.config.shared_topics import renamed_commands
+from pebble.config.rules.exposure import brokers
+from pebble.config.rules.shared_topics import renamed_commands
 from pebble.config.transport import Mqtt, ZenohSection
 from pebble.config.tree import Root
 from pebble.config.web import is_loopback

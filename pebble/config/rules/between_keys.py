@@ -8,15 +8,15 @@ from typing import Any
 
 from msgspec.structs import replace
 
-from pebble.config.doors import check_doors, check_lan
-from pebble.config.exposure import warn_if_readable, warn_of_known_id, warn_of_logins_in_clear
 from pebble.config.hosts import HostError, check_web_url
 from pebble.config.media import AvDaemon, VideoStream
 from pebble.config.neighbours import Neighbours
 from pebble.config.problems import Path
 from pebble.config.reader import Check, Reader
+from pebble.config.rules.doors import check_doors, check_lan
+from pebble.config.rules.exposure import warn_if_readable, warn_of_known_id, warn_of_logins_in_clear
+from pebble.config.rules.shared_topics import shared_topics
 from pebble.config.secret_text import without_login
-from pebble.config.shared_topics import shared_topics
 from pebble.config.text_files import NotTextError, read_text
 from pebble.config.transport import Mqtt, Tls, TransportSection
 from pebble.config.tree import MqttBridge, Root, SerialBridge, SerialBridges, SerialSafety, Services

@@ -12,7 +12,6 @@ from typing import Any, NamedTuple
 
 import msgspec
 
-from pebble.bench import control_far as far
 from pebble.bench.comparison import (
     Budget,
     Case,
@@ -26,7 +25,8 @@ from pebble.bench.comparison import (
     seconds,
     variants,
 )
-from pebble.bench.control_worker import ONE_WAY, ROUND_TRIP, SMALLEST, Slice, SliceSpec, condition
+from pebble.bench.control import far
+from pebble.bench.control.ends import ONE_WAY, ROUND_TRIP, SMALLEST, Slice, SliceSpec, condition
 from pebble.bench.engine import roles_of
 from pebble.bench.judging import null
 from pebble.bench.judging.aims import outcome, rounds_with_lost
@@ -89,7 +89,7 @@ class Participants(Processes):
                 where = MqttSettings(host="127.0.0.1", port=broker.port, **settings)
                 stream = ("mqtt", broker.port)
             ends = [
-                self.worker(f"{role}: {name}", "pebble.bench.control_worker", name, kind, _json(where))
+                self.worker(f"{role}: {name}", "pebble.bench.control.ends", name, kind, _json(where))
                 for name in ("sender", "echo")
             ]
             self._parts[role] = backbone, stream, ends

@@ -10,7 +10,7 @@ from pebble.client.robot_view import RobotView
 from pebble.transports.clock import since_boot as clock
 from pebble.web import messages as m
 from pebble.web import robot_commands
-from pebble.web.driving import Driving
+from pebble.web.drive.driving import Driving
 
 
 class Refusals:

@@ -10,14 +10,14 @@ from micropython import const
 
 from common.arbiter import PERSON, REFUSED
 from common.capabilities import describe
-from common.clock import Clock
 from common.deadman import DeadMan
 from common.estop import EmergencyStop
 from common.payload import parse
-from common.session import Session
 from common.settings import base, get
 from common.ticks import add, diff
-from common.wifi import Wifi
+from net.clock import Clock
+from net.session import Session
+from net.wifi import Wifi
 
 _DRIVE_LIMIT_MS = const(900)  # one second, including a slow turn of the loop
 # Places of the topics, stops first. Where names are checked, the topics without one are the first two, or three if

@@ -7,11 +7,11 @@ from binascii import hexlify
 
 from micropython import const
 
-from common import mqtt
-from common.connection import Connection
 from common.settings import get, hosts
-from common.sockets import Stream, query_name
 from common.ticks import diff
+from net import mqtt
+from net.connection import Connection
+from net.sockets import Stream, query_name
 
 _ALIVE_S = const(15)  # MQTT's keepalive: the broker publishes the will after 1.5 times of it
 _LONGEST_PAYLOAD = const(512)

@@ -8,7 +8,7 @@ from pebble.contract.payloads import Driver
 from pebble.contract.payloads import Driving as DrivingPayload
 from pebble.errors import PayloadError
 from pebble.transports import Message
-from pebble.web.driving import Lease
+from pebble.web.drive.driving import Lease
 
 _EVERY_S = 1.0
 _ANNOUNCED = 64  # in one announcement

@@ -1,0 +1,1 @@
+"""Messages between two services, and between two machines: one-way times and round trips."""

@@ -1,0 +1,95 @@
+"""The robots that a gateway carries now: each begins and ends with its turn; all are synchronised and probed."""
+
+import logging
+from collections.abc import Callable, Mapping
+from functools import partial
+
+from pebble.contract import ESTOP
+from pebble.contract.identity import parse_topic
+from pebble.forwarding.cycles import PROBE_PERIOD_S
+from pebble.forwarding.retained_window import INITIAL_SYNC_S
+from pebble.services.gateway.carried import Carried
+from pebble.services.gateway.connections import Connections
+from pebble.services.gateway.ownership import Ownership
+
+log = logging.getLogger(__name__)
+
+BEGINNING_S = 0.1  # in one turn: taking many robots must not hold up the end of others
+
+
+class CarriedRobots:
+    """Robots by base topic. ``ownership`` decides about each message whether its robot is still carried."""
+
+    def __init__(self, connections: Connections, ownership: Ownership, clock: Callable[[], float]) -> None:
+        self._connections, self._ownership, self._clock = connections, ownership, clock
+        self._robots: dict[str, Carried] = {}
+        self._synchronize: dict[str, float] = {}  # when what is retained of it has arrived
+        self._probed_at = float("-inf")
+
+    @property
+    def bases(self) -> frozenset[str]:
+        return frozenset(self._robots)
+
+    def of(self, topic: str) -> Carried | None:
+        address = parse_topic(topic)
+        return None if address is None else self._robots.get(address.identity.base)
+
+    def may_leave(self, base: str) -> bool:
+        """Whether that robot is carried at this moment."""
+        one = self._robots.get(base)
+        return one is not None and self._holds(one.base, one.since)
+
+    def follow(self, held: Mapping[str, float]) -> bool:
+        """Carry those that are held, each since then; False: some have to wait for the next turn."""
+        for robot, one in list(self._robots.items()):
+            if held.get(robot) != one.since:
+                self._end(robot)
+        end = self._clock() + BEGINNING_S
+        waiting = {robot: since for robot, since in held.items() if robot not in self._robots}
+        while waiting:
+            robot = next(iter(waiting))
+            self._begin(robot, waiting.pop(robot))
+            if self._clock() >= end:
+                return False
+        return True
+
+    def tick(self, now: float) -> None:
+        for robot, due in list(self._synchronize.items()):
+            if self._clock() >= due:
+                del self._synchronize[robot]
+                if robot in self._robots:
+                    self._robots[robot].synchronize()
+        if now - self._probed_at >= PROBE_PERIOD_S:
+            self._probed_at = now
+            for one in self._robots.values():
+                one.probe()
+
+    def hub_changed(self) -> None:
+        for robot, one in list(self._robots.items()):
+            one.hub_changed(self._connections.hub.state)
+            self._synchronize[robot] = self._clock() + INITIAL_SYNC_S
+
+    def _begin(self, robot: str, since: float) -> None:
+        hub, broker = self._connections.hub, self._connections.broker
+        one = Carried(robot, since, hub, broker, partial(self._holds, robot, since), self._clock)
+        for transport in (hub, broker):
+            transport.judge_topics(is_stop=is_stop)  # of all robots, not of this one
+        self._robots[robot] = one
+        if one.begin():
+            self._synchronize[robot] = self._clock() + INITIAL_SYNC_S
+            log.info("carries %s", robot)
+        else:  # it was not the owner any more before it had begun
+            self._end(robot, begun=False)
+
+    def _end(self, robot: str, *, begun: bool = True) -> None:
+        self._synchronize.pop(robot, None)
+        self._robots.pop(robot).end()
+        log.info("carries %s no more" if begun else "was to carry %s, and is no more", robot)
+
+    def _holds(self, robot: str, since: float) -> bool:
+        return self._ownership.since(robot, self._clock()) == since
+
+
+def is_stop(topic: str) -> bool:
+    """Whether it is a stop, with the name of a sender or without."""
+    return f"/{ESTOP.direction}/" in topic and topic.endswith(f"/{ESTOP.metric}")
