@@ -107,16 +107,25 @@ def conf_differences(folder: Path, fleet: Fleet) -> Iterator[str]:
 def apply(folder: Path, before: Fleet, after: Fleet, passwords: Mapping[str, str] | None = None) -> str:
     """Make all brokers of the fleet know ``after``, then write `fleet.json`. Returns how, in words.
 
-    Raises FleetError if a broker does not know it then; `fleet.json` stays as it is.
+    Raises FleetError if a broker does not know it then; `fleet.json` stays as it is, and hubs and all others know it.
     """
     new = passwords or {}
+    if after.hubs != "none":
+        write_zenoh(folder, after)
     how = change_brokers(folder, before, after, new)
     if ADMIN in new:
         write(folder / ADMIN_PASSWORD, f"{new[ADMIN]}\n".encode(), 0o600, FleetError)
-    if after.hubs != "none":
-        write_zenoh(folder, after)
     save(folder, after)
     return how
+
+
+def copies(folder: Path, fleet: Fleet) -> Iterator[str]:
+    """Where copies of the folder's rules count, which no command reaches: there nothing changes until they are new."""
+    if fleet.rules == "files":
+        anew = f"its copies of {folder / ACL} and {PASSWORDS}: copy them again, and send it SIGHUP"
+        yield from (f"broker {server.host}:{server.port} obeys {anew}" for server in fleet.brokers[1:])
+    if fleet.hubs == "elsewhere":
+        yield f"Zenoh hubs obey their copies of {folder / ZENOH}: copy it again, they have read it within two seconds"
 
 
 def write_zenoh(folder: Path, fleet: Fleet) -> None:
@@ -222,23 +231,20 @@ def _apply_commands(
 ) -> str:
     how, failed = "", list[str]()
     for number, server in enumerate(after.brokers):
-        try:
+        try:  # a broker that is away keeps no other one from knowing it
             connection = control(folder, server, own=number == 0)
-        except FleetError as error:
-            if number == 0:
-                raise
-            failed.append(str(error))
-            continue
-        if connection is None:
-            known = passwords_of(folder, before)
-            _write_rules(folder, after, known | {name: broker_files.hashed(one) for name, one in new.items()})
-            how = f"in {folder / SECURITY}: mosquitto does not run"
-        else:
+            if connection is None:
+                known = passwords_of(folder, before)
+                _write_rules(folder, after, known | {name: broker_files.hashed(one) for name, one in new.items()})
+                how = f"in {folder / SECURITY}: mosquitto does not run"
+                continue
             with connection:
                 if ADMIN in new:
                     raise FleetError(f"mosquitto runs: stop it first, because it is changed by the account {ADMIN}")
                 connection.send(commands(connection))
             how = how or "at once"
+        except FleetError as error:
+            failed.append(str(error))
     if failed:
         raise FleetError("\n".join(failed))
     return how

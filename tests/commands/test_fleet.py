@@ -21,7 +21,7 @@ from pebble.config.hub_file import load_hub
 from pebble.config.raw import deep_merge
 from pebble.fleet import certificates
 from pebble.fleet.broker_client import BrokerClient, Place
-from pebble.fleet.folder import CONF, ZENOH
+from pebble.fleet.folder import CONF, FLEET, ZENOH
 from pebble.fleet.people import People
 from pebble.fleet.roles import Role
 from pebble.rig.processes import mosquitto_path, python
@@ -225,6 +225,20 @@ def test_removing_a_person_acts_on_pages_here_and_names_those_elsewhere(hall: Pa
     assert pebble("pebble fleet remove page-2", hall).returncode == 0
 
 
+def test_a_broker_that_no_command_reaches_is_named_at_each_change_that_takes_something_away(tmp_path: Path) -> None:
+    """Without the plugin only files are changed, and a second broker has copies of them."""
+    port = free_port()
+    run(f"pebble fleet init hall --host 127.0.0.1 --port {port} --without-plugin", tmp_path)
+    run("pebble fleet add ann --role driver", tmp_path)
+    file = tmp_path / "hall" / FLEET
+    fleet = json.loads(file.read_text())
+    file.write_text(json.dumps(fleet | {"brokers": [*fleet["brokers"], {"host": "spare.lab", "port": 8884}]}))
+    for line in ("role ann viewer", "password ann", "remove ann"):
+        done = pebble(f"pebble fleet {line}", tmp_path)
+        assert done.returncode == 1, line
+        assert "broker spare.lab:8884 obeys its copies of hall/acl and passwords: copy them again" in done.stderr
+
+
 @pytest.mark.thorough
 def test_zenoh_hubs_have_the_same_accounts(hall: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """What is printed for a robot makes a valid config."""
@@ -248,7 +262,7 @@ def test_zenoh_hubs_have_the_same_accounts(hall: Path, monkeypatch: pytest.Monke
     assert pebble("pebble fleet remove hub1", hall).returncode == 1
     done = pebble("pebble fleet remove ann", hall)
     assert (done.returncode, set(read_access(rules).accounts)) == (1, {"admin", "goob"})
-    assert "Zenoh hubs with a copy of hall/zenoh.json admit ann until they have the new one" in done.stderr
+    assert "Zenoh hubs obey their copies of hall/zenoh.json: copy it again" in done.stderr
     run("pebble fleet zenoh --only-here", hall)
     run("pebble fleet remove goob", hall)
     assert set(read_access(rules).accounts) == {"admin"}

@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import copy
+import shutil
 import subprocess
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Literal
 
+from msgspec.structs import replace
+
 from pebble.fleet import applying
 from pebble.fleet.broker_client import BrokerClient, Place
 from pebble.fleet.broker_files import new_password
 from pebble.fleet.certificates import CA_CERT
-from pebble.fleet.folder import CONF, Fleet, Server, load
+from pebble.fleet.folder import CONF, Fleet, Server, load, save
 from pebble.fleet.roles import Account
 from pebble.rig.processes import mosquitto_path
 from tests.support import Child, free_port, listening, until
@@ -47,6 +51,17 @@ class FleetBroker:
             self.passwords[name] = new_password()
         applying.apply(folder, before, after, {name: self.passwords[name] for name in accounts})
         self._process: subprocess.Popen[bytes] | None = None
+
+    def spare(self, folder: Path) -> FleetBroker:
+        """A second broker of this fleet, made as docs/fleet.md has it, before one of the two runs."""
+        other = copy.copy(self)
+        other.folder, other.port = folder, free_port()
+        server = Server(host=HOST, port=other.port)
+        save(self.folder, replace(self.fleet, brokers=(*self.fleet.brokers, server)))
+        shutil.copytree(self.folder, folder)
+        text = (folder / CONF).read_text().replace(str(self.folder), str(folder))
+        (folder / CONF).write_text(text.replace(f"listener {self.port}", f"listener {other.port}"))
+        return other
 
     @property
     def fleet(self) -> Fleet:

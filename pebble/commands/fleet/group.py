@@ -2,7 +2,7 @@
 
 import json
 import os
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -168,7 +168,7 @@ def role_(
         after = replace(fleet, accounts={**fleet.accounts, name: changed})
         how = applying.apply(place, fleet, after)
     typer.echo(f"{name} is {', '.join(changed.roles)} now ({how})")
-    return 0
+    return _left(applying.copies(Path(_shown(place)), after))
 
 
 def password(name: _Name, folder_: _Folder = None) -> int:
@@ -178,7 +178,7 @@ def password(name: _Name, folder_: _Folder = None) -> int:
         secret = new_password()
         how = applying.apply(place, fleet, fleet, {name: secret})
     _print_account(place, fleet, name, secret, how)
-    return 0
+    return _left(applying.copies(Path(_shown(place)), replace(fleet, hubs="none")))  # which know no passwords
 
 
 def remove(name: _Name, folder_: _Folder = None) -> int:
@@ -186,17 +186,15 @@ def remove(name: _Name, folder_: _Folder = None) -> int:
     with _changing(folder_) as (place, fleet):
         account = _account(place, fleet, name)
         _keep_admin(name)
-        how = applying.apply(place, fleet, fleet.without(name))
-        typer.echo(f"{name} is removed and disconnected ({how})")
+        after = fleet.without(name)
         left = list(_remove_from_pages(fleet, name)) if not set(account.roles) & set(ProgramRole) else []
-        if fleet.hubs == "elsewhere":
-            left.append(
-                f"Zenoh hubs with a copy of {_shown(place / ZENOH)} admit {name} until they have the new one, "
-                "within two seconds of it"
-            )
-    for line in left:
-        typer.echo(f"pebble: {line}", err=True)
-    return 1 if left else 0
+        left += applying.copies(Path(_shown(place)), after)
+        try:
+            how = applying.apply(place, fleet, after)
+            typer.echo(f"{name} is removed and disconnected ({how})")
+        except FleetError as error:
+            left += [*str(error).splitlines(), f"{name} may still get in there: give this command again"]
+    return _left(left)
 
 
 def zenoh(
@@ -314,7 +312,7 @@ def _init_again(place: Path, host: str | None, level: str | None, plain: bool | 
         how = applying.apply(place, fleet, after)
         applying.repair(place, after)
     typer.echo(f"{_shown(place)} has level {after.level}{' and plain topics' if after.plain else ''} ({how})")
-    return 0
+    return _left(applying.copies(Path(_shown(place)), after))
 
 
 @contextmanager
@@ -427,6 +425,14 @@ def _host_and_port(server: Server) -> str:
 
 def _level(fleet: Fleet, account: Account) -> str:
     return "login" if account.plain else fleet.level
+
+
+def _left(lines: Iterable[str]) -> int:
+    """Print where a change does not count yet; the command's exit code."""
+    left = list(lines)
+    for line in left:
+        typer.echo(f"pebble: {line}", err=True)
+    return 1 if left else 0
 
 
 def _remove_from_pages(fleet: Fleet, name: str) -> Iterator[str]:
