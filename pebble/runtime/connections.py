@@ -195,8 +195,10 @@ def lan_transport(config: Config) -> Transport:
     return create("zenoh", _name(config, "zenoh", "lan"), settings)
 
 
-def gateway_transports(gateway: "GatewayFile", run_dir: Path, will: Message) -> tuple[Transport, Transport, Transport]:
-    """The connections of a gateway: to the hub, and two to the broker, one of them for presence and stops alone."""
+def gateway_transports(
+    gateway: "GatewayFile", run_dir: Path, will: Message
+) -> tuple[Transport, Transport, Transport, Transport]:
+    """The connections of a gateway: to the hub, and three to the broker, two for heartbeats and for stops alone."""
     hub, mqtt = gateway.hub, gateway.mqtt
     zenoh = ZenohSettings(
         run_dir=run_dir,
@@ -208,11 +210,12 @@ def gateway_transports(gateway: "GatewayFile", run_dir: Path, will: Message) -> 
     )
     base = will.topic.removesuffix(f"/{c.ONLINE.suffix}")
     forwards = mqtt_settings(mqtt, as_published=True, reconnect_max_s=REMOTE_RECONNECT_S)
-    presence = mqtt_settings(mqtt, reconnect_max_s=REMOTE_RECONNECT_S)
+    apart = mqtt_settings(mqtt, reconnect_max_s=REMOTE_RECONNECT_S)
     return (
         create("zenoh", f"{base}-hub", zenoh),
         create("mqtt", f"{base}/forwards", forwards, will=will),
-        create("mqtt", f"{base}/presence", presence),
+        create("mqtt", f"{base}/presence", apart),
+        create("mqtt", f"{base}/stops", apart),
     )
 
 

@@ -1,7 +1,8 @@
 """The gateway as a program: it receives robots at a hub, agrees with other gateways at the broker, and carries robots.
 
 What only its owner forwards passes by :class:`Carried`. A live emergency stop is forwarded by every gateway, in every
-state, over the connection of the heartbeats, where nothing else holds it up: its name makes it count once.
+state, over a connection that is subscribed to nothing else: its name makes it count once. Heartbeats of gateways have
+one of their own as well, and a thread: neither floods nor a robot whose begin takes long may cost it the others.
 """
 
 import logging
@@ -21,9 +22,10 @@ from pebble.forwarding.retained_window import INITIAL_SYNC_S
 from pebble.forwarding.routing import Side
 from pebble.forwarding.subjects import Subject
 from pebble.runtime.rate_limit import RateLimitedLog
-from pebble.services.gateway.carried import Carried
+from pebble.services.gateway.carried import Beginning, Carried
 from pebble.services.gateway.heartbeats import OwnHeartbeats, PresentRobots
 from pebble.services.gateway.ownership import MAX_ROBOTS, Ownership
+from pebble.services.gateway.pace import MOST_STOPS, Pace, Senders
 from pebble.transports import Message, QoS, State, Transport
 from pebble.transports.counters import Counters
 
@@ -38,8 +40,8 @@ _decode = msgspec.json.Decoder(GatewayHeartbeat).decode
 
 
 class Gateway:
-    """``broker`` carries what is forwarded, as published, and has the :func:`will`; ``presence`` is a second
-    connection to the same broker. The transports are not yet open. ``robots`` are filters of their bases.
+    """``broker`` carries what is forwarded, as published, and has the :func:`will`; ``presence`` and ``stops`` are
+    further connections to the same broker. The transports are not yet open. ``robots`` are filters of their bases.
     """
 
     def __init__(
@@ -49,19 +51,22 @@ class Gateway:
         hub: Transport,
         broker: Transport,
         presence: Transport,
+        stops: Transport,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self.ownership = Ownership(name)
         self.counters = Counters()
         self._robots, self._clock = tuple(robots), clock
-        self._hub, self._broker, self._presence = hub, broker, presence
+        self._hub, self._broker, self._presence, self._stop_way = hub, broker, presence, stops
         self._heartbeats, self._present = OwnHeartbeats(name, broker), PresentRobots()
         self._carried: dict[str, Carried] = {}
+        self._beginning = Beginning()  # of the one that begins now
         self._synchronize: dict[str, float] = {}  # when what is retained of it has arrived
-        self._stops = Cycles(clock)
+        self._stops, self._stop_pace = Cycles(clock), Pace(clock, MOST_STOPS)
+        self._stop_senders = Senders(self._present, clock)
         self._quiet_log = RateLimitedLog(log, period_s=60.0)
         self._probed_at = float("-inf")
-        self._states = threading.Lock()
+        self._states, self._publishing = threading.Lock(), threading.Lock()
         self._at_broker, self._at_hub = False, False
         self._wake = threading.Event()
         self._running = True
@@ -76,6 +81,8 @@ class Gateway:
         """Run until :meth:`quit`."""
         self.open()
         ready()
+        heartbeats = threading.Thread(target=self._publish_heartbeats, name="pebble-gateway heartbeats", daemon=True)
+        heartbeats.start()
         try:
             while self._running:
                 due = self.ownership.next_due(self._clock()) - self._clock()
@@ -91,18 +98,18 @@ class Gateway:
         self._wake.set()
 
     def open(self) -> None:
-        for transport in (self._hub, self._broker, self._presence):
+        for transport in self._transports:
             transport.judge_topics(is_stop=_is_stop, may_leave=self._may_leave)
             transport.on_state(self._on_state)
         self._hub.judge_topics(is_invented=self._is_invented)
         self._broker.judge_topics(skips_retained=self._skips_retained, delivers_late=True)
-        for transport in (self._hub, self._broker, self._presence):
+        for transport in self._transports:
             transport.open(timeout=0.0)
         for base in self._robots:
             stop = ESTOP.topic(base)
             self._hub.subscribe(ONLINE.topic(base), self._on_robot, echo=False, direct=True)
             for topic in (stop, with_name(stop, "+")):
-                self._presence.subscribe(topic, self._on_stop, direct=True)
+                self._stop_way.subscribe(topic, self._on_stop, direct=True)
         self._presence.subscribe(ONLINE.filter(_ANY), self._on_gateway, direct=True)
 
     def close(self) -> None:
@@ -110,14 +117,33 @@ class Gateway:
         self.ownership.lost()
         for robot in list(self._carried):
             self._end(robot)
-        for transport in (self._broker, self._presence, self._hub):
+        for transport in reversed(self._transports):
             transport.close()
+
+    @property
+    def _transports(self) -> tuple[Transport, ...]:
+        return self._hub, self._stop_way, self._presence, self._broker
+
+    def publish_heartbeat(self) -> None:
+        """Publish a heartbeat, if one is due."""
+        with self._publishing:
+            now = self._clock()
+            if self._broker.state is State.CONNECTED and self._heartbeats.due(now, TICK_S):
+                self._heartbeats.publish(self._present.robots(now) if self._hub.state is State.CONNECTED else (), now)
+
+    def _publish_heartbeats(self) -> None:
+        while self._running:
+            self.publish_heartbeat()
+            time.sleep(TICK_S)
 
     def tick(self) -> None:
         """A turn: heartbeat, who carries what, what is due."""
+        self.publish_heartbeat()
+        for stop in self._stop_pace.due():
+            self._pass_stop(stop)
+        for one in list(self._carried.values()):
+            one.pass_waiting()
         now = self._clock()
-        if self._broker.state is State.CONNECTED and self._heartbeats.due(now, TICK_S):
-            self._heartbeats.publish(self._present.robots(now) if self._hub.state is State.CONNECTED else (), now)
         self.ownership.judge(now)
         held = self.ownership.held(now)
         for robot, one in list(self._carried.items()):
@@ -137,11 +163,16 @@ class Gateway:
     def _begin(self, robots: Mapping[str, float]) -> None:
         end = self._clock() + BEGINNING_S
         for robot, since in robots.items():
-            one = Carried(robot, since, self._hub, self._broker, partial(self._holds, robot, since), self._clock)
+            holds = partial(self._holds, robot, since)
+            one = Carried(
+                robot, since, self._hub, self._broker, holds, self._clock, self._report_flood, self._beginning
+            )
             for transport in (self._hub, self._broker):
                 transport.judge_topics(is_stop=_is_stop)  # of all robots, not of this one
             self._carried[robot] = one
-            if one.begin():
+            with self._beginning:
+                begun = one.begin()
+            if begun:
                 self._synchronize[robot] = self._clock() + INITIAL_SYNC_S
                 log.info("carries %s", robot)
             else:
@@ -161,7 +192,7 @@ class Gateway:
     # -- the transports' threads
 
     def _on_state(self, _state: State) -> None:
-        """Both connections to the broker are needed: one carries, the other shows whether the others hear this one."""
+        """Two connections to the broker are needed: one carries, one shows whether the others hear this one."""
         with self._states:
             at_broker = all(one.state is State.CONNECTED for one in (self._broker, self._presence))
             if at_broker is not self._at_broker:
@@ -207,10 +238,22 @@ class Gateway:
         self._wake.set()
 
     def _on_stop(self, message: Message) -> None:
-        if message.retain or self._stops.examine(Side.REMOTE, _STOP, message) is not Finding.PASS:
+        if message.retain:
+            return
+        if self._stop_pace.takes(message, self._stop_senders.key(message)):
+            self._pass_stop(message)
+        else:
+            self._report_flood(message.topic)
+
+    def _pass_stop(self, message: Message) -> None:
+        if self._stops.examine(Side.REMOTE, _STOP, message) is not Finding.PASS:
             return
         self.counters.add("stops")
         self._hub.publish(message.topic, message.payload, qos=QoS.DELIVERED, urgent=True)
+
+    def _report_flood(self, topic: str) -> None:
+        self.counters.add("too_often")
+        self._quiet_log.warning("flood", "more comes on %s than a gateway passes in a second", topic[:200])
 
     def _may_leave(self, topic: str) -> bool:
         """Whether it is a stop, or of a robot that is carried at this moment, or no robot's: a heartbeat."""
@@ -233,9 +276,10 @@ class Gateway:
         return None if address is None else self._carried.get(address.identity.base)
 
 
+_INCOMING = f"/{ESTOP.direction}/"
 _STOP_END = f"/{ESTOP.metric}".encode()
 
 
 def _is_stop(topic: str) -> bool:
     """Whether it is a stop, with the name of a sender or without."""
-    return f"/{ESTOP.direction}/" in topic and topic.endswith(f"/{ESTOP.metric}")
+    return _INCOMING in topic and topic.endswith(f"/{ESTOP.metric}")

@@ -33,6 +33,10 @@ class PresentRobots:
     def __init__(self) -> None:
         self._received: dict[str, tuple[float, float]] = {}  # when, and after how many seconds of silence it is away
 
+    def __contains__(self, robot: object) -> bool:
+        """Whether it is one of those, or was until lately."""
+        return robot in self._received
+
     def note(self, robot: str, now: float) -> None:
         before = self._received.get(robot)
         if before is None and len(self._received) >= MAX_ROBOTS:
