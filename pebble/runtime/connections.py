@@ -197,17 +197,18 @@ def lan_transport(config: Config) -> Transport:
 
 def gateway_transports(
     gateway: "GatewayFile", operators: Mqtt, run_dir: Path, will: Message
-) -> tuple[Transport, Transport, Transport]:
-    """The connections of a gateway: to where the robots are, and two to the operators' broker, one of them for
-    presence and stops alone.
+) -> tuple[Transport, Transport, Transport, Transport]:
+    """The connections of a gateway: to where the robots are, and three to the operators' broker, one of them for
+    heartbeats alone, and one for stops.
     """
     base = will.topic.removesuffix(f"/{c.ONLINE.suffix}")
     forwards = mqtt_settings(operators, as_published=True, reconnect_max_s=REMOTE_RECONNECT_S)
-    presence = mqtt_settings(operators, reconnect_max_s=REMOTE_RECONNECT_S)
+    apart = mqtt_settings(operators, reconnect_max_s=REMOTE_RECONNECT_S)
     return (
         _robots_transport(gateway, base, run_dir),
         create("mqtt", f"{base}/forwards", forwards, will=will),
-        create("mqtt", f"{base}/presence", presence),
+        create("mqtt", f"{base}/presence", apart),
+        create("mqtt", f"{base}/stops", apart),
     )
 
 

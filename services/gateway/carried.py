@@ -26,7 +26,8 @@ from pebble.errors import PayloadError
 from pebble.forwarding.forwarder import Forwarder
 from pebble.forwarding.routing import GATEWAY, Side
 from pebble.forwarding.subjects import Subject, Subjects
-from pebble.transports import Message, State, Subscription, Transport
+from pebble.services.gateway.pace import LARGEST, MOST_EACH, MOST_TOGETHER, Pace
+from pebble.transports import Message, State, Subscription, Transport, clock
 
 #: What the robot sends of each medium, by what allows and what requests it.
 _MEDIA = ((CAMERA, MQTT_VIDEO, VIDEO_CONTROL), (AUDIO, MQTT_AUDIO, AUDIO_CONTROL))
@@ -46,6 +47,42 @@ class NamedSubjects(Subjects):
         return self._subject(Kind.COMMAND, found.channel, found.qos)  # nothing is retained behind a name
 
 
+class Beginning:
+    """Tells since when commands may have waited behind what the broker retains for a robot that begins.
+
+    They share a connection with it, on which something of ours is nearly always on its way, so pings do not tell.
+    """
+
+    LONG_S, REST_S = 0.5, 0.25  # what moves may wait so long; so long after it what had waited is still being read
+
+    def __init__(self) -> None:
+        self._began: float | None = None  # None: none begins
+        self._slow, self._until = 0.0, float("-inf")  # the newest one that took long: since, until
+
+    def __enter__(self) -> None:
+        self._began = clock.since_boot()
+
+    def __exit__(self, *_: object) -> None:
+        now, began = clock.since_boot(), self._began
+        if began is not None and now - began > self.LONG_S:
+            self._slow, self._until = began, now + self.REST_S
+        self._began = None
+
+    def aged(self, message: Message) -> Message:
+        """``message`` with the time since when it may have waited. Hot."""
+        began = self._began
+        if began is None and self._until == float("-inf"):
+            return message
+        now, since = clock.since_boot(), None
+        if began is not None and now - began > self.LONG_S:
+            since = began
+        elif now <= self._until:
+            since = self._slow
+        if since is None:
+            return message
+        return Message(message.topic, message.payload, message.qos, message.retain, message.retain_requested, since)
+
+
 class Carried:
     """A robot of the hub, since ``since``.
 
@@ -60,9 +97,13 @@ class Carried:
         broker: Transport,
         holds: Callable[[], bool],
         clock: Callable[[], float] = time.monotonic,
+        flooded: Callable[[str], None] = lambda _topic: None,
+        beginning: Beginning | None = None,
     ) -> None:
         self.base, self.since = base, since
         self._hub, self._broker, self._holds = hub, broker, holds
+        self._beginning = Beginning() if beginning is None else beginning
+        self._paces, self._flooded = {side: Pace(clock, MOST_EACH, MOST_TOGETHER) for side in Side}, flooded
         self._subscriptions: list[Subscription] = []
         #: By the channel of each medium: what allows it, and whether it was requested at the broker; None: not known.
         self._allowed: dict[Channel, bool] = {}
@@ -122,6 +163,19 @@ class Carried:
 
     def receive(self, side: Side, message: Message) -> None:
         """Pass a message on, unless this gateway does not carry the robot now."""
+        is_old = self.forwarder.sides[side].window.may_be_old(message)  # all that is retained comes at once
+        if len(message.payload) <= LARGEST and (is_old or self._paces[side].takes(message, message.topic)):
+            self._pass(side, message)
+        else:
+            self._flooded(message.topic)
+
+    def pass_waiting(self) -> None:
+        """Pass what was too much in the second before."""
+        for side, pace in self._paces.items():
+            for message in pace.due():
+                self._pass(side, message)
+
+    def _pass(self, side: Side, message: Message) -> None:
         if not self._holds():
             return
         subject = self.subjects[message.topic]
@@ -131,7 +185,7 @@ class Carried:
                 self._note_request(channel, message)
             elif not self._is_wanted(channel):
                 return
-        self.forwarder.receive(side, message)
+        self.forwarder.receive(side, self._beginning.aged(message) if side is Side.REMOTE else message)
 
     def _subscribe(self, side: Side, transport: Transport, *filters: str) -> None:
         receive = partial(self.receive, side)

@@ -8,21 +8,33 @@ from pebble.contract import ESTOP
 from pebble.contract.identity import parse_topic
 from pebble.forwarding.cycles import PROBE_PERIOD_S
 from pebble.forwarding.retained_window import INITIAL_SYNC_S
-from pebble.services.gateway.carried import Carried
+from pebble.services.gateway.carried import Beginning, Carried
 from pebble.services.gateway.connections import Connections
 from pebble.services.gateway.ownership import Ownership
 
 log = logging.getLogger(__name__)
 
+_INCOMING = f"/{ESTOP.direction}/"
 BEGINNING_S = 0.1  # in one turn: taking many robots must not hold up the end of others
 
 
 class CarriedRobots:
-    """Robots by base topic. ``ownership`` decides about each message whether its robot is still carried."""
+    """Robots by base topic. ``ownership`` decides about each message whether its robot is still carried.
 
-    def __init__(self, connections: Connections, ownership: Ownership, clock: Callable[[], float]) -> None:
-        self._connections, self._ownership, self._clock = connections, ownership, clock
+    ``flooded`` is called with the topic of each message that is too much at this moment.
+    """
+
+    def __init__(
+        self,
+        connections: Connections,
+        ownership: Ownership,
+        flooded: Callable[[str], None],
+        clock: Callable[[], float],
+    ) -> None:
+        self._connections, self._ownership = connections, ownership
+        self._flooded, self._clock = flooded, clock
         self._robots: dict[str, Carried] = {}
+        self._beginning = Beginning()  # of the one that begins now
         self._synchronize: dict[str, float] = {}  # when what is retained of it has arrived
         self._probed_at = float("-inf")
 
@@ -53,6 +65,10 @@ class CarriedRobots:
                 return False
         return True
 
+    def pass_waiting(self) -> None:
+        for one in list(self._robots.values()):
+            one.pass_waiting()
+
     def tick(self, now: float) -> None:
         for robot, due in list(self._synchronize.items()):
             if self._clock() >= due:
@@ -71,11 +87,14 @@ class CarriedRobots:
 
     def _begin(self, robot: str, since: float) -> None:
         hub, broker = self._connections.hub, self._connections.broker
-        one = Carried(robot, since, hub, broker, partial(self._holds, robot, since), self._clock)
+        holds = partial(self._holds, robot, since)
+        one = Carried(robot, since, hub, broker, holds, self._clock, self._flooded, self._beginning)
         for transport in (hub, broker):
             transport.judge_topics(is_stop=is_stop)  # of all robots, not of this one
         self._robots[robot] = one
-        if one.begin():
+        with self._beginning:
+            begun = one.begin()
+        if begun:
             self._synchronize[robot] = self._clock() + INITIAL_SYNC_S
             log.info("carries %s", robot)
         else:  # it was not the owner any more before it had begun
@@ -92,4 +111,4 @@ class CarriedRobots:
 
 def is_stop(topic: str) -> bool:
     """Whether it is a stop, with the name of a sender or without."""
-    return f"/{ESTOP.direction}/" in topic and topic.endswith(f"/{ESTOP.metric}")
+    return _INCOMING in topic and topic.endswith(f"/{ESTOP.metric}")

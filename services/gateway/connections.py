@@ -7,15 +7,18 @@ from pebble.transports import State, Transport
 
 
 class Connections:
-    """``broker`` carries robots, ``presence`` the heartbeats; only with both does the gateway know its place."""
+    """``broker`` carries robots, ``presence`` the heartbeats; only with both does the gateway know its place.
 
-    def __init__(self, hub: Transport, broker: Transport, presence: Transport) -> None:
-        self.hub, self.broker, self.presence = hub, broker, presence
+    ``stops`` has nothing but stops, so that nothing holds them up.
+    """
+
+    def __init__(self, hub: Transport, broker: Transport, presence: Transport, stops: Transport) -> None:
+        self.hub, self.broker, self.presence, self.stops = hub, broker, presence, stops
         self._looking = threading.Lock()
         self._at_broker = self._at_hub = False
 
     def __iter__(self) -> Iterator[Transport]:
-        return iter((self.hub, self.broker, self.presence))
+        return iter((self.hub, self.stops, self.presence, self.broker))
 
     @property
     def at_hub(self) -> bool:

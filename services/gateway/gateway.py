@@ -3,7 +3,8 @@
 Where boards are, the broker of a LAN takes the place of the hub.
 
 What only its owner forwards passes by :class:`Carried`. A live emergency stop is forwarded by every gateway, in every
-state, over the connection of the heartbeats, where nothing else holds it up: its name makes it count once.
+state, over a connection that is subscribed to nothing else: its name makes it count once. Heartbeats of gateways have
+one of their own as well, and a thread: neither floods nor a robot whose begin takes long may cost it the others.
 """
 
 import logging
@@ -26,6 +27,7 @@ from pebble.services.gateway.carried_robots import CarriedRobots, is_stop
 from pebble.services.gateway.connections import Connections
 from pebble.services.gateway.heartbeats import OwnHeartbeats, PresentRobots
 from pebble.services.gateway.ownership import MAX_ROBOTS, Ownership
+from pebble.services.gateway.pace import MOST_STOPS, Pace, Senders
 from pebble.transports import Message, QoS, State, Transport
 from pebble.transports.counters import Counters
 
@@ -39,8 +41,8 @@ _decode = msgspec.json.Decoder(GatewayHeartbeat).decode
 
 
 class Gateway:
-    """``broker`` carries what is forwarded, as published, and has the :func:`will`; ``presence`` is a second
-    connection to the same broker. The transports are not yet open. ``robots`` are filters of their bases.
+    """``broker`` carries what is forwarded, as published, and has the :func:`will`; ``presence`` and ``stops`` are
+    further connections to the same broker. The transports are not yet open. ``robots`` are filters of their bases.
     """
 
     def __init__(
@@ -50,15 +52,17 @@ class Gateway:
         hub: Transport,
         broker: Transport,
         presence: Transport,
+        stops: Transport,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self.ownership = Ownership(name)
         self.counters = Counters()
         self._robots, self._clock = tuple(robots), clock
-        self._connections = Connections(hub, broker, presence)
+        self._connections = Connections(hub, broker, presence, stops)
         self._heartbeats, self._present = OwnHeartbeats(name, broker), PresentRobots()
-        self._carried = CarriedRobots(self._connections, self.ownership, clock)
-        self._stops = Cycles(clock)
+        self._carried = CarriedRobots(self._connections, self.ownership, self._report_flood, clock)
+        self._stops, self._stop_pace = Cycles(clock), Pace(clock, MOST_STOPS)
+        self._stop_senders = Senders(self._present, clock)
         self._quiet_log = RateLimitedLog(log, period_s=60.0)
         self._wake, self._heartbeat_due = threading.Event(), threading.Event()
         self._running = True
@@ -81,8 +85,8 @@ class Gateway:
         """
         self.open()
         ready()
-        beating = threading.Thread(target=self._publish_heartbeats, name="heartbeats", daemon=True)
-        beating.start()
+        heartbeats = threading.Thread(target=self._publish_heartbeats, name="heartbeats", daemon=True)
+        heartbeats.start()
         try:
             while self._running:
                 due = self.ownership.next_due(self._clock()) - self._clock()
@@ -91,7 +95,7 @@ class Gateway:
                 self.tick()
         finally:
             self.quit()
-            beating.join()
+            heartbeats.join()
             self.close()
 
     def quit(self) -> None:
@@ -101,7 +105,7 @@ class Gateway:
         self._heartbeat_due.set()
 
     def open(self) -> None:
-        hub, broker, presence = self._connections
+        hub, broker = self._connections.hub, self._connections.broker
         for transport in self._connections:
             transport.judge_topics(is_stop=is_stop, may_leave=self._may_leave)
             transport.on_state(self._on_state)
@@ -113,15 +117,14 @@ class Gateway:
             stop = ESTOP.topic(base)
             hub.subscribe(ONLINE.topic(base), self._on_robot, echo=False, direct=True)
             for topic in (stop, with_name(stop, "+")):
-                presence.subscribe(topic, self._on_stop, direct=True)
-        presence.subscribe(ONLINE.filter(_ANY), self._on_gateway, direct=True)
+                self._connections.stops.subscribe(topic, self._on_stop, direct=True)
+        self._connections.presence.subscribe(ONLINE.filter(_ANY), self._on_gateway, direct=True)
 
     def close(self) -> None:
         """Stop forwarding, and only then tell the others."""
         self.ownership.lost()
         self._carried.follow({})
-        hub, broker, presence = self._connections
-        for transport in (broker, presence, hub):
+        for transport in reversed([*self._connections]):
             transport.close()
 
     def publish_heartbeat(self) -> None:
@@ -141,7 +144,10 @@ class Gateway:
             self.quit()
 
     def tick(self) -> None:
-        """A turn: who carries what, what is due."""
+        """A turn: what waited for this second, who carries what, what is due."""
+        for stop in self._stop_pace.due():
+            self._pass_stop(stop)
+        self._carried.pass_waiting()
         now = self._clock()
         self.ownership.judge(now)
         if not self._carried.follow(self.ownership.held(now)):
@@ -194,10 +200,22 @@ class Gateway:
         self._wake.set()
 
     def _on_stop(self, message: Message) -> None:
-        if message.retain or self._stops.examine(Side.REMOTE, _STOP, message) is not Finding.PASS:
+        if message.retain:
+            return
+        if self._stop_pace.takes(message, self._stop_senders.key(message)):
+            self._pass_stop(message)
+        else:
+            self._report_flood(message.topic)
+
+    def _pass_stop(self, message: Message) -> None:
+        if self._stops.examine(Side.REMOTE, _STOP, message) is not Finding.PASS:
             return
         self.counters.add("stops")
         self._connections.hub.publish(message.topic, message.payload, qos=QoS.DELIVERED, urgent=True)
+
+    def _report_flood(self, topic: str) -> None:
+        self.counters.add("too_often")
+        self._quiet_log.warning("flood", "more comes on %s than a gateway passes in a second", topic[:200])
 
     def _may_leave(self, topic: str) -> bool:
         """Whether it is a stop, or of a robot that is carried at this moment, or no robot's: a heartbeat."""

@@ -41,6 +41,10 @@ class PresentRobots:
         if self._first.setdefault(robot, payload) != payload:
             self.note(robot, now)
 
+    def __contains__(self, robot: object) -> bool:
+        """Whether it is one of those, or was until lately."""
+        return robot in self._received
+
     def note(self, robot: str, now: float) -> None:
         before = self._received.get(robot)
         if before is None and len(self._received) >= MAX_ROBOTS:

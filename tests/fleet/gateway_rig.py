@@ -189,18 +189,22 @@ class World:
         now = time.monotonic()
         assert until(lambda: self.driven(now + 2.5), 60), [len(one.commands) for one in self.robots]
 
-    def stop_all(self) -> float:
-        """Stop each robot, once; seconds until the last one has heard it."""
-        name, began = f"s{next(self._stops):015d}", time.monotonic()
-        for robot in self.robots:
+    def of(self, name: str) -> list[Robot]:
+        """The robot of this name, or all."""
+        return [one for one in self.robots if not name or one.base.endswith(f"/{name}")]
+
+    def stop(self, of: str = "") -> float:
+        """Stop a robot, or each, once; seconds until the last one has heard it."""
+        name, began, robots = f"s{next(self._stops):015d}", time.monotonic(), self.of(of)
+        for robot in robots:
             stop = json.dumps({"stop": name, "by": "ann"}).encode()
             self.operator.publish(ESTOP.topic(robot.base), stop, qos=QoS.DELIVERED, urgent=True)
-        assert until(lambda: all(name in one.stops for one in self.robots), 10), "a stop did not arrive"
-        return max(one.stops[name] for one in self.robots) - began
+        assert until(lambda: all(name in one.stops for one in robots), 10), "a stop did not arrive"
+        return max(one.stops[name] for one in robots) - began
 
-    def outage_s(self, since: float) -> float:
-        """The longest time without a command, of any robot."""
-        gaps = (b.at - a.at for one in self.robots for a, b in itertools.pairwise(one.commands) if b.at > since)
+    def outage_s(self, since: float, of: str = "") -> float:
+        """The longest time without a command, of a robot or of any."""
+        gaps = (b.at - a.at for one in self.of(of) for a, b in itertools.pairwise(one.commands) if b.at > since)
         return max(gaps)
 
     def wrong(self) -> dict[str, int]:

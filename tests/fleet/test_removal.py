@@ -163,7 +163,7 @@ class Hall:
 
     def goes_on(self, name: str, robot: str) -> bool:
         since = time.monotonic()
-        return until(lambda: self.arrived[name, robot] > since, 20)
+        return until(lambda: self.arrived[name, robot] > since, 60)
 
 
 @pytest.fixture

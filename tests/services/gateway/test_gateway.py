@@ -6,17 +6,18 @@ import itertools
 import json
 import random
 from collections.abc import Callable
-from typing import Any
 
 import pytest
 
 from pebble.contract import ONLINE
 from pebble.forwarding.routing import Side
 from pebble.services.gateway import carried_robots as module
+from pebble.services.gateway.carried import Beginning, Carried
 from pebble.services.gateway.gateway import Gateway
 from pebble.services.gateway.heartbeats import PresentRobots, will
 from pebble.services.gateway.ownership import FRESH_S, TAKING_S
-from pebble.transports import Message, Subscription
+from pebble.services.gateway.pace import MOST_EACH, MOST_STOPS, MOST_TOGETHER
+from pebble.transports import Message, clock
 from tests.forwarding.virtual import Connection, Hub
 from tests.services.mqtt_bridge.bridge_rig import Client
 from tests.support import cases
@@ -29,18 +30,19 @@ class Running:
     """A gateway and its three connections; while it hangs it does nothing, and what is sent to it waits."""
 
     def __init__(self, world: World, name: str) -> None:
-        self.hub, self.broker, self.presence = (
+        self.hub, self.broker, self.presence, self.stops = (
             Connection(f"{name}-hub", world.hub, world),  # type: ignore[arg-type]
             Connection(f"{name}-forwards", world.broker, world, will=will(name)),  # type: ignore[arg-type]
             Connection(f"{name}-presence", world.broker, world),  # type: ignore[arg-type]
+            Connection(f"{name}-stops", world.broker, world),  # type: ignore[arg-type]
         )
-        self.gateway = Gateway(name, ["pebble/robots/+"], self.hub, self.broker, self.presence, clock=lambda: world.now)
+        self.gateway = Gateway(name, ["pebble/robots/+"], *self.connections, clock=lambda: world.now)
         self.hangs = False
         self.gateway.open()
 
     @property
     def connections(self) -> tuple[Connection, ...]:
-        return self.hub, self.broker, self.presence
+        return self.hub, self.broker, self.presence, self.stops
 
     def hang(self) -> None:
         self.hangs = True
@@ -240,6 +242,72 @@ def test_every_gateway_forwards_a_live_stop_in_every_state(monkeypatch: pytest.M
     assert len(world.robots[0].on("incoming/estop")) == before
 
 
+def test_what_one_robot_is_sent_holds_up_no_other(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A connection on which stops wait does not, nor does a flood of commands or stops."""
+    world = World(monkeypatch, "a", robots=(GOOB, "pebble/robots/fred"))
+    world.run(3)
+    world.running["a"].stops.hold()
+    for number in range(3 * MOST_TOGETHER):
+        world.operators[0].publish(f"incoming/lights-{'solid' if number % 2 else 'flash'}", b"%d" % number)
+        world.operators[0].publish("incoming/front-camera", b"%d" % number)
+    world.run(3)
+    lights = world.robots[0].payloads("incoming/lights-solid")
+    assert len(lights) <= MOST_EACH + 1
+    assert lights[-1] == b"%d" % (3 * MOST_TOGETHER - 1), "the last one passes"
+    assert len(world.robots[0].payloads("incoming/front-camera")) <= MOST_EACH + 1
+    assert world.all_pass()
+    assert world.running["a"].gateway.counters["too_often"] > MOST_TOGETHER
+    world.running["a"].stops.let_go()
+    for number in range(2 * MOST_STOPS):
+        world.operators[0].publish("incoming/estop", b'{"stop": "x%d"}' % number)
+        for base in range(3):
+            world.operators[0].transport.publish(f"pebble/robots/x{number}{base}/incoming/estop", b"")
+    world.operators[1].publish("incoming/estop", b'{"stop": "fred"}')
+    world.rest()
+    assert b'{"stop": "fred"}' in world.robots[1].payloads("incoming/estop")
+
+
+def test_a_robot_that_takes_long_to_begin_costs_the_gateway_no_other(monkeypatch: pytest.MonkeyPatch) -> None:
+    """So it does where a driver has left thousands of retained messages; heartbeats have a thread meanwhile."""
+    world = World(monkeypatch, "a", robots=(GOOB, "pebble/robots/fred"))
+    world.silent.add("pebble/robots/fred")
+    world.run(3)
+    gateway, begin = world.running["a"].gateway, Carried.begin
+
+    def slow(carried: Carried) -> bool:
+        for _ in range(int(2 * FRESH_S / STEP_S)):
+            world.now += STEP_S
+            for robot in world.robots:
+                robot.publish("outgoing/online", b'{"t": 0}', retain=True)
+            gateway.publish_heartbeat()
+            world.rest()
+        return begin(carried)
+
+    monkeypatch.setattr(Carried, "begin", slow)
+    since = gateway.ownership.since(GOOB, world.now)
+    world.silent.clear()
+    world.run(4)
+    assert gateway.carries == {GOOB, "pebble/robots/fred"}
+    assert gateway.ownership.since(GOOB, world.now) == since
+
+
+@pytest.mark.parametrize(
+    ("begun_s", "then_s", "waited_s"),
+    [(0.4, 0.0, 0.0), (3.0, 0.0, 3.0), (3.0, 0.2, 3.2), (3.0, 0.3, 0.0)],
+)
+def test_commands_behind_what_is_retained_have_waited_as_long(
+    monkeypatch: pytest.MonkeyPatch, begun_s: float, then_s: float, waited_s: float
+) -> None:
+    now = [100.0]
+    monkeypatch.setattr(clock, "since_boot", lambda: now[0])
+    beginning = Beginning()
+    with beginning:
+        now[0] += begun_s
+    with beginning:  # another robot
+        now[0] += then_s
+    assert beginning.aged(Message("a/b/c/incoming/drive-values", b"")).waited_s == pytest.approx(waited_s)
+
+
 @pytest.mark.parametrize("stood_s", [0.0, 2 * FRESH_S])
 def test_what_it_has_in_hand_while_it_stands_still_does_not_leave(
     monkeypatch: pytest.MonkeyPatch, alone: World, stood_s: float
@@ -258,27 +326,6 @@ def test_what_it_has_in_hand_while_it_stands_still_does_not_leave(
     alone.robots[0].publish("outgoing/counted", b"-1")
     alone.rest()
     assert (b"-1" in alone.operators[0].payloads("outgoing/counted")) is (stood_s == 0)
-
-
-def test_who_waits_for_the_hub_as_it_begins_is_not_taken_for_dead(
-    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
-    world = World(monkeypatch, "a")
-    caplog.set_level("INFO", module.__name__)
-    one = world.running["a"]
-    subscribe = one.hub.subscribe
-
-    def slowly(topic: str, *arguments: Any, **options: Any) -> Subscription:
-        for _ in range(int(2 * FRESH_S / STEP_S) * topic.endswith("#")):
-            world.now += STEP_S
-            world.robots[0].publish("outgoing/online", b"{}", retain=True)
-            one.gateway.publish_heartbeat()  # as its thread does
-            world.rest()
-        return subscribe(topic, *arguments, **options)
-
-    monkeypatch.setattr(one.hub, "subscribe", slowly)
-    world.run(4)
-    assert [record.getMessage() for record in caplog.records] == [f"carries {GOOB}"]
 
 
 def test_of_two_with_one_name_one_rests(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -307,7 +354,7 @@ def test_nothing_comes_twice_or_out_of_order_whatever_fails(monkeypatch: pytest.
                 *(each.cut for each in one.connections),
                 *(each.mend for each in one.connections),
                 # Not the broker's alone: the hub in memory queues what was not subscribed to yet, which no broker does.
-                *(each.hold for each in (one.hub, one.presence)),
+                *(each.hold for each in (one.hub, one.presence, one.stops)),
                 *(each.let_go for each in one.connections if not one.hangs),
             ]
             chance.choice(faults)()
