@@ -20,7 +20,7 @@ from pebble.recordings.files.mcap import Recorded
 from pebble.recordings.recorder.intake import EVENTS
 from pebble.transports import Message, MqttSettings, QoS, Transport, create
 from tests.commands.command_line import Run
-from tests.support import AmqttBroker, Broker, further, until
+from tests.support import AmqttBroker, Broker, until
 
 GOOB = "pebble/robots/goob"
 ONLINE, AUDIO, STATUS = f"{GOOB}/outgoing/online", f"{GOOB}/outgoing/audio", f"{GOOB}/outgoing/status"
@@ -91,9 +91,7 @@ def publish_all(robot: Transport, reference: Reference, number: int = 300) -> No
     assert until(lambda: len(reference.of(DRIVE)) == number, 10)
 
 
-@pytest.mark.parametrize(
-    ("protocol", "filters"), [("5", ()), further("3.1.1", ("--filter", "#", "--filter", "pebble/#"))]
-)
+@pytest.mark.parametrize(("protocol", "filters"), [("5", ()), ("3.1.1", ("--filter", "#", "--filter", "pebble/#"))])
 def test_what_a_subscriber_sees_is_recorded_byte_for_byte_with_its_flags(
     tmp_path: Path, protocol: str, filters: tuple[str, ...]
 ) -> None:
