@@ -6,7 +6,7 @@ from micropython import const
 from benjr import motor_shield, pins
 from common.payload import mix
 from common.settings import get
-from net.network_robot import NetworkRobot
+from wifi.network_robot import NetworkRobot
 
 _I2C_HZ = const(100_000)
 _I2C_TIMEOUT_US = const(2000)  # for a shield that stretches the clock

@@ -7,8 +7,8 @@ from common.drv8833 import Motor
 from common.payload import mix
 from common.settings import get
 from minilamp import pins
-from net.network_robot import NetworkRobot
-from net.tls import Wrapper
+from wifi.network_robot import NetworkRobot
+from wifi.tls import Wrapper
 
 _THRESHOLD = const(0.25)  # below it a motor stays off
 

@@ -22,7 +22,7 @@ ROM, PLAIN = "image with ROMFS", "plain image"
 NAMED = "image with ROMFS, named"
 #: Modules that are never loaded there.
 _UNUSED = {STOCK: ("usb",), FULL: ("console", "uart"), ROM: ("names",), PLAIN: ("names",), "": ("names",)}
-_SCRIPTS = ("board", "other_end", "workload_serial", "workload_described", "workload_network", "heap")
+_SCRIPTS = ("board", "net", "workload_serial", "workload_described", "workload_network", "heap")
 _DESCRIBED = ("goob_imu", "outlets")  # by pebble_serial_v1
 _ENOUGH_S = 300.0  # a minute of its own time takes 5 s, and whatever `make test` leaves it of the processors
 _HEAP = 64 * 1024  # to start with: the smaller, the quicker it is searched for garbage

@@ -47,7 +47,7 @@ class Mutation:
         )
 
 
-_ROBOT, _SESSION, _LIMIT = "net/network_robot.py", "net/session.py", "_DRIVE_LIMIT_MS = const(900)"
+_ROBOT, _SESSION, _LIMIT = "wifi/network_robot.py", "wifi/session.py", "_DRIVE_LIMIT_MS = const(900)"
 MUTATIONS = {
     "no dead-man": Mutation(_ROBOT, "_DRIVE_LIMIT_MS = const(90000)", _LIMIT),
     "a slow dead-man": Mutation(_ROBOT, "_DRIVE_LIMIT_MS = const(1020)", _LIMIT),
@@ -59,13 +59,13 @@ MUTATIONS = {
     ),
     "ticks without their wrap": Mutation("common/deadman.py", "\n\ndef diff(later, earlier): return later - earlier\n"),
     "retained commands count": Mutation(
-        "net/mqtt.py",
+        "wifi/mqtt.py",
         "\n\n_take = Client.take\n\n\ndef take(self, *count):\n    kind = _take(self, *count)\n    self.retained = 0\n"
         "    return kind\n\n\nClient.take = take\n",
         faults=("retained", "quiet"),
     ),
     "silence is borne": Mutation(
-        "net/connection.py",
+        "wifi/connection.py",
         "\n\n_step = Connection.step\n\n\ndef step(self, now, wifi):\n    due = _step(self, now, wifi)\n"
         "    return '' if due == 'drop' and self.reason == 'silence' else due\n\n\nConnection.step = step\n",
         faults=("stale",),
@@ -118,7 +118,7 @@ MUTATIONS = {
         faults=("script",),
     ),
     "names do not count": Mutation(
-        "net/mqtt.py", 'self.by = "ann"', "self.by = bytes(data[at:first]).decode()", ("control",), named=True
+        "wifi/mqtt.py", 'self.by = "ann"', "self.by = bytes(data[at:first]).decode()", ("control",), named=True
     ),
     "without a name one is whoever has control": Mutation(
         _ROBOT, 'by or (stops.lease.holder or [""])[0]', 'by or ("-" if stops.names else "")', ("control",), named=True

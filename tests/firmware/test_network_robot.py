@@ -11,12 +11,12 @@ from typing import Any
 
 import pytest
 
-from net import sockets
 from pebble.contract.identity import Identity
 from pebble.simulation import crowd
 from tests.firmware.drill import BASE, DRIVE, LIMIT_S, ONLINE, STALE_S, START_S, Drill
 from tests.simulation.virtual_broker import Session, VirtualBroker
 from tests.simulation.virtual_network import Answers
+from wifi import sockets
 
 KINDS = ("minilamp", "benjr")
 WEEK_S = 7 * 86_400.0  # more than half a period of the ticks
@@ -258,7 +258,7 @@ def test_settings_that_are_missing_are_named_when_the_motors_are_off(kind: str) 
 
 def test_a_certificate_needs_the_date() -> None:
     drill = Drill("minilamp", 1)
-    wrapper = drill.board.firmware.module("net.tls").Wrapper({"ca": "/ca.der"})
+    wrapper = drill.board.firmware.module("wifi.tls").Wrapper({"ca": "/ca.der"})
     wrapper.set_time(5_000)  # since boot
     assert drill.board.rtc[0] == 2000
     wrapper.set_time(1_700_000_000_999)

@@ -50,7 +50,7 @@ def names(tree: ast.Module) -> Iterator[str]:
 def imported(tree: ast.Module) -> set[str]:
     found = {alias.name for node in ast.walk(tree) if isinstance(node, ast.Import) for alias in node.names}
     found |= {node.module for node in ast.walk(tree) if isinstance(node, ast.ImportFrom) and node.module}
-    return {name.partition(".")[0] for name in found} - {"common", "net", *FIRMWARE}
+    return {name.partition(".")[0] for name in found} - {"common", "wifi", *FIRMWARE}
 
 
 @pytest.mark.parametrize("robot", ROBOTS)

@@ -67,7 +67,7 @@ def test_everything_arrives_on_a_real_micropython(board: NodeBoard, reported: li
     look = """
 import os
 from common.ticks import diff
-print(" ".join([f + "/" + n for f in ("common", "net", "minilamp") for n in os.listdir(f)]))
+print(" ".join([f + "/" + n for f in ("common", "wifi", "minilamp") for n in os.listdir(f)]))
 print(diff(5, 2**30 - 5))
 """
     files = (":private_config.json", ":main.py")

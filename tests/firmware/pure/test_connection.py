@@ -1,6 +1,6 @@
 """Getting to the broker, noticing its loss, and waiting before the next attempt."""
 
-from net.connection import Connection
+from wifi.connection import Connection
 
 MASK = (1 << 30) - 1
 

@@ -2,7 +2,7 @@
 
 import random
 
-from net.dns import answer, query
+from wifi.dns import answer, query
 
 HOST = "Broker.Example.org"
 ASKED = query(HOST, b"\x12\x34")

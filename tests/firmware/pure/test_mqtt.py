@@ -3,7 +3,7 @@
 import random
 
 from common import names
-from net.mqtt import Client, login
+from wifi.mqtt import Client, login
 
 ROOT = b"pebble/robots/r/incoming/"
 TOPICS = (b"estop", b"drive-values")

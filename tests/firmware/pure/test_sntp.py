@@ -3,7 +3,7 @@
 import struct
 
 from common.ticks import add
-from net.sntp import WallClock, epoch_ms, request
+from wifi.sntp import WallClock, epoch_ms, request
 
 NONCE = b"abcdefgh"
 LAST = (1 << 30) - 1  # the highest tick

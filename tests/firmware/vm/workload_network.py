@@ -3,7 +3,7 @@
 import json
 
 import board
-import other_end
+import net
 
 _MINUTE_MS = 60_000
 _COMMAND_MS = 50
@@ -25,13 +25,13 @@ class Workload:
         self._estop = _TOPIC % (robot, by, b"estop")
         self._reset = _TOPIC % (robot, by, b"estop-reset")
         self._stops = self._resets = 0
-        self._signed = other_end.publish(
+        self._signed = net.publish(
             topic, b'{"x":-0.250,"z":0.625,"y":0.000,"source":"autonomy","run":1000000,"valid_ms":400}', 2
         )
-        self._drive = other_end.publish(topic, b'{"x": -0.250, "y": 0.000, "z": 1.000}', 2)
-        self._wrapped = other_end.publish(topic, b'{"t": 1700000000000, "value": {"x": "0.5", "z": 0.75, "y": 0}}', 2)
-        self._retained = other_end.publish(topic, b'{"x": 0, "z": 1}', 3)
-        self._bad = [other_end.publish(topic, payload, 2) for payload in _BAD]
+        self._drive = net.publish(topic, b'{"x": -0.250, "y": 0.000, "z": 1.000}', 2)
+        self._wrapped = net.publish(topic, b'{"t": 1700000000000, "value": {"x": "0.5", "z": 0.75, "y": 0}}', 2)
+        self._retained = net.publish(topic, b'{"x": 0, "z": 1}', 3)
+        self._bad = [net.publish(topic, payload, 2) for payload in _BAD]
         self._next = 0
         self._count = 0
         self._joined = 0
@@ -42,16 +42,16 @@ class Workload:
         if board.now > _MINUTE_MS:
             return ""
         second = board.now // 1000
-        other_end.wifi_up = board.now > 2000 and not 40 <= second < 44
-        other_end.broker_up = not 25 <= second < 30
-        other_end.serve()
-        if not other_end.wifi_up or not other_end.broker_up:
+        net.wifi_up = board.now > 2000 and not 40 <= second < 44
+        net.broker_up = not 25 <= second < 30
+        net.serve()
+        if not net.wifi_up or not net.broker_up:
             return "no network"
         if board.now < self._next:
             return self._part
         self._next = board.now + _COMMAND_MS
         self._count += 1
-        if not other_end.connection or board.to_board.used:
+        if not net.connection or board.to_board.used:
             return self._part
         if 15 <= second < 20:
             self._part = "flood"
@@ -77,21 +77,20 @@ class Workload:
         if self._count % 10 < 5 and second < 37:
             self._stops += 1
             text = b'{"stop":"%016x","by":"%s","why":"%s"}' % (self._stops, b"b" * 32, b"w" * 40)
-            board.to_board.put(other_end.publish(self._estop, text if self._stops % 9 else b"x" * 2000, 2))
-        elif b'"latched":true' in bytes(other_end.state):
-            state = json.loads(other_end.state)
+            board.to_board.put(net.publish(self._estop, text if self._stops % 9 else b"x" * 2000, 2))
+        elif b'"latched":true' in bytes(net.state):
+            state = json.loads(net.state)
             self._resets += 1
             text = b'{"boot":"%s","count":%d,"by":"ann"}' % (state["boot"].encode(), state["count"])
-            board.to_board.put(other_end.publish(self._reset, text, 2))
+            board.to_board.put(net.publish(self._reset, text, 2))
 
     def check(self, robot):
         assert self._stops > 10, self._stops
         assert self._resets > 5, self._resets
-        state = json.loads(other_end.state)
+        state = json.loads(net.state)
         assert state["count"] > 10, state
         assert not state["latched"], state
         assert state["persisted"] is True, state
-        counts = other_end.counts
-        assert counts.get(other_end.CONNECT, 0) >= 3, counts  # boot, after the broker's outage, after the Wi-Fi's
-        assert counts.get(other_end.SUBSCRIBE, 0) >= 3, counts
-        assert counts.get(other_end.PUBLISH, 0) > 100, counts  # heartbeats
+        assert net.counts.get(net.CONNECT, 0) >= 3, net.counts  # boot, after the broker's outage, after the Wi-Fi's
+        assert net.counts.get(net.SUBSCRIBE, 0) >= 3, net.counts
+        assert net.counts.get(net.PUBLISH, 0) > 100, net.counts  # heartbeats

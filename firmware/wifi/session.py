@@ -9,9 +9,9 @@ from micropython import const
 
 from common.settings import get, hosts
 from common.ticks import diff
-from net import mqtt
-from net.connection import Connection
-from net.sockets import Stream, query_name
+from wifi import mqtt
+from wifi.connection import Connection
+from wifi.sockets import Stream, query_name
 
 _ALIVE_S = const(15)  # MQTT's keepalive: the broker publishes the will after 1.5 times of it
 _LONGEST_PAYLOAD = const(512)

@@ -5,8 +5,8 @@ import random
 from micropython import const
 
 from common.ticks import add, diff
-from net import sntp
-from net.sockets import Query, query_name
+from wifi import sntp
+from wifi.sockets import Query, query_name
 
 _WAIT_MS = const(900)  # half of the round trip is added; for longer ones that would be too inaccurate
 _LOOKUP_MS = const(3500)

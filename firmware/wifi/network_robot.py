@@ -15,9 +15,9 @@ from common.estop import EmergencyStop
 from common.payload import parse
 from common.settings import base, get
 from common.ticks import add, diff
-from net.clock import Clock
-from net.session import Session
-from net.wifi import Wifi
+from wifi.clock import Clock
+from wifi.session import Session
+from wifi.wifi import Wifi
 
 _DRIVE_LIMIT_MS = const(900)  # one second, including a slow turn of the loop
 # Places of the topics, stops first. Where names are checked, the topics without one are the first two, or three if

@@ -12,7 +12,7 @@ import socket
 from micropython import const
 
 from common.ticks import diff
-from net import dns
+from wifi import dns
 
 _AGAIN_MS = const(1000)
 _DATAGRAM = const(512)  # more than any answer needed here (RFC 1035 section 2.3.4)
