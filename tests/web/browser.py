@@ -8,12 +8,12 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
 import pytest
-from playwright.sync_api import Browser, BrowserContext, CDPSession, Locator, Page, Route
+from playwright.sync_api import Browser, BrowserContext, CDPSession, Error, Locator, Page, Route
 
 from pebble.bench import page_rig
 
@@ -90,8 +90,10 @@ class Tab:
         """The control of this name, once it is shown; it may be behind a tab of a phone, or folded."""
         found, end = self.page.locator(f'[data-test="{name}"]:visible'), time.monotonic() + within
         while time.monotonic() < end:
-            for press in (lambda: None, *(one.click for one in self.page.locator(_COVERS).all())):
-                press()
+            for cover in (None, *self.page.locator(_COVERS).element_handles()):
+                with suppress(Error):  # the one before has taken it away
+                    if cover is not None:
+                        cover.click(timeout=2000)
                 if self.until(lambda: found.count(), 0.3):
                     return found
         raise AssertionError(f"the page shows no {name}")
