@@ -32,6 +32,7 @@ pytestmark = pytest.mark.alone
 LAMP = "pebble/robots/minilamp"
 GRANT = {"shares": [ONLINE.metric], "commanded": {"goob": [DRIVE.metric]}}
 CABLE_S, STOP_S, BACK_S = 10.0, 1.0, 6.0
+_RUNS = itertools.count(7)  # the gateway's state has each that has begun, as long as this process
 
 
 class Lan:
@@ -69,7 +70,6 @@ class Lan:
         self.operator.subscribe(f"{LAMP}/outgoing/#", self._on_received, direct=True)
         self.commands: list[tuple[float, Message]] = []  # as the board receives them
         self._client("witness", self.near.port).subscribe(DRIVE.topic(LAMP), self._on_command, direct=True)
-        self._runs = itertools.count(7)
 
     def _client(self, name: str, port: int) -> Transport:
         client = create("mqtt", name, MqttSettings(host="127.0.0.1", port=port)).open(10)
@@ -84,7 +84,7 @@ class Lan:
 
     def script(self) -> Robot:
         """A new start of a script of goob's."""
-        run = next(self._runs)
+        run = next(_RUNS)
         robot = Robot(self.goob.config, MemoryTransport(f"script-{run}", self.goob.hub).open(), lambda _above: run)
         self._stack.callback(robot.close)
         assert until(lambda: robot.neighbour("minilamp").online, 20)
