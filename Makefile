@@ -12,7 +12,7 @@ help:
 	@echo "make demo SECONDS=30  ends by itself; succeeds only if every robot moved, stopped and obeyed as it should"
 	@echo "make demo PHONE=1     opens its page to the network, by https, with a login and a QR code"
 	@echo "make demo FLEET=1     two robots that hear each other on a LAN, two hubs and a gateway; goob follows fred without the broker"
-	@echo "make test             all checks and tests, some rows of each rule, some twelve minutes"
+	@echo "make test             all checks and tests, some rows of each rule, some nine minutes"
 	@echo "make quick            what to run before each commit: lint, types, contract, memory transport, one robot; a minute"
 	@echo "make thorough         the same, with all rows, all cases of the random tests, and the tests that take longest"
 	@echo "make fleet            brokers and hubs that are killed, hung and cut off under driven robots and 300 boards; 300 robots at a page; a quarter of an hour"
@@ -61,10 +61,11 @@ COMPUTING := tests/config tests/contract tests/media tests/motion tests/percepti
 	$(addprefix tests/firmware/test_,compile.py deadman_virtual.py golden.py heap.py motor_boards.py outlets.py) \
 	$(addprefix tests/firmware/test_,types.py vm.py) \
 	$(addprefix tests/web/,modules $(addprefix test_,driving_lockstep.py log_lines.py page_clock.py recent.py types.py))
-# Robots of a hundred lines, watched for most of a minute: they leave the processors to the demo.
-WAITING := $(addprefix tests/conform/test_,conform.py operators.py)
+# Robots of a hundred lines, watched for most of a minute, and demos that end at once: they leave the processors to others.
+WAITING := $(addprefix tests/conform/test_,conform.py operators.py) tests/test_demo.py
+ENDING := nothing_outlives or does_not_come_up
 # Files with tests of whole robots, to collect no others.
-ALONE = $(filter-out tests/test_demo.py $(WAITING),\
+ALONE = $(filter-out $(WAITING),\
 	$(shell grep --recursive --files-with-matches --include=test_*.py 'mark\.alone' tests))
 
 # Each run of pytest appends what its tests took; without it, for parts that are called alone.
@@ -107,10 +108,10 @@ test-robots: test-running
 
 test-demo: test-robots
 	@echo "pebble: the demo, whose robots need all processors"
-	@$(TESTS) $(if $(PEBBLE_THOROUGH),,-m "not thorough") tests/test_demo.py
+	@$(TESTS) -m "not page$(LESS)" -k "not ($(ENDING))" tests/test_demo.py
 
-test-waiting: test-robots
-	@$(TESTS) --workers 4 --spread -m "not page$(LESS)" $(WAITING) >.venv/waiting.log 2>&1 || \
+test-waiting: test-running
+	@$(TESTS) --workers 4 --spread -m "not page$(LESS)" -k "test_conform or test_operators or $(ENDING)" $(WAITING) >.venv/waiting.log 2>&1 || \
 		{ cat .venv/waiting.log; exit 1; }
 	@echo "pebble: robots of a hundred lines: $$(tail -n 1 .venv/waiting.log)"
 

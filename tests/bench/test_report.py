@@ -121,6 +121,7 @@ def test_the_times_of_the_run_are_shown() -> None:
     assert "Started 2026-11-20 14:00 UTC, 1 min 1 s." in written
 
 
+@pytest.mark.thorough
 def test_render_writes_all_again_from_what_is_there(tmp_path: Path) -> None:
     put(tmp_path, synthetic.startup(), "a table")
     put(tmp_path, synthetic.null_test("frames", "zenoh-shm"), "another table")

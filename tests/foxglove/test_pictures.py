@@ -208,6 +208,7 @@ def test_why_there_are_no_pictures_is_shown_in_foxglove(broker: Broker) -> None:
         assert until(lambda: robot.requests[-1] == WITHDRAWN, 20)
 
 
+@pytest.mark.thorough
 def test_a_client_that_does_not_read_delays_no_other_and_loses_the_oldest(broker: Broker) -> None:
     with filming(broker, fps=60, size=(640, 480), encoding="pbvd") as robot, live(broker) as server:
         watcher = Watcher(server.address)

@@ -41,6 +41,8 @@ def hub(file: FileArgument, state: StateOption = False) -> int:
             raise TransportError(f"no hub runs with {file}: start it with `pebble hub {file}`")
         for one in states:
             linked = f"linked to {', '.join(one.hubs)}" if one.hubs else "linked to no other hub"
+            if one.links < len(one.hubs):
+                linked += f", {one.links or 'none'} of them directly"
             counts = f"{one.clients} clients, {one.wills} wills, {one.retained} retained messages, {one.merges} merges"
             typer.echo(f"hub {one.name}: {counts}; {linked}")
         return 0

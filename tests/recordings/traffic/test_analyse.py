@@ -40,6 +40,7 @@ def folder(tmp_path: Path, messages: list[Sent]) -> Path:
     return tmp_path / "recordings"
 
 
+@pytest.mark.thorough
 def test_a_folder_that_is_recorded_to(run, folder, tmp_path):
     assert run("analyse", folder) == 0
     lines = {line.split()[0]: line.split() for line in run.out.splitlines() if line.strip()}

@@ -77,6 +77,7 @@ class Tags(HTMLParser):
         assert self.open.pop() == tag
 
 
+@pytest.mark.thorough
 def test_each_element_is_closed(page):
     assert Tags(page).open == []
 

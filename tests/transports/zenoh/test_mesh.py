@@ -20,6 +20,7 @@ from pathlib import Path
 import msgspec
 import pytest
 
+from pebble.client.hubs import hub_states
 from pebble.fleet import applying, certificates
 from pebble.fleet.folder import ZENOH, Fleet
 from pebble.fleet.roles import Account
@@ -149,6 +150,11 @@ class Mesh:
         slowest = float(process.stdout.readline())
         self._robots |= dict.fromkeys(names, process)
         return slowest
+
+    def is_whole(self) -> bool:
+        """Whether each hub has a connection to each other one: after one hung that takes a while."""
+        states = hub_states(self.hubs[NAMES[0]].settings)
+        return [one.links for one in states] == [len(NAMES) - 1] * len(NAMES)
 
     def kill_robot(self, name: str) -> None:
         process = self._robots.pop(name)
@@ -350,6 +356,7 @@ class TestWills:
         assert watch.receives(*robots)
         for number in range(hangs):
             name = NAMES[number % 3]
+            assert until(mesh.is_whole, 30), "else this one is all that connects the others"
             watch.leave(name)
             mesh.hubs[name].signal(signal.SIGSTOP)
             began = time.monotonic()

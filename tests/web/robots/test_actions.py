@@ -58,6 +58,7 @@ def _has_speed(robot: Console, speed: float) -> bool:
     return robot.tab.until(lambda: robot.speeds == pytest.approx((speed, speed), abs=0.01), 1)
 
 
+@pytest.mark.thorough
 def test_plus_and_minus_change_the_speed_of_the_wheels_while_they_turn(at_benjr: Console) -> None:
     assert at_benjr.drive()
     for key, speed in [("+", 0.7), ("+", 0.8), ("-", 0.7), ("-", 0.6)]:

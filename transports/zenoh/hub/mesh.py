@@ -333,12 +333,12 @@ class Mesh:
             store, hub = self._hub.store, self._hub
             clients = hub.alive_clients - self._wills.hubs - {self._name}
             counts = len(clients), len(store.wills()), len(store.retained())
-            state = HubState(self._name, sorted(self._wills.hubs), *counts, self.merges)
+            state = HubState(self._name, sorted(self._wills.hubs), *counts, self.merges, len(self.routers))
             query.reply(str(query.key_expr), merge.encode(state))
 
 
 class HubState(msgspec.Struct, frozen=True):
-    """What a hub tells people of itself. ``hubs``: the others that it sees."""
+    """What a hub tells people of itself. ``hubs``: the others that it sees; ``links``: those it has a connection to."""
 
     name: str
     hubs: list[str]
@@ -346,6 +346,7 @@ class HubState(msgspec.Struct, frozen=True):
     wills: int
     retained: int
     merges: int
+    links: int = 0
 
 
 decode_state = msgspec.msgpack.Decoder(HubState).decode
