@@ -10,7 +10,7 @@ from playwright.sync_api import Error, Page
 
 from tests.web.browser import Tab
 from tests.web.canned import CannedServer, Show
-from tests.web.states import GOOB, STATES
+from tests.web.states import GOOB, STATES, driver, estop
 
 _DENY = """for (const [owner, names] of [%s]) for (const name of names.split(" "))
   Object.defineProperty(owner, name, { configurable: true, %s });"""
@@ -64,14 +64,12 @@ CHANGES = {
     "the body is another": "document.body.replaceWith(made('body', 'to be read'));",
     "the body is taken away": "document.body.remove();",
 }
-_MINE = """(ref) => {
-  pebble.store.set(ref, "web/driver", { you: true, by: "alice", device: "" });
-  pebble.store.set(ref, "web/estop", { latched: false, sending: "", owners: [] });
+_SET = """([ref, driver, estop]) => {
+  pebble.store.set(ref, "web/driver", driver);
+  pebble.store.set(ref, "web/estop", estop);
 }"""
-_LATER = """(ref) => {
-  pebble.store.set(ref, "web/driver", { you: false, by: "zoe", device: "" });
-  pebble.store.set(ref, "web/estop", { latched: true, by: "zoe", why: "button", since: 0, sending: "", owners: [] });
-}"""
+_MINE = [GOOB, driver("alice", you=True), estop(0)]
+_LATER = [GOOB, driver("zoe"), estop(0, "zoe")]
 _WORDS = "(document.body?.innerText ?? '')"
 _RARE = pytest.mark.page
 
@@ -98,10 +96,10 @@ def test_what_a_browser_denies_keeps_no_page_from_its_server(show: Show, server:
 @_RARE
 @pytest.mark.parametrize("change", CHANGES)
 def test_state_is_shown_whatever_others_do_to_the_page(driving: Tab, change: str) -> None:
-    driving.page.evaluate(_MINE, GOOB)
+    driving.page.evaluate(_SET, _MINE)
     assert driving.until(f"{_WORDS}.includes('You drive') && !{_WORDS}.includes('is stopped')")
     driving.page.evaluate(f"() => {{ {_TEXTS} {CHANGES[change]} }}")
-    driving.page.evaluate(_LATER, GOOB)
+    driving.page.evaluate(_SET, _LATER)
     later = f"/is stopped\\s+by zoe/.test({_WORDS}) && !{_WORDS}.includes('You drive')"
     assert driving.until(later), driving.page.evaluate(_WORDS)
     foreign = "document.querySelector(':is(header, .banners, .why-line) .foreign')"

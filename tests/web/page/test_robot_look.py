@@ -235,7 +235,7 @@ def test_a_key_without_control_is_answered_and_enter_takes_control(show: Show, s
         assert server.sent("drive") == []
         page.keyboard.press("Enter")
         assert opened.until(lambda: [one["take"] for one in server.sent("lease")] == [True])
-        page.evaluate(SET, [GOOB, "web/driver", {"by": "alice", "device": "", "server": "", "you": True}])
+        page.evaluate(SET, [GOOB, "web/driver", driver("alice", you=True)])
         assert opened.until("pebble.store.get(pebble.driver.ref, 'web/driver').value.you")
         page.wait_for_timeout(300)
         assert not [one for one in server.sent("drive") if one["x"] or one["z"]], "a key that was held before"
