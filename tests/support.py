@@ -49,7 +49,7 @@ def some(all_: Iterable[T], step: int) -> list[T]:
     return list(all_)[:: 1 if THOROUGH else step]
 
 
-needs_root = pytest.mark.skipif(os.geteuid() != 0, reason="only root makes other users' files and mounts file systems")
+needs_root = pytest.mark.skipif(os.geteuid() != 0, reason="only root makes other users' files, mounts and networks")
 
 
 @contextmanager

@@ -25,8 +25,8 @@ from pebble.rig.processes import mosquitto_path, python
 from pebble.script import Robot
 from pebble.transports import TlsSettings, ZenohSettings, create
 from tests.fleet.test_neighbours import neighbour
-from tests.kit.lan import Lan, Machine, needs_root
-from tests.support import Child, until
+from tests.kit.lan import Lan, Machine
+from tests.support import Child, needs_root, until
 from tests.transports.zenoh_net import HubProcess
 
 pytestmark = [pytest.mark.alone, pytest.mark.thorough, needs_root]

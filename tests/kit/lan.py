@@ -11,13 +11,10 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
-import pytest
-
 from pebble.rig.processes import SBIN
 from tests.support import ROOT, Child, until
 
 NET = "10.78.0"
-needs_root = pytest.mark.skipif(os.geteuid() != 0, reason="network namespaces need root")
 
 
 class Machine:

@@ -94,7 +94,8 @@ def _drives(world: World, slot: int) -> None:
     """Do what the page says, until the wheels turn."""
     human = world.humans[slot]
     end = world.now + DRIVES_WITHIN_S
-    pressed, asks_until = False, world.now + _ASKED_S
+    asks_until = world.now + _ASKED_S * (len(world.humans) - 1)  # of two who ask, one waits for the other
+    pressed = False
     state = {"reason": "", "action": ""}
     while world.now < end:
         world.scheduler.run(_LOOK_S)
