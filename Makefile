@@ -5,7 +5,7 @@ VENV := .venv/bin/python
 
 .DEFAULT_GOAL := help
 unexport PYTHONDONTWRITEBYTECODE  # every test starts programs: compiling them each time would cost a third of the time
-.PHONY: help demo demo-options test quick thorough fleet stops soak floods schedules script-schedules page-schedules page-tests looks gstreamer gstreamer-tests brokers check firmware report clean lock audit sbom release life life-long check-types check-names check-collection quick-tests test-running test-robots test-computing test-checks test-demo test-waiting
+.PHONY: help demo demo-options test quick thorough fleet stops soak floods schedules script-schedules page-schedules page-tests looks gstreamer gstreamer-tests brokers check firmware report clean lock audit sbom release life life-long check-types check-names check-collection quick-tests test-packages test-running test-robots test-computing test-checks test-demo test-waiting
 
 help:
 	@echo "make demo             four simulated robots, on Zenoh, on MQTT and on MCUs, driven through a broker; Ctrl-C ends it"
@@ -84,20 +84,23 @@ quick-tests:
 	@$(TESTS) -k memory tests/transports/test_contract.py
 	@$(TESTS) -k "(drive_forms or silence) and zenoh" tests/robot/test_robot.py
 
-# Types, lint and what only computes use what tests that wait and measure leave of the processors.
-test: .venv/.ready-dev
-	@sh tools/debian-packages.sh mosquitto=mosquitto mosquitto_pub=mosquitto-clients chromium=chromium node=nodejs g++=g++ openssl=openssl ip=iproute2 tc=iproute2 nft=nftables systemd-analyze=systemd
-	@test -e /usr/include/mosquitto.h -a -e /usr/include/cjson/cJSON.h || sh tools/debian-packages.sh =gcc =libc6-dev =libmosquitto-dev =libcjson-dev
+# Types, lint and what only computes use what tests that wait and measure leave of the processors. pip and apt wait for
+# their downloads, so both run at once, and types are checked meanwhile.
+test:
 	@rm -f $(TIMES)
 	@$(MAKE) --no-print-directory --jobs=4 test-checks test-computing test-demo test-waiting
 	@$(SHOW_TIMES)
 	@$(VENV) tools/tree_growth.py
 
-test-running:
+test-packages:
+	@sh tools/debian-packages.sh mosquitto=mosquitto mosquitto_pub=mosquitto-clients chromium=chromium node=nodejs g++=g++ openssl=openssl ip=iproute2 tc=iproute2 nft=nftables systemd-analyze=systemd
+	@test -e /usr/include/mosquitto.h -a -e /usr/include/cjson/cJSON.h || sh tools/debian-packages.sh =gcc =libc6-dev =libmosquitto-dev =libcjson-dev
+
+test-running: test-packages .venv/.ready-dev
 	@echo "pebble: tests"
 	@$(TESTS) --workers 8 -m "not alone and not page$(LESS)" $(addprefix --ignore=,$(COMPUTING) tests/life) tests
 
-test-checks:
+test-checks: .venv/.ready-dev
 	@$(GENTLY) $(MAKE) --no-print-directory --jobs=2 check-types check-names >.venv/checks.log 2>&1 || \
 		{ cat .venv/checks.log; exit 1; }
 	@echo "pebble: lint, types, imports and names are in order"
@@ -115,7 +118,7 @@ test-waiting: test-running
 		{ cat .venv/waiting.log; exit 1; }
 	@echo "pebble: robots of a hundred lines: $$(tail -n 1 .venv/waiting.log)"
 
-test-computing:
+test-computing: test-packages .venv/.ready-dev
 	@$(GENTLY) $(TESTS) --workers 2 --timeout=600 -m "not alone and not page$(LESS)" $(COMPUTING) >.venv/computing.log 2>&1 || \
 		{ cat .venv/computing.log; exit 1; }
 	@echo "pebble: what only computes: $$(tail -n 1 .venv/computing.log)"
