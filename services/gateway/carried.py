@@ -122,7 +122,7 @@ class Carried:
         beginning: Beginning | None = None,
     ) -> None:
         self.base, self.since = base, since
-        self._hub, self._broker, self._holds = hub, broker, holds
+        self._holds = holds
         self._beginning = Beginning() if beginning is None else beginning
         self._paces, self._flooded = {side: Pace(clock, MOST_EACH, MOST_TOGETHER) for side in Side}, flooded
         self._subscriptions: list[Subscription] = []

@@ -18,6 +18,9 @@ _INCOMING = f"/{ESTOP.direction}/"
 #: Robots that begin in one turn: they wait together for hub and broker. More would hold up the end of others, and what
 #: moves is taken for old while a turn lasts longer than Beginning.LONG_S.
 TOGETHER = 8
+#: A turn that takes so long does not end. Those that begin in it wait 0.5 s and 0.7 s for a slow hub, twice if it is
+#: just back, and twice 2 s for a slow broker.
+STANDS_S = 10.0
 
 
 class CarriedRobots:
@@ -39,6 +42,12 @@ class CarriedRobots:
         self._beginning = Beginning()  # of those that begin now
         self._synchronize: dict[str, float] = {}  # when what is retained of it has arrived
         self._probed_at = float("-inf")
+        self._ticked_at = clock()
+
+    @property
+    def stands(self) -> bool:
+        """Whether what has to be done in each turn is not done any more."""
+        return self._clock() - self._ticked_at > STANDS_S
 
     @property
     def bases(self) -> frozenset[str]:
@@ -77,6 +86,7 @@ class CarriedRobots:
             self._probed_at = now
             for one in self._robots.values():
                 one.probe()
+        self._ticked_at = self._clock()
 
     def hub_changed(self) -> None:
         for robot, one in list(self._robots.items()):

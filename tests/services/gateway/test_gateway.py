@@ -27,7 +27,10 @@ GOOB = "pebble/robots/goob"
 
 
 class Running:
-    """A gateway and its three connections; while it hangs it does nothing, and what is sent to it waits."""
+    """A gateway and its connections; while it hangs it does nothing, and what is sent to it waits.
+
+    While it ``stands`` its turns do not end, and its other threads go on.
+    """
 
     def __init__(self, world: World, name: str) -> None:
         self.hub, self.broker, self.presence, self.stops = (
@@ -37,7 +40,7 @@ class Running:
             Connection(f"{name}-stops", world.broker, world),  # type: ignore[arg-type]
         )
         self.gateway = Gateway(name, ["pebble/robots/+"], *self.connections, clock=lambda: world.now)
-        self.hangs = False
+        self.hangs = self.stands = False
         self.gateway.open()
 
     @property
@@ -86,6 +89,7 @@ class World:
             for one in self.running.values():
                 if not one.hangs:
                     one.gateway.publish_heartbeat()
+                if not (one.hangs or one.stands):
                     one.gateway.tick()
             self.rest()
 
@@ -274,7 +278,7 @@ def test_a_robot_that_takes_long_to_begin_costs_the_gateway_no_other(monkeypatch
     gateway, begin = world.running["a"].gateway, module.begin
 
     def slow(robots: Sequence[Carried], hub: Transport, broker: Transport) -> list[Carried]:
-        for _ in range(int(2 * FRESH_S / STEP_S)):
+        for _ in range(int(0.7 * module.STANDS_S / STEP_S)):
             world.now += STEP_S
             for robot in world.robots:
                 robot.publish("outgoing/online", b'{"t": 0}', retain=True)
@@ -288,6 +292,24 @@ def test_a_robot_that_takes_long_to_begin_costs_the_gateway_no_other(monkeypatch
     world.run(4)
     assert gateway.carries == {GOOB, "pebble/robots/fred"}
     assert gateway.ownership.since(GOOB, world.now) == since
+
+
+def test_a_gateway_whose_turns_do_not_end_loses_its_robots() -> None:
+    world = World("a", "b", robots=(GOOB, "pebble/robots/fred"))
+    world.run(4)
+    (name,) = (name for name, one in world.running.items() if GOOB in one.gateway.carries)
+    (other,) = world.running.keys() - {name}
+    world.running[name].stands = True
+    world.run(0.9 * module.STANDS_S)
+    assert world.all_pass(), "its threads that receive carry them still"
+    world.run(0.1 * module.STANDS_S + FRESH_S + TAKING_S)
+    assert world.running[other].gateway.carries == {GOOB, "pebble/robots/fred"}
+    assert world.all_pass()
+    world.running[name].stands = False
+    world.run(RECOVERY_S)
+    assert GOOB in world.running[name].gateway.carries
+    assert world.wrong() == 0
+    assert world.all_pass()
 
 
 def test_robots_begin_together(monkeypatch: pytest.MonkeyPatch) -> None:
