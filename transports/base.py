@@ -9,7 +9,7 @@ import logging
 import threading
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Collection, Iterable, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from types import TracebackType
 from typing import Self
@@ -409,17 +409,36 @@ class Transport(ABC):
         that only forwards the message: it then runs on the receiving thread and must neither block nor subscribe.
         Messages published after this returned are received (T3), if there is a connection.
         """
-        check_filter(filter_)
-        if self.as_published and echo:
-            raise TransportError(f"an as-published connection never echoes: subscribe {filter_} with echo=False")
-        subscription = Subscription(self, filter_, handler, qos=QoS(qos), echo=echo, direct=direct, limit=limit)
+        (subscription,) = self.subscribe_all({filter_: handler}, qos=qos, echo=echo, direct=direct, limit=limit)
+        return subscription
+
+    def subscribe_all(
+        self,
+        handlers: Mapping[str, Handler],
+        *,
+        qos: QoS = QoS.DELIVERED,
+        echo: bool = True,
+        direct: bool = False,
+        limit: int = QUEUE_LIMIT,
+    ) -> list[Subscription]:
+        """As :meth:`subscribe`, for each filter and its handler; waits once for all of them."""
+        for filter_ in handlers:
+            check_filter(filter_)
+            if self.as_published and echo:
+                raise TransportError(f"an as-published connection never echoes: subscribe {filter_} with echo=False")
+        made = [
+            Subscription(self, filter_, handler, qos=QoS(qos), echo=echo, direct=direct, limit=limit)
+            for filter_, handler in handlers.items()
+        ]
         with self._subscriptions.lock:
             if self._state is State.CLOSED:
-                subscription._stop()
+                for one in made:
+                    one._stop()
                 raise TransportError(f"transport {self.client_id} is closed")
-            self._subscriptions.add(subscription)
-        self._declare(subscription)
-        return subscription
+            for one in made:
+                self._subscriptions.add(one)
+        self._declare_all(made)
+        return made
 
     def ask(self, topics: Collection[str]) -> None:
         """Have the retained messages of ``topics`` delivered to the subscriptions that match; waits, bounded.
@@ -482,6 +501,11 @@ class Transport(ABC):
     @abstractmethod
     def _send(self, message: Message, urgent: bool) -> bool:
         """Send one message within a bounded time; False if it cannot be sent now."""
+
+    def _declare_all(self, subscriptions: Sequence[Subscription]) -> None:
+        """As :meth:`_declare` for each; a backend may wait once for all."""
+        for subscription in subscriptions:
+            self._declare(subscription)
 
     @abstractmethod
     def _declare(self, subscription: Subscription) -> None:

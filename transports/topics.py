@@ -15,6 +15,7 @@ _REMEMBERED = 4096
 _NON_CHARACTERS = "\ufdd0-\ufdef" + "".join(
     chr(plane * 0x10000 + last) for plane in range(17) for last in (0xFFFE, 0xFFFF)
 )
+_WILDCARD = re.compile(r"/?[+#]")
 _FORBIDDEN = re.compile(f"[\x00-\x1f\x7f-\x9f{_NON_CHARACTERS}]")
 
 
@@ -84,10 +85,18 @@ def is_pattern(filter_: str) -> bool:
     return "+" in filter_ or "#" in filter_
 
 
+@remembered
+def beginning(filter_: str) -> str:
+    """What every topic that ``filter_`` matches begins with. Of hundreds of filters it soon shows those that do not."""
+    return _WILDCARD.split(filter_, maxsplit=1)[0]
+
+
 def matches(filter_: str, topic: str) -> bool:
     """MQTT's rules: ``+`` is one level, a final ``#`` is the rest and its parent, wildcards skip ``$…`` topics."""
     if filter_ == topic:
         return True
+    if not topic.startswith(beginning(filter_)):
+        return False
     want, have = filter_.split("/"), topic.split("/")
     if topic.startswith("$") and want[0] in ("+", "#"):
         return False

@@ -5,8 +5,9 @@ what hub and broker retain now.
 """
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Sequence
 from functools import partial
+from itertools import islice
 
 from pebble.contract import (
     AUDIO,
@@ -27,7 +28,7 @@ from pebble.forwarding.forwarder import Forwarder
 from pebble.forwarding.routing import GATEWAY, Side
 from pebble.forwarding.subjects import Subject, Subjects
 from pebble.services.gateway.pace import LARGEST, MOST_EACH, MOST_TOGETHER, Pace
-from pebble.transports import Message, State, Subscription, Transport, clock
+from pebble.transports import Handler, Message, State, Subscription, Transport, clock
 
 #: What the robot sends of each medium, by what allows and what requests it.
 _MEDIA = ((CAMERA, MQTT_VIDEO, VIDEO_CONTROL), (AUDIO, MQTT_AUDIO, AUDIO_CONTROL))
@@ -83,6 +84,26 @@ class Beginning:
         return Message(message.topic, message.payload, message.qos, message.retain, message.retain_requested, since)
 
 
+def begin(robots: Sequence["Carried"], hub: Transport, broker: Transport) -> list["Carried"]:
+    """Forward for each of ``robots`` from now on; first what the hub retains. Waits, bounded, for both sides: once for
+    all of them, as a round trip takes longer than all else that a robot needs. Returns those that are carried still.
+    """
+    _subscribe(robots, Side.LOCAL, hub, f"{OUTGOING}/#", f"{INCOMING}/flags/#")
+    held = [one for one in robots if one.open()]
+    _subscribe(held, Side.REMOTE, broker, f"{INCOMING}/#")
+    return held
+
+
+def _subscribe(robots: Sequence["Carried"], side: Side, transport: Transport, *below: str) -> None:
+    handlers: dict[str, Handler] = {}
+    for one in robots:
+        handlers |= one.subscribing(side, *below)
+    made = iter(transport.subscribe_all(handlers, echo=False, direct=True))
+    transport.ask([flag for one in robots for flag in one.subjects.flags] if side is Side.REMOTE else [])
+    for one in robots:
+        one.subscribed(side, islice(made, len(below)))
+
+
 class Carried:
     """A robot of the hub, since ``since``.
 
@@ -101,7 +122,7 @@ class Carried:
         beginning: Beginning | None = None,
     ) -> None:
         self.base, self.since = base, since
-        self._hub, self._broker, self._holds = hub, broker, holds
+        self._holds = holds
         self._beginning = Beginning() if beginning is None else beginning
         self._paces, self._flooded = {side: Pace(clock, MOST_EACH, MOST_TOGETHER) for side in Side}, flooded
         self._subscriptions: list[Subscription] = []
@@ -118,23 +139,22 @@ class Carried:
             clock=clock,
         )
 
-    def begin(self) -> bool:
-        """Forward from now on; first what the hub retains. Waits, bounded, for both sides.
-
-        False: meanwhile this gateway does not carry the robot any more.
-        """
-        sides, incoming = self.forwarder.sides, f"{self.base}/{INCOMING}"
-        sides[Side.LOCAL].subscribing()
-        self._subscribe(Side.LOCAL, self._hub, f"{self.base}/{OUTGOING}/#", f"{incoming}/flags/#")
-        self.forwarder.subscribed(Side.LOCAL)
+    def open(self) -> bool:
+        """Forward from now on; first what has waited. False: this gateway does not carry the robot any more."""
         if not self._holds():
             return False
         self.forwarder.open()
-        sides[Side.REMOTE].subscribing()
-        self._subscribe(Side.REMOTE, self._broker, f"{incoming}/#")
-        self._broker.ask(self.subjects.flags)
-        self.forwarder.subscribed(Side.REMOTE)
         return True
+
+    def subscribing(self, side: Side, *below: str) -> dict[str, Handler]:
+        """What to subscribe to on ``side`` below the robot's base; its retained messages arrive from now on."""
+        self.forwarder.sides[side].subscribing()
+        return {f"{self.base}/{one}": partial(self.receive, side) for one in below}
+
+    def subscribed(self, side: Side, subscriptions: Iterable[Subscription]) -> None:
+        """These are active, and what is retained there has arrived."""
+        self._subscriptions += subscriptions
+        self.forwarder.subscribed(side)
 
     def end(self) -> None:
         self.forwarder.shut()
@@ -186,10 +206,6 @@ class Carried:
             elif not self._is_wanted(channel):
                 return
         self.forwarder.receive(side, self._beginning.aged(message) if side is Side.REMOTE else message)
-
-    def _subscribe(self, side: Side, transport: Transport, *filters: str) -> None:
-        receive = partial(self.receive, side)
-        self._subscriptions += [transport.subscribe(one, receive, echo=False, direct=True) for one in filters]
 
     # -- media
 

@@ -8,14 +8,19 @@ from pebble.contract import ESTOP
 from pebble.contract.identity import parse_topic
 from pebble.forwarding.cycles import PROBE_PERIOD_S
 from pebble.forwarding.retained_window import INITIAL_SYNC_S
-from pebble.services.gateway.carried import Beginning, Carried
+from pebble.services.gateway.carried import Beginning, Carried, begin
 from pebble.services.gateway.connections import Connections
 from pebble.services.gateway.ownership import Ownership
 
 log = logging.getLogger(__name__)
 
 _INCOMING = f"/{ESTOP.direction}/"
-BEGINNING_S = 0.1  # in one turn: taking many robots must not hold up the end of others
+#: Robots that begin in one turn: they wait together for hub and broker. More would hold up the end of others, and what
+#: moves is taken for old while a turn lasts longer than Beginning.LONG_S.
+TOGETHER = 8
+#: A turn that takes so long does not end. Those that begin in it wait 0.5 s and 0.7 s for a slow hub, twice if it is
+#: just back, and twice 2 s for a slow broker.
+STANDS_S = 10.0
 
 
 class CarriedRobots:
@@ -34,9 +39,15 @@ class CarriedRobots:
         self._connections, self._ownership = connections, ownership
         self._flooded, self._clock = flooded, clock
         self._robots: dict[str, Carried] = {}
-        self._beginning = Beginning()  # of the one that begins now
+        self._beginning = Beginning()  # of those that begin now
         self._synchronize: dict[str, float] = {}  # when what is retained of it has arrived
         self._probed_at = float("-inf")
+        self._ticked_at = clock()
+
+    @property
+    def stands(self) -> bool:
+        """Whether what has to be done in each turn is not done any more."""
+        return self._clock() - self._ticked_at > STANDS_S
 
     @property
     def bases(self) -> frozenset[str]:
@@ -56,14 +67,10 @@ class CarriedRobots:
         for robot, one in list(self._robots.items()):
             if held.get(robot) != one.since:
                 self._end(robot)
-        end = self._clock() + BEGINNING_S
-        waiting = {robot: since for robot, since in held.items() if robot not in self._robots}
-        while waiting:
-            robot = next(iter(waiting))
-            self._begin(robot, waiting.pop(robot))
-            if self._clock() >= end:
-                return False
-        return True
+        waiting = [robot for robot in held if robot not in self._robots]
+        if waiting:
+            self._begin({robot: held[robot] for robot in waiting[:TOGETHER]})
+        return len(waiting) <= TOGETHER
 
     def pass_waiting(self) -> None:
         for one in list(self._robots.values()):
@@ -79,26 +86,31 @@ class CarriedRobots:
             self._probed_at = now
             for one in self._robots.values():
                 one.probe()
+        self._ticked_at = self._clock()
 
     def hub_changed(self) -> None:
         for robot, one in list(self._robots.items()):
             one.hub_changed(self._connections.hub.state)
             self._synchronize[robot] = self._clock() + INITIAL_SYNC_S
 
-    def _begin(self, robot: str, since: float) -> None:
+    def _begin(self, held: Mapping[str, float]) -> None:
         hub, broker = self._connections.hub, self._connections.broker
-        holds = partial(self._holds, robot, since)
-        one = Carried(robot, since, hub, broker, holds, self._clock, self._flooded, self._beginning)
+        made = []
+        for robot, since in held.items():
+            holds = partial(self._holds, robot, since)
+            one = Carried(robot, since, hub, broker, holds, self._clock, self._flooded, self._beginning)
+            made.append(one)
+            self._robots[robot] = one
         for transport in (hub, broker):
-            transport.judge_topics(is_stop=is_stop)  # of all robots, not of this one
-        self._robots[robot] = one
+            transport.judge_topics(is_stop=is_stop)  # of all robots, not of the newest one
         with self._beginning:
-            begun = one.begin()
-        if begun:
-            self._synchronize[robot] = self._clock() + INITIAL_SYNC_S
-            log.info("carries %s", robot)
-        else:  # it was not the owner any more before it had begun
-            self._end(robot, begun=False)
+            begun = begin(made, hub, broker)
+        for one in made:
+            if one in begun:
+                self._synchronize[one.base] = self._clock() + INITIAL_SYNC_S
+                log.info("carries %s", one.base)
+            else:  # it was not the owner any more before it had begun
+                self._end(one.base, begun=False)
 
     def _end(self, robot: str, *, begun: bool = True) -> None:
         self._synchronize.pop(robot, None)

@@ -81,7 +81,7 @@ class Gateway:
         """Run until :meth:`quit`.
 
         Heartbeats have a thread of their own: who begins to carry a robot waits for hub and broker, and one that sends
-        none meanwhile would be taken for dead, by itself too.
+        none meanwhile would be taken for dead, by itself too. Where turns do not end any more it is.
         """
         self.open()
         ready()
@@ -128,8 +128,11 @@ class Gateway:
             transport.close()
 
     def publish_heartbeat(self) -> None:
-        """Publish a heartbeat if one is due."""
+        """Publish a heartbeat if one is due, unless this gateway does not do its work."""
         now = self._clock()
+        if self._carried.stands:
+            self._quiet_log.log("stands", logging.ERROR, "no turn ends any more: others have to carry the robots")
+            return
         at_broker = self._connections.broker.state is State.CONNECTED
         if at_broker and self._heartbeats.due(now, TICK_S):
             self._heartbeats.publish(self._present.robots(now) if self._connections.at_hub else (), now)

@@ -17,7 +17,7 @@ from typing import NamedTuple
 
 import msgspec
 
-from pebble.contract import CAPABILITIES, DRIVE, ESTOP, MQTT_VIDEO, ONLINE
+from pebble.contract import CHANNELS, DRIVE, ESTOP, MQTT_VIDEO, ONLINE, Kind
 from pebble.transports import Message, MqttSettings, QoS, State, Transport, ZenohSettings, create
 from tests.support import Broker, free_port, until
 from tests.tcp_proxy import TcpProxy
@@ -25,6 +25,7 @@ from tests.transports.forked import Forked
 
 COMMANDS_HZ, HEARTBEAT_EACH, EVENT_EACH = 40, 10, 4  # of the commands each tenth comes with a heartbeat
 NEVER = ("commands twice", "commands out of order", "commands older than 1 s", "events twice", "events out of order")
+_STATES = [one for one in CHANNELS if one.kind is Kind.STATE and not one.is_pattern]  # a robot retains that many
 _EVENT = "outgoing/counted"  # the contract does not know it: an event
 
 
@@ -42,7 +43,8 @@ class Robot:
         self.stops: dict[str, float] = {}
         self.flags: list[bytes] = []
         self.events = itertools.count(1)
-        client.publish(CAPABILITIES.topic(self.base), b"{}", qos=QoS.DELIVERED, retain=True)
+        for state in _STATES:
+            client.publish(state.topic(self.base), b"{}", qos=QoS.DELIVERED, retain=True)
         client.subscribe(DRIVE.topic(self.base), self._on_drive, direct=True)
         client.subscribe(ESTOP.topic(self.base), self._on_stop, direct=True)
         client.subscribe(MQTT_VIDEO.topic(self.base), lambda message: self.flags.append(message.payload), direct=True)

@@ -18,7 +18,7 @@ from tests.transports.forked import Forked
 
 pytestmark = pytest.mark.alone
 FAULT_S = 5.0  # longer than everything that notices it takes
-OUTAGE_S, STOP_S = 4.0, 1.0
+OUTAGE_S, ALL_S, STOP_S = 4.0, 5.0, 1.0
 
 
 @pytest.fixture(scope="module", params=[2, pytest.param(3, marks=pytest.mark.thorough)])
@@ -80,6 +80,20 @@ def test_what_one_robot_is_sent_holds_up_no_other(hall: World, topic: str) -> No
     assert hall.wrong() == dict.fromkeys(NEVER, 0)
     assert outage <= OUTAGE_S / 4
     assert max(stops) <= STOP_S
+
+
+@pytest.mark.thorough
+def test_the_two_hundred_robots_of_a_gateway_that_dies_are_soon_carried_again(tmp_path: Path) -> None:
+    with world(tmp_path, 2, 400, proxied=False, many=True) as hall:
+        began = time.monotonic()
+        hall.gateways["gate-0"].kill()
+        stop = hall.stop()
+        assert until(lambda: hall.driven(began), 60)
+        took = time.monotonic() - began
+        sys.stdout.write(f"\n400 robots, half of them of a gateway that dies: {took:.1f} s; a stop {stop:.2f} s\n")
+        assert hall.wrong() == dict.fromkeys(NEVER, 0)
+        assert took <= ALL_S
+        assert stop <= STOP_S
 
 
 @pytest.mark.thorough

@@ -155,6 +155,27 @@ def test_T03_a_message_put_right_after_open_and_subscribe_arrives(net: Net, base
         receiver.close()
 
 
+def test_T03_several_subscriptions_that_are_made_together_are_as_good_as_each(net: Net, base: str) -> None:
+    publisher, client = net.client("publisher"), net.client("together")
+    topics = [f"{base}/{name}/topic" for name in ("a", "b", "c")]
+    for topic in topics:
+        assert publisher.publish(topic, b"retained", qos=DELIVERED, retain=True)
+    drained(publisher, client, base)
+    handlers = {f"{base}/{name}/#": Received() for name in ("a", "b", "c")}
+    first, *others = client.subscribe_all(handlers)
+    for topic in topics:
+        assert publisher.publish(topic, b"live", qos=DELIVERED)
+    assert all(received.until(b"retained", b"live") for received in handlers.values())
+    first.close()
+    for topic in topics:
+        assert publisher.publish(topic, b"again", qos=DELIVERED)
+    assert [received.until(b"retained", b"live", b"again") for received in [*handlers.values()][1:]] == [True, True]
+    assert [one.filter for one in others] == [*handlers][1:]
+    assert handlers[first.filter].payloads == [b"retained", b"live"]
+    with pytest.raises(TransportError):
+        client.subscribe_all({f"{base}/d": Received(), "d#": Received()})
+
+
 def test_T03_a_short_lived_publisher_is_received(net: Net, base: str) -> None:
     received = Received()
     net.client("receiver").subscribe(f"{base}/#", received)

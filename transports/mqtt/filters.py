@@ -11,6 +11,7 @@ from hashlib import blake2b
 
 from pebble.transports.base import Message
 from pebble.transports.bounds import BoundedTable
+from pebble.transports.topics import beginning, is_pattern
 
 _LIMIT = 65_536  # topics whose newest retained payload is recognised, per connection
 _BYTES = 8 << 20  # the same, for their names and digests
@@ -18,6 +19,9 @@ _BYTES = 8 << 20  # the same, for their names and digests
 
 def overlap(one: str, other: str) -> bool:
     """Whether there is a topic that both filters match."""
+    begin, other_begin = beginning(one), beginning(other)
+    if not (begin.startswith(other_begin) or other_begin.startswith(begin)):
+        return False
     left, right = one.split("/"), other.split("/")
     if "$" in (left[0][:1], right[0][:1]) and left[0] != right[0]:
         return False  # wildcards do not match a first level with a $
@@ -67,10 +71,14 @@ class BrokerFilters:
         self._subscribed = [*(existing for existing in self._subscribed if existing not in merged), wanted]
         return wanted, sorted(merged - {wanted})
 
-    def prune(self, wanted: Iterable[str]) -> list[str]:
-        """Remove and return the filters that overlap none of ``wanted``."""
+    def prune(self, unwanted: str, wanted: Iterable[str]) -> list[str]:
+        """Remove and return the filters that overlap ``unwanted``, which was wanted, and none of ``wanted``."""
         needs = list(wanted)
-        idle = [existing for existing in self._subscribed if not any(overlap(existing, need) for need in needs)]
+        idle = [
+            existing
+            for existing in self._subscribed
+            if overlap(existing, unwanted) and not any(overlap(existing, need) for need in needs)
+        ]
         self._subscribed = [existing for existing in self._subscribed if existing not in idle]
         return idle
 
@@ -99,7 +107,8 @@ class OwnMessageFilter:
 
     def subscribe_again(self, filter_: str) -> None:
         """Expect the retained messages that ``filter_`` matches to be sent once more."""
-        self._repeats.update(topic for topic in list(self._seen) if overlap(topic, filter_))
+        seen = list(self._seen) if is_pattern(filter_) else [filter_] if self._seen.has(filter_) else []
+        self._repeats.update(topic for topic in seen if overlap(topic, filter_))
 
     def is_echo(self, message: Message) -> bool:
         """Whether this is our own retained message, sent back because we subscribed."""

@@ -6,7 +6,7 @@ import logging
 import random
 import threading
 import time
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Mapping, Sequence
 from math import ceil
 
 from pebble.errors import TransportError
@@ -158,26 +158,34 @@ class MqttTransport(Transport):
         return accepted
 
     def _declare(self, subscription: Subscription) -> None:
+        self._declare_all([subscription])
+
+    def _declare_all(self, subscriptions: Sequence[Subscription]) -> None:
+        acks = []
         with self._filters.lock:
-            filter_, replaced = self._filters.add(subscription.filter)
             connection = self._connection
+            for subscription in subscriptions:
+                filter_, replaced = self._filters.add(subscription.filter)
+                if connection is not None:
+                    self._own_message_filter.subscribe_again(filter_)
+                    acks.append(connection.subscribe([(filter_, self._no_local(filter_))]))
+                    acks.append(connection.unsubscribe(replaced))
             if connection is None:
-                return  # the next connection subscribes to it
-            self._own_message_filter.subscribe_again(filter_)
-            asked = connection.subscribe([(filter_, self._no_local(filter_))])
+                return  # the next connection subscribes to them
             # Retained messages come after the SUBACK, on a bad network long after it; a ping's answer follows them.
-            acks = [asked, connection.unsubscribe(replaced), connection.ping()]
+            acks.append(connection.ping())
         if self._network is None or threading.current_thread() is not self._network.thread:
             deadline = time.monotonic() + _ANSWER_S
             for ack in acks:
                 ack.wait(deadline - time.monotonic())
 
     def ask(self, topics: Collection[str]) -> None:
-        deadline, rest = time.monotonic() + _ANSWER_S, list(topics)
+        deadline, rest, acks = time.monotonic() + _ANSWER_S, list(topics), list[PendingAck]()
         while rest:
             asked, rest = rest[:_ASKED], rest[_ASKED:]
-            for ack in self._ask(asked):
-                ack.wait(deadline - time.monotonic())
+            acks += self._ask(asked)
+        for ack in acks:
+            ack.wait(deadline - time.monotonic())
 
     def _ask(self, topics: list[str]) -> list[PendingAck]:
         with self._filters.lock:
@@ -189,9 +197,9 @@ class MqttTransport(Transport):
             asked = connection.subscribe([(name, self._no_local(name)) for name in names], QoS.LATEST)
             return [asked, connection.ping(), connection.unsubscribe(names)]
 
-    def _undeclare(self, subscription: Subscription) -> None:  # noqa: ARG002  (the ones that stay decide)
+    def _undeclare(self, subscription: Subscription) -> None:
         with self._filters.lock:
-            idle = self._filters.prune(other.filter for other in self._subscriptions)
+            idle = self._filters.prune(subscription.filter, [other.filter for other in self._subscriptions])
             if self._connection is not None:
                 self._connection.unsubscribe(idle)
 

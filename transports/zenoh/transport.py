@@ -12,7 +12,7 @@ import logging
 import os
 import threading
 import time
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 
 import zenoh
 
@@ -329,16 +329,20 @@ class ZenohTransport(Transport):
     # -- receiving
 
     def _declare(self, subscription: Subscription) -> None:
+        self._declare_all([subscription])
+
+    def _declare_all(self, subscriptions: Sequence[Subscription]) -> None:
         check_process(self._pid)
         with self._connecting:
             session = self._session
             if session is None:
-                return  # it is declared when there is a session
+                return  # they are declared when there is a session
             with contextlib.suppress(zenoh.ZError):  # closed meanwhile: then nothing is received any more
-                self._start(session, subscription)
+                for subscription in subscriptions:
+                    self._start(session, subscription)
                 counts = self._siblings.synchronize(SYNC_S)
                 if self._state is State.CONNECTED:
-                    self._hub.fetch(session, [subscription], counts)
+                    self._hub.fetch(session, subscriptions, counts)
 
     def _undeclare(self, subscription: Subscription) -> None:
         subscriber = self._subscribers.pop(subscription, None)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import json
 import random
-from collections.abc import Callable
+from collections.abc import Callable, Collection, Sequence
 
 import pytest
 
@@ -17,7 +17,7 @@ from pebble.services.gateway.gateway import Gateway
 from pebble.services.gateway.heartbeats import PresentRobots, will
 from pebble.services.gateway.ownership import FRESH_S, TAKING_S
 from pebble.services.gateway.pace import MOST_EACH, MOST_STOPS, MOST_TOGETHER
-from pebble.transports import Message, clock
+from pebble.transports import Message, Transport, clock
 from tests.forwarding.virtual import Connection, Hub
 from tests.services.mqtt_bridge.bridge_rig import Client
 from tests.support import cases
@@ -27,7 +27,10 @@ GOOB = "pebble/robots/goob"
 
 
 class Running:
-    """A gateway and its three connections; while it hangs it does nothing, and what is sent to it waits."""
+    """A gateway and its connections; while it hangs it does nothing, and what is sent to it waits.
+
+    While it ``stands`` its turns do not end, and its other threads go on.
+    """
 
     def __init__(self, world: World, name: str) -> None:
         self.hub, self.broker, self.presence, self.stops = (
@@ -37,7 +40,7 @@ class Running:
             Connection(f"{name}-stops", world.broker, world),  # type: ignore[arg-type]
         )
         self.gateway = Gateway(name, ["pebble/robots/+"], *self.connections, clock=lambda: world.now)
-        self.hangs = False
+        self.hangs = self.stands = False
         self.gateway.open()
 
     @property
@@ -58,8 +61,7 @@ class Running:
 class World:
     """Robots at a hub, an operator at a broker, who send numbered commands and events all the time."""
 
-    def __init__(self, monkeypatch: pytest.MonkeyPatch, *gateways: str, robots: tuple[str, ...] = (GOOB,)) -> None:
-        monkeypatch.setattr(module, "BEGINNING_S", float("inf"))  # time stands still in a turn
+    def __init__(self, *gateways: str, robots: tuple[str, ...] = (GOOB,)) -> None:
         self.now = 100.0
         self.connections: list[Connection] = []
         self.hub, self.broker = Hub(), Hub()
@@ -87,6 +89,7 @@ class World:
             for one in self.running.values():
                 if not one.hangs:
                     one.gateway.publish_heartbeat()
+                if not (one.hangs or one.stands):
                     one.gateway.tick()
             self.rest()
 
@@ -117,14 +120,14 @@ class World:
 
 
 @pytest.fixture
-def alone(monkeypatch: pytest.MonkeyPatch) -> World:
-    world = World(monkeypatch, "a")
+def alone() -> World:
+    world = World("a")
     world.run(3)
     return world
 
 
-def test_a_robot_is_carried_with_all_that_it_retains(monkeypatch: pytest.MonkeyPatch) -> None:
-    world = World(monkeypatch, "a")
+def test_a_robot_is_carried_with_all_that_it_retains() -> None:
+    world = World("a")
     (robot,), (operator,) = world.robots, world.operators
     robot.publish("outgoing/capabilities", b'{"v": 1}', retain=True)
     robot.publish("incoming/flags/mqtt-audio", b"true", retain=True)
@@ -147,8 +150,8 @@ def test_a_heartbeat_that_may_be_retained_shows_its_robot_once_another_follows()
     assert present.robots(0.0) == (GOOB,)
 
 
-def test_a_successor_takes_what_the_robot_retains_now(monkeypatch: pytest.MonkeyPatch) -> None:
-    world = World(monkeypatch, "a", "b")
+def test_a_successor_takes_what_the_robot_retains_now() -> None:
+    world = World("a", "b")
     world.run(4)
     (owner,) = (name for name, one in world.running.items() if GOOB in one.gateway.carries)
     world.robots[0].publish("outgoing/status", b'{"n": 1}', retain=True)
@@ -225,8 +228,8 @@ def test_pictures_pass_while_they_are_allowed_until_an_operator_ends_them(alone:
     assert not passes()
 
 
-def test_every_gateway_forwards_a_live_stop_in_every_state(monkeypatch: pytest.MonkeyPatch) -> None:
-    world = World(monkeypatch, "a", "b")
+def test_every_gateway_forwards_a_live_stop_in_every_state() -> None:
+    world = World("a", "b")
     stop = b'{"stop": "s%d"}'
     for number, seconds in enumerate((STEP_S, 0.5, 2.0)):  # not heard; taking; carried
         world.run(seconds)
@@ -242,9 +245,9 @@ def test_every_gateway_forwards_a_live_stop_in_every_state(monkeypatch: pytest.M
     assert len(world.robots[0].on("incoming/estop")) == before
 
 
-def test_what_one_robot_is_sent_holds_up_no_other(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_one_robot_is_sent_holds_up_no_other() -> None:
     """A connection on which stops wait does not, nor does a flood of commands or stops."""
-    world = World(monkeypatch, "a", robots=(GOOB, "pebble/robots/fred"))
+    world = World("a", robots=(GOOB, "pebble/robots/fred"))
     world.run(3)
     world.running["a"].stops.hold()
     for number in range(3 * MOST_TOGETHER):
@@ -269,26 +272,65 @@ def test_what_one_robot_is_sent_holds_up_no_other(monkeypatch: pytest.MonkeyPatc
 
 def test_a_robot_that_takes_long_to_begin_costs_the_gateway_no_other(monkeypatch: pytest.MonkeyPatch) -> None:
     """So it does where a driver has left thousands of retained messages; heartbeats have a thread meanwhile."""
-    world = World(monkeypatch, "a", robots=(GOOB, "pebble/robots/fred"))
+    world = World("a", robots=(GOOB, "pebble/robots/fred"))
     world.silent.add("pebble/robots/fred")
     world.run(3)
-    gateway, begin = world.running["a"].gateway, Carried.begin
+    gateway, begin = world.running["a"].gateway, module.begin
 
-    def slow(carried: Carried) -> bool:
-        for _ in range(int(2 * FRESH_S / STEP_S)):
+    def slow(robots: Sequence[Carried], hub: Transport, broker: Transport) -> list[Carried]:
+        for _ in range(int(0.7 * module.STANDS_S / STEP_S)):
             world.now += STEP_S
             for robot in world.robots:
                 robot.publish("outgoing/online", b'{"t": 0}', retain=True)
             gateway.publish_heartbeat()
             world.rest()
-        return begin(carried)
+        return begin(robots, hub, broker)
 
-    monkeypatch.setattr(Carried, "begin", slow)
+    monkeypatch.setattr(module, "begin", slow)
     since = gateway.ownership.since(GOOB, world.now)
     world.silent.clear()
     world.run(4)
     assert gateway.carries == {GOOB, "pebble/robots/fred"}
     assert gateway.ownership.since(GOOB, world.now) == since
+
+
+def test_a_gateway_whose_turns_do_not_end_loses_its_robots() -> None:
+    world = World("a", "b", robots=(GOOB, "pebble/robots/fred"))
+    world.run(4)
+    (name,) = (name for name, one in world.running.items() if GOOB in one.gateway.carries)
+    (other,) = world.running.keys() - {name}
+    world.running[name].stands = True
+    world.run(0.9 * module.STANDS_S)
+    assert world.all_pass(), "its threads that receive carry them still"
+    world.run(0.1 * module.STANDS_S + FRESH_S + TAKING_S)
+    assert world.running[other].gateway.carries == {GOOB, "pebble/robots/fred"}
+    assert world.all_pass()
+    world.running[name].stands = False
+    world.run(RECOVERY_S)
+    assert GOOB in world.running[name].gateway.carries
+    assert world.wrong() == 0
+    assert world.all_pass()
+
+
+def test_robots_begin_together(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each waits for hub and broker, and a gateway may take hundreds from one that has died."""
+    robots = tuple(f"pebble/robots/r{number}" for number in range(5 * module.TOGETHER))
+    world = World("a", robots=robots)
+    broker = world.running["a"].broker
+    ask = broker.ask
+
+    def slow(topics: Collection[str]) -> None:
+        world.now += 0.1
+        ask(topics)
+
+    monkeypatch.setattr(broker, "ask", slow)
+    while not world.running["a"].gateway.carries:
+        world.run(STEP_S)
+    began = world.now
+    while world.running["a"].gateway.carries != frozenset(robots):
+        world.run(STEP_S)
+    assert world.now - began <= 4 * (0.1 + STEP_S) + 0.01
+    assert world.all_pass()
 
 
 @pytest.mark.parametrize(
@@ -328,8 +370,8 @@ def test_what_it_has_in_hand_while_it_stands_still_does_not_leave(
     assert (b"-1" in alone.operators[0].payloads("outgoing/counted")) is (stood_s == 0)
 
 
-def test_of_two_with_one_name_one_rests(monkeypatch: pytest.MonkeyPatch) -> None:
-    world = World(monkeypatch, "a")
+def test_of_two_with_one_name_one_rests() -> None:
+    world = World("a")
     world.run(3)
     world.running["a again"] = Running(world, "a")
     world.run(8)
@@ -338,9 +380,9 @@ def test_of_two_with_one_name_one_rests(monkeypatch: pytest.MonkeyPatch) -> None
 
 
 @pytest.mark.parametrize("seed", range(cases(4, 200)))
-def test_nothing_comes_twice_or_out_of_order_whatever_fails(monkeypatch: pytest.MonkeyPatch, seed: int) -> None:
+def test_nothing_comes_twice_or_out_of_order_whatever_fails(seed: int) -> None:
     chance, names = random.Random(seed), ("a", "b", "c")[: 2 + seed % 2]
-    world = World(monkeypatch, *names, robots=(GOOB, "pebble/robots/fred"))
+    world = World(*names, robots=(GOOB, "pebble/robots/fred"))
     world.run(4)
     for _ in range(10):
         name = chance.choice(names)

@@ -181,7 +181,9 @@ class HubWorker:
         if "*" not in text:
             retained = self._store.get(text.removeprefix(wire.RETAINED))
             return [] if retained is None else [retained]
-        return [retained for retained in self._store.retained() if wanted.intersects(wire.RETAINED + retained.key)]
+        begin = text.partition("*")[0].rstrip("$/")  # of all of a fleet's it sorts most out soon
+        every = ((wire.RETAINED + retained.key, retained) for retained in self._store.retained())
+        return [retained for key, retained in every if key.startswith(begin) and wanted.intersects(key)]
 
     # -- clients
 
