@@ -162,7 +162,7 @@ def fleet(now: int) -> list[Value]:
     """Four robots, one of them off, and three components of other types."""
     lamp = liveness(latency_ms=900.0, whole_seconds=True)
     return [
-        ("", "web/broker", {"connected": True, "problem": "", "robots_omitted": 0}, 0),
+        ("", "web/broker", {"connected": True, "problem": "", "unheard": "", "robots_omitted": 0}, 0),
         *goob(now),
         *robot(now, FRED, "mqtt", 11.8, charging=True),
         (FRED, "autonomy-status", {"running": True, "timestamp": now / 1000, "file": "apriltag-follow"}, 1000),
@@ -357,7 +357,12 @@ UNDRIVEABLE = (
 REPLAYING = State("/replay?days", fleet, LIVE, {"recordings": True}, recordings=True)
 
 SILENT = at(GOOB, "web/liveness", liveness(online=False, silent_s=5.2))
-NO_BROKER = {"connected": False, "problem": "connection refused by 10.0.0.2:8883", "robots_omitted": 0}
+NO_BROKER = {
+    "connected": False,
+    "problem": "connection refused by 10.0.0.2:8883",
+    "unheard": "",
+    "robots_omitted": 0,
+}
 UNCONFIRMED = "base has not confirmed it"
 BOB_DRIVES = at(GOOB, "web/driver", driver("bob", "phone"))
 
