@@ -245,23 +245,28 @@ def test_it_finds_changes_of_the_plugin(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("instead", "found"),
+    ("without", "instead", "found"),
     [
-        ("", []),
-        ("#", ["lets in clients without a name", "lets in clients with a wrong password", "has no rules"]),
-        ("password_file passwords\n#", ["has no rules, each account may do all"]),
+        ((), (), []),
+        (
+            ("plugin", "allow_anonymous"),
+            ("allow_anonymous true",),
+            ["lets in clients without a name", "lets in clients with a wrong password", "has no rules"],
+        ),
+        (("plugin",), ("password_file {passwords}",), ["has no rules, each account may do all"]),
     ],
     ids=["of this fleet", "open", "without rules"],
 )
-def test_it_finds_a_second_broker_that_lets_everybody_write(tmp_path: Path, instead: str, found: list[str]) -> None:
+def test_it_finds_a_second_broker_that_lets_everybody_write(
+    tmp_path: Path, without: tuple[str, ...], instead: tuple[str, ...], found: list[str]
+) -> None:
     broker = FleetBroker(tmp_path / "hall", {"otto": DRIVER})
     second = broker.spare(tmp_path / "spare")
-    passwords = {name: broker_files.hashed(one) for name, one in broker.passwords.items()}
-    (second.folder / PASSWORDS).write_text(broker_files.passwords_text(passwords))
-    conf = (second.folder / CONF).read_text()
-    conf = conf.replace("allow_anonymous false", f"allow_anonymous {str(instead == '#').lower()}")
-    conf = conf.replace("\nplugin", f"\n{instead}plugin")
-    (second.folder / CONF).write_text(conf.replace("file passwords", f"file {second.folder / PASSWORDS}"))
+    conf, passwords = second.folder / CONF, second.folder / PASSWORDS
+    hashed = {name: broker_files.hashed(one) for name, one in broker.passwords.items()}
+    passwords.write_text(broker_files.passwords_text(hashed))
+    kept = [line for line in conf.read_text().splitlines() if not line.startswith(without)]
+    conf.write_text("\n".join([*kept, *(more.format(passwords=passwords) for more in instead)]))
     with broker, second:
         ((server, lines),) = check.of_others(broker.folder, broker.fleet)
         assert server.port == second.port
