@@ -99,8 +99,8 @@ class EveryHost(Transport):
 
     moved: Callable[[str], None] = staticmethod(lambda _base: None)
     delivers_late = True  # what is asked for is delivered, whatever came before
-    #: What is published on it every second, and subscribed to: a host that lets us in and does not deliver it lets us
-    #: publish or receive nothing. Empty: that is not noticed.
+    #: What is published on it every second, and subscribed to: a host that lets us in and does not deliver it, though
+    #: another one does, lets us publish or receive nothing. Empty: that is not noticed.
     echoed = ""
 
     def __init__(self, client_id: str, settings: MqttSettings) -> None:
@@ -109,7 +109,8 @@ class EveryHost(Transport):
         self._places = [f"{one.host}:{one.port}" for one in settings.each()]
         self._hosts = tuple(create("mqtt", client_id, one) for one in settings.each())
         self._homes = Homes()
-        self._unechoed: dict[int, float] = {}  # since when a host has not delivered what was published
+        self._echoing: set[int] = set()  # hosts that have delivered what was published
+        self._unechoed: dict[int, float] = {}  # since when a host has not
         self._lock = threading.Condition(threading.RLock())
         self._asked: dict[str, int] = {}  # robots whose states are to be asked for, and where
         self._expected: dict[str, int] = {}  # topics that are asked for now, and where
@@ -169,7 +170,7 @@ class EveryHost(Transport):
             return one.problem or f"{place} has not answered yet"
         if unheard := one.unheard:
             return f"{place}: {unheard}"
-        silent = time.monotonic() - self._unechoed.get(number, float("inf")) > _ECHO_S
+        silent = time.monotonic() - self._unechoed.get(number, float("inf")) > _ECHO_S and self._echoing - {number}
         return f"{place} delivers nothing of what this account publishes: may it do both there?" if silent else ""
 
     @property
@@ -326,6 +327,7 @@ class EveryHost(Transport):
 
     def _take(self, number: int, subscription: Subscription, message: Message) -> None:
         if message.topic == self.echoed:
+            self._echoing.add(number)
             self._unechoed.pop(number, None)
         parsed = parse_topic(message.topic)
         if parsed is not None:

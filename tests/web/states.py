@@ -363,6 +363,10 @@ NO_BROKER = {
     "unheard": "",
     "robots_omitted": 0,
 }
+UNHEARD = (
+    "only 1 of 2 brokers can be heard: broker spare.lab:8884 refused us: not authorized (bad user name or password?)"
+)
+ONE_BROKER = NO_BROKER | {"connected": True, "problem": "", "unheard": UNHEARD}
 UNCONFIRMED = "base has not confirmed it"
 BOB_DRIVES = at(GOOB, "web/driver", driver("bob", "phone"))
 
@@ -424,6 +428,7 @@ STATES: dict[str, State] = {
     ),
     "lost": State(GOOB_PATH, changed(fleet, MINE), silent=True, freezes=True),
     "no-broker": of(GOOB_PATH, MINE, at("", "web/broker", NO_BROKER)),
+    "one-broker": of(GOOB_PATH, MINE, at("", "web/broker", ONE_BROKER)),
     "silent": of(GOOB_PATH, MINE, SILENT, repeated={}, pictures=False),
     "old-picture": replace(DRIVING, freezes=True),
     "no-picture": of(GOOB_PATH, MINE, at(GOOB, "web/picture", flow("starting")), logs=logs, pictures=False),
