@@ -91,6 +91,19 @@ class SenderClocks(Generic[K]):
             age = now - sent - min(clock.least, clock.proved)
             return age if now - clock.began >= _YOUNG_S else max(age, waited_s)
 
+    def is_passed(self, key: K, sent: float) -> bool:
+        """Whether a message of this sender with a newer stamp was received; if much newer, its clock was set back."""
+        with self._lock:
+            clock = self._clocks.get(key)
+            return clock is not None and clock.newest - _JUMP_S < sent < clock.newest
+
+    def pass_over(self, key: K, sent: float, now: float) -> None:
+        """A message that is not judged was stamped ``sent``: what its sender stamped before it comes too late."""
+        with self._lock:
+            clock = self._clocks.get(key)
+            if clock is not None and sent - clock.newest < now - clock.received_at + _JUMP_S:
+                clock.newest = max(clock.newest, sent)
+
     def _begin(self, key: K, clock: _Clock) -> _Clock:
         clocks = self._clocks
         if key not in clocks and len(clocks) >= self._most:

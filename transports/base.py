@@ -33,6 +33,7 @@ _DELIVERED_TOPICS_LIMIT = 65_536  # topics a subscription remembers as delivered
 _DELIVERED_TOPICS_BYTES = 4 << 20
 _HANDLER_END_S = 1.0  # how long closing waits for handlers that are running
 _TURN_S = 0.02  # how soon the end of a turn is noticed
+_NAMED = 3  # subscriptions in one line
 _WARNING_PERIOD_S = 5.0  # between two log lines about the same overflowing subscription
 
 
@@ -285,6 +286,13 @@ class Transport(ABC):
     def untried(self) -> bool:
         """Whether the name of the broker has addresses that have not had their first turn yet."""
         return False
+
+    @property
+    def unheard(self) -> str:
+        """What is not delivered to us although there is a connection, and why, in one line; empty: all is."""
+        refused = [one.filter for one in self._subscriptions if one.refused]
+        more = f" and {len(refused) - _NAMED} more" if len(refused) > _NAMED else ""
+        return f"it refuses to deliver {', '.join(refused[:_NAMED])}{more}" if refused else ""
 
     def judge_topics(
         self,

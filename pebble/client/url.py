@@ -58,10 +58,12 @@ def _mqtt(url: str, password: str | None, ca_cert: Path | None) -> MqttSettings:
     if parts.rest.strip("/"):
         raise UrlError(f"--url must end after the port; topics are named separately: {FORMS}")
     others = [_another(one, parts.scheme) for one in more]
+    port = _PORTS[parts.scheme] if parts.port is None else parts.port
+    if len({(host.lower(), port) for host, port in ((parts.host, port), *others)}) <= len(others):
+        raise UrlError("--url names a broker twice: leave one of them")
     encrypted = parts.scheme == "mqtts"
     if ca_cert is not None and not encrypted:
         raise UrlError("--ca-cert has no use with mqtt://: use mqtts://")
-    port = _PORTS[parts.scheme] if parts.port is None else parts.port
     return MqttSettings(
         host=parts.host,
         port=port,

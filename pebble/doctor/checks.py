@@ -11,12 +11,13 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from functools import partial
 from importlib import metadata
 from pathlib import Path
 
 from pebble.check_result import CheckResult, State
-from pebble.client.page.from_config import settings_of
+from pebble.client.page.from_config import broker_of, settings_of
 from pebble.client.page.packages import require_packages
 from pebble.config import Config, Mqtt
 from pebble.config.web import is_loopback
@@ -27,11 +28,11 @@ from pebble.doctor.broker_probe import TIMEOUT_S, probe
 from pebble.doctor.driving import driving
 from pebble.doctor.loudspeaker import loudspeaker
 from pebble.doctor.media import media
-from pebble.doctor.publishing import publishing
+from pebble.doctor.publishing import of_page, publishing
 from pebble.doctor.reachable import beyond_loopback, own_addresses
 from pebble.doctor.recordings import recorder
 from pebble.doctor.who import who_drives
-from pebble.errors import PebbleError
+from pebble.errors import ConfigError, PebbleError
 from pebble.fleet import certificates
 from pebble.runtime.connections import REMOTE_RECONNECT_S, mqtt_settings
 from pebble.transports.socket_paths import FRAMES_SOCKET, fits_socket
@@ -69,15 +70,17 @@ def _robot(config: Config) -> Iterator[CheckResult]:
     yield from media(config, Path("/dev"))
     yield from loudspeaker(config)
     yield from operator_page(config)
+    yield from page_brokers(config)
     yield from recorder(config)
+    level = config.security.level
     for name, mqtt in _brokers(config):
         bridge = config.services.mqtt_bridge
         answer_s = LEVELS[bridge.link.slowest if mqtt is bridge.remote_mqtt else "wide"].answer_s
         for settings in mqtt_settings(mqtt, reconnect_max_s=REMOTE_RECONNECT_S, program="doctor").each():
-            found = list(broker(name, settings, partial(probe, timeout_s=max(TIMEOUT_S, answer_s))))
+            found = list(broker(name, settings, partial(probe, timeout_s=max(TIMEOUT_S, answer_s)), level=level))
             yield from found
             if mqtt is bridge.remote_mqtt and found[0].state is State.OK:
-                yield from publishing(found[0].what, settings, config.base, answer_s)
+                yield from publishing(found[0].what, settings, config.base, answer_s, level)
             if is_loopback(settings.host):
                 yield from beyond_loopback(name, settings, own_addresses())
 
@@ -98,6 +101,20 @@ def operator_page(config: Config) -> Iterator[CheckResult]:
         yield ok("operator page", f"port {settings.port} of {settings.host}")
     if settings.certificate is not None:
         yield _page_certificate(settings.certificate, time.time())
+
+
+def page_brokers(config: Config) -> Iterator[CheckResult]:
+    """Whether each broker of the operator page lets it in, and delivers what all robots send."""
+    web = config.web_interface
+    with suppress(ConfigError):  # of which the check of the page tells
+        section = broker_of(config) if web.mqtt.host or config.services.web_handler.enabled else None
+        level = config.security.level
+        each = () if section is None else mqtt_settings(section, reconnect_max_s=REMOTE_RECONNECT_S).each()
+        for settings in each:
+            found = list(broker("page's broker", settings, level=level)) if section is web.mqtt else []
+            yield from found
+            if not any(one.state is State.FAILED for one in found):
+                yield from of_page(f"page's broker {settings.host}:{settings.port}", settings, level)
 
 
 def _page_certificate(file: Path, now: float) -> CheckResult:

@@ -1,7 +1,8 @@
-"""Tries what an account may publish at a broker, and whether that broker holds small messages back."""
+"""Tries what an account may publish and receive at a broker, and whether that broker holds small messages back."""
 
 from __future__ import annotations
 
+import secrets
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -10,7 +11,9 @@ from dataclasses import replace
 from statistics import median
 
 from pebble.check_result import CheckResult
-from pebble.contract import BRIDGE_PROBE
+from pebble.config.security import SecurityLevel
+from pebble.contract import BRIDGE_PROBE, DRIVING, ONLINE
+from pebble.contract.identity import SERVERS, Identity
 from pebble.contract.levels import LEVELS
 from pebble.doctor import fail, ok, warn
 from pebble.forwarding.probes import new_probe
@@ -28,11 +31,15 @@ _HELD = 0.75  # of a round trip: a thin link itself needs some of it for the sec
 
 
 def publishing(
-    what: str, settings: MqttSettings, base: str, answer_s: float = LEVELS["wide"].answer_s
+    what: str,
+    settings: MqttSettings,
+    base: str,
+    answer_s: float = LEVELS["wide"].answer_s,
+    level: SecurityLevel = "open",
 ) -> Iterator[CheckResult]:
     """Publish probes, which no program takes for anything else, below ``base``, and see when they come back.
 
-    After ``answer_s`` one counts as lost.
+    After ``answer_s`` one counts as lost. Above the level ``open`` one that poses as another robot has to be.
     """
     client = MqttTransport("doctor", replace(settings, keepalive_s=_QUIET_S, silence_s=_QUIET_S))
     with closing(client):
@@ -48,9 +55,42 @@ def publishing(
             yield fail(what, f"this account may not publish to {echo.topic}: {why}", fix)
             return
         yield ok(what, "accepts what this account publishes")
+        if level != "open":
+            yield _bounds(what, client, echo)
         pairs = [pair for _ in range(_PAIRS if came_back else 0) if (pair := echo.pair()) is not None]
         if pairs:
             yield from held_back(what, min(pair[0] for pair in pairs), median(pair[1] for pair in pairs))
+
+
+def _bounds(what: str, client: MqttTransport, own: _Echo) -> CheckResult:
+    """Whether the broker has rules: no robot, and no page, may publish what a robot of another name does."""
+    other = _Echo(client, BRIDGE_PROBE.topic(f"pebble/robots/doctor-{secrets.token_hex(4)}"), own.answer_s)
+    payload = other.send(QoS.DELIVERED)
+    own.arrival(own.send(QoS.DELIVERED))  # what was let through has come before it
+    if other.has(payload):
+        fix = "start it with the files of `pebble fleet init`, see docs/fleet.md"
+        return fail(what, "has no rules: with this account one can pose as any robot, and drive it", fix)
+    return ok(what, "keeps this account from posing as another robot")
+
+
+def of_page(what: str, settings: MqttSettings, level: SecurityLevel = "open") -> Iterator[CheckResult]:
+    """Whether a page server with this account is sent what robots publish, and may announce who drives."""
+    client = MqttTransport("doctor", settings)
+    with closing(client):
+        client.open(_OPEN_S)
+        why = client.problem
+        if client.state is State.CONNECTED:
+            client.subscribe(ONLINE.filter("+/+/+"), lambda _: None)
+            echo = _Echo(client, DRIVING.topic(Identity("pebble", SERVERS, "doctor").base), LEVELS["wide"].answer_s)
+            came_back = echo.arrival(echo.send(QoS.DELIVERED)) is not None
+            why = client.unheard or ("" if came_back else f"what it publishes on {echo.topic} does not come back")
+        if why:
+            fix = "pebble fleet check; its role is page"
+            yield fail(what, f"a page with this account does not hear robots: {why}", fix)
+            return
+        yield ok(what, "delivers what robots send, and takes what a page publishes")
+        if level != "open":
+            yield _bounds(what, client, echo)
 
 
 def held_back(what: str, round_trip_s: float, apart_s: float) -> Iterator[CheckResult]:
@@ -76,7 +116,7 @@ class _Echo:
     """Probes on one topic, and when each came back."""
 
     def __init__(self, client: MqttTransport, topic: str, answer_s: float) -> None:
-        self._client, self.topic, self._answer_s = client, topic, answer_s
+        self._client, self.topic, self.answer_s = client, topic, answer_s
         self._came, self._arrivals = threading.Condition(), dict[bytes, float]()
         client.subscribe(topic, self._note)
 
@@ -95,11 +135,16 @@ class _Echo:
 
     def arrival(self, payload: bytes, giving_up: Callable[[], bool] = lambda: False) -> float | None:
         """When it came back; None: it has not in time."""
-        deadline = time.monotonic() + self._answer_s
+        deadline = time.monotonic() + self.answer_s
         with self._came:
             while payload not in self._arrivals and time.monotonic() < deadline and not giving_up():
                 self._came.wait(_POLL_S)
             return self._arrivals.get(payload)
+
+    def has(self, payload: bytes) -> bool:
+        """Whether it has come back."""
+        with self._came:
+            return payload in self._arrivals
 
     def pair(self) -> tuple[float, float] | None:
         """The round trip of one message, and by how much a second one, sent a moment later, came after it."""

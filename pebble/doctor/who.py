@@ -1,6 +1,7 @@
 """Who can drive a robot now: in words, and by name where the folder of its fleet is at hand."""
 
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 
 from pebble.check_result import CheckResult
@@ -37,6 +38,19 @@ def who_drives(config: Config) -> Iterator[CheckResult]:
             f'also senders without a name{while_}, because security.strangers is "{config.security.unnamed}"',
             "leave out security.strangers once all clients have names",
         )
+
+
+def unknown_brokers(config: Config) -> Iterator[str]:
+    """Of several brokers those that the fleet beside the config does not have: no file tells of their rules."""
+    remote = config.services.mqtt_bridge.remote_mqtt
+    for folder in _folders(config) if config.security.level != "open" and len(remote.hosts) > 1 else ():
+        with suppress(FleetError):  # of which the doctor tells
+            known = {(one.host, port) for one in load(folder).brokers for port in (one.port, one.unencrypted)}
+            for host, port in remote.places:
+                if (host, port) not in known:
+                    where = f"services.mqtt_bridge.remote_mqtt.hosts: {host}:{port}"
+                    doctor = "`pebble doctor` tries whether it lets everybody write"
+                    yield f"{where} is no broker of {folder / FLEET}, by this name: {doctor}"
 
 
 def _accounts(fleet: Fleet) -> str:

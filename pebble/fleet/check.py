@@ -30,7 +30,8 @@ _OTHER = "check-other"  # whose name others take
 
 def compare(folder: Path, fleet: Fleet) -> list[str]:
     """What a broker has too much or too little, and what will not do for long; one line each. Raises FleetError."""
-    return [*by_hand(folder, fleet), *of_rules(folder, fleet)]
+    others = [line for _, found in of_others(folder, fleet) for line in found]
+    return [*by_hand(folder, fleet), *of_rules(folder, fleet), *others]
 
 
 def by_hand(folder: Path, fleet: Fleet) -> list[str]:
@@ -43,14 +44,51 @@ def of_rules(folder: Path, fleet: Fleet) -> list[str]:
     found = list(zenoh_differences(folder, fleet))
     if fleet.rules == "files":
         return [*found, *_of_files(folder, fleet)]
-    for number, server in enumerate(fleet.brokers):
-        connection = control(folder, server, own=number == 0)
-        if connection is None:
-            found += _of_security(folder, fleet)
-        else:
-            with connection:
-                found += _of_plugin(fleet, connection)
-    return found
+    connection = control(folder, fleet.brokers[0], own=True)
+    if connection is None:
+        return [*found, *_of_security(folder, fleet)]
+    with connection:
+        return [*found, *_of_plugin(fleet, connection)]
+
+
+def of_others(folder: Path, fleet: Fleet) -> Iterator[tuple[Server, list[str]]]:
+    """Return the same of each further broker, which has its files on another machine; and whether it has rules at all.
+
+    One that is away, or is no broker of this fleet, keeps no other one from being compared.
+    """
+    for server in fleet.brokers[1:]:
+        place, found = next(places(folder, server, own=False)), list[str]()
+        try:
+            found += _doors(folder, place)
+            if fleet.rules == "plugin" and not found:
+                with dynsec.Control(place, ADMIN, admin_password(folder)) as connection:
+                    found += [f"broker {place}: {line}" for line in _of_plugin(fleet, connection)]
+        except FleetError as error:
+            found.append(str(error))
+        yield server, found
+
+
+def _doors(folder: Path, place: Place) -> Iterator[str]:
+    """Whether this broker lets strangers in, or an account do what none may."""
+    password, topic = admin_password(folder), f"check-{secrets.token_hex(4)}/robots/a/outgoing/junk"
+    for what, name, given in (("without a name", None, None), ("with a wrong password", ADMIN, f"{password}x")):
+        if _gets_in(place, name, given):
+            yield f"broker {place} lets in clients {what}: start it with a copy of the files in {folder}"
+    with BrokerClient(place, ADMIN, password) as client:
+        client.subscribe([topic])
+        client.publish(topic, b"")
+        client.flush()
+        client.subscribe([f"{topic}-2"])  # answered after what was sent before
+        if client.received:
+            yield f"broker {place} has no rules, each account may do all: start it with a copy of the files in {folder}"
+
+
+def _gets_in(place: Place, name: str | None, password: str | None) -> bool:
+    try:
+        BrokerClient(place, name, password).__exit__()
+    except (RefusedError, UnreachableError):
+        return False
+    return True
 
 
 def _certificates(folder: Path, fleet: Fleet) -> Iterator[str]:
@@ -158,14 +196,21 @@ class Tried:
 
 
 def attempt(folder: Path, fleet: Fleet) -> Tried:
-    """Make each attempt, with accounts that exist only meanwhile, at robots that do not exist. Raises FleetError."""
-    return _Attempts(folder, fleet).run()
+    """Make each attempt, with accounts that exist only meanwhile, at robots that do not exist. Raises FleetError.
+
+    Further brokers of `fleet` have their turn as well, unless they know rules by files, which no command changes there.
+    """
+    tried = Tried()
+    for number in range(len(fleet.brokers) if fleet.rules == "plugin" else 1):
+        _Attempts(folder, fleet, number, tried).run()
+    return tried
 
 
 class _Attempts:
     """Two robots that do not exist, one account of each role, and what each of them gets through."""
 
-    def __init__(self, folder: Path, fleet: Fleet) -> None:
+    def __init__(self, folder: Path, fleet: Fleet, number: int, tried: Tried) -> None:
+        """``number``: that of the broker."""
         self._folder, self._fleet = folder, fleet
         nonce = secrets.token_hex(4)
         self._base, self._other = (f"check-{nonce}/robots/{one}" for one in ("a", "b"))
@@ -177,10 +222,11 @@ class _Attempts:
         self._robot, self._admin = f"check-a-{nonce}", f"check-admin-{nonce}"
         self._fleet_then = replace(fleet, accounts=fleet.accounts | made)
         self._passwords = {name: broker_files.new_password() for name in made}
-        self._place = self._reachable(fleet.brokers[0])
-        self._tried = Tried()
+        self._server, self._own = fleet.brokers[number], number == 0
+        self._place = self._reachable()
+        self._tried = tried
 
-    def run(self) -> Tried:
+    def run(self) -> None:
         change_brokers(self._folder, self._fleet, self._fleet_then, self._passwords)
         try:
             self._wait_until_known()
@@ -193,7 +239,6 @@ class _Attempts:
             self._strangers()
         finally:
             change_brokers(self._folder, self._fleet_then, self._fleet, {})
-        return self._tried
 
     def _writes(self, name: str, robot: BrokerClient, admin: BrokerClient) -> None:
         tried: list[tuple[Row, str, bytes]] = []
@@ -261,16 +306,17 @@ class _Attempts:
         ports = {place: f"port {place.port}" for place in (self._place, *self._unencrypted())}
         for place, shown in ports.items():
             for what, (name, password) in logins.items():
-                self._note("stranger", f"log in {what}", shown, False, self._gets_in(place, name, password))
+                self._note("stranger", f"log in {what}", shown, False, _gets_in(place, name, password))
 
     def _unencrypted(self) -> Iterator[Place]:
-        port = self._fleet.brokers[0].unencrypted
+        port = self._server.unencrypted
         if port is not None:
             yield Place(self._place.host, port, None)
 
     def _note(self, name: str, what: str, topic: str, expected: bool, seen: bool) -> None:
         who = name.removeprefix("check-").rpartition("-")[0] or name
-        shown = {"a": "robot", "b": "another robot"}.get(who, who)
+        at = "" if self._own else f"broker {self._place}: "
+        shown = at + {"a": "robot", "b": "another robot"}.get(who, who)
         self._tried.note(shown, what, topic.replace(name, "NAME"), expected=expected, seen=seen)
 
     def _leave(self, name: str, will: Message) -> None:
@@ -279,25 +325,18 @@ class _Attempts:
     def _login(self, name: str) -> BrokerClient:
         return BrokerClient(self._place, name, self._passwords[name])
 
-    def _gets_in(self, place: Place, name: str | None, password: str | None) -> bool:
-        try:
-            BrokerClient(place, name, password).__exit__()
-        except (RefusedError, UnreachableError):
-            return False
-        return True
-
     def _wait_until_known(self) -> None:
         deadline = time.monotonic() + _ADOPTED_S
         last = list(self._passwords)[-1]
-        while not self._gets_in(self._place, last, self._passwords[last]):
+        while not _gets_in(self._place, last, self._passwords[last]):
             if time.monotonic() > deadline:
                 raise FleetError(f"broker {self._place} does not know new accounts: has it read its files?")
             time.sleep(0.05)
 
-    def _reachable(self, server: Server) -> Place:
+    def _reachable(self) -> Place:
         """Raises FleetError."""
         why: FleetError | None = None
-        for place in places(self._folder, server, own=True):
+        for place in places(self._folder, self._server, own=self._own):
             try:
                 BrokerClient(place, ADMIN, admin_password(self._folder)).__exit__()
             except UnreachableError as error:

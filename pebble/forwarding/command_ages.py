@@ -4,6 +4,8 @@ On a thin link what is known by pings includes the way *up*, which may wait behi
 sender's clock ``t`` and a ``key`` needs no pings once one of this key was fast; a request for control has its ``id``.
 """
 
+from math import inf
+
 from pebble.contract import codec
 from pebble.contract.payloads import ControlRequest, Drive
 from pebble.errors import PayloadError
@@ -63,8 +65,13 @@ class CommandAges:
             clocks, key = self._drivers, self._key(command)
         else:
             clocks, key = self._asking, command.id
-        if not isinstance(command.t, int) or not key or command.ends():  # what ends something may come another way
+        if not isinstance(command.t, int) or not key:
             return waited_s
+        if command.ends():  # what ends something may come another way
+            clocks.pass_over((account, key), command.t / 1000, clock.since_boot())
+            return waited_s
+        if clocks.is_passed((account, key), command.t / 1000):
+            return inf  # it was sent again, with QoS 2 for example, after a newer one
         return clocks.age_s((account, key), command.t / 1000, waited_s, clock.since_boot(), subject.waits_s)
 
     def _key(self, command: Drive) -> str:

@@ -407,6 +407,8 @@ class BrokerView(Struct, frozen=True, kw_only=True):
 
     connected: bool
     problem: str
+    #: What the server is not sent although it is connected, such as by one of several brokers, and why.
+    unheard: str
     robots_omitted: int
 
 

@@ -151,7 +151,10 @@ class Server:
 
     def _show_broker(self) -> None:
         view = m.BrokerView(
-            connected=self.broker.connected, problem=self.broker.problem, robots_omitted=self.robots.omitted
+            connected=self.broker.connected,
+            problem=self.broker.problem,
+            unheard=self.broker.unheard,
+            robots_omitted=self.robots.omitted,
         )
         self.robots.set_server_metric("", "web/broker", view)
 

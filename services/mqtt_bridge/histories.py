@@ -89,7 +89,7 @@ class StopHistory:
         self._clock, self._act, self._waits = clock, act, waits
         self._stops: OrderedDict[str, tuple[Row, bool]] = OrderedDict()  # by name; whether the sender's was checked
         self._states: dict[str, EstopState] = {}  # of the motor owners, by topic
-        self._reset: tuple[str, str, float] = ("", "", float("-inf"))
+        self._resets: OrderedDict[tuple[str, int], tuple[str, str, float]] = OrderedDict()  # by what they end
         self._nameless_at = float("-inf")
 
     def stop(self, by: str | None, stop: EstopCommand) -> None:
@@ -97,8 +97,8 @@ class StopHistory:
         self._stopped(stop.stop or "", who, account, stop.why or "")
 
     def reset(self, by: str | None, reset: EstopReset) -> None:
-        if any(one.boot == reset.boot and one.count == reset.count for one in self._states.values()):
-            self._reset = (*sender(by, reset.by), self._clock())
+        """It may come before the state that shows the stop has been followed."""
+        _remember(self._resets, (reset.boot, reset.count), (*sender(by, reset.by), self._clock()))
 
     def follow(self, topic: str, state: EstopState) -> None:
         """A motor owner has told its newest state."""
@@ -110,7 +110,7 @@ class StopHistory:
         for name in state.recent[: max(new, 0)] or [""] * (new > 0):
             self._stopped(name, *sender(None, state.by), state.why, seen_by_owner=True)
         if before.latched and not state.latched and state.boot == before.boot:
-            who, account, at = self._reset
+            who, account, at = self._resets.get((before.boot, before.count), ("", "", float("-inf")))
             recent = self._clock() - at < _RECENT_S
             self._act("reset", *((who, account) if recent else (UNKNOWN, UNKNOWN)), {})
 

@@ -44,7 +44,7 @@ def test_a_password_in_a_url_is_refused_and_not_repeated(url: str) -> None:
 
 @pytest.mark.parametrize(
     "url", ["", "broker", "mqtt:broker", "http://broker", "mqtt://", "mqtt://broker:99999", "mqtt://broker/a/topic",
-            "mqtt://a,", "mqtt://a,ann@b", "mqtt://a,b/topic", "mqtt://a,mqtt://b",
+            "mqtt://a,", "mqtt://a,ann@b", "mqtt://a,b/topic", "mqtt://a,mqtt://b", "mqtt://a,b,A:1883",
             "zenoh:", "zenoh:/nowhere/at/all", "zenoh:/tmp/" + 300 * "x"],
 )  # fmt: skip
 def test_other_urls_are_refused(url: str) -> None:

@@ -164,7 +164,7 @@ def test_a_list_of_brokers_is_brought_into_one_spelling() -> None:
     ("keys", "problem"),
     [
         ({"host": "c", "hosts": ["a", "b"]}, "host: is given beside hosts, which takes its place: leave out host"),
-        ({"hosts": ["a", "b", "a:1883"]}, "hosts: names a:1883 twice, leave one of them"),
+        ({"hosts": ["a", "b", "A:1883"]}, "hosts: names A:1883 twice, leave one of them"),
         ({"hosts": [f"b{number}" for number in range(9)]}, "hosts: must be 8 at most, not 9"),
         ({"hosts": ["mqtt://b:1883"]}, "is a URL: write"),
         ({"hosts": ["ann:s3cr3t@b"]}, "holds a login"),

@@ -244,6 +244,36 @@ def test_it_finds_changes_of_the_plugin(tmp_path: Path) -> None:
         assert check.compare(broker.folder, broker.fleet) == []
 
 
+@pytest.mark.parametrize(
+    ("without", "instead", "found"),
+    [
+        ((), (), []),
+        (
+            ("plugin", "allow_anonymous"),
+            ("allow_anonymous true",),
+            ["lets in clients without a name", "lets in clients with a wrong password", "has no rules"],
+        ),
+        (("plugin",), ("password_file {passwords}",), ["has no rules, each account may do all"]),
+    ],
+    ids=["of this fleet", "open", "without rules"],
+)
+def test_it_finds_a_second_broker_that_lets_everybody_write(
+    tmp_path: Path, without: tuple[str, ...], instead: tuple[str, ...], found: list[str]
+) -> None:
+    broker = FleetBroker(tmp_path / "hall", {"otto": DRIVER})
+    second = broker.spare(tmp_path / "spare")
+    conf, passwords = second.folder / CONF, second.folder / PASSWORDS
+    hashed = {name: broker_files.hashed(one) for name, one in broker.passwords.items()}
+    passwords.write_text(broker_files.passwords_text(hashed))
+    kept = [line for line in conf.read_text().splitlines() if not line.startswith(without)]
+    conf.write_text("\n".join([*kept, *(more.format(passwords=passwords) for more in instead)]))
+    with broker, second:
+        ((server, lines),) = check.of_others(broker.folder, broker.fleet)
+        assert server.port == second.port
+        assert [any(one in line for line in lines) for one in found] == [True] * len(lines)
+        assert all(f":{second.port} " in line for line in lines)
+
+
 # -- a person who drives
 
 

@@ -109,6 +109,17 @@ def test_a_clock_that_jumps_needs_the_pings_again(robot: Robot) -> None:
     assert late == [True, True, True, False]
 
 
+@pytest.mark.parametrize("newer", [MOVES, ZERO], ids=["drive", "zero"])
+@pytest.mark.parametrize(("ago_s", "late"), [(0.4, True), (0.1, False)], ids=["older", "as old"])
+def test_a_command_that_is_sent_again_after_a_newer_one_moves_nothing(
+    robot: Robot, newer: dict[str, Any], ago_s: float, late: bool
+) -> None:
+    """With QoS 2 a client does that after a broken handshake, and no robot is shown the mark of a duplicate."""
+    robot.knows(MOVES | OWN)
+    assert not robot.is_late("drive-values", newer | OWN, ago_s=0.1)
+    assert robot.is_late("drive-values", MOVES | OWN, ago_s=ago_s) == late
+
+
 def test_only_the_key_of_control_counts_where_there_is_one(robot: Robot) -> None:
     robot.ages.keys = frozenset((b"0badf00d",))
     for key in ("0badf00d", "12345678", "0badf00d 12345678"):

@@ -196,7 +196,7 @@ class RecordingRobot:
         keeps: bool = False,
         named: bool = False,
         pace: float = 1.0,
-        **login: str,
+        **login: Any,
     ) -> None:
         self.base, self.named, self._pace = base, named, pace
         self.wire: set[str] = set()

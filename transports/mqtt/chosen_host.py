@@ -115,6 +115,7 @@ class HostChoice:
         self._follows = settings.follows
         self._accepts_login = accepts_login
         self._connected: Place | None = None  # in the newest connection
+        self._silent: set[Place] = set()  # refuse all that is subscribed to, since one did not
         self._returning, self._probes = Return(), Probes(self._probe_first)
 
     @property
@@ -140,6 +141,15 @@ class HostChoice:
         self._returning.connected(time.monotonic(), first=place == self._places[0])
         if self._chosen is not None and not self._follows:
             self._chosen.write(place)
+
+    def leaves_silent(self, place: Place) -> bool:
+        """Whether to try the others because ``place`` refuses all subscriptions: once, as they may be no better."""
+        known, self._silent = self._silent, self._silent | {place}
+        return self.several and place not in known
+
+    def hears(self) -> None:
+        """A subscription is granted."""
+        self._silent = set()
 
     def why_leave(self, idle_s: Callable[[], float]) -> str:
         """Why to leave this host now, empty if it is to stay; ``idle_s``: for how long a change has disturbed nothing.

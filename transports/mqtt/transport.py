@@ -479,6 +479,11 @@ class MqttTransport(Transport):
             for subscription in subscriptions:
                 if overlap(subscription.filter, filter_):  # the filter that covers it: no other one overlaps
                     subscription.refused = is_refused
+        hosts, run = self._dialler.hosts, self._network
+        if not all(one.refused for one in subscriptions):
+            hosts.hears()
+        elif run is not None and subscriptions and hosts.leaves_silent(self._dialler.turns.place):
+            run.renewal = "it refuses all that is subscribed to"
 
     def note_refusal(self, topic: str, why: str) -> None:
         self._refused.report(self._dialler.where, topic, why)

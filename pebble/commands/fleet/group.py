@@ -276,8 +276,12 @@ def check_(
     require_packages("pebble fleet")
     with _changing(folder_) as (place, fleet):
         by_hand, rules = check.by_hand(place, fleet), check.of_rules(place, fleet)
-        tried = check.attempt(place, fleet) if live else None
-    wrong = by_hand + rules + ([] if tried is None else tried.wrong)
+        others = list(check.of_others(place, fleet))
+        bad = [server for server, found in others if found]
+        good = replace(fleet, brokers=tuple(one for one in fleet.brokers if one not in bad))
+        tried = check.attempt(place, good) if live else None
+    of_others = [line for _, found in others for line in found]
+    wrong = by_hand + rules + of_others + ([] if tried is None else tried.wrong)
     for line in wrong:
         typer.echo(f"pebble: {line}", err=True)
     if rules:

@@ -287,7 +287,8 @@ def _with_hosts(reader: Reader, mqtt: Mqtt, path: Path) -> Mqtt:
         )
     if len(mqtt.hosts) > _MOST_HOSTS:
         reader.notes.problem((*path, "hosts"), f"must be {_MOST_HOSTS} at most, not {len(mqtt.hosts)}")
-    if twice := [host for place, host in enumerate(mqtt.hosts) if mqtt.places[place] in mqtt.places[:place]]:
+    places = [(host.lower(), port) for host, port in mqtt.places]
+    if twice := [host for place, host in enumerate(mqtt.hosts) if places[place] in places[:place]]:
         reader.notes.problem((*path, "hosts"), f"names {twice[0]} twice, leave one of them")
     if path[-1] == "mqtt_mirror":
         reader.notes.problem((*path, "hosts"), "cannot be several: write host, the broker on the robot")

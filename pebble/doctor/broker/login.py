@@ -5,6 +5,7 @@ from collections.abc import Callable, Iterator
 
 from pebble.check_result import CheckResult
 from pebble.config.secret_text import shown_user
+from pebble.config.security import SecurityLevel
 from pebble.config.web import is_loopback
 from pebble.doctor import fail, ok, warn
 from pebble.doctor.broker_probe import REFUSED_ID, REFUSED_LOGINS, ProbeResult, probe
@@ -14,9 +15,16 @@ SOON_S = 14 * 86400
 
 
 def broker(
-    name: str, settings: MqttSettings, probe_login: Callable[..., ProbeResult] = probe, now: float | None = None
+    name: str,
+    settings: MqttSettings,
+    probe_login: Callable[..., ProbeResult] = probe,
+    now: float | None = None,
+    level: SecurityLevel = "open",
 ) -> Iterator[CheckResult]:
-    """Check that it answers, accepts the config's login, refuses anonymous ones, and is encrypted."""
+    """Check that it answers, accepts the config's login, refuses anonymous ones, and is encrypted.
+
+    Above the level ``open`` one that lets everybody in is no mere warning.
+    """
     what = f"{name} {settings.host}:{settings.port}"
     own = probe_login(settings, login=True)
     if own.code is None:
@@ -35,7 +43,7 @@ def broker(
             f"correct the addresses of {settings.host} in your DNS, or start the brokers there",
         )
     without_login = own if settings.username is None else probe_login(settings, login=False)
-    yield _anonymous_logins(what, settings, without_login)
+    yield _anonymous_logins(what, settings, without_login, level)
     yield _encryption(what, settings, own, time.time() if now is None else now)
 
 
@@ -55,12 +63,12 @@ def _login(what: str, settings: MqttSettings, answer: ProbeResult) -> CheckResul
     )
 
 
-def _anonymous_logins(what: str, settings: MqttSettings, answer: ProbeResult) -> CheckResult:
+def _anonymous_logins(what: str, settings: MqttSettings, answer: ProbeResult, level: SecurityLevel) -> CheckResult:
     if answer.code != 0:
         return ok(what, "refuses anonymous logins")
     if is_loopback(settings.host):
         return ok(what, "accepts anonymous logins: every program on this machine can drive the robot")
-    return warn(
+    return (warn if level == "open" else fail)(
         what,
         "accepts anonymous logins: every client that reaches it can drive the robot",
         "in mosquitto.conf: allow_anonymous false, password_file /etc/mosquitto/passwd",

@@ -11,13 +11,18 @@ from pebble.transports import Message
 from pebble.web.drive.driving import Lease
 
 _EVERY_S = 1.0
+_SYSTEM = "pebble"  # of the robots of most
 _ANNOUNCED = 64  # in one announcement
 
 
 class DrivenHere:
-    """``server`` is the id of this one. Publish what ``tick`` returns."""
+    """``server`` is the id of this one. Publish what ``tick`` returns.
+
+    ``always``: it is announced on `topic` that none is driven, too.
+    """
 
     def __init__(self, server: str) -> None:
+        self.topic, self.always = DRIVING.topic(Identity(_SYSTEM, "servers", server).base), False
         self.changed: set[str] = set()  # robots whose lease is another one: announced at once
         self._server = server
         self._announced_at = float("-inf")
@@ -40,7 +45,8 @@ class DrivenHere:
             return []
         self.changed.clear()
         self._announced_at = now
-        systems: dict[str, dict[str, Driver]] = {system: {} for system in self._systems}
+        always = {_SYSTEM} if self.always else set()
+        systems: dict[str, dict[str, Driver]] = {system: {} for system in self._systems | always}
         for ref, lease in list(leases.items())[:_ANNOUNCED]:
             one = Driver(by=lease.tab.user, device=lease.tab.device, since=lease.since_ms)
             systems.setdefault(ref.partition("/")[0], {})[ref] = one

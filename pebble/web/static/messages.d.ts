@@ -329,6 +329,7 @@ export interface RestartsView {
 export interface BrokerView {
   connected: boolean;
   problem: string;
+  unheard: string;
   robots_omitted: number;
 }
 

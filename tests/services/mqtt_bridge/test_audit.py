@@ -132,7 +132,9 @@ def test_a_stop_is_one_row_with_the_name_that_was_checked(watched: Watched) -> N
     watched.estop(latched=False, count=1, recent=[STOP])
     assert watched.rows() == [{"what": "reset", "who": "ben"}]
     watched.estop(latched=True, count=2, recent=["f" * 16, STOP], by="button")  # from within the robot
-    assert watched.rows() == [{"what": "stop", "who": "button?"}]
+    watched.send(ESTOP_RESET, "ben", boot="b", count=2)  # before the state was looked at
+    watched.estop(latched=False, count=2, recent=["f" * 16, STOP])
+    assert watched.rows() == [{"what": "stop", "who": "button?"}, {"what": "reset", "who": "ben"}]
 
 
 def test_a_command_with_an_old_key_is_refused(watched: Watched) -> None:

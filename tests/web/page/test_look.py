@@ -202,6 +202,7 @@ WHEN = {
     "stop-old": "cannot be held",
     "not-confirmed": "NOT CONFIRMED",
     "no-broker": "connection refused",
+    "one-broker": "broker spare.lab:8884 refused us",
     "silent": "goob is silent since",
     "old-picture": "The picture is ",
     "no-picture": "There is no picture yet",

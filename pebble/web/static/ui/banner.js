@@ -83,6 +83,11 @@ function ServerBanner() {
       <p><b>The server cannot reach the broker:</b> ${broker.problem || "no reason is known"}</p>
     <//>`;
   }
+  if (broker?.unheard) {
+    return html`<${Banner} kind="warn">
+      <p><b>The server does not hear everything, so robots may be missing:</b> ${broker.unheard}</p>
+    <//>`;
+  }
   if (you && !you.drives) {
     return html`<${Banner} kind="warn">
       <p><b>This connection is not encrypted.</b> Driving is switched off; stopping works.</p>
