@@ -149,7 +149,7 @@ def test_comments_and_indentation_are_left_out() -> None:
     source = f"/** What.\n * @param {{string}} a */\n  {code[0]}\n  // gone\n{code[1]} // gone\n{code[2]}\n"
     cast = "d = /** @type {string} */ (e);\n"
     assert stripped((source + cast).encode(), "js").decode() == f"{code[0]}\n{code[1]}\n{code[2]}\nd = (e);\n"
-    assert stripped(b"a {\n  b: url(//c); /* d */\n\n}\n", "css") == b"a{\nb:url(//c); /* d */\n}\n"
+    assert stripped(b"a {\n  b: url(//c); /* d */\n\n}\n", "css") == b"a{b:url(//c); /* d */\n}"
 
 
 def test_what_is_sent_is_the_same_program(tmp_path: Path) -> None:

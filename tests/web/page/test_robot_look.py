@@ -104,6 +104,16 @@ def test_trouble_moves_nothing_that_works_a_robot(show: Show, size: Size, what: 
             assert opened.page.evaluate(COVERED) == []
 
 
+@pytest.mark.parametrize("size", ["desktop", "phone", "landscape"])
+def test_a_panel_that_is_fetched_moves_nothing(show: Show, size: Size) -> None:
+    with show(QUIET, size, routes={"**/ui/panels/panels.js": lambda _route: None}) as opened:
+        _ready(opened)
+        before = opened.page.evaluate(PLACES)
+        opened.page.evaluate("pebble.panels.show('settings')")
+        opened.page.locator(".app > .loading").wait_for()
+        assert opened.page.evaluate(PLACES) == before
+
+
 @pytest.mark.parametrize("size", ["desktop", "phone"])
 @pytest.mark.parametrize("what", [_stopped, _notice, _lost], ids=lambda one: one.__name__)
 def test_trouble_moves_nothing_in_the_fleet(show: Show, size: Size, what: Callable[[Page], None]) -> None:

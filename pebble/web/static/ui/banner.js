@@ -55,10 +55,13 @@ function All({ at }) {
   </section>`;
 }
 
-const Banner = ({ kind, icon = "warning", children }) => html`<div class=${`banner ${kind}`}>
+const Banner = ({ kind, icon = "warning", button = null, children }) => html`<div class=${`banner ${kind}`}>
   <${Icon} name=${icon} />
   <div class="banner-text">${children}</div>
+  ${button}
 </div>`;
+
+const Reload = ({ children }) => html`<button type="button" onClick=${() => location.reload()}>${children}</button>`;
 
 /** No server, no broker, an old page, or no encryption. */
 function ServerBanner() {
@@ -66,16 +69,14 @@ function ServerBanner() {
   const broker = useValue("", "web/broker");
   const { bye, you } = connection;
   if (bye) {
-    return html`<${Banner} kind="bad">
+    return html`<${Banner} kind="bad" button=${html`<${Reload}>Connect again<//>`}>
       <p><b>The server has ended this connection:</b> ${bye.why}</p>
-      <div class="banner-actions"><button type="button" onClick=${() => location.reload()}>Connect again</button></div>
     <//>`;
   }
   if (connection.state === "lost") return html`<${LostBanner} />`;
   if (connection.isOld) {
-    return html`<${Banner} kind="bad">
+    return html`<${Banner} kind="bad" button=${html`<${Reload}>Reload<//>`}>
       <p><b>This page is older than the server.</b> Driving is off until it is loaded again.</p>
-      <div class="banner-actions"><button type="button" onClick=${() => location.reload()}>Reload</button></div>
     <//>`;
   }
   if (broker && !broker.connected) {

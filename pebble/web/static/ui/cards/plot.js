@@ -60,6 +60,7 @@ export function Lines({ series, fields, shownMs, least, paused }) {
     sizes.observe(element);
     sight.observe(element);
     join(draw);
+    draw();
     return () => {
       leave(draw);
       sizes.disconnect();

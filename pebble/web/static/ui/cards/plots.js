@@ -4,6 +4,7 @@ import { numbers } from "../../core/series.js";
 import { MOST_ADDED, USUAL, choices, fieldsOf, limitsOf, nameOfLine, restored } from "../../core/plot-choices.js";
 import { html, useMetrics, useOnline, usePage, useState, useTick } from "../parts/hooks.js";
 import { read, write } from "../parts/models.js";
+import { Nothing } from "../parts/nothing.js";
 import { Gone, Icon, Why, isGone } from "../parts/parts.js";
 import { Lines } from "./plot.js";
 import { recorderOf } from "../parts/recorder.js";
@@ -30,8 +31,9 @@ export function Plots({ at }) {
     showAll(!all);
   };
   const parts = { at, paused };
+  const empty = !known.length && !added.length;
   return html`<div class="plots">
-    ${!known.length && !added.length && html`<p class="dim">Nothing that could be plotted was received yet.</p>`}
+    ${empty && html`<${Nothing} icon="plot" what="Nothing to plot yet">It begins with the first number that is received.<//>`}
     ${usual.map((plot) => html`<${Figure} key=${plot.id} plot=${plot} ...${parts} />`)}
     ${added.map(
       (plot) => html`<${Figure}
@@ -45,9 +47,10 @@ export function Plots({ at }) {
       />`,
     )}
     <div class="plot-tools">
-      <button type="button" data-test="plots-pause" onClick=${() => pause(!paused)}>
+      ${!empty &&
+      html`<button type="button" data-test="plots-pause" onClick=${() => pause(!paused)}>
         <${Icon} name=${paused ? "play" : "halt"} />${paused ? "Go on" : "Pause"}
-      </button>
+      </button>`}
       ${more > 0 &&
       html`<button type="button" data-test="plots-all" aria-expanded=${all} onClick=${toggle}>
         ${all ? `Hide ${more}` : `${more} more`}
@@ -116,6 +119,7 @@ function Add({ at, metrics, added, onAdd }) {
     .slice(0, MOST_METRICS)
     .map((metric) => ({ metric, plots: choices(metric, store.get(at, metric)?.value) }))
     .filter(({ plots }) => plots.length);
+  if (!groups.length && !added.length) return null;
   const full = added.length >= MOST_ADDED ? `Not more than ${MOST_ADDED}: remove one first` : "";
   const why = full || (groups.length ? "" : "Nothing with numbers was received yet");
   const choose = ({ currentTarget }) => {

@@ -278,6 +278,10 @@ function ServiceFact({ at }) {
 const Told = ({ sign, className, children }) =>
   html`<li class=${`fact told ${className}`}><span aria-hidden="true">${sign}</span><span>${children}</span></li>`;
 
+/** On one line, which ends with dots where there is more. */
+const Fact = ({ icon = "", className = "dim", children }) =>
+  html`<li class=${`fact ${className}`}>${icon && html`<${Icon} name=${icon} />`}<span>${children}</span></li>`;
+
 /** Whether its motors obey. */
 function DoubtFact({ at }) {
   const { no, text } = doubtOf(useValue(at, "status"));
@@ -287,7 +291,7 @@ function DoubtFact({ at }) {
 /** The broker where it is, if that is not the preferred one. */
 function HostFact({ at }) {
   const view = useValue(at, "web/host");
-  return view && !view.first && html`<li class="fact dim">broker ${view.host}</li>`;
+  return view && !view.first && html`<${Fact}>broker ${view.host}<//>`;
 }
 
 /** ``plain``: without a picture. @param {{at: string, plain?: boolean}} props */
@@ -312,7 +316,7 @@ function FleetCard({ at, plain }) {
       <${Badge} at=${at} looks=${looks} />
       <${RouteLink} to=${at} className="fleet-card-link">
         <h2>${looks.name}</h2>
-        <span class="dim">${what}</span>
+        ${estop?.latched && !pictured ? html`<span class="bad">${stopWords(estop)}</span>` : html`<span class="dim">${what}</span>`}
       <//>
       <${Liveness} at=${at} />
     </div>
@@ -371,27 +375,25 @@ function DriverFact({ at, offers, online, estop, pictured }) {
   const view = useValue(at, "web/driver");
   const doubt = doubtOf(useValue(at, "status")).text;
   if (!offers.known && !offers.drives) return null;
-  if (!online && offers.drives) return html`<li class="fact dim"><${Icon} name="wheel" />who drives is not known</li>`;
-  if (!offers.drives) return html`<li class="fact dim"><${Icon} name="wheel" />does not drive</li>`;
-  if (estop?.latched) return html`<li class="fact dim"><${Icon} name="stop" />${pictured ? "reset it to drive" : stopWords(estop)}</li>`;
-  if (!view?.by) return doubt ? null : html`<li class="fact dim"><${Icon} name="wheel" />nobody drives</li>`;
-  return html`<li class="fact">
-    <${Icon} name="wheel" />${view.you ? html`<b>driven by you</b>` : `driven by ${driverName(view)}`}
-  </li>`;
+  if (!online && offers.drives) return html`<${Fact} icon="wheel">who drives is not known<//>`;
+  if (!offers.drives) return html`<${Fact} icon="wheel">does not drive<//>`;
+  if (estop?.latched) return pictured && html`<${Fact} icon="stop">reset it to drive<//>`;
+  if (!view?.by) return doubt ? null : html`<${Fact} icon="wheel">nobody drives<//>`;
+  return html`<${Fact} icon="wheel" className="">${view.you ? html`<b>driven by you</b>` : `driven by ${driverName(view)}`}<//>`;
 }
 
 function ScriptFact({ at, online }) {
   const status = useValue(at, "autonomy-status");
   if (!status?.running) return null;
-  if (!online) return html`<li class="fact dim"><${Icon} name="script" />script: not known</li>`;
-  return html`<li class="fact"><${Icon} name="script" />script: ${plain(status.file ?? "?")}${status.waiting_for ? ", waiting" : ""}</li>`;
+  if (!online) return html`<${Fact} icon="script">script: not known<//>`;
+  return html`<${Fact} icon="script" className="">script: ${plain(status.file ?? "?")}${status.waiting_for ? ", waiting" : ""}<//>`;
 }
 
 /** In a word or two, what a component reports that is no robot. */
 function StatusFact({ at }) {
   const status = inner(useValue(at, "status"));
   if (!isObject(status)) return null;
-  return html`<li class="fact dim">${plain(Object.fromEntries(Object.entries(status).slice(0, 3)))}</li>`;
+  return html`<${Fact}>${plain(Object.fromEntries(Object.entries(status).slice(0, 3)))}<//>`;
 }
 
 /**

@@ -87,23 +87,20 @@ function Bar({ at, replay, player }) {
       </button>
       <button type="button" data-test="on-10" aria-label="Forward: +10 s" onClick=${() => replay.step(10_000)}>+10 s</button>
     </div>
-    <label class="field"
-      ><span>Speed</span
-      ><select
-        data-test="speed"
-        value=${String(player.speed)}
-        onChange=${(event) => player.setSpeed(Number(event.currentTarget.value))}
-      >
-        ${SPEEDS.map((speed) => html`<option key=${speed} value=${speed}>×${speed}</option>`)}
-      </select></label
+    <select
+      data-test="speed"
+      aria-label="Speed"
+      value=${String(player.speed)}
+      onChange=${(event) => player.setSpeed(Number(event.currentTarget.value))}
     >
+      ${SPEEDS.map((speed) => html`<option key=${speed} value=${speed}>×${speed}</option>`)}
+    </select>
     <div class="replay-keys" role="group" aria-label="One picture">
       <button type="button" data-test="picture-back" aria-label="One picture back" onClick=${() => replay.stepPicture(-1)}><${Icon} name="back" /><kbd>,</kbd></button>
       <button type="button" data-test="picture-on" class="turned" aria-label="One picture on" onClick=${() => replay.stepPicture(1)}><${Icon} name="back" /><kbd>.</kbd></button>
     </div>
     <output class="replay-time" data-test="time">${player.seeks ? stamp(player.position) : "–"} <small>${words}</small></output>
-    <${Listen} sound=${replay.sound} player=${player} />
-    <${StillTools} source=${at} />
+    <div class="replay-tools"><${Listen} sound=${replay.sound} player=${player} /><${StillTools} source=${at} /></div>
   </div>`;
 }
 
