@@ -5,7 +5,7 @@
 2. No motion resumes by itself: a gesture begins with an action of the human, and only of inputs that were pressed
    after the last interruption.
 3. No page is blocked for good: see rest.py.
-4. Only the holder of the lease moves wheels.
+4. Only the holder of the lease moves wheels; it is that of a robot which has given control to another no more.
 5. After a stop nothing moves until a new gesture begins.
 6. A command is at most 0.6 s old when the server forwards it.
 """
@@ -73,6 +73,7 @@ class Rules:
         self._received: dict[Any, float] = {}  # the newest command of that gesture
         self._newest_command: Command | None = None
         self._gap_s = 0.0  # between the newest two
+        self._holder = ""  # the client to which the robot has given control
         self.published = 0  # commands that move
         self.reachable: Callable[[], bool] = lambda: True  # the broker, by the server
         self.stopping: Callable[[], bool] = lambda: False  # an emergency stop is being sent, with zeros
@@ -157,6 +158,19 @@ class Rules:
     def lease_moved(self, tab: Any) -> None:
         """It belongs to another page, or another server."""
         self._ends(tab, "a wheel turns by a page that no longer has the lease")
+
+    def control_given(self, holder: str) -> None:
+        """The robot publishes which client of this server, or of another one, has control."""
+        self._holder, faults = holder, self.faults
+
+        def look() -> None:
+            if faults == self.faults and self._holder == holder and self.reachable():
+                lease = self.driving().leases.get(self._base)
+                client = None if lease is None else lease.control
+                self._check(client is None or client.id == holder, "a page has the lease of a robot that another has")
+
+        if holder and self.reachable():
+            self._scheduler.after(SILENCE_S + TICK_S + self.path_s() + _EPS, look)
 
     # -- faults
 

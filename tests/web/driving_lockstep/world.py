@@ -15,7 +15,7 @@ from typing import Any, Self
 
 import msgspec
 
-from pebble.contract import CAPABILITIES, CONTROL, CONTROL_TAKE, DRIVING, ONLINE, codec
+from pebble.contract import CAPABILITIES, CONTROL, CONTROL_STATE, CONTROL_TAKE, DRIVING, ONLINE, codec
 from pebble.contract.identity import Identity
 from pebble.contract.payloads import ControlRequest, Driver
 from pebble.contract.payloads import Driving as DrivingPayload
@@ -52,6 +52,7 @@ _ORDERS = (
 _NAMES = tuple(KEYS)
 _STICK = ((0.0, 0.9), (0.7, 0.3), (-0.8, 0.0), (0.05, 0.02), (0.3, -0.9))
 _HEARTBEAT_S = 1.0
+_CONTROL_STATE = CONTROL_STATE.topic(BASE, owner="serial")
 
 _GONE = {"reason": "gone", "action": "", "open": False, "ended": False, "dragged": False, "token": ""}
 
@@ -87,7 +88,7 @@ class World:
         scheduler.on_output = self._output
         TIME.clock = scheduler.clock
         self.rules = Rules(scheduler, BASE)
-        self.network = Network(scheduler, lambda *_: None, lambda *_: None)
+        self.network = Network(scheduler, lambda *_: None, self._published)
         wheels = RecordedWheels(scheduler)
         wheels.moved = self.rules.moved
         self.rules.wheels = wheels
@@ -203,6 +204,10 @@ class World:
             before = float("inf") if human.blocked_from is None else human.blocked_from
             human.interrupt(self.now, f"the server has refused it: {message['why']}", before)
             human.gesture = None
+
+    def _published(self, sender: Process, message: Message) -> None:
+        if sender is self.owner and message.topic == _CONTROL_STATE:
+            self.rules.control_given(msgspec.json.decode(message.payload)["id"])
 
     def _void(self, slot: int, why: str) -> None:
         self.humans[slot].interrupt(self.now, why)
