@@ -58,6 +58,7 @@ class Human:
     balance: float = 0.0
     dialog: int = 0  # counts what is opened and closed
     has_pad: bool = False
+    without_pad: float = float("-inf")  # since when
     pad_frozen: bool = False
     meta: bool = False
     asleep: bool = False  # their computer

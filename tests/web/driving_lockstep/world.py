@@ -357,12 +357,17 @@ class World:
     def show_pad(self, slot: int, axes: tuple[float, float, float] | None) -> None:
         human = self.humans[slot]
         x, z, y = axes or (0.0, 0.0, 0.0)
+        appears = not human.has_pad and human.blocked_from is None and self.now - human.without_pad > SOON_S
+        if human.has_pad and axes is None:
+            human.without_pad = self.now
         human.has_pad = axes is not None
         if axes and (x or z or y):
             if "pad" in human.held:
                 human.change("pad", axes, self.now)
             else:
                 human.press("pad", axes, self.now)
+                if appears:
+                    human.held["pad"].end(float("-inf"), "it was not in neutral when it appeared")
         else:
             human.let_go("pad", self.now)
         if human.pad_frozen and axes is not None and "pad" in human.held:
