@@ -23,7 +23,7 @@ from tests.support import ROOT, free_port, listening, until
 
 pytestmark = pytest.mark.thorough
 
-GOOB, ZENOH = "pebble/robots/goob", {"transport": {"kind": "zenoh"}}
+GOOB = "pebble/robots/goob"
 RECEIVES = "pebble topic echo neighbours -c goob.json --raw -n 1 -s 5"
 
 
@@ -87,22 +87,21 @@ def test_two_robots_of_a_lan_receive_each_other_in_six_commands_and_a_board_in_s
     section, more = Section("neighbours.md", "goob drives fred", here), Section("fleet.md", "A LAN with boards", here)
     init, *accounts, start_hub, up_goob, up_fred = section.lines
     run(f"{init} --port {port}", tmp_path)
-    listens = {"goob.json": {"listens": {"minilamp": ["online"]}}, "fred.json": {}}
+    listens = {"goob.json": {"minilamp": ["online"]}, "fred.json": {}}
     for line, name in zip(accounts, listens, strict=True):
-        piece: dict[str, Any] = json.loads(section.files[name].replace('"lan": {…}', '"enabled": true'))
-        services = deep_merge({"services": piece}, {"services": {"neighbours": listens[name]}})
-        (tmp_path / name).write_text(json.dumps(deep_merge(printed(line, tmp_path, hub), {**services, **ZENOH})))
+        config = deep_merge(piece_in(run(line, tmp_path), hub), json.loads(section.files[name]))
+        config["services"]["neighbours"].setdefault("listens", {}).update(listens[name])
+        (tmp_path / name).write_text(json.dumps(config))
     broker, *accounts, start_gateway, start_board = more.lines
     (tmp_path / "hub.json").write_text(section.files["hub.json"])
     with ExitStack() as stack:
         stack.enter_context(mosquitto(tmp_path / broker.split()[2], port))
-        board, gateway, neighbour = (run(line, tmp_path) for line in accounts)
-        lan = json.dumps(piece_in(neighbour, hub)["services"]["neighbours"]["lan"])
+        board, _, gateway = (run(line, tmp_path) for line in accounts)
         lamp = deep_merge(json.loads(more.files["minilamp.json"]), piece_in(board, hub))
         lamp["local_mqtt"]["tls"]["ca_cert"] = f"lan/{certificates.CA_CERT}"
         files = {
             "lan-1-password": PASSWORD.findall(gateway)[0],
-            "lan-1.json": more.files["lan-1.json"].replace("{…}", lan),
+            "lan-1.json": json.dumps(deep_merge(piece_in(gateway, hub), json.loads(more.files["lan-1.json"]))),
             "minilamp.json": json.dumps(lamp),
         }
         for name, body in files.items():
@@ -122,10 +121,6 @@ def received(folder: Path) -> dict[str, bool]:
     """Whom goob receives now."""
     shown = pebble(RECEIVES, folder).stdout
     return dict(json.loads(shown)["receives"]) if shown else {}
-
-
-def printed(line: str, folder: Path, hub: int) -> dict[str, Any]:
-    return piece_in(run(line, folder), hub)
 
 
 def piece_in(shown: str, hub: int) -> dict[str, Any]:

@@ -375,7 +375,12 @@ def _print_account(place: Path, fleet: Fleet, name: str, secret: str, how: str, 
     elif ProgramRole.HUB in account.roles:
         typer.echo("A hub needs none, but a certificate:")
         typer.echo(f"    pebble fleet certificate {name} HOST")
-    elif not {ProgramRole.GATEWAY, ProgramRole.BOARDS} & {*account.roles}:
+    elif ProgramRole.BOARDS in account.roles:
+        typer.echo(
+            f"The file of that gateway, with its password in {name}-password, and what each board grants to add:"
+        )
+        typer.echo(json.dumps(_file_of_boards(place, fleet, name), indent=2))
+    elif ProgramRole.GATEWAY not in account.roles:
         typer.echo(f"    pebble drive ROBOT --url {url} --ca-cert {ca} --password-file FILE")
 
 
@@ -387,20 +392,36 @@ def _print_certificate(place: Path, fleet: Fleet, name: str, files: tuple[Path, 
     typer.echo(
         f"Move the key to its machine, with copies of {copies} beside it. `pebble fleet check` watches the date."
     )
-    tls = {"enabled": True, "ca_cert": certificates.CA_CERT, "client_cert": f"{name}.pem", "client_key": f"{name}.key"}
-    connect = [f"tls/{fleet.brokers[0].host}:{_ZENOH_PORT}"]
+    at_hub = _at_hub(fleet, name, certificates.CA_CERT, name)
+    tls = at_hub["tls"]
     if ProgramRole.HUB in roles:
         typer.echo(f"And a copy of {_shown(place / ZENOH)}. The file of that hub, with the other hubs in connect:")
         file = {"listen": [f"tls/0.0.0.0:{_ZENOH_PORT}"], "connect": [], "tls": tls, "access": ZENOH}
         typer.echo(json.dumps({**file, "journal": f"{name}.journal"}, indent=2))
     if ProgramRole.ROBOT in roles:
-        remote = {"kind": "zenoh", "account": name, "connect": connect, "tls": tls}
-        piece = {"services": {"mqtt_bridge": {"enabled": True, "remote": remote}}}
+        piece = {"services": {"mqtt_bridge": {"enabled": True, "remote": {"kind": "zenoh", **at_hub}}}}
         typer.echo(json.dumps({**_who(fleet, name), **piece}, indent=2))
     if ProgramRole.NEIGHBOUR in roles:
-        lan = {"account": name, "connect": connect, "tls": tls}
         robot = _who(fleet, name)["robot"]
-        typer.echo(json.dumps({"robot": robot, "services": {"neighbours": {"enabled": True, "lan": lan}}}, indent=2))
+        typer.echo(json.dumps({"robot": robot, "services": {"neighbours": {"enabled": True, "lan": at_hub}}}, indent=2))
+
+
+def _at_hub(fleet: Fleet, name: str, ca: str, keys: str) -> dict[str, Any]:
+    """How this account connects to the fleet's hub: its authority and its own keys, these without their suffix."""
+    tls = {"enabled": True, "ca_cert": ca, "client_cert": f"{keys}.pem", "client_key": f"{keys}.key"}
+    return {"account": name, "connect": [f"tls/{fleet.brokers[0].host}:{_ZENOH_PORT}"], "tls": tls}
+
+
+def _file_of_boards(place: Path, fleet: Fleet, name: str) -> dict[str, Any]:
+    """The file of a gateway of boards beside this folder: those that have an account as a neighbour are in it."""
+    server, ca = fleet.brokers[0], _shown(place / certificates.CA_CERT)
+    login = {"username": name, "password_file": f"{name}-password", "tls": {"enabled": True, "ca_cert": ca}}
+    neighbours = {
+        account.bases[0]: {"lan": _at_hub(fleet, other, ca, _shown(place / certificates.ACCOUNTS / other))}
+        for other, account in fleet.accounts.items()
+        if ProgramRole.NEIGHBOUR in account.roles and account.bases[0] in fleet.accounts[name].bases
+    }
+    return {"id": name, "boards": {"host": server.host, "port": server.port, **login}, "neighbours": neighbours}
 
 
 def piece_of_config(fleet: Fleet, name: str, secret: str, *, board: bool) -> dict[str, Any]:
