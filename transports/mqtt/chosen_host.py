@@ -147,7 +147,7 @@ class HostChoice:
         known, self._silent = self._silent, self._silent | {place}
         return self.several and place not in known
 
-    def hears(self) -> None:
+    def receives(self) -> None:
         """A subscription is granted."""
         self._silent = set()
 

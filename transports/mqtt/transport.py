@@ -473,7 +473,7 @@ class MqttTransport(Transport):
                     subscription.refused = is_refused
         hosts, run = self._dialler.hosts, self._network
         if not all(one.refused for one in subscriptions):
-            hosts.hears()
+            hosts.receives()
         elif run is not None and subscriptions and hosts.leaves_silent(self._dialler.turns.place):
             run.renewal = "it refuses all that is subscribed to"
 
