@@ -22,7 +22,7 @@ from pebble.fleet.folder import ADMIN, CONF, PASSWORDS
 from pebble.fleet.roles import Account
 from pebble.rig.processes import python
 from pebble.runtime.every_host import EveryHost
-from pebble.transports import Message, MqttSettings, TlsSettings, create
+from pebble.transports import Message, MqttSettings, QoS, TlsSettings, Transport, create
 from pebble.transports import State as Link
 from tests.fleet.brokers import HOST, FleetBroker
 from tests.support import until
@@ -168,6 +168,22 @@ def test_a_robot_uses_the_other_broker(first: FleetBroker, second: FleetBroker, 
         _refuse_subscriptions(second, "goob")
         robot.renew_connection("test")
         assert until(lambda: robot.state is Link.CONNECTED and bool(robot.not_received), 10), robot.problem
+
+
+def test_a_robot_leaves_a_broker_that_takes_nothing_from_it(first: FleetBroker, second: FleetBroker) -> None:
+    """Once: if both do so, it stays."""
+    _take_rights(first, "goob")
+    with create("mqtt", "robot", settings("goob", first, second)) as robot:
+        robot.publish(f"{GOOB}/outgoing/status", b"{}", qos=QoS.DELIVERED, retain=True)
+        assert until(lambda: robot.host == f"{HOST}:{second.port}", 20)
+        _take_rights(second, "goob")
+        assert until(lambda: _stays(robot), 60)
+
+
+def _stays(robot: Transport) -> bool:
+    """Whether it makes no new connection for longer than it takes to notice that nothing is taken."""
+    before = robot.counters["connected"]
+    return not until(lambda: robot.counters["connected"] > before, 5)
 
 
 @pytest.mark.parametrize(("rules", "found"), [(True, State.OK), (False, State.FAILED)])
