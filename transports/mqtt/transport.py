@@ -325,7 +325,8 @@ class MqttTransport(Transport):
         if not missing or len(missing) < len(check.topics):
             hosts.accepted(_PUBLISHED)
             return
-        self._retention.forget()
+        if hosts.several:
+            self._retention.forget()
         if hosts.refused(_PUBLISHED, self._dialler.turns.place):
             connection.disconnect()
             raise Lost("it has nothing of what was published")
