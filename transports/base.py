@@ -288,7 +288,7 @@ class Transport(ABC):
         return False
 
     @property
-    def unheard(self) -> str:
+    def not_received(self) -> str:
         """What is not delivered to us although there is a connection, and why, in one line; empty: all is."""
         refused = [one.filter for one in self._subscriptions if one.refused]
         more = f" and {len(refused) - _NAMED} more" if len(refused) > _NAMED else ""

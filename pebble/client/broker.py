@@ -62,14 +62,14 @@ class Broker:
         return "it does not answer" if self.transport.outgoing.stalled_s > ANSWER_S else ""
 
     @property
-    def unheard(self) -> str:
+    def not_received(self) -> str:
         """What is not heard although there is a connection, such as one of several brokers, and why, in one line."""
-        return self.transport.unheard if self.connected else ""
+        return self.transport.not_received if self.connected else ""
 
-    def echoes(self, topic: str) -> bool:
+    def proves_hosts(self, topic: str) -> bool:
         """Whether it is worth while to publish on ``topic`` every second: that proves that each of several is heard."""
         if isinstance(self.transport, EveryHost):
-            self.transport.echoed = topic
+            self.transport.proof_topic = topic
         return isinstance(self.transport, EveryHost)
 
     def on_move(self, watcher: Callable[[str, str, bool], None]) -> None:

@@ -67,16 +67,16 @@ def connected(target: Target) -> Iterator[tuple[Transport, Names]]:
             raise TransportError(f"cannot connect to {where}: {why}")
         if isinstance(transport, EveryHost) and names.base != ANY_ROBOT and not transport.find(names.base, _FIND_S):
             log.info("%s is heard at no host", names.base)
-        unheard = _report_unheard(transport)
+        not_received = _report_missing(transport)
         yield transport, names
-        _report_unheard(transport, unheard)  # what was subscribed to meanwhile may be refused
+        _report_missing(transport, not_received)  # what was subscribed to meanwhile may be refused
 
 
-def _report_unheard(transport: Transport, before: str = "") -> str:
-    unheard = transport.unheard if transport.state is State.CONNECTED else ""
-    if unheard not in ("", before):
-        log.error("%s", unheard)
-    return unheard
+def _report_missing(transport: Transport, before: str = "") -> str:
+    not_received = transport.not_received if transport.state is State.CONNECTED else ""
+    if not_received not in ("", before):
+        log.error("%s", not_received)
+    return not_received
 
 
 def resolve(target: Target) -> tuple[str, Any, Names, str]:

@@ -11,13 +11,12 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import suppress
 from functools import partial
 from importlib import metadata
 from pathlib import Path
 
 from pebble.check_result import CheckResult, State
-from pebble.client.page.from_config import broker_of, settings_of
+from pebble.client.page.from_config import settings_of
 from pebble.client.page.packages import require_packages
 from pebble.config import Config, Mqtt
 from pebble.config.web import is_loopback
@@ -32,7 +31,7 @@ from pebble.doctor.publishing import of_page, publishing
 from pebble.doctor.reachable import beyond_loopback, own_addresses
 from pebble.doctor.recordings import recorder
 from pebble.doctor.who import who_drives
-from pebble.errors import ConfigError, PebbleError
+from pebble.errors import PebbleError
 from pebble.fleet import certificates
 from pebble.runtime.connections import REMOTE_RECONNECT_S, mqtt_settings
 from pebble.transports.socket_paths import FRAMES_SOCKET, fits_socket
@@ -104,17 +103,13 @@ def operator_page(config: Config) -> Iterator[CheckResult]:
 
 
 def page_brokers(config: Config) -> Iterator[CheckResult]:
-    """Whether each broker of the operator page lets it in, and delivers what all robots send."""
-    web = config.web_interface
-    with suppress(ConfigError):  # of which the check of the page tells
-        section = broker_of(config) if web.mqtt.host or config.services.web_handler.enabled else None
-        level = config.security.level
-        each = () if section is None else mqtt_settings(section, reconnect_max_s=REMOTE_RECONNECT_S).each()
-        for settings in each:
-            found = list(broker("page's broker", settings, level=level)) if section is web.mqtt else []
-            yield from found
-            if not any(one.state is State.FAILED for one in found):
-                yield from of_page(f"page's broker {settings.host}:{settings.port}", settings, level)
+    """Whether each broker of an operator page that has its own lets it in, and delivers what all robots send."""
+    mqtt, level = config.web_interface.mqtt, config.security.level
+    for settings in mqtt_settings(mqtt, reconnect_max_s=REMOTE_RECONNECT_S).each() if mqtt.host else ():
+        found = list(broker("page's broker", settings, level=level))
+        yield from found
+        if not any(one.state is State.FAILED for one in found):
+            yield from of_page(found[0].what, settings, level)
 
 
 def _page_certificate(file: Path, now: float) -> CheckResult:

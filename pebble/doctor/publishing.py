@@ -83,7 +83,7 @@ def of_page(what: str, settings: MqttSettings, level: SecurityLevel = "open") ->
             client.subscribe(ONLINE.filter("+/+/+"), lambda _: None)
             echo = _Echo(client, DRIVING.topic(Identity("pebble", SERVERS, "doctor").base), LEVELS["wide"].answer_s)
             came_back = echo.arrival(echo.send(QoS.DELIVERED)) is not None
-            why = client.unheard or ("" if came_back else f"what it publishes on {echo.topic} does not come back")
+            why = client.not_received or ("" if came_back else f"what it publishes on {echo.topic} does not come back")
         if why:
             fix = "pebble fleet check; its role is page"
             yield fail(what, f"a page with this account does not hear robots: {why}", fix)

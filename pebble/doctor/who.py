@@ -41,7 +41,7 @@ def who_drives(config: Config) -> Iterator[CheckResult]:
 
 
 def unknown_brokers(config: Config) -> Iterator[str]:
-    """Of several brokers those that the fleet beside the config does not have: no file tells of their rules."""
+    """Name those of several brokers that the fleet beside the config does not have: no file has their rules."""
     remote = config.services.mqtt_bridge.remote_mqtt
     for folder in _folders(config) if config.security.level != "open" and len(remote.hosts) > 1 else ():
         with suppress(FleetError):  # of which the doctor tells

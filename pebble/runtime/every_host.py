@@ -25,7 +25,7 @@ MAX_ROBOTS = 2000  # whose host is known; of others what all hosts send is shown
 _MAX_TOPICS = 64  # of one of them, which are asked for when it changes its host
 _SILENT_S = 10.0  # such robots make room for others, so often at most
 _READY_S = 0.5  # after the first host is connected: until then all others should be, and heartbeats have come
-_ECHO_S = 3.0  # longer a host that hears us and is heard does not take: a connection that is silent ends earlier
+_OWN_S = 3.0  # longer no host takes to deliver what it lets pass: a connection that is silent ends earlier
 _LATE_S = 0.25  # some brokers send what they retain so long after they have answered
 _HEARTBEATS = {one.metric: one for one in CHANNELS if ONLINE.metric in (one.metric, one.synonym_of)}
 
@@ -101,7 +101,7 @@ class EveryHost(Transport):
     delivers_late = True  # what is asked for is delivered, whatever came before
     #: What is published on it every second, and subscribed to: a host that lets us in and does not deliver it, though
     #: another one does, lets us publish or receive nothing. Empty: that is not noticed.
-    echoed = ""
+    proof_topic = ""
 
     def __init__(self, client_id: str, settings: MqttSettings) -> None:
         self._hosts: tuple[Transport, ...] = ()  # super() sets `problem`
@@ -109,8 +109,8 @@ class EveryHost(Transport):
         self._places = [f"{one.host}:{one.port}" for one in settings.each()]
         self._hosts = tuple(create("mqtt", client_id, one) for one in settings.each())
         self._homes = Homes()
-        self._echoing: set[int] = set()  # hosts that have delivered what was published
-        self._unechoed: dict[int, float] = {}  # since when a host has not
+        self._delivering: set[int] = set()  # hosts that have delivered what was published
+        self._owing: dict[int, float] = {}  # since when a host has not
         self._lock = threading.Condition(threading.RLock())
         self._asked: dict[str, int] = {}  # robots whose states are to be asked for, and where
         self._expected: dict[str, int] = {}  # topics that are asked for now, and where
@@ -155,22 +155,22 @@ class EveryHost(Transport):
         """That of each host counts."""
 
     @property
-    def unheard(self) -> str:
+    def not_received(self) -> str:
         """Which hosts are not heard, or not all that is asked for there, and why, while some host has a connection."""
         if not self._is_connected:
             return ""
         count, missing = len(self._hosts), [why for number in range(len(self._hosts)) if (why := self._why(number))]
-        heard = count - len(missing)
-        return f"only {heard} of {count} brokers can be heard: {'; '.join(missing)}" if missing else ""
+        received = count - len(missing)
+        return f"messages come from only {received} of {count} brokers: {'; '.join(missing)}" if missing else ""
 
     def _why(self, number: int) -> str:
         """Why that host is not heard; empty if it is."""
         one, place = self._hosts[number], f"broker {self._places[number]}"
         if one.state is not State.CONNECTED:
             return one.problem or f"{place} has not answered yet"
-        if unheard := one.unheard:
-            return f"{place}: {unheard}"
-        silent = time.monotonic() - self._unechoed.get(number, float("inf")) > _ECHO_S and self._echoing - {number}
+        if not_received := one.not_received:
+            return f"{place}: {not_received}"
+        silent = time.monotonic() - self._owing.get(number, float("inf")) > _OWN_S and self._delivering - {number}
         return f"{place} delivers nothing of what this account publishes: may it do both there?" if silent else ""
 
     @property
@@ -232,8 +232,8 @@ class EveryHost(Transport):
         if self._state is State.CLOSED:
             self.counters.add("refused")
             return False
-        if message.topic == self.echoed:
-            self._expect_echoes()
+        if message.topic == self.proof_topic:
+            self._expect_own()
         accepted = [
             one.publish(
                 message.topic,
@@ -252,11 +252,11 @@ class EveryHost(Transport):
         self._count_sent()
         return True
 
-    def _expect_echoes(self) -> None:
+    def _expect_own(self) -> None:
         now = time.monotonic()
         for number, one in enumerate(self._hosts):
             if one.state is State.CONNECTED:
-                self._unechoed.setdefault(number, now)
+                self._owing.setdefault(number, now)
 
     def _receivers(self, message: Message) -> Iterable[Transport]:
         parsed = parse_topic(message.topic)
@@ -291,7 +291,7 @@ class EveryHost(Transport):
     # -- the threads of the hosts
 
     def _on_state(self, number: int, state: State) -> None:
-        self._unechoed.pop(number, None)
+        self._owing.pop(number, None)
         with self._lock:
             if state is not State.CONNECTED:
                 self._homes.lost(number)
@@ -326,9 +326,9 @@ class EveryHost(Transport):
         self.moved(base)
 
     def _take(self, number: int, subscription: Subscription, message: Message) -> None:
-        if message.topic == self.echoed:
-            self._echoing.add(number)
-            self._unechoed.pop(number, None)
+        if message.topic == self.proof_topic:
+            self._delivering.add(number)
+            self._owing.pop(number, None)
         parsed = parse_topic(message.topic)
         if parsed is not None:
             with self._lock:

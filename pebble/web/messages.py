@@ -408,7 +408,7 @@ class BrokerView(Struct, frozen=True, kw_only=True):
     connected: bool
     problem: str
     #: What the server is not sent although it is connected, such as by one of several brokers, and why.
-    unheard: str
+    not_received: str
     robots_omitted: int
 
 

@@ -153,7 +153,7 @@ class Server:
         view = m.BrokerView(
             connected=self.broker.connected,
             problem=self.broker.problem,
-            unheard=self.broker.unheard,
+            not_received=self.broker.not_received,
             robots_omitted=self.robots.omitted,
         )
         self.robots.set_server_metric("", "web/broker", view)

@@ -265,8 +265,8 @@ def test_it_finds_a_second_broker_that_lets_everybody_write(
     conf, passwords = second.folder / CONF, second.folder / PASSWORDS
     hashed = {name: broker_files.hashed(one) for name, one in broker.passwords.items()}
     passwords.write_text(broker_files.passwords_text(hashed))
-    kept = [line for line in conf.read_text().splitlines() if not line.startswith(without)]
-    conf.write_text("\n".join([*kept, *(more.format(passwords=passwords) for more in instead)]))
+    lines = [line for line in conf.read_text().splitlines() if not line.startswith(without)]
+    conf.write_text("\n".join([*lines, *(more.format(passwords=passwords) for more in instead)]))
     with broker, second:
         ((server, lines),) = check.of_others(broker.folder, broker.fleet)
         assert server.port == second.port

@@ -115,7 +115,8 @@ class HostChoice:
         self._follows = settings.follows
         self._accepts_login = accepts_login
         self._connected: Place | None = None  # in the newest connection
-        self._silent: set[Place] = set()  # refuse all that is subscribed to, since one did not
+        #: By what they refuse of us, all that is subscribed to or published: such hosts, since one has not refused it.
+        self._refusing: dict[str, set[Place]] = {}
         self._returning, self._probes = Return(), Probes(self._probe_first)
 
     @property
@@ -142,14 +143,15 @@ class HostChoice:
         if self._chosen is not None and not self._follows:
             self._chosen.write(place)
 
-    def leaves_silent(self, place: Place) -> bool:
-        """Whether to try the others because ``place`` refuses all subscriptions: once, as they may be no better."""
-        known, self._silent = self._silent, self._silent | {place}
-        return self.several and place not in known
+    def refused(self, what: str, place: Place) -> bool:
+        """That host refuses all of it; whether to try the others: once, as they may be no better."""
+        known = self._refusing.setdefault(what, set())
+        is_new = place not in known
+        known.add(place)
+        return self.several and is_new
 
-    def hears(self) -> None:
-        """A subscription is granted."""
-        self._silent = set()
+    def accepted(self, what: str) -> None:
+        self._refusing.pop(what, None)
 
     def why_leave(self, idle_s: Callable[[], float]) -> str:
         """Why to leave this host now, empty if it is to stay; ``idle_s``: for how long a change has disturbed nothing.

@@ -94,6 +94,10 @@ class RetentionChecks:
         """There is a new connection, to the broker at ``address``."""
         self._address, self.current = address, None if address in self._checked else RetentionCheck(now)
 
+    def forget(self) -> None:
+        """Ask this broker again at the next connection."""
+        self._checked.discard(self._address)
+
     def proceed(self, connection: Connection, now: float, own_topics: Callable[[], list[str]]) -> list[str]:
         """Ask for each of ``own_topics`` by name once it is time; returns those that the broker has not sent."""
         check = self.current

@@ -33,6 +33,7 @@ _RETRY_S = 0.05  # second attempt to connect; doubles up to settings.reconnect_m
 _CATCH_UP_S = 0.5  # time for a broker that was suspended to deliver its backlog before we subscribe
 _STEADY_S = 2.0  # after a connection this long the first retry is immediate
 _REPEAT_LOG_S = 30.0  # between two equal log lines
+_SUBSCRIBED, _PUBLISHED = "subscriptions", "publications"  # what a host may refuse
 _TRIED_S = 1.0  # after which a connection shows what the broker has
 
 
@@ -309,7 +310,8 @@ class MqttTransport(Transport):
                 self._own.remember(message, sent=self._send(message, False))
 
     def _check_retention(self, connection: Connection) -> None:
-        """Report which of our retained messages the broker does not have."""
+        """Report which of our retained messages the broker does not have. Raises Lost where another may have them."""
+        check = self._retention.current
         missing = [
             topic
             for topic in self._retention.proceed(
@@ -325,6 +327,17 @@ class MqttTransport(Transport):
                 connection.where,
                 named(missing),
             )
+        if check is None or self._retention.current is check:
+            return
+        hosts = self._dialler.hosts
+        if not missing or len(missing) < len(check.topics):
+            hosts.accepted(_PUBLISHED)
+            return
+        if hosts.several:
+            self._retention.forget()
+        if hosts.refused(_PUBLISHED, self._dialler.turns.place):
+            connection.disconnect()
+            raise Lost("it has nothing of what was published")
 
     def _own_topics_apart(self, connection: Connection) -> list[str]:
         """Topics of our retained messages that the broker should have, and that no subscription of ours receives."""
@@ -366,6 +379,8 @@ class MqttTransport(Transport):
         self._initial_sync(known)
         if not self.is_slow:  # it costs as much as a beginning
             self._retention.begin(self._dialler.address, now)
+            if self._retention.current is None:
+                self._dialler.hosts.accepted(_PUBLISHED)
 
     def _let_catch_up(self, connection: Connection, stopping: threading.Event) -> None:
         """Wait before subscribing: a broker that was suspended first forwards old messages of others."""
@@ -481,8 +496,8 @@ class MqttTransport(Transport):
                     subscription.refused = is_refused
         hosts, run = self._dialler.hosts, self._network
         if not all(one.refused for one in subscriptions):
-            hosts.hears()
-        elif run is not None and subscriptions and hosts.leaves_silent(self._dialler.turns.place):
+            hosts.accepted(_SUBSCRIBED)
+        elif run is not None and subscriptions and hosts.refused(_SUBSCRIBED, self._dialler.turns.place):
             run.renewal = "it refuses all that is subscribed to"
 
     def note_refusal(self, topic: str, why: str) -> None:

@@ -25,7 +25,7 @@ def settings_of(config: Config) -> WebSettings:
     for key in ("certificate", "key", "ca"):
         _check(f"web_interface.tls.{key}", getattr(web.tls, key))
     return WebSettings(
-        broker=mqtt_settings(broker_of(config), reconnect_max_s=REMOTE_RECONNECT_S, program="web"),
+        broker=mqtt_settings(_broker(config), reconnect_max_s=REMOTE_RECONNECT_S, program="web"),
         host=web.host,
         port=web.port,
         names=web.names,
@@ -56,8 +56,8 @@ def _recordings(config: Config) -> Path | None:
     return recorder.place if recorder.enabled else None
 
 
-def broker_of(config: Config) -> Mqtt:
-    """The broker of ``web_interface.mqtt``, else the one that the robot's bridge connects to. Raises ConfigError."""
+def _broker(config: Config) -> Mqtt:
+    """The broker of ``web_interface.mqtt``, else the one that the robot's bridge connects to."""
     bridge = config.services.mqtt_bridge
     if config.web_interface.mqtt.host:
         return config.web_interface.mqtt

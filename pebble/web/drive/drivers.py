@@ -29,7 +29,7 @@ class Drivers:
         self.refusals = Refusals(broker, self.driving, robots.view)
         self.driving.held_elsewhere, self.driving.pace_of = self.controls.elsewhere, self.pace_of
         self._broker, self._robots, self._here = broker, robots, DrivenHere(server)
-        self._here.always = broker.echoes(self._here.topic)
+        self._here.always = broker.proves_hosts(self._here.topic)
 
     def pace_of(self, ref: str) -> Pace:
         robot = self._robots.view(ref)

@@ -329,7 +329,7 @@ export interface RestartsView {
 export interface BrokerView {
   connected: boolean;
   problem: string;
-  unheard: string;
+  not_received: string;
   robots_omitted: number;
 }
 

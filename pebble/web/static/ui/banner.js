@@ -84,9 +84,9 @@ function ServerBanner() {
       <p><b>The server cannot reach the broker:</b> ${broker.problem || "no reason is known"}</p>
     <//>`;
   }
-  if (broker?.unheard) {
+  if (broker?.not_received) {
     return html`<${Banner} kind="warn">
-      <p><b>The server does not hear everything, so robots may be missing:</b> ${broker.unheard}</p>
+      <p><b>Not all robots can be seen:</b> ${broker.not_received}</p>
     <//>`;
   }
   if (you && !you.drives) {

@@ -22,7 +22,7 @@ from pebble.fleet.folder import ADMIN, CONF, PASSWORDS
 from pebble.fleet.roles import Account
 from pebble.rig.processes import python
 from pebble.runtime.every_host import EveryHost
-from pebble.transports import Message, MqttSettings, TlsSettings, create
+from pebble.transports import Message, MqttSettings, QoS, TlsSettings, Transport, create
 from pebble.transports import State as Link
 from tests.fleet.brokers import HOST, FleetBroker
 from tests.support import until
@@ -50,7 +50,7 @@ def second(first: FleetBroker, tmp_path: Path) -> Iterator[FleetBroker]:
 
 
 def settings(name: str, *brokers: FleetBroker) -> MqttSettings:
-    """Of all of them, with the login at the first."""
+    """Return those of all of them, with the login at the first."""
     own, places = brokers[0], tuple((HOST, one.port) for one in brokers)
     return MqttSettings(
         host=HOST,
@@ -100,7 +100,7 @@ def _drives_and_stops(page: Page, robot: RecordingRobot) -> bool:
 
 
 def _is_named(text: str, second: FleetBroker, why: str) -> bool:
-    return text.startswith("only 1 of 2 brokers can be heard: ") and f":{second.port}" in text and why in text
+    return text.startswith("messages come from only 1 of 2 brokers: ") and f":{second.port}" in text and why in text
 
 
 @pytest.mark.parametrize("refusal", REFUSALS)
@@ -115,11 +115,11 @@ def test_a_page_names_the_broker_that_refuses_it(
             RecordingRobot(first.port, GOOB, username="goob", password=login.password, tls=login.tls)
         )
         before = stack.enter_context(Served(first.port, broker=settings("page", first, second))) if running else None
-        assert before is None or until(lambda: before.app.state.server.broker.unheard == "", 5)
+        assert before is None or until(lambda: before.app.state.server.broker.not_received == "", 5)
         refuse(second, "page")
         served = before or stack.enter_context(Served(first.port, broker=settings("page", first, second)))
         page = stack.enter_context(served.page())
-        assert until(lambda: _is_named(page.value("", "web/broker", "unheard") or "", second, why), 10), page.state
+        assert until(lambda: _is_named(page.value("", "web/broker", "not_received") or "", second, why), 10), page.state
         assert _drives_and_stops(page, robot)
 
 
@@ -150,7 +150,7 @@ def test_the_doctor_names_it(first: FleetBroker, second: FleetBroker, refusal: s
 
 def test_a_certificate_that_is_not_trusted_is_named_too(first: FleetBroker, tmp_path: Path) -> None:
     with first, FleetBroker(tmp_path / "other", {}) as other, EveryHost("page", settings("page", first, other)) as page:
-        assert until(lambda: _is_named(page.unheard, other, "certificate verify failed"), 5), page.unheard
+        assert until(lambda: _is_named(page.not_received, other, "certificate verify failed"), 5), page.not_received
 
 
 @pytest.mark.parametrize("refusal", ["account", "subscriptions"])
@@ -160,23 +160,39 @@ def test_a_robot_uses_the_other_broker(first: FleetBroker, second: FleetBroker, 
     with create("mqtt", "robot", settings("goob", first, second)) as robot:
         got: list[Message] = []
         robot.subscribe(f"{GOOB}/incoming/#", got.append)
-        assert until(lambda: robot.host == f"{HOST}:{second.port}" and not robot.unheard, 10), robot.problem
+        assert until(lambda: robot.host == f"{HOST}:{second.port}" and not robot.not_received, 10), robot.problem
         with second.login("ann") as ann:
             ann.publish(f"{GOOB}/incoming/estop", b"{}")
             ann.flush()
         assert until(lambda: bool(got), 5)
         _refuse_subscriptions(second, "goob")
         robot.renew_connection("test")
-        assert until(lambda: robot.state is Link.CONNECTED and bool(robot.unheard), 10), robot.problem
+        assert until(lambda: robot.state is Link.CONNECTED and bool(robot.not_received), 10), robot.problem
+
+
+def test_a_robot_leaves_a_broker_that_takes_nothing_from_it(first: FleetBroker, second: FleetBroker) -> None:
+    """Once: if both do so, it stays."""
+    _take_rights(first, "goob")
+    with create("mqtt", "robot", settings("goob", first, second)) as robot:
+        robot.publish(f"{GOOB}/outgoing/status", b"{}", qos=QoS.DELIVERED, retain=True)
+        assert until(lambda: robot.host == f"{HOST}:{second.port}", 20)
+        _take_rights(second, "goob")
+        assert until(lambda: _stays(robot), 60)
+
+
+def _stays(robot: Transport) -> bool:
+    """Whether it makes no new connection for longer than it takes to notice that nothing is taken."""
+    before = robot.counters["connected"]
+    return not until(lambda: robot.counters["connected"] > before, 5)
 
 
 @pytest.mark.parametrize(("rules", "found"), [(True, State.OK), (False, State.FAILED)])
 def test_the_doctor_of_a_robot_names_a_broker_without_rules(first: FleetBroker, *, rules: bool, found: State) -> None:
     if not rules:
-        conf, kept = first.folder / CONF, first.folder / PASSWORDS
-        kept.write_text(passwords_text({"goob": hashed(first.passwords["goob"])}))
+        conf, logins = first.folder / CONF, first.folder / PASSWORDS
+        logins.write_text(passwords_text({"goob": hashed(first.passwords["goob"])}))
         conf.write_text(
-            conf.read_text().replace("\nplugin", f"\npassword_file {kept}\n#plugin", 1).replace("\nplugin", "\n#")
+            conf.read_text().replace("\nplugin", f"\npassword_file {logins}\n#plugin", 1).replace("\nplugin", "\n#")
         )
     with first:
         *_, last = publishing("remote broker", settings("goob", first), GOOB, level="login")
