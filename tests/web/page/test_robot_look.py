@@ -79,6 +79,12 @@ def _lost(page: Page) -> None:
 CARDS_OF_FLEET = """() => Object.fromEntries([...document.querySelectorAll(".fleet-card, main button, .top .stop")]
   .map((one, n) => [one.dataset.test ?? one.textContent.trim(), one.getBoundingClientRect()])
   .map(([name, { x, y, width, height }]) => [name, [x, y, width, height].map(Math.round)]))"""
+#: Controls of the fleet of which a band over the title has any part.
+UNDER_BANDS = """() => [...document.querySelectorAll(".screen-title .banner")].flatMap((band) =>
+  [...document.querySelectorAll("main button, main input, main a")].filter((one) => {
+    const [a, b] = [band.getBoundingClientRect(), one.getBoundingClientRect()];
+    return !band.contains(one) && a.bottom > b.top && b.bottom > a.top && a.right > b.left && b.right > a.left;
+  })).map((one) => one.outerHTML.slice(0, 120))"""
 TROUBLE: dict[str, Callable[[Page], None]] = {
     "a stop": _stopped,
     "a question before the reset": _asks_to_reset,
@@ -126,6 +132,7 @@ def test_trouble_moves_nothing_in_the_fleet(show: Show, size: Size, what: Callab
         after = opened.page.evaluate(CARDS_OF_FLEET)
         assert {name: place for name, place in after.items() if before.get(name, place) != place} == {}
         assert opened.page.evaluate(COVERED) == []
+        assert opened.page.evaluate(UNDER_BANDS) == []
 
 
 def test_stops_in_the_fleet_are_behind_one_chip(show: Show, server: CannedServer) -> None:

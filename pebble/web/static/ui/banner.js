@@ -48,7 +48,7 @@ function All({ at }) {
   return html`<section class="banners" aria-label="What to know now">
     ${at ? html`<div class="stop-banners"><${StopBanner} at=${at} /></div>` : html`<${Unconfirmed} />`}
     <${PressBanner} />
-    <div role="alert"><${ServerBanner} />${at && html`<${SilentBanner} at=${at} />`}</div>
+    <div role="alert"><${ServerBanner} at=${at} />${at && html`<${SilentBanner} at=${at} />`}</div>
     ${at && html`<${AlsoStopped} at=${at} /><${SlowLink} at=${at} />`}
     <${Notice} />
     ${at && html`<${ControlHint} />`}
@@ -64,7 +64,7 @@ const Banner = ({ kind, icon = "warning", button = null, children }) => html`<di
 const Reload = ({ children }) => html`<button type="button" onClick=${() => location.reload()}>${children}</button>`;
 
 /** No server, no broker, an old page, or no encryption. */
-function ServerBanner() {
+function ServerBanner({ at }) {
   const { connection } = usePage();
   const broker = useValue("", "web/broker");
   const { bye, you } = connection;
@@ -73,7 +73,7 @@ function ServerBanner() {
       <p><b>The server has ended this connection:</b> ${bye.why}</p>
     <//>`;
   }
-  if (connection.state === "lost") return html`<${LostBanner} />`;
+  if (connection.state === "lost") return html`<${LostBanner} at=${at} />`;
   if (connection.isOld) {
     return html`<${Banner} kind="bad" button=${html`<${Reload}>Reload<//>`}>
       <p><b>This page is older than the server.</b> Driving is off until it is loaded again.</p>
@@ -97,14 +97,15 @@ function ServerBanner() {
   return null;
 }
 
-function LostBanner() {
+function LostBanner({ at }) {
   const { connection } = usePage();
   useTick(1000);
   const { lostAt, attempts } = connection.socket;
   return html`<${Banner} kind="bad">
     <p>
-      <b>No connection to the server since ${clockTime(lostAt)}.</b> What you drove stops by itself.
-      <span aria-hidden="true"> Retrying${attempts > 1 ? ` (${attempts})` : ""}…</span>
+      <b>No connection to the server since ${clockTime(lostAt)}.</b>${" "}
+      ${at && html`What you drove stops by itself.<br />`}
+      <small aria-hidden="true">Retrying${attempts > 1 ? ` (${attempts})` : ""}…</small>
     </p>
   <//>`;
 }

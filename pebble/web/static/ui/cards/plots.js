@@ -33,7 +33,7 @@ export function Plots({ at }) {
   const parts = { at, paused };
   const empty = !known.length && !added.length;
   return html`<div class="plots">
-    ${empty && html`<${Nothing} icon="plot" what="Nothing to plot yet">It begins with the first number that is received.<//>`}
+    ${empty && html`<${Nothing} icon="plot" what="Nothing to plot yet">Any number that is received can be drawn.<//>`}
     ${usual.map((plot) => html`<${Figure} key=${plot.id} plot=${plot} ...${parts} />`)}
     ${added.map(
       (plot) => html`<${Figure}

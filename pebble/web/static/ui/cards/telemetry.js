@@ -38,16 +38,17 @@ function Hint({ at }) {
 }
 
 /**
- * ``streams``: it comes several times a second. Its period is unknown (0) until four values came, and a value without one
+ * Nothing where there are no words for a value. ``streams``: it comes several times a second. Its period is unknown (0) until four values came, and a value without one
  * is never gone: until then a second is assumed.
  */
 function Row({ at, metric, name, online, streams = false, children: words }) {
   const received = useMetric(at, metric);
-  if (!received) return null;
+  const text = received && words(received.value);
+  if (!text) return null;
   const entry = streams ? { ...received, period: received.period || STREAM_MS } : received;
   return html`<div>
     <dt>${name}</dt>
-    <dd><${Live} entry=${entry} online=${online}>${words(entry.value)}<//></dd>
+    <dd><${Live} entry=${entry} online=${online}>${text}<//></dd>
   </div>`;
 }
 

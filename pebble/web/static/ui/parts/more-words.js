@@ -7,10 +7,10 @@ const short = new Intl.DateTimeFormat("en-GB", { hour: "2-digit", minute: "2-dig
 /** @param {number} ms epoch @returns {string} 12:03 */
 export const shortTime = (ms) => short.format(ms);
 
-/** @param {unknown} payload of charging-status @returns {string} */
+/** @param {unknown} payload of charging-status @returns {string} "": it is not known */
 export function charging(payload) {
   const value = inner(payload);
-  return value === true ? "charging" : value === false ? "not charging" : "charging: unknown";
+  return value === true ? "charging" : value === false ? "not charging" : "";
 }
 
 const MAX_TEXT = 400;
