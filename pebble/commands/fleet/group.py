@@ -17,7 +17,7 @@ from pebble.fleet import applying, certificates, check, folder
 from pebble.fleet.broker_files import new_password
 from pebble.fleet.folder import ADMIN, CONF, ZENOH, Fleet, FleetError, Server
 from pebble.fleet.people import People
-from pebble.fleet.roles import Account, ProgramRole
+from pebble.fleet.roles import Account, ProgramRole, Role
 
 _HELP = """The accounts of a broker: robots, people and page servers, and what each may do.
 
@@ -372,7 +372,8 @@ def _print_account(place: Path, fleet: Fleet, name: str, secret: str, how: str, 
         typer.echo("A hub needs none, but a certificate:")
         typer.echo(f"    pebble fleet certificate {name} HOST")
     elif not {ProgramRole.GATEWAY, ProgramRole.BOARDS} & {*account.roles}:
-        typer.echo(f"    pebble drive ROBOT --url {url} --ca-cert {ca} --password-file FILE")
+        does = "watch" if account.roles == (Role.VIEWER,) else "drive"
+        typer.echo(f"    pebble {does} ROBOT --url {url} --ca-cert {ca} --password-file FILE")
 
 
 def _print_certificate(place: Path, fleet: Fleet, name: str, files: tuple[Path, Path]) -> None:
