@@ -96,7 +96,7 @@ def test_what_is_printed_can_be_pasted_and_a_signal_ends_everything_within_five_
         assert "goob" in shell(stop)
         assert "goob" in shell(reset)
     assert re.search(r"Recorded [\d,]+ messages \(.+\) of 4 robots;", recorded()), recorded()
-    (folder,) = re.findall(r"They are recorded into (\S+), for its Recordings", demo.output)
+    (folder,) = re.findall(r"Its Recordings show what they do, from (\S+), which", demo.output)
     assert Path(folder).is_relative_to(temporary)
     assert until(lambda: recorded_robots(page_of(demo)) == ["benjr", "fred", "goob", "minilamp"])
     ends_by(demo, signal.SIGINT)

@@ -114,6 +114,10 @@ def test_a_command_line_is_one_that_exists(pebble: Any, line: str, monkeypatch: 
 ALL_TEXT = "\n".join(path.read_text() for path in DOCUMENTS)
 
 
+def test_a_command_line_stands_in_a_block_of_code() -> None:
+    assert re.findall(r"^\n(?:sudo|pebble|make|pip) .*", ALL_TEXT, re.MULTILINE) == []
+
+
 def test_extras_targets_and_modules_are_ones_that_exist() -> None:
     extras = set(tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"])
     rules = re.findall(r"^([a-z][a-z -]*):", (ROOT / "Makefile").read_text(), re.MULTILINE)

@@ -108,8 +108,13 @@ def _run(arguments: list[str]) -> int:
     try:
         code = typer.main.get_command(app).main(line, prog_name="pebble", standalone_mode=False)
     except typer.TyperException as error:
-        help_ = " ".join(["pebble", *wanted, "--help"])
-        sys.stderr.write(f"pebble: {without_secrets(error.format_message().rstrip('.'))}; see {help_}\n")
+        context = getattr(error, "ctx", None)
+        wrong = (
+            without_secrets(error.format_message().rstrip("."))
+            .replace("float range", "number")
+            .replace("int range", "whole number")
+        )
+        sys.stderr.write(f"pebble: {wrong}; see {context.command_path if context else 'pebble'} --help\n")
         return 2
     except typer.Abort as error:  # Ctrl-C
         raise KeyboardInterrupt from error

@@ -41,7 +41,9 @@ def compare(
 
 
 def echo(
-    url: Annotated[str, typer.Argument(help="mqtt://HOST[:PORT] or mqtts://HOST[:PORT]", show_default=False)],
+    url: Annotated[
+        str, typer.Argument(help="mqtt://HOST[:PORT] or mqtts://HOST[:PORT]", metavar="URL", show_default=False)
+    ],
 ) -> int:
     """Send back what `pebble bench control --far` sends, until Ctrl-C. Runs on the other machine."""
     from pebble.bench.control.far import serve

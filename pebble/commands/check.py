@@ -37,7 +37,7 @@ _FIXED = {_LAUNCHER: STATUS, "av_daemon": MEDIA_STATUS}
 
 
 def check(
-    configs: Annotated[list[Path], typer.Argument(help="Config files.", show_default=False)],
+    configs: Annotated[list[Path], typer.Argument(help="Config files.", metavar="CONFIG…", show_default=False)],
     as_json: Annotated[bool, typer.Option("--json", help="Print only the keys and their values.")] = False,
 ) -> int:
     """Report all mistakes of a config at once, or print a summary of it.
@@ -61,7 +61,8 @@ def _check(path: Path, *, as_json: bool, first: bool) -> bool:
         _check_certificates(config)
     except ConfigError as error:
         for problem in error.problems:
-            typer.echo(f"pebble: {without_secrets(f'{path.name}: {problem}')}", err=True)
+            line = problem if f"{path.name}: " in problem else f"{path.name}: {problem}"
+            typer.echo(f"pebble: {without_secrets(line)}", err=True)
         return False
     if as_json:
         typer.echo(json.dumps(resolved(config), indent=2))

@@ -25,7 +25,9 @@ _INDENT = " " * 6
 
 
 def doctor(
-    config: Annotated[Path | None, typer.Argument(help="Also check what this robot needs.", show_default=False)] = None,
+    config: Annotated[
+        Path | None, typer.Argument(help="Also check what this robot needs.", metavar="CONFIG", show_default=False)
+    ] = None,
     broker: BrokerOption = None,
     below: BelowOption = BELOW,
     restart: RestartOption = False,

@@ -25,7 +25,11 @@ _OF_PLATFORM = {"esp32": "minilamp", "esp8266": "benjr"}
 def flash(
     robot: Annotated[
         str,
-        typer.Argument(help=f"A robot's config file, or a firmware's name: {', '.join(FIRMWARE)}.", show_default=False),
+        typer.Argument(
+            help=f"A robot's config file, or a firmware's name: {', '.join(FIRMWARE)}.",
+            metavar="ROBOT",
+            show_default=False,
+        ),
     ],
     port: Annotated[
         str | None, typer.Option(help="The board's serial port.", metavar="PORT", show_default=False)

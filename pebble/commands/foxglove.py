@@ -21,7 +21,8 @@ if TYPE_CHECKING:
 
 def foxglove(
     config: Annotated[
-        Path | None, typer.Argument(help="A robot's config file: show this robot.", show_default=False)
+        Path | None,
+        typer.Argument(help="A robot's config file: show this robot.", metavar="CONFIG", show_default=False),
     ] = None,
     url: Annotated[
         str | None, typer.Option(help="mqtt://[USER@]HOST[:PORT] or mqtts://… of the robots' broker.", metavar="URL")

@@ -11,7 +11,7 @@ import typer
 from pebble.config import hosts
 from pebble.errors import PebbleError
 
-ConfigArgument = Annotated[Path, typer.Argument(help="A robot's config file.", show_default=False)]
+ConfigArgument = Annotated[Path, typer.Argument(help="A robot's config file.", metavar="CONFIG", show_default=False)]
 ConfigOption = Annotated[
     Path | None, typer.Option("--config", "-c", help="A robot's config file: use its own transport.", metavar="CONFIG")
 ]

@@ -10,7 +10,10 @@ from pebble.setup.places import Places
 
 ZipArgument = Annotated[Path, typer.Argument(help="Zip file to write.", metavar="FILE.zip", show_default=False)]
 OtherConfig = Annotated[
-    Path | None, typer.Argument(help="A robot's config file. [default: the installed one]", show_default=False)
+    Path | None,
+    typer.Argument(
+        help="A robot's config file. [default: the installed one]", metavar="CONFIG", exists=True, show_default=False
+    ),
 ]
 
 

@@ -139,7 +139,7 @@ def fleet(
 
 
 def loudspeaker(
-    file: Annotated[str, typer.Argument(help="A WAV file, or - for raw sound from standard input.")],
+    file: Annotated[str, typer.Argument(help="A WAV file, or - for raw sound from standard input.", metavar="FILE")],
     record: Annotated[
         Path | None, typer.Option(help="For events.jsonl and WAV files of what is played.", metavar="FOLDER")
     ] = None,

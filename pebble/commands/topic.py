@@ -35,7 +35,9 @@ _REPORT_PERIOD_S = 1.0
 Name = Annotated[
     str,
     typer.Argument(
-        help="A metric (drive-values, outgoing/online) or a whole topic; + and # except with pub.", show_default=False
+        help="A metric (drive-values, outgoing/online) or a whole topic; + and # except with pub.",
+        metavar="TOPIC",
+        show_default=False,
     ),
 ]
 SecondsOption = Annotated[float | None, typer.Option("--seconds", "-s", min=0.1, help="Stop after this long.")]
@@ -139,7 +141,7 @@ def echo(
 @with_target(robot=True)
 def pub(
     topic: Name,
-    payload: Annotated[str, typer.Argument(help="JSON, any text, or @FILE.", show_default=False)],
+    payload: Annotated[str, typer.Argument(help="JSON, any text, or @FILE.", metavar="PAYLOAD", show_default=False)],
     retain: Annotated[
         bool | None,
         typer.Option("--retain/--no-retain", help="Retain it for later subscribers. [default: the contract's rule]"),

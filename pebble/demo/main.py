@@ -158,7 +158,7 @@ def _start_page(testbed: Testbed, ending: threading.Event, console: Console, ope
     testbed.start_recorder(recordings, *_RECORDED)
     page = usual_or_free(testbed, ending, recordings=recordings, **({} if opened is None else opened.settings))
     print_line(console, f"See and drive them in a browser: {page.url}")
-    print_line(console, f"They are recorded into {recordings}, for its Recordings; the folder goes with the demo.")
+    print_line(console, f"Its Recordings show what they do, from {recordings}, which is deleted when the demo ends.")
     if opened is not None:
         opened.show(page.url, console)
     return page.url

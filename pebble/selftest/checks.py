@@ -168,7 +168,7 @@ def boards(robot: RobotUnderTest) -> CheckResult:
         return skipped(f"{', '.join(unheard)} sends nothing at rest, as some boards do")
     if drives is not None and drives.state == "unknown":
         return skipped(f"it is not known whether its motors obey: {drives.why}")
-    return ok(f"{', '.join(lines)} was heard" + (", and commands reach the motors" if drives is not None else ""))
+    return ok(f"heard: {', '.join(lines)}" + (", and commands reach the motors" if drives is not None else ""))
 
 
 _MCU_STATES = {"silent": "its board has stopped sending", "absent": "there is no such device", "booting": "it starts"}

@@ -55,11 +55,11 @@ def test_without_a_command_the_commands_are_listed(run: Run, arguments: tuple[st
     ("arguments", "named", "help_"),
     [
         (("flyy",), "flyy", "pebble --help"),
-        (("up",), "config", "pebble up --help"),
+        (("up",), "CONFIG", "pebble up --help"),
         (("topics", "--bad"), "--bad", "pebble topics --help"),
         (("sim", "bob"), "bob", "pebble sim --help"),
-        (("topic", "pub", "drive-values"), "payload", "pebble topic --help"),
-        (("topic", "pub", "drive-values", "{}", "--qos", "2"), "qos", "pebble topic --help"),
+        (("topic", "pub", "drive-values"), "PAYLOAD", "pebble topic pub --help"),
+        (("topic", "pub", "drive-values", "{}", "--qos", "2"), "qos", "pebble topic pub --help"),
     ],
 )
 def test_a_wrong_command_line_is_one_line_and_exit_code_2(

@@ -17,7 +17,7 @@ from pebble.fleet import applying, certificates, check, folder
 from pebble.fleet.broker_files import new_password
 from pebble.fleet.folder import ADMIN, CONF, ZENOH, Fleet, FleetError, Server
 from pebble.fleet.people import People
-from pebble.fleet.roles import Account, ProgramRole
+from pebble.fleet.roles import Account, ProgramRole, Role
 
 _HELP = """The accounts of a broker: robots, people and page servers, and what each may do.
 
@@ -381,7 +381,8 @@ def _print_account(place: Path, fleet: Fleet, name: str, secret: str, how: str, 
         )
         typer.echo(json.dumps(_file_of_boards(place, fleet, name), indent=2))
     elif ProgramRole.GATEWAY not in account.roles:
-        typer.echo(f"    pebble drive ROBOT --url {url} --ca-cert {ca} --password-file FILE")
+        does = "watch" if account.roles == (Role.VIEWER,) else "drive"
+        typer.echo(f"    pebble {does} ROBOT --url {url} --ca-cert {ca} --password-file FILE")
 
 
 def _print_certificate(place: Path, fleet: Fleet, name: str, files: tuple[Path, Path]) -> None:

@@ -30,12 +30,15 @@ _FIRST_SECOND_S = 1.0  # most mistakes in a script end it within that
 _SAME_ERROR_S = 1.0  # an error that was there before the command is the answer to it, too, if it stays
 
 _Robot = Annotated[
-    str, typer.Argument(help="A robot's config file, or with --url or --config its id.", show_default=False)
+    str,
+    typer.Argument(
+        help="A robot's config file, or with --url or --config its id.", metavar="ROBOT", show_default=False
+    ),
 ]
 
 
 def new(
-    name: Annotated[str, typer.Argument(help="Of the script and its folder.", show_default=False)],
+    name: Annotated[str, typer.Argument(help="Of the script and its folder.", metavar="NAME", show_default=False)],
     folder: Annotated[Path, typer.Option("--folder", help="Where its folder is made.", metavar="DIR")] = Path(),
 ) -> None:
     """Write a script that follows a tag, a test that runs it in a simulated room, and a robot for that room.
@@ -69,7 +72,9 @@ def list_(robot: _Robot, *, target: Target) -> int:
 def start(
     context: typer.Context,
     robot: _Robot,
-    file: Annotated[str, typer.Argument(help="The script; its own options follow.", show_default=False)] = "",
+    file: Annotated[
+        str, typer.Argument(help="The script; its own options follow.", metavar="SCRIPT", show_default=False)
+    ] = "",
     *,
     target: Target,
 ) -> int:

@@ -41,7 +41,10 @@ Port = Annotated[
 
 def serve(
     config: Annotated[
-        Path | None, typer.Argument(help="A robot's config file: its broker, and web_interface.", show_default=False)
+        Path | None,
+        typer.Argument(
+            help="A robot's config file: its broker, and web_interface.", metavar="CONFIG", show_default=False
+        ),
     ] = None,
     url: Annotated[
         str | None, typer.Option(help="mqtt://[USER@]HOST[:PORT] or mqtts://… of the robots' broker.", metavar="URL")

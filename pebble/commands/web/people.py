@@ -43,7 +43,7 @@ PeopleOption = Annotated[
 ]
 _Name = Annotated[str, typer.Argument(help="1 to 32 of a-z, 0-9, _ and -.", metavar="NAME", show_default=False)]
 _RoleOption = Annotated[Role, typer.Option(help="What the person may do; everybody may stop a robot.")]
-_RoleArgument = Annotated[Role, typer.Argument(help="What the person may do.", show_default=False)]
+_RoleArgument = Annotated[Role, typer.Argument(help="What the person may do.", metavar="ROLE", show_default=False)]
 
 
 def audit(

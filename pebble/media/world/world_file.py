@@ -134,7 +134,7 @@ class World(Section, frozen=True, kw_only=True):
 
 def read_world(path: Path) -> World:
     """Read a world file. Raises ConfigError with every mistake in it, each with its place."""
-    return parse_world(decode(read_text(path), path.name))
+    return parse_world(decode(read_text(path), str(path)))
 
 
 def parse_world(raw: Any) -> World:
