@@ -27,6 +27,7 @@ QUICK = (
     "commands are valid for long",
     "an interruption leaves the inputs as they are",
     "the end of a gesture is not sent",
+    "a gamepad needs no neutral",
 )
 
 
