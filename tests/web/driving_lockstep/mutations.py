@@ -135,11 +135,6 @@ MUTATIONS = {
         "    else if (!moving) this.mustRelease = false;\n",
     ),
     "a frozen gamepad drives on": Mutation(_INPUTS, "const FROZEN_MS = 3000;", "const FROZEN_MS = 300000;"),
-    "a gesture outlives its connection": Mutation(
-        _DRIVER,
-        "    this.inputs.clear();\n    this.gesture.reset();\n    this.changed();\n",
-        "    this.changed();\n",
-    ),
     "a dialog ends nothing": Mutation(
         _REASONS, '  if (s.dialog) return reason("dialog", "Close the panel first");\n', ""
     ),
@@ -147,9 +142,6 @@ MUTATIONS = {
         _INPUTS,
         "    if (!this.keys.size) this.waiting.clear(); // the release of the others may have been lost\n",
         "",
-    ),
-    "a press right after a reset is lost without a word": Mutation(
-        _REASONS, "const RESET_MS = 600;", "const RESET_MS = 0;"
     ),
     "a lost connection is not made again": Mutation(
         _SOCKET, "    this.retry = setTimeout(() => this.connect(), delay);\n", ""
