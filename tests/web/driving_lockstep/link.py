@@ -160,4 +160,5 @@ class Link:
             return
         if what == "message":
             self._delivered(str(value))
+        self.closed = what == "closed"
         self._pages.do(self.page, "network", self.number, what, value)

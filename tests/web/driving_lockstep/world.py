@@ -175,6 +175,8 @@ class World:
         elif slot is None:
             return
         elif output.what == "connect":
+            others = [one for one in self.links.values() if one.page == output.page and not (one.broken or one.closed)]
+            self.scheduler.check(not others, "a page has two connections")
             deliver = lambda text: self._delivered(output.page, output.value, text)
             link = Link(output.page, output.value, self.wires[slot], self.server, self.pages, deliver)
             link.first = len(self.rules.sent)
