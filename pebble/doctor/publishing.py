@@ -66,7 +66,9 @@ def _bounds(what: str, client: MqttTransport, own: _Echo) -> CheckResult:
     """Whether the broker has rules: no robot, and no page, may publish what a robot of another name does."""
     other = _Echo(client, BRIDGE_PROBE.topic(f"pebble/robots/doctor-{secrets.token_hex(4)}"), own.answer_s)
     payload = other.send(QoS.DELIVERED)
-    own.arrival(own.send(QoS.DELIVERED))  # what was let through has come before it
+    came_back = own.arrival(own.send(QoS.DELIVERED)) is not None  # what was let through has come before it
+    if not (came_back or other.has(payload)):
+        return warn(what, "does not answer in time: whether it has rules is not known")
     if other.has(payload):
         fix = "start it with the files of `pebble fleet init`, see docs/fleet.md"
         return fail(what, "has no rules: with this account one can pose as any robot, and drive it", fix)
@@ -118,7 +120,7 @@ class _Echo:
     def __init__(self, client: MqttTransport, topic: str, answer_s: float) -> None:
         self._client, self.topic, self.answer_s = client, topic, answer_s
         self._came, self._arrivals = threading.Condition(), dict[bytes, float]()
-        client.subscribe(topic, self._note)
+        client.subscribe(topic, self._note, direct=True)  # in the order in which messages come
 
     @property
     def refusal(self) -> str:
