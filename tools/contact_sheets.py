@@ -12,8 +12,8 @@ ROOT = Path(__file__).resolve().parent.parent
 PICTURES, DOCS = ROOT / "build" / "page", ROOT / "docs"
 #: Size of the page, scale, columns, quality; what is also on the sheet.
 SHEETS = {
-    "desktop": ((1280, 800), 0.17, 8, 38, ()),
-    "phone": ((390, 844), 0.23, 16, 38, ("landscape", "small")),
+    "desktop": ((1280, 800), 0.17, 8, 36, ()),
+    "phone": ((390, 844), 0.23, 16, 36, ("landscape", "small")),
 }
 LABEL, GAP = 22, 10
 BACKGROUND, INK = (64, 70, 76), (255, 255, 255)

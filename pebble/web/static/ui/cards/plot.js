@@ -59,8 +59,9 @@ export function Lines({ series, fields, shownMs, least, paused }) {
     const sight = more.sight((is) => (seen = is));
     sizes.observe(element);
     sight.observe(element);
-    join(draw);
     draw();
+    drawnAt = -Infinity; // what comes with the page's other messages is drawn with the next step
+    join(draw);
     return () => {
       leave(draw);
       sizes.disconnect();

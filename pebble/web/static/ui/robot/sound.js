@@ -70,12 +70,10 @@ export function SoundFacts({ at }) {
   return html`<p class="facts" data-test="sound-state">${words(sound, view, useName(at))}</p>`;
 }
 
-/** Numbers are folded, and not read aloud. */
+/** Numbers are not read aloud. */
 function State({ text }) {
-  const well = text.includes("buffered");
-  const said = useCalm(well ? "Listening" : text);
-  const state = html`<p class="sound-state" data-test="sound-state">${text}</p>`;
-  return html`${well ? html`<details class="folded"><summary>Listening</summary>${state}</details>` : state}
+  const said = useCalm(text.replace(/^.*buffered.*$/, "Listening"));
+  return html`<p class="sound-state" data-test="sound-state">${text}</p>
     <span class="sr" role="status">${said}</span>`;
 }
 
