@@ -6,6 +6,7 @@ import shutil
 import signal
 import tempfile
 import time
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -14,7 +15,7 @@ from hypothesis import settings
 from pebble.transports import segments
 from tests.kit import rows
 from tests.recordings.replayed import recording as recording  # a fixture for all tests
-from tests.support import cases
+from tests.support import Broker, cases
 
 # Started in the background of a shell or by nohup, this process ignores signals, and so would every program it starts.
 signal.signal(signal.SIGINT, signal.default_int_handler)
@@ -45,6 +46,23 @@ _LONG = (
     *("commands/test_estop.py", "commands/test_drive.py", "launcher/test_launcher.py", "flash/test_steps.py"),
     *("web/test_types.py", "firmware/test_heap.py", "firmware/test_deadman_virtual.py", "web/test_driving_lockstep.py"),
 )
+
+
+@pytest.fixture
+def broker(tmp_path: Path) -> Iterator[Broker]:
+    """One for this test alone; in some folders there is one for a whole module."""
+    running = Broker(tmp_path)
+    yield running
+    running.stop()
+
+
+@pytest.fixture
+def brokers(tmp_path: Path) -> Iterator[tuple[Broker, Broker]]:
+    """Two, of which a test ends one."""
+    first, second = Broker(tmp_path), Broker(tmp_path)
+    yield first, second
+    first.kill()
+    second.kill()
 
 
 @pytest.hookimpl(tryfirst=True)  # before tests are chosen by their marks

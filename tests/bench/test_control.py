@@ -117,13 +117,6 @@ def test_a_process_that_dies_is_named() -> None:
 
 
 @pytest.fixture
-def broker(tmp_path: Path) -> Iterator[Broker]:
-    broker = Broker(tmp_path)
-    yield broker
-    broker.stop()
-
-
-@pytest.fixture
 def url(broker: Broker) -> str:
     return f"mqtt://127.0.0.1:{broker.port}"
 

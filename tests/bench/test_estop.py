@@ -186,13 +186,6 @@ def test_results_are_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
 # -- the driver
 
 
-@pytest.fixture
-def broker(tmp_path: Path) -> Iterator[Broker]:
-    broker = Broker(tmp_path)
-    yield broker
-    broker.kill()
-
-
 def test_the_driver_sends_a_zero_before_and_after_its_commands(broker: Broker, tmp_path: Path) -> None:
     received: list[tuple[str, float]] = []
 

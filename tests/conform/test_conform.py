@@ -231,13 +231,6 @@ class Machine:
             self.on()
 
 
-@pytest.fixture
-def broker(tmp_path: Path) -> Iterator[Broker]:
-    broker = Broker(tmp_path)
-    yield broker
-    broker.stop()
-
-
 @contextmanager
 def switched_on(command: Sequence[str | Path], target: Target) -> Iterator[Component]:
     """A robot, and who looks at it through its broker."""

@@ -128,13 +128,6 @@ def judged(robot: StandIn, *names: str) -> dict[str, tuple[State, str]]:
     return {check.name: (one.state, one.text) for check, one in run(robot, [ALL[name] for name in names or ALL])}
 
 
-@pytest.fixture
-def broker(tmp_path: Path) -> Iterator[Broker]:
-    broker = Broker(tmp_path)
-    yield broker
-    broker.stop()
-
-
 @pytest.mark.parametrize("language", [OPERATORS[0], *map(further, OPERATORS[1:])])
 def test_the_smallest_honest_operator_passes(broker: Broker, tmp_path: Path, language: Language) -> None:
     program = language("operator", tmp_path)

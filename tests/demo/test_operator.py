@@ -5,7 +5,6 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Iterator
-from pathlib import Path
 
 import pytest
 
@@ -101,13 +100,6 @@ class Robot:
 
     def _receive(self, message: Message) -> None:
         self.drives.append((time.monotonic(), codec.decode(DRIVE, message.payload)))
-
-
-@pytest.fixture
-def broker(tmp_path: Path) -> Iterator[Broker]:
-    running = Broker(tmp_path)
-    yield running
-    running.stop()
 
 
 @pytest.fixture

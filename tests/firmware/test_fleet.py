@@ -5,7 +5,6 @@ from __future__ import annotations
 import signal
 import sys
 import time
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Self
 
@@ -16,13 +15,6 @@ from pebble.bench.fleet import STEPS, latencies_ms, longest_gap_s
 from pebble.errors import ConfigError
 from pebble.simulation.fleet import MOST, Moved, members
 from tests.support import ROOT, Broker, Child, free_port, until
-
-
-@pytest.fixture
-def broker(tmp_path: Path) -> Iterator[Broker]:
-    broker = Broker(tmp_path)
-    yield broker
-    broker.kill()
 
 
 class TestMembers:

@@ -58,13 +58,6 @@ class Program:
 
 
 @pytest.fixture
-def broker(tmp_path: Path) -> Iterator[Broker]:
-    broker = Broker(tmp_path)
-    yield broker
-    broker.kill()
-
-
-@pytest.fixture
 def start(tmp_path: Path) -> Iterator[Any]:
     programs: list[Program] = []
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from pathlib import Path
 
 import pytest
 
@@ -49,14 +48,6 @@ def test_invented_robots_keep_no_real_one_out() -> None:
         homes.get(f"invented-{number}")
     assert homes.heartbeat("real", 1, 100.0)
     assert homes.of("real") == 1
-
-
-@pytest.fixture
-def brokers(tmp_path: Path) -> Iterator[tuple[Broker, Broker]]:
-    first, second = Broker(tmp_path), Broker(tmp_path)
-    yield first, second
-    first.kill()
-    second.kill()
 
 
 @pytest.fixture

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import socket
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -110,14 +109,6 @@ def test_a_file_that_is_missing_or_wrong_names_the_first_host(tmp_path: Path) ->
     for wrong in (b"elsewhere:1883", b"\xff", b""):
         (tmp_path / "remote-host").write_bytes(wrong)
         assert chosen.read() == A
-
-
-@pytest.fixture
-def brokers(tmp_path: Path) -> Iterator[tuple[Broker, Broker]]:
-    first, second = Broker(tmp_path), Broker(tmp_path)
-    yield first, second
-    first.kill()
-    second.kill()
 
 
 def _settings(brokers: tuple[Broker, Broker], folder: Path) -> MqttSettings:

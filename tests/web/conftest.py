@@ -3,8 +3,7 @@
 Not for the whole session: while Playwright runs, asyncio.run fails in this process.
 """
 
-from __future__ import annotations
-
+import itertools
 from collections.abc import Iterator
 from functools import partial
 
@@ -14,7 +13,9 @@ from playwright.sync_api import Browser
 from tests.support import Broker
 from tests.web.browser import chromium
 from tests.web.canned import CannedServer, Show, serving, showing
-from tests.web.served import Served
+from tests.web.served import Page, RecordingRobot, Served
+
+_NUMBERS = itertools.count(1)
 
 
 @pytest.fixture(scope="module")
@@ -28,6 +29,22 @@ def broker(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Broker]:
 def served(broker: Broker) -> Iterator[Served]:
     with Served(broker.port) as running:
         yield running
+
+
+@pytest.fixture
+def robot(broker: Broker) -> Iterator[RecordingRobot]:
+    """Another one for each test."""
+    with RecordingRobot(broker.port, f"pebble/robots/robot{next(_NUMBERS)}") as one:
+        yield one
+
+
+@pytest.fixture
+def page(served: Served, robot: RecordingRobot) -> Iterator[Page]:
+    """It can drive the robot, once it has asked for control."""
+    with served.page() as one:
+        assert one.knows(robot.base)
+        assert one.ready()
+        yield one
 
 
 @pytest.fixture(scope="module")

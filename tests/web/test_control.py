@@ -4,32 +4,16 @@ from __future__ import annotations
 
 import itertools
 import time
-from collections.abc import Iterator
 
 import httpx
-import pytest
 
 from pebble.web.server import Server
 from tests.support import until
-from tests.web.served import Page, RecordingRobot, Served
+from tests.web.served import RecordingRobot, Served
 
 ZERO = {"x": 0.0, "z": 0.0, "y": 0.0}
 FINAL = {**ZERO, "valid_ms": 0}
 NAMES = itertools.count(1)
-
-
-@pytest.fixture
-def robot(broker) -> Iterator[RecordingRobot]:
-    with RecordingRobot(broker.port, f"pebble/robots/rover{next(NAMES)}") as one:
-        yield one
-
-
-@pytest.fixture
-def page(served: Served, robot: RecordingRobot) -> Iterator[Page]:
-    with served.page() as one:
-        assert one.knows(robot.base)
-        assert one.ready()
-        yield one
 
 
 def last(robot: RecordingRobot):

@@ -32,12 +32,6 @@ def lines(page: Page) -> list[Any]:
 
 
 @pytest.fixture
-def robot(broker: Broker) -> Iterator[RecordingRobot]:
-    with RecordingRobot(broker.port, f"pebble/robots/rig{next(NAMES)}") as one:
-        yield one
-
-
-@pytest.fixture
 def page(served: Served, robot: RecordingRobot) -> Iterator[Page]:
     with Page(served) as one:
         assert one.knows(robot.base)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 import json
-from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -208,20 +207,6 @@ def test_what_capabilities_rule_out(fields: dict[str, Any], capabilities: dict[s
 
 
 # -- at a server
-
-
-@pytest.fixture
-def robot(broker: Broker) -> Iterator[RecordingRobot]:
-    with RecordingRobot(broker.port, f"pebble/robots/asked{next(NUMBERS)}") as one:
-        yield one
-
-
-@pytest.fixture
-def page(served: Served, robot: RecordingRobot) -> Iterator[Page]:
-    with served.page() as one:
-        assert one.knows(robot.base)
-        assert one.ready()
-        yield one
 
 
 def asked_of(robot: RecordingRobot) -> list[tuple[str, Any]]:
