@@ -23,14 +23,7 @@ from rich.console import Console
 from pebble.client.estop import StopSender, new_name
 from pebble.client.estop_states import Reset
 from pebble.client.page.packages import require_packages
-from pebble.contract import (
-    AUTONOMY_FILES,
-    AUTONOMY_STATUS,
-    DRIVE,
-    NEIGHBOUR_VALUE,
-    WHEEL_ODOMETRY,
-    codec,
-)
+from pebble.contract import AUTONOMY_FILES, AUTONOMY_STATUS, DRIVE, NEIGHBOUR_VALUE, WHEEL_ODOMETRY, codec
 from pebble.contract.payloads import Drive
 from pebble.demo.brokers import BrokerKind, best_kind
 from pebble.demo.main import ending_on_signals, print_line, usual_or_free

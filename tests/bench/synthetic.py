@@ -10,15 +10,7 @@ import numpy as np
 from pebble.bench.fleet import BROKER_CPU, BROKER_MB, PAGE_MB, PINS, VIEWER_CPU
 from pebble.bench.results import Cell, Judged, Results
 from pebble.bench.traffic import cells_of
-from pebble.recordings.traffic.results import (
-    Bandwidth,
-    Histogram,
-    Intervals,
-    Latency,
-    Outage,
-    RobotTraffic,
-    Traffic,
-)
+from pebble.recordings.traffic.results import Bandwidth, Histogram, Intervals, Latency, Outage, RobotTraffic, Traffic
 
 TRIALS = (
     "base-start", "1024k", "512k", "256k", "128k", "64k", "1%", "2%", "5%", "10%",

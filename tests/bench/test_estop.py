@@ -13,19 +13,7 @@ from rich.console import Console
 from pebble.bench import engine
 from pebble.bench.comparison import Case, Measuring, Round
 from pebble.bench.engine import Collected, run
-from pebble.bench.estop import (
-    ALL,
-    BOARD,
-    CONFIRMED,
-    ESTOP,
-    HOLD,
-    REST,
-    STOP,
-    ZERO,
-    cell_of,
-    measure,
-    rest,
-)
+from pebble.bench.estop import ALL, BOARD, CONFIRMED, ESTOP, HOLD, REST, STOP, ZERO, cell_of, measure, rest
 from pebble.bench.pictures import pictures
 from pebble.bench.results import Cell, Results, load
 from pebble.errors import PebbleError

@@ -8,17 +8,7 @@ import pytest
 
 from pebble.bench.engine import check_folder
 from pebble.bench.judging.compare import compare
-from pebble.bench.results import (
-    FORMAT,
-    OVER_TIME,
-    Cell,
-    Results,
-    begin,
-    load,
-    machine,
-    pack,
-    percentile,
-)
+from pebble.bench.results import FORMAT, OVER_TIME, Cell, Results, begin, load, machine, pack, percentile
 from pebble.errors import PebbleError
 
 

@@ -9,13 +9,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from pebble.contract import (
-    APRILTAG_DATA,
-    APRILTAG_LOCATIONS,
-    CHARGING_LEVEL,
-    LOGS,
-    WHEEL_ODOMETRY,
-)
+from pebble.contract import APRILTAG_DATA, APRILTAG_LOCATIONS, CHARGING_LEVEL, LOGS, WHEEL_ODOMETRY
 from pebble.contract.payloads import ChargingLevel, LogRecord, TagData, TagDetection, TagLocations, WheelOdometry
 from pebble.transports import Message, QoS, Transport
 from tests.foxglove.live import FRED, GOOB, client, live, online, publish

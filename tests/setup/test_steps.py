@@ -17,16 +17,7 @@ from pebble.setup.manifest import Manifest
 from pebble.setup.places import Places
 from pebble.setup.steps import Engine, State, Step
 from tests.commands.command_line import Run
-from tests.setup.rig import (
-    PASSWORD,
-    answers_in,
-    in_child,
-    machine_root,
-    manifest_is_true,
-    set_up,
-    tree,
-    without_rights,
-)
+from tests.setup.rig import PASSWORD, answers_in, in_child, machine_root, manifest_is_true, set_up, tree, without_rights
 from tests.support import cases, needs_root
 
 _MOMENTS = cases(6, 20)

@@ -12,17 +12,7 @@ import pytest
 from rich.console import Console
 
 from pebble.bench.impair import metrics
-from pebble.bench.impair.metrics import (
-    Arrival,
-    Command,
-    Heartbeat,
-    Record,
-    Sound,
-    Trial,
-    Window,
-    cells_of,
-    over_time,
-)
+from pebble.bench.impair.metrics import Arrival, Command, Heartbeat, Record, Sound, Trial, Window, cells_of, over_time
 from pebble.bench.impair.network import Traffic
 from pebble.bench.impair.trials import IMPAIR, QUICK, SUBJECTS, ImpairedRobot, conditions, groups
 from pebble.bench.results import Cell

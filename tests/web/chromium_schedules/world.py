@@ -8,16 +8,7 @@ from contextlib import ExitStack
 from tests.support import until
 from tests.tcp_proxy import TcpProxy
 from tests.web.browser import chromium
-from tests.web.chromium_schedules.rules import (
-    BUSY_S,
-    CERTAIN_S,
-    PAGE_S,
-    SILENCE_S,
-    VALID_S,
-    Motors,
-    Press,
-    problems,
-)
+from tests.web.chromium_schedules.rules import BUSY_S, CERTAIN_S, PAGE_S, SILENCE_S, VALID_S, Motors, Press, problems
 from tests.web.chromium_schedules.schedules import ACTIVE_S, Schedule, Step
 from tests.web.console import Console, console
 from tests.web.stage import Stage

@@ -17,17 +17,7 @@ from pebble.media.scene import read_counter
 from pebble.media.video import make_encoder
 from pebble.transports import QoS
 from pebble.web.media import rescue
-from tests.web.media.robots import (
-    CAMERA,
-    EVERYTHING,
-    REF,
-    VIDEO,
-    PicturePage,
-    PictureRobot,
-    Server,
-    serving,
-    until,
-)
+from tests.web.media.robots import CAMERA, EVERYTHING, REF, VIDEO, PicturePage, PictureRobot, Server, serving, until
 
 pytestmark = pytest.mark.anyio
 PLAIN = EVERYTHING - {"h264"}

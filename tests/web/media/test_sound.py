@@ -16,16 +16,7 @@ from pebble.fleet.roles import Role
 from pebble.transports import Message
 from pebble.web.media.sound import MAX_PACKETS, WINDOW, SoundQueue, best
 from pebble.web.media.talk import LATE_S, PIECE_BYTES, PIECES_PER_S, SILENT_S, Talk, Voice
-from tests.web.media.robots import (
-    AUDIO,
-    REF,
-    UPLINK,
-    Server,
-    SoundPage,
-    SoundRobot,
-    serving,
-    until,
-)
+from tests.web.media.robots import AUDIO, REF, UPLINK, Server, SoundPage, SoundRobot, serving, until
 
 pytestmark = pytest.mark.anyio
 PLAIN, NOTHING = frozenset({"pcm"}), frozenset[str]()
