@@ -1,7 +1,6 @@
 """A simulated MCU behind a real pseudo terminal, which the host uses as a serial port."""
 
 import errno
-import logging
 import os
 import queue
 import select
@@ -23,8 +22,6 @@ from pebble.simulation.bodies import Outlets, Pair
 from pebble.simulation.micropython.board import UID
 from pebble.simulation.motion import Pose, RobotMotion
 from pebble.simulation.trace import Entry, Event, Trace, motors_entry
-
-log = logging.getLogger(__name__)
 
 _NO_HOST_S = 0.005  # a master whose slave is closed is always "ready", so it is polled with this period
 _LATE_S = 0.03  # that a turn of the MCU may come after its time

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import threading
 import time
 from collections.abc import Callable
@@ -15,8 +14,6 @@ from pebble.transports.socket_holders import port_holder
 if TYPE_CHECKING:
     import foxglove
     from foxglove.websocket import ChannelView, Client, WebSocketServer
-
-log = logging.getLogger(__name__)
 
 #: Messages that wait for one client before the SDK drops the oldest, uncounted, and how large each may be.
 BACKLOG, MAX_BYTES = 128, 1 << 20

@@ -1,7 +1,6 @@
 """The control socket of one page: what it asks for, and the state that it is sent."""
 
 import asyncio
-import logging
 import secrets
 import time
 from collections import deque
@@ -25,8 +24,6 @@ from pebble.web.pace import STOP_WAITS_S, Pace
 from pebble.web.page_clock import PING_S, ClockJumpError
 from pebble.web.robots import Interest
 from pebble.web.server import Server, encode
-
-log = logging.getLogger(__name__)
 
 FLUSH_S = 0.05  # between two states
 HELLO_S = 5.0  # to begin with

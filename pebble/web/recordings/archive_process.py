@@ -1,7 +1,6 @@
 """The processes that read recordings for pages: one that answers at once, and one for each long job."""
 
 import asyncio
-import logging
 import multiprocessing
 import signal
 from collections.abc import Callable
@@ -13,8 +12,6 @@ from typing import Any, Final, TypeVar
 
 from pebble.errors import PebbleError
 from pebble.recordings.seek import questions
-
-log = logging.getLogger(__name__)
 
 MOST_WAITING: Final = 64  # questions
 _SPAWN: Final = multiprocessing.get_context("spawn")
