@@ -24,6 +24,7 @@ from pebble.transports import Message, MqttSettings, QoS, State, Transport
 
 log = logging.getLogger(__name__)
 
+_STEP_S = 0.005  # between two looks at a condition
 _LATE_S = 0.25  # some brokers send what is retained so long after they have acknowledged a subscription
 _OPEN_TIMEOUT_S = 3.0
 _FIND_S = 1.0  # where several brokers are heard: longer than a robot takes between two heartbeats
@@ -160,13 +161,14 @@ def subscribed_stop(transport: Transport, base: str) -> RobotEstop:
     """The emergency stop of a robot, with what is retained of it, also from a broker that sends it a moment later."""
     robot = RobotEstop(base)
     robot.subscribe(transport)
-    _wait(lambda: robot.has_capabilities)
+    wait_for(lambda: robot.has_capabilities, _LATE_S)
     transport.ask(robot.missing)
-    _wait(lambda: not robot.missing)
+    wait_for(lambda: not robot.missing, _LATE_S)
     return robot
 
 
-def _wait(arrived: Callable[[], bool]) -> None:
-    end = time.monotonic() + _LATE_S
-    while not arrived() and time.monotonic() < end:
-        time.sleep(_LATE_S / 25)
+def wait_for(condition: Callable[[], object], seconds: float) -> None:
+    """Return once ``condition`` is true, or after so long."""
+    end = time.monotonic() + seconds
+    while not condition() and time.monotonic() < end:
+        time.sleep(_STEP_S)

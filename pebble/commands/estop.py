@@ -8,14 +8,13 @@ import socket
 import sys
 import threading
 import time
-from collections.abc import Callable
 from contextlib import suppress
 from functools import partial
 from typing import Annotated
 
 import typer
 
-from pebble.client.connection import Listener, Target, connected, put_names, target_of
+from pebble.client.connection import Listener, Target, connected, put_names, target_of, wait_for
 from pebble.client.discovery import ALL_OUTGOING, Discovery
 from pebble.client.driveable import Driveable
 from pebble.client.estop import Progress, RobotStop, StopSender, new_name, send
@@ -253,9 +252,9 @@ def _reset(target: Target) -> int:
         put_names(transport, names, lambda base: base == robot.base and robot.named)
         robot.subscribe(transport)
         transport.subscribe(LINK.topic(robot.base), lambda one: view.receive(LINK, one, 0.0, 0.0), direct=True)
-        _wait(lambda: robot.has_capabilities)
+        wait_for(lambda: robot.has_capabilities, _ANSWER_S)
         transport.ask(robot.missing)  # the capabilities may have come after the subscription
-        _wait(lambda: not robot.missing)
+        wait_for(lambda: not robot.missing, _ANSWER_S)
         if not robot.states:
             raise PebbleError(f"{name} publishes no emergency stop: {_absent(robot)}")
         reset = Reset(robot, me(names.account))
@@ -267,7 +266,7 @@ def _reset(target: Target) -> int:
         for message in reset.messages():
             if not transport.publish(message.topic, message.payload, qos=message.qos, urgent=True):
                 raise TransportError(f"the reset was not sent: {transport.problem or 'the connection was lost'}")
-        _wait(lambda: not reset.waiting, view.pace.answer_s)
+        wait_for(lambda: not reset.waiting, view.pace.answer_s)
         for owner, why in reset.refusals().items():
             raise PebbleError(shown(f"{name} is still stopped: {owner}: {why}; look again, then repeat"))
     typer.echo(f"{name}: free; it moves again once drive commands have paused for half a second")
@@ -287,12 +286,15 @@ def _status(target: Target, *, every: bool) -> int:
             transport.subscribe(channel.filter(names.base), take, direct=True)
         ask_beside(transport, by_name)
         if not every:
-            _wait(lambda: names.base in discovery.robots and discovery.robots[names.base].estop.has_capabilities)
+            wait_for(
+                lambda: names.base in discovery.robots and discovery.robots[names.base].estop.has_capabilities,
+                _ANSWER_S,
+            )
             transport.ask([topic for robot in discovery.all_robots() for topic in robot.estop.missing])
         if is_remote:
             found, began = discovery.all_robots, time.monotonic()
-            _wait(lambda: not discovery.awaits_heartbeat(time.monotonic() - began), float("inf"))
-            _wait(lambda: not any(one.liveness.received_at and one.estop.lacks for one in found()))
+            wait_for(lambda: not discovery.awaits_heartbeat(time.monotonic() - began), float("inf"))
+            wait_for(lambda: not any(one.liveness.received_at and one.estop.lacks for one in found()), _ANSWER_S)
         robots = sorted(discovery.all_robots(), key=lambda robot: robot.base)
     for robot in robots:
         _print_states(robot.estop, robot.driveable, silent=is_remote and robot.liveness.received_at is None)
@@ -329,9 +331,3 @@ def _absent(robot: RobotEstop) -> str:
     if robot.has_capabilities and not robot.available:
         return "its broker refuses it" if robot.drives else "it does not drive"
     return "is it on, and is this its broker?"
-
-
-def _wait(condition: Callable[[], bool], seconds: float = _ANSWER_S) -> None:
-    end = time.monotonic() + seconds
-    while not condition() and time.monotonic() < end:
-        time.sleep(0.005)

@@ -1,11 +1,7 @@
 """Whether a robot that runs on this machine can be driven, as its own status says."""
 
-from __future__ import annotations
-
-import time
-
 from pebble.check_result import CheckResult, State
-from pebble.client.connection import Target, connected
+from pebble.client.connection import Target, connected, wait_for
 from pebble.client.driveable import Driveable, driveable_of
 from pebble.config import Config
 from pebble.contract import STATUS
@@ -30,9 +26,7 @@ def driving(config: Config) -> CheckResult | None:
     try:
         with connected(Target(config=config.path, program="doctor")) as (transport, names):
             transport.subscribe(STATUS.filter(names.base), receive)
-            end = time.monotonic() + _ANSWER_S
-            while not found and time.monotonic() < end:
-                time.sleep(0.01)
+            wait_for(lambda: found, _ANSWER_S)
     except PebbleError as error:
         return fail("driving", f"nothing reaches the running robot: {error}")
     if not found or found[-1] is None:

@@ -1,14 +1,14 @@
 """``pebble script``: writes a new script, and lists, starts and stops those of a robot."""
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
-from pebble.client.connection import Target, connected, put_names, target_of
+from pebble.client.connection import Target, connected, put_names, target_of, wait_for
 from pebble.client.names import id_of
 from pebble.client.scripts import RobotScripts, options_of
 from pebble.commands.options import with_target
@@ -88,7 +88,7 @@ def start(
     with _scripts(robot, target) as (transport, scripts, _):
         before, answers, began = scripts.status, scripts.answers, time.monotonic()
         _sent(transport, scripts.start(transport, file, context.args))
-        _wait(
+        wait_for(
             lambda: scripts.answers > answers and _answered(before, scripts.status, file, time.monotonic() - began),
             scripts.answer_s,
         )
@@ -98,7 +98,7 @@ def start(
         if not _runs(before, status, file):
             raise PebbleError(shown(status.error or f"{file} does not run"))
         _print_status(status)
-        _wait(lambda: _ended(scripts.status), _FIRST_SECOND_S)
+        wait_for(lambda: _ended(scripts.status), _FIRST_SECOND_S)
         if scripts.status is not None and _ended(scripts.status) and scripts.status.error:
             raise PebbleError(shown(scripts.status.error))
     return 0
@@ -109,7 +109,7 @@ def stop(robot: _Robot, *, target: Target) -> int:
     """Stop the script that runs. In an emergency: pebble estop."""
     with _scripts(robot, target) as (transport, scripts, _):
         _sent(transport, scripts.stop(transport))
-        _wait(lambda: scripts.status is not None and not scripts.status.running, scripts.answer_s)
+        wait_for(lambda: scripts.status is not None and not scripts.status.running, scripts.answer_s)
         if scripts.status is None or scripts.status.running:
             raise PebbleError(
                 f"it is not known to have stopped within {scripts.answer_s:g} s: pebble estop stops the robot"
@@ -145,7 +145,7 @@ def _scripts(robot: str, target: Target) -> Iterator[tuple[Transport, RobotScrip
         scripts = RobotScripts(names)
         put_names(transport, names, lambda base: base == names.base and scripts.named)
         scripts.subscribe(transport)
-        _wait(lambda: scripts.files is not None and scripts.status is not None, 1.0)
+        wait_for(lambda: scripts.files is not None and scripts.status is not None, 1.0)
         yield transport, scripts, shown(id_of(names.base))
 
 
@@ -198,9 +198,3 @@ def _option(one: dict[str, Any]) -> str:
 
 def _print(line: str) -> None:
     typer.echo(shown(line))
-
-
-def _wait(condition: Callable[[], bool], seconds: float) -> None:
-    end = time.monotonic() + seconds
-    while not condition() and time.monotonic() < end:
-        time.sleep(0.005)
