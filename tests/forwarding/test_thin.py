@@ -1,8 +1,5 @@
 """What a bridge sends over a thin link, in virtual time, and that nothing is in a stop's way."""
 
-from __future__ import annotations
-
-import json
 import logging
 from collections.abc import Callable
 from itertools import pairwise
@@ -28,7 +25,6 @@ EVENT, DRIVE, STOP, FLAG = (
     "incoming/estop",
     "incoming/flags/lamp",
 )
-NAMED = {"security": {"level": "named"}, "remote_mqtt": {"host": "127.0.0.1", "port": 1884}}
 MOVES, DATED = b'{"z": 0.5}', b'{"z": 0.5, "t": 1, "key": "0badf00d"}'
 COMMANDS = {"late": [MOVES], "fresh": [MOVES], "dated": [DATED], "zeros": [b'{"z": 0}'], "rest": []}
 LATE_S = {"late": 2.0, "fresh": 0.0, "dated": 2.0, "zeros": 2.0, "rest": 0.0}
@@ -49,11 +45,6 @@ def start(monkeypatch: pytest.MonkeyPatch) -> Start:
 
 def link_states(world: World) -> list[LinkState]:
     return [codec.decode(LINK, payload) for payload in world.remote.payloads(LINK_STATE)]
-
-
-def times(world: World, suffix: str) -> list[float]:
-    """When messages of a heartbeat's kind were made, in seconds."""
-    return [json.loads(payload)["t"] for payload in world.remote.payloads(suffix)]
 
 
 def stream(world: World, suffix: str, seconds: float, *, every_s: float = 0.02, qos: int = 1) -> int:

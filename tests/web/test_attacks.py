@@ -255,8 +255,6 @@ def ops(ref: str) -> dict[str, dict[str, Any]]:
 
 #: What a viewer may send: it moves nothing and changes nothing for others, but a stop.
 FOR_VIEWERS = {"hello", "echo", "watch", "read-logs", "stop", "estop", "estop-end"}
-#: What stops a robot, and is sent to it for that.
-STOPPING = {"stop", "estop", "estop-end"}
 
 
 def test_every_op_is_attacked() -> None:

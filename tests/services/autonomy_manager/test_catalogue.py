@@ -18,10 +18,6 @@ from pebble.services.autonomy_manager.catalogue import MAX_SCRIPTS, Catalogue, f
 from pebble.services.autonomy_manager.forms import Setting, form
 from pebble.services.autonomy_manager.script import Script
 
-OURS = """
-import sys
-from pebble.script import run  # found by its syntax; what follows only pretends
-"""
 ANSWER = '{"label": "Walk", "configs": [{"key": "speed", "arg": "--speed"}, {"key": "laps", "arg": "--laps"}]}'
 PRETENDS = f"""
 if 0:

@@ -21,8 +21,6 @@ from tests.services.serial_mcu_bridge.mcu_wire import IMU, LAMP, STATION, F, I, 
 from tests.services.serial_mcu_bridge.test_pebble_serial_hostile import ATTACKS
 from tests.support import cases, until
 
-STATE = b"\1\0\1"
-
 
 def test_the_launcher_is_notified_of_outlets_while_they_are_in_use(
     memory_rig: SerialRig, monkeypatch: pytest.MonkeyPatch

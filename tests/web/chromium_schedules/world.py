@@ -13,7 +13,6 @@ from tests.web.chromium_schedules.schedules import ACTIVE_S, Schedule, Step
 from tests.web.console import Console, console
 from tests.web.stage import Stage
 
-_BACK_S = 25.0  # until everything works again
 _ANSWER_S = 0.4
 _NO_PICTURE = "localStorage.setItem('pebble video {ref}', 'false')"  # its age is another test's
 _REFUSALS = """() => {
