@@ -105,8 +105,8 @@ def _part(level: float) -> float:
 class Battery:
     """``cells`` in series. Its voltage falls with time and motion, sags under load and rises on the charger."""
 
-    def __init__(self, cells: int = 2, *, charging: bool = False) -> None:
-        self.charging = charging
+    def __init__(self, cells: int) -> None:
+        self.charging = False
         self._cells = cells
         self._rest_v, self._load = _START_V, 0.0  # of one cell
 

@@ -27,9 +27,9 @@ _HEADERS = 20 + 32  # bytes: IP version 4 without options, TCP with time stamps 
 _CHUNK_MS = 20
 
 
-def wire_bytes(payload: int, topic: str = TOPIC) -> int:
+def wire_bytes(payload: int) -> int:
     """Size of one PUBLISH with QoS 0 in a TCP segment of its own (MQTT 3.1.1, 3.3)."""
-    length = 2 + len(topic.encode()) + payload
+    length = 2 + len(TOPIC) + payload
     digits = max(1, (length.bit_length() + 6) // 7)  # of the remaining length
     return _HEADERS + 1 + digits + length
 

@@ -41,6 +41,7 @@ _AUDIO_TURN_S = ROUND_S / len(ALL_SOUND)
 _STEP_S = 0.1
 _GAP_MS = 15.0  # less than the shortest chunk
 _CAPABILITIES_TIMEOUT_S = 5.0
+_NAME = "pebble-demo-viewer"
 _PICTURES, _SOUNDS, _RESULTS = 1000, 5000, 200  # upper limits of what is stored
 _CONTROLS: dict[Medium, Channel] = {"video": VIDEO_CONTROL, "audio": AUDIO_CONTROL}
 
@@ -115,22 +116,16 @@ class MediaCheck:
     machine could not keep up between these times (monotonic), and why.
     """
 
-    def __init__(
-        self,
-        port: int,
-        counting: Collection[str],
-        overloaded: Callable[[float, float], str],
-        name: str = "pebble-demo-viewer",
-    ) -> None:
+    def __init__(self, port: int, counting: Collection[str], overloaded: Callable[[float, float], str]) -> None:
         self._counting, self._overloaded = counting, overloaded
         self.recorders: dict[str, MediaRecorder] = {}
         self.results: deque[MediaResult] = deque(maxlen=_RESULTS)
         self.rounds = 0
-        self._transport = create("mqtt", name, MqttSettings(host="127.0.0.1", port=port))
+        self._transport = create("mqtt", _NAME, MqttSettings(host="127.0.0.1", port=port))
         self._robots: Sequence[RobotView] = ()
         self._once = False
         self._stopping = threading.Event()
-        self._thread = threading.Thread(target=self._run, name=name, daemon=True)
+        self._thread = threading.Thread(target=self._run, name=_NAME, daemon=True)
 
     def begin(self, robots: Sequence[RobotView], *, once: bool = False) -> None:
         """Start requesting media from these robots, one round after another or ``once``; returns at once."""

@@ -36,11 +36,7 @@ _decoder = msgspec.json.Decoder(m.FromPage)
 
 
 class Leave(Exception):  # noqa: N818 - not an error
-    """The server ends this connection. ``again``: the page may connect anew."""
-
-    def __init__(self, why: str, *, again: bool) -> None:
-        super().__init__(why)
-        self.why, self.again = why, again
+    """The server ends this connection; the page may connect anew."""
 
 
 class Control:
@@ -80,9 +76,9 @@ class Control:
         except Leave as reason:
             await self._leave(reason)
         except TimeoutError:
-            await self._leave(Leave("no hello", again=True))
+            await self._leave(Leave("no hello"))
         except ClockJumpError as error:
-            await self._leave(Leave(str(error), again=True))
+            await self._leave(Leave(str(error)))
         except (WebSocketDisconnect, RuntimeError):
             pass  # the page has gone
         finally:
@@ -97,7 +93,7 @@ class Control:
 
     def _begin(self, hello: Any) -> None:
         if not isinstance(hello, m.Hello):
-            raise Leave("the first message must be hello", again=True)
+            raise Leave("the first message must be hello")
         server, settings = self._server, self._server.settings
         self._tab.device = printable(hello.device)
         if not settings.login:
@@ -141,7 +137,7 @@ class Control:
     async def _leave(self, reason: Leave) -> None:
         self._end_leases()
         try:
-            await self._websocket.send_text(encode(m.Bye(why=reason.why, again=reason.again)))
+            await self._websocket.send_text(encode(m.Bye(why=str(reason), again=True)))
             await self._websocket.close(4000)
         except (WebSocketDisconnect, RuntimeError):
             pass  # it has gone already
@@ -160,7 +156,7 @@ class Control:
         try:
             return _decoder.decode(text)
         except (msgspec.MsgspecError, RecursionError) as error:
-            raise Leave(f"not understood: {error}"[:200], again=True) from None
+            raise Leave(f"not understood: {error}"[:200]) from None
 
     async def _receive_text(self) -> str:
         message = await self._websocket.receive()
@@ -168,9 +164,9 @@ class Control:
             raise WebSocketDisconnect
         text = message.get("text")
         if text is None:
-            raise Leave("messages on this connection are text", again=True)
+            raise Leave("messages on this connection are text")
         if len(text) > m.MAX_OP_BYTES:
-            raise Leave(f"a message is longer than {m.MAX_OP_BYTES} characters", again=True)
+            raise Leave(f"a message is longer than {m.MAX_OP_BYTES} characters")
         return str(text)
 
     def _handle(self, op: Any) -> None:
@@ -208,7 +204,7 @@ class Control:
             case m.StreamAddressOp():
                 self._stream_address(op)
             case m.Hello():
-                raise Leave("hello comes only once", again=True)
+                raise Leave("hello comes only once")
             case _:
                 self._command(op)
         self._wake.set()

@@ -290,7 +290,7 @@ class Reader:
         if first not in _SHORTEST or len(body) < _SHORTEST[first]:
             raise MalformedError(f"a packet that begins with {first:02x} and has {len(body)} bytes")
         if first in (_SUBACK, _UNSUBACK):
-            codes = 2 + self._properties_size(body, 2)
+            codes = 2 + self._properties_size(body)
             self._listener.on_answer(body[0] << 8 | body[1], body[codes:])
         elif first == _PINGRESP:
             self._listener.on_pong()
@@ -301,18 +301,18 @@ class Reader:
         else:
             self._listener.on_disconnect(body[0] if body else 0)
 
-    def _properties_size(self, body: bytes, at: int) -> int:
-        """Bytes of the properties at ``at``, with their length; 0 on 3.1.1."""
+    def _properties_size(self, body: bytes) -> int:
+        """Bytes of the properties behind the first two bytes, with their length; 0 on 3.1.1."""
         if not self._modern:
             return 0
-        size, start = _read_variable(body, at)
-        return start - at + size if size >= 0 else len(body)
+        size, start = _read_variable(body, 2)
+        return start - 2 + size if size >= 0 else len(body)
 
     def _connack(self, body: bytes) -> None:
         if body[1]:
             self._listener.on_refused(body[1])
             return
-        found = properties(body[2 : 2 + self._properties_size(body, 2)])
+        found = properties(body[2 : 2 + self._properties_size(body)])
         wanted = (_MAXIMUM_PACKET, _RECEIVE_MAXIMUM, _MAXIMUM_QOS, _RETAIN_AVAILABLE)
         accepted = Accepted(*map(found.get, wanted))
         if accepted.receive_maximum is not None:

@@ -86,13 +86,11 @@ class Contents:
 class McapWriter:
     """One file. :meth:`flush` it at least once a second, and :meth:`finish` it."""
 
-    def __init__(
-        self, sink: Sink, *, library: str, packer: Packer | None = None, chunk_bytes: int = CHUNK_BYTES
-    ) -> None:
+    def __init__(self, sink: Sink, *, library: str, packer: Packer | None = None) -> None:
         self.contents = Contents()
         self.size = 0  # bytes that the sink has taken
         self.flushed = 0  # messages that it has taken
-        self._sink, self._packer, self._chunk_bytes = sink, packer or Packer(), chunk_bytes
+        self._sink, self._packer = sink, packer or Packer()
         self._declare_at: dict[int, int] = {}  # by channel; log time
         self._declared: dict[int, int] = {}  # how often
         self._records: list[bytes] = []  # of the chunk that is being made
@@ -148,7 +146,7 @@ class McapWriter:
             self._end_ns = log_ns
         self._put(mcap.message(channel, self.contents.messages, log_ns, publish_ns, payload))
         self.contents.count(channel, log_ns)
-        if self._records_size >= self._chunk_bytes:
+        if self._records_size >= CHUNK_BYTES:
             self._cut()
 
     def flush(self) -> None:
