@@ -14,6 +14,7 @@ from pebble.media.jitter import JitterBuffer
 from pebble.media.pcm import Resampler
 from pebble.media.sound import make_sound_encoder, unpack
 from pebble.media.speech import Speech
+from tests.media.test_jitter import play
 from tests.web.in_node import evaluate
 
 EPOCH_MS = 1_700_000_000_000
@@ -49,26 +50,15 @@ result = given.map(({ options, arrivals }) => {
 """
 
 
-def play(options: dict[str, int], arrivals: list[Arrival]) -> dict[str, Any]:
+def expected_of(options: dict[str, int], arrivals: list[Arrival]) -> dict[str, Any]:
     """Does the same by pebble.media.jitter."""
     buffer = JitterBuffer(
         limit=options["limit"], concealment_ms=options["concealmentMs"], target_ms=options["targetMs"]
     )
-    chunks, coming, now = [], list(arrivals), 0.0
-    while True:
-        wait = buffer.wait(now)
-        if wait is None and not coming:
-            break
-        due = float("inf") if wait is None else now + wait
-        if coming and coming[0][0] <= due:
-            now, payload = coming.pop(0)
-            buffer.put(payload, now)
-            continue
-        now = due
-        chunk = buffer.take(now)
-        if chunk is not None:
-            samples = chunk.samples.reshape(-1).tolist()
-            chunks.append([now, chunk.rate, chunk.channels, chunk.concealed, samples])
+    chunks = [
+        [at, chunk.rate, chunk.channels, chunk.concealed, chunk.samples.reshape(-1).tolist()]
+        for at, chunk in play(buffer, arrivals).chunks
+    ]
     return {"chunks": chunks, "counters": {name: buffer.counters[name] for name in (*COUNTERS, "refused")}}
 
 
@@ -124,7 +114,7 @@ def test_the_jitter_buffer_plays_the_same_samples_at_the_same_times(seeds: range
     modules = {"media/jitter.js": "JitterBuffer", "media/sound-packet.js": "pcmOf, unpack"}
     made = evaluate(modules, _PLAY, given)
     for (options, coming), one in zip(cases, made, strict=True):
-        expected = play(options, coming)
+        expected = expected_of(options, coming)
         assert one["chunks"] == expected["chunks"]
         assert {name: one["counters"][name] for name in expected["counters"]} == expected["counters"]
 
@@ -133,7 +123,7 @@ def test_the_cases_have_everything_in_them() -> None:
     cases = [arrivals(random.Random(seed)) for seed in range(12)]
     total = dict.fromkeys((*COUNTERS, "refused"), 0)
     for coming in cases:
-        counters = play({"limit": 20, "concealmentMs": 100, "targetMs": 37}, coming)["counters"]
+        counters = expected_of({"limit": 20, "concealmentMs": 100, "targetMs": 37}, coming)["counters"]
         total = {name: total[name] + counters[name] for name in total}
     assert all(total.values()), total
 
