@@ -227,7 +227,7 @@ class World:
 
 def _write_scripts(root: Path) -> None:
     """The scripts of :data:`FILES`."""
-    stubborn = _STUBBORN + _FOLLOW.replace("from __future__ import annotations\n", "")
+    stubborn = _STUBBORN + _FOLLOW
     for name, text in {"follow": _FOLLOW, "stubborn": stubborn, "busy": _BUSY}.items():
         (root / name).mkdir()
         (root / name / "run.py").write_text(text)
