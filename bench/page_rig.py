@@ -15,7 +15,7 @@ import shutil
 import tempfile
 import time
 from collections.abc import Callable, Iterator
-from contextlib import closing, contextmanager, suppress
+from contextlib import ExitStack, closing, contextmanager, suppress
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -218,16 +218,20 @@ def missing() -> str | None:
 
 
 @contextmanager
-def chromium(*flags: str, program: str | None = None) -> Iterator[Browser]:
-    """Run one with further ``flags``; ``program`` starts it in another way. Raises PebbleError with what to install."""
+def chromium(*flags: str, program: str | None = None, beside: Browser | None = None) -> Iterator[Browser]:
+    """Run one with further ``flags``; ``program`` starts it in another way. Raises PebbleError with what to install.
+
+    ``beside`` is one that runs already: a thread has one Playwright.
+    """
     if problem := missing():
         raise PebbleError(problem)
     from playwright.sync_api import Error, sync_playwright  # optional
 
-    with sync_playwright() as playwright:
+    with ExitStack() as stack:
+        kind = stack.enter_context(sync_playwright()).chromium if beside is None else beside.browser_type
         path = program or shutil.which("chromium")
         try:
-            with closing(playwright.chromium.launch(executable_path=path, args=[*_FLAGS, *flags])) as browser:
+            with closing(kind.launch(executable_path=path, args=[*_FLAGS, *flags])) as browser:
                 yield browser
         except Error as error:
             raise PebbleError(f"the browser: {error.message.splitlines()[0]}") from error

@@ -56,13 +56,16 @@ _HIDE = """(hidden) => {
 
 
 @contextmanager
-def chromium(*flags: str, program: str | None = None) -> Iterator[Browser]:
-    """A headless browser, started by ``program``. Skips the test without one, except where CI says it must be there."""
+def chromium(*flags: str, program: str | None = None, beside: Browser | None = None) -> Iterator[Browser]:
+    """A headless browser, started by ``program``, perhaps ``beside`` one that runs.
+
+    Skips the test without one, except where CI says it must be there.
+    """
     problem = page_rig.missing()
     if problem is not None:
         reason = f"{problem}; or `sh tools/debian-packages.sh chromium=chromium`"
         (pytest.fail if os.environ.get("CI") == "true" else pytest.skip)(reason)
-    with page_rig.chromium(*flags, program=program) as browser:
+    with page_rig.chromium(*flags, program=program, beside=beside) as browser:
         yield browser
 
 

@@ -19,9 +19,9 @@ HOST = "lab-pc.test"
 
 
 @pytest.fixture(scope="module")
-def browser() -> Iterator[Browser]:
+def browser(browser: Browser) -> Iterator[Browser]:
     """It believes that this machine has a name in the network."""
-    with chromium(f"--host-resolver-rules=MAP {HOST} 127.0.0.1") as running:
+    with chromium(f"--host-resolver-rules=MAP {HOST} 127.0.0.1", beside=browser) as running:
         yield running
 
 

@@ -33,10 +33,10 @@ pytestmark = pytest.mark.page
 
 
 @pytest.fixture(scope="module")
-def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
+def browser(browser: Browser, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
     voice = tmp_path_factory.mktemp("voice") / "voice.wav"
     write_voice(voice)
-    with chromium(*fake_microphone(voice)) as running:
+    with chromium(*fake_microphone(voice), beside=browser) as running:
         yield running
 
 
