@@ -140,15 +140,16 @@ class Audit:
             elif error is not None and not ends and not failed:
                 log.error("audit: entries wait to be written: %s", error)
             failed = error is not None
+            if not failed and lost:
+                dropped += lost
+                log.warning("audit: %d entries are lost: too many waited to be written", lost)
+                self.write("audit-dropped", count=lost)
+                continue
             if ends:
                 return
             if failed:
                 with self._changed:
                     self._rows.give_back(rows)
-            elif lost:
-                dropped += lost
-                log.warning("audit: %d entries are lost: too many waited to be written", lost)
-                self.write("audit-dropped", count=lost)
             self._closing.wait(_ROUND_S)
 
     def _store(self, rows: list[Entry], marks: dict[tuple[str, str], Mark]) -> object:

@@ -128,7 +128,7 @@ def test_stop_halts_the_wheels_and_the_run_that_has_ended_is_barred(bench: Bench
     """Else a process that left the script's process group could drive on."""
     walk = bench.start("walk")
     bench.stop(walk)
-    assert bench.zeros(run_of(walk)) == 1, "first"
+    assert until(lambda: bench.zeros(run_of(walk)) == 1), "first"
     assert bench.status["running"] is True  # until it has ended
     walk.end(0)
     assert bench.becomes(**IDLE)
@@ -136,7 +136,7 @@ def test_stop_halts_the_wheels_and_the_run_that_has_ended_is_barred(bench: Bench
     assert (bench.drives[-1]["run"], bench.drives[-1]["x"], bench.drives[-1]["z"]) == (run_of(walk) + 1, 0, 0)
     bench.advance(0.11)
     bench.advance(0.2)
-    assert bench.zeros(run_of(walk)) == 4, "and again when the process has ended"
+    assert until(lambda: bench.zeros(run_of(walk)) == 4), "and again when the process has ended"
     assert run_of(bench.start("sing")) > run_of(walk) + 1, "a person may have barred that number meanwhile"
 
 
@@ -178,7 +178,7 @@ def test_an_end_stops_the_wheels_and_nothing_is_started_again(bench: Bench, code
     bench.advance(0.11)
     bench.advance(0.2)
     bench.advance(60)
-    assert bench.zeros(run_of(walk)) == 3
+    assert until(lambda: bench.zeros(run_of(walk)) == 3)
     assert bench.children.files == []
 
 
@@ -210,7 +210,7 @@ def test_a_dependencys_end_stops_the_script(bench: Bench, code: int, how: str) -
     eyes, wheel, _ = bench.children.all
     eyes.end(code)
     assert until(lambda: follow.signals == [TERM])
-    assert bench.zeros(run_of(follow)) == 1
+    assert until(lambda: bench.zeros(run_of(follow)) == 1)
     follow.end(1)
     assert until(lambda: wheel.signals == [TERM])
     wheel.end(0)
