@@ -34,7 +34,7 @@ _IMPORT = re.compile(rb'^(?:import|export|\}).*?"(\.\.?/[^"]+)";?$', re.MULTILIN
 _COMMENTS = re.compile(r"^[ \t]*(?:/\*.*?\*/|//[^\n]*)[ \t]*$", re.MULTILINE | re.DOTALL)
 _CASTS = re.compile(r"/\*\* @[^\n]*?\*/ ")  # types within a line
 _LINE_ENDS = re.compile(r"(?<=\S)[ \t]+//[ ][^\"'`\n]*$", re.MULTILINE)  # one with quotes may be the end of a string
-_LOOSE = re.compile(r" (?=\{$)|(^[\w-]+:) |;\n(?=})|(?<=[{};,])\n", re.MULTILINE)  # in style sheets
+_LOOSE = re.compile(r" (?=\{$)|(^[\w-]+:) |;\n(?=})|(?<=[{};,])\n|(?<=,) ", re.MULTILINE)  # in style sheets
 _INDENTATION = re.compile(r"^\s+", re.MULTILINE)
 
 
