@@ -15,6 +15,7 @@ _BEHIND = 500  # messages for a receiver that acknowledges none of them
 _APART_S = 0.005
 _HELD_S = 0.03  # by which Nagle's algorithm delays where the receiver's kernel confirms late
 _PAIRS = 5
+_PING_TRIES = 3  # an answer that comes too early may by chance come last
 _PING_S = 2.0  # after which a robot gives a connection up
 _PICTURE, _LARGE = 35_000, 256_000  # bytes
 _REFUSED = 0x80
@@ -231,16 +232,21 @@ def pings(bench: Bench) -> CheckResult:
     if not peer.ping():
         return fail("it does not answer a ping", "use another broker: robots would connect anew all the time")
     seconds = time.monotonic() - began
-    for place in range(20):
-        peer.publish("x", b"%d" % place)
-    peer.ping()
-    bench.wait_quiet(peer)
-    late = len(peer.received) - peer.pongs[-1]
+    late = max(_late(bench, peer) for _ in range(_PING_TRIES))
     if seconds > _PING_S:
         return fail(f"it takes {seconds:.1f} s for one", "use a broker that is nearer, or less busy")
     if late:
         return warn(f"it answers before it has passed on what came before ({late} of 20 messages)", "")
     return ok(f"after {1000 * seconds:.1f} ms, behind what came before")
+
+
+def _late(bench: Bench, peer: Peer) -> int:
+    """How many of twenty messages come after the answer to a ping that was sent after them."""
+    for place in range(20):
+        peer.publish("x", b"%d" % place)
+    peer.ping()
+    bench.wait_quiet(peer)
+    return len(peer.received) - peer.pongs[-1]
 
 
 def overlaps(bench: Bench) -> CheckResult:
