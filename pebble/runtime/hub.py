@@ -6,7 +6,6 @@ pebble.runtime.process, which would be a good part of this small process.
 """
 
 import logging
-import signal
 import sys
 import threading
 import time
@@ -20,6 +19,7 @@ from pebble.contract import CHANNELS, INCOMING, Kind
 from pebble.contract.names import BY
 from pebble.errors import PebbleError
 from pebble.runtime.parent import ALIVE_PERIOD_S, DROPPED_PERIOD_S, DroppedMessages, Notifier, set_up_logging
+from pebble.runtime.signals import EndSignal
 from pebble.transports.settings import ZenohSettings
 from pebble.transports.zenoh.hub import ZenohHub
 
@@ -41,9 +41,7 @@ _decoder = msgspec.json.Decoder(ZenohSettings, dec_hook=lambda _kind, text: Path
 
 def main(arguments: list[str]) -> int:
     set_up_logging("INFO")
-    stop = threading.Event()
-    for number in (signal.SIGTERM, signal.SIGINT):
-        signal.signal(number, lambda *_: stop.set())
+    stop = EndSignal()
     try:
         run_hub(_settings(arguments), stop)
     except PebbleError as error:
@@ -52,7 +50,7 @@ def main(arguments: list[str]) -> int:
     return 0
 
 
-def run_hub(settings: ZenohSettings, stop: threading.Event) -> None:
+def run_hub(settings: ZenohSettings, stop: EndSignal | threading.Event) -> None:
     """Run a hub until ``stop`` is set. Raises TransportError if it cannot open."""
     notify = Notifier()
     dropped, due = DroppedMessages(notify), time.monotonic()

@@ -1,5 +1,7 @@
-"""The signals that end a program: handled in a ``with`` block, or turned into KeyboardInterrupt."""
+"""The signals that end a program: waited for, handled in a ``with`` block, or turned into KeyboardInterrupt."""
 
+import os
+import select
 import signal
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -7,6 +9,25 @@ from types import FrameType
 from typing import Any
 
 _NAMES = ("SIGINT", "SIGTERM", "SIGHUP")  # the last one is unknown to Windows
+
+
+class EndSignal:
+    """It is set by SIGTERM and SIGINT, or by :meth:`set`, and stays so.
+
+    A handler must not set an event: it may have interrupted the wait for it, which holds its lock, and waits for ever.
+    """
+
+    def __init__(self) -> None:
+        self._read, self._write = os.pipe()
+        for number in (signal.SIGTERM, signal.SIGINT):
+            signal.signal(number, lambda *_: self.set())
+
+    def set(self) -> None:
+        os.write(self._write, b".")
+
+    def wait(self, timeout: float | None = None) -> bool:
+        """Whether it is set within ``timeout`` seconds."""
+        return bool(select.select([self._read], [], [], timeout)[0])
 
 
 @contextmanager

@@ -1,14 +1,14 @@
 """``pebble gateway``: carries robots of a Zenoh hub, or of a broker on a LAN, to the broker of their operators."""
 
 import logging
-import os
-import signal
 import threading
 from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Protocol
 
 import typer
+
+from pebble.runtime.signals import EndSignal
 
 log = logging.getLogger(__name__)
 
@@ -76,30 +76,25 @@ class _Together:
 
     def __init__(self, programs: list[_Program]) -> None:
         self._programs, self._failed = programs, False
-        self._ended, self._ends = os.pipe()  # safe in handlers of signals, where an event may wait for itself
 
     def run(self, ready: Callable[[], None]) -> int:
-        for number in (signal.SIGTERM, signal.SIGINT):
-            signal.signal(number, lambda *_: self._end())
-        threads = [threading.Thread(target=self._run, args=(one,)) for one in self._programs]
+        ends = EndSignal()
+        threads = [threading.Thread(target=self._run, args=(one, ends)) for one in self._programs]
         for thread in threads:
             thread.start()
         ready()
-        os.read(self._ended, 1)
+        ends.wait()
         for one in self._programs:
             one.quit()
         for thread in threads:
             thread.join()
         return int(self._failed)
 
-    def _end(self) -> None:
-        os.write(self._ends, b".")
-
-    def _run(self, program: _Program) -> None:
+    def _run(self, program: _Program, ends: EndSignal) -> None:
         try:
             program.run()
         except Exception:  # the process boundary: its manager starts it again
             log.exception("%s has failed", type(program).__name__)
             self._failed = True
         finally:
-            self._end()
+            ends.set()

@@ -1,7 +1,5 @@
 """``pebble hub``: runs a Zenoh hub for several robots, and shows those that run."""
 
-import signal
-import threading
 from pathlib import Path
 from typing import Annotated
 
@@ -48,11 +46,10 @@ def hub(file: FileArgument, state: StateOption = False) -> int:
         return 0
     from pebble.runtime.hub import run_hub  # of Linux only
     from pebble.runtime.parent import set_up_logging
+    from pebble.runtime.signals import EndSignal
 
     set_up_logging("INFO")
-    stop = threading.Event()
-    for number in (signal.SIGTERM, signal.SIGINT):
-        signal.signal(number, lambda *_: stop.set())
+    stop = EndSignal()
     here = f"on this machine --url zenoh:{settings.run_dir}"
     typer.echo(f"hub at {', '.join(settings.listen)}, {here}; Ctrl-C ends it", err=True)
     run_hub(settings, stop)
