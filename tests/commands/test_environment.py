@@ -18,16 +18,16 @@ from tests.support import ROOT, cases, some
 
 _PATH = {"PATH": os.defpath}
 _NO_USER = ("setpriv", "--reuid=12345", "--regid=12345", "--clear-groups")
-needs_root = pytest.mark.skipif(
+changes_users = pytest.mark.skipif(
     os.getuid() != 0 or subprocess.run([*_NO_USER, sys.executable, "-c", ""], capture_output=True).returncode != 0,
     reason="needs root, and a Python that other users may run",
 )
 
 #: Words before the command, the environment, and what the command says instead of ending with a traceback.
 ENVIRONMENTS = [
-    pytest.param(_NO_USER, {}, "~/.local/state: the home folder is not known; set HOME", marks=needs_root),
-    pytest.param(_NO_USER, {"HOME": ""}, "", marks=needs_root),
-    pytest.param(_NO_USER, {"HOME": "/nonexistent"}, "", marks=needs_root),
+    pytest.param(_NO_USER, {}, "~/.local/state: the home folder is not known; set HOME", marks=changes_users),
+    pytest.param(_NO_USER, {"HOME": ""}, "", marks=changes_users),
+    pytest.param(_NO_USER, {"HOME": "/nonexistent"}, "", marks=changes_users),
     ((), {"LC_ALL": "C", "PYTHONCOERCECLOCALE": "0", "PYTHONUTF8": "0"}, "pebble/robots/gö🤖b"),
     ((), {"PYTHONIOENCODING": "ascii"}, "pebble/robots/g\\xf6\\U0001f916b"),
     ((), {"PYTHONIOENCODING": "latin-1"}, "\\U0001f916b"),
