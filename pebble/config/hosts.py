@@ -127,6 +127,8 @@ def split(text: str) -> Address:
         raise HostError("holds an @ after a / or ?: a password with such characters belongs into a key of its own")
     login, at, place = authority.rpartition("@")
     user, colon, password = login.partition(":")
+    if place.endswith(":") and not place.endswith("::"):
+        raise HostError("ends with a : and no port: remove it, or write the port behind it")
     bracketed = place.startswith("[")
     if bracketed:
         name, closed, port = place[1:].partition("]")

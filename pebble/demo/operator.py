@@ -41,7 +41,7 @@ from pebble.rig.testbed import CLIP, TAG_ID
 from pebble.transports import Message, MqttSettings, QoS, create
 
 COMMAND_PERIOD_S = 0.05  # how often a held stick is repeated
-NAME = "the demo's operator"
+NAME = "demo-operator"
 STOP = Drive()
 OBSERVING = ": observing"  # after the name of a step
 _POLL_S = 0.02

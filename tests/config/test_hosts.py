@@ -48,6 +48,7 @@ def test_what_is_understood(text: str, host: str) -> None:
         ("rover:s3cr3t", "holds a port that is no number from 1 to 65535"),
         ("mqtt://rover:s3cr3t", "holds a port that is no number"),
         ("b:0", "holds a port that is no number"),
+        *((text, "ends with a : and no port") for text in ("b:", "mqtt://b:/", "[::1]:")),
         ("1883:s3cr3t", "is no whole address"),
         ("rover%3As3cr3t%40b", "must be a name or address"),
         *((text, "is no whole address") for text in ("1.2.3", "999.1.1.1", "127.1", "2130706433", "0x7f.1")),
@@ -109,7 +110,7 @@ def test_every_key_that_names_a_host_reads_it_so(place: str, value: object) -> N
 @pytest.mark.parametrize(
     "url",
     ["mqtt://rover:s3cr3t@b", "mqtt://rover:s3cr3t", "mqtt://rover:s3/cr3t@b", "mqtt://bro\nker", "mqtt://b ",
-     "mqtt://127.1", "mqtt://b,", "mqtt://u:s3cr3t@[::1", "tcp://u:s3cr3t@b"],
+     "mqtt://127.1", "mqtt://b,", "mqtt://b,c:", "mqtt://u:s3cr3t@[::1", "tcp://u:s3cr3t@b"],
 )  # fmt: skip
 def test_so_does_the_command_line(url: str, tmp_path: Path) -> None:
     for read in (settings_of, lambda text: init(tmp_path, [text])):

@@ -93,7 +93,7 @@ def listener(origin: str, can: str) -> Iterator[None]:
 
 
 def state(opened: Tab) -> str:
-    return str(opened.test("sound-state").inner_text())
+    return str(opened.test("sound-state").evaluate("(shown) => shown.title || shown.innerText"))
 
 
 def is_played(opened: Tab, needed: float, *, envelopes: bool, within: float = 20.0) -> bool:

@@ -70,11 +70,11 @@ export function SoundFacts({ at }) {
   return html`<p class="facts" data-test="sound-state">${words(sound, view, useName(at))}</p>`;
 }
 
-/** Numbers are not read aloud. */
+/** Numbers are for who asks for them. */
 function State({ text }) {
-  const said = useCalm(text.replace(/^.*buffered.*$/, "Listening"));
-  return html`<p class="sound-state" data-test="sound-state">${text}</p>
-    <span class="sr" role="status">${said}</span>`;
+  const words = text.replace(/^.*buffered.*$/, "Listening");
+  return html`<p class="sound-state" data-test="sound-state" title=${text}>${words}</p>
+    <span class="sr" role="status">${useCalm(words)}</span>`;
 }
 
 /** Under the buttons that are off; once, if it is the same for both. */
