@@ -172,7 +172,8 @@ class MqttBridge(ForwardingService):
 
     def connected(self, side: Side, epoch: int) -> None:
         if side is Side.REMOTE:
-            self._publish_heartbeat(at_once=True)
+            if self.forwarder.gate is Gate.SHUT:
+                self._publish_heartbeat(at_once=True)
         else:
             barrier(self.transport, self._same_broker.topic)
             self.forwarder.subscribed(Side.LOCAL)
@@ -184,6 +185,10 @@ class MqttBridge(ForwardingService):
             self.subscribe_remote()
         else:
             self._same_broker.send()
+
+    def subscribe_remote(self) -> None:
+        super().subscribe_remote()
+        self._publish_heartbeat(at_once=True)  # not before: who sees it sends commands, which would be lost
 
     def _forwards(self) -> bool:
         return self.forwarder.gate is Gate.OPEN and self.remote.state is State.CONNECTED
@@ -229,6 +234,7 @@ class MqttBridge(ForwardingService):
 
     def found_one_broker(self) -> None:
         self.forward_nothing()
+        self._publish_heartbeat(at_once=True)
         self.log.info(
             "the local and the remote side are one broker, or something else forwards outgoing/# to the local one: "
             "nothing is mirrored"

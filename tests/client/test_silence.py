@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from typing import Any
 
 import pytest
 
@@ -18,7 +19,7 @@ from pebble.contract.levels import LEVELS, link_of, silent_after
 from pebble.contract.payloads import LinkLevel
 from pebble.recordings.replay.live import LiveRobots
 from pebble.runtime.by_name import ByName
-from pebble.transports import Message
+from pebble.transports import Handler, Message, Subscription
 from pebble.transports.memory import MemoryHub, MemoryTransport
 from tests.support import until
 
@@ -64,11 +65,18 @@ def gives_its_place_to_another(level: LinkLevel, after_s: float) -> bool:
     return not by_name.omitted
 
 
+class Direct(MemoryTransport):
+    """Delivers in the order in which messages come; else each subscription has its own thread."""
+
+    def subscribe(self, filter_: str, handler: Handler, **options: Any) -> Subscription:
+        return super().subscribe(filter_, handler, **(options | {"direct": True}))
+
+
 def lets_a_replay_begin(level: LinkLevel, after_s: float) -> bool:
     now, hub = [0.0], MemoryHub()
     robot = MemoryTransport("robot", hub).open()
     robot.publish(link(level).topic, link(level).payload, retain=True)
-    replay = MemoryTransport("replay", hub).open()  # after it: what comes live is a sign of life
+    replay = Direct("replay", hub).open()  # after it: what comes live is a sign of life
     live = LiveRobots([BASE], lambda: now[0])
     after: list[Message] = []  # what arrives behind that which is retained
     replay.subscribe("after", after.append)

@@ -80,18 +80,25 @@ class HallMemory:
         return os.path.samestat(found, os.fstat(descriptor))
 
     def _open(self) -> tuple[int, mmap.mmap, memoryview]:
-        descriptor = os.open(self._path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, _MODE)
+        """Make it, or open what is there. It appears whole: a reader maps what it finds, and would keep less."""
+        flags, made = os.O_RDWR | os.O_CLOEXEC, False
+        try:
+            descriptor = os.open(self._path, flags | os.O_NOFOLLOW)
+        except FileNotFoundError:
+            descriptor, made = os.open(self._path.parent, flags | os.O_TMPFILE, _MODE), True
         try:
             memory = self._mapped(descriptor)
+            form = (_MAGIC, _VERSION, self._slots, 0)
+            *found, newest = _HEADER.unpack_from(memory)
+            if tuple(found) == form:  # its readers go on
+                self._number = max(self._number, newest)
+            else:
+                _HEADER.pack_into(memory, 0, *form, self._number)
+            if made:  # with a descriptor, so that Python follows the link
+                os.link(f"/proc/self/fd/{descriptor}", self._path, src_dir_fd=descriptor)
         except BaseException:
             os.close(descriptor)
             raise
-        form = (_MAGIC, _VERSION, self._slots, 0)
-        *found, newest = _HEADER.unpack_from(memory)
-        if tuple(found) == form:  # its readers go on
-            self._number = max(self._number, newest)
-        else:
-            _HEADER.pack_into(memory, 0, *form, self._number)
         return descriptor, memory, memoryview(memory).cast("Q")
 
     def _mapped(self, descriptor: int) -> mmap.mmap:
