@@ -98,6 +98,8 @@ class TestReturn:
     def test_at_the_first_host_nothing_is_tried(self) -> None:
         robot = Robot()
         robot.rule.connected(0.0, first=True)
+        robot.rule.probed(1.0, good=True)  # a look from before the return is answered late
+        assert not robot.rule.is_due(1e9, 1e9)
         assert not robot.rule.wants_probe(1e9)
 
 

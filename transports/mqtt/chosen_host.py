@@ -5,6 +5,7 @@ import os
 import threading
 import time
 from collections.abc import Callable, Sequence
+from math import inf
 from pathlib import Path
 
 from pebble.transports.hosts import Address, Place, addresses_of
@@ -53,12 +54,12 @@ class Return:
     def __init__(self) -> None:
         self._good_s = _GOOD_S
         self._good_since: float | None = None
-        self._probe_at = float("inf")  # no probe is due at the first host
+        self._probe_at = inf  # no probe is due at the first host
         self._returned_at: float | None = None  # and what became of it is not known yet
 
     def connected(self, now: float, *, first: bool) -> None:
         self._good_since = None
-        self._probe_at = float("inf") if first else now + _PROBE_S
+        self._probe_at = inf if first else now + _PROBE_S
         if not first and self._returned_at is not None:
             short = now - self._returned_at < _HELD_S
             self._good_s, self._returned_at = min(2 * self._good_s, _WORST_S) if short else _GOOD_S, None
@@ -71,7 +72,7 @@ class Return:
         return True
 
     def probed(self, now: float, *, good: bool) -> None:
-        if not good:
+        if not good or self._probe_at == inf:  # of a look from before the return, perhaps
             self._good_since = None
         elif self._good_since is None:
             self._good_since = now

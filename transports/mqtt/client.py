@@ -22,6 +22,7 @@ from pebble.transports.settings import MqttSettings
 
 SEND_BUFFER = 64 * 1024  # bytes in the kernel for a slow connection: with its default a stream would lag by minutes
 _PIECE = 64 * 1024  # bytes that are read at once
+_ENDING_S = 0.2  # after DISCONNECT
 _MOST_IDS = 65_535
 _NOTSENT_LOWAT = getattr(socket, "TCP_NOTSENT_LOWAT", None)  # not on Windows
 _CORK = getattr(socket, "TCP_CORK", None)  # Linux only
@@ -265,17 +266,19 @@ class Client:
     def disconnect(self) -> None:
         """Send DISCONNECT, and close so that it arrives: a connection that is reset may lose it.
 
-        One with unread data is reset when it is closed, so what has come meanwhile is read, and thrown away.
+        One with unread data is reset when it is closed, and a proxy on the way then resets the broker's. So what comes
+        until the broker closes it, or for `_ENDING_S`, is read, and thrown away.
         """
         self._send(packets.DISCONNECT)
         if self.waiting:
             return
         if self.socket is not None:
-            with suppress(OSError, ValueError):  # there is nothing more now; it has ended
+            with suppress(OSError, ValueError):  # it sends nothing more; it has ended
                 self.socket.shutdown(socket.SHUT_WR)
-                for _ in range(16):  # a broker that goes on sending is not waited for
-                    if not self.socket.recv(_PIECE):
-                        break
+                self.socket.settimeout(_ENDING_S)
+                end = time.monotonic() + _ENDING_S  # a broker that goes on sending is not waited for
+                while self.socket.recv(_PIECE) and time.monotonic() < end:
+                    pass
         self.close()
 
     def _next_id(self) -> int:
