@@ -73,7 +73,7 @@ export function SoundFacts({ at }) {
 /** Numbers are for who asks for them. */
 function State({ text }) {
   const words = text.replace(/^.*buffered.*$/, "Listening");
-  return html`<p class="sound-state" data-test="sound-state" title=${text}>${words}</p>
+  return html`<p class="sound-state" data-test="sound-state" title=${text === words ? "" : text}>${words}</p>
     <span class="sr" role="status">${useCalm(words)}</span>`;
 }
 
