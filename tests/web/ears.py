@@ -144,7 +144,7 @@ def talks(opened: Tab) -> bool:
         assert opened.until(opened.test("talk").is_enabled)  # the talk of another page may not be over yet
         opened.test("talk").hover()
         opened.page.mouse.down()
-        if opened.until(lambda: state(opened) == "Goob plays your voice.", 8):
+        if opened.until(lambda: state(opened).lower() == "goob plays your voice.", 8):
             return True
         print(f"no talk: {state(opened)}")  # noqa: T201
         opened.page.mouse.up()

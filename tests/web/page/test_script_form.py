@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 
 from tests.web.browser import Size
 from tests.web.canned import Show
-from tests.web.states import GOOB, STATES, setting
+from tests.web.states import ASKED, GOOB, MINE, STATES, at, changed, setting
 
 pytestmark = pytest.mark.page
 
 MANY = [setting(f"n{number}", f"Setting {number}", "float", 0.5, min=0, max=1) for number in range(18)]
 FOLLOW = {"file": "follow", "label": "Follow", "summary": "Follows a tag.", "main": ["n2", "n1", "n0"], "configs": MANY}
-FILES = {"files": [FOLLOW]}
+STATE = replace(STATES["asked"], values=changed(ASKED, MINE, at(GOOB, "autonomy-files", {"files": [FOLLOW]})))
 #: What is pressed until the card is there.
 WAY: dict[Size, str] = {"phone": "[data-test=tab-more]", "small": "[data-test=tab-more]", "landscape": ".round"}
 #: Whether the middle of an element belongs to it, in the window.
@@ -24,8 +26,7 @@ _SEEN = """(one) => {
 
 @pytest.mark.parametrize("size", ["desktop", "phone", "small", "landscape"])
 def test_start_stays_in_view_and_covers_no_field(show: Show, size: Size) -> None:
-    with show(STATES["asked"], size) as opened:
-        opened.page.evaluate("([ref, files]) => pebble.store.set(ref, 'autonomy-files', files)", [GOOB, FILES])
+    with show(STATE, size) as opened:
         if size in WAY:
             opened.page.locator(WAY[size]).first.click()
         opened.test("script-follow").click()
