@@ -35,7 +35,7 @@ _SOURCES = (".py", ".sh", ".js", ".html", ".md")  # programs have "password=" in
 _WORDS = ("true", "false", "none", "null")
 _named = re.compile(r"passw|secret|token|credential|psk|\.key$|_key$", re.IGNORECASE).search
 _setting = re.compile(r'^\s*"?([\w.-]{1,60})"?\s*[=: ]\s*"?([^"#\n]{1,512}?)"?\s*,?\s*$').match
-_assigned = re.compile(r"[\w-]*(?:pass|secret|token|pwd)[\w-]*=[\"']?([^\s\"'&]+)", re.IGNORECASE).findall
+_assigned = re.compile(r"[\w-]*(?:pass|secret|token|pwd)[\w-]*=[\"']?(=*[^\s\"'&=][^\s\"'&]*)", re.IGNORECASE).findall
 _login = re.compile(r"://[^\s/@:\"']{0,64}:([^\s/@\"']{1,200})@").findall
 _key = re.compile(r"-----BEGIN [A-Z ]*PRIVATE KEY-----\n(.*?)-----END", re.DOTALL).findall
 

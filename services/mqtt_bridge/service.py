@@ -136,7 +136,15 @@ class MqttBridge(ForwardingService):
     def _publish_heartbeat(self, *, at_once: bool = False) -> None:
         if self._heartbeat is None or not (at_once or self._uplink is None or self._uplink.heartbeat_due()):
             return
+        if not at_once and self._subscribes_soon:
+            return
         self._heartbeat.publish(self.remote, now_ms(), None if self._uplink is None else self._uplink.heartbeat_qos)
+
+    @property
+    def _subscribes_soon(self) -> bool:
+        """Whether the heartbeat waits: who sees it sends commands, which would be lost before the subscription."""
+        subscribed = self.subscriptions[Side.REMOTE] or self.forwarder.gate is Gate.SHUT
+        return not subscribed and self._same_broker.both_connected
 
     def _follow_link(self) -> None:
         """Learn what the link carries, and send what has waited for room."""
@@ -188,7 +196,7 @@ class MqttBridge(ForwardingService):
 
     def subscribe_remote(self) -> None:
         super().subscribe_remote()
-        self._publish_heartbeat(at_once=True)  # not before: who sees it sends commands, which would be lost
+        self._publish_heartbeat(at_once=True)
 
     def _forwards(self) -> bool:
         return self.forwarder.gate is Gate.OPEN and self.remote.state is State.CONNECTED

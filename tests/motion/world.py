@@ -756,7 +756,8 @@ class World:
         for owner in self.owners:
             for _ in range(8):
                 owner.write(self.now)
-        self.do_wait(0, WAITS.index(500))
-        for index, owner in enumerate(self.owners):
-            for who in range(len(self.senders)):
-                self._show(3 + (who - 3) % len(self.senders), index, owner.states[-1])
+        for wait in (0, STATE_MS, STATE_MS):  # until senders repeat: one state at once, one when it is due
+            self.do_wait(0, WAITS.index(wait))
+            for index, owner in enumerate(self.owners):
+                for who in range(len(self.senders)):
+                    self._show(3 + (who - 3) % len(self.senders), index, owner.states[-1])

@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 
 from pebble.forwarding.routing import Side
-from pebble.transports import QoS
+from pebble.transports import Message, QoS
 from pebble.transports.memory import MemoryTransport
 from tests.recordings.demo_robots import DRIVE as RECORDED_DRIVE
 from tests.recordings.demo_robots import GOOB, messages, recorded
@@ -80,6 +80,18 @@ class TestTable:
 
 
 class TestHeartbeat:
+    def test_a_stop_on_sight_of_the_first_one_reaches_the_robot(self, rig: MemoryRig) -> None:
+        """So a robot is not announced before it receives commands."""
+        stops = iter([PRESS])
+
+        def press(_: Message) -> None:
+            for stop in stops:
+                rig.remote.publish(STOP, stop)
+
+        rig.remote.transport.subscribe(f"{BASE}/outgoing/online", press)
+        rig.bridge()
+        assert until(lambda: PRESS in rig.local.payloads(STOP), 3)
+
     def test_a_burst_does_not_delay_it(self, rig: MemoryRig, caplog: pytest.LogCaptureFixture) -> None:
         caplog.set_level(logging.INFO)
         rig.bridge(heartbeat={"interval_seconds": 0.05})

@@ -306,7 +306,7 @@ class TestWills:
             if kill == "hub":
                 assert watch.receives(*everyone), (number, robot)
                 took[kill].append(time.monotonic() - at)
-            assert watch.saw(), (number, kill, robot, str(watch))
+            assert watch.saw(), f"{number} {kill} {robot}: {watch}"
             if kill != "hub":
                 took[kill].append(watch.latest(robot) - at)
             if kill != "robot":
@@ -322,6 +322,30 @@ class TestWills:
         sys.stdout.write(f"\nuntil a will, and with a killed hub until all are heard: {_figures(took)}\n")
         assert max(took["robot"]) <= 1.0
         assert max(took["both"]) <= 5.0
+
+    @pytest.mark.alone
+    @pytest.mark.thorough
+    @pytest.mark.parametrize("apart", [False, True])
+    def test_a_hub_that_comes_back_publishes_none_that_others_have(self, mesh: Mesh, *, apart: bool) -> None:
+        """Its robot is back before the hubs have compared what they have, or long before."""
+        mesh.robots("c", "c0")
+        watch = Watch(mesh)
+        assert watch.receives("c0")
+        watch.leave("c")
+        _kill(mesh, "both", "c", "c0", watch)
+        assert watch.saw(), str(watch)
+        for link in mesh.links:
+            link.blackhole()
+        mesh.start("c")
+        watch.enter("c")
+        mesh.robots("c", "c0")
+        if apart:
+            time.sleep(QUIET_S)
+        for link in mesh.links:
+            link.resume()
+        assert watch.receives("c0")
+        time.sleep(QUIET_S)
+        assert watch.saw(), str(watch)
 
     @pytest.mark.alone
     @pytest.mark.thorough

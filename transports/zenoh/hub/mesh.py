@@ -136,6 +136,10 @@ class Mesh:
         """These clients' wills are of before a restart: another hub may have published them meanwhile."""
         self._recalled = set(names)
 
+    def may_have_published(self, name: str) -> bool:
+        """Whether another hub may have published the will of ``name`` while this one was away, and cannot say so yet."""
+        return name in self._recalled
+
     def merge_again(self) -> None:
         """Compare with every other hub once more."""
         for name in self._wills.hubs:
@@ -158,6 +162,7 @@ class Mesh:
 
     def on_alive(self, name: str) -> None:
         """A client is there: a will that was published for it in its absence is taken back."""
+        self._recalled.discard(name)
         if (replaced := self._replaced.pop(name, None)) is None:
             return
         before, arrived = replaced

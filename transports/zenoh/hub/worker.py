@@ -208,12 +208,17 @@ class HubWorker:
             query.reply(wire.asked(wire.HELLO, account), wire.encode(lacking))
 
     def _end_predecessor(self, hello: wire.Hello) -> None:
-        """Publish the pending will of a restarted client's former session now, unless it has published there since."""
+        """Publish the pending will of a restarted client's former session now, unless it has published there since.
+
+        One of before a restart waits, as another hub may have published it.
+        """
         if hello.will is None:
             return
         for name in self._store.wills() - {hello.name}:
             will = self._store.will(name)
-            if will is not None and will.client == hello.will.client:
+            if will is None or (self._store.has_history and self._mesh.may_have_published(name)):
+                continue
+            if will.client == hello.will.client:
                 self._mesh.publish(name)
                 self.forget_will(name)
                 if topic_to_key(will.topic) not in hello.own:
@@ -254,10 +259,18 @@ class HubWorker:
         except zenoh.ZError:  # this session is being replaced by another one
             self._wills.on_restart([name], time.monotonic())
             raise
-        if is_successor and will.retain and self._wills.met_others:
+        overtaken = self._is_overtaken(name, will)
+        if is_successor and will.retain and self._wills.met_others and not overtaken:
             self._mesh.replace(name, topic_to_key(will.topic))
         self.forget_will(name)
-        self._publish_will(name, will)
+        if not overtaken:
+            self._publish_will(name, will)
+
+    def _is_overtaken(self, name: str, will: wire.Will) -> bool:
+        """Whether the client has begun anew since, and published where its will would come."""
+        now = self._store.get(topic_to_key(will.topic))
+        later = None if now is None or now.stamp.origin == name else self._store.will(now.stamp.origin)
+        return later is not None and later.client == will.client
 
     def forget_will(self, name: str) -> None:
         """The client ``name`` has no will any more."""
