@@ -137,7 +137,7 @@ class Mesh:
         self._recalled = set(names)
 
     def may_have_published(self, name: str) -> bool:
-        """Whether another hub may have published the will of ``name`` while this one was away, and cannot say so yet."""
+        """Whether another hub may have published the will of ``name`` while this one was away."""
         return name in self._recalled
 
     def merge_again(self) -> None:
