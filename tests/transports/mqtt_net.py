@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 from pebble.transports import MqttSettings
 from tests.support import Broker
@@ -12,6 +12,7 @@ from tests.transports.net import Net
 
 class MqttNet(Net):
     kind = "mqtt"
+    patient: ClassVar[dict[str, Any]] = {"silence_s": 20.0}
 
     def __init__(self, folder: Path, protocol: str, client: str) -> None:
         super().__init__()

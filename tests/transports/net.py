@@ -10,7 +10,7 @@ import base64
 import json
 import pickle
 from abc import ABC, abstractmethod
-from typing import Any, Protocol
+from typing import Any, ClassVar, Protocol
 
 from pebble.transports import Message, QoS, State, Transport, create
 from tests.transports.forked import Forked
@@ -62,6 +62,9 @@ class Net(ABC):
     def echoless_settings(self) -> Any:
         """Settings of a client whose `echo=False` is exact (T16)."""
         return self.settings()
+
+    #: Changes to settings of a client that is not to count the network as silent while this machine is busy.
+    patient: ClassVar[dict[str, Any]] = {}
 
     @abstractmethod
     def heal(self) -> None:

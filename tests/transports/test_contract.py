@@ -187,7 +187,7 @@ def test_T03_a_short_lived_publisher_is_received(net: Net, base: str) -> None:
 
 
 def test_T03_delivered_messages_arrive_in_order(net: Net, base: str) -> None:
-    sender, receiver, received = net.client("sender"), net.client("receiver"), Received()
+    sender, receiver, received = net.client("sender"), net.client("receiver", **net.patient), Received()
     receiver.subscribe(f"{base}/+", received, limit=5000)
     wanted = []
     for number in range(900):  # mosquitto queues 1000 for a receiver that falls behind

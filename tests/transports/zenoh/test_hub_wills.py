@@ -246,3 +246,9 @@ def test_a_hub_that_does_not_see_another_one_it_is_connected_to_begins_anew(monk
         renewed += [second - 100] if made.is_cut() else []
     assert CUT_S <= renewed[0] <= 2 * CUT_S + 1
     assert [len([at for at in renewed if at // 3600 == hour]) for hour in (0, 1)] == [RENEWALS, RENEWALS]
+    assert not made.is_cut()
+    wills.on_hub("o", present=True)
+    assert not made.is_cut(), "each is seen again"
+    wills.on_hub("o", present=False)
+    clock[0] += 2 * CUT_S + 1
+    assert made.is_cut(), "the last time may have helped"

@@ -38,7 +38,7 @@ ASKED = 5  # times, before another hub counts as one that does not merge
 MAX_REPLACED = 1000  # values that a will replaced, in case its client comes back
 MAX_REPLACED_BYTES = 4096  # of one of them: heartbeats have a tenth of it
 CUT_S = 4.0  # a connection to a hub that is not seen stands so long, or up to twice that, before all are made anew
-RENEWALS, RENEWALS_S = 5, 3600.0  # of them in so many seconds: each costs clients some 0.3 s
+RENEWALS, RENEWALS_S = 5, 3600.0  # of them that do not help in so many seconds: each costs clients some 0.3 s
 _PAUSE_S = 0.1
 _LONGEST_NAME = 12  # of a hub; an exchange is longer
 
@@ -89,7 +89,8 @@ class Mesh:
         # Two that miss each other do not begin anew at one instant.
         self._patience_s = CUT_S * random.uniform(1, 2)  # noqa: S311  (not a secret)
         self._whole_at = time.monotonic()  # when it last saw as many hubs as it has connections to
-        self._renewed_at: deque[float] = deque(maxlen=RENEWALS)
+        self._renewed_at: deque[float] = deque(maxlen=RENEWALS)  # and that did not help so far
+        self._renewed_with = 0  # connections to hubs, the last time
 
     def serve(self, session: zenoh.Session, queued: _Queued) -> None:
         """Take part in the mesh of ``session``; ``queued`` brings an event to the hub's thread."""
@@ -117,13 +118,16 @@ class Mesh:
         After a hub hung, or was away, Zenoh's routers lose some of what others have declared, and never ask again
         (measured: once in some ten times, in one direction of one connection, which it had not lost).
         """
-        now = time.monotonic()
-        if len(self._wills.hubs) >= len(self.routers) or not self._wills.met_others:  # a router may be no hub of ours
+        now, times, links = time.monotonic(), self._renewed_at, len(self.routers)
+        is_whole = len(self._wills.hubs) >= links
+        if is_whole or not self._wills.met_others:  # a router may be no hub of ours
             self._whole_at = now
-        times = self._renewed_at
+        if is_whole and links >= self._renewed_with:
+            times.clear()  # what has helped may be done again
         if now - self._whole_at < self._patience_s or (len(times) == RENEWALS and now - times[0] < RENEWALS_S):
             return False
         self._whole_at = now
+        self._renewed_with = links
         times.append(now)
         return True
 
