@@ -25,7 +25,7 @@ OPERATORS, ROBOTS, MCUS, BROKERS = range(4)
 
 HOST = "127.0.0.1"  # of brokers
 SBIN = "/usr/local/sbin:/usr/sbin:/sbin"  # where Debian puts brokers and network tools, not in the PATH of users
-_PORTS = 10_000, 32_768  # below those of outgoing connections, on Linux and elsewhere
+_PORTS = 10_100, 32_768  # below those of outgoing connections, on Linux and elsewhere; no browser opens 10080
 _LONGEST_FOLDER = 40  # characters: Unix sockets live below, and their paths end at 108 bytes
 
 Wrap = Callable[[Sequence[str]], Sequence[str]]  # extends a command, so that it runs in another network

@@ -73,7 +73,7 @@ def test_a_driver_sees_that_the_robot_can_no_longer_be_driven_and_then_that_it_c
             opened.page.evaluate("([ref, status]) => pebble.store.set(ref, 'status', status)", [GOOB, status])
             assert opened.until(f"{SHOWN} === '{chip}{hint}'"), opened.page.evaluate(SHOWN)
         opened.test("bell").click()
-        assert opened.until("document.querySelector('.notice-driveable').innerText.includes('can be driven again 2')")
+        assert opened.until("document.querySelector('.notice-driveable')?.innerText.includes('can be driven again 2')")
 
 
 def test_a_button_that_is_switched_off_while_it_is_held_does_nothing(show: Show, server: CannedServer) -> None:
