@@ -4,12 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
-from typing import Any
 
 import pytest
 
-from pebble.transports.zenoh.hub import mesh as mesh_module
-from pebble.transports.zenoh.hub.mesh import CUT_S, RENEWALS
+from pebble.transports.zenoh.hub.links import CUT_S, RENEWALS, Links
 from pebble.transports.zenoh.hub.wills import (
     ALONE_S,
     HOME_S,
@@ -228,27 +226,30 @@ class _Mesh:
                 event(wills)
 
 
-def test_a_hub_that_does_not_see_another_one_it_is_connected_to_begins_anew(monkeypatch: pytest.MonkeyPatch) -> None:
-    clock, wills = [0.0], WillTimes("m")
-    monkeypatch.setattr(mesh_module.time, "monotonic", lambda: clock[0])
-    hub_: Any = None
-    made = mesh_module.Mesh("m", hub_, wills)
-    made.routers.add("z1")
-    clock[0] = 50.0
-    assert not made.is_cut(), "it is connected to what is no hub of ours"
-    wills.on_hub("n", present=True)
-    clock[0] = 100.0
-    assert not made.is_cut(), "each is seen"
-    made.routers.add("z2")
-    renewed = []
-    for second in range(100, 100 + 2 * 3600):
-        clock[0] = float(second)
-        renewed += [second - 100] if made.is_cut() else []
+def test_a_hub_that_does_not_see_another_one_it_is_connected_to_begins_anew() -> None:
+    made = Links(0.0)
+    made.on_link("z1", 1.0, present=True)
+    assert not made.is_cut(None, 50.0), "it is connected to what is no hub of ours"
+    assert not made.is_cut(1, 100.0), "each is seen"
+    made.on_link("z2", 100.0, present=True)
+    renewed = [second - 100 for second in range(100, 100 + 2 * 3600) if made.is_cut(1, float(second))]
     assert CUT_S <= renewed[0] <= 2 * CUT_S + 1
     assert [len([at for at in renewed if at // 3600 == hour]) for hour in (0, 1)] == [RENEWALS, RENEWALS]
-    assert not made.is_cut()
-    wills.on_hub("o", present=True)
-    assert not made.is_cut(), "each is seen again"
-    wills.on_hub("o", present=False)
-    clock[0] += 2 * CUT_S + 1
-    assert made.is_cut(), "the last time may have helped"
+    assert not made.is_cut(1, 7300.0)
+    assert not made.is_cut(2, 7300.0), "each is seen again"
+    assert made.is_cut(1, 7300.0 + 2 * CUT_S + 1), "the last time may have helped"
+
+
+def test_a_hub_that_hung_begins_anew_if_that_cost_it_a_connection() -> None:
+    made = Links(0.0)
+    made.on_link("z1", 1.0, present=True)
+    made.on_standstill(10.0)
+    assert not made.is_cut(1, 10.1), "it was short"
+    made.on_link("z1", 10.2, present=False)
+    made.on_link("z1", 10.3, present=True)
+    assert made.is_cut(1, 10.4)
+    made.on_new_session()
+    made.on_link("z1", 11.0, present=True)
+    assert not made.is_cut(1, 11.1)
+    made.on_link("z1", 10.0 + LINK_S + 1, present=False)
+    assert not made.is_cut(1, 10.0 + LINK_S + 2), "the other one was killed"

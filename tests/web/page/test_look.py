@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import os
 import re
+import time
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -403,20 +404,25 @@ _TOO_WIDE = "() => document.documentElement.scrollWidth > innerWidth"
 
 
 def _measured(page: Page, size: Size) -> list[str]:
+    """What stays wrong at each width: a busy machine takes a moment to draw another layout."""
     before = page.viewport_size
     assert before is not None
     problems: list[str] = []
     for width in WIDTHS[size]:
         page.set_viewport_size({"width": width, "height": before["height"]})
+        deadline = time.monotonic() + 2
         page.wait_for_timeout(60)
-        problems += [f"{width} px: scrolls sideways"] * page.evaluate(_TOO_WIDE)
-        problems += [
-            f"{width} px: {text}" for text in page.evaluate(_SMALL, TAPPABLE) + page.evaluate(_DRAWN_NEAR, TAPPABLE)
-        ]
-        problems += [f"{width} px: {text}" for text in page.evaluate(_SCROLLS_NEAR, TAPPABLE)]
-        problems += [f"{width} px: {text}" for script in (_OUT_OF_BAR, _CUT) for text in page.evaluate(script)]
-        for offset in (0, 40, 90, 150, 230):
-            problems += [f"{width} px: {text}" for text in page.evaluate(_NEAR, [TAPPABLE, offset])]
+        while (wrong := _wrong(page)) and time.monotonic() < deadline:
+            page.wait_for_timeout(60)
+        problems += [f"{width} px: {text}" for text in wrong]
     page.set_viewport_size(before)
     page.evaluate("() => scrollTo(0, 0)")
     return problems
+
+
+def _wrong(page: Page) -> list[str]:
+    found = ["scrolls sideways"] * page.evaluate(_TOO_WIDE)
+    found += page.evaluate(_SMALL, TAPPABLE) + page.evaluate(_DRAWN_NEAR, TAPPABLE)
+    found += page.evaluate(_SCROLLS_NEAR, TAPPABLE)
+    found += [text for script in (_OUT_OF_BAR, _CUT) for text in page.evaluate(script)]
+    return found + [text for offset in (0, 40, 90, 150, 230) for text in page.evaluate(_NEAR, [TAPPABLE, offset])]

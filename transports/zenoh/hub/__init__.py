@@ -120,7 +120,7 @@ class ZenohHub:
         self._problem = ""
         self._listen(worker)
         if found and cut:
-            log.warning("the hub did not see another one that it is connected to: it has made its connections anew")
+            log.warning("the hub hung, or did not see another one it is connected to: it has made its connections anew")
         elif found:
             log.info("the hub uses renewed certificates or rules")
         else:

@@ -8,10 +8,8 @@ from __future__ import annotations
 
 import logging
 import queue
-import random
 import threading
 import time
-from collections import deque
 from collections.abc import Callable, Collection, Iterable, Iterator
 from functools import partial
 from itertools import chain
@@ -24,6 +22,7 @@ from msgspec.structs import replace
 from pebble.transports.zenoh import wire
 from pebble.transports.zenoh.callbacks import direct
 from pebble.transports.zenoh.hub import merge
+from pebble.transports.zenoh.hub.links import Links
 from pebble.transports.zenoh.hub.records import Retained
 from pebble.transports.zenoh.hub.store import HubStore
 from pebble.transports.zenoh.hub.wills import WillTimes
@@ -37,8 +36,6 @@ VALUES_S = 10.0  # for values, which may be large
 ASKED = 5  # times, before another hub counts as one that does not merge
 MAX_REPLACED = 1000  # values that a will replaced, in case its client comes back
 MAX_REPLACED_BYTES = 4096  # of one of them: heartbeats have a tenth of it
-CUT_S = 4.0  # a connection to a hub that is not seen stands so long, or up to twice that, before all are made anew
-RENEWALS, RENEWALS_S = 5, 3600.0  # of them that do not help in so many seconds: each costs clients some 0.3 s
 _PAUSE_S = 0.1
 _LONGEST_NAME = 12  # of a hub; an exchange is longer
 
@@ -85,12 +82,7 @@ class Mesh:
         self._names: dict[str, set[str]] = {}  # under which each other hub is there
         self._compared: dict[str, float] = {}  # when another hub got our table
         self._taken: dict[str, int] = {}  # values of another hub, in the parts so far
-        self.routers: set[str] = set()  # hubs that this one has a connection to, by Zenoh's ids
-        # Two that miss each other do not begin anew at one instant.
-        self._patience_s = CUT_S * random.uniform(1, 2)  # noqa: S311  (not a secret)
-        self._whole_at = time.monotonic()  # when it last saw as many hubs as it has connections to
-        self._renewed_at: deque[float] = deque(maxlen=RENEWALS)  # and that did not help so far
-        self._renewed_with = 0  # connections to hubs, the last time
+        self._links = Links(time.monotonic())
 
     def serve(self, session: zenoh.Session, queued: _Queued) -> None:
         """Take part in the mesh of ``session``; ``queued`` brings an event to the hub's thread."""
@@ -102,7 +94,7 @@ class Mesh:
 
         self._session = session
         self._names.clear()
-        self._hub.post(self.routers.clear)
+        self._hub.post(self._links.on_new_session)
         others = zenoh.Locality.REMOTE
         session.declare_subscriber(wire.PUBLISHED, queued(self._on_published), allowed_origin=others)
         session.declare_queryable(wire.MERGE + self._name, queued(self._on_merge))
@@ -113,23 +105,12 @@ class Mesh:
     # -- for the hub's other tasks
 
     def is_cut(self) -> bool:
-        """Whether its connections must be made anew: it has one to a hub that it does not see.
+        """Whether its connections must be made anew."""
+        seen = len(self._wills.hubs) if self._wills.met_others else None
+        return self._links.is_cut(seen, time.monotonic())
 
-        After a hub hung, or was away, Zenoh's routers lose some of what others have declared, and never ask again
-        (measured: once in some ten times, in one direction of one connection, which it had not lost).
-        """
-        now, times, links = time.monotonic(), self._renewed_at, len(self.routers)
-        is_whole = len(self._wills.hubs) >= links
-        if is_whole or not self._wills.met_others:  # a router may be no hub of ours
-            self._whole_at = now
-        if is_whole and links >= self._renewed_with:
-            times.clear()  # what has helped may be done again
-        if now - self._whole_at < self._patience_s or (len(times) == RENEWALS and now - times[0] < RENEWALS_S):
-            return False
-        self._whole_at = now
-        self._renewed_with = links
-        times.append(now)
-        return True
+    def on_standstill(self) -> None:
+        self._links.on_standstill(time.monotonic())
 
     @property
     def merging_until(self) -> float:
@@ -178,10 +159,10 @@ class Mesh:
     # -- other hubs
 
     def _on_link(self, event: zenoh.TransportEvent) -> None:
-        present, session = event.kind == zenoh.SampleKind.PUT, str(event.transport.zid)
-        self._wills.on_link(session, time.monotonic(), present=present)
+        present, session, now = event.kind == zenoh.SampleKind.PUT, str(event.transport.zid), time.monotonic()
+        self._wills.on_link(session, now, present=present)
         if event.transport.whatami == zenoh.WhatAmI.ROUTER:
-            (self.routers.add if present else self.routers.discard)(session)
+            self._links.on_link(session, now, present=present)
 
     def _on_published(self, sample: zenoh.Sample) -> None:
         name = wire.decode_name(sample.payload.to_bytes())
@@ -342,7 +323,7 @@ class Mesh:
             store, hub = self._hub.store, self._hub
             clients = hub.alive_clients - self._wills.hubs - {self._name}
             counts = len(clients), len(store.wills()), len(store.retained())
-            state = HubState(self._name, sorted(self._wills.hubs), *counts, self.merges, len(self.routers))
+            state = HubState(self._name, sorted(self._wills.hubs), *counts, self.merges, len(self._links.routers))
             query.reply(str(query.key_expr), merge.encode(state))
 
 

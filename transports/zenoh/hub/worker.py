@@ -113,6 +113,7 @@ class HubWorker:
             before, turn = turn, clock.since_boot()
             if self._wills.met_others and turn - before > _LOOK_S + STILL_S:
                 self._wills.on_standstill(time.monotonic())
+                self._mesh.on_standstill()
             self._do(task)
             self._answer_waiting()
             self._publish_due_wills()
