@@ -29,7 +29,7 @@ class Links:
 
     def on_new_session(self) -> None:
         self.routers.clear()
-        self._lost_still = False
+        self._still_until, self._lost_still = float("-inf"), False
 
     def on_link(self, router: str, now: float, *, present: bool) -> None:
         """There is a connection to a hub, or it is lost."""
