@@ -80,6 +80,10 @@ class HubWorker:
         if not self._thread.is_alive():
             self._thread.start()
 
+    @property
+    def has_met_others(self) -> bool:
+        return self._wills.met_others
+
     def is_cut(self) -> bool:
         """Whether another hub is not seen, and a new session would mend it."""
         return self._mesh.is_cut()
