@@ -26,6 +26,7 @@ from pebble.fleet.folder import ZENOH, Fleet
 from pebble.fleet.roles import Account
 from pebble.transports import Message, QoS, State, Transport, ZenohSettings, create
 from pebble.transports.zenoh import wire
+from pebble.transports.zenoh.hub.links import CUT_S
 from tests.support import ROOT, free_port, until
 from tests.tcp_proxy import TcpProxy
 from tests.transports.forked import Forked
@@ -152,9 +153,9 @@ class Mesh:
         return slowest
 
     def is_whole(self) -> bool:
-        """Whether each hub has a connection to each other one: after one hung that takes a while."""
+        """Whether each hub has a connection to each other one, and sees it: after one hung that takes a while."""
         states = hub_states(self.hubs[NAMES[0]].settings)
-        return [one.links for one in states] == [len(NAMES) - 1] * len(NAMES)
+        return [(one.links, len(one.hubs)) for one in states] == [(len(NAMES) - 1, len(NAMES) - 1)] * len(NAMES)
 
     def kill_robot(self, name: str) -> None:
         process = self._robots.pop(name)
@@ -349,6 +350,7 @@ class TestWills:
     @pytest.mark.thorough
     def test_a_hub_that_makes_its_socket_anew_loses_none(self, mesh: Mesh) -> None:
         """Its session is closed while a will is due, as with a renewed certificate."""
+        assert until(mesh.is_whole)
         mesh.robots("a", "a0")
         mesh.robots("a", "a1")
         watch = Watch(mesh, "bc")
@@ -360,6 +362,18 @@ class TestWills:
         time.sleep(QUIET_S)
         assert watch.saw(), str(watch)
         assert watch.receives("a1")
+
+    @pytest.mark.alone
+    @pytest.mark.thorough
+    @pytest.mark.parametrize("name", NAMES)
+    def test_a_hub_that_makes_its_socket_anew_is_seen_and_sees(self, mesh: Mesh, name: str) -> None:
+        """Sooner than a hub that is blind makes its connections anew once more."""
+        for number in range(5):
+            assert until(mesh.is_whole), number
+            socket = mesh.hubs[name].settings.run_dir / "hub.sock"
+            socket.unlink()
+            assert until(socket.exists, 5)
+            assert until(mesh.is_whole, CUT_S), number
 
     @pytest.mark.alone
     @pytest.mark.parametrize(
@@ -392,6 +406,7 @@ class TestWills:
             assert watch.receives(*robots)
         time.sleep(QUIET_S)
         assert watch.saw(), str(watch)
+        assert mesh.is_whole()
         sys.stdout.write(f"\nuntil all robots are heard at another hub: {_figures(took)}\n")
         assert max(took["hung"]) <= 4.5
 

@@ -82,7 +82,8 @@ def test_the_way_to_a_day_and_a_robot(show: Show) -> None:
         assert opened.until("window.pebble?.replay?.player.seeks > 0", 30)
         opened.page.go_back()
         assert opened.until("pebble.route.ref !== '' && pebble.replay === null")
-        assert opened.complaints() == []
+        # Who leaves the robot's page so soon closes its line for pictures before that is there.
+        assert [one for one in opened.complaints() if "closed before the connection is established" not in one] == []
 
 
 def test_no_way_leads_there_without_recordings(show: Show) -> None:
