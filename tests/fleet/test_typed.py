@@ -81,36 +81,40 @@ def test_a_gateway_in_six_commands(tmp_path: Path) -> None:
         assert until(carried, 60), (robot.problem, (tmp_path / "simulation.log").read_text())
 
 
-def test_two_robots_of_a_lan_receive_each_other_in_six_commands_and_a_board_in_six_more(tmp_path: Path) -> None:
-    hub, port = free_port(), free_port()
-    here = {"0.0.0.0:7447": f"127.0.0.1:{hub}", "hub.lab": "127.0.0.1", "8883": str(port)}
-    section, more = Section("neighbours.md", "goob drives fred", here), Section("fleet.md", "A LAN with boards", here)
+def test_two_robots_of_a_lan_receive_each_other_in_six_commands(tmp_path: Path) -> None:
+    hub = free_port()
+    section = Section("neighbours.md", "goob drives fred", {"0.0.0.0:7447": f"127.0.0.1:{hub}", "hub.lab": "127.0.0.1"})
     init, *accounts, start_hub, up_goob, up_fred = section.lines
-    run(f"{init} --port {port}", tmp_path)
-    listens = {"goob.json": {"minilamp": ["online"]}, "fred.json": {}}
-    for line, name in zip(accounts, listens, strict=True):
+    run(init, tmp_path)
+    for line, name in zip(accounts, ("goob.json", "fred.json"), strict=True):
         config = deep_merge(piece_in(run(line, tmp_path), hub), json.loads(section.files[name]))
-        config["services"]["neighbours"].setdefault("listens", {}).update(listens[name])
         (tmp_path / name).write_text(json.dumps(config))
-    broker, *accounts, start_gateway, start_board = more.lines
     (tmp_path / "hub.json").write_text(section.files["hub.json"])
+    for file in (tmp_path / "lan" / certificates.CA_CERT, *(tmp_path / "lan" / certificates.ACCOUNTS).iterdir()):
+        shutil.copy(file, tmp_path)
     with ExitStack() as stack:
-        stack.enter_context(mosquitto(tmp_path / broker.split()[2], port))
-        board, _, gateway = (run(line, tmp_path) for line in accounts)
-        lamp = deep_merge(json.loads(more.files["minilamp.json"]), piece_in(board, hub))
-        lamp["local_mqtt"]["tls"]["ca_cert"] = f"lan/{certificates.CA_CERT}"
-        files = {
-            "lan-1-password": PASSWORD.findall(gateway)[0],
-            "lan-1.json": json.dumps(deep_merge(piece_in(gateway, hub), json.loads(more.files["lan-1.json"]))),
-            "minilamp.json": json.dumps(lamp),
-        }
-        for name, body in files.items():
-            (tmp_path / name).write_text(body)
-            (tmp_path / name).chmod(0o600)
-        for file in (tmp_path / "lan" / certificates.CA_CERT, *(tmp_path / "lan" / certificates.ACCOUNTS).iterdir()):
-            shutil.copy(file, tmp_path)
+        for line in (start_hub, up_goob, up_fred):
+            start(line, tmp_path, hub, stack)
+        assert until(lambda: received(tmp_path) == {"fred": True}, 60), (tmp_path / "simulation.log").read_text()
+
+
+def test_two_robots_of_a_lan_and_a_board_receive_each_other_in_six_commands(tmp_path: Path) -> None:
+    hub, port = free_port(), free_port()
+    section = Section("fleet.md", "A LAN with boards", {"hub.lab": "127.0.0.1"})
+    make, *starts, _ = section.lines
+    run(f"{make} --port {port}", tmp_path)
+    lan = tmp_path / "lan"
+    (grants,) = section.files.values()
+    gateway = lan / "gateway.json"
+    gateway.write_text(json.dumps(deep_merge(json.loads(gateway.read_text()), json.loads(grants))))
+    for file in lan.glob("**/*.json"):
+        if file.name not in ("fleet.json", "zenoh.json"):
+            file.write_text(file.read_text().replace("0.0.0.0:7447", "127.0.0.1:7447").replace("7447", str(hub)))
+    for file in lan.glob("robots/*/*"):
+        shutil.copy(file, tmp_path)
+    with ExitStack() as stack:
         began = time.monotonic()
-        for line in (start_hub, up_goob, up_fred, start_gateway, start_board):
+        for line in starts:
             start(line, tmp_path, hub, stack)
         both = {"fred": True, "minilamp": True}
         assert until(lambda: received(tmp_path) == both, 60), (tmp_path / "simulation.log").read_text()

@@ -11,9 +11,10 @@ import typer
 from msgspec.structs import replace
 
 from pebble.client.page.packages import require_packages
+from pebble.commands.fleet import lan
 from pebble.commands.options import host_of, split_names
 from pebble.errors import PebbleError
-from pebble.fleet import applying, certificates, check, folder
+from pebble.fleet import applying, certificates, check, folder, pieces
 from pebble.fleet.broker_files import new_password
 from pebble.fleet.folder import ADMIN, CONF, ZENOH, Fleet, FleetError, Server
 from pebble.fleet.people import People
@@ -43,7 +44,6 @@ _Roles = Annotated[
         metavar="ROLE[,ROLE]",
     ),
 ]
-_ZENOH_PORT = 7447
 _LEVELS: dict[str, Literal["login", "named"]] = {"login": "login", "named": "named"}
 
 
@@ -296,7 +296,14 @@ def check_(
 def register(app: typer.Typer) -> None:
     group = typer.Typer(help=_HELP, rich_markup_mode=None)
     commands: dict[str, Any] = {"init": init, "add": add, "role": role_, "password": password, "remove": remove}
-    commands |= {"list": list_, "check": check_, "zenoh": zenoh, "certificate": certificate}
+    commands |= {
+        "list": list_,
+        "check": check_,
+        "zenoh": zenoh,
+        "certificate": certificate,
+        "lan": lan.lan,
+        "up": lan.up,
+    }
     for name, command in commands.items():
         group.command(name)(command)
     app.add_typer(group, name="fleet")
@@ -367,9 +374,9 @@ def _print_account(place: Path, fleet: Fleet, name: str, secret: str, how: str, 
     ca = _shown(place / certificates.CA_CERT)
     if ProgramRole.ROBOT in account.roles:
         typer.echo(f"For its config, which no other user may read, with a copy of {ca} beside it:")
-        typer.echo(json.dumps(piece_of_config(fleet, name, secret, board=board), indent=2))
+        typer.echo(json.dumps(pieces.of_broker(fleet, name, secret, board=board), indent=2))
         return
-    url = f"mqtts://{name}@" + ",".join(_host_and_port(server) for server in fleet.brokers)
+    url = f"mqtts://{name}@" + ",".join(pieces.host_and_port(server) for server in fleet.brokers)
     if ProgramRole.PAGE in account.roles:
         typer.echo(f"    pebble web --url {url} --ca-cert {ca} --password-file FILE")
     elif ProgramRole.HUB in account.roles:
@@ -379,7 +386,7 @@ def _print_account(place: Path, fleet: Fleet, name: str, secret: str, how: str, 
         typer.echo(
             f"The file of that gateway, with its password in {name}-password, and what each board grants to add:"
         )
-        typer.echo(json.dumps(_file_of_boards(place, fleet, name), indent=2))
+        typer.echo(json.dumps(pieces.boards_file(fleet, name, f"{_shown(place)}/"), indent=2))
     elif ProgramRole.GATEWAY not in account.roles:
         does = "watch" if account.roles == (Role.VIEWER,) else "drive"
         typer.echo(f"    pebble {does} ROBOT --url {url} --ca-cert {ca} --password-file FILE")
@@ -393,65 +400,10 @@ def _print_certificate(place: Path, fleet: Fleet, name: str, files: tuple[Path, 
     typer.echo(
         f"Move the key to its machine, with copies of {copies} beside it. `pebble fleet check` watches the date."
     )
-    at_hub = _at_hub(fleet, name, certificates.CA_CERT, name)
-    tls = at_hub["tls"]
     if ProgramRole.HUB in roles:
         typer.echo(f"And a copy of {_shown(place / ZENOH)}. The file of that hub, with the other hubs in connect:")
-        file = {"listen": [f"tls/0.0.0.0:{_ZENOH_PORT}"], "connect": [], "tls": tls, "access": ZENOH}
-        typer.echo(json.dumps({**file, "journal": f"{name}.journal"}, indent=2))
-    if ProgramRole.ROBOT in roles:
-        piece = {"services": {"mqtt_bridge": {"enabled": True, "remote": {"kind": "zenoh", **at_hub}}}}
-        typer.echo(json.dumps({**_who(fleet, name), **piece}, indent=2))
-    if ProgramRole.NEIGHBOUR in roles:
-        robot = _who(fleet, name)["robot"]
-        typer.echo(json.dumps({"robot": robot, "services": {"neighbours": {"enabled": True, "lan": at_hub}}}, indent=2))
-
-
-def _at_hub(fleet: Fleet, name: str, ca: str, keys: str) -> dict[str, Any]:
-    """How this account connects to the fleet's hub: its authority and its own keys, these without their suffix."""
-    tls = {"enabled": True, "ca_cert": ca, "client_cert": f"{keys}.pem", "client_key": f"{keys}.key"}
-    return {"account": name, "connect": [f"tls/{fleet.brokers[0].host}:{_ZENOH_PORT}"], "tls": tls}
-
-
-def _file_of_boards(place: Path, fleet: Fleet, name: str) -> dict[str, Any]:
-    """The file of a gateway of boards beside this folder: those that have an account as a neighbour are in it."""
-    server, ca = fleet.brokers[0], _shown(place / certificates.CA_CERT)
-    login = {"username": name, "password_file": f"{name}-password", "tls": {"enabled": True, "ca_cert": ca}}
-    neighbours = {
-        account.bases[0]: {"lan": _at_hub(fleet, other, ca, _shown(place / certificates.ACCOUNTS / other))}
-        for other, account in fleet.accounts.items()
-        if ProgramRole.NEIGHBOUR in account.roles and account.bases[0] in fleet.accounts[name].bases
-    }
-    return {"id": name, "boards": {"host": server.host, "port": server.port, **login}, "neighbours": neighbours}
-
-
-def piece_of_config(fleet: Fleet, name: str, secret: str, *, board: bool) -> dict[str, Any]:
-    """What a robot's config needs, to be at this broker."""
-    server, *others = fleet.brokers
-    places: dict[str, Any] = {"host": server.host, "port": server.port}
-    if others:
-        places = {"hosts": [one.host if one.port == server.port else _host_and_port(one) for one in fleet.brokers]}
-        places["port"] = server.port
-    login = places | {"username": name, "password": secret}
-    link = login | {"tls": {"enabled": True, "ca_cert": certificates.CA_CERT}}
-    found = {"local_mqtt": link} if board else {"services": {"mqtt_bridge": {"enabled": True, "remote_mqtt": link}}}
-    return {**_who(fleet, name), **found}
-
-
-def _who(fleet: Fleet, name: str) -> dict[str, Any]:
-    """The id with the account, which may do nothing below another base: its messages would be dropped in silence."""
-    account = fleet.accounts[name]
-    parts = dict(zip(("system", "type", "id"), account.bases[0].split("/"), strict=True))
-    robot = {key: part for key, part in parts.items() if key == "id" or part != {"system": "pebble"}.get(key, "robots")}
-    return {"robot": robot, "security": {"level": _level(fleet, account)}}
-
-
-def _host_and_port(server: Server) -> str:
-    return f"[{server.host}]:{server.port}" if ":" in server.host else f"{server.host}:{server.port}"
-
-
-def _level(fleet: Fleet, account: Account) -> str:
-    return "login" if account.plain else fleet.level
+    if piece := pieces.of_certificate(fleet, name):
+        typer.echo(json.dumps(piece, indent=2))
 
 
 def _left(lines: Iterable[str]) -> int:
