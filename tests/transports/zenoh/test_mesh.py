@@ -386,13 +386,12 @@ class TestWills:
     def test_a_hub_that_hangs_costs_no_robot_a_will(self, mesh: Mesh, hangs: int) -> None:
         for name in NAMES:
             mesh.robots(name, *(f"{name}{robot}" for robot in range(3)))
-        took: dict[str, list[float]] = {"hung": []}
+        took: dict[str, list[float]] = {"hung": [], "whole": []}
         robots = [f"{one}{robot}" for one in NAMES for robot in range(3)]
         watch = Watch(mesh)
         assert watch.receives(*robots)
         for number in range(hangs):
             name = NAMES[number % 3]
-            assert until(mesh.is_whole, 30), "else this one is all that connects the others"
             watch.leave(name)
             mesh.hubs[name].signal(signal.SIGSTOP)
             began = time.monotonic()
@@ -401,13 +400,16 @@ class TestWills:
             took["hung"].append(time.monotonic() - began)
             time.sleep(max(0.0, began + 6 - time.monotonic()))
             mesh.hubs[name].signal(signal.SIGCONT)
+            began = time.monotonic()
+            assert until(mesh.is_whole, 30), "else the next one is all that connects the others"
+            took["whole"].append(time.monotonic() - began)
             assert watch.saw(), (number, str(watch))
             watch.enter(name)
             assert watch.receives(*robots)
         time.sleep(QUIET_S)
         assert watch.saw(), str(watch)
         assert mesh.is_whole()
-        sys.stdout.write(f"\nuntil all robots are heard at another hub: {_figures(took)}\n")
+        sys.stdout.write(f"\nuntil robots are heard elsewhere, and hubs see each other: {_figures(took)}\n")
         assert max(took["hung"]) <= 4.5
 
 
