@@ -17,6 +17,7 @@ from pebble.transports.zenoh.presence import HubWatch
 from pebble.transports.zenoh.publishers import remember_first
 
 HUB_ANSWER_S = 1.0
+OTHERS_S = 0.2  # so long an answer of one hub waits for those of the others, which give each other what they lack
 FETCH_S = 0.7  # the longest wait for the hub's retained messages, which it may delay for half a second
 GOODBYE_S = 0.3  # the longest wait for an answer when closing
 
@@ -83,7 +84,7 @@ class HubConnection:
 
     def greet(self, session: zenoh.Session, hello: bytes, timeout: float) -> set[str] | None:
         """The topics that the hub lacks; None: no hub answers in time."""
-        answers = wire.ask(session, wire.asked(wire.HELLO, self._account), hello, timeout)
+        answers = wire.ask(session, wire.asked(wire.HELLO, self._account), hello, timeout, others_s=OTHERS_S)
         return {key_to_topic(key) for answer in answers for key in wire.decode_keys(answer)} if answers else None
 
     def leave(self, session: zenoh.Session) -> None:

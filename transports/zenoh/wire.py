@@ -7,6 +7,8 @@ match no wildcard, so no ordinary subscription receives these.
 
 from __future__ import annotations
 
+import contextlib
+import queue
 import struct
 import time
 from collections.abc import Callable
@@ -19,6 +21,7 @@ import msgspec
 import zenoh
 
 from pebble.transports.base import Message, QoS
+from pebble.transports.zenoh.callbacks import direct
 
 RETAINED = "@retain/"  # + key: the newest retained message, put before the live one and queried by subscribers
 SYNC = "@sync/"  # + name: answers with how many retained messages this session has sent
@@ -36,6 +39,7 @@ OF = "~"
 ALL_KEYS = ("**", *(f"{prefix}**" for prefix in (RETAINED, SYNC, UP, LIVE, "@hub/")))
 
 RETAINED_ANSWER_S = 3.0  # so long a client waits for what is retained
+_LATE_S = 0.1  # so much later than its time limit Zenoh may say that a query has ended
 
 # How put() and get() treat a message. Not `express`: it is no faster here (64 B at 200 Hz: p50 108 against 112 us), and
 # it gives each message a batch of its own, so that 1.5 s of 200 Hz fill the queue to a stopped sibling.
@@ -151,18 +155,31 @@ def asked(what: str, account: str) -> str:
     return f"{what}/{account}" if account else what
 
 
-def ask(session: zenoh.Session, key: str, payload: bytes, timeout: float) -> list[bytes]:
-    """What all that have this key answer within ``timeout`` seconds."""
-    replies = session.get(
+def ask(
+    session: zenoh.Session, key: str, payload: bytes, timeout: float, *, others_s: float = float("inf")
+) -> list[bytes]:
+    """What all that have this key answer within ``timeout`` seconds, and within ``others_s`` after the first one.
+
+    Where one of them has just died, a router that does not know it yet waits for its answer to the end.
+    """
+    came: queue.SimpleQueue[zenoh.Reply | None] = queue.SimpleQueue()
+    session.get(
         key,
-        zenoh.handlers.FifoChannel(256),
+        direct(came.put, lambda: came.put(None)),
         target=zenoh.QueryTarget.ALL,
         consolidation=zenoh.ConsolidationMode.NONE,
         timeout=timeout,
         payload=payload,
         **BLOCK,
     )
-    return [reply.ok.payload.to_bytes() for reply in replies if reply.ok is not None]
+    answers: list[bytes] = []
+    end = time.monotonic() + timeout + _LATE_S
+    with contextlib.suppress(queue.Empty):
+        while (reply := came.get(timeout=max(0.0, end - time.monotonic()))) is not None:
+            if reply.ok is not None:
+                end = end if answers else min(end, time.monotonic() + others_s)
+                answers.append(reply.ok.payload.to_bytes())
+    return answers
 
 
 def account_of(key: str, what: str) -> str:
