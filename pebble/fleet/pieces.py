@@ -12,7 +12,7 @@ HUB_PORT = 7447
 
 
 def of_broker(fleet: Fleet, name: str, secret: str, *, board: bool) -> dict[str, Any]:
-    """Of a robot's config: how it is at the fleet's broker."""
+    """Return what a robot needs in its config to be at the fleet's broker."""
     server, *others = fleet.brokers
     places: dict[str, Any] = {"host": server.host, "port": server.port}
     if others:
