@@ -83,9 +83,7 @@ def lan(
     for name in robots:
         typer.echo(f"    pebble up {name}.json")
     for name in boards:
-        typer.echo(
-            f"    pebble flash {name} -c {name}.json     # or, simulated: pebble sim minilamp --broker {name}.json"
-        )
+        typer.echo(f"    pebble flash {name}.json     # or, simulated: pebble sim minilamp --broker {name}.json")
     typer.echo(f"Keep {shown} secret: its keys and passwords are in it.")
     return 0
 
