@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import json
-import logging
 import os
 import shutil
 import signal
 import subprocess
 import sys
+from collections import Counter
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
@@ -25,9 +25,8 @@ from pebble.fleet.folder import CONF, Fleet, FleetError, Server
 from pebble.fleet.roles import Account, ProgramRole
 from pebble.fleet.whole_file import write
 
-log = logging.getLogger(__name__)
-
 HUB_FILE, GATEWAY_FILE, ROBOTS = "hub.json", "gateway.json", "robots"
+_LOCK = ".up"
 GATEWAY = "lan-gateway"  # the account of the boards' gateway
 _SHARED = ("online",)  # what all receive of each other until their configs say more
 _SBIN = "/usr/local/sbin:/usr/sbin:/sbin"  # where Debian puts mosquitto, not in the PATH of users
@@ -96,31 +95,33 @@ def up(folder_: Annotated[Path, typer.Argument(metavar="FOLDER", help="Of the fl
     \b
         pebble fleet up hall
     """
-    from pebble.runtime.parent import set_up_logging
     from pebble.runtime.signals import EndSignal
+    from pebble.transports.peers import FileLock
 
     place = folder_.absolute()
-    folder.load(place)
+    if not (place / HUB_FILE).is_file():
+        raise FleetError(f"{folder_ / HUB_FILE} is missing: name a folder that `pebble fleet lan` has made")
     commands = {name: command for name, command in _commands(place).items() if command}
-    if not commands:
-        raise FleetError(f"{folder_ / HUB_FILE} is missing: `pebble fleet lan` writes it")
-    set_up_logging("INFO")
+    if (lock := FileLock.take(place / _LOCK)) is None:
+        raise FleetError(f"{folder_} runs already: another `pebble fleet up` holds {folder_ / _LOCK}")
     ends = EndSignal()
     with ExitStack() as stack:
+        stack.callback(lock.release)
         running = {name: stack.enter_context(_running(command)) for name, command in commands.items()}
         typer.echo(f"{', '.join(running)} of {folder_}; Ctrl-C ends them", err=True)
         while not ends.wait(_LOOK_S):
             for name, process in running.items():
                 if (code := process.poll()) is not None:
-                    log.error("%s has ended with code %d, so all others end, too", name, code)
-                    return 1
+                    raise PebbleError(
+                        f"{name} has ended with code {code}, so all others end, too: read what it said, and start again"
+                    )
     return 0
 
 
 def _commands(place: Path) -> dict[str, list[str]]:
     """What runs here, by its name; nothing for what this LAN does not have. Raises PebbleError."""
     pebble = [sys.executable, "-m", "pebble"]
-    found = {"hub": [*pebble, "hub", str(place / HUB_FILE)] if (place / HUB_FILE).exists() else []}
+    found = {"hub": [*pebble, "hub", str(place / HUB_FILE)]}
     if not (place / GATEWAY_FILE).exists():
         return found
     mosquitto = shutil.which("mosquitto", path=f"{os.environ.get('PATH', os.defpath)}:{_SBIN}")
@@ -149,8 +150,9 @@ def _running(command: list[str]) -> Iterator[subprocess.Popen[bytes]]:
 def _accounts(fleet: Fleet, robots: list[str], boards: list[str]) -> Fleet:
     """Each is a neighbour of the others; boards are at the broker as well, with a gateway. Raises FleetError."""
     bases = {name: f"pebble/robots/{name}" for name in (*robots, *boards)}
-    if len(bases) < len(robots) + len(boards):
-        raise FleetError("a robot is named twice")
+    for name, times in Counter((*robots, *boards)).items():
+        if times > 1:
+            raise FleetError(f"{name} is named {times} times")
     wanted = [(_neighbour(name), ProgramRole.NEIGHBOUR, [base]) for name, base in bases.items()]
     wanted += [(name, ProgramRole.ROBOT, [bases[name]]) for name in boards]
     wanted += [(GATEWAY, ProgramRole.BOARDS, [bases[name] for name in boards])] if boards else []
