@@ -33,6 +33,8 @@ def test_keys_turn_the_wheels_while_they_are_held(browser: Browser, stage: Stage
 def test_stop_all_latches_robots_of_every_kind(stage: Stage, at_lamp: Console, wire: Wire) -> None:
     at_lamp.test("stop-all").click()
     assert at_lamp.tab.until(lambda: all(wire.latched(name) for name in stage.robots), 3)
+    refs = [stage.ref(name) for name in stage.robots]  # the page resets those stops that it has seen
+    assert at_lamp.tab.until(lambda: all(at_lamp.state("web/estop", ref)["latched"] for ref in refs), 3)
     for name in stage.robots:
         at_lamp.reset(name)
     assert at_lamp.tab.until(lambda: not any(wire.latched(name) for name in stage.robots), 3)
