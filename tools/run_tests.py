@@ -3,7 +3,8 @@
 Several hundred tests start whole robots and check deadlines. Where other programs take the processors for seconds, one
 of them may miss its deadline; a test that fails twice, the second time with nothing beside it, fails.
 
-Processes that a test has left behind are ended, named with their test, and a failure.
+Processes that a test has left behind are ended, named with their test, and a failure. What tests leave in the temporary
+folder is removed, apart from pytest's own folders.
 """
 
 import os
@@ -34,7 +35,10 @@ def main(arguments: list[str]) -> int:
 
 
 def run(arguments: list[str]) -> int:
-    with tempfile.TemporaryDirectory() as folder:
+    os.environ.setdefault("PYTEST_DEBUG_TEMPROOT", tempfile.gettempdir())
+    with tempfile.TemporaryDirectory(prefix="t", ignore_cleanup_errors=True) as folder:  # short: it holds unix sockets
+        Path(folder).chmod(0o1777)  # some tests are run by other users as well
+        os.environ["TMPDIR"] = folder
         list_ = Path(folder, "failed")
         code = pytest(arguments, list_)
         failed = list_.read_text().splitlines() if list_.exists() else []
