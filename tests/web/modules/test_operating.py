@@ -174,7 +174,7 @@ const level = (value, more = {}) =>
 """
 
 
-notices = Script({"core/notices.js": "Notices, Watcher, MOST"}, _NOTICES, "result ??= texts();")
+notices = Script({"core/notices.js": "Notices, Watcher, aloud, MOST"}, _NOTICES, "result ??= texts();")
 
 
 UNPLUGGED = "a cannot be driven: no board"
@@ -208,6 +208,14 @@ NOTICES: Rows = {
         result = [notices.list.length, texts()[0], notices.unread];
         notices.read(); online('z', true, false); result.push(notices.unread);
         notices.clear(); result.push(texts());""", [50, "r79 is offline", 50, 1, []]),
+    "stops are read aloud first, then the others as they came": ("""
+        for (const name of ["a", "b", "c"]) online(name, true, false);
+        for (const name of ["s", "t"]) for (const latched of [false, true]) watcher.stop(name, { latched, by: "x" }, 1);
+        result = aloud(notices.list, (ref) => ref.toUpperCase());""",
+        "S was stopped by x. T was stopped by x. A is offline. B is offline. and 1 more"),
+    "one that comes again is a newer one": (
+        "online('a', true, false, true); online('b', true, false); result = notices.list.map((one) => one.number);",
+        [3, 2]),
     "a stop that latches": ("""
         watcher.stop("a", { latched: true, by: "x" }, 1); watcher.stop("b", { latched: false }, 1);
         watcher.stop("b", { latched: true, by: "eve on phone" }, 2); watcher.stop("b", { latched: true, by: "bob" }, 3);

@@ -10,7 +10,7 @@ import pytest
 
 from tests.web.browser import Size, Theme, answer
 from tests.web.canned import CannedServer, Show
-from tests.web.states import GOOB, STATES
+from tests.web.states import FRED, GOOB, LAMP, STATES
 
 pytestmark = pytest.mark.page
 
@@ -75,6 +75,22 @@ def test_a_driver_sees_that_the_robot_can_no_longer_be_driven_and_then_that_it_c
             assert opened.until(f"{SHOWN} === '{chip}{hint}'"), opened.page.evaluate(SHOWN)
         opened.test("bell").click()
         assert opened.until("document.querySelector('.notice-driveable')?.innerText.includes('can be driven again 2')")
+
+
+STOPPED = """(refs) => refs.forEach((ref) => pebble.store.set(
+  ref, "web/estop", { ...pebble.store.get(ref, "web/estop").value, latched: true, by: "eve" }))"""
+
+
+def test_stops_are_read_aloud_whatever_comes_right_after_them(show: Show) -> None:
+    with show(STATES["fleet"]) as opened:
+        opened.test("bell").wait_for()
+        opened.page.evaluate(STOPPED, [FRED, LAMP])
+        opened.page.evaluate("(ref) => pebble.store.set(ref, 'web/liveness', { online: false })", GOOB)
+        announced = opened.test("announcement")
+        stops = "fred was stopped by eve. minilamp was stopped by eve"
+        assert opened.until(lambda: stops in announced.inner_text()), announced.inner_text()
+        opened.test("bell").click()
+        assert opened.until(lambda: announced.inner_text() == "")
 
 
 def test_a_button_that_is_switched_off_while_it_is_held_does_nothing(show: Show, server: CannedServer) -> None:

@@ -3,6 +3,7 @@
 import { isObject } from "./json.js";
 
 export const MOST = 50;
+const ALOUD = 4; // sentences at once
 const COMPONENTS = 600; // whose last states are remembered
 const SERVICES = 64; // of one component
 const LOW_PERCENT = 20;
@@ -13,7 +14,7 @@ const LONGEST = 160; // characters of what a robot reports of itself
 /**
  * One line of the list: what happens again and again is one line with a count. Times are epoch ms.
  * @typedef {{key: string, ref: string, kind: Kind, text: string, at: number, since: number, count: number,
- *   unread: boolean}} Notice
+ *   unread: boolean, number: number}} Notice  ``number`` grows with each that is added
  */
 
 /** The list, the newest first. */
@@ -21,6 +22,7 @@ export class Notices {
   constructor() {
     /** @type {Notice[]} */
     this.list = [];
+    this.number = 0; // of the newest
   }
 
   /** @param {{key?: string, ref: string, kind: Kind, text: string, at: number}} notice */
@@ -29,7 +31,7 @@ export class Notices {
     const old = this.list.find((one) => one.key === whole);
     const { since, count } = old ?? { since: at, count: 0 };
     const rest = this.list.filter((one) => one !== old);
-    this.list = [{ key: whole, ref, kind, text, at, since, count: count + 1, unread: true }, ...rest].slice(0, MOST);
+    this.list = [{ key: whole, ref, kind, text, at, since, count: count + 1, unread: true, number: ++this.number }, ...rest].slice(0, MOST);
   }
 
   get unread() {
@@ -43,6 +45,20 @@ export class Notices {
   clear() {
     this.list = [];
   }
+}
+
+/**
+ * What is read aloud of ``notices``, the newest first: stops, then the others as they came.
+ * @param {Notice[]} notices @param {(ref: string) => string} name
+ */
+export function aloud(notices, name) {
+  const rank = (/** @type {Notice} */ one) => (one.kind === "stop" ? 0 : 1);
+  const sentences = [...notices]
+    .reverse()
+    .sort((one, other) => rank(one) - rank(other))
+    .map((one) => `${name(one.ref)} ${one.text}`);
+  const more = sentences.length - ALOUD;
+  return [...sentences.slice(0, ALOUD), ...(more > 0 ? [`and ${more} more`] : [])].join(". ");
 }
 
 /** The last state of one component. @typedef {{online?: boolean, latched?: boolean, failure?: string, low?: boolean,

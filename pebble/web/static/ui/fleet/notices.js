@@ -1,8 +1,8 @@
 // What an operator of many robots should learn without looking at each: a bell in the header, and its list.
 
-import { Notices, Watcher } from "../../core/notices.js";
+import { Notices, Watcher, aloud } from "../../core/notices.js";
 import { DoubtMark } from "./doubt.js";
-import { html, useCalm, useEffect, useModel, usePage, useRefs, useState, useValue } from "../parts/hooks.js";
+import { html, useEffect, useModel, usePage, useRef, useRefs, useState, useValue } from "../parts/hooks.js";
 import { Model, read, write } from "../parts/models.js";
 import { Panel } from "../panels/panel.js";
 import { nameIn } from "../parts/looks.js";
@@ -147,7 +147,7 @@ export function Bell({ at, wide, room = wide }) {
     if (!open) panels.show("");
     show(!open);
   };
-  return html`<${Announcement} newest=${notices.list[0]} />
+  return html`<${Announcement} list=${notices.list} />
     ${at && html`<${DoubtMark} at=${at} />`}
     ${room && at && html`<${RecordingsLink} at=${at} className="button quiet" />`}
     ${wide &&
@@ -168,12 +168,25 @@ export function Bell({ at, wide, room = wide }) {
     <//>`}`;
 }
 
-/** Read aloud, at most one a second. Of the component that is open the banners are read. */
-function Announcement({ newest }) {
+/** What came since the last time is read aloud, at most once a second. Of the component that is open the banners are read. */
+function Announcement({ list }) {
   const { route, store } = usePage();
-  const banner = newest && newest.ref === route.ref && ["offline", "stop", "undriveable"].includes(newest.kind);
-  const text = useCalm(newest?.unread && !banner ? `${nameIn(store, newest.ref)} ${newest.text}` : "");
-  return html`<span class="sr" role="status" data-test="announcement">${text}</span>`;
+  const [{ text, upto }, say] = useState({ text: "", upto: 0 });
+  const changedAt = useRef(-Infinity);
+  const banner = ({ ref, kind }) => ref === route.ref && ["offline", "stop", "undriveable"].includes(kind);
+  useEffect(() => {
+    const waiting = list.filter((one) => one.number > upto && one.unread && !banner(one));
+    if (!waiting.length) return undefined;
+    const timer = setTimeout(
+      () => {
+        changedAt.current = performance.now();
+        say({ text: aloud(waiting, (ref) => nameIn(store, ref)), upto: list[0].number });
+      },
+      Math.max(0, changedAt.current + 1000 - performance.now()),
+    );
+    return () => clearTimeout(timer);
+  }, [list, upto, route.ref]);
+  return html`<span class="sr" role="status" data-test="announcement">${list.some((one) => one.unread) && text}</span>`;
 }
 
 export function NoticeList({ onGo }) {
