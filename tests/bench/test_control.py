@@ -96,6 +96,7 @@ def test_ctrl_c_leaves_nothing(temporary: Path, tmp_path: Path) -> None:
     try:
         assert until(lambda: len(children(bench.pid)) == 8, 30)  # two are the pictures
         started = children(bench.pid)
+        assert list(temporary.iterdir())
         bench.send_signal(signal.SIGINT)
         assert bench.wait(30) == 130
     finally:

@@ -82,15 +82,16 @@ def test_a_writer_that_is_held_up_is_seen_in_every_latency() -> None:
     assert min(cell.samples) >= 5000.0
 
 
-def test_ctrl_c_leaves_nothing(temporary: Path) -> None:
+def test_ctrl_c_leaves_nothing(temporary: Path, tmp_path: Path) -> None:
     bench = subprocess.Popen(
-        command("--output", str(temporary.parent), "--quick", "--seconds", "30", "--variants", "zenoh-copy"),
+        command("--output", str(tmp_path), "--quick", "--seconds", "30", "--variants", "zenoh-copy"),
         env={**os.environ, "TMPDIR": str(temporary)}, cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
     )  # fmt: skip
     try:
         assert until(lambda: len(children(bench.pid)) == 2, 20)
         started = children(bench.pid)
         assert until(lambda: all(map(segments, started)), 20)
+        assert list(temporary.iterdir())
         shared = set().union(*map(segments, started))
         time.sleep(1)  # files younger than a second are not swept
         bench.send_signal(signal.SIGINT)
@@ -103,9 +104,9 @@ def test_ctrl_c_leaves_nothing(temporary: Path) -> None:
     assert list(temporary.iterdir()) == []
 
 
-def test_workers_end_with_a_killed_bench(temporary: Path) -> None:
+def test_workers_end_with_a_killed_bench(temporary: Path, tmp_path: Path) -> None:
     bench = subprocess.Popen(
-        command("--output", str(temporary.parent), "--quick", "--seconds", "30", "--variants", "zenoh-net"),
+        command("--output", str(tmp_path), "--quick", "--seconds", "30", "--variants", "zenoh-net"),
         env={**os.environ, "TMPDIR": str(temporary)}, cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
     )  # fmt: skip
     try:

@@ -66,7 +66,7 @@ def test_our_stand_in_reads_what_debians_writer_sends(tmp_path: Path) -> None:
     finally:
         writer.kill()
         writer.wait(10)
-        for left in SHM.glob(f"shmpipe.{writer.pid}.*"):  # it leaves that even when it ends regularly
+        for left in SHM.glob(f"shmpipe.{writer.pid:5}.*"):  # it leaves that even when it ends regularly
             left.unlink()
 
 
