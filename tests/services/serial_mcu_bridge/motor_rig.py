@@ -64,9 +64,10 @@ class Bench:
         self.start()
 
     def start(self) -> None:
+        before = len(self.lines)
         self.service = self._new_service()
         self.running = Running(self.service)
-        assert until(lambda: len(self.lines) >= 2, 5)  # the stop after opening and after booting
+        assert until(lambda: len(self.lines) >= before + 2, 5)  # the stop after opening and after booting
 
     @property
     def lines(self) -> list[str]:

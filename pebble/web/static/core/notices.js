@@ -22,7 +22,7 @@ export class Notices {
   constructor() {
     /** @type {Notice[]} */
     this.list = [];
-    this.number = 0; // of the newest
+    this.number = this.announced = 0; // of the newest, and of the newest that was read aloud
   }
 
   /** @param {{key?: string, ref: string, kind: Kind, text: string, at: number}} notice */

@@ -147,7 +147,7 @@ export function Bell({ at, wide, room = wide }) {
     if (!open) panels.show("");
     show(!open);
   };
-  return html`<${Announcement} list=${notices.list} />
+  return html`<${Announcement} notices=${notices} list=${notices.list} />
     ${at && html`<${DoubtMark} at=${at} />`}
     ${room && at && html`<${RecordingsLink} at=${at} className="button quiet" />`}
     ${wide &&
@@ -169,24 +169,26 @@ export function Bell({ at, wide, room = wide }) {
 }
 
 /** What came since the last time is read aloud, at most once a second. Of the component that is open the banners are read. */
-function Announcement({ list }) {
+function Announcement({ notices, list }) {
   const { route, store } = usePage();
-  const [{ text, upto }, say] = useState({ text: "", upto: 0 });
+  const [text, say] = useState("");
   const changedAt = useRef(-Infinity);
   const banner = ({ ref, kind }) => ref === route.ref && ["offline", "stop", "undriveable"].includes(kind);
   useEffect(() => {
-    const waiting = list.filter((one) => one.number > upto && one.unread && !banner(one));
+    const waiting = list.filter((one) => one.number > notices.announced && one.unread && !banner(one));
+    if (!list.some((one) => one.unread)) say("");
     if (!waiting.length) return undefined;
     const timer = setTimeout(
       () => {
         changedAt.current = performance.now();
-        say({ text: aloud(waiting, (ref) => nameIn(store, ref)), upto: list[0].number });
+        notices.announced = list[0].number;
+        say(aloud(waiting, (ref) => nameIn(store, ref)));
       },
       Math.max(0, changedAt.current + 1000 - performance.now()),
     );
     return () => clearTimeout(timer);
-  }, [list, upto, route.ref]);
-  return html`<span class="sr" role="status" data-test="announcement">${list.some((one) => one.unread) && text}</span>`;
+  }, [list, route.ref]);
+  return html`<span class="sr" role="status" data-test="announcement">${text}</span>`;
 }
 
 export function NoticeList({ onGo }) {
