@@ -88,6 +88,7 @@ class Program:
 
     def __init__(self, rig: Rig, opened: ExitStack) -> None:
         self._rig, self._z, self._state = rig, 0.0, dict[str, Any]()
+        self._commands = 0  # that were sent
         self._here = opened.enter_context(local_transport(load(rig.config), "program"))
         self._here.subscribe(
             f"{GOOB}/{STATE}", lambda message: self._state.update(json.loads(message.payload)), direct=True
@@ -100,6 +101,8 @@ class Program:
         self._z = 0.0
         assert until(lambda: stop in ("", *self._state.get("recent", [])), 10), self._state
         assert until(self._is_reset, 10, step=0.05)
+        enough = self._commands + 2
+        assert until(lambda: self._commands >= enough)  # after a reset nothing drives before a zero
         self._z = 0.3
         assert until(self._rig.mcu.turning, 10)
 
@@ -111,6 +114,7 @@ class Program:
     def _run(self) -> None:
         while not self._ended.wait(0.05):
             self._send("drive-values", {"x": 0, "z": self._z})
+            self._commands += 1
 
     def _send(self, metric: str, body: dict[str, Any]) -> None:
         self._here.publish(f"{GOOB}/incoming/{metric}", json.dumps(body).encode(), qos=QoS.DELIVERED, urgent=True)
