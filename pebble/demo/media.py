@@ -54,6 +54,7 @@ class MediaRecorder(MediaReceiver):
         self.problem = ""
         self.audio_rate = 0
         self.watched: set[Medium] = set()  # that others have requested
+        self.disturbed: set[Medium] = set()  # that others requested, or let go, since the last turn began
         self._shown: deque[tuple[str, ShownPicture]] = deque(maxlen=_PICTURES)
         self._stretch: deque[ReceivedSound] = deque(maxlen=_SOUNDS)
 
@@ -71,6 +72,7 @@ class MediaRecorder(MediaReceiver):
             request = codec.decode(channel, message.payload)
         except PayloadError:
             return
+        self.disturbed.add(medium)
         if request.enabled:
             self.watched.add(medium)
             self.viewer.hand_over(medium)
@@ -172,6 +174,7 @@ class MediaCheck:
 
     def _ask(self, medium: Medium, encoding: str) -> None:
         for recorder in self.recorders.values():
+            recorder.disturbed.discard(medium)
             if medium not in recorder.watched:
                 self._try(recorder, partial(recorder.viewer.request, medium, encoding))
 
@@ -201,7 +204,7 @@ class MediaCheck:
     def _assess(self, medium: Medium, name: str, encoding: str) -> MediaResult:
         recorder = self.recorders[name]
         capabilities = recorder.viewer.capabilities.get(medium, {})
-        if medium in recorder.watched:
+        if medium in recorder.watched | recorder.disturbed:
             return watched(name, encoding)
         if recorder.problem:
             return MediaResult(name, encoding, "", (recorder.problem,))

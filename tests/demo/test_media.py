@@ -91,3 +91,4 @@ def test_it_is_the_demos_again_when_the_person_has_seen_enough(recorder: MediaRe
     for enabled in (True, False):
         person.publish(VIDEO_CONTROL.topic(GOOB), codec.encode(VIDEO_CONTROL, MediaRequest(enabled=enabled)))
         assert until(lambda: recorder.watched == ({"video"} if enabled else set()))  # noqa: B023 - at once
+    assert recorder.disturbed == {"video"}  # a turn in which somebody watched is not assessed
