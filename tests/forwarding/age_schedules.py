@@ -23,7 +23,6 @@ from pebble.forwarding.command_ages import MOST, CommandAges, ends_something
 from pebble.forwarding.subjects import Subjects
 from pebble.transports import Message, clock
 from pebble.transports.mqtt.read_age import BrokerDelay
-from tests.kit.mutations import Mutation
 from tests.kit.schedules import Engine, Outcome, RandomSteps, Steps, check, perform_steps, shared
 
 _BASE = "pebble/robots/goob"
@@ -370,37 +369,8 @@ _WEIGHTS = {
 _STANDING = {**_WEIGHTS, "down": 4, "change_key": 5, "set_clock": 4, "up": 0, "up_grows": 0, "break": 0}
 _CALM = {**_WEIGHTS, "up": 1, "down": 1, "down_grows": 0, "set_clock": 1, "freeze": 0}
 
-_AGES, _JUDGE = "pebble.transports.ages", "pebble.forwarding.command_ages"
-MUTATIONS = {
-    "a queue that was there from the beginning is taken for the way": Mutation(
-        _AGES, "min(clock.least, clock.proved)", "clock.least", schedule=40
-    ),
-    "a young clock is trusted": Mutation(_AGES, "if now - clock.began >= _YOUNG_S", "if True"),
-    "a clock that jumped is trusted": Mutation(_AGES, "now - sent < clock.least - _JUMP_S", "False", schedule=1269),
-    "the fastest message is forgotten": Mutation(_AGES, "min(now - sent, self.least + drift)", "now - sent"),
-    "clocks drift by a tenth": Mutation(
-        _AGES, "drift = _DRIFT * (now - self.received_at)", "drift = 0.1 * (now - self.received_at)"
-    ),
-    "who is late for a moment is believed": Mutation(
-        _AGES, "if now - other.began <= other.patience_s:", "if now - other.began <= 2.0:"
-    ),
-    "who is late is never believed": Mutation(_AGES, "if now - other.began <= other.patience_s:", "if True:"),
-    "a clock that is set back is one that is late": Mutation(
-        _AGES, "patience_s = patience.set_back_s if", "patience_s = patience.believed_s if", schedule=173
-    ),
-    "what was late long ago counts": Mutation(_AGES, "            clock.other = None\n", "", schedule=141),
-    "the youngest way of a late sender is its way": Mutation(_AGES, "        other.receive(sent, now)\n", ""),
-    "the oldest gives way": Mutation(_AGES, "if clock.began - clocks[leaves].received_at <= _IDLE_S:", "if False:"),
-    "a key counts for every account": Mutation(_JUDGE, "clocks.age_s((account, key)", 'clocks.age_s(("", key)'),
-    "any key counts while there is control": Mutation(_JUDGE, "if keys is None:", "if True:"),
-    "a late zero is refused": Mutation(
-        _JUDGE, "return subject.channel.ends(codec.decode(subject.channel, message.payload))", "return False"
-    ),
-}
-
 ENGINE = Engine(
     draw=RandomSteps(_WEIGHTS, _STANDING, _CALM, length=24, layouts=3, begin=(("drive", 0, None), ("wait", 0, None))),
-    world=lambda _kind, bug: shared(bug),
+    world=lambda _kind: shared(),
     perform=_perform,
-    mutations=MUTATIONS,
 )

@@ -15,7 +15,6 @@ from pebble.forwarding.sieve import Rank, Sieve
 from pebble.forwarding.subjects import Subject
 from pebble.transports import Message, QoS
 from pebble.transports.counters import Counters
-from tests.kit.mutations import Mutation, in_process
 from tests.support import cases
 
 STATE, STREAM, EVENT = (Subject(kind) for kind in (Kind.STATE, Kind.STREAM, Kind.EVENT))
@@ -136,34 +135,3 @@ def perform(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.parametrize("seed", range(cases(12, 1000)))
 def test_no_walk_violates_a_rule(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
     perform(seed, monkeypatch)
-
-
-BUGS = {
-    "what waits is sent after what is newer": ("if not waits and self._is_turn(", "if self._is_turn("),
-    "what waits is not replaced": (
-        "self._waiting[topic] = Waiting(rank, subject, message, forward, since)",
-        "self._waiting.setdefault(topic, Waiting(rank, subject, message, forward, since))",
-    ),
-    "what is sent waits on": ("                del self._waiting[topic]\n", ""),
-    "what was replaced is not counted": ('self._counters.add("thinned" if', '("thinned" if'),
-    "what has no place is not counted": ('            self._counters.add("shed")\n', ""),
-    "streams have no turns": ("rank is Rank.STATE or self._clock()", "True or self._clock()"),
-    "turns are not noted": ("        self._sent_at[topic] = self._clock()\n", ""),
-    "a small message goes before a large one": ("rank in self._short or", ""),
-    "events go before states": ("(overdue or Rank.STATE not in self._short) and ", ""),
-    "an event gives way for ever": ("(overdue or Rank.STATE", "(Rank.STATE"),
-    "states take the room of an event that is overdue": ("            if asked:  #", "            if False:  #"),
-    "states wait for an event that is gone": ("asked, self._event_asked = self._event_asked, False", "asked = True"),
-    "a stream gives way for ever": ("Rank.STATE if one.since <= overdue else one.rank", "one.rank"),
-    "a newer value begins to wait anew": ("self._waiting[topic].since if waits else self._clock()", "self._clock()"),
-    "what was short of room once is so for ever": ("        self._short.discard(rank)\n", ""),
-    "a state without a place is lost": ("return False  # no state is lost", "return True"),
-    "any number waits": ("len(self._waiting) >= TOPICS", "len(self._waiting) >= 1000"),
-    "one message waits on a wide link": ("while self._waiting:", "if self._waiting:"),
-}
-
-
-@pytest.mark.parametrize("bug", BUGS)
-def test_each_deliberate_bug_shows(bug: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    with in_process(Mutation(module.__name__, *BUGS[bug])), pytest.raises(AssertionError):
-        deque((perform(seed, monkeypatch) for seed in range(30)), 0)

@@ -1,4 +1,4 @@
-"""Random schedules: drawn from a seed, performed in a world with rules, made short, and proved by deliberate bugs.
+"""Random schedules: drawn from a seed, performed in a world with rules, and made short.
 
 ``python -m tests.kit.schedules NAME`` runs those of one of the :data:`ENGINES`. What it prints of a schedule that
 violates a rule, its number and kind, repeats it.
@@ -21,8 +21,6 @@ from importlib import import_module
 from itertools import accumulate, repeat
 from pathlib import Path
 from typing import Any
-
-from tests.kit.mutations import Mutation, in_process
 
 #: The modules that declare an ENGINE, by the name on the command line.
 ENGINES = {
@@ -115,26 +113,22 @@ class Result:
 
 @dataclass(frozen=True, kw_only=True)
 class Engine:
-    """Schedules of one kind of world; what ``bug`` yields of a mutation is passed to ``world``."""
+    """Schedules of one kind of world."""
 
     draw: Callable[[str, int, int], Any]  # kind of world, seed, number
-    world: Callable[[str, Any], AbstractContextManager[Any]]  # kind, what a bug yields or None
+    world: Callable[[str], AbstractContextManager[Any]]  # of a kind
     perform: Callable[[Any, Any], Outcome]  # one schedule; it may raise
     kinds: tuple[str, ...] = ("",)
     schedules: int = 10_000  # unless it is told otherwise
     per_world: int = 100  # schedules, then the world begins anew
     jobs: int = 1  # processes
     repeats: bool = True  # the same schedule violates the same rule, so it can be made short
-    mutations: Mapping[str, Mutation] = field(default_factory=dict)
-    bug: Callable[[Mutation], AbstractContextManager[Any]] = in_process
 
-    def run(
-        self, kind: str, seed: int, numbers: Iterable[int], bug: Any = None, *, verbose: bool = False
-    ) -> Iterator[Result]:
+    def run(self, kind: str, seed: int, numbers: Iterable[int], *, verbose: bool = False) -> Iterator[Result]:
         """Perform these schedules in as few worlds as possible: after a violation in a new one."""
         waiting = deque(numbers)
         while waiting:
-            with self.world(kind, bug) as world:
+            with self.world(kind) as world:
                 for _ in range(min(self.per_world, len(waiting))):
                     number = waiting.popleft()
                     began = time.monotonic()
@@ -148,17 +142,10 @@ class Engine:
         """The rule that is violated in this schedule; empty if none is."""
         return next(iter(self._outcome(world, schedule).problems), "")
 
-    def shortest(self, schedule: Steps, rule: str, kind: str = "", bug: Any = None) -> Steps:
+    def shortest(self, schedule: Steps, rule: str, kind: str = "") -> Steps:
         """``schedule``, which violates the rule, without what does not matter for it."""
-        with self.world(kind, bug) as world:
+        with self.world(kind) as world:
             return shrink(schedule, lambda shorter: self.violation(world, shorter) == rule)
-
-    def find(self, name: str, seed: int, schedules: int) -> Result | None:
-        """The first of so many schedules that finds this mutation; the one it names is tried before the others."""
-        mutation = self.mutations[name]
-        with self.bug(mutation) as bug:
-            numbers = (mutation.schedule, *range(schedules))
-            return next((one for one in self.run(mutation.kind, seed, numbers, bug) if one.problems), None)
 
     def _outcome(self, world: Any, schedule: Any) -> Outcome:
         try:
@@ -206,8 +193,6 @@ def main(arguments: list[str]) -> int:
     signal.signal(signal.SIGTERM, signal.default_int_handler)  # so that everything that was started ends
     options.schedules = engine.schedules if options.schedules is None else options.schedules
     options.jobs = options.jobs or engine.jobs
-    if options.mutations is not None:
-        return _mutations(options, engine, module)
     return _schedules(options, engine, module)
 
 
@@ -265,25 +250,6 @@ def _show(options: argparse.Namespace, engine: Engine, one: Result, *, new: bool
         print(f"SCHEDULE = ({layout}, [", *(f"    {step}," for step in steps), "])", sep="\n", flush=True)
 
 
-def _mutations(options: argparse.Namespace, engine: Engine, module: str) -> int:
-    names = [name for name in engine.mutations if options.mutations in name]
-    found = _map(options.jobs, _find, repeat((module, options.seed, options.schedules)), names)
-    missed = 0
-    for name, what in zip(names, found, strict=True):
-        missed += not what
-        print(f"{name}: {what or 'NOT FOUND'}", flush=True)
-    print(f"{len(names) - missed} of {len(names)} found")
-    return 1 if missed else 0
-
-
-def _find(what: tuple[str, int, int], name: str) -> str:
-    module, seed, schedules = what
-    logging.disable(logging.CRITICAL)
-    engine: Engine = import_module(module).ENGINE
-    found = engine.find(name, seed, schedules)
-    return "" if found is None else f"{found}, {found.problems[0]}"
-
-
 def _map(jobs: int, work: Callable[..., Any], *arguments: Iterable[Any]) -> Iterator[Any]:
     if jobs == 1:
         yield from map(work, *arguments)
@@ -319,7 +285,6 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--first", action="store_true", help="end at the first violation")
     parser.add_argument("--log", type=Path, help="folder for what happened in schedules with a violation")
     parser.add_argument("--verbose", action="store_true", help="print what happened in each")
-    parser.add_argument("--mutations", nargs="?", const="", metavar="PART", help="find each bug with this in its name")
     return parser
 
 

@@ -7,7 +7,6 @@ from collections.abc import Iterator
 from typing import Any
 
 from tests.kit.schedules import Engine, Outcome, RandomSteps, Steps, shared
-from tests.motion.mutations import MUTATIONS, mutated
 from tests.motion.world import CORES, LAYOUTS, World
 
 LENGTH = 100  # steps of a history
@@ -48,7 +47,7 @@ def _numbers(chance: random.Random, count: int) -> Iterator[tuple[int, int]]:
 
 
 def _perform(what: tuple[type[World], Any], history: Steps) -> Outcome:
-    """``what``: the world and its cores, one of which may have a bug."""
+    """``what``: the world and its cores."""
     layout, steps = history
     kind, cores = what
     world = kind(layout, cores)
@@ -64,10 +63,8 @@ ENGINE = Engine(
         layouts=len(LAYOUTS),
         numbers=_numbers,
     ),
-    world=lambda _kind, bug: shared(bug or (World, CORES)),
+    world=lambda _kind: shared((World, CORES)),
     perform=_perform,
     schedules=3000,
     per_world=1000,
-    mutations=MUTATIONS,
-    bug=mutated,
 )

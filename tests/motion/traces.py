@@ -114,15 +114,13 @@ def _recording(calls: list[Any]) -> Any:
     return SimpleNamespace(Latch=Latch, Lease=Lease, Arbiter=Arbiter, diff=CORES.diff, StopSender=CORES.StopSender)
 
 
-def repeat(folder: Path, lines: Iterable[str], root: Path | None = None) -> list[str]:
+def repeat(folder: Path, lines: Iterable[str]) -> list[str]:
     """Repeat the calls in MicroPython, on the cores as they are compiled for a board; the lines that it prints.
-
-    ``root``: firmware that is not Pebble's.
 
     The last one is ``[histories, calls, whether all results are the same]``.
     """
     for name in CORE_NAMES:
-        compile_module(FIRMWARE["minilamp"], Path("common", f"{name}.py"), folder, root)
+        compile_module(FIRMWARE["minilamp"], Path("common", f"{name}.py"), folder)
     with (folder / "traces.jsonl").open("w", encoding="utf-8") as file:
         file.writelines(line + "\n" for line in (bodies(), *lines))
     done = run(folder, SCRIPTS / "motion.py", heap=8 * 1024 * 1024, timeout_s=600.0)

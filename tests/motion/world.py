@@ -9,7 +9,6 @@ from __future__ import annotations
 import json
 import operator
 from collections.abc import Callable
-from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -37,12 +36,12 @@ CORE_NAMES = ("latch", "lease", "arbiter", "ticks")
 Command = tuple[Any, ...]  # (what, owner, when it was sent, whether it is a retained copy, ...)
 
 
-def load_cores(root: Path | None = None, sender: type = StopSender) -> Any:
-    """The cores from the firmware below ``root``, and the sender of stops."""
-    modules = FirmwareModules({"micropython": SimpleNamespace(const=lambda value: value)}, root=root)
+def load_cores() -> Any:
+    """The cores from the firmware, and the sender of stops."""
+    modules = FirmwareModules({"micropython": SimpleNamespace(const=lambda value: value)})
     latch, lease, arbiter, ticks = (modules.module(f"common.{name}") for name in CORE_NAMES)
     return SimpleNamespace(
-        Latch=latch.Latch, Lease=lease.Lease, Arbiter=arbiter.Arbiter, diff=ticks.diff, StopSender=sender
+        Latch=latch.Latch, Lease=lease.Lease, Arbiter=arbiter.Arbiter, diff=ticks.diff, StopSender=StopSender
     )
 
 

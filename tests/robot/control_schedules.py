@@ -7,7 +7,6 @@ level named each person also commands by the other's name and with the other's k
 
 from __future__ import annotations
 
-import os
 import secrets
 import shutil
 import tempfile
@@ -18,10 +17,8 @@ from contextlib import ExitStack, closing, contextmanager
 from itertools import groupby
 from pathlib import Path
 from typing import Any
-from unittest.mock import patch
 
 from pebble.client.estop import new_name
-from tests.kit.mutations import Mutation, in_copy
 from tests.kit.schedules import Engine, Outcome, RandomSteps, Steps
 from tests.kit.stalls import Stalls, lost_s
 from tests.robot.named import Hall, Named
@@ -368,52 +365,16 @@ def _account(state: ReceivedMessage) -> str:
     return name.partition("/")[0]
 
 
-@contextmanager
-def _world(kind: str, bug: dict[str, str] | None) -> Iterator[World]:
-    """``bug``: what the robot's processes have in their environment."""
-    with patch.dict(os.environ, bug or {}), closing(World(kind)) as world:
-        yield world
-
-
-@contextmanager
-def _mutated(mutation: Mutation) -> Iterator[dict[str, str]]:
-    """A copy of the product, from which processes import in place of their working folder."""
-    with in_copy(
-        mutation, ROOT, "pebble", *(link.name for link in (ROOT / "pebble").iterdir() if link.is_symlink())
-    ) as root:
-        yield {"PYTHONPATH": str(root), "PYTHONSAFEPATH": "1"}
-
-
-_LEASE, _ARBITER = "firmware/common/lease.py", "firmware/common/arbiter.py"
-MUTATIONS = {
-    "a key counts for every account": Mutation(_LEASE, " and self.holder[:1] == (by,)", "", kind="mqtt named"),
-    "a sender chooses its name": Mutation(
-        "pebble/forwarding/names.py", 'body["by"] = by\n', 'body["by"] = claim or by\n', kind="mqtt named"
-    ),
-    "who takes over gets the key of before": Mutation(
-        _LEASE, "self._random(4) if ms else", "(self.key or self._random(4)) if ms else", kind="mqtt"
-    ),
-    "a person does not hold a script": Mutation(_ARBITER, "        self._held = True\n", "", kind="mqtt"),
-    "wheels turn until the MCU stops them": Mutation(
-        "services/serial_mcu_bridge/text/motor_bridge.py",
-        "self._set_deadline(now + valid_s)",
-        "self._set_deadline(now + 9)",
-        kind="mqtt",
-    ),
-}
-
 _BEGIN = (("take", 0, None), ("drive", 0, None))
 _AS_THEMSELVES = RandomSteps(_WEIGHTS, length=22, layouts=1, begin=_BEGIN)
 _AS_OTHERS = RandomSteps(_WEIGHTS | {"pose": 6}, length=26, layouts=1, begin=_BEGIN)
 
 ENGINE = Engine(
     draw=lambda kind, seed, number: (_AS_OTHERS if "named" in kind else _AS_THEMSELVES)(kind, seed, number),
-    world=_world,
+    world=lambda kind: closing(World(kind)),
     perform=lambda world, schedule: world.perform(schedule),
     kinds=("mqtt", "zenoh", "mqtt named", "zenoh named"),
     schedules=200,
     per_world=20,
     repeats=False,
-    mutations=MUTATIONS,
-    bug=_mutated,
 )

@@ -1,7 +1,4 @@
-"""A robot drives by itself in a simulated world: it follows a tag, obeys a person, and stops however a script ends.
-
-``python -m tests.robot.closed_loop`` measures the same with many starts and rounds, and more.
-"""
+"""A robot drives by itself in a simulated world: it follows a tag, obeys a person, and stops however a script ends."""
 
 from __future__ import annotations
 

@@ -29,7 +29,6 @@ from pebble.contract.levels import LEVELS
 from pebble.services.mqtt_bridge import service as bridge_module
 from pebble.services.mqtt_bridge.service import MqttBridge
 from pebble.transports import Answer, Message, Outgoing, QoS
-from tests.kit.mutations import Mutation
 from tests.kit.schedules import Engine, Outcome, RandomSteps, Steps, perform_steps, shared
 from tests.robot.lockstep.commands import PERSON, Command, Commands
 from tests.robot.lockstep.network import Connection, Network
@@ -365,30 +364,6 @@ def _perform(folder: Folder, schedule: Steps) -> Outcome:
     return Outcome(counts=dict(world.counts))
 
 
-_FORWARDING, _BRIDGE = "pebble.forwarding", "pebble.services.mqtt_bridge"
-_MOTORS = "pebble.services.serial_mcu_bridge"
-#: Of the sieve alone tests/forwarding/test_sieve.py has more.
-MUTATIONS = {
-    "confirmations wait like other states": Mutation(
-        f"{_FORWARDING}.sifter", "Side.LOCAL or subject.prompt:", "Side.LOCAL or subject.drives:"
-    ),
-    "there is always room": Mutation(f"{_BRIDGE}.link", "        return fits\n", "        return True\n"),
-    "what is sent takes no room": Mutation(
-        f"{_BRIDGE}.link", "            self._waiting += size\n", "            pass\n"
-    ),
-    "streams have the room of states": Mutation(f"{_BRIDGE}.link", "self._bytes * rank", "self._bytes * 40"),
-    "what waits for room is forgotten": Mutation(
-        f"{_FORWARDING}.sieve",
-        "        self._waiting[topic] = Waiting(rank, subject, message, forward, since)\n",
-        "        self._waiting.setdefault(topic, Waiting(rank, subject, message, forward, since))\n",
-    ),
-    "nothing that waits is sent": Mutation(f"{_BRIDGE}.uplink", "        self._forwarder.sifter.send_waiting()\n", ""),
-    "a stop leaves the wheels turning": Mutation(
-        f"{_MOTORS}.text.motor_bridge",
-        "        for stop in batch.stops:\n            self._halt()\n",
-        "        for stop in batch.stops:\n",
-    ),
-}
 ENGINE = Engine(
     draw=RandomSteps(
         {"wait": 20, "drive": 6, "zero": 3, "take": 6, "ask": 2, "release": 2, "stop": 6, "reset": 5, "report": 8,
@@ -397,8 +372,7 @@ ENGINE = Engine(
         layouts=12,
         begin=[("take", 0, 0), ("drive", 0, 0), ("wait", 0, 7), ("flood", 0, None)],
     ),
-    world=lambda _kind, _bug: shared(Folder()),
+    world=lambda _kind: shared(Folder()),
     perform=_perform,
     schedules=1_000,
-    mutations=MUTATIONS,
 )  # fmt: skip

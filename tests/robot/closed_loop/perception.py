@@ -1,4 +1,4 @@
-"""What scripts publish about the tags that the camera sees, compared with the true projection; and what they cost."""
+"""What scripts publish about the tags that the camera sees, compared with the true projection."""
 
 from __future__ import annotations
 
@@ -8,11 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from pebble.bench.usage import pss_mb
 from pebble.media.world.poses import RobotPose
 from tests.robot.closed_loop.aims import Samples
-from tests.robot.rig import descendants
-from tests.robot.world_rig import FOLLOW, TAG_SIZE_M, WorldRig
+from tests.robot.world_rig import TAG_SIZE_M, WorldRig
 from tests.support import gone, until
 
 LOCATIONS, OVERLAYS = "outgoing/apriltag-locations", "outgoing/video-overlays"
@@ -77,37 +75,6 @@ def crashed_dependency(rig: WorldRig) -> Samples:
     alive = [pid for pid in pids if not gone(pid)]
     again = rig.script()["running"]
     return {"exit code": [float("crash" in error and "3" in error)], "alive": [float(len(alive) + again)]}
-
-
-def memory(rig: WorldRig) -> tuple[Samples, list[str]]:
-    """PSS of every process of the robot while it follows a tag; the camera's process with and without the renderer."""
-    rig.world.place(rig.name, 0.0, 0.3, 0.0)
-    script = rig.driving("apriltag-follow", FOLLOW)
-    time.sleep(3.0)
-    processes = {"launcher": rig.launcher_pid, **rig.processes(), "script apriltag-follow": script}
-    found = {name: pss_mb(pid) for name, pid in processes.items()}
-    known = set(processes.values())
-    others = [pid for pid in descendants(rig.launcher_pid) if pid not in known]
-    found["other descendants"] = sum(map(pss_mb, others))
-    rig.idle()
-    renderer = found["av_daemon"] - _plain_camera(rig.kind)
-    found["av_daemon"] -= renderer
-    whole = sum(found.values())
-    lines = [f"{name:<28}{mb:>8.1f} MB" for name, mb in sorted(found.items())]
-    lines += [f"{'whole robot':<28}{whole:>8.1f} MB", f"{'renderer (simulation)':<28}{renderer:>8.1f} MB"]
-    return {"memory": [whole]}, lines
-
-
-def _plain_camera(kind: str) -> float:
-    """PSS of av_daemon whose pictures are drawn without a world, with one reader, beside the same processes."""
-    from pebble import camera
-    from tests.robot.world_rig import WorldRig
-
-    video = {"enabled": True, "video": {"backend": "synthetic", "width": 640, "height": 480, "fps": 15}}
-    with WorldRig(kind, av_daemon=video | {"audio": {"enabled": False}}) as rig, camera(rig.folder / "run") as view:
-        for _ in range(15):
-            next(view)
-        return pss_mb(rig.processes()["av_daemon"])
 
 
 def _tags(rig: WorldRig, since: float) -> list[Any]:

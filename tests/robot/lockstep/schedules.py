@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from tests.kit.schedules import Engine, Outcome, RandomSteps, Steps, perform_steps, shared
-from tests.robot.lockstep.mutations import MUTATIONS
 from tests.robot.lockstep.rest import rest
 from tests.robot.lockstep.world import Folder, World
 
@@ -40,7 +39,6 @@ ENGINE = Engine(
         layouts=72,  # ends times configs
         begin=[("start", 4, None), ("wait", 0, 9)],
     ),
-    world=lambda _kind, _bug: shared(Folder()),
+    world=lambda _kind: shared(Folder()),
     perform=_perform,
-    mutations=MUTATIONS,
 )

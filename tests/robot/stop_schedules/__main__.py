@@ -9,7 +9,6 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
-from tests.robot.stop_schedules.mutations import MUTATIONS, find
 from tests.robot.stop_schedules.performance import Performance, Result, described, wheels_described
 from tests.robot.stop_schedules.schedules import make, setups
 from tests.robot.stop_schedules.world import World
@@ -65,8 +64,6 @@ def _line(name: str, group: list[Result]) -> str:
 def main() -> int:
     options = _parser().parse_args()
     signal.signal(signal.SIGTERM, signal.default_int_handler)  # so that everything that was started ends
-    if options.mutations:
-        return _mutations(options)
     chosen = [options.setup] if options.setup else list(setups(options.transport))
     results: list[Result] = []
     began = time.monotonic()
@@ -82,16 +79,6 @@ def main() -> int:
                 return 1
     print(f"\n{options.transport}, seed {options.seed}, {time.monotonic() - began:.0f} s\n{table(results)}")
     return 1 if any(result.problems for result in results) else 0
-
-
-def _mutations(options: argparse.Namespace) -> int:
-    missed = 0
-    for mutation in MUTATIONS:
-        found = find(mutation, options.transport, options.schedules, options.seed)
-        missed += not found
-        print(f"{mutation.name}: {found or 'NOT FOUND'}", flush=True)
-    print(f"{len(MUTATIONS) - missed} of {len(MUTATIONS)} found")
-    return 1 if missed else 0
 
 
 def _progress(options: argparse.Namespace, result: Result, number: int) -> None:
@@ -111,7 +98,6 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--log", type=Path, help="folder for the histories of schedules with a violation")
     parser.add_argument("--first", action="store_true", help="end at the first violation")
-    parser.add_argument("--mutations", action="store_true", help="put each fault of mutations.py in, and find it")
     parser.add_argument("--verbose", action="store_true", help="print every history")
     return parser
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 
 from tests.kit.schedules import Engine, Outcome, RandomSteps, Steps
-from tests.web.driving_lockstep.mutations import MUTATIONS, mutated
 from tests.web.driving_lockstep.rest import rest
 from tests.web.driving_lockstep.world import CORE, Rig, World
 
@@ -47,9 +46,7 @@ ENGINE = Engine(
         layouts=84,
         begin=[("take", 0, 0), ("wait", 0, 5), ("press", 0, None), ("wait", 0, None)],
     ),
-    world=lambda _kind, folder: Rig(folder or CORE),
+    world=lambda _kind: Rig(CORE),
     perform=_perform,
     jobs=os.cpu_count() or 1,
-    mutations=MUTATIONS,
-    bug=mutated,
 )
