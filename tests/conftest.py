@@ -2,11 +2,14 @@
 
 import gc
 import os
+import secrets
 import shutil
 import signal
+import sys
 import tempfile
 import time
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
@@ -14,8 +17,10 @@ from hypothesis import settings
 
 from pebble.transports import segments
 from tests.kit import rows
+from tests.kit.workers import pytest_addoption as pytest_addoption  # of the initial conftest
+from tests.kit.workers import pytest_configure as pytest_configure
 from tests.recordings.replayed import recording as recording  # a fixture for all tests
-from tests.support import Broker, cases
+from tests.support import ROOT, Broker, cases
 
 # Started in the background of a shell or by nohup, this process ignores signals, and so would every program it starts.
 signal.signal(signal.SIGINT, signal.default_int_handler)
@@ -30,21 +35,33 @@ gc.disable()  # until the tests are collected, of which nothing is garbage: a fi
 settings.register_profile("pebble", deadline=None, max_examples=cases(30, 100))
 settings.load_profile("pebble")
 
-# What robots save belongs to the run, not to the user who runs it.
-_STATE = tempfile.mkdtemp(prefix="pebble-tests-")
-os.environ.pop("STATE_DIRECTORY", None)
-os.environ["XDG_STATE_HOME"] = _STATE
+# Node.js, which tests of the page and of the firmware need, is the one that is locked.
+os.environ["PATH"] = f"{ROOT / 'node_modules' / '.bin'}:{os.environ['PATH']}"
 
+# What tests and robots save belongs to the run, not to the user who runs it. Short: it holds unix sockets.
+os.environ.setdefault("PYTEST_DEBUG_TEMPROOT", tempfile.gettempdir())
+_FOLDER = tempfile.mkdtemp(prefix="t")
+Path(_FOLDER).chmod(0o1777)  # some tests are run by other users as well
+os.environ["TMPDIR"] = tempfile.tempdir = _FOLDER
+os.environ.pop("STATE_DIRECTORY", None)
+os.environ["XDG_STATE_HOME"] = f"{_FOLDER}/state"
+
+#: A variable of every process that a test starts.
+_RUN = f"PEBBLE_TEST_RUN={secrets.token_hex(8)}"
+os.environ.update([_RUN.split("=")])
+_ENDING_S = 5.0  # for processes that are about to end
+
+#: Folders of tests that check no times.
+_COMPUTING = (
+    *("config", "contract", "media", "motion", "perception", "bench/judging", "web/modules"),
+    *("recordings/exports", "recordings/files", "recordings/seek", "recordings/traffic"),
+)
 #: Modules that take longest begin first: begun last, one of them would delay the end of the run.
 _LONG = (
-    *("robot/test_closed_loop.py", "web/robots/test_controls.py", "web/robots/test_actions.py"),
-    *("selftest/test_robot.py", "conform/test_conform.py", "conform/test_operators.py", "robot/test_names.py"),
-    *("robot/test_media.py", "robot/test_robot.py", "transports/zenoh/test_mesh.py", "robot/test_faults.py"),
-    *("robot/test_driveable.py", "robot/test_hostile.py", "robot/test_runs.py", "commands/test_fleet.py"),
-    *("robot/test_surroundings.py", "robot/test_retained.py", "web/test_attacks.py", "web/test_hostile_broker.py"),
-    "forwarding/links/test_table.py",
-    *("commands/test_estop.py", "commands/test_drive.py", "launcher/test_launcher.py", "flash/test_steps.py"),
-    *("web/test_types.py", "firmware/test_heap.py", "firmware/test_deadman_virtual.py", "web/test_driving_lockstep.py"),
+    *("conform/test_conform.py", "selftest/test_robot.py", "web/robots/test_controls.py", "conform/test_operators.py"),
+    *("robot/test_closed_loop.py", "robot/test_media.py", "robot/test_driveable.py", "transports/zenoh/test_mesh.py"),
+    *("commands/test_estop.py", "commands/test_drive.py", "transports/test_mqtt.py", "recordings/recorder"),
+    *("web/test_types.py", "firmware/test_deadman_virtual.py", "motion/test_traces.py"),
 )
 
 
@@ -69,20 +86,26 @@ def brokers(tmp_path: Path) -> Iterator[tuple[Broker, Broker]]:
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     for row in rows.fewer(items):
         row.add_marker(pytest.mark.thorough)
+    computing = tuple(f"{Path(__file__).parent / folder}/" for folder in _COMPUTING)
+    for item in items:
+        if str(item.path).startswith(computing):
+            item.add_marker(pytest.mark.computing)
+        if item.get_closest_marker("computing"):
+            item.add_marker(pytest.mark.timeout(600))  # they wait for the processors
     places = {path: _place(path) for path in {item.path for item in items}}
     items.sort(key=lambda item: places[item.path])
 
 
 def _place(path: Path) -> int:
     """When a module begins."""
-    return next((at for at, end in enumerate(_LONG) if path.as_posix().endswith(end)), len(_LONG))
+    return next((at for at, part in enumerate(_LONG) if part in path.as_posix()), len(_LONG))
 
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_runtest_setup() -> None:
     """What robots save in one worker is nothing to those of another one."""
-    own = Path(_STATE, str(os.getpid()))
-    own.mkdir(exist_ok=True)
+    own = Path(_FOLDER, "state", str(os.getpid()))
+    own.mkdir(parents=True, exist_ok=True)
     os.environ["XDG_STATE_HOME"] = str(own)
 
 
@@ -94,10 +117,40 @@ def pytest_collection_finish() -> None:
     gc.freeze()
 
 
-def pytest_sessionfinish() -> None:
+def pytest_sessionfinish(session: pytest.Session) -> None:
     gc.unfreeze()
-    shutil.rmtree(_STATE, ignore_errors=True)
+    for pid, description in _processes_left().items():
+        sys.stdout.write(f"\npebble: LEFT BEHIND: {description}\n")
+        session.exitstatus = session.exitstatus or pytest.ExitCode.TESTS_FAILED
+        with suppress(OSError):
+            os.kill(pid, signal.SIGKILL)
+    shutil.rmtree(_FOLDER, ignore_errors=True)
     _remove_segments()
+
+
+def _processes_left() -> dict[int, str]:
+    """Return command lines and tests of processes that tests have left behind, by pid; of Linux only."""
+    deadline = time.monotonic() + _ENDING_S
+    while left := {pid: text for pid in _pids() if (text := _described(pid))}:
+        if time.monotonic() > deadline:
+            break
+        time.sleep(0.1)
+    return left
+
+
+def _pids() -> list[int]:
+    return [int(path.name) for path in Path("/proc").glob("[0-9]*") if int(path.name) != os.getpid()]
+
+
+def _described(pid: int) -> str:
+    """Return the command line and the test of a process of this run; empty for others."""
+    with suppress(OSError):
+        variables = Path(f"/proc/{pid}/environ").read_bytes().decode(errors="replace").split("\0")
+        command = Path(f"/proc/{pid}/cmdline").read_bytes().decode(errors="replace").replace("\0", " ")
+        if _RUN in variables and command:
+            test = next((one for one in variables if one.startswith("PYTEST_CURRENT_TEST=")), "")
+            return f"{pid} {command}{test}"
+    return ""
 
 
 def _remove_segments() -> None:

@@ -38,6 +38,7 @@ def requested(url: str) -> str:
         return str(answer.read().decode())
 
 
+@pytest.mark.solo
 @pytest.mark.parametrize("broker", ["EMBEDDED", pytest.param("MOSQUITTO", marks=pytest.mark.thorough)])
 def test_all_robots_do_what_they_are_commanded(demos: list[Demo], temporary: Path, broker: str) -> None:
     demo = start(demos, temporary, f"{SHORTEST_S}, broker=BrokerKind.{broker}")
@@ -81,6 +82,7 @@ def ends_by(demo: Demo, sign: signal.Signals) -> None:
     assert demo.folders() == []
 
 
+@pytest.mark.solo
 def test_what_is_printed_can_be_pasted_and_a_signal_ends_everything_within_five_seconds(
     demos: list[Demo], temporary: Path
 ) -> None:

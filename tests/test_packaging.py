@@ -13,6 +13,8 @@ import pytest
 
 from tests.support import ROOT
 
+pytestmark = pytest.mark.computing
+
 LINKED = ("bench", "configs", "firmware", "rig", "services", "simulation", "transports")
 NOT_MODULES = ("pebble/firmware/", "pebble/scripts/")  # imported by boards; started as programs
 NOT_SOURCES = shutil.ignore_patterns(".*", "__pycache__", "*.egg-info", "build", "dist", "tests", "docs")

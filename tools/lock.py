@@ -1,57 +1,60 @@
-"""Writes requirements/*.txt: every package that Pebble installs, pinned, with the hashes of its files.
+"""Writes requirements.txt: every package that Pebble installs, pinned, with the hashes of its files.
 
-``dev.txt`` has everything; the others are parts of it, so a robot installs the versions that the tests ran with. A file
-serves every Python and processor that pyproject.toml allows. ``lock.py`` changes only what no longer fits
-pyproject.toml, ``lock.py --upgrade`` takes the newest versions of everything.
+Under each package stands what it is installed for: tools/locked.sh prints the packages of one kind. So a robot installs
+the versions that the tests ran with. The file serves every Python and processor that pyproject.toml allows. It changes
+only what no longer fits pyproject.toml; ``lock.py --upgrade`` takes the newest versions of everything.
+
+pip installs from it, not uv: uv reads none of pip's settings, and on a Raspberry Pi these name the index with its
+builds.
 """
 
 from __future__ import annotations
 
-import argparse
+import re
 import subprocess
 import sys
 import tomllib
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
-FOLDER = ROOT / "requirements"
-#: The extras of each file; the first one constrains the others. What builds the wheel is in all of them.
-LOCKS: dict[str, tuple[str, ...]] = {
-    "dev": ("dev", "demo", "bench", "flash", "media", "web", "record", "archive", "foxglove", "mongo"),
-    "robot": ("media", "record", "web"),
-    "demo": ("demo",),
-    "bench": ("bench",),
-}
-TOOLS = "tools"  # a dependency group: uv itself, and what audits
-UV = (
-    *("uv", "pip", "compile", "--no-config", "--quiet", "--universal", "--python-version", "3.11", "--generate-hashes"),
-    *("--no-emit-package", "colorama"),  # of packages that also run on Windows
-    *("--no-header", "--annotation-style", "line"),
-)
-HEADER = "# Written by make lock from pyproject.toml.\n# pip install --require-hashes -r requirements/{name}.txt\n"
+LOCK = ROOT / "requirements.txt"
+#: The extras of each kind of installation. What builds the wheel is in all of them but the tools.
+KINDS: dict[str, tuple[str, ...]] = {"robot": ("media", "record", "web"), "demo": ("demo",), "dev": ("dev",)}
+TOOLS = "tools"  # a dependency group: uv itself, and what audits and lists packages
+EVERYTHING = ("--all-extras", "--group", TOOLS)
+HEADER = "# Written by make lock from pyproject.toml. What is installed of it: tools/locked.sh\n"
+NAME = re.compile(r"^[a-z0-9][a-z0-9._-]*(?===)", re.MULTILINE)
 
 
-def write(name: str, *what: str, upgrade: bool) -> None:
-    """Write one file; its present versions stay if they can, unless ``upgrade``."""
-    path = FOLDER / f"{name}.txt"
+def compiled(*words: str) -> str:
+    """Return the packages that uv chooses; ends the program if it cannot."""
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())
-    builds = "\n".join(project["build-system"]["requires"])  # read where ``what`` has a dash
-    command = [sys.executable, "-m", *UV, "--output-file", str(path), *(["--upgrade"] if upgrade else []), *what]
-    if subprocess.run(command, cwd=ROOT, input=builds, text=True, check=False).returncode != 0:
-        sys.exit(f"requirements/{name}.txt is as it was: uv could not choose the packages, see above")
-    path.write_text(HEADER.format(name=name) + path.read_text())
+    builds = "\n".join(project["build-system"]["requires"])  # read where ``words`` has a dash
+    command = [sys.executable, "-m", "uv", "pip", "compile", "--no-config", "--quiet", "--universal"]
+    command += ["--python-version", "3.11", "--no-header", "--no-annotate"]
+    command += ["--no-emit-package", "colorama"]  # of packages that also run on Windows
+    done = subprocess.run([*command, *words], cwd=ROOT, input=builds, text=True, stdout=subprocess.PIPE, check=False)
+    if done.returncode != 0:
+        sys.exit("requirements.txt: uv could not choose the packages, see above")
+    return done.stdout
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
-    parser.add_argument("--upgrade", action="store_true")
-    upgrade = parser.parse_args().upgrade
-    FOLDER.mkdir(exist_ok=True)
-    for name, extras in LOCKS.items():
-        wanted = [word for extra in extras for word in ("--extra", extra)]
-        within = [] if name == "dev" else ["--constraint", "requirements/dev.txt"]
-        write(name, "pyproject.toml", "-", *wanted, *within, upgrade=upgrade)
-    write(TOOLS, "--group", TOOLS, upgrade=upgrade)
+    upgrade = ["--upgrade"] if "--upgrade" in sys.argv[1:] else []
+    compiled("pyproject.toml", "-", *EVERYTHING, "--generate-hashes", "--output-file", str(LOCK), *upgrade)
+    text = LOCK.read_text()
+    within = ("--constraint", str(LOCK))
+    kinds = {
+        kind: set(NAME.findall(compiled("pyproject.toml", "-", *within, *(f"--extra={one}" for one in extras))))
+        for kind, extras in KINDS.items()
+    }
+    kinds[TOOLS] = set(NAME.findall(compiled("--group", TOOLS, *within)))
+    packages = re.split(r"^(?=[a-z0-9])", text, flags=re.MULTILINE)
+    for number, package in enumerate(packages):
+        if name := NAME.match(package):
+            used = " ".join(kind for kind, names in kinds.items() if name[0] in names)
+            packages[number] = f"{package.rstrip()}\n    # for {used}\n"
+    LOCK.write_text(HEADER + "".join(packages))
 
 
 if __name__ == "__main__":

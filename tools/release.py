@@ -122,7 +122,10 @@ def build(source: Path, into: Path, sbom: Path | None = None) -> str:
         shutil.rmtree(source / "build", ignore_errors=True)
     (sdist,), (wheel,) = into.glob("*.tar.gz"), into.glob("*.whl")
     normal(sdist, int(os.environ["SOURCE_DATE_EPOCH"]))
-    lock = Path(shutil.copyfile(source / "requirements/robot.txt", into / "robot.txt"))
+    lock = into / "robot.txt"
+    lock.write_bytes(
+        subprocess.run(["sh", source / "tools/locked.sh", "robot"], stdout=subprocess.PIPE, check=True).stdout
+    )
     release = into / "RELEASE.json"
     release.write_text(json.dumps(manifest(source, version, [wheel, lock]), indent=1) + "\n")
     package(source, version, [release, lock, wheel], into)
@@ -135,7 +138,7 @@ def build(source: Path, into: Path, sbom: Path | None = None) -> str:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
-    parser.add_argument("--sbom", type=Path, help="goes with it; make sbom writes it")
+    parser.add_argument("--sbom", type=Path, help="goes with it; tools/sbom.py writes it")
     parser.add_argument("--into", type=Path, default=INTO)
     asked = parser.parse_args()
     git = subprocess.run(["git", "log", "-1", "--format=%ct"], cwd=ROOT, capture_output=True, text=True, check=True)

@@ -1,7 +1,7 @@
 """Writes build/sbom.cdx.json: what a robot with the operator page consists of, as CycloneDX 1.6.
 
-Python packages come from requirements/robot.txt, by cyclonedx-py; the page's JavaScript from its vendor.json. Libraries
-inside wheels are not in it: docs/licences.md names them.
+Python packages are those that requirements.txt has for a robot, by cyclonedx-py; the page's JavaScript is that of its
+vendor.json. Libraries inside wheels are not in it: docs/licences.md names them.
 """
 
 from __future__ import annotations
@@ -42,8 +42,8 @@ def vendored(entries: list[dict[str, str]]) -> list[dict[str, Any]]:
 def main() -> None:
     command = [sys.executable, "-W", "ignore::UserWarning", "-m", "cyclonedx_py", "requirements"]
     command += ["--pyproject", "pyproject.toml", "--output-reproducible", "--spec-version", "1.6"]
-    command += ["requirements/robot.txt"]
-    done = subprocess.run(command, cwd=ROOT, stdout=subprocess.PIPE, check=False)
+    packages = subprocess.run(["sh", "tools/locked.sh", "robot"], cwd=ROOT, stdout=subprocess.PIPE, check=True).stdout
+    done = subprocess.run([*command, "-"], cwd=ROOT, input=packages, stdout=subprocess.PIPE, check=False)
     if done.returncode != 0:
         sys.exit("no SBOM: cyclonedx-py failed, see above")
     sbom = json.loads(done.stdout)

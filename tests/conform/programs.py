@@ -18,6 +18,7 @@ from pebble.fleet import certificates
 from pebble.fleet.certificates import CA_CERT
 from pebble.fleet.roles import Account
 from tests.fleet.brokers import HOST, FleetBroker
+from tests.kit.npm import package
 from tests.support import ROOT, Broker
 from tests.transports.brokers import MAKERS, named_nats
 
@@ -37,18 +38,9 @@ def in_python(program: str, _folder: Path) -> Command:
     return [sys.executable, source(program, "py")]
 
 
-def in_javascript(program: str, folder: Path) -> Command:
-    """npm's bundle is for browsers: it takes the place of the package, which has twenty others below it."""
-    bundle = ROOT / ".venv" / "mqtt" / "dist" / "mqtt.esm.js"
-    if shutil.which("node") is None or not bundle.exists():
-        missing("needs Node.js (apt install nodejs) and MQTT.js (python tools/fetch_npm.py .venv mqtt)")
-    package = folder / "node_modules" / "mqtt"
-    package.mkdir(parents=True, exist_ok=True)
-    (package / "package.json").write_text('{"exports": "./index.mjs"}')
-    (package / "index.mjs").write_text(
-        f'globalThis.navigator ??= {{}};\nexport default (await import("{bundle}")).default;\n'
-    )
-    return ["node", shutil.copy(source(program, "mjs"), folder)]
+def in_javascript(program: str, _folder: Path) -> Command:
+    package("mqtt")
+    return ["node", source(program, "mjs")]
 
 
 def in_c(program: str, folder: Path) -> Command:
@@ -75,11 +67,10 @@ def sketch(file: Path, program: Path) -> Command:
 
 def in_micropython(program: str, _folder: Path) -> Command:
     """The real interpreter, as WebAssembly; sockets, flash and console of a board are this machine's."""
-    if shutil.which("node") is None or not (ROOT / ".venv" / "micropython").exists():
-        missing("needs Node.js (apt install nodejs) and MicroPython (python tools/fetch_npm.py .venv micropython)")
+    interpreter = package("@micropython/micropython-webassembly-pyscript")
     board, mqtt = ROOT / "tests" / "conform" / "micropython", source("robot", "py").with_name("mqtt.py")
     sample = source(program, "py").with_name(f"{program}-micropython.py")
-    return ["node", board / "run.mjs", ROOT / ".venv" / "micropython", mqtt, sample]
+    return ["node", board / "run.mjs", interpreter, mqtt, sample]
 
 
 def missing(what: str) -> None:

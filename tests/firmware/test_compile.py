@@ -11,6 +11,8 @@ from pebble.flash.on_board import MPY_VERSION
 from pebble.flash.sources import firmware_folder, modules
 from tests.firmware.micropython import compile_module
 
+pytestmark = pytest.mark.computing
+
 #: Bytes of the file system on a XIAO SAMD21: 256 KB of flash less 8 for the boot loader and 184 for MicroPython.
 SMALLEST_DISK = 64 * 1024
 

@@ -24,6 +24,8 @@ from tests.firmware.drill import LIMIT_S, ONLINE, RESENT_S, START_S, Drill, Viol
 from tests.firmware.schedules import FAULTS, act, perform
 from tests.support import cases, some
 
+pytestmark = pytest.mark.computing
+
 MIXED, SINGLE = cases(40, 700), cases(2, 30)  # schedules per robot; of each fault alone
 FIRST_SINGLE = MUTATED = 700  # seeds of single faults begin here; within so many every deliberate bug shows
 

@@ -22,6 +22,8 @@ from pebble.simulation.bodies import body_of
 from pebble.simulation.micropython.board import Board
 from pebble.simulation.micropython.clock import VirtualClock
 
+pytestmark = pytest.mark.computing
+
 GOLDEN = Path(__file__).parent / "golden"
 ROBOTS = ("goob", "fred")
 _ADC_V = 1.65  # at 65535

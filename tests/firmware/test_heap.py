@@ -10,6 +10,8 @@ from tests.firmware.heap import CASES, LIMITS, Case, measure
 from tests.firmware.sizes import documented
 from tests.support import some
 
+pytestmark = pytest.mark.computing
+
 _PEAK = 7  # column of the table
 
 

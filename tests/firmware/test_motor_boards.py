@@ -11,6 +11,8 @@ from pebble.simulation.micropython.modules.machine import Machine
 from tests.firmware.benches import Bench
 from tests.support import some
 
+pytestmark = pytest.mark.computing
+
 KINDS = ("goob", "fred")
 STARTS = {"goob": 2, "fred": 4}  # pins of motors that come first: Goob's headlights take a timer channel between them
 

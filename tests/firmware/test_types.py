@@ -9,6 +9,8 @@ import pytest
 from pebble.flash.boards import FIRMWARE
 from tests.firmware.types import check
 
+pytestmark = pytest.mark.computing
+
 
 @pytest.mark.parametrize(
     ("robot", "code", "complaint"),

@@ -12,6 +12,8 @@ import pytest
 from tests.firmware.micropython import SCRIPTS, compile_all, run
 from tests.support import ROOT
 
+pytestmark = pytest.mark.computing
+
 PURE = Path(__file__).parent / "pure"
 
 

@@ -18,6 +18,8 @@ from tests.forwarding.age_schedules import ENGINE
 from tests.services.mqtt_bridge.bridge_rig import BASE, make_config
 from tests.support import cases
 
+pytestmark = pytest.mark.computing
+
 SCHEDULES = cases(30, 600)
 MOVES, ZERO = {"z": 0.5}, {"z": 0}
 HOLD = {"id": "3f2a91c0"}

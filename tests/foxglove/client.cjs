@@ -1,10 +1,7 @@
 // Foxglove's own client: node client.cjs ADDRESS TOPIC COUNT prints what it has received of a topic, as one JSON object.
 "use strict";
-const { createRequire } = require("node:module");
-const path = require("node:path");
-const packages = createRequire(path.join(__dirname, "..", "..", ".venv", "node_modules", "x.js"));
-const { default: FoxgloveClient } = packages("@foxglove/ws-protocol/dist/cjs/src/FoxgloveClient.js");
-const { WebSocket } = packages("ws");
+const { default: FoxgloveClient } = require("@foxglove/ws-protocol/dist/cjs/src/FoxgloveClient.js");
+const { WebSocket } = require("ws");
 
 const [address, topic, count] = process.argv.slice(2);
 const client = new FoxgloveClient({ ws: new WebSocket(address, ["foxglove.sdk.v1"]) });

@@ -4,27 +4,20 @@ from __future__ import annotations
 
 import base64
 import json
-import os
-import shutil
 import subprocess
 import time
 from pathlib import Path
 from typing import Any
 
-import pytest
-
 from tests.foxglove.live import GOOB, client, live, online
 from tests.foxglove.test_pictures import H264, JPEG, WITHDRAWN, filming, nal_types
 from tests.foxglove.watcher import Watcher, parser
-from tests.support import ROOT, Broker, until
-
-PACKAGES = ROOT / ".venv" / "node_modules" / "@foxglove" / "ws-protocol"
+from tests.kit.npm import package
+from tests.support import Broker, until
 
 
 def watch(address: str, topic: str, count: int) -> dict[str, Any]:
-    if shutil.which("node") is None or not PACKAGES.exists():
-        missing = pytest.fail if os.environ.get("CI") == "true" else pytest.skip
-        missing("needs Node.js (apt install nodejs) and Foxglove's client (python tools/fetch_npm.py .venv)")
+    package("@foxglove/ws-protocol")
     watcher = Watcher(address)
     assert until(lambda: topic in watcher.channels)
     watcher.close()

@@ -60,7 +60,7 @@ def packages(tmp_path_factory: pytest.TempPathFactory) -> Packages:
 def wheels() -> Path:
     """What a slot is built from where there is no network."""
     if not any(WHEELS.glob("*.whl")):
-        pytest.skip("needs the wheels of requirements/robot.txt: make life fetches them")
+        pytest.skip("needs the wheels of a robot: make long PART=life fetches them")
     return WHEELS
 
 

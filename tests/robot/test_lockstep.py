@@ -13,6 +13,8 @@ import pytest
 from tests.robot.lockstep.schedules import ENGINE
 from tests.support import cases
 
+pytestmark = pytest.mark.computing
+
 SCHEDULES = cases(40, 150)
 
 

@@ -13,6 +13,8 @@ import pytest
 from tests.robot.thin_schedules import ENGINE
 from tests.support import cases
 
+pytestmark = pytest.mark.computing
+
 
 @pytest.fixture(autouse=True)
 def quiet() -> Iterator[None]:

@@ -15,6 +15,8 @@ from tests.kit.schedules import Result
 from tests.support import cases
 from tests.web.driving_lockstep.schedules import ENGINE
 
+pytestmark = pytest.mark.computing
+
 SCHEDULES = cases(16, 300)
 PARTS = 4  # of them, for as many processes of pytest
 

@@ -2,25 +2,23 @@
 
 from __future__ import annotations
 
-import os
-import shutil
 import subprocess
 from pathlib import Path
 
 import pytest
 
+from tests.kit.npm import package
 from tests.support import ROOT
 
-COMPILER = ROOT / ".venv" / "typescript" / "lib" / "tsc.js"
+pytestmark = pytest.mark.computing
+
 PROJECT = Path(__file__).parent / "tsconfig.json"
 
 
 def complaints(project: Path) -> list[str]:
     """What the compiler says of our own files; vendored ones are minified, and have no types."""
-    if shutil.which("node") is None or not COMPILER.exists():
-        missing = pytest.fail if os.environ.get("CI") == "true" else pytest.skip
-        missing("needs Node.js (apt install nodejs) and TypeScript (python tools/fetch_npm.py .venv typescript)")
-    command = ["node", str(COMPILER), "-p", str(project), "--pretty", "false"]
+    compiler = package("typescript") / "lib" / "tsc.js"
+    command = ["node", str(compiler), "-p", str(project), "--pretty", "false"]
     done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=600)
     return [line for line in done.stdout.splitlines() if "error TS" in line and "/vendor/" not in line]
 

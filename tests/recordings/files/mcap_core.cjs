@@ -2,11 +2,8 @@
 // the messages of its statistics, those found by its index, and those found from its beginning to its end.
 "use strict";
 const fs = require("node:fs");
-const { createRequire } = require("node:module");
-const path = require("node:path");
-const packages = createRequire(path.join(__dirname, "..", "..", "..", ".venv", "node_modules", "x.js"));
-const { McapIndexedReader, McapStreamReader } = packages("@mcap/core");
-const { decompress } = packages("fzstd");
+const { McapIndexedReader, McapStreamReader } = require("@mcap/core");
+const { decompress } = require("fzstd");
 
 const decompressHandlers = { zstd: (data, size) => decompress(data, new Uint8Array(Number(size))) };
 

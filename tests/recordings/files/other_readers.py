@@ -2,19 +2,14 @@
 
 from __future__ import annotations
 
-import os
-import shutil
 import subprocess
 from pathlib import Path
 from typing import NamedTuple
 
-import pytest
 from mcap.reader import make_reader
 from mcap.stream_reader import StreamReader
 
-from tests.support import ROOT
-
-_PACKAGE = ROOT / ".venv" / "node_modules" / "@mcap" / "core"
+from tests.kit.npm import package
 
 
 class Counted(NamedTuple):
@@ -40,9 +35,7 @@ def by_mcap(path: Path) -> Counted:
 
 def by_mcap_core(paths: list[Path]) -> list[Counted]:
     """The messages of each file as npm's ``@mcap/core`` reads them."""
-    if shutil.which("node") is None or not _PACKAGE.exists():
-        missing = pytest.fail if os.environ.get("CI") == "true" else pytest.skip
-        missing("needs Node.js (apt install nodejs) and @mcap/core (python tools/fetch_npm.py .venv)")
+    package("@mcap/core")
     command = ["node", Path(__file__).with_name("mcap_core.cjs"), *paths]
     done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=300)
     assert (done.returncode, done.stderr) == (0, "")

@@ -19,6 +19,8 @@ from pebble.simulation.motion import FULL_SPEED_MM_S, TRACK_MM
 from pebble.simulation.world.lockstep import CameraMode, LockstepRobot, LockstepWorld
 from tests.simulation.world.worlds import CLEAR, projected, tags_in
 
+pytestmark = pytest.mark.computing
+
 TAG = {"id": 13, "x": 3.0, "y": 0.0, "yaw_deg": 180.0}
 
 

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import gzip
-import os
 import re
-import shutil
 import subprocess
 from collections.abc import Iterable
 from graphlib import TopologicalSorter
@@ -17,8 +15,8 @@ from starlette.requests import Request
 
 import pebble.web
 from pebble.web.static_files import StaticFiles, stripped
+from tests.kit.npm import package
 from tests.support import some
-from tests.web.test_types import COMPILER
 
 STATIC = Path(pebble.web.__file__).parent / "static"
 OURS = [
@@ -154,9 +152,7 @@ def test_comments_and_indentation_are_left_out() -> None:
 
 def test_what_is_sent_is_the_same_program(tmp_path: Path) -> None:
     """Each module, printed without comments by TypeScript, before and after; markup ignores indentation."""
-    if shutil.which("node") is None or not COMPILER.exists():
-        missing = pytest.fail if os.environ.get("CI") == "true" else pytest.skip
-        missing("needs Node.js (apt install nodejs) and TypeScript (python tools/fetch_npm.py .venv typescript)")
+    compiler = package("typescript") / "lib" / "tsc.js"
     paths = []
     for path in some((path for path in SERVED if path.suffix in (".js", ".mjs")), 10):
         paths += [tmp_path / when / path.relative_to(STATIC) for when in ("before", "after")]
@@ -165,7 +161,7 @@ def test_what_is_sent_is_the_same_program(tmp_path: Path) -> None:
             place.write_bytes(source)
     options = ["--module", "esnext", "--target", "esnext"]
     folders = ["--rootDir", str(tmp_path), "--outDir", str(tmp_path / "out")]
-    command = ["node", str(COMPILER), *PRINT, *options, *folders, *paths]
+    command = ["node", str(compiler), *PRINT, *options, *folders, *paths]
     subprocess.run(command, capture_output=True, check=False, timeout=60)  # it misses all types, and prints
     for before, after in zip(paths[::2], paths[1::2], strict=True):
         printed = [(tmp_path / "out" / one.relative_to(tmp_path)).read_text() for one in (before, after)]

@@ -1,11 +1,7 @@
-"""What people see in every state of the page: pictures in build/page, accessibility, sizes, and distances to STOP.
-
-``python tools/contact_sheets.py`` puts the pictures together, and a person looks at them.
-"""
+"""What people see in every state of the page: pictures in build/page, accessibility, sizes, and distances to STOP."""
 
 from __future__ import annotations
 
-import os
 import re
 import time
 from collections.abc import Callable
@@ -14,13 +10,13 @@ from typing import Any, NamedTuple
 import pytest
 from playwright.sync_api import Page
 
+from tests.kit.npm import package
 from tests.support import ROOT
 from tests.web.browser import Size, Tab, Theme
 from tests.web.canned import Show
 from tests.web.states import STATES
 
 PICTURES = ROOT / "build" / "page"
-AXE = ROOT / ".venv" / "axe" / "axe.min.js"
 WIDTHS: dict[Size, tuple[int, ...]] = {
     "desktop": (1280, 844),
     "phone": (390, 320),
@@ -293,10 +289,7 @@ CASES = [(screen, size) for screen in SCREENS for size in screen.sizes]
 
 @pytest.fixture(scope="module")
 def axe() -> str:
-    if not AXE.exists():
-        missing = pytest.fail if os.environ.get("CI") == "true" else pytest.skip
-        missing(f"{AXE} is missing: python tools/fetch_npm.py .venv axe")
-    return AXE.read_text()
+    return (package("axe-core") / "axe.min.js").read_text()
 
 
 @pytest.mark.parametrize(("screen", "size"), CASES, ids=[f"{screen.name}-{size}" for screen, size in CASES])

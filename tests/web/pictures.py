@@ -1,4 +1,4 @@
-"""Makes the README's pictures of the operator page, with four simulated robots: ``python tools/page_pictures.py``.
+"""Makes the README's pictures of the operator page, with four simulated robots: ``python -m tests.web.pictures``.
 
 They are docs/page-driving.jpg, in which the key W is held, and docs/page-fleet.jpg. It needs mosquitto and
 Chromium.
@@ -6,13 +6,13 @@ Chromium.
 
 import io
 import sys
-from pathlib import Path
 
 from PIL import Image
 
 from pebble.bench.page_rig import KEY, ROBOT, Rig, rig
+from tests.support import ROOT
 
-DOCS = Path(__file__).resolve().parent.parent / "docs"
+DOCS = ROOT / "docs"
 WIDTH, QUALITY, MOST_BYTES = 1000, 78, 200_000
 SHARP_S, SMALL_PICTURES_S = 4.0, 4.0
 CARDS = {"x": 0, "y": 0, "width": 1280, "height": 580}

@@ -1,9 +1,12 @@
-"""A pytest plugin that runs tests in several processes: ``--workers 4``. They are forked once all tests are collected.
+"""Runs tests in several processes: ``--workers 8``. They are forked once all tests are collected.
+
+Tests without a mark come first, then those marked ``alone``, with fewer processes, then those marked ``solo``, one
+after the other. Tests marked ``computing`` run all the time, when nothing else wants a processor.
 
 A worker gets the tests of one module after another, in the order in which they were collected, so each fixture of a
-module is made once; tests that share a fixture of their package are one module. With ``--spread``, for few tests that
-take long, tests that share no fixture are given one by one. A worker that dies fails its test, and another goes on with
-the rest.
+module is made once; tests that share a fixture of their package are one module. Tests marked ``alone``, which take
+long, are given one by one unless they share a fixture. A worker that dies fails its test, and another goes on with the
+rest.
 """
 
 from __future__ import annotations
@@ -12,8 +15,9 @@ import os
 import sys
 import traceback
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
+from dataclasses import dataclass, field
 from itertools import pairwise
 from multiprocessing import Pipe
 from multiprocessing.connection import Connection, wait
@@ -23,28 +27,40 @@ from typing import Any, NamedTuple, cast
 import pytest
 
 Indexes = list[int]  # of items, in the order in which they are collected
+ALONE, IDLE = 5, 2  # processes: these tests check deadlines; those of the background
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--workers", type=int, default=0, help="processes that run tests; 0: the one that collects them")
-    parser.addoption("--spread", action="store_true", help="give tests that share no fixture to workers one by one")
 
 
 def pytest_configure(config: pytest.Config) -> None:
+    """Register the plugin if asked for."""
     if config.getoption("--workers"):
         config.pluginmanager.register(Workers(), "workers")
 
 
+@dataclass(frozen=True)
+class Lane:
+    """Tests that so many processes share."""
+
+    processes: int
+    idle: bool = False  # they run when nothing else wants a processor
+    modules: deque[Indexes] = field(default_factory=deque)
+
+
 class Worker(NamedTuple):
+    """A process that runs tests of a lane."""
+
     pid: int
-    left: deque[int]  # what it has been given and not reported; it runs the first of them
+    lane: Lane
+    left: deque[int]  # given to it and not reported; it runs the first of them
 
 
 class Workers:
-    """Forks workers, gives each of them modules, and passes on what they report; in the process that collects."""
+    """Forks workers, gives each of them modules, and passes on their reports; in the process that collects."""
 
     def __init__(self) -> None:
-        self._modules: deque[Indexes] = deque()
         self._workers: dict[Connection, Worker] = {}
         self._code = 1
 
@@ -52,19 +68,15 @@ class Workers:
     def pytest_runtestloop(self, session: pytest.Session) -> bool | None:
         if session.testsfailed or session.config.option.collectonly:
             return None  # pytest's own loop runs nothing then, either
-        together = shared if session.config.getoption("--spread") else module_of
-        groups: dict[str, Indexes] = {}
-        for index, item in enumerate(session.items):
-            groups.setdefault(together(item), []).append(index)
-        self._modules.extend(groups.values())
+        background, *phases = lanes(session.items, session.config.getoption("--workers"))
         try:
-            for _ in range(min(session.config.getoption("--workers"), len(self._modules))):
-                self._fork(session)
+            self._start(session, background)
+            for lane in phases:
+                self._start(session, lane)
+                while any(worker.lane is lane for worker in self._workers.values()):
+                    self._wait(session)
             while self._workers:
-                for connection in wait(list(self._workers)):
-                    self._receive(session, cast(Connection, connection))
-                if reason := session.shouldfail or session.shouldstop:
-                    raise session.Interrupted(str(reason))
+                self._wait(session)
         finally:
             for connection in list(self._workers):
                 self._reap(connection)
@@ -82,12 +94,25 @@ class Workers:
         sys.stderr.flush()
         os._exit(self._code)
 
-    def _fork(self, session: pytest.Session) -> None:
+    def _start(self, session: pytest.Session, lane: Lane) -> None:
+        for _ in range(min(lane.processes, len(lane.modules))):
+            self._fork(session, lane)
+
+    def _wait(self, session: pytest.Session) -> None:
+        """Receive reports of all lanes."""
+        for connection in wait(list(self._workers)):
+            self._receive(session, cast(Connection, connection))
+        if reason := session.shouldfail or session.shouldstop:
+            raise session.Interrupted(str(reason))
+
+    def _fork(self, session: pytest.Session, lane: Lane) -> None:
         here, there = Pipe()
         if pid := os.fork():
             there.close()
-            self._workers[here] = Worker(pid, deque())
+            self._workers[here] = Worker(pid, lane, deque())
             return
+        if lane.idle:
+            os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))
         for connection in (here, *self._workers):
             connection.close()
         code = 1
@@ -96,7 +121,7 @@ class Workers:
             code = 0
         except (BrokenPipeError, EOFError, KeyboardInterrupt):
             pass  # the run has ended
-        except BaseException:  # noqa: BLE001  (nothing of the other process may run in this one)
+        except BaseException:
             traceback.print_exc()
         finally:
             os._exit(code)
@@ -111,7 +136,7 @@ class Workers:
                 self._died(session, worker)
             return
         if received is None:
-            module = self._modules.popleft() if self._modules else []
+            module = worker.lane.modules.popleft() if worker.lane.modules else []
             worker.left.extend(module)
             with suppress(BrokenPipeError):
                 connection.send(module)
@@ -134,13 +159,28 @@ class Workers:
         )
         session.config.hook.pytest_runtest_logreport(report=report)
         if worker.left:
-            self._modules.appendleft(list(worker.left))
-        if self._modules:
-            self._fork(session)
+            worker.lane.modules.appendleft(list(worker.left))
+        if worker.lane.modules:
+            self._fork(session, worker.lane)
 
     def _reap(self, connection: Connection) -> None:
         connection.close()
         os.waitpid(self._workers.pop(connection).pid, 0)
+
+
+def lanes(items: Sequence[pytest.Item], processes: int) -> list[Lane]:
+    """Return the lane of the background, then the others, one after the other."""
+    computing, unmarked, alone, solo = Lane(IDLE, idle=True), Lane(processes), Lane(min(ALONE, processes)), Lane(1)
+    marked = {"computing": computing, "solo": solo, "alone": alone}
+    groups: dict[tuple[int, str], Indexes] = {}
+    for index, item in enumerate(items):
+        lane = next((lane for name, lane in marked.items() if item.get_closest_marker(name)), unmarked)
+        key = id(lane), shared(item) if lane is alone else module_of(item)
+        if key not in groups:
+            groups[key] = []
+            lane.modules.append(groups[key])
+        groups[key].append(index)
+    return [computing, unmarked, alone, solo]
 
 
 def module_of(item: pytest.Item) -> str:
@@ -175,7 +215,7 @@ def work(session: pytest.Session, connection: Connection) -> None:
     config = session.config
     plugins = config.pluginmanager
     writer = SimpleNamespace(_tw=config.get_terminal_writer())  # where config looks for it
-    for name in ("workers", "records", "terminalreporter"):
+    for name in ("workers", "terminalreporter"):
         plugins.unregister(name=name)
     plugins.register(writer, "terminalreporter")
     plugins.register(Reports(config, connection))

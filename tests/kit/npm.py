@@ -1,0 +1,19 @@
+"""npm's packages, which ``make`` installs as package-lock.json pins them."""
+
+import os
+from pathlib import Path
+
+import pytest
+
+from tests.support import ROOT
+
+MODULES = ROOT / "node_modules"
+
+
+def package(name: str) -> Path:
+    """Return the folder of a package; skips the test, and fails it for CI, where it or Node.js is missing."""
+    folder = MODULES / name
+    if not (folder.exists() and (MODULES / ".bin" / "node").exists()):
+        missing = pytest.fail if os.environ.get("CI") == "true" else pytest.skip
+        missing(f"needs {name} and Node.js: make check installs them")
+    return folder

@@ -1,0 +1,84 @@
+#!/bin/sh
+# Runs a part of the tests that takes too long for each commit: make long PART=stops. Without a part it lists them.
+set -eu
+python=.venv/bin/python
+
+debian() { sh tools/debian-packages.sh "$@"; }
+tests() { PEBBLE_THOROUGH=1 $python -m pytest "$@"; }
+both() { for transport in zenoh mqtt; do $python -m "$@" --transport $transport; done; }
+tool() { PYTHONPATH=.venv/tools $python "$@"; }
+
+list() {
+    cat <<END
+make long PART=stops      400 random schedules of emergency stops and faults with whole robots, 40 minutes
+make long PART=soak       floods, kills, freezes, full disks and more while an operator drives; MINUTES=30 for each transport
+make long PART=floods     60,000 retained flags, 10,000 actions a second and more, also while a robot starts, four minutes
+make long PART=schedules  random schedules in virtual time, with whole robots and scripts, and at the page, an hour
+make long PART=page       every state, card, interruption and finger at the operator page in Chromium, 25 minutes
+make long PART=looks      store anew how the page looks, for PART=page to compare; look at the pictures, a minute
+make long PART=fleet      brokers and hubs that are killed, hung and cut off under driven robots and 300 boards, 16 minutes
+make long PART=brokers    install NATS, RabbitMQ and aedes where possible, test robots with them, judge them, seven minutes
+make long PART=gstreamer  install GStreamer and OpenCV, and have them read the original's local media, three minutes
+make long PART=firmware   measure the firmware's use of each board in the real MicroPython; writes docs/firmware.md
+make long PART=life       install, update, damage and remove packages on machines with a real systemd; root, 15 minutes
+make long PART=packages   known vulnerabilities of all packages, from OSV, and build/sbom.cdx.json
+END
+}
+
+case "$1" in
+stops | soak | floods | schedules | fleet | brokers | gstreamer | life) debian mosquitto=mosquitto ;;
+page) debian mosquitto=mosquitto chromium=chromium ;;
+looks) debian chromium=chromium ;;
+esac
+
+case "$1" in
+stops) both tests.robot.stop_schedules --log build/stops ;;
+soak) both tests.robot.soak --minutes "${MINUTES:-5}" ;;
+floods) both tests.robot.soak.floods ;;
+schedules) # the shortest schedule that violates a rule is printed, or the seed of a sequence that does
+    debian chromium=chromium
+    $python -m tests.kit.schedules motion --schedules 10000
+    $python -m tests.kit.schedules lockstep --schedules 10000
+    both tests.robot.script_schedules
+    $python -m tests.web.chromium_schedules
+    ;;
+page) $python -m pytest --workers 8 -m page tests/web ;;
+looks) $python -m tests.web.looks ;;
+fleet) tests --workers 2 --timeout 900 -s tests/bench/test_fleet.py tests/transports/zenoh/test_mesh.py tests/fleet ;;
+brokers)
+    sh tests/brokers/install.sh
+    $python -m pytest -ra tests/transports/test_brokers.py tests/transports/test_client_ids.py tests/brokers
+    $python -m pytest -ra -k "(nats or another) and in_python" tests/conform
+    ;;
+gstreamer)
+    debian gst-launch-1.0=gstreamer1.0-tools
+    { gst-inspect-1.0 --exists shmsrc && gst-inspect-1.0 --exists videotestsrc; } ||
+        debian =gstreamer1.0-plugins-base =gstreamer1.0-plugins-bad
+    /usr/bin/python3 -c "import cv2, paho.mqtt.client" 2>/dev/null || debian =python3-opencv =python3-paho-mqtt
+    tests tests/services/gstreamer_mirror tests/robot/test_original_media.py
+    ;;
+firmware) $python -m tests.firmware.sizes ;;
+life)
+    debian mosquitto_pub=mosquitto-clients ip=iproute2 systemd-analyze=systemd minisign=minisign
+    sh tools/locked.sh robot >.venv/robot.txt
+    cmp -s .venv/robot.txt .venv/wheels/robot.txt || {
+        echo "pebble: fetching the packages of a robot, 140 MB"
+        rm -rf .venv/wheels
+        $python -m pip download --quiet --require-hashes --only-binary :all: --dest .venv/wheels -r .venv/robot.txt
+        cp .venv/robot.txt .venv/wheels/robot.txt
+    }
+    tests --timeout=900 -ra tests/configs/test_slot.py tests/update tests/life
+    ;;
+packages)
+    sh tools/setup.sh tools
+    tool tools/audit.py
+    tool tools/sbom.py
+    ;;
+*)
+    list
+    [ -z "$1" ] || {
+        echo "make long: there is no part '$1'" >&2
+        exit 2
+    }
+    ;;
+esac
