@@ -1,5 +1,6 @@
 """What holds for every test."""
 
+import atexit
 import gc
 import os
 import secrets
@@ -11,6 +12,15 @@ import time
 from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
+
+# What tests and robots save belongs to the run, not to the user who runs it. Short: it holds unix sockets.
+os.environ.setdefault("PYTEST_DEBUG_TEMPROOT", tempfile.gettempdir())
+_FOLDER = tempfile.mkdtemp(prefix="t")
+Path(_FOLDER).chmod(0o1777)  # some tests are run by other users as well
+atexit.register(shutil.rmtree, _FOLDER, ignore_errors=True)  # before others remove what is in it
+os.environ["TMPDIR"] = tempfile.tempdir = _FOLDER
+os.environ.pop("STATE_DIRECTORY", None)
+os.environ["XDG_STATE_HOME"] = f"{_FOLDER}/state"
 
 import pytest
 from hypothesis import settings
@@ -37,14 +47,6 @@ settings.load_profile("pebble")
 
 # Node.js, which tests of the page and of the firmware need, is the one that is locked.
 os.environ["PATH"] = f"{ROOT / 'node_modules' / '.bin'}:{os.environ['PATH']}"
-
-# What tests and robots save belongs to the run, not to the user who runs it. Short: it holds unix sockets.
-os.environ.setdefault("PYTEST_DEBUG_TEMPROOT", tempfile.gettempdir())
-_FOLDER = tempfile.mkdtemp(prefix="t")
-Path(_FOLDER).chmod(0o1777)  # some tests are run by other users as well
-os.environ["TMPDIR"] = tempfile.tempdir = _FOLDER
-os.environ.pop("STATE_DIRECTORY", None)
-os.environ["XDG_STATE_HOME"] = f"{_FOLDER}/state"
 
 #: A variable of every process that a test starts.
 _RUN = f"PEBBLE_TEST_RUN={secrets.token_hex(8)}"
@@ -119,12 +121,13 @@ def pytest_collection_finish() -> None:
 
 def pytest_sessionfinish(session: pytest.Session) -> None:
     gc.unfreeze()
-    for pid, description in _processes_left().items():
-        sys.stdout.write(f"\npebble: LEFT BEHIND: {description}\n")
-        session.exitstatus = session.exitstatus or pytest.ExitCode.TESTS_FAILED
-        with suppress(OSError):
-            os.kill(pid, signal.SIGKILL)
-    shutil.rmtree(_FOLDER, ignore_errors=True)
+    if session.config.getoption("--workers"):  # otherwise what this process started ends with it
+        for pid, description in _processes_left().items():
+            sys.stdout.write(f"\npebble: LEFT BEHIND: {description}\n")
+            session.exitstatus = session.exitstatus or pytest.ExitCode.TESTS_FAILED
+            with suppress(OSError):
+                os.kill(pid, signal.SIGKILL)
+        shutil.rmtree(_FOLDER, ignore_errors=True)
     _remove_segments()
 
 

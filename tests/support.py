@@ -30,7 +30,7 @@ T = TypeVar("T")
 _LONGEST_PAUSE_S = 0.03
 
 
-#: `make thorough` sets it: tests with many cases then try all of them.
+#: `make test THOROUGH=1` sets it: tests with many cases then try all of them.
 THOROUGH = bool(os.environ.get("PEBBLE_THOROUGH"))
 
 
@@ -40,7 +40,7 @@ def cases(some: int, all_: int) -> int:
 
 
 def further(*values: Any) -> Any:
-    """Parameters of a rule that other ones of the same test prove as well; ``make thorough`` tries them, too."""
+    """Parameters of a rule that other ones of the same test prove as well; ``make test THOROUGH=1`` tries them, too."""
     return pytest.param(*values, marks=pytest.mark.thorough)
 
 

@@ -127,6 +127,8 @@ def test_extras_targets_and_modules_are_ones_that_exist() -> None:
     named = {name for names in re.findall(r"'\.\[([\w,]+)\]'", ALL_TEXT) for name in names.split(",")}
     assert named - extras == set()
     assert set(re.findall(r"(?:^ {4}|`)make ([a-z][\w-]+)", ALL_TEXT, re.MULTILINE)) - targets == set()
+    parts = set(re.findall(r"^make long PART=(\w+)", (ROOT / "tools" / "long.sh").read_text(), re.MULTILINE))
+    assert set(re.findall(r"make long PART=(\w+)", ALL_TEXT)) - parts == set()
     assert [module for module in sorted(modules) if find_spec(module) is None] == []
 
 

@@ -85,7 +85,7 @@ BROKERS = {
 _HEAD = """# Brokers
 
 Written by `python -m tests.brokers.document` with what `pebble doctor --broker` finds at each broker that
-can run here; `make brokers` compares it.
+can run here; `make long PART=brokers` compares it.
 
     pebble doctor --broker mqtt://broker.example          # what is wrong, what it costs, and what to type
     pebble doctor --broker mqtts://ann@broker.lab --ca-cert ca.pem --password-file ann-password
@@ -181,7 +181,7 @@ def main(names: list[str]) -> None:
     rows = json.loads(RESULTS.read_text()) if RESULTS.exists() else {}
     for name in names or BROKERS:
         if BROKERS[name].missing():
-            sys.exit(f"{name} cannot run here: make brokers installs it")
+            sys.exit(f"{name} cannot run here: make long PART=brokers installs it")
         found_of = judged(BROKERS[name])
         probes = {probe: [one.state.value, one.text] for probe, one in found_of.items()}
         rows[name] = {"version": BROKERS[name].version(), "date": f"{datetime.now(UTC):%Y-%m-%d}", "probes": probes}

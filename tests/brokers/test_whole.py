@@ -31,7 +31,7 @@ def plain(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Broker]:
 @pytest.mark.parametrize(
     "name",
     [
-        pytest.param(name, marks=pytest.mark.skipif(row.missing(), reason=f"needs {name}: make brokers"))
+        pytest.param(name, marks=pytest.mark.skipif(row.missing(), reason=f"needs {name}: make long PART=brokers"))
         for name, row in BROKERS.items()
     ],
 )

@@ -82,7 +82,7 @@ OPERATORS = ROBOTS
 
 
 NATS = MAKERS["nats"]
-WITHOUT_NATS = pytest.mark.skipif(NATS.missing(), reason="needs NATS: make brokers")
+WITHOUT_NATS = pytest.mark.skipif(NATS.missing(), reason="needs NATS: make long PART=brokers")
 PASSWORDS = {"mine": "any robot", "ann": "any person"}
 
 

@@ -79,7 +79,7 @@ VIOLATIONS: dict[str, tuple[str, str, str]] = {
     "numbers": ('command = {"x": self.stick[0],', 'command = {"x": math.nan,', "NaN"),
     "release": ('operator.request("release")\nclient', "client", "control is kept"),
     "retained": ("json.dumps(value), qos)", "json.dumps(value), qos, True)", "incoming/drive-values"),
-    # It sends without a pause, which costs more than all others: only `make thorough` tries it.
+    # It sends without a pause, which costs more than all others: only `make test THOROUGH=1` tries it.
     "idle": (
         "    operator.drive()\n",
         '    operator.drive()\n    operator.send("drive-values", {"x": 0, "z": 0})\n',

@@ -1,4 +1,4 @@
-"""Prints what the firmware costs of each board, and puts it into docs/firmware.md: `make firmware`."""
+"""Prints what the firmware costs of each board, and puts it into docs/firmware.md: `make long PART=firmware`."""
 
 from __future__ import annotations
 

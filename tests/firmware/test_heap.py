@@ -1,4 +1,4 @@
-"""A robot runs for a minute in the real MicroPython within its board's memory; with ``make thorough`` each does."""
+"""A robot runs for a minute in the real MicroPython within its board's memory. ``make test THOROUGH=1``: each does."""
 
 from __future__ import annotations
 
@@ -22,6 +22,6 @@ def test_heap(case: Case, tmp_path: Path) -> None:
     assert limit is None or cost.peak <= limit, f"{case}: {cost}"
     documented_peak = int(documented()[str(case)][_PEAK])
     assert abs(documented_peak - cost.peak) <= 0.02 * cost.peak, (
-        f"docs has {documented_peak}, measured {cost.peak}: make firmware"
+        f"docs has {documented_peak}, measured {cost.peak}: make long PART=firmware"
     )
     assert cost.imported < cost.built <= cost.live <= cost.peak, cost  # else something was not measured

@@ -1,4 +1,4 @@
-"""``make test`` tries some members of a rule where there are many; ``make thorough`` tries them all.
+"""``make test`` tries some members of a rule where there are many; ``make test THOROUGH=1`` tries them all.
 
 Each line of ``rows.txt`` is a test whose rows are one rule for several transports, encodings, kinds of damage or ways
 to fail, and how many of them stay. What stays fails when the rule itself breaks; what is left out fails when it breaks
@@ -28,7 +28,7 @@ def table() -> dict[str, int]:
 
 
 def fewer(items: Iterable[pytest.Item]) -> Iterator[pytest.Item]:
-    """Those of the collected rows that only ``make thorough`` tries."""
+    """Those of the collected rows that only ``make test THOROUGH=1`` tries."""
     groups: defaultdict[str, list[pytest.Item]] = defaultdict(list)
     for item in items:
         if item.get_closest_marker("thorough") is None:

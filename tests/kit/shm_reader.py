@@ -1,6 +1,6 @@
 """A stand-in for GStreamer's ``shmsrc``, for tests that hold, lose and misuse buffers; it needs no GStreamer.
 
-It is believed because `make gstreamer-tests` has it read from Debian's own ``shmsink``.
+It is believed because `make long PART=gstreamer` has it read from Debian's own ``shmsink``.
 """
 
 from __future__ import annotations

@@ -3,7 +3,7 @@
 A packet that is well-formed and lies (another id, another picture, a damaged bare JPEG) cannot be told from an honest
 one: what is shown from there to the next honest key frame is not judged. Everything else is.
 
-``make thorough`` tries 100,000; PEBBLE_HOSTILE_SEED makes them others.
+``make test THOROUGH=1`` tries 100,000; PEBBLE_HOSTILE_SEED makes them others.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Malformed messages and as many garbage lines: nothing dies, nothing moves, every refusal is counted.
 
-100,000 of each with ``make thorough``.
+100,000 of each with ``make test THOROUGH=1``.
 """
 
 from __future__ import annotations

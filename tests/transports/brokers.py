@@ -1,7 +1,7 @@
 """Brokers of several makers, real ones on free loopback ports, and what each was seen to do and to lack.
 
 Two accounts: :data:`ROBOT` may publish all but :data:`FORBIDDEN`, and clients without a name may do everything.
-`make brokers` installs those that are missing.
+`make long PART=brokers` installs those that are missing.
 """
 
 from __future__ import annotations

@@ -29,7 +29,7 @@ from tests.transports.brokers import MAKERS, ROBOT, Maker, sparing_aedes
 from tests.transports.net import ProcessPeer
 from tests.transports.received import Received
 
-pytestmark = [pytest.mark.alone, pytest.mark.thorough]  # deadlines are checked; make brokers runs it
+pytestmark = [pytest.mark.alone, pytest.mark.thorough]  # deadlines are checked; make long PART=brokers runs it
 
 FLAG = "incoming/flags/mqtt-audio"
 STOPPED = {"latched": True, "boot": "b", "count": 1, "recent": [], "by": "ann", "why": "", "since": 1}
@@ -38,7 +38,7 @@ TRUE, FALSE = b'{"value": true}', b'{"value": false}'
 
 def needed(name: str) -> Maker:
     if MAKERS[name].missing():
-        pytest.skip(f"needs {name}: make brokers")
+        pytest.skip(f"needs {name}: make long PART=brokers")
     return MAKERS[name]
 
 

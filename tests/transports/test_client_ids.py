@@ -119,7 +119,7 @@ def test_two_with_one_id_are_reported(folder: Path, protocol: str) -> None:
     robot.broker.stop()
 
 
-@pytest.mark.skipif(MAKERS["nats"].missing(), reason="needs nats: make brokers")
+@pytest.mark.skipif(MAKERS["nats"].missing(), reason="needs nats: make long PART=brokers")
 def test_nats_takes_them(folder: Path) -> None:
     broker = MAKERS["nats"].make(folder)
     for name in ("a.b", "a b", "a/b", "a>b", "a*b", "größe"):

@@ -1,4 +1,4 @@
-"""How the page looks in a few states, pixel by pixel, and the stored pictures of that: ``make looks`` renews them.
+"""How the page looks in a few states, pixel by pixel, and stored pictures of it: ``make long PART=looks``.
 
 Time stands still on the page and at its server, nothing moves, and the camera shows flat colours; so a picture differs
 only where the page does, and by how the browser smooths edges. Pictures are stored at half size: that is readable, and
@@ -186,8 +186,8 @@ def check(name: str, found: Pixels) -> None:
         Image.fromarray(picture).save(path)
     shown = " and ".join(str(path.relative_to(ROOT)) for path in paths)
     raise AssertionError(
-        f"{name} looks different in {share:.2%} of its pixels: see {shown}. If it is meant to, `make looks` renews "
-        f"{STORED.relative_to(ROOT)}"
+        f"{name} looks different in {share:.2%} of its pixels: see {shown}. If it is meant to, "
+        f"`make long PART=looks` renews {STORED.relative_to(ROOT)}"
     )
 
 

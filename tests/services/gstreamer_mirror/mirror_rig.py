@@ -19,7 +19,7 @@ from tests.kit.robot import Program, ProgramRobot
 from tests.services.media_rig import Device
 from tests.support import Child, until
 
-#: `make gstreamer-tests` and `make thorough` install it.
+#: `make long PART=gstreamer` and `make test THOROUGH=1` install it.
 needs_gstreamer = pytest.mark.skipif(shutil.which("gst-launch-1.0") is None, reason="GStreamer is not installed")
 WIDTH, HEIGHT, RATE = 160, 120, 16_000
 CHUNK = RATE // 50

@@ -1,6 +1,6 @@
 """Three linked hubs as processes: each will once, hubs that hang or are killed, and a separation that heals.
 
-One of each in the normal run; `make fleet` has the series (`PEBBLE_THOROUGH=1`).
+One of each in the normal run; `make long PART=fleet` has the series (`PEBBLE_THOROUGH=1`).
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The page looks as it did: pictures of a few states are those in tests/web/page/looks, which ``make looks`` renews."""
+"""The page looks as it did: pictures of a few states are those in tests/web/page/looks (``make long PART=looks``)."""
 
 from __future__ import annotations
 
