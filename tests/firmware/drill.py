@@ -14,7 +14,6 @@ import math
 import random
 from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, Final
 
 from msgspec import UNSET
@@ -108,12 +107,12 @@ class Seen:
 
 
 class Drill:
-    """One robot and its environment; ``seed`` is that of all randomness. ``root``: firmware that is not Pebble's.
+    """One robot and its environment; ``seed`` is that of all randomness.
 
     ``named``: the board checks names; its operators are of the accounts ann, who drives, and bob.
     """
 
-    def __init__(self, kind: str, seed: int, *, root: Path | None = None, named: bool = False) -> None:
+    def __init__(self, kind: str, seed: int, *, named: bool = False) -> None:
         self.kind, self.random, self.named = kind, random.Random(f"{kind} {seed}"), named
         self.clock = WatchedClock(START_S)
         self.broker = VirtualBroker(self.clock.now)
@@ -132,7 +131,6 @@ class Drill:
             port=port,
             seed=seed,
             ticks_at_boot_ms=_WRAP_MS - self.random.randrange(1000, 9000) if wraps else 0,
-            root=root,
         )
         self.shield = Shield()
         self.seen = Seen()

@@ -5,7 +5,6 @@ from __future__ import annotations
 import pytest
 
 from tests.robot.stop_schedules.__main__ import perform
-from tests.robot.stop_schedules.schedules import make, setups
 
 pytestmark = pytest.mark.alone  # deadlines are checked
 
@@ -23,10 +22,3 @@ def test_what_people_and_owners_do_is_seen_at_the_wheels(transport: str, setup: 
     (result,) = perform(transport, setup, [2])
     assert not result.problems
     assert result.stops
-
-
-@pytest.mark.parametrize("transport", ["zenoh", "mqtt"])
-def test_a_seed_makes_one_schedule(transport: str) -> None:
-    for setup in setups(transport):
-        assert make(transport, setup, 7) == make(transport, setup, 7)
-        assert make(transport, setup, 7) != make(transport, setup, 8)
