@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, NamedTuple
 
 import typer
 
+from pebble.commands import completion
 from pebble.config import Config, Mqtt, load, resolved
 from pebble.config.neighbours import Neighbours
 from pebble.config.rules.doors import places_of
@@ -37,7 +38,10 @@ _FIXED = {_LAUNCHER: STATUS, "av_daemon": MEDIA_STATUS}
 
 
 def check(
-    configs: Annotated[list[Path], typer.Argument(help="Config files.", metavar="CONFIG…", show_default=False)],
+    configs: Annotated[
+        list[Path],
+        typer.Argument(help="Config files.", metavar="CONFIG…", show_default=False, autocompletion=completion.configs),
+    ],
     as_json: Annotated[bool, typer.Option("--json", help="Print only the keys and their values.")] = False,
 ) -> int:
     """Report all mistakes of a config at once, or print a summary of it.

@@ -8,12 +8,33 @@ from typing import Annotated, Any
 
 import typer
 
-from pebble.config import hosts
+from pebble.commands import completion
 from pebble.errors import PebbleError
 
-ConfigArgument = Annotated[Path, typer.Argument(help="A robot's config file.", metavar="CONFIG", show_default=False)]
+ConfigArgument = Annotated[
+    Path,
+    typer.Argument(
+        help="A robot's config file.", metavar="CONFIG", show_default=False, autocompletion=completion.configs
+    ),
+]
 ConfigOption = Annotated[
-    Path | None, typer.Option("--config", "-c", help="A robot's config file: use its own transport.", metavar="CONFIG")
+    Path | None,
+    typer.Option(
+        "--config",
+        "-c",
+        help="A robot's config file: use its own transport.",
+        metavar="CONFIG",
+        autocompletion=completion.configs,
+    ),
+]
+RobotArgument = Annotated[
+    str,
+    typer.Argument(
+        help="A robot's config file, or with --url or --config its id.",
+        metavar="ROBOT",
+        show_default=False,
+        autocompletion=completion.robots,
+    ),
 ]
 UrlOption = Annotated[
     str | None, typer.Option(help="mqtt://[USER@]HOST[:PORT], mqtts://… or zenoh:RUN_DIR.", metavar="URL")
@@ -26,7 +47,14 @@ PasswordFile = Annotated[
 ]
 CaCert = Annotated[Path | None, typer.Option(help="Certificate authority to trust with mqtts://.", metavar="FILE")]
 RobotOption = Annotated[
-    str | None, typer.Option("--robot", "-r", help="The robot that short names refer to.", metavar="[SYSTEM/TYPE/]ID")
+    str | None,
+    typer.Option(
+        "--robot",
+        "-r",
+        help="The robot that short names refer to.",
+        metavar="[SYSTEM/TYPE/]ID",
+        autocompletion=completion.robots,
+    ),
 ]
 RootOption = Annotated[
     Path, typer.Option("--root", help="Folder that stands for / where the robot is installed.", metavar="DIR")
@@ -72,10 +100,12 @@ def with_target(*, program: str = "tool", robot: bool = False) -> Callable[[Call
     return decorate
 
 
-def host_of(option: str, text: str, parse: Callable[[str], str] = hosts.host) -> str:
+def host_of(option: str, text: str, parse: Callable[[str], str] | None = None) -> str:
     """The host that an option names. Raises PebbleError."""
+    from pebble.config import hosts  # not all commands that use this module have one
+
     try:
-        return parse(text)
+        return (parse or hosts.host)(text)
     except hosts.HostError as error:
         raise PebbleError(f"{option} {error}") from None
 
