@@ -41,9 +41,8 @@ def bash(folder: Path, line: str) -> list[str]:
     words = line.split(" ")
     asked = f"COMP_WORDS=({shlex.join(words)}); COMP_CWORD={len(words) - 1}; _pebble_completion pebble"
     script = f'source {BASH}; {asked}; printf "%s\\n" "${{COMPREPLY[@]}}"'
-    done = subprocess.run(
-        ["bash", "--norc", "-c", script], cwd=folder, env=environment(folder), capture_output=True, text=True, timeout=60
-    )
+    command = ["bash", "--norc", "-c", script]
+    done = subprocess.run(command, cwd=folder, env=environment(folder), capture_output=True, text=True, timeout=60)
     assert done.stderr == ""
     return done.stdout.split()
 
@@ -74,7 +73,7 @@ def test_bash_completes_a_word(folder: Path, line: str, offered: list[str]) -> N
 @pytest.mark.parametrize(
     ("shell", "more", "expected"),
     [
-        ("zsh", {}, "_arguments '*: :((\"estop\":\"stop robots until they are reset\"))'"),
+        ("zsh", {}, '_arguments \'*: :(("estop":"stop robots until they are reset"))\''),
         ("fish", {"_TYPER_COMPLETE_FISH_ACTION": "get-args"}, "estop\tstop robots until they are reset"),
     ],
 )

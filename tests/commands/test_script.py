@@ -70,7 +70,8 @@ def manager(broker: Broker) -> Iterator[Manager]:
 def test_it_lists_scripts_and_their_options(run: Run, config: Path, manager: Manager) -> None:
     assert run("script", "list", config) == 0, run.err
     assert [line.strip().split("  ")[0] for line in run.out.splitlines()] == [
-        "follow: Follow a tag", "--tag-id INT", "--speed ENUM", "[--search | --no-search]", "--size-m FLOAT", "no script runs"
+        "follow: Follow a tag", "--tag-id INT", "--speed ENUM", "[--search | --no-search]", "--size-m FLOAT",
+        "no script runs",
     ]  # fmt: skip
     assert "(min 0; max 34; default: 13)" in run.out
     assert "(slow, fast; default: slow)" in run.out

@@ -85,10 +85,7 @@ def test_both_are_driven_report_their_state_and_end_at_once_by_a_signal_with_mot
 ) -> None:
     address = f"127.0.0.1:{broker.port}"
     traces = {kind: tmp_path / f"{kind}.jsonl" for kind in KINDS}
-    programs = {
-        kind: start(kind, address, "--name", NAME, "--report", "--trace", str(traces[kind]))
-        for kind in KINDS
-    }
+    programs = {kind: start(kind, address, "--name", NAME, "--report", "--trace", str(traces[kind])) for kind in KINDS}
 
     def motors(kind: str) -> list[Any]:
         return [entry.motors for entry in read_trace(traces[kind])]
