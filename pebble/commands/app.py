@@ -122,7 +122,9 @@ class _Listed(TyperCommand):
         return self._command(args).make_context(info_name, args, parent, **extra)
 
     def _command(self, arguments: list[str]) -> Command:
-        below = {words.split()[1]: _Listed(words) for words in _ROWS if words.startswith(f"{self._words} ")}
+        below: dict[str, Command] = {
+            words.split()[1]: _Listed(words) for words in _ROWS if words.startswith(f"{self._words} ")
+        }
         if arguments and arguments[0] in below:
             return TyperGroup(name=self.name, commands=below, rich_markup_mode=None)
         module, name = import_module(f"pebble.commands.{_ROWS[self._words][0]}"), str(self.name)
@@ -133,7 +135,7 @@ class _Listed(TyperCommand):
             app.command(name)(getattr(module, name))
         command = typer.main.get_group(app).commands[name]
         if isinstance(command, TyperGroup):
-            command.commands |= below
+            command.commands.update(below)
         return command
 
 

@@ -29,7 +29,8 @@ def robots() -> list[str]:
 
 def scripts(ctx: typer.Context) -> list[str]:
     """Return the scripts of the robot whose config was given, else those of Pebble."""
-    folders, file = (Path(pebble.__file__).with_name("scripts"),), Path(str(ctx.params.get("robot")))
+    file = Path(str(ctx.params.get("robot")))
+    folders: tuple[Path, ...] = (Path(pebble.__file__).with_name("scripts"),)
     if file.is_file():
         from pebble.config import load
         from pebble.errors import PebbleError

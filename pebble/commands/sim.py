@@ -33,7 +33,7 @@ _OF = {
     "seconds": ("fleet",),
     "folder": ("world",),
     "trace": (*_SERIAL, *_WIFI, "fleet", "world"),
-    "trace_said": _SERIAL,
+    "trace_output": _SERIAL,
     "report": (*_SERIAL, *_WIFI, "world"),
     "control": (*_SERIAL, "world"),
 }
@@ -77,7 +77,7 @@ def sim(
         Path | None,
         typer.Option(help="File for what boards receive and motors do; of a world the folder.", metavar="PATH"),
     ] = None,
-    trace_said: Annotated[bool, typer.Option("--trace-said", help="Also trace what the board sends.")] = False,
+    trace_output: Annotated[bool, typer.Option("--trace-said", help="Also trace what the board sends.")] = False,
     report: Annotated[bool, typer.Option("--report", help="Print the state as JSON, ten times a second.")] = False,
     control: Annotated[bool, typer.Option("--control", help="Read commands, such as unplug, from stdin.")] = False,
     password_file: PasswordFile = None,
@@ -118,7 +118,7 @@ def sim(
             typer.echo(f"{kind} is at {path}; Ctrl-C ends it")
         settings = {"outlets": outlets} if kind == "outlets" else None
         return run_mcu(
-            kind, path, trace=trace, trace_output=trace_said, charging=charging, settings=settings,
+            kind, path, trace=trace, trace_output=trace_output, charging=charging, settings=settings,
             unreachable=unreachable or (), report=report, control=control,
         )  # fmt: skip
     if broker is None:
