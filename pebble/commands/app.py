@@ -158,6 +158,8 @@ def _run(arguments: list[str]) -> int:
 
 
 class _ErrorHandler(logging.StreamHandler):  # type: ignore[type-arg]  # of the stream of the moment
+    """Writes without logins, and imports what that takes with the first error."""
+
     def format(self, record: logging.LogRecord) -> str:
         from pebble.runtime.parent import MaskingFormatter  # of use to errors only
 

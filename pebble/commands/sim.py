@@ -16,9 +16,9 @@ if TYPE_CHECKING:
 
 _SERIAL = ("goob", "fred", "goob_imu", "outlets")
 _WIFI = ("minilamp", "benjr")
+_NAMED = (*_WIFI, "world")
 #: The kinds that each option is for.
 _OF = {
-    "name": (*_WIFI, "world"),
     "link": _SERIAL,
     "charging": ("goob", "fred"),
     "outlets": ("outlets",),
@@ -58,7 +58,9 @@ def sim(
     ] = None,
     broker: Annotated[
         str | None,
-        typer.Option("--broker", "-b", help="mqtt://[USER@]HOST[:PORT], mqtts://… or its config.", metavar="URL"),
+        typer.Option(
+            "--broker", "-b", help="mqtt://[USER@]HOST[:PORT], mqtts://… or the robot's config.", metavar="URL"
+        ),
     ] = None,
     called: Annotated[str, typer.Option("--name", help="What people call the robot.", metavar="TEXT")] = "",
     files: Annotated[
@@ -100,11 +102,12 @@ def sim(
         pebble sim world world.json
         pebble sim loudspeaker --record /tmp/played clip.wav
     """
+    _check_options(context, kind)
     if kind == "loudspeaker":
         from pebble.simulation.loudspeaker import main
 
         return main([word for word in (name, *context.args) if word is not None])
-    _check(context, kind, name)
+    _check_words(kind, [word for word in (name, *context.args) if word is not None])
     if kind == "world":
         from pebble.simulation.world.program import ROOM
         from pebble.simulation.world.program import run as run_world
@@ -169,18 +172,21 @@ def demo(
     return run(seconds, for_phones=phone)
 
 
-def _check(context: typer.Context, kind: str, name: str | None) -> None:
-    """Raises BadParameter for words that are not of this kind; its options are those of all kinds."""
-    for word in (name or "", *context.args):
-        if word.startswith("-"):
-            raise typer.BadParameter(f"there is no option {word}")
-    if context.args:
-        raise typer.BadParameter(f"{kind} takes no {context.args[0]}")
+def _check_options(context: typer.Context, kind: str) -> None:
+    """Raises BadParameter for an option of another kind."""
     for parameter in context.command.params:
         source = context.get_parameter_source(str(parameter.name))
         if source is not None and source.name == "COMMANDLINE" and kind not in _OF.get(str(parameter.name), (kind,)):
-            word = f" {name}" if parameter.name == "name" else parameter.opts[0]
-            raise typer.BadParameter(f"{kind} takes no {word.strip()}")
+            raise typer.BadParameter(f"{kind} takes no {parameter.opts[0]}")
+
+
+def _check_words(kind: str, words: list[str]) -> None:
+    """Raises BadParameter for an option that there is not, and for more words than this kind takes."""
+    for word in words:
+        if word.startswith("-"):
+            raise typer.BadParameter(f"there is no option {word}")
+    if len(words) > (kind in _NAMED):
+        raise typer.BadParameter(f"{kind} takes no {words[-1]}")
 
 
 def _wireless(
