@@ -119,7 +119,12 @@ class _Listed(TyperCommand):
         self._words = words
 
     def make_context(self, info_name: str | None, args: list[str], parent: Context | None = None, **extra: Any) -> Any:
-        return self._command(args).make_context(info_name, args, parent, **extra)
+        command = self._command(args)
+        if extra.get("resilient_parsing"):  # for Tab
+            from pebble.commands.completion import complete_values
+
+            complete_values(command)
+        return command.make_context(info_name, args, parent, **extra)
 
     def _command(self, arguments: list[str]) -> Command:
         below: dict[str, Command] = {

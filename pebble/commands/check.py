@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Annotated, NamedTuple
 
 import typer
 
-from pebble.commands import completion
 from pebble.config import Config, Mqtt, load, resolved
 from pebble.config.neighbours import Neighbours
 from pebble.config.rules.doors import places_of
@@ -38,10 +37,7 @@ _FIXED = {_LAUNCHER: STATUS, "av_daemon": MEDIA_STATUS}
 
 
 def check(
-    configs: Annotated[
-        list[Path],
-        typer.Argument(help="Config files.", metavar="CONFIG…", show_default=False, autocompletion=completion.configs),
-    ],
+    configs: Annotated[list[Path], typer.Argument(help="Config files.", metavar="CONFIG…", show_default=False)],
     as_json: Annotated[bool, typer.Option("--json", help="Print only the keys and their values.")] = False,
 ) -> int:
     """Report all mistakes of a config at once, or print a summary of it.

@@ -1,35 +1,55 @@
-"""What Tab completes of a command line, besides commands and options: files and robots of this machine, no network."""
+"""What Tab completes besides commands and options: files and robots of this machine, without a network."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import suppress
+from functools import partial
 from itertools import islice
 from pathlib import Path
+from typing import TYPE_CHECKING, Final
 
-import typer
+from typer._click.shell_completion import CompletionItem
+from typer.core import TyperGroup
 
 import pebble
+
+if TYPE_CHECKING:
+    from typer._click.core import Command, Context
 
 _PLACES = (Path(), Path("/etc/pebble"))
 _FILES = 200  # that are looked into
 _LONGEST = 1_000_000  # bytes of a config
 
 
-def configs() -> list[str]:
+def complete_values(command: Command) -> None:
+    """Let a command, and those below it, complete the values of arguments and options that ``VALUES`` has."""
+    for parameter in command.params:
+        if values := VALUES.get(parameter.metavar or ""):
+            parameter.shell_complete = partial(_items, values)  # type: ignore[method-assign]
+    for below in command.commands.values() if isinstance(command, TyperGroup) else ():
+        complete_values(below)
+
+
+def _items(values: Callable[[Context], list[str]], context: Context, incomplete: str) -> list[CompletionItem]:
+    return [CompletionItem(value) for value in values(context) if value.startswith(incomplete)]
+
+
+def configs(context: Context) -> list[str]:
     """Return the JSON files of this folder; the shell itself completes those of others."""
-    return sorted(str(path) for path in Path().glob("*.json"))
+    commands = ["user", "audit"] if context.command.name == "serve" else []  # of `pebble web [CONFIG]`
+    return [*commands, *sorted(str(path) for path in Path().glob("*.json"))]
 
 
-def robots() -> list[str]:
+def robots(context: Context) -> list[str]:
     """Return the JSON files of this folder, and the ids of robots whose configs are here or in /etc/pebble."""
-    return [*configs(), *sorted(set(_ids()))]
+    return [*configs(context), *sorted(set(_ids()))]
 
 
-def scripts(ctx: typer.Context) -> list[str]:
+def scripts(context: Context) -> list[str]:
     """Return the scripts of the robot whose config was given, else those of Pebble."""
-    file = Path(str(ctx.params.get("robot")))
+    file = Path(str(context.params.get("robot")))
     folders: tuple[Path, ...] = (Path(pebble.__file__).with_name("scripts"),)
     if file.is_file():
         from pebble.config import load
@@ -48,3 +68,14 @@ def _ids() -> Iterator[str]:
                 yield str(json.loads(file.read_bytes())["robot"]["id"])
         except (OSError, ValueError, LookupError, TypeError):  # no config of a robot
             continue
+
+
+#: Functions for the values of arguments and options, by how the help calls them.
+VALUES: Final = {
+    "CONFIG": configs,
+    "CONFIG…": configs,
+    "ROBOT": robots,
+    "[SYSTEM/TYPE/]ID": robots,
+    "[reset|status] ROBOT": lambda context: ["reset", "status", *robots(context)],
+    "SCRIPT": scripts,
+}

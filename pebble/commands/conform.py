@@ -11,7 +11,6 @@ import typer
 from pebble.check_result import State
 from pebble.client.connection import Target, target_of
 from pebble.client.names import base_of
-from pebble.commands import completion
 from pebble.commands.broker import BELOW, BrokerOption, conform_of, settings_at
 from pebble.commands.options import with_target
 from pebble.commands.selftest import INDENT, is_clear, printed, row
@@ -28,10 +27,7 @@ _STARTS_S = 10.0  # until a person has started a client
 @with_target(program="conform")
 def conform(
     robot: Annotated[
-        str | None,
-        typer.Argument(
-            help="Its id, or SYSTEM/TYPE/ID.", metavar="ROBOT", show_default=False, autocompletion=completion.robots
-        ),
+        str | None, typer.Argument(help="Its id, or SYSTEM/TYPE/ID.", metavar="ROBOT", show_default=False)
     ] = None,
     may_move: Annotated[bool, typer.Option("--may-move", help="Ask, then also turn its wheels.")] = False,
     cut: Annotated[

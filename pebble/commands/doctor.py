@@ -8,7 +8,6 @@ from typing import Annotated
 import typer
 
 from pebble.check_result import CheckResult, State
-from pebble.commands import completion
 from pebble.commands.broker import BELOW, BelowOption, BrokerOption, RestartOption, doctor_of, settings_at
 from pebble.commands.options import CaCert, PasswordFile, RootOption
 from pebble.config import load
@@ -27,13 +26,7 @@ _INDENT = " " * 6
 
 def doctor(
     config: Annotated[
-        Path | None,
-        typer.Argument(
-            help="Also check what this robot needs.",
-            metavar="CONFIG",
-            show_default=False,
-            autocompletion=completion.configs,
-        ),
+        Path | None, typer.Argument(help="Also check what this robot needs.", metavar="CONFIG", show_default=False)
     ] = None,
     running: Annotated[bool, typer.Option("--running", help="Test the robot, which runs, instead.")] = False,
     may_move: Annotated[

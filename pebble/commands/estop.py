@@ -21,7 +21,6 @@ from pebble.client.estop import Progress, RobotStop, StopSender, new_name, send
 from pebble.client.estop_states import Reset, RobotEstop
 from pebble.client.names import id_of
 from pebble.client.robot_view import RobotView
-from pebble.commands import completion
 from pebble.commands.options import with_target
 from pebble.commands.terminal import show
 from pebble.config.visible import shown
@@ -49,7 +48,6 @@ def estop(
             help="A robot's config file, or with --url or --config its id.",
             metavar="[reset|status] ROBOT",
             show_default=False,
-            autocompletion=lambda: [*_VERBS, *completion.robots()],
         ),
     ] = None,
     all_: Annotated[bool, typer.Option("--all", help="Stop all robots there.")] = False,

@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from pebble.client.connection import Target, resolve
-from pebble.commands import completion
 from pebble.commands.options import CaCert, PasswordFile, host_of
 from pebble.config.web import is_loopback
 from pebble.errors import PebbleError
@@ -23,12 +22,7 @@ if TYPE_CHECKING:
 def foxglove(
     config: Annotated[
         Path | None,
-        typer.Argument(
-            help="A robot's config file: show this robot.",
-            metavar="CONFIG",
-            show_default=False,
-            autocompletion=completion.configs,
-        ),
+        typer.Argument(help="A robot's config file: show this robot.", metavar="CONFIG", show_default=False),
     ] = None,
     url: Annotated[
         str | None, typer.Option(help="mqtt://[USER@]HOST[:PORT] or mqtts://… of the robots' broker.", metavar="URL")

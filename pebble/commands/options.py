@@ -8,32 +8,16 @@ from typing import Annotated, Any
 
 import typer
 
-from pebble.commands import completion
 from pebble.errors import PebbleError
 
-ConfigArgument = Annotated[
-    Path,
-    typer.Argument(
-        help="A robot's config file.", metavar="CONFIG", show_default=False, autocompletion=completion.configs
-    ),
-]
+ConfigArgument = Annotated[Path, typer.Argument(help="A robot's config file.", metavar="CONFIG", show_default=False)]
 ConfigOption = Annotated[
-    Path | None,
-    typer.Option(
-        "--config",
-        "-c",
-        help="A robot's config file: use its own transport.",
-        metavar="CONFIG",
-        autocompletion=completion.configs,
-    ),
+    Path | None, typer.Option("--config", "-c", help="A robot's config file: use its own transport.", metavar="CONFIG")
 ]
 RobotArgument = Annotated[
     str,
     typer.Argument(
-        help="A robot's config file, or with --url or --config its id.",
-        metavar="ROBOT",
-        show_default=False,
-        autocompletion=completion.robots,
+        help="A robot's config file, or with --url or --config its id.", metavar="ROBOT", show_default=False
     ),
 ]
 UrlOption = Annotated[
@@ -47,14 +31,7 @@ PasswordFile = Annotated[
 ]
 CaCert = Annotated[Path | None, typer.Option(help="Certificate authority to trust with mqtts://.", metavar="FILE")]
 RobotOption = Annotated[
-    str | None,
-    typer.Option(
-        "--robot",
-        "-r",
-        help="The robot that short names refer to.",
-        metavar="[SYSTEM/TYPE/]ID",
-        autocompletion=completion.robots,
-    ),
+    str | None, typer.Option("--robot", "-r", help="The robot that short names refer to.", metavar="[SYSTEM/TYPE/]ID")
 ]
 RootOption = Annotated[
     Path, typer.Option("--root", help="Folder that stands for / where the robot is installed.", metavar="DIR")

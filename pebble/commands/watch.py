@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from pebble.client.connection import Target, connected, put_names
-from pebble.commands import completion
 from pebble.commands.options import CaCert, PasswordFile
 from pebble.config import load
 from pebble.errors import PebbleError
@@ -25,13 +24,7 @@ _FIRST_PICTURE_S = 15.0  # a camera that is off takes a moment to open
 _TICK_S = 0.1
 
 RobotArgument = Annotated[
-    str,
-    typer.Argument(
-        help="A robot's config file, or with --url its id.",
-        metavar="ROBOT",
-        show_default=False,
-        autocompletion=completion.robots,
-    ),
+    str, typer.Argument(help="A robot's config file, or with --url its id.", metavar="ROBOT", show_default=False)
 ]
 UrlOption = Annotated[
     str | None, typer.Option(help="mqtt://[USER@]HOST[:PORT] or mqtts://… of the operators' broker.", metavar="URL")

@@ -75,7 +75,7 @@ def test_a_command_imports_no_other() -> None:
         "import sys; from pebble import cli; sys.argv = ['pebble', *sys.argv[1:]]; cli.main();"
         "print(sorted(name for name in sys.modules if name.startswith('pebble.commands.')))"
     )
-    for words, commands in (("--help", "app"), ("up --help", "app completion options up")):
+    for words, commands in (("--help", "app"), ("up --help", "app options up")):
         done = subprocess.run([sys.executable, "-c", code, *words.split()], cwd=ROOT, capture_output=True, text=True)
         assert done.stdout.splitlines()[-1] == str([f"pebble.commands.{name}" for name in commands.split()])
 

@@ -63,6 +63,7 @@ def bash(folder: Path, line: str) -> list[str]:
         ("pebble script start goob foll", ["follow"]),
         ("pebble sim mini", ["minilamp"]),
         ("pebble web us", ["user"]),
+        ("pebble conform mini", ["minilamp"]),
         ("pebble doctor --may", ["--may-move"]),
     ],
 )

@@ -11,7 +11,6 @@ import typer
 from pebble.client.connection import Target, connected, put_names, target_of, wait_for
 from pebble.client.names import id_of
 from pebble.client.scripts import RobotScripts, options_of
-from pebble.commands import completion
 from pebble.commands.options import RobotArgument, with_target
 from pebble.config.visible import shown
 from pebble.contract.payloads import AutonomyStatus
@@ -68,13 +67,7 @@ def start(
     context: typer.Context,
     robot: RobotArgument,
     file: Annotated[
-        str,
-        typer.Argument(
-            help="The script; its own options follow.",
-            metavar="SCRIPT",
-            show_default=False,
-            autocompletion=completion.scripts,
-        ),
+        str, typer.Argument(help="The script; its own options follow.", metavar="SCRIPT", show_default=False)
     ] = "",
     *,
     target: Target,

@@ -16,7 +16,6 @@ from typer.core import TyperCommand, TyperGroup
 from pebble.client.connection import password as broker_password
 from pebble.client.page.packages import require_packages
 from pebble.client.url import settings_of as settings_of_url
-from pebble.commands import completion
 from pebble.commands.options import CaCert, PasswordFile, host_of
 from pebble.commands.web.people import PEOPLE, TLS, PeopleOption, default_folder, opened, register_people
 from pebble.config import load
@@ -44,10 +43,7 @@ def serve(
     config: Annotated[
         Path | None,
         typer.Argument(
-            help="A robot's config file: its broker, and web_interface.",
-            metavar="CONFIG",
-            show_default=False,
-            autocompletion=lambda: ["user", "audit", *completion.configs()],
+            help="A robot's config file: its broker, and web_interface.", metavar="CONFIG", show_default=False
         ),
     ] = None,
     url: Annotated[
