@@ -30,7 +30,7 @@ def main() -> int:
         code = _fail(*_without_secrets(str(error)).splitlines())
     except KeyboardInterrupt:
         code = 130
-    except BrokenPipeError:  # the reader has ended (`pebble topics | head`)
+    except BrokenPipeError:  # the reader has ended (`pebble topic contract | head`)
         code = 1
     except OSError as error:
         if error.filename is not None or error.errno not in _FULL:

@@ -66,13 +66,13 @@ class SimulatedRobot:
         self.programs.append(self.running.add(Program(name, command, self.folder / log, each), kind))
         return self.programs[-1]
 
-    def _start_mcu(self, module: str, *options: object, name: str = "MCU", each: Each | None = None) -> Program:
-        return self._add(f"{self.name}'s {name}", python(module, *options), MCUS, f"{name}.log", each)
+    def _start_mcu(self, kind: str, *options: object, name: str = "MCU", each: Each | None = None) -> Program:
+        command = python("pebble.cli", "sim", kind, *options)
+        return self._add(f"{self.name}'s {name}", command, MCUS, f"{name}.log", each)
 
     def _start_board(self, kind: str, port: Path, trace: Path, *options: object, **more: Any) -> Program:
         """An MCU on a pty."""
-        where = ("--kind", kind, "--link", port, "--trace", trace)
-        return self._start_mcu("pebble.simulation.mcu", *where, *options, **more)
+        return self._start_mcu(kind, "--link", port, "--trace", trace, *options, **more)
 
     def _collect(self, line: bytes) -> None:
         from pebble.simulation.mcu import Snapshot

@@ -109,8 +109,8 @@ class RoomRobot(LinuxRobot):
         }
 
     def _start_motors(self) -> Program:
-        options = (self.room, "--folder", self.folder, "--trace", "--report")
-        return self._start_mcu("pebble.simulation.world", *options, each=self._collect)
+        options = (self.room, "--folder", self.folder, "--trace", self.folder, "--report")
+        return self._start_mcu("world", *options, each=self._collect)
 
     def _collect(self, line: bytes) -> None:
         seen = msgspec.json.decode(line, type=WorldSnapshot)
@@ -132,12 +132,12 @@ class McuRobot(SimulatedRobot):
 
     def __init__(self, running: Testbed, name: str) -> None:
         super().__init__(running, name, running.folder / name)
-        self.runs_on, self._broker = _BOARDS[name], f"{HOST}:{running.broker_port}"
+        self.runs_on, self._broker = _BOARDS[name], f"mqtt://{HOST}:{running.broker_port}"
         self._called = _config(name)["robot"]["name"]
 
     def bring_up(self, ending: threading.Event) -> None:
-        options = ("--kind", self.name, "--name", self._called, "--broker", self._broker, "--trace", self._trace)
-        mcu = self._start_mcu("pebble.simulation.networked", *options, "--report", each=self._collect)
+        options = ("--name", self._called, "--broker", self._broker, "--trace", self._trace)
+        mcu = self._start_mcu(self.name, *options, "--report", each=self._collect)
         mcu.wait_until(lambda: bool(self.mcu_reports), START_S, ending)
 
 

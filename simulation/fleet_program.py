@@ -1,13 +1,10 @@
-"""A fleet of simulated robots as a program: ``python -m pebble.simulation.fleet_program --robots 50 --broker HOST``."""
+"""A fleet of simulated robots as a program, ``pebble sim fleet --robots 50 --broker mqtt://HOST``."""
 
 from __future__ import annotations
 
-import argparse
-import sys
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 
 from rich import box
@@ -15,41 +12,37 @@ from rich.console import Console
 from rich.live import Live
 from rich.table import Table
 
-from pebble.errors import PebbleError
 from pebble.simulation.fleet import ConnectionReporter, Fleet, members
-from pebble.simulation.networked import StopSignal, add_broker_options, broker_address
+from pebble.simulation.networked import StopSignal
 from pebble.simulation.wireless import KINDS, BrokerAddress
 
 _TABLE_PERIOD_S, _LINE_PERIOD_S = 1.0, 10.0  # on a terminal, and in plain lines
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class FleetOptions:
-    """What to simulate; ``seconds`` None: until a signal."""
+def run(
+    broker: BrokerAddress,
+    robots: int,
+    kinds: Sequence[str] | None = None,
+    *,
+    seconds: float | None = None,
+    trace: Path | None = None,
+) -> int:
+    """Run the fleet and show its status; returns 0 if all robots are online at the end. Raises PebbleError.
 
-    robots: int
-    broker: BrokerAddress
-    kinds: Sequence[str] = KINDS
-    seconds: float | None = None
-    trace: Path | None = None
-
-
-def run(options: FleetOptions, console: Console | None = None) -> int:
-    """Run the fleet and show its status; returns 0 if all robots are online at the end. Raises PebbleError."""
-    console = console or Console()
+    ``seconds`` None: until a signal. ``trace``: a file for every change of all motors, with its time.
+    """
+    console = Console()
     stop_signal = StopSignal()
-    with Fleet(options.broker, trace=options.trace) as fleet:
-        for kind, identity in members(options.robots, options.kinds):
+    with Fleet(broker, trace=trace) as fleet:
+        for kind, identity in members(robots, kinds or KINDS):
             fleet.add(kind, identity)
-        console.print(
-            f"{options.robots} robots, {fleet.robots[0].identity.id} and so on; Ctrl-C ends it", highlight=False
-        )
-        until = time.monotonic() + options.seconds if options.seconds is not None else float("inf")
+        console.print(f"{robots} robots, {fleet.robots[0].identity.id} and so on; Ctrl-C ends it", highlight=False)
+        until = time.monotonic() + seconds if seconds is not None else float("inf")
         with _shown(fleet, console) as show:
             fleet.run(lambda: not stop_signal.received and time.monotonic() < until, show.poll)
         online = sum(robot.online for robot in fleet.robots)
         console.print(show.line(), highlight=False)
-    return 0 if online == options.robots else 1
+    return 0 if online == robots else 1
 
 
 @contextmanager
@@ -114,33 +107,3 @@ def _count(fleet: Fleet, kind: str | None) -> tuple[int, int]:
     """Numbers of robots that are online and that move, of one kind or of all."""
     robots = [robot for robot in fleet.robots if kind in (None, robot.kind)]
     return sum(robot.online for robot in robots), sum(robot.moving for robot in robots)
-
-
-def main(arguments: list[str] | None = None) -> int:
-    parsed = _parser().parse_args(arguments)
-    try:
-        options = FleetOptions(
-            robots=parsed.robots,
-            broker=broker_address(parsed),
-            kinds=parsed.kinds.split(","),
-            seconds=parsed.seconds,
-            trace=parsed.trace,
-        )
-        return run(options)
-    except PebbleError as error:
-        sys.stderr.write(f"{error}\n")
-        return 1
-
-
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(prog="python -m pebble.simulation.fleet_program", description=__doc__)
-    parser.add_argument("--robots", type=int, default=10)
-    parser.add_argument("--kinds", default=",".join(KINDS), help="comma-separated; robots alternate between them")
-    parser.add_argument("--seconds", type=float, help="end after this time")
-    parser.add_argument("--trace", type=Path, help="file to append every change of all motors to, with its time")
-    add_broker_options(parser)
-    return parser
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -98,7 +98,7 @@ WRITTEN = sorted({line for path in DOCUMENTS for line in COMMAND.findall(path.re
 
 @pytest.fixture(scope="module")
 def pebble() -> Any:
-    return typer.main.get_command(application())
+    return application()
 
 
 @pytest.mark.parametrize("line", WRITTEN)

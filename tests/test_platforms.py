@@ -21,7 +21,7 @@ from tests.support import ROOT, THOROUGH, Broker, Child, free_port, until
 
 ELSEWHERE = [sys.executable, str(ROOT / "tests" / "fakes" / "other_platform.py")]
 MODULES = (
-    *(f"pebble.commands.{name}" for name in ("topic", "estop", "watch", "web", "cert", "drive", "topics", "check")),
+    *(f"pebble.commands.{name}" for name in ("topic", "estop", "watch", "web", "cert", "drive", "check")),
     *("pebble.web.app", "pebble.web.serve", "pebble.transports.mqtt.transport", "pebble.client.media_receiver"),
     *("pebble.commands.foxglove", "pebble.foxglove.run"),
 )

@@ -100,4 +100,4 @@ def _refuse_misspelt(name: str) -> None:
     if near:
         raise NamingError(f'there is no topic "{name}": did you mean "{near[0]}"?')
     if "/" not in name:
-        raise NamingError(f'there is no topic "{name}"; `pebble topics` lists all topics')
+        raise NamingError(f'there is no topic "{name}"; `pebble topic contract` lists all topics')

@@ -1,119 +1,160 @@
 """Builds the command line from the modules it needs, and runs it."""
 
+from __future__ import annotations
+
 import logging
 import sys
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from importlib import import_module
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import typer
+from typer.core import TyperCommand, TyperGroup
 
-from pebble.config.secret_text import without_secrets
-from pebble.runtime.parent import MaskingFormatter
 from pebble.version import __version__
 
-#: Each command, and the module of this package that has the function of its name, or registers what is below it.
-COMMANDS = {
-    "setup": "setup",
-    "up": "up",
-    "check": "check",
-    "doctor": "doctor",
-    "selftest": "selftest",
-    "report": "report",
-    "backup": "backup",
-    "topics": "topics",
-    "topic": "topic",
-    "estop": "estop",
-    "drive": "drive",
-    "script": "script.group",
-    "sim": "sim",
-    "demo": "sim",
-    "watch": "watch",
-    "snapshot": "watch",
-    "web": "web.group",
-    "foxglove": "foxglove",
-    "record": "recordings.record",
-    "recordings": "recordings.group",
-    "replay": "recordings.replay",
-    "analyse": "recordings.analyse",
-    "cert": "cert",
-    "fleet": "fleet.group",
-    "hub": "fleet.hub",
-    "gateway": "fleet.gateway",
-    "audit": "fleet.audit",
-    "conform": "conform",
-    "flash": "flash",
-    "bench": "bench",
-    "impair": "impair",
+if TYPE_CHECKING:
+    from typer._click.core import Command, Context
+    from typer._click.formatting import HelpFormatter
+
+#: Each command, by what it is for: the module of this package that has the function of its name, or registers what is
+#: below it, and its line of help. One of two words is imported without the others of its group.
+COMMANDS: Final = {
+    "use": {
+        "demo": ("sim", "run four simulated robots; needs nothing else"),
+        "drive": ("drive", "drive a robot with the keys of this terminal"),
+        "estop": ("estop", "stop robots until they are reset"),
+        "watch": ("watch", "show a robot's camera and play its microphone"),
+        "web": ("web.group", "drive, stop and watch robots in a browser"),
+        "foxglove": ("foxglove", "show robots live in the Foxglove app"),
+    },
+    "own": {
+        "setup": ("setup", "make a robot of this machine, or back it up"),
+        "up": ("up", "run a robot"),
+        "check": ("check", "validate configs and summarise them"),
+        "doctor": ("doctor", "find what is wrong with a machine, robot or broker"),
+        "flash": ("flash", "install a robot's firmware on its board"),
+    },
+    "write": {
+        "script": ("script.group", "write, start and stop programs that move a robot"),
+        "topic": ("topic", "list, print, publish and measure messages"),
+        "sim": ("sim", "simulate boards, robots, rooms and fleets"),
+        "conform": ("conform", "judge a robot of your own by the contract"),
+    },
+    "share": {
+        "fleet": ("fleet.group", "give robots and people accounts at a broker"),
+        "fleet hub": ("fleet.hub", "Run a Zenoh hub for several robots."),
+        "fleet gateway": ("fleet.gateway", "Carry robots of a hub or a LAN to a broker."),
+        "fleet audit": ("fleet.audit", "Print who did what to a robot."),
+        "cert": ("cert", "make certificates, so that phones may connect"),
+    },
+    "measure": {
+        "record": ("recordings.record", "record robots"),
+        "recordings": ("recordings.group", "list, search, mend and export recordings"),
+        "replay": ("recordings.replay", "play recordings as if their robots were there"),
+        "analyse": ("recordings.analyse", "report bandwidth, outages and latency of recordings"),
+        "bench": ("bench", "compare MQTT and Zenoh on this machine"),
+    },
 }
 
-_REGISTERED = ("topic", "script", "sim", "web", "recordings", "cert", "fleet", "bench", "impair")
-#: What prints its help when nothing follows.
-_GROUPS = [
-    words.split() for words in ("", "topic", "bench", "sim", "script", "cert", "fleet", "recordings", "web user")
-]
+#: Commands of the last release, and how they are called now.
+FORMER: Final = {
+    "topics": "topic contract",
+    "topic bw": "topic hz",
+    "snapshot": "watch --picture FILE",
+    "script status": "script list",
+    "selftest": "doctor --running",
+    "report": "doctor --report FILE.zip",
+    "backup": "setup --backup FILE",
+    "hub": "fleet hub",
+    "gateway": "fleet gateway",
+    "audit": "fleet audit",
+    "impair": "bench impair",
+}
 
-_HELP = """Runs and inspects Pebble robots.
-
-\b
-    pebble demo                run four simulated robots; needs nothing else
-    sudo pebble setup          make a robot of this machine
-    pebble check goob.json     validate a config and summarise it
-    pebble doctor goob.json    check that this machine is ready for the robot
-    pebble up goob.json        run the robot
-    pebble selftest goob.json  test the running robot, end to end
-    pebble report goob.zip     pack what helps to find a fault, no secrets
-    pebble backup goob.tar     pack what a new machine needs to be this robot
-    pebble drive goob.json     drive it with the keys of this terminal
-    pebble estop goob.json     stop the robot until it is reset
-    pebble script new follow   write a first program that moves a robot
-    pebble watch goob.json     show its camera and play its microphone
-    pebble web goob.json       drive, stop and watch robots in a browser
-    pebble foxglove goob.json  show robots live in the Foxglove app
-    pebble record --url URL    record robots; for recordings, replay, analyse
-    pebble cert init NAME      make certificates, so that phones can, too
-    pebble fleet init hall     give robots and people accounts at a broker
-    pebble audit goob.json     show who did what to the robot
-    pebble conform rover       judge a robot of your own by the contract
-    pebble flash lamp.json     install a robot's firmware on its board
-    pebble bench control       compare MQTT and Zenoh on this machine
-    pebble impair              measure robots behind an impaired network
-"""
+_ROWS: Final = {words: row for rows in COMMANDS.values() for words, row in rows.items()}
 
 
 def run(arguments: list[str]) -> int:
     """Run one command line; returns the exit code, 2 for a wrong command line. Raises PebbleError."""
+    for former, now in FORMER.items():
+        if arguments[: len(former.split())] == former.split():
+            command = now.partition(" --")[0]
+            sys.stderr.write(f'pebble: "{former}" is now "{now}": pebble {command} --help\n')
+            return 2
     with _thread_errors_on_stderr():
         return _run(arguments)
 
 
-def application(names: Iterable[str] = COMMANDS) -> typer.Typer:
-    """The command line with these commands."""
-    app = typer.Typer(rich_markup_mode=None, add_completion=False)
-    app.callback(help=_HELP)(_options)
-    for name in names:
-        module = import_module(f"pebble.commands.{COMMANDS[name]}")
-        if name in _REGISTERED:
+def application() -> Command:
+    """Build the command line; what is below a command is imported when it is needed."""
+    app = typer.Typer(cls=_Pebble, rich_markup_mode=None)
+    app.callback()(_options)
+    return typer.main.get_command(app)
+
+
+class _Pebble(TyperGroup):
+    """The command ``pebble``. Its help has one line for each command, and fits on a terminal of 80 x 24."""
+
+    def __init__(self, **attributes: Any) -> None:
+        commands = {words: _Listed(words) for words in _ROWS if " " not in words}
+        super().__init__(**attributes | {"commands": commands})
+
+    def format_help(self, ctx: Context, formatter: HelpFormatter) -> None:
+        formatter.write(
+            f"Usage: {ctx.command_path} COMMAND …  (also: --version, COMMAND --help, --install-completion)\n"
+        )
+        for group, rows in COMMANDS.items():
+            names = [name for name in rows if " " not in name]
+            for name in names:
+                formatter.write(f"{group if name == names[0] else '':<9}{name:<12}{rows[name][1]}\n")
+
+
+class _Listed(TyperCommand):
+    """A command of the table. It is imported when it runs, explains itself or completes what is typed."""
+
+    def __init__(self, words: str) -> None:
+        super().__init__(words.split()[-1], help=_ROWS[words][1])
+        self._words = words
+
+    def make_context(self, info_name: str | None, args: list[str], parent: Context | None = None, **extra: Any) -> Any:
+        command = self._command(args)
+        if extra.get("resilient_parsing"):  # for Tab
+            from pebble.commands.completion import complete_values
+
+            complete_values(command)
+        return command.make_context(info_name, args, parent, **extra)
+
+    def _command(self, arguments: list[str]) -> Command:
+        below: dict[str, Command] = {
+            words.split()[1]: _Listed(words) for words in _ROWS if words.startswith(f"{self._words} ")
+        }
+        if arguments and arguments[0] in below:
+            return TyperGroup(name=self.name, commands=below, rich_markup_mode=None)
+        module, name = import_module(f"pebble.commands.{_ROWS[self._words][0]}"), str(self.name)
+        app = typer.Typer(rich_markup_mode=None)
+        if hasattr(module, "register"):
             module.register(app)
         else:
             app.command(name)(getattr(module, name))
-    return app
+        command = typer.main.get_group(app).commands[name]
+        if isinstance(command, TyperGroup):
+            command.commands.update(below)
+        return command
 
 
 def _run(arguments: list[str]) -> int:
-    wanted = [arguments[0]] if arguments and arguments[0] in COMMANDS else []
-    app = application(wanted or COMMANDS)
-    line = [*arguments, "--help"] if arguments in _GROUPS else arguments
     try:
-        code = typer.main.get_command(app).main(line, prog_name="pebble", standalone_mode=False)
+        code = application().main(arguments, prog_name="pebble", standalone_mode=False)
     except typer.TyperException as error:
-        context = getattr(error, "ctx", None)
-        wrong = (
-            without_secrets(error.format_message().rstrip("."))
-            .replace("float range", "number")
-            .replace("int range", "whole number")
-        )
+        context, message = getattr(error, "ctx", None), error.format_message().rstrip(".")
+        if context is not None and message == "Missing command":
+            typer.echo(context.get_help())
+            return 0
+        from pebble.config.secret_text import without_secrets  # of use to errors only
+
+        wrong = without_secrets(message).replace("float range", "number").replace("int range", "whole number")
         sys.stderr.write(f"pebble: {wrong}; see {context.command_path if context else 'pebble'} --help\n")
         return 2
     except typer.Abort as error:  # Ctrl-C
@@ -121,12 +162,20 @@ def _run(arguments: list[str]) -> int:
     return code if isinstance(code, int) else 0
 
 
+class _ErrorHandler(logging.StreamHandler):  # type: ignore[type-arg]  # of the stream of the moment
+    """Writes without logins, and imports what that takes with the first error."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        from pebble.runtime.parent import MaskingFormatter  # of use to errors only
+
+        return MaskingFormatter("pebble: %(message)s").format(record)
+
+
 @contextmanager
 def _thread_errors_on_stderr() -> Iterator[None]:
     """Log errors to stderr: a command raises its own errors, but not those of threads."""
-    handler = logging.StreamHandler()
+    handler = _ErrorHandler()
     handler.setLevel(logging.ERROR)
-    handler.setFormatter(MaskingFormatter("pebble: %(message)s"))
     logging.getLogger("pebble").addHandler(handler)
     try:
         yield

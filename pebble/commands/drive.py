@@ -16,7 +16,7 @@ from pebble.client.terminal.driver import TerminalDriver
 from pebble.client.terminal.key_decoder import END
 from pebble.client.terminal.key_gesture import PERIOD_S, KeyGesture
 from pebble.commands.estop import me
-from pebble.commands.options import with_target
+from pebble.commands.options import RobotArgument, with_target
 from pebble.commands.terminal.loop import TerminalLoop
 from pebble.media.in_flight import InFlight
 from pebble.transports import Message, QoS, State, Transport
@@ -29,13 +29,6 @@ T takes control, or asks for it; O takes it over."""
 _STOP_S = 3.0  # so long an emergency stop is still sent after the terminal has ended
 _ARRIVED = 1000  # messages that wait to be handled
 _OVERHEAD = 32  # bytes of a message on the wire besides topic and payload
-
-RobotArgument = Annotated[
-    str,
-    typer.Argument(
-        help="A robot's config file, or with --url or --config its id.", metavar="ROBOT", show_default=False
-    ),
-]
 
 
 @with_target(program="drive")

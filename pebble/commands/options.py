@@ -8,12 +8,17 @@ from typing import Annotated, Any
 
 import typer
 
-from pebble.config import hosts
 from pebble.errors import PebbleError
 
 ConfigArgument = Annotated[Path, typer.Argument(help="A robot's config file.", metavar="CONFIG", show_default=False)]
 ConfigOption = Annotated[
     Path | None, typer.Option("--config", "-c", help="A robot's config file: use its own transport.", metavar="CONFIG")
+]
+RobotArgument = Annotated[
+    str,
+    typer.Argument(
+        help="A robot's config file, or with --url or --config its id.", metavar="ROBOT", show_default=False
+    ),
 ]
 UrlOption = Annotated[
     str | None, typer.Option(help="mqtt://[USER@]HOST[:PORT], mqtts://… or zenoh:RUN_DIR.", metavar="URL")
@@ -72,10 +77,12 @@ def with_target(*, program: str = "tool", robot: bool = False) -> Callable[[Call
     return decorate
 
 
-def host_of(option: str, text: str, parse: Callable[[str], str] = hosts.host) -> str:
+def host_of(option: str, text: str, parse: Callable[[str], str] | None = None) -> str:
     """The host that an option names. Raises PebbleError."""
+    from pebble.config import hosts  # not all commands that use this module have one
+
     try:
-        return parse(text)
+        return (parse or hosts.host)(text)
     except hosts.HostError as error:
         raise PebbleError(f"{option} {error}") from None
 

@@ -1,37 +1,21 @@
-"""``pebble report``: packs what helps to find a fault, without a secret."""
+"""``pebble doctor --report``: packs what helps to find a fault, without a secret."""
 
 from pathlib import Path
-from typing import Annotated
 
 import typer
 
-from pebble.commands.options import RootOption
 from pebble.setup.places import Places
 
-ZipArgument = Annotated[Path, typer.Argument(help="Zip file to write.", metavar="FILE.zip", show_default=False)]
-OtherConfig = Annotated[
-    Path | None,
-    typer.Argument(
-        help="A robot's config file. [default: the installed one]", metavar="CONFIG", exists=True, show_default=False
-    ),
-]
 
-
-def report(file: ZipArgument, config: OtherConfig = None, root: RootOption = Path("/")) -> int:
-    """Pack what helps to find a fault: config, doctor, status, journal, units, slots, versions, devices.
-
-    Passwords and keys are masked; then every one that is known on this machine is searched for in it, and if one is
-    found, nothing is written. Run it as root: it searches only for what it may read.
-
-    \b
-        pebble report goob.zip
-        pebble report goob.zip goob.json
-    """
+def report(file: Path, config: Path | None, root: Path) -> int:
+    """Write the zip file; without a config it is about the installed robot."""
     from pebble.selftest.new_file import write_new  # of Linux only
     from pebble.selftest.report import make
 
     if file.exists():
         raise typer.BadParameter(f"{file} exists: name another file, or remove it")
+    if config is not None and not config.exists():
+        raise typer.BadParameter(f"{config} does not exist: name a robot's config file")
     made = make(Places(root.absolute()), None if config is None else config.absolute())
     write_new(file, made.packed())
     typer.echo(f"{file}: {', '.join(made.parts)}")

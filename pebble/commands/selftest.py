@@ -1,17 +1,16 @@
-"""``pebble selftest``: tests a robot that runs, end to end."""
+"""``pebble doctor --running``: tests a robot that runs, end to end."""
 
 import json
 import shlex
 import sys
 import textwrap
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import typer
 
 from pebble.check_result import CheckResult, State
 from pebble.commands.estop import me
-from pebble.commands.options import ConfigArgument, RootOption
 from pebble.config import load
 from pebble.config.secret_text import without_secrets
 from pebble.config.visible import shown
@@ -22,22 +21,8 @@ _COLOURS = {State.OK: typer.colors.GREEN, State.FAILED: typer.colors.RED, State.
 INDENT = " " * 9
 
 
-def selftest(
-    config: ConfigArgument,
-    may_move: Annotated[bool, typer.Option("--may-move", help="Ask, then also turn the wheels a little.")] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object instead.")] = False,
-    root: RootOption = Path("/"),
-) -> int:
-    """Test a robot that runs, end to end: on its own machine, as its user or root.
-
-    Without --may-move no wheel turns. The robot is stopped for a moment, by an emergency stop that is ended by its
-    name; not while a person or a script drives it, or another stop holds. Exits 1 if a check fails; each is printed
-    with what ends its failure.
-
-    \b
-        pebble selftest goob.json
-        pebble selftest goob.json --may-move
-    """
+def selftest(config: Path, root: Path, *, may_move: bool, as_json: bool) -> int:
+    """Print each check with what ends its failure; returns 1 if one failed."""
     from pebble.selftest.checks import CHECKS, MOVING, run  # of Linux only
     from pebble.selftest.robot import become_user_of, reached
 

@@ -1,4 +1,4 @@
-"""``pebble setup``: from a blank machine to a robot that runs; the same command restores, renames, moves and undoes."""
+"""``pebble setup``: from a blank machine to a robot that runs; it also backs up, restores, renames and undoes."""
 
 from pathlib import Path
 from typing import Annotated, Any
@@ -15,7 +15,10 @@ _Answers = Annotated[
 ]
 _Camera = Annotated[str | None, typer.Option(help="A device, libcamera, synthetic, or none.", metavar="CAMERA")]
 _BrokerPassword = Annotated[Path | None, typer.Option(help="File with that account's password.", metavar="FILE")]
-_From = Annotated[Path | None, typer.Option("--from", help="Restore a backup of `pebble backup`.", metavar="BACKUP")]
+_Backup = Annotated[
+    Path | None, typer.Option("--backup", help="Only pack what a new machine needs to be this robot.", metavar="FILE")
+]
+_From = Annotated[Path | None, typer.Option("--from", help="Restore a backup.", metavar="FILE")]
 _As = Annotated[str | None, typer.Option("--as", help="With --from: a second robot, of this name.", metavar="NAME")]
 _Purge = Annotated[
     bool, typer.Option("--purge", help="With --undo: erase also keys, people, state and what was changed by hand.")
@@ -36,6 +39,7 @@ def setup(
     page: Annotated[bool | None, typer.Option("--page/--no-page", help="The operator page, for phones.")] = None,
     user: Annotated[str | None, typer.Option(help="First user of the page.", metavar="NAME")] = None,
     password_file: Annotated[Path | None, typer.Option(help="File with the user's password.", metavar="FILE")] = None,
+    backup: _Backup = None,
     from_: _From = None,
     as_: _As = None,
     yes: Annotated[bool, typer.Option("--yes", help="Do it without asking.")] = False,
@@ -48,15 +52,24 @@ def setup(
 
     It asks six questions; what was done before stays as it is. With one other answer it changes what differs.
 
+    A backup has config, people, the stop, certificates, accounts and calibration, but no recordings. It holds
+    passwords and private keys, and only its owner can read it; nothing is overwritten. The robot may run meanwhile.
+
     \b
         sudo pebble setup
         pebble setup --dry-run --answers goob.answers.json
         sudo pebble setup --camera none              one other answer
         sudo pebble setup --id fred                  another name
+        sudo pebble setup --backup goob.tar
         sudo pebble setup --from goob.tar            after the SD card died
         sudo pebble setup --from goob.tar --as fred  a second robot
         sudo pebble setup --undo --purge             before it is given away
     """
+    places = Places(root.absolute())
+    if backup is not None:
+        from pebble.commands.backup import backup as write_backup  # of Linux only
+
+        return write_backup(backup, places)
     given: dict[str, Any] = {
         "id": robot, "port": port, "protocol": protocol, "baud": baud, "camera": camera,
         "broker": broker, "broker_user": broker_user, "broker_password_file": broker_password_file,
@@ -66,10 +79,10 @@ def setup(
     require_packages("pebble setup")
     from pebble.setup.session import Session  # of Linux only
 
-    session = Session(Places(root.absolute()), yes=yes, dry=dry_run)
+    session = Session(places, yes=yes, dry=dry_run)
     try:
         _together("--purge", purge, "--undo", undo)
-        _together("--as", as_, "--from BACKUP", from_)
+        _together("--as", as_, "--from FILE", from_)
         return session.undo(purge=purge) if undo else session.set_up(answers, given, from_, as_)
     except AnswersError as error:
         for line in str(error).splitlines():

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import tempfile
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
@@ -13,186 +14,124 @@ if TYPE_CHECKING:
     from pebble.config import Config
     from pebble.simulation.wireless import BrokerAddress
 
-_GROUP_HELP = """The real firmware of a robot's MCU on simulated pins.
+_SERIAL = ("goob", "fred", "goob_imu", "outlets")
+_WIFI = ("minilamp", "benjr")
+_NAMED = (*_WIFI, "world")
+#: The kinds that each option is for.
+_OF = {
+    "link": _SERIAL,
+    "charging": ("goob", "fred"),
+    "outlets": ("outlets",),
+    "unreachable": ("outlets",),
+    "broker": (*_WIFI, "fleet"),
+    "password_file": (*_WIFI, "fleet"),
+    "ca_cert": (*_WIFI, "fleet"),
+    "called": _WIFI,
+    "files": _WIFI,
+    "robots": ("fleet",),
+    "kinds": ("fleet",),
+    "seconds": ("fleet",),
+    "folder": ("world",),
+    "trace": (*_SERIAL, *_WIFI, "fleet", "world"),
+    "trace_output": _SERIAL,
+    "report": (*_SERIAL, *_WIFI, "world"),
+    "control": (*_SERIAL, "world"),
+}
 
-Goob's and Fred's is on a serial port, MiniLAMP's and BenJr's on Wi-Fi.
-
-\b
-    pebble sim goob --link /tmp/goob
-    pebble sim outlets --link /tmp/outlets
-    pebble sim minilamp --broker mqtt://127.0.0.1
-    pebble sim fleet --robots 200 --broker mqtt://127.0.0.1
-    pebble sim world world.json
-
-A loudspeaker that records what is played stands in for aplay.
-
-\b
-    pebble sim loudspeaker --record /tmp/played clip.wav
-"""
-_BROKER_HELP = "mqtt://[USER@]HOST[:PORT], mqtts://… or a robot's config file."
-
-_Link = Annotated[
-    Path | None, typer.Option("--link", help="Path of the serial port. [default: /tmp/pebble-…]", metavar="PATH")
-]
-_Charging = Annotated[bool, typer.Option("--charging", help="Start with the charger connected.")]
-_Broker = Annotated[str, typer.Option("--broker", "-b", help=_BROKER_HELP, metavar="URL", show_default=False)]
-_Id = Annotated[str | None, typer.Option("--id", help="The robot's id. [default: its kind]", metavar="ID")]
-
-
-def goob(link: _Link = None, charging: _Charging = False) -> int:
-    """Goob's motor MCU on a pseudo terminal, until Ctrl-C.
-
-    Set serial.port in the robot's config to the path of the link.
-
-    \b
-        pebble sim goob --link /tmp/goob
-    """
-    return _serial("goob", link, charging)
+Kind = Literal["goob", "fred", "goob_imu", "outlets", "minilamp", "benjr", "fleet", "world", "loudspeaker"]
 
 
-def fred(link: _Link = None, charging: _Charging = False) -> int:
-    """Fred's motor MCU on a pseudo terminal, until Ctrl-C.
-
-    Set serial.port in the robot's config to the path of the link.
-
-    \b
-        pebble sim fred --link /tmp/fred
-    """
-    return _serial("fred", link, charging)
-
-
-def goob_imu(link: _Link = None) -> int:
-    """Goob's IMU board on a pseudo terminal, until Ctrl-C.
-
-    Set serial.port of an instance in the config to the path of the link.
-
-    \b
-        pebble sim goob_imu --link /tmp/goob-imu
-    """
-    return _serial("goob_imu", link, False)
-
-
-def outlets(
-    link: _Link = None,
-    count: Annotated[int, typer.Option("--outlets", "-n", min=1, max=4, help="How many.")] = 4,
+def sim(
+    context: typer.Context,
+    kind: Annotated[Kind, typer.Argument(help="What to simulate.", metavar="KIND", show_default=False)],
+    name: Annotated[
+        str | None,
+        typer.Argument(help="A MiniLAMP's or BenJr's id, or a world's file.", metavar="[ID|FILE]", show_default=False),
+    ] = None,
+    link: Annotated[
+        Path | None, typer.Option(help="Path of the serial port. [default: /tmp/pebble-KIND]", metavar="PATH")
+    ] = None,
+    charging: Annotated[bool, typer.Option("--charging", help="Start with the charger connected.")] = False,
+    outlets: Annotated[int, typer.Option("--outlets", min=1, max=4, help="How many sockets.")] = 4,
     unreachable: Annotated[
+        list[str] | None, typer.Option(help="A socket without its relay: o4; repeatable.", metavar="oN")
+    ] = None,
+    broker: Annotated[
+        str | None,
+        typer.Option(
+            "--broker", "-b", help="mqtt://[USER@]HOST[:PORT], mqtts://… or the robot's config.", metavar="URL"
+        ),
+    ] = None,
+    called: Annotated[str, typer.Option("--name", help="What people call the robot.", metavar="TEXT")] = "",
+    files: Annotated[
+        Path | None, typer.Option(help="Folder for the files of the board, which survive it.", metavar="FOLDER")
+    ] = None,
+    robots: Annotated[int, typer.Option("--robots", "-n", min=1, help="How many robots a fleet has.")] = 10,
+    kinds: Annotated[
         list[str] | None,
-        typer.Option(help="An outlet without its relay: o4. May be given several times.", metavar="oN"),
+        typer.Option("--kind", help="Of the robots of a fleet; repeatable. [default: minilamp, benjr]"),
     ] = None,
-    trace: Annotated[Path | None, typer.Option(help="Append each change of a relay to this file.")] = None,
-) -> int:
-    """A station of switched sockets on a pseudo terminal, until Ctrl-C. It prints what each relay does.
-
-    Set serial.port of an instance in the config to the path of the link.
-
-    \b
-        pebble sim outlets --link /tmp/outlets
-        pebble sim outlets --outlets 2 --unreachable o2
-    """
-    options = ["--outlets", str(count), *(["--trace", str(trace)] if trace is not None else [])]
-    return _serial("outlets", link, False, *options, *(f"--unreachable={outlet}" for outlet in unreachable or ()))
-
-
-def minilamp(broker: _Broker, id_: _Id = None, password_file: PasswordFile = None, ca_cert: CaCert = None) -> int:
-    """A whole MiniLAMP on a real broker, until Ctrl-C.
-
-    \b
-        pebble sim minilamp --broker mqtt://127.0.0.1
-        pebble sim minilamp --broker minilamp.json
-    """
-    return _wireless("minilamp", id_, broker, password_file, ca_cert)
-
-
-def benjr(broker: _Broker, id_: _Id = None, password_file: PasswordFile = None) -> int:
-    """A whole BenJr on a real broker, until Ctrl-C.
-
-    \b
-        pebble sim benjr --broker mqtt://127.0.0.1 --id benjr-2
-    """
-    return _wireless("benjr", id_, broker, password_file, None)
-
-
-def fleet(
-    broker: _Broker,
-    robots: Annotated[int, typer.Option("--robots", "-n", min=1, help="How many.")] = 10,
-    kind: Annotated[
-        list[str] | None, typer.Option(help="May be given several times. [default: minilamp, benjr]")
+    seconds: Annotated[float | None, typer.Option("--seconds", "-s", min=1, help="End a fleet after this.")] = None,
+    folder: Annotated[
+        Path | None, typer.Option(help="For a world's serial ports. [default: /tmp/pebble-world-…]", metavar="FOLDER")
     ] = None,
-    seconds: Annotated[float | None, typer.Option("--seconds", "-s", min=1, help="End after this long.")] = None,
+    trace: Annotated[
+        Path | None,
+        typer.Option(help="File for what boards receive and motors do; of a world the folder.", metavar="PATH"),
+    ] = None,
+    trace_output: Annotated[bool, typer.Option("--trace-said", help="Also trace what the board sends.")] = False,
+    report: Annotated[bool, typer.Option("--report", help="Print the state as JSON, ten times a second.")] = False,
+    control: Annotated[bool, typer.Option("--control", help="Read commands, such as unplug, from stdin.")] = False,
     password_file: PasswordFile = None,
     ca_cert: CaCert = None,
 ) -> int:
-    """Many whole robots on a real broker, until Ctrl-C.
+    """Simulate a board, a robot, many robots or a room, until Ctrl-C. Boards run the firmware of the real ones.
 
-    Their ids are minilamp-001, benjr-001, minilamp-002 and so on. With --seconds it exits 0 only if all
-    were online at the end.
-
-    \b
-        pebble sim fleet --robots 200 --broker mqtt://127.0.0.1:1883
-        pebble sim fleet -n 3 --kind minilamp --broker mqtts://broker.lan --seconds 60
-    """
-    from pebble.simulation.fleet_program import FleetOptions, run
-    from pebble.simulation.wireless import KINDS
-
-    address = _address(broker, password_file, ca_cert)[0]
-    return run(FleetOptions(robots=robots, broker=address, kinds=kind or KINDS, seconds=seconds))
-
-
-def loudspeaker(
-    file: Annotated[str, typer.Argument(help="A WAV file, or - for raw sound from standard input.", metavar="FILE")],
-    record: Annotated[
-        Path | None, typer.Option(help="For events.jsonl and WAV files of what is played.", metavar="FOLDER")
-    ] = None,
-    exclusive: Annotated[
-        bool, typer.Option("--exclusive", help="Play one sound at a time, as a sound card without a mixer does.")
-    ] = False,
-    file_type: Annotated[str, typer.Option("-t", "--file-type", help="wav, or raw: signed 16-bit samples.")] = "wav",
-    format_: Annotated[str, typer.Option("-f", "--format", help="Of raw sound: S16_LE.")] = "S16_LE",
-    channels: Annotated[int, typer.Option("-c", "--channels", min=1, help="Of raw sound.")] = 1,
-    rate: Annotated[int, typer.Option("-r", "--rate", min=1, help="Of raw sound, in Hz.")] = 8000,
-    device: Annotated[str, typer.Option("-D", "--device", help="Not used.")] = "default",
-    quiet: Annotated[bool, typer.Option("-q", "--quiet", help="Not used.")] = False,
-) -> int:
-    """A loudspeaker that records: takes aplay's place as player_command of a robot without sound.
-
-    It plays in real time. Without --record it prints when a sound begins and ends, as JSON.
-    Robots start it faster as `python -m pebble.simulation.loudspeaker`, with the same options.
+    goob, fred, goob_imu and outlets are boards on a pseudo terminal: set serial.port in a robot's config to its link.
+    minilamp and benjr are whole robots on a real broker; fleet is many of them, minilamp-001, benjr-001 and so on, and
+    exits 0 only if all were online at the end. world is a room with walls and AprilTags, which robots' cameras see; it
+    prints what belongs in their configs. loudspeaker takes aplay's arguments, and with --record FOLDER records what is
+    played.
 
     \b
+        pebble sim goob --link /tmp/goob
+        pebble sim outlets --link /tmp/outlets --unreachable o4
+        pebble sim benjr benjr-2 --broker mqtt://127.0.0.1
+        pebble sim minilamp --broker minilamp.json
+        pebble sim fleet --robots 200 --broker mqtt://127.0.0.1
+        pebble sim world world.json
         pebble sim loudspeaker --record /tmp/played clip.wav
-        pebble sim loudspeaker -t raw -f S16_LE -c 1 -r 16000 - < sound.raw
     """
-    from pebble.simulation.loudspeaker import main
+    _check_options(context, kind)
+    if kind == "loudspeaker":
+        from pebble.simulation.loudspeaker import main
 
-    del quiet
-    options = [*(["--record", str(record)] if record is not None else []), *(["--exclusive"] if exclusive else [])]
-    raw = ["-t", file_type, "-f", format_, "-c", str(channels), "-r", str(rate), "-D", device]
-    return main([*options, *raw, file])
+        return main([word for word in (name, *context.args) if word is not None])
+    _check_words(kind, [word for word in (name, *context.args) if word is not None])
+    if kind == "world":
+        from pebble.simulation.world.program import ROOM
+        from pebble.simulation.world.program import run as run_world
 
+        return run_world(Path(name or ROOM), folder, trace=trace, report=report, control=control)
+    if kind in _SERIAL:
+        from pebble.simulation.mcu import run as run_mcu
 
-def world(
-    file: Annotated[
-        Path | None, typer.Argument(help="The world file. [default: a room with four tags]", metavar="FILE")
-    ] = None,
-    folder: Annotated[
-        Path | None,
-        typer.Option("--folder", help="For serial ports and traces. [default: /tmp/pebble-world-…]", metavar="PATH"),
-    ] = None,
-    trace: Annotated[bool, typer.Option("--trace", help="Record what the MCUs receive.")] = False,
-    control: Annotated[bool, typer.Option("--control", help="Read commands from standard input.")] = False,
-) -> int:
-    """Robots in a room with walls and AprilTags, which their cameras see, until Ctrl-C.
+        path = link or Path(tempfile.gettempdir(), f"pebble-{kind}")
+        if not report:
+            typer.echo(f"{kind} is at {path}; Ctrl-C ends it")
+        settings = {"outlets": outlets} if kind == "outlets" else None
+        return run_mcu(
+            kind, path, trace=trace, trace_output=trace_output, charging=charging, settings=settings,
+            unreachable=unreachable or (), report=report, control=control,
+        )  # fmt: skip
+    if broker is None:
+        raise typer.BadParameter(f"{kind} needs --broker URL")
+    address, config = _address(broker, password_file, ca_cert)
+    if kind == "fleet":
+        from pebble.simulation.fleet_program import run as run_fleet
 
-    It prints the serial port and the camera of each robot for its config.
-
-    \b
-        pebble sim world
-        pebble sim world world.json --folder /tmp/world
-    """
-    from pebble.simulation.world.program import ROOM, main
-
-    flags = [*(["--trace"] if trace else []), *(["--control"] if control else [])]
-    return main([str(file or ROOM), *(["--folder", str(folder)] if folder else []), *flags])
+        return run_fleet(address, robots, kinds, seconds=seconds, trace=trace)
+    return _wireless(kind, name, address, config, called, trace=trace, report=report, files=files)
 
 
 def demo(
@@ -233,28 +172,44 @@ def demo(
     return run(seconds, for_phones=phone)
 
 
-def _serial(kind: str, link: Path | None, charging: bool, *options: str) -> int:
-    import tempfile
-
-    from pebble.simulation.mcu import main
-
-    path = Path(tempfile.gettempdir(), f"pebble-{kind}") if link is None else link
-    typer.echo(f"{kind} is at {path}; Ctrl-C ends it")
-    return main(["--kind", kind, "--link", str(path), *(["--charging"] if charging else []), *options])
+def _check_options(context: typer.Context, kind: str) -> None:
+    """Raises BadParameter for an option of another kind."""
+    for parameter in context.command.params:
+        source = context.get_parameter_source(str(parameter.name))
+        if source is not None and source.name == "COMMANDLINE" and kind not in _OF.get(str(parameter.name), (kind,)):
+            raise typer.BadParameter(f"{kind} takes no {parameter.opts[0]}")
 
 
-def _wireless(kind: str, id_: str | None, broker: str, password_file: Path | None, ca_cert: Path | None) -> int:
+def _check_words(kind: str, words: list[str]) -> None:
+    """Raises BadParameter for an option that there is not, and for more words than this kind takes."""
+    for word in words:
+        if word.startswith("-"):
+            raise typer.BadParameter(f"there is no option {word}")
+    if len(words) > (kind in _NAMED):
+        raise typer.BadParameter(f"{kind} takes no {words[-1]}")
+
+
+def _wireless(
+    kind: str,
+    id_: str | None,
+    broker: BrokerAddress,
+    config: Config | None,
+    called: str,
+    *,
+    trace: Path | None,
+    report: bool,
+    files: Path | None,
+) -> int:
     from pebble.contract.identity import Identity
     from pebble.simulation.networked import run
 
-    address, config = _address(broker, password_file, ca_cert)
-    identity = Identity("pebble", "robots", id_ or kind)
+    identity, security = Identity("pebble", "robots", id_ or kind), None
     if config is not None:
-        identity = Identity(config.robot.system, config.robot.type, id_ or config.robot.id)
-    typer.echo(f"{identity} connects to the broker at {address}; Ctrl-C ends it")
-    if config is None:
-        return run(kind, identity, address)
-    return run(kind, identity, address, name=config.robot.name or "", security=config.security)
+        identity, security = Identity(config.robot.system, config.robot.type, id_ or config.robot.id), config.security
+        called = called or config.robot.name or ""
+    if not report:
+        typer.echo(f"{identity} connects to the broker at {broker}; Ctrl-C ends it")
+    return run(kind, identity, broker, name=called, security=security, trace=trace, report=report, files=files)
 
 
 def _address(broker: str, password_file: Path | None, ca_cert: Path | None) -> tuple[BrokerAddress, Config | None]:
@@ -296,7 +251,6 @@ def _address(broker: str, password_file: Path | None, ca_cert: Path | None) -> t
 
 
 def register(app: typer.Typer) -> None:
-    group = typer.Typer(help=_GROUP_HELP, rich_markup_mode=None)
-    for command in (goob, fred, goob_imu, outlets, minilamp, benjr, fleet, world, loudspeaker):
-        group.command(command.__name__)(command)
-    app.add_typer(group, name="sim")
+    others = {"ignore_unknown_options": True, "allow_extra_args": True}  # those of a loudspeaker
+    app.command("sim", context_settings=others)(sim)
+    app.command("demo")(demo)

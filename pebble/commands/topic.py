@@ -19,6 +19,7 @@ from pebble.client.names import Names, id_of
 from pebble.commands.draft import Draft, draft
 from pebble.commands.options import with_target
 from pebble.commands.terminal import show
+from pebble.commands.topic_contract import contract
 from pebble.config.visible import shown
 from pebble.contract import CHANNELS, DRIVE, ONLINE, codec
 from pebble.contract.identity import parse_topic
@@ -50,12 +51,13 @@ _GROUP_HELP = """List, print, publish and measure messages, on either transport.
     pebble topic echo online -c goob.json --remote
     pebble topic pub drive-values '{"z": 0.3}' -c goob.json --rate 10 -n 20
     pebble topic hz touch-sensors --url mqtt://127.0.0.1 -r fred
+    pebble topic contract
 """
 
 
 def register(app: typer.Typer) -> None:
     group = typer.Typer(help=_GROUP_HELP, rich_markup_mode=None)
-    for command in (list_, echo, pub, hz, bw):
+    for command in (list_, echo, pub, hz, contract):
         group.command(command.__name__.rstrip("_"))(command)
     app.add_typer(group, name="topic")
 
@@ -190,22 +192,26 @@ def pub(
 
 @with_target(robot=True)
 def hz(topic: Name, window: WindowOption = 100, seconds: SecondsOption = None, *, target: Target) -> int:
-    """Print once a second how often messages arrive. Retained messages do not count.
+    """Print once a second how often messages arrive, and how many payload bytes. Retained messages do not count.
 
     \b
         pebble topic hz online -c goob.json --remote
+        pebble topic hz front-camera --url mqtt://127.0.0.1 -r goob
     """
-    return _measure("hz", topic, window, seconds, target)
-
-
-@with_target(robot=True)
-def bw(topic: Name, window: WindowOption = 100, seconds: SecondsOption = None, *, target: Target) -> int:
-    """Print once a second how many payload bytes arrive per second. Retained messages do not count.
-
-    \b
-        pebble topic bw front-camera --url mqtt://127.0.0.1 -r goob
-    """
-    return _measure("bw", topic, window, seconds, target)
+    meter = RateMeter(window_s=math.inf, limit=window + 1)
+    with _connected(target) as (transport, names):
+        listener = Listener(transport, names.filters(topic))
+        end, report_at, reported = _end(seconds), time.monotonic() + _REPORT_PERIOD_S, 0
+        while time.monotonic() < end:
+            message = listener.next(min(end, report_at) - time.monotonic())
+            if message is not None and not message.retain:
+                meter.add(time.monotonic(), len(message.payload))
+            if time.monotonic() >= min(end, report_at):
+                report_at += _REPORT_PERIOD_S
+                _print_rate(meter, silent=meter.count == reported)
+                reported = meter.count
+        _warn_of_dropped(listener)
+    return 0 if meter.count else 1
 
 
 @contextmanager
@@ -217,26 +223,8 @@ def _connected(target: Target) -> Iterator[tuple[Transport, Names]]:
         yield transport, names
 
 
-def _measure(what: str, topic: str, window: int, seconds: float | None, target: Target) -> int:
-    meter = RateMeter(window_s=math.inf, limit=window + 1)
-    with _connected(target) as (transport, names):
-        listener = Listener(transport, names.filters(topic))
-        end, report_at, reported = _end(seconds), time.monotonic() + _REPORT_PERIOD_S, 0
-        while time.monotonic() < end:
-            message = listener.next(min(end, report_at) - time.monotonic())
-            if message is not None and not message.retain:
-                meter.add(time.monotonic(), len(message.payload))
-            if time.monotonic() >= min(end, report_at):
-                report_at += _REPORT_PERIOD_S
-                _print_rate(meter, what, silent=meter.count == reported)
-                reported = meter.count
-        _warn_of_dropped(listener)
-    return 0 if meter.count else 1
-
-
-def _print_rate(meter: RateMeter, what: str, *, silent: bool) -> None:
-    now = time.monotonic()
-    line = show.frequency_line(meter, now) if what == "hz" else show.bandwidth_line(meter, now)
+def _print_rate(meter: RateMeter, *, silent: bool) -> None:
+    line = show.rate_line(meter, time.monotonic())
     if silent or line is None:
         line = "no new messages" if meter.count != 1 else "one message so far"
     typer.echo(line)

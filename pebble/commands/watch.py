@@ -1,4 +1,4 @@
-"""``pebble watch`` and ``pebble snapshot``: receive a robot's pictures and sound, as an operator does."""
+"""``pebble watch``: receives a robot's pictures and sound, as an operator does."""
 
 from __future__ import annotations
 
@@ -44,6 +44,9 @@ def watch(
         Path | None,
         typer.Option(help="Write pictures and sound into this folder, even with a screen.", metavar="FOLDER"),
     ] = None,
+    picture: Annotated[
+        Path | None, typer.Option(help="Only write one picture into this file, PNG or JPEG.", metavar="FILE")
+    ] = None,
     password_file: PasswordFile = None,
     ca_cert: CaCert = None,
 ) -> int:
@@ -55,9 +58,15 @@ def watch(
     \b
         pebble watch goob.json
         pebble watch goob --url mqtt://127.0.0.1 --encoding h264 --seconds 10
+        pebble watch goob.json --picture front.png
     """
     from pebble.commands.terminal import screens
 
+    if picture is not None:
+        if out is not None or seconds is not None:
+            raise typer.BadParameter("--picture writes one picture, and ends: leave out --out and --seconds")
+        with interrupted_by_signals(), _receiver(robot, url, password_file, ca_cert) as receiver:
+            return _write_picture(receiver, encoding, picture)
     end = float("inf") if seconds is None else time.monotonic() + seconds
     with ExitStack() as stack:
         stack.enter_context(interrupted_by_signals())  # else the camera would continue without a viewer
@@ -73,32 +82,18 @@ def watch(
     return 0 if seen else 1
 
 
-def snapshot(
-    robot: RobotArgument,
-    file: Annotated[Path, typer.Argument(help="PNG or JPEG to write.", metavar="FILE", show_default=False)],
-    url: UrlOption = None,
-    encoding: EncodingOption = None,
-    password_file: PasswordFile = None,
-    ca_cert: CaCert = None,
-) -> int:
-    """Write one picture of a robot's camera into a file.
-
-    \b
-        pebble snapshot goob.json front.png
-        pebble snapshot goob front.png --url mqtt://127.0.0.1
-    """
+def _write_picture(receiver: MediaReceiver, encoding: str | None, file: Path) -> int:
     from pebble.commands.terminal.screens import save_picture
 
-    with interrupted_by_signals(), _receiver(robot, url, password_file, ca_cert) as receiver:
-        receiver.request(encoding, sound=False)
-        end = time.monotonic() + _FIRST_PICTURE_S
-        while receiver.newest is None:
-            if time.monotonic() > end:
-                raise PebbleError(f"no picture came from {receiver.name} within {_FIRST_PICTURE_S:.0f} s")
-            receiver.poll()
-            time.sleep(_TICK_S)
-        save_picture(receiver.newest.picture, file)
-        height, width = receiver.newest.picture.shape[:2]
+    receiver.request(encoding, sound=False)
+    end = time.monotonic() + _FIRST_PICTURE_S
+    while receiver.newest is None:
+        if time.monotonic() > end:
+            raise PebbleError(f"no picture came from {receiver.name} within {_FIRST_PICTURE_S:.0f} s")
+        receiver.poll()
+        time.sleep(_TICK_S)
+    save_picture(receiver.newest.picture, file)
+    height, width = receiver.newest.picture.shape[:2]
     typer.echo(f"{file}: {width}×{height}")
     return 0
 

@@ -1,4 +1,4 @@
-"""The file of ``pebble gateway``: where robots are, the MQTT broker of their operators, and which robots."""
+"""The file of ``pebble fleet gateway``: where robots are, the MQTT broker of their operators, and which robots."""
 
 import os
 from collections.abc import Mapping

@@ -1,4 +1,4 @@
-"""The file of ``pebble hub``: a Zenoh hub for several robots, on a machine of its own."""
+"""The file of ``pebble fleet hub``: a Zenoh hub for several robots, on a machine of its own."""
 
 import os
 from collections.abc import Mapping

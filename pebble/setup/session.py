@@ -145,7 +145,7 @@ class Session:
         """The exit code of the self-test of the robot that now runs; None: it is not started by this machine."""
         if not engine.is_live or wanted.machine.systemd or wanted.machine.unit:
             return None
-        command = [sys.executable, "-m", "pebble", "selftest", str(self.places.config)]
+        command = [sys.executable, "-m", "pebble", "doctor", str(self.places.config), "--running"]
         return subprocess.run(command, check=False).returncode
 
     # -- the end
@@ -160,7 +160,7 @@ class Session:
             could_not.append(f"{self.places.root} is not the system that runs, so not: {'; '.join(skipped)}")
         could_not += [*self.notes, *wanted.machine.lacks()]
         if checked:
-            could_not.append(f"pebble selftest ended with {checked}: pebble selftest {self.places.config}")
+            could_not.append(f"the self-test ended with {checked}: pebble doctor {self.places.config} --running")
         _block("Done", [f"{done} steps that were new, see above" if done else "nothing: all was so before"])
         _block("Could not", could_not or ["nothing"])
         _block("Next", self._next(wanted))

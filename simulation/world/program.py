@@ -1,6 +1,5 @@
 """A simulated world as a program: the MCUs of its robots behind pseudo terminals, and their poses for their cameras."""
 
-import argparse
 import math
 import os
 import select
@@ -16,7 +15,7 @@ from typing import Any, Final
 
 import msgspec
 
-from pebble.errors import ConfigError, DeviceError, PebbleError
+from pebble.errors import ConfigError, DeviceError
 from pebble.media.world.pose_page import PERIOD_S, PosePage, page_path
 from pebble.media.world.poses import RobotPose
 from pebble.media.world.world_file import World, read_world
@@ -35,23 +34,40 @@ Mcus = dict[str, PtyMcu]
 
 
 class Snapshot(msgspec.Struct, frozen=True):
-    """A line of ``--report``: one JSON object, ten times a second. ``ns`` is time.monotonic_ns()."""
+    """A line of a report: one JSON object, ten times a second. ``ns`` is time.monotonic_ns()."""
 
     ns: int
     robots: dict[str, BoardState]
 
 
-def main(arguments: list[str] | None = None) -> int:
-    """Run until a signal, or with ``--control`` until standard input ends."""
-    options = _parser().parse_args(arguments)
+def run(
+    file: Path, folder: Path | None = None, *, trace: Path | None = None, report: bool = False, control: bool = False
+) -> int:
+    """Run until a signal, or with ``control`` until standard input ends. Raises PebbleError.
+
+    ``folder`` is for serial ports, ``trace`` for what MCUs receive, ROBOT.trace.jsonl. ``report``: write a
+    :class:`Snapshot` to standard output ten times a second.
+    """
+    end, path = EndRequest(), file.absolute()
+    world = _read(path)
+    folder = folder or Path(tempfile.gettempdir(), f"pebble-world-{path.stem}")
     try:
-        return _run(options, EndRequest())
-    except PebbleError as error:
-        sys.stderr.write(f"{error}\n")
-        return 1
+        folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        sys.stderr.write(f"{error.filename}: {error.strerror}\n")
-        return 1
+        raise DeviceError(f"{error.filename}: {error.strerror}") from None
+    with ExitStack() as stack:
+        page = _page(path, world)
+        stack.callback(page.close)
+        floor = Floor(world)
+        motions = {name: RobotMotion(start_pose(world, name), floor.mover(name)) for name in world.robots}
+        mcus = {name: stack.enter_context(mcu) for name, mcu in _mcus(world, motions, folder, trace).items()}
+        imus = {name: stack.enter_context(imu) for name, imu in _imus(world, motions, folder).items()}
+        if not report:
+            _write(_introduction(path, mcus, imus))
+        if control:
+            threading.Thread(target=_run_commands, args=(mcus, end), name="pebble-world control", daemon=True).start()
+        _publish_poses(page, mcus, end, report=report)
+    return 0
 
 
 class EndRequest:
@@ -85,28 +101,8 @@ def imu_port_path(folder: Path, robot: str) -> Path:
 
 
 def trace_path(folder: Path, robot: str) -> Path:
-    """What ``--trace`` records of a robot's MCU."""
+    """The file for what a robot's MCU receives."""
     return folder / f"{robot}.trace.jsonl"
-
-
-def _run(options: argparse.Namespace, end: EndRequest) -> int:
-    path = options.file.absolute()
-    world = _read(path)
-    folder = options.folder or Path(tempfile.gettempdir(), f"pebble-world-{path.stem}")
-    folder.mkdir(parents=True, exist_ok=True)
-    with ExitStack() as stack:
-        page = _page(path, world)
-        stack.callback(page.close)
-        floor = Floor(world)
-        motions = {name: RobotMotion(start_pose(world, name), floor.mover(name)) for name in world.robots}
-        mcus = {name: stack.enter_context(mcu) for name, mcu in _mcus(world, motions, folder, options).items()}
-        imus = {name: stack.enter_context(imu) for name, imu in _imus(world, motions, folder).items()}
-        if not options.report:
-            _write(_introduction(path, mcus, imus))
-        if options.control:
-            threading.Thread(target=_run_commands, args=(mcus, end), name="pebble-world control", daemon=True).start()
-        _publish_poses(page, mcus, end, report=options.report)
-    return 0
 
 
 def _read(path: Path) -> World:
@@ -126,14 +122,12 @@ def _page(path: Path, world: World) -> PosePage:
         raise DeviceError(f"{path}: {error}") from None
 
 
-def _mcus(world: World, motions: Mapping[str, RobotMotion], folder: Path, options: argparse.Namespace) -> Mcus:
+def _mcus(world: World, motions: Mapping[str, RobotMotion], folder: Path, trace: Path | None) -> Mcus:
     return {
         name: PtyMcu(
             place.kind,
             port_path(folder, name),
-            trace=trace_path(folder, name) if options.trace else None,
-            trace_output=options.trace_output,
-            failsafe_s=options.failsafe,
+            trace=trace_path(trace, name) if trace else None,
             motion=motions[name],
         )
         for name, place in world.robots.items()
@@ -202,7 +196,7 @@ def _run_commands(mcus: Mcus, end: EndRequest) -> None:
 
 
 def _command(mcus: Mcus, words: list[str]) -> str:
-    """Execute one line of ``--control``; returns what is wrong with it."""
+    """Execute one line of standard input; returns what is wrong with it."""
     if len(words) < 2 or words[0] not in mcus:
         return f"begin with a robot ({', '.join(mcus)}) and a command"
     mcu, command, arguments = mcus[words[0]], words[1], words[2:]
@@ -218,25 +212,3 @@ def _command(mcus: Mcus, words: list[str]) -> str:
     except ValueError:
         return "place needs three numbers: metres, metres, degrees"
     return ""
-
-
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(prog="python -m pebble.simulation.world", description=__doc__)
-    parser.add_argument("file", type=Path, nargs="?", default=ROOM, metavar="FILE", help="the world file")
-    parser.add_argument("--folder", type=Path, help="for serial ports and traces; by default a temporary one")
-    parser.add_argument(
-        "--trace", action="store_true", help="record every line that an MCU received, ROBOT.trace.jsonl"
-    )
-    parser.add_argument(
-        "--trace-said", dest="trace_output", action="store_true", help="also the lines of the MCUs that hosts received"
-    )
-    parser.add_argument(
-        "--failsafe", type=float, metavar="S", help="stop after this silence, instead of the firmware's own"
-    )
-    parser.add_argument("--report", action="store_true", help="write all states to standard output at 10 Hz")
-    parser.add_argument(
-        "--control",
-        action="store_true",
-        help="read from standard input: ROBOT and unplug, replug, reset, charge, discharge, or place X Y DEGREES",
-    )
-    return parser

@@ -16,7 +16,8 @@ from pebble.commands import app
 from tests.commands.command_line import Run, config_file, program, running
 from tests.support import ROOT, free_port, some, until
 
-GROUP = ("list", "echo", "pub", "hz", "bw")
+NAMES = [tuple(words.split()) for rows in app.COMMANDS.values() for words in rows]
+TOPIC = [("topic", name) for name in ("list", "echo", "pub", "hz", "contract")]
 
 
 def test_a_command_leaves_logging_as_it_was(run: Run) -> None:
@@ -36,7 +37,7 @@ def test_the_package_runs_as_the_command_does() -> None:
     assert (package.returncode, package.stdout, package.stderr) == (command.returncode, command.stdout, command.stderr)
 
 
-@pytest.mark.parametrize("command", [(name,) for name in app.COMMANDS] + [("topic", name) for name in GROUP])
+@pytest.mark.parametrize("command", NAMES + TOPIC)
 def test_every_command_explains_itself_with_an_example(run: Run, command: tuple[str, ...]) -> None:
     assert run(*command, "--help") == 0
     assert f"\n      pebble {command[0]}" in run.out
@@ -44,11 +45,39 @@ def test_every_command_explains_itself_with_an_example(run: Run, command: tuple[
     assert run.err == ""
 
 
-@pytest.mark.parametrize("arguments", [(), ("--help",), ("topic",)])
-def test_without_a_command_the_commands_are_listed(run: Run, arguments: tuple[str, ...]) -> None:
+@pytest.mark.parametrize("arguments", [(), ("--help",)])
+def test_all_commands_are_listed_on_one_screen(run: Run, arguments: tuple[str, ...]) -> None:
     assert run(*arguments) == 0
+    usage, *lines = run.out.splitlines()
+    assert [line[9:20].rstrip() for line in lines] == [name for name, *below in NAMES if not below]
+    assert [line.split()[0] for line in lines if line[0] != " "] == ["use", "own", "write", "share", "measure"]
+    assert len(lines) == 22, "and the usage and a prompt: 24 lines"
+    assert max(map(len, (usage, *lines))) <= 80
+
+
+@pytest.mark.parametrize("group", ["topic", "fleet", "web user"])
+def test_a_group_without_a_command_lists_those_below_it(run: Run, group: str) -> None:
+    assert run(*group.split()) == 0
     assert "Commands:" in run.out
     assert max(map(len, run.out.splitlines())) <= 80
+
+
+@pytest.mark.parametrize(("former", "now"), app.FORMER.items())
+def test_a_former_name_is_one_line_with_the_new_one(run: Run, former: str, now: str) -> None:
+    assert run(*former.split(), "goob.json", "--help") == 2
+    assert run.out == ""
+    help_ = f"pebble {now.partition(' --')[0]} --help"
+    assert run.err == f'pebble: "{former}" is now "{now}": {help_}\n'
+
+
+def test_a_command_imports_no_other() -> None:
+    code = (
+        "import sys; from pebble import cli; sys.argv = ['pebble', *sys.argv[1:]]; cli.main();"
+        "print(sorted(name for name in sys.modules if name.startswith('pebble.commands.')))"
+    )
+    for words, commands in (("--help", "app"), ("up --help", "app options up")):
+        done = subprocess.run([sys.executable, "-c", code, *words.split()], cwd=ROOT, capture_output=True, text=True)
+        assert done.stdout.splitlines()[-1] == str([f"pebble.commands.{name}" for name in commands.split()])
 
 
 @pytest.mark.parametrize(
@@ -56,8 +85,16 @@ def test_without_a_command_the_commands_are_listed(run: Run, arguments: tuple[st
     [
         (("flyy",), "flyy", "pebble --help"),
         (("up",), "CONFIG", "pebble up --help"),
-        (("topics", "--bad"), "--bad", "pebble topics --help"),
+        (("topic", "contract", "--bad"), "--bad", "pebble topic contract --help"),
         (("sim", "bob"), "bob", "pebble sim --help"),
+        (("sim", "minilamp"), "--broker URL", "pebble sim --help"),
+        (("sim", "goob", "--outlets", "2"), "goob takes no --outlets", "pebble sim --help"),
+        (("sim", "goob", "spot"), "goob takes no spot", "pebble sim --help"),
+        (("sim", "world", "--lnk", "/tmp"), "no option --lnk", "pebble sim --help"),
+        (("doctor", "--running"), "which robot", "pebble doctor --help"),
+        (("doctor", "--running", "--report", "a.zip"), "--running or --report", "pebble doctor --help"),
+        (("doctor", "goob.json", "--may-move"), "--may-move is for --running", "pebble doctor --help"),
+        (("watch", "goob.json", "--picture", "a.png", "--out", "."), "leave out --out", "pebble watch --help"),
         (("topic", "pub", "drive-values"), "PAYLOAD", "pebble topic pub --help"),
         (("topic", "pub", "drive-values", "{}", "--qos", "2"), "qos", "pebble topic pub --help"),
     ],
@@ -88,7 +125,7 @@ def test_a_wrong_command_line_is_one_line_and_exit_code_2(
             "--password-file: No such file",
         ),
         (("topic", "list", "--url", "mqtt://127.0.0.1:1"), "127.0.0.1:1"),
-        (("topics", "--base", "a/b"), "a/b"),
+        (("topic", "contract", "--base", "a/b"), "a/b"),
     ],
 )
 def test_what_cannot_be_done_is_one_line_and_exit_code_1(run: Run, arguments: tuple[str, ...], named: str) -> None:
@@ -140,7 +177,7 @@ def test_a_reader_that_goes_away_is_no_error() -> None:
     fcntl.fcntl(write, fcntl.F_SETPIPE_SZ, 4096)
     # Unbuffered, Python itself would lose what a broken pipe did not accept, without an error.
     env = {name: value for name, value in os.environ.items() if name != "PYTHONUNBUFFERED"}
-    process = program("topics", "--json", stdout=write, env=env)
+    process = program("topic", "contract", "--json", stdout=write, env=env)
     os.close(write)
     assert os.read(read, 1) == b"["
     os.close(read)

@@ -40,8 +40,8 @@ class Lamp:
         self._transport = create("mqtt", "observer", MqttSettings(host="127.0.0.1", port=broker.port)).open()
         self.capabilities = threading.Event()
         self._transport.subscribe(f"{BASE}/#", self._take)
-        command = [*(sys.executable, "-m", "pebble.simulation.networked"), *("--kind", "minilamp")]
-        address = [*("--broker", f"127.0.0.1:{broker.port}"), *("--trace", str(self._trace))]
+        command = [sys.executable, "-m", "pebble.cli", "sim", "minilamp"]
+        address = [*("--broker", f"mqtt://127.0.0.1:{broker.port}"), *("--trace", str(self._trace))]
         self._process = Child([*command, *address], cwd=ROOT, stderr=subprocess.DEVNULL)
         assert self.capabilities.wait(20)
 

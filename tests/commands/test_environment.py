@@ -70,7 +70,7 @@ OUTPUTS = [">/dev/full", "2>/dev/full", ">/dev/full 2>&1", "| true"]
 
 
 @pytest.mark.parametrize(
-    ("words", "outputs"), some(product([*COMMANDS, ["--help"], ["topics"], ["nonsense"]], OUTPUTS), 5)
+    ("words", "outputs"), some(product([*COMMANDS, ["--help"], ["topic", "contract"], ["nonsense"]], OUTPUTS), 5)
 )
 def test_an_output_that_is_full_or_gone_ends_a_command_in_order(config: Path, words: list[str], outputs: str) -> None:
     command = [sys.executable, "-m", "pebble.cli", *words, *([str(config)] if words in COMMANDS else [])]

@@ -1,4 +1,4 @@
-"""`pebble gateway`: files that are none."""
+"""`pebble fleet gateway`: files that are none."""
 
 from __future__ import annotations
 
@@ -51,5 +51,5 @@ def test_it_is_called_as_its_account_unless_it_has_an_id(tmp_path: Path) -> None
     ],
 )
 def test_a_file_that_cannot_work_is_refused(run: Run, tmp_path: Path, settings: dict[str, Any], complaint: str) -> None:
-    assert run("gateway", str(gateway_file(tmp_path, **settings))) == 1
+    assert run("fleet", "gateway", str(gateway_file(tmp_path, **settings))) == 1
     assert complaint in run.err

@@ -1,4 +1,4 @@
-"""`pebble hub`: two hubs that are linked, what they tell of themselves, and files that are none."""
+"""`pebble fleet hub`: two hubs that are linked, what they tell of themselves, and files that are none."""
 
 from __future__ import annotations
 
@@ -22,16 +22,16 @@ def test_linked_hubs_show_each_other(run: Run, tmp_path: Path) -> None:
     one, two = (f"tcp/127.0.0.1:{free_port()}" for _ in range(2))
     first = hub_file(tmp_path, "a", listen=[one], journal="a.journal")
     second = hub_file(tmp_path, "b", listen=[two], connect=[one])
-    with running("hub", str(first)), running("hub", str(second)):
+    with running("fleet", "hub", str(first)), running("fleet", "hub", str(second)):
 
         def state() -> list[str]:
-            run("hub", str(first), "--state")
+            run("fleet", "hub", str(first), "--state")
             return run.out.splitlines()
 
         assert until(lambda: len(state()) == 2 and all("linked to no" not in line for line in state()), 20)
         assert all("0 clients, 0 wills" in line for line in state())
-    assert run("hub", str(first), "--state") == 1
-    assert run.err == f"pebble: no hub runs with {first}: start it with `pebble hub {first}`\n"
+    assert run("fleet", "hub", str(first), "--state") == 1
+    assert run.err == f"pebble: no hub runs with {first}: start it with `pebble fleet hub {first}`\n"
 
 
 @pytest.mark.parametrize(
@@ -44,5 +44,5 @@ def test_linked_hubs_show_each_other(run: Run, tmp_path: Path) -> None:
     ],
 )
 def test_a_file_that_cannot_work_is_refused(run: Run, tmp_path: Path, settings: dict[str, Any], complaint: str) -> None:
-    assert run("hub", str(hub_file(tmp_path, "hub", **settings))) == 1
+    assert run("fleet", "hub", str(hub_file(tmp_path, "hub", **settings))) == 1
     assert complaint in run.err

@@ -70,7 +70,8 @@ def manager(broker: Broker) -> Iterator[Manager]:
 def test_it_lists_scripts_and_their_options(run: Run, config: Path, manager: Manager) -> None:
     assert run("script", "list", config) == 0, run.err
     assert [line.strip().split("  ")[0] for line in run.out.splitlines()] == [
-        "follow: Follow a tag", "--tag-id INT", "--speed ENUM", "[--search | --no-search]", "--size-m FLOAT"
+        "follow: Follow a tag", "--tag-id INT", "--speed ENUM", "[--search | --no-search]", "--size-m FLOAT",
+        "no script runs",
     ]  # fmt: skip
     assert "(min 0; max 34; default: 13)" in run.out
     assert "(slow, fast; default: slow)" in run.out
@@ -114,13 +115,13 @@ def test_a_refused_start_is_an_error_even_if_the_script_runs_already(run: Run, c
     assert run.err == f"pebble: {error}\n"
 
 
-def test_status_exits_1_if_nothing_runs(run: Run, config: Path, manager: Manager) -> None:
+def test_the_list_ends_with_what_runs(run: Run, config: Path, manager: Manager) -> None:
     manager.publish(AutonomyStatus(running=False, timestamp=2.0, error="follow exited with code 3"))
-    assert run("script", "status", config) == 1
-    assert run.out == "no script runs\nerror: follow exited with code 3\n"
+    assert run("script", "list", config) == 0
+    assert run.out.splitlines()[-2:] == ["no script runs", "error: follow exited with code 3"]
     manager.publish(AutonomyStatus(running=True, timestamp=2.0, file="follow", pid=4, overridden=True))
-    assert run("script", "status", config) == 0
-    assert run.out == "follow runs (process 4), but a person drives: it waits\n"
+    assert run("script", "list", config) == 0
+    assert run.out.splitlines()[-1] == "follow runs (process 4), but a person drives: it waits"
 
 
 def test_an_unknown_script_is_named(run: Run, config: Path, manager: Manager) -> None:

@@ -55,8 +55,7 @@ def test_a_thin_link_is_listed() -> None:
 
 def test_rates() -> None:
     meter = RateMeter(window_s=math.inf, limit=11)
-    assert show.frequency_line(meter, 0.0) is None
+    assert show.rate_line(meter, 0.0) is None
     for number in range(50):
         meter.add(number * 0.25, 100)
-    assert str(show.frequency_line(meter, 99.0)).startswith("4.000 Hz  min 0.2500 s  max 0.2500 s")
-    assert str(show.bandwidth_line(meter, 99.0)).startswith("400 B/s (3.2 kbit/s)  mean 100 B")
+    assert str(show.rate_line(meter, 99.0)).startswith("4.000 Hz  3.2 kbit/s  min 0.2500 s  max 0.2500 s")

@@ -91,7 +91,7 @@ class Walk:
             _, file = fleet(f"certificate {name} 127.0.0.1")
             other = [one for one in connect if not one.endswith(str(port))] if name == "hub1" else []
             file |= {"listen": [f"tls/127.0.0.1:{port}"], "connect": other}
-            self._machine(name, file, "hub {}")
+            self._machine(name, file, "fleet hub {}")
         _, fred = fleet("certificate fred")
         fred["services"]["mqtt_bridge"]["remote"]["connect"] = connect
         fleet("certificate ann")

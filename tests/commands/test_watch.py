@@ -28,9 +28,9 @@ def config(tmp_path: Path) -> Iterator[Path]:
     broker.stop()
 
 
-def test_a_snapshot_is_of_the_local_camera(run: Run, config: Path) -> None:
+def test_a_picture_is_of_the_local_camera(run: Run, config: Path) -> None:
     file = config.with_name("view.png")
-    assert run("snapshot", config, file) == 0, run.err
+    assert run("watch", config, "--picture", file) == 0, run.err
     assert run.out == f"{file}: {WIDTH}×{HEIGHT}\n"
     assert run.err == f"pebble: {config} names no remote broker: this machine's camera, without sound\n"
     picture = cv2.imread(str(file))

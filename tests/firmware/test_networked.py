@@ -17,6 +17,8 @@ from typing import Any
 import msgspec
 import pytest
 
+from pebble.commands import app
+from pebble.errors import PebbleError
 from pebble.simulation import networked
 from pebble.simulation.mcu import Snapshot
 from pebble.simulation.trace import read_trace
@@ -35,7 +37,7 @@ class Program:
     def __init__(self, folder: Path, kind: str, broker: str, *options: str, **environment: str) -> None:
         self._files = folder / f"{kind}.out", folder / f"{kind}.err"
         out, err = (path.open("wb") for path in self._files)
-        command = [sys.executable, "-m", "pebble.simulation.networked", "--kind", kind, "--broker", broker, *options]
+        command = [sys.executable, "-m", "pebble.cli", "sim", kind, "--broker", f"mqtt://{broker}", *options]
         with out, err:
             self.process = Child(
                 command, cwd=ROOT, stdin=subprocess.DEVNULL, stdout=out, stderr=err, env={**os.environ, **environment}
@@ -83,10 +85,7 @@ def test_both_are_driven_report_their_state_and_end_at_once_by_a_signal_with_mot
 ) -> None:
     address = f"127.0.0.1:{broker.port}"
     traces = {kind: tmp_path / f"{kind}.jsonl" for kind in KINDS}
-    programs = {
-        kind: start(kind, address, "--id", kind, "--name", NAME, "--report", "--trace", str(traces[kind]))
-        for kind in KINDS
-    }
+    programs = {kind: start(kind, address, "--name", NAME, "--report", "--trace", str(traces[kind])) for kind in KINDS}
 
     def motors(kind: str) -> list[Any]:
         return [entry.motors for entry in read_trace(traces[kind])]
@@ -147,8 +146,8 @@ class Running:
         self._threads: list[Thread] = []
 
     def start(self, kind: str, broker: str, *options: str) -> None:
-        arguments = ["--kind", kind, "--broker", broker, *options]
-        self._threads.append(Thread(target=networked.main, args=(arguments,), daemon=True))
+        arguments = ["sim", kind, "--broker", broker, *options]
+        self._threads.append(Thread(target=app.run, args=(arguments,), daemon=True))
         self._threads[-1].start()
 
     @property
@@ -171,7 +170,7 @@ def running(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str])
 
 def test_a_broker_that_is_not_there_is_named_and_waited_for(running: Running, tmp_path: Path) -> None:
     port = free_port()
-    running.start("minilamp", f"localhost:{port}")
+    running.start("minilamp", f"mqtt://localhost:{port}")
     wanted = f"minilamp: cannot reach the broker at localhost:{port}: Connection refused; it keeps trying"
     assert until(lambda: wanted in running.err, 15), running.err
     broker = Broker(tmp_path, port=port)
@@ -188,10 +187,10 @@ def test_a_login_that_is_refused_is_named(running: Running, monkeypatch: pytest.
     wrong.write_text("wrong")
     monkeypatch.setenv("PEBBLE_PASSWORD", "right")
     broker = Broker(tmp_path, "allow_anonymous false", f"password_file {passwords}")
-    address = f"127.0.0.1:{broker.port}"
+    address = f"mqtt://ann@127.0.0.1:{broker.port}"
     try:
-        running.start("benjr", address, "--username", "ann", "--password-file", str(wrong))
-        running.start("minilamp", address, "--username", "ann")
+        running.start("benjr", address, "--password-file", str(wrong))
+        running.start("minilamp", address)
         assert until(lambda: "minilamp: connected to" in running.err, 15), running.err
         assert until(lambda: "benjr: cannot reach" in running.err, 15), running.err
         assert "refused" in running.err
@@ -203,7 +202,7 @@ def test_tls(running: Running, tmp_path: Path) -> None:
     broker = Broker(tmp_path, f"certfile {TLS / 'server.crt'}", f"keyfile {TLS / 'server.key'}")
     try:
         for name, ca in (("trusting", "ca.crt"), ("doubting", "other-ca.crt")):
-            running.start("minilamp", f"localhost:{broker.port}", "--id", name, "--ca", str(TLS / ca))
+            running.start("minilamp", f"mqtts://localhost:{broker.port}", name, "--ca-cert", str(TLS / ca))
         assert until(lambda: "connected to" in running.err, 20), running.err
         assert until(lambda: "cannot reach" in running.err, 20), running.err
         assert "CERTIFICATE_VERIFY_FAILED" in running.err
@@ -214,18 +213,19 @@ def test_tls(running: Running, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("options", "named"),
     [
-        (("minilamp", "127.0.0.1:port"), "--broker"),
-        (("minilamp", "127.0.0.1", "--id", "a/b"), "robot.id"),
-        (("minilamp", "127.0.0.1", "--username", "ann", "--password-file", "/nowhere"), "--password-file"),
-        (("minilamp", "127.0.0.1", "--ca", "/nowhere"), "/nowhere"),
-        (("benjr", "127.0.0.1", "--tls"), "memory"),
+        (("minilamp", "mqtt://127.0.0.1:port"), "--broker"),
+        (("minilamp", "mqtt://127.0.0.1", "a/b"), "robot.id"),
+        (("minilamp", "mqtt://ann@127.0.0.1", "--password-file", "/nowhere"), "--password-file"),
+        (("minilamp", "mqtts://127.0.0.1", "--ca-cert", "/nowhere"), "/nowhere"),
+        (("benjr", "mqtts://127.0.0.1"), "memory"),
     ],
 )
-def test_what_makes_no_sense_is_one_line(running: Running, options: tuple[str, ...], named: str) -> None:
+def test_what_makes_no_sense_is_one_line(options: tuple[str, ...], named: str) -> None:
     kind, broker, *more = options
-    assert networked.main(["--kind", kind, "--broker", broker, *more]) == 1
-    assert named in running.err
-    assert len(running.err.splitlines()) == 1
+    with pytest.raises(PebbleError) as error:
+        app.run(["sim", kind, "--broker", broker, *more])
+    assert named in str(error.value)
+    assert len(str(error.value).splitlines()) == 1
 
 
 def test_firmware_that_fails_stops_its_motors_and_boots_anew(broker: Broker) -> None:
@@ -245,7 +245,7 @@ def test_firmware_that_fails_stops_its_motors_and_boots_anew(broker: Broker) -> 
 
 
 def test_two_drivers_of_a_board_and_only_the_key_of_now_moves_it(start: Any, broker: Broker) -> None:
-    program = start("benjr", f"127.0.0.1:{broker.port}", "--id", "benjr", "--report")
+    program = start("benjr", f"127.0.0.1:{broker.port}", "--report")
     base = "pebble/robots/benjr"
 
     def state() -> dict[str, Any]:

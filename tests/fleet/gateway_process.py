@@ -1,4 +1,4 @@
-"""`pebble gateway` in a forked process."""
+"""`pebble fleet gateway` in a forked process."""
 
 from __future__ import annotations
 

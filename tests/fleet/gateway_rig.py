@@ -65,7 +65,7 @@ class Robot:
 
 
 class Process:
-    """`pebble gateway FILE`, through a proxy on each side, unless it is not ``proxied``."""
+    """`pebble fleet gateway FILE`, through a proxy on each side, unless it is not ``proxied``."""
 
     def __init__(self, folder: Path, name: str, hub: int, broker: int, *, proxied: bool) -> None:
         self.name = name

@@ -95,7 +95,7 @@ def test_a_command_through_a_gateway(stack: ExitStack, folder: Path) -> None:
     }
     endpoint = start_hub(hub, folder, **accounts)
     file.write_text(json.dumps({"id": "gate-1", "hub": at_hub(endpoint, folder, "gate-1"), "mqtt": at_broker}))
-    gate.start(python("pebble.cli", "gateway", file))
+    gate.start(python("pebble.cli", "fleet", "gateway", file))
     of_robot = {**at_hub(endpoint, folder, "r0"), "run_dir": str(folder / "robot"), "base": BASE}
     robots = start_far(robot, "receive", of_robot, COUNT), start_far(beside, "receive", at_broker, COUNT)
     for one in robots:

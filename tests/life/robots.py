@@ -39,8 +39,8 @@ class Robot:
     def plug_in(self) -> None:
         """Start the board; its port is the robot's user's, as a serial port is group dialout's."""
         unit = ("--unit=board", "--uid=pebble", "--gid=pebble", *FOLDERS)
-        board = ("-m", "pebble.simulation.mcu", "--kind", "goob", "--link", PORT, "--trace", TRACE)
-        self.machine.run("systemd-run", "--quiet", *unit, "--", "/opt/pebble/a/bin/python3", *board)
+        board = ("sim", "goob", "--link", PORT, "--trace", TRACE)
+        self.machine.run("systemd-run", "--quiet", *unit, "--", "/opt/pebble/a/bin/pebble", *board)
         assert until(lambda: self.machine.succeeds("test", "-e", PORT), 30, step=0.1)
 
     def configure(self, config: dict[str, Any] = CONFIG) -> None:

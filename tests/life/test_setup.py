@@ -38,10 +38,10 @@ print(ask("/"), ask("/api/login", {{"user": "ann", "password": "{PASSWORD}"}}))
 SETUP = ("pebble", "setup", "--answers", "/srv/answers.json", "--yes")
 #: What a person types on a robot, with which outputs go to others.
 COMMANDS = (
-    ("pebble", "selftest", "/etc/pebble/robot.json"),
+    ("pebble", "doctor", "/etc/pebble/robot.json", "--running"),
     ("pebble", "doctor", "/etc/pebble/robot.json"),
-    ("pebble", "report", "/srv/goob.zip"),
-    ("pebble", "backup", "/srv/goob.tar"),
+    ("pebble", "doctor", "--report", "/srv/goob.zip"),
+    ("pebble", "setup", "--backup", "/srv/goob.tar"),
     ("pebble", "web", "user", "list"),
     ("systemctl", "restart", "pebble.service"),
 )
@@ -73,5 +73,5 @@ def test_package_and_setup_make_a_robot_with_heartbeats_and_let_its_user_in(mach
     secrets = secrets_of(Places(machine.root), None, [machine.root / "srv/password"])
     assert len({one.where for one in secrets.known}) > 5, "passwords, and keys of the page and of the broker"
     assert [where for text in texts if (where := secrets.found_in("", text))] == []
-    planted = (b"in-an-environment", b"sleep\x001.5", b"mosquitto_sub\0", b"selftest\0", b"report\0", b"backup\0")
+    planted = (b"in-an-environment", b"sleep\x001.5", b"mosquitto_sub\0", b"--running\0", b"--report\0", b"--backup\0")
     assert [text for text in planted if not any(text in one for one in seen)] == [], "that is found where it is"

@@ -80,7 +80,8 @@ class Linux(Robot):
         super().__init__(name, tree, folder)
         self.local = Broker(self.folder) if kind == "mqtt" else None
         port = self.folder / "tty"
-        self.run("pebble.simulation.mcu", "--kind", "goob", "--link", str(port), "--trace", str(self.trace))
+        board = ("pebble.simulation.mcu", "--kind", "goob") if self.old else ("pebble.cli", "sim", "goob")
+        self.run(*board, "--link", str(port), "--trace", str(self.trace))
         assert until(port.exists), "the simulated MCU did not start"
         config = self.folder / "robot.json"
         config.write_text(json.dumps(self._config(kind, port, remote)))

@@ -90,7 +90,7 @@ class Mcu(Motors):
     def __init__(self, folder: Path, kind: str = "goob") -> None:
         super().__init__(folder / "tty", folder / "trace.jsonl")
         self._process = subprocess.Popen(
-            [sys.executable, "-m", "pebble.simulation.mcu", "--kind", kind, "--link", str(self.port),
+            [sys.executable, "-m", "pebble.cli", "sim", kind, "--link", str(self.port),
              "--trace", str(self._trace), "--control"],
             cwd=ROOT, stdin=subprocess.PIPE,
         )  # fmt: skip

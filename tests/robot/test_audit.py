@@ -55,11 +55,11 @@ def test_what_people_did_stays_and_what_was_changed_is_named(
         noted = mark(rig)
         rig.stop()
 
-        assert pebble("audit", rig.config, "-n", "1000") == 0
+        assert pebble("fleet", "audit", rig.config, "-n", "1000") == 0
         assert "otto?" in pebble.out
-        assert pebble("audit", rig.config, "--refused") == 0
+        assert pebble("fleet", "audit", rig.config, "--refused") == 0
         assert "wrong key" in pebble.out
-        assert pebble("audit", rig.config, "--verify") == 0, pebble.out
+        assert pebble("fleet", "audit", rig.config, "--verify") == 0, pebble.out
         [file] = written(rig)
         whole = file.read_bytes().splitlines(keepends=True)
         for changed, problem in (
@@ -67,7 +67,7 @@ def test_what_people_did_stays_and_what_was_changed_is_named(
             ([*whole[:2], *whole[3:]], "acts: line 3 is missing"),
         ):
             file.write_bytes(b"".join(changed))
-            assert pebble("audit", rig.config, "--verify") == 1
+            assert pebble("fleet", "audit", rig.config, "--verify") == 1
             assert pebble.out.startswith(problem)
         assert chain.verify((line.rstrip() for line in whole), [noted]) == ""
         assert chain.verify((line.rstrip() for line in whole[: noted.n - 1]), [noted]).endswith(

@@ -39,8 +39,8 @@ class World:
         self.path, self.layout = folder / "world.json", layout or ROOM
         self.path.write_text(json.dumps(self.layout))
         self._process = Child(
-            [sys.executable, "-m", "pebble.simulation.world", str(self.path), "--folder", str(folder), "--trace",
-             "--report", "--control"],
+            [sys.executable, "-m", "pebble.cli", "sim", "world", str(self.path), "--folder", str(folder),
+             "--trace", str(folder), "--report", "--control"],
             cwd=ROOT, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL,
         )  # fmt: skip
         ports = [port_path(folder, name) for name in self.layout["robots"]]

@@ -1,4 +1,4 @@
-"""``pebble backup``: what is restored from it is the same robot; what is no whole backup is refused in one line."""
+"""``pebble setup --backup``: what is restored from it is the same robot; what is not whole is refused in one line."""
 
 from __future__ import annotations
 
@@ -105,7 +105,7 @@ def test_the_command(places: Places, tmp_path: Path, run: Run) -> None:
     file = tmp_path / "goob.tar"
     before = os.umask(0)
     try:
-        assert run("backup", file, "--root", places.root) == 0
+        assert run("setup", "--backup", file, "--root", places.root) == 0
     finally:
         os.umask(before)
     assert stat.S_IMODE(file.stat().st_mode) == 0o600
@@ -115,7 +115,7 @@ def test_the_command(places: Places, tmp_path: Path, run: Run) -> None:
     about = read(file).about
     assert (about.format, about.id) == (1, "goob")
     first = file.read_bytes()
-    assert run("backup", file, "--root", places.root) == 2
+    assert run("setup", "--backup", file, "--root", places.root) == 2
     assert "exists: name another file" in run.err
     assert file.read_bytes() == first
     listed = subprocess.run(["tar", "tf", file], capture_output=True, text=True, check=True).stdout.splitlines()
@@ -125,7 +125,7 @@ def test_the_command(places: Places, tmp_path: Path, run: Run) -> None:
 def test_others_cannot_read_it_from_its_first_byte_on(places: Places, tmp_path: Path) -> None:
     """The call that makes the file makes it so."""
     file, log = tmp_path / "goob.tar", tmp_path / "calls"
-    command = [sys.executable, "-m", "pebble.cli", "backup", str(file), "--root", str(places.root)]
+    command = [sys.executable, "-m", "pebble.cli", "setup", "--backup", str(file), "--root", str(places.root)]
     audit = (
         "import sys, os, runpy\n"
         f"log = open({str(log)!r}, 'w')\n"
@@ -145,12 +145,12 @@ def test_nothing_is_left_of_one_that_cannot_be_made(tmp_path: Path, run: Run) ->
     with installed(tmp_path / "root") as broken:
         pass  # its database is closed
     (broken.root / PEOPLE).write_bytes(b"SQLite format 3\0" + bytes(4000))
-    assert run("backup", file, "--root", broken.root) == 1
+    assert run("setup", "--backup", file, "--root", broken.root) == 1
     assert "people.sqlite: is" in run.err
     assert len(run.err.splitlines()) == 1
-    assert run("backup", file, "--root", tmp_path / "elsewhere") == 1
+    assert run("setup", "--backup", file, "--root", tmp_path / "elsewhere") == 1
     assert "no robot is installed there" in run.err
-    assert run("backup", tmp_path / "no" / "folder", "--root", tmp_path / "elsewhere") == 1
+    assert run("setup", "--backup", tmp_path / "no" / "folder", "--root", tmp_path / "elsewhere") == 1
     assert not file.exists()
 
 

@@ -1,4 +1,4 @@
-"""What ``pebble selftest`` finds of the machine: unit, slot, disk, and the page with its certificate."""
+"""What ``pebble doctor --running`` finds of the machine: unit, slot, disk, and the page with its certificate."""
 
 from __future__ import annotations
 

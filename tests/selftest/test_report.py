@@ -1,4 +1,4 @@
-"""``pebble report``: everything that helps is in it, and no password or key."""
+"""``pebble doctor --report``: everything that helps is in it, and no password or key."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def parts(file: Path) -> dict[str, str]:
 
 def test_what_is_in_it_and_what_is_not(places: Places, tmp_path: Path, run: Run) -> None:
     file = tmp_path / "goob.zip"
-    assert run("report", file, "--root", places.root) == 0
+    assert run("doctor", "--report", file, "--root", places.root) == 0
     assert stat.S_IMODE(file.stat().st_mode) == 0o600
     found = parts(file)
     missing = {line.split(": ")[0] for line in found["index.txt"].splitlines() if ": MISSING: " in line}
@@ -65,7 +65,7 @@ def test_what_is_in_it_and_what_is_not(places: Places, tmp_path: Path, run: Run)
     assert "eclipse-zenoh" in found["versions.txt"]
     text = "".join(found.values()) + run.out + run.err
     assert [word for word in WORDS if word in text] == []
-    assert run("report", file, "--root", places.root) == 2
+    assert run("doctor", "--report", file, "--root", places.root) == 2
     assert "exists: name another file" in run.err
 
 
@@ -97,7 +97,7 @@ def test_a_secret_in_it_refuses_the_file_and_is_not_shown(
     monkeypatch.setattr(report, "PARTS", {"units.txt": report.PARTS["units.txt"]})
     (places.root / UNIT).write_text(text.format(ROBOT))
     file = tmp_path / "goob.zip"
-    assert run("report", file, "--root", places.root) == 1
+    assert run("doctor", "--report", file, "--root", places.root) == 1
     assert run.err.startswith("pebble: nothing was written: a password or key of ")
     assert "units.txt" in run.err
     assert ROBOT not in run.out + run.err

@@ -1,4 +1,4 @@
-"""``pebble selftest`` of whole robots: both transports, all levels, and a board that was pulled out."""
+"""``pebble doctor --running`` of whole robots: both transports, all levels, and a board that was pulled out."""
 
 from __future__ import annotations
 
@@ -72,8 +72,8 @@ def only(*names: str) -> tuple[Check, ...]:
 
 
 def command(rig: Rig, *options: str, typed: str = "") -> tuple[int, dict[str, Any]]:
-    """The exit code of ``pebble selftest --json``, and its checks by name."""
-    line = [sys.executable, "-m", "pebble.cli", "selftest", str(rig.config), "--json", *options]
+    """The exit code of ``pebble doctor --running --json``, and its checks by name."""
+    line = [sys.executable, "-m", "pebble.cli", "doctor", str(rig.config), "--running", "--json", *options]
     done = subprocess.run(line, cwd=ROOT, capture_output=True, text=True, input=typed, timeout=120, check=False)
     printed = json.loads(done.stdout or "{}")
     assert printed.get("ok", False) is (done.returncode == 0), done
@@ -120,7 +120,7 @@ def test_a_person_who_agrees_sees_the_wheels_turn(rig: Rig) -> None:
 
 def test_one_that_is_ended_while_wheels_turn_sends_a_zero_and_gives_control_back(rig: Rig) -> None:
     began = time.monotonic()
-    with running("selftest", rig.config, "--may-move", stdin=subprocess.PIPE) as process:
+    with running("doctor", rig.config, "--running", "--may-move", stdin=subprocess.PIPE) as process:
         assert process.stdin is not None
         process.stdin.write("y\n")
         process.stdin.flush()

@@ -146,7 +146,7 @@ def without_rights(act: Callable[[], str]) -> str:
 
 
 def backup_of(root: Path, file: Path) -> Path:
-    """What `pebble backup` writes of it."""
+    """What `pebble setup --backup` writes of it."""
     file.write_bytes(packed(make(Places(root))))
     return file
 

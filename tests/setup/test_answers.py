@@ -81,7 +81,7 @@ def test_a_wrong_answer_is_one_line_and_nothing_is_written(
     ("line", "message"),
     [
         (("--purge",), "--purge needs --undo"),
-        (("--as", "fred"), "--as needs --from BACKUP"),
+        (("--as", "fred"), "--as needs --from FILE"),
         (("--id", "goob"), "port is missing"),
         (("--undo", "--yes"), "this machine was not set up by this command"),
         (("--from", "/nowhere", "--yes"), "/nowhere: No such file or directory"),

@@ -12,7 +12,6 @@ from pathlib import Path
 import pytest
 
 from pebble.errors import ConfigError
-from pebble.simulation.mcu import main
 from pebble.simulation.pty import PtyMcu
 from pebble.simulation.trace import read_trace
 from tests.services.serial_mcu_bridge import mcu_wire as wire
@@ -66,20 +65,15 @@ def test_only_outlets_that_are_there_can_be_taken_away(station: PtyMcu, tmp_path
         imu.connect("o1", False)
 
 
-def test_only_a_station_has_a_number_of_outlets(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit):
-        main(["--kind", "goob", "--link", str(tmp_path / "port"), "--outlets", "2"])
-    assert "--outlets: goob has none" in capsys.readouterr().err
-
-
 def test_the_program_prints_what_its_relays_do(tmp_path: Path) -> None:
     link = tmp_path / "port"
-    command = [sys.executable, "-m", "pebble.simulation.mcu", "--kind", "outlets", "--link", str(link)]
+    command = [sys.executable, "-m", "pebble.cli", "sim", "outlets", "--link", str(link)]
     options = ["--outlets", "2", "--unreachable", "o2", "--control"]
     with subprocess.Popen([*command, *options], stdin=subprocess.PIPE, stdout=subprocess.PIPE) as program:
         assert program.stdin is not None
         assert program.stdout is not None
         host = Host(link)
+        assert program.stdout.readline() == f"outlets is at {link}; Ctrl-C ends it\n".encode()
         host.send(wire.CMD, b"\1", interface=1)
         assert program.stdout.readline() == b"o1 on\n"
         host.send(wire.CMD, b"\1", interface=3)

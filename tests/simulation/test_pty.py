@@ -135,8 +135,8 @@ def test_a_motors_entry_has_three_decimals_and_no_minus_zero() -> None:
 
 def test_the_program(tmp_path: Path) -> None:
     symlink, trace = tmp_path / "port", tmp_path / "trace"
-    command = [sys.executable, "-m", "pebble.simulation.mcu", "--kind", "fred", "--link", str(symlink)]
-    command += ["--trace", str(trace), "--report", "--control", "--charging", "--failsafe", "5"]
+    command = [sys.executable, "-m", "pebble.cli", "sim", "fred", "--link", str(symlink)]
+    command += ["--trace", str(trace), "--report", "--control", "--charging"]
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, bufsize=1) as program:
         assert program.stdin is not None
         assert program.stdout is not None
@@ -181,18 +181,16 @@ def test_who_takes_over_a_link_keeps_it(tmp_path: Path) -> None:
 
 
 def test_a_port_that_cannot_be_created_is_a_one_line_error(tmp_path: Path) -> None:
-    command = [sys.executable, "-m", "pebble.simulation.mcu", "--kind", "goob", "--link", str(tmp_path / "no" / "port")]
+    command = [sys.executable, "-m", "pebble.cli", "sim", "goob", "--link", str(tmp_path / "no" / "port")]
     done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=20)
     assert done.returncode == 1
-    assert done.stderr == f"cannot create a serial port at {tmp_path}/no/port: No such file or directory\n"
+    assert done.stderr == f"pebble: cannot create a serial port at {tmp_path}/no/port: No such file or directory\n"
 
 
 @pytest.mark.parametrize("how", [signal.SIGTERM, signal.SIGINT, signal.SIGHUP])
 def test_the_program_ends_on_a_signal_and_takes_its_link_along(tmp_path: Path, how: signal.Signals) -> None:
     symlink = tmp_path / "port"
-    with subprocess.Popen(
-        [sys.executable, "-m", "pebble.simulation.mcu", "--kind", "goob", "--link", symlink]
-    ) as program:
+    with subprocess.Popen([sys.executable, "-m", "pebble.cli", "sim", "goob", "--link", symlink]) as program:
         assert until(symlink.is_symlink)
         program.send_signal(how)
         assert program.wait(10) == 0

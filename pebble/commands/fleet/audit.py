@@ -1,4 +1,4 @@
-"""``pebble audit``: who did what to this robot, as the robot itself has kept it."""
+"""``pebble fleet audit``: who did what to this robot, as the robot itself has kept it."""
 
 import time
 from collections.abc import Iterable
@@ -26,9 +26,9 @@ def audit(
     """Print who did what to a robot, on its own computer, the newest last. Names with ? are claims.
 
     \b
-        pebble audit goob.json
-        pebble audit goob.json --refused
-        pebble audit goob.json --verify
+        pebble fleet audit goob.json
+        pebble fleet audit goob.json --refused
+        pebble fleet audit goob.json --verify
     """
     files = chain_files(load(config))
     try:

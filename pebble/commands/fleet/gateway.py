@@ -1,4 +1,4 @@
-"""``pebble gateway``: carries robots of a Zenoh hub, or of a broker on a LAN, to the broker of their operators."""
+"""``pebble fleet gateway``: carries robots of a Zenoh hub, or of a LAN's broker, to the broker of their operators."""
 
 import logging
 import threading
@@ -34,7 +34,7 @@ def gateway(file: FileArgument) -> int:
          "robots": ["pebble/robots/+"]}
 
     \b
-        pebble gateway gate-1.json
+        pebble fleet gateway gate-1.json
 
     Boards cannot speak Zenoh: with "boards", their broker on a LAN, instead of
     "hub" it carries them, and "neighbours" lets robots of the LAN's hub receive

@@ -1,4 +1,4 @@
-"""``pebble hub``: runs a Zenoh hub for several robots, and shows those that run."""
+"""``pebble fleet hub``: runs a Zenoh hub for several robots, and shows those that run."""
 
 from pathlib import Path
 from typing import Annotated
@@ -24,8 +24,8 @@ def hub(file: FileArgument, state: StateOption = False) -> int:
          "journal": "hub1.journal"}
 
     \b
-        pebble hub hub1.json
-        pebble hub hub1.json --state
+        pebble fleet hub hub1.json
+        pebble fleet hub hub1.json --state
     """
     from pebble.config.hub_file import load_hub
     from pebble.runtime.connections import fleet_hub_settings
@@ -36,7 +36,7 @@ def hub(file: FileArgument, state: StateOption = False) -> int:
 
         states = hub_states(settings)
         if not states:
-            raise TransportError(f"no hub runs with {file}: start it with `pebble hub {file}`")
+            raise TransportError(f"no hub runs with {file}: start it with `pebble fleet hub {file}`")
         for one in states:
             linked = f"linked to {', '.join(one.hubs)}" if one.hubs else "linked to no other hub"
             if one.links < len(one.hubs):

@@ -121,14 +121,14 @@ def up(folder_: Annotated[Path, typer.Argument(metavar="FOLDER", help="Of the fl
 def _commands(place: Path) -> dict[str, list[str]]:
     """What runs here, by its name; nothing for what this LAN does not have. Raises PebbleError."""
     pebble = [sys.executable, "-m", "pebble"]
-    found = {"hub": [*pebble, "hub", str(place / HUB_FILE)]}
+    found = {"hub": [*pebble, "fleet", "hub", str(place / HUB_FILE)]}
     if not (place / GATEWAY_FILE).exists():
         return found
     mosquitto = shutil.which("mosquitto", path=f"{os.environ.get('PATH', os.defpath)}:{_SBIN}")
     if mosquitto is None:
         raise PebbleError("mosquitto is not installed: sudo apt install mosquitto")
     broker = [] if applying.pid_of(place) else [mosquitto, "-c", str(place / CONF)]
-    return {"broker": broker, **found, "gateway": [*pebble, "gateway", str(place / GATEWAY_FILE)]}
+    return {"broker": broker, **found, "gateway": [*pebble, "fleet", "gateway", str(place / GATEWAY_FILE)]}
 
 
 @contextmanager

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Final
 import typer
 
 from pebble.commands.options import Output
-from pebble.commands.recordings.options import Since, Until
+from pebble.commands.recordings.options import RecordingsArgument, Since, Until
 
 if TYPE_CHECKING:
     from pebble.recordings.traffic.results import RobotTraffic, Traffic
@@ -22,14 +22,13 @@ if TYPE_CHECKING:
 FOLDER: Final = Path("report")
 _QUIET_S: Final = 2.0  # before progress is shown
 
-Places = Annotated[list[Path], typer.Argument(help="Recordings, or folders of them.", metavar="DIR|FILE")]
 Robots = Annotated[
     list[str] | None, typer.Option("--robot", "-r", help="Only this one; may be repeated.", metavar="[SYSTEM/TYPE/]ID")
 ]
 
 
 def analyse(
-    places: Places,
+    places: RecordingsArgument,
     since: Since = None,
     until: Until = None,
     robot: Robots = None,

@@ -11,7 +11,7 @@ from typing import Annotated, BinaryIO
 import typer
 
 from pebble.client.names import base_of
-from pebble.commands.recordings.options import Places, RobotOption, Since, Topics, Until, period
+from pebble.commands.recordings.options import RecordingsArgument, RobotOption, Since, Topics, Until, period
 from pebble.commands.recordings.progress import progress_of_time
 from pebble.commands.recordings.report import report_unread
 from pebble.commands.terminal import show
@@ -54,7 +54,7 @@ _BY_SUFFIX = {
 
 
 def export(
-    places: Places,
+    places: RecordingsArgument,
     target: Annotated[Path, typer.Argument(help="A new file.", metavar="OUT")],
     form: Annotated[Form | None, typer.Option("--as", help="What to write. [default: by the name of OUT]")] = None,
     robot: RobotOption = None,

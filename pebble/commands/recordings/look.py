@@ -11,7 +11,7 @@ from rich.console import Console
 from rich.table import Table
 
 from pebble.client.names import base_of
-from pebble.commands.recordings.options import Places, RobotOption, Since, Topics, Until, period
+from pebble.commands.recordings.options import RecordingsArgument, RobotOption, Since, Topics, Until, period
 from pebble.commands.recordings.progress import progress
 from pebble.commands.recordings.report import local_time, one_line, report_unread
 from pebble.commands.terminal import show
@@ -27,7 +27,7 @@ _CHECKED = 256 << 20  # bytes of files that are read as a whole without being as
 Check = Annotated[bool, typer.Option("--check", help="Read all of it; without, of much only the summaries.")]
 
 
-def list_(places: Places, since: Since = None, until: Until = None, check: Check = False) -> int:
+def list_(places: RecordingsArgument, since: Since = None, until: Until = None, check: Check = False) -> int:
     """List the files, their times, sizes and state."""
     table = Table(*_columns("begins", "lasts", "what", "messages", "size", "state"), box=box.SIMPLE, pad_edge=False)
     total = Counter[str]()
@@ -42,7 +42,7 @@ def list_(places: Places, since: Since = None, until: Until = None, check: Check
     return report_unread(unread)
 
 
-def info(places: Places, since: Since = None, until: Until = None, check: Check = False) -> int:
+def info(places: RecordingsArgument, since: Since = None, until: Until = None, check: Check = False) -> int:
     """Show robots, topics, and what happened to the recording."""
     looked, unread = _looked_at(places, since, until, check=check)
     topics, sizes = Counter[str](), sum(one.size for one in looked)
@@ -78,7 +78,7 @@ def info(places: Places, since: Since = None, until: Until = None, check: Check 
 
 
 def search(
-    places: Places,
+    places: RecordingsArgument,
     robot: RobotOption = None,
     since: Since = None,
     until: Until = None,

@@ -8,7 +8,7 @@ import typer
 
 from pebble.recordings.period import SINCE_HELP, UNTIL_HELP, parse_period
 
-Places = Annotated[list[Path], typer.Argument(help="Recordings, or folders of them.", metavar="DIR|FILE…")]
+RecordingsArgument = Annotated[list[Path], typer.Argument(help="Recordings, or folders of them.", metavar="DIR|FILE…")]
 Since = Annotated[str | None, typer.Option(help=SINCE_HELP, metavar="TIME")]
 Until = Annotated[str | None, typer.Option(help=UNTIL_HELP, metavar="TIME")]
 RobotOption = Annotated[

@@ -11,7 +11,7 @@ import typer
 from pebble.client.connection import Target, connected, put_names, target_of, wait_for
 from pebble.client.names import id_of
 from pebble.client.scripts import RobotScripts, options_of
-from pebble.commands.options import with_target
+from pebble.commands.options import RobotArgument, with_target
 from pebble.config.visible import shown
 from pebble.contract.payloads import AutonomyStatus
 from pebble.errors import PebbleError, TransportError
@@ -21,20 +21,12 @@ _HELP = """Programs that move a robot by themselves; docs/scripts.md explains th
 
 \b
     pebble script new follow            write a first script and its test
-    pebble script list goob.json        what the robot offers
+    pebble script list goob.json        what the robot offers, and what runs
     pebble script start goob.json follow --tag-id 7
-    pebble script status goob.json
     pebble script stop goob.json
 """
 _FIRST_SECOND_S = 1.0  # most mistakes in a script end it within that
 _SAME_ERROR_S = 1.0  # an error that was there before the command is the answer to it, too, if it stays
-
-_Robot = Annotated[
-    str,
-    typer.Argument(
-        help="A robot's config file, or with --url or --config its id.", metavar="ROBOT", show_default=False
-    ),
-]
 
 
 def new(
@@ -55,8 +47,8 @@ def new(
 
 
 @with_target()
-def list_(robot: _Robot, *, target: Target) -> int:
-    """The scripts that a robot offers, and their options."""
+def list_(robot: RobotArgument, *, target: Target) -> int:
+    """List the scripts that a robot offers, their options, what runs with which settings, and the last error."""
     with _scripts(robot, target) as (_, scripts, name):
         if scripts.files is None:
             raise PebbleError(f"{name} has published no scripts: is it up, and services.autonomy_manager.enabled true?")
@@ -65,13 +57,15 @@ def list_(robot: _Robot, *, target: Target) -> int:
             _print(file if label == file else f"{file}: {label}")
             for one in entry.get("configs") or ():
                 _print(f"    {_option(one)}")
+        if scripts.status is not None:
+            _print_status(scripts.status)
     return 0
 
 
 @with_target()
 def start(
     context: typer.Context,
-    robot: _Robot,
+    robot: RobotArgument,
     file: Annotated[
         str, typer.Argument(help="The script; its own options follow.", metavar="SCRIPT", show_default=False)
     ] = "",
@@ -105,7 +99,7 @@ def start(
 
 
 @with_target()
-def stop(robot: _Robot, *, target: Target) -> int:
+def stop(robot: RobotArgument, *, target: Target) -> int:
     """Stop the script that runs. In an emergency: pebble estop."""
     with _scripts(robot, target) as (transport, scripts, _):
         _sent(transport, scripts.stop(transport))
@@ -118,23 +112,12 @@ def stop(robot: _Robot, *, target: Target) -> int:
     return 0
 
 
-@with_target()
-def status(robot: _Robot, *, target: Target) -> int:
-    """What runs, with which settings, and the last error. Exit code 0: a script runs; 1: none."""
-    with _scripts(robot, target) as (_, scripts, name):
-        if scripts.status is None:
-            raise PebbleError(f"{name} has published nothing about scripts: is it up?")
-        _print_status(scripts.status)
-        return 0 if scripts.status.running else 1
-
-
 def register(app: typer.Typer) -> None:
     group = typer.Typer(help=_HELP, rich_markup_mode=None)
     group.command("new", context_settings={"ignore_unknown_options": True})(new)  # else -x is not seen as a name
     group.command("list")(list_)
     group.command("start", context_settings={"allow_extra_args": True, "ignore_unknown_options": True})(start)
     group.command("stop")(stop)
-    group.command("status")(status)
     app.add_typer(group, name="script")
 
 

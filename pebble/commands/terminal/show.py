@@ -121,26 +121,15 @@ def size(count: float) -> str:
     return f"{count / 1e3:.1f} kB" if count < 1e6 else f"{count / 1e6:.1f} MB"
 
 
-def frequency_line(meter: RateMeter, now: float) -> str | None:
-    """How often messages come, as ``ros2 topic hz`` prints it; None before the second message."""
+def rate_line(meter: RateMeter, now: float) -> str | None:
+    """Return how often messages and how many bits of payload come; None before the second message."""
     hz, arrivals = meter.rate(now), meter.arrivals(now)
     if not hz:
         return None
     gaps = [later.at - earlier.at for earlier, later in pairwise(arrivals)]
+    kbit = hz * statistics.fmean(arrival.size for arrival in arrivals) * 8 / 1000
     limits = f"min {min(gaps):.4f} s  max {max(gaps):.4f} s"
-    return f"{hz:.3f} Hz  {limits}  std dev {statistics.pstdev(gaps):.5f} s  window {len(gaps)}"
-
-
-def bandwidth_line(meter: RateMeter, now: float) -> str | None:
-    """How many bytes come per second, as ``ros2 topic bw`` prints it; None before the second message."""
-    hz, sizes = meter.rate(now), [arrival.size for arrival in meter.arrivals(now)]
-    if not hz:
-        return None
-    mean = statistics.fmean(sizes)
-    return (
-        f"{size(mean * hz)}/s ({mean * hz * 8 / 1000:.1f} kbit/s)  mean {size(mean)}  "
-        f"min {size(min(sizes))}  max {size(max(sizes))}  window {len(sizes)}"
-    )
+    return f"{hz:.3f} Hz  {kbit:.1f} kbit/s  {limits}  std dev {statistics.pstdev(gaps):.5f} s  window {len(gaps)}"
 
 
 def _is_text(payload: bytes) -> bool:

@@ -35,10 +35,10 @@ class BoardProcess:
         self.trace = folder / "board.jsonl"
         self.trace.touch()
         self.wheels = Wheels(self.trace)
+        broker = f"mqtt://{'' if login is None else f'{login}@'}127.0.0.1:{port}"
         self._command = [
-            *(sys.executable, "-m", "pebble.simulation.networked", "--kind", kind, "--id", BOARD),
-            *("--broker", f"127.0.0.1:{port}", "--trace", str(self.trace), "--files", str(folder / "files")),
-            *(() if login is None else ("--username", login)),
+            *(sys.executable, "-m", "pebble.cli", "sim", kind, BOARD, "--broker", broker),
+            *("--trace", str(self.trace), "--files", str(folder / "files")),
         ]
         self._log = (folder / "board.log").open("ab")
         self.start()

@@ -18,6 +18,7 @@ import pytest
 import serial
 
 import pebble.simulation.world
+from pebble.errors import PebbleError
 from pebble.media.world.pose_page import PoseReader, page_path
 from pebble.media.world.poses import RobotPose, Track
 from pebble.simulation.trace import read_trace
@@ -34,7 +35,8 @@ def room(tmp_path: Path) -> Path:
 
 
 def command(room: Path, *options: str) -> list[str]:
-    return [sys.executable, "-m", "pebble.simulation.world", str(room), "--folder", str(room.parent / "f"), *options]
+    world = [sys.executable, "-m", "pebble.cli", "sim", "world", str(room)]
+    return [*world, "--folder", str(room.parent / "f"), *options]
 
 
 @contextmanager
@@ -68,7 +70,7 @@ def test_a_world_is_driven_controlled_and_ended_by_its_standard_input(room: Path
     room.write_text(json.dumps(described))
     folder = room.parent / "f"
     goob, imu = port_path(folder, "goob"), imu_port_path(folder, "goob")
-    with running(room, "--trace", "--control") as world:
+    with running(room, "--trace", str(folder), "--control") as world:
         start = poses(room)
         assert start["goob"] == pytest.approx((-0.8, 0.4, -0.5236), abs=1e-4)
         with serial.Serial(str(imu), timeout=30) as line:
@@ -104,7 +106,7 @@ def test_a_world_that_was_killed_starts_again_reports_the_truth_and_is_alone(
         report = json.loads(world.stdout.readline())
         assert report["robots"]["goob"]["pose"]["x_mm"] == pytest.approx(-800)
         assert report["robots"]["fred"]["left_mm"] == 0.0
-        assert refused(room) == f"{room}: this world runs already, end its other program first\n"
+        assert refused(room) == f"{room}: this world runs already, end its other program first"
         # a signal ends it whichever thread receives it: libraries start threads when they are imported
         tasks = sorted(int(path.name) for path in Path(f"/proc/{world.pid}/task").iterdir())
         tasks.remove(world.pid)
@@ -121,15 +123,14 @@ def test_it_ends_at_once_where_standard_input_has_ended_already(room: Path) -> N
 
 
 @pytest.fixture
-def refused(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Callable[[Path], str]:
-    """What the program writes about a room that it does not run, in this process, whose signals stay as they are."""
+def refused(monkeypatch: pytest.MonkeyPatch) -> Callable[[Path], str]:
+    """What is wrong with a room that is not run, in this process, whose signals stay as they are."""
     monkeypatch.setattr(program, "EndRequest", lambda: None)
 
     def refuse(room: Path) -> str:
-        assert program.main([str(room), "--folder", str(room.parent / "f")]) == 1
-        out, err = capsys.readouterr()
-        assert out == ""
-        return err
+        with pytest.raises(PebbleError) as error:
+            program.run(room, room.parent / "f")
+        return str(error.value)
 
     return refuse
 
@@ -145,7 +146,7 @@ def test_mistakes_in_the_file_are_printed_all_at_once(room: Path, refused: Calla
 def test_a_missing_file_and_a_folder_that_cannot_be_made_are_one_line(
     room: Path, refused: Callable[[Path], str]
 ) -> None:
-    assert refused(room.with_name("none.json")) == f"{room.with_name('none.json')}: there is no such file\n"
+    assert refused(room.with_name("none.json")) == f"{room.with_name('none.json')}: there is no such file"
     (room.parent / "f").touch()
-    assert refused(room) == f"{room.parent / 'f'}: File exists\n"
+    assert refused(room) == f"{room.parent / 'f'}: File exists"
     assert not page_path(room).exists()

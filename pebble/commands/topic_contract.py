@@ -1,4 +1,4 @@
-"""``pebble topics``: the contract as a table, or as JSON."""
+"""``pebble topic contract``: the contract as a table, or as JSON."""
 
 import json
 from typing import Annotated, Any
@@ -10,7 +10,7 @@ from pebble.contract import CHANNELS, INCOMING, OUTGOING, Channel
 from pebble.contract.docs import authority, payload_name, rate, travels
 
 
-def topics(
+def contract(
     base: Annotated[
         str | None, typer.Option("--base", help="Print the whole topics of this robot.", metavar="[SYSTEM/TYPE/]ID")
     ] = None,
@@ -20,10 +20,10 @@ def topics(
     """Print the contract: every topic, and how it is delivered.
 
     \b
-        pebble topics
-        pebble topics --base goob
-        pebble topics --json | jq '.[] | select(.kind == "STATE") | .topic'
-        pebble topics --json-schema > payloads.schema.json
+        pebble topic contract
+        pebble topic contract --base goob
+        pebble topic contract --json | jq '.[] | select(.kind == "STATE").topic'
+        pebble topic contract --json-schema > payloads.schema.json
     """
     prefix = "" if base is None else f"{base_of(base)}/"
     if json_schema:

@@ -1,0 +1,1 @@
+complete --command pebble --no-files --arguments "(env _PEBBLE_COMPLETE=complete_fish _TYPER_COMPLETE_FISH_ACTION=get-args _TYPER_COMPLETE_ARGS=(commandline -cp) pebble)" --condition "env _PEBBLE_COMPLETE=complete_fish _TYPER_COMPLETE_FISH_ACTION=is-args _TYPER_COMPLETE_ARGS=(commandline -cp) pebble"

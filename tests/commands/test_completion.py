@@ -1,0 +1,84 @@
+"""What Tab completes: in a real bash, with the script that packages install, and the words for other shells."""
+
+from __future__ import annotations
+
+import json
+import os
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from tests.support import ROOT
+
+BASH = ROOT / "configs" / "completion" / "pebble"
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """A folder with the configs of two robots, one of which has a script, and with files that are no configs."""
+    for name, robot in (("hall.json", {"id": "goob"}), ("lamp.json", {"id": "minilamp"})):
+        (tmp_path / name).write_text(json.dumps({"robot": robot}))
+    for name, text in (("broken.json", "{"), ("list.json", "[]"), ("notes.txt", "")):
+        (tmp_path / name).write_text(text)
+    (tmp_path / "autonomy" / "dance").mkdir(parents=True)
+    (tmp_path / "autonomy" / "dance" / "run.py").touch()
+    (tmp_path / "bin").mkdir()
+    program = tmp_path / "bin" / "pebble"
+    program.write_text(f'#!/bin/sh\nexec {shlex.quote(sys.executable)} -m pebble.cli "$@"\n')
+    program.chmod(0o755)
+    return tmp_path
+
+
+def environment(folder: Path) -> dict[str, str]:
+    return {**os.environ, "PATH": f"{folder / 'bin'}:{os.environ['PATH']}", "PYTHONPATH": str(ROOT)}
+
+
+def bash(folder: Path, line: str) -> list[str]:
+    """What a bash offers for the last word of a line."""
+    words = line.split(" ")
+    asked = f"COMP_WORDS=({shlex.join(words)}); COMP_CWORD={len(words) - 1}; _pebble_completion pebble"
+    script = f'source {BASH}; {asked}; printf "%s\\n" "${{COMPREPLY[@]}}"'
+    command = ["bash", "--norc", "-c", script]
+    done = subprocess.run(command, cwd=folder, env=environment(folder), capture_output=True, text=True, timeout=60)
+    assert done.stderr == ""
+    return done.stdout.split()
+
+
+@pytest.mark.parametrize(
+    ("line", "offered"),
+    [
+        ("pebble est", ["estop"]),
+        ("pebble fleet h", ["hub"]),
+        ("pebble up h", ["hall.json"]),
+        ("pebble up notes", []),
+        ("pebble drive goo", ["goob"]),
+        ("pebble drive ", ["broken.json", "hall.json", "lamp.json", "list.json", "goob", "minilamp"]),
+        ("pebble estop reset mini", ["minilamp"]),
+        ("pebble topic echo online -r goo", ["goob"]),
+        ("pebble topic echo online --config lam", ["lamp.json"]),
+        ("pebble script start hall.json da", ["dance"]),
+        ("pebble script start goob foll", ["follow"]),
+        ("pebble sim mini", ["minilamp"]),
+        ("pebble web us", ["user"]),
+        ("pebble conform mini", ["minilamp"]),
+        ("pebble doctor --may", ["--may-move"]),
+    ],
+)
+def test_bash_completes_a_word(folder: Path, line: str, offered: list[str]) -> None:
+    assert bash(folder, line) == offered
+
+
+@pytest.mark.parametrize(
+    ("shell", "more", "expected"),
+    [
+        ("zsh", {}, '_arguments \'*: :(("estop":"stop robots until they are reset"))\''),
+        ("fish", {"_TYPER_COMPLETE_FISH_ACTION": "get-args"}, "estop\tstop robots until they are reset"),
+    ],
+)
+def test_other_shells_show_what_a_command_does(folder: Path, shell: str, more: dict[str, str], expected: str) -> None:
+    asked = {"_PEBBLE_COMPLETE": f"complete_{shell}", "_TYPER_COMPLETE_ARGS": "pebble est", **more}
+    done = subprocess.run(["pebble"], env=environment(folder) | asked, cwd=folder, capture_output=True, text=True)
+    assert (done.stdout.rstrip("\n"), done.stderr) == (expected, "")
