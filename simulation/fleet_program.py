@@ -8,7 +8,6 @@ import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from pathlib import Path
 
 from rich import box
 from rich.console import Console
@@ -31,14 +30,13 @@ class FleetOptions:
     broker: BrokerAddress
     kinds: Sequence[str] = KINDS
     seconds: float | None = None
-    trace: Path | None = None
 
 
 def run(options: FleetOptions, console: Console | None = None) -> int:
     """Run the fleet and show its status; returns 0 if all robots are online at the end. Raises PebbleError."""
     console = console or Console()
     stop_signal = StopSignal()
-    with Fleet(options.broker, trace=options.trace) as fleet:
+    with Fleet(options.broker) as fleet:
         for kind, identity in members(options.robots, options.kinds):
             fleet.add(kind, identity)
         console.print(
@@ -124,7 +122,6 @@ def main(arguments: list[str] | None = None) -> int:
             broker=broker_address(parsed),
             kinds=parsed.kinds.split(","),
             seconds=parsed.seconds,
-            trace=parsed.trace,
         )
         return run(options)
     except PebbleError as error:
@@ -137,7 +134,6 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--robots", type=int, default=10)
     parser.add_argument("--kinds", default=",".join(KINDS), help="comma-separated; robots alternate between them")
     parser.add_argument("--seconds", type=float, help="end after this time")
-    parser.add_argument("--trace", type=Path, help="file to append every change of all motors to, with its time")
     add_broker_options(parser)
     return parser
 

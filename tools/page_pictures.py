@@ -1,4 +1,4 @@
-"""Makes the README's pictures of the operator page, with four simulated robots: ``python tools/page_pictures.py``.
+"""Makes the README's pictures of the operator page, with four simulated robots: ``python -m tools.page_pictures``.
 
 They are docs/page-driving.jpg, in which the key W is held, and docs/page-fleet.jpg. It needs mosquitto and
 Chromium.
@@ -10,7 +10,7 @@ from pathlib import Path
 
 from PIL import Image
 
-from pebble.bench.page_rig import KEY, ROBOT, Rig, rig
+from tests.web.rig import KEY, ROBOT, Rig, rig
 
 DOCS = Path(__file__).resolve().parent.parent / "docs"
 WIDTH, QUALITY, MOST_BYTES = 1000, 78, 200_000

@@ -45,10 +45,9 @@ COMMANDS = {
     "conform": "conform",
     "flash": "flash",
     "bench": "bench",
-    "impair": "impair",
 }
 
-_REGISTERED = ("topic", "script", "sim", "web", "recordings", "cert", "fleet", "bench", "impair")
+_REGISTERED = ("topic", "script", "sim", "web", "recordings", "cert", "fleet", "bench")
 #: What prints its help when nothing follows.
 _GROUPS = [
     words.split() for words in ("", "topic", "bench", "sim", "script", "cert", "fleet", "recordings", "web user")
@@ -78,7 +77,7 @@ _HELP = """Runs and inspects Pebble robots.
     pebble conform rover       judge a robot of your own by the contract
     pebble flash lamp.json     install a robot's firmware on its board
     pebble bench control       compare MQTT and Zenoh on this machine
-    pebble impair              measure robots behind an impaired network
+    pebble bench impair        measure robots behind an impaired network
 """
 
 

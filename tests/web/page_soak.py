@@ -18,10 +18,10 @@ from playwright.sync_api import CDPSession
 from rich.console import Console as Terminal
 from rich.table import Table
 
-from pebble.bench import page_rig as program
 from pebble.bench.usage import pss_mb
 from pebble.rig.testbed import ROBOTS
 from tests.support import quarters
+from tests.web import rig
 from tests.web.browser import Tab
 from tests.web.console import Console, console
 from tests.web.stage import Stage
@@ -36,7 +36,7 @@ Samples = dict[str, list[float]]  # MB, by what was measured
 @contextmanager
 def pages() -> Iterator[tuple[Stage, CDPSession, list[Console]]]:
     """A page of each robot, with every card open and its sound on."""
-    with Stage() as stage, program.chromium() as browser, ExitStack() as stack:
+    with Stage() as stage, rig.chromium() as browser, ExitStack() as stack:
         opened = [stack.enter_context(console(browser, stage, name)) for name in ROBOTS]
         for one in opened:
             assert one.tab.until(lambda one=one: one.state("capabilities") is not None, 30), one.name  # type: ignore[misc]
