@@ -86,7 +86,7 @@ def run(settings: Settings, console: Console) -> Shown:
 
 def shown(results: Results) -> Shown:
     """Return the tables and pictures of results."""
-    return Shown(results, tables(results), plots.tails("frames", "Frames between processes", results.cells))
+    return Shown(results, tables(results), plots.curves("frames", "Frames between processes", results.cells))
 
 
 def missing(variant: str) -> str | None:

@@ -67,9 +67,8 @@ class Bar:
     panel: str
     row: str
     variant: str
-    begin: float
     end: float
-    line: tuple[float, ...] = ()
+    line: tuple[float, ...]
     text: str = ""
 
 
@@ -78,7 +77,7 @@ def medians(
 ) -> list[Picture]:
     """Return bars to the medians, with lines between the fastest and the slowest round."""
     bars = [
-        Bar(panel(cell), row(cell), cell.variant, 0.0, p50, (min(rounds), max(rounds)), f"  {digits(p50)}")
+        Bar(panel(cell), row(cell), cell.variant, p50, (min(rounds), max(rounds)), f"  {digits(p50)}")
         for cell in cells
         for p50, rounds in [(cell.percentile(50), cell.medians())]
         if rounds
@@ -88,19 +87,6 @@ def medians(
     return [Picture(name, caption, partial(_bars, bars, caption, "" if len(units) > 1 else units[0]))] if bars else []
 
 
-def tails(name: str, caption: str, cells: Sequence[Cell]) -> list[Picture]:
-    """Return bars to the medians, with lines to the 99th percentiles; one panel for each condition."""
-    known = [cell for cell in cells if cell.samples]
-    bars = [
-        Bar(cell.conditions(), cell.variant, cell.variant, 0.5 * min(other.percentile(50) for other in known), p50,
-            (p50, p99), f"  {digits(p50)} / {digits(p99)}")
-        for cell in known
-        for p50, p99 in [(cell.percentile(50), cell.percentile(99))]
-    ]  # fmt: skip
-    caption = f"{caption}: bars to the median, lines to the 99th percentile"
-    return [Picture(name, caption, partial(_bars, bars, caption, "latency, µs", log=True))] if bars else []
-
-
 def ratios(name: str, caption: str, cells: Sequence[Cell], baseline: str) -> list[Picture]:
     """Return the medians as ratios to the baseline's, with their intervals; a panel for each measure."""
     base = {(cell.measure, cell.conditions()): cell for cell in cells if cell.variant == baseline}
@@ -108,18 +94,18 @@ def ratios(name: str, caption: str, cells: Sequence[Cell], baseline: str) -> lis
     judged = [(cell, ratio(cell, theirs)) for cell, theirs in pairs if theirs is not None]
     bars = [_ratio_bar(cell, interval) for cell, interval in judged if math.isfinite(interval.ratio)]
     caption = f"{caption}: median as a ratio to {baseline}'s, with its interval of 99 %"
-    return [Picture(name, caption, partial(_bars, bars, caption, "ratio; left of 1 is faster", at=1.0))] if bars else []
+    return [Picture(name, caption, partial(_bars, bars, caption, "ratio", is_ratio=True))] if bars else []
 
 
 def _ratio_bar(cell: Cell, interval: Interval) -> Bar:
     line = (interval.ratio,) if interval.few else (interval.low, interval.high)
-    return Bar(cell.measure, cell.conditions(), cell.variant, 1.0, interval.ratio, line)
+    return Bar(cell.measure, cell.conditions(), cell.variant, interval.ratio, line)
 
 
-def _bars(bars: Sequence[Bar], title: str, label: str, *, log: bool = False, at: float | None = None) -> Figure:
-    """Draw panels of bars, those of a row below each other. ``at``: where ratios begin."""
+def _bars(bars: Sequence[Bar], title: str, label: str, *, is_ratio: bool = False) -> Figure:
+    """Draw panels of bars, those of a row below each other; ratios begin at 1."""
     by_panel, style_of = grouped(bars, lambda bar: bar.panel), styles(unique([bar.variant for bar in bars]))
-    every_row = unique([bar.row for bar in bars])
+    every_row, begin = unique([bar.row for bar in bars]), float(is_ratio)
     height = 0.9 + 0.17 * max(map(len, by_panel.values())) + 0.15 * len(every_row)
     figure, every = panels(len(by_panel), 2, (5.6, height), title)
     for axes, (panel, some) in zip(every, by_panel.items(), strict=True):
@@ -127,49 +113,43 @@ def _bars(bars: Sequence[Bar], title: str, label: str, *, log: bool = False, at:
         for place, row in enumerate(rows):
             here = [bar for bar in some if bar.row == row]
             for number, bar in enumerate(here):
-                y = place + 0.8 * ((number + 0.5) / len(here) - 0.5)
-                axes.barh(y, bar.end - bar.begin, left=bar.begin, height=min(0.5, 0.72 / len(here)),
-                          color=style_of[bar.variant].colour, alpha=0.8)  # fmt: skip
+                y, thick = place + 0.8 * ((number + 0.5) / len(here) - 0.5), min(0.5, 0.72 / len(here))
+                axes.barh(y, bar.end - begin, left=begin, height=thick, color=style_of[bar.variant].colour, alpha=0.8)
                 axes.plot(bar.line, [y] * len(bar.line), color=_DARK, linewidth=1.1, marker="|", markersize=6)
                 axes.annotate(bar.text, (max((bar.end, *bar.line)), y), fontsize=8, va="center")
         axes.set_yticks(range(len(rows)), [short(row, 34) for row in rows])
         axes.set(ylim=(len(rows) - 0.4, -0.6), title=short(panel, 50))
         axes.grid(visible=False, axis="y")
-        _bar_axis(axes, some, label, log=log, at=at)
+        ends = [value for bar in some for value in (bar.end, *bar.line)]
+        if is_ratio:
+            low, high = max(0.02, 0.93 * min(0.95, *ends)), min(50.0, 1.07 * max(1.25, *ends))
+            log_axis(axes, "x", f"{label}; left of 1 is faster", low, high)
+            axes.axvline(1.0, color=_DARK, linewidth=0.9)
+        else:
+            axes.set(xlim=(0, 1.25 * max(ends) or 1.0), xlabel=label)
     legend(figure, {variant: Style(style.colour, "", "s") for variant, style in style_of.items()})
     return figure
 
 
-def _bar_axis(axes: Axes, bars: Sequence[Bar], label: str, *, log: bool, at: float | None) -> None:
-    """Scale the axis to the bars of a panel, with room for their texts."""
-    ends = [value for bar in bars for value in (bar.end, *bar.line)]
-    if at is not None:
-        log_axis(axes, "x", label, max(0.02, 0.93 * min(0.95, *ends)), min(50.0, 1.07 * max(1.25, *ends)))
-        axes.axvline(at, color=_DARK, linewidth=0.9)
-    elif log:
-        log_axis(axes, "x", label, min(bar.begin for bar in bars), 9 * max(ends))
-    else:
-        axes.set(xlim=(0, 1.25 * max(ends) or 1.0), xlabel=label)
-
-
 def lines(name: str, caption: str, cells: Sequence[Cell], *, over: str) -> list[Picture]:
-    """Return lines through the medians of each measure as the parameter ``over`` grows; one panel for each unit."""
+    """Return lines through the medians as the parameter ``over`` grows; one panel for each measure."""
     known = [cell for cell in cells if cell.samples]
     return [Picture(name, caption, partial(_lines, known, caption, over))] if known else []
 
 
 def _lines(cells: Sequence[Cell], title: str, over: str) -> Figure:
-    by_unit, style_of = grouped(cells, _unit), styles(unique([f"{cell.variant}, {cell.measure}" for cell in cells]))
-    figure, every = panels(len(by_unit), 3, (3.9, 3.0), title)
-    for axes, (unit, some) in zip(every, by_unit.items(), strict=True):
-        for line, points in grouped(some, lambda cell: f"{cell.variant}, {cell.measure}").items():
+    by_measure, style_of = grouped(cells, lambda cell: cell.measure), styles(unique([cell.variant for cell in cells]))
+    figure, every = panels(len(by_measure), 3, (3.9, 3.0), title)
+    for axes, (measure, some) in zip(every, by_measure.items(), strict=True):
+        for variant, points in grouped(some, lambda cell: cell.variant).items():
             along = sorted((float(str(cell.params[over])), cell.percentile(50)) for cell in points)
-            style = style_of[line]
+            style, last = style_of[variant], along[-1]
             axes.plot(*zip(*along, strict=True), color=style.colour, linestyle=style.dash, marker=style.marker)
-            axes.annotate(f" {digits(along[-1][1])}", along[-1], fontsize=8, va="center", annotation_clip=False)
-        at = unique([str(cell.params[over]) for cell in some])
-        log_axis(axes, "x", over, 0.8 * float(at[0]), 1.8 * float(at[-1]))
-        axes.set(ylim=(0, None), ylabel=unit)
+            axes.annotate(f"  {digits(last[1])}", last, fontsize=8, va="center", annotation_clip=False)
+        at = [float(str(cell.params[over])) for cell in some]
+        log_axis(axes, "x", over, 0.8 * min(at), 2.5 * max(at))
+        top = 1.15 * max(cell.percentile(50) for cell in some) or 1.0
+        axes.set(ylim=(0, top), ylabel=f"{measure}, {_unit(some[0])}")
     legend(figure, style_of)
     return figure
 

@@ -1,9 +1,10 @@
 """Measures what 10, 100 and 1,000 boards cost a server of the operator page, and a hub: CPU, memory and latency.
 
-``page``: boards at a stock mosquitto, a page server and one viewer. ``hub``: boards at a Zenoh hub, and one observer of
-everything. Boards are cheap, all on one thread: a connection and a will each, retained capabilities, four heartbeats a
-second, and nothing that obeys. The latency is that of a voltage, from the publish call of one more board until the
-viewer, or the observer, has it.
+``page``: boards at a stock mosquitto, a page server and one viewer. ``hub``: the same boards at a Zenoh hub, and one
+observer of everything; one session carries them all, as a gateway does, because boards speak MQTT alone. They are
+cheap, all on one thread: a connection and a will each, retained capabilities, four heartbeats a second, and nothing
+that obeys. The latency is that of a voltage, from the publish call of one more board until the viewer, or the observer,
+has it.
 
 ``python -m pebble.bench.scale mqtt|zenoh WHERE COUNT`` are the boards; ``WHERE`` is a broker's port or a hub's folder.
 """
@@ -154,13 +155,19 @@ def _measured(
     variant: str, boards: int, seconds: float, pids: Mapping[str, int], publish: Publish, values: Mapping[float, int]
 ) -> Iterator[Cell]:
     """Publish values for some seconds; ``values`` is when each has arrived."""
-    params, base, sent = {"boards": boards}, Identity("pebble", "robots", _PROBE).base, dict[float, int]()
+    params, topic, sent = {"boards": boards}, CHARGING_LEVEL.topic(_base(_PROBE)), dict[float, int]()
+    end = time.monotonic() + _UP_S
+    while not values:
+        if time.monotonic() > end:
+            raise PebbleError(f"{variant}, {boards} boards: no value arrived within {_UP_S:.0f} s")
+        publish(topic, _voltage(0.0))
+        time.sleep(_POLL_S)
     before, began = {name: cpu_s([pid]) for name, pid in pids.items()}, time.monotonic()
     for number in range(round(seconds * PROBE_HZ)):
         time.sleep(max(0.0, began + number / PROBE_HZ - time.monotonic()))
         value = round(7 + number / 1000, 3)
         sent[value] = time.monotonic_ns()
-        publish(CHARGING_LEVEL.topic(base), json.dumps({"value": value, "unit": "v"}).encode())
+        publish(topic, _voltage(value))
     took = time.monotonic() - began
     for name, pid in pids.items():
         yield round_cell(variant, CPU, "%", [100 * (cpu_s([pid]) - before[name]) / took], {**params, "process": name})
@@ -232,14 +239,21 @@ def by_mqtt(port: str, name: str) -> Publish:
 
 
 def by_zenoh(run_dir: str, name: str) -> Publish:
-    """Connect a board to a hub. Raises PebbleError."""
-    board = create("zenoh", name, ZenohSettings(run_dir=Path(run_dir), client=True), will=_will(name)).open(_UP_S)
-    return lambda topic, payload: board.publish(topic, payload, qos=QoS.LATEST, retain=True)
+    """Connect to a hub. Raises PebbleError."""
+    session = create("zenoh", name, ZenohSettings(run_dir=Path(run_dir), client=True)).open(_UP_S)
+    return lambda topic, payload: session.publish(topic, payload, qos=QoS.LATEST, retain=True)
+
+
+def _base(name: str) -> str:
+    return Identity("pebble", "robots", name).base
 
 
 def _will(name: str) -> Message:
-    base = Identity("pebble", "robots", name).base
-    return Message(ONLINE.topic(base), b'{"t": 0, "online": false}', QoS.DELIVERED, retain=True)
+    return Message(ONLINE.topic(_base(name)), b'{"t": 0, "online": false}', QoS.DELIVERED, retain=True)
+
+
+def _voltage(value: float) -> bytes:
+    return json.dumps({"value": value, "unit": "v"}).encode()
 
 
 def capabilities(identity: Identity) -> bytes:
@@ -256,9 +270,10 @@ def _epoch_ms() -> int:
 def main(kind: str, where: str, count: int) -> None:
     """Run boards until standard input closes; their heartbeats are evenly spread."""
     ended, boards = serve_on_thread(lambda _line: None), list[tuple[str, Publish]]()
+    gateway = None if kind == "mqtt" else by_zenoh(where, "gateway")
     for number in range(count):
         identity = Identity("pebble", "robots", f"board-{number:04d}")
-        publish = (by_mqtt if kind == "mqtt" else by_zenoh)(where, identity.id)
+        publish = gateway or by_mqtt(where, identity.id)
         publish(CAPABILITIES.topic(identity.base), capabilities(identity))
         boards.append((ONLINE.topic(identity.base), publish))
     answer({"ready": True})

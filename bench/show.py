@@ -86,7 +86,8 @@ def digits(value: float) -> str:
     """Return three significant digits; a dash for NaN, "never" for infinity."""
     if not math.isfinite(value):
         return "–" if math.isnan(value) else "never"
-    return f"{value:.0f}" if abs(value) >= 100 else f"{value:.1f}" if abs(value) >= 10 else f"{value:.2f}"
+    size = abs(float(f"{value:.3g}"))  # 99.96 is 100
+    return f"{value:.0f}" if size >= 100 else f"{value:.1f}" if size >= 10 else f"{value:.2f}"
 
 
 def middle(cell: Cell | None) -> str:

@@ -18,11 +18,11 @@ if TYPE_CHECKING:
     from pebble.bench.show import Shown
 
 FOLDER = Path("bench-results")
-_MOST_S = 3600.0  # of one phase
+_LONGEST_S = 3600.0  # of one phase
 
 Variants = Annotated[str | None, typer.Option(help="Some of them, separated by commas.", metavar="NAMES")]
 Seconds = Annotated[
-    float | None, typer.Option(help="Duration of each case in a round.", min=0.1, max=_MOST_S, show_default=False)
+    float | None, typer.Option(help="Duration of each case in a round.", min=0.1, max=_LONGEST_S, show_default=False)
 ]
 Rounds = Annotated[int | None, typer.Option(help="Rounds of all cases.", min=1, max=10_000, show_default=False)]
 
@@ -80,7 +80,7 @@ def bridge(
     with_media: Annotated[bool, typer.Option("--with-media", help="Also with 1080p pictures and sound.")] = False,
     seconds: Annotated[
         float | None,
-        typer.Option(help="Driving time per robot and round, under each load.", min=0.1, max=_MOST_S),
+        typer.Option(help="Driving time per robot and round, under each load.", min=0.1, max=_LONGEST_S),
     ] = None,
     rounds: Rounds = None,
     quick: Quick = False,
@@ -116,7 +116,7 @@ def startup(variants: Variants = None, rounds: Rounds = None, quick: Quick = Fal
 @app.command()
 def cost(
     variants: Variants = None,
-    seconds: Annotated[float | None, typer.Option(help="Of each phase.", min=0.4, max=_MOST_S)] = None,
+    seconds: Annotated[float | None, typer.Option(help="Of each phase.", min=0.4, max=_LONGEST_S)] = None,
     rounds: Rounds = None,
     quick: Quick = False,
     output: Output = FOLDER,
@@ -160,7 +160,7 @@ def frames(
 @app.command()
 def scale(
     boards: Annotated[str | None, typer.Option(help="For example 10,100,1000.", metavar="NUMBERS")] = None,
-    seconds: Annotated[float | None, typer.Option(help="Of each size.", min=1, max=_MOST_S)] = None,
+    seconds: Annotated[float | None, typer.Option(help="Of each size.", min=1, max=_LONGEST_S)] = None,
     quick: Quick = False,
     output: Output = FOLDER,
 ) -> int:
@@ -190,7 +190,7 @@ def impair(
         str | None, typer.Option(help='Such as "mqtt original,zenoh h264 opus".', metavar="NAMES")
     ] = None,
     window: Annotated[
-        float | None, typer.Option(help="Seconds of video, and of audio, per trial.", min=1, max=_MOST_S)
+        float | None, typer.Option(help="Seconds of video, and of audio, per trial.", min=1, max=_LONGEST_S)
     ] = None,
     quick: Quick = False,
     output: Output = FOLDER,

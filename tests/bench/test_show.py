@@ -141,10 +141,10 @@ def test_texts_that_lie_over_each_other_would_be_seen() -> None:
 
 def test_nothing_measured_is_no_picture() -> None:
     nothing = [Cell(variant="mqtt", measure="way", unit="us", params={"n": 1}, rounds=rounds) for rounds in ([], [[]])]
-    drawn = (plots.curves("x", "X", nothing), plots.tails("x", "X", nothing), plots.ratios("x", "X", nothing, "mqtt"),
+    drawn = (plots.curves("x", "X", nothing), plots.ratios("x", "X", nothing, "mqtt"),
              plots.lines("x", "X", nothing, over="n"),
              plots.medians("x", "X", nothing, panel=Cell.conditions, row=Cell.conditions))  # fmt: skip
-    assert drawn == ([], [], [], [], [])
+    assert drawn == ([], [], [], [])
 
 
 def test_a_distribution_ends_below_100_percent_by_what_was_lost() -> None:
@@ -191,8 +191,8 @@ def test_a_variant_looks_the_same_everywhere_and_like_no_other() -> None:
 
 
 def test_numbers_have_three_digits() -> None:
-    assert [digits(value) for value in (1234.5, 12.345, 0.1234, math.nan, math.inf)] == [
-        "1234", "12.3", "0.12", "–", "never",
+    assert [digits(value) for value in (1234.5, 99.96, 12.345, 0.1234, math.nan, math.inf)] == [
+        "1234", "100", "12.3", "0.12", "–", "never",
     ]  # fmt: skip
     cell = Cell(variant="a", measure="m", unit="s", rounds=[[3.0], [1.0], [], [2.0]])
     assert (spread(cell), spread(None)) == ("2.00 (1.00 to 3.00)", "–")
