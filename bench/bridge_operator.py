@@ -23,7 +23,7 @@ from paho.mqtt.client import MQTTMessage
 
 from pebble import contract
 from pebble.bench.clients import RATE_HZ, RobotSubscriber, StockClient, axes_of
-from pebble.bench.judging.null import spin
+from pebble.bench.results import STAND_IN
 from pebble.bench.usage import cpu_s
 from pebble.errors import PebbleError
 from pebble.rig.processes import python
@@ -32,7 +32,7 @@ from pebble.rig.worker_end import serve, serve_on_thread
 from pebble.services.serial_mcu_bridge.text.goob_base import Touch, parse
 from pebble.simulation.trace import Entry, Trace
 
-STAND_IN, HOP = "paho", "one hop"  # paho: two plain programs in place of a robot of ours, see stand_in
+HOP = "one hop"
 ALL = "all"  # processes of a robot; and those that forward, by the names of their services
 SERVICES = {"bridge": "mqtt_bridge", "serial bridge": "serial_mcu_bridge"}
 _MODULE = "pebble.bench.bridge_operator"
@@ -121,23 +121,18 @@ class DrivenRobot(StockClient):
         if running and len(self._parts) < len(SERVICES):
             raise PebbleError(f"{robot.kind}: a bridge is not running\n{robot.log()}")
 
-    def drive(self, seconds: float, rate_hz: float = RATE_HZ, *, work_us: float = 0.0, slowed: bool = False) -> Turn:
-        """The operator works for ``work_us`` before each command: before it reads the clock, or, if ``slowed``, after.
-
-        Raises PebbleError if one of the two bridges has ended.
-        """
+    def drive(self, seconds: float) -> Turn:
+        """Drive at a steady rate. Raises PebbleError if one of the two bridges has ended."""
         groups = {ALL: self.robot.pids(), **self._parts}
         before = {name: cpu_s(pids) for name, pids in groups.items()}
         sent: dict[Wheels, int] = {}
         began, due = time.monotonic_ns(), time.monotonic()
-        for _ in range(round(seconds * rate_hz)):
+        for _ in range(round(seconds * RATE_HZ)):
             self._number += 1
             left, right = wheels(self._number)
-            spin(0.0 if slowed else work_us)
             sent[left, right] = time.monotonic_ns()
-            spin(work_us if slowed else 0.0)
             self.send(contract.DRIVE, BASE, axes_of(left, right))
-            due += 1 / rate_hz
+            due += 1 / RATE_HZ
             time.sleep(max(0.0, due - time.monotonic()))
         ended = time.monotonic_ns()
         used = {name: cpu_s(pids) - before[name] for name, pids in groups.items() if pids}

@@ -1,19 +1,15 @@
-"""Stock paho clients, of which operators are made; one drives many robots, one watches a robot start and stream.
-
-``python -m pebble.bench.clients PORT`` drives the robots whose base topics its newest line names, separated by spaces.
-"""
+"""Stock paho clients, of which operators are made: one drives robots, one watches a robot start and stream."""
 
 from __future__ import annotations
 
 import json
 import socket
-import sys
 import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager, suppress
-from itertools import zip_longest
+from itertools import cycle, zip_longest
 from typing import Any, Final, Self
 
 from paho.mqtt.client import Client, MQTTMessage, MQTTMessageInfo
@@ -23,10 +19,8 @@ from pebble import contract
 from pebble.contract.packets import Codec, Picture, PictureKind, Sound
 from pebble.errors import PayloadError, PebbleError
 from pebble.rig.robot import BASE, MEDIA, Robot, one_robot
-from pebble.rig.worker_end import serve
 
 RATE_HZ: Final = 20.0  # of each robot
-MANY: Final = 65_535  # messages in flight
 AHEAD: Final = {"x": 0.0, "z": 0.5}
 ZERO: Final = {"x": 0.0, "z": 0.0}
 _ANSWER_S = 10.0
@@ -36,7 +30,7 @@ _MEDIA_CHANNELS = (contract.MQTT_VIDEO, contract.VIDEO_CONTROL), (contract.MQTT_
 
 
 def axes_of(left: float, right: float) -> dict[str, float]:
-    """The axes of the drive command for these wheel speeds."""
+    """Return the axes of the drive command for these wheel speeds."""
     return {"x": (left - right) / 2, "z": (left + right) / 2}
 
 
@@ -70,12 +64,12 @@ class StockClient:
         return self
 
     def wait(self) -> None:
-        """Until the broker has acknowledged the subscriptions, or the connection without any. Raises PebbleError."""
+        """Wait for the broker to acknowledge the subscriptions, or the connection without any. Raises PebbleError."""
         if not self._ready.wait(_ANSWER_S):
             raise PebbleError(f"the broker acknowledged nothing within {_ANSWER_S:.0f} s")
 
     def subscribe(self, filter_: str, qos: int) -> None:
-        """One more subscription, acknowledged by the broker when this returns. Raises PebbleError."""
+        """Add a subscription, acknowledged by the broker when this returns. Raises PebbleError."""
         self._ready.clear()
         self.paho.subscribe(filter_, qos)
         self.wait()
@@ -106,33 +100,23 @@ def _send_at_once(_client: Client, _data: Any, sock: Any) -> None:
 
 
 class Driver(StockClient):
-    """Drives the chosen robots at :data:`RATE_HZ`, spread evenly. Those that begin or end to be driven get a zero."""
+    """Drives robots at :data:`RATE_HZ` each, spread evenly, after a zero for each."""
 
     def __init__(self, port: int, *bases: str) -> None:
         super().__init__()
-        self._lock, self._closed = threading.Lock(), threading.Event()
-        self._bases: tuple[str, ...] = ()
-        self.paho.max_inflight_messages_set(MANY)
+        self._bases, self._closed = bases, threading.Event()
         self.open(port)
-        self.choose(bases)
         threading.Thread(target=self._run, name="driver", daemon=True).start()
 
-    def choose(self, bases: tuple[str, ...]) -> None:
-        """Drive these robots, and no others."""
-        with self._lock:
-            for base in {*self._bases} ^ {*bases}:
-                self.send(contract.DRIVE, base, ZERO)
-            self._bases = bases
-
     def _run(self) -> None:
-        number, due = 0, time.monotonic()
-        while not self._closed.wait(max(0.0, due - time.monotonic())):
-            with self._lock:
-                count = len(self._bases)
-                if count:
-                    self.send(contract.DRIVE, self._bases[number % count], AHEAD)
-            number += 1
-            due = max(due + 1 / RATE_HZ / max(1, count), time.monotonic() - 1 / RATE_HZ)
+        for base in self._bases:
+            self.send(contract.DRIVE, base, ZERO)
+        due = time.monotonic()
+        for base in cycle(self._bases):
+            if self._closed.wait(max(0.0, due - time.monotonic())):
+                return
+            self.send(contract.DRIVE, base, AHEAD)
+            due = max(due + 1 / RATE_HZ / len(self._bases), time.monotonic() - 1 / RATE_HZ)
 
     def close(self) -> None:
         self._closed.set()
@@ -140,7 +124,7 @@ class Driver(StockClient):
 
 
 def driving(port: int, *bases: str) -> closing[Driver]:
-    """Drives these robots during the ``with`` block, whether or not they receive it."""
+    """Drive these robots during the ``with`` block, whether or not they receive it."""
     return closing(Driver(port, *bases))
 
 
@@ -171,7 +155,7 @@ class RobotSubscriber(StockClient):
 
 @contextmanager
 def ready_robot(kind: str) -> Iterator[tuple[Robot, RobotSubscriber]]:
-    """A robot with a camera and a microphone whose services are ready. Raises PebbleError with its log."""
+    """Start a robot with a camera and a microphone, whose services are ready. Raises PebbleError with its log."""
     with one_robot(kind, services=MEDIA) as robot, closing(RobotSubscriber(robot.remote_port, BASE)) as subscriber:
         subscriber.wait()
         robot.launch()
@@ -180,7 +164,7 @@ def ready_robot(kind: str) -> Iterator[tuple[Robot, RobotSubscriber]]:
 
 
 def encoding_of(raw: bytes) -> str:
-    """The encoding of a picture or a sound packet; ``json`` if it has no binary header."""
+    """Return the encoding of a picture or a sound packet; ``json`` if it has no binary header."""
     with suppress(PayloadError):
         return "h264" if Picture.unpack(raw).kind == PictureKind.H264 else "pbvd"
     with suppress(PayloadError):
@@ -189,11 +173,6 @@ def encoding_of(raw: bytes) -> str:
 
 
 def all_ready(status: Mapping[str, Any]) -> bool:
-    """Programs on demand are ``stopped`` until requested; before the robot runs, all are."""
+    """True if all services are ready; those on demand are ``stopped`` until requested, as all are before."""
     states = {service["state"] for service in status.get("services", {}).values()}
     return "ready" in states and states <= {"ready", "stopped"}
-
-
-if __name__ == "__main__":
-    with driving(int(sys.argv[1])) as only:
-        serve(lambda line: only.choose(tuple(line.split())))

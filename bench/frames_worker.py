@@ -1,9 +1,9 @@
 """One end of a transfer of time-stamped frames, 30 a second, as a process that measures during a given window.
 
-``python -m pebble.bench.frames_worker VARIANT ROLE WHERE SIZE SLOWER_US``: ``WHERE`` is a folder for sockets, or a
-broker's port; ``SIZE`` is ``640x480``; a writer delays each frame by ``SLOWER_US``. One end of GStreamer's is this
-file in the system's Python, where gi and Gst are installed; without arguments it fails if it could not be. So a plain
-file imports only the standard library, numpy, and the other end of a worker.
+``python -m pebble.bench.frames_worker VARIANT ROLE WHERE SIZE``: ``WHERE`` is a folder for sockets, or a broker's
+port; ``SIZE`` is ``640x480``. One end of GStreamer's is this file in the system's Python, where gi and Gst are
+installed; without arguments it fails if it could not be. So a plain file imports only the standard library, numpy, and
+the other end of a worker.
 
 A frame begins with the time it was complete (CLOCK_MONOTONIC, ns) and its number, and ends with its number again. The
 time is written last. A process writes ``{"ready": true}``, receives ``FROM UNTIL`` (CLOCK_MONOTONIC, ns), and answers
@@ -57,11 +57,8 @@ class Window:
         return None
 
 
-def write(writer: Writer, size: int, slower_us: float) -> None:
-    """Writes a frame of ``size`` bytes 30 times a second until standard input closes; answers how many of the window.
-
-    Each frame is delayed by ``slower_us`` of busy work between its time stamp and its sending.
-    """
+def write(writer: Writer, size: int) -> None:
+    """Write a frame of ``size`` bytes 30 times a second until standard input closes; answer how many of the window."""
     picture = np.random.default_rng(1).integers(0, 256, size, dtype=np.uint8)
     stamps: list[int] = []  # of the frames, also of those that could not be sent
 
@@ -72,9 +69,6 @@ def write(writer: Writer, size: int, slower_us: float) -> None:
             struct.pack_into("<q", frame.data, place, len(stamps))
         stamps.append(time.monotonic_ns())
         struct.pack_into("<q", frame.data, 0, stamps[-1])
-        end = time.perf_counter_ns() + int(1000 * slower_us)
-        while time.perf_counter_ns() < end:  # as judging.null.spin, which the system's Python cannot import
-            pass
 
     window = Window(lambda: {"sent": sum(one in window.ns for one in stamps), "fallbacks": writer.fallbacks})
     worker_end.answer({"ready": True})
@@ -315,13 +309,13 @@ def main(arguments: list[str]) -> None:
         _load_gstreamer()
     if not arguments:  # only asked whether it could
         return
-    variant, role, where, size, slower_us = arguments
+    variant, role, where, size = arguments
     width, height = map(int, size.split("x"))
     count, caps = 3 * width * height, f"video/x-raw,format=BGR,width={width},height={height},framerate=30/1"
     if variant == "zenoh-net":  # as on a system where memory may not be locked: frames are sent as bytes
         shared_memory.lockable = lambda size: False  # noqa: ARG005
     if role == "writer":
-        write(writer(variant, where, count, caps), count, float(slower_us))
+        write(writer(variant, where, count, caps), count)
     else:
         read(reader(variant, where, caps), count if variant == "memcpy" else 0)
 

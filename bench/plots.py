@@ -1,4 +1,4 @@
-"""The common style of all pictures: colours of the variants, panels, axes, legends. matplotlib is imported to draw."""
+"""Draws the pictures of comparisons: distributions, bars, and lines. matplotlib is imported only to draw."""
 
 from __future__ import annotations
 
@@ -7,10 +7,13 @@ import math
 import textwrap
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pebble.bench.results import Results, named
+from pebble.bench.results import STAND_IN, Cell, grouped, named, percentile
+from pebble.bench.rounds import Interval, ratio
+from pebble.bench.show import Picture, digits
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -19,11 +22,143 @@ if TYPE_CHECKING:
 
 _DPI = 150
 _WIDEST = 13.0  # inches
+_DARK = "#222"
+_LEAST = 20  # samples for a distribution
 _SETTINGS: dict[Any, Any] = {
     "font.size": 9, "axes.titlesize": 9, "figure.titlesize": 11, "xtick.labelsize": 8, "ytick.labelsize": 8,
     "axes.spines.top": False, "axes.spines.right": False, "axes.titlelocation": "left",
     "axes.grid": True, "axes.axisbelow": True, "grid.color": "#e4e4e4",
 }  # fmt: skip
+
+
+# -- the kinds of pictures
+
+
+def curves(name: str, caption: str, cells: Sequence[Cell]) -> list[Picture]:
+    """Return the distributions, a panel for each condition: the share of all messages that arrived within a time."""
+    known = [cell for cell in cells if len(cell.samples) >= _LEAST]
+    caption = f"{caption}. Share of all messages, lost ones included, within the time"
+    return [Picture(name, caption, partial(_curves, known, caption))] if known else []
+
+
+def _curves(cells: Sequence[Cell], title: str) -> Figure:
+    """The curves end below 100 % by the lost share; the slowest few are cut off."""
+    by_place, style_of = grouped(cells, Cell.conditions), styles([cell.variant for cell in cells])
+    figure, every = panels(len(by_place), 3, (3.9, 2.7), title)
+    ends = around([percentile(cell.samples, percent) for cell in cells for percent in (0.1, 99.8)])
+    for axes, (place, some) in zip(every, by_place.items(), strict=True):
+        for cell in some:
+            times, style = sorted(cell.samples), style_of[cell.variant]
+            step = 100 / (len(times) + (cell.lost or 0))
+            shares = [step * count for count in range(1, len(times) + 1)]
+            axes.plot(times, shares, color=style.colour, linestyle=style.dash)
+        log_axis(axes, "x", f"latency, {_unit(cells[0])}", *ends)
+        axes.set(ylim=(0, 101), title=short(place, 44))
+        for percent in (50, 99):
+            guide(axes, percent, f"p{percent}")
+    legend(figure, {variant: replace(style, marker="") for variant, style in style_of.items()})
+    return figure
+
+
+@dataclass(frozen=True, slots=True)
+class Bar:
+    """A bar in a panel and in a row, in a variant's colour; a line over it, and a text at the end of both."""
+
+    panel: str
+    row: str
+    variant: str
+    end: float
+    line: tuple[float, ...]
+    text: str = ""
+
+
+def medians(
+    name: str, caption: str, cells: Sequence[Cell], *, panel: Callable[[Cell], str], row: Callable[[Cell], str]
+) -> list[Picture]:
+    """Return bars to the medians, with lines between the fastest and the slowest round."""
+    bars = [
+        Bar(panel(cell), row(cell), cell.variant, p50, (min(rounds), max(rounds)), f"  {digits(p50)}")
+        for cell in cells
+        for p50, rounds in [(cell.percentile(50), cell.medians())]
+        if rounds
+    ]
+    caption = f"{caption}: medians, with lines from the lowest to the highest round"
+    units = unique([_unit(cell) for cell in cells])
+    return [Picture(name, caption, partial(_bars, bars, caption, "" if len(units) > 1 else units[0]))] if bars else []
+
+
+def ratios(name: str, caption: str, cells: Sequence[Cell], baseline: str) -> list[Picture]:
+    """Return the medians as ratios to the baseline's, with their intervals; a panel for each measure."""
+    base = {(cell.measure, cell.conditions()): cell for cell in cells if cell.variant == baseline}
+    pairs = [(cell, base.get((cell.measure, cell.conditions()))) for cell in cells if cell.variant != baseline]
+    judged = [(cell, ratio(cell, theirs)) for cell, theirs in pairs if theirs is not None]
+    bars = [_ratio_bar(cell, interval) for cell, interval in judged if math.isfinite(interval.ratio)]
+    caption = f"{caption}: median as a ratio to {baseline}'s, with its interval of 99 %"
+    return [Picture(name, caption, partial(_bars, bars, caption, "ratio", is_ratio=True))] if bars else []
+
+
+def _ratio_bar(cell: Cell, interval: Interval) -> Bar:
+    line = (interval.ratio,) if interval.few else (interval.low, interval.high)
+    return Bar(cell.measure, cell.conditions(), cell.variant, interval.ratio, line)
+
+
+def _bars(bars: Sequence[Bar], title: str, label: str, *, is_ratio: bool = False) -> Figure:
+    """Draw panels of bars, those of a row below each other; ratios begin at 1."""
+    by_panel, style_of = grouped(bars, lambda bar: bar.panel), styles(unique([bar.variant for bar in bars]))
+    every_row, begin = unique([bar.row for bar in bars]), float(is_ratio)
+    height = 0.9 + 0.17 * max(map(len, by_panel.values())) + 0.15 * len(every_row)
+    figure, every = panels(len(by_panel), 2, (5.6, height), title)
+    for axes, (panel, some) in zip(every, by_panel.items(), strict=True):
+        rows = [row for row in every_row if any(bar.row == row for bar in some)]
+        for place, row in enumerate(rows):
+            here = [bar for bar in some if bar.row == row]
+            for number, bar in enumerate(here):
+                y, thick = place + 0.8 * ((number + 0.5) / len(here) - 0.5), min(0.5, 0.72 / len(here))
+                axes.barh(y, bar.end - begin, left=begin, height=thick, color=style_of[bar.variant].colour, alpha=0.8)
+                axes.plot(bar.line, [y] * len(bar.line), color=_DARK, linewidth=1.1, marker="|", markersize=6)
+                axes.annotate(bar.text, (max((bar.end, *bar.line)), y), fontsize=8, va="center")
+        axes.set_yticks(range(len(rows)), [short(row, 34) for row in rows])
+        axes.set(ylim=(len(rows) - 0.4, -0.6), title=short(panel, 50))
+        axes.grid(visible=False, axis="y")
+        ends = [value for bar in some for value in (bar.end, *bar.line)]
+        if is_ratio:
+            low, high = max(0.02, 0.93 * min(0.95, *ends)), min(50.0, 1.07 * max(1.25, *ends))
+            log_axis(axes, "x", f"{label}; left of 1 is faster", low, high)
+            axes.axvline(1.0, color=_DARK, linewidth=0.9)
+        else:
+            axes.set(xlim=(0, 1.25 * max(ends) or 1.0), xlabel=label)
+    legend(figure, {variant: Style(style.colour, "", "s") for variant, style in style_of.items()})
+    return figure
+
+
+def lines(name: str, caption: str, cells: Sequence[Cell], *, over: str) -> list[Picture]:
+    """Return lines through the medians as the parameter ``over`` grows; one panel for each measure."""
+    known = [cell for cell in cells if cell.samples]
+    return [Picture(name, caption, partial(_lines, known, caption, over))] if known else []
+
+
+def _lines(cells: Sequence[Cell], title: str, over: str) -> Figure:
+    by_measure, style_of = grouped(cells, lambda cell: cell.measure), styles(unique([cell.variant for cell in cells]))
+    figure, every = panels(len(by_measure), 3, (3.9, 3.0), title)
+    for axes, (measure, some) in zip(every, by_measure.items(), strict=True):
+        for variant, points in grouped(some, lambda cell: cell.variant).items():
+            along = sorted((float(str(cell.params[over])), cell.percentile(50)) for cell in points)
+            style, last = style_of[variant], along[-1]
+            axes.plot(*zip(*along, strict=True), color=style.colour, linestyle=style.dash, marker=style.marker)
+            axes.annotate(f"  {digits(last[1])}", last, fontsize=8, va="center", annotation_clip=False)
+        at = [float(str(cell.params[over])) for cell in some]
+        log_axis(axes, "x", over, 0.8 * min(at), 2.5 * max(at))
+        top = 1.15 * max(cell.percentile(50) for cell in some) or 1.0
+        axes.set(ylim=(0, top), ylabel=f"{measure}, {_unit(some[0])}")
+    legend(figure, style_of)
+    return figure
+
+
+def _unit(cell: Cell) -> str:
+    return {"us": "µs", "%": "% of a core"}.get(cell.unit, cell.unit)
+
+
+# -- the common style of all pictures: colours of the variants, panels, axes, legends
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,15 +171,6 @@ class Style:
     hollow: bool = False
 
 
-@dataclass(frozen=True, slots=True)
-class Picture:
-    """A picture: its file name without ending, its caption, and the function that draws it."""
-
-    name: str
-    caption: str
-    make: Callable[[], Figure]
-
-
 #: The variants of each colour. The first four are for other ones of Zenoh, too, the next four of MQTT, the rest of all.
 _VARIANTS: dict[str, tuple[str, ...]] = {
     "#0072B2": ("zenoh", "zenoh-p2p", "zenoh-shm", "zenoh h264 opus"),
@@ -54,7 +180,7 @@ _VARIANTS: dict[str, tuple[str, ...]] = {
     "#D55E00": ("mqtt", "mqtt h264 opus"),
     "#E69F00": ("mqtt-nodelay", "mqtt original"),
     "#A4133C": ("mqtt5",),
-    "#8C510A": ("paho",),
+    "#8C510A": (STAND_IN,),
     "#4D4D4D": ("one hop", "memcpy"),
     "#8A8A8A": ("gstreamer-shm",),
     **dict.fromkeys(("#117733", "#6DBE8B", "#CC79A7", "#7B4F9E", "#1A1A1A", "#B3B3B3"), ()),
@@ -65,31 +191,27 @@ _STYLES = {
 
 
 def styles(variants: Sequence[str]) -> dict[str, Style]:
-    """The fixed style of each known variant, and one from its family's colours for every other."""
-    found = {name: colour for colour, names in _VARIANTS.items() for name in names if name in variants}
+    """Return the fixed style of each known variant, and one from its family's colours for every other."""
+    colours = {name: colour for colour, names in _VARIANTS.items() for name in names if name in variants}
     for name in variants:
-        begin, end = (0, 4) if name.startswith("zenoh") else (4, 8) if name.startswith(("mqtt", "paho")) else (8, None)
+        begin, end = (0, 4) if name.startswith("zenoh") else (4, 8) if name.startswith("mqtt") else (8, None)
         family = list(_VARIANTS)[begin:end]
-        found.setdefault(name, next((colour for colour in family if colour not in found.values()), family[0]))
-    return {name: replace(_STYLES[found[name]], hollow="original" in name) for name in variants}
+        colours.setdefault(name, next((colour for colour in family if colour not in colours.values()), family[0]))
+    return {name: replace(_STYLES[colours[name]], hollow="original" in name) for name in variants}
 
 
 def unique(values: Sequence[str]) -> list[str]:
-    """The values in the order of their first appearance."""
+    """Return the values in the order of their first appearance."""
     return list(dict.fromkeys(values))
 
 
-def finite(samples: Sequence[float | None]) -> list[float]:
-    return [sample for sample in samples if sample is not None and math.isfinite(sample)]
-
-
 def short(text: str, width: int = 30) -> str:
-    """Wraps long names to two lines and truncates them."""
+    """Wrap long names to two lines and truncate them."""
     return "\n".join(textwrap.wrap(text, width, max_lines=2, placeholder="…")) or text
 
 
 def panels(count: int, columns: int, size: tuple[float, float], title: str) -> tuple[Figure, list[Axes]]:
-    """A figure with ``count`` panels of ``size`` inches each, as many in a row as fit."""
+    """Return a figure with ``count`` panels of ``size`` inches each, as many in a row as fit."""
     from matplotlib.figure import Figure
 
     columns = min(columns, count)
@@ -101,7 +223,7 @@ def panels(count: int, columns: int, size: tuple[float, float], title: str) -> t
 
 
 def legend(figure: Figure, entries: dict[str, Style], *, more: Sequence[Line2D] = ()) -> None:
-    """Adds a legend below the panels."""
+    """Add a legend below the panels."""
     from matplotlib.lines import Line2D
 
     handles = [
@@ -115,25 +237,26 @@ def legend(figure: Figure, entries: dict[str, Style], *, more: Sequence[Line2D] 
     figure.legend(handles=handles, loc="outside lower center", ncols=columns, frameon=False)
 
 
-def save(picture: Picture, path: Path, results: Results) -> None:
-    """Draws a PNG; a quick run is marked in the corner. Raises PebbleError if it cannot be written."""
+def save(picture: Picture, folder: Path, *, quick: bool) -> Path:
+    """Draw a PNG; a quick run is marked in the corner. Raises PebbleError if it cannot be written."""
     import matplotlib as mpl
     from PIL import Image
 
-    buffer = io.BytesIO()
+    buffer, path = io.BytesIO(), folder / f"{picture.name}.png"
     with mpl.rc_context(_SETTINGS):
         figure = picture.make()
-        if results.quick:
+        if quick:
             figure.text(0.995, 0.993, "quick run", ha="right", va="top", color="#A4133C", weight="bold")
         figure.savefig(buffer, format="png", dpi="figure")
     drawn = Image.open(buffer).convert("RGB")  # with a palette, a file is a third as large
     image = drawn.quantize(255, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE)
     with named(path):
         image.save(path, optimize=True, dpi=(_DPI, _DPI))
+    return path
 
 
 def log_axis(axes: Axes, which: str, label: str, low: float, high: float) -> None:
-    """Sets a logarithmic axis from ``low`` to ``high``, with written-out numbers for any number of decades."""
+    """Set a logarithmic axis from ``low`` to ``high``, with written-out numbers for any number of decades."""
     from matplotlib.ticker import LogLocator, MaxNLocator, NullLocator
 
     limits: dict[str, Any] = {f"{which}scale": "log", f"{which}lim": (low, high), f"{which}label": label}
@@ -145,14 +268,14 @@ def log_axis(axes: Axes, which: str, label: str, low: float, high: float) -> Non
     axis.set_minor_locator(NullLocator())
 
 
-def around(values: Sequence[float | None]) -> tuple[float, float]:
-    """Ends of a logarithmic axis with some margin around all positive values."""
-    positive = [value for value in finite(values) if value > 0] or [1.0]
+def around(values: Sequence[float]) -> tuple[float, float]:
+    """Return the ends of a logarithmic axis with some margin around all positive values."""
+    positive = [value for value in values if 0 < value < math.inf] or [1.0]
     return 0.75 * min(positive), 1.4 * max(positive)
 
 
 def guide(axes: Axes, value: float, text: str) -> None:
-    """Draws a thin line at a reference value, with its name at the end."""
+    """Draw a thin line at a reference value, with its name at the end."""
     axes.axhline(value, color="#8a8a8a", linewidth=0.8, linestyle=(0, (4, 3)), zorder=1)
     axes.annotate(
         text, (1.0, value), xycoords=axes.get_yaxis_transform(), xytext=(4, 0), textcoords="offset points", fontsize=8,

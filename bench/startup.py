@@ -1,19 +1,30 @@
-"""Measures a robot's start-up, how fast a late subscriber receives all retained messages, and the first picture."""
+"""Measures a robot's start-up, how fast a late subscriber receives all retained messages, and the first picture.
+
+Every launch is a fresh robot at a remote broker that runs already; an operator subscribes there, and sends drive
+commands at 20 Hz, before the launcher is started. ``first heartbeat``, ``all ready`` and ``first drive obeyed`` count
+from just before that, the last one until a line that moves the wheels has reached the MCU's pty. ``late …``: from the
+begin of a connection until the last retained topic has arrived. ``picture …``: from an operator's request until the
+first picture is decoded, from a camera that no program uses, or for a second operator while the first one watches.
+"""
 
 from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable, Iterator, Set
+from collections.abc import Callable, Iterator, Sequence, Set
 from contextlib import closing
+from dataclasses import dataclass
 from functools import partial
-from typing import Any
+from typing import Any, Final
 
-from pebble.bench.clients import RATE_HZ, UP_S, RobotSubscriber, StockClient, driving, ready_robot
-from pebble.bench.comparison import Budget, Case, Comparison, Measuring, Report, rounds, variants
-from pebble.bench.pictures import dots
-from pebble.bench.results import Cell
-from pebble.bench.tables import SPREAD, Claims, Grid
+from rich.console import Console
+from rich.table import Table
+
+from pebble.bench import plots
+from pebble.bench.clients import UP_S, RobotSubscriber, StockClient, driving, ready_robot
+from pebble.bench.results import Cell, Results, begin, round_cell
+from pebble.bench.rounds import Say, in_turn, measure_rounds
+from pebble.bench.show import RATIOS, Shown, compared, plain_table, spread
 from pebble.client.media_receiver import MediaReceiver
 from pebble.config import load
 from pebble.contract.encodings import ALL_VIDEO
@@ -23,10 +34,11 @@ from pebble.rig.robot import BASE, KINDS, Robot, one_robot
 from pebble.runtime.connections import local_transport
 from pebble.transports import Message, MqttSettings, Transport, create
 
-PICTURES_EVERY = 5  # launches, the first of which is followed by one of a robot with a camera
-PICTURES = tuple(f"picture, {encoding}, {state}" for state in ("at rest", "running") for encoding in ALL_VIDEO)
-STARTED = ("first heartbeat", "all ready", "first drive obeyed")
-MEASURES = (*STARTED, "late operator", "late operator, paho", "late service", *PICTURES)
+STARTED: Final = ("first heartbeat", "all ready", "first drive obeyed")
+LATE: Final = ("late operator", "late operator, paho", "late service")
+PICTURES: Final = tuple(f"picture, {encoding}, {state}" for encoding in ALL_VIDEO for state in ("at rest", "running"))
+MEASURES: Final = (*STARTED, *LATE, *PICTURES)
+_PICTURES_EVERY = 5  # launches, the first of which is followed by one of a robot with a camera
 _CAMERA = "camera_publisher"  # runs while it is requested
 _LATE_S = 10.0  # for one late subscriber
 _QUIET_S = 0.3  # without another retained message until all count as received
@@ -37,16 +49,63 @@ _POLL_S = 0.02  # how often an operator looks whether a key frame is missing
 _Receive = Callable[[Any], None]  # is called with each message
 
 
-def measure(case: Case) -> Iterator[Cell]:
-    """One launch, and in some rounds the first pictures, of fresh robots. Raises PebbleError with the robot's log."""
-    yield from launch(case)
-    if case.number % PICTURES_EVERY == 0:
-        yield from first_pictures(case)
+@dataclass(frozen=True, slots=True)
+class Settings:
+    """Launches of each variant, one in each round, and late subscribers of each launch."""
+
+    variants: Sequence[str] = KINDS
+    rounds: int = 10
+    joins: int = 5
 
 
-def launch(case: Case) -> Iterator[Cell]:
-    """Seconds count from just before the launcher is started."""
-    with one_robot(case.variant) as robot, closing(RobotSubscriber(robot.remote_port, BASE)) as subscriber:
+FULL: Final = Settings()
+QUICK: Final = Settings(rounds=3, joins=3)
+
+
+def run(settings: Settings, console: Console) -> Shown:
+    """Measure all variants. Raises PebbleError."""
+    results = begin("startup", settings)
+
+    def measure_round(number: int, say: Say) -> Iterator[Cell]:
+        for variant in in_turn(settings.variants, number):
+            say(variant)
+            yield from launch(variant, settings.joins)
+            if number % _PICTURES_EVERY == 0:
+                yield from first_pictures(variant)
+
+    measure_rounds(results, settings.rounds, measure_round, console)
+    return shown(results)
+
+
+def shown(results: Results) -> Shown:
+    """Return the tables and pictures of results."""
+    results.cells.sort(key=lambda cell: MEASURES.index(cell.measure))
+    pictures = plots.medians("startup", "Start-up", results.cells, panel=_phase, row=lambda cell: cell.measure)
+    return Shown(results, [table(results)], pictures)
+
+
+def _phase(cell: Cell) -> str:
+    """Return the panel of a measure; a late subscriber takes a hundredth of the others."""
+    if cell.measure in STARTED:
+        return "from the launch, s"
+    return "late subscribers, ms" if cell.measure in LATE else "from the request of a picture, ms"
+
+
+def table(results: Results) -> Table:
+    """Return the times of both variants, and their ratio."""
+    ours, theirs = "zenoh", "mqtt"
+    grid = plain_table("Median (minimum to maximum) of the launches", ["", "unit", theirs, ours, f"{ours} / {theirs}"],
+                        left=2, caption=RATIOS)  # fmt: skip
+    for measure in dict.fromkeys(cell.measure for cell in results.cells):
+        mqtt, zenoh = results.find(theirs, measure), results.find(ours, measure)
+        unit = next(cell.unit for cell in results.cells if cell.measure == measure)
+        grid.add_row(measure, unit, spread(mqtt), spread(zenoh), compared(zenoh, mqtt))
+    return grid
+
+
+def launch(variant: str, joins: int) -> Iterator[Cell]:
+    """Launch a fresh robot. Seconds count from just before the launcher is started. Raises PebbleError with its log."""
+    with one_robot(variant) as robot, closing(RobotSubscriber(robot.remote_port, BASE)) as subscriber:
         subscriber.wait()
         with driving(robot.remote_port, BASE):
             began_ns = time.monotonic_ns()
@@ -56,33 +115,33 @@ def launch(case: Case) -> Iterator[Cell]:
             robot.expect(lambda: bool(_obeyed(robot, began_ns)), "no drive command was obeyed", UP_S)
         times = (subscriber.first_heartbeat_ns or 0, subscriber.ready_ns or 0, _obeyed(robot, began_ns)[0])
         for name, at_ns in zip(STARTED, times, strict=True):
-            yield case.cell(name, "s", [(at_ns - began_ns) / 1e9])
-        yield from _late(case, robot)
+            yield round_cell(variant, name, "s", [(at_ns - began_ns) / 1e9])
+        yield from _late(robot, joins)
 
 
 def _obeyed(robot: Robot, since_ns: int) -> list[int]:
-    """The times at which lines that move the wheels reached the MCU."""
+    """Return the times at which lines that move the wheels reached the MCU."""
     return [line.ns for line in robot.lines(since_ns) if line.drive is not None and any(line.drive)]
 
 
 # -- late subscribers, operators and services, wait for all retained messages of a running robot
 
 
-def _late(case: Case, robot: Robot) -> Iterator[Cell]:
+def _late(robot: Robot, joins: int) -> Iterator[Cell]:
     port, local = robot.remote_port, partial(local_transport, load(robot.config))
     inside, outside = map(_retained_topics, (local("retained-topics"), _connection(port)))  # start-up work finishes
     late: dict[str, tuple[Set[str], Callable[[_Receive], StockClient | Transport]]] = {
-        "late service": (inside, lambda _receive: local("late-service")),
         "late operator": (outside, lambda _receive: _connection(port)),
         "late operator, paho": (outside, lambda receive: StockClient(receive, [(_EVERYTHING, 1)], at_once=False)),
+        "late service": (inside, lambda _receive: local("late-service")),
     }
     for name, (topics, make) in late.items():
-        samples = [_late_ms(topics, make, port) for _ in range(case.run["joins"])]
-        yield case.cell(name, "ms", samples, topics=len(topics))
+        samples = [_late_ms(topics, make, port) for _ in range(joins)]
+        yield round_cell(robot.kind, name, "ms", samples, topics=len(topics))
 
 
 def _retained_topics(transport: Transport) -> set[str]:
-    """The topics with a retained message. Waits for a pause, since no message is marked as the last."""
+    """Return the topics with a retained message. Waits for a pause, since no message is marked as the last."""
     found: list[Message] = []
     with transport:
         transport.subscribe(_EVERYTHING, found.append, direct=True)
@@ -95,7 +154,7 @@ def _retained_topics(transport: Transport) -> set[str]:
 
 
 def _late_ms(topics: Set[str], make: Callable[[_Receive], StockClient | Transport], port: int) -> float:
-    """Milliseconds from opening a client until messages of all topics have arrived. Raises PebbleError."""
+    """Return the ms from opening a client until messages of all topics have arrived. Raises PebbleError."""
     missing, complete, ended_ns = set(topics), threading.Event(), 0
 
     def receive(message: Any) -> None:
@@ -119,7 +178,7 @@ def _late_ms(topics: Set[str], make: Callable[[_Receive], StockClient | Transpor
 
 
 def _connection(port: int) -> Transport:
-    """An operator's, not yet opened."""
+    """Return an operator's connection, not yet opened."""
     return create("mqtt", f"operator-{time.monotonic_ns()}", MqttSettings(host="127.0.0.1", port=port))
 
 
@@ -138,7 +197,7 @@ class _Operator(MediaReceiver):
             self._first_ns = time.monotonic_ns()
 
     def wait_ms(self) -> float:
-        """Milliseconds from the request to the first picture. Raises PebbleError if none comes."""
+        """Return the ms from the request to the first picture. Raises PebbleError if none comes."""
         self.wait_for_capabilities(UP_S)
         began_ns = time.monotonic_ns()
         self.request(self._encoding, sound=False)
@@ -150,12 +209,12 @@ class _Operator(MediaReceiver):
         return (self._first_ns - began_ns) / 1e6
 
 
-def first_pictures(case: Case) -> Iterator[Cell]:
-    """The wait with the camera at rest, and that of a second operator, of a fresh robot in each encoding.
+def first_pictures(variant: str) -> Iterator[Cell]:
+    """Measure the wait with the camera at rest, and that of a second operator, of a fresh robot in each encoding.
 
     Both are connected beforehand, as operators who have the robot's page open.
     """
-    with ready_robot(case.variant) as (robot, _):
+    with ready_robot(variant) as (robot, _):
         for encoding in ALL_VIDEO:
             robot.expect(lambda: _CAMERA not in robot.processes(), "the camera does not rest", _REST_S)
             with (
@@ -164,35 +223,5 @@ def first_pictures(case: Case) -> Iterator[Cell]:
                 closing(_Operator(one, encoding)) as first,
                 closing(_Operator(other, encoding)) as second,
             ):
-                yield case.cell(f"picture, {encoding}, at rest", "ms", [first.wait_ms()])
-                yield case.cell(f"picture, {encoding}, running", "ms", [second.wait_ms()])
-
-
-STARTUP = Comparison(
-    name="startup",
-    title="Start-up",
-    what="The time from a robot's launch to its first heartbeat, to ready and to the first obeyed command, and the "
-    "time until a late subscriber has all retained messages; and the time from an operator's request to the first "
-    "decoded picture. Each dot in the figure is one launch or subscriber.",
-    help="""How fast a robot starts: first heartbeat, all services ready, first drive command executed.
-
-    And how fast an operator or a service that connects later receives all retained messages, and how long an operator
-    waits for the first picture in each encoding. Every launch is a new simulated robot. Needs mosquitto.
-    """,
-    options=(rounds("Launches of each variant."), variants(KINDS, "mqtt or zenoh.")),
-    full=Budget(100, rounds=10, joins=5),
-    quick=Budget(23, rounds=3, joins=3),
-    constants={"rate_hz": RATE_HZ},
-    variants=KINDS,
-    measuring=Measuring(measure=measure, measures=MEASURES, figures={"topics": max}),
-    report=Report(
-        tables=(
-            Grid(
-                title="median (minimum to maximum) of the launches", rows=("measure", "unit"), heads=("", "unit"),
-                columns=(SPREAD,), ratio=True,
-            ),
-        ),
-        assessment=(Claims(judged=lambda cell: cell.measure not in PICTURES),),
-        pictures=(dots("Start-up"),),
-    ),
-)  # fmt: skip
+                yield round_cell(variant, f"picture, {encoding}, at rest", "ms", [first.wait_ms()])
+                yield round_cell(variant, f"picture, {encoding}, running", "ms", [second.wait_ms()])

@@ -5,18 +5,14 @@ from __future__ import annotations
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
-from pathlib import Path
 from types import TracebackType
-from typing import Any, BinaryIO, Self
-
-import msgspec
+from typing import Any, Self
 
 from pebble.contract.identity import Identity
 from pebble.errors import ConfigError
 from pebble.simulation.micropython.servers import LoopbackServers
 from pebble.simulation.scheduler import Scheduler
-from pebble.simulation.wireless import KINDS, BrokerAddress, Motors, WirelessRobot
+from pebble.simulation.wireless import KINDS, BrokerAddress, WirelessRobot
 
 MOST = 1000
 _JOB_S = 0.1
@@ -24,29 +20,17 @@ _OFFLINE_S = 2.0  # a robot that is offline for longer is reported
 _MOVING_S = 0.05  # period of a robot's turns while its motors run and its sockets are idle
 
 
-@dataclass(frozen=True, slots=True)
-class Moved:
-    """A line of a fleet's trace: at ``ns`` (CLOCK_MONOTONIC) a robot's motors changed to ``motors``."""
-
-    ns: int
-    robot: str
-    motors: Motors
-
-
 class Fleet:
     """``add`` robots, then ``run`` them; leaving the context stops all motors and closes all connections."""
 
-    def __init__(self, broker: BrokerAddress, *, trace: Path | None = None) -> None:
+    def __init__(self, broker: BrokerAddress) -> None:
         self.broker = broker
         self.robots: list[WirelessRobot] = []
         self.servers = LoopbackServers()
         self.scheduler = Scheduler(self.servers)
-        self._trace: BinaryIO | None = trace.open("ab") if trace is not None else None
 
     def add(self, kind: str, identity: Identity, *, moving_s: float = _MOVING_S, **options: Any) -> WirelessRobot:
         """Add a robot; its first turn is when the fleet runs."""
-        if self._trace is not None:
-            options["on_motors"] = self._recorder(identity.id)
         robot = WirelessRobot(kind, identity, self.broker, self.servers, moving_s=moving_s, **options)
         self.robots.append(robot)
         self.scheduler.add(robot)
@@ -60,29 +44,18 @@ class Fleet:
             if time.monotonic() >= due:
                 due = time.monotonic() + _JOB_S
                 job()
-                if self._trace is not None:
-                    self._trace.flush()
 
     def close(self) -> None:
         for robot in self.robots:
             robot.stop()
         self.scheduler.close()
         self.servers.close()
-        if self._trace is not None:
-            self._trace.close()
 
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, tb: TracebackType | None) -> None:
         self.close()
-
-    def _recorder(self, name: str) -> Callable[[float, Motors], None]:
-        def record(now: float, motors: Motors) -> None:
-            if self._trace is not None:
-                self._trace.write(msgspec.json.encode(Moved(int(now * 1e9), name, motors)) + b"\n")
-
-        return record
 
 
 class ConnectionReporter:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from pathlib import Path
 
 from rich import box
 from rich.console import Console
@@ -25,15 +24,14 @@ def run(
     kinds: Sequence[str] | None = None,
     *,
     seconds: float | None = None,
-    trace: Path | None = None,
 ) -> int:
     """Run the fleet and show its status; returns 0 if all robots are online at the end. Raises PebbleError.
 
-    ``seconds`` None: until a signal. ``trace``: a file for every change of all motors, with its time.
+    ``seconds`` None: until a signal.
     """
     console = Console()
     stop_signal = StopSignal()
-    with Fleet(broker, trace=trace) as fleet:
+    with Fleet(broker) as fleet:
         for kind, identity in members(robots, kinds or KINDS):
             fleet.add(kind, identity)
         console.print(f"{robots} robots, {fleet.robots[0].identity.id} and so on; Ctrl-C ends it", highlight=False)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import groupby, pairwise
 
@@ -16,7 +16,7 @@ import msgspec
 
 from pebble.bench.bridge_operator import arrivals
 from pebble.bench.impair.network import Traffic
-from pebble.bench.results import OVER_TIME, Cell, grouped, rounded
+from pebble.bench.results import Cell, percentile, round_cell
 from pebble.client.robot_view import Liveness
 from pebble.simulation.loudspeaker import Playback
 from pebble.simulation.trace import Entry
@@ -25,7 +25,6 @@ SOUND, PICTURES, PICTURE_GAP = "audio latency", "video latency", "picture gap"
 HEARTBEAT_GAP, HEARTBEAT_DELAY = "heartbeat gap", "heartbeat delay"
 DRIVE, DRIVE_ALONE, DRIVE_VIDEO, DRIVE_AUDIO = "drive", "drive alone", "drive during video", "drive during audio"
 AFTER_VIDEO, AFTER_AUDIO, CLIP = "heartbeat gap after video", "heartbeat gap after audio", "clip"
-SOUND_OVER_TIME, DRIVE_OVER_TIME = f"audio{OVER_TIME}", f"drive{OVER_TIME}"
 
 ON_TIME_S = 1.0  # older sound is useless in a conversation
 FROZEN_S = 1.0  # a picture shown for longer counts as frozen
@@ -208,11 +207,8 @@ class Trial:
     traffic: dict[str, tuple[Traffic, Traffic]]
     playbacks: Sequence[Playback] = ()  # of the robot's loudspeaker, in any trial
 
-    def cell(self, measure: str, unit: str, samples: list[float], **figures: float | None) -> Cell:
-        return Cell(
-            variant=self.subject, params={"trial": self.name}, measure=measure, unit=unit, rounds=[samples],
-            figures={name: rounded(value, 3) for name, value in figures.items()},
-        )  # fmt: skip
+    def cell(self, measure: str, unit: str, samples: list[float], **figures: float) -> Cell:
+        return round_cell(self.subject, measure, unit, samples, {"trial": self.name}, **figures)
 
     def wire(self, phase: str) -> dict[str, float]:
         """What the robot sent in a phase, and what the network dropped of it."""
@@ -221,22 +217,15 @@ class Trial:
         return {"window_s": seconds, "bytes_up": sent, "dropped_up": dropped, "kbit_up": 8e-3 * sent / seconds}
 
 
-def cells_of(trials: Iterable[Trial]) -> list[Cell]:
-    parts = (_sound, _pictures, _heartbeats, _drive, _afterwards)
-    return [cell for trial in trials for part in parts for cell in part(trial)]
+def cells_of(trials: Iterable[Trial]) -> Iterator[Cell]:
+    for trial in trials:
+        for part in (_sound, _pictures, _heartbeats, _drive, _afterwards):
+            yield from part(trial)
 
 
-def over_time(trials: Iterable[Trial], began_ns: int) -> list[Cell]:
-    """Each subject's sound and commands of the whole run. Two rounds: seconds since the start, latencies in ms."""
-    cells = []
-    for subject, own in grouped(trials, lambda trial: trial.subject).items():
-        sounds = [(one.arrived_ns, one.ms) for trial in own for one in trial.record.sounds]
-        driven = [pair for trial in own for pair in driven_ms(trial.record.commands, trial.entries)]
-        arrived = [(command.sent_ns + round(1e6 * ms), ms) for command, ms in driven]
-        for measure, points in ((SOUND_OVER_TIME, sorted(sounds)), (DRIVE_OVER_TIME, sorted(arrived))):
-            rounds = [[(ns - began_ns) / 1e9 for ns, _ in points], [ms for _, ms in points]]
-            cells.append(Cell(variant=subject, measure=measure, unit="ms", rounds=rounds))
-    return cells
+def with_lost(percent: float) -> Callable[[Cell], float]:
+    """Return a function for a percentile in which lost messages are infinitely late."""
+    return lambda cell: percentile([sample for samples in cell.with_lost() for sample in samples], percent)
 
 
 def _sound(trial: Trial) -> Iterator[Cell]:
@@ -244,7 +233,6 @@ def _sound(trial: Trial) -> Iterator[Cell]:
     packets, delivered = received(sounds, window), sound_percent(sounds, window)
     yield trial.cell(
         SOUND, "ms", [packet.ms for packet in packets],
-        sent=max(len(packets), round(100 * len(packets) / delivered)) if packets else None,  # as far as can be told
         delivered_percent=delivered, on_time_percent=sound_percent(sounds, window, ON_TIME_S), **trial.wire("audio"),
     )  # fmt: skip
 
@@ -274,7 +262,7 @@ def _drive(trial: Trial) -> Iterator[Cell]:
     own = sum((command.left, command.right) in reached for command in commands)  # the others were overtaken or lost
     yield trial.cell(
         DRIVE, "ms", [ms for _, ms in driven],
-        sent=len(commands), delivered_percent=100 * own / len(commands) if commands else None,
+        sent=len(commands), delivered_percent=100 * own / len(commands) if commands else 0.0,
         trips=trips(commands, trial.entries), rest_s=rest_s(commands, trial.entries), window_s=record.driven.seconds,
     )  # fmt: skip
     for measure, phase in ((DRIVE_ALONE, "alone"), (DRIVE_VIDEO, "video"), (DRIVE_AUDIO, "audio")):

@@ -1,136 +1,289 @@
-"""``pebble bench``: the command of each comparison, which follows from its declaration, and those for all results."""
+"""``pebble bench``: a command for each comparison, and one for a report of all."""
 
 from __future__ import annotations
 
-import inspect
-from collections.abc import Callable
+from collections.abc import Callable, Collection
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
 import typer
-from typer.core import TyperGroup
 
-from pebble.bench.comparison import FOLDER, MODULES, Comparison, Option, chosen, find
 from pebble.commands.options import Output, Quick, split_names
 from pebble.errors import PebbleError
 
 if TYPE_CHECKING:
-    from typer._click.core import Command, Context
+    from rich.console import Console
 
-_GROUP_HELP = """Comparisons, side by side in one run on this machine.
+    from pebble.bench.show import Shown
+
+FOLDER = Path("bench-results")
+_LONGEST_S = 3600.0  # of one phase
+
+Variants = Annotated[str | None, typer.Option(help="Some of them, separated by commas.", metavar="NAMES")]
+Seconds = Annotated[
+    float | None, typer.Option(help="Duration of each case in a round.", min=0.1, max=_LONGEST_S, show_default=False)
+]
+Rounds = Annotated[int | None, typer.Option(help="Rounds of all cases.", min=1, max=10_000, show_default=False)]
+
+S = TypeVar("S")
+N = TypeVar("N", int, float)
+
+app = typer.Typer(
+    rich_markup_mode=None,
+    help="""Comparisons, side by side in one run on this machine.
 
 \b
     pebble bench frames
-    pebble bench compare before/frames.json after/frames.json
-"""
-_NAMES = [name for name in MODULES if name != "impair"]  # which is a command of its own
+    pebble bench impair --quick
+    pebble bench report build/report
+""",
+)
 
 
-def compare(
-    a: Annotated[Path, typer.Argument(help="Results of the older run.", metavar="A.json", show_default=False)],
-    b: Annotated[Path, typer.Argument(help="Results of the newer run.", metavar="B.json", show_default=False)],
-    everything: Annotated[bool, typer.Option("--all", help="Also list what did not change.")] = False,
+@app.command()
+def control(
+    variants: Variants = None,
+    sizes: Annotated[str | None, typer.Option(help="For example 40,1024.", metavar="BYTES")] = None,
+    rates: Annotated[str | None, typer.Option(help="Messages a second, for example 20,200.", metavar="HZ")] = None,
+    loads: Annotated[str | None, typer.Option(help="Some of none, media and hog.", metavar="NAMES")] = None,
+    seconds: Seconds = None,
+    rounds: Rounds = None,
+    quick: Quick = False,
+    output: Output = FOLDER,
 ) -> int:
-    """Did medians, p99 or losses get worse from A to B, beyond noise? Exit code 1 if so.
+    """Round trips between two services: MQTT and Zenoh; unloaded, with camera frames, beside a busy process.
 
-    Both files come from the same comparison, if possible on the same machine with the same options.
+    Each round starts two processes and a broker or hub for each variant. Needs mosquitto.
+
+    \b
+        pebble bench control
+        pebble bench control --variants mqtt,zenoh-p2p --sizes 40 --rates 200 --rounds 20
     """
-    from pebble.bench.judging.compare import run
+    from pebble.bench import control as comparison
 
-    return run(a, b, everything=everything)
+    settings = _settings(
+        comparison.QUICK if quick else comparison.FULL,
+        variants=_chosen("variants", variants, comparison.VARIANTS),
+        sizes=_numbers("sizes", sizes, int, least=40, most=1 << 20),
+        rates=_numbers("rates", rates, float, least=1, most=2000),
+        loads=_chosen("loads", loads, comparison.LOADS),
+        seconds=seconds,
+        rounds=rounds,
+    )
+    return _run(comparison.run, settings, quick, output)
 
 
-def echo(
-    url: Annotated[
-        str, typer.Argument(help="mqtt://HOST[:PORT] or mqtts://HOST[:PORT]", metavar="URL", show_default=False)
-    ],
+@app.command()
+def bridge(
+    variants: Variants = None,
+    with_media: Annotated[bool, typer.Option("--with-media", help="Also with 1080p pictures and sound.")] = False,
+    seconds: Annotated[
+        float | None,
+        typer.Option(help="Driving time per robot and round, under each load.", min=0.1, max=_LONGEST_S),
+    ] = None,
+    rounds: Rounds = None,
+    quick: Quick = False,
+    output: Output = FOLDER,
 ) -> int:
-    """Send back what `pebble bench control --far` sends, until Ctrl-C. Runs on the other machine."""
-    from pebble.bench.control.far import serve
+    """Drive commands from an operator to the wheels of a whole simulated robot, and its telemetry back.
 
-    return serve(url)
+    On MQTT, on Zenoh and on plain paho, a stand-in for the original, beside one hop through a stock broker. Needs
+    mosquitto.
+    """
+    from pebble.bench import bridge as comparison
+
+    full = comparison.QUICK if quick else comparison.FULL
+    chosen = _chosen("variants", variants, full.variants)
+    settings = _settings(full, variants=chosen, with_media=with_media, seconds=seconds, rounds=rounds)
+    return _run(comparison.run, settings, quick, output)
 
 
+@app.command()
+def startup(variants: Variants = None, rounds: Rounds = None, quick: Quick = False, output: Output = FOLDER) -> int:
+    """How fast a robot starts: first heartbeat, all services ready, first drive command executed.
+
+    And how fast an operator or a service that connects later receives all retained messages, and how long an operator
+    waits for the first picture in each encoding. Every launch is a new simulated robot. Needs mosquitto.
+    """
+    from pebble.bench import startup as comparison
+
+    full = comparison.QUICK if quick else comparison.FULL
+    settings = _settings(full, variants=_chosen("variants", variants, full.variants), rounds=rounds)
+    return _run(comparison.run, settings, quick, output)
+
+
+@app.command()
+def cost(
+    variants: Variants = None,
+    seconds: Annotated[float | None, typer.Option(help="Of each phase.", min=0.4, max=_LONGEST_S)] = None,
+    rounds: Rounds = None,
+    quick: Quick = False,
+    output: Output = FOLDER,
+) -> int:
+    """What a robot costs: memory, CPU and threads of each of its processes.
+
+    Idle, driven 20 times a second, and sending pictures (640x480, 15 per second) and sound to an operator in two
+    forms. Whole simulated robots; needs mosquitto.
+    """
+    from pebble.bench import cost as comparison
+
+    full = comparison.QUICK if quick else comparison.FULL
+    chosen = _chosen("variants", variants, full.variants)
+    return _run(comparison.run, _settings(full, variants=chosen, seconds=seconds, rounds=rounds), quick, output)
+
+
+@app.command()
+def frames(
+    variants: Variants = None,
+    size: Annotated[str | None, typer.Option(help="Such as 640x480,1920x1080.", metavar="SIZES")] = None,
+    readers: Annotated[str | None, typer.Option(help="For example 1,3.", metavar="COUNTS")] = None,
+    seconds: Seconds = None,
+    rounds: Rounds = None,
+    quick: Quick = False,
+    output: Output = FOLDER,
+) -> int:
+    """Camera frames from one process to others: latency, CPU and memory."""
+    from pebble.bench import frames as comparison
+
+    settings = _settings(
+        comparison.QUICK if quick else comparison.FULL,
+        variants=_chosen("variants", variants, comparison.VARIANTS),
+        size=_chosen("size", size, comparison.SIZES),
+        readers=_numbers("readers", readers, int, least=1, most=16),
+        seconds=seconds,
+        rounds=rounds,
+    )
+    return _run(comparison.run, settings, quick, output)
+
+
+@app.command()
+def scale(
+    boards: Annotated[str | None, typer.Option(help="For example 10,100,1000.", metavar="NUMBERS")] = None,
+    seconds: Annotated[float | None, typer.Option(help="Of each size.", min=1, max=_LONGEST_S)] = None,
+    quick: Quick = False,
+    output: Output = FOLDER,
+) -> int:
+    """What many boards cost a server of the operator page, and a hub: CPU, memory, latency. Needs mosquitto."""
+    from pebble.bench import scale as comparison
+
+    numbers = _numbers("boards", boards, int, least=1, most=comparison.MOST)
+    settings = _settings(comparison.QUICK if quick else comparison.FULL, boards=numbers, seconds=seconds)
+    return _run(comparison.run, settings, quick, output)
+
+
+@app.command()
+def traffic(quick: Quick = False, output: Output = FOLDER) -> int:
+    """Traffic of the demo's robots as in the paper's section 4.1: bandwidth, outages and latency.
+
+    Needs mosquitto and the packages of the extra "archive".
+    """
+    from pebble.bench import traffic as comparison
+
+    return _run(comparison.run, comparison.QUICK if quick else comparison.FULL, quick, output)
+
+
+@app.command()
+def impair(
+    trials: Annotated[str | None, typer.Option(help="Some of them, separated by commas.", metavar="NAMES")] = None,
+    subjects: Annotated[
+        str | None, typer.Option(help='Such as "mqtt original,zenoh h264 opus".', metavar="NAMES")
+    ] = None,
+    window: Annotated[
+        float | None, typer.Option(help="Seconds of video, and of audio, per trial.", min=1, max=_LONGEST_S)
+    ] = None,
+    quick: Quick = False,
+    output: Output = FOLDER,
+) -> int:
+    """Robots behind an impaired network: the trials of the paper's section 4.2.
+
+    Simulated robots on MQTT and on Zenoh, with the original's encodings and with H.264 and Opus, each with its own
+    network to its broker. In each trial the network has a low rate, loses packets, or both; an operator drives the
+    robot and receives its video and audio. Needs mosquitto and network namespaces, so usually root.
+
+    \b
+        pebble bench impair --quick
+        pebble bench impair --trials base-start,256k,64k+5%
+        pebble bench impair --subjects "mqtt h264 opus"
+    """
+    from pebble.bench.impair import trials as comparison
+
+    settings = _settings(
+        comparison.QUICK if quick else comparison.FULL,
+        trials=_chosen("trials", trials, comparison.TRIALS),
+        subjects=_chosen("subjects", subjects, comparison.SUBJECTS),
+        window_s=window,
+    )
+    return _run(comparison.run, settings, quick, output)
+
+
+@app.command()
 def report(
     folder: Annotated[Path, typer.Argument(help="Folder for results, pictures and README.md.", metavar="FOLDER")],
     quick: Quick = False,
     only: Annotated[str | None, typer.Option(help="Some of them, separated by commas.", metavar="NAMES")] = None,
-    render: Annotated[bool, typer.Option("--render", help="Only write pictures and README.md again.")] = False,
 ) -> int:
-    """Run all comparisons and pebble impair, one after the other, and write a report.
+    """Run all comparisons, one after the other, and write a report.
 
-    Takes an hour and a half, with --quick some five minutes. If a comparison fails, the others still run, and
-    the exit code is 1. Without root, comparisons that need it are left out.
+    Takes an hour and a quarter, with --quick some five minutes. If a comparison fails, the others still run, and the
+    exit code is 1. Without root, impair is left out.
     """
-    from pebble.bench.report import run, write
+    from rich.console import Console
 
-    if render:
-        typer.echo(f"Written: {write(folder)}")
-        return 0
-    return run(chosen([] if only is None else split_names(only)), folder, quick=quick)
+    from pebble.bench.report import SECTIONS, run
 
-
-class Comparisons(TyperGroup):
-    """Imports the declaration of a comparison when its command is wanted."""
-
-    def list_commands(self, ctx: Context) -> list[str]:
-        return [*_NAMES, *super().list_commands(ctx)]
-
-    def get_command(self, ctx: Context, cmd_name: str) -> Command | None:
-        if cmd_name not in _NAMES:
-            return super().get_command(ctx, cmd_name)
-        return command_named(cmd_name)
+    names = _chosen("only", only, [section.name for section in SECTIONS]) or ()
+    return run(names, folder, quick=quick, console=Console(highlight=False))
 
 
-def command_named(name: str) -> Command:
-    app = typer.Typer(rich_markup_mode=None, add_completion=False)
-    app.command(name)(command_of(find(name)))
-    return typer.main.get_command(app)
+def _settings(settings: S, **given: object) -> S:
+    """Return the settings with the options that are given."""
+    return replace(settings, **{name: value for name, value in given.items() if value is not None})  # type: ignore[type-var]
 
 
-def command_of(about: Comparison) -> Callable[..., int]:
-    """The function of a command, with the options of its comparison."""
-    options = {option.name.replace("-", "_"): option for option in about.options}
-
-    def run(*, quick: bool = False, output: Path = FOLDER, **given: Any) -> int:
-        from pebble.bench.engine import run as run_
-
-        wanted = {options[name].key: _parsed(options[name], value) for name, value in given.items()}
-        mode = about.mode(wanted)
-        return run_(mode.run_of(quick=quick, output=output, **wanted))
-
-    declared: dict[str, tuple[Any, Any]] = {name: (_annotation(about, one), None) for name, one in options.items()}
-    declared |= {"quick": (Quick, False), "output": (Output, about.folder)}
-    run.__doc__ = about.help
-    run.__annotations__ = {name: annotation for name, (annotation, _) in declared.items()}
-    run.__signature__ = inspect.Signature([  # type: ignore[attr-defined]
-        inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=annotation)
-        for name, (annotation, default) in declared.items()
-    ])  # fmt: skip
-    return run
+def _chosen(option: str, text: str | None, known: Collection[str]) -> tuple[str, ...] | None:
+    """Return names that are separated by commas; None for no option. Raises PebbleError for an unknown one."""
+    if text is None:
+        return None
+    names = split_names(text)
+    if unknown := [name for name in names if name not in known]:
+        raise PebbleError(f"--{option}: unknown {', '.join(unknown)}: there are {', '.join(known)}")
+    if len(set(names)) < len(names):
+        raise PebbleError(f"--{option}: name each one once")
+    return tuple(names)
 
 
-def _annotation(about: Comparison, option: Option) -> Any:
-    """The option for typer, with a default as text: None if it is not given."""
-    kind: Any = list[str] if option.many else option.kind
-    default = about.full.get(option.key)
-    shown = "" if default in (None, False) or option.known else f" [default: {option.as_word(default)}]"
-    own = typer.Option(f"--{option.name}", help=option.help + shown, metavar=option.metavar, show_default=False)
-    return Annotated[kind | None, own]
-
-
-def _parsed(option: Option, value: Any) -> Any:
-    """Values may be separated by commas, too. Raises PebbleError for text in place of numbers."""
-    if not option.many:
-        return value
+def _numbers(option: str, text: str | None, kind: type[N], *, least: float, most: float) -> tuple[N, ...] | None:
+    """Return numbers that are separated by commas; None for no option. Raises PebbleError."""
     try:
-        return [option.kind(one) for words in value or () for one in split_names(words)] or None
+        numbers = None if text is None else tuple(kind(number) for number in split_names(text))
     except ValueError:
-        raise PebbleError(f"--{option.name}: {','.join(value)} is not a list of numbers") from None
+        raise PebbleError(f"--{option}: {text} is not a list of numbers") from None
+    for number in numbers or ():
+        if not least <= number <= most:
+            raise PebbleError(f"--{option} {number:g}: must be at least {least:g} and at most {most:g}")
+    return numbers
 
 
-def register(app: typer.Typer) -> None:
-    group = typer.Typer(cls=Comparisons, help=_GROUP_HELP, rich_markup_mode=None)
-    for command in (compare, echo, report):
-        group.command(command.__name__)(command)
-    app.add_typer(group, name="bench")
+def _run(run: Callable[[Any, Console], Shown], settings: Any, quick: bool, output: Path) -> int:
+    """Measure, print and write; returns 0 if everything has results of enough rounds. Raises PebbleError."""
+    from rich.console import Console
+
+    from pebble.bench.results import check_folder
+    from pebble.bench.show import finish
+    from pebble.runtime.signals import interrupted_by_signals
+    from pebble.transports.segments import sweep
+
+    console = Console()
+    check_folder(output)
+    with interrupted_by_signals():
+        try:
+            shown = run(settings, console)
+        finally:
+            sweep()  # Zenoh leaves files behind even after a regular end
+    shown.results.quick = quick
+    return finish(shown, output, console)
+
+
+def register(parent: typer.Typer) -> None:
+    parent.add_typer(app, name="bench")

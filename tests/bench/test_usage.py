@@ -8,11 +8,11 @@ from pathlib import Path
 
 import pytest
 
-from pebble.bench.usage import cpu_s, pss_mb, wake_ups, wall_clock_ahead_ns
+from pebble.bench.usage import cpu_s, pss_mb, wall_clock_ahead_ns
 from pebble.errors import PebbleError
 from pebble.rig.processes import Worker, children
 from tests.own_memory import own_mb
-from tests.support import Child, until
+from tests.support import Child
 
 GONE = 1 << 22  # above the largest pid
 
@@ -22,22 +22,6 @@ def test_cpu_time_is_finer_than_ticks() -> None:
     while time.process_time() < end:
         pass
     assert 0.003 <= cpu_s([os.getpid(), GONE]) - before < 5
-
-
-def test_wake_ups_of_a_waiting_process_are_counted() -> None:
-    """Uses a child process: the count of a thread disappears with it, and the test process has many."""
-    child = Child([sys.executable, "-c", "while not input(): print(flush=True)"], stdin=-1, stdout=-1)
-    child.stdin.write(b"\n")
-    child.stdin.flush()
-    child.stdout.readline()  # it has started, and waits
-    before = wake_ups([child.pid, GONE])
-    for _ in range(5):
-        child.stdin.write(b"\n")
-        child.stdin.flush()
-        child.stdout.readline()
-        time.sleep(0.02)
-    assert until(lambda: wake_ups([child.pid, GONE]) - before >= 4)  # the first wait may be older
-    child.communicate()
 
 
 def test_how_far_the_wall_clock_is_ahead() -> None:

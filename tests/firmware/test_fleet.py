@@ -1,4 +1,4 @@
-"""Many robots in one process: who they are, that each obeys its own operator only, and what a fleet is measured by."""
+"""Many robots in one process: who they are, and that each obeys its own operator only."""
 
 from __future__ import annotations
 
@@ -11,9 +11,8 @@ from typing import Self
 import pytest
 
 from pebble import cli
-from pebble.bench.fleet import STEPS, latencies_ms, longest_gap_s
 from pebble.errors import ConfigError
-from pebble.simulation.fleet import MOST, Moved, members
+from pebble.simulation.fleet import MOST, members
 from tests.support import ROOT, Broker, Child, free_port, until
 
 
@@ -35,41 +34,6 @@ class TestMembers:
     def test_what_makes_no_sense_is_named(self, count: int, kinds: list[str], named: str) -> None:
         with pytest.raises(ConfigError, match=named):
             list(members(count, kinds))
-
-
-SENT = [number * 100_000_000 for number in range(20)]  # 10 Hz
-
-
-class TestLatencies:
-    def moves(self, late_ns: int, without: int = -1) -> list[Moved]:
-        return [
-            Moved(at + late_ns, "r", tuple(map(float, STEPS[number % len(STEPS)])))
-            for number, at in enumerate(SENT)
-            if number != without
-        ]
-
-    def test_every_command_is_distinguished(self) -> None:
-        assert latencies_ms({"r": SENT}, {"r": self.moves(3_000_000)}) == [3.0] * 20
-
-    def test_also_when_it_is_slower_than_the_next_one_is_sent(self) -> None:
-        assert latencies_ms({"r": SENT}, {"r": self.moves(250_000_000)}) == [250.0] * 20
-
-    def test_a_lost_one_is_missing_and_no_other_takes_its_place(self) -> None:
-        assert latencies_ms({"r": SENT}, {"r": self.moves(3_000_000, without=7)}) == [3.0] * 19
-
-    def test_a_robot_that_does_not_move_has_none(self) -> None:
-        assert latencies_ms({"r": SENT}, {}) == []
-
-    def test_no_two_commands_in_a_row_ask_for_the_same(self) -> None:
-        assert len(set(STEPS)) == len(STEPS)
-
-
-def test_a_robot_that_falls_silent_is_missed_until_the_end() -> None:
-    second = 1_000_000_000
-    alive, dead = [number * second for number in range(1, 10)], [second, 2 * second]
-    assert longest_gap_s([alive], 0, 10 * second) == 1.0
-    assert longest_gap_s([alive, dead], 0, 10 * second) == 8.0
-    assert longest_gap_s([alive, []], 0, 10 * second) == 10.0
 
 
 class Command:

@@ -11,8 +11,6 @@ from typing import Any
 
 import pytest
 
-from pebble.contract.identity import Identity
-from pebble.simulation import crowd
 from tests.firmware.drill import BASE, DRIVE, LIMIT_S, ONLINE, STALE_S, START_S, Drill
 from tests.simulation.virtual_broker import Session, VirtualBroker
 from tests.simulation.virtual_network import Answers
@@ -79,12 +77,6 @@ def test_its_capabilities_are_a_retained_message(kind: str) -> None:
         }.items()
     )
     assert json.loads(message.payload)["schema"] == "pebble-capabilities/v1"
-
-
-def test_a_crowd_publishes_the_capabilities_of_a_minilamp_that_knows_no_control() -> None:
-    (capabilities,) = published(online("minilamp"), "capabilities")
-    capabilities["value"]["drive"]["control"] = False
-    assert crowd.capabilities(Identity("pebble", "robots", "rover")) == capabilities["value"]
 
 
 @pytest.mark.parametrize("kind", KINDS)

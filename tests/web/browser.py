@@ -15,7 +15,7 @@ from typing import Any, Literal
 import pytest
 from playwright.sync_api import Browser, BrowserContext, CDPSession, Error, Locator, Page, Route
 
-from pebble.bench import page_rig
+from tests.web import rig
 
 Size = Literal["desktop", "phone", "landscape", "small"]
 Theme = Literal["light", "dark"]
@@ -61,11 +61,11 @@ def chromium(*flags: str, program: str | None = None, beside: Browser | None = N
 
     Skips the test without one, except where CI says it must be there.
     """
-    problem = page_rig.missing()
+    problem = rig.missing()
     if problem is not None:
         reason = f"{problem}; or `sh tools/debian-packages.sh chromium=chromium`"
         (pytest.fail if os.environ.get("CI") == "true" else pytest.skip)(reason)
-    with page_rig.chromium(*flags, program=program, beside=beside) as browser:
+    with rig.chromium(*flags, program=program, beside=beside) as browser:
         yield browser
 
 

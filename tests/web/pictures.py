@@ -9,8 +9,8 @@ import sys
 
 from PIL import Image
 
-from pebble.bench.page_rig import KEY, ROBOT, Rig, rig
 from tests.support import ROOT
+from tests.web.rig import KEY, ROBOT, Rig, rig
 
 DOCS = ROOT / "docs"
 WIDTH, QUALITY, MOST_BYTES = 1000, 78, 200_000

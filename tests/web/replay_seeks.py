@@ -15,13 +15,13 @@ from typing import Any
 
 from playwright.sync_api import Browser, CDPSession
 
-from pebble.bench import page_rig as program
 from pebble.bench.results import percentile
 from pebble.bench.usage import pss_mb
 from tests.recordings.playing import GOOB, ms
 from tests.recordings.recorder.test_record import Reference
 from tests.recordings.seek.filming import FPS, film
 from tests.support import Broker
+from tests.web import rig
 from tests.web.browser import Tab, tab
 from tests.web.page_soak import memory
 from tests.web.served import Served
@@ -90,7 +90,7 @@ def main() -> int:
     parser.add_argument("--seeks", type=int, default=200)
     options = parser.parse_args()
     bad = 0
-    with tempfile.TemporaryDirectory() as folder, program.chromium() as browser:
+    with tempfile.TemporaryDirectory() as folder, rig.chromium() as browser:
         broker = Broker(Path(folder))
         reference = Reference(broker.port)
         for encoding in ENCODINGS:

@@ -9,8 +9,8 @@ import pytest
 
 from pebble.bench.impair.conditions import Condition, Shape
 from pebble.bench.impair.network import why_no_namespaces
-from pebble.bench.page_rig import Rig, linked
 from tests.web.ears import PLAIN_MICROPHONE, TAP, compared, fake_microphone, played, recorded, write_voice
+from tests.web.rig import Rig, linked
 
 pytestmark = [pytest.mark.alone, pytest.mark.thorough]
 THIN = Condition("256 kbit/s, 2 %", up=Shape(kbit=256, loss=0.02), down=Shape(loss=0.02))

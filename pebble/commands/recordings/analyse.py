@@ -52,7 +52,6 @@ def analyse(
     from pebble.recordings.traffic.duck import require_packages
 
     require_packages("duckdb", "matplotlib")
-    from pebble.bench.engine import check_folder
     from pebble.client.names import base_of
     from pebble.config.visible import shown
     from pebble.recordings.catalogue import check_name
@@ -63,7 +62,6 @@ def analyse(
 
     since_ns, until_ns = parse_period(since, until, now=datetime.now())
     bases = [base_of(name) for name in robot or ()]
-    check_folder(output)
     with tempfile.TemporaryDirectory(prefix="pebble-analyse-") as folder, _progress() as progress:
         scratch = Path(folder)
         found = sources(places, scratch, robots=bases, since_ns=since_ns, until_ns=until_ns, progress=progress)

@@ -3,8 +3,6 @@
 import pytest
 
 from pebble.bench.impair.conditions import CONDITIONS, Handover, Shape, arrival
-from pebble.bench.impair.trials import IMPAIR, conditions
-from pebble.errors import PebbleError
 
 NAMES = [
     *("base-start", "1024k", "512k", "256k", "128k", "64k", "1%", "2%", "5%", "10%"),
@@ -29,12 +27,6 @@ def test_only_the_uplink_is_shaped_but_in_the_profiles() -> None:
     assert {condition.down for condition in CONDITIONS[:14]} == {Shape()}
     assert all(condition.up.timed and condition.down.timed for condition in CONDITIONS[14:])
     assert not any(condition.up.timed for condition in CONDITIONS[:14])
-
-
-def test_some_trials_can_be_chosen() -> None:
-    assert [each.name for each in conditions(IMPAIR.run_of(trials=["base-end", "256k"]))] == ["256k", "base-end"]
-    with pytest.raises(PebbleError, match=r"--trials: unknown 300k: there are base-start, 1024k"):
-        IMPAIR.run_of(trials=["256k", "300k"])
 
 
 def test_without_delay_everything_arrives_as_it_is_sent() -> None:

@@ -5,25 +5,22 @@ from __future__ import annotations
 import io
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import replace
 from itertools import islice
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, cast
 
 import msgspec
 import pytest
 from rich.console import Console
 
-from pebble.bench import engine
-from pebble.bench.comparison import Run
+from pebble.bench.impair import trials as module
 from pebble.bench.impair.conditions import Condition
-from pebble.bench.impair.metrics import OperatorReport, Record, Window
+from pebble.bench.impair.metrics import DRIVE, OperatorReport, Record, Window
 from pebble.bench.impair.network import Traffic
-from pebble.bench.impair.trials import IMPAIR, SUBJECTS, ImpairedRobot
-from pebble.bench.results import load
+from pebble.bench.impair.trials import FULL, QUICK, SUBJECTS, TRIALS, ImpairedRobot, Settings, groups, run
+from pebble.bench.results import Results
 from pebble.errors import PebbleError
-from tests.bench.found import found
 
 S = 1_000_000_000
 PHASES = ("alone", "video", "video off", "audio", "audio off")
@@ -68,7 +65,7 @@ class FakeOperator:
         self._log.append("hurry")
 
 
-def fake_robots(log: list[str], trials: int) -> Callable[[Run], AbstractContextManager[list[ImpairedRobot]]]:
+def fake_robots(log: list[str], trials: int) -> Callable[[Settings], AbstractContextManager[list[ImpairedRobot]]]:
     """Replaces pebble.bench.impair.trials.robots."""
     nothing = SimpleNamespace(
         programs=[], lines=lambda _since: [], log=lambda: "", folder=Path("/nowhere"), ended=False
@@ -78,67 +75,54 @@ def fake_robots(log: list[str], trials: int) -> Callable[[Run], AbstractContextM
         parts: Any = (QuietNetwork(log, subject), nothing, nothing, FakeOperator(log, trials))
         return ImpairedRobot(subject, *parts, limit_s=30)
 
-    return lambda run: nullcontext([fake(subject) for subject in SUBJECTS if subject in run["variants"]])
+    return lambda settings: nullcontext([fake(subject) for subject in SUBJECTS if subject in settings.subjects])
 
 
-def go(monkeypatch: pytest.MonkeyPatch, folder: Path, trials: int) -> tuple[list[str], str]:
+def go(monkeypatch: pytest.MonkeyPatch, trials: int) -> tuple[list[str], Results]:
     log: list[str] = []
-    printed = io.StringIO()
-    monkeypatch.setattr("pebble.bench.engine.find_spec", lambda _name: None)  # no plots
+    monkeypatch.setattr(module, "robots", fake_robots(log, trials))
     monkeypatch.setattr("pebble.bench.impair.network.why_no_namespaces", lambda: None)
-    run = replace(IMPAIR, measuring=replace(IMPAIR.measuring, environment=fake_robots(log, trials))).run_of(
-        trials=["1024k", "5%"],
-        variants=["mqtt original", "zenoh original", "mqtt h264 opus"],
-        output=folder,
-        console=Console(file=printed, width=120),
-    )
-    try:
-        engine.run(run)
-    except PebbleError as error:
-        log.append(str(error))
-    return log, printed.getvalue()
+    settings = Settings(trials=("1024k", "5%"), subjects=("mqtt original", "zenoh original", "mqtt h264 opus"))
+    return log, run(settings, Console(file=io.StringIO())).results
 
 
-def test_each_group_runs_each_condition_and_then_a_clean_network(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    log, _ = go(monkeypatch, tmp_path, trials=2)
+def test_each_group_runs_each_condition_and_then_a_clean_network(monkeypatch: pytest.MonkeyPatch) -> None:
+    log, results = go(monkeypatch, trials=2)
     pair, single = ("mqtt original", "zenoh original"), ("mqtt h264 opus",)
     turns = [(pair, "1024k"), (single, "1024k"), (single, "5%"), (pair, "5%")]  # the last one comes first
     expected = [sorted(f"{one}: {what}" for one in group) for group, name in turns for what in (name, "clean")]
     applied = iter(log)
     assert [sorted(islice(applied, len(group))) for group in expected] == expected
     assert list(applied) == ["hurry"] * 3
+    assert results.complete, "although nothing arrived"
+    assert {cell.params["trial"] for cell in results.cells} == {"1024k", "5%"}
 
 
-def test_the_file_records_the_conditions(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    go(monkeypatch, tmp_path, trials=2)
-    results = load(tmp_path / "impair.json")
-    assert (results.bench, results.options["window_s"]) == ("impair", 8.0)
-    marks = [mark.partition("@")[0] for mark in str(results.options["marks"]).split(";")]
-    assert marks == ["1024k", "5%"]
-    assert {len(cell.rounds) for cell in results.cells if "trial" in cell.params} == {1}
-    assert {len(cell.rounds) for cell in results.cells if "trial" not in cell.params} <= {2}  # curves
-
-
-def test_without_namespaces_it_does_not_begin(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_without_namespaces_it_does_not_begin(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("pebble.bench.impair.network.why_no_namespaces", lambda: "not permitted")
     with pytest.raises(PebbleError, match="no network namespaces: not permitted"):
-        engine.run(IMPAIR.run_of(output=tmp_path))
+        run(FULL, Console(quiet=True))
 
 
-def test_a_robot_that_fails_ends_the_run_and_costs_no_results(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    log, _ = go(monkeypatch, tmp_path, trials=1)
-    assert log[-1].startswith("the trials ended early: ")
-    assert log[-1].endswith(" said nothing for 30 s")
-    results = load(tmp_path / "impair.json")
-    assert found(results, "mqtt h264 opus", trial="1024k") is not None
-    assert results.assessment[0] == log[-1].replace("the trials", "The trials")
+def test_a_robot_that_fails_ends_the_run_and_costs_no_results(monkeypatch: pytest.MonkeyPatch) -> None:
+    _, results = go(monkeypatch, trials=1)
+    (note,) = results.notes
+    assert note.startswith("The trials ended early: ")
+    assert note.endswith(" said nothing for 30 s")
+    assert not results.complete
+    assert results.find("mqtt h264 opus", DRIVE, trial="1024k") is not None
 
 
-def test_robots_that_fail_at_once_leave_no_file(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    log, printed = go(monkeypatch, tmp_path, trials=0)
-    assert log[0] == "hurry"
-    assert log[-1] == "mqtt original: the operator said nothing for 30 s"
-    assert "trial" not in printed
-    assert not (tmp_path / "impair.json").exists()
+def test_robots_that_fail_at_once_are_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(PebbleError, match="mqtt original: the operator said nothing for 30 s"):
+        go(monkeypatch, trials=0)
+
+
+def test_a_full_run_groups_transports_and_a_quick_one_all_subjects() -> None:
+    robots = [cast(ImpairedRobot, SimpleNamespace(subject=subject)) for subject in SUBJECTS]
+    assert [[robot.subject for robot in group] for group in groups(FULL, robots)] == [
+        [*SUBJECTS[:2]],
+        [*SUBJECTS[2:]],
+    ]
+    assert [len(group) for group in groups(QUICK, robots)] == [4]
+    assert set(QUICK.trials) < set(TRIALS)

@@ -10,12 +10,12 @@ from pathlib import Path
 
 import pytest
 
-from pebble.bench.impair import rsa_chain
 from pebble.runtime.connections import local_transport
 from pebble.services.mqtt_bridge.service import MqttBridge
 from pebble.transports import State
 from pebble.transports.hosts import CONNECT_TIMEOUT_S
 from tests.robot.operator import Operator
+from tests.services.mqtt_bridge import rsa_chain
 from tests.services.mqtt_bridge.bridge_rig import BASE, Running, make_config
 from tests.support import Broker, cases, until
 from tests.tcp_proxy import SlowTcpProxy, TcpProxy

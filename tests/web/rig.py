@@ -1,14 +1,11 @@
-"""A stage, a browser and a subscriber at the broker: what all measurements of the operator page need.
+"""A stage with the operator page in a headless Chromium, which may be behind an impaired network.
 
-Times are seconds of time.monotonic(), also those that the page stamps. The subscriber is mosquitto's own: one in this
-process would wait for its other threads at the very moment that counts. The browser is Chromium, driven by Playwright,
-which comes with the extra ``dev``; it may be behind an impaired network, by the namespaces of pebble impair.
+Playwright drives the browser; it comes with the extra ``dev``. Times are seconds of time.monotonic().
 """
 
 from __future__ import annotations
 
 import ctypes
-import json
 import os
 import shlex
 import shutil
@@ -23,16 +20,12 @@ from typing import TYPE_CHECKING, Any
 from pebble.bench.impair.conditions import Condition
 from pebble.bench.impair.network import CLONE_NEWNET, NamespaceNetwork, require_namespaces
 from pebble.bench.impair.network import ROBOT_HOST as SERVER
-from pebble.bench.usage import wall_clock_ahead_ns
-from pebble.contract import DRIVE
 from pebble.errors import PebbleError
-from pebble.rig.processes import OPERATORS, Program
 from pebble.rig.testbed import ROBOTS, Stage
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser, Page
 
-Drives = list[tuple[float, dict[str, float]]]  # time and axes
 Test = str | Callable[[], Any]  # an expression of the page, or a function
 
 ROBOT, KEY = "goob", "KeyW"  # that are driven, by default
@@ -56,42 +49,6 @@ _FLAGS = (
     "--disable-gpu", "--disable-quic", "--autoplay-policy=no-user-gesture-required", f"--disable-features={_WITHOUT}",
 )  # fmt: skip
 
-#: Stamps inputs, first contents, drawn pictures and sent commands; runs before the page's own scripts.
-_HOOKS = """
-const now = () => performance.timeOrigin + performance.now();
-window.bench = { now, drawn: [], sent: [], updates: 0 };
-for (const input of ["keydown", "keyup", "pointerdown"])
-  addEventListener(input, (event) => event.repeat || (bench[input] = now()), true);
-const look = () => {
-  bench.robot ||= document.querySelector('[data-test^="card-"]') && performance.now();
-  bench.picture ||= window.pebble?.video?.info && pebble.video.drawnAt; // before what waits for it
-  if (!bench.robot || !bench.picture) requestAnimationFrame(look);
-};
-requestAnimationFrame(look);
-bench.film = () => {
-  const draw = pebble.video.draw;
-  pebble.video.draw = function (bitmap, info) {
-    draw.call(this, bitmap, info);
-    bench.drawn.push([info.encoding, info.frame, info.capturedMs, now()]); // in ms
-  };
-};
-bench.stop = (ref) => pebble.store.get(ref, "web/estop")?.value;
-bench.confirmed = (refs, before = pebble.estop.pressed) => {
-  const confirmed = (view) => view?.stop === pebble.estop.pressed.stop && view.sending === "confirmed";
-  const done = () => pebble.estop.pressed !== before && refs.every((ref) => confirmed(bench.stop(ref)));
-  const mark = () => requestAnimationFrame(done() ? () => (bench.mark = now()) : mark);
-  bench.mark = 0;
-  mark();
-};
-const send = WebSocket.prototype.send;
-WebSocket.prototype.send = function (data) {
-  const op = bench.number && String(data).includes('"op":"drive"') ? JSON.parse(data) : {};
-  if (!op.x && !op.z) return send.call(this, data);
-  op.y = (bench.number++ % 1000) / 1000; // tells the commands apart
-  bench.sent.push([op.y, now()]);
-  return send.call(this, JSON.stringify(op));
-};
-"""
 #: Empty when the robot of the page can be driven, else why it cannot.
 _REASON = """() => {
   const driver = window.pebble?.driver;
@@ -104,34 +61,28 @@ _REASON = """() => {
 
 
 class Rig:
-    """One stage and one browser. ``drives`` are the commands to the robot that the broker has delivered so far."""
+    """One stage and one browser."""
 
-    def __init__(self, stage: Stage, browser: Browser, drives: Drives) -> None:
-        self.stage, self.ref, self.drives, self._browser = stage, stage.ref, drives, browser
+    def __init__(self, stage: Stage, browser: Browser) -> None:
+        self.stage, self._browser = stage, browser
 
     def page(self, name: str = "") -> Page:
-        """A robot's page; without a name the fleet's."""
-        context = self._browser.new_context(viewport={"width": 1280, "height": 800})
-        context.add_init_script(_HOOKS)
-        page = context.new_page()
+        """Open a robot's page; without a name the fleet's."""
+        page = self._browser.new_context(viewport={"width": 1280, "height": 800}).new_page()
         page.goto(self.stage.robot_url(name) if name else self.stage.url, wait_until="domcontentloaded")
         return page
 
-    def pause(self, page: Page | None, seconds: float) -> None:
+    def pause(self, page: Page, seconds: float) -> None:
         """Wait; the page's events are handled meanwhile."""
-        if page is None:
-            time.sleep(seconds)
-        else:
-            page.wait_for_timeout(1000 * seconds)
+        page.wait_for_timeout(1000 * seconds)
 
-    def until(self, page: Page | None, condition: Test, what: Test, wait_s: float = _WAIT_S) -> Any:
-        """The condition's first true value. Raises PebbleError with ``what`` is wrong, in words."""
+    def until(self, page: Page, condition: Test, what: Test, wait_s: float = _WAIT_S) -> None:
+        """Wait until the condition is true. Raises PebbleError with ``what`` is wrong, in words."""
         end = time.monotonic() + wait_s
-        while not (found := condition() if callable(condition) else page and page.evaluate(condition)):
+        while not (condition() if callable(condition) else page.evaluate(condition)):
             if time.monotonic() > end:
                 raise PebbleError(f"waited {wait_s:.0f} s: {what() if callable(what) else what}")
             self.pause(page, _STEP_S)
-        return found
 
     def ready(self, page: Page) -> None:
         """Wait until the robot of that page can be driven."""
@@ -142,76 +93,40 @@ class Rig:
         for _ in range(_PRESSES):
             page.keyboard.up(key)
             self.ready(page)
+            pressed = time.monotonic()
             page.keyboard.down(key)
             with suppress(PebbleError):
-                self.moved_after(page, self.stamp(page, "keydown"))
+                self.until(page, lambda since=pressed: self._moved_since(since), f"{ROBOT} did not move", _MOVED_S)
                 self.pause(page, HELD_S)
                 if self.stage.wheels_turning(ROBOT):
                     return
         raise PebbleError(f"{ROBOT} did not move")
 
-    # -- when something happened
+    def stopped(self, page: Page, name: str = ROBOT) -> None:
+        """Wait until a robot's motors have stopped."""
 
-    def stamp(self, page: Page, event: str) -> float:
-        """The newest input of this kind."""
-        return monotonic(page.evaluate(f"bench.{event}"))
+        def at_rest() -> bool:
+            return time.monotonic() - self.stage.last_motion_ns(name) / 1e9 > _AT_REST_S
 
-    def command_after(self, page: Page, since: float) -> float:
-        """When the broker delivered the first command that moves the robot after ``since``."""
+        self.until(page, at_rest, f"{name} did not stop", _STOPPED_S)
 
-        def found() -> list[float]:
-            return [at for at, axes in self.drives if at > since and (axes.get("x") or axes.get("z"))]
-
-        return float(self.until(page, found, "no command reached the broker", _STOPPED_S)[0])
-
-    def moved_after(self, page: Page, since: float) -> float:
-        """When the robot's motors first ran after ``since``."""
-
-        def found() -> list[float]:
-            return [ns / 1e9 for ns, speeds in self.stage.motors(ROBOT) if ns / 1e9 > since and any(speeds)]
-
-        return float(self.until(page, found, f"{ROBOT} did not move", _MOVED_S)[0])
-
-    def stopped(self, page: Page | None, name: str = ROBOT) -> float:
-        """When a robot's motors stopped, once they have."""
-
-        def at_rest() -> float:
-            last = self.stage.last_motion_ns(name) / 1e9
-            return last if time.monotonic() - last > _AT_REST_S else 0.0
-
-        return float(self.until(page, at_rest, f"{name} did not stop", _STOPPED_S))
-
-
-def monotonic(page_ms: float) -> float:
-    """A stamp of another process on this machine: epoch milliseconds, as time.monotonic()."""
-    return page_ms / 1000 - wall_clock_ahead_ns() / 1e9
+    def _moved_since(self, since: float) -> bool:
+        """True if the robot's motors have begun to run since then."""
+        return any(ns / 1e9 > since and any(speeds) for ns, speeds in self.stage.motors(ROBOT))
 
 
 @contextmanager
 def rig(*names: str, program: str | None = None, flags: tuple[str, ...] = (), **settings: Any) -> Iterator[Rig]:
     """Start everything; ``settings`` are of the stage and of the page's server. Raises PebbleError."""
-    if shutil.which("mosquitto_sub") is None:
-        raise PebbleError("mosquitto_sub is missing: apt install mosquitto-clients")
-    drives: Drives = []
-
-    def receive(line: bytes) -> None:
-        at, axes = line.split(b" ", 1)
-        drives.append((monotonic(1000 * float(at)), json.loads(axes)))
-
     with Stage(*(names or ROBOTS), **settings) as stage, chromium(*flags, program=program) as browser:
-        options = ["-h", "127.0.0.1", "-p", str(stage.broker_port), "-t", DRIVE.topic(stage.ref(ROBOT)), "-F", "%U %p"]
-        log = stage.folder / "subscriber.log"
-        subscriber = stage.add(Program("subscriber", ["mosquitto_sub", *options], log, each=receive), OPERATORS)
-        yield Rig(stage, browser, drives)
-        if subscriber.ended or not subscriber.is_read:
-            raise PebbleError("mosquitto_sub has ended: what it should have received is missing")
+        yield Rig(stage, browser)
 
 
 # -- the browser
 
 
 def missing() -> str | None:
-    """What to do before a page can be opened; None: nothing."""
+    """Return what to install before a page can be opened; None: nothing."""
     if shutil.which("chromium") is None:
         return "no Chromium: apt install chromium"
     return None if find_spec("playwright") else "no Playwright: pip install 'pebble-robot[dev]'"

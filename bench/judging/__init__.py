@@ -1,1 +1,0 @@
-"""What two results differ by, and whether that is more than noise."""
