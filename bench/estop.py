@@ -86,8 +86,8 @@ class Robots(Processes):
             robot.prepare()
             self._linux.append(robot)
             self._bases[kind], self._starts[kind] = [robot.base], robot.launch
-        where = ("--robots", len(self._bases[BOARD]), "--broker", self._target.url, "--trace", self._trace)
-        self._starts[BOARD] = partial(self.robot, "the fleet", "pebble.cli", "sim", "fleet", *where)
+        where = ("--robots", len(self._bases[BOARD]), "--broker", f"127.0.0.1:{broker.port}", "--trace", self._trace)
+        self._starts[BOARD] = partial(self.robot, "the fleet", "pebble.simulation.fleet_program", *where)
         self._driver = self.worker("driver", "pebble.bench.clients", broker.port)
 
     def hold(self, case: Case, robots: str) -> Iterator[Cell]:

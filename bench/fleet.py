@@ -90,8 +90,8 @@ class World(Processes):
         self.crowd = self.worker("crowd", "pebble.simulation.crowd", port, self.robots - self.boards)
         check_online(self.crowd.answer(_UP_S), self.robots - self.boards, self.server_of_robots)
         self.trace = self.folder / "trace.jsonl"
-        where = ("--broker", f"mqtt://127.0.0.1:{port}", "--trace", self.trace)
-        self.fleet = self.robot("fleet", "pebble.cli", "sim", "fleet", "--robots", self.boards, *where)
+        where = ("--kinds", ",".join(KINDS), "--broker", f"127.0.0.1:{port}", "--trace", self.trace)
+        self.fleet = self.robot("fleet", "pebble.simulation.fleet_program", "--robots", self.boards, *where)
 
     @property
     def pids(self) -> dict[str, int]:

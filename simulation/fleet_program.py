@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from pathlib import Path
 
 from rich import box
 from rich.console import Console
@@ -20,20 +19,15 @@ _TABLE_PERIOD_S, _LINE_PERIOD_S = 1.0, 10.0  # on a terminal, and in plain lines
 
 
 def run(
-    broker: BrokerAddress,
-    robots: int,
-    kinds: Sequence[str] | None = None,
-    *,
-    seconds: float | None = None,
-    trace: Path | None = None,
+    broker: BrokerAddress, robots: int, kinds: Sequence[str] | None = None, *, seconds: float | None = None
 ) -> int:
-    """Run the fleet and show its status; returns 0 if all robots are online at the end. Raises PebbleError.
+    """Run the fleet until a signal, or for some seconds, and show its status. Raises PebbleError.
 
-    ``seconds`` None: until a signal. ``trace``: a file for every change of all motors, with its time.
+    Returns 0 if all robots are online at the end.
     """
     console = Console()
     stop_signal = StopSignal()
-    with Fleet(broker, trace=trace) as fleet:
+    with Fleet(broker) as fleet:
         for kind, identity in members(robots, kinds or KINDS):
             fleet.add(kind, identity)
         console.print(f"{robots} robots, {fleet.robots[0].identity.id} and so on; Ctrl-C ends it", highlight=False)

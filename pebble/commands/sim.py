@@ -32,7 +32,7 @@ _OF = {
     "kinds": ("fleet",),
     "seconds": ("fleet",),
     "folder": ("world",),
-    "trace": (*_SERIAL, *_WIFI, "fleet", "world"),
+    "trace": (*_SERIAL, *_WIFI, "world"),
     "trace_output": _SERIAL,
     "report": (*_SERIAL, *_WIFI, "world"),
     "control": (*_SERIAL, "world"),
@@ -130,7 +130,7 @@ def sim(
     if kind == "fleet":
         from pebble.simulation.fleet_program import run as run_fleet
 
-        return run_fleet(address, robots, kinds, seconds=seconds, trace=trace)
+        return run_fleet(address, robots, kinds, seconds=seconds)
     return _wireless(kind, name, address, config, called, trace=trace, report=report, files=files)
 
 
