@@ -18,16 +18,10 @@ from pebble.simulation.wireless import KINDS, BrokerAddress
 _TABLE_PERIOD_S, _LINE_PERIOD_S = 1.0, 10.0  # on a terminal, and in plain lines
 
 
-def run(
-    broker: BrokerAddress,
-    robots: int,
-    kinds: Sequence[str] | None = None,
-    *,
-    seconds: float | None = None,
-) -> int:
-    """Run the fleet and show its status; returns 0 if all robots are online at the end. Raises PebbleError.
+def run(broker: BrokerAddress, robots: int, kinds: Sequence[str] | None = None, *, seconds: float | None = None) -> int:
+    """Run the fleet until a signal, or for some seconds, and show its status. Raises PebbleError.
 
-    ``seconds`` None: until a signal.
+    Returns 0 if all robots are online at the end.
     """
     console = Console()
     stop_signal = StopSignal()

@@ -134,10 +134,10 @@ class Fleet(Testbed):
         self.remote_broker.wait(self._ending)
 
     def _tool(self, command: str, name: str, contents: dict[str, Any]) -> None:
-        """``pebble fleet hub FILE`` or ``pebble fleet gateway FILE``."""
+        """``pebble hub FILE`` or ``pebble gateway FILE``."""
         file = self.folder / f"{name}.json"
         file.write_text(json.dumps(contents, indent=1), encoding="utf-8")
-        self.add(Program(name, python("pebble.cli", "fleet", command, file), self.folder / f"{name}.log"), OPERATORS)
+        self.add(Program(name, python("pebble.cli", command, file), self.folder / f"{name}.log"), OPERATORS)
 
 
 class Person:
