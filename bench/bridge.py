@@ -23,7 +23,7 @@ from rich.table import Table
 from pebble.bench import plots
 from pebble.bench.bridge_operator import ALL, HOP, Arrived, DrivenRobot, Turn, driven_robot
 from pebble.bench.results import STAND_IN, Cell, Results, begin, grouped, round_cell
-from pebble.bench.rounds import Say, in_turn, measure_rounds
+from pebble.bench.rounds import Progress, in_turn, measure_rounds
 from pebble.bench.show import RATIOS, Shown, compared, percentiles, plain_table, spread
 from pebble.rig.robot import KINDS
 
@@ -51,7 +51,7 @@ QUICK: Final = Settings(seconds=0.5, rounds=2)
 def run(settings: Settings, console: Console) -> Shown:
     """Measure all variants. Raises PebbleError."""
     results = begin("bridge", settings)
-    measure_rounds(results, settings.rounds, lambda number, say: measure(settings, number, say), console)
+    measure_rounds(results, settings.rounds, lambda number, progress: measure(settings, number, progress), console)
     return shown(results)
 
 
@@ -88,28 +88,28 @@ def running(kinds: Iterable[str], *, media: bool = False, reports: bool = True) 
         yield driven
 
 
-def measure(settings: Settings, number: int, say: Say) -> Iterator[Cell]:
+def measure(settings: Settings, number: int, progress: Progress) -> Iterator[Cell]:
     """Measure fresh robots that forward reports, also with media; and fresh ones that do not."""
     for load in in_turn((UNLOADED, COMMANDS), number):
         reports, media = load == UNLOADED, load == UNLOADED and settings.with_media
-        say("starting the robots")
+        progress("starting the robots")
         with running([*settings.variants, *([HOP] if reports else [])], media=media, reports=reports) as driven:
-            yield from _in_turns(settings, number, say, load, driven)
+            yield from _in_turns(settings, number, progress, load, driven)
             for variant in in_turn(list(driven), number) if media else ():
                 if variant in KINDS:  # the stand-in has no media
-                    say(f"{variant}, {LOADED}")
+                    progress(f"{variant}, {LOADED}")
                     turn = driven[variant].drive_with_media(min(settings.seconds, _LOADED_S))
                     yield from cells_of(variant, LOADED, turn, driven[variant].arrived([turn]))
 
 
 def _in_turns(
-    settings: Settings, number: int, say: Say, load: str, driven: Mapping[str, DrivenRobot]
+    settings: Settings, number: int, progress: Progress, load: str, driven: Mapping[str, DrivenRobot]
 ) -> Iterator[Cell]:
     """Drive each of them for the seconds of a round, in turns."""
     turns, passes = [], max(1, round(settings.seconds / settings.turn_s))
     for pass_ in range(passes):
         for variant in in_turn(list(driven), number + pass_):
-            say(f"{variant}, {load}")
+            progress(f"{variant}, {load}")
             turns.append((variant, driven[variant].drive(settings.seconds / passes)))
     for variant, own in grouped(turns, lambda turn: turn[0]).items():
         arrived = driven[variant].arrived([turn for _, turn in own])

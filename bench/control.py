@@ -23,7 +23,7 @@ from rich.table import Table
 from pebble.bench import plots
 from pebble.bench.control_ends import Slice, SliceSpec
 from pebble.bench.results import STAND_IN, Cell, Params, Results, begin, grouped, round_cell
-from pebble.bench.rounds import Say, in_turn, measure_rounds
+from pebble.bench.rounds import Progress, in_turn, measure_rounds
 from pebble.bench.show import RATIOS, Shown, compared, percentiles, plain_table
 from pebble.errors import PebbleError
 from pebble.rig.processes import BROKERS, OPERATORS, Processes, Program, Worker, python
@@ -76,7 +76,7 @@ QUICK: Final = Settings(sizes=(40,), rates=(200,), loads=(NONE, MEDIA), seconds=
 def run(settings: Settings, console: Console) -> Shown:
     """Measure all variants. Raises PebbleError."""
     results = begin("control", settings)
-    measure_rounds(results, settings.rounds, lambda number, say: measure(settings, number, say), console)
+    measure_rounds(results, settings.rounds, lambda number, progress: measure(settings, number, progress), console)
     return shown(results)
 
 
@@ -108,13 +108,13 @@ def spec_of(condition: Params, seconds: float) -> SliceSpec:
     return SliceSpec(int(number) * (1024 if unit == "KB" else 1), float(rate), seconds)
 
 
-def measure(settings: Settings, number: int, say: Say) -> Iterator[Cell]:
+def measure(settings: Settings, number: int, progress: Progress) -> Iterator[Cell]:
     """Measure one round; in every other pass backwards."""
     with Participants(settings.variants) as participants:
         for pass_ in range(_PASSES):
             for condition in in_turn(conditions(settings), number + pass_):
                 for variant in in_turn(settings.variants, number + pass_):
-                    say(f"{variant}, {', '.join(map(str, condition.values()))}")
+                    progress(f"{variant}, {', '.join(map(str, condition.values()))}")
                     done, pictures_hz = participants.run(
                         variant, spec_of(condition, settings.seconds), str(condition["load"])
                     )

@@ -22,7 +22,7 @@ from rich.table import Table
 from pebble.bench import plots
 from pebble.bench.clients import RobotSubscriber, driving, ready_robot
 from pebble.bench.results import Cell, Results, begin, round_cell
-from pebble.bench.rounds import Say, in_turn, measure_rounds
+from pebble.bench.rounds import Progress, in_turn, measure_rounds
 from pebble.bench.show import RATIOS, Shown, compared, middle, plain_table
 from pebble.bench.usage import cpu_s, pss_mb
 from pebble.errors import PebbleError
@@ -59,9 +59,9 @@ def run(settings: Settings, console: Console) -> Shown:
     if find_spec("av") is None:
         results.notes.append("h264+opus is left out: there is no PyAV")
 
-    def measure_round(number: int, say: Say) -> Iterator[Cell]:
+    def measure_round(number: int, progress: Progress) -> Iterator[Cell]:
         for variant in in_turn(settings.variants, number):
-            say(variant)
+            progress(variant)
             yield from measure(variant, settings.seconds)
 
     measure_rounds(results, settings.rounds, measure_round, console)

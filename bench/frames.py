@@ -2,7 +2,7 @@
 
 One process writes BGR pictures at 30 Hz, one or three others read them. The latency is from the last byte written until
 a reader has a whole numpy array. Every case starts new processes in every round: starts of a process differ more than
-frames of one process, so many short rounds say more than a few long ones. The first frames do not count.
+frames of one process, so many short rounds are better than a few long ones. The first frames do not count.
 
 ``zenoh-shm``: created in the shared segment and read as a view. ``zenoh-copy``: one copy in, one out. ``zenoh-net``:
 the same code where memory may not be locked. ``mqtt``: mosquitto and paho, QoS 0. ``gstreamer-shm``: shmsink to shmsrc,
@@ -25,7 +25,7 @@ from rich.table import Table
 
 from pebble.bench import plots
 from pebble.bench.results import Cell, Params, Results, begin, grouped, round_cell
-from pebble.bench.rounds import Say, in_turn, measure_rounds
+from pebble.bench.rounds import Progress, in_turn, measure_rounds
 from pebble.bench.show import RATIOS, Shown, compared, percentiles, plain_table
 from pebble.bench.usage import cpu_s, pss_mb
 from pebble.errors import PebbleError
@@ -75,9 +75,9 @@ def run(settings: Settings, console: Console) -> Shown:
     ]
     cases = list(product(conditions, variants))
 
-    def measure_round(number: int, say: Say) -> Iterator[Cell]:
+    def measure_round(number: int, progress: Progress) -> Iterator[Cell]:
         for condition, variant in in_turn(cases, number):
-            say(f"{variant}, {condition['size']}, {condition['readers']} readers")
+            progress(f"{variant}, {condition['size']}, {condition['readers']} readers")
             yield measure(variant, condition, settings.seconds)
 
     measure_rounds(results, settings.rounds, measure_round, console)

@@ -173,7 +173,7 @@ class Style:
 
 #: The variants of each colour. The first four are for other ones of Zenoh, too, the next four of MQTT, the rest of all.
 _VARIANTS: dict[str, tuple[str, ...]] = {
-    "#0072B2": ("zenoh", "zenoh-p2p", "zenoh-shm", "zenoh h264 opus"),
+    "#0072B2": ("zenoh", "zenoh-p2p", "zenoh-shm", "zenoh h264 opus", "hub"),
     "#2AA198": ("zenoh-hub", "zenoh-copy"),
     "#56B4E9": ("zenoh-net", "zenoh original"),
     "#1B3A6B": (),
@@ -182,7 +182,7 @@ _VARIANTS: dict[str, tuple[str, ...]] = {
     "#A4133C": ("mqtt5",),
     "#8C510A": (STAND_IN,),
     "#4D4D4D": ("one hop", "memcpy"),
-    "#8A8A8A": ("gstreamer-shm",),
+    "#8A8A8A": ("gstreamer-shm", "page"),
     **dict.fromkeys(("#117733", "#6DBE8B", "#CC79A7", "#7B4F9E", "#1A1A1A", "#B3B3B3"), ()),
 }
 _STYLES = {

@@ -28,7 +28,7 @@ _INFINITE = 1e15  # stands for infinity where resampling computes differences
 _LARGEST = 1e6  # ratio that is written as a number
 
 Samples = Sequence[Sequence[float]]  # of each round
-Say = Callable[[str], None]  # shows what is being done
+Progress = Callable[[str], None]  # shows what is being done
 T = TypeVar("T")
 
 
@@ -41,7 +41,7 @@ def in_turn(things: Sequence[T], number: int) -> Sequence[T]:
 
 
 def measure_rounds(
-    results: Results, rounds: int, measure: Callable[[int, Say], Iterable[Cell]], console: Console
+    results: Results, rounds: int, measure: Callable[[int, Progress], Iterable[Cell]], console: Console
 ) -> None:
     """Measure all rounds and join their cells; a round that fails is left out for all variants, and noted.
 
@@ -51,11 +51,11 @@ def measure_rounds(
     with console.status("", refresh_per_second=4) as status:
         for number in range(rounds):
 
-            def say(what: str, before: str = f"round {number + 1} of {rounds}: ") -> None:
+            def progress(what: str, before: str = f"round {number + 1} of {rounds}: ") -> None:
                 status.update(escape(before + what))
 
             try:
-                add_round(results, measure(number, say))
+                add_round(results, measure(number, progress))
             except (PebbleError, OSError) as error:
                 failed.append(f"round {number + 1}: {error}")
                 if len(failed) == number + 1 == min(_GIVEN_UP, rounds):

@@ -1,10 +1,10 @@
 """Measures what 10, 100 and 1,000 boards cost a server of the operator page, and a hub: CPU, memory and latency.
 
 ``page``: boards at a stock mosquitto, a page server and one viewer. ``hub``: the same boards at a Zenoh hub, and one
-observer of everything; one session carries them all, as a gateway does, because boards speak MQTT alone. They are
+subscriber to everything; one session carries them all, as a gateway does, because boards speak MQTT alone. They are
 cheap, all on one thread: a connection and a will each, retained capabilities, four heartbeats a second, and nothing
-that obeys. The latency is that of a voltage, from the publish call of one more board until the viewer, or the observer,
-has it.
+that obeys. The latency is that of a voltage, from the publish call of one more board until the viewer, or the
+subscriber, has it.
 
 ``python -m pebble.bench.scale mqtt|zenoh WHERE COUNT`` are the boards; ``WHERE`` is a broker's port or a hub's folder.
 """
@@ -29,7 +29,7 @@ from rich.table import Table
 
 from pebble.bench import plots
 from pebble.bench.results import Cell, Results, begin, round_cell
-from pebble.bench.rounds import Say, measure_rounds
+from pebble.bench.rounds import Progress, measure_rounds
 from pebble.bench.show import Shown, digits, plain_table
 from pebble.bench.usage import cpu_s, pss_mb
 from pebble.client.discovery import ALL_OUTGOING
@@ -72,10 +72,10 @@ def run(settings: Settings, console: Console) -> Shown:
     allow_files(max(settings.boards))
     results = begin("scale", settings)
 
-    def measure(_number: int, say: Say) -> Iterator[Cell]:
+    def measure(_number: int, progress: Progress) -> Iterator[Cell]:
         for boards in settings.boards:
             for variant, of in ((PAGE, page), (HUB, hub)):
-                say(f"{variant}, {boards} boards")
+                progress(f"{variant}, {boards} boards")
                 yield from of(boards, settings.seconds)
 
     measure_rounds(results, 1, measure, console)
@@ -131,7 +131,7 @@ def page(boards: int, seconds: float) -> Iterator[Cell]:
 
 
 def hub(boards: int, seconds: float) -> Iterator[Cell]:
-    """Measure a hub with one observer. Raises PebbleError."""
+    """Measure a hub with one subscriber. Raises PebbleError."""
     with Processes() as processes:
         own, values = ZenohSettings(run_dir=processes.folder / "z"), dict[float, int]()
         settings = msgspec.json.encode(own, enc_hook=str).decode()
@@ -145,8 +145,8 @@ def hub(boards: int, seconds: float) -> Iterator[Cell]:
             if message.topic.endswith(CHARGING_LEVEL.suffix):
                 values.setdefault(json.loads(message.payload)["value"], time.monotonic_ns())
 
-        with create("zenoh", "observer", ZenohSettings(run_dir=own.run_dir, client=True)) as observer:
-            observer.subscribe(ALL_OUTGOING, receive, direct=True)
+        with create("zenoh", "subscriber", ZenohSettings(run_dir=own.run_dir, client=True)) as subscriber:
+            subscriber.subscribe(ALL_OUTGOING, receive, direct=True)
             pids = {HUB: program.pid, "boards": crowd.pid}
             yield from _measured(HUB, boards, seconds, pids, by_zenoh(str(own.run_dir), _PROBE), values)
 

@@ -23,7 +23,7 @@ from rich.table import Table
 from pebble.bench import plots
 from pebble.bench.clients import UP_S, RobotSubscriber, StockClient, driving, ready_robot
 from pebble.bench.results import Cell, Results, begin, round_cell
-from pebble.bench.rounds import Say, in_turn, measure_rounds
+from pebble.bench.rounds import Progress, in_turn, measure_rounds
 from pebble.bench.show import RATIOS, Shown, compared, plain_table, spread
 from pebble.client.media_receiver import MediaReceiver
 from pebble.config import load
@@ -66,9 +66,9 @@ def run(settings: Settings, console: Console) -> Shown:
     """Measure all variants. Raises PebbleError."""
     results = begin("startup", settings)
 
-    def measure_round(number: int, say: Say) -> Iterator[Cell]:
+    def measure_round(number: int, progress: Progress) -> Iterator[Cell]:
         for variant in in_turn(settings.variants, number):
-            say(variant)
+            progress(variant)
             yield from launch(variant, settings.joins)
             if number % _PICTURES_EVERY == 0:
                 yield from first_pictures(variant)

@@ -23,7 +23,7 @@ from rich.table import Table
 
 from pebble.bench.clients import driving
 from pebble.bench.results import Cell, begin, round_cell
-from pebble.bench.rounds import Say, measure_rounds
+from pebble.bench.rounds import Progress, measure_rounds
 from pebble.bench.show import Picture, Shown, plain_table
 from pebble.client.media_receiver import MediaReceiver
 from pebble.errors import PebbleError
@@ -77,8 +77,8 @@ def run(settings: Settings, console: Console) -> Shown:
         raise PebbleError('left out: the analysis of recordings needs DuckDB: pip install "pebble-robot[archive]"')
     results, robots = begin("traffic", settings), dict[str, RobotTraffic]()
 
-    def measure(_number: int, say: Say) -> Iterator[Cell]:
-        say("recording")
+    def measure(_number: int, progress: Progress) -> Iterator[Cell]:
+        progress("recording")
         robots.update(analysed(settings))
         return cells_of(robots)
 

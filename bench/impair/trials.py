@@ -29,7 +29,7 @@ from pebble.bench.impair.network import REMOTE_HOST, NamespaceNetwork, Traffic, 
 from pebble.bench.impair.operator import CLIP
 from pebble.bench.impair.pictures import over_trials
 from pebble.bench.results import STAND_IN, Cell, Results, begin, grouped
-from pebble.bench.rounds import Say, measure_rounds, paired
+from pebble.bench.rounds import Progress, measure_rounds, paired
 from pebble.bench.show import RATIOS, Shown, digits, plain_table
 from pebble.config.raw import deep_merge
 from pebble.errors import PebbleError
@@ -83,7 +83,7 @@ def run(settings: Settings, console: Console) -> Shown:
     require_namespaces()
     results = begin("impair", settings)
     ended: list[str] = []
-    measure_rounds(results, 1, lambda _number, say: measure(settings, say, ended), console)
+    measure_rounds(results, 1, lambda _number, progress: measure(settings, progress, ended), console)
     results.notes += ended
     results.complete = not ended  # in the worst trials nothing may arrive
     return shown(results, settings.window_s)
@@ -186,17 +186,17 @@ def robots(settings: Settings) -> Iterator[list[ImpairedRobot]]:
 # -- the course of the trials
 
 
-def measure(settings: Settings, say: Say, ended: list[str]) -> Iterator[Cell]:
+def measure(settings: Settings, progress: Progress, ended: list[str]) -> Iterator[Cell]:
     """Measure all trials; one that fails ends them, which ``ended`` gets to know, and the earlier ones count.
 
     Raises PebbleError if there are none.
     """
-    say("starting the robots")
+    progress("starting the robots")
     with robots(settings) as every:
-        yield from cells_of(_trials(settings, every, say, ended))
+        yield from cells_of(_trials(settings, every, progress, ended))
 
 
-def _trials(settings: Settings, every: Sequence[ImpairedRobot], say: Say, ended: list[str]) -> list[Trial]:
+def _trials(settings: Settings, every: Sequence[ImpairedRobot], progress: Progress, ended: list[str]) -> list[Trial]:
     trials: list[Trial] = []
     with ThreadPoolExecutor(len(every), thread_name_prefix="subject") as pool:
         try:
@@ -205,7 +205,7 @@ def _trials(settings: Settings, every: Sequence[ImpairedRobot], say: Say, ended:
             for number, condition in enumerate(conditions):
                 turn = slice(None, None, -1 if number % 2 else 1)
                 for group in (together[turn] for together in groups(settings, every)[turn]):
-                    say(f"{condition.name}: {', '.join(robot.subject for robot in group)}")
+                    progress(f"{condition.name}: {', '.join(robot.subject for robot in group)}")
                     list(pool.map(ImpairedRobot.recover, group))
                     list(pool.map(lambda robot, now=condition: robot.network.apply(now), group))
                     trials += list(pool.map(lambda robot, name=condition.name: robot.trial(name), group))

@@ -11,7 +11,7 @@ from pebble.transports.base import Outgoing
 
 LEAST_BITRATE: Final = 16_000  # of Opus: below it speech gets hard to follow
 #: Age of the oldest packet in flight, beyond a round trip, above which the newest are dropped. On a slow connection
-#: Opus gets smaller; what it waits for are packets that were lost and are sent again. Measured behind `pebble impair`
+#: Opus gets smaller; what it waits for are packets that were lost and are sent again. Measured by `pebble bench impair`
 #: at 64 kbit/s and 5 % loss, windows of 12 s: with 0.2 s it lost 3 to 8 % of the sound, with 0.5 s 0 to 1.5 %.
 WAITING_LIMIT_S: Final = 0.2
 OPUS_WAITING_LIMIT_S: Final = 0.5

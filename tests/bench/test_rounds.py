@@ -12,7 +12,7 @@ from rich.console import Console
 
 from pebble.bench import rounds
 from pebble.bench.results import Cell, Results, round_cell
-from pebble.bench.rounds import LEAST_ROUNDS, Say, add_round, in_turn, measure_rounds, paired, ratio
+from pebble.bench.rounds import LEAST_ROUNDS, Progress, add_round, in_turn, measure_rounds, paired, ratio
 from pebble.errors import PebbleError
 
 Rounds = list[list[float]]
@@ -101,7 +101,7 @@ def measured(outcomes: str, printed: io.StringIO | None = None) -> Results:
     """One round for each letter; ``x`` fails after its first variant."""
     results = Results(bench="wake-up")
 
-    def measure(number: int, _say: Say) -> Iterator[Cell]:
+    def measure(number: int, _progress: Progress) -> Iterator[Cell]:
         yield round_cell("pipe", "way", "us", [float(number)])
         if outcomes[number] == "x":
             raise PebbleError("the robot is not up\nits last [words]")
