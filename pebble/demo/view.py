@@ -6,7 +6,7 @@ import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from types import TracebackType
-from typing import Self, TypeVar
+from typing import Self
 
 from rich.console import Console, Group
 from rich.live import Live
@@ -23,7 +23,7 @@ _COLUMN_WIDTH = 26  # characters, of the longest usual cell: keeps the layout st
 _COLUMN_EDGE = 3  # a line, and a space on each side
 _LABEL_WIDTH = 20  # the first column, with its edges
 
-T = TypeVar("T")
+Cells = dict[str, str]  # of one robot, by their labels
 
 
 class View:
@@ -115,7 +115,7 @@ class View:
             self._console.quiet = True  # writing to it would be an error from now on
             self._ending.set()
 
-    def _row(self, robot: SimulatedRobot, now: float) -> dict[str, str]:
+    def _row(self, robot: SimulatedRobot, now: float) -> Cells:
         seen = self._operator.discovery.robots.get(robot.base)
         row = {"robot": f"{robot.name} ({robot.runs_on})"}
         if seen is None:
@@ -145,14 +145,10 @@ class View:
 
 def show_outcomes(console: Console, robots: Sequence[str], outcomes: Outcomes) -> None:
     """Print a table with a row for each step and a column for each robot, of several rounds the worst."""
-    steps = outcomes.steps()
-    for some in _side_by_side(robots, console) if steps else ():
-        table = Table(title="Measured by the MCUs: motors off after", title_justify="left")
-        table.add_column("step")
-        for name in some:
-            table.add_column(name)
-        for step in steps:
-            table.add_row(step, *(_cell(outcomes.of(name, step)) for name in some))
+    table = Table("step", *robots, title="Measured by the MCUs: time until the motors were off", title_justify="left")
+    for step in outcomes.steps():
+        table.add_row(step, *(_cell(outcomes.of(name, step)) for name in robots))
+    if table.rows:
         console.print(table)
 
 
@@ -170,14 +166,14 @@ def show_media(console: Console, received: Mapping[str, CountedMedia]) -> None:
         console.print(f"Pictures and sounds from {name}: {counts or 'none'}", highlight=False, soft_wrap=True)
 
 
-def _side_by_side(columns: Sequence[T], console: Console) -> Iterator[Sequence[T]]:
+def _side_by_side(columns: Sequence[Cells], console: Console) -> Iterator[Sequence[Cells]]:
     """Yield as many columns as the terminal is wide for; two fit into 80 characters."""
     fitting = max(1, (console.width - _LABEL_WIDTH) // (_COLUMN_WIDTH + _COLUMN_EDGE))
     for first in range(0, len(columns), fitting):
         yield columns[first : first + fitting]
 
 
-def _table(columns: Sequence[dict[str, str]]) -> Table:
+def _table(columns: Sequence[Cells]) -> Table:
     """Return one column per robot, without lines: two such tables fit into a terminal of 24 rows."""
     table = Table(show_header=False, box=None, padding=(0, 1))
     table.add_column(style="dim")
@@ -197,7 +193,7 @@ def _heartbeat(seen: RobotView, now: float) -> str:
     return f"{state}, {age:.2f} s ago" + ("" if latency is None else f" ({latency * 1000:.0f} ms)")
 
 
-def _truth(robot: SimulatedRobot) -> dict[str, str]:
+def _truth(robot: SimulatedRobot) -> Cells:
     if not robot.mcu_reports:
         return {"wheels": "", "pose": ""}
     board = robot.mcu_reports[-1].board
