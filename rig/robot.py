@@ -38,14 +38,11 @@ Config = Mapping[str, Any]
 class SimulatedRobot:
     """A robot on this machine, whose processes are among ``running``, and end with them.
 
-    ``entries()`` and ``mcu_reports`` are what its MCU measured, independent of telemetry. ``stop_s``: how long its
-    wheels may turn after the last command, its own watchdog included.
+    ``entries()`` and ``mcu_reports`` are what its MCU measured, independent of telemetry.
     """
 
     runs_on: str
-    stop_s: float
     has_media = has_imu = has_scripts = False
-    has_counter = True  # its camera shows a scene with a counter in it
 
     def __init__(self, running: Processes, name: str, folder: Path) -> None:
         self.running, self.name, self.folder = running, name, folder

@@ -32,7 +32,6 @@ ROBOTS = ("goob", "fred", "minilamp", "benjr")
 OUTLETS = "outlets"
 CLIP = "horn.wav"  # that Goob plays
 TAG_ID = 21  # of the tag that Goob follows, as in the world file
-CAMERA_FPS: int = MEDIA["av_daemon"]["video"]["fps"]
 _BOARDS = {"minilamp": "ESP32-C6", "benjr": "ESP8266"}
 #: Self-describing MCUs that Goob has besides, by their instance of the serial bridge: kind and options.
 _DEVICES = {"imu": ("goob_imu",), OUTLETS: ("outlets", "--unreachable", "o4")}
@@ -48,7 +47,6 @@ class LinuxRobot(Robot):
     """Goob or Fred: the real launcher and services; camera, microphone, MCUs and loudspeaker are simulated."""
 
     runs_on = "Linux, SAMD21"
-    stop_s = 0.85  # 0.75 s watchdog, and its resolution
     has_media = True
 
     def __init__(self, running: Testbed, name: str) -> None:
@@ -90,7 +88,7 @@ class RoomRobot(LinuxRobot):
     Its camera sees the ``room``, and a simulated loudspeaker records what it ``played``.
     """
 
-    has_scripts, has_counter = True, False
+    has_scripts = True
 
     def __init__(self, running: Testbed, name: str) -> None:
         super().__init__(running, name)
@@ -127,8 +125,6 @@ def _loudspeaker(record: Path) -> list[str]:
 
 class McuRobot(SimulatedRobot):
     """MiniLAMP or BenJr: the firmware's own files against simulated pins, with its own connection to the broker."""
-
-    stop_s = 1.0
 
     def __init__(self, running: Testbed, name: str) -> None:
         super().__init__(running, name, running.folder / name)

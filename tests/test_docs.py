@@ -49,13 +49,12 @@ DECISIONS = sorted((ROOT / "docs" / "decisions").glob("*.md"))
 #: The files that a decision named when it was written, and where they are now.
 NOW_AT = re.compile(r"^Now at: (.+)\.$", re.MULTILINE)
 MOVED = re.compile(r"`([^`]+)` → `[^`]+`")
-ROW = re.compile(r"^\| `([^`]+)` \|", re.MULTILINE)  # of docs/moved.md: the old path comes first
 
 
 @pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: str(path.relative_to(ROOT)))
 def test_files_it_names_exist(document: Path) -> None:
     text = document.read_text()
-    moved = MOVED.findall("".join(NOW_AT.findall(text))) + ROW.findall(text) * (document.name == "moved.md")
+    moved = MOVED.findall("".join(NOW_AT.findall(text)))
     assert [name for name in CODE.findall(text) if name not in moved and not _exists(name)] == []
 
 
@@ -156,13 +155,11 @@ def test_the_table_of_bounds_names_each() -> None:
     assert found - set(LISTED) == set(), "add a row to docs/bounds.md"
 
 
-def test_the_table_of_samples_has_their_lines() -> None:
-    docs = ROOT / "docs"
-    table = re.findall(r"\| \[(\d+)\]\(([^)]+)\)", (docs / "your-robot.md").read_text())
-    listed = {(docs / path).resolve(): int(lines) for lines, path in table}
-    samples = {path: len(path.read_text().splitlines()) for path in ROOT.glob("examples/your-*/*.*")}
-    assert listed == samples
-    assert max(samples.values()) <= 150
+def test_each_file_of_the_samples_is_named_and_short() -> None:
+    named = re.findall(r"\(\.\./(examples/[^)]+)\)", (ROOT / "docs" / "your-robot.md").read_text())
+    files = {str(path.relative_to(ROOT)): path for path in ROOT.glob("examples/your-*/*.*")}
+    assert sorted(named) == sorted(files)
+    assert max(len(path.read_text().splitlines()) for path in files.values()) <= 120
 
 
 def test_each_check_is_beside_its_duty_and_counted() -> None:

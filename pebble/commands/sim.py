@@ -141,32 +141,17 @@ def demo(
     phone: Annotated[
         bool, typer.Option("--phone", help="Open the page to the network: https, a login and a QR code.")
     ] = False,
-    fleet: Annotated[
-        bool, typer.Option("--fleet", help="Two robots that hear each other, two hubs and a gateway instead.")
-    ] = False,
 ) -> int:
     """Four simulated robots, driven by a scripted operator through one broker, until Ctrl-C.
 
     Goob on Zenoh, Fred on MQTT, MiniLAMP and BenJr on MCUs with their own firmware; needs no hardware.
     With --seconds it exits 0 only if every robot moved and stopped as commanded.
 
-    With --fleet Goob follows Fred by a hub of their LAN, also while the broker is stopped. It is over after
-    --seconds, and exits 0 only if every step was seen by then.
-
     \b
         pebble demo
         pebble demo --seconds 30
         pebble demo --phone
-        pebble demo --fleet
     """
-    if fleet:
-        from pebble.demo.fleet import run as run_fleet
-        from pebble.errors import PebbleError
-
-        if phone:
-            raise PebbleError("--fleet has no page for phones: leave out --phone")
-
-        return run_fleet(seconds)
     from pebble.demo.main import run
 
     return run(seconds, for_phones=phone)

@@ -1,1 +1,1 @@
-"""The demo: four simulated robots of different kinds, a scripted operator, and an assessment of every step."""
+"""The demo: four simulated robots of different kinds, the operator page, and a scripted operator that drives them."""

@@ -13,8 +13,6 @@ from typing import Any
 from pebble.errors import PebbleError
 from pebble.rig.processes import HOST, mosquitto_path
 
-_MODULE = "pebble.demo.brokers"
-
 
 class BrokerKind(StrEnum):
     MOSQUITTO = "mosquitto"
@@ -22,12 +20,12 @@ class BrokerKind(StrEnum):
 
     @property
     def program(self) -> str | None:
-        """The module that is one; None: it is none of ours."""
-        return _MODULE if self is BrokerKind.EMBEDDED else None
+        """The module that is one; None: it is mosquitto."""
+        return "pebble.demo.brokers" if self is BrokerKind.EMBEDDED else None
 
 
 def best_kind() -> BrokerKind:
-    """The best kind of broker installed on this machine. Raises PebbleError with both remedies if there is none."""
+    """Return the best kind installed on this machine. Raises PebbleError with both remedies if there is none."""
     if mosquitto_path() is not None:
         return BrokerKind.MOSQUITTO
     if find_spec("amqtt") is not None:
@@ -38,10 +36,7 @@ def best_kind() -> BrokerKind:
 
 
 class _Subscriptions(dict[str, Any]):
-    """May grow during an iteration, which amqtt (0.12.1) interrupts to let other tasks run.
-
-    Else a filter that is added meanwhile ends the service of a client, or a message misses subscribers.
-    """
+    """Subscriptions that may grow while amqtt 0.12.1 iterates over them: else that ends the service of a client."""
 
     def __iter__(self) -> Iterator[str]:
         return iter(list(self.keys()))

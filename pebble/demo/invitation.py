@@ -3,7 +3,6 @@
 import shlex
 import sys
 from pathlib import Path
-from typing import NamedTuple
 
 from pebble.contract import DRIVE
 from pebble.contract.identity import Identity
@@ -12,28 +11,21 @@ from pebble.rig.processes import HOST
 ROBOT = Identity("pebble", "robots", "goob")
 
 
-class Line(NamedTuple):
-    """A line for a shell, and what it does."""
-
-    what: str
-    line: str
-
-
 def broker_url(port: int) -> str:
     return f"mqtt://{HOST}:{port}"
 
 
-def lines(port: int) -> tuple[Line, ...]:
-    """The lines for the demo's broker; each can be pasted as it is, in the folder in which the demo was started."""
+def lines(port: int) -> dict[str, str]:
+    """Return lines for a shell, by what they do; each works as it is, in the folder in which the demo was started."""
     pebble, url = _pebble(), broker_url(port)
     drive = f'mosquitto_pub -h {HOST} -p {port} -t {DRIVE.topic(ROBOT.base)} -m \'{{"x": 0, "z": 0.3}}\''
-    return (
-        Line("look at its drive commands", f"{pebble} topic echo {DRIVE.metric} --robot {ROBOT.id} --url {url}"),
-        Line("drive Goob, by any MQTT client", drive),
-        Line("record all robots until Ctrl-C", f"{pebble} record --url {url}"),
-        Line("stop Goob, whoever drives it", f"{pebble} estop {ROBOT.id} --url {url}"),
-        Line("let it go again", f"{pebble} estop reset {ROBOT.id} --url {url}"),
-    )
+    return {
+        "look at its drive commands": f"{pebble} topic echo {DRIVE.metric} --robot {ROBOT.id} --url {url}",
+        "drive Goob, by any MQTT client": drive,
+        "record all robots until Ctrl-C": f"{pebble} record --url {url}",
+        "stop Goob, whoever drives it": f"{pebble} estop {ROBOT.id} --url {url}",
+        "let it go again": f"{pebble} estop reset {ROBOT.id} --url {url}",
+    }
 
 
 def _pebble() -> str:

@@ -1,12 +1,12 @@
-"""Output of the demo: a live table in a terminal, a plain line at each step elsewhere, and tables of results."""
+"""Output of the demo: a live table in a terminal, a plain line at each step elsewhere, and what was measured."""
 
 import math
 import threading
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from types import TracebackType
-from typing import Self, TypeVar
+from typing import Self
 
 from rich.console import Console, Group
 from rich.live import Live
@@ -14,25 +14,20 @@ from rich.table import Table
 from rich.text import Text
 
 from pebble.client.robot_view import RobotView
-from pebble.contract.encodings import ALL_SOUND, ALL_VIDEO
-from pebble.demo.emergency import StopResult
-from pebble.demo.following import FollowResult
-from pebble.demo.media import MediaCheck
-from pebble.demo.media_assessment import MediaResult
-from pebble.demo.operator import OBSERVING, Operator
-from pebble.demo.results import Result
-from pebble.demo.steps import StepResult
+from pebble.demo.media import CountedMedia, MediaViewer
+from pebble.demo.operator import Operator
+from pebble.demo.outcome import Outcome, Outcomes
 from pebble.rig.robot import SimulatedRobot
 
 _COLUMN_WIDTH = 26  # characters, of the longest usual cell: keeps the layout stable
 _COLUMN_EDGE = 3  # a line, and a space on each side
 _LABEL_WIDTH = 20  # the first column, with its edges
 
-T = TypeVar("T")
+Cells = dict[str, str]  # of one robot, by their labels
 
 
 class View:
-    """Shows the robots while they run; call ``update`` at any rate.
+    """The robots while they run; call ``update`` at any rate.
 
     ``ending`` is set when the terminal was closed: under make, SIGHUP reaches only make. ``addresses`` stay above the
     table.
@@ -42,10 +37,10 @@ class View:
         self,
         console: Console,
         operator: Operator,
-        media: MediaCheck,
+        media: MediaViewer,
         robots: Sequence[SimulatedRobot],
         ending: threading.Event,
-        addresses: Sequence[str] = (),
+        addresses: str,
     ) -> None:
         self._addresses = addresses
         self._console, self._operator, self._media = console, operator, media
@@ -67,31 +62,30 @@ class View:
 
     def update(self) -> None:
         with self._until_closed():
-            self._draw(time.monotonic())
+            self._print_events()
+            if self._live is None:
+                self._print_changes(time.monotonic())
+            else:
+                self._draw(self._live, time.monotonic())
 
-    def _draw(self, now: float) -> None:
-        self._print_events()
-        if self._live is not None:
-            activity = f"{now - self._began:5.1f} s  operator: {self._operator.activity}"
-            rows = [self._row(robot, now) for robot in self._robots]
-            tables = [_table(some) for some in _side_by_side(rows, self._console)]
-            last = Text.assemble(activity, ("   Ctrl-C ends it", "dim"), no_wrap=True, overflow="ellipsis")
-            addresses = Text("   ".join(self._addresses), style="bold", no_wrap=True, overflow="ellipsis")
-            self._live.update(Group(addresses, *tables, last), refresh=True)
-        else:
-            self._print_changes(now)
+    def _draw(self, live: Live, now: float) -> None:
+        activity = f"{now - self._began:5.1f} s  operator: {self._operator.activity}"
+        rows = [self._row(robot, now) for robot in self._robots]
+        tables = [_table(some) for some in _side_by_side(rows, self._console)]
+        last = Text.assemble(activity, ("   Ctrl-C ends it", "dim"), no_wrap=True, overflow="ellipsis")
+        addresses = Text(self._addresses, style="bold", no_wrap=True, overflow="ellipsis")
+        live.update(Group(addresses, *tables, last), refresh=True)
 
     def _print_changes(self, now: float) -> None:
-        """A line for each robot when it is discovered, and for each step when it begins."""
+        """Print a line for each robot when it is discovered, and for each step when it begins."""
         for robot in self._robots:
-            seen = self._discovered(robot.name)
+            seen = self._operator.discovery.robots.get(robot.base)
             if seen is not None and seen.capabilities and robot.name not in self._known:
                 self._known.add(robot.name)
                 self._print(now, f"{robot.name} is online: {robot.runs_on}, {seen.transport} inside")
-        step = self._operator.activity.replace(OBSERVING, "")
-        if step != self._step:
-            self._step = step
-            self._print(now, f"operator: {step}")
+        if self._operator.activity != self._step:
+            self._step = self._operator.activity
+            self._print(now, f"operator: {self._step}")
 
     def _print(self, at: float, line: str, style: str = "") -> None:
         self._console.print(
@@ -99,7 +93,7 @@ class View:
         )
 
     def _print_events(self) -> None:
-        """Above the live table, where they stay."""
+        """Print them above the live table, where they stay."""
         while self._operator.events:
             at, line = self._operator.events.popleft()
             self._print(at, line, "bold yellow")
@@ -121,8 +115,8 @@ class View:
             self._console.quiet = True  # writing to it would be an error from now on
             self._ending.set()
 
-    def _row(self, robot: SimulatedRobot, now: float) -> dict[str, str]:
-        seen = self._discovered(robot.name)
+    def _row(self, robot: SimulatedRobot, now: float) -> Cells:
+        seen = self._operator.discovery.robots.get(robot.base)
         row = {"robot": f"{robot.name} ({robot.runs_on})"}
         if seen is None:
             return row | {"transport": "not discovered yet"}
@@ -136,14 +130,11 @@ class View:
         if robot.has_scripts:
             row["script"] = _script(seen)
         if robot.has_media:
-            recorder = self._media.recorders.get(robot.name)
-            row["video"] = "" if recorder is None else recorder.summary("video", now)
-            row["audio"] = "" if recorder is None else recorder.summary("audio", now)
+            media = self._media.received.get(robot.name)
+            row["video"] = "" if media is None else media.summary("video", now)
+            row["audio"] = "" if media is None else media.summary("audio", now)
         row["messages"] = f"{self._operator.discovery.traffic[seen.base].rate(now):3.0f}/s"
         return row
-
-    def _discovered(self, name: str) -> RobotView | None:
-        return next((seen for seen in self._operator.discovery.all_robots() if seen.name == name), None)
 
     def _command(self, seen: RobotView, now: float) -> str:
         if seen.base not in self._operator.steering.commands:
@@ -152,79 +143,38 @@ class View:
         return f"x {drive.x:+.2f} z {drive.z:+.2f}, {now - sent_at:3.1f} s ago"
 
 
-def show_results(console: Console, robots: Sequence[str], results: Sequence[Result], problems: Sequence[str]) -> None:
-    """One row per step, one column per robot, the worst of several rounds; then every problem."""
-    driven = [result for result in results if not isinstance(result, FollowResult)]
-    steps = list(dict.fromkeys(result.step for result in driven))
-    for some in _side_by_side(robots, console) if driven else ():
-        table = Table(title="Measured by the MCUs: distance, and time until the stop", title_justify="left")
-        table.add_column("step")
-        for name in some:
-            table.add_column(name)
-        for step in steps:
-            table.add_row(step, *(_cell(step, name, driven) for name in some))
+def show_outcomes(console: Console, robots: Sequence[str], outcomes: Outcomes) -> None:
+    """Print a table with a row for each step and a column for each robot, of several rounds the worst."""
+    table = Table("step", *robots, title="Measured by the MCUs: time until the motors were off", title_justify="left")
+    for step in outcomes.steps():
+        table.add_row(step, *(_cell(outcomes.of(name, step)) for name in robots))
+    if table.rows:
         console.print(table)
-    for result in results:
-        if isinstance(result, FollowResult):
-            _show_follow(console, result)
-    for problem in problems:
-        console.print(problem, style="red", highlight=False, markup=False, soft_wrap=True)
-    if results and not problems:
-        console.print("Every robot moved and stopped as commanded.", style="green")
 
 
-def _show_follow(console: Console, result: FollowResult) -> None:
-    title = f"Measured by {result.robot}'s MCU, room and loudspeaker: script and override"
-    table = Table(title=title, title_justify="left")
-    table.add_column("step")
-    table.add_column(result.robot)
-    for check in result.checks:
-        table.add_row(check.name, f"{'FAILED' if check.wrong else 'ok'}  {check.measured}")
-    console.print(table)
+def _cell(outcome: Outcome | None) -> str:
+    if outcome is None:
+        return "–"
+    off = "never off" if math.isinf(outcome.off_s) else f"{outcome.off_s * 1000:.0f} ms"
+    return f"{'FAILED' if outcome.wrong else 'ok'}  {off}"
 
 
-def show_media_results(console: Console, robots: Sequence[str], results: Sequence[MediaResult]) -> None:
-    """One row per encoding, one column per robot, the worst of several checks."""
-    table = Table(title="Received by the operator", title_justify="left")
-    table.add_column("encoding")
-    for name in robots:
-        table.add_column(name)
-    for encoding in (*ALL_VIDEO, *ALL_SOUND):
-        cells = [[one for one in results if one.robot == name and one.encoding == encoding] for name in robots]
-        if any(cells):
-            table.add_row(encoding, *(_media_cell(cell) for cell in cells))
-    if results:
-        console.print(table)
-    if slow := [result.overloaded for result in results if result.overloaded]:
-        console.print(f"slow: this machine was overloaded and could not keep up: {slow[-1]}.", soft_wrap=True)
+def show_media(console: Console, received: Mapping[str, CountedMedia]) -> None:
+    """Print a line for each robot with the number of its pictures and sounds."""
+    for name, media in received.items():
+        counts = ", ".join(f"{encoding} {number}" for encoding, number in media.counted.items())
+        console.print(f"Pictures and sounds from {name}: {counts or 'none'}", highlight=False, soft_wrap=True)
 
 
-def _media_cell(results: Sequence[MediaResult]) -> str:
-    if not results:
-        return "not done"
-    worst = max(results, key=lambda result: (len(result.wrong), result.judged, bool(result.overloaded)))
-    if not worst.judged:
-        return worst.measured
-    return f"{'FAILED' if worst.wrong else 'slow' if worst.overloaded else 'ok'}  {worst.measured}"
-
-
-def _cell(step: str, name: str, results: Sequence[StepResult | StopResult]) -> str:
-    mine = [result for result in results if result.step == step and result.robot == name]
-    if not mine:
-        return "not done"
-    worst = max(mine, key=lambda result: (len(result.wrong), result.stop_s))
-    return f"{'FAILED' if worst.wrong else 'ok'}  {worst.summary}"
-
-
-def _side_by_side(columns: Sequence[T], console: Console) -> Iterator[Sequence[T]]:
-    """The table has as many columns as the terminal is wide for; two fit into 80 characters."""
+def _side_by_side(columns: Sequence[Cells], console: Console) -> Iterator[Sequence[Cells]]:
+    """Yield as many columns as the terminal is wide for; two fit into 80 characters."""
     fitting = max(1, (console.width - _LABEL_WIDTH) // (_COLUMN_WIDTH + _COLUMN_EDGE))
     for first in range(0, len(columns), fitting):
         yield columns[first : first + fitting]
 
 
-def _table(columns: Sequence[dict[str, str]]) -> Table:
-    """One column per robot, without lines: two such tables fit into a terminal of 24 rows."""
+def _table(columns: Sequence[Cells]) -> Table:
+    """Return one column per robot, without lines: two such tables fit into a terminal of 24 rows."""
     table = Table(show_header=False, box=None, padding=(0, 1))
     table.add_column(style="dim")
     for _ in columns:
@@ -243,7 +193,7 @@ def _heartbeat(seen: RobotView, now: float) -> str:
     return f"{state}, {age:.2f} s ago" + ("" if latency is None else f" ({latency * 1000:.0f} ms)")
 
 
-def _truth(robot: SimulatedRobot) -> dict[str, str]:
+def _truth(robot: SimulatedRobot) -> Cells:
     if not robot.mcu_reports:
         return {"wheels": "", "pose": ""}
     board = robot.mcu_reports[-1].board

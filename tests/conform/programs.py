@@ -1,4 +1,4 @@
-"""The sample programs of docs/your-robot.md in each language: how they are made, and how they are started."""
+"""The samples of docs/your-robot.md: how they are made, and how they are started."""
 
 from __future__ import annotations
 
@@ -23,62 +23,64 @@ from tests.support import ROOT, Broker
 from tests.transports.brokers import MAKERS, named_nats
 
 Command = list[str | Path]
-Language = Callable[[str, Path], Command]  # makes its "robot" or "operator" in a folder
+Sample = Callable[[Path], Command]  # makes it in a folder
 
-EXAMPLES = ROOT / "examples"
+ROBOT_PY = ROOT / "examples" / "your-robot" / "robot.py"
+OPERATOR_PY = ROOT / "examples" / "your-operator" / "my_operator.py"
 CJSON = Path("/usr/include/cjson/cJSON.h")
 WARNINGS = ("-Wall", "-Wextra", "-Werror", "-O2")
 
 
-def source(program: str, ending: str) -> Path:
-    return EXAMPLES / f"your-{program}" / f"{program}.{ending}"
+def robot_in_python(_folder: Path) -> Command:
+    return [sys.executable, ROBOT_PY]
 
 
-def in_python(program: str, _folder: Path) -> Command:
-    return [sys.executable, source(program, "py")]
+def operator_in_python(_folder: Path) -> Command:
+    return [sys.executable, OPERATOR_PY]
 
 
-def in_javascript(program: str, _folder: Path) -> Command:
+def mutant(sample: Path, folder: Path, old: str, new: str) -> Path:
+    """Return a copy of a sample, with ``new`` in place of ``old`` in all files of its folder that have it."""
+    copy = shutil.copytree(sample.parent, folder / "mutant")
+    files = [file for file in copy.iterdir() if old in file.read_text()]
+    assert files, f"no file has {old!r}"
+    for file in files:
+        file.write_text(file.read_text().replace(old, new))
+    return copy / sample.name
+
+
+def operator_in_javascript(_folder: Path) -> Command:
     package("mqtt")
-    return ["node", source(program, "mjs")]
+    return ["node", OPERATOR_PY.with_name("operator.mjs")]
 
 
-def in_c(program: str, folder: Path) -> Command:
-    if shutil.which("gcc") is None or not Path("/usr/include/mosquitto.h").exists() or not CJSON.exists():
-        missing("needs a compiler and libraries (apt install gcc libc6-dev libmosquitto-dev libcjson-dev)")
-    libraries = ("-lmosquitto", "-lcjson", "-lm")
-    subprocess.run(["gcc", *WARNINGS, "-o", folder / program, source(program, "c"), *libraries], check=True)
-    return [folder / program]
+def robot_in_arduino(folder: Path) -> Command:
+    return sketch(ROBOT_PY.with_name("robot.cpp"), folder / "robot")
 
 
-def in_arduino(program: str, folder: Path) -> Command:
-    return sketch(source(program, "cpp"), folder / program)
-
-
-def sketch(file: Path, program: Path) -> Command:
+def sketch(sample: Path, program: Path) -> Command:
     """A stand-in takes the place of Arduino's libraries; its TLS is the openssl program."""
     if shutil.which("g++") is None or shutil.which("openssl") is None or not CJSON.exists():
         missing("needs a compiler, OpenSSL and cJSON (apt install g++ openssl libcjson-dev)")
     board = ROOT / "tests" / "conform" / "arduino"
     command: Command = ["g++", "-std=gnu++17", *WARNINGS, "-I", board, "-o", program, board / "main.cpp"]
-    subprocess.run([*command, file, "-lcjson", "-pthread"], check=True)
+    subprocess.run([*command, sample, "-lcjson", "-pthread"], check=True)
     return [program]
 
 
-def in_micropython(program: str, _folder: Path) -> Command:
-    """The real interpreter, as WebAssembly; sockets, flash and console of a board are this machine's."""
+def robot_in_micropython(_folder: Path) -> Command:
+    """The real interpreter, as WebAssembly; sockets and flash of a board are this machine's."""
     interpreter = package("@micropython/micropython-webassembly-pyscript")
-    board, mqtt = ROOT / "tests" / "conform" / "micropython", source("robot", "py").with_name("mqtt.py")
-    sample = source(program, "py").with_name(f"{program}-micropython.py")
-    return ["node", board / "run.mjs", interpreter, mqtt, sample]
+    board = ROOT / "tests" / "conform" / "micropython"
+    return ["node", board / "run.mjs", interpreter, ROBOT_PY.with_name("robot-micropython.py")]
 
 
 def missing(what: str) -> None:
     (pytest.fail if os.environ.get("CI") == "true" else pytest.skip)(what)
 
 
-ROBOTS = (in_python, in_javascript, in_c, in_arduino, in_micropython)
-OPERATORS = ROBOTS
+ROBOTS = (robot_in_python, robot_in_arduino, robot_in_micropython)
+OPERATORS = (operator_in_python, operator_in_javascript)
 
 
 NATS = MAKERS["nats"]

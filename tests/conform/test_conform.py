@@ -1,4 +1,4 @@
-"""The checker finds every planted violation of the smallest honest robot, and passes it as it is."""
+"""The checker finds every planted violation of the sample robot, and passes it as it is."""
 
 from __future__ import annotations
 
@@ -29,43 +29,48 @@ from tests.commands.command_line import Run
 from tests.commands.conftest import run as run
 from tests.conform.programs import (
     NATS,
+    ROBOT_PY,
     ROBOTS,
     WITHOUT_NATS,
     Command,
     Hall,
-    Language,
+    Sample,
     at_named,
     at_open,
     believing,
     ended,
+    mutant,
     named_by_nats,
     named_by_the_fleet,
     sketch,
-    source,
 )
 from tests.fleet.conftest import cheap_hashes as cheap_hashes
 from tests.support import Broker, Child, beside, further, some
 
 pytestmark = pytest.mark.alone  # deadlines of wheels are checked
 
-SOURCE = source("robot", "py").read_text()
 ALL = {check.name: check for check in (*CHECKS, *CONTROL, *MOVING, *LAST, *CUT)}
 LOOKS_S = 2.0
 
 #: The check that finds it, how that names it, and what is written into the robot's program, in place of what.
 VIOLATIONS = (
-    ("heartbeat", "in the time of observation", "heartbeat_at = now() + 0.25", "heartbeat_at = now() + 5"),
-    ("heartbeat", "one every 1.5", "heartbeat_at = now() + 0.25", "heartbeat_at = now() + 1.5"),
-    ("clock", "3600 s ahead", "int(1000 * time.time())", "int(1000 * time.time()) + 3_600_000"),
-    ("payloads", "online: Expected `int`", '{"t": epoch_ms()}, qos=0', '{"t": str(time.time())}, qos=0'),
-    ("numbers", "not JSON: outgoing/status", '{"wheels": self.wheels}', '{"wheels": self.wheels, "amperes": math.nan}'),
-    ("sizes", "outgoing/estop/motors has", '"by": "", "why": "", "since"', '"by": "", "why": 400 * "x", "since"'),
+    ("heartbeat", "in the time of observation", "HEARTBEAT_MS = 250", "HEARTBEAT_MS = 5000"),
+    ("heartbeat", "one every 1.5", "HEARTBEAT_MS = 250", "HEARTBEAT_MS = 1500"),
+    ("clock", "3600 s ahead", "time.time_ns() // 1_000_000", "time.time_ns() // 1_000_000 + 3_600_000"),
+    ("payloads", "online: Expected `int`", '"online", {"t": self.epoch_ms()}', '"online", {"t": str(self.epoch_ms())}'),
+    (
+        "numbers",
+        "not JSON: outgoing/status",
+        '{"wheels": self.wheels}',
+        '{"wheels": self.wheels, "amperes": float("nan")}',
+    ),
+    ("sizes", "outgoing/estop/motors has", '"by": "", "why": ""', '"by": "", "why": 400 * "x"'),
     ("retained", "not retained:", "qos, retain=True", "qos, retain=False"),
     (
         "parked commands",
         "incoming/control",
-        "    def publish(self",
-        '        client.publish(IN + "control", "{}", 1, True)\n\n    def publish(self',
+        "    def save(self, text):",
+        '        client.publish(self.base + "/incoming/control", "{}", 1, True)\n\n    def save(self, text):',
     ),
     ("capabilities", "Expected `bool`", '"available": True', '"available": "yes"'),
     (
@@ -74,136 +79,116 @@ VIOLATIONS = (
         '"controls": True',
         '"controls": True, "topic": "pebble/robots/other/incoming/drive-values"',
     ),
-    ("identity", "it calls itself", '"id": ID', '"id": "other"'),
-    (
-        "junk",
-        "its heartbeats ended",
-        "(ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError)",
-        "(KeyError)",
-    ),
-    ("stop states", "no state of outgoing/estop/motors", 'publish(f"estop/{OWNER}"', 'publish("estop/others"'),
-    ("stop", "no state has its name", 'self.stop = {"latched": True', 'self.stop = {"latched": False'),
-    ("stop once", "its repetition counts again", 'if name not in self.stop["recent"]:', "if True:"),
+    ("identity", "it calls itself", '"id": robot_id', '"id": "other"'),
+    ("junk", "its heartbeats ended", "except (ValueError, RuntimeError, MemoryError)", "except KeyError"),
+    ("stop states", "no state of outgoing/estop/motors", '"estop/" + OWNER', '"estop/others"'),
+    ("stop", "no state has its name", '{"latched": True', '{"latched": False'),
+    ("stop once", "its repetition counts again", 'if name in self.stop["recent"]:', "if False:"),
     (
         "stop once",
         "its repetition after a reset stops it again",
-        'self.stop | {"latched": False}',
-        'self.stop | {"latched": False, "recent": []}',
+        'self.stop["latched"] = False',
+        "self.stop.update(latched=False, recent=[])",
     ),
     (
         "stop unread",
         "a stop that is no JSON does nothing",
-        "            claims = dict(json.loads(payload))",
-        "            claims = {}\n        claims = dict(json.loads(payload))",
+        '"estop" and payload:',
+        '"estop" and command:',
     ),
     (
         "stop holds",
         "a drive command ends the stop",
-        "        if not x and not z:\n",
-        "        if not x and not z:\n            self.stop = FREE\n            self.publish_stop()\n",
+        "self.halt()  # a zero",
+        'self.stop.stop["latched"], self.stop.is_new = False, True\n            self.halt()  # a zero',
     ),
-    ("reset refused", "a reset with an older count ends it", "if self.refused is None and", "if"),
-    ("control", "a second request takes it", 'elif take or mine or not self.holder["key"]:', "elif True:"),
-    ("control asked", "a second request is not shown", '{"asks": new["by"], "asks_id": new["id"]}', "UNASKED"),
-    ("control asked", "it is shown after its end", "now() <= robot.asks_until", "True"),
-    ("control released", "it is kept after its release", "NONE if mine else self.holder", "self.holder"),
-    ("control released", "another's release ends it", "NONE if mine else self.holder", "NONE"),
-    ("control taken", "the one who has it keeps it", "elif take or mine or", "elif mine or"),
-    ("control taken", "its key stays", "secrets.token_hex(4)})", '"0badf00e"})'),
-    ("control ends", "it stays with who went away", "now() > robot.ends:", "False:"),
-    ("control ends", "it ends in the middle of its commands", "if mine else self.ends", "if False else self.ends"),
+    ("reset refused", "a reset with an older count ends it", 'command.get("count") != self.count', "False"),
+    ("control", "a second request takes it", "elif is_holder or take or self.is_free:", "elif True:"),
+    ("control asked", "a second request is not shown", "self._asks_id = own_id", 'self._asks_id = ""'),
+    ("control asked", "it is shown after its end", "if now > self._asks_until:", "if False:"),
+    ("control released", "it is kept after its release", "self.pass_to(NOBODY)\n        elif", "pass\n        elif"),
     (
-        "dead man",
-        "it still moves after the last command",
-        'DEAD_MAN_S, PAUSE_S, LONGEST = "motors", 0.75',
-        'DEAD_MAN_S, PAUSE_S, LONGEST = "motors", 3.0',
+        "control released",
+        "another's release ends it",
+        "if is_holder:",
+        "if True:",
     ),
+    ("control taken", "the one who has it keeps it", "elif is_holder or take or", "elif is_holder or"),
+    ("control taken", "its key stays", '"key": new_hex(8)', '"key": "0badf00e"'),
+    ("control ends", "it stays with who went away", "not self.is_free and now > self._ends_at", "False"),
     (
-        "validity",
-        "it still moves after the last command",
-        'command.get("valid_ms", 1000 * DEAD_MAN_S)',
-        "1000 * DEAD_MAN_S",
+        "control ends",
+        "it ends in the middle of its commands",
+        "self.control.renew(self.now())",
+        "pass",
     ),
-    ("validity", "valid_ms 4000: it", "min(DEAD_MAN_S, max(", "max(0.0, max("),
-    (
-        "zero",
-        "after a zero with another key",
-        "            self.turn(0.0, 0.0, 0.0)\n            self.paused_at",
-        "            self.paused_at",
-    ),
+    ("dead man", "it still moves after the last command", "DEAD_MAN_MS = 750", "DEAD_MAN_MS = 3000"),
+    ("validity", "it still moves after the last command", 'command.get("valid_ms", DEAD_MAN_MS)', "DEAD_MAN_MS"),
+    ("validity", "valid_ms 4000: it", "clamp(valid_ms, 0, DEAD_MAN_MS)", "valid_ms"),
+    ("zero", "after a zero with another key", "self.halt()  # a zero needs no key", "pass"),
     (
         "zero",
         "after a zero with another key",
-        "        if not x and not z:\n",
-        '        if not (x or z or mine) and "key" in command:\n            return\n        if not x and not z:\n',
+        "if x == 0 and z == 0:",
+        'if not (x or z or by_holder) and "key" in command:\n            return\n        if x == 0 and z == 0:',
     ),
     (
         "steering",
         "at x 0.4, z 0 its wheels do [0.4, 0.4]",
-        'command.get("x", 0), command.get("z", 0)',
-        'command.get("z", 0), command.get("x", 0)',
+        "        x = clamp(x, -1, 1)\n        z = clamp(z, -1, 1)",
+        "        x, z = clamp(z, -1, 1), clamp(x, -1, 1)",
     ),
     (
         "steering",
         "at x 0.4, z 0 its wheels do [-0.4, 0.4]",
-        "min(1.0, z + x)), max(-1.0, min(1.0, z - x))",
-        "min(1.0, z - x)), max(-1.0, min(1.0, z + x))",
+        "self.move(clamp(z + x, -1, 1), clamp(z - x, -1, 1)",
+        "self.move(clamp(z - x, -1, 1), clamp(z + x, -1, 1)",
     ),
-    ("steering", "within value its wheels do []", 'value["value"] if type', "value if type"),
-    ("no number", "no number", "math.isfinite(one) for", "True for"),
-    ("clamps", "a wheel got 3", "self.turn(max(-1.0, min(1.0, z + x))", "self.turn(z - 2 * x"),
-    ("foreign key", "it moves by another's key", '(mine or ("key" not in command and not NAMED))', "True"),
-    ("foreign key", "while no one has control", '(mine or ("key"', '(mine or not self.holder["key"] or ("key"'),
+    ("steering", "within value its wheels do []", "inner if isinstance(inner, dict) else value", "value"),
+    ("no number", "no number", " and -INFINITY < value < INFINITY", ""),
+    ("clamps", "a wheel got 3", "self.move(clamp(z + x, -1, 1)", "self.move(z - 2 * x"),
+    ("foreign key", "it moves by another's key", "and (by_holder or keyless)", ""),
+    (
+        "foreign key",
+        "while no one has control",
+        "(by_holder or keyless)",
+        "(self.control.is_free or by_holder or keyless)",
+    ),
     (
         "control passes",
         "after another took control",
-        "to, UNASKED\n            self.turn(0.0, 0.0, 0.0)",
-        "to, UNASKED",
+        "self.halt()  # the next driver",
+        "pass  # the next driver",
     ),
-    ("stop moving", "after the stop", 'elif not self.stop["latched"] and', "elif"),
-    ("reset waits", "a stick that is held down", "elif now() < self.paused_at + PAUSE_S:", "elif False:"),
-    (
-        "reset waits",
-        "a stick that is held down",
-        '-math.inf if mine or not self.holder["key"] else self.paused_at',
-        "-math.inf",
-    ),
+    ("stop moving", "after the stop", "elif not self.stop.latched and", "elif"),
+    ("reset waits", "a stick that is held down", "elif self.now() < self.paused_until:", "elif False:"),
+    ("reset waits", "a stick that is held down", "if by_holder or self.control.is_free:", "if True:"),
     (
         "long messages",
         "no stop reaches it",
-        "client.on_connect, client.on_message = robot.connected, robot.receive",
+        "client.on_message = on_message",
         "client.manual_ack_set(True)\n"
-        "client.on_connect, client.on_message = robot.connected, lambda client, data, message: (\n"
-        "    robot.receive(client, data, message),\n"
+        "client.on_message = lambda client, data, message: (\n"
+        "    on_message(client, data, message),\n"
         "    len(message.payload) < 1024 and client.ack(message.mid, message.qos))",
     ),
-    (
-        "will",
-        "nothing tells that it is gone",
-        'json.dumps({"t": epoch_ms(), "online": False})',
-        'json.dumps({"t": epoch_ms()})',
-    ),
-    ("retained commands", "it stops by a retained stop", "if message.retain:", "if False:"),
-    ("stop survives", "it is free after a power cut", "self.stop |= json.load(open(STOP_FILE))", "self.stop = FREE"),
+    ("will", "nothing tells that it is gone", '"online": False', '"online": True'),
+    ("retained commands", "it stops by a retained stop", "if retained:", "if False:"),
+    ("stop survives", "it is free after a power cut", "if saved is not None:", "if False:"),
 )
 
 #: The same at level named.
 NAMED_VIOLATIONS = (
-    ("control", "its state tells that 'conform' has it", 'f"{account}/{by}".strip("/")[:40]', "by"),
+    ("control", "its state tells that 'conform' has it", '(account + "/" + only', '("" + only'),
     (
         "nameless",
         "a reset without an account",
-        'metric == "estop-reset" and (account or not NAMED)',
-        'metric == "estop-reset"',
+        "(self.named and not account)",
+        '(self.named and not account and metric != "estop-reset")',
     ),
-    ("nameless", "a request without an account", '"control/take") and (account or not NAMED)', '"control/take")'),
-    ("keyless", "without a key", '("key" not in command and not NAMED)', '"key" not in command'),
-    (
-        "foreign account",
-        "a key that another sends",
-        '(command.get("key"), account) == (self.holder["key"], self.account)',
-        'command.get("key") == self.holder["key"]',
-    ),
+    ("nameless", "a request without an account", "(self.named and not account)", "False"),
+    ("keyless", "without a key", '"key" not in command and not self.named', '"key" not in command'),
+    ("foreign account", "a key that another sends", " and account == self._account\n\n", "\n\n"),
 )
 
 
@@ -262,9 +247,9 @@ def lacking(found: Found) -> Found:
     return {name: one for name, one in found.items() if one[0] is not State.OK}
 
 
-@pytest.mark.parametrize("language", [ROBOTS[0], *map(further, ROBOTS[1:])])
-def test_the_smallest_honest_robot_passes(broker: Broker, tmp_path: Path, language: Language) -> None:
-    program = language("robot", tmp_path)
+@pytest.mark.parametrize("sample", [ROBOTS[0], *map(further, ROBOTS[1:])])
+def test_a_sample_robot_passes(broker: Broker, tmp_path: Path, sample: Sample) -> None:
+    program = sample(tmp_path)
     arguments, target = at_open(broker)
     with switched_on([*program, *with_stop_file(arguments, tmp_path)], target) as component:
         found = judged(component, *ALL.values())
@@ -282,7 +267,7 @@ REFUSED = {
 
 @pytest.mark.usefixtures("cheap_hashes")
 @pytest.mark.parametrize(
-    ("hall", "language", "unseen"),
+    ("hall", "sample", "unseen"),
     [
         (named_by_the_fleet, ROBOTS[0], REFUSED),
         *(further(named_by_the_fleet, one, REFUSED) for one in ROBOTS[1:]),
@@ -290,8 +275,8 @@ REFUSED = {
         *(further(believing, one, {}) for one in ROBOTS),
     ],
 )
-def test_it_passes_where_names_are_checked(hall: Hall, tmp_path: Path, language: Language, unseen: Found) -> None:
-    program = language("robot", tmp_path)
+def test_it_passes_where_names_are_checked(hall: Hall, tmp_path: Path, sample: Sample, unseen: Found) -> None:
+    program = sample(tmp_path)
     with hall(tmp_path / "hall") as broker:
         arguments, target = at_named(broker, tmp_path, "mine", "ann")
         with switched_on([*program, *with_stop_file(arguments, tmp_path)], target) as component:
@@ -300,35 +285,31 @@ def test_it_passes_where_names_are_checked(hall: Hall, tmp_path: Path, language:
 
 @pytest.mark.thorough
 @WITHOUT_NATS
-@pytest.mark.parametrize("language", ROBOTS)
-def test_it_passes_at_another_broker(tmp_path: Path, language: Language) -> None:
-    program = language("robot", tmp_path)
+@pytest.mark.parametrize("sample", ROBOTS)
+def test_it_passes_at_another_broker(tmp_path: Path, sample: Sample) -> None:
+    program = sample(tmp_path)
     with ended(NATS.make(tmp_path)) as broker:
         arguments, target = at_open(broker)
         with switched_on([*program, *with_stop_file(arguments, tmp_path)], target) as component:
             assert lacking(judged(component, *ALL.values())) == {}
 
 
-def mutant(folder: Path, old: str, new: str) -> Command:
-    assert old in SOURCE
-    (folder / "robot.py").write_text(SOURCE.replace(old, new))
-    return [sys.executable, folder / "robot.py"]
-
-
 @pytest.mark.parametrize(("name", "reason", "old", "new"), some(VIOLATIONS, 10))
 def test_a_violation_is_found(broker: Broker, tmp_path: Path, name: str, reason: str, old: str, new: str) -> None:
+    program = [sys.executable, mutant(ROBOT_PY, tmp_path, old, new)]
     arguments, target = at_open(broker)
     needs = [ALL["will"]] if name == "retained commands" else []
-    with switched_on([*mutant(tmp_path, old, new), *with_stop_file(arguments, tmp_path)], target) as component:
+    with switched_on([*program, *with_stop_file(arguments, tmp_path)], target) as component:
         state, text = judged(component, *needs, ALL[name])[name]
     assert (state, reason in text) == (State.FAILED, True), text
 
 
 @pytest.mark.parametrize(("name", "reason", "old", "new"), some(NAMED_VIOLATIONS, 5))
 def test_a_violation_at_level_named_is_found(tmp_path: Path, name: str, reason: str, old: str, new: str) -> None:
+    program = [sys.executable, mutant(ROBOT_PY, tmp_path, old, new)]
     with believing(tmp_path / "hall") as broker:
         arguments, target = at_named(broker, tmp_path, "mine", "ann")
-        with switched_on([*mutant(tmp_path, old, new), *with_stop_file(arguments, tmp_path)], target) as component:
+        with switched_on([*program, *with_stop_file(arguments, tmp_path)], target) as component:
             state, text = judged(component, ALL[name])[name]
     assert (state, reason in text) == (State.FAILED, True), text
 
@@ -336,9 +317,8 @@ def test_a_violation_at_level_named_is_found(tmp_path: Path, name: str, reason: 
 @pytest.mark.thorough
 def test_a_library_that_acknowledges_no_long_message_is_found(broker: Broker, tmp_path: Path) -> None:
     """The sample subscribes with QoS 0, because PubSubClient is one."""
-    text = source("robot", "cpp").read_text()
-    (tmp_path / "robot.cpp").write_text(text.replace("mqtt.subscribe(topic, 0)", "mqtt.subscribe(topic, 1)"))
-    program = sketch(tmp_path / "robot.cpp", tmp_path / "robot")
+    copy = mutant(ROBOT_PY.with_name("robot.cpp"), tmp_path, '"incoming/#").c_str(), 0)', '"incoming/#").c_str(), 1)')
+    program = sketch(copy, tmp_path / "robot")
     arguments, target = at_open(broker)
     with switched_on([*program, *with_stop_file(arguments, tmp_path)], target) as component:
         assert [*lacking(judged(component, ALL["junk"], ALL["long messages"]))] == ["long messages"]
@@ -346,7 +326,7 @@ def test_a_library_that_acknowledges_no_long_message_is_found(broker: Broker, tm
 
 @pytest.mark.thorough
 def test_a_robot_whose_disk_is_slow_passes(broker: Broker, tmp_path: Path) -> None:
-    program = mutant(tmp_path, "os.fsync(file.fileno())", "time.sleep(0.7)")
+    program = [sys.executable, mutant(ROBOT_PY, tmp_path, "os.fsync(file.fileno())", "time.sleep(0.7)")]
     arguments, target = at_open(broker)
     with switched_on([*program, *with_stop_file(arguments, tmp_path)], target) as component:
         assert lacking(judged(component, ALL["stop"], ALL["stop moving"], ALL["reset waits"])) == {}

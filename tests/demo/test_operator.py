@@ -13,10 +13,10 @@ from pebble.contract import (
     AUTONOMY_FILES,
     AUTONOMY_STATUS,
     CAPABILITIES,
+    CONTROL,
+    CONTROL_STATE,
     DRIVE,
-    DRIVING,
     ESTOP_STATE,
-    LINK,
     ONLINE,
     codec,
 )
@@ -24,33 +24,37 @@ from pebble.contract.payloads import (
     AutonomyFiles,
     AutonomyStatus,
     Capabilities,
+    ControlState,
     Drive,
-    Driver,
-    Driving,
     EstopState,
     Heartbeat,
-    LinkState,
 )
-from pebble.demo.operator import SCRIPT, TRAIL, Operator
+from pebble.demo.operator import TRAIL, Operator
 from pebble.transports import Message, MqttSettings, QoS, Transport, create
 from tests.support import Broker, until
 
 BASE = "pebble/robots/goob"
+KEY = "0badf00d"
 START_S = 5.0
 
 
 class Robot:
-    """Capabilities and heartbeats of a robot that drives, and every drive command that it receives."""
+    """Capabilities and heartbeats of a robot that drives, and every drive command that it receives.
+
+    It gives control to the operator's first request.
+    """
 
     def __init__(self, port: int) -> None:
         self.transport: Transport = create("mqtt", "goob", MqttSettings(host="127.0.0.1", port=port))
         self.transport.open()
         self.drives: list[tuple[float, Drive]] = []
+        self.asked = False
         self.scripts: list[str | None] = []
         self.transport.subscribe(DRIVE.topic(BASE), self._receive)
         self.transport.subscribe(AUTONOMY_COMMAND.topic(BASE), self._receive_script)
+        self.transport.subscribe(CONTROL.topic(BASE), self._receive_request)
         value = {
-            "drive": {"available": True, "topic": DRIVE.topic(BASE)},
+            "drive": {"available": True, "topic": DRIVE.topic(BASE), "control": True},
             "estop": {"available": True, "owners": ["m"]},
             "autonomy": {"available": True},
         }
@@ -70,14 +74,10 @@ class Robot:
     def driven_since(self, at: float) -> bool:
         return any(received > at for received, _ in list(self.drives))
 
-    def announce(self, *robots: str) -> None:
-        driven = {base: Driver(by="anna", device="phone", since=1) for base in robots}
-        payload = codec.encode(DRIVING, Driving(t=1, robots=driven))
-        self.transport.publish(DRIVING.topic("pebble/servers/hall"), payload, qos=QoS.DELIVERED)
-
-    def show_link(self) -> None:
-        link = codec.encode(LINK, LinkState(level="thin", drive_hz=4, rtt_ms=600, queue_ms=0, t=1))
-        self.transport.publish(LINK.topic(BASE), link, retain=True, qos=QoS.DELIVERED)
+    def give_control(self, holder: str, by: str) -> None:
+        state = ControlState(id=holder, by=by, key=KEY[: len(holder)])
+        topic = CONTROL_STATE.topic(BASE, owner="m")
+        self.transport.publish(topic, codec.encode(CONTROL_STATE, state), retain=True, qos=QoS.DELIVERED)
 
     def show_script(self) -> None:
         status = codec.encode(AUTONOMY_STATUS, AutonomyStatus(running=True, timestamp=1, file=self.scripts[-1] or ""))
@@ -98,6 +98,12 @@ class Robot:
     def _receive_script(self, message: Message) -> None:
         self.scripts.append(codec.decode(AUTONOMY_COMMAND, message.payload).file)
 
+    def _receive_request(self, message: Message) -> None:
+        request = codec.decode(CONTROL, message.payload)
+        if request.want == "hold" and not self.asked:
+            self.give_control(request.id, request.by)
+        self.asked = True
+
     def _receive(self, message: Message) -> None:
         self.drives.append((time.monotonic(), codec.decode(DRIVE, message.payload)))
 
@@ -113,7 +119,7 @@ def robot(broker: Broker) -> Iterator[Robot]:
 def operator(broker: Broker, robot: Robot) -> Iterator[Operator]:
     running = Operator(broker.port)
     running.connect()
-    assert until(lambda: running.ready(1), START_S)
+    assert until(lambda: running.not_ready(["goob"]) == [], START_S)
     yield running
     running.close()
 
@@ -121,31 +127,16 @@ def operator(broker: Broker, robot: Robot) -> Iterator[Operator]:
 def test_a_robot_that_a_person_has_taken_is_left_alone_until_the_step_after(robot: Robot, operator: Operator) -> None:
     operator.begin()
     assert until(lambda: robot.driven_since(0.0))
-    robot.announce(BASE)
-    assert until(lambda: operator.activity.endswith("; goob is driven by anna on phone"))
+    assert {drive.key for _, drive in robot.drives} == {KEY}
+    robot.give_control("3f2a91c0", "anna")
+    assert until(lambda: operator.activity.endswith("; goob is driven by anna"))
     taken = time.monotonic()
     assert not until(lambda: robot.driven_since(taken + 0.1), 1.0)
+    robot.give_control("", "")
     assert until(lambda: "goob" not in operator.activity, START_S)
     assert until(lambda: robot.driven_since(taken + 0.1), START_S)
-    assert operator.left_alone == {"goob"}
+    assert operator.visitors.left_alone == {"goob"}
     assert [one for one in operator.completed if one.ended > taken > one.began] == []
-
-
-def test_what_may_be_due_to_the_machine_is_repeated_but_not_for_ever(broker: Broker) -> None:
-    operator, times = Operator(broker.port), []
-    operator.until_right("x", lambda: times.append(1))
-    assert len(times) == 1
-    operator.again = frozenset({"x"})
-    operator.until_right("x", lambda: times.append(2))
-    assert times == [1, 2, 2, 2]
-
-    def is_right() -> None:
-        times.append(3)
-        operator.again = frozenset()
-
-    operator.until_right("x", is_right)
-    assert times == [1, 2, 2, 2, 3]
-    operator.close()
 
 
 def test_a_persons_stop_is_left_to_the_person(robot: Robot, operator: Operator) -> None:
@@ -166,7 +157,7 @@ def test_a_robot_that_another_program_drives_is_left_alone_as_well(
         visitor.publish(DRIVE.topic(BASE), b'{"x": 0, "z": 0.3}', qos=QoS.DELIVERED)
     assert until(lambda: operator.activity.endswith("; goob is driven by another program"))
     taken = time.monotonic()
-    assert until(lambda: operator.left_alone == {"goob"})
+    assert until(lambda: operator.visitors.left_alone == {"goob"})
     assert until(lambda: robot.driven_since(taken + 0.1), 2 * START_S)
     assert [one for one in operator.completed if one.ended > taken > one.began] == []
 
@@ -178,15 +169,3 @@ def test_a_robot_with_scripts_draws_its_trail_from_the_first_drive_on(robot: Rob
     robot.show_script()
     assert until(lambda: len(robot.scripts) > 1, 30.0)
     assert robot.scripts[:2] == [TRAIL, None], "it is ended before the emergency stop, which would make it fail"
-
-
-def test_over_a_thin_link_it_drives_at_the_pace_that_the_robot_asks_for(robot: Robot, operator: Operator) -> None:
-    robot.show_link()
-    assert until(lambda: operator.discovery.robots[BASE].link is not None, START_S)
-    operator.begin()
-    assert until(lambda: any(not drive.moves for _, drive in robot.drives), START_S)
-    moving = [drive for _, drive in robot.drives if drive.moves]
-    assert 2 <= len(moving) <= SCRIPT[0].drive_s * 4 + 2
-    assert {(drive.valid_ms, isinstance(drive.t, int), isinstance(drive.key, str)) for drive in moving} == {
-        (750, True, True)
-    }

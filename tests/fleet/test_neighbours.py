@@ -27,7 +27,7 @@ from pebble.fleet.roles import Account, rules
 from pebble.transports import Message, QoS, TlsSettings, Transport, ZenohSettings, create
 from pebble.transports.topics import matches
 from tests.robot.rig import STOP, Rig
-from tests.support import Child, beside, cases, free_port, until
+from tests.support import ROOT, Child, beside, cases, free_port, until
 from tests.tcp_proxy import TcpProxy
 from tests.transports.zenoh_net import HubProcess
 
@@ -142,10 +142,13 @@ class Hall:
         path = self.folder / "lead.py"
         path.write_text(LEAD)
         began = time.monotonic()
-        script = Child([sys.executable, str(path), "--config", str(self.goob.config)])
+        self.start(self.goob, path, stack)
+        assert until(lambda: self.by_goob(began), 20), self.fred.log.read_text()[-3000:]
+
+    def start(self, robot: Rig, path: Path, stack: ExitStack) -> None:
+        script = Child([sys.executable, str(path), "--config", str(robot.config)])
         stack.callback(script.wait, 10)
         stack.callback(script.terminate)
-        assert until(lambda: self.by_goob(began), 20), self.fred.log.read_text()[-3000:]
 
     def by_goob(self, since: float) -> list[float]:
         return [at for at, wheels in self.fred.mcu.drives(since) if wheels == BY_GOOB]
@@ -392,3 +395,22 @@ def test_after_a_fault_nothing_comes_twice_late_or_out_of_order(hall: Hall, stac
     sys.stdout.write(f"\nLAN, {fault}: {json.dumps({**figures, **stream.wrong()})}\n")
     assert stream.wrong() == dict.fromkeys(stream.wrong(), 0)
     assert stop <= 1.0
+
+
+@pytest.mark.thorough
+@pytest.mark.alone
+def test_goob_follows_fred_while_their_brokers_are_down(hall: Hall, stack: ExitStack) -> None:
+    hall.rests()
+    for robot, name in ((hall.fred, "wheel-odometry"), (hall.goob, "wheel-odometry"), (hall.goob, "follow")):
+        hall.start(robot, ROOT / "pebble" / "scripts" / name / "run.py", stack)
+    for robot in (hall.fred, hall.goob):
+        robot.remote.kill()
+        stack.callback(robot.remote.start)
+    began = time.monotonic()
+
+    def fred_drives_and_goob_follows() -> bool:
+        hall.local.publish(DRIVE.topic(FRED), codec.encode(DRIVE, Drive(z=0.4)), qos=QoS.DELIVERED)
+        return any(min(wheels) > 0 for _, wheels in hall.goob.mcu.motors(began))
+
+    assert until(fred_drives_and_goob_follows, 20), hall.goob.log.read_text()[-3000:]
+    assert until(lambda: not hall.goob.mcu.turning(), 20), "fred stands, and goob has caught up"

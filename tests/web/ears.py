@@ -18,11 +18,11 @@ import numpy.typing as npt
 from websockets.sync.client import connect
 from websockets.typing import Origin
 
-from pebble.demo.media_assessment import best_match, envelope
 from pebble.media.pcm import Resampler
 from pebble.media.speech import PERIOD_S, Speech
 from pebble.rig.testbed import LinuxRobot
 from pebble.simulation.loudspeaker import playbacks
+from tests.kit.sound import best_match, envelope
 from tests.web.browser import Tab
 from tests.web.media.robots import REF
 from tests.web.stage import Stage

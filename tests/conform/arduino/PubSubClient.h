@@ -14,7 +14,6 @@ public:
     bool setBufferSize(uint16_t size) { return buffer_.resize(size), true; }
     bool connected() { return up_ && client_->connected(); }
 
-    bool connect(const char *id, const char *user, const char *password) { return connect(id, user, password, nullptr, 0, false, nullptr); }
     bool connect(const char *id, const char *user, const char *password, const char *will, uint8_t qos, bool retain, const char *message) {
         up_ = false;
         if (!client_->connect(host_, port_)) return false;

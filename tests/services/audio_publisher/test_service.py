@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 
 from pebble.contract.payloads import MediaReport
-from pebble.demo.media_assessment import best_match, envelope
 from pebble.media.sound import ReceivedSound
 from pebble.media.speech import PERIOD_S, Speech
+from tests.kit.sound import best_match, envelope
 from tests.services.audio_rig import Ear, Mouth, Program
 from tests.support import Broker, until
 from tests.tcp_proxy import SlowTcpProxy

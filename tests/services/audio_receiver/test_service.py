@@ -18,7 +18,6 @@ import pytest
 
 from pebble.config import parse
 from pebble.contract.packets import Codec, Sound
-from pebble.demo.media_assessment import best_match, envelope
 from pebble.media.pcm import to_bytes
 from pebble.media.sound import make_sound_encoder, sequence_numbers
 from pebble.media.speech import Speech
@@ -27,6 +26,7 @@ from pebble.services.audio_receiver.service import AudioReceiver
 from pebble.transports import QoS, Subscription
 from pebble.transports.memory import MemoryHub, MemoryTransport
 from tests.kit.robot import Running
+from tests.kit.sound import best_match, envelope
 from tests.services.audio_rig import RECORDER, Program
 from tests.services.media_rig import BASE, client
 from tests.support import Broker, until

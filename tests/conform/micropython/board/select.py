@@ -1,6 +1,4 @@
-"""MicroPython's select, as far as the samples use it: one poll is for a socket or for the console."""
-
-import sys
+"""MicroPython's select, as far as the sample uses it: for one socket."""
 
 import host
 
@@ -8,8 +6,8 @@ POLLIN = 1
 
 
 class poll:  # noqa: N801 - its name in MicroPython
-    def register(self, stream, events):
-        self._ready = host.typed if stream is sys.stdin else host.wait
+    def register(self, socket, events):
+        pass
 
     def poll(self, ms):
-        return [(None, POLLIN)] if self._ready(ms) else []
+        return [(None, POLLIN)] if host.wait(ms) else []

@@ -1,4 +1,4 @@
-"""MicroPython's socket, as far as the samples use it: it is connected as soon as it is to wait no more."""
+"""MicroPython's socket, as far as the sample uses it: it is connected as soon as it is to wait no more."""
 
 import binascii
 

@@ -1,4 +1,4 @@
-"""MicroPython's tls, as far as the samples use it."""
+"""MicroPython's tls, as far as the sample uses it."""
 
 PROTOCOL_TLS_CLIENT, CERT_REQUIRED = 0, 2
 

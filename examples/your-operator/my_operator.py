@@ -1,0 +1,120 @@
+"""Drives a robot by the lines that a person types. It needs paho-mqtt, and the modules beside it.
+
+    python my_operator.py ID HOST PORT [USER PASSWORD_FILE CA_FILE]
+
+"0 0.5" steers by 0 and drives at 0.5 until the next line, "0 0" lets go, "stop" and "reset" are the emergency stop.
+With a user, commands carry this name. (A file called operator.py would hide a module of Python.)
+"""
+
+import json
+import queue
+import secrets
+import sys
+import threading
+import time
+from contextlib import suppress
+from pathlib import Path
+
+import paho.mqtt.client as mqtt
+from driver import Driver
+from robot_state import METRICS, RobotState
+
+ID, HOST, PORT, *LOGIN = sys.argv[1:]
+NAME = LOGIN[0] if LOGIN else "sample"
+BASE = f"pebble/robots/{ID}"
+PLAIN = f"{BASE}/incoming/"
+INCOMING = f"{PLAIN}by/{NAME}/" if LOGIN else PLAIN
+STEP_S = 0.01
+KEEPALIVE_S = 5
+RETRY_S = 0.2
+REPEATS_S = 0.5
+GIVES_UP_S = 60.0
+
+
+class StopSender:
+    """An emergency stop, repeated until each owner of motors has confirmed it."""
+
+    def __init__(self):
+        self.stop = {"stop": secrets.token_hex(8), "by": NAME}
+        self.due_at = time.monotonic()
+        self.ends_at = self.due_at + GIVES_UP_S
+
+    def is_over(self):
+        return robot.has_stop(self.stop["stop"]) or time.monotonic() > self.ends_at
+
+    def step(self):
+        if time.monotonic() >= self.due_at:
+            self.due_at = time.monotonic() + REPEATS_S
+            for base in {PLAIN, INCOMING}:  # a stop counts without a name as well
+                client.publish(base + "estop", json.dumps(self.stop), qos=1)
+
+
+def send(metric, value, qos):
+    """Publish a command, never retained: it would be carried out at every start of the robot."""
+    client.publish(INCOMING + metric, json.dumps(value), qos)
+
+
+def reset():
+    """End the stops that are shown now, and no later one."""
+    for state in robot.stops.values():
+        send("estop-reset", {"boot": state.get("boot"), "count": state.get("count")}, 1)
+
+
+def on_connect(_client, _data, _flags, _reason, _properties):
+    client.subscribe([(f"{BASE}/outgoing/{metric}", 1) for metric in METRICS])
+
+
+def on_message(_client, _data, message):
+    robot.receive(message.topic.removeprefix(f"{BASE}/outgoing/"), message.payload, message.retain)
+
+
+def read_lines():
+    for line in sys.stdin:
+        lines.put(line.strip())
+    lines.put(None)
+
+
+robot = RobotState()
+driver = Driver(robot, NAME, send)
+stop = None
+lines = queue.SimpleQueue()
+client = mqtt.Client(mqtt.CallbackAPIVersion.VERSION2)
+client.on_connect = on_connect
+client.on_message = on_message
+if LOGIN:
+    _, password_file, ca_file = LOGIN
+    client.username_pw_set(NAME, Path(password_file).read_text().strip())
+    client.tls_set(ca_file)
+client.connect_async(HOST, int(PORT), KEEPALIVE_S)
+threading.Thread(target=read_lines, daemon=True).start()
+
+typed = ""
+while typed is not None:
+    if client.loop(STEP_S) != mqtt.MQTT_ERR_SUCCESS:  # not connected
+        robot.disconnect()
+        time.sleep(RETRY_S)
+        with suppress(OSError):  # no network, or no broker: it tries again
+            client.reconnect()
+    typed = "" if lines.empty() else lines.get()
+    if typed == "stop":
+        stop = StopSender()
+    elif typed == "reset":
+        reset()
+    elif typed:
+        try:
+            x, z = typed.split()
+            driver.push(float(x), float(z))
+        except ValueError:
+            print("type two numbers, stop or reset", flush=True)
+            driver.push(0.0, 0.0)
+    if stop and stop.is_over():
+        print("the robot is stopped" if robot.is_stopped() else "no robot confirms the stop", flush=True)
+        stop = None
+    if stop:
+        stop.step()
+    driver.step(is_stopping=stop is not None)
+
+driver.push(0.0, 0.0)
+driver.release()
+for _ in range(30):
+    client.loop(STEP_S)

@@ -1,0 +1,76 @@
+"""What an operator knows of a robot, by the messages that it publishes."""
+
+import json
+import math
+import time
+
+METRICS = ("online", "capabilities", "link", "estop/+", "control/+")
+SILENT_S = {"wide": 1.5, "narrow": 3.0, "thin": 5.0}  # without a heartbeat, by the level of the link
+WIDE = {"level": "wide", "drive_hz": 20}
+
+
+class RobotState:
+    """One robot."""
+
+    def __init__(self):
+        self.capabilities = {}
+        self.link = WIDE  # what the way to the robot carries
+        self.stops = {}  # the state of the emergency stop, by the name of each owner of motors
+        self.controls = {}  # who has control, by the same
+        self.is_offline = True
+        self.heartbeat_at = -math.inf
+
+    def disconnect(self):
+        self.is_offline = True
+        self.controls = {}
+
+    def receive(self, metric, payload, retained):
+        """Take one message below outgoing/; one that cannot be read changes nothing."""
+        try:
+            self.take(metric, json.loads(payload) if payload else {}, retained)
+        except (ValueError, TypeError, KeyError, AttributeError, RecursionError):
+            print("cannot be read:", metric, payload[:80], flush=True)
+
+    def take(self, metric, value, retained):
+        name, _, owner = metric.partition("/")
+        if name == "online" and not retained:  # a retained heartbeat is no sign of life
+            self.heartbeat_at = time.monotonic()
+            self.is_offline = value.get("online") is False
+        elif name == "capabilities":
+            self.capabilities = dict(value["value"])
+        elif name == "link":
+            self.link = {"level": str(value["level"]), "drive_hz": float(value["drive_hz"])} if value else WIDE
+        elif name == "estop":
+            self.stops[owner] = dict(value)
+        elif name == "control":
+            self.controls[owner] = dict(value)
+            if value.get("asks"):
+                print(value["asks"], "asks for control", flush=True)
+
+    def is_wide(self):
+        return self.link["level"] == "wide"
+
+    def is_silent(self):
+        limit_s = SILENT_S.get(self.link["level"], SILENT_S["wide"])
+        return self.is_offline or time.monotonic() > self.heartbeat_at + limit_s
+
+    def is_stopped(self):
+        return any(stop.get("latched") is not False for stop in self.stops.values())
+
+    def has_stop(self, name):
+        """True if each owner of motors tells that it has the emergency stop of this name."""
+        owners = (self.capabilities.get("estop") or {}).get("owners") or list(self.stops)
+        confirmed = [name in self.stops.get(owner, {}).get("recent", ()) for owner in owners]
+        return bool(confirmed) and all(confirmed)
+
+    def gives_control(self):
+        """True if it moves for the client that has control only."""
+        return (self.capabilities.get("drive") or {}).get("control") is True
+
+    def key(self, own_id):
+        """Return the keys of all owners that gave control to this id; "" if the first by name did not, who decides."""
+        keys = [
+            str(control.get("key") or "") if control.get("id") == own_id else ""
+            for _, control in sorted(self.controls.items())
+        ]
+        return " ".join(filter(None, keys)) if keys and keys[0] else ""
