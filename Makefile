@@ -23,12 +23,12 @@ help:
 
 # The options are checked before the set-up, which takes a minute; the shortest is that of pebble.demo.main, rounded up.
 demo:
-	@test -n "$(FLEET)" || awk 'BEGIN { exit ARGV[1] + 0 < 26 }' "$(or $(SECONDS),26)" || \
+	@awk 'BEGIN { exit ARGV[1] + 0 < 26 }' "$(or $(SECONDS),26)" || \
 		{ echo "make demo: one round of driving takes 26 s: give it at least that many, make demo SECONDS=30" >&2; exit 2; }
 	@test -z "$(PHONE)" || test -t 1 || \
 		{ echo "make demo: PHONE=1 prints a password, to a terminal only: start it in one, without a pipe" >&2; exit 2; }
 	@$(MAKE) --no-print-directory .venv/.ready-demo
-	@$(VENV) -m pebble.cli demo $(if $(SECONDS),--seconds $(SECONDS)) $(if $(PHONE),--phone) $(if $(FLEET),--fleet)
+	@$(VENV) -m pebble.cli demo $(if $(SECONDS),--seconds $(SECONDS)) $(if $(PHONE),--phone)
 
 # Types and lint use what tests leave of the processors.
 QUICKLY := --workers 4 -m "not page and not thorough and not alone" tests/contract tests/forwarding tests/motion \
@@ -37,8 +37,7 @@ WHOLE := --workers 8 --durations 10 -m "not page$(if $(THOROUGH),, and not thoro
 test: .venv/.ready-dev
 	@$(DEBIAN) mosquitto=mosquitto mosquitto_pub=mosquitto-clients chromium=chromium g++=g++ openssl=openssl \
 		ip=iproute2 tc=iproute2 nft=nftables systemd-analyze=systemd
-	@test -e /usr/include/mosquitto.h -a -e /usr/include/cjson/cJSON.h || \
-		$(DEBIAN) =gcc =libc6-dev =libmosquitto-dev =libcjson-dev
+	@test -e /usr/include/cjson/cJSON.h || $(DEBIAN) =libcjson-dev
 	@chrt --idle 0 $(MAKE) --no-print-directory check >.venv/checks.log 2>&1 & checks=$$!; \
 	$(if $(THOROUGH),PEBBLE_THOROUGH=1) $(VENV) -m pytest $(if $(QUICK),$(QUICKLY),$(WHOLE)); tests=$$?; \
 	wait $$checks || { cat .venv/checks.log; exit 1; }; \
@@ -58,7 +57,7 @@ long: .venv/.ready-dev
 # Comparisons whose packages cannot be installed are left out, and the report says so; only a broker is required.
 report: .venv/.ready-dev
 	@$(DEBIAN) mosquitto=mosquitto
-	@$(DEBIAN) ip=iproute2 tc=iproute2 nft=nftables || echo "pebble: without them pebble impair fails"
+	@$(DEBIAN) ip=iproute2 tc=iproute2 nft=nftables || echo "pebble: without them pebble bench impair fails"
 	@$(VENV) -c "import sys; from pebble.bench.frames import missing; sys.exit(missing('gstreamer-shm') is not None)" || \
 		$(DEBIAN) =gstreamer1.0-plugins-base =gstreamer1.0-plugins-bad =gir1.2-gst-plugins-base-1.0 \
 		=python3-gst-1.0 =python3-numpy || echo "pebble: continuing without GStreamer"
