@@ -14,7 +14,7 @@ from typing import Final
 from rich.console import Console
 
 from pebble.bench.results import STAND_IN, Results, Value, check_folder, load, named
-from pebble.bench.show import RATIOS, compared, middle
+from pebble.bench.show import RATIOS, compared, digits, middle
 from pebble.errors import PebbleError
 from pebble.rig.processes import Program, end_all, python
 from pebble.runtime.signals import interrupted_by_signals
@@ -176,8 +176,10 @@ def _headlines(measured: Mapping[str, Results]) -> Iterator[str]:
         if results is None:
             continue
         cells = [results.find(variant, headline.measure, **headline.params) for variant in headline.variants]
+        if not any(cells):
+            continue
         shown = [
-            middle(one) if not headline.figure or one is None else f"{one.middle(headline.figure):.1f}" for one in cells
+            middle(one) if not headline.figure or one is None else digits(one.middle(headline.figure)) for one in cells
         ]
         _, mqtt, zenoh = cells
         unit = "%" if headline.figure else next((one.unit for one in cells if one), "")

@@ -65,11 +65,6 @@ class Program:
             self._reader.start()
 
     @property
-    def is_read(self) -> bool:
-        """Whether ``each`` still gets lines: the program has not closed its output, and no line was an error."""
-        return self._reader.is_alive()
-
-    @property
     def code(self) -> int | None:
         """Its exit code, once it has ended."""
         return self._process.poll()
@@ -264,10 +259,6 @@ class Processes:
         """A worker that is not a module."""
         self.workers.append(self.add(Worker(name, command, self.folder / f"{name}.log"), OPERATORS))
         return self.workers[-1]
-
-    def robot(self, name: str, module: str, *arguments: object) -> Program:
-        """One or more robots."""
-        return self.add(Program(name, python(module, *arguments), self.folder / f"{name}.log"), ROBOTS)
 
     def broker(self, name: str = "broker", folder: Path | None = None, **more: Any) -> Broker:
         """A broker that is starting: wait for it."""
