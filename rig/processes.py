@@ -60,9 +60,8 @@ class Program:
                 start_new_session=True,
             )
         self.pid = self._process.pid
-        self._reader = threading.Thread(target=self._read, args=(each,), name=f"output of {name}", daemon=True)
         if each is not None:
-            self._reader.start()
+            threading.Thread(target=self._read, args=(each,), name=f"output of {name}", daemon=True).start()
 
     @property
     def code(self) -> int | None:
