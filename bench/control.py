@@ -33,7 +33,6 @@ NONE, MEDIA, HOG = LOADS = ("none", "media", "hog")
 ONE_WAY, ROUND_TRIP = "one-way", "round trip"
 BASELINE: Final = "mqtt"
 _LOADED_RATES = 2  # the first ones
-_PASSES = 2  # of each condition in a round
 _READY_S = 40.0
 _ANSWER_S = 30.0  # in addition to the slice itself
 
@@ -59,7 +58,7 @@ VARIANTS: Final = {
 
 @dataclass(frozen=True, slots=True)
 class Settings:
-    """What is measured, and for how long: ``seconds`` of each condition in each pass."""
+    """What is measured: ``seconds`` of each condition in each of the ``passes`` of a round."""
 
     variants: Sequence[str] = tuple(VARIANTS)
     sizes: Sequence[int] = (40, 1024)  # bytes
@@ -67,10 +66,11 @@ class Settings:
     loads: Sequence[str] = LOADS
     seconds: float = 0.35
     rounds: int = 10
+    passes: int = 2
 
 
 FULL: Final = Settings()
-QUICK: Final = Settings(sizes=(40,), rates=(200,), loads=(NONE, MEDIA), seconds=0.3, rounds=4)
+QUICK: Final = Settings(sizes=(40,), rates=(200,), loads=(NONE, MEDIA), seconds=0.3, rounds=3, passes=1)
 
 
 def run(settings: Settings, console: Console) -> Shown:
@@ -111,7 +111,7 @@ def spec_of(condition: Params, seconds: float) -> SliceSpec:
 def measure(settings: Settings, number: int, progress: Progress) -> Iterator[Cell]:
     """Measure one round; in every other pass backwards."""
     with Participants(settings.variants) as participants:
-        for pass_ in range(_PASSES):
+        for pass_ in range(settings.passes):
             for condition in in_turn(conditions(settings), number + pass_):
                 for variant in in_turn(settings.variants, number + pass_):
                     progress(f"{variant}, {', '.join(map(str, condition.values()))}")

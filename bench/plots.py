@@ -9,11 +9,12 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+from statistics import median
 from typing import TYPE_CHECKING, Any
 
 from pebble.bench.results import STAND_IN, Cell, grouped, named, percentile
 from pebble.bench.rounds import Interval, ratio
-from pebble.bench.show import Picture, digits
+from pebble.bench.show import Picture, digits, middle
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -77,9 +78,9 @@ def medians(
 ) -> list[Picture]:
     """Return bars to the medians, with lines between the fastest and the slowest round."""
     bars = [
-        Bar(panel(cell), row(cell), cell.variant, p50, (min(rounds), max(rounds)), f"  {digits(p50)}")
+        Bar(panel(cell), row(cell), cell.variant, median(rounds), (min(rounds), max(rounds)), f"  {middle(cell)}")
         for cell in cells
-        for p50, rounds in [(cell.percentile(50), cell.medians())]
+        for rounds in [cell.medians()]
         if rounds
     ]
     caption = f"{caption}: medians, with lines from the lowest to the highest round"
@@ -93,7 +94,7 @@ def ratios(name: str, caption: str, cells: Sequence[Cell], baseline: str) -> lis
     pairs = [(cell, base.get((cell.measure, cell.conditions()))) for cell in cells if cell.variant != baseline]
     judged = [(cell, ratio(cell, theirs)) for cell, theirs in pairs if theirs is not None]
     bars = [_ratio_bar(cell, interval) for cell, interval in judged if math.isfinite(interval.ratio)]
-    caption = f"{caption}: median as a ratio to {baseline}'s, with its interval of 99 %"
+    caption = f"{caption}: median as a ratio to {baseline}'s, from 8 rounds on with its interval of 99 %"
     return [Picture(name, caption, partial(_bars, bars, caption, "ratio", is_ratio=True))] if bars else []
 
 
@@ -122,7 +123,7 @@ def _bars(bars: Sequence[Bar], title: str, label: str, *, is_ratio: bool = False
         axes.grid(visible=False, axis="y")
         ends = [value for bar in some for value in (bar.end, *bar.line)]
         if is_ratio:
-            low, high = max(0.02, 0.93 * min(0.95, *ends)), min(50.0, 1.07 * max(1.25, *ends))
+            low, high = max(0.005, 0.93 * min(0.95, *ends)), min(50.0, 1.07 * max(1.25, *ends))
             log_axis(axes, "x", f"{label}; left of 1 is faster", low, high)
             axes.axvline(1.0, color=_DARK, linewidth=0.9)
         else:

@@ -7,6 +7,7 @@ import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
+from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Final
@@ -14,7 +15,7 @@ from typing import Final
 from rich.console import Console
 
 from pebble.bench.results import STAND_IN, Results, Value, check_folder, load, named
-from pebble.bench.show import RATIOS, compared, middle
+from pebble.bench.show import RATIOS, compared, digits, middle
 from pebble.errors import PebbleError
 from pebble.rig.processes import Program, end_all, python
 from pebble.runtime.signals import interrupted_by_signals
@@ -38,8 +39,10 @@ class Section:
     full_s: int
     quick_s: int
     options: Sequence[str] = ()  # of the full run
+    needs_root: bool = False
 
 
+_MODULES: Final = {"impair": "impair.trials"}  # that are not in the module of their name
 SECTIONS: Final = (
     Section("control", "Service to service", 700, 40),
     Section("bridge", "Operator to wheels, and back", 2100, 22, ("--with-media",)),
@@ -48,7 +51,7 @@ SECTIONS: Final = (
     Section("frames", "Camera frames inside the robot", 350, 20),
     Section("scale", "Many boards", 240, 40),
     Section("traffic", "Traffic of robots, as in the paper", 140, 19),
-    Section("impair", "On an impaired network", 1000, 85),  # needs root
+    Section("impair", "On an impaired network", 1000, 85, needs_root=True),
 )
 
 
@@ -92,20 +95,11 @@ def run(names: Sequence[str], folder: Path, *, quick: bool, console: Console) ->
 
     Without names all that this user may run. Raises PebbleError if the folder cannot be written.
     """
-    if find_spec("matplotlib") is None:
-        raise PebbleError("a report needs matplotlib, which is not installed: pip install 'pebble-robot[bench]'")
-    check_folder(folder)
-    path, failed = folder / NAME, 0
-    if path.exists() and not path.read_text(errors="replace").startswith(_HEADING):
-        raise PebbleError(f"{path} is not a report of pebble bench and would be overwritten: name another folder")
-    chosen = [one for one in SECTIONS if one.name in names or not names]
-    if os.geteuid() and not names:
-        console.print("impair needs root, and is left out")
-        chosen = [one for one in chosen if one.name != "impair"]
-    console.print(f"{len(chosen)} comparisons: about {_span(sum(_expected_s(one, quick) for one in chosen))}")
+    path, sections, failed = _checked(folder), _chosen(names), 0
+    console.print(f"{len(sections)} comparisons: about {_span(sum(_expected_s(one, quick) for one in sections))}")
     try:
         with interrupted_by_signals():
-            for section in chosen:
+            for section in sections:
                 began = time.monotonic()
                 with console.status(f"{section.name}, about {_expected_s(section, quick)} s"):
                     problem = run_one(section, folder, quick)
@@ -117,6 +111,22 @@ def run(names: Sequence[str], folder: Path, *, quick: bool, console: Console) ->
             path.write_text(text(folder))
         console.print(f"Written: {path}", soft_wrap=True)
     return 1 if failed else 0
+
+
+def _checked(folder: Path) -> Path:
+    """Return the page's path. Raises PebbleError, before an hour of measuring, if it cannot or must not be written."""
+    if find_spec("matplotlib") is None:
+        raise PebbleError("a report needs matplotlib, which is not installed: pip install 'pebble-robot[bench]'")
+    check_folder(folder)
+    path = folder / NAME
+    if path.exists() and not path.read_text(errors="replace").startswith(_HEADING):
+        raise PebbleError(f"{path} is not a report of pebble bench and would be overwritten: name another folder")
+    return path
+
+
+def _chosen(names: Sequence[str]) -> list[Section]:
+    """Return the sections of these names; without names all that this user may run."""
+    return [one for one in SECTIONS if one.name in names or (not names and not (one.needs_root and os.geteuid()))]
 
 
 def run_one(section: Section, folder: Path, quick: bool) -> str:
@@ -176,8 +186,10 @@ def _headlines(measured: Mapping[str, Results]) -> Iterator[str]:
         if results is None:
             continue
         cells = [results.find(variant, headline.measure, **headline.params) for variant in headline.variants]
+        if not any(cells):
+            continue
         shown = [
-            middle(one) if not headline.figure or one is None else f"{one.middle(headline.figure):.1f}" for one in cells
+            middle(one) if not headline.figure or one is None else digits(one.middle(headline.figure)) for one in cells
         ]
         _, mqtt, zenoh = cells
         unit = "%" if headline.figure else next((one.unit for one in cells if one), "")
@@ -193,6 +205,7 @@ def _section(section: Section, folder: Path, results: Results | None) -> Iterato
         return
     lines = output.read_text(errors="replace").rstrip().splitlines()
     yield f"## {section.title}"
+    yield (import_module(f"pebble.bench.{_MODULES.get(section.name, section.name)}").__doc__ or "").strip()
     if results is None:
         yield "**It failed, and left no results.**"
     else:

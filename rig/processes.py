@@ -60,14 +60,8 @@ class Program:
                 start_new_session=True,
             )
         self.pid = self._process.pid
-        self._reader = threading.Thread(target=self._read, args=(each,), name=f"output of {name}", daemon=True)
         if each is not None:
-            self._reader.start()
-
-    @property
-    def is_read(self) -> bool:
-        """Whether ``each`` still gets lines: the program has not closed its output, and no line was an error."""
-        return self._reader.is_alive()
+            threading.Thread(target=self._read, args=(each,), name=f"output of {name}", daemon=True).start()
 
     @property
     def code(self) -> int | None:
@@ -264,10 +258,6 @@ class Processes:
         """A worker that is not a module."""
         self.workers.append(self.add(Worker(name, command, self.folder / f"{name}.log"), OPERATORS))
         return self.workers[-1]
-
-    def robot(self, name: str, module: str, *arguments: object) -> Program:
-        """One or more robots."""
-        return self.add(Program(name, python(module, *arguments), self.folder / f"{name}.log"), ROBOTS)
 
     def broker(self, name: str = "broker", folder: Path | None = None, **more: Any) -> Broker:
         """A broker that is starting: wait for it."""

@@ -82,8 +82,7 @@ class Robot(SimulatedRobot):
 
     It connects to a broker for operators at ``remote``, host and port. ``services``: fields of its services' configs
     besides these connections; one that is named is enabled. ``reports``: whether every report of its MCU is recorded
-    and forwarded, 50 a second. ``wrap`` extends the commands of all processes that use the network. ``more``: other
-    sections of its config.
+    and forwarded, 50 a second. ``wrap`` extends the commands of all processes that use the network.
     """
 
     def __init__(
@@ -97,7 +96,6 @@ class Robot(SimulatedRobot):
         services: Mapping[str, Config] | None = None,
         reports: bool | None = False,
         wrap: Wrap = unchanged,
-        more: Config | None = None,
     ) -> None:
         super().__init__(running, name, folder or running.folder)
         self.kind = kind
@@ -110,7 +108,7 @@ class Robot(SimulatedRobot):
         self._started: list[Program] = []
         motors = {"serial": {"baud": 460_800}, "telemetry": {"publish_touch_sensors": reports}}
         self._services: dict[str, Config] = {"mqtt_bridge": {}, "serial_mcu_bridge": motors, **(services or {})}
-        self._own: Config = {"robot": {"id": name}, "transport": {"kind": kind}, **(more or {})}
+        self._own: Config = {"robot": {"id": name}, "transport": {"kind": kind}}
 
     def prepare(self, ending: threading.Event | None = None) -> None:
         """Starts what the robot needs and writes its config, or waits no longer once ``ending`` is set.

@@ -68,7 +68,6 @@ class Traffic:
 
     bytes_up: int = 0
     dropped_up: int = 0
-    bytes_down: int = 0
 
 
 class NamespaceNetwork(Worker):
@@ -107,7 +106,7 @@ class NamespaceNetwork(Worker):
     def traffic(self) -> Traffic:
         """The kernel counts, and the process what it dropped itself."""
         dropped = self._request("")["dropped_up"] + self._robot.dropped() + self._remote.lost()
-        return Traffic(self._robot.sent_bytes(), dropped, self._remote.sent_bytes())
+        return Traffic(self._robot.sent_bytes(), dropped)
 
     def _request(self, line: str) -> dict[str, Any]:
         """Sends a line and returns the answer. A timeout ends the process: its late answer would be misread."""

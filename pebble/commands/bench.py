@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
     from pebble.bench.show import Shown
 
-FOLDER = Path("bench-results")
+FOLDER, REPORT = Path("bench-results"), Path("build/report")
 _LONGEST_S = 3600.0  # of one phase
 
 Variants = Annotated[str | None, typer.Option(help="Some of them, separated by commas.", metavar="NAMES")]
@@ -36,7 +36,7 @@ app = typer.Typer(
 \b
     pebble bench frames
     pebble bench impair --quick
-    pebble bench report build/report
+    pebble bench report
 """,
 )
 
@@ -219,7 +219,9 @@ def impair(
 
 @app.command()
 def report(
-    folder: Annotated[Path, typer.Argument(help="Folder for results, pictures and README.md.", metavar="FOLDER")],
+    folder: Annotated[
+        Path, typer.Argument(help="Folder for results, pictures and README.md.", metavar="FOLDER")
+    ] = REPORT,
     quick: Quick = False,
     only: Annotated[str | None, typer.Option(help="Some of them, separated by commas.", metavar="NAMES")] = None,
 ) -> int:

@@ -56,7 +56,8 @@ def test_a_section_has_its_command_its_pictures_and_its_tables_once(tmp_path: Pa
     with (tmp_path / "control.txt").open("w") as output:
         finish(shown, tmp_path, Console(file=output, width=120))
     page = text(tmp_path)
-    assert "## Service to service\n\n    pebble bench control\n\nStarted 2026-11-20 14:00 UTC, 61 s.\n" in page
+    assert "## Service to service\n\nMeasures the latency of messages between two services" in page
+    assert "\n    pebble bench control\n\nStarted 2026-11-20 14:00 UTC, 61 s.\n" in page
     links = re.findall(r"!\[[^]]+\]\(([^)]+)\)", page)
     assert links == ["control-one-way.png", "control-ratios.png"]
     assert all((tmp_path / link).exists() for link in links)

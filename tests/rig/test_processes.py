@@ -51,15 +51,13 @@ def test_operators_end_first_and_brokers_last(tmp_path: Path) -> None:
     assert not processes.folder.exists()
 
 
-def test_each_line_that_a_program_writes_is_read_until_its_output_ends(tmp_path: Path) -> None:
+def test_each_line_that_a_program_writes_is_read(tmp_path: Path) -> None:
     lines: list[bytes] = []
     with Processes() as processes:
         command = ["sh", "-c", "echo one; echo two; exec sleep 60"]
         program = Program("lines", command, tmp_path / "log", each=lines.append)
         processes.add(program, OPERATORS)
         assert until(lambda: lines == [b"one\n", b"two\n"])
-        assert program.is_read
-    assert until(lambda: not program.is_read)
 
 
 def test_one_that_ended_by_itself_is_named_and_one_that_was_ended_is_not(tmp_path: Path) -> None:
