@@ -120,6 +120,7 @@ class MediaViewer:
         for media in self.received.values():
             with suppress(PebbleError):  # then nothing arrives
                 media.ask("video", video)
+            with suppress(PebbleError):
                 media.ask("audio", audio)
         for _ in range(round(TURN_S / _STEP_S)):
             for media in self.received.values():
