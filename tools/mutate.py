@@ -77,6 +77,8 @@ def mutants(file: str, text: bytes) -> Iterator[Mutant]:
 def replacements(node: Any) -> Iterator[tuple[str, Any, ast.AST]]:
     """Yield the changes of this node, each once: the operator, the part that goes, and the one that comes."""
     match node:
+        case ast.If(test=ast.Name(id="TYPE_CHECKING")):
+            return
         case ast.Compare():
             for at, compared in enumerate(node.ops):
                 ops = [*node.ops[:at], SWAPPED[type(compared)](), *node.ops[at + 1 :]]
@@ -239,10 +241,9 @@ class Trial:
 
     def attempt(self, record: dict[str, Any], reached_by: set[tuple[str, int]], text: bytes) -> dict[str, Any]:
         """Run rows with a mutant; write and return the result."""
-        start, names, file = time.monotonic(), list(self.rows), record["file"]
+        start, file = time.monotonic(), record["file"]
         swaps = [] if reached_by & self.imported else self.swaps(file, text)
-        if swaps:
-            names = [name for name in names if reached_by & self.lines[name]]
+        names = [name for name in self.rows if not swaps or reached_by & self.lines[name]]
         seconds = sum(self.rows[name][0] for name in names)
         seconds += sum(self.slowest[path] for path in {self.items[name].path for name in names})
         self.failed.write_text("")
@@ -306,8 +307,7 @@ def compare(before: Iterable[str], after: Iterable[str]) -> int:
 
 def spare(results: Iterable[Iterable[str]]) -> int:
     """Print test functions that can go together: others have each of their arcs and kill all that they kill."""
-    killers = [json.loads(line)["killers"] for lines in results for line in lines]
-    needs = [{name.partition("[")[0] for name in names} for names in killers]
+    needs = [{name.partition("[")[0] for name in json.loads(line)["killers"]} for lines in results for line in lines]
     counts = Counter(itertools.chain.from_iterable(needs))
     for function in sorted(counts, key=lambda function: (counts[function], function)):
         having = [need for need in needs if function in need]
