@@ -4,7 +4,7 @@
 subscriber to everything; one session carries them all, as a gateway does, because boards speak MQTT alone. They are
 cheap, all on one thread: a connection and a will each, retained capabilities, four heartbeats a second, and nothing
 that obeys. The latency is that of a voltage, from the publish call of one more board until the viewer, or the
-subscriber, has it.
+subscriber, has it; one that the page has replaced by a newer one is lost.
 
 ``python -m pebble.bench.scale mqtt|zenoh WHERE COUNT`` are the boards; ``WHERE`` is a broker's port or a hub's folder.
 """
@@ -39,7 +39,7 @@ from pebble.errors import PebbleError
 from pebble.rig.processes import BROKERS, HOST, OPERATORS, Processes, Program, python
 from pebble.rig.testbed import PageServer
 from pebble.rig.worker_end import answer, serve_on_thread
-from pebble.transports import Message, QoS, ZenohSettings, create
+from pebble.transports import Message, QoS, Transport, ZenohSettings, create
 from pebble.transports.mqtt import packets
 
 PAGE, HUB = VARIANTS = ("page", "hub")
@@ -134,8 +134,7 @@ def hub(boards: int, seconds: float) -> Iterator[Cell]:
     """Measure a hub with one subscriber. Raises PebbleError."""
     with Processes() as processes:
         own, values = ZenohSettings(run_dir=processes.folder / "z"), dict[float, int]()
-        settings = msgspec.json.encode(own, enc_hook=str).decode()
-        command = python("pebble.runtime.hub", settings)
+        command = python("pebble.runtime.hub", msgspec.json.encode(own, enc_hook=str).decode())
         program = processes.add(Program("hub", command, processes.folder / "hub.log"), BROKERS)
         program.wait_until((own.run_dir / "hub.sock").exists, _UP_S)
         crowd = processes.worker("boards", "pebble.bench.scale", "zenoh", own.run_dir, boards)
@@ -145,10 +144,10 @@ def hub(boards: int, seconds: float) -> Iterator[Cell]:
             if message.topic.endswith(CHARGING_LEVEL.suffix):
                 values.setdefault(json.loads(message.payload)["value"], time.monotonic_ns())
 
-        with create("zenoh", "subscriber", ZenohSettings(run_dir=own.run_dir, client=True)) as subscriber:
+        with at_hub(own.run_dir, "subscriber") as subscriber, at_hub(own.run_dir, _PROBE) as probe:
             subscriber.subscribe(ALL_OUTGOING, receive, direct=True)
             pids = {HUB: program.pid, "boards": crowd.pid}
-            yield from _measured(HUB, boards, seconds, pids, by_zenoh(str(own.run_dir), _PROBE), values)
+            yield from _measured(HUB, boards, seconds, pids, by_zenoh(probe), values)
 
 
 def _measured(
@@ -238,9 +237,12 @@ def by_mqtt(port: str, name: str) -> Publish:
     )
 
 
-def by_zenoh(run_dir: str, name: str) -> Publish:
-    """Connect to a hub. Raises PebbleError."""
-    session = create("zenoh", name, ZenohSettings(run_dir=Path(run_dir), client=True)).open(_UP_S)
+def at_hub(run_dir: Path, name: str) -> Transport:
+    """Return a session with a hub, not yet opened."""
+    return create("zenoh", name, ZenohSettings(run_dir=run_dir, client=True))
+
+
+def by_zenoh(session: Transport) -> Publish:
     return lambda topic, payload: session.publish(topic, payload, qos=QoS.LATEST, retain=True)
 
 
@@ -270,7 +272,7 @@ def _epoch_ms() -> int:
 def main(kind: str, where: str, count: int) -> None:
     """Run boards until standard input closes; their heartbeats are evenly spread."""
     ended, boards = serve_on_thread(lambda _line: None), list[tuple[str, Publish]]()
-    gateway = None if kind == "mqtt" else by_zenoh(where, "gateway")
+    gateway = None if kind == "mqtt" else by_zenoh(at_hub(Path(where), "gateway").open(_UP_S))
     for number in range(count):
         identity = Identity("pebble", "robots", f"board-{number:04d}")
         publish = gateway or by_mqtt(where, identity.id)

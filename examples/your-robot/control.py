@@ -5,7 +5,7 @@ Times are milliseconds of a clock that is never set.
 
 from payloads import NAME, clamp, is_hex, is_number, new_hex, only
 
-NOBODY = {"id": "", "by": "", "device": "", "key": ""}
+NO_HOLDER = {"id": "", "by": "", "device": "", "key": ""}
 SHORTEST_MS = 1000  # for which one request counts
 USUAL_MS = 3000
 LONGEST_MS = 10000
@@ -15,7 +15,7 @@ class Control:
     """The control of one robot. Its holder gets a key, and no command of others moves the robot."""
 
     def __init__(self):
-        self.holder = NOBODY
+        self.holder = NO_HOLDER
         self._account = ""  # of the holder: a key counts with this account only
         self._for_ms = 0  # how long it lasts without a request or a command
         self._ends_at = 0
@@ -45,7 +45,7 @@ class Control:
         is_holder = own_id == self.holder["id"] and account == self._account
         if command.get("want") == "release":
             if is_holder:
-                self.pass_to(NOBODY)
+                self.pass_to(NO_HOLDER)
         elif is_holder or take or self.is_free:
             if not is_holder:
                 device = only(command.get("device"), NAME, 20)
@@ -65,7 +65,7 @@ class Control:
     def tick(self, now):
         """End what is over."""
         if not self.is_free and now > self._ends_at:
-            self.pass_to(NOBODY)
+            self.pass_to(NO_HOLDER)
         if now > self._asks_until:
             self._asks = self._asks_id = ""
 

@@ -1,4 +1,4 @@
-"""As much MQTT 3.1.1 as a robot in MicroPython needs. Only connecting waits, for 2 s at most."""
+"""This is as much MQTT 3.1.1 as a robot in MicroPython needs. Only connecting waits, for 2 s at most."""
 
 import json
 import select

@@ -31,7 +31,7 @@ _SLOW_S = 60.0  # how much longer the first round may take, on the smallest mach
 _POLL_S = 0.1
 _ROBOTS = """\
 Goob on Zenoh and Fred on MQTT, with simulated motor MCU, camera and microphone;
-Goob also with an inertial sensor, a loudspeaker and scripts, in a room with tags.
+Goob also with inertial sensor, loudspeaker and scripts, in a room with tags.
 MiniLAMP and BenJr are MCUs that use MQTT themselves: their firmware, on
 simulated pins."""
 _RECORDED = ("--keep", "256M", "--rotate-size", "32M", "--free", "512M", "--level", "1")  # fast rather than small

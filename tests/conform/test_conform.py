@@ -106,7 +106,7 @@ VIOLATIONS = (
     ("control", "a second request takes it", "elif is_holder or take or self.is_free:", "elif True:"),
     ("control asked", "a second request is not shown", "self._asks_id = own_id", 'self._asks_id = ""'),
     ("control asked", "it is shown after its end", "if now > self._asks_until:", "if False:"),
-    ("control released", "it is kept after its release", "self.pass_to(NOBODY)\n        elif", "pass\n        elif"),
+    ("control released", "it is kept after its release", "self.pass_to(NO_HOLDER)\n        elif", "pass\n        elif"),
     (
         "control released",
         "another's release ends it",
