@@ -41,7 +41,7 @@ def operator_in_python(_folder: Path) -> Command:
 
 def mutant(sample: Path, folder: Path, old: str, new: str) -> Path:
     """Return a copy of a sample, with ``new`` in place of ``old`` in all files of its folder that have it."""
-    copy = shutil.copytree(sample.parent, folder / "mutant")
+    copy = shutil.copytree(sample.parent, folder / "mutant", ignore=shutil.ignore_patterns("__pycache__"))
     files = [file for file in copy.iterdir() if old in file.read_text()]
     assert files, f"no file has {old!r}"
     for file in files:

@@ -1,7 +1,7 @@
 """Runs tests in several processes: ``--workers 8``. They are forked once all tests are collected.
 
-Tests without a mark come first, then those marked ``alone``, with fewer processes, then those marked ``solo``, one
-after the other. Tests marked ``computing`` run all the time, when nothing else wants a processor.
+Tests without a mark come first, then those marked ``alone``, with fewer processes. Tests marked ``computing`` run
+meanwhile, when nothing else wants a processor. At last come those marked ``solo``, one after the other.
 
 A worker gets the tests of one module after another, in the order in which they were collected, so each fixture of a
 module is made once; tests that share a fixture of their package are one module. Tests marked ``alone``, which take
@@ -68,13 +68,16 @@ class Workers:
     def pytest_runtestloop(self, session: pytest.Session) -> bool | None:
         if session.testsfailed or session.config.option.collectonly:
             return None  # pytest's own loop runs nothing then, either
-        background, *phases = lanes(session.items, session.config.getoption("--workers"))
+        background, *others, solo = lanes(session.items, session.config.getoption("--workers"))
         try:
             self._start(session, background)
-            for lane in phases:
+            for lane in others:
                 self._start(session, lane)
                 while any(worker.lane is lane for worker in self._workers.values()):
                     self._wait(session)
+            while self._workers:
+                self._wait(session)
+            self._start(session, solo)
             while self._workers:
                 self._wait(session)
         finally:
@@ -169,7 +172,7 @@ class Workers:
 
 
 def lanes(items: Sequence[pytest.Item], processes: int) -> list[Lane]:
-    """Return the lane of the background, then the others, one after the other."""
+    """Return the lane of the background, then the others in their order, the one of single tests last."""
     computing, unmarked, alone, solo = Lane(IDLE, idle=True), Lane(processes), Lane(min(ALONE, processes)), Lane(1)
     marked = {"computing": computing, "solo": solo, "alone": alone}
     groups: dict[tuple[int, str], Indexes] = {}

@@ -38,7 +38,7 @@ def ended(reader: ShmReader) -> bool:
     """Read what is left, and whether the writer is gone."""
     try:
         reader.read(0.1)
-    except EOFError:
+    except (EOFError, BrokenPipeError):  # what is read last, or acknowledged last
         return True
     return False
 
