@@ -51,7 +51,7 @@ SECTIONS: Final = (
     Section("frames", "Camera frames inside the robot", 350, 20),
     Section("scale", "Many boards", 240, 40),
     Section("traffic", "Traffic of robots, as in the paper", 140, 19),
-    Section("impair", "On an impaired network", 1000, 85, needs_root=True),
+    Section("impair", "On an impaired network", 900, 85, needs_root=True),
 )
 
 
@@ -224,7 +224,7 @@ def _table(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 
 _LIMITS: Final = (
     "One machine. Intervals are over the rounds of one run; another run, kernel or load changes medians by more.",
-    "No radio: all went over loopback, veth pairs and TUN devices. Profiles imitate effects of Wi-Fi, not their cause.",
+    "No radio: all went over loopback and veth pairs.",
     "No second machine: brokers, operators and the measuring programs compete with the robot for the same cores.",
     "No Raspberry Pi: its cores are slower, and throttle when hot. Ratios between variants transfer better than times.",
     "No camera, microphone and hardware encoder: real pictures and sounds are noisier than ours, which costs bytes.",

@@ -2,7 +2,7 @@
 
 Two network namespaces, each with two devices: rate by TBF and loss by nftables, in the kernel. Without delay, a veth
 pair carries everything, entirely in the kernel. With delay, the route uses TUN devices, whose descriptors are held by a
-process: a packet sent into one device leaves the other one when its schedule allows. The addresses stay the same, so
+process: a packet sent into one device leaves the other one after the delay. The addresses stay the same, so
 connections survive. When the process ends, the devices disappear, and so do the namespaces once they are empty.
 
 ``python -m pebble.bench.impair.network`` is that process. It applies each condition that it reads; after every line it
@@ -34,7 +34,7 @@ from typing import Any
 
 import msgspec
 
-from pebble.bench.impair.conditions import Condition, Shape, arrival
+from pebble.bench.impair.conditions import Condition, Shape
 from pebble.errors import PebbleError
 from pebble.rig.processes import SBIN, Worker, end_all, python
 from pebble.rig.worker_end import answer
@@ -97,9 +97,9 @@ class NamespaceNetwork(Worker):
             raise
 
     def apply(self, condition: Condition) -> None:
-        """Applies a condition. Connections stay; the condition's time starts at 0."""
+        """Apply a condition. Connections stay."""
         self._request(msgspec.json.encode(condition).decode())
-        device = _TIMED if condition.up.timed or condition.down.timed else _WIRE
+        device = _TIMED if condition.up.delay_ms or condition.down.delay_ms else _WIRE
         self._robot.apply(condition.up.kbit, condition.down.loss, device)
         self._remote.apply(condition.down.kbit, condition.up.loss, device)
 
@@ -216,14 +216,13 @@ def require_namespaces() -> None:
 class Packets:
     """Packets in flight from one device to the other, in order."""
 
-    def __init__(self, source: int, sink: int, seed: str) -> None:
-        self._source, self._sink, self._seed = source, sink, seed
+    def __init__(self, source: int, sink: int) -> None:
+        self._source, self._sink, self._delay_s = source, sink, 0.0
         self._in_flight: deque[tuple[float, bytes]] = deque()
         self.dropped = 0
-        self.apply(Shape())
 
     def apply(self, shape: Shape) -> None:
-        self._began, self._shape = time.monotonic(), shape
+        self._delay_s = shape.delay_ms / 1000
 
     @property
     def due(self) -> float:
@@ -234,12 +233,11 @@ class Packets:
         with suppress(BlockingIOError):
             for _ in range(_AT_ONCE):
                 packet = os.read(self._source, _PACKET)
-                at = arrival(self._shape, self._seed, time.monotonic() - self._began)
-                if at is None or len(self._in_flight) >= _ROOM:
+                if len(self._in_flight) >= _ROOM:
                     self.dropped += 1
                 else:
                     last = self._in_flight[-1][0] if self._in_flight else 0.0
-                    self._in_flight.append((max(last, self._began + at), packet))
+                    self._in_flight.append((max(last, time.monotonic() + self._delay_s), packet))
 
     def deliver(self) -> None:
         """Writes the packets that are due."""
@@ -264,7 +262,7 @@ def main() -> int:
         answer({"unavailable": f"{why}: run it as root, or in `unshare --map-root-user`"})
         return 1
     answer({"robot": robot, "remote": remote})
-    up, down = Packets(robot_tun, remote_tun, "up"), Packets(remote_tun, robot_tun, "down")
+    up, down = Packets(robot_tun, remote_tun), Packets(remote_tun, robot_tun)
     sources, requests = {robot_tun: up, remote_tun: down}, sys.stdin.fileno()
     while True:
         due = min(up.due, down.due)

@@ -22,6 +22,7 @@ from pebble.demo.outcome import Outcomes, outcome_of
 from pebble.demo.phone import Phone
 from pebble.demo.view import View, show_media, show_outcomes
 from pebble.errors import PebbleError
+from pebble.rig.robot import SimulatedRobot
 from pebble.rig.testbed import ROBOTS, PageServer, Testbed
 from pebble.runtime.signals import handled_by
 
@@ -87,7 +88,7 @@ class Demo:
         self._media = MediaViewer(testbed.broker_port)
 
     def play(self) -> list[str]:
-        """Drive until the end; returns a line for everything that went wrong."""
+        """Drive until the end; returns a line for each robot and each process that failed."""
         robots = list(self._testbed.robots.values())
         broker_url = invitation.broker_url(self._testbed.broker_port)
         addresses = f"Operator page: {self._page_url}   Broker: {broker_url}"
@@ -100,11 +101,9 @@ class Demo:
         finally:
             self._media.end()
             self._operator.close()
-        if not self._ending.is_set():
-            problems += [f"{name} did not become ready to drive within {_DISCOVERY_S:.0f} s" for name in missing]
-        if self._seconds is not None:
-            problems += self._steps_not_done() + self._media.problems()
-        return problems + self._outcomes.problems()
+        if missing and not self._ending.is_set():
+            return problems + [f"{name} did not become ready to drive within {_DISCOVERY_S:.0f} s" for name in missing]
+        return problems + [f"{robot.name}: {'; '.join(wrong)}" for robot in robots if (wrong := self._wrong(robot))]
 
     def show_results(self, problems: list[str]) -> None:
         show_media(self._console, self._media.received)
@@ -167,15 +166,16 @@ class Demo:
             driven = self._operator.completed.popleft()
             self._outcomes.add(outcome_of(driven, self._testbed.robots[driven.robot].entries()))
 
-    def _steps_not_done(self) -> list[str]:
-        """Return a line for each step of a robot that no person took from the operator."""
-        wanted = [(name, step) for name in ROBOTS for step in STEPS]
-        wanted += [(robot.name, TAKE_OVER) for robot in self._testbed.robots.values() if robot.has_scripts]
-        return [
-            f"{name}, {step}: not done"
-            for name, step in wanted
-            if name not in self._operator.visitors.left_alone and self._outcomes.of(name, step) is None
-        ]
+    def _wrong(self, robot: SimulatedRobot) -> list[str]:
+        """Return what a robot did wrong, and with a time to drive also what it lacks, unless a person took it."""
+        wrong = self._outcomes.problems(robot.name)
+        if self._seconds is None:
+            return wrong
+        if robot.name not in self._operator.visitors.left_alone:
+            steps = (*STEPS, TAKE_OVER) if robot.has_scripts else STEPS
+            wrong += [f"{step}: not done" for step in steps if self._outcomes.of(robot.name, step) is None]
+        missing = self._media.received[robot.name].missing() if robot.name in self._media.received else []
+        return wrong + [f"nothing arrived as {encoding}" for encoding in missing]
 
 
 def print_line(console: Console, line: str) -> None:

@@ -90,11 +90,6 @@ class MediaViewer:
         self._thread = threading.Thread(target=self._run, args=(turns,), name=_NAME, daemon=True)
         self._thread.start()
 
-    def problems(self) -> list[str]:
-        """Return a line for each robot of which nothing arrived in some encodings, once each had a turn."""
-        missing = {name: ", ".join(media.missing()) for name, media in self.received.items()}
-        return [f"{name}: nothing arrived as {encodings}" for name, encodings in missing.items() if encodings]
-
     def end(self) -> None:
         """Withdraw the requests and disconnect."""
         self._stopping.set()

@@ -78,6 +78,6 @@ class Outcomes:
     def steps(self) -> list[str]:
         return list(dict.fromkeys(step for _, step in self._worst))
 
-    def problems(self) -> list[str]:
-        """Return a line for each robot and step that went wrong."""
-        return [f"{robot}, {step}: {outcome.wrong}" for (robot, step), outcome in self._worst.items() if outcome.wrong]
+    def problems(self, robot: str) -> list[str]:
+        """Return what went wrong with a robot, step by step."""
+        return [f"{one.step}: {one.wrong}" for one in self._worst.values() if one.robot == robot and one.wrong]

@@ -12,7 +12,7 @@ from pebble.bench.impair import metrics, trials
 from pebble.bench.results import STAND_IN, Cell, Results
 from pebble.recordings.traffic.results import Bandwidth, Histogram, Intervals, Latency, Outage, RobotTraffic
 
-TRIALS = ("base-start", "512k", "256k", "64k+5%", "wifi-power-save")
+TRIALS = ("base-start", "512k", "256k", "64k+5%", "base-end")
 _random = np.random.default_rng(7)
 
 

@@ -56,4 +56,5 @@ def test_of_each_robot_and_step_the_worst_round_stays() -> None:
         assert outcomes.of("goob", "back, stop") == worst
     outcomes.add(Outcome("fred", "back, stop", 0.1, ""))
     assert outcomes.steps() == ["back, stop"]
-    assert outcomes.problems() == ["goob, back, stop: it did not move as commanded"]
+    assert outcomes.problems("goob") == ["back, stop: it did not move as commanded"]
+    assert outcomes.problems("fred") == []
