@@ -18,7 +18,7 @@ import msgspec
 import numpy as np
 
 from pebble.contract.packets import KEY_FRAME, Codec, Picture, PictureKind, Sound
-from pebble.recordings.files.writer import McapWriter
+from pebble.recordings.files.writer import RecordingWriter
 from pebble.recordings.stamps import stamp_ns
 from pebble.recordings.traffic.activity import Activity
 from pebble.recordings.traffic.duck import connected, quoted
@@ -144,7 +144,7 @@ def write_recording(path: Path, messages: Iterable[Sent], *, finished: bool = Tr
     path.parent.mkdir(parents=True, exist_ok=True)
     channels: dict[tuple[str, bool], int] = {}
     with path.open("wb", buffering=0) as file:
-        writer = McapWriter(file, library="pebble test")
+        writer = RecordingWriter(file, library="pebble test")
         for sent in messages:
             number = channels.get((sent.topic, sent.retained))
             if number is None:

@@ -25,8 +25,8 @@ from pebble.recordings.exports.foxglove import write_foxglove
 from pebble.recordings.exports.lines import BadLine, Imported, read_lines, write_lines
 from pebble.recordings.exports.mongo import read_mongo, write_mongo
 from pebble.recordings.exports.unfinished import unfinished
-from pebble.recordings.files.mcap import Recorded
-from pebble.recordings.files.writer import LIBRARY, McapWriter
+from pebble.recordings.files.recorded import Recorded
+from pebble.recordings.files.writer import RecordingWriter
 from pebble.recordings.library import Damages, files, merged, problems
 from pebble.recordings.stamps import stamp_ns
 
@@ -89,7 +89,7 @@ def import_(
 ) -> int:
     """Import what the original's logger or MongoDB recorded."""
     with _opened(source) as file, unfinished(target, overwrite=False) as path, path.open("wb", buffering=0) as out:
-        writer = McapWriter(out, library=LIBRARY)
+        writer = RecordingWriter(out)
         writer.metadata("pebble.recording", {"format": "1", "imported": source.name})
         read = read_mongo if ".bson" in source.name else read_lines
         counted = _import(read(file), writer)
@@ -129,7 +129,7 @@ def _export(
     return f"{target}: {count:,} messages"
 
 
-def _import(found: Iterable[Imported | BadLine], writer: McapWriter) -> Counter[str]:
+def _import(found: Iterable[Imported | BadLine], writer: RecordingWriter) -> Counter[str]:
     counted = Counter[str]()
     channels: dict[tuple[str, str, tuple[tuple[str, str], ...]], int] = {}
     for one in found:

@@ -1,4 +1,4 @@
-"""``pebble recordings`` finish, recover, compact, index and rm: what is done to the files themselves."""
+"""``pebble recordings`` mend and rm: what is done to the files themselves."""
 
 from __future__ import annotations
 
@@ -11,80 +11,37 @@ from pebble.client.names import base_of
 from pebble.commands.recordings.options import RobotOption, Since, Until, period
 from pebble.commands.recordings.progress import progress
 from pebble.commands.recordings.report import report_left, report_unread
-from pebble.commands.terminal import show
 from pebble.config.visible import shown
 from pebble.errors import PebbleError
 from pebble.recordings.catalogue import Query, check_names
-from pebble.recordings.files.finish import finish as finish_file
-from pebble.recordings.files.mcap import Recorded, RecordingError
+from pebble.recordings.files.recorded import Recorded, RecordingError
 from pebble.recordings.files.rewrite import rewrite
-from pebble.recordings.files.scan import Damage
 from pebble.recordings.library import ACTIVE, SUFFIX, files, robot_of, span
-from pebble.recordings.recorder.folder import DAMAGED, Folder, finished_path, rename
-from pebble.recordings.traffic.index import Index, archive_of, not_indexed
+from pebble.recordings.recorder.finisher import mend as mend_leftover
+from pebble.recordings.recorder.folder import DAMAGED, Folder, finished_path
+from pebble.recordings.traffic.index import Index, archive_of
 
 
-def finish(folder: Annotated[Path, typer.Argument(help="Folder of a recorder.", metavar="DIR")]) -> int:
-    """Finish what a killed recorder left; the next one there does it, too."""
-    owner = Folder(_existing(folder))
+def mend(
+    source: Annotated[Path, typer.Argument(help="Folder of a recorder; or one file.", metavar="DIR|FILE")],
+    target: Annotated[Path | None, typer.Argument(help="For a file: a new one.", metavar="OUT")] = None,
+) -> int:
+    """Copy what can be read of damaged or unfinished recordings.
+
+    In a folder that is what a killed recorder left, as the next recorder there does: a file of which not all could be
+    read stays beside its copy, as ….mcap.damaged. FILE stays as it is.
+    """
+    if not source.is_dir():
+        return _mend_file(source, target)
+    owner = Folder(source)
     try:
         owner.take()
     except RecordingError as error:
-        raise PebbleError(f"{folder}: a recorder writes here, and finishes them itself") from error
+        raise PebbleError(f"{source}: a recorder writes here, and mends its files itself") from error
     try:
-        return _finish_all(owner)
+        return _mend_all(owner)
     finally:
         owner.release()
-
-
-def recover(
-    source: Annotated[Path, typer.Argument(help="A damaged recording; it stays as it is.", metavar="FILE")],
-    target: Annotated[Path, typer.Argument(help="A new file.", metavar="OUT")],
-) -> int:
-    """Copy what can be read of a recording into a new file."""
-    files([source])
-    if target.exists():
-        raise PebbleError(f"{target} exists already")
-    made = rewrite(source, target)
-    typer.echo(f"{target}: {made.messages:,} messages, {made.missing:,} missing")
-    if made.unread:
-        typer.echo(f"pebble: {source}: {shown(made.unread)}", err=True)
-    return 0 if made.messages else 1
-
-
-def compact(folder: Annotated[Path, typer.Argument(help="Folder of a recorder.", metavar="DIR")]) -> int:
-    """Write files again in larger pieces, which are smaller."""
-    before = after = left = 0
-    owner = Folder(_existing(folder))
-    with owner.maintained():
-        entries = [entry for entry in owner.entries() if entry.is_finished]
-        with progress("compacting", len(entries)) as advance:
-            for number, entry in enumerate(entries, 1):
-                try:
-                    made = rewrite(entry.path, entry.path)
-                except (PebbleError, OSError) as error:
-                    left += report_left(error)
-                    continue
-                before, after = before + entry.size, after + made.size
-                advance(number)
-    typer.echo(f"{show.size(before)} became {show.size(after)}")
-    return 1 if left else 0
-
-
-def index(folder: Annotated[Path, typer.Argument(help="Folder of a recorder.", metavar="DIR")]) -> int:
-    """Index recordings for `pebble analyse`, as Parquet files."""
-    from pebble.recordings.traffic.duck import require_packages
-
-    require_packages("duckdb", "matplotlib")
-    due, unread = not_indexed(folder), []
-    with progress("indexing", len(due)) as advance:
-        for number, path in enumerate(due, 1):
-            entry = Index(folder).add(path)
-            if entry.unread:
-                unread.append(f"{path}: {entry.unread}")
-            advance(number)
-    typer.echo(f"{len(due)} recordings indexed")
-    return report_unread(unread)
 
 
 def rm(
@@ -150,12 +107,11 @@ def rm(
 
 def _reaches_into(path: Path, since_ns: int, until_ns: int) -> bool:
     """Whether a file may hold messages of a period: one that cannot be read may."""
-    damage = Damage()
     try:
-        one = span(path, damage)
+        covered = span(path)
     except RecordingError:
         return True
-    return damage.unread if one is None else one.last_ns >= since_ns and one.first_ns < until_ns
+    return covered is None or (covered.last_ns >= since_ns and covered.first_ns < until_ns)
 
 
 def _delete_whole(path: Path, *, yes: bool) -> int:
@@ -175,23 +131,30 @@ def _delete_whole(path: Path, *, yes: bool) -> int:
     return 0
 
 
-def _finish_all(folder: Folder) -> int:
-    left = [entry.path for entry in folder.entries() if entry.is_active]
-    failed = 0
+def _mend_file(source: Path, target: Path | None) -> int:
+    files([source])
+    if target is None:
+        raise PebbleError(f"{source}: name a new file for what can be read: pebble recordings mend {source} OUT")
+    if target.exists():
+        raise PebbleError(f"{target} exists already")
+    made = rewrite(source, target)
+    typer.echo(f"{target}: {made.messages:,} messages, {made.missing:,} missing")
+    report_unread([f"{source}: {made.unread}"] if made.unread else [])
+    return 0 if made.messages else 1
+
+
+def _mend_all(folder: Folder) -> int:
+    left, failed = [entry.path for entry in folder.entries() if entry.is_active], False
     for path in left:
         try:
-            made = finish_file(path)
-            rename(path, finished_path(path))
+            made = mend_leftover(path)
         except (PebbleError, OSError) as error:
-            typer.echo(f"pebble: {path.name}: {shown(str(error))}", err=True)
-            failed += 1
+            failed |= bool(report_left(f"{path.name}: {error}"))
             continue
-        lost = f", {made.missing:,} missing" if made.missing else ""
-        lost += f", {made.damaged_bytes:,} damaged bytes" if made.damaged_bytes else ""
-        failed += bool(lost)
-        typer.echo(f"{finished_path(path).name}: {made.messages:,} messages{lost}")
+        failed |= not made.is_whole
+        typer.echo(f"{finished_path(path).name}: {made.messages:,} messages, {made.missing:,} missing")
     if not left:
-        typer.echo("nothing to finish")
+        typer.echo("nothing to mend")
     return 1 if failed else 0
 
 

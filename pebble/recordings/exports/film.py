@@ -17,7 +17,7 @@ from pebble.recordings.exports.film_pictures import MILLISECOND, QUALITY, Pictur
 from pebble.recordings.exports.film_sound import RATE, SoundResult, SoundTrack
 from pebble.recordings.exports.lines import Progress
 from pebble.recordings.exports.unfinished import unfinished
-from pebble.recordings.files.mcap import Recorded, RecordingError
+from pebble.recordings.files.recorded import Recorded, RecordingError
 from pebble.recordings.stamps import is_picture
 
 #: By the ending of the film: FFmpeg's names of the container and of the encoder of its sound.

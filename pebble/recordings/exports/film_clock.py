@@ -4,7 +4,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Final
 
-from pebble.recordings.files.mcap import Recorded
+from pebble.recordings.files.recorded import Recorded
 
 _BACK_MS: Final = 1000  # a stamp so far behind the one before it is of a clock that was set
 _AHEAD_MS: Final = 10_000  # or so far ahead of its reception, if it came as fast as the first one

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from pebble.recordings.files.mcap import RecordingError
+from pebble.recordings.files.recorded import RecordingError
 
 if TYPE_CHECKING:
     from pebble.media.pcm import Resampler, Samples

@@ -15,7 +15,7 @@ import msgspec
 from msgspec import UNSET, Meta, Raw, Struct, UnsetType
 
 from pebble.errors import TransportError
-from pebble.recordings.files.mcap import Recorded
+from pebble.recordings.files.recorded import Recorded
 from pebble.transports.topics import check_topic
 
 TRUNCATED: Final = "truncated"  # of a channel: its payloads were cut before they were recorded here

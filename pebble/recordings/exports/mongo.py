@@ -14,7 +14,7 @@ from typing import Any, BinaryIO, Final, NoReturn, cast
 
 from pebble.errors import PebbleError
 from pebble.recordings.exports.lines import TRUNCATED, BadLine, Imported, Progress, checked, epoch_ns
-from pebble.recordings.files.mcap import Recorded
+from pebble.recordings.files.recorded import Recorded
 
 _MOST_PAYLOAD: Final = 15_000_000
 _LARGEST: Final = (16 << 20) + (16 << 10)  # bytes of a document: what MongoDB's server itself takes

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO, Final
 
-from pebble.recordings.files.mcap import RecordingError
+from pebble.recordings.files.recorded import RecordingError
 from pebble.recordings.files.rewrite import PART
 from pebble.recordings.library import ACTIVE, SUFFIX
 from pebble.transports.own_file import OwnFile

@@ -12,7 +12,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Final
 
-from pebble.recordings.files.mcap import LARGEST_PAYLOAD
+from pebble.recordings.files.recorded import require_package
 from pebble.recordings.recorder.background import Background
 from pebble.recordings.recorder.clock import RecordingClock
 from pebble.recordings.recorder.due import Due
@@ -26,6 +26,7 @@ from pebble.runtime.rate_limit import RateLimitedLog
 
 log = logging.getLogger(__name__)
 
+LARGEST_PAYLOAD: Final = 16 << 20
 _TICK_S: Final = 0.2
 _LATE_S: Final = 0.5
 
@@ -53,7 +54,8 @@ class Recorder:
         self._quiet_log = RateLimitedLog(log, period_s=60.0)
 
     def start(self) -> None:
-        """Raises RecordingError if the folder cannot be used."""
+        """Raises RecordingError if the folder cannot be used, or the package ``mcap`` is not installed."""
+        require_package()
         self.folder.take()
         left = self._writing.mend_leftovers()
         self.events.note("start", pid=os.getpid(), leftovers=left)

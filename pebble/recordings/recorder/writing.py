@@ -9,7 +9,7 @@ from operator import attrgetter
 from pathlib import Path
 from typing import Final, NamedTuple
 
-from pebble.recordings.files.mcap import Packer, RecordingError
+from pebble.recordings.files.recorded import RecordingError
 from pebble.recordings.recorder.background import Background
 from pebble.recordings.recorder.clock import RecordingClock
 from pebble.recordings.recorder.disk_space import Disk, outdated, surplus
@@ -60,7 +60,7 @@ class Writing:
         self.slowest_flush_s = 0.0
         self._folder, self._options, self._clock, self._counters, self._events, about = context
         self._intake = intake
-        self._files = OpenFiles(self._folder, about, Packer(self._options.level), background.watch)
+        self._files = OpenFiles(self._folder, about, background.watch)
         self._finisher = Finisher(background, self._events.note, self._note_finished)
         self._blocked: _Blocked | None = None
         self._lacking: list[Item] = []  # what no file has taken; bounded: a second of messages
@@ -107,6 +107,9 @@ class Writing:
         at_ns = self._clock.at(item.boot_ns)
         try:
             file = self._files.get(lane, now_ns=self._clock.now(), at_ns=at_ns)
+            if file.is_full:
+                self._finisher.finish(self._files.take(lane))
+                file = self._files.get(lane, now_ns=self._clock.now(), at_ns=at_ns)
         except OSError as error:
             self._lacking.append(item)
             self._block(lane, error)

@@ -19,7 +19,7 @@ from pebble.contract.channels import is_reserved
 from pebble.contract.identity import Identity, ParsedTopic, parse_topic
 from pebble.contract.payloads import Drive
 from pebble.errors import PayloadError, PebbleError, TransportError
-from pebble.recordings.files.mcap import Channel, Recorded
+from pebble.recordings.files.recorded import Channel, Recorded
 from pebble.recordings.stamps import shifted
 from pebble.transports import Message, QoS
 from pebble.transports.topics import check_filter, check_topic, matches

@@ -6,7 +6,7 @@ from typing import Any, Final
 
 from msgspec import Struct
 
-from pebble.recordings.files.mcap import RecordingError
+from pebble.recordings.files.recorded import RecordingError
 from pebble.recordings.library import FOREVER_NS
 from pebble.recordings.traffic.duck import connected, parquet
 from pebble.recordings.traffic.queries import RobotQueries

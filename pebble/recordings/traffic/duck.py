@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from pebble.errors import PebbleError
-from pebble.recordings.files.mcap import RecordingError
+from pebble.recordings.files.recorded import RecordingError
 
 if TYPE_CHECKING:
     from duckdb import DuckDBPyConnection

@@ -27,9 +27,8 @@ import msgspec
 
 from pebble.contract.channels import HEARTBEAT, ONLINE
 from pebble.contract.identity import parse_topic
-from pebble.recordings.files.mcap import Channel, Recorded, RecordingError
-from pebble.recordings.files.reader import Summary, mapped, read
-from pebble.recordings.files.scan import Damage
+from pebble.recordings.files.reader import RecordingFile
+from pebble.recordings.files.recorded import Channel, Damage, Recorded, RecordingError
 from pebble.recordings.library import ACTIVE, SUFFIX, files
 from pebble.recordings.media_numbers import media_number
 from pebble.recordings.recorder.intake import EVENTS
@@ -230,16 +229,14 @@ class _Rows:
 
     def read(self, recording: Path, advance: Advance) -> Damage:
         """Returns what could not be read. Raises RecordingError."""
-        damage = Damage()
-        with mapped(recording) as data:
-            summary = Summary.of(data)
-            expected = 0 if summary is None else summary.statistics.messages
-            for message in read(data, damage):
+        with RecordingFile(recording) as file:
+            damage, expected = file.damage, 0 if file.statistics is None else file.statistics.message_count
+            for message in file.read():
                 if message.log_ns <= _LATEST_NS:
                     self._add(message)
                 else:
                     damage.missing += 1
-                    damage.note("times after 2262")
+                    damage.why = "times after 2262"
                 if len(self._batch) >= _BATCH:
                     self._flush()
                     advance(min(1.0, self.count / expected) if expected else 0.5)

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from msgspec import Struct, field
 
-from pebble.recordings.files.mcap import RecordingError
+from pebble.recordings.files.recorded import RecordingError
 from pebble.recordings.library import ACTIVE, files
 from pebble.recordings.recorder.folder import finished_path
 from pebble.recordings.traffic.index import FOLDER, NO_ROBOT, Entry, Index, archive_of

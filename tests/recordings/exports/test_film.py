@@ -24,7 +24,7 @@ from pebble.media.video import make_encoder
 from pebble.recordings.exports.film import write_film, write_wav
 from pebble.recordings.exports.film_pictures import parameter_sets
 from pebble.recordings.exports.film_sound import RATE
-from pebble.recordings.files.mcap import Channel, Recorded, RecordingError
+from pebble.recordings.files.recorded import Channel, Recorded, RecordingError
 from tests.support import further, some
 
 ROBOT = "pebble/robots/goob"

@@ -18,7 +18,7 @@ from bson.objectid import ObjectId
 from pebble.errors import PebbleError
 from pebble.recordings.exports.lines import BadLine, Imported
 from pebble.recordings.exports.mongo import read_mongo, write_mongo
-from pebble.recordings.files.mcap import Channel, Recorded
+from pebble.recordings.files.recorded import Channel, Recorded
 
 T_MS = 1_732_300_000_123
 TOPIC = "pebble/robots/goob/outgoing/audio"

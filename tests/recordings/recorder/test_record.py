@@ -16,7 +16,7 @@ from typing import Any
 import pytest
 
 from pebble.recordings import library
-from pebble.recordings.files.mcap import Recorded
+from pebble.recordings.files.recorded import Recorded
 from pebble.recordings.recorder.intake import EVENTS
 from pebble.transports import Message, MqttSettings, QoS, Transport, create
 from tests.commands.command_line import Run

@@ -16,7 +16,7 @@ from pathlib import Path
 import pytest
 
 from pebble.bench.results import percentile
-from pebble.recordings.files.finish import finish
+from pebble.recordings.files.rewrite import rewrite
 from pebble.recordings.replay import live
 from pebble.recordings.replay import robots as replayed_robots
 from pebble.transports import Message, MqttSettings, QoS, create
@@ -290,20 +290,18 @@ def test_other_places_are_errors_too(tmp_path: Path, run: Run, quick: None) -> N
 
 
 def test_what_damage_has_taken_is_counted(tmp_path: Path, at: tuple[str, str], run: Run, quick: None) -> None:
-    path = tmp_path / "x.mcap"
+    path, mended = tmp_path / "x.mcap", tmp_path / "mended.mcap"
     messages.write(path, 400, channels=3)
     data = bytearray(path.read_bytes())
     middle = len(data) // 2
     data[middle : middle + 20] = bytes(20)
     path.write_bytes(data)
-    missing = finish(path).missing
-    assert missing == 100
-    assert run("replay", path, *at, "--speed", "100") == 0
+    assert rewrite(path, mended).missing == 100
+    assert run("replay", mended, *at, "--speed", "100") == 0
     assert run.err == "pebble: 100 messages are missing in this recording: files were damaged\n"
     assert run.out.splitlines()[-1] == "300 sent, 0 skipped"
-    path.write_bytes(data)
     assert run("replay", path, *at, "--speed", "100") == 1
-    assert "1 damaged parts" in run.err
+    assert "1 damaged parts, 100 messages missing" in run.err
     assert run.out.splitlines()[-1] == "300 sent, 0 skipped"
 
 

@@ -9,7 +9,7 @@ import pytest
 
 from pebble.contract import CHANNELS, INCOMING, Kind
 from pebble.errors import ConfigError, TransportError
-from pebble.recordings.files.mcap import Channel, Recorded
+from pebble.recordings.files.recorded import Channel, Recorded
 from pebble.recordings.replay.rules import Options, Outgoing, ReplayError, is_zero, zero
 from pebble.transports import QoS
 from tests.recordings.playing import FRED, GOOB, THEN_NS, Line, js, ms, rules_of

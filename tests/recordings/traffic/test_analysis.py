@@ -12,7 +12,7 @@ import pytest
 
 from pebble.contract.packets import Codec, Picture, PictureKind, Sound
 from pebble.errors import PebbleError
-from pebble.recordings.files.mcap import Recorded
+from pebble.recordings.files.recorded import Recorded
 from pebble.recordings.library import FOREVER_NS, merged
 from pebble.recordings.traffic.analysis import analyse
 from pebble.recordings.traffic.results import (

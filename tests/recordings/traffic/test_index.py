@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from pebble.contract.packets import Codec, Sound
-from pebble.recordings.files.mcap import RecordingError
+from pebble.recordings.files.recorded import RecordingError
 from pebble.recordings.traffic.activity import Activity
 from pebble.recordings.traffic.index import COLUMNS, NO_ROBOT, Index, archive_of, not_indexed
 from tests.recordings.synthetic import FLEET, START_NS, Sent, event, traffic, write_recording
