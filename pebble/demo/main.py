@@ -47,7 +47,7 @@ _DISCOVERY_S = 30.0  # until all robots can be driven, on the smallest machine
 _MEDIA_START_S = 2.0  # from the first request to the first picture, with some to spare
 _POLL_S = 0.1
 _REPORTED_S = 0.3  # an MCU reports ten times a second: the end of a step is reported a little later
-_RECORDED = ("--keep", "256M", "--rotate-size", "32M", "--free", "512M", "--level", "1")  # fast rather than small
+_RECORDED = ("--keep", "256M", "--rotate", "5min")
 _SLOW_S = 60.0  # how much longer an overloaded machine may take for the first round, and to repeat steps of it
 
 

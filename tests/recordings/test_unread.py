@@ -337,7 +337,7 @@ def test_what_was_not_read_makes_no_room(tmp_path: Path) -> None:
     entries = Folder(tmp_path / "rec").entries()
     assert [one.number for one in surplus(entries, Limits(keep_bytes=1500), Disk(1 << 40))] == [1]
     assert surplus(entries, Limits(keep_bytes=2000), Disk(1 << 40)) == []
-    old = outdated(entries[1:], Limits(keep_state_days=1.0), entries[0].ended + 1e6)
+    old = outdated(entries[1:], Limits(keep_media_days=1.0), entries[0].ended + 1e6)
     assert old is None
 
 

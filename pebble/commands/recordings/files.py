@@ -15,7 +15,7 @@ from pebble.config.visible import shown
 from pebble.errors import PebbleError
 from pebble.recordings.catalogue import Query, check_names
 from pebble.recordings.files.recorded import Recorded, RecordingError
-from pebble.recordings.files.rewrite import rewrite
+from pebble.recordings.files.rewrite import Keeps, rewrite
 from pebble.recordings.library import ACTIVE, SUFFIX, files, robot_of, span
 from pebble.recordings.recorder.finisher import mend as mend_leftover
 from pebble.recordings.recorder.folder import DAMAGED, Folder, finished_path
@@ -34,14 +34,8 @@ def mend(
     if not source.is_dir():
         return _mend_file(source, target)
     owner = Folder(source)
-    try:
-        owner.take()
-    except RecordingError as error:
-        raise PebbleError(f"{source}: a recorder writes here, and mends its files itself") from error
-    try:
+    with owner.taken():
         return _mend_all(owner)
-    finally:
-        owner.release()
 
 
 def rm(
@@ -68,19 +62,23 @@ def rm(
         inside = since_ns <= message.log_ns < until_ns
         return not inside or (base is not None and robot_of(message.channel) != base)
 
-    if Folder.is_in_use(_existing(folder)):
-        raise PebbleError(f"{folder}: a recorder writes here, and would write retained values again: stop it first")
-    entries = Folder(folder).entries()
+    owner = Folder(_existing(folder))
+    with owner.taken():  # a recorder would write retained values again
+        return _rm(owner, base, (since_ns, until_ns), keeps, yes=yes)
+
+
+def _rm(owner: Folder, base: str | None, period_ns: tuple[int, int], keeps: Keeps, *, yes: bool) -> int:
+    entries, folder = owner.entries(), owner.root
     left = sum(report_left(f"{entry.path}: is not finished, or damaged") for entry in entries if not entry.is_finished)
     finished = [entry.path for entry in entries if entry.is_finished]
     if not left:
         check_names(Query(base), finished, [folder])
-    due = [path for path in finished if _reaches_into(path, since_ns, until_ns)]
+    due = [path for path in finished if _reaches_into(path, *period_ns)]
     what = f"{shown(base)} " if base else "everything "
     if not yes and not typer.confirm(f"Delete {what}from {len(due)} files in {folder}?"):
         return 1
     deleted = 0
-    with Folder(folder).maintained(), progress("deleting", len(due)) as advance:
+    with progress("deleting", len(due)) as advance:
         for number, path in enumerate(due, 1):
             try:
                 names = path.stat().st_nlink
