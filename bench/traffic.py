@@ -26,7 +26,6 @@ from pebble.bench.results import Cell, Judged, Results, Value
 from pebble.bench.tables import plain_table
 from pebble.client.media_receiver import MediaReceiver
 from pebble.errors import PebbleError
-from pebble.recordings.library import FOREVER_NS
 from pebble.recordings.traffic.results import AUDIO, IDLE, SESSION, VIDEO, RobotTraffic, Traffic
 from pebble.rig.processes import end_all
 from pebble.rig.testbed import ROBOTS, Testbed
@@ -75,7 +74,7 @@ def measure(case: Case) -> Iterator[Cell]:
     with tempfile.TemporaryDirectory(prefix="pebble-traffic-") as scratch:
         recordings = Path(scratch) / "recordings"
         record(recordings, case.run["idle_s"], case.run["session_s"])
-        found = sources([recordings], Path(scratch), since_ns=0, until_ns=FOREVER_NS)
+        found = sources([recordings], Path(scratch))
         yield from cells_of(analyse(found, Path(scratch)))
 
 

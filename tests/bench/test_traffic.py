@@ -16,7 +16,6 @@ from pebble.bench.pictures import pictures
 from pebble.bench.results import load
 from pebble.bench.traffic import TABLE_4_1, TRAFFIC, assessment, cells_of, robots_of, tables
 from pebble.errors import PebbleError
-from pebble.recordings.library import FOREVER_NS
 from pebble.recordings.traffic.analysis import analyse
 from pebble.recordings.traffic.results import ALL, AUDIO, VIDEO, Bandwidth, Traffic
 from pebble.recordings.traffic.sources import sources
@@ -36,7 +35,7 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Traffic:
     """The analysis of the demo's robots in tests/data."""
     pytest.importorskip("duckdb")
     scratch = tmp_path_factory.mktemp("scratch")
-    found = sources([DRIVE, MEDIA], scratch, since_ns=0, until_ns=FOREVER_NS)
+    found = sources([DRIVE, MEDIA], scratch)
     return analyse(found, scratch)
 
 

@@ -25,7 +25,7 @@ from pebble.recordings.recorder.folder import Folder
 from pebble.recordings.replay.source import ReplaySource
 from pebble.recordings.seek.archive import Archive
 from pebble.recordings.seek.days import Days
-from pebble.recordings.traffic.index import Index
+from pebble.recordings.traffic.sources import sources
 from tests.commands.command_line import Run
 from tests.recordings.messages import contents, read, write
 from tests.recordings.others import (
@@ -64,8 +64,8 @@ def stored(folder: Path, data: bytes, name: str = NAME) -> Path:
 @pytest.mark.parametrize("name", VALID)
 def test_a_file_of_another_program_is_read_in_the_order_of_time(tmp_path: Path, run: Run, name: str) -> None:
     path, copy = stored(tmp_path, VALID[name]), tmp_path / "copy.mcap"
-    found, damage = read(path)
-    assert (found, damage.report()) == (EXPECTED, "")
+    messages, damage = read(path)
+    assert (messages, damage.report()) == (EXPECTED, "")
     for check in ([], ["--check"]):
         assert (run("recordings", "list", tmp_path / "rec", *check, columns=200), run.err) == (0, "")
         assert f" {COUNT} " in run.out
@@ -81,8 +81,8 @@ def test_a_file_of_another_program_is_read_in_the_order_of_time(tmp_path: Path, 
     replayed = ReplaySource([path])
     assert [(one.channel.topic, one.payload) for one in replayed.messages()] == EXPECTED
     assert problems(replayed.damages) == []
-    indexed = Index(tmp_path / "rec").add(path)
-    assert (indexed.rows, indexed.unread) == (COUNT, "")
+    found = sources([path], tmp_path)
+    assert (found.robots, found.unread) == (["pebble/robots/fred", "pebble/robots/goob"], [])
 
 
 @pytest.mark.parametrize("name", REFUSED)

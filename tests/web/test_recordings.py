@@ -25,6 +25,7 @@ from pebble.fleet.roles import Role
 from pebble.recordings.library import files
 from pebble.recordings.seek import questions
 from pebble.recordings.seek.segment import Flag, unpacked
+from pebble.recordings.traffic.index import index_path
 from pebble.web.recordings import archive_process, routes
 from tests.recordings.messages import START_NS
 from tests.recordings.others import DAMAGED
@@ -71,7 +72,8 @@ def test_a_timeline_that_failed_stays_so_until_a_person_tries_again_and_is_index
 ) -> None:
     pytest.importorskip("duckdb")
     Path(archive.app.state.recordings.scratch).rmdir()  # as systems do with what is temporary
-    (folder / "index").write_text("")
+    for path in folder.rglob("*.mcap"):
+        index_path(path).mkdir()
     asked = partial(get, archive, "timeline", day=DAY, robot=GOOB)
 
     def ended() -> httpx.Response:
@@ -82,8 +84,9 @@ def test_a_timeline_that_failed_stays_so_until_a_person_tries_again_and_is_index
         return answers[-1]
 
     failed = [(answer.status_code, answer.text) for answer in (ended(), asked(), asked())]
-    assert failed == 3 * [(422, f"{folder}/index: File exists; move it away")]
-    (folder / "index").unlink()
+    assert [(code, "Is a directory; move it away" in text) for code, text in failed] == 3 * [(422, True)]
+    for path in folder.rglob("*.parquet"):
+        path.rmdir()
     assert asked().status_code == 422
     assert asked(again=1).status_code == 202
     found = ended().json()
@@ -96,7 +99,7 @@ def test_a_timeline_that_failed_stays_so_until_a_person_tries_again_and_is_index
     assert len(found["activity"]) == len(found["video"]) == len(found["audio"]) == len(found["rest"]) == 4
     assert found["audio"][1] == pytest.approx(50 * 664 * 8 / 1000, abs=0.1)  # as in the paper, Table 4.1
     assert [round(one["until"] - one["since"]) // 1000 for one in found["sessions"]] == [SECONDS + 10]
-    assert (folder / "index").is_dir()
+    assert len(list(folder.rglob("*.parquet"))) == 2
     began = time.monotonic()
     assert asked().status_code == 200
     assert time.monotonic() - began < 2.0

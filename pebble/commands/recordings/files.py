@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Annotated
 
@@ -19,7 +20,9 @@ from pebble.recordings.files.rewrite import Keeps, rewrite
 from pebble.recordings.library import ACTIVE, SUFFIX, files, robot_of, span
 from pebble.recordings.recorder.finisher import mend as mend_leftover
 from pebble.recordings.recorder.folder import DAMAGED, Folder, finished_path
-from pebble.recordings.traffic.index import Index, archive_of
+from pebble.recordings.traffic.index import index_path
+
+_DATE = re.compile(r"\d{2}|\d{4}", re.ASCII)
 
 
 def mend(
@@ -91,7 +94,7 @@ def _rm(owner: Folder, base: str | None, period_ns: tuple[int, int], keeps: Keep
                 if names > 1:
                     left += 1
                     typer.echo(f"pebble: {path}: has other names (hard links), which keep all of it", err=True)
-                Index(folder).remove(path)
+                index_path(path).unlink(missing_ok=True)
                 if made.is_empty:
                     path.unlink()
             advance(number)
@@ -118,13 +121,12 @@ def _delete_whole(path: Path, *, yes: bool) -> int:
         raise PebbleError(f"{path} is a link: name the file itself")
     if not path.is_file() or not path.name.endswith((SUFFIX, ACTIVE, DAMAGED)):
         raise PebbleError(f"{path}: there is no such folder or recording")
-    archive = archive_of(path.parent)
-    if path.name.endswith(ACTIVE) and Folder.is_in_use(archive):
+    if path.name.endswith(ACTIVE) and Folder.is_in_use(_archive_of(path)):
         raise PebbleError(f"{path}: is being written: stop the recorder first")
     if not yes and not typer.confirm(f"Delete {path}?"):
         return 1
     path.unlink()
-    Index(archive).remove(path)
+    index_path(path).unlink(missing_ok=True)
     typer.echo(f"{path.name}: deleted")
     return 0
 
@@ -154,6 +156,14 @@ def _mend_all(folder: Folder) -> int:
     if not left:
         typer.echo("nothing to mend")
     return 1 if failed else 0
+
+
+def _archive_of(path: Path) -> Path:
+    """The folder of a recorder, which has one for each year, month and day."""
+    folder = path.resolve().parent
+    while _DATE.fullmatch(folder.name):
+        folder = folder.parent
+    return folder
 
 
 def _existing(folder: Path) -> Path:

@@ -47,9 +47,9 @@ def connected(scratch: Path, *, memory_mb: int, threads: int = 1) -> Iterator[Du
         raise RecordingError(f"DuckDB: {str(error).partition(chr(10))[0]}") from None
 
 
-def quoted(path: Path) -> str:
-    """A file's name in SQL."""
-    return "'" + str(path).replace("'", "''") + "'"
+def quoted(value: object) -> str:
+    """Return a text in SQL."""
+    return "'" + str(value).replace("'", "''") + "'"
 
 
 def parquet(paths: Iterable[Path]) -> str:
