@@ -17,7 +17,7 @@ ROOT = Path(__file__).resolve().parent.parent
 FOLDER = ROOT / "requirements"
 #: The extras of each file; the first one constrains the others. What builds the wheel is in all of them.
 LOCKS: dict[str, tuple[str, ...]] = {
-    "dev": ("dev", "demo", "bench", "flash", "media", "web", "record", "archive", "foxglove", "mongo"),
+    "dev": ("dev", "demo", "bench", "flash", "media", "web", "record", "archive", "foxglove"),
     "robot": ("media", "record", "web"),
     "demo": ("demo",),
     "bench": ("bench",),

@@ -96,7 +96,7 @@ def test_what_a_recorder_uses_is_left_alone(folder: Path, run: Run) -> None:
 
 
 READING = [
-    ("search", "{rec}"), *(("export", "{rec}", f"{{tmp}}/a.{end}") for end in ("jsonl", "bson", "mcap", "mkv", "wav")),
+    ("search", "{rec}"), *(("export", "{rec}", f"{{tmp}}/a.{end}") for end in ("jsonl", "mcap", "mkv", "wav")),
 ]  # fmt: skip
 NO_ROBOT = f"no robot pebble/robots/nosuch in {{rec}}; there are: {FRED}, {GOOB}\n"
 
