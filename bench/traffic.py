@@ -27,7 +27,6 @@ from pebble.bench.rounds import Progress, measure_rounds
 from pebble.bench.show import Picture, Shown, plain_table
 from pebble.client.media_receiver import MediaReceiver
 from pebble.errors import PebbleError
-from pebble.recordings.library import FOREVER_NS
 from pebble.recordings.traffic.results import AUDIO, IDLE, SESSION, VIDEO, RobotTraffic
 from pebble.rig.processes import end_all
 from pebble.rig.testbed import Testbed
@@ -96,7 +95,7 @@ def analysed(settings: Settings) -> Analysed:
     with tempfile.TemporaryDirectory(prefix="pebble-traffic-") as scratch:
         recordings = Path(scratch) / "recordings"
         record(recordings, settings.idle_s, settings.session_s)
-        found = sources([recordings], Path(scratch), since_ns=0, until_ns=FOREVER_NS)
+        found = sources([recordings], Path(scratch))
         return {robot.robot.rpartition("/")[2]: robot for robot in analyse(found, Path(scratch)).robots}
 
 

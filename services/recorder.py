@@ -16,10 +16,6 @@ from pebble.runtime.service import Service, every
 
 _NICE: Final = 10  # whatever drives comes first
 _METRICS_S: Final = 10.0
-_LIMITS: Final = (
-    *("rotate_seconds", "rotate_bytes", "keep_bytes", "keep_media_days", "keep_state_days"),
-    *("free_bytes", "sync_seconds", "level", "media"),
-)
 
 
 class RobotRecorder(Service):
@@ -29,7 +25,7 @@ class RobotRecorder(Service):
 
     def start(self) -> None:
         section = self.config.services.recorder
-        options = Options(**{name: getattr(section, name) for name in _LIMITS})
+        options = Options(**{name: getattr(section, name) for name in Options.__struct_fields__})
         folder = section.place
         os.nice(_NICE)
         self._recorder = Recorder(folder, options, {"recorder": self.config.base})

@@ -35,7 +35,7 @@ Goob on Zenoh and Fred on MQTT, with simulated motor MCU, camera and microphone;
 Goob also with inertial sensor, loudspeaker and scripts, in a room with tags.
 MiniLAMP and BenJr are MCUs that use MQTT themselves: their firmware, on
 simulated pins."""
-_RECORDED = ("--keep", "256M", "--rotate-size", "32M", "--free", "512M", "--level", "1")  # fast rather than small
+_RECORDED = ("--keep", "256M", "--rotate", "5min")
 
 
 def run(

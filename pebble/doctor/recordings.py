@@ -45,7 +45,7 @@ def _running(folder: Path, now: float, entries: list[Entry]) -> CheckResult:
         left = sum(entry.is_active for entry in entries)
         if left:
             text = f"does not run, and {left} files in {folder} are not finished"
-            return warn(_WHAT, text, f"pebble recordings finish {folder}")
+            return warn(_WHAT, text, f"pebble recordings mend {folder}")
         return ok(_WHAT, "does not run now")
     status = _status(folder)
     silent_s = now - float(status.get("at", 0.0))
@@ -81,7 +81,7 @@ def _missed(entries: list[Entry], now: float) -> Iterator[CheckResult]:
     damaged = [entry for entry in entries if not (entry.is_finished or entry.is_active)]
     if damaged:
         text = f"{len(damaged)} files could not be finished, and are kept: {damaged[0].path}"
-        yield warn(_WHAT, text, "pebble recordings recover FILE OUT, or pebble recordings rm FILE")
+        yield warn(_WHAT, text, "pebble recordings mend FILE OUT, or pebble recordings rm FILE")
     finished = [entry for entry in entries if entry.is_finished and now - entry.ended <= _DAY_S]
     missing = sum(catalogue.look_at(entry.path).missing for entry in finished)
     if missing:

@@ -8,11 +8,9 @@ from pathlib import Path
 from typing import Any, Final
 
 from pebble.config.visible import shown
-from pebble.recordings.files.mcap import FILE_TOPIC, Channel, Recorded, RecordingError, number_in
-from pebble.recordings.files.reader import DAMAGE, MISSING, Summary, mapped, metadata_of, read
-from pebble.recordings.files.rewrite import REWRITTEN
-from pebble.recordings.files.scan import Damage
-from pebble.recordings.library import ACTIVE, channels_in, merged, robot_of
+from pebble.recordings.files.reader import DAMAGE, RecordingFile, missing_before
+from pebble.recordings.files.recorded import Channel, Recorded, RecordingError
+from pebble.recordings.library import ACTIVE, merged, robot_of
 from pebble.recordings.recorder.intake import EVENTS
 from pebble.transports.topics import matches
 
@@ -50,42 +48,40 @@ def look_at(path: Path, *, whole: bool = False) -> FileInfo:
     except OSError as error:
         raise RecordingError(f"{path}: {error.strerror}") from None
     info = FileInfo(path, size)
-    with mapped(path) as data:
-        summary = Summary.of(data)
-        if summary is None or whole:
-            _read_all(info, data)
+    with RecordingFile(path) as file:
+        if file.statistics is None or whole:
+            _read_all(info, file)
         else:
-            _take_over(info, summary)
-        if summary is not None:
-            about = metadata_of(data)
-            before, rewritten = (number_in(about.get(name, {}), MISSING) for name in (DAMAGE, REWRITTEN))
-            info.missing = max(info.missing, before) + rewritten
-            info.damaged = info.damaged or DAMAGE in about
+            _take_over(info, file)
+        metadata = file.metadata()
+        info.missing = file.damage.missing + missing_before(metadata)
+        info.finished = file.damage.finished
+        info.damaged = bool(file.damage.parts) or DAMAGE in metadata
+        info.problem = file.damage.report(active=info.is_active)
     return info
 
 
-def _take_over(info: FileInfo, summary: Summary) -> None:
-    statistics = summary.statistics
-    info.messages, info.first_ns, info.last_ns = statistics.messages, statistics.first_ns, statistics.last_ns
-    for number, count in statistics.counts.items():
-        if number in summary.channels:
-            _count(info, summary.channels[number], count)
+def _take_over(info: FileInfo, file: RecordingFile) -> None:
+    counted = file.statistics
+    if counted is not None:
+        info.messages, info.first_ns, info.last_ns = (
+            counted.message_count,
+            counted.message_start_time,
+            counted.message_end_time,
+        )
+        for number, count in counted.channel_message_counts.items():
+            _count(info, file.channels[number], count)
 
 
-def _read_all(info: FileInfo, data: Any) -> None:
-    damage = Damage()
-    for message in read(data, damage):
+def _read_all(info: FileInfo, file: RecordingFile) -> None:
+    for message in file.read():
         info.first_ns = message.log_ns if not info.messages else info.first_ns
         info.last_ns = message.log_ns
         info.messages += 1
         _count(info, message.channel, 1)
-    info.finished, info.missing, info.damaged = damage.finished, damage.missing, bool(damage.spans)
-    info.problem = damage.report(active=info.is_active)
 
 
 def _count(info: FileInfo, channel: Channel, count: int) -> None:
-    if channel.topic == FILE_TOPIC:
-        return
     info.topics[channel.topic] += count
     info.encodings[channel.topic] = channel.encoding
     robot = robot_of(channel)
@@ -130,12 +126,14 @@ def check_names(query: Query, paths: Iterable[Path], places: Iterable[Path]) -> 
         return
     found: list[Channel] = []
     for path in paths:
-        damage = Damage()
         try:
-            found += channels_in(path, damage)
+            with RecordingFile(path) as file:
+                for _ in file.read(chooses=lambda _channel: False) if file.statistics is None else ():
+                    pass
+                found += file.channels.values()
+                if file.damage.report(active=path.name.endswith(ACTIVE)):
+                    return
         except RecordingError:
-            return
-        if damage.report(active=path.name.endswith(ACTIVE)):
             return
     check_name("robot", query.robot, {robot for one in found if (robot := robot_of(one))}, places)
     topics = {one.topic for one in found if query.robot in (None, robot_of(one))}

@@ -1,16 +1,16 @@
 """Recordings as one stream of messages in the order of time, however many files they are in."""
 
-from collections.abc import Collection, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Final
 
-from pebble.recordings.files.mcap import MAGIC, Channel, Recorded, RecordingError
-from pebble.recordings.files.reader import FOREVER_NS as FOREVER_NS
-from pebble.recordings.files.reader import SUFFIX as SUFFIX
-from pebble.recordings.files.reader import Chooses, Summary, in_time_order, mapped, read
-from pebble.recordings.files.scan import Damage
+from pebble.recordings.files.reader import Chooses, RecordingFile, in_time_order
+from pebble.recordings.files.recorded import FOREVER_NS as FOREVER_NS
+from pebble.recordings.files.recorded import SUFFIX as SUFFIX
+from pebble.recordings.files.recorded import Channel, Damage, Recorded, RecordingError
+from pebble.recordings.files.records import MAGIC
 
 ACTIVE: Final = ".mcap.active"  # is being written, or was left by a recorder that was killed
 #: What is wrong with each file that was read.
@@ -45,32 +45,16 @@ def _is_recording(path: Path) -> bool:
     return path.name.endswith((SUFFIX, ACTIVE)) and (path.is_file() or path.is_symlink())
 
 
-def span(path: Path, damage: Damage | None = None) -> Span | None:
-    """The time that a file covers; None if it holds no message. One that is not finished is read as far as needed."""
-    with mapped(path) as data:
-        summary = Summary.of(data)
-        if summary is None:
-            first = next(read(data, damage), None)
-            return None if first is None else Span(first.log_ns, FOREVER_NS)
-        counted = summary.statistics
-        return Span(counted.first_ns, counted.last_ns) if counted.messages else None
+def span(path: Path) -> Span | None:
+    """Return the time that a file covers, without an end if it is not finished; None if it holds no message."""
+    with RecordingFile(path) as file:
+        return span_of(file)
 
 
-def channels_in(path: Path, damage: Damage | None = None) -> Collection[Channel]:
-    """The channels of a file: from its summary, else by reading it. Raises RecordingError."""
-    with mapped(path) as data:
-        summary = Summary.of(data)
-        if summary is not None:
-            return summary.channels.values()
-        found: list[Channel] = []
-
-        def note(channel: Channel) -> bool:
-            found.append(channel)
-            return False
-
-        for _ in read(data, damage, chooses=note):
-            pass
-        return found
+def span_of(file: RecordingFile) -> Span | None:
+    if not file.chunks:
+        return None
+    return Span(file.first_ns, file.last_ns if file.damage.finished else FOREVER_NS)
 
 
 def merged(
@@ -89,13 +73,13 @@ def merged(
     damages = {} if damages is None else damages
     due = []
     for path in paths:
-        damage = Damage()
-        one = span(path, damage)
-        if one is None:
+        with RecordingFile(path) as file:
+            covered, damage = span_of(file), file.damage
+        if covered is None:
             damages[path] = damage
-        elif one.last_ns >= since_ns and one.first_ns < until_ns:
+        elif covered.last_ns >= since_ns and covered.first_ns < until_ns:
             reading = partial(_messages, path, since_ns, until_ns, chooses, damages)
-            due.append((max(one.first_ns, since_ns), reading))
+            due.append((max(covered.first_ns, since_ns), reading))
     yield from in_time_order(due)
 
 
@@ -110,9 +94,9 @@ def _messages(path: Path, since_ns: int, until_ns: int, chooses: Chooses, damage
         path = path.with_name(path.name.removesuffix(ACTIVE) + SUFFIX)
     if not path.exists():  # deleted meanwhile, to make room
         return
-    damage = damages[path] = Damage()
-    with mapped(path) as data:
-        for message in read(data, damage, chooses=chooses, since_ns=since_ns, until_ns=until_ns):
+    with RecordingFile(path) as file:
+        damages[path] = file.damage
+        for message in file.read(chooses=chooses, since_ns=since_ns, until_ns=until_ns):
             if since_ns <= message.log_ns < until_ns:
                 yield message
 

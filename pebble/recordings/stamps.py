@@ -13,7 +13,7 @@ from pebble.contract.packets import KEY_FRAME, PBAT, PBVD, PictureKind
 _TAIL, _HEAD = 64, 512  # bytes of a JSON payload in which its stamp is looked for
 _STAMP: Final = re.compile(rb'"t(?:imestamp)?"\s*:\s*(-?\d+)(\.\d+)?([eE][+-]?\d+)?')
 _MILLISECONDS_FROM: Final = 1e11  # a stamp as large as this is in milliseconds
-_CLOCK_FROM_NS: Final = 10**18  # 2001: a smaller stamp counts from the start of a board, not from 1970
+CLOCK_FROM_NS: Final = 10**18  # 2001: a smaller stamp counts from the start of a board, not from 1970
 _LATEST_NS: Final = (1 << 63) - 1
 _SOUND_AT, _PICTURE_AT = 16, 11  # where the header of PBAT and of PBVD has its stamp: 8 bytes, milliseconds
 _BACKSLASH: Final = 0x5C
@@ -47,7 +47,7 @@ def shifted(payload: bytes, by_ns: int) -> bytes:
         return _shifted_json(payload, by_ns)
     at = _stamp_at(payload)
     stamp = stamp_ns(payload) if at else 0
-    if stamp < _CLOCK_FROM_NS or not 0 < stamp + by_ns <= _LATEST_NS:
+    if stamp < CLOCK_FROM_NS or not 0 < stamp + by_ns <= _LATEST_NS:
         return payload
     moved = (stamp + by_ns) // 1_000_000
     return payload[:at] + moved.to_bytes(8, "big") + payload[at + 8 :]
@@ -129,7 +129,7 @@ def _shifted_json(payload: bytes, by_ns: int) -> bytes:
     parts, at = [], 0
     for found in sorted(_stamps(payload), key=re.Match[bytes].start):
         stamp = _in_ns(found)
-        if stamp >= _CLOCK_FROM_NS and 0 < stamp + by_ns <= _LATEST_NS:
+        if stamp >= CLOCK_FROM_NS and 0 < stamp + by_ns <= _LATEST_NS:
             parts += [payload[at : found.start(1)], _moved(found, by_ns)]
             at = found.end()
     return b"".join([*parts, payload[at:]])

@@ -110,22 +110,21 @@ def of_impair() -> Results:
 
 
 def analysed() -> dict[str, RobotTraffic]:
-    """Return all of the paper's robots, with outages of each cause."""
+    """Return all of the paper's robots, with outages."""
     return {name: _robot_traffic(name) for name in ("goob", "fred", "minilamp", "benjr")}
 
 
 def _robot_traffic(name: str) -> RobotTraffic:
-    outages = [Outage(since_ns=0, length_ms=length, shared=length > 500) for length in (120.0, 180.0, 900.0)]
-    outages.append(Outage(since_ns=0, length_ms=250.0, recorder_late=True))
+    outages = [Outage(since_ns=0, length_ms=length) for length in (120.0, 180.0, 250.0, 900.0)]
     families = (("drive", 3.2), ("heartbeat", 1.2), ("video", 170.0), ("audio", 265.6))
     return RobotTraffic(
         robot=f"pebble/robots/{name}", machine="MCU" if name in ("minilamp", "benjr") else "Linux", messages=1000,
-        bytes=100_000, session_s=30, idle_s=30, offline=0, offline_s=0.0, sessions=[], outages=outages, streams=[],
+        bytes=100_000, session_s=30, idle_s=30, offline=0, offline_s=0.0, sessions=[], outages=outages,
         bandwidth=[
             Bandwidth(family, time, 30, kbps, 1.3 * kbps, 300, 10_000)
             for family, kbps in families
             for time in ("all", "session", "idle")
         ],
         intervals=Intervals(count=240, median_ms=250.0, p95_ms=260.0, p99_ms=400.0, longest_ms=1150.0),
-        latency=Latency(240, 1.0, 2.5, 30.0, 60.0, 0.0, Histogram(0.0, 2.0, [90, 80, 40, 20, 5, 0, 5])),
+        latency=Latency(240, 1.0, 2.5, 30.0, 60.0, Histogram(0.0, 2.0, [90, 80, 40, 20, 5, 0, 5])),
     )  # fmt: skip

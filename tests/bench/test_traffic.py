@@ -13,7 +13,6 @@ from pebble.bench import traffic as comparison
 from pebble.bench.show import finish
 from pebble.bench.traffic import QUICK, TABLE_4_1, Analysed, Settings, heartbeat_table, media_table, run
 from pebble.errors import PebbleError
-from pebble.recordings.library import FOREVER_NS
 from pebble.recordings.traffic.analysis import analyse
 from pebble.recordings.traffic.results import AUDIO, VIDEO
 from pebble.recordings.traffic.sources import sources
@@ -31,7 +30,7 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Analysed:
     """The analysis of the demo's robots in tests/data."""
     pytest.importorskip("duckdb")
     scratch = tmp_path_factory.mktemp("scratch")
-    found = sources([DRIVE, MEDIA], scratch, since_ns=0, until_ns=FOREVER_NS)
+    found = sources([DRIVE, MEDIA], scratch)
     return {robot.robot.rpartition("/")[2]: robot for robot in analyse(found, scratch).robots}
 
 

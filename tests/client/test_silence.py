@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
-from typing import Any
 
 import pytest
 
@@ -17,11 +16,8 @@ from pebble.client.scripts import RobotScripts
 from pebble.contract import LINK, ONLINE
 from pebble.contract.levels import LEVELS, link_of, silent_after
 from pebble.contract.payloads import LinkLevel
-from pebble.recordings.replay.live import LiveRobots
 from pebble.runtime.by_name import ByName
-from pebble.transports import Handler, Message, Subscription
-from pebble.transports.memory import MemoryHub, MemoryTransport
-from tests.support import until
+from pebble.transports import Message
 
 BASE = "pebble/robots/goob"
 NEAR_S = 0.1
@@ -65,39 +61,10 @@ def gives_its_place_to_another(level: LinkLevel, after_s: float) -> bool:
     return not by_name.omitted
 
 
-class Direct(MemoryTransport):
-    """Delivers in the order in which messages come; else each subscription has its own thread."""
-
-    def subscribe(self, filter_: str, handler: Handler, **options: Any) -> Subscription:
-        return super().subscribe(filter_, handler, **(options | {"direct": True}))
-
-
-def lets_a_replay_begin(level: LinkLevel, after_s: float) -> bool:
-    now, hub = [0.0], MemoryHub()
-    robot = MemoryTransport("robot", hub).open()
-    robot.publish(link(level).topic, link(level).payload, retain=True)
-    replay = Direct("replay", hub).open()  # after it: what comes live is a sign of life
-    live = LiveRobots([BASE], lambda: now[0])
-    after: list[Message] = []  # what arrives behind that which is retained
-    replay.subscribe("after", after.append)
-
-    def wait(seconds: float) -> None:
-        now[0] += seconds
-        if not after:
-            robot.publish("after", b"1")
-            assert until(lambda: after)
-
-    live.listen(replay, wait)
-    robot.close()
-    replay.close()
-    return now[0] <= after_s
-
-
 MEMBERS: dict[str, tuple[Callable[[LinkLevel, float], bool], dict[LinkLevel, float]]] = {
     "a page, or a terminal": (shown_by_a_page_or_terminal, {"wide": 2, "narrow": 3, "thin": 5}),
     "pebble estop status": (printed_by_estop_status, {"wide": 2, "narrow": 3, "thin": 5}),
     "who asks robots by name": (gives_its_place_to_another, {"wide": 2, "narrow": 3, "thin": 5}),
-    "a replay in its name": (lets_a_replay_begin, {"wide": 2, "narrow": 3, "thin": 5}),
 }
 
 

@@ -84,7 +84,7 @@ def test_files_that_were_left(tmp_path: Path) -> None:
     path = recorded(tmp_path)
     path.rename(path.with_name(f"{path.name}.active"))
     found = findings(tmp_path)[0]
-    assert (found.state, found.fix) == (State.WARN, f"pebble recordings finish {tmp_path}")
+    assert (found.state, found.fix) == (State.WARN, f"pebble recordings mend {tmp_path}")
 
 
 def test_gaps_of_the_last_hour_and_no_older_ones(tmp_path: Path) -> None:

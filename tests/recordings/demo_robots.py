@@ -10,7 +10,7 @@ import json
 from pathlib import Path
 from typing import Any
 
-from pebble.recordings.files.mcap import Recorded
+from pebble.recordings.files.recorded import Recorded
 from pebble.recordings.library import merged
 from pebble.transports import Message, QoS
 

@@ -17,9 +17,9 @@ from pathlib import Path
 import msgspec
 
 from pebble.media.decode import encoding_of
-from pebble.recordings.files.mcap import Recorded
+from pebble.recordings.files.recorded import Recorded
 from pebble.recordings.files.rewrite import Copy
-from pebble.recordings.files.writer import LIBRARY, McapWriter
+from pebble.recordings.files.writer import RecordingWriter
 from pebble.recordings.library import files, merged
 from tests.recordings.demo_robots import DRIVE, MEDIA
 from tests.support import ROOT, Child, listening, until
@@ -97,13 +97,13 @@ def _media(recorded: list[Recorded]) -> Iterator[Recorded]:
 
 def _write(path: Path, messages: Iterable[Recorded]) -> int:
     with path.open("wb", buffering=0) as file:
-        writer = McapWriter(file, library=LIBRARY)
+        writer = RecordingWriter(file)
         writer.metadata("pebble.recording", {"format": "1", "exported": "1"})
         copy = Copy(writer)
         for message in messages:
             copy.add(message)
         writer.finish()
-    return writer.contents.messages
+    return writer.messages
 
 
 if __name__ == "__main__":

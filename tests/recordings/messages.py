@@ -7,23 +7,22 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-from pebble.recordings.files.mcap import Packer
-from pebble.recordings.files.reader import mapped, read
-from pebble.recordings.files.scan import Damage
-from pebble.recordings.files.writer import McapWriter
+from pebble.recordings.files.reader import RecordingFile
+from pebble.recordings.files.recorded import Damage
+from pebble.recordings.files.writer import RecordingWriter
 
 START_NS = 1_790_000_000_000_000_000
 STEP_NS = 10_000_000
 
 
 def write(
-    path: Path, messages: int = 2000, *, finish: bool = True, level: int = 3, channels: int = 20, each: int = 100
+    path: Path, messages: int = 2000, *, finish: bool = True, channels: int = 20, each: int = 100
 ) -> list[tuple[str, bytes]]:
     """A file with random payloads, one chunk for every ``each`` of them; returns topics and payloads."""
     rng = random.Random(messages)
     written = []
     with path.open("wb", buffering=0) as file:
-        writer = McapWriter(file, library="pebble test", packer=Packer(level))
+        writer = RecordingWriter(file, library="pebble test")
         writer.metadata("pebble.recording", {"format": "1"})
         topics = [f"pebble/robots/r{number}/outgoing/t{number}" for number in range(channels)]
         numbers = [writer.channel(topic, "json", {"qos": "0"}) for topic in topics]
@@ -37,10 +36,15 @@ def write(
     return written
 
 
-def contents(path: Path, damage: Damage | None = None, **options: Any) -> list[tuple[str, bytes]]:
+def contents(path: Path, **options: Any) -> list[tuple[str, bytes]]:
     """Topics and payloads of what can be read."""
-    with mapped(path) as data:
-        return [(message.channel.topic, message.payload) for message in read(data, damage, **options)]
+    return read(path, **options)[0]
+
+
+def read(path: Path, **options: Any) -> tuple[list[tuple[str, bytes]], Damage]:
+    """Topics and payloads of what can be read, and what cannot."""
+    with RecordingFile(path) as file:
+        return [(message.channel.topic, message.payload) for message in file.read(**options)], file.damage
 
 
 def is_part_of(some: Iterable[Any], whole: Iterable[Any]) -> bool:

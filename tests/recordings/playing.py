@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from pebble.contract.packets import KEY_FRAME, Codec, Picture, PictureKind, Sound
-from pebble.recordings.files.mcap import Channel
-from pebble.recordings.files.writer import McapWriter
+from pebble.recordings.files.recorded import Channel
+from pebble.recordings.files.writer import RecordingWriter
 from pebble.recordings.replay.player import Player
 from pebble.recordings.replay.rules import Options, Rules
 from pebble.recordings.replay.source import ReplaySource
@@ -53,7 +53,7 @@ def ms(at: float) -> int:
 
 def write(path: Path, lines: Iterable[Line], *, finished: bool = True) -> Path:
     with path.open("wb", buffering=0) as file:
-        writer = McapWriter(file, library="pebble test")
+        writer = RecordingWriter(file, library="pebble test")
         numbers: dict[tuple[str, str], int] = {}
         for line in lines:
             key = line.topic, str(line.metadata)

@@ -7,43 +7,35 @@ from pathlib import Path
 
 import pytest
 
-from pebble.recordings.replay.player import Player
-from pebble.recordings.replay.rules import Options, Rules
-from pebble.recordings.replay.source import ReplaySource
-from pebble.transports import Message, Transport
+from pebble.recordings.library import merged
+from pebble.transports import Message, QoS, Transport
 from pebble.transports.memory import MemoryHub, MemoryTransport
-from tests.recordings.playing import VirtualTime
+from pebble.transports.topics import matches
 from tests.support import until
 
-#: Everything as it was: in a hub of its own a replay moves no robot.
-AS_RECORDED = Options(system=None, incoming=True, actions=True, retain=True, shift=False)
-
-Plays = Callable[..., Player]
+Plays = Callable[..., int]
 
 
 @pytest.fixture
 def recording() -> Iterator[Plays]:
-    """``recording(paths, hub)`` publishes recordings to the clients of a hub, and returns when they have received all.
+    """``recording(path, hub)`` publishes a recording to the clients of a hub, and returns when they have received all.
 
-    It takes no time: of 60 s only as long as the clients need. ``options`` and the keywords of `Player` may follow.
+    It takes no time: of 60 s only as long as the clients need. A filter of topics may follow.
     """
     transports: list[Transport] = []
 
-    def play(paths: list[Path], hub: MemoryHub, options: Options = AS_RECORDED, **playing: float | bool) -> Player:
-        time, source = VirtualTime(), ReplaySource(paths)
-        rules = Rules(options, source.channels)
+    def play(path: Path, hub: MemoryHub, filter_: str = "#") -> int:
         transport = MemoryTransport("recording", hub).open()
         transports.append(transport)
-
-        def publish(message: Message) -> bool:
-            accepted = transport.publish(message.topic, message.payload, qos=message.qos, retain=message.retain)
-            assert until(lambda: not any(client._inbox for client in hub._connected_clients), step=0.0001)
-            return accepted
-
-        clocks = {"now": time.now, "wall_ns": time.wall_ns, "wait": time.wait}
-        player = Player(source, rules, publish, **clocks, **playing)  # type: ignore[arg-type]
-        player.run()
-        return player
+        count = 0
+        for one in merged([path]):
+            if matches(filter_, one.channel.topic):
+                flags = one.channel.metadata
+                message = Message(one.channel.topic, one.payload, QoS(int(flags["qos"])), flags.get("retain") == "1")
+                transport.publish(message.topic, message.payload, qos=message.qos, retain=message.retain)
+                count += 1
+                assert until(lambda: not any(client._inbox for client in hub._connected_clients), step=0.0001)
+        return count
 
     yield play
     for transport in transports:

@@ -14,19 +14,19 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import msgspec
 import numpy as np
 
 from pebble.contract.packets import KEY_FRAME, Codec, Picture, PictureKind, Sound
-from pebble.recordings.files.writer import McapWriter
+from pebble.recordings.files.writer import RecordingWriter
 from pebble.recordings.stamps import stamp_ns
 from pebble.recordings.traffic.activity import Activity
 from pebble.recordings.traffic.duck import connected, quoted
-from pebble.recordings.traffic.index import COLUMNS, FOLDER, Entry, Part
+from pebble.recordings.traffic.index import COLUMNS, PICTURE, SOUND
 
 START_NS = 1_763_600_400 * 10**9  # 2025-11-20 01:00 UTC
 _S, _MS = 10**9, 10**6
 _DAY_S = 86_400
+_NO_ROWS = f"SELECT {', '.join(f'NULL::{kind} AS {name}' for name, kind in COLUMNS.items())} WHERE false"
 
 
 @dataclass(frozen=True)
@@ -50,7 +50,6 @@ class Robot:
     delay_ms: float = 30.0
     outages: tuple[tuple[float, float], ...] = ()
     session: tuple[float, float] | None = None  # driven, with video and sound if it is a Linux robot
-    lost_every: int = 0  # of this many packets of sound, one
 
     @property
     def base(self) -> str:
@@ -60,7 +59,7 @@ class Robot:
 #: The robots of the paper. All but BenJr lose their heartbeats at 20 s: that is no robot's fault.
 SHARED_OUTAGE = (20.0, 1.2)
 FLEET = (
-    Robot("goob", outages=(SHARED_OUTAGE, (42.0, 0.8)), session=(10.0, 40.0), lost_every=100),
+    Robot("goob", outages=(SHARED_OUTAGE, (42.0, 0.8)), session=(10.0, 40.0)),
     Robot("fred", ahead_ms=250.0, outages=(SHARED_OUTAGE,), session=(5.0, 25.0)),
     Robot("minilamp", linux=False, whole_seconds=True, outages=(SHARED_OUTAGE,), session=(30.0, 35.0)),
     Robot("benjr", linux=False, whole_seconds=True, outages=((50.0, 2.0),)),
@@ -109,9 +108,8 @@ class _Making:
 
     def sound(self, since: float, until: float) -> Iterator[Sent]:
         for number, at in enumerate(self._times(since, until, 50.0, jitter_ms=0.0), start=1):
-            if not self._robot.lost_every or number % self._robot.lost_every:
-                packet = Sound(Codec.PCM16LE, 1, 16000, 320, number, self._ms(at), bytes(640))
-                yield self._sent(at, "outgoing/audio", packet.pack(), jitter_ms=1.0)
+            packet = Sound(Codec.PCM16LE, 1, 16000, 320, number, self._ms(at), bytes(640))
+            yield self._sent(at, "outgoing/audio", packet.pack(), jitter_ms=1.0)
 
     def pictures(self, since: float, until: float) -> Iterator[Sent]:
         for number, at in enumerate(self._times(since, until, 15.0)):
@@ -144,7 +142,7 @@ def write_recording(path: Path, messages: Iterable[Sent], *, finished: bool = Tr
     path.parent.mkdir(parents=True, exist_ok=True)
     channels: dict[tuple[str, bool], int] = {}
     with path.open("wb", buffering=0) as file:
-        writer = McapWriter(file, library="pebble test")
+        writer = RecordingWriter(file, library="pebble test")
         for sent in messages:
             number = channels.get((sent.topic, sent.retained))
             if number is None:
@@ -176,35 +174,30 @@ class _Column:
     size: Any
     direction: str = "outgoing"
     activity: Activity = Activity.NONE
-    kind: int = 0
+    medium: int = 0
     delay_s: float = 0.03
     whole_seconds: bool = False
     stamped: bool = True
 
     @property
     def is_media(self) -> bool:
-        return self.kind != 0
+        return self.medium != 0
 
 
 def write_day(archive: Path, *, robots: Iterable[int], hours: int) -> int:
-    """The index of ``hours`` of some robots, by their numbers, in one recording per hour; returns its rows.
+    """The indexes of ``hours`` of some robots, by their numbers, one for each hour; returns their rows.
 
     Each robot is used for two of 24 hours; eight of ten have video and sound. Two of ten cut their stamps to seconds.
     """
     chance, rows = np.random.default_rng(1), 0
+    archive.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory() as scratch, connected(Path(scratch), memory_mb=256) as connection:
         for hour in range(hours):
-            parts = []
-            for robot in robots:
-                columns = list(_hour(chance, robot, hour))
-                base = f"pebble/robots/robot{robot:02}"
-                parts += _write_parts(connection, archive, base, hour, columns)
-            name = f"synthetic-{hour:04}"
-            entry = Entry(1, f"{name}.mcap", 0, 0, sum(part.rows for part in parts), 0, parts, [])
-            path = archive / FOLDER / "recordings" / f"{name}.json"
-            path.parent.mkdir(parents=True, exist_ok=True)
-            path.write_bytes(msgspec.json.encode(entry))
-            rows += entry.rows
+            columns = {f"pebble/robots/robot{robot:02}": list(_hour(chance, robot, hour)) for robot in robots}
+            for lane, is_media in (("state", False), ("media", True)):
+                chosen = [(base, one) for base, each in columns.items() for one in each if one.is_media == is_media]
+                _write_index(connection, archive / f"synthetic-{hour:04}.{lane}.parquet", chosen)
+                rows += sum(len(column.at) for _, column in chosen)
     return rows
 
 
@@ -221,10 +214,12 @@ def _hour(chance: np.random.Generator, robot: int, hour: int) -> Iterator[_Colum
             "drive-values", _regular(chance, begin, 3600.0, 20.0), 24, "incoming", Activity.DRIVE, stamped=False
         )
         if not whole:
-            yield _Column("audio", _regular(chance, begin, 3600.0, 50.0, 0.0), 664, activity=Activity.MEDIA, kind=21)
+            yield _Column(
+                "audio", _regular(chance, begin, 3600.0, 50.0, 0.0), 664, activity=Activity.MEDIA, medium=SOUND
+            )
             pictures = _regular(chance, begin, 3600.0, 15.0)
             sizes = chance.integers(800, 2500, len(pictures))
-            yield _Column("front-camera", pictures, sizes, activity=Activity.MEDIA, kind=15)
+            yield _Column("front-camera", pictures, sizes, activity=Activity.MEDIA, medium=PICTURE)
 
 
 def _regular(chance: np.random.Generator, begin: float, seconds: float, rate_hz: float, jitter_s: float = 0.005) -> Any:
@@ -232,23 +227,14 @@ def _regular(chance: np.random.Generator, begin: float, seconds: float, rate_hz:
     return begin + np.arange(count) / rate_hz + (chance.random(count) * jitter_s if jitter_s else 0.0)
 
 
-def _write_parts(connection: Any, archive: Path, base: str, hour: int, columns: Sequence[_Column]) -> list[Part]:
-    day = str(np.datetime64(START_NS // _S // _DAY_S * _DAY_S + hour * 3600, "s").astype("M8[D]"))
-    found = []
-    for lane, of_lane in (("state", [one for one in columns if not one.is_media]),
-                          ("media", [one for one in columns if one.is_media])):  # fmt: skip
-        if not of_lane:
-            continue
-        path = f"day={day}/robot={base.replace('/', '%2F')}/synthetic-{hour:04}.{lane}.parquet"
-        (archive / FOLDER / path).parent.mkdir(parents=True, exist_ok=True)
-        queries = []
-        for number, column in enumerate(of_lane):
-            connection.register(f"c{number}", _arrays(column))
-            queries.append(f"SELECT {_select(column)} FROM c{number}")
-        query = f"{' UNION ALL '.join(queries)} ORDER BY ts"
-        connection.execute(f"COPY ({query}) TO {quoted(archive / FOLDER / path)} (FORMAT parquet, COMPRESSION zstd)")
-        found.append(Part(base, day, path, sum(len(one.at) for one in of_lane)))
-    return found
+def _write_index(connection: Any, path: Path, columns: Sequence[tuple[str, _Column]]) -> None:
+    queries = []
+    for number, (robot, column) in enumerate(columns):
+        connection.register(f"c{number}", _arrays(column))
+        queries.append(f"SELECT {_select(robot, column)} FROM c{number}")
+    about = "{recording: 'synthetic.mcap', size: '0', changed_ns: '0', missing: '0', unread: ''}"
+    query = f"{' UNION ALL '.join(queries)} ORDER BY robot, ts" if queries else _NO_ROWS
+    connection.execute(f"COPY ({query}) TO {quoted(path)} (FORMAT parquet, COMPRESSION zstd, KV_METADATA {about})")
 
 
 def _arrays(column: _Column) -> dict[str, Any]:
@@ -260,27 +246,25 @@ def _arrays(column: _Column) -> dict[str, Any]:
         "ts": received,
         "stamp": stamp // _S * _S if column.whole_seconds else stamp,
         "size": np.broadcast_to(np.asarray(column.size, "u4"), stamp.shape).copy(),
-        "number": np.arange(len(stamp), dtype="u4"),
     }
 
 
-def _select(column: _Column) -> str:
+def _select(robot: str, column: _Column) -> str:
     media = column.is_media
     values = {
         "ts": "make_timestamp_ns(ts)",
         "stamp": "make_timestamp_ns(stamp)" if column.stamped else "NULL",
+        "robot": f"'{robot}'",
         "direction": f"'{column.direction}'",
         "metric": f"'{column.metric}'",
         "size": "size",
         "qos": "0" if media else "1",
         "retain": str(column.metric == "online").lower(),
         "retained": "false",
-        "number": "number" if media else "NULL",
-        "keyframe": "number % 30 = 0" if column.kind == 15 else "NULL",
-        "kind": str(column.kind) if media else "NULL",
+        "medium": str(column.medium) if media else "NULL",
         "activity": str(int(column.activity)),
         "online": "true" if column.metric == "online" else "NULL",
-        "file": "'synthetic.mcap'",
+        "event": "NULL",
     }
     return ", ".join(f"{values[name]}::{type_} AS {name}" for name, type_ in COLUMNS.items())
 
@@ -293,7 +277,7 @@ def main() -> None:
     given = parser.parse_args()
     rows = write_day(given.archive, robots=range(given.robots), hours=given.hours)
     size = sum(path.stat().st_size for path in given.archive.rglob("*.parquet"))
-    print(f"{rows} rows, {size / 1e6:.0f} MB of Parquet in {given.archive / FOLDER}")  # noqa: T201
+    print(f"{rows} rows, {size / 1e6:.0f} MB of Parquet in {given.archive}")  # noqa: T201
 
 
 if __name__ == "__main__":

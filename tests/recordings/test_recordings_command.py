@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from pebble.recordings import library
-from pebble.recordings.files.writer import McapWriter
+from pebble.recordings.files.writer import RecordingWriter
 from pebble.recordings.recorder.recorder import Recorder
 from pebble.recordings.recorder.settings import Options
 from tests.commands.command_line import Run
@@ -87,17 +87,16 @@ def test_what_a_recorder_uses_is_left_alone(folder: Path, run: Run) -> None:
     recorder = Recorder(folder, Options(free_bytes=0))
     recorder.start()
     try:
-        for command in (("rm", folder, "--robot", "fred", "--yes"), ("finish", folder)):
+        for command in (("rm", folder, "--robot", "fred", "--yes"), ("mend", folder)):
             assert (run("recordings", *command), len(run.err.splitlines())) == (1, 1)
             assert "a recorder writes here" in run.err
-        assert run("recordings", "compact", folder) == 0
     finally:
         recorder.stop()
     assert messages(folder) == 201
 
 
 READING = [
-    ("search", "{rec}"), *(("export", "{rec}", f"{{tmp}}/a.{end}") for end in ("jsonl", "bson", "mcap", "mkv", "wav")),
+    ("search", "{rec}"), *(("export", "{rec}", f"{{tmp}}/a.{end}") for end in ("jsonl", "mcap", "mkv", "wav")),
 ]  # fmt: skip
 NO_ROBOT = f"no robot pebble/robots/nosuch in {{rec}}; there are: {FRED}, {GOOB}\n"
 
@@ -116,7 +115,7 @@ NO_ROBOT = f"no robot pebble/robots/nosuch in {{rec}}; there are: {FRED}, {GOOB}
         (("search", "{rec}", "-r", "fred", "-t", "outgoing/logs"), f"; there are: {FRED}/outgoing/online\n"),
         (("rm", "{rec}"), "what to delete is missing"),
         (("search", "{rec}", "--since", "soon"), "--since"),
-        (("compact", "{tmp}/none"), "there is no such folder"),
+        (("mend", "{tmp}/none"), "none: No such file or directory"),
     ],
 )
 def test_mistakes_are_one_line(
@@ -139,7 +138,7 @@ def test_mistakes_are_one_line(
 def test_a_foreign_file_cannot_forge_lines(tmp_path: Path, run: Run) -> None:
     path = tmp_path / "[red]evil.mcap"
     with path.open("wb", buffering=0) as file:
-        writer = McapWriter(file, library="evil")
+        writer = RecordingWriter(file, library="evil")
         channel = writer.channel("a/b/c/outgoing/x\n2026 forged\x1b[31m", "json", {"qos": "?"})
         writer.metadata("pebble.damage", {"missing_messages": "many"})
         events = writer.channel("$recorder/events", "json", {})

@@ -20,7 +20,7 @@ def without(package: str, kind: str, answer: Connection, archive: Path, scratch:
     paths = [str(path) for path in archive.rglob("*.mcap")]
     stretch = ms(5) * 10**6, ms(6) * 10**6
     if kind == "timeline":
-        questions.make_timeline_job(answer, archive, paths, scratch / package, GOOB, stretch)
+        questions.make_timeline_job(answer, paths, scratch / package, GOOB, stretch)
     else:
         questions.export_job(answer, paths, scratch / f"{package}.mkv", GOOB, stretch, "mkv")
 

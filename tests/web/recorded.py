@@ -22,7 +22,7 @@ from PIL import Image
 
 from pebble.contract.packets import Codec, Picture, PictureKind, Sound
 from pebble.media.speech import Speech
-from pebble.recordings.files.writer import McapWriter
+from pebble.recordings.files.writer import RecordingWriter
 from pebble.recordings.recorder.intake import EVENTS
 from tests.support import ROOT
 
@@ -161,7 +161,7 @@ def _media(since: int, until: int) -> list[Recorded]:
 def _write(path: Path, messages: list[Recorded]) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     with path.open("wb", buffering=0) as file:
-        writer = McapWriter(file, library="pebble test")
+        writer = RecordingWriter(file, library="pebble test")
         channels: dict[str, int] = {}
         second = 0
         for at, topic, payload in messages:

@@ -34,15 +34,12 @@ def analyse(
     robot: Robots = None,
     output: Output = FOLDER,
     csv: Annotated[bool, typer.Option("--csv", help="Write each table as a CSV file, too.")] = False,
-    overhead: Annotated[
-        bool, typer.Option("--overhead", help="Bandwidths with the headers of MQTT and TCP/IP, not of payloads alone.")
-    ] = False,
 ) -> int:
     """Bandwidth, sessions, outages and latency of recordings.
 
     Writes one HTML page with the figures of the paper's section 4.1 for every robot. A folder may be analysed while
-    it is recorded to. Recordings are indexed first, in the folder's index/, which may be deleted. Needs the packages
-    of the extra "archive".
+    it is recorded to. Each recording is indexed first, in a .parquet beside it, which may be deleted. Needs the
+    packages of the extra "archive".
 
     \b
         pebble analyse recordings/
@@ -62,19 +59,31 @@ def analyse(
 
     since_ns, until_ns = parse_period(since, until, now=datetime.now())
     bases = [base_of(name) for name in robot or ()]
+    with _errors_of_files():
+        output.mkdir(parents=True, exist_ok=True)  # before the work, not after it
     with tempfile.TemporaryDirectory(prefix="pebble-analyse-") as folder, _progress() as progress:
         scratch = Path(folder)
-        found = sources(places, scratch, robots=bases, since_ns=since_ns, until_ns=until_ns, progress=progress)
+        with _errors_of_files():
+            found = sources(places, scratch, progress)
         for line in found.unread:
             typer.echo(f"pebble: {shown(line)}", err=True)
         for base in () if found.unread else bases:
             check_name("robot", base, found.robots, places)
-        traffic = analyse_traffic(
-            found, scratch, since_ns=since_ns, until_ns=until_ns, overhead=overhead, progress=progress
-        )
+        traffic = analyse_traffic(found, scratch, since_ns=since_ns, until_ns=until_ns, robots=bases, progress=progress)
         written = write_report(traffic, output, csv=csv, advance=progress)
     _print(traffic, written)
     return 1 if found.unread else 0
+
+
+@contextmanager
+def _errors_of_files() -> Iterator[None]:
+    """Raise PebbleError for OSError."""
+    from pebble.errors import PebbleError
+
+    try:
+        yield
+    except OSError as error:
+        raise PebbleError(f"{error.filename}: {error.strerror}") from None
 
 
 @contextmanager
@@ -113,7 +122,7 @@ def _print(traffic: Traffic, written: list[Path]) -> None:
     from pebble.recordings.traffic.report import remarks
 
     table = Table(box=box.SIMPLE_HEAD)
-    for heading in ("robot", "messages", "sessions", "outages", "shared", "latency", "video", "audio"):
+    for heading in ("robot", "messages", "sessions", "outages", "latency", "video", "audio"):
         is_name = heading == "robot"
         table.add_column(
             heading, justify="left" if is_name else "right", no_wrap=True, min_width=8 if is_name else None
@@ -133,7 +142,6 @@ def _cells(robot: RobotTraffic) -> Iterator[str]:
     from pebble.recordings.traffic.results import AUDIO, VIDEO
 
     yield from (f"{robot.messages:,}", str(len(robot.sessions)), str(len(robot.outages)))
-    yield f"{robot.shared_share:.0%}" if robot.outages else ""
     latency = robot.latency
     yield "" if latency is None else f"{latency.median_ms:.0f}"
     for family in (VIDEO, AUDIO):

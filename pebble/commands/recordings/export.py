@@ -23,10 +23,9 @@ from pebble.recordings.exports.copy import write_copy
 from pebble.recordings.exports.film import write_film, write_wav
 from pebble.recordings.exports.foxglove import write_foxglove
 from pebble.recordings.exports.lines import BadLine, Imported, read_lines, write_lines
-from pebble.recordings.exports.mongo import read_mongo, write_mongo
 from pebble.recordings.exports.unfinished import unfinished
-from pebble.recordings.files.mcap import Recorded
-from pebble.recordings.files.writer import LIBRARY, McapWriter
+from pebble.recordings.files.recorded import Recorded
+from pebble.recordings.files.writer import RecordingWriter
 from pebble.recordings.library import Damages, files, merged, problems
 from pebble.recordings.stamps import stamp_ns
 
@@ -35,7 +34,6 @@ class Form(StrEnum):
     """What recordings can be exported to."""
 
     LINES = "lines"
-    MONGO = "mongo"
     FOXGLOVE = "foxglove"
     MKV = "mkv"
     MP4 = "mp4"
@@ -45,7 +43,6 @@ class Form(StrEnum):
 
 _BY_SUFFIX = {
     ".jsonl": Form.LINES,
-    ".bson": Form.MONGO,
     ".mkv": Form.MKV,
     ".mp4": Form.MP4,
     ".wav": Form.WAV,
@@ -62,7 +59,7 @@ def export(
     until: Until = None,
     topic: Topics = None,
 ) -> int:
-    """Export to JSON lines, MongoDB, Foxglove, a film, MCAP."""
+    """Export to JSON lines, Foxglove, a film, sound, MCAP."""
     form = form or _BY_SUFFIX.get(target.suffix)
     if form is None:
         raise PebbleError(f"{target}: what to write is not clear from this name: add --as lines, foxglove, mkv …")
@@ -84,15 +81,14 @@ def export(
 
 
 def import_(
-    source: Annotated[Path, typer.Argument(help="logger.jsonl, or messages.bson of mongodump.", metavar="FILE")],
+    source: Annotated[Path, typer.Argument(help="JSON lines.", metavar="FILE")],
     target: Annotated[Path, typer.Argument(help="A new recording.", metavar="OUT.mcap")],
 ) -> int:
-    """Import what the original's logger or MongoDB recorded."""
+    """Import what the original's logger recorded, or an export as lines."""
     with _opened(source) as file, unfinished(target, overwrite=False) as path, path.open("wb", buffering=0) as out:
-        writer = McapWriter(out, library=LIBRARY)
+        writer = RecordingWriter(out)
         writer.metadata("pebble.recording", {"format": "1", "imported": source.name})
-        read = read_mongo if ".bson" in source.name else read_lines
-        counted = _import(read(file), writer)
+        counted = _import(read_lines(file), writer)
         writer.finish()
     typer.echo(f"{target}: {counted['messages']:,} messages")
     if counted["bad"]:
@@ -122,14 +118,12 @@ def _export(
     with unfinished(target, overwrite=False) as path, path.open("wb") as out:
         if form is Form.LINES:
             count = write_lines(messages, out, on_time=on_time)
-        elif form is Form.MONGO:
-            count = write_mongo(messages, out, on_time=on_time)
         else:
             count = write_copy(messages, out, on_time=on_time, beside=beside)
     return f"{target}: {count:,} messages"
 
 
-def _import(found: Iterable[Imported | BadLine], writer: McapWriter) -> Counter[str]:
+def _import(found: Iterable[Imported | BadLine], writer: RecordingWriter) -> Counter[str]:
     counted = Counter[str]()
     channels: dict[tuple[str, str, tuple[tuple[str, str], ...]], int] = {}
     for one in found:

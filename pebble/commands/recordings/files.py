@@ -1,7 +1,8 @@
-"""``pebble recordings`` finish, recover, compact, index and rm: what is done to the files themselves."""
+"""``pebble recordings`` mend and rm: what is done to the files themselves."""
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Annotated
 
@@ -11,80 +12,33 @@ from pebble.client.names import base_of
 from pebble.commands.recordings.options import RobotOption, Since, Until, period
 from pebble.commands.recordings.progress import progress
 from pebble.commands.recordings.report import report_left, report_unread
-from pebble.commands.terminal import show
 from pebble.config.visible import shown
 from pebble.errors import PebbleError
 from pebble.recordings.catalogue import Query, check_names
-from pebble.recordings.files.finish import finish as finish_file
-from pebble.recordings.files.mcap import Recorded, RecordingError
-from pebble.recordings.files.rewrite import rewrite
-from pebble.recordings.files.scan import Damage
+from pebble.recordings.files.recorded import Recorded, RecordingError
+from pebble.recordings.files.rewrite import Keeps, rewrite
 from pebble.recordings.library import ACTIVE, SUFFIX, files, robot_of, span
-from pebble.recordings.recorder.folder import DAMAGED, Folder, finished_path, rename
-from pebble.recordings.traffic.index import Index, archive_of, not_indexed
+from pebble.recordings.recorder.finisher import mend as mend_leftover
+from pebble.recordings.recorder.folder import DAMAGED, Folder, finished_path
+from pebble.recordings.traffic.index import index_path
+
+_DATE = re.compile(r"\d{2}|\d{4}", re.ASCII)
 
 
-def finish(folder: Annotated[Path, typer.Argument(help="Folder of a recorder.", metavar="DIR")]) -> int:
-    """Finish what a killed recorder left; the next one there does it, too."""
-    owner = Folder(_existing(folder))
-    try:
-        owner.take()
-    except RecordingError as error:
-        raise PebbleError(f"{folder}: a recorder writes here, and finishes them itself") from error
-    try:
-        return _finish_all(owner)
-    finally:
-        owner.release()
-
-
-def recover(
-    source: Annotated[Path, typer.Argument(help="A damaged recording; it stays as it is.", metavar="FILE")],
-    target: Annotated[Path, typer.Argument(help="A new file.", metavar="OUT")],
+def mend(
+    source: Annotated[Path, typer.Argument(help="Folder of a recorder; or one file.", metavar="DIR|FILE")],
+    target: Annotated[Path | None, typer.Argument(help="For a file: a new one.", metavar="OUT")] = None,
 ) -> int:
-    """Copy what can be read of a recording into a new file."""
-    files([source])
-    if target.exists():
-        raise PebbleError(f"{target} exists already")
-    made = rewrite(source, target)
-    typer.echo(f"{target}: {made.messages:,} messages, {made.missing:,} missing")
-    if made.unread:
-        typer.echo(f"pebble: {source}: {shown(made.unread)}", err=True)
-    return 0 if made.messages else 1
+    """Copy what can be read of damaged or unfinished recordings.
 
-
-def compact(folder: Annotated[Path, typer.Argument(help="Folder of a recorder.", metavar="DIR")]) -> int:
-    """Write files again in larger pieces, which are smaller."""
-    before = after = left = 0
-    owner = Folder(_existing(folder))
-    with owner.maintained():
-        entries = [entry for entry in owner.entries() if entry.is_finished]
-        with progress("compacting", len(entries)) as advance:
-            for number, entry in enumerate(entries, 1):
-                try:
-                    made = rewrite(entry.path, entry.path)
-                except (PebbleError, OSError) as error:
-                    left += report_left(error)
-                    continue
-                before, after = before + entry.size, after + made.size
-                advance(number)
-    typer.echo(f"{show.size(before)} became {show.size(after)}")
-    return 1 if left else 0
-
-
-def index(folder: Annotated[Path, typer.Argument(help="Folder of a recorder.", metavar="DIR")]) -> int:
-    """Index recordings for `pebble analyse`, as Parquet files."""
-    from pebble.recordings.traffic.duck import require_packages
-
-    require_packages("duckdb", "matplotlib")
-    due, unread = not_indexed(folder), []
-    with progress("indexing", len(due)) as advance:
-        for number, path in enumerate(due, 1):
-            entry = Index(folder).add(path)
-            if entry.unread:
-                unread.append(f"{path}: {entry.unread}")
-            advance(number)
-    typer.echo(f"{len(due)} recordings indexed")
-    return report_unread(unread)
+    In a folder that is what a killed recorder left, as the next recorder there does: a file of which not all could be
+    read stays beside its copy, as ….mcap.damaged. FILE stays as it is.
+    """
+    if not source.is_dir():
+        return _mend_file(source, target)
+    owner = Folder(source)
+    with owner.taken():
+        return _mend_all(owner)
 
 
 def rm(
@@ -111,19 +65,23 @@ def rm(
         inside = since_ns <= message.log_ns < until_ns
         return not inside or (base is not None and robot_of(message.channel) != base)
 
-    if Folder.is_in_use(_existing(folder)):
-        raise PebbleError(f"{folder}: a recorder writes here, and would write retained values again: stop it first")
-    entries = Folder(folder).entries()
+    owner = Folder(_existing(folder))
+    with owner.taken():  # a recorder would write retained values again
+        return _rm(owner, base, (since_ns, until_ns), keeps, yes=yes)
+
+
+def _rm(owner: Folder, base: str | None, period_ns: tuple[int, int], keeps: Keeps, *, yes: bool) -> int:
+    entries, folder = owner.entries(), owner.root
     left = sum(report_left(f"{entry.path}: is not finished, or damaged") for entry in entries if not entry.is_finished)
     finished = [entry.path for entry in entries if entry.is_finished]
     if not left:
         check_names(Query(base), finished, [folder])
-    due = [path for path in finished if _reaches_into(path, since_ns, until_ns)]
+    due = [path for path in finished if _reaches_into(path, *period_ns)]
     what = f"{shown(base)} " if base else "everything "
     if not yes and not typer.confirm(f"Delete {what}from {len(due)} files in {folder}?"):
         return 1
     deleted = 0
-    with Folder(folder).maintained(), progress("deleting", len(due)) as advance:
+    with progress("deleting", len(due)) as advance:
         for number, path in enumerate(due, 1):
             try:
                 names = path.stat().st_nlink
@@ -136,7 +94,7 @@ def rm(
                 if names > 1:
                     left += 1
                     typer.echo(f"pebble: {path}: has other names (hard links), which keep all of it", err=True)
-                Index(folder).remove(path)
+                index_path(path).unlink(missing_ok=True)
                 if made.is_empty:
                     path.unlink()
             advance(number)
@@ -150,12 +108,11 @@ def rm(
 
 def _reaches_into(path: Path, since_ns: int, until_ns: int) -> bool:
     """Whether a file may hold messages of a period: one that cannot be read may."""
-    damage = Damage()
     try:
-        one = span(path, damage)
+        covered = span(path)
     except RecordingError:
         return True
-    return damage.unread if one is None else one.last_ns >= since_ns and one.first_ns < until_ns
+    return covered is None or (covered.last_ns >= since_ns and covered.first_ns < until_ns)
 
 
 def _delete_whole(path: Path, *, yes: bool) -> int:
@@ -164,35 +121,49 @@ def _delete_whole(path: Path, *, yes: bool) -> int:
         raise PebbleError(f"{path} is a link: name the file itself")
     if not path.is_file() or not path.name.endswith((SUFFIX, ACTIVE, DAMAGED)):
         raise PebbleError(f"{path}: there is no such folder or recording")
-    archive = archive_of(path.parent)
-    if path.name.endswith(ACTIVE) and Folder.is_in_use(archive):
+    if path.name.endswith(ACTIVE) and Folder.is_in_use(_archive_of(path)):
         raise PebbleError(f"{path}: is being written: stop the recorder first")
     if not yes and not typer.confirm(f"Delete {path}?"):
         return 1
     path.unlink()
-    Index(archive).remove(path)
+    index_path(path).unlink(missing_ok=True)
     typer.echo(f"{path.name}: deleted")
     return 0
 
 
-def _finish_all(folder: Folder) -> int:
-    left = [entry.path for entry in folder.entries() if entry.is_active]
-    failed = 0
+def _mend_file(source: Path, target: Path | None) -> int:
+    files([source])
+    if target is None:
+        raise PebbleError(f"{source}: name a new file for what can be read: pebble recordings mend {source} OUT")
+    if target.exists():
+        raise PebbleError(f"{target} exists already")
+    made = rewrite(source, target)
+    typer.echo(f"{target}: {made.messages:,} messages, {made.missing:,} missing")
+    report_unread([f"{source}: {made.unread}"] if made.unread else [])
+    return 0 if made.messages else 1
+
+
+def _mend_all(folder: Folder) -> int:
+    left, failed = [entry.path for entry in folder.entries() if entry.is_active], False
     for path in left:
         try:
-            made = finish_file(path)
-            rename(path, finished_path(path))
+            made = mend_leftover(path)
         except (PebbleError, OSError) as error:
-            typer.echo(f"pebble: {path.name}: {shown(str(error))}", err=True)
-            failed += 1
+            failed |= bool(report_left(f"{path.name}: {error}"))
             continue
-        lost = f", {made.missing:,} missing" if made.missing else ""
-        lost += f", {made.damaged_bytes:,} damaged bytes" if made.damaged_bytes else ""
-        failed += bool(lost)
-        typer.echo(f"{finished_path(path).name}: {made.messages:,} messages{lost}")
+        failed |= not made.is_whole
+        typer.echo(f"{finished_path(path).name}: {made.messages:,} messages, {made.missing:,} missing")
     if not left:
-        typer.echo("nothing to finish")
+        typer.echo("nothing to mend")
     return 1 if failed else 0
+
+
+def _archive_of(path: Path) -> Path:
+    """The folder of a recorder, which has one for each year, month and day."""
+    folder = path.resolve().parent
+    while _DATE.fullmatch(folder.name):
+        folder = folder.parent
+    return folder
 
 
 def _existing(folder: Path) -> Path:

@@ -3,7 +3,7 @@
 import typer
 
 from pebble.commands.recordings.export import export, import_
-from pebble.commands.recordings.files import compact, finish, index, recover, rm
+from pebble.commands.recordings.files import mend, rm
 from pebble.commands.recordings.look import info, list_, search
 
 _HELP = """List, search, mend, export and delete recordings.
@@ -13,12 +13,12 @@ _HELP = """List, search, mend, export and delete recordings.
     pebble recordings info DIR --since 10:00
     pebble recordings search DIR --robot goob -t outgoing/logs --text WARN
     pebble recordings export DIR walk.mkv -r goob --since 10:00 --until +5m
-    pebble recordings finish DIR     after a power cut, without a recorder
+    pebble recordings mend DIR       after a power cut, without a recorder
 """
 
 
 def register(app: typer.Typer) -> None:
     group = typer.Typer(help=_HELP, rich_markup_mode=None)
-    for command in (list_, info, search, finish, recover, compact, index, export, import_, rm):
+    for command in (list_, info, search, mend, export, import_, rm):
         group.command(command.__name__.rstrip("_"))(command)
     app.add_typer(group, name="recordings")

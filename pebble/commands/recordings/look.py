@@ -18,7 +18,7 @@ from pebble.commands.terminal import show
 from pebble.config.visible import shown
 from pebble.recordings import catalogue
 from pebble.recordings.catalogue import FileInfo, Query
-from pebble.recordings.files.mcap import RecordingError
+from pebble.recordings.files.recorded import RecordingError
 from pebble.recordings.library import Damages, files, merged, problems, robot_in
 
 _SHOWN_TOPICS = 30

@@ -2,28 +2,25 @@
 
 import logging
 import re
+import shutil
 import sys
 import time
-from collections.abc import Iterator
 from contextlib import ExitStack
-from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any, Final
+from typing import Annotated, Final
 
 import typer
 
-from pebble.client.connection import Target, password, resolve
-from pebble.client.url import settings_of
+from pebble.client.connection import Target, resolve
 from pebble.commands.options import with_target
 from pebble.commands.terminal import show
 from pebble.errors import PebbleError
 from pebble.launcher.sd_notify import SystemdNotifier
 from pebble.recordings.recorder import metrics
 from pebble.recordings.recorder.recorder import Recorder
-from pebble.recordings.recorder.settings import EVERYTHING, Connection, Options, Settings, load
+from pebble.recordings.recorder.settings import EVERYTHING, Options
 from pebble.recordings.recorder.source import Source
 from pebble.runtime.signals import interrupted_by_signals
-from pebble.transports import MqttSettings
 from pebble.transports.topics import check_filter
 
 _TURN_S = 0.25
@@ -45,18 +42,9 @@ def record(
     into: Annotated[Path | None, typer.Option(help="Folder. [default: recordings]", metavar="DIR")] = None,
     media: Annotated[bool, typer.Option("--media/--no-media", help="Record pictures and sound.")] = True,
     rotate: Annotated[str, typer.Option(help="Begin new files after this long.", metavar="TIME")] = "1h",
-    rotate_size: Annotated[str, typer.Option(help="… or at this size.", metavar="SIZE")] = "512M",
     keep: Annotated[str, typer.Option(help="Delete the oldest beyond this; 0: never.", metavar="SIZE")] = "0",
     keep_media: Annotated[str, typer.Option(help="Delete older pictures and sound; 0: never.", metavar="TIME")] = "0",
-    keep_state: Annotated[str, typer.Option(help="Delete older state; 0: never.", metavar="TIME")] = "0",
-    free: Annotated[str, typer.Option(help="Leave this free on the disk.", metavar="SIZE")] = "2G",
-    sync: Annotated[str, typer.Option(help="Make all durable so often: a power cut loses it.", metavar="TIME")] = "5s",
-    level: Annotated[int, typer.Option(help="Zstandard's level; 0: no compression.", min=0, max=19)] = 3,
-    protocol: Annotated[str, typer.Option(help="MQTT 5 or 3.1.1; only 5 shows who retains.", metavar="5|3.1.1")] = "5",
     length: Annotated[str | None, typer.Option("--for", help="Stop after this long.", metavar="TIME")] = None,
-    settings: Annotated[
-        Path | None, typer.Option(help="A recorder's own file instead of all other options.", metavar="FILE")
-    ] = None,
 ) -> int:
     """Record robots into MCAP files, until Ctrl-C.
 
@@ -69,121 +57,78 @@ def record(
         pebble record --url mqtts://me@broker --keep 50G --keep-media 7d
         pebble recordings list recordings
     """
-    if settings is not None:
-        return _run(*_of_file(settings), length=length)
+    into = into or Path("recordings")
     options = Options(
         rotate_seconds=seconds(rotate),
-        rotate_bytes=size(rotate_size),
         keep_bytes=size(keep),
         keep_media_days=seconds(keep_media) / 86_400,
-        keep_state_days=seconds(keep_state) / 86_400,
-        free_bytes=size(free),
-        sync_seconds=seconds(sync),
-        level=level,
+        free_bytes=_free_bytes(into),
         media=media,
     )
     kind, transport, names, where = resolve(target)
     chosen = tuple(filters) if filters else (f"{names.base}/#",) if target.config is not None else EVERYTHING
     for filter_ in chosen:
         check_filter(filter_)
-    connection = (kind, _modern(transport, protocol), chosen, "", where)
-    return _run(into or Path("recordings"), options, [connection], length=length)
+    recorder = Recorder(into, options, {"filters": " ".join(chosen)})
+    _run(recorder, Source(recorder, kind, transport, chosen), where, length)
+    _print_end(recorder, into)
+    return 0
 
 
-_Connection = tuple[str, Any, tuple[str, ...], str, str]
+def _free_bytes(into: Path) -> int:
+    """What stays free: as much as by default, or a tenth of a small disk."""
+    place = next(path for path in (into, *into.absolute().parents) if path.exists())
+    return min(Options().free_bytes, shutil.disk_usage(place).total // 10)
 
 
-def _of_file(path: Path) -> tuple[Path, Options, list[_Connection]]:
-    found: Settings = load(path)
-    connections = []
-    for one in found.connections:
-        kind, transport = _transport_of(one, path.parent)
-        connections.append((kind, _modern(transport, one.protocol), one.filters, one.name, one.url))
-    plain = {name: getattr(found, name) for name in Options.__struct_fields__}
-    return found.into, Options(**plain), connections
-
-
-def _transport_of(connection: Connection, folder: Path) -> tuple[str, Any]:
-    """The kind of transport and its settings. Raises PebbleError."""
-    file, ca_cert = (path and folder / path for path in (connection.password_file, connection.ca_cert))
-    secret = None if file is None else password(file)
-    return settings_of(connection.url, password=secret, password_file=file, ca_cert=ca_cert)
-
-
-def _modern(transport: Any, protocol: str) -> Any:
-    if not isinstance(transport, MqttSettings):
-        return transport
-    if protocol not in ("5", "3.1.1"):
-        raise PebbleError(f'--protocol "{protocol}": use 5 or 3.1.1')
-    return replace(transport, protocol=protocol)
-
-
-def _each_host(kind: str, transport: Any, filters: tuple[str, ...], name: str, where: str) -> Iterator[_Connection]:
-    """A recording tells what each of several brokers has sent."""
-    if not isinstance(transport, MqttSettings) or not transport.hosts:
-        yield kind, transport, filters, name, where
-        return
-    for one in transport.each():
-        place = f"{one.host}:{one.port}"
-        yield kind, one, filters, f"{name} {place}".strip(), place
-
-
-def _run(into: Path, options: Options, connections: list[_Connection], *, length: str | None) -> int:
+def _run(recorder: Recorder, source: Source, where: str, length: str | None) -> None:
     logging.getLogger("pebble.recordings").setLevel(logging.INFO)
     ends_at = None if length is None else time.monotonic() + seconds(length)
-    about = {"filters": " ".join(filter_ for one in connections for filter_ in one[2])}
-    recorder = Recorder(into, options, about)
-    connections = [one for connection in connections for one in _each_host(*connection)]
-    sources = [Source(recorder, kind, transport, filters, name) for kind, transport, filters, name, _ in connections]
     with ExitStack() as stack:
         stack.enter_context(interrupted_by_signals())
         try:
             recorder.start()
             stack.callback(recorder.stop)
-            for source, connection in zip(sources, connections, strict=True):
-                source.start()
-                stack.callback(source.close)
-                _print_start(source, connection, into)
-            _serve(recorder, sources, ends_at)
+            source.start()
+            stack.callback(source.close)
+            _print_start(source, where, recorder.folder.root)
+            _serve(recorder, source, ends_at)
         except KeyboardInterrupt:
             pass
         if sys.stderr.isatty():
             typer.echo("", err=True)
-    _print_end(recorder, into)
-    return 0
 
 
-def _serve(recorder: Recorder, sources: list[Source], ends_at: float | None) -> None:
+def _serve(recorder: Recorder, source: Source, ends_at: float | None) -> None:
     systemd = SystemdNotifier()
     systemd.ready()
     began = printed = written = time.monotonic()
     while ends_at is None or time.monotonic() < ends_at:
         time.sleep(_TURN_S)
-        for source in sources:
-            source.check()
+        source.check()
         if recorder.alive:
             systemd.watchdog()
         now = time.monotonic()
         if now - printed >= _LINE_S:
             printed = now
-            line = _line(recorder, sources, now - began)
+            line = _line(recorder, source, now - began)
             systemd.status(line)
             if sys.stderr.isatty():
                 sys.stderr.write(f"\r\x1b[2K{line}")
                 sys.stderr.flush()
         if now - written >= _METRICS_S:
             written = now
-            _write_metrics(recorder, sources)
+            _write_metrics(recorder, source)
 
 
-def _write_metrics(recorder: Recorder, sources: list[Source]) -> None:
+def _write_metrics(recorder: Recorder, source: Source) -> None:
     try:
-        metrics.write(recorder, sources)
+        metrics.write(recorder, [source])
     except OSError:  # a full disk: the recorder says so
         return
 
 
-def _line(recorder: Recorder, sources: list[Source], seconds_: float) -> str:
+def _line(recorder: Recorder, source: Source, seconds_: float) -> str:
     counters = recorder.counters
     parts = [
         f"{show.duration(seconds_)}",
@@ -193,14 +138,12 @@ def _line(recorder: Recorder, sources: list[Source], seconds_: float) -> str:
     ]
     if counters["dropped"]:
         parts.append(f"{counters['dropped']:,} dropped")
-    lost = [source.problem for source in sources if not source.connected]
-    return "  ".join(
-        parts + [f"not connected: {problem}" for problem in lost] + [recorder.blocked] * bool(recorder.blocked)
-    )
+    if not source.connected:
+        parts.append(f"not connected: {source.problem}")
+    return "  ".join(parts + [recorder.blocked] * bool(recorder.blocked))
 
 
-def _print_start(source: Source, connection: _Connection, into: Path) -> None:
-    where = connection[4]
+def _print_start(source: Source, where: str, into: Path) -> None:
     if source.connected:
         typer.echo(f"Recording {where} into {into} (Ctrl-C ends it)", err=True)
     else:

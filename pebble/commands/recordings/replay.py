@@ -8,7 +8,6 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from datetime import datetime
-from enum import StrEnum
 from functools import partial
 from pathlib import Path
 from typing import Annotated
@@ -16,7 +15,6 @@ from typing import Annotated
 import typer
 
 from pebble.client.connection import password
-from pebble.client.names import id_of
 from pebble.client.terminal.key_decoder import END, LEFT, RIGHT, SPACE
 from pebble.client.url import settings_of
 from pebble.commands.options import CaCert, PasswordFile
@@ -49,15 +47,7 @@ UrlOption = Annotated[
 ]
 
 
-class Stamps(StrEnum):
-    """What becomes of the stamps in payloads."""
-
-    SHIFT = "shift"
-    AS_IS = "as-is"
-
-
 Base = Annotated[str | None, typer.Option(help=f"First level of the new topics. [default: {SYSTEM}]", metavar="SYSTEM")]
-SameBase = Annotated[bool, typer.Option("--same-base", help="Under the recorded topics, while these robots are off.")]
 Speed = Annotated[float, typer.Option(min=SLOWEST, max=FASTEST, help="1: as it was.")]
 Loop = Annotated[bool, typer.Option("--loop", help="Begin again at the end.")]
 Paused = Annotated[bool, typer.Option("--paused", help="Wait for the space key.")]
@@ -65,21 +55,12 @@ Only = Annotated[
     list[str] | None, typer.Option(help="Only recorded topics that match; may be repeated.", metavar="FILTER")
 ]
 Incoming = Annotated[bool, typer.Option("--incoming", help="Drive commands of people, lights and sounds as well.")]
-Actions = Annotated[bool, typer.Option("--actions", help="With --incoming: all other commands as well; asks first.")]
-Keep = Annotated[
-    bool,
-    typer.Option(
-        "--keep", help="Retain what was retained, until the end; a killed process leaves it. Heartbeats never."
-    ),
-]
-StampsOption = Annotated[Stamps, typer.Option(help="Move the stamps in payloads to now, or leave them.")]
 
 
 def replay(
     recordings: RecordingsArgument,
     url: UrlOption,
     base: Base = None,
-    same_base: SameBase = False,
     speed: Speed = 1.0,
     since: Since = None,
     until: Until = None,
@@ -87,18 +68,14 @@ def replay(
     paused: Paused = False,
     only: Only = None,
     incoming: Incoming = False,
-    actions: Actions = False,
-    keep: Keep = False,
-    stamps: StampsOption = Stamps.SHIFT,
     password_file: PasswordFile = None,
     ca_cert: CaCert = None,
 ) -> int:
     """Publish a recording again, at its pace.
 
-    By default it appears under other topics, `replay/` for `pebble/`, without any command, and nothing of it is
-    retained. It does not start, and ends at once, where a robot is live under the same topics. At the end its robots
-    are published as offline; if the process is killed, the broker does it. A replay stops no robot and resets no
-    emergency stop, whatever the options.
+    It appears under other topics, `replay/` for `pebble/`, without any command, and nothing of it is retained. At the
+    end its robots are published as offline; if the process is killed, the broker does it. A replay stops no robot and
+    resets no emergency stop, whatever the options.
 
     With a terminal: space pauses, the arrows go 10 s back and on, + and - change the speed. Ctrl-C ends.
 
@@ -107,20 +84,14 @@ def replay(
         pebble replay recordings --url mqtt://broker --since 10:00 --speed 4
         pebble replay walk.mcap --url mqtt://127.0.0.1 --base test --incoming
     """
-    options = Options(
-        system=None if same_base else base or SYSTEM,
-        incoming=incoming,
-        actions=actions,
-        retain=keep,
-        shift=stamps is Stamps.SHIFT,
-        only=tuple(only or ()),
-    )
-    _check(options, base, url, speed, paused=paused)
+    options = Options(system=base or SYSTEM, incoming=incoming, only=tuple(only or ()))
+    if paused and not _has_terminal():
+        raise PebbleError("--paused needs a terminal, whose space key goes on")
+    if incoming and speed < _WITH_COMMANDS:
+        raise PebbleError(f"--speed {speed:g} would drive a robot for longer than it was: leave out --incoming")
     connection = settings_of(url, password=password(password_file), password_file=password_file, ca_cert=ca_cert)
     since_ns, until_ns = period(since, until)
     source, rules = _read(recordings, options)
-    if actions:
-        _confirm(rules)
     slowest, console = _WITH_COMMANDS if incoming else SLOWEST, _Console()
     make_player = partial(
         Player, source, rules, now=time.monotonic, wall_ns=time.time_ns, wait=console.wait,
@@ -130,24 +101,6 @@ def replay(
     typer.echo(f"{player.sent} sent, {player.skipped} skipped")
     unread = report_unread(problems(source.damages))
     return unread if console.ended in ("", "SIGINT", END) else 1
-
-
-def _check(options: Options, base: str | None, url: str, speed: float, *, paused: bool) -> None:
-    same = options.system is None
-    if same and base is not None:
-        raise PebbleError("--base and --same-base exclude each other")
-    if same and options.retain:
-        raise PebbleError("--keep is for another base: under its own one it would remove a robot's retained messages")
-    if same and url.startswith("zenoh:"):
-        raise PebbleError(
-            "zenoh:RUN_DIR is a robot's own transport, where its programs obey what they receive: --same-base needs mqtt://"
-        )
-    if options.actions and not options.incoming:
-        raise PebbleError("--actions needs --incoming")
-    if paused and not _has_terminal():
-        raise PebbleError("--paused needs a terminal, whose space key goes on")
-    if options.incoming and speed < _WITH_COMMANDS:
-        raise PebbleError(f"--speed {speed:g} would drive a robot for longer than it was: leave out --incoming")
 
 
 def _read(recordings: list[Path], options: Options) -> tuple[ReplaySource, Rules]:
@@ -168,11 +121,11 @@ def _read(recordings: list[Path], options: Options) -> tuple[ReplaySource, Rules
 
 
 def _play(console: _Console, make: Make, bases: list[str], make_player: Callable[..., Player]) -> Player:
-    """Play to the end, for these robots. Raises ReplayError and TransportError."""
+    """Play to the end, for these robots. Raises TransportError."""
     terminal = _has_terminal()
     with ExitStack() as stack:
         stack.enter_context(handled_by(console.on_signal))
-        robots = ReplayedRobots(make, bases, now=time.monotonic, wall_ms=_wall_ms, wait=console.listen)
+        robots = ReplayedRobots(make, bases, wall_ms=lambda: time.time_ns() // 1_000_000)
         player = make_player(stack.enter_context(robots).publish)
         typer.echo(f"{', '.join(map(shown, bases))}{': ' + _KEYS if terminal else ''}")
         sys.stdout.flush()
@@ -183,24 +136,11 @@ def _play(console: _Console, make: Make, bases: list[str], make_player: Callable
     return player
 
 
-def _confirm(rules: Rules) -> None:
-    """Ask for each robot's id. Raises PebbleError for any other answer."""
-    for base in rules.robots:
-        name = id_of(base).rpartition("/")[2]
-        answer = typer.prompt(f"Type {shown(name)} to send the recorded actions to {shown(base)}")
-        if answer.strip() != name:
-            raise PebbleError(f"{shown(base)}: not confirmed")
-
-
 def _maker(kind: str, settings: object) -> Make:
     def make(name: str, will: Message | None) -> Transport:
         return create(kind, name.replace("/", "-"), settings, will=will)
 
     return make
-
-
-def _wall_ms() -> int:
-    return time.time_ns() // 1_000_000
 
 
 def _has_terminal() -> bool:
@@ -240,14 +180,7 @@ class _Console:
             finally:
                 self._loop = None
 
-    def listen(self, seconds: float) -> None:
-        """Before the player starts, and after it has ended."""
-        if self.ended and self._player is None:
-            raise KeyboardInterrupt
-        time.sleep(seconds)
-
     def wait(self, seconds: float) -> None:
-        """Raises ReplayError if one of the robots is live."""
         player, robots = self._player, self._robots
         if player is None or robots is None:
             return
@@ -260,7 +193,6 @@ class _Console:
             self._loop.suspend(player.pause)
             self.ended = self.ended or self._loop.ended
             self._loop.show(lambda: status(player, robots.problem), at_once=False)
-        robots.check()
         if self.ended and not player.ended:
             player.stop()
 

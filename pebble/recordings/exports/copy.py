@@ -4,10 +4,10 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import BinaryIO, Final
 
-from pebble.recordings.files.mcap import Recorded
-from pebble.recordings.files.reader import DAMAGE, mapped
-from pebble.recordings.files.rewrite import REWRITTEN, Copy, copy_beside
-from pebble.recordings.files.writer import LIBRARY, McapWriter
+from pebble.recordings.files.reader import DAMAGE, OLD_COPY, RecordingFile
+from pebble.recordings.files.recorded import Recorded
+from pebble.recordings.files.rewrite import Copy, copy_beside
+from pebble.recordings.files.writer import RecordingWriter
 
 _ABOUT: Final = "pebble.recording"
 
@@ -19,25 +19,12 @@ def write_copy(
 
     ``beside``: files whose metadata and attachments go with them, as they are known after the last message.
     """
-    writer = McapWriter(_Whole(out), library=LIBRARY)
+    writer = RecordingWriter(out)
     writer.metadata(_ABOUT, {"format": "1", "exported": "1"})
-    copy = Copy(writer)
-    for message in messages:
-        copy.add(message)
-        on_time(message.log_ns)
+    Copy(writer).add_all(messages, on_time)
     for path in beside:
         if path.exists():  # not deleted meanwhile, to make room
-            with mapped(path) as data:
-                copy_beside(data, writer, (_ABOUT, DAMAGE, REWRITTEN))
+            with RecordingFile(path) as file:
+                copy_beside(file, writer, (_ABOUT, DAMAGE, OLD_COPY))
     writer.finish()
-    return writer.contents.messages
-
-
-class _Whole:
-    """A buffered file as a writer's sink."""
-
-    def __init__(self, file: BinaryIO) -> None:
-        self._file = file
-
-    def write(self, data: memoryview, /) -> int | None:
-        return self._file.write(data)
+    return writer.messages

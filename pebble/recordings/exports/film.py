@@ -1,9 +1,9 @@
-"""One robot's pictures and sound as a film, or its sound alone: each where its capture stamp says, on one clock."""
+"""One robot's pictures and sound as a film, or its sound alone: each at the time at which it was received."""
 
 import heapq
 import tempfile
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -12,12 +12,11 @@ from pebble.contract import OUTGOING
 from pebble.contract.packets import PBAT
 from pebble.errors import PebbleError
 from pebble.media import pyav
-from pebble.recordings.exports.film_clock import FilmClock
-from pebble.recordings.exports.film_pictures import MILLISECOND, QUALITY, PictureTrack
+from pebble.recordings.exports.film_pictures import MILLISECOND, PictureTrack
 from pebble.recordings.exports.film_sound import RATE, SoundResult, SoundTrack
 from pebble.recordings.exports.lines import Progress
 from pebble.recordings.exports.unfinished import unfinished
-from pebble.recordings.files.mcap import Recorded, RecordingError
+from pebble.recordings.files.recorded import Recorded, RecordingError
 from pebble.recordings.stamps import is_picture
 
 #: By the ending of the film: FFmpeg's names of the container and of the encoder of its sound.
@@ -37,8 +36,6 @@ class FilmResult:
     width: int
     height: int
     scaled: int  # pictures of another size than the film
-    copied: bool  # H.264 as it was sent; False: encoded again
-    clock_steps: int  # how often the robot's clock was set meanwhile
     sound: SoundResult | None  # None: none was received
 
 
@@ -48,7 +45,6 @@ def write_film(
     robot: str,
     *,
     overwrite: bool = False,
-    quality: float = QUALITY,
     on_time: Progress | None = None,
 ) -> FilmResult:
     """Write the pictures and the sound of ``robot`` (its base) to ``target``, which ends in .mkv or .mp4.
@@ -61,41 +57,36 @@ def write_film(
     av = _pyav()
     with unfinished(target, overwrite=overwrite) as path, _folder_beside(target) as folder:
         try:
-            clock, pictures = FilmClock(), PictureTrack(av, folder, quality)
-            with SoundTrack(folder / "sound.wav") as sound:
-                for message in _media(messages, robot, on_time):
-                    if is_picture(message.payload):
-                        pictures.add(message.payload, clock.of("pictures", message))
-                    else:
-                        sound.add(message.payload, clock.of("sound", message))
-            pictures.close()
+            pictures = PictureTrack(av, folder / "pictures.mkv")
+            with closing(pictures), SoundTrack(folder / "sound.wav") as sound:
+                for at_ms, payload in _media(messages, robot, on_time):
+                    (pictures if is_picture(payload) else sound).add(payload, at_ms)
             if pictures.count == 0:
                 raise RecordingError(f"{robot}: no pictures; its sound alone can be exported as wav")
             _join(av, pictures.path, sound.path if sound.result.packets else None, path, target.suffix)
         except av.error.FFmpegError as error:
             raise RecordingError(f"{target}: {error}") from None
-    return _result(pictures, clock, sound.result if sound.result.packets else None)
+    return _result(pictures, sound.result if sound.result.packets else None)
 
 
 def write_wav(
     messages: Iterable[Recorded], target: Path, robot: str, *, overwrite: bool = False, on_time: Progress | None = None
 ) -> SoundResult:
     """Write the sound of ``robot`` (its base) to ``target``, from its first sample on. Raises RecordingError."""
-    clock = FilmClock()
     with unfinished(target, overwrite=overwrite) as path, SoundTrack(path) as track:
-        for message in _media(messages, robot, on_time):
-            if not is_picture(message.payload):
-                track.add(message.payload, clock.of("sound", message))
+        first_ms = None
+        for at_ms, payload in _media(messages, robot, on_time):
+            if not is_picture(payload):
+                first_ms = at_ms if first_ms is None else first_ms
+                track.add(payload, at_ms - first_ms)
         if not track.result.packets:
             raise RecordingError(f"{robot}: no sound" + ("" if pyav.installed() else f"; Opus {pyav.INSTALL}"))
     return track.result
 
 
-def _result(pictures: PictureTrack, clock: FilmClock, sound: SoundResult | None) -> FilmResult:
+def _result(pictures: PictureTrack, sound: SoundResult | None) -> FilmResult:
     seconds = max((pictures.last_ms + _LAST_PICTURE_MS) / 1000, 0.0 if sound is None else sound.seconds)
-    return FilmResult(
-        seconds, pictures.count, pictures.left_out, *pictures.size, pictures.scaled, pictures.copied, clock.steps, sound
-    )
+    return FilmResult(seconds, pictures.count, pictures.left_out, *pictures.size, pictures.scaled, sound)
 
 
 def _pyav() -> Any:
@@ -113,9 +104,9 @@ def _folder_beside(target: Path) -> Iterator[Path]:
         yield Path(name)
 
 
-def _media(messages: Iterable[Recorded], robot: str, on_time: Progress | None) -> Iterator[Recorded]:
-    """The pictures and the sound of one robot, of one topic each."""
-    below, topics = f"{robot}/{OUTGOING}/", dict[bool, str]()
+def _media(messages: Iterable[Recorded], robot: str, on_time: Progress | None) -> Iterator[tuple[int, bytes]]:
+    """The pictures and the sound of one robot, of one topic each, with milliseconds since the first one."""
+    below, topics, first_ms = f"{robot}/{OUTGOING}/", dict[bool, str](), None
     for message in messages:
         if on_time is not None:
             on_time(message.log_ns)
@@ -123,7 +114,9 @@ def _media(messages: Iterable[Recorded], robot: str, on_time: Progress | None) -
         if topic.startswith(below) and message.channel.metadata.get("retained") != "1":
             picture = is_picture(payload)
             if (picture or payload.startswith(PBAT)) and topics.setdefault(picture, topic) == topic:
-                yield message
+                log_ms = message.log_ns // 10**6
+                first_ms = log_ms if first_ms is None else first_ms
+                yield log_ms - first_ms, payload
 
 
 def _join(av: Any, pictures: Path, sound: Path | None, target: Path, ending: str) -> None:

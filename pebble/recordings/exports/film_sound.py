@@ -3,19 +3,18 @@
 from __future__ import annotations
 
 import wave
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from pebble.recordings.files.mcap import RecordingError
+from pebble.recordings.files.recorded import RecordingError
 
 if TYPE_CHECKING:
     from pebble.media.pcm import Resampler, Samples
     from pebble.media.sound import ReceivedSound
 
 RATE: Final = 48_000  # Hz of the film's sound, whatever was sent: the rate of Opus
-_HOLE_MS: Final = 60  # sound that is missing for longer becomes silence; less is the jitter of stamps
+_HOLE_MS: Final = 500  # sound that is missing for longer becomes silence; less is a delay of the network
 _WAV_BYTES: Final = (1 << 32) - (1 << 16)  # the format's lengths have 32 bits
 
 
@@ -51,8 +50,8 @@ class SoundTrack:
         if self._file is not None:
             self._file.close()
 
-    def add(self, payload: bytes, place: Callable[[int | None], int]) -> None:
-        """``place`` gives the time of a capture stamp."""
+    def add(self, payload: bytes, at_ms: int) -> None:
+        """Play a packet at ``at_ms``, or where the one before it ends, if that is near."""
         sound = self._decoder.feed(payload)
         if sound is None:
             self.result.left_out += 1
@@ -60,7 +59,7 @@ class SoundTrack:
         if self._file is None:
             self._open(1 if sound.channels == 1 else 2)
         samples = self._resampled(sound)
-        missing = place(sound.captured_ms or None) * RATE // 1000 - self._written
+        missing = at_ms * RATE // 1000 - self._written
         if missing > _HOLE_MS * RATE // 1000 or not self._written:
             self._silence(missing)
         elif missing < -_HOLE_MS * RATE // 1000:

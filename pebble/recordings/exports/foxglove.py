@@ -22,8 +22,8 @@ from pebble.recordings.exports.foxglove_messages import (
 )
 from pebble.recordings.exports.lines import Progress
 from pebble.recordings.exports.unfinished import unfinished
-from pebble.recordings.files.mcap import Recorded
-from pebble.recordings.files.writer import McapWriter
+from pebble.recordings.files.recorded import Recorded
+from pebble.recordings.files.writer import RecordingWriter
 from pebble.recordings.stamps import is_picture
 
 JSON: Final = "json"
@@ -45,7 +45,7 @@ def write_foxglove(
     """
     schemas = Schemas()
     with unfinished(target, overwrite=overwrite) as path, path.open("wb", buffering=0) as file:
-        export = _Export(McapWriter(file, library="pebble recordings"), schemas, quality)
+        export = _Export(RecordingWriter(file), schemas, quality)
         for message in messages:
             export.add(message)
             if on_time is not None:
@@ -57,7 +57,7 @@ def write_foxglove(
 class _Export:
     """One file in the making."""
 
-    def __init__(self, writer: McapWriter, schemas: Schemas, quality: float) -> None:
+    def __init__(self, writer: RecordingWriter, schemas: Schemas, quality: float) -> None:
         self.counts: Counter[str] = Counter()
         self._writer, self._schemas = writer, schemas
         self._media = Media(schemas, quality)
@@ -102,7 +102,7 @@ class _Export:
         self._put(topic, message.log_ns, payload, _time_of(message), JSON)
 
     def _declare(self, topic: str, encoding: str, schema: int) -> None:
-        if len(self._writer.contents.channels) < MOST_CHANNELS:
+        if self._writer.channels < MOST_CHANNELS:
             self._channels[topic] = self._writer.channel(topic, encoding, {}, schema)
 
     def _put(self, topic: str, log_ns: int, payload: bytes, stamp: int, count_as: str) -> None:

@@ -19,7 +19,7 @@ from pebble.contract.channels import channel_of
 from pebble.contract.packets import PBAT, PBVD, Picture, PictureKind
 from pebble.contract.payloads import Corners, LogRecord, TagData, TagLocations, VideoOverlays
 from pebble.errors import PayloadError, PebbleError
-from pebble.recordings.stamps import stamp_ns
+from pebble.recordings.stamps import CLOCK_FROM_NS, stamp_ns
 
 if TYPE_CHECKING:
     from pebble.media.decode import VideoDecoder
@@ -32,7 +32,6 @@ VIDEO, IMAGE, SOUND = ("CompressedVideo", "video"), ("CompressedImage", "image")
 
 _LEVELS: Final = {"DEBUG": 1, "INFO": 2, "WARNING": 3, "ERROR": 4, "CRITICAL": 5}  # Foxglove's numbers; 0: unknown
 _LINE_LOOP, _LINE_STRIP = 2, 3  # types of PointsAnnotation
-_CLOCK_FROM_NS: Final = 10**18  # 2001: a smaller stamp counts from the start of a board
 _YELLOW: Final = {"r": 1.0, "g": 0.85, "b": 0.0, "a": 1.0}
 _THICKNESS, _FONT_SIZE = 2.0, 14.0  # pixels
 _MILLIMETRES: Final = 1000.0
@@ -271,7 +270,7 @@ def stamped(message: Any, ns: int) -> bytes:
 def time_of(payload: bytes, received_ns: int, publish_ns: int = 0) -> int:
     """The payload's own time, or when it was received."""
     stamp = publish_ns or stamp_ns(payload)
-    return stamp if stamp >= _CLOCK_FROM_NS else received_ns
+    return stamp if stamp >= CLOCK_FROM_NS else received_ns
 
 
 def as_object(payload: bytes) -> bytes | None:

@@ -15,7 +15,7 @@ import msgspec
 from msgspec import UNSET, Meta, Raw, Struct, UnsetType
 
 from pebble.errors import TransportError
-from pebble.recordings.files.mcap import Recorded
+from pebble.recordings.files.recorded import Recorded
 from pebble.transports.topics import check_topic
 
 TRUNCATED: Final = "truncated"  # of a channel: its payloads were cut before they were recorded here
@@ -51,7 +51,7 @@ class Imported(Struct, frozen=True):
 
 
 class BadLine(Struct, frozen=True):
-    """A line or document that holds no message."""
+    """A line that holds no message."""
 
     number: int  # from 1
     problem: str
@@ -121,13 +121,6 @@ def checked(message: Imported) -> Imported:
     return message
 
 
-def epoch_ns(stamp: float | Decimal) -> int:
-    """Nanoseconds since 1970 of a stamp in seconds or milliseconds. Raises ValueError."""
-    if not 0 <= stamp < _LATEST_NS // 1_000_000:  # false for NaN, too
-        raise ValueError("the stamp is no time")
-    return int(Decimal(stamp) * (10**6 if stamp >= _MILLISECONDS_FROM else 10**9))
-
-
 def _line(message: Recorded, text: bool) -> _Written:
     metadata, payload = message.channel.metadata, message.payload
     seconds, fraction = divmod(message.log_ns, 10**9)
@@ -188,9 +181,16 @@ def _stamp_ns(stamp: bytes) -> int:
     """The time of a number, or of a text in ISO 8601, which is UTC unless it names another zone. Raises ValueError."""
     if not stamp.startswith(b'"'):
         try:
-            return epoch_ns(Decimal(stamp.decode()))
+            return _epoch_ns(Decimal(stamp.decode()))
         except ArithmeticError:
             raise ValueError("the stamp is no number") from None
     moment = datetime.fromisoformat(msgspec.json.decode(stamp, type=str))
     moment = moment if moment.tzinfo is not None else moment.replace(tzinfo=UTC)
     return (moment - _EPOCH) // _MICROSECOND * 1000
+
+
+def _epoch_ns(stamp: Decimal) -> int:
+    """Nanoseconds since 1970 of a stamp in seconds or milliseconds. Raises ValueError."""
+    if not 0 <= stamp < _LATEST_NS // 1_000_000:  # false for NaN, too
+        raise ValueError("the stamp is no time")
+    return int(stamp * (10**6 if stamp >= _MILLISECONDS_FROM else 10**9))

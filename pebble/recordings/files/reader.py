@@ -1,105 +1,490 @@
-"""Reads MCAP files in any state: all that can be read, and what is missing."""
+"""Reads MCAP files in any state: all that can be read, and how much is missing.
+
+A finished file is read by its summary. Where there is none, because the file is being written, or its recorder was
+killed, or its end is damaged, its records are looked through once. Behind damage reading goes on at the next chunk
+whose checksum is right.
+"""
 
 from __future__ import annotations
 
 import heapq
-import mmap
 import os
-import struct
-from collections import Counter
+import zlib
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager, suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from itertools import pairwise
 from operator import attrgetter
 from pathlib import Path
-from typing import Any, Final
+from typing import TYPE_CHECKING, Final, NamedTuple
 
-from pebble.recordings.files import mcap
-from pebble.recordings.files.mcap import MESSAGE, Channel, ChunkIndex, DamageError, Metadata, Op, Recorded, Statistics
-from pebble.recordings.files.reading_lock import share
-from pebble.recordings.files.scan import Block, Damage, block_at, blocks, is_of_others
+from pebble.recordings.files.recorded import (
+    FOREVER_NS,
+    Channel,
+    Damage,
+    DamageError,
+    Recorded,
+    RecordingError,
+    Schema,
+    number_in,
+    require_package,
+    unnamed,
+)
+from pebble.recordings.files.records import (
+    CHUNK,
+    FOOTER,
+    HEAD,
+    INDEX,
+    LARGEST_CHUNK,
+    LOOKS_LIKE_CHUNK,
+    MAGIC,
+    MESSAGE,
+    Op,
+    channel_of,
+    record_of,
+    records,
+    schema_of,
+    summary_of,
+    unpack_chunk,
+    with_own_topic,
+)
 
-SUFFIX: Final = ".mcap"  # of a file that is finished
-#: The topic of messages whose channel is not named anywhere in a damaged file, before its number.
-UNNAMED: Final = "$recorder/unnamed/"
+if TYPE_CHECKING:
+    from mcap.records import Attachment, ChunkIndex, McapRecord, Metadata, Statistics
+    from mcap.summary import Summary
 
-DAMAGE: Final = "pebble.damage"  # the metadata of a file that was finished with a part of it missing
-MISSING: Final = "missing_messages"
+DAMAGE, MISSING = "pebble.damage", "missing_messages"  # metadata of a copy of a file of which a part was missing
+#: Names of the last version: of that metadata, and of the channel of topics for which a file had no room.
+OLD_COPY, OLD_OTHER = "pebble.rewritten", "$recorder/other"
 
-FOREVER_NS: Final = 1 << 64  # after all times that a file can hold
-
+_INDEX_ENTRY, _INDEXES = 16, 8192  # bytes: of one entry; that are read at once behind a chunk
+_CHECKSUM: Final = 4  # bytes
+_LONGEST_NAME: Final = 16  # of a compression
+_LARGEST_HEADER: Final = 1 << 16
+_LARGEST_SUMMARY: Final = 256 << 20
+_LARGEST_RECORD: Final = LARGEST_CHUNK + (1 << 16)
+_SEARCHED, _OVERLAP = 1 << 20, 64  # bytes behind damage that are read at once
 _MOST_OPEN: Final = 512 << 20  # bytes of chunks that are sorted at the same time
 _time = attrgetter("log_ns")
 
 Chooses = Callable[[Channel], bool]
 
 
-def unnamed(number: int) -> Channel:
-    """A name for a channel that has lost its own."""
-    return Channel(number, f"{UNNAMED}{number}", "application/octet-stream")
+class Chunk(NamedTuple):
+    """Where a chunk is, and what it holds; ``channels`` empty: not known, so it may hold any."""
+
+    start_ns: int
+    end_ns: int
+    at: int
+    length: int  # with its head
+    channels: frozenset[int] = frozenset()
+    messages: int = 0  # 0: not known
 
 
-@contextmanager
-def mapped(path: Path) -> Iterator[Any]:
-    """The bytes of a file. Raises RecordingError, also for what is found in them meanwhile."""
-    try:
-        with path.open("rb") as file:
-            if not path.name.endswith(SUFFIX):
-                share(file)
-            if not os.fstat(file.fileno()).st_size:
-                yield b""
-                return
-            with mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
-                yield data
-    except OSError as error:
-        raise mcap.RecordingError(f"{path}: {error.strerror or error}") from None
-    except mcap.UnreadableError as error:
-        raise mcap.UnreadableError(f"{path}: {error}") from None
-    except DamageError as error:
-        raise mcap.RecordingError(f"{path}: {error}") from None
+class RecordingFile:
+    """One file, finished or not. Not thread-safe. Each method raises RecordingError."""
 
+    def __init__(self, path: Path) -> None:
+        require_package()
+        self.path, self.damage = path, Damage()
+        self.channels: dict[int, Channel] = {}
+        self.chunks: list[Chunk] = []
+        self.is_ours = True  # and its messages are numbered
+        self.statistics: Statistics | None = None  # None: it is not finished, or does not say all
+        self._schemas: dict[int, Schema] = {}
+        self._names: dict[int, Channel] = {}  # channels that are named beside chunks, where no checksum protects them
+        self._beside: list[int] = []  # where metadata and attachments are
+        self._at = self._searched = len(MAGIC)  # how far it was looked through, and how far for a chunk
+        self._again_at = 0  # the last chunk, behind which more indexes may be written yet
+        self._size, self._ended, self._looked_everywhere = 0, False, False
+        try:
+            self._file = path.open("rb")
+        except OSError as error:
+            raise RecordingError(f"{path}: {error.strerror or error}") from None
+        try:
+            self._open()
+        except BaseException:
+            self.close()
+            raise
 
-def read(
-    data: Any,
-    damage: Damage | None = None,
-    *,
-    chooses: Chooses = lambda _channel: True,
-    since_ns: int = 0,
-    until_ns: int = FOREVER_NS,
-) -> Iterator[Recorded]:
-    """The messages of the channels that ``chooses`` accepts, in the order of time.
+    def __enter__(self) -> RecordingFile:
+        return self
 
-    What is wrong with the file is noted in ``damage``. Chunks of a finished file that lie outside the period are left
-    out; messages outside it may come all the same. Raises UnreadableError.
-    """
-    damage = Damage() if damage is None else damage
-    reading = _Reading(data, damage, chooses)
-    if not reading.is_in_order:
-        yield from reading.sorted(since_ns, until_ns)
-        return
-    begin, end = reading.part(since_ns, until_ns)
-    for block in blocks(data, damage, begin):
-        if end is not None and block.at >= end:
-            break
-        if block.op is Op.CHUNK:
-            yield from reading.messages(block)
-    reading.end(whole=not begin and end is None)
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        self._file.close()
+
+    @property
+    def first_ns(self) -> int:
+        """When the first message was received; 0: there is none."""
+        return min((chunk.start_ns for chunk in self.chunks if chunk.start_ns), default=0)
+
+    @property
+    def last_ns(self) -> int:
+        return max((chunk.end_ns for chunk in self.chunks), default=0)
+
+    @property
+    def is_cut_off(self) -> bool:
+        """Whether nothing is at its end but zeros, or the begin of one record: so a kill leaves it."""
+        rest = self._read(self._at, min(self.damage.torn, _LARGEST_RECORD))
+        if len(rest) < HEAD.size or not any(rest):
+            return len(rest) >= self.damage.torn
+        op, length = HEAD.unpack_from(rest)
+        return self._may_begin(op, length) and self._at + HEAD.size + length > self._size
+
+    def refresh(self) -> None:
+        """Find what was written since; a file that is finished does not change."""
+        if self.statistics is None:
+            self._size = os.fstat(self._file.fileno()).st_size
+            self._look_through()
+
+    def read(
+        self, *, chooses: Chooses = lambda _channel: True, since_ns: int = 0, until_ns: int = FOREVER_NS
+    ) -> Iterator[Recorded]:
+        """Yield the messages of the channels that ``chooses`` accepts, in the order of time.
+
+        What is wrong is noted in :attr:`damage`. Chunks outside the period are left out; messages outside it may come.
+        """
+        chunks = [chunk for chunk in self.chunks if chunk.end_ns >= since_ns and chunk.start_ns < until_ns]
+        if any(one.end_ns > two.start_ns for one, two in pairwise(chunks)):  # other programs write in any order
+            opened = [0]
+            yield from in_time_order(
+                (chunk.start_ns, partial(self._opened, chunk, chooses, opened)) for chunk in chunks
+            )
+            return
+        due = 0 if len(chunks) == len(self.chunks) else None
+        for chunk in chunks:
+            messages, numbers = self._unpacked(chunk, chooses)
+            if numbers is not None and self.is_ours and self.statistics is None:
+                self.damage.missing += 0 if due is None else max(0, numbers[0] - due)
+                due = numbers[1] + 1
+            elif due is not None:
+                due += chunk.messages  # they are counted as damaged
+            yield from messages
+
+    def messages(self, chunk: Chunk, chooses: Chooses = lambda _channel: True) -> list[Recorded]:
+        """Return those of one chunk in the order of time; none if it is damaged."""
+        return self._unpacked(chunk, chooses)[0]
+
+    def metadata(self) -> dict[str, dict[str, str]]:
+        """Return the named texts of the file; of two with one name the last."""
+        from mcap.records import Metadata
+
+        found = (record for record in self._records_beside() if isinstance(record, Metadata))
+        return {record.name: record.metadata for record in found}
+
+    def beside(self) -> Iterator[Metadata | Attachment]:
+        """Yield what the file holds beside messages."""
+        from mcap.records import Attachment, Metadata
+
+        for record in self._records_beside():
+            if isinstance(record, Metadata | Attachment):
+                yield record
+
+    # -- a finished file
+
+    def _open(self) -> None:
+        self._size = os.fstat(self._file.fileno()).st_size
+        if not self._size:
+            self.damage.why = "it is empty"
+        elif self._read(0, len(MAGIC)) != MAGIC:
+            self.damage.add(0, "it does not begin as MCAP does")
+        self._read_header()
+        summary = self._summary()
+        if summary is None or not self._take_over(summary):
+            self._look_through()
+
+    def _read_header(self) -> None:
+        from mcap.records import Header
+
+        try:
+            header = record_of(self._read(self._at, _LARGEST_HEADER))
+        except DamageError:
+            return
+        if isinstance(header, Header):
+            self.is_ours = header.library.startswith("pebble")
+
+    def _summary(self) -> Summary | None:
+        """None: it is not finished, its end is damaged, or it has none."""
+        tail = FOOTER.size + len(MAGIC)
+        footer = self._read(max(0, self._size - tail), tail)
+        if len(footer) < tail or footer[FOOTER.size :] != MAGIC:
+            return None
+        op, length, start, _, checksum = FOOTER.unpack_from(footer)
+        size = self._size - start if start else tail
+        if op != Op.FOOTER or length != FOOTER.size - HEAD.size or not tail <= size <= _LARGEST_SUMMARY:
+            return None
+        end = self._read(self._size - size, size)
+        if checksum and zlib.crc32(end[: -len(MAGIC) - _CHECKSUM]) != checksum:
+            return None
+        self.damage.finished = True
+        try:
+            return summary_of(end)
+        except DamageError:
+            return None
+
+    def _take_over(self, summary: Summary) -> bool:
+        """Whether the summary names all messages: those of other programs need not."""
+        chunks = [_indexed(index) for index in summary.chunk_indexes if index.message_index_offsets]
+        counted = summary.statistics
+        if counted is None or counted.message_count != sum(chunk.messages for chunk in chunks):
+            return False
+        if not counted.channel_message_counts.keys() <= summary.channels.keys():
+            return False
+        self._schemas = {number: Schema(one.name, one.encoding, one.data) for number, one in summary.schemas.items()}
+        for number, one in summary.channels.items():
+            schema = self._schemas.get(one.schema_id)
+            self.channels[number] = Channel(number, one.topic, one.message_encoding, one.metadata, schema)
+        self._beside = [index.offset for index in summary.metadata_indexes]
+        self._beside += [index.offset for index in summary.attachment_indexes]
+        self.chunks, self.statistics = chunks, counted
+        return True
+
+    # -- one that is not
+
+    def _look_through(self) -> None:
+        """Find the chunks, and the names of channels, from where the last look has ended."""
+        if self._again_at and not self._ended:
+            self.chunks.pop()
+            self._at, self._again_at = self._again_at, 0
+        while self._at < self._size and not self._ended:
+            record = self._record_at(self._at)
+            if record is not None:
+                self._at = self._take(*record)
+                continue
+            again = self._next_chunk(max(self._at + 1, self._searched))
+            if again is None:
+                self._searched = max(self._searched, self._size - _OVERLAP)
+                break
+            self.damage.add(self._at, f"{again - self._at:,} bytes are no record")
+            self._at = again
+        self.damage.torn = 0 if self._ended else max(0, self._size - self._at)
+
+    def _record_at(self, at: int) -> tuple[int, int] | None:
+        """The opcode of the record at ``at``, and its end; None if it is none, or not all of it is there."""
+        head = self._read(at, HEAD.size)
+        if len(head) < HEAD.size:
+            return None
+        op, length = HEAD.unpack_from(head)
+        end = at + HEAD.size + length
+        if end > self._size:
+            return None
+        if op == Op.CHUNK:
+            is_one = self._is_chunk(at, length)
+        elif op == Op.CHANNEL:
+            is_one = self._is_channel(at, length)
+        elif op == Op.DATA_END:
+            is_one = length == _CHECKSUM
+        elif op == Op.MESSAGE and not self.is_ours:
+            raise RecordingError(f"{self.path}: its messages are not in chunks: mcap compress {self.path.name} -o OUT")
+        else:
+            is_one = self._may_begin(op, length) and self._begins_record(end)
+        return (op, end) if is_one else None
+
+    def _begins_record(self, at: int) -> bool:
+        """Whether a record may begin at ``at``, or the file ends there."""
+        head = self._read(at, HEAD.size)
+        return len(head) < HEAD.size or self._may_begin(*HEAD.unpack(head))
+
+    def _may_begin(self, op: int, length: int) -> bool:
+        is_known = Op.HEADER <= op <= Op.DATA_END or op == Op.PADDING or (op > 0 and not self.is_ours)
+        return is_known and length <= _LARGEST_SUMMARY
+
+    def _is_chunk(self, at: int, length: int) -> bool:
+        """Whether the lengths in its head agree."""
+        head = self._read(at + HEAD.size, CHUNK.size + _LONGEST_NAME + 8)
+        if len(head) < CHUNK.size + 8:
+            return False
+        data_at = CHUNK.size + min(CHUNK.unpack_from(head)[4], _LONGEST_NAME)
+        packed = int.from_bytes(head[data_at : data_at + 8], "little")
+        return length == data_at + 8 + packed and length < _LARGEST_RECORD
+
+    def _is_channel(self, at: int, length: int) -> bool:
+        """Whether it is exactly what it says."""
+        try:
+            channel_of(self._read(at + HEAD.size, min(length, _LARGEST_RECORD)))
+        except DamageError:
+            return False
+        return True
+
+    def _take(self, op: int, end: int) -> int:
+        """Take over the record at hand; returns where the next one begins."""
+        at = self._at
+        if op == Op.CHUNK:
+            return self._take_chunk(at, end)
+        if op in (Op.METADATA, Op.ATTACHMENT):
+            self._beside.append(at)
+        elif op in (Op.SCHEMA, Op.CHANNEL):
+            try:
+                self._declare(op, self._read(at + HEAD.size, end - at - HEAD.size), self._names)
+            except DamageError as error:
+                self.damage.add(at, error)
+        self._ended = op == Op.DATA_END
+        return end
+
+    def _take_chunk(self, at: int, end: int) -> int:
+        start_ns, end_ns = CHUNK.unpack(self._read(at + HEAD.size, CHUNK.size))[:2]
+        entries, after, are_all = self._indexes(end)
+        self._again_at = 0 if are_all else at
+        channels = frozenset(entries if are_all else ())
+        chunk = Chunk(start_ns, end_ns, at, end - at, channels, sum(entries.values()))
+        self.chunks.append(chunk)
+        if not entries or not entries.keys() <= self.channels.keys():
+            self._learn(chunk)
+        return after
+
+    def _indexes(self, at: int) -> tuple[dict[int, int], int, bool]:
+        """The messages by channel that are indexed behind a chunk, where that ends, and whether these are all."""
+        entries, data, place = dict[int, int](), b"", 0
+        while True:
+            if place + INDEX.size > len(data):
+                at, place = at + place, 0
+                data = self._read(at, _INDEXES)
+                if len(data) < INDEX.size:
+                    return entries, at, False
+            op, length, channel, size = INDEX.unpack_from(data, place)
+            after = place + HEAD.size + length
+            if op != Op.MESSAGE_INDEX or length != INDEX.size - HEAD.size + size or at + after > self._size:
+                return entries, at + place, op != Op.MESSAGE_INDEX
+            entries[channel] = size // _INDEX_ENTRY
+            place = after
+
+    def _learn(self, chunk: Chunk) -> None:
+        """Take over the names of channels in a chunk, which uses them first."""
+        try:
+            data = self._records(chunk)
+            for op, begin, end in records(data):
+                self._declare(op, data[begin:end], self.channels)
+        except DamageError as error:
+            self.damage.add(chunk.at, error, chunk.messages)
+            return
+        for number in self._names.keys() - self.channels.keys():
+            if not chunk.channels or number in chunk.channels:
+                self.channels[number] = self._names[number]
+
+    def _next_chunk(self, at: int) -> int | None:
+        """Where behind damage the next chunk begins."""
+        while at < self._size:
+            part, found = self._read(at, _SEARCHED + _OVERLAP), -1
+            while (match := LOOKS_LIKE_CHUNK.search(part, found + 1)) is not None and match.start() < _SEARCHED:
+                found = match.start()
+                record = self._record_at(at + found)
+                if record is not None and self._is_whole(at + found, record[1]):
+                    return at + found
+            at += _SEARCHED
+        return None
+
+    def _is_whole(self, at: int, end: int) -> bool:
+        try:
+            for _ in records(self._records(Chunk(0, 0, at, end - at))):
+                pass
+        except DamageError:
+            return False
+        return True
+
+    # -- both
+
+    def _unpacked(self, chunk: Chunk, chooses: Chooses) -> tuple[list[Recorded], tuple[int, int] | None]:
+        """The chosen messages of a chunk, and the numbers of its first and last one."""
+        found: list[Recorded] = []
+        first, last = -1, -1
+        chosen: dict[int, Channel | None] = {}
+        lost: set[int] = set()
+        try:
+            data = self._records(chunk)
+            for op, begin, end in records(data):
+                if op != Op.MESSAGE:
+                    self._declare(op, data[begin:end], self.channels)
+                    continue
+                number, sequence, log_ns, publish_ns = MESSAGE.unpack_from(data, begin)
+                first, last = sequence if first < 0 else first, sequence
+                if number not in chosen:
+                    channel = self._channel(number)
+                    lost |= {number} - self.channels.keys()
+                    chosen[number] = channel if channel.topic == OLD_OTHER or chooses(channel) else None
+                if lost and number in lost:
+                    self.damage.unnamed += 1
+                taken = chosen[number]
+                if taken is not None:
+                    found.append(Recorded(taken, sequence, log_ns, publish_ns, data[begin + MESSAGE.size : end]))
+            if any(channel is not None and channel.topic == OLD_OTHER for channel in chosen.values()):
+                found = [message for message in map(_with_own_topic, found) if chooses(message.channel)]
+        except DamageError as error:
+            self.damage.add(chunk.at, error, chunk.messages)
+            return [], None
+        found.sort(key=_time)
+        return found, (first, last) if first >= 0 else None
+
+    def _opened(self, chunk: Chunk, chooses: Chooses, opened: list[int]) -> Iterator[Recorded]:
+        opened[0] += chunk.length
+        if opened[0] > _MOST_OPEN:
+            raise RecordingError(
+                f"{self.path}: over {_MOST_OPEN >> 20} MB of it are not in the order of time: `mcap sort` puts them so"
+            )
+        yield from self.messages(chunk, chooses)
+        opened[0] -= chunk.length
+
+    def _declare(self, op: int, body: bytes, channels: dict[int, Channel]) -> None:
+        """Take over a record that is no message. Raises DamageError."""
+        if op == Op.SCHEMA:
+            number, schema = schema_of(body)
+            self._schemas.setdefault(number, schema)
+        elif op == Op.CHANNEL:
+            channel, number = channel_of(body)
+            channels.setdefault(channel.id, replace(channel, schema=self._schemas.get(number)))
+
+    def _channel(self, number: int) -> Channel:
+        """The channel of this number, wherever it is named: the chunk that named it first may be lost."""
+        if number not in self.channels and number in self._names:
+            self.channels[number] = self._names[number]
+        if number not in self.channels and not self._looked_everywhere:
+            self._looked_everywhere = True
+            for chunk in self.chunks:
+                self._learn(chunk)
+        return self.channels.get(number) or unnamed(number)
+
+    def _records(self, chunk: Chunk) -> bytes:
+        """The records of a chunk. Raises DamageError."""
+        head = self._read(chunk.at, HEAD.size if chunk.length < _LARGEST_RECORD else 0)
+        if len(head) < HEAD.size or HEAD.unpack(head) != (Op.CHUNK, chunk.length - HEAD.size):
+            raise DamageError("a chunk is damaged")
+        return unpack_chunk(self._read(chunk.at + HEAD.size, chunk.length - HEAD.size))
+
+    def _records_beside(self) -> Iterator[McapRecord]:
+        for at in self._beside:
+            head = self._read(at, HEAD.size)
+            length = HEAD.unpack(head)[1] if len(head) == HEAD.size else _LARGEST_RECORD
+            try:
+                if length >= _LARGEST_RECORD:
+                    raise DamageError("metadata, or an attachment, of a size that cannot be")
+                yield record_of(self._read(at, HEAD.size + length))
+            except DamageError as error:
+                self.damage.add(at, error)
+
+    def _read(self, at: int, length: int) -> bytes:
+        try:
+            self._file.seek(at)
+            return self._file.read(length)
+        except (OSError, OverflowError, ValueError) as error:
+            raise RecordingError(f"{self.path}: {getattr(error, 'strerror', '') or error}") from None
 
 
 def in_time_order(streams: Iterable[tuple[int, Callable[[], Iterator[Recorded]]]]) -> Iterator[Recorded]:
-    """The messages of several streams by their times; of each: its first time, and what opens it when that has come."""
-    due = sorted(streams, key=lambda one: one[0])
-    due.reverse()
+    """Yield the messages of several streams by their times.
+
+    Of each stream: its first time, and what opens it when that has come.
+    """
+    due = sorted(streams, key=lambda stream: stream[0], reverse=True)
     heap: list[tuple[int, int, Recorded, Iterator[Recorded]]] = []
     turn = 0
     while due or heap:
         while due and (not heap or due[-1][0] <= heap[0][0]):
-            stream = due.pop()[1]()
+            opened = due.pop()[1]()
             turn += 1
-            if (first := next(stream, None)) is not None:
-                heapq.heappush(heap, (first.log_ns, turn, first, stream))
+            if (first := next(opened, None)) is not None:
+                heapq.heappush(heap, (first.log_ns, turn, first, opened))
         if not heap:
             continue
         _, number, message, stream = heap[0]
@@ -110,243 +495,26 @@ def in_time_order(streams: Iterable[tuple[int, Callable[[], Iterator[Recorded]]]
             heapq.heapreplace(heap, (following.log_ns, number, following, stream))
 
 
-def metadata_of(data: Any) -> dict[str, dict[str, str]]:
-    """The named texts of a file, which stand before its messages or at its end; of two with one name the last."""
-    found: dict[str, dict[str, str]] = {}
-    summary = Summary.of(data)
-    if summary is not None:
-        for at in summary.metadata:
-            with suppress(DamageError, struct.error):  # what the summary of another program's file says may be wrong
-                _, length = mcap.HEAD.unpack_from(data, at)
-                one = Metadata.unpack(data[at + mcap.HEAD.size : at + mcap.HEAD.size + length])
-                found[one.name] = dict(one.items)
-        return found
-    for block in blocks(data, Damage()):
-        if block.op is not Op.METADATA:
-            break
-        one = Metadata.unpack(block.body)
-        found[one.name] = dict(one.items)
-    return found
+def missing_before(metadata: dict[str, dict[str, str]]) -> int:
+    """Return how many messages were missing when this copy was made, by its metadata."""
+    return sum(number_in(metadata.get(name, {}), MISSING) for name in (DAMAGE, OLD_COPY))
 
 
-class _Reading:
-    """The channels and numbers of a file while it is read."""
-
-    def __init__(self, data: Any, damage: Damage, chooses: Chooses) -> None:
-        self._data, self._damage, self._chooses = data, damage, chooses
-        self._is_of_others = is_of_others(data)
-        self._summary = Summary.of(data)
-        self._schemas: dict[int, mcap.Schema] = {}
-        self._declared: dict[int, Channel] = {}
-        self._channels: dict[int, Channel | None] = {}  # None: not chosen
-        self._counts = Counter[int]()  # messages by channel, of a first reading
-        self._unnamed: set[int] = set()
-        self._looked_ahead = False
-        self._due = self._read = 0
-        self._open = 0  # bytes of chunks that are read at the same time
-        if self._summary is not None and not self._is_of_others:
-            self._schemas.update(self._summary.schemas)
-            for channel in self._summary.channels.values():
-                self._add(channel)
-
-    @property
-    def is_in_order(self) -> bool:
-        """Whether the chunks follow each other in time: not those of other programs, nor of what was imported."""
-        chunks = [] if self._summary is None else [one for one in self._summary.chunks if one.start_ns]
-        return not self._is_of_others and all(one.end_ns <= two.start_ns for one, two in pairwise(chunks))
-
-    def part(self, since_ns: int, until_ns: int) -> tuple[int, int | None]:
-        """Where the chunks begin and end that may hold messages of the period; 0 and None: the whole file."""
-        chunks = [] if self._summary is None else self._summary.chunks
-        if not chunks or (chunks[0].start_ns >= since_ns and chunks[-1].end_ns < until_ns):
-            return 0, None
-        wanted = [one for one in chunks if (one.end_ns >= since_ns and one.start_ns < until_ns) or not one.start_ns]
-        if not wanted:
-            return len(self._data), None
-        first, last = wanted[0], wanted[-1]
-        self._due = -1  # its numbers begin anywhere
-        return (0 if first is chunks[0] else first.at), last.at + 1
-
-    def messages(self, block: Block) -> list[Recorded]:
-        """Those of a chunk in the order of time."""
-        found: list[Recorded] = []
-        for op, begin, end in mcap.records(block.body):
-            if op == Op.MESSAGE:
-                number, sequence, _, _ = MESSAGE.unpack_from(block.body, begin)
-                self._count(sequence)
-                if number not in self._channels and not self._find(number, block):
-                    self._add(unnamed(number))
-                if number in self._unnamed:
-                    self._damage.orphans += 1
-                message = self._message(block, begin, end)
-                if message is not None:
-                    found.append(message)
-            else:
-                self._declare(op, block.body[begin:end])
-        found.sort(key=_time)
-        return found
-
-    def sorted(self, since_ns: int, until_ns: int) -> Iterator[Recorded]:
-        """All in the order of time, after a first reading that finds the channels, and the times of each chunk."""
-        places = []
-        for block in blocks(self._data, self._damage):
-            times = self._look_at(block) if block.op is Op.CHUNK else None
-            if times is not None and times[1] >= since_ns and times[0] < until_ns:
-                places.append((times[0], partial(self._opened, block.at, block.record_end)))
-        summary = self._summary
-        self._schemas = {**({} if summary is None else summary.schemas), **self._schemas}
-        for channel in (*self._declared.values(), *(() if summary is None else summary.channels.values())):
-            self._add(channel)
-        for number in self._counts.keys() - self._channels.keys():
-            self._add(unnamed(number))
-        self._damage.orphans += sum(self._counts[number] for number in self._unnamed)
-        self.end(whole=True)
-        yield from in_time_order(places)
-
-    def end(self, *, whole: bool) -> None:
-        if self._summary is None:
-            return
-        self._damage.known = mcap.number_in(metadata_of(self._data).get(DAMAGE, {}), MISSING)
-        if whole:  # messages at the end may be missing, too
-            before = self._summary.statistics.messages + self._damage.known
-            self._damage.missing = max(self._damage.missing, before - self._read)
-
-    def _look_at(self, block: Block) -> tuple[int, int] | None:
-        """The first and the last time of a chunk; None for one without messages."""
-        times = []
-        try:
-            for op, begin, end in mcap.records(block.body):
-                if op == Op.MESSAGE:
-                    number, sequence, log_ns, _ = MESSAGE.unpack_from(block.body, begin)
-                    self._count(-1 if self._is_of_others else sequence)
-                    self._counts[number] += 1
-                    times.append(log_ns)
-                else:
-                    self._declare(op, block.body[begin:end])
-        except DamageError as error:
-            self._damage.spans.append((block.at, block.record_end))
-            self._damage.note(error)
-        return (min(times), max(times)) if times else None
-
-    def _opened(self, at: int, end: int) -> Iterator[Recorded]:
-        block = block_at(self._data, at, end)
-        self._open += len(block.body)
-        if self._open > _MOST_OPEN:
-            raise mcap.UnreadableError(
-                f"over {_MOST_OPEN >> 20} MB of it are not in the order of time: `mcap sort` puts them so"
-            )
-        found = []
-        for op, begin, stop in mcap.records(block.body):
-            message = self._message(block, begin, stop) if op == Op.MESSAGE else None
-            if message is not None:
-                found.append(message)
-        found.sort(key=_time)
-        yield from found
-        self._open -= len(block.body)
-
-    def _count(self, sequence: int) -> None:
-        if sequence > self._due >= 0:
-            self._damage.missing += sequence - self._due
-        self._due = sequence + 1
-        self._read += 1
-
-    def _message(self, block: Block, begin: int, end: int) -> Recorded | None:
-        number, sequence, log_ns, publish_ns = MESSAGE.unpack_from(block.body, begin)
-        channel = self._channels[number]
-        if channel is None:
-            return None
-        payload = block.body[begin + MESSAGE.size : end]
-        if channel.topic == mcap.OTHER:
-            with suppress(DamageError):  # another program may use that topic
-                channel, payload = mcap.unpack_other(channel, payload)
-            if not self._chooses(channel):
-                return None
-        return Recorded(channel, sequence, log_ns, publish_ns, payload)
-
-    def _find(self, number: int, block: Block) -> bool:
-        """Look for a channel further on: the chunk that named it first may be lost."""
-        if not self._looked_ahead:
-            self._looked_ahead = True
-            for later in blocks(self._data, Damage(), block.at):
-                if later.op is Op.CHUNK:
-                    for op, begin, end in mcap.records(later.body):
-                        self._declare(op, later.body[begin:end])
-        return number in self._channels
-
-    def _declare(self, op: int, body: bytes) -> None:
-        """Take over a record of a chunk that is no message."""
-        if op == Op.SCHEMA:
-            schema = mcap.Schema.unpack(body)
-            self._refuse_another(self._schemas.setdefault(schema.id, schema), schema)
-        elif op == Op.CHANNEL:
-            channel = Channel.unpack(body)
-            self._refuse_another(self._declared.setdefault(channel.id, channel), channel)
-            if not self._is_of_others:
-                self._add(channel)
-        elif op != Op.MESSAGE_INDEX:
-            self._damage.private += 1
-
-    def _refuse_another(self, known: Channel | mcap.Schema, one: Channel | mcap.Schema) -> None:
-        if self._is_of_others and known != one:
-            raise mcap.UnreadableError(f"{type(one).__name__.lower()} {one.id} is declared as two different ones")
-
-    def _add(self, channel: Channel) -> None:
-        if channel.topic.startswith(UNNAMED):
-            self._unnamed.add(channel.id)
-        if channel.id not in self._channels:
-            if channel.schema:
-                channel = replace(channel, described=self._schemas.get(channel.schema))
-            chosen = channel.topic == mcap.OTHER or self._chooses(channel)
-            self._channels[channel.id] = channel if chosen else None
+def _indexed(index: ChunkIndex) -> Chunk:
+    channels = frozenset(index.message_index_offsets)
+    entries = index.message_index_length - INDEX.size * len(channels)
+    return Chunk(
+        index.message_start_time,
+        index.message_end_time,
+        index.chunk_start_offset,
+        index.chunk_length,
+        channels,
+        entries // _INDEX_ENTRY,
+    )
 
 
-@dataclass(frozen=True, slots=True)
-class Summary:
-    """What a finished file says about itself."""
-
-    channels: dict[int, Channel]
-    chunks: list[ChunkIndex]
-    statistics: Statistics
-    metadata: list[int]  # where they are
-    schemas: dict[int, mcap.Schema]
-
-    @classmethod
-    def of(cls, data: Any) -> Summary | None:
-        """None for a file that is not finished, or whose summary is damaged, or does not say all.
-
-        What another program writes into its summary counts if two of its records agree.
-        """
-        found = mcap.summary_of(data)
-        if found is None:
-            return None
-        channels: dict[int, Channel] = {}
-        schemas: dict[int, mcap.Schema] = {}
-        chunks, statistics, metadata = [], None, []
-        try:
-            for op, begin, end in mcap.records(found[1]):
-                body = found[1][begin:end]
-                if op == Op.CHANNEL:
-                    channel = Channel.unpack(body)
-                    channels[channel.id] = channel
-                elif op == Op.SCHEMA:
-                    schema = mcap.Schema.unpack(body)
-                    schemas[schema.id] = schema
-                elif op == Op.CHUNK_INDEX:
-                    chunks.append(ChunkIndex.unpack(body))
-                elif op == Op.STATISTICS:
-                    statistics = Statistics.unpack(body)
-                elif op == Op.METADATA_INDEX:
-                    metadata.append(int.from_bytes(body[:8], "little"))
-        except DamageError:
-            return None
-        if statistics is None or statistics.messages != sum(statistics.counts.values()):
-            return None
-        made = cls(channels, chunks, statistics, metadata, schemas)
-        return None if is_of_others(data) and not made._agrees() else made
-
-    def _agrees(self) -> bool:
-        about = self.statistics
-        times = [(one.start_ns, one.end_ns) for one in self.chunks if one.indexes]
-        if not times or not about.counts.keys() <= self.channels.keys():
-            return False
-        return (min(one for one, _ in times), max(one for _, one in times)) == (about.first_ns, about.last_ns)
+def _with_own_topic(message: Recorded) -> Recorded:
+    if message.channel.topic != OLD_OTHER:
+        return message
+    channel, payload = with_own_topic(message.channel, message.payload)
+    return Recorded(channel, message.sequence, message.log_ns, message.publish_ns, payload)

@@ -4,25 +4,28 @@ import logging
 import os
 import threading
 import time
-from collections import deque
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from typing import Final
 
 from pebble.recordings.recorder.lane import OpenFile
 from pebble.runtime.memory import return_free_pages
 
 log = logging.getLogger(__name__)
 
+SYNC_S: Final = 5.0  # a power cut loses as much
+
 
 class Background:
-    """Makes files durable every few seconds, and returns free memory; does what may take long, one after the other."""
+    """One thread makes files durable every few seconds, and returns free memory; another one does what takes long."""
 
-    def __init__(self, period_s: float, note: Callable[[float], None]) -> None:
-        self._period_s, self._note = period_s, note
-        self._jobs: deque[Callable[[], None]] = deque()
+    def __init__(self, note: Callable[[float], None]) -> None:
+        """``note`` gets how many seconds each file took to be made durable."""
+        self._note = note
+        self._jobs = ThreadPoolExecutor(1, "pebble-recorder-finish")
         self._files: list[OpenFile] = []
-        self._wake = threading.Condition()
-        self._stopping = False
-        self._thread = threading.Thread(target=self._run, name="pebble-recorder-sync", daemon=True)
+        self._stopping = threading.Event()
+        self._thread = threading.Thread(target=self._sync_all, name="pebble-recorder-sync", daemon=True)
 
     @property
     def alive(self) -> bool:
@@ -32,43 +35,22 @@ class Background:
         self._thread.start()
 
     def stop(self) -> None:
-        with self._wake:
-            self._stopping = True
-            self._wake.notify()
+        """Wait until all jobs are done."""
+        self._jobs.shutdown()
+        self._stopping.set()
         self._thread.join()
 
     def do(self, job: Callable[[], None]) -> None:
-        with self._wake:
-            self._jobs.append(job)
-            self._wake.notify()
+        self._jobs.submit(_logged, job)
 
     def watch(self, files: list[OpenFile]) -> None:
-        with self._wake:
-            self._files = files
+        self._files = files
 
-    def _run(self) -> None:
-        synced = time.monotonic()
-        while True:
-            with self._wake:
-                if not self._jobs and not self._stopping:
-                    self._wake.wait(max(0.0, synced + self._period_s - time.monotonic()))
-                job = self._jobs.popleft() if self._jobs else None
-                files = list(self._files)
-                if job is None and self._stopping:
-                    return
-            if job is not None:
-                self._do(job)
-            if time.monotonic() - synced >= self._period_s:
-                synced = time.monotonic()
-                for file in files:
-                    self._sync(file)
-                return_free_pages()
-
-    def _do(self, job: Callable[[], None]) -> None:
-        try:
-            job()
-        except Exception:  # one file must not keep the others from being finished
-            log.exception("a recording could not be finished")
+    def _sync_all(self) -> None:
+        while not self._stopping.wait(SYNC_S):
+            for file in self._files:
+                self._sync(file)
+            return_free_pages()
 
     def _sync(self, file: OpenFile) -> None:
         began = time.monotonic()
@@ -83,3 +65,10 @@ class Background:
         finally:
             os.close(descriptor)
         self._note(time.monotonic() - began)
+
+
+def _logged(job: Callable[[], None]) -> None:
+    try:
+        job()
+    except Exception:  # one file must not keep the others from being finished
+        log.exception("a recording could not be finished")

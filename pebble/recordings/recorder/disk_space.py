@@ -14,8 +14,7 @@ class Limits:
 
     keep_bytes: int = 0
     keep_media_days: float = 0.0
-    keep_state_days: float = 0.0
-    free_bytes: int = 2 << 30
+    free_bytes: int = 1 << 30
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,12 +46,10 @@ def surplus(entries: Iterable[Entry], limits: Limits, disk: Disk) -> list[Entry]
 
 
 def outdated(entries: Iterable[Entry], limits: Limits, now: float) -> Entry | None:
-    """One file that is older than the limits of age allow; one at a time, because the clock may have been set wrong."""
-    for entry in _deletable(list(entries)):
-        days = limits.keep_media_days if entry.is_media else limits.keep_state_days
-        if days and now - entry.ended > days * _DAY_S:
-            return entry
-    return None
+    """A file of pictures and sound that is too old; one at a time, because the clock may have been set wrong."""
+    age_s = limits.keep_media_days * _DAY_S
+    old = (entry for entry in _deletable(list(entries)) if entry.is_media and now - entry.ended > age_s)
+    return next(old, None) if age_s else None
 
 
 def _deletable(entries: list[Entry]) -> list[Entry]:

@@ -9,23 +9,16 @@ class Due:
     def __init__(self, boot_ns: Callable[[], int]) -> None:
         self._boot_ns = boot_ns
         self._done: dict[str, int] = {}
-        self._turned = boot_ns()
+        self._began = self._awake_at = boot_ns()
         self._awake: int | None = None
-        self._awake_at = self._turned
 
     def every(self, what: str, seconds: float) -> bool:
         now = self._boot_ns()
-        if now - self._done.get(what, self._turned) < seconds * 1e9:
+        if now - self._done.get(what, self._began) < seconds * 1e9:
             self._done.setdefault(what, now)
             return False
         self._done[what] = now
         return True
-
-    def late_s(self, expected_s: float) -> float:
-        """By how much longer than expected the last turn took."""
-        now = self._boot_ns()
-        took, self._turned = (now - self._turned) / 1e9, now
-        return took - expected_s
 
     def suspended_s(self, awake_ns: int) -> float:
         """Seconds for which the machine was suspended since the last call."""

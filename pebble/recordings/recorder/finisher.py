@@ -1,24 +1,40 @@
 """Finishes files beside the writer: complete ones, and what a killed recorder or a full disk has left."""
 
 import logging
-import subprocess
-import sys
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import Final
 
-import msgspec
-
-from pebble.recordings.files.finish import CANNOT_BE_READ, Finished
+from pebble.recordings.files.recorded import RecordingError
+from pebble.recordings.files.rewrite import Rewritten, rewrite
 from pebble.recordings.library import SUFFIX
 from pebble.recordings.recorder.background import Background
-from pebble.recordings.recorder.folder import DAMAGED, finished_path, rename
+from pebble.recordings.recorder.folder import DAMAGED, finished_path, rename, sync_folder
 from pebble.recordings.recorder.lane import OpenFile
 
 log = logging.getLogger(__name__)
 
-_LONGEST_S: Final = 600.0
+
+def mend(path: Path) -> Rewritten:
+    """Make a finished file of one that a killed recorder has left.
+
+    That one is deleted if nothing but the begin of a record is lost, else kept as ``….mcap.damaged``. Raises
+    RecordingError, OSError.
+    """
+    target = finished_path(path)
+    made = rewrite(path, target)
+    if made.is_empty:
+        target.unlink()
+    sync_folder(path.parent)
+    if made.is_whole:
+        path.unlink()
+    else:
+        rename(path, _damaged_path(path))
+    return made
+
+
+def _damaged_path(path: Path) -> Path:
+    return finished_path(path).with_suffix(SUFFIX + DAMAGED)
 
 
 class Finisher:
@@ -51,41 +67,30 @@ class Finisher:
         self._on_finished()
 
     def _mend(self, path: Path) -> None:
-        """Works in a process of its own: reading from a damaged disk may kill it (SIGBUS)."""
         self._unfinished.discard(path)
         if not path.exists():
             return
-        command = [sys.executable, "-m", "pebble.recordings.files.finish", str(path)]
         try:
-            done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=_LONGEST_S)
-        except (OSError, subprocess.TimeoutExpired) as error:
+            made = mend(path)
+        except RecordingError as error:
+            self._set_aside(path, str(error))
+            return
+        except OSError as error:
             self._later(path, str(error))
             return
-        if done.returncode == 0:
-            self._mended(path, msgspec.json.decode(done.stdout, type=Finished))
-        elif done.returncode == CANNOT_BE_READ or done.returncode < 0:
-            why = done.stderr.strip() or f"its reader was ended by signal {-done.returncode}"
-            if self._renamed(path, finished_path(path).with_suffix(SUFFIX + DAMAGED)):
-                self._event("damaged", file=path.name, why=why)
-        else:
-            self._later(path, done.stderr.strip())
+        if not made.is_whole:
+            self._event("damaged", file=path.name, why=made.unread)
+        if not made.is_empty:
+            self._event("recovered", file=path.name, messages=made.messages, missing=made.missing)
+            self._on_finished()
 
-    def _mended(self, path: Path, made: Finished) -> None:
-        if made.messages == 0 and made.whole:
-            path.unlink()
-            return
-        if not self._renamed(path, finished_path(path)):
-            return
-        self._event("recovered", file=path.name, messages=made.messages, missing=made.missing, torn=made.torn_bytes)
-        self._on_finished()
-
-    def _renamed(self, path: Path, target: Path) -> bool:
+    def _set_aside(self, path: Path, why: str) -> None:
         try:
-            rename(path, target)
+            rename(path, _damaged_path(path))
         except OSError as error:
-            self._later(path, f"{target.name}: {error.strerror or error}")
-            return False
-        return True
+            self._later(path, str(error))
+            return
+        self._event("damaged", file=path.name, why=why)
 
     def _later(self, path: Path, why: str) -> None:
         """It stays as it is, and can be read, until there is room."""

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO, Final
 
-from pebble.recordings.files.mcap import RecordingError
+from pebble.recordings.files.recorded import RecordingError
 from pebble.recordings.files.rewrite import PART
 from pebble.recordings.library import ACTIVE, SUFFIX
 from pebble.transports.own_file import OwnFile
@@ -20,7 +20,6 @@ STATE: Final = "state"
 MEDIA: Final = "media."
 DAMAGED: Final = ".damaged"
 LOCK: Final = "recorder.lock"
-_MAINTENANCE: Final = "maintenance.lock"
 _NAME: Final = re.compile(
     r"(?P<stamp>\d{8}T\d{6}Z)-(?P<number>\d{6,})\.(?P<lane>state|media\.[A-Za-z0-9_.-]{1,120})\.mcap(?P<state>|\.active|\.damaged)"
 )
@@ -65,10 +64,13 @@ class Folder:
         try:
             self.root.mkdir(mode=0o750, parents=True, exist_ok=True)
         except OSError as error:
-            raise RecordingError(f"{self.root}: {error.strerror}: name another folder with --into") from None
-        used = f"{self.root}: another recorder writes here: name another folder with --into"
+            raise RecordingError(f"{self.root}: {error.strerror}: name another folder") from None
+        used = f"{self.root}: a recorder writes here: stop it first, or name another folder"
         self._lock.enter_context(_locked(self.root / LOCK, used))
         self._own = OwnFile(self.root / LOCK)
+        for path in self._files():
+            if _COPY.fullmatch(path.name):  # was being written when its process was killed
+                path.unlink(missing_ok=True)
         self._number = max((self._number, *(entry.number for entry in self.entries())))
 
     @property
@@ -80,16 +82,13 @@ class Folder:
         self._lock.close()
 
     @contextmanager
-    def maintained(self) -> Iterator[None]:
-        """While files are written again: against a second one who does so. Raises RecordingError, OSError.
-
-        Copies that such a one has left when it was killed are deleted.
-        """
-        with _locked(self.root / _MAINTENANCE, f"{self.root}: is being compacted or cleaned: try again later"):
-            for path in self._files():
-                if _COPY.fullmatch(path.name):
-                    path.unlink(missing_ok=True)
+    def taken(self) -> Iterator[None]:
+        """Keep recorders away meanwhile. Raises RecordingError."""
+        self.take()
+        try:
             yield
+        finally:
+            self.release()
 
     @classmethod
     def is_in_use(cls, root: Path) -> bool:
@@ -143,7 +142,7 @@ def _locked(path: Path, used: str) -> Iterator[None]:
     try:
         file = path.open("a+b")
     except OSError as error:
-        raise RecordingError(f"{path}: {error.strerror}: name another folder with --into") from None
+        raise RecordingError(f"{path}: {error.strerror}: name another folder") from None
     with file:
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)

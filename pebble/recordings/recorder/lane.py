@@ -5,15 +5,16 @@ import re
 from collections.abc import Mapping
 from typing import BinaryIO, Final, NamedTuple
 
-from pebble.recordings.files.channels import ChannelTable
-from pebble.recordings.files.mcap import Packer
-from pebble.recordings.files.writer import LIBRARY, McapWriter
+from pebble.recordings.files.writer import RecordingWriter
 from pebble.recordings.recorder.folder import MEDIA, STATE, Folder, finished_path, rename
 from pebble.recordings.stamps import stamp_ns
 
 #: Of a retained value that is written again at the begin of a file.
 CARRIED: Final = "carried"
 _DAY_NS: Final = 86_400 * 10**9
+#: Of one file, so that many robots, or who invents topics, begin files more often. It begins with 10,000 at most.
+_MOST_CHANNELS: Final = 20_000
+_MOST_INDEXED: Final = 300_000  # channels of all its chunks: each takes 100 bytes of memory until it is finished
 _JSON: Final = frozenset(b'{["-0123456789tfn')
 OTHER_MEDIA: Final = f"{MEDIA}_other"
 _PLAIN: Final = re.compile(r"[A-Za-z0-9_-]{1,32}").fullmatch
@@ -34,19 +35,24 @@ class Item(NamedTuple):
 class OpenFile:
     """A file that is being written."""
 
-    def __init__(self, folder: Folder, lane: str, now_ns: int, about: Mapping[str, str], packer: Packer) -> None:
+    def __init__(self, folder: Folder, lane: str, now_ns: int, about: Mapping[str, str]) -> None:
         self.file, self.path = folder.create(lane, now_ns)
         self.began_ns = now_ns
         self.last_ns = 0  # of its messages
         self.pending: list[Item] = []  # what the file has not taken yet
         try:
-            self.writer = McapWriter(RawFile(self.file), library=LIBRARY, packer=packer)
+            self.writer = RecordingWriter(RawFile(self.file))
             self.writer.metadata("pebble.recording", {**about, "lane": lane})
         except OSError:
             self.discard()
             raise
         self._taken = 0
-        self._channels = ChannelTable(self.writer)
+        self._channels: dict[tuple[object, ...], int] = {}
+
+    @property
+    def is_full(self) -> bool:
+        """Whether the next message belongs into another file."""
+        return self.writer.channels >= _MOST_CHANNELS or self.writer.indexed >= _MOST_INDEXED
 
     def add(self, item: Item, at_ns: int) -> None:
         """Raises OSError. Times never go back within a file."""
@@ -56,14 +62,11 @@ class OpenFile:
         stamp = stamp_ns(item.payload)
         publish_ns = stamp if abs(stamp - log_ns) < _DAY_NS else 0
         key = (item.topic, item.qos, item.retain, item.retained, item.source, _is_json(item.payload))
-        channel = self._channels.find(key)
+        channel = self._channels.get(key)
         if channel is None:
             encoding = "json" if _is_json(item.payload) else "application/octet-stream"
-            channel = self._channels.declare(key, item.topic, encoding, _metadata(item))
-        if channel is None:
-            self._channels.add_other(item.topic, _metadata(item), log_ns, item.payload, publish_ns)
-        else:
-            self.writer.add(channel, log_ns, item.payload, publish_ns)
+            channel = self._channels[key] = self.writer.channel(item.topic, encoding, _metadata(item))
+        self.writer.add(channel, log_ns, item.payload, publish_ns)
 
     def flush(self) -> int:
         """Give all that was added to the file; returns how many messages it has taken since the last call."""
@@ -78,7 +81,7 @@ class OpenFile:
 
     def take_lacking(self) -> list[Item]:
         """After an error: the messages that the file has not taken. They are not pending any more."""
-        lacking = self.writer.contents.messages - self.writer.flushed
+        lacking = self.writer.messages - self.writer.flushed
         items, self.pending = self.pending, []
         return items[max(0, len(items) - lacking) :] if lacking else []
 

@@ -1,4 +1,4 @@
-"""What a recorder does, as numbers: for node_exporter's textfile collector, and for ``pebble recordings list``."""
+"""What a recorder does, as numbers in a file: for ``pebble doctor``, and for programs that watch machines."""
 
 import json
 import os
@@ -11,7 +11,6 @@ from typing import Any, Final
 from pebble.recordings.recorder.recorder import Recorder
 from pebble.recordings.recorder.source import Source
 
-PROMETHEUS: Final = "recorder.prom"
 STATUS: Final = "recorder.json"
 _TOTALS: Final = ("messages", "bytes", "written", "dropped", "errors", "refused", "pruned_bytes")
 
@@ -37,28 +36,10 @@ def snapshot(recorder: Recorder, sources: Iterable[Source]) -> dict[str, Any]:
 
 
 def write(recorder: Recorder, sources: Iterable[Source]) -> None:
-    """Replace both files. Raises OSError."""
-    values = snapshot(recorder, sources)
-    _replace(recorder.folder.root / STATUS, json.dumps(values))
-    _replace(recorder.folder.root / PROMETHEUS, _prometheus(values))
-
-
-def _prometheus(values: dict[str, Any]) -> str:
-    lines = [f"pebble_record_{name}_total {values[name]}" for name in (*_TOTALS, "gaps")]
-    gauges = ("connected", "connections", "waiting", "free_bytes", "slowest_flush_s", "slowest_sync_s")
-    lines += [
-        f"pebble_record_{name.removesuffix('_s')}{'_seconds' * name.endswith('_s')} {values[name]}" for name in gauges
-    ]
-    lines.append(f"pebble_record_blocked {int(bool(values['blocked']))}")
-    for robot, at in values["robots"].items():
-        name = robot.replace("\\", "\\\\").replace('"', '\\"')
-        lines.append(f'pebble_record_last_message_timestamp_seconds{{robot="{name}"}} {at:.3f}')
-    return "\n".join(lines) + "\n"
-
-
-def _replace(path: Path, text: str) -> None:
+    """Replace the file. Raises OSError."""
+    path = recorder.folder.root / STATUS
     part = path.with_name(f".{path.name}.part")
-    part.write_text(text, encoding="utf-8")
+    part.write_text(json.dumps(snapshot(recorder, sources)), encoding="utf-8")
     part.replace(path)
 
 

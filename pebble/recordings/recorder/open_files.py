@@ -4,7 +4,6 @@ from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Final
 
-from pebble.recordings.files.mcap import Packer
 from pebble.recordings.recorder.folder import STATE, Folder
 from pebble.recordings.recorder.lane import CARRIED, OTHER_MEDIA, Item, OpenFile, lane_of
 from pebble.recordings.stamps import is_media
@@ -50,11 +49,9 @@ class OpenFiles:
     ``about`` is written into each file, and ``watch`` gets all of them whenever that changes.
     """
 
-    def __init__(
-        self, folder: Folder, about: Mapping[str, str], packer: Packer, watch: Callable[[list[OpenFile]], None]
-    ) -> None:
+    def __init__(self, folder: Folder, about: Mapping[str, str], watch: Callable[[list[OpenFile]], None]) -> None:
         self.retained = RetainedValues()
-        self._folder, self._about, self._packer, self._watch = folder, about, packer, watch
+        self._folder, self._about, self._watch = folder, about, watch
         self._files: dict[str, OpenFile] = {}
 
     @property
@@ -77,7 +74,7 @@ class OpenFiles:
         file = self._files.get(lane)
         if file is not None:
             return file
-        file = OpenFile(self._folder, lane, now_ns, self._about, self._packer)
+        file = OpenFile(self._folder, lane, now_ns, self._about)
         if lane == STATE:
             try:
                 for value in self.retained.carried():

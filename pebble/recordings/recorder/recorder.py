@@ -12,7 +12,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Final
 
-from pebble.recordings.files.mcap import LARGEST_PAYLOAD
+from pebble.recordings.files.recorded import require_package
 from pebble.recordings.recorder.background import Background
 from pebble.recordings.recorder.clock import RecordingClock
 from pebble.recordings.recorder.due import Due
@@ -26,8 +26,11 @@ from pebble.runtime.rate_limit import RateLimitedLog
 
 log = logging.getLogger(__name__)
 
+LARGEST_PAYLOAD: Final = 16 << 20
+FLUSH_S: Final = 1.0  # a kill loses as much
+QUEUE_BYTES: Final = 64 << 20
 _TICK_S: Final = 0.2
-_LATE_S: Final = 0.5
+_SUSPENDED_S: Final = 0.5
 
 
 class Recorder:
@@ -41,9 +44,9 @@ class Recorder:
         self.slowest_sync_s = 0.0
         self._clocks = clocks or Clocks()
         self.clock = RecordingClock(self._clocks.wall_ns, self._clocks.boot_ns)
-        self._intake = Intake(options.queue_bytes, self._clocks, self.counters)
+        self._intake = Intake(QUEUE_BYTES, self._clocks, self.counters)
         self.events = Events(self._intake, self.clock, self._clocks.boot_ns, self.counters)
-        self._background = Background(options.sync_seconds, self._note_sync)
+        self._background = Background(self._note_sync)
         context = Context(
             self.folder, options, self.clock, self.counters, self.events, {"format": "1", **(about or {})}
         )
@@ -53,7 +56,8 @@ class Recorder:
         self._quiet_log = RateLimitedLog(log, period_s=60.0)
 
     def start(self) -> None:
-        """Raises RecordingError if the folder cannot be used."""
+        """Raises RecordingError if the folder cannot be used, or the package ``mcap`` is not installed."""
+        require_package()
         self.folder.take()
         left = self._writing.mend_leftovers()
         self.events.note("start", pid=os.getpid(), leftovers=left)
@@ -121,9 +125,6 @@ class Recorder:
         due = Due(self._clocks.boot_ns)
         while True:
             stopping = self._stopping.wait(_TICK_S)
-            late_s = due.late_s(_TICK_S)
-            if late_s > _LATE_S:
-                self.events.note("late", max_ms=round(late_s * 1000))
             try:
                 self._turn(due, stopping=stopping)
             except Exception:  # noqa: BLE001  an unforeseen error must not end the recording
@@ -133,7 +134,7 @@ class Recorder:
                 return
 
     def _turn(self, due: Due, *, stopping: bool) -> None:
-        flushing = stopping or due.every("flush", self.options.flush_seconds)
+        flushing = stopping or due.every("flush", FLUSH_S)
         if flushing:
             self._follow_clock(due)
         self._writing.check_space(due, now_s=self._clocks.wall_ns() / 1e9)
@@ -151,7 +152,7 @@ class Recorder:
 
     def _follow_clock(self, due: Due) -> None:
         suspended_s = due.suspended_s(self._clocks.awake_ns())
-        if suspended_s > _LATE_S:
+        if suspended_s > _SUSPENDED_S:
             self.events.gap(self.clock.now() - round(suspended_s * 1e9), "suspended")
         offset_ns = self.clock.offset_ns
         by_s = self.clock.follow()

@@ -17,6 +17,8 @@ REPLAYED: Final = "replay/"
 #: How long a connection for retained messages waits for the next one before it ends.
 _QUIET_S: Final = 1.0
 _LONGEST_S: Final = 60.0
+#: The reason of a broker that knows only MQTT 3.1.1, which does not show how a live message was published.
+_OLD_BROKER: Final = "unsupported protocol version"
 _LOSSES: Final = ("too_long", "malformed")  # messages that a transport has dropped
 
 
@@ -32,7 +34,7 @@ class Source:
         self._recorder, self._kind, self._name = recorder, kind, name
         self._filters = list(dict.fromkeys(filters))
         self._ignored = () if any(one.startswith(REPLAYED) for one in self._filters) else (REPLAYED,)
-        self._settings = settings
+        self._settings, self._is_modern = settings, True
         self._lost_at = 0  # nanoseconds since 1970; 0: connected, or never was
         self._losses: dict[str, int] = {}
         self._copies: _Copies | None = None
@@ -49,10 +51,7 @@ class Source:
 
     def start(self, timeout: float = 3.0) -> None:
         """Connect, and go on trying. Raises TransportError for settings that can never work."""
-        self._transport.on_state(self._watch)
-        self._transport.open(timeout)
-        for filter_, receive in _once(self._filters, self._receive):
-            self._transport.subscribe(filter_, receive, qos=QoS.DELIVERED, echo=False, direct=True)
+        self._open(timeout)
         self.check()
 
     def check(self) -> None:
@@ -63,6 +62,11 @@ class Source:
             if new > 0:
                 self._losses[name] = counted[name]
                 self._recorder.events.note("dropped", messages=new, why=name, **self._about)
+        if self._kind == "mqtt" and self._is_modern and _OLD_BROKER in self.problem:
+            self._transport.close()
+            self._is_modern = False
+            self._transport = self._make()
+            self._open(0.0)
         copies = self._copies
         if copies is not None and (copies.is_done or self._wants_copies):
             copies.close()
@@ -78,14 +82,21 @@ class Source:
         if self._copies is not None:
             self._copies.close()
 
+    def _open(self, timeout: float) -> None:
+        self._transport.on_state(self._watch)
+        self._transport.open(timeout)
+        for filter_, receive in _once(self._filters, self._receive):
+            self._transport.subscribe(filter_, receive, qos=QoS.DELIVERED, echo=False, direct=True)
+
     @property
     def _about(self) -> dict[str, str]:
         return {"source": self._name} if self._name else {}
 
     def _make(self) -> Transport:
         if self._kind == "mqtt":
-            modern = self._settings.protocol == "5"
-            settings = replace(self._settings, as_published=modern, sends_retained=not modern)
+            modern = self._is_modern
+            protocol = "5" if modern else "3.1.1"
+            settings = replace(self._settings, protocol=protocol, as_published=modern, sends_retained=not modern)
             return create("mqtt", "pebble-recorder", settings)
         return create(self._kind, "pebble-recorder", self._settings)
 

@@ -9,7 +9,7 @@ from operator import attrgetter
 from pathlib import Path
 from typing import Final, NamedTuple
 
-from pebble.recordings.files.mcap import Packer, RecordingError
+from pebble.recordings.files.recorded import RecordingError
 from pebble.recordings.recorder.background import Background
 from pebble.recordings.recorder.clock import RecordingClock
 from pebble.recordings.recorder.disk_space import Disk, outdated, surplus
@@ -18,13 +18,14 @@ from pebble.recordings.recorder.events import Events
 from pebble.recordings.recorder.finisher import Finisher
 from pebble.recordings.recorder.folder import STATE, Folder
 from pebble.recordings.recorder.intake import EVENTS, FORGET, Intake
-from pebble.recordings.recorder.lane import Item
+from pebble.recordings.recorder.lane import Item, OpenFile
 from pebble.recordings.recorder.open_files import OpenFiles
 from pebble.recordings.recorder.settings import Options
 from pebble.runtime.rate_limit import RateLimitedLog
 
 log = logging.getLogger(__name__)
 
+ROTATE_BYTES: Final = 512 << 20  # of one file
 _SPACE_S: Final = 2.0  # between two looks at the disk
 _LISTED_S: Final = 60.0  # between two looks at all files
 _AGE_S: Final = 60.0  # between two files that are deleted for their age
@@ -60,7 +61,7 @@ class Writing:
         self.slowest_flush_s = 0.0
         self._folder, self._options, self._clock, self._counters, self._events, about = context
         self._intake = intake
-        self._files = OpenFiles(self._folder, about, Packer(self._options.level), background.watch)
+        self._files = OpenFiles(self._folder, about, background.watch)
         self._finisher = Finisher(background, self._events.note, self._note_finished)
         self._blocked: _Blocked | None = None
         self._lacking: list[Item] = []  # what no file has taken; bounded: a second of messages
@@ -107,6 +108,10 @@ class Writing:
         at_ns = self._clock.at(item.boot_ns)
         try:
             file = self._files.get(lane, now_ns=self._clock.now(), at_ns=at_ns)
+            if file.is_full:
+                self._flush(lane, file)
+                self._finish(lane)
+                file = self._files.get(lane, now_ns=self._clock.now(), at_ns=at_ns)
         except OSError as error:
             self._lacking.append(item)
             self._block(lane, error)
@@ -119,15 +124,7 @@ class Writing:
     def flush(self) -> None:
         """Give what was added to the files."""
         for lane, file in self._files.by_lane.items():
-            began = self._clock.now()
-            try:
-                self._counters["written"] += file.flush()
-            except OSError as error:
-                self._fail(lane, error)
-                continue
-            self.slowest_flush_s = max(self.slowest_flush_s, (self._clock.now() - began) / 1e9)
-            if not file.is_there():
-                self._forget_removed(lane)
+            self._flush(lane, file)
 
     def rotate(self, *, all_of_them: bool = False) -> None:
         """Finish the files that are old, large or idle."""
@@ -135,8 +132,24 @@ class Writing:
         for lane, file in self._files.by_lane.items():
             old = now_ns - file.began_ns > self._options.rotate_seconds * 1e9
             idle = lane != STATE and now_ns - max(file.last_ns, file.began_ns) > _IDLE_NS
-            if all_of_them or old or idle or file.writer.size > self._options.rotate_bytes:
-                self._finisher.finish(self._files.take(lane))
+            if all_of_them or old or idle or file.writer.size > ROTATE_BYTES:
+                self._finish(lane)
+
+    def _flush(self, lane: str, file: OpenFile) -> None:
+        began = self._clock.now()
+        try:
+            self._counters["written"] += file.flush()
+        except OSError as error:
+            self._fail(lane, error)
+            return
+        self.slowest_flush_s = max(self.slowest_flush_s, (self._clock.now() - began) / 1e9)
+        if not file.is_there():
+            self._forget_removed(lane)
+
+    def _finish(self, lane: str) -> None:
+        """Finish the file of a lane, unless it has failed meanwhile."""
+        if lane in self._files.by_lane:
+            self._finisher.finish(self._files.take(lane))
 
     def note_drops(self) -> None:
         """Write down what was dropped because the queue was full."""

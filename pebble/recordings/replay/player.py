@@ -3,7 +3,7 @@
 from collections.abc import Callable, Iterator
 from typing import Final
 
-from pebble.recordings.files.mcap import Recorded
+from pebble.recordings.files.recorded import Recorded
 from pebble.recordings.library import FOREVER_NS
 from pebble.recordings.replay.pace import SLOWEST, Pace
 from pebble.recordings.replay.rules import Rules, zero

@@ -1,8 +1,8 @@
-"""What of a recording may be published again, and how: harmless unless asked twice. Pure.
+"""What of a recording may be published again, and how: harmless unless asked for more. Pure.
 
-The rules in their order: nothing of a broker's own; another base; nothing that is an order to a robot, unless asked
-for; nothing retained, unless asked for. Names of topics decide by the contract, so an unknown name counts as the worst
-of its direction.
+The rules in their order: nothing of a broker's own; another base; nothing that is an order to a robot, but mild ones
+if asked for; nothing retained. Names of topics decide by the contract, so an unknown name counts as the worst of its
+direction.
 """
 
 from collections.abc import Iterable
@@ -19,7 +19,7 @@ from pebble.contract.channels import is_reserved
 from pebble.contract.identity import Identity, ParsedTopic, parse_topic
 from pebble.contract.payloads import Drive
 from pebble.errors import PayloadError, PebbleError, TransportError
-from pebble.recordings.files.mcap import Channel, Recorded
+from pebble.recordings.files.recorded import Channel, Recorded
 from pebble.recordings.stamps import shifted
 from pebble.transports import Message, QoS
 from pebble.transports.topics import check_filter, check_topic, matches
@@ -27,7 +27,7 @@ from pebble.transports.topics import check_filter, check_topic, matches
 SYSTEM: Final = "replay"  # the first level of replayed topics, unless another one is named
 
 #: Commands whose effect ends by itself, or is visible at once. All others, and all that the contract does not know,
-#: are actions: they switch on cameras, mains and scripts, or move what no zero stops.
+#: are never sent: they switch on cameras, mains and scripts, or move what no zero stops.
 _MILD: Final = frozenset({c.DRIVE, c.LIGHTS_SOLID, c.LIGHTS_FLASH, c.AUDIO_STREAM, c.SOUNDBOARD_COMMAND})
 _HEARTBEATS: Final = frozenset({c.ONLINE, c.HEARTBEAT})
 _PROBE: Final = 24  # bytes of white space at the end of a payload by which bridges look for cycles
@@ -36,18 +36,15 @@ _ZERO: Final = codec.encode(c.DRIVE, Drive(valid_ms=0))  # final: no script resu
 
 
 class ReplayError(PebbleError):
-    """A replay that must not go on. Example: ``pebble/robots/goob is live: …``."""
+    """A replay that cannot be. Example: ``--base pebble is the base of pebble/robots/goob itself: …``."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Options:
     """What the user has asked for."""
 
-    system: str | None = SYSTEM  # None: the recorded one
+    system: str = SYSTEM
     incoming: bool = False  # commands that end by themselves
-    actions: bool = False  # all other incoming messages
-    retain: bool = False  # outgoing ones as they were
-    shift: bool = True  # move stamps to now
     only: tuple[str, ...] = ()  # filters of recorded topics; none: all
 
 
@@ -66,7 +63,6 @@ class _Address(NamedTuple):
     topic: str
     declared: Declared | None
     qos: QoS
-    retain: bool
 
 
 class Rules:
@@ -75,8 +71,7 @@ class Rules:
     def __init__(self, options: Options, channels: Iterable[Channel]) -> None:
         """``channels``: those of the recording. Raises ReplayError, ConfigError or TransportError."""
         self._options = options
-        if options.system is not None:
-            Identity(options.system, "robots", "any")
+        Identity(options.system, "robots", "any")
         for filter_ in options.only:
             check_filter(filter_)
         self._found = lru_cache(maxsize=65_536)(self._find)
@@ -102,9 +97,7 @@ class Rules:
             payload = self._capabilities(payload, address)
             if not payload:
                 return None
-        if self._options.shift:
-            payload = shifted(payload, by_ns)
-        return Outgoing(Message(address.topic, payload, address.qos, address.retain), moves)
+        return Outgoing(Message(address.topic, shifted(payload, by_ns), address.qos), moves)
 
     def _listed(self, channel: Channel) -> _Address | None:
         """None for robots that the files did not name at the start: they may be live."""
@@ -113,29 +106,24 @@ class Rules:
 
     def _address(self, channel: Channel) -> _Address | None:
         metadata = channel.metadata
-        return self._found(
-            channel.topic, metadata.get("qos", "0"), metadata.get("retain") == "1", metadata.get("retained") == "1"
-        )
+        return self._found(channel.topic, metadata.get("qos", "0"), metadata.get("retained") == "1")
 
-    def _find(self, topic: str, qos: str, retain: bool, retained: bool) -> _Address | None:
-        """``retain``: published so; ``retained``: the recorder received it as an old message."""
+    def _find(self, topic: str, qos: str, retained: bool) -> _Address | None:
+        """``retained``: the recorder received it as an old message."""
         parsed = None if topic.startswith("$") else parse_topic(topic)
         if parsed is None or parsed.identity.is_server or not self._wanted(topic):
             return None
         declared = channel_of(f"{parsed.direction}/{parsed.metric}")
         if not self._allowed(parsed, declared, retained):
             return None
-        identity = parsed.identity
-        if self._options.system is not None:
-            identity = Identity(self._options.system, identity.type, identity.id)
+        identity = Identity(self._options.system, parsed.identity.type, parsed.identity.id)
         new = ParsedTopic(identity, parsed.direction, parsed.metric).topic
         try:
             check_topic(new)
         except TransportError:  # no transport of ours can have recorded it
             return None
-        keeps = self._options.retain and parsed.direction != c.INCOMING and declared not in _HEARTBEATS
         quality = QoS.LATEST if qos == "0" else QoS.DELIVERED
-        return _Address(parsed.identity, identity.base, new, declared, quality, keeps and (retain or retained))
+        return _Address(parsed.identity, identity.base, new, declared, quality)
 
     def _wanted(self, topic: str) -> bool:
         only = self._options.only
@@ -143,16 +131,10 @@ class Rules:
 
     def _allowed(self, parsed: ParsedTopic, declared: Declared | None, retained: bool) -> bool:
         if parsed.direction != c.INCOMING:
-            return self._allowed_outgoing(parsed.metric, declared, retained)
+            return declared is not c.BRIDGE_PROBE and not (retained and declared in _HEARTBEATS)
         if retained or is_reserved(parsed.metric):  # stale; or who stops, resets and drives the robot, or did
             return False
-        return self._options.incoming and (self._options.actions or declared in _MILD)
-
-    def _allowed_outgoing(self, metric: str, declared: Declared | None, retained: bool) -> bool:
-        if declared is c.BRIDGE_PROBE or (retained and declared in _HEARTBEATS):
-            return False
-        # In its own name a robot that is away must not appear free or stopped, nor claim a device.
-        return self._options.system is not None or not (is_reserved(metric) or declared is c.MCU_DESCRIBE)
+        return self._options.incoming and declared in _MILD
 
     def _moves(self, payload: bytes) -> bool | None:
         """None for a command that is not to be sent: one that cannot be read, or a script's."""
@@ -161,7 +143,7 @@ class Rules:
         except PayloadError:
             return None
         # A script's number would bar the runs of the robot's own scripts.
-        return None if command.signed and not self._options.actions else command.moves
+        return None if command.signed else command.moves
 
     def _capabilities(self, payload: bytes, address: _Address) -> bytes:
         """Its topics below the new base, and no offers of what is not there; empty if it cannot be read.
@@ -179,8 +161,7 @@ class Rules:
 
     def _section(self, name: str, section: Any, address: _Address) -> Any:
         section = _rebased(section, f"{address.recorded.base}/", f"{address.base}/")
-        watched = name in _WATCHED and self._options.system is not None
-        return section if watched else _without_controls(section, drives=name == "drive")
+        return section if name in _WATCHED else _without_controls(section, drives=name == "drive")
 
     def _add(self, channel: Channel) -> None:
         address = self._address(channel)
@@ -188,9 +169,7 @@ class Rules:
             return
         base = address.recorded.base
         if self._options.system == address.recorded.system:
-            raise ReplayError(
-                f"--base {self._options.system} is the base of {base} itself: choose another one, or add --same-base"
-            )
+            raise ReplayError(f"--base {self._options.system} is the base of {base} itself: choose another one")
         if self.robots.setdefault(address.base, base) != base:
             raise ReplayError(
                 f"{self.robots[address.base]} and {base} would both be {address.base}: choose one by --only '{base}/#'"
@@ -200,11 +179,6 @@ class Rules:
 def zero(topic: str) -> Message:
     """What stops a robot that a drive command on ``topic`` may have set in motion."""
     return Message(topic, _ZERO, QoS.DELIVERED)
-
-
-def is_zero(message: Message) -> bool:
-    """Whether :func:`zero` has made it."""
-    return message.payload == _ZERO
 
 
 def _is_probe(payload: bytes) -> bool:

@@ -7,10 +7,9 @@ from pathlib import Path
 from typing import Final
 
 from pebble.contract import HEARTBEAT, ONLINE, OUTGOING, Kind, channel_of
-from pebble.recordings.files.mcap import Channel, Recorded
-from pebble.recordings.files.reader import Chooses
-from pebble.recordings.files.scan import Damage
-from pebble.recordings.library import FOREVER_NS, Damages, Span, channels_in, merged, span
+from pebble.recordings.files.reader import Chooses, RecordingFile
+from pebble.recordings.files.recorded import Channel, Recorded
+from pebble.recordings.library import FOREVER_NS, Damages, Span, merged, span_of
 from pebble.recordings.stamps import is_keyframe, is_picture
 
 #: How far before a time its state and its last key frame are looked for. A file of states is then read from its begin.
@@ -28,12 +27,12 @@ class ReplaySource:
         self._files: list[tuple[Path, Span, list[Channel]]] = []
         self.damages = Damages()  # of what was read
         for path in paths:
-            damage = Damage()
-            found = span(path, damage)
-            if found is None:
-                self.damages[path] = damage
-            else:
-                self._files.append((path, found, list(channels_in(path))))
+            with RecordingFile(path) as file:
+                covered = span_of(file)
+                if covered is None:
+                    self.damages[path] = file.damage
+                else:
+                    self._files.append((path, covered, list(file.channels.values())))
 
     @property
     def channels(self) -> list[Channel]:

@@ -10,11 +10,12 @@ from typing import Final, NamedTuple
 from pebble.contract.channels import LOGS
 from pebble.contract.identity import Direction, parse_topic
 from pebble.errors import PebbleError
-from pebble.recordings.files.mcap import Channel, Recorded
+from pebble.recordings.files.reader import Chunk
+from pebble.recordings.files.recorded import Channel, Recorded
 from pebble.recordings.library import ACTIVE, SUFFIX
 from pebble.recordings.recorder.folder import MEDIA
 from pebble.recordings.recorder.lane import OTHER_MEDIA, lane_of
-from pebble.recordings.seek.file import Chunk, RecordingFile, is_carried
+from pebble.recordings.seek.file import SeekableFile, is_carried
 from pebble.recordings.stamps import is_keyframe, is_media, is_picture
 
 LOG_LINES: Final = 50  # of the state at a time
@@ -42,7 +43,7 @@ class Archive:
         self.folder = folder
         self._named: list[_Named] = []
         self._listed_at = float("-inf")
-        self._open: dict[Path, RecordingFile] = {}
+        self._open: dict[Path, SeekableFile] = {}
         self._failed: dict[Path, str] = {}  # those that cannot be opened, and why
 
     def close(self) -> None:
@@ -56,7 +57,7 @@ class Archive:
             for chunk in _within(file, file.channels_of(robot), since_ns, until_ns):
                 found += (
                     one
-                    for one in file.messages(chunk)
+                    for one in file.messages_of(chunk)
                     if since_ns <= one.log_ns < until_ns and _is_of(one.channel, robot) and not is_carried(one.channel)
                 )
         found.sort(key=lambda one: one.log_ns)
@@ -79,7 +80,7 @@ class Archive:
                 file.channels[number].topic in missing for number in chunk.channels if number in file.channels
             ):
                 continue
-            for one in reversed(file.messages(chunk)):
+            for one in reversed(file.messages_of(chunk)):
                 topic = one.channel.topic
                 if one.log_ns < at_ns and topic not in found and _is_of(one.channel, robot):
                     found[topic] = one
@@ -92,7 +93,7 @@ class Archive:
         for file in reversed(self.files(robot, at_ns - _LOG_NS, at_ns, media=False)):
             numbers = frozenset(number for number, one in file.channels.items() if one.topic == topic)
             for chunk in reversed(_within(file, numbers, at_ns - _LOG_NS, at_ns)):
-                lines = [one for one in file.messages(chunk) if one.channel.topic == topic and one.log_ns < at_ns]
+                lines = [one for one in file.messages_of(chunk) if one.channel.topic == topic and one.log_ns < at_ns]
                 found += reversed(lines)
                 if len(found) >= LOG_LINES:
                     break
@@ -125,7 +126,7 @@ class Archive:
                 found = one if found is None else min(found, one)
         return found
 
-    def files(self, robot: str, since_ns: int, until_ns: int, *, media: bool = True) -> list[RecordingFile]:
+    def files(self, robot: str, since_ns: int, until_ns: int, *, media: bool = True) -> list[SeekableFile]:
         """Those that may hold messages of a robot in a period, opened, in the order of time."""
         lane = lane_of(f"{robot}/", is_media=True)
         found = []
@@ -140,7 +141,7 @@ class Archive:
             found.append(file)
         return sorted(found, key=lambda one: one.first_ns)
 
-    def all_files(self) -> Iterator[RecordingFile]:
+    def all_files(self) -> Iterator[SeekableFile]:
         """All, opened one after the other."""
         for named in self._list():
             file = self._opened(named.path)
@@ -164,7 +165,7 @@ class Archive:
             self._failed = {path: why for path, why in self._failed.items() if path in there}
         return self._named
 
-    def _opened(self, path: Path) -> RecordingFile | None:
+    def _opened(self, path: Path) -> SeekableFile | None:
         """None for one that has gone meanwhile, or is no recording."""
         file = self._open.pop(path, None)
         try:
@@ -172,7 +173,7 @@ class Archive:
                 file.close()
                 file = None
             if file is None:
-                file = RecordingFile(path)
+                file = SeekableFile(path)
             file.refresh()
         except (PebbleError, OSError) as error:
             self._failed[path] = str(error).removeprefix(f"{path}: ")
@@ -188,7 +189,7 @@ class Archive:
         since_ns = at_ns - _CHAIN_NS
         for file in reversed(self.files(robot, since_ns, at_ns)):
             for chunk in reversed(_within(file, file.channels_of(robot), since_ns, at_ns)):
-                for one in reversed(file.messages(chunk)):
+                for one in reversed(file.messages_of(chunk)):
                     outgoing = one.channel.topic.startswith(f"{robot}/outgoing/")
                     if one.log_ns < at_ns and outgoing and is_picture(one.payload):
                         yield one
@@ -202,15 +203,15 @@ def metric_of(topic: str) -> tuple[str, bool]:
     return parsed.metric, parsed.direction is Direction.INCOMING
 
 
-def _first(file: RecordingFile, robot: str, at_ns: int) -> int | None:
+def _first(file: SeekableFile, robot: str, at_ns: int) -> int | None:
     for chunk in _within(file, file.channels_of(robot), at_ns, 1 << 63):
-        for one in file.messages(chunk):
+        for one in file.messages_of(chunk):
             if one.log_ns >= at_ns and _is_of(one.channel, robot) and not is_carried(one.channel):
                 return one.log_ns
     return None
 
 
-def _within(file: RecordingFile, channels: frozenset[int], since_ns: int, until_ns: int) -> list[Chunk]:
+def _within(file: SeekableFile, channels: frozenset[int], since_ns: int, until_ns: int) -> list[Chunk]:
     """The chunks of a period that hold messages of these channels."""
     return [
         chunk

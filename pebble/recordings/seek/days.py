@@ -10,10 +10,11 @@ from typing import Final
 from msgspec import Struct, field
 
 from pebble.contract import DRIVE
+from pebble.recordings.files.reader import Chunk
 from pebble.recordings.library import robot_of
 from pebble.recordings.recorder.intake import EVENTS
 from pebble.recordings.seek.archive import Archive
-from pebble.recordings.seek.file import Chunk, RecordingFile
+from pebble.recordings.seek.file import SeekableFile
 
 DAY_NS: Final = 86_400 * 10**9
 _MOST_DAYS: Final = 31  # of one chunk
@@ -50,7 +51,7 @@ class Days:
             days = self._known.get(file.path)
             if days is None:
                 days = _days(file)
-                if file.is_finished:
+                if file.damage.finished:
                     self._known[file.path] = days
             for day in days:
                 _merge(found.setdefault(day.day, Day(day.day, first=day.first)), day)
@@ -63,7 +64,7 @@ class Days:
         return sorted(found.values(), key=lambda day: day.day, reverse=True)
 
 
-def _days(file: RecordingFile) -> list[Day]:
+def _days(file: SeekableFile) -> list[Day]:
     if not file.chunks:
         return []
     gaps = _gaps(file)
@@ -71,14 +72,14 @@ def _days(file: RecordingFile) -> list[Day]:
     for number in sorted({number for chunk in file.chunks for number in _day_numbers(chunk)}):
         begin, end = number * DAY_NS, (number + 1) * DAY_NS
         first, last = max(file.first_ns, begin), min(file.last_ns, end - 1)
-        size = 0 if days else file.size()
+        size = 0 if days else file.size
         within = sum(begin <= ns < end for ns in gaps)
         driven = _driven(file, begin, end)
         days.append(Day(_day_of(number * 86_400), sorted(file.robots()), size, first / 1e6, last / 1e6, within, driven))
     return days
 
 
-def _driven(file: RecordingFile, begin: int, end: int) -> dict[str, float]:
+def _driven(file: SeekableFile, begin: int, end: int) -> dict[str, float]:
     """Seconds within a day, by robot."""
     drives = {number: robot_of(channel) for number, channel in file.channels.items() if _drives(channel.topic)}
     robots = {number: robot for number, robot in drives.items() if robot is not None}
@@ -114,13 +115,15 @@ def _merge(day: Day, other: Day) -> None:
         day.driven[robot] = day.driven.get(robot, 0.0) + seconds
 
 
-def _gaps(file: RecordingFile) -> list[int]:
+def _gaps(file: SeekableFile) -> list[int]:
     """When the recorder wrote down gaps."""
     numbers = {number for number, channel in file.channels.items() if channel.topic == EVENTS}
     found = []
     for chunk in file.chunks if numbers else []:
         if not chunk.channels.isdisjoint(numbers):
-            found += [one.log_ns for one in file.messages(chunk) if one.channel.id in numbers and _is_gap(one.payload)]
+            found += [
+                one.log_ns for one in file.messages_of(chunk) if one.channel.id in numbers and _is_gap(one.payload)
+            ]
     return found
 
 

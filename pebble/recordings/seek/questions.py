@@ -30,7 +30,6 @@ from pebble.recordings.seek.segment import segment as make_segment
 from pebble.recordings.seek.thumbnails import Frame
 from pebble.recordings.seek.thumbnails import frame as make_frame
 from pebble.recordings.seek.thumbnails import strip as make_strip
-from pebble.recordings.traffic.index import FOLDER
 from pebble.recordings.traffic.timeline import timeline as make_timeline
 from pebble.runtime.parent import end_with_parent
 
@@ -46,8 +45,7 @@ _MENDS: Final = {
     errno.EACCES: _ACCESS,
     errno.EPERM: _ACCESS,
     errno.EROFS: _ACCESS,
-    errno.EEXIST: "move it away",
-    errno.ENOTDIR: "move it away",
+    errno.EISDIR: "move it away",
     errno.EIO: "look at the disk (dmesg)",
 }
 _archive: Archive
@@ -88,15 +86,11 @@ def strip(robot: str, since_ms: float, step_ms: float, count: int, width: int) -
 # -- jobs, each in a process of its own: they take long
 
 
-def make_timeline_job(
-    answer: Connection, folder: Path, paths: list[str], target: Path, robot: str, period: tuple[int, int]
-) -> None:
+def make_timeline_job(answer: Connection, paths: list[str], target: Path, robot: str, period: tuple[int, int]) -> None:
     """Index what is not indexed, and write the timeline to ``target``, as JSON."""
     _in_background(_NICE)
 
     def work() -> str:
-        if os.access(folder, os.W_OK):
-            (folder / FOLDER).mkdir(mode=0o750, exist_ok=True)
         places, progress = [Path(path) for path in paths], _Progress(answer)
         with tempfile.TemporaryDirectory(dir=target.parent) as scratch:
             made = make_timeline(places, Path(scratch), robot, *period, progress.share)

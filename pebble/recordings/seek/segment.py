@@ -6,7 +6,7 @@ from enum import IntFlag
 from typing import Final, NamedTuple
 
 from pebble.contract.channels import LOGS
-from pebble.recordings.files.mcap import Recorded
+from pebble.recordings.files.recorded import Recorded
 from pebble.recordings.seek.archive import Archive, metric_of
 from pebble.recordings.stamps import is_media, is_picture
 

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from pebble.errors import PebbleError
-from pebble.recordings.files.mcap import RecordingError
+from pebble.recordings.files.recorded import RecordingError
 
 if TYPE_CHECKING:
     from duckdb import DuckDBPyConnection
@@ -47,9 +47,9 @@ def connected(scratch: Path, *, memory_mb: int, threads: int = 1) -> Iterator[Du
         raise RecordingError(f"DuckDB: {str(error).partition(chr(10))[0]}") from None
 
 
-def quoted(path: Path) -> str:
-    """A file's name in SQL."""
-    return "'" + str(path).replace("'", "''") + "'"
+def quoted(value: object) -> str:
+    """Return a text in SQL."""
+    return "'" + str(value).replace("'", "''") + "'"
 
 
 def parquet(paths: Iterable[Path]) -> str:

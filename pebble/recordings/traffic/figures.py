@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 #: Colours that colour-blind readers can tell apart (Okabe and Ito).
-_BLUE, _ORANGE, _GREEN, _RED, _GREY = "#0072B2", "#E69F00", "#009E73", "#D55E00", "#999999"
+_BLUE, _ORANGE, _GREEN, _RED = "#0072B2", "#E69F00", "#009E73", "#D55E00"
 _SETTINGS: Final[dict[Any, Any]] = {
     "font.family": "sans-serif",
     "font.size": 9,
@@ -31,11 +31,6 @@ _SETTINGS: Final[dict[Any, Any]] = {
 }
 _SIZE: Final = (4.6, 2.8)  # inches
 _LONGEST_MS, _BIN_MS = 3000, 50
-_CAUSES: Final = (
-    ("robot", "this robot alone", _BLUE),
-    ("shared", "several robots at once", _ORANGE),
-    ("recorder", "recorder was late", _GREY),
-)
 _TIMES: Final = ((SESSION, "in sessions", _BLUE, -0.14, "o"), (IDLE, "idle", _ORANGE, 0.14, "s"))
 _TALL: Final = 30  # a highest bar of so many times the lowest makes the axis logarithmic
 
@@ -62,32 +57,24 @@ def _outages(robot: RobotTraffic) -> Figure | None:
     number = "Figure 4.4" if robot.machine == MCU else "Figure 4.1"
     caption = (
         f"A heartbeat comes every {usual.median_ms:.0f} ms. When one is missing, this counts by how much longer than "
-        "usual the robot was silent. Outages that several robots had at the same moment are not this robot's fault."
+        "usual the robot was silent."
     )
     return Figure(number, "Heartbeat outages", caption, _svg(lambda axes: draw_outages(axes, robot), robot, "outages"))
 
 
 def draw_outages(axes: Axes, robot: RobotTraffic) -> None:
-    """How many outages of each length, by their cause."""
-    edges = [start * _BIN_MS for start in range(_LONGEST_MS // _BIN_MS + 1)]
-    lengths = {
-        cause: [min(one.length_ms, _LONGEST_MS - 1) for one in robot.outages if one.cause == cause]
-        for cause, _, _ in _CAUSES
-    }
-    used = [(cause, label, colour) for cause, label, colour in _CAUSES if lengths[cause]]
-    if not used:
+    """Draw how many outages of each length there were."""
+    if not robot.outages:
         axes.set_axis_off()
         axes.text(0.5, 0.5, "no outage", ha="center", va="center", transform=axes.transAxes, color="#555")
         return
-    counts = axes.hist(
-        [lengths[cause] for cause, _, _ in used], bins=edges, stacked=True, color=[colour for _, _, colour in used],
-        label=[f"{label}: {len(lengths[cause])}" for cause, label, _ in used],
-    )[0]  # fmt: skip
-    _scale_counts(axes, [float(count) for count in _flat(counts)])
+    edges = [start * _BIN_MS for start in range(_LONGEST_MS // _BIN_MS + 1)]
+    lengths = [min(outage.length_ms, _LONGEST_MS - 1) for outage in robot.outages]
+    counts = axes.hist(lengths, bins=edges, color=_BLUE)[0]
+    _scale_counts(axes, [float(count) for count in counts])
     axes.set_xlim(0, _LONGEST_MS)
     axes.set_xlabel("ms longer than usual; the last bar: 3 s and more")
     axes.set_ylabel("outages")
-    _legend(axes)
 
 
 def _latency(robot: RobotTraffic) -> Figure | None:
@@ -99,8 +86,6 @@ def _latency(robot: RobotTraffic) -> Figure | None:
         "The time from a heartbeat's own stamp to its reception by the recorder. It depends on both clocks: only "
         "differences between values are certain."
     )
-    if latency.whole_seconds:
-        caption += " This robot cuts its stamps to whole seconds: 0 to 1000 ms of each value is the stamp's."
     if latency.ahead_ms:
         caption += f" Values below 0 show that its clock is at least {latency.ahead_ms:.0f} ms ahead."
     svg = _svg(lambda axes: draw_latency(axes, latency), robot, "latency")
@@ -174,12 +159,6 @@ def _scale_counts(axes: Axes, counts: Sequence[float]) -> None:
         axes.yaxis.set_major_formatter(lambda value, _: f"{value:g}")
     else:
         axes.locator_params(axis="y", integer=True, min_n_ticks=1)
-
-
-def _flat(counts: Any) -> list[float]:
-    """The heights of stacked bars; matplotlib gives one row for each part, or one if there is one."""
-    rows = counts if len(counts) and hasattr(counts[0], "__len__") else [counts]
-    return [count for row in rows for count in row]
 
 
 def _short(value: float) -> str:

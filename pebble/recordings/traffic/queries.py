@@ -8,22 +8,17 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from pebble.contract import channels as c
-from pebble.recordings import media_numbers
 from pebble.recordings.library import FOREVER_NS
 from pebble.recordings.traffic import results as traffic
 from pebble.recordings.traffic.activity import SESSION, Activity
-from pebble.recordings.traffic.duck import parquet
+from pebble.recordings.traffic.duck import parquet, quoted
+from pebble.recordings.traffic.index import PICTURE, SOUND
 
 if TYPE_CHECKING:
     from duckdb import DuckDBPyConnection
 
 _BINS, _FINEST_MS = 60, 0.5  # of histograms
-_LARGEST_STEP: Final = 1000  # a larger one is no loss but another beginning
-_WRAP: Final = media_numbers.LIMIT
 _LINUX_ONLY: Final = tuple(one.metric for one in (c.LOGS, c.MEDIA_STATUS, c.SOUNDBOARD_FILES, c.AUTONOMY_FILES))
-#: What a message takes on the wire beside its payload: its topic, MQTT's own bytes (up to 16 kB), and headers of TCP/IP
-#: without options for each segment of at most 1460 bytes.
-_MQTT_BYTES, _TCP_BYTES, _SEGMENT_BYTES = 4, 40, 1460
 
 
 def _names(texts: Sequence[str]) -> str:
@@ -42,20 +37,19 @@ def _percentile(value: str, share: float) -> str:
     return f"sum({value} * greatest(0, 1 - abs(place - {share} * last)))"
 
 
-_VIDEO, _AUDIO = _numbers(media_numbers.VIDEO), _numbers(media_numbers.AUDIO)
 _FAMILY: Final = f"""CASE
-    WHEN direction = '{c.OUTGOING}' AND (kind IN ({_VIDEO}) OR metric = '{c.CAMERA.metric}') THEN '{traffic.VIDEO}'
-    WHEN direction = '{c.OUTGOING}' AND (kind IN ({_AUDIO}) OR metric = '{c.AUDIO.metric}') THEN '{traffic.AUDIO}'
+    WHEN direction = '{c.OUTGOING}' AND (medium = {PICTURE} OR metric = '{c.CAMERA.metric}') THEN '{traffic.VIDEO}'
+    WHEN direction = '{c.OUTGOING}' AND (medium = {SOUND} OR metric = '{c.AUDIO.metric}') THEN '{traffic.AUDIO}'
     WHEN direction = '{c.OUTGOING}' AND metric IN ('{c.ONLINE.metric}', '{c.HEARTBEAT.metric}')
         THEN '{traffic.HEARTBEATS}'
     WHEN direction = '{c.OUTGOING}' THEN '{traffic.TELEMETRY}'
-    WHEN kind IN ({_AUDIO}) THEN '{traffic.VOICE}'
+    WHEN medium = {SOUND} THEN '{traffic.VOICE}'
     WHEN metric = '{c.DRIVE.metric}' THEN '{traffic.DRIVING}'
     ELSE '{traffic.CONTROL}' END"""
 _SECONDS: Final = f"""
     CREATE OR REPLACE TEMP TABLE seconds AS
     SELECT epoch_ns(ts) // 1000000000 AS second, {_FAMILY} AS family, count(*) AS messages,
-           sum({{size}})::BIGINT AS bytes, bit_or(if(activity IN ({_numbers(SESSION)}), 1 << activity, 0)) AS used
+           sum(size)::BIGINT AS bytes, bit_or(if(activity IN ({_numbers(SESSION)}), 1 << activity, 0)) AS used
     FROM messages GROUP BY ALL
 """
 _HEARTBEATS: Final = f"""
@@ -65,7 +59,7 @@ _HEARTBEATS: Final = f"""
                epoch_ns(ts) - lag(epoch_ns(ts)) OVER (ORDER BY ts) AS before
         FROM messages WHERE direction = '{c.OUTGOING}' AND metric = ? AND online IS NOT FALSE
     )
-    SELECT ns, (ns - stamp_ns) / 1e6 AS latency_ms, stamp_ns % 1000000000 = 0 AS whole,
+    SELECT ns, (ns - stamp_ns) / 1e6 AS latency_ms,
            if(EXISTS (FROM breaks WHERE breaks.until_ns > ns - before AND breaks.since_ns < ns), NULL, before)
            AS interval_ns
     FROM received
@@ -135,46 +129,19 @@ _OFFLINE: Final = f"""
 _PLAUSIBLE: Final = f"abs(latency_ms) <= {traffic.LARGEST_LATENCY_S}e3"
 _LATENCY: Final = f"""
     WITH ranked AS (
-        SELECT latency_ms AS ms, whole, row_number() OVER (ORDER BY latency_ms) - 1 AS place,
+        SELECT latency_ms AS ms, row_number() OVER (ORDER BY latency_ms) - 1 AS place,
                count(*) OVER () - 1 AS last
         FROM heartbeats WHERE {_PLAUSIBLE}
     )
-    SELECT count(*), {", ".join(_percentile("ms", share) for share in (0.01, 0.5, 0.95, 0.99))}, avg(whole::INT)
+    SELECT count(*), {", ".join(_percentile("ms", share) for share in (0.01, 0.5, 0.95, 0.99))}
     FROM ranked
 """
 _LATENCIES: Final = f"""
     SELECT greatest(0, least({_BINS - 1}, floor((latency_ms - $low) / $width)))::INT AS bin, count(*)
     FROM heartbeats WHERE {_PLAUSIBLE} GROUP BY bin
 """
-#: A number that is lower by more than half of the range has wrapped: sound goes on with 1, pictures with 0.
-_STREAMS: Final = f"""
-    WITH numbered AS (
-        SELECT metric, kind, number::BIGINT - lag(number) OVER before AS difference,
-               CASE WHEN kind IN ({media_numbers.JSON_PICTURE}, {media_numbers.JPEG}) OR kind IN ({_AUDIO}) THEN kind
-                    ELSE (kind + 1) // 2 END AS encoding, lag(encoding) OVER before AS encoding_before,
-               epoch_ns(ts) - lag(epoch_ns(ts)) OVER before AS received,
-               epoch_ns(stamp) - lag(epoch_ns(stamp)) OVER before AS captured
-        FROM messages WHERE direction = '{c.OUTGOING}' AND number IS NOT NULL
-        WINDOW before AS (PARTITION BY metric ORDER BY ts)
-    ), stepped AS (
-        SELECT *, CASE WHEN encoding <> encoding_before THEN 0
-                       WHEN difference < -{_WRAP // 2} THEN difference + {_WRAP} - (kind IN ({_AUDIO}))::INT
-                       ELSE difference END AS step,
-               if(step BETWEEN 1 AND {_LARGEST_STEP}, abs(received - captured) / 1e6, NULL) AS jitter
-        FROM numbered
-    ), ranked AS (
-        SELECT *, row_number() OVER (PARTITION BY metric ORDER BY jitter NULLS LAST) - 1 AS place,
-               count(jitter) OVER (PARTITION BY metric) - 1 AS last
-        FROM stepped
-    )
-    SELECT metric, list(DISTINCT kind), count(*),
-           coalesce(sum(step - 1) FILTER (step BETWEEN 2 AND {_LARGEST_STEP}), 0)::BIGINT,
-           count(*) FILTER (step <= 0 OR step > {_LARGEST_STEP}),
-           {_percentile("jitter", 0.5)}, {_percentile("jitter", 0.95)}
-    FROM ranked GROUP BY metric ORDER BY metric
-"""
 _ABOUT: Final = f"""
-    SELECT bool_or(direction = '{c.OUTGOING}' AND (metric IN ({_names(_LINUX_ONLY)}) OR kind IS NOT NULL)),
+    SELECT bool_or(direction = '{c.OUTGOING}' AND (metric IN ({_names(_LINUX_ONLY)}) OR medium IS NOT NULL)),
            bool_or(metric = '{c.ONLINE.metric}'), bool_or(metric IN ('{c.ONLINE.metric}', '{c.HEARTBEAT.metric}'))
     FROM indexed
 """
@@ -187,18 +154,14 @@ _TOTALS: Final = """
 class RobotQueries:
     """Tables of one robot; the table ``breaks`` (since_ns, until_ns) has to be there."""
 
-    def __init__(self, connection: DuckDBPyConnection, robot: str, *, overhead: bool) -> None:
+    def __init__(self, connection: DuckDBPyConnection, robot: str) -> None:
         self._connection, self._robot = connection, robot
-        self._size = "size"
-        if overhead:
-            topic = len(f"{robot}//".encode())
-            packet = f"(size + strlen(direction) + strlen(metric) + {topic + _MQTT_BYTES})"
-            self._size = f"({packet} + {_TCP_BYTES} * (({packet} + {_SEGMENT_BYTES - 1}) // {_SEGMENT_BYTES}))"
         self.machine = ""
 
-    def load(self, parts: Sequence[Path], since_ns: int, until_ns: int) -> None:
+    def load(self, indexes: Sequence[Path], since_ns: int, until_ns: int) -> None:
         """Make the tables of the messages in a period."""
-        indexed = f"CREATE OR REPLACE TEMP VIEW indexed AS FROM {parquet(parts)}"
+        robot = f"SELECT * FROM {parquet(indexes)} WHERE robot = {quoted(self._robot)}"
+        indexed = f"CREATE OR REPLACE TEMP VIEW indexed AS {robot}"
         inside = ["NOT retained"]
         if since_ns:
             inside.append(f"ts >= make_timestamp_ns({since_ns})")
@@ -208,7 +171,7 @@ class RobotQueries:
         self._connection.execute(f"CREATE OR REPLACE TEMP VIEW messages AS FROM indexed WHERE {' AND '.join(inside)}")
         linux, has_online, has_heartbeats = self._row(_ABOUT)
         self.machine = traffic.LINUX if linux else traffic.MCU if has_heartbeats else traffic.COMPONENT
-        self._connection.execute(_SECONDS.format(size=self._size))
+        self._connection.execute(_SECONDS)
         self._connection.execute(_HEARTBEATS, [c.ONLINE.metric if has_online else c.HEARTBEAT.metric])
         self._connection.execute(_ONLINE)
         self._connection.execute(_SESSIONS)
@@ -253,10 +216,10 @@ class RobotQueries:
         return [traffic.Outage(*row) for row in self._rows(_OUTAGES, {"median": median_ms})]
 
     def latency(self) -> traffic.Latency | None:
-        count, floor, median, p95, p99, whole = self._row(_LATENCY)
+        count, floor, median, p95, p99 = self._row(_LATENCY)
         if not count:
             return None
-        return traffic.Latency(count, floor, median, p95, p99, whole, self._histogram(floor, p99))
+        return traffic.Latency(count, floor, median, p95, p99, self._histogram(floor, p99))
 
     def _histogram(self, floor_ms: float, p99_ms: float) -> traffic.Histogram:
         """From 0, or from below if the robot's clock is ahead, to a little above the 99th percentile."""
@@ -268,10 +231,6 @@ class RobotQueries:
         for place, count in self._rows(_LATENCIES, {"low": low, "width": width}):
             counts[place] = count
         return traffic.Histogram(low, width, counts)
-
-    def streams(self) -> list[traffic.Stream]:
-        rows = self._rows(_STREAMS)
-        return [traffic.Stream(metric, traffic.encoding_names(kinds), *rest) for metric, kinds, *rest in rows]
 
     def _rows(self, query: str, parameters: Any = None) -> list[Any]:
         return self._connection.execute(query, parameters).fetchall()

@@ -8,14 +8,11 @@ from typing import Any, Final
 from pebble.errors import PebbleError
 from pebble.recordings.traffic.figures import Figure, figures
 from pebble.recordings.traffic.results import COMPONENT, RobotTraffic, Traffic
-from pebble.recordings.traffic.tables import Table, latency_note, media_bandwidth, moment, tables, write_csv
+from pebble.recordings.traffic.tables import Table, media_bandwidth, moment, tables, write_csv
 from pebble.version import __version__
 
 NAME: Final = "traffic.html"
 _MOST_ROWS: Final = 200  # of a table on the page; CSV has all
-_LOSS, _COMMON = 0.01, 0.5  # shares of lost media and shared outages that are worth a remark
-_FEW: Final = 3  # outages
-_SHARES: Final = frozenset({"lost_share", "whole_second_share"})
 
 _STYLE: Final = """
 body { font: 16px/1.5 system-ui, sans-serif; color: #1a1a1a; background: #fff }
@@ -50,22 +47,10 @@ _DEFINITIONS: Final = (
         "than usual. Above 60 s a robot counts as offline. Times in which nothing was recorded are left out.",
     ),
     (
-        "shared",
-        "At the same moment at least half of the robots that were online, and at least two, had an outage: the "
-        "network, the broker or the recorder's computer is the cause, not one robot.",
-    ),
-    ("recorder late", "The recorder noted that its computer was too busy to let it run."),
-    (
         "floor",
         "The first percentile of latency: nearly the fastest heartbeat. A floor below 0 means that the robot's clock "
         "is ahead of the recorder's. Nothing is corrected by it.",
     ),
-    (
-        "lost, restarts",
-        "Pictures and sound are numbered. Numbers that are left out are lost; a number that is not higher than the one "
-        "before is a restart, as is another encoding.",
-    ),
-    ("jitter", "By how much the time between two pictures or packets differs between capturing and receiving."),
 )
 
 
@@ -98,18 +83,9 @@ def remarks(traffic: Traffic) -> list[str]:
         )
     found += [f"Not all could be read of {line}." for line in traffic.unread]
     for robot in traffic.robots:
-        found += [f"{_id(robot)}: {remark}." for remark in _robot_remarks(robot)]
+        if robot.latency is not None and robot.latency.ahead_ms:
+            found.append(f"{_id(robot)}: the robot's clock is at least {robot.latency.ahead_ms:.0f} ms ahead.")
     return found
-
-
-def _robot_remarks(robot: RobotTraffic) -> Iterable[str]:
-    if note := latency_note(robot):
-        yield note
-    if len(robot.outages) >= _FEW and robot.shared_share >= _COMMON:
-        yield f"{robot.shared_share:.0%} of {len(robot.outages)} outages were not this robot's alone"
-    for stream in robot.streams:
-        if stream.lost_share >= _LOSS:
-            yield f"{stream.lost_share:.1%} of {stream.metric} was lost"
 
 
 def _page(traffic: Traffic, advance: Callable[[str, float], None]) -> str:
@@ -132,13 +108,12 @@ def _page(traffic: Traffic, advance: Callable[[str, float], None]) -> str:
 
 def _head(traffic: Traffic) -> Iterable[str]:
     messages, size = sum(one.messages for one in traffic.robots), sum(one.bytes for one in traffic.robots)
-    counted = "with the headers of MQTT and TCP/IP" if traffic.overhead else "of payloads, without headers"
     yield "<h1>Robot traffic</h1>"
     yield (
         f"<p>{moment(traffic.since_ns // 10**9)} to {moment(traffic.until_ns // 10**9)}: {len(traffic.robots)} robots "
         f"and components, {messages:,} messages, {size / 1e6:,.1f} MB of payload, from {traffic.recordings} "
-        f"recordings. Times are UTC. Bandwidths are {counted}. The figures are those of section 4.1 of the "
-        f"paper, for every robot. <small>Pebble {_text(__version__)}</small></p>"
+        f"recordings. Times are UTC. Bandwidths are of payloads, without headers. The figures are those of section "
+        f"4.1 of the paper, for every robot. <small>Pebble {_text(__version__)}</small></p>"
     )
     links = [f'<a href="#robot-{number}">{_text(_id(robot))}</a>' for number, robot in enumerate(traffic.robots)]
     yield f'<nav>{" ".join(links)} <a href="#tables">tables</a><a href="#words">words</a></nav>'
@@ -182,29 +157,24 @@ def _table(table: Table, *, heading: str) -> str:
     heads = "".join(
         f"<th{_class(text)}>{_text(title)}</th>" for (_, title), text in zip(table.columns, texts, strict=True)
     )
-    rows = "".join(f"<tr>{_cells(table, row, texts)}</tr>" for row in table.rows[:_MOST_ROWS])
+    rows = "".join(f"<tr>{_cells(row, texts)}</tr>" for row in table.rows[:_MOST_ROWS])
     more = len(table.rows) - _MOST_ROWS
     note = f"<p><small>{more:,} more rows: --csv writes them all.</small></p>" if more > 0 else ""
     head = f"<{heading}>{_text(table.title)}</{heading}>"
     return f'{head}<div class="scroll"><table><thead><tr>{heads}</tr></thead><tbody>{rows}</tbody></table></div>{note}'
 
 
-def _cells(table: Table, row: Sequence[Any], texts: Sequence[bool]) -> str:
-    return "".join(
-        f"<td{_class(text)}>{_text(_formatted(name, value))}</td>"
-        for (name, _), value, text in zip(table.columns, row, texts, strict=True)
-    )
+def _cells(row: Sequence[Any], texts: Sequence[bool]) -> str:
+    return "".join(f"<td{_class(text)}>{_text(_formatted(value))}</td>" for value, text in zip(row, texts, strict=True))
 
 
 def _class(is_text: bool) -> str:
     return ' class="text"' if is_text else ""
 
 
-def _formatted(name: str, value: Any) -> str:
+def _formatted(value: Any) -> str:
     if value is None:
         return "–"
-    if name in _SHARES:
-        return f"{value:.1%}"
     if isinstance(value, float):
         return f"{value:,.2f}" if abs(value) < 1000 else f"{value:,.0f}"
     return f"{value:,}" if isinstance(value, int) else str(value)

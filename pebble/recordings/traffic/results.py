@@ -1,4 +1,4 @@
-"""What the traffic of robots was like: bandwidth, sessions, heartbeats, outages, latency, media (paper, section 4.1).
+"""What the traffic of robots was like: bandwidth, sessions, heartbeats, outages, latency (paper, section 4.1).
 
 Definitions, all of payload bytes and of the time of receiving, without retained messages:
 
@@ -8,15 +8,11 @@ Definitions, all of payload bytes and of the time of receiving, without retained
   the time without a session in which heartbeats came.
 * An *outage* is a heartbeat interval of more than 1.5 times the robot's median; its length is the interval minus the
   median. Intervals above 60 s count as offline. What the recorder did not see is neither.
-* An outage is *shared* if at the same moment at least half of the robots that were online, and at least two, had one:
-  then its cause was the network, the broker or the recorder's machine.
 """
 
 from typing import Final
 
 from msgspec import Struct, field
-
-from pebble.recordings.media_numbers import NAMES
 
 #: Families of messages. The paper's Figure 4.3 and Table 4.1 have their bandwidths.
 VIDEO, AUDIO, VOICE, DRIVING, CONTROL, HEARTBEATS, TELEMETRY, TOTAL = FAMILIES = (
@@ -28,7 +24,6 @@ LINUX, MCU, COMPONENT = "Linux", "MCU", "component"
 SESSION_GAP_S, SESSION_MARGIN_S = 120, 5
 OUTAGE_FACTOR: Final = 1.5
 OFFLINE_AFTER_S: Final = 60
-WHOLE_SHARE, WHOLE_COUNT, WHOLE_SPREAD_MS = 0.9, 30, 700.0
 LARGEST_LATENCY_S: Final = 86_400  # stamps further away are of clocks that do not count from 1970
 
 
@@ -66,17 +61,11 @@ class Intervals(Struct, frozen=True):
     longest_ms: float
 
 
-class Outage(Struct):
+class Outage(Struct, frozen=True):
     """Heartbeats that were missing."""
 
     since_ns: int  # the last heartbeat before it
     length_ms: float  # by which the interval was longer than usual
-    shared: bool = False
-    recorder_late: bool = False  # the recorder noted that it did not get to run
-
-    @property
-    def cause(self) -> str:
-        return "recorder" if self.recorder_late else "shared" if self.shared else "robot"
 
 
 class Histogram(Struct, frozen=True):
@@ -95,38 +84,12 @@ class Latency(Struct, frozen=True):
     median_ms: float
     p95_ms: float
     p99_ms: float
-    whole_share: float  # of stamps that are a whole second
     histogram: Histogram
-
-    @property
-    def whole_seconds(self) -> bool:
-        """Whether the stamps are cut to seconds: 0 to 1000 ms of each latency are the stamp's, not the network's.
-
-        Nothing is corrected by that: what is lost depends on when within a second heartbeats are sent.
-        """
-        spread = self.p99_ms - self.floor_ms
-        return self.count >= WHOLE_COUNT and self.whole_share > WHOLE_SHARE and spread > WHOLE_SPREAD_MS
 
     @property
     def ahead_ms(self) -> float:
         """By how much the robot's clock is ahead, at least; 0 if that does not show."""
         return max(0.0, -self.floor_ms)
-
-
-class Stream(Struct, frozen=True):
-    """The pictures or packets of sound of one topic."""
-
-    metric: str
-    encodings: list[str]
-    messages: int
-    lost: int  # numbers that were left out
-    restarts: int  # numbers that began anew, as with another encoding
-    jitter_median_ms: float | None  # difference of intervals of receiving and of capturing
-    jitter_p95_ms: float | None
-
-    @property
-    def lost_share(self) -> float:
-        return self.lost / (self.messages + self.lost)
 
 
 class RobotTraffic(Struct, kw_only=True):
@@ -145,15 +108,9 @@ class RobotTraffic(Struct, kw_only=True):
     intervals: Intervals | None
     outages: list[Outage]
     latency: Latency | None
-    streams: list[Stream]
 
     def of(self, family: str, time: str = ALL) -> Bandwidth | None:
         return next((one for one in self.bandwidth if one.family == family and one.time == time), None)
-
-    @property
-    def shared_share(self) -> float:
-        """The outages that were not this robot's alone."""
-        return sum(one.cause != "robot" for one in self.outages) / max(1, len(self.outages))
 
 
 class Gap(Struct, frozen=True):
@@ -175,8 +132,3 @@ class Traffic(Struct, kw_only=True):
     dropped: int  # messages that the recorder could not write
     gaps: list[Gap]
     robots: list[RobotTraffic]
-    overhead: bool  # bandwidths with the headers of MQTT and TCP/IP
-
-
-def encoding_names(kinds: list[int]) -> list[str]:
-    return list(dict.fromkeys(NAMES[kind] for kind in sorted(kinds) if kind in NAMES))

@@ -1,137 +1,104 @@
-"""Finds the index of recordings for an analysis, and makes what is missing of it."""
+"""Finds the indexes of recordings for an analysis, and makes those that are missing."""
+# ruff: noqa: S608  (what is put into queries are names of files in quotes)
+
+from __future__ import annotations
 
 import os
-from collections.abc import Callable, Collection, Iterable
-from datetime import UTC, datetime
+from collections.abc import Callable, Iterable, Iterator
+from functools import partial
 from pathlib import Path
+from typing import TYPE_CHECKING, Final
 
 from msgspec import Struct, field
 
-from pebble.recordings.files.mcap import RecordingError
+from pebble.recordings.files.recorded import SUFFIX, RecordingError
 from pebble.recordings.library import ACTIVE, files
 from pebble.recordings.recorder.folder import finished_path
-from pebble.recordings.traffic.index import FOLDER, NO_ROBOT, Entry, Index, archive_of
+from pebble.recordings.traffic.duck import connected, parquet
+from pebble.recordings.traffic.index import INDEX, about, index_path, is_of, write_index
+
+if TYPE_CHECKING:
+    from duckdb import DuckDBPyConnection
 
 #: Called with what is done now, and the share of all that is done.
 Progress = Callable[[str, float], None]
 
+_MEMORY_MB: Final = 128
+_OLD: Final = "index"  # the folder in which the last version had its index
+
 
 class Sources(Struct):
-    """Parquet files to analyse."""
+    """The indexes of recordings, and what they hold."""
 
-    parts: dict[str, list[Path]] = field(default_factory=dict)  # by robot
-    events: list[Path] = field(default_factory=list)
-    recordings: int = 0
+    indexes: list[Path] = field(default_factory=list)
+    robots: list[str] = field(default_factory=list)
     missing: int = 0  # messages that damage has taken
-    robots: set[str] = field(default_factory=set)  # all in these recordings, also those that were not chosen
     unread: list[str] = field(default_factory=list)  # a line for each file that could not be read completely
 
-    def add(self, index: Index, entry: Entry, chosen: Collection[str], days: tuple[str, str]) -> None:
-        """Take over what an index holds of one recording, as far as it belongs to the robots and days."""
-        if entry.unread:
-            self.unread.append(f"{entry.recording}: {entry.unread}")
-        self.events += [index.folder / path for path in entry.events]
-        of_robots = [part for part in entry.parts if part.robot != NO_ROBOT]
-        self.robots.update(part.robot for part in of_robots)
-        parts = [part for part in of_robots if days[0] <= part.day <= days[1]]
-        parts = [part for part in parts if not chosen or part.robot in chosen]
-        for part in parts:
-            self.parts.setdefault(part.robot, []).append(index.folder / part.path)
-        if parts:
-            self.recordings += 1
-            self.missing += entry.missing
 
+def sources(places: Iterable[Path], scratch: Path, progress: Progress = lambda _what, _share: None) -> Sources:
+    """Return the indexes of all recordings in ``places``, files or folders.
 
-def sources(
-    places: Iterable[Path],
-    scratch: Path,
-    *,
-    robots: Collection[str] = (),
-    since_ns: int,
-    until_ns: int,
-    progress: Progress = lambda _what, _share: None,
-) -> Sources:
-    """The index of all recordings in ``places``, files or folders; ``robots``: all, unless some are named.
-
-    What is not indexed yet is indexed now: below the archive if that can be written, else, as for files that are still
-    being written, below ``scratch``. In a folder, recordings count that were deleted after they had been indexed.
-    Raises RecordingError.
+    What is not indexed yet is indexed now: beside the recording if its folder can be written, else, as for files that
+    are still being written, below ``scratch``. In a folder, recordings count that were deleted after they had been
+    indexed. Raises RecordingError.
     """
-    found, days = Sources(), (_day(since_ns), _day(until_ns - 1))
-    seen: set[Path] = set()
-    for place in places:
-        collecting = _Collecting(place, scratch, seen, progress)
-        for index, entry in collecting.entries():
-            found.add(index, entry, robots, days)
+    found = Sources()
+    scratch.mkdir(parents=True, exist_ok=True)
+    with connected(scratch, memory_mb=_MEMORY_MB) as connection:
+        for path in _indexes([place.resolve() for place in places], scratch, connection, progress):
+            made = about(path, connection)
+            if made is not None:
+                found.indexes.append(path)
+                found.missing += made.missing
+                found.unread += [f"{made.recording}: {made.unread}"] if made.unread else []
+        if found.indexes:
+            names = f"SELECT DISTINCT robot FROM {parquet(found.indexes)} WHERE robot <> '' ORDER BY robot"
+            found.robots = [robot for (robot,) in connection.execute(names).fetchall()]
     return found
 
 
-class _Share(Struct, frozen=True):
-    """The part of all work that one file is."""
-
-    before: float
-    own: float
-
-    def of(self, done: float) -> float:
-        return self.before + done * self.own
-
-
-class _Collecting:
-    """The recordings of one place."""
-
-    def __init__(self, place: Path, scratch: Path, seen: set[Path], progress: Progress) -> None:
-        self._place, self._seen, self._progress = place.resolve(), seen, progress
-        archive = archive_of(place if place.is_dir() else place.resolve().parent)
-        self._temporary = Index(archive, scratch / f"index-{len(seen)}")
-        self._index = Index(archive)
-        lasting = place.is_dir() or self._index.folder.is_dir()
-        if not lasting or not os.access(archive / FOLDER if self._index.folder.is_dir() else archive, os.W_OK):
-            self._index = self._temporary
-
-    def entries(self) -> Iterable[tuple[Index, Entry]]:
-        deleted = list(self._deleted())
-        try:
-            paths = self._new(files([self._place]))
-        except RecordingError:
-            if not deleted:
-                raise
-            paths = []
-        yield from deleted
-        sizes = [path.stat().st_size if path.exists() else 0 for path in paths]
-        done, total = 0, max(1, sum(sizes))
-        for path, size in zip(paths, sizes, strict=True):
-            added = self._add(path, _Share(done / total, size / total))
-            done += size
-            if added is not None:
-                yield added
-
-    def _new(self, paths: list[Path]) -> list[Path]:
-        """Those that no earlier place held."""
-        new = [path for path in dict.fromkeys(path.resolve() for path in paths) if path not in self._seen]
-        self._seen.update(new)
-        return new
-
-    def _add(self, path: Path, part: _Share) -> tuple[Index, Entry] | None:
-        """None for a file that has been deleted meanwhile."""
-        index = self._temporary if path.name.endswith(ACTIVE) else self._index
-        try:
-            return index, index.add(path, lambda share: self._progress(f"index {path.name}", part.of(share)))
-        except FileNotFoundError:
-            if not path.name.endswith(ACTIVE) or not finished_path(path).exists():
-                return None
-            return self._add(finished_path(path), part)  # its recorder finished it a moment ago
-        except OSError as error:
-            raise RecordingError(f"{path}: {error.strerror}") from None
-
-    def _deleted(self) -> Iterable[tuple[Index, Entry]]:
-        """What is indexed of recordings that are not there any more."""
-        if self._place.is_dir():
-            for entry in self._index.entries():
-                path = self._index.archive / entry.recording
-                if path not in self._seen and path.is_relative_to(self._place) and not path.exists():
-                    self._seen.add(path)
-                    yield self._index, entry
+def _indexes(places: list[Path], scratch: Path, connection: DuckDBPyConnection, progress: Progress) -> Iterator[Path]:
+    deleted = [path for place in places if place.is_dir() for path in _of_deleted(place)]
+    try:
+        paths = list(dict.fromkeys(path.resolve() for path in files(places)))
+    except RecordingError:
+        if not deleted:
+            raise
+        paths = []
+    yield from dict.fromkeys(deleted)
+    sizes = [path.stat().st_size if path.exists() else 0 for path in paths]
+    done, total = 0, max(1, sum(sizes))
+    for number, (path, size) in enumerate(zip(paths, sizes, strict=True)):
+        advance = partial(_report, progress, path.name, done / total, size / total)
+        index = _index(path, scratch / f"{number}{INDEX}", connection, advance)
+        done += size
+        if index is not None:
+            yield index
 
 
-def _day(ns: int) -> str:
-    return datetime.fromtimestamp(max(0, ns) // 10**9, UTC).strftime("%Y-%m-%d")
+def _of_deleted(place: Path) -> Iterator[Path]:
+    """The indexes of recordings that are not there any more."""
+    for index in sorted(place.rglob(f"*{INDEX}")):
+        is_ours = _OLD not in index.relative_to(place).parts and not index.name.startswith(".")
+        if is_ours and not index.with_suffix(SUFFIX).exists():
+            yield index
+
+
+def _report(progress: Progress, name: str, before: float, own: float, share: float) -> None:
+    progress(f"index {name}", before + share * own)
+
+
+def _index(path: Path, spare: Path, connection: DuckDBPyConnection, advance: Callable[[float], None]) -> Path | None:
+    """The index of a recording, ``spare`` if it has none beside it; None if it was deleted meanwhile."""
+    if path.name.endswith(ACTIVE) and not path.exists():
+        path = finished_path(path)  # its recorder finished it a moment ago
+    if not path.exists():
+        return None
+    is_active = path.name.endswith(ACTIVE)
+    index = index_path(path)
+    if not is_active and is_of(index, path, connection):
+        return index
+    index = spare if is_active or not os.access(path.parent, os.W_OK) else index
+    write_index(path, index, spare.parent, advance)
+    return index

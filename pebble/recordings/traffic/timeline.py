@@ -7,11 +7,11 @@ from typing import Any, Final
 from msgspec import Struct, field
 
 from pebble.contract.channels import HEARTBEAT, ONLINE, OUTGOING
-from pebble.recordings import media_numbers
 from pebble.recordings.traffic import results as traffic
 from pebble.recordings.traffic.activity import Activity
 from pebble.recordings.traffic.analysis import recorder_events
 from pebble.recordings.traffic.duck import connected
+from pebble.recordings.traffic.index import PICTURE, SOUND
 from pebble.recordings.traffic.queries import RobotQueries
 from pebble.recordings.traffic.sources import Progress, sources
 
@@ -30,18 +30,14 @@ _BITS: Final = {
 }
 
 
-def _numbers(numbers: frozenset[int]) -> str:
-    return ", ".join(map(str, sorted(numbers)))
-
-
 _CASES: Final = " ".join(f"WHEN {activity.value} THEN {bit}" for activity, bit in _BITS.items())
 _ACTIVITY: Final = f"""
     SELECT epoch_ns(ts) // {STEP_S}000000000 AS step, bit_or(
         CASE activity {_CASES} ELSE 0 END
         | CASE WHEN direction = '{OUTGOING}' AND metric IN ('{ONLINE.metric}', '{HEARTBEAT.metric}')
                     AND online IS NOT FALSE THEN {ONLINE_BIT}
-               WHEN direction = '{OUTGOING}' AND kind IN ({_numbers(media_numbers.VIDEO)}) THEN {PICTURES_BIT}
-               WHEN direction = '{OUTGOING}' AND kind IN ({_numbers(media_numbers.AUDIO)}) THEN {VOICE_BIT}
+               WHEN direction = '{OUTGOING}' AND medium = {PICTURE} THEN {PICTURES_BIT}
+               WHEN direction = '{OUTGOING}' AND medium = {SOUND} THEN {VOICE_BIT}
                ELSE 0 END)
     FROM messages GROUP BY step
 """
@@ -84,14 +80,14 @@ def timeline(
     progress: Progress = lambda _what, _share: None,
 ) -> Timeline:
     """What the recordings ``paths`` hold of a robot; what is not indexed yet is indexed now. Raises RecordingError."""
-    found = sources(paths, scratch, robots=[robot], since_ns=since_ns, until_ns=until_ns, progress=progress)
+    found = sources(paths, scratch, progress)
     with connected(scratch, memory_mb=_MEMORY_MB) as connection:
-        recorder = recorder_events(connection, found.events, since_ns, until_ns)
+        recorder = recorder_events(connection, found.indexes, since_ns, until_ns)
         gaps = [Stretch(_ms(gap.since_ns), _ms(gap.until_ns), gap.why) for gap in recorder.gaps]
-        if robot not in found.parts:
+        if robot not in found.robots:
             return Timeline(since_ns // 10**6, gaps=gaps)
-        queries = RobotQueries(connection, robot, overhead=False)
-        queries.load(found.parts[robot], since_ns, until_ns)
+        queries = RobotQueries(connection, robot)
+        queries.load(found.indexes, since_ns, until_ns)
         made = _stepped(connection)
         made.gaps = gaps
         made.sessions = [Stretch(1000 * one.since_s, 1000 * one.until_s) for one in queries.sessions()]

@@ -154,7 +154,7 @@ class Recordings:
         self, robot: str, period: tuple[int, int], paths: list[str], *, active: bool, before: bytes | None
     ) -> _Timeline:
         target = self._target(f"{secrets.token_hex(8)}.json")
-        job = Job(questions.make_timeline_job, self.folder, paths, target, robot, period)
+        job = Job(questions.make_timeline_job, paths, target, robot, period)
         return _Timeline(paths, active, target, job, clock(), before)
 
     def _target(self, name: str) -> Path:

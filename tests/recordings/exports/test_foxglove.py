@@ -36,7 +36,7 @@ from pebble.media.scene import Scene, read_counter
 from pebble.media.sound import make_sound_encoder
 from pebble.media.video import make_encoder
 from pebble.recordings.exports.foxglove import write_foxglove
-from pebble.recordings.files.mcap import Channel, Recorded, RecordingError
+from pebble.recordings.files.recorded import Channel, Recorded, RecordingError
 
 ROBOT = "pebble/robots/goob"
 T0_MS = 1_732_300_000_000

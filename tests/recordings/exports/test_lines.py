@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from pebble.media.json_video import JsonPicture
 from pebble.recordings.exports import lines
 from pebble.recordings.exports.lines import BadLine, Imported, read_lines, write_lines
-from pebble.recordings.files.mcap import Channel, Recorded
+from pebble.recordings.files.recorded import Channel, Recorded
 
 T_NS = 1_732_300_000_123_456_789
 TOPIC = "pebble/robots/goob/outgoing/online"

@@ -51,9 +51,7 @@ OLD = [entry(1, days=9), entry(2, MEDIA, days=8), entry(3, days=3), entry(4, MED
         (OLD, Limits(), None),
         (OLD, Limits(keep_media_days=7), 2),
         (OLD, Limits(keep_media_days=10), None),
-        (OLD, Limits(keep_state_days=7), 1),
-        (OLD, Limits(keep_state_days=7, keep_media_days=1), 2),
-        (OLD[:2], Limits(keep_state_days=1, keep_media_days=1), None),
+        (OLD[:2], Limits(keep_media_days=1), None),
     ],
 )
 def test_one_that_is_too_old_but_never_the_newest_of_its_kind(

@@ -11,7 +11,7 @@ import numpy as np
 from pebble.contract.packets import Codec, Sound
 from pebble.media.scene import Scene
 from pebble.media.video import make_encoder
-from pebble.recordings.files.writer import McapWriter
+from pebble.recordings.files.writer import RecordingWriter
 from pebble.recordings.stamps import stamp_ns
 from tests.recordings.playing import GOOB, THEN_NS, Line, js, ms
 
@@ -82,7 +82,7 @@ def film(
 
 def _write(path: Path, lines: list[Line], *, finished: bool) -> None:
     with path.open("wb", buffering=0) as file:
-        writer = McapWriter(file, library="pebble test")
+        writer = RecordingWriter(file, library="pebble test")
         numbers: dict[tuple[str, str], int] = {}
         second = 0
         for line in lines:

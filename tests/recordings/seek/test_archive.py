@@ -11,13 +11,13 @@ import numpy as np
 import pytest
 
 from pebble.media.scene import read_counter
-from pebble.recordings.files.mcap import Packer, Recorded
+from pebble.recordings.files.recorded import Recorded
 from pebble.recordings.library import files, merged
 from pebble.recordings.recorder.folder import Folder, finished_path
 from pebble.recordings.recorder.lane import CARRIED, Item, OpenFile
 from pebble.recordings.seek.archive import Archive
 from pebble.recordings.seek.days import Days
-from pebble.recordings.seek.file import RecordingFile
+from pebble.recordings.seek.file import SeekableFile
 from pebble.recordings.seek.segment import Flag, segment, unpacked
 from pebble.recordings.seek.thumbnails import frame, strip
 from tests.recordings.playing import FRED, GOOB, THEN_NS, Line, js, ms, write
@@ -75,7 +75,7 @@ def test_the_state_is_the_newest_value_of_each_topic(archive: Archive, everythin
 def test_what_was_carried_into_a_file_is_state_and_no_message(tmp_path: Path) -> None:
     folder = Folder(tmp_path / "own")
     folder.take()
-    lane = OpenFile(folder, "state", THEN_NS, {}, Packer())
+    lane = OpenFile(folder, "state", THEN_NS, {})
     lane.add(Item(0, f"{GOOB}/outgoing/status", b'{"n": 1}', 1, True, CARRIED), THEN_NS)
     lane.add(Item(0, f"{GOOB}/outgoing/online", b'{"t": 1}', 1, True, ""), THEN_NS + 10**9)
     lane.finish()
@@ -158,7 +158,7 @@ def test_what_is_written_meanwhile_is_found(tmp_path: Path) -> None:
     growing.parent.mkdir()
     data = source.read_bytes()
     growing.write_bytes(data[: len(data) // 2])
-    file = RecordingFile(growing)
+    file = SeekableFile(growing)
     before = len(file.chunks)
     for end in range(len(data) // 2, len(data), 997):
         growing.write_bytes(data[:end])
@@ -166,7 +166,7 @@ def test_what_is_written_meanwhile_is_found(tmp_path: Path) -> None:
     growing.write_bytes(data)
     file.refresh()
     assert 0 < before < len(file.chunks)
-    found = [one for chunk in file.chunks for one in file.messages(chunk)]
+    found = [one for chunk in file.chunks for one in file.messages_of(chunk)]
     assert texts(found) == texts([one for one in merged([source]) if not one.channel.topic.startswith("$")])
     file.close()
 
@@ -186,7 +186,7 @@ def test_damage_costs_its_chunk_only(tmp_path: Path) -> None:
     archive = Archive(film(tmp_path, "pbvd", 10))
     before = len(archive.messages(GOOB, 0, 1 << 62))
     file = next(one for one in archive.all_files() if "media" in one.path.name)
-    lost = len(file.messages(file.chunks[3]))
+    lost = len(file.messages_of(file.chunks[3]))
     archive.close()
     with file.path.open("r+b") as out:
         out.seek(file.chunks[3].at + 200)

@@ -1,4 +1,4 @@
-"""The analysis gives what a plain computation over the messages gives, and knows whose fault an outage is."""
+"""The analysis gives what a plain computation over the messages gives."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ import pytest
 
 from pebble.contract.packets import Codec, Picture, PictureKind, Sound
 from pebble.errors import PebbleError
-from pebble.recordings.files.mcap import Recorded
-from pebble.recordings.library import FOREVER_NS, merged
+from pebble.recordings.files.recorded import Recorded
+from pebble.recordings.library import merged
 from pebble.recordings.traffic.analysis import analyse
 from pebble.recordings.traffic.results import (
     ALL,
@@ -30,7 +30,6 @@ from pebble.recordings.traffic.results import (
     RobotTraffic,
     Traffic,
 )
-from pebble.recordings.traffic.shared_outages import Presence, shared
 from pebble.recordings.traffic.sources import sources
 from tests.recordings.synthetic import FLEET, START_NS, Robot, Sent, event, traffic, write_recording
 
@@ -42,8 +41,7 @@ GOOB, FRED, MINILAMP, BENJR = (robot.base for robot in FLEET)
 
 def analysed(folder: Path, messages: Iterable[Sent], scratch: Path, **options: object) -> Traffic:
     write_recording(folder / "x.mcap", messages)
-    found = sources([folder], scratch, since_ns=0, until_ns=FOREVER_NS)
-    return analyse(found, scratch, **options)
+    return analyse(sources([folder], scratch), scratch, **options)
 
 
 @pytest.fixture
@@ -142,22 +140,6 @@ def test_latency(minute, base):
     )
 
 
-def test_loss_and_jitter(minute):
-    path, found = minute
-    packets = messages_of(path, GOOB, "outgoing/audio")
-    sounds = [Sound.unpack(message.payload) for message in packets]
-    steps = [after.sequence - before.sequence for before, after in pairwise(sounds)]
-    received = [(after.log_ns - before.log_ns) / MS for before, after in pairwise(packets)]
-    captured = [after.captured_ms - before.captured_ms for before, after in pairwise(sounds)]
-    jitter = [abs(one - other) for one, other in zip(received, captured, strict=True)]
-    audio = next(stream for stream in robot(found, GOOB).streams if stream.metric == "audio")
-    assert (audio.messages, audio.lost, audio.restarts) == (len(packets), sum(step - 1 for step in steps), 0)
-    assert audio.lost == 14
-    assert audio.jitter_median_ms == pytest.approx(percentile(jitter, 0.5))
-    assert audio.jitter_p95_ms == pytest.approx(percentile(jitter, 0.95))
-    assert audio.encodings == ["pcm"]
-
-
 # -- what robots are like
 
 
@@ -169,18 +151,6 @@ def test_kinds_of_robots(minute):
 def test_a_component_without_heartbeats(of):
     found = of([Sent(START_NS, "pebble/infrastructure/mast/outgoing/charging-level", b"{}")]).robots[0]
     assert (found.machine, found.intervals, found.latency, found.outages) == (COMPONENT, None, None, [])
-
-
-def test_whole_second_stamps_are_named_and_nothing_is_corrected(minute):
-    named = {one.robot: one.latency.whole_seconds for one in minute[1].robots}
-    assert named == {GOOB: False, FRED: False, MINILAMP: True, BENJR: True}
-    assert robot(minute[1], BENJR).latency.median_ms > 300
-
-
-def test_heartbeats_that_happen_on_the_second_are_not_named(of):
-    found = of(heartbeats(GOOB, [number * 0.25 for number in range(200)]))
-    assert robot(found, GOOB).latency.whole_share == pytest.approx(0.25)
-    assert not robot(found, GOOB).latency.whole_seconds
 
 
 def test_a_clock_that_is_ahead_is_named(minute):
@@ -219,14 +189,6 @@ def ordered(*parts: Iterable[Sent]) -> list[Sent]:
     return sorted((sent for part in parts for sent in part), key=lambda sent: sent.ns)
 
 
-def causes(found: Traffic) -> dict[str, list[str]]:
-    return {one.robot: [outage.cause for outage in one.outages] for one in found.robots}
-
-
-def test_the_planted_outage_is_shared_and_others_are_not(minute):
-    assert causes(minute[1]) == {GOOB: ["shared", "robot"], FRED: ["shared"], MINILAMP: ["shared"], BENJR: ["robot"]}
-
-
 def test_the_length_of_an_outage_is_beyond_the_usual(of):
     found = robot(of(steady(GOOB, (20.0, 22.0))), GOOB)
     assert [outage.length_ms for outage in found.outages] == [1750.0]
@@ -236,34 +198,6 @@ def test_the_length_of_an_outage_is_beyond_the_usual(of):
 def test_an_interval_of_up_to_one_and_a_half_is_none(of):
     times = [number * 0.25 for number in range(20)] + [4.75 + 0.375 + number * 0.25 for number in range(20)]
     assert robot(of(heartbeats(GOOB, times)), GOOB).outages == []
-
-
-def presence(*outages: float, online: tuple[float, float] = (0.0, 60.0), interval_s: float = 0.25) -> Presence:
-    """A robot with outages that begin at these seconds."""
-    span = round(online[0] * SECOND), round(online[1] * SECOND)
-    return Presence(interval_s * SECOND, [span], [round(at * SECOND) for at in outages])
-
-
-STEADY = presence()
-
-
-@pytest.mark.parametrize(
-    ("robots", "expected"),
-    [
-        ([presence(20.0)], [[False]]),  # alone
-        ([presence(20.0), presence(20.3)], [[True], [True]]),
-        ([presence(20.0), presence(20.6)], [[False], [False]]),
-        ([presence(20.0), STEADY], [[False], []]),
-        ([presence(20.0), presence(20.0), STEADY, STEADY], [[True], [True], [], []]),
-        ([presence(20.0), presence(20.0), STEADY, STEADY, STEADY], [[False], [False], [], [], []]),
-        ([presence(20.0), presence(20.0), *[presence(online=(0.0, 10.0))] * 5], [[True], [True], *[[]] * 5]),
-        ([presence(20.0), presence(20.0), *[presence(online=(30.0, 60.0))] * 5], [[True], [True], *[[]] * 5]),
-        ([presence(5.0, 20.0, 40.0), presence(20.0, 30.0)], [[False, True, False], [True, False]]),
-        ([presence(20.0), presence(18.5, interval_s=2.0)], [[True], [True]]),  # a slow heartbeat misses it later
-    ],
-)
-def test_outages_are_shared_by_at_least_half_of_the_robots_that_were_online(robots, expected):
-    assert shared(robots) == expected
 
 
 def test_above_a_minute_a_robot_was_offline(of):
@@ -284,11 +218,6 @@ def test_what_was_not_recorded_is_no_outage(of):
 def test_nothing_is_measured_across_a_start_of_the_recorder(of, name):
     noted = event(START_NS + 21 * SECOND, name)
     assert robot(of(ordered(steady(GOOB, (20.0, 22.0)), [noted])), GOOB).outages == []
-
-
-def test_a_recorder_that_was_late_is_named(of):
-    late = event(START_NS + 22 * SECOND, "late", max_ms=1500)
-    assert causes(of(ordered(steady(GOOB, (20.0, 22.0), (40.0, 41.0)), [late]))) == {GOOB: ["recorder", "robot"]}
 
 
 def test_messages_that_were_dropped_are_counted(of):
@@ -344,8 +273,8 @@ def test_a_warning_is_no_session(of):
 
 def test_bandwidths_of_sessions_and_of_idle_time_are_apart(minute):
     goob = robot(minute[1], GOOB)
-    assert (goob.session_s, goob.sessions[0].activities) == (40, ["drive", "media"])
-    assert goob.idle_s == 60 - 40
+    assert (goob.session_s, goob.sessions[0].activities) == (41, ["drive", "media"])
+    assert goob.idle_s == 60 - 41
     assert goob.of(VIDEO, IDLE) is None
     assert goob.of(TOTAL, IDLE).median_kbps < 3 < 300 < goob.of(TOTAL, SESSION).median_kbps
     both = goob.of(TOTAL, SESSION), goob.of(TOTAL, IDLE)
@@ -357,7 +286,6 @@ def test_sound_sent_to_a_robot_is_not_its_audio(of):
     found = robot(of([Sent(START_NS, f"{GOOB}/incoming/audio-stream", packet)]), GOOB)
     assert found.of(VOICE).messages == 1
     assert found.of(AUDIO) is None
-    assert found.streams == []
 
 
 def test_a_request_for_pictures_is_no_video(of):
@@ -377,46 +305,6 @@ def test_retained_messages_are_not_traffic(minute):
     assert sum(one.messages for one in found.robots) == total
 
 
-# -- numbers of media
-
-
-def pictures(*numbers: int, kind: PictureKind = PictureKind.H264) -> list[bytes]:
-    return [Picture(kind, number % 2**32, START_NS // MS, b"").pack() for number in numbers]
-
-
-def sounds(*numbers: int) -> list[bytes]:
-    return [Sound(Codec.PCM16LE, 1, 16000, 1, number, START_NS // MS, b"\0\0").pack() for number in numbers]
-
-
-#: Payloads, and how many are lost and how often numbers begin anew.
-NUMBERED = {
-    "left out": (pictures(1, 2, 3, 7), 3, 0),
-    "restart": (pictures(1, 2, 1, 2), 0, 1),
-    "the same again": (pictures(5, 5), 0, 1),
-    "many left out": (pictures(1, 1000), 998, 0),
-    "too many for a loss": (pictures(1, 1002), 0, 1),
-    "pictures go on with 0": (pictures(2**32 - 2, 2**32 - 1, 0, 1), 0, 0),
-    "pictures lost where they wrap": (pictures(2**32 - 1, 2), 2, 0),
-    "sound goes on with 1": (sounds(2**32 - 1, 1, 2), 0, 0),
-    "sound lost where it wraps": (sounds(2**32 - 2, 3), 3, 0),
-    "another encoding": (pictures(1, 2, kind=PictureKind.JPEG) + pictures(8, 9), 0, 1),
-    "differences are numbered with full pictures": (
-        pictures(1, kind=PictureKind.JPEG) + pictures(2, 5, kind=PictureKind.DELTA_JPEG), 2, 0,
-    ),
-}  # fmt: skip
-
-
-def test_numbers_that_are_left_out_are_lost(of):
-    found = of(
-        Sent(START_NS + number * MS, f"{GOOB}/outgoing/{name}", payload)
-        for name, (payloads, _, _) in NUMBERED.items()
-        for number, payload in enumerate(payloads)
-    )
-    streams = {one.metric: (one.messages, one.lost, one.restarts) for one in robot(found, GOOB).streams}
-    expected = {name: (len(payloads), lost, restarts) for name, (payloads, lost, restarts) in NUMBERED.items()}
-    assert streams == expected
-
-
 # -- periods, places, options
 
 
@@ -432,40 +320,17 @@ def test_a_period_without_messages_is_refused(of):
         of(steady(GOOB), until_ns=START_NS)
 
 
-def test_overhead_adds_topics_and_headers(of):
-    found = robot(of(steady(GOOB, seconds=1.0), overhead=True), GOOB)
-    size = len(f"{GOOB}/outgoing/online") + len(b'{"t": 1763600400000, "online": true}') + 4 + 40
-    assert found.of(HEARTBEATS).bytes == 4 * size
-    assert found.bytes == 4 * 36
-
-
-def test_overhead_counts_a_header_for_each_segment(of):
-    found = robot(of([Sent(START_NS, f"{GOOB}/outgoing/front-camera", bytes(3000))], overhead=True), GOOB)
-    assert found.of(VIDEO).bytes == 3000 + len(f"{GOOB}/outgoing/front-camera") + 4 + 3 * 40
-
-
-def test_only_some_robots(tmp_path):
-    write_recording(tmp_path / "x.mcap", traffic(seconds=2.0))
-    found = sources([tmp_path], tmp_path / "scratch", robots=[GOOB], since_ns=0, until_ns=FOREVER_NS)
-    assert list(found.parts) == [GOOB]
-
-
-def test_only_the_days_of_the_period(tmp_path):
-    day = 86_400 * SECOND
-    write_recording(
-        tmp_path / "x.mcap", [Sent(START_NS + days * day, f"{GOOB}/outgoing/status", b"{}") for days in range(3)]
-    )
-    found = sources([tmp_path], tmp_path / "scratch", since_ns=START_NS + day, until_ns=START_NS + day + SECOND)
-    assert len(found.parts[GOOB]) == 1
+def test_only_some_robots(of):
+    assert [one.robot for one in of(traffic(seconds=2.0), robots=[GOOB]).robots] == [GOOB]
 
 
 def test_a_file_that_is_being_written_is_read_and_not_indexed(tmp_path):
     folder, scratch = tmp_path / "recordings", tmp_path / "scratch"
     write_recording(folder / "a.mcap", steady(GOOB, seconds=2.0))
     write_recording(folder / "b.mcap.active", steady(FRED, seconds=3.0), finished=False)
-    found = sources([folder], scratch, since_ns=0, until_ns=FOREVER_NS)
-    assert (found.recordings, set(found.parts)) == (2, {GOOB, FRED})
-    assert [path.name for path in (folder / "index" / "recordings").iterdir()] == ["a.json"]
+    found = sources([folder], scratch)
+    assert (len(found.indexes), found.robots) == (2, [FRED, GOOB])
+    assert [path.name for path in folder.glob("*.parquet")] == ["a.parquet"]
     robots = {one.robot: one.messages for one in analyse(found, scratch).robots}
     assert robots == {GOOB: 8, FRED: 12}
 
@@ -474,58 +339,52 @@ def test_a_file_that_is_finished_meanwhile_is_found(tmp_path, monkeypatch):
     finished = write_recording(tmp_path / "a.mcap", steady(GOOB, seconds=2.0))
     gone = tmp_path / "a.mcap.active"
     monkeypatch.setattr("pebble.recordings.traffic.sources.files", lambda _places: [gone, tmp_path / "deleted.mcap"])
-    found = sources([tmp_path], tmp_path / "scratch", since_ns=0, until_ns=FOREVER_NS)
-    assert found.recordings == 1
+    assert len(sources([tmp_path], tmp_path / "scratch").indexes) == 1
     assert finished.exists()
 
 
 def test_a_recording_that_was_deleted_still_counts(tmp_path):
     path = write_recording(tmp_path / "a.mcap", steady(GOOB, seconds=2.0))
-    sources([tmp_path], tmp_path / "scratch", since_ns=0, until_ns=FOREVER_NS)
+    sources([tmp_path], tmp_path / "scratch")
     path.unlink()
-    again = sources([tmp_path], tmp_path / "scratch", since_ns=0, until_ns=FOREVER_NS)
-    assert (again.recordings, list(again.parts)) == (1, [GOOB])
+    again = sources([tmp_path], tmp_path / "scratch")
+    assert (len(again.indexes), again.robots) == (1, [GOOB])
 
 
-def test_a_day_of_an_archive_uses_the_index_of_the_archive(tmp_path):
-    write_recording(tmp_path / "2025/11/20/a.mcap", steady(GOOB, seconds=2.0))
-    write_recording(tmp_path / "2025/11/21/b.mcap", steady(FRED, seconds=2.0))
-    sources([tmp_path], tmp_path / "scratch", since_ns=0, until_ns=FOREVER_NS)
-    found = sources([tmp_path / "2025/11/20"], tmp_path / "scratch", since_ns=0, until_ns=FOREVER_NS)
-    assert list(found.parts) == [GOOB]
-    assert not (tmp_path / "2025/11/20/index").exists()
+def test_the_index_of_the_last_version_is_left_alone(tmp_path):
+    write_recording(tmp_path / "a.mcap", steady(GOOB, seconds=2.0))
+    old = tmp_path / "index" / "day=2025-11-20" / "robot=pebble%2Frobots%2Ffred" / "a.parquet"
+    old.parent.mkdir(parents=True)
+    old.write_bytes(b"rows of fred")
+    assert sources([tmp_path], tmp_path / "scratch").robots == [GOOB]
 
 
-def test_a_file_alone_is_not_indexed_beside_it(tmp_path):
+def test_a_file_that_is_named_again_counts_once(tmp_path):
     path = write_recording(tmp_path / "a.mcap", steady(GOOB, seconds=2.0))
-    found = sources([path, path, tmp_path / "a.mcap"], tmp_path / "scratch", since_ns=0, until_ns=FOREVER_NS)
-    assert found.recordings == 1
-    assert not (tmp_path / "index").exists()
+    assert len(sources([path, tmp_path, path], tmp_path / "scratch").indexes) == 1
 
 
 def test_files_of_several_folders(tmp_path):
     paths = [write_recording(tmp_path / base[-4:] / "same.mcap", steady(base, seconds=2.0)) for base in (GOOB, FRED)]
-    found = sources(paths, tmp_path / "scratch", since_ns=0, until_ns=FOREVER_NS)
-    assert set(found.parts) == {GOOB, FRED}
-    assert len({path for parts in found.parts.values() for path in parts}) == 2
+    found = sources(paths, tmp_path / "scratch")
+    assert (found.robots, len(found.indexes)) == ([FRED, GOOB], 2)
 
 
 def test_a_folder_without_recordings_is_refused(tmp_path):
     with pytest.raises(PebbleError, match="there is no recording"):
-        sources([tmp_path], tmp_path / "scratch", since_ns=0, until_ns=FOREVER_NS)
+        sources([tmp_path], tmp_path / "scratch")
 
 
 def test_names_of_folders_are_no_patterns(tmp_path):
     folder, scratch = tmp_path / "it's [1] *?", tmp_path / "scratch"
     write_recording(folder / "a.mcap", steady(GOOB, seconds=2.0))
-    found = sources([folder], scratch, since_ns=0, until_ns=FOREVER_NS)
-    assert analyse(found, scratch).robots[0].messages == 8
+    assert analyse(sources([folder], scratch), scratch).robots[0].messages == 8
 
 
 def test_a_damaged_index_is_named(tmp_path):
     write_recording(tmp_path / "a.mcap", steady(GOOB, seconds=2.0))
-    found = sources([tmp_path], tmp_path / "scratch", since_ns=0, until_ns=FOREVER_NS)
-    found.parts[GOOB][0].write_bytes(b"no Parquet")
+    found = sources([tmp_path], tmp_path / "scratch")
+    found.indexes[0].write_bytes(b"no Parquet")
     with pytest.raises(PebbleError) as error:
         analyse(found, tmp_path / "scratch")
     assert "a.parquet" in str(error.value)

@@ -6,7 +6,6 @@ import logging
 import threading
 import time
 from collections.abc import Iterator
-from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -17,7 +16,7 @@ from pebble.transports import Message, QoS
 from pebble.transports.memory import MemoryTransport
 from tests.recordings.demo_robots import DRIVE as RECORDED_DRIVE
 from tests.recordings.demo_robots import GOOB, messages, recorded
-from tests.recordings.replayed import AS_RECORDED, Plays
+from tests.recordings.replayed import Plays
 from tests.services.mqtt_bridge.bridge_rig import BASE, Client, MemoryRig, Quiet
 from tests.support import until
 
@@ -57,7 +56,7 @@ class TestTable:
     def test_what_a_robot_published_reaches_the_remote_side_unchanged(self, goob: MemoryRig, recording: Plays) -> None:
         """Payloads, quality and order of each topic."""
         goob.bridge(robot="goob")
-        recording([RECORDED_DRIVE], goob.local_hub, replace(AS_RECORDED, only=(f"{GOOB}/outgoing/#",)))
+        recording(RECORDED_DRIVE, goob.local_hub, f"{GOOB}/outgoing/#")
         after_all(goob.local, goob.remote)
         Quiet(goob.remote).wait()
         arrived = [(one.topic, one.payload, int(one.qos)) for one in goob.remote.seen]
@@ -70,7 +69,7 @@ class TestTable:
     def test_recorded_commands_reach_the_robot_once_and_in_order(self, goob: MemoryRig, recording: Plays) -> None:
         goob.bridge(robot="goob")
         topic = f"{GOOB}/{DRIVE}"
-        recording([RECORDED_DRIVE], goob.remote_hub, replace(AS_RECORDED, only=(topic,)))
+        recording(RECORDED_DRIVE, goob.remote_hub, topic)
         published = recorded(RECORDED_DRIVE, topic)
         assert len(published) > 100
         assert until(lambda: len(goob.local.on(DRIVE)) >= len(published))

@@ -1,0 +1,103 @@
+"""What a recording holds: messages of channels, and what is wrong with it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from importlib.util import find_spec
+from typing import Final
+
+import msgspec
+
+from pebble.errors import PebbleError
+
+SUFFIX: Final = ".mcap"  # of a file that is finished
+#: The topic of messages whose channel is not named anywhere in a damaged file, before its number.
+UNNAMED: Final = "$recorder/unnamed/"
+FOREVER_NS: Final = 1 << 64  # after all times that a file can hold
+
+
+class RecordingError(PebbleError):
+    """A file that cannot be read as a recording. Example: ``walk.mcap: No such file or directory``."""
+
+
+class DamageError(PebbleError):
+    """Bytes that are not the record they should be. Example: ``a chunk's checksum is wrong``."""
+
+
+@dataclass(frozen=True, slots=True)
+class Schema:
+    """The description of a channel's messages: data for their encoding, such as a set of Protobuf descriptors."""
+
+    name: str
+    encoding: str
+    data: bytes
+
+
+@dataclass(frozen=True, slots=True)
+class Channel:
+    """A topic with what its messages have in common; several channels may share a topic."""
+
+    id: int
+    topic: str
+    encoding: str  # of its messages: json, protobuf, application/octet-stream
+    metadata: Mapping[str, str] = field(default_factory=dict)
+    schema: Schema | None = None
+
+
+class Recorded(msgspec.Struct, frozen=True):
+    """One message of a recording."""
+
+    channel: Channel
+    sequence: int  # its number in the file, from 0
+    log_ns: int  # when it was received, since 1970
+    publish_ns: int  # its own stamp; 0: it has none
+    payload: bytes
+
+
+@dataclass(slots=True)
+class Damage:
+    """What is wrong with a file, as far as it was read."""
+
+    parts: set[int] = field(default_factory=set)  # where chunks are damaged, and where bytes between records begin
+    missing: int = 0  # messages; those at a torn end are not known
+    unnamed: int = 0  # messages whose channel is not named anywhere
+    torn: int = 0  # bytes at the end that are no whole record
+    finished: bool = False  # the file ends with a summary
+    why: str = ""  # the first reason
+
+    def add(self, at: int, why: object, messages: int = 0) -> None:
+        """Note a damaged part once, and how many messages it held."""
+        if at not in self.parts:
+            self.parts.add(at)
+            self.missing += messages
+            self.why = self.why or str(why)
+
+    def report(self, *, active: bool = False) -> str:
+        """Return what could not be read, in words; "" if all was. One that is ``active`` needs no end."""
+        reasons = [
+            (len(self.parts), f"{len(self.parts):,} damaged parts"),
+            (self.missing, f"{self.missing:,} messages missing"),
+            (self.unnamed, f"{self.unnamed:,} messages without a topic"),
+            (self.torn and not active, f"{self.torn:,} bytes at its end cannot be read"),
+            (not (self.finished or active), "its end is missing or damaged, or it is being written"),
+        ]
+        text = ", ".join(words for number, words in reasons if number)
+        return f"{text} ({self.why})" if text and self.why else text
+
+
+def unnamed(number: int) -> Channel:
+    """Return a channel in place of one that has lost its name."""
+    return Channel(number, f"{UNNAMED}{number}", "application/octet-stream")
+
+
+def require_package() -> None:
+    """Raise RecordingError where the package ``mcap`` is not installed."""
+    if find_spec("mcap") is None:
+        raise RecordingError('recordings need the package mcap: pip install "pebble-robot[record]"')
+
+
+def number_in(items: Mapping[str, str], name: str) -> int:
+    """Return a number in metadata; 0 where there is none."""
+    text = items.get(name, "")
+    return int(text) if text.isascii() and text.isdigit() and len(text) < 18 else 0
