@@ -125,6 +125,7 @@ def test_there_is_one_writer_at_a_time(tmp_path: Path) -> None:
         pass
 
 
+@pytest.mark.alone
 def test_a_stopped_reader_does_not_starve_the_others(net: FramesNet) -> None:
     writer = net.writer(size=VGA, rate=60)
     stopped, other = net.reader(views=True), net.reader(views=True)
