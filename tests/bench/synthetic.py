@@ -125,6 +125,6 @@ def _robot_traffic(name: str) -> RobotTraffic:
             for family, kbps in families
             for time in ("all", "session", "idle")
         ],
-        intervals=Intervals(count=240, median_ms=250.0, p95_ms=260.0, p99_ms=400.0, longest_ms=1150.0),
+        intervals=Intervals(count=240, median_ms=250.0),
         latency=Latency(240, 1.0, 2.5, 30.0, 60.0, Histogram(0.0, 2.0, [90, 80, 40, 20, 5, 0, 5])),
     )  # fmt: skip

@@ -20,8 +20,9 @@ from pebble.recordings.files.reader import RecordingFile
 from pebble.recordings.files.recorded import RecordingError
 from pebble.recordings.files.rewrite import rewrite
 from pebble.recordings.library import problems
-from pebble.recordings.recorder.disk_space import Disk, Limits, outdated, surplus
+from pebble.recordings.recorder.disk_space import Disk, outdated, surplus
 from pebble.recordings.recorder.folder import Folder
+from pebble.recordings.recorder.settings import Options
 from pebble.recordings.replay.source import ReplaySource
 from pebble.recordings.seek.archive import Archive
 from pebble.recordings.seek.days import Days
@@ -89,7 +90,7 @@ def test_a_file_of_another_program_is_read_in_the_order_of_time(tmp_path: Path, 
 def test_one_without_chunks_is_refused_with_one_line(tmp_path: Path, run: Run, name: str) -> None:
     path = stored(tmp_path, REFUSED[name])
     assert run("recordings", "search", path) == 1
-    assert run.err == f"pebble: {path}: its messages are not in chunks: mcap compress {NAME} -o OUT\n"
+    assert run.err == f"pebble: {path}: its messages are not in chunks: `mcap compress` puts them there\n"
 
 
 def test_a_deletion_leaves_it_as_it_is(tmp_path: Path, run: Run) -> None:
@@ -335,9 +336,9 @@ def test_what_was_not_read_makes_no_room(tmp_path: Path) -> None:
     for number, end in enumerate(["", ".damaged", "", ".damaged"], 1):
         stored(tmp_path, bytes(1000), f"{NAME.replace('001', f'{number:03}')}{end}")
     entries = Folder(tmp_path / "rec").entries()
-    assert [one.number for one in surplus(entries, Limits(keep_bytes=1500), Disk(1 << 40))] == [1]
-    assert surplus(entries, Limits(keep_bytes=2000), Disk(1 << 40)) == []
-    old = outdated(entries[1:], Limits(keep_media_days=1.0), entries[0].ended + 1e6)
+    assert [one.number for one in surplus(entries, Options(keep_bytes=1500), Disk(1 << 40))] == [1]
+    assert surplus(entries, Options(keep_bytes=2000), Disk(1 << 40)) == []
+    old = outdated(entries[1:], Options(keep_media_days=1.0), entries[0].ended + 1e6)
     assert old is None
 
 

@@ -24,7 +24,8 @@ from pebble.recordings.exports.film import write_film, write_wav
 from pebble.recordings.exports.foxglove import write_foxglove
 from pebble.recordings.exports.lines import BadLine, Imported, read_lines, write_lines
 from pebble.recordings.exports.unfinished import unfinished
-from pebble.recordings.files.recorded import Recorded
+from pebble.recordings.files.recorded import Channel, Recorded
+from pebble.recordings.files.rewrite import Copy
 from pebble.recordings.files.writer import RecordingWriter
 from pebble.recordings.library import Damages, files, merged, problems
 from pebble.recordings.stamps import stamp_ns
@@ -88,7 +89,7 @@ def import_(
     with _opened(source) as file, unfinished(target, overwrite=False) as path, path.open("wb", buffering=0) as out:
         writer = RecordingWriter(out)
         writer.metadata("pebble.recording", {"format": "1", "imported": source.name})
-        counted = _import(read_lines(file), writer)
+        counted = _import(read_lines(file), Copy(writer))
         writer.finish()
     typer.echo(f"{target}: {counted['messages']:,} messages")
     if counted["bad"]:
@@ -123,9 +124,8 @@ def _export(
     return f"{target}: {count:,} messages"
 
 
-def _import(found: Iterable[Imported | BadLine], writer: RecordingWriter) -> Counter[str]:
+def _import(found: Iterable[Imported | BadLine], copy: Copy) -> Counter[str]:
     counted = Counter[str]()
-    channels: dict[tuple[str, str, tuple[tuple[str, str], ...]], int] = {}
     for one in found:
         if isinstance(one, BadLine):
             counted["bad"] += 1
@@ -133,10 +133,8 @@ def _import(found: Iterable[Imported | BadLine], writer: RecordingWriter) -> Cou
                 typer.echo(f"pebble: line {one.number}: {shown(one.problem)}", err=True)
             continue
         encoding = "json" if one.payload[:1] in (b"{", b"[") else "application/octet-stream"
-        key = (one.topic, encoding, tuple(one.metadata.items()))
-        if key not in channels:
-            channels[key] = writer.channel(one.topic, encoding, one.metadata)
-        writer.add(channels[key], one.log_ns, one.payload, stamp_ns(one.payload))
+        channel = Channel(0, one.topic, encoding, one.metadata)
+        copy.add(Recorded(channel, 0, one.log_ns, stamp_ns(one.payload), one.payload))
         counted["messages"] += 1
         counted["truncated"] += one.truncated
     return counted

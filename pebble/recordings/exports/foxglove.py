@@ -10,7 +10,6 @@ from typing import Final
 
 from pebble.contract.packets import PBAT
 from pebble.recordings.exports.foxglove_messages import (
-    MOST_CHANNELS,
     QUALITY,
     Converted,
     Media,
@@ -22,7 +21,8 @@ from pebble.recordings.exports.foxglove_messages import (
 )
 from pebble.recordings.exports.lines import Progress
 from pebble.recordings.exports.unfinished import unfinished
-from pebble.recordings.files.recorded import Recorded
+from pebble.recordings.files.recorded import Channel, Recorded, Schema
+from pebble.recordings.files.rewrite import Copy
 from pebble.recordings.files.writer import RecordingWriter
 from pebble.recordings.stamps import is_picture
 
@@ -45,25 +45,25 @@ def write_foxglove(
     """
     schemas = Schemas()
     with unfinished(target, overwrite=overwrite) as path, path.open("wb", buffering=0) as file:
-        export = _Export(RecordingWriter(file), schemas, quality)
+        writer = RecordingWriter(file)
+        export = _Export(Copy(writer), schemas, quality)
         for message in messages:
             export.add(message)
             if on_time is not None:
                 on_time(message.log_ns)
-        export.finish()
+        writer.finish()
     return dict(export.counts)
 
 
 class _Export:
     """One file in the making."""
 
-    def __init__(self, writer: RecordingWriter, schemas: Schemas, quality: float) -> None:
+    def __init__(self, copy: Copy, schemas: Schemas, quality: float) -> None:
         self.counts: Counter[str] = Counter()
-        self._writer, self._schemas = writer, schemas
+        self._copy, self._schemas = copy, schemas
         self._media = Media(schemas, quality)
         self._telemetry = Telemetry(schemas)
-        self._schema_ids: dict[str, int] = {}
-        self._channels: dict[str, int] = {}
+        self._channels: dict[str, Channel] = {}
 
     def add(self, message: Recorded) -> None:
         topic, payload = message.channel.topic, message.payload
@@ -79,39 +79,22 @@ class _Export:
         if converted is None or converted.beside:
             self._add_json(message)
 
-    def finish(self) -> None:
-        self._writer.finish()
-
     def _add(self, message: Recorded, converted: Converted) -> None:
-        made, stamp = converted.message, _time_of(message)
-        name, topic = made.DESCRIPTOR.full_name, f"{message.channel.topic}/{converted.ending}"
+        made, topic = converted.message, f"{message.channel.topic}/{converted.ending}"
         if topic not in self._channels:
-            if name not in self._schema_ids:
-                schema = self._schemas.descriptors(made)
-                self._schema_ids[name] = self._writer.schema(name, "protobuf", schema)
-            self._declare(topic, "protobuf", self._schema_ids[name])
-        self._put(topic, message.log_ns, stamped(made, stamp), stamp, made.DESCRIPTOR.name)
+            schema = Schema(made.DESCRIPTOR.full_name, "protobuf", self._schemas.descriptors(made))
+            self._channels[topic] = Channel(0, topic, "protobuf", {}, schema)
+        stamp = _time_of(message)
+        self._copy.add(Recorded(self._channels[topic], 0, message.log_ns, stamp, stamped(made, stamp)))
+        self.counts[made.DESCRIPTOR.name] += 1
 
     def _add_json(self, message: Recorded) -> None:
         payload, topic = as_object(message.payload), message.channel.topic
         if payload is None:
             self.counts[LEFT_OUT] += 1
             return
-        if topic not in self._channels:
-            self._declare(topic, JSON, 0)
-        self._put(topic, message.log_ns, payload, _time_of(message), JSON)
-
-    def _declare(self, topic: str, encoding: str, schema: int) -> None:
-        if self._writer.channels < MOST_CHANNELS:
-            self._channels[topic] = self._writer.channel(topic, encoding, {}, schema)
-
-    def _put(self, topic: str, log_ns: int, payload: bytes, stamp: int, count_as: str) -> None:
-        channel = self._channels.get(topic)
-        if channel is None:
-            self.counts[LEFT_OUT] += 1
-            return
-        self._writer.add(channel, log_ns, payload, stamp)
-        self.counts[count_as] += 1
+        self._copy.add(Recorded(Channel(0, topic, JSON), 0, message.log_ns, _time_of(message), payload))
+        self.counts[JSON] += 1
 
 
 def _time_of(message: Recorded) -> int:

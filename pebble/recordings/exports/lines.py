@@ -20,9 +20,7 @@ from pebble.transports.topics import check_topic
 
 TRUNCATED: Final = "truncated"  # of a channel: its payloads were cut before they were recorded here
 
-LONGEST: Final = 96 << 20  # bytes of a line; the largest message of a recording takes less
 _TEXT_MOST: Final = 1 << 16  # bytes of a payload that is written as text, too
-SKIPPED_AT_ONCE: Final = 1 << 20
 _MILLISECONDS_FROM: Final = 10**11  # a number as large as this counts milliseconds (paper A.4.2)
 _LATEST_NS: Final = (1 << 63) - 1
 _EPOCH: Final = datetime(1970, 1, 1, tzinfo=UTC)
@@ -103,10 +101,8 @@ def write_lines(
 
 def read_lines(file: BinaryIO) -> Iterator[Imported | BadLine]:
     """The messages of a logger's file, in its order. Lines that are none are yielded as such; empty ones are not."""
-    for number, line in enumerate(_lines(file), 1):
-        if line is None:
-            yield BadLine(number, f"longer than {LONGEST} bytes")
-        elif not line.isspace():
+    for number, line in enumerate(file, 1):
+        if not line.isspace():
             yield _imported(number, line)
 
 
@@ -145,17 +141,6 @@ def _add_text(line: _Written, payload: bytes) -> None:
         line.payload_json = msgspec.json.decode(payload)
     except (UnicodeDecodeError, msgspec.DecodeError, RecursionError):
         pass
-
-
-def _lines(file: BinaryIO) -> Iterator[bytes | None]:
-    """The lines of ``file``; None for one that is too long."""
-    while line := file.readline(LONGEST):
-        if len(line) == LONGEST and not line.endswith(b"\n"):
-            while (rest := file.readline(SKIPPED_AT_ONCE)) and not rest.endswith(b"\n"):
-                pass
-            yield None
-        else:
-            yield line
 
 
 def _imported(number: int, line: bytes) -> Imported | BadLine:

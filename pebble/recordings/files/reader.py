@@ -11,6 +11,7 @@ import heapq
 import os
 import zlib
 from collections.abc import Callable, Iterable, Iterator
+from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 from itertools import pairwise
@@ -35,8 +36,7 @@ from pebble.recordings.files.records import (
     FOOTER,
     HEAD,
     INDEX,
-    LARGEST_CHUNK,
-    LOOKS_LIKE_CHUNK,
+    LARGEST_RECORD,
     MAGIC,
     MESSAGE,
     Op,
@@ -48,22 +48,19 @@ from pebble.recordings.files.records import (
     unpack_chunk,
     with_own_topic,
 )
+from pebble.recordings.files.scan import Scan
 
 if TYPE_CHECKING:
-    from mcap.records import Attachment, ChunkIndex, McapRecord, Metadata, Statistics
+    from mcap.records import Attachment, ChunkIndex, Metadata, Statistics
     from mcap.summary import Summary
 
 DAMAGE, MISSING = "pebble.damage", "missing_messages"  # metadata of a copy of a file of which a part was missing
 #: Names of the last version: of that metadata, and of the channel of topics for which a file had no room.
 OLD_COPY, OLD_OTHER = "pebble.rewritten", "$recorder/other"
 
-_INDEX_ENTRY, _INDEXES = 16, 8192  # bytes: of one entry; that are read at once behind a chunk
-_CHECKSUM: Final = 4  # bytes
-_LONGEST_NAME: Final = 16  # of a compression
+_INDEX_ENTRY: Final = 16  # bytes
 _LARGEST_HEADER: Final = 1 << 16
 _LARGEST_SUMMARY: Final = 256 << 20
-_LARGEST_RECORD: Final = LARGEST_CHUNK + (1 << 16)
-_SEARCHED, _OVERLAP = 1 << 20, 64  # bytes behind damage that are read at once
 _MOST_OPEN: Final = 512 << 20  # bytes of chunks that are sorted at the same time
 _time = attrgetter("log_ns")
 
@@ -94,9 +91,7 @@ class RecordingFile:
         self._schemas: dict[int, Schema] = {}
         self._names: dict[int, Channel] = {}  # channels that are named beside chunks, where no checksum protects them
         self._beside: list[int] = []  # where metadata and attachments are
-        self._at = self._searched = len(MAGIC)  # how far it was looked through, and how far for a chunk
-        self._again_at = 0  # the last chunk, behind which more indexes may be written yet
-        self._size, self._ended, self._looked_everywhere = 0, False, False
+        self._looked_everywhere = False
         try:
             self._file = path.open("rb")
         except OSError as error:
@@ -126,18 +121,17 @@ class RecordingFile:
         return max((chunk.end_ns for chunk in self.chunks), default=0)
 
     @property
+    def size(self) -> int:
+        return os.fstat(self._file.fileno()).st_size
+
+    @property
     def is_cut_off(self) -> bool:
-        """Whether nothing is at its end but zeros, or the begin of one record: so a kill leaves it."""
-        rest = self._read(self._at, min(self.damage.torn, _LARGEST_RECORD))
-        if len(rest) < HEAD.size or not any(rest):
-            return len(rest) >= self.damage.torn
-        op, length = HEAD.unpack_from(rest)
-        return self._may_begin(op, length) and self._at + HEAD.size + length > self._size
+        """True if nothing is at its end but zeros, or the begin of one record: so a kill leaves it."""
+        return self._scan.is_cut_off
 
     def refresh(self) -> None:
         """Find what was written since; a file that is finished does not change."""
         if self.statistics is None:
-            self._size = os.fstat(self._file.fileno()).st_size
             self._look_through()
 
     def read(
@@ -172,52 +166,56 @@ class RecordingFile:
         """Return the named texts of the file; of two with one name the last."""
         from mcap.records import Metadata
 
-        found = (record for record in self._records_beside() if isinstance(record, Metadata))
-        return {record.name: record.metadata for record in found}
+        return {record.name: record.metadata for record in self.beside() if isinstance(record, Metadata)}
 
     def beside(self) -> Iterator[Metadata | Attachment]:
         """Yield what the file holds beside messages."""
         from mcap.records import Attachment, Metadata
 
-        for record in self._records_beside():
+        for at in self._beside:
+            head = self._read(at, HEAD.size)
+            length = HEAD.unpack(head)[1] if len(head) == HEAD.size else LARGEST_RECORD
+            try:
+                if length >= LARGEST_RECORD:
+                    raise DamageError("metadata, or an attachment, of a size that cannot be")
+                record = record_of(self._read(at, HEAD.size + length))
+            except DamageError as error:
+                self.damage.add(at, error)
+                continue
             if isinstance(record, Metadata | Attachment):
                 yield record
 
     # -- a finished file
 
     def _open(self) -> None:
-        self._size = os.fstat(self._file.fileno()).st_size
-        if not self._size:
+        from mcap.records import Header
+
+        begin = self._read(0, _LARGEST_HEADER)
+        if not begin:
             self.damage.why = "it is empty"
-        elif self._read(0, len(MAGIC)) != MAGIC:
+        elif not begin.startswith(MAGIC):
             self.damage.add(0, "it does not begin as MCAP does")
-        self._read_header()
+        with suppress(DamageError):
+            header = record_of(begin[len(MAGIC) :])
+            self.is_ours = not isinstance(header, Header) or header.library.startswith("pebble")
+        self._scan = Scan(self.path, self._read, self.damage, is_ours=self.is_ours)
         summary = self._summary()
         if summary is None or not self._take_over(summary):
             self._look_through()
 
-    def _read_header(self) -> None:
-        from mcap.records import Header
-
-        try:
-            header = record_of(self._read(self._at, _LARGEST_HEADER))
-        except DamageError:
-            return
-        if isinstance(header, Header):
-            self.is_ours = header.library.startswith("pebble")
-
     def _summary(self) -> Summary | None:
         """None: it is not finished, its end is damaged, or it has none."""
         tail = FOOTER.size + len(MAGIC)
-        footer = self._read(max(0, self._size - tail), tail)
+        file_size = self.size
+        footer = self._read(max(0, file_size - tail), tail)
         if len(footer) < tail or footer[FOOTER.size :] != MAGIC:
             return None
         op, length, start, _, checksum = FOOTER.unpack_from(footer)
-        size = self._size - start if start else tail
+        size = file_size - start if start else tail
         if op != Op.FOOTER or length != FOOTER.size - HEAD.size or not tail <= size <= _LARGEST_SUMMARY:
             return None
-        end = self._read(self._size - size, size)
-        if checksum and zlib.crc32(end[: -len(MAGIC) - _CHECKSUM]) != checksum:
+        end = self._read(file_size - size, size)
+        if checksum and zlib.crc32(end[: -len(MAGIC) - 4]) != checksum:
             return None
         self.damage.finished = True
         try:
@@ -246,110 +244,30 @@ class RecordingFile:
 
     def _look_through(self) -> None:
         """Find the chunks, and the names of channels, from where the last look has ended."""
-        if self._again_at and not self._ended:
-            self.chunks.pop()
-            self._at, self._again_at = self._again_at, 0
-        while self._at < self._size and not self._ended:
-            record = self._record_at(self._at)
-            if record is not None:
-                self._at = self._take(*record)
-                continue
-            again = self._next_chunk(max(self._at + 1, self._searched))
-            if again is None:
-                self._searched = max(self._searched, self._size - _OVERLAP)
-                break
-            self.damage.add(self._at, f"{again - self._at:,} bytes are no record")
-            self._at = again
-        self.damage.torn = 0 if self._ended else max(0, self._size - self._at)
+        if self.chunks and not self.chunks[-1].channels:  # its indexes may be there by now
+            chunk = self.chunks.pop()
+            indexed, _, is_indexed = self._scan.indexes(chunk.at + chunk.length)
+            self._add_chunk(chunk, indexed, is_indexed=is_indexed)
+        for record in self._scan.records(self.size):
+            at, begin = record.at, record.at + HEAD.size
+            if record.op == Op.CHUNK:
+                start_ns, end_ns, *_ = CHUNK.unpack(self._read(begin, CHUNK.size))
+                chunk = Chunk(start_ns, end_ns, at, record.end - at)
+                self._add_chunk(chunk, record.indexed, is_indexed=record.is_indexed)
+            elif record.op in (Op.METADATA, Op.ATTACHMENT):
+                self._beside.append(at)
+            elif record.op in (Op.SCHEMA, Op.CHANNEL):
+                try:
+                    self._declare(record.op, self._read(begin, record.end - begin), self._names)
+                except DamageError as error:
+                    self.damage.add(at, error)
 
-    def _record_at(self, at: int) -> tuple[int, int] | None:
-        """The opcode of the record at ``at``, and its end; None if it is none, or not all of it is there."""
-        head = self._read(at, HEAD.size)
-        if len(head) < HEAD.size:
-            return None
-        op, length = HEAD.unpack_from(head)
-        end = at + HEAD.size + length
-        if end > self._size:
-            return None
-        if op == Op.CHUNK:
-            is_one = self._is_chunk(at, length)
-        elif op == Op.CHANNEL:
-            is_one = self._is_channel(at, length)
-        elif op == Op.DATA_END:
-            is_one = length == _CHECKSUM
-        elif op == Op.MESSAGE and not self.is_ours:
-            raise RecordingError(f"{self.path}: its messages are not in chunks: mcap compress {self.path.name} -o OUT")
-        else:
-            is_one = self._may_begin(op, length) and self._begins_record(end)
-        return (op, end) if is_one else None
-
-    def _begins_record(self, at: int) -> bool:
-        """Whether a record may begin at ``at``, or the file ends there."""
-        head = self._read(at, HEAD.size)
-        return len(head) < HEAD.size or self._may_begin(*HEAD.unpack(head))
-
-    def _may_begin(self, op: int, length: int) -> bool:
-        is_known = Op.HEADER <= op <= Op.DATA_END or op == Op.PADDING or (op > 0 and not self.is_ours)
-        return is_known and length <= _LARGEST_SUMMARY
-
-    def _is_chunk(self, at: int, length: int) -> bool:
-        """Whether the lengths in its head agree."""
-        head = self._read(at + HEAD.size, CHUNK.size + _LONGEST_NAME + 8)
-        if len(head) < CHUNK.size + 8:
-            return False
-        data_at = CHUNK.size + min(CHUNK.unpack_from(head)[4], _LONGEST_NAME)
-        packed = int.from_bytes(head[data_at : data_at + 8], "little")
-        return length == data_at + 8 + packed and length < _LARGEST_RECORD
-
-    def _is_channel(self, at: int, length: int) -> bool:
-        """Whether it is exactly what it says."""
-        try:
-            channel_of(self._read(at + HEAD.size, min(length, _LARGEST_RECORD)))
-        except DamageError:
-            return False
-        return True
-
-    def _take(self, op: int, end: int) -> int:
-        """Take over the record at hand; returns where the next one begins."""
-        at = self._at
-        if op == Op.CHUNK:
-            return self._take_chunk(at, end)
-        if op in (Op.METADATA, Op.ATTACHMENT):
-            self._beside.append(at)
-        elif op in (Op.SCHEMA, Op.CHANNEL):
-            try:
-                self._declare(op, self._read(at + HEAD.size, end - at - HEAD.size), self._names)
-            except DamageError as error:
-                self.damage.add(at, error)
-        self._ended = op == Op.DATA_END
-        return end
-
-    def _take_chunk(self, at: int, end: int) -> int:
-        start_ns, end_ns = CHUNK.unpack(self._read(at + HEAD.size, CHUNK.size))[:2]
-        entries, after, are_all = self._indexes(end)
-        self._again_at = 0 if are_all else at
-        channels = frozenset(entries if are_all else ())
-        chunk = Chunk(start_ns, end_ns, at, end - at, channels, sum(entries.values()))
+    def _add_chunk(self, chunk: Chunk, indexed: dict[int, int], *, is_indexed: bool) -> None:
+        channels = frozenset(indexed if is_indexed else ())
+        chunk = chunk._replace(channels=channels, messages=sum(indexed.values()))
         self.chunks.append(chunk)
-        if not entries or not entries.keys() <= self.channels.keys():
+        if not indexed or not indexed.keys() <= self.channels.keys():
             self._learn(chunk)
-        return after
-
-    def _indexes(self, at: int) -> tuple[dict[int, int], int, bool]:
-        """The messages by channel that are indexed behind a chunk, where that ends, and whether these are all."""
-        entries, data, place = dict[int, int](), b"", 0
-        while True:
-            if place + INDEX.size > len(data):
-                at, place = at + place, 0
-                data = self._read(at, _INDEXES)
-                if len(data) < INDEX.size:
-                    return entries, at, False
-            op, length, channel, size = INDEX.unpack_from(data, place)
-            after = place + HEAD.size + length
-            if op != Op.MESSAGE_INDEX or length != INDEX.size - HEAD.size + size or at + after > self._size:
-                return entries, at + place, op != Op.MESSAGE_INDEX
-            entries[channel] = size // _INDEX_ENTRY
-            place = after
 
     def _learn(self, chunk: Chunk) -> None:
         """Take over the names of channels in a chunk, which uses them first."""
@@ -363,26 +281,6 @@ class RecordingFile:
         for number in self._names.keys() - self.channels.keys():
             if not chunk.channels or number in chunk.channels:
                 self.channels[number] = self._names[number]
-
-    def _next_chunk(self, at: int) -> int | None:
-        """Where behind damage the next chunk begins."""
-        while at < self._size:
-            part, found = self._read(at, _SEARCHED + _OVERLAP), -1
-            while (match := LOOKS_LIKE_CHUNK.search(part, found + 1)) is not None and match.start() < _SEARCHED:
-                found = match.start()
-                record = self._record_at(at + found)
-                if record is not None and self._is_whole(at + found, record[1]):
-                    return at + found
-            at += _SEARCHED
-        return None
-
-    def _is_whole(self, at: int, end: int) -> bool:
-        try:
-            for _ in records(self._records(Chunk(0, 0, at, end - at))):
-                pass
-        except DamageError:
-            return False
-        return True
 
     # -- both
 
@@ -447,21 +345,10 @@ class RecordingFile:
 
     def _records(self, chunk: Chunk) -> bytes:
         """The records of a chunk. Raises DamageError."""
-        head = self._read(chunk.at, HEAD.size if chunk.length < _LARGEST_RECORD else 0)
+        head = self._read(chunk.at, HEAD.size if chunk.length < LARGEST_RECORD else 0)
         if len(head) < HEAD.size or HEAD.unpack(head) != (Op.CHUNK, chunk.length - HEAD.size):
             raise DamageError("a chunk is damaged")
         return unpack_chunk(self._read(chunk.at + HEAD.size, chunk.length - HEAD.size))
-
-    def _records_beside(self) -> Iterator[McapRecord]:
-        for at in self._beside:
-            head = self._read(at, HEAD.size)
-            length = HEAD.unpack(head)[1] if len(head) == HEAD.size else _LARGEST_RECORD
-            try:
-                if length >= _LARGEST_RECORD:
-                    raise DamageError("metadata, or an attachment, of a size that cannot be")
-                yield record_of(self._read(at, HEAD.size + length))
-            except DamageError as error:
-                self.damage.add(at, error)
 
     def _read(self, at: int, length: int) -> bytes:
         try:

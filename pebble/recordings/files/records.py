@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 
 MAGIC: Final = b"\x89MCAP0\r\n"
 LARGEST_CHUNK: Final = 64 << 20  # unpacked: ours are about 1 MB, and hold one message more than that
+LARGEST_RECORD: Final = LARGEST_CHUNK + (1 << 16)
 
 
 class Op(IntEnum):

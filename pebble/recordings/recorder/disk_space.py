@@ -4,17 +4,9 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 from pebble.recordings.recorder.folder import Entry
+from pebble.recordings.recorder.settings import Options
 
 _DAY_S = 86_400.0
-
-
-@dataclass(frozen=True, slots=True)
-class Limits:
-    """What the folder may hold; 0: no limit. ``free_bytes`` stay free on its file system."""
-
-    keep_bytes: int = 0
-    keep_media_days: float = 0.0
-    free_bytes: int = 1 << 30
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,7 +17,7 @@ class Disk:
     has_inodes: bool = True
 
 
-def surplus(entries: Iterable[Entry], limits: Limits, disk: Disk) -> list[Entry]:
+def surplus(entries: Iterable[Entry], options: Options, disk: Disk) -> list[Entry]:
     """What to delete now to keep the limits of space: the oldest first, pictures and sound before state.
 
     Files that are being written are never among them, nor those that could not be finished: these may hold what was
@@ -35,8 +27,8 @@ def surplus(entries: Iterable[Entry], limits: Limits, disk: Disk) -> list[Entry]
     used, free = sum(entry.size for entry in listed), disk.free_bytes
     deleted = []
     for entry in _deletable(listed):
-        too_much = limits.keep_bytes and used > limits.keep_bytes
-        if not too_much and free >= limits.free_bytes and disk.has_inodes:
+        too_much = options.keep_bytes and used > options.keep_bytes
+        if not too_much and free >= options.free_bytes and disk.has_inodes:
             break
         deleted.append(entry)
         used -= entry.size
@@ -45,9 +37,9 @@ def surplus(entries: Iterable[Entry], limits: Limits, disk: Disk) -> list[Entry]
     return deleted
 
 
-def outdated(entries: Iterable[Entry], limits: Limits, now: float) -> Entry | None:
+def outdated(entries: Iterable[Entry], options: Options, now: float) -> Entry | None:
     """A file of pictures and sound that is too old; one at a time, because the clock may have been set wrong."""
-    age_s = limits.keep_media_days * _DAY_S
+    age_s = options.keep_media_days * _DAY_S
     old = (entry for entry in _deletable(list(entries)) if entry.is_media and now - entry.ended > age_s)
     return next(old, None) if age_s else None
 

@@ -4,21 +4,15 @@ from typing import Final
 
 import msgspec
 
-from pebble.recordings.recorder.disk_space import Limits
-
 #: All robots of a broker, and what belongs to no robot.
 EVERYTHING: Final = ("+/+/+/#", "+/infrastructure")
 
 
 class Options(msgspec.Struct, frozen=True, kw_only=True):
-    """How a recorder records; sizes in bytes. 0 in ``keep_…``: no limit."""
+    """How a recorder records; sizes in bytes. 0 in ``keep_…``: no limit; ``free_bytes`` stay free on the disk."""
 
     rotate_seconds: float = 3600.0
     keep_bytes: int = 0
     keep_media_days: float = 0.0
     free_bytes: int = 1 << 30
     media: bool = True
-
-    @property
-    def limits(self) -> Limits:
-        return Limits(self.keep_bytes, self.keep_media_days, self.free_bytes)

@@ -223,7 +223,7 @@ class Writing:
         """Make room, and stop or go on writing; a few times a minute."""
         if not (due.every("space", _SPACE_S) or self._changed):
             return
-        limits = self._options.limits
+        options = self._options
         try:
             self._follow_folder()
             disk = _disk(self._folder.root)
@@ -233,17 +233,17 @@ class Writing:
         except OSError as error:
             self._stand_still(f"{self._folder.root}: {error.strerror}")
             return
-        if disk.free_bytes < limits.free_bytes or not disk.has_inodes or self._changed or due.every("list", _LISTED_S):
+        if disk.free_bytes < options.free_bytes or not disk.has_inodes or self._changed or due.every("list", _LISTED_S):
             self._changed = False
             self._make_room(disk, due, now_s)
         if due.every("finish", _LISTED_S):
             self._finisher.retry()
-        if disk.free_bytes < limits.free_bytes // 2 or not disk.has_inodes:
+        if disk.free_bytes < options.free_bytes // 2 or not disk.has_inodes:
             self.flush()
             self.rotate(all_of_them=True)  # while there is room to finish them
-            free, wanted = disk.free_bytes >> 20, limits.free_bytes >> 20
+            free, wanted = disk.free_bytes >> 20, options.free_bytes >> 20
             self._stand_still(f"the disk is full ({free} MB are free, and {wanted} MB must stay)", full=True)
-        elif self._blocked is not None and (disk.free_bytes >= limits.free_bytes or not self._blocked.full):
+        elif self._blocked is not None and (disk.free_bytes >= options.free_bytes or not self._blocked.full):
             self.try_again()
 
     def _follow_folder(self) -> None:
@@ -257,11 +257,11 @@ class Writing:
         log.warning("%s was removed, or is on another disk now: recording into what is there", self._folder.root)
 
     def _make_room(self, disk: Disk, due: Due, now_s: float) -> None:
-        entries, limits = self._folder.entries(), self._options.limits
-        for entry in surplus(entries, limits, disk):
+        entries = self._folder.entries()
+        for entry in surplus(entries, self._options, disk):
             self._delete(entry.path, entry.size)
         if due.every("age", _AGE_S):
-            old = outdated(entries, limits, now_s)
+            old = outdated(entries, self._options, now_s)
             if old is not None:
                 self._delete(old.path, old.size)
 

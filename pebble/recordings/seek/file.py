@@ -26,10 +26,6 @@ class SeekableFile(RecordingFile):
         """What could not be read of it, as far as that is known."""
         return self.damage.report(active=self.path.name.endswith(ACTIVE))
 
-    @property
-    def size(self) -> int:
-        return os.fstat(self._file.fileno()).st_size
-
     def robots(self) -> set[str]:
         """All that a channel belongs to."""
         return {robot for channel in self.channels.values() if (robot := robot_of(channel)) is not None}

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Final
 from pebble.contract import channels as c
 from pebble.recordings.library import FOREVER_NS
 from pebble.recordings.traffic import results as traffic
-from pebble.recordings.traffic.activity import SESSION, Activity
+from pebble.recordings.traffic.activity import SESSION
 from pebble.recordings.traffic.duck import parquet, quoted
 from pebble.recordings.traffic.index import PICTURE, SOUND
 
@@ -49,7 +49,7 @@ _FAMILY: Final = f"""CASE
 _SECONDS: Final = f"""
     CREATE OR REPLACE TEMP TABLE seconds AS
     SELECT epoch_ns(ts) // 1000000000 AS second, {_FAMILY} AS family, count(*) AS messages,
-           sum(size)::BIGINT AS bytes, bit_or(if(activity IN ({_numbers(SESSION)}), 1 << activity, 0)) AS used
+           sum(size)::BIGINT AS bytes, bool_or(activity IN ({_numbers(SESSION)})) AS used
     FROM messages GROUP BY ALL
 """
 _HEARTBEATS: Final = f"""
@@ -75,11 +75,10 @@ _ONLINE: Final = f"""
 """
 _SESSIONS: Final = f"""
     CREATE OR REPLACE TEMP TABLE sessions AS
-    WITH active AS (SELECT second, bit_or(used) AS used FROM seconds WHERE used > 0 GROUP BY second),
+    WITH active AS (SELECT DISTINCT second FROM seconds WHERE used),
     begun AS (SELECT *, second - lag(second) OVER (ORDER BY second) > {traffic.SESSION_GAP_S} AS new FROM active),
     numbered AS (SELECT *, sum(coalesce(new, true)::INT) OVER (ORDER BY second) AS number FROM begun)
-    SELECT min(second) - {traffic.SESSION_MARGIN_S} AS since, max(second) + 1 + {traffic.SESSION_MARGIN_S} AS until,
-           bit_or(used) AS used
+    SELECT min(second) - {traffic.SESSION_MARGIN_S} AS since, max(second) + 1 + {traffic.SESSION_MARGIN_S} AS until
     FROM numbered GROUP BY number ORDER BY since
 """
 _BANDWIDTH: Final = f"""
@@ -116,7 +115,7 @@ _INTERVALS: Final = f"""
                count(*) OVER () - 1 AS last
         FROM heartbeats WHERE interval_ns <= {traffic.OFFLINE_AFTER_S}e9
     )
-    SELECT count(*), {_percentile("ms", 0.5)}, {_percentile("ms", 0.95)}, {_percentile("ms", 0.99)}, max(ms) FROM ranked
+    SELECT count(*), {_percentile("ms", 0.5)} FROM ranked
 """
 _OUTAGES: Final = f"""
     SELECT ns - interval_ns, interval_ns / 1e6 - $median FROM heartbeats
@@ -198,11 +197,7 @@ class RobotQueries:
         return sorted(known, key=lambda one: (order[one.family], order[one.time]))
 
     def sessions(self) -> list[traffic.Session]:
-        rows = self._rows("FROM sessions")
-        return [
-            traffic.Session(since, until, [_word(one) for one in SESSION if used >> one & 1])
-            for since, until, used in rows
-        ]
+        return [traffic.Session(since, until) for since, until in self._rows("FROM sessions")]
 
     def online(self) -> list[tuple[int, int]]:
         """Seconds since 1970 between which heartbeats came."""
@@ -237,10 +232,6 @@ class RobotQueries:
 
     def _row(self, query: str) -> Any:
         return self._connection.execute(query).fetchone()
-
-
-def _word(activity: int) -> str:
-    return Activity(activity).name.lower().replace("_", " ")
 
 
 def _round_up(value: float) -> float:

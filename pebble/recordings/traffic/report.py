@@ -1,9 +1,9 @@
 """The report of an analysis: one HTML file that needs no other, and its tables as CSV."""
 
 import html
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 from pebble.errors import PebbleError
 from pebble.recordings.traffic.figures import Figure, figures
@@ -12,7 +12,6 @@ from pebble.recordings.traffic.tables import Table, media_bandwidth, moment, tab
 from pebble.version import __version__
 
 NAME: Final = "traffic.html"
-_MOST_ROWS: Final = 200  # of a table on the page; CSV has all
 
 _STYLE: Final = """
 body { font: 16px/1.5 system-ui, sans-serif; color: #1a1a1a; background: #fff }
@@ -93,8 +92,6 @@ def _page(traffic: Traffic, advance: Callable[[str, float], None]) -> str:
     for number, robot in enumerate(traffic.robots):
         advance(f"draw {robot.robot}", number / len(traffic.robots))
         body += _robot(robot, number)
-    body.append('<h2 id="tables">Tables</h2>')
-    body += [_table(table, heading="h3") for table in tables(traffic)[1:] if table.rows]
     body.append('<h2 id="words">Words</h2><dl>')
     body += [f"<dt><b>{_text(word)}</b></dt><dd>{_text(meaning)}</dd>" for word, meaning in _DEFINITIONS]
     body.append("</dl>")
@@ -116,14 +113,14 @@ def _head(traffic: Traffic) -> Iterable[str]:
         f"4.1 of the paper, for every robot. <small>Pebble {_text(__version__)}</small></p>"
     )
     links = [f'<a href="#robot-{number}">{_text(_id(robot))}</a>' for number, robot in enumerate(traffic.robots)]
-    yield f'<nav>{" ".join(links)} <a href="#tables">tables</a><a href="#words">words</a></nav>'
+    yield f'<nav>{" ".join(links)} <a href="#words">words</a></nav>'
     found = remarks(traffic)
     if found:
         items = "".join(f"<li>{_text(one)}</li>" for one in found)
         yield f'<h2>What stands out</h2><ul class="remarks">{items}</ul>'
     table = media_bandwidth(traffic)
     if table.rows:
-        yield _table(table, heading="h2")
+        yield _table(table)
         yield (
             "<p><small>Seconds without video, or without audio, do not count. One channel of uncompressed sound at "
             "16 kHz takes 265.6 kbit/s: 50 packets of 664 bytes a second.</small></p>"
@@ -152,32 +149,24 @@ def _figure(figure: Figure, robot: RobotTraffic) -> str:
     )
 
 
-def _table(table: Table, *, heading: str) -> str:
-    texts = [all(isinstance(row[place], str) for row in table.rows) for place in range(len(table.columns))]
-    heads = "".join(
-        f"<th{_class(text)}>{_text(title)}</th>" for (_, title), text in zip(table.columns, texts, strict=True)
+def _table(table: Table) -> str:
+    heads = "".join(f"<th{_class(number)}>{_text(title)}</th>" for number, (_, title) in enumerate(table.columns))
+    rows = "".join(
+        f"<tr>{''.join(f'<td{_class(number)}>{_formatted(value)}</td>' for number, value in enumerate(row))}</tr>"
+        for row in table.rows
     )
-    rows = "".join(f"<tr>{_cells(row, texts)}</tr>" for row in table.rows[:_MOST_ROWS])
-    more = len(table.rows) - _MOST_ROWS
-    note = f"<p><small>{more:,} more rows: --csv writes them all.</small></p>" if more > 0 else ""
-    head = f"<{heading}>{_text(table.title)}</{heading}>"
-    return f'{head}<div class="scroll"><table><thead><tr>{heads}</tr></thead><tbody>{rows}</tbody></table></div>{note}'
+    return (
+        f'<h2>{_text(table.title)}</h2><div class="scroll"><table><thead><tr>{heads}</tr></thead>'
+        f"<tbody>{rows}</tbody></table></div>"
+    )
 
 
-def _cells(row: Sequence[Any], texts: Sequence[bool]) -> str:
-    return "".join(f"<td{_class(text)}>{_text(_formatted(value))}</td>" for value, text in zip(row, texts, strict=True))
+def _class(column: int) -> str:
+    return "" if column else ' class="text"'
 
 
-def _class(is_text: bool) -> str:
-    return ' class="text"' if is_text else ""
-
-
-def _formatted(value: Any) -> str:
-    if value is None:
-        return "–"
-    if isinstance(value, float):
-        return f"{value:,.2f}" if abs(value) < 1000 else f"{value:,.0f}"
-    return f"{value:,}" if isinstance(value, int) else str(value)
+def _formatted(value: str | float | None) -> str:
+    return "–" if value is None else _text(value) if isinstance(value, str) else f"{value:,.2f}"
 
 
 def _id(robot: RobotTraffic) -> str:

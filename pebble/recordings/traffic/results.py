@@ -44,11 +44,6 @@ class Session(Struct, frozen=True):
 
     since_s: int
     until_s: int
-    activities: list[str]
-
-    @property
-    def length_s(self) -> int:
-        return self.until_s - self.since_s
 
 
 class Intervals(Struct, frozen=True):
@@ -56,9 +51,6 @@ class Intervals(Struct, frozen=True):
 
     count: int
     median_ms: float
-    p95_ms: float
-    p99_ms: float
-    longest_ms: float
 
 
 class Outage(Struct, frozen=True):

@@ -12,7 +12,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pebble.media.json_video import JsonPicture
-from pebble.recordings.exports import lines
 from pebble.recordings.exports.lines import BadLine, Imported, read_lines, write_lines
 from pebble.recordings.files.recorded import Channel, Recorded
 
@@ -180,27 +179,6 @@ def test_bad_lines_are_reported_and_the_others_read(line: bytes) -> None:
     assert bad.number == 2
     assert bad.problem
     assert first == last == Imported(1_732_300_000_250_000_000, TOPIC, b"\0\1\xff", qos=1)
-
-
-def test_a_line_that_is_too_long_is_skipped_in_parts(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(lines, "LONGEST", 1000)
-    monkeypatch.setattr(lines, "SKIPPED_AT_ONCE", 300)
-    good = json.dumps(LINE).encode()
-    file = _Watched(b"\n".join([good, b"x" * 5000, good, good + b" " * (999 - len(good)), b"x" * 1000]))
-    found = list(read_lines(file))
-    assert [type(one).__name__ for one in found] == ["Imported", "BadLine", "Imported", "Imported", "BadLine"]
-    assert file.most <= 1000
-
-
-class _Watched(io.BytesIO):
-    """A file that knows the longest piece that was read."""
-
-    most = 0
-
-    def readline(self, size: int | None = -1, /) -> bytes:
-        line = super().readline(size)
-        self.most = max(self.most, len(line))
-        return line
 
 
 def test_messages_are_written_as_they_come() -> None:

@@ -6,8 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from pebble.recordings.recorder.disk_space import Disk, Limits, outdated, surplus
+from pebble.recordings.recorder.disk_space import Disk, outdated, surplus
 from pebble.recordings.recorder.folder import Entry
+from pebble.recordings.recorder.settings import Options
 
 NOW, DAY_S = 1_760_000_000.0, 86_400.0
 MEDIA = "media.pebble.robots.goob"
@@ -26,18 +27,18 @@ BOTH = [*STATE, *(entry(number, MEDIA) for number in (2, 4, 6))]
 @pytest.mark.parametrize(
     ("entries", "limits", "disk", "deleted"),
     [
-        (BOTH, Limits(free_bytes=0), MUCH, []),
-        (BOTH, Limits(keep_bytes=60), MUCH, []),
-        (BOTH, Limits(keep_bytes=45), MUCH, [2, 4]),
-        (BOTH, Limits(keep_bytes=1), MUCH, [2, 4, 1, 3]),
-        ([*STATE, entry(9, ending=".active")], Limits(keep_bytes=35), MUCH, [1]),
-        ([*STATE, entry(9, ending=".damaged")], Limits(keep_bytes=35), MUCH, []),
-        (BOTH, Limits(free_bytes=115), Disk(100), [2, 4]),
-        (BOTH, Limits(free_bytes=0), Disk(100, has_inodes=False), [2]),
+        (BOTH, Options(free_bytes=0), MUCH, []),
+        (BOTH, Options(keep_bytes=60), MUCH, []),
+        (BOTH, Options(keep_bytes=45), MUCH, [2, 4]),
+        (BOTH, Options(keep_bytes=1), MUCH, [2, 4, 1, 3]),
+        ([*STATE, entry(9, ending=".active")], Options(keep_bytes=35), MUCH, [1]),
+        ([*STATE, entry(9, ending=".damaged")], Options(keep_bytes=35), MUCH, []),
+        (BOTH, Options(free_bytes=115), Disk(100), [2, 4]),
+        (BOTH, Options(free_bytes=0), Disk(100, has_inodes=False), [2]),
     ],
 )
 def test_the_oldest_go_and_pictures_before_state(
-    entries: list[Entry], limits: Limits, disk: Disk, deleted: list[int]
+    entries: list[Entry], limits: Options, disk: Disk, deleted: list[int]
 ) -> None:
     assert [one.number for one in surplus(entries, limits, disk)] == deleted
 
@@ -48,14 +49,14 @@ OLD = [entry(1, days=9), entry(2, MEDIA, days=8), entry(3, days=3), entry(4, MED
 @pytest.mark.parametrize(
     ("entries", "limits", "found"),
     [
-        (OLD, Limits(), None),
-        (OLD, Limits(keep_media_days=7), 2),
-        (OLD, Limits(keep_media_days=10), None),
-        (OLD[:2], Limits(keep_media_days=1), None),
+        (OLD, Options(), None),
+        (OLD, Options(keep_media_days=7), 2),
+        (OLD, Options(keep_media_days=10), None),
+        (OLD[:2], Options(keep_media_days=1), None),
     ],
 )
 def test_one_that_is_too_old_but_never_the_newest_of_its_kind(
-    entries: list[Entry], limits: Limits, found: int | None
+    entries: list[Entry], limits: Options, found: int | None
 ) -> None:
     old = outdated(entries, limits, NOW)
     assert (None if old is None else old.number) == found
