@@ -42,7 +42,7 @@ def module_broker(*options: str, files: Callable[[Path], list[str]] = lambda _fo
     @pytest.fixture(scope="module")
     def broker(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Broker]:
         folder = tmp_path_factory.mktemp("broker")
-        made = Broker(folder, *options, *files(folder))
+        made = Broker(folder, "max_queued_messages 0", *options, *files(folder))  # a busy receiver loses none
         yield made
         made.stop()
 
