@@ -81,6 +81,7 @@ export class Driver {
     } else if (now >= this.askedAt + ASKS_MS) {
       this.askedAt = now;
       this.request("hold");
+      this.robot.showHolder(this.id);
     }
   }
 

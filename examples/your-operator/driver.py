@@ -64,6 +64,7 @@ class Driver:
         elif now >= self.asked_at + ASKS_S:
             self.asked_at = now
             self.request("hold")
+            self.robot.show_holder(self.id)
 
     def release(self):
         self.request("release")
@@ -92,3 +93,13 @@ class Driver:
 def clock_ms():
     """Return milliseconds of a clock that is never set: by them a robot drops commands that come late."""
     return time.monotonic_ns() // 1_000_000
+
+
+def numbers(text):
+    """Return the two numbers that were typed; NaN, which lets go of the stick, if these are none."""
+    try:
+        x, z = text.split()
+        return float(x), float(z)
+    except ValueError:
+        print("type two numbers, stop or reset", flush=True)
+        return math.nan, math.nan

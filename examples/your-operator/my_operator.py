@@ -1,22 +1,23 @@
-"""Drives a robot by the lines that a person types. It needs paho-mqtt, and the modules beside it.
+"""Drives a robot by the lines that a person types. It needs paho-mqtt 2 or newer, in a venv,
+and the modules beside it:
 
     python my_operator.py ID HOST PORT [USER PASSWORD_FILE CA_FILE]
 
-"0 0.5" steers by 0 and drives at 0.5 until the next line, "0 0" lets go, "stop" and "reset" are the emergency stop.
-With a user, commands carry this name. (A file called operator.py would hide a module of Python.)
+"0 0.5" steers by 0 and drives at 0.5 until the next line, "0 0" or an empty line lets go, "stop" and "reset" are the
+emergency stop, Ctrl-D ends it. With a user, commands carry this name. (operator.py would hide a module of Python.)
 """
 
 import json
 import queue
 import secrets
+import signal
 import sys
 import threading
 import time
-from contextlib import suppress
 from pathlib import Path
 
 import paho.mqtt.client as mqtt
-from driver import Driver
+from driver import Driver, numbers
 from robot_state import METRICS, RobotState
 
 ID, HOST, PORT, *LOGIN = sys.argv[1:]
@@ -26,7 +27,7 @@ PLAIN = f"{BASE}/incoming/"
 INCOMING = f"{PLAIN}by/{NAME}/" if LOGIN else PLAIN
 STEP_S = 0.01
 KEEPALIVE_S = 5
-RETRY_S = 0.2
+RETRY_S = 0.5
 REPEATS_S = 0.5
 GIVES_UP_S = 60.0
 
@@ -56,11 +57,12 @@ def send(metric, value, qos):
 
 def reset():
     """End the stops that are shown now, and no later one."""
-    for state in robot.stops.values():
+    for state in robot.known(robot.stops).values():
         send("estop-reset", {"boot": state.get("boot"), "count": state.get("count")}, 1)
 
 
-def on_connect(_client, _data, _flags, _reason, _properties):
+def on_connect(_client, _data, _flags, reason, _properties):
+    print("the broker answers:", reason, flush=True)
     client.subscribe([(f"{BASE}/outgoing/{metric}", 1) for metric in METRICS])
 
 
@@ -70,7 +72,7 @@ def on_message(_client, _data, message):
 
 def read_lines():
     for line in sys.stdin:
-        lines.put(line.strip())
+        lines.put(line.strip() or "0 0")
     lines.put(None)
 
 
@@ -86,6 +88,7 @@ if LOGIN:
     client.username_pw_set(NAME, Path(password_file).read_text().strip())
     client.tls_set(ca_file)
 client.connect_async(HOST, int(PORT), KEEPALIVE_S)
+signal.signal(signal.SIGINT, lambda *_: lines.put(None))  # Ctrl-C lets go as well
 threading.Thread(target=read_lines, daemon=True).start()
 
 typed = ""
@@ -93,22 +96,19 @@ while typed is not None:
     if client.loop(STEP_S) != mqtt.MQTT_ERR_SUCCESS:  # not connected
         robot.disconnect()
         time.sleep(RETRY_S)
-        with suppress(OSError):  # no network, or no broker: it tries again
+        try:
             client.reconnect()
+        except OSError as error:  # no network, or no broker: it tries again
+            print(error, flush=True)
     typed = "" if lines.empty() else lines.get()
     if typed == "stop":
         stop = StopSender()
     elif typed == "reset":
         reset()
     elif typed:
-        try:
-            x, z = typed.split()
-            driver.push(float(x), float(z))
-        except ValueError:
-            print("type two numbers, stop or reset", flush=True)
-            driver.push(0.0, 0.0)
+        driver.push(*numbers(typed))
     if stop and stop.is_over():
-        print("the robot is stopped" if robot.is_stopped() else "no robot confirms the stop", flush=True)
+        print("the robot is stopped" if robot.has_stop(stop.stop["stop"]) else "the stop is not confirmed", flush=True)
         stop = None
     if stop:
         stop.step()

@@ -2,8 +2,8 @@
 //
 //     node operator.mjs ID HOST PORT [USER PASSWORD_FILE CA_FILE]
 //
-// "0 0.5" steers by 0 and drives at 0.5 until the next line, "0 0" lets go, "stop" and "reset" are the emergency stop.
-// With a user, commands carry this name.
+// "0 0.5" steers by 0 and drives at 0.5 until the next line, "0 0" or an empty line lets go, "stop" and "reset" are the
+// emergency stop, Ctrl-D ends it. With a user, commands carry this name.
 import { randomBytes } from "node:crypto";
 import fs from "node:fs";
 import net from "node:net";
@@ -49,6 +49,7 @@ readline
   .createInterface({ input: process.stdin })
   .on("line", (line) => obey(line.trim()))
   .on("close", end);
+process.on("SIGINT", end); // Ctrl-C lets go as well
 setInterval(step, STEP_MS);
 
 function dial() {
@@ -79,7 +80,7 @@ function obey(line) {
 
 /** End the stops that are shown now, and no later one. */
 function reset() {
-  for (const { boot, count } of robot.stops.values()) {
+  for (const { boot, count } of robot.known(robot.stops).values()) {
     send("estop-reset", { boot, count }, 1);
   }
 }
@@ -87,7 +88,7 @@ function reset() {
 function step() {
   const now = performance.now();
   if (stop !== null && (robot.hasStop(stop.command.stop) || now > stop.endsAt)) {
-    console.log(robot.isStopped() ? "the robot is stopped" : "no robot confirms the stop");
+    console.log(robot.hasStop(stop.command.stop) ? "the robot is stopped" : "the stop is not confirmed");
     stop = null;
   }
   if (stop !== null && now >= stop.dueAt) {

@@ -12,6 +12,7 @@ export class RobotState {
   controls = new Map(); // who has control, by the same
   isOffline = true;
   heartbeatAt = -Infinity;
+  shownHolder = "";
 
   disconnect() {
     this.isOffline = true;
@@ -56,8 +57,14 @@ export class RobotState {
     return this.isOffline || performance.now() > this.heartbeatAt + limit;
   }
 
+  /** Without those of owners that capabilities do not list: a broker keeps them after a renaming. */
+  known(states) {
+    const owners = this.capabilities.estop?.owners;
+    return new Map([...states].filter(([owner]) => !owners?.length || owners.includes(owner)));
+  }
+
   isStopped() {
-    return [...this.stops.values()].some((stop) => stop.latched !== false);
+    return [...this.known(this.stops).values()].some((stop) => stop.latched !== false);
   }
 
   /** True if each owner of motors tells that it has the emergency stop of this name. */
@@ -66,18 +73,29 @@ export class RobotState {
     return owners.length > 0 && owners.every((owner) => this.stops.get(owner)?.recent?.includes(name));
   }
 
-  /** True if it moves for the client that has control only. */
+  /** True if no command with another key than that of who has control moves it. */
   givesControl() {
     return this.capabilities.drive?.control === true;
   }
 
   /** The keys of all owners that gave control to this id; "" if the first by name did not, who decides. */
   key(id) {
-    const owners = [...this.controls.keys()].sort();
+    const owners = [...this.known(this.controls).keys()].sort();
     const keys = owners.map((owner) => {
       const control = this.controls.get(owner);
       return (control.id === id && control.key) || "";
     });
     return keys[0] ? keys.filter(Boolean).join(" ") : "";
+  }
+
+  /** Print once that another client has control. */
+  showHolder(id) {
+    const controls = [...this.known(this.controls).values()];
+    const other = controls.find((control) => control.key && control.id !== id);
+    const holder = other ? other.by || "another" : "";
+    if (holder && holder !== this.shownHolder) {
+      console.log(`${holder} has control, asking`);
+    }
+    this.shownHolder = holder;
   }
 }

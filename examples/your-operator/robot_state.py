@@ -19,6 +19,7 @@ class RobotState:
         self.controls = {}  # who has control, by the same
         self.is_offline = True
         self.heartbeat_at = -math.inf
+        self.shown_holder = ""
 
     def disconnect(self):
         self.is_offline = True
@@ -54,8 +55,13 @@ class RobotState:
         limit_s = SILENT_S.get(self.link["level"], SILENT_S["wide"])
         return self.is_offline or time.monotonic() > self.heartbeat_at + limit_s
 
+    def known(self, states):
+        """Return them without those of owners that capabilities do not list: a broker keeps them after a renaming."""
+        owners = (self.capabilities.get("estop") or {}).get("owners")
+        return {owner: state for owner, state in states.items() if not owners or owner in owners}
+
     def is_stopped(self):
-        return any(stop.get("latched") is not False for stop in self.stops.values())
+        return any(stop.get("latched") is not False for stop in self.known(self.stops).values())
 
     def has_stop(self, name):
         """True if each owner of motors tells that it has the emergency stop of this name."""
@@ -64,13 +70,23 @@ class RobotState:
         return bool(confirmed) and all(confirmed)
 
     def gives_control(self):
-        """True if it moves for the client that has control only."""
+        """True if no command with another key than that of who has control moves it."""
         return (self.capabilities.get("drive") or {}).get("control") is True
 
     def key(self, own_id):
         """Return the keys of all owners that gave control to this id; "" if the first by name did not, who decides."""
         keys = [
             str(control.get("key") or "") if control.get("id") == own_id else ""
-            for _, control in sorted(self.controls.items())
+            for _, control in sorted(self.known(self.controls).items())
         ]
         return " ".join(filter(None, keys)) if keys and keys[0] else ""
+
+    def show_holder(self, own_id):
+        """Print once that another client has control."""
+        holder = ""
+        for control in self.known(self.controls).values():
+            if control.get("key") and control.get("id") != own_id:
+                holder = str(control.get("by") or "another")
+        if holder not in ("", self.shown_holder):
+            print(holder, "has control, asking", flush=True)
+        self.shown_holder = holder

@@ -1,5 +1,5 @@
 // Who drives a robot: one has control until it ends, is released or is taken; one who asks meanwhile is shown.
-// Its holder gets a key, and no command of others moves the robot.
+// No command with another key than its holder's moves the robot; at level open one without a key still does.
 #pragma once
 #include "payloads.h"
 

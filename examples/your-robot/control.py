@@ -12,7 +12,10 @@ LONGEST_MS = 10000
 
 
 class Control:
-    """The control of one robot. Its holder gets a key, and no command of others moves the robot."""
+    """The control of one robot. No command with another key than its holder's moves the robot.
+
+    At level open one without a key still does.
+    """
 
     def __init__(self):
         self.holder = NO_HOLDER

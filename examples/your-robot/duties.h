@@ -5,7 +5,7 @@
 
 static const char *const OWNER = "motors";  // the name of what commands the motors
 static const int DEAD_MAN_MS = 750;         // the longest time for which a command counts
-static const int PAUSE_MS = 500;            // after a reset: without commands, or until the driver has let go
+static const int PAUSE_MS = 500;            // after a reset: until no command came for so long, or a zero of the driver
 static const int HEARTBEAT_MS = 250;
 
 class Robot {
@@ -38,7 +38,7 @@ public:
             drive(command, account);
         } else if (metric == "estop-reset" && is_command && is_known) {
             if (stop.reset(command)) paused_until = now_ms() + PAUSE_MS;
-        } else if (metric.startsWith("control") && is_command && is_known) {
+        } else if ((metric == "control" || metric == "control/take") && is_command && is_known) {
             control.request(command, account, metric == "control/take");
         }
         if (control.changes != changes) halt();  // the next driver must not get a robot that moves

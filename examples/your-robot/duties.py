@@ -6,7 +6,7 @@ from payloads import clamp, command_of, is_number
 
 OWNER = "motors"  # the name of what commands the motors
 DEAD_MAN_MS = 750  # the longest time for which a command counts
-PAUSE_MS = 500  # after a reset: a command moves the robot once none came for so long, or the driver has let go
+PAUSE_MS = 500  # after a reset nothing moves until no command came for so long, or the driver sent a zero
 HEARTBEAT_MS = 250
 
 

@@ -27,7 +27,10 @@ def packet(first, content):
 def message(first, content):
     """Return the topic, the number and the payload in a PUBLISH packet; the number is empty with QoS 0."""
     start = 2 + struct.unpack("!H", content)[0]
-    topic = content[2:start].decode()
+    try:
+        topic = content[2:start].decode()
+    except UnicodeError:
+        topic = ""  # it is cut inside a letter: none of ours is so long
     end = start + 2 if first & 6 else start
     return topic, content[start:end], content[end:]
 

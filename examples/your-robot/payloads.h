@@ -22,7 +22,7 @@ inline int64_t epoch_ms() {
 
 // Read a payload into a message, and return the command in it: {"value": {...}} means the same as {...}.
 inline JsonVariantConst command_of(JsonDocument &message, const uint8_t *payload, unsigned size) {
-    deserializeJson(message, payload, size <= LONGEST ? size : 0);
+    if (deserializeJson(message, payload, size <= LONGEST ? size : 0)) return JsonVariantConst();  // not JSON, or cut
     JsonVariantConst inner = message["value"];
     return inner.is<JsonObjectConst>() ? inner : message.as<JsonVariantConst>();
 }

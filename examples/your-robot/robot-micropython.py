@@ -31,7 +31,10 @@ class MyRobot(Robot):
         super().__init__(ID, bool(LOGIN), saved())
 
     def turn(self, left, right):
-        """Set the pins of your motors here."""
+        """Set the pins of your motors here. It must not raise OSError, which means "not connected" below.
+
+        It is called in every round while at rest: write to the hardware only on a change.
+        """
 
     def publish(self, metric, value, qos):
         client.publish(self.base + "/outgoing/" + metric, value, qos)
@@ -78,6 +81,7 @@ def connect():
     client.open()
     client.subscribe(robot.base + "/incoming/#")
     robot.connected()
+    print("connected")
 
 
 wifi = network.WLAN(network.STA_IF)
@@ -97,8 +101,9 @@ try:
             time.sleep_ms(RETRY_MS)
             try:
                 connect()
-            except OSError:
-                client.close()  # no network, or no broker: it tries again
+            except OSError as error:  # no network, or no broker: it tries again
+                print("not connected:", error)
+                client.close()
         robot.tick()
 finally:
     robot.halt()  # an error in this program must not leave the motors running

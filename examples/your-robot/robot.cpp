@@ -16,8 +16,9 @@ static WatchedClient<WiFiClientSecure> secure(retained);
 static PubSubClient mqtt;
 static Ticker dead_man;
 
-// Command your motors here, -1..1.
-static void set_motors(double, double) {}
+// Command your motors here, -1..1; a timer calls it too: be short, no Wire or Serial.
+// It is called in every round while at rest: write to the hardware only on a change.
+static void set_motors([[maybe_unused]] double left, [[maybe_unused]] double right) {}
 
 static String topic_of(const String &metric) {
     return String("pebble/robots/") + ID + "/" + metric;
@@ -87,9 +88,11 @@ static void connect() {
     mqtt.subscribe(topic_of("incoming/#").c_str(), 0);
     publish_capabilities();
     robot.connected();
+    Serial.println("connected");
 }
 
 void setup() {
+    Serial.begin(115200);
     WiFi.begin(WIFI, WIFI_PASSWORD);
     while (WiFi.status() != WL_CONNECTED) delay(100);
     configTime(0, 0, "pool.ntp.org");

@@ -1,15 +1,16 @@
-"""A robot for a computer with Python, such as a Raspberry Pi. It needs paho-mqtt, and the modules beside it.
+"""A robot for a computer with Python, such as a Raspberry Pi. It needs paho-mqtt 2 or newer, in a venv.
 
     python robot.py ID HOST PORT STOP_FILE [USER PASSWORD_FILE CA_FILE]
 
+It needs the modules beside it as well.
 With a user it is at level named, see docs/fleet.md: commands count only under the account of their sender.
 """
 
 import json
 import os
+import signal
 import sys
 import time
-from contextlib import suppress
 from pathlib import Path
 
 import paho.mqtt.client as mqtt
@@ -24,8 +25,13 @@ RETRY_S = 0.2
 class MyRobot(Robot):
     """The parts of a robot that differ from computer to computer."""
 
+    said = ""  # about the connection
+
     def turn(self, left, right):
-        """Set the pins of your motors here."""
+        """Set the pins of your motors here.
+
+        It is called in every round while at rest: write to the hardware only on a change.
+        """
 
     def publish(self, metric, value, qos):
         client.publish(self.base + "/outgoing/" + metric, json.dumps(value), qos, retain=True)
@@ -45,6 +51,12 @@ class MyRobot(Robot):
     def epoch_ms(self):
         return time.time_ns() // 1_000_000
 
+    def say(self, text):
+        """Print it, unless it was printed last: it tries again five times a second."""
+        if text != self.said:
+            print(text, flush=True)
+        self.said = text
+
 
 def saved():
     """Return what was saved last; None if there is no file, "" if it cannot be read."""
@@ -56,7 +68,11 @@ def saved():
         return ""
 
 
-def on_connect(_client, _data, _flags, _reason, _properties):
+def on_connect(_client, _data, _flags, reason, _properties):
+    if reason.is_failure:
+        robot.say(f"the broker refuses the connection: {reason}")
+        return
+    robot.say("connected")
     client.subscribe(robot.base + "/incoming/#", qos=1)
     robot.connected()
 
@@ -78,13 +94,16 @@ if LOGIN:
     client.tls_set(ca_file)
 client.connect_async(HOST, int(PORT), KEEPALIVE_S)
 
+signal.signal(signal.SIGTERM, lambda *_: sys.exit())  # as systemd ends it: else the motors would run on
 try:
     while True:
         if client.loop(STEP_S) != mqtt.MQTT_ERR_SUCCESS:  # not connected
             robot.halt()  # before connecting, which may take seconds
             time.sleep(RETRY_S)
-            with suppress(OSError):  # no network, or no broker: it tries again
+            try:
                 client.reconnect()
+            except OSError as error:  # no network, or no broker: it tries again
+                robot.say(f"not connected: {error}")
         robot.tick()
 finally:
     robot.halt()  # Ctrl-C, or an error in this program, must not leave the motors running

@@ -21,6 +21,8 @@ inline int64_t esp_timer_get_time() { timespec t; clock_gettime(CLOCK_MONOTONIC,
 inline uint32_t esp_random() { uint32_t n; if (getentropy(&n, sizeof n)) abort(); return n; }
 inline void configTime(long, int, const char *) {}  // this machine's clock is set
 
+inline struct HardwareSerial { void begin(int) {} void println(const char *) {} } Serial;
+
 class String : public std::string {
 public:
     using std::string::string;
