@@ -21,7 +21,7 @@ inline int64_t esp_timer_get_time() { timespec t; clock_gettime(CLOCK_MONOTONIC,
 inline uint32_t esp_random() { uint32_t n; if (getentropy(&n, sizeof n)) abort(); return n; }
 inline void configTime(long, int, const char *) {}  // this machine's clock is set
 
-struct { void begin(int) {} void println(const char *) {} } inline Serial;
+inline struct HardwareSerial { void begin(int) {} void println(const char *) {} } Serial;
 
 class String : public std::string {
 public:
