@@ -51,6 +51,10 @@ class Finisher:
         """Finish a file as it was left."""
         self._background.do(partial(self._mend, path))
 
+    def postpone(self, path: Path) -> None:
+        """Finish a file when there is room again."""
+        self._unfinished.add(path)
+
     def retry(self) -> None:
         """Try again what could not be finished."""
         for path in list(self._unfinished):
@@ -62,13 +66,13 @@ class Finisher:
         try:
             file.finish()
         except OSError as error:
-            self._later(file.path, error.strerror or str(error))
+            self._later(file.path, error)
             return
         self._on_finished()
 
     def _mend(self, path: Path) -> None:
-        self._unfinished.discard(path)
         if not path.exists():
+            self._unfinished.discard(path)
             return
         try:
             made = mend(path)
@@ -76,8 +80,9 @@ class Finisher:
             self._set_aside(path, str(error))
             return
         except OSError as error:
-            self._later(path, str(error))
+            self._later(path, error)
             return
+        self._unfinished.discard(path)
         if not made.is_whole:
             self._event("damaged", file=path.name, why=made.unread)
         if not made.is_empty:
@@ -88,11 +93,13 @@ class Finisher:
         try:
             rename(path, _damaged_path(path))
         except OSError as error:
-            self._later(path, str(error))
+            self._later(path, error)
             return
+        self._unfinished.discard(path)
         self._event("damaged", file=path.name, why=why)
 
-    def _later(self, path: Path, why: str) -> None:
-        """It stays as it is, and can be read, until there is room."""
-        log.warning("%s is not finished yet: %s", path.name, why)
+    def _later(self, path: Path, error: OSError) -> None:
+        """Leave it as it is, so that it can be read, until there is room; said once."""
+        if path not in self._unfinished:
+            log.warning("%s is not finished yet: %s", path.name, error.strerror or error)
         self._unfinished.add(path)

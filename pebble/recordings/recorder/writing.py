@@ -166,7 +166,7 @@ class Writing:
         self._lacking += file.take_lacking()
         self._counters["written"] += file.take_written()
         file.file.close()
-        self._finisher.mend(file.path)
+        self._finisher.postpone(file.path)
         self._block(lane, error)
 
     def _forget_removed(self, lane: str) -> None:

@@ -309,7 +309,7 @@ class TestDisk:
         assert sum(event["messages"] for event in events(running.root, "dropped")) == dropped
 
     def test_a_full_disk_loses_only_what_comes_meanwhile_and_the_count_is_written_down(
-        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
     ) -> None:
         full, write = threading.Event(), RawFile.write
 
@@ -331,7 +331,7 @@ class TestDisk:
         running.recorder.events.note("lost", why="meanwhile")
         assert until(lambda: running.recorder.counters["dropped"] == 70, 10)
         full.clear()
-        assert until(lambda: not running.recorder.blocked, 10)
+        assert until(lambda: running.recorder.counters["event_recovered"] == 1, 10)
         running.send(10)
         running.stop()
         expected = [b"%d" % number for number in (*range(150), *range(220, 230))]
@@ -339,6 +339,10 @@ class TestDisk:
         gap = events(running.root, "gap")
         assert [event["messages"] for event in gap] == [70]
         assert [len(events(running.root, name)) for name in ("recovered", "lost")] == [1, 1]
+        assert [record.getMessage() for record in caplog.records if record.name.startswith("pebble.recordings")] == [
+            "the disk is full: nothing is recorded until that is mended",
+            "recording again",
+        ]
 
     def test_the_oldest_media_go_first_and_what_is_not_ours_stays(self, tmp_path: Path) -> None:
         root = tmp_path / "rec"
