@@ -33,7 +33,7 @@ demo:
 # Types and lint use what tests leave of the processors.
 QUICKLY := --workers 4 -m "not page and not thorough and not alone" tests/contract tests/forwarding tests/motion \
 	tests/robot/test_lockstep.py tests/transports/test_contract.py
-WHOLE := --workers 9 --durations 10 -m "not page$(if $(THOROUGH),, and not thorough)" --ignore tests/life tests
+WHOLE := --workers 8 --durations 10 -m "not page$(if $(THOROUGH),, and not thorough)" --ignore tests/life tests
 test: .venv/.ready-dev
 	@$(DEBIAN) mosquitto=mosquitto mosquitto_pub=mosquitto-clients chromium=chromium g++=g++ openssl=openssl \
 		ip=iproute2 tc=iproute2 nft=nftables systemd-analyze=systemd

@@ -4,6 +4,7 @@ import json
 import shutil
 import time
 from collections.abc import Iterator
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Final
 
@@ -28,6 +29,9 @@ def recorder(config: Config, now: float | None = None) -> Iterator[CheckResult]:
     if not section.enabled:
         return
     now, folder = time.time() if now is None else now, section.place
+    if find_spec("mcap") is None:
+        yield fail(_WHAT, "the package mcap is not installed: it records nothing", 'pip install "pebble-robot[record]"')
+        return
     if not folder.is_dir():
         yield ok(_WHAT, f"{folder} is not there yet: it has not recorded anything")
         return
@@ -80,8 +84,8 @@ def _missed(entries: list[Entry], now: float) -> Iterator[CheckResult]:
         yield warn(_WHAT, f"{len(gaps)} gaps in the last hour, the last one because of: {why}")
     damaged = [entry for entry in entries if not (entry.is_finished or entry.is_active)]
     if damaged:
-        text = f"{len(damaged)} files could not be finished, and are kept: {damaged[0].path}"
-        yield warn(_WHAT, text, "pebble recordings mend FILE OUT, or pebble recordings rm FILE")
+        text = f"{len(damaged)} damaged files are kept, beside what could be read of them: {damaged[0].path}"
+        yield warn(_WHAT, text, "pebble recordings rm FILE deletes one")
     finished = [entry for entry in entries if entry.is_finished and now - entry.ended <= _DAY_S]
     missing = sum(catalogue.look_at(entry.path).missing for entry in finished)
     if missing:

@@ -111,10 +111,16 @@ def test_damage_is_counted(tmp_path: Path) -> None:
     assert any("messages of the last day are missing: files were damaged" in one.text for one in findings(tmp_path))
 
 
-def test_what_could_not_be_finished_is_named(tmp_path: Path) -> None:
+def test_without_the_package_it_fails(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("pebble.doctor.recordings.find_spec", lambda _: None)
+    (found,) = findings(tmp_path)
+    assert (found.state, found.fix) == (State.FAILED, 'pip install "pebble-robot[record]"')
+
+
+def test_damaged_files_are_named(tmp_path: Path) -> None:
     path = recorded(tmp_path)
     path.rename(path.with_name(f"{path.name}.damaged"))
-    (found,) = [one for one in findings(tmp_path) if "could not be finished" in one.text]
+    (found,) = [one for one in findings(tmp_path) if "damaged files are kept" in one.text]
     assert (found.state, f"{path}.damaged" in found.text) == (State.WARN, True)
 
 

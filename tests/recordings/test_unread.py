@@ -332,7 +332,7 @@ class TestNames:
 
 
 def test_what_was_not_read_makes_no_room(tmp_path: Path) -> None:
-    """Files that could not be finished are neither deleted for their size and age nor is another one for theirs."""
+    """Damaged files are neither deleted for their size and age nor is another one for theirs."""
     for number, end in enumerate(["", ".damaged", "", ".damaged"], 1):
         stored(tmp_path, bytes(1000), f"{NAME.replace('001', f'{number:03}')}{end}")
     entries = Folder(tmp_path / "rec").entries()

@@ -20,7 +20,7 @@ class Disk:
 def surplus(entries: Iterable[Entry], options: Options, disk: Disk) -> list[Entry]:
     """What to delete now to keep the limits of space: the oldest first, pictures and sound before state.
 
-    Files that are being written are never among them, nor those that could not be finished: these may hold what was
+    Files that are being written are never among them, nor those that are damaged: these may hold what was
     not read, and do not count. The newest file of each kind stays.
     """
     listed = [entry for entry in entries if entry.is_active or entry.is_finished]
