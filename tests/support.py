@@ -184,7 +184,7 @@ class Broker:
     def forget(self) -> None:
         """Delete what a stopped broker saved."""
         for file in self.store.glob("*"):
-            file.unlink()
+            file.unlink(missing_ok=True)
 
     def freeze(self) -> None:
         """SIGSTOP: it keeps its connections and answers nothing."""
