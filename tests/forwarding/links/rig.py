@@ -87,7 +87,7 @@ class MqttEnd(End):
     def save(self) -> None:
         assert isinstance(self.broker, Broker)
         self.broker.save()
-        self._saved = {file: file.read_bytes() for file in self.broker.store.iterdir()}
+        self._saved = {file: file.read_bytes() for file in self.broker.store.glob("*.db")}  # not a half-written .new
 
     def restore(self) -> None:
         for file, data in self._saved.items():
