@@ -10,7 +10,7 @@ from pebble.setup.places import Places
 
 def backup(file: Path, places: Places) -> int:
     """Write the tar file, and read it again."""
-    from pebble.selftest.new_file import write_new
+    from pebble.checks.report.new_file import write_new
 
     if file.exists():
         raise typer.BadParameter(f"{file} exists: name another file, or remove it")

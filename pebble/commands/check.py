@@ -165,7 +165,7 @@ def _print(config: Config, path: Path, scripts: Mapping[str, Script]) -> None:
         for name, script in scripts.items():
             grid.add_row(Text("script", style="dim"), Text(shown(name)), Text(shown(_fitness(script))))
         console.print(Padding(grid, (1, 0, 0, 2)))
-    from pebble.doctor.who import unknown_brokers
+    from pebble.checks.who import unknown_brokers
 
     if warnings := [*config.warnings, *unknown_brokers(config)]:
         grid = Table.grid(padding=(0, 2))

@@ -1,27 +1,28 @@
-"""``pebble doctor``: prints the findings of :mod:`pebble.doctor.checks`, or tests a robot that runs, or a broker."""
+"""``pebble doctor``: checks a machine and the robot on it, a robot that runs, or a broker; and packs a report."""
 
-import shutil
-import textwrap
+from __future__ import annotations
+
+import sys
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from pebble.check_result import CheckResult, State
-from pebble.commands.broker import BELOW, BelowOption, BrokerOption, RestartOption, doctor_of, settings_at
+from pebble.client.url import FORMS, UrlError, settings_of
+from pebble.commands.checks import Printer, is_clear
+from pebble.commands.estop import me
 from pebble.commands.options import CaCert, PasswordFile, RootOption
 from pebble.config import load
-from pebble.config.secret_text import without_secrets
+from pebble.config.text_files import password
 from pebble.errors import PebbleError
 from pebble.runtime.environment import withhold
+from pebble.runtime.signals import interrupted_by_signals
+from pebble.setup.places import Places
+from pebble.transports import MqttSettings
+from pebble.transports.topics import check_topic
 
-_COLOURS = {
-    State.OK: typer.colors.GREEN,
-    State.WARN: typer.colors.YELLOW,
-    State.FAILED: typer.colors.RED,
-    State.SKIPPED: typer.colors.BLUE,
-}
-_INDENT = " " * 6
+_BELOW = "pebble/doctor"
+_FORMS = "mqtt://[USER@]HOST[:PORT] or mqtts://[USER@]HOST[:PORT]"
 
 
 def doctor(
@@ -38,10 +39,17 @@ def doctor(
             "--report", help="Pack what helps to find a fault, of CONFIG or the installed robot.", metavar="FILE.zip"
         ),
     ] = None,
-    broker: BrokerOption = None,
-    below: BelowOption = BELOW,
-    restart: RestartOption = False,
-    as_json: Annotated[bool, typer.Option("--json", help="With --running or --broker: print JSON instead.")] = False,
+    broker: Annotated[
+        str | None,
+        typer.Option("--broker", help="Judge this broker instead: mqtt://[USER@]HOST[:PORT].", metavar="URL"),
+    ] = None,
+    below: Annotated[
+        str, typer.Option("--below", help="With --broker: topics below which the account may do all.", metavar="TOPIC")
+    ] = _BELOW,
+    restart: Annotated[
+        bool, typer.Option("--restart", help="With --broker: ask to restart it, and see what is still retained.")
+    ] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON instead.")] = False,
     root: RootOption = Path("/"),
     password_file: PasswordFile = None,
     ca_cert: CaCert = None,
@@ -57,9 +65,8 @@ def doctor(
     A broker is tried for some 10 s on topics of its own, which are removed; no robot moves. Exits 1 if it has limits,
     2 if robots cannot use it.
 
-    A report has config, findings, status, journal, units, slots, versions and devices. Passwords and keys are masked;
-    then every one that is known on this machine is searched for in it, and if one is found, nothing is written. Run it
-    as root: it searches only for what it may read.
+    A report has config, findings, status, journal, units, slots, versions and devices. Every password and key that is
+    known on this machine is hidden in it. Run it as root: it knows only what it may read.
 
     \b
         pebble doctor
@@ -69,38 +76,30 @@ def doctor(
         pebble doctor --broker mqtts://ann@broker.lab --password-file ann-password
     """
     modes = {"--running": running, "--report": report is not None, "--broker": broker is not None}
-    _check_modes(modes, {"--may-move": may_move, "--json": as_json, "--root": root != Path("/")})
+    _check_modes(modes, {"--may-move": may_move, "--root": root != Path("/")})
     if running:
-        from pebble.commands.selftest import selftest
-
         if config is None:
             raise typer.BadParameter("which robot is missing: name its config file")
-        return selftest(config, root, may_move=may_move, as_json=as_json)
+        return _running(config, Places(root.absolute()), may_move=may_move, as_json=as_json)
     if report is not None:
-        from pebble.commands.report import report as write_report
-
-        return write_report(report, config, root)
+        return _report(report, config, Places(root.absolute()))
     if broker is not None:
         if config is not None:
             raise PebbleError("--broker judges a broker alone: leave out the config file")
-        settings = settings_at(broker, password_file, ca_cert)
-        return doctor_of(settings, below, restart=restart, as_json=as_json, show=_print)
-    from pebble.doctor.checks import run_checks  # of Linux only
+        return _broker(_settings_at(broker, password_file, ca_cert), below, restart=restart, as_json=as_json)
+    from pebble.checks.robot import run_checks  # of Linux only
 
-    counts = dict.fromkeys(_COLOURS, 0)
+    printer = Printer("CONFIG" if config is None else str(config), as_json=as_json)
     loaded = None if config is None else load(config)
     if loaded is not None:
         withhold(loaded.password_variables)
-    for finding in run_checks(loaded):
-        counts[finding.state] += 1
-        _print(finding)
-    failed, warned = counts[State.FAILED], counts[State.WARN]
-    typer.echo(f"checks: {sum(counts.values())}, warnings: {warned}, failures: {failed}")
-    return 1 if failed else 0
+    for result in run_checks(loaded):
+        printer.take(result)
+    return printer.end()
 
 
 #: Options, and those that they go with.
-_WITH = {"--may-move": ("--running",), "--json": ("--running", "--broker"), "--root": ("--running", "--report")}
+_WITH = {"--may-move": ("--running",), "--root": ("--running", "--report")}
 
 
 def _check_modes(modes: dict[str, bool], options: dict[str, bool]) -> None:
@@ -113,11 +112,97 @@ def _check_modes(modes: dict[str, bool], options: dict[str, bool]) -> None:
             raise typer.BadParameter(f"{option} is for {' and '.join(_WITH[option])} only")
 
 
-def _print(finding: CheckResult) -> None:
-    width = shutil.get_terminal_size().columns
-    typer.secho(f"{finding.state[:4]:<4}  ", fg=_COLOURS[finding.state], nl=False)
-    text = without_secrets(f"{finding.what}: {finding.text}")
-    text = textwrap.fill(text, width, initial_indent=_INDENT, subsequent_indent=_INDENT)
-    typer.echo(text.removeprefix(_INDENT))
-    if finding.fix:  # always on one line: it is to be copied
-        typer.secho(f"{_INDENT}fix: {without_secrets(finding.fix)}", bold=True)
+# -- a robot that runs
+
+
+def _running(config: Path, places: Places, *, may_move: bool, as_json: bool) -> int:
+    from pebble.checks.check import run
+    from pebble.checks.running.checks import CHECKS, MOVING  # of Linux only
+    from pebble.checks.running.robot import become_user_of, reached
+
+    loaded, printer = load(config), Printer(str(config), as_json=as_json)
+    if may_move and not is_clear(loaded.robot.name or loaded.robot.id, "about 3 cm ahead and back, slowly"):
+        return 1
+    become_user_of(loaded.run_dir())
+    with interrupted_by_signals(), reached(loaded, places, me()) as robot:
+        for _, result in run((*CHECKS, *(MOVING if may_move else ())), robot, refresh=robot.read):
+            printer.take(result)
+        if dropped := sum(side.dropped for side in robot.sides):
+            typer.echo(f"pebble: warning: {dropped} messages came too fast to be read", err=True)
+    return printer.end()
+
+
+# -- a report
+
+
+def _report(file: Path, config: Path | None, places: Places) -> int:
+    """Write the zip file; without a config it is about the installed robot."""
+    from pebble.checks.report.new_file import write_new  # of Linux only
+    from pebble.checks.report.report import make
+
+    if file.exists():
+        raise typer.BadParameter(f"{file} exists: name another file, or remove it")
+    if config is not None and not config.exists():
+        raise typer.BadParameter(f"{config} does not exist: name a robot's config file")
+    made = make(places, None if config is None else config.absolute())
+    write_new(file, made.packed())
+    typer.echo(f"{file}: {', '.join(made.parts)}")
+    for name, why in made.missing.items():
+        typer.echo(f"missing: {name}: {why}")
+    if made.unread:
+        typer.echo(f"pebble: warning: passwords in {len(made.unread)} files are not known: use sudo", err=True)
+    return 0
+
+
+# -- a broker
+
+
+def _settings_at(url: str, password_file: Path | None, ca_cert: Path | None) -> MqttSettings:
+    """Raises UrlError."""
+    try:
+        _, settings = settings_of(url, password=password(password_file), password_file=password_file, ca_cert=ca_cert)
+    except UrlError as error:
+        raise UrlError(str(error).replace("--url", "--broker").replace(FORMS, _FORMS)) from None
+    if not isinstance(settings, MqttSettings):
+        raise UrlError(f"--broker must be {_FORMS}")
+    if settings.hosts:
+        raise UrlError("--broker judges one broker: use one HOST[:PORT], and the command again for each further one")
+    return settings
+
+
+def _broker(settings: MqttSettings, below: str, *, restart: bool, as_json: bool) -> int:
+    """Print what is wrong with a broker, and what to type. Returns 0, 1 with limits, 2 if robots cannot use it."""
+    from pebble.checks.broker.login import broker
+    from pebble.checks.broker.peer import reached
+    from pebble.checks.broker.probes import assessment, judge
+    from pebble.checks.broker.reachable import other_doors
+    from pebble.checks.check import State
+
+    check_topic(below)
+    printer = Printer(as_json=as_json)
+    with interrupted_by_signals():
+        for result in broker("broker", settings):
+            printer.take(result)
+        states = dict.fromkeys(printer.names("failed"), State.FAILED)
+        if not states:
+            for result in other_doors("broker", settings):
+                printer.take(result)
+            with reached(settings, below, _ask_to_restart if restart else None) as trial:
+                for probe, result in judge(trial):
+                    printer.take(result, probe.why)
+                    states[probe.name] = result.state
+            if trial.left:
+                more = f" and {len(trial.left) - 1} more" if len(trial.left) > 1 else ""
+                typer.echo(f"pebble: warning: still retained at the broker: {next(iter(trial.left))}{more}", err=True)
+    words = assessment(states)
+    for line in () if as_json else words:
+        typer.secho(line, bold=True)
+    limits = printer.end(warnings_count=True, assessment=words)
+    return 2 if printer.names("failed") else limits
+
+
+def _ask_to_restart() -> bool:
+    typer.echo(
+        "Restart the broker now (sudo systemctl restart mosquitto), then press Enter; q to go without: ", err=True
+    )
+    return sys.stdin.readline().isspace()  # nothing at all: no person is there

@@ -15,8 +15,8 @@ from pathlib import Path
 
 import serial
 
-from pebble.check_result import State
-from pebble.doctor.checks import clock, synchronised
+from pebble.checks.check import State
+from pebble.checks.machine import clock, synchronised
 from pebble.fleet.folder import PLAIN_PORT, PORT
 from pebble.services.serial_mcu_bridge.pebble_serial_v1.frame import FrameError, decode
 from pebble.setup.places import Places

@@ -12,9 +12,9 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
+from pebble.checks.broker.login_attempt import REFUSED_LOGINS, attempt
 from pebble.config.config import file_name, parse
 from pebble.contract.identity import Identity
-from pebble.doctor.broker_probe import REFUSED_LOGINS, probe
 from pebble.fleet import certificates
 from pebble.fleet.broker_files import new_password
 from pebble.fleet.folder import ACL, ADMIN_PASSWORD, FLEET, PASSWORDS, PLAIN_PORT
@@ -351,7 +351,7 @@ def _refusal(plan: Plan) -> str:
     user = plan.answers.account if plan.has_login else None
     tls = TlsSettings(ca_cert=ca) if plan.answers.is_far else None
     settings = MqttSettings(host=host, port=port, username=user, password=password, tls=tls)
-    found = probe(settings, login=True)
+    found = attempt(settings, login=True)
     if found.code == 0:
         return ""
     why = found.problem if found.code is None else REFUSED_LOGINS.get(found.code, f"code {found.code}")

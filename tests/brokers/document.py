@@ -11,10 +11,9 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from pebble.check_result import CheckResult, State
-from pebble.conform.brokers import PROMISES
-from pebble.doctor.broker.judgement import assessment, reached
-from pebble.doctor.broker.probes import PROBES, run
+from pebble.checks.broker.peer import reached
+from pebble.checks.broker.probes import PROBES, assessment, judge
+from pebble.checks.check import CheckResult, State
 from pebble.transports import MqttSettings
 from tests.support import ROOT, Broker
 from tests.transports.brokers import MAKERS, found
@@ -91,26 +90,19 @@ can run here; `make long PART=brokers` compares it.
     pebble doctor --broker mqtts://ann@broker.lab --ca-cert ca.pem --password-file ann-password
     pebble doctor --broker mqtt://broker.lab --restart    # asks to restart it: is what it retains still there?
     pebble doctor --broker mqtts://goob@broker.lab --below pebble/robots/goob    # that account may use only that
-    pebble conform --broker mqtt://broker.example         # the same by the promises T1 to T21
 
 It takes some 10 s and moves no robot. It publishes below `pebble/doctor/` and random digits, and removes all that it
 left there, also when it is interrupted. `doctor` exits with 0, with 1 (robots can use the broker, and something is to
 be mended) or with 2 (they cannot, with this account). Where an account may not publish and read there, nothing else is
 tried: people at a broker of [`pebble fleet`](fleet.md) may not, so use the account of a robot, as in the fourth line.
 
-Two probes leave those topics, because their question has no answer inside:
-
-* *refused subscriptions* asks for `{random digits}/doctor/one/#`, and publishes one byte there where that is granted.
-  Only a topic that no rule mentions shows how an account is refused; no robot and no program has that name, and the
-  message is not retained.
-* *accounts* asks mosquitto's plugin, at `$CONTROL/dynamic-security/v1`, for the rights that every account has. It
-  changes nothing, and only who may change accounts is answered: that is what you want to know of a robot's account.
-
-A broker that logs what it refuses shows both, with a client id that begins with `pebble_doctor`.
+One probe leaves those topics: *refused subscriptions* asks for `{random digits}/doctor/one/#`, and publishes one byte
+there where that is granted. Only a topic that no rule mentions shows how an account is refused; no robot and no program
+has that name, and the message is not retained. A broker that logs what it refuses shows it, with a client id that
+begins with `pebble_doctor`.
 
 Not tested, because they cannot be installed here: EMQX, HiveMQ, VerneMQ, NanoMQ, hosted ones. Run the command.
 """
-_BY_TRANSPORT = "are kept by the transport, whatever the broker ([transports.md](transports.md))"
 
 
 def judged(row: Row) -> dict[str, CheckResult]:
@@ -124,8 +116,8 @@ def judged(row: Row) -> dict[str, CheckResult]:
             return True
 
         try:
-            with reached(MqttSettings(host="127.0.0.1", port=broker.port), "pebble/doctor", restart) as bench:
-                return {probe.name: finding for probe, finding in run(bench)}
+            with reached(MqttSettings(host="127.0.0.1", port=broker.port), "pebble/doctor", restart) as trial:
+                return {probe.name: result for probe, result in judge(trial)}
         finally:
             broker.stop()
 
@@ -135,12 +127,10 @@ def marks(findings: dict[str, CheckResult]) -> dict[str, str]:
 
 
 def document(rows: dict[str, Any]) -> str:
-    lines = [_HEAD, _row("promise", "what", *(_title(name, rows) for name in rows)), _row(*["---"] * (len(rows) + 2))]
+    lines = [_HEAD, _row("what", *(_title(name, rows) for name in rows)), _row(*["---"] * (len(rows) + 1))]
     for probe in PROBES:
-        cells = [MARKS[_level(row, probe.name)] for row in rows.values()]
-        lines.append(_row(", ".join(probe.promises), probe.name, *cells))
-    undecided = [promise for promise in PROMISES if not any(promise in probe.promises for probe in PROBES)]
-    lines.append(f"\n–: not tried. {', '.join(undecided)} {_BY_TRANSPORT}.\n")
+        lines.append(_row(probe.name, *(MARKS[_level(row, probe.name)] for row in rows.values())))
+    lines.append("\n–: not tried.\n")
     for name, row in rows.items():
         about = BROKERS[name].about
         lines += [f"## {_title(name, rows)}\n", f"{about[0].upper()}{about[1:]}. Seen on {row['date']}.\n"]
@@ -162,7 +152,7 @@ def _level(row: dict[str, Any], probe: str) -> State:
 def _lacks(row: dict[str, Any]) -> Iterator[str]:
     for probe in PROBES:
         if _level(row, probe.name) in (State.WARN, State.FAILED):
-            yield f"* *{probe.name}*: {row['probes'][probe.name][1]}. Costs: {probe.costs}."
+            yield f"* *{probe.name}*: {row['probes'][probe.name][1]}. Costs: {probe.why}."
 
 
 def _row(*cells: str) -> str:
@@ -172,8 +162,8 @@ def _row(*cells: str) -> str:
 def columns(text: str) -> dict[str, dict[str, str]]:
     """The marks in the table of a document: by broker without its version, then by probe."""
     rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in text.splitlines() if line.startswith("|")]
-    names = [title.rpartition(" ")[0] for title in rows[0][2:]]
-    return {name: {row[1]: row[place] for row in rows[2:]} for place, name in enumerate(names, 2)}
+    names = [title.rpartition(" ")[0] for title in rows[0][1:]]
+    return {name: {row[0]: row[place] for row in rows[2:]} for place, name in enumerate(names, 1)}
 
 
 def main(names: list[str]) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import secrets
 import threading
 from abc import ABC, abstractmethod
 from contextlib import suppress
@@ -59,42 +58,6 @@ class LateWills(Fault):
     late_s = _LATE_S
 
 
-class WillsAfterGoodbye(Fault):
-    def up(self, first: int, body: bytes) -> list[bytes]:
-        return [] if first == DISCONNECT else super().up(first, body)
-
-
-class Loses(Fault):
-    """Every hundredth message is acknowledged and goes no further."""
-
-    seen = 0
-
-    def up(self, first: int, body: bytes) -> list[bytes]:
-        self.seen += kind(first) == PUBLISH and bool(first & QOS_1)
-        if kind(first) != PUBLISH or not self.seen or self.seen % 100:
-            return super().up(first, body)
-        end = payload_at(first, body)
-        self.answers.append(b"\x40\x02" + body[end - 2 : end])
-        return []
-
-
-class Reorders(Fault):
-    """Every tenth message goes after the one behind it."""
-
-    held = b""
-    seen = 0
-
-    def up(self, first: int, body: bytes) -> list[bytes]:
-        if kind(first) != PUBLISH:
-            return super().up(first, body)
-        self.seen += 1
-        if self.seen % 10 == 3 and not self.held:
-            self.held = packet(first, body)
-            return []
-        held, self.held = self.held, b""
-        return [packet(first, body), *([held] if held else [])]
-
-
 class RetainsNothing(Fault):
     def up(self, first: int, body: bytes) -> list[bytes]:
         return super().up(first & ~RETAIN if kind(first) == PUBLISH else first, body)
@@ -107,33 +70,9 @@ class HidesRetained(Fault):
         return super().down(first & ~RETAIN if kind(first) == PUBLISH else first, body)
 
 
-class AllRetained(Fault):
-    """What is live looks retained."""
-
-    def down(self, first: int, body: bytes) -> list[bytes]:
-        return super().down(first | RETAIN if kind(first) == PUBLISH else first, body)
-
-
 class Doubles(Fault):
     def down(self, first: int, body: bytes) -> list[bytes]:
         return super().down(first, body) * (2 if kind(first) == PUBLISH else 1)
-
-
-class Changes(Fault):
-    """The last byte of large payloads is another one."""
-
-    def down(self, first: int, body: bytes) -> list[bytes]:
-        changed = kind(first) == PUBLISH and len(body) - payload_at(first, body) > 100
-        return super().down(first, body[:-1] + bytes((body[-1] ^ 1,)) if changed else body)
-
-
-class KeepsRemoved(Fault):
-    def up(self, first: int, body: bytes) -> list[bytes]:
-        end = payload_at(first, body) if kind(first) == PUBLISH else -1
-        removes = end == len(body) and bool(first & RETAIN)
-        if removes and first & QOS_1:
-            self.answers.append(b"\x40\x02" + body[end - 2 : end])
-        return [] if removes else super().up(first, body)
 
 
 class Mute(Fault):
@@ -162,34 +101,11 @@ class _Connects(Fault, ABC):
         """The CONNECT that the broker sees."""
 
 
-class KeepsOld(_Connects):
-    """The broker sees another client each time: the old connection of one that is back stays open."""
-
-    def changed(self, body: bytes) -> bytes:
-        size = int.from_bytes(body[_ID - 2 : _ID], "big")
-        return body[:_ID] + secrets.token_hex(size).encode()[:size] + body[_ID + size :]
-
-
-class Remembers(_Connects):
-    """Sessions are never clean: what was sent during an outage comes afterwards."""
-
-    def changed(self, body: bytes) -> bytes:
-        return body[:_FLAGS] + bytes((body[_FLAGS] & ~CLEAN,)) + body[_FLAGS + 1 :]
-
-
 class SendsBack(_Connects):
     """Takes bridge mode and does not keep it; does not take MQTT 5."""
 
     def changed(self, body: bytes) -> bytes:
         return body[:_LEVEL] + bytes((body[_LEVEL] & ~BRIDGE if body[_LEVEL] != 5 else 9,)) + body[_LEVEL + 1 :]
-
-
-class WidensPlus(Fault):
-    """A last + matches as # does."""
-
-    def up(self, first: int, body: bytes) -> list[bytes]:
-        wide = first == SUBSCRIBE and body[-2:-1] == b"+"
-        return super().up(first, body[:-2] + b"#" + body[-1:] if wide else body)
 
 
 class FaultyBroker:
@@ -211,7 +127,8 @@ class FaultyBroker:
         tasks = asyncio.all_tasks(self._loop)
         for task in tasks:
             task.cancel()
-        self._loop.run_until_complete(asyncio.gather(*tasks, return_exceptions=True))
+        if tasks:
+            self._loop.run_until_complete(asyncio.wait(tasks))
         self._loop.close()
 
     async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:

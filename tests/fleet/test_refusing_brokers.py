@@ -11,10 +11,10 @@ from pathlib import Path
 
 import pytest
 
-from pebble.check_result import State
+from pebble.checks.broker.account import robot_account
+from pebble.checks.broker.of_config import page_brokers
+from pebble.checks.check import State
 from pebble.config import load
-from pebble.doctor.checks import page_brokers
-from pebble.doctor.publishing import publishing
 from pebble.fleet.broker_files import hashed, passwords_text
 from pebble.fleet.certificates import CA_CERT
 from pebble.fleet.dynsec import Control
@@ -195,5 +195,5 @@ def test_the_doctor_of_a_robot_names_a_broker_without_rules(first: FleetBroker, 
             conf.read_text().replace("\nplugin", f"\npassword_file {logins}\n#plugin", 1).replace("\nplugin", "\n#")
         )
     with first:
-        *_, last = publishing("remote broker", settings("goob", first), GOOB, level="login")
+        *_, last = robot_account("remote broker", settings("goob", first), GOOB, level="login")
         assert last.state is found, last.text

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from typing import Any
 
-from pebble.selftest.secrets_here import secrets_of
+from pebble.checks.report.secrets_here import secrets_of
 from pebble.setup.places import Places
 from tests.kit.machine import Machine
 from tests.life.robots import BASE, PORT, ROBOT, Robot

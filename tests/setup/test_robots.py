@@ -13,10 +13,10 @@ from pathlib import Path
 
 import pytest
 
+from pebble.checks.broker.login_attempt import attempt
 from pebble.commands.web import people as web_people
 from pebble.config import load
 from pebble.contract.identity import Identity
-from pebble.doctor.broker_probe import probe
 from pebble.fleet import certificates
 from pebble.fleet.certificates import CA_CERT
 from pebble.fleet.people import People
@@ -69,7 +69,7 @@ def test_its_own_broker_lets_in_the_robot_and_its_page_and_no_stranger(root: Pat
 
     def code(port: int, tls: TlsSettings | None, user: str | None = None, password: str | None = None) -> int | None:
         settings = MqttSettings(host=HOST, port=port, username=user, password=password, tls=tls)
-        return probe(settings, login=user is not None).code
+        return attempt(settings, login=user is not None).code
 
     with mosquitto(root) as (plain, encrypted):
         found = [

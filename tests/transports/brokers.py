@@ -16,7 +16,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from pebble.doctor.broker_probe import probe
+from pebble.checks.broker.login_attempt import attempt
 from pebble.transports import MqttSettings
 from tests.support import ROOT, Broker, Child, free_port, until
 
@@ -138,7 +138,7 @@ class _RabbitMq(_Other):
 
     def answers(self) -> bool:
         """It listens some time before it lets a client in."""
-        return super().answers() and probe(MqttSettings(host=self.host, port=self.port), login=False).code == 0
+        return super().answers() and attempt(MqttSettings(host=self.host, port=self.port), login=False).code == 0
 
     def end(self, how: Callable[[subprocess.Popen[bytes]], None]) -> None:
         super().end(how)

@@ -11,10 +11,10 @@ from typing import Any
 
 import pytest
 
+from pebble.checks.broker.login_attempt import attempt
 from pebble.client.connection import Target, resolve
 from pebble.client.page.from_config import settings_of
 from pebble.config import Config, load
-from pebble.doctor.broker_probe import probe
 from pebble.runtime.connections import local_transport, mirror_transport, remote_transport
 from pebble.transports import MqttSettings, State, create
 from pebble.transports.mqtt.client_ids import unique
@@ -79,7 +79,7 @@ class Robot:
         for transport in made:
             with closing(transport.open(10)):
                 assert transport.state is State.CONNECTED
-        assert probe(tools[0], login=True).code == 0
+        assert attempt(tools[0], login=True).code == 0
 
 
 @pytest.fixture

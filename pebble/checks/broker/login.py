@@ -1,0 +1,87 @@
+"""Checks whom a broker lets in, and whether others can read what is sent to it."""
+
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+
+from pebble.checks.broker import MOSQUITTO
+from pebble.checks.broker.login_attempt import REFUSED_ID, REFUSED_LOGINS, LoginAttempt, attempt
+from pebble.checks.check import CheckResult, failed, ok, warn
+from pebble.config.secret_text import shown_user
+from pebble.config.security import SecurityLevel
+from pebble.config.web import is_loopback
+from pebble.transports.settings import MqttSettings
+
+_SOON_S = 14 * 86400
+
+
+def broker(
+    name: str,
+    settings: MqttSettings,
+    log_in: Callable[..., LoginAttempt] = attempt,
+    now: float | None = None,
+    level: SecurityLevel = "open",
+) -> Iterator[CheckResult]:
+    """Check that it answers, accepts the config's login, refuses anonymous ones, and is encrypted.
+
+    Above the level ``open`` one that lets everybody in is no mere warning.
+    """
+    what = f"{name} {settings.host}:{settings.port}"
+    for result in _logins(settings, log_in, time.time() if now is None else now, level):
+        yield replace(result, what=what)
+
+
+def _logins(
+    settings: MqttSettings, log_in: Callable[..., LoginAttempt], now: float, level: SecurityLevel
+) -> Iterator[CheckResult]:
+    host, is_here = settings.host, is_loopback(settings.host)
+    own = log_in(settings, login=True)
+    if own.code is None:
+        start = "sudo systemctl start mosquitto" if is_here else f"nc -vz {host} {settings.port}"
+        yield failed(f"cannot be reached: {own.problem}", start)
+        return
+    yield _own_login(settings, own)
+    if own.problem and not is_here:
+        fix = f"correct the addresses of {host} in your DNS, or start the brokers there"
+        yield warn(f"has addresses that do not answer: {own.problem}", fix)
+    without_name = own if settings.username is None else log_in(settings, login=False)
+    yield _anonymous_login(without_name, level, is_here=is_here)
+    yield _encryption(settings, own, now, is_here=is_here)
+
+
+def _own_login(settings: MqttSettings, answer: LoginAttempt) -> CheckResult:
+    if answer.code == 0:
+        return ok(f"answers, connected in {answer.connect_ms:.1f} ms")
+    if answer.code == REFUSED_ID:
+        fix = "let it admit any client id, or set remote_mqtt.client_id to one that it knows"
+        return failed("refuses the client id", fix)
+    why = REFUSED_LOGINS.get(answer.code or 0, f"code {answer.code}")
+    if settings.username is None:
+        return failed(f"refuses the login: {why}", "set username and password_file of this broker")
+    user = shown_user(settings.username)
+    fix = f"on the broker: sudo mosquitto_passwd /etc/mosquitto/passwd {user}"
+    return failed(f"refuses user {user}: {why}", fix)
+
+
+def _anonymous_login(answer: LoginAttempt, level: SecurityLevel, *, is_here: bool) -> CheckResult:
+    if answer.code != 0:
+        return ok("refuses anonymous logins")
+    if is_here:
+        return ok("accepts anonymous logins: every program on this machine can drive the robot")
+    return (warn if level == "open" else failed)(
+        "accepts anonymous logins: every client that reaches it can drive the robot",
+        f"{MOSQUITTO}allow_anonymous false, password_file /etc/mosquitto/passwd",
+    )
+
+
+def _encryption(settings: MqttSettings, answer: LoginAttempt, now: float, *, is_here: bool) -> CheckResult:
+    if settings.tls is None:
+        if is_here:
+            return ok("not encrypted, which is fine on this machine")
+        return warn("is not encrypted: commands and passwords can be read on the network", "set tls.enabled to true")
+    days = None if answer.expires is None else (answer.expires - now) / 86400
+    if days is not None and 86400 * days < _SOON_S:
+        return warn(f"its certificate expires in {days:.0f} days", "renew the broker's certificate")
+    if settings.tls.insecure:
+        return warn("encrypted, but the name in its certificate is not checked", "set tls.insecure to false")
+    return ok("encrypted" if days is None else f"encrypted, its certificate for {days:.0f} more days")

@@ -1,0 +1,333 @@
+"""A trial of a broker: clients on one thread that show what it does, packet by packet.
+
+The transports hide what a broker lacks; here that is the result.
+"""
+
+from __future__ import annotations
+
+import secrets
+import select
+import socket
+import struct
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, nullcontext, suppress
+from dataclasses import dataclass, replace
+from typing import Any
+
+from pebble.errors import TransportError
+from pebble.runtime.signals import handled_by
+from pebble.transports.base import Message, QoS
+from pebble.transports.credentials import Credentials
+from pebble.transports.hosts import Address, addresses_of, described
+from pebble.transports.mqtt import client_ids, packets, reasons
+from pebble.transports.mqtt.client import Client, Opening
+from pebble.transports.settings import MqttSettings
+
+ANSWER_S = 3.0  # within which a broker answers, and four round trips
+_QUIET_S = 0.3  # of silence, and four round trips: then nothing more comes
+_STEP_S = 0.05
+_KEEPALIVE_S = 60
+_AT_ONCE = 1000  # packets
+_MOST = 50_000  # messages that are kept; a probe sends a thousand
+_TRIES = 3  # to take back what is retained
+_RESET = struct.pack("ii", 1, 0)  # SO_LINGER that turns close() into a reset
+
+NAME = "pebble_doctor_of_a_broker"  # as long as the names of a robot's programs
+
+
+class RefusedError(TransportError):
+    """The broker does not take this client. Its text says what it did."""
+
+
+@dataclass(frozen=True, slots=True)
+class Received:
+    """``topic`` is below that of the probe; ``at``: when it was read (monotonic)."""
+
+    topic: str
+    payload: bytes
+    retain: bool
+    at: float
+
+
+class Peer(packets.Listener):
+    """One connection, which reads in :meth:`BrokerTrial.wait`. Topics are below ``base``; whole ones if it is empty."""
+
+    def __init__(self, trial: BrokerTrial, base: str, opening: Opening, *, bridge: bool) -> None:
+        self.received: deque[Received] = deque(maxlen=_MOST)
+        self.acks: dict[int, int] = {}  # by message id: the code of MQTT 5
+        self.granted: dict[int, bytes] = {}
+        self.pongs: list[int] = []  # how many messages had been received at each answer to a ping
+        self.code: int | None = None  # of CONNACK
+        self.problem = ""
+        self._trial, self.base = trial, base
+        self._client = Client(opening, self, bridge=bridge)
+        self._client.open()
+
+    # -- what it does
+
+    def subscribe(self, *filters: str, qos: int = 1, options: bool = False) -> bytes:
+        """Returns the broker's answer: a code for each filter, nothing if none comes. ``options``: those of MQTT 5."""
+        wanted = [packets.Filter(self._whole(one), qos, no_local=options, as_published=options) for one in filters]
+        mid = self._client.subscribe(wanted)
+        self._trial.wait(lambda: mid in self.granted or self.closed)
+        return self.granted.get(mid, b"")
+
+    def publish(self, topic: str, payload: bytes = b"1", *, qos: int = 0, retain: bool = False) -> int:
+        """Returns its number in `acks`, 0 with QoS 0."""
+        if retain:
+            self._trial.left[self._whole(topic)] = None
+        return self._client.publish(self._whole(topic), payload, qos, retain=retain, expires_s=None)
+
+    def _whole(self, topic: str) -> str:
+        return f"{self.base}/{topic}" if self.base else topic
+
+    def remove(self, topic: str, qos: int) -> int:
+        """Take back what is retained on a topic, with its whole name; returns its number in `acks`."""
+        return self._client.publish(topic, b"", qos, retain=True, expires_s=None)
+
+    def ping(self) -> bool:
+        """False: it was not answered in time."""
+        before = len(self.pongs)
+        self._client.ping()
+        return self._trial.wait(lambda: len(self.pongs) > before or self.closed) and not self.closed
+
+    def leave(self) -> None:
+        """Say goodbye: the broker does not publish the will."""
+        self._client.disconnect()
+        self._client.close()
+
+    def cut(self) -> None:
+        """By a reset: the broker publishes the will."""
+        if self._client.socket is not None:
+            self._client.socket.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, _RESET)
+        self._client.close()
+
+    def acknowledge_late(self) -> None:
+        """Let the kernel confirm what comes as late as it does for a program that sends nothing itself."""
+        if self._client.socket is not None and hasattr(socket, "TCP_QUICKACK"):
+            self._client.socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_QUICKACK, 0)
+
+    # -- what it saw
+
+    @property
+    def closed(self) -> bool:
+        return self._client.socket is None
+
+    @property
+    def sockets(self) -> tuple[socket.socket | None, bool]:
+        """The socket, and whether something waits to be written to it."""
+        return self._client.socket, bool(self._client.waiting)
+
+    def payloads(self, topic: str | None = None) -> list[bytes]:
+        return [message.payload for message in self.received if topic in (None, message.topic)]
+
+    def topics(self) -> set[str]:
+        return {message.topic for message in self.received}
+
+    # -- inside
+
+    def pump(self) -> None:
+        """Read what has come, and write what waits."""
+        client = self._client
+        try:
+            while client.receive():
+                while client.read(_AT_ONCE):
+                    pass
+        except packets.MalformedError as error:
+            self.problem = f"it sends what is no MQTT: {error}"
+            client.close()
+        if client.owes:
+            client.acknowledge()
+        if client.waiting:
+            client.write()
+
+    def on_accepted(self, accepted: packets.Accepted) -> None:
+        del accepted
+        self.code = 0
+
+    def on_refused(self, code: int) -> None:
+        self.code = code
+        self.problem = reasons.connection_refused(code)
+
+    def on_publication(self, topic: bytes, payload: bytes, first: int) -> None:
+        below = topic.decode(errors="replace").removeprefix(f"{self.base}/")
+        self.received.append(Received(below, payload, bool(first & packets.RETAIN), time.monotonic()))
+
+    def on_puback(self, mid: int, code: int) -> None:
+        self.acks[mid] = code
+
+    def on_answer(self, mid: int, codes: bytes) -> None:
+        self.granted[mid] = codes
+
+    def on_pong(self) -> None:
+        self.pongs.append(len(self.received))
+
+    def on_disconnect(self, code: int) -> None:
+        self.problem = reasons.words(code)
+
+    def on_too_long(self, topic: bytes, length: int) -> None:
+        self.on_publication(topic, b"", 0)
+        self.problem = f"a message of {length} bytes"
+
+    def skips(self, topic: bytes) -> bool:
+        del topic
+        return False
+
+
+class BrokerTrial:
+    """Peers at one broker, and what they left there. ``address``: of the host, one that accepted a login.
+
+    Everything is below ``{below}/{random digits}``, and what is retained there is removed by :meth:`close`.
+    """
+
+    def __init__(
+        self, settings: MqttSettings, address: Address, below: str, restart: Callable[[], bool] | None = None
+    ) -> None:
+        self.settings, self.restart = settings, restart  # which has the broker restarted
+        self.root = f"{below}/{secrets.token_hex(8)}"
+        self.base = self.root  # of the probe that is made now
+        self.round_trip_s, self.patience_s = 0.0, ANSWER_S
+        self.qos, self.retains, self.wildcards = 1, True, True  # as found out by the first probe
+        self._address = address
+        self._peers: list[Peer] = []
+        self.left: dict[str, None] = {}  # topics that are retained, and not removed yet, in their order
+        self._credentials = Credentials(settings)
+
+    def begin(self, name: str) -> None:
+        """The peers of the last probe leave, and this one has topics of its own."""
+        for peer in self._peers:
+            peer.leave()
+        self._peers, self.base = [], f"{self.root}/{name}"
+
+    def peer(
+        self,
+        *,
+        protocol: str = "3.1.1",
+        bridge: bool = False,
+        will: Message | None = None,
+    ) -> Peer:
+        """A client that the broker has accepted. Raises RefusedError."""
+        password = self._credentials.password()
+        settings = replace(self.settings, protocol=protocol, keepalive_s=_KEEPALIVE_S, password=password)
+        name = self.settings.client_id or client_ids.unique(NAME)
+        if will is not None:
+            will = Message(f"{self.base}/{will.topic}", will.payload, will.qos, retain=will.retain)
+            self.left |= {will.topic: None} if will.retain else {}
+        opening = Opening(name, settings, self._credentials.context(), will, self._address)
+        try:
+            peer = Peer(self, self.base, opening, bridge=bridge)
+        except OSError as error:
+            raise RefusedError(error.strerror or str(error)) from None
+        self._peers.append(peer)
+        self.wait(lambda: peer.code is not None or peer.closed)
+        if peer.code != 0:
+            peer.leave()
+            why = peer.problem or ("it hangs up" if peer.code is None and peer.closed else "it does not answer")
+            raise RefusedError(why)
+        return peer
+
+    @property
+    def answer_s(self) -> float:
+        """How long an answer is waited for."""
+        return self.patience_s + 4 * self.round_trip_s
+
+    def wait(self, condition: Callable[[], object], seconds: float | None = None) -> bool:
+        """Let all peers read until ``condition``; False: not within ``seconds``, or within a broker's usual answer."""
+        end = time.monotonic() + (self.answer_s if seconds is None else seconds)
+        while True:
+            for peer in self._peers:
+                peer.pump()
+            if condition():
+                return True
+            left = end - time.monotonic()
+            sockets = [peer.sockets for peer in self._peers]
+            reading = [sock for sock, _ in sockets if sock is not None]
+            if left <= 0 or not reading:
+                return False
+            select.select(reading, [sock for sock, writes in sockets if sock and writes], [], min(left, _STEP_S))
+
+    def wait_quiet(self, *peers: Peer) -> None:
+        """Wait until nothing more comes to these peers."""
+        quiet_s, end = _QUIET_S + 4 * self.round_trip_s, time.monotonic() + self.answer_s
+
+        def seen() -> int:
+            return sum(len(peer.received) for peer in peers)
+
+        while time.monotonic() < end:
+            before = seen()
+            if not self.wait(lambda: seen() > before, quiet_s):  # noqa: B023
+                return
+
+    # -- what is left there
+
+    def close(self) -> None:
+        """Remove all that is retained. Signals wait meanwhile."""
+        with _undisturbed():
+            self.begin("end")
+            for _ in range(_TRIES):
+                if not self.left:
+                    break
+                with suppress(TransportError):
+                    self._remove()
+
+    def _remove(self) -> None:
+        peer, left = self.peer(), list(self.left)
+        numbers = {topic: peer.remove(topic, self.qos) for topic in left}
+        done = self.wait(lambda: set(numbers.values()) <= peer.acks.keys() or peer.closed) if self.qos else peer.ping()
+        if done and not peer.closed:
+            self.left = {}
+        else:
+            self.left = {topic: None for topic, mid in numbers.items() if mid not in peer.acks}
+
+
+@contextmanager
+def _undisturbed() -> Iterator[None]:
+    """Let no signal interrupt what takes a moment; on other threads none does."""
+
+    def later(_signal: int, _frame: Any) -> None:
+        pass
+
+    on_main = threading.current_thread() is threading.main_thread()
+    with handled_by(later) if on_main else nullcontext():
+        yield
+
+
+def number(payload: bytes) -> int:
+    """Return that of a numbered message; -1: the broker has made something else of it."""
+    return int(payload) if payload.isdigit() else -1
+
+
+def will(topic: str, payload: bytes, *, qos: int = 1, retain: bool = True) -> Message:
+    """``topic`` is below that of the probe."""
+    return Message(topic, payload, QoS(qos), retain=retain)
+
+
+@contextmanager
+def reached(settings: MqttSettings, below: str, restart: Callable[[], bool] | None = None) -> Iterator[BrokerTrial]:
+    """Connect to the first address that accepts a login; at the end everything is removed. Raises TransportError."""
+    trial = _trial(settings, below, restart)
+    try:
+        yield trial
+    finally:
+        trial.close()
+
+
+def _trial(settings: MqttSettings, below: str, restart: Callable[[], bool] | None) -> BrokerTrial:
+    where = f"broker {settings.host}:{settings.port}"
+    try:
+        addresses = addresses_of(settings.host, settings.port)
+    except (OSError, UnicodeError) as error:
+        raise TransportError(f"{where}: {getattr(error, 'strerror', None) or error}") from None
+    failures = {}
+    for address in addresses:
+        trial = BrokerTrial(settings, address, below, restart)
+        try:
+            trial.peer()
+        except RefusedError as error:
+            failures[f"{address.text}:"] = str(error)
+        else:
+            return trial
+    raise TransportError(f"{where} cannot be used: {described(failures)}")

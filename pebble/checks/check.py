@@ -1,0 +1,98 @@
+"""The engine of all checks: what a check is, what its result is, and how a table of checks is run."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, replace
+from enum import StrEnum
+from functools import partial
+from typing import Final, Generic, TypeVar
+
+from pebble.errors import PebbleError
+
+_TRIES: Final = 3  # of a check whose failure is doubtful
+
+Subject = TypeVar("Subject")
+
+
+class State(StrEnum):
+    OK = "ok"
+    WARN = "warn"
+    FAILED = "failed"
+    SKIPPED = "skipped"
+
+
+@dataclass(frozen=True, slots=True)
+class CheckResult:
+    """The result of one check.
+
+    ``fix`` is the command or config change that ends a failure; ``what`` is the subject, where a check has several.
+    The text of a check that was skipped completes "skipped because", and its fix is what would let it be made.
+    """
+
+    state: State
+    text: str
+    fix: str = ""
+    what: str = ""
+
+
+ok, warn, failed, skipped = (partial(CheckResult, state) for state in State)
+
+
+def _always(_subject: object) -> bool:
+    return True
+
+
+@dataclass(frozen=True, slots=True)
+class Check(Generic[Subject]):
+    """One row of a table of checks.
+
+    ``run`` returns a result, or one for each thing that it has looked at. ``needs`` are asked in their order: the first
+    that returns a text is why the check is skipped. ``binds`` returns True if the subject has this duty at all.
+    ``why`` says what goes wrong for people where the check fails.
+    """
+
+    name: str
+    run: Callable[[Subject], CheckResult | Iterable[CheckResult]]
+    needs: tuple[Callable[[Subject], str], ...] = ()
+    why: str = ""
+    binds: Callable[[Subject], bool] = _always
+
+
+def run(
+    checks: Iterable[Check[Subject]],
+    subject: Subject,
+    *,
+    refresh: Callable[[], object] = lambda: None,
+    is_doubtful: Callable[[], bool] = lambda: False,
+) -> Iterator[tuple[Check[Subject], CheckResult]]:
+    """Run one check after the other, and return the results with their subject's name.
+
+    ``refresh`` reads what has arrived before each. A failure for which ``is_doubtful`` returns True afterwards is tried
+    again; only a pass takes it back, because a failed check may leave a robot in which the next try is skipped.
+    """
+    for check in checks:
+        refresh()
+        if not check.binds(subject):
+            continue
+        why = next((why for need in check.needs if (why := need(subject))), "")
+        try:
+            for result in (skipped(why),) if why else _results(check, subject, is_doubtful):
+                yield check, replace(result, what=result.what or check.name)
+        except (PebbleError, OSError) as error:  # a connection was lost
+            yield check, failed(str(error), "run it again", what=check.name)
+
+
+def _results(check: Check[Subject], subject: Subject, is_doubtful: Callable[[], bool]) -> Iterable[CheckResult]:
+    is_doubtful()  # what was before does not count
+    first = check.run(subject)
+    if not isinstance(first, CheckResult):
+        return first
+    for _ in range(_TRIES - 1):
+        if first.state is not State.FAILED or not is_doubtful():
+            break
+        again = check.run(subject)
+        if isinstance(again, CheckResult) and again.state is State.OK:
+            text = f"{again.text}; tried again, because this machine stalled: {first.text}, at first"
+            return (replace(again, text=text),)
+    return (first,)

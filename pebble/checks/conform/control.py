@@ -1,0 +1,163 @@
+"""What a robot owes those who drive it by turns, as a table: control, and names where they are checked."""
+
+from __future__ import annotations
+
+import secrets
+import time
+from collections.abc import Callable
+from typing import Literal
+
+from pebble import contract as c
+from pebble.checks.check import Check, CheckResult, failed, ok, skipped
+from pebble.checks.conform.checks import BY, commanded, controls, drives, free, states, stops, while_stopped
+from pebble.checks.observer import ANSWER_S, Observer
+from pebble.contract.payloads import ControlRequest, ControlState, EstopReset
+
+_SHORTEST_MS = 1000  # control ends so long after the last request or command, or later
+_RENEWS_S = 0.3
+#: Where the broker itself refuses what has another name, or none, the robot never gets it.
+UNSEEN = "its broker does not show this account that it delivers such a message"
+
+
+class Driver:
+    """Requests control as one program of a person."""
+
+    def __init__(self, robot: Observer) -> None:
+        self._robot, self.id = robot, secrets.token_hex(4)
+
+    def request(self, want: Literal["hold", "release"] = "hold", for_ms: float = _SHORTEST_MS) -> ControlRequest:
+        return ControlRequest(id=self.id, want=want, for_ms=for_ms, by=BY)
+
+    def asks(self, want: Literal["hold", "release"] = "hold", for_ms: float = _SHORTEST_MS) -> None:
+        self._robot.send(c.CONTROL, self.request(want, for_ms))
+
+    def leaves(self) -> bool:
+        """Release it; False: the robot keeps it."""
+        self.asks("release")
+        return self._robot.answers(lambda: not self.holds)
+
+    def takes(self) -> float:
+        """Ask nobody; returns when."""
+        return self._robot.send(c.CONTROL_TAKE, self.request())
+
+    @property
+    def state(self) -> ControlState | None:
+        """The newest of the robot."""
+        newest = self._robot.of(c.CONTROL_STATE, retained=True)[-1:]
+        return newest[0].value if newest else None
+
+    @property
+    def key(self) -> str:
+        """That of its control; empty while it has none."""
+        return str(self.state.key) if self.state and self.state.id == self.id else ""
+
+    @property
+    def holds(self) -> bool:
+        return self.key != ""
+
+
+def _with_control(test: Callable[[Observer, Driver], CheckResult]) -> Callable[[Observer], CheckResult]:
+    def run(robot: Observer) -> CheckResult:
+        driver = Driver(robot)
+        driver.asks()
+        try:
+            if not robot.answers(lambda: driver.holds):
+                return failed(f"no key within {ANSWER_S:g} s", "answer incoming/control on outgoing/control/{owner}")
+            return test(robot, driver)
+        finally:
+            driver.leaves()
+
+    return run
+
+
+def _first_keeps(robot: Observer, driver: Driver) -> CheckResult:
+    by = "" if driver.state is None else driver.state.by
+    if robot.view.named and by.partition("/")[0] != robot.account:
+        return failed(f"its state tells that {by!r} has it", "at level named, by begins with the account in the topic")
+    driver.asks(for_ms=5 * _SHORTEST_MS)  # longer than one looks on, else the second gets what has ended
+    second = Driver(robot)
+    second.asks()
+    took = robot.happens(lambda: second.holds)
+    second.leaves()
+    if took:
+        return failed("a second request takes it", "while one holds control, others wait: show them in asks")
+    return ok("the first one keeps it")
+
+
+def _shows_asker(robot: Observer, driver: Driver) -> CheckResult:
+    driver.asks(for_ms=5 * _SHORTEST_MS)
+    second = Driver(robot)
+    second.asks()
+
+    def shown() -> bool:
+        return driver.state is not None and driver.state.asks_id == second.id
+
+    if not robot.answers(shown):
+        return failed("a second request is not shown", "publish its by and id as asks and asks_id while it is repeated")
+    if not robot.wait(lambda: not shown(), _SHORTEST_MS / 1000 + ANSWER_S):
+        return failed("it is shown after its end", "who asks is shown until for_ms after the last request")
+    return ok("the one who waits is shown, while it repeats that")
+
+
+def _released(robot: Observer, driver: Driver) -> CheckResult:
+    driver.asks(for_ms=5 * _SHORTEST_MS)
+    Driver(robot).asks("release")
+    if robot.happens(lambda: not driver.holds):
+        return failed("another's release ends it", "a release counts with the id, and account, of who has control")
+    if not driver.leaves():
+        return failed("it is kept after its release", 'end it by {"want": "release"}')
+    return ok("it ends by its release")
+
+
+def _taken(robot: Observer, driver: Driver) -> CheckResult:
+    key, second = driver.key, Driver(robot)
+    second.takes()
+    took = robot.answers(lambda: second.holds)
+    same = second.key == key
+    second.leaves()
+    if not took:
+        return failed("the one who has it keeps it", "give control to who asks on incoming/control/take")
+    return failed("its key stays", "make a new key for each new holder") if same else ok("it passes on, with a new key")
+
+
+def _ends(robot: Observer, driver: Driver) -> CheckResult:
+    """Commands prolong it: here zeros, which move nothing."""
+    began = time.monotonic()
+    while driver.holds and time.monotonic() < began + 1.5 * _SHORTEST_MS / 1000:
+        robot.send(c.DRIVE, b'{"x": 0, "z": 0, "key": "%s"}' % driver.key.encode())
+        robot.look(_RENEWS_S)
+    if not driver.holds:
+        return failed("it ends in the middle of its commands", "end it for_ms after the last request or command")
+    if not robot.wait(lambda: not driver.holds, _SHORTEST_MS / 1000 + 2 * ANSWER_S):
+        return failed("it stays with who went away", "end it for_ms after the last request or command")
+    return ok("commands prolong it, and it ends by itself")
+
+
+def _nameless(robot: Observer, _name: str) -> CheckResult:
+    fix = "at level named take requests and resets on incoming/by/{account}/… only"
+    stranger = Driver(robot)
+    if not robot.send_as("", c.CONTROL, stranger.request()):
+        return skipped(UNSEEN)
+    if robot.happens(lambda: stranger.holds):
+        return failed("it gives control to a request without an account", fix)
+    for one in states(robot).values():
+        robot.send_as("", c.ESTOP_RESET, EstopReset(boot=one.boot, count=one.count, by=BY))
+    if robot.happens(lambda: not robot.view.latched):
+        return failed("a reset without an account ends a stop", fix)
+    return ok("requests and resets without an account do nothing")
+
+
+def named(robot: Observer) -> bool:
+    return robot.view.named
+
+
+_CONTROL = (controls, free, commanded)
+
+CONTROL: tuple[Check[Observer], ...] = (
+    Check("control", _with_control(_first_keeps), _CONTROL, "one person drives at a time"),
+    Check("control asked", _with_control(_shows_asker), _CONTROL, "who drives must see who waits"),
+    Check("control released", _with_control(_released), _CONTROL, "the next one must not wait"),
+    Check("control taken", _with_control(_taken), _CONTROL, "who is responsible must get it from who does not answer"),
+    Check("control ends", _with_control(_ends), (drives, *_CONTROL), "who goes away must not keep it"),
+    Check("nameless", while_stopped(_nameless), (stops, *_CONTROL), "it can be anybody's", binds=named),
+)

@@ -1,0 +1,284 @@
+"""Checks that turn wheels, as far as the robot shows them. A person has agreed, and looks on."""
+
+from __future__ import annotations
+
+import secrets
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import msgspec
+
+from pebble import contract as c
+from pebble.checks.check import Check, CheckResult, State, failed, ok, skipped
+from pebble.checks.conform.checks import commanded, controls, drives, free, freed, reset, stop, stops
+from pebble.checks.conform.control import UNSEEN, Driver, named
+from pebble.checks.observer import ANSWER_S, Observer
+
+SPEED = 0.4  # some motors are on or off, by a threshold
+DRIVES_S = 0.6
+RESTS_S = 0.75  # after the last command, at the latest
+_LATE_S = 0.5  # until a report of it is here
+_STEP_S = 0.05
+_SWING = 30  # of a hall sensor's value: less is noise
+_OTHER_KEY, _OTHER_ACCOUNT = "0badf00d", "conform-other"
+_NOT_SHOWN = "nothing that it publishes shows whether it moves"
+_SHOW_IT = 'publish {"value": {"wheels": [left, right]}} on outgoing/status whenever they change, or touch-sensors'
+
+
+def moves_until(robot: Observer, since: float) -> float | None:
+    """When the last motion after ``since`` ended, infinite while it lasts, 0 without any; None: nothing shows it.
+
+    Shown by ``wheels`` in the status, which is published on change, or by readings of hall sensors.
+    """
+    turning = [(at, any(wheels)) for at, wheels in _shown(robot)]
+    touches = [(one.at, msgspec.structs.astuple(one.value.value)) for one in robot.of(c.TOUCH_SENSORS) if one.value]
+    if not turning and not touches:
+        return None
+    last, level = 0.0, touches[0][1] if touches else ()
+    for index, (_, moving) in enumerate(turning):
+        end = turning[index + 1][0] if index + 1 < len(turning) else float("inf")
+        if moving and end > since:
+            last = end
+    for at, values in touches:
+        if any(abs(value - before) > _SWING for value, before in zip(values, level, strict=True)):
+            level = values
+            last = max(last, at) if at > since else last
+    return last
+
+
+def _shown(robot: Observer) -> list[tuple[float, list[float]]]:
+    """What its wheels did, and since when."""
+    reports = [(one.at, one.value.value.get("wheels")) for one in robot.of(c.STATUS) if one.value is not None]
+    return robot.eyes() or [(at, wheels) for at, wheels in reports if _are_wheels(wheels)]
+
+
+def _moves(robot: Observer, since: float) -> list[float] | None:
+    """What its wheels do by commands since then; empty: nothing, None: it is not shown."""
+
+    def moving() -> list[float]:
+        return next((wheels for at, wheels in reversed(_shown(robot)) if at >= since and any(wheels)), [])
+
+    robot.wait(moving, ANSWER_S)
+    robot.look(_LATE_S)
+    return moving() if _shown(robot) else None
+
+
+def _are_wheels(value: Any) -> bool:
+    return isinstance(value, list) and len(value) > 0 and all(isinstance(one, int | float) for one in value)
+
+
+class _Wheel:
+    """Sends drive commands, with the key of control where the robot has one."""
+
+    def __init__(self, robot: Observer) -> None:
+        self._robot, self.driver = robot, Driver(robot)
+
+    def send(self, z: object = SPEED, *, key: str | None = None, wrapped: bool = False, **fields: object) -> float:
+        """One command; ``key``: instead of its own, "" for none. Returns when."""
+        of = self.driver.key if key is None else key
+        command = {"x": 0, "z": z, **({"key": of} if of else {}), **fields}
+        return self._robot.send(c.DRIVE, msgspec.json.encode({"value": command} if wrapped else command))
+
+    def drive(self, seconds: float = DRIVES_S, **fields: Any) -> tuple[float, float]:
+        """Commands for so long; when the first and the last one left."""
+        began = last = time.monotonic()
+        while time.monotonic() < began + seconds:
+            last = self.send(**fields)
+            self._robot.look(_STEP_S)
+        return began, last
+
+
+@contextmanager
+def _at_the_wheel(robot: Observer) -> Iterator[_Wheel]:
+    """Its driver has control, and has let go, so that a wait after a reset is over; at the end, too."""
+    wheel = _Wheel(robot)
+    if robot.view.controlled:
+        wheel.driver.asks(for_ms=10_000)
+        robot.answers(lambda: wheel.driver.holds)
+    wheel.send(0)
+    robot.wait(lambda: moves_until(robot, time.monotonic()) != float("inf"), ANSWER_S)
+    try:
+        yield wheel
+    finally:
+        wheel.send(0)
+        wheel.driver.leaves()
+
+
+def _rest(robot: Observer, began: float, last: float, limit_s: float, what: str = "the last command") -> CheckResult:
+    robot.look(limit_s + _LATE_S)
+    until = moves_until(robot, began)
+    if until is None:
+        return skipped(_NOT_SHOWN, _SHOW_IT)
+    if until == 0.0:
+        return failed(f"z {SPEED} for {DRIVES_S} s does not move it", "drive by incoming/drive-values, live ones")
+    if until > last + limit_s + _LATE_S / 2:
+        shown = "still moves" if until == float("inf") else f"moved for {until - last:.2f} s"
+        return failed(f"it {shown} after {what}", f"stop {limit_s:g} s after {what}, at the latest")
+    return ok(f"it rests {max(0.0, until - last):.2f} s after {what}")
+
+
+def _moved(robot: Observer, since: float, why: str, fix: str) -> CheckResult:
+    """A failure if it has moved."""
+    robot.look(robot.patience_s)
+    until = moves_until(robot, since)
+    if until is None:
+        return skipped(_NOT_SHOWN, _SHOW_IT)
+    return failed(why, fix) if until > since else ok("it moves nothing")
+
+
+def dead_man(robot: Observer) -> CheckResult:
+    with _at_the_wheel(robot) as wheel:
+        return _rest(robot, *wheel.drive(), RESTS_S)
+
+
+def valid_ms(robot: Observer) -> CheckResult:
+    """A short time, and one that is too long."""
+    with _at_the_wheel(robot) as wheel:
+        outcome = _rest(robot, *wheel.drive(valid_ms=150), 0.15)
+        if outcome.state is not State.OK:
+            return outcome
+        last = _rest(robot, *wheel.drive(0.2, valid_ms=4000), RESTS_S)
+        return outcome if last.state is State.OK else failed(f"valid_ms 4000: {last.text}", last.fix)
+
+
+def zero(robot: Observer) -> CheckResult:
+    """It comes from another than the driver: it needs no key."""
+    with _at_the_wheel(robot) as wheel:
+        began, _ = wheel.drive()
+        return _rest(robot, began, wheel.send(0, key=_OTHER_KEY), 0.1, "a zero with another key")
+
+
+def steering(robot: Observer) -> CheckResult:
+    ways: tuple[tuple[dict[str, Any], tuple[int, int]], ...] = (
+        ({"z": 0, "x": SPEED}, (1, -1)),
+        ({"z": SPEED}, (1, 1)),
+        ({"z": -SPEED, "wrapped": True}, (-1, -1)),
+    )
+    with _at_the_wheel(robot) as wheel:
+        for fields, signs in ways:
+            found = _moves(robot, wheel.drive(DRIVES_S / 2, **fields)[0])
+            if found is None:
+                return skipped(_NOT_SHOWN, _SHOW_IT)
+            if [one * sign > 0 for one, sign in zip(found, signs, strict=False)] != [True, True]:
+                sent = f"x {fields.get('x', 0):g}, z {fields['z']:g}" + " within value" * ("wrapped" in fields)
+                return failed(f"at {sent} its wheels do {found}", "left is z + x, right is z - x, also within value")
+    return ok("x to the right, z ahead")
+
+
+def stop_moving(robot: Observer) -> CheckResult:
+    """Commands go on, and begin again after the stick was let go; they move nothing."""
+    with _at_the_wheel(robot) as wheel:
+        began, _ = wheel.drive()
+        at = time.monotonic()
+        stop(robot, secrets.token_hex(8))
+        wheel.drive()
+        wheel.send(0)
+        wheel.drive(DRIVES_S / 2)
+        outcome = _rest(robot, began, at, 0.25, "the stop")
+    return outcome if freed(robot) else failed("a reset does not end the stop", "end it on incoming/estop-reset")
+
+
+def reset_waits(robot: Observer) -> CheckResult:
+    """The stick is held down meanwhile. A zero of another ends no wait while one has control."""
+    with _at_the_wheel(robot) as wheel:
+        stop(robot, secrets.token_hex(8))
+        began, _ = wheel.drive(2 * _STEP_S)  # from before the reset on: a pause would end the wait
+        reset(robot)
+        wheel.drive(DRIVES_S / 2)
+        if robot.view.controlled:
+            wheel.send(0, key=_OTHER_KEY)
+        wheel.drive()
+        outcome = _moved(
+            robot,
+            began,
+            "a stick that is held down moves it after a reset",
+            "wait for a zero of who has control, or for 0.5 s without commands",
+        )
+        if outcome.state is State.OK:
+            wheel.send(0)
+            outcome = _rest(robot, *wheel.drive(), RESTS_S)
+    if robot.wait(lambda: not robot.view.latched, ANSWER_S):
+        return outcome
+    return failed("a reset does not end the stop", "end it on incoming/estop-reset")
+
+
+def not_a_number(robot: Observer) -> CheckResult:
+    with _at_the_wheel(robot):
+        began = time.monotonic()
+        for number in (b"NaN", b"Infinity", b"1e999", b'"nan"', b"null"):
+            robot.send(c.DRIVE, b'{"x": 0, "z": %s}' % number)
+        return _moved(robot, began, "it moves by a command that is no number", "refuse NaN and infinity")
+
+
+def clamped(robot: Observer) -> CheckResult:
+    with _at_the_wheel(robot) as wheel:
+        wheels = _moves(robot, wheel.drive(DRIVES_S / 2, z=9, x=-9)[0])
+    if wheels is None:
+        return skipped(_NOT_SHOWN, _SHOW_IT)
+    if not wheels:
+        return failed("x -9, z 9 does not move it", "clamp both axes to -1..1, and obey")
+    largest = max(map(abs, wheels))
+    if largest > 1.0:
+        return failed(f"a wheel got {largest:g}", "clamp both axes to -1..1, and the sum of them for each wheel")
+    return ok(f"{largest:g} at most")
+
+
+def foreign_key(robot: Observer) -> CheckResult:
+    """While one has control, and while none has."""
+    why, fix = "it moves by another's key", "refuse what moves and has another key"
+    with _at_the_wheel(robot) as wheel:
+        outcome = _moved(robot, wheel.drive(key=_OTHER_KEY)[0], why, fix)
+    if outcome.state is not State.OK:
+        return outcome
+    return _moved(robot, wheel.drive(DRIVES_S / 2, key=_OTHER_KEY)[0], f"{why} while no one has control", fix)
+
+
+def control_passes(robot: Observer) -> CheckResult:
+    with _at_the_wheel(robot) as wheel:
+        began, _ = wheel.drive()
+        key, second = wheel.driver.key, Driver(robot)
+        at = second.takes()
+        robot.answers(lambda: second.holds)
+        wheel.drive(key=key)
+        outcome = _rest(robot, began, at, 0.25, "another took control")
+        second.leaves()
+    return outcome
+
+
+def keyless(robot: Observer) -> CheckResult:
+    with _at_the_wheel(robot) as wheel:
+        began, _ = wheel.drive(key="")
+        return _moved(robot, began, "it moves by a command without a key", "at level named refuse those")
+
+
+def foreign_account(robot: Observer) -> CheckResult:
+    """The key of control, behind another account and behind none."""
+    with _at_the_wheel(robot) as wheel:
+        command = msgspec.json.encode({"x": 0, "z": SPEED, "key": wheel.driver.key})
+        began = time.monotonic()
+        delivered = [robot.send_as(account, c.DRIVE, command) for account in (_OTHER_ACCOUNT, "")]
+        outcome = _moved(
+            robot, began, "it moves by a key that another sends", "a key counts with the account that asked for it"
+        )
+    return outcome if all(delivered) or outcome.state is State.FAILED else skipped(UNSEEN)
+
+
+_MOVES = (drives, free, commanded)
+_BY_TURNS = (*_MOVES, controls)
+
+MOVING: tuple[Check[Observer], ...] = (
+    Check("dead man", dead_man, _MOVES, "a driver may vanish at any moment"),
+    Check("validity", valid_ms, _MOVES, "a command tells how long it counts, but never long"),
+    Check("zero", zero, _MOVES, "who lets go expects it to stop at once, and anyone may halt it"),
+    Check("steering", steering, _MOVES, "a person must know where it will go"),
+    Check("no number", not_a_number, _MOVES, "a speed that is no number must not be one"),
+    Check("clamps", clamped, _MOVES, "motors get no more than everything"),
+    Check("foreign key", foreign_key, _BY_TURNS, "who had control before must not drive on"),
+    Check("control passes", control_passes, _BY_TURNS, "the next driver must not get a robot that moves"),
+    Check("stop moving", stop_moving, (*_MOVES, stops), "a stopped robot does not move, whatever is sent"),
+    Check("reset waits", reset_waits, (*_MOVES, stops), "who resets must not be surprised by a stick"),
+    Check("keyless", keyless, _BY_TURNS, "where names are checked, who drives is known", binds=named),
+    Check("foreign account", foreign_account, _BY_TURNS, "a key can be read by all", binds=named),
+)

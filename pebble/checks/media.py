@@ -1,0 +1,101 @@
+"""Checks of camera, microphone, codecs and loudspeaker."""
+
+import os
+import shutil
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+from pebble.checks import devices
+from pebble.checks.check import CheckResult, failed, ok, warn
+from pebble.config import Config
+from pebble.contract.encodings import NEED_PYAV
+from pebble.media import pyav
+from pebble.services.soundboard_handler.playback import Players
+
+_DEVICE = "services.av_daemon.video.device"
+_LIBCAMERA = ("rpicam-vid", "libcamera-vid")
+
+Which = Callable[[str], str | None]
+
+
+def cameras(config: Config, folder: Path = Path("/dev"), which: Which = shutil.which) -> Iterator[CheckResult]:
+    """``folder``: of device files. Nothing for a robot without a camera."""
+    daemon = config.services.av_daemon
+    if daemon.enabled and daemon.video.enabled:
+        yield camera(daemon.video.backend, daemon.video.device, folder, which)
+
+
+def microphone(config: Config, which: Which = shutil.which) -> Iterator[CheckResult]:
+    daemon = config.services.av_daemon
+    if daemon.enabled and daemon.audio.enabled and daemon.audio.source != "synthetic":
+        yield _program(("arecord",), "sudo apt install alsa-utils", which)
+
+
+def codecs(config: Config, *, installed: bool | None = None) -> Iterator[CheckResult]:
+    """H.264 and Opus; missing codecs are an error only if the config selects them."""
+    if not config.services.av_daemon.enabled:
+        return
+    if pyav.installed() if installed is None else installed:
+        yield ok("H.264 and Opus are available")
+        return
+    sent = config.services.mqtt_bridge.media
+    asked = [name for name in (sent.video_publisher.encoding, sent.audio_publisher.encoding) if name in NEED_PYAV]
+    fix = "pip install 'pebble-robot[media]'"
+    if asked:
+        yield failed(f"PyAV is not installed, so there is no {' and no '.join(asked)}", fix)
+    else:
+        yield ok(f"PyAV is not installed: no H.264, no Opus ({fix})")
+
+
+def sockets_of_the_original(config: Config) -> Iterator[CheckResult]:
+    """Whether `gstreamer_mirror` can make the sockets that scripts of the original read."""
+    daemon = config.services.av_daemon
+    for name, path in daemon.sockets().items() if daemon.enabled else ():
+        yield shm_socket(f"{name} for the original's scripts", path)
+
+
+def shm_socket(what: str, path: Path) -> CheckResult:
+    folder = path.parent
+    if not folder.is_dir():
+        return failed(f"there is no folder {folder}", f"sudo install -d -o $USER {folder}", what)
+    if not os.access(folder, os.W_OK | os.X_OK):
+        return failed(f"{folder} is not writable for this user", f"sudo chown $USER {folder}", what)
+    if path.exists() and not path.is_socket():
+        return failed(f"{path} is a file and no socket", f"rm {path}", what)
+    return ok(str(path), what=what)
+
+
+def camera(backend: str, device: str, folder: Path, which: Which) -> CheckResult:
+    if backend == "synthetic":
+        return ok("synthetic: needs no device")
+    if backend != "v4l2":
+        return _program(_LIBCAMERA, "sudo apt install rpicam-apps", which)
+    names = folder / "v4l"
+    path = folder / f"video{device}" if device.isdecimal() else Path(device)
+    if "://" in device:
+        return ok("on the network: not checked")
+    if not path.exists():
+        return devices.missing(f"{path} does not exist: is it plugged in?", _DEVICE, names)
+    if not os.access(path, os.R_OK | os.W_OK):
+        return failed(f"{path} is not accessible to this user", "sudo usermod -aG video $USER, log in again")
+    return devices.usable(path, f"{path} readable and writable", _DEVICE, names)
+
+
+def _program(names: tuple[str, ...], fix: str, which: Which) -> CheckResult:
+    """One of ``names`` must be installed."""
+    name = next((name for name in names if which(name) is not None), None)
+    return failed(f"{' or '.join(names)} is not installed", fix) if name is None else ok(f"uses {name}")
+
+
+def loudspeaker(config: Config, which: Which = shutil.which) -> Iterator[CheckResult]:
+    """Nothing for a robot that plays neither sounds nor an operator's voice."""
+    services, players = config.services, Players.of(config)
+    talk_back = services.av_daemon.enabled and services.av_daemon.audio.enabled
+    commands = [players.wav] * services.soundboard_handler.enabled + [players.raw] * talk_back
+    for name in dict.fromkeys(command[0] for command in commands):
+        if which(name) is not None:
+            yield ok(f"uses {name}")
+            continue
+        install = f"install {name}, or name another player in the config"
+        fix = "sudo apt install alsa-utils" if name == "aplay" else install
+        yield warn(f"{name} is not installed: nothing can be played", fix)

@@ -1,0 +1,221 @@
+"""One robot as a client sees it: everything that it publishes, and what is sent to it."""
+
+from __future__ import annotations
+
+import secrets
+import time
+from collections import defaultdict, deque
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from typing import Any
+
+from pebble import contract as c
+from pebble.client.connection import Target, connected, put_names
+from pebble.client.names import Names
+from pebble.client.robot_view import RobotView
+from pebble.contract import channel_of, codec
+from pebble.contract.names import with_name
+from pebble.contract.payloads import ControlRequest
+from pebble.errors import PayloadError
+from pebble.transports import Message, QoS, Transport
+
+ANSWER_S = 1.0  # within which a robot answers
+_STEP_S = 0.005
+_MOST = 50_000  # messages that are kept; a robot at rest sends some ten a second
+_RETAINED_S = 1.0  # some brokers send what is retained a moment after the subscription
+_STALL_S = 0.1  # a failure tells nothing while this machine stalls for so long
+
+
+@dataclass(frozen=True, slots=True)
+class Record:
+    """One message, when it arrived (monotonic), and its value by the contract; ``wrong``: why it has none."""
+
+    at: float
+    metric: str  # below the base: ``outgoing/online``
+    payload: bytes
+    retain: bool
+    channel: c.Channel | None
+    value: Any = None
+    wrong: str = ""
+
+
+class Observer:
+    """What arrived of one robot at one connection. :meth:`wait` lets time pass and reads it."""
+
+    def __init__(
+        self, target: Target, transport: Transport, names: Names, base: str, filters: Iterable[str] = ()
+    ) -> None:
+        """``filters``: instead of all that the robot publishes."""
+        self.base, self.target, self.transport, self.account = base, target, transport, names.account
+        self.view = RobotView(base)
+        self.records: deque[Record] = deque(maxlen=_MOST)
+        self.dropped = 0  # messages that came faster than they were read
+        self.listeners: list[Callable[[Message, float], None]] = []  # get each message, and when it arrived (monotonic)
+        #: When its wheels changed (monotonic), and to what, left and right: from where it is seen besides.
+        self.eyes: Callable[[], list[tuple[float, list[float]]]] = list
+        self._of: defaultdict[c.Channel | None, deque[Record]] = defaultdict(lambda: deque(maxlen=_MOST))
+        self._stalled_s = 0.0  # the longest time that this program waited in vain to go on
+        self._slowest_s = ANSWER_S / 4  # of its answers
+        self._arrived: deque[tuple[Message, float, float]] = deque(maxlen=_MOST)
+        put_names(transport, names, lambda of: of == base and self.view.named)
+        for filter_ in filters or (f"{base}/{c.OUTGOING}/#",):
+            transport.subscribe(filter_, self._take, qos=QoS.DELIVERED, direct=True)
+
+    def _take(self, message: Message) -> None:
+        self.dropped += len(self._arrived) == _MOST
+        self._arrived.append((message, time.monotonic(), time.time()))
+
+    # -- what arrives
+
+    def channel_of(self, topic: str) -> c.Channel | None:
+        return channel_of(topic.removeprefix(f"{self.base}/"))
+
+    def read(self) -> None:
+        """Take what has arrived."""
+        while self._arrived:
+            message, at, wall = self._arrived.popleft()
+            self.receive(message, at, wall)
+            for listener in self.listeners:
+                listener(message, at)
+
+    @contextmanager
+    def heard_by(self, listener: Callable[[Message, float], None]) -> Iterator[None]:
+        """Let ``listener`` hear what arrives until the block ends."""
+        self.listeners.append(listener)
+        try:
+            yield
+        finally:
+            self.listeners.remove(listener)
+
+    def receive(self, message: Message, at: float, wall: float) -> None:
+        record = self.record_of(message, at)
+        self.records.append(record)
+        self._of[record.channel].append(record)
+        self.view.receive(record.channel, message, at, wall)
+
+    def record_of(self, message: Message, at: float) -> Record:
+        channel = self.channel_of(message.topic)
+        record = Record(at, message.topic.removeprefix(f"{self.base}/"), message.payload, message.retain, channel)
+        if channel is None or not message.payload:
+            return record
+        try:
+            return replace(record, value=codec.decode(channel, message.payload))
+        except PayloadError as error:
+            return replace(record, wrong=str(error))
+
+    def of(self, channel: c.Channel, since: float = 0.0, *, retained: bool = False) -> list[Record]:
+        """Return its live messages of a channel, or with ``retained`` all."""
+        return [
+            record
+            for record in self._of[channel]
+            if record.at >= since and record.payload and (retained or not record.retain)
+        ]
+
+    def newest(self, channel: c.Channel) -> Any:
+        """Return the newest value of a channel that could be read; None if there is none."""
+        return next((record.value for record in reversed(self._of[channel]) if record.value is not None), None)
+
+    # -- time
+
+    def wait(self, condition: Callable[[], object], seconds: float) -> bool:
+        """Read what arrives until ``condition``; False: not within ``seconds``."""
+        end = time.monotonic() + seconds
+        while True:
+            self.read()
+            if condition():
+                return True
+            if time.monotonic() >= end:
+                return False
+            slept = time.monotonic()
+            time.sleep(_STEP_S)
+            self._stalled_s = max(self._stalled_s, time.monotonic() - slept)
+
+    def look(self, seconds: float) -> float:
+        """Only let time pass; returns when that began."""
+        began = time.monotonic()
+        self.wait(lambda: False, seconds)
+        return began
+
+    def has_stalled(self) -> bool:
+        """True if this program could not go on in time since this was asked last."""
+        stalled_s, self._stalled_s = self._stalled_s, 0.0
+        return stalled_s >= _STALL_S
+
+    def answers(self, condition: Callable[[], object]) -> bool:
+        """True if the robot does what was asked, in time."""
+        began = time.monotonic()
+        done = self.wait(condition, ANSWER_S)
+        if done:
+            self._slowest_s = max(self._slowest_s, time.monotonic() - began)
+        return done
+
+    @property
+    def patience_s(self) -> float:
+        """How long one must look on to be sure that something does not happen: it may answer late, here or always."""
+        return 2 * self._slowest_s
+
+    def happens(self, condition: Callable[[], object]) -> bool:
+        """True if the robot does what it must not do."""
+        return self.wait(condition, self.patience_s)
+
+    # -- what is sent
+
+    def send(self, channel: c.Channel, value: object) -> float:
+        """Publish a command, as bytes or as its struct; returns when."""
+        payload = value if isinstance(value, bytes) else codec.encode(channel, value)
+        self.transport.publish(channel.topic(self.base), payload, qos=QoS(channel.default_qos), urgent=True)
+        return time.monotonic()
+
+    def publish(self, messages: Iterable[Message]) -> bool:
+        """Publish all at once; False if one was not accepted."""
+        are_accepted = True
+        for message in messages:
+            is_accepted = self.transport.publish(message.topic, message.payload, qos=message.qos, urgent=True)
+            are_accepted = are_accepted and is_accepted
+        return are_accepted
+
+    def sent(self, seconds: float) -> float:
+        """Wait until the broker has all that was sent, so long at most; returns when."""
+        self.wait(lambda: self.transport.outgoing.waiting == 0, seconds)
+        return time.monotonic()
+
+    def send_as(self, account: str, channel: c.Channel, value: object) -> bool:
+        """Publish a command with another account in its topic, or "": without one; True if the broker delivers it."""
+        payload = value if isinstance(value, bytes) else codec.encode(channel, value)
+        topic = channel.topic(self.base)
+        with self._beside("conform-other", c.INCOMING) as (beside, messages):
+            beside.publish(with_name(topic, account) if account else topic, payload, qos=QoS.DELIVERED, urgent=True)
+            return self.wait(lambda: any(message.payload == payload for message in list(messages)), _RETAINED_S)
+
+    def reads_commands(self) -> bool:
+        """True if this client may read what is sent to the robot: a request that changes nothing comes back."""
+        request = ControlRequest(id=secrets.token_hex(4), want="release")
+        with self._beside("conform-commands", c.INCOMING) as (_, messages):
+            self.send(c.CONTROL, request)
+            own = request.id.encode()
+            return self.wait(lambda: any(own in message.payload for message in list(messages)), _RETAINED_S)
+
+    def retained(self) -> list[Record]:
+        """Return what the broker has retained of it and for it, as one gets it who connects now."""
+        with self._beside("conform-retained", c.OUTGOING, c.INCOMING) as (_, messages):
+            self.look(_RETAINED_S)
+        return [self.record_of(message, 0.0) for message in list(messages) if message.retain and message.payload]
+
+    @contextmanager
+    def _beside(self, program: str, *directions: str) -> Iterator[tuple[Transport, deque[Message]]]:
+        """A second connection, and what arrives there; each direction of its own, as some brokers refuse one."""
+        messages: deque[Message] = deque(maxlen=_MOST)
+        with connected(replace(self.target, program=program)) as (beside, _):
+            for direction in directions:
+                beside.subscribe(f"{self.base}/{direction}/#", messages.append, qos=QoS.DELIVERED, direct=True)
+            yield beside, messages
+
+
+@contextmanager
+def observed(target: Target, seconds: float) -> Iterator[Observer]:
+    """Connect, and look on for so long. Raises PebbleError."""
+    with connected(target) as (transport, names):
+        observer = Observer(target, transport, names, names.base)
+        observer.look(seconds)
+        yield observer

@@ -1,0 +1,120 @@
+"""Checks of a robot's own recorder: does it run, did it miss anything, and for how long is there room?"""
+
+import json
+import shutil
+import time
+from collections.abc import Iterator
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any, Final
+
+from pebble.checks.check import CheckResult, failed, ok, warn
+from pebble.config import Config
+from pebble.errors import PebbleError
+from pebble.recordings import catalogue
+from pebble.recordings.recorder.folder import Entry, Folder
+from pebble.recordings.recorder.metrics import STATUS
+
+_ROOM: Final = "recorder's room"
+_SILENT_S: Final = 30.0  # it writes its numbers every ten seconds
+_HOUR_S, _DAY_S = 3600.0, 86_400.0
+_LITTLE_S: Final = _DAY_S  # room for less is warned of
+_SHORTEST_S: Final = 600.0  # of recording, to know a rate
+
+
+def recorder(config: Config, now: float | None = None) -> Iterator[CheckResult]:
+    """Nothing for a robot without one. ``now``: seconds since 1970."""
+    section = config.services.recorder
+    if not section.enabled:
+        return
+    now, folder = time.time() if now is None else now, section.place
+    if find_spec("mcap") is None:
+        yield failed("the package mcap is not installed: it records nothing", 'pip install "pebble-robot[record]"')
+        return
+    if not folder.is_dir():
+        yield ok(f"{folder} is not there yet: it has not recorded anything")
+        return
+    try:
+        entries = Folder(folder).entries()
+        yield _running(folder, now, entries)
+        yield from _missed(entries, now)
+        yield _room(folder, entries, section.keep_bytes, section.free_bytes)
+    except (PebbleError, OSError) as error:
+        yield failed(f"{folder} cannot be read: {error}")
+
+
+def _running(folder: Path, now: float, entries: list[Entry]) -> CheckResult:
+    if not Folder.is_in_use(folder):
+        left = sum(entry.is_active for entry in entries)
+        if left:
+            text = f"does not run, and {left} files in {folder} are not finished"
+            return warn(text, f"pebble recordings mend {folder}")
+        return ok("does not run now")
+    status = _status(folder)
+    silent_s = now - float(status.get("at", 0.0))
+    if silent_s > _SILENT_S:
+        return warn(f"has stood still for {silent_s:.0f} s", "pebble up")
+    if status.get("blocked"):
+        return failed(f"writes nothing: {status['blocked']}", f"make room on the disk of {folder}")
+    if status.get("dropped"):
+        return warn(f"runs, and has dropped {status['dropped']} messages: the disk is too slow")
+    return ok(f"runs, {status.get('messages', 0)} messages into {folder}")
+
+
+def _status(folder: Path) -> dict[str, Any]:
+    try:
+        found = json.loads((folder / STATUS).read_bytes())
+    except (OSError, ValueError):
+        return {}
+    return found if isinstance(found, dict) else {}
+
+
+def _missed(entries: list[Entry], now: float) -> Iterator[CheckResult]:
+    """Gaps of the last hour, and messages that damage has taken in the last day."""
+    newest = [entry for entry in entries if now - entry.ended <= _HOUR_S and not entry.is_media]
+    since_ms = 1000 * (now - _HOUR_S)
+    gaps = [
+        event
+        for event in catalogue.events(entry.path for entry in newest if entry.is_active or entry.is_finished)
+        if event["event"] == "gap" and event["t"] >= since_ms
+    ]
+    if gaps:
+        why = str(gaps[-1].get("why", "unknown"))[:100]
+        yield warn(f"{len(gaps)} gaps in the last hour, the last one because of: {why}")
+    damaged = [entry for entry in entries if not (entry.is_finished or entry.is_active)]
+    if damaged:
+        text = f"{len(damaged)} damaged files are kept, beside what could be read of them: {damaged[0].path}"
+        yield warn(text, "pebble recordings rm FILE deletes one")
+    finished = [entry for entry in entries if entry.is_finished and now - entry.ended <= _DAY_S]
+    missing = sum(catalogue.look_at(entry.path).missing for entry in finished)
+    if missing:
+        yield warn(f"{missing} messages of the last day are missing: files were damaged")
+
+
+def _room(folder: Path, entries: list[Entry], keep_bytes: int, free_bytes: int) -> CheckResult:
+    """Seconds for which there is room at the rate of what was recorded in the last files."""
+    span_s, size = _rate(entries)
+    room = max(0, shutil.disk_usage(folder).free - free_bytes)
+    if span_s < _SHORTEST_S or not size:
+        return ok(f"{room / 1e9:.1f} GB; how long that lasts is not known yet", what=_ROOM)
+    rate = size / span_s
+    if keep_bytes and keep_bytes < room + sum(entry.size for entry in entries):
+        return ok(f"the last {keep_bytes / rate / _HOUR_S:.1f} hours are kept", what=_ROOM)
+    lasts_s = room / rate
+    if lasts_s < _LITTLE_S and not keep_bytes:
+        text = f"for {lasts_s / _HOUR_S:.1f} hours at this rate; then the oldest are deleted"
+        return warn(text, "services.recorder.keep_media_days, or a larger disk", what=_ROOM)
+    return ok(f"for {lasts_s / _DAY_S:.1f} days at this rate", what=_ROOM)
+
+
+def _rate(entries: list[Entry]) -> tuple[float, int]:
+    """Seconds and bytes of the files of the last day."""
+    if not entries:
+        return 0.0, 0
+    last = max(entry.ended for entry in entries)
+    newest = [entry for entry in entries if last - entry.ended <= _DAY_S and not entry.is_active]
+    if not newest:
+        return 0.0, 0
+    spans = [catalogue.look_at(entry.path) for entry in newest if not entry.is_media and entry.is_finished]
+    first_ns = min((one.first_ns for one in spans if one.messages), default=0)
+    return (last - first_ns / 1e9 if first_ns else 0.0), sum(entry.size for entry in newest)

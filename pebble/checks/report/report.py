@@ -1,0 +1,210 @@
+"""What helps to find a fault from elsewhere, in one zip file without a password or key."""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+import platform
+import shutil
+import subprocess
+import sys
+import time
+import zipfile
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+from pebble.checks.report.secrets_here import Secrets, secrets_of
+from pebble.checks.robot import run_checks
+from pebble.checks.running.robot import user_of
+from pebble.config import Config, load
+from pebble.config.config import resolved
+from pebble.config.masking import masked
+from pebble.config.problems import Notes
+from pebble.config.raw import decode, plain, read_text
+from pebble.config.secret_text import without_secrets
+from pebble.errors import PebbleError
+from pebble.setup.places import Places
+from pebble.version import __version__
+
+_JOURNAL_LINES = 2000
+_PROGRAM_S = 20.0
+_LONGEST_PART = 8 << 20  # bytes
+_UNITS = ("etc/systemd/system", "usr/lib/systemd/system", "lib/systemd/system", "usr/local/lib/systemd/system")
+
+
+class MissingError(PebbleError):
+    """A part that cannot be had here. Example: ``journalctl is not installed``."""
+
+
+@dataclass(frozen=True)
+class Here:
+    """What is reported: the installed robot below ``places``, or that of another config."""
+
+    places: Places
+    file: Path
+    config: Config | None = None  # None: it has mistakes, or is not there
+    problem: str = ""
+
+
+@dataclass
+class Report:
+    """``missing``: why a part is not in it; ``unread``: files whose secrets could not be searched for."""
+
+    parts: dict[str, str] = field(default_factory=dict)
+    missing: dict[str, str] = field(default_factory=dict)
+    unread: tuple[str, ...] = ()
+
+    def packed(self) -> bytes:
+        output = io.BytesIO()
+        with zipfile.ZipFile(output, "w", zipfile.ZIP_DEFLATED) as packed:
+            for name, text in self.parts.items():
+                packed.writestr(name, text)
+        return output.getvalue()
+
+
+def make(places: Places, file: Path | None = None) -> Report:
+    """Collect all parts, without a secret of this machine; a part that fails is named in the index."""
+    here = _here(places, file or places.config)
+    known = secrets_of(places, here.config, [here.file])
+    report = Report(unread=known.unread)
+    for name, part in PARTS.items():
+        try:
+            report.parts[name] = known.hidden(without_secrets(part(here))[:_LONGEST_PART])
+        except Exception as error:  # noqa: BLE001 - what is broken is why there is a report: the rest is in it
+            kind = "" if isinstance(error, PebbleError) else f"{type(error).__name__}: "
+            report.missing[name] = known.hidden(without_secrets(kind + " ".join(str(error).split())))
+    report.parts = {"index.txt": known.hidden(_index(report, known)), **report.parts}
+    return report
+
+
+def _here(places: Places, file: Path) -> Here:
+    env = {"STATE_DIRECTORY": str(places.state)} if file == places.config and places.state.exists() else {}
+    try:
+        return Here(places, file, load(file, {**os.environ, **env}))
+    except PebbleError as error:
+        return Here(places, file, None, str(error))
+
+
+def _index(report: Report, known: Secrets) -> str:
+    lines = [f"Pebble {__version__}, {time.strftime('%Y-%m-%d %H:%M:%S %z')}", ""]
+    lines += [f"{name}: {len(text):,} characters" for name, text in report.parts.items()]
+    lines += [f"{name}: MISSING: {why}" for name, why in report.missing.items()]
+    lines += ["", f"{len(known.known)} passwords and keys of this machine are hidden in it"]
+    lines += [f"too short to be hidden: one in {where}" for where in known.short]
+    lines += [f"could not be read, so what is in it is not hidden: {file}" for file in known.unread]
+    return "\n".join(lines) + "\n"
+
+
+# -- the parts
+
+
+def _config(here: Here) -> str:
+    """The config as written and as it is meant, with stars where there are secrets."""
+    written = masked(plain(decode(read_text(here.file), here.file.name), Notes()))
+    whole: dict[str, Any] = {"file": str(here.file), "written": written}
+    whole |= {"problems": here.problem.splitlines()} if here.config is None else {"resolved": resolved(here.config)}
+    return json.dumps(whole, indent=1, ensure_ascii=False)
+
+
+def _doctor(here: Here) -> str:
+    results = run_checks(here.config)
+    return (
+        "".join(f"{result.state:<7}  {result.what}: {result.text}  {result.fix}\n" for result in results) + here.problem
+    )
+
+
+def _status(here: Here) -> str:
+    """What the robot's own side retains of its state; asked as its user, as root may not."""
+    if here.config is None:
+        raise MissingError("the config cannot be read")
+    who = user_of(here.config.run_dir())
+    command = [sys.executable, "-m", "pebble.checks.report.states", str(here.file.absolute())]
+    as_user: dict[str, Any] = {} if who is None else {"user": who.pw_uid, "group": who.pw_gid, "extra_groups": []}
+    done: subprocess.CompletedProcess[str] = subprocess.run(
+        command, capture_output=True, text=True, check=False, timeout=_PROGRAM_S, cwd="/", **as_user
+    )
+    if done.returncode:
+        raise MissingError(done.stderr.strip().rpartition("\n")[2] or "its own side is not reached")
+    return done.stdout
+
+
+def _journal(here: Here) -> str:
+    root = [] if here.places.root == Path("/") else [f"--root={here.places.root}"]
+    units = [word for name in ("pebble*", "mosquitto*") for word in ("--unit", name)]
+    return _printed("journalctl", *root, *units, f"--lines={_JOURNAL_LINES}", "--no-pager", "--output=short-iso")
+
+
+def _units(here: Here) -> str:
+    roots = [here.places.root / name for name in _UNITS]
+    files = [file for root in roots for file in sorted(root.glob("pebble*"))]
+    inside = [file for one in files for file in (sorted(one.glob("*")) if one.is_dir() else [one])]
+    inside += sorted((here.places.root / "etc/polkit-1/rules.d").glob("*pebble*"))
+    if not inside:
+        raise MissingError("no unit of Pebble is installed")
+    return "\n".join(f"# {file}\n{file.read_text(encoding='utf-8', errors='replace')}" for file in inside)
+
+
+def _slots(here: Here) -> str:
+    places = here.places
+    if not places.slots.is_dir():
+        raise MissingError(f"there is no {places.slots}")
+    return "\n".join(_described(path) for path in _of_slots(places)) + "\n"
+
+
+def _of_slots(places: Places) -> Iterator[Path]:
+    yield from sorted(places.slots.iterdir())
+    yield from sorted(places.slots.glob("*/.complete"))
+    yield places.current_slot
+    yield from sorted(places.slot_state.glob("*"))
+
+
+def _described(path: Path) -> str:
+    if path.is_symlink():
+        return f"{path} -> {path.readlink()}"
+    if path.is_file():
+        return f"{path}: {path.read_text(encoding='utf-8', errors='replace').strip()[:1000]}"
+    return f"{path}{'/' if path.is_dir() else ' is missing'}"
+
+
+def _versions(here: Here) -> str:
+    lines = [f"pebble {__version__}", f"python {sys.version}", f"{sys.executable}", " ".join(platform.uname())]
+    release = here.places.root / "etc/os-release"
+    lines += release.read_text(encoding="utf-8", errors="replace").splitlines() if release.is_file() else []
+    installed = {one.name: one.version for one in metadata.distributions()}
+    return "\n".join([*lines, *(f"{name} {version}" for name, version in sorted(installed.items()))]) + "\n"
+
+
+def _devices(_here: Here) -> str:
+    names = [f"{path} -> {path.resolve()}" for path in sorted(Path("/dev").glob("*/by-id/*"))]
+    return "\n".join([_printed("lsusb"), *names]) + "\n"
+
+
+def _disk(_here: Here) -> str:
+    return _printed("df", "-h", "-x", "tmpfs") + _printed("free", "-h") + _printed("uptime")
+
+
+def _printed(program: str, *arguments: str) -> str:
+    if shutil.which(program) is None:
+        raise MissingError(f"{program} is not installed")
+    done = subprocess.run([program, *arguments], capture_output=True, timeout=_PROGRAM_S, check=False)
+    if done.returncode and not done.stdout:
+        raise MissingError(f"{program} ended with {done.returncode}: {done.stderr.decode(errors='replace')[:300]}")
+    return done.stdout.decode(errors="replace")
+
+
+#: In the order in which a reader wants them.
+PARTS: dict[str, Callable[[Here], str]] = {
+    "config.json": _config,
+    "doctor.txt": _doctor,
+    "status.json": _status,
+    "journal.txt": _journal,
+    "units.txt": _units,
+    "slots.txt": _slots,
+    "versions.txt": _versions,
+    "lsusb.txt": _devices,
+    "disk.txt": _disk,
+}

@@ -1,0 +1,130 @@
+"""Every password and key on a machine that a robot could have to do with, to be hidden in what leaves it."""
+
+from __future__ import annotations
+
+import base64
+import json
+import os
+import re
+from collections.abc import Collection, Iterable, Iterator
+from pathlib import Path
+from typing import NamedTuple
+from urllib.parse import quote
+
+from msgspec.structs import fields
+
+from pebble.config import Config
+from pebble.config.secret_text import HIDDEN
+from pebble.config.types import Secret, Section
+from pebble.setup.places import Places
+
+_SHORTEST = 4  # characters: a shorter one is in every text
+_LARGEST = 1 << 20  # bytes of a file of passwords; others are no such files
+#: Below the root: what Pebble and its brokers have, and the keys of this machine and of its networks.
+_PLACES = (
+    *("etc/pebble", "var/lib/pebble", "var/lib/pebble-web", "var/lib/pebble-record", "etc/mosquitto", "etc/credstore"),
+    *("etc/default/pebble*", "etc/systemd/system/pebble*", "etc/ssh/*_key"),
+    *("etc/NetworkManager/system-connections", "etc/wpa_supplicant/*.conf", "etc/netplan"),
+)
+_PROGRAMS = (".py", ".sh", ".js", ".html", ".md")  # have "password=" in them, and no password
+_NOTHING = frozenset({"true", "false", "none", "null"})
+_names_secrets = re.compile(r"passw|secret|token|credential|psk|\.key$|_key$", re.IGNORECASE).search
+#: A key that says so, and its value: in JSON, in a file of settings, in an option or a query.
+_settings = re.compile(
+    r"""["']?\b[\w.-]*(?:passw(?:or)?d|passwd|secret|token|credential|psk|api_key|private-key|wep-key0|pwd)\b["']?"""
+    r"""[ \t]*[=: ][ \t]*(?:"((?:[^"\\\n]|\\.){1,512})"|'([^'\n]{1,512})'|([^\s"'#&,{}\[\]()][^"'#\n&,{}()]{0,511}))""",
+    re.IGNORECASE,
+).findall
+_logins = re.compile(r"://[^\s/@:\"']{0,64}:([^\s/@\"']{1,200})@").findall
+_keys = re.compile(r"-----BEGIN [A-Z ]*PRIVATE KEY-----\n(.*?)-----END", re.DOTALL).findall
+
+
+class Secrets(NamedTuple):
+    """``known`` by where they are written; ``unread`` are files that may hold more, ``short`` of too short ones."""
+
+    known: dict[str, str]
+    unread: tuple[str, ...]
+    short: tuple[str, ...]
+
+    def hidden(self, text: str) -> str:
+        """Return ``text`` with stars in place of each, in whatever form it is written."""
+        for value in sorted(self.known, key=len, reverse=True):
+            for form in _forms(value):
+                text = text.replace(form, HIDDEN)
+        return text
+
+
+def secrets_of(places: Places, config: Config | None, more: Collection[Path] = ()) -> Secrets:
+    """Return what is known on this machine. ``more``: further files and folders that may hold some."""
+    values = [] if config is None else [(str(value), f"the config's {key}") for key, value in _texts(config, Secret)]
+    folders = [path for pattern in _PLACES for path in sorted(places.root.glob(pattern))]
+    if config is not None:
+        folders += [config.folder, config.state_dir()]
+        folders += [file for _, value in _texts(config, Path) if (file := Path(str(value))).is_file()]
+        values += [(value, f"${name}") for name in config.password_variables if (value := os.environ.get(name))]
+    unread: list[str] = []
+    for file in dict.fromkeys(_walk([*folders, *more], unread)):
+        try:
+            if file.stat().st_size <= _LARGEST:
+                values += [(value, str(file)) for value in values_in(file.name, file.read_bytes())]
+        except OSError:
+            unread.append(str(file))
+    known = {value: where for value, where in reversed(values) if len(value) >= _SHORTEST}
+    short = {where for value, where in values if len(value) < _SHORTEST}
+    return Secrets(known, tuple(sorted(set(unread))), tuple(sorted(short)))
+
+
+def values_in(name: str, raw: bytes) -> Iterator[str]:
+    """Return the secrets in one file, by its name and by the keys in it."""
+    text = raw.decode(errors="replace")
+    yield from _logins(text)
+    keys = _keys(text)
+    yield from (line.strip() for key in keys for line in key.splitlines() if len(line.strip()) >= 4 * _SHORTEST)
+    if name.endswith(_PROGRAMS):
+        return
+    for match in _settings(text):
+        value = next(filter(None, match), "").strip()
+        if value.lower() not in _NOTHING:
+            yield from {value, _decoded(value)}
+    if _names_secrets(name) and "-----BEGIN" not in text and not text.lstrip().startswith("{"):
+        for line in filter(None, map(str.strip, text.splitlines())):
+            _, colon, hashed = line.partition(":$")
+            yield from (part for part in hashed.split("$") if len(part) >= 4 * _SHORTEST) if colon else (line,)
+
+
+def _decoded(value: str) -> str:
+    try:
+        return str(json.loads(f'"{value}"'))
+    except ValueError:
+        return value
+
+
+def _texts(value: object, kind: type, key: str = "") -> Iterator[tuple[str, object]]:
+    """Return the values of one kind in a config, and their keys."""
+    if isinstance(value, kind):
+        yield key, value
+    elif isinstance(value, Section):
+        for field in fields(value):
+            yield from _texts(getattr(value, field.name), kind, f"{key}.{field.encode_name}".lstrip("."))
+    elif isinstance(value, dict):
+        for name, item in value.items():
+            yield from _texts(item, kind, f"{key}.{name}")
+
+
+def _walk(places: Iterable[Path], unread: list[str]) -> Iterator[Path]:
+    def note(error: OSError) -> None:
+        if not isinstance(error, FileNotFoundError | NotADirectoryError):
+            unread.append(str(error.filename))
+
+    for place in places:
+        if place.is_file():
+            yield place
+            continue
+        for folder, _, names in os.walk(place, onerror=note):
+            yield from (file for name in sorted(names) if (file := Path(folder, name)).is_file())
+
+
+def _forms(value: str) -> Iterator[str]:
+    """Return how it may be written: as it is, in JSON, in an address, and as base64."""
+    yield from (value, json.dumps(value)[1:-1], quote(value, safe=""))
+    yield base64.b64encode(value.encode()).rstrip(b"=").decode()

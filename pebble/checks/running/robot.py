@@ -1,0 +1,182 @@
+"""The robot under test, as its own side and its operators' side show it."""
+
+from __future__ import annotations
+
+import os
+import pwd
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+from pebble import contract as c
+from pebble.checks.observer import Observer
+from pebble.client.connection import Target, connected
+from pebble.client.names import Names
+from pebble.client.robot_view import RobotView
+from pebble.config import Config
+from pebble.config.rules.exposure import is_near
+from pebble.config.web import is_loopback
+from pebble.contract.identity import parse_topic
+from pebble.errors import PebbleError
+from pebble.runtime.addresses import Addresses
+from pebble.setup.places import Places
+from pebble.transports import Message, Transport
+
+PATIENCE_S, RESTS_S = 3.0, 0.75
+_STEP_S = 0.005
+_MAX_IDS = 1000  # other robots at a broker of this machine
+_STATES = (c.ONLINE, c.CAPABILITIES, c.STATUS, c.ESTOP_STATE)
+_WATCHED = (*_STATES, c.CONTROL_STATE, c.LINK, c.CHARGING_LEVEL, c.CHARGING_STATUS, c.AUTONOMY_STATUS)
+_ANY = "+/+/+"
+
+
+class Side(Observer):
+    """One side of the robot, and what other robots have left there."""
+
+    def __init__(self, config: Config, target: Target, transport: Transport, names: Names, *, own: bool) -> None:
+        """``own``: the robot's own side, where its processes meet."""
+        self.own = own
+        self.others: dict[str, set[str]] = {}  # retained topics by the base of another robot
+        self.live: set[str] = set()  # other robots that send heartbeats
+        self._addresses = Addresses(config)
+        filters = {self._addresses[channel].topic for channel in (*_WATCHED, *((c.TOUCH_SENSORS,) if own else ()))}
+        if self.is_here(config):  # each message comes once: of filters that overlap, only the wider ones
+            filters -= {channel.filter(config.base) for channel in _STATES}
+            filters |= {channel.filter(_ANY) for channel in _STATES}
+        super().__init__(target, transport, names, config.base, sorted(filters))
+
+    def is_here(self, config: Config) -> bool:
+        """True if it ends on this machine: what other robots have left there can only be left over."""
+        if self.own:
+            return config.transport.kind != "mqtt" or is_loopback(config.local_mqtt.host)
+        return is_near(config.services.mqtt_bridge.remote_mqtt)
+
+    def ask(self) -> None:
+        """Some brokers send what is retained only to those who ask by name."""
+        topics = [self._addresses[channel].topic for channel in _WATCHED if not channel.is_pattern]
+        self.transport.ask([*topics, *self.view.estop.missing, *self.view.estop.missing_control])
+
+    def channel_of(self, topic: str) -> c.Channel | None:
+        return self._addresses.channel(topic)
+
+    def receive(self, message: Message, at: float, wall: float) -> None:
+        if message.topic.startswith(f"{self.base}/") or self.channel_of(message.topic) is not None:
+            super().receive(message, at, wall)
+        else:
+            self._note_other(message)
+
+    def _note_other(self, message: Message) -> None:
+        address = parse_topic(message.topic)
+        if address is None or address.identity.is_server:
+            return
+        base = address.identity.base
+        if address.metric == c.ONLINE.metric and not message.retain:
+            self.live.add(base)
+        elif message.retain and message.payload and (base in self.others or len(self.others) < _MAX_IDS):
+            self.others.setdefault(base, set()).add(message.topic)
+
+    @property
+    def status(self) -> dict[str, object]:
+        """The value of the newest status; empty before the first."""
+        newest = self.newest(c.STATUS)
+        return {} if newest is None else newest.value
+
+    @property
+    def heartbeats(self) -> list[float]:
+        """When live ones arrived (monotonic)."""
+        return [record.at for record in self.of(c.ONLINE) if record.value is not None]
+
+
+@dataclass(kw_only=True)
+class RobotUnderTest:
+    """One robot, and its sides as far as they are reached; ``why_own`` and ``why_operators`` are why they are not."""
+
+    config: Config
+    places: Places
+    by: str  # who tests it, for stops and control: ann@goob
+    patience_s: float  # for a picture, a sound, and other answers
+    rests_s: float  # so long after the last command wheels may turn
+    own: Side | None = None
+    operators: Side | None = None
+    why_own: str = ""
+    why_operators: str = ""
+
+    @property
+    def sides(self) -> list[Side]:
+        return [side for side in (self.own, self.operators) if side is not None]
+
+    @property
+    def way(self) -> Side:
+        """The side from which it is commanded: that of its operators, if it is reached."""
+        return self.operators or self.inside
+
+    @property
+    def inside(self) -> Side:
+        """Its own side, which the check needs."""
+        assert self.own is not None  # noqa: S101
+        return self.own
+
+    @property
+    def view(self) -> RobotView:
+        return self.inside.view
+
+    def read(self) -> None:
+        """Take what has arrived on both sides."""
+        for side in self.sides:
+            side.read()
+
+    def wait(self, condition: Callable[[], object], seconds: float) -> bool:
+        """Read what arrives until ``condition``; False: not within ``seconds``."""
+        end = time.monotonic() + seconds
+        while True:
+            self.read()
+            if condition():
+                return True
+            if time.monotonic() >= end:
+                return False
+            time.sleep(_STEP_S)
+
+
+def user_of(folder: Path) -> pwd.struct_passwd | None:
+    """Return as whom root reaches the robot of this folder, so that it leaves no files of its own; None: as itself."""
+    owner = folder.stat().st_uid if folder.is_dir() else 0
+    return pwd.getpwuid(owner) if owner and os.geteuid() == 0 else None
+
+
+def become_user_of(folder: Path) -> None:
+    """Go on as :func:`user_of`."""
+    user = user_of(folder)
+    if user is not None:
+        os.initgroups(user.pw_name, user.pw_gid)
+        os.setgid(user.pw_gid)
+        os.setuid(user.pw_uid)
+
+
+@contextmanager
+def reached(
+    config: Config, places: Places, by: str, *, patience_s: float = PATIENCE_S, rests_s: float = RESTS_S
+) -> Iterator[RobotUnderTest]:
+    """Connect to both sides of a robot, as far as that is possible, until the block ends."""
+    robot = RobotUnderTest(config=config, places=places, by=by, patience_s=patience_s, rests_s=rests_s)
+    with ExitStack() as stack:
+
+        def connect(*, own: bool) -> tuple[Side | None, str]:
+            target = Target(config=config.path, remote=not own, program="selftest")
+            try:
+                transport, names = stack.enter_context(connected(target))
+                return Side(config, target, transport, names, own=own), ""
+            except PebbleError as error:
+                return None, str(error)
+
+        robot.own, robot.why_own = connect(own=True)
+        robot.why_operators = "its config has no mqtt_bridge"
+        if config.services.mqtt_bridge.enabled:
+            robot.operators, robot.why_operators = connect(own=False)
+        for side in robot.sides:
+            side.ask()
+        robot.wait(lambda: all(side.view.estop.has_capabilities for side in robot.sides), robot.patience_s)
+        for side in robot.sides:
+            side.ask()
+        yield robot

@@ -1,0 +1,108 @@
+"""Checks of the emergency stop and of retained commands. No wheel turns, and the robot is free afterwards."""
+
+import time
+from contextlib import suppress
+
+from pebble.checks.check import CheckResult, failed, ok, skipped
+from pebble.checks.running.robot import RobotUnderTest
+from pebble.client.connection import connected
+from pebble.client.estop import StopSender, new_name
+from pebble.client.estop_states import Reset
+from pebble.contract import ESTOP_RESET, ESTOP_STATE, codec
+from pebble.contract.payloads import EstopReset
+from pebble.errors import PayloadError
+from pebble.transports import Message, QoS
+
+_CONFIRMED_S = 5.0  # it is repeated every half second
+_WHY = "selftest"
+_NO_BOOT, _NO_COUNT = "selftest", 1_000_000  # of no start of a motor owner, and of no stop
+
+
+def stop(robot: RobotUnderTest) -> CheckResult:
+    """Stop it as operators do, and end exactly this stop on its own side."""
+    before = {owner: state.recent for owner, state in robot.view.estop.states.items()}
+    name = new_name()
+    try:
+        outcome = _stopped(robot, name)
+    finally:  # also when this is interrupted: what it has stopped, it ends
+        left = _ended(robot, name, before)
+    return failed(left, "pebble estop reset CONFIG") if left else outcome
+
+
+def _stopped(robot: RobotUnderTest, name: str) -> CheckResult:
+    side = robot.way
+    sender = StopSender(name, by=robot.by, why=_WHY, now=time.monotonic(), robots=[robot.config.base])
+    stopped = sender.robots[robot.config.base]
+    stopped.estop = side.view.estop  # as it is known already, with its topics
+
+    def confirmed() -> bool:
+        side.publish(sender.tick(time.monotonic()))
+        return sender.confirmed
+
+    with side.heard_by(sender.receive):
+        robot.wait(confirmed, _CONFIRMED_S)
+    if not sender.confirmed:
+        return failed(
+            f"NOT CONFIRMED after {_CONFIRMED_S:g} s: {stopped.why}", "pebble doctor CONFIG; pebble estop CONFIG"
+        )
+    from_ = "its own side" if side.own else "operators"
+    return ok(f"confirmed {stopped.confirmed_s:.2f} s after {from_} sent it, and ended by name")
+
+
+def _ended(robot: RobotUnderTest, name: str, before: dict[str, list[str]]) -> str:
+    """End this stop; empty, or why the robot stays stopped."""
+    view = robot.inside.view
+    robot.wait(lambda: all(name in state.recent for state in view.estop.states.values()), 1.0)
+    if not view.latched:
+        return ""
+    for owner, state in view.estop.latched.items():
+        if state.recent[:1] != [name] or not set(state.recent[1:]) <= set(before.get(owner, [])):
+            return f"it was stopped by another one meanwhile, and stays so ({state.by or 'unknown'}: {state.why})"
+    reset = Reset(view.estop, robot.by)
+    if not robot.inside.publish(reset.messages()):
+        return "the end of the stop was not sent: it stays stopped"
+    robot.wait(lambda: not reset.waiting, robot.patience_s)
+    refused = [f"{owner}: {why}" for owner, why in reset.refusals().items()]
+    return f"it stays stopped: {', '.join(refused)}" if refused else ""
+
+
+def retained_commands(robot: RobotUnderTest) -> CheckResult:
+    """Leave a command retained at the broker, one that could do no harm, and see that the robot ignores it.
+
+    It is a reset that no motor owner could take: who reads it, publishes why it refuses it. A live one of another kind
+    follows, so that the silence before it means something.
+    """
+    operators = robot.operators
+    assert operators is not None  # noqa: S101 - the table says so
+    if robot.inside.heartbeats:
+        return skipped("one broker serves both sides: there, what is published to be retained is live at first")
+    owner, state = next(iter(robot.view.estop.states.items()), (None, None))
+    if owner is None or state is None:
+        return skipped("it publishes no emergency stop")
+    if state.reset_refused is not None:
+        return skipped("it refused a reset before, which looks the same", "run it again")
+    topic, answers = ESTOP_RESET.topic(robot.config.base), ESTOP_STATE.topic(robot.config.base, owner=owner)
+    old = codec.encode(ESTOP_RESET, EstopReset(boot=_NO_BOOT, count=0, by=_WHY))
+    live = EstopReset(boot=state.boot, count=state.count + _NO_COUNT, by=_WHY)
+    seen = set[str | None]()
+
+    def note(message: Message, _at: float) -> None:
+        if message.topic == answers:
+            with suppress(PayloadError):
+                seen.add(codec.decode(ESTOP_STATE, message.payload).reset_refused)
+
+    # It puts no name into the topic: nothing with one is retained.
+    with operators.heard_by(note), connected(operators.target) as (beside, _):
+        try:
+            beside.publish(topic, old, qos=QoS.DELIVERED, retain=True, remember=False)
+            robot.wait(lambda: beside.outgoing.waiting == 0, robot.patience_s)
+            operators.send(ESTOP_RESET, live)
+            robot.wait(lambda: "count" in seen, robot.patience_s)
+        finally:
+            beside.publish(topic, b"", qos=QoS.DELIVERED, retain=True, remember=False)
+            robot.wait(lambda: beside.outgoing.waiting == 0, robot.patience_s)
+    if "boot" in seen:
+        return failed("it read a retained command as if it were sent now", "pebble doctor CONFIG")
+    if "count" not in seen:
+        return skipped("a live one of this account is not answered either")
+    return ok("it ignores them")

@@ -1,0 +1,126 @@
+"""The check that turns wheels: a little way, after a person has agreed, and under control that no other person had."""
+
+import time
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+
+import msgspec
+
+from pebble.checks.check import CheckResult, failed, ok, skipped
+from pebble.checks.observer import Record
+from pebble.checks.running.robot import RobotUnderTest, Side
+from pebble.client.control import ControlClient
+from pebble.client.pace_of_link import WIDE
+from pebble.contract import DRIVE, TOUCH_SENSORS, codec
+from pebble.contract.payloads import Drive
+from pebble.transports import Message
+
+SPEED, DRIVES_S = 0.2, 0.3
+_STEP_S = 0.05
+_LOOKS_S = 0.5  # so much longer wheels are looked at
+_CONTROL_S = 3.0
+_SWING = 30  # of a sensor's value: less is noise, as for pebble.perception.hall
+_SENSORS = "set services.serial_mcu_bridge.telemetry.publish_touch_sensors to true"
+_LOG = "pebble doctor CONFIG; journalctl -u pebble -n 50"
+
+
+def wheels(robot: RobotUnderTest) -> CheckResult:
+    """Drive a little way ahead and back; between the two, and after it, the robot stops by itself."""
+    if robot.view.charging:
+        return skipped("it is on its charger")
+    side = robot.way
+    with _in_control(robot, side) as (control, why):
+        if why:
+            return skipped(why)
+        results = []
+        for speed in (SPEED, -SPEED):
+            results.append(_drive(robot, side, control, speed))
+            if isinstance(results[-1], CheckResult):
+                break
+    problem = next((one for one in results if isinstance(one, CheckResult)), None)
+    if problem is not None:
+        return problem
+    rested = [one for one in results if isinstance(one, float)]
+    if not rested:
+        return skipped("it was driven, but reports no wheels: look whether it moved", _SENSORS)
+    return ok(f"they turned ahead and back, and rested {max(rested):.2f} s after the last command")
+
+
+def _drive(robot: RobotUnderTest, side: Side, control: ControlClient, speed: float) -> CheckResult | float | None:
+    """How long after the last command they turned; None: there are no samples of them."""
+    side.publish([_command(side, control, Drive())])  # after a reset it waits for one
+    began = sent_at = time.monotonic()
+    while time.monotonic() < began + DRIVES_S:
+        if robot.view.latched:
+            return failed("it was stopped meanwhile", "pebble estop status CONFIG")
+        if robot.view.controlled and not control.held:
+            return skipped(f"{robot.view.control.who or 'another one'} took control")
+        sent_at = time.monotonic()
+        side.publish([_command(side, control, Drive(z=speed, valid_ms=side.view.pace.valid_ms))])
+        _hold(robot, side, control, max(_STEP_S, side.view.pace.step_s))
+    _hold(robot, side, control, robot.rests_s + _LOOKS_S)
+    samples = robot.inside.of(TOUCH_SENSORS, began - _STEP_S)
+    if not samples:
+        return None
+    turned = [at for at in _turns(samples) if at >= began]
+    if not turned:
+        return failed(f"they did not turn at {speed:+.1f}", f"battery, motors and their wires; {_LOG}")
+    if turned[-1] - sent_at > robot.rests_s:
+        return failed(f"they still turned {turned[-1] - sent_at:.2f} s after the last command", _LOG)
+    return max(0.0, turned[-1] - sent_at)
+
+
+def _turns(samples: Iterable[Record]) -> Iterator[float]:
+    """Return when a wheel had turned on, by any of its sensors."""
+    level: tuple[int, ...] | None = None
+    for sample in samples:
+        if sample.value is None:
+            continue
+        values = msgspec.structs.astuple(sample.value.value)
+        if level is None:
+            level = values
+        elif any(abs(value - before) > _SWING for value, before in zip(values, level, strict=True)):
+            level = values
+            yield sample.at
+
+
+@contextmanager
+def _in_control(robot: RobotUnderTest, side: Side) -> Iterator[tuple[ControlClient, str]]:
+    """Control for the block, or why there is none; the one who has it is asked for nothing."""
+    control = ControlClient(side.view.control, by=robot.by.partition("@")[0], device="selftest")
+
+    def held() -> bool:
+        side.publish(control.tick(time.monotonic()))
+        return control.held or not control.wanted
+
+    why = ""
+    try:
+        if side.view.controlled:
+            control.ask(time.monotonic())
+            robot.wait(held, _CONTROL_S)
+            why = "" if control.held else control.failed or f"{side.view.control.who or 'no one'} has control"
+        yield control, why
+    finally:
+        if not why:
+            side.publish([_command(side, control, Drive(valid_ms=0))])
+        control.release()
+        side.publish(control.tick(time.monotonic()))
+
+
+def _hold(robot: RobotUnderTest, side: Side, control: ControlClient, seconds: float) -> None:
+    """Let time pass, and renew control meanwhile; a request drives nothing."""
+
+    def renew() -> bool:
+        side.publish(control.tick(time.monotonic()))
+        return False
+
+    robot.wait(renew, seconds)
+
+
+def _command(side: Side, control: ControlClient, command: Drive) -> Message:
+    if control.key and command.valid_ms != 0:
+        command = msgspec.structs.replace(command, key=control.key)
+    qos = WIDE.qos
+    if command.moves:
+        qos, command = side.view.pace.qos, side.view.pace.dated(command, time.monotonic(), control.id)
+    return Message(side.view.estop.drive_topic, codec.encode(DRIVE, command), qos)

@@ -1,0 +1,71 @@
+"""Who can drive a robot now: in words, and by name where the folder of its fleet is at hand."""
+
+from collections.abc import Iterator
+from contextlib import suppress
+from pathlib import Path
+
+from pebble.checks.check import CheckResult, ok, warn
+from pebble.config import Config
+from pebble.config.rules.doors import warning_of_open
+from pebble.fleet.folder import FLEET, Fleet, FleetError, load
+from pebble.fleet.roles import ProgramRole, Right, rights
+
+_WHO = "who can drive"
+_SHOWN = 12  # names in one line
+_WORDS = {
+    "open": "every program that reaches its broker, which here only this machine's do",
+    "login": "every account of its broker with a role that drives; which one sent a command is not checked",
+    "named": "every account of its broker with a role that drives, under its own name",
+}
+
+
+def who_drives(config: Config) -> Iterator[CheckResult]:
+    """Its level, and who may drive it at that."""
+    level = config.security.level
+    if open_ := warning_of_open(config):
+        yield warn(open_, "pebble fleet init, then the account of this robot")
+        return
+    yield ok(f"level {level}: it is driven by {_WORDS[level]}")
+    for folder in _folders(config) if level != "open" else ():
+        try:
+            yield ok(_accounts(load(folder)), what=_WHO)
+        except FleetError as error:
+            yield warn(str(error), what=_WHO)
+    if level == "named" and config.security.unnamed != "refuse":
+        while_ = " while nobody has control" if config.security.unnamed == "free" else ""
+        yield warn(
+            f'also senders without a name{while_}, because security.strangers is "{config.security.unnamed}"',
+            "leave out security.strangers once all clients have names",
+            _WHO,
+        )
+
+
+def unknown_brokers(config: Config) -> Iterator[str]:
+    """Name those of several brokers that the fleet beside the config does not have: no file has their rules."""
+    remote = config.services.mqtt_bridge.remote_mqtt
+    for folder in _folders(config) if config.security.level != "open" and len(remote.hosts) > 1 else ():
+        with suppress(FleetError):  # of which the doctor tells
+            known = {(one.host, port) for one in load(folder).brokers for port in (one.port, one.unencrypted)}
+            for host, port in remote.places:
+                if (host, port) not in known:
+                    where = f"services.mqtt_bridge.remote_mqtt.hosts: {host}:{port}"
+                    doctor = "`pebble doctor` tries whether it lets everybody write"
+                    yield f"{where} is no broker of {folder / FLEET}, by this name: {doctor}"
+
+
+def _accounts(fleet: Fleet) -> str:
+    """Those whose roles let them drive, servers of the page with a word more."""
+    found = [
+        f"{name} (a page server: its people, too)" if ProgramRole.PAGE in account.roles else name
+        for name, account in fleet.accounts.items()
+        if Right.DRIVE in rights(account.roles, fleet.level)
+    ]
+    more = f", and {len(found) - _SHOWN} more" if len(found) > _SHOWN else ""
+    return f"{', '.join(found[:_SHOWN]) or 'no account'}{more}; programs on the robot itself, too"
+
+
+def _folders(config: Config) -> list[Path]:
+    """Where the files of its fleet are: beside its config, or the authority that it trusts."""
+    ca_cert = config.services.mqtt_bridge.remote_mqtt.tls.ca_cert
+    places = [config.folder, *([] if ca_cert is None else [Path(ca_cert).parent])]
+    return [one for one in dict.fromkeys(place.absolute() for place in places) if (one / FLEET).is_file()][:1]

@@ -1,0 +1,142 @@
+"""The sample operators drive the sample robot: control, commands, letting go, stop, reset, and a robot that is gone."""
+
+from __future__ import annotations
+
+import subprocess
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import NamedTuple
+
+import pytest
+
+from pebble import contract as c
+from pebble.checks.observer import Observer
+from pebble.client.connection import connected
+from pebble.contract.payloads import Drive
+from tests.checks.conform.programs import OPERATORS, Sample, at_open, robot_in_python
+from tests.support import Broker, Child, further, until
+
+pytestmark = pytest.mark.alone  # rates and deadlines are checked
+
+SLOWEST_HZ, FASTEST_HZ = 8.0, 25.0
+SOON_S, SILENT_S = 0.5, 5.0
+
+
+class Scene(NamedTuple):
+    """A robot, the program of its operator, and everything that both publish."""
+
+    robot: Child
+    operator: Child
+    seen: Observer
+
+    def type(self, *lines: str) -> None:
+        """Type lines as the operator's person."""
+        assert self.operator.stdin is not None
+        self.operator.stdin.write("".join(f"{line}\n" for line in lines).encode())
+        self.operator.stdin.flush()
+
+    def is_connected(self) -> bool:
+        """True if something is published when the person lets go: what is typed before it is connected is dropped."""
+        self.type("0 0")
+        return self.seen.wait(self.commands, 0.5)
+
+    def commands(self, since: float = 0.0) -> list[Drive]:
+        return [record.value for record in self.seen.of(c.DRIVE, since) if record.value is not None]
+
+    def wheels(self) -> list[float]:
+        status = self.seen.newest(c.STATUS)
+        return [] if status is None else status.value.get("wheels", [])
+
+    def drives(self) -> None:
+        """Drive ahead; one that was kept from driving lets go first."""
+        self.type("0 0")
+        self.seen.look(0.3)
+        self.type("0 0.5")
+        assert self.seen.wait(lambda: self.wheels() == [0.5, 0.5], 10)
+
+
+@pytest.fixture(params=[OPERATORS[0], *map(further, OPERATORS[1:])])
+def scene(request: pytest.FixtureRequest, broker: Broker, tmp_path: Path) -> Iterator[Scene]:
+    sample: Sample = request.param
+    with _scene(sample(tmp_path), broker, tmp_path) as scene:
+        yield scene
+
+
+@contextmanager
+def _scene(operator: list[str | Path], broker: Broker, folder: Path) -> Iterator[Scene]:
+    arguments, target = at_open(broker)
+    quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+    robot = Child(
+        [str(word) for word in (*robot_in_python(folder), *arguments[:3], folder / "stop.json", *arguments[3:])],
+        **quiet,
+    )
+    try:
+        with connected(target) as (transport, names):
+            seen = Observer(target, transport, names, names.base, [f"{names.base}/#"])
+            assert seen.wait(lambda: seen.view.estop.states, 30)
+            person = Child([str(word) for word in (*operator, *arguments)], stdin=subprocess.PIPE, **quiet)
+            try:
+                scene = Scene(robot, person, seen)
+                assert until(scene.is_connected, 20)
+                seen.look(1.0)  # until it has seen a heartbeat
+                yield scene
+            finally:
+                person.kill()
+                person.wait()
+    finally:
+        robot.kill()
+        robot.wait()
+
+
+def test_it_asks_for_control_and_drives_at_its_rate(scene: Scene) -> None:
+    scene.drives()
+    began = scene.seen.look(2.0)
+    commands = scene.commands(began)
+    assert SLOWEST_HZ <= len(commands) / 2.0 <= FASTEST_HZ
+    key = scene.seen.newest(c.CONTROL_STATE).key
+    assert {command.key for command in commands} == {key}
+    stamps = [command.t for command in commands]
+    assert stamps == sorted(stamps)
+    scene.type("9 -9")
+    assert scene.seen.wait(lambda: scene.commands()[-1].z == -1, 2)
+    assert scene.commands()[-1].x == 1
+
+
+def test_a_stick_that_is_let_go_stops_it_at_once_and_then_nothing_is_sent(scene: Scene) -> None:
+    scene.drives()
+    began = time.monotonic()
+    scene.type("0 0")
+    assert scene.seen.wait(lambda: scene.wheels() == [0, 0], SOON_S)
+    assert time.monotonic() - began < SOON_S
+    quiet_from = scene.seen.look(SOON_S) + SOON_S
+    scene.seen.look(1.0)
+    assert scene.commands(quiet_from) == []
+
+
+def test_a_stop_latches_the_robot_and_only_a_reset_frees_it(scene: Scene) -> None:
+    scene.drives()
+    scene.type("stop")
+    assert scene.seen.wait(lambda: scene.seen.view.latched, 5)
+    assert scene.seen.wait(lambda: scene.wheels() == [0, 0], SOON_S)
+    scene.seen.look(1.0)
+    scene.type("0 0", "reset")
+    assert scene.seen.wait(lambda: not scene.seen.view.latched, 5)
+    scene.drives()
+
+
+def test_it_releases_control_at_its_end(scene: Scene) -> None:
+    scene.drives()
+    assert scene.operator.stdin is not None
+    scene.operator.stdin.close()
+    assert scene.seen.wait(lambda: scene.seen.newest(c.CONTROL_STATE).key == "", SOON_S)
+    assert scene.operator.wait(10) == 0
+
+
+def test_a_robot_that_is_gone_is_not_driven_on(scene: Scene) -> None:
+    scene.drives()
+    scene.robot.kill()
+    scene.robot.wait()
+    scene.seen.look(SILENT_S)
+    assert scene.commands(scene.seen.look(1.0)) == []

@@ -1,0 +1,383 @@
+"""Each check finds its problem, with the command that fixes it."""
+
+from __future__ import annotations
+
+import json
+import mmap
+import os
+import resource
+import socket
+import subprocess
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from pebble.checks import devices, machine, robot
+from pebble.checks.broker import login
+from pebble.checks.broker.account import robot_account
+from pebble.checks.broker.login_attempt import LoginAttempt, attempt, connect_packet
+from pebble.checks.check import CheckResult, State
+from pebble.checks.who import unknown_brokers, who_drives
+from pebble.config import load, parse
+from pebble.transports.settings import MqttSettings, TlsSettings
+from tests.fleet.brokers import FleetBroker, accounts
+from tests.support import Broker, free_port
+from tests.tcp_proxy import ForbiddingProxy
+
+MEGABYTE = 1024 * 1024
+
+
+@pytest.fixture(scope="module")
+def open_broker(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Broker]:
+    broker = Broker(tmp_path_factory.mktemp("open"))
+    yield broker
+    broker.stop()
+
+
+@pytest.fixture(scope="module")
+def closed_broker(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Broker]:
+    """Requires the login of ann, whose password is geheim."""
+    folder = tmp_path_factory.mktemp("closed")
+    subprocess.run(
+        ["mosquitto_passwd", "-b", "-c", str(folder / "passwords"), "ann", "geheim"], check=True, capture_output=True
+    )
+    broker = Broker(folder, "allow_anonymous false", f"password_file {folder / 'passwords'}")
+    yield broker
+    broker.stop()
+
+
+def levels(findings: Iterator[CheckResult]) -> list[str]:
+    return [finding.state.value for finding in findings]
+
+
+# -- the machine
+
+
+def test_versions() -> None:
+    assert machine.python_version((3, 11, 2)).state is State.OK
+    assert machine.python_version((3, 10, 9)).state is State.FAILED
+    assert machine.installed("paho-mqtt").state is State.OK
+    missing = machine.installed("no-such-package")
+    assert missing.state is State.FAILED
+    assert missing.fix.endswith("-m pip install no-such-package")
+
+
+def test_memory_lock() -> None:
+    assert machine.memory_lock(resource.RLIM_INFINITY, root=False).state is State.OK
+    assert machine.memory_lock(64 * MEGABYTE, root=False).state is State.OK
+    assert machine.memory_lock(8 * MEGABYTE, root=True).state is State.OK
+    low = machine.memory_lock(8 * MEGABYTE, root=False)
+    assert low.state is State.WARN
+    assert "8192 kB" in low.text
+    assert "LimitMEMLOCK=infinity" in low.fix
+
+
+@pytest.mark.parametrize(
+    ("now", "synchronised", "level"),
+    [(0.0, True, State.FAILED), (1.8e9, True, State.OK), (1.8e9, None, State.OK), (1.8e9, False, State.WARN)],
+)
+def test_clock(now: float, synchronised: bool | None, level: State) -> None:
+    finding = machine.clock(now, synchronised)
+    assert finding.state is level
+    assert bool(finding.fix) == (level is not State.OK)
+
+
+@pytest.mark.parametrize(
+    ("script", "known"), [("echo yes", True), ("echo no", False), ("exit 1", None), ("echo Failed to connect", None)]
+)
+def test_clock_synchronisation_by_systemd(
+    script: str, known: bool | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    tool = tmp_path / "timedatectl"
+    tool.write_text(f"#!/bin/sh\n{script}\n")
+    tool.chmod(0o755)
+    monkeypatch.setenv("PATH", str(tmp_path), prepend=os.pathsep)
+    assert machine.synchronised() is known
+    monkeypatch.setenv("PATH", str(tmp_path / "empty"))
+    assert machine.synchronised() is None
+
+
+def test_segments_in_use_are_no_leftovers(tmp_path: Path) -> None:
+    used, left = tmp_path / "1.zenoh", tmp_path / "2.zenoh"
+    assert machine.leftover_segments(tmp_path, Path("/proc")).state is State.OK
+    used.write_bytes(bytes(4096))
+    with used.open("r+b") as file, mmap.mmap(file.fileno(), 4096):
+        assert machine.leftover_segments(tmp_path, Path("/proc")).state is State.OK
+        left.write_bytes(bytes(4096))
+        finding = machine.leftover_segments(tmp_path, Path("/proc"))
+    assert finding.state is State.WARN
+    assert finding.fix == f"rm {left}"
+
+
+# -- the robot
+
+
+def test_run_directory(tmp_path: Path) -> None:
+    own, uid = tmp_path / "run", os.geteuid()
+    assert robot.run_directory(own, uid).text.endswith("will be created")
+    own.mkdir(mode=0o700)
+    assert robot.run_directory(own, uid).state is State.OK
+    own.chmod(0o755)
+    assert robot.run_directory(own, uid) == CheckResult(State.WARN, f"{own} is open to other users", f"chmod 700 {own}")
+    assert robot.run_directory(own, uid + 1).fix.startswith("sudo chown")
+    assert robot.run_directory(tmp_path / ("x" * 100), uid).state is State.FAILED
+    (tmp_path / "file").touch()
+    assert robot.run_directory(tmp_path / "file", uid).text.endswith("is not a directory")
+
+
+def test_leftover_sockets_are_found(tmp_path: Path) -> None:
+    assert robot.leftover_sockets(tmp_path / "missing", robot.is_listening).state is State.OK
+    with socket.socket(socket.AF_UNIX) as living, socket.socket(socket.AF_UNIX) as dying:
+        living.bind(str(tmp_path / "living.sock"))
+        living.listen()
+        assert robot.leftover_sockets(tmp_path, robot.is_listening).text == "1 in use"
+        dying.bind(str(tmp_path / "dead.sock"))
+        finding = robot.leftover_sockets(tmp_path, robot.is_listening)
+    assert finding.state is State.WARN
+    assert finding.fix == f"rm {tmp_path / 'dead.sock'}"
+
+
+def test_serial_port(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    missing = devices.serial_port(tmp_path / "ttyACM0", "a.b")
+    assert missing.state is State.FAILED
+    assert "plugged in" in missing.text
+    (tmp_path / "file").touch()
+    assert devices.serial_port(tmp_path / "file", "a.b").text.endswith("is not a device")
+    tty = os.ttyname(os.openpty()[1])
+    assert devices.serial_port(Path(tty), "a.b").state is State.OK
+    monkeypatch.setattr(os, "access", lambda *_: False)
+    assert devices.serial_port(Path(tty), "a.b").fix.startswith("sudo usermod -aG ")
+
+
+# -- brokers
+
+
+def test_an_open_broker_on_this_machine_is_fine(open_broker: Broker) -> None:
+    findings = list(login.broker("local broker", MqttSettings(host="127.0.0.1", port=open_broker.port)))
+    assert levels(iter(findings)) == ["ok", "ok", "ok"]
+    assert " ms" in findings[0].text
+    assert "anonymous" in findings[1].text
+
+
+def test_a_broker_that_requires_a_login(closed_broker: Broker) -> None:
+    def found(username: str | None, password: str | None) -> list[CheckResult]:
+        settings = MqttSettings(host="127.0.0.1", port=closed_broker.port, username=username, password=password)
+        return list(login.broker("local broker", settings))
+
+    right, wrong, none = found("ann", "geheim"), found("ann", "falsch"), found(None, None)
+    assert [finding.state for finding in right] == [State.OK] * 3
+    assert right[1].text == "refuses anonymous logins"
+    assert wrong[0].state is State.FAILED
+    assert wrong[0].text.startswith("refuses user ann: ")
+    assert none[0].fix == "set username and password_file of this broker"
+    assert "falsch" not in str(wrong)
+
+
+def test_an_unreachable_broker_fails() -> None:
+    port = free_port()
+    finding, *more = login.broker("local broker", MqttSettings(host="127.0.0.1", port=port))
+    assert more == []
+    assert finding == CheckResult(
+        State.FAILED,
+        "cannot be reached: Connection refused",
+        "sudo systemctl start mosquitto",
+        f"local broker 127.0.0.1:{port}",
+    )
+
+
+@pytest.mark.parametrize("protocol", ["3.1.1", "5"])
+@pytest.mark.parametrize(
+    ("allowed", "level", "why"),
+    [
+        ("readwrite #", State.OK, "accepts what this account publishes"),
+        ("read #", State.FAILED, "may not publish to pebble/robots/goob/outgoing/bridge-probe"),
+        (
+            "readwrite pebble/robots/other/#",
+            State.FAILED,
+            "may not publish to pebble/robots/goob/outgoing/bridge-probe",
+        ),
+    ],
+)
+def test_an_account_that_may_not_publish_is_found(
+    tmp_path: Path, protocol: str, allowed: str, level: State, why: str
+) -> None:
+    (tmp_path / "acl").write_text(f"topic {allowed}\n")
+    broker = Broker(tmp_path, f"acl_file {tmp_path / 'acl'}")
+    try:
+        settings = MqttSettings(host="127.0.0.1", port=broker.port, protocol=protocol)
+        finding = next(robot_account("b", settings, "pebble/robots/goob"))
+    finally:
+        broker.stop()
+    assert (finding.state, why in finding.text) == (level, True)
+    assert level is State.OK or finding.fix == "allow it to write and read pebble/robots/goob/outgoing/# on the broker"
+
+
+def test_a_broker_that_hangs_up_on_what_is_published_is_found(open_broker: Broker) -> None:
+    with ForbiddingProxy(open_broker.port) as proxy:
+        proxy.forbidden = {"pebble/robots/goob/outgoing/bridge-probe"}
+        finding = next(robot_account("b", MqttSettings(host="127.0.0.1", port=proxy.port), "pebble/robots/goob"))
+    assert (finding.state, "hangs up" in finding.text) == (State.FAILED, True)
+
+
+def probe_returning(own: LoginAttempt, without_login: LoginAttempt) -> Callable[..., LoginAttempt]:
+    return lambda _settings, *, login: own if login else without_login
+
+
+def test_an_open_or_unencrypted_broker_elsewhere_is_a_warning() -> None:
+    let_in, shut_out = LoginAttempt(code=0, connect_ms=3.0), LoginAttempt(code=5)
+    plain = MqttSettings(host="broker.example", username="ann", password="geheim")
+    tls = MqttSettings(host="broker.example", port=8883, username="ann", password="geheim", tls=TlsSettings())
+    assert levels(login.broker("b", plain, probe_returning(let_in, let_in))) == ["ok", "warn", "warn"]
+    assert levels(login.broker("b", plain, probe_returning(let_in, shut_out))) == ["ok", "ok", "warn"]
+    assert levels(login.broker("b", tls, probe_returning(let_in, shut_out))) == ["ok", "ok", "ok"]
+    anyone = replace(tls, tls=TlsSettings(insecure=True))
+    *_, last = login.broker("b", anyone, probe_returning(let_in, shut_out))
+    assert (last.state, last.fix) == (State.WARN, "set tls.insecure to false")
+
+
+@pytest.mark.parametrize(
+    ("days", "level", "text"),
+    [
+        (3, State.WARN, "its certificate expires in 3 days"),
+        (15, State.OK, "encrypted, its certificate for 15 more days"),
+        (397, State.OK, "encrypted, its certificate for 397 more days"),
+    ],
+)
+def test_the_days_of_a_brokers_certificate(days: int, level: State, text: str) -> None:
+    answer, shut_out = LoginAttempt(code=0, expires=1000.0 + days * 86400), LoginAttempt(code=5)
+    settings = MqttSettings(host="b", username="ann", password="geheim", tls=TlsSettings())
+    *_, last = login.broker("b", settings, probe_returning(answer, shut_out), 1000.0)
+    assert (last.state, last.text) == (level, text)
+
+
+def test_the_certificate_of_a_fleets_broker_is_read(tmp_path: Path) -> None:
+    with FleetBroker(tmp_path / "hall", accounts(["viewer"])) as hall:
+        tls = TlsSettings(ca_cert=hall.place.ca)
+        settings = MqttSettings(
+            host="127.0.0.1", port=hall.port, username="viewer", password=hall.passwords["viewer"], tls=tls
+        )
+        texts = [one.text for one in login.broker("b", settings)]
+    assert texts[1:] == ["refuses anonymous logins", "encrypted, its certificate for 397 more days"]
+
+
+def test_a_server_that_is_no_broker_is_a_problem() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        settings = MqttSettings(host="127.0.0.1", port=server.getsockname()[1])
+        assert "timed out" in attempt(settings, login=True, timeout_s=0.2).problem
+    wrong_file = MqttSettings(host="127.0.0.1", port=free_port(), tls=TlsSettings(ca_cert=Path("/nowhere/ca.pem")))
+    assert attempt(wrong_file, login=True).problem != ""
+    unknown = MqttSettings(host="ü" * 60, port=free_port())
+    assert attempt(unknown, login=True).problem.endswith("is no name of a host")
+
+
+def test_the_connect_packet_follows_the_mqtt_specification() -> None:
+    settings = MqttSettings(host="b", username="ann", password="p" * 200)
+    anonymous, named = connect_packet(settings, login=False), connect_packet(settings, login=True)
+    assert anonymous[:1] + anonymous[2:12] == b"\x10\x00\x04MQTT\x04\x02\x00\x0a"
+    assert anonymous[1] == len(anonymous) - 2
+    assert named[1] & 0x80  # two bytes of length
+    assert (named[1] & 0x7F) + named[2] * 128 == len(named) - 3
+    assert named[10] == 0xC2
+    assert named.endswith(b"\x00\x03ann\x00\xc8" + b"p" * 200)
+
+
+@pytest.mark.parametrize(
+    ("web", "level", "text"),
+    [
+        ({"mqtt": {"host": "127.0.0.1"}}, State.OK, "port 8080 of 127.0.0.1"),
+        ({}, State.FAILED, "web_interface.mqtt.host: is missing"),
+        ({"mqtt": {"host": "b"}, "host": "0.0.0.0"}, State.FAILED, "`pebble cert init` and `pebble web user add`"),
+        ({"mqtt": {"host": "b"}, "host": "0.0.0.0", "plain_http": True}, State.WARN, "is not encrypted"),
+    ],
+)
+def test_the_operator_page_of_a_robot(web: dict[str, object], level: State, text: str) -> None:
+    raw = {"robot": {"id": "goob"}, "services": {"web_handler": {"enabled": True}}, "web_interface": web}
+    (finding,) = robot.operator_page(parse(raw, folder=Path("/nowhere"), env={}))
+    assert (finding.state, text in finding.text) == (level, True)
+
+
+def test_a_whole_robot_is_examined(tmp_path: Path, open_broker: Broker) -> None:
+    path = tmp_path / "fred.json"
+    bridge = {"enabled": True, "remote_mqtt": {"host": "127.0.0.1", "port": free_port()}}
+    serial = {"enabled": True, "serial": {"port": str(tmp_path / "ttyACM0")}}
+    text = {
+        "robot": {"id": "fred"},
+        "local_mqtt": {"port": open_broker.port},
+        "services": {"mqtt_bridge": bridge, "serial_mcu_bridge": serial},
+    }
+    path.write_text(json.dumps(text))
+    findings = list(robot.run_checks(load(path)))
+    failed = [finding.what.split(" ")[0] for finding in findings if finding.state is State.FAILED]
+    assert failed == ["serial", "remote"]
+    assert {"python", "eclipse-zenoh", "memory lock", "clock", "shared memory", "run directory", "sockets"} <= {
+        finding.what for finding in findings
+    }
+    assert [finding for finding in findings if finding.state is not State.OK and not finding.fix] == []
+
+
+# -- who may drive
+
+LOGIN = (
+    "ok level login: it is driven by every account of its broker with a role that drives; "
+    "which one sent a command is not checked"
+)
+
+
+@pytest.mark.parametrize(
+    ("security", "accounts", "expected"),
+    [
+        (
+            {},
+            {},
+            ["ok level open: it is driven by every program that reaches its broker, which here only this machine's do"],
+        ),
+        (
+            {"level": "login"},
+            {"ann": "driver", "otto": "viewer", "page-1": "page"},
+            [
+                LOGIN,
+                "ok ann, page-1 (a page server: its people, too); programs on the robot itself, too",
+            ],
+        ),
+        (
+            {"level": "login"},
+            {f"p{n}": "driver" for n in range(20)},
+            [
+                LOGIN,
+                f"ok {', '.join(f'p{n}' for n in range(12))}, and 8 more; programs on the robot itself, too",
+            ],
+        ),
+    ],
+)
+def test_who_can_drive_is_shown_by_the_level_and_by_the_fleet_beside_the_config(
+    tmp_path: Path, security: dict[str, str], accounts: dict[str, str], expected: list[str]
+) -> None:
+    config = tmp_path / "goob.json"
+    config.write_text(json.dumps({"robot": {"id": "goob"}, "security": security}))
+    roles = {name: {"roles": [role]} for name, role in accounts.items()}
+    fleet = {"level": "login", "brokers": [{"host": "broker.lab", "port": 8883}], "accounts": roles}
+    (tmp_path / "fleet.json").write_text(json.dumps(fleet))
+    found = list(who_drives(load(config)))
+    assert [f"{one.state.value} {one.text}" for one in found] == expected
+
+
+def test_a_second_broker_that_the_fleet_does_not_have_is_named(tmp_path: Path) -> None:
+    config = tmp_path / "goob.json"
+    remote = {"hosts": ["broker.lab", "spare.lab:8884"], "port": 8883, "username": "goob", "tls": {"enabled": True}}
+    services = {"mqtt_bridge": {"enabled": True, "remote_mqtt": remote}}
+    config.write_text(json.dumps({"robot": {"id": "goob"}, "security": {"level": "login"}, "services": services}))
+    fleet = {"level": "login", "brokers": [{"host": "broker.lab", "port": 8883}]}
+    (tmp_path / "fleet.json").write_text(json.dumps(fleet))
+    (found,) = unknown_brokers(load(config))
+    assert "spare.lab:8884 is no broker of" in found
+
+
+def test_a_fleet_that_cannot_be_read_is_named(tmp_path: Path) -> None:
+    config = tmp_path / "goob.json"
+    config.write_text(json.dumps({"robot": {"id": "goob"}, "security": {"level": "login"}}))
+    (tmp_path / "fleet.json").write_text("{")
+    (finding,) = list(who_drives(load(config)))[1:]
+    assert finding.state is State.WARN
+    assert "fleet.json" in finding.text
