@@ -48,7 +48,7 @@ fleet) tests --workers 2 --timeout 900 -s tests/transports/zenoh/test_mesh.py te
 brokers)
     sh tests/brokers/install.sh
     $python -m pytest -ra tests/transports/test_brokers.py tests/transports/test_client_ids.py tests/brokers
-    $python -m pytest -ra -k "(nats or another) and in_python" tests/conform
+    $python -m pytest -ra -k "(nats or another) and in_python" tests/checks/conform
     ;;
 gstreamer)
     debian gst-launch-1.0=gstreamer1.0-tools

@@ -99,7 +99,7 @@ tried: people at a broker of [`pebble fleet`](fleet.md) may not, so use the acco
 One probe leaves those topics: *refused subscriptions* asks for `{random digits}/doctor/one/#`, and publishes one byte
 there where that is granted. Only a topic that no rule mentions shows how an account is refused; no robot and no program
 has that name, and the message is not retained. A broker that logs what it refuses shows it, with a client id that
-begins with `pebble_doctor`.
+begins with `pebble-doctor`.
 
 Not tested, because they cannot be installed here: EMQX, HiveMQ, VerneMQ, NanoMQ, hosted ones. Run the command.
 """

@@ -16,8 +16,9 @@ from typing import Any
 
 import pytest
 
-from pebble.checks.running.checks import CHECKS, MOVING, Check, run
-from pebble.checks.running.robot import reached
+from pebble.checks.check import Check, run
+from pebble.checks.running.checks import CHECKS, MOVING
+from pebble.checks.running.robot import RobotUnderTest, reached
 from pebble.config import load
 from pebble.fleet import certificates
 from pebble.setup.places import Places
@@ -61,13 +62,14 @@ def started(rig: Rig) -> None:
     assert shows(rig, "yes", seconds=60)
 
 
-def found(rig: Rig, checks: tuple[Check, ...] = CHECKS) -> dict[str, tuple[str, str]]:
+def found(rig: Rig, checks: tuple[Check[RobotUnderTest], ...] = CHECKS) -> dict[str, tuple[str, str]]:
     """The state and the text of each check, by a test that has more patience than people have."""
     with reached(load(rig.config), Places(), "ann@desk", patience_s=PATIENCE_S, rests_s=PATIENCE_S / 10) as robot:
-        return {check.name: (outcome.state.value, outcome.text) for check, outcome in run(robot, checks)}
+        results = run(checks, robot, refresh=robot.read)
+        return {check.name: (result.state.value, result.text) for check, result in results}
 
 
-def only(*names: str) -> tuple[Check, ...]:
+def only(*names: str) -> tuple[Check[RobotUnderTest], ...]:
     return tuple(check for check in (*CHECKS, *MOVING) if check.name in names)
 
 

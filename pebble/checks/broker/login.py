@@ -51,7 +51,7 @@ def _logins(
 
 def _own_login(settings: MqttSettings, answer: LoginAttempt) -> CheckResult:
     if answer.code == 0:
-        return ok(f"answers, connected in {answer.connect_ms:.1f} ms")
+        return ok(f"answers, and lets it in within {answer.took_ms:.1f} ms")
     if answer.code == REFUSED_ID:
         fix = "let it admit any client id, or set remote_mqtt.client_id to one that it knows"
         return failed("refuses the client id", fix)

@@ -35,11 +35,15 @@ _MOST = 50_000  # messages that are kept; a probe sends a thousand
 _TRIES = 3  # to take back what is retained
 _RESET = struct.pack("ii", 1, 0)  # SO_LINGER that turns close() into a reset
 
-NAME = "pebble_doctor_of_a_broker"  # as long as the names of a robot's programs
+NAME = "pebble-doctor-of-a-broker"  # as long as the names of a robot's programs
 
 
 class RefusedError(TransportError):
-    """The broker does not take this client. Its text says what it did."""
+    """The broker does not take this client. ``code``: of its CONNACK, if it sent one; the text says what it did."""
+
+    def __init__(self, text: str, code: int | None = None) -> None:
+        super().__init__(text)
+        self.code = code
 
 
 @dataclass(frozen=True, slots=True)
@@ -184,12 +188,17 @@ class BrokerTrial:
     """
 
     def __init__(
-        self, settings: MqttSettings, address: Address, below: str, restart: Callable[[], bool] | None = None
+        self,
+        settings: MqttSettings,
+        address: Address,
+        below: str,
+        restart: Callable[[], bool] | None = None,
+        patience_s: float = ANSWER_S,
     ) -> None:
         self.settings, self.restart = settings, restart  # which has the broker restarted
         self.root = f"{below}/{secrets.token_hex(8)}"
         self.base = self.root  # of the probe that is made now
-        self.round_trip_s, self.patience_s = 0.0, ANSWER_S
+        self.round_trip_s, self.patience_s = 0.0, patience_s
         self.qos, self.retains, self.wildcards = 1, True, True  # as found out by the first probe
         self._address = address
         self._peers: list[Peer] = []
@@ -216,17 +225,17 @@ class BrokerTrial:
         if will is not None:
             will = Message(f"{self.base}/{will.topic}", will.payload, will.qos, retain=will.retain)
             self.left |= {will.topic: None} if will.retain else {}
-        opening = Opening(name, settings, self._credentials.context(), will, self._address)
+        opening = Opening(name, settings, self._credentials.context(), will, self._address, self.patience_s)
         try:
             peer = Peer(self, self.base, opening, bridge=bridge)
         except OSError as error:
-            raise RefusedError(error.strerror or str(error)) from None
+            raise RefusedError(getattr(error, "reason", None) or error.strerror or str(error)) from None
         self._peers.append(peer)
         self.wait(lambda: peer.code is not None or peer.closed)
         if peer.code != 0:
+            why = peer.problem or ("it hangs up" if peer.closed else "it does not answer")
             peer.leave()
-            why = peer.problem or ("it hangs up" if peer.code is None and peer.closed else "it does not answer")
-            raise RefusedError(why)
+            raise RefusedError(why, peer.code)
         return peer
 
     @property

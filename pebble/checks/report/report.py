@@ -11,7 +11,7 @@ import subprocess
 import sys
 import time
 import zipfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from importlib import metadata
 from pathlib import Path
@@ -33,7 +33,8 @@ from pebble.version import __version__
 _JOURNAL_LINES = 2000
 _PROGRAM_S = 20.0
 _LONGEST_PART = 8 << 20  # bytes
-_UNITS = ("etc/systemd/system", "usr/lib/systemd/system", "lib/systemd/system", "usr/local/lib/systemd/system")
+_FOLDERS = ("etc/systemd/system", "usr/lib/systemd/system", "lib/systemd/system", "usr/local/lib/systemd/system")
+_UNITS = (*(f"{folder}/pebble*{inner}" for folder in _FOLDERS for inner in ("", "/*")), "etc/polkit-1/rules.d/*pebble*")
 
 
 class MissingError(PebbleError):
@@ -73,7 +74,7 @@ def make(places: Places, file: Path | None = None) -> Report:
     report = Report(unread=known.unread)
     for name, part in PARTS.items():
         try:
-            report.parts[name] = known.hidden(without_secrets(part(here))[:_LONGEST_PART])
+            report.parts[name] = known.hidden(without_secrets(part(here)))[:_LONGEST_PART]
         except Exception as error:  # noqa: BLE001 - what is broken is why there is a report: the rest is in it
             kind = "" if isinstance(error, PebbleError) else f"{type(error).__name__}: "
             report.missing[name] = known.hidden(without_secrets(kind + " ".join(str(error).split())))
@@ -139,35 +140,26 @@ def _journal(here: Here) -> str:
 
 
 def _units(here: Here) -> str:
-    roots = [here.places.root / name for name in _UNITS]
-    files = [file for root in roots for file in sorted(root.glob("pebble*"))]
-    inside = [file for one in files for file in (sorted(one.glob("*")) if one.is_dir() else [one])]
-    inside += sorted((here.places.root / "etc/polkit-1/rules.d").glob("*pebble*"))
-    if not inside:
+    files = sorted({file for pattern in _UNITS for file in here.places.root.glob(pattern) if file.is_file()})
+    if not files:
         raise MissingError("no unit of Pebble is installed")
-    return "\n".join(f"# {file}\n{file.read_text(encoding='utf-8', errors='replace')}" for file in inside)
+    return "\n".join(map(_described, files)) + "\n"
 
 
 def _slots(here: Here) -> str:
     places = here.places
     if not places.slots.is_dir():
         raise MissingError(f"there is no {places.slots}")
-    return "\n".join(_described(path) for path in _of_slots(places)) + "\n"
-
-
-def _of_slots(places: Places) -> Iterator[Path]:
-    yield from sorted(places.slots.iterdir())
-    yield from sorted(places.slots.glob("*/.complete"))
-    yield places.current_slot
-    yield from sorted(places.slot_state.glob("*"))
+    files = [*sorted(places.slots.glob("*")), *sorted(places.slots.glob("*/.complete")), places.current_slot]
+    return "\n".join(map(_described, [*files, *sorted(places.slot_state.glob("*"))])) + "\n"
 
 
 def _described(path: Path) -> str:
     if path.is_symlink():
-        return f"{path} -> {path.readlink()}"
+        return f"# {path} -> {path.readlink()}"
     if path.is_file():
-        return f"{path}: {path.read_text(encoding='utf-8', errors='replace').strip()[:1000]}"
-    return f"{path}{'/' if path.is_dir() else ' is missing'}"
+        return f"# {path}\n{path.read_text(encoding='utf-8', errors='replace').strip()}"
+    return f"# {path}{'/' if path.is_dir() else ' is missing'}"
 
 
 def _versions(here: Here) -> str:
