@@ -91,7 +91,7 @@ can run here; `make long PART=brokers` compares it.
     pebble doctor --broker mqtt://broker.lab --restart    # asks to restart it: is what it retains still there?
     pebble doctor --broker mqtts://goob@broker.lab --below pebble/robots/goob    # that account may use only that
 
-It takes some 10 s and moves no robot. It publishes below the topic `pebble/doctor`, and removes all that it
+It takes some 10 s and moves no robot. It publishes below *pebble/doctor*, and removes all that it
 left there, also when it is interrupted. `doctor` exits with 0, with 1 (robots can use the broker, and something is to
 be mended) or with 2 (they cannot, with this account). Where an account may not publish and read there, nothing else is
 tried: people at a broker of [`pebble fleet`](fleet.md) may not, so use the account of a robot, as in the fourth line.
