@@ -1,24 +1,18 @@
 """``pebble drive``: drives a robot with the keys of a terminal."""
 
-import secrets
 import socket
 import time
 from collections import deque
-from contextlib import suppress
 from typing import Annotated
 
 import typer
 
 from pebble.client.connection import Target, connected, put_names, target_of
-from pebble.client.driver_lease import ANSWER_S, DriverLease
-from pebble.client.named_topics import NoNameError
-from pebble.client.terminal.driver import TerminalDriver
+from pebble.client.terminal.driver import PERIOD_S, TerminalDriver
 from pebble.client.terminal.key_decoder import END
-from pebble.client.terminal.key_gesture import PERIOD_S, KeyGesture
 from pebble.commands.estop import me
 from pebble.commands.options import RobotArgument, with_target
 from pebble.commands.terminal.loop import TerminalLoop
-from pebble.media.in_flight import InFlight
 from pebble.transports import Message, QoS, State, Transport
 from pebble.transports.clock import since_boot as clock
 
@@ -27,8 +21,8 @@ W A S D or arrows drive, Q E grousers, space stops.
 ! or Esc Esc is the emergency stop, Ctrl-C ends.
 T takes control, or asks for it; O takes it over."""
 _STOP_S = 3.0  # so long an emergency stop is still sent after the terminal has ended
+_ANSWER_S = 0.25  # a broker that acknowledges nothing for longer would deliver commands late, all at once
 _ARRIVED = 1000  # messages that wait to be handled
-_OVERHEAD = 32  # bytes of a message on the wire besides topic and payload
 
 
 @with_target(program="drive")
@@ -45,9 +39,8 @@ def drive(
     W A S D or the arrows drive, Q and E move the grousers, space stops. ! or twice Escape is the emergency stop,
     which only `pebble estop reset` ends. Ctrl-C ends.
 
-    A terminal repeats a key that is held and does not report its release, so a key counts as held for 0.4 s: the
-    robot moves on for so long after you let go, and halts briefly where the first repetition comes later than that.
-    Of several keys only the last one repeats. What interrupts a drive ends it: let go of all keys, then press again.
+    A key counts as held for 0.4 s after its last repetition: the robot moves on for so long after you let go, and halts
+    briefly where the first repetition comes later. What interrupts a drive ends it: let go of all keys, press again.
 
     Control is taken if nobody has it, and given back after a minute without a drive. T asks another driver for it, O
     takes it over. When another one asks, L lets them drive, K keeps it.
@@ -63,91 +56,56 @@ def drive(
     target = target_of(robot, target)
     with connected(target) as (transport, names):
         by, device = me(names.account), f"terminal on {socket.gethostname()}"
-        lease = DriverLease(names.base, f"drive-{secrets.token_hex(4)}", by=by, device=device)
         heartbeat = target.remote or str(target.url).startswith("mqtt")  # within a robot there is none
         driver = TerminalDriver(
-            names.base, KeyGesture(speed, turn), lease, by=by, now=clock(), take_over=take_over, heartbeat=heartbeat
+            names.base, by=by, device=device, speed=speed, turn=turn, take_over=take_over, heartbeat=heartbeat
         )
         put_names(transport, names, lambda base: base == names.base and driver.robot.named)
-        driving = _Driving(transport, driver)
         typer.echo(_KEYS)
         with opened() as terminal:
-            return driving.run(TerminalLoop(terminal, clock))
+            loop = TerminalLoop(terminal, clock)
+            _drive(transport, driver, loop)
+    if driver.unconfirmed:
+        typer.echo(f"pebble: the emergency stop of {driver.name} is NOT CONFIRMED", err=True)
+    return 0 if loop.ended in ("SIGINT", END) else 1
 
 
-class _Driving:
-    """Passes keys and messages to the driver, and what it returns to the transport, every 50 ms."""
+def _drive(transport: Transport, driver: TerminalDriver, loop: TerminalLoop) -> None:
+    """Pass keys and messages to the driver, and what it returns to the transport, until the terminal ends."""
+    arrived: deque[tuple[Message, float, float]] = deque(maxlen=_ARRIVED)
+    for filter_ in driver.filters:
+        transport.subscribe(
+            filter_, lambda message: arrived.append((message, clock(), time.time())), qos=QoS.DELIVERED, direct=True
+        )
 
-    def __init__(self, transport: Transport, driver: TerminalDriver) -> None:
-        """Subscribes; on a slow network this takes seconds."""
-        self._transport, self._driver = transport, driver
-        self._in_flight = InFlight(_OVERHEAD)
-        self._arrived: deque[tuple[Message, float, float]] = deque(maxlen=_ARRIVED)
-        self._nameless: NoNameError | None = None  # the robot takes no commands from here
-        for filter_ in driver.filters:
-            transport.subscribe(filter_, self._take, qos=QoS.DELIVERED, direct=True)
-
-    def run(self, loop: TerminalLoop) -> int:
-        """Until a signal, Ctrl-D, or the end of the terminal."""
-        try:
-            while not (loop.ended or self._nameless):
-                keys, now = loop.keys(PERIOD_S), clock()
-                self._driver.press(keys, now)
-                self._tick(now)
-                loop.show(self._driver.status, at_once=bool(keys))
-                loop.suspend(lambda: self._halt(self._driver.suspend(clock())))
-        finally:
-            self._halt(self._driver.leave(clock(), time.time()))
-            self._finish_stop()
-        if self._nameless:
-            raise self._nameless
-        return 0 if loop.ended in ("SIGINT", END) else 1
-
-    def _take(self, message: Message) -> None:
-        self._arrived.append((message, clock(), time.time()))
-
-    def _tick(self, now: float) -> None:
-        while self._arrived:
-            self._driver.receive(*self._arrived.popleft())
-        outgoing = self._transport.outgoing
-        self._in_flight.acknowledge(outgoing.waiting)
-        late_s = self._in_flight.age_s(now)
-        if problem := self._problem():
-            self._in_flight.clear()
-        elif outgoing.stalled_s > ANSWER_S:
-            problem = "it does not answer"
-        self._publish(self._driver.tick(now, time.time(), problem=problem, late_s=late_s), now)
-
-    def _publish(self, messages: list[Message], now: float) -> None:
+    def publish(messages: list[Message]) -> None:
         for message in messages:
-            if self._accepts(message):
-                self._in_flight.sent(len(message.topic) + len(message.payload) + _OVERHEAD, now)
-            else:
-                self._driver.refused(now)
+            transport.publish(message.topic, message.payload, qos=message.qos, urgent=True)
 
-    def _accepts(self, message: Message) -> bool:
-        try:
-            return self._transport.publish(message.topic, message.payload, qos=message.qos, urgent=True)
-        except NoNameError as error:
-            self._nameless = error
-            return False
+    def tick() -> None:
+        while arrived:
+            driver.receive(*arrived.popleft())
+        late_s = transport.outgoing.stalled_s
+        problem = "" if transport.state is State.CONNECTED else transport.problem or "it was lost"
+        problem = problem or ("it does not answer" if late_s > _ANSWER_S else "")
+        publish(driver.tick(clock(), problem=problem, late_s=late_s))
 
-    def _problem(self) -> str:
-        return "" if self._transport.state is State.CONNECTED else self._transport.problem or "it was lost"
-
-    def _halt(self, messages: list[Message]) -> None:
-        """Publish the last zero, and twice more, before this process ends or stands still."""
-        self._publish(messages, clock())
-        for _ in range(3 if messages else 0):
+    def halt(*, leave: bool) -> None:
+        publish(driver.halt(clock(), leave=leave))
+        for _ in range(3):
             time.sleep(PERIOD_S)
-            self._tick(clock())
+            tick()
 
-    def _finish_stop(self) -> None:
-        """An emergency stop is not given up because the terminal has ended."""
+    try:
+        while not loop.ended:
+            keys = loop.keys(PERIOD_S)
+            driver.press(keys, clock())
+            tick()
+            loop.show(driver.status, at_once=bool(keys))
+            loop.suspend(lambda: halt(leave=False))
+    finally:
+        halt(leave=True)
         end = clock() + _STOP_S
-        while self._driver.unconfirmed and clock() < end:
+        while driver.unconfirmed and clock() < end:
             time.sleep(PERIOD_S)
-            self._tick(clock())
-        if self._driver.unconfirmed:
-            with suppress(OSError):  # that terminal is gone
-                typer.echo(f"pebble: the emergency stop of {self._driver.name} is NOT CONFIRMED", err=True)
+            tick()

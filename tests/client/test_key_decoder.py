@@ -25,7 +25,7 @@ from pebble.client.terminal.key_decoder import ALONE_S, KeyDecoder
         (b"\x1b[5~w", ["w"]),
         (b"\x1b[[Aw", ["w"]),  # the first function key of the Linux console
         (b"\x1b[200~w\x1b[201~", ["w"]),
-        ("ä€\x00\r\n\t\x7f".encode(), []),
+        ("ä€\x00\r\n\t\x7f".encode(), ["ä", "€"]),
         (b"\x1b[" + b"0" * 100 + b"w", []),
     ],
 )

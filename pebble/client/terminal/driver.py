@@ -1,6 +1,7 @@
-"""Drives one robot with the keys of a terminal: what may be sent, why not, and what is shown. Pure.
+"""Drives one robot with the keys of a terminal: what is sent, and what is shown. Pure.
 
-The rules are those of the operator page: a reason against driving ends the gesture, and the keys must be released.
+A terminal repeats a key that is held and does not report its release: a key counts as held for HELD_S after its last
+repetition. A reason against driving ends the drive, and all keys must be released before the next one.
 """
 
 import secrets
@@ -8,316 +9,221 @@ from collections.abc import Sequence
 
 import msgspec
 
-from pebble.client.control import IDLE_S, UNANSWERED, ControlClient
-from pebble.client.drive_reasons import SLOW_S, SLOW_SPEED, Code, Situation, first_reason
-from pebble.client.driver_lease import FILTER, LISTEN_S, DriverLease
+from pebble import contract as c
+from pebble.client.control import IDLE_S, ControlClient
+from pebble.client.drive_reasons import Code, first_reason
+from pebble.client.estop import StopSender, new_name
 from pebble.client.names import id_of
-from pebble.client.pace_of_link import WIDE, Pace
+from pebble.client.pace_of_link import WIDE
 from pebble.client.robot_view import RobotView
-from pebble.client.terminal.key_decoder import SPACE
-from pebble.client.terminal.key_gesture import AXES, KeyGesture
-from pebble.client.terminal.stop_keys import StopKeys
-from pebble.contract import (
-    AUTONOMY_STATUS,
-    CAPABILITIES,
-    CHARGING_LEVEL,
-    CONTROL_STATE,
-    DRIVE,
-    ESTOP_STATE,
-    LINK,
-    ONLINE,
-    channel_of,
-    codec,
-)
+from pebble.client.terminal.key_decoder import DOWN, ESCAPE, LEFT, RIGHT, SPACE, UP
+from pebble.contract import channel_of, codec
 from pebble.contract.payloads import Drive
-from pebble.transports import Message
+from pebble.transports import Message, QoS
 
-_WANTS_S = 1.0  # after a key that drives
-
-TAKE, TAKE_OVER, LET, KEEP = "t", "o", "l", "k"  # keys
-
-_RECEIVED = (ESTOP_STATE, CONTROL_STATE, CAPABILITIES, ONLINE, LINK, CHARGING_LEVEL, AUTONOMY_STATUS)
+HELD_S, PERIOD_S = 0.4, 0.05  # a key after its last repetition; between two commands
+_STALL_S = 0.25  # a process that stood still for longer does not go on as if nothing had happened
+_BURST = 8  # as many keys at once were held back on the way, and are old
+_TWICE_S = 0.6  # between two presses of Escape
+_ZEROS = 3  # sent where a drive ends
+_WANTS_S = 1.0  # control, after a key that drives
+_ZERO, _FINAL_ZERO = Drive(), Drive(valid_ms=0)  # after the second one an interrupted script does not go on
+_AXES = {
+    "w": ("z", 1), UP: ("z", 1), "s": ("z", -1), DOWN: ("z", -1),
+    "d": ("x", 1), RIGHT: ("x", 1), "a": ("x", -1), LEFT: ("x", -1),
+    "q": ("y", 1), "e": ("y", -1),
+}  # fmt: skip
 _WORDS = {
-    Code.UNSEEN: "waiting for {name}",
+    Code.SILENT: "{name} is silent or offline",
+    Code.UNSEEN: "no heartbeat of {name}: is it on?",
+    Code.STOPPED: "stopped by {by}: pebble estop reset {name}",
     Code.STOPPING: "emergency stop",
     Code.RESET: "it was reset a moment ago",
     Code.UNKNOWN: "{name} has not published what it can do",
     Code.NO_DRIVE: "{name} does not drive",
-    Code.LISTENING: "listening for other drivers",
+    Code.LEASE: "{who} drives: t asks for control, o takes it over",
+    Code.LISTENING: "nobody drives: t takes control",
+    Code.SCRIPT: "a script is driving: stop it first",
+    Code.LATE: "commands are late",
 }
 
 
 class TerminalDriver:
-    """One person at one terminal. Pass every message of ``filters`` to :meth:`receive`, keys to :meth:`press`.
+    """One person at one terminal. Pass messages to :meth:`receive`, keys to :meth:`press`; publish what is returned.
 
-    Publish what :meth:`tick` and :meth:`leave` return, at once. ``heartbeat``: whether the robot sends one on this
-    connection. Times are seconds of one monotonic clock that goes on while the machine is suspended.
+    ``heartbeat``: whether the robot sends one on this connection. Times are seconds of one monotonic clock that goes
+    on while the machine is suspended.
     """
 
     def __init__(
-        self,
-        base: str,
-        gesture: KeyGesture,
-        lease: DriverLease,
-        *,
-        by: str,
-        now: float,
-        take_over: bool = False,
-        heartbeat: bool = True,
+        self, base: str, *, by: str, device: str, speed: float, turn: float, take_over: bool, heartbeat: bool
     ) -> None:
-        self.robot = RobotView(base)
-        self.gesture, self.lease = gesture, lease
-        self.control = ControlClient(
-            self.robot.control, by=by.partition("@")[0], device=lease.device, pace_of=lambda: self._pace
-        )
-        self.stop = StopKeys(self.robot, by)
-        self._take_over, self._heartbeat = take_over, heartbeat
-        self._began = self._used_at = now
-        self._wants_until = float("inf")  # until then control is taken as soon as it is free
-        self._decided = ""  # the key of control, as far as the gesture knows of it
-        self._reason = "connecting"
-        self._connected = False
-        self._key = ""  # where the robot has given none; another one with each connection
-        self._out: list[Message] = []
+        self.robot, self.name = RobotView(base), id_of(base)
+        self.stop: StopSender | None = None
+        pace_of = lambda: self.robot.pace if heartbeat else WIDE  # noqa: E731 - within the robot there is no link
+        self._control = ControlClient(self.robot.control, by=by.partition("@")[0], device=device, pace_of=pace_of)
+        self._by, self._speed, self._turn, self._heartbeat = by, speed, turn, heartbeat
+        self._pace_of, self._id = pace_of, secrets.token_hex(4)
+        self._wants_until, self._take_over = float("inf"), take_over  # control as soon as it is free, or at once
+        self._held: dict[str, tuple[int, float]] = {}  # by axis: the direction, and when its key last arrived
+        self._driving, self._must_let_go = False, False
+        self._last, self._zeros, self._decided = _ZERO, 0, ""
+        self._reason, self._note = "connecting", ""
+        self._key_at = self._sent_at = self._ticked_at = self._escape_at = float("-inf")
+        self._used_at = 0.0
 
     @property
     def filters(self) -> list[str]:
-        return [*(channel.filter(self.robot.base) for channel in _RECEIVED), FILTER]
-
-    @property
-    def name(self) -> str:
-        """How people name the robot here."""
-        return id_of(self.robot.base)
-
-    # -- what arrives
+        channels = (c.ESTOP_STATE, c.CONTROL_STATE, c.CAPABILITIES, c.ONLINE, c.LINK, c.CHARGING_LEVEL)
+        return [channel.filter(self.robot.base) for channel in (*channels, c.AUTONOMY_STATUS)]
 
     def receive(self, message: Message, now: float, wall: float) -> None:
-        held = self.lease.held
-        self.lease.receive(message, now)
-        if held and not self.lease.held:  # of a robot that does not keep control itself
-            self._take_over = False  # a newer driver is asked for, not fought
-            self._drive(self.gesture.interrupt(now, repeat=False), now)
-        if message.topic.startswith(f"{self.robot.base}/"):
-            channel = channel_of(message.topic[len(self.robot.base) + 1 :])
-            self.robot.receive(channel, message, now, wall)
-            if channel not in (CONTROL_STATE, LINK):
-                self.robot.remember(message)
-            self._check_control(now)
-        self.stop.receive(message, now)
+        channel = channel_of(message.topic.removeprefix(f"{self.robot.base}/"))
+        self.robot.receive(channel, message, now, wall)
+        if channel not in (c.CONTROL_STATE, c.LINK):
+            self.robot.remember(message)
+        if self.stop is not None:
+            self.stop.receive(message, now)
 
     def press(self, keys: Sequence[str], now: float) -> None:
+        """Take the keys that were read; the newest one of an axis counts."""
         for key in keys:
-            if self.stop.pressed(key, now):
-                self._out += self.stop.stop(now)
-                self._drive(self.gesture.stop(now), now)
+            if key == "!" or (key == ESCAPE and now - self._escape_at <= _TWICE_S):
+                self._begin_stop(now)
             elif key == SPACE:
-                self._drive(self.gesture.stop(now), now)
-            elif self.robot.controlled:
-                self._press_control(key, now)
-        if not AXES.keys().isdisjoint(keys):
-            self._wants_until = max(self._wants_until, now + _WANTS_S)
-        self.gesture.press(keys, now)
+                self._end(_FINAL_ZERO, now)
+            elif key in ("t", "o"):
+                self._control.ask(now, over=key == "o")
+            elif key == "l" and self._control.asked_by:
+                self._end(_FINAL_ZERO, now)
+                self._control.release()
+            elif key == "k":
+                self._control.keep()
+            elif key in _AXES:
+                axis, direction = _AXES[key]
+                self._held[axis], self._key_at = (direction, now), now
+                self._wants_until = max(self._wants_until, now + _WANTS_S)
+            elif not key.isascii():
+                self._note = f"this keyboard types {key}: W A S D need a Latin layout; the arrows drive, too"
+            self._escape_at = now if key == ESCAPE else self._escape_at
+        if len(keys) >= _BURST:
+            self._end(_FINAL_ZERO, now)
 
-    # -- what follows
-
-    def tick(self, now: float, wall: float, *, problem: str = "", late_s: float = 0.0) -> list[Message]:
-        """What to publish now; to be called every 50 ms.
-
-        ``problem``: why there is no connection; ``late_s``: how long the oldest command has not been acknowledged.
-        """
-        if not problem and not self._connected:
-            self.lease.reconnected()
-            self._key = secrets.token_hex(4)
-        self._connected = not problem
-        situation = self._situation(now, problem, late_s)
-        against = first_reason(situation)
-        self._reason = self._words(against, situation, now)
-        limit = SLOW_SPEED if (self.lease.round_trip_s or 0.0) >= SLOW_S else 1.0
-        self._drive(self.gesture.update(against is None, now, limit=limit, step_s=self._pace.step_s), now)
-        if self.robot.controlled:
-            self._tick_control(now, int(1000 * wall), problem)
-        elif self.gesture.active:
-            if not self.lease.held:
-                self._take_over = False
-                self.lease.take(now, int(1000 * wall))
-            self.lease.use(now)
-        self._out += self.lease.tick(now, int(1000 * wall))
-        self._out += self.stop.tick(now)
-        out, self._out = self._out, []
+    def tick(self, now: float, *, problem: str = "", late_s: float = 0.0) -> list[Message]:
+        """Return what to publish now; to be called every PERIOD_S. ``problem``: why there is no connection."""
+        out = [] if problem else self._tick_control(now)
+        out += [] if self.stop is None else self.stop.tick(now)
+        self._reason = f"no connection: {problem}" if problem else self._why_not(now, late_s)
+        stalled, self._ticked_at = now - self._ticked_at > _STALL_S, now
+        if self._must_let_go and now - self._key_at >= HELD_S:
+            self._must_let_go = False
+            self._held.clear()
+        wanted = self._wanted(now)
+        if stalled or (self._driving and self._reason):
+            self._end(_FINAL_ZERO, now)
+        elif wanted.moves and not self._must_let_go:
+            self._must_let_go = self._reason != ""
+            step_s = max(self._pace_of().step_s, 0.8 * PERIOD_S)
+            if not self._reason and (not self._driving or now - self._sent_at >= step_s):
+                self._driving, self._zeros, self._used_at, self._last = True, 0, now, wanted
+                return [*out, self._message(wanted, now)]
+        elif self._driving and not wanted.moves:
+            self._driving, self._last, self._zeros = False, _ZERO, _ZEROS
+        if self._zeros:
+            self._zeros -= 1
+            out.append(self._message(self._last, now))
         return out
 
-    def refused(self, now: float) -> None:
-        """What :meth:`tick` returned was not accepted by the transport."""
-        self.gesture.interrupt(now, repeat=False)
-
-    def leave(self, now: float, wall: float) -> list[Message]:
-        """The terminal is gone, or the driver leaves: stop, and give the lease back. Then :meth:`tick` twice more."""
-        self._drive(self.gesture.interrupt(now), now)
-        self._wants_until, self._decided = now, ""  # the zero is repeated all the same
-        self.control.release()
-        self._out += self.control.tick(now)
-        self.lease.release()
-        self._out += self.lease.tick(now, int(1000 * wall))
-        out, self._out = self._out, []
-        return out
-
-    def suspend(self, now: float) -> list[Message]:
-        """This process is about to stand still. Then :meth:`tick` twice more."""
-        self._drive(self.gesture.interrupt(now), now)
-        out, self._out = self._out, []
-        return out
+    def halt(self, now: float, *, leave: bool) -> list[Message]:
+        """Stop, because the terminal or the person goes, or this process stands still; then :meth:`tick` twice more."""
+        self._end(_FINAL_ZERO, now)
+        if leave:
+            self._wants_until = now
+            self._control.release()
+        return self.tick(now)
 
     @property
     def unconfirmed(self) -> bool:
-        """Whether an emergency stop from here is not confirmed."""
-        return self.stop.unconfirmed
-
-    # -- what is shown
+        """True if an emergency stop from here is not confirmed."""
+        return self.stop is not None and not self.stop.confirmed
 
     def status(self) -> str:
-        """One line: what is sent, or why nothing is, and what is known of the robot. Parts of it come from others."""
-        parts = [self.name, self._doing(), self.stop.text(), *self._others(), self._battery(), self._latency()]
-        return " · ".join(part for part in parts if part)
-
-    def _doing(self) -> str:
-        if self.gesture.active:
-            last = self.gesture.last
-            y = f" y {last.y:+.2f}" if last.y else ""
-            return f"driving x {last.x:+.2f} z {last.z:+.2f}{y}"
-        if self._reason:
-            return self._reason
-        return "let go first" if self.gesture.must_release else "ready"
-
-    def _others(self) -> list[str]:
-        """Who else wants to drive, or does."""
-        state, asks = self.robot.control.state, self.control.asked_by
-        asked = f"{asks} asks for control: l lets {asks} drive, k keeps it" if asks else ""
-        return [asked, "somebody else drives, too" if self.control.held and state is not None and state.others else ""]
-
-    def _battery(self) -> str:
-        return "" if self.robot.volts is None else f"{self.robot.volts:.1f} V"
-
-    def _latency(self) -> str:
-        if self._heartbeat and self.robot.slow_s is not None:
-            return f"slow connection: commands take {self.robot.slow_s:.1f} s"
-        if self.lease.round_trip_s is not None:
-            return f"{1000 * self.lease.round_trip_s:.0f} ms"
-        latency = self.robot.liveness.latency_s
-        return "" if latency is None else f"heartbeat {1000 * latency:.0f} ms old"
+        """Return one line: what is sent, or why nothing is, and what is known. Parts of it come from others."""
+        asks, robot = self._control.asked_by, self.robot
+        doing = f"driving x {self._last.x:+.2f} z {self._last.z:+.2f}" if self._driving else self._reason
+        stop = self.stop.robots[robot.base] if self.stop is not None and self.unconfirmed else None
+        parts = [
+            self.name,
+            doing or ("let go first" if self._must_let_go else "ready"),
+            "" if stop is None else f"EMERGENCY STOP NOT CONFIRMED: {stop.why}",
+            f"{asks} asks for control: l lets {asks} drive, k keeps it" if asks else "",
+            self._control.failed if not self._control.held else "",
+            "" if robot.volts is None else f"{robot.volts:.1f} V",
+            "" if not robot.slow_s else f"slow connection: commands take {robot.slow_s:.1f} s",
+            self._note,
+        ]
+        return " · ".join(filter(None, parts))
 
     # -- inside
 
-    @property
-    def _pace(self) -> Pace:
-        return self.robot.pace if self._heartbeat else WIDE  # within the robot there is no link
-
-    def _situation(self, now: float, problem: str, late_s: float) -> Situation:
-        """What speaks for and against driving now."""
-        lease = self.lease
-        situation = self.robot.situation(now)
+    def _tick_control(self, now: float) -> list[Message]:
+        """Ask for control where a key was pressed, and give it back after a minute without one."""
+        control = self._control
         if self.robot.controlled:
-            driven = self.robot.control.who != "" and not self.control.held
-            listening = not self.control.held
-        else:
-            other = lease.other(now)
-            driven = other is not None and not self._take_over
-            listening = not lease.held and other is None and now - self._began < LISTEN_S
-        return situation._replace(
-            problem=problem,
-            online=situation.online if self._heartbeat else True,
-            stopping=self.stop.sending,
-            driven=driven,
-            listening=listening,
-            late_s=max(late_s, lease.late_s(now), lease.round_trip_s or 0.0),
-        )
+            if control.held and now - self._used_at > IDLE_S:
+                control.release()
+            elif now < self._wants_until and not control.wanted and self.robot.control.state is not None:
+                if self._take_over or not self.robot.control.who:
+                    control.ask(now, over=self._take_over)
+                    self._used_at, self._take_over, self._wants_until = now, False, now
+        out = control.tick(now)
+        if control.decided != self._decided:  # whoever gets control begins from rest; so does this terminal
+            self._decided, self._used_at = control.decided, now
+            if self._driving:
+                self._end(_FINAL_ZERO, now)
+                self._zeros = 1  # another one may drive by now
+        return out
 
-    def _words(self, code: Code | None, situation: Situation, now: float) -> str:
-        """The reason against driving as it is shown; empty if there is none."""
-        robot, name = self.robot, self.name
-        match code:
-            case None:
-                return ""
-            case Code.BROKER:
-                return f"no connection: {situation.problem}"
-            case Code.SILENT if robot.liveness.reported_offline:
-                return f"{name} is offline"
-            case Code.SILENT:
-                return f"{name} is silent for {robot.liveness.age_s(now):.0f} s"
-            case Code.UNSEEN if robot.liveness.received_at is None:
-                return f"no heartbeat of {name}: is it on?"
-            case Code.STOPPED:
-                by = robot.stopped_by
-                why = f" ({by.why})" if by is not None and by.why else ""
-                return f"stopped by {(by and by.by) or 'unknown'}{why}: pebble estop reset {name}"
-            case Code.LEASE | Code.LISTENING if robot.controlled:
-                return self._whose()
-            case Code.LEASE:
-                return f"{self.lease.other(now)} is driving (--take-over drives instead)"
-            case Code.SCRIPT:
-                return f"{(robot.autonomy and robot.autonomy.file) or 'a script'} is driving: stop it first"
-            case Code.LATE:
-                return f"commands are late ({1000 * situation.late_s:.0f} ms)"
-        return _WORDS[code].format(name=name)
+    def _why_not(self, now: float, late_s: float) -> str:
+        """Return the reason against driving; empty if there is none."""
+        who, stopped = self.robot.control.who, self.robot.stopped_by
+        is_sending = self.stop is not None and not self.stop.finished
+        situation = self.robot.situation(now)._replace(stopping=is_sending, late_s=late_s)
+        if not self._heartbeat:
+            situation = situation._replace(online=True)
+        if self.robot.controlled and not self._control.held:
+            situation = situation._replace(driven=who != "", listening=True)
+        code, state = first_reason(situation), self.robot.control.state
+        if state is not None and who:
+            who = f"{who} ({state.device}{', ' * bool(state.device)}name {'' if state.named else 'not '}checked)"
+        return "" if code is None else _WORDS[code].format(name=self.name, who=who, by=(stopped and stopped.by) or "?")
 
-    def _whose(self) -> str:
-        """Who has control, which is not here, and what can be done about it."""
-        control, state = self.robot.control, self.robot.control.state
-        if state is None:
-            return f"{self.name} has not published who has control"
-        if not control.who:
-            if self.control.failed.endswith(UNANSWERED):  # brokers do not tell what they refuse
-                return f"{self.control.failed}: may this account drive, and is the robot of its broker's level? t asks"
-            return "taking control" if self.control.wanted else "nobody drives: t takes control"
-        device = f"{state.device}, " if state.device else ""
-        who = f"{control.who} ({device}name {'' if state.named else 'not '}checked) drives"
-        return f"{who}: asked, o takes over" if self.control.wanted else f"{who}: t asks for control, o takes over"
+    def _wanted(self, now: float) -> Drive:
+        side, ahead, up = (direction if now - at < HELD_S else 0 for direction, at in map(self._held_at, "xzy"))
+        turn, speed = side * self._turn, ahead * self._speed
+        most = max(1.0, abs(speed + turn), abs(speed - turn))  # no wheel is faster than 1
+        x, z, y = (round(axis, 3) + 0.0 for axis in (turn / most, speed / most, up * self._speed))
+        return Drive(x=x, z=z, y=y, valid_ms=WIDE.valid_ms)
 
-    def _press_control(self, key: str, now: float) -> None:
-        if key in (TAKE, TAKE_OVER):
-            self.control.ask(now, over=key == TAKE_OVER)
-        elif key == KEEP:
-            self.control.keep()
-        elif key == LET and self.control.asked_by:
-            self._drive(self.gesture.interrupt(now, repeat=False), now)
-            self.control.release()
+    def _held_at(self, axis: str) -> tuple[int, float]:
+        return self._held.get(axis, (0, float("-inf")))
 
-    def _tick_control(self, now: float, epoch_ms: int, problem: str) -> None:
-        """Have control while this terminal is used; the lease only measures the way through the broker."""
-        if self.gesture.active or not self.control.held:
-            self._used_at = now
-        if self.control.held and now - self._used_at > IDLE_S:
-            self.control.release()
-        elif (
-            now < self._wants_until
-            and not (problem or self.control.wanted)
-            and self.robot.control.state is not None
-            and (self._take_over or not self.robot.control.who)
-        ):
-            self.control.ask(now, over=self._take_over)
-            self._take_over, self._wants_until = False, now
-        self._out += self.control.tick(now)
-        self._check_control(now)
-        if self.control.held and not self.lease.held:
-            self.lease.take(now, epoch_ms, announce=False)
-        elif self.lease.held and not self.control.held:
-            self.lease.release()
-        self.lease.use(now)
+    def _end(self, zero: Drive, now: float) -> None:
+        """End the drive; the pause before the next one is one in which keys were read."""
+        self._driving, self._last, self._zeros = False, zero, _ZEROS
+        self._must_let_go, self._key_at = True, now
 
-    def _check_control(self, now: float) -> None:
-        """Whoever gets control, begins from rest; so does this terminal."""
-        self.control.update(now)
-        if self.control.decided != self._decided:
-            self._decided, self._wants_until = self.control.decided, now
-            self._drive(self.gesture.interrupt(now, repeat=False), now)
-
-    def _drive(self, commands: Sequence[Drive], now: float) -> None:
-        self._out += [self._message(command, now) for command in commands]
+    def _begin_stop(self, now: float) -> None:
+        self._end(_FINAL_ZERO, now)
+        if self.stop is None or self.stop.finished:
+            self.stop = StopSender(new_name(), by=self._by, why="", now=now, robots=[self.robot.base])
+            for message in self.robot.remembered.values():
+                self.stop.receive(message, now)
 
     def _message(self, command: Drive, now: float) -> Message:
-        key, qos = self.control.key, WIDE.qos
-        if key and command.valid_ms != 0:  # a final zero is no letting go
-            command = msgspec.structs.replace(command, key=key)
+        self._sent_at, qos = now, WIDE.qos
+        if self._control.key and command.valid_ms != 0:  # a final zero is no letting go
+            command = msgspec.structs.replace(command, key=self._control.key)
         if command.moves:
-            qos = self._pace.qos
-            command = self._pace.dated(command, now, self._key)
-        return Message(self.robot.estop.drive_topic, codec.encode(DRIVE, command), qos)
+            qos, command = self._pace_of().qos, self._pace_of().dated(command, now, self._id)
+        return Message(self.robot.estop.drive_topic, codec.encode(c.DRIVE, command), QoS(qos))

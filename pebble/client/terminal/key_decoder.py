@@ -23,7 +23,7 @@ class KeyDecoder:
         return self._since + ALONE_S if self._waiting else None
 
     def feed(self, data: bytes, now: float) -> list[str]:
-        """The keys in ``data``, in order: a printable ASCII character in lower case, or one of the names above."""
+        """The keys in ``data``, in order: a printable character in lower case, or one of the names above."""
         keys = self._flush() if self._waiting and now >= self._since + ALONE_S else []
         if not data:
             return keys
@@ -50,6 +50,9 @@ class KeyDecoder:
 def _first(data: bytes) -> tuple[int, str | None]:
     """How many bytes the first key has, and its name; 0 bytes: more is needed, no name: a key without a meaning."""
     if data[0] != _ESC:
+        if data[0] >= 0xC0:  # the first byte of a character of several, by UTF-8
+            length = 2 + (data[0] >= 0xE0) + (data[0] >= 0xF0)
+            return (length, data[:length].decode(errors="ignore").lower() or None) if len(data) >= length else (0, None)
         return 1, _NAMED.get(data[0]) or (chr(data[0]).lower() if 0x20 < data[0] < 0x7F else None)
     if len(data) == 1:
         return 0, None
