@@ -10,7 +10,6 @@ from collections.abc import Callable
 from typing import Final
 
 from pebble.client.arrived import Arrived, Handler
-from pebble.client.driver_lease import ANSWER_S
 from pebble.client.named_topics import NamedTopics
 from pebble.errors import TransportError
 from pebble.runtime.by_name import EACH_S, ByName
@@ -19,6 +18,7 @@ from pebble.transports import Message, MqttSettings, QoS, State, Subscription, T
 
 log = logging.getLogger(__name__)
 
+ANSWER_S: Final = 0.25  # a broker that acknowledges nothing for longer would deliver commands late, all at once
 _DELIVER_S: Final = 0.01  # for them at a time: whatever else is due must not wait for a flood
 
 

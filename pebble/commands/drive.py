@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 
+from pebble.client.broker import ANSWER_S
 from pebble.client.connection import Target, connected, put_names, target_of
 from pebble.client.terminal.driver import PERIOD_S, TerminalDriver
 from pebble.client.terminal.key_decoder import END
@@ -21,7 +22,6 @@ W A S D or arrows drive, Q E grousers, space stops.
 ! or Esc Esc is the emergency stop, Ctrl-C ends.
 T takes control, or asks for it; O takes it over."""
 _STOP_S = 3.0  # so long an emergency stop is still sent after the terminal has ended
-_ANSWER_S = 0.25  # a broker that acknowledges nothing for longer would deliver commands late, all at once
 _ARRIVED = 1000  # messages that wait to be handled
 
 
@@ -87,7 +87,7 @@ def _drive(transport: Transport, driver: TerminalDriver, loop: TerminalLoop) -> 
             driver.receive(*arrived.popleft())
         late_s = transport.outgoing.stalled_s
         problem = "" if transport.state is State.CONNECTED else transport.problem or "it was lost"
-        problem = problem or ("it does not answer" if late_s > _ANSWER_S else "")
+        problem = problem or ("it does not answer" if late_s > ANSWER_S else "")
         publish(driver.tick(clock(), problem=problem, late_s=late_s))
 
     def halt(*, leave: bool) -> None:
