@@ -14,7 +14,7 @@ from pebble.client.control import IDLE_S, ControlClient
 from pebble.client.drive_reasons import Code, first_reason
 from pebble.client.estop import StopSender, new_name
 from pebble.client.names import id_of
-from pebble.client.pace_of_link import WIDE
+from pebble.client.pace_of_link import WIDE, Pace
 from pebble.client.robot_view import RobotView
 from pebble.client.terminal.key_decoder import DOWN, ESCAPE, LEFT, RIGHT, SPACE, UP
 from pebble.contract import channel_of, codec
@@ -60,10 +60,9 @@ class TerminalDriver:
     ) -> None:
         self.robot, self.name = RobotView(base), id_of(base)
         self.stop: StopSender | None = None
-        pace_of = lambda: self.robot.pace if heartbeat else WIDE  # noqa: E731 - within the robot there is no link
-        self._control = ControlClient(self.robot.control, by=by.partition("@")[0], device=device, pace_of=pace_of)
+        self._control = ControlClient(self.robot.control, by=by.partition("@")[0], device=device, pace_of=self._pace)
         self._by, self._speed, self._turn, self._heartbeat = by, speed, turn, heartbeat
-        self._pace_of, self._id = pace_of, secrets.token_hex(4)
+        self._id = secrets.token_hex(4)
         self._wants_until, self._take_over = float("inf"), take_over  # control as soon as it is free, or at once
         self._held: dict[str, tuple[int, float]] = {}  # by axis: the direction, and when its key last arrived
         self._driving, self._must_let_go = False, False
@@ -123,7 +122,7 @@ class TerminalDriver:
             self._end(_FINAL_ZERO, now)
         elif wanted.moves and not self._must_let_go:
             self._must_let_go = self._reason != ""
-            step_s = max(self._pace_of().step_s, 0.8 * PERIOD_S)
+            step_s = max(self._pace().step_s, 0.8 * PERIOD_S)
             if not self._reason and (not self._driving or now - self._sent_at >= step_s):
                 self._driving, self._zeros, self._used_at, self._last = True, 0, now, wanted
                 return [*out, self._message(wanted, now)]
@@ -166,16 +165,23 @@ class TerminalDriver:
 
     # -- inside
 
+    def _pace(self) -> Pace:
+        return self.robot.pace if self._heartbeat else WIDE  # within the robot there is no link
+
     def _tick_control(self, now: float) -> list[Message]:
         """Ask for control where a key was pressed, and give it back after a minute without one."""
         control = self._control
         if self.robot.controlled:
             if control.held and now - self._used_at > IDLE_S:
                 control.release()
-            elif now < self._wants_until and not control.wanted and self.robot.control.state is not None:
-                if self._take_over or not self.robot.control.who:
-                    control.ask(now, over=self._take_over)
-                    self._used_at, self._take_over, self._wants_until = now, False, now
+            elif (
+                now < self._wants_until
+                and not control.wanted
+                and self.robot.control.state is not None
+                and (self._take_over or not self.robot.control.who)
+            ):
+                control.ask(now, over=self._take_over)
+                self._used_at, self._take_over, self._wants_until = now, False, now
         out = control.tick(now)
         if control.decided != self._decided:  # whoever gets control begins from rest; so does this terminal
             self._decided, self._used_at = control.decided, now
@@ -225,5 +231,5 @@ class TerminalDriver:
         if self._control.key and command.valid_ms != 0:  # a final zero is no letting go
             command = msgspec.structs.replace(command, key=self._control.key)
         if command.moves:
-            qos, command = self._pace_of().qos, self._pace_of().dated(command, now, self._id)
+            qos, command = self._pace().qos, self._pace().dated(command, now, self._id)
         return Message(self.robot.estop.drive_topic, codec.encode(c.DRIVE, command), QoS(qos))
