@@ -22,13 +22,12 @@ from pebble.recordings.catalogue import Query
 from pebble.recordings.exports.copy import write_copy
 from pebble.recordings.exports.film import write_film, write_wav
 from pebble.recordings.exports.foxglove import write_foxglove
-from pebble.recordings.exports.lines import BadLine, Imported, read_lines, write_lines
+from pebble.recordings.exports.lines import TRUNCATED, BadLine, read_lines, write_lines
 from pebble.recordings.exports.unfinished import unfinished
-from pebble.recordings.files.recorded import Channel, Recorded
+from pebble.recordings.files.recorded import Recorded
 from pebble.recordings.files.rewrite import Copy
 from pebble.recordings.files.writer import RecordingWriter
 from pebble.recordings.library import Damages, files, merged, problems
-from pebble.recordings.stamps import stamp_ns
 
 
 class Form(StrEnum):
@@ -124,7 +123,7 @@ def _export(
     return f"{target}: {count:,} messages"
 
 
-def _import(found: Iterable[Imported | BadLine], copy: Copy) -> Counter[str]:
+def _import(found: Iterable[Recorded | BadLine], copy: Copy) -> Counter[str]:
     counted = Counter[str]()
     for one in found:
         if isinstance(one, BadLine):
@@ -132,11 +131,9 @@ def _import(found: Iterable[Imported | BadLine], copy: Copy) -> Counter[str]:
             if counted["bad"] <= 3:
                 typer.echo(f"pebble: line {one.number}: {shown(one.problem)}", err=True)
             continue
-        encoding = "json" if one.payload[:1] in (b"{", b"[") else "application/octet-stream"
-        channel = Channel(0, one.topic, encoding, one.metadata)
-        copy.add(Recorded(channel, 0, one.log_ns, stamp_ns(one.payload), one.payload))
+        copy.add(one)
         counted["messages"] += 1
-        counted["truncated"] += one.truncated
+        counted["truncated"] += TRUNCATED in one.channel.metadata
     return counted
 
 

@@ -48,7 +48,7 @@ from pebble.recordings.files.records import (
     unpack_chunk,
     with_own_topic,
 )
-from pebble.recordings.files.scan import Scan
+from pebble.recordings.files.scan import Found, Scan
 
 if TYPE_CHECKING:
     from mcap.records import Attachment, ChunkIndex, Metadata, Statistics
@@ -91,6 +91,8 @@ class RecordingFile:
         self._schemas: dict[int, Schema] = {}
         self._names: dict[int, Channel] = {}  # channels that are named beside chunks, where no checksum protects them
         self._beside: list[int] = []  # where metadata and attachments are
+        self._indexed: dict[int, int] | None = None  # messages by channel of the last chunk, while its indexes may come
+        self._indexed_to = 0  # where these end
         self._looked_everywhere = False
         try:
             self._file = path.open("rb")
@@ -244,16 +246,17 @@ class RecordingFile:
 
     def _look_through(self) -> None:
         """Find the chunks, and the names of channels, from where the last look has ended."""
-        if self.chunks and not self.chunks[-1].channels:  # its indexes may be there by now
-            chunk = self.chunks.pop()
-            indexed, _, is_indexed = self._scan.indexes(chunk.at + chunk.length)
-            self._add_chunk(chunk, indexed, is_indexed=is_indexed)
         for record in self._scan.records(self.size):
+            if record.op == Op.MESSAGE_INDEX:
+                self._take_index(record)
+                continue
+            self._take_indexes(are_all=record.at == self._indexed_to)
+            self._indexed = None
             at, begin = record.at, record.at + HEAD.size
             if record.op == Op.CHUNK:
                 start_ns, end_ns, *_ = CHUNK.unpack(self._read(begin, CHUNK.size))
-                chunk = Chunk(start_ns, end_ns, at, record.end - at)
-                self._add_chunk(chunk, record.indexed, is_indexed=record.is_indexed)
+                self.chunks.append(Chunk(start_ns, end_ns, at, record.end - at))
+                self._indexed, self._indexed_to = {}, record.end
             elif record.op in (Op.METADATA, Op.ATTACHMENT):
                 self._beside.append(at)
             elif record.op in (Op.SCHEMA, Op.CHANNEL):
@@ -262,10 +265,23 @@ class RecordingFile:
                 except DamageError as error:
                     self.damage.add(at, error)
 
-    def _add_chunk(self, chunk: Chunk, indexed: dict[int, int], *, is_indexed: bool) -> None:
-        channels = frozenset(indexed if is_indexed else ())
-        chunk = chunk._replace(channels=channels, messages=sum(indexed.values()))
-        self.chunks.append(chunk)
+        self._take_indexes(are_all=False)
+
+    def _take_index(self, record: Found) -> None:
+        """Count the messages of a channel in the last chunk, unless damage lies between."""
+        entries = record.end - record.at - INDEX.size
+        if self._indexed is not None and record.at == self._indexed_to and entries >= 0:
+            channel = INDEX.unpack(self._read(record.at, INDEX.size))[2]
+            self._indexed[channel] = entries // _INDEX_ENTRY
+            self._indexed_to = record.end
+
+    def _take_indexes(self, *, are_all: bool) -> None:
+        """Note what the last chunk holds; ``are_all``: none of its indexes is damaged, or not written yet."""
+        indexed = self._indexed
+        if indexed is None:
+            return
+        channels = frozenset(indexed if are_all else ())
+        chunk = self.chunks[-1] = self.chunks[-1]._replace(channels=channels, messages=sum(indexed.values()))
         if not indexed or not indexed.keys() <= self.channels.keys():
             self._learn(chunk)
 

@@ -120,8 +120,7 @@ def test_intervals_and_outages(minute, base):
         (before, interval - usual) for before, interval in zip(times, intervals, strict=False) if interval > 1.5 * usual
     ]
     one = robot(found, base)
-    assert one.intervals.count == len(intervals)
-    assert one.intervals.median_ms == pytest.approx(usual)
+    assert one.interval_ms == pytest.approx(usual)
     assert [outage.since_ns for outage in one.outages] == [since for since, _ in outages]
     assert [outage.length_ms for outage in one.outages] == pytest.approx([length for _, length in outages])
 
@@ -132,9 +131,7 @@ def test_latency(minute, base):
     latencies = [(message.log_ns - message.publish_ns) / MS for message in messages_of(path, base, "outgoing/online")]
     one = robot(found, base).latency
     assert one.count == len(latencies) == sum(one.histogram.counts)
-    assert [one.floor_ms, one.median_ms, one.p95_ms, one.p99_ms] == pytest.approx(
-        [percentile(latencies, share) for share in (0.01, 0.5, 0.95, 0.99)]
-    )
+    assert [one.median_ms, one.p95_ms] == pytest.approx([percentile(latencies, share) for share in (0.5, 0.95)])
 
 
 # -- what robots are like
@@ -147,13 +144,7 @@ def test_kinds_of_robots(minute):
 
 def test_a_component_without_heartbeats(of):
     found = of([Sent(START_NS, "pebble/infrastructure/mast/outgoing/charging-level", b"{}")]).robots[0]
-    assert (found.machine, found.intervals, found.latency, found.outages) == (COMPONENT, None, None, [])
-
-
-def test_a_clock_that_is_ahead_is_named(minute):
-    ahead = {one.robot: one.latency.ahead_ms for one in minute[1].robots}
-    assert ahead[FRED] == pytest.approx(220, abs=2)
-    assert ahead[GOOB] == 0
+    assert (found.machine, found.interval_ms, found.latency, found.outages) == (COMPONENT, None, None, [])
 
 
 def test_stamps_of_clocks_that_were_never_set_do_not_count(of):
@@ -199,8 +190,7 @@ def test_an_interval_of_up_to_one_and_a_half_is_none(of):
 
 def test_above_a_minute_a_robot_was_offline(of):
     found = robot(of(steady(GOOB, (20.0, 90.0), seconds=120.0)), GOOB)
-    assert (found.offline, found.offline_s, found.outages) == (1, 70.0, [])
-    assert found.idle_s == 21 + 30
+    assert found.outages == []
 
 
 def test_what_was_not_recorded_is_no_outage(of):
@@ -224,17 +214,17 @@ def test_messages_that_were_dropped_are_counted(of):
 
 def test_the_last_heartbeat_of_a_connection_does_not_count(of):
     will = Sent(START_NS + 10 * SECOND + 100 * MS, f"{GOOB}/outgoing/online", b'{"t": 5, "online": false}')
-    assert robot(of(ordered(steady(GOOB), [will])), GOOB).intervals.count == 239
+    assert robot(of(ordered(steady(GOOB), [will])), GOOB).latency.count == 240
 
 
 def test_the_older_name_of_the_heartbeat(of):
     older = [Sent(sent.ns, sent.topic.replace("online", "heartbeat"), sent.payload) for sent in steady(GOOB)]
-    assert robot(of(older), GOOB).intervals.median_ms == 250.0
+    assert robot(of(older), GOOB).interval_ms == 250.0
 
 
 def test_both_names_of_the_heartbeat_count_once(of):
     both = [Sent(sent.ns + MS, sent.topic.replace("online", "heartbeat"), sent.payload) for sent in steady(GOOB)]
-    assert robot(of(ordered(steady(GOOB), both)), GOOB).intervals.median_ms == 250.0
+    assert robot(of(ordered(steady(GOOB), both)), GOOB).interval_ms == 250.0
 
 
 # -- sessions
@@ -269,8 +259,7 @@ def test_a_warning_is_no_session(of):
 
 def test_bandwidths_of_sessions_and_of_idle_time_are_apart(minute):
     goob = robot(minute[1], GOOB)
-    assert (goob.session_s, len(goob.sessions)) == (41, 1)
-    assert goob.idle_s == 60 - 41
+    assert [session.until_s - session.since_s for session in goob.sessions] == [41]
     assert goob.of(VIDEO, IDLE) is None
     assert goob.of(TOTAL, IDLE).median_kbps < 3 < 300 < goob.of(TOTAL, SESSION).median_kbps
     both = goob.of(TOTAL, SESSION), goob.of(TOTAL, IDLE)

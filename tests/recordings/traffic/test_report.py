@@ -111,10 +111,6 @@ def test_every_drawing_has_a_name_for_those_who_cannot_see_it(page):
     assert "<text" in page  # and not the shapes of letters
 
 
-def test_what_stands_out(minute):
-    assert remarks(minute) == ["fred: the robot's clock is at least 220 ms ahead."]
-
-
 def test_gaps_and_losses_stand_out(minute):
     minute = Traffic(**{name: getattr(minute, name) for name in minute.__struct_fields__})
     minute.gaps, minute.dropped, minute.missing = [Gap(START_NS, START_NS + 10**9, "lost")], 5, 7
