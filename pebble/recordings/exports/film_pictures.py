@@ -1,15 +1,16 @@
-"""The pictures of a film, in a file of their own: whatever was sent is decoded and encoded as H.264."""
+"""The pictures of a film: whatever was sent is decoded and encoded as H.264."""
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator
 from fractions import Fraction
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 if TYPE_CHECKING:
     from pebble.media.jpeg import Pixels
 
-MILLISECOND: Final = Fraction(1, 1000)
+LAST_PICTURE_MS: Final = 66  # how long the last picture of a film is shown
+_MILLISECOND: Final = Fraction(1, 1000)
 _KEYFRAME_INTERVAL: Final = 60  # pictures: how far a player jumps
 _NOMINAL_FPS: Final = 15  # for the encoder; each picture has its own time
 _OPTIONS: Final = {"crf": "23", "preset": "veryfast"}
@@ -18,56 +19,51 @@ _OPTIONS: Final = {"crf": "23", "preset": "veryfast"}
 class PictureTrack:
     """Pictures of any size and encoding as H.264 of one size, that of the first."""
 
-    def __init__(self, av: Any, path: Path) -> None:
+    def __init__(self, av: Any, out: Any) -> None:
         from pebble.media.decode import VideoDecoder
 
-        self.path = path
-        self.count = self.left_out = self.scaled = 0
+        self.count = self.left_out = 0
         self.last_ms = -1
-        self.size = (0, 0)
-        self._av, self._decoder = av, VideoDecoder()
-        self._out: Any = None
-        self._stream: Any = None
+        self._size = (0, 0)
+        self._av, self._out, self._decoder = av, out, VideoDecoder()
 
-    def add(self, payload: bytes, at_ms: int) -> None:
-        """Show a picture at ``at_ms``, but after the one before it."""
-        decoded = self._decoder.feed(payload)
-        if decoded is None:  # damaged, or without those that it builds on
-            self.left_out += 1
-            return
-        if self._stream is None:
-            self._open(*decoded.picture.shape[:2])
-        frame = self._av.VideoFrame.from_ndarray(self._fitted(decoded.picture), format="bgr24")
-        self.last_ms = frame.pts = max(at_ms, self.last_ms + 1)
-        frame.time_base = MILLISECOND
-        self.count += 1
-        self._out.mux(self._stream.encode(frame))
+    def packets(self, pictures: Iterable[tuple[int, bytes]]) -> Iterator[Any]:
+        """Yield packets of a stream of ``out``: each picture is shown at its time (ms), but after the one before it."""
+        stream: Any = None
+        for at_ms, payload in pictures:
+            decoded = self._decoder.feed(payload)
+            if decoded is None:  # damaged, or without those that it builds on
+                self.left_out += 1
+                continue
+            if stream is None:
+                stream = self._opened(*decoded.picture.shape[:2])
+            frame = self._av.VideoFrame.from_ndarray(self._fitted(decoded.picture), format="bgr24")
+            self.last_ms = frame.pts = max(at_ms, self.last_ms + 1)
+            frame.time_base = _MILLISECOND
+            self.count += 1
+            yield from _lasting(stream.encode(frame))
+        if stream is not None:
+            yield from _lasting(stream.encode(None))
 
-    def close(self) -> None:
-        if self._stream is not None:
-            self._out.mux(self._stream.encode(None))
-            self._out.close()
-
-    def _open(self, height: int, width: int) -> None:
+    def _opened(self, height: int, width: int) -> Any:
         """Colour is stored for two by two pixels."""
-        self.size = width & ~1, height & ~1
-        self._out = self._av.open(str(self.path), "w", format="matroska")
-        stream = self._stream = self._out.add_stream("libx264", rate=_NOMINAL_FPS, options=_OPTIONS)
-        stream.width, stream.height = self.size
+        self._size = width & ~1, height & ~1
+        stream = self._out.add_stream("libx264", rate=_NOMINAL_FPS, options=_OPTIONS)
+        stream.width, stream.height = self._size
         stream.pix_fmt = "yuv420p"
-        stream.codec_context.time_base = MILLISECOND
+        stream.codec_context.time_base = _MILLISECOND
         stream.codec_context.gop_size = _KEYFRAME_INTERVAL
         stream.codec_context.max_b_frames = 0
+        return stream
 
     def _fitted(self, picture: Pixels) -> Pixels:
         """The picture as large as fits into the film, in its middle, on black."""
         import cv2
         import numpy as np
 
-        width, height = self.size
+        width, height = self._size
         if picture.shape[:2] == (height, width):
             return picture
-        self.scaled += 1
         scale = min(height / picture.shape[0], width / picture.shape[1])
         high = max(1, min(height, round(picture.shape[0] * scale)))
         wide = max(1, min(width, round(picture.shape[1] * scale)))
@@ -76,3 +72,10 @@ class PictureTrack:
         way = cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR
         whole[top : top + high, left : left + wide] = cv2.resize(picture, (wide, high), interpolation=way)
         return whole
+
+
+def _lasting(packets: list[Any]) -> list[Any]:
+    """Give each a length, which counts for the last one: the others are shown until the next."""
+    for packet in packets:
+        packet.duration = LAST_PICTURE_MS
+    return packets

@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 from pebble.recordings.files.recorded import (
+    ACTIVE,
     FOREVER_NS,
     Channel,
     Damage,
@@ -130,6 +131,16 @@ class RecordingFile:
     def is_cut_off(self) -> bool:
         """True if nothing is at its end but zeros, or the begin of one record: so a kill leaves it."""
         return self._scan.is_cut_off
+
+    @property
+    def problem(self) -> str:
+        """What could not be read of it, in words; "" if all was, as far as that is known."""
+        return self.damage.report(active=self.path.name.endswith(ACTIVE))
+
+    def reaches_into(self, since_ns: int, until_ns: int) -> bool:
+        """True if it may hold messages of a period: one that is not finished has no end."""
+        ends = self.damage.finished and self.last_ns < since_ns
+        return bool(self.chunks) and self.first_ns < until_ns and not ends
 
     def refresh(self) -> None:
         """Find what was written since; a file that is finished does not change."""

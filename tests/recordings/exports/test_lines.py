@@ -95,6 +95,10 @@ def test_payloads_are_readable_where_they_are_text_or_json(payload: bytes, reada
     assert [message.payload for message in read(raw) if isinstance(message, Recorded)] == [payload]
 
 
+def shown(message: Recorded) -> tuple[object, ...]:
+    return message.log_ns, message.channel.topic, message.payload, message.channel.metadata
+
+
 @given(
     st.lists(
         st.builds(
@@ -109,10 +113,8 @@ def test_payloads_are_readable_where_they_are_text_or_json(payload: bytes, reada
     )
 )
 def test_there_and_back(messages: list[Recorded]) -> None:
-    back = read(written(messages))
-    assert [(one.log_ns, one.channel.topic, one.payload, one.channel.metadata) for one in back if isinstance(one, Recorded)] == [
-        (one.log_ns, one.channel.topic, one.payload, one.channel.metadata) for one in messages
-    ]
+    back = [message for message in read(written(messages)) if isinstance(message, Recorded)]
+    assert list(map(shown, back)) == list(map(shown, messages))
 
 
 def test_flags_there_and_back() -> None:
