@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import io
+import shutil
 from pathlib import Path
 
 import pytest
@@ -30,7 +31,7 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Analysed:
     """The analysis of the demo's robots in tests/data."""
     pytest.importorskip("duckdb")
     scratch = tmp_path_factory.mktemp("scratch")
-    found = sources([DRIVE, MEDIA], scratch)
+    found = sources([Path(shutil.copy2(path, scratch)) for path in (DRIVE, MEDIA)], scratch)
     return {robot.robot.rpartition("/")[2]: robot for robot in analyse(found, scratch).robots}
 
 

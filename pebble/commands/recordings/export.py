@@ -85,7 +85,7 @@ def import_(
     target: Annotated[Path, typer.Argument(help="A new recording.", metavar="OUT.mcap")],
 ) -> int:
     """Import what the original's logger recorded, or an export as lines."""
-    with _opened(source) as file, unfinished(target, overwrite=False) as path, path.open("wb", buffering=0) as out:
+    with _opened(source) as file, unfinished(target) as path, path.open("wb", buffering=0) as out:
         writer = RecordingWriter(out)
         writer.metadata("pebble.recording", {"format": "1", "imported": source.name})
         counted = _import(read_lines(file), Copy(writer))
@@ -116,7 +116,7 @@ def _export(
         return f"{target}: {show.duration(film.seconds)}, {film.pictures:,} pictures, {sound}{lost}"
     if form is Form.WAV:
         return f"{target}: {show.duration(write_wav(read(), target, robot, on_time=on_time).seconds)} of sound"
-    with unfinished(target, overwrite=False) as path, path.open("wb") as out:
+    with unfinished(target) as path, path.open("wb") as out:
         if form is Form.LINES:
             count = write_lines(read(), out, on_time=on_time)
         else:

@@ -38,7 +38,6 @@ def write_film(
     target: Path,
     robot: str,
     *,
-    overwrite: bool = False,
     on_time: Progress = lambda _log_ns: None,
 ) -> FilmResult:
     """Write the pictures and the sound of ``robot`` (its base) to ``target``, which ends in .mkv or .mp4.
@@ -51,7 +50,7 @@ def write_film(
         raise RecordingError(f"{target}: a film ends in {' or '.join(_FORMATS)}")
     av = pyav.load("film")
     container, codec = _FORMATS[target.suffix]
-    with unfinished(target, overwrite=overwrite) as path, _file_beside(target) as wav:
+    with unfinished(target) as path, _file_beside(target) as wav:
         try:
             with SoundTrack(wav) as sound:
                 for at_ms, payload in _media(read(), robot, lambda _log_ns: on_time(0)):
@@ -79,11 +78,10 @@ def write_wav(
     target: Path,
     robot: str,
     *,
-    overwrite: bool = False,
     on_time: Progress = lambda _log_ns: None,
 ) -> SoundResult:
     """Write the sound of ``robot`` (its base) to ``target``, from its first sample on. Raises RecordingError."""
-    with unfinished(target, overwrite=overwrite) as path, SoundTrack(path) as track:
+    with unfinished(target) as path, SoundTrack(path) as track:
         first_ms = None
         for at_ms, payload in _media(messages, robot, on_time):
             if not is_picture(payload):

@@ -33,8 +33,7 @@ def write_foxglove(
     messages: Iterable[Recorded],
     target: Path,
     *,
-    overwrite: bool = False,
-    on_time: Progress | None = None,
+    on_time: Progress = lambda _log_ns: None,
 ) -> dict[str, int]:
     """Write ``messages`` to the MCAP file ``target``; returns how many there are by schema, ``json`` and ``left out``.
 
@@ -42,13 +41,12 @@ def write_foxglove(
     retained messages. Raises RecordingError if ``target`` cannot be written, PebbleError without Foxglove's schemas.
     """
     schemas = Schemas()
-    with unfinished(target, overwrite=overwrite) as path, path.open("wb", buffering=0) as file:
+    with unfinished(target) as path, path.open("wb", buffering=0) as file:
         writer = RecordingWriter(file)
         export = _Export(Copy(writer), schemas)
         for message in messages:
             export.add(message)
-            if on_time is not None:
-                on_time(message.log_ns)
+            on_time(message.log_ns)
         writer.finish()
     return dict(export.counts)
 

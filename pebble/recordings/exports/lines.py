@@ -66,20 +66,17 @@ _encoder = msgspec.json.Encoder()
 _decoder = msgspec.json.Decoder(_Line)
 
 
-def write_lines(
-    messages: Iterable[Recorded], out: BinaryIO, *, text: bool = True, on_time: Progress | None = None
-) -> int:
+def write_lines(messages: Iterable[Recorded], out: BinaryIO, *, on_time: Progress = lambda _log_ns: None) -> int:
     """Write a line for each message; returns how many.
 
-    Stamps have nine decimals, so that reading the lines again gives the same nanoseconds. With ``text``, payloads of
-    up to 64 KiB are readable, too, where they are text or JSON.
+    Stamps have nine decimals, so that reading the lines again gives the same nanoseconds. Payloads of up to 64 KiB are
+    readable, too, where they are text or JSON.
     """
     count = 0
     for message in messages:
-        out.write(_encoder.encode(_line(message, text)) + b"\n")
+        out.write(_encoder.encode(_line(message)) + b"\n")
         count += 1
-        if on_time is not None:
-            on_time(message.log_ns)
+        on_time(message.log_ns)
     return count
 
 
@@ -95,7 +92,7 @@ def read_lines(file: BinaryIO) -> Iterator[Recorded | BadLine]:
             yield _message(number, line)
 
 
-def _line(message: Recorded, text: bool) -> _Written:
+def _line(message: Recorded) -> _Written:
     metadata, payload = message.channel.metadata, message.payload
     seconds, fraction = divmod(message.log_ns, 10**9)
     line = _Written(
@@ -108,7 +105,7 @@ def _line(message: Recorded, text: bool) -> _Written:
         payload_truncated=metadata.get(TRUNCATED) == "1",
         payload_b64=payload,
     )
-    if text and len(payload) <= _TEXT_MOST:
+    if len(payload) <= _TEXT_MOST:
         _add_text(line, payload)
     return line
 

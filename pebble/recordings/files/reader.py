@@ -12,7 +12,6 @@ import os
 import zlib
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
-from dataclasses import replace
 from functools import partial
 from itertools import pairwise
 from operator import attrgetter
@@ -41,10 +40,8 @@ from pebble.recordings.files.records import (
     MAGIC,
     MESSAGE,
     Op,
-    channel_of,
     record_of,
     records,
-    schema_of,
     summary_of,
     unpack_chunk,
     with_own_topic,
@@ -52,7 +49,7 @@ from pebble.recordings.files.records import (
 from pebble.recordings.files.scan import Found, Scan
 
 if TYPE_CHECKING:
-    from mcap.records import Attachment, ChunkIndex, Metadata, Statistics
+    from mcap.records import Attachment, ChunkIndex, McapRecord, Metadata, Statistics
     from mcap.summary import Summary
 
 DAMAGE, MISSING = "pebble.damage", "missing_messages"  # metadata of a copy of a file of which a part was missing
@@ -244,10 +241,8 @@ class RecordingFile:
             return False
         if not counted.channel_message_counts.keys() <= summary.channels.keys():
             return False
-        self._schemas = {number: Schema(one.name, one.encoding, one.data) for number, one in summary.schemas.items()}
-        for number, one in summary.channels.items():
-            schema = self._schemas.get(one.schema_id)
-            self.channels[number] = Channel(number, one.topic, one.message_encoding, one.metadata, schema)
+        for record in (*summary.schemas.values(), *summary.channels.values()):
+            self._name(record, self.channels)
         self._beside = [index.offset for index in summary.metadata_indexes]
         self._beside += [index.offset for index in summary.attachment_indexes]
         self.chunks, self.statistics = chunks, counted
@@ -272,7 +267,7 @@ class RecordingFile:
                 self._beside.append(at)
             elif record.op in (Op.SCHEMA, Op.CHANNEL):
                 try:
-                    self._declare(record.op, self._read(begin, record.end - begin), self._names)
+                    self._declare(self._read(at, record.end - at), self._names)
                 except DamageError as error:
                     self.damage.add(at, error)
 
@@ -301,7 +296,8 @@ class RecordingFile:
         try:
             data = self._records(chunk)
             for op, begin, end in records(data):
-                self._declare(op, data[begin:end], self.channels)
+                if op != Op.MESSAGE:
+                    self._declare(data[begin - HEAD.size : end], self.channels)
         except DamageError as error:
             self.damage.add(chunk.at, error, chunk.messages)
             return
@@ -321,7 +317,7 @@ class RecordingFile:
             data = self._records(chunk)
             for op, begin, end in records(data):
                 if op != Op.MESSAGE:
-                    self._declare(op, data[begin:end], self.channels)
+                    self._declare(data[begin - HEAD.size : end], self.channels)
                     continue
                 number, sequence, log_ns, publish_ns = MESSAGE.unpack_from(data, begin)
                 first, last = sequence if first < 0 else first, sequence
@@ -351,14 +347,21 @@ class RecordingFile:
         yield from self.messages(chunk, chooses)
         opened[0] -= chunk.length
 
-    def _declare(self, op: int, body: bytes, channels: dict[int, Channel]) -> None:
-        """Take over a record that is no message. Raises DamageError."""
-        if op == Op.SCHEMA:
-            number, schema = schema_of(body)
-            self._schemas.setdefault(number, schema)
-        elif op == Op.CHANNEL:
-            channel, number = channel_of(body)
-            channels.setdefault(channel.id, replace(channel, schema=self._schemas.get(number)))
+    def _declare(self, data: bytes, channels: dict[int, Channel]) -> None:
+        """Take over a record of a schema or of a channel. Raises DamageError."""
+        if data[0] in (Op.SCHEMA, Op.CHANNEL):
+            self._name(record_of(data), channels)
+
+    def _name(self, record: McapRecord, channels: dict[int, Channel]) -> None:
+        from mcap.records import Channel as ChannelRecord
+        from mcap.records import Schema as SchemaRecord
+
+        if isinstance(record, SchemaRecord):
+            self._schemas.setdefault(record.id, Schema(record.name, record.encoding, record.data))
+        elif isinstance(record, ChannelRecord):
+            schema = self._schemas.get(record.schema_id)
+            channel = Channel(record.id, record.topic, record.message_encoding, record.metadata, schema)
+            channels.setdefault(record.id, channel)
 
     def _channel(self, number: int) -> Channel:
         """The channel of this number, wherever it is named: the chunk that named it first may be lost."""

@@ -11,7 +11,7 @@ from pebble.recordings.files.records import (
     LOOKS_LIKE_CHUNK,
     MAGIC,
     Op,
-    channel_of,
+    record_of,
     records,
     unpack_chunk,
 )
@@ -115,7 +115,7 @@ class Scan:
     def _is_channel(self, at: int, length: int) -> bool:
         """True if it is exactly what it says: it has no checksum."""
         try:
-            channel_of(self._read(at + HEAD.size, min(length, LARGEST_RECORD)))
+            record_of(self._read(at, HEAD.size + min(length, LARGEST_RECORD)))
         except DamageError:
             return False
         return True

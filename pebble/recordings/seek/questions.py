@@ -126,7 +126,7 @@ def export_job(
         if form in FILMS:
             write_film(read, target, robot, on_time=on_time)
         else:
-            with unfinished(target, overwrite=False) as path, path.open("wb") as out:
+            with unfinished(target) as path, path.open("wb") as out:
                 if not write_copy(read(), out, on_time=on_time):
                     raise PebbleError(f"there is no message of {robot} in this stretch")
         return "; ".join(problems(damages))
