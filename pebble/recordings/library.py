@@ -20,7 +20,7 @@ def files(places: Iterable[Path]) -> list[Path]:
     found: list[Path] = []
     for place in places:
         if place.is_dir():
-            found += sorted(path for path in place.rglob(f"*{SUFFIX}*") if _is_recording(path))
+            found += sorted(recordings_in(place))
         elif _begins_as_mcap(place) or place.name.endswith((SUFFIX, ACTIVE)):
             found.append(place)
         else:
@@ -30,9 +30,11 @@ def files(places: Iterable[Path]) -> list[Path]:
     return found
 
 
-def _is_recording(path: Path) -> bool:
-    """By its name; a link that leads nowhere is one that cannot be read."""
-    return path.name.endswith((SUFFIX, ACTIVE)) and (path.is_file() or path.is_symlink())
+def recordings_in(folder: Path) -> Iterator[Path]:
+    """Yield them by their names; a link that leads nowhere is one that cannot be read."""
+    for path in folder.rglob(f"*{SUFFIX}*"):
+        if path.name.endswith((SUFFIX, ACTIVE)) and (path.is_file() or path.is_symlink()):
+            yield path
 
 
 def reaches_into(path: Path, since_ns: int, until_ns: int) -> bool:

@@ -316,7 +316,7 @@ def whys(functions: Iterable[Callable[..., None]], *arguments: Path) -> list[str
 
 
 FAILURES: dict[Callable[..., None], str] = {
-    partial(failing_jobs.without, "duckdb", "timeline"): 'this needs DuckDB: pip install "pebble-robot[archive]"',
+    partial(failing_jobs.without, "duckdb", "timeline"): 'duckdb missing: pip install "pebble-robot[archive]"',
     partial(failing_jobs.without, "mcap", "export"): 'pip install "pebble-robot[record]"',
     partial(failing_jobs.without, "av", "export"): "film needs PyAV: pip install 'pebble-robot[media]'",
     failing_jobs.killed: "its process was killed, as it is where memory runs out",

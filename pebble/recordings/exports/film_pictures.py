@@ -4,10 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from fractions import Fraction
-from typing import TYPE_CHECKING, Any, Final
-
-if TYPE_CHECKING:
-    from pebble.media.jpeg import Pixels
+from typing import Any, Final
 
 LAST_PICTURE_MS: Final = 66  # how long the last picture of a film is shown
 _MILLISECOND: Final = Fraction(1, 1000)
@@ -17,14 +14,13 @@ _OPTIONS: Final = {"crf": "23", "preset": "veryfast"}
 
 
 class PictureTrack:
-    """Pictures of any size and encoding as H.264 of one size, that of the first."""
+    """Pictures of any size and encoding as H.264 of one size, that of the first: the encoder scales the others."""
 
     def __init__(self, av: Any, out: Any) -> None:
         from pebble.media.decode import VideoDecoder
 
         self.count = self.left_out = 0
         self.last_ms = -1
-        self._size = (0, 0)
         self._av, self._out, self._decoder = av, out, VideoDecoder()
 
     def packets(self, pictures: Iterable[tuple[int, bytes]]) -> Iterator[Any]:
@@ -37,7 +33,7 @@ class PictureTrack:
                 continue
             if stream is None:
                 stream = self._opened(*decoded.picture.shape[:2])
-            frame = self._av.VideoFrame.from_ndarray(self._fitted(decoded.picture), format="bgr24")
+            frame = self._av.VideoFrame.from_ndarray(decoded.picture, format="bgr24")
             self.last_ms = frame.pts = max(at_ms, self.last_ms + 1)
             frame.time_base = _MILLISECOND
             self.count += 1
@@ -47,31 +43,13 @@ class PictureTrack:
 
     def _opened(self, height: int, width: int) -> Any:
         """Colour is stored for two by two pixels."""
-        self._size = width & ~1, height & ~1
         stream = self._out.add_stream("libx264", rate=_NOMINAL_FPS, options=_OPTIONS)
-        stream.width, stream.height = self._size
+        stream.width, stream.height = width & ~1, height & ~1
         stream.pix_fmt = "yuv420p"
         stream.codec_context.time_base = _MILLISECOND
         stream.codec_context.gop_size = _KEYFRAME_INTERVAL
         stream.codec_context.max_b_frames = 0
         return stream
-
-    def _fitted(self, picture: Pixels) -> Pixels:
-        """The picture as large as fits into the film, in its middle, on black."""
-        import cv2
-        import numpy as np
-
-        width, height = self._size
-        if picture.shape[:2] == (height, width):
-            return picture
-        scale = min(height / picture.shape[0], width / picture.shape[1])
-        high = max(1, min(height, round(picture.shape[0] * scale)))
-        wide = max(1, min(width, round(picture.shape[1] * scale)))
-        top, left = (height - high) // 2, (width - wide) // 2
-        whole = np.zeros((height, width, 3), np.uint8)
-        way = cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR
-        whole[top : top + high, left : left + wide] = cv2.resize(picture, (wide, high), interpolation=way)
-        return whole
 
 
 def _lasting(packets: list[Any]) -> list[Any]:
