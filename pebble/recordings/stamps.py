@@ -105,7 +105,8 @@ def _shifted_json(payload: bytes, by_ns: int) -> bytes:
     moved = {}
     for name in _Stamped.__struct_fields__:
         stamp = plain.get(name)
-        if type(stamp) in (int, float) and _moves(_in_ns(stamp), by_ns):
-            by = by_ns / _unit(stamp) if type(stamp) is float else by_ns // _unit(stamp)
-            moved[name] = stamp + by
+        if not isinstance(stamp, int | float) or isinstance(stamp, bool) or not _moves(_in_ns(stamp), by_ns):
+            continue
+        unit = _unit(stamp)
+        moved[name] = stamp + (by_ns / unit if isinstance(stamp, float) else by_ns // unit)
     return msgspec.json.encode(plain | moved) if moved else payload
