@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import struct
 from collections.abc import Iterable, Iterator, Sequence
@@ -128,12 +127,6 @@ class Stage:
 
     def payloads(self, topic: str) -> list[bytes]:
         return [sent.message.payload for sent in self.sent if sent.message.topic == topic]
-
-    def digest(self) -> str:
-        found = hashlib.sha256()
-        for at, message in self.sent:
-            found.update(repr((round(at, 9), message.topic, message.payload, message.qos, message.retain)).encode())
-        return found.hexdigest()
 
     def _publish(self, message: Message) -> bool:
         if self.refuses:

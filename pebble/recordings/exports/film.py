@@ -5,13 +5,13 @@ import tempfile
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from fractions import Fraction
 from pathlib import Path
 from typing import Any, Final
 
 from pebble.contract import OUTGOING
 from pebble.contract.packets import PBAT
 from pebble.media import pyav
-from pebble.recordings.exports.film_pictures import LAST_PICTURE_MS, PictureTrack
 from pebble.recordings.exports.film_sound import RATE, SoundResult, SoundTrack
 from pebble.recordings.exports.lines import Progress
 from pebble.recordings.exports.unfinished import unfinished
@@ -20,6 +20,11 @@ from pebble.recordings.stamps import is_picture
 
 #: By the ending of the film: FFmpeg's names of the container and of the encoder of its sound.
 _FORMATS: Final = {".mkv": ("matroska", "libopus"), ".mp4": ("mp4", "aac")}
+_LAST_PICTURE_MS: Final = 66  # how long the last picture of a film is shown
+_MILLISECOND: Final = Fraction(1, 1000)
+_KEYFRAME_INTERVAL: Final = 60  # pictures: how far a player jumps
+_NOMINAL_FPS: Final = 15  # for the encoder; each picture has its own time
+_OPTIONS: Final = {"crf": "23", "preset": "veryfast"}
 _BITRATE: Final = 64_000  # bits per second of each channel
 
 
@@ -57,7 +62,7 @@ def write_film(
                     if not is_picture(payload):
                         sound.add(payload, at_ms)
             with av.open(str(path), "w", format=container) as out:
-                pictures = PictureTrack(av, out)
+                pictures = _Pictures(av, out)
                 media = _media(read(), robot, on_time)
                 tracks = [pictures.packets((at_ms, payload) for at_ms, payload in media if is_picture(payload))]
                 if sound.result.packets:
@@ -69,7 +74,7 @@ def write_film(
             raise RecordingError(f"{target}: {error}") from None
         if not pictures.count:
             raise RecordingError(f"{robot}: no pictures; its sound alone can be exported as wav")
-    seconds = max((pictures.last_ms + LAST_PICTURE_MS) / 1000, sound.result.seconds)
+    seconds = max((pictures.last_ms + _LAST_PICTURE_MS) / 1000, sound.result.seconds)
     return FilmResult(seconds, pictures.count, pictures.left_out, sound.result if sound.result.packets else None)
 
 
@@ -122,3 +127,49 @@ def _sound_packets(av: Any, path: Path, out: Any, codec: str) -> Iterator[Any]:
         for frame in source.decode(wav):
             yield from stream.encode(frame)
         yield from stream.encode(None)
+
+
+class _Pictures:
+    """Pictures of any size and encoding as H.264 of one size, that of the first: the encoder scales the others."""
+
+    def __init__(self, av: Any, out: Any) -> None:
+        from pebble.media.decode import VideoDecoder
+
+        self.count = self.left_out = 0
+        self.last_ms = -1
+        self._av, self._out, self._decoder = av, out, VideoDecoder()
+
+    def packets(self, pictures: Iterable[tuple[int, bytes]]) -> Iterator[Any]:
+        """Yield packets of a stream of ``out``: each picture is shown at its time (ms), but after the one before it."""
+        stream: Any = None
+        for at_ms, payload in pictures:
+            decoded = self._decoder.feed(payload)
+            if decoded is None:  # damaged, or without those that it builds on
+                self.left_out += 1
+                continue
+            if stream is None:
+                stream = self._opened(*decoded.picture.shape[:2])
+            frame = self._av.VideoFrame.from_ndarray(decoded.picture, format="bgr24")
+            self.last_ms = frame.pts = max(at_ms, self.last_ms + 1)
+            frame.time_base = _MILLISECOND
+            self.count += 1
+            yield from _lasting(stream.encode(frame))
+        if stream is not None:
+            yield from _lasting(stream.encode(None))
+
+    def _opened(self, height: int, width: int) -> Any:
+        """Colour is stored for two by two pixels."""
+        stream = self._out.add_stream("libx264", rate=_NOMINAL_FPS, options=_OPTIONS)
+        stream.width, stream.height = width & ~1, height & ~1
+        stream.pix_fmt = "yuv420p"
+        stream.codec_context.time_base = _MILLISECOND
+        stream.codec_context.gop_size = _KEYFRAME_INTERVAL
+        stream.codec_context.max_b_frames = 0
+        return stream
+
+
+def _lasting(packets: list[Any]) -> list[Any]:
+    """Give each a length, which counts for the last one: the others are shown until the next."""
+    for packet in packets:
+        packet.duration = _LAST_PICTURE_MS
+    return packets

@@ -56,20 +56,17 @@ def pictures(
     *,
     size: tuple[int, int] = (160, 120),
     channel: Channel = CAMERA,
-    shift_ms: int = 0,
 ) -> list[Recorded]:
     encoder = make_encoder(name, fps=15, quality=40, keyframe_interval=15)
     made = []
     for number in numbers:
         at_ms = T0_MS + number * STEP_MS
-        payload = encoder.encode(picture(number, size), at_ms + shift_ms)
+        payload = encoder.encode(picture(number, size), at_ms)
         made.append(recorded(channel, at_ms, payload))
     return made
 
 
-def sound(
-    name: str, rate: int, seconds: float, *, begin_ms: int = 0, channels: int = 1, shift_ms: int = 0
-) -> list[Recorded]:
+def sound(name: str, rate: int, seconds: float, *, begin_ms: int = 0, channels: int = 1) -> list[Recorded]:
     """Silence with a click of 20 ms at the flash."""
     samples = np.zeros((int(seconds * rate), channels), np.int16)
     click = (FLASH * STEP_MS - begin_ms) * rate // 1000
@@ -80,7 +77,7 @@ def sound(
     made, step = [], rate * PACKET_MS // 1000
     for at in range(0, len(samples), step):
         at_ms = T0_MS + begin_ms + at * 1000 // rate
-        payloads = encoder.encode(to_bytes(samples[at : at + step]), at_ms + shift_ms)
+        payloads = encoder.encode(to_bytes(samples[at : at + step]), at_ms)
         made += [recorded(MICROPHONE, at_ms, payload) for payload in payloads]
     return made
 
@@ -248,15 +245,6 @@ def test_sound_that_came_twice_is_played_once(tmp_path: Path) -> None:
     result = write_wav([*once, *once[-90:-40]], tmp_path / "walk.wav", ROBOT)
     assert result.seconds == pytest.approx(2.0, abs=0.07)
     assert result.left_out == 50
-
-
-def test_pictures_without_stamps_are_shown_as_others(tmp_path: Path) -> None:
-    jpegs = [
-        recorded(CAMERA, T0_MS + number * STEP_MS, cv2.imencode(".jpg", picture(number))[1].tobytes())
-        for number in range(20)
-    ]
-    write_film(lambda: jpegs, tmp_path / "walk.mkv", ROBOT)
-    check_numbers(opened(tmp_path / "walk.mkv"))
 
 
 def test_other_robots_and_an_operators_voice_are_left_out(tmp_path: Path) -> None:

@@ -31,7 +31,7 @@ from pebble.recordings.traffic.results import (
     Traffic,
 )
 from pebble.recordings.traffic.sources import sources
-from tests.recordings.synthetic import FLEET, START_NS, Robot, Sent, event, traffic, write_recording
+from tests.recordings.synthetic import FLEET, START_NS, Sent, event, traffic, write_recording
 
 pytest.importorskip("duckdb")
 
@@ -217,11 +217,6 @@ def test_the_last_heartbeat_of_a_connection_does_not_count(of):
     assert robot(of(ordered(steady(GOOB), [will])), GOOB).latency.count == 240
 
 
-def test_the_older_name_of_the_heartbeat(of):
-    older = [Sent(sent.ns, sent.topic.replace("online", "heartbeat"), sent.payload) for sent in steady(GOOB)]
-    assert robot(of(older), GOOB).interval_ms == 250.0
-
-
 def test_both_names_of_the_heartbeat_count_once(of):
     both = [Sent(sent.ns + MS, sent.topic.replace("online", "heartbeat"), sent.payload) for sent in steady(GOOB)]
     assert robot(of(ordered(steady(GOOB), both)), GOOB).interval_ms == 250.0
@@ -300,15 +295,6 @@ def test_a_period(of):
     assert (found.since_ns, found.until_ns) == (since, until - 250 * MS)
 
 
-def test_a_period_without_messages_is_refused(of):
-    with pytest.raises(PebbleError, match="no message"):
-        of(steady(GOOB), until_ns=START_NS)
-
-
-def test_only_some_robots(of):
-    assert [one.robot for one in of(traffic(seconds=2.0), robots=[GOOB]).robots] == [GOOB]
-
-
 def test_a_file_that_is_being_written_is_read_and_not_indexed(tmp_path):
     folder, scratch = tmp_path / "recordings", tmp_path / "scratch"
     write_recording(folder / "a.mcap", steady(GOOB, seconds=2.0))
@@ -349,17 +335,6 @@ def test_a_file_that_is_named_again_counts_once(tmp_path):
     assert len(sources([path, tmp_path, path], tmp_path / "scratch").indexes) == 1
 
 
-def test_files_of_several_folders(tmp_path):
-    paths = [write_recording(tmp_path / base[-4:] / "same.mcap", steady(base, seconds=2.0)) for base in (GOOB, FRED)]
-    found = sources(paths, tmp_path / "scratch")
-    assert (found.robots, len(found.indexes)) == ([FRED, GOOB], 2)
-
-
-def test_a_folder_without_recordings_is_refused(tmp_path):
-    with pytest.raises(PebbleError, match="there is no recording"):
-        sources([tmp_path], tmp_path / "scratch")
-
-
 def test_names_of_folders_are_no_patterns(tmp_path):
     folder, scratch = tmp_path / "it's [1] *?", tmp_path / "scratch"
     write_recording(folder / "a.mcap", steady(GOOB, seconds=2.0))
@@ -374,8 +349,3 @@ def test_a_damaged_index_is_named(tmp_path):
         analyse(found, tmp_path / "scratch")
     assert "a.parquet" in str(error.value)
     assert "\n" not in str(error.value)
-
-
-def test_robots_are_analysed_in_order_of_their_names(of):
-    robots = [Robot("b"), Robot("a")]
-    assert [one.robot for one in of(traffic(robots, seconds=2.0)).robots] == ["pebble/robots/a", "pebble/robots/b"]
