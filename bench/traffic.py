@@ -172,8 +172,8 @@ def heartbeat_table(robots: Analysed) -> Table:
     """Return what the paper shows as distributions of heartbeats."""
     table = plain_table("Heartbeats", ["robot", "heartbeats", "every ms", "outages", "latency p50", "p95 ms"])
     for name, robot in robots.items():
-        if robot.intervals is not None and robot.latency is not None:
-            counts = (robot.latency.count, round(robot.intervals.median_ms), len(robot.outages))
+        if robot.interval_ms is not None and robot.latency is not None:
+            counts = (robot.latency.count, round(robot.interval_ms), len(robot.outages))
             times = (robot.latency.median_ms, robot.latency.p95_ms)
             table.add_row(name, *map(str, counts), *(f"{time_ms:.1f}" for time_ms in times))
     return table

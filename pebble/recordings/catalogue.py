@@ -14,7 +14,7 @@ from pebble.recordings.library import ACTIVE, merged, robot_of
 from pebble.recordings.recorder.intake import EVENTS
 from pebble.transports.topics import matches
 
-_SHOWN_EVENTS: Final = frozenset({"gap", "clock", "dropped", "pruned", "recovered", "damaged", "removed", "late"})
+_SHOWN_EVENTS: Final = frozenset({"gap", "clock", "dropped", "pruned", "recovered", "damaged", "removed"})
 _LISTED: Final = 20  # names that a message lists
 
 
@@ -57,7 +57,7 @@ def look_at(path: Path, *, whole: bool = False) -> FileInfo:
         info.missing = file.damage.missing + missing_before(metadata)
         info.finished = file.damage.finished
         info.damaged = bool(file.damage.parts) or DAMAGE in metadata
-        info.problem = file.damage.report(active=info.is_active)
+        info.problem = file.problem
     return info
 
 
@@ -131,7 +131,7 @@ def check_names(query: Query, paths: Iterable[Path], places: Iterable[Path]) -> 
                 for _ in file.read(chooses=lambda _channel: False) if file.statistics is None else ():
                     pass
                 found += file.channels.values()
-                if file.damage.report(active=path.name.endswith(ACTIVE)):
+                if file.problem:
                     return
         except RecordingError:
             return

@@ -1,28 +1,18 @@
 """Recordings as one stream of messages in the order of time, however many files they are in."""
 
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Final
 
 from pebble.recordings.files.reader import Chooses, RecordingFile, in_time_order
+from pebble.recordings.files.recorded import ACTIVE as ACTIVE
 from pebble.recordings.files.recorded import FOREVER_NS as FOREVER_NS
 from pebble.recordings.files.recorded import SUFFIX as SUFFIX
 from pebble.recordings.files.recorded import Channel, Damage, Recorded, RecordingError
 from pebble.recordings.files.records import MAGIC
 
-ACTIVE: Final = ".mcap.active"  # is being written, or was left by a recorder that was killed
 #: What is wrong with each file that was read.
 Damages = dict[Path, Damage]
-
-
-@dataclass(frozen=True, slots=True)
-class Span:
-    """From the first message to the last, in nanoseconds since 1970."""
-
-    first_ns: int
-    last_ns: int
 
 
 def files(places: Iterable[Path]) -> list[Path]:
@@ -30,7 +20,7 @@ def files(places: Iterable[Path]) -> list[Path]:
     found: list[Path] = []
     for place in places:
         if place.is_dir():
-            found += sorted(path for path in place.rglob(f"*{SUFFIX}*") if _is_recording(path))
+            found += sorted(recordings_in(place))
         elif _begins_as_mcap(place) or place.name.endswith((SUFFIX, ACTIVE)):
             found.append(place)
         else:
@@ -40,21 +30,17 @@ def files(places: Iterable[Path]) -> list[Path]:
     return found
 
 
-def _is_recording(path: Path) -> bool:
-    """By its name; a link that leads nowhere is one that cannot be read."""
-    return path.name.endswith((SUFFIX, ACTIVE)) and (path.is_file() or path.is_symlink())
+def recordings_in(folder: Path) -> Iterator[Path]:
+    """Yield them by their names; a link that leads nowhere is one that cannot be read."""
+    for path in folder.rglob(f"*{SUFFIX}*"):
+        if path.name.endswith((SUFFIX, ACTIVE)) and (path.is_file() or path.is_symlink()):
+            yield path
 
 
-def span(path: Path) -> Span | None:
-    """Return the time that a file covers, without an end if it is not finished; None if it holds no message."""
+def reaches_into(path: Path, since_ns: int, until_ns: int) -> bool:
+    """True if a file may hold messages of a period. Raises RecordingError."""
     with RecordingFile(path) as file:
-        return span_of(file)
-
-
-def span_of(file: RecordingFile) -> Span | None:
-    if not file.chunks:
-        return None
-    return Span(file.first_ns, file.last_ns if file.damage.finished else FOREVER_NS)
+        return file.reaches_into(since_ns, until_ns)
 
 
 def merged(
@@ -74,12 +60,11 @@ def merged(
     due = []
     for path in paths:
         with RecordingFile(path) as file:
-            covered, damage = span_of(file), file.damage
-        if covered is None:
-            damages[path] = damage
-        elif covered.last_ns >= since_ns and covered.first_ns < until_ns:
-            reading = partial(_messages, path, since_ns, until_ns, chooses, damages)
-            due.append((max(covered.first_ns, since_ns), reading))
+            if not file.chunks:
+                damages[path] = file.damage
+            elif file.reaches_into(since_ns, until_ns):
+                reading = partial(_messages, path, since_ns, until_ns, chooses, damages)
+                due.append((max(file.first_ns, since_ns), reading))
     yield from in_time_order(due)
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from pebble.bench import bridge, control, cost, frames, startup
 from pebble.bench.impair import metrics, trials
 from pebble.bench.results import STAND_IN, Cell, Results
-from pebble.recordings.traffic.results import Bandwidth, Histogram, Intervals, Latency, Outage, RobotTraffic
+from pebble.recordings.traffic.results import Bandwidth, Histogram, Latency, Outage, RobotTraffic
 
 TRIALS = ("base-start", "512k", "256k", "64k+5%", "base-end")
 _random = np.random.default_rng(7)
@@ -119,12 +119,12 @@ def _robot_traffic(name: str) -> RobotTraffic:
     families = (("drive", 3.2), ("heartbeat", 1.2), ("video", 170.0), ("audio", 265.6))
     return RobotTraffic(
         robot=f"pebble/robots/{name}", machine="MCU" if name in ("minilamp", "benjr") else "Linux", messages=1000,
-        bytes=100_000, session_s=30, idle_s=30, offline=0, offline_s=0.0, sessions=[], outages=outages,
+        bytes=100_000, sessions=[], outages=outages,
         bandwidth=[
             Bandwidth(family, time, 30, kbps, 1.3 * kbps, 300, 10_000)
             for family, kbps in families
             for time in ("all", "session", "idle")
         ],
-        intervals=Intervals(count=240, median_ms=250.0),
-        latency=Latency(240, 1.0, 2.5, 30.0, 60.0, Histogram(0.0, 2.0, [90, 80, 40, 20, 5, 0, 5])),
+        interval_ms=250.0,
+        latency=Latency(240, 2.5, 30.0, Histogram(0.0, 2.0, [90, 80, 40, 20, 5, 0, 5])),
     )  # fmt: skip

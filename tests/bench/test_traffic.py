@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import io
+import shutil
 from pathlib import Path
 
 import pytest
@@ -14,7 +15,7 @@ from pebble.bench.show import finish
 from pebble.bench.traffic import QUICK, TABLE_4_1, Analysed, Settings, heartbeat_table, media_table, run
 from pebble.errors import PebbleError
 from pebble.recordings.traffic.analysis import analyse
-from pebble.recordings.traffic.results import AUDIO, VIDEO
+from pebble.recordings.traffic.results import AUDIO, IDLE, TOTAL, VIDEO
 from pebble.recordings.traffic.sources import sources
 from tests.recordings.demo_robots import DRIVE, FRED, MEDIA, messages
 
@@ -30,7 +31,7 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Analysed:
     """The analysis of the demo's robots in tests/data."""
     pytest.importorskip("duckdb")
     scratch = tmp_path_factory.mktemp("scratch")
-    found = sources([DRIVE, MEDIA], scratch)
+    found = sources([Path(shutil.copy2(path, scratch)) for path in (DRIVE, MEDIA)], scratch)
     return {robot.robot.rpartition("/")[2]: robot for robot in analyse(found, scratch).robots}
 
 
@@ -79,6 +80,6 @@ def test_the_robots_are_recorded_at_a_broker(tmp_path: Path, monkeypatch: pytest
         assert sound is not None
         assert sound.messages > 100
         assert sound.bytes == 664 * sound.messages, "PCM of one channel"
-    assert all(robot.sessions and robot.idle_s for robot in robots["all"].values())
+    assert all(robot.sessions and robot.of(TOTAL, IDLE) for robot in robots["all"].values())
     assert any("20 to 40 ms" in note for note in shown.results.notes)
     assert (tmp_path / "traffic-figures.png").exists()

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
-from collections.abc import Iterable, Sequence
+import struct
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -14,6 +14,7 @@ from pebble.recordings.files.writer import RecordingWriter
 from pebble.recordings.replay.player import Player
 from pebble.recordings.replay.rules import Options, Rules
 from pebble.recordings.replay.source import ReplaySource
+from pebble.recordings.seek.segment import Flag
 from pebble.recordings.stamps import stamp_ns
 from pebble.transports import Message
 
@@ -66,6 +67,16 @@ def write(path: Path, lines: Iterable[Line], *, finished: bool = True) -> Path:
     return path
 
 
+def unpacked(segment: bytes) -> Iterator[tuple[float, Flag, str, bytes]]:
+    """Yield received (epoch ms), flags, metric and payload of each message in a segment, as pages read it."""
+    head, at = struct.Struct(">IdBH"), 0
+    while at < len(segment):
+        length, received_ms, flags, size = head.unpack_from(segment, at)
+        body = segment[at + head.size : at + 4 + length]
+        yield received_ms, Flag(flags), body[:size].decode(), body[size:]
+        at += 4 + length
+
+
 class VirtualTime:
     """A clock that only waiting moves on."""
 
@@ -116,12 +127,6 @@ class Stage:
 
     def payloads(self, topic: str) -> list[bytes]:
         return [sent.message.payload for sent in self.sent if sent.message.topic == topic]
-
-    def digest(self) -> str:
-        found = hashlib.sha256()
-        for at, message in self.sent:
-            found.update(repr((round(at, 9), message.topic, message.payload, message.qos, message.retain)).encode())
-        return found.hexdigest()
 
     def _publish(self, message: Message) -> bool:
         if self.refuses:

@@ -29,7 +29,7 @@ def folder(tmp_path: Path) -> Path:
     recorder.receive(
         f"{GOOB}/outgoing/logs", json.dumps({"level": "WARNING", "message": "low \n battery"}).encode(), 1, retain=False
     )
-    recorder.events.note("gap", since=1000, until=61_000, why="no connection")
+    recorder.note("gap", since=1000, until=61_000, why="no connection")
     recorder.stop()
     return tmp_path / "rec"
 

@@ -24,12 +24,12 @@ from pebble.fleet.people import People
 from pebble.fleet.roles import Role
 from pebble.recordings.library import files
 from pebble.recordings.seek import questions
-from pebble.recordings.seek.segment import Flag, unpacked
+from pebble.recordings.seek.segment import Flag
 from pebble.recordings.traffic.index import index_path
 from pebble.web.recordings import archive_process, routes
 from tests.recordings.messages import START_NS
 from tests.recordings.others import DAMAGED
-from tests.recordings.playing import GOOB, js, ms
+from tests.recordings.playing import GOOB, js, ms, unpacked
 from tests.recordings.seek.filming import CAMERA, FPS, film
 from tests.support import Broker, further, gone, until
 from tests.web import failing_jobs
@@ -316,7 +316,7 @@ def whys(functions: Iterable[Callable[..., None]], *arguments: Path) -> list[str
 
 
 FAILURES: dict[Callable[..., None], str] = {
-    partial(failing_jobs.without, "duckdb", "timeline"): 'this needs DuckDB: pip install "pebble-robot[archive]"',
+    partial(failing_jobs.without, "duckdb", "timeline"): 'duckdb missing: pip install "pebble-robot[archive]"',
     partial(failing_jobs.without, "mcap", "export"): 'pip install "pebble-robot[record]"',
     partial(failing_jobs.without, "av", "export"): "film needs PyAV: pip install 'pebble-robot[media]'",
     failing_jobs.killed: "its process was killed, as it is where memory runs out",

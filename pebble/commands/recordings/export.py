@@ -5,6 +5,7 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from enum import StrEnum
+from functools import partial
 from pathlib import Path
 from typing import Annotated, BinaryIO
 
@@ -19,16 +20,14 @@ from pebble.config.visible import shown
 from pebble.errors import PebbleError
 from pebble.recordings import catalogue
 from pebble.recordings.catalogue import Query
-from pebble.recordings.exports.copy import write_copy
 from pebble.recordings.exports.film import write_film, write_wav
 from pebble.recordings.exports.foxglove import write_foxglove
-from pebble.recordings.exports.lines import BadLine, Imported, read_lines, write_lines
+from pebble.recordings.exports.lines import TRUNCATED, BadLine, read_lines, write_lines
 from pebble.recordings.exports.unfinished import unfinished
-from pebble.recordings.files.recorded import Channel, Recorded
-from pebble.recordings.files.rewrite import Copy
+from pebble.recordings.files.recorded import Recorded
+from pebble.recordings.files.rewrite import Copy, write_copy
 from pebble.recordings.files.writer import RecordingWriter
 from pebble.recordings.library import Damages, files, merged, problems
-from pebble.recordings.stamps import stamp_ns
 
 
 class Form(StrEnum):
@@ -74,8 +73,8 @@ def export(
     beside = damages if query == Query() else ()  # those that were read
     try:
         with progress_of_time(paths, since_ns, until_ns) as on_time:
-            messages = merged(paths, since_ns=since_ns, until_ns=until_ns, chooses=query.chooses, damages=damages)
-            typer.echo(_export(form, messages, target, query.robot or "", on_time, beside))
+            read = partial(merged, paths, since_ns=since_ns, until_ns=until_ns, chooses=query.chooses, damages=damages)
+            typer.echo(_export(form, read, target, query.robot or "", on_time, beside))
     finally:
         code = report_unread(problems(damages))
     return code
@@ -86,7 +85,7 @@ def import_(
     target: Annotated[Path, typer.Argument(help="A new recording.", metavar="OUT.mcap")],
 ) -> int:
     """Import what the original's logger recorded, or an export as lines."""
-    with _opened(source) as file, unfinished(target, overwrite=False) as path, path.open("wb", buffering=0) as out:
+    with _opened(source) as file, unfinished(target) as path, path.open("wb", buffering=0) as out:
         writer = RecordingWriter(out)
         writer.metadata("pebble.recording", {"format": "1", "imported": source.name})
         counted = _import(read_lines(file), Copy(writer))
@@ -101,30 +100,31 @@ def import_(
 
 def _export(
     form: Form,
-    messages: Iterable[Recorded],
+    read: Callable[[], Iterable[Recorded]],
     target: Path,
     robot: str,
     on_time: Callable[[int], None],
     beside: Iterable[Path],
 ) -> str:
     if form is Form.FOXGLOVE:
-        counts = write_foxglove(messages, target, on_time=on_time)
+        counts = write_foxglove(read(), target, on_time=on_time)
         return f"{target}: " + ", ".join(f"{count:,} {name}" for name, count in counts.items())
     if form in (Form.MKV, Form.MP4):
-        film = write_film(messages, target, robot, on_time=on_time)
+        film = write_film(read, target, robot, on_time=on_time)
         sound = "no sound" if film.sound is None else f"{show.duration(film.sound.seconds)} of sound"
-        return f"{target}: {show.duration(film.seconds)}, {film.pictures:,} pictures, {sound}"
+        lost = f", {film.left_out:,} pictures that cannot be decoded left out" if film.left_out else ""
+        return f"{target}: {show.duration(film.seconds)}, {film.pictures:,} pictures, {sound}{lost}"
     if form is Form.WAV:
-        return f"{target}: {show.duration(write_wav(messages, target, robot, on_time=on_time).seconds)} of sound"
-    with unfinished(target, overwrite=False) as path, path.open("wb") as out:
+        return f"{target}: {show.duration(write_wav(read(), target, robot, on_time=on_time).seconds)} of sound"
+    with unfinished(target) as path, path.open("wb") as out:
         if form is Form.LINES:
-            count = write_lines(messages, out, on_time=on_time)
+            count = write_lines(read(), out, on_time=on_time)
         else:
-            count = write_copy(messages, out, on_time=on_time, beside=beside)
+            count = write_copy(read(), out, on_time=on_time, beside=beside)
     return f"{target}: {count:,} messages"
 
 
-def _import(found: Iterable[Imported | BadLine], copy: Copy) -> Counter[str]:
+def _import(found: Iterable[Recorded | BadLine], copy: Copy) -> Counter[str]:
     counted = Counter[str]()
     for one in found:
         if isinstance(one, BadLine):
@@ -132,11 +132,9 @@ def _import(found: Iterable[Imported | BadLine], copy: Copy) -> Counter[str]:
             if counted["bad"] <= 3:
                 typer.echo(f"pebble: line {one.number}: {shown(one.problem)}", err=True)
             continue
-        encoding = "json" if one.payload[:1] in (b"{", b"[") else "application/octet-stream"
-        channel = Channel(0, one.topic, encoding, one.metadata)
-        copy.add(Recorded(channel, 0, one.log_ns, stamp_ns(one.payload), one.payload))
+        copy.add(one)
         counted["messages"] += 1
-        counted["truncated"] += one.truncated
+        counted["truncated"] += TRUNCATED in one.channel.metadata
     return counted
 
 

@@ -15,9 +15,10 @@ from pebble.commands.recordings.report import report_left, report_unread
 from pebble.config.visible import shown
 from pebble.errors import PebbleError
 from pebble.recordings.catalogue import Query, check_names
+from pebble.recordings.files.reader import RecordingFile
 from pebble.recordings.files.recorded import Recorded, RecordingError
 from pebble.recordings.files.rewrite import Keeps, rewrite
-from pebble.recordings.library import ACTIVE, SUFFIX, files, robot_of, span
+from pebble.recordings.library import ACTIVE, SUFFIX, files, robot_of
 from pebble.recordings.recorder.finisher import mend as mend_leftover
 from pebble.recordings.recorder.folder import DAMAGED, Folder, finished_path
 from pebble.recordings.traffic.index import index_path
@@ -109,10 +110,10 @@ def _rm(owner: Folder, base: str | None, period_ns: tuple[int, int], keeps: Keep
 def _reaches_into(path: Path, since_ns: int, until_ns: int) -> bool:
     """Whether a file may hold messages of a period: one that cannot be read may."""
     try:
-        covered = span(path)
+        with RecordingFile(path) as file:
+            return not file.chunks or file.reaches_into(since_ns, until_ns)
     except RecordingError:
         return True
-    return covered is None or (covered.last_ns >= since_ns and covered.first_ns < until_ns)
 
 
 def _delete_whole(path: Path, *, yes: bool) -> int:

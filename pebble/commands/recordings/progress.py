@@ -11,7 +11,7 @@ from pathlib import Path
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
 
-from pebble.recordings.library import FOREVER_NS, span
+from pebble.recordings.files.reader import RecordingFile
 
 _QUIET_S = 2.0  # before progress is shown
 
@@ -40,8 +40,12 @@ def progress(what: str, total: int) -> Iterator[Callable[[float], None]]:
 
 @contextmanager
 def progress_of_time(paths: list[Path], since_ns: int, until_ns: int) -> Iterator[Callable[[int], None]]:
-    spans = [one for path in paths if (one := span(path)) is not None]
-    begin = max(since_ns, min((one.first_ns for one in spans), default=0))
-    end = min(until_ns, max((one.last_ns for one in spans if one.last_ns != FOREVER_NS), default=begin + 1))
+    first, last = [], [0]
+    for path in paths:
+        with RecordingFile(path) as file:
+            first += [file.first_ns] if file.chunks else []
+            last += [file.last_ns] if file.damage.finished else []
+    begin = max(since_ns, min(first, default=0))
+    end = min(until_ns, max(last))
     with progress("exporting", max(1, end - begin)) as advance:
         yield lambda log_ns: advance(log_ns - begin)

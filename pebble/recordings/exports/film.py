@@ -2,17 +2,16 @@
 
 import heapq
 import tempfile
-from collections.abc import Iterable, Iterator
-from contextlib import closing, contextmanager
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
+from fractions import Fraction
 from pathlib import Path
 from typing import Any, Final
 
 from pebble.contract import OUTGOING
 from pebble.contract.packets import PBAT
-from pebble.errors import PebbleError
 from pebble.media import pyav
-from pebble.recordings.exports.film_pictures import MILLISECOND, PictureTrack
 from pebble.recordings.exports.film_sound import RATE, SoundResult, SoundTrack
 from pebble.recordings.exports.lines import Progress
 from pebble.recordings.exports.unfinished import unfinished
@@ -21,9 +20,12 @@ from pebble.recordings.stamps import is_picture
 
 #: By the ending of the film: FFmpeg's names of the container and of the encoder of its sound.
 _FORMATS: Final = {".mkv": ("matroska", "libopus"), ".mp4": ("mp4", "aac")}
-_PYAV: Final = 15  # older ones cannot make a stream out of packets that another encoder made
+_LAST_PICTURE_MS: Final = 66  # how long the last picture of a film is shown
+_MILLISECOND: Final = Fraction(1, 1000)
+_KEYFRAME_INTERVAL: Final = 60  # pictures: how far a player jumps
+_NOMINAL_FPS: Final = 15  # for the encoder; each picture has its own time
+_OPTIONS: Final = {"crf": "23", "preset": "veryfast"}
 _BITRATE: Final = 64_000  # bits per second of each channel
-_LAST_PICTURE_MS: Final = 66  # how long a film of one picture is
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,47 +35,58 @@ class FilmResult:
     seconds: float
     pictures: int
     left_out: int  # pictures: damaged, or without those that they build on
-    width: int
-    height: int
-    scaled: int  # pictures of another size than the film
     sound: SoundResult | None  # None: none was received
 
 
 def write_film(
+    read: Callable[[], Iterable[Recorded]],
+    target: Path,
+    robot: str,
+    *,
+    on_time: Progress = lambda _log_ns: None,
+) -> FilmResult:
+    """Write the pictures and the sound of ``robot`` (its base) to ``target``, which ends in .mkv or .mp4.
+
+    The messages are read twice: for the sound, then for the pictures, which take long. If several of its topics carry
+    pictures, or sound, the first one counts. The film has the size of its first picture. Raises
+    RecordingError if there are no pictures or ``target`` cannot be written; PebbleError without PyAV.
+    """
+    if target.suffix not in _FORMATS:
+        raise RecordingError(f"{target}: a film ends in {' or '.join(_FORMATS)}")
+    av = pyav.load("film")
+    container, codec = _FORMATS[target.suffix]
+    with unfinished(target) as path, _file_beside(target) as wav:
+        try:
+            with SoundTrack(wav) as sound:
+                for at_ms, payload in _media(read(), robot, lambda _log_ns: on_time(0)):
+                    if not is_picture(payload):
+                        sound.add(payload, at_ms)
+            with av.open(str(path), "w", format=container) as out:
+                pictures = _Pictures(av, out)
+                media = _media(read(), robot, on_time)
+                tracks = [pictures.packets((at_ms, payload) for at_ms, payload in media if is_picture(payload))]
+                if sound.result.packets:
+                    tracks.append(_sound_packets(av, wav, out, codec))
+                for packet in heapq.merge(*tracks, key=lambda packet: packet.dts * packet.time_base):
+                    if pictures.count:
+                        out.mux(packet)
+        except av.error.FFmpegError as error:
+            raise RecordingError(f"{target}: {error}") from None
+        if not pictures.count:
+            raise RecordingError(f"{robot}: no pictures; its sound alone can be exported as wav")
+    seconds = max((pictures.last_ms + _LAST_PICTURE_MS) / 1000, sound.result.seconds)
+    return FilmResult(seconds, pictures.count, pictures.left_out, sound.result if sound.result.packets else None)
+
+
+def write_wav(
     messages: Iterable[Recorded],
     target: Path,
     robot: str,
     *,
-    overwrite: bool = False,
-    on_time: Progress | None = None,
-) -> FilmResult:
-    """Write the pictures and the sound of ``robot`` (its base) to ``target``, which ends in .mkv or .mp4.
-
-    If several of its topics carry pictures, or sound, the first one counts. The film has the size of its first
-    picture. Raises RecordingError if there are no pictures or ``target`` cannot be written; PebbleError without PyAV.
-    """
-    if target.suffix not in _FORMATS:
-        raise RecordingError(f"{target}: a film ends in {' or '.join(_FORMATS)}")
-    av = _pyav()
-    with unfinished(target, overwrite=overwrite) as path, _folder_beside(target) as folder:
-        try:
-            pictures = PictureTrack(av, folder / "pictures.mkv")
-            with closing(pictures), SoundTrack(folder / "sound.wav") as sound:
-                for at_ms, payload in _media(messages, robot, on_time):
-                    (pictures if is_picture(payload) else sound).add(payload, at_ms)
-            if pictures.count == 0:
-                raise RecordingError(f"{robot}: no pictures; its sound alone can be exported as wav")
-            _join(av, pictures.path, sound.path if sound.result.packets else None, path, target.suffix)
-        except av.error.FFmpegError as error:
-            raise RecordingError(f"{target}: {error}") from None
-    return _result(pictures, sound.result if sound.result.packets else None)
-
-
-def write_wav(
-    messages: Iterable[Recorded], target: Path, robot: str, *, overwrite: bool = False, on_time: Progress | None = None
+    on_time: Progress = lambda _log_ns: None,
 ) -> SoundResult:
     """Write the sound of ``robot`` (its base) to ``target``, from its first sample on. Raises RecordingError."""
-    with unfinished(target, overwrite=overwrite) as path, SoundTrack(path) as track:
+    with unfinished(target) as path, SoundTrack(path) as track:
         first_ms = None
         for at_ms, payload in _media(messages, robot, on_time):
             if not is_picture(payload):
@@ -84,32 +97,18 @@ def write_wav(
     return track.result
 
 
-def _result(pictures: PictureTrack, sound: SoundResult | None) -> FilmResult:
-    seconds = max((pictures.last_ms + _LAST_PICTURE_MS) / 1000, 0.0 if sound is None else sound.seconds)
-    return FilmResult(seconds, pictures.count, pictures.left_out, *pictures.size, pictures.scaled, sound)
-
-
-def _pyav() -> Any:
-    """Raises PebbleError."""
-    av = pyav.load("film")
-    if int(av.__version__.partition(".")[0]) < _PYAV:
-        raise PebbleError(f"film needs PyAV {_PYAV} or newer, this is {av.__version__}")
-    return av
-
-
 @contextmanager
-def _folder_beside(target: Path) -> Iterator[Path]:
-    """A folder for files that may be as large as the film: one for temporary files is often in memory."""
+def _file_beside(target: Path) -> Iterator[Path]:
+    """A file that may become as large as the film: the folder for temporary files is often in memory."""
     with tempfile.TemporaryDirectory(dir=target.parent, prefix=f".{target.name}.") as name:
-        yield Path(name)
+        yield Path(name, "sound.wav")
 
 
-def _media(messages: Iterable[Recorded], robot: str, on_time: Progress | None) -> Iterator[tuple[int, bytes]]:
+def _media(messages: Iterable[Recorded], robot: str, on_time: Progress) -> Iterator[tuple[int, bytes]]:
     """The pictures and the sound of one robot, of one topic each, with milliseconds since the first one."""
     below, topics, first_ms = f"{robot}/{OUTGOING}/", dict[bool, str](), None
     for message in messages:
-        if on_time is not None:
-            on_time(message.log_ns)
+        on_time(message.log_ns)
         topic, payload = message.channel.topic, message.payload
         if topic.startswith(below) and message.channel.metadata.get("retained") != "1":
             picture = is_picture(payload)
@@ -117,35 +116,6 @@ def _media(messages: Iterable[Recorded], robot: str, on_time: Progress | None) -
                 log_ms = message.log_ns // 10**6
                 first_ms = log_ms if first_ms is None else first_ms
                 yield log_ms - first_ms, payload
-
-
-def _join(av: Any, pictures: Path, sound: Path | None, target: Path, ending: str) -> None:
-    """One file of both, in the order of time."""
-    container, codec = _FORMATS[ending]
-    with av.open(str(target), "w", format=container) as out, av.open(str(pictures)) as source:
-        stream = out.add_stream_from_template(source.streams.video[0], opaque=True)
-        stream.time_base = MILLISECOND
-        tracks = [_picture_packets(source, stream)]
-        if sound is not None:
-            tracks.append(_sound_packets(av, sound, out, codec))
-        for packet in heapq.merge(*tracks, key=lambda packet: packet.dts * packet.time_base):
-            out.mux(packet)
-
-
-def _picture_packets(source: Any, stream: Any) -> Iterator[Any]:
-    """Each is shown until the next one; the last one as long as the one before it."""
-    duration = _LAST_PICTURE_MS
-    packets = (packet for packet in source.demux(video=0) if packet.pts is not None)
-    last = None
-    for packet in packets:
-        if last is not None:
-            duration = last.duration = packet.pts - last.pts
-            yield last
-        packet.stream = stream
-        last = packet
-    if last is not None:
-        last.duration = min(duration, 1000)
-        yield last
 
 
 def _sound_packets(av: Any, path: Path, out: Any, codec: str) -> Iterator[Any]:
@@ -157,3 +127,49 @@ def _sound_packets(av: Any, path: Path, out: Any, codec: str) -> Iterator[Any]:
         for frame in source.decode(wav):
             yield from stream.encode(frame)
         yield from stream.encode(None)
+
+
+class _Pictures:
+    """Pictures of any size and encoding as H.264 of one size, that of the first: the encoder scales the others."""
+
+    def __init__(self, av: Any, out: Any) -> None:
+        from pebble.media.decode import VideoDecoder
+
+        self.count = self.left_out = 0
+        self.last_ms = -1
+        self._av, self._out, self._decoder = av, out, VideoDecoder()
+
+    def packets(self, pictures: Iterable[tuple[int, bytes]]) -> Iterator[Any]:
+        """Yield packets of a stream of ``out``: each picture is shown at its time (ms), but after the one before it."""
+        stream: Any = None
+        for at_ms, payload in pictures:
+            decoded = self._decoder.feed(payload)
+            if decoded is None:  # damaged, or without those that it builds on
+                self.left_out += 1
+                continue
+            if stream is None:
+                stream = self._opened(*decoded.picture.shape[:2])
+            frame = self._av.VideoFrame.from_ndarray(decoded.picture, format="bgr24")
+            self.last_ms = frame.pts = max(at_ms, self.last_ms + 1)
+            frame.time_base = _MILLISECOND
+            self.count += 1
+            yield from _lasting(stream.encode(frame))
+        if stream is not None:
+            yield from _lasting(stream.encode(None))
+
+    def _opened(self, height: int, width: int) -> Any:
+        """Colour is stored for two by two pixels."""
+        stream = self._out.add_stream("libx264", rate=_NOMINAL_FPS, options=_OPTIONS)
+        stream.width, stream.height = width & ~1, height & ~1
+        stream.pix_fmt = "yuv420p"
+        stream.codec_context.time_base = _MILLISECOND
+        stream.codec_context.gop_size = _KEYFRAME_INTERVAL
+        stream.codec_context.max_b_frames = 0
+        return stream
+
+
+def _lasting(packets: list[Any]) -> list[Any]:
+    """Give each a length, which counts for the last one: the others are shown until the next."""
+    for packet in packets:
+        packet.duration = _LAST_PICTURE_MS
+    return packets

@@ -10,7 +10,6 @@ from typing import Final
 
 from pebble.contract.packets import PBAT
 from pebble.recordings.exports.foxglove_messages import (
-    QUALITY,
     Converted,
     Media,
     Schemas,
@@ -34,9 +33,7 @@ def write_foxglove(
     messages: Iterable[Recorded],
     target: Path,
     *,
-    overwrite: bool = False,
-    quality: float = QUALITY,
-    on_time: Progress | None = None,
+    on_time: Progress = lambda _log_ns: None,
 ) -> dict[str, int]:
     """Write ``messages`` to the MCAP file ``target``; returns how many there are by schema, ``json`` and ``left out``.
 
@@ -44,13 +41,12 @@ def write_foxglove(
     retained messages. Raises RecordingError if ``target`` cannot be written, PebbleError without Foxglove's schemas.
     """
     schemas = Schemas()
-    with unfinished(target, overwrite=overwrite) as path, path.open("wb", buffering=0) as file:
+    with unfinished(target) as path, path.open("wb", buffering=0) as file:
         writer = RecordingWriter(file)
-        export = _Export(Copy(writer), schemas, quality)
+        export = _Export(Copy(writer), schemas)
         for message in messages:
             export.add(message)
-            if on_time is not None:
-                on_time(message.log_ns)
+            on_time(message.log_ns)
         writer.finish()
     return dict(export.counts)
 
@@ -58,10 +54,10 @@ def write_foxglove(
 class _Export:
     """One file in the making."""
 
-    def __init__(self, copy: Copy, schemas: Schemas, quality: float) -> None:
+    def __init__(self, copy: Copy, schemas: Schemas) -> None:
         self.counts: Counter[str] = Counter()
         self._copy, self._schemas = copy, schemas
-        self._media = Media(schemas, quality)
+        self._media = Media(schemas)
         self._telemetry = Telemetry(schemas)
         self._channels: dict[str, Channel] = {}
 

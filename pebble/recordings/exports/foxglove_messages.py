@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from pebble.media.decode import VideoDecoder
     from pebble.media.sound import SoundDecoder
 
-QUALITY: Final = 85.0  # of the JPEGs that are made of pictures, 1 to 100
+QUALITY: Final = 85  # of the JPEGs that are made of pictures, 1 to 100
 MOST_CHANNELS: Final = 8192
 #: What media become, and the endings of their topics.
 VIDEO, IMAGE, SOUND = ("CompressedVideo", "video"), ("CompressedImage", "image"), ("RawAudio", "sound")
@@ -83,8 +83,8 @@ class Schemas:
 class Media:
     """Pictures and sound: H.264 as it was sent, other pictures as whole JPEGs, all sound as samples."""
 
-    def __init__(self, schemas: Schemas, quality: float = QUALITY) -> None:
-        self._make, self._quality = schemas.make, round(quality)
+    def __init__(self, schemas: Schemas) -> None:
+        self._make = schemas.make
         self._pictures: dict[str, VideoDecoder] = {}  # by topic
         self._sounds: dict[str, SoundDecoder] = {}
 
@@ -117,7 +117,7 @@ class Media:
         decoded = self.decoder(topic).feed(payload)
         if decoded is None:
             return None
-        jpeg = cv2.imencode(".jpg", decoded.picture, [cv2.IMWRITE_JPEG_QUALITY, self._quality])[1].tobytes()
+        jpeg = cv2.imencode(".jpg", decoded.picture, [cv2.IMWRITE_JPEG_QUALITY, QUALITY])[1].tobytes()
         schema, ending = IMAGE
         return Converted(self._make(schema, frame_id=_id(topic), data=jpeg, format="jpeg"), ending)
 

@@ -9,17 +9,20 @@ messages that are from before them only, ours as they were published.
 from collections.abc import Callable, Iterable, Iterator
 from datetime import UTC, datetime, timedelta
 from decimal import Decimal
+from functools import partial
 from typing import Annotated, Any, BinaryIO, Final
 
 import msgspec
 from msgspec import UNSET, Meta, Raw, Struct, UnsetType
 
 from pebble.errors import TransportError
-from pebble.recordings.files.recorded import Recorded
+from pebble.recordings.files.recorded import Channel, Recorded, RecordingError
+from pebble.recordings.stamps import stamp_ns
 from pebble.transports.topics import check_topic
 
 TRUNCATED: Final = "truncated"  # of a channel: its payloads were cut before they were recorded here
 
+LONGEST_LINE: Final = 96 << 20  # bytes; the largest message of a recording takes less
 _TEXT_MOST: Final = 1 << 16  # bytes of a payload that is written as text, too
 _MILLISECONDS_FROM: Final = 10**11  # a number as large as this counts milliseconds (paper A.4.2)
 _LATEST_NS: Final = (1 << 63) - 1
@@ -27,25 +30,6 @@ _EPOCH: Final = datetime(1970, 1, 1, tzinfo=UTC)
 _MICROSECOND: Final = timedelta(microseconds=1)
 
 Progress = Callable[[int], None]  # called with the log time of each message
-
-
-class Imported(Struct, frozen=True):
-    """A message that another program recorded."""
-
-    log_ns: int  # when it was received, since 1970
-    topic: str
-    payload: bytes
-    qos: int = 0
-    retain: bool = False
-    retained: bool = False  # it was from before the subscription
-    truncated: bool = False  # the payload is only the beginning of what was published
-
-    @property
-    def metadata(self) -> dict[str, str]:
-        """The form is that of a recording's channel."""
-        flags = {"retained": self.retained, TRUNCATED: self.truncated}
-        known = {"qos": str(self.qos), "retain": str(int(self.retain))}
-        return known | {name: "1" for name, is_set in flags.items() if is_set}
 
 
 class BadLine(Struct, frozen=True):
@@ -60,7 +44,7 @@ class _Line(Struct):
     topic: str
     qos: Annotated[int, Meta(ge=0, le=2)] = 0
     retain: bool = False
-    retained: bool | None = None
+    retained: bool | None = None  # it was from before the subscription; None: the logger's "retain" says so
     payload_truncated: bool = False
     payload_b64: bytes = b""
 
@@ -82,42 +66,33 @@ _encoder = msgspec.json.Encoder()
 _decoder = msgspec.json.Decoder(_Line)
 
 
-def write_lines(
-    messages: Iterable[Recorded], out: BinaryIO, *, text: bool = True, on_time: Progress | None = None
-) -> int:
+def write_lines(messages: Iterable[Recorded], out: BinaryIO, *, on_time: Progress = lambda _log_ns: None) -> int:
     """Write a line for each message; returns how many.
 
-    Stamps have nine decimals, so that reading the lines again gives the same nanoseconds. With ``text``, payloads of
-    up to 64 KiB are readable, too, where they are text or JSON.
+    Stamps have nine decimals, so that reading the lines again gives the same nanoseconds. Payloads of up to 64 KiB are
+    readable, too, where they are text or JSON.
     """
     count = 0
     for message in messages:
-        out.write(_encoder.encode(_line(message, text)) + b"\n")
+        out.write(_encoder.encode(_line(message)) + b"\n")
         count += 1
-        if on_time is not None:
-            on_time(message.log_ns)
+        on_time(message.log_ns)
     return count
 
 
-def read_lines(file: BinaryIO) -> Iterator[Imported | BadLine]:
-    """The messages of a logger's file, in its order. Lines that are none are yielded as such; empty ones are not."""
-    for number, line in enumerate(file, 1):
+def read_lines(file: BinaryIO) -> Iterator[Recorded | BadLine]:
+    """Yield the messages of a logger's file, in its order. Lines that are none are yielded as such; empty ones are not.
+
+    Raises RecordingError at a line that is too long to be held in memory.
+    """
+    for number, line in enumerate(iter(partial(file.readline, LONGEST_LINE + 1), b""), 1):
+        if len(line) > LONGEST_LINE:
+            raise RecordingError(f"{file.name}: line {number} is longer than {LONGEST_LINE:,} bytes")
         if not line.isspace():
-            yield _imported(number, line)
+            yield _message(number, line)
 
 
-def checked(message: Imported) -> Imported:
-    """The message, if a recording can hold it. Raises ValueError."""
-    try:
-        check_topic(message.topic.removeprefix("$"))  # our own events have one
-    except TransportError as error:
-        raise ValueError(str(error)) from None
-    if not 0 <= message.log_ns <= _LATEST_NS:
-        raise ValueError("the stamp is no time between 1970 and 2262")
-    return message
-
-
-def _line(message: Recorded, text: bool) -> _Written:
+def _line(message: Recorded) -> _Written:
     metadata, payload = message.channel.metadata, message.payload
     seconds, fraction = divmod(message.log_ns, 10**9)
     line = _Written(
@@ -130,7 +105,7 @@ def _line(message: Recorded, text: bool) -> _Written:
         payload_truncated=metadata.get(TRUNCATED) == "1",
         payload_b64=payload,
     )
-    if text and len(payload) <= _TEXT_MOST:
+    if len(payload) <= _TEXT_MOST:
         _add_text(line, payload)
     return line
 
@@ -143,23 +118,26 @@ def _add_text(line: _Written, payload: bytes) -> None:
         pass
 
 
-def _imported(number: int, line: bytes) -> Imported | BadLine:
+def _message(number: int, line: bytes) -> Recorded | BadLine:
     try:
         found = _decoder.decode(line)
-        retained = found.retain if found.retained is None else found.retained
-        return checked(
-            Imported(
-                _stamp_ns(bytes(found.timestamp)),
-                found.topic,
-                found.payload_b64,
-                found.qos,
-                found.retain,
-                retained,
-                found.payload_truncated,
-            )
-        )
-    except (ValueError, OverflowError, RecursionError) as error:  # msgspec's and UnicodeDecodeError are ValueErrors
+        check_topic(found.topic.removeprefix("$"))  # our own events have one
+        log_ns = _stamp_ns(bytes(found.timestamp))
+        if not 0 <= log_ns <= _LATEST_NS:
+            raise ValueError("the stamp is no time between 1970 and 2262")
+    except (ValueError, OverflowError, RecursionError, TransportError) as error:  # msgspec's are ValueErrors
         return BadLine(number, str(error))
+    payload = found.payload_b64
+    encoding = "json" if payload[:1] in (b"{", b"[") else "application/octet-stream"
+    channel = Channel(0, found.topic, encoding, _metadata(found))
+    return Recorded(channel, 0, log_ns, stamp_ns(payload), payload)
+
+
+def _metadata(line: _Line) -> dict[str, str]:
+    """The form is that of a recording's channel."""
+    flags = {"retained": line.retain if line.retained is None else line.retained, TRUNCATED: line.payload_truncated}
+    known = {"qos": str(line.qos), "retain": str(int(line.retain))}
+    return known | {name: "1" for name, is_set in flags.items() if is_set}
 
 
 def _stamp_ns(stamp: bytes) -> int:

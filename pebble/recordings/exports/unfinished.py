@@ -9,19 +9,19 @@ from pebble.recordings.files.recorded import RecordingError
 
 
 @contextmanager
-def unfinished(target: Path, *, overwrite: bool) -> Iterator[Path]:
+def unfinished(target: Path) -> Iterator[Path]:
     """A path beside ``target`` to write to: it becomes ``target`` at the end, and is removed after an error.
 
     Raises RecordingError if there is a file already, no folder, or no room.
     """
-    if target.exists() and not overwrite:
+    if target.exists():
         raise RecordingError(f"{target} exists already")
     if not target.parent.is_dir():
         raise RecordingError(f"{target.parent}: there is no such folder")
     path = target.with_name(f".{target.name}.{os.getpid()}")
     try:
         yield path
-        if target.exists() and not overwrite:
+        if target.exists():
             raise RecordingError(f"{target} exists already")
         path.replace(target)
     except OSError as error:

@@ -12,7 +12,6 @@ import os
 import zlib
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
-from dataclasses import replace
 from functools import partial
 from itertools import pairwise
 from operator import attrgetter
@@ -20,6 +19,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 from pebble.recordings.files.recorded import (
+    ACTIVE,
     FOREVER_NS,
     Channel,
     Damage,
@@ -40,18 +40,16 @@ from pebble.recordings.files.records import (
     MAGIC,
     MESSAGE,
     Op,
-    channel_of,
     record_of,
     records,
-    schema_of,
     summary_of,
     unpack_chunk,
     with_own_topic,
 )
-from pebble.recordings.files.scan import Scan
+from pebble.recordings.files.scan import Found, Scan
 
 if TYPE_CHECKING:
-    from mcap.records import Attachment, ChunkIndex, Metadata, Statistics
+    from mcap.records import Attachment, ChunkIndex, McapRecord, Metadata, Statistics
     from mcap.summary import Summary
 
 DAMAGE, MISSING = "pebble.damage", "missing_messages"  # metadata of a copy of a file of which a part was missing
@@ -91,6 +89,8 @@ class RecordingFile:
         self._schemas: dict[int, Schema] = {}
         self._names: dict[int, Channel] = {}  # channels that are named beside chunks, where no checksum protects them
         self._beside: list[int] = []  # where metadata and attachments are
+        self._indexed: dict[int, int] | None = None  # messages by channel of the last chunk, while its indexes may come
+        self._indexed_to = 0  # where these end
         self._looked_everywhere = False
         try:
             self._file = path.open("rb")
@@ -128,6 +128,16 @@ class RecordingFile:
     def is_cut_off(self) -> bool:
         """True if nothing is at its end but zeros, or the begin of one record: so a kill leaves it."""
         return self._scan.is_cut_off
+
+    @property
+    def problem(self) -> str:
+        """What could not be read of it, in words; "" if all was, as far as that is known."""
+        return self.damage.report(active=self.path.name.endswith(ACTIVE))
+
+    def reaches_into(self, since_ns: int, until_ns: int) -> bool:
+        """True if it may hold messages of a period: one that is not finished has no end."""
+        ends = self.damage.finished and self.last_ns < since_ns
+        return bool(self.chunks) and self.first_ns < until_ns and not ends
 
     def refresh(self) -> None:
         """Find what was written since; a file that is finished does not change."""
@@ -231,10 +241,8 @@ class RecordingFile:
             return False
         if not counted.channel_message_counts.keys() <= summary.channels.keys():
             return False
-        self._schemas = {number: Schema(one.name, one.encoding, one.data) for number, one in summary.schemas.items()}
-        for number, one in summary.channels.items():
-            schema = self._schemas.get(one.schema_id)
-            self.channels[number] = Channel(number, one.topic, one.message_encoding, one.metadata, schema)
+        for record in (*summary.schemas.values(), *summary.channels.values()):
+            self._name(record, self.channels)
         self._beside = [index.offset for index in summary.metadata_indexes]
         self._beside += [index.offset for index in summary.attachment_indexes]
         self.chunks, self.statistics = chunks, counted
@@ -244,28 +252,42 @@ class RecordingFile:
 
     def _look_through(self) -> None:
         """Find the chunks, and the names of channels, from where the last look has ended."""
-        if self.chunks and not self.chunks[-1].channels:  # its indexes may be there by now
-            chunk = self.chunks.pop()
-            indexed, _, is_indexed = self._scan.indexes(chunk.at + chunk.length)
-            self._add_chunk(chunk, indexed, is_indexed=is_indexed)
         for record in self._scan.records(self.size):
+            if record.op == Op.MESSAGE_INDEX:
+                self._take_index(record)
+                continue
+            self._take_indexes(are_all=record.at == self._indexed_to)
+            self._indexed = None
             at, begin = record.at, record.at + HEAD.size
             if record.op == Op.CHUNK:
                 start_ns, end_ns, *_ = CHUNK.unpack(self._read(begin, CHUNK.size))
-                chunk = Chunk(start_ns, end_ns, at, record.end - at)
-                self._add_chunk(chunk, record.indexed, is_indexed=record.is_indexed)
+                self.chunks.append(Chunk(start_ns, end_ns, at, record.end - at))
+                self._indexed, self._indexed_to = {}, record.end
             elif record.op in (Op.METADATA, Op.ATTACHMENT):
                 self._beside.append(at)
             elif record.op in (Op.SCHEMA, Op.CHANNEL):
                 try:
-                    self._declare(record.op, self._read(begin, record.end - begin), self._names)
+                    self._declare(self._read(at, record.end - at), self._names)
                 except DamageError as error:
                     self.damage.add(at, error)
 
-    def _add_chunk(self, chunk: Chunk, indexed: dict[int, int], *, is_indexed: bool) -> None:
-        channels = frozenset(indexed if is_indexed else ())
-        chunk = chunk._replace(channels=channels, messages=sum(indexed.values()))
-        self.chunks.append(chunk)
+        self._take_indexes(are_all=False)
+
+    def _take_index(self, record: Found) -> None:
+        """Count the messages of a channel in the last chunk, unless damage lies between."""
+        entries = record.end - record.at - INDEX.size
+        if self._indexed is not None and record.at == self._indexed_to and entries >= 0:
+            channel = INDEX.unpack(self._read(record.at, INDEX.size))[2]
+            self._indexed[channel] = entries // _INDEX_ENTRY
+            self._indexed_to = record.end
+
+    def _take_indexes(self, *, are_all: bool) -> None:
+        """Note what the last chunk holds; ``are_all``: none of its indexes is damaged, or not written yet."""
+        indexed = self._indexed
+        if indexed is None:
+            return
+        channels = frozenset(indexed if are_all else ())
+        chunk = self.chunks[-1] = self.chunks[-1]._replace(channels=channels, messages=sum(indexed.values()))
         if not indexed or not indexed.keys() <= self.channels.keys():
             self._learn(chunk)
 
@@ -274,7 +296,8 @@ class RecordingFile:
         try:
             data = self._records(chunk)
             for op, begin, end in records(data):
-                self._declare(op, data[begin:end], self.channels)
+                if op != Op.MESSAGE:
+                    self._declare(data[begin - HEAD.size : end], self.channels)
         except DamageError as error:
             self.damage.add(chunk.at, error, chunk.messages)
             return
@@ -294,7 +317,7 @@ class RecordingFile:
             data = self._records(chunk)
             for op, begin, end in records(data):
                 if op != Op.MESSAGE:
-                    self._declare(op, data[begin:end], self.channels)
+                    self._declare(data[begin - HEAD.size : end], self.channels)
                     continue
                 number, sequence, log_ns, publish_ns = MESSAGE.unpack_from(data, begin)
                 first, last = sequence if first < 0 else first, sequence
@@ -324,14 +347,21 @@ class RecordingFile:
         yield from self.messages(chunk, chooses)
         opened[0] -= chunk.length
 
-    def _declare(self, op: int, body: bytes, channels: dict[int, Channel]) -> None:
-        """Take over a record that is no message. Raises DamageError."""
-        if op == Op.SCHEMA:
-            number, schema = schema_of(body)
-            self._schemas.setdefault(number, schema)
-        elif op == Op.CHANNEL:
-            channel, number = channel_of(body)
-            channels.setdefault(channel.id, replace(channel, schema=self._schemas.get(number)))
+    def _declare(self, data: bytes, channels: dict[int, Channel]) -> None:
+        """Take over a record of a schema or of a channel. Raises DamageError."""
+        if data[0] in (Op.SCHEMA, Op.CHANNEL):
+            self._name(record_of(data), channels)
+
+    def _name(self, record: McapRecord, channels: dict[int, Channel]) -> None:
+        from mcap.records import Channel as ChannelRecord
+        from mcap.records import Schema as SchemaRecord
+
+        if isinstance(record, SchemaRecord):
+            self._schemas.setdefault(record.id, Schema(record.name, record.encoding, record.data))
+        elif isinstance(record, ChannelRecord):
+            schema = self._schemas.get(record.schema_id)
+            channel = Channel(record.id, record.topic, record.message_encoding, record.metadata, schema)
+            channels.setdefault(record.id, channel)
 
     def _channel(self, number: int) -> Channel:
         """The channel of this number, wherever it is named: the chunk that named it first may be lost."""

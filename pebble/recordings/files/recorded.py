@@ -12,6 +12,7 @@ import msgspec
 from pebble.errors import PebbleError
 
 SUFFIX: Final = ".mcap"  # of a file that is finished
+ACTIVE: Final = ".mcap.active"  # is being written, or was left by a recorder that was killed
 #: The topic of messages whose channel is not named anywhere in a damaged file, before its number.
 UNNAMED: Final = "$recorder/unnamed/"
 FOREVER_NS: Final = 1 << 64  # after all times that a file can hold

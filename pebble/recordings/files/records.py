@@ -12,7 +12,7 @@ from io import BytesIO
 from typing import TYPE_CHECKING, Final
 
 from pebble.errors import PebbleError
-from pebble.recordings.files.recorded import Channel, DamageError, Schema
+from pebble.recordings.files.recorded import Channel, DamageError
 
 if TYPE_CHECKING:
     from mcap.records import McapRecord
@@ -80,29 +80,6 @@ def unpack_chunk(body: bytes) -> bytes:
     return unpacked
 
 
-def schema_of(body: bytes) -> tuple[int, Schema]:
-    from mcap.data_stream import ReadDataStream
-    from mcap.records import Schema as Record
-
-    with _damage():
-        record = Record.read(ReadDataStream(BytesIO(body)))
-    return record.id, Schema(record.name, record.encoding, record.data)
-
-
-def channel_of(body: bytes) -> tuple[Channel, int]:
-    """Return a channel, and the number of its schema. Raises DamageError if it is not exactly what it says."""
-    from mcap.data_stream import ReadDataStream, RecordBuilder
-    from mcap.records import Channel as Record
-
-    builder = RecordBuilder()
-    with _damage():
-        record = Record.read(ReadDataStream(BytesIO(body)))
-        record.write(builder)
-    if builder.end()[HEAD.size :] != body:
-        raise DamageError("the name of a channel is damaged")
-    return Channel(record.id, record.topic, record.message_encoding, record.metadata), record.schema_id
-
-
 def with_own_topic(channel: Channel, payload: bytes) -> tuple[Channel, bytes]:
     """Split a payload before which the topic and metadata of its own channel are. Raises DamageError."""
     from mcap.data_stream import ReadDataStream
@@ -115,11 +92,19 @@ def with_own_topic(channel: Channel, payload: bytes) -> tuple[Channel, bytes]:
 
 
 def record_of(data: bytes) -> McapRecord:
-    """Parse one whole record."""
+    """Parse one whole record. Raises DamageError, also for a channel that is not exactly what it says."""
+    from mcap.data_stream import RecordBuilder
+    from mcap.records import Channel as ChannelRecord
     from mcap.stream_reader import StreamReader
 
+    builder = RecordBuilder()
     with _damage():
-        return next(StreamReader(BytesIO(data), skip_magic=True).records)
+        record = next(StreamReader(BytesIO(data), skip_magic=True).records)
+        if isinstance(record, ChannelRecord):
+            record.write(builder)
+    if isinstance(record, ChannelRecord) and builder.end() != data:
+        raise DamageError("the name of a channel is damaged")
+    return record
 
 
 def summary_of(tail: bytes) -> Summary | None:

@@ -10,9 +10,10 @@ from typing import Final
 
 from pebble.recordings.files.reader import DAMAGE, MISSING, OLD_COPY, RecordingFile, missing_before
 from pebble.recordings.files.recorded import Channel, Recorded, RecordingError, Schema, number_in
-from pebble.recordings.files.writer import MOST_CHANNELS, RecordingWriter
+from pebble.recordings.files.writer import MOST_CHANNELS, File, RecordingWriter
 
 PART: Final = ".part"  # the end of a copy's name while it is written
+_ABOUT: Final = "pebble.recording"  # metadata of each file that is not a copy
 _COVERED: Final = "damaged_bytes"  # metadata of the last version: bytes that are left in a file, and not read
 
 Keeps = Callable[[Recorded], bool]
@@ -88,12 +89,6 @@ class Copy:
             number = self._channels[key] = self._declare(channel)
         self._writer.add(number, message.log_ns, message.payload, message.publish_ns)
 
-    def add_all(self, messages: Iterable[Recorded], on_time: Callable[[int], None] = lambda _ns: None) -> None:
-        """``on_time`` gets the time of each."""
-        for message in messages:
-            self.add(message)
-            on_time(message.log_ns)
-
     def _declare(self, channel: Channel) -> int:
         if self._writer.channels == MOST_CHANNELS:
             raise RecordingError(f"{channel.topic}: one file has no room for more topics: choose a shorter time")
@@ -103,6 +98,27 @@ class Copy:
             if not number:
                 number = self._schemas[schema] = self._writer.schema(schema.name, schema.encoding, schema.data)
         return self._writer.channel(channel.topic, channel.encoding, channel.metadata, number)
+
+
+def write_copy(
+    messages: Iterable[Recorded], out: File, *, on_time: Callable[[int], None], beside: Iterable[Path] = ()
+) -> int:
+    """Write ``messages`` as a recording; returns how many there were. ``on_time`` gets the time of each.
+
+    ``beside``: files whose metadata and attachments go with them, as they are known after the last message.
+    """
+    writer = RecordingWriter(out)
+    writer.metadata(_ABOUT, {"format": "1", "exported": "1"})
+    copy = Copy(writer)
+    for message in messages:
+        copy.add(message)
+        on_time(message.log_ns)
+    for path in beside:
+        if path.exists():  # not deleted meanwhile, to make room
+            with RecordingFile(path) as file:
+                copy_beside(file, writer, (_ABOUT, DAMAGE, OLD_COPY))
+    writer.finish()
+    return writer.messages
 
 
 def _copy(source: Path, part: Path, keeps: Keeps, *, complete: bool) -> Rewritten:

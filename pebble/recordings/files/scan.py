@@ -7,19 +7,17 @@ from pebble.recordings.files.recorded import Damage, DamageError, RecordingError
 from pebble.recordings.files.records import (
     CHUNK,
     HEAD,
-    INDEX,
     LARGEST_RECORD,
     LOOKS_LIKE_CHUNK,
     MAGIC,
     Op,
-    channel_of,
+    record_of,
     records,
     unpack_chunk,
 )
 
-_CHECKSUM, _INDEX_ENTRY = 4, 16  # bytes
+_CHECKSUM: Final = 4  # bytes
 _LONGEST_NAME: Final = 16  # of a compression
-_INDEXES: Final = 8192  # bytes behind a chunk that are read at once
 _SEARCHED, _OVERLAP = 1 << 20, 64  # bytes behind damage that are read at once
 
 #: Takes a position and a length; there may be less.
@@ -27,13 +25,11 @@ Read = Callable[[int, int], bytes]
 
 
 class Found(NamedTuple):
-    """A record; of a chunk how many messages of each channel are indexed behind it, and whether these are all."""
+    """A record."""
 
     op: int
     at: int
     end: int
-    indexed: dict[int, int]
-    is_indexed: bool
 
 
 class Scan:
@@ -73,30 +69,10 @@ class Scan:
                 self._damage.add(self._at, f"{again - self._at:,} bytes are no record")
                 self._at = again
                 continue
-            at, (op, end) = self._at, record
-            self._ended = op == Op.DATA_END
-            indexed, self._at, is_indexed = self.indexes(end) if op == Op.CHUNK else ({}, end, False)
-            yield Found(op, at, end, indexed, is_indexed)
+            found = Found(record[0], self._at, record[1])
+            self._at, self._ended = found.end, found.op == Op.DATA_END
+            yield found
         self._damage.torn = 0 if self._ended else max(0, size - self._at)
-
-    def indexes(self, at: int) -> tuple[dict[int, int], int, bool]:
-        """Return how many messages of each channel are indexed from ``at`` on, to where, and whether these are all.
-
-        More may be written yet: behind the last chunk they are all when something follows them.
-        """
-        entries, data, place = dict[int, int](), b"", 0
-        while True:
-            if place + INDEX.size > len(data):
-                at, place = at + place, 0
-                data = self._read(at, _INDEXES)
-                if len(data) < INDEX.size:
-                    return entries, at, False
-            op, length, channel, size = INDEX.unpack_from(data, place)
-            after = place + HEAD.size + length
-            if op != Op.MESSAGE_INDEX or length != INDEX.size - HEAD.size + size or at + after > self._size:
-                return entries, at + place, op != Op.MESSAGE_INDEX
-            entries[channel] = size // _INDEX_ENTRY
-            place = after
 
     def _record_at(self, at: int) -> tuple[int, int] | None:
         """Return the opcode of the record at ``at``, and its end; None if it is none, or not all of it is there."""
@@ -139,7 +115,7 @@ class Scan:
     def _is_channel(self, at: int, length: int) -> bool:
         """True if it is exactly what it says: it has no checksum."""
         try:
-            channel_of(self._read(at + HEAD.size, min(length, LARGEST_RECORD)))
+            record_of(self._read(at, HEAD.size + min(length, LARGEST_RECORD)))
         except DamageError:
             return False
         return True

@@ -3,7 +3,6 @@
 import logging
 import os
 import threading
-import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from typing import Final
@@ -19,9 +18,7 @@ SYNC_S: Final = 5.0  # a power cut loses as much
 class Background:
     """One thread makes files durable every few seconds, and returns free memory; another one does what takes long."""
 
-    def __init__(self, note: Callable[[float], None]) -> None:
-        """``note`` gets how many seconds each file took to be made durable."""
-        self._note = note
+    def __init__(self) -> None:
         self._jobs = ThreadPoolExecutor(1, "pebble-recorder-finish")
         self._files: list[OpenFile] = []
         self._stopping = threading.Event()
@@ -53,7 +50,6 @@ class Background:
             return_free_pages()
 
     def _sync(self, file: OpenFile) -> None:
-        began = time.monotonic()
         try:
             descriptor = os.dup(file.file.fileno())
         except (OSError, ValueError):  # closed meanwhile
@@ -64,7 +60,6 @@ class Background:
             log.error("%s cannot be made durable: %s", file.path.name, error.strerror)
         finally:
             os.close(descriptor)
-        self._note(time.monotonic() - began)
 
 
 def _logged(job: Callable[[], None]) -> None:

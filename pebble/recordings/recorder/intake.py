@@ -1,13 +1,15 @@
 """What waits to be written into files."""
 
+import json
 import threading
 import time
 from collections import Counter, deque
 from collections.abc import Callable
 from operator import attrgetter
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 from pebble.contract import OUTGOING
+from pebble.recordings.recorder.clock import RecordingClock
 from pebble.recordings.recorder.lane import Item
 from pebble.recordings.stamps import is_media
 from pebble.transports.bounds import BoundedQueue
@@ -33,9 +35,10 @@ class Clocks(NamedTuple):
 class Intake:
     """What waits to be written: bounded, and pictures and sound never in the way of state. Any thread may add to it."""
 
-    def __init__(self, limit: int, clocks: Clocks, counters: Counter[str]) -> None:
+    def __init__(self, limit: int, clocks: Clocks, clock: RecordingClock, counters: Counter[str]) -> None:
         self.robots: dict[str, float] = {}  # when each was received last, seconds since 1970
-        self._boot_ns, self._wall_ns, self._counters = clocks.boot_ns, clocks.wall_ns, counters
+        self._boot_ns, self._wall_ns = clocks.boot_ns, clocks.wall_ns
+        self._clock, self._counters = clock, counters
         self._lock = threading.Lock()
         self._state = BoundedQueue[Item](_MOST_WAITING, limit // 4)
         self._media = BoundedQueue[Item](_MOST_WAITING, limit - limit // 4)
@@ -56,9 +59,17 @@ class Intake:
             if robot and (robot in self.robots or len(self.robots) < _MOST_ROBOTS):
                 self.robots[robot] = self._wall_ns() / 1e9
 
-    def add_event(self, payload: bytes, boot_ns: int) -> None:
-        """What happened to the recording itself; not dropped for messages, but beyond 1,000 of its own."""
+    def note(self, event: str, **about: Any) -> None:
+        """Write down what happened to the recording itself; not dropped for messages, but beyond 1,000 of its own."""
+        boot_ns = self._boot_ns()
+        payload = json.dumps({"t": self._clock.at(boot_ns) // 10**6, "event": event, **about}).encode()
         self._events.append(Item(boot_ns, EVENTS, payload, 1, False, ""))
+        self._counters[f"event_{event}"] += 1
+
+    def note_gap(self, since_ns: int, why: str, **about: Any) -> None:
+        """Write down that nothing was recorded since ``since_ns`` (since 1970)."""
+        now_ns = self._clock.now()
+        self.note("gap", since=since_ns // 10**6, until=now_ns // 10**6, why=why, **about)
 
     def put_back(self, event: Item) -> None:
         self._events.append(event)

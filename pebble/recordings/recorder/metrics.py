@@ -27,8 +27,6 @@ def snapshot(recorder: Recorder, sources: Iterable[Source]) -> dict[str, Any]:
         "blocked": recorder.blocked,
         "waiting": recorder.waiting,
         "free_bytes": _free(recorder.folder.root),
-        "slowest_flush_s": round(recorder.slowest_flush_s, 4),
-        "slowest_sync_s": round(recorder.slowest_sync_s, 4),
         "robots": recorder.robots,
         "at": time.time(),
         "pid": os.getpid(),

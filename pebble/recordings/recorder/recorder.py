@@ -16,7 +16,6 @@ from pebble.recordings.files.recorded import require_package
 from pebble.recordings.recorder.background import Background
 from pebble.recordings.recorder.clock import RecordingClock
 from pebble.recordings.recorder.due import Due
-from pebble.recordings.recorder.events import Events
 from pebble.recordings.recorder.folder import Folder
 from pebble.recordings.recorder.intake import FORGET, Clocks, Intake
 from pebble.recordings.recorder.settings import Options
@@ -41,15 +40,12 @@ class Recorder:
     ) -> None:
         self.folder, self.options = Folder(root), options
         self.counters: Counter[str] = Counter()
-        self.slowest_sync_s = 0.0
         self._clocks = clocks or Clocks()
         self.clock = RecordingClock(self._clocks.wall_ns, self._clocks.boot_ns)
-        self._intake = Intake(QUEUE_BYTES, self._clocks, self.counters)
-        self.events = Events(self._intake, self.clock, self._clocks.boot_ns, self.counters)
-        self._background = Background(self._note_sync)
-        context = Context(
-            self.folder, options, self.clock, self.counters, self.events, {"format": "1", **(about or {})}
-        )
+        self._intake = Intake(QUEUE_BYTES, self._clocks, self.clock, self.counters)
+        self.note, self.note_gap = self._intake.note, self._intake.note_gap
+        self._background = Background()
+        context = Context(self.folder, options, self.clock, self.counters, {"format": "1", **(about or {})})
         self._writing = Writing(context, self._intake, self._background)
         self._stopping = threading.Event()
         self._thread = threading.Thread(target=self._write, name="pebble-recorder", daemon=True)
@@ -60,13 +56,13 @@ class Recorder:
         require_package()
         self.folder.take()
         left = self._writing.mend_leftovers()
-        self.events.note("start", pid=os.getpid(), leftovers=left)
+        self.note("start", pid=os.getpid(), leftovers=left)
         self._background.start()
         self._thread.start()
 
     def stop(self) -> None:
         """Write all that was received, and finish the files."""
-        self.events.note("stop")
+        self.note("stop")
         self._stopping.set()
         self._thread.join()
         self._background.stop()
@@ -105,10 +101,6 @@ class Recorder:
     @property
     def alive(self) -> bool:
         return self._thread.is_alive() and self._background.alive
-
-    @property
-    def slowest_flush_s(self) -> float:
-        return self._writing.slowest_flush_s
 
     @property
     def waiting(self) -> int:
@@ -153,15 +145,10 @@ class Recorder:
     def _follow_clock(self, due: Due) -> None:
         suspended_s = due.suspended_s(self._clocks.awake_ns())
         if suspended_s > _SUSPENDED_S:
-            self.events.gap(self.clock.now() - round(suspended_s * 1e9), "suspended")
+            self.note_gap(self.clock.now() - round(suspended_s * 1e9), "suspended")
         offset_ns = self.clock.offset_ns
         by_s = self.clock.follow()
         if by_s:
-            self.events.note("clock", by_s=round(by_s, 3), offset_before_ns=offset_ns)
+            self.note("clock", by_s=round(by_s, 3), offset_before_ns=offset_ns)
             self._writing.flush()
             self._writing.rotate(all_of_them=True)
-
-    # -- the background thread
-
-    def _note_sync(self, seconds: float) -> None:
-        self.slowest_sync_s = max(self.slowest_sync_s, seconds)

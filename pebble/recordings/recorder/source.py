@@ -61,7 +61,7 @@ class Source:
             new = counted.get(name, 0) - self._losses.get(name, 0)
             if new > 0:
                 self._losses[name] = counted[name]
-                self._recorder.events.note("dropped", messages=new, why=name, **self._about)
+                self._recorder.note("dropped", messages=new, why=name, **self._about)
         if self._kind == "mqtt" and self._is_modern and _OLD_BROKER in self.problem:
             self._transport.close()
             self._is_modern = False
@@ -72,7 +72,7 @@ class Source:
             copies.close()
             self._copies = None
             if copies.failed:
-                self._recorder.events.note("dropped", why="the retained messages cannot be fetched", **self._about)
+                self._recorder.note("dropped", why="the retained messages cannot be fetched", **self._about)
         if self._wants_copies:
             self._wants_copies = False
             self._copies = _Copies(self._settings, self._filters, self._record_retained)
@@ -106,15 +106,15 @@ class Source:
         now_ns = self._recorder.clock.now()
         if state is State.CONNECTED:
             if self._lost_at:
-                self._recorder.events.gap(self._lost_at, "no connection", **self._about)
+                self._recorder.note_gap(self._lost_at, "no connection", **self._about)
             self._lost_at = 0
-            self._recorder.events.note("connected", **self._about)
+            self._recorder.note("connected", **self._about)
             self._wants_copies = self._kind == "mqtt"
             self._recorder.forget_retained(self._name)
             self._was_connected = True
         elif state is State.CONNECTING and self._was_connected and not self._lost_at:
             self._lost_at = now_ns
-            self._recorder.events.note("lost", why=self.problem, **self._about)
+            self._recorder.note("lost", why=self.problem, **self._about)
 
     def _receive(self, message: Message) -> None:
         if message.topic.startswith(self._ignored):

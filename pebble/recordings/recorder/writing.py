@@ -14,7 +14,6 @@ from pebble.recordings.recorder.background import Background
 from pebble.recordings.recorder.clock import RecordingClock
 from pebble.recordings.recorder.disk_space import Disk, outdated, surplus
 from pebble.recordings.recorder.due import Due
-from pebble.recordings.recorder.events import Events
 from pebble.recordings.recorder.finisher import Finisher
 from pebble.recordings.recorder.folder import STATE, Folder
 from pebble.recordings.recorder.intake import EVENTS, FORGET, Intake
@@ -50,7 +49,6 @@ class Context(NamedTuple):
     options: Options
     clock: RecordingClock
     counters: Counter[str]
-    events: Events
     about: Mapping[str, str]  # of the recording, for each file
 
 
@@ -58,11 +56,10 @@ class Writing:
     """Writes the messages of one recorder. Not thread-safe."""
 
     def __init__(self, context: Context, intake: Intake, background: Background) -> None:
-        self.slowest_flush_s = 0.0
-        self._folder, self._options, self._clock, self._counters, self._events, about = context
+        self._folder, self._options, self._clock, self._counters, about = context
         self._intake = intake
         self._files = OpenFiles(self._folder, about, background.watch)
-        self._finisher = Finisher(background, self._events.note, self._note_finished)
+        self._finisher = Finisher(background, self._intake.note, self._note_finished)
         self._blocked: _Blocked | None = None
         self._lacking: list[Item] = []  # what no file has taken; bounded: a second of messages
         self._noted_drops = 0
@@ -136,13 +133,11 @@ class Writing:
                 self._finish(lane)
 
     def _flush(self, lane: str, file: OpenFile) -> None:
-        began = self._clock.now()
         try:
             self._counters["written"] += file.flush()
         except OSError as error:
             self._fail(lane, error)
             return
-        self.slowest_flush_s = max(self.slowest_flush_s, (self._clock.now() - began) / 1e9)
         if not file.is_there():
             self._forget_removed(lane)
 
@@ -155,7 +150,7 @@ class Writing:
         """Write down what was dropped because the queue was full."""
         total = self._counters["dropped"]
         if total > self._noted_drops and self._blocked is None:
-            self._events.note("dropped", messages=total - self._noted_drops, why="the disk is too slow")
+            self._intake.note("dropped", messages=total - self._noted_drops, why="the disk is too slow")
             self._noted_drops = total
 
     # -- when files cannot be written
@@ -173,7 +168,7 @@ class Writing:
         file = self._files.take(lane)
         file.file.close()
         self._counters["errors"] += 1
-        self._events.note("removed", file=file.path.name, by="another program")
+        self._intake.note("removed", file=file.path.name, by="another program")
 
     def _block(self, lane: str, error: OSError) -> None:
         self._counters["errors"] += 1
@@ -207,7 +202,7 @@ class Writing:
             return
         self._finisher.retry()
         dropped = self._counters["dropped"]
-        self._events.gap(blocked.since_ns, blocked.why, messages=dropped - blocked.dropped)
+        self._intake.note_gap(blocked.since_ns, blocked.why, messages=dropped - blocked.dropped)
         self._noted_drops = dropped
         log.warning("recording again")
 
@@ -272,7 +267,7 @@ class Writing:
             self._quiet_log.warning("delete", "%s cannot be deleted: %s", path, error.strerror)
             return
         self._counters["pruned_bytes"] += size
-        self._events.note("pruned", file=path.name, bytes=size)
+        self._intake.note("pruned", file=path.name, bytes=size)
 
     def _note_finished(self) -> None:
         self._changed = True

@@ -131,12 +131,6 @@ class Player:
         return reached_ns if next_ is None else min(reached_ns, max(next_.log_ns, from_ns))
 
     @property
-    def late_s(self) -> float:
-        """How long ago the next message was due."""
-        next_ = self._reading.next
-        return 0.0 if next_ is None else -self._pace.due_s(next_.log_ns, self._now())
-
-    @property
     def speed(self) -> float:
         return self._pace.speed
 

@@ -9,7 +9,7 @@ from typing import Final
 from pebble.contract import HEARTBEAT, ONLINE, OUTGOING, Kind, channel_of
 from pebble.recordings.files.reader import Chooses, RecordingFile
 from pebble.recordings.files.recorded import Channel, Recorded
-from pebble.recordings.library import FOREVER_NS, Damages, Span, merged, span_of
+from pebble.recordings.library import FOREVER_NS, Damages, merged, reaches_into
 from pebble.recordings.stamps import is_keyframe, is_picture
 
 #: How far before a time its state and its last key frame are looked for. A file of states is then read from its begin.
@@ -24,24 +24,21 @@ class ReplaySource:
 
     def __init__(self, paths: Iterable[Path]) -> None:
         """Reads the end of each file, or all of one that is not finished. Raises RecordingError."""
-        self._files: list[tuple[Path, Span, list[Channel]]] = []
+        self._files: dict[Path, list[Channel]] = {}
         self.damages = Damages()  # of what was read
         for path in paths:
             with RecordingFile(path) as file:
-                covered = span_of(file)
-                if covered is None:
+                self._files[path] = list(file.channels.values())
+                if not file.chunks:
                     self.damages[path] = file.damage
-                else:
-                    self._files.append((path, covered, list(file.channels.values())))
 
     @property
     def channels(self) -> list[Channel]:
-        return [channel for _, _, channels in self._files for channel in channels]
+        return [channel for channels in self._files.values() for channel in channels]
 
     def messages(self, since_ns: int = 0, until_ns: int = FOREVER_NS) -> Iterator[Recorded]:
         """By the time at which they were received; ``until_ns`` is not included."""
-        paths = [path for path, _, _ in self._files]
-        return merged(paths, since_ns=since_ns, until_ns=until_ns, damages=self.damages)
+        return merged(self._files, since_ns=since_ns, until_ns=until_ns, damages=self.damages)
 
     def state_before(self, at_ns: int, publishes: Chooses = lambda _channel: True) -> list[Recorded]:
         """The newest retained message of each topic, then all pictures since each topic's last key frame.
@@ -77,11 +74,8 @@ class ReplaySource:
 
     def _having(self, chooses: Callable[[Channel], bool], since_ns: int, until_ns: int) -> list[Path]:
         """Files of that time with such channels: media must not be unpacked for a state."""
-        return [
-            path
-            for path, covered, channels in self._files
-            if covered.first_ns < until_ns and covered.last_ns >= since_ns and any(map(chooses, channels))
-        ]
+        having = [path for path, channels in self._files.items() if any(map(chooses, channels))]
+        return [path for path in having if reaches_into(path, since_ns, until_ns)]
 
 
 def _is_state(channel: Channel) -> bool:

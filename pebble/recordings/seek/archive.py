@@ -12,7 +12,7 @@ from pebble.contract.identity import Direction, parse_topic
 from pebble.errors import PebbleError
 from pebble.recordings.files.reader import Chunk
 from pebble.recordings.files.recorded import Channel, Recorded
-from pebble.recordings.library import ACTIVE, SUFFIX
+from pebble.recordings.library import recordings_in
 from pebble.recordings.recorder.folder import MEDIA
 from pebble.recordings.recorder.lane import OTHER_MEDIA, lane_of
 from pebble.recordings.seek.file import SeekableFile, is_carried
@@ -143,10 +143,8 @@ class Archive:
 
     def all_files(self) -> Iterator[SeekableFile]:
         """All, opened one after the other."""
-        for named in self._list():
-            file = self._opened(named.path)
-            if file is not None:
-                yield file
+        files = (self._opened(named.path) for named in self._list())
+        yield from (file for file in files if file is not None)
 
     def unread(self) -> dict[Path, str]:
         """What could not be read of each file, as far as that is known."""
@@ -157,7 +155,7 @@ class Archive:
     def _list(self) -> list[_Named]:
         now = time.monotonic()
         if now - self._listed_at >= LIST_S:
-            self._named = sorted(_named(path) for path in self.folder.rglob(f"*{SUFFIX}*") if _is_recording(path))
+            self._named = sorted(_named(path) for path in recordings_in(self.folder) if path.is_file())
             self._listed_at = now
             there = {named.path for named in self._named}
             for path in [path for path in self._open if path not in there]:
@@ -224,10 +222,6 @@ def _within(file: SeekableFile, channels: frozenset[int], since_ns: int, until_n
 
 def _is_of(channel: Channel, robot: str) -> bool:
     return channel.topic.startswith((f"{robot}/outgoing/", f"{robot}/incoming/"))
-
-
-def _is_recording(path: Path) -> bool:
-    return path.name.endswith((SUFFIX, ACTIVE)) and path.is_file()
 
 
 def _named(path: Path) -> _Named:

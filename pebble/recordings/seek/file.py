@@ -21,11 +21,6 @@ class SeekableFile(RecordingFile):
         super().__init__(path)
         self._about = os.fstat(self._file.fileno())
 
-    @property
-    def problem(self) -> str:
-        """What could not be read of it, as far as that is known."""
-        return self.damage.report(active=self.path.name.endswith(ACTIVE))
-
     def robots(self) -> set[str]:
         """All that a channel belongs to."""
         return {robot for channel in self.channels.values() if (robot := robot_of(channel)) is not None}

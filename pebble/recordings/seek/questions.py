@@ -12,6 +12,7 @@ import signal
 import tempfile
 import time
 from collections.abc import Callable
+from functools import partial
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Final
@@ -19,9 +20,9 @@ from typing import Final
 import msgspec
 
 from pebble.errors import PebbleError
-from pebble.recordings.exports.copy import write_copy
 from pebble.recordings.exports.film import write_film
 from pebble.recordings.exports.unfinished import unfinished
+from pebble.recordings.files.rewrite import write_copy
 from pebble.recordings.library import ACTIVE, Damages, merged, problems, robot_of
 from pebble.recordings.seek.archive import Archive
 from pebble.recordings.seek.days import Days
@@ -109,7 +110,8 @@ def export_job(
 
     def work() -> str:
         damages = Damages()
-        messages = merged(
+        read = partial(
+            merged,
             [Path(path) for path in paths],
             since_ns=since_ns,
             until_ns=until_ns,
@@ -122,10 +124,10 @@ def export_job(
             progress.share("", (log_ns - since_ns) / (until_ns - since_ns))
 
         if form in FILMS:
-            write_film(messages, target, robot, on_time=on_time)
+            write_film(read, target, robot, on_time=on_time)
         else:
-            with unfinished(target, overwrite=False) as path, path.open("wb") as out:
-                if not write_copy(messages, out, on_time=on_time):
+            with unfinished(target) as path, path.open("wb") as out:
+                if not write_copy(read(), out, on_time=on_time):
                     raise PebbleError(f"there is no message of {robot} in this stretch")
         return "; ".join(problems(damages))
 

@@ -1,7 +1,6 @@
 """A few seconds of one robot as bytes for a page: docs/web-messages.md, "Recordings"."""
 
 import struct
-from collections.abc import Iterable
 from enum import IntFlag
 from typing import Final, NamedTuple
 
@@ -73,16 +72,6 @@ def _packed(one: Recorded, flags: Flag) -> bytes:
     metric = metric_of(one.channel.topic)[0].encode()
     length = _AFTER_LENGTH + len(metric) + len(one.payload)
     return _HEAD.pack(length, one.log_ns / 1e6, flags, len(metric)) + metric + one.payload
-
-
-def unpacked(data: bytes) -> Iterable[tuple[float, Flag, str, bytes]]:
-    """Received (epoch ms), flags, metric and payload of each message in a segment, as pages read it."""
-    at = 0
-    while at < len(data):
-        length, received_ms, flags, size = _HEAD.unpack_from(data, at)
-        body = data[at + _HEAD.size : at + 4 + length]
-        yield received_ms, Flag(flags), body[:size].decode(), body[size:]
-        at += 4 + length
 
 
 def _ns(ms: float) -> int:

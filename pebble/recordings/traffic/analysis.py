@@ -73,14 +73,11 @@ def analyse(
 
 
 def _robot(queries: RobotQueries, name: str, messages: int, size: int) -> RobotTraffic:
-    intervals = queries.intervals()
-    session_s, idle_s = queries.durations()
-    offline, offline_s = queries.offline()
+    interval_ms = queries.interval_ms()
     return RobotTraffic(
-        robot=name, machine=queries.machine, messages=messages, bytes=size, session_s=session_s, idle_s=idle_s,
-        offline=offline, offline_s=offline_s, bandwidth=queries.bandwidth(), sessions=queries.sessions(),
-        intervals=intervals, outages=[] if intervals is None else queries.outages(intervals.median_ms),
-        latency=queries.latency(),
+        robot=name, machine=queries.machine, messages=messages, bytes=size, bandwidth=queries.bandwidth(),
+        sessions=queries.sessions(), interval_ms=interval_ms,
+        outages=[] if interval_ms is None else queries.outages(interval_ms), latency=queries.latency(),
     )  # fmt: skip
 
 

@@ -31,10 +31,9 @@ def connected(scratch: Path, *, memory_mb: int, threads: int = 1) -> Iterator[Du
 
     Raises PebbleError without DuckDB, and RecordingError for what fails in it.
     """
-    try:
-        import duckdb
-    except ImportError:
-        raise PebbleError('this needs DuckDB: pip install "pebble-robot[archive]"') from None
+    require_packages("duckdb")
+    import duckdb
+
     config: dict[str, str | bool | int | float | list[str]] = {
         "memory_limit": f"{memory_mb}MB",
         "threads": threads,

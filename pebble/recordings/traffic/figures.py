@@ -51,12 +51,11 @@ def figures(robot: RobotTraffic) -> list[Figure]:
 
 
 def _outages(robot: RobotTraffic) -> Figure | None:
-    usual = robot.intervals
-    if usual is None:
+    if robot.interval_ms is None:
         return None
     number = "Figure 4.4" if robot.machine == MCU else "Figure 4.1"
     caption = (
-        f"A heartbeat comes every {usual.median_ms:.0f} ms. When one is missing, this counts by how much longer than "
+        f"A heartbeat comes every {robot.interval_ms:.0f} ms. When one is missing, this counts by how much longer than "
         "usual the robot was silent."
     )
     return Figure(number, "Heartbeat outages", caption, _svg(lambda axes: draw_outages(axes, robot), robot, "outages"))
@@ -84,10 +83,8 @@ def _latency(robot: RobotTraffic) -> Figure | None:
     number = "Figures 4.5 and 4.6" if robot.machine == MCU else "Figure 4.2"
     caption = (
         "The time from a heartbeat's own stamp to its reception by the recorder. It depends on both clocks: only "
-        "differences between values are certain."
+        "differences between values are certain. Values below 0 show that the robot's clock is ahead."
     )
-    if latency.ahead_ms:
-        caption += f" Values below 0 show that its clock is at least {latency.ahead_ms:.0f} ms ahead."
     svg = _svg(lambda axes: draw_latency(axes, latency), robot, "latency")
     return Figure(number, "Latency of heartbeats", caption, svg)
 

@@ -20,7 +20,6 @@ from pebble.contract.identity import parse_topic
 from pebble.contract.packets import PBAT
 from pebble.recordings.files.reader import RecordingFile
 from pebble.recordings.files.recorded import SUFFIX, Channel, Recorded
-from pebble.recordings.library import ACTIVE
 from pebble.recordings.recorder.intake import EVENTS
 from pebble.recordings.stamps import is_picture
 from pebble.recordings.traffic.activity import Activity, activity_of
@@ -157,9 +156,10 @@ class _Rows:
                 if len(self._batch) >= _BATCH:
                     self._flush()
                     advance(min(1.0, self._count / expected) if expected else 0.5)
+            unread = file.problem
         self._flush()
         advance(1.0)
-        return damage.missing, damage.report(active=recording.name.endswith(ACTIVE))
+        return damage.missing, unread
 
     def _add(self, message: Recorded) -> None:
         channel, payload = message.channel.id, message.payload

@@ -101,29 +101,18 @@ _BANDWIDTH: Final = f"""
            sum(bytes)::BIGINT
     FROM ranked GROUP BY family, time
 """
-_DURATIONS: Final = """
-    WITH common AS (
-        SELECT greatest(0, least(s.until, o.until) - greatest(s.since, o.since)) AS length FROM sessions s, online o
-    )
-    SELECT (SELECT coalesce(sum(until - since), 0) FROM sessions)::BIGINT,
-           ((SELECT coalesce(sum(until - since), 0) FROM online)
-            - (SELECT coalesce(sum(length), 0) FROM common))::BIGINT
-"""
-_INTERVALS: Final = f"""
+_INTERVAL: Final = f"""
     WITH ranked AS (
         SELECT interval_ns / 1e6 AS ms, row_number() OVER (ORDER BY interval_ns) - 1 AS place,
                count(*) OVER () - 1 AS last
         FROM heartbeats WHERE interval_ns <= {traffic.OFFLINE_AFTER_S}e9
     )
-    SELECT count(*), {_percentile("ms", 0.5)} FROM ranked
+    SELECT {_percentile("ms", 0.5)} FROM ranked
 """
 _OUTAGES: Final = f"""
     SELECT ns - interval_ns, interval_ns / 1e6 - $median FROM heartbeats
     WHERE interval_ns / 1e6 > {traffic.OUTAGE_FACTOR} * $median AND interval_ns <= {traffic.OFFLINE_AFTER_S}e9
     ORDER BY ns
-"""
-_OFFLINE: Final = f"""
-    SELECT count(*), coalesce(sum(interval_ns), 0) / 1e9 FROM heartbeats WHERE interval_ns > {traffic.OFFLINE_AFTER_S}e9
 """
 _PLAUSIBLE: Final = f"abs(latency_ms) <= {traffic.LARGEST_LATENCY_S}e3"
 _LATENCY: Final = f"""
@@ -180,16 +169,6 @@ class RobotQueries:
         messages, size, first, last = self._row(_TOTALS)
         return messages, size, first, last
 
-    def durations(self) -> tuple[int, int]:
-        """Seconds of sessions, and idle ones."""
-        session_s, idle_s = self._row(_DURATIONS)
-        return session_s, idle_s
-
-    def offline(self) -> tuple[int, float]:
-        """How often it was offline, and how many seconds in total."""
-        times, seconds = self._row(_OFFLINE)
-        return times, seconds
-
     def bandwidth(self) -> list[traffic.Bandwidth]:
         found = [traffic.Bandwidth(*row) for row in self._rows(_BANDWIDTH)]
         order = {name: number for number, name in enumerate((*traffic.FAMILIES, *traffic.TIMES))}
@@ -199,27 +178,22 @@ class RobotQueries:
     def sessions(self) -> list[traffic.Session]:
         return [traffic.Session(since, until) for since, until in self._rows("FROM sessions")]
 
-    def online(self) -> list[tuple[int, int]]:
-        """Seconds since 1970 between which heartbeats came."""
-        return [(since, until) for since, until in self._rows("FROM online")]
-
-    def intervals(self) -> traffic.Intervals | None:
-        row = self._row(_INTERVALS)
-        return traffic.Intervals(*row) if row[0] else None
+    def interval_ms(self) -> float | None:
+        """Return the median between heartbeats."""
+        (median,) = self._row(_INTERVAL)
+        return None if median is None else float(median)
 
     def outages(self, median_ms: float) -> list[traffic.Outage]:
         return [traffic.Outage(*row) for row in self._rows(_OUTAGES, {"median": median_ms})]
 
     def latency(self) -> traffic.Latency | None:
-        count, floor, median, p95, p99 = self._row(_LATENCY)
-        if not count:
-            return None
-        return traffic.Latency(count, floor, median, p95, p99, self._histogram(floor, p99))
+        count, p1, median, p95, p99 = self._row(_LATENCY)
+        return traffic.Latency(count, median, p95, self._histogram(p1, p99)) if count else None
 
-    def _histogram(self, floor_ms: float, p99_ms: float) -> traffic.Histogram:
+    def _histogram(self, p1_ms: float, p99_ms: float) -> traffic.Histogram:
         """From 0, or from below if the robot's clock is ahead, to a little above the 99th percentile."""
-        margin = 0.1 * (p99_ms - floor_ms)
-        low, high = min(0.0, floor_ms - margin), p99_ms + margin
+        margin = 0.1 * (p99_ms - p1_ms)
+        low, high = min(0.0, p1_ms - margin), p99_ms + margin
         width = _round_up(max(_FINEST_MS, (high - low) / _BINS))
         low = low // width * width
         counts = [0] * _BINS

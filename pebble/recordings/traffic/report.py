@@ -45,11 +45,6 @@ _DEFINITIONS: Final = (
         "An interval between two heartbeats of more than 1.5 times the usual one; its length is what it was longer "
         "than usual. Above 60 s a robot counts as offline. Times in which nothing was recorded are left out.",
     ),
-    (
-        "floor",
-        "The first percentile of latency: nearly the fastest heartbeat. A floor below 0 means that the robot's clock "
-        "is ahead of the recorder's. Nothing is corrected by it.",
-    ),
 )
 
 
@@ -80,11 +75,7 @@ def remarks(traffic: Traffic) -> list[str]:
             f"{traffic.dropped} messages were not recorded for lack of room or speed, "
             f"and {traffic.missing} were lost to damage of recordings."
         )
-    found += [f"Not all could be read of {line}." for line in traffic.unread]
-    for robot in traffic.robots:
-        if robot.latency is not None and robot.latency.ahead_ms:
-            found.append(f"{_id(robot)}: the robot's clock is at least {robot.latency.ahead_ms:.0f} ms ahead.")
-    return found
+    return found + [f"Not all could be read of {line}." for line in traffic.unread]
 
 
 def _page(traffic: Traffic, advance: Callable[[str, float], None]) -> str:
@@ -135,9 +126,7 @@ def _robot(robot: RobotTraffic, number: int) -> Iterable[str]:
 
 def _about(robot: RobotTraffic) -> str:
     kind = "a component without heartbeats" if robot.machine == COMPONENT else f"{robot.machine} robot"
-    sessions = f"{len(robot.sessions)} sessions ({_duration(robot.session_s)})"
-    text = f"{robot.robot}, {kind}: {robot.messages:,} messages; {sessions}, idle {_duration(robot.idle_s)}"
-    return f"{text}, offline {_times(robot.offline)} ({_duration(robot.offline_s)})." if robot.offline else f"{text}."
+    return f"{robot.robot}, {kind}: {robot.messages:,} messages, {len(robot.sessions)} sessions."
 
 
 def _figure(figure: Figure, robot: RobotTraffic) -> str:
@@ -175,12 +164,6 @@ def _id(robot: RobotTraffic) -> str:
 
 def _times(number: int) -> str:
     return "once" if number == 1 else f"{number:,} times"
-
-
-def _duration(seconds: float) -> str:
-    minutes, rest = divmod(round(seconds), 60)
-    hours, minutes = divmod(minutes, 60)
-    return f"{hours} h {minutes:02} min" if hours else f"{minutes} min {rest:02} s" if minutes else f"{rest} s"
 
 
 def _text(text: str) -> str:

@@ -46,13 +46,6 @@ class Session(Struct, frozen=True):
     until_s: int
 
 
-class Intervals(Struct, frozen=True):
-    """Between heartbeats, without those above OFFLINE_AFTER_S."""
-
-    count: int
-    median_ms: float
-
-
 class Outage(Struct, frozen=True):
     """Heartbeats that were missing."""
 
@@ -72,16 +65,9 @@ class Latency(Struct, frozen=True):
     """From a heartbeat's stamp to its reception, as the two clocks had it."""
 
     count: int
-    floor_ms: float  # the first percentile
     median_ms: float
     p95_ms: float
-    p99_ms: float
     histogram: Histogram
-
-    @property
-    def ahead_ms(self) -> float:
-        """By how much the robot's clock is ahead, at least; 0 if that does not show."""
-        return max(0.0, -self.floor_ms)
 
 
 class RobotTraffic(Struct, kw_only=True):
@@ -91,13 +77,9 @@ class RobotTraffic(Struct, kw_only=True):
     machine: str  # LINUX, MCU, or COMPONENT without heartbeats
     messages: int
     bytes: int
-    session_s: int
-    idle_s: int
-    offline: int  # times
-    offline_s: float
     bandwidth: list[Bandwidth]
     sessions: list[Session]
-    intervals: Intervals | None
+    interval_ms: float | None  # the median between heartbeats, without those above OFFLINE_AFTER_S
     outages: list[Outage]
     latency: Latency | None
 

@@ -59,11 +59,10 @@ def _bandwidth(traffic: Traffic) -> Table:
 
 def _latency(traffic: Traffic) -> Table:
     columns = [
-        ("robot", "robot"), ("heartbeats", "heartbeats"), ("floor_ms", "floor (p1) ms"), ("median_ms", "median ms"),
-        ("p95_ms", "p95 ms"), ("p99_ms", "p99 ms"),
+        ("robot", "robot"), ("heartbeats", "heartbeats"), ("median_ms", "median ms"), ("p95_ms", "p95 ms"),
     ]  # fmt: skip
     rows = [
-        [robot.robot, one.count, one.floor_ms, one.median_ms, one.p95_ms, one.p99_ms]
+        [robot.robot, one.count, one.median_ms, one.p95_ms]
         for robot in traffic.robots
         if (one := robot.latency) is not None
     ]

@@ -91,8 +91,8 @@ def timeline(
         made = _stepped(connection)
         made.gaps = gaps
         made.sessions = [Stretch(1000 * one.since_s, 1000 * one.until_s) for one in queries.sessions()]
-        intervals = queries.intervals()
-        for one in () if intervals is None else queries.outages(intervals.median_ms):
+        interval_ms = queries.interval_ms()
+        for one in () if interval_ms is None else queries.outages(interval_ms):
             made.outages.append(Stretch(_ms(one.since_ns), _ms(one.since_ns) + one.length_ms))
     return made
 

@@ -56,20 +56,17 @@ def pictures(
     *,
     size: tuple[int, int] = (160, 120),
     channel: Channel = CAMERA,
-    shift_ms: int = 0,
 ) -> list[Recorded]:
     encoder = make_encoder(name, fps=15, quality=40, keyframe_interval=15)
     made = []
     for number in numbers:
         at_ms = T0_MS + number * STEP_MS
-        payload = encoder.encode(picture(number, size), at_ms + shift_ms)
+        payload = encoder.encode(picture(number, size), at_ms)
         made.append(recorded(channel, at_ms, payload))
     return made
 
 
-def sound(
-    name: str, rate: int, seconds: float, *, begin_ms: int = 0, channels: int = 1, shift_ms: int = 0
-) -> list[Recorded]:
+def sound(name: str, rate: int, seconds: float, *, begin_ms: int = 0, channels: int = 1) -> list[Recorded]:
     """Silence with a click of 20 ms at the flash."""
     samples = np.zeros((int(seconds * rate), channels), np.int16)
     click = (FLASH * STEP_MS - begin_ms) * rate // 1000
@@ -80,7 +77,7 @@ def sound(
     made, step = [], rate * PACKET_MS // 1000
     for at in range(0, len(samples), step):
         at_ms = T0_MS + begin_ms + at * 1000 // rate
-        payloads = encoder.encode(to_bytes(samples[at : at + step]), at_ms + shift_ms)
+        payloads = encoder.encode(to_bytes(samples[at : at + step]), at_ms)
         made += [recorded(MICROPHONE, at_ms, payload) for payload in payloads]
     return made
 
@@ -155,7 +152,7 @@ def test_pictures_and_sound_are_where_they_were_received(
 ) -> None:
     target = tmp_path / f"walk{ending}"
     messages = in_order(pictures(encoding, range(45)), sound(codec, rate, 3.0))
-    result = write_film(messages, target, ROBOT)
+    result = write_film(lambda: messages, target, ROBOT)
     film = opened(target)
     assert (result.pictures, result.left_out) == (45, 0)
     assert film.codecs == ["h264", "opus" if ending == ".mkv" else "aac"]
@@ -173,7 +170,7 @@ def test_after_a_lost_h264_picture_the_film_waits_for_a_key_frame(tmp_path: Path
     messages = pictures("h264", range(45))
     del messages[20]
     messages[34] = recorded(CAMERA, T0_MS + 35 * STEP_MS, messages[34].payload[:-30])  # damaged
-    result = write_film(messages, tmp_path / "walk.mkv", ROBOT)
+    result = write_film(lambda: messages, tmp_path / "walk.mkv", ROBOT)
     film = opened(tmp_path / "walk.mkv")
     assert [number for _, number, _ in film.shown] == [*range(20), *range(30, 35)]
     assert result.left_out == 9 + 10
@@ -187,9 +184,9 @@ def test_encodings_and_sizes_that_change(tmp_path: Path) -> None:
         pictures("h264", range(24, 36), size=(320, 180)),
         pictures("pbvd", range(36, 45), size=(80, 60)),
     ]
-    result = write_film(in_order(*parts, sound("pcm", 16_000, 3.0)), tmp_path / "walk.mp4", ROBOT)
+    result = write_film(lambda: in_order(*parts, sound("pcm", 16_000, 3.0)), tmp_path / "walk.mp4", ROBOT)
     film = opened(tmp_path / "walk.mp4")
-    assert (result.pictures, result.scaled, film.size) == (45, 21, (160, 120))
+    assert (result.pictures, film.size) == (45, (160, 120))
     times = [at_ms for at_ms, _, _ in film.shown]
     assert times == pytest.approx([number * STEP_MS for number in range(45)], abs=1)
     assert [number for _, number, _ in film.shown[:20]] == list(range(20))
@@ -203,7 +200,7 @@ def test_undamaged_units_that_are_no_h264_are_left_out(tmp_path: Path) -> None:
         for unit, at_ms, number, flags in ((units[0], -66, 0, 1), (units[1], 12 * STEP_MS, 12, 0))
     )
     good, other = pictures("h264", range(12)), pictures("pbvd", range(13, 20))
-    result = write_film([first, *good, second, *other], tmp_path / "walk.mkv", ROBOT)
+    result = write_film(lambda: [first, *good, second, *other], tmp_path / "walk.mkv", ROBOT)
     film = opened(tmp_path / "walk.mkv")
     assert result.pictures + result.left_out == 21
     assert result.pictures == len(film.shown)
@@ -212,7 +209,7 @@ def test_undamaged_units_that_are_no_h264_are_left_out(tmp_path: Path) -> None:
 
 def test_sound_that_is_missing_becomes_silence(tmp_path: Path) -> None:
     received = [message for message in sound("pcm", 16_000, 3.0) if not 300 <= offset_ms(message) < 1000]
-    result = write_film(in_order(pictures("pbvd", range(45)), received), tmp_path / "walk.mkv", ROBOT)
+    result = write_film(lambda: in_order(pictures("pbvd", range(45)), received), tmp_path / "walk.mkv", ROBOT)
     film = opened(tmp_path / "walk.mkv")
     assert result.sound is not None
     assert result.sound.silence_s == pytest.approx(0.7, abs=0.02)
@@ -227,7 +224,7 @@ def offset_ms(message: Recorded) -> int:
 @pytest.mark.parametrize("begin_ms", [-600, 800])
 def test_sound_that_begins_before_or_after_the_pictures(tmp_path: Path, begin_ms: int) -> None:
     messages = in_order(pictures("h264", range(45)), sound("pcm", 16_000, 2.0, begin_ms=begin_ms))
-    write_film(messages, tmp_path / "walk.mp4", ROBOT)
+    write_film(lambda: messages, tmp_path / "walk.mp4", ROBOT)
     film = opened(tmp_path / "walk.mp4")
     assert film.shown[0][0] == pytest.approx(max(0, -begin_ms), abs=1)
     assert film.click_ms == pytest.approx(film.flash_ms, abs=80)
@@ -236,7 +233,7 @@ def test_sound_that_begins_before_or_after_the_pictures(tmp_path: Path, begin_ms
 def test_sound_whose_rate_and_channels_change(tmp_path: Path) -> None:
     low = [one for one in sound("pcm", 8_000, 3.0) if offset_ms(one) < 1000]
     high = [one for one in sound("opus", 24_000, 3.0, channels=2) if offset_ms(one) >= 1000]
-    result = write_film(in_order(pictures("pbvd", range(45)), low, high), tmp_path / "walk.mkv", ROBOT)
+    result = write_film(lambda: in_order(pictures("pbvd", range(45)), low, high), tmp_path / "walk.mkv", ROBOT)
     film = opened(tmp_path / "walk.mkv")
     assert result.sound is not None
     assert result.sound.seconds == pytest.approx(3.0, abs=0.07)
@@ -250,15 +247,6 @@ def test_sound_that_came_twice_is_played_once(tmp_path: Path) -> None:
     assert result.left_out == 50
 
 
-def test_pictures_without_stamps_are_shown_as_others(tmp_path: Path) -> None:
-    jpegs = [
-        recorded(CAMERA, T0_MS + number * STEP_MS, cv2.imencode(".jpg", picture(number))[1].tobytes())
-        for number in range(20)
-    ]
-    write_film(jpegs, tmp_path / "walk.mkv", ROBOT)
-    check_numbers(opened(tmp_path / "walk.mkv"))
-
-
 def test_other_robots_and_an_operators_voice_are_left_out(tmp_path: Path) -> None:
     other = Channel(7, "pebble/robots/fred/outgoing/front-camera", "application/octet-stream")
     renamed = Channel(8, f"{ROBOT}/outgoing/eye", "application/octet-stream")
@@ -270,9 +258,9 @@ def test_other_robots_and_an_operators_voice_are_left_out(tmp_path: Path) -> Non
         [recorded(Channel(10, f"{ROBOT}/outgoing/online", "json"), T0_MS, b'{"t":1}')],
     )
     times: list[int] = []
-    result = write_film(messages, tmp_path / "walk.mkv", ROBOT, on_time=times.append)
+    result = write_film(lambda: messages, tmp_path / "walk.mkv", ROBOT, on_time=times.append)
     assert (result.pictures, result.sound) == (20, None)
-    assert times == [message.log_ns for message in messages]
+    assert [time for time in times if time] == [message.log_ns for message in messages]
     assert opened(tmp_path / "walk.mkv").codecs == ["h264"]
 
 
@@ -287,9 +275,9 @@ def test_wav(tmp_path: Path) -> None:
     assert np.argmax(np.abs(samples) > 5000) / RATE == pytest.approx(FLASH * STEP_MS / 1000, abs=0.02)
 
 
-def refused(messages: list[Recorded], target: Path, **more: bool) -> str:
+def refused(messages: list[Recorded], target: Path) -> str:
     with pytest.raises(RecordingError) as caught:
-        write_film(messages, target, ROBOT, **more)
+        write_film(lambda: messages, target, ROBOT)
     return str(caught.value)
 
 
@@ -302,8 +290,6 @@ def test_what_is_refused(tmp_path: Path) -> None:
     target.write_bytes(b"precious")
     assert "exists already" in refused(pictures("pbvd", range(3)), target)
     assert target.read_bytes() == b"precious"
-    write_film(pictures("pbvd", range(3)), target, ROBOT, overwrite=True)
-    assert len(opened(target).shown) == 3
     with pytest.raises(RecordingError, match="no sound"):
         write_wav(pictures("pbvd", range(3)), tmp_path / "walk.wav", ROBOT)
     assert list(tmp_path.iterdir()) == [target]
@@ -315,17 +301,11 @@ def test_an_error_on_the_way_leaves_nothing_behind(tmp_path: Path) -> None:
         raise RecordingError("the disk is gone")
 
     with pytest.raises(RecordingError, match="gone"):
-        write_film(broken(), tmp_path / "walk.mkv", ROBOT)
+        write_film(lambda: broken(), tmp_path / "walk.mkv", ROBOT)
     assert list(tmp_path.iterdir()) == []
 
 
 def test_without_pyav_one_line_names_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "av", None)
     with pytest.raises(PebbleError, match=r"film needs PyAV: pip install 'pebble-robot\[media\]'"):
-        write_film([], tmp_path / "walk.mkv", ROBOT)
-
-
-def test_an_older_pyav_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(av, "__version__", "14.4.0")
-    with pytest.raises(PebbleError, match="PyAV 15 or newer"):
-        write_film([], tmp_path / "walk.mkv", ROBOT)
+        write_film(list, tmp_path / "walk.mkv", ROBOT)

@@ -106,7 +106,7 @@ def _parsed(schema: Schema | None, channel: McapChannel, data: bytes) -> Any:
 
 def converted(tmp_path: Path, messages: list[Recorded]) -> tuple[File, dict[str, int]]:
     target = tmp_path / "walk.mcap"
-    counts = write_foxglove(messages, target, overwrite=True)
+    counts = write_foxglove(messages, target)
     assert [path.name for path in tmp_path.iterdir()] == ["walk.mcap"]
     return File(target), counts
 
@@ -302,7 +302,7 @@ def test_an_existing_file_and_an_error_on_the_way(tmp_path: Path) -> None:
         raise RecordingError("the disk is gone")
 
     with pytest.raises(RecordingError, match="gone"):
-        write_foxglove(broken(), target, overwrite=True)
+        write_foxglove(broken(), tmp_path / "other.mcap")
     assert target.read_bytes() == b"precious"
     assert list(tmp_path.iterdir()) == [target]
 

@@ -5,15 +5,17 @@ from __future__ import annotations
 import base64
 import io
 import json
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
+from pathlib import Path
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from pebble.media.json_video import JsonPicture
-from pebble.recordings.exports.lines import BadLine, Imported, read_lines, write_lines
-from pebble.recordings.files.recorded import Channel, Recorded
+from pebble.recordings.exports import lines
+from pebble.recordings.exports.lines import BadLine, read_lines, write_lines
+from pebble.recordings.files.recorded import Channel, Recorded, RecordingError
 
 T_NS = 1_732_300_000_123_456_789
 TOPIC = "pebble/robots/goob/outgoing/online"
@@ -27,24 +29,31 @@ LINE = {
     "payload_b64": "AAH/",
 }
 
+BYTES = Channel(0, TOPIC, "application/octet-stream", {"qos": "1", "retain": "0"})
+MESSAGE = Recorded(BYTES, 0, 1_732_300_000_250_000_000, 0, b"\0\1\xff")
+
 
 def recorded(payload: bytes, topic: str = TOPIC, log_ns: int = T_NS, **metadata: str) -> Recorded:
     return Recorded(Channel(1, topic, "json", {"qos": "0", "retain": "0"} | metadata), 0, log_ns, 0, payload)
 
 
-def written(messages: list[Recorded], **more: bool) -> bytes:
+def written(messages: list[Recorded]) -> bytes:
     out = io.BytesIO()
-    assert write_lines(messages, out, **more) == len(messages)
+    assert write_lines(messages, out) == len(messages)
     return out.getvalue()
 
 
-def read(raw: bytes) -> list[Imported | BadLine]:
+def read(raw: bytes) -> list[Recorded | BadLine]:
     return list(read_lines(io.BytesIO(raw)))
+
+
+def metadata(raw: bytes) -> list[Mapping[str, str]]:
+    return [message.channel.metadata for message in read_lines(io.BytesIO(raw)) if isinstance(message, Recorded)]
 
 
 def test_a_line_of_the_loggers() -> None:
     raw = json.dumps(LINE).encode() + b"\n"
-    assert read(raw) == [Imported(1_732_300_000_250_000_000, TOPIC, b"\0\1\xff", qos=1)]
+    assert read(raw) == [MESSAGE]
 
 
 def test_a_line_of_ours() -> None:
@@ -82,8 +91,11 @@ def test_payloads_are_readable_where_they_are_text_or_json(payload: bytes, reada
     raw = written([recorded(payload)])
     assert raw.count(b"\n") == 1
     assert {name for name in json.loads(raw) if name in ("payload_text", "payload_json")} == readable
-    assert not any(name in json.loads(written([recorded(payload)], text=False)) for name in readable)
-    assert read(raw) == [Imported(T_NS, TOPIC, payload)]
+    assert [message.payload for message in read(raw) if isinstance(message, Recorded)] == [payload]
+
+
+def shown(message: Recorded) -> tuple[object, ...]:
+    return message.log_ns, message.channel.topic, message.payload, message.channel.metadata
 
 
 @given(
@@ -100,10 +112,8 @@ def test_payloads_are_readable_where_they_are_text_or_json(payload: bytes, reada
     )
 )
 def test_there_and_back(messages: list[Recorded]) -> None:
-    back = read(written(messages))
-    assert [(one.log_ns, one.topic, one.payload, one.metadata) for one in back if isinstance(one, Imported)] == [
-        (one.log_ns, one.channel.topic, one.payload, one.channel.metadata) for one in messages
-    ]
+    back = [message for message in read(written(messages)) if isinstance(message, Recorded)]
+    assert list(map(shown, back)) == list(map(shown, messages))
 
 
 def test_flags_there_and_back() -> None:
@@ -112,21 +122,27 @@ def test_flags_there_and_back() -> None:
         {"qos": "0", "retain": "1", "retained": "1"},
         {"qos": "2", "retain": "0", "truncated": "1"},
     ]
-    back = read(written([recorded(b"x", **one) for one in flags]))
-    assert [one.metadata for one in back if isinstance(one, Imported)] == flags
+    assert metadata(written([recorded(b"x", **one) for one in flags])) == flags
 
 
 def test_the_loggers_retain_is_a_message_from_before_its_subscription() -> None:
-    (message,) = read(json.dumps(LINE | {"retain": True}).encode())
-    assert isinstance(message, Imported)
-    assert message.metadata == {"qos": "1", "retain": "1", "retained": "1"}
+    assert metadata(json.dumps(LINE | {"retain": True}).encode()) == [{"qos": "1", "retain": "1", "retained": "1"}]
 
 
 def test_a_payload_that_the_logger_cut_is_marked() -> None:
-    (message,) = read(json.dumps(LINE | {"payload_truncated": True, "payload_size_bytes": 9000}).encode())
-    assert isinstance(message, Imported)
-    assert message.truncated
-    assert message.metadata["truncated"] == "1"
+    (flags,) = metadata(json.dumps(LINE | {"payload_truncated": True, "payload_size_bytes": 9000}).encode())
+    assert flags["truncated"] == "1"
+
+
+def test_a_line_without_an_end_is_refused_by_file_and_number(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(lines, "LONGEST_LINE", 1000)
+    path = tmp_path / "day.jsonl"
+    path.write_bytes(json.dumps(LINE).encode() + b"\n" + b" " * 999 + b"\n" + b"x" * 1001)
+    with path.open("rb") as file:
+        messages = read_lines(file)
+        next(messages)
+        with pytest.raises(RecordingError, match=r"day\.jsonl: line 3 is longer than 1,000 bytes"):
+            next(messages)
 
 
 @pytest.mark.parametrize(
@@ -145,7 +161,7 @@ def test_a_payload_that_the_logger_cut_is_marked() -> None:
 )
 def test_stamps(stamp: str, expected_ns: int) -> None:
     raw = json.dumps(LINE | {"timestamp": "STAMP"}).replace('"STAMP"', stamp).encode()
-    assert [one.log_ns for one in read(raw) if isinstance(one, Imported)] == [expected_ns]
+    assert [one.log_ns for one in read(raw) if isinstance(one, Recorded)] == [expected_ns]
 
 
 @pytest.mark.parametrize(
@@ -178,7 +194,7 @@ def test_bad_lines_are_reported_and_the_others_read(line: bytes) -> None:
     assert isinstance(bad, BadLine)
     assert bad.number == 2
     assert bad.problem
-    assert first == last == Imported(1_732_300_000_250_000_000, TOPIC, b"\0\1\xff", qos=1)
+    assert first == last == MESSAGE
 
 
 def test_messages_are_written_as_they_come() -> None:

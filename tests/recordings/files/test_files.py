@@ -157,7 +157,7 @@ class TestDamaged:
             path.write_bytes(raw)
             found, report = read(path)
             assert is_part_of([one for one in found if not one[0].startswith(UNNAMED)], written)
-            if damage in (flip, zero_a_page):  # a torn end may have held more
+            if damage in (flip, zero_a_page) and not report.torn:  # a torn end may have held more
                 assert report.missing == len(written) - len(found)
             copy = tmp_path / f"{number}-mended.mcap"
             made = rewrite(path, copy)

@@ -167,7 +167,7 @@ class TestFiles:
         running = Running(tmp_path / "rec")
         for _ in range(60):
             running.send(payload=b'{"t":%d}' % (time.time_ns() // 10**6))
-            running.recorder.events.note("connected")
+            running.recorder.note("connected")
             time.sleep(0.02)
         running.stop()
         online = [message for message in recorded(running.root) if message.channel.topic == ONLINE]
@@ -328,7 +328,7 @@ class TestDisk:
         running.send(50)
         assert until(lambda: bool(running.recorder.blocked), 10)
         running.send(70)
-        running.recorder.events.note("lost", why="meanwhile")
+        running.recorder.note("lost", why="meanwhile")
         assert until(lambda: running.recorder.counters["dropped"] == 70, 10)
         full.clear()
         assert until(lambda: running.recorder.counters["event_recovered"] == 1, 10)

@@ -129,10 +129,12 @@ def test_replayed_at_ten_times_its_speed_it_is_the_same(
     assert operator.retained() == {}
 
 
-def _without_stamp(payload: bytes) -> bytes:
+def _without_stamp(payload: bytes) -> object:
     """A payload, which a replay changes in its stamp only."""
     stamp = stamp_ns(payload) // 10**6
-    return payload.replace(b"%d" % stamp, b"").replace(stamp.to_bytes(8, "big"), b"") if stamp else payload
+    if stamp and payload.startswith(b"{"):
+        return {name: value for name, value in json.loads(payload).items() if name not in ("t", "timestamp")}
+    return payload.replace(stamp.to_bytes(8, "big"), b"") if stamp else payload
 
 
 def test_by_default_it_is_harmless_and_current(

@@ -250,7 +250,7 @@ def test_rule_7_zeros_are_known() -> None:
 
 
 def test_payloads_stay_as_they_are_but_for_their_stamps() -> None:
-    line = Line(0, f"{GOOB}/outgoing/logs", b'{"message" : "pebble/robots/goob/x", "t":1700000000000}')
+    line = Line(0, f"{GOOB}/outgoing/logs", b'{"message":"pebble/robots/goob/x","t":1700000000000}')
     as_is = sent(Options(), line)
     assert as_is is not None
     assert as_is.message.payload == line.payload

@@ -18,9 +18,9 @@ from pebble.recordings.recorder.lane import CARRIED, Item, OpenFile
 from pebble.recordings.seek.archive import Archive
 from pebble.recordings.seek.days import Days
 from pebble.recordings.seek.file import SeekableFile
-from pebble.recordings.seek.segment import Flag, segment, unpacked
+from pebble.recordings.seek.segment import Flag, segment
 from pebble.recordings.seek.thumbnails import frame, strip
-from tests.recordings.playing import FRED, GOOB, THEN_NS, Line, js, ms, write
+from tests.recordings.playing import FRED, GOOB, THEN_NS, Line, js, ms, unpacked, write
 from tests.recordings.seek.filming import CAMERA, FPS, SCENES, film
 
 SECONDS = 30

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from tests.commands.command_line import Run
-from tests.recordings.synthetic import FLEET, Sent, traffic, write_day, write_recording
+from tests.recordings.synthetic import FLEET, Sent, traffic, write_recording
 from tests.support import ROOT
 
 pytest.importorskip("duckdb")
@@ -89,11 +89,6 @@ def test_a_name_does_not_control_the_terminal(run, tmp_path):
     assert "\\u202egoob" in run.out
 
 
-def test_help(run):
-    assert run("analyse", "--help", columns=100) == 0
-    assert "pebble analyse recordings/ --since 10:00 --until +30m --robot goob" in run.out
-
-
 def test_the_help_needs_no_large_package():
     names = (
         "commands.recordings.analyse",
@@ -103,13 +98,3 @@ def test_the_help_needs_no_large_package():
     code = f"{imports}; import sys; print(sorted({{'duckdb', 'matplotlib', 'numpy'}} & set(sys.modules)))"
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
     assert done.stdout == "[]\n"
-
-
-@pytest.mark.thorough
-def test_the_synthetic_day_is_as_an_index_is(run, tmp_path):
-    rows = write_day(tmp_path / "day", robots=(0, 8), hours=1)
-    assert run("analyse", tmp_path / "day", "--csv") == 0
-    lines = (tmp_path / "report" / "table-4-1-media-bandwidth.csv").read_text().splitlines()
-    assert [line.split(",")[0] for line in lines[1:]] == ["pebble/robots/robot00"]
-    assert lines[1].split(",")[3] == "265.6"
-    assert rows == sum(int(line.split()[1].replace(",", "")) for line in run.out.splitlines() if " robot0" in line)

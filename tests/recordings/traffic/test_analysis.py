@@ -31,7 +31,7 @@ from pebble.recordings.traffic.results import (
     Traffic,
 )
 from pebble.recordings.traffic.sources import sources
-from tests.recordings.synthetic import FLEET, START_NS, Robot, Sent, event, traffic, write_recording
+from tests.recordings.synthetic import FLEET, START_NS, Sent, event, traffic, write_recording
 
 pytest.importorskip("duckdb")
 
@@ -120,8 +120,7 @@ def test_intervals_and_outages(minute, base):
         (before, interval - usual) for before, interval in zip(times, intervals, strict=False) if interval > 1.5 * usual
     ]
     one = robot(found, base)
-    assert one.intervals.count == len(intervals)
-    assert one.intervals.median_ms == pytest.approx(usual)
+    assert one.interval_ms == pytest.approx(usual)
     assert [outage.since_ns for outage in one.outages] == [since for since, _ in outages]
     assert [outage.length_ms for outage in one.outages] == pytest.approx([length for _, length in outages])
 
@@ -132,9 +131,7 @@ def test_latency(minute, base):
     latencies = [(message.log_ns - message.publish_ns) / MS for message in messages_of(path, base, "outgoing/online")]
     one = robot(found, base).latency
     assert one.count == len(latencies) == sum(one.histogram.counts)
-    assert [one.floor_ms, one.median_ms, one.p95_ms, one.p99_ms] == pytest.approx(
-        [percentile(latencies, share) for share in (0.01, 0.5, 0.95, 0.99)]
-    )
+    assert [one.median_ms, one.p95_ms] == pytest.approx([percentile(latencies, share) for share in (0.5, 0.95)])
 
 
 # -- what robots are like
@@ -147,13 +144,7 @@ def test_kinds_of_robots(minute):
 
 def test_a_component_without_heartbeats(of):
     found = of([Sent(START_NS, "pebble/infrastructure/mast/outgoing/charging-level", b"{}")]).robots[0]
-    assert (found.machine, found.intervals, found.latency, found.outages) == (COMPONENT, None, None, [])
-
-
-def test_a_clock_that_is_ahead_is_named(minute):
-    ahead = {one.robot: one.latency.ahead_ms for one in minute[1].robots}
-    assert ahead[FRED] == pytest.approx(220, abs=2)
-    assert ahead[GOOB] == 0
+    assert (found.machine, found.interval_ms, found.latency, found.outages) == (COMPONENT, None, None, [])
 
 
 def test_stamps_of_clocks_that_were_never_set_do_not_count(of):
@@ -199,8 +190,7 @@ def test_an_interval_of_up_to_one_and_a_half_is_none(of):
 
 def test_above_a_minute_a_robot_was_offline(of):
     found = robot(of(steady(GOOB, (20.0, 90.0), seconds=120.0)), GOOB)
-    assert (found.offline, found.offline_s, found.outages) == (1, 70.0, [])
-    assert found.idle_s == 21 + 30
+    assert found.outages == []
 
 
 def test_what_was_not_recorded_is_no_outage(of):
@@ -224,17 +214,12 @@ def test_messages_that_were_dropped_are_counted(of):
 
 def test_the_last_heartbeat_of_a_connection_does_not_count(of):
     will = Sent(START_NS + 10 * SECOND + 100 * MS, f"{GOOB}/outgoing/online", b'{"t": 5, "online": false}')
-    assert robot(of(ordered(steady(GOOB), [will])), GOOB).intervals.count == 239
-
-
-def test_the_older_name_of_the_heartbeat(of):
-    older = [Sent(sent.ns, sent.topic.replace("online", "heartbeat"), sent.payload) for sent in steady(GOOB)]
-    assert robot(of(older), GOOB).intervals.median_ms == 250.0
+    assert robot(of(ordered(steady(GOOB), [will])), GOOB).latency.count == 240
 
 
 def test_both_names_of_the_heartbeat_count_once(of):
     both = [Sent(sent.ns + MS, sent.topic.replace("online", "heartbeat"), sent.payload) for sent in steady(GOOB)]
-    assert robot(of(ordered(steady(GOOB), both)), GOOB).intervals.median_ms == 250.0
+    assert robot(of(ordered(steady(GOOB), both)), GOOB).interval_ms == 250.0
 
 
 # -- sessions
@@ -269,8 +254,7 @@ def test_a_warning_is_no_session(of):
 
 def test_bandwidths_of_sessions_and_of_idle_time_are_apart(minute):
     goob = robot(minute[1], GOOB)
-    assert (goob.session_s, len(goob.sessions)) == (41, 1)
-    assert goob.idle_s == 60 - 41
+    assert [session.until_s - session.since_s for session in goob.sessions] == [41]
     assert goob.of(VIDEO, IDLE) is None
     assert goob.of(TOTAL, IDLE).median_kbps < 3 < 300 < goob.of(TOTAL, SESSION).median_kbps
     both = goob.of(TOTAL, SESSION), goob.of(TOTAL, IDLE)
@@ -309,15 +293,6 @@ def test_a_period(of):
     found = of(steady(GOOB), since_ns=since, until_ns=until)
     assert robot(found, GOOB).messages == 40
     assert (found.since_ns, found.until_ns) == (since, until - 250 * MS)
-
-
-def test_a_period_without_messages_is_refused(of):
-    with pytest.raises(PebbleError, match="no message"):
-        of(steady(GOOB), until_ns=START_NS)
-
-
-def test_only_some_robots(of):
-    assert [one.robot for one in of(traffic(seconds=2.0), robots=[GOOB]).robots] == [GOOB]
 
 
 def test_a_file_that_is_being_written_is_read_and_not_indexed(tmp_path):
@@ -360,17 +335,6 @@ def test_a_file_that_is_named_again_counts_once(tmp_path):
     assert len(sources([path, tmp_path, path], tmp_path / "scratch").indexes) == 1
 
 
-def test_files_of_several_folders(tmp_path):
-    paths = [write_recording(tmp_path / base[-4:] / "same.mcap", steady(base, seconds=2.0)) for base in (GOOB, FRED)]
-    found = sources(paths, tmp_path / "scratch")
-    assert (found.robots, len(found.indexes)) == ([FRED, GOOB], 2)
-
-
-def test_a_folder_without_recordings_is_refused(tmp_path):
-    with pytest.raises(PebbleError, match="there is no recording"):
-        sources([tmp_path], tmp_path / "scratch")
-
-
 def test_names_of_folders_are_no_patterns(tmp_path):
     folder, scratch = tmp_path / "it's [1] *?", tmp_path / "scratch"
     write_recording(folder / "a.mcap", steady(GOOB, seconds=2.0))
@@ -385,8 +349,3 @@ def test_a_damaged_index_is_named(tmp_path):
         analyse(found, tmp_path / "scratch")
     assert "a.parquet" in str(error.value)
     assert "\n" not in str(error.value)
-
-
-def test_robots_are_analysed_in_order_of_their_names(of):
-    robots = [Robot("b"), Robot("a")]
-    assert [one.robot for one in of(traffic(robots, seconds=2.0)).robots] == ["pebble/robots/a", "pebble/robots/b"]

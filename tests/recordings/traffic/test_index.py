@@ -2,13 +2,11 @@
 
 import errno
 import os
-import shutil
 from pathlib import Path
 
 import pytest
 
 from pebble.contract.packets import Codec, Sound
-from pebble.recordings.files.recorded import RecordingError
 from pebble.recordings.traffic.activity import Activity
 from pebble.recordings.traffic.index import COLUMNS, PICTURE, SOUND, index_path, write_index
 from pebble.recordings.traffic.sources import sources
@@ -155,24 +153,3 @@ def test_a_torn_recording_is_indexed_as_far_as_it_goes_and_not_beside_it(tmp_pat
     (index,) = sources([tmp_path], tmp_path / "scratch").indexes
     assert query("SELECT count(*) FROM read_parquet(?)", str(index)) == [(len(messages),)]
     assert list(tmp_path.glob("*.parquet")) == []
-
-
-def test_an_archive_may_be_moved(tmp_path):
-    write_recording(tmp_path / "old" / NAME, traffic(seconds=1.0))
-    sources([tmp_path / "old"], tmp_path / "scratch")
-    before = state(tmp_path / "old")
-    shutil.move(tmp_path / "old", tmp_path / "new")
-    sources([tmp_path / "new"], tmp_path / "scratch")
-    assert [ns for _, ns in state(tmp_path / "new")] == [ns for _, ns in before]
-
-
-def test_a_file_that_is_no_recording_is_refused(tmp_path):
-    with pytest.raises(RecordingError):
-        sources([tmp_path / "missing.mcap"], tmp_path / "scratch")
-
-
-def test_progress_ends_at_one(tmp_path):
-    shares: list[float] = []
-    write_recording(tmp_path / NAME, traffic(seconds=1.0))
-    sources([tmp_path], tmp_path / "scratch", lambda _what, share: shares.append(share))
-    assert shares[-1] == 1.0
