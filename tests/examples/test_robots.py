@@ -5,17 +5,18 @@ from __future__ import annotations
 import runpy
 import struct
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
-from tests.conform.programs import ROBOT_PY, Command, Sample, mutant, robot_in_micropython, sketch
+from tests.conform.programs import ROBOT_PY, ROBOTS, Command, Sample, mutant, robot_in_micropython, sketch
 from tests.robot.operator import Operator
 from tests.support import Broker, Child, until
 
-PUBLISH_QOS_1, PUBACK = 0x32, 0x40
+PUBLISH_QOS_1 = 0x32
 BASE = "pebble/robots/mine"
 
 
@@ -68,13 +69,15 @@ def micropython(folder: Path) -> Command:
     return [*robot_in_micropython(folder)[:-1], sample]
 
 
-@pytest.mark.parametrize("sample", [arduino, micropython])
-def test_without_internet_a_robot_drives_at_level_open(sample: Sample, broker: Broker, tmp_path: Path) -> None:
+@contextmanager
+def driven(command: Command, broker: Broker, folder: Path) -> Iterator[Operator]:
+    """Start a robot; at the end it must still be driven."""
     operator = Operator(broker.port, BASE)
-    command = [*sample(tmp_path), "mine", "127.0.0.1", str(broker.port), tmp_path / "stop"]
-    robot = Child(list(map(str, command)))
+    robot = Child(list(map(str, [*command, "mine", "127.0.0.1", broker.port, folder / "stop"])))
     try:
-        operator.wait_for("outgoing/estop/motors", 20)
+        for state in ("capabilities", "estop/motors"):  # before the first it has subscribed
+            operator.wait_for(f"outgoing/{state}", 20)
+        yield operator
         for z in (0, 0.5):  # after its start it waits for a zero
             operator.send("incoming/drive-values", {"z": z})
         moves = {"wheels": [0.5, 0.5]}
@@ -83,3 +86,16 @@ def test_without_internet_a_robot_drives_at_level_open(sample: Sample, broker: B
         robot.kill()
         robot.wait()
         operator.close()
+
+
+@pytest.mark.parametrize("sample", [arduino, micropython])
+def test_without_internet_a_robot_drives_at_level_open(sample: Sample, broker: Broker, tmp_path: Path) -> None:
+    with driven(sample(tmp_path), broker, tmp_path):
+        pass
+
+
+@pytest.mark.parametrize("sample", ROBOTS)
+def test_topics_of_any_length_hold_up_nothing(sample: Sample, broker: Broker, tmp_path: Path) -> None:
+    with driven(sample(tmp_path), broker, tmp_path) as operator:
+        for _ in range(50):  # more than a broker sends unacknowledged
+            operator.send("incoming/" + 1500 * "x", {})
