@@ -22,9 +22,10 @@ from typing import Any, Final, NamedTuple
 from paho.mqtt.client import MQTTMessage
 
 from pebble import contract
-from pebble.bench.clients import RATE_HZ, RobotSubscriber, StockClient, axes_of
+from pebble.bench.clients import RobotSubscriber, StockClient, drive_of
 from pebble.bench.results import STAND_IN
 from pebble.bench.usage import cpu_s
+from pebble.client.scripted_operator import paced
 from pebble.errors import PebbleError
 from pebble.rig.processes import python
 from pebble.rig.robot import BASE, Robot, one_robot, synthetic_media
@@ -106,6 +107,7 @@ class DrivenRobot(StockClient):
         super().__init__(self._on_message, [(channel.topic(BASE), 1) for channel in channels])
         self.paho.on_publish = self._acknowledge
         self.robot = robot
+        self._driver = self.driver(BASE)
         self._number = 0  # of the last command
         self._received: list[tuple[int, bytes]] = []  # reports
         self._parts: dict[str, list[int]] = {}  # the processes that forward
@@ -126,14 +128,11 @@ class DrivenRobot(StockClient):
         groups = {ALL: self.robot.pids(), **self._parts}
         before = {name: cpu_s(pids) for name, pids in groups.items()}
         sent: dict[Wheels, int] = {}
-        began, due = time.monotonic_ns(), time.monotonic()
-        for _ in range(round(seconds * RATE_HZ)):
+        began = time.monotonic_ns()
+        for _ in paced(seconds):
             self._number += 1
-            left, right = wheels(self._number)
-            sent[left, right] = time.monotonic_ns()
-            self.send(contract.DRIVE, BASE, axes_of(left, right))
-            due += 1 / RATE_HZ
-            time.sleep(max(0.0, due - time.monotonic()))
+            speeds = wheels(self._number)
+            sent[speeds] = round(1e9 * self._driver.command(drive_of(*speeds)))
         ended = time.monotonic_ns()
         used = {name: cpu_s(pids) - before[name] for name, pids in groups.items() if pids}
         if min(used.values(), default=1.0) <= 0:

@@ -1,4 +1,4 @@
-"""Stock paho clients, of which operators are made: one drives robots, one watches a robot start and stream."""
+"""Stock paho clients, of which operators are made: some drive robots, one watches a robot start and stream."""
 
 from __future__ import annotations
 
@@ -9,29 +9,31 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager, suppress
-from itertools import cycle, zip_longest
+from itertools import zip_longest
 from typing import Any, Final, Self
 
 from paho.mqtt.client import Client, MQTTMessage, MQTTMessageInfo
 from paho.mqtt.enums import CallbackAPIVersion
 
 from pebble import contract
+from pebble.client.robot_view import RobotView
+from pebble.client.scripted_operator import ScriptedOperator
 from pebble.contract.packets import Codec, Picture, PictureKind, Sound
+from pebble.contract.payloads import Drive
 from pebble.errors import PayloadError, PebbleError
 from pebble.rig.robot import BASE, MEDIA, Robot, one_robot
+from pebble.transports import Message
 
-RATE_HZ: Final = 20.0  # of each robot
-AHEAD: Final = {"x": 0.0, "z": 0.5}
-ZERO: Final = {"x": 0.0, "z": 0.0}
+_AHEAD: Final = 0.5
 _ANSWER_S = 10.0
 UP_S: Final = 20.0  # for a robot to start
 #: Flag and request, of pictures and of sound.
 _MEDIA_CHANNELS = (contract.MQTT_VIDEO, contract.VIDEO_CONTROL), (contract.MQTT_AUDIO, contract.AUDIO_CONTROL)
 
 
-def axes_of(left: float, right: float) -> dict[str, float]:
-    """Return the axes of the drive command for these wheel speeds."""
-    return {"x": (left - right) / 2, "z": (left + right) / 2}
+def drive_of(left: float, right: float) -> Drive:
+    """Return the drive command for these wheel speeds."""
+    return Drive(x=(left - right) / 2, z=(left + right) / 2)
 
 
 class StockClient:
@@ -82,6 +84,13 @@ class StockClient:
         """Publishes ``body`` as JSON, with the QoS and the retain flag of the channel."""
         return self.paho.publish(channel.topic(base), json.dumps(body), channel.default_qos, channel.default_retain)
 
+    def publish(self, message: Message) -> None:
+        self.paho.publish(message.topic, message.payload, message.qos, message.retain)
+
+    def driver(self, base: str, wait: Callable[[float], object] = time.sleep) -> ScriptedOperator:
+        """Return an operator of a robot of which it knows nothing, as the original page: without control."""
+        return ScriptedOperator(RobotView(base), self.publish, by="bench", wait=wait)
+
     def request_media(self, base: str, enabled: bool = True, *encodings: str) -> None:
         """Allows and requests a robot's pictures and sound, by default as it is configured; or ends both."""
         for (flag, request), encoding in zip_longest(_MEDIA_CHANNELS, encodings):
@@ -99,33 +108,22 @@ def _send_at_once(_client: Client, _data: Any, sock: Any) -> None:
     sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
 
 
-class Driver(StockClient):
-    """Drives robots at :data:`RATE_HZ` each, spread evenly, after a zero for each."""
-
-    def __init__(self, port: int, *bases: str) -> None:
-        super().__init__()
-        self._bases, self._closed = bases, threading.Event()
-        self.open(port)
-        threading.Thread(target=self._run, name="driver", daemon=True).start()
-
-    def _run(self) -> None:
-        for base in self._bases:
-            self.send(contract.DRIVE, base, ZERO)
-        due = time.monotonic()
-        for base in cycle(self._bases):
-            if self._closed.wait(max(0.0, due - time.monotonic())):
-                return
-            self.send(contract.DRIVE, base, AHEAD)
-            due = max(due + 1 / RATE_HZ / len(self._bases), time.monotonic() - 1 / RATE_HZ)
-
-    def close(self) -> None:
-        self._closed.set()
-        super().close()
-
-
-def driving(port: int, *bases: str) -> closing[Driver]:
+@contextmanager
+def driving(port: int, *bases: str) -> Iterator[None]:
     """Drive these robots during the ``with`` block, whether or not they receive it."""
-    return closing(Driver(port, *bases))
+    ended = threading.Event()
+    with closing(StockClient().open(port)) as client:
+        drivers = [client.driver(base, ended.wait) for base in bases]
+        threads = [threading.Thread(target=driver.drive, args=(0.0, _AHEAD), daemon=True) for driver in drivers]
+        for driver, thread in zip(drivers, threads, strict=True):
+            driver.command(Drive())
+            thread.start()
+        try:
+            yield
+        finally:
+            ended.set()
+            for thread in threads:
+                thread.join()
 
 
 class RobotSubscriber(StockClient):

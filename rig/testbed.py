@@ -21,7 +21,7 @@ from pebble.contract.identity import Identity
 from pebble.errors import PebbleError
 from pebble.media.sound_file import write_wav
 from pebble.rig.processes import HOST, OPERATORS, Processes, Program, python
-from pebble.rig.robot import MEDIA, START_S, Robot, SimulatedRobot
+from pebble.rig.robot import MEDIA, START_S, Config, Robot, SimulatedRobot
 from pebble.simulation.mcu import Snapshot
 from pebble.simulation.world.program import Snapshot as WorldSnapshot
 from pebble.simulation.world.program import port_path, trace_path
@@ -29,12 +29,9 @@ from pebble.transports import MqttSettings, create
 from pebble.web.program import Ready
 
 ROBOTS = ("goob", "fred", "minilamp", "benjr")
-OUTLETS = "outlets"
 CLIP = "horn.wav"  # that Goob plays
 TAG_ID = 21  # of the tag that Goob follows, as in the world file
 _BOARDS = {"minilamp": "ESP32-C6", "benjr": "ESP8266"}
-#: Self-describing MCUs that Goob has besides, by their instance of the serial bridge: kind and options.
-_DEVICES = {"imu": ("goob_imu",), OUTLETS: ("outlets", "--unreachable", "o4")}
 _RESTART = ["sh", "-c", "kill $PPID"]  # the bridge alone, which runs it: the demo would take more for a failure
 _RATE = 16_000
 _POLL_S = 0.02
@@ -44,7 +41,10 @@ _START = {"goob": {"kind": "goob", "x": -0.3, "y": 0.2, "heading_deg": 0.0}}
 
 
 class LinuxRobot(Robot):
-    """Goob or Fred: the real launcher and services; camera, microphone, MCUs and loudspeaker are simulated."""
+    """Goob or Fred: the real launcher and services; camera, microphone, MCUs and loudspeaker are simulated.
+
+    ``instances`` are the configs of its self-describing MCUs, to which others may be added before it is brought up.
+    """
 
     runs_on = "Linux, SAMD21"
     has_media = True
@@ -55,26 +55,29 @@ class LinuxRobot(Robot):
         super().__init__(running, own["transport"]["kind"], remote, name=name, folder=folder)
         self.has_imu, self.local_port = name == "goob", running.local_broker.port
         self.voice = folder / "voice"  # where its loudspeaker records what it plays of operators' voices
-        self._devices = {device: folder / device for device in _DEVICES if name == "goob"}  # their serial ports
+        self._imu = folder / "imu"  # a serial port
+        self.instances: dict[str, Config] = {}
+        if self.has_imu:
+            self.instances["imu"] = {"protocol": "pebble_serial_v1", "serial": {"port": str(self._imu)}}
         self._own = own | {"services": own["services"] | {"av_daemon": {}}}
         raw = ["-t", "raw", "-f", "S16_LE", "-c", "{channels}", "-r", "{rate}", "-"]
-        ports = {device: {"port": str(port)} for device, port in self._devices.items()}
-        instances = {device: {"protocol": "pebble_serial_v1", "serial": port} for device, port in ports.items()}
         self._services = {
             "mqtt_bridge": {
                 "service_restart_control": {"command": _RESTART},
                 "media": {"audio_receiver": {"command": [*_loudspeaker(self.voice), *raw]}},
             },
-            "serial_mcu_bridge": {"instances": instances, "telemetry": {"publish_touch_sensors": self.has_scripts}},
+            "serial_mcu_bridge": {
+                "instances": self.instances,
+                "telemetry": {"publish_touch_sensors": self.has_scripts},
+            },
             "av_daemon": MEDIA["av_daemon"],
         }
 
     def bring_up(self, ending: threading.Event) -> None:
         """Start the MCUs first, so that their ports exist, then the robot."""
-        for device, port in self._devices.items():
-            kind, *options = _DEVICES[device]
-            mcu = self._start_board(kind, port, self.folder / f"{device}.jsonl", *options, name=device)
-            mcu.wait_until(port.exists, START_S, ending)
+        if self.has_imu:
+            mcu = self._start_board("goob_imu", self._imu, self.folder / "imu.jsonl", name="imu")
+            mcu.wait_until(self._imu.exists, START_S, ending)
         self.prepare(ending)
         self.start(self.name, python("pebble.cli", "up", self.config))
 

@@ -35,7 +35,6 @@ KINDS: Final = {
     "goob": Profile(0.005, 0.02),
     "fred": Profile(0.005, 0.02),
     "goob_imu": Profile(0.0025, 0.005, is_text=False),
-    "outlets": Profile(0.005, 0.02, is_text=False),
 }
 
 
@@ -44,8 +43,7 @@ class SimulatedMcu:
 
     ``now`` is a monotonic time in seconds from one clock for all calls. ``failsafe_s`` replaces the firmware's own
     limit; ``uid`` is the MCU's unique id; ``motion`` is where the robot stands, and on what ground.
-    ``on_motors(now, (left, right))`` is called at each change of the motors, + = forward; ``on_relay(now, outlet, on)``
-    at each change of a relay. ``settings`` are those of the firmware.
+    ``on_motors(now, (left, right))`` is called at each change of the motors, + = forward.
     """
 
     def __init__(
@@ -58,8 +56,6 @@ class SimulatedMcu:
         uid: bytes = UID,
         motion: RobotMotion | None = None,
         on_motors: Callable[[float, Pair], None] | None = None,
-        on_relay: Callable[[float, str, bool], None] | None = None,
-        settings: dict[str, Any] | None = None,
     ) -> None:
         if kind not in KINDS:
             raise ConfigError(f"unknown simulated MCU {kind!r}; known: {', '.join(KINDS)}")
@@ -71,13 +67,12 @@ class SimulatedMcu:
         self.board = Board(self._clock, uid=uid)
         self.body = body_of(kind, self.board, motion)
         self.body.on_motors = on_motors or self.body.on_motors
-        self.body.on_relay = on_relay or self.body.on_relay
         self.motion, self.battery = self.body.motion, self.body.battery
         self.battery.charging = charging
         self._boot_output = b""
         self.robot: Any = None  # the firmware's, since the last boot
         self._obeyed = _ObeyedLines(None)
-        self._runner = Runner(self.board, kind, settings, on_boot=self._on_boot)
+        self._runner = Runner(self.board, kind, None, on_boot=self._on_boot)
         self._start()
 
     @property

@@ -70,7 +70,6 @@ class Body:
         self.motion = motion or RobotMotion()
         self.battery = Battery(self.cells)
         self.on_motors: Callable[[float, Pair], None] = lambda _now, _motors: None
-        self.on_relay: Callable[[float, str, bool], None] = lambda _now, _outlet, _on: None
         self._rolled = self._changed_at = board.clock.now()
         self._motors = self._reported = (0.0, 0.0)
         self._stale = False
@@ -252,34 +251,7 @@ class GoobImu(Body):
         board.attach_i2c(self.pins.IMU, self.imu)
 
 
-class Outlets(Body):
-    """A station of switched sockets: a relay for each of them, with a board of its own. It does not move.
-
-    ``on_relay(now, "o1", True)`` is called when a relay has changed.
-    """
-
-    kind = "outlets"
-
-    def __init__(self, board: Board, motion: RobotMotion | None = None) -> None:
-        super().__init__(board, motion)
-        self.wires = {f"o{number}": pins for number, pins in enumerate(self.pins.OUTLETS, 1)}
-        self._on = dict.fromkeys(self.wires, False)
-        for outlet in self.wires:
-            self.connect(outlet, True)
-
-    def connect(self, outlet: str, on: bool) -> None:
-        """Connect the board of a relay, or take it away."""
-        self.board.set_pin(self.wires[outlet][1], on)
-
-    def end_turn(self) -> None:
-        for outlet, (relay, _) in self.wires.items():
-            on = self.board.duty(relay) > 0
-            if on != self._on[outlet]:
-                self._on[outlet] = on
-                self.on_relay(self.board.clock.now(), outlet, on)
-
-
-BODIES: Final[dict[str, type[Body]]] = {kind.kind: kind for kind in (Goob, Fred, Minilamp, Benjr, GoobImu, Outlets)}
+BODIES: Final[dict[str, type[Body]]] = {kind.kind: kind for kind in (Goob, Fred, Minilamp, Benjr, GoobImu)}
 
 
 def body_of(kind: str, board: Board, motion: RobotMotion | None = None) -> Body:

@@ -5,11 +5,9 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
-from typing import Any
 
 import msgspec
 
@@ -17,7 +15,6 @@ from pebble.simulation.board import BoardState
 from pebble.simulation.pty import PtyMcu
 
 _REPORT_PERIOD_S = 0.1
-_RELAYS = (("connect", True), ("disconnect", False))
 _SIGNALS = {signal.SIGTERM, signal.SIGINT, signal.SIGHUP}
 
 
@@ -38,12 +35,10 @@ def run(
     trace: Path | None = None,
     trace_output: bool = False,
     charging: bool = False,
-    settings: dict[str, Any] | None = None,
-    unreachable: Iterable[str] = (),
     report: bool = False,
     control: bool = False,
 ) -> int:
-    """Run until a signal, or with ``control`` until standard input ends; ``unreachable`` are outlets without a relay.
+    """Run until a signal, or with ``control`` until standard input ends.
 
     ``report``: write a :class:`Snapshot` to standard output ten times a second. Raises PebbleError.
     """
@@ -54,11 +49,7 @@ def run(
         trace=trace,
         trace_output=trace_output,
         charging=charging,
-        settings=settings,
-        on_relay=_print if not report else lambda _change: None,
     ) as mcu:
-        for outlet in unreachable:
-            mcu.connect(outlet, False)
         if control:
             threading.Thread(target=_run_commands, args=(mcu,), name="pebble-sim control", daemon=True).start()
         while signal.sigtimedwait(_SIGNALS, _REPORT_PERIOD_S) is None:
@@ -69,10 +60,6 @@ def run(
 
 def _report(mcu: PtyMcu) -> bool:
     return _write(msgspec.json.encode(Snapshot(time.monotonic_ns(), mcu.plugged, mcu.host, mcu.state())))
-
-
-def _print(line: str) -> None:
-    _write(line.encode())
 
 
 def _write(line: bytes) -> bool:
@@ -94,7 +81,6 @@ def actions(mcu: PtyMcu) -> dict[str, Callable[[], None]]:
         "discharge": lambda: mcu.charge(False),
         "disturb": lambda: mcu.disturb(True),
         "undisturb": lambda: mcu.disturb(False),
-        **{f"{word} {outlet}": partial(mcu.connect, outlet, on) for word, on in _RELAYS for outlet in mcu.outlets},
     }
 
 

@@ -14,11 +14,11 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self, TypeVar
 
-from pebble.errors import ConfigError, DeviceError
+from pebble.errors import DeviceError
 from pebble.runtime.lines import LineSplitter
 from pebble.runtime.wakeup_pipe import WakeupPipe
 from pebble.simulation.board import BoardState, SimulatedMcu
-from pebble.simulation.bodies import Outlets, Pair
+from pebble.simulation.bodies import Pair
 from pebble.simulation.micropython.board import UID
 from pebble.simulation.motion import Pose, RobotMotion
 from pebble.simulation.trace import Entry, Event, Trace, motors_entry
@@ -66,8 +66,7 @@ class PtyMcu:
     The symlink's folder must exist; only a symlink is replaced. Unplugging closes the pty but leaves the MCU powered:
     its motors stop by failsafe, as on a robot whose MCU is powered by the battery. Each replug makes a new pty behind
     the same symlink. ``motion`` is where the robot stands, used by that thread alone. The file ``trace`` also has when
-    the MCU was late, and with ``trace_output`` the trace has the MCU's own lines that the host received. ``settings``
-    are those of the firmware; ``on_relay`` is called with ``o1 on`` when a relay has changed.
+    the MCU was late, and with ``trace_output`` the trace has the MCU's own lines that the host received.
     """
 
     def __init__(
@@ -81,14 +80,11 @@ class PtyMcu:
         charging: bool = False,
         uid: bytes = UID,
         motion: RobotMotion | None = None,
-        settings: dict[str, Any] | None = None,
-        on_relay: Callable[[str], None] = lambda _change: None,
     ) -> None:
         self.symlink = symlink
         self.trace = Trace(trace)
         self.dropped = 0  # bytes of the MCU that no host received
         self._traces_late = trace is not None
-        self._on_relay = on_relay
         self._mcu = SimulatedMcu(
             kind,
             time.monotonic(),
@@ -97,8 +93,6 @@ class PtyMcu:
             uid=uid,
             motion=motion,
             on_motors=self._moved,
-            on_relay=self._switched,
-            settings=settings,
         )
         self._tick_s = self._mcu.profile.tick_s
         self._recorder = _Recorder(self.trace, is_text=self._mcu.profile.is_text, output=trace_output)
@@ -154,19 +148,6 @@ class PtyMcu:
     def disturb(self, on: bool) -> None:
         """Make the devices on the board's I2C bus fail, or work again."""
         self._call(lambda: self._mcu.disturb(on))
-
-    @property
-    def outlets(self) -> tuple[str, ...]:
-        """The names of a station's outlets; others have none."""
-        body = self._mcu.body
-        return tuple(body.wires) if isinstance(body, Outlets) else ()
-
-    def connect(self, outlet: str, on: bool) -> None:
-        """Connect the relay of one of a station's outlets, or take it away. Raises ConfigError for an unknown one."""
-        body = self._mcu.body
-        if not isinstance(body, Outlets) or outlet not in body.wires:
-            raise ConfigError(f"{self._mcu.kind} has no outlet {outlet!r}")
-        self._call(lambda: body.connect(outlet, on))
 
     def place(self, pose: Pose) -> None:
         """Lift the robot and put it down at ``pose``."""
@@ -292,8 +273,3 @@ class PtyMcu:
 
     def _moved(self, now: float, motors: Pair) -> None:
         self.trace.add(motors_entry(round(now * 1e9), motors))
-
-    def _switched(self, now: float, outlet: str, on: bool) -> None:
-        change = f"{outlet} {'on' if on else 'off'}"
-        self.trace.add(Entry(round(now * 1e9), "relay", change))
-        self._on_relay(change)

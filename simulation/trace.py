@@ -9,17 +9,17 @@ import msgspec
 
 _RETAINED = 100_000  # entries in memory; a file has all of them
 
-Event = Literal["plugged", "opened", "line", "closed", "unplugged", "motors", "relay", "said", "late"]
+Event = Literal["plugged", "opened", "line", "closed", "unplugged", "motors", "said", "late"]
 
 
 @dataclass(frozen=True, slots=True)
 class Entry:
-    """One line from the host or (``said``) to it, a change of the port, of the motors or of a relay.
+    """One line from the host or (``said``) to it, a change of the port or of the motors.
 
     ``ns`` is time.monotonic_ns() when the line's last byte was received, just before it was written, or when the
     outputs changed. The line of ``motors`` is ``<left> <right>`` with three decimals, -1..1, + = forward of the robot,
-    however its motors are mounted. That of ``relay`` is ``<outlet> on`` or ``<outlet> off``. That of ``late`` are the
-    seconds for which a busy machine kept the MCU from its port until now: what it receives next came at any time since.
+    however its motors are mounted. That of ``late`` are the seconds for which a busy machine kept the MCU from its port
+    until now: what it receives next came at any time since.
     """
 
     ns: int

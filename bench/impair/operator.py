@@ -18,12 +18,14 @@ from typing import Any
 import msgspec
 
 from pebble.bench.bridge_operator import wheels
-from pebble.bench.clients import all_ready, axes_of
+from pebble.bench.clients import all_ready, drive_of
 from pebble.bench.impair.metrics import Arrival, Command, Heartbeat, OperatorReport, Plan, Record, Sound, Window
 from pebble.bench.usage import wall_clock_ahead_ns
 from pebble.client.media_receiver import MediaReceiver
+from pebble.client.robot_view import RobotView
+from pebble.client.scripted_operator import ScriptedOperator, paced
 from pebble.client.viewer import Medium
-from pebble.contract import DRIVE, ONLINE, SOUNDBOARD_COMMAND, SOUNDBOARD_STATUS, STATUS, Channel, codec
+from pebble.contract import ONLINE, SOUNDBOARD_COMMAND, SOUNDBOARD_STATUS, STATUS, Channel, codec
 from pebble.contract.payloads import Heartbeat as Online
 from pebble.contract.payloads import SoundboardCommand
 from pebble.errors import PayloadError, PebbleError
@@ -33,7 +35,7 @@ from pebble.rig.worker_end import answer, serve_on_thread
 from pebble.transports import Message, MqttSettings, QoS, State, Transport, create
 
 CLIP = "clip.wav"  # in the folder of the robot's soundboard
-_PERIOD_S = 0.1  # between two drive commands
+_RATE_HZ = 10.0  # of drive commands
 _UP_S, _CONNECT_S, _KNOWN_S = 60.0, 10.0, 5.0
 _FIRST_S = 5.0  # the longest wait for a first picture or sound before the window begins
 _POLL_S = 0.05
@@ -66,6 +68,7 @@ class TrialOperator:
         settings = MqttSettings(host=host, port=port)
         self._controls = create("mqtt", "pebble-impair-controls", settings)
         self._media = create("mqtt", "pebble-impair-media", settings)
+        self._driver = ScriptedOperator(RobotView(base), self._publish, by="bench")
         self._number = 0
         self._commands: list[Command] = []
         self._heartbeats: list[Heartbeat] = []
@@ -151,15 +154,14 @@ class TrialOperator:
     # -- the driver's thread
 
     def _drive(self, enough: threading.Event) -> None:
-        topic, due = DRIVE.topic(self._base), time.monotonic()
-        while not enough.is_set():
+        for _ in paced(rate_hz=_RATE_HZ, wait=enough.wait):
             self._number += 1
             left, right = wheels(self._number)
-            payload = msgspec.json.encode(axes_of(left, right))
-            self._commands.append(Command(left, right, time.monotonic_ns()))
-            self._controls.publish(topic, payload, qos=QoS.DELIVERED, urgent=True)
-            due += _PERIOD_S
-            enough.wait(max(0.0, due - time.monotonic()))
+            sent_at = self._driver.command(drive_of(left, right))
+            self._commands.append(Command(left, right, round(1e9 * sent_at)))
+
+    def _publish(self, message: Message) -> None:
+        self._controls.publish(message.topic, message.payload, qos=message.qos, urgent=True)
 
     # -- the transports' threads
 

@@ -6,9 +6,7 @@
 // emergency stop, Ctrl-D ends it. With a user, commands carry this name.
 import { randomBytes } from "node:crypto";
 import fs from "node:fs";
-import net from "node:net";
 import readline from "node:readline";
-import tls from "node:tls";
 import mqtt from "mqtt";
 import { Driver } from "./driver.mjs";
 import { METRICS, RobotState } from "./robot-state.mjs";
@@ -26,13 +24,17 @@ const robot = new RobotState();
 const driver = new Driver(robot, NAME, send);
 let stop = null; // an emergency stop that is not confirmed yet
 
-const client = new mqtt.MqttClient(dial, {
-  protocolVersion: 4,
+const client = mqtt.connect({
+  protocol: USER === undefined ? "mqtt" : "mqtts", // mqtts: with TLS
+  host: HOST,
+  port: Number(PORT),
+  ca: USER === undefined ? undefined : fs.readFileSync(CA_FILE),
+  protocolVersion: 4, // MQTT 3.1.1
   clientId: `operator-${driver.id}`,
   username: USER,
   password: USER === undefined ? undefined : fs.readFileSync(PASSWORD_FILE, "utf8").trim(),
-  keepalive: 5,
-  reconnectPeriod: 500,
+  keepalive: 5, // seconds
+  reconnectPeriod: 500, // milliseconds
   resubscribe: false, // it is done at each connection, below
   queueQoSZero: false, // what waited would come late
 });
@@ -50,14 +52,7 @@ readline
   .on("line", (line) => obey(line.trim()))
   .on("close", end);
 process.on("SIGINT", end); // Ctrl-C lets go as well
-setInterval(step, STEP_MS);
-
-function dial() {
-  if (USER === undefined) {
-    return net.connect(PORT, HOST);
-  }
-  return tls.connect({ port: PORT, host: HOST, ca: fs.readFileSync(CA_FILE) });
-}
+const steps = setInterval(step, STEP_MS);
 
 /** Publish a command, never retained: it would be carried out at every start of the robot. */
 function send(metric, value, qos, base = INCOMING) {
@@ -101,6 +96,7 @@ function step() {
 }
 
 function end() {
+  clearInterval(steps); // else it would ask for control again
   driver.push(0, 0);
   driver.release();
   setTimeout(() => process.exit(), 300); // until this is sent

@@ -2,7 +2,7 @@
 
 export const METRICS = ["online", "capabilities", "link", "estop/+", "control/+"];
 const SILENT_MS = { wide: 1500, narrow: 3000, thin: 5000 }; // without a heartbeat, by the level of the link
-const WIDE = { level: "wide", drive_hz: 20 };
+const WIDE = { level: "wide", drive_hz: 20 }; // a link that carries everything: robots that report none have it
 
 /** One robot. */
 export class RobotState {

@@ -6,7 +6,7 @@ import time
 
 METRICS = ("online", "capabilities", "link", "estop/+", "control/+")
 SILENT_S = {"wide": 1.5, "narrow": 3.0, "thin": 5.0}  # without a heartbeat, by the level of the link
-WIDE = {"level": "wide", "drive_hz": 20}
+WIDE = {"level": "wide", "drive_hz": 20}  # a link that carries everything: robots that report none have it
 
 
 class RobotState:

@@ -23,14 +23,14 @@ class Robot:
         self.named = named
         self.stop = EmergencyStop(saved, self.save, named)
         self.control = Control()
-        self.wheels = [0, 0]
+        self.wheels = [0, 0]  # left and right as commanded, -1..1
         self.wheels_until = 0  # when they stop by themselves
         self.paused_until = 0
         self.heartbeat_at = 0
         self.shown = None  # the wheels and the control that were published last
         self.capabilities = {
             "identity": {"system": "pebble", "type": "robots", "id": robot_id},
-            "drive": {"available": True, "controls": True, "control": True},
+            "drive": {"available": True, "controls": True, "control": True},  # pages may offer it
             "estop": {"available": True, "owners": [OWNER]},
             "named": named,
         }

@@ -1,4 +1,9 @@
-"""This is as much MQTT 3.1.1 as a robot in MicroPython needs. Only connecting waits, for 2 s at most."""
+"""This is as much MQTT 3.1.1 as a robot in MicroPython needs.
+
+``open`` waits for the network, for seconds: halt before it. Later only ``messages`` waits, as long as it is told; what
+the network does not take at once is sent in the next round. (Some boards, such as the Pico W, wait up to half a second
+in a write while the network takes nothing.)
+"""
 
 import json
 import select

@@ -17,20 +17,23 @@ def text(value):
     return struct.pack("!H", len(data)) + data
 
 
+def header(first, size):
+    """Return the first bytes of a packet. Each byte of its size has seven bits, and one that is set if more follow."""
+    data = bytes((first,))
+    while size > 127:
+        data += bytes((size & 127 | 128,))
+        size >>= 7
+    return data + bytes((size,))
+
+
 def packet(first, content):
-    """Return a packet. Each byte of its length has seven bits, and one that is set if more follow."""
-    size = len(content)
-    length = bytes((size,)) if size < 128 else bytes((size & 127 | 128, size >> 7))
-    return bytes((first,)) + length + content
+    return header(first, len(content)) + content
 
 
 def message(first, content):
     """Return the topic, the number and the payload in a PUBLISH packet; the number is empty with QoS 0."""
-    start = 2 + struct.unpack("!H", content)[0]
-    try:
-        topic = content[2:start].decode()
-    except UnicodeError:
-        topic = ""  # it is cut inside a letter: none of ours is so long
+    start = 2 + struct.unpack_from("!H", content)[0]
+    topic = content[2:start].decode()
     end = start + 2 if first & 6 else start
     return topic, content[start:end], content[end:]
 
@@ -41,24 +44,47 @@ class Reader:
     def __init__(self):
         self.data = b""
         self.skipped = 0  # bytes of a long packet that are still to come
+        self.head = b""  # what comes before the rest of the data, once these are skipped
 
     def add(self, data):
         self.data += data
 
     def packets(self):
         """Yield the first byte and the content of each packet that is there; content that is too long is cut."""
-        while True:
-            gone = min(self.skipped, len(self.data))
-            self.skipped -= gone
-            self.data = self.data[gone:]
+        while self.skip():
             size, start = self.length()
             end = start + min(size, LONGEST)
             if start == 0 or len(self.data) < end:
                 return
             first, content = self.data[0], self.data[start:end]
+            if first & 0xF0 == PUBLISH and self.skip_long_topic(start, size):
+                continue
             self.data = self.data[end:]
             self.skipped = start + size - end
             yield first, content
+
+    def skip(self):
+        """Drop what is to be skipped, as far as it is there. Return True if it was."""
+        gone = min(self.skipped, len(self.data))
+        self.skipped -= gone
+        self.data = self.data[gone:]
+        if self.skipped == 0:
+            self.data = self.head + self.data
+            self.head = b""
+        return self.skipped == 0
+
+    def skip_long_topic(self, start, size):
+        """Skip the topic of a message if the number behind it, which is to be acknowledged, would be cut off.
+
+        Return True if it is skipped. None of ours is so long: what is left is a message with an empty topic.
+        """
+        topic = struct.unpack_from("!H", self.data, start)[0]
+        if 2 + topic + 2 <= LONGEST:
+            return False
+        self.head = header(self.data[0], size - topic) + text("")
+        self.data = self.data[start + 2 :]
+        self.skipped = topic
+        return True
 
     def length(self):
         """Return the size of the next packet's content, and where it begins: 0 if that is not there yet."""

@@ -69,11 +69,18 @@ def saved():
 
 
 def set_clock():
-    """Ask the network for the time: certificates have a date, and people are shown how old messages are."""
+    """Ask the internet for the time: people are shown how old messages are.
+
+    Without it the times of messages count from the start of the board, and it drives as well.
+    """
     if time.gmtime()[0] < 2024:
         import ntptime
 
-        ntptime.settime()
+        try:
+            ntptime.settime()
+        except OSError:  # no internet, or no answer
+            if LOGIN:
+                raise  # a certificate cannot be checked without the date
 
 
 def connect():

@@ -1,8 +1,6 @@
 // A robot for Arduino on an ESP32, with the libraries PubSubClient and ArduinoJson, and the headers beside it.
 //
-// Your own settings.h has WIFI, WIFI_PASSWORD, ID, HOST, PORT, USER, PASSWORD and CA, the certificate of the broker's
-// authority. With a USER it is at level named, see docs/fleet.md: commands count only under the account of their
-// sender. Else USER, PASSWORD and CA are nullptr.
+// Copy settings-example.h to settings.h, and write your own network, broker and account into it.
 #include <PubSubClient.h>
 #include <Ticker.h>
 #include <WiFiClientSecure.h>
@@ -95,8 +93,8 @@ void setup() {
     Serial.begin(115200);
     WiFi.begin(WIFI, WIFI_PASSWORD);
     while (WiFi.status() != WL_CONNECTED) delay(100);
-    configTime(0, 0, "pool.ntp.org");
-    while (time(nullptr) < 1700000000) delay(100);  // certificates have a date
+    configTime(0, 0, "pool.ntp.org");  // without internet its times count from the start: it drives as well
+    while (USER != nullptr && time(nullptr) < 1700000000) delay(100);  // but a certificate needs the date
     robot.begin(USER != nullptr);
     if (USER != nullptr) {
         secure.setCACert(CA);
@@ -106,9 +104,9 @@ void setup() {
     }
     mqtt.setServer(HOST, PORT);
     mqtt.setCallback(receive);
-    mqtt.setKeepAlive(5);
-    mqtt.setSocketTimeout(2);
-    mqtt.setBufferSize(1024);
+    mqtt.setKeepAlive(5);      // seconds
+    mqtt.setSocketTimeout(2);  // seconds
+    mqtt.setBufferSize(1024);  // bytes
 }
 
 void loop() {

@@ -14,15 +14,13 @@ if TYPE_CHECKING:
     from pebble.config import Config
     from pebble.simulation.wireless import BrokerAddress
 
-_SERIAL = ("goob", "fred", "goob_imu", "outlets")
+_SERIAL = ("goob", "fred", "goob_imu")
 _WIFI = ("minilamp", "benjr")
 _NAMED = (*_WIFI, "world")
 #: The kinds that each option is for.
 _OF = {
     "link": _SERIAL,
     "charging": ("goob", "fred"),
-    "outlets": ("outlets",),
-    "unreachable": ("outlets",),
     "broker": (*_WIFI, "fleet"),
     "password_file": (*_WIFI, "fleet"),
     "ca_cert": (*_WIFI, "fleet"),
@@ -38,7 +36,7 @@ _OF = {
     "control": (*_SERIAL, "world"),
 }
 
-Kind = Literal["goob", "fred", "goob_imu", "outlets", "minilamp", "benjr", "fleet", "world", "loudspeaker"]
+Kind = Literal["goob", "fred", "goob_imu", "minilamp", "benjr", "fleet", "world", "loudspeaker"]
 
 
 def sim(
@@ -52,10 +50,6 @@ def sim(
         Path | None, typer.Option(help="Path of the serial port. [default: /tmp/pebble-KIND]", metavar="PATH")
     ] = None,
     charging: Annotated[bool, typer.Option("--charging", help="Start with the charger connected.")] = False,
-    outlets: Annotated[int, typer.Option("--outlets", min=1, max=4, help="How many sockets.")] = 4,
-    unreachable: Annotated[
-        list[str] | None, typer.Option(help="A socket without its relay: o4; repeatable.", metavar="oN")
-    ] = None,
     broker: Annotated[
         str | None,
         typer.Option(
@@ -87,7 +81,7 @@ def sim(
 ) -> int:
     """Simulate a board, a robot, many robots or a room, until Ctrl-C. Boards run the firmware of the real ones.
 
-    goob, fred, goob_imu and outlets are boards on a pseudo terminal: set serial.port in a robot's config to its link.
+    goob, fred and goob_imu are boards on a pseudo terminal: set serial.port in a robot's config to its link.
     minilamp and benjr are whole robots on a real broker; fleet is many of them, minilamp-001, benjr-001 and so on, and
     exits 0 only if all were online at the end. world is a room with walls and AprilTags, which robots' cameras see; it
     prints what belongs in their configs. loudspeaker takes aplay's arguments, and with --record FOLDER records what is
@@ -95,7 +89,6 @@ def sim(
 
     \b
         pebble sim goob --link /tmp/goob
-        pebble sim outlets --link /tmp/outlets --unreachable o4
         pebble sim benjr benjr-2 --broker mqtt://127.0.0.1
         pebble sim minilamp --broker minilamp.json
         pebble sim fleet --robots 200 --broker mqtt://127.0.0.1
@@ -119,11 +112,9 @@ def sim(
         path = link or Path(tempfile.gettempdir(), f"pebble-{kind}")
         if not report:
             typer.echo(f"{kind} is at {path}; Ctrl-C ends it")
-        settings = {"outlets": outlets} if kind == "outlets" else None
         return run_mcu(
-            kind, path, trace=trace, trace_output=trace_output, charging=charging, settings=settings,
-            unreachable=unreachable or (), report=report, control=control,
-        )  # fmt: skip
+            kind, path, trace=trace, trace_output=trace_output, charging=charging, report=report, control=control
+        )
     if broker is None:
         raise typer.BadParameter(f"{kind} needs --broker URL")
     address, config = _address(broker, password_file, ca_cert)

@@ -7,7 +7,6 @@ Times are seconds of time.monotonic().
 from __future__ import annotations
 
 import math
-import queue
 import threading
 import time
 from collections import deque
@@ -17,21 +16,18 @@ from typing import NamedTuple
 
 from pebble import contract as c
 from pebble.client.discovery import ALL_OUTGOING, Discovery
-from pebble.client.estop import StopSender, new_name
-from pebble.client.estop_states import Reset
 from pebble.client.robot_view import RobotView
+from pebble.client.scripted_operator import ScriptedOperator, paced
 from pebble.contract import codec
 from pebble.contract.identity import parse_topic
 from pebble.contract.payloads import AutonomyCommand, Drive, LightsFlash, LightsSolid, SoundboardCommand, TagData
 from pebble.demo.outcome import Driven, Wheels
-from pebble.demo.steering import Steering
 from pebble.demo.visitors import Visitors
 from pebble.errors import PayloadError
 from pebble.motion.arbiter import HOLD_MS
 from pebble.rig.testbed import CLIP, TAG_ID
 from pebble.transports import Message, MqttSettings, QoS, create
 
-COMMAND_PERIOD_S = 0.05  # how often a held stick is repeated
 NAME = "demo-operator"
 STOP = Drive()
 _POLL_S = 0.02
@@ -67,6 +63,8 @@ AFTER_RESET = "after the reset"  # they can be driven again
 _BEFORE_S, _IN_VAIN_S, _RESET_S, _AFTER_S, _STOPPED_REST_S = 0.8, 1.0, 0.8, 0.6, 0.8
 EMERGENCY_S = _BEFORE_S + _IN_VAIN_S + _RESET_S + _AFTER_S + _STOPPED_REST_S + 0.5
 _CONFIRMED_S = 3.0  # until every robot has confirmed, on the smallest machine
+_CONTROL_S = 1.0  # until every robot has given it
+_AGAIN_S = 0.05  # until the operator looks whether a stop is confirmed
 _FORWARD = Drive(z=0.5)
 
 TAKE_OVER = "take over"  # a robot follows a tag by a script, and is driven for a moment in between
@@ -107,7 +105,7 @@ class Operator:
         self.completed: deque[Driven] = deque(maxlen=_MOST_WAITING)
         self._doing = "discovering robots"
         self.visitors = Visitors(NAME)
-        self.steering = Steering(NAME, self._publish_all, self.visitors.own_ids)
+        self.drivers: dict[str, ScriptedOperator] = {}  # by base topic
         self._drawing: set[str] = set()  # base topics of robots that have listed the script for their trail
         self._robots: list[RobotView] = []  # that take part in the present step
         self._scripted: RobotView | None = None  # if a person takes it, the present step ends
@@ -177,7 +175,7 @@ class Operator:
                     self._stop_all(robots)
                     self._take_over(robots)
                 self.rounds += 1
-            self.steering.release()
+            self._release()
             self._doing = yours
             while True:
                 self._show_trails(robots)
@@ -188,7 +186,7 @@ class Operator:
     def _begin(self, step: str, robots: Sequence[RobotView]) -> None:
         """Choose the robots that are free."""
         self._doing = step
-        self.steering.release()
+        self._release()
         self.visitors.begin_step(time.monotonic())
         self._robots = [robot for robot in robots if self._mine(robot)]
 
@@ -213,29 +211,56 @@ class Operator:
 
     def _drive(self, drive: Drive) -> float:
         """Send one command to all robots that are free; returns when."""
-        for robot in filter(self._mine, self._robots):
-            self.steering.drive(robot, drive)
+        for driver in self._free_drivers():
+            driver.command(drive)
         return time.monotonic()
 
     def _hold(self, drive: Drive, seconds: float) -> float:
         """Send a command again and again, as a held stick does; returns when it was last sent."""
-        self.steering.take(filter(self._mine, self._robots), self._until)
-        began = due = sent = time.monotonic()
-        while due < began + seconds:
+        self._take_control()
+        sent = time.monotonic()
+        for _ in paced(seconds, wait=self._wait):
             sent = self._drive(drive)
-            due += COMMAND_PERIOD_S
-            self._wait(max(0.0, due - sent))
         return sent
+
+    def _free_drivers(self) -> list[ScriptedOperator]:
+        return [self._driver(robot) for robot in self._robots if self._mine(robot)]
+
+    def _driver(self, robot: RobotView) -> ScriptedOperator:
+        if robot.base not in self.drivers:
+            driver = ScriptedOperator(robot, self._publish_message, by=NAME, device="demo")
+            self.visitors.own_ids.add(driver.control.id)
+            self.drivers[robot.base] = driver
+        return self.drivers[robot.base]
+
+    def _take_control(self) -> None:
+        """Ask for control of all robots that are free, as a person would."""
+        drivers = self._free_drivers()
+
+        def have_control() -> bool:
+            for driver in drivers:
+                driver.tick()
+            return all(driver.has_control for driver in drivers)
+
+        for driver in drivers:
+            driver.ask_control()
+        self._until(have_control, _CONTROL_S)
+        for driver in drivers:
+            if not driver.has_control:  # a person was faster
+                driver.release()
+
+    def _release(self) -> None:
+        for driver in self.drivers.values():
+            driver.release()
 
     def _publish(self, topic: str | None, payload: bytes) -> None:
         if topic is not None:
-            self._publish_all([Message(topic, payload, QoS.DELIVERED)])
+            self._publish_message(Message(topic, payload, QoS.DELIVERED))
 
-    def _publish_all(self, messages: Iterable[Message]) -> None:
-        for one in messages:
-            if one.topic.endswith(c.DRIVE.suffix):  # the zeros of an emergency stop are among them
-                self.visitors.note_sent(one.topic, one.payload)
-            self._transport.publish(one.topic, one.payload, qos=one.qos, urgent=True)
+    def _publish_message(self, message: Message) -> None:
+        if message.topic.endswith(c.DRIVE.suffix):  # the zeros of an emergency stop are among them
+            self.visitors.note_sent(message.topic, message.payload)
+        self._transport.publish(message.topic, message.payload, qos=message.qos, urgent=True)
 
     # -- a step, an emergency stop, and a script
 
@@ -252,25 +277,27 @@ class Operator:
 
     def _stop_all(self, robots: Sequence[RobotView]) -> None:
         """Drive all, stop them, drive in vain, reset, drive again; a stop by a person is the person's to reset."""
-        received, began = queue.SimpleQueue[Message](), time.monotonic()
+        began = time.monotonic()
         self._begin(EMERGENCY_STOP, robots)
         self._end_trails()
-        with closing(self._transport.subscribe(ALL_OUTGOING, received.put)):  # brings retained capabilities again
-            self._hold(_FORWARD, _BEFORE_S)
-            pressed = time.monotonic()
-            bases = [robot.base for robot in self._robots]
-            sender = StopSender(new_name(), by=NAME, why="part of the demo", now=pressed, robots=bases)
-            while not sender.confirmed and time.monotonic() < pressed + _CONFIRMED_S:
-                self._publish_all(sender.tick(time.monotonic()))
-                self._hold(_FORWARD, COMMAND_PERIOD_S)
-                while not received.empty():
-                    sender.receive(received.get(), time.monotonic())
+        self._hold(_FORWARD, _BEFORE_S)
+        pressed = time.monotonic()
+        drivers = [self._driver(robot) for robot in self._robots]
+
+        def receive(message: Message) -> None:
+            for driver in drivers:
+                driver.receive(message)
+
+        for driver in drivers:
+            driver.stop("part of the demo")
+        with closing(self._transport.subscribe(ALL_OUTGOING, receive)):  # brings retained capabilities again
+            while not all(driver.stopped for driver in drivers) and time.monotonic() < pressed + _CONFIRMED_S:
+                self._hold(_FORWARD, _AGAIN_S)
         self._hold(_FORWARD, _IN_VAIN_S)
         reset_at = time.monotonic()
         self._complete(EMERGENCY_STOP, _FORWARD, began, pressed, reset_at)
-        for robot in self._robots:
-            if robot.stopped_by is None or robot.stopped_by.by == NAME:
-                self._publish_all(Reset(robot.estop, NAME).messages())
+        for driver in drivers:
+            driver.reset()
         self._wait(_RESET_S)
         self._hold(_FORWARD, _AFTER_S)
         released = self._drive(STOP)

@@ -137,9 +137,10 @@ class View:
         return row
 
     def _command(self, seen: RobotView, now: float) -> str:
-        if seen.base not in self._operator.steering.commands:
+        driver = self._operator.drivers.get(seen.base)
+        if driver is None or driver.newest is None:
             return "none yet"
-        drive, sent_at = self._operator.steering.commands[seen.base]
+        drive, sent_at = driver.newest
         return f"x {drive.x:+.2f} z {drive.z:+.2f}, {now - sent_at:3.1f} s ago"
 
 

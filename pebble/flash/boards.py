@@ -96,7 +96,6 @@ FIRMWARE = {
         Firmware(name="goob", board=SAMD21, baud=460800, is_report=_lines(b"T a0=")),
         Firmware(name="fred", board=SAMD21, is_report=_lines(b"T t0=")),
         Firmware(name="goob_imu", board=SAMD21, is_report=_frames, fallback_port="D6 and D7, 115200 baud"),
-        Firmware(name="outlets", board=SAMD21, is_report=_frames, fallback_port="D6 and D7, 115200 baud"),
     )
 }
 

@@ -56,7 +56,7 @@ ESP8266: Final = Port("esp8266", "ESP module with ESP8266", _esp_pin, 1.0, 80_00
 
 #: The board type of each robot
 OF_ROBOT: Final = {
-    **dict.fromkeys(("goob", "fred", "goob_imu", "outlets"), SAMD21),
+    **dict.fromkeys(("goob", "fred", "goob_imu"), SAMD21),
     "minilamp": ESP32_C6,
     "benjr": ESP8266,
 }

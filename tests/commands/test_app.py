@@ -88,7 +88,7 @@ def test_a_command_imports_no_other() -> None:
         (("topic", "contract", "--bad"), "--bad", "pebble topic contract --help"),
         (("sim", "bob"), "bob", "pebble sim --help"),
         (("sim", "minilamp"), "--broker URL", "pebble sim --help"),
-        (("sim", "goob", "--outlets", "2"), "goob takes no --outlets", "pebble sim --help"),
+        (("sim", "goob", "--robots", "2"), "goob takes no --robots", "pebble sim --help"),
         (("sim", "goob", "spot"), "goob takes no spot", "pebble sim --help"),
         (("sim", "world", "--lnk", "/tmp"), "no option --lnk", "pebble sim --help"),
         (("doctor", "--running"), "which robot", "pebble doctor --help"),

@@ -23,7 +23,7 @@ NAMED = "image with ROMFS, named"
 #: Modules that are never loaded there.
 _UNUSED = {STOCK: ("usb",), FULL: ("console", "uart"), ROM: ("names",), PLAIN: ("names",), "": ("names",)}
 _SCRIPTS = ("board", "net", "workload_serial", "workload_described", "workload_network", "heap")
-_DESCRIBED = ("goob_imu", "outlets")  # by pebble_serial_v1
+_DESCRIBED = ("goob_imu",)  # by pebble_serial_v1
 _ENOUGH_S = 300.0  # a minute of its own time takes 5 s, and whatever `make test` leaves it of the processors
 _HEAP = 64 * 1024  # to start with: the smaller, the quicker it is searched for garbage
 _SETTINGS = {

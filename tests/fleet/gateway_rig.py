@@ -148,6 +148,7 @@ class World:
     # -- what happens all the time
 
     def _drive(self) -> None:
+        """Send commands, heartbeats and events by one schedule: what is late is late for all."""
         due = time.monotonic()
         for number in self._numbers:
             if self._ending.wait(max(0.0, due - time.monotonic())):

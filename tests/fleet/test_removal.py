@@ -39,7 +39,7 @@ SILENT_S = 2.0
 
 
 class Driver:
-    """A person who drives a robot until the broker ends the connection."""
+    """A person who drives a robot until the broker ends the connection, which other clients would make anew."""
 
     def __init__(self, broker: FleetBroker, name: str, robot: str) -> None:
         self._client, self._ending = broker.login(name), threading.Event()

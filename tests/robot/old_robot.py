@@ -14,15 +14,15 @@ import signal
 import subprocess
 import sys
 import tempfile
-import threading
 import time
 from collections import Counter
-from contextlib import ExitStack
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
 from pebble.simulation.trace import read_trace
-from tests.robot.operator import Operator
+from tests.robot.operator import Driver, Operator
 from tests.support import ROOT, Broker, Child, until
 
 OLD = "456f31d"  # the newest commit without emergency stops
@@ -122,25 +122,16 @@ class MiniLamp(Robot):
         )  # fmt: skip
 
 
-class Drivers:
-    """Sends every robot forward, 10 times a second, until stopped."""
-
-    def __init__(self, operators: dict[str, Operator]) -> None:
-        self.sent: Counter[str] = Counter()
-        self._operators = operators
-        self._end = threading.Event()
-        self._thread = threading.Thread(target=self._run, daemon=True)
-        self._thread.start()
-
-    def stop(self) -> None:
-        self._end.set()
-        self._thread.join()
-
-    def _run(self) -> None:
-        while not self._end.wait(0.1):
-            for name, operator in self._operators.items():
-                operator.send(DRIVE, FORWARD)
-                self.sent[name] += 1
+@contextmanager
+def driven(operators: dict[str, Operator], sent: Counter[str]) -> Iterator[None]:
+    """Send every robot forward, 10 times a second, and count what was sent."""
+    drivers = {name: Driver(operator, 10.0, body=lambda _: FORWARD) for name, operator in operators.items()}
+    try:
+        yield
+    finally:
+        for name, driver in drivers.items():
+            driver.stop()
+            sent[name] += len(driver.sent_at)
 
 
 def main() -> int:
@@ -171,27 +162,25 @@ def _compare(stack: ExitStack, remote: Broker, robots: list[Robot]) -> int:
         for robot in robots
         if isinstance(robot, Linux) and robot.local is not None
     }
-    drivers = Drivers(operators)
-    moving = until(lambda: all(robot.moving for robot in robots), 20)
+    sent = Counter[str]()
+    with driven(operators, sent):
+        moving = until(lambda: all(robot.moving for robot in robots), 20)
     assert moving, [(robot.name, (robot.folder / "log").read_text()[-2000:]) for robot in robots if not robot.moving]
-    drivers.stop()
     began = time.monotonic()
     sender = Child(
         [sys.executable, "-m", "pebble.cli", "estop", "--all", "--url", f"mqtt://127.0.0.1:{remote.port}"],
         cwd=ROOT, stdout=subprocess.DEVNULL,
     )  # fmt: skip
     # The client drives on until the stop is sent: else the dead-man's switches would stop the wheels first.
-    driving = Drivers(operators)
-    assert until(lambda: all(_zeros(one, began) for one in operators.values()), 10), "the stop is not sent"
-    driving.stop()
-    drivers.sent += driving.sent
+    with driven(operators, sent):
+        assert until(lambda: all(_zeros(one, began) for one in operators.values()), 10), "the stop is not sent"
     time.sleep(SECONDS)
     sender.send_signal(signal.SIGINT)
     sender.wait(10)
     time.sleep(1)  # what circulates would go on
     rows, failures = [], 0
     for robot in robots:
-        row, right = _judge(robot, operators[robot.name], local.get(robot.name), drivers.sent[robot.name], began)
+        row, right = _judge(robot, operators[robot.name], local.get(robot.name), sent[robot.name], began)
         rows.append(row)
         failures += not right
     _print(rows)

@@ -6,6 +6,8 @@ import json
 import socket
 import threading
 import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
@@ -122,11 +124,20 @@ def number_of(left: float, right: float) -> int:
 
 
 class Driver:
-    """Sends numbered commands at ``rate_hz`` until stopped, and remembers when each was sent."""
+    """Sends commands at ``rate_hz`` until stopped, and remembers when each was sent; ``body`` makes one of a number."""
 
-    def __init__(self, operator: Operator, rate_hz: float = 20.0, first: int = 0, *, qos: int = 1) -> None:
+    def __init__(
+        self,
+        operator: Operator,
+        rate_hz: float = 20.0,
+        first: int = 0,
+        *,
+        qos: int = 1,
+        body: Callable[[int], dict[str, Any]] = numbered,
+    ) -> None:
         self.sent_at: dict[int, float] = {}
         self._operator, self._period, self._first, self._qos = operator, 1 / rate_hz, first, qos
+        self._body = body
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, daemon=True)
         self._thread.start()
@@ -139,10 +150,20 @@ class Driver:
         number, due = self._first, time.monotonic()
         while not self._stop.is_set():
             self.sent_at[number] = time.monotonic()
-            self._operator.send("incoming/drive-values", numbered(number), qos=self._qos)
+            self._operator.send("incoming/drive-values", self._body(number), qos=self._qos)
             number += 1
             due += self._period
             self._stop.wait(max(0.0, due - time.monotonic()))
+
+
+@contextmanager
+def driving(operator: Operator, z: float, **more: Any) -> Iterator[Driver]:
+    """Drive straight at 20 Hz, as a page does; ``more`` is the rest of each command."""
+    driver = Driver(operator, body=lambda _: {"x": 0, "z": z, **more})
+    try:
+        yield driver
+    finally:
+        driver.stop()
 
 
 def _send_at_once(_client: paho.Client, _data: Any, sock: socket.socket) -> None:

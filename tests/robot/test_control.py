@@ -7,13 +7,12 @@ import json
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
 from typing import Any
 
 import pytest
 
 from tests.robot.control_schedules import ENGINE
-from tests.robot.operator import Operator
+from tests.robot.operator import Operator, driving
 from tests.robot.rig import BASE, STOP, Rig, lines
 from tests.support import beside, cases, until
 
@@ -47,20 +46,6 @@ def held(rig: Rig, topic: str, client: dict[str, Any]) -> str:
     assert until(lambda: state(rig).get("id") == client["id"], 5), state(rig)
     key: str = state(rig)["key"]
     return key
-
-
-@contextmanager
-def driving(operator: Operator, z: float, **more: Any) -> Iterator[list[float]]:
-    """Drive at 20 Hz; the list has when each command was sent."""
-    ending, sent = threading.Event(), []
-
-    def drive() -> None:
-        while not ending.wait(0.05):
-            sent.append(time.monotonic())
-            operator.send(DRIVE, {"x": 0, "z": z, **more})
-
-    with beside(drive, ending):
-        yield sent
 
 
 def test_take_over_stop_and_a_restart_of_the_motor_owner(rig: Rig) -> None:
@@ -111,12 +96,12 @@ def test_a_flood_of_strangers_takes_nothing_from_who_has_control(rig: Rig) -> No
                 stranger.send(DRIVE if number % 3 == 0 else CONTROL, body)
 
     try:
-        with driving(rig.operator, 0.5, key=key) as sent:
+        with driving(rig.operator, 0.5, key=key) as driver:
             assert until(lambda: lines(rig, 0.5), 5)
             with beside(flood, ending):
-                began, before = time.monotonic(), len(sent)
+                began, before = time.monotonic(), len(driver.sent_at)
                 assert until(lambda: time.monotonic() > began + FLOOD_S, FLOOD_S + 5)
-                asked = len(sent) - before
+                asked = len(driver.sent_at) - before
             assert until(lambda: len(lines(rig, 0.5, began)) >= LEAST * asked, 2), (len(lines(rig, 0.5, began)), asked)
         gap_s = max(after - line for line, after in itertools.pairwise(lines(rig, 0.5, began)))
         print(f"{rig.kind}: {len(lines(rig, 0.5, began))} lines of {asked} commands, gap {gap_s:.3f} s")  # noqa: T201

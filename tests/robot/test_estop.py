@@ -2,31 +2,16 @@
 
 from __future__ import annotations
 
-import threading
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 
 import pytest
 
 from tests.commands.command_line import program
+from tests.robot.operator import driving
 from tests.robot.rig import BASE, STOP, Rig
-from tests.support import beside, until
+from tests.support import until
 
 pytestmark = pytest.mark.alone  # deadlines are checked
-
-
-@contextmanager
-def driven_by_operator(rig: Rig) -> Iterator[None]:
-    """Drive forward at 20 Hz, as a page does."""
-    ending = threading.Event()
-
-    def drive() -> None:
-        while not ending.wait(0.05):
-            rig.operator.send("incoming/drive-values", {"x": 0, "z": 0.5})
-
-    with beside(drive, ending):
-        yield
 
 
 def pebble(*arguments: object) -> tuple[int, str]:
@@ -39,7 +24,7 @@ def pebble(*arguments: object) -> tuple[int, str]:
 def test_a_stop_from_either_side_holds_over_restarts_until_its_reset(kind: str) -> None:
     with Rig(kind) as rig:
         remote = f"--url=mqtt://127.0.0.1:{rig.remote.port}"
-        with driven_by_operator(rig):
+        with driving(rig.operator, 0.5):
             assert until(rig.mcu.moving, 5)
             code, printed = pebble("estop", BASE, remote, "--why", "dog")
             stopped = time.monotonic()
@@ -54,7 +39,7 @@ def test_a_stop_from_either_side_holds_over_restarts_until_its_reset(kind: str) 
         code, printed = pebble("estop", "reset", rig.config)  # on the robot's own transport
         assert code == 0, printed
         rig.operator.send("incoming/drive-values", {"x": 0, "z": 0})  # without it the robot waits for half a second
-        with driven_by_operator(rig):
+        with driving(rig.operator, 0.5):
             assert until(rig.mcu.moving, 5)
             code, printed = pebble("estop", rig.config)
             assert code == 0, printed

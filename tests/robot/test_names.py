@@ -24,9 +24,8 @@ from pebble.transports import Message
 from tests.commands.test_drive import Console
 from tests.fleet.brokers import HOST
 from tests.robot.named import CONTROL, DRIVE, Hall, Named
-from tests.robot.operator import Operator
+from tests.robot.operator import Operator, driving
 from tests.robot.rig import BASE, STOP, lines
-from tests.robot.test_control import driving
 from tests.support import beside, cases, until
 
 pytestmark = pytest.mark.alone  # lines are counted
@@ -171,8 +170,8 @@ class _By:
     def __init__(self, rig: Named, name: str) -> None:
         self._rig, self._name = rig, name
 
-    def send(self, suffix: str, body: Any) -> None:
-        self._rig.send(self._name, suffix.removeprefix("incoming/"), body)
+    def send(self, suffix: str, body: Any, **options: Any) -> None:
+        self._rig.send(self._name, suffix.removeprefix("incoming/"), body, **options)
 
 
 # -- flags

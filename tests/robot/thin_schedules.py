@@ -150,7 +150,7 @@ class Program(Process):
 
 
 class Person(Program):
-    """Drives as often as the robot says, with the key of control if it has it."""
+    """Drives as often as the robot says, with the key of control if it has it, in virtual time."""
 
     def __init__(self, number: int, network: Network, commands: Commands) -> None:
         super().__init__(f"person-{number}", network, "outgoing/#")

@@ -6,8 +6,7 @@
 from __future__ import annotations
 
 from pebble.rig import testbed
-from pebble.rig.testbed import OUTLETS
-from pebble.simulation.trace import Entry, read_trace
+from pebble.simulation.trace import Entry
 
 
 class Stage(testbed.Stage):
@@ -22,11 +21,6 @@ class Stage(testbed.Stage):
     def turned_s(self, name: str, since_ns: int) -> float:
         """How long its motors have run since then, in seconds."""
         return sum(max(0, end - max(since_ns, begin)) for begin, end in self.motions(name)) / 1e9
-
-    def relays(self, name: str) -> list[str]:
-        """Every change of its outlets' relays, oldest first: "o1 on"."""
-        trace = self.robots[name].folder / f"{OUTLETS}.jsonl"
-        return [entry.line for entry in read_trace(trace) if entry.event == "relay"]
 
     def lines(self, name: str) -> list[Entry]:
         """What its MCU received, oldest first."""

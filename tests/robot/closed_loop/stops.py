@@ -10,6 +10,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
+from pebble.client.scripted_operator import paced
 from pebble.config import load
 from pebble.runtime.connections import local_transport
 from pebble.transports import QoS
@@ -19,7 +20,7 @@ from tests.robot.world_rig import STOP_TIMEOUT_S, WorldRig
 from tests.support import gone, until
 
 DRIVE = "incoming/drive-values"
-PERSON_S, PERIOD_S = 1.0, 0.05
+PERSON_S = 1.0
 _CRUISE = {"x": 0.0, "z": 0.3, "rate_hz": 20.0}
 _BACK = {"x": 0.0, "z": -0.4}
 _WHEELS_BACK = (-0.4, -0.4)
@@ -96,11 +97,9 @@ def overridden(rig: WorldRig, send: Callable[[dict[str, float]], object] | None 
     """A person drives for a second against a script that drives at 20 Hz."""
     send = send or (lambda body: rig.operator.send(DRIVE, body))
     rig.driving("cruise", _CRUISE)
-    began = due = time.monotonic()
-    while due < began + PERSON_S:
+    began = time.monotonic()
+    for _ in paced(PERSON_S):
         send(_BACK)
-        due += PERIOD_S
-        time.sleep(max(0.0, due - time.monotonic()))
     send({"x": 0, "z": 0})
     released = time.monotonic()
     assert until(lambda: any(speeds[0] > 0 for _, speeds in rig.mcu.drives(released)), 5), "the script did not resume"

@@ -22,7 +22,7 @@ _ENDS = ("release", "lost", "halt")
 
 
 class Person(Process):
-    """A page or a program of a person, on the network of the robot."""
+    """A page or a program of a person, on the network of the robot: in virtual time, and not always by the contract."""
 
     def __init__(self, name: str, network: Network, commands: Commands) -> None:
         super().__init__(name, network.scheduler)

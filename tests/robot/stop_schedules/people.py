@@ -38,7 +38,10 @@ def speed_of_run(run: int) -> float:
 
 
 class Driver:
-    """Repeats a drive command on a thread while told to; a person, or a script that goes on whatever happens."""
+    """Repeats a drive command on a thread while told to; a person, or a script that goes on whatever happens.
+
+    Unlike other drivers it falls silent without a zero, and writes down what it does.
+    """
 
     def __init__(self, port: int, robot: str, history: History) -> None:
         self.robot, self.history = robot, history

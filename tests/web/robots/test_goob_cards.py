@@ -1,4 +1,4 @@
-"""The cards of a robot at the whole Goob: what its MCU and its relays do, and what its sensors sent.
+"""The cards of a robot at the whole Goob: what its MCUs are told, and what its sensors sent.
 
 On a desktop and on a phone, where the cards are behind tabs. Clips and scripts are tested at a
 robot that records what it is asked (test_lights_sounds_scripts).
@@ -15,7 +15,10 @@ from typing import Any
 import pytest
 from playwright.sync_api import Browser
 
+from pebble.rig.testbed import LinuxRobot
 from pebble.transports import Message, MqttSettings, create
+from tests.kit.board import ScriptedMcu
+from tests.services.serial_mcu_bridge import mcu_wire
 from tests.web.console import Console, Wire, console
 from tests.web.stage import Stage
 
@@ -45,9 +48,43 @@ class Reports:
         self.received[message.topic.removeprefix(self._prefix)].append(json.loads(message.payload))
 
 
+class GoobWithOutlets(Stage):
+    """Goob with a microcontroller besides, which describes itself as a station of outlets."""
+
+    def __init__(self, station: ScriptedMcu) -> None:
+        super().__init__("goob", room=False)
+        self._station = station
+
+    def start_robots(self) -> None:
+        goob = self.robots["goob"]
+        assert isinstance(goob, LinuxRobot)
+        port = {"port": str(self._station.link)}
+        goob.instances["outlets"] = {"protocol": "pebble_serial_v1", "serial": port}
+        super().start_robots()
+
+
+def state_of(number: int, on: bytes = b"\0") -> bytes:
+    """Return the report of an outlet; the fourth one has no relay."""
+    return mcu_wire.frame(mcu_wire.STATE, b"\1\0\0" if number == 4 else b"\1\1" + on, 2 * number)
+
+
+def obey(command: mcu_wire.Received) -> bytes:
+    """Return what the station answers: it does what it is told, and reports so."""
+    done = mcu_wire.frame(mcu_wire.ACK, b"", command.interface, command.sequence)
+    return done + state_of((command.interface + 1) // 2, command.payload)
+
+
 @pytest.fixture(scope="module")
-def stage() -> Iterator[Stage]:
-    with Stage("goob", room=False) as running:
+def station(tmp_path_factory: pytest.TempPathFactory) -> Iterator[ScriptedMcu]:
+    with ScriptedMcu(tmp_path_factory.mktemp("station") / "port", mcu_wire.STATION, sends_hello=True) as running:
+        running.after_describing = b"".join(map(state_of, (1, 2, 3, 4)))
+        running.answers = obey
+        yield running
+
+
+@pytest.fixture(scope="module")
+def stage(station: ScriptedMcu) -> Iterator[Stage]:
+    with GoobWithOutlets(station) as running:
         yield running
 
 
@@ -100,19 +137,22 @@ def test_a_flag_is_retained_at_the_broker(goob: Console, stage: Stage, wire: Wir
 # -- outlets and microcontrollers
 
 
-def switched(goob: Console, *changes: str) -> bool:
-    """Whether these are the newest changes of the relays."""
-    return goob.tab.until(lambda: goob.stage.relays("goob")[-len(changes) :] == list(changes), _SWITCHES_S)
+def switched(goob: Console, station: ScriptedMcu, *commands: tuple[int, bytes]) -> bool:
+    """True if these are the newest commands of the station: interfaces and payloads."""
+    return goob.tab.until(
+        lambda: [(one.interface, one.payload) for one in station.commands()[-len(commands) :]] == list(commands),
+        _SWITCHES_S,
+    )
 
 
-def test_a_relay_is_switched_on_and_off(goob: Console) -> None:
+def test_a_relay_is_switched_on_and_off(goob: Console, station: ScriptedMcu) -> None:
     switch = goob.uncover("outlet-o1")
     switch.click()
-    assert switched(goob, "o1 on")
+    assert switched(goob, station, (1, b"\1"))
     assert goob.tab.until(lambda: switch.get_attribute("aria-checked") == "true")
     assert goob.test("outlet-asked-o1").count() == 0
     switch.click()
-    assert switched(goob, "o1 on", "o1 off")
+    assert switched(goob, station, (1, b"\1"), (1, b"\0"))
     assert goob.tab.until(lambda: goob.test("outlet-state-o1").inner_text() == "off")
 
 
@@ -124,12 +164,12 @@ def test_an_unreachable_outlet_has_its_reason(goob: Console) -> None:
     assert why.inner_text() == "outlet is unreachable"
 
 
-def test_a_generated_form_reaches_the_microcontroller(goob: Console) -> None:
+def test_a_generated_form_reaches_the_microcontroller(goob: Console, station: ScriptedMcu) -> None:
     field, state = goob.uncover("mcu-in-o2_set").locator('[data-test="field-on"]'), goob.test("outlet-state-o2")
-    for switch, word in ((field.check, "on"), (field.uncheck, "off")):
+    for switch, payload, word in ((field.check, b"\1", "on"), (field.uncheck, b"\0", "off")):
         switch()
         goob.test("send-o2_set").click()
-        assert switched(goob, f"o2 {word}")
+        assert switched(goob, station, (3, payload))
         assert goob.tab.until(lambda word=word: state.inner_text() == word)  # type: ignore[misc]
 
 
