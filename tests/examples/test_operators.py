@@ -1,4 +1,4 @@
-"""What the samples of an operator owe besides the checks of ``pebble conform --operator``."""
+"""What the samples of an operator do when their person leaves."""
 
 from __future__ import annotations
 
