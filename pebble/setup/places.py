@@ -7,18 +7,13 @@ from pathlib import Path
 
 @dataclass(frozen=True)
 class Places:
-    """The paths of an installed robot. ``root`` is ``/``, or a folder that stands for it in tests and dry runs."""
+    """The paths of an installed robot. ``root`` is ``/``, or a folder that stands for it in tests and reports."""
 
     root: Path = Path("/")
 
-    @property
-    def is_live(self) -> bool:
-        """Whether it is the system that runs, of which services can be started."""
-        return self.root == Path("/")
-
     @cached_property
     def etc(self) -> Path:
-        """Config, passwords, certificates and the manifest: ``root:pebble``, files 0640."""
+        """Config, passwords and certificates: ``root:pebble``, files 0640."""
         return self.root / "etc/pebble"
 
     @cached_property
@@ -26,8 +21,13 @@ class Places:
         return self.etc / "robot.json"
 
     @cached_property
+    def unfinished(self) -> Path:
+        """There while setup runs: what reads its files may not have been started anew. No backup has it."""
+        return self.etc / "setup.new"
+
+    @cached_property
     def manifest(self) -> Path:
-        """What ``pebble setup`` was answered, and the SHA-256 of each file that it wrote."""
+        """What the setup of version 0.1.0 had written; nothing reads it now."""
         return self.etc / "setup.json"
 
     @cached_property
@@ -71,5 +71,5 @@ class Places:
         return self.state / "people.sqlite"
 
     def named(self, path: Path) -> str:
-        """The path as it is on the machine whose root this is."""
+        """Return the path as it is on the machine whose root this is."""
         return f"/{path.relative_to(self.root)}"
