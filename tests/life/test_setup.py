@@ -1,4 +1,4 @@
-"""From a package and a file of answers to a robot with heartbeats, and a page on which its user logs in."""
+"""From a package and a file of answers to a robot with heartbeats and a page; and from its backup to it again."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ print(ask("/"), ask("/api/login", {{"user": "ann", "password": "{PASSWORD}"}}))
 """
 
 
-SETUP = ("pebble", "setup", "--answers", "/srv/answers.json", "--yes")
+SETUP = ("pebble", "setup", "--answers", "/srv/answers.json")
 #: What a person types on a robot, with which outputs go to others.
 COMMANDS = (
     ("pebble", "doctor", "/etc/pebble/robot.json", "--running"),
@@ -44,6 +44,13 @@ COMMANDS = (
     ("pebble", "setup", "--backup", "/srv/goob.tar"),
     ("pebble", "web", "user", "list"),
     ("systemctl", "restart", "pebble.service"),
+)
+#: Everything but what the robot writes while it runs.
+OWNERS = "find /etc/pebble /etc/mosquitto /var/lib/pebble/people.sqlite -not -type l -printf '%u:%g %m %p\n' | sort"
+BLANK = (
+    "systemctl disable --now pebble; systemctl stop mosquitto;"
+    "rm -r /etc/pebble /var/lib/pebble /etc/mosquitto/pebble /etc/mosquitto/conf.d/pebble.conf;"
+    "systemd-tmpfiles --create pebble.conf"
 )
 
 
@@ -67,7 +74,12 @@ def test_package_and_setup_make_a_robot_with_heartbeats_and_let_its_user_in(mach
         shown = [done, *(machine.run(*command, check=False, timeout=300) for command in COMMANDS)]
         assert machine.succeeds(*receives)
         again = machine.run(*SETUP, timeout=300)
-        assert " new " not in again
+        assert "All is so already." in again
+        before = machine.sh(OWNERS)
+        machine.sh(BLANK)
+        shown.append(machine.run("pebble", "setup", "--from", "/srv/goob.tar", timeout=300))
+        assert machine.succeeds(*receives), "the backup is the same robot"
+        assert machine.sh(OWNERS) == before
         machine.run("env", "PLANTED=in-an-environment", "sleep", "1.5")
     texts = [*seen, *map(str.encode, shown), machine.run("journalctl", "--output=export").encode()]
     secrets = secrets_of(Places(machine.root), None, [machine.root / "srv/password"])
