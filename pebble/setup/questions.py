@@ -17,7 +17,6 @@ from pebble.setup import detect
 from pebble.setup.answers import HERE, NONE, AnswersError, needs_login, needs_user
 from pebble.setup.steps import Job
 
-_TRIES = 3  # for an answer that cannot be
 _Given = dict[str, Any]
 
 
@@ -36,23 +35,20 @@ def say(text: str, indent: int = 0) -> None:
 
 
 def asked(job: Job) -> Job:
-    """Return the job with the answers of the person at the terminal. Raises AnswersError after three wrong ones."""
+    """Return the job with the answers of the person at the terminal; a wrong one is asked again."""
     first = [] if job.config is not None else [_ask_name]
     for number, ask in enumerate([*first, _ask_board, _ask_camera, _ask_broker, _ask_page], start=1):
-        job = _tried(job, number, ask)
+        job = _answered(job, number, ask)
     return _with_passwords(job)
 
 
-def _tried(job: Job, number: int, ask: Callable[[Job, str], _Given]) -> Job:
-    for remaining in reversed(range(_TRIES)):
+def _answered(job: Job, number: int, ask: Callable[[Job, str], _Given]) -> Job:
+    while True:
         try:
             return job.with_answers(ask(job, f"{number}."))
         except AnswersError as error:
-            if not remaining:
-                raise
             for line in str(error).splitlines():
                 say(line, 3)
-    raise AssertionError
 
 
 def _ask(question: str) -> None:
@@ -128,9 +124,12 @@ def _ask_page(job: Job, number: str) -> _Given:
 def _with_passwords(job: Job) -> Job:
     """Ask for those that are needed."""
     answers, secrets = job.answers, job.secrets
-    if needs_login(answers) and not job.has_login:
-        text = f"   Password of {answers.account} at the broker"
-        secrets = replace(secrets, broker_password=str(typer.prompt(text, hide_input=True)))
+    if needs_login(answers):
+        text, default = f"   Password of {answers.account} at the broker", None
+        if job.has_login:
+            text, default = f"{text} (empty: as before)", ""
+        typed = str(typer.prompt(text, default=default, show_default=False, hide_input=True))
+        secrets = replace(secrets, broker_password=typed or None)
     if needs_user(answers, has_people=bool(answers.page) and has_user(job.people)):
         text = f"   Password of {answers.user}"
         typed = str(typer.prompt(text, hide_input=True, confirmation_prompt="   Again"))

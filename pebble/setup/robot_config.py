@@ -1,6 +1,5 @@
 """The config that follows from answers, and the answers that follow from a config."""
 
-import json
 import os
 from pathlib import Path
 from typing import Any
@@ -58,10 +57,6 @@ def changed(current: dict[str, Any], before: dict[str, Any], after: dict[str, An
         elif here == old:
             result.pop(key, None)
     return result
-
-
-def content_of(config: dict[str, Any]) -> bytes:
-    return json.dumps(config, indent=1).encode() + b"\n"
 
 
 def config_of(answers: Answers, places: Places) -> dict[str, Any]:

@@ -44,7 +44,7 @@ def set_up(system: System, answers_file: Path | None, backup_file: Path | None) 
         job = asked(job)
     job.require()
     steps = job.left()
-    typer.echo("\nThis is done:" if steps else "\nAll is so already.")
+    typer.echo(f"\nThis {'will be' if asks else 'is'} done:" if steps else "\nAll is so already.")
     for step in steps:
         say(step.what, 2)
     if asks and steps:

@@ -1,5 +1,6 @@
 """What makes a robot of a machine, in order. Each step is looked at first, and done only where it is not so yet."""
 
+import json
 import os
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import closing
@@ -7,8 +8,6 @@ from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
-
-import msgspec
 
 from pebble.client.page.from_config import people_of
 from pebble.config import Config, load
@@ -32,9 +31,8 @@ from pebble.setup.robot_config import (
     answers_of,
     changed,
     config_of,
-    content_of,
 )
-from pebble.setup.system import MOSQUITTO, ROBOT, ROBOTS, SetupError, System
+from pebble.setup.system import MOSQUITTO, ROBOTS, SetupError, System
 
 ROBOT_SERVICE, BROKER_SERVICE = UNIT, "mosquitto.service"
 
@@ -78,9 +76,13 @@ class Job:
         return self.config is not None and self.answers.broker == self.earlier.broker
 
     @property
+    def page(self) -> Config | None:
+        """The config, if the robot serves its page already."""
+        return self.config if self.config is not None and self.config.services.web_handler.enabled else None
+
+    @property
     def people(self) -> Path:
-        has_page = self.config is not None and self.config.services.web_handler.enabled
-        return people_of(self.config) if self.config is not None and has_page else self.places.people
+        return self.places.people if self.page is None else people_of(self.page)
 
     def with_answers(self, given: Mapping[str, Any], secrets: Secrets | None = None) -> "Job":
         """Return the same with further answers. Raises AnswersError with a line for each mistake."""
@@ -99,8 +101,7 @@ class Job:
 
     def steps(self) -> list[Step]:
         """All of them, in their order: the config is written when all that it names is there."""
-        steps = [self._folder(self.places.etc, 0o750, ROBOTS), self._folder(self.places.state, 0o700, ROBOT)]
-        steps += [*self._passwords(), *(self._own_broker() if self.answers.broker == HERE else self._other_broker())]
+        steps = [*self._passwords(), *(self._own_broker() if self.answers.broker == HERE else self._other_broker())]
         if self.answers.page:
             steps += [*self._certificate(), *self._first_user()]
         steps.append(self._config())
@@ -111,20 +112,14 @@ class Job:
             steps.append(Step(what, lambda: False, self.places.manifest.unlink, ()))
         return steps
 
-    def _folder(self, folder: Path, mode: int, owner: str) -> Step:
-        """A folder that the package makes; without it the steps after this one could not write."""
-        what = f"folder {self.places.named(folder)}"
-        return Step(what, folder.is_dir, lambda: self.system.make_folder(folder, mode, owner), ())
-
     def _passwords(self) -> Iterator[Step]:
         file, page = self.places.etc / BROKER_PASSWORD, self.places.etc / PAGE_PASSWORD
         given = self.secrets.broker_password
         if given is not None and self.answers.broker != HERE:
             yield self._file("password of the robot at its broker", file, f"{given}\n".encode())
         if self.answers.broker == HERE:
-            yield self._new_password(
-                "password of the robot at its own broker", file, known=self.config is None or self.has_login
-            )
+            known = self.config is None or self.has_login
+            yield self._new_password("password of the robot at its own broker", file, known=known)
             if self.answers.page:
                 yield self._new_password("password of the page at the robot's broker", page)
 
@@ -171,24 +166,24 @@ class Job:
         own = self.places.broker
         if own.exists():
             yield Step("the robot's own broker ends", lambda: False, own.unlink, (BROKER_SERVICE,))
-        if self.answers.broker_ca is not None:
-            given, file = Path(self.answers.broker_ca), self.places.etc / BROKER_CA
-            try:
-                content = given.read_bytes()
-            except OSError as error:
-                raise SetupError(f"broker_ca: {given}: {error.strerror}") from None
-            if self.answers.broker_ca != self.earlier.broker_ca:
-                yield self._file("authority of the broker", file, content)
+        if self.answers.broker_ca in (None, self.earlier.broker_ca):
+            return
+        given = Path(str(self.answers.broker_ca))
+        try:
+            content = given.read_bytes()
+        except OSError as error:
+            raise SetupError(f"broker_ca: {given}: {error.strerror}") from None
+        yield self._file("authority of the broker", self.places.etc / BROKER_CA, content)
 
     def _certificate(self) -> Iterator[Step]:
-        if self.config is not None and self.config.web_interface.tls.certificate is not None:
-            return
+        tls = self.places.tls
+        if self.page is not None and self.page.web_interface.tls.certificate != tls / certificates.SERVER_CERT:
+            return  # it has another one
 
         def fill(new: Path) -> None:
             certificates.init(new, certificates.own_names())
             (new / certificates.SERVER_KEY).chmod(0o640)  # the robot reads it; only root signs others
 
-        tls = self.places.tls
         yield Step("certificate of the page", tls.is_dir, lambda: self.system.make_folder(tls, 0o750, ROBOTS, fill))
 
     def _first_user(self) -> Iterator[Step]:
@@ -204,7 +199,7 @@ class Job:
 
     def _config(self) -> Step:
         file, wanted = self.places.config, config_of(self.answers, self.places)
-        current = msgspec.json.decode(file.read_bytes()) if self.config is not None else {}
+        current = json.loads(file.read_bytes()) if self.config is not None else {}
         before = config_of(self.earlier, self.places) if self.config is not None else {}
         content = changed(current, before, wanted)
 
@@ -212,7 +207,7 @@ class Job:
             check_connections(parse(content, folder=self.places.etc, env=os.environ))
             if self.config is not None:
                 self.system.write(file.with_name(f"{file.name}.before"), file.read_bytes())
-            self.system.write(file, content_of(content))
+            self.system.write(file, json.dumps(content, indent=1).encode() + b"\n")
 
         return Step(f"config {self.places.named(file)}", lambda: file.exists() and content == current, write)
 
@@ -238,7 +233,7 @@ class Job:
             services |= {ROBOT_SERVICE, *([BROKER_SERVICE] if self.answers.broker == HERE else [])}
         try:
             for step in steps:
-                if self.places.etc.is_dir() and not unfinished.exists():
+                if not unfinished.exists():
                     self.system.write(unfinished, b"")
                 step.do()
             for service in (BROKER_SERVICE, ROBOT_SERVICE):

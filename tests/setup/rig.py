@@ -36,13 +36,13 @@ _WRITES = {"os.rename", "os.mkdir", "os.remove", "os.rmdir", "os.chmod", "os.sym
 
 
 def machine_root(folder: Path) -> Path:
-    """A machine with mosquitto and polkit, by the files that setup looks for."""
+    """A machine with our package, mosquitto and polkit, by the files that setup looks for."""
     root = folder / "root"
     for name in ("usr/sbin/mosquitto", "usr/lib/polkit-1/polkitd", "etc/mosquitto/mosquitto.conf"):
         (root / name).parent.mkdir(parents=True, exist_ok=True)
         (root / name).touch()
-    (root / "etc/mosquitto/conf.d").mkdir()
-    (root / "var/lib").mkdir(parents=True)
+    for name in ("etc/mosquitto/conf.d", "etc/pebble", "var/lib/pebble"):
+        (root / name).mkdir(parents=True)
     return root
 
 

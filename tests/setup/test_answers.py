@@ -13,7 +13,7 @@ import pytest
 from pebble.setup.places import Places
 from tests.commands.command_line import Run
 from tests.kit.terminal import Terminal
-from tests.setup.rig import ANSWERS, PASSWORD, answers_in, set_up, tree
+from tests.setup.rig import ANSWERS, BROKER_PASSWORD, PASSWORD, answers_in, set_up, tree
 from tests.support import ROOT
 
 FAR = ANSWERS | {"broker": "broker.lab:8884", "broker_user": "goob"}
@@ -84,7 +84,7 @@ def test_a_wrong_answer_is_one_line_and_nothing_is_written(
 def test_options_that_lead_nowhere(line: tuple[str, ...], message: str, root: Path, run: Run) -> None:
     assert run("setup", *line) in (1, 2)
     assert message in run.err
-    assert not Places(root).etc.exists()
+    assert not any(Places(root).etc.iterdir())
 
 
 def test_a_robot_keeps_its_name_where_the_answers_are_of_another_one(root: Path, tmp_path: Path, run: Run) -> None:
@@ -99,7 +99,7 @@ def test_without_mosquitto_there_is_no_broker_here(root: Path, tmp_path: Path, r
     (root / "usr/sbin/mosquitto").unlink()
     assert run("setup", "--answers", answers_in(tmp_path)) == 2
     assert run.err == "pebble: broker: mosquitto is not installed: sudo apt install mosquitto, then sudo pebble setup\n"
-    assert not Places(root).etc.exists()
+    assert not any(Places(root).etc.iterdir())
 
 
 def terminal(root: Path) -> Terminal:
@@ -134,6 +134,21 @@ def test_six_questions_in_a_terminal(root: Path) -> None:
     assert [line for line in shown.splitlines() if len(line) > 60 and " " in line.strip()] == []
     assert len(re.findall(r"Open\s+https://", shown)) == 1
     assert json.loads(Places(root).config.read_text())["robot"]["id"] == "goob"
+
+
+def test_a_login_that_the_broker_refused_is_asked_again(root: Path, tmp_path: Path) -> None:
+    set_up(root, broker="127.0.0.1:9", broker_user="goob", port="none")
+    password = Places(root).etc / "broker.password"
+    for typed, left in (("", BROKER_PASSWORD), ("another", "another")):
+        asking = terminal(root)
+        for prompt in ("answer [none]", "answer [synthetic]", "[:PORT] [127.0.0.1:9]", "Page [Y/n]"):
+            asking.answers(prompt, "")
+        asking.answers("goob at the broker (empty: as before): ", typed)
+        if typed:
+            asking.answers("Do it?", "")
+        asking.ends()
+        assert "the broker 127.0.0.1:9 does not" in " ".join(asking.shown.split())
+        assert password.read_text() == f"{left}\n"
 
 
 def test_asked_again_each_answer_of_now_is_one_key_away(root: Path) -> None:

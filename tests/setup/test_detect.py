@@ -87,7 +87,7 @@ def test_a_broker_with_listeners_of_its_own_is_left_alone(name: str, root: Path)
 
 def test_what_a_machine_lacks_is_named_with_what_to_type(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (root / "usr/lib/polkit-1/polkitd").unlink()
-    monkeypatch.setattr(detect.time, "time", lambda: 0.0)
+    monkeypatch.setattr("time.time", lambda: 0.0)
     monkeypatch.setattr(detect, "_has_network", lambda: False)
     assert list(detect.lacks(Places(root))) == [
         detect.NO_POLKIT,

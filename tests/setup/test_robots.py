@@ -174,7 +174,6 @@ def test_a_machine_with_other_files_takes_no_backup(
     assert run("setup", "--backup", tmp_path / "goob.tar") == 0
     other = machine_root(tmp_path / "other")
     at(other, monkeypatch)
-    (other / name).parent.mkdir(parents=True)
     (other / name).write_text("{}")
     before = tree(other)
     assert run("setup", "--from", tmp_path / "goob.tar") == 1

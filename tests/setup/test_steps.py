@@ -128,8 +128,8 @@ def test_what_version_0_1_0_had_written_is_removed_with_one_line(root: Path) -> 
 
 
 def test_a_disk_that_takes_nothing_is_one_line(root: Path) -> None:
-    places = Places(root)
-    places.state.symlink_to("/dev/full")
+    Places(root).state.rmdir()
+    Places(root).state.symlink_to("/dev/full")
     with pytest.raises(SetupError, match=r"\A[^\n]+; what was done until then stays, and sudo pebble setup goes on "):
         set_up(root)
 
