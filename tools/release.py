@@ -100,8 +100,8 @@ def package(source: Path, version: str, release: list[Path], into: Path) -> Path
         target.parent.mkdir(parents=True, exist_ok=True)
         shutil.copyfile(path, target)
         target.chmod(mode)
-    help_ = subprocess.run([sys.executable, "-m", "pebble.cli", "--help"], cwd=source, stdout=subprocess.PIPE, check=True)
-    (tree / HELP).write_bytes(help_.stdout)
+    command = [sys.executable, "-m", "pebble.cli", "--help"]
+    (tree / HELP).write_bytes(subprocess.run(command, cwd=source, stdout=subprocess.PIPE, check=True).stdout)
     (tree / "usr/sbin").mkdir()
     (tree / "usr/sbin/pebble-slot").symlink_to("../lib/pebble/pebble-slot")
     installed = sorted(

@@ -259,10 +259,10 @@ def _exists(name: str) -> PeopleError:
 
 
 def has_user(path: Path, name: str = "") -> bool:
-    """Return True if the database knows this person, or without a name anybody; writes nothing. Raises DatabaseError."""
+    """Return True if the database knows this person, or without a name anybody. Raises DatabaseError."""
     if not path.exists():
         return False
-    # what is in a write-ahead log is read, too, which needs a file of SQLite's that only then is there
+    # Writes nothing. What is in a write-ahead log is read, too, which needs a file of SQLite's that only then is there
     unchanged = "" if path.with_name(f"{path.name}-wal").exists() else "&immutable=1"
     try:
         with closing(sqlite3.connect(f"{path.absolute().as_uri()}?mode=ro{unchanged}", uri=True)) as connection:

@@ -120,7 +120,7 @@ def cameras(devices: Path) -> Iterator[str]:
 
 
 def lacks(places: Places) -> Iterator[str]:
-    """What keeps no step from being done, with what ends it."""
+    """Yield what the robot has to do without, and what to type for it."""
     if not any((places.root / path).exists() for path in _POLKIT):
         yield NO_POLKIT
     found = clock(time.time(), synchronised())

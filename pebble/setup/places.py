@@ -1,4 +1,4 @@
-"""Where an installed robot has its files, below ``/`` or below another root."""
+"""The places of an installed robot's files, below ``/`` or below another root."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -22,17 +22,17 @@ class Places:
 
     @cached_property
     def unfinished(self) -> Path:
-        """There while setup runs: what reads its files may not have been started anew. No backup has it."""
+        """A mark while setup runs: programs that read its files were not yet started anew. No backup has it."""
         return self.etc / "setup.new"
 
     @cached_property
     def manifest(self) -> Path:
-        """What the setup of version 0.1.0 had written; nothing reads it now."""
+        """A list of an earlier setup, which nothing reads now."""
         return self.etc / "setup.json"
 
     @cached_property
     def state(self) -> Path:
-        """What survives a power cut, the stop among it: ``pebble:pebble``, 0700. ``$STATE_DIRECTORY`` of the unit."""
+        """The stop, and all that survives a power cut: ``pebble:pebble``, 0700. ``$STATE_DIRECTORY`` of the unit."""
         return self.root / "var/lib/pebble"
 
     @cached_property
@@ -52,7 +52,7 @@ class Places:
 
     @cached_property
     def broker(self) -> Path:
-        """The part of mosquitto's configuration that is ours."""
+        """Our part of mosquitto's configuration."""
         return self.root / "etc/mosquitto/conf.d/pebble.conf"
 
     @cached_property
@@ -67,7 +67,7 @@ class Places:
 
     @cached_property
     def people(self) -> Path:
-        """Who may use the robot's page. It keeps its name when the robot gets another."""
+        """The users of the robot's page. The file keeps its name when the robot gets another."""
         return self.state / "people.sqlite"
 
     def named(self, path: Path) -> str:

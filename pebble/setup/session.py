@@ -65,7 +65,7 @@ def set_up(system: System, answers_file: Path | None, backup_file: Path | None) 
 
 
 def _failures(job: Job, *, is_started: bool) -> Iterator[str]:
-    """What keeps the robot from being driven, with what ends it."""
+    """Yield what keeps the robot from being driven; a robot that was started tests itself."""
     places = job.places
     if not job.system.has_systemd:
         yield f"systemd does not run here, so nothing starts the robot: pebble up {places.config}"

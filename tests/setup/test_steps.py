@@ -118,7 +118,7 @@ def test_the_own_broker_ends_with_another_answer_and_comes_back(root: Path) -> N
     assert set_up(root) == []
 
 
-def test_what_version_0_1_0_had_written_is_removed_with_one_line(root: Path) -> None:
+def test_what_an_earlier_setup_had_written_is_removed_with_one_line(root: Path) -> None:
     set_up(root)
     places = Places(root)
     places.manifest.write_text('{"format": 1, "answers": {"id": "goob"}}')
