@@ -266,6 +266,8 @@ def has_user(path: Path, name: str = "") -> bool:
     unchanged = "" if path.with_name(f"{path.name}-wal").exists() else "&immutable=1"
     try:
         with closing(sqlite3.connect(f"{path.absolute().as_uri()}?mode=ro{unchanged}", uri=True)) as connection:
+            if not connection.execute("SELECT 1 FROM sqlite_master WHERE name = 'people'").fetchall():
+                return False  # the program that made it was killed
             return bool(connection.execute("SELECT 1 FROM people WHERE ? IN (name, '')", (name,)).fetchall())
     except sqlite3.Error as error:
         raise DatabaseError(path, error) from None

@@ -17,7 +17,7 @@ from tests.commands.command_line import Run
 from tests.setup.rig import ANSWERS, PASSWORD, answers_in, in_child, machine_root, set_up, tree
 from tests.support import cases
 
-_MOMENTS = cases(6, 40)
+_MOMENTS = cases(6, 110)
 RESTARTS = ["systemctl restart mosquitto.service", "systemctl restart pebble.service"]
 
 
