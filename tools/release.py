@@ -25,6 +25,7 @@ from typing import Any
 ROOT = Path(__file__).resolve().parent.parent
 INTO = ROOT / "build" / "release"
 SHARED = "usr/share/pebble/release"  # below the root of a robot: its first release
+HELP = "usr/share/pebble/help"  # what `pebble --help` prints while there is no slot
 UNITS = "usr/lib/systemd/system"
 #: The Debian package: where each file of the checkout goes, and its mode.
 PACKAGE = (
@@ -34,6 +35,7 @@ PACKAGE = (
     ("configs/debian/slot.conf", f"{UNITS}/pebble.service.d/slot.conf", 0o644),
     ("configs/debian/pebble-slot.service", f"{UNITS}/pebble-slot.service", 0o644),
     ("configs/debian/sysusers.conf", "usr/lib/sysusers.d/pebble.conf", 0o644),
+    ("configs/debian/tmpfiles.conf", "usr/lib/tmpfiles.d/pebble.conf", 0o644),
     ("configs/systemd/50-pebble.rules", "usr/share/polkit-1/rules.d/50-pebble.rules", 0o644),
     ("configs/completion/pebble", "usr/share/bash-completion/completions/pebble", 0o644),
     ("configs/completion/_pebble", "usr/share/zsh/vendor-completions/_pebble", 0o644),
@@ -98,6 +100,8 @@ def package(source: Path, version: str, release: list[Path], into: Path) -> Path
         target.parent.mkdir(parents=True, exist_ok=True)
         shutil.copyfile(path, target)
         target.chmod(mode)
+    command = [sys.executable, "-m", "pebble.cli", "--help"]
+    (tree / HELP).write_bytes(subprocess.run(command, cwd=source, stdout=subprocess.PIPE, check=True).stdout)
     (tree / "usr/sbin").mkdir()
     (tree / "usr/sbin/pebble-slot").symlink_to("../lib/pebble/pebble-slot")
     installed = sorted(

@@ -4,8 +4,8 @@ from pathlib import Path
 
 import typer
 
+from pebble.runtime.places import Places
 from pebble.setup import backup as backups
-from pebble.setup.places import Places
 
 
 def backup(file: Path, places: Places) -> int:

@@ -16,8 +16,8 @@ from pebble.config import load
 from pebble.config.text_files import password
 from pebble.errors import PebbleError
 from pebble.runtime.environment import withhold
+from pebble.runtime.places import Places
 from pebble.runtime.signals import interrupted_by_signals
-from pebble.setup.places import Places
 from pebble.transports import MqttSettings
 from pebble.transports.topics import check_topic
 

@@ -258,15 +258,17 @@ def _exists(name: str) -> PeopleError:
     return PeopleError(f"{name} exists already: change the password or the role, or remove {name}")
 
 
-def has_user(path: Path, name: str) -> bool:
-    """Whether the database knows this person; writes nothing. Raises DatabaseError."""
+def has_user(path: Path, name: str = "") -> bool:
+    """Return True if the database knows this person, or without a name anybody. Raises DatabaseError."""
     if not path.exists():
         return False
-    # what is in a write-ahead log is read, too, which needs a file of SQLite's that only then is there
+    # Writes nothing. What is in a write-ahead log is read, too, which needs a file of SQLite's that only then is there
     unchanged = "" if path.with_name(f"{path.name}-wal").exists() else "&immutable=1"
     try:
         with closing(sqlite3.connect(f"{path.absolute().as_uri()}?mode=ro{unchanged}", uri=True)) as connection:
-            return bool(connection.execute("SELECT 1 FROM people WHERE name = ?", (name,)).fetchall())
+            if not connection.execute("SELECT 1 FROM sqlite_master WHERE name = 'people'").fetchall():
+                return False  # the program that made it was killed
+            return bool(connection.execute("SELECT 1 FROM people WHERE ? IN (name, '')", (name,)).fetchall())
     except sqlite3.Error as error:
         raise DatabaseError(path, error) from None
 

@@ -1,1 +1,1 @@
-"""From a blank machine to a robot that runs: questions, steps, and the manifest that undoes them."""
+"""From an installed package to a robot that runs: questions, one config, credentials, a unit; backups of all that."""

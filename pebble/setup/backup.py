@@ -1,4 +1,4 @@
-"""What a new machine needs to be this robot, as one tar file: made, and read again.
+"""Packs what a new machine needs to be this robot into one tar file, and reads it again.
 
 The first member is ``backup.json``, an :class:`About`; the others are files at their paths below the root, without the
 leading slash. Recordings are not in it.
@@ -26,7 +26,7 @@ from pebble.config import Config, load
 from pebble.config.types import Section
 from pebble.errors import PebbleError
 from pebble.fleet.folder import FLEET
-from pebble.setup.places import Places
+from pebble.runtime.places import Places
 from pebble.version import __version__
 
 FORMAT = 1
@@ -77,7 +77,7 @@ class Backup:
 
     @property
     def bytes(self) -> int:
-        return sum(len(one.content) for one in self.files.values())
+        return sum(len(saved.content) for saved in self.files.values())
 
 
 # -- making one
@@ -103,7 +103,7 @@ def make(places: Places) -> Backup:
 
 
 def _files(places: Places, config: Config) -> Iterator[Path]:
-    """What the robot cannot be made from again. A file that another one names may be anywhere."""
+    """Yield what the robot cannot be made from again. A file that another one names may be anywhere."""
     without = [_here(places, folder) for _, folder in _left_out(config)]
     for folder in (places.etc, places.state, _here(places, config.state_dir())):
         yield from _below(folder, without)
@@ -119,7 +119,7 @@ def _files(places: Places, config: Config) -> Iterator[Path]:
 
 
 def _here(places: Places, path: Path) -> Path:
-    """Where a path of the robot is below the root."""
+    """Return where a path of the robot is below the root."""
     path = Path(os.path.normpath(path.absolute()))  # a config may name it by ../..
     return path if path.is_relative_to(places.root) else places.root / path.relative_to("/")
 
@@ -133,19 +133,19 @@ def _left_out(config: Config) -> Iterator[tuple[str, Path]]:
         yield "sounds", sounds
 
 
-def _below(folder: Path, without: Iterable[Path]) -> Iterator[Path]:
-    for path in sorted(folder.rglob("*")):
-        if path.is_file() and not any(path.is_relative_to(one) for one in without):
+def _below(place: Path, without: Iterable[Path]) -> Iterator[Path]:
+    for path in sorted(place.rglob("*")):
+        if path.is_file() and not any(path.is_relative_to(folder) for folder in without):
             yield path
 
 
 def _of_config(value: object) -> Iterator[Path]:
-    """The files that a config names, such as certificates."""
+    """Yield the files that a config names, such as certificates."""
     if isinstance(value, Path):
         yield value
     elif isinstance(value, Section):
-        for one in fields(value):
-            yield from _of_config(getattr(value, one.name))
+        for field_ in fields(value):
+            yield from _of_config(getattr(value, field_.name))
     elif isinstance(value, dict):
         for item in value.values():
             yield from _of_config(item)
@@ -171,7 +171,7 @@ def _add(backup: Backup, root: Path, file: Path) -> None:
 
 
 def _database(file: Path) -> bytes:
-    """A database as it is between two changes, by SQLite's own backup. Raises BackupError for a damaged one."""
+    """Return a database as it is between two changes, by SQLite's own backup. Raises BackupError for a damaged one."""
     try:
         with (
             closing(sqlite3.connect(f"file:{file}?mode=ro", uri=True)) as there,
@@ -187,15 +187,15 @@ def _database(file: Path) -> bytes:
 
 
 def packed(backup: Backup) -> bytes:
-    """The tar file."""
+    """Return the tar file."""
     output = io.BytesIO()
     about = Saved(msgspec.json.format(msgspec.json.encode(backup.about)) + b"\n", 0o600)
     with tarfile.open(None, "w", output, format=tarfile.PAX_FORMAT) as tar:
-        for name, one in {ABOUT: about, **dict(sorted(backup.files.items()))}.items():
+        for name, saved in {ABOUT: about, **dict(sorted(backup.files.items()))}.items():
             member = tarfile.TarInfo(name)
-            member.size, member.mode, member.mtime = len(one.content), one.mode, int(time.time())
-            member.pax_headers = {} if name == ABOUT else {_SHA256: hashlib.sha256(one.content).hexdigest()}
-            tar.addfile(member, io.BytesIO(one.content))
+            member.size, member.mode, member.mtime = len(saved.content), saved.mode, int(time.time())
+            member.pax_headers = {} if name == ABOUT else {_SHA256: hashlib.sha256(saved.content).hexdigest()}
+            tar.addfile(member, io.BytesIO(saved.content))
     return output.getvalue()
 
 
@@ -214,7 +214,7 @@ def read(file: Path) -> Backup:
 
 
 def unpacked(raw: bytes, name: str) -> Backup:
-    """The same from the content of the file called ``name``."""
+    """Read the same from the content of the file called ``name``."""
     try:
         with tarfile.open(fileobj=io.BytesIO(raw), mode="r:") as tar:
             members = iter(tar)
@@ -245,7 +245,7 @@ def _about(tar: tarfile.TarFile, member: tarfile.TarInfo | None, name: str) -> A
 
 
 def _path(member: tarfile.TarInfo, backup: Backup, name: str) -> str:
-    """The path of a member, which nothing outside the root can be written by."""
+    """Return the path of a member, by which nothing outside the root can be written."""
     path = PurePosixPath(member.name)
     if not member.isfile() or path.is_absolute() or ".." in path.parts or str(path) != member.name:
         raise BackupError(f"{name}: {member.name!r} is not what a backup has: it was changed, or is of another program")
@@ -255,7 +255,7 @@ def _path(member: tarfile.TarInfo, backup: Backup, name: str) -> str:
 
 
 def _content(tar: tarfile.TarFile, member: tarfile.TarInfo) -> bytes:
-    """Raises EOFError where it is cut off, or is not what it was."""
+    """Return what is in a file. Raises EOFError where it is cut off, or is not what it was."""
     opened = tar.extractfile(member)
     content = b"" if opened is None else opened.read()
     if len(content) != member.size or member.pax_headers.get(_SHA256) not in (

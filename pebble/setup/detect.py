@@ -1,13 +1,9 @@
-"""What is at this machine: boards, which are listened to and never written to, cameras, and what a robot needs."""
+"""What is at this machine: boards, which are listened to and never written to, cameras, and what a robot lacks."""
 
-import fcntl
-import os
 import re
 import shutil
 import socket
-import struct
 import subprocess
-import sys
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -18,8 +14,8 @@ import serial
 from pebble.checks.check import State
 from pebble.checks.machine import clock, synchronised
 from pebble.fleet.folder import PLAIN_PORT, PORT
+from pebble.runtime.places import Places
 from pebble.services.serial_mcu_bridge.pebble_serial_v1.frame import FrameError, decode
-from pebble.setup.places import Places
 
 DEVICES, SERIAL_PORTS = Path("/dev"), Path("/dev/serial/by-id")
 BAUDS = (460800, 115200)
@@ -29,11 +25,17 @@ _ENOUGH = 0.8  # of the lines must be readable; the first one is cut off
 _KINDS = {b"T": "goob_base_v1", b"C": "goob_base_v1", b"I": "imu_mpu6050_v1", b"S": "imu_mpu6050_v1"}
 _LIBCAMERA = ("rpicam-hello", "libcamera-hello")
 _CAMERA_S = 10.0
-#: Linux, videodev2.h: what `VIDIOC_QUERYCAP` answers, and that a device file captures pictures.
-_QUERYCAP, _QUERYCAP_BYTES, _DEVICE_CAPS_AT, _CAPTURES = 0x80685600, 104, 88, 0x1 | 0x1000
 #: What only one file of mosquitto's configuration may set.
 _GLOBAL = re.compile(
     r"^\s*(listener|port|password_file|acl_file|allow_anonymous|per_listener_settings|plugin|auth_plugin)\b.*", re.M
+)
+_POLKIT = ("usr/lib/polkit-1/polkitd", "usr/libexec/polkitd", "usr/lib/policykit-1/polkitd")
+_RENEW = "sudo pebble cert renew --folder /etc/pebble/tls"
+NO_POLKIT = "polkit is not installed, so the page cannot restart or reboot the robot: sudo apt install polkitd"
+NO_MOSQUITTO = "mosquitto is not installed: sudo apt install mosquitto, then sudo pebble setup"
+OFFLINE = (
+    "This machine has no network, so no phone reaches it: join one, such as by sudo nmtui,"
+    f" then {_RENEW} NAME.local ADDRESS"
 )
 
 
@@ -54,12 +56,12 @@ def boards(folder: Path, bauds: Sequence[int] = BAUDS, seconds: float = LISTEN_S
 
 
 def listen(port: str, bauds: Sequence[int] = BAUDS, seconds: float = LISTEN_S) -> Board:
-    """What a port sends by itself. Nothing is written to it, and its reset lines stay as they are."""
+    """Return what a port sends by itself. Nothing is written to it, and its reset lines stay as they are."""
     try:
         for baud in bauds:
             received = _received(port, baud, seconds)
-            if (found := _understood(received)) is not None:
-                protocol, what = found
+            if (understood := _understood(received)) is not None:
+                protocol, what = understood
                 return Board(port, baud, f"{baud} baud, answers, {what}", protocol)
     except (OSError, ValueError) as error:  # SerialException is an OSError
         return Board(port, None, f"cannot be opened: {getattr(error, 'strerror', None) or error}")
@@ -77,7 +79,7 @@ def _received(port: str, baud: int, seconds: float) -> bytes:
 
 
 def _understood(received: bytes) -> tuple[str | None, str] | None:
-    """The protocol and what was received, in words; None: nothing that makes sense at this speed."""
+    """Return the protocol and what was received, in words; None: nothing that makes sense at this speed."""
     if b"\0" in received:
         return ("pebble_serial_v1", "frames") if any(map(_is_frame, received.split(b"\0"))) else None
     lines = [line.strip() for line in received.split(b"\n") if line.strip()]
@@ -100,8 +102,11 @@ def _is_frame(stuffed: bytes) -> bool:
 
 
 def cameras(devices: Path) -> Iterator[str]:
-    """Device files that capture pictures, by names that stay; `libcamera` for one at the board's own connector."""
-    yield from (str(link) for link in sorted((devices / "v4l/by-id").glob("*")) if captures(link))
+    """Yield device files that capture pictures, by names that stay; `libcamera` for one at the board's own connector.
+
+    udev gives a camera's other files, of its metadata, the names ``…-video-index1`` and so on.
+    """
+    yield from map(str, sorted((devices / "v4l/by-id").glob("*-video-index0")))
     program = next((name for name in _LIBCAMERA if shutil.which(name)), None)
     if program is not None:
         try:
@@ -114,109 +119,19 @@ def cameras(devices: Path) -> Iterator[str]:
             yield "libcamera"
 
 
-def captures(device: Path) -> bool:
-    """Whether a device file gives pictures; a camera has others, of its metadata."""
-    answer = bytearray(_QUERYCAP_BYTES)
-    try:
-        descriptor = os.open(device, os.O_RDWR | os.O_NONBLOCK)
-    except OSError:
-        return False
-    try:
-        fcntl.ioctl(descriptor, _QUERYCAP, answer)
-    except OSError:
-        return False
-    finally:
-        os.close(descriptor)
-    return bool(struct.unpack_from("<I", answer, _DEVICE_CAPS_AT)[0] & _CAPTURES)
+def lacks(places: Places) -> Iterator[str]:
+    """Yield what the robot has to do without, and what to type for it."""
+    if not any((places.root / path).exists() for path in _POLKIT):
+        yield NO_POLKIT
+    found = clock(time.time(), synchronised())
+    if found.state is State.FAILED:
+        yield f"The clock {found.text.partition(':')[0]}, so certificates would be refused: {found.fix}, then {_RENEW}"
+    if not _has_network():
+        yield OFFLINE
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Machine:
-    """What a robot needs of its machine, each empty if all is well, else why it lacks and what to do."""
-
-    systemd: str = ""
-    unit: str = ""
-    mosquitto: str = ""
-    polkit: str = ""
-    writable: str = ""
-    bits: str = ""
-    clock: str = ""
-    network: str = ""
-
-    def lacks(self) -> list[str]:
-        """What no step depends on, in words."""
-        return [text for text in (self.bits, self.clock, self.network) if text]
-
-
-def machine(places: Places) -> Machine:
-    """Look at the machine whose root this is."""
-    root = places.root
-    units = ("etc/systemd/system", "usr/lib/systemd/system", "lib/systemd/system")
-    installed = any((root / folder / "pebble.service").exists() for folder in units)
-    polkit = ("usr/lib/polkit-1/polkitd", "usr/libexec/polkitd", "usr/lib/policykit-1/polkitd")
-    return Machine(
-        systemd="" if (root / "run/systemd/system").is_dir() or not places.is_live else NO_SYSTEMD,
-        unit="" if installed else NO_UNIT,
-        mosquitto=_mosquitto(places),
-        polkit="" if any((root / path).exists() for path in polkit) else NO_POLKIT,
-        writable=unwritable(places),
-        bits=bits(sys.maxsize),
-        clock=unset_clock(time.time(), synchronised()),
-        network="" if _has_network() else OFFLINE,
-    )
-
-
-RENEW = "sudo pebble cert renew --folder /etc/pebble/tls"
-NO_UNIT = (
-    "pebble.service is not installed, so nothing starts the robot with the machine:"
-    " sudo apt install ./pebble-robot_….deb, then sudo pebble setup"
-)
-NO_SYSTEMD = "systemd does not run here, so nothing starts the robot with the machine: pebble up /etc/pebble/robot.json"
-NO_POLKIT = (
-    "polkit is not installed, so the page cannot restart or reboot the robot:"
-    " sudo apt install polkitd, then sudo pebble setup"
-)
-NO_MOSQUITTO = (
-    "mosquitto is not installed, so there is no broker on this robot:"
-    " sudo apt install mosquitto, then sudo pebble setup"
-)
-OFFLINE = (
-    "this machine has no network, so no phone reaches it: join one, such as by sudo nmtui,"
-    f" then {RENEW} NAME.local ADDRESS"
-)
-
-
-def bits(largest: int) -> str:
-    """``largest``: of a C pointer's size."""
-    if largest > 2**32:
-        return ""
-    return "this system has 32 bits, for which the versions of packages are not locked: install one of 64 bits"
-
-
-def unset_clock(now: float, known: bool | None) -> str:
-    found = clock(now, known)
-    if found.state is not State.FAILED:
-        return ""
-    return f"the clock {found.text.partition(':')[0]}, so certificates would be refused: {found.fix}, then {RENEW}"
-
-
-def unwritable(places: Places) -> str:
-    """Why nothing can be written below the root, for whatever user; empty: it can."""
-    folder = next(one for one in (places.etc, *places.etc.parents) if one.exists())
-    if os.statvfs(folder).f_flag & os.ST_RDONLY:
-        return f"{folder} is read-only: sudo mount -o remount,rw {mount_point(folder)}, then sudo pebble setup"
-    return ""
-
-
-def mount_point(path: Path) -> Path:
-    """Where the file system of the path is mounted: `mount` takes no other folder."""
-    lines = Path("/proc/self/mounts").read_text(encoding="utf-8", errors="surrogateescape").splitlines()
-    points = {Path(re.sub(r"\\([0-7]{3})", lambda found: chr(int(found[1], 8)), line.split()[1])) for line in lines}
-    return next((folder for folder in (path, *path.parents) if folder in points), Path("/"))
-
-
-def _mosquitto(places: Places) -> str:
-    """Why the robot's own broker cannot be made here."""
+def no_broker(places: Places) -> str:
+    """Return why the robot's own broker cannot be made here; empty: it can."""
     if not any((places.root / path).exists() for path in ("usr/sbin/mosquitto", "usr/bin/mosquitto")):
         return NO_MOSQUITTO
     for file in (places.broker.parent.parent / "mosquitto.conf", *sorted(places.broker.parent.glob("*.conf"))):
@@ -228,13 +143,11 @@ def _mosquitto(places: Places) -> str:
             continue
         if found is not None:
             line = found[0].strip().split()[0]
-            return f"{places.named(file)} has its own `{line}`: remove it, or give --broker the name of that broker"
-    if not places.is_live or places.broker.exists() or _runs("mosquitto"):
+            return f"{places.named(file)} has its own `{line}`: remove it, or answer with the name of that broker"
+    if places.root != Path("/") or places.broker.exists() or _runs("mosquitto"):
         return ""
-    taken = next((port for port in (PLAIN_PORT, PORT) if _is_taken(port)), None)
-    return (
-        "" if taken is None else f"port {taken} is taken by another program: sudo ss -ltnp 'sport = :{taken}' names it"
-    )
+    taken = [port for port in (PLAIN_PORT, PORT) if _is_taken(port)]
+    return f"port {taken[0]} is taken by another program: sudo ss -ltnp 'sport = :{taken[0]}' names it" if taken else ""
 
 
 def _runs(program: str) -> bool:
@@ -258,7 +171,7 @@ def _is_taken(port: int) -> bool:
 
 
 def _has_network() -> bool:
-    """Whether there is a way to other machines; sends nothing."""
+    """Return True if there is a way to other machines; sends nothing."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         try:
             probe.connect(("192.0.2.1", 9))

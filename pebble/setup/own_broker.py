@@ -5,14 +5,14 @@ from pathlib import Path
 from pebble.fleet import applying, broker_files, certificates, folder
 from pebble.fleet.folder import CONF, PID, Fleet, Server
 from pebble.fleet.roles import Account, ProgramRole
-from pebble.setup.places import Places
+from pebble.runtime.places import Places
+from pebble.setup.answers import PAGE
 
-PAGE = "page"  # the account of the robot's own page
 _LINKS = {CONF: "../conf.d/pebble.conf", PID: "../../../run/mosquitto/mosquitto.pid"}
 
 
 def fleet_of(account: str, base: str, people: Path) -> Fleet:
-    """Accounts for the robot and its page, at a broker that other machines reach with a login and TLS only."""
+    """Return accounts for the robot and its page, at a broker that other machines reach with a login and TLS only."""
     accounts = {
         account: Account(roles=(ProgramRole.ROBOT,), bases=(base,)),
         PAGE: Account(roles=(ProgramRole.PAGE,), people=str(people)),
@@ -22,7 +22,7 @@ def fleet_of(account: str, base: str, people: Path) -> Fleet:
 
 
 def conf_text(places: Places, fleet: Fleet) -> bytes:
-    """What mosquitto includes; its paths are those of the machine whose root this is."""
+    """Return what mosquitto includes; its paths are those of the machine whose root this is."""
     return broker_files.conf_text(fleet, Path(places.named(places.broker_folder)), None, "").encode()
 
 
@@ -35,27 +35,25 @@ def make(new: Path, fleet: Fleet, passwords: dict[str, str]) -> None:
 
 
 def link(place: Path) -> None:
-    """Links to what mosquitto has elsewhere, relative so that they mean the same below another root."""
+    """Make links to what mosquitto has elsewhere, relative so that they mean the same below another root."""
     for name, target in _LINKS.items():
         if not (place / name).is_symlink():
             (place / name).symlink_to(target)
 
 
 def knows(place: Path, wanted: Fleet, passwords: dict[str, str]) -> bool:
-    """Whether these accounts are there as they should be, with these passwords."""
+    """Return True if these accounts are there as they should be, with these passwords."""
     fleet = folder.load(place)
     stored = applying.passwords_of(place, fleet)
     known = all(fleet.accounts.get(name) == account for name, account in wanted.accounts.items())
-    return known and all(name in stored and stored[name].is_of(one) for name, one in passwords.items())
+    return known and all(name in stored and stored[name].is_of(password) for name, password in passwords.items())
 
 
-def change(place: Path, wanted: Fleet, passwords: dict[str, str], earlier: set[str]) -> None:
-    """Let the broker know these accounts, at once where it runs, and no longer the robot's ``earlier`` ones."""
+def change(place: Path, wanted: Fleet, passwords: dict[str, str]) -> None:
+    """Let the broker know these accounts, at once where it runs."""
     with folder.locked(place):
         before = folder.load(place)
         after = before
-        for name in earlier - set(wanted.accounts):
-            after = after.without(name)
         for name, account in wanted.accounts.items():
             after = after.without(name).with_account(name, account)
         applying.apply(place, before, after, passwords)

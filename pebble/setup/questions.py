@@ -1,204 +1,137 @@
-"""The questions of ``pebble setup``, and its answers: from a file, from options, from the last time, or asked."""
+"""The questions of ``pebble setup`` in a terminal. What the robot has already is offered as the answer of each."""
 
-import re
+import os
+import shutil
 import socket
-from collections.abc import Mapping
+import textwrap
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-import msgspec
-from msgspec import Struct
-from msgspec.structs import asdict
+import typer
+from msgspec.structs import replace
 
-from pebble.config import hosts
-from pebble.config.web import is_loopback
-from pebble.contract.identity import LEVEL, LEVEL_RULE
-from pebble.contract.names import NAME
 from pebble.contract.serial_protocols import SERIAL_PROTOCOLS
-from pebble.errors import PebbleError
-from pebble.fleet.folder import ADMIN
-from pebble.fleet.people import MIN_PASSWORD
+from pebble.fleet.people import has_user, usable
+from pebble.setup import detect
+from pebble.setup.answers import HERE, NONE, AnswersError, needs_login, needs_user
+from pebble.setup.steps import Job
 
-NONE, HERE = "none", "here"
-RESERVED = (ADMIN, "page")  # accounts of the robot's own broker
-_BAUDS = {"goob_base_v1": 460800}
-_OTHER_BAUD = 115200
-_PORTS = {True: 1883, False: 8883}  # of a broker on loopback or beyond
+_Given = dict[str, Any]
 
 
-class AnswersError(PebbleError):
-    """Answers that are missing or wrong; each line names its key. Example: ``--camera (camera) is missing: …``."""
+def say(text: str, indent: int = 0) -> None:
+    """Print a text, broken between its words where the terminal's line ends."""
+    width = shutil.get_terminal_size().columns
+    lines = textwrap.wrap(
+        text,
+        width,
+        initial_indent=" " * indent,
+        subsequent_indent=" " * (indent + 2),
+        break_long_words=False,
+        break_on_hyphens=False,
+    )
+    typer.echo("\n".join(lines))
 
 
-class Answers(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """What the user wants. ``None`` is not answered yet. Files of passwords are read once and are not among them.
-
-    ``port`` and ``camera`` may be ``none``, ``broker`` ``here`` (on the robot) or ``none`` (yet).
-    """
-
-    id: str | None = None
-    port: str | None = None
-    protocol: str | None = None
-    baud: int | None = None
-    camera: str | None = None
-    broker: str | None = None
-    broker_user: str | None = None
-    broker_ca: str | None = None
-    page: bool | None = None
-    user: str | None = None
-
-    @property
-    def remote(self) -> tuple[str, int] | None:
-        """Host and port of a broker that is not the robot's own."""
-        if self.broker in (None, NONE, HERE):
-            return None
-        address = hosts.split(str(self.broker))
-        return address.host, address.port or _PORTS[is_loopback(address.host)]
-
-    @property
-    def is_far(self) -> bool:
-        """Whether the broker is beyond this machine, so that the level `login` demands encryption and an account."""
-        return self.remote is not None and not is_loopback(self.remote[0])
-
-    @property
-    def account(self) -> str:
-        """The robot's login at its broker; its own broker knows it by its name."""
-        return account_of(str(self.id)) if self.broker == HERE else str(self.broker_user)
-
-    @property
-    def speed(self) -> int:
-        return self.baud or _BAUDS.get(str(self.protocol), _OTHER_BAUD)
+def asked(job: Job) -> Job:
+    """Return the job with the answers of the person at the terminal; a wrong one is asked again."""
+    first = [] if job.config is not None else [_ask_name]
+    for number, ask in enumerate([*first, _ask_board, _ask_camera, _ask_broker, _ask_page], start=1):
+        job = _answered(job, number, ask)
+    return _with_passwords(job)
 
 
-class Secrets(Struct, frozen=True, kw_only=True):
-    """Passwords that were typed or read from files; shown nowhere, and in no file but those that they are for."""
-
-    password: str | None = None
-    broker_password: str | None = None
-
-    def __repr__(self) -> str:
-        return "Secrets(***)"
-
-
-#: Each key: what it means, for messages, and the option that answers it.
-KEYS: Mapping[str, str] = {
-    "id": "the name of the robot, one level of its topics",
-    "port": "the board's serial port, or none",
-    "protocol": f"what the board speaks: {', '.join(SERIAL_PROTOCOLS)}",
-    "baud": "its speed, unless the protocol's usual one",
-    "camera": "a device, libcamera, synthetic, or none",
-    "broker": "here (on this robot), HOST[:PORT], or none (yet)",
-    "broker_user": "the robot's account there",
-    "broker_password_file": "a file with the password of that account",
-    "broker_ca": "a file with the authority of its certificate",
-    "page": "whether phones may open the robot's page: true or false",
-    "user": "the first user of the page",
-    "password_file": f"a file with that user's password, of {MIN_PASSWORD} characters or more",
-}
-FILES = ("broker_password_file", "password_file")
+def _answered(job: Job, number: int, ask: Callable[[Job, str], _Given]) -> Job:
+    while True:
+        try:
+            return job.with_answers(ask(job, f"{number}."))
+        except AnswersError as error:
+            for line in str(error).splitlines():
+                say(line, 3)
 
 
-def decode(text: bytes, name: str) -> dict[str, Any]:
-    """The answers of a file. Raises AnswersError."""
-    try:
-        found = msgspec.json.decode(text, type=dict[str, Any])
-    except msgspec.MsgspecError as error:
-        raise AnswersError(f"{name}: {error}: write an object with the keys {', '.join(KEYS)}") from None
-    unknown = [key for key in found if key not in KEYS and not key.startswith("//")]
-    if unknown:
-        raise AnswersError(f"{name}: {unknown[0]}: unknown key; there are {', '.join(KEYS)}")
-    return {key: value for key, value in found.items() if key in KEYS}
+def _ask(question: str) -> None:
+    typer.echo()
+    say(question)
 
 
-def combined(*sources: Mapping[str, Any]) -> Answers:
-    """Later sources go before earlier ones. Raises AnswersError."""
-    merged: dict[str, Any] = {}
-    for source in sources:
-        merged |= {key: value for key, value in source.items() if value is not None and key not in FILES}
-    try:
-        answers = msgspec.convert(merged, Answers)
-    except msgspec.ValidationError as error:
-        raise AnswersError(f"answers: {error}") from None
-    if wrong := mistakes(answers):
-        raise AnswersError("\n".join(wrong))
-    return answers
+def _choose(question: str, choices: Sequence[tuple[str, str]], default: str, other: str = "another answer") -> str:
+    """Return one of the values, chosen by its number, or another text."""
+    _ask(question)
+    for place, (value, label) in enumerate(choices, start=1):
+        say(f"{place}  {value}{f'  ({label})' if label else ''}", 5)
+    answer = str(typer.prompt(f"   Number, or {other}", default=default))
+    return choices[int(answer) - 1][0] if answer.isdecimal() and 0 < int(answer) <= len(choices) else answer
 
 
-def plain(answers: Answers) -> dict[str, Any]:
-    """What the manifest keeps of them."""
-    return {key: value for key, value in asdict(answers).items() if value is not None}
+def _ask_name(_job: Job, number: str) -> _Given:
+    _ask(f"{number} What is the robot called? The name is a part of all its topics.")
+    host = socket.gethostname().partition(".")[0] or "robot"
+    return {"id": str(typer.prompt("   Name", default=host))}
 
 
-def option(key: str) -> str:
-    return "--" + key.replace("_", "-")
+def _ask_board(job: Job, number: str) -> _Given:
+    typer.echo("\n   Listening to serial ports…")
+    boards = {board.port: board for board in detect.boards(detect.SERIAL_PORTS)}
+    choices = [*((board.port, board.text) for board in boards.values()), (NONE, "no board now")]
+    known = next((board.port for board in boards.values() if board.baud), NONE)
+    port = _choose(f"{number} Which board drives the motors?", choices, job.answers.port or known)
+    if port == NONE:
+        return {"port": NONE}
+    board = boards.get(port)
+    if board is not None and board.protocol is not None:
+        return {"port": port, "protocol": board.protocol, "baud": board.baud}
+    usual = job.answers.protocol or next(iter(SERIAL_PROTOCOLS))
+    protocol = _choose("What does it speak?", [(name, "") for name in SERIAL_PROTOCOLS], usual)
+    return {"port": port, "protocol": protocol} | ({"baud": board.baud} if board is not None and board.baud else {})
 
 
-def mistakes(answers: Answers) -> list[str]:
-    """One line for each answer that cannot be."""
-    found = []
-    if answers.id is not None and not re.search(LEVEL, answers.id):
-        found.append(f"id: must be {LEVEL_RULE}, not {answers.id!r}")
-    if answers.broker == HERE and account_of(str(answers.id)) in RESERVED:
-        found.append(f"id: {answers.id!r} is an account of the robot's own broker already: choose another name")
-    if answers.protocol is not None and answers.protocol not in SERIAL_PROTOCOLS:
-        found.append(f"protocol: {answers.protocol!r} is none of {', '.join(SERIAL_PROTOCOLS)}")
-    if answers.baud is not None and answers.baud < 1:
-        found.append(f"baud: {answers.baud} is no speed")
-    if answers.broker not in (None, NONE, HERE) and (why := _broker_mistake(str(answers.broker))):
-        found.append(f"broker: {why}")
-    if answers.page and answers.broker == NONE:
-        found.append("page: a page needs a broker: answer broker, too")
-    if answers.user is not None and not NAME.fullmatch(answers.user):
-        found.append(f"user: {answers.user!r} is no name: use 1 to 32 of a-z, 0-9, _ and -")
-    return found
+def _ask_camera(job: Job, number: str) -> _Given:
+    choices = [*((camera, "") for camera in detect.cameras(detect.DEVICES)), (NONE, "no camera now")]
+    return {"camera": _choose(f"{number} Which camera?", choices, job.answers.camera or choices[0][0])}
 
 
-def _broker_mistake(text: str) -> str:
-    try:
-        address = hosts.split(text)
-        hosts.broker_host(address.host)
-    except hosts.HostError as error:
-        return str(error)
-    if address.scheme or address.rest or address.user is not None:
-        return "write HOST or HOST:PORT; user and password have keys of their own"
-    return ""
-
-
-def missing(answers: Answers, secrets: Secrets, *, has_login: bool, has_user: bool) -> list[str]:
-    """The keys without an answer. ``has_login``: the broker's password is there already; ``has_user``: the user is."""
-    wanted = ["id", "port", "camera", "broker", "page"]
-    if answers.port not in (None, NONE):
-        wanted.append("protocol")
+def _ask_broker(job: Job, number: str) -> _Given:
+    question = f"{number} Where is the broker, at which operators meet the robot?"
+    choices = [(HERE, "on this robot"), (NONE, "none yet")]
+    broker = _choose(question, choices, job.answers.broker or HERE, "HOST[:PORT]")
+    if broker == NONE:
+        return {"broker": NONE, "page": False}
+    answers = job.with_answers({"broker": broker}).answers
+    given: _Given = {"broker": broker}
     if answers.is_far:
-        wanted.append("broker_user")
-    if answers.page:
-        wanted.append("user")
-    found = [key for key in wanted if getattr(answers, key) is None]
-    login = answers.is_far or (answers.remote is not None and answers.broker_user is not None)
-    if login and not has_login and secrets.broker_password is None:
-        found.append("broker_password_file")
-    if answers.page and not has_user and secrets.password is None:
-        found.append("password_file")
-    return [key for key in KEYS if key in found]
+        default = answers.broker_user or str(answers.id)
+        given["broker_user"] = str(typer.prompt("   The robot's account there", default=default))
+        known = answers.broker_ca or ""
+        ca = str(typer.prompt("   File with its authority, ca.pem (empty: a public one)", default=known))
+        given["broker_ca"] = str(Path(ca).absolute()) if ca else None
+    return given
 
 
-def missing_error(keys: list[str]) -> AnswersError:
-    return AnswersError("\n".join(f"{key} is missing: {KEYS[key]} ({option(key)})" for key in keys))
+def _ask_page(job: Job, number: str) -> _Given:
+    if job.answers.broker == NONE:
+        return {"page": False}
+    _ask(f"{number} May phones and computers in this network open the robot's page?")
+    if not typer.confirm("   Page", default=job.answers.page is not False):
+        return {"page": False}
+    if has_user(job.people):
+        return {"page": True}
+    name = (os.environ.get("SUDO_USER") or "admin").lower()
+    return {"page": True, "user": str(typer.prompt("   First user, who may do everything", default=name))}
 
 
-def host_name() -> str:
-    """The default name of the robot."""
-    return socket.gethostname().partition(".")[0] or "robot"
-
-
-def account_of(name: str) -> str:
-    """The account of a robot of this name, which may have other letters than an account."""
-    return re.sub(r"[^a-z0-9_-]", "-", name.lower()).lstrip("-")[:32] or "robot"
-
-
-def read_file(file: Path) -> bytes:
-    """Raises AnswersError."""
-    try:
-        return file.read_bytes()
-    except OSError as error:
-        raise AnswersError(f"--answers {file}: {error.strerror}") from None
+def _with_passwords(job: Job) -> Job:
+    """Ask for those that are needed."""
+    answers, secrets = job.answers, job.secrets
+    if needs_login(answers):
+        text, default = f"   Password of {answers.account} at the broker", None
+        if job.has_login:
+            text, default = f"{text} (empty: as before)", ""
+        typed = str(typer.prompt(text, default=default, show_default=False, hide_input=True))
+        secrets = replace(secrets, broker_password=typed or None)
+    if needs_user(answers, has_people=bool(answers.page) and has_user(job.people)):
+        text = f"   Password of {answers.user}"
+        typed = str(typer.prompt(text, hide_input=True, confirmation_prompt="   Again"))
+        secrets = replace(secrets, password=usable(typed))
+    return job.with_answers({}, secrets)

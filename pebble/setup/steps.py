@@ -1,398 +1,245 @@
-"""Steps of a set-up as data, and the engine that does them, any number of times, and undoes them.
+"""What makes a robot of a machine, in order. Each step is looked at first, and done only where it is not so yet."""
 
-A step that was done is the *same*; a file that was changed by hand is never overwritten. All that is written is in the
-manifest before it is written, so a set-up that was killed goes on where it was.
-"""
-
-import grp
+import json
 import os
-import pwd
-import shutil
-import subprocess
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
-from enum import StrEnum
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import closing
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+from pebble.client.page.from_config import people_of
+from pebble.config import Config, load
+from pebble.config.config import parse
+from pebble.contract.identity import Identity
 from pebble.errors import PebbleError
-from pebble.fleet.whole_file import is_root, write
-from pebble.setup import manifest as manifests
-from pebble.setup.manifest import Manifest, SetupError, content_of, sha256
-from pebble.setup.places import Places
+from pebble.fleet import certificates
+from pebble.fleet.broker_files import new_password
+from pebble.fleet.people import People, has_user
+from pebble.fleet.roles import Role
+from pebble.runtime.connections import check_connections
+from pebble.runtime.places import Places
+from pebble.setup import own_broker
+from pebble.setup.answers import HERE, PAGE, Answers, AnswersError, Secrets, combined, needs_user, require
+from pebble.setup.detect import no_broker
+from pebble.setup.robot_config import (
+    BROKER_CA,
+    BROKER_PASSWORD,
+    PAGE_PASSWORD,
+    UNIT,
+    answers_of,
+    changed,
+    config_of,
+)
+from pebble.setup.system import MOSQUITTO, ROBOTS, SetupError, System
 
-BESIDE = ".pebble-new"
-_COMMAND_S = 120.0
-
-
-class State(StrEnum):
-    """How a step finds the machine."""
-
-    NEW = "new"
-    SAME = "same"
-    BY_HAND = "changed by hand"
-    CANNOT = "cannot"
-    SKIPPED = "skipped"  # it concerns the running machine, and the root is another
-
-
-class Result(NamedTuple):
-    """What became of one step, or would."""
-
-    step: "Step"
-    state: State
-    why: str = ""
+ROBOT_SERVICE, BROKER_SERVICE = UNIT, "mosquitto.service"
 
 
-@dataclass(frozen=True, kw_only=True)
-class Step:
-    """One thing that must be so: a folder, a file, a folder made with its files, a command that ran, or an act of ours.
-
-    ``content``: of a file; a function makes it once, and what is there then stays. ``check`` raises PebbleError before
-    it is written. ``make`` fills a new folder.
-    ``of``: files for which ``command`` runs again when they change. ``changes``: files that ``act`` writes.
-    ``undo`` runs before files are removed, ``after`` afterwards. ``cannot``: why this machine does not allow the step.
-    """
+class Step(NamedTuple):
+    """One thing that must be so. ``restarts``: the services that read what it writes."""
 
     what: str
-    target: Path | None = None
-    content: bytes | Callable[[], bytes] | None = None
-    make: Callable[[Path], None] | None = None
-    check: Callable[[bytes], None] | None = None
-    mode: int = 0o644
-    owner: str = "root:root"
-    command: tuple[str, ...] = ()
-    of: tuple[Path, ...] = ()
-    act: Callable[[], None] | None = None
-    done: Callable[[], bool] | None = None
-    changes: tuple[Path, ...] = ()
-    undo: tuple[str, ...] = ()
-    undo_act: Callable[[], None] | None = None
-    after: tuple[str, ...] = ()
-    cannot: str = ""
-    live: bool = False  # it concerns the machine that runs, not files below a root
+    is_done: Callable[[], bool]
+    do: Callable[[], object]
+    restarts: tuple[str, ...] = (ROBOT_SERVICE,)
+
+
+def load_config(places: Places) -> Config | None:
+    """Return the config that is there; None: there is none yet. Raises ConfigError."""
+    if not places.config.exists():
+        return None
+    return load(places.config, {**os.environ, "STATE_DIRECTORY": str(places.state)})
+
+
+@dataclass(frozen=True)
+class Job:
+    """All that the steps depend on. ``config`` is the one that is there already."""
+
+    system: System
+    config: Config | None
+    answers: Answers
+    secrets: Secrets
 
     @property
-    def is_folder(self) -> bool:
-        return self.target is not None and self.content is None and self.make is None
+    def places(self) -> Places:
+        return self.system.places
 
+    @property
+    def earlier(self) -> Answers:
+        return Answers() if self.config is None else answers_of(self.config, self.places)
 
-def run_command(command: Sequence[str]) -> None:
-    """Run a program of the system. Raises SetupError with its first line of complaint."""
-    line = " ".join(command)
-    try:
-        done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=_COMMAND_S)
-    except OSError as error:
-        raise SetupError(f"`{line}`: {error.strerror}") from None
-    except subprocess.TimeoutExpired:
-        raise SetupError(f"`{line}` did not end within {_COMMAND_S:g} s") from None
-    if done.returncode != 0:
-        complaint = (done.stderr.strip() or done.stdout.strip() or "it failed").splitlines()[0]
-        raise SetupError(f"`{line}`: {complaint}")
+    @property
+    def has_login(self) -> bool:
+        """True if the robot has logged in at this broker before."""
+        return self.config is not None and self.answers.broker == self.earlier.broker
 
+    @property
+    def page(self) -> Config | None:
+        """The config, if the robot serves its page already."""
+        return self.config if self.config is not None and self.config.services.web_handler.enabled else None
 
-@dataclass
-class Engine:
-    """Does steps below one root. ``run`` starts programs of the system."""
+    @property
+    def people(self) -> Path:
+        return self.places.people if self.page is None else people_of(self.page)
 
-    places: Places
-    manifest: Manifest
-    run: Callable[[Sequence[str]], None] = run_command
-    is_live: bool = False  # whether this is the machine that runs, of which services can be started
-    _applied: set[Path] = field(default_factory=set)
+    def with_answers(self, given: Mapping[str, Any], secrets: Secrets | None = None) -> "Job":
+        """Return the same with further answers. Raises AnswersError with a line for each mistake."""
+        answers = combined(self.answers, given)
+        if given.get("broker") == HERE and (why := no_broker(self.places)):
+            raise AnswersError(f"broker: {why}")
+        return replace(self, answers=answers, secrets=secrets or self.secrets)
 
-    def begin(self) -> None:
-        """Write the manifest before anything else."""
-        self._save()
+    def require(self) -> None:
+        """Raise AnswersError with the keys that have no answer."""
+        has_people = bool(self.answers.page) and has_user(self.people)
+        is_known = self.answers.user is not None and has_user(self.people, self.answers.user)
+        require(self.answers, self.secrets, has_login=self.has_login, has_people=has_people, has_user=is_known)
 
-    def finish(self, left: Mapping[str, str]) -> None:
-        """Note that a backup is restored, and forget the earlier names whose last step, in ``left``, is done."""
-        self.manifest.restoring = ""
-        for robot in [robot for robot in self.manifest.leaving if left[robot] in self.manifest.ran]:
-            self.manifest.leaving.remove(robot)
-            del self.manifest.ran[left[robot]]
-        self._save()
+    # -- the steps
 
-    def forget(self) -> None:
-        """Forget what :meth:`states` expected."""
-        self._applied.clear()
+    def steps(self) -> list[Step]:
+        """All of them, in their order: the config is written when all that it names is there."""
+        steps = [*self._passwords(), *(self._own_broker() if self.answers.broker == HERE else self._other_broker())]
+        if self.answers.page:
+            steps += [*self._certificate(), *self._first_user()]
+        steps.append(self._config())
+        if self.system.has_systemd:
+            steps.append(self._enabled())
+        if self.places.manifest.exists():
+            what = f"remove {self.places.named(self.places.manifest)}, which an earlier version needed"
+            steps.append(Step(what, lambda: False, self.places.manifest.unlink, ()))
+        return steps
 
-    # -- forwards
+    def _passwords(self) -> Iterator[Step]:
+        file, page = self.places.etc / BROKER_PASSWORD, self.places.etc / PAGE_PASSWORD
+        given = self.secrets.broker_password
+        if given is not None and self.answers.broker != HERE:
+            yield self._file("password of the robot at its broker", file, f"{given}\n".encode())
+        if self.answers.broker == HERE:
+            known = self.config is None or self.has_login
+            yield self._new_password("password of the robot at its own broker", file, known=known)
+            if self.answers.page:
+                yield self._new_password("password of the page at the robot's broker", page)
 
-    def states(self, steps: Iterable[Step]) -> Iterator[Result]:
-        """How each step finds the machine; writes nothing."""
-        for step in steps:
-            state, why = self._state(step)
-            if state is State.NEW:
-                self._applied.update(filter(None, (step.target, *step.changes)))
-            yield Result(step, state, why)
+    def _new_password(self, what: str, file: Path, *, known: bool = True) -> Step:
+        """``known``: what is in the file is of this broker."""
+        write = partial(self.system.write, file)
+        return Step(what, lambda: known and file.exists(), lambda: write(f"{new_password()}\n".encode()))
 
-    def apply(self, steps: Sequence[Step]) -> Iterator[Result]:
-        """Do each step that is not done; one that fails does not keep the others from being done."""
-        self._save()
-        for step in (*self.left_over(steps), *steps):
-            state, why = self._state(step)
-            try:
-                if state is State.NEW:
-                    self._do(step)
-                    self._applied.update(filter(None, (step.target, *step.changes)))
-                elif state is State.BY_HAND and why:
-                    self._put_beside(step)
-                else:
-                    self._note_same(step, state)
-            except (PebbleError, OSError) as error:
-                state, why = State.CANNOT, _reason(error)
-            yield Result(step, state, why)
-        self._save()
+    def _file(self, what: str, file: Path, content: bytes, **options: Any) -> Step:
+        write = partial(self.system.write, file, content, **options)
+        return Step(what, lambda: file.exists() and file.read_bytes() == content, write)
 
-    def left_over(self, steps: Sequence[Step]) -> list[Step]:
-        """Steps that remove what earlier answers needed, and these do not."""
-        wanted = [self._name(step.target) for step in steps if step.target is not None]
-        used = {*wanted, *(name + BESIDE for name in wanted)}
-        made = tuple(f"{self._name(step.target)}/" for step in steps if step.make is not None and step.target)
-        names = [name for name in self.manifest.files if name not in used and not name.startswith(made or "\0")]
-        return [
-            Step(what=f"remove {name}, which is not needed now", act=lambda name=name: self._remove(name))  # type: ignore[misc]
-            for name in names
-            if self._is_removable(name)
-        ]
+    def _own_broker(self) -> Iterator[Step]:
+        places, folder = self.places, self.places.broker_folder
+        base = str(Identity("pebble", "robots", str(self.answers.id))) if self.config is None else self.config.base
+        wanted = own_broker.fleet_of(self.answers.account, base, Path(places.named(places.people)))
 
-    def _state(self, step: Step) -> tuple[State, str]:
-        if step.live and not self.is_live:
-            return State.SKIPPED, f"{self.places.root} is not the system that runs"
-        if step.cannot:
-            return State.CANNOT, step.cannot
-        try:
-            state = self._found(step)
-            return state, self._beside(step) if state is State.BY_HAND else ""
-        except PermissionError as error:
-            return State.CANNOT, f"{error.filename} may not be read by this user: use sudo"
-        except (OSError, PebbleError) as error:
-            return State.CANNOT, _reason(error)
+        def passwords() -> dict[str, str]:
+            files = {self.answers.account: places.etc / BROKER_PASSWORD, PAGE: places.etc / PAGE_PASSWORD}
+            return {name: file.read_text(encoding="utf-8").strip() for name, file in files.items() if file.exists()}
 
-    def _beside(self, step: Step) -> str:
-        """Where our content goes; empty: it is that which was changed, so it is of no use."""
-        assert step.target is not None  # noqa: S101 - only files are changed by hand
-        known = isinstance(step.content, bytes) and self.manifest.is_ours(self._name(step.target), step.content)
-        return "" if known else f"ours is {self._name(step.target)}{BESIDE}"
-
-    def _found(self, step: Step) -> State:
-        if step.target is not None and (step.is_folder or step.make is not None):
-            return State.SAME if step.target.is_dir() and self._is_given(step, step.target) else State.NEW
-        if step.target is not None:
-            return self._file_state(step)
-        if any(self.manifest.is_changing(self._name(path)) for path in step.changes):
-            return State.NEW
-        if step.done is not None and not step.done():
-            return State.NEW
-        if step.command and (step.of or step.done is None):
-            fresh = self.manifest.ran.get(step.what) == self._digest(step) and not self._applied & {*step.of}
-            return State.SAME if fresh else State.NEW
-        return State.SAME if step.done is not None else State.NEW
-
-    def _is_given(self, step: Step, folder: Path) -> bool:
-        """Whether a folder of ours has its owner, who may not have been there when it was made."""
-        owner = self.owner(step.owner) if self._name(folder) in self.manifest.folders else None
-        found = folder.stat()
-        return owner is None or owner == (found.st_uid, found.st_gid)
-
-    def _file_state(self, step: Step) -> State:
-        target = step.target
-        assert target is not None  # noqa: S101 - by the caller
-        try:
-            current = target.read_bytes()
-        except FileNotFoundError:
-            return State.NEW
-        if not isinstance(step.content, bytes) or current == step.content:
-            return State.SAME
-        return State.NEW if self.manifest.is_ours(self._name(target), current) else State.BY_HAND
-
-    def _do(self, step: Step) -> None:
-        if step.target is not None and step.make is not None:
-            self._make_folder(step.target, step)
-        elif step.target is not None and step.is_folder and step.target.is_dir():
-            manifests.finish_folder(step.target, step.mode, self.owner(step.owner))
-        elif step.target is not None and step.is_folder:
-            self._parents(step.target)
-            self._folder(step.target, step.mode, self.owner(step.owner))
-        elif step.target is not None:
-            content = step.content() if callable(step.content) else step.content
-            if step.check is not None:
-                step.check(content or b"")
-            self._write(step.target, content or b"", step)
-        else:
-            self._intend(step.changes)
-            if step.act is not None:
-                step.act()
-            if step.command:
-                self.run(step.command)
-                self.manifest.ran[step.what] = self._digest(step)
-            for path in step.changes:
-                self.manifest.wrote(self._name(path), path.read_bytes())
-            self._save()
-
-    def _write(self, target: Path, content: bytes, step: Step) -> None:
-        name = self._name(target)
-        self._parents(target)
-        self.manifest.intend(name, content)
-        self._save()
-        write(target, content, step.mode, SetupError, self.owner(step.owner))
-        self.manifest.wrote(name, content)
-
-    def _put_beside(self, step: Step) -> None:
-        """Write what we would have written beside what was changed by hand."""
-        assert step.target is not None  # noqa: S101 - only files are changed by hand
-        beside = step.target.with_name(step.target.name + BESIDE)
-        if not beside.exists() or beside.read_bytes() != step.content:
-            self._write(beside, bytes(step.content or b""), step)  # type: ignore[arg-type]
-
-    def _note_same(self, step: Step, state: State) -> None:
-        """Forget the content before, if setup was killed after it had replaced it."""
-        target = step.target
-        if state is not State.SAME or target is None:
-            return
-        name, folder = self._name(target), f"{self._name(target)}/"
-        for one in [one for one in self.manifest.files if one == name or one.startswith(folder)]:
-            path = self.places.root / one[1:]
-            several = path.is_file() and len(self.manifest.files[one]) > 1 and not self.manifest.is_changing(one)
-            if several and self.manifest.is_ours(one, content := content_of(path)):
-                self.manifest.wrote(one, content)
-
-    def _make_folder(self, target: Path, step: Step) -> None:
-        """Fill a folder beside it, and put it in its place whole."""
-        self._parents(target)
-        new = target.with_name(f".{target.name}.new")
-        shutil.rmtree(new, ignore_errors=True)
-        new.mkdir(mode=0o700)
-        assert step.make is not None  # noqa: S101 - by the caller
-        step.make(new)
-        owner = self.owner(step.owner)
-        for path in sorted(new.iterdir()):
-            self.manifest.intend(self._name(target / path.name), content_of(path))
-            if owner is not None:
-                os.chown(path, *owner, follow_symlinks=False)
-        self._note_folder(target)
-        manifests.finish_folder(new, step.mode, owner)
-        new.rename(target)
-        for path in target.iterdir():
-            self.manifest.wrote(self._name(path), content_of(path))
-
-    def _parents(self, target: Path) -> None:
-        for folder in reversed(target.parents):
-            if folder != self.places.etc and not folder.exists():
-                self._folder(folder, 0o755, self.owner("root:root"))
-
-    def _folder(self, folder: Path, mode: int, owner: tuple[int, int] | None) -> None:
-        self._note_folder(folder)
-        new = folder.with_name(f".{folder.name}.new")
-        if new.exists():
-            new.rmdir()
-        new.mkdir(mode=0o700)
-        manifests.finish_folder(new, mode, owner)
-        new.rename(folder)
-
-    def _note_folder(self, folder: Path) -> None:
-        name = self._name(folder)
-        if name not in self.manifest.folders:
-            self.manifest.folders.append(name)
-        self._save()
-
-    def _intend(self, changes: Iterable[Path]) -> None:
-        for path in changes:
-            self.manifest.intend(self._name(path), None)
-        self._save()
-
-    def _digest(self, step: Step) -> str:
-        parts = [" ".join(step.command).encode()]
-        parts += [path.read_bytes() if path.is_file() else b"" for path in step.of]
-        return sha256(b"\0".join(parts))
-
-    def owner(self, owner: str) -> tuple[int, int] | None:
-        """The ids of ``user:group``; None: files stay ours. Raises SetupError."""
-        if not self.is_live or not is_root():
-            return None
-        user, _, group = owner.partition(":")
-        try:
-            return pwd.getpwnam(user).pw_uid, grp.getgrnam(group).gr_gid
-        except KeyError:
-            raise SetupError(f"there is no user {user} or no group {group} on this machine") from None
-
-    def _save(self) -> None:
-        try:
-            owner = self.owner("root:pebble")
-        except SetupError:
-            owner = None  # the user comes later
-        manifests.save(self.places, self.manifest, owner)
-
-    def _name(self, path: Path) -> str:
-        return self.places.named(path)
-
-    # -- backwards
-
-    def undo(self, steps: Sequence[Step], *, purge: bool, dry: bool = False) -> Iterator[tuple[str, State, str]]:
-        """Undo what the manifest names: (what, state, why). ``purge``: also what was changed by hand, and the state."""
-        backwards = list(reversed(steps))
-        for step in backwards:
-            if step.undo and step.what in self.manifest.ran:
-                yield self._undone(" ".join(step.undo), lambda step=step: self.run(step.undo), step, dry)  # type: ignore[misc]
-            if step.undo_act is not None:
-                yield self._undone("remove the robot's retained messages", step.undo_act, step, dry)
-        for name in sorted(self.manifest.files, reverse=True):
-            path = self.places.root / name[1:]
-            if not (path.exists() or path.is_symlink()):
-                continue
-            if not purge and not self._is_removable(name):
-                yield f"{name} stays", State.BY_HAND, "it was changed after setup wrote it"
+        def make_or_change() -> None:
+            if folder.is_dir():
+                own_broker.change(folder, wanted, passwords())
             else:
-                yield self._undone(f"remove {name}", lambda name=name: self._remove(name), None, dry)  # type: ignore[misc]
-        if purge and self.places.state.exists():
-            erase = f"erase {self._name(self.places.state)}"
-            yield self._undone(erase, lambda: shutil.rmtree(self.places.state), None, dry)
-        if not dry:
-            self._remove_folders()
-        for step in backwards:
-            if step.after and step.what in self.manifest.ran:
-                yield self._undone(" ".join(step.after), lambda step=step: self.run(step.after), step, dry)  # type: ignore[misc]
+                make = partial(own_broker.make, fleet=wanted, passwords=passwords())
+                self.system.make_folder(folder, 0o700, MOSQUITTO, make)
 
-    def _undone(self, what: str, act: Callable[[], None], step: Step | None, dry: bool) -> tuple[str, State, str]:
-        if step is not None and step.live and not self.is_live:
-            return what, State.SKIPPED, f"{self.places.root} is not the system that runs"
-        if dry:
-            return what, State.NEW, ""
+        yield Step(
+            "accounts, rules and certificate of the robot's own broker",
+            lambda: folder.is_dir() and own_broker.knows(folder, wanted, passwords()),
+            make_or_change,
+            (ROBOT_SERVICE,) if folder.is_dir() else (BROKER_SERVICE, ROBOT_SERVICE),
+        )
+        yield self._file(
+            "mosquitto listens with logins, and beyond this machine encrypted",
+            places.broker,
+            own_broker.conf_text(places, wanted),
+            mode=0o644,
+            owner="root:root",
+        )._replace(restarts=(BROKER_SERVICE,))
+
+    def _other_broker(self) -> Iterator[Step]:
+        own = self.places.broker
+        if own.exists():
+            yield Step("the robot's own broker ends", lambda: False, own.unlink, (BROKER_SERVICE,))
+        if self.answers.broker_ca in (None, self.earlier.broker_ca):
+            return
+        given = Path(str(self.answers.broker_ca))
         try:
-            act()
+            content = given.read_bytes()
+        except OSError as error:
+            raise SetupError(f"broker_ca: {given}: {error.strerror}") from None
+        yield self._file("authority of the broker", self.places.etc / BROKER_CA, content)
+
+    def _certificate(self) -> Iterator[Step]:
+        tls = self.places.tls
+        if self.page is not None and self.page.web_interface.tls.certificate != tls / certificates.SERVER_CERT:
+            return  # it has another one
+
+        def fill(new: Path) -> None:
+            certificates.init(new, certificates.own_names())
+            (new / certificates.SERVER_KEY).chmod(0o640)  # the robot reads it; only root signs others
+
+        yield Step("certificate of the page", tls.is_dir, lambda: self.system.make_folder(tls, 0o750, ROBOTS, fill))
+
+    def _first_user(self) -> Iterator[Step]:
+        file, name = self.people, self.answers.user
+        if not needs_user(self.answers, has_people=has_user(file)):
+            return
+
+        def add() -> None:
+            with closing(People(file)) as people:
+                people.add(str(name), self.secrets.password or "", Role.ADMIN)
+
+        yield Step(f"{name} may log in at the page, as admin", lambda: has_user(file, str(name)), add, ())
+
+    def _config(self) -> Step:
+        file, wanted = self.places.config, config_of(self.answers, self.places)
+        current = json.loads(file.read_bytes()) if self.config is not None else {}
+        before = config_of(self.earlier, self.places) if self.config is not None else {}
+        content = changed(current, before, wanted)
+
+        def write() -> None:
+            check_connections(parse(content, folder=self.places.etc, env=os.environ))
+            if self.config is not None:
+                self.system.write(file.with_name(f"{file.name}.before"), file.read_bytes())
+            self.system.write(file, json.dumps(content, indent=1).encode() + b"\n")
+
+        return Step(f"config {self.places.named(file)}", lambda: file.exists() and content == current, write)
+
+    def _enabled(self) -> Step:
+        wants = self.places.root / "etc/systemd/system/multi-user.target.wants" / UNIT
+        enable = ("systemctl", "enable", UNIT)
+        return Step("the robot starts with the machine", wants.exists, lambda: self.system.run(enable))
+
+    # -- doing them
+
+    def left(self) -> list[Step]:
+        """Return the steps that are not done yet. Raises PebbleError."""
+        return [step for step in self.steps() if not step.is_done()]
+
+    def do(self, steps: list[Step]) -> bool:
+        """Do the steps, then start anew the services that read what was written.
+
+        Returns True if the robot was started. Raises SetupError at the first failure.
+        """
+        unfinished = self.places.unfinished
+        services = {service for step in steps for service in step.restarts}
+        if unfinished.exists():
+            services |= {ROBOT_SERVICE, *([BROKER_SERVICE] if self.answers.broker == HERE else [])}
+        try:
+            for step in steps:
+                if not unfinished.exists():
+                    self.system.write(unfinished, b"")
+                step.do()
+            for service in (BROKER_SERVICE, ROBOT_SERVICE):
+                if service in services and self.system.has_systemd:
+                    self.system.run(("systemctl", "restart", service))
+            unfinished.unlink(missing_ok=True)
         except (PebbleError, OSError) as error:
-            return what, State.CANNOT, _reason(error)
-        return what, State.NEW, ""
-
-    def _is_removable(self, name: str) -> bool:
-        try:
-            return self.manifest.is_ours(name, content_of(self.places.root / name[1:]))
-        except OSError:
-            return False
-
-    def _remove(self, name: str) -> None:
-        path = self.places.root / name[1:]
-        path.unlink(missing_ok=True)
-        self.manifest.files.pop(name, None)
-        folder, etc = path.parent, self.places.etc
-        if folder != etc and self._name(folder) in self.manifest.folders and not any(folder.iterdir()):
-            folder.rmdir()
-            self.manifest.folders.remove(self._name(folder))
-        self._save()
-
-    def _remove_folders(self) -> None:
-        """Remove the folders that setup made and that are empty now, and last the manifest."""
-        own = self._name(self.places.etc)
-        for name in sorted(self.manifest.folders, reverse=True):
-            folder = self.places.root / name[1:]
-            if name != own and folder.is_dir() and not any(folder.iterdir()):
-                folder.rmdir()
-        self.places.manifest.unlink(missing_ok=True)
-        if own in self.manifest.folders and not any(self.places.etc.iterdir()):
-            self.places.etc.rmdir()
-
-
-def _reason(error: Exception) -> str:
-    if isinstance(error, OSError):
-        return f"{error.filename or ''}: {error.strerror}".removeprefix(": ")
-    return str(error).splitlines()[0]
+            raise SetupError(f"{error}; what was done until then stays, and sudo pebble setup goes on there") from None
+        return self.system.has_systemd and ROBOT_SERVICE in services

@@ -19,8 +19,8 @@ from pebble.fleet.folder import load as load_fleet
 from pebble.fleet.people import People
 from pebble.fleet.roles import Account, Role
 from pebble.motion.latch import Latch
+from pebble.runtime.places import Places
 from pebble.services.serial_mcu_bridge.motion.state_file import StateFile
-from pebble.setup.places import Places
 
 PAGE, MQTT, ROBOT = "sentinel of the page", "sentinel-of-mqtt", "sentinel-of-the-robot"
 BROKER = Path("etc/mosquitto/pebble")

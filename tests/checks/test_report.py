@@ -13,7 +13,7 @@ from pebble.checks.report import report
 from pebble.checks.report.report import make
 from pebble.checks.report.secrets_here import secrets_of, values_in
 from pebble.fleet.folder import ADMIN_PASSWORD
-from pebble.setup.places import Places
+from pebble.runtime.places import Places
 from tests.checks.installed import BROKER, MQTT, ROBOT, config_of, installed
 from tests.commands.command_line import Run
 

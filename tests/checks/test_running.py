@@ -21,7 +21,7 @@ from pebble.checks.running.checks import CHECKS, MOVING
 from pebble.checks.running.robot import RobotUnderTest, reached
 from pebble.config import load
 from pebble.fleet import certificates
-from pebble.setup.places import Places
+from pebble.runtime.places import Places
 from tests.commands.command_line import running
 from tests.robot.named import Hall, Named
 from tests.robot.operator import Operator, retained_messages

@@ -18,7 +18,7 @@ from pebble.checks.running import machine
 from pebble.checks.running.robot import RobotUnderTest
 from pebble.config import parse
 from pebble.fleet import certificates
-from pebble.setup.places import Places
+from pebble.runtime.places import Places
 from tests.support import free_port
 
 RUNS = {"LoadState": "loaded", "ActiveState": "active", "SubState": "running", "UnitFileState": "enabled"}

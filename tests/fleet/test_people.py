@@ -14,7 +14,7 @@ import pytest
 
 from pebble.errors import PebbleError
 from pebble.fleet.database import DatabaseError
-from pebble.fleet.people import SESSION_S, People, PeopleError, TooManyTriesError, User
+from pebble.fleet.people import SESSION_S, People, PeopleError, TooManyTriesError, User, has_user
 from pebble.fleet.roles import LOCAL, Role, page_rights
 from pebble.fleet.tries import TRIES, WINDOW_S, network_of
 
@@ -307,3 +307,14 @@ def test_while_there_is_no_usable_file_a_session_stays_what_it_was_and_no_empty_
         assert people.session(token) == session
         people.end_session(token)
         assert people.session(token) is None
+
+
+def test_a_look_for_a_person_writes_nothing_and_needs_no_tables(tmp_path: Path) -> None:
+    file = tmp_path / "people.sqlite"
+    assert (has_user(file), file.exists()) == (False, False)
+    file.touch()
+    assert (has_user(file), file.stat().st_size) == (False, 0)
+    with closing(People(file)) as people:
+        assert not has_user(file)
+        people.add("ann", "correct horse", Role.ADMIN)
+    assert (has_user(file), has_user(file, "ann"), has_user(file, "eve")) == (True, True, False)

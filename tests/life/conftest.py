@@ -79,7 +79,7 @@ def installed(
     try:
         machine.boot()
         machine.sh(f"apt-get install --quiet --yes /mnt/{packages.folder.name}/{OLD}/*.deb", timeout=300)
-        machine.run("pebble", "--wheels", "/mnt/wheels", "--version", timeout=600)
+        machine.run("pebble-slot", "take", "--wheels", "/mnt/wheels", timeout=600)
         machine.cut()
         yield machine
     finally:

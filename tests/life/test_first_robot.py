@@ -95,12 +95,12 @@ def answered(robot: Robot, clock: Clock) -> str:
         (f"Name [{NAME}]", ""),
         (f"answer [{BY_ID}/usb-board]", ""),
         ("answer [none]", "synthetic"),
-        ("answer [here]", ""),
+        ("[:PORT] [here]", ""),
         ("Page [Y/n]", ""),
         ("everything [", "ann"),
         ("Password of ann: ", PASSWORD),
         ("Again: ", PASSWORD),
-        ("Do it?", "y"),
+        ("Do it? [Y/n]", ""),
     ):
         terminal.answers(prompt, text)
     clock.did("all is answered")
@@ -175,6 +175,10 @@ def test_a_stranger_installs_a_robot_and_drives_it_with_a_phone(blank: Machine, 
     robot, clock = Robot(blank), Clock()
     blank.sh(f"apt-get install --quiet --yes /mnt/{packages.folder.name}/{OLD}/*.deb", timeout=300)
     clock.did("the package is installed")
+    assert blank.run("pebble").endswith("sudo pebble setup\n")
+    assert blank.run("pebble", "--version") == f"pebble {OLD}\n"
+    assert "make a robot of this machine" in blank.run("pebble", "--help")
+    assert not blank.succeeds("test", "-e", "/opt/pebble/a"), "that needed no slot"
     with phone_beside(blank) as browser:
         shown = answered(robot, clock)
         assert QUESTION.findall(shown) == list("12345"), "the sixth is whether to do it"
@@ -182,7 +186,7 @@ def test_a_stranger_installs_a_robot_and_drives_it_with_a_phone(blank: Machine, 
         assert url == f"https://{NAME}.local:8080/"
         with tab(browser, url, "phone", engineers=False, ignore_https_errors=True) as opened:
             phone = Phone(opened)
-            assert fingerprint(opened, url) in shown.replace(":", "")
+            assert fingerprint(opened, url) in re.sub(r"\s", "", shown)
             phone.logs_in()
             phone.sees("document.querySelectorAll('.fleet-card').length === 1")
             clock.did("the phone has logged in")

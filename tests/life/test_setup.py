@@ -1,4 +1,4 @@
-"""From a package and a file of answers to a robot with heartbeats, and a page on which its user logs in."""
+"""From a package and a file of answers to a robot with heartbeats and a page; and from its backup to it again."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import json
 from typing import Any
 
 from pebble.checks.report.secrets_here import secrets_of
-from pebble.setup.places import Places
+from pebble.runtime.places import Places
 from tests.kit.machine import Machine
 from tests.life.robots import BASE, PORT, ROBOT, Robot
 from tests.support import until
@@ -35,7 +35,7 @@ print(ask("/"), ask("/api/login", {{"user": "ann", "password": "{PASSWORD}"}}))
 """
 
 
-SETUP = ("pebble", "setup", "--answers", "/srv/answers.json", "--yes")
+SETUP = ("pebble", "setup", "--answers", "/srv/answers.json")
 #: What a person types on a robot, with which outputs go to others.
 COMMANDS = (
     ("pebble", "doctor", "/etc/pebble/robot.json", "--running"),
@@ -44,6 +44,13 @@ COMMANDS = (
     ("pebble", "setup", "--backup", "/srv/goob.tar"),
     ("pebble", "web", "user", "list"),
     ("systemctl", "restart", "pebble.service"),
+)
+#: Everything but what the robot writes while it runs.
+OWNERS = "find /etc/pebble /etc/mosquitto /var/lib/pebble/people.sqlite -not -type l -printf '%u:%g %m %p\n' | sort"
+BLANK = (
+    "systemctl disable --now pebble; systemctl stop mosquitto;"
+    "rm -r /etc/pebble /var/lib/pebble /etc/mosquitto/pebble /etc/mosquitto/conf.d/pebble.conf;"
+    "systemd-tmpfiles --create pebble.conf"
 )
 
 
@@ -67,11 +74,16 @@ def test_package_and_setup_make_a_robot_with_heartbeats_and_let_its_user_in(mach
         shown = [done, *(machine.run(*command, check=False, timeout=300) for command in COMMANDS)]
         assert machine.succeeds(*receives)
         again = machine.run(*SETUP, timeout=300)
-        assert " new " not in again
+        assert "All is so already." in again
+        before = machine.sh(OWNERS)
+        machine.sh(BLANK)
+        shown.append(machine.run("pebble", "setup", "--from", "/srv/goob.tar", timeout=300))
+        assert machine.succeeds(*receives), "the backup is the same robot"
+        assert machine.sh(OWNERS) == before
         machine.run("env", "PLANTED=in-an-environment", "sleep", "1.5")
-    texts = [*seen, *map(str.encode, shown), machine.run("journalctl", "--output=export").encode()]
+    texts = [*(text.decode(errors="replace") for text in seen), *shown, machine.run("journalctl", "--output=export")]
     secrets = secrets_of(Places(machine.root), None, [machine.root / "srv/password"])
-    assert len({one.where for one in secrets.known}) > 5, "passwords, and keys of the page and of the broker"
-    assert [where for text in texts if (where := secrets.found_in("", text))] == []
+    assert len({*secrets.known.values()}) > 5, "passwords, and keys of the page and of the broker"
+    assert [text for text in texts if secrets.hidden(text) != text] == []
     planted = (b"in-an-environment", b"sleep\x001.5", b"mosquitto_sub\0", b"--running\0", b"--report\0", b"--backup\0")
     assert [text for text in planted if not any(text in one for one in seen)] == [], "that is found where it is"

@@ -1,4 +1,4 @@
-"""What tests of setup share: a scratch root, a file of answers, and the command line inside this process."""
+"""What tests of setup share: a scratch root, and the command line inside this process, at that root."""
 
 from __future__ import annotations
 
@@ -6,8 +6,11 @@ from pathlib import Path
 
 import pytest
 
+from pebble.commands import setup as command
+from pebble.runtime.places import Places
+from pebble.setup import system
 from tests.commands.command_line import Run
-from tests.setup.rig import answers_in, machine_root
+from tests.setup.rig import machine, machine_root
 
 
 @pytest.fixture
@@ -16,10 +19,12 @@ def root(tmp_path: Path) -> Path:
 
 
 @pytest.fixture
-def run(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Run:
+def run(root: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Run:
+    at(root, monkeypatch)
     return Run(monkeypatch, capsys)
 
 
-@pytest.fixture
-def answers(tmp_path: Path) -> Path:
-    return answers_in(tmp_path)
+def at(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let the command act on this machine."""
+    monkeypatch.setattr(system, "System", lambda: machine(root))
+    monkeypatch.setattr(command, "Places", lambda: Places(root))

@@ -15,22 +15,31 @@ from typing import Any
 
 import pytest
 
+from pebble.commands import setup as command
 from pebble.fleet import applying, certificates
 from pebble.fleet.folder import load as load_fleet
 from pebble.fleet.people import People
 from pebble.motion.latch import Latch
 from pebble.perception.camera_model import CameraModel
+from pebble.runtime.places import Places
 from pebble.services.serial_mcu_bridge.motion.state_file import StateFile
 from pebble.setup.backup import ABOUT, BackupError, make, packed, read, unpacked
-from pebble.setup.places import Places
 from tests.checks.installed import BROKER, MQTT, PAGE, PEOPLE, ROBOT, config_of, installed
 from tests.commands.command_line import Run
 from tests.support import ROOT
 
 
+class Backup(Run):
+    """``pebble setup --backup FILE`` on the machine below a root."""
+
+    def of(self, root: Path, file: Path) -> int:
+        self._monkeypatch.setattr(command, "Places", lambda: Places(root))
+        return self("setup", "--backup", file)
+
+
 @pytest.fixture
-def run(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Run:
-    return Run(monkeypatch, capsys)
+def run(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Backup:
+    return Backup(monkeypatch, capsys)
 
 
 @pytest.fixture(scope="module")
@@ -101,11 +110,11 @@ def test_what_is_not_in_it(places: Places) -> None:
     assert all(not name.startswith(("/", "..")) for name in made.files)
 
 
-def test_the_command(places: Places, tmp_path: Path, run: Run) -> None:
+def test_the_command(places: Places, tmp_path: Path, run: Backup) -> None:
     file = tmp_path / "goob.tar"
     before = os.umask(0)
     try:
-        assert run("setup", "--backup", file, "--root", places.root) == 0
+        assert run.of(places.root, file) == 0
     finally:
         os.umask(before)
     assert stat.S_IMODE(file.stat().st_mode) == 0o600
@@ -115,7 +124,7 @@ def test_the_command(places: Places, tmp_path: Path, run: Run) -> None:
     about = read(file).about
     assert (about.format, about.id) == (1, "goob")
     first = file.read_bytes()
-    assert run("setup", "--backup", file, "--root", places.root) == 2
+    assert run.of(places.root, file) == 2
     assert "exists: name another file" in run.err
     assert file.read_bytes() == first
     listed = subprocess.run(["tar", "tf", file], capture_output=True, text=True, check=True).stdout.splitlines()
@@ -125,14 +134,14 @@ def test_the_command(places: Places, tmp_path: Path, run: Run) -> None:
 def test_others_cannot_read_it_from_its_first_byte_on(places: Places, tmp_path: Path) -> None:
     """The call that makes the file makes it so."""
     file, log = tmp_path / "goob.tar", tmp_path / "calls"
-    command = [sys.executable, "-m", "pebble.cli", "setup", "--backup", str(file), "--root", str(places.root)]
     audit = (
-        "import sys, os, runpy\n"
+        "import sys, os, pathlib\n"
+        "from pebble.commands.backup import backup\n"
+        "from pebble.runtime.places import Places\n"
         f"log = open({str(log)!r}, 'w')\n"
         f"sys.addaudithook(lambda name, arguments: name == 'open' and arguments[0] == {str(file)!r}\n"
         "    and print(arguments[2], os.umask(os.umask(0)), os.path.exists(arguments[0]), file=log))\n"
-        f"sys.argv = {command[2:]!r}\n"
-        "runpy.run_module('pebble.cli', run_name='__main__')\n"
+        f"backup(pathlib.Path({str(file)!r}), Places(pathlib.Path({str(places.root)!r})))\n"
     )
     subprocess.run([sys.executable, "-c", audit], cwd=ROOT, check=True, capture_output=True)
     assert stat.S_IMODE(file.stat().st_mode) == 0o600
@@ -140,17 +149,17 @@ def test_others_cannot_read_it_from_its_first_byte_on(places: Places, tmp_path: 
     assert (int(flags) & os.O_EXCL != 0, existed) == (True, "False")
 
 
-def test_nothing_is_left_of_one_that_cannot_be_made(tmp_path: Path, run: Run) -> None:
+def test_nothing_is_left_of_one_that_cannot_be_made(tmp_path: Path, run: Backup) -> None:
     file = tmp_path / "goob.tar"
     with installed(tmp_path / "root") as broken:
         pass  # its database is closed
     (broken.root / PEOPLE).write_bytes(b"SQLite format 3\0" + bytes(4000))
-    assert run("setup", "--backup", file, "--root", broken.root) == 1
+    assert run.of(broken.root, file) == 1
     assert "people.sqlite: is" in run.err
     assert len(run.err.splitlines()) == 1
-    assert run("setup", "--backup", file, "--root", tmp_path / "elsewhere") == 1
+    assert run.of(tmp_path / "elsewhere", file) == 1
     assert "no robot is installed there" in run.err
-    assert run("setup", "--backup", tmp_path / "no" / "folder", "--root", tmp_path / "elsewhere") == 1
+    assert run.of(tmp_path / "elsewhere", tmp_path / "no" / "folder") == 1
     assert not file.exists()
 
 

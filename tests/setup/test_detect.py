@@ -5,8 +5,6 @@ from __future__ import annotations
 import os
 import pty
 import select
-import subprocess
-import sys
 import threading
 import tty
 from collections.abc import Iterator
@@ -15,18 +13,11 @@ from pathlib import Path
 
 import pytest
 
+from pebble.runtime.places import Places
 from pebble.services.serial_mcu_bridge.pebble_serial_v1 import frame
-from pebble.setup import detect
-from pebble.setup.detect import Machine
-from pebble.setup.manifest import Manifest
-from pebble.setup.places import Places
-from pebble.setup.plan import Plan, steps
-from pebble.setup.questions import Secrets, combined
-from pebble.setup.steps import Engine, State
-from tests.setup.rig import ANSWERS, machine_root, set_up
-from tests.support import needs_root
+from pebble.setup import detect, system
+from pebble.setup.system import SetupError
 
-_LISTENS = "mosquitto listens with logins, and beyond this machine encrypted"
 _HELLO = frame.encode(frame.Frame(frame.Type.HELLO, b"x"))
 
 
@@ -79,116 +70,37 @@ def test_a_port_that_cannot_be_opened_is_described(tmp_path: Path) -> None:
     assert found.text.startswith("cannot be opened")
 
 
-def test_a_file_that_is_no_camera_is_none(tmp_path: Path) -> None:
+def test_a_camera_is_known_by_the_name_that_stays(tmp_path: Path) -> None:
     cameras = tmp_path / "v4l/by-id"
     cameras.mkdir(parents=True)
-    (cameras / "usb-1").symlink_to("/dev/null")
-    assert not any("usb-1" in camera for camera in detect.cameras(tmp_path))
-
-
-@pytest.mark.parametrize(
-    ("machine", "step", "text"),
-    [
-        (Machine(mosquitto=detect.NO_MOSQUITTO), _LISTENS, detect.NO_MOSQUITTO),
-        (Machine(polkit=detect.NO_POLKIT), "the page may restart and reboot the robot", detect.NO_POLKIT),
-        (Machine(writable="/etc is read-only: …"), "config", "/etc is read-only: …"),
-    ],
-)
-def test_a_step_that_the_machine_does_not_allow_gives_the_reason(
-    machine: Machine, step: str, text: str, root: Path
-) -> None:
-    found = {result.step.what: result for result in set_up(root, machine)}
-    assert found[step].state is State.CANNOT
-    assert found[step].why == text
-    done = {result.step.what: result.state for result in set_up(root)}
-    assert done[step] is State.NEW, "the next run does what was left"
-
-
-SERVICE = "the robot starts with the machine"
-#: What a machine lacks, as a person reads it: the step that is not done, or none, and the whole text.
-LACKING = {
-    "no systemd": (
-        {"systemd": detect.NO_SYSTEMD},
-        SERVICE,
-        "systemd does not run here, so nothing starts the robot with the machine: pebble up /etc/pebble/robot.json",
-    ),
-    "no unit": (
-        {"unit": detect.NO_UNIT},
-        SERVICE,
-        "pebble.service is not installed, so nothing starts the robot with the machine:"
-        " sudo apt install ./pebble-robot_….deb, then sudo pebble setup",
-    ),
-    "no mosquitto": (
-        {"mosquitto": detect.NO_MOSQUITTO},
-        _LISTENS,
-        "mosquitto is not installed, so there is no broker on this robot:"
-        " sudo apt install mosquitto, then sudo pebble setup",
-    ),
-    "no polkit": (
-        {"polkit": detect.NO_POLKIT},
-        "the page may restart and reboot the robot",
-        "polkit is not installed, so the page cannot restart or reboot the robot:"
-        " sudo apt install polkitd, then sudo pebble setup",
-    ),
-    "32 bits": (
-        {"bits": detect.bits(2**31)},
-        None,
-        "this system has 32 bits, for which the versions of packages are not locked: install one of 64 bits",
-    ),
-    "offline": (
-        {"network": detect.OFFLINE},
-        None,
-        "this machine has no network, so no phone reaches it: join one, such as by sudo nmtui,"
-        " then sudo pebble cert renew --folder /etc/pebble/tls NAME.local ADDRESS",
-    ),
-    "unset clock": (
-        {"clock": detect.unset_clock(0.0, None)},
-        None,
-        "the clock is set to 1970, so certificates would be refused: sudo timedatectl set-ntp true,"
-        " then sudo pebble cert renew --folder /etc/pebble/tls",
-    ),
-}
-
-
-@pytest.mark.parametrize(("machine", "what", "text"), LACKING.values(), ids=LACKING)
-def test_what_a_machine_does_not_allow_is_named_with_what_to_type(
-    machine: dict[str, str], what: str | None, text: str, root: Path
-) -> None:
-    wanted = Plan(Places(root), combined(ANSWERS), Machine(**machine), Manifest(), Secrets())
-    found = Engine(wanted.places, wanted.manifest, is_live=True).states(steps(wanted))
-    cannot = [(result.step.what, result.why) for result in found if result.state is State.CANNOT]
-    assert (what, text) in [*cannot, *((None, why) for why in wanted.machine.lacks())]
-
-
-def test_a_machine_that_lacks_nothing(root: Path) -> None:
-    assert detect.bits(2**63) == ""
-    assert detect.unset_clock(1.8e9, True) == ""
-    found = detect.machine(Places(root))
-    assert (found.mosquitto, found.polkit, found.writable) == ("", "", "")
-    assert "pebble.service is not installed" in found.unit
+    for index in (0, 1):
+        (cameras / f"usb-cam-video-index{index}").symlink_to("/dev/null")
+    assert [camera for camera in detect.cameras(tmp_path) if "usb" in camera] == [f"{cameras}/usb-cam-video-index0"]
 
 
 @pytest.mark.parametrize("name", ["mosquitto.conf", "conf.d/own.conf"])
 def test_a_broker_with_listeners_of_its_own_is_left_alone(name: str, root: Path) -> None:
-    file = root / "etc/mosquitto" / name
-    file.parent.mkdir(exist_ok=True)
-    file.write_text("# mine\nlistener 1883\n")
-    assert f"/etc/mosquitto/{name} has its own `listener`" in detect.machine(Places(root)).mosquitto
+    assert detect.no_broker(Places(root)) == ""
+    (root / "etc/mosquitto" / name).write_text("# mine\nlistener 1883\n")
+    assert detect.no_broker(Places(root)).startswith(f"/etc/mosquitto/{name} has its own `listener`")
 
 
-@needs_root
-def test_a_read_only_root_is_recognised(tmp_path: Path) -> None:
-    root = machine_root(tmp_path)
-    command = f'mount --bind -o ro {root} {root} && mount -o remount,bind,ro {root} && exec "$@"'
-    script = (
-        "from pathlib import Path; from pebble.setup.detect import unwritable; from pebble.setup.places import Places;"
-        f"print(unwritable(Places(Path({str(root)!r}))))"
-    )
-    done = subprocess.run(
-        ["unshare", "-m", "sh", "-c", command, "sh", sys.executable, "-c", script],
-        capture_output=True,
-        text=True,
-        check=True,
-        timeout=60,
-    )
-    assert done.stdout.strip() == f"{root}/etc is read-only: sudo mount -o remount,rw {root}, then sudo pebble setup"
+def test_what_a_machine_lacks_is_named_with_what_to_type(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (root / "usr/lib/polkit-1/polkitd").unlink()
+    monkeypatch.setattr("time.time", lambda: 0.0)
+    monkeypatch.setattr(detect, "_has_network", lambda: False)
+    assert list(detect.lacks(Places(root))) == [
+        detect.NO_POLKIT,
+        "The clock is set to 1970, so certificates would be refused: sudo timedatectl set-ntp true,"
+        " then sudo pebble cert renew --folder /etc/pebble/tls",
+        detect.OFFLINE,
+    ]
+
+
+def test_a_machine_without_the_package_is_told_how_to_get_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(system, "is_root", lambda: False)
+    with pytest.raises(SetupError, match=r"^only root can do this: sudo pebble setup$"):
+        system.owner_of("root:pebble")
+    monkeypatch.setattr(system, "is_root", lambda: True)
+    with pytest.raises(SetupError, match=r"^there is no user no-such: sudo apt install no-such, then sudo"):
+        system.owner_of("root:no-such")

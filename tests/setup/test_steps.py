@@ -1,185 +1,141 @@
-"""Steps are done once, survive being killed, keep what was changed by hand, and can be undone."""
+"""Steps are done once, survive being killed, and keep what was written by hand."""
 
 from __future__ import annotations
 
 import json
 import os
 import signal
-import tempfile
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
-from pebble.fleet.people import People
-from pebble.setup import manifest
-from pebble.setup.manifest import Manifest
-from pebble.setup.places import Places
-from pebble.setup.steps import Engine, State, Step
+from pebble.config import load
+from pebble.runtime.places import Places
+from pebble.setup.robot_config import changed
+from pebble.setup.system import SetupError
 from tests.commands.command_line import Run
-from tests.setup.rig import PASSWORD, answers_in, in_child, machine_root, manifest_is_true, set_up, tree, without_rights
-from tests.support import cases, needs_root
+from tests.setup.rig import ANSWERS, PASSWORD, answers_in, in_child, machine_root, set_up, tree
+from tests.support import cases
 
-_MOMENTS = cases(6, 20)
-_LIVE = {
-    "user pebble",
-    "mosquitto starts with its part",
-    "the robot starts with the machine",
-    "the robot runs with this config",
-}
+_MOMENTS = cases(6, 110)
+RESTARTS = ["systemctl restart mosquitto.service", "systemctl restart pebble.service"]
 
 
-@pytest.fixture
-def open_folder() -> Iterator[Path]:
-    """A folder that all users read, unlike those of pytest."""
-    with tempfile.TemporaryDirectory() as name:
-        folder = Path(name)
-        folder.chmod(0o755)
-        yield folder
-
-
-def states(out: str) -> list[str]:
-    """The first column of a listing."""
-    words = [line[:15].strip() for line in out.splitlines()]
-    return [word for word in words if word in list(State)]
-
-
-def test_a_second_run_finds_all_the_same(root: Path, answers: Path, run: Run) -> None:
-    assert run("setup", "--root", root, "--answers", answers, "--yes") == 0
+def test_a_second_run_finds_all_as_it_should_be(root: Path, tmp_path: Path, run: Run) -> None:
+    answers = answers_in(tmp_path)
+    assert run("setup", "--answers", answers) == 1
+    assert run.out.count("Failed: systemd does not run here, so nothing starts the robot") == 1
     before = tree(root)
-    assert run("setup", "--root", root, "--answers", answers, "--yes") == 0
-    assert set(states(run.out)) == {State.SAME, State.SKIPPED}
-    assert "nothing: all was so before" in run.out
-    assert run("setup", "--root", root, "--yes") == 0, "the answers of the last time count"
+    assert run("setup", "--answers", answers) == 1
+    assert "All is so already." in run.out
     assert tree(root) == before
-    assert manifest_is_true(root)
-
-
-@needs_root
-def test_a_dry_run_of_an_ordinary_user_names_each_step_and_writes_nothing(open_folder: Path, run: Run) -> None:
-    root = machine_root(open_folder)
-    answers = answers_in(open_folder)
-    for file in open_folder.glob("a*"):
-        file.chmod(0o644)
-    before = tree(root)
-    line = ("setup", "--root", root, "--answers", answers, "--dry-run")
-    assert run(*line) == 0
-    named = states(run.out)
-    assert named.count(State.NEW) == 12
-    assert named.count(State.SKIPPED) == len(_LIVE)
-    assert tree(root) == before
-    set_up(root)
-    done = tree(root)
-
-    def again() -> str:
-        return f"{run(*line)} {run.err}\n{run.out}"
-
-    shown = without_rights(again)
-    assert shown.startswith("0 \n"), shown
-    assert len(states(shown)) == len(named)
-    assert tree(root) == done
 
 
 def test_killed_at_any_moment_it_goes_on_and_ends_with_the_same_tree(tmp_path: Path) -> None:
     whole = machine_root(tmp_path / "whole")
+    (whole / "run/systemd/system").mkdir(parents=True)
     status, changes = in_child(lambda: set_up(whole), below=whole)
     assert status == 0
     expected = tree(whole)
     for moment in range(_MOMENTS):
         root = machine_root(tmp_path / str(moment))
+        (root / "run/systemd/system").mkdir(parents=True)
         at = 1 + moment * (changes - 1) // (_MOMENTS - 1)
         status, _ = in_child(lambda root=root: set_up(root), kill_at=at, below=root)  # type: ignore[misc]
         assert os.waitstatus_to_exitcode(status) == -signal.SIGKILL, at
-        set_up(root)
-        assert tree(root) == expected, f"killed before change {at} of {changes}"
-        assert manifest_is_true(root), at
+        ran: list[str] = []
+        set_up(root, ran)
+        left = {path for path in tree(root) if Path(path).name.startswith(".") and path.endswith(".new")}
+        assert {path: shown for path, shown in tree(root).items() if path not in left} == expected, f"{at} of {changes}"
+        assert ran[-2:] == RESTARTS, f"{at} of {changes}"
 
 
-def test_undo_leaves_the_tree_of_before_but_state(root: Path, run: Run) -> None:
-    before = tree(root)
-    set_up(root)
-    assert run("setup", "--root", root, "--undo", "--dry-run") == 0
-    assert "remove /etc/pebble/robot.json" in run.out
-    assert run("setup", "--root", root, "--undo", "--yes") == 0
-    after = tree(root)
-    state = {"var/lib/pebble": after["var/lib/pebble"], "var/lib/pebble/people.sqlite": ("-rw-------", b"")}
-    assert after == before | state
-    set_up(root, user="eve")
-    with_both = People(Places(root).people)
-    assert [user.name for user in with_both.list()] == ["ann", "eve"]
-    with_both.close()
+def test_services_are_started_anew_for_what_they_read(root: Path) -> None:
+    (root / "run/systemd/system").mkdir(parents=True)
+    wants = root / "etc/systemd/system/multi-user.target.wants"
+    wants.mkdir(parents=True)
+    ran: list[str] = []
+    set_up(root, ran)
+    assert ran == ["systemctl enable pebble.service", *RESTARTS]
+    (wants / "pebble.service").touch()
+    assert set_up(root, ran) == []
+    assert set_up(root, ran, camera="none") == ["config /etc/pebble/robot.json"]
+    assert ran[3:] == RESTARTS[1:]
+    Places(root).unfinished.touch()
+    set_up(root, ran)
+    assert ran[4:] == RESTARTS, "it was killed before"
 
 
-def test_what_was_changed_by_hand_stays_and_is_named(root: Path, run: Run) -> None:
+def test_one_other_answer_changes_what_depends_on_it_and_leaves_what_was_written_by_hand(root: Path) -> None:
     set_up(root)
     config = Places(root).config
-    by_hand = config.read_text().replace("synthetic", "libcamera")
-    config.write_text(by_hand)
-    assert run("setup", "--root", root, "--yes", "--port", "none") == 0
-    assert "robot.json was changed by hand and stays: ours is /etc/pebble/robot.json.pebble-new" in run.out
-    assert config.read_text() == by_hand
-    ours = json.loads(config.with_name("robot.json.pebble-new").read_text())
-    assert "serial_mcu_bridge" not in ours["services"]
-    assert run("setup", "--root", root, "--undo", "--yes") == 0
-    assert "changed by hand  /etc/pebble/robot.json stays" in run.out
-    assert sorted(path.name for path in config.parent.iterdir()) == ["robot.json"]
-
-
-def test_a_purge_erases_keys_people_state_and_what_was_changed(root: Path, run: Run) -> None:
-    before = tree(root)
-    set_up(root)
-    places = Places(root)
-    places.config.write_text(places.config.read_text() + "\n")
-    set_up(root, camera="none")
-    assert places.config.with_name("robot.json.pebble-new").exists()
-    (places.state / "estop-serial-pebble+robots+goob.json").write_text("{}")
-    assert run("setup", "--root", root, "--undo", "--purge", "--yes") == 0
-    assert tree(root) == before
+    content = json.loads(config.read_text())
+    content["services"]["av_daemon"]["audio"] = {"enabled": True}
+    content["services"]["av_daemon"]["video"]["width"] = 320
+    content["services"]["recorder"] = {"enabled": True}
+    config.write_text(json.dumps(content))
+    assert set_up(root) == []
+    set_up(root, camera="/dev/video7")
+    set_up(root, camera="none", port="none")
+    services = json.loads(config.read_text())["services"]
+    assert services["av_daemon"] == {"enabled": False, "audio": {"enabled": True}, "video": {"width": 320}}
+    assert services["serial_mcu_bridge"] == {"enabled": False, "serial": {}}
+    assert services["recorder"] == {"enabled": True}
+    assert json.loads(config.with_name("robot.json.before").read_text())["services"]["av_daemon"]["enabled"]
+    set_up(root, **{key: ANSWERS[key] for key in ("camera", "port", "protocol")})
+    before = {key: value for key, value in content.items() if key != "//"}
+    assert before == {key: value for key, value in json.loads(config.read_text()).items() if key != "//"}
 
 
 @pytest.mark.parametrize(
-    ("changes", "gone"),
+    ("current", "before", "after", "result"),
     [
-        ({"page": False}, "etc/pebble/page.password etc/pebble/tls etc/pebble/tls/ca.key"),
-        ({"broker": "none", "page": False}, "etc/mosquitto/conf.d/pebble.conf etc/mosquitto/pebble"),
+        ({"a": 1}, {"a": 1}, {"a": 2}, {"a": 2}),
+        ({"a": 3}, {"a": 1}, {"a": 1}, {"a": 3}),
+        ({"a": 3}, {"a": 1}, {"a": 2}, {"a": 2}),
+        ({"a": 1, "b": 5}, {"a": 1}, {}, {"b": 5}),
+        ({"a": 3, "b": 5}, {"a": 1}, {}, {"a": 3, "b": 5}),
+        ({}, {"a": 1}, {"a": 1, "c": 2}, {"c": 2}),
+        ({"a": {"b": 1, "c": 2}}, {"a": {"b": 1}}, {"a": {"b": 3}}, {"a": {"b": 3, "c": 2}}),
+        ({"a": {"b": 1, "c": 2}}, {"a": {"b": 1}}, {}, {"a": {"c": 2}}),
+        ({"a": {"c": 2}}, {}, {"a": {"b": 1}}, {"a": {"b": 1, "c": 2}}),
     ],
 )
-def test_what_other_answers_do_not_need_is_removed(root: Path, changes: dict[str, object], gone: str) -> None:
+def test_a_change_of_a_config(
+    current: dict[str, object], before: dict[str, object], after: dict[str, object], result: dict[str, object]
+) -> None:
+    assert changed(current, before, after) == result
+
+
+def test_the_own_broker_ends_with_another_answer_and_comes_back(root: Path) -> None:
     set_up(root)
-    set_up(root, **changes)
-    assert not {*gone.split()} & tree(root).keys()
-    assert manifest_is_true(root)
+    password = (Places(root).etc / "broker.password").read_text()
+    set_up(root, broker="none", page=False)
+    assert not Places(root).broker.exists()
     set_up(root, broker="here", page=True)
-    assert {*gone.split()} <= tree(root).keys()
+    assert Places(root).broker.exists()
+    assert (Places(root).etc / "broker.password").read_text() != password
+    assert set_up(root) == []
 
 
-def test_commands_run_again_only_for_what_changed_and_are_undone(root: Path) -> None:
-    ran: list[str] = []
+def test_what_an_earlier_setup_had_written_is_removed_with_one_line(root: Path) -> None:
+    set_up(root)
     places = Places(root)
-    file = root / "etc/a"
-
-    def steps(content: bytes) -> list[Step]:
-        restart = ("systemctl", "restart", "a")
-        return [
-            Step(what="file", target=file, content=content),
-            Step(what="restart", command=restart, of=(file,), undo=("stop", "a"), after=restart, live=True),
-            Step(what="not here", command=("b",), cannot="there is no b", live=True),
-        ]
-
-    def engine(known: Manifest | None) -> Engine:
-        return Engine(places, known or Manifest(), run=lambda command: ran.append(" ".join(command)), is_live=True)
-
-    for content in (b"1", b"1", b"2"):
-        found = [result.state for result in engine(manifest.load(places)).apply(steps(content))]
-        assert found[2] is State.CANNOT
-    assert ran == ["systemctl restart a"] * 2
-    list(engine(manifest.load(places)).undo(steps(b"2"), purge=False))
-    assert ran[2:] == ["stop a", "systemctl restart a"]
-    assert not file.exists()
+    places.manifest.write_text('{"format": 1, "answers": {"id": "goob"}}')
+    assert set_up(root) == ["remove /etc/pebble/setup.json, which an earlier version needed"]
+    assert not places.manifest.exists()
+    assert load(places.config).robot.id == "goob"
 
 
-def test_no_password_is_shown_or_stored_but_where_it_belongs(root: Path, answers: Path, run: Run) -> None:
-    assert run("setup", "--root", root, "--answers", answers, "--yes") == 0
+def test_a_disk_that_takes_nothing_is_one_line(root: Path) -> None:
+    Places(root).state.rmdir()
+    Places(root).state.symlink_to("/dev/full")
+    with pytest.raises(SetupError, match=r"\A[^\n]+; what was done until then stays, and sudo pebble setup goes on "):
+        set_up(root)
+
+
+def test_no_password_is_shown_or_stored_but_where_it_belongs(root: Path, tmp_path: Path, run: Run) -> None:
+    run("setup", "--answers", answers_in(tmp_path))
     places = Places(root)
     secrets = [PASSWORD, *((places.etc / f"{name}.password").read_text().strip() for name in ("broker", "page"))]
     shown = [secret for secret in secrets if secret in run.out + run.err]

@@ -27,7 +27,7 @@ from pebble.config.problems import Notes
 from pebble.config.raw import decode, plain, read_text
 from pebble.config.secret_text import without_secrets
 from pebble.errors import PebbleError
-from pebble.setup.places import Places
+from pebble.runtime.places import Places
 from pebble.version import __version__
 
 _JOURNAL_LINES = 2000

@@ -16,7 +16,7 @@ from msgspec.structs import fields
 from pebble.config import Config
 from pebble.config.secret_text import HIDDEN
 from pebble.config.types import Secret, Section
-from pebble.setup.places import Places
+from pebble.runtime.places import Places
 
 _SHORTEST = 4  # characters: a shorter one is in every text
 _LARGEST = 1 << 20  # bytes of a file of passwords; others are no such files

@@ -21,7 +21,7 @@ from pebble.config.web import is_loopback
 from pebble.contract.identity import parse_topic
 from pebble.errors import PebbleError
 from pebble.runtime.addresses import Addresses
-from pebble.setup.places import Places
+from pebble.runtime.places import Places
 from pebble.transports import Message, Transport
 
 PATIENCE_S, RESTS_S = 3.0, 0.75

@@ -18,7 +18,7 @@ from pebble.fleet.audit import Audit
 from pebble.fleet.audit_rows import Entry
 from pebble.fleet.people import People
 from pebble.fleet.roles import Role
-from pebble.setup.places import Places
+from pebble.runtime.places import Places
 
 PEOPLE = "people.sqlite"
 PLACES = Places()

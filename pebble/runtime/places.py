@@ -1,4 +1,4 @@
-"""Where an installed robot has its files, below ``/`` or below another root."""
+"""The places of an installed robot's files, below ``/`` or below another root."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -7,18 +7,13 @@ from pathlib import Path
 
 @dataclass(frozen=True)
 class Places:
-    """The paths of an installed robot. ``root`` is ``/``, or a folder that stands for it in tests and dry runs."""
+    """The paths of an installed robot. ``root`` is ``/``, or a folder that stands for it in tests and reports."""
 
     root: Path = Path("/")
 
-    @property
-    def is_live(self) -> bool:
-        """Whether it is the system that runs, of which services can be started."""
-        return self.root == Path("/")
-
     @cached_property
     def etc(self) -> Path:
-        """Config, passwords, certificates and the manifest: ``root:pebble``, files 0640."""
+        """Config, passwords and certificates: ``root:pebble``, files 0640."""
         return self.root / "etc/pebble"
 
     @cached_property
@@ -26,13 +21,18 @@ class Places:
         return self.etc / "robot.json"
 
     @cached_property
+    def unfinished(self) -> Path:
+        """A mark while setup runs: programs that read its files were not yet started anew. No backup has it."""
+        return self.etc / "setup.new"
+
+    @cached_property
     def manifest(self) -> Path:
-        """What ``pebble setup`` was answered, and the SHA-256 of each file that it wrote."""
+        """A list of an earlier setup, which nothing reads now."""
         return self.etc / "setup.json"
 
     @cached_property
     def state(self) -> Path:
-        """What survives a power cut, the stop among it: ``pebble:pebble``, 0700. ``$STATE_DIRECTORY`` of the unit."""
+        """The stop, and all that survives a power cut: ``pebble:pebble``, 0700. ``$STATE_DIRECTORY`` of the unit."""
         return self.root / "var/lib/pebble"
 
     @cached_property
@@ -52,7 +52,7 @@ class Places:
 
     @cached_property
     def broker(self) -> Path:
-        """The part of mosquitto's configuration that is ours."""
+        """Our part of mosquitto's configuration."""
         return self.root / "etc/mosquitto/conf.d/pebble.conf"
 
     @cached_property
@@ -67,9 +67,9 @@ class Places:
 
     @cached_property
     def people(self) -> Path:
-        """Who may use the robot's page. It keeps its name when the robot gets another."""
+        """The users of the robot's page. The file keeps its name when the robot gets another."""
         return self.state / "people.sqlite"
 
     def named(self, path: Path) -> str:
-        """The path as it is on the machine whose root this is."""
+        """Return the path as it is on the machine whose root this is."""
         return f"/{path.relative_to(self.root)}"

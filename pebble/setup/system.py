@@ -1,0 +1,84 @@
+"""The machine that setup changes: files with their owners, and programs of the system."""
+
+import grp
+import os
+import pwd
+import shutil
+import subprocess
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from pebble.errors import PebbleError
+from pebble.fleet.whole_file import is_root, write
+from pebble.runtime.places import Places
+
+ROBOTS = "root:pebble"  # what the robot reads, and only root changes
+ROBOT = "pebble:pebble"
+MOSQUITTO = "mosquitto:mosquitto"
+_COMMAND_S = 120.0
+_PACKAGES = {"pebble": "./pebble-robot_….deb", "mosquitto": "mosquitto"}
+
+
+class SetupError(PebbleError):
+    """A machine cannot be set up as asked. Example: ``only root can do this: sudo pebble setup``."""
+
+
+def run_command(command: Sequence[str]) -> None:
+    """Run a program of the system. Raises SetupError with its first line of complaint."""
+    line = " ".join(command)
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=_COMMAND_S)
+    except OSError as error:
+        raise SetupError(f"`{line}`: {error.strerror}") from None
+    except subprocess.TimeoutExpired:
+        raise SetupError(f"`{line}` did not end within {_COMMAND_S:g} s") from None
+    if done.returncode != 0:
+        complaint = (done.stderr.strip() or done.stdout.strip() or "it failed").splitlines()[0]
+        raise SetupError(f"`{line}`: {complaint}")
+
+
+def owner_of(names: str) -> tuple[int, int]:
+    """Return the ids of ``user:group``, which packages of Debian have made. Raises SetupError."""
+    if not is_root():
+        raise SetupError("only root can do this: sudo pebble setup")
+    user, _, group = names.partition(":")
+    try:
+        return pwd.getpwnam(user).pw_uid, grp.getgrnam(group).gr_gid
+    except KeyError:
+        package = _PACKAGES.get(group, group)
+        raise SetupError(f"there is no user {group}: sudo apt install {package}, then sudo pebble setup") from None
+
+
+@dataclass(frozen=True)
+class System:
+    """One machine. Tests give it another root, and keep programs from being run and files from being given away."""
+
+    places: Places = field(default_factory=Places)
+    run: Callable[[Sequence[str]], None] = run_command
+    owner: Callable[[str], tuple[int, int] | None] = owner_of
+
+    @property
+    def has_systemd(self) -> bool:
+        return (self.places.root / "run/systemd/system").is_dir()
+
+    def write(self, file: Path, content: bytes, mode: int = 0o640, owner: str = ROBOTS) -> None:
+        """Replace a file at once. Raises SetupError."""
+        write(file, content, mode, SetupError, self.owner(owner))
+
+    def make_folder(self, folder: Path, mode: int, owner: str, fill: Callable[[Path], None] | None = None) -> None:
+        """Make a folder, filled beside its place, so that it is there whole or not at all. Raises SetupError."""
+        ids = self.owner(owner)
+        new = folder.with_name(f".{folder.name}.new")
+        try:
+            shutil.rmtree(new, ignore_errors=True)
+            new.mkdir(mode=0o700)
+            if fill is not None:
+                fill(new)
+            if ids is not None:
+                for path in (*new.iterdir(), new):
+                    os.chown(path, *ids, follow_symlinks=False)
+            new.chmod(mode)
+            new.rename(folder)
+        except OSError as error:
+            raise SetupError(f"{folder}: {error.strerror}") from None
