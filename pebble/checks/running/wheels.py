@@ -1,17 +1,17 @@
 """The check that turns wheels: a little way, after a person has agreed, and under control that no other person had."""
 
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 
 import msgspec
 
 from pebble.checks.check import CheckResult, failed, ok, skipped
-from pebble.checks.observer import Record
+from pebble.checks.conform.motion import moves_until
 from pebble.checks.running.robot import RobotUnderTest, Side
 from pebble.client.control import ControlClient
 from pebble.client.pace_of_link import WIDE
-from pebble.contract import DRIVE, TOUCH_SENSORS, codec
+from pebble.contract import DRIVE, codec
 from pebble.contract.payloads import Drive
 from pebble.transports import Message
 
@@ -19,7 +19,6 @@ SPEED, DRIVES_S = 0.2, 0.3
 _STEP_S = 0.05
 _LOOKS_S = 0.5  # so much longer wheels are looked at
 _CONTROL_S = 3.0
-_SWING = 30  # of a sensor's value: less is noise, as for pebble.perception.hall
 _SENSORS = "set services.serial_mcu_bridge.telemetry.publish_touch_sensors to true"
 _LOG = "pebble doctor CONFIG; journalctl -u pebble -n 50"
 
@@ -47,7 +46,7 @@ def wheels(robot: RobotUnderTest) -> CheckResult:
 
 
 def _drive(robot: RobotUnderTest, side: Side, control: ControlClient, speed: float) -> CheckResult | float | None:
-    """How long after the last command they turned; None: there are no samples of them."""
+    """Return how long after the last command they turned; None if nothing shows them."""
     side.publish([_command(side, control, Drive())])  # after a reset it waits for one
     began = sent_at = time.monotonic()
     while time.monotonic() < began + DRIVES_S:
@@ -59,29 +58,14 @@ def _drive(robot: RobotUnderTest, side: Side, control: ControlClient, speed: flo
         side.publish([_command(side, control, Drive(z=speed, valid_ms=side.view.pace.valid_ms))])
         _hold(robot, side, control, max(_STEP_S, side.view.pace.step_s))
     _hold(robot, side, control, robot.rests_s + _LOOKS_S)
-    samples = robot.inside.of(TOUCH_SENSORS, began - _STEP_S)
-    if not samples:
+    until = moves_until(robot.inside, began)
+    if until is None:
         return None
-    turned = [at for at in _turns(samples) if at >= began]
-    if not turned:
+    if until == 0.0:
         return failed(f"they did not turn at {speed:+.1f}", f"battery, motors and their wires; {_LOG}")
-    if turned[-1] - sent_at > robot.rests_s:
-        return failed(f"they still turned {turned[-1] - sent_at:.2f} s after the last command", _LOG)
-    return max(0.0, turned[-1] - sent_at)
-
-
-def _turns(samples: Iterable[Record]) -> Iterator[float]:
-    """Return when a wheel had turned on, by any of its sensors."""
-    level: tuple[int, ...] | None = None
-    for sample in samples:
-        if sample.value is None:
-            continue
-        values = msgspec.structs.astuple(sample.value.value)
-        if level is None:
-            level = values
-        elif any(abs(value - before) > _SWING for value, before in zip(values, level, strict=True)):
-            level = values
-            yield sample.at
+    if until - sent_at > robot.rests_s:
+        return failed(f"they still turned {until - sent_at:.2f} s after the last command", _LOG)
+    return max(0.0, until - sent_at)
 
 
 @contextmanager
