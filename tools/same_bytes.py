@@ -170,7 +170,7 @@ def run(tree: Path) -> Counter[str]:
 def robot(direct: int, remote: int, local: int) -> None:
     """This runs in a process of its own, with the modules of the tree that is measured."""
     from pebble import contract
-    from pebble.bench.clients import AHEAD, ZERO, RobotSubscriber, StockClient
+    from pebble.bench.clients import RobotSubscriber, StockClient
     from pebble.rig.processes import Processes
     from pebble.rig.robot import BASE, MEDIA, Robot
 
@@ -184,9 +184,9 @@ def robot(direct: int, remote: int, local: int) -> None:
         one.expect(lambda: seen.ready_ns is not None, "not ready", 60)
         time.sleep(3)
         for _ in range(40):
-            client.send(contract.DRIVE, BASE, AHEAD)
+            client.send(contract.DRIVE, BASE, {"x": 0.0, "z": 0.3})
             time.sleep(0.05)
-        client.send(contract.DRIVE, BASE, ZERO)
+        client.send(contract.DRIVE, BASE, {"x": 0.0, "z": 0.0})
         client.send(contract.CONTROL, BASE, {"id": "0badf00d", "by": "ann"})
         time.sleep(1)
         client.send(contract.CONTROL, BASE, {"id": "0badf00d", "by": "ann", "want": "release"})
