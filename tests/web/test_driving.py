@@ -25,7 +25,7 @@ class World:
     """One server, whose time is ``now``, and pages that it has just received from."""
 
     def __init__(self) -> None:
-        self.driving = Driving("here")
+        self.driving = Driving()
         self.now = 100.0
         self._names = count(1)
 
@@ -44,7 +44,7 @@ class World:
         return tab
 
     def take(self, tab: Tab, *, over: bool = False) -> str:
-        return self.driving.take(tab, REF, self.now, int(1000 * self.now), over=over).refused
+        return self.driving.take(tab, REF, self.now, over=over).refused
 
     def drive(self, tab: Tab, g: int, *, z: float = 0.5, ref: str = REF, age: float = 0.0, blocked: str = "") -> object:
         """Commands, or why it was refused."""
@@ -267,7 +267,7 @@ def test_who_has_just_driven_is_asked_and_who_rests_is_not(world: World) -> None
 def test_taking_over_stops_the_one_before(world: World) -> None:
     tab, other = world.holder(), world.tab("eve")
     world.drive(tab, 1)
-    commands, refused = world.driving.take(other, REF, world.now, 0, over=True)
+    commands, refused = world.driving.take(other, REF, world.now, over=True)
     assert (commands, refused) == ([FINAL], "")
     world.now += STEP_S
     assert world.drive(tab, 1) == LET_GO
@@ -364,56 +364,18 @@ def test_a_revoked_user_has_no_lease_to_come_back_to(world: World) -> None:
     assert world.driving.leases == {}
 
 
-# -- other servers
-
-
-def announce(world: World, since_s: float, server: str = "there") -> list[Command]:
-    robots = {REF: ("eve", "phone", int(1000 * since_s))}
-    return world.driving.announced(server, robots, world.now)
-
-
-def test_the_newer_lease_counts(world: World) -> None:
-    tab = world.holder()
-    world.drive(tab, 1)
-    assert announce(world, world.now - 10) == []
-    assert REF in world.driving.leases
-    assert announce(world, world.now + 10) == [FINAL]
-    assert world.drive(tab, 2) == "eve at there is driving"
-
-
-def test_what_another_server_drives_can_be_taken_over(world: World) -> None:
-    announce(world, world.now - 10)
-    tab = world.tab()
-    assert world.take(tab) == "eve at there is driving"
-    assert world.take(tab, over=True) == ""
-    announce(world, world.now - 10)
-    assert world.drive(tab, 1) == [MOVE]
-
-
-def test_a_server_that_is_no_longer_received_drives_nothing(world: World) -> None:
-    announce(world, world.now)
-    world.wait(3.1)
-    assert world.take(world.tab()) == ""
-
-
-def test_a_server_may_release_a_robot(world: World) -> None:
-    announce(world, world.now)
-    world.driving.announced("there", {}, world.now)
-    assert world.take(world.tab()) == ""
-
-
 def test_who_takes_another_robot_moves_the_first_one_no_more(world: World) -> None:
     tab = world.holder()
     assert world.drive(tab, 1) == [MOVE]
-    assert world.driving.moved_by(REF, world.now) == "anna"
-    assert world.driving.take(tab, OTHER, world.now, 0) == ([FINAL], "")
-    assert world.driving.moved_by(REF, world.now) == ""
+    assert world.driving.moved_by(REF) == "anna"
+    assert world.driving.take(tab, OTHER, world.now) == ([FINAL], "")
+    assert world.driving.moved_by(REF) == ""
     assert world.drive(tab, 1, ref=OTHER) == LET_GO
 
 
 def test_each_robot_has_a_lease_of_its_own(world: World) -> None:
     tab, other = world.holder(), world.tab("eve")
-    assert world.driving.take(other, OTHER, world.now, 0) == ([], "")
+    assert world.driving.take(other, OTHER, world.now) == ([], "")
     assert world.drive(tab, 1) == [MOVE]
     assert world.drive(other, 1, ref=OTHER) == [Command(OTHER, MOVE.drive)]
     assert world.drive(other, 1, ref=REF) == "anna is driving"

@@ -80,24 +80,24 @@ class Controls:
 
     # -- of robots
 
-    def update(self, ref: str, now: float, epoch_ms: int) -> list[Command]:
+    def update(self, ref: str, now: float) -> list[Command]:
         """A robot has answered, or is another one than before."""
         commands: list[Command] = []
         for wish in [one for one in self._wishes if one.ref == ref]:
-            commands += self._update(wish, now, epoch_ms)
+            commands += self._update(wish, now)
         robot, lease = self._robot_of(ref), self._driving.leases.get(ref)
         if lease is not None and lease.control is None and robot is not None and robot.controlled:
             commands += self._driving.revoke(ref, now)
         self._driving.changed.add(ref)
         return commands
 
-    def tick(self, now: float, epoch_ms: int) -> Step:
+    def tick(self, now: float) -> Step:
         """What to publish now."""
         commands: list[Command] = []
         messages: list[Message] = []
         for wish in list(self._wishes):
             messages += wish.client.tick(now)
-            commands += self._update(wish, now, epoch_ms)
+            commands += self._update(wish, now)
         self._wishes = [one for one in self._wishes if not self._is_over(one, now)]
         return Step(commands, messages)
 
@@ -108,7 +108,7 @@ class Controls:
         state = self.state(ref)
         if state is None or not state.id or any(one.client.id == state.id for one in self._wishes):
             return None
-        return Elsewhere("", state.by or "somebody", state.device)
+        return Elsewhere(state.by or "somebody", state.device)
 
     def state(self, ref: str) -> ControlState | None:
         """It is what that robot has published; None if it does not keep control itself."""
@@ -125,7 +125,7 @@ class Controls:
     def _of(self, tab: Tab, ref: str) -> Wish | None:
         return next((one for one in self._wishes if one.tab is tab and one.ref == ref), None)
 
-    def _update(self, wish: Wish, now: float, epoch_ms: int) -> list[Command]:
+    def _update(self, wish: Wish, now: float) -> list[Command]:
         client, lease = wish.client, self._driving.leases.get(wish.ref)
         robot = self._robot_of(wish.ref)
         if robot is None or not robot.controlled or robot.control is not client.robot:
@@ -137,7 +137,7 @@ class Controls:
             commands = self._driving.revoke(wish.ref, now)
             has = False
         if client.held and not has:
-            commands += self._driving.grant(wish.tab, wish.ref, client, now, epoch_ms)
+            commands += self._driving.grant(wish.tab, wish.ref, client, now)
             wish.granted()
         if client.failed:
             if not had:  # who has had it sees who has it now

@@ -1,6 +1,5 @@
-"""What pages, robots and other servers want of driving, and what is published for it."""
+"""What pages and robots want of driving, and what is published for it."""
 
-import time
 from collections.abc import Callable
 
 from msgspec.structs import replace
@@ -10,33 +9,30 @@ from pebble.client.estop import send
 from pebble.client.pace_of_link import WIDE, Pace
 from pebble.client.robot_view import RobotView
 from pebble.contract import DRIVE, codec
-from pebble.transports import Message
 from pebble.transports.clock import since_boot as clock
 from pebble.web import messages as m
 from pebble.web.drive.controls import Controls
-from pebble.web.drive.driven_here import DrivenHere
 from pebble.web.drive.driving import Command, Driving, Tab
 from pebble.web.drive.refusals import Refusals
 from pebble.web.robots import Robots
 
 
 class Drivers:
-    """It belongs to one server, which others know as ``server``. What a method decides is published at once."""
+    """It belongs to one server. What a method decides is published at once."""
 
-    def __init__(self, server: str, broker: Broker, robots: Robots) -> None:
-        self.driving = Driving(server)
+    def __init__(self, broker: Broker, robots: Robots) -> None:
+        self.driving = Driving()
         self.controls = Controls(self.driving, robots.view)
         self.refusals = Refusals(broker, self.driving, robots.view)
-        self.driving.held_elsewhere, self.driving.pace_of = self.controls.elsewhere, self.pace_of
-        self._broker, self._robots, self._here = broker, robots, DrivenHere(server)
-        self._here.always = broker.proves_hosts(self._here.topic)
+        self.driving.elsewhere, self.driving.pace_of = self.controls.elsewhere, self.pace_of
+        self._broker, self._robots = broker, robots
 
     def pace_of(self, ref: str) -> Pace:
         robot = self._robots.view(ref)
         return WIDE if robot is None else robot.pace
 
     def keeps_control(self, ref: str) -> bool:
-        """Whether that robot decides itself who drives it; of others, the servers announce it to each other."""
+        """Whether that robot decides itself who drives it; of others, each server decides for its own pages."""
         robot = self._robots.view(ref)
         return robot is not None and robot.controlled
 
@@ -54,7 +50,7 @@ class Drivers:
             why = self.controls.ask(tab, robot, now, granted, failed, over=over)
             self._send_control(now)
         else:
-            commands, why = self.driving.take(tab, robot.base, now, _epoch_ms(), over=over)
+            commands, why = self.driving.take(tab, robot.base, now, over=over)
             self._publish(commands)
             if not why:
                 granted()
@@ -109,37 +105,29 @@ class Drivers:
 
     def view(self, tab: Tab, ref: str) -> m.DriverView:
         """What this page is shown of who drives a robot."""
-        now, state = clock(), self.controls.state(ref)
+        state = self.controls.state(ref)
         view = m.DriverView(keeps=self.keeps_control(ref), asking=self.controls.asks(tab, ref))
         if state is not None:
             asks = (state.asks or "somebody") if state.asks_id else ""
             view = replace(view, asks=asks, checked=state.named, others=state.others)
-        if (other := self.driving.elsewhere(ref, now)) is not None:
-            return replace(view, by=other.by, device=other.device, server=other.server)
+        if (other := self.controls.elsewhere(ref)) is not None:
+            return replace(view, by=other.by, device=other.device)
         lease = self.driving.leases.get(ref)
         if lease is None:
             return view
         driver = lease.tab
-        idle = None if driver.live is not None and driver.live_ref == ref else now - lease.idle_from
+        idle = None if driver.live is not None and driver.live_ref == ref else clock() - lease.idle_from
         return replace(view, by=driver.user, device=driver.device, you=driver is tab, idle_s=idle)
 
-    # -- of robots and other servers
+    # -- of robots
 
     def updated(self, ref: str) -> None:
         """A robot has published what it can do, or who has control."""
-        self._publish(self.controls.update(ref, clock(), _epoch_ms()))
+        self._publish(self.controls.update(ref, clock()))
 
     def moved(self, ref: str) -> None:
         """A robot is at another broker: what moves it has an end there, and begins anew."""
         self._publish(self.driving.interrupt(ref, clock()))
-
-    def announced(self, message: Message, _now: float) -> None:
-        """Another server drives robots."""
-        announced = self._here.receive(message)
-        if announced is not None:
-            server, robots = announced
-            robots = {ref: one for ref, one in robots.items() if not self.keeps_control(ref)}
-            self._publish(self.driving.announced(server, robots, clock()))
 
     # -- what is due
 
@@ -147,17 +135,11 @@ class Drivers:
         self._publish(self.driving.tick(now))
         self._send_control(now)
 
-    def announce(self, now: float) -> None:
-        """Tell other servers."""
-        leases = {ref: one for ref, one in self.driving.leases.items() if one.control is None}
-        for message in self._here.tick(leases, now, _epoch_ms()):
-            self._broker.publish(message.topic, message.payload)
-
     # -- inside
 
     def _send_control(self, now: float) -> None:
         """Publish what is due of control; after the zeros of who has had it."""
-        step = self.controls.tick(now, _epoch_ms())
+        step = self.controls.tick(now)
         self._publish(step.commands)
         send(self._broker.publish, step.messages)
 
@@ -168,10 +150,5 @@ class Drivers:
             topic = self._robots.topic(ref, "drive", "topic", DRIVE)
             accepted = self._broker.publish(topic, codec.encode(DRIVE, drive), qos=qos, by=by) and accepted
         changed, self.driving.changed = self.driving.changed, set()
-        self._here.changed |= changed
         self._robots.mark_drivers(changed)
         return accepted
-
-
-def _epoch_ms() -> int:
-    return int(1000 * time.time())

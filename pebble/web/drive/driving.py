@@ -22,8 +22,6 @@ SILENCE_S = 0.25  # without a command of a gesture it is over
 REPEATS_S = (0.1, 0.2)  # after a zero of the server's own
 TAKEN_FROM_IDLE_S = 5.0  # a driver who has not moved for so long is not asked
 RESERVED_S = 5.0  # for a page that connects again
-ANNOUNCED_S = 3.0  # so long another server's announcement counts; they come every second
-MAX_ANNOUNCED = 1000  # robots, by other servers
 
 LET_GO = "Let go first"
 ZERO, FINAL_ZERO = Drive(), Drive(valid_ms=0)
@@ -55,7 +53,6 @@ class Lease:
     """The right to drive one robot."""
 
     tab: Tab
-    since_ms: int  # epoch
     idle_from: float
     moving: bool = False  # its last command was no zero
     sent_at: float = float("-inf")  # of the last command that was forwarded
@@ -70,21 +67,10 @@ class Lease:
 
 
 class Elsewhere(NamedTuple):
-    """Who drives a robot, but not by this server. ``server``: by which; "" where the robot has told it itself."""
+    """Who drives a robot, as it says itself, but not by this server."""
 
-    server: str
     by: str
     device: str
-
-
-class Announced(NamedTuple):
-    """A lease at another server."""
-
-    server: str
-    by: str
-    device: str
-    since_ms: int
-    at: float
 
 
 class Outcome(NamedTuple):
@@ -97,14 +83,12 @@ class Outcome(NamedTuple):
 class Driving:
     """All leases of one server. ``changed`` collects the robots whose driver is another one than before."""
 
-    def __init__(self, server: str = "") -> None:
+    def __init__(self) -> None:
         self.leases: dict[str, Lease] = {}
         self.changed: set[str] = set()
-        self.held_elsewhere: Callable[[str], Elsewhere | None] = lambda _ref: None  # as robots tell it themselves
+        self.elsewhere: Callable[[str], Elsewhere | None] = lambda _ref: None
         self.pace_of: Callable[[str], Pace] = lambda _ref: WIDE
         self.renew_key()
-        self.server = server
-        self._announced: dict[str, Announced] = {}
         self._reserved: dict[str, tuple[str, Lease, float]] = {}  # by token: the robot, and until when
         self._repeats: dict[str, list[float]] = {}  # by robot: when to send a zero again
 
@@ -114,7 +98,7 @@ class Driving:
 
     # -- leases
 
-    def take(self, tab: Tab, ref: str, now: float, epoch_ms: int, *, over: bool = False) -> Outcome:
+    def take(self, tab: Tab, ref: str, now: float, *, over: bool = False) -> Outcome:
         """Give ``tab`` the lease; ``over``: also from a driver who is active."""
         lease = self.leases.get(ref)
         if lease is not None and lease.tab is tab:
@@ -124,17 +108,16 @@ class Driving:
         commands = [] if lease is None else self._end_lease(ref, now)
         if tab.live is not None:  # it moves another robot: inputs that are held now move neither
             commands += self._end_gesture(tab, tab.live, now)
-        self._announced.pop(ref, None)
-        self.leases[ref] = Lease(tab, epoch_ms, now)
+        self.leases[ref] = Lease(tab, now)
         self.changed.add(ref)
         return Outcome(commands)
 
-    def grant(self, tab: Tab, ref: str, control: ControlClient, now: float, epoch_ms: int) -> list[Command]:
+    def grant(self, tab: Tab, ref: str, control: ControlClient, now: float) -> list[Command]:
         """The robot has given ``tab`` the control that it keeps itself."""
         commands = self._end_lease(ref, now) if ref in self.leases else []
         if tab.live is not None:
             commands += self._end_gesture(tab, tab.live, now)
-        self.leases[ref] = Lease(tab, epoch_ms, now, control=control, decided=control.decided)
+        self.leases[ref] = Lease(tab, now, control=control, decided=control.decided)
         self.changed.add(ref)
         return commands
 
@@ -176,37 +159,13 @@ class Driving:
             return commands, ""
         if lease.control is not None:
             return commands, ref
-        self.leases[ref] = Lease(tab, lease.since_ms, now)
+        self.leases[ref] = Lease(tab, now)
         self.changed.add(ref)
         return commands, ""
 
-    def announced(self, server: str, robots: dict[str, tuple[str, str, int]], now: float) -> list[Command]:
-        """Take over what another server announces: by robot, who drives it, from which device and since when."""
-        commands: list[Command] = []
-        for ref in [ref for ref, one in self._announced.items() if one.server == server and ref not in robots]:
-            del self._announced[ref]
-            self.changed.add(ref)
-        for ref, (by, device, since_ms) in robots.items():
-            lease = self.leases.get(ref)
-            if lease is not None and (since_ms, server) < (lease.since_ms, self.server):
-                continue  # that server will learn of ours, and give way
-            if lease is not None:
-                commands += self._end_lease(ref, now)
-            if ref in self._announced or len(self._announced) < MAX_ANNOUNCED:
-                self._announced[ref] = Announced(server, by, device, since_ms, now)
-                self.changed.add(ref)
-        return commands
-
-    def elsewhere(self, ref: str, now: float) -> Elsewhere | None:
-        """The lease of that robot at another server."""
-        one = self._announced.get(ref)
-        if one is not None and now - one.at <= ANNOUNCED_S:
-            return Elsewhere(one.server, one.by, one.device)
-        return self.held_elsewhere(ref)
-
-    def moved_by(self, ref: str, now: float) -> str:
-        """Who moves that robot now: while a gesture lasts, or a lease at another server. Empty: no page does."""
-        if (other := self.elsewhere(ref, now)) is not None:
+    def moved_by(self, ref: str) -> str:
+        """Return who moves that robot now: while a gesture lasts, or as the robot says. Empty: no page does."""
+        if (other := self.elsewhere(ref)) is not None:
             return other.by
         lease = self.leases.get(ref)
         return "" if lease is None or lease.tab.live is None or lease.tab.live_ref != ref else lease.tab.user
@@ -255,9 +214,6 @@ class Driving:
             elif now - lease.idle_from > IDLE_S:
                 commands += self._end_lease(ref, now)
         commands += list(self._repeated(now))
-        for ref in [ref for ref, one in self._announced.items() if now - one.at > ANNOUNCED_S]:
-            del self._announced[ref]
-            self.changed.add(ref)
         for token in [token for token, (_, _, until) in self._reserved.items() if now > until]:
             del self._reserved[token]
         return commands
@@ -266,8 +222,8 @@ class Driving:
 
     def _active(self, ref: str, now: float) -> str:
         """Who drives it now and has to be asked; empty: it can be taken."""
-        if (other := self.elsewhere(ref, now)) is not None:
-            return f"{other.by} at {other.server}" if other.server else other.by
+        if (other := self.elsewhere(ref)) is not None:
+            return other.by
         lease = self.leases.get(ref)
         if lease is None or (lease.tab.live is None and now - lease.idle_from >= TAKEN_FROM_IDLE_S):
             return ""

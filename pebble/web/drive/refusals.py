@@ -7,7 +7,6 @@ from pebble.client.broker import Broker
 from pebble.client.drive_reasons import SCRIPT_ORDER, SERVER_ORDER, Code, Situation, first_reason
 from pebble.client.named_topics import why_not
 from pebble.client.robot_view import RobotView
-from pebble.transports.clock import since_boot as clock
 from pebble.web import messages as m
 from pebble.web import robot_commands
 from pebble.web.drive.driving import Driving
@@ -42,7 +41,7 @@ class Refusals:
 
     def _of_script(self, robot: RobotView) -> str:
         """Why no script may begin now."""
-        by = self._driving.moved_by(robot.base, clock())
+        by = self._driving.moved_by(robot.base)
         situation = self._situation(robot)._replace(driven=bool(by) and not robot.arbitrates)
         match first_reason(situation, SCRIPT_ORDER):
             case Code.UNSEEN:
