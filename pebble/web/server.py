@@ -71,7 +71,7 @@ class Server:
             audit,
             known.__contains__,
             self.robots.components.__contains__,
-            lambda ref: self.drivers.pace_of(ref).answer_s,
+            lambda ref: self.drivers.robot(ref).pace.answer_s,
         )
         self.people_version = (0, 0, 0)
         self._tasks: set[asyncio.Task[None]] = set()
@@ -81,7 +81,7 @@ class Server:
         self.broker.on_move(self._moved)
         await self.broker.open()
         self.broker.on_state(self._show_broker)
-        self.broker.on_state(self.drivers.driving.renew_key)
+        self.broker.on_state(self.drivers.renew_keys)
         self._show_broker()
         for channel in (*FLEET, *SYNONYMS):
             deferred = channel is ONLINE or channel in SYNONYMS

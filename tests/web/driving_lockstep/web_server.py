@@ -148,7 +148,8 @@ class WebServer(Process):
         super().__init__("web", network.scheduler)
         self.lives = 0
         self.roles: dict[int, Role] = {}
-        self.lease_moved: Callable[[Any], None] = lambda tab: None  # by the robot
+        self.base = ""  # of the robot that the rules are about
+        self.lease_moved: Callable[[Any], None] = lambda tab: None
         self._network, self._rewrite, self._handling = network, rewrite, handling
         self._restart = 0
         self.loop: VirtualLoop | None = None
@@ -166,19 +167,27 @@ class WebServer(Process):
             self.server = server.Server(
                 WebSettings(broker=MqttSettings(host="fair"), server="fair"), _Nothing(), _Nothing()
             )  # type: ignore[arg-type]
-        driving = self.server.drivers.driving
-        driving.revoke = self._revoked(driving)
+        drivers = self.server.drivers
+        drivers.updated, drivers.tick = self._watched(drivers.updated), self._watched(drivers.tick)
         self.loop.create_task(self.server.open())
         self.wake()
 
-    def _revoked(self, driving: Any) -> Any:
-        revoke = driving.revoke
+    def driven(self, ref: str) -> Any:
+        """Who drives that robot, as the server knows it."""
+        return self.server.drivers.robot(ref)
 
-        def revoked(ref: str, now: float) -> Any:
-            self.lease_moved(driving.leases[ref].tab)
-            return revoke(ref, now)
+    def _watched(self, method: Callable[[Any], None]) -> Callable[[Any], None]:
+        """The method of the server's drivers, after which the rules see whether a page has lost control by it."""
 
-        return revoked
+        def watched(argument: Any) -> None:
+            robots = self.server.drivers._driven.values()
+            before = [(robot, robot.tab) for robot in robots if robot.tab is not None]
+            method(argument)
+            for robot, tab in before:
+                if robot.tab is not tab and robot.ref == self.base:
+                    self.lease_moved(tab)
+
+        return watched
 
     def kill(self, restart_s: float | None) -> None:
         """End at once: nothing is published any more."""

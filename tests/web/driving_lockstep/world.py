@@ -96,8 +96,8 @@ class World:
         self.silent_until = 0.0
         self.server = WebServer(self.network, self.rules.rewrite, self._handling)
         self.rules.stopping = lambda: any(not one.finished for one, _ in self.server.server.stops._senders.values())
-        self.server.lease_moved = self.rules.lease_moved
-        self.rules.driving = lambda: self.server.server.drivers.driving
+        self.server.base, self.server.lease_moved = BASE, self.rules.lease_moved
+        self.rules.driven = lambda: self.server.driven(BASE)
         self.rules.reachable = self.reaches
         self.rules.owner_up = self._owner_up
         self.rules.path_s = lambda: 0.003 + self.server.delay + self.owner.delay
@@ -227,8 +227,7 @@ class World:
             return
         self.rules.handling(control, op, before)
         if not before:
-            lease = self.server.server.drivers.driving.leases.get(BASE)
-            tab = None if lease is None else lease.tab
+            tab = self.server.driven(BASE).tab
             if self._lease is not None and self._lease is not tab:
                 self.rules.lease_moved(self._lease)
             self._lease = tab
