@@ -44,7 +44,8 @@ class World:
         self.tokens: dict[str, str] = {}
         self.marked: set[str] = set()
         self.accepts = True
-        self.blocked = ""
+        self.blocked = self.nameless = ""
+        self.granted = 0
         self._numbers = count(1)
         self._arriving: list[Message] = []
         self.owners = {base: KeepingRobot(base) for base in (GOOB, FRED)}
@@ -54,7 +55,9 @@ class World:
             view=self.views.get, topic=lambda ref, *_: c.DRIVE.topic(ref), mark_drivers=self.marked.update
         )
         self.drivers = Drivers(broker, robots)  # type: ignore[arg-type]
-        self.drivers.refusals = SimpleNamespace(of_driving=lambda _ref: self.blocked, nameless=lambda _view: "")  # type: ignore[assignment]
+        self.drivers.refusals = SimpleNamespace(
+            of_driving=lambda _ref: self.blocked, nameless=lambda _view: self.nameless
+        )  # type: ignore[assignment]
         for owner in self.owners.values():
             owner.owners[0].start(self.now)
         for base in self.views:
@@ -82,8 +85,8 @@ class World:
                 self.now += float(seconds)
             case ["blocked", *why]:
                 self.blocked = " ".join(why)
-            case ["deaf"]:
-                self.accepts = False
+            case ["deaf"] | ["hears"]:  # the broker
+                self.accepts = words == ["hears"]
             case ["moved"]:
                 self.note(self.drivers.robot(ref).moved_by or "nobody")
             case ["robot", *what]:
@@ -106,6 +109,12 @@ class World:
                 self.drivers.updated(ref)
             case ["silent"]:
                 self.owners[ref].owners[0].receives = False
+            case ["drives", "not"]:
+                self.views[ref].capabilities = {"outlets": {}}
+            case ["tells", "nothing"]:
+                self.views[ref].capabilities = {}
+            case ["takes", "names"]:
+                self.nameless = "goob takes commands with names only"
             case ["moves", "host"]:
                 self.drivers.moved(ref)
 
@@ -117,7 +126,7 @@ class World:
         match what:
             case ["takes"] | ["takes", "over"]:
                 view = self.views[ref]
-                self.drivers.take(tab, view, lambda: None, self.note, over=len(what) == 2)
+                self.drivers.take(tab, view, self.grant, self.note, over=len(what) == 2)
             case ["drives", g, *late]:
                 self.drive(tab, ref, int(g), late, z=0.5)
             case ["goes", "on", g, "for", seconds]:
@@ -140,6 +149,9 @@ class World:
 
     def note(self, what: str) -> None:
         self.happened.append(what)
+
+    def grant(self) -> None:
+        self.granted += 1
 
     def connect(self, who: str, token: str = "") -> Tab:
         tab = self.tabs[who] = Tab(f"token {next(self._numbers)}", who, "desk")
@@ -307,9 +319,7 @@ HISTORIES = {
         ann drives 2: go
         ann rests 1: zero
         wait 0.05
-        ann drives 2: go
-        wait 0.3: final
-        wait 0.3: final, final""",
+        ann drives 2: go""",
     "a robot that may not move does not": """
         ann takes
         ann drives 1: go
@@ -338,7 +348,11 @@ HISTORIES = {
     "a command that the broker does not take ends the gesture": """
         ann takes
         deaf
-        ann drives 1: The server cannot reach the broker""",
+        ann drives 1: The server cannot reach the broker
+        hears
+        ann drives 1: Let go first
+        wait 0.3: final, final
+        ann drives 2: go""",
     # -- stops
     "a stop ends the gesture that moves the robot": """
         ann takes
@@ -348,6 +362,11 @@ HISTORIES = {
         ann drives 1: Let go first
         ann drives 2: go""",
     "a stop is forwarded without a driver": "stop: final",
+    "a stop is forwarded to what may drive only": """
+        robot drives not
+        stop
+        robot tells nothing
+        stop: final""",
     "a robot that is at another broker needs a new gesture": """
         ann takes
         ann drives 1: go
@@ -398,6 +417,10 @@ HISTORIES = {
         ann rests 1: zero
         wait 59
         ann sees: you""",
+    "who has no name does not get control of a robot that takes names": """
+        robot takes names
+        ann takes: goob takes commands with names only
+        ann drives 1: Take control to drive""",
     "who gives control back drives no more": """
         ann takes
         ann drives 1: go
@@ -578,6 +601,16 @@ ROBOT_GIVES = {
         bob takes
         ann goes on 1 for 31: go, ann drives on, go
         bob sees: ann""",
+    "who is taken over by one who asked before is not refused": """
+        bob takes
+        ann takes
+        bob releases
+        ann sees: you
+        bob takes over
+        bob sees: you
+        ann sees: bob
+        wait 1
+        bob sees: you""",
     "who asks and leaves asks no more": """
         ann takes
         bob takes
@@ -734,6 +767,39 @@ def test_pages_are_told_whenever_who_drives_changes(world: World) -> None:
         world.marked.clear()
         world.tell(line)
         assert world.marked == ({GOOB} if tells else set()), line
+
+
+@pytest.mark.parametrize("world", ["keeps"], indirect=True)
+def test_pages_are_told_what_is_asked_before_the_robot_answers(world: World) -> None:
+    world.wait(STEP_S)
+    for line, tells in (
+        ("stranger takes", True), ("ann sees: eve", False), ("robot silent", False), ("ann takes", True),
+        ("ann releases", True),
+    ):  # fmt: skip
+        world.marked.clear()
+        world.tell(line)
+        assert world.marked == ({GOOB} if tells else set()), line
+
+
+def test_who_gets_and_gives_control_is_known_for_the_audit(world: World) -> None:
+    world.tell("ann takes\n ann takes over")
+    assert world.granted == (1 if world.views[GOOB].controlled else 2)
+    world.tell("bob sees: ann" + ("" if world.views[GOOB].controlled else ", no control"))
+    ann, bob = world.tabs["ann"], world.tabs["bob"]
+    assert [world.drivers.release(tab, GOOB) for tab in (bob, ann, ann)] == [False, True, False]
+
+
+def test_whether_wheels_move_is_known_for_the_audit(world: World) -> None:
+    world.tell("ann takes")
+    tab = world.tabs["ann"]
+
+    def drive(g: int, z: float) -> tuple[bool, str]:
+        return world.drivers.drive(tab, DriveOp(ref=GOOB, g=g, t=1000 * world.now, z=z), "")
+
+    assert [drive(1, 0.5), drive(1, 0.5), drive(1, 0.0)] == [(True, ""), (False, ""), (False, "")]
+    assert drive(1, 0.5) == (False, "Let go first")
+    world.perform(["deaf"])
+    assert drive(2, 0.5) == (False, "The server cannot reach the broker")
 
 
 def test_of_a_robot_that_rests_nothing_is_remembered(world: World) -> None:

@@ -52,7 +52,7 @@ class Step(NamedTuple):
     """What follows from an event."""
 
     state: State
-    halts: bool = False  # by a final zero that is repeated, unless a zero was the last command
+    halts: bool = False  # by a final zero, which is repeated
     gives_back: bool = False  # who has had control tells the robot
 
 
@@ -84,13 +84,6 @@ class Outcome(NamedTuple):
 
     commands: list[Command]
     refused: str = ""
-
-
-class Turn(NamedTuple):
-    """What is to be published, in this order."""
-
-    commands: list[Command]
-    messages: list[Message]
 
 
 @dataclass(slots=True, eq=False)
@@ -133,7 +126,6 @@ class DrivenRobot:
         self._decided = ""  # the key with which it was given
         self._wishes: dict[Tab, Wish] = {}
         self._idle_from = self._sent_at = self._received_at = float("-inf")
-        self._rolling = False  # the last command was no zero
         self._repeats: list[float] = []  # when to send a zero again
         self._awaited = ("", float("-inf"))  # a page, by its token, that had control; and until when
         self.renew_key()
@@ -202,7 +194,7 @@ class DrivenRobot:
     # -- control
 
     def take(
-        self, tab: Tab, now: float, granted: Callable[[], None], failed: Callable[[str], None], *, over: bool = False
+        self, tab: Tab, now: float, granted: Callable[[], None], failed: Callable[[str], None], *, over: bool
     ) -> list[Command]:
         """Want control for this page; ``over``: also from who drives."""
         robot = self._view()
@@ -222,12 +214,14 @@ class DrivenRobot:
 
     def release(self, tab: Tab, now: float) -> list[Command]:
         """Give control back, or do not ask for it any more."""
+        if self.tab is tab:
+            return self._on(Event.ENDED, now)
         if (wish := self._wishes.get(tab)) is not None:
             wish.client.release()
             self._changed.add(self.ref)
-        return self._on(Event.ENDED, now) if self.tab is tab else []
+        return []
 
-    def closed(self, tab: Tab, now: float, *, for_good: bool = False) -> list[Command]:
+    def closed(self, tab: Tab, now: float, *, for_good: bool) -> list[Command]:
         """Take note that the connection has ended; ``for_good``: the user may no longer drive, so nothing is kept."""
         if self.tab is tab and not for_good:
             self._awaited = (tab.token, now + AWAITED_S)
@@ -261,7 +255,7 @@ class DrivenRobot:
         pace = self.pace
         if now - self._sent_at < pace.step_s:
             return Outcome([])
-        self._sent_at, self._rolling = now, True
+        self._sent_at = now
         drive = self._signed(Drive(x=op.x, z=op.z, y=op.y, valid_ms=WIDE.valid_ms))
         return Outcome([Command(self.ref, pace.dated(drive, now, self._key), pace.qos)])
 
@@ -274,8 +268,8 @@ class DrivenRobot:
         """End the gesture that moves it."""
         return self._on(Event.INTERRUPTED, now)
 
-    def tick(self, now: float) -> Turn:
-        """End what is silent or idle, and say what is due; to be called every 50 ms."""
+    def tick(self, now: float) -> tuple[list[Command], list[Message]]:
+        """End what is silent or idle; what is to be published, in this order. To be called every 50 ms."""
         commands: list[Command] = []
         if self.state is State.MOVING and now - self._received_at > SILENCE_S:
             commands += self.interrupt(now)
@@ -291,7 +285,7 @@ class DrivenRobot:
             commands += self._answered(tab, wish, now)
             if self._is_over(wish, now):
                 del self._wishes[tab]
-        return Turn(commands, messages)
+        return commands, messages
 
     # -- inside
 
@@ -303,7 +297,7 @@ class DrivenRobot:
         if self.state is State.MOVING and self.tab is not None:  # each step from there ends the gesture
             self.tab.over = max(self.tab.over, self.tab.gesture)
             self.tab.moves, self._idle_from = None, now
-        commands = self._final_zero(now) if step.halts and self._rolling else []
+        commands = self._final_zero(now) if step.halts else []
         if step.gives_back and self.client is not None:
             self.client.release()
         if step.state is State.FREE:
@@ -376,8 +370,6 @@ class DrivenRobot:
     def _zero(self, tab: Tab, op: DriveOp, now: float) -> list[Command]:
         """Forward it always. At the end of a gesture it is the release."""
         tab.over = max(tab.over, op.g)
-        if self.tab is tab:
-            self._rolling = False
         if tab.moves is self and op.g >= tab.gesture:
             self._on(Event.LETS_GO, now)
         commands = tab.interrupt(op.g, now)  # what it moves elsewhere
@@ -391,6 +383,5 @@ class DrivenRobot:
         return replace(drive, key=key) if key else drive
 
     def _final_zero(self, now: float) -> list[Command]:
-        self._rolling = False
         self._repeats = [now + after for after in REPEATS_S]
         return [Command(self.ref, FINAL_ZERO)]
