@@ -79,13 +79,6 @@ class Command(NamedTuple):
     qos: QoS = WIDE.qos
 
 
-class Outcome(NamedTuple):
-    """What follows from a command of a page: commands to publish, and why it was refused, if it was."""
-
-    commands: list[Command]
-    refused: str = ""
-
-
 @dataclass(slots=True, eq=False)
 class Tab:
     """One control connection of a page. It moves one robot at a time."""
@@ -239,14 +232,17 @@ class DrivenRobot:
 
     # -- commands
 
-    def drive(self, tab: Tab, op: DriveOp, now: float, blocked: str = "") -> Outcome:
-        """Judge a command of a gesture. ``blocked``: why this robot may not be moved. Raises ClockJumpError."""
+    def drive(self, tab: Tab, op: DriveOp, now: float, blocked: str) -> tuple[list[Command], str]:
+        """Judge a command of a gesture: what is to be published, and why it was refused, if it was.
+
+        ``blocked``: why this robot may not be moved. Raises ClockJumpError.
+        """
         if not (op.x or op.z or op.y):
-            return Outcome(self._zero(tab, op, now))
+            return self._zero(tab, op, now), ""
         if op.g <= tab.over:
-            return Outcome([], LET_GO)
+            return [], LET_GO
         if why := self._why_not(tab, op, now) or blocked:
-            return Outcome(tab.interrupt(op.g, now), why)
+            return tab.interrupt(op.g, now), why
         if tab.moves is None:
             tab.moves, tab.gesture = self, op.g
             self._sent_at, self._repeats = float("-inf"), []  # repeated zeros would interrupt it
@@ -254,10 +250,10 @@ class DrivenRobot:
         self._received_at = now
         pace = self.pace
         if now - self._sent_at < pace.step_s:
-            return Outcome([])
+            return [], ""
         self._sent_at = now
         drive = self._signed(Drive(x=op.x, z=op.z, y=op.y, valid_ms=WIDE.valid_ms))
-        return Outcome([Command(self.ref, pace.dated(drive, now, self._key), pace.qos)])
+        return [Command(self.ref, pace.dated(drive, now, self._key), pace.qos)], ""
 
     def stop(self, now: float) -> list[Command]:
         """Halt it for anybody; the gesture that moves it is over."""

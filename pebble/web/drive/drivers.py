@@ -73,8 +73,7 @@ class Drivers:
         """The connection of a page has ended; ``for_good``: its user may no longer drive."""
         now, wanted = clock(), [robot for robot in self._driven.values() if robot.wanted_by(tab)]
         try:
-            for robot in wanted:
-                self._publish(robot.closed(tab, now, for_good=for_good))
+            self._publish([zero for robot in wanted for zero in robot.closed(tab, now, for_good=for_good)])
         finally:
             for robot in wanted:
                 self._turn(robot, now)
@@ -86,14 +85,14 @@ class Drivers:
     def drive(self, tab: Tab, op: m.DriveOp, blocked: str) -> tuple[bool, str]:
         """Judge a command of a gesture, and publish what follows: whether wheels move now, and why it was refused."""
         now, robot = clock(), self.robot(op.ref)
-        outcome = robot.drive(tab, op, now, blocked or self.refusals.of_driving(op.ref))
-        accepted = self._publish(outcome.commands, tab.user)
-        if outcome.refused:
-            return False, outcome.refused
+        commands, refused = robot.drive(tab, op, now, blocked or self.refusals.of_driving(op.ref))
+        accepted = self._publish(commands, tab.user)
+        if refused:
+            return False, refused
         if not accepted:
             self._publish(robot.stop(now))
             return False, "The server cannot reach the broker"
-        return bool(outcome.commands) and outcome.commands[0].drive.moves, ""
+        return bool(commands) and commands[0].drive.moves, ""
 
     def stop(self, ref: str, by: str) -> None:
         """A zero from anybody, who need not drive."""

@@ -180,12 +180,10 @@ class WebServer(Process):
         """The method of the server's drivers, after which the rules see whether a page has lost control by it."""
 
         def watched(argument: Any) -> None:
-            robots = self.server.drivers._driven.values()
-            before = [(robot, robot.tab) for robot in robots if robot.tab is not None]
+            tab = self.driven(self.base).tab
             method(argument)
-            for robot, tab in before:
-                if robot.tab is not tab and robot.ref == self.base:
-                    self.lease_moved(tab)
+            if tab is not None and self.driven(self.base).tab is not tab:
+                self.lease_moved(tab)
 
         return watched
 
