@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
 from itertools import count, groupby
 from types import SimpleNamespace
 from typing import Any
@@ -205,7 +204,7 @@ class World:
         self.drivers.updated(base)
 
     def ask_as_stranger(self, ref: str, want: str) -> None:
-        request = {"id": STRANGER, "by": "eve", "device": "phone", "want": "release" if want == "releases" else "hold"}
+        request: dict[str, Any] = {"id": STRANGER, "by": "eve", "device": "phone", "want": "release" if want == "releases" else "hold"}
         topic = (c.CONTROL_TAKE if want == "takes" else c.CONTROL).topic(ref)
         self._arriving.append(Message(topic, json.dumps(request).encode()))
 
@@ -218,7 +217,7 @@ class World:
             + ["no control"] * (not view.keeps)
         )
 
-    def _publish(self, topic: str, payload: bytes, *, qos: QoS = QoS.DELIVERED, by: str = "", **_: Any) -> bool:
+    def _publish(self, topic: str, payload: bytes, *, qos: QoS = QoS.DELIVERED, by: str = "", **_more: Any) -> bool:
         if not self.accepts:
             return False
         base, _, metric = topic.partition("/incoming/")
@@ -238,7 +237,7 @@ KINDS = {"none": False, "keeps": True}
 
 
 @pytest.fixture(params=KINDS)
-def world(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Iterator[World]:
+def world(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> World:
     world = World(keeps=KINDS[request.param])
     monkeypatch.setattr(module, "clock", lambda: world.now)
     return world
@@ -825,4 +824,5 @@ def test_how_long_who_has_control_has_rested_is_shown(world: World) -> None:
     assert world.drivers.robot(GOOB).shown(world.tabs["ann"], world.now).idle_s is None
     world.tell("ann rests 1: zero\n wait 2")
     view = world.drivers.robot(GOOB).shown(world.tabs["ann"], world.now)
-    assert (view.idle_s, view.device) == (pytest.approx(2), "desk")
+    assert view.idle_s == pytest.approx(2)
+    assert view.device == "desk"
