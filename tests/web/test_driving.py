@@ -204,7 +204,7 @@ class World:
         self.drivers.updated(base)
 
     def ask_as_stranger(self, ref: str, want: str) -> None:
-        request: dict[str, Any] = {"id": STRANGER, "by": "eve", "device": "phone", "want": "release" if want == "releases" else "hold"}
+        request = {"id": STRANGER, "by": "eve", "want": "release" if want == "releases" else "hold"}
         topic = (c.CONTROL_TAKE if want == "takes" else c.CONTROL).topic(ref)
         self._arriving.append(Message(topic, json.dumps(request).encode()))
 
