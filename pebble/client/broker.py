@@ -11,6 +11,7 @@ from typing import Final
 
 from pebble.client.arrived import Arrived, Handler
 from pebble.client.named_topics import NamedTopics
+from pebble.contract import BRIDGE_PROBE, codec
 from pebble.errors import TransportError
 from pebble.runtime.by_name import EACH_S, ByName
 from pebble.runtime.every_host import EveryHost, operators
@@ -19,6 +20,7 @@ from pebble.transports import Message, MqttSettings, QoS, State, Subscription, T
 log = logging.getLogger(__name__)
 
 ANSWER_S: Final = 0.25  # a broker that acknowledges nothing for longer would deliver commands late, all at once
+_PROBE_S: Final = 1.0
 _DELIVER_S: Final = 0.01  # for them at a time: whatever else is due must not wait for a flood
 
 
@@ -66,11 +68,18 @@ class Broker:
         """What is not heard although there is a connection, such as one of several brokers, and why, in one line."""
         return self.transport.not_received if self.connected else ""
 
-    def proves_hosts(self, topic: str) -> bool:
-        """Whether it is worth while to publish on ``topic`` every second: that proves that each of several is heard."""
-        if isinstance(self.transport, EveryHost):
-            self.transport.proof_topic = topic
-        return isinstance(self.transport, EveryHost)
+    async def prove_hosts(self, base: str) -> None:
+        """Where there are several brokers, publish a probe below ``base`` every second, until it is cancelled.
+
+        It proves that each of them delivers what this account publishes.
+        """
+        if not isinstance(self.transport, EveryHost):
+            return
+        self.transport.proof_topic = topic = BRIDGE_PROBE.topic(base)
+        await self.subscribe(topic, lambda _message, _at: None, deferred=True)
+        while True:
+            self.publish(topic, codec.encode(BRIDGE_PROBE, {"t": int(1000 * time.time())}))
+            await asyncio.sleep(_PROBE_S)
 
     def on_move(self, watcher: Callable[[str, str, bool], None]) -> None:
         """Call ``watcher`` when a robot is found at one of several brokers, or at another one than before.

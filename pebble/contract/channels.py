@@ -197,7 +197,8 @@ LINK = _c("link", Kind.STATE, p.LinkState, "What the link to the remote broker c
 AUDIT = _c("audit", Kind.STATE, p.AuditState, "The newest line of each chain of the audit, for others to note.")
 AUDIT_LINES = _c("audit-lines", Kind.EVENT, p.AuditLines, "Lines of the audit that were requested, as stored.")
 BRIDGE_PROBE = _c("bridge-probe", Kind.EVENT, p.AnyObject,
-                  "By it the bridge detects that two of the robot's connections lead to one broker.")  # fmt: skip
+                  "By it the bridge detects that two of the robot's connections lead to one broker, "
+                  "and a page server (`{system}/servers/{id}`) that each of several brokers delivers.")  # fmt: skip
 LOGS = _c("logs", Kind.STREAM, p.LogRecord, "Log lines of all services.", override=_full("services.launcher.logs"))
 
 # -- outgoing: telemetry
@@ -264,10 +265,6 @@ NEIGHBOURS = _c("neighbours", Kind.STATE, p.Neighbours, "Which robots this one r
 NEIGHBOUR_VALUE = _c("neighbours/{robot}/{metric}", Kind.STREAM, bytes,
                      "What another robot of the LAN publishes, as it does, for scripts of this one.",
                      remote=False)  # fmt: skip
-
-# -- outgoing: of servers, which are no robots
-DRIVING = _c("driving", Kind.EVENT, p.Driving, "Which robots are driven by way of a server (`{system}/servers/{id}`).",
-             rate_hz=1, bridged=False)  # fmt: skip
 
 #: Families that pass neither to operators nor to a mirror, whatever stands below them.
 BETWEEN_ROBOTS = (f"{INCOMING}/from/", f"{INCOMING}/to/", f"{OUTGOING}/neighbours/")

@@ -589,24 +589,6 @@ class OutletStatus(Payload, frozen=True, kw_only=True):
     label: str | UnsetType = UNSET
 
 
-class Driver(Payload, frozen=True, kw_only=True):
-    """Who drives a robot by way of a server."""
-
-    by: Annotated[str, Meta(max_length=64)]  # the user
-    device: Annotated[str, Meta(max_length=64)]  # where: "phone", "terminal on laptop-3"
-    since: Annotated[int, Meta(ge=0)]  # epoch milliseconds
-
-
-_Drivers = Annotated[dict[Annotated[str, Meta(max_length=200)], Driver], Meta(max_length=64)]
-
-
-class Driving(Payload, frozen=True, kw_only=True):
-    """The robots that are driven by way of one server; repeated every second while there are any, then once empty."""
-
-    t: int  # epoch milliseconds
-    robots: _Drivers  # by base topic, for example pebble/robots/goob; at most 64
-
-
 class AnyObject(Payload, frozen=True, kw_only=True):
     """A payload whose fields other components define (ROS extras); only the stamp is common."""
 

@@ -66,7 +66,7 @@ ROWS = (
     Row("commands and flags that the contract does not know", Form.OWN, ("junk", "flags/junk")),
     Row("pose as this robot", Form.OUTGOING, ("online", "capabilities", "control/serial", "estop/serial", "junk")),
     Row("pose as another or a new robot", Form.ELSEWHERE, ("robots/fake/outgoing/online", "robots/fake/incoming/junk")),
-    Row("announce who drives", Form.ELSEWHERE, (f"{SERVERS}/x1/outgoing/driving",)),
+    Row("probe a broker as a page server", Form.ELSEWHERE, (f"{SERVERS}/x1/outgoing/bridge-probe",)),
     Row("pose as a page server otherwise", Form.ELSEWHERE, (f"{SERVERS}/x1/outgoing/online",)),
     Row("change accounts", Form.ELSEWHERE, (CONTROL_TOPIC,)),
 )

@@ -200,7 +200,7 @@ def _of_rights(
                 for base in plain if level == "named" else (_ANY,):
                     yield Rule("write", f"{base}/{INCOMING}/{metric}")
     if Right.DRIVE in held:
-        yield Rule("write", c.DRIVING.filter(f"+/{SERVERS}/+"))
+        yield Rule("write", c.BRIDGE_PROBE.filter(f"+/{SERVERS}/+"))
     if Right.PEOPLE in held:
         yield Rule("read", CONTROL_ANSWERS)
         yield Rule("write", CONTROL_TOPIC)

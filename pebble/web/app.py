@@ -57,7 +57,7 @@ def create_app(settings: WebSettings) -> Starlette:
         archive = None if settings.recordings is None else Recordings(settings.recordings)
         server = Server(settings, people, audit)
         state = app.state
-        state.server, state.audit, state.driving, state.stops = server, audit, server.drivers.driving, server.stops
+        state.server, state.audit, state.stops = server, audit, server.stops
         state.recordings = archive
         state.robots, state.broker = server.robots, server.broker
         state.media, state.sound = server.media.pictures, server.media.sound

@@ -18,7 +18,7 @@ from pebble.transports.clock import since_boot as clock
 from pebble.web import messages as m
 from pebble.web import robot_commands
 from pebble.web.access.login import named, printable
-from pebble.web.drive.driving import Tab
+from pebble.web.drive.driven_robot import Tab
 from pebble.web.log_lines import LogReader
 from pebble.web.pace import STOP_WAITS_S, Pace
 from pebble.web.page_clock import PING_S, ClockJumpError
@@ -121,7 +121,7 @@ class Control:
             )
         )
         if "drive" in self._rights():
-            server.drivers.restore(hello.token, self._tab, lambda: None, lambda _why: None)
+            server.drivers.restore(hello.token, self._tab)
         server.robots.join(self._interest)
         self._interest.dirty |= {(ref, "web/driver") for ref in server.robots.components}
         self._post(self._ping())
@@ -295,7 +295,7 @@ class Control:
                 self._audit("release", op.ref)
             return
         robot = server.robots.view(op.ref)
-        right = "take" if op.over and server.drivers.keeps_control(op.ref) else "drive"
+        right = "take" if op.over and server.drivers.robot(op.ref).keeps else "drive"
         if not self._may(right, op):
             return
         if self._why_not or robot is None:
@@ -306,7 +306,7 @@ class Control:
             server.operated(op.ref)
             self._audit("take over" if op.over else "take", op.ref)
 
-        if not op.over and (state := server.drivers.controls.state(op.ref)) is not None and state.id:
+        if not op.over and (state := server.drivers.robot(op.ref).published) is not None and state.id:
             self._audit("ask", op.ref)
         server.drivers.take(self._tab, robot, granted, lambda why: self._refuse(op, why), over=op.over)
 
@@ -370,9 +370,8 @@ class Control:
         self._large_due = self._large_due and not large
         if self._interest.more:
             self._wake.set()
-        values = found + tuple(
-            (ref, "web/driver", self._server.drivers.view(self._tab, ref), 0.0) for ref, _ in drivers
-        )
+        seen, driven = clock(), self._server.drivers
+        values = found + tuple((ref, "web/driver", driven.robot(ref).shown(self._tab, seen), 0.0) for ref, _ in drivers)
         gone, self._interest.gone = tuple(self._interest.gone), set()
         if values or gone:
             await self._websocket.send_text(encode(m.State(now=1000 * time.time(), set=values, gone=gone)))

@@ -370,7 +370,6 @@ class DriverView(Struct, frozen=True, kw_only=True):
 
     by: str = ""
     device: str = ""
-    server: str = ""  # that has announced it; "": this one, or the robot itself
     you: bool = False
     idle_s: float | None = None  # since the last gesture ended; None: a gesture lasts, or it is not known
     keeps: bool = False  # the robot keeps control itself: who drives it is asked for it

@@ -15,8 +15,8 @@ from pebble.client.estop import send
 from pebble.client.page.settings import WebSettings
 from pebble.client.robot_topics import FLEET, SYNONYMS
 from pebble.config.security import SecurityLevel
-from pebble.contract import AUDIT, CAPABILITIES, CONTROL_STATE, DRIVING, LINK, ONLINE, channel_of
-from pebble.contract.identity import GATEWAYS, Identity, parse_topic
+from pebble.contract import AUDIT, CAPABILITIES, CONTROL_STATE, LINK, ONLINE, channel_of
+from pebble.contract.identity import GATEWAYS, SERVERS, Identity, parse_topic
 from pebble.errors import ConfigError
 from pebble.fleet.audit import Audit
 from pebble.fleet.database import DatabaseError
@@ -52,10 +52,10 @@ class Server:
 
     def __init__(self, settings: WebSettings, people: People, audit: Audit) -> None:
         self.settings, self.people, self.audit = settings, people, audit
-        server = f"{settings.name}-{secrets.token_hex(2)}"
+        self._base = Identity("pebble", SERVERS, f"{settings.name}-{secrets.token_hex(2)}").base
         self.broker = Broker(settings.broker)
         self.robots, self.stops = Robots(), Stops(self._has_sent)
-        self.drivers = Drivers(server, self.broker, self.robots)
+        self.drivers = Drivers(self.broker, self.robots)
         self.media = PicturesAndSound(settings.broker, self.robots, self._note_talk)
         self.saved = SavedRobots(people)
         known = self.robots.before = self.saved.robots
@@ -71,7 +71,7 @@ class Server:
             audit,
             known.__contains__,
             self.robots.components.__contains__,
-            lambda ref: self.drivers.pace_of(ref).answer_s,
+            lambda ref: self.drivers.robot(ref).pace.answer_s,
         )
         self.people_version = (0, 0, 0)
         self._tasks: set[asyncio.Task[None]] = set()
@@ -81,13 +81,12 @@ class Server:
         self.broker.on_move(self._moved)
         await self.broker.open()
         self.broker.on_state(self._show_broker)
-        self.broker.on_state(self.drivers.driving.renew_key)
+        self.broker.on_state(self.drivers.renew_keys)
         self._show_broker()
         for channel in (*FLEET, *SYNONYMS):
             deferred = channel is ONLINE or channel in SYNONYMS
             await self.broker.subscribe(channel.filter("+/+/+"), self.receive, deferred=deferred)
         await self.broker.subscribe(AUDIT.filter("+/+/+"), self.robot_audits.receive, deferred=True)
-        await self.broker.subscribe(DRIVING.filter("+/+/+"), self.drivers.announced)
         gateways = Gateways()
         await self.broker.subscribe(
             ONLINE.filter(f"+/{GATEWAYS}/+"), lambda message, _: self._gateway(gateways, message), deferred=True
@@ -96,6 +95,7 @@ class Server:
         if self.settings.login:
             self.spawn(self._watch_people())
         self.spawn(self.broker.ask(self.by_name))
+        self.spawn(self.broker.prove_hosts(self._base))
 
     async def close(self) -> None:
         """Stop what pages move, then disconnect."""
@@ -225,7 +225,6 @@ class Server:
                     self._show_broker()
                     self._remember_robots()
                     self.robot_audits.tick(now)
-                self.drivers.announce(now)
             except (
                 Exception
             ):  # one faulty round must not end all later ones, on which the end of silent gestures depends

@@ -468,22 +468,6 @@ def test_what_a_robot_publishes_may_be_larger() -> None:
     assert len(codec.decode(c.SOUNDBOARD_FILES, files).files) == 1000
 
 
-@pytest.mark.parametrize(
-    "robots",
-    [
-        {f"pebble/robots/r{number}": {"by": "eve", "device": "", "since": 1} for number in range(65)},
-        {"pebble/robots/goob": {"by": "e" * 65, "device": "", "since": 1}},
-        {"pebble/robots/goob": {"by": "eve", "device": "d" * 65, "since": 1}},
-        {"pebble/robots/" + "g" * 190: {"by": "eve", "device": "", "since": 1}},
-        {"pebble/robots/goob": {"by": "eve", "device": "", "since": -1}},
-        {"pebble/robots/goob": {"by": "eve"}},
-        ["pebble/robots/goob"],
-    ],
-)
-def test_the_robots_that_a_server_drives_are_few_and_their_texts_short(robots: object) -> None:
-    refused(c.DRIVING, json.dumps({"t": 1, "robots": robots}).encode())
-
-
 # -- what we say
 
 

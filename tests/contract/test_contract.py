@@ -121,7 +121,7 @@ def test_what_stays_on_the_robot_and_what_never_passes_the_bridge() -> None:
         *("from/{robot}/drive-values", "to/{robot}/drive-values", "neighbours/{robot}/{metric}"),
     ]
     assert {channel.suffix for channel in CHANNELS if not channel.bridged} == {
-        "incoming/audio-stream", "outgoing/front-camera", "outgoing/audio", "outgoing/driving",
+        "incoming/audio-stream", "outgoing/front-camera", "outgoing/audio",
     }  # fmt: skip
 
 

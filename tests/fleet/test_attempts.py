@@ -66,7 +66,7 @@ TOPICS = [
     *(f"{GOOB}/incoming/by/{name}/{metric}" for name in ("otto", "sam", "goob", "nobody") for metric in METRICS),
     *(f"{GOOB}/outgoing/{metric}" for metric in ("online", "control/serial", "estop/serial", "capabilities", "audit")),
     *(f"{FRED}/{metric}" for metric in ("outgoing/online", "incoming/drive-values", "incoming/flags/reboot")),
-    "pebble/servers/x1/outgoing/driving",
+    "pebble/servers/x1/outgoing/bridge-probe",
     "pebble/servers/x1/outgoing/online",
     "pebble/gateways/gate/outgoing/online",
     "pebble/gateways/other/outgoing/online",
@@ -90,7 +90,7 @@ def lets_through(name: str, topic: str, level: str) -> bool:
     if name in ("hub", "lan"):
         return False  # test_zenoh has what they are at a hub
     if not rest:
-        return topic == "pebble/servers/x1/outgoing/driving" and name != "vera"
+        return topic == "pebble/servers/x1/outgoing/bridge-probe" and name != "vera"
     if rest == "estop":
         return True
     if level == "login":

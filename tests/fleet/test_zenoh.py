@@ -190,7 +190,7 @@ def test_only_state_and_flags_are_retained_and_never_under_a_name(hall: Hall) ->
 def test_a_robot_leaves_a_will_for_itself_and_no_one_else_leaves_any(hall: Hall) -> None:
     name_of_will = {
         **dict.fromkeys(("vera", "otto"), f"{GOOB}/incoming/{'by/otto/' * (hall.fleet.level == 'named')}drive-values"),
-        "mia": "pebble/servers/x1/outgoing/driving",
+        "mia": "pebble/servers/x1/outgoing/bridge-probe",
         "sam": f"{GOOB}/incoming/estop",
         "fred": STATE,
         "goob": DRIVE,

@@ -52,9 +52,9 @@ def liveness(online: bool | None = True, silent_s: float | None = 0.1, **more: A
     return {"online": online, "silent_s": silent_s} | heartbeats | more
 
 
-def driver(by: str = "", device: str = "", *, you: bool = False, server: str = "") -> dict[str, Any]:
-    more = {"keeps": False, "asking": False, "asks": "", "checked": False, "others": False}
-    return {"by": by, "device": device, "server": server, "you": you, "idle_s": None} | more
+def driver(by: str = "", device: str = "", *, you: bool = False, keeps: bool = True) -> dict[str, Any]:
+    more = {"keeps": keeps, "asking": False, "asks": "", "checked": False, "others": False}
+    return {"by": by, "device": device, "you": you, "idle_s": None} | more
 
 
 def estop(now: int, by: str = "", *, sending: str = "", text: str = "", why: str = "button") -> dict[str, Any]:
@@ -366,12 +366,12 @@ NO_BROKER = {
 NOT_RECEIVED = "messages come from only 1 of 2 brokers: broker spare.lab:8884 refused us: not authorized"
 ONE_BROKER = NO_BROKER | {"connected": True, "problem": "", "not_received": NOT_RECEIVED}
 UNCONFIRMED = "base has not confirmed it"
-BOB_DRIVES = at(GOOB, "web/driver", driver("bob", "phone"))
+BOB_DRIVES = at(GOOB, "web/driver", driver("bob", "phone", keeps=False))
 
 
 def keeping(**more: Any) -> Callable[[int], Value]:
     """A robot keeps control itself."""
-    return at(GOOB, "web/driver", driver() | {"keeps": True} | more)
+    return at(GOOB, "web/driver", driver() | more)
 
 
 #: Goob waits with its pictures while it is driven.

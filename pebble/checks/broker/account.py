@@ -12,7 +12,7 @@ from pebble.checks.broker import MOSQUITTO
 from pebble.checks.broker.peer import BrokerTrial, Peer, reached
 from pebble.checks.check import CheckResult, failed, ok, warn
 from pebble.config.security import SecurityLevel
-from pebble.contract import BRIDGE_PROBE, DRIVING, ONLINE
+from pebble.contract import BRIDGE_PROBE, ONLINE
 from pebble.contract.identity import SERVERS, Identity
 from pebble.contract.levels import LEVELS
 from pebble.errors import TransportError
@@ -59,11 +59,11 @@ def robot_account(
 
 
 def page_account(what: str, settings: MqttSettings, level: SecurityLevel = "open") -> Iterator[CheckResult]:
-    """Check that a page server with this account is sent what robots publish, and may announce who drives."""
+    """Check that a page server with this account is sent what robots publish, and may publish itself."""
     why = ""
     try:
         with _logged_in(settings, LEVELS["wide"].answer_s) as (trial, peer):
-            topic, states = DRIVING.topic(Identity("pebble", SERVERS, "doctor").base), ONLINE.filter("+/+/+")
+            topic, states = BRIDGE_PROBE.topic(Identity("pebble", SERVERS, "doctor").base), ONLINE.filter("+/+/+")
             if (peer.subscribe(states) or b"\xff")[0] >= _REFUSED:
                 why = f"the broker refuses it {states}"
             else:

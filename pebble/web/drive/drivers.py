@@ -1,165 +1,135 @@
-"""What pages, robots and other servers want of driving, and what is published for it."""
+"""What pages and robots want of driving, and what is published for it."""
 
-import time
 from collections.abc import Callable
-
-from msgspec.structs import replace
+from functools import partial
 
 from pebble.client.broker import Broker
 from pebble.client.estop import send
-from pebble.client.pace_of_link import WIDE, Pace
 from pebble.client.robot_view import RobotView
 from pebble.contract import DRIVE, codec
-from pebble.transports import Message
 from pebble.transports.clock import since_boot as clock
 from pebble.web import messages as m
-from pebble.web.drive.controls import Controls
-from pebble.web.drive.driven_here import DrivenHere
-from pebble.web.drive.driving import Command, Driving, Tab
+from pebble.web.drive.driven_robot import Command, DrivenRobot, Tab
 from pebble.web.drive.refusals import Refusals
 from pebble.web.robots import Robots
 
+MOST_WISHES = 16  # of one tab: robots of which it has control, or asks for it
+
 
 class Drivers:
-    """It belongs to one server, which others know as ``server``. What a method decides is published at once."""
+    """It belongs to one server. What a method decides is published at once."""
 
-    def __init__(self, server: str, broker: Broker, robots: Robots) -> None:
-        self.driving = Driving(server)
-        self.controls = Controls(self.driving, robots.view)
-        self.refusals = Refusals(broker, self.driving, robots.view)
-        self.driving.held_elsewhere, self.driving.pace_of = self.controls.elsewhere, self.pace_of
-        self._broker, self._robots, self._here = broker, robots, DrivenHere(server)
-        self._here.always = broker.proves_hosts(self._here.topic)
+    def __init__(self, broker: Broker, robots: Robots) -> None:
+        self._broker, self._robots = broker, robots
+        self._driven: dict[str, DrivenRobot] = {}
+        self._changed: set[str] = set()
+        self.refusals = Refusals(broker, lambda ref: self.robot(ref).moved_by, robots.view)
 
-    def pace_of(self, ref: str) -> Pace:
-        robot = self._robots.view(ref)
-        return WIDE if robot is None else robot.pace
-
-    def keeps_control(self, ref: str) -> bool:
-        """Whether that robot decides itself who drives it; of others, the servers announce it to each other."""
-        robot = self._robots.view(ref)
-        return robot is not None and robot.controlled
+    def robot(self, ref: str) -> DrivenRobot:
+        """Return who drives that robot; of one that rests nothing is remembered."""
+        robot = self._driven.get(ref)
+        if robot is None:
+            robot = self._driven[ref] = DrivenRobot(ref, partial(self._robots.view, ref), self._changed)
+        return robot
 
     # -- of pages
 
     def take(
-        self, tab: Tab, robot: RobotView, granted: Callable[[], None], failed: Callable[[str], None], *, over: bool
+        self, tab: Tab, view: RobotView, granted: Callable[[], None], failed: Callable[[str], None], *, over: bool
     ) -> None:
         """A page wants control; ``granted``, or ``failed`` with the reason, is called as soon as that is known."""
-        now = clock()
-        if why := self.refusals.nameless(robot):
+        now, robot = clock(), self.robot(view.base)
+        wanted = sum(one.wanted_by(tab) for one in self._driven.values())
+        if why := self.refusals.nameless(view):
             failed(why)
-            return
-        if robot.controlled:
-            why = self.controls.ask(tab, robot, now, granted, failed, over=over)
-            self._send_control(now)
+        elif wanted >= MOST_WISHES and not robot.wanted_by(tab):
+            failed(f"This page has control of {MOST_WISHES} robots: release one")
         else:
-            commands, why = self.driving.take(tab, robot.base, now, _epoch_ms(), over=over)
-            self._publish(commands)
-            if not why:
-                granted()
-        if why:
-            failed(why)
+            self._publish(robot.take(tab, now, granted, failed, over=over))
+            self._turn(robot, now)
 
     def release(self, tab: Tab, ref: str) -> bool:
         """A page gives control back, or does not ask for it any more; whether it had it."""
-        lease, now = self.driving.leases.get(ref), clock()
-        self._publish(self.driving.release(tab, ref, now))
-        self.controls.withdraw(tab, ref)
-        self._send_control(now)
-        return lease is not None and lease.tab is tab
+        now, robot = clock(), self.robot(ref)
+        had = robot.tab is tab
+        self._publish(robot.release(tab, now))
+        self._turn(robot, now)
+        return had
 
-    def restore(self, token: str, tab: Tab, granted: Callable[[], None], failed: Callable[[str], None]) -> None:
-        """A page has connected again."""
-        commands, ref = self.driving.restore(token, tab, clock())
-        self._publish(commands)
-        if ref and (robot := self._robots.view(ref)) is not None:
-            self.take(tab, robot, granted, failed, over=False)
+    def restore(self, token: str, tab: Tab) -> None:
+        """A page has connected again: it asks for what it had, but no gesture goes on.
+
+        Its old connection may still be open, if nothing comes from it any more.
+        """
+        now = clock()
+        old = {robot.tab for robot in self._driven.values() if robot.tab is not None and robot.tab.token == token}
+        for stalled in [one for one in old if one.clock.problem(now)]:
+            self.closed(stalled)
+        for robot in [one for one in self._driven.values() if one.awaits(token, now)]:
+            if (view := self._robots.view(robot.ref)) is not None:
+                self.take(tab, view, lambda: None, lambda _why: None, over=False)
 
     def closed(self, tab: Tab, *, for_good: bool = False) -> None:
         """The connection of a page has ended; ``for_good``: its user may no longer drive."""
-        end, now = self.driving.withdraw if for_good else self.driving.closed, clock()
+        now, wanted = clock(), [robot for robot in self._driven.values() if robot.wanted_by(tab)]
         try:
-            self._publish(end(tab, now))
+            self._publish([zero for robot in wanted for zero in robot.closed(tab, now, for_good=for_good)])
         finally:
-            self.controls.closed(tab)
-            self._send_control(now)
+            for robot in wanted:
+                self._turn(robot, now)
 
     def closed_all(self) -> None:
-        for lease in list(self.driving.leases.values()):
-            self.closed(lease.tab)
+        for tab in [robot.tab for robot in self._driven.values() if robot.tab is not None]:
+            self.closed(tab)
 
     def drive(self, tab: Tab, op: m.DriveOp, blocked: str) -> tuple[bool, str]:
         """Judge a command of a gesture, and publish what follows: whether wheels move now, and why it was refused."""
-        now = clock()
-        outcome = self.driving.drive(tab, op, now, blocked or self.refusals.of_driving(op.ref))
-        accepted = self._publish(outcome.commands, tab.user)
-        if outcome.refused:
-            return False, outcome.refused
+        now, robot = clock(), self.robot(op.ref)
+        commands, refused = robot.drive(tab, op, now, blocked or self.refusals.of_driving(op.ref))
+        accepted = self._publish(commands, tab.user)
+        if refused:
+            return False, refused
         if not accepted:
-            self._publish(self.driving.stop(op.ref, now))
+            self._publish(robot.stop(now))
             return False, "The server cannot reach the broker"
-        return bool(outcome.commands) and outcome.commands[0].drive.moves, ""
+        return bool(commands) and commands[0].drive.moves, ""
 
     def stop(self, ref: str, by: str) -> None:
         """A zero from anybody, who need not drive."""
-        robot = self._robots.view(ref)
-        if robot is not None and (robot.drives or not robot.capabilities):
-            self._publish(self.driving.stop(ref, clock()), by)
+        view = self._robots.view(ref)
+        if view is not None and (view.drives or not view.capabilities):
+            self._publish(self.robot(ref).stop(clock()), by)
 
-    def view(self, tab: Tab, ref: str) -> m.DriverView:
-        """What this page is shown of who drives a robot."""
-        now, state = clock(), self.controls.state(ref)
-        view = m.DriverView(keeps=self.keeps_control(ref), asking=self.controls.asks(tab, ref))
-        if state is not None:
-            asks = (state.asks or "somebody") if state.asks_id else ""
-            view = replace(view, asks=asks, checked=state.named, others=state.others)
-        if (other := self.driving.elsewhere(ref, now)) is not None:
-            return replace(view, by=other.by, device=other.device, server=other.server)
-        lease = self.driving.leases.get(ref)
-        if lease is None:
-            return view
-        driver = lease.tab
-        idle = None if driver.live is not None and driver.live_ref == ref else now - lease.idle_from
-        return replace(view, by=driver.user, device=driver.device, you=driver is tab, idle_s=idle)
-
-    # -- of robots and other servers
+    # -- of robots
 
     def updated(self, ref: str) -> None:
         """A robot has published what it can do, or who has control."""
-        self._publish(self.controls.update(ref, clock(), _epoch_ms()))
+        self._publish(self.robot(ref).update(clock()))
 
     def moved(self, ref: str) -> None:
         """A robot is at another broker: what moves it has an end there, and begins anew."""
-        self._publish(self.driving.interrupt(ref, clock()))
+        self._publish(self.robot(ref).interrupt(clock()))
 
-    def announced(self, message: Message, _now: float) -> None:
-        """Another server drives robots."""
-        announced = self._here.receive(message)
-        if announced is not None:
-            server, robots = announced
-            robots = {ref: one for ref, one in robots.items() if not self.keeps_control(ref)}
-            self._publish(self.driving.announced(server, robots, clock()))
+    def renew_keys(self) -> None:
+        """The connection to the broker is another one."""
+        for robot in self._driven.values():
+            robot.renew_key()
 
     # -- what is due
 
     def tick(self, now: float) -> None:
-        self._publish(self.driving.tick(now))
-        self._send_control(now)
-
-    def announce(self, now: float) -> None:
-        """Tell other servers."""
-        leases = {ref: one for ref, one in self.driving.leases.items() if one.control is None}
-        for message in self._here.tick(leases, now, _epoch_ms()):
-            self._broker.publish(message.topic, message.payload)
+        for ref, robot in list(self._driven.items()):
+            self._turn(robot, now)
+            if robot.at_rest(now):
+                del self._driven[ref]
 
     # -- inside
 
-    def _send_control(self, now: float) -> None:
-        """Publish what is due of control; after the zeros of who has had it."""
-        step = self.controls.tick(now, _epoch_ms())
-        self._publish(step.commands)
-        send(self._broker.publish, step.messages)
+    def _turn(self, robot: DrivenRobot, now: float) -> None:
+        """Publish what is due; requests of control come after the zeros of who has had it."""
+        commands, messages = robot.tick(now)
+        self._publish(commands)
+        send(self._broker.publish, messages)
 
     def _publish(self, commands: list[Command], by: str = "") -> bool:
         """Publish drive commands of a person, each to the robot's own topic; False if one was not accepted."""
@@ -167,11 +137,7 @@ class Drivers:
         for ref, drive, qos in commands:
             topic = self._robots.topic(ref, "drive", "topic", DRIVE)
             accepted = self._broker.publish(topic, codec.encode(DRIVE, drive), qos=qos, by=by) and accepted
-        changed, self.driving.changed = self.driving.changed, set()
-        self._here.changed |= changed
-        self._robots.mark_drivers(changed)
+        if self._changed:
+            self._robots.mark_drivers(set(self._changed))
+            self._changed.clear()
         return accepted
-
-
-def _epoch_ms() -> int:
-    return int(1000 * time.time())

@@ -7,17 +7,17 @@ from pebble.client.broker import Broker
 from pebble.client.drive_reasons import SCRIPT_ORDER, SERVER_ORDER, Code, Situation, first_reason
 from pebble.client.named_topics import why_not
 from pebble.client.robot_view import RobotView
-from pebble.transports.clock import since_boot as clock
 from pebble.web import messages as m
 from pebble.web import robot_commands
-from pebble.web.drive.driving import Driving
 
 
 class Refusals:
-    """It belongs to one server; ``robot_of`` finds a component that is known."""
+    """It belongs to one server; ``moved_by`` tells who moves a component, ``robot_of`` finds it."""
 
-    def __init__(self, broker: Broker, driving: Driving, robot_of: Callable[[str], RobotView | None]) -> None:
-        self._broker, self._driving, self._robot_of = broker, driving, robot_of
+    def __init__(
+        self, broker: Broker, moved_by: Callable[[str], str], robot_of: Callable[[str], RobotView | None]
+    ) -> None:
+        self._broker, self._moved_by, self._robot_of = broker, moved_by, robot_of
 
     def of_driving(self, ref: str) -> str:
         """Why this component may not be moved by any page."""
@@ -42,7 +42,7 @@ class Refusals:
 
     def _of_script(self, robot: RobotView) -> str:
         """Why no script may begin now."""
-        by = self._driving.moved_by(robot.base, clock())
+        by = self._moved_by(robot.base)
         situation = self._situation(robot)._replace(driven=bool(by) and not robot.arbitrates)
         match first_reason(situation, SCRIPT_ORDER):
             case Code.UNSEEN:

@@ -280,7 +280,6 @@ export interface EstopView {
 export interface DriverView {
   by?: string;
   device?: string;
-  server?: string;
   you?: boolean;
   idle_s?: number | null;
   keeps?: boolean;

@@ -63,7 +63,7 @@ def _mend(world: World) -> None:
     world.scheduler.run(travels_s)
     for _ in range(30):  # what is frozen, dead or away for some time is back soon
         world.scheduler.run(0.1)
-        if world.reaches() and world.other_server is None and not world.rules.stopping():
+        if world.reaches() and world.other_until is None and not world.rules.stopping():
             break
     world.scheduler.run(_HEARTBEAT_S)  # one that was lost is no silence any more
     world.rules.faults += 1

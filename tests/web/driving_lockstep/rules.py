@@ -66,7 +66,7 @@ class Rules:
         self.path_s: Callable[[], float] = lambda: 0.0
         self.owner: Owner
         self.wheels: RecordedWheels
-        self.driving: Callable[[], Any]
+        self.driven: Callable[[], Any]  # the robot, by the server
         self._handling: tuple[Any, Any] | None = None
         self._newest: dict[Any, int] = {}  # by tab: the newest gesture
         self._over: dict[Any, int] = {}  # this one and all before it have ended
@@ -131,8 +131,7 @@ class Rules:
         assert control is not None
         assert op is not None
         tab = control._tab
-        lease = self.driving().leases.get(self._base)
-        self._check(lease is not None and lease.tab is tab, "a page moves wheels without the lease")
+        self._check(self.driven().tab is tab, "a page moves wheels without the lease")
         self._check(op.g > self._over.get(tab, -1), "a gesture goes on that has ended")
         sent, sent_number = self.sent[control.page, op.t]
         self._check(now - sent <= AGE_S + _DRIFT_S, "a command that is too old moves wheels")
@@ -151,8 +150,7 @@ class Rules:
             return
         tab, g = command.tab, command.g
         silent = self._scheduler.now - self._received[tab, g] > SILENCE_S
-        lease = self.driving().leases.get(self._base)
-        ended = g <= self._over.get(tab, -1) or lease is None or lease.tab is not tab
+        ended = g <= self._over.get(tab, -1) or self.driven().tab is not tab
         self._check(silent or ended, "the server interrupts a gesture by a zero")
 
     def lease_moved(self, tab: Any) -> None:
@@ -165,8 +163,7 @@ class Rules:
 
         def look() -> None:
             if faults == self.faults and self._holder == holder and self.reachable():
-                lease = self.driving().leases.get(self._base)
-                client = None if lease is None else lease.control
+                client = self.driven().client
                 self._check(client is None or client.id == holder, "a page has the lease of a robot that another has")
 
         if holder and self.reachable():

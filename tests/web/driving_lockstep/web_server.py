@@ -76,9 +76,9 @@ def virtual() -> Iterator[None]:
         token_hex=lambda size: f"{next(numbers):0{2 * size}x}", token_urlsafe=lambda _: f"token-{next(numbers)}"
     )
     with ExitStack() as stack:
-        for module in (server, drivers, refusals, robots, control, broker):
+        for module in (server, refusals, robots, control, broker):
             stack.enter_context(patch.object(module, "time", TIME))
-        for module in (server, drivers, refusals, control):
+        for module in (server, drivers, control):
             stack.enter_context(patch.object(module, "clock", TIME.monotonic))
         stack.enter_context(patch.object(message_clock, "since_boot", TIME.monotonic))
         for module in (server, control, broker):
@@ -148,7 +148,8 @@ class WebServer(Process):
         super().__init__("web", network.scheduler)
         self.lives = 0
         self.roles: dict[int, Role] = {}
-        self.lease_moved: Callable[[Any], None] = lambda tab: None  # to another server
+        self.base = ""  # of the robot that the rules are about
+        self.lease_moved: Callable[[Any], None] = lambda tab: None
         self._network, self._rewrite, self._handling = network, rewrite, handling
         self._restart = 0
         self.loop: VirtualLoop | None = None
@@ -166,31 +167,25 @@ class WebServer(Process):
             self.server = server.Server(
                 WebSettings(broker=MqttSettings(host="fair"), server="fair"), _Nothing(), _Nothing()
             )  # type: ignore[arg-type]
-        driving = self.server.drivers.driving
-        driving.announced, driving.revoke = self._announced(driving), self._revoked(driving)
+        drivers = self.server.drivers
+        drivers.updated, drivers.tick = self._watched(drivers.updated), self._watched(drivers.tick)
         self.loop.create_task(self.server.open())
         self.wake()
 
-    def _announced(self, driving: Any) -> Any:
-        take = driving.announced
+    def driven(self, ref: str) -> Any:
+        """Who drives that robot, as the server knows it."""
+        return self.server.drivers.robot(ref)
 
-        def announced(server: str, robots: dict[str, Any], now: float) -> Any:
-            for ref, (_, _, since_ms) in robots.items():
-                lease = driving.leases.get(ref)
-                if lease is not None and (lease.since_ms, driving.server) < (since_ms, server):
-                    self.lease_moved(lease.tab)
-            return take(server, robots, now)
+    def _watched(self, method: Callable[[Any], None]) -> Callable[[Any], None]:
+        """The method of the server's drivers, after which the rules see whether a page has lost control by it."""
 
-        return announced
+        def watched(argument: Any) -> None:
+            tab = self.driven(self.base).tab
+            method(argument)
+            if tab is not None and self.driven(self.base).tab is not tab:
+                self.lease_moved(tab)
 
-    def _revoked(self, driving: Any) -> Any:
-        revoke = driving.revoke
-
-        def revoked(ref: str, now: float) -> Any:
-            self.lease_moved(driving.leases[ref].tab)
-            return revoke(ref, now)
-
-        return revoked
+        return watched
 
     def kill(self, restart_s: float | None) -> None:
         """End at once: nothing is published any more."""

@@ -15,10 +15,8 @@ from typing import Any, Self
 
 import msgspec
 
-from pebble.contract import CAPABILITIES, CONTROL, CONTROL_STATE, CONTROL_TAKE, DRIVING, ONLINE, codec
-from pebble.contract.identity import Identity
-from pebble.contract.payloads import ControlRequest, Driver
-from pebble.contract.payloads import Driving as DrivingPayload
+from pebble.contract import CAPABILITIES, CONTROL, CONTROL_STATE, CONTROL_TAKE, ONLINE, codec
+from pebble.contract.payloads import ControlRequest
 from pebble.fleet.roles import Role
 from pebble.transports import Message, QoS, State
 from pebble.web import messages as m
@@ -98,8 +96,8 @@ class World:
         self.silent_until = 0.0
         self.server = WebServer(self.network, self.rules.rewrite, self._handling)
         self.rules.stopping = lambda: any(not one.finished for one, _ in self.server.server.stops._senders.values())
-        self.server.lease_moved = self.rules.lease_moved
-        self.rules.driving = lambda: self.server.server.drivers.driving
+        self.server.base, self.server.lease_moved = BASE, self.rules.lease_moved
+        self.rules.driven = lambda: self.server.driven(BASE)
         self.rules.reachable = self.reaches
         self.rules.owner_up = self._owner_up
         self.rules.path_s = lambda: 0.003 + self.server.delay + self.owner.delay
@@ -111,7 +109,7 @@ class World:
         self._loads = 0
         self._lease: Any = None
         self._take = False  # the other server does so with its next request
-        self.other_server: tuple[int, float] | None = None  # another server drives: since, and until
+        self.other_until: float | None = None  # another server has control, or asks for it
         self.owner.start()
         self.server.start()
         self._announce()
@@ -229,8 +227,7 @@ class World:
             return
         self.rules.handling(control, op, before)
         if not before:
-            lease = self.server.server.drivers.driving.leases.get(BASE)
-            tab = None if lease is None else lease.tab
+            tab = self.server.driven(BASE).tab
             if self._lease is not None and self._lease is not tab:
                 self.rules.lease_moved(self._lease)
             self._lease = tab
@@ -544,11 +541,11 @@ class World:
         self.pages.do(human.page, "reset")
 
     def do_other(self, a: int, b: int) -> None:
-        """Another server drives the robot; where that keeps control itself, it is taken over or asked for."""
-        since = int(1000 * (EPOCH + self.now)) + (0, -3_600_000, 0)[b % 3]
-        self.other_server = (since, self.now + (0.1, 0.9, 2.5)[a % 3])
-        self._take = self.keeps and b % 3 == 0
-        self._announce_other()
+        """Another server takes control over, or asks for it."""
+        if self.keeps:
+            self.other_until = self.now + (0.1, 0.9, 2.5)[a % 3]
+            self._take = b % 3 == 0
+            self._request_as_other()
 
     def do_role(self, a: int, b: int) -> None:
         """The human may no longer drive, or may again."""
@@ -668,22 +665,17 @@ class World:
                 self._publish(ONLINE.topic(base), {"t": int(1000 * (EPOCH + self.now))})
         self.scheduler.after(_HEARTBEAT_S, self._heartbeat)
 
-    def _announce_other(self) -> None:
-        if self.other_server is None:
+    def _request_as_other(self) -> None:
+        if self.other_until is None:
             return
-        since, until = self.other_server
-        ends = self.now >= until
-        if self.keeps:
-            request = ControlRequest(id="0e0e0e0e", by="eve", want="release" if ends else "hold")
-            channel, self._take = CONTROL_TAKE if self._take else CONTROL, False
-            self._send(Message(channel.topic(BASE), codec.encode(channel, request), QoS.DELIVERED))
-        robots = {} if ends else {BASE: Driver(by="eve", device="desk", since=since)}
-        payload = codec.encode(DRIVING, DrivingPayload(t=int(1000 * (EPOCH + self.now)), robots=robots))
-        self._send(Message(DRIVING.topic(Identity("pebble", "servers", "other-1").base), payload, QoS.LATEST))
+        ends = self.now >= self.other_until
+        request = ControlRequest(id="0e0e0e0e", by="eve", want="release" if ends else "hold")
+        channel, self._take = CONTROL_TAKE if self._take else CONTROL, False
+        self._send(Message(channel.topic(BASE), codec.encode(channel, request), QoS.DELIVERED))
         if ends:
-            self.other_server = None
+            self.other_until = None
         else:
-            self.scheduler.after(min(1.0, until - self.now), self._announce_other)
+            self.scheduler.after(min(1.0, self.other_until - self.now), self._request_as_other)
 
     def _publish(self, topic: str, value: Any, *, retain: bool = False) -> None:
         self._send(Message(topic, msgspec.json.encode(value), QoS.DELIVERED, retain))

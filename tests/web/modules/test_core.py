@@ -168,7 +168,7 @@ const situation = {
   name: "goob", open: false, broker: "refused", reload: true, drives: false, rights: [], hidden: true, focus: false,
   dialog: true,
   fromKeys: true, liveness: { online: false, silent_s: 12.3 }, estop: { latched: true, by: "eve" }, freeForMs: 100,
-  capabilities: {}, driver: { by: "bob", device: "phone", server: "fair-2", you: false },
+  capabilities: {}, driver: { by: "bob", device: "phone", you: false },
   script: { running: true, file: "april-follow" }, pictureAgeMs: 2400, inSight: false, roundTripMs: 640,
   padFrozen: true, mustRelease: true,
 };
@@ -196,7 +196,7 @@ def test_the_first_reason_counts() -> None:
         "server": "No connection to the server",
         "silent": "goob is silent for 12 s",
         "stopped": "Stopped by eve",
-        "lease": "bob (phone, fair-2) is driving",
+        "lease": "bob (phone) is driving",
         "free": "april-follow runs. Take control to drive",
         "picture": "The picture is 2.4 s old",
         "late": "Commands are late (640 ms)",
@@ -220,7 +220,7 @@ def test_the_first_reason_counts() -> None:
 )
 def test_who_drives_a_robot_that_keeps_control_is_asked(change: str, rights: str, expected: list[str | None]) -> None:
     steps = f"""{_GOOD}
-      const driver = {{ by: "bob", device: "phone", server: "", you: false, keeps: true, ...{change} }};
+      const driver = {{ by: "bob", device: "phone", you: false, keeps: true, ...{change} }};
       const found = driveReason({{ ...situation, driver, rights: ["drive", ...{rights}] }});
       result = [found.code, found.text, found.action.kind, found.also?.kind ?? null];"""
     assert reasons(steps) == expected

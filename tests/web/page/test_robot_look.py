@@ -225,6 +225,26 @@ def test_each_card_has_one_bold_button_at_most(show: Show, state: str) -> None:
 # -- without control
 
 
+@pytest.mark.parametrize("size", ["desktop", "phone"])
+def test_a_robot_that_keeps_no_control_is_named(show: Show, size: Size) -> None:
+    places = "[...document.querySelectorAll('.slot, .stick')].map((one) => one.getBoundingClientRect().toJSON())"
+    cut = """[...document.querySelectorAll('.slot-words *')]
+      .some(({ scrollWidth, clientWidth }) => clientWidth && scrollWidth > clientWidth + 1)"""
+    with show(FREE, size) as opened:
+        _ready(opened)
+        before = opened.page.evaluate(places)
+        for view, words in (
+            (driver(keeps=False), "Nobody drives from here"),
+            (driver("alice", you=True, keeps=False), "You drive"),
+        ):
+            opened.page.evaluate(SET, [GOOB, "web/driver", view])
+            assert opened.until(
+                f"document.querySelector('[data-test=why]').textContent.includes('{words}It keeps no control')"
+            )
+            assert opened.page.evaluate(places) == before
+            assert not opened.page.evaluate(cut)
+
+
 def test_a_key_without_control_is_answered_and_enter_takes_control(show: Show, server: CannedServer) -> None:
     with show(FREE) as opened:
         _ready(opened)

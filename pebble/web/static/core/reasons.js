@@ -83,8 +83,7 @@ function leaseReason(s) {
     const runs = s.script?.running ? `${scriptName(s) || "A script"} runs. ` : "";
     return reason("free", `${runs}Take control to drive`, { label: "Take control", kind: "take" });
   }
-  const where = [s.driver.device, s.driver.server].filter(Boolean).join(", ");
-  const who = `${s.driver.by}${where ? ` (${where})` : ""}`;
+  const who = s.driver.device ? `${s.driver.by} (${s.driver.device})` : s.driver.by;
   if (s.driver.keeps) return askReason(s, who);
   if (s.driverIdleMs >= IDLE_MS) {
     return reason("idle", `${who} has control, but does not drive`, { label: "Take control", kind: "take" });

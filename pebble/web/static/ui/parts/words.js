@@ -60,8 +60,7 @@ export function mediaOf(payload) {
   return isObject(streams) ? Object.entries(streams).slice(0, 8) : [];
 }
 
-/** @param {any} view DriverView @returns {string} "bob (phone)", "bob at fair-1" */
+/** @param {any} view DriverView @returns {string} "bob (phone)" */
 export function driverName(view) {
-  const device = view.device ? ` (${view.device})` : "";
-  return `${view.by}${device}${view.server ? ` at ${view.server}` : ""}`;
+  return view.device ? `${view.by} (${view.device})` : view.by;
 }

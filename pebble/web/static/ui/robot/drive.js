@@ -72,11 +72,13 @@ export function Slot({ at }) {
 function slotWords(reason, text, view, typing, script) {
   switch (reason?.code) {
     case undefined:
-      return ["You drive", typing ? "Keys go to the field you have chosen: click beside it." : "Let go, and it stops."];
+      if (typing) return ["You drive", "Keys go to the field you have chosen: click beside it."];
+      return ["You drive", view?.keeps === false ? "It keeps no control: others may, too." : "Let go, and it stops."];
     case "connecting":
       return ["One moment", "Who drives is not known yet."];
     case "free":
       if (view?.others) return ["Nobody has control", "Someone drives all the same"];
+      if (view?.keeps === false) return ["Nobody drives from here", "It keeps no control: others may drive it"];
       return ["Nobody drives", script ? `${script} runs. Take control to drive` : "One person at a time"];
     case "stopped":
       return ["Stopped", "Reset it at the picture to drive."];
@@ -91,8 +93,8 @@ function slotWords(reason, text, view, typing, script) {
   }
 }
 
-/** By which device and server, and whether the name may be trusted. */
-const origin = (view) => [view?.device, view?.server, view?.keeps && `name ${view.checked ? "" : "not "}checked`].filter(Boolean).join(", ");
+/** By which device, and whether the name may be trusted. */
+const origin = (view) => [view?.device, view?.keeps && `name ${view.checked ? "" : "not "}checked`].filter(Boolean).join(", ");
 
 function ReasonAction({ action }) {
   const { commands, driver } = usePage();
