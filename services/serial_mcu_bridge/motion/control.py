@@ -130,13 +130,12 @@ class Control:
         return min((at for at in times if at is not None), default=None)
 
     def tick(self, now: float) -> None:
-        """Let what is over end; then :meth:`note`."""
+        """Let what is over end; then :meth:`note` and :meth:`show_turn`."""
         if self._next is not None and now >= self._next:
             self._next = None
             self.lease.tick(_ms(now))
         self._state.tick(now)
         self._turns.tick(now)
-        self.show_turn(now)
 
     def show_turn(self, now: float) -> None:
         """Send the turn to the other owners, if it has changed or is due again; the motors are halted before."""
