@@ -8,7 +8,7 @@ import pytest
 from msgspec import structs
 
 from pebble.config import Security
-from pebble.contract.payloads import ControlRequest, ControlTurn, Drive
+from pebble.contract.payloads import ControlRequest, ControlState, ControlTurn, Drive
 from pebble.services.serial_mcu_bridge.motion.control import Control
 
 OWNERS = ("serial", "arm", "tail")  # the first by name is the second here
@@ -21,7 +21,8 @@ class Owner:
     def __init__(self, name: str, owners: tuple[str, ...] = OWNERS, **security: Any) -> None:
         self.name, self.now = name, START_S
         self.sent: list[tuple[float, ControlTurn | None]] = []
-        self.control = Control(Security(**security), lambda _state: None, self.now, name, owners, self._send)
+        self.states: list[ControlState] = []
+        self.control = Control(Security(**security), self.states.append, self.now, name, owners, self._send)
 
     def _send(self) -> None:
         self.sent.append((round(self.now, 3), self.control.turn(7, self.now)))
@@ -171,6 +172,16 @@ def test_a_turn_that_is_older_or_to_come_is_not_followed(turn: ControlTurn, halt
     assert second.receive("arm", turn) is halts
     assert second.control.state().key == key
     assert {one: second.moves(one) for one in ("k", "l", "")} == {one: one == key for one in ("k", "l", "")}
+
+
+def test_another_owner_publishes_its_state_when_what_it_shows_changes() -> None:
+    second = Owner("serial")
+    for tenth, fields in enumerate(({}, {}, {"asks": "eve", "asks_id": "b"}, {"others": True}, {"others": True}), 1):
+        second.now = START_S + tenth
+        second.receive("arm", granted(**{"t": 100_000 + tenth} | fields))
+    assert [(state.key, state.asks, state.others) for state in second.states] == [
+        *(("k", "", False), ("k", "eve", False), ("k", "", True)),
+    ]
 
 
 def test_another_owner_answers_nobody_and_ends_nothing() -> None:
