@@ -105,7 +105,7 @@ class Control:
 
     def left_ms(self, now: float) -> int:
         """For how long a command that is permitted now may move the motors at most."""
-        return sys.maxsize if self._shared is None else self._shared.until - _ms(now)
+        return sys.maxsize if self._shared is None else max(0, self._shared.until - _ms(now))
 
     def note(self, now: float) -> bool:
         """Publish what has changed; True: control has passed on, so halt the motors first."""

@@ -141,7 +141,7 @@ def test_another_owner_follows_the_first_for_1_5_seconds_of_its_stamp() -> None:
     second = Owner("serial", strangers="drive")
     assert second.control.peers == {"arm"}
     assert not second.moves()
-    assert second.control.left_ms(START_S) <= 0
+    assert second.control.left_ms(START_S) == 0
     second.now = 101.0
     assert second.receive("arm", granted())  # halts
     assert second.control.left_ms(101.0) == 500
