@@ -49,7 +49,7 @@ def perform(config: Config, events: tuple[Any, ...]) -> TwoOwners:
         elif what == "killed":
             world.owners[who].kill(*rest)
         elif what == "retained":
-            world.do_retain(1, 0)
+            world.do_retain(1, -1)  # the newest turn, with a time of now
         else:
             arguments = [argument for argument in rest if not isinstance(argument, dict)]
             fields = next((argument for argument in rest if isinstance(argument, dict)), {})
