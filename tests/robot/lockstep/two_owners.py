@@ -19,7 +19,7 @@ from itertools import count
 from pathlib import Path
 
 from pebble.config import Config, load
-from pebble.contract import CONTROL_TURN, codec
+from pebble.contract import CONTROL_STATE, CONTROL_TURN, codec
 from pebble.runtime.process import view_of
 from pebble.transports import Message, QoS
 from tests.kit.schedules import Engine, Outcome, RandomSteps, Steps, perform_steps
@@ -74,7 +74,8 @@ class TwoOwners:
         }  # fmt: skip
         self.drivers = {name: Driver(name, self.network, self.commands) for name in ("ann", "eve", STRANGER)}
         self.moved: set[tuple[str, str]] = set()  # (owner, driver)
-        self._granted: list[tuple[float, str]] = []  # when, and to whose id; by the first
+        self._granted: list[tuple[float, str]] = []  # when, and to whose id; what the first tells the second
+        self._shown = (0.0, "")  # the same; what it tells everybody: both are lost while it has no connection
         self._recorded: list[Message] = []  # turns of the first
         self._run = 100
         for owner in self.owners.values():
@@ -90,6 +91,8 @@ class TwoOwners:
             turn = codec.decode(CONTROL_TURN, message.payload)
             self._recorded = [*self._recorded, message][-8:]
             self._granted = [*self._granted, (self.scheduler.now, turn.id)][-100:]
+        elif process is self.owners[FIRST] and message.topic == CONTROL_STATE.topic(BASE, owner=FIRST):
+            self._shown = self.scheduler.now, codec.decode(CONTROL_STATE, message.payload).id
 
     def _turned(self, owner: Owner) -> None:
         late = self.scheduler.now > owner.wheels.deadline + owner.slack + _MS
@@ -120,8 +123,9 @@ class TwoOwners:
         persons = {driver for driver in drivers.values() if driver not in ("", SCRIPT)}
         self.scheduler.check(len(persons) < 2, "two drivers move the two owners")
         first, second = self.owners.values()
+        newest = [*self._granted[-1:], self._shown]
         if drivers[FIRST] and first.alive and not first.frozen:
-            self.scheduler.check(self._named(drivers[FIRST], self._granted[-1:]), "the first obeys who has no control")
+            self.scheduler.check(self._named(drivers[FIRST], newest), "the first obeys who has no control")
         if drivers[SECOND] and second.alive and not second.frozen:
             since = self.scheduler.now - FOLLOWS_S - second.slack - _MS
             recent = [granted for granted in self._granted if granted[0] >= since]
