@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from msgspec.structs import asdict
+from msgspec.structs import asdict, replace
 
 from pebble.config.home import in_home
 from pebble.config.masking import holds_secret, masked
@@ -36,6 +36,7 @@ class Config(Root, frozen=True, kw_only=True):
     run_folder: Path
     state_folder: Path
     password_variables: tuple[str, ...]  # of the environment: those that passwords were read from
+    motor_owners: tuple[str, ...] = ()  # of the whole robot, also in the view of one serial line
 
     @property
     def base(self) -> str:
@@ -141,7 +142,7 @@ def _config(raw: Any, path: Path | None, folder: Path, env: Mapping[str, str]) -
     if reader.notes.problems:
         raise ConfigError(list(dict.fromkeys(map(str, reader.notes.problems))))
     identity = Identity(root.robot.system, root.robot.type, root.robot.id)
-    return Config(
+    config = Config(
         **asdict(root),
         identity=identity,
         path=path,
@@ -151,6 +152,7 @@ def _config(raw: Any, path: Path | None, folder: Path, env: Mapping[str, str]) -
         state_folder=root.transport.state_dir or default_state_folder(identity.base, env),
         password_variables=tuple(reader.password_variables),
     )
+    return replace(config, motor_owners=tuple(map(config.motor_owner, config.motor_lines())))
 
 
 def default_run_folder(base: str, env: Mapping[str, str]) -> Path:

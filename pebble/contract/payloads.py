@@ -340,6 +340,23 @@ class ControlState(Payload, frozen=True, kw_only=True):
     boot: str = ""  # random at each start of the owner, as in its emergency stop
 
 
+class ControlTurn(Payload, frozen=True, kw_only=True, omit_defaults=True):
+    """What the first of several motor owners grants; of another owner only ``boot`` and ``turn``, which it follows."""
+
+    boot: str  # of the first owner
+    turn: Annotated[int, Meta(ge=0)]  # grows whenever control passes on, also to nobody
+    t: Annotated[int, Meta(ge=0, le=LARGEST_MS)] = 0  # when it was sent, by the machine's clock since its start
+    key: str = ""
+    account: str = ""  # of who has control, where names are checked
+    id: str = ""
+    by: str = ""
+    device: str = ""
+    asks: str = ""
+    asks_id: str = ""
+    others: bool = False
+    barred: Annotated[int, Meta(ge=0, le=LAST_RUN)] = 0  # no run up to this one moves anything
+
+
 class LinkState(Payload, frozen=True, kw_only=True):
     """What the way between a robot and its remote broker carries now, as its bridge measures it."""
 

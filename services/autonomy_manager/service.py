@@ -64,7 +64,7 @@ class AutonomyManager(Service):
         motors = self.config.motor_lines()
         self.addresses = Addresses(view_of(self.config, next(iter(motors), "")))
         self._local = LocalScripts(self.config)
-        self._owners = MotorOwners([self.config.motor_owner(line) for line in motors])
+        self._owners = MotorOwners(self.config.motor_owners)
         processes = Processes(self.config.run_dir() / "scripts.lock")
         self.on_stop(processes.close)
         self._runner = Runner(self, spawn or processes, self._section.stop_timeout_seconds)

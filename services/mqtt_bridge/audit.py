@@ -42,7 +42,7 @@ class Audit(Acts):
     """What :class:`Acts` finds is written once a second; ``remote`` gets the newest marks, and what is asked for."""
 
     def __init__(self, config: Config, remote: Transport, clock: Callable[[], float] = time.monotonic) -> None:
-        super().__init__(config.base, map(config.motor_owner, config.motor_lines()), clock, time.time)
+        super().__init__(config.base, config.motor_owners, clock, time.time)
         self._remote, self._addresses = remote, Addresses(config)
         self._level = config.security.level
         self._lines_bytes = LINES_BYTES if config.services.mqtt_bridge.link.slowest == "wide" else THIN_LINES_BYTES

@@ -65,8 +65,7 @@ class MqttBridge(ForwardingService):
         self._heartbeat = Heartbeat(self.addresses[ONLINE]) if section.heartbeat.enabled else None
         self._same_broker = SameBrokerProbe(self.config, self.transport, self.remote, self.clock)
         notifier = Notifier()
-        owners = map(self.config.motor_owner, self.config.motor_lines())
-        self._owners = MotorOwners(self.config.base, owners, notifier)
+        self._owners = MotorOwners(self.config.base, self.config.motor_owners, notifier)
         self._audit = Audit(self.config, self.remote, self.clock)
         self._private = PrivateTopics(self.config.base)
         self._uplink: Uplink | None = None

@@ -26,6 +26,7 @@ from typing import Any
 ENGINES = {
     "motion": "tests.motion.histories",
     "lockstep": "tests.robot.lockstep.schedules",
+    "owners": "tests.robot.lockstep.two_owners",
     "driving_lockstep": "tests.web.driving_lockstep.schedules",
     "control": "tests.robot.control_schedules",
     "ages": "tests.forwarding.age_schedules",

@@ -3,17 +3,20 @@
 import logging
 import operator
 import secrets
+import sys
 from collections.abc import Callable
 
 from pebble.config import Security
-from pebble.contract.payloads import ControlRequest, ControlState, Drive
-from pebble.motion.lease import Lease
+from pebble.contract.payloads import ControlRequest, ControlState, ControlTurn, Drive
 from pebble.runtime.rate_limit import RateLimitedLog
 from pebble.services.serial_mcu_bridge.motion.paced import Paced
+from pebble.services.serial_mcu_bridge.motion.shared_lease import SharedLease, lease_of
 
 log = logging.getLogger(__name__)
 
 _TICK_S = 0.25  # while a client has control, or others drive: what is over ends so late at most
+_REPEAT_S = 0.5  # of the turn, where there are several owners
+_TURNS_PER_S = 20  # at most: a turn is shown at once, but not each one of a flood
 _NO_CLIENT = ("", "", "", "")
 
 
@@ -23,11 +26,23 @@ class Control:
     ``publish(state)`` is called with each new state. Nothing is saved: after a restart no client has control.
     """
 
-    def __init__(self, security: Security, publish: Callable[[ControlState], object], now: float) -> None:
+    def __init__(
+        self,
+        security: Security,
+        publish: Callable[[ControlState], object],
+        now: float,
+        owner: str = "",
+        owners: tuple[str, ...] = (),
+        show_turn: Callable[[], object] = lambda: None,
+    ) -> None:
+        """``owners``: all of the robot; if there are others, ``show_turn()`` is to send them :meth:`turn`."""
         self.boot = secrets.token_hex(4)  # of this life of the motor owner
         self._named = security.named
         strangers = ("drive", "free", "refuse").index(security.unnamed)
-        self.lease = Lease(_ms(now), operator.sub, secrets.token_hex, strangers)
+        self.lease = lease_of(owner, owners, self.boot, _ms(now), operator.sub, secrets.token_hex, strangers)
+        self._shared = self.lease if isinstance(self.lease, SharedLease) else None
+        self._turns = Paced(show_turn, _TURNS_PER_S)
+        self._turn_due = None if self._shared is None else now
         self._state = Paced(lambda: publish(self.state()))
         self._log = RateLimitedLog(log, burst=5)
         self._next: float | None = None  # the next tick
@@ -70,12 +85,35 @@ class Control:
         account = request.by.partition("/")[0] if self._named else ""
         return account, request.id, request.by, request.device
 
+    @property
+    def peers(self) -> frozenset[str]:
+        """The other owners whose turns this one needs."""
+        return frozenset() if self._shared is None else self._shared.peers
+
+    def receive_turn(self, owner: str, turn: ControlTurn, now: float) -> None:
+        """Take what a peer has sent; then :meth:`note`."""
+        if self._shared is not None:
+            self._shared.receive(owner, turn, _ms(now))
+
+    def turn(self, barred: int, now: float) -> ControlTurn | None:
+        """Return what the other owners are to receive; ``barred`` is the arbiter's."""
+        return None if self._shared is None else self._shared.shown(barred, _ms(now))
+
+    def waits(self, now: float) -> bool:
+        """True if nothing may move because the robot's owners may differ."""
+        return self._shared is not None and self._shared.waits(_ms(now))
+
+    def left_ms(self, now: float) -> int:
+        """For how long a command that is permitted now may move the motors at most."""
+        return sys.maxsize if self._shared is None else max(0, self._shared.until - _ms(now))
+
     def note(self, now: float) -> bool:
         """Publish what has changed; True: control has passed on, so halt the motors first."""
         lease = self.lease
         if lease.changed:
             lease.changed = False
             self._state.changed(now)
+            self._turn_due = None if self._shared is None else now
         if self._next is None and (lease.key or lease.others):
             self._next = now + _TICK_S
         halts, lease.halts = lease.halts, False
@@ -88,14 +126,22 @@ class Control:
     @property
     def due(self) -> float | None:
         """When :meth:`tick` has something to do; None: nothing."""
-        return min((at for at in (self._next, self._state.due) if at is not None), default=None)
+        times = (self._next, self._state.due, self._turn_due, self._turns.due)
+        return min((at for at in times if at is not None), default=None)
 
     def tick(self, now: float) -> None:
-        """Let what is over end; then :meth:`note`."""
+        """Let what is over end; then :meth:`note` and :meth:`show_turn`."""
         if self._next is not None and now >= self._next:
             self._next = None
             self.lease.tick(_ms(now))
         self._state.tick(now)
+        self._turns.tick(now)
+
+    def show_turn(self, now: float) -> None:
+        """Send the turn to the other owners, if it has changed or is due again; the motors are halted before."""
+        if self._turn_due is not None and now >= self._turn_due:
+            self._turn_due = now + _REPEAT_S
+            self._turns.changed(now)
 
     def repeat_state(self, now: float) -> None:
         self._state.changed(now)

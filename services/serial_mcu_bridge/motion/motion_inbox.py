@@ -5,7 +5,7 @@ from itertools import chain
 
 from msgspec import Struct
 
-from pebble.contract.payloads import SCRIPT, ControlRequest, Drive, EstopCommand, EstopReset
+from pebble.contract.payloads import SCRIPT, ControlRequest, ControlTurn, Drive, EstopCommand, EstopReset
 from pebble.motion.arbiter import PERSON, UNKNOWN_RUN
 from pebble.services.serial_mcu_bridge.motion.control import Control
 
@@ -44,6 +44,7 @@ class Batch(Struct):
     stops: list[EstopCommand]
     resets: list[ReceivedReset]
     requests: list[ReceivedRequest]
+    turns: list[tuple[str, ControlTurn]]
     drives: list[ReceivedDrive]
 
 
@@ -62,6 +63,7 @@ class MotionInbox:
         self._stops: list[EstopCommand] = []
         self._resets: list[ReceivedReset] = []
         self._requests: dict[tuple[str, str], ReceivedRequest] = {}  # by sender, the newest sender last
+        self._turns: dict[str, ControlTurn] = {}  # by owner
         self._drives: dict[int, list[ReceivedDrive]] = {}  # the same
 
     def put_stop(self, stop: EstopCommand) -> bool:
@@ -94,9 +96,15 @@ class MotionInbox:
             self._requests[sender] = ReceivedRequest(request, over, now)
             return was_empty
 
+    def put_turn(self, owner: str, turn: ControlTurn) -> bool:
+        with self._lock:
+            was_empty = self._empty
+            self._turns[owner] = turn
+            return was_empty
+
     def put_drive(self, drive: Drive, now: float) -> bool:
         with self._lock:
-            was_empty = not (self._drives or self._stops or self._resets or self._requests)
+            was_empty = self._empty
             sender = run_of(drive)
             if drive.key and sender == PERSON and self._control.holds(drive):
                 sender = _HOLDER
@@ -112,13 +120,13 @@ class MotionInbox:
         """Return all that waits, and forget it."""
         with self._lock:
             drives = list(chain.from_iterable(self._drives.values()))
-            batch = Batch(self._stops, self._resets, list(self._requests.values()), drives)
-            self._stops, self._resets, self._requests, self._drives = [], [], {}, {}
+            batch = Batch(self._stops, self._resets, list(self._requests.values()), list(self._turns.items()), drives)
+            self._stops, self._resets, self._requests, self._turns, self._drives = [], [], {}, {}, {}
             return batch
 
     @property
     def _empty(self) -> bool:
-        return not (self._stops or self._resets or self._requests or self._drives)
+        return not (self._drives or self._stops or self._resets or self._requests or self._turns)
 
     def _drop(self, waiting: list[EstopCommand] | list[ReceivedReset]) -> None:
         del waiting[0]

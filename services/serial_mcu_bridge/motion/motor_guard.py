@@ -124,14 +124,25 @@ class MotorGuard:
             strange = self._control.lease.refuses(
                 drive.moves, run != PERSON or account is None, key, account or "", _ms(now)
             )
-            reason = "stranger" if strange else "latched" if self.latched else "overruled"
+            waits = drive.moves and self._control.waits(now)
+            reason = "handover" if waits else "stranger" if strange else "latched" if self.latched else "overruled"
             self._counters.add(reason)
             if drive.moves or run == PERSON:  # a script's zero is only to bar older runs, which the arbiter has done
-                self._log.warning(reason, "refused a drive command: %s", self._why_refused(run, key, strange))
+                self._log.warning(reason, "refused a drive command: %s", self._why_refused(reason, run, key))
             return None
         if run == PERSON:
             self._hold_until = now + _HOLD_S
-        return limit / 1000
+        return min(limit, self._control.left_ms(now)) / 1000
+
+    def bar(self, run: int, now: float) -> None:
+        """Bar what another owner of the robot has barred."""
+        self._arbiter.bar(run)
+        if self._arbiter.barred != self._barred:
+            self._note_barred(now)
+
+    @property
+    def barred(self) -> int:
+        return self._barred
 
     @property
     def due(self) -> float | None:
@@ -186,10 +197,12 @@ class MotorGuard:
         fields: dict[str, Any] = self._latch.state(self.persisted)
         return EstopState(**fields, barred=self._barred or UNSET)
 
-    def _why_refused(self, run: int, key: str, strange: bool) -> str:
-        if strange:
+    def _why_refused(self, reason: str, run: int, key: str) -> str:
+        if reason == "handover":
+            return "the robot's motor owners do not follow the same holder yet"
+        if reason == "stranger":
             return "its key of control is not the one of now" if key else "only who has control may drive"
-        if self.latched:
+        if reason == "latched":
             return "the robot is stopped"
         if run == PERSON:
             return "after the reset no zero and no pause was received yet"

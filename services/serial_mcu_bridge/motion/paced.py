@@ -7,11 +7,11 @@ STATES_PER_S = 4
 
 
 class Paced:
-    """Calls ``publish()`` at each change, or as soon as the rate allows: at most four times a second."""
+    """Calls ``publish()`` at each change, or as soon as the rate allows: at most so many times a second."""
 
-    def __init__(self, publish: Callable[[], object]) -> None:
+    def __init__(self, publish: Callable[[], object], per_s: int = STATES_PER_S) -> None:
         self._publish = publish
-        self._published = deque([float("-inf")] * STATES_PER_S, maxlen=STATES_PER_S)
+        self._published = deque([float("-inf")] * per_s, maxlen=per_s)
         self.due: float | None = None  # when a state is published that could not be before
 
     @property

@@ -11,6 +11,7 @@ from pebble.contract.payloads import (
     ChargingStatus,
     ControlRequest,
     ControlState,
+    ControlTurn,
     Drive,
     EstopCommand,
     EstopReset,
@@ -34,6 +35,7 @@ from pebble.services.serial_mcu_bridge.text import goob_base
 from pebble.services.serial_mcu_bridge.text.device_log import DeviceLogLine, is_known
 from pebble.services.serial_mcu_bridge.text.goob_base import Charging, Level, Report, Touch
 from pebble.services.serial_mcu_bridge.text.hall_memory import HallMemory
+from pebble.transports import Message, QoS
 
 _LIGHTS = "lights"  # a steady colour and a fade replace one another
 _SAVE_AGAIN_S = 1.0
@@ -60,7 +62,10 @@ class MotorBridge(SerialService):
     A bridge of another text protocol sets ``protocol`` and ``stop_line``.
     """
 
-    publishes = (c.ESTOP_STATE, c.CONTROL_STATE, c.TOUCH_SENSORS, c.CHARGING_STATUS, c.CHARGING_LEVEL)
+    publishes = (
+        *(c.ESTOP_STATE, c.CONTROL_STATE, c.CONTROL_TURN),
+        *(c.TOUCH_SENSORS, c.CHARGING_STATUS, c.CHARGING_LEVEL),
+    )
     protocol: ClassVar[MotorProtocol] = goob_base
     stop_line = goob_base.STOP
 
@@ -68,7 +73,14 @@ class MotorBridge(SerialService):
         super().__init__(*arguments, **options)
         self._publishes_touch = self.options.telemetry.publish_touch_sensors
         self._owner = self.config.motor_owner(self.instance)
-        self._control = Control(self.config.security, self._publish_control, self.clock())
+        self._control = Control(
+            self.config.security,
+            self._publish_control,
+            self.clock(),
+            self._owner,
+            self.config.motor_owners,
+            self._show_turn,
+        )
         self._waiting = MotionInbox(self._control)
         self.state_file = StateFile(self.config.state_file(f"estop-{self._owner}"), self._on_saved)
         self._barred_file = StateFile(self.config.run_dir() / f"barred-{self._owner}.json")
@@ -120,6 +132,18 @@ class MotorBridge(SerialService):
     def receive_take(self, request: ControlRequest, arrived: float) -> None:
         self._judge_soon(self._waiting.put_request(request, True, arrived))
 
+    def set_up(self) -> None:
+        """Receive the turns of other motor owners as well, where there are any."""
+        super().set_up()
+        receive = self.refusals.reader(c.CONTROL_TURN, self._receive_turn)
+        for owner in self._control.peers:
+            topic = c.CONTROL_TURN.topic(self.config.base, owner=owner)
+            self.transport.subscribe(topic, receive, qos=QoS(c.CONTROL_TURN.default_qos), direct=True)
+
+    def _receive_turn(self, message: Message, turn: ControlTurn, names: dict[str, str]) -> None:
+        if not message.retain:
+            self._judge_soon(self._waiting.put_turn(names["owner"], turn))
+
     @on(c.DRIVE, direct=True)
     def receive_drive(self, drive: Drive, arrived: float) -> None:
         self._judge_soon(self._waiting.put_drive(drive, arrived))
@@ -145,6 +169,10 @@ class MotorBridge(SerialService):
             self._guard.reset(waiting.reset, self.clock() - waiting.at, self.clock())
         for request in batch.requests:
             self._answer(request)
+        for owner, turn in batch.turns:
+            self._control.receive_turn(owner, turn, self.clock())
+            self._guard.bar(turn.barred, self.clock())
+            self._note_control()
         for received in batch.drives:
             if latches or not (batch.stops and received.drive.moves):
                 self._drive(received)
@@ -165,8 +193,7 @@ class MotorBridge(SerialService):
             self.count_late(c.DRIVE)
             return
         valid_s = self._guard.judge(drive, now)
-        if self._control.note(now):
-            self._halt()
+        self._note_control()
         if valid_s is None:
             return
         if self._deadline is not None and now >= self._deadline.due:
@@ -184,8 +211,12 @@ class MotorBridge(SerialService):
             self.count_late(c.CONTROL)
             return
         self._control.request(received.request, received.over, now)
-        if self._control.note(now):
+        self._note_control()
+
+    def _note_control(self) -> None:
+        if self._control.note(self.clock()):
             self._halt()
+        self._control.show_turn(self.clock())
 
     def _halt(self) -> None:
         self._set_deadline(None)
@@ -253,8 +284,7 @@ class MotorBridge(SerialService):
         self._guard_timer = None
         self._guard.tick(self.clock())
         self._control.tick(self.clock())
-        if self._control.note(self.clock()):
-            self._halt()
+        self._note_control()
         self._arm_guard()
 
     @every(_SAVE_AGAIN_S)
@@ -280,6 +310,11 @@ class MotorBridge(SerialService):
 
     def _publish_control(self, state: ControlState) -> None:
         self.publish(c.CONTROL_STATE, state, owner=self._owner)
+
+    def _show_turn(self) -> None:
+        turn = self._control.turn(self._guard.barred, self.clock())
+        if turn is not None:
+            self.publish(c.CONTROL_TURN, turn, owner=self._owner)
 
     def _on_saved(self, number: int, succeeded: bool) -> None:
         """On the file's thread."""

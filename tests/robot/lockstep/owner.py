@@ -36,6 +36,7 @@ class Wheels:
         self._line = _STOP
         self._at = scheduler.now
         self.received = 0
+        self.deadline = 0.0  # of the newest drive command that the line was given
 
     def receive(self, line: bytes) -> None:
         self.received += 1
@@ -76,6 +77,7 @@ class RecordedLine:
         self._wheels.receive(_STOP)
 
     def drive(self, line: bytes, valid_s: float) -> None:
+        self._wheels.deadline = self._scheduler.now + valid_s
         self._outbox.drive(line, self._scheduler.now, valid_s)
         self._pump()
 
@@ -138,9 +140,21 @@ class MemoryFile:
 class Owner(ServiceProcess):
     """``before`` and ``after`` are called around each turn."""
 
-    def __init__(self, network: Network, config: Config, disk: Disk, wheels: Wheels) -> None:
-        super().__init__("owner", network.scheduler, lambda process: self._service(network, config, disk))
+    def __init__(
+        self,
+        network: Network,
+        config: Config,
+        disk: Disk,
+        wheels: Wheels,
+        *,
+        instance: str = "",
+        token_hex: Callable[[int], str] | None = None,
+    ) -> None:
+        """``token_hex``: of each boot and key; without it they are the number of the life."""
+        super().__init__("owner" + instance, network.scheduler, lambda process: self._service(network, config, disk))
         self.wheels = wheels
+        self._instance = instance
+        self._token_hex = token_hex or (lambda size: f"{self.lives:0{2 * size}x}")
         self.before: Callable[[], None] = lambda: None
         self.after: Callable[[], None] = lambda: None
 
@@ -153,13 +167,15 @@ class Owner(ServiceProcess):
         def file(path: Path, *on_saved: Any) -> MemoryFile:
             return MemoryFile(disk, self, path, *on_saved)
 
-        random = SimpleNamespace(token_hex=lambda size: f"{self.lives:0{2 * size}x}")
+        random = SimpleNamespace(token_hex=self._token_hex)
         with (
             patch.object(motor_bridge, "StateFile", file),
             patch.object(motor_guard, "secrets", random),
             patch.object(control, "secrets", random),
         ):
-            service = MotorBridge(config, Connection(self, network), clock=self.scheduler.clock)
+            service = MotorBridge(
+                config, Connection(self, network), instance=self._instance, clock=self.scheduler.clock
+            )
         service.line.close()
         service.line = RecordedLine(self.wheels, self, self.scheduler)  # type: ignore[assignment]
         return service

@@ -5,7 +5,7 @@ import random
 import pytest
 
 from pebble.config import Security
-from pebble.contract.payloads import ControlRequest, Drive, EstopCommand, EstopReset
+from pebble.contract.payloads import ControlRequest, ControlTurn, Drive, EstopCommand, EstopReset
 from pebble.services.serial_mcu_bridge.motion.control import Control
 from pebble.services.serial_mcu_bridge.motion.motion_inbox import MotionInbox
 
@@ -154,3 +154,16 @@ def test_which_request_waits(arrived: list[tuple[ControlRequest, bool]], waiting
     for request, over in arrived:
         inbox.put_request(request, over, 0.0)
     assert [(one.request.ends(), one.over) for one in inbox.take().requests] == waiting
+
+
+def test_the_newest_turn_of_each_owner_waits_and_is_taken_once() -> None:
+    inbox = empty()
+    arm, tail = ControlTurn(boot="b", turn=2), ControlTurn(boot="b", turn=1)
+    assert inbox.put_turn("arm", ControlTurn(boot="b", turn=1))
+    assert not inbox.put_turn("tail", tail)
+    assert not inbox.put_turn("arm", arm)
+    assert not inbox.put_drive(ZERO, 0.0)
+    assert sorted(inbox.take().turns, key=str) == [("arm", arm), ("tail", tail)]
+    assert inbox.take().turns == []
+    assert inbox.put_drive(ZERO, 0.0)
+    assert not inbox.put_turn("arm", arm)

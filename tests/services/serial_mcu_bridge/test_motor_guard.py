@@ -5,7 +5,7 @@ import os
 import shutil
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack
+from contextlib import ExitStack, closing
 from pathlib import Path
 
 import msgspec
@@ -13,7 +13,7 @@ import pytest
 from msgspec import structs
 
 from pebble.config import Security
-from pebble.contract.payloads import Drive, EstopCommand, EstopReset, EstopState
+from pebble.contract.payloads import ControlTurn, Drive, EstopCommand, EstopReset, EstopState
 from pebble.services.serial_mcu_bridge.motion.control import Control
 from pebble.services.serial_mcu_bridge.motion.motor_guard import MotorGuard
 from pebble.services.serial_mcu_bridge.motion.state_file import StateFile
@@ -27,16 +27,16 @@ SCRIPT = Drive(z=0.5, source="autonomy", run=7)
 class Rig:
     """A guard on a clock that the test moves; writes end when the test waits for them."""
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, owners: tuple[str, ...] = ()) -> None:
         self.now = 100.0
         self.states: list[EstopState] = []
         self.counters = Counters()
         self._results: list[tuple[int, bool]] = []
         self.file = StateFile(path, lambda number, succeeded: self._results.append((number, succeeded)))
         self.barred_file = StateFile(path.with_name("barred.json"))
-        control = Control(Security(), lambda _state: None, self.now)
+        self.control = Control(Security(), lambda _state: None, self.now, "serial", owners)
         self.guard = MotorGuard(
-            self.file, self.barred_file, self.states.append, self.counters, control, watchdog_s=0.75, now=self.now
+            self.file, self.barred_file, self.states.append, self.counters, self.control, watchdog_s=0.75, now=self.now
         )
         self.guard.begin(self.now)
 
@@ -118,6 +118,26 @@ def test_a_zero_of_a_manager_that_starts_again_stops_the_script_of_its_predecess
     assert rig.guard.judge(SCRIPT, rig.now) == 0.75
     assert rig.guard.judge(Drive(source="autonomy", run=8), rig.now) == 0
     assert rig.guard.judge(SCRIPT, rig.now) is None
+
+
+def test_what_follows_another_owner_moves_until_1_5_seconds_after_its_turn_and_bars_what_that_bars(
+    path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    with closing(Rig(path, owners=("arm", "serial"))) as rig:
+        assert rig.guard.judge(Drive(z=1), rig.now) is None
+        assert rig.guard.judge(Drive(), rig.now) == 0  # a zero waits for nothing
+        assert rig.counters["handover"] == 1
+        assert "the robot's motor owners do not follow the same holder yet" in caplog.text
+        rig.control.receive_turn("arm", ControlTurn(boot="b", turn=0, t=100_000), rig.now)
+        assert rig.guard.judge(Drive(z=1), rig.now) == 0.75
+        rig.advance(1.25)
+        assert rig.guard.judge(Drive(z=1), rig.now) == 0.25
+        rig.advance(0.25)
+        assert rig.guard.judge(Drive(z=1), rig.now) is None
+        rig.guard.bar(7, rig.now)
+        assert (rig.guard.barred, rig.state.barred) == (7, 7)
+        rig.guard.bar(6, rig.now)
+        assert rig.guard.barred == 7
 
 
 def test_a_stop_is_published_at_once_and_again_when_it_is_saved(rig: Rig, path: Path) -> None:

@@ -1,0 +1,118 @@
+"""The leases of several motor owners that are one robot: the first by name grants, the others follow it. Pure.
+
+Times are milliseconds of the clock that all processes of a machine share.
+"""
+
+import sys
+from abc import abstractmethod
+from typing import Any
+
+from pebble.contract.payloads import ControlTurn
+from pebble.motion.lease import Lease
+
+FOLLOWS_MS = 1500  # so long after it was sent a turn is followed; it is repeated every 500
+SETTLES_MS = FOLLOWS_MS + 100
+
+
+class SharedLease(Lease):
+    """A lease that refuses motion for as long as the owners may differ."""
+
+    until = sys.maxsize  # when everything stops, unless another turn is received before
+
+    def __init__(self, peers: frozenset[str], now: int, *lease: Any) -> None:
+        """``peers``: whose turns are given to :meth:`receive`; ``lease``: what else Lease needs."""
+        super().__init__(now, *lease)
+        self.peers = peers
+
+    def refuses(self, moves: bool, script: bool, key: str, by: str, now: int) -> bool:
+        refused = super().refuses(moves, script, key, by, now)
+        return refused or (moves and self.waits(now))
+
+    @abstractmethod
+    def waits(self, now: int) -> bool:
+        """True if nothing may move, whoever commands it."""
+
+    @abstractmethod
+    def receive(self, owner: str, turn: ControlTurn, now: int) -> None:
+        """Take a peer's turn."""
+
+    @abstractmethod
+    def shown(self, barred: int, now: int) -> ControlTurn | None:
+        """Return what the peers are to receive."""
+
+
+class FirstLease(SharedLease):
+    """The lease of the first owner: after its start and each handover it waits until the others follow."""
+
+    def __init__(self, boot: str, peers: frozenset[str], now: int, *lease: Any) -> None:
+        super().__init__(peers, now, *lease)
+        self._boot, self._turn = boot, 0
+        self._missing, self._turned_at = set(peers), now
+
+    def take(self, client: tuple[str, ...], ms: int, now: int) -> None:
+        super().take(client, ms, now)
+        self._turn += 1
+        self._missing, self._turned_at = set(self.peers), now
+
+    def waits(self, now: int) -> bool:
+        return bool(self._missing) and now - self._turned_at < SETTLES_MS
+
+    def receive(self, owner: str, turn: ControlTurn, _now: int) -> None:
+        if (turn.boot, turn.turn) == (self._boot, self._turn):
+            self._missing.discard(owner)
+
+    def shown(self, barred: int, now: int) -> ControlTurn:
+        account, name, by, device = self.holder or ("", "", "", "")
+        _, asks_id, asks, _ = self.asker or ("", "", "", "")
+        return ControlTurn(
+            boot=self._boot, turn=self._turn, t=now, key=self.key, account=account, id=name, by=by, device=device,
+            asks=asks, asks_id=asks_id, others=self.others, barred=barred,
+        )  # fmt: skip
+
+
+class FollowingLease(SharedLease):
+    """What another owner knows of the first one's lease: it grants and ends nothing itself."""
+
+    until = 0
+
+    def __init__(self, peers: frozenset[str], now: int, *lease: Any) -> None:
+        super().__init__(peers, now, *lease)
+        self._followed: ControlTurn | None = None
+
+    def waits(self, now: int) -> bool:
+        return now >= self.until
+
+    def receive(self, _owner: str, turn: ControlTurn, now: int) -> None:
+        """Follow the newest turn; one with a time to come is of another clock."""
+        before, self._followed = self._followed, turn
+        if turn.t > now or (before is not None and turn.t < before.t):
+            self._followed = before
+            return
+        self.until = turn.t + FOLLOWS_MS
+        if before is None or (turn.boot, turn.turn) != (before.boot, before.turn):
+            self.take((turn.account, turn.id, turn.by, turn.device) if turn.key else (), 0, now)
+            self.key = turn.key
+        asker = ("", turn.asks_id, turn.asks, "") if turn.asks_id else ()
+        self.changed = self.changed or (asker, turn.others) != (self.asker, self.others)
+        self.asker, self.others = asker, turn.others
+
+    def shown(self, _barred: int, _now: int) -> ControlTurn | None:
+        turn = self._followed
+        return None if turn is None else ControlTurn(boot=turn.boot, turn=turn.turn)
+
+    def hold(self, client: tuple[str, ...], ms: int, urgent: bool, now: int) -> None:
+        """Do nothing: the first owner answers."""
+
+    def release(self, client: tuple[str, ...], now: int) -> None:
+        """Do nothing: the first owner answers."""
+
+    def tick(self, now: int) -> None:
+        """Do nothing: the first owner ends what is over."""
+
+
+def lease_of(owner: str, owners: tuple[str, ...], boot: str, *lease: Any) -> Lease:
+    """Return the lease of ``owner``, one of the robot's ``owners``; ``lease``: what Lease needs."""
+    others, first = frozenset(owners) - {owner}, min(owners, default=owner)
+    if not others:
+        return Lease(*lease)
+    return FirstLease(boot, others, *lease) if owner == first else FollowingLease(frozenset({first}), *lease)

@@ -1,0 +1,108 @@
+"""Drivers in virtual time: they ask for control, drive with its keys or without one, and pretend to be scripts."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import msgspec
+
+from pebble.contract import CONTROL, CONTROL_STATE, CONTROL_TAKE, DRIVE, ESTOP, ESTOP_RESET, ESTOP_STATE, codec
+from pebble.transports import Message, QoS
+from tests.robot.lockstep.commands import PERSON, Command, Commands
+from tests.robot.lockstep.network import Connection, Network
+from tests.robot.lockstep.processes import Process
+
+BASE = "pebble/robots/goob"
+SCRIPT = "script"
+STRANGER = "stranger"  # all commands without a key are of one driver: nobody can tell them apart
+PERIOD_S = 0.1
+
+
+class Driver(Process):
+    """A page of a person, or a program that knows nothing of control."""
+
+    def __init__(self, name: str, network: Network, commands: Commands) -> None:
+        super().__init__(name, network.scheduler)
+        self.alive = True
+        self.id = (name.encode().hex() * 8)[:8]
+        self.seen: dict[str, Any] = {}  # the newest state of control, by owner
+        self.old_keys: list[str] = []  # under which it had control once
+        self._stops: dict[str, Any] = {}
+        self._commands = commands
+        self._wants = self._gesture = 0
+        self._connection = Connection(self, network).open(0.0)
+        self._connection.subscribe(f"{BASE}/outgoing/#", self._receive, direct=True)
+
+    # -- control
+
+    def hold(self, for_ms: int = 3000, *, take: bool = False, period_s: float = 1.0, seconds: float = 1e9) -> None:
+        """Ask, and go on asking."""
+        self._wants += 1
+        self._ask(self._wants, for_ms, take, period_s, self.scheduler.now + seconds)
+
+    def _ask(self, number: int, for_ms: int, take: bool, period_s: float, until: float) -> None:
+        if number != self._wants or self.scheduler.now >= until:
+            return
+        fields = {"id": self.id, "by": self.name, "for_ms": for_ms}
+        self._publish((CONTROL_TAKE if take else CONTROL).topic(BASE), fields)
+        self.scheduler.after(period_s, lambda: self._ask(number, for_ms, False, period_s, until))
+
+    def let_go(self, *, release: bool = True) -> None:
+        """Release control, or lose the connection."""
+        self._wants += 1
+        self._gesture += 1
+        if release:
+            self._publish(CONTROL.topic(BASE), {"id": self.id, "want": "release"})
+
+    # -- driving
+
+    @property
+    def key(self) -> str:
+        """As a page has it: the keys of all owners that show its id."""
+        return " ".join(state.key for _, state in sorted(self.seen.items()) if state.id == self.id)
+
+    def drive(self, key: str | None = None, **fields: Any) -> None:
+        """One command; with ``key``, under that one."""
+        key = self.key if key is None else key
+        sender = SCRIPT if "run" in fields else self.name if key else STRANGER
+        command = Command(fields.get("run", PERSON), sender, self.scheduler.now, 5.0, may_move=True)
+        x, z = self._commands.add(command)
+        self._publish(DRIVE.topic(BASE), {"x": x, "z": z} | ({"key": key} if key else {}) | fields)
+
+    def steer(self, seconds: float, key: str | None = None, **fields: Any) -> None:
+        """Drive for so long."""
+        self._gesture += 1
+        self._steer(self._gesture, self.scheduler.now + seconds, key, fields)
+
+    def _steer(self, gesture: int, until: float, key: str | None, fields: dict[str, Any]) -> None:
+        if gesture == self._gesture and self.scheduler.now < until:
+            if key is not None or self.key:  # a page without control sends nothing
+                self.drive(key, **fields)
+            self.scheduler.after(PERIOD_S, lambda: self._steer(gesture, until, key, fields))
+
+    def steer_by_old_key(self, seconds: float) -> None:
+        self.steer(seconds, self.old_keys[-1])
+
+    def zero(self, *, final: bool = False) -> None:
+        self._publish(DRIVE.topic(BASE), {"x": 0, "z": 0} | ({"valid_ms": 0} if final else {}))
+
+    def stop(self) -> None:
+        self._publish(ESTOP.topic(BASE), {"stop": f"{self.scheduler.now:016.3f}".replace(".", "a"), "by": self.name})
+
+    def reset(self) -> None:
+        for state in self._stops.values():
+            self._publish(ESTOP_RESET.topic(BASE), {"boot": state.boot, "count": state.count})
+
+    # -- parts
+
+    def _publish(self, topic: str, fields: dict[str, Any]) -> None:
+        self._connection.publish(topic, msgspec.json.encode(fields), qos=QoS.DELIVERED)
+
+    def _receive(self, message: Message) -> None:
+        owner = message.topic.rpartition("/")[2]
+        if message.payload and message.topic == CONTROL_STATE.topic(BASE, owner=owner):
+            state = self.seen[owner] = codec.decode(CONTROL_STATE, message.payload)
+            if state.id == self.id and state.key not in self.old_keys:
+                self.old_keys.append(state.key)
+        elif message.payload and message.topic == ESTOP_STATE.topic(BASE, owner=owner):
+            self._stops[owner] = codec.decode(ESTOP_STATE, message.payload)

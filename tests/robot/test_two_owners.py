@@ -1,0 +1,158 @@
+"""Two motor owners are one robot: the table of who drives both, random schedules, and what is shown.
+
+``python -m tests.kit.schedules owners`` runs thousands. The world in virtual time checks its own rules all the time.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from pebble.config import Config
+from tests.robot.lockstep.drivers import STRANGER
+from tests.robot.lockstep.two_owners import ENGINE, FIRST, SECOND, TwoOwners, configuration
+from tests.support import cases
+
+pytestmark = pytest.mark.computing
+
+SCHEDULES = cases(50, 150)
+FOREVER = 1e6
+
+
+@pytest.fixture(autouse=True)
+def quiet() -> Iterator[None]:
+    """What services log would take most of the time."""
+    logging.disable(logging.CRITICAL)
+    yield
+    logging.disable(logging.NOTSET)
+
+
+@pytest.fixture(scope="module")
+def config(tmp_path_factory: pytest.TempPathFactory) -> Config:
+    return configuration(Path(tmp_path_factory.mktemp("own")), "free")
+
+
+def perform(config: Config, events: tuple[Any, ...]) -> TwoOwners:
+    """``(seconds, who or which owner, what, ...)``; ``(seconds, "moved by", first, second)`` is what must be then."""
+    world = TwoOwners(0, (config,))
+    begun = world.scheduler.now
+    for at, who, what, *rest in sorted(events, key=lambda event: event[0]):
+        world.scheduler.run(begun + at - world.scheduler.now)
+        if who == "moved by":
+            assert [world.driver_of(name) for name in world.owners] == [what, *rest], f"after {at} s"
+        elif what == "frozen":
+            world.freeze(world.owners[who], *rest)
+        elif what == "killed":
+            world.owners[who].kill(*rest)
+        elif what == "retained":
+            world.do_retain(1, -1)  # the newest turn, with a time of now
+        else:
+            arguments = [argument for argument in rest if not isinstance(argument, dict)]
+            fields = next((argument for argument in rest if isinstance(argument, dict)), {})
+            getattr(world.drivers[who], what)(*arguments, **fields)
+    return world
+
+
+TAKE: dict[str, Any] = {"take": True}
+ANN_DRIVES = ((0, "ann", "hold", 3000, TAKE), (0.1, "ann", "steer", 20))
+EVE_TAKES_OVER = ((1.0, "eve", "hold", 3000, TAKE), (1.1, "eve", "steer", 20))
+EVE_ASKS = (0.5, "eve", "hold", 10_000, {"period_s": 0.02})
+
+#: By name: what happens, and who must move the first and the second owner when.
+MEMBERS: dict[str, tuple[Any, ...]] = {
+    "who takes control drives both": (*ANN_DRIVES, (0.4, "moved by", "ann", "ann")),
+    "the second restarts while a driver without control asks 50 times a second": (
+        *(*ANN_DRIVES, EVE_ASKS, (1.0, SECOND, "killed", 0.5), (1.6, "eve", "steer", 20)),
+        *((at, "moved by", "ann", "ann") for at in (3.0, 4.0, 7.0)),
+    ),
+    "the second is frozen for five seconds, and control passes on meanwhile": (
+        *(*ANN_DRIVES, (0.9, SECOND, "frozen", 5.0), *EVE_TAKES_OVER),
+        *((1.5, "moved by", "", "ann"), (2.7, "moved by", "eve", ""), (6.5, "moved by", "eve", "eve")),
+    ),
+    "the second is frozen for five seconds, and control becomes free meanwhile": (
+        *(*ANN_DRIVES, (0.9, SECOND, "frozen", 5.0), (1.0, "ann", "let_go"), (1.1, STRANGER, "steer", 20, "")),
+        *((1.5, "moved by", "", "ann"), (2.7, "moved by", STRANGER, ""), (6.5, "moved by", STRANGER, STRANGER)),
+    ),
+    "the first restarts while a driver without control asks 50 times a second": (
+        *(*ANN_DRIVES, EVE_ASKS, (1.0, FIRST, "killed", 0.5), (1.6, "eve", "steer", 20)),
+        *((at, "moved by", "eve", "eve") for at in (2.5, 4.0, 7.0)),
+    ),
+    "the first restarts and the second is frozen": (
+        *(*ANN_DRIVES, (0.9, SECOND, "frozen", 5.0), (1.0, FIRST, "killed", 0.1), (1.0, "ann", "let_go")),
+        *((1.2, "eve", "hold"), (1.3, "eve", "steer", 20), (2.6, "moved by", "", ""), (3.2, "moved by", "eve", "")),
+    ),
+    "the first is dead": (
+        *(*ANN_DRIVES, (1.0, FIRST, "killed", None), (1.9, "moved by", "", "ann"), (2.6, "moved by", "", "")),
+        *((3.0, STRANGER, "steer", 20, ""), (3.0, "eve", "hold", 3000, TAKE), (3.1, "eve", "steer", 20)),
+        (8.0, "moved by", "", ""),
+    ),
+    "the first is frozen": (
+        *(*ANN_DRIVES, (1.0, FIRST, "frozen", 1.9), (2.6, "moved by", "", ""), (3.2, "moved by", "ann", "ann")),
+    ),
+    "the second is dead": (
+        *(*ANN_DRIVES, (0.9, SECOND, "killed", None), *EVE_TAKES_OVER),
+        *((2.5, "moved by", "", ""), (2.8, "moved by", "eve", ""), (5.0, "moved by", "eve", "")),
+    ),
+    "control passes on to nobody": (
+        *(*ANN_DRIVES, (1.0, "ann", "let_go"), (1.05, "moved by", "", ""), (1.1, STRANGER, "steer", 20, "")),
+        (1.2, "moved by", STRANGER, STRANGER),
+    ),
+    "control is taken over": (
+        *(*ANN_DRIVES, *EVE_TAKES_OVER),
+        *((1.05, "moved by", "", ""), (1.2, "moved by", "eve", "eve")),
+    ),
+    "control is taken over, and the driver of before goes on": (
+        *(*ANN_DRIVES, (0.5, "ann", "steer", 20, "00000000"), *EVE_TAKES_OVER, (3.0, "moved by", "eve", "eve")),
+    ),
+    "a key of before": (
+        *(*ANN_DRIVES, (1.0, "ann", "let_go"), (1.2, "ann", "steer_by_old_key", 20), (2.0, "moved by", "", "")),
+        *((2.0, "eve", "hold"), (3.0, "moved by", "", "")),
+    ),
+    "a retained turn of before the machine was started": (
+        *(*ANN_DRIVES, (1.0, FIRST, "killed", None), (3.0, "ann", "retained"), (3.0, SECOND, "killed", 0.1)),
+        *((4.0, "moved by", "", ""), (4.5, "moved by", "", "")),
+    ),
+    "a command without a key, while control is held": (
+        *((0, "ann", "hold"), (0.2, STRANGER, "steer", 20, ""), (1.0, "moved by", "", ""), (5.0, "moved by", "", "")),
+    ),
+    "a command without a key, before anybody has control": (
+        *((0, STRANGER, "steer", 20, ""), (0.2, "moved by", STRANGER, STRANGER)),
+    ),
+    "a script": (
+        *((1.5, STRANGER, "steer", 20, "", {"source": "autonomy", "run": 7}), (2.0, "moved by", "script", "script")),
+        *((2.0, "ann", "hold"), (2.1, "ann", "steer", 1.0), (2.5, "moved by", "ann", "ann")),
+    ),
+    "anybody's zero": (*ANN_DRIVES, (0.52, "eve", "zero"), (0.53, "moved by", "", ""), (0.7, "moved by", "ann", "ann")),
+    "anybody's zero at the second, whose first is dead": (
+        *(*ANN_DRIVES, (0.5, FIRST, "killed", None), (1.3, "moved by", "", "ann")),
+        *((1.32, "eve", "zero"), (1.33, "moved by", "", "")),
+    ),
+    "anybody's stop": (*ANN_DRIVES, (0.5, STRANGER, "stop"), (0.53, "moved by", "", ""), (3.0, "moved by", "", "")),
+    "anybody's stop while the first waits": (
+        *(*ANN_DRIVES, (0.9, SECOND, "frozen", 1.0), *EVE_TAKES_OVER, (1.5, STRANGER, "stop")),
+        *((2.7, "moved by", "", ""), (4.0, "moved by", "", "")),
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", MEMBERS)
+def test_who_drives_two_owners(config: Config, name: str) -> None:
+    perform(config, MEMBERS[name])
+
+
+def test_the_second_shows_what_the_first_does_under_its_own_boot(config: Config) -> None:
+    world = perform(config, (*ANN_DRIVES, (0.5, "eve", "hold"), (1.0, "moved by", "ann", "ann")))
+    first, second = (world.drivers["ann"].seen[name] for name in (FIRST, SECOND))
+    shown = ("id", "by", "key", "device", "asks", "asks_id", "others", "named")
+    assert [getattr(second, field) for field in shown] == [getattr(first, field) for field in shown]
+    assert (first.by, first.asks, len(first.key)) == ("ann", "eve", 8)
+    assert first.boot != second.boot
+
+
+def test_no_schedule_has_two_drivers() -> None:
+    broken = [rule for result in ENGINE.run("", 1, range(SCHEDULES)) for rule in result.problems]
+    assert not broken, "python -m tests.kit.schedules owners prints the shortest schedule"
