@@ -19,7 +19,7 @@ from typing import Any
 
 from pebble.errors import TransportError
 from pebble.runtime.signals import handled_by
-from pebble.transports.base import Message, QoS
+from pebble.transports.base import Message
 from pebble.transports.credentials import Credentials
 from pebble.transports.hosts import Address, addresses_of, described
 from pebble.transports.mqtt import client_ids, packets, reasons
@@ -211,14 +211,8 @@ class BrokerTrial:
             peer.leave()
         self._peers, self.base = [], f"{self.root}/{name}"
 
-    def peer(
-        self,
-        *,
-        protocol: str = "3.1.1",
-        bridge: bool = False,
-        will: Message | None = None,
-    ) -> Peer:
-        """A client that the broker has accepted. Raises RefusedError."""
+    def peer(self, *, protocol: str = "3.1.1", bridge: bool = False, will: Message | None = None) -> Peer:
+        """A client that the broker has accepted; the topic of ``will`` is below the probe's. Raises RefusedError."""
         password = self._credentials.password()
         settings = replace(self.settings, protocol=protocol, keepalive_s=_KEEPALIVE_S, password=password)
         name = self.settings.client_id or client_ids.unique(NAME)
@@ -302,16 +296,6 @@ def _undisturbed() -> Iterator[None]:
     on_main = threading.current_thread() is threading.main_thread()
     with handled_by(later) if on_main else nullcontext():
         yield
-
-
-def number(payload: bytes) -> int:
-    """Return that of a numbered message; -1: the broker has made something else of it."""
-    return int(payload) if payload.isdigit() else -1
-
-
-def will(topic: str, payload: bytes, *, qos: int = 1, retain: bool = True) -> Message:
-    """``topic`` is below that of the probe."""
-    return Message(topic, payload, QoS(qos), retain=retain)
 
 
 @contextmanager
