@@ -169,11 +169,9 @@ class Observer:
 
     def publish(self, messages: Iterable[Message]) -> bool:
         """Publish all at once; False if one was not accepted."""
-        are_accepted = True
-        for message in messages:
-            is_accepted = self.transport.publish(message.topic, message.payload, qos=message.qos, urgent=True)
-            are_accepted = are_accepted and is_accepted
-        return are_accepted
+        publish = self.transport.publish
+        accepted = [publish(message.topic, message.payload, qos=message.qos, urgent=True) for message in messages]
+        return all(accepted)
 
     def sent(self, seconds: float) -> float:
         """Wait until the broker has all that was sent, so long at most; returns when."""
@@ -190,11 +188,8 @@ class Observer:
 
     def reads_commands(self) -> bool:
         """True if this client may read what is sent to the robot: a request that changes nothing comes back."""
-        request = ControlRequest(id=secrets.token_hex(4), want="release")
-        with self._beside("conform-commands", c.INCOMING) as (_, messages):
-            self.send(c.CONTROL, request)
-            own = request.id.encode()
-            return self.wait(lambda: any(own in message.payload for message in list(messages)), _RETAINED_S)
+        account = (self.account or "") if self.view.named else ""
+        return self.send_as(account, c.CONTROL, ControlRequest(id=secrets.token_hex(4), want="release"))
 
     def retained(self) -> list[Record]:
         """Return what the broker has retained of it and for it, as one gets it who connects now."""

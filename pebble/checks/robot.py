@@ -3,13 +3,12 @@
 import os
 import socket
 import stat
-import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from pebble.checks import devices, media
 from pebble.checks.broker.of_config import brokers, page_brokers
-from pebble.checks.check import Check, CheckResult, State, failed, ok, run, warn
+from pebble.checks.check import SOON_DAYS, Check, CheckResult, State, failed, ok, run, warn
 from pebble.checks.machine import MACHINE
 from pebble.checks.recorder import recorder
 from pebble.checks.users import user_name
@@ -26,7 +25,6 @@ from pebble.runtime.parent import launcher_runs
 from pebble.transports import Message
 from pebble.transports.socket_paths import FRAMES_SOCKET, fits_socket
 
-SOON_S = 14 * 86400  # before its end, a certificate is warned of
 _ANSWER_S = 2.0
 _DRIVEABLE = {"yes": State.OK, "unknown": State.WARN, "no": State.FAILED}
 
@@ -139,16 +137,16 @@ def operator_page(config: Config) -> Iterator[CheckResult]:
     else:
         yield ok(f"port {settings.port} of {settings.host}")
     if settings.certificate is not None:
-        yield _page_certificate(settings.certificate, time.time())
+        yield _page_certificate(settings.certificate)
 
 
-def _page_certificate(file: Path, now: float) -> CheckResult:
+def _page_certificate(file: Path) -> CheckResult:
     try:
-        left_s = certificates.show(file).until.timestamp() - now
+        days = certificates.show(file).days_left
     except certificates.CertificateError as error:
         return failed(str(error), "pebble cert init")
-    text = f"its certificate ends in {left_s / 86400:.0f} days"
-    return ok(text) if left_s >= SOON_S else warn(text, "pebble cert renew")
+    text = f"its certificate ends in {days:.0f} days"
+    return ok(text) if days >= SOON_DAYS else warn(text, "pebble cert renew")
 
 
 ROBOT: tuple[Check[Config], ...] = (

@@ -349,7 +349,7 @@ def test_who_can_drive_is_shown_by_the_level_and_by_the_fleet_beside_the_config(
     fleet = {"level": "login", "brokers": [{"host": "broker.lab", "port": 8883}], "accounts": roles}
     (tmp_path / "fleet.json").write_text(json.dumps(fleet))
     found = list(who_drives(load(config)))
-    assert [f"{one.state.value} {one.text}" for one in found] == expected
+    assert [f"{result.state.value} {result.text}" for result in found] == expected
 
 
 def test_a_second_broker_that_the_fleet_does_not_have_is_named(tmp_path: Path) -> None:

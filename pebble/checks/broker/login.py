@@ -6,13 +6,11 @@ from dataclasses import replace
 
 from pebble.checks.broker import MOSQUITTO
 from pebble.checks.broker.login_attempt import REFUSED_ID, REFUSED_LOGINS, LoginAttempt, attempt
-from pebble.checks.check import CheckResult, failed, ok, warn
+from pebble.checks.check import SOON_DAYS, CheckResult, failed, ok, warn
 from pebble.config.secret_text import shown_user
 from pebble.config.security import SecurityLevel
 from pebble.config.web import is_loopback
 from pebble.transports.settings import MqttSettings
-
-_SOON_S = 14 * 86400
 
 
 def broker(
@@ -80,7 +78,7 @@ def _encryption(settings: MqttSettings, answer: LoginAttempt, now: float, *, is_
             return ok("not encrypted, which is fine on this machine")
         return warn("is not encrypted: commands and passwords can be read on the network", "set tls.enabled to true")
     days = None if answer.expires is None else (answer.expires - now) / 86400
-    if days is not None and 86400 * days < _SOON_S:
+    if days is not None and days < SOON_DAYS:
         return warn(f"its certificate expires in {days:.0f} days", "renew the broker's certificate")
     if settings.tls.insecure:
         return warn("encrypted, but the name in its certificate is not checked", "set tls.insecure to false")

@@ -42,9 +42,7 @@ class Driver:
 
     @property
     def state(self) -> ControlState | None:
-        """The newest of the robot."""
-        newest = self._robot.of(c.CONTROL_STATE, retained=True)[-1:]
-        return newest[0].value if newest else None
+        return self._robot.view.control.state
 
     @property
     def key(self) -> str:
@@ -140,8 +138,8 @@ def _nameless(robot: Observer, _name: str) -> CheckResult:
         return skipped(UNSEEN)
     if robot.happens(lambda: stranger.holds):
         return failed("it gives control to a request without an account", fix)
-    for one in states(robot).values():
-        robot.send_as("", c.ESTOP_RESET, EstopReset(boot=one.boot, count=one.count, by=BY))
+    for state in states(robot).values():
+        robot.send_as("", c.ESTOP_RESET, EstopReset(boot=state.boot, count=state.count, by=BY))
     if robot.happens(lambda: not robot.view.latched):
         return failed("a reset without an account ends a stop", fix)
     return ok("requests and resets without an account do nothing")

@@ -19,7 +19,7 @@ from pebble.checks.observer import ANSWER_S, Observer
 SPEED = 0.4  # some motors are on or off, by a threshold
 DRIVES_S = 0.6
 RESTS_S = 0.75  # after the last command, at the latest
-_LATE_S = 0.5  # until a report of it is here
+LATE_S = 0.5  # until a report of it is here
 _STEP_S = 0.05
 _SWING = 30  # of a hall sensor's value: less is noise
 _OTHER_KEY, _OTHER_ACCOUNT = "0badf00d", "conform-other"
@@ -33,7 +33,8 @@ def moves_until(robot: Observer, since: float) -> float | None:
     Shown by ``wheels`` in the status, which is published on change, or by readings of hall sensors.
     """
     turning = [(at, any(wheels)) for at, wheels in _shown(robot)]
-    touches = [(one.at, msgspec.structs.astuple(one.value.value)) for one in robot.of(c.TOUCH_SENSORS) if one.value]
+    readings = [record for record in robot.of(c.TOUCH_SENSORS) if record.value]
+    touches = [(reading.at, msgspec.structs.astuple(reading.value.value)) for reading in readings]
     if not turning and not touches:
         return None
     last, level = 0.0, touches[0][1] if touches else ()
@@ -50,7 +51,7 @@ def moves_until(robot: Observer, since: float) -> float | None:
 
 def _shown(robot: Observer) -> list[tuple[float, list[float]]]:
     """What its wheels did, and since when."""
-    reports = [(one.at, one.value.value.get("wheels")) for one in robot.of(c.STATUS) if one.value is not None]
+    reports = [(report.at, report.value.value.get("wheels")) for report in robot.of(c.STATUS) if report.value]
     return robot.eyes() or [(at, wheels) for at, wheels in reports if _are_wheels(wheels)]
 
 
@@ -61,12 +62,12 @@ def _moves(robot: Observer, since: float) -> list[float] | None:
         return next((wheels for at, wheels in reversed(_shown(robot)) if at >= since and any(wheels)), [])
 
     robot.wait(moving, ANSWER_S)
-    robot.look(_LATE_S)
+    robot.look(LATE_S)
     return moving() if _shown(robot) else None
 
 
 def _are_wheels(value: Any) -> bool:
-    return isinstance(value, list) and len(value) > 0 and all(isinstance(one, int | float) for one in value)
+    return isinstance(value, list) and len(value) > 0 and all(isinstance(speed, int | float) for speed in value)
 
 
 class _Wheel:
@@ -107,13 +108,18 @@ def _at_the_wheel(robot: Observer) -> Iterator[_Wheel]:
 
 
 def _rest(robot: Observer, began: float, last: float, limit_s: float, what: str = "the last command") -> CheckResult:
-    robot.look(limit_s + _LATE_S)
+    robot.look(limit_s + LATE_S)
+    return rested(robot, began, last, limit_s, what)
+
+
+def rested(robot: Observer, began: float, last: float, limit_s: float, what: str = "the last command") -> CheckResult:
+    """Judge what was seen of a robot that was driven from ``began`` to ``last``, and had to rest soon after."""
     until = moves_until(robot, began)
     if until is None:
         return skipped(_NOT_SHOWN, _SHOW_IT)
     if until == 0.0:
-        return failed(f"z {SPEED} for {DRIVES_S} s does not move it", "drive by incoming/drive-values, live ones")
-    if until > last + limit_s + _LATE_S / 2:
+        return failed("its commands do not move it", "drive by incoming/drive-values, live ones")
+    if until > last + limit_s + LATE_S / 2:
         shown = "still moves" if until == float("inf") else f"moved for {until - last:.2f} s"
         return failed(f"it {shown} after {what}", f"stop {limit_s:g} s after {what}, at the latest")
     return ok(f"it rests {max(0.0, until - last):.2f} s after {what}")
@@ -158,12 +164,12 @@ def steering(robot: Observer) -> CheckResult:
     )
     with _at_the_wheel(robot) as wheel:
         for fields, signs in ways:
-            found = _moves(robot, wheel.drive(DRIVES_S / 2, **fields)[0])
-            if found is None:
+            wheels = _moves(robot, wheel.drive(DRIVES_S / 2, **fields)[0])
+            if wheels is None:
                 return skipped(_NOT_SHOWN, _SHOW_IT)
-            if [one * sign > 0 for one, sign in zip(found, signs, strict=False)] != [True, True]:
+            if [speed * sign > 0 for speed, sign in zip(wheels, signs, strict=False)] != [True, True]:
                 sent = f"x {fields.get('x', 0):g}, z {fields['z']:g}" + " within value" * ("wrapped" in fields)
-                return failed(f"at {sent} its wheels do {found}", "left is z + x, right is z - x, also within value")
+                return failed(f"at {sent} its wheels do {wheels}", "left is z + x, right is z - x, also within value")
     return ok("x to the right, z ahead")
 
 

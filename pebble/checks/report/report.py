@@ -174,7 +174,10 @@ def _programs(*commands: tuple[str, ...]) -> Part:
 def _printed(program: str, *arguments: str, **who: Any) -> str:
     if shutil.which(program) is None:
         raise MissingError(f"{program} is not installed")
-    done = subprocess.run([program, *arguments], capture_output=True, timeout=_PROGRAM_S, check=False, cwd="/", **who)
+    command = [program, *arguments]
+    done: subprocess.CompletedProcess[bytes] = subprocess.run(
+        command, capture_output=True, timeout=_PROGRAM_S, check=False, cwd="/", **who
+    )
     if done.returncode and not done.stdout:
         raise MissingError(f"{program} ended with {done.returncode}: {done.stderr.decode(errors='replace')[-300:]}")
     return done.stdout.decode(errors="replace")
