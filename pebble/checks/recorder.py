@@ -25,7 +25,7 @@ _STAMP: Final = len("20261120T232921Z")
 
 
 def recorder(config: Config, now: float | None = None) -> Iterator[CheckResult]:
-    """Nothing for a robot without one. ``now``: seconds since 1970."""
+    """Check the recorder of a robot that has one. ``now``: seconds since 1970."""
     section = config.services.recorder
     if not section.enabled:
         return
@@ -65,14 +65,14 @@ def _running(folder: Path, now: float, entries: list[Entry]) -> CheckResult:
 
 def _status(folder: Path) -> dict[str, Any]:
     try:
-        found = json.loads((folder / STATUS).read_bytes())
+        status = json.loads((folder / STATUS).read_bytes())
     except (OSError, ValueError):
         return {}
-    return found if isinstance(found, dict) else {}
+    return status if isinstance(status, dict) else {}
 
 
 def _missed(entries: list[Entry], now: float) -> Iterator[CheckResult]:
-    """Gaps of the last hour, and messages that damage has taken in the last day."""
+    """Find gaps of the last hour, and messages that damage has taken in the last day."""
     newest = [entry for entry in entries if now - entry.ended <= _HOUR_S and not entry.is_media]
     since_ms = 1000 * (now - _HOUR_S)
     gaps = [
@@ -94,7 +94,7 @@ def _missed(entries: list[Entry], now: float) -> Iterator[CheckResult]:
 
 
 def _room(folder: Path, entries: list[Entry], keep_bytes: int, free_bytes: int) -> CheckResult:
-    """Seconds for which there is room at the rate of what was recorded in the last files."""
+    """Tell for how long there is room at the rate of the last files."""
     span_s, size = _rate(entries)
     room = max(0, shutil.disk_usage(folder).free - free_bytes)
     if span_s < _SHORTEST_S or not size:
@@ -110,7 +110,7 @@ def _room(folder: Path, entries: list[Entry], keep_bytes: int, free_bytes: int) 
 
 
 def _rate(entries: list[Entry]) -> tuple[float, int]:
-    """Seconds and bytes of the finished files of the last day; their names tell when they began."""
+    """Return seconds and bytes of the finished files of the last day; their names tell when they began."""
     last = max((entry.ended for entry in entries), default=0.0)
     newest = [entry for entry in entries if last - entry.ended <= _DAY_S and not entry.is_active]
     stamps = [datetime.strptime(entry.path.name[:_STAMP], "%Y%m%dT%H%M%S%z").timestamp() for entry in newest]

@@ -20,7 +20,7 @@ _WORDS = {
 
 
 def who_drives(config: Config) -> Iterator[CheckResult]:
-    """Its level, and who may drive it at that."""
+    """Tell its level, and who may drive it at that."""
     level = config.security.level
     if open_ := warning_of_open(config):
         yield warn(open_, "pebble fleet init, then the account of this robot")
@@ -55,7 +55,7 @@ def unknown_brokers(config: Config) -> Iterator[str]:
 
 
 def _accounts(fleet: Fleet) -> str:
-    """Those whose roles let them drive, servers of the page with a word more."""
+    """Return those whose roles let them drive, servers of the page with a word more."""
     names = [
         f"{name} (a page server: its people, too)" if ProgramRole.PAGE in account.roles else name
         for name, account in fleet.accounts.items()
@@ -65,7 +65,7 @@ def _accounts(fleet: Fleet) -> str:
 
 
 def _folders(config: Config) -> list[Path]:
-    """Where the files of its fleet are: beside its config, or the authority that it trusts."""
+    """Return where the files of its fleet are: beside its config, or the authority that it trusts."""
     ca_cert = config.services.mqtt_bridge.remote_mqtt.tls.ca_cert
     places = [config.folder, *([] if ca_cert is None else [Path(ca_cert).parent])]
     return [folder for folder in (place.absolute() for place in places) if (folder / FLEET).is_file()][:1]

@@ -77,7 +77,7 @@ def page_account(what: str, settings: MqttSettings, level: SecurityLevel = "open
 
 @contextmanager
 def _logged_in(settings: MqttSettings, answer_s: float) -> Iterator[tuple[BrokerTrial, Peer]]:
-    """One client with the account, for whole topics. Raises TransportError."""
+    """Log one client in with the account, for whole topics. Raises TransportError."""
     with reached(settings, "") as trial:
         trial.begin("account")
         trial.base, trial.patience_s = "", answer_s

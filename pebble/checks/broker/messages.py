@@ -140,7 +140,7 @@ def delay(trial: BrokerTrial) -> CheckResult:
 
 
 def held_back(trial: BrokerTrial, reader: Peer, writer: Peer, topic: str) -> CheckResult:
-    """By Nagle's algorithm a small message waits until the one before it is confirmed by the receiver's kernel."""
+    """Judge whether a message waits, by Nagle's algorithm, until the receiver's kernel has confirmed the one before."""
     times = [seconds for _ in range(_PAIRS) if (seconds := _apart(trial, reader, writer, topic)) is not None]
     if len(times) < _PAIRS:
         return failed("they are lost on an idle connection", OTHER)

@@ -15,12 +15,10 @@ _PERSISTENT = f"{MOSQUITTO}persistence true, persistence_location /var/lib/mosqu
 
 
 def retains(trial: BrokerTrial) -> str:
-    """What its probes need."""
     return "" if trial.retains else "it retains nothing"
 
 
 def is_restarted(trial: BrokerTrial) -> str:
-    """What the last of them needs besides."""
     return "" if trial.restart is not None else "it was not restarted: --restart asks for that"
 
 

@@ -49,13 +49,13 @@ def controls(robot: Observer) -> str:
 
 
 def free(robot: Observer) -> str:
-    """The end of the check before may still be on its way."""
+    """Wait for the end of the check before, which may still be on its way."""
     robot.wait(lambda: not why_not_free(robot.view), ANSWER_S)
     return why_not_free(robot.view)
 
 
 def commanded(robot: Observer) -> str:
-    """At level named a robot takes commands of accounts only."""
+    """Ask for an account where the robot takes commands of accounts only."""
     named = robot.view.named and not robot.account
     return "it takes commands only with a name: use an account, as in --url mqtts://ANN@BROKER" if named else ""
 
@@ -187,7 +187,7 @@ def own_topics(robot: Observer) -> CheckResult:
 
 
 def _topics(value: object, path: str) -> Iterator[tuple[str, str]]:
-    """What a key calls a topic, however deep it is."""
+    """Return each value whose key calls it a topic, however deep it is."""
     for key, inner in value.items() if isinstance(value, dict) else ():
         where = f"{path}.{key}".lstrip(".")
         if isinstance(inner, str) and key.endswith("topic"):
@@ -303,7 +303,7 @@ def _after_long_ones(robot: Observer) -> CheckResult:
 
 
 def _repeated(robot: Observer) -> CheckResult:
-    """While it is stopped, and after its reset, when a repetition may still be on its way."""
+    """Repeat a stop during it, and after its reset, when a repetition may still be on its way."""
     names: list[str] = []
 
     def again(robot: Observer, name: str) -> CheckResult:

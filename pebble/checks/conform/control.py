@@ -20,7 +20,7 @@ UNSEEN = "its broker does not show this account that it delivers such a message"
 
 
 class Driver:
-    """Requests control as one program of a person."""
+    """A program of a person who requests control."""
 
     def __init__(self, robot: Observer) -> None:
         self._robot, self.id = robot, secrets.token_hex(4)
@@ -32,12 +32,12 @@ class Driver:
         self._robot.send(c.CONTROL, self.request(want, for_ms))
 
     def leaves(self) -> bool:
-        """Release it; False: the robot keeps it."""
+        """Release it; return False if the robot keeps it."""
         self.asks("release")
         return self._robot.answers(lambda: not self.holds)
 
     def takes(self) -> float:
-        """Ask nobody; returns when."""
+        """Take control without asking who has it; return when."""
         return self._robot.send(c.CONTROL_TAKE, self.request())
 
     @property
@@ -46,7 +46,7 @@ class Driver:
 
     @property
     def key(self) -> str:
-        """That of its control; empty while it has none."""
+        """Return the key of its control; empty while it has none."""
         return str(self.state.key) if self.state and self.state.id == self.id else ""
 
     @property
@@ -119,7 +119,7 @@ def _taken(robot: Observer, driver: Driver) -> CheckResult:
 
 
 def _ends(robot: Observer, driver: Driver) -> CheckResult:
-    """Commands prolong it: here zeros, which move nothing."""
+    """Prolong it by commands: zeros, which move nothing."""
     began = time.monotonic()
     while driver.holds and time.monotonic() < began + 1.5 * _SHORTEST_MS / 1000:
         robot.send(c.DRIVE, b'{"x": 0, "z": 0, "key": "%s"}' % driver.key.encode())

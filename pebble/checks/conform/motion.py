@@ -28,9 +28,9 @@ _SHOW_IT = 'publish {"value": {"wheels": [left, right]}} on outgoing/status when
 
 
 def moves_until(robot: Observer, since: float) -> float | None:
-    """When the last motion after ``since`` ended, infinite while it lasts, 0 without any; None: nothing shows it.
+    """Return when the last motion after ``since`` ended: infinite while it lasts, 0 without any, None if none is shown.
 
-    Shown by ``wheels`` in the status, which is published on change, or by readings of hall sensors.
+    It is shown by ``wheels`` in the status, which is published on change, or by readings of hall sensors.
     """
     turning = [(at, any(wheels)) for at, wheels in _shown(robot)]
     readings = [record for record in robot.of(c.TOUCH_SENSORS) if record.value]
@@ -50,13 +50,13 @@ def moves_until(robot: Observer, since: float) -> float | None:
 
 
 def _shown(robot: Observer) -> list[tuple[float, list[float]]]:
-    """What its wheels did, and since when."""
+    """Return since when its wheels did what."""
     reports = [(report.at, report.value.value.get("wheels")) for report in robot.of(c.STATUS) if report.value]
     return robot.eyes() or [(at, wheels) for at, wheels in reports if _are_wheels(wheels)]
 
 
 def _moves(robot: Observer, since: float) -> list[float] | None:
-    """What its wheels do by commands since then; empty: nothing, None: it is not shown."""
+    """Return what its wheels do by commands since then; empty: nothing, None: it is not shown."""
 
     def moving() -> list[float]:
         return next((wheels for at, wheels in reversed(_shown(robot)) if at >= since and any(wheels)), [])
@@ -71,19 +71,19 @@ def _are_wheels(value: Any) -> bool:
 
 
 class _Wheel:
-    """Sends drive commands, with the key of control where the robot has one."""
+    """A sender of drive commands, with the key of control where the robot has one."""
 
     def __init__(self, robot: Observer) -> None:
         self._robot, self.driver = robot, Driver(robot)
 
     def send(self, z: object = SPEED, *, key: str | None = None, wrapped: bool = False, **fields: object) -> float:
-        """One command; ``key``: instead of its own, "" for none. Returns when."""
+        """Send one command, and return when; ``key``: instead of its own, "" for none."""
         of = self.driver.key if key is None else key
         command = {"x": 0, "z": z, **({"key": of} if of else {}), **fields}
         return self._robot.send(c.DRIVE, msgspec.json.encode({"value": command} if wrapped else command))
 
     def drive(self, seconds: float = DRIVES_S, **fields: Any) -> tuple[float, float]:
-        """Commands for so long; when the first and the last one left."""
+        """Send commands for so long; return when the first and the last one left."""
         began = last = time.monotonic()
         while time.monotonic() < began + seconds:
             last = self.send(**fields)
@@ -93,7 +93,7 @@ class _Wheel:
 
 @contextmanager
 def _at_the_wheel(robot: Observer) -> Iterator[_Wheel]:
-    """Its driver has control, and has let go, so that a wait after a reset is over; at the end, too."""
+    """Take control and let go, so that a wait after a reset is over; at the end, too."""
     wheel = _Wheel(robot)
     if robot.view.controlled:
         wheel.driver.asks(for_ms=10_000)
@@ -126,7 +126,7 @@ def rested(robot: Observer, began: float, last: float, limit_s: float, what: str
 
 
 def _moved(robot: Observer, since: float, why: str, fix: str) -> CheckResult:
-    """A failure if it has moved."""
+    """Return a failure if it has moved."""
     robot.look(robot.patience_s)
     until = moves_until(robot, since)
     if until is None:
@@ -140,7 +140,7 @@ def dead_man(robot: Observer) -> CheckResult:
 
 
 def valid_ms(robot: Observer) -> CheckResult:
-    """A short time, and one that is too long."""
+    """Drive by commands with a short time, and with one that is too long."""
     with _at_the_wheel(robot) as wheel:
         outcome = _rest(robot, *wheel.drive(valid_ms=150), 0.15)
         if outcome.state is not State.OK:
@@ -150,7 +150,7 @@ def valid_ms(robot: Observer) -> CheckResult:
 
 
 def zero(robot: Observer) -> CheckResult:
-    """It comes from another than the driver: it needs no key."""
+    """Send a zero that is not the driver's: it needs no key."""
     with _at_the_wheel(robot) as wheel:
         began, _ = wheel.drive()
         return _rest(robot, began, wheel.send(0, key=_OTHER_KEY), 0.1, "a zero with another key")
@@ -174,7 +174,7 @@ def steering(robot: Observer) -> CheckResult:
 
 
 def stop_moving(robot: Observer) -> CheckResult:
-    """Commands go on, and begin again after the stick was let go; they move nothing."""
+    """Go on with commands, and begin again after the stick was let go; they move nothing."""
     with _at_the_wheel(robot) as wheel:
         began, _ = wheel.drive()
         at = time.monotonic()
@@ -187,7 +187,7 @@ def stop_moving(robot: Observer) -> CheckResult:
 
 
 def reset_waits(robot: Observer) -> CheckResult:
-    """The stick is held down meanwhile. A zero of another ends no wait while one has control."""
+    """Hold the stick down meanwhile. A zero of another ends no wait while one has control."""
     with _at_the_wheel(robot) as wheel:
         stop(robot, secrets.token_hex(8))
         began, _ = wheel.drive(2 * _STEP_S)  # from before the reset on: a pause would end the wait
@@ -232,7 +232,7 @@ def clamped(robot: Observer) -> CheckResult:
 
 
 def foreign_key(robot: Observer) -> CheckResult:
-    """While one has control, and while none has."""
+    """Drive with another's key while one has control, and while none has."""
     why, fix = "it moves by another's key", "refuse what moves and has another key"
     with _at_the_wheel(robot) as wheel:
         outcome = _moved(robot, wheel.drive(key=_OTHER_KEY)[0], why, fix)
@@ -260,7 +260,7 @@ def keyless(robot: Observer) -> CheckResult:
 
 
 def foreign_account(robot: Observer) -> CheckResult:
-    """The key of control, behind another account and behind none."""
+    """Send the key of control behind another account, and behind none."""
     with _at_the_wheel(robot) as wheel:
         command = msgspec.json.encode({"x": 0, "z": SPEED, "key": wheel.driver.key})
         began = time.monotonic()

@@ -43,7 +43,7 @@ class MissingError(PebbleError):
 
 @dataclass(frozen=True)
 class Here:
-    """What is reported: the installed robot below ``places``, or that of another config."""
+    """The robot that is reported: that installed below ``places``, or that of another config."""
 
     places: Places
     file: Path
@@ -107,7 +107,7 @@ def _index(report: Report, known: Secrets) -> str:
 
 
 def _config(here: Here) -> str:
-    """The config as written and as it is meant, with stars where there are secrets."""
+    """Return the config as written and as it is meant, with stars where there are secrets."""
     written = masked(plain(decode(read_text(here.file), here.file.name), Notes()))
     whole: dict[str, Any] = {"file": str(here.file), "written": written}
     whole |= {"problems": here.problem.splitlines()} if here.config is None else {"resolved": resolved(here.config)}

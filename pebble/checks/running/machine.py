@@ -45,7 +45,7 @@ def unit(robot: RobotUnderTest) -> CheckResult:
 
 
 def unit_of(properties: Mapping[str, str]) -> CheckResult:
-    """Do the same from what ``systemctl show`` prints."""
+    """Judge what ``systemctl show`` prints."""
     if properties.get("LoadState") != "loaded":
         return skipped(f"{UNIT} is not installed")
     state, sub, restarts = (properties.get(name, "?") for name in ("ActiveState", "SubState", "NRestarts"))

@@ -31,7 +31,7 @@ _ANY = "+/+/+"
 
 
 class Side(Observer):
-    """One side of the robot, and what other robots have left there."""
+    """A side of the robot, and what other robots have left there."""
 
     def __init__(self, config: Config, target: Target, transport: Transport, names: Names, *, own: bool) -> None:
         """``own``: the robot's own side, where its processes meet."""
@@ -79,19 +79,19 @@ class Side(Observer):
 
     @property
     def status(self) -> dict[str, object]:
-        """The value of the newest status; empty before the first."""
-        newest = self.newest(c.STATUS)
-        return {} if newest is None else newest.value
+        """Return the value of the newest status; empty before the first."""
+        values = [record.value.value for record in self.of(c.STATUS, retained=True) if record.value is not None]
+        return values[-1] if values else {}
 
     @property
     def heartbeats(self) -> list[float]:
-        """When live ones arrived (monotonic)."""
+        """Return when live ones arrived (monotonic)."""
         return [record.at for record in self.of(c.ONLINE) if record.value is not None]
 
 
 @dataclass(kw_only=True)
 class RobotUnderTest:
-    """One robot, and its sides as far as they are reached; ``why_own`` and ``why_operators`` are why they are not."""
+    """A robot, and its sides as far as they are reached; ``why_own`` and ``why_operators`` are why they are not."""
 
     config: Config
     places: Places
@@ -109,12 +109,12 @@ class RobotUnderTest:
 
     @property
     def way(self) -> Side:
-        """The side from which it is commanded: that of its operators, if it is reached."""
+        """Return the side from which it is commanded: that of its operators, if it is reached."""
         return self.operators or self.inside
 
     @property
     def inside(self) -> Side:
-        """Its own side, which the check needs."""
+        """Return its own side, which the check needs."""
         assert self.own is not None  # noqa: S101
         return self.own
 
@@ -123,12 +123,11 @@ class RobotUnderTest:
         return self.inside.view
 
     def read(self) -> None:
-        """Take what has arrived on both sides."""
         for side in self.sides:
             side.read()
 
     def wait(self, condition: Callable[[], object], seconds: float) -> bool:
-        """Read what arrives until ``condition``; False: not within ``seconds``."""
+        """Read what arrives on both sides until ``condition``; return False if it does not hold within ``seconds``."""
 
         def holds() -> object:
             self.read()

@@ -48,7 +48,7 @@ def _stopped(robot: RobotUnderTest, name: str) -> CheckResult:
 
 
 def _ended(robot: RobotUnderTest, name: str, before: dict[str, list[str]]) -> str:
-    """End this stop; empty, or why the robot stays stopped."""
+    """End this stop; return why the robot stays stopped, or nothing."""
     view = robot.inside.view
     robot.wait(lambda: all(name in state.recent for state in view.estop.states.values()), 1.0)
     if not view.latched:

@@ -59,7 +59,7 @@ def _drive(robot: RobotUnderTest, side: Side, control: ControlClient, speed: flo
 
 @contextmanager
 def _in_control(robot: RobotUnderTest, side: Side) -> Iterator[tuple[ControlClient, str]]:
-    """Control for the block, or why there is none; the one who has it is asked for nothing."""
+    """Take control for the block, or tell why there is none; who has it is asked for nothing."""
     control = ControlClient(side.view.control, by=robot.by.partition("@")[0], device="selftest")
 
     def held() -> bool:
