@@ -8,8 +8,9 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 
+from pebble.checks.broker.login_attempt import reached
 from pebble.checks.broker.messages import REFUSED, held_back
-from pebble.checks.broker.peer import BrokerTrial, Peer, reached
+from pebble.checks.broker.peer import BrokerTrial, Peer
 from pebble.checks.check import CheckResult, failed, ok, warn
 from pebble.config.security import SecurityLevel
 from pebble.contract import BRIDGE_PROBE, DRIVING, ONLINE
@@ -99,13 +100,13 @@ def _echo(trial: BrokerTrial, peer: Peer, topic: str) -> tuple[bool, str]:
     return is_back, refusal()
 
 
-def _rules(what: str, trial: BrokerTrial, peer: Peer, own: str) -> CheckResult:
+def _rules(what: str, trial: BrokerTrial, peer: Peer, topic: str) -> CheckResult:
     """Check that the broker has rules: no robot, and no page, may publish what a robot of another name does."""
     other = BRIDGE_PROBE.topic(f"pebble/robots/doctor-{secrets.token_hex(4)}")
     peer.subscribe(other)
     payload = new_probe(time.time_ns() // 1_000_000)
     peer.publish(other, payload, qos=1)
-    is_back, _ = _echo(trial, peer, own)  # what was let through has come before it
+    is_back, _ = _echo(trial, peer, topic)  # what was let through has come before it
     if payload in peer.payloads():
         fix = "start it with the files of `pebble fleet init`, see docs/fleet.md"
         return failed("has no rules: with this account one can pose as any robot, and drive it", fix, what)

@@ -33,18 +33,18 @@ def _logins(
     settings: MqttSettings, log_in: Callable[..., LoginAttempt], now: float, level: SecurityLevel
 ) -> Iterator[CheckResult]:
     host, is_here = settings.host, is_loopback(settings.host)
-    own = log_in(settings, login=True)
-    if own.code is None:
+    answer = log_in(settings, login=True)
+    if answer.code is None:
         start = "sudo systemctl start mosquitto" if is_here else f"nc -vz {host} {settings.port}"
-        yield failed(f"cannot be reached: {own.problem}", start)
+        yield failed(f"cannot be reached: {answer.problem}", start)
         return
-    yield _own_login(settings, own)
-    if own.problem and not is_here:
+    yield _own_login(settings, answer)
+    if answer.problem and not is_here:
         fix = f"correct the addresses of {host} in your DNS, or start the brokers there"
-        yield warn(f"has addresses that do not answer: {own.problem}", fix)
-    without_name = own if settings.username is None else log_in(settings, login=False)
+        yield warn(f"has addresses that do not answer: {answer.problem}", fix)
+    without_name = answer if settings.username is None else log_in(settings, login=False)
     yield _anonymous_login(without_name, level, is_here=is_here)
-    yield _encryption(settings, own, now, is_here=is_here)
+    yield _encryption(settings, answer, now, is_here=is_here)
 
 
 def _own_login(settings: MqttSettings, answer: LoginAttempt) -> CheckResult:

@@ -141,20 +141,20 @@ def delay(trial: BrokerTrial) -> CheckResult:
 
 def held_back(trial: BrokerTrial, reader: Peer, writer: Peer, topic: str) -> CheckResult:
     """Judge whether a message waits, by Nagle's algorithm, until the receiver's kernel has confirmed the one before."""
-    times = [seconds for _ in range(_PAIRS) if (seconds := _apart(trial, reader, writer, topic)) is not None]
-    if len(times) < _PAIRS:
+    pairs = [pair for _ in range(_PAIRS) if (pair := _pair(trial, reader, writer, topic)) is not None]
+    if len(pairs) < _PAIRS:
         return failed("they are lost on an idle connection", OTHER)
-    late_s = median(times) - _APART_S
-    if late_s < max(_HELD_S, _HELD * trial.round_trip_s):
+    round_trip_s, late_s = min(pair[0] for pair in pairs), median(pair[1] for pair in pairs) - _APART_S
+    if late_s < max(_HELD_S, _HELD * round_trip_s):
         return ok("are passed on at once")
     text = f"it holds them back: a message that follows another one comes {1000 * late_s:.0f} ms late"
     return warn(text, f"{MOSQUITTO}set_tcp_nodelay true")
 
 
-def _apart(trial: BrokerTrial, reader: Peer, writer: Peer, topic: str) -> float | None:
-    """Return how long after the first the second message of a pair comes; None if one is lost."""
+def _pair(trial: BrokerTrial, reader: Peer, writer: Peer, topic: str) -> tuple[float, float] | None:
+    """Return the round trip of a message, and how long after it a second one comes; None if one is lost."""
     reader.acknowledge_late()
-    probes = [new_probe(number) for number in range(2)]
+    began, probes = time.monotonic(), [new_probe(number) for number in range(2)]
     for probe in probes:
         writer.publish(topic, probe)
         trial.wait(lambda: False, _APART_S)
@@ -162,7 +162,7 @@ def _apart(trial: BrokerTrial, reader: Peer, writer: Peer, topic: str) -> float 
         return None
     trial.wait(lambda: False, 2 * _HELD_S + trial.round_trip_s)  # the pair is acknowledged then
     first, second = (message.at for message in reader.received if message.payload in probes)
-    return second - first
+    return first - began, second - first
 
 
 def pings(trial: BrokerTrial) -> CheckResult:

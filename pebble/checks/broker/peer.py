@@ -21,7 +21,7 @@ from pebble.errors import TransportError
 from pebble.runtime.signals import handled_by
 from pebble.transports.base import Message
 from pebble.transports.credentials import Credentials
-from pebble.transports.hosts import Address, addresses_of, described
+from pebble.transports.hosts import Address
 from pebble.transports.mqtt import client_ids, packets, reasons
 from pebble.transports.mqtt.client import Client, Opening
 from pebble.transports.settings import MqttSettings
@@ -294,31 +294,3 @@ def _undisturbed() -> Iterator[None]:
     on_main = threading.current_thread() is threading.main_thread()
     with handled_by(later) if on_main else nullcontext():
         yield
-
-
-@contextmanager
-def reached(settings: MqttSettings, below: str, restart: Callable[[], bool] | None = None) -> Iterator[BrokerTrial]:
-    """Connect to the first address that accepts a login; at the end everything is removed. Raises TransportError."""
-    trial = _trial(settings, below, restart)
-    try:
-        yield trial
-    finally:
-        trial.close()
-
-
-def _trial(settings: MqttSettings, below: str, restart: Callable[[], bool] | None) -> BrokerTrial:
-    where = f"broker {settings.host}:{settings.port}"
-    try:
-        addresses = addresses_of(settings.host, settings.port)
-    except (OSError, UnicodeError) as error:
-        raise TransportError(f"{where}: {getattr(error, 'strerror', None) or error}") from None
-    failures = {}
-    for address in addresses:
-        trial = BrokerTrial(settings, address, below, restart)
-        try:
-            trial.peer()
-        except RefusedError as error:
-            failures[f"{address.text}:"] = str(error)
-        else:
-            return trial
-    raise TransportError(f"{where} cannot be used: {described(failures)}")
