@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from functools import partial
+from itertools import islice
 from typing import Final, Generic, TypeVar
 
 from pebble.errors import PebbleError
 
+SOON_DAYS: Final = 14  # before its end, a certificate is warned of
 _TRIES: Final = 3  # of a check whose failure is doubtful
 
 Subject = TypeVar("Subject")
@@ -37,6 +39,12 @@ class CheckResult:
 
 
 ok, warn, failed, skipped = (partial(CheckResult, state) for state in State)
+
+
+def some_of(names: Collection[str], most: int = 3) -> str:
+    """Return the first names, for one line, and how many more there are."""
+    more = f", and {len(names) - most} more" if len(names) > most else ""
+    return ", ".join(islice(names, most)) + more
 
 
 def _always(_subject: object) -> bool:

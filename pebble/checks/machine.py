@@ -17,13 +17,6 @@ _TIMEDATECTL_S = 3.0
 _SHARED_MEMORY = Path("/dev/shm")  # noqa: S108 - where Zenoh puts its segments
 
 
-def python_version(version: tuple[int, ...]) -> CheckResult:
-    text = ".".join(map(str, version))
-    return (
-        ok(text) if version >= (3, 11) else failed(f"{text} is too old, 3.11 is needed", "sudo apt install python3.11")
-    )
-
-
 def installed(package: str) -> CheckResult:
     try:
         return ok(metadata.version(package))
@@ -101,7 +94,6 @@ def _memory_lock(_: None) -> CheckResult:
 
 
 MACHINE: tuple[Check[None], ...] = (
-    Check("python", lambda _: python_version(sys.version_info[:3])),
     Check("eclipse-zenoh", lambda _: installed("eclipse-zenoh")),
     Check("paho-mqtt", lambda _: installed("paho-mqtt")),
     Check("memory lock", _memory_lock),

@@ -19,7 +19,7 @@ Which = Callable[[str], str | None]
 
 
 def cameras(config: Config, folder: Path = Path("/dev"), which: Which = shutil.which) -> Iterator[CheckResult]:
-    """``folder``: of device files. Nothing for a robot without a camera."""
+    """Check the camera, if it has one. ``folder``: of device files."""
     daemon = config.services.av_daemon
     if daemon.enabled and daemon.video.enabled:
         yield camera(daemon.video.backend, daemon.video.device, folder, which)
@@ -32,7 +32,7 @@ def microphone(config: Config, which: Which = shutil.which) -> Iterator[CheckRes
 
 
 def codecs(config: Config, *, installed: bool | None = None) -> Iterator[CheckResult]:
-    """H.264 and Opus; missing codecs are an error only if the config selects them."""
+    """Look for H.264 and Opus; missing codecs are an error only if the config selects them."""
     if not config.services.av_daemon.enabled:
         return
     if pyav.installed() if installed is None else installed:
@@ -48,7 +48,7 @@ def codecs(config: Config, *, installed: bool | None = None) -> Iterator[CheckRe
 
 
 def sockets_of_the_original(config: Config) -> Iterator[CheckResult]:
-    """Whether `gstreamer_mirror` can make the sockets that scripts of the original read."""
+    """Check that `gstreamer_mirror` can make the sockets that scripts of the original read."""
     daemon = config.services.av_daemon
     for name, path in daemon.sockets().items() if daemon.enabled else ():
         yield shm_socket(f"{name} for the original's scripts", path)
@@ -82,13 +82,13 @@ def camera(backend: str, device: str, folder: Path, which: Which) -> CheckResult
 
 
 def _program(names: tuple[str, ...], fix: str, which: Which) -> CheckResult:
-    """One of ``names`` must be installed."""
+    """Look for one of ``names``."""
     name = next((name for name in names if which(name) is not None), None)
     return failed(f"{' or '.join(names)} is not installed", fix) if name is None else ok(f"uses {name}")
 
 
 def loudspeaker(config: Config, which: Which = shutil.which) -> Iterator[CheckResult]:
-    """Nothing for a robot that plays neither sounds nor an operator's voice."""
+    """Look for the players of sounds and of an operator's voice, if it plays them."""
     services, players = config.services, Players.of(config)
     talk_back = services.av_daemon.enabled and services.av_daemon.audio.enabled
     commands = [players.wav] * services.soundboard_handler.enabled + [players.raw] * talk_back

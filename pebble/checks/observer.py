@@ -29,7 +29,7 @@ _STALL_S = 0.1  # a failure tells nothing while this machine stalls for so long
 
 @dataclass(frozen=True, slots=True)
 class Record:
-    """One message, when it arrived (monotonic), and its value by the contract; ``wrong``: why it has none."""
+    """A message, when it arrived (monotonic), and its value by the contract; ``wrong``: why it has none."""
 
     at: float
     metric: str  # below the base: ``outgoing/online``
@@ -41,7 +41,7 @@ class Record:
 
 
 class Observer:
-    """What arrived of one robot at one connection. :meth:`wait` lets time pass and reads it."""
+    """The messages of one robot at one connection. :meth:`wait` lets time pass and reads them."""
 
     def __init__(
         self, target: Target, transport: Transport, names: Names, base: str, filters: Iterable[str] = ()
@@ -72,7 +72,6 @@ class Observer:
         return channel_of(topic.removeprefix(f"{self.base}/"))
 
     def read(self) -> None:
-        """Take what has arrived."""
         while self._arrived:
             message, at, wall = self._arrived.popleft()
             self.receive(message, at, wall)
@@ -112,14 +111,10 @@ class Observer:
             if record.at >= since and record.payload and (retained or not record.retain)
         ]
 
-    def newest(self, channel: c.Channel) -> Any:
-        """Return the newest value of a channel that could be read; None if there is none."""
-        return next((record.value for record in reversed(self._of[channel]) if record.value is not None), None)
-
     # -- time
 
     def wait(self, condition: Callable[[], object], seconds: float) -> bool:
-        """Read what arrives until ``condition``; False: not within ``seconds``."""
+        """Read what arrives until ``condition``; return False if it does not hold within ``seconds``."""
         end = time.monotonic() + seconds
         while True:
             self.read()
@@ -132,7 +127,7 @@ class Observer:
             self._stalled_s = max(self._stalled_s, time.monotonic() - slept)
 
     def look(self, seconds: float) -> float:
-        """Only let time pass; returns when that began."""
+        """Let time pass; return when that began."""
         began = time.monotonic()
         self.wait(lambda: False, seconds)
         return began
@@ -152,7 +147,7 @@ class Observer:
 
     @property
     def patience_s(self) -> float:
-        """How long one must look on to be sure that something does not happen: it may answer late, here or always."""
+        """Return how long to look on to be sure that something does not happen: it may answer late, here or always."""
         return 2 * self._slowest_s
 
     def happens(self, condition: Callable[[], object]) -> bool:
@@ -162,21 +157,19 @@ class Observer:
     # -- what is sent
 
     def send(self, channel: c.Channel, value: object) -> float:
-        """Publish a command, as bytes or as its struct; returns when."""
+        """Publish a command, as bytes or as its struct; return when."""
         payload = value if isinstance(value, bytes) else codec.encode(channel, value)
         self.transport.publish(channel.topic(self.base), payload, qos=QoS(channel.default_qos), urgent=True)
         return time.monotonic()
 
     def publish(self, messages: Iterable[Message]) -> bool:
-        """Publish all at once; False if one was not accepted."""
-        are_accepted = True
-        for message in messages:
-            is_accepted = self.transport.publish(message.topic, message.payload, qos=message.qos, urgent=True)
-            are_accepted = are_accepted and is_accepted
-        return are_accepted
+        """Publish all at once; return False if one was not accepted."""
+        publish = self.transport.publish
+        accepted = [publish(message.topic, message.payload, qos=message.qos, urgent=True) for message in messages]
+        return all(accepted)
 
     def sent(self, seconds: float) -> float:
-        """Wait until the broker has all that was sent, so long at most; returns when."""
+        """Wait until the broker has all that was sent, so long at most; return when."""
         self.wait(lambda: self.transport.outgoing.waiting == 0, seconds)
         return time.monotonic()
 
@@ -190,11 +183,8 @@ class Observer:
 
     def reads_commands(self) -> bool:
         """True if this client may read what is sent to the robot: a request that changes nothing comes back."""
-        request = ControlRequest(id=secrets.token_hex(4), want="release")
-        with self._beside("conform-commands", c.INCOMING) as (_, messages):
-            self.send(c.CONTROL, request)
-            own = request.id.encode()
-            return self.wait(lambda: any(own in message.payload for message in list(messages)), _RETAINED_S)
+        account = (self.account or "") if self.view.named else ""
+        return self.send_as(account, c.CONTROL, ControlRequest(id=secrets.token_hex(4), want="release"))
 
     def retained(self) -> list[Record]:
         """Return what the broker has retained of it and for it, as one gets it who connects now."""
@@ -204,7 +194,7 @@ class Observer:
 
     @contextmanager
     def _beside(self, program: str, *directions: str) -> Iterator[tuple[Transport, deque[Message]]]:
-        """A second connection, and what arrives there; each direction of its own, as some brokers refuse one."""
+        """Connect again, to see what arrives there; each direction is a subscription, as some brokers refuse one."""
         messages: deque[Message] = deque(maxlen=_MOST)
         with connected(replace(self.target, program=program)) as (beside, _):
             for direction in directions:

@@ -4,6 +4,7 @@ import json
 import shutil
 import time
 from collections.abc import Iterator
+from datetime import datetime
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Final
@@ -20,10 +21,11 @@ _SILENT_S: Final = 30.0  # it writes its numbers every ten seconds
 _HOUR_S, _DAY_S = 3600.0, 86_400.0
 _LITTLE_S: Final = _DAY_S  # room for less is warned of
 _SHORTEST_S: Final = 600.0  # of recording, to know a rate
+_STAMP: Final = len("20261120T232921Z")
 
 
 def recorder(config: Config, now: float | None = None) -> Iterator[CheckResult]:
-    """Nothing for a robot without one. ``now``: seconds since 1970."""
+    """Check the recorder of a robot that has one. ``now``: seconds since 1970."""
     section = config.services.recorder
     if not section.enabled:
         return
@@ -63,14 +65,14 @@ def _running(folder: Path, now: float, entries: list[Entry]) -> CheckResult:
 
 def _status(folder: Path) -> dict[str, Any]:
     try:
-        found = json.loads((folder / STATUS).read_bytes())
+        status = json.loads((folder / STATUS).read_bytes())
     except (OSError, ValueError):
         return {}
-    return found if isinstance(found, dict) else {}
+    return status if isinstance(status, dict) else {}
 
 
 def _missed(entries: list[Entry], now: float) -> Iterator[CheckResult]:
-    """Gaps of the last hour, and messages that damage has taken in the last day."""
+    """Find gaps of the last hour, and messages that damage has taken in the last day."""
     newest = [entry for entry in entries if now - entry.ended <= _HOUR_S and not entry.is_media]
     since_ms = 1000 * (now - _HOUR_S)
     gaps = [
@@ -92,7 +94,7 @@ def _missed(entries: list[Entry], now: float) -> Iterator[CheckResult]:
 
 
 def _room(folder: Path, entries: list[Entry], keep_bytes: int, free_bytes: int) -> CheckResult:
-    """Seconds for which there is room at the rate of what was recorded in the last files."""
+    """Tell for how long there is room at the rate of the last files."""
     span_s, size = _rate(entries)
     room = max(0, shutil.disk_usage(folder).free - free_bytes)
     if span_s < _SHORTEST_S or not size:
@@ -108,13 +110,8 @@ def _room(folder: Path, entries: list[Entry], keep_bytes: int, free_bytes: int) 
 
 
 def _rate(entries: list[Entry]) -> tuple[float, int]:
-    """Seconds and bytes of the files of the last day."""
-    if not entries:
-        return 0.0, 0
-    last = max(entry.ended for entry in entries)
+    """Return seconds and bytes of the finished files of the last day; their names tell when they began."""
+    last = max((entry.ended for entry in entries), default=0.0)
     newest = [entry for entry in entries if last - entry.ended <= _DAY_S and not entry.is_active]
-    if not newest:
-        return 0.0, 0
-    spans = [catalogue.look_at(entry.path) for entry in newest if not entry.is_media and entry.is_finished]
-    first_ns = min((one.first_ns for one in spans if one.messages), default=0)
-    return (last - first_ns / 1e9 if first_ns else 0.0), sum(entry.size for entry in newest)
+    stamps = [datetime.strptime(entry.path.name[:_STAMP], "%Y%m%dT%H%M%S%z").timestamp() for entry in newest]
+    return last - min(stamps, default=last), sum(entry.size for entry in newest)

@@ -3,19 +3,18 @@
 import os
 import socket
 import stat
-import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from pebble.checks import devices, media
 from pebble.checks.broker.of_config import brokers, page_brokers
-from pebble.checks.check import Check, CheckResult, State, failed, ok, run, warn
+from pebble.checks.check import SOON_DAYS, Check, CheckResult, State, failed, ok, run, warn
 from pebble.checks.machine import MACHINE
+from pebble.checks.observer import Observer
 from pebble.checks.recorder import recorder
 from pebble.checks.users import user_name
 from pebble.checks.who import who_drives
-from pebble.client.connection import Target, connected, wait_for
-from pebble.client.driveable import Driveable, driveable_of
+from pebble.client.connection import Target, connected
 from pebble.client.page.from_config import settings_of
 from pebble.client.page.packages import require_packages
 from pebble.config import Config
@@ -23,10 +22,8 @@ from pebble.contract import STATUS
 from pebble.errors import PebbleError
 from pebble.fleet import certificates
 from pebble.runtime.parent import launcher_runs
-from pebble.transports import Message
 from pebble.transports.socket_paths import FRAMES_SOCKET, fits_socket
 
-SOON_S = 14 * 86400  # before its end, a certificate is warned of
 _ANSWER_S = 2.0
 _DRIVEABLE = {"yes": State.OK, "unknown": State.WARN, "no": State.FAILED}
 
@@ -104,28 +101,23 @@ def driving(config: Config) -> Iterator[CheckResult]:
     """Read on its own side whether it can be driven; nothing if it has no motors, or does not run."""
     if not config.motor_lines() or not launcher_runs(config.run_dir()):
         return
-    states: list[Driveable | None] = []
-
-    def receive(message: Message) -> None:
-        states.append(driveable_of(message.payload))
-
+    target = Target(config=config.path, program="doctor")
     try:
-        with connected(Target(config=config.path, program="doctor")) as (transport, names):
-            transport.subscribe(STATUS.filter(names.base), receive)
-            wait_for(lambda: states, _ANSWER_S)
+        with connected(target) as (transport, names):
+            robot = Observer(target, transport, names, names.base, [STATUS.filter(names.base)])
+            robot.wait(lambda: robot.view.driveable, _ANSWER_S)
     except PebbleError as error:
         yield failed(f"nothing reaches the running robot: {error}")
         return
-    if not states or states[-1] is None:
+    drives = robot.view.driveable
+    if drives is None:
         yield warn("the running robot does not say whether it can be driven")
-        return
-    state, why = states[-1]
-    text = "commands reach the motors" if state == "yes" else f"{'not possible' if state == 'no' else state}: {why}"
-    yield CheckResult(_DRIVEABLE[state], text)
+    else:
+        yield CheckResult(_DRIVEABLE[drives.state], drives.doubt or "commands reach the motors")
 
 
 def operator_page(config: Config) -> Iterator[CheckResult]:
-    """Whether the page that the robot itself serves can start; if it has users, only its own user can read that."""
+    """Check that the page that the robot itself serves can start; if it has users, only its own user can read that."""
     if not config.services.web_handler.enabled:
         return
     try:
@@ -139,16 +131,16 @@ def operator_page(config: Config) -> Iterator[CheckResult]:
     else:
         yield ok(f"port {settings.port} of {settings.host}")
     if settings.certificate is not None:
-        yield _page_certificate(settings.certificate, time.time())
+        yield _page_certificate(settings.certificate)
 
 
-def _page_certificate(file: Path, now: float) -> CheckResult:
+def _page_certificate(file: Path) -> CheckResult:
     try:
-        left_s = certificates.show(file).until.timestamp() - now
+        days = certificates.show(file).days_left
     except certificates.CertificateError as error:
         return failed(str(error), "pebble cert init")
-    text = f"its certificate ends in {left_s / 86400:.0f} days"
-    return ok(text) if left_s >= SOON_S else warn(text, "pebble cert renew")
+    text = f"its certificate ends in {days:.0f} days"
+    return ok(text) if days >= SOON_DAYS else warn(text, "pebble cert renew")
 
 
 ROBOT: tuple[Check[Config], ...] = (

@@ -4,7 +4,7 @@ from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
 
-from pebble.checks.check import CheckResult, ok, warn
+from pebble.checks.check import CheckResult, ok, some_of, warn
 from pebble.config import Config
 from pebble.config.rules.doors import warning_of_open
 from pebble.fleet.folder import FLEET, Fleet, FleetError, load
@@ -20,7 +20,7 @@ _WORDS = {
 
 
 def who_drives(config: Config) -> Iterator[CheckResult]:
-    """Its level, and who may drive it at that."""
+    """Tell its level, and who may drive it at that."""
     level = config.security.level
     if open_ := warning_of_open(config):
         yield warn(open_, "pebble fleet init, then the account of this robot")
@@ -45,7 +45,8 @@ def unknown_brokers(config: Config) -> Iterator[str]:
     remote = config.services.mqtt_bridge.remote_mqtt
     for folder in _folders(config) if config.security.level != "open" and len(remote.hosts) > 1 else ():
         with suppress(FleetError):  # of which the doctor tells
-            known = {(one.host, port) for one in load(folder).brokers for port in (one.port, one.unencrypted)}
+            brokers = load(folder).brokers
+            known = {(broker.host, port) for broker in brokers for port in (broker.port, broker.unencrypted)}
             for host, port in remote.places:
                 if (host, port) not in known:
                     where = f"services.mqtt_bridge.remote_mqtt.hosts: {host}:{port}"
@@ -54,18 +55,17 @@ def unknown_brokers(config: Config) -> Iterator[str]:
 
 
 def _accounts(fleet: Fleet) -> str:
-    """Those whose roles let them drive, servers of the page with a word more."""
-    found = [
+    """Return those whose roles let them drive, servers of the page with a word more."""
+    names = [
         f"{name} (a page server: its people, too)" if ProgramRole.PAGE in account.roles else name
         for name, account in fleet.accounts.items()
         if Right.DRIVE in rights(account.roles, fleet.level)
     ]
-    more = f", and {len(found) - _SHOWN} more" if len(found) > _SHOWN else ""
-    return f"{', '.join(found[:_SHOWN]) or 'no account'}{more}; programs on the robot itself, too"
+    return f"{some_of(names, _SHOWN) or 'no account'}; programs on the robot itself, too"
 
 
 def _folders(config: Config) -> list[Path]:
-    """Where the files of its fleet are: beside its config, or the authority that it trusts."""
+    """Return where the files of its fleet are: beside its config, or the authority that it trusts."""
     ca_cert = config.services.mqtt_bridge.remote_mqtt.tls.ca_cert
     places = [config.folder, *([] if ca_cert is None else [Path(ca_cert).parent])]
-    return [one for one in dict.fromkeys(place.absolute() for place in places) if (one / FLEET).is_file()][:1]
+    return [folder for folder in (place.absolute() for place in places) if (folder / FLEET).is_file()][:1]

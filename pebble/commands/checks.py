@@ -7,8 +7,7 @@ import shlex
 import shutil
 import sys
 import textwrap
-from collections.abc import Iterable, Iterator
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import typer
 
@@ -16,7 +15,7 @@ from pebble.config.secret_text import without_secrets
 from pebble.config.visible import shown
 
 if TYPE_CHECKING:
-    from pebble.checks.check import Check, CheckResult
+    from pebble.checks.check import CheckResult
 
 _COLOURS = {
     "ok": typer.colors.GREEN,
@@ -35,12 +34,6 @@ class Printer:
         """``config``: what fixes name as their config file."""
         self.rows: list[dict[str, str]] = []
         self._config, self._as_json = shlex.quote(config), as_json
-
-    def take_all(self, results: Iterable[tuple[Check[Any], CheckResult]]) -> Iterator[tuple[Check[Any], CheckResult]]:
-        """Print each result that comes, and pass it on."""
-        for check, result in results:
-            self.take(result, check.why)
-            yield check, result
 
     def take(self, result: CheckResult, why: str = "") -> None:
         """Texts come from the robot, so they are shown without secrets and control characters."""

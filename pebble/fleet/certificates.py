@@ -55,6 +55,10 @@ class Shown:
     until: datetime.datetime
     sha256: str  # of the certificate, as browsers show it
 
+    @property
+    def days_left(self) -> float:
+        return (self.until - datetime.datetime.now(datetime.UTC)) / datetime.timedelta(days=1)
+
 
 def init(folder: Path, names: Sequence[str]) -> None:
     """Write a new authority and a server certificate for ``names``. Raises CertificateError; overwrites nothing."""

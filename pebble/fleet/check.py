@@ -1,6 +1,5 @@
 """Compares the folder of a fleet with its broker, and tries what the broker lets accounts do."""
 
-import datetime
 import json
 import secrets
 import time
@@ -20,7 +19,7 @@ from pebble.fleet.folder import ACL, ADMIN, PASSWORDS, SECURITY, Fleet, FleetErr
 from pebble.fleet.roles import CONTROL_ANSWERS, CONTROL_TOPIC, Account, ProgramRole, Role, Rule
 from pebble.transports.base import Message, QoS
 
-_SOON = datetime.timedelta(days=30)
+_SOON_DAYS = 30
 _ADOPTED_S = 3.0  # for mosquitto to read its files again, and for a will
 _OTHER = "check-other"  # whose name others take
 
@@ -98,9 +97,9 @@ def _certificates(folder: Path, fleet: Fleet) -> Iterator[str]:
         if file.exists():
             renewed[file] = f"`pebble fleet certificate {name}`, with its hosts, and move it to its machine"
     for file, how in renewed.items():
-        left = certificates.show(file).until - datetime.datetime.now(datetime.UTC)
-        if left < _SOON:
-            yield f"{file} ends in {left.days} days: {how}"
+        days = certificates.show(file).days_left
+        if days < _SOON_DAYS:
+            yield f"{file} ends in {days:.0f} days: {how}"
 
 
 def _of_plugin(fleet: Fleet, connection: dynsec.Control) -> Iterator[str]:

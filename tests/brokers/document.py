@@ -11,7 +11,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from pebble.checks.broker.peer import reached
+from pebble.checks.broker.login_attempt import reached
 from pebble.checks.broker.probes import PROBES, assessment, judge
 from pebble.checks.check import CheckResult, State
 from pebble.transports import MqttSettings

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from pebble.checks.broker.peer import reached
+from pebble.checks.broker.login_attempt import reached
 from pebble.checks.broker.probes import PROBES, Probe
 from pebble.checks.check import CheckResult, State, run
 from pebble.transports import MqttSettings

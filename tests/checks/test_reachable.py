@@ -60,22 +60,3 @@ def test_doctor_tries_the_addresses_of_this_machine(tmp_path: Path) -> None:
     broker.stop()
     expected = [f"does not answer at {', '.join(own_addresses())}"] if own_addresses() else []
     assert [text for text in found if text.startswith("does not answer")] == expected
-
-
-def test_the_addresses_are_the_kernels(tmp_path: Path) -> None:
-    (tmp_path / "net").mkdir()
-    (tmp_path / "net/fib_trie").write_text(
-        "Main:\n"
-        "           |-- 127.0.0.1\n              /32 host LOCAL\n"
-        "           |-- 192.0.2.2\n              /32 host LOCAL\n"
-        "        |-- 192.0.2.255\n           /32 link BROADCAST\n"
-        "Local:\n"
-        "           |-- 192.0.2.2\n              /32 host LOCAL\n"
-    )
-    (tmp_path / "net/if_inet6").write_text(
-        "fd000000000000000000000000000002 04 40 00 82     eth0\n"
-        "fe8000000000000000fc00fffe000001 04 40 20 80     eth0\n"
-        "00000000000000000000000000000001 01 80 10 80       lo\n"
-    )
-    assert own_addresses(tmp_path) == ["192.0.2.2", "fd00::2", "fe80::fc:ff:fe00:1%eth0"]
-    assert own_addresses(tmp_path / "nowhere") == []

@@ -58,7 +58,7 @@ def test_what_is_in_it_and_what_is_not(places: Places, tmp_path: Path, run: Run)
     found = parts(file)
     missing = {line.split(": ")[0] for line in found["index.txt"].splitlines() if ": MISSING: " in line}
     assert found.keys() | missing == {"index.txt", *report.PARTS}
-    assert missing >= {"status.json", "slots.txt"}  # it does not run, and has no slots
+    assert missing >= {"status.txt", "slots.txt"}  # it does not run, and has no slots
     assert '"password": "***"' in found["config.json"]
     assert "User=pebble" in found["units.txt"]
     assert "security: " in found["doctor.txt"]
@@ -141,7 +141,7 @@ def test_a_config_with_mistakes_or_none_is_reported_as_such(text: str | None, tm
         file.write_text(content)
     made = make(places)
     assert "robot.json" in made.missing.get("config.json", "") + made.parts.get("config.json", "")
-    assert "status.json" in made.missing
+    assert "status.txt" in made.missing
     assert "versions.txt" in made.parts
 
 

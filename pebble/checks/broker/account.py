@@ -6,10 +6,11 @@ import secrets
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from statistics import median
+from dataclasses import replace
 
-from pebble.checks.broker import MOSQUITTO
-from pebble.checks.broker.peer import BrokerTrial, Peer, reached
+from pebble.checks.broker.login_attempt import reached
+from pebble.checks.broker.messages import REFUSED, held_back
+from pebble.checks.broker.peer import BrokerTrial, Peer
 from pebble.checks.check import CheckResult, failed, ok, warn
 from pebble.config.security import SecurityLevel
 from pebble.contract import BRIDGE_PROBE, ONLINE
@@ -19,12 +20,7 @@ from pebble.errors import TransportError
 from pebble.forwarding.probes import new_probe
 from pebble.transports import MqttSettings
 
-_REFUSED = 0x80
-_APART_S = 0.005  # between the two messages of a pair
-_PAIRS = 5
-_QUIET = 1.5  # round trips between two pairs: the one before is acknowledged then
-_MATTERS_S = 0.02  # a shorter round trip delays nothing that people notice
-_HELD = 0.75  # of a round trip: a thin link itself needs some of it for the second message
+_MATTERS_S = 0.02  # a shorter round trip delays nothing that people notice: our own programs acknowledge at once
 
 
 def robot_account(
@@ -51,9 +47,8 @@ def robot_account(
             yield ok("accepts what this account publishes", what=what)
             if level != "open":
                 yield _rules(what, trial, peer, topic)
-            pairs = [pair for _ in range(_PAIRS if is_back else 0) if (pair := _pair(trial, peer, topic)) is not None]
-            if pairs:
-                yield from held_back(what, min(pair[0] for pair in pairs), median(pair[1] for pair in pairs))
+            if is_back and trial.round_trip_s >= _MATTERS_S:
+                yield replace(held_back(trial, peer, peer, topic), what=f"small messages at {what}")
     except TransportError as error:
         yield warn(f"cannot be published to: {error}", what=what)
 
@@ -64,7 +59,7 @@ def page_account(what: str, settings: MqttSettings, level: SecurityLevel = "open
     try:
         with _logged_in(settings, LEVELS["wide"].answer_s) as (trial, peer):
             topic, states = BRIDGE_PROBE.topic(Identity("pebble", SERVERS, "doctor").base), ONLINE.filter("+/+/+")
-            if (peer.subscribe(states) or b"\xff")[0] >= _REFUSED:
+            if (peer.subscribe(states) or b"\xff")[0] >= REFUSED:
                 why = f"the broker refuses it {states}"
             else:
                 peer.subscribe(topic)
@@ -83,7 +78,7 @@ def page_account(what: str, settings: MqttSettings, level: SecurityLevel = "open
 
 @contextmanager
 def _logged_in(settings: MqttSettings, answer_s: float) -> Iterator[tuple[BrokerTrial, Peer]]:
-    """One client with the account, for whole topics. Raises TransportError."""
+    """Log one client in with the account, for whole topics. Raises TransportError."""
     with reached(settings, "") as trial:
         trial.begin("account")
         trial.base, trial.patience_s = "", answer_s
@@ -92,62 +87,29 @@ def _logged_in(settings: MqttSettings, answer_s: float) -> Iterator[tuple[Broker
 
 def _echo(trial: BrokerTrial, peer: Peer, topic: str) -> tuple[bool, str]:
     """Publish a probe; True if it comes back, and why the broker does not take it, as far as it tells."""
-    payload = new_probe(time.time_ns() // 1_000_000)
+    payload, began = new_probe(time.time_ns() // 1_000_000), time.monotonic()
     mid = peer.publish(topic, payload, qos=1)
 
     def refusal() -> str:
-        if peer.acks.get(mid, 0) >= _REFUSED:
+        if peer.acks.get(mid, 0) >= REFUSED:
             return f"the broker refuses it (code {peer.acks[mid]})"
         return "the broker hangs up on it" if peer.closed else ""
 
-    trial.wait(lambda: payload in peer.payloads() or refusal())
-    return payload in peer.payloads(), refusal()
+    is_back = trial.wait(lambda: payload in peer.payloads() or refusal()) and payload in peer.payloads()
+    trial.round_trip_s = time.monotonic() - began if is_back else 0.0
+    return is_back, refusal()
 
 
-def _rules(what: str, trial: BrokerTrial, peer: Peer, own: str) -> CheckResult:
+def _rules(what: str, trial: BrokerTrial, peer: Peer, topic: str) -> CheckResult:
     """Check that the broker has rules: no robot, and no page, may publish what a robot of another name does."""
     other = BRIDGE_PROBE.topic(f"pebble/robots/doctor-{secrets.token_hex(4)}")
     peer.subscribe(other)
     payload = new_probe(time.time_ns() // 1_000_000)
     peer.publish(other, payload, qos=1)
-    is_back, _ = _echo(trial, peer, own)  # what was let through has come before it
+    is_back, _ = _echo(trial, peer, topic)  # what was let through has come before it
     if payload in peer.payloads():
         fix = "start it with the files of `pebble fleet init`, see docs/fleet.md"
         return failed("has no rules: with this account one can pose as any robot, and drive it", fix, what)
     if not is_back and not peer.closed:
         return warn("does not answer in time: whether it has rules is not known", what=what)
     return ok("keeps this account from posing as another robot", what=what)
-
-
-def _pair(trial: BrokerTrial, peer: Peer, topic: str) -> tuple[float, float] | None:
-    """Return the round trip of one message, and by how much a second one, sent a moment later, came after it."""
-    began, probes = time.monotonic(), [new_probe(number) for number in range(2)]
-    for probe in probes:
-        peer.publish(topic, probe)
-        trial.wait(lambda: False, _APART_S)
-    trial.wait(lambda: set(probes) <= set(peer.payloads()))
-    arrivals = {message.payload: message.at for message in peer.received}
-    if not set(probes) <= arrivals.keys():
-        return None
-    round_trip_s = arrivals[probes[0]] - began
-    trial.wait(lambda: False, _QUIET * round_trip_s)
-    return round_trip_s, arrivals[probes[1]] - arrivals[probes[0]]
-
-
-def held_back(what: str, round_trip_s: float, apart_s: float) -> Iterator[CheckResult]:
-    """Judge the shortest round trip, and the time by which the second message of a pair usually came after the first.
-
-    By Nagle's algorithm a broker sends the second one when the first is acknowledged, so a round trip later.
-    """
-    if round_trip_s < _MATTERS_S:
-        return
-    if apart_s < _HELD * round_trip_s:
-        yield ok("passes small messages on at once", what=what)
-        return
-    saved_ms = 1000 * (apart_s - _APART_S)
-    yield warn(
-        f"holds small messages back: a command that follows another one comes up to {saved_ms:.0f} ms later, "
-        f"a round trip being {1000 * round_trip_s:.0f} ms",
-        f"{MOSQUITTO}set_tcp_nodelay true",
-        what,
-    )

@@ -6,13 +6,11 @@ from dataclasses import replace
 
 from pebble.checks.broker import MOSQUITTO
 from pebble.checks.broker.login_attempt import REFUSED_ID, REFUSED_LOGINS, LoginAttempt, attempt
-from pebble.checks.check import CheckResult, failed, ok, warn
+from pebble.checks.check import SOON_DAYS, CheckResult, failed, ok, warn
 from pebble.config.secret_text import shown_user
 from pebble.config.security import SecurityLevel
 from pebble.config.web import is_loopback
 from pebble.transports.settings import MqttSettings
-
-_SOON_S = 14 * 86400
 
 
 def broker(
@@ -35,18 +33,18 @@ def _logins(
     settings: MqttSettings, log_in: Callable[..., LoginAttempt], now: float, level: SecurityLevel
 ) -> Iterator[CheckResult]:
     host, is_here = settings.host, is_loopback(settings.host)
-    own = log_in(settings, login=True)
-    if own.code is None:
+    answer = log_in(settings, login=True)
+    if answer.code is None:
         start = "sudo systemctl start mosquitto" if is_here else f"nc -vz {host} {settings.port}"
-        yield failed(f"cannot be reached: {own.problem}", start)
+        yield failed(f"cannot be reached: {answer.problem}", start)
         return
-    yield _own_login(settings, own)
-    if own.problem and not is_here:
+    yield _own_login(settings, answer)
+    if answer.problem and not is_here:
         fix = f"correct the addresses of {host} in your DNS, or start the brokers there"
-        yield warn(f"has addresses that do not answer: {own.problem}", fix)
-    without_name = own if settings.username is None else log_in(settings, login=False)
+        yield warn(f"has addresses that do not answer: {answer.problem}", fix)
+    without_name = answer if settings.username is None else log_in(settings, login=False)
     yield _anonymous_login(without_name, level, is_here=is_here)
-    yield _encryption(settings, own, now, is_here=is_here)
+    yield _encryption(settings, answer, now, is_here=is_here)
 
 
 def _own_login(settings: MqttSettings, answer: LoginAttempt) -> CheckResult:
@@ -80,7 +78,7 @@ def _encryption(settings: MqttSettings, answer: LoginAttempt, now: float, *, is_
             return ok("not encrypted, which is fine on this machine")
         return warn("is not encrypted: commands and passwords can be read on the network", "set tls.enabled to true")
     days = None if answer.expires is None else (answer.expires - now) / 86400
-    if days is not None and 86400 * days < _SOON_S:
+    if days is not None and days < SOON_DAYS:
         return warn(f"its certificate expires in {days:.0f} days", "renew the broker's certificate")
     if settings.tls.insecure:
         return warn("encrypted, but the name in its certificate is not checked", "set tls.insecure to false")

@@ -2,11 +2,14 @@
 
 import ssl
 import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 
 from pebble.checks.broker.peer import BrokerTrial, RefusedError
 from pebble.errors import TransportError
 from pebble.transports.hosts import Address, addresses_of, described
+from pebble.transports.mqtt import reasons
 from pebble.transports.settings import MqttSettings
 
 TIMEOUT_S = 3.0
@@ -26,6 +29,7 @@ class LoginAttempt:
     took_ms: float = 0.0
     problem: str = ""
     expires: float | None = None  # the broker's certificate, in epoch seconds
+    address: Address | None = None  # that accepted the login
 
 
 def attempt(settings: MqttSettings, *, login: bool, timeout_s: float = TIMEOUT_S) -> LoginAttempt:
@@ -65,10 +69,24 @@ def _attempt(settings: MqttSettings, address: Address, timeout_s: float) -> Logi
     took_ms = 1000 * (time.monotonic() - began)
     expires = _expiry(peer.sockets[0])
     trial.close()
-    return LoginAttempt(code=0, took_ms=took_ms, expires=expires)
+    return LoginAttempt(code=0, took_ms=took_ms, expires=expires, address=address)
 
 
 def _expiry(sock: object) -> float | None:
     certificate = sock.getpeercert() if isinstance(sock, ssl.SSLSocket) else None
     until = certificate.get("notAfter") if certificate else None
     return ssl.cert_time_to_seconds(until) if isinstance(until, str) else None
+
+
+@contextmanager
+def reached(settings: MqttSettings, below: str, restart: Callable[[], bool] | None = None) -> Iterator[BrokerTrial]:
+    """Try the broker at the address that accepts a login; at the end everything is removed. Raises TransportError."""
+    answer = attempt(settings, login=True)
+    if answer.address is None:
+        why = answer.problem or reasons.connection_refused(answer.code or 0)
+        raise TransportError(f"broker {settings.host}:{settings.port} cannot be used: {why}")
+    trial = BrokerTrial(settings, answer.address, below, restart)
+    try:
+        yield trial
+    finally:
+        trial.close()

@@ -19,9 +19,9 @@ from typing import Any
 
 from pebble.errors import TransportError
 from pebble.runtime.signals import handled_by
-from pebble.transports.base import Message, QoS
+from pebble.transports.base import Message
 from pebble.transports.credentials import Credentials
-from pebble.transports.hosts import Address, addresses_of, described
+from pebble.transports.hosts import Address
 from pebble.transports.mqtt import client_ids, packets, reasons
 from pebble.transports.mqtt.client import Client, Opening
 from pebble.transports.settings import MqttSettings
@@ -73,14 +73,15 @@ class Peer(packets.Listener):
     # -- what it does
 
     def subscribe(self, *filters: str, qos: int = 1, options: bool = False) -> bytes:
-        """Returns the broker's answer: a code for each filter, nothing if none comes. ``options``: those of MQTT 5."""
-        wanted = [packets.Filter(self._whole(one), qos, no_local=options, as_published=options) for one in filters]
+        """Return the broker's answer: a code for each filter, nothing if none comes. ``options``: those of MQTT 5."""
+        names = map(self._whole, filters)
+        wanted = [packets.Filter(name, qos, no_local=options, as_published=options) for name in names]
         mid = self._client.subscribe(wanted)
         self._trial.wait(lambda: mid in self.granted or self.closed)
         return self.granted.get(mid, b"")
 
     def publish(self, topic: str, payload: bytes = b"1", *, qos: int = 0, retain: bool = False) -> int:
-        """Returns its number in `acks`, 0 with QoS 0."""
+        """Return its number in `acks`, 0 with QoS 0."""
         if retain:
             self._trial.left[self._whole(topic)] = None
         return self._client.publish(self._whole(topic), payload, qos, retain=retain, expires_s=None)
@@ -88,12 +89,8 @@ class Peer(packets.Listener):
     def _whole(self, topic: str) -> str:
         return f"{self.base}/{topic}" if self.base else topic
 
-    def remove(self, topic: str, qos: int) -> int:
-        """Take back what is retained on a topic, with its whole name; returns its number in `acks`."""
-        return self._client.publish(topic, b"", qos, retain=True, expires_s=None)
-
     def ping(self) -> bool:
-        """False: it was not answered in time."""
+        """Return False if it was not answered in time."""
         before = len(self.pongs)
         self._client.ping()
         return self._trial.wait(lambda: len(self.pongs) > before or self.closed) and not self.closed
@@ -104,7 +101,7 @@ class Peer(packets.Listener):
         self._client.close()
 
     def cut(self) -> None:
-        """By a reset: the broker publishes the will."""
+        """Reset the connection: the broker publishes the will."""
         if self._client.socket is not None:
             self._client.socket.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, _RESET)
         self._client.close()
@@ -122,7 +119,7 @@ class Peer(packets.Listener):
 
     @property
     def sockets(self) -> tuple[socket.socket | None, bool]:
-        """The socket, and whether something waits to be written to it."""
+        """Return the socket, and whether something waits to be written to it."""
         return self._client.socket, bool(self._client.waiting)
 
     def payloads(self, topic: str | None = None) -> list[bytes]:
@@ -206,19 +203,13 @@ class BrokerTrial:
         self._credentials = Credentials(settings)
 
     def begin(self, name: str) -> None:
-        """The peers of the last probe leave, and this one has topics of its own."""
+        """Let the peers of the last probe leave, and give this one topics of its own."""
         for peer in self._peers:
             peer.leave()
         self._peers, self.base = [], f"{self.root}/{name}"
 
-    def peer(
-        self,
-        *,
-        protocol: str = "3.1.1",
-        bridge: bool = False,
-        will: Message | None = None,
-    ) -> Peer:
-        """A client that the broker has accepted. Raises RefusedError."""
+    def peer(self, *, protocol: str = "3.1.1", bridge: bool = False, will: Message | None = None) -> Peer:
+        """Connect a client, or raise RefusedError; the topic of ``will`` is below the probe's."""
         password = self._credentials.password()
         settings = replace(self.settings, protocol=protocol, keepalive_s=_KEEPALIVE_S, password=password)
         name = self.settings.client_id or client_ids.unique(NAME)
@@ -240,7 +231,7 @@ class BrokerTrial:
 
     @property
     def answer_s(self) -> float:
-        """How long an answer is waited for."""
+        """Return how long to wait for an answer."""
         return self.patience_s + 4 * self.round_trip_s
 
     def wait(self, condition: Callable[[], object], seconds: float | None = None) -> bool:
@@ -283,8 +274,9 @@ class BrokerTrial:
                     self._remove()
 
     def _remove(self) -> None:
-        peer, left = self.peer(), list(self.left)
-        numbers = {topic: peer.remove(topic, self.qos) for topic in left}
+        self.base = ""
+        peer = self.peer()
+        numbers = {topic: peer.publish(topic, b"", qos=self.qos, retain=True) for topic in list(self.left)}
         done = self.wait(lambda: set(numbers.values()) <= peer.acks.keys() or peer.closed) if self.qos else peer.ping()
         if done and not peer.closed:
             self.left = {}
@@ -302,41 +294,3 @@ def _undisturbed() -> Iterator[None]:
     on_main = threading.current_thread() is threading.main_thread()
     with handled_by(later) if on_main else nullcontext():
         yield
-
-
-def number(payload: bytes) -> int:
-    """Return that of a numbered message; -1: the broker has made something else of it."""
-    return int(payload) if payload.isdigit() else -1
-
-
-def will(topic: str, payload: bytes, *, qos: int = 1, retain: bool = True) -> Message:
-    """``topic`` is below that of the probe."""
-    return Message(topic, payload, QoS(qos), retain=retain)
-
-
-@contextmanager
-def reached(settings: MqttSettings, below: str, restart: Callable[[], bool] | None = None) -> Iterator[BrokerTrial]:
-    """Connect to the first address that accepts a login; at the end everything is removed. Raises TransportError."""
-    trial = _trial(settings, below, restart)
-    try:
-        yield trial
-    finally:
-        trial.close()
-
-
-def _trial(settings: MqttSettings, below: str, restart: Callable[[], bool] | None) -> BrokerTrial:
-    where = f"broker {settings.host}:{settings.port}"
-    try:
-        addresses = addresses_of(settings.host, settings.port)
-    except (OSError, UnicodeError) as error:
-        raise TransportError(f"{where}: {getattr(error, 'strerror', None) or error}") from None
-    failures = {}
-    for address in addresses:
-        trial = BrokerTrial(settings, address, below, restart)
-        try:
-            trial.peer()
-        except RefusedError as error:
-            failures[f"{address.text}:"] = str(error)
-        else:
-            return trial
-    raise TransportError(f"{where} cannot be used: {described(failures)}")

@@ -16,7 +16,7 @@ _RIGHTS, _WILDCARDS, _BRIDGE_MODE = "rights", "retained, to + and #", "bridge mo
 def _probe(
     name: str, costs: str, test: Callable[[BrokerTrial], CheckResult], *needs: Callable[[BrokerTrial], str]
 ) -> Probe:
-    """A probe on topics of its own, with new connections."""
+    """Return a probe on topics of its own, with new connections."""
 
     def tried(trial: BrokerTrial) -> CheckResult:
         trial.begin(re.sub(r"\W+", "-", name).strip("-"))

@@ -1,11 +1,8 @@
 """Checks whether a broker answers where it should not: on the network, or without encryption."""
 
-import ipaddress
-import re
-import socket
+import subprocess
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
-from pathlib import Path
 
 from pebble.checks.broker import MOSQUITTO
 from pebble.checks.broker.login_attempt import attempt
@@ -15,7 +12,6 @@ from pebble.transports.settings import MqttSettings
 
 _UNENCRYPTED = 1883
 _TIMEOUT_S = 1.0  # these addresses are this machine's own
-_LOCAL_IPV4 = re.compile(r"\|-- (\S+)\n\s+/32 host LOCAL")
 
 
 def other_doors(name: str, settings: MqttSettings) -> Iterator[CheckResult]:
@@ -58,22 +54,10 @@ def beyond_loopback(name: str, settings: MqttSettings, addresses: Iterable[str])
         yield ok(f"does not answer at {', '.join(codes)}", what=what)
 
 
-def own_addresses(proc: Path = Path("/proc")) -> list[str]:
-    """Return the addresses of this machine that are not its loopback's, IPv4 first; of Linux only."""
-    ipv4 = _LOCAL_IPV4.findall(_text(proc / "net/fib_trie"))
-    ipv6 = [_ipv6(line.split()) for line in _text(proc / "net/if_inet6").splitlines()]
-    addresses = dict.fromkeys(ipv4 + ipv6)
-    return [address for address in addresses if not ipaddress.ip_address(address.partition("%")[0]).is_loopback]
-
-
-def _ipv6(words: list[str]) -> str:
-    """Return the address of a line such as ``fe80…0001 04 40 20 80 eth0``; a link-local one needs the link's name."""
-    address = socket.inet_ntop(socket.AF_INET6, bytes.fromhex(words[0]))
-    return f"{address}%{words[5]}" if ipaddress.ip_address(address).is_link_local else address
-
-
-def _text(path: Path) -> str:
+def own_addresses() -> list[str]:
+    """Return the addresses of this machine on its networks; none on systems whose ``hostname`` does not tell them."""
     try:
-        return path.read_text(encoding="utf-8")
-    except OSError:  # no IPv6, or a kernel without this file
-        return ""
+        command = ["hostname", "-I"]
+        return subprocess.run(command, capture_output=True, text=True, timeout=_TIMEOUT_S, check=False).stdout.split()
+    except (OSError, subprocess.TimeoutExpired):
+        return []

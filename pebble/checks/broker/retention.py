@@ -5,7 +5,7 @@ from __future__ import annotations
 from itertools import count, pairwise
 
 from pebble.checks.broker import MOSQUITTO, OTHER
-from pebble.checks.broker.peer import BrokerTrial, RefusedError, number
+from pebble.checks.broker.peer import BrokerTrial, RefusedError
 from pebble.checks.check import CheckResult, failed, ok, skipped, warn
 
 _STATES = 200  # retained ones; a robot has some twenty
@@ -15,12 +15,10 @@ _PERSISTENT = f"{MOSQUITTO}persistence true, persistence_location /var/lib/mosqu
 
 
 def retains(trial: BrokerTrial) -> str:
-    """What its probes need."""
     return "" if trial.retains else "it retains nothing"
 
 
 def is_restarted(trial: BrokerTrial) -> str:
-    """What the last of them needs besides."""
     return "" if trial.restart is not None else "it was not restarted: --restart asks for that"
 
 
@@ -66,7 +64,7 @@ def order(trial: BrokerTrial) -> CheckResult:
         reader.subscribe("state", qos=trial.qos)
     writer.ping()
     trial.wait_quiet(*readers)
-    received = [[number(payload) for payload in reader.payloads()] for reader in readers]
+    received = [[int(payload) if payload.isdigit() else -1 for payload in reader.payloads()] for reader in readers]
     newest = next(numbers) - 1
     wrong = [reader for reader, seen in zip(readers, received, strict=True) if seen[-1:] != [newest]]
     if any(not reader.received or not reader.received[-1].retain for reader in wrong):

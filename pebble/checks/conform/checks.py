@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import secrets
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from itertools import pairwise
 
 import msgspec
 
 from pebble import contract as c
-from pebble.checks.check import Check, CheckResult, State, failed, ok, skipped
+from pebble.checks.check import Check, CheckResult, State, failed, ok, skipped, some_of
 from pebble.checks.observer import ANSWER_S, Observer, Record
-from pebble.checks.running import why_not_free
+from pebble.checks.running import available, why_not_free
 from pebble.client.robot_topics import section_of
 from pebble.contract.capabilities import CapabilitiesValue
 from pebble.contract.identity import parse_topic
@@ -23,7 +23,6 @@ _CLOCK_S = 60.0  # that its clock may differ
 _LARGEST = 64 * 1024  # bytes of JSON
 _LARGEST_STATE = 400  # bytes of a state of the emergency stop
 _REPEATED = (c.CHARGING_STATUS, c.CHARGING_LEVEL)  # boards of the original repeat them every 5 s instead
-_SHOWN = 3  # examples in one line
 _SLOWEST_S = 1.25  # between heartbeats, by their mean; they are to come each second
 BY, _WHY = "conform", "conformance test"
 
@@ -50,13 +49,13 @@ def controls(robot: Observer) -> str:
 
 
 def free(robot: Observer) -> str:
-    """The end of the check before may still be on its way."""
+    """Wait for the end of the check before, which may still be on its way."""
     robot.wait(lambda: not why_not_free(robot.view), ANSWER_S)
     return why_not_free(robot.view)
 
 
 def commanded(robot: Observer) -> str:
-    """At level named a robot takes commands of accounts only."""
+    """Ask for an account where the robot takes commands of accounts only."""
     named = robot.view.named and not robot.account
     return "it takes commands only with a name: use an account, as in --url mqtts://ANN@BROKER" if named else ""
 
@@ -71,16 +70,16 @@ def readable(robot: Observer) -> str:
 
 
 def heartbeat(robot: Observer) -> CheckResult:
-    found = robot.of(c.ONLINE)
-    if not found:
+    beats = robot.of(c.ONLINE)
+    if not beats:
         return failed("none arrived", 'publish {"t": <epoch ms>} on outgoing/online every 0.25 s to 1 s')
-    wrong = [one.wrong for one in found if one.wrong]
+    wrong = [beat.wrong for beat in beats if beat.wrong]
     if wrong:
         return failed(wrong[0], 'its payload is {"t": <epoch milliseconds, an integer>}')
-    gaps = [after.at - before.at for before, after in pairwise(found)]
+    gaps = [after.at - before.at for before, after in pairwise(beats)]
     interval = robot.view.liveness.interval_s
     if len(gaps) < 2 or interval is None:
-        return failed(f"{len(found)} in the time of observation", "publish one at least every second")
+        return failed(f"{len(beats)} in the time of observation", "publish one at least every second")
     longest = silent_after(interval, robot.view.liveness.link, 0.0)
     if max(gaps) > longest:
         return failed(f"a gap of {max(gaps):.1f} s, where {longest:.1f} s counts as silence", "publish them evenly")
@@ -105,25 +104,23 @@ def clock(robot: Observer) -> CheckResult:
 
 
 def payloads(robot: Observer) -> CheckResult:
-    wrong = {one.metric: one.wrong for one in robot.records if one.wrong}
+    wrong = {record.metric: record.wrong for record in robot.records if record.wrong}
     if wrong:
         return failed(some_of(wrong.values()), "docs/topics.md has each payload")
-    return ok(f"{len({one.metric for one in robot.records if one.channel})} kinds of messages")
+    return ok(f"{len({record.metric for record in robot.records if record.channel})} kinds of messages")
 
 
 def numbers(robot: Observer) -> CheckResult:
-    def strange(record: Record) -> bool:
-        try:
-            msgspec.json.decode(record.payload)
-        except (msgspec.DecodeError, UnicodeDecodeError, RecursionError):
-            return True
-        return False
-
-    is_json = [one for one in robot.records if one.channel and one.channel.payload is not bytes and one.payload]
-    if found := {one.metric for one in is_json if strange(one)}:
-        return failed(
-            f"not JSON: {some_of(sorted(found))}", "NaN, Infinity and comments are no JSON: leave the field out"
-        )
+    strange = set()
+    for record in robot.records:
+        if record.channel and record.channel.payload is not bytes and record.payload:
+            try:
+                msgspec.json.decode(record.payload)
+            except (msgspec.DecodeError, UnicodeDecodeError, RecursionError):
+                strange.add(record.metric)
+    if strange:
+        fix = "NaN, Infinity and comments are no JSON: leave the field out"
+        return failed(f"not JSON: {some_of(sorted(strange))}", fix)
     return ok("all JSON is JSON")
 
 
@@ -132,16 +129,16 @@ def sizes(robot: Observer) -> CheckResult:
         return _LARGEST_STATE if record.channel is c.ESTOP_STATE else _LARGEST
 
     large = {
-        f"{one.metric} has {len(one.payload)} bytes, more than {limit(one)}"
-        for one in robot.records
-        if (one.channel is None or one.channel.payload is not bytes) and len(one.payload) > limit(one)
+        f"{record.metric} has {len(record.payload)} bytes, more than {limit(record)}"
+        for record in robot.records
+        if (record.channel is None or record.channel.payload is not bytes) and len(record.payload) > limit(record)
     }
     return failed(some_of(sorted(large)), "send less: readers drop it") if large else ok("no message is too large")
 
 
 def retained(robot: Observer) -> CheckResult:
-    there = {one.metric for one in robot.retained()}
-    live = {one.metric: one.channel for one in robot.records if one.channel is not None and one.payload}
+    there = {record.metric for record in robot.retained()}
+    live = {record.metric: record.channel for record in robot.records if record.channel and record.payload}
     must = {metric for metric, channel in live.items() if channel.default_retain and channel not in _REPEATED}
     lacks = sorted(must - there)
     if lacks:
@@ -157,10 +154,10 @@ def retained(robot: Observer) -> CheckResult:
 
 
 def stale_commands(robot: Observer) -> CheckResult:
-    found = sorted(one.metric for one in robot.retained() if one.channel is not None and one.channel.one_shot)
-    if found:
-        topic = f"{robot.base}/{found[0]}"
-        return failed(some_of(found), f"remove it: mosquitto_pub -r -n -t '{topic}'; and find who publishes it so")
+    parked = sorted(record.metric for record in robot.retained() if record.channel and record.channel.one_shot)
+    if parked:
+        topic = f"{robot.base}/{parked[0]}"
+        return failed(some_of(parked), f"remove it: mosquitto_pub -r -n -t '{topic}'; and find who publishes it so")
     return ok("none")
 
 
@@ -168,19 +165,14 @@ def stale_commands(robot: Observer) -> CheckResult:
 
 
 def capabilities(robot: Observer) -> CheckResult:
-    found = robot.of(c.CAPABILITIES, retained=True)
-    if not found:
+    published = robot.of(c.CAPABILITIES, retained=True)
+    if not published:
         return failed("it publishes none: pages offer nothing of it", "publish outgoing/capabilities, retained")
     try:
-        msgspec.convert(found[-1].value.value, CapabilitiesValue)
+        msgspec.convert(published[-1].value.value, CapabilitiesValue)
     except (msgspec.ValidationError, ValueError, AttributeError) as error:
-        return failed(str(found[-1].wrong or error), "docs/topics.md, CapabilitiesValue, has each field")
-    return ok(some_of(_offers(robot), 20) or "nothing is offered")
-
-
-def _offers(robot: Observer) -> list[str]:
-    value = robot.view.capabilities
-    return sorted(name for name in value if section_of(value, name).get("available") is True)
+        return failed(str(published[-1].wrong or error), "docs/topics.md, CapabilitiesValue, has each field")
+    return ok(some_of(sorted(available(robot.view.capabilities)), 20) or "nothing is offered")
 
 
 def own_topics(robot: Observer) -> CheckResult:
@@ -195,15 +187,15 @@ def own_topics(robot: Observer) -> CheckResult:
 
 
 def _topics(value: object, path: str) -> Iterator[tuple[str, str]]:
-    """What a key calls a topic, however deep it is."""
+    """Return each value whose key calls it a topic, however deep it is."""
     for key, inner in value.items() if isinstance(value, dict) else ():
         where = f"{path}.{key}".lstrip(".")
         if isinstance(inner, str) and key.endswith("topic"):
             yield where, inner
-        for one in inner if isinstance(inner, list) and key.endswith("topics") else ():
-            yield where, str(one)
-        for one in inner if isinstance(inner, list) else (inner,):
-            yield from _topics(one, where)
+        for topic in inner if isinstance(inner, list) and key.endswith("topics") else ():
+            yield where, str(topic)
+        for part in inner if isinstance(inner, list) else (inner,):
+            yield from _topics(part, where)
 
 
 def identity(robot: Observer) -> CheckResult:
@@ -227,8 +219,9 @@ def junk(robot: Observer) -> CheckResult:
     interval = robot.view.liveness.interval_s or ANSWER_S
     if not robot.wait(lambda: len(robot.of(c.ONLINE, sent + 2 * interval)) >= 2, 6 * interval + ANSWER_S):
         return failed("its heartbeats ended", "drop what is no JSON of the contract, and go on")
-    offline = [one for one in robot.of(c.ONLINE, began) if one.value and one.value.online is False]
-    return failed("it went offline meanwhile", "drop what cannot be read") if offline else ok("it goes on")
+    if any(beat.value and beat.value.online is False for beat in robot.of(c.ONLINE, began)):
+        return failed("it went offline meanwhile", "drop what cannot be read")
+    return ok("it goes on")
 
 
 # -- the emergency stop
@@ -251,13 +244,17 @@ def stop(robot: Observer, name: str) -> bool:
 
 
 def _has(robot: Observer, name: str) -> bool:
-    found = states(robot)
-    return bool(found) and all(one.latched and name in one.recent for one in found.values())
+    by_owner = states(robot)
+    return bool(by_owner) and all(state.latched and name in state.recent for state in by_owner.values())
+
+
+def _counts(robot: Observer) -> dict[str, int]:
+    return {owner: state.count for owner, state in states(robot).items()}
 
 
 def reset(robot: Observer, *, boot: str = "", more: int = 0) -> None:
-    for one in states(robot).values():
-        robot.send(c.ESTOP_RESET, EstopReset(boot=boot or one.boot, count=one.count + more, by=BY))
+    for state in states(robot).values():
+        robot.send(c.ESTOP_RESET, EstopReset(boot=boot or state.boot, count=state.count + more, by=BY))
 
 
 def freed(robot: Observer) -> bool:
@@ -306,15 +303,15 @@ def _after_long_ones(robot: Observer) -> CheckResult:
 
 
 def _repeated(robot: Observer) -> CheckResult:
-    """While it is stopped, and after its reset, when a repetition may still be on its way."""
+    """Repeat a stop during it, and after its reset, when a repetition may still be on its way."""
     names: list[str] = []
 
     def again(robot: Observer, name: str) -> CheckResult:
         names.append(name)
-        before = {owner: one.count for owner, one in states(robot).items()}
+        before = _counts(robot)
         robot.send(c.ESTOP, EstopCommand(stop=name, by=BY, why=_WHY))
         robot.look(robot.patience_s)
-        counted = [owner for owner, one in states(robot).items() if one.count != before.get(owner)]
+        counted = [owner for owner, count in _counts(robot).items() if count != before.get(owner)]
         if counted:
             return failed(f"its repetition counts again ({some_of(counted)})", "a name in recent is the same stop")
         return ok("the same stop counts once")
@@ -329,12 +326,11 @@ def _repeated(robot: Observer) -> CheckResult:
 
 
 def _unreadable(robot: Observer, _name: str) -> CheckResult:
-    before = {owner: one.count for owner, one in states(robot).items()}
+    before = _counts(robot)
     robot.send(c.ESTOP, b"stop!")
-    if not robot.answers(lambda: all(one.count > before.get(of, 0) for of, one in states(robot).items())):
-        return failed(
-            "a stop that is no JSON does nothing", "whatever arrives on incoming/estop is a stop, if not empty"
-        )
+    if not robot.answers(lambda: all(count > before.get(owner, 0) for owner, count in _counts(robot).items())):
+        fix = "whatever arrives on incoming/estop is a stop, if not empty"
+        return failed("a stop that is no JSON does nothing", fix)
     robot.look(robot.patience_s)  # at named it is sent with a name and without, and counts twice
     return ok("what cannot be read stops, too")
 
@@ -352,12 +348,6 @@ def _driven(robot: Observer, _name: str) -> CheckResult:
     if robot.happens(lambda: not robot.view.latched):
         return failed("a drive command ends the stop", "only a reset ends it")
     return ok("a drive command does not end it")
-
-
-def some_of(names: Iterable[object], most: int = _SHOWN) -> str:
-    found = [str(one) for one in names]
-    more = f" and {len(found) - most} more" if len(found) > most else ""
-    return ", ".join(found[:most]) + more
 
 
 _STOP = (stops, free, commanded)

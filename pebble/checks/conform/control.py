@@ -5,7 +5,9 @@ from __future__ import annotations
 import secrets
 import time
 from collections.abc import Callable
-from typing import Literal
+from typing import Any, Literal
+
+import msgspec
 
 from pebble import contract as c
 from pebble.checks.check import Check, CheckResult, failed, ok, skipped
@@ -15,12 +17,14 @@ from pebble.contract.payloads import ControlRequest, ControlState, EstopReset
 
 _SHORTEST_MS = 1000  # control ends so long after the last request or command, or later
 _RENEWS_S = 0.3
+SPEED = 0.4  # some motors are on or off, by a threshold
+DRIVES_S, STEP_S = 0.6, 0.05
 #: Where the broker itself refuses what has another name, or none, the robot never gets it.
 UNSEEN = "its broker does not show this account that it delivers such a message"
 
 
 class Driver:
-    """Requests control as one program of a person."""
+    """A program of a person who requests control, and drives with its key, if it has one."""
 
     def __init__(self, robot: Observer) -> None:
         self._robot, self.id = robot, secrets.token_hex(4)
@@ -32,23 +36,35 @@ class Driver:
         self._robot.send(c.CONTROL, self.request(want, for_ms))
 
     def leaves(self) -> bool:
-        """Release it; False: the robot keeps it."""
+        """Release it; return False if the robot keeps it."""
         self.asks("release")
         return self._robot.answers(lambda: not self.holds)
 
     def takes(self) -> float:
-        """Ask nobody; returns when."""
+        """Take control without asking who has it; return when."""
         return self._robot.send(c.CONTROL_TAKE, self.request())
+
+    def send(self, z: object = 0, *, key: str | None = None, wrapped: bool = False, **fields: object) -> float:
+        """Send one command, and return when; ``key``: instead of its own, "" for none."""
+        of = self.key if key is None else key
+        command = {"x": 0, "z": z, **({"key": of} if of else {}), **fields}
+        return self._robot.send(c.DRIVE, msgspec.json.encode({"value": command} if wrapped else command))
+
+    def drive(self, seconds: float = DRIVES_S, *, z: object = SPEED, **fields: Any) -> tuple[float, float]:
+        """Send commands for so long; return when the first and the last one left."""
+        began = last = time.monotonic()
+        while time.monotonic() < began + seconds:
+            last = self.send(z, **fields)
+            self._robot.look(STEP_S)
+        return began, last
 
     @property
     def state(self) -> ControlState | None:
-        """The newest of the robot."""
-        newest = self._robot.of(c.CONTROL_STATE, retained=True)[-1:]
-        return newest[0].value if newest else None
+        return self._robot.view.control.state
 
     @property
     def key(self) -> str:
-        """That of its control; empty while it has none."""
+        """Return the key of its control; empty while it has none."""
         return str(self.state.key) if self.state and self.state.id == self.id else ""
 
     @property
@@ -121,10 +137,10 @@ def _taken(robot: Observer, driver: Driver) -> CheckResult:
 
 
 def _ends(robot: Observer, driver: Driver) -> CheckResult:
-    """Commands prolong it: here zeros, which move nothing."""
+    """Prolong it by commands: zeros, which move nothing."""
     began = time.monotonic()
     while driver.holds and time.monotonic() < began + 1.5 * _SHORTEST_MS / 1000:
-        robot.send(c.DRIVE, b'{"x": 0, "z": 0, "key": "%s"}' % driver.key.encode())
+        driver.send()
         robot.look(_RENEWS_S)
     if not driver.holds:
         return failed("it ends in the middle of its commands", "end it for_ms after the last request or command")
@@ -140,8 +156,8 @@ def _nameless(robot: Observer, _name: str) -> CheckResult:
         return skipped(UNSEEN)
     if robot.happens(lambda: stranger.holds):
         return failed("it gives control to a request without an account", fix)
-    for one in states(robot).values():
-        robot.send_as("", c.ESTOP_RESET, EstopReset(boot=one.boot, count=one.count, by=BY))
+    for state in states(robot).values():
+        robot.send_as("", c.ESTOP_RESET, EstopReset(boot=state.boot, count=state.count, by=BY))
     if robot.happens(lambda: not robot.view.latched):
         return failed("a reset without an account ends a stop", fix)
     return ok("requests and resets without an account do nothing")

@@ -13,14 +13,11 @@ import msgspec
 from pebble import contract as c
 from pebble.checks.check import Check, CheckResult, State, failed, ok, skipped
 from pebble.checks.conform.checks import commanded, controls, drives, free, freed, reset, stop, stops
-from pebble.checks.conform.control import UNSEEN, Driver, named
+from pebble.checks.conform.control import DRIVES_S, SPEED, STEP_S, UNSEEN, Driver, named
 from pebble.checks.observer import ANSWER_S, Observer
 
-SPEED = 0.4  # some motors are on or off, by a threshold
-DRIVES_S = 0.6
 RESTS_S = 0.75  # after the last command, at the latest
-_LATE_S = 0.5  # until a report of it is here
-_STEP_S = 0.05
+LATE_S = 0.5  # until a report of it is here
 _SWING = 30  # of a hall sensor's value: less is noise
 _OTHER_KEY, _OTHER_ACCOUNT = "0badf00d", "conform-other"
 _NOT_SHOWN = "nothing that it publishes shows whether it moves"
@@ -28,12 +25,13 @@ _SHOW_IT = 'publish {"value": {"wheels": [left, right]}} on outgoing/status when
 
 
 def moves_until(robot: Observer, since: float) -> float | None:
-    """When the last motion after ``since`` ended, infinite while it lasts, 0 without any; None: nothing shows it.
+    """Return when the last motion after ``since`` ended: infinite while it lasts, 0 without any, None if none is shown.
 
-    Shown by ``wheels`` in the status, which is published on change, or by readings of hall sensors.
+    It is shown by ``wheels`` in the status, which is published on change, or by readings of hall sensors.
     """
     turning = [(at, any(wheels)) for at, wheels in _shown(robot)]
-    touches = [(one.at, msgspec.structs.astuple(one.value.value)) for one in robot.of(c.TOUCH_SENSORS) if one.value]
+    readings = [record for record in robot.of(c.TOUCH_SENSORS) if record.value]
+    touches = [(reading.at, msgspec.structs.astuple(reading.value.value)) for reading in readings]
     if not turning and not touches:
         return None
     last, level = 0.0, touches[0][1] if touches else ()
@@ -49,78 +47,62 @@ def moves_until(robot: Observer, since: float) -> float | None:
 
 
 def _shown(robot: Observer) -> list[tuple[float, list[float]]]:
-    """What its wheels did, and since when."""
-    reports = [(one.at, one.value.value.get("wheels")) for one in robot.of(c.STATUS) if one.value is not None]
+    """Return since when its wheels did what."""
+    reports = [(report.at, report.value.value.get("wheels")) for report in robot.of(c.STATUS) if report.value]
     return robot.eyes() or [(at, wheels) for at, wheels in reports if _are_wheels(wheels)]
 
 
 def _moves(robot: Observer, since: float) -> list[float] | None:
-    """What its wheels do by commands since then; empty: nothing, None: it is not shown."""
+    """Return what its wheels do by commands since then; empty: nothing, None: it is not shown."""
 
     def moving() -> list[float]:
         return next((wheels for at, wheels in reversed(_shown(robot)) if at >= since and any(wheels)), [])
 
     robot.wait(moving, ANSWER_S)
-    robot.look(_LATE_S)
+    robot.look(LATE_S)
     return moving() if _shown(robot) else None
 
 
 def _are_wheels(value: Any) -> bool:
-    return isinstance(value, list) and len(value) > 0 and all(isinstance(one, int | float) for one in value)
-
-
-class _Wheel:
-    """Sends drive commands, with the key of control where the robot has one."""
-
-    def __init__(self, robot: Observer) -> None:
-        self._robot, self.driver = robot, Driver(robot)
-
-    def send(self, z: object = SPEED, *, key: str | None = None, wrapped: bool = False, **fields: object) -> float:
-        """One command; ``key``: instead of its own, "" for none. Returns when."""
-        of = self.driver.key if key is None else key
-        command = {"x": 0, "z": z, **({"key": of} if of else {}), **fields}
-        return self._robot.send(c.DRIVE, msgspec.json.encode({"value": command} if wrapped else command))
-
-    def drive(self, seconds: float = DRIVES_S, **fields: Any) -> tuple[float, float]:
-        """Commands for so long; when the first and the last one left."""
-        began = last = time.monotonic()
-        while time.monotonic() < began + seconds:
-            last = self.send(**fields)
-            self._robot.look(_STEP_S)
-        return began, last
+    return isinstance(value, list) and len(value) > 0 and all(isinstance(speed, int | float) for speed in value)
 
 
 @contextmanager
-def _at_the_wheel(robot: Observer) -> Iterator[_Wheel]:
-    """Its driver has control, and has let go, so that a wait after a reset is over; at the end, too."""
-    wheel = _Wheel(robot)
+def _at_the_wheel(robot: Observer) -> Iterator[Driver]:
+    """Take control and let go, so that a wait after a reset is over; at the end, too."""
+    driver = Driver(robot)
     if robot.view.controlled:
-        wheel.driver.asks(for_ms=10_000)
-        robot.answers(lambda: wheel.driver.holds)
-    wheel.send(0)
+        driver.asks(for_ms=10_000)
+        robot.answers(lambda: driver.holds)
+    driver.send()
     robot.wait(lambda: moves_until(robot, time.monotonic()) != float("inf"), ANSWER_S)
     try:
-        yield wheel
+        yield driver
     finally:
-        wheel.send(0)
-        wheel.driver.leaves()
+        driver.send()
+        driver.leaves()
 
 
 def _rest(robot: Observer, began: float, last: float, limit_s: float, what: str = "the last command") -> CheckResult:
-    robot.look(limit_s + _LATE_S)
+    robot.look(limit_s + LATE_S)
+    return rested(robot, began, last, limit_s, what)
+
+
+def rested(robot: Observer, began: float, last: float, limit_s: float, what: str = "the last command") -> CheckResult:
+    """Judge what was seen of a robot that was driven from ``began`` to ``last``, and had to rest soon after."""
     until = moves_until(robot, began)
     if until is None:
         return skipped(_NOT_SHOWN, _SHOW_IT)
     if until == 0.0:
-        return failed(f"z {SPEED} for {DRIVES_S} s does not move it", "drive by incoming/drive-values, live ones")
-    if until > last + limit_s + _LATE_S / 2:
+        return failed("its commands do not move it", "drive by incoming/drive-values, live ones")
+    if until > last + limit_s + LATE_S / 2:
         shown = "still moves" if until == float("inf") else f"moved for {until - last:.2f} s"
         return failed(f"it {shown} after {what}", f"stop {limit_s:g} s after {what}, at the latest")
     return ok(f"it rests {max(0.0, until - last):.2f} s after {what}")
 
 
 def _moved(robot: Observer, since: float, why: str, fix: str) -> CheckResult:
-    """A failure if it has moved."""
+    """Return a failure if it has moved."""
     robot.look(robot.patience_s)
     until = moves_until(robot, since)
     if until is None:
@@ -129,25 +111,25 @@ def _moved(robot: Observer, since: float, why: str, fix: str) -> CheckResult:
 
 
 def dead_man(robot: Observer) -> CheckResult:
-    with _at_the_wheel(robot) as wheel:
-        return _rest(robot, *wheel.drive(), RESTS_S)
+    with _at_the_wheel(robot) as driver:
+        return _rest(robot, *driver.drive(), RESTS_S)
 
 
 def valid_ms(robot: Observer) -> CheckResult:
-    """A short time, and one that is too long."""
-    with _at_the_wheel(robot) as wheel:
-        outcome = _rest(robot, *wheel.drive(valid_ms=150), 0.15)
+    """Drive by commands with a short time, and with one that is too long."""
+    with _at_the_wheel(robot) as driver:
+        outcome = _rest(robot, *driver.drive(valid_ms=150), 0.15)
         if outcome.state is not State.OK:
             return outcome
-        last = _rest(robot, *wheel.drive(0.2, valid_ms=4000), RESTS_S)
+        last = _rest(robot, *driver.drive(0.2, valid_ms=4000), RESTS_S)
         return outcome if last.state is State.OK else failed(f"valid_ms 4000: {last.text}", last.fix)
 
 
 def zero(robot: Observer) -> CheckResult:
-    """It comes from another than the driver: it needs no key."""
-    with _at_the_wheel(robot) as wheel:
-        began, _ = wheel.drive()
-        return _rest(robot, began, wheel.send(0, key=_OTHER_KEY), 0.1, "a zero with another key")
+    """Send a zero that is not the driver's: it needs no key."""
+    with _at_the_wheel(robot) as driver:
+        began, _ = driver.drive()
+        return _rest(robot, began, driver.send(key=_OTHER_KEY), 0.1, "a zero with another key")
 
 
 def steering(robot: Observer) -> CheckResult:
@@ -156,40 +138,40 @@ def steering(robot: Observer) -> CheckResult:
         ({"z": SPEED}, (1, 1)),
         ({"z": -SPEED, "wrapped": True}, (-1, -1)),
     )
-    with _at_the_wheel(robot) as wheel:
+    with _at_the_wheel(robot) as driver:
         for fields, signs in ways:
-            found = _moves(robot, wheel.drive(DRIVES_S / 2, **fields)[0])
-            if found is None:
+            wheels = _moves(robot, driver.drive(DRIVES_S / 2, **fields)[0])
+            if wheels is None:
                 return skipped(_NOT_SHOWN, _SHOW_IT)
-            if [one * sign > 0 for one, sign in zip(found, signs, strict=False)] != [True, True]:
+            if [speed * sign > 0 for speed, sign in zip(wheels, signs, strict=False)] != [True, True]:
                 sent = f"x {fields.get('x', 0):g}, z {fields['z']:g}" + " within value" * ("wrapped" in fields)
-                return failed(f"at {sent} its wheels do {found}", "left is z + x, right is z - x, also within value")
+                return failed(f"at {sent} its wheels do {wheels}", "left is z + x, right is z - x, also within value")
     return ok("x to the right, z ahead")
 
 
 def stop_moving(robot: Observer) -> CheckResult:
-    """Commands go on, and begin again after the stick was let go; they move nothing."""
-    with _at_the_wheel(robot) as wheel:
-        began, _ = wheel.drive()
+    """Go on with commands, and begin again after the stick was let go; they move nothing."""
+    with _at_the_wheel(robot) as driver:
+        began, _ = driver.drive()
         at = time.monotonic()
         stop(robot, secrets.token_hex(8))
-        wheel.drive()
-        wheel.send(0)
-        wheel.drive(DRIVES_S / 2)
+        driver.drive()
+        driver.send()
+        driver.drive(DRIVES_S / 2)
         outcome = _rest(robot, began, at, 0.25, "the stop")
     return outcome if freed(robot) else failed("a reset does not end the stop", "end it on incoming/estop-reset")
 
 
 def reset_waits(robot: Observer) -> CheckResult:
-    """The stick is held down meanwhile. A zero of another ends no wait while one has control."""
-    with _at_the_wheel(robot) as wheel:
+    """Hold the stick down meanwhile. A zero of another ends no wait while one has control."""
+    with _at_the_wheel(robot) as driver:
         stop(robot, secrets.token_hex(8))
-        began, _ = wheel.drive(2 * _STEP_S)  # from before the reset on: a pause would end the wait
+        began, _ = driver.drive(2 * STEP_S)  # from before the reset on: a pause would end the wait
         reset(robot)
-        wheel.drive(DRIVES_S / 2)
+        driver.drive(DRIVES_S / 2)
         if robot.view.controlled:
-            wheel.send(0, key=_OTHER_KEY)
-        wheel.drive()
+            driver.send(key=_OTHER_KEY)
+        driver.drive()
         outcome = _moved(
             robot,
             began,
@@ -197,8 +179,8 @@ def reset_waits(robot: Observer) -> CheckResult:
             "wait for a zero of who has control, or for 0.5 s without commands",
         )
         if outcome.state is State.OK:
-            wheel.send(0)
-            outcome = _rest(robot, *wheel.drive(), RESTS_S)
+            driver.send()
+            outcome = _rest(robot, *driver.drive(), RESTS_S)
     if robot.wait(lambda: not robot.view.latched, ANSWER_S):
         return outcome
     return failed("a reset does not end the stop", "end it on incoming/estop-reset")
@@ -213,8 +195,8 @@ def not_a_number(robot: Observer) -> CheckResult:
 
 
 def clamped(robot: Observer) -> CheckResult:
-    with _at_the_wheel(robot) as wheel:
-        wheels = _moves(robot, wheel.drive(DRIVES_S / 2, z=9, x=-9)[0])
+    with _at_the_wheel(robot) as driver:
+        wheels = _moves(robot, driver.drive(DRIVES_S / 2, z=9, x=-9)[0])
     if wheels is None:
         return skipped(_NOT_SHOWN, _SHOW_IT)
     if not wheels:
@@ -226,37 +208,37 @@ def clamped(robot: Observer) -> CheckResult:
 
 
 def foreign_key(robot: Observer) -> CheckResult:
-    """While one has control, and while none has."""
+    """Drive with another's key while one has control, and while none has."""
     why, fix = "it moves by another's key", "refuse what moves and has another key"
-    with _at_the_wheel(robot) as wheel:
-        outcome = _moved(robot, wheel.drive(key=_OTHER_KEY)[0], why, fix)
+    with _at_the_wheel(robot) as driver:
+        outcome = _moved(robot, driver.drive(key=_OTHER_KEY)[0], why, fix)
     if outcome.state is not State.OK:
         return outcome
-    return _moved(robot, wheel.drive(DRIVES_S / 2, key=_OTHER_KEY)[0], f"{why} while no one has control", fix)
+    return _moved(robot, driver.drive(DRIVES_S / 2, key=_OTHER_KEY)[0], f"{why} while no one has control", fix)
 
 
 def control_passes(robot: Observer) -> CheckResult:
-    with _at_the_wheel(robot) as wheel:
-        began, _ = wheel.drive()
-        key, second = wheel.driver.key, Driver(robot)
+    with _at_the_wheel(robot) as driver:
+        began, _ = driver.drive()
+        key, second = driver.key, Driver(robot)
         at = second.takes()
         robot.answers(lambda: second.holds)
-        wheel.drive(key=key)
+        driver.drive(key=key)
         outcome = _rest(robot, began, at, 0.25, "another took control")
         second.leaves()
     return outcome
 
 
 def keyless(robot: Observer) -> CheckResult:
-    with _at_the_wheel(robot) as wheel:
-        began, _ = wheel.drive(key="")
+    with _at_the_wheel(robot) as driver:
+        began, _ = driver.drive(key="")
         return _moved(robot, began, "it moves by a command without a key", "at level named refuse those")
 
 
 def foreign_account(robot: Observer) -> CheckResult:
-    """The key of control, behind another account and behind none."""
-    with _at_the_wheel(robot) as wheel:
-        command = msgspec.json.encode({"x": 0, "z": SPEED, "key": wheel.driver.key})
+    """Send the key of control behind another account, and behind none."""
+    with _at_the_wheel(robot) as driver:
+        command = msgspec.json.encode({"x": 0, "z": SPEED, "key": driver.key})
         began = time.monotonic()
         delivered = [robot.send_as(account, c.DRIVE, command) for account in (_OTHER_ACCOUNT, "")]
         outcome = _moved(

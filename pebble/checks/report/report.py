@@ -33,8 +33,8 @@ from pebble.version import __version__
 _JOURNAL_LINES = 2000
 _PROGRAM_S = 20.0
 _LONGEST_PART = 8 << 20  # bytes
-_FOLDERS = ("etc/systemd/system", "usr/lib/systemd/system", "lib/systemd/system", "usr/local/lib/systemd/system")
-_UNITS = (*(f"{folder}/pebble*{inner}" for folder in _FOLDERS for inner in ("", "/*")), "etc/polkit-1/rules.d/*pebble*")
+_STATES_S = 1.0  # until all have come
+_UNITS = ("etc/systemd/system", "usr/lib/systemd/system", "lib/systemd/system", "usr/local/lib/systemd/system")
 
 
 class MissingError(PebbleError):
@@ -43,12 +43,15 @@ class MissingError(PebbleError):
 
 @dataclass(frozen=True)
 class Here:
-    """What is reported: the installed robot below ``places``, or that of another config."""
+    """The robot that is reported: that installed below ``places``, or that of another config."""
 
     places: Places
     file: Path
     config: Config | None = None  # None: it has mistakes, or is not there
     problem: str = ""
+
+
+Part = Callable[[Here], str]
 
 
 @dataclass
@@ -104,7 +107,7 @@ def _index(report: Report, known: Secrets) -> str:
 
 
 def _config(here: Here) -> str:
-    """The config as written and as it is meant, with stars where there are secrets."""
+    """Return the config as written and as it is meant, with stars where there are secrets."""
     written = masked(plain(decode(read_text(here.file), here.file.name), Notes()))
     whole: dict[str, Any] = {"file": str(here.file), "written": written}
     whole |= {"problems": here.problem.splitlines()} if here.config is None else {"resolved": resolved(here.config)}
@@ -119,18 +122,14 @@ def _doctor(here: Here) -> str:
 
 
 def _status(here: Here) -> str:
-    """What the robot's own side retains of its state; asked as its user, as root may not."""
+    """Return what the robot's own side publishes and retains; asked as its user, as root may not."""
     if here.config is None:
         raise MissingError("the config cannot be read")
-    who = user_of(here.config.run_dir())
-    command = [sys.executable, "-m", "pebble.checks.report.states", str(here.file.absolute())]
-    as_user: dict[str, Any] = {} if who is None else {"user": who.pw_uid, "group": who.pw_gid, "extra_groups": []}
-    done: subprocess.CompletedProcess[str] = subprocess.run(
-        command, capture_output=True, text=True, check=False, timeout=_PROGRAM_S, cwd="/", **as_user
-    )
-    if done.returncode:
-        raise MissingError(done.stderr.strip().rpartition("\n")[2] or "its own side is not reached")
-    return done.stdout
+    user, file = user_of(here.config.run_dir()), str(here.file.absolute())
+    who: dict[str, Any] = {} if user is None else {"user": user.pw_uid, "group": user.pw_gid, "extra_groups": []}
+    topics = f"{here.config.base}/outgoing/#"
+    echo = ("-m", "pebble.cli", "topic", "echo", topics, "--seconds", str(_STATES_S), "--config", file)
+    return _printed(sys.executable, *echo, **who)
 
 
 def _journal(here: Here) -> str:
@@ -139,19 +138,24 @@ def _journal(here: Here) -> str:
     return _printed("journalctl", *root, *units, f"--lines={_JOURNAL_LINES}", "--no-pager", "--output=short-iso")
 
 
-def _units(here: Here) -> str:
-    files = sorted({file for pattern in _UNITS for file in here.places.root.glob(pattern) if file.is_file()})
-    if not files:
-        raise MissingError("no unit of Pebble is installed")
-    return "\n".join(map(_described, files)) + "\n"
+def _versions(here: Here) -> str:
+    lines = [f"pebble {__version__}", f"python {sys.version}", f"{sys.executable}", " ".join(platform.uname())]
+    release = here.places.root / "etc/os-release"
+    lines += release.read_text(encoding="utf-8", errors="replace").splitlines() if release.is_file() else []
+    installed = {package.name: package.version for package in metadata.distributions()}
+    return "\n".join([*lines, *(f"{name} {version}" for name, version in sorted(installed.items()))]) + "\n"
 
 
-def _slots(here: Here) -> str:
-    places = here.places
-    if not places.slots.is_dir():
-        raise MissingError(f"there is no {places.slots}")
-    files = [*sorted(places.slots.glob("*")), *sorted(places.slots.glob("*/.complete")), places.current_slot]
-    return "\n".join(map(_described, [*files, *sorted(places.slot_state.glob("*"))])) + "\n"
+def _files(*patterns: str) -> Part:
+    """Return the part with all files that match, below the root."""
+
+    def part(here: Here) -> str:
+        files = sorted({file for pattern in patterns for file in here.places.root.glob(pattern)})
+        if not files:
+            raise MissingError("there are no such files")
+        return "\n".join(map(_described, files)) + "\n"
+
+    return part
 
 
 def _described(path: Path) -> str:
@@ -159,44 +163,38 @@ def _described(path: Path) -> str:
         return f"# {path} -> {path.readlink()}"
     if path.is_file():
         return f"# {path}\n{path.read_text(encoding='utf-8', errors='replace').strip()}"
-    return f"# {path}{'/' if path.is_dir() else ' is missing'}"
+    return f"# {path}/"
 
 
-def _versions(here: Here) -> str:
-    lines = [f"pebble {__version__}", f"python {sys.version}", f"{sys.executable}", " ".join(platform.uname())]
-    release = here.places.root / "etc/os-release"
-    lines += release.read_text(encoding="utf-8", errors="replace").splitlines() if release.is_file() else []
-    installed = {one.name: one.version for one in metadata.distributions()}
-    return "\n".join([*lines, *(f"{name} {version}" for name, version in sorted(installed.items()))]) + "\n"
+def _programs(*commands: tuple[str, ...]) -> Part:
+    """Return the part with what these commands print."""
+    return lambda _here: "".join(_printed(*command) for command in commands)
 
 
-def _devices(_here: Here) -> str:
-    names = [f"{path} -> {path.resolve()}" for path in sorted(Path("/dev").glob("*/by-id/*"))]
-    return "\n".join([_printed("lsusb"), *names]) + "\n"
-
-
-def _disk(_here: Here) -> str:
-    return _printed("df", "-h", "-x", "tmpfs") + _printed("free", "-h") + _printed("uptime")
-
-
-def _printed(program: str, *arguments: str) -> str:
+def _printed(program: str, *arguments: str, **who: Any) -> str:
     if shutil.which(program) is None:
         raise MissingError(f"{program} is not installed")
-    done = subprocess.run([program, *arguments], capture_output=True, timeout=_PROGRAM_S, check=False)
+    command = [program, *arguments]
+    done: subprocess.CompletedProcess[bytes] = subprocess.run(
+        command, capture_output=True, timeout=_PROGRAM_S, check=False, cwd="/", **who
+    )
     if done.returncode and not done.stdout:
-        raise MissingError(f"{program} ended with {done.returncode}: {done.stderr.decode(errors='replace')[:300]}")
+        raise MissingError(f"{program} ended with {done.returncode}: {done.stderr.decode(errors='replace')[-300:]}")
     return done.stdout.decode(errors="replace")
 
 
 #: In the order in which a reader wants them.
-PARTS: dict[str, Callable[[Here], str]] = {
+PARTS: dict[str, Part] = {
     "config.json": _config,
     "doctor.txt": _doctor,
-    "status.json": _status,
+    "status.txt": _status,
     "journal.txt": _journal,
-    "units.txt": _units,
-    "slots.txt": _slots,
+    "units.txt": _files(
+        *(f"{folder}/pebble*{inner}" for folder in _UNITS for inner in ("", "/*")), "etc/polkit-1/rules.d/*pebble*"
+    ),
+    "slots.txt": _files("opt/pebble/*", "opt/pebble/*/.complete", "run/pebble-slot/*", "var/lib/pebble-update/*"),
     "versions.txt": _versions,
-    "lsusb.txt": _devices,
-    "disk.txt": _disk,
+    "lsusb.txt": _programs(("lsusb",)),
+    "devices.txt": _files("dev/*/by-id/*"),
+    "disk.txt": _programs(("df", "-h", "-x", "tmpfs"), ("free", "-h"), ("uptime",)),
 }

@@ -40,7 +40,7 @@ _keys = re.compile(r"-----BEGIN [A-Z ]*PRIVATE KEY-----\n(.*?)-----END", re.DOTA
 
 
 class Secrets(NamedTuple):
-    """``known`` by where they are written; ``unread`` are files that may hold more, ``short`` of too short ones."""
+    """Secrets, ``known`` with where they are written; ``unread`` files may hold more, ``short`` have too short ones."""
 
     known: dict[str, str]
     unread: tuple[str, ...]

@@ -1,5 +1,9 @@
 """Checks of a robot that runs, end to end, from its own side and from its operators'."""
 
+from collections.abc import Iterator
+from typing import Any
+
+from pebble.client.robot_topics import section_of
 from pebble.client.robot_view import RobotView
 
 
@@ -10,3 +14,8 @@ def why_not_free(view: RobotView) -> str:
     if view.autonomy is not None and view.autonomy.running:
         return f"the script {view.autonomy.file} is running"
     return f"{view.control.who} drives it" if view.control.who else ""
+
+
+def available(capabilities: dict[str, Any]) -> Iterator[str]:
+    """Return the sections of a robot's capabilities that are available."""
+    return (name for name in capabilities if section_of(capabilities, name).get("available") is True)

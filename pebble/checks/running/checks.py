@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import math
 import shlex
-from collections.abc import Iterator
 from itertools import pairwise
 
-from pebble.checks.check import Check, CheckResult, failed, ok, skipped
-from pebble.checks.running import machine, why_not_free
+from pebble.checks.check import Check, CheckResult, failed, ok, skipped, some_of
+from pebble.checks.running import available, machine, why_not_free
 from pebble.checks.running.media import picture, sound
 from pebble.checks.running.robot import RobotUnderTest, Side
 from pebble.checks.running.stops import retained_commands, stop
@@ -76,9 +75,9 @@ def _unready(robot: RobotUnderTest) -> list[str]:
     if not robot.inside.status:
         return ["its status has not arrived: is it starting?"]
     wanted = set(robot.config.on_demand_programs())
-    found = _states(robot).items()
+    states = _states(robot).items()
     return [
-        f"{name} is {state}" for name, state in found if state != "ready" and not (name in wanted or state == "held")
+        f"{name} is {state}" for name, state in states if state != "ready" and not (name in wanted or state == "held")
     ]
 
 
@@ -116,24 +115,17 @@ def _gap(side: Side) -> float:
 
 def capabilities(robot: RobotUnderTest) -> CheckResult:
     """Check that it offers, on both sides, what its config has."""
-    wanted = set(_available(expected_capabilities(robot.config, Addresses(robot.config))))
+    wanted = {*available(expected_capabilities(robot.config, Addresses(robot.config)))} - {"outlets"}  # with a device
     lacking: dict[str, str] = {}
     for side in robot.sides:
         where = "" if side.own else " to operators"
         if not side.view.estop.has_capabilities:
             return failed(f"it has not published them{where}", _LOG)
-        for name in sorted(wanted - set(_available(side.view.capabilities))):
+        for name in sorted(wanted - {*available(side.view.capabilities)}):
             lacking.setdefault(name, f"{name}{where}")
     if lacking:
         return failed(f"it does not offer {', '.join(lacking.values())}", _LOG)
     return ok(", ".join(sorted(wanted)) or "none")
-
-
-def _available(value: dict[str, object]) -> Iterator[str]:
-    """Return the sections of capabilities that are available; those that come with a device are left out."""
-    for name in value:
-        if section_of(value, name).get("available") is True and name != "outlets":
-            yield name
 
 
 # -- what hangs on it
@@ -193,7 +185,7 @@ def leftovers(robot: RobotUnderTest) -> CheckResult:
     for side in here:
         gone = sorted(side.others.keys() - side.live)
         if gone:
-            names = ", ".join(id_of(base) for base in gone[:_SHOWN])
+            names = some_of([id_of(base) for base in gone], _SHOWN)
             remote = "" if side.own else " --remote"
             topic = shlex.quote(min(side.others[gone[0]]))  # anybody may have chosen it
             fix = f"if they are gone: pebble topic pub {topic} '' --retain --force -c CONFIG{remote}, and so on"

@@ -12,7 +12,7 @@ from urllib.error import HTTPError
 from urllib.request import HTTPSHandler, ProxyHandler, build_opener
 
 from pebble.checks import machine as this_machine
-from pebble.checks.check import CheckResult, State, failed, ok, skipped
+from pebble.checks.check import SOON_DAYS, CheckResult, State, failed, ok, skipped
 from pebble.checks.running.robot import RobotUnderTest
 from pebble.client.page.from_config import settings_of
 from pebble.errors import PebbleError
@@ -24,7 +24,6 @@ _SYSTEMCTL_S = 5.0
 _PAGE_S = 5.0
 _LEAST_FREE = 200_000_000  # bytes: logs, the audit and an update's states go on for weeks
 _LEAST_SHARE = 0.02
-_SOON_DAYS = 14
 _ANY_HOST = {"0.0.0.0": "127.0.0.1", "::": "::1"}  # noqa: S104 - where a page that listens everywhere is asked
 
 
@@ -46,7 +45,7 @@ def unit(robot: RobotUnderTest) -> CheckResult:
 
 
 def unit_of(properties: Mapping[str, str]) -> CheckResult:
-    """Do the same from what ``systemctl show`` prints."""
+    """Judge what ``systemctl show`` prints."""
     if properties.get("LoadState") != "loaded":
         return skipped(f"{UNIT} is not installed")
     state, sub, restarts = (properties.get(name, "?") for name in ("ActiveState", "SubState", "NRestarts"))
@@ -82,36 +81,28 @@ def slot(robot: RobotUnderTest) -> CheckResult:
 
 
 def clock(_robot: RobotUnderTest) -> CheckResult:
-    """A clock that was never set makes stamps and certificates wrong."""
-    return _result(this_machine.clock(time.time(), this_machine.synchronised()))
+    """Find a clock that was never set; a robot without a network has no time server, which is no failure."""
+    result = this_machine.clock(time.time(), this_machine.synchronised())
+    return result if result.state is State.FAILED else ok(result.text)
 
 
 def disk(robot: RobotUnderTest) -> CheckResult:
     """Check that stops, people and the audit can go on being saved."""
     folder = Path(os.path.normpath(robot.config.state_dir()))  # a config may name it by ../..
-    existing = next(one for one in (folder, *folder.parents) if one.exists())
-    try:
-        found = os.statvfs(existing)
-    except OSError as error:
-        return failed(f"{existing}: {error.strerror}", f"ls -ld {existing}")
-    return disk_of(folder, found)
+    existing = next(place for place in (folder, *folder.parents) if place.exists())
+    return disk_of(folder, os.statvfs(existing))
 
 
-def disk_of(folder: Path, found: os.statvfs_result) -> CheckResult:
-    free, whole = found.f_bavail * found.f_frsize, found.f_blocks * found.f_frsize
+def disk_of(folder: Path, room: os.statvfs_result) -> CheckResult:
+    free, whole = room.f_bavail * room.f_frsize, room.f_blocks * room.f_frsize
     text = f"{free / 1e9:.1f} of {whole / 1e9:.1f} GB are free at {folder}"
-    if found.f_flag & os.ST_RDONLY:
+    if room.f_flag & os.ST_RDONLY:
         return failed(f"{folder} is read-only: no stop survives a power cut", "sudo mount -o remount,rw /")
     if free < max(_LEAST_FREE, _LEAST_SHARE * whole):
         return failed(text, f"du -xh --max-depth=1 {folder.parent} | sort -h; journalctl --vacuum-size=50M")
-    if found.f_files and not found.f_favail:
+    if room.f_files and not room.f_favail:
         return failed(f"{folder}: no file can be made any more", f"du -x --inodes {folder.parent} | sort -n | tail")
     return ok(text)
-
-
-def _result(result: CheckResult) -> CheckResult:
-    """A warning is no failure: a robot without a network has no time server."""
-    return failed(result.text, result.fix) if result.state is State.FAILED else ok(result.text)
 
 
 # -- what it serves
@@ -140,7 +131,7 @@ def page(robot: RobotUnderTest) -> CheckResult:
         return failed(f"{where} does not answer: {reason}", "pebble doctor CONFIG; journalctl -u pebble -n 50")
     if days is None:
         return ok(f"{where} answers, without encryption")
-    if days < _SOON_DAYS:
+    if days < SOON_DAYS:
         return failed(f"{where} answers; its certificate ends in {days:.0f} days", _RENEW)
     return ok(f"{where} answers; its certificate is valid for {days:.0f} more days")
 
@@ -155,4 +146,4 @@ def _trusting(certificate: Path | None) -> tuple[ssl.SSLContext | None, float | 
     context = ssl.create_default_context(cafile=str(certificate))
     context.check_hostname = False
     context.verify_flags |= ssl.VERIFY_X509_PARTIAL_CHAIN
-    return context, (certificates.show(certificate).until.timestamp() - time.time()) / 86_400
+    return context, certificates.show(certificate).days_left

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import pwd
-import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
@@ -25,7 +24,6 @@ from pebble.runtime.places import Places
 from pebble.transports import Message, Transport
 
 PATIENCE_S, RESTS_S = 3.0, 0.75
-_STEP_S = 0.005
 _MAX_IDS = 1000  # other robots at a broker of this machine
 _STATES = (c.ONLINE, c.CAPABILITIES, c.STATUS, c.ESTOP_STATE)
 _WATCHED = (*_STATES, c.CONTROL_STATE, c.LINK, c.CHARGING_LEVEL, c.CHARGING_STATUS, c.AUTONOMY_STATUS)
@@ -33,7 +31,7 @@ _ANY = "+/+/+"
 
 
 class Side(Observer):
-    """One side of the robot, and what other robots have left there."""
+    """A side of the robot, and what other robots have left there."""
 
     def __init__(self, config: Config, target: Target, transport: Transport, names: Names, *, own: bool) -> None:
         """``own``: the robot's own side, where its processes meet."""
@@ -53,10 +51,12 @@ class Side(Observer):
             return config.transport.kind != "mqtt" or is_loopback(config.local_mqtt.host)
         return is_near(config.services.mqtt_bridge.remote_mqtt)
 
-    def ask(self) -> None:
-        """Some brokers send what is retained only to those who ask by name."""
-        topics = [self._addresses[channel].topic for channel in _WATCHED if not channel.is_pattern]
-        self.transport.ask([*topics, *self.view.estop.missing, *self.view.estop.missing_control])
+    def ask(self, patience_s: float) -> None:
+        """Ask for what is retained by its name, which some brokers need; capabilities name some of it."""
+        estop = self.view.estop
+        self.transport.ask([self._addresses[channel].topic for channel in _WATCHED if not channel.is_pattern])
+        self.wait(lambda: estop.has_capabilities, patience_s)
+        self.transport.ask([*estop.missing, *estop.missing_control])
 
     def channel_of(self, topic: str) -> c.Channel | None:
         return self._addresses.channel(topic)
@@ -79,19 +79,19 @@ class Side(Observer):
 
     @property
     def status(self) -> dict[str, object]:
-        """The value of the newest status; empty before the first."""
-        newest = self.newest(c.STATUS)
-        return {} if newest is None else newest.value
+        """Return the value of the newest status; empty before the first."""
+        values = [record.value.value for record in self.of(c.STATUS, retained=True) if record.value is not None]
+        return values[-1] if values else {}
 
     @property
     def heartbeats(self) -> list[float]:
-        """When live ones arrived (monotonic)."""
+        """Return when live ones arrived (monotonic)."""
         return [record.at for record in self.of(c.ONLINE) if record.value is not None]
 
 
 @dataclass(kw_only=True)
 class RobotUnderTest:
-    """One robot, and its sides as far as they are reached; ``why_own`` and ``why_operators`` are why they are not."""
+    """A robot, and its sides as far as they are reached; ``why_own`` and ``why_operators`` are why they are not."""
 
     config: Config
     places: Places
@@ -109,12 +109,12 @@ class RobotUnderTest:
 
     @property
     def way(self) -> Side:
-        """The side from which it is commanded: that of its operators, if it is reached."""
+        """Return the side from which it is commanded: that of its operators, if it is reached."""
         return self.operators or self.inside
 
     @property
     def inside(self) -> Side:
-        """Its own side, which the check needs."""
+        """Return its own side, which the check needs."""
         assert self.own is not None  # noqa: S101
         return self.own
 
@@ -123,20 +123,17 @@ class RobotUnderTest:
         return self.inside.view
 
     def read(self) -> None:
-        """Take what has arrived on both sides."""
         for side in self.sides:
             side.read()
 
     def wait(self, condition: Callable[[], object], seconds: float) -> bool:
-        """Read what arrives until ``condition``; False: not within ``seconds``."""
-        end = time.monotonic() + seconds
-        while True:
+        """Read what arrives on both sides until ``condition``; return False if it does not hold within ``seconds``."""
+
+        def holds() -> object:
             self.read()
-            if condition():
-                return True
-            if time.monotonic() >= end:
-                return False
-            time.sleep(_STEP_S)
+            return condition()
+
+        return self.sides[0].wait(holds, seconds)
 
 
 def user_of(folder: Path) -> pwd.struct_passwd | None:
@@ -175,8 +172,5 @@ def reached(
         if config.services.mqtt_bridge.enabled:
             robot.operators, robot.why_operators = connect(own=False)
         for side in robot.sides:
-            side.ask()
-        robot.wait(lambda: all(side.view.estop.has_capabilities for side in robot.sides), robot.patience_s)
-        for side in robot.sides:
-            side.ask()
+            side.ask(robot.patience_s)
         yield robot

@@ -1,7 +1,6 @@
 """Checks of the emergency stop and of retained commands. No wheel turns, and the robot is free afterwards."""
 
 import time
-from contextlib import suppress
 
 from pebble.checks.check import CheckResult, failed, ok, skipped
 from pebble.checks.running.robot import RobotUnderTest
@@ -10,8 +9,7 @@ from pebble.client.estop import StopSender, new_name
 from pebble.client.estop_states import Reset
 from pebble.contract import ESTOP_RESET, ESTOP_STATE, codec
 from pebble.contract.payloads import EstopReset
-from pebble.errors import PayloadError
-from pebble.transports import Message, QoS
+from pebble.transports import QoS
 
 _CONFIRMED_S = 5.0  # it is repeated every half second
 _WHY = "selftest"
@@ -50,7 +48,7 @@ def _stopped(robot: RobotUnderTest, name: str) -> CheckResult:
 
 
 def _ended(robot: RobotUnderTest, name: str, before: dict[str, list[str]]) -> str:
-    """End this stop; empty, or why the robot stays stopped."""
+    """End this stop; return why the robot stays stopped, or nothing."""
     view = robot.inside.view
     robot.wait(lambda: all(name in state.recent for state in view.estop.states.values()), 1.0)
     if not view.latched:
@@ -81,28 +79,27 @@ def retained_commands(robot: RobotUnderTest) -> CheckResult:
         return skipped("it publishes no emergency stop")
     if state.reset_refused is not None:
         return skipped("it refused a reset before, which looks the same", "run it again")
-    topic, answers = ESTOP_RESET.topic(robot.config.base), ESTOP_STATE.topic(robot.config.base, owner=owner)
+    topic, metric = ESTOP_RESET.topic(robot.config.base), ESTOP_STATE.suffix.format(owner=owner)
     old = codec.encode(ESTOP_RESET, EstopReset(boot=_NO_BOOT, count=0, by=_WHY))
     live = EstopReset(boot=state.boot, count=state.count + _NO_COUNT, by=_WHY)
-    seen = set[str | None]()
+    began = time.monotonic()
 
-    def note(message: Message, _at: float) -> None:
-        if message.topic == answers:
-            with suppress(PayloadError):
-                seen.add(codec.decode(ESTOP_STATE, message.payload).reset_refused)
+    def refused() -> set[str | None]:
+        states = [record for record in operators.of(ESTOP_STATE, began) if record.metric == metric]
+        return {record.value.reset_refused for record in states if record.value is not None}
 
     # It puts no name into the topic: nothing with one is retained.
-    with operators.heard_by(note), connected(operators.target) as (beside, _):
+    with connected(operators.target) as (beside, _):
         try:
             beside.publish(topic, old, qos=QoS.DELIVERED, retain=True, remember=False)
             robot.wait(lambda: beside.outgoing.waiting == 0, robot.patience_s)
             operators.send(ESTOP_RESET, live)
-            robot.wait(lambda: "count" in seen, robot.patience_s)
+            robot.wait(lambda: "count" in refused(), robot.patience_s)
         finally:
             beside.publish(topic, b"", qos=QoS.DELIVERED, retain=True, remember=False)
             robot.wait(lambda: beside.outgoing.waiting == 0, robot.patience_s)
-    if "boot" in seen:
+    if "boot" in refused():
         return failed("it read a retained command as if it were sent now", "pebble doctor CONFIG")
-    if "count" not in seen:
+    if "count" not in refused():
         return skipped("a live one of this account is not answered either")
     return ok("it ignores them")

@@ -3,11 +3,12 @@
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 
 import msgspec
 
-from pebble.checks.check import CheckResult, failed, ok, skipped
-from pebble.checks.conform.motion import moves_until
+from pebble.checks.check import CheckResult, State, failed, skipped
+from pebble.checks.conform.motion import LATE_S, rested
 from pebble.checks.running.robot import RobotUnderTest, Side
 from pebble.client.control import ControlClient
 from pebble.client.pace_of_link import WIDE
@@ -17,10 +18,11 @@ from pebble.transports import Message
 
 SPEED, DRIVES_S = 0.2, 0.3
 _STEP_S = 0.05
-_LOOKS_S = 0.5  # so much longer wheels are looked at
 _CONTROL_S = 3.0
-_SENSORS = "set services.serial_mcu_bridge.telemetry.publish_touch_sensors to true"
-_LOG = "pebble doctor CONFIG; journalctl -u pebble -n 50"
+_FIXES = {
+    State.FAILED: "battery, motors and their wires; pebble doctor CONFIG; journalctl -u pebble -n 50",
+    State.SKIPPED: "look whether it moved, or set services.serial_mcu_bridge.telemetry.publish_touch_sensors to true",
+}
 
 
 def wheels(robot: RobotUnderTest) -> CheckResult:
@@ -34,19 +36,12 @@ def wheels(robot: RobotUnderTest) -> CheckResult:
         results = []
         for speed in (SPEED, -SPEED):
             results.append(_drive(robot, side, control, speed))
-            if isinstance(results[-1], CheckResult):
+            if results[-1].state is State.FAILED:
                 break
-    problem = next((one for one in results if isinstance(one, CheckResult)), None)
-    if problem is not None:
-        return problem
-    rested = [one for one in results if isinstance(one, float)]
-    if not rested:
-        return skipped("it was driven, but reports no wheels: look whether it moved", _SENSORS)
-    return ok(f"they turned ahead and back, and rested {max(rested):.2f} s after the last command")
+    return next((result for result in results if result.state is not State.OK), results[-1])
 
 
-def _drive(robot: RobotUnderTest, side: Side, control: ControlClient, speed: float) -> CheckResult | float | None:
-    """Return how long after the last command they turned; None if nothing shows them."""
+def _drive(robot: RobotUnderTest, side: Side, control: ControlClient, speed: float) -> CheckResult:
     side.publish([_command(side, control, Drive())])  # after a reset it waits for one
     began = sent_at = time.monotonic()
     while time.monotonic() < began + DRIVES_S:
@@ -57,20 +52,14 @@ def _drive(robot: RobotUnderTest, side: Side, control: ControlClient, speed: flo
         sent_at = time.monotonic()
         side.publish([_command(side, control, Drive(z=speed, valid_ms=side.view.pace.valid_ms))])
         _hold(robot, side, control, max(_STEP_S, side.view.pace.step_s))
-    _hold(robot, side, control, robot.rests_s + _LOOKS_S)
-    until = moves_until(robot.inside, began)
-    if until is None:
-        return None
-    if until == 0.0:
-        return failed(f"they did not turn at {speed:+.1f}", f"battery, motors and their wires; {_LOG}")
-    if until - sent_at > robot.rests_s:
-        return failed(f"they still turned {until - sent_at:.2f} s after the last command", _LOG)
-    return max(0.0, until - sent_at)
+    _hold(robot, side, control, robot.rests_s + LATE_S)
+    result = rested(robot.inside, began, sent_at, robot.rests_s)
+    return replace(result, text=f"at {speed:+.1f}: {result.text}", fix=_FIXES.get(result.state, ""))
 
 
 @contextmanager
 def _in_control(robot: RobotUnderTest, side: Side) -> Iterator[tuple[ControlClient, str]]:
-    """Control for the block, or why there is none; the one who has it is asked for nothing."""
+    """Take control for the block, or tell why there is none; who has it is asked for nothing."""
     control = ControlClient(side.view.control, by=robot.by.partition("@")[0], device="selftest")
 
     def held() -> bool:
