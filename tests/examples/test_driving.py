@@ -46,8 +46,13 @@ class Scene(NamedTuple):
         return [record.value for record in self.seen.of(c.DRIVE, since) if record.value is not None]
 
     def wheels(self) -> list[float]:
-        status = self.seen.newest(c.STATUS)
-        return [] if status is None else status.value.get("wheels", [])
+        reports = [record.value.value for record in self.seen.of(c.STATUS, retained=True) if record.value is not None]
+        return reports[-1].get("wheels", []) if reports else []
+
+    def key(self) -> str:
+        """That of who has control; empty if nobody has."""
+        state = self.seen.view.control.state
+        return "" if state is None else state.key
 
     def drives(self) -> None:
         """Drive ahead; one that was kept from driving lets go first."""
@@ -95,7 +100,7 @@ def test_it_asks_for_control_and_drives_at_its_rate(scene: Scene) -> None:
     began = scene.seen.look(2.0)
     commands = scene.commands(began)
     assert SLOWEST_HZ <= len(commands) / 2.0 <= FASTEST_HZ
-    key = scene.seen.newest(c.CONTROL_STATE).key
+    key = scene.key()
     assert {command.key for command in commands} == {key}
     stamps = [command.t for command in commands]
     assert stamps == sorted(stamps)
@@ -130,7 +135,7 @@ def test_it_releases_control_at_its_end(scene: Scene) -> None:
     scene.drives()
     assert scene.operator.stdin is not None
     scene.operator.stdin.close()
-    assert scene.seen.wait(lambda: scene.seen.newest(c.CONTROL_STATE).key == "", SOON_S)
+    assert scene.seen.wait(lambda: scene.key() == "", SOON_S)
     assert scene.operator.wait(10) == 0
 
 
