@@ -26,6 +26,7 @@ from pebble.config.masking import masked
 from pebble.config.problems import Notes
 from pebble.config.raw import decode, plain, read_text
 from pebble.config.secret_text import without_secrets
+from pebble.contract import OUTGOING
 from pebble.errors import PebbleError
 from pebble.runtime.places import Places
 from pebble.version import __version__
@@ -127,7 +128,7 @@ def _status(here: Here) -> str:
         raise MissingError("the config cannot be read")
     user, file = user_of(here.config.run_dir()), str(here.file.absolute())
     who: dict[str, Any] = {} if user is None else {"user": user.pw_uid, "group": user.pw_gid, "extra_groups": []}
-    topics = f"{here.config.base}/outgoing/#"
+    topics = f"{here.config.base}/{OUTGOING}/#"
     echo = ("-m", "pebble.cli", "topic", "echo", topics, "--seconds", str(_STATES_S), "--config", file)
     return _printed(sys.executable, *echo, **who)
 
