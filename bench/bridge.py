@@ -35,7 +35,7 @@ _LOADED_S = 2.0  # at most, of driving each robot while media flow
 
 @dataclass(frozen=True, slots=True)
 class Settings:
-    """What is measured: ``seconds`` of driving for each robot and round, under each load, in turns of ``turn_s``."""
+    """The robots, and how they are driven: ``seconds`` in each round and under each load, in turns of ``turn_s``."""
 
     variants: Sequence[str] = (STAND_IN, *KINDS)
     with_media: bool = False

@@ -58,7 +58,7 @@ VARIANTS: Final = {
 
 @dataclass(frozen=True, slots=True)
 class Settings:
-    """What is measured: ``seconds`` of each condition in each of the ``passes`` of a round."""
+    """The variants and conditions: ``seconds`` of each condition in each of the ``passes`` of a round."""
 
     variants: Sequence[str] = tuple(VARIANTS)
     sizes: Sequence[int] = (40, 1024)  # bytes

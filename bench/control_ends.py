@@ -47,7 +47,7 @@ Handler = Callable[[bytes], None]
 
 
 class SliceSpec(msgspec.Struct, frozen=True):
-    """One slice: messages of this size at this rate."""
+    """A slice of a round: messages of this size at this rate."""
 
     size: int
     rate: float
@@ -55,7 +55,7 @@ class SliceSpec(msgspec.Struct, frozen=True):
 
 
 class Exchange(NamedTuple):
-    """When a message was sent, echoed, and received again: CLOCK_MONOTONIC, ns."""
+    """The times at which a message was sent, echoed, and received again: CLOCK_MONOTONIC, ns."""
 
     sent_ns: int
     echoed_ns: int
@@ -74,7 +74,7 @@ class Slice(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Connection(NamedTuple):
-    """What one end does with its connection."""
+    """A connection, as its end uses it: three functions."""
 
     subscribe: Callable[[str, Handler], object]  # to a topic
     publish: Callable[[str, bytes], object]

@@ -49,7 +49,7 @@ _ANSWER_S = 10.0
 
 @dataclass(frozen=True, slots=True)
 class Settings:
-    """What is measured, and for how long: ``seconds`` of each case in each round."""
+    """The cases, and how long each is measured: ``seconds`` of each case in each round."""
 
     variants: Sequence[str] = VARIANTS
     size: Sequence[str] = ("640x480", "1920x1080")

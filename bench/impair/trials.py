@@ -55,7 +55,7 @@ SUBJECTS: Final = tuple(f"{transport} {form}" for form in FORMS for transport in
 
 @dataclass(frozen=True, slots=True)
 class Settings:
-    """What is measured, and the seconds of each phase of a trial, see Plan.
+    """The variants and trials, and the seconds of each phase of a trial, see Plan.
 
     Without ``all_at_once`` only the transports of one form run at the same time, to limit the load on small machines.
     """
