@@ -50,7 +50,7 @@ class Scene(NamedTuple):
         return reports[-1].get("wheels", []) if reports else []
 
     def key(self) -> str:
-        """That of who has control; empty if nobody has."""
+        """Return the key of who has control; empty if nobody has."""
         state = self.seen.view.control.state
         return "" if state is None else state.key
 
