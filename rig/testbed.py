@@ -15,7 +15,7 @@ from urllib.parse import urlsplit
 import msgspec
 
 from pebble.client.discovery import ALL_OUTGOING, Discovery
-from pebble.client.page.packages import require_packages
+from pebble.client.page import require_packages
 from pebble.config.raw import deep_merge
 from pebble.contract.identity import Identity
 from pebble.errors import PebbleError
@@ -26,7 +26,7 @@ from pebble.simulation.mcu import Snapshot
 from pebble.simulation.world.program import Snapshot as WorldSnapshot
 from pebble.simulation.world.program import port_path, trace_path
 from pebble.transports import MqttSettings, create
-from pebble.web.program import Ready
+from pebble.web.run import Ready
 
 ROBOTS = ("goob", "fred", "minilamp", "benjr")
 CLIP = "horn.wav"  # that Goob plays
@@ -148,7 +148,7 @@ class PageServer(Program):
         require_packages()
         self.url = ""  # with a slash at the end; empty until it can be opened
         fields = {"broker": {"host": HOST, "port": broker_port}, "host": HOST, "server": "demo", **settings}
-        command = python("pebble.web.program", msgspec.json.encode(fields, enc_hook=str).decode())
+        command = python("pebble.web.run", msgspec.json.encode(fields, enc_hook=str).decode())
         super().__init__("the operator page", command, folder / "page.log", self._take)
 
     def wait(self, ending: threading.Event | None = None) -> None:

@@ -15,8 +15,7 @@ from pebble.checks.recorder import recorder
 from pebble.checks.users import user_name
 from pebble.checks.who import who_drives
 from pebble.client.connection import Target, connected
-from pebble.client.page.from_config import settings_of
-from pebble.client.page.packages import require_packages
+from pebble.client.page import require_packages, settings_of
 from pebble.config import Config
 from pebble.contract import STATUS
 from pebble.errors import PebbleError

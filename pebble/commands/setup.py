@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from pebble.client.page.packages import require_packages
+from pebble.client.page import require_packages
 from pebble.runtime.places import Places
 
 _Answers = Annotated[

@@ -12,8 +12,7 @@ from typing import Any
 
 from rich.console import Console
 
-from pebble.client.page.packages import require_packages
-from pebble.client.page.settings import DEFAULT_PORT
+from pebble.client.page import DEFAULT_PORT, require_packages
 from pebble.demo import invitation, phone
 from pebble.demo.brokers import BrokerKind, best_kind
 from pebble.demo.media import MediaViewer

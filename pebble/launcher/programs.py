@@ -136,7 +136,7 @@ def _web_handler(config: Config) -> Program:
     """The operator page; its module is above the launcher, which only starts it, and may miss what it imports."""
     arguments, environment = (str(config.path),), config.services.web_handler.env
     return Program(
-        "web_handler", "pebble.web.robot_service", arguments, Stage.CONNECTION, preloaded=False, environment=environment
+        "web_handler", "pebble.web.run", arguments, Stage.CONNECTION, preloaded=False, environment=environment
     )
 
 

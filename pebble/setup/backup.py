@@ -21,7 +21,7 @@ from pathlib import Path, PurePosixPath
 import msgspec
 from msgspec.structs import fields
 
-from pebble.client.page.from_config import people_of
+from pebble.client.page import people_of
 from pebble.config import Config, load
 from pebble.config.types import Section
 from pebble.errors import PebbleError

@@ -9,7 +9,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from pebble.client.page.from_config import people_of
+from pebble.client.page import people_of
 from pebble.config import Config, load
 from pebble.config.config import parse
 from pebble.contract.identity import Identity

@@ -21,7 +21,7 @@ from starlette.routing import Route, WebSocketRoute
 from starlette.types import Lifespan
 from starlette.websockets import WebSocket
 
-from pebble.client.page.settings import WebSettings
+from pebble.client.page import WebSettings
 from pebble.errors import PebbleError
 from pebble.fleet.audit import Audit
 from pebble.fleet.people import People

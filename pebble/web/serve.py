@@ -10,7 +10,7 @@ from pathlib import Path
 
 import uvicorn
 
-from pebble.client.page.settings import WebSettings
+from pebble.client.page import WebSettings
 from pebble.errors import PebbleError
 from pebble.fleet import certificates
 from pebble.transports.renewed import Renewed

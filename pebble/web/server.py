@@ -12,7 +12,7 @@ import msgspec
 
 from pebble.client.broker import Broker
 from pebble.client.estop import send
-from pebble.client.page.settings import WebSettings
+from pebble.client.page import WebSettings
 from pebble.client.robot_topics import FLEET, SYNONYMS
 from pebble.config.security import SecurityLevel
 from pebble.contract import AUDIT, CAPABILITIES, CONTROL_STATE, LINK, ONLINE, channel_of

@@ -7,11 +7,10 @@ from typing import Any
 
 import pytest
 
-from pebble.client.page.from_config import settings_of
-from pebble.client.page.settings import WebSettings
+from pebble.client.page import WebSettings, settings_of
 from pebble.config import load, parse
 from pebble.errors import ConfigError
-from pebble.web.ready_settings import settings_or_all_problems
+from pebble.web.run import settings_or_all_problems
 
 ROOT = Path(__file__).resolve().parents[2]
 REMOTE: dict[str, Any] = {

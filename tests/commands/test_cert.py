@@ -71,7 +71,7 @@ def test_cert_alone_prints_help(run: Run) -> None:
 
 
 def test_without_the_extra(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("pebble.client.page.packages.find_spec", lambda name: None)
+    monkeypatch.setattr("pebble.client.page.find_spec", lambda name: None)
     assert run("cert", "init", "lab-pc.local") == 1
     assert run.err.endswith("pip install 'pebble-robot[web]'\n")
     assert run.err.count("\n") == 1

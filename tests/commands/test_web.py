@@ -16,7 +16,7 @@ from typing import Any
 
 import pytest
 
-from pebble.client.page.settings import WebSettings
+from pebble.client.page import WebSettings
 from pebble.fleet.audit import Audit
 from pebble.fleet.people import People
 from pebble.fleet.roles import Role
@@ -223,7 +223,7 @@ def test_mistakes_are_one_line(run: Run, served: list[WebSettings], arguments: l
 
 
 def test_without_the_extra(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("pebble.client.page.packages.find_spec", lambda name: None)
+    monkeypatch.setattr("pebble.client.page.find_spec", lambda name: None)
     assert run("web", "--url", "mqtt://a") == 1
     assert run.err.endswith("pip install 'pebble-robot[web]'\n")
     assert run.err.count("\n") == 1

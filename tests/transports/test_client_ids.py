@@ -13,7 +13,7 @@ import pytest
 
 from pebble.checks.broker.login_attempt import attempt
 from pebble.client.connection import Target, resolve
-from pebble.client.page.from_config import settings_of
+from pebble.client.page import settings_of
 from pebble.config import Config, load
 from pebble.runtime.connections import local_transport, mirror_transport, remote_transport
 from pebble.transports import MqttSettings, State, create

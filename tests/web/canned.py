@@ -31,7 +31,7 @@ from starlette.responses import HTMLResponse, JSONResponse, Response
 from starlette.routing import Route, WebSocketRoute
 from starlette.websockets import WebSocket, WebSocketDisconnect, WebSocketState
 
-from pebble.client.page.settings import WebSettings
+from pebble.client.page import WebSettings
 from pebble.contract.packets import Codec, Picture, PictureKind, Sound
 from pebble.fleet.audit import Audit
 from pebble.media.speech import Speech

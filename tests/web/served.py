@@ -14,7 +14,7 @@ import uvicorn
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import ClientConnection, connect
 
-from pebble.client.page.settings import WebSettings
+from pebble.client.page import WebSettings
 from pebble.contract import ESTOP_STATE, ONLINE, codec
 from pebble.contract.names import without_name
 from pebble.contract.payloads import EstopState, Heartbeat

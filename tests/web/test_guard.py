@@ -10,7 +10,7 @@ from typing import Any
 import httpx
 import pytest
 
-from pebble.client.page.settings import WebSettings
+from pebble.client.page import WebSettings
 from pebble.fleet import certificates
 from pebble.transports import MqttSettings
 from pebble.web.access import guard as guard_module

@@ -21,7 +21,7 @@ from starlette.requests import Request
 from starlette.responses import JSONResponse
 from starlette.routing import Route
 
-from pebble.client.page.settings import WebSettings
+from pebble.client.page import WebSettings
 from pebble.fleet.audit import MAX_REFUSED, Audit
 from pebble.fleet.audit_rows import GROUPS, WINDOW_S
 from pebble.fleet.people import SESSION_S, People

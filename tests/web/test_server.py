@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from pebble.client.page.settings import WebSettings
+from pebble.client.page import WebSettings
 from pebble.fleet.audit import Audit
 from pebble.fleet.people import People
 from pebble.transports import Message, MqttSettings

@@ -7,7 +7,7 @@ import time
 import pytest
 
 from pebble.client.estop import GIVE_UP_S, StopSender, new_name
-from pebble.client.page.settings import WebSettings
+from pebble.client.page import WebSettings
 from pebble.contract import CAPABILITIES, ESTOP, ONLINE, codec
 from pebble.contract.payloads import Capabilities, Heartbeat
 from pebble.fleet.audit import Audit

@@ -14,7 +14,7 @@ from urllib.request import HTTPSHandler, ProxyHandler, build_opener
 from pebble.checks import machine as this_machine
 from pebble.checks.check import SOON_DAYS, CheckResult, State, failed, ok, skipped
 from pebble.checks.running.robot import RobotUnderTest
-from pebble.client.page.from_config import settings_of
+from pebble.client.page import settings_of
 from pebble.errors import PebbleError
 from pebble.fleet import certificates
 

@@ -10,7 +10,7 @@ from typing import Annotated, Any, Literal
 import typer
 from msgspec.structs import replace
 
-from pebble.client.page.packages import require_packages
+from pebble.client.page import require_packages
 from pebble.commands.fleet import lan
 from pebble.commands.options import host_of, split_names
 from pebble.errors import PebbleError

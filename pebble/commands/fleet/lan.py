@@ -16,7 +16,7 @@ from typing import Annotated, Any
 
 import typer
 
-from pebble.client.page.packages import require_packages
+from pebble.client.page import require_packages
 from pebble.commands.options import host_of
 from pebble.errors import PebbleError
 from pebble.fleet import applying, certificates, folder, pieces

@@ -14,7 +14,7 @@ import typer
 from typer.core import TyperCommand, TyperGroup
 
 from pebble.client.connection import password as broker_password
-from pebble.client.page.packages import require_packages
+from pebble.client.page import require_packages
 from pebble.client.url import settings_of as settings_of_url
 from pebble.commands.options import CaCert, PasswordFile, host_of
 from pebble.commands.web.people import PEOPLE, TLS, PeopleOption, default_folder, opened, register_people
@@ -28,7 +28,7 @@ from pebble.runtime.connections import REMOTE_RECONNECT_S
 from pebble.transports import MqttSettings
 
 if TYPE_CHECKING:
-    from pebble.client.page.settings import WebSettings
+    from pebble.client.page import WebSettings
 
 Host = Annotated[
     str | None,
@@ -134,7 +134,7 @@ def _broker(url: str, password_file: Path | None, ca_cert: Path | None) -> MqttS
 
 
 def _of_url(broker: MqttSettings, options: dict[str, Any], folder: Path | None) -> WebSettings:
-    from pebble.client.page.settings import WebSettings
+    from pebble.client.page import WebSettings
 
     given = {key: value for key, value in options.items() if value is not None}
     settings = WebSettings(**{"broker": broker, "people": default_folder() / PEOPLE, **given})
@@ -148,7 +148,7 @@ def _of_url(broker: MqttSettings, options: dict[str, Any], folder: Path | None) 
 
 def _of_config(file: Path, options: dict[str, Any], folder: Path | None) -> tuple[WebSettings, bool]:
     """The settings, and whether the config allows plain http."""
-    from pebble.web.ready_settings import settings_or_all_problems
+    from pebble.web.run import settings_or_all_problems
 
     config = load(file)
     web = config.web_interface

@@ -11,7 +11,7 @@ from starlette.datastructures import Headers, MutableHeaders
 from starlette.responses import PlainTextResponse
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from pebble.client.page.settings import WebSettings
+from pebble.client.page import WebSettings
 from pebble.fleet import certificates
 
 MAX_BODY = 16 * 1024

@@ -14,7 +14,7 @@ from starlette.requests import HTTPConnection, Request
 from starlette.responses import JSONResponse, Response
 from starlette.routing import Route
 
-from pebble.client.page.settings import WebSettings
+from pebble.client.page import WebSettings
 from pebble.fleet.database import DatabaseError
 from pebble.fleet.people import SESSION_S, TooManyTriesError, User
 from pebble.fleet.roles import LOCAL, Session

@@ -9,7 +9,7 @@ import socket
 from collections.abc import Container
 from typing import Any, Final
 
-from pebble.client.page.settings import WebSettings
+from pebble.client.page import WebSettings
 from pebble.contract import STATUS, codec
 from pebble.errors import PayloadError
 from pebble.web.access.guard import canonical, host_names, is_loopback

@@ -13,7 +13,7 @@ from unittest.mock import patch
 from starlette.websockets import WebSocketDisconnect, WebSocketState
 
 from pebble.client import broker
-from pebble.client.page.settings import WebSettings
+from pebble.client.page import WebSettings
 from pebble.contract import DRIVE, codec
 from pebble.fleet.roles import Role, Session
 from pebble.transports import MqttSettings

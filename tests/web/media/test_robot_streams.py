@@ -12,7 +12,7 @@ import httpx
 import msgspec
 import pytest
 
-from pebble.client.page.settings import WebSettings
+from pebble.client.page import WebSettings
 from pebble.transports import MqttSettings
 from pebble.web.access.guard import CONTENT_SECURITY_POLICY
 from pebble.web.media.robot_streams import MAX_ORIGINS, OwnHosts, origin

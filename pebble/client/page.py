@@ -1,20 +1,61 @@
-"""The settings of an operator page from a robot's config, for ``pebble web CONFIG`` and for the robot's own service."""
+"""The settings of an operator page, and those of a robot's config; ``pebble.web`` serves it."""
 
+from __future__ import annotations
+
+import socket
+from dataclasses import dataclass
+from importlib.util import find_spec
 from pathlib import Path
 
-from pebble.client.page.settings import WebSettings
 from pebble.config import Config, Mqtt
+from pebble.config.security import SecurityLevel
 from pebble.config.web import WebInterface
-from pebble.errors import ConfigError
+from pebble.errors import ConfigError, PebbleError
 from pebble.runtime.connections import REMOTE_RECONNECT_S, mqtt_settings
+from pebble.transports import MqttSettings
 
+DEFAULT_PORT = 8080
 PEOPLE = "people.sqlite"  # in the state directory
+_PACKAGES = ("cryptography", "starlette", "uvicorn", "websockets")  # an extra, which few machines need
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class WebSettings:
+    """``certificate`` and ``key`` None: plain http. ``login`` False: everybody is admin; only on loopback."""
+
+    broker: MqttSettings
+    host: str = "127.0.0.1"
+    port: int = DEFAULT_PORT  # 0: a free one
+    names: tuple[str, ...] = ()  # further host names by which browsers may address it
+    server: str = ""  # its name; "": this machine's
+    login: bool = False
+    level: SecurityLevel = "open"  # of its robots
+    people: Path | None = None  # the database of users, sessions and settings; None: in memory
+    certificate: Path | None = None
+    key: Path | None = None
+    recordings: Path | None = None  # the folder of a recorder, to look at; None: none
+    authority: Path | None = None  # offered for download, so that phones can trust it
+    plain_http_drive: bool = True  # False: over plain http from another machine nothing drives
+
+    @property
+    def name(self) -> str:
+        """What it is called on pages and for other servers."""
+        return self.server or socket.gethostname().partition(".")[0] or "server"
+
+
+def require_packages(what: str = "the operator page") -> None:
+    """Raise PebbleError with the command that installs them, unless they are here."""
+    missing = [name for name in _PACKAGES if find_spec(name) is None]
+    if missing:
+        raise PebbleError(
+            f"{what} needs packages that are not installed ({', '.join(missing)}): pip install 'pebble-robot[web]'"
+        )
 
 
 def settings_of(config: Config) -> WebSettings:
     """How ``config`` sets up the operator page. Raises ConfigError with the key and what to do.
 
-    Whether there is a user, where ``login`` is true, is seen only in a database: ``pebble.web.ready_settings``.
+    Whether there is a user, where ``login`` is true, is seen only in a database: ``pebble.web.run``.
     """
     web = config.web_interface
     if not web.local and web.tls.certificate is None and not web.plain_http:

@@ -14,8 +14,8 @@ from typing import Any
 
 import pytest
 
-from pebble.client.page import packages as extra
-from pebble.web import robot_service
+from pebble.client import page as settings_module
+from pebble.web import run
 from tests.support import ROOT, Broker, Child, free_port, until
 
 
@@ -32,13 +32,13 @@ def written(folder: Path, web: dict[str, Any], **services: Any) -> Path:
 
 
 def test_a_page_that_cannot_start_ends_with_one_line(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    assert robot_service.main([str(written(tmp_path, {}))]) == 1
+    assert run.main([str(written(tmp_path, {}))]) == 1
     assert [record.message.partition(":")[0] for record in caplog.records] == ["web_interface.mqtt.host"]
 
 
 def test_a_login_needs_a_user(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     config = written(tmp_path, {"host": "0.0.0.0", "plain_http": True, "mqtt": {"host": "127.0.0.1"}})
-    assert robot_service.main([str(config)]) == 1
+    assert run.main([str(config)]) == 1
     (line,) = [record.message for record in caplog.records]
     assert line.startswith(
         f"web_interface.people: {tmp_path}/state/people.sqlite has no user: run `pebble web user add"
@@ -46,7 +46,7 @@ def test_a_login_needs_a_user(tmp_path: Path, caplog: pytest.LogCaptureFixture) 
 
 
 def test_everything_that_is_missing_is_named_at_once(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    assert robot_service.main([str(written(tmp_path, {"host": "0.0.0.0", "mqtt": {"host": "127.0.0.1"}}))]) == 1
+    assert run.main([str(written(tmp_path, {"host": "0.0.0.0", "mqtt": {"host": "127.0.0.1"}}))]) == 1
     keys = [record.message.partition(":")[0] for record in caplog.records]
     assert keys == ["web_interface.host", "web_interface.people"]
 
@@ -54,13 +54,13 @@ def test_everything_that_is_missing_is_named_at_once(tmp_path: Path, caplog: pyt
 def test_missing_packages_are_named_with_the_command_that_installs_them(
     tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(extra, "find_spec", lambda name: None if name == "uvicorn" else object())
-    assert robot_service.main([str(written(tmp_path, {"mqtt": {"host": "127.0.0.1"}}))]) == 1
+    monkeypatch.setattr(settings_module, "find_spec", lambda name: None if name == "uvicorn" else object())
+    assert run.main([str(written(tmp_path, {"mqtt": {"host": "127.0.0.1"}}))]) == 1
     assert "(uvicorn): pip install 'pebble-robot[web]'" in caplog.text
 
 
 def test_the_command_line_is_one_config(capsys: pytest.CaptureFixture[str]) -> None:
-    assert robot_service.main([]) == 2
+    assert run.main([]) == 2
     assert "usage" in capsys.readouterr().err
 
 
@@ -69,7 +69,7 @@ def test_it_reports_that_it_is_ready_and_alive_and_ends_by_a_signal(tmp_path: Pa
     config = written(tmp_path, {"port": port, "mqtt": {"host": "127.0.0.1", "port": broker.port}})
     reader, writer = os.pipe()
     page = Child(
-        [sys.executable, "-m", "pebble.web.robot_service", str(config)],
+        [sys.executable, "-m", "pebble.web.run", str(config)],
         cwd=ROOT,
         env=os.environ | {"PEBBLE_NOTIFY_FD": str(writer)},
         pass_fds=[writer],

@@ -1,1 +1,0 @@
-"""What the page of one robot is set to, and what of it this machine can serve."""
