@@ -25,7 +25,7 @@ class RobotRecorder(Service):
 
     def start(self) -> None:
         section = self.config.services.recorder
-        options = Options(**{name: getattr(section, name) for name in Options.__struct_fields__})
+        options = Options(keep_bytes=section.keep_bytes, keep_media_days=section.keep_media_days, media=section.media)
         folder = section.place
         os.nice(_NICE)
         self._recorder = Recorder(folder, options, {"recorder": self.config.base})

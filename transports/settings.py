@@ -12,7 +12,6 @@ class TlsSettings:
     client_cert: Path | None = None
     client_key: Path | None = None
     insecure: bool = False  # True: do not check the host name
-    ciphers: str | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

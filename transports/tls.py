@@ -20,12 +20,10 @@ def make_context(tls: TlsSettings) -> ssl.SSLContext:
     if tls.client_key is not None and tls.client_cert is None:
         raise TransportError("tls.client_key is set without tls.client_cert")
     context = _try(f"tls.ca_cert: {tls.ca_cert}", lambda: ssl.create_default_context(cafile=tls.ca_cert))
-    context.minimum_version = ssl.TLSVersion.TLSv1_2  # whatever the ciphers allow
+    context.minimum_version = ssl.TLSVersion.TLSv1_2
     context.check_hostname = not tls.insecure
     if (cert := tls.client_cert) is not None:
         _try(f"tls.client_cert: {cert}", lambda: context.load_cert_chain(cert, tls.client_key, _no_password))
-    if (ciphers := tls.ciphers) is not None:
-        _try(f"tls.ciphers: {ciphers}", lambda: context.set_ciphers(ciphers))
     return context
 
 

@@ -15,6 +15,7 @@ from pebble.errors import PebbleError
 from pebble.recordings import catalogue
 from pebble.recordings.recorder.folder import Entry, Folder
 from pebble.recordings.recorder.metrics import STATUS
+from pebble.recordings.recorder.settings import Options
 
 _ROOM: Final = "recorder's room"
 _SILENT_S: Final = 30.0  # it writes its numbers every ten seconds
@@ -40,7 +41,7 @@ def recorder(config: Config, now: float | None = None) -> Iterator[CheckResult]:
         entries = Folder(folder).entries()
         yield _running(folder, now, entries)
         yield from _missed(entries, now)
-        yield _room(folder, entries, section.keep_bytes, section.free_bytes)
+        yield _room(folder, entries, section.keep_bytes, Options().free_bytes)
     except (PebbleError, OSError) as error:
         yield failed(f"{folder} cannot be read: {error}")
 

@@ -107,7 +107,7 @@ def _fitness(script: Script) -> str:
 
 
 def _check_certificates(config: Config) -> None:
-    """Raise ConfigError for files and ciphers of TLS that a connection would refuse."""
+    """Raise ConfigError for files of TLS that a connection would refuse."""
     bridge, transport = config.services.mqtt_bridge, config.transport
     sections = {
         "local_mqtt": config.local_mqtt.tls,
@@ -241,7 +241,7 @@ def _lines(config: Config, service: str) -> list[TopicLine]:
 
 def _is_of(channel: Channel, service: str) -> bool:
     """Does the channel belong to the service? The config path that renames it begins with the service's name."""
-    path = "" if channel.override is None else channel.override.topic
+    path = channel.override or ""
     if service in _MEDIA:
         return path == f"services.mqtt_bridge.media.{_MEDIA[service]}.topic"
     return path.startswith(f"services.{service}.") and ".media." not in path

@@ -38,7 +38,6 @@ def contract(
 
 
 def _plain(channel: Channel, prefix: str) -> dict[str, Any]:
-    override = channel.override
     return {
         "topic": prefix + channel.suffix,
         "direction": channel.direction,
@@ -51,7 +50,7 @@ def _plain(channel: Channel, prefix: str) -> dict[str, Any]:
         "rate_hz": channel.rate_hz,
         "travels": travels(channel),
         "authority": authority(channel),
-        "renamed_at": None if override is None else override.topic,
+        "renamed_at": channel.override,
         "synonym_of": channel.synonym_of,
     }
 

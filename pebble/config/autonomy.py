@@ -1,8 +1,18 @@
 """The config section of autonomy: which scripts a robot offers, and how they run."""
 
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
-from pebble.config.types import EMPTY, File, HandlerTopics, Interval, Seconds, Section, ServiceSection, Variables, doc
+from pebble.config.types import (
+    EMPTY,
+    ONE_VALUE,
+    File,
+    HandlerTopics,
+    Seconds,
+    Section,
+    ServiceSection,
+    Variables,
+    doc,
+)
 
 
 class ScriptArgument(Section, frozen=True, kw_only=True):
@@ -49,10 +59,11 @@ class Script(Section, frozen=True, kw_only=True):
 class AutonomyManager(ServiceSection, frozen=True, kw_only=True):
     """Runs one autonomy script at a time."""
 
+    retired: ClassVar = {"scan_interval_seconds": ONE_VALUE}
+
     autonomy_root: Annotated[
         str, doc("Folder of scripts. Relative: seen from the config's folder, and Pebble's own are offered, too.")
     ] = "autonomy"
-    scan_interval_seconds: Annotated[Interval, doc("Seconds between scans of the folder.")] = 5.0
     stop_timeout_seconds: Annotated[Seconds, doc("How long a script may take to stop before it is killed.")] = 8.0
     on_override: Annotated[
         Literal["resume", "stop"],

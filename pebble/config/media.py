@@ -6,7 +6,9 @@ from typing import Annotated, Any, ClassVar, Literal
 from msgspec import Meta, field
 
 from pebble.config.types import (
+    BY_CONTRACT,
     EMPTY,
+    ONE_VALUE,
     AudioChannels,
     BitsPerSecond,
     Command,
@@ -15,10 +17,8 @@ from pebble.config.types import (
     FramesPerSecond,
     HandlerTopics,
     Pixels,
-    Qos,
     Rotation,
     SampleRate,
-    Seconds,
     Section,
     ServiceSection,
     Topic,
@@ -37,7 +37,7 @@ _INPUT = {"input_shm": _FRAMES, "input_retry_seconds": _FRAMES}
 class CameraCapture(Section, frozen=True, kw_only=True):
     """The camera."""
 
-    retired: ClassVar = _SHMSINK
+    retired: ClassVar = {**_SHMSINK, "io_mode": "OpenCV chooses by itself"}
 
     enabled: Annotated[bool, doc("Open the camera.")] = True
     backend: Annotated[
@@ -48,7 +48,6 @@ class CameraCapture(Section, frozen=True, kw_only=True):
         str, doc("Device of a v4l2 camera, or a file or URL; of a synthetic one, `world.json#goob`: a simulated robot.")
     ] = "/dev/video0"
     capture_format: Annotated[str, doc("`auto`, `raw`, `mjpeg`, or a pixel format such as `yuyv`.")] = "auto"
-    io_mode: Annotated[str | int, doc("Not used: OpenCV chooses by itself.")] = "auto"
     camera_name: Annotated[str | None, doc("Which libcamera camera; unset: the first.")] = None
     camera_controls: Annotated[dict[str, Any], doc("Settings passed to the camera unchanged.")] = field(
         default_factory=dict
@@ -82,9 +81,8 @@ class Microphone(Section, frozen=True, kw_only=True):
 class AvDaemon(ServiceSection, frozen=True, kw_only=True):
     """Owns the camera and the microphone."""
 
-    restart_delay_seconds: Annotated[Seconds, doc("Wait before a failed device is opened again.")] = 2.0
-    stop_timeout_seconds: Annotated[Seconds, doc("How long a device may take to close.")] = 5.0
-    cwd: Annotated[File | None, doc("Folder to run in.")] = None
+    retired: ClassVar = dict.fromkeys(("restart_delay_seconds", "stop_timeout_seconds", "cwd"), ONE_VALUE)
+
     env: Annotated[Variables, doc("Environment variables to add.")] = EMPTY
     video: Annotated[CameraCapture, doc("Camera.")] = CameraCapture()
     audio: Annotated[Microphone, doc("Microphone.")] = Microphone()
@@ -113,10 +111,9 @@ class VideoStream(ServiceSection, frozen=True, kw_only=True):
 class VideoPublisher(Section, frozen=True, kw_only=True):
     """Pictures for operators."""
 
-    retired: ClassVar = {**_INPUT, "source_*": _SOURCE}
+    retired: ClassVar = {**_INPUT, "source_*": _SOURCE, "reconnect_seconds": ONE_VALUE, "profile": "nothing reads it"}
 
     encoding: Annotated[VideoEncoding, doc("How pictures are sent unless a request names another encoding.")] = "json"
-    profile: Annotated[str, doc("Name of this set of values.")] = "default"
     topic: Annotated[Topic | None, doc("Instead of `{base}/outgoing/front-camera`.")] = None
     overlays_topic: Annotated[Topic | None, doc("Instead of `{base}/outgoing/video-overlays`.")] = None
     width: Annotated[Pixels | None, doc("Pixels, where publish_width is not set; unset: as captured.")] = None
@@ -130,13 +127,12 @@ class VideoPublisher(Section, frozen=True, kw_only=True):
     jpeg_quality: Annotated[int, Meta(ge=1, le=100, description="1 is worst and smallest.")] = 10
     bitrate: Annotated[BitsPerSecond | None, doc("Of h264, at most; unset: quality as jpeg_quality.")] = None
     rotate_degrees: Annotated[Rotation, doc("Clockwise, in addition to the camera's section.")] = 0
-    reconnect_seconds: Annotated[Seconds, doc("Wait between attempts to reach the broker.")] = 10.0
 
 
 class AudioPublisher(Section, frozen=True, kw_only=True):
     """Sound for operators."""
 
-    retired: ClassVar = _INPUT
+    retired: ClassVar = {**_INPUT, "qos": BY_CONTRACT["qos"]}
 
     encoding: Annotated[SoundEncoding, doc("How sound is sent unless a request names another encoding.")] = "pcm"
     topic: Annotated[Topic | None, doc("Instead of `{base}/outgoing/audio`.")] = None
@@ -148,11 +144,12 @@ class AudioPublisher(Section, frozen=True, kw_only=True):
     ] = 20
     bitrate: Annotated[int, Meta(ge=6_000, le=256_000, description="Of opus, bits per second.")] = 24_000
     bundle: Annotated[int, Meta(ge=1, le=3, description="How many parts a packet of opus has.")] = 2
-    qos: Annotated[Qos | None, doc("Instead of the contract's QoS.")] = None
 
 
 class AudioReceiver(Section, frozen=True, kw_only=True):
     """Sound from operators."""
+
+    retired: ClassVar = {"qos": BY_CONTRACT["qos"], **dict.fromkeys(("queue_limit", "concealment_ms"), ONE_VALUE)}
 
     topic: Annotated[Topic | None, doc("Instead of `{base}/incoming/audio-stream`.")] = None
     device: Annotated[str, doc("ALSA device to play on.")] = "default"
@@ -164,9 +161,6 @@ class AudioReceiver(Section, frozen=True, kw_only=True):
     latency_ms: Annotated[
         int, Meta(ge=0, le=1000, description="Sound buffered against uneven arrival; increased when necessary.")
     ] = 60
-    queue_limit: Annotated[Count, doc("Packets that wait to be played; beyond it the oldest is dropped.")] = 48
-    concealment_ms: Annotated[int, Meta(ge=0, le=10_000, description="Longest gap filled with the last packet.")] = 100
-    qos: Annotated[Qos | None, doc("Instead of the contract's QoS.")] = None
 
 
 class Media(Section, frozen=True, kw_only=True):
@@ -180,12 +174,12 @@ class Media(Section, frozen=True, kw_only=True):
 class Playback(Section, frozen=True, kw_only=True):
     """Where sounds are and what plays them; decoded ones are played by the audio receiver's command."""
 
+    retired: ClassVar = dict.fromkeys(("stop_timeout", "scan_interval"), ONE_VALUE)
+
     directory: Annotated[File | None, doc("Folder of the sounds; unset: `~/sounds`.")] = None
     player_command: Annotated[Command, doc("Plays wav files; `{file}` stands for the sound, else it comes last.")] = (
         "aplay",
     )
-    stop_timeout: Annotated[Seconds, doc("How long the player may take to stop before it is killed.")] = 5.0
-    scan_interval: Annotated[float, Meta(ge=1, le=86_400, description="Seconds between scans of the folder.")] = 10.0
     cwd: Annotated[File | None, doc("Folder to run the player in.")] = None
     env: Annotated[Variables, doc("Environment variables to add.")] = EMPTY
     volume: Annotated[float, Meta(ge=0, le=1, description="1: as recorded; less: wav files are decoded, too.")] = 1.0

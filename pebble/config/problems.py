@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 from pebble.config.secret_text import without_secrets
 
 Path = tuple[str | int, ...]
+_FEW_REASONS = 2  # why keys are no longer used, that are told; a file of the original has a dozen
 
 
 class Note(NamedTuple):
@@ -43,13 +44,18 @@ class Notes:
             notes[:] = [note for note in notes if holds(own, note.path) or not holds(merged, note.path)]
 
     def warning_lines(self) -> tuple[str, ...]:
-        """One line per warning; keys that are replaced by the same thing share a line."""
-        return (*_grouped(self.retired), *map(str, self.warnings))
+        """One line per warning; the keys that are no longer used share one."""
+        return (*_unused(self.retired), *map(str, self.warnings))
 
 
-def _grouped(retired: list[Note]) -> Iterator[str]:
-    """Example: ``video.{socket_path, shm_size}: no longer used, …``."""
-    for text in dict.fromkeys(note.text for note in retired):
+def _unused(retired: list[Note]) -> Iterator[str]:
+    """Example: ``video.{shm_size, io_mode}: no longer used, …``; of many keys only the ends of their paths."""
+    reasons = dict.fromkeys(note.text for note in retired)
+    if len(reasons) > _FEW_REASONS:
+        names = ", ".join(dict.fromkeys(show_path(note.path[-2:]) for note in retired))
+        yield without_secrets(f"no longer used, delete them: {names}; docs/configuration.md says what replaces each")
+        return
+    for text in reasons:
         groups: dict[Path, list[str]] = {}
         for note in retired:
             if note.text == text:

@@ -12,8 +12,7 @@ from pebble.config.visible import hidden, without_hidden
 from pebble.errors import ConfigError
 
 _SERVICES = tuple(name for name in Services.__struct_fields__ if isinstance(getattr(Services(), name), ServiceSection))
-_INTERVAL = "retained_publish_interval_seconds"
-_WORDS = ("command", "player_command", "env", "publisher_env", "receiver_env", "robots", "robot_discovery")
+_WORDS = ("command", "player_command", "env", "robots", "robot_discovery")
 _DEEPEST = 50  # levels: far more than any section has, and few enough for whatever reads it later
 
 
@@ -97,7 +96,7 @@ def _is_words(path: problems.Path) -> bool:
 
 
 def inherit(raw: Any) -> Any:
-    """``raw`` with the root's log level and the common republish interval in every service, and merged instances."""
+    """``raw`` with the root's log level in every service, and merged instances."""
     return _with_instances(deep_merge(_shared(raw), raw))
 
 
@@ -113,9 +112,7 @@ def deep_merge(under: Any, over: Any) -> Any:
 
 def _shared(raw: Any) -> dict[str, Any]:
     level = _at(raw, "log_level")
-    interval = _at(raw, "services", "defaults", _INTERVAL)
-    services = {name: {"log_level": level, _INTERVAL: interval} for name in _SERVICES}
-    services["launcher"]["capabilities"] = {"publish_interval_seconds": interval}
+    services = {name: {"log_level": level} for name in _SERVICES}
     return {"services": services, "web_interface": {"log_level": level}}
 
 

@@ -61,7 +61,7 @@ class Reader:
         return section
 
     def _note_key(self, kind: type[Section], known: Mapping[str, Any], key: str, path: problems.Path) -> None:
-        for name, replacement in kind.retired.items():
+        for name, replacement in kind.all_retired().items():
             if key == name or (name.endswith("*") and key.startswith(name[:-1])):
                 self.notes.retired.append(problems.Note(path, replacement))
                 return

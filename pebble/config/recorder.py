@@ -6,7 +6,7 @@ from typing import Annotated, ClassVar
 from msgspec import Meta
 
 from pebble.config.home import in_home
-from pebble.config.types import File, Interval, Seconds, ServiceSection, doc
+from pebble.config.types import ONE_VALUE, File, Seconds, ServiceSection, doc
 
 Bytes = Annotated[int, Meta(ge=0, le=1 << 50)]
 
@@ -18,17 +18,15 @@ class Recorder(ServiceSection, frozen=True, kw_only=True):
     """
 
     retired: ClassVar = {
-        **dict.fromkeys(("rotate_bytes", "sync_seconds", "level"), "one value serves all robots: docs/recordings.md"),
+        **dict.fromkeys(("rotate_seconds", "rotate_bytes", "free_bytes", "sync_seconds", "level"), ONE_VALUE),
         "keep_state_days": "`keep_bytes` deletes the oldest, and `keep_media_days` pictures and sound",
     }
 
     folder: Annotated[File | None, doc("Folder of the recordings; unset: `~/recordings`.")] = None
     remote: Annotated[bool, doc("Record the remote broker's side as well, where pictures and sound are.")] = False
     media: Annotated[bool, doc("Record pictures and sound.")] = True
-    rotate_seconds: Annotated[Interval, doc("How long one file is written.")] = 3600.0
     keep_bytes: Annotated[Bytes, doc("Size of all; the oldest are deleted beyond it. 0: no limit.")] = 2 << 30
     keep_media_days: Annotated[Seconds, doc("Days after which pictures and sound are deleted. 0: never.")] = 0.0
-    free_bytes: Annotated[Bytes, doc("What stays free on the disk.")] = 1 << 30
 
     @property
     def place(self) -> Path:

@@ -39,7 +39,7 @@ def schema_text() -> str:
 
 
 def _complete(definition: dict[str, Any], kind: type[Section]) -> None:
-    """Allow comments and keys of the original; a section's default consists of the defaults of its keys."""
+    """Allow comments and retired keys; a section's default consists of the defaults of its keys."""
     properties = definition["properties"]
     for value in properties.values():
         if "$ref" in value or value.get("default", 0) is None:
@@ -47,12 +47,9 @@ def _complete(definition: dict[str, Any], kind: type[Section]) -> None:
         if value.get("items") == {"type": "string"}:
             value["type"] = ["array", "string"]  # words, or one line of them
     patterns: dict[str, Any] = {"^//": {"description": "A comment."}}
-    for key, replacement in kind.retired.items():
-        deprecated = {"deprecated": True, "description": f"No longer used: {replacement}."}
-        if key.endswith("*"):
-            patterns[f"^{key[:-1]}"] = deprecated
-        else:
-            properties[key] = properties.get(key, {}) | deprecated
+    for key, replacement in kind.all_retired().items():
+        pattern = f"^{key[:-1]}" if key.endswith("*") else f"^{key}$"
+        patterns[pattern] = {"deprecated": True, "description": f"No longer used: {replacement}."}
     definition["patternProperties"] = patterns
 
 
@@ -85,8 +82,8 @@ def _chapters(kind: type[Section], path: str, places: dict[type[Section], str]) 
             inner.append((section, place))
     yield f"### {f'`{path}`' if path else 'The whole file'}\n\n"
     yield f"{kind.__doc__}\n\n| key | default | meaning |\n|---|---|---|\n{''.join(rows)}\n"
-    for text in dict.fromkeys(kind.retired.values()):
-        keys = ", ".join(f"`{key}`" for key, replacement in kind.retired.items() if replacement == text)
+    for text in dict.fromkeys(kind.all_retired().values()):
+        keys = ", ".join(f"`{key}`" for key, replacement in kind.all_retired().items() if replacement == text)
         yield f"No longer used: {keys}; {text}.\n\n"
     for section, place in inner:
         yield from _chapters(section, place, places)

@@ -1,6 +1,6 @@
 """The config sections of connections: brokers, Zenoh endpoints, encryption."""
 
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 from msgspec import Meta, field
 
@@ -24,12 +24,13 @@ from pebble.config.types import (
 class Tls(Section, frozen=True, kw_only=True):
     """Encryption of one connection."""
 
+    retired: ClassVar = {"ciphers": "OpenSSL's own are used, of TLS 1.2 or newer"}
+
     enabled: Annotated[bool, doc("Encrypt the connection; otherwise the other keys have no effect.")] = False
     ca_cert: Annotated[File | None, doc("Authority to trust; unset: those of the system.")] = None
     client_cert: Annotated[File | None, doc("Certificate to show; needs client_key.")] = None
     client_key: Annotated[File | None, doc("Private key of client_cert.")] = None
     insecure: Annotated[bool, doc("Do not check that the certificate names the host.")] = False
-    ciphers: Annotated[str | None, doc("OpenSSL cipher list, of TLS 1.2 or newer; unset: OpenSSL's own.")] = None
 
 
 class Mqtt(Section, frozen=True, kw_only=True):

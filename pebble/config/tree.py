@@ -1,18 +1,19 @@
 """The sections of a robot's config file: every key with its default, its limits and its meaning."""
 
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 from msgspec import Meta, field
 
 from pebble.config.autonomy import AutonomyManager
 from pebble.config.media import AvDaemon, Media, SoundboardHandler, VideoStream
 from pebble.config.neighbours import Neighbours
-from pebble.config.planned import Ros1Bridge
 from pebble.config.recorder import Recorder
 from pebble.config.security import Security
 from pebble.config.transport import Mqtt, RemoteConnection, RemoteMqtt, TransportSection
 from pebble.config.types import (
+    BY_CONTRACT,
     EMPTY,
+    ONE_VALUE,
     Cells,
     Command,
     Device,
@@ -21,7 +22,6 @@ from pebble.config.types import (
     Label,
     Level,
     LogLevel,
-    Qos,
     Seconds,
     Section,
     Sentence,
@@ -65,26 +65,19 @@ class Defaults(Section, frozen=True, kw_only=True):
 class CapabilitiesSection(Section, frozen=True, kw_only=True):
     """The message that lists what the robot can do."""
 
+    retired: ClassVar = {"publish_interval_seconds": "services.defaults has one for all", **BY_CONTRACT}
+
     enabled: Annotated[bool, doc("Publish it.")] = True
     topic: Annotated[Topic | None, doc("Instead of `{base}/outgoing/capabilities`.")] = None
-    qos: Annotated[Qos | None, doc("Instead of the contract's QoS.")] = None
-    retain: Annotated[bool | None, doc("Instead of the contract's retain flag.")] = None
-    publish_interval_seconds: Annotated[
-        Interval, doc("How often it is published again; services.defaults' unless set.")
-    ] = 3600.0
 
 
 class LogsSection(Section, frozen=True, kw_only=True):
     """Log lines of all services as messages."""
 
+    retired: ClassVar = {"min_level": ONE_VALUE, "max_message_chars": ONE_VALUE, **BY_CONTRACT}
+
     enabled: Annotated[bool, doc("Publish them.")] = True
     topic: Annotated[Topic | None, doc("Instead of `{base}/outgoing/logs`.")] = None
-    qos: Annotated[Qos | None, doc("Instead of the contract's QoS.")] = None
-    retain: Annotated[bool | None, doc("Instead of the contract's retain flag.")] = None
-    min_level: Annotated[LogLevel, doc("Lines below this level stay on the robot.")] = "INFO"
-    max_message_chars: Annotated[
-        int, Meta(ge=64, le=65536, description="Longer lines are cut and end in three dots.")
-    ] = 2048
 
 
 class Launcher(ServiceSection, frozen=True, kw_only=True):
@@ -117,39 +110,24 @@ class BridgeTopics(Section, frozen=True, kw_only=True):
 class Heartbeat(Section, frozen=True, kw_only=True):
     """The robot's sign of life towards operators."""
 
+    retired: ClassVar = BY_CONTRACT
+
     enabled: Annotated[bool, doc("Send it.")] = True
     topic: Annotated[Topic | None, doc("Instead of `{base}/outgoing/online`.")] = None
     interval_seconds: Annotated[float, Meta(ge=0.05, le=3600, description="Seconds between two of them.")] = 0.25
-    qos: Annotated[Qos | None, doc("Instead of the contract's QoS.")] = None
-    retain: Annotated[bool | None, doc("Instead of the contract's retain flag.")] = None
 
 
 class SystemControl(Section, frozen=True, kw_only=True):
     """A command of the operating system that one flag runs, without a shell."""
 
+    retired: ClassVar = {
+        "cooldown_seconds": ONE_VALUE,
+        "ignore_retained": "a retained request is stale: it is always refused",
+    }
+
     command: Annotated[Command, doc("The program and its arguments; unset: the flag does nothing.")] = ()
     cwd: Annotated[File | None, doc("Folder to run it in; unset: the service's own.")] = None
     env: Annotated[Variables, doc("Environment variables to add.")] = EMPTY
-    cooldown_seconds: Annotated[Seconds, doc("Further requests within this time are refused.")] = 0.0
-    ignore_retained: Annotated[bool, doc("Refuse a retained request, because it is stale.")] = True
-
-
-class RebootControl(SystemControl, frozen=True, kw_only=True):
-    """What `flags/reboot` runs, for example `systemctl --no-ask-password reboot`."""
-
-    cooldown_seconds: Annotated[Seconds, doc("Further requests within this time are refused.")] = 30.0
-
-
-class ServiceRestartControl(SystemControl, frozen=True, kw_only=True):
-    """What `flags/service-restart` runs, for example `systemctl --no-block restart pebble.service`."""
-
-    cooldown_seconds: Annotated[Seconds, doc("Further requests within this time are refused.")] = 10.0
-
-
-class GitPullControl(SystemControl, frozen=True, kw_only=True):
-    """What `flags/git-pull` runs, for example `systemctl --no-ask-password start pebble-update.service`."""
-
-    cooldown_seconds: Annotated[Seconds, doc("Further requests within this time are refused.")] = 60.0
 
 
 _MEDIA_PROGRAMS = "the media services choose their programs, and services.mqtt_bridge.media configures them"
@@ -159,19 +137,16 @@ class MediaControl(Section, frozen=True, kw_only=True):
     """How the media programs are run while they are requested."""
 
     retired: ClassVar = {
-        key: _MEDIA_PROGRAMS
-        for prefix in ("", "publisher_", "receiver_")
-        for key in (f"{prefix}command", f"{prefix}cwd")
+        **{
+            f"{prefix}{key}": _MEDIA_PROGRAMS
+            for prefix in ("", "publisher_", "receiver_")
+            for key in ("command", "cwd")
+        },
+        **dict.fromkeys(("publisher_env", "receiver_env"), "`env` is for all of them"),
+        "stop_timeout": ONE_VALUE,
     }
 
-    stop_timeout: Annotated[Seconds, doc("How long a media program may take to stop before it is killed.")] = 10.0
     env: Annotated[Variables, doc("Environment variables to add.")] = EMPTY
-    publisher_env: Annotated[Variables, doc("Environment variables to add for the audio publisher.")] = field(
-        default_factory=dict
-    )
-    receiver_env: Annotated[Variables, doc("Environment variables to add for the audio receiver.")] = field(
-        default_factory=dict
-    )
 
 
 class Link(Section, frozen=True, kw_only=True):
@@ -199,21 +174,28 @@ class MqttBridge(ServiceSection, frozen=True, kw_only=True):
     media: Annotated[Media, doc("Pictures and sound, to and from operators.")] = Media()
     video_control: Annotated[MediaControl, doc("Running the camera publisher.")] = MediaControl()
     audio_control: Annotated[MediaControl, doc("Running the audio programs.")] = MediaControl()
-    reboot_control: Annotated[RebootControl, doc("What `flags/reboot` runs.")] = RebootControl()
-    service_restart_control: Annotated[ServiceRestartControl, doc("What `flags/service-restart` runs.")] = (
-        ServiceRestartControl()
-    )
-    git_pull_control: Annotated[GitPullControl, doc("What `flags/git-pull` runs.")] = GitPullControl()
+    reboot_control: Annotated[
+        SystemControl, doc("What `flags/reboot` runs, for example `systemctl --no-ask-password reboot`.")
+    ] = SystemControl()
+    service_restart_control: Annotated[
+        SystemControl,
+        doc("What `flags/service-restart` runs, for example `systemctl --no-block restart pebble.service`."),
+    ] = SystemControl()
+    git_pull_control: Annotated[
+        SystemControl,
+        doc("What `flags/git-pull` runs, for example `systemctl --no-ask-password start pebble-update.service`."),
+    ] = SystemControl()
 
 
 class SerialPort(Section, frozen=True, kw_only=True):
     """The line to the MCU."""
 
+    retired: ClassVar = {"timeout_seconds": ONE_VALUE}
+
     port: Annotated[Device | None, doc("Device: `ls /dev/serial/by-id/*`; required where the bridge is enabled.")] = (
         None
     )
     baud: Annotated[int, Meta(ge=50, le=12_000_000, description="Bits per second; must be the firmware's.")] = 115200
-    timeout_seconds: Annotated[Interval, doc("How long one read waits.")] = 0.1
 
 
 class SerialTelemetry(Section, frozen=True, kw_only=True):
@@ -233,13 +215,16 @@ class OdometryRing(Section, frozen=True, kw_only=True):
 class SerialSafety(Section, frozen=True, kw_only=True):
     """When the wheels are stopped."""
 
+    retired: ClassVar = {
+        "ignore_retained_drive": "a retained drive command is stale: it is always refused",
+        "stop_on_shutdown": "a stop is always sent as the last line",
+    }
+
     # 5 s is the limit of the original's MCU firmware.
     drive_timeout_seconds: Annotated[
         float,
         Meta(gt=0, le=5, description="No drive command for this long: stop. Our MCUs stop by themselves after 1 s."),
     ] = 0.75
-    ignore_retained_drive: Annotated[bool, doc("Retained drive commands are always refused as stale.")] = True
-    stop_on_shutdown: Annotated[bool, doc("A stop is always sent as the last line.")] = True
 
 
 class SerialTopics(Section, frozen=True, kw_only=True):
@@ -255,28 +240,13 @@ class SerialTopics(Section, frozen=True, kw_only=True):
     low_rate: Annotated[Topic | None, doc("Instead of `{base}/outgoing/sensors/imu`.")] = None
 
 
-class ImuPublish(Section, frozen=True, kw_only=True):
-    """How IMU samples are published."""
-
-    high_rate_qos: Annotated[Qos | None, doc("Instead of the contract's QoS of `sensors/imu-fast`.")] = None
-    low_rate_qos: Annotated[Qos | None, doc("Instead of the contract's QoS of `sensors/imu`.")] = None
-    high_rate_retain: Annotated[bool | None, doc("Instead of the contract's rule for `sensors/imu-fast`.")] = None
-    low_rate_retain: Annotated[bool | None, doc("Instead of the contract's rule for `sensors/imu`.")] = None
-
-
-class SerialHealth(Section, frozen=True, kw_only=True):
-    """When the process exits and is restarted."""
-
-    imu_sample_timeout_seconds: Annotated[
-        Seconds | None, doc("No IMU sample for this long: exit; 0: never. Unset: 5 for an IMU, else 0.")
-    ] = None
-    exit_on_serial_error: Annotated[
-        bool | None, doc("Exit when a self-describing MCU or an IMU disappears. Unset: search for it again instead.")
-    ] = None
-
-
 class SerialBridge(ServiceSection, frozen=True, kw_only=True):
     """One serial line to an MCU; one process each."""
+
+    retired: ClassVar = {
+        "health": "a device that is gone is searched for, and an IMU that is silent is restarted",
+        "publish": "the contract fixes QoS and retain flag",
+    }
 
     protocol: Annotated[SerialProtocolName, doc("The serial protocol of the MCU.")] = "goob_base_v1"
     serial: Annotated[SerialPort, doc("The line.")] = SerialPort()
@@ -286,8 +256,6 @@ class SerialBridge(ServiceSection, frozen=True, kw_only=True):
     ] = None
     safety: Annotated[SerialSafety, doc("When to stop.")] = SerialSafety()
     topics: Annotated[SerialTopics, doc("Other names for topics.")] = SerialTopics()
-    publish: Annotated[ImuPublish, doc("IMU samples.")] = ImuPublish()
-    health: Annotated[SerialHealth, doc("When to exit.")] = SerialHealth()
 
 
 class SerialBridges(SerialBridge, frozen=True, kw_only=True):
@@ -305,7 +273,7 @@ class Services(Section, frozen=True, kw_only=True):
     launcher: Annotated[Launcher, doc("Starts the others.")] = Launcher()
     av_daemon: Annotated[AvDaemon, doc("Camera and microphone.")] = AvDaemon()
     mqtt_bridge: Annotated[MqttBridge, doc("Connection to operators.")] = MqttBridge()
-    ros1_bridge: Annotated[Ros1Bridge, doc("Connection to ROS 1.")] = Ros1Bridge()
+    ros1_bridge: Annotated[dict[str, Any], doc("The original's connection to ROS 1: read, and not used.")] = EMPTY
     serial_mcu_bridge: Annotated[SerialBridges, doc("Serial line to the motor MCU.")] = SerialBridges()
     video_stream: Annotated[VideoStream, doc("A streaming program of a third party.")] = VideoStream()
     soundboard_handler: Annotated[SoundboardHandler, doc("Plays sounds.")] = SoundboardHandler()

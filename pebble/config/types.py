@@ -63,7 +63,6 @@ Sentence = Annotated[str, Meta(pattern=_LINE % 60, extra={"expected": "one line,
 Cells = Annotated[int, Meta(ge=1, le=14)]
 LogLevel = Literal["DEBUG", "INFO", "WARNING", "ERROR", "CRITICAL"]
 Port = Annotated[int, Meta(ge=1, le=65535)]
-Qos = Annotated[int, Meta(ge=0, le=1, extra={"expected": "0 or 1"})]
 Count = Annotated[int, Meta(ge=1, le=1_000_000_000)]
 # A wait beyond 100 days is a typing mistake, and some clocks and locks of the system refuse it.
 Seconds = Annotated[float, Meta(ge=0, le=10_000_000)]
@@ -97,6 +96,12 @@ def doc(text: str) -> Meta:
     return Meta(description=text)
 
 
+#: Why a key is retired whose value is a constant.
+ONE_VALUE = "one value serves all robots"
+#: The delivery of a channel, which no config changes (paper 4.3 and 4.4).
+BY_CONTRACT: Mapping[str, str] = dict.fromkeys(("qos", "retain"), "the contract fixes QoS and retain flag")
+
+
 class Secret(str):
     """Text that is not shown by accident: ``repr()`` hides it, ``str()`` does not."""
 
@@ -109,18 +114,22 @@ class Secret(str):
 class Section(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """One object of a config file. Subclasses are data: keys, defaults, limits and what they mean."""
 
-    #: Keys of the original that lost their meaning, with what replaces them; a final ``*`` stands for any ending.
+    #: Keys that are accepted and do nothing, with what replaces them; a final ``*`` stands for any ending.
     retired: ClassVar[Mapping[str, str]] = {}
+
+    @classmethod
+    def all_retired(cls) -> dict[str, str]:
+        """Return ``retired`` of this class and of those it extends."""
+        return {key: why for kind in reversed(cls.__mro__) for key, why in getattr(kind, "retired", {}).items()}
 
 
 class ServiceSection(Section, frozen=True, kw_only=True):
     """The keys of every service's section."""
 
+    retired: ClassVar = {"retained_publish_interval_seconds": "services.defaults has one for all"}
+
     enabled: Annotated[bool, doc("Start this service.")] = False
     log_level: Annotated[LogLevel, doc("How much this service logs; the root's log_level unless set.")] = "INFO"
-    retained_publish_interval_seconds: Annotated[
-        Interval, doc("How often retained state is published again; services.defaults' unless set.")
-    ] = 3600.0
 
 
 class HandlerTopics(Section, frozen=True, kw_only=True):

@@ -1,15 +1,12 @@
 """The config sections of the operator page: where it listens, who may use it, and the robot's service that runs it."""
 
 import ipaddress
-from typing import Annotated, Any
-
-from msgspec import Meta, field
+from typing import Annotated, ClassVar
 
 from pebble.config.transport import Mqtt
 from pebble.config.types import (
     EMPTY,
     BrokerHost,
-    Count,
     File,
     Host,
     Level,
@@ -47,22 +44,13 @@ class WebTls(Section, frozen=True, kw_only=True):
     )
 
 
-class MqttHistory(Section, frozen=True, kw_only=True):
-    """The original's record of all messages in MongoDB. Not used: `services.recorder` records into files."""
-
-    enabled: Annotated[bool, doc("Keep one.")] = False
-    uri: Annotated[str, doc("MongoDB to keep it in.")] = "mongodb://127.0.0.1:27017"
-    database: Annotated[str, doc("Its database.")] = "pebble"
-    collection: Annotated[str, doc("Its collection.")] = "mqtt_history"
-    max_bytes: Annotated[int, Meta(ge=1, description="How large it may become.")] = 500 * 1024**3
-    subscribe_all_topics: Annotated[bool, doc("Record other systems' topics too.")] = True
-    prune_check_every_messages: Annotated[Count, doc("How often its size is checked.")] = 2000
-    prune_chunk_documents: Annotated[Count, doc("How many messages are deleted at once.")] = 50000
-    prune_target_ratio: Annotated[float, Meta(gt=0, le=1, description="How full it is after deleting.")] = 0.9
-
-
 class WebInterface(Section, frozen=True, kw_only=True):
     """The operator page, of `pebble web CONFIG` and of `services.web_handler`."""
+
+    retired: ClassVar = {
+        **dict.fromkeys(("robots", "robot_discovery"), "robots are found by their messages, and named by `robot.name`"),
+        "mqtt_history": "`services.recorder` records into files",
+    }
 
     log_level: Annotated[LogLevel, doc("Log level of `pebble web`; the root's log_level unless set.")] = "INFO"
     host: Annotated[
@@ -83,14 +71,6 @@ class WebInterface(Section, frozen=True, kw_only=True):
     recordings: Annotated[
         File | None, doc("Folder of recordings to look at on the page; unset: that of services.recorder, if it runs.")
     ] = None
-    robots: Annotated[
-        tuple[dict[str, Any], ...],
-        doc("Read and ignored: robots are found by their messages, and named by `robot.name` of their own configs."),
-    ] = ()
-    robot_discovery: Annotated[dict[str, Any], doc("Read and ignored: robots are found by their messages.")] = field(
-        default_factory=dict
-    )
-    mqtt_history: Annotated[MqttHistory, doc("A record of all messages.")] = MqttHistory()
 
     @property
     def local(self) -> bool:

@@ -40,14 +40,6 @@ class Kind(Enum):
         self.one_shot = direction == INCOMING and not retain
 
 
-class Override(Struct, frozen=True):
-    """Where a config may rename a channel (paper Table A.6): dotted paths of its topic, QoS and retain keys."""
-
-    topic: str
-    qos: str | None = None
-    retain: str | None = None
-
-
 class Channel(Struct, frozen=True, kw_only=True, dict=True):
     """One topic, or a family of topics: its name, payload and delivery.
 
@@ -71,7 +63,7 @@ class Channel(Struct, frozen=True, kw_only=True, dict=True):
     prompt: bool = False
     qos: int = -1  # -1: that of the kind
     retain: bool | None = None  # None: that of the kind
-    override: Override | None = None
+    override: str | None = None  # where a config may rename it (paper Table A.6): the dotted path of a key
     synonym_of: str | None = None  # another name for this metric: understood, never published
 
     @property
@@ -121,20 +113,16 @@ def _c(metric: str, kind: Kind, payload: Any, doc: str, **more: Any) -> Channel:
     return Channel(metric=metric, kind=kind, payload=payload, doc=doc, **more)
 
 
-def _serial(key: str) -> Override:
-    return Override(f"services.serial_mcu_bridge.topics.{key}")
+def _serial(key: str) -> str:
+    return f"services.serial_mcu_bridge.topics.{key}"
 
 
-def _bridge(key: str) -> Override:
-    return Override(f"services.mqtt_bridge.topics.{key}")
+def _bridge(key: str) -> str:
+    return f"services.mqtt_bridge.topics.{key}"
 
 
-def _service(name: str, key: str) -> Override:
-    return Override(f"services.{name}.topics.{key}")
-
-
-def _full(section: str) -> Override:
-    return Override(f"{section}.topic", f"{section}.qos", f"{section}.retain")
+def _service(name: str, key: str) -> str:
+    return f"services.{name}.topics.{key}"
 
 
 _MEDIA = "services.mqtt_bridge.media"
@@ -159,8 +147,7 @@ VIDEO_CONTROL = _c("front-camera", Kind.COMMAND, p.MediaRequest, "Start or stop 
 AUDIO_CONTROL = _c("audio", Kind.COMMAND, p.MediaRequest, "Start or stop remote audio, both directions.",
                    waits_s=_PATIENT_S, override=_bridge("audio_control"))  # fmt: skip
 AUDIO_STREAM = _c("audio-stream", Kind.FEED, bytes, "An operator's voice as PBAT packets.",
-                  rate_hz=50, bridged=False, override=Override(f"{_MEDIA}.audio_receiver.topic",
-                                                               f"{_MEDIA}.audio_receiver.qos"))  # fmt: skip
+                  rate_hz=50, bridged=False, override=f"{_MEDIA}.audio_receiver.topic")  # fmt: skip
 SOUNDBOARD_COMMAND = _c("soundboard-command", Kind.COMMAND, p.SoundboardCommand, "Play or stop a sound clip.",
                         waits_s=_PATIENT_S, override=_service("soundboard_handler", "command"))  # fmt: skip
 AUTONOMY_COMMAND = _c("autonomy-command", Kind.COMMAND, p.AutonomyCommand, "Start or stop an autonomy script.",
@@ -184,10 +171,10 @@ MIP_RAW = _c("mip-raw", Kind.COMMAND, bytes, "Bytes for a MiP's own UART, as hex
 
 # -- outgoing: supervision
 ONLINE = _c("online", Kind.STATE, p.Heartbeat, "Heartbeat, and as the will: offline.",
-            rate_hz=4, override=_full("services.mqtt_bridge.heartbeat"))  # fmt: skip
+            rate_hz=4, override="services.mqtt_bridge.heartbeat.topic")  # fmt: skip
 HEARTBEAT = _c("heartbeat", Kind.STATE, p.Heartbeat, "Older name of the heartbeat.", synonym_of="online")
 CAPABILITIES = _c("capabilities", Kind.STATE, p.Capabilities, "What the robot can do, and under which topics.",
-                  override=_full("services.launcher.capabilities"))  # fmt: skip
+                  override="services.launcher.capabilities.topic")  # fmt: skip
 STATUS = _c("status", Kind.STATE, p.Status, "General state; robots list the state of their services.")
 ESTOP_STATE = _c("estop/{owner}", Kind.STATE, p.EstopState, "Whether a motor owner is stopped, and by whom.",
                  prompt=True)  # fmt: skip
@@ -202,7 +189,7 @@ AUDIT_LINES = _c("audit-lines", Kind.EVENT, p.AuditLines, "Lines of the audit th
 BRIDGE_PROBE = _c("bridge-probe", Kind.EVENT, p.AnyObject,
                   "By it the bridge detects that two of the robot's connections lead to one broker, "
                   "and a page server (`{system}/servers/{id}`) that each of several brokers delivers.")  # fmt: skip
-LOGS = _c("logs", Kind.STREAM, p.LogRecord, "Log lines of all services.", override=_full("services.launcher.logs"))
+LOGS = _c("logs", Kind.STREAM, p.LogRecord, "Log lines of all services.", override="services.launcher.logs.topic")
 
 # -- outgoing: telemetry
 CHARGING_STATUS = _c("charging-status", Kind.STATE, p.ChargingStatus, "On the charger: true, false or unknown.",
@@ -213,13 +200,9 @@ TOUCH_SENSORS = _c("touch-sensors", Kind.STREAM, p.TouchSensors, "Raw touch or h
                    rate_hz=50, qos=1, override=_serial("touch_sensors"))  # fmt: skip
 IMU_FAST = _c("sensors/imu-fast", Kind.STREAM, p.ImuFast, "Every sample of the inertial sensor.",
               rate_hz=100, remote=False,
-              override=Override("services.serial_mcu_bridge.topics.high_rate",
-                                "services.serial_mcu_bridge.publish.high_rate_qos",
-                                "services.serial_mcu_bridge.publish.high_rate_retain"))  # fmt: skip
+              override=_serial("high_rate"))  # fmt: skip
 IMU = _c("sensors/imu", Kind.STREAM, p.Imu, "Summary of the inertial sensor.", rate_hz=5, qos=1,
-         override=Override("services.serial_mcu_bridge.topics.low_rate",
-                           "services.serial_mcu_bridge.publish.low_rate_qos",
-                           "services.serial_mcu_bridge.publish.low_rate_retain"))  # fmt: skip
+         override=_serial("low_rate"))  # fmt: skip
 MCU_DESCRIBE = _c("mcu/{uid}/describe", Kind.STATE, p.McuManifest, "Manifest of a self-describing MCU.")
 MCU_VALUE = _c("mcu/{uid}/{name}", Kind.STREAM, p.McuSample,
                "A value of a self-describing MCU; its manifest defines QoS and retain.")  # fmt: skip
@@ -227,14 +210,14 @@ OUTLET_STATUS = _c("outlets/{outlet}/status", Kind.STATE, p.OutletStatus, "State
 
 # -- outgoing: media
 CAMERA = _c("front-camera", Kind.STREAM, bytes, "Pictures: JSON, PBVD or JPEG, distinguished by their first bytes.",
-            rate_hz=15, bridged=False, override=Override(f"{_MEDIA}.video_publisher.topic"))  # fmt: skip
+            rate_hz=15, bridged=False, override=f"{_MEDIA}.video_publisher.topic")  # fmt: skip
 AUDIO = _c("audio", Kind.STREAM, bytes, "Sound as PBAT packets.", rate_hz=50, bridged=False,
-           override=Override(f"{_MEDIA}.audio_publisher.topic", f"{_MEDIA}.audio_publisher.qos"))  # fmt: skip
+           override=f"{_MEDIA}.audio_publisher.topic")  # fmt: skip
 MEDIA_STATUS = _c("media-status", Kind.STATE, p.MediaStatus, "State of camera, microphone and media programs.")
 MEDIA_REPORT = _c("media-report/{program}", Kind.EVENT, p.MediaReport,
                   "State of one media program; becomes part of media-status.", rate_hz=1, remote=False)  # fmt: skip
 VIDEO_OVERLAYS = _c("video-overlays", Kind.STREAM, p.VideoOverlays, "Shapes and labels to draw over the picture.",
-                    rate_hz=12, override=Override(f"{_MEDIA}.video_publisher.overlays_topic"))  # fmt: skip
+                    rate_hz=12, override=f"{_MEDIA}.video_publisher.overlays_topic")  # fmt: skip
 
 # -- outgoing: sounds and scripts
 SOUNDBOARD_FILES = _c("soundboard-files", Kind.STATE, p.SoundboardFiles, "The clips a robot can play.",

@@ -87,13 +87,11 @@ def _meaning_row(channel: Channel) -> tuple[str, ...]:
 
 
 def _travel_row(channel: Channel) -> tuple[str, ...]:
-    override = channel.override
-    paths = () if override is None else (override.topic, override.qos, override.retain)
     return (
         f"`{channel.suffix}`",
         authority(channel),
         travels(channel),
-        "<br>".join(f"`{path}`" for path in paths if path is not None),
+        "" if channel.override is None else f"`{channel.override}`",
     )
 
 

@@ -89,8 +89,6 @@ def _forget_launcher(environment: Mapping[str, str]) -> None:
 def _run(program: Program) -> None:
     die_with_launcher()
     ctypes.CDLL(None).prctl(_PR_SET_NAME, program.name.encode()[:_NAME_BYTES])  # ps and top show it
-    if program.folder is not None:
-        os.chdir(program.folder)
     sys.argv = [program.module, *program.arguments]
     if not hasattr(sys.modules.get(program.module), "__path__"):
         sys.modules.pop(program.module, None)  # it is __main__ now; importing it as well gives a second copy, as always

@@ -55,7 +55,7 @@ class Launcher:
         self._status = StatusPublisher(
             config, self._reactor, self._supervisors, self._features, self._dropped, self._driveable
         )
-        self._logs = LogForwarder(self._status.publish_log, config.services.launcher.logs)
+        self._logs = LogForwarder(self._status.publish_log)
         self._config_watch = ConfigWatch(config)
         self._signals = StopSignals(self._kill_all)
         self._lost = False  # another launcher has taken the run directory

@@ -10,7 +10,6 @@ from collections.abc import Callable
 from typing import Self
 
 from pebble.config.secret_text import without_secrets
-from pebble.config.tree import LogsSection
 from pebble.config.visible import shown
 from pebble.contract.payloads import LogRecord
 from pebble.runtime.parent import TAG
@@ -19,16 +18,17 @@ LINE_LIMIT = 16_384  # bytes of a child's line; the rest of a longer one is drop
 LEVELS = ("DEBUG", "INFO", "WARNING", "ERROR", "CRITICAL")
 
 _OWN_NAME = "launcher"
+_LEAST = LEVELS.index("INFO")  # of what is published
+_LONGEST = 2048  # characters; longer lines are cut and end in three dots
 _FORM = re.compile(r"\d\d:\d\d:\d\d(?:[.,]\d+)? \[([A-Z]+)\] (.*)", re.DOTALL).fullmatch
 _TRACEBACK = re.compile(r"[\s|+]*(Exception Group )?Traceback \(most recent call last\):").match
 
 
 class LogForwarder:
-    """Writes every line to stderr, and hands those of at least the configured level to ``publish`` as records."""
+    """Writes every line to stderr, and hands those of INFO and above to ``publish`` as records."""
 
-    def __init__(self, publish: Callable[[LogRecord], None], logs: LogsSection, *, stderr: int | None = None) -> None:
-        self._publish, self._limit = publish, logs.max_message_chars
-        self._least = LEVELS.index(logs.min_level)
+    def __init__(self, publish: Callable[[LogRecord], None], *, stderr: int | None = None) -> None:
+        self._publish = publish
         self._stderr = NonBlockingWriter(sys.stderr.fileno() if stderr is None else stderr)
         self._readers: dict[str, tuple[int, LevelReader]] = {}  # with the pid of the process that it reads
 
@@ -57,8 +57,8 @@ class LogForwarder:
         clock = time.strftime("%H:%M:%S")
         for line in text.splitlines():
             self._stderr.write(f"{clock} [{level}] [{service}] {line}")
-        if published and LEVELS.index(level) >= self._least:
-            message = cut(f"[{service}] {text}", self._limit)
+        if published and LEVELS.index(level) >= _LEAST:
+            message = cut(f"[{service}] {text}", _LONGEST)
             now_ms = time.time_ns() // 1_000_000
             self._publish(LogRecord(t=now_ms, level=level, service=service, message=message, logger=logger, pid=pid))
 

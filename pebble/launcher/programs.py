@@ -6,7 +6,6 @@ import os
 from collections.abc import Iterable
 from enum import IntEnum
 from importlib import import_module
-from pathlib import Path
 from typing import Any
 
 from msgspec import Struct
@@ -47,7 +46,6 @@ class Program(Struct, frozen=True):
     preloaded: bool = True  # False: its imports are needed by few, and would cost every process their memory
     entry: str = ""  # what the package that is run begins with; "": the module is no package
     environment: dict[str, str] = {}
-    folder: Path | None = None  # to run in; None: the launcher's
     stop_timeout_s: float = 10.0  # after this an on-demand program that was released is killed
 
 
@@ -128,8 +126,8 @@ def _serial_line(config: Config, instance: str, line: SerialBridge) -> Program:
 
 
 def _av_daemon(config: Config) -> Program:
-    section = config.services.av_daemon
-    return _service(config, "av_daemon", Stage.DEVICE, preloaded=False, environment=section.env, folder=section.cwd)
+    environment = config.services.av_daemon.env
+    return _service(config, "av_daemon", Stage.DEVICE, preloaded=False, environment=environment)
 
 
 def _web_handler(config: Config) -> Program:
@@ -146,16 +144,7 @@ def _on_demand(config: Config, name: str) -> Program:
         return _service(config, name, Stage.CONNECTION, on_demand=True)
     bridge = config.services.mqtt_bridge
     control = bridge.video_control if name == "camera_publisher" else bridge.audio_control
-    own = control.receiver_env if name == "audio_receiver" else control.publisher_env
-    return _service(
-        config,
-        name,
-        Stage.CONNECTION,
-        on_demand=True,
-        preloaded=False,
-        environment={**control.env, **own},
-        stop_timeout_s=control.stop_timeout,
-    )
+    return _service(config, name, Stage.CONNECTION, on_demand=True, preloaded=False, environment=control.env)
 
 
 def _announcer(config: Config) -> Program:

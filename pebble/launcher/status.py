@@ -53,13 +53,14 @@ class StatusPublisher:
     def start(self) -> None:
         """Publish now, on every change and on the configured intervals."""
         launcher = self._config.services.launcher
+        interval_s = self._config.services.defaults.retained_publish_interval_seconds
         if self._systemd.watchdog_period_s is not None:
             self._reactor.every(self._systemd.watchdog_period_s, self._systemd.watchdog)
         if launcher.enabled and launcher.capabilities.enabled:
             self._publish_capabilities()
-            self._reactor.every(launcher.capabilities.publish_interval_seconds, self._publish_capabilities)
+            self._reactor.every(interval_s, self._publish_capabilities)
         self.changed()
-        self._reactor.every(launcher.retained_publish_interval_seconds, self._publish_status)
+        self._reactor.every(interval_s, self._publish_status)
 
     def changed(self) -> None:
         """The state of a supervisor may have changed: publish soon."""

@@ -1,10 +1,10 @@
-"""The topic, QoS and retain flag that one robot uses for each channel, after its config (paper Table A.6)."""
+"""The topic that one robot uses for each channel, after its config (paper Table A.6)."""
 
 from functools import reduce
 from typing import Any, NamedTuple
 
 from pebble.config import Config
-from pebble.contract import CHANNELS, Channel, Override, channel_of
+from pebble.contract import CHANNELS, Channel, channel_of
 
 
 class Address(NamedTuple):
@@ -45,24 +45,16 @@ class Addresses:
 
 def _address(channel: Channel, config: Config) -> Address:
     default = _default(channel, config.base)
-    return default if channel.override is None else _overridden(default, channel.override, config)
+    topic = None if channel.override is None else _at(config, channel.override)
+    return default if topic is None else default._replace(topic=topic)
 
 
 def _default(channel: Channel, base: str) -> Address:
     return Address(channel.filter(base), channel.default_qos, channel.default_retain)
 
 
-def _overridden(default: Address, override: Override, config: Config) -> Address:
-    topic, qos, retain = (
-        _at(config, path) if path else None for path in (override.topic, override.qos, override.retain)
-    )
-    return Address(
-        default.topic if topic is None else topic,
-        default.qos if qos is None else qos,
-        default.retain if retain is None else retain,
-    )
-
-
-def _at(config: Config, path: str) -> Any:
-    """The value at a dotted path of the config tree; None where the key was not set."""
-    return reduce(getattr, path.split("."), config)
+def _at(config: Config, path: str) -> str | None:
+    """The topic at a dotted path of the config tree; None where the key was not set."""
+    section: Any = config
+    topic: str | None = reduce(getattr, path.split("."), section)
+    return topic

@@ -288,5 +288,4 @@ def tls_settings(tls: Tls) -> TlsSettings | None:
         client_cert=tls.client_cert,
         client_key=tls.client_key,
         insecure=tls.insecure,
-        ciphers=tls.ciphers,
     )

@@ -19,6 +19,7 @@ from pebble.transports import Message, QoS, State
 
 _IDLE_S = 0.5  # between two checks whether it has been silent for long
 _END_S = 1.5
+_WAITING_PACKETS = 48  # that wait to be played
 
 
 class PlaybackThread:
@@ -31,14 +32,13 @@ class PlaybackThread:
         self,
         buffer: JitterBuffer,
         make_player: Callable[[threading.Event], Player],
-        limit: int,
         on_end: Callable[[], None],
     ) -> None:
         self.dropped = 0  # packets that came while too many waited
         self._stopping = threading.Event()
         self.buffer, self.player = buffer, make_player(self._stopping)
         self._packets: deque[tuple[bytes, float]] = deque()
-        self._limit, self._on_end = limit, on_end
+        self._on_end = on_end
         self._wake = threading.Event()
         self._thread = threading.Thread(target=self._run, name="pebble-playback", daemon=True)
 
@@ -53,7 +53,7 @@ class PlaybackThread:
 
     def put(self, payload: bytes) -> None:
         """Queue one packet that has just arrived."""
-        if len(self._packets) >= self._limit:
+        if len(self._packets) >= _WAITING_PACKETS:
             self.dropped += 1
             self._packets.popleft()
         self._packets.append((payload, time.monotonic()))
@@ -92,13 +92,10 @@ class AudioReceiver(Service):
         settings = self.config.services.mqtt_bridge.media.audio_receiver
         self._stopping = False
         self._meter = RateMeter()
-        self._buffer = JitterBuffer(
-            limit=settings.queue_limit, concealment_ms=settings.concealment_ms, target_ms=settings.latency_ms
-        )
+        self._buffer = JitterBuffer(target_ms=settings.latency_ms)
         self._playback = PlaybackThread(
             self._buffer,
             lambda stopping: Player(settings.command, settings.device, stopping),
-            settings.queue_limit,
             lambda: self.post(self._on_end),
         )
         self._remote = remote_transport(self.config, "audio-receiver")

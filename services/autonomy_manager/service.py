@@ -45,7 +45,7 @@ if TYPE_CHECKING:
 _START = frozenset(("start", "run", "play", "enable", "enabled", "on"))
 _HALTS_S = (0.1, 0.3)  # after the first one
 _HOLD_S = HOLD_MS / 1000
-_SHORTEST_SCAN_S = 1.0
+_SCAN_S = 5.0  # between two looks into the folder of scripts
 _LOOK_S = 2.0  # between two looks at whether a script waits
 _CLOSE_S = 1.0  # for scripts to end after SIGTERM when this process ends; it is killed after 3 s
 
@@ -75,14 +75,9 @@ class AutonomyManager(Service):
         self._media, self._began = LocalMedia(self.config), 0.0
         self._gate: tuple[int, Gate] | None = None  # of the present run, if one of its scripts needs it
 
-    @property
-    def republish_interval_s(self) -> float:
-        return self._section.retained_publish_interval_seconds
-
     def start(self) -> None:
         if self._offer.begin():
-            period = max(_SHORTEST_SCAN_S, self._section.scan_interval_seconds)
-            self.timers.add(self.clock(), self._offer.scan, period=period)
+            self.timers.add(self.clock(), self._offer.scan, period=_SCAN_S)
         self.timers.add(self.clock(), self._look, period=_LOOK_S)
         self.changed()
 

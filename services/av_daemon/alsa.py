@@ -30,7 +30,7 @@ class AlsaMicrophone:
             f"--period-time={CHUNK_S * 1e6:.0f}", f"--buffer-time={_BUFFER_S * 1e6:.0f}",
             *([f"--device={audio.device}"] if audio.device is not None else []),
         ]  # fmt: skip
-        self._program = CaptureProgram(command, stop_s=options.stop_timeout_seconds)
+        self._program = CaptureProgram(command)
 
     def grab(self) -> Capture:
         while len(self._buffer) < self._size:

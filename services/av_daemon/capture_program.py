@@ -16,17 +16,17 @@ from pebble.runtime.parent import tied_to_parent
 
 SILENCE_S = 3.0  # without output: the device hangs
 _FIRST_SILENCE_S = 10.0  # it may take its time to start
+_STOP_S = 5.0  # before it is killed
 _ERROR_LIMIT = 500  # bytes of its standard error that are remembered
 _LAST_READS = 64  # of 4096 bytes: more than a pipe holds
 _CHUNK = 256 * 1024
 
 
 class CaptureProgram:
-    """A running program. ``read`` fails when it ends or writes nothing for 3 s; ``stop_s``: before it is killed."""
+    """A running program. ``read`` fails when it ends or writes nothing for 3 s."""
 
-    def __init__(self, command: Sequence[str], *, stop_s: float = 5.0, pipe_bytes: int = 0) -> None:
+    def __init__(self, command: Sequence[str], *, pipe_bytes: int = 0) -> None:
         self.name = Path(command[0]).name
-        self._stop_s = stop_s
         self._errors = b""
         self._silence_s = _FIRST_SILENCE_S
         try:
@@ -78,7 +78,7 @@ class CaptureProgram:
         for pipe in self._pipes:  # frees a program that is blocked in a write
             pipe.close()
         try:
-            self._process.wait(self._stop_s)
+            self._process.wait(_STOP_S)
         except subprocess.TimeoutExpired:
             self._process.kill()
             self._process.wait()

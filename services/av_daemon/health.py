@@ -10,15 +10,15 @@ from pebble.transports.frames import FrameInfo
 
 _OPENING_S = 15.0  # a device that takes longer to open hangs
 _SILENCE_S = 4.0  # as does one without a frame for so long; a second more than the sources' own timeout
-_LONGEST_DELAY_S = 30.0
+FIRST_DELAY_S, _LONGEST_DELAY_S = 2.0, 30.0  # before a device that failed is opened again
 _GOOD_RUN_S = 10.0  # after which a failure is the first again
 
 
 class Health:
-    """Safe from any thread. A failed device is opened again after ``restart_delay_s``, doubled with each failure."""
+    """Safe from any thread. The delay before a failed device is opened again doubles with each failure."""
 
-    def __init__(self, restart_delay_s: float) -> None:
-        self._first_delay_s = restart_delay_s
+    def __init__(self, first_delay_s: float = FIRST_DELAY_S) -> None:
+        self._first_delay_s = first_delay_s
         self._lock = threading.Lock()
         self._doing = "starts"
         self._deadline: float | None = None  # for the next frame; None: none is expected

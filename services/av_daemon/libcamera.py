@@ -102,4 +102,4 @@ def _start(options: AvDaemon, codec: str) -> CaptureProgram:
         command += ["--camera", video.camera_name]
     for name, value in video.camera_controls.items():
         command += [f"--{name}"] if value is True else [f"--{name}", str(value)]
-    return CaptureProgram(command, stop_s=options.stop_timeout_seconds, pipe_bytes=_PIPE_BYTES)
+    return CaptureProgram(command, pipe_bytes=_PIPE_BYTES)

@@ -68,10 +68,6 @@ class AvDaemon(Service):
             stream.join()
         self._publish({stream.name: MediaReport(running=False, doing="ended") for stream in self._streams})
 
-    @property
-    def republish_interval_s(self) -> float:
-        return self.config.services.av_daemon.retained_publish_interval_seconds
-
     @on(MEDIA_REPORT)
     def take_report(self, report: MediaReport, program: str) -> None:
         self._reports.put(program, report, self.clock())
@@ -112,8 +108,7 @@ class AvDaemon(Service):
         writer.open()
         self.on_stop(writer.close)
         self._writers.append(writer)
-        delay = self.config.services.av_daemon.restart_delay_seconds
-        self._streams.append(Stream(name, writer, open_source, restart_delay_s=delay))
+        self._streams.append(Stream(name, writer, open_source))
 
 
 def _states(value: dict[str, MediaReport]) -> dict[str, MediaReport]:

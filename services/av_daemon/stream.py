@@ -8,7 +8,7 @@ from msgspec.structs import replace
 
 from pebble.contract.payloads import MediaReport
 from pebble.services.av_daemon.capturer import Capturer, Writer
-from pebble.services.av_daemon.health import Health
+from pebble.services.av_daemon.health import FIRST_DELAY_S, Health
 from pebble.services.av_daemon.source import Source
 
 log = logging.getLogger(__name__)
@@ -26,11 +26,11 @@ class Stream:
         writer: Writer,
         open_source: Callable[[], Source],
         *,
-        restart_delay_s: float,
+        first_delay_s: float = FIRST_DELAY_S,
         rest_s: float = REST_S,
     ) -> None:
         self.name, self._writer, self._open_source, self._rest_s = name, writer, open_source, rest_s
-        self._health = Health(restart_delay_s)
+        self._health = Health(first_delay_s)
         self._capturer = self._start(0.0)
         self._hung: list[Capturer] = []
 

@@ -26,16 +26,17 @@ _CHUNK = 65536
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """One action: its channel, and the section of services.mqtt_bridge with its command."""
+    """One action: its channel, the section of services.mqtt_bridge with its command, and the time between two runs."""
 
     channel: Channel
     section: str
+    cooldown_s: float
 
 
 ACTIONS: Final = (
-    Row(REBOOT, "reboot_control"),
-    Row(SERVICE_RESTART, "service_restart_control"),
-    Row(GIT_PULL, "git_pull_control"),
+    Row(REBOOT, "reboot_control", 30.0),
+    Row(SERVICE_RESTART, "service_restart_control", 10.0),
+    Row(GIT_PULL, "git_pull_control", 60.0),
 )
 
 
@@ -46,10 +47,10 @@ class Action:
     """
 
     def __init__(
-        self, name: str, control: SystemControl, *, folder: Path, clock: Callable[[], float] = time.monotonic
+        self, row: Row, control: SystemControl, *, folder: Path, clock: Callable[[], float] = time.monotonic
     ) -> None:
-        self.name, self.control = name, control
-        self._output = folder / f"{name.rpartition('/')[2]}.log"
+        self.name, self.control, self._cooldown_s = row.channel.metric, control, row.cooldown_s
+        self._output = folder / f"{self.name.rpartition('/')[2]}.log"
         self._clock = clock
         self._ran_at: float | None = None
         self._process: subprocess.Popen[bytes] | None = None
@@ -71,7 +72,7 @@ class Action:
             self._log.warning("refused", "%s refused: it is still running", self.name)
             return False
         now = self._clock()
-        if self._ran_at is not None and now - self._ran_at < self.control.cooldown_seconds:
+        if self._ran_at is not None and now - self._ran_at < self._cooldown_s:
             self._log.warning("refused", "%s refused: it ran %.0f s ago", self.name, now - self._ran_at)
             return False
         self._ran_at = now
@@ -118,14 +119,8 @@ class SystemActions:
 
     def __init__(self, section: MqttBridge, *, folder: Path, clock: Callable[[], float] = time.monotonic) -> None:
         self._actions = {
-            row.channel: Action(row.channel.metric, getattr(section, row.section), folder=folder, clock=clock)
-            for row in ACTIONS
+            row.channel: Action(row, getattr(section, row.section), folder=folder, clock=clock) for row in ACTIONS
         }
-
-    def accepts_retained(self, channel: Channel) -> bool:
-        """Whether ``channel`` is an action whose retained requests run, too (``ignore_retained: false``)."""
-        action = self._actions.get(channel)
-        return action is not None and not action.control.ignore_retained
 
     def request(self, channel: Channel) -> bool:
         """Run the command of ``channel``; False if it is refused."""

@@ -320,10 +320,9 @@ class MqttBridge(ForwardingService):
         if not local and isinstance(routed.outcome, Drop):
             self._audit.drop(routed.outcome, routed.by)
         if routed.outcome is Drop.STALE:
-            if channel is None or not (local and self._requests.actions.accepts_retained(channel)):
-                self.refusals.stale("a command" if channel is None else channel.metric)
-                return
-        elif not isinstance(routed.outcome, Forward) and (routed.outcome in _IGNORED or not local):
+            self.refusals.stale("a command" if channel is None else channel.metric)
+            return
+        if not isinstance(routed.outcome, Forward) and (routed.outcome in _IGNORED or not local):
             return
         if channel is None or codec.is_blank(message.payload):
             return

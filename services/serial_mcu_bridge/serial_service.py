@@ -50,7 +50,6 @@ class SerialService(Service, ABC):
             on_state=lambda state, _problem: self.post(lambda: self._on_line_state(state)),
             drive_timeout_s=section.safety.drive_timeout_seconds,
             boot_s=self.boot_s,
-            read_timeout_s=section.serial.timeout_seconds,
             retry_s=self.retry_s,
             end=b"" if self.receive_only else self.end,
         )
@@ -63,15 +62,6 @@ class SerialService(Service, ABC):
     def options(self) -> SerialBridge:
         """The config section of this serial line; with instances, the merged one of this instance."""
         return self.config.services.serial_mcu_bridge
-
-    @property
-    def republish_interval_s(self) -> float:
-        return self.options.retained_publish_interval_seconds
-
-    def exit_if_configured(self) -> None:
-        """Raise DeviceError for a device that has gone, if the config asks for a restart instead of another attempt."""
-        if self.options.health.exit_on_serial_error and self.line.opened:
-            raise DeviceError(self.line.problem or "the device has gone")
 
     # -- to override
 

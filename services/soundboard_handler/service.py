@@ -17,7 +17,9 @@ _PLAY = ("play", "start", "on", "enable", "enabled")
 _AT_ONCE_S = 1.0  # a player that fails so soon may not have got the device
 _REPORT_AGE_S = 3.0  # of a report that still counts; one comes every second
 _SHORTEST_S = 0.2  # between two starts of a clip that is repeated
-_STOP_S = 2.0  # the launcher kills a service after three
+_SCAN_S = 10.0  # between two looks into the folder of sounds
+_KILL_S = 5.0  # before a player that does not end is killed
+_STOP_S = 2.0  # the same when the service ends: the launcher kills it after three
 _LONGEST_NAME = 300  # characters in an error
 
 
@@ -48,19 +50,15 @@ class SoundboardHandler(Service):
         self._error: str | None = None
         self._talk_back_at = -math.inf  # when audio_receiver last reported that it plays
 
-    @property
-    def republish_interval_s(self) -> float:
-        return self._section.retained_publish_interval_seconds
-
     def start(self) -> None:
-        self.timers.add(self.clock(), self.scan, period=self._section.playback.scan_interval)
+        self.timers.add(self.clock(), self.scan, period=_SCAN_S)
         self._publish_status()
 
     def stop(self) -> None:
         playback, self._playback = self._playback, None
         if playback is not None:
             playback.stop()
-            playback.wait(min(_STOP_S, self._section.playback.stop_timeout))
+            playback.wait(_STOP_S)
         self._publish_status()
 
     @on(SOUNDBOARD_COMMAND)
@@ -118,7 +116,7 @@ class SoundboardHandler(Service):
         playback = self._playback
         if playback is not None and not playback.stopped:
             playback.stop()
-            self.call_at(self.clock() + self._section.playback.stop_timeout, playback.kill)
+            self.call_at(self.clock() + _KILL_S, playback.kill)
         if playback is None or playback.ended:
             self._play_next()
 

@@ -94,11 +94,9 @@ class TestMeaning:
         assert pitcam.serial_instances() == {}
 
     def test_zero_and_false_are_values(self) -> None:
-        bridge = {"heartbeat": {"enabled": False, "qos": 0, "retain": False}, "reboot_control": {"cooldown_seconds": 0}}
+        bridge = {"heartbeat": {"enabled": False}}
         config = read(at("services.mqtt_bridge", bridge) | {"local_mqtt": {"keepalive": 0}})
-        heartbeat = config.services.mqtt_bridge.heartbeat
-        assert (heartbeat.enabled, heartbeat.qos, heartbeat.retain) == (False, 0, False)
-        assert config.services.mqtt_bridge.reboot_control.cooldown_seconds == 0
+        assert not config.services.mqtt_bridge.heartbeat.enabled
         assert config.local_mqtt.keepalive == 0
 
     @pytest.mark.parametrize("nothing", ["", None])
@@ -124,10 +122,9 @@ class TestMeaning:
     def test_words_to_choose_from_may_be_in_any_case(self) -> None:
         assert read(at("log_level", "debug")).log_level == "DEBUG"
 
-    def test_each_system_command_has_its_own_cooldown_and_none_has_a_command(self) -> None:
+    def test_no_action_has_a_command_by_itself(self) -> None:
         bridge = read(at("services.mqtt_bridge", {"reboot_control": {}})).services.mqtt_bridge
         controls = (bridge.reboot_control, bridge.service_restart_control, bridge.git_pull_control)
-        assert [control.cooldown_seconds for control in controls] == [30, 10, 60]
         assert [control.command for control in controls] == [(), (), ()]
 
     def test_paths_are_relative_to_the_file(self, tmp_path: Path) -> None:
@@ -161,14 +158,17 @@ class TestOriginal:
         assert config.services.serial_mcu_bridge.topics.drive_values == "pebble/robots/rover-7/incoming/drive-values"
         assert list(config.serial_instances()) == [""]
 
-    def test_every_key_whose_meaning_is_gone_is_reported_once_with_what_replaces_it(self) -> None:
-        gone = [line for line in load(ORIGINAL, env={}).warnings if "no longer used" in line]
-        assert len(gone) == 3
-        sockets, inputs, programs = gone
-        assert "services.av_daemon.video.{shm_size, wait_for_connection}" in sockets
-        assert "services.mqtt_bridge.media.audio_publisher.{input_shm, input_retry_seconds}" in inputs
-        assert "services.mqtt_bridge.video_control.{command, cwd}" in programs
-        assert all(line.partition("no longer used, ")[2] for line in gone)
+    def test_every_key_whose_meaning_is_gone_is_reported_in_one_line(self) -> None:
+        (gone,) = [line for line in load(ORIGINAL, env={}).warnings if "no longer used" in line]
+        for key in ("video.shm_size", "audio_publisher.input_shm", "video_control.command", "heartbeat.qos"):
+            assert f" {key}," in gone
+        assert gone.endswith("; docs/configuration.md says what replaces each")
+
+    def test_few_of_them_are_reported_with_what_replaces_them(self) -> None:
+        config = read(at("services.mqtt_bridge.heartbeat", {"qos": 0, "retain": False}))
+        assert config.warnings == (
+            "services.mqtt_bridge.heartbeat.{qos, retain}: no longer used, the contract fixes QoS and retain flag",
+        )
 
     def test_what_its_scripts_find_on_the_robot_is_offered(self) -> None:
         services = load(ORIGINAL, env={}).services
@@ -186,15 +186,9 @@ class TestOriginal:
         later = [line for line in read({"robot": {"id": "goob"}} | enabled).warnings if "later release" in line]
         assert [line.partition(":")[0] for line in later] == ["services.ros1_bridge"]
 
-    def test_its_record_of_messages_names_ours(self) -> None:
-        enabled = {"web_interface": {"mqtt_history": {"enabled": True}}}
-        (warning,) = [line for line in read({"robot": {"id": "goob"}} | enabled).warnings if "mqtt_history" in line]
-        assert warning == "web_interface.mqtt_history: is not used: enable services.recorder, which records into files"
-
     def test_its_page_for_other_machines_needs_a_certificate(self) -> None:
         config = load(ORIGINAL, env={})
-        warning, names = [line for line in config.warnings if line.startswith("web_interface")]
-        assert names.startswith("web_interface.robots: names are not used")
+        (warning,) = [line for line in config.warnings if line.startswith("web_interface")]
         assert warning.startswith("web_interface.host: other machines reach 0.0.0.0, so the page starts only with a ")
         assert "`pebble cert init`" in warning
         assert (config.services.web_handler.enabled, config.web_interface.mqtt.host) == (True, "127.0.0.1")
@@ -295,14 +289,6 @@ class TestInheritance:
         assert config.log_level_of("serial_mcu_bridge:imu") == "ERROR"
         assert config.log_level_of("serial_mcu_bridge") == "DEBUG"
 
-    def test_the_common_interval_is_every_services_unless_it_has_its_own(self) -> None:
-        common = {"retained_publish_interval_seconds": 60}
-        own = {"retained_publish_interval_seconds": 5}
-        services = read(at("services", {"defaults": common, "serial_mcu_bridge": own})).services
-        assert services.serial_mcu_bridge.retained_publish_interval_seconds == 5
-        assert services.soundboard_handler.retained_publish_interval_seconds == 60
-        assert services.launcher.capabilities.publish_interval_seconds == 60
-
     def test_a_mistake_in_a_shared_value_is_reported_where_it_stands(self) -> None:
         assert only_problem(at("log_level", "LOUD")).startswith("log_level: must be ")
         serial = {"safety": {"drive_timeout_seconds": 0}, "typo": 1, "instances": {"a": {}, "b": {}}}
@@ -322,7 +308,7 @@ class TestSerialInstances:
     ROOT_LINE: ClassVar[dict[str, Any]] = {
         "enabled": True,
         "serial": {"port": "/dev/a", "baud": 9600},
-        "safety": {"drive_timeout_seconds": 0.4, "stop_on_shutdown": False},
+        "safety": {"drive_timeout_seconds": 0.4},
         "topics": {"drive_values": "x/drive"},
     }
 
@@ -335,7 +321,7 @@ class TestSerialInstances:
         assert list(lines) == ["", "rear"]
         rear = lines["rear"]
         assert (rear.serial.port, rear.serial.baud) == ("/dev/b", 9600)
-        assert (rear.safety.drive_timeout_seconds, rear.safety.stop_on_shutdown) == (0.2, False)
+        assert rear.safety.drive_timeout_seconds == 0.2
         assert rear.topics.drive_values == "x/drive"
         assert lines[""].safety.drive_timeout_seconds == 0.4
 
@@ -419,7 +405,6 @@ class TestMistakes:
             ("services.av_daemon.env", {"A\x00B": ""}, 'has a key "AB" that holds U+0000 (NUL)'),
             ("services.av_daemon.env", {"A=B": "c"}, "must be the name of a variable, without ="),
             ("services.autonomy_manager.env", {"": "c"}, "must be the name of a variable, without ="),
-            ("services.mqtt_bridge.audio_control.publisher_env", {"=": "c"}, "must be the name of a variable"),
             ("local_mqtt.username", "ü" * 40_000, "is longer than MQTT carries, 65535 bytes"),
             ("local_mqtt.password", "ü" * 40_000, "holds more than MQTT carries, 65535 bytes"),
             ("transport.kind", 5, "must be text, not 5"),
@@ -427,10 +412,7 @@ class TestMistakes:
             ("services.defaults.retained_publish_interval_seconds", float("nan"), "must be a number, not nan"),
             ("services.launcher.restart_delay_seconds", float("-inf"), "must be a number, not -inf"),
             ("services.launcher.restart_delay_seconds", 10**400, "must be a number from 0"),
-            ("services.launcher.logs.max_message_chars", 63, "must be a whole number from 64 to 65536"),
             ("services.mqtt_bridge.heartbeat.interval_seconds", 0.049, "must be a number from 0.05 to 3600, not 0.049"),
-            ("services.mqtt_bridge.heartbeat.qos", 2, "must be 0 or 1, not 2"),
-            ("services.mqtt_bridge.heartbeat.retain", 1, "must be true or false, not 1"),
             ("services.mqtt_bridge.heartbeat.enabled", "true", 'must be true or false, not the text "true"'),
             ("services.mqtt_bridge.heartbeat.topic", "$SYS/x", "must be a topic"),
             ("services.mqtt_bridge.heartbeat.topic", "half \ud800", "holds half a character"),
@@ -445,7 +427,6 @@ class TestMistakes:
             ("services.serial_mcu_bridge.odometry_shm.name", "/..", "must be a name without /"),
             ("services.serial_mcu_bridge.protocol", "goob", 'must be "goob_base_v1", "imu_mpu6050_v1"'),
             ("services.av_daemon.video.rotate_degrees", 45, "must be 0, 90, 180 or 270, not 45"),
-            ("services.av_daemon.video.io_mode", [], "must be text or a whole number, not a list"),
         ],
     )
     def test_one_wrong_value(self, path: str, value: Any, expected: str) -> None:
@@ -582,7 +563,7 @@ class TestMistakes:
         del raw["robot"]["id"]
         raw["log_level"] = "LOUD"
         raw["local_mqtt"]["port"] = "1883"
-        services["launcher"]["logs"]["max_message_chars"] = 10
+        services["launcher"]["restart_delay_seconds"] = -1
         services["mqtt_bridge"]["heartbeet"] = services["mqtt_bridge"].pop("heartbeat")
         services["mqtt_bridge"]["remote_mqtt"]["host"] = ""
         services["mqtt_bridge"]["topics"]["reboot"] = "pebble/+/reboot"
@@ -593,7 +574,7 @@ class TestMistakes:
             load(written(tmp_path, json.dumps(raw)), env={})
         assert sorted(line.partition(":")[0] for line in caught.value.problems) == [
             *("local_mqtt.port", "log_level", "robot.id", "services.av_daemon.video.rotate_degrees"),
-            *("services.launcher.logs.max_message_chars", "services.mqtt_bridge.heartbeet"),
+            *("services.launcher.restart_delay_seconds", "services.mqtt_bridge.heartbeet"),
             *("services.mqtt_bridge.remote_mqtt.host", "services.mqtt_bridge.topics.reboot"),
             *("services.serial_mcu_bridge.safety.drive_timeout_seconds", "services.serial_mcu_bridge.serial.port"),
         ]
@@ -693,7 +674,7 @@ class TestPasswords:
         assert warning == "local_mqtt.password: is not sent: there is no username"
 
     def test_passwords_in_addresses_and_settings_are_hidden_too(self) -> None:
-        raw = at("web_interface.mqtt_history.uri", f"mongodb://me:{self.SECRET.split()[0]}@db.example/x")
+        raw = at("services.ros1_bridge.uri", f"mongodb://me:{self.SECRET.split()[0]}@db.example/x")
         raw["transport"] = {"kind": "other", "settings": {"api_token": "t0k3n", "list": [{"secret": "s3cret"}]}}
         shown = json.dumps(resolved(read(raw)))
         assert "mongodb://***@db.example/x" in shown
@@ -710,7 +691,7 @@ class TestPasswords:
             ],
         }
         raw = at("services.video_stream", stream)
-        raw["services"]["mqtt_bridge"] = {"audio_control": {"publisher_env": {"X": "y0u"}}}
+        raw["services"]["mqtt_bridge"] = {"audio_control": {"env": {"X": "y0u"}}}
         raw["transport"] = {"kind": "other", "settings": {"API_KEY": "an0ther"}}
         shown = resolved(read(raw))
         assert shown["services"]["video_stream"]["env"] == dict.fromkeys(stream["env"], "***")
@@ -785,8 +766,11 @@ class TestWebInterface:
         ("keys", "expected"),
         [
             ({"mqtt": {"port": 8883}}, "mqtt: not used: it has no host"),
-            ({"mqtt_history": {"enabled": True}}, "mqtt_history: is not used: enable services.recorder"),
-            ({"robots": [{"id": "goob", "name": "Goob"}]}, "robots: names are not used, robots announce themselves"),
+            ({"mqtt_history": {"enabled": True}}, "mqtt_history: no longer used, `services.recorder` records into"),
+            (
+                {"robots": [{"id": "goob", "name": "Goob"}]},
+                "robots: no longer used, robots are found by",
+            ),
         ],
     )
     def test_keys_without_an_effect_are_reported(self, keys: dict[str, Any], expected: str) -> None:

@@ -39,7 +39,7 @@ def test_every_channel_has_its_lines(channel: Channel) -> None:
     meaning, route = lines
     assert channel.kind.name in meaning
     assert channel.doc in meaning
-    paths = [] if channel.override is None else [channel.override.topic]
+    paths = [] if channel.override is None else [channel.override]
     assert [path for path in paths if f"`{path}`" not in route] == []
 
 

@@ -110,7 +110,10 @@ def _config(run_dir: Path, launcher: dict[str, Any]) -> dict[str, Any]:
         "robot": {"id": "rover"},
         "transport": {"kind": "mqtt", "run_dir": str(run_dir)},
         "local_mqtt": {"password": "hush"},
-        "services": {"launcher": launcher},
+        "services": {
+            "defaults": {"retained_publish_interval_seconds": launcher.pop("republish_s", 3600)},
+            "launcher": launcher,
+        },
     }
 
 

@@ -46,8 +46,7 @@ def test_children_start_in_order_and_their_readiness_is_published(launch: Launch
 def test_retained_state_is_published_again_on_its_interval(launch: Launch) -> None:
     robot = launch(
         ("bridge", "good", CONNECTION),
-        retained_publish_interval_seconds=0.1,
-        capabilities={"publish_interval_seconds": 0.1},
+        republish_s=0.1,
     )
     assert until(lambda: len(robot.published("status")) > 10 and len(robot.published("capabilities")) > 5)
     stamps = [one["payload"]["t"] for one in robot.published("capabilities")]
@@ -198,7 +197,7 @@ def test_the_reason_why_nothing_is_published_is_logged(launch: Launch) -> None:
 
 
 def test_a_killed_announcer_is_started_again_and_receives_what_it_missed(launch: Launch) -> None:
-    robot = launch(("serial", "good", DEVICE), retained_publish_interval_seconds=600)
+    robot = launch(("serial", "good", DEVICE), republish_s=600)
     assert robot.ready("serial", "announcer")
     os.kill(robot.children()["announcer"], signal.SIGKILL)
     assert until(lambda: robot.services()["announcer"] == {"state": "ready", "restarts": 1, "last_exit": "signal 9"})
@@ -357,7 +356,7 @@ def test_a_second_signal_ends_everything_at_once(launch: Launch) -> None:
 
 
 def test_childrens_lines_become_records(launch: Launch) -> None:
-    robot = launch(("serial_mcu_bridge:imu", "talker", DEVICE), logs={"max_message_chars": 100})
+    robot = launch(("serial_mcu_bridge:imu", "talker", DEVICE))
     assert until(lambda: any(record["level"] == "ERROR" for record in robot.logs()), 20)
     assert until(lambda: any("tail" in record["message"] for record in robot.logs()), 20)
     records = [record for record in robot.logs() if record["service"] == "serial_mcu_bridge:imu"]
@@ -372,7 +371,7 @@ def test_childrens_lines_become_records(launch: Launch) -> None:
         ("ERROR", '  File "somewhere.py", line 1, in <module>'),
         ("ERROR", "ValueError: seven"),
         ("INFO", "and goes on"),
-        ("INFO", "x" * (97 - len("[serial_mcu_bridge:imu] ")) + "..."),
+        ("INFO", "x" * (2045 - len("[serial_mcu_bridge:imu] ")) + "..."),
         ("INFO", "caf\ufffd and a tail without newline"),
     ]
     assert {"t", "level", "service", "message", "logger", "pid"} == set(records[0])
@@ -443,15 +442,10 @@ def test_an_mqtt_robot_has_no_hub() -> None:
     assert arm == ("serial_mcu_bridge:arm", "pebble.services.serial_mcu_bridge", ("None", "arm"), Stage.DEVICE)
 
 
-DEVICES = {"enabled": True, "env": {"MARK": "d"}, "cwd": "cameras"}
+DEVICES = {"enabled": True, "env": {"MARK": "d"}}
 CONTROLS = {
-    "video_control": {"env": {"MARK": "v"}, "stop_timeout": 4},
-    "audio_control": {
-        "env": {"MARK": "a"},
-        "publisher_env": {"MARK": "p"},
-        "receiver_env": {"MORE": "r"},
-        "stop_timeout": 0,
-    },
+    "video_control": {"env": {"MARK": "v"}},
+    "audio_control": {"env": {"MARK": "a"}},
 }
 
 
@@ -485,10 +479,9 @@ def test_camera_and_microphone_start_with_the_robot_and_media_only_when_they_are
     assert [name for name, program in table.items() if program.may_request] == ["mqtt_bridge"]
     assert [name for name, program in table.items() if program.preloaded] == ["announcer", "mqtt_bridge"]
     assert (table["av_daemon"].stage, table["camera_publisher"].stage) == (Stage.DEVICE, Stage.CONNECTION)
-    assert (table["av_daemon"].environment, table["av_daemon"].folder) == ({"MARK": "d"}, Path("/robots/cameras"))
+    assert table["av_daemon"].environment == {"MARK": "d"}
     environments = [table[name].environment for name in list(table)[3:]]
-    assert environments == [{"MARK": "v"}, {"MARK": "p"}, {"MARK": "a", "MORE": "r"}]
-    assert [table[name].stop_timeout_s for name in list(table)[3:]] == [4, 0, 0]
+    assert environments == [{"MARK": "v"}, {"MARK": "a"}, {"MARK": "a"}]
 
 
 @pytest.mark.parametrize(

@@ -6,18 +6,18 @@ from collections.abc import Iterator
 
 import pytest
 
-from pebble.config.tree import LogsSection
 from pebble.contract.payloads import LogRecord
+from pebble.launcher import log_forwarding
 from pebble.launcher.log_forwarding import LevelReader, LogForwarder, NonBlockingWriter, OwnRecords, cut, text_of
 
 
 class Forwarded:
     """A forwarder whose stderr is a pipe."""
 
-    def __init__(self, logs: LogsSection) -> None:
+    def __init__(self) -> None:
         self.read_end, self.write_end = os.pipe2(os.O_NONBLOCK)
         self.records: list[LogRecord] = []
-        self.forwarder = LogForwarder(self.records.append, logs, stderr=self.write_end)
+        self.forwarder = LogForwarder(self.records.append, stderr=self.write_end)
 
     def written(self) -> str:
         try:
@@ -31,8 +31,9 @@ class Forwarded:
 
 
 @pytest.fixture
-def forwarded() -> Iterator[Forwarded]:
-    made = Forwarded(LogsSection(min_level="WARNING", max_message_chars=64))
+def forwarded(monkeypatch: pytest.MonkeyPatch) -> Iterator[Forwarded]:
+    monkeypatch.setattr(log_forwarding, "_LEAST", log_forwarding.LEVELS.index("WARNING"))
+    made = Forwarded()
     yield made
     made.close()
 
@@ -53,8 +54,8 @@ def test_what_is_below_the_least_level_stays_here(forwarded: Forwarded) -> None:
 
 
 def test_a_message_is_cut_with_its_name_counted(forwarded: Forwarded) -> None:
-    forwarded.forwarder.child_line("x", 1, "12:00:00 [ERROR] " + "y" * 1000)
-    assert forwarded.records[0].message == "[x] " + "y" * 57 + "..."
+    forwarded.forwarder.child_line("x", 1, "12:00:00 [ERROR] " + "y" * 3000)
+    assert forwarded.records[0].message == "[x] " + "y" * 2041 + "..."
 
 
 def test_children_do_not_share_a_traceback(forwarded: Forwarded) -> None:

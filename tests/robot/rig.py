@@ -332,7 +332,7 @@ class Rig:
 
     def _actions(self) -> dict[str, Any]:
         def recorder(name: str) -> dict[str, Any]:
-            return {"command": ["sh", "-c", f"echo {name} >> {self.folder}/actions.txt"], "cooldown_seconds": 0}
+            return {"command": ["sh", "-c", f"echo {name} >> {self.folder}/actions.txt"]}
 
         return {f"{name}_control": recorder(name) for name in ("reboot", "service_restart", "git_pull")}
 

@@ -196,7 +196,7 @@ class WorldRig(Rig):
 
     def _playback(self) -> dict[str, Any]:
         player = [sys.executable, "-m", "pebble.simulation.loudspeaker", "--record", str(self._record)]
-        return {"directory": str(self.sounds), "player_command": player, "scan_interval": 1.0}
+        return {"directory": str(self.sounds), "player_command": player}
 
     def _environment(self) -> dict[str, str]:
         return {"TIMING": str(self.world.folder / "timing"), "PYTHONPATH": str(ROOT)}

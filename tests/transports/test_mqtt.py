@@ -1180,7 +1180,6 @@ def test_tls_checks_host_name_and_authority_and_shows_a_certificate(
         ({"ca_cert": "make.sh"}, "tls.ca_cert: .*make.sh cannot be used"),
         ({"client_key": "server.key"}, "tls.client_cert: .*client.crt cannot be used"),
         ({"client_cert": "make.sh"}, "tls.client_cert: .*make.sh cannot be used"),
-        ({"ciphers": "NO-SUCH-CIPHER"}, "NO-SUCH-CIPHER cannot be used"),
     ],
 )
 def test_tls_mistakes_are_one_clear_error(clients: Clients, wrong: dict[str, Any], words: str) -> None:

@@ -133,8 +133,6 @@ def _tls(tls: TlsSettings | None) -> dict[str, Any]:
     """One certificate for both directions. With a configured CA both sides must present one that it signed."""
     if tls is None:
         return {}
-    if tls.ciphers is not None:
-        raise TransportError("transport.tls.ciphers: Zenoh does not support this setting, remove it")
     link: dict[str, Any] = {"verify_name_on_connect": not tls.insecure}
     if tls.ca_cert is not None:
         link["root_ca_certificate"] = str(tls.ca_cert)

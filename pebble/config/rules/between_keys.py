@@ -19,7 +19,7 @@ from pebble.config.rules.shared_topics import shared_topics
 from pebble.config.secret_text import without_login
 from pebble.config.text_files import NotTextError, read_text
 from pebble.config.transport import Mqtt, Tls, TransportSection
-from pebble.config.tree import MqttBridge, Root, SerialBridge, SerialBridges, SerialSafety, Services
+from pebble.config.tree import MqttBridge, Root, SerialBridge, SerialBridges, Services
 from pebble.config.types import Secret
 from pebble.config.web import WebInterface, WebMqtt, WebTls
 from pebble.contract import DRIVE, OUTGOING, channel_of, is_reserved
@@ -27,7 +27,6 @@ from pebble.contract.identity import GATEWAYS, SERVERS
 
 MOST_NEIGHBOURS, MOST_METRICS = 16, 32  # of one robot; metrics of one neighbour
 _MOST_HOSTS = 8  # in a list of brokers: each that is hung takes two seconds of a round
-_LATER = ("ros1_bridge",)
 _TLS = ("tls/", "quic/")  # endpoints of Zenoh that are encrypted
 _LONGEST_TEXT = 65535  # bytes of a user name or password (MQTT 3.1.1, section 1.5.3)
 _VARIABLE = re.compile("[A-Z_][A-Z0-9_]*").fullmatch  # as they are usually written; else it may be a password
@@ -79,9 +78,8 @@ def _transport(reader: Reader, transport: TransportSection, path: Path) -> Trans
 
 
 def _services(reader: Reader, services: Services, path: Path) -> Services:
-    for name in _LATER:
-        if getattr(services, name).enabled:
-            reader.notes.warning((*path, name), "is enabled, but arrives in a later release; skipped")
+    if services.ros1_bridge.get("enabled"):
+        reader.notes.warning((*path, "ros1_bridge"), "is enabled, but arrives in a later release; skipped")
     if services.video_stream.enabled and not services.video_stream.command:
         reader.notes.doubt((*path, "video_stream", "command"), "is missing, write the program that streams the video")
     if services.soundboard_handler.enabled and not services.soundboard_handler.playback.player_command:
@@ -189,15 +187,6 @@ def _serial_line(reader: Reader, line: SerialBridge, path: Path, ports: dict[str
         ports[port] = name
 
 
-def _safety(reader: Reader, safety: SerialSafety, path: Path) -> SerialSafety:
-    """Two keys of the original that have no effect: the motors always stop, and stale commands never move them."""
-    if not safety.ignore_retained_drive:
-        reader.notes.warning((*path, "ignore_retained_drive"), "false has no effect: a retained one is never executed")
-    if not safety.stop_on_shutdown:
-        reader.notes.warning((*path, "stop_on_shutdown"), "false has no effect: the last line is always a stop")
-    return safety
-
-
 def _tls(reader: Reader, tls: Tls, path: Path) -> Tls:
     files = {key: getattr(tls, key) for key in ("ca_cert", "client_cert", "client_key")}
     named = {key: file for key, file in files.items() if file is not None}
@@ -228,11 +217,6 @@ def _web(reader: Reader, web: WebInterface, path: Path) -> WebInterface:
             f"other machines reach {web.host}, so the page starts only with a certificate and a user: run "
             f"`pebble cert init` and `pebble web user add`, write web_interface.tls; or leave out host",
         )
-    if web.mqtt_history.enabled:
-        reader.notes.warning((*path, "mqtt_history"), "is not used: enable services.recorder, which records into files")
-    if any(robot.get("name") for robot in web.robots):
-        text = "names are not used, robots announce themselves: write robot.name in each robot's own config"
-        reader.notes.warning((*path, "robots"), text)
     if not web.mqtt.host and web.mqtt != WebMqtt():
         reader.notes.warning((*path, "mqtt"), "not used: it has no host, so the page connects to the robot's broker")
     if web.plain_http and web.tls.certificate is not None:
@@ -334,7 +318,6 @@ CHECKS = _table(
     (MqttBridge, _bridge),
     (Neighbours, _neighbours),
     (SerialBridges, _serial),
-    (SerialSafety, _safety),
     (Tls, _tls),
     (Mqtt, _mqtt),
     (WebTls, _web_tls),

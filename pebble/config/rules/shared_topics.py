@@ -44,7 +44,7 @@ def _keys(channel: Channel, root: Root) -> Iterator[tuple[Path, str | None]]:
     if channel.override is None:
         yield (), None
         return
-    keys = tuple(channel.override.topic.split("."))
+    keys = tuple(channel.override.split("."))
     if keys[:2] != _SERIAL:
         yield keys, _at(root, keys)
         return

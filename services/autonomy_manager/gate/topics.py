@@ -38,8 +38,7 @@ class TopicRules:
         """The rules for a robot's config, with its renamed topics."""
         lines = [name for name, line in config.serial_instances().items() if SERIAL_PROTOCOLS[line.protocol].drives]
         drive = {Addresses(view_of(config, name))[DRIVE].topic for name in ("", *lines)}
-        by_ros = config.services.ros1_bridge.topics.drive_values
-        drive |= {DRIVE.topic(config.base), *((by_ros,) if by_ros is not None else ())}
+        drive.add(DRIVE.topic(config.base))
         return cls(frozenset(drive), frozenset({Addresses(config)[AUTONOMY_COMMAND].topic}))
 
     def rule(self, topic: str) -> Rule:

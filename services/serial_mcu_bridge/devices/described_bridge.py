@@ -93,7 +93,6 @@ class DescribedBridge(SerialService):
         elif state is LineState.ABSENT:
             self.watchdog.end()
             self._handle_events(self._session.closed())
-            self.exit_if_configured()
         self._arm()
 
     def on_input(self, chunk: bytes) -> None:

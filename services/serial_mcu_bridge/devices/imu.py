@@ -81,15 +81,12 @@ class ImuWatchdog:
     """
 
     def __init__(self, options: SerialBridge, instance: str) -> None:
-        self._configured = options.health.imu_sample_timeout_seconds
         self._is_imu = SERIAL_PROTOCOLS[options.protocol].has_imu(instance)
         self._since: float | None = None  # the newest sample, or the opening of the line
 
     @property
     def timeout_s(self) -> float:
         """0 for never."""
-        if self._configured is not None:
-            return self._configured
         return TIMEOUT_S if self._is_imu else 0.0
 
     def found_imu(self) -> None:

@@ -38,7 +38,6 @@ class ImuBridge(SerialService):
             self._watchdog.begin(self.clock())
         else:
             self._watchdog.end()
-            self.exit_if_configured()
 
     def on_input(self, chunk: bytes) -> None:
         for line in self._splitter.feed(chunk):

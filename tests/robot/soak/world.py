@@ -39,7 +39,7 @@ class World:
         self._folder.mkdir(mode=0o700)
         self.remote = Broker(self._folder, persistence=True, autosave=False)
         self.older: dict[str, bytes] = {}  # what the remote broker saved some time ago
-        never = {"command": ["true"], "cooldown_seconds": 10}
+        never = {"command": ["true"]}
         actions = {f"{name}_control": never for name in ("reboot", "service_restart", "git_pull")}
         self.rig = Rig(
             transport,

@@ -36,7 +36,7 @@ class ManagerRig(ProgramRobot):
         self.root.mkdir()
         self.drives: list[dict[str, Any]] = []
         self.world.transport.subscribe(f"{self.world.base}/incoming/drive-values", self._on_drive, direct=True)
-        times = {"scan_interval_seconds": 1, "stop_timeout_seconds": 2}
+        times = {"stop_timeout_seconds": 2}
         self.section: dict[str, Any] = {"enabled": True, "autonomy_root": str(self.root), **times, **section}
         self.section["scripts"] = {}
         self.raw["services"] = {"autonomy_manager": self.section}

@@ -148,8 +148,9 @@ def test_silence_is_an_error(
 
 
 class TestCaptureProgram:
-    def test_one_that_does_not_want_to_end_is_killed(self) -> None:
-        program = CaptureProgram(["sh", "-c", "trap '' TERM; echo up; while :; do sleep 0.05; done"], stop_s=0.2)
+    def test_one_that_does_not_want_to_end_is_killed(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setattr(capture_program, "_STOP_S", 0.2)
+        program = CaptureProgram(["sh", "-c", "trap '' TERM; echo up; while :; do sleep 0.05; done"])
         assert program.read() == b"up\n"
         begin = time.monotonic()
         program.close()

@@ -157,5 +157,5 @@ def test_a_wrong_device_is_one_line(path: Path, device: str, problem: str) -> No
 
 
 def test_a_world_that_is_expected_is_looked_for_without_growing_delays() -> None:
-    health = Health(restart_delay_s=2.0)
+    health = Health(2.0)
     assert [health.failed("absent", expected=True) for _ in range(4)] == [2.0, 2.0, 2.0, 2.0]

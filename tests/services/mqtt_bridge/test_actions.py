@@ -7,13 +7,12 @@ import sys
 import threading
 import time
 from pathlib import Path
-from typing import Any
 
 import pytest
 
 from pebble.config import SystemControl
-from pebble.contract import CHANNELS, Kind
-from pebble.services.mqtt_bridge.actions import ACTIONS, OUTPUT_BYTES, Action, SystemActions
+from pebble.contract import CHANNELS, GIT_PULL, REBOOT, Channel, Kind
+from pebble.services.mqtt_bridge.actions import ACTIONS, OUTPUT_BYTES, Action, Row, SystemActions
 from tests.services.mqtt_bridge.bridge_rig import make_config
 from tests.support import until
 
@@ -28,8 +27,12 @@ class Clock:
         return self.now
 
 
-def control(code: str, **more: Any) -> SystemControl:
-    return SystemControl(command=(sys.executable, "-c", code), **more)
+def row(channel: Channel, cooldown_s: float = 0.0) -> Row:
+    return Row(channel, "", cooldown_s)
+
+
+def control(code: str) -> SystemControl:
+    return SystemControl(command=(sys.executable, "-c", code))
 
 
 def finished(action: Action) -> bool:
@@ -40,16 +43,15 @@ def test_the_table_has_a_row_for_every_action_of_the_contract() -> None:
     assert {row.channel for row in ACTIONS} == {channel for channel in CHANNELS if channel.kind is Kind.ACTION}
 
 
-@pytest.mark.parametrize(
-    ("section", "cooldown_s"), [("reboot_control", 30), ("service_restart_control", 10), ("git_pull_control", 60)]
-)
-def test_cooldowns_unless_configured(section: str, cooldown_s: float) -> None:
-    assert getattr(make_config().services.mqtt_bridge, section).cooldown_seconds == cooldown_s
+def test_the_cooldowns() -> None:
+    assert [(row.section, row.cooldown_s) for row in ACTIONS] == [
+        ("reboot_control", 30), ("service_restart_control", 10), ("git_pull_control", 60)
+    ]  # fmt: skip
 
 
 def test_a_cooldown_begins_with_the_first_run_and_not_with_the_machine(tmp_path: Path) -> None:
     clock = Clock()
-    action = Action("reboot", control("pass", cooldown_seconds=30), folder=tmp_path, clock=clock)
+    action = Action(row(REBOOT, 30.0), control("pass"), folder=tmp_path, clock=clock)
     assert action.request()
     assert finished(action)
     clock.now = 29.9
@@ -60,7 +62,7 @@ def test_a_cooldown_begins_with_the_first_run_and_not_with_the_machine(tmp_path:
 
 
 def test_zero_is_a_cooldown(tmp_path: Path) -> None:
-    action = Action("reboot", control("pass", cooldown_seconds=0.0), folder=tmp_path, clock=Clock())
+    action = Action(row(REBOOT), control("pass"), folder=tmp_path, clock=Clock())
     for _ in range(3):
         assert action.request()
         assert finished(action)
@@ -69,7 +71,7 @@ def test_zero_is_a_cooldown(tmp_path: Path) -> None:
 def test_refused_while_it_runs(tmp_path: Path) -> None:
     gate = tmp_path / "gate"
     code = f"import os\nwhile not os.path.exists({str(gate)!r}): pass"
-    action = Action("git-pull", control(code), folder=tmp_path, clock=Clock())
+    action = Action(row(GIT_PULL), control(code), folder=tmp_path, clock=Clock())
     assert action.request()
     assert not action.request()
     gate.touch()
@@ -82,7 +84,7 @@ def test_runs_without_a_shell_in_its_folder_with_its_environment(tmp_path: Path)
     code = "import os, sys; open('said', 'w').write(os.environ['MARK'] + sys.argv[1])"
     words = (sys.executable, "-c", code, "; touch oops $MARK")
     as_configured = SystemControl(command=words, cwd=tmp_path, env={"MARK": "m"})
-    action = Action("git-pull", as_configured, folder=tmp_path, clock=Clock())
+    action = Action(row(GIT_PULL), as_configured, folder=tmp_path, clock=Clock())
     assert action.request()
     assert finished(action)
     assert (tmp_path / "said").read_text() == "m; touch oops $MARK"
@@ -99,7 +101,7 @@ def test_a_line_of_text_is_split_as_a_shell_would(tmp_path: Path) -> None:
 def test_its_words_and_its_output_stay_in_a_file_on_the_robot(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level(logging.DEBUG)
     code = "import sys; print('pulls from https://deploy:ghp_TOKEN@git.example'); sys.exit(3)"
-    action = Action("flags/git-pull", control(code), folder=tmp_path / "state", clock=Clock())
+    action = Action(row(GIT_PULL), control(code), folder=tmp_path / "state", clock=Clock())
     assert action.request()
     output = tmp_path / "state" / "git-pull.log"
     assert until(lambda: f"flags/git-pull ended with exit code 3, its output is in {output}" in caplog.messages)
@@ -109,7 +111,7 @@ def test_its_words_and_its_output_stay_in_a_file_on_the_robot(tmp_path: Path, ca
 
 
 def test_the_file_holds_the_newest_run_and_a_part_of_endless_output(tmp_path: Path) -> None:
-    action = Action("git-pull", control("print('x' * 1_000_000)", cooldown_seconds=0), folder=tmp_path, clock=Clock())
+    action = Action(row(GIT_PULL), control("print('x' * 1_000_000)"), folder=tmp_path, clock=Clock())
     for _ in range(2):
         assert action.request()
         assert finished(action)
@@ -119,13 +121,13 @@ def test_the_file_holds_the_newest_run_and_a_part_of_endless_output(tmp_path: Pa
 def test_runs_also_where_no_file_can_be_written(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level(logging.INFO)
     (tmp_path / "state").touch()  # a file where the folder is expected
-    action = Action("git-pull", control("print('done')"), folder=tmp_path / "state", clock=Clock())
+    action = Action(row(GIT_PULL), control("print('done')"), folder=tmp_path / "state", clock=Clock())
     assert action.request()
     assert until(lambda: "git-pull ended with exit code 0, its output is lost: File exists: " in caplog.text)
 
 
 def test_a_missing_command_is_one_warning(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    action = Action("reboot", SystemControl(), folder=tmp_path, clock=Clock())
+    action = Action(row(REBOOT), SystemControl(), folder=tmp_path, clock=Clock())
     assert [action.request() for _ in range(5)] == [False] * 5
     assert len([record for record in caplog.records if record.levelno == logging.WARNING]) == 1
 
@@ -133,21 +135,18 @@ def test_a_missing_command_is_one_warning(tmp_path: Path, caplog: pytest.LogCapt
 def test_a_program_that_is_not_there_is_an_error_that_does_not_quote_it(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    action = Action("reboot", SystemControl(command=("/no/such/TOKEN",)), folder=tmp_path, clock=Clock())
+    action = Action(row(REBOOT), SystemControl(command=("/no/such/TOKEN",)), folder=tmp_path, clock=Clock())
     assert not action.request()
     assert "reboot failed: its command or cwd: No such file or directory" in caplog.text
     assert "TOKEN" not in caplog.text
 
 
 @pytest.mark.parametrize("command", [(sys.executable, "-c", "input()"), ("/no/such/program",)])
-@pytest.mark.parametrize("cooldown_s", [0, 1000])
 def test_a_flood_of_requests_is_a_few_lines_of_the_log(
-    command: tuple[str, ...], cooldown_s: float, tmp_path: Path, caplog: pytest.LogCaptureFixture
+    command: tuple[str, ...], tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     caplog.set_level(logging.DEBUG)
-    controls = {
-        row.section: {"command": list(command), "cooldown_seconds": cooldown_s, "cwd": str(tmp_path)} for row in ACTIONS
-    }
+    controls = {row.section: {"command": list(command), "cwd": str(tmp_path)} for row in ACTIONS}
     actions = SystemActions(make_config(**controls).services.mqtt_bridge, folder=tmp_path)
     threads, before = threading.active_count(), time.monotonic()
     for _ in range(40):
@@ -159,7 +158,7 @@ def test_a_flood_of_requests_is_a_few_lines_of_the_log(
 
 def test_leaves_no_thread_behind(tmp_path: Path) -> None:
     before = threading.active_count()
-    action = Action("reboot", control("pass"), folder=tmp_path, clock=Clock())
+    action = Action(row(REBOOT), control("pass"), folder=tmp_path, clock=Clock())
     assert action.request()
     assert finished(action)
     assert until(lambda: threading.active_count() == before)

@@ -11,7 +11,7 @@ from contextlib import suppress
 import pytest
 
 from pebble.runtime.parent import NOTIFY_FD
-from pebble.services.serial_mcu_bridge.devices import peers
+from pebble.services.serial_mcu_bridge.devices import imu, peers
 from pebble.services.serial_mcu_bridge.pebble_serial_v1 import host
 from pebble.services.serial_mcu_bridge.pebble_serial_v1.host import SILENCE_S
 from pebble.transports import QoS
@@ -382,9 +382,10 @@ def test_thousands_of_hostile_frames_do_not_stop_the_bridge(memory_rig: SerialRi
 
 
 @pytest.mark.alone
-def test_a_silent_inertial_sensor_ends_the_process(memory_rig: SerialRig) -> None:
+def test_a_silent_inertial_sensor_ends_the_process(memory_rig: SerialRig, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(imu, "TIMEOUT_S", 1.0)
     mcu = memory_rig.mcu(IMU)
-    running = memory_rig.bridge(health={"imu_sample_timeout_seconds": 1.0}, log_level="INFO")
+    running = memory_rig.bridge(log_level="INFO")
     mcu.stream(100, motion())
     assert memory_rig.got("sensors/imu-fast")
     time.sleep(1.2)
@@ -403,9 +404,10 @@ def test_only_an_inertial_sensor_must_not_be_silent(memory_rig: SerialRig, manif
     assert running.service.watchdog.timeout_s == timeout_s < SILENCE_S  # type: ignore[attr-defined]
 
 
-def test_an_absent_sensor_is_waited_for(memory_rig: SerialRig) -> None:
+def test_an_absent_sensor_is_waited_for(memory_rig: SerialRig, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(imu, "TIMEOUT_S", 0.5)
     mcu = memory_rig.mcu(IMU)
-    running = memory_rig.bridge(health={"imu_sample_timeout_seconds": 0.5})
+    running = memory_rig.bridge()
     mcu.stream(100, motion())
     assert memory_rig.got("sensors/imu-fast")
     mcu.unplug()
@@ -413,14 +415,6 @@ def test_an_absent_sensor_is_waited_for(memory_rig: SerialRig) -> None:
     assert running.alive
     mcu.plug()
     memory_rig.described("goob-imu-nano")
-
-
-def test_the_process_may_end_when_the_port_fails(memory_rig: SerialRig) -> None:
-    mcu, running = memory_rig.up(LAMP, health={"exit_on_serial_error": True})
-    mcu.unplug()
-    assert until(lambda: not running.alive, 3)
-    assert running.error is not None
-    assert until(lambda: memory_rig.world.newest_raw("mcu/lamp-1/describe") == [])
 
 
 def test_a_refused_alias_is_logged_and_its_interface_still_works(

@@ -12,7 +12,6 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from pebble.config import SerialBridge
-from pebble.config.tree import SerialHealth
 from pebble.contract import DRIVE, MCU_DESCRIBE, codec
 from pebble.contract.payloads import McuManifest
 from pebble.services.mqtt_bridge.private_topics import PrivateTopics
@@ -273,13 +272,10 @@ def test_the_number_of_peer_devices_is_bounded() -> None:
         ({"protocol": "imu_mpu6050_v1"}, "", 5.0),
         ({"protocol": "pebble_serial_v1"}, "imu", 5.0),
         ({"protocol": "pebble_serial_v1"}, "outlets", 0.0),
-        ({"protocol": "imu_mpu6050_v1", "timeout": 0.0}, "", 0.0),
-        ({"protocol": "pebble_serial_v1", "timeout": 2.0}, "outlets", 2.0),
     ],
 )
 def test_which_lines_have_a_timeout(section: dict[str, object], instance: str, expected: float) -> None:
-    health = SerialHealth(imu_sample_timeout_seconds=section.pop("timeout", None))  # type: ignore[arg-type]
-    watchdog = ImuWatchdog(SerialBridge(health=health, **section), instance)  # type: ignore[arg-type]
+    watchdog = ImuWatchdog(SerialBridge(**section), instance)  # type: ignore[arg-type]
     assert watchdog.timeout_s == expected
     watchdog.begin(100.0)
     assert watchdog.expired(108.0) == (expected > 0)

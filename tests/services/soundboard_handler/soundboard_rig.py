@@ -49,7 +49,7 @@ class Soundboard(ProgramRobot):
         self.sounds, self.record = self.folder / "sounds", self.folder / "played"
         self.sounds.mkdir()
         self.player = [*LOUDSPEAKER, "--record", str(self.record), *["--exclusive"] * exclusive]
-        options = {"directory": str(self.sounds), "player_command": self.player, "scan_interval": 1, **playback}
+        options = {"directory": str(self.sounds), "player_command": self.player, **playback}
         self.raw["services"] = {
             "mqtt_bridge": {"media": {"audio_receiver": {"command": [*self.player, *RAW]}}},
             "soundboard_handler": {"enabled": True, "playback": options},
