@@ -193,7 +193,7 @@ def test_an_environment_of_its_own(launch: Launch) -> None:
     assert robot.ready("bridge")
     robot.order("bridge", "media 1")
     assert robot.ready("media")
-    assert environment_notes(robot) == ["env:red:somewhere else:None"]
+    assert environment_notes(robot) == ["env:red:somewhere-else:None"]
 
 
 def test_each_start_gets_the_encoding_that_was_requested_last(launch: Launch) -> None:
