@@ -231,9 +231,6 @@ class Transport(ABC):
     is_invented: Callable[[str], bool] = staticmethod(lambda _topic: False)
     #: Whether a topic is one of stops: where a backend refuses messages because too many wait, it still takes these.
     is_stop: Callable[[str], bool] = staticmethod(lambda _topic: False)
-    #: Whether a message of a topic may leave now: asked last of all, as a process that stood still goes on with what it
-    #: has in hand.
-    may_leave: Callable[[str], bool] = staticmethod(lambda _topic: True)
     #: Whether the way to the other end is slow: keep little in the kernel, where nothing can go ahead of what waits,
     #: and wait longer for answers, with fewer questions. Set by :meth:`suit_link`; a backend may ignore it.
     is_slow: bool = False
@@ -299,14 +296,13 @@ class Transport(ABC):
         *,
         is_stop: Callable[[str], bool] | None = None,
         is_invented: Callable[[str], bool] | None = None,
-        may_leave: Callable[[str], bool] | None = None,
         skips_retained: Callable[[bytes], bool] | None = None,
         delivers_late: bool | None = None,
         forms: Callable[[Message], Iterable[Message]] | None = None,
     ) -> None:
         """Set what the owner knows of topics and wants of retained messages, before :meth:`open`; None: as it was."""
         self.is_stop, self.is_invented = is_stop or self.is_stop, is_invented or self.is_invented
-        self.skips_retained, self.may_leave = skips_retained or self.skips_retained, may_leave or self.may_leave
+        self.skips_retained = skips_retained or self.skips_retained
         self.forms = forms or self.forms
         self.delivers_late = self.delivers_late if delivers_late is None else delivers_late
 
@@ -391,7 +387,7 @@ class Transport(ABC):
             if self._state is State.CLOSED:
                 self.counters.add("refused")
                 return False
-            accepted = self.may_leave(message.topic) and self._send(message, urgent)
+            accepted = self._send(message, urgent)
             sent = accepted and self._state is State.CONNECTED
             stored = message.retain and remember and self._own.remember(message, sent=sent, shared=shared)
             if accepted:

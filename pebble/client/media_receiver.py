@@ -1,24 +1,19 @@
-"""Receives one robot's pictures, overlays and sound, measures their rate and age, and whether the robot is stopped."""
+"""Receives one robot's pictures and sound, measures their rate and age, and whether the robot is stopped."""
 
 import time
-from collections import deque
 
 from pebble.client.estop_states import RobotEstop
-from pebble.client.overlays import OverlayState
 from pebble.client.viewer import Medium, Viewer
-from pebble.contract import VIDEO_OVERLAYS
 from pebble.media.decode import Decoded, VideoDecoder, encoding_of
 from pebble.media.rate_meter import RateMeter
 from pebble.media.sound import ReceivedSound, SoundDecoder
-from pebble.transports import Message, Subscription, Transport
-
-_SOUNDS = 500  # decoded packets that wait for take_sounds: ten seconds of the usual ones
+from pebble.transports import Transport
 
 
 class MediaReceiver:
     """One robot's pictures and sound. The caller opens and closes ``transport``.
 
-    The transport's threads decode; one other thread may read ``newest`` and call :meth:`take_sounds`.
+    The transport's threads decode; others may read ``newest``.
     """
 
     def __init__(self, transport: Transport, base: str) -> None:
@@ -26,14 +21,10 @@ class MediaReceiver:
         self.newest: Decoded | None = None
         self.pictures, self.sounds = RateMeter(), RateMeter()
         self.encoding: dict[Medium, str] = {}  # of the last payload
-        self.overlays = OverlayState()
         self.estop = RobotEstop(base)
         self.estop.subscribe(transport)
         self._video, self._audio = VideoDecoder(), SoundDecoder()
-        self._received: deque[ReceivedSound] = deque(maxlen=_SOUNDS)
         self.viewer = Viewer(transport, base, self._on_payload)
-        self._transport = transport
-        self._overlay_subscription: Subscription | None = None
 
     def wait_for_capabilities(self, timeout: float) -> None:
         """Wait for the robot's capabilities; raises PebbleError on timeout."""
@@ -42,9 +33,6 @@ class MediaReceiver:
     def request(self, encoding: str | None, *, sound: bool) -> None:
         """Request pictures, and sound if the robot has it. Raises PebbleError if it has no pictures."""
         self.viewer.request("video", encoding)
-        if self._overlay_subscription is None:
-            topic = self.viewer.topic("video", "overlays_topic", VIDEO_OVERLAYS)
-            self._overlay_subscription = self._transport.subscribe(topic, self._on_overlays, direct=True)
         if sound and self.viewer.capabilities.get("audio", {}).get("available"):
             self.viewer.request("audio")
 
@@ -53,13 +41,6 @@ class MediaReceiver:
         self.viewer.repeat_requests()
         if self._video.wants_keyframe:
             self.viewer.request_keyframe(self.encoding.get("video"))
-
-    def take_sounds(self) -> list[ReceivedSound]:
-        """The packets received since the last call, in order of arrival."""
-        taken = []
-        while self._received:
-            taken.append(self._received.popleft())
-        return taken
 
     def summary(self, medium: Medium, now: float) -> str:
         """A line for display: ``h264 10/s 212 kbit/s, 45 ms``; empty while nothing arrives."""
@@ -71,8 +52,6 @@ class MediaReceiver:
         return f"{self.encoding[medium]} {rate:.0f}/s {meter.bitrate(now) / 1000:.0f} kbit/s{age}"
 
     def close(self) -> None:
-        if self._overlay_subscription is not None:
-            self._overlay_subscription.close()
         self.viewer.close()
 
     def on_picture(self, picture: Decoded) -> None:
@@ -82,10 +61,6 @@ class MediaReceiver:
         """Override to get every packet of sound; runs on a thread of the transport."""
 
     # -- the transport's threads, one per medium
-
-    def _on_overlays(self, message: Message) -> None:
-        if not message.retain:
-            self.overlays.receive(message.payload, time.monotonic())
 
     def _on_payload(self, medium: Medium, payload: bytes) -> None:
         if medium == "video":
@@ -110,5 +85,4 @@ class MediaReceiver:
             return
         self.sounds.add(time.monotonic(), len(payload), time.time() - received.captured_ms / 1000)
         self.encoding["audio"] = received.encoding
-        self._received.append(received)
         self.on_sound(received)

@@ -25,7 +25,7 @@ COMMANDS: Final = {
         "demo": ("sim", "run four simulated robots; needs nothing else"),
         "drive": ("drive", "drive a robot with the keys of this terminal"),
         "estop": ("estop", "stop robots until they are reset"),
-        "watch": ("watch", "show a robot's camera and play its microphone"),
+        "watch": ("watch", "write a picture of a robot's camera into a file"),
         "web": ("web.group", "drive, stop and watch robots in a browser"),
         "foxglove": ("foxglove", "show robots live in the Foxglove app"),
     },

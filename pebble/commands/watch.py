@@ -1,10 +1,9 @@
-"""``pebble watch``: receives a robot's pictures and sound, as an operator does."""
+"""``pebble watch``: receives one picture of a robot, as an operator does."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -17,7 +16,7 @@ from pebble.errors import PebbleError
 from pebble.runtime.signals import interrupted_by_signals
 
 if TYPE_CHECKING:
-    from pebble.client.media_receiver import MediaReceiver
+    from pebble.cameras import Picture
 
 _CAPABILITIES_TIMEOUT_S = 5.0  # for the robot's retained capabilities to arrive
 _FIRST_PICTURE_S = 15.0  # a camera that is off takes a moment to open
@@ -36,88 +35,64 @@ EncodingOption = Annotated[
 
 def watch(
     robot: RobotArgument,
+    picture: Annotated[Path, typer.Option(help="The file to write, PNG or JPEG.", metavar="FILE", show_default=False)],
     url: UrlOption = None,
     encoding: EncodingOption = None,
-    sound: Annotated[bool, typer.Option("--sound/--no-sound", help="Play audio.")] = True,
-    seconds: Annotated[float | None, typer.Option("--seconds", "-s", min=0.5, help="Stop after this long.")] = None,
-    out: Annotated[
-        Path | None,
-        typer.Option(help="Write pictures and sound into this folder, even with a screen.", metavar="FOLDER"),
-    ] = None,
-    picture: Annotated[
-        Path | None, typer.Option(help="Only write one picture into this file, PNG or JPEG.", metavar="FILE")
-    ] = None,
     password_file: PasswordFile = None,
     ca_cert: CaCert = None,
 ) -> int:
-    """Show a robot's camera, with what scripts draw over it, and play its microphone, until Ctrl-C.
+    """Write one picture of a robot's camera into a file.
 
-    Opens a window, and plays sound through aplay. Without a screen it writes a picture per second (PNG) and the sound
-    (WAV) into a folder. A robot without a remote broker is shown on its own machine, without sound.
+    A robot without a remote broker is seen on its own machine. The page of `pebble web` shows pictures as they come,
+    with what scripts draw over them, and plays the sound.
 
     \b
-        pebble watch goob.json
-        pebble watch goob --url mqtt://127.0.0.1 --encoding h264 --seconds 10
         pebble watch goob.json --picture front.png
+        pebble watch goob --url mqtt://127.0.0.1 -e h264 --picture front.png
     """
-    from pebble.commands.terminal import screens
+    target = _target(robot, url, password_file, ca_cert)
+    with interrupted_by_signals():  # else the camera would continue without a viewer
+        if target.config is not None and not target.remote:
+            from pebble.cameras import camera  # its shared memory is of Linux only
 
-    if picture is not None:
-        if out is not None or seconds is not None:
-            raise typer.BadParameter("--picture writes one picture, and ends: leave out --out and --seconds")
-        with interrupted_by_signals(), _receiver(robot, url, password_file, ca_cert) as receiver:
-            return _write_picture(receiver, encoding, picture)
-    end = float("inf") if seconds is None else time.monotonic() + seconds
-    with ExitStack() as stack:
-        stack.enter_context(interrupted_by_signals())  # else the camera would continue without a viewer
-        receiver = stack.enter_context(_receiver(robot, url, password_file, ca_cert))
-        screen = stack.enter_context(screens.best(receiver.name, out))
-        receiver.request(encoding, sound=sound and screen.can_play)
-        while time.monotonic() < end and screen.open:
-            receiver.poll()
-            screen.show(receiver)
-            time.sleep(_TICK_S)
-        seen = receiver.pictures.count
-    typer.echo(screen.summary())
-    return 0 if seen else 1
-
-
-def _write_picture(receiver: MediaReceiver, encoding: str | None, file: Path) -> int:
-    from pebble.commands.terminal.screens import save_picture
-
-    receiver.request(encoding, sound=False)
-    end = time.monotonic() + _FIRST_PICTURE_S
-    while receiver.newest is None:
-        if time.monotonic() > end:
-            raise PebbleError(f"no picture came from {receiver.name} within {_FIRST_PICTURE_S:.0f} s")
-        receiver.poll()
-        time.sleep(_TICK_S)
-    save_picture(receiver.newest.picture, file)
-    height, width = receiver.newest.picture.shape[:2]
-    typer.echo(f"{file}: {width}×{height}")
+            typer.echo(f"pebble: {robot} names no remote broker: this machine's camera", err=True)
+            with camera(target.config, timeout=_FIRST_PICTURE_S) as pictures:
+                newest = next(pictures)
+        else:
+            newest = _received(target, encoding)
+    _save(newest, picture)
+    height, width = newest.shape[:2]
+    typer.echo(f"{picture}: {width}×{height}")
     return 0
 
 
-@contextmanager
-def _receiver(robot: str, url: str | None, password_file: Path | None, ca_cert: Path | None) -> Iterator[MediaReceiver]:
+def _received(target: Target, encoding: str | None) -> Picture:
+    """Return the first picture that comes from the operators' broker. Raises PebbleError if none does."""
     from pebble.client.media_receiver import MediaReceiver
 
-    target = _target(robot, url, password_file, ca_cert)
-    with connected(target) as (transport, names):
-        if target.config is not None and not target.remote:
-            from pebble.client.local_camera import LocalReceiver  # its shared memory is of Linux only
+    with connected(target) as (transport, names), closing(MediaReceiver(transport, names.base)) as receiver:
+        put_names(transport, names, lambda base: base == names.base and receiver.estop.named)
+        receiver.wait_for_capabilities(_CAPABILITIES_TIMEOUT_S)
+        receiver.request(encoding, sound=False)
+        end = time.monotonic() + _FIRST_PICTURE_S
+        while receiver.newest is None:
+            if time.monotonic() > end:
+                raise PebbleError(f"no picture came from {receiver.name} within {_FIRST_PICTURE_S:.0f} s")
+            receiver.poll()
+            time.sleep(_TICK_S)
+        return receiver.newest.picture
 
-            typer.echo(f"pebble: {robot} names no remote broker: this machine's camera, without sound", err=True)
-            receiver: MediaReceiver = LocalReceiver(transport, names.base, target.config)
-        else:
-            receiver = MediaReceiver(transport, names.base)
-            estop = receiver.estop
-            put_names(transport, names, lambda base: base == estop.base and estop.named)
-        try:
-            receiver.wait_for_capabilities(_CAPABILITIES_TIMEOUT_S)
-            yield receiver
-        finally:
-            receiver.close()
+
+def _save(picture: Picture, file: Path) -> None:
+    """Write a BGR picture in the format of the file's suffix. Raises PebbleError if that fails."""
+    import cv2
+
+    try:
+        written = cv2.imwrite(str(file), picture)
+    except cv2.error:
+        raise PebbleError(f"{file}: cannot write this kind of picture, name it .png or .jpg") from None
+    if not written:
+        raise PebbleError(f"{file} cannot be written")
 
 
 def _target(robot: str, url: str | None, password_file: Path | None, ca_cert: Path | None) -> Target:

@@ -83,7 +83,7 @@ def _check_sides(notes: Notes, gateway: GatewayFile, operators: Mqtt | None) -> 
     if gateway.hub.listen:
         notes.problem(("hub", "listen"), "must be left out: a gateway is a client of hubs")
     if operators is not None and operators.hosts:
-        why = "cannot be several: gateways agree at one broker; write host, and run others for it"
+        why = "cannot be several: write host, and run a gateway of its own for another broker"
         notes.problem(("mqtt", "hosts"), why)
     if boards is not None and boards.hosts:
         notes.problem(("boards", "hosts"), "cannot be several: write host")

@@ -220,8 +220,7 @@ class GatewayHeartbeat(Payload, frozen=True, kw_only=True):
 
     t: int  # epoch milliseconds
     run: str  # another one at each start
-    number: int  # of this heartbeat, by which its gateway knows when it sent it
-    robots: tuple[str, ...] = ()  # bases of those that it receives at its hub
+    robots: tuple[str, ...] = ()  # bases of those that it carries
 
 
 class NeighbourRefusal(Payload, frozen=True, kw_only=True):

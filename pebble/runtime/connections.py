@@ -198,16 +198,16 @@ def lan_transport(config: Config) -> Transport:
 def gateway_transports(
     gateway: "GatewayFile", operators: Mqtt, run_dir: Path, will: Message
 ) -> tuple[Transport, Transport, Transport, Transport]:
-    """The connections of a gateway: to where the robots are, and three to the operators' broker, one of them for
-    heartbeats alone, and one for stops.
+    """The connections of a gateway: to where the robots are, and three to the operators' broker, one of them for its
+    heartbeats, with its will, and one for stops.
     """
     base = will.topic.removesuffix(f"/{c.ONLINE.suffix}")
     forwards = mqtt_settings(operators, as_published=True, reconnect_max_s=REMOTE_RECONNECT_S)
     apart = mqtt_settings(operators, reconnect_max_s=REMOTE_RECONNECT_S)
     return (
         _robots_transport(gateway, base, run_dir),
-        create("mqtt", f"{base}/forwards", forwards, will=will),
-        create("mqtt", f"{base}/presence", apart),
+        create("mqtt", f"{base}/forwards", forwards),
+        create("mqtt", f"{base}/presence", apart, will=will),
         create("mqtt", f"{base}/stops", apart),
     )
 

@@ -32,18 +32,13 @@ class Way(NamedTuple):
     clock: Callable[[], float]
 
 
-class _Arrived(NamedTuple):
-    value: Any
-    at: float
-
-
 class Neighbour:
     """Robot ``name``; ``me`` is this one. :meth:`pebble.script.Robot.neighbour` makes it. Any thread may use it."""
 
     def __init__(self, name: str, me: str, way: Way) -> None:
         self.name = name
         self._me, self._way = me, way
-        self._newest: dict[str, _Arrived] = {}
+        self._newest: dict[str, tuple[Any, float]] = {}  # by metric: the payload, and when it arrived
         self._topic = TO_NEIGHBOUR.topic(way.addresses.base, robot=name)
         self._sent_at = float("-inf")
         self._moves = False  # the newest command does
@@ -64,8 +59,7 @@ class Neighbour:
         """
         self._way.check()
         self._receive(channel)
-        newest = self._newest.get(channel.metric)
-        return None if newest is None or self._way.clock() - newest.at > max_age else newest.value
+        return self._fresh(channel, max_age)
 
     def drive(self, x: float = 0.0, z: float = 0.0, y: float = 0.0) -> bool:
         """Drive it, as :meth:`Robot.drive` does this one, for 0.3 s at most. False: that has no effect, as far as is
@@ -108,9 +102,12 @@ class Neighbour:
 
     @property
     def _state(self) -> Neighbours | None:
-        newest = self._newest.get(NEIGHBOURS.metric)
-        fresh = newest is not None and self._way.clock() - newest.at <= PRESENT_S
-        return newest.value if newest is not None and fresh else None
+        state: Neighbours | None = self._fresh(NEIGHBOURS, PRESENT_S)
+        return state
+
+    def _fresh(self, channel: Channel, max_age: float) -> Any:
+        value, at = self._newest[channel.metric]
+        return value if self._way.clock() - at <= max_age else None
 
     def _send(self, command: Drive) -> bool:
         raw = codec.encode(TO_NEIGHBOUR, command)
@@ -123,9 +120,8 @@ class Neighbour:
     def _receive(self, channel: Channel) -> None:
         metric = channel.metric
         if metric not in self._newest:
-            self._newest[metric] = _Arrived(None, float("-inf"))
+            self._newest[metric] = None, float("-inf")
             topic = NEIGHBOUR_VALUE.topic(self._way.addresses.base, robot=self.name, metric=metric)
-            self._way.receive(topic, channel, lambda value, **_: self._note(metric, value))
-
-    def _note(self, metric: str, value: Any) -> None:
-        self._newest[metric] = _Arrived(value, self._way.clock())
+            self._way.receive(
+                topic, channel, lambda value, **_: self._newest.update({metric: (value, self._way.clock())})
+            )

@@ -331,12 +331,6 @@ class HostView(Struct, frozen=True, kw_only=True):
     first: bool  # it is the preferred one
 
 
-class GatewaysView(Struct, frozen=True, kw_only=True):
-    """``web/gateways``: which gateways receive the component at their hub; not sent before there was one."""
-
-    names: tuple[str, ...]
-
-
 class OwnerState(Struct, frozen=True, kw_only=True):
     """One motor owner in EstopView."""
 
@@ -440,7 +434,6 @@ class RestartsView(Struct, frozen=True, kw_only=True):
 SERVER_METRICS: dict[str, type] = {
     "web/liveness": Liveness,
     "web/host": HostView,
-    "web/gateways": GatewaysView,
     "web/estop": EstopView,
     "web/driver": DriverView,
     "web/picture": PictureView,

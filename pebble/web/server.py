@@ -16,7 +16,7 @@ from pebble.client.page import WebSettings
 from pebble.client.robot_topics import FLEET, SYNONYMS
 from pebble.config.security import SecurityLevel
 from pebble.contract import AUDIT, CAPABILITIES, CONTROL_STATE, LINK, ONLINE, channel_of
-from pebble.contract.identity import GATEWAYS, SERVERS, Identity, parse_topic
+from pebble.contract.identity import SERVERS, Identity, parse_topic
 from pebble.errors import ConfigError
 from pebble.fleet.audit import Audit
 from pebble.fleet.database import DatabaseError
@@ -27,7 +27,6 @@ from pebble.transports import Message
 from pebble.transports.clock import since_boot as clock
 from pebble.web import messages as m
 from pebble.web.drive.drivers import Drivers
-from pebble.web.gateways import Gateways
 from pebble.web.known_robots import SavedRobots
 from pebble.web.media.chosen_sources import ChosenSources
 from pebble.web.media.pictures_and_sound import PicturesAndSound
@@ -87,10 +86,6 @@ class Server:
             deferred = channel is ONLINE or channel in SYNONYMS
             await self.broker.subscribe(channel.filter("+/+/+"), self.receive, deferred=deferred)
         await self.broker.subscribe(AUDIT.filter("+/+/+"), self.robot_audits.receive, deferred=True)
-        gateways = Gateways()
-        await self.broker.subscribe(
-            ONLINE.filter(f"+/{GATEWAYS}/+"), lambda message, _: self._gateway(gateways, message), deferred=True
-        )
         self.spawn(self._tick())
         if self.settings.login:
             self.spawn(self._watch_people())
@@ -139,15 +134,6 @@ class Server:
         self.drivers.moved(ref)
         if host:
             self.robots.set_server_metric(ref, "web/host", m.HostView(host=host, first=first))
-
-    def _gateway(self, gateways: Gateways, message: Message) -> None:
-        """A gateway tells which components it receives at its hub; nothing once it has gone."""
-        address = parse_topic(message.topic)
-        if address is None:
-            return
-        changed = gateways.receive(address.identity.id, message.payload, self.robots.components)
-        for ref, names in changed.items():
-            self.robots.set_server_metric(ref, "web/gateways", m.GatewaysView(names=names))
 
     def _show_broker(self) -> None:
         view = m.BrokerView(

@@ -6,7 +6,7 @@ script has, ends it by what motor owners publish. A person ends it by any comman
 
 from collections.abc import Callable, Mapping
 
-from pebble.contract.payloads import Drive, EstopState
+from pebble.contract.payloads import Drive, EstopState, NeighbourRefusal
 from pebble.runtime.runs import SUPERSEDED, newest
 from pebble.script.drive_sender import HOLD_S, DriveSender
 
@@ -34,7 +34,7 @@ class Visit:
         self._states: Mapping[str, EstopState] = {}
         self._received = 0  # the newest number of all commands here
         self._person_at = float("-inf")
-        self._refused: dict[str, tuple[int, str]] = {}
+        self._refused: dict[str, NeighbourRefusal] = {}
 
     def command(self, name: str, drive: Drive, now: float) -> bool:
         """A command of a robot that may drive this one. False: it has no effect."""
@@ -87,24 +87,22 @@ class Visit:
         """Whose run drives this robot; empty: none does."""
         return self._who[0] if self._sender is not None and not self._sender.ended(now) else ""
 
-    def refused(self, now: float) -> dict[str, tuple[int, str]]:
-        """By robot its newest run here, and why that has no effect."""
-        found = dict(self._refused)
-        if self._sender is not None and (why := self._sender.refusal(now)):
-            found[self._who[0]] = self._who[1], why
-        return found
+    def refused(self, now: float) -> dict[str, NeighbourRefusal]:
+        """By robot its newest run here, while that has no effect."""
+        why = "" if self._sender is None else self._sender.refusal(now)
+        return self._refused | ({self._who[0]: NeighbourRefusal(run=self._who[1], why=why)} if why else {})
 
     def _start(self, name: str, run: int, now: float) -> None:
-        known, _ = self._refused.get(name, (0, ""))
         why = self._begin(name, run) or (PERSON if now - self._person_at < HOLD_S else "")
         barred = newest(state.last_barred for state in self._states.values())
         number = None if why else self._number(barred, self._received)
         if number is None:
-            if known != run:  # else the first reason is the one to know
-                self._refused[name] = run, why or LOCAL
+            known = self._refused.get(name)
+            if known is None or known.run != run:  # else the first reason is the one to know
+                self._refused[name] = NeighbourRefusal(run=run, why=why or LOCAL)
             return
         if self._sender is not None:
-            self._refused[self._who[0]] = self._who[1], self._sender.refusal(now) or SUPERSEDED
             self._sender.end(SUPERSEDED, now)
+            self._refused = self.refused(now)
         self._refused.pop(name, None)
         self._who, self._sender = (name, run), DriveSender(number, self._publish)

@@ -1,47 +1,13 @@
-"""What a receiver subscribes to besides pictures and sound."""
+"""What is received of a recorded robot."""
 
 from __future__ import annotations
 
-import json
-import time
-
-import pytest
-
 from pebble.client.media_receiver import MediaReceiver
-from pebble.transports import Message, QoS
+from pebble.transports import QoS
 from pebble.transports.memory import MemoryHub, MemoryTransport
-from tests.client.estop_robot import capabilities
 from tests.recordings.demo_robots import DRIVE, FRED, MEDIA, recorded
 from tests.recordings.replayed import Plays
 from tests.support import until
-
-BASE = "pebble/robots/goob"
-SHAPE = json.dumps([[[0.0, 0.0], [1.0, 1.0]]]).encode()
-
-
-@pytest.mark.parametrize("topic", [f"{BASE}/outgoing/video-overlays", "elsewhere/overlays"])
-def test_overlays_come_from_the_topic_in_the_capabilities(topic: str) -> None:
-    hub = MemoryHub()
-    with MemoryTransport("robot", hub) as robot, MemoryTransport("viewer", hub) as viewer:
-        video = {"available": True, "controls": True, "overlays_topic": topic}
-        can = capabilities(BASE, {"video": video})
-        robot.publish(can.topic, can.payload, qos=QoS.DELIVERED, retain=True)
-        old = json.dumps({"source": "old", "shapes": [[[0.0, 1.0], [1.0, 1.0]]]}).encode()
-        retained: list[Message] = []
-        robot.subscribe(topic, retained.append)
-        robot.publish(topic, old, qos=QoS.DELIVERED, retain=True)
-        assert until(lambda: retained)
-        receiver = MediaReceiver(viewer, BASE)
-        receiver.wait_for_capabilities(5)
-        receiver.request(None, sound=False)
-        receiver.request("h264", sound=False)  # does not subscribe twice
-        robot.publish(topic, SHAPE)
-        assert until(lambda: receiver.overlays.current(time.monotonic()).shapes)
-        assert receiver.overlays.current(time.monotonic()).shapes == (((0.0, 0.0), (1.0, 1.0)),)
-        receiver.close()
-        robot.publish(topic, b"7")
-        assert until(lambda: len(retained) == 3)
-        assert receiver.overlays.refused == 0
 
 
 def test_every_recorded_picture_and_sound_is_received(recording: Plays) -> None:

@@ -94,7 +94,7 @@ def test_a_command_imports_no_other() -> None:
         (("doctor", "--running"), "which robot", "pebble doctor --help"),
         (("doctor", "--running", "--report", "a.zip"), "--running or --report", "pebble doctor --help"),
         (("doctor", "goob.json", "--may-move"), "--may-move is for --running", "pebble doctor --help"),
-        (("watch", "goob.json", "--picture", "a.png", "--out", "."), "leave out --out", "pebble watch --help"),
+        (("watch", "goob.json"), "--picture", "pebble watch --help"),
         (("topic", "pub", "drive-values"), "PAYLOAD", "pebble topic pub --help"),
         (("topic", "pub", "drive-values", "{}", "--qos", "2"), "qos", "pebble topic pub --help"),
     ],

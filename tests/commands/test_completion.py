@@ -60,7 +60,7 @@ def bash(folder: Path, line: str) -> list[str]:
         ("pebble topic echo online -r goo", ["goob"]),
         ("pebble topic echo online --config lam", ["lamp.json"]),
         ("pebble script start hall.json da", ["dance"]),
-        ("pebble script start goob foll", ["follow"]),
+        ("pebble script start goob whe", ["wheel-odometry"]),
         ("pebble sim mini", ["minilamp"]),
         ("pebble web us", ["user"]),
         ("pebble conform mini", ["minilamp"]),

@@ -1,4 +1,4 @@
-"""A hub, a broker and gateways between them as processes; robots that count numbered commands, and an operator."""
+"""A hub, a broker and a gateway between them as processes; robots that count numbered commands, and an operator."""
 
 from __future__ import annotations
 
@@ -84,6 +84,15 @@ class Process:
     def start(self) -> None:
         self._process = Forked("tests.fleet.gateway_process", str(self._file))
 
+    @property
+    def printed(self) -> str:
+        return "" if self._process is None else self._process.printed
+
+    def ends(self, within_s: float) -> int | None:
+        """Wait until it has ended; returns its exit status."""
+        assert self._process is not None
+        return self._process.wait(within_s)
+
     def signal(self, number: int) -> None:
         assert self._process is not None
         os.kill(self._process.pid, number)
@@ -103,10 +112,8 @@ class Process:
 class World:
     """One client stands for all robots where there are ``many``, and each is driven once a second."""
 
-    def __init__(
-        self, folder: Path, stack: ExitStack, gateways: int, robots: int, *, proxied: bool, many: bool = False
-    ) -> None:
-        self._folder = folder
+    def __init__(self, folder: Path, stack: ExitStack, robots: int, *, proxied: bool, many: bool = False) -> None:
+        self._folder, self._stack, self._proxied = folder, stack, proxied
         self._hz, self._heartbeat_each = (1, 1) if many else (COMMANDS_HZ, HEARTBEAT_EACH)
         self.broker = Broker(folder, "max_queued_messages 20000")
         stack.callback(self.broker.kill)
@@ -127,15 +134,17 @@ class World:
         beside = create("mqtt", "beside", MqttSettings(host="127.0.0.1", port=self.broker.port)).open(10)
         stack.callback(beside.close)
         beside.subscribe(DRIVE.topic(self.robots[0].base), self._note_direct, direct=True)
-        names = [f"gate-{n}" for n in range(gateways)]
-        ports = self.hub_port, self.broker.port
-        self.gateways = {name: Process(folder, name, *ports, proxied=proxied) for name in names}
-        for one in self.gateways.values():
-            stack.callback(one.close)
+        self.gateway = self.process("gate-1")
         thread = threading.Thread(target=self._drive, daemon=True)
         thread.start()
         stack.callback(thread.join)
         stack.callback(self._ending.set)
+
+    def process(self, name: str) -> Process:
+        """Start a gateway."""
+        process = Process(self._folder, name, self.hub_port, self.broker.port, proxied=self._proxied)
+        self._stack.callback(process.close)
+        return process
 
     def _client(self, name: str, stack: ExitStack) -> Transport:
         connect = (f"tcp/127.0.0.1:{self.hub_port}",)
@@ -187,8 +196,8 @@ class World:
         """Whether each robot has had a command that was sent after ``since``."""
         return all(one.commands and self.sent[one.commands[-1].number] > since for one in self.robots)
 
-    def wait_until_shared(self) -> None:
-        """Wait until every gateway may have its share: after its start, or a fault."""
+    def wait_until_carried(self) -> None:
+        """Wait until every robot is driven without a break: after a start, or a fault."""
         now = time.monotonic()
         assert until(lambda: self.driven(now + 2.5), 60), [len(one.commands) for one in self.robots]
 
@@ -262,8 +271,8 @@ FAULTS: dict[str, Callable[[Process], Callable[[], None]]] = {
 
 
 @contextmanager
-def world(folder: Path, gateways: int = 2, robots: int = 6, **options: bool) -> Iterator[World]:
+def world(folder: Path, robots: int = 6, **options: bool) -> Iterator[World]:
     with ExitStack() as stack:
-        made = World(folder, stack, gateways, robots, **{"proxied": True, **options})
-        made.wait_until_shared()
+        made = World(folder, stack, robots, **{"proxied": True, **options})
+        made.wait_until_carried()
         yield made

@@ -401,8 +401,10 @@ def test_after_a_fault_nothing_comes_twice_late_or_out_of_order(hall: Hall, stac
 @pytest.mark.alone
 def test_goob_follows_fred_while_their_brokers_are_down(hall: Hall, stack: ExitStack) -> None:
     hall.rests()
-    for robot, name in ((hall.fred, "wheel-odometry"), (hall.goob, "wheel-odometry"), (hall.goob, "follow")):
-        hall.start(robot, ROOT / "pebble" / "scripts" / name / "run.py", stack)
+    odometry = ROOT / "pebble" / "scripts" / "wheel-odometry" / "run.py"
+    follow = ROOT / "examples" / "follow-a-robot" / "run.py"
+    for robot, script in ((hall.fred, odometry), (hall.goob, odometry), (hall.goob, follow)):
+        hall.start(robot, script, stack)
     for robot in (hall.fred, hall.goob):
         robot.remote.kill()
         stack.callback(robot.remote.start)

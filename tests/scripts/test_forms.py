@@ -15,7 +15,7 @@ from pebble.services.autonomy_manager.builtin_forms import DEPENDENCIES, SETTING
 from tests.support import ROOT
 
 SCRIPTS = ROOT / "pebble" / "scripts"
-NAMES = ("apriltag-follow", "apriltag-locations", "apriltag-odom-follow", "follow", "wheel-odometry")
+NAMES = ("apriltag-follow", "apriltag-locations", "apriltag-odom-follow", "wheel-odometry")
 #: A path that an operator chooses, a window on the robot's screen, and a topic that the original does not use either.
 CAMERAS = {"width", "height", "fps"}
 LEFT_OUT = {"log_file", "preview", "map_pose_topic"}

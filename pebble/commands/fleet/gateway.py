@@ -8,6 +8,7 @@ from typing import Annotated, Protocol
 
 import typer
 
+from pebble.errors import PebbleError
 from pebble.runtime.signals import EndSignal
 
 log = logging.getLogger(__name__)
@@ -18,9 +19,9 @@ FileArgument = Annotated[Path, typer.Argument(help="The gateway's file, in JSON.
 def gateway(file: FileArgument) -> int:
     """Carry robots of a Zenoh hub, or of a LAN's broker, to an MQTT broker and back; Ctrl-C ends it.
 
-    Operators at the broker see, drive and stop them as if they were there. Run
-    two or three on different machines: they share the robots, and when one dies
-    the others take its robots. An example:
+    Operators at the broker see, drive and stop them as if they were there. There
+    is one gateway for a LAN, which systemd starts again; a second one does not
+    start while it hears the first. An example:
 
     \b
         {"id": "gate-1",
@@ -43,8 +44,7 @@ def gateway(file: FileArgument) -> int:
     from pebble.config.gateway_file import load_gateway
     from pebble.runtime.connections import gateway_transports
     from pebble.runtime.parent import Notifier, set_up_logging
-    from pebble.services.gateway.gateway import Gateway
-    from pebble.services.gateway.heartbeats import will
+    from pebble.services.gateway.gateway import Gateway, will
     from pebble.services.neighbours.board import of_board
 
     settings, name, run_dir = load_gateway(file)
@@ -93,6 +93,9 @@ class _Together:
     def _run(self, program: _Program, ends: EndSignal) -> None:
         try:
             program.run()
+        except PebbleError as error:
+            log.error("%s", error)
+            self._failed = True
         except Exception:  # the process boundary: its manager starts it again
             log.exception("%s has failed", type(program).__name__)
             self._failed = True

@@ -261,10 +261,6 @@ export interface HostView {
   first: boolean;
 }
 
-export interface GatewaysView {
-  names: string[];
-}
-
 export interface EstopView {
   available: boolean;
   latched: boolean;
@@ -335,7 +331,6 @@ export interface BrokerView {
 export interface Metrics {
   "web/liveness": Liveness;
   "web/host": HostView;
-  "web/gateways": GatewaysView;
   "web/estop": EstopView;
   "web/driver": DriverView;
   "web/picture": PictureView;

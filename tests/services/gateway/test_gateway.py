@@ -1,46 +1,54 @@
-"""Gateways with their forwarders in virtual time, between a hub and a broker in memory."""
+"""A gateway with its forwarders in virtual time, between a hub and a broker in memory."""
 
 from __future__ import annotations
 
 import itertools
 import json
 import random
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection
+from dataclasses import replace
+from typing import Any
 
+import msgspec
 import pytest
 
 from pebble.contract import ONLINE
-from pebble.forwarding.routing import Side
-from pebble.services.gateway import carried_robots as module
-from pebble.services.gateway.carried import Beginning, Carried
-from pebble.services.gateway.gateway import Gateway
-from pebble.services.gateway.heartbeats import PresentRobots, will
-from pebble.services.gateway.ownership import FRESH_S, TAKING_S
-from pebble.services.gateway.pace import MOST_EACH, MOST_STOPS, MOST_TOGETHER
-from pebble.transports import Message, Transport, clock
+from pebble.services.gateway import gateway as module
+from pebble.services.gateway.carried_robot import Beginning
+from pebble.services.gateway.gateway import SILENT_S, TICK_S, Gateway, SecondGatewayError, will
+from pebble.services.gateway.pace import LARGEST, MOST_EACH, MOST_STOPS, MOST_TOGETHER
+from pebble.transports import Message, clock
 from tests.forwarding.virtual import Connection, Hub
 from tests.services.mqtt_bridge.bridge_rig import Client
 from tests.support import cases
 
-STEP_S, RECOVERY_S = 0.05, 8.0
-GOOB = "pebble/robots/goob"
+STEP_S, RECOVERY_S = 0.05, 4.0
+GOOB, FRED = "pebble/robots/goob", "pebble/robots/fred"
+
+
+class BoardsConnection(Connection):
+    """A client of a LAN's broker, to whom live messages look like retained ones."""
+
+    as_published = True
+
+    def receive(self, delivery: Any) -> None:
+        message = delivery.message
+        retain = message.retain or bool(message.retain_requested)
+        super().receive(replace(delivery, message=msgspec.structs.replace(message, retain=retain)))
 
 
 class Running:
-    """A gateway and its connections; while it hangs it does nothing, and what is sent to it waits.
+    """A gateway and its connections; while it hangs it does nothing, and what is sent to it waits."""
 
-    While it ``stands`` its turns do not end, and its other threads go on.
-    """
-
-    def __init__(self, world: World, name: str) -> None:
+    def __init__(self, world: World, name: str, *robots: str, hub: type[Connection] = Connection) -> None:
         self.hub, self.broker, self.presence, self.stops = (
-            Connection(f"{name}-hub", world.hub, world),  # type: ignore[arg-type]
-            Connection(f"{name}-forwards", world.broker, world, will=will(name)),  # type: ignore[arg-type]
-            Connection(f"{name}-presence", world.broker, world),  # type: ignore[arg-type]
+            hub(f"{name}-hub", world.hub, world),  # type: ignore[arg-type]
+            Connection(f"{name}-forwards", world.broker, world),  # type: ignore[arg-type]
+            Connection(f"{name}-presence", world.broker, world, will=will(name)),  # type: ignore[arg-type]
             Connection(f"{name}-stops", world.broker, world),  # type: ignore[arg-type]
         )
-        self.gateway = Gateway(name, ["pebble/robots/+"], *self.connections, clock=lambda: world.now)
-        self.hangs = self.stands = False
+        self.gateway = Gateway(name, robots or ["pebble/robots/+"], *self.connections, clock=lambda: world.now)
+        self.hangs = False
         self.gateway.open()
 
     @property
@@ -88,8 +96,6 @@ class World:
             self.rest()
             for one in self.running.values():
                 if not one.hangs:
-                    one.gateway.publish_heartbeat()
-                if not (one.hangs or one.stands):
                     one.gateway.tick()
             self.rest()
 
@@ -141,37 +147,14 @@ def test_a_robot_is_carried_with_all_that_it_retains() -> None:
     assert world.all_pass()
 
 
-def test_a_heartbeat_that_may_be_retained_shows_its_robot_once_another_follows() -> None:
-    present = PresentRobots()
-    for payload in (b"1", b"1"):
-        present.note_copy(GOOB, payload, 0.0)
-    assert present.robots(0.0) == ()
-    present.note_copy(GOOB, b"2", 0.0)
-    assert present.robots(0.0) == (GOOB,)
-
-
-def test_a_successor_takes_what_the_robot_retains_now() -> None:
-    world = World("a", "b")
-    world.run(4)
-    (owner,) = (name for name, one in world.running.items() if GOOB in one.gateway.carries)
-    world.robots[0].publish("outgoing/status", b'{"n": 1}', retain=True)
-    world.run(0.2)
-    world.running[owner].hang()
-    world.robots[0].publish("outgoing/status", b'{"n": 2}', retain=True)
-    world.run(4)
-    world.running[owner].go_on()
-    world.run(4)
-    assert world.operators[0].payloads("outgoing/status")[:2] == [b'{"n": 1}', b'{"n": 2}']
-    assert world.broker.retained[f"{GOOB}/outgoing/status"].payload == b'{"n": 2}'
-    assert world.wrong() == 0
-
-
-def test_the_will_of_a_robot_that_was_silent_before_reaches_the_broker(alone: World) -> None:
+def test_a_robot_that_is_silent_is_carried_no_more_until_its_will_comes(alone: World) -> None:
     alone.silent.add(GOOB)
-    alone.run(4, sending=False)
+    alone.run(SILENT_S - 1, sending=False)
+    assert alone.running["a"].gateway.carries == {GOOB}
+    alone.run(2, sending=False)
     assert alone.running["a"].gateway.carries == frozenset()
     alone.robots[0].publish("outgoing/online", b'{"t": 0, "online": false}', retain=True)
-    alone.run(2 * TAKING_S, sending=False)
+    alone.run(1, sending=False)
     assert alone.broker.retained[ONLINE.topic(GOOB)].payload == b'{"t": 0, "online": false}'
 
 
@@ -228,88 +211,20 @@ def test_pictures_pass_while_they_are_allowed_until_an_operator_ends_them(alone:
     assert not passes()
 
 
-def test_every_gateway_forwards_a_live_stop_in_every_state() -> None:
-    world = World("a", "b")
-    stop = b'{"stop": "s%d"}'
-    for number, seconds in enumerate((STEP_S, 0.5, 2.0)):  # not heard; taking; carried
-        world.run(seconds)
-        world.operators[0].publish("incoming/estop", stop % number)
-        world.rest()
-        assert world.robots[0].payloads("incoming/estop").count(stop % number) >= 2
-    world.operators[0].publish("incoming/estop", stop % 9, retain=True)
-    world.run(0.1)
-    before = len(world.robots[0].on("incoming/estop"))
-    late = world.running["late"] = Running(world, "late")
-    world.run(3)
-    assert late.gateway.counters["stops"] == 0, "a retained one is old"
-    assert len(world.robots[0].on("incoming/estop")) == before
-
-
-def test_what_one_robot_is_sent_holds_up_no_other() -> None:
-    """A connection on which stops wait does not, nor does a flood of commands or stops."""
-    world = World("a", robots=(GOOB, "pebble/robots/fred"))
-    world.run(3)
-    world.running["a"].stops.hold()
-    for number in range(3 * MOST_TOGETHER):
-        world.operators[0].publish(f"incoming/lights-{'solid' if number % 2 else 'flash'}", b"%d" % number)
-        world.operators[0].publish("incoming/front-camera", b"%d" % number)
-    world.run(3)
-    lights = world.robots[0].payloads("incoming/lights-solid")
-    assert len(lights) <= MOST_EACH + 1
-    assert lights[-1] == b"%d" % (3 * MOST_TOGETHER - 1), "the last one passes"
-    assert len(world.robots[0].payloads("incoming/front-camera")) <= MOST_EACH + 1
-    assert world.all_pass()
-    assert world.running["a"].gateway.counters["too_often"] > MOST_TOGETHER
-    world.running["a"].stops.let_go()
-    for number in range(2 * MOST_STOPS):
-        world.operators[0].publish("incoming/estop", b'{"stop": "x%d"}' % number)
-        for base in range(3):
-            world.operators[0].transport.publish(f"pebble/robots/x{number}{base}/incoming/estop", b"")
-    world.operators[1].publish("incoming/estop", b'{"stop": "fred"}')
+@pytest.mark.parametrize("state", ["not heard", "listens", "carried", "stops away", "broker flooded"])
+def test_a_live_stop_passes_once_in_every_state(state: str) -> None:
+    world = World("a")
+    gate = world.running["a"]
+    world.run({"not heard": STEP_S, "listens": 0.5}.get(state, 3.0))
+    if state == "stops away":
+        gate.stops.cut()
+    elif state == "broker flooded":
+        gate.broker.hold()
     world.rest()
-    assert b'{"stop": "fred"}' in world.robots[1].payloads("incoming/estop")
-
-
-def test_a_robot_that_takes_long_to_begin_costs_the_gateway_no_other(monkeypatch: pytest.MonkeyPatch) -> None:
-    """So it does where a driver has left thousands of retained messages; heartbeats have a thread meanwhile."""
-    world = World("a", robots=(GOOB, "pebble/robots/fred"))
-    world.silent.add("pebble/robots/fred")
-    world.run(3)
-    gateway, begin = world.running["a"].gateway, module.begin
-
-    def slow(robots: Sequence[Carried], hub: Transport, broker: Transport) -> list[Carried]:
-        for _ in range(int(0.7 * module.STANDS_S / STEP_S)):
-            world.now += STEP_S
-            for robot in world.robots:
-                robot.publish("outgoing/online", b'{"t": 0}', retain=True)
-            gateway.publish_heartbeat()
-            world.rest()
-        return begin(robots, hub, broker)
-
-    monkeypatch.setattr(module, "begin", slow)
-    since = gateway.ownership.since(GOOB, world.now)
-    world.silent.clear()
-    world.run(4)
-    assert gateway.carries == {GOOB, "pebble/robots/fred"}
-    assert gateway.ownership.since(GOOB, world.now) == since
-
-
-def test_a_gateway_whose_turns_do_not_end_loses_its_robots() -> None:
-    world = World("a", "b", robots=(GOOB, "pebble/robots/fred"))
-    world.run(4)
-    (name,) = (name for name, one in world.running.items() if GOOB in one.gateway.carries)
-    (other,) = world.running.keys() - {name}
-    world.running[name].stands = True
-    world.run(0.9 * module.STANDS_S)
-    assert world.all_pass(), "its threads that receive carry them still"
-    world.run(0.1 * module.STANDS_S + FRESH_S + TAKING_S)
-    assert world.running[other].gateway.carries == {GOOB, "pebble/robots/fred"}
-    assert world.all_pass()
-    world.running[name].stands = False
-    world.run(RECOVERY_S)
-    assert GOOB in world.running[name].gateway.carries
-    assert world.wrong() == 0
-    assert world.all_pass()
+    for topic, stop in (("incoming/estop", b""), ("incoming/by/ann/estop", b'{"stop": "s1"}')):
+        world.operators[0].publish(topic, stop)
+        world.rest()
+        assert world.robots[0].payloads(topic) == [stop]
 
 
 def test_robots_begin_together(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -333,6 +248,35 @@ def test_robots_begin_together(monkeypatch: pytest.MonkeyPatch) -> None:
     assert world.all_pass()
 
 
+def test_what_one_robot_is_sent_holds_up_no_other() -> None:
+    """A connection on which stops wait does not, nor does a flood of commands or stops."""
+    world = World("a", robots=(GOOB, FRED))
+    world.run(3)
+    world.running["a"].stops.hold()
+    for number in range(3 * MOST_TOGETHER):
+        world.operators[0].publish(f"incoming/lights-{'solid' if number % 2 else 'flash'}", b"%d" % number)
+        world.operators[0].publish("incoming/front-camera", b"%d" % number)
+    world.run(3)
+    lights = world.robots[0].payloads("incoming/lights-solid")
+    assert len(lights) <= MOST_EACH + 1
+    assert lights[-1] == b"%d" % (3 * MOST_TOGETHER - 1), "the last one passes"
+    assert len(world.robots[0].payloads("incoming/front-camera")) <= MOST_EACH + 1
+    assert world.all_pass()
+    assert world.running["a"].gateway.counters["too_often"] > MOST_TOGETHER
+    world.running["a"].stops.let_go()
+    for number in range(2 * MOST_STOPS):
+        world.operators[0].publish("incoming/estop", b'{"stop": "x%d"}' % number)
+        for base in range(3):
+            world.operators[0].transport.publish(f"pebble/robots/x{number}{base}/incoming/estop", b"")
+    world.operators[1].publish("incoming/estop", b'{"stop": "fred"}')
+    world.rest()
+    assert b'{"stop": "fred"}' in world.robots[1].payloads("incoming/estop")
+    world.running["a"].stops.hold()
+    world.operators[1].publish("incoming/estop", b"")
+    world.rest()
+    assert b"" in world.robots[1].payloads("incoming/estop"), "it does not wait behind the flood"
+
+
 @pytest.mark.parametrize(
     ("begun_s", "then_s", "waited_s"),
     [(0.4, 0.0, 0.0), (3.0, 0.0, 3.0), (3.0, 0.2, 3.2), (3.0, 0.3, 0.0)],
@@ -350,48 +294,89 @@ def test_commands_behind_what_is_retained_have_waited_as_long(
     assert beginning.aged(Message("a/b/c/incoming/drive-values", b"")).waited_s == pytest.approx(waited_s)
 
 
-@pytest.mark.parametrize("stood_s", [0.0, 2 * FRESH_S])
-def test_what_it_has_in_hand_while_it_stands_still_does_not_leave(
-    monkeypatch: pytest.MonkeyPatch, alone: World, stood_s: float
-) -> None:
-    """It passed when it came; another gateway may have carried the robot since."""
-    carried = alone.running["a"].gateway.carried(GOOB)
-    assert carried is not None
-    forwarder = carried.forwarder
-    receive = forwarder.receive
-
-    def stand_still(side: Side, message: Message) -> None:
-        alone.now += stood_s
-        receive(side, message)
-
-    monkeypatch.setattr(forwarder, "receive", stand_still)
-    alone.robots[0].publish("outgoing/counted", b"-1")
+def test_a_message_that_the_broker_would_hang_up_on_does_not_pass(alone: World) -> None:
+    for size in (LARGEST, LARGEST + 1):
+        alone.robots[0].publish("outgoing/status", b"x" * size)
     alone.rest()
-    assert (b"-1" in alone.operators[0].payloads("outgoing/counted")) is (stood_s == 0)
+    assert [len(one) for one in alone.operators[0].payloads("outgoing/status")] == [LARGEST]
 
 
-def test_of_two_with_one_name_one_rests() -> None:
-    world = World("a")
+def test_at_a_broker_of_boards_the_second_heartbeat_shows_a_robot() -> None:
+    """The first may be a retained one."""
+    world = World()
+    world.silent.add(GOOB)
+    world.running["a"] = Running(world, "a", hub=BoardsConnection)
+    world.run(2)
+    for number, carried in ((1, set()), (1, set()), (2, {GOOB})):
+        world.robots[0].publish("outgoing/online", b'{"t": %d}' % number, retain=True)
+        world.run(2 * TICK_S)
+        assert world.running["a"].gateway.carries == carried
+    assert world.all_pass()
+
+
+def test_robots_beyond_the_bound_are_not_carried(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "MAX_ROBOTS", 1)
+    world = World("a", robots=(GOOB, FRED))
     world.run(3)
-    world.running["a again"] = Running(world, "a")
-    world.run(8)
+    assert world.running["a"].gateway.carries == {GOOB}
+    world.operators[1].publish("incoming/estop", b"")
+    world.rest()
+    assert world.robots[1].payloads("incoming/estop") == [b""], "no bound concerns a stop"
+
+
+# -- other gateways
+
+
+def test_a_second_one_does_not_start_and_names_the_first(alone: World) -> None:
+    alone.running["b"] = Running(alone, "b")
+    with pytest.raises(SecondGatewayError, match=f"gateway b does not start: a carries {GOOB} already"):
+        alone.run(3)
+    del alone.running["b"]
+    assert alone.all_pass()
+    assert alone.wrong() == 0
+
+
+@pytest.mark.parametrize("name", ["b", "a"])
+def test_it_starts_once_the_first_has_gone(alone: World, name: str) -> None:
+    """Its will tells so, or its silence; what is retained of it counts for nothing."""
+    alone.kill("a")
+    alone.broker.retained[will("a").topic] = Message(
+        will("a").topic, b'{"t": 1, "run": "f", "robots": ["%s"]}' % GOOB.encode(), retain=True
+    )
+    alone.running[name] = Running(alone, name)
+    alone.run(3)
+    assert alone.all_pass()
+
+
+def test_gateways_of_other_robots_share_a_broker() -> None:
+    world = World(robots=(GOOB, FRED))
+    world.running = {"a": Running(world, "a", GOOB), "b": Running(world, "b", FRED)}
+    world.run(3)
+    assert [one.gateway.carries for one in world.running.values()] == [{GOOB}, {FRED}]
+    assert world.all_pass()
+
+
+@pytest.mark.parametrize("names", [("a", "b"), ("a", "a")])
+def test_of_two_that_begin_together_one_leaves_the_robots(names: tuple[str, str]) -> None:
+    world = World()
+    world.running = {number: Running(world, name) for number, name in enumerate(names)}  # type: ignore[misc]
+    world.run(4)
     assert sorted(len(one.gateway.carries) for one in world.running.values()) == [0, 1]
-    assert world.wrong() == 0
+    assert world.all_pass()
 
 
 @pytest.mark.parametrize("seed", range(cases(4, 200)))
 def test_nothing_comes_twice_or_out_of_order_whatever_fails(seed: int) -> None:
-    chance, names = random.Random(seed), ("a", "b", "c")[: 2 + seed % 2]
-    world = World(*names, robots=(GOOB, "pebble/robots/fred"))
+    chance = random.Random(seed)
+    world = World("a", robots=(GOOB, FRED))
     world.run(4)
     for _ in range(10):
-        name = chance.choice(names)
-        one = world.running.get(name)
+        one = world.running.get("a")
         if one is None:
-            world.running[name] = Running(world, name)
+            world.running["a"] = Running(world, "a")
         else:
             faults: list[Callable[[], object]] = [
-                lambda name=name: world.kill(name),  # type: ignore[misc]
+                lambda: world.kill("a"),
                 *((one.go_on, one.go_on) if one.hangs else (one.hang,)),
                 *(each.cut for each in one.connections),
                 *(each.mend for each in one.connections),
@@ -402,11 +387,11 @@ def test_nothing_comes_twice_or_out_of_order_whatever_fails(seed: int) -> None:
             chance.choice(faults)()
         world.run(chance.choice((0.2, 0.7, 1.5, 3.0)))
         assert world.wrong() == 0
-    for name in names:
-        one = world.running.setdefault(name, Running(world, name)) if name not in world.running else world.running[name]
-        for each in one.connections:
-            each.mend()
-        one.go_on()
+    one = world.running.get("a") or Running(world, "a")
+    world.running["a"] = one
+    for each in one.connections:
+        each.mend()
+    one.go_on()
     world.run(RECOVERY_S)
     assert world.wrong() == 0
     assert world.all_pass()

@@ -152,7 +152,7 @@ def test_what_ends_a_run_ends_it_for_good_and_a_new_start_drives(fred: Fred, wha
     fred.moved.clear()
     fred.goob(seconds=LONG_S)
     assert fred.moved == []
-    assert fred.visit.refused(fred.now)["goob"][0] == 7
+    assert fred.visit.refused(fred.now)["goob"].run == 7
     fred.goob(run=9)
     assert bool(fred.moved) == drives_again
 

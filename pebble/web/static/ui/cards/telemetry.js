@@ -81,13 +81,11 @@ function Heartbeat({ at }) {
     ${host && html`<div><dt>Broker</dt><dd>${host}</dd></div>`}`;
 }
 
-/** By which gateways it is received, and which robots of its LAN it receives. */
+/** Which robots of its LAN it receives, and whose script drives it. */
 function Neighbours({ at }) {
-  const gateways = useValue(at, "web/gateways")?.names ?? [];
   const { receives, driven_by: driver } = useValue(at, "neighbours") ?? {};
   const robots = Object.entries(isObject(receives) ? receives : {}).map(([name, is]) => (is ? name : `not ${name}`));
-  return html`${gateways.length > 0 && html`<div><dt>Gateway</dt><dd>${gateways.join(", ")}</dd></div>`}
-    ${robots.length > 0 && html`<div><dt>Receives</dt><dd>${robots.join(", ")}</dd></div>`}
+  return html`${robots.length > 0 && html`<div><dt>Receives</dt><dd>${robots.join(", ")}</dd></div>`}
     ${driver && html`<div><dt>Driven by</dt><dd>a script of ${plain(driver)}</dd></div>`}`;
 }
 

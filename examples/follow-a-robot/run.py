@@ -1,5 +1,9 @@
-"""Follows another robot of the LAN by the odometry of both, and holds a distance from it. No camera is needed."""
+"""Follows another robot of the LAN by the odometry of both, and holds a distance from it. No camera is needed.
 
+Copy its folder to the robot's scripts (`services.autonomy_manager.autonomy_root`), and it is offered there.
+"""
+
+import cmath
 import time
 from typing import Annotated
 
@@ -7,12 +11,13 @@ from msgspec import Meta, Struct, convert
 
 from pebble import Robot, run
 from pebble.contract import WHEEL_ODOMETRY
-from pebble.perception.companion import Companion
 from pebble.perception.follow import Follower, FollowSettings
-from pebble.perception.odom_follow import pose_of
+from pebble.perception.odom_follow import Pose, pose_of
+from pebble.perception.tags import Place
 from pebble.runtime.rate_limit import RateLimitedLog
 
 POSE_AGE_S = 1.0  # odometry is published twice a second at rest
+JUMP_M = 0.5  # between two calls: an odometry that has begun anew, no motion
 
 Power = Annotated[float, Meta(ge=0, le=1)]
 
@@ -27,6 +32,33 @@ class Options(Struct, kw_only=True):
     forward_max_power: Annotated[Power, Meta(title="Forward Max Power")] = 1.0
     turn_power: Annotated[float, Meta(ge=0.05, le=1, title="Turn Power")] = 0.5
     control_rate_hz: Annotated[float, Meta(ge=5, le=50, title="Control Rate (Hz)")] = 10.0
+
+
+class Companion:
+    """Where another robot is, seen from this one. Each odometry has a frame of its own, so only motions count.
+
+    ``ahead_m`` and ``left_m``: where the other one stands at the first call, heading as this one does.
+    """
+
+    def __init__(self, ahead_m: float, left_m: float) -> None:
+        self._seen, self._turned_rad = complex(ahead_m, left_m), 0.0
+        self._poses: tuple[Pose, Pose] | None = None
+
+    def place(self, mine: Pose, its: Pose) -> Place:
+        before, self._poses = self._poses or (mine, its), (mine, its)
+        (step, turn_rad), (its_step, its_turn_rad) = _motion(before[0], mine), _motion(before[1], its)
+        self._seen += its_step * cmath.rect(1, self._turned_rad)
+        self._seen = (self._seen - step) * cmath.rect(1, -turn_rad)
+        self._turned_rad += its_turn_rad - turn_rad
+        return Place(abs(self._seen), -cmath.phase(self._seen))
+
+
+def _motion(before: Pose, now: Pose) -> tuple[complex, float]:
+    """Return the step in the frame of ``before``, and the turn; none at a jump."""
+    step = complex(now.x_m - before.x_m, now.y_m - before.y_m)
+    if abs(step) > JUMP_M:
+        return 0j, 0.0
+    return step * cmath.rect(1, -before.heading_rad), now.heading_rad - before.heading_rad
 
 
 def main(robot: Robot, options: Options) -> None:

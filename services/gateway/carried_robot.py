@@ -1,10 +1,8 @@
-"""One robot for as long as this gateway carries it: a forwarder of its own, made anew each time, and its subscriptions.
+"""A robot that the gateway carries: a forwarder and the subscriptions of one time, made anew when it begins again.
 
-Nothing of an earlier time is left in it, because another gateway may have carried the robot meanwhile: what counts is
-what hub and broker retain now.
+So what hub and broker retain then counts, as at the start of a bridge.
 """
 
-import time
 from collections.abc import Callable, Iterable, Sequence
 from functools import partial
 from itertools import islice
@@ -24,11 +22,13 @@ from pebble.contract import (
 )
 from pebble.contract.names import BY, stop_topic, without_name
 from pebble.errors import PayloadError
+from pebble.forwarding.cycles import PROBE_PERIOD_S
 from pebble.forwarding.forwarder import Forwarder
+from pebble.forwarding.retained_window import INITIAL_SYNC_S
 from pebble.forwarding.routing import GATEWAY, Side
 from pebble.forwarding.subjects import Subject, Subjects
 from pebble.services.gateway.pace import LARGEST, MOST_EACH, MOST_TOGETHER, Pace
-from pebble.transports import Handler, Message, State, Subscription, Transport, clock
+from pebble.transports import Handler, Message, Subscription, Transport, clock
 
 #: What the robot sends of each medium, by what allows and what requests it.
 _MEDIA = ((CAMERA, MQTT_VIDEO, VIDEO_CONTROL), (AUDIO, MQTT_AUDIO, AUDIO_CONTROL))
@@ -42,10 +42,10 @@ class NamedSubjects(Subjects):
             return super()._find(topic)
         named = without_name(topic)
         plain = named.topic if named is not None else stop_topic(topic)
-        found = None if plain is None else super()._find(plain)
-        if found is None or found.kind is not Kind.FLAG:
-            return found
-        return self._subject(Kind.COMMAND, found.channel, found.qos)  # nothing is retained behind a name
+        subject = None if plain is None else super()._find(plain)
+        if subject is None or subject.kind is not Kind.FLAG:
+            return subject
+        return self._subject(Kind.COMMAND, subject.channel, subject.qos)  # nothing is retained behind a name
 
 
 class Beginning:
@@ -70,7 +70,7 @@ class Beginning:
         self._began = None
 
     def aged(self, message: Message) -> Message:
-        """``message`` with the time since when it may have waited. Hot."""
+        """Return ``message`` with the time since when it may have waited. Hot."""
         began = self._began
         if began is None and self._until == float("-inf"):
             return message
@@ -84,51 +84,53 @@ class Beginning:
         return Message(message.topic, message.payload, message.qos, message.retain, message.retain_requested, since)
 
 
-def begin(robots: Sequence["Carried"], hub: Transport, broker: Transport) -> list["Carried"]:
-    """Forward for each of ``robots`` from now on; first what the hub retains. Waits, bounded, for both sides: once for
-    all of them, as a round trip takes longer than all else that a robot needs. Returns those that are carried still.
+def begin(robots: Sequence["CarriedRobot"], hub: Transport, broker: Transport) -> None:
+    """Forward for ``robots`` from now on; first what the hub retains.
+
+    Waits, bounded, for both sides: once for all robots, as a round trip takes longer than all else that one needs.
     """
     _subscribe(robots, Side.LOCAL, hub, f"{OUTGOING}/#", f"{INCOMING}/flags/#")
-    held = [one for one in robots if one.open()]
-    _subscribe(held, Side.REMOTE, broker, f"{INCOMING}/#")
-    return held
+    for robot in robots:
+        robot.forwarder.open()
+    _subscribe(robots, Side.REMOTE, broker, f"{INCOMING}/#")
 
 
-def _subscribe(robots: Sequence["Carried"], side: Side, transport: Transport, *below: str) -> None:
+def _subscribe(robots: Sequence["CarriedRobot"], side: Side, transport: Transport, *below: str) -> None:
     handlers: dict[str, Handler] = {}
-    for one in robots:
-        handlers |= one.subscribing(side, *below)
-    made = iter(transport.subscribe_all(handlers, echo=False, direct=True))
-    transport.ask([flag for one in robots for flag in one.subjects.flags] if side is Side.REMOTE else [])
-    for one in robots:
-        one.subscribed(side, islice(made, len(below)))
+    for robot in robots:
+        handlers |= robot.subscribing(side, *below)
+    subscriptions = iter(transport.subscribe_all(handlers, echo=False, direct=True))
+    if side is Side.REMOTE:
+        transport.ask([flag for robot in robots for flag in robot.subjects.flags])
+    for robot in robots:
+        robot.subscribed(side, islice(subscriptions, len(below)))
 
 
-class Carried:
-    """A robot of the hub, since ``since``.
+class CarriedRobot:
+    """A robot of the hub.
 
-    ``holds`` is asked for each message: whether this gateway carries it at this moment, and has done so since then.
+    ``stops_pass`` is asked for each stop: whether another way carries it. ``flooded`` is called with the topic of each
+    message that is too much at this moment.
     """
 
     def __init__(
         self,
         base: str,
-        since: float,
         hub: Transport,
         broker: Transport,
-        holds: Callable[[], bool],
-        clock: Callable[[], float] = time.monotonic,
-        flooded: Callable[[str], None] = lambda _topic: None,
-        beginning: Beginning | None = None,
+        stops_pass: Callable[[], bool],
+        flooded: Callable[[str], None],
+        clock: Callable[[], float],
+        beginning: Beginning,
     ) -> None:
-        self.base, self.since = base, since
-        self._holds = holds
-        self._beginning = Beginning() if beginning is None else beginning
-        self._paces, self._flooded = {side: Pace(clock, MOST_EACH, MOST_TOGETHER) for side in Side}, flooded
+        self.base = base
+        self._stops_pass, self._flooded, self._clock, self._beginning = stops_pass, flooded, clock, beginning
+        self._paces = {side: Pace(clock, MOST_EACH, MOST_TOGETHER) for side in Side}
         self._subscriptions: list[Subscription] = []
         #: By the channel of each medium: what allows it, and whether it was requested at the broker; None: not known.
         self._allowed: dict[Channel, bool] = {}
         self._requested: dict[Channel, bool | None] = {medium: None for medium, _, _ in _MEDIA}
+        self._synchronize_at = self._probe_at = float("-inf")
         self.subjects = NamedSubjects(base)
         self.forwarder = Forwarder(
             self.subjects,
@@ -139,79 +141,62 @@ class Carried:
             clock=clock,
         )
 
-    def open(self) -> bool:
-        """Forward from now on; first what has waited. False: this gateway does not carry the robot any more."""
-        if not self._holds():
-            return False
-        self.forwarder.open()
-        return True
-
     def subscribing(self, side: Side, *below: str) -> dict[str, Handler]:
-        """What to subscribe to on ``side`` below the robot's base; its retained messages arrive from now on."""
+        """Return what to subscribe to on ``side``; its retained messages arrive from now on."""
         self.forwarder.sides[side].subscribing()
-        return {f"{self.base}/{one}": partial(self.receive, side) for one in below}
+        return {f"{self.base}/{metrics}": partial(self.receive, side) for metrics in below}
 
     def subscribed(self, side: Side, subscriptions: Iterable[Subscription]) -> None:
-        """These are active, and what is retained there has arrived."""
+        """Note that these are active, and that what is retained there has arrived."""
         self._subscriptions += subscriptions
         self.forwarder.subscribed(side)
+        self._synchronize_at = self._clock() + INITIAL_SYNC_S
 
     def end(self) -> None:
         self.forwarder.shut()
-        subscriptions, self._subscriptions = self._subscriptions, []
-        for one in subscriptions:
-            one.close()
+        for subscription in self._subscriptions:
+            subscription.close()
 
-    def hub_changed(self, state: State) -> None:
-        """The connection to the hub was lost, or is back; then what it retains comes again."""
-        self.forwarder.sides[Side.LOCAL].watch(state)
-        if state is State.CONNECTED:
-            self.forwarder.subscribed(Side.LOCAL)
-
-    def synchronize(self) -> None:
-        """What both sides retain has arrived."""
-        if self._holds():
+    def tick(self, now: float) -> None:
+        """Do what is due: what was too much in the second before; what both sides retain; a look for cycles."""
+        for side, pace in self._paces.items():
+            for message in pace.due():
+                self._pass(side, message)
+        if now >= self._synchronize_at:
+            self._synchronize_at = float("inf")
             for side in Side:
                 self.forwarder.retained.synchronize(side)
-
-    def probe(self) -> None:
-        """Once a second: find out whether what circulated does so still."""
-        if self._holds():
+        if now >= self._probe_at:
+            self._probe_at = now + PROBE_PERIOD_S
             self.forwarder.publisher.probe_again((Side.REMOTE,), self.forwarder.retained.value)
 
     # -- the transports' threads
 
     def receive(self, side: Side, message: Message) -> None:
-        """Pass a message on, unless this gateway does not carry the robot now."""
         is_old = self.forwarder.sides[side].window.may_be_old(message)  # all that is retained comes at once
         if len(message.payload) <= LARGEST and (is_old or self._paces[side].takes(message, message.topic)):
             self._pass(side, message)
         else:
             self._flooded(message.topic)
 
-    def pass_waiting(self) -> None:
-        """Pass what was too much in the second before."""
-        for side, pace in self._paces.items():
-            for message in pace.due():
-                self._pass(side, message)
-
     def _pass(self, side: Side, message: Message) -> None:
-        if not self._holds():
-            return
         subject = self.subjects[message.topic]
-        channel = None if subject is None else subject.channel
-        if channel is not None and (side is Side.REMOTE or channel in self._requested):
-            if side is Side.REMOTE:
-                self._note_request(channel, message)
-            elif not self._is_wanted(channel):
-                return
-        self.forwarder.receive(side, self._beginning.aged(message) if side is Side.REMOTE else message)
+        if subject is None:
+            return
+        if side is Side.LOCAL:
+            if self._is_wanted(subject.channel):
+                self.forwarder.receive(side, message)
+        elif not (subject.is_stop and self._stops_pass()):
+            self._note_request(subject.channel, message)
+            self.forwarder.receive(side, self._beginning.aged(message))
 
     # -- media
 
-    def _is_wanted(self, medium: Channel) -> bool:
-        """Whether pictures or sound pass. After a change of gateways it is not known who has requested them."""
-        return self._allowed.get(medium, False) and self._requested[medium] is not False
+    def _is_wanted(self, channel: Channel | None) -> bool:
+        """True if it is no medium, or one that is allowed and that no operator at the broker has ended."""
+        if channel not in self._requested:
+            return True
+        return self._allowed.get(channel, False) and self._requested[channel] is not False
 
     def _on_value(self, subject: Subject, payload: bytes) -> None:
         for medium, flag, _ in _MEDIA:
@@ -221,7 +206,7 @@ class Carried:
                 except PayloadError:
                     self._allowed[medium] = False
 
-    def _note_request(self, channel: Channel, message: Message) -> None:
+    def _note_request(self, channel: Channel | None, message: Message) -> None:
         for medium, _, request in _MEDIA:
             if channel is request and not message.retain:
                 try:

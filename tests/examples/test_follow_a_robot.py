@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
+import runpy
 
 import pytest
 
-from pebble.perception.companion import Companion
 from pebble.perception.odom_follow import Pose
 from pebble.perception.tags import Place
+from tests.support import ROOT
 
 AT_0 = Pose(0.0, 0.0, 0.0)
 AHEAD, HALF, QUARTER = Pose(0.4, 0.0, 0.0), Pose(0.2, 0.0, 0.0), math.pi / 2
@@ -30,6 +31,6 @@ WAYS: dict[str, tuple[list[tuple[Pose, Pose]], tuple[float, float]]] = {
 @pytest.mark.parametrize("way", WAYS)
 def test_it_is_known_where_it_is(way: str) -> None:
     poses, (ahead, left) = WAYS[way]
-    companion = Companion(0.6, 0.0)
+    companion = runpy.run_path(str(ROOT / "examples" / "follow-a-robot" / "run.py"))["Companion"](0.6, 0.0)
     place = [companion.place(mine, its) for mine, its in poses][-1]
     assert place == pytest.approx(Place(math.hypot(ahead, left), -math.atan2(left, ahead)))

@@ -1,0 +1,49 @@
+"""Other gateways at the same broker, by their `online`: a robot that one of them carries is not carried twice. Pure."""
+
+from dataclasses import dataclass
+
+HEARTBEAT_S = 0.5
+FRESH_S = 1.25  # so long a heartbeat counts; and so long a gateway listens before it begins
+MAX_GATEWAYS = 16  # that are known beside this one
+
+
+@dataclass(frozen=True, slots=True)
+class _Other:
+    at: float
+    run: str
+    robots: frozenset[str]
+
+
+class OtherGateways:
+    """The newest heartbeat of each. ``run`` names this one: of two that carry a robot the one with the greater goes on.
+
+    Two that begin in the same moment both carry it until they hear each other.
+    """
+
+    def __init__(self, run: str) -> None:
+        self.run = run
+        self._others: dict[str, _Other] = {}
+
+    def forget(self) -> None:
+        """Forget all: the connection on which they were heard was lost."""
+        self._others.clear()
+
+    def left(self, name: str) -> None:
+        """Note that the broker has published the will of that gateway, or that it has left in order."""
+        self._others.pop(name, None)
+
+    def heard(self, name: str, run: str, robots: tuple[str, ...], now: float) -> None:
+        """Note a live heartbeat of any gateway."""
+        if run == self.run:
+            return
+        others = self._others
+        if name not in others and len(others) >= MAX_GATEWAYS:
+            others.pop(min(others.copy().items(), key=lambda item: item[1].at)[0], None)
+        others[name] = _Other(now, run, frozenset(robots))
+
+    def carrier(self, robot: str, now: float, *, carried: bool) -> str:
+        """Return which other gateway carries ``robot``; empty if none does. ``carried``: this one does so, too."""
+        for name, other in list(self._others.items()):
+            if now - other.at <= FRESH_S and robot in other.robots and (not carried or other.run > self.run):
+                return name
+        return ""
