@@ -22,6 +22,7 @@ ZENOH = "zenoh.json"
 PORT, PLAIN_PORT = 8883, 1883  # of MQTT over TLS, and without
 MAX_ACCOUNTS = 10_000
 _LOCK = ".lock"
+_NO_LINK = getattr(os, "O_NOFOLLOW", 0)  # which Windows lacks
 _METRIC = re.compile(r"[^/#$+\x00-\x20\x7f]+|\+")  # one level
 
 
@@ -144,7 +145,7 @@ def _refused_base(base: str, *, several: bool) -> str:
 def locked(folder: Path) -> Iterator[None]:
     """One command at a time changes the folder. Raises FleetError if there is none."""
     try:
-        descriptor = os.open(folder / _LOCK, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+        descriptor = os.open(folder / _LOCK, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | _NO_LINK, 0o600)
     except OSError as error:
         raise FleetError(f"{folder}: {error.strerror}") from None
     try:

@@ -13,7 +13,6 @@ from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
-from pebble.fleet.dynsec import Control
 
 from pebble.checks.broker.account import robot_account
 from pebble.checks.broker.of_config import page_brokers
@@ -21,7 +20,7 @@ from pebble.checks.check import State
 from pebble.config import load
 from pebble.fleet.broker_files import passwords_in
 from pebble.fleet.certificates import CA_CERT
-from pebble.fleet.folder import ADMIN, CONF, PASSWORDS
+from pebble.fleet.folder import ACL, CONF, PASSWORDS
 from pebble.fleet.roles import Account
 from pebble.rig.processes import python
 from pebble.runtime.every_host import EveryHost
@@ -80,7 +79,7 @@ def _change(broker: FleetBroker, file: str, pattern: str) -> None:
     os.kill(broker.pid, signal.SIGHUP)
 
 
-def _refuse_subscriptions(broker: FleetBroker, name: str) -> None:  # noqa: ARG001
+def _refuse_subscriptions(broker: FleetBroker, name: str) -> None:
     """Our own brokers grant all, and deliver what is allowed; one with this plugin refuses."""
     stored = passwords_in((broker.folder / PASSWORDS).read_text())
     clients = [
