@@ -105,7 +105,7 @@ def _check_permitted(authority: Authority, hosts: Sequence[str]) -> None:
     constraints = authority.certificate.extensions.get_extension_for_class(x509.NameConstraints).value
     permitted = constraints.permitted_subtrees or ()
     domains = [f".{name.value}" for name in permitted if isinstance(name, x509.DNSName)]
-    networks = [name.value for name in permitted if isinstance(name, x509.IPAddress)]
+    networks: list[Any] = [name.value for name in permitted if isinstance(name, x509.IPAddress)]
     for host in hosts:
         is_in = any(ip_address(host) in net for net in networks) if _is_address(host) else False
         if not (is_in or f".{host}".endswith(tuple(domains))):

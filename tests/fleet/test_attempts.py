@@ -153,14 +153,14 @@ def test_each_account_writes_what_it_may_and_nothing_else(broker: FleetBroker, p
         expected = {topic for topic in TOPICS if lets_through(name, topic, broker.fleet.level)}
         wrong += [(name, topic) for topic in sorted(passed ^ expected)]
     assert wrong == []
-    assert len(ACCOUNTS) * len(TOPICS) > 1_700  # for each of two brokers, and both of their ports
+    assert len(ACCOUNTS) * len(TOPICS) > 2_500  # for each of two brokers, both of their ports, and written and read
 
 
 def test_each_account_reads_what_it_may_and_nothing_else(broker: FleetBroker, place: Place) -> None:
     """Also what is retained, and whatever it subscribes to."""
-    senders = {name: broker.login(name) for name in ("goob", "fred", "lamp", "eye")}
-    sent = {topic: next((name for name in senders if lets_through(name, topic, "login")), "eye") for topic in TOPICS}
-    sent = {topic: name for topic, name in sent.items() if "/incoming/" not in topic or name != "eye"}
+    bases = {"goob": GOOB, "fred": FRED, "lamp": LAMP}
+    senders = {name: broker.login(name) for name in (*bases, "eye")}
+    sent = {topic: next((name for name in bases if topic.startswith(bases[name])), "eye") for topic in TOPICS}
     retained = [f"{GOOB}/outgoing/online", f"{GOOB}/incoming/flags/mqtt-video", f"{GOOB}/incoming/drive-values"]
     for topic in retained:
         senders["goob"].publish(topic, b"before", retain=True)
@@ -169,7 +169,6 @@ def test_each_account_reads_what_it_may_and_nothing_else(broker: FleetBroker, pl
     for name in ACCOUNTS:
         with BrokerClient(place, name, broker.passwords[name]) as client:
             client.subscribe(["#", "$SYS/#", "+/+/+/#", *sent], qos=0)
-            kept = {topic for topic, payload in client.received if payload == b"before"}
             for topic, sender in sent.items():
                 senders[sender].publish(topic, name.encode())
             for sender in senders.values():
@@ -184,7 +183,6 @@ def test_each_account_reads_what_it_may_and_nothing_else(broker: FleetBroker, pl
     for client in senders.values():
         client.__exit__()
     assert wrong == []
-    assert len(sent) > 100
 
 
 @pytest.mark.parametrize("name", ["vera", "otto", "fred"])
