@@ -17,12 +17,12 @@ from pebble.errors import ConfigError, PebbleError
 from pebble.fleet.roles import GATEWAYS, Account, Extra, ProgramRole, Rule, add_up, rules
 from pebble.fleet.whole_file import write
 
-FLEET, ADMIN_PASSWORD, CONF, PID = "fleet.json", "admin.password", "mosquitto.conf", "mosquitto.pid"
-SECURITY, ACL, PASSWORDS, ZENOH = "dynamic-security.json", "acl", "passwords", "zenoh.json"
-ADMIN = "admin"  # the account by which `pebble fleet` changes a running broker
+FLEET, CONF, PID, ACL, PASSWORDS = "fleet.json", "mosquitto.conf", "mosquitto.pid", "acl", "passwords"
+ZENOH = "zenoh.json"
 PORT, PLAIN_PORT = 8883, 1883  # of MQTT over TLS, and without
 MAX_ACCOUNTS = 10_000
 _LOCK = ".lock"
+_NO_LINK = getattr(os, "O_NOFOLLOW", 0)  # which Windows lacks
 _METRIC = re.compile(r"[^/#$+\x00-\x20\x7f]+|\+")  # one level
 
 
@@ -46,14 +46,14 @@ class Server(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, omit
 class Fleet(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """The content of `fleet.json`. The first broker is the one whose files are in this folder.
 
-    ``rules``: whether the broker knows them by its dynamic-security plugin, or by `acl` and `passwords`.
-    ``plain``: all robots keep their topics without names beside those with names. ``hubs``: where Zenoh hubs run that
-    read the rules for them, on this machine in this folder or elsewhere from copies.
+    ``rules``: `plugin` if an earlier version made it for mosquitto's dynamic-security plugin: `pebble fleet apply`
+    turns it into files. ``plain``: all robots keep their topics without names beside those with names. ``hubs``: where
+    Zenoh hubs run that read the rules for them, on this machine in this folder or elsewhere from copies.
     """
 
     level: Literal["login", "named"]
     brokers: Annotated[tuple[Server, ...], Meta(min_length=1)]
-    rules: Literal["plugin", "files"] = "plugin"
+    rules: Literal["plugin", "files"] = "files"
     plain: bool = False
     hubs: Literal["none", "here", "elsewhere"] = "none"
     accounts: dict[str, Account] = msgspec.field(default_factory=dict)
@@ -145,7 +145,7 @@ def _refused_base(base: str, *, several: bool) -> str:
 def locked(folder: Path) -> Iterator[None]:
     """One command at a time changes the folder. Raises FleetError if there is none."""
     try:
-        descriptor = os.open(folder / _LOCK, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+        descriptor = os.open(folder / _LOCK, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | _NO_LINK, 0o600)
     except OSError as error:
         raise FleetError(f"{folder}: {error.strerror}") from None
     try:

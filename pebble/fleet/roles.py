@@ -20,7 +20,6 @@ from pebble.contract.names import BY
 from pebble.contract.rights import WRITES as WRITES
 from pebble.contract.rights import Right as Right
 
-CONTROL_TOPIC, CONTROL_ANSWERS = "$CONTROL/dynamic-security/v1", "$CONTROL/dynamic-security/#"
 _ANY = "+/+/+"  # any component
 
 
@@ -142,8 +141,8 @@ def rules(
 ) -> tuple[Rule, ...]:
     """All that a broker lets this account do. ``plain``: bases of robots that do not know names, or ``+/+/+``.
 
-    They are literal: the ``%u`` of some brokers is unknown to mosquitto 2.0's plugin. ``at_hub``: what a Zenoh hub lets
-    it do. That differs for a gateway, whose robots are at the hub, and their operators at the broker.
+    ``at_hub``: what a Zenoh hub lets it do. That differs for a gateway, whose robots are at the hub, and their
+    operators at the broker.
     """
     found = [
         *_of_bases(name, account, at_hub=at_hub),
@@ -201,6 +200,3 @@ def _of_rights(
                     yield Rule("write", f"{base}/{INCOMING}/{metric}")
     if Right.DRIVE in held:
         yield Rule("write", c.BRIDGE_PROBE.filter(f"+/{SERVERS}/+"))
-    if Right.PEOPLE in held:
-        yield Rule("read", CONTROL_ANSWERS)
-        yield Rule("write", CONTROL_TOPIC)

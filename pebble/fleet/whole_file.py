@@ -29,14 +29,16 @@ def write(
     try:
         temporary.unlink(missing_ok=True)
         with os.fdopen(os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "wb") as output:
+            # By the descriptor: in a folder of somebody else's its name may be a link by now.
+            open_file = output.fileno() if os.chmod in os.supports_fd else temporary
+            if owner is None:
+                give_as(open_file, file)
+            else:
+                os.chown(open_file, *owner)
+            os.chmod(open_file, mode)  # noqa: PTH101
             output.write(content)
             output.flush()
             os.fsync(output.fileno())
-        if owner is None:
-            give_as(temporary, file)
-        else:
-            os.chown(temporary, *owner)
-        temporary.chmod(mode)
         temporary.replace(file)
     except OSError as why:
         raise error(f"{file}: {why.strerror}") from None

@@ -73,4 +73,4 @@ def _retained(keys: Iterable[str]) -> tuple[str, ...]:
 
 
 def _keys(filters: Iterable[str]) -> tuple[str, ...]:
-    return tuple(filter_to_key(one) for one in filters if not one.startswith("$"))
+    return tuple(map(filter_to_key, filters))

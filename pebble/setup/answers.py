@@ -16,7 +16,7 @@ from pebble.contract.identity import LEVEL, LEVEL_RULE
 from pebble.contract.names import NAME
 from pebble.contract.serial_protocols import SERIAL_PROTOCOLS
 from pebble.errors import PebbleError
-from pebble.fleet.folder import ADMIN, PLAIN_PORT, PORT
+from pebble.fleet.folder import PLAIN_PORT, PORT
 from pebble.fleet.people import MIN_PASSWORD, usable
 
 NONE, HERE = "none", "here"
@@ -137,7 +137,7 @@ def _mistakes(earlier: Answers, answers: Answers) -> Iterator[str]:
         yield f"id: must be {LEVEL_RULE}, not {answers.id!r}"
     if earlier.id not in (None, answers.id):
         yield f"id: this robot is {earlier.id}; docs/life-of-a-robot.md says how it gets another name"
-    if answers.broker == HERE and answers.account in (ADMIN, PAGE):
+    if answers.broker == HERE and answers.account == PAGE:
         yield f"id: {answers.account!r} is an account of the robot's own broker already: choose another name"
     if answers.protocol is not None and answers.protocol not in SERIAL_PROTOCOLS:
         yield f"protocol: {answers.protocol!r} is none of {', '.join(SERIAL_PROTOCOLS)}"

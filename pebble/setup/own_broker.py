@@ -18,17 +18,17 @@ def fleet_of(account: str, base: str, people: Path) -> Fleet:
         PAGE: Account(roles=(ProgramRole.PAGE,), people=str(people)),
     }
     host = certificates.own_names()[0]
-    return Fleet(level="login", rules="files", brokers=(Server(host=host, included=True),), accounts=accounts)
+    return Fleet(level="login", brokers=(Server(host=host, included=True),), accounts=accounts)
 
 
 def conf_text(places: Places, fleet: Fleet) -> bytes:
     """Return what mosquitto includes; its paths are those of the machine whose root this is."""
-    return broker_files.conf_text(fleet, Path(places.named(places.broker_folder)), None, "").encode()
+    return broker_files.conf_text(fleet, Path(places.named(places.broker_folder)), "").encode()
 
 
 def make(new: Path, fleet: Fleet, passwords: dict[str, str]) -> None:
     """Fill a new folder."""
-    applying.make(new, fleet, None, passwords)
+    applying.make(new, fleet, passwords)
     with folder.locked(new):
         pass  # its file belongs to the folder
     link(new)
@@ -44,7 +44,7 @@ def link(place: Path) -> None:
 def knows(place: Path, wanted: Fleet, passwords: dict[str, str]) -> bool:
     """Return True if these accounts are there as they should be, with these passwords."""
     fleet = folder.load(place)
-    stored = applying.passwords_of(place, fleet)
+    stored = applying.passwords_of(place)
     known = all(fleet.accounts.get(name) == account for name, account in wanted.accounts.items())
     return known and all(name in stored and stored[name].is_of(password) for name, password in passwords.items())
 
@@ -52,8 +52,7 @@ def knows(place: Path, wanted: Fleet, passwords: dict[str, str]) -> bool:
 def change(place: Path, wanted: Fleet, passwords: dict[str, str]) -> None:
     """Let the broker know these accounts, at once where it runs."""
     with folder.locked(place):
-        before = folder.load(place)
-        after = before
+        fleet = folder.load(place)
         for name, account in wanted.accounts.items():
-            after = after.without(name).with_account(name, account)
-        applying.apply(place, before, after, passwords)
+            fleet = fleet.without(name).with_account(name, account)
+        applying.apply(place, fleet, passwords)

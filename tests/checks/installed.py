@@ -64,7 +64,7 @@ def installed(root: Path) -> Iterator[Places]:
     _write(places.state / "recordings/1.mcap", "large")
     certificates.init(places.etc / "tls", ["goob.local"])
     _accounts(root / BROKER)
-    _write(places.broker, conf_text(load_fleet(root / BROKER), Path("/", BROKER), None, "mosquitto"))
+    _write(places.broker, conf_text(load_fleet(root / BROKER), Path("/", BROKER), "mosquitto"))
     _calibrations(places.etc)
     _stop(places)
     people = People(root / PEOPLE)
@@ -85,11 +85,9 @@ def _write(file: Path, text: str) -> None:
 
 
 def _accounts(folder: Path) -> None:
-    fleet = Fleet(level="named", brokers=(Server(host="127.0.0.1"),), rules="files")
-    applying.make(folder, fleet, None)
-    before = load_fleet(folder)
-    after = before.with_account("goob", Account(roles=("robot",), bases=("pebble/robots/goob",)))
-    applying.apply(folder, before, after, {"goob": ROBOT})
+    fleet = Fleet(level="named", brokers=(Server(host="127.0.0.1"),))
+    fleet = fleet.with_account("goob", Account(roles=("robot",), bases=("pebble/robots/goob",)))
+    applying.make(folder, fleet, {"goob": ROBOT})
 
 
 def _calibrations(folder: Path) -> None:

@@ -12,7 +12,6 @@ import pytest
 from pebble.checks.report import report
 from pebble.checks.report.report import make
 from pebble.checks.report.secrets_here import secrets_of, values_in
-from pebble.fleet.folder import ADMIN_PASSWORD
 from pebble.runtime.places import Places
 from tests.checks.installed import BROKER, MQTT, ROBOT, config_of, installed
 from tests.commands.command_line import Run
@@ -74,7 +73,6 @@ def test_each_secret_of_the_machine_is_known(places: Places) -> None:
     wanted = {
         *(MQTT, ROBOT, "sentinel-of-the-unit", "sentinel of the network", "sentinel-of-wpa", "sentinel-of-systemd"),
         *("c2VudGluZWwtb2YtdGhlLWhvc3Qta2V5", "sentinel-in-a-url", "sentinel-in-json"),
-        (places.root / BROKER / ADMIN_PASSWORD).read_text().strip(),
         *_lines(places.etc / "tls/server.key"),
         *_lines(places.root / BROKER / "ca.key"),
     }

@@ -17,7 +17,7 @@ from pebble.checks.check import CheckResult
 from pebble.checks.running import machine
 from pebble.checks.running.robot import RobotUnderTest
 from pebble.config import parse
-from pebble.fleet import certificates
+from pebble.fleet import authority, certificates
 from pebble.runtime.places import Places
 from tests.support import free_port
 
@@ -134,7 +134,7 @@ def test_the_page(
     days: int, status: int, same: bool, state: str, text: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """``same``: whether it shows the certificate of the config."""
-    monkeypatch.setattr(certificates, "SERVER_DAYS", days)
+    monkeypatch.setattr(authority, "SERVER_DAYS", days)
     for name in ("here", "there"):
         certificates.init(tmp_path / name, ["127.0.0.1"])
     shown = tmp_path / "here" / "server.pem"

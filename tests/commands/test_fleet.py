@@ -19,14 +19,14 @@ import pytest
 from pebble.config import load
 from pebble.config.hub_file import load_hub
 from pebble.config.raw import deep_merge
-from pebble.fleet import certificates
-from pebble.fleet.broker_client import BrokerClient, Place
+from pebble.fleet import authority, certificates
 from pebble.fleet.folder import CONF, FLEET, ZENOH
 from pebble.fleet.people import People
 from pebble.fleet.roles import Role
 from pebble.rig.processes import mosquitto_path, python
 from pebble.transports.zenoh.access import read_access
 from tests.commands.test_drive import Console
+from tests.fleet.broker_client import BrokerClient, Place
 from tests.support import ROOT, Child, free_port, listening, until
 
 PAGE = (ROOT / "docs" / "fleet.md").read_text()
@@ -76,7 +76,7 @@ def test_the_first_page_as_a_newcomer_types_it(level: str, tmp_path: Path) -> No
             passwords[line.split()[3]] = PASSWORD.findall(shown)[0]
             for piece in re.findall(r"^\{.*^\}", shown, re.DOTALL | re.MULTILINE):
                 _robot_accepts(_merged(json.loads(piece), tmp_path), level)
-        assert "attempts, 0 not as the table says" in run(check, tmp_path)
+        assert "have its 5 accounts, and their rules" in run(check, tmp_path)
         for name, password in passwords.items():
             (tmp_path / f"{name}-password").write_text(f"{password}\n")
         place = Place("127.0.0.1", port, tmp_path / "hall" / "ca.pem")
@@ -158,13 +158,9 @@ def hall(new: Path, tmp_path: Path) -> Path:
         ("pebble fleet add ann --role boss", "'boss' is no role: use viewer, driver"),
         ("pebble fleet add ann --role robot,driver", "robot goes with no other role"),
         ("pebble fleet add ann --role driver --plain", "only a robot can be plain"),
-        ("pebble fleet add admin --role viewer", "admin exists already, as admin"),
         ("pebble fleet role otto driver", "hall/fleet.json has no account 'otto': `pebble fleet list` lists them"),
-        ("pebble fleet role admin driver", "admin is the account by which this command changes the broker"),
-        ("pebble fleet remove admin", "admin is the account by which this command changes the broker"),
         ("pebble fleet remove otto", "hall/fleet.json has no account 'otto'"),
         ("pebble fleet list --folder nowhere", "nowhere/fleet.json: `pebble fleet init"),
-        ("pebble fleet check --live", "attempts need a broker that runs"),
     ],
 )
 def test_a_refusal_names_the_remedy(hall: Path, line: str, error: str) -> None:
@@ -197,14 +193,13 @@ def test_accounts_come_and_go_in_the_files_of_a_broker_that_is_down(hall: Path) 
         assert (done.returncode, done.stderr) == (0, ""), done
     listed = pebble("pebble fleet list", hall).stdout.splitlines()
     assert [line.split() for line in listed[1:]] == [
-        ["admin", "admin"],
         ["dora", "viewer"],
         ["lamp", "robot", "pebble/lamps/lamp", "plain"],
         ["gate", "gateway", "pebble/robots/+"],
     ]
     assert "mosquitto does not run" in pebble("pebble fleet remove dora", hall).stdout
     done = pebble("pebble fleet check", hall)
-    assert (done.returncode, done.stdout) == (0, "The broker knows the 3 accounts of hall, and their rules.\n")
+    assert (done.returncode, done.stdout) == (0, "The files of hall have its 2 accounts, and their rules.\n")
     assert (hall / "hall" / CONF).read_text().count("listener") == 3  # per_listener_settings, and two of them
 
 
@@ -226,14 +221,14 @@ def test_removing_a_person_acts_on_pages_here_and_names_those_elsewhere(hall: Pa
 
 
 def test_a_broker_that_no_command_reaches_is_named_at_each_change_that_takes_something_away(tmp_path: Path) -> None:
-    """Without the plugin only files are changed, and a second broker has copies of them."""
+    """A second broker has copies of the files."""
     port = free_port()
-    run(f"pebble fleet init hall --host 127.0.0.1 --port {port} --without-plugin", tmp_path)
+    run(f"pebble fleet init hall --host 127.0.0.1 --port {port}", tmp_path)
     run("pebble fleet add ann --role driver", tmp_path)
     file = tmp_path / "hall" / FLEET
     fleet = json.loads(file.read_text())
     file.write_text(json.dumps(fleet | {"brokers": [*fleet["brokers"], {"host": "spare.lab", "port": 8884}]}))
-    for line in ("role ann viewer", "password ann", "remove ann"):
+    for line in ("role ann viewer", "password ann", "apply", "remove ann"):
         done = pebble(f"pebble fleet {line}", tmp_path)
         assert done.returncode == 1, line
         assert "broker spare.lab:8884 obeys its copies of hall/acl and passwords: copy them again" in done.stderr
@@ -251,7 +246,7 @@ def test_zenoh_hubs_have_the_same_accounts(hall: Path, monkeypatch: pytest.Monke
     piece = json.loads(printed[printed.index("{") :])
     (hall / "ca.pem").write_bytes((hall / "hall" / "ca.pem").read_bytes())
     _robot_accepts(_written({"robot": {"id": "goob"}, **piece}, hall, "goob"), "login")
-    assert set(read_access(rules).accounts) == {"admin", "ann", "goob"}
+    assert set(read_access(rules).accounts) == {"ann", "goob"}
     run("pebble fleet add hub1 --role hub", hall)
     assert "name where others reach it" in pebble("pebble fleet certificate hub1", hall).stderr
     printed = run("pebble fleet certificate hub1 hub1.local", hall)
@@ -261,17 +256,17 @@ def test_zenoh_hubs_have_the_same_accounts(hall: Path, monkeypatch: pytest.Monke
     assert load_hub(hall / "hub1.json")[0].access == hall / ZENOH
     assert pebble("pebble fleet remove hub1", hall).returncode == 1
     done = pebble("pebble fleet remove ann", hall)
-    assert (done.returncode, set(read_access(rules).accounts)) == (1, {"admin", "goob"})
+    assert (done.returncode, set(read_access(rules).accounts)) == (1, {"goob"})
     assert "Zenoh hubs obey their copies of hall/zenoh.json: copy it again" in done.stderr
     run("pebble fleet zenoh --only-here", hall)
     run("pebble fleet remove goob", hall)
-    assert set(read_access(rules).accounts) == {"admin"}
+    assert set(read_access(rules).accounts) == set()
     run("pebble fleet add boss --role admin", hall)
-    monkeypatch.setattr(certificates, "SERVER_DAYS", 20)
+    monkeypatch.setattr(authority, "SERVER_DAYS", 20)
     for name in ("boss", "gone"):
         certificates.of_account(hall / "hall", name)
     rules.write_bytes(rules.read_bytes().replace(b"incoming/estop", b"incoming/#"))
     problems = pebble("pebble fleet check", hall).stderr
     assert "zenoh.json does not hold the rules of the table" in problems
-    assert "boss.pem ends in 19 days: `pebble fleet certificate boss`" in problems
+    assert "boss.pem ends in 20 days: `pebble fleet certificate boss`" in problems
     assert "gone.pem" not in problems

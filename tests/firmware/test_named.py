@@ -5,16 +5,16 @@ from __future__ import annotations
 import json
 import threading
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import pytest
 
 from pebble.config import Security
 from pebble.contract.names import with_name
-from pebble.fleet.broker_client import BrokerClient
 from pebble.fleet.certificates import CA_CERT
 from pebble.fleet.roles import Account
 from tests.firmware.wireless_rig import Robots
+from tests.fleet.broker_client import BrokerClient
 from tests.fleet.brokers import HOST, FleetBroker
 from tests.support import beside, until
 
@@ -47,9 +47,8 @@ def became(eye: BrokerClient, metric: str, **fields: Any) -> dict[str, Any]:
     return newest(eye, metric)
 
 
-@pytest.mark.parametrize("rules", ["plugin", "files"])
-def test_who_has_control_drives_and_everybody_stops(tmp_path: Path, rules: Literal["plugin", "files"]) -> None:
-    with FleetBroker(tmp_path / "hall", ACCOUNTS, level="named", rules=rules) as broker:
+def test_who_has_control_drives_and_everybody_stops(tmp_path: Path) -> None:
+    with FleetBroker(tmp_path / "hall", ACCOUNTS, level="named") as broker:
         login = {"username": KIND, "password": broker.passwords[KIND], "ca": tmp_path / "hall" / CA_CERT}
         named = Security(level="named")
         with (
@@ -109,7 +108,7 @@ def test_who_has_control_drives_and_everybody_stops(tmp_path: Path, rules: Liter
 )
 def test_a_flood_keeps_no_stop_away_that_is_repeated(tmp_path: Path, account: str, size: int) -> None:
     """A driver floods, or the one who has control, whose small commands all move the board."""
-    with FleetBroker(tmp_path / "hall", ACCOUNTS, level="named", rules="plugin") as broker:
+    with FleetBroker(tmp_path / "hall", ACCOUNTS, level="named") as broker:
         login = {"username": KIND, "password": broker.passwords[KIND], "ca": tmp_path / "hall" / CA_CERT}
         with (
             Robots(HOST, broker.port, kinds=[KIND], security=Security(level="named"), **login) as boards,

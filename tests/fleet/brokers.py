@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import copy
+import os
 import shutil
+import signal
 import subprocess
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -12,12 +14,12 @@ from typing import Literal
 from msgspec.structs import replace
 
 from pebble.fleet import applying
-from pebble.fleet.broker_client import BrokerClient, Place
 from pebble.fleet.broker_files import new_password
 from pebble.fleet.certificates import CA_CERT
-from pebble.fleet.folder import CONF, Fleet, Server, load, save
+from pebble.fleet.folder import ACL, CONF, PASSWORDS, Fleet, Server, load, save
 from pebble.fleet.roles import Account
 from pebble.rig.processes import mosquitto_path
+from tests.fleet.broker_client import BrokerClient, Place
 from tests.support import Child, free_port, listening, until
 
 HOST = "127.0.0.1"
@@ -35,21 +37,14 @@ class FleetBroker:
         accounts: Mapping[str, Account],
         *,
         level: Literal["login", "named"] = "login",
-        rules: Literal["plugin", "files"] = "plugin",
         unencrypted: int | None = None,
     ) -> None:
         folder.mkdir(exist_ok=True)
         self.folder, self.port, self.unencrypted = folder, free_port(), unencrypted
         server = Server(host=HOST, port=self.port, unencrypted=unencrypted)
-        fleet = Fleet(level=level, rules=rules, brokers=(server,))
-        plugin = applying.found_plugin() if rules == "plugin" else None
-        self.passwords = {"admin": applying.make(folder, fleet, plugin)}
-        before = load(folder)
-        after = before
-        for name, account in accounts.items():
-            after = after.with_account(name, account)
-            self.passwords[name] = new_password()
-        applying.apply(folder, before, after, {name: self.passwords[name] for name in accounts})
+        self.passwords = {name: new_password() for name in accounts}
+        fleet = Fleet(level=level, brokers=(server,), accounts=dict(accounts))
+        applying.make(folder, fleet, self.passwords)
         self._process: subprocess.Popen[bytes] | None = None
 
     def spare(self, folder: Path) -> FleetBroker:
@@ -91,14 +86,13 @@ class FleetBroker:
         assert until(lambda: all(map(listening, ports)), 10), (self.folder / "log").read_text()
 
     def stop(self) -> None:
-        """By SIGKILL: with its plugin it has been seen to hang at its end, once."""
         if self._process is not None:
             self._process.kill()
             self._process.wait(10)
             self._process = None
 
     def change(self, after: Fleet, passwords: Mapping[str, str] | None = None) -> str:
-        return applying.apply(self.folder, self.fleet, after, passwords)
+        return applying.apply(self.folder, after, passwords)
 
     def add(self, name: str, account: Account) -> str:
         self.passwords[name] = new_password()
@@ -107,6 +101,12 @@ class FleetBroker:
     def renew(self, name: str) -> str:
         self.passwords[name] = new_password()
         return self.change(self.fleet, {name: self.passwords[name]})
+
+    def copy_rules(self, other: FleetBroker) -> None:
+        """As docs/fleet.md has it for a second broker after a change, which ``other`` has made."""
+        for name in (ACL, PASSWORDS):
+            shutil.copy(other.folder / name, self.folder / name)
+        os.kill(self.pid, signal.SIGHUP)
 
     def remove(self, name: str) -> str:
         return self.change(self.fleet.without(name))

@@ -17,7 +17,7 @@ from cryptography import x509
 from cryptography.hazmat.primitives.hashes import SHA256
 from cryptography.hazmat.primitives.serialization import load_pem_private_key
 
-from pebble.fleet import certificates
+from pebble.fleet import authority
 from pebble.fleet.certificates import CertificateError, init, renew, show
 
 
@@ -128,7 +128,7 @@ def test_an_authority_does_not_sign_for_foreign_names(folder: Path, name: str) -
 def test_clients_refuse_what_a_stolen_authority_signs_for_foreign_names(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(certificates, "_check_permitted", lambda *_: None)
+    monkeypatch.setattr(authority, "_check_permitted", lambda *_: None)
     renew(folder, ["bank.example.com", "8.8.8.8"])
     assert connect(folder, "bank.example.com") == "permitted subtree violation"
     assert connect(folder, "8.8.8.8") == "permitted subtree violation"

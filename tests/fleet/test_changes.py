@@ -4,33 +4,37 @@ from __future__ import annotations
 
 import json
 import os
+import re
+import subprocess
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack
+from getpass import getuser
 from pathlib import Path
 from typing import Any
 
 import pytest
 from msgspec.structs import replace
 
-from pebble.fleet import applying, broker_files, check
-from pebble.fleet.broker_client import BrokerClient, RefusedError
-from pebble.fleet.dynsec import Control
-from pebble.fleet.folder import ACL, CONF, FLEET, PASSWORDS, SECURITY, Extra, FleetError, Server, load, locked, refused
+from pebble.fleet import broker_files, check
+from pebble.fleet.folder import ACL, CONF, FLEET, PASSWORDS, Extra, FleetError, load, locked, refused
 from pebble.fleet.roles import Account
-from pebble.rig.processes import Processes
+from pebble.rig.processes import Processes, python
 from pebble.rig.robot import Robot
+from tests.fleet.broker_client import BrokerClient, RefusedError
 from tests.fleet.brokers import HOST, FleetBroker
-from tests.support import until
+from tests.support import ROOT, until
 
 DRIVER, VIEWER = Account(roles=("driver",)), Account(roles=("viewer",))
 GOOB = Account(roles=("robot",), bases=("pebble/robots/goob",))
+DATA = ROOT / "tests" / "data" / "plugin_fleet"
+PLUGIN = next(Path("/usr/lib").glob("*/mosquitto_dynamic_security.so"), None)
 DRIVE, STOP = "pebble/robots/goob/incoming/drive-values", "pebble/robots/goob/incoming/estop"
 
 
-@pytest.fixture(params=["plugin", "files"])
-def broker(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[FleetBroker]:
-    with FleetBroker(tmp_path / "hall", {"otto": DRIVER, "goob": GOOB}, rules=request.param) as broker:
+@pytest.fixture
+def broker(tmp_path: Path) -> Iterator[FleetBroker]:
+    with FleetBroker(tmp_path / "hall", {"otto": DRIVER, "goob": GOOB}) as broker:
         yield broker
 
 
@@ -96,22 +100,13 @@ def _gets_in(broker: FleetBroker, name: str) -> bool:
     return True
 
 
-def test_who_takes_all_connections_is_removed_while_mosquitto_is_down(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """The command says what to do, and not that it is another broker."""
+def test_who_takes_all_connections_is_removed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(broker_files, "MAX_CONNECTIONS", 10)
-    with FleetBroker(tmp_path / "hall", {"otto": DRIVER}) as broker, ExitStack() as all_of_them:
-        for _ in range(10):
-            all_of_them.enter_context(broker.login("otto"))
-        with pytest.raises(FleetError, match=f"mosquitto runs there .process {broker.pid}.: end it"):
-            broker.remove("otto")
-        assert "otto" in broker.fleet.accounts
-        broker.stop()
-        assert "does not run" in broker.remove("otto")
-        broker.start()
-        with pytest.raises(RefusedError):
-            broker.login("otto")
+    with FleetBroker(tmp_path / "hall", {"otto": DRIVER, "zoe": DRIVER}) as broker, ExitStack() as all_of_them:
+        clients = [all_of_them.enter_context(broker.login("otto")) for _ in range(10)]
+        assert broker.remove("otto") == "at once"
+        assert until(lambda: all(client.listen(0.01) or client.closed for client in clients), 3)
+        assert _gets_in(broker, "zoe")
 
 
 def test_a_change_while_mosquitto_is_down_counts_when_it_runs(broker: FleetBroker) -> None:
@@ -119,7 +114,7 @@ def test_a_change_while_mosquitto_is_down_counts_when_it_runs(broker: FleetBroke
     assert "mosquitto does not run" in broker.add("zoe", DRIVER)
     broker.remove("otto")
     broker.start()
-    assert check.compare(broker.folder, broker.fleet) == []
+    assert check.of_rules(broker.folder, broker.fleet) == []
     assert [_gets_in(broker, name) for name in ("zoe", "otto", "goob")] == [True, False, True]
 
 
@@ -140,59 +135,19 @@ def test_metrics_beyond_the_contract(broker: FleetBroker) -> None:
         assert not passes(broker, otto, "pebble/robots/goob/incoming/arm")
 
 
-def test_the_file_of_the_plugin_is_never_written_while_mosquitto_runs(tmp_path: Path) -> None:
-    with FleetBroker(tmp_path / "hall", {"otto": DRIVER}) as broker:
-        os.kill(broker.pid, 19)  # it keeps its port and answers nothing
-        before = (broker.folder / SECURITY).read_bytes()
-        with pytest.raises(FleetError, match="mosquitto runs there"):
-            broker.add("zoe", DRIVER)
-        os.kill(broker.pid, 18)
-        assert (broker.folder / SECURITY).read_bytes() == before
-        assert "zoe" not in broker.fleet.accounts
-        assert "at once" in broker.add("zoe", DRIVER)
-
-
-def test_a_second_broker_that_is_away_is_named_and_nothing_is_written(tmp_path: Path) -> None:
-    with FleetBroker(tmp_path / "hall", {"otto": DRIVER}) as broker:
-        away = Server(host=HOST, port=1)
-        fleet = replace(broker.fleet, brokers=(*broker.fleet.brokers, away))
-        with pytest.raises(FleetError, match="Connection refused: it was not changed"):
-            applying.apply(broker.folder, fleet, fleet.without("otto"))
-        assert "otto" in broker.fleet.accounts  # so that the command can be given again
-        assert not _gets_in(broker, "otto")
-
-
 # -- what a check finds
 
 
-def test_it_finds_one_rule_too_many_and_one_too_few(broker: FleetBroker) -> None:
-    assert check.compare(broker.folder, broker.fleet) == []
-    without = Account(roles=("viewer",))
+def test_it_finds_one_rule_too_many_and_one_too_few(tmp_path: Path) -> None:
+    broker = FleetBroker(tmp_path / "hall", {"otto": DRIVER, "goob": GOOB})
     fleet = broker.fleet
-    if_driver_were_viewer = replace(fleet, accounts=fleet.accounts | {"otto": without, "new": VIEWER})
-    found = check.compare(broker.folder, if_driver_were_viewer)
-    assert "otto: one rule too many: write +/+/+/incoming/drive-values" in found
-    assert "new: an account too few: the broker does not have it: `pebble fleet password new`" in found
-    more = replace(fleet, extra=Extra(look=("arm/+",))).without("goob")
-    found = check.compare(broker.folder, more)
-    assert "otto: one rule too few: write +/+/+/incoming/arm/+" in found
-    assert "goob: an account too many: the broker lets it in, and fleet.json does not have it" in found
-
-
-def test_attempts_find_one_rule_too_many_and_one_too_few(broker: FleetBroker, monkeypatch: pytest.MonkeyPatch) -> None:
-    assert check.attempt(broker.folder, broker.fleet).wrong == []
-    real = check.may
-
-    def table(rules: Any, access: str, topic: str) -> bool:
-        """The broker's rules are right, and what is expected is not: another robot's reboot, and no lights."""
-        return topic.endswith("flags/reboot") or (real(rules, access, topic) and not topic.endswith("lights-solid"))
-
-    monkeypatch.setattr(check, "may", table)
-    wrong = check.attempt(broker.folder, broker.fleet).wrong
-    assert any("viewer: one rule too few: reboot" in line for line in wrong)
-    assert any("driver: one rule too many: lights" in line for line in wrong)
-    assert not any(name.startswith("check-") for name in broker.fleet.accounts)
-    assert check.compare(broker.folder, broker.fleet) == []  # the accounts of the attempts are gone
+    assert check.of_rules(broker.folder, fleet) == []
+    found = check.of_rules(broker.folder, replace(fleet, accounts=fleet.accounts | {"otto": VIEWER, "new": VIEWER}))
+    assert "one rule too many: otto: write +/+/+/incoming/drive-values" in found
+    assert "new: has no password: `pebble fleet password new`" in found
+    found = check.of_rules(broker.folder, replace(fleet, extra=Extra(look=("arm/+",))).without("goob"))
+    assert "one rule too few: otto: write +/+/+/incoming/arm/+" in found
+    assert "goob: an account too many: the broker lets it in" in found
 
 
 @pytest.mark.parametrize(
@@ -200,78 +155,70 @@ def test_attempts_find_one_rule_too_many_and_one_too_few(broker: FleetBroker, mo
     [
         (CONF, "allow_anonymous false", "allow_anonymous true", "has a line of its own: allow_anonymous true"),
         (CONF, "max_connections", "listener 1883\nmax_connections", "has a line of its own: listener 1883"),
-        (ACL, "user admin\n", "topic readwrite #\nuser admin\n", "everybody: one rule too many: topic readwrite #"),
-        (ACL, "topic write +/+/+/incoming/audio\n", "", "otto: one rule too few: write +/+/+/incoming/audio"),
-        (PASSWORDS, "goob:", "bob:", "goob: an account too few"),
+        (ACL, "user otto\n", "topic readwrite #\nuser otto\n", "one rule too many: everybody: readwrite #"),
+        (ACL, "topic write +/+/+/incoming/audio\n", "", "one rule too few: otto: write +/+/+/incoming/audio"),
+        (PASSWORDS, "goob:", "bob:", "goob: has no password"),
     ],
 )
 def test_it_finds_changes_of_files(tmp_path: Path, file: str, old: str, new: str, found: str) -> None:
-    broker = FleetBroker(tmp_path / "hall", {"otto": DRIVER, "goob": GOOB}, rules="files")
+    broker = FleetBroker(tmp_path / "hall", {"otto": DRIVER, "goob": GOOB})
     changed = (broker.folder / file).read_text().replace(old, new)
     (broker.folder / file).write_text(changed)
     by_hand, rules = check.by_hand(broker.folder, broker.fleet), check.of_rules(broker.folder, broker.fleet)
     assert any(found in line for line in (*by_hand, *rules))
-    assert bool(by_hand) == (file == CONF), "`pebble fleet init` is advised for what it mends"
+    assert bool(by_hand) == (file == CONF), "`pebble fleet apply` is advised for what it mends"
     assert all(line.endswith("then restart mosquitto") for line in by_hand)
 
 
-def test_it_finds_changes_of_the_plugin(tmp_path: Path) -> None:
-    with FleetBroker(tmp_path / "hall", {"otto": DRIVER}) as broker:
-        with Control(broker.place, "admin", broker.passwords["admin"]) as control:
-            acls = [{"acltype": "publishClientReceive", "allow": True}]
-            rule = {"acltype": "publishClientSend", "topic": "#", "allow": True}
-            control.send(
-                [
-                    {"command": "setDefaultACLAccess", "acls": acls},
-                    {"command": "addRoleACL", "rolename": "account-otto", **rule},
-                    {"command": "createGroup", "groupname": "guests"},
-                    {"command": "setAnonymousGroup", "groupname": "guests"},
-                    {"command": "disableClient", "username": "otto"},
-                ]
-            )
-        assert check.compare(broker.folder, broker.fleet) == [
-            "otto: is disabled at the broker",
-            "everybody: one rule too many: publishClientReceive is allowed for all",
-            "clients without a name: have the rights of group guests: stop mosquitto before the next line",
-            "otto: one rule too many: write #",
-        ]
-        applying.repair(broker.folder, broker.fleet)
-        (left,) = check.compare(broker.folder, broker.fleet)
-        assert left.startswith("clients without a name")
-        broker.stop()
-        applying.repair(broker.folder, broker.fleet)
-        broker.start()
-        assert check.compare(broker.folder, broker.fleet) == []
+# -- a fleet of the last version
 
 
-@pytest.mark.parametrize(
-    ("without", "instead", "found"),
-    [
-        ((), (), []),
-        (
-            ("plugin", "allow_anonymous"),
-            ("allow_anonymous true",),
-            ["lets in clients without a name", "lets in clients with a wrong password", "has no rules"],
-        ),
-        (("plugin",), ("password_file {passwords}",), ["has no rules, each account may do all"]),
-    ],
-    ids=["of this fleet", "open", "without rules"],
-)
-def test_it_finds_a_second_broker_that_lets_everybody_write(
-    tmp_path: Path, without: tuple[str, ...], instead: tuple[str, ...], found: list[str]
-) -> None:
-    broker = FleetBroker(tmp_path / "hall", {"otto": DRIVER})
-    second = broker.spare(tmp_path / "spare")
-    conf, passwords = second.folder / CONF, second.folder / PASSWORDS
-    hashed = {name: broker_files.hashed(one) for name, one in broker.passwords.items()}
-    passwords.write_text(broker_files.passwords_text(hashed))
-    lines = [line for line in conf.read_text().splitlines() if not line.startswith(without)]
-    conf.write_text("\n".join([*lines, *(more.format(passwords=passwords) for more in instead)]))
-    with broker, second:
-        ((server, lines),) = check.of_others(broker.folder, broker.fleet)
-        assert server.port == second.port
-        assert [any(one in line for line in lines) for one in found] == [True] * len(lines)
-        assert all(f":{second.port} " in line for line in lines)
+def test_a_fleet_of_the_plugin_becomes_one_of_files(tmp_path: Path) -> None:
+    """As the last version made it, and the plugin has it: vera is disabled, mia without rights, ghost in no table."""
+    broker = FleetBroker(tmp_path / "hall", {})
+    with_plugin = (
+        (DATA / CONF).read_text().format(folder=broker.folder, port=broker.port, user=getuser(), plugin=PLUGIN)
+    )
+    (broker.folder / CONF).write_text(with_plugin)
+    for name in (FLEET, "dynamic-security.json"):
+        (broker.folder / name).write_text((DATA / name).read_text().replace("18883", str(broker.port)))
+    (broker.folder / ACL).unlink()
+    (broker.folder / PASSWORDS).unlink()
+    broker.passwords = {"otto": "ne64-pksd-a7vu-j2p8", "goob": "bbe2-qvse-j4bs-2ch3", "ghost": "boo"}
+    broker.passwords |= {"vera": "4cvf-pjhv-bg6v-tjyb", "mia": "4kds-nsmp-zbbu-wha4", "admin": "3aht-huvw-xgnj-exxp"}
+    with broker:
+        before = [name for name in broker.passwords if _gets_in(broker, name)]
+        refused = _pebble(broker, "remove", "otto")
+        assert (refused.returncode, "`pebble fleet apply --folder hall` makes it files" in refused.stderr) == (1, True)
+        applied = _pebble(broker, "apply")
+        assert applied.returncode == 1  # until the lines are changed
+        lines = re.findall(r"(?:has a line of its own|is without the line): (.*): (remove|add) it", applied.stderr)
+        assert "mosquitto still obeys its dynamic-security plugin" in _pebble(broker, "remove", "otto").stderr
+    gone = [line for line, what in lines if what == "remove"]
+    wanted = [line for line in with_plugin.splitlines() if line not in gone]
+    (broker.folder / CONF).write_text("\n".join(wanted + [line for line, what in lines if what == "add"]))
+    with broker:
+        after = [name for name in broker.passwords if _gets_in(broker, name)]
+        with broker.login("otto") as otto:
+            by_otto = "pebble/robots/goob/incoming/by/otto/drive-values"
+            assert [passes(broker, otto, topic) for topic in (by_otto, DRIVE, STOP)] == [True, False, True]
+            assert _pebble(broker, "apply").returncode == 0
+            assert _pebble(broker, "check").stderr.count("pebble: ") == 3  # vera and mia have no password
+            assert _pebble(broker, "remove", "otto").returncode == 0
+            assert until(lambda: otto.listen(0.05) or otto.closed, 3)
+    assert before == ["otto", "goob", "ghost", "mia", "admin"]
+    assert after == ["otto", "goob", "admin"]
+    assert [name for name in ("ghost", "vera", "mia") if f"pebble: {name}: " in applied.stderr] == [
+        "ghost",
+        "vera",
+        "mia",
+    ]
+
+
+def _pebble(broker: FleetBroker, *words: str) -> subprocess.CompletedProcess[str]:
+    """Run a command of `pebble fleet` beside the folder."""
+    command = python("pebble.cli", "fleet", *words, "--folder", "hall")
+    return subprocess.run(command, cwd=broker.folder.parent, capture_output=True, text=True, check=False, timeout=60)
 
 
 # -- a person who drives
@@ -382,5 +329,5 @@ def test_commands_change_a_folder_one_after_the_other(tmp_path: Path) -> None:
         with locked(broker.folder):
             broker.add(f"b{number}", DRIVER)
     assert os.waitpid(child, 0)[1] == 0
-    assert len(broker.fleet.accounts) == 21
-    assert check.compare(broker.folder, broker.fleet) == []
+    assert len(broker.fleet.accounts) == 20
+    assert check.of_rules(broker.folder, broker.fleet) == []

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import itertools
 import json
+import os
+import re
+import signal
 import subprocess
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
@@ -15,10 +18,9 @@ from pebble.checks.broker.account import robot_account
 from pebble.checks.broker.of_config import page_brokers
 from pebble.checks.check import State
 from pebble.config import load
-from pebble.fleet.broker_files import hashed, passwords_text
+from pebble.fleet.broker_files import passwords_in
 from pebble.fleet.certificates import CA_CERT
-from pebble.fleet.dynsec import Control
-from pebble.fleet.folder import ADMIN, CONF, PASSWORDS
+from pebble.fleet.folder import ACL, CONF, PASSWORDS
 from pebble.fleet.roles import Account
 from pebble.rig.processes import python
 from pebble.runtime.every_host import EveryHost
@@ -63,22 +65,35 @@ def settings(name: str, *brokers: FleetBroker) -> MqttSettings:
 
 
 def _remove(broker: FleetBroker, name: str) -> None:
-    with Control(broker.place, ADMIN, broker.passwords[ADMIN]) as control:
-        control.send([{"command": "deleteClient", "username": name}])
+    _change(broker, PASSWORDS, f"^{name}:.*\n")
 
 
 def _take_rights(broker: FleetBroker, name: str) -> None:
-    with Control(broker.place, ADMIN, broker.passwords[ADMIN]) as control:
-        (roles,) = (one["roles"] for one in control.accounts() if one["username"] == name)
-        control.send([{"command": "removeClientRole", "username": name, "rolename": one["rolename"]} for one in roles])
+    _change(broker, ACL, f"^user {name}\n(topic .*\n)*")
+
+
+def _change(broker: FleetBroker, file: str, pattern: str) -> None:
+    """Take lines out of a file that this broker reads."""
+    text = (broker.folder / file).read_text()
+    (broker.folder / file).write_text(re.sub(pattern, "", text, flags=re.MULTILINE))
+    os.kill(broker.pid, signal.SIGHUP)
 
 
 def _refuse_subscriptions(broker: FleetBroker, name: str) -> None:
-    """Our own brokers grant all, and deliver what is allowed; brokers of others refuse."""
-    access = [{"acltype": one, "allow": False} for one in ("subscribe", "publishClientReceive")]
-    with Control(broker.place, ADMIN, broker.passwords[ADMIN]) as control:
-        control.send([{"command": "setDefaultACLAccess", "acls": access}])
-    _take_rights(broker, name)
+    """Our own brokers grant all, and deliver what is allowed; one with this plugin refuses."""
+    stored = passwords_in((broker.folder / PASSWORDS).read_text())
+    clients = [
+        {"username": one, "password": word.hash, "salt": word.salt, "iterations": word.iterations}
+        for one, word in stored.items()
+    ]
+    access = {"publishClientSend": False, "publishClientReceive": False, "subscribe": False, "unsubscribe": True}
+    file, conf = broker.folder / "plugin.json", broker.folder / CONF
+    file.write_text(json.dumps({"defaultACLAccess": access, "clients": clients, "groups": [], "roles": []}))
+    text = re.sub(r"^(acl|password)_file .*\n", "", conf.read_text(), flags=re.MULTILINE)
+    plugin = next(Path("/usr/lib").glob("*/mosquitto_dynamic_security.so"))
+    conf.write_text(f"plugin {plugin}\nplugin_opt_config_file {file}\n{text}")
+    broker.stop()
+    broker.start()
 
 
 #: What a broker does, and how that is named.
@@ -189,11 +204,7 @@ def _stays(robot: Transport) -> bool:
 @pytest.mark.parametrize(("rules", "found"), [(True, State.OK), (False, State.FAILED)])
 def test_the_doctor_of_a_robot_names_a_broker_without_rules(first: FleetBroker, *, rules: bool, found: State) -> None:
     if not rules:
-        conf, logins = first.folder / CONF, first.folder / PASSWORDS
-        logins.write_text(passwords_text({"goob": hashed(first.passwords["goob"])}))
-        conf.write_text(
-            conf.read_text().replace("\nplugin", f"\npassword_file {logins}\n#plugin", 1).replace("\nplugin", "\n#")
-        )
+        (first.folder / CONF).write_text((first.folder / CONF).read_text().replace("acl_file", "#"))
     with first:
         *_, last = robot_account("remote broker", settings("goob", first), GOOB, level="login")
         assert last.state is found, last.text

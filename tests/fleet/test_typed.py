@@ -16,9 +16,9 @@ import pytest
 from pebble.config.raw import deep_merge
 from pebble.contract import CAPABILITIES, ONLINE
 from pebble.fleet import certificates
-from pebble.fleet.broker_client import BrokerClient, Place
 from pebble.transports import QoS, TlsSettings, ZenohSettings, create
 from tests.commands.test_fleet import PASSWORD, mosquitto, pebble, run, typed
+from tests.fleet.broker_client import BrokerClient, Place
 from tests.support import ROOT, free_port, listening, until
 
 pytestmark = pytest.mark.thorough

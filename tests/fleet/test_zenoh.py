@@ -32,7 +32,7 @@ from tests.support import free_port, until
 from tests.transports.forked import Forked
 from tests.transports.zenoh_net import HubProcess
 
-NAMES = (*(name for name in ACCOUNTS if name != "hub"), "admin")  # that is no client
+NAMES = tuple(name for name in ACCOUNTS if name != "hub")  # that is no client
 DRIVE, STATE, FLAG = f"{GOOB}/incoming/drive-values", f"{GOOB}/outgoing/status", f"{GOOB}/incoming/flags/mqtt-video"
 NAMED = f"{GOOB}/incoming/by/otto/drive-values"
 
@@ -53,9 +53,8 @@ class Hall:
 
     def __init__(self, folder: Path, level: Literal["login", "named"]) -> None:
         certificates.init(folder, ["127.0.0.1", "localhost"])
-        accounts = {**ACCOUNTS, "admin": Account(roles=("admin",))}
         self.folder, self.endpoint = folder, f"tls/127.0.0.1:{free_port()}"
-        self.fleet = Fleet(level=level, brokers=(Server(host="127.0.0.1"),), hubs="here", accounts=accounts)
+        self.fleet = Fleet(level=level, brokers=(Server(host="127.0.0.1"),), hubs="here", accounts=ACCOUNTS)
         for name in NAMES:
             certificates.of_account(folder, name)
         applying.write_zenoh(folder, self.fleet)

@@ -17,11 +17,11 @@ import pytest
 from msgspec.structs import replace
 
 from pebble.config import load
-from pebble.fleet.broker_client import BrokerClient, Place
 from pebble.forwarding.retained_window import INITIAL_SYNC_S
 from pebble.runtime.connections import local_transport
 from pebble.transports import Message
 from tests.commands.test_drive import Console
+from tests.fleet.broker_client import BrokerClient, Place
 from tests.fleet.brokers import HOST
 from tests.robot.named import CONTROL, DRIVE, Hall, Named
 from tests.robot.operator import Operator, driving

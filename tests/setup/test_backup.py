@@ -73,7 +73,7 @@ def _stop(places: Places) -> object:
 
 def _accounts(places: Places) -> object:
     folder = places.root / BROKER
-    return load_fleet(folder), applying.passwords_of(folder, load_fleet(folder)), applying.admin_password(folder)
+    return load_fleet(folder), applying.passwords_of(folder)
 
 
 def _camera(places: Places) -> object:

@@ -14,9 +14,9 @@ from pebble.client.page import require_packages
 from pebble.commands.fleet import lan
 from pebble.commands.options import host_of, split_names
 from pebble.errors import PebbleError
-from pebble.fleet import applying, certificates, check, folder, pieces
+from pebble.fleet import applying, certificates, check, folder, pieces, plugin
 from pebble.fleet.broker_files import new_password
-from pebble.fleet.folder import ADMIN, CONF, ZENOH, Fleet, FleetError, Server
+from pebble.fleet.folder import CONF, ZENOH, Fleet, FleetError, Server
 from pebble.fleet.people import People
 from pebble.fleet.roles import Account, ProgramRole, Role
 
@@ -29,7 +29,7 @@ _HELP = """The accounts of a broker: robots, people and page servers, and what e
     pebble fleet add goob --role robot             prints a piece of config
     pebble fleet role ann maintainer
     pebble fleet remove ann
-    pebble fleet check --live
+    pebble fleet check
 """
 _Folder = Annotated[
     Path | None, typer.Option("--folder", help="Folder of the fleet; else the only one here.", metavar="FOLDER")
@@ -65,9 +65,6 @@ def init(
     plain: Annotated[
         bool | None, typer.Option("--plain/--no-plain", help="At level named: topics without names are allowed, too.")
     ] = None,
-    without_plugin: Annotated[
-        bool, typer.Option("--without-plugin", help="Rules in acl and passwords, not in mosquitto's plugin.")
-    ] = False,
 ) -> int:
     """Write all files of a broker: authority, certificate, mosquitto.conf, accounts and rules.
 
@@ -88,17 +85,13 @@ def init(
         raise PebbleError("--host is missing: the name or address by which robots and people reach the broker")
     first, *others = (host_of("--host", one) for one in split_names(host))
     server = Server(host=first, port=port, unencrypted=unencrypted)
-    plugin = None if without_plugin else applying.found_plugin()
-    rules: Literal["plugin", "files"] = "files" if plugin is None else "plugin"
-    fleet = Fleet(level=_LEVELS[level or "login"], brokers=(server,), rules=rules, plain=bool(plain))
-    applying.make(place, fleet, plugin, others=others)
+    fleet = Fleet(level=_LEVELS[level or "login"], brokers=(server,), plain=bool(plain))
+    applying.make(place, fleet, others=others)
     typer.echo(f"{_shown(place)} has all files of a broker at {server.host}:{server.port}, level {fleet.level}.")
-    if plugin is None and not without_plugin:
-        typer.echo("mosquitto's plugin is not installed: it reads rules from files, and again after each change.")
     typer.echo(f"Start it:\n    mosquitto -c {_shown(place / CONF)}")
     if os.geteuid() == 0:
         typer.echo("It will run as root, as whom these files were made: a user of its own would do.")
-    typer.echo(f"Keep {_shown(place)} secret, and a copy of it: its keys and the password of {ADMIN} are in it.")
+    typer.echo(f"Keep {_shown(place)} secret, and a copy of it: its keys are in it.")
     return 0
 
 
@@ -146,7 +139,7 @@ def add(
         if is_neighbour:
             require_packages("pebble fleet")
             after = replace(after, hubs="here" if fleet.hubs == "none" else fleet.hubs)
-        how = applying.apply(place, fleet, after, {name: secret})
+        how = applying.apply(place, after, {name: secret})
         files = certificates.of_account(place, name, ()) if is_neighbour else None
     _print_account(place, after, name, secret, how, board=board)
     if files is not None:
@@ -162,12 +155,11 @@ def role_(
     """Change what an account may do; it stays connected."""
     with _changing(folder_) as (place, fleet):
         account = _account(place, fleet, name)
-        _keep_admin(name)
         changed = replace(account, roles=tuple(dict.fromkeys(split_names(roles))))
         if why := folder.refused(fleet.without(name), name, changed):
             raise FleetError(why)
         after = replace(fleet, accounts={**fleet.accounts, name: changed})
-        how = applying.apply(place, fleet, after)
+        how = applying.apply(place, after)
     typer.echo(f"{name} is {', '.join(changed.roles)} now ({how})")
     return _left(applying.copies(Path(_shown(place)), after))
 
@@ -177,7 +169,7 @@ def password(name: _Name, folder_: _Folder = None) -> int:
     with _changing(folder_) as (place, fleet):
         _account(place, fleet, name)
         secret = new_password()
-        how = applying.apply(place, fleet, fleet, {name: secret})
+        how = applying.apply(place, fleet, {name: secret})
     _print_account(place, fleet, name, secret, how)
     return _left(applying.copies(Path(_shown(place)), replace(fleet, hubs="none")))  # which know no passwords
 
@@ -186,12 +178,11 @@ def remove(name: _Name, folder_: _Folder = None) -> int:
     """Remove an account everywhere, and end its connections; say where it may still get in."""
     with _changing(folder_) as (place, fleet):
         account = _account(place, fleet, name)
-        _keep_admin(name)
         after = fleet.without(name)
         left = list(_remove_from_pages(fleet, name)) if not set(account.roles) & set(ProgramRole) else []
         left += applying.copies(Path(_shown(place)), after)
         try:
-            how = applying.apply(place, fleet, after)
+            how = applying.apply(place, after)
             typer.echo(f"{name} is removed and disconnected ({how})")
         except FleetError as error:
             left += [*str(error).splitlines(), f"{name} may still get in there: give this command again"]
@@ -262,35 +253,42 @@ def list_(folder_: _Folder = None) -> int:
     return 0
 
 
-def check_(
-    live: Annotated[
-        bool, typer.Option("--live", help="Also try what the broker lets through, with accounts that exist meanwhile.")
-    ] = False,
-    folder_: _Folder = None,
-) -> int:
-    """Compare the folder with its broker, and name each account and rule too many or too few.
+def apply_(folder_: _Folder = None) -> int:
+    """Write all rules again from the table, and let the broker read them.
+
+    A fleet that an earlier version made for mosquitto's plugin becomes one of
+    files; the lines of mosquitto.conf to change are printed.
 
     \b
-        pebble fleet check --live
+        pebble fleet apply
+    """
+    with _changing(folder_, any_rules=True) as (place, fleet):
+        left = list[str]()
+        if fleet.rules == "plugin":
+            fleet, left = plugin.convert(place, fleet)
+        if applying.obeys_plugin(place):
+            left += applying.conf_differences(place, fleet)
+        else:
+            typer.echo(f"{_shown(place)} knows {len(fleet.accounts)} accounts ({applying.apply(place, fleet)})")
+        left += applying.copies(Path(_shown(place)), fleet)
+    return _left(left)
+
+
+def check_(folder_: _Folder = None) -> int:
+    """Compare the broker's files with the table, and name each rule too many or too few.
+
+    \b
+        pebble fleet check
     """
     require_packages("pebble fleet")
     with _changing(folder_) as (place, fleet):
         by_hand, rules = check.by_hand(place, fleet), check.of_rules(place, fleet)
-        others = list(check.of_others(place, fleet))
-        bad = [server for server, found in others if found]
-        good = replace(fleet, brokers=tuple(one for one in fleet.brokers if one not in bad))
-        tried = check.attempt(place, good) if live else None
-    of_others = [line for _, found in others for line in found]
-    wrong = by_hand + rules + of_others + ([] if tried is None else tried.wrong)
-    for line in wrong:
-        typer.echo(f"pebble: {line}", err=True)
+    code = _left(by_hand + rules)
     if rules:
-        typer.echo(f"pebble: `pebble fleet init {_shown(place)}` gives every account its rules again", err=True)
-    if tried is not None:
-        typer.echo(f"{tried.attempts} attempts, {len(tried.wrong)} not as the table says")
-    if not wrong:
-        typer.echo(f"The broker knows the {len(fleet.accounts)} accounts of {_shown(place)}, and their rules.")
-    return 1 if wrong else 0
+        typer.echo(f"pebble: `pebble fleet apply --folder {_shown(place)}` writes the rules again", err=True)
+    if not code:
+        typer.echo(f"The files of {_shown(place)} have its {len(fleet.accounts)} accounts, and their rules.")
+    return code
 
 
 def register(app: typer.Typer) -> None:
@@ -298,6 +296,7 @@ def register(app: typer.Typer) -> None:
     commands: dict[str, Any] = {"init": init, "add": add, "role": role_, "password": password, "remove": remove}
     commands |= {
         "list": list_,
+        "apply": apply_,
         "check": check_,
         "zenoh": zenoh,
         "certificate": certificate,
@@ -321,17 +320,21 @@ def _init_again(place: Path, host: str | None, level: str | None, plain: bool | 
             level=fleet.level if level is None else _LEVELS[level],
             plain=fleet.plain if plain is None else plain,
         )
-        how = applying.apply(place, fleet, after)
-        applying.repair(place, after)
+        how = applying.apply(place, after)
     typer.echo(f"{_shown(place)} has level {after.level}{' and plain topics' if after.plain else ''} ({how})")
     return _left(applying.copies(Path(_shown(place)), after))
 
 
 @contextmanager
-def _changing(folder_: Path | None) -> Iterator[tuple[Path, Fleet]]:
+def _changing(folder_: Path | None, *, any_rules: bool = False) -> Iterator[tuple[Path, Fleet]]:
+    """Lock a fleet; one that is still for the plugin only with ``any_rules``. Raises PebbleError."""
     place = _place(folder_)
     with folder.locked(place):
-        yield place, folder.load(place)
+        fleet = folder.load(place)
+        if fleet.rules == "plugin" and not any_rules:
+            shown = _shown(place)
+            raise FleetError(f"{shown} is for mosquitto's plugin: `pebble fleet apply --folder {shown}` makes it files")
+        yield place, fleet
 
 
 def _place(folder_: Path | None) -> Path:
@@ -356,11 +359,6 @@ def _account(place: Path, fleet: Fleet, name: str) -> Account:
     if name not in fleet.accounts:
         raise FleetError(f"{_shown(place / folder.FLEET)} has no account {name!r}: `pebble fleet list` lists them")
     return fleet.accounts[name]
-
-
-def _keep_admin(name: str) -> None:
-    if name == ADMIN:
-        raise FleetError(f"{ADMIN} is the account by which this command changes the broker: it stays as it is")
 
 
 def _print_account(place: Path, fleet: Fleet, name: str, secret: str, how: str, *, board: bool = False) -> None:

@@ -60,14 +60,10 @@ def lan(
     place, shown, boards = folder_.absolute(), str(folder_), boards or []
     if (place / folder.FLEET).exists():
         raise FleetError(f"{shown} is a fleet already: add to it with `pebble fleet add`, or name another folder")
-    plugin, server = applying.found_plugin(), Server(host=host_of("--host", host), port=port)
-    fleet = _accounts(
-        Fleet(level="login", brokers=(server,), rules="files" if plugin is None else "plugin", hubs="here"),
-        robots,
-        boards,
-    )
+    server = Server(host=host_of("--host", host), port=port)
+    fleet = _accounts(Fleet(level="login", brokers=(server,), hubs="here"), robots, boards)
     passwords = {name: new_password() for name in fleet.accounts}
-    applying.make(place, fleet, plugin, passwords)
+    applying.make(place, fleet, passwords)
     applying.write_zenoh(place, folder.load(place))
     for name in (*robots, *boards):
         certificates.of_account(place, _neighbour(name), ())
