@@ -62,7 +62,6 @@ ROWS = (
         Form.OWN,
         (c.REBOOT.metric, c.SERVICE_RESTART.metric, c.GIT_PULL.metric, c.REMOTE_MIRROR.metric),
     ),
-    Row("read the audit", Form.OWN, ("audit-read",)),
     Row("commands and flags that the contract does not know", Form.OWN, ("junk", "flags/junk")),
     Row("pose as this robot", Form.OUTGOING, ("online", "capabilities", "control/serial", "estop/serial", "junk")),
     Row("pose as another or a new robot", Form.ELSEWHERE, ("robots/fake/outgoing/online", "robots/fake/incoming/junk")),
@@ -71,7 +70,7 @@ ROWS = (
     Row("change accounts", Form.ELSEWHERE, (CONTROL_TOPIC,)),
 )
 READS = (
-    ("see what the robot publishes, and its flags", ("outgoing/online", "outgoing/audit", "incoming/flags/x")),
+    ("see what the robot publishes, and its flags", ("outgoing/online", "incoming/flags/x")),
     ("see commands of others", ("incoming/drive-values", "incoming/audio-stream", "incoming/by/otto/drive-values")),
 )
 

@@ -45,7 +45,7 @@ DRIVE = LOOK | {
     *("drive-values", "control", "lights-solid", "lights-flash", "audio", "audio-stream", "soundboard-command"),
     *("autonomy-command", "mcu/u1/led", "outlets/a/power", "mip-raw", "flags/mqtt-video", "flags/mqtt-audio"),
 }
-SYSTEM = {"flags/reboot", "flags/service-restart", "flags/git-pull", "flags/remote-mirror", "audit-read"}
+SYSTEM = {"flags/reboot", "flags/service-restart", "flags/git-pull", "flags/remote-mirror"}
 MAY = {
     "vera": LOOK,
     "otto": DRIVE,
@@ -64,7 +64,7 @@ METRICS = sorted(
 TOPICS = [
     *(f"{base}/incoming/{metric}" for base in (GOOB, LAMP) for metric in METRICS),
     *(f"{GOOB}/incoming/by/{name}/{metric}" for name in ("otto", "sam", "goob", "nobody") for metric in METRICS),
-    *(f"{GOOB}/outgoing/{metric}" for metric in ("online", "control/serial", "estop/serial", "capabilities", "audit")),
+    *(f"{GOOB}/outgoing/{metric}" for metric in ("online", "control/serial", "estop/serial", "capabilities")),
     *(f"{FRED}/{metric}" for metric in ("outgoing/online", "incoming/drive-values", "incoming/flags/reboot")),
     "pebble/servers/x1/outgoing/bridge-probe",
     "pebble/servers/x1/outgoing/online",
@@ -152,12 +152,12 @@ def test_each_account_reads_what_it_may_and_nothing_else(broker: FleetBroker) ->
     published = [
         (f"{GOOB}/outgoing/online", True),
         (f"{GOOB}/incoming/flags/mqtt-video", True),
-        (f"{GOOB}/outgoing/audit-lines", False),
+        (f"{GOOB}/outgoing/logs", False),
         (f"{GOOB}/incoming/drive-values", False),
         (f"{GOOB}/incoming/by/otto/audio-stream", False),
     ]
     everything = {topic for topic, _ in published}
-    public = {f"{GOOB}/outgoing/online", f"{GOOB}/outgoing/audit-lines", f"{GOOB}/incoming/flags/mqtt-video"}
+    public = {f"{GOOB}/outgoing/online", f"{GOOB}/outgoing/logs", f"{GOOB}/incoming/flags/mqtt-video"}
     expected = dict.fromkeys(PEOPLE, public) | {"goob": everything, "gate": everything, "fred": set(), "lamp": set()}
     found = {}
     with broker.login("goob") as robot:
