@@ -61,7 +61,7 @@ class Audit:
         self._level = config.security.level
         self._writer = RowWriter(self._append, clock)
         self._holder: ControlState | None = None  # None: not known yet
-        self._stops = deque[str](maxlen=_STOPS)
+        self._stops = deque[tuple[str, str]](maxlen=_STOPS)
 
     def start(self) -> None:
         self._writer.start()
@@ -80,9 +80,9 @@ class Audit:
         with suppress(PayloadError):
             if says is not None:
                 command = codec.decode(channel, payload)
-                row = says(command)
-                if row and not self._is_repeated(row.get("stop", "")):
-                    self.note(who=_sender(by, command), **_place(by), **row)
+                row, who = says(command), _sender(by, command)
+                if row and not self._is_repeated(row.get("stop", ""), who):
+                    self.note(who=who, **_place(by), **row)
             elif channel.kind in (Kind.FLAG, Kind.ACTION):
                 on = bool(payload) and bool(codec.decode(channel, payload))
                 if on or channel.kind is Kind.FLAG:
@@ -106,11 +106,11 @@ class Audit:
                 who = holder.by if holder.named and holder.by else f"{holder.by}{_UNCHECKED}"
                 self.note(what, who, id=holder.id, device=holder.device)
 
-    def _is_repeated(self, stop: str) -> bool:
-        """True if a stop of this name has been noted."""
-        repeated = stop in self._stops
+    def _is_repeated(self, stop: str, who: str) -> bool:
+        """True if a stop of this name and sender has been noted; it may come with a checked name and without one."""
+        repeated = (stop, who) in self._stops
         if stop and not repeated:
-            self._stops.append(stop)
+            self._stops.append((stop, who))
         return repeated
 
     def _append(self, rows: list[Row]) -> None:

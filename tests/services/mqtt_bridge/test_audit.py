@@ -112,9 +112,10 @@ def test_a_stop_that_is_repeated_is_one_row_and_another_is_another(log: Log) -> 
             log.send(ESTOP, None, stop=f"{number:016x}", by="ann")
     log.send(ESTOP, None, by="ann")
     log.send(ESTOP, None, by="ann")
+    log.send(ESTOP, "ann", stop="0" * 16)
     rows = log.rows()
     assert [row.get("stop") for row in rows[:250]] == [f"{number:016x}" for number in range(250)]
-    assert [row.get("count", 1) for row in rows[250:]] == [1, 1]
+    assert [(row["who"], row.get("count", 1)) for row in rows[250:]] == [("ann?", 1), ("ann", 1), ("ann?", 1)]
 
 
 def test_control_is_given_and_ends(log: Log) -> None:
