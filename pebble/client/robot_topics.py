@@ -29,7 +29,7 @@ WATCHED = tuple(
     and channel.payload is not bytes
     and channel.remote
     and channel not in FLEET
-    and channel not in (*SYNONYMS, c.AUDIT)  # of which servers note the newest line
+    and channel not in SYNONYMS
     and channel.kind is not c.Kind.EVENT
 )
 #: Flags, by the section of the capabilities whose ``flag_topic`` may name another topic for it.

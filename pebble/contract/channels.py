@@ -162,7 +162,6 @@ REBOOT = _c("flags/reboot", Kind.ACTION, bool, "Restart the computer.", override
 SERVICE_RESTART = _c("flags/service-restart", Kind.ACTION, bool, "Restart Pebble.",
                      override=_bridge("service_restart"))  # fmt: skip
 GIT_PULL = _c("flags/git-pull", Kind.ACTION, bool, "Update the software.", override=_bridge("git_pull"))
-AUDIT_READ = _c("audit-read", Kind.COMMAND, p.AuditRead, "Requests lines of the robot's audit.", waits_s=_PATIENT_S)
 
 # -- incoming: devices
 OUTLET_COMMAND = _c("outlets/{outlet}/power", Kind.COMMAND, p.OutletCommand, "Switch an outlet.")
@@ -184,8 +183,6 @@ CONTROL_TURN = _c("control-turn/{owner}", Kind.EVENT, p.ControlTurn,
                   "Where a robot has several motor owners: what the first grants, and what the others follow.",
                   rate_hz=2, remote=False)  # fmt: skip
 LINK = _c("link", Kind.STATE, p.LinkState, "What the link to the remote broker carries; only where it may be thin.")
-AUDIT = _c("audit", Kind.STATE, p.AuditState, "The newest line of each chain of the audit, for others to note.")
-AUDIT_LINES = _c("audit-lines", Kind.EVENT, p.AuditLines, "Lines of the audit that were requested, as stored.")
 BRIDGE_PROBE = _c("bridge-probe", Kind.EVENT, p.AnyObject,
                   "By it the bridge detects that two of the robot's connections lead to one broker, "
                   "and a page server (`{system}/servers/{id}`) that each of several brokers delivers.")  # fmt: skip
@@ -262,13 +259,13 @@ _PATTERNS = [
 ]
 
 
-_RESERVED = frozenset(("audit", "by", "control", "control-turn", "from", "to", "neighbours"))
+_RESERVED = frozenset(("by", "control", "control-turn", "from", "to", "neighbours"))
 
 
 def is_reserved(metric: str) -> bool:
-    """Whether only the robot itself may define ``metric``, in either direction: who stops and drives it, or did."""
+    """Whether only the robot itself may define ``metric``, in either direction: who stops and drives it."""
     family = metric.partition("/")[0]
-    return family.startswith(("estop", "audit-")) or family in _RESERVED
+    return family.startswith("estop") or family in _RESERVED
 
 
 def channel_of(suffix: str) -> Channel | None:

@@ -38,7 +38,6 @@ def _clamp(payload: Payload, low: float, high: float, *names: str) -> None:
 
 SCRIPT = "autonomy"  # the source of a script's drive command; any other source is a person
 LAST_RUN = arbiter.LAST_RUN
-AuditChain = Literal["acts", "refused"]  # what people did; what anybody can cause
 LinkLevel = Literal["wide", "narrow", "thin"]
 LARGEST_MS = (1 << 53) - 1  # of a clock: the largest number that every JSON reader knows exactly
 
@@ -193,14 +192,6 @@ class OutletCommand(Payload, frozen=True, kw_only=True):
         return not self.on
 
 
-class AuditRead(Payload, frozen=True, kw_only=True):
-    """Requests ``count`` lines of one chain of the audit: those before a number, or the newest."""
-
-    chain: AuditChain
-    before: Annotated[int, Meta(ge=0, le=LARGEST_MS)] = 0  # 0: the newest
-    count: Annotated[int, Meta(ge=1, le=1000)] = 50
-
-
 # -- outgoing
 
 
@@ -297,29 +288,6 @@ class EstopState(Payload, frozen=True, kw_only=True):
     def last_barred(self) -> int:
         """``barred``; 0 where it is unset."""
         return self.barred if isinstance(self.barred, int) else 0
-
-
-class AuditMark(Payload, frozen=True, kw_only=True):
-    """The newest line of a chain: its number, and its hash."""
-
-    n: int
-    h: str
-
-
-class AuditState(Payload, frozen=True, kw_only=True):
-    """The audit of a robot; who notes this can prove later that lines were cut off. At most every 10 s."""
-
-    acts: AuditMark
-    refused: AuditMark
-    saved: bool = True  # False: the disk takes nothing
-
-
-class AuditLines(Payload, frozen=True, kw_only=True):
-    """Lines as stored, the oldest first, 16 KB at most; each is a JSON object with a hash (docs/fleet.md)."""
-
-    chain: AuditChain
-    before: int = 0  # as in the request that this answers
-    lines: list[str]
 
 
 class ControlState(Payload, frozen=True, kw_only=True):

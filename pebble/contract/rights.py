@@ -41,5 +41,5 @@ WRITES: Mapping[Right, tuple[Channel | str, ...]] = {
     ),
     Right.RESET: (c.ESTOP_RESET,),
     Right.TAKE: (c.CONTROL_TAKE,),
-    Right.SYSTEM: (c.REBOOT, c.SERVICE_RESTART, c.GIT_PULL, c.REMOTE_MIRROR, c.AUDIT_READ),
+    Right.SYSTEM: (c.REBOOT, c.SERVICE_RESTART, c.GIT_PULL, c.REMOTE_MIRROR),
 }

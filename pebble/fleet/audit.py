@@ -1,213 +1,121 @@
-"""The audit log: who did what to which robot, written by a thread of its own."""
+"""The audit of a page server: who did what to which robot, one table."""
 
-import logging
 import sqlite3
 import threading
 import time
-from dataclasses import astuple
 from pathlib import Path
+from typing import Final
 
-from pebble.contract.chain import Mark
-from pebble.fleet.audit_rows import Entry, Merging, new
-from pebble.fleet.database import Database, DatabaseError
+from msgspec import Struct
 
-log = logging.getLogger(__name__)
+from pebble.fleet.database import Database
+from pebble.fleet.tries import network_of
+from pebble.runtime.row_writer import DIFFERENT, OF_STRANGERS, Row, RowWriter
 
-MAX_ACTS, MAX_REFUSED = 100_000, 10_000  # rows; beyond, see _TRIM
-_ROUND_S = 0.2  # between two transactions: a row that is repeated is not written each time
+#: What anybody can cause, without a right and without a login.
+REFUSED: Final = ("login-refused", "login-limited")
+OTHERS = "(others)"
+MAX_ROWS, MAX_REFUSED = 100_000, 10_000  # of all, and of REFUSED; beyond, the oldest go
 _TRIM_PERIOD = 1000  # rows between two deletions of old ones
-_FIELDS = "at, what, ref, user, device, address, detail, count, last"
-_ADDED = {"count": "INTEGER NOT NULL DEFAULT 1", "last": "REAL NOT NULL DEFAULT 0"}  # to the table of older versions
-_TABLES = "".join(
-    f"CREATE TABLE IF NOT EXISTS {table} ("
+_MAX_TEXT = 200
+_FIELDS = ("ref", "user", "device", "address", "detail")
+_COLUMNS = ", ".join(("at", "what", *_FIELDS, "count"))
+_TABLES = (
+    "CREATE TABLE IF NOT EXISTS audit ("
     "number INTEGER PRIMARY KEY AUTOINCREMENT, at REAL NOT NULL, what TEXT NOT NULL, ref TEXT NOT NULL, "
     "user TEXT NOT NULL, device TEXT NOT NULL, address TEXT NOT NULL, detail TEXT NOT NULL, "
-    + ", ".join(map(" ".join, _ADDED.items()))
-    + ");"
-    for table in ("audit", "refused")
+    "count INTEGER NOT NULL DEFAULT 1);"
 )
-_TABLES += (
-    "CREATE TABLE IF NOT EXISTS marks (ref TEXT NOT NULL, chain TEXT NOT NULL, hour INTEGER NOT NULL, "
-    "n INTEGER NOT NULL, h TEXT NOT NULL, PRIMARY KEY (ref, chain, hour)) WITHOUT ROWID;"
-)
-MAX_MARKS = 200  # of a robot's chain
-_TRIM_MARKS = """
-DELETE FROM marks WHERE (ref, chain, hour) IN (
-    SELECT ref, chain, hour FROM (
-        SELECT *, ROW_NUMBER() OVER (PARTITION BY ref, chain ORDER BY hour DESC) AS newer FROM marks)
-    WHERE newer > ?)
-"""
-_PUT_MARK = (
-    "INSERT INTO marks VALUES (?, ?, ?, ?, ?) ON CONFLICT DO UPDATE SET n = excluded.n, h = excluded.h "
-    "WHERE excluded.n > marks.n"
-)
-#: The oldest of the person with the most rows of a kind: many of one person displace none of another.
 _TRIM = """
-DELETE FROM {table} WHERE number IN (
-    SELECT number FROM (
-        SELECT number, ROW_NUMBER() OVER (PARTITION BY what, {who} ORDER BY number DESC) AS newer FROM {table})
-    ORDER BY newer DESC, number LIMIT MAX(0, (SELECT COUNT(*) FROM {table}) - ?))
+DELETE FROM audit WHERE number IN (
+    SELECT number FROM audit WHERE what IN (?, ?) ORDER BY number DESC LIMIT -1 OFFSET ?
+) OR number IN (SELECT number FROM audit ORDER BY number DESC LIMIT -1 OFFSET ?)
 """
+
+
+class Entry(Struct, frozen=True):
+    """A row of the audit; ``at`` is in epoch seconds. With a ``count``: so many more of the minute before."""
+
+    at: float
+    what: str
+    ref: str
+    user: str
+    device: str
+    address: str
+    detail: str
+    count: int
 
 
 class Audit:
-    """Thread-safe. ``write`` never blocks. What anybody can cause is in a table of its own.
-
-    Repeated rows are merged before they wait (:class:`Merging`); rows that do not fit are counted, and the count is
-    written later. What robots tell of their own audits is noted beside it, the newest line of each hour, so that none
-    can lose the end of its audit unnoticed.
-    """
+    """Thread-safe; :meth:`write` never blocks."""
 
     def __init__(self, path: Path | None) -> None:
-        self._database = Database(path, _TABLES, _add_columns)
-        self._opened = self._database.opened
+        self._database = Database(path, _TABLES, _take_over)
         self._lock = threading.Lock()
-        self._changed = threading.Condition()  # guards what follows
-        self._rows = Merging()
-        self._marks: dict[tuple[str, str], Mark] = {}  # that wait
-        self._closing = threading.Event()
         self._written = 0
-        self._thread = threading.Thread(target=self._run, name="audit", daemon=True)
-        self._thread.start()
-
-    @property
-    def dropped(self) -> int:
-        return self._rows.dropped
+        self._writer = RowWriter(self._store)
+        self._writer.start()
 
     def write(
-        self,
-        what: str,
-        *,
-        ref: str = "",
-        user: str = "",
-        device: str = "",
-        address: str = "",
-        detail: str = "",
-        count: int = 1,
+        self, what: str, *, ref: str = "", user: str = "", device: str = "", address: str = "", detail: str = ""
     ) -> None:
-        entry = new(time.time(), what, ref, user, device, address, detail)
-        entry.count = count
-        with self._changed:
-            self._rows.add(entry, time.monotonic())
-            self._changed.notify()
+        texts = dict(zip(_FIELDS, map(_storable, (ref, user, device, address, detail)), strict=True))
+        refused = what in REFUSED
+        like = (what, network_of(address)) if refused else None
+        self._writer.add({"t": time.time(), "what": what, **texts}, like, OF_STRANGERS if refused else DIFFERENT)
 
-    def note(self, ref: str, chain: str, mark: Mark) -> None:
-        """The newest line of a robot's own audit. ``ref`` is of a bounded set."""
-        with self._changed:
-            self._marks[ref, chain] = mark
-            self._changed.notify()
+    def read(self, limit: int, ref: str = "") -> list[Entry]:
+        """Return the newest rows, the newest last; of one robot, and of all robots, if ``ref`` names it.
 
-    def marks(self, ref: str, chain: str) -> list[Mark]:
-        """What was noted of a robot's audit, the oldest first. Raises DatabaseError."""
-        with self._changed:
-            waiting = self._marks.get((ref, chain))
-        with self._lock:
-            rows = self._database.rows("SELECT n, h FROM marks WHERE ref = ? AND chain = ? ORDER BY hour", (ref, chain))
-        return [Mark(*row) for row in rows] + ([waiting] if waiting is not None else [])
-
-    def read(self, limit: int) -> list[Entry]:
-        """The newest rows of both tables in the order of their first time, the newest last."""
+        Raises DatabaseError.
+        """
         with self._lock:
             rows = self._database.rows(
-                f"SELECT {_FIELDS}, number FROM audit UNION ALL SELECT {_FIELDS}, number FROM refused "  # noqa: S608
+                f"SELECT {_COLUMNS} FROM audit WHERE ? IN ('', ref) OR ref = 'all' "  # noqa: S608
                 "ORDER BY at DESC, number DESC LIMIT ?",
-                (limit,),
+                (ref, limit),
             )
         return [Entry(*row) for row in reversed(rows)]
 
     def close(self) -> None:
         """Write what waits, for at most a few seconds."""
-        with self._changed:
-            self._closing.set()
-            self._changed.notify()
-        self._thread.join(7.0)
-        if self._thread.is_alive():
-            log.error("audit: entries are lost: the disk is too slow")
+        self._writer.close()
         with self._lock:
             self._database.close()
 
-    def _run(self) -> None:
-        dropped, failed = 0, False
-        while True:
-            with self._changed:
-                self._changed.wait_for(lambda: self._closing.is_set() or self._rows.waits or self._marks)
-                ends, rows = self._closing.is_set(), self._rows.take()
-                marks = dict(self._marks)
-            error = self._store(rows, marks)
-            lost = self.dropped - dropped
-            if error is not None and ends and (rows or lost):
-                log.error("audit: %d entries are lost: %s", len(rows) + lost, error)
-            elif error is not None and not ends and not failed:
-                log.error("audit: entries wait to be written: %s", error)
-            failed = error is not None
-            if not failed and lost:
-                dropped += lost
-                log.warning("audit: %d entries are lost: too many waited to be written", lost)
-                self.write("audit-dropped", count=lost)
-                continue
-            if ends:
-                return
-            if failed:
-                with self._changed:
-                    self._rows.give_back(rows)
-            self._closing.wait(_ROUND_S)
-
-    def _store(self, rows: list[Entry], marks: dict[tuple[str, str], Mark]) -> object:
-        """All rows or, when this returns why not, none: a full disk must not end the thread."""
-        try:
-            with self._lock:
-                if removed := self._database.removed:
-                    return removed
-                with self._database.transaction() as connection:
-                    if self._database.opened != self._opened:
-                        self._opened = self._database.opened
-                        self._begin_again(rows)
-                    numbers = [self._put(connection, row) for row in rows]
-                    hour = int(time.time() // 3600)
-                    connection.executemany(_PUT_MARK, [(*of, hour, *mark) for of, mark in marks.items()])
-                    self._written += len(rows) + len(marks)
-                    if self._written >= _TRIM_PERIOD:
-                        self._written = 0
-                        connection.execute(_TRIM.format(table="audit", who="user"), (MAX_ACTS,))
-                        connection.execute(_TRIM.format(table="refused", who="address"), (MAX_REFUSED,))
-                        connection.execute(_TRIM_MARKS, (MAX_MARKS,))
-        except (DatabaseError, sqlite3.Error, OSError) as error:
-            return error
-        for row, number in zip(rows, numbers, strict=True):
-            row.number = number
-        with self._changed:
-            for of, mark in marks.items():
-                if self._marks.get(of) == mark:
-                    del self._marks[of]
-        return None
-
-    def _begin_again(self, rows: list[Entry]) -> None:
-        """Another file has taken the place of the one that has the numbers of rows."""
-        with self._changed:
-            self._rows.begin_again()
-        for row in rows:
-            row.number = 0
-
-    def _put(self, connection: sqlite3.Connection, row: Entry) -> int:
-        table = "refused" if row.refused else "audit"
-        if row.number:
-            connection.execute(
-                f"UPDATE {table} SET user = ?, address = ?, count = ?, last = ? WHERE number = ?",  # noqa: S608
-                (row.user, row.address, row.count, row.last, row.number),
-            )
-            return row.number
-        cursor = connection.execute(
-            f"INSERT INTO {table} ({_FIELDS}) VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?)",  # noqa: S608
-            astuple(row)[:-1],
-        )
-        return cursor.lastrowid or 0
+    def _store(self, rows: list[Row]) -> None:
+        """Store all rows. Raises DatabaseError or OSError, and then none is stored."""
+        with self._lock:
+            if removed := self._database.removed:
+                raise OSError(removed)
+            self._written += len(rows)
+            with self._database.transaction() as connection:
+                connection.executemany(
+                    f"INSERT INTO audit ({_COLUMNS}) VALUES (?, ?, ?, ?, ?, ?, ?, ?)",  # noqa: S608
+                    [_values(row) for row in rows],
+                )
+                if self._written >= _TRIM_PERIOD:
+                    self._written = 0
+                    connection.execute(_TRIM, (*REFUSED, MAX_REFUSED, MAX_ROWS))
 
 
-def _add_columns(database: sqlite3.Connection) -> None:
-    """To a table of an older version: its rows happened once."""
+def _values(row: Row) -> tuple[float | str | int, ...]:
+    """A row as it is stored; without texts it stands for those that differ too much."""
+    texts = (row.get(field, OTHERS if field == "user" else "") for field in _FIELDS)
+    return (row["t"], row["what"], *texts, row.get("count", 1))
+
+
+def _take_over(database: sqlite3.Connection) -> None:
+    """Bring what an older version stored in several tables into one."""
     database.execute("BEGIN IMMEDIATE")  # another process may do the same
-    found = {row[1] for row in database.execute("PRAGMA table_info(audit)")}
-    for name, kind in _ADDED.items():
-        if name not in found:
-            database.execute(f"ALTER TABLE audit ADD COLUMN {name} {kind}")
+    if "count" not in {row[1] for row in database.execute("PRAGMA table_info(audit)")}:
+        database.execute("ALTER TABLE audit ADD COLUMN count INTEGER NOT NULL DEFAULT 1")
+    if list(database.execute("PRAGMA table_info(refused)")):
+        database.execute(f"INSERT INTO audit ({_COLUMNS}) SELECT {_COLUMNS} FROM refused")  # noqa: S608
+        database.execute("DROP TABLE refused")
+    database.execute("DROP TABLE IF EXISTS marks")
     database.execute("COMMIT")
+
+
+def _storable(text: str) -> str:
+    return text[:_MAX_TEXT].encode(errors="replace").decode()

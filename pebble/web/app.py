@@ -22,8 +22,8 @@ from starlette.types import Lifespan
 from starlette.websockets import WebSocket
 
 from pebble.client.page import WebSettings
-from pebble.errors import PebbleError
 from pebble.fleet.audit import Audit
+from pebble.fleet.database import DatabaseError
 from pebble.fleet.people import People
 from pebble.fleet.roles import Session, page_rights
 from pebble.web.access import login
@@ -36,6 +36,7 @@ from pebble.web.recordings.routes import Recordings
 from pebble.web.server import PEOPLE_S, Server
 from pebble.web.static_files import FOREVER, NO_STORE, StaticFiles, root_of
 
+_AUDIT_ROWS = 200  # that a page shows; `pebble web audit` prints more
 _ENCODINGS = frozenset({"json", "pbvd", "pbvz", "h264", "jpeg"})
 _estop_decoder = msgspec.json.Decoder(EstopOp)
 
@@ -88,7 +89,7 @@ def _app(settings: WebSettings, lifespan: Lifespan[Starlette]) -> Starlette:
             Route("/healthz", _health),
             Route("/api/snapshot.jpg", _snapshot),
             Route("/api/estop", _estop, methods=["POST"]),
-            Route("/api/robot-audit", _robot_audit),
+            Route("/api/audit", _audit),
             *login.routes(),
             *recordings.routes(),
             WebSocketRoute("/ws/control", _control),
@@ -167,22 +168,18 @@ async def _estop(request: Request) -> Response:
     return PlainTextResponse("sent", 202)
 
 
-async def _robot_audit(request: Request) -> Response:
-    """Lines of the audit that a robot keeps, for those who look after robots; compared with what was noted here."""
+async def _audit(request: Request) -> Response:
+    """The newest rows of this server's audit about one robot, for those who look after robots."""
     session, server = login.session_of(request), _server_of(request)
     if session is None:
         return PlainTextResponse("log in first", 401)
     if "system" not in page_rights(session.role, server.settings.level):
         return PlainTextResponse(f"The role {session.role} may not do this", 403)
-    ref, name = request.query_params.get("ref", ""), request.query_params.get("chain", "acts")
-    before = request.query_params.get("before", "0")
-    if ref not in server.robots.components or name not in ("acts", "refused") or not before.isdecimal():
-        return PlainTextResponse("unknown component, or no such lines", 404)
     try:
-        found = await server.robot_audits.read(ref, "acts" if name == "acts" else "refused", int(before[:15]))
-    except PebbleError as error:
+        rows = await asyncio.to_thread(server.audit.read, _AUDIT_ROWS, request.query_params.get("ref", ""))
+    except DatabaseError as error:
         return PlainTextResponse(str(error), 503, headers=NO_STORE)
-    return Response(msgspec.json.encode(found), media_type="application/json", headers=NO_STORE)
+    return Response(msgspec.json.encode(rows), media_type="application/json", headers=NO_STORE)
 
 
 def _server_of(request: Request) -> Server:

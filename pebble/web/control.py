@@ -30,6 +30,7 @@ HELLO_S = 5.0  # to begin with
 CHECK_S = 5.0  # between two looks at whether the session still exists, while no person and no session changes
 _WATCH_COST = 20  # it subscribes to so many topics
 _WAITING = 64  # messages that wait to be sent, besides the state
+_NOT_NOTED = ("op", "ref", "n", "config")  # settings of a script may be secret
 _RELOAD = "This page is older than the server: reload it"
 
 _decoder = msgspec.json.Decoder(m.FromPage)
@@ -405,4 +406,4 @@ def _tag(op: m.FromPage) -> str:
 
 def _detail(op: m.RobotOp) -> str:
     fields = msgspec.to_builtins(op)
-    return ", ".join(f"{key} {value}" for key, value in fields.items() if key not in ("op", "ref", "n"))[:200]
+    return ", ".join(f"{key} {value}" for key, value in fields.items() if key not in _NOT_NOTED)[:200]

@@ -15,7 +15,7 @@ from pebble.client.estop import send
 from pebble.client.page import WebSettings
 from pebble.client.robot_topics import FLEET, SYNONYMS
 from pebble.config.security import SecurityLevel
-from pebble.contract import AUDIT, CAPABILITIES, CONTROL_STATE, LINK, ONLINE, channel_of
+from pebble.contract import CAPABILITIES, CONTROL_STATE, LINK, ONLINE, channel_of
 from pebble.contract.identity import SERVERS, Identity, parse_topic
 from pebble.errors import ConfigError
 from pebble.fleet.audit import Audit
@@ -32,7 +32,6 @@ from pebble.web.media.chosen_sources import ChosenSources
 from pebble.web.media.pictures_and_sound import PicturesAndSound
 from pebble.web.media.robot_streams import OwnHosts
 from pebble.web.open_components import OpenComponents
-from pebble.web.robot_audits import RobotAudits
 from pebble.web.robots import Robots
 from pebble.web.stops import Stops
 
@@ -65,13 +64,6 @@ class Server:
         self.sources = ChosenSources(people, self.robots, OwnHosts(settings), self.open_components.update)
         self.by_name = ByName(FLEET, lambda ref: ref in known or ref in self.open_components)
         self.robots.on_forget = self.by_name.forget
-        self.robot_audits = RobotAudits(
-            self.broker,
-            audit,
-            known.__contains__,
-            self.robots.components.__contains__,
-            lambda ref: self.drivers.robot(ref).pace.answer_s,
-        )
         self.people_version = (0, 0, 0)
         self._tasks: set[asyncio.Task[None]] = set()
 
@@ -85,7 +77,6 @@ class Server:
         for channel in (*FLEET, *SYNONYMS):
             deferred = channel is ONLINE or channel in SYNONYMS
             await self.broker.subscribe(channel.filter("+/+/+"), self.receive, deferred=deferred)
-        await self.broker.subscribe(AUDIT.filter("+/+/+"), self.robot_audits.receive, deferred=True)
         self.spawn(self._tick())
         if self.settings.login:
             self.spawn(self._watch_people())
@@ -210,7 +201,6 @@ class Server:
                     self.robots.refresh(time.monotonic())
                     self._show_broker()
                     self._remember_robots()
-                    self.robot_audits.tick(now)
             except (
                 Exception
             ):  # one faulty round must not end all later ones, on which the end of silent gestures depends

@@ -1,140 +1,148 @@
-"""The robot's audit: who did what to it, written by a thread of its own, read by those who have the right.
+"""The robot's audit: one log of JSON lines, who did what to it, written where the bridge passes a command in.
 
-Forwarding never waits for the disk. What cannot be written waits within bounds, and ``outgoing/audit`` tells so.
+Forwarding never waits for it. Commands to drive are not in it, and of other commands neither parameters nor keys.
 """
 
-import logging
-import threading
+import errno
+import os
 import time
 from collections import deque
 from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
 
 import msgspec
 
 from pebble.config import Config
-from pebble.contract import AUDIT, AUDIT_LINES, codec
-from pebble.contract.payloads import AuditLines, AuditMark, AuditRead, AuditState
-from pebble.runtime.addresses import Addresses
-from pebble.services.mqtt_bridge.acts import Acts
-from pebble.services.mqtt_bridge.chain_files import ChainFiles
-from pebble.transports import QoS, Transport
+from pebble.contract import AUTONOMY_COMMAND, CONTROL, CONTROL_TAKE, ESTOP, ESTOP_RESET, Channel, Kind, codec
+from pebble.contract.names import NO_ACCOUNT
+from pebble.contract.payloads import ControlState
+from pebble.errors import PayloadError
+from pebble.forwarding.routing import Drop
+from pebble.motion.lease import shown
+from pebble.runtime.row_writer import OF_STRANGERS, Row, RowWriter
 from pebble.version import __version__
 
-log = logging.getLogger(__name__)
+ROBOT = "(robot)"  # a program of the robot: no account has such a name
+_UNCHECKED = "?"  # behind a name that the broker has not checked
+_MOST_BYTES = 8_000_000  # of each of two files
+_NAME, _FILE = 40, 64  # characters
+_STOPS = 256  # names of stops that are remembered: a stop is repeated until it is confirmed
+_REFUSED = {
+    *(Drop.UNNAMED, Drop.MISNAMED, Drop.UNREADABLE, Drop.SIGNED, Drop.LATE),
+    *(Drop.STALE, Drop.TOO_LARGE, Drop.TOO_MANY, Drop.TOO_OFTEN),
+}
+#: What is noted of a command; empty: nothing.
+_COMMANDS: dict[str, Callable[[Any], Row]] = {
+    ESTOP.suffix: lambda stop: {"what": "stop", "stop": stop.stop or "", "why": stop.why or ""},
+    ESTOP_RESET.suffix: lambda _: {"what": "reset"},
+    CONTROL.suffix: lambda request: {"what": "control-released", "id": request.id} if request.ends() else {},
+    CONTROL_TAKE.suffix: lambda request: {"what": "control-demanded", "id": request.id},
+    AUTONOMY_COMMAND.suffix: lambda script: (
+        {"what": "script-stop" if script.ends() else "script-start", "file": (script.file or "")[:_FILE]}
+        if script.ends() or script.file
+        else {}
+    ),
+}
 
-_ACTS_BYTES, _REFUSED_BYTES = 2_000_000, 500_000  # of one of two files
-_ROUND_S = 1.0  # between two writes, and two answers
-_MARK_S = 10.0  # between two publications of the newest lines
-_ASKED = 8  # requests that wait to be answered
-LINES_BYTES, THIN_LINES_BYTES = 16_000, 2_000  # of one answer: 2 s of 9.6 kbit/s, in which heartbeats wait behind it
-_END_S = 2.0  # longest wait for the last write
+
+def files(config: Config) -> list[Path]:
+    """The files of a robot's audit, the newer one first."""
+    path = config.state_file("audit").with_suffix(".jsonl")
+    return [path, path.with_suffix(".old.jsonl")]
 
 
-def chain_files(config: Config) -> dict[str, ChainFiles]:
-    """The two chains of a robot, by name."""
-    return {
-        name: ChainFiles(config.state_file(f"audit-{name}").with_suffix(".jsonl"), most, synced=name == "acts")
-        for name, most in (("acts", _ACTS_BYTES), ("refused", _REFUSED_BYTES))
-    }
+class Audit:
+    """Notes commands, refusals and who has control. Thread-safe, but for :meth:`control`."""
 
-
-class Audit(Acts):
-    """What :class:`Acts` finds is written once a second; ``remote`` gets the newest marks, and what is asked for."""
-
-    def __init__(self, config: Config, remote: Transport, clock: Callable[[], float] = time.monotonic) -> None:
-        super().__init__(config.base, config.motor_owners, clock, time.time)
-        self._remote, self._addresses = remote, Addresses(config)
+    def __init__(self, config: Config, clock: Callable[[], float] = time.monotonic) -> None:
+        self._path, self._older = files(config)
         self._level = config.security.level
-        self._lines_bytes = LINES_BYTES if config.services.mqtt_bridge.link.slowest == "wide" else THIN_LINES_BYTES
-        self._chains = {
-            name: (files, self.acts if name == "acts" else self.refused) for name, files in chain_files(config).items()
-        }
-        self._asked: deque[AuditRead] = deque(maxlen=_ASKED)
-        self._published, self._publish_at = b"", float("-inf")
-        self._saved = True
-        self._closing = threading.Event()
-        self._thread = threading.Thread(target=self._run, name="audit", daemon=True)
+        self._writer = RowWriter(self._append, clock)
+        self._holder: ControlState | None = None  # None: not known yet
+        self._stops = deque[tuple[str, str]](maxlen=_STOPS)
 
     def start(self) -> None:
+        self._writer.start()
         self.note("start", level=self._level, version=__version__)
-        self._thread.start()
 
     def close(self) -> None:
-        """Write what waits, for a bounded time."""
-        self._closing.set()
-        self._thread.join(_END_S)
+        self._writer.close()
 
-    def ask(self, request: AuditRead) -> None:
-        """Publish these lines soon: one answer a second."""
-        self._asked.append(request)
+    def note(self, what: str, who: str = ROBOT, **more: str | float | bool) -> None:
+        """Write down what was done, or found; ``what`` is of a fixed set."""
+        self._writer.add({"t": round(time.time(), 3), "what": what, "who": who, **more})
 
-    # -- the thread
+    def passed(self, channel: Channel, by: str | None, payload: bytes) -> None:
+        """Note a command or a changed flag. ``by`` is the sender that the broker has checked, ROBOT, or None."""
+        says = _COMMANDS.get(channel.suffix)
+        with suppress(PayloadError):
+            if says is not None:
+                command = codec.decode(channel, payload)
+                row, who = says(command), _sender(by, command)
+                if row and not self._is_repeated(row.get("stop", ""), who):
+                    self.note(who=who, **_place(by), **row)
+            elif channel.kind in (Kind.FLAG, Kind.ACTION):
+                on = bool(payload) and bool(codec.decode(channel, payload))
+                if on or channel.kind is Kind.FLAG:
+                    name = channel.metric.removeprefix("flags/")
+                    self.note(channel.kind.name.lower(), _sender(by), **_place(by), name=name, on=on)
 
-    def _run(self) -> None:
-        ends = False
-        while not ends:
-            ends = self._closing.wait(_ROUND_S)
-            try:
-                self._do_round(ends=ends)
-            except Exception:  # else nothing would be written from now on, and nothing would show it
-                if self._saved:
-                    log.exception("the audit cannot be written")
-                self._saved = False
-                self._publish()
+    def refused(self, drop: Drop, channel: Channel | None, by: str | None) -> None:
+        """Note that a message from outside did not pass."""
+        if drop in _REFUSED:
+            name, who = "" if channel is None else channel.metric, _sender(by)
+            row = {"t": round(time.time(), 3), "what": "refused", "who": who, **_place(by), "name": name}
+            self._writer.add({**row, "why": drop.value}, most=OF_STRANGERS)
 
-    def _do_round(self, *, ends: bool) -> None:
-        self.follow_states()
-        self._write(all_of_them=ends)
-        self._publish()
-        if self._asked and not ends:
-            self._answer(self._asked.popleft())
-
-    def _write(self, *, all_of_them: bool) -> None:
-        problem: OSError | None = None
-        for files, waiting in self._chains.values():
-            with self.lock:
-                rows = waiting.take(self._clock(), all_of_them=all_of_them)
-            if not rows:
-                continue
-            try:
-                files.append(rows)
-            except OSError as error:
-                problem = error
-                with self.lock:
-                    waiting.give_back(rows, self._clock())
-            else:
-                with self.lock:
-                    waiting.written()
-        if problem is not None and self._saved:
-            log.error("the audit cannot be written, it waits: %s: %s", problem.filename or "disk", problem.strerror)
-        elif problem is None and not self._saved:
-            log.warning("the audit is written again")
-        self._saved = problem is None
-
-    def _publish(self) -> None:
-        now = self._clock()
-        if now < self._publish_at:
+    def control(self, state: ControlState) -> None:
+        """Note who has got control and who has it no longer; the motor owner that decides has told this."""
+        before, self._holder = self._holder, state
+        if before is None or (before.key, before.boot) == (state.key, state.boot):
             return
-        marks = {name: AuditMark(n=files.mark.n, h=files.mark.h) for name, (files, _) in self._chains.items()}
-        payload = codec.encode(AUDIT, AuditState(**marks, saved=self._saved))
-        if payload != self._published:
-            self._publish_at, self._published = now + _MARK_S, payload
-            address = self._addresses[AUDIT]
-            self._remote.publish(address.topic, payload, qos=QoS(address.qos), retain=address.retain)
+        for what, holder in (("control-ended", before), ("control-given", state)):
+            if holder.key:
+                who = holder.by if holder.named and holder.by else f"{holder.by}{_UNCHECKED}"
+                self.note(what, who, id=holder.id, device=holder.device)
 
-    def _answer(self, request: AuditRead) -> None:
-        files, _ = self._chains[request.chain]
+    def _is_repeated(self, stop: str, who: str) -> bool:
+        """True if a stop of this name and sender has been noted; it may come with a checked name and without one."""
+        repeated = (stop, who) in self._stops
+        if stop and not repeated:
+            self._stops.append((stop, who))
+        return repeated
+
+    def _append(self, rows: list[Row]) -> None:
+        """Write all of them, or raise OSError: then the file is as before."""
+        lines = b"".join(msgspec.json.encode(row) + b"\n" for row in rows)
+        self._path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+        if self._path.exists() and self._path.stat().st_size >= _MOST_BYTES:
+            self._path.replace(self._older)
+        file = os.open(self._path, os.O_RDWR | os.O_CREAT | os.O_APPEND, 0o600)
+        size = os.fstat(file).st_size
         try:
-            lines = [raw.decode(errors="replace") for raw in files.newest(request.before, request.count)]
-        except OSError as error:
-            log.warning("the audit cannot be read: %s", error.strerror)
-            return
-        size = 0
-        for number, one in enumerate(reversed(lines)):  # the newest ones that fit
-            size += len(msgspec.json.encode(one)) + 1
-            if size > self._lines_bytes:
-                lines = lines[len(lines) - number :]
-                break
-        address = self._addresses[AUDIT_LINES]
-        payload = codec.encode(AUDIT_LINES, AuditLines(chain=request.chain, before=request.before, lines=lines))
-        self._remote.publish(address.topic, payload, qos=QoS(address.qos), retain=address.retain)
+            if size and os.pread(file, 1, size - 1) != b"\n":  # a power cut has left a part of a line
+                lines = b"\n" + lines
+            if os.write(file, lines) != len(lines):
+                raise OSError(errno.ENOSPC, "No space left on device")
+            os.fdatasync(file)
+        except OSError:
+            os.ftruncate(file, size)
+            raise
+        finally:
+            os.close(file)
+
+
+def _sender(by: str | None, command: Any = None) -> str:
+    """The account; else what the sender claims to be, marked as such."""
+    claim = getattr(command, "by", None)
+    name = shown(claim.rstrip(_UNCHECKED), _NAME) if isinstance(claim, str) else ""
+    if by == ROBOT:
+        return f"{ROBOT}/{name}" if name else ROBOT
+    return f"{name}{_UNCHECKED}" if by is None or by == NO_ACCOUNT else by
+
+
+def _place(by: str | None) -> dict[str, str]:
+    """Where a command came from."""
+    return {"from": "robot" if by == ROBOT else "operators"}

@@ -6,12 +6,12 @@ retained topics that nobody but the robot publishes.
 
 from collections.abc import Callable
 
-from pebble.contract import AUDIT, CHANNELS, MCU_DESCRIBE, MCU_VALUE, ONLINE, OUTGOING, Channel, Kind
+from pebble.contract import CHANNELS, MCU_DESCRIBE, MCU_VALUE, ONLINE, OUTGOING, Channel, Kind
 from pebble.forwarding.subjects import Subjects
 from pebble.transports import Message, Subscription, Transport
 
 _TOPICS = 10_000  # noted of each side; with more nothing is removed
-_NOT_HERE = (ONLINE, AUDIT, MCU_DESCRIBE)  # the bridge's own, and what MCU_VALUE covers
+_NOT_HERE = (ONLINE, MCU_DESCRIBE)  # the bridge's own, and what MCU_VALUE covers
 
 
 class Leftovers:

@@ -1,13 +1,13 @@
-"""What messages request of the bridge itself: system actions, pictures and sound, and rows of the audit."""
+"""What messages request of the bridge itself: system actions, pictures and sound."""
 
 from collections.abc import Callable
 from contextlib import suppress
 from functools import partial
 from typing import Any
 
-from pebble.contract import AUDIT_READ, DRIVE, REMOTE_MIRROR, Channel, codec
+from pebble.contract import DRIVE, REMOTE_MIRROR, Channel, codec
 from pebble.contract.levels import LEVELS
-from pebble.contract.payloads import SCRIPT, AuditRead, Drive
+from pebble.contract.payloads import SCRIPT, Drive
 from pebble.errors import PayloadError
 from pebble.forwarding.forwarder import Mirroring
 from pebble.runtime.parent import Notifier, earlier_requests
@@ -23,13 +23,12 @@ class OwnRequests:
     def __init__(
         self,
         service: Service,
-        ask: Callable[[AuditRead], None],
         mirroring: Mirroring,
         notifier: Notifier,
         uplink: Uplink | None,
     ) -> None:
         config, section = service.config, service.config.services.mqtt_bridge
-        self._service, self._post, self._clock, self._ask = service, service.post_message, service.clock, ask
+        self._service, self._post, self._clock = service, service.post_message, service.clock
         self._mirroring, self._uplink = mirroring, uplink
         self.actions = SystemActions(section, folder=config.state_dir(), clock=service.clock)
         self._media = MediaRequests(Media(config.on_demand_programs(), earlier_requests()), notifier.request)
@@ -38,7 +37,6 @@ class OwnRequests:
         self._messages: dict[str, Callable[[bytes], None]] = {
             **{row.request.suffix: partial(self._on_media_request, row.request) for row in MEDIA},
             **{row.channel.suffix: partial(self._on_action, row.channel) for row in ACTIONS},
-            AUDIT_READ.suffix: self._on_audit_read,
         }
         if section.link.profile != "wide" or section.remote_mqtt.hosts:
             self._messages[DRIVE.suffix] = self._on_drive
@@ -87,10 +85,6 @@ class OwnRequests:
             thin = self._uplink is not None and self._uplink.level is LEVELS["thin"]
             if thin and command.moves and command.source != SCRIPT:
                 self._post(DRIVE, lambda: self._hold.drive(self._clock()), newest_of="hold")
-
-    def _on_audit_read(self, payload: bytes) -> None:
-        if (request := self._decoded(AUDIT_READ, payload)) is not None:
-            self._ask(request)
 
     def _on_action(self, channel: Channel, payload: bytes) -> None:
         if self._boolean(channel, payload):

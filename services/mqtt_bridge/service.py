@@ -1,11 +1,14 @@
 """The bridge as a process: forwarding, heartbeat, same-broker probe, system actions and media requests."""
 
+from contextlib import suppress
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
-from pebble.contract import AUDIT_READ, BRIDGE_PROBE, DRIVE, ESTOP, LINK, ONLINE, REMOTE_MIRROR, Channel, codec
+from pebble.contract import BRIDGE_PROBE, CONTROL_STATE, DRIVE, ESTOP, LINK, ONLINE, REMOTE_MIRROR, Channel, codec
 from pebble.contract.levels import LEVELS
 from pebble.contract.names import with_name
+from pebble.contract.payloads import ControlState
+from pebble.errors import PayloadError
 from pebble.forwarding.forwarder import Routed, barrier
 from pebble.forwarding.names import Names
 from pebble.forwarding.retained_window import INITIAL_SYNC_S
@@ -18,8 +21,7 @@ from pebble.runtime.parent import Notifier
 from pebble.runtime.service import every
 from pebble.runtime.timers import Timer
 from pebble.services.mqtt_bridge.actions import ACTIONS
-from pebble.services.mqtt_bridge.audit import Audit
-from pebble.services.mqtt_bridge.audit_rows import ROBOT
+from pebble.services.mqtt_bridge.audit import ROBOT, Audit
 from pebble.services.mqtt_bridge.heartbeat import Heartbeat
 from pebble.services.mqtt_bridge.leftovers import Leftovers
 from pebble.services.mqtt_bridge.media import MEDIA
@@ -57,7 +59,7 @@ class MqttBridge(ForwardingService):
     @classmethod
     def handles(cls) -> tuple[Channel, ...]:
         media = (channel for row in MEDIA for channel in (row.flag, row.request))
-        return (REMOTE_MIRROR, AUDIT_READ, *media, *(row.channel for row in ACTIONS))
+        return (REMOTE_MIRROR, *media, *(row.channel for row in ACTIONS))
 
     def __init__(self, *arguments: Any, **options: Any) -> None:
         super().__init__(*arguments, **options)
@@ -66,12 +68,14 @@ class MqttBridge(ForwardingService):
         self._same_broker = SameBrokerProbe(self.config, self.transport, self.remote, self.clock)
         notifier = Notifier()
         self._owners = MotorOwners(self.config.base, self.config.motor_owners, notifier)
-        self._audit = Audit(self.config, self.remote, self.clock)
+        self._audit = Audit(self.config, self.clock)
+        decides = min(self.config.motor_owners, default="")
+        self._control_topic = CONTROL_STATE.topic(self.config.base, owner=decides) if decides else ""
         self._private = PrivateTopics(self.config.base)
         self._uplink: Uplink | None = None
         if section.link.profile != "wide":
             self._uplink = Uplink(section, self.addresses[LINK], self.remote, self.forwarder, self.clock)
-        self._requests = OwnRequests(self, self._audit.ask, self.forwarder.mirroring, notifier, self._uplink)
+        self._requests = OwnRequests(self, self.forwarder.mirroring, notifier, self._uplink)
         own, sparing = ((), False) if self._uplink is None else ((LINK,), True)
         self._leftovers = Leftovers(self.config.base, self.subjects, self.remote, *own, sparing=sparing)
         self._leftover_timer: Timer | None = None
@@ -280,12 +284,20 @@ class MqttBridge(ForwardingService):
             return
         if message.topic in self._owners.topics:
             self._owners.receive(message.topic)
-        if message.topic in self._audit.topics:
-            self._audit.state(message.topic, message.payload)
-            self.forwarder.ages.keys = self._audit.keys
+        if message.topic == self._control_topic:
+            self._follow_control(message.payload)
         self._leftovers.note_local(message)
         for admitted in self._private.admit(message):
             self._react(Side.LOCAL, admitted, self.forwarder.receive(Side.LOCAL, admitted))
+
+    def _follow_control(self, payload: bytes) -> None:
+        """Learn who has control, and its key: the age of a command counts by it."""
+        keys = None
+        with suppress(PayloadError):
+            state: ControlState = codec.decode(CONTROL_STATE, payload)
+            keys = frozenset([state.key.encode()]) - {b""}
+            self._audit.control(state)
+        self.forwarder.ages.keys = keys
 
     def _on_probe(self, message: Message) -> None:
         if self._same_broker.proves_same_broker(message):
@@ -318,7 +330,7 @@ class MqttBridge(ForwardingService):
         channel = routed.subject.channel if routed.subject is not None else None
         local = side is Side.LOCAL
         if not local and isinstance(routed.outcome, Drop):
-            self._audit.drop(routed.outcome, routed.by)
+            self._audit.refused(routed.outcome, channel, routed.by)
         if routed.outcome is Drop.STALE:
             self.refusals.stale("a command" if channel is None else channel.metric)
             return

@@ -44,7 +44,7 @@ DRIVE = LOOK | {
     *("drive-values", "control", "lights-solid", "lights-flash", "audio", "audio-stream", "soundboard-command"),
     *("autonomy-command", "mcu/u1/led", "outlets/a/power", "mip-raw", "flags/mqtt-video", "flags/mqtt-audio"),
 }
-SYSTEM = {"flags/reboot", "flags/service-restart", "flags/git-pull", "flags/remote-mirror", "audit-read"}
+SYSTEM = {"flags/reboot", "flags/service-restart", "flags/git-pull", "flags/remote-mirror"}
 MAY = {
     "vera": LOOK,
     "otto": DRIVE,
@@ -63,7 +63,7 @@ METRICS = sorted(
 TOPICS = [
     *(f"{base}/incoming/{metric}" for base in (GOOB, LAMP) for metric in METRICS),
     *(f"{GOOB}/incoming/by/{name}/{metric}" for name in ("otto", "sam", "goob", "nobody") for metric in METRICS),
-    *(f"{GOOB}/outgoing/{metric}" for metric in ("online", "control/serial", "estop/serial", "capabilities", "audit")),
+    *(f"{GOOB}/outgoing/{metric}" for metric in ("online", "control/serial", "estop/serial", "capabilities")),
     *(f"{FRED}/{metric}" for metric in ("outgoing/online", "incoming/drive-values", "incoming/flags/reboot")),
     "pebble/servers/x1/outgoing/bridge-probe",
     "pebble/servers/x1/outgoing/online",

@@ -329,7 +329,7 @@ def flood(world: World, history: str) -> None:
 
 def sent(world: World) -> list[tuple[str, bytes, int, bool]]:
     """What the bridge has published on the remote side, without what differs at each run."""
-    own = (ONLINE, "outgoing/bridge-probe", "outgoing/audit")
+    own = (ONLINE, "outgoing/bridge-probe")
     return [
         (one.topic, one.payload, int(one.qos), bool(one.retain_requested))
         for one in world.remote.seen

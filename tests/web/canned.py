@@ -71,7 +71,7 @@ class State:
     refused: str = ""  # why nothing that is asked of a robot is done
     recordings: bool = False  # those of tests.web.recorded are offered
     days: tuple[int, str] | None = None  # status and text that a list of recorded days is answered with; status 0: none
-    audit: dict[str, Any] = field(default_factory=dict)  # of a robot, as it is read
+    audit: list[Any] = field(default_factory=list)  # of a robot, as it is read
     frames: str = ""  # origins that the page may show in a frame; {port} is the server's, here and in all values
 
 
@@ -95,7 +95,7 @@ class CannedServer:
                 Route("/static/{version}/{name:path}", self._static),
                 Route("/stream", self._stream),
                 Route("/api/snapshot.jpg", self._snapshot),
-                Route("/api/robot-audit", self._audit),
+                Route("/api/audit", self._audit),
                 Route("/api/{name}", self._post, methods=["POST"]),
                 WebSocketRoute("/ws/control", self._control),
                 WebSocketRoute("/ws/media", self._media),

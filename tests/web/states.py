@@ -300,18 +300,19 @@ def past(now_ms: int) -> dict[tuple[str, str], list[Any]]:
 
 MINE = at(GOOB, "web/driver", driver("alice", "laptop", you=True))
 DRIVING = State(GOOB_PATH, changed(fleet, MINE), LIVE, logs=logs)
-_ACTS: list[dict[str, Any]] = [
-    {"what": "start", "who": "(robot)", "version": "1.0.0", "level": "named"},
-    {"what": "control-given", "who": "hall/ann", "device": "phone"},
-    {"what": "stop", "who": "hall/bob", "why": "button"},
-    {"what": "control-ended", "who": "hall/ann", "seconds": 41.2, "commands": 318, "why": "silent"},
-    {"what": "reset", "who": "hall/ann"},
-    {"what": "control-taken", "who": "otto?", "device": "laptop in the hall, on the table"},
-    {"what": "script-start", "who": "otto?", "file": "apriltag-follow"},
-    {"what": "flag", "who": "hall/a-name-that-is-as-long-as-names-may-be", "name": "mqtt-video", "on": True},
-    {"what": "control-given", "who": "?", "since": 1_795_341_588, "count": 12},
+_ACTS = (
+    ("take", "ann", "phone", "", 1),
+    ("stop", "ann", "phone", "button", 1),
+    ("reset", "bob", "", "", 1),
+    ("release", "ann", "laptop in the hall, on the table", "", 1),
+    ("autonomy", "otto", "laptop", "file apriltag-follow", 1),
+    ("flag", "a-name-that-is-as-long-as-names-may-be", "", "name mqtt-video, on True", 12),
+)
+_ROWS = [
+    {"at": 1_795_341_540 + 11 * n, "ref": GOOB, "address": "10.0.0.7"}
+    | dict(zip(("what", "user", "device", "detail", "count"), act, strict=True))
+    for n, act in enumerate(_ACTS)
 ]
-_LINES = [{"n": 1205 + n, "t": 1_795_341_540 + 11 * n, **act, "h": "ab" * 16} for n, act in enumerate(_ACTS)]
 #: May restart robots, and is not logged in.
 OPERATING = replace(
     DRIVING,
@@ -321,7 +322,7 @@ OPERATING = replace(
         "rights": ["drive", "people", "reset", "system", "take"],
         "login": False,
     },
-    audit={"lines": _LINES, "problem": "", "noted": 1211},
+    audit=[*_ROWS, {**_ROWS[1], "ref": "all"}],
 )
 
 SQUARE = [[0.25, 0.25], [0.75, 0.25], [0.75, 0.75], [0.25, 0.75]]

@@ -620,9 +620,7 @@ def test_passwords_cannot_be_guessed(broker: Broker, tmp_path: Path) -> None:
             )
             assert answer.status_code == 429, f"{forwarded} is not believed"
         audit = hall.served.app.state.audit
-        assert until(
-            lambda: {one.what: one.count for one in audit.read(9)} == {"login-refused": 5, "login-limited": 12}
-        )
+        assert until(lambda: {one.what for one in audit.read(9)} == {"login-refused", "login-limited"})
 
 
 # -- secrets

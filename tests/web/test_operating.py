@@ -202,6 +202,23 @@ def test_what_each_role_may_ask(broker, tmp_path: Path, role: str, may: set[str]
         assert until(lambda: robot.topics() == {f"{base}/incoming/flags/{name}" for name in may})
 
 
+def test_only_who_looks_after_robots_reads_what_was_done(broker, tmp_path: Path) -> None:
+    with Hall(broker.port, tmp_path) as hall:
+        audit = hall.served.app.state.audit
+        for number, ref in enumerate(("pebble/robots/goob", "pebble/robots/fred", "all")):
+            audit.write("stop", ref=ref, user="ann", detail=f"{number}")
+        assert until(lambda: len(audit.read(9, "pebble/robots/goob")) == 2)
+        for name, code in (("viewer", 403), ("driver", 403), ("", 401), ("maintainer", 200), ("admin", 200)):
+            with hall.client(name) as client:
+                answer = client.get("/api/audit", params={"ref": "pebble/robots/goob"})
+            assert answer.status_code == code, name
+        rows = answer.json()
+        assert [(row["what"], row["ref"], row["user"], row["detail"], row["count"]) for row in rows] == [
+            ("stop", "pebble/robots/goob", "ann", "0", 1),
+            ("stop", "all", "ann", "2", 1),
+        ]
+
+
 def test_an_answer_has_the_number_of_what_was_asked(page, robot) -> None:
     page.send("outlet", ref=robot.base, outlet="o1", on=True, n=5)
     page.send("lights", ref="pebble/robots/nobody", g=0.5, n=6)

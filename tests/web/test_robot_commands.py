@@ -240,8 +240,8 @@ def test_every_command_reaches_the_robot_in_its_order_and_is_in_the_audit(
     assert {one.topic.rpartition("/")[2] for one in retained} == {"remote-mirror", "mqtt-audio", "mqtt-video"}
     assert until(lambda: len(noted()) == len(PUBLISHED) - 6), (noted(), page.closed)
     assert noted()[1:4] == [
-        "autonomy: file follow, config {}",
-        "autonomy: file , config {}",
+        "autonomy: file follow",
+        "autonomy: file ",
         "outlet: outlet o1, on True",
     ]
     assert noted()[-1] == "flag: name mqtt-video, on True"

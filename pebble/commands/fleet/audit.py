@@ -1,73 +1,51 @@
-"""``pebble fleet audit``: who did what to this robot, as the robot itself has kept it."""
+"""``pebble fleet audit``: who did what to this robot, as its bridge has logged it."""
 
+import json
 import time
-from collections.abc import Iterable
-from typing import Annotated
+from typing import Annotated, Any
 
-import msgspec
 import typer
 
 from pebble.commands.options import ConfigArgument
 from pebble.commands.terminal.show import print_table
 from pebble.config import load
-from pebble.contract import chain
 from pebble.errors import PebbleError
-from pebble.services.mqtt_bridge.audit import chain_files
+from pebble.services.mqtt_bridge.audit import files
 
-_KNOWN = ("n", "t", "what", "who", "count", "since", "after", "h")
+_COLUMNS = ("t", "what", "who", "from", "count")
 
 
 def audit(
     config: ConfigArgument,
-    verify: Annotated[bool, typer.Option("--verify", help="Name the first line that was changed.")] = False,
-    refused: Annotated[bool, typer.Option("--refused", help="Print what was refused instead.")] = False,
-    limit: Annotated[int, typer.Option("--limit", "-n", help="Lines to print.", min=1, max=100_000)] = 50,
+    limit: Annotated[int, typer.Option("--limit", "-n", help="Rows to print.", min=1, max=100_000)] = 50,
 ) -> int:
     """Print who did what to a robot, on its own computer, the newest last. Names with ? are claims.
 
+    A row with a number stands for so many more of its minute. The log is a file of JSON lines, for jq and grep.
+
     \b
         pebble fleet audit goob.json
-        pebble fleet audit goob.json --refused
-        pebble fleet audit goob.json --verify
     """
-    files = chain_files(load(config))
+    newer, older = files(load(config))
     try:
-        if verify:
-            found = [_verify(name, one.lines()) for name, one in files.items()]
-            return 1 if any(found) else 0
-        lines = files["refused" if refused else "acts"].newest(0, limit)
+        lines = [line for file in (older, newer) if file.exists() for line in file.read_bytes().splitlines() if line]
     except OSError as error:
         raise PebbleError(f"{error.filename}: {error.strerror}; run it as the robot's user") from None
-    print_table(("line", "time", "what", "who", ""), [row for raw in lines if (row := _row(raw))])
-    if not lines:
-        typer.echo("nothing yet: the bridge of this robot writes it")
+    rows = [row for line in lines[-limit:] if (row := _row(line))]
+    print_table(("time", "what", "who", "from", ""), rows)
+    typer.echo(f"{newer}: {len(lines):,} rows" if lines else "nothing yet: the bridge of this robot writes it")
+    if unread := min(limit, len(lines)) - len(rows):
+        typer.echo(f"{unread:,} lines cannot be read: a power cut leaves such, or somebody has changed them")
     return 0
 
 
-def _verify(name: str, lines: Iterable[bytes]) -> str:
-    whole = list(lines)
-    problem = chain.verify(whole)
-    newest = chain.parse(whole[-1]) if whole else None
-    text = f"{len(whole):,} lines follow each other" + (f", the newest is {newest.n} {newest.h}" if newest else "")
-    typer.echo(f"{name}: {problem or text}")
-    return problem
-
-
-def _row(raw: bytes) -> tuple[str, ...]:
-    line = chain.parse(raw)
-    if line is None:
-        return ()
-    fields = msgspec.json.decode(raw)
-    count, since = fields.get("count", 1), fields.get("since", line.t)
-    what = line.what
-    if count != 1 and isinstance(count, int) and isinstance(since, int | float):  # a file may have been edited
-        what = f"{what} × {count:,} since {_time(since, '%H:%M:%S')}"
-    more = ", ".join(f"{key} {value}" for key, value in fields.items() if key not in _KNOWN)
-    return str(line.n), _time(line.t, "%Y-%m-%d %H:%M:%S"), what, line.who, more
-
-
-def _time(t: float, form: str) -> str:
+def _row(line: bytes) -> tuple[str, ...]:
+    """The columns of a line; none if it cannot be read."""
     try:
-        return time.strftime(form, time.localtime(t))
-    except (OverflowError, ValueError, OSError):
-        return f"{t:g}"
+        row: dict[str, Any] = json.loads(line)
+        at = time.strftime("%Y-%m-%d %H:%M:%S", time.localtime(row["t"]))
+    except (ValueError, LookupError, TypeError, ArithmeticError, OSError, RecursionError):
+        return ()
+    what, who, place, count = (str(row.get(column, "")) for column in _COLUMNS[1:])
+    more = ", ".join(f"{key} {value}" for key, value in row.items() if key not in _COLUMNS and value != "")
+    return at, f"{what} × {count}" if count else what, who, place, more

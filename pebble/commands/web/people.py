@@ -14,8 +14,7 @@ from pebble.commands.terminal.show import print_table
 from pebble.config import load
 from pebble.config.config import default_state_folder
 from pebble.errors import PebbleError
-from pebble.fleet.audit import Audit
-from pebble.fleet.audit_rows import Entry
+from pebble.fleet.audit import Audit, Entry
 from pebble.fleet.people import People
 from pebble.fleet.roles import Role
 from pebble.runtime.places import Places
@@ -51,7 +50,7 @@ def audit(
     config: _ConfigOption = None,
     people: PeopleOption = None,
 ) -> int:
-    """Print who did what to which robot, the newest last.
+    """Print who did what to which robot, the newest last. A row with a number stands for so many more of its minute.
 
     \b
         pebble web audit --limit 200
@@ -70,8 +69,7 @@ def audit(
 
 def _columns(entry: Entry) -> tuple[str, ...]:
     at = time.strftime("%Y-%m-%d %H:%M:%S", time.localtime(entry.at))
-    until = time.strftime("%H:%M:%S", time.localtime(entry.last))
-    what = entry.what if entry.count == 1 else f"{entry.what} × {entry.count:,} until {until}"
+    what = entry.what if entry.count == 1 else f"{entry.what} × {entry.count:,}"
     return at, what, entry.ref, entry.user, entry.device, entry.address, entry.detail
 
 

@@ -25,9 +25,6 @@ LOCAL, REMOTE = Side.LOCAL, Side.REMOTE
 _numbers = count(1)
 
 
-_BRIDGES_OWN = ("outgoing/online", "outgoing/audit")
-
-
 class End(ABC):
     """One side: a broker or a hub. The service can lose it, and it can lose what it retains, or get an older save back.
 
@@ -213,7 +210,7 @@ class Rig:
         Quiet(late).wait(0.2)
         late.transport.close()
         retained = {m.topic.removeprefix(f"{self.base}/"): m.payload for m in late.seen if m.retain}
-        return {suffix: payload for suffix, payload in retained.items() if suffix not in _BRIDGES_OWN}
+        return {suffix: payload for suffix, payload in retained.items() if suffix != "outgoing/online"}
 
     def after_all(self, speaker: Side, suffix: str = "incoming/lights-solid") -> None:
         """Wait until earlier messages of the client on that side have passed, if they do."""

@@ -1,331 +1,248 @@
-"""The robot's audit: what becomes a row, whose quota it takes, what a disk does to it, and how it is read."""
+"""The robot's audit: what becomes a row, what a disk does to it, and how it is read."""
 
 from __future__ import annotations
 
 import json
 import os
+import stat
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from pebble.contract import AUTONOMY_COMMAND, CONTROL_STATE, CONTROL_TAKE, DRIVE, ESTOP, ESTOP_RESET, ESTOP_STATE, chain
+from pebble.contract import AUTONOMY_COMMAND, CONTROL_TAKE, DRIVE, ESTOP, ESTOP_RESET, LIGHTS_SOLID, codec
 from pebble.contract import channels as c
 from pebble.forwarding.routing import Drop
-from pebble.services.mqtt_bridge.acts import Acts
-from pebble.services.mqtt_bridge.audit import LINES_BYTES, THIN_LINES_BYTES, chain_files
-from pebble.services.mqtt_bridge.audit_rows import ACCOUNTS, OTHERS, ROBOT, WAITING, AuditRows
-from pebble.services.mqtt_bridge.chain_files import ChainFiles
-from tests.services.mqtt_bridge.bridge_rig import BASE, MemoryRig, make_config
-from tests.support import cases, until
+from pebble.services.mqtt_bridge import audit as audit_module
+from pebble.services.mqtt_bridge.audit import ROBOT, Audit, files
+from tests.commands.command_line import Run
+from tests.services.mqtt_bridge.bridge_rig import MemoryRig, make_config
+from tests.support import until
 
-OWNER = "serial"
 STOP = "0123456789abcdef"
+ID = "0000000a"
+SCRIPT = {"file": "f" * 80, "enabled": True, "config": {"password": "sentinel"}, "by": "ann"}
+DISK_IS_FULL = "No space left on device"
 
 
-class Watched:
-    """Acts with a clock of their own, and what became of them."""
+class Log:
+    """An audit with a folder of its own, and its rows but for their times."""
 
     def __init__(self) -> None:
-        self.now = 1000.0
-        self.acts = Acts(BASE, [OWNER], lambda: self.now, lambda: self.now)
+        config = make_config()
+        self.path, self.older = files(config)
+        self.audit = Audit(config)
+        self.audit.start()
+
+    def send(self, channel: c.Channel, sender: str | None, **payload: Any) -> None:
+        self.audit.passed(channel, sender, json.dumps(payload).encode())
 
     def control(self, **state: Any) -> None:
         whole = {"by": "", "id": "", "key": "", "boot": "b", "named": True, **state}
-        self.acts.state(CONTROL_STATE.topic(BASE, owner=OWNER), json.dumps(whole).encode())
-
-    def estop(self, **state: Any) -> None:
-        whole = {"latched": False, "boot": "b", "count": 0, "recent": [], "by": "", "why": "", "since": 0, **state}
-        self.acts.state(ESTOP_STATE.topic(BASE, owner=OWNER), json.dumps(whole).encode())
-
-    def send(self, channel: c.Channel, sender: str | None, **payload: Any) -> None:
-        self.acts.passed(channel, sender, json.dumps(payload).encode())
+        self.audit.control(codec.decode(c.CONTROL_STATE, json.dumps(whole).encode()))
 
     def rows(self) -> list[dict[str, Any]]:
-        """The acts since the last call, without their times."""
-        self.now += 1.0
-        self.acts.follow_states()
-        self.now += 1.0
-        return [{key: value for key, value in row.items() if key != "t"} for row in self.acts.acts.take(self.now)]
-
-    def refused(self) -> list[tuple[str, str]]:
-        self.now += 1.0
-        return [(row["what"], row["who"]) for row in self.acts.refused.take(self.now)]
+        """All rows in the end, without the first one."""
+        self.audit.close()
+        rows = [json.loads(line) for line in self.path.read_bytes().splitlines()]
+        assert all(row.pop("t") > 1.7e9 for row in rows)
+        return rows[1:]
 
 
 @pytest.fixture
-def watched() -> Watched:
-    one = Watched()
-    one.control()
-    one.estop()
-    assert one.rows() == []  # what was before it started
-    return one
+def log(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Log]:
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
+    one = Log()
+    yield one
+    one.audit.close()
 
 
-def test_control_is_given_asked_for_taken_released_and_ends(watched: Watched) -> None:
-    otto = {"by": "otto", "id": "00000001", "key": "aa", "device": "pad"}
-    ann = {"by": "page-1/ann", "id": "00000002", "key": "bb"}
-    watched.control(**otto)
-    assert watched.rows() == [{"what": "control-given", "who": "otto", "device": "pad"}]
-    for _ in range(20):
-        watched.send(DRIVE, "otto", x=0.5, key="aa")
-    watched.control(**otto, asks="page-1/ann", asks_id="00000002")
-    assert watched.rows() == [{"what": "control-asked", "who": "page-1/ann"}]
-    watched.send(CONTROL_TAKE, "page-1", id="00000002", by="ann")
-    watched.control(**ann)
-    assert watched.rows() == [
-        {"what": "control-ended", "who": "otto", "device": "pad", "seconds": 4.0, "commands": 20, "why": "another"},
-        {"what": "control-taken", "who": "page-1/ann"},
-    ]
-    watched.control()  # its state may be received before the request is noted
-    watched.send(c.CONTROL, "page-1", id="00000002", want="release")
-    assert watched.rows() == [{"what": "control-released", "who": "page-1/ann", "seconds": 2.0, "commands": 0}]
-    watched.control(**otto)
-    watched.control(by="", boot="another")
-    assert [row["what"] for row in watched.rows()] == ["control-given", "control-ended"]
+OUTSIDE, INSIDE = {"from": "operators"}, {"from": "robot"}
+# fmt: off
+ROWS: dict[str, tuple[c.Channel, str | None, dict[str, Any], dict[str, Any] | None]] = {
+    "a stop": (ESTOP, "ann", {"stop": STOP, "why": "cat"},
+               {"what": "stop", "who": "ann", **OUTSIDE, "stop": STOP, "why": "cat"}),
+    "of who claims a name": (ESTOP, "-", {"by": "Ann?", "why": "w" * 80},
+                             {"what": "stop", "who": "ann?", **OUTSIDE, "stop": "", "why": "w" * 40}),
+    "of who has none": (ESTOP, None, {}, {"what": "stop", "who": "?", **OUTSIDE, "stop": "", "why": ""}),
+    "of the robot": (ESTOP, ROBOT, {"by": "b" * 32},
+                     {"what": "stop", "who": f"{ROBOT}/{'b' * 32}", **INSIDE, "stop": "", "why": ""}),
+    "a reset": (ESTOP_RESET, "page-1/ann", {"boot": "b", "count": 1},
+                {"what": "reset", "who": "page-1/ann", **OUTSIDE}),
+    "control is demanded": (CONTROL_TAKE, None, {"id": ID, "by": "otto"},
+                            {"what": "control-demanded", "who": "otto?", **OUTSIDE, "id": ID}),
+    "and released": (c.CONTROL, "otto", {"id": ID, "want": "release"},
+                     {"what": "control-released", "who": "otto", **OUTSIDE, "id": ID}),
+    "a script, without its settings": (AUTONOMY_COMMAND, "ann", SCRIPT,
+                                       {"what": "script-start", "who": "ann", **OUTSIDE, "file": "f" * 64}),
+    "its end": (AUTONOMY_COMMAND, ROBOT, {"action": "stop"},
+                {"what": "script-stop", "who": ROBOT, **INSIDE, "file": ""}),
+    "an action": (c.REBOOT, "ann", {"value": True},
+                  {"what": "action", "who": "ann", **OUTSIDE, "name": "reboot", "on": True}),
+    "a flag": (c.MQTT_VIDEO, "ann", {"value": False},
+               {"what": "flag", "who": "ann", **OUTSIDE, "name": "mqtt-video", "on": False}),
+    "an action that is switched off": (c.REBOOT, "ann", {"value": False}, None),
+    "a wish for control": (c.CONTROL, "ann", {"id": ID}, None),
+    "no script": (AUTONOMY_COMMAND, "ann", {}, None),
+    "driving": (DRIVE, "ann", {"x": 1, "key": "sentinel"}, None),
+    "lights": (LIGHTS_SOLID, "ann", {"r": 1}, None),
+    "what cannot be read": (ESTOP_RESET, "ann", {"boot": 7}, None),
+    "a flag that cannot be read": (c.MQTT_VIDEO, "ann", {"value": "sentinel"}, None),
+}
+# fmt: on
 
 
-def test_a_request_with_the_id_of_another_account_explains_nothing(watched: Watched) -> None:
-    watched.control(by="mia", id="00000001", key="aa")
-    watched.rows()
-    watched.send(c.CONTROL, "otto", id="00000001", by="mia", want="release")
-    watched.send(CONTROL_TAKE, "boss", id="00000002", by="otto")
-    watched.control(by="otto", id="00000002", key="bb")
-    assert [row["what"] for row in watched.rows()] == ["control-ended", "control-given"]
+@pytest.mark.parametrize("name", ROWS)
+def test_what_is_noted_of_a_command(log: Log, name: str) -> None:
+    channel, by, payload, row = ROWS[name]
+    log.send(channel, by, **payload)
+    assert log.rows() == ([] if row is None else [row])
+    assert b"sentinel" not in log.path.read_bytes()
 
 
-@pytest.mark.parametrize(
-    ("channel", "by", "payload", "row"),
-    [
-        (ESTOP, "ann", {"stop": STOP, "why": "cat"}, {"what": "stop", "who": "ann", "why": "cat"}),
-        (ESTOP, "-", {"by": "Ann"}, {"what": "stop", "who": "ann?"}),
-        (ESTOP, None, {}, {"what": "stop", "who": "?"}),
-        (AUTONOMY_COMMAND, "ann", {"file": "f", "enabled": True}, {"what": "script-start", "who": "ann", "file": "f"}),
-        (AUTONOMY_COMMAND, ROBOT, {"action": "stop"}, {"what": "script-stop", "who": ROBOT}),
-        (c.REBOOT, "robot", {"value": True}, {"what": "action", "who": "robot", "name": "reboot"}),
-        (c.MQTT_VIDEO, "ann", {"value": False}, {"what": "flag", "who": "ann", "name": "mqtt-video", "on": False}),
-    ],
-)  # fmt: skip
-def test_a_command_is_an_act(watched: Watched, channel: Any, by: Any, payload: Any, row: dict[str, Any]) -> None:
-    watched.send(channel, by, **payload)
-    assert watched.rows() == [row]
+def test_a_flag_that_is_removed_is_off(log: Log) -> None:
+    log.audit.passed(c.MQTT_VIDEO, "ann", b"")
+    assert [row["on"] for row in log.rows()] == [False]
 
 
-def test_what_moves_nothing_and_what_only_drives_is_none(watched: Watched) -> None:
-    watched.send(DRIVE, "ann", x=1)
-    watched.send(c.REBOOT, "ann", value=False)
-    watched.send(AUTONOMY_COMMAND, "ann")
-    watched.send(c.LIGHTS_SOLID, "ann", r=1)
-    watched.send(c.CONTROL, "ann", id="00000001")
-    assert watched.rows() == []
+def test_a_stop_that_is_repeated_is_one_row_and_another_is_another(log: Log) -> None:
+    for number in range(250):
+        for _ in range(2):
+            log.send(ESTOP, None, stop=f"{number:016x}", by="ann")
+    log.send(ESTOP, None, by="ann")
+    log.send(ESTOP, None, by="ann")
+    log.send(ESTOP, "ann", stop="0" * 16)
+    rows = log.rows()
+    assert [row.get("stop") for row in rows[:250]] == [f"{number:016x}" for number in range(250)]
+    assert [(row["who"], row.get("count", 1)) for row in rows[250:]] == [("ann?", 1), ("ann", 1), ("ann?", 1)]
 
 
-def test_a_stop_is_one_row_with_the_name_that_was_checked(watched: Watched) -> None:
-    watched.send(ESTOP, "-", stop=STOP, by="somebody")
-    watched.send(ESTOP, "ann", stop=STOP)
-    for _ in range(3):  # repeated until it is confirmed
-        watched.send(ESTOP, "-", stop=STOP)
-    watched.estop(latched=True, count=1, recent=[STOP], by="-")
-    assert watched.rows() == [{"what": "stop", "who": "ann"}]
-    watched.send(ESTOP_RESET, "eve", boot="b", count=7)  # of another stop
-    watched.send(ESTOP_RESET, "ben", boot="b", count=1)
-    watched.estop(latched=False, count=1, recent=[STOP])
-    assert watched.rows() == [{"what": "reset", "who": "ben"}]
-    watched.estop(latched=True, count=2, recent=["f" * 16, STOP], by="button")  # from within the robot
-    watched.send(ESTOP_RESET, "ben", boot="b", count=2)  # before the state was looked at
-    watched.estop(latched=False, count=2, recent=["f" * 16, STOP])
-    assert watched.rows() == [{"what": "stop", "who": "button?"}, {"what": "reset", "who": "ben"}]
+def test_control_is_given_and_ends(log: Log) -> None:
+    otto = {"by": "otto", "id": ID, "key": "aa", "device": "pad"}
+    ann = {"by": "ann", "id": "0000000b", "key": "bb", "named": False}
+    log.control(**otto)  # from before the bridge has started
+    log.control(**otto, asks="ann")
+    log.control(**ann)
+    log.control()
+    log.control(boot="another")
+    log.control(**{**otto, "by": ""}, boot="another")
+    log.control(**otto, boot="a third")
+    holder = {"who": "otto", "id": ID, "device": "pad"}
+    other = {"who": "ann?", "id": "0000000b", "device": ""}
+    given, ended = {"what": "control-given"}, {"what": "control-ended"}
+    nobody = holder | {"who": "?"}
+    passed = [ended | holder, given | other, ended | other, given | nobody, ended | nobody, given | holder]
+    assert log.rows() == passed
+    assert "aa" not in log.path.read_text()
 
 
-def test_a_command_with_an_old_key_is_refused(watched: Watched) -> None:
-    watched.control(by="otto", id="00000001", key="aa")
-    for key, x in (("aa", 1), ("bb", 0), ("bb aa", 1)):
-        watched.send(DRIVE, "otto", x=x, key=key)
-    assert watched.refused() == []
-    watched.send(DRIVE, "eve", x=1, key="bb")
-    assert watched.refused() == [("wrong key", "eve")]
+def test_refusals_of_one_kind_and_sender_are_one_row(log: Log) -> None:
+    for _ in range(3):
+        log.audit.refused(Drop.LATE, ESTOP, "eve")
+        log.audit.refused(Drop.ECHO, ESTOP, "eve")
+    log.audit.refused(Drop.TOO_MANY, None, None)
+    late = {"what": "refused", "who": "eve", **OUTSIDE, "name": "estop", "why": Drop.LATE.value}
+    many = {"what": "refused", "who": "?", **OUTSIDE, "name": "", "why": Drop.TOO_MANY.value}
+    assert log.rows() == [late, many, late | {"count": 2}]
 
 
-def test_refusals_are_one_row_a_minute_for_each_account_and_reason(watched: Watched) -> None:
-    drops = (Drop.UNNAMED, Drop.LATE, Drop.STALE, Drop.SIGNED, Drop.ECHO)
-    refusals = cases(5_000, 100_000)
-    for number in range(refusals):
-        watched.acts.drop(drops[number % 5], f"eve{number % 1000}")
-    first = watched.refused()
-    assert len(first) <= 4 * ACCOUNTS
-    assert ("late", OTHERS) in first
-    watched.now += 60.0
-    rows = watched.acts.refused.take(watched.now)
-    assert sum(row["count"] for row in rows) + len(first) == 4 * refusals // 5
-    assert len(rows) <= 4 * (ACCOUNTS + 1)
+def test_a_flood_of_refusals_hides_no_act(log: Log) -> None:
+    for number in range(1000):
+        log.audit.refused(Drop.UNNAMED, DRIVE, f"eve{number}")
+    log.audit.note("stop-not-confirmed", owner="serial")
+    rows = log.rows()
+    assert {"what": "stop-not-confirmed", "who": ROBOT, "owner": "serial"} in rows
+    assert len(rows) == audit_module.OF_STRANGERS + 2
+    assert sum(row.get("count", 1) for row in rows) == 1001
 
 
-def test_who_floods_takes_no_row_from_others() -> None:
-    rows, now = AuditRows(200, 300.0), 0.0
-    for number in range(10_000):
-        rows.add({"t": now, "what": "script-start", "who": "eve", "file": str(number)}, "eve", now)
-    rows.add({"t": now, "what": "script-start", "who": "ann"}, "ann", now)
-    written = rows.take(1.0)
-    assert len(written) == 201
-    assert written[-1]["who"] == "ann"
-    [merged] = rows.take(301.0)
-    assert (merged["count"], merged["since"], merged["file"]) == (9_800, 0.0, "9999")
-    a_day = 86_400
-    later = sum(len(flooded(rows, 1000.0 + second)) for second in range(0, a_day, 60))
-    assert later <= 200 + a_day / 300
+def test_the_log_is_the_robots_own_and_turns_over(log: Log, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert until(log.path.exists)
+    assert stat.S_IMODE(log.path.stat().st_mode) == 0o600
+    monkeypatch.setattr(audit_module, "_MOST_BYTES", 300)
+    log.path.write_bytes(b"a" * 299 + b"\n")
+    for number in range(2):
+        log.audit.note("stop", number=number)
+        assert until(lambda number=number: log.path.read_bytes().endswith(b'"number":%d}\n' % number))
+    assert log.older.read_bytes().startswith(b"aaa")
+    assert len(log.path.read_bytes().splitlines()) == 2
 
 
-def flooded(rows: AuditRows, now: float) -> list[dict[str, Any]]:
-    for _ in range(10):
-        rows.add({"t": now, "what": "script-start", "who": "eve"}, "eve", now)
-    return rows.take(now)
+def test_half_a_line_is_left_to_itself(log: Log) -> None:
+    assert until(log.path.exists)
+    with log.path.open("ab") as file:
+        file.write(b'{"t":4')
+    log.audit.note("stop")
+    log.audit.close()
+    lines = log.path.read_bytes().splitlines()
+    assert lines[1] == b'{"t":4'
+    assert json.loads(lines[2])["what"] == "stop"
 
 
-def test_what_cannot_be_written_waits_within_bounds() -> None:
-    rows = AuditRows(10 * WAITING, 1.0)
-    for now in range(3):  # also what comes while it is tried
-        taken = rows.take(float(now))
-        for number in range(WAITING):
-            rows.add({"t": 0.0, "what": "stop", "who": "ann", "number": number}, "ann", float(now))
-            rows.add({"t": 0.0, "what": "stop", "who": "ben", "number": number}, "ben", float(now))
-        rows.give_back(taken, float(now))
-    taken = rows.take(3.0)
-    assert len(taken) == WAITING
-    rows.written()
-    assert sum(row.get("count", 1) for row in [*taken, *rows.take(4.0)]) == 6 * WAITING
-
-
-def row(number: int) -> dict[str, Any]:
-    return {"t": float(number), "what": "stop", "who": "ann", "number": number}
-
-
-def test_a_chain_goes_on_in_the_next_file_and_process(tmp_path: Path) -> None:
-    path = tmp_path / "new" / "acts.jsonl"
-    for number in range(50):
-        files = ChainFiles(path, 1000)
-        files.append([row(number)])
-        last = chain.parse(files.newest(0, 1)[0])
-        assert last is not None
-        assert (last.mark, last.n) == (files.mark, number + 1)
-    assert files.older.stat().st_size < 1300
-    whole = list(files.lines())
-    assert len(whole) < 25  # older ones are gone
-    assert chain.verify(whole, [files.mark]) == ""
-    assert files.newest(0, 1000) == whole
-    assert [json.loads(raw)["n"] for raw in files.newest(48, 3)] == [45, 46, 47]
-
-
-@pytest.mark.parametrize("end", [b'{"n":4,"t":3.0,"wh', b"\0" * 5000, b'{"n":4}\n', b"\xff\n" * 70_000])
-def test_a_torn_end_is_dropped_with_a_note(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, end: bytes) -> None:
-    path = tmp_path / "acts.jsonl"
-    ChainFiles(path, 10**6).append([row(1), row(2), row(3)])
-    with path.open("ab") as file:
-        file.write(end)
-    files = ChainFiles(path, 10**6)
-    with monkeypatch.context() as patched:  # the first note is lost
-        patched.setattr("os.write", lambda _file, _content: 0)
-        with pytest.raises(OSError, match="space"):
-            files.append([row(4)])
-    files.append([row(4)])
-    files.append([row(5)])
-    written = [json.loads(raw) for raw in files.lines()]
-    assert [one["what"] for one in written] == ["stop"] * 3 + ["torn", "stop", "stop"]
-    assert written[3]["bytes"] == len(end)
-    assert chain.verify(files.lines(), [files.mark]) == ""
-
-
-def test_a_disk_that_takes_nothing_leaves_the_chain_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    files = ChainFiles(tmp_path / "acts.jsonl", 10**6)
-    files.append([row(1)])
-    mark = files.mark
-
+@pytest.mark.parametrize("call", ["write", "fdatasync"])
+def test_a_disk_that_is_full_leaves_the_log_whole(
+    log: Log, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, call: str
+) -> None:
     write = os.write
 
+    def full(file: int, content: bytes = b"") -> int:
+        if call == "write":
+            return write(file, content[:10])
+        raise OSError(28, DISK_IS_FULL)
+
+    assert until(log.path.exists)
     with monkeypatch.context() as patched:
-        patched.setattr("os.write", lambda file, content: write(file, content[:10]))
-        with pytest.raises(OSError, match="space"):
-            files.append([row(2)])
-    assert files.mark == mark
-    files.append([row(3)])
-    assert chain.verify(files.lines(), [files.mark]) == ""
+        patched.setattr(f"os.{call}", full)
+        for number in range(3):
+            log.audit.note("stop", number=number)
+        assert until(lambda: DISK_IS_FULL in caplog.text)
+    assert [row["number"] for row in log.rows()] == [0, 1, 2]
+    assert caplog.text.count(DISK_IS_FULL) == 1
 
 
-def test_a_disk_that_takes_no_new_file_costs_no_file_of_others(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    files = ChainFiles(tmp_path / "acts.jsonl", 100)
-    files.append([row(1)])
-    files.append([row(2)])
-    real, closed = os.open, list[int]()
-
-    def full(path: Any, flags: int, mode: int = 0o777) -> int:
-        if flags & os.O_EXCL:
-            raise OSError(28, "No space left on device")
-        return real(path, flags, mode)
-
-    with monkeypatch.context() as patched:
-        patched.setattr("os.open", full)
-        patched.setattr("os.close", closed.append)
-        with pytest.raises(OSError, match="space"):
-            files.append([row(3)])
-    assert len(closed) == 1
-    os.close(closed[0])
-    files.append([row(4)])
-    assert chain.verify(files.lines(), [files.mark]) == ""
-
-
-def test_a_bridge_writes_and_answers(monkeypatch: pytest.MonkeyPatch) -> None:
-    rig = MemoryRig(monkeypatch)
-    try:
-        bridge = rig.bridge()
-        rig.remote.publish("incoming/estop", json.dumps({"stop": STOP, "by": "ann"}).encode())
-        rig.remote.publish("incoming/autonomy-command", b'{"action": "stop"}', retain=True)  # live, though retained
-        rig.local.publish("incoming/autonomy-command", b'{"action": "start", "file": "a"}')
-        written = chain_files(make_config())["acts"]
-
-        def rows() -> list[dict[str, Any]]:
-            return [json.loads(raw) for raw in written.lines()]
-
-        wanted = {("stop", "ann?"), ("script-start", ROBOT)}
-        assert until(lambda: wanted <= {(one["what"], one["who"]) for one in rows()}), rows()
-        assert rows()[0]["what"] == "start"
-        assert rows()[0]["level"] == "open"
-        assert until(lambda: rig.remote.payloads("outgoing/audit"))
-        assert rig.remote.on("outgoing/audit")[0].payload.startswith(b'{"acts":{"n":')
-        rig.remote.publish("incoming/audit-read", b'{"chain": "acts", "before": 3, "count": 50}')
-        assert until(lambda: rig.remote.payloads("outgoing/audit-lines"))
-        [answer] = rig.remote.payloads("outgoing/audit-lines")
-        assert len(answer) <= LINES_BYTES + 100
-        assert json.loads(answer)["before"] == 3
-        assert [one.encode() for one in json.loads(answer)["lines"]] == list(written.lines())[:2]
-        assert bridge.status.counts
-    finally:
-        rig.close()
-
-
-@pytest.mark.parametrize(("profile", "most"), [("wide", LINES_BYTES), ("thin", THIN_LINES_BYTES)])
-def test_an_answer_is_as_long_as_its_link_permits(monkeypatch: pytest.MonkeyPatch, profile: str, most: int) -> None:
-    rig = MemoryRig(monkeypatch)  # with a state folder of its own
-    try:
-        chain_files(make_config())["acts"].append([row(number) for number in range(200)])
-        rig.bridge(link={"profile": profile})
-        rig.remote.publish("incoming/audit-read", b'{"chain": "acts", "before": 0, "count": 200}')
-        assert until(lambda: rig.remote.payloads("outgoing/audit-lines"))
-        [answer] = rig.remote.payloads("outgoing/audit-lines")
-        assert most / 2 < len(answer) <= most + 100
-    finally:
-        rig.close()
-
-
-def test_a_robot_whose_disk_is_full_drives_on(monkeypatch: pytest.MonkeyPatch) -> None:
-    def full(_self: ChainFiles, _rows: list[Any]) -> None:
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr(ChainFiles, "append", full)
+def test_a_bridge_notes_what_passes_and_a_command_prints_it(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
     rig = MemoryRig(monkeypatch)
     try:
         rig.bridge()
-        assert until(lambda: rig.remote.payloads("outgoing/audit"))
-        assert json.loads(rig.remote.payloads("outgoing/audit")[0])["saved"] is False
+        path, older = files(make_config())
+        rig.remote.publish("incoming/estop", json.dumps({"stop": STOP, "by": "ann"}).encode())
+        rig.remote.publish("incoming/audit-read", b'{"chain": "acts"}')  # of a page of the last version
+        rig.remote.publish("incoming/autonomy-command", b'{"action": "stop"}', retain=True)  # live, though retained
+        rig.local.publish("incoming/autonomy-command", b'{"action": "start", "file": "a"}')
         rig.remote.publish("incoming/drive-values", b'{"x": 1}')
+        assert until(lambda: path.exists() and path.read_bytes().count(b"\n") == 4), path.read_text()
+        assert not [one for one in rig.remote.seen if "audit" in one.topic]
         assert until(lambda: rig.local.payloads("incoming/drive-values"))
     finally:
         rig.close()
+    with path.open("ab") as file:
+        file.write(b'{"t": "x"}\n\n[1]\n{"t":1e99}\n{"t":1,"what":"stop","count":9,"by":"\\u001b[2J"}\n')
+    older.write_bytes(b'{"t":0,"what":"first"}\n')
+    robot = tmp_path / "rover.json"
+    robot.write_text(json.dumps({"robot": {"id": "rover"}, "services": {}}))
+    pebble = Run(monkeypatch, capsys)
+    assert pebble("fleet", "audit", robot, columns=200) == 0
+    lines = [line.rstrip() for line in pebble.out.splitlines()]
+    assert lines[0].split() == ["time", "what", "who", "from"]
+    assert [line.split()[2] for line in lines[1:3]] == ["first", "start"]
+    assert lines[2].endswith("level open, version 0.1.0")
+    shown = [line.split()[2:] for line in lines[3:6]]  # of two connections
+    assert ["stop", "ann?", "operators", "stop", STOP] in shown
+    assert ["script-start", ROBOT, "robot", "file", "a"] in shown
+    assert {row[0] for row in shown} == {"stop", "script-start", "refused"}
+    assert "× 9" in lines[6]
+    assert lines[6].endswith(r"by \u001b[2J")
+    assert lines[7:] == [
+        f"{path}: 9 rows",
+        "3 lines cannot be read: a power cut leaves such, or somebody has changed them",
+    ]
+    assert pebble("fleet", "audit", robot, "-n", "1") == 0
+    assert "× 9" in pebble.out
+    assert pebble.out.count("\n") == 3
+    path.unlink()
+    older.unlink()
+    assert pebble("fleet", "audit", robot) == 0
+    assert "nothing yet" in pebble.out

@@ -144,23 +144,6 @@ def test_what_a_robot_lacks_in_every_spelling(action: str, capabilities: object,
     assert evaluate({"core/outcome.js": "lacks"}, f"result = lacks({json.dumps(action)}, {value});") == why
 
 
-# -- who did what
-
-audit = Script({"ui/cards/audit.js": "partsOf"}, "const one = (line) => partsOf({ t: 1, what: 'stop', ...line });")
-
-
-# fmt: off
-AUDIT: Rows = {
-    "an account": ("result = one({ who: 'ann' }).who;", "ann"),
-    "who gave no name": ("result = one({ who: '?' }).who;", "Without a name"),
-    "a claim of a name": ("result = one({ who: 'ann?' }).who;", "ann?"),
-    "several of one kind": ("result = one({ what: 'stop-reset', count: 3 }).what;", "Stop reset × 3"),
-    "what else is known of it": ("result = one({ device: 'phone', commands: 9 }).more;", "on phone, 9 drive commands"),
-    "no line at all": ("const it = partsOf({}); result = [it.day, it.time, it.what, it.who, it.more];", [""] * 5),
-}
-# fmt: on
-
-
 # -- notices
 
 _NOTICES = """
@@ -255,6 +238,6 @@ NOTICES: Rows = {
 # fmt: on
 
 
-@rows((book, BOOK), (outcome, OUTCOME), (notices, NOTICES), (audit, AUDIT))
+@rows((book, BOOK), (outcome, OUTCOME), (notices, NOTICES))
 def test_each(found: Callable[[], Any], expected: Any) -> None:
     assert found() == expected

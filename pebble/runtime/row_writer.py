@@ -1,0 +1,108 @@
+"""Rows of an audit, stored by a thread of its own: who adds one never waits for the disk."""
+
+import logging
+import threading
+import time
+from collections.abc import Callable, Hashable
+from typing import Any
+
+from pebble.errors import PebbleError
+
+log = logging.getLogger(__name__)
+
+WINDOW_S = 60.0  # rows that are alike within it are one, and a second one with the number of the others
+DIFFERENT, OF_STRANGERS = 300, 100  # rows within it that differ; what is beyond is counted by its kind
+WAITING = 1000  # rows that are not stored yet
+_ROUND_S = 10.0  # between two looks at what was counted, and two tries at a disk that takes nothing
+_END_S = 3.0  # longest wait for the last rows
+
+Row = dict[str, Any]
+
+
+class RowWriter:
+    """Gives rows to ``store`` in their order; where that raises OSError or PebbleError they wait, and it is said once.
+
+    A row has its time ``t``, its kind ``what``, and more. Kinds are a fixed set. Thread-safe.
+    """
+
+    def __init__(self, store: Callable[[list[Row]], None], clock: Callable[[], float] = time.monotonic) -> None:
+        self._store, self._clock = store, clock
+        self._lock = threading.Lock()  # guards what follows
+        self._counts: dict[Hashable, tuple[Row, int]] = {}  # of this window: the newest row, how many are not stored
+        self._since = 0.0
+        self._rows: list[Row] = []  # that wait
+        self._lost = 0
+        self._saved = True
+        self._wake, self._closing = threading.Event(), threading.Event()
+        self._thread = threading.Thread(target=self._run, name="audit", daemon=True)
+
+    def start(self) -> None:
+        self._thread.start()
+
+    def close(self) -> None:
+        """Store what waits, for a bounded time."""
+        self._closing.set()
+        self._wake.set()
+        self._thread.join(_END_S)
+        if lost := sum(row.get("count", 1) for row in self._rows) + self._lost:
+            log.error("audit: %d rows are lost", lost)
+
+    def add(self, row: Row, like: Hashable = None, most: int = DIFFERENT) -> None:
+        """Store ``row``, or count it if one of this window is ``like`` it: without that, equal but for its time."""
+        like = (tuple(row.items())[1:],) if like is None else like
+        now = self._clock()
+        with self._lock:
+            if now - self._since >= WINDOW_S:
+                self._end_window(now)
+            if like not in self._counts and len(self._counts) >= most:
+                row, like = {"t": row["t"], "what": row["what"]}, row["what"]
+            count = self._counts[like][1] + 1 if like in self._counts else 0
+            self._counts[like] = row, count
+            if not count:
+                self._put(row)
+        self._wake.set()
+
+    def _end_window(self, now: float) -> None:
+        """Let what was counted wait as well, and begin anew."""
+        for row, count in self._counts.values():
+            if count:
+                self._put({**row, "count": count})
+        self._counts, self._since = {}, now
+
+    def _put(self, row: Row) -> None:
+        if len(self._rows) < WAITING:
+            self._rows.append(row)
+        else:
+            self._lost += row.get("count", 1)
+
+    def _run(self) -> None:
+        ends = False
+        while not ends:
+            self._wake.wait(_ROUND_S)
+            self._wake.clear()
+            ends = self._closing.is_set()
+            with self._lock:
+                if ends or self._clock() - self._since >= WINDOW_S:
+                    self._end_window(self._clock())
+            self._store_all()
+
+    def _store_all(self) -> None:
+        with self._lock:
+            rows, lost = [*self._rows], self._lost
+        if lost:
+            rows.append({"t": round(time.time(), 3), "what": "audit-dropped", "count": lost})
+        if not rows:
+            return
+        try:
+            self._store(rows)
+        except (OSError, PebbleError) as error:
+            if self._saved:
+                log.error("audit: rows wait to be written: %s", error)
+            self._saved = False
+            return
+        if not self._saved:
+            log.warning("audit: rows are written again, %d are lost", lost)
+        self._saved = True
+        with self._lock:
+            del self._rows[: len(rows) - bool(lost)]
+            self._lost -= lost

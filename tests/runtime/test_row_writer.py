@@ -1,0 +1,139 @@
+"""Rows of an audit: which are one, what is beyond the bounds, and what a store that takes nothing does to them."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+
+from pebble.runtime import row_writer
+from pebble.runtime.row_writer import DIFFERENT, WAITING, WINDOW_S, RowWriter
+from tests.support import until
+
+
+class Store:
+    """Keeps rows, unless it is told to fail or to wait; the writer's clock stands still."""
+
+    def __init__(self) -> None:
+        self.now, self.rows, self.fails = 1000.0, list[dict[str, Any]](), False
+        self.may_go = threading.Event()
+        self.may_go.set()
+        self.writer = RowWriter(self.store, lambda: self.now)
+        self.writer.start()
+
+    def store(self, rows: list[dict[str, Any]]) -> None:
+        self.may_go.wait(10)
+        if self.fails:
+            raise OSError(28, "No space left on device")
+        self.rows += rows
+
+    def add(self, what: str, number: int = 0, **options: Any) -> None:
+        self.writer.add({"t": self.now, "what": what, "number": number}, **options)
+
+    def end(self) -> list[tuple[str, Any, int]]:
+        """What is stored at the end: kind, number and count of each row."""
+        self.writer.close()
+        return [(row["what"], row.get("number"), row.get("count", 1)) for row in self.rows]
+
+
+@pytest.fixture
+def store(monkeypatch: pytest.MonkeyPatch) -> Iterator[Store]:
+    monkeypatch.setattr(row_writer, "_ROUND_S", 0.02)
+    one = Store()
+    yield one
+    one.may_go.set()
+    one.writer.close()
+
+
+def test_alike_rows_of_a_minute_are_one_and_another_with_their_number(store: Store) -> None:
+    for after_s in (0, WINDOW_S - 1, WINDOW_S - 0.5):
+        store.now = 1000.0 + after_s
+        store.add("stop", 7)
+        store.add("reset", 1 if after_s else 0)
+    store.now = 1000.0 + WINDOW_S
+    store.add("stop", 7)
+    once = [("stop", 7, 1), ("reset", 0, 1), ("reset", 1, 1)]
+    assert store.end() == [*once, ("stop", 7, 2), ("reset", 1, 1), ("stop", 7, 1)]
+    assert [row["t"] - 1000 for row in store.rows if "count" in row] == [WINDOW_S - 0.5] * 2
+
+
+def test_what_was_counted_is_stored_when_nothing_comes_after_it(store: Store) -> None:
+    for _ in range(3):
+        store.add("stop")
+    assert until(lambda: len(store.rows) == 1)
+    store.now += WINDOW_S - 0.1
+    time.sleep(0.05)  # for some rounds nothing is due
+    assert len(store.rows) == 1
+    store.now += 0.1
+    assert until(lambda: store.rows[1:] == [{"t": 1000.0, "what": "stop", "number": 0, "count": 2}])
+
+
+def test_rows_that_differ_too_much_are_counted_by_their_kind(store: Store) -> None:
+    for number in range(DIFFERENT + 3):
+        store.add("stop", number)
+    store.add("reset")
+    store.add("stop", 0)
+    stored = store.end()
+    assert stored[:DIFFERENT] == [("stop", number, 1) for number in range(DIFFERENT)]
+    assert stored[DIFFERENT:] == [("stop", None, 1), ("reset", None, 1), ("stop", 0, 1), ("stop", None, 2)]
+
+
+def test_strangers_leave_room_for_others(store: Store) -> None:
+    for number in range(5):
+        store.add("refused", number, most=2)
+    store.add("refused", 9, like="the first of many", most=10)
+    for _ in range(2):
+        store.add("refused", 8, like="the first of many", most=2)
+    store.add("stop", 7)
+    kept = [("refused", 0, 1), ("refused", 1, 1), ("refused", None, 1), ("refused", 9, 1), ("stop", 7, 1)]
+    assert store.end() == [*kept, ("refused", None, 2), ("refused", 8, 2)]
+
+
+def test_a_store_that_takes_nothing_is_said_once_and_loses_no_row(
+    store: Store, caplog: pytest.LogCaptureFixture
+) -> None:
+    store.fails = True
+    for number in range(3):
+        store.add("stop", number)
+    assert until(lambda: "rows wait to be written" in caplog.text)
+    time.sleep(0.1)  # for some rounds
+    store.fails = False
+    store.add("stop", 3)
+    assert store.end() == [("stop", number, 1) for number in range(4)]
+    assert [record.message for record in caplog.records if "audit" in record.message] == [
+        "audit: rows wait to be written: [Errno 28] No space left on device",
+        "audit: rows are written again, 0 are lost",
+    ]
+
+
+def test_who_adds_a_row_never_waits_and_what_finds_no_room_is_counted(
+    store: Store, caplog: pytest.LogCaptureFixture
+) -> None:
+    store.may_go.clear()
+    began = time.monotonic()
+    for number in range(2 * WAITING):
+        store.now += WINDOW_S / DIFFERENT  # so that all may be stored
+        store.add("stop", number)
+    assert time.monotonic() - began < 1.0
+    store.fails = True
+    store.may_go.set()
+    assert until(lambda: "rows wait to be written" in caplog.text)
+    store.fails = False
+    stored = store.end()
+    assert stored == [*(("stop", number, 1) for number in range(WAITING)), ("audit-dropped", None, WAITING)]
+    assert f"audit: rows are written again, {WAITING} are lost" in caplog.text
+    assert "audit: 1" not in caplog.text
+
+
+@pytest.mark.parametrize("further", [0, 2])
+def test_rows_that_cannot_be_stored_at_the_end_are_counted(
+    store: Store, caplog: pytest.LogCaptureFixture, further: int
+) -> None:
+    store.fails = True
+    for _ in range(1 + further):
+        store.add("stop")
+    assert store.end() == []
+    assert f"audit: {1 + further} rows are lost" in caplog.text
