@@ -123,12 +123,11 @@ def test_check_shows_what_scripts_of_the_original_find(run: Run, tmp_path: Path)
     assert run("check", config_file(tmp_path, services=services), columns=200) == 0
     lines = [" ".join(line.split()) for line in run.out.splitlines()]
     for expected in (
-        f"pictures at {tmp_path / 'v.sock'}",
-        f"sound at {tmp_path / 'a.sock'}",
+        f"pictures at {tmp_path / 'v.sock'}, by examples/gstreamer_sockets.py",
+        f"sound at {tmp_path / 'a.sock'}, by examples/gstreamer_sockets.py",
         "hall samples in the shared memory pebble_robots_goob_odometry_raw",
     ):
         assert f"for the original's scripts {expected}" in lines
-    assert "processes launcher, announcer, serial_mcu_bridge, av_daemon, gstreamer_mirror" in lines
 
 
 def test_check_shows_what_runs_on_request(run: Run, tmp_path: Path) -> None:
