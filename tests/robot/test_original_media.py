@@ -44,14 +44,15 @@ class OriginalRig(WorldRig):
     def __init__(self, kind: str) -> None:
         self.shm = f"pebble-test-{os.getpid()}-{kind}"
         needs = [{"file": "original-locations"}, {"file": "original-odometry"}]
+        name = [{"key": "memory", "arg": "--shm-name", "default": self.shm}]
         scripts: dict[str, dict[str, Any]] = {
             "original-follow": {"dependencies": needs},
-            "original-locations": {"python": SYSTEM},
-            "original-video-follow": {"python": SYSTEM},
+            "original-odometry": {"args": name},
         }
+        self.person: dict[str, Any] = {}
         super().__init__(
             kind, mirror=kind == "zenoh", pictures_socket=True, scripts=scripts,
-            serial_mcu_bridge={"odometry_shm": {"name": self.shm}},
+            serial_mcu_bridge={"odometry_shm": {"name": self.shm}}, top={"security": {"strangers": "free"}},
         )  # fmt: skip
         self.offer()
 
