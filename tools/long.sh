@@ -53,10 +53,10 @@ brokers)
     ;;
 gstreamer)
     debian gst-launch-1.0=gstreamer1.0-tools
-    { gst-inspect-1.0 --exists shmsrc && gst-inspect-1.0 --exists videotestsrc; } ||
+    { gst-inspect-1.0 --exists shmsrc && gst-inspect-1.0 --exists rawvideoparse; } ||
         debian =gstreamer1.0-plugins-base =gstreamer1.0-plugins-bad
     /usr/bin/python3 -c "import cv2, paho.mqtt.client" 2>/dev/null || debian =python3-opencv =python3-paho-mqtt
-    tests tests/services/gstreamer_mirror tests/robot/test_original_media.py
+    tests tests/examples/test_gstreamer_sockets.py tests/robot/test_original_media.py
     ;;
 firmware) $python -m tests.firmware.sizes ;;
 life)

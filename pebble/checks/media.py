@@ -47,22 +47,17 @@ def codecs(config: Config, *, installed: bool | None = None) -> Iterator[CheckRe
         yield ok(f"PyAV is not installed: no H.264, no Opus ({fix})")
 
 
-def sockets_of_the_original(config: Config) -> Iterator[CheckResult]:
-    """Check that `gstreamer_mirror` can make the sockets that scripts of the original read."""
-    daemon = config.services.av_daemon
-    for name, path in daemon.sockets().items() if daemon.enabled else ():
-        yield shm_socket(f"{name} for the original's scripts", path)
-
-
-def shm_socket(what: str, path: Path) -> CheckResult:
-    folder = path.parent
-    if not folder.is_dir():
-        return failed(f"there is no folder {folder}", f"sudo install -d -o $USER {folder}", what)
-    if not os.access(folder, os.W_OK | os.X_OK):
-        return failed(f"{folder} is not writable for this user", f"sudo chown $USER {folder}", what)
-    if path.exists() and not path.is_socket():
-        return failed(f"{path} is a file and no socket", f"rm {path}", what)
-    return ok(str(path), what=what)
+def sockets_of_the_original(config: Config, which: Which = shutil.which) -> Iterator[CheckResult]:
+    """Look for what serves the sockets that scripts of the original read, and what would offer them there."""
+    for name, path in config.services.av_daemon.sockets().items():
+        what = f"{name} for the original's scripts"
+        if which("gst-launch-1.0") is None:
+            fix = "sudo apt install gstreamer1.0-tools gstreamer1.0-plugins-base gstreamer1.0-plugins-bad"
+            yield warn(f"GStreamer, which serves {path}, is not installed", fix, what)
+        elif not path.is_socket():
+            yield warn(f"there is no {path} now", "run examples/gstreamer_sockets.py: docs/original-scripts.md", what)
+        else:
+            yield ok(str(path), what=what)
 
 
 def camera(backend: str, device: str, folder: Path, which: Which) -> CheckResult:

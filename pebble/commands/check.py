@@ -69,9 +69,8 @@ def _check(path: Path, *, as_json: bool, first: bool) -> bool:
         return True
     if not first:
         typer.echo()
-    found = _found_scripts(config)
-    _print(config, path, found)
-    return _sizes_fit(found, path)
+    _print(config, path, _found_scripts(config))
+    return True
 
 
 def _found_scripts(config: Config) -> dict[str, Script]:
@@ -87,23 +86,15 @@ def _found_scripts(config: Config) -> dict[str, Script]:
     return found[-1]
 
 
-def _sizes_fit(scripts: Mapping[str, Script], path: Path) -> bool:
-    """A script that asks for another size would report tags in wrong places, and no error."""
-    if not scripts:
-        return True
-    from pebble.services.autonomy_manager.script import size_problems
-
-    problems = list(size_problems(scripts))
-    for problem in problems:
-        typer.echo(f"pebble: {path.name}: services.autonomy_manager.scripts.{problem}", err=True)
-    return not problems
-
-
 def _fitness(script: Script) -> str:
     """Whether it can run here, in a few words."""
-    if script.instead_of:
-        return f"runs: Pebble's own, because the copy in autonomy_root cannot: {script.instead_of}"
-    return f"does not run: {script.broken}" if script.broken else "runs" + (", Pebble's own" if script.ours else "")
+    if script.broken or script.ours:
+        return f"does not run: {script.broken}" if script.broken else "runs, Pebble's own"
+    from pebble.services.autonomy_manager.environment import environment
+    from pebble.services.autonomy_manager.interpreter import lacking
+
+    missing = lacking(script.command, script.folder, environment(script.environment))
+    return f"runs with {script.command[0]}" + (f", which lacks {', '.join(missing)}" if missing else "")
 
 
 def _check_certificates(config: Config) -> None:
@@ -303,7 +294,8 @@ def _local_media(config: Config) -> Iterator[str]:
     """What programs of the original find on the robot besides MQTT."""
     devices = config.services.av_daemon
     forms = {"video": "pictures", "audio": "sound"}
-    yield from (f"{forms[name]} at {path}" for name, path in devices.sockets().items())
+    for name, path in devices.sockets().items():
+        yield f"{forms[name]} at {path}, by examples/gstreamer_sockets.py"
     for line in config.motor_lines().values():
         if (name := config.hall_memory(line)) is not None:
             yield f"hall samples in the shared memory {name}"

@@ -43,13 +43,15 @@ class ScriptDependency(Section, frozen=True, kw_only=True):
 class Script(Section, frozen=True, kw_only=True):
     """One autonomy script: a folder with an entry point."""
 
+    retired: ClassVar = {"arbitrate": "what a script of others drives ranks below a person who has control"}
+
     enabled: Annotated[bool, doc("Offer it.")] = True
     display_name: Annotated[str | None, doc("Its name for operators; unset: the folder's.")] = None
     entrypoint: Annotated[str, doc("File to run.")] = "run.py"
-    python: Annotated[str | None, doc("Interpreter of a Python entry point; unset: the one that runs Pebble.")] = None
-    arbitrate: Annotated[
-        bool, doc("Sign the drive commands of a script that does not sign them itself, so that people go first.")
-    ] = True
+    python: Annotated[
+        str | None,
+        doc("Interpreter of a Python entry point; unset: Pebble's for one that imports pebble, else /usr/bin/python3."),
+    ] = None
     cwd: Annotated[File | None, doc("Folder to run it in; unset: its own.")] = None
     env: Annotated[Variables, doc("Environment variables to add.")] = EMPTY
     args: Annotated[tuple[ScriptArgument, ...], doc("Its settings.")] = ()

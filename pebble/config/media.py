@@ -29,7 +29,7 @@ from pebble.contract.encodings import SoundEncoding, VideoEncoding
 
 _FRAMES = "pictures and sound use the robot's own shared memory, found by transport.run_dir"
 _SOURCE = "every frame has its own size and format"
-_SOCKET = "a socket has the memory that its frames need, and never waits for its readers"
+_SOCKET = "examples/gstreamer_sockets.py chooses them"
 _SHMSINK = {"shm_size": _SOCKET, "wait_for_connection": _SOCKET}
 _INPUT = {"input_shm": _FRAMES, "input_retry_seconds": _FRAMES}
 
@@ -57,7 +57,7 @@ class CameraCapture(Section, frozen=True, kw_only=True):
     fps: Annotated[FramesPerSecond, doc("Frames per second.")] = 15
     rotate_degrees: Annotated[Rotation, doc("Clockwise.")] = 0
     socket_path: Annotated[
-        File | None, doc("Offer pictures to programs of the original: raw BGR at this GStreamer `shmsink` socket.")
+        File | None, doc("Where programs of the original read raw BGR; examples/gstreamer_sockets.py offers it there.")
     ] = None
 
 
@@ -74,7 +74,7 @@ class Microphone(Section, frozen=True, kw_only=True):
     rate: Annotated[SampleRate, doc("Samples per second.")] = 16000
     channels: Annotated[AudioChannels, doc("1 is mono, 2 stereo.")] = 1
     socket_path: Annotated[
-        File | None, doc("Offer sound to programs of the original: S16LE at this GStreamer `shmsink` socket.")
+        File | None, doc("Where programs of the original read S16LE; examples/gstreamer_sockets.py offers it there.")
     ] = None
 
 
@@ -88,7 +88,7 @@ class AvDaemon(ServiceSection, frozen=True, kw_only=True):
     audio: Annotated[Microphone, doc("Microphone.")] = Microphone()
 
     def sockets(self) -> dict[str, Path]:
-        """The sockets that `gstreamer_mirror` offers, by the section that names them."""
+        """Return the GStreamer sockets for programs of the original, by the section that names them."""
         if not self.enabled:
             return {}
         sections: dict[str, CameraCapture | Microphone] = {"video": self.video, "audio": self.audio}

@@ -507,7 +507,6 @@ class AutonomyStatus(Payload, frozen=True, kw_only=True):
     config: dict[str, Any] | None = None  # the effective settings
     controls: bool = True
     overridden: bool | UnsetType = UNSET  # true while a person drives, and the script has to wait
-    waiting_for: str | UnsetType = UNSET  # what it has been waiting for, silent, for more than 10 s
 
 
 class WheelOdometry(Payload, frozen=True, kw_only=True):

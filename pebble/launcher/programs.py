@@ -63,7 +63,6 @@ def programs(config: Config) -> tuple[Program, ...]:
         (services.autonomy_manager.enabled, _package(config, "autonomy_manager", Stage.CONNECTION, runs_scripts=True)),
         (services.mqtt_bridge.enabled, _package(config, "mqtt_bridge", Stage.CONNECTION, may_request=True)),
         (mirror is not None, _service(config, "mqtt_mirror", Stage.CONNECTION)),
-        (bool(services.av_daemon.sockets()), _service(config, "gstreamer_mirror", Stage.CONNECTION, preloaded=False)),
         (services.soundboard_handler.enabled, _package(config, "soundboard_handler", Stage.CONNECTION)),
         (services.web_handler.enabled, _web_handler(config)),
         (services.neighbours.enabled, _service(config, "neighbours", Stage.CONNECTION, preloaded=False)),

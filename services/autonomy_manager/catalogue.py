@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import logging
 import os
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from functools import partial
 from pathlib import Path
 
 import msgspec
@@ -14,7 +15,6 @@ import pebble
 from pebble.config import Config
 from pebble.config.autonomy import Script as ScriptSection
 from pebble.config.home import in_home
-from pebble.services.autonomy_manager import builtin_forms
 from pebble.services.autonomy_manager.describe import (
     MANIFEST,
     BrokenScriptError,
@@ -27,9 +27,7 @@ from pebble.services.autonomy_manager.describe import (
 )
 from pebble.services.autonomy_manager.environment import environment, local_login
 from pebble.services.autonomy_manager.forms import MAX_SETTINGS, Setting, form
-from pebble.services.autonomy_manager.local_media import LocalMedia
-from pebble.services.autonomy_manager.needs import HALL_OPTION, Needs, needs_of
-from pebble.services.autonomy_manager.pythons import Pythons
+from pebble.services.autonomy_manager.interpreter import interpreter
 from pebble.services.autonomy_manager.script import Dependency, Script
 
 MAX_SCRIPTS = 256
@@ -60,13 +58,10 @@ def roots(config: Config, own: Path = _OWN_SCRIPTS) -> tuple[Path, ...]:
 class Catalogue:
     """Scans the folders. For one thread, because to ask a script takes up to 20 s."""
 
-    def __init__(self, config: Config, *, pythons: Pythons | None = None, asks: bool = True) -> None:
+    def __init__(self, config: Config, *, asks: bool = True) -> None:
         """``asks`` is False for a list of scripts without the settings of ours."""
         self._config, self._section, self._asks = config, config.services.autonomy_manager, asks
-        self._roots = roots(config)
-        self._own = self._roots[-1] if len(self._roots) > 1 else None
-        self._pythons, self._media = pythons or Pythons(), LocalMedia(config)
-        self._needs: dict[Path, tuple[object, Needs]] = {}  # by entry point, of scripts that are not ours
+        self._roots, self._login = roots(config), local_login(config)
         self._manifests, self._answers = Descriptions(), Descriptions()
         self._ours: dict[str, tuple[object, bool, str]] = {}  # by name: version, whether it is ours, what is wrong
         self._scanned = False
@@ -77,34 +72,20 @@ class Catalogue:
         folders = dict(self._folders())
         scripts: dict[str, Script] = {}
         for name, places in folders.items():
-            script = self._first_able(name, places, lambda: self._scanned or found(dict(scripts)))
-            if script is not None:
-                scripts[name] = script
-        known = {*folders, *map(_own_key, folders)}
+            before_asking = partial(self._before_asking, scripts, found)
+            for folder in places:
+                if (script := self._script(name, folder, before_asking)) is not None:
+                    scripts[name] = script
+                    break
         for descriptions in (self._manifests, self._answers):
-            descriptions.retain_only(known)
-        self._ours = {key: answer for key, answer in self._ours.items() if key in known}
-        self._needs = {entry: needs for entry, needs in self._needs.items() if entry.parent.name in folders}
+            descriptions.retain_only(set(folders))
+        self._ours = {name: answer for name, answer in self._ours.items() if name in folders}
         self._scanned = True
         found(scripts)
 
-    def _first_able(self, name: str, folders: Sequence[Path], before_asking: Callable[[], object]) -> Script | None:
-        """The script in the first folder; but Pebble's own where that one cannot run here."""
-        script = self._script(name, folders[0], before_asking)
-        if script is None and len(folders) > 1:
-            return self._first_able(name, folders[1:], before_asking)
-        if script is None or not script.broken or folders[0].parent == self._own:
-            return script
-        if folders[-1].parent == self._own:
-            own = self._script(name, folders[-1], before_asking, own=True)
-            if own is not None and not own.broken:
-                text = "%s in %s cannot run here: %s; Pebble's own %s is offered instead"
-                self._complain(name, text, name, folders[0].parent, script.broken, name)
-                return replace(own, instead_of=script.broken)
-        elif (_OWN_SCRIPTS / name).is_dir():
-            hint = f"; Pebble's own {name} does the same: write a relative autonomy_root, and it is offered"
-            return replace(script, broken=script.broken + hint)
-        return script
+    def _before_asking(self, scripts: dict[str, Script], found: Callable[[dict[str, Script]], object]) -> None:
+        if not self._scanned:
+            found(dict(scripts))
 
     def _folders(self) -> Iterator[tuple[str, list[Path]]]:
         names: dict[str, list[Path]] = {}
@@ -125,63 +106,36 @@ class Catalogue:
             return False
         return self._section.scripts.get(name, ScriptSection()).enabled
 
-    def _script(
-        self, name: str, folder: Path, before_asking: Callable[[], object], *, own: bool = False
-    ) -> Script | None:
-        """``own``: Pebble's own instead of the robot's copy, for which the config says how to run it."""
+    def _script(self, name: str, folder: Path, before_asking: Callable[[], object]) -> Script | None:
         section = self._section.scripts.get(name, ScriptSection())
-        key = name
-        if own:
-            section, key = replace(section, entrypoint="run.py", python=None, cwd=None), _own_key(name)
         entry, manifest = folder / section.entrypoint, folder / MANIFEST
-        described = self._manifests.get(key, [manifest], lambda: _manifest(manifest)) or Description()
+        described = self._manifests.get(name, [manifest], lambda: _manifest(manifest)) or Description()
         if not described.command and not entry.is_file():
             return None
-        ours, broken = (False, "") if described.command else self._is_ours(key, entry, section)
-        variables = environment(self._section.env, section.env)
-        needs = Needs() if ours or described.command or broken else self._needs_of(entry)
-        command, lacking = self._command(name, folder, entry, section, described, needs, variables)
-        working = section.cwd or folder
-        broken = broken or lacking or self._media.lacks(needs, folder, working)
+        ours, broken = (False, "") if described.command else self._is_ours(name, entry, section)
+        command = self._command(folder, entry, section, described, ours=ours)
         if ours and self._asks:
 
             def question() -> Description:
                 before_asking()
-                return ask(command, folder, variables)
+                return ask(command, folder, environment(self._section.env, section.env))
 
-            answer = self._answers.get(key, [entry], question)
-            broken = self._answers.broken(key)
+            answer = self._answers.get(name, [entry], question)
+            broken = self._answers.broken(name)
             described = _merged(described, answer or Description())
-        settings = self._settings(name, section, described, ours=ours)
-        login = local_login(self._config) if ours or not section.arbitrate else {}  # the others get the gate's
         return Script(
             file=name,
             label=(section.display_name or described.label or name)[:_LONGEST_NAME],
             command=command,
-            folder=working,
-            settings=settings,
+            folder=section.cwd or folder,
+            settings=self._settings(name, section, described, ours=ours),
             summary=described.summary,
             main=tuple(described.main),
-            dependencies=_dependencies(name, section, described, ours=ours),
-            environment={**login, **self._section.env, **section.env},
+            dependencies=_dependencies(name, section, described),
+            environment={**self._login, **self._section.env, **section.env},
             ours=ours,
-            arbitrate=section.arbitrate,
             broken=broken,
-            needs=needs,
-            size=self._media.size if needs.pictures else None,
-            more=self._media.hall_options if needs.hall and HALL_OPTION not in _options(settings) else (),
         )
-
-    def _needs_of(self, entry: Path) -> Needs:
-        """Read again only when one of its files has changed, which may take a second."""
-        if entry.suffix != ".py":
-            return Needs()
-        before = self._needs.get(entry)
-        if before is not None and before[0] == [stamp(file) for file in before[1].files]:
-            return before[1]
-        needs = needs_of(entry)
-        self._needs[entry] = ([stamp(file) for file in needs.files], needs)
-        return needs
 
     def _is_ours(self, name: str, entry: Path, section: ScriptSection) -> tuple[bool, str]:
         """Whether it is ours, and why it cannot be started; parsed only when it has changed, which may take a second.
@@ -202,31 +156,23 @@ class Catalogue:
         return ours, broken
 
     def _command(
-        self,
-        name: str,
-        folder: Path,
-        entry: Path,
-        section: ScriptSection,
-        described: Description,
-        needs: Needs,
-        variables: Mapping[str, str],
-    ) -> tuple[tuple[str, ...], str]:
-        """The command line without options, and why it cannot be started."""
+        self, folder: Path, entry: Path, section: ScriptSection, described: Description, *, ours: bool
+    ) -> tuple[str, ...]:
+        """The command line without options."""
         if described.command:
             program, *more = described.command
-            return (str(folder / program) if "/" in program else program, *more), ""
+            return (str(folder / program) if "/" in program else program, *more)
         python = section.python
         if python is None and entry.suffix != ".py" and os.access(entry, os.X_OK):
-            return (str(entry),), ""
+            return (str(entry),)
         if python is not None and "/" in python:
             python = str(self._config.folder / in_home(python))
-        chosen, lacking = self._pythons.choose(name, python, needs, folder, variables)
-        return (chosen, str(entry)), lacking
+        return (interpreter(python, ours=ours), str(entry))
 
     def _settings(
         self, name: str, section: ScriptSection, described: Description, *, ours: bool
     ) -> tuple[Setting, ...]:
-        """By key: the config's, then the script's own, then the built-in ones. One of ours knows its options best."""
+        """By key: the config's, then the script's own. One of ours knows its options best."""
         configured = [Setting(**asdict(argument)) for argument in section.args]
         own = {setting.key: setting for setting in described.configs}
         if ours and own:
@@ -235,9 +181,7 @@ class Catalogue:
                 self._complain(name, "%s has no setting %s: ignored", name, ", ".join(unknown))
             configured = [_with_option(setting, own[setting.key]) for setting in configured if setting.key in own]
         merged = {setting.key: setting for setting in configured}
-        camera = self._config.services.av_daemon.video
-        known = () if ours else builtin_forms.settings_of(name, camera)
-        for setting in (*own.values(), *known):
+        for setting in own.values():
             merged.setdefault(setting.key, setting)
         settings = tuple(merged.values())
         size = len(msgspec.json.encode(form(settings)))
@@ -272,14 +216,6 @@ def _first_seen(script: Script, configs: Iterable[Mapping[str, object]]) -> dict
     return {name: value for name, value in first.items() if value}
 
 
-def _own_key(name: str) -> str:
-    return f"Pebble's own {name}"
-
-
-def _options(settings: Iterable[Setting]) -> set[str | None]:
-    return {setting.arg for setting in settings}
-
-
 def _inside(root: Path) -> list[Path]:
     try:
         return [folder for folder in root.iterdir() if folder.is_dir()]
@@ -307,14 +243,12 @@ def _with_option(configured: Setting, own: Setting) -> Setting:
     return replace(configured, arg=own.arg, arg_false=own.arg_false, mode=own.mode)
 
 
-def _dependencies(name: str, section: ScriptSection, described: Description, *, ours: bool) -> tuple[Dependency, ...]:
-    """The config's, else the script's own, else the built-in ones; each script once, and never itself."""
+def _dependencies(name: str, section: ScriptSection, described: Description) -> tuple[Dependency, ...]:
+    """The config's, else the script's own; each script once, and never itself."""
     chosen: Iterable[tuple[str, Mapping[str, object]]]
     if section.dependencies:
         chosen = ((each.file, each.config) for each in section.dependencies if each.enabled)
-    elif described.dependencies:
-        chosen = ((each.file, each.config) for each in described.dependencies)
     else:
-        chosen = () if ours else builtin_forms.DEPENDENCIES.get(name, ())
+        chosen = ((each.file, each.config) for each in described.dependencies)
     by_file = {file: Dependency(file, dict(config)) for file, config in chosen if file != name}
     return tuple(by_file.values())[:_MAX_DEPENDENCIES]

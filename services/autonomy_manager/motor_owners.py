@@ -69,13 +69,21 @@ class MotorOwners:
         """What must not change while a script runs."""
         return {owner: (state.boot, state.count, state.last_barred) for owner, state in self._states.items()}
 
-    def ending(self, run: int, baseline: Baseline) -> str:
-        """Why this run has to end; empty if it may go on. Owners that are new are added to ``baseline``."""
+    @property
+    def held(self) -> bool:
+        """True if somebody has control of one of them."""
+        return any(state.key for state in self._controls.values())
+
+    def ending(self, run: int, baseline: Baseline, signs: bool = True) -> str:
+        """Why this run has to end; empty if it may go on. Owners that are new are added to ``baseline``.
+
+        A run that does not sign its commands bars itself by them, and is not stopped by that.
+        """
         for owner, state in self._states.items():
             boot, count, barred = baseline.setdefault(owner, (state.boot, state.count, 0))
             if state.latched or (state.boot == boot and state.count != count):
                 return _stopped(owner, state)
-            if state.last_barred != barred and not newer(run, state.last_barred):
+            if signs and state.last_barred != barred and not newer(run, state.last_barred):
                 alone = state.last_barred == run and not newer(self.newest_run, run)
                 return OVERRIDDEN if alone else SUPERSEDED
             if state.boot != boot:

@@ -16,7 +16,7 @@ from pebble.services.autonomy_manager.child import Child, Launch, Spawn
 from pebble.services.autonomy_manager.environment import environment
 from pebble.services.autonomy_manager.forms import Value
 from pebble.services.autonomy_manager.motor_owners import Baseline
-from pebble.services.autonomy_manager.script import Plan, Script, Step
+from pebble.services.autonomy_manager.script import Plan, Step
 
 log = logging.getLogger(__name__)
 
@@ -24,11 +24,10 @@ log = logging.getLogger(__name__)
 class Surroundings(Protocol):
     """What a runner needs of its service."""
 
-    def begin_run(self) -> tuple[int, Baseline]:
-        """The number of a new run. Raises PebbleError if none may start now."""
+    config_path: Path  # of the robot
 
-    def config_path(self, script: Script, run: int) -> Path:
-        """The config for this script. Raises PebbleError."""
+    def begin_run(self, plan: Plan) -> tuple[int, Baseline]:
+        """Return the number of a new run. Raises PebbleError if none may start now."""
 
     def halt(self, run: int) -> None:
         """Stop the wheels now."""
@@ -155,7 +154,7 @@ class Runner:
     def _begin(self, plan: Plan) -> None:
         file = plan.main.script.file
         try:
-            number, baseline = self._surroundings.begin_run()
+            number, baseline = self._surroundings.begin_run(plan)
             self._run = run = Run(number, plan, baseline)
             self._surroundings.halt(number)  # the motor owner knows the run: who stops now, stops it before it drives
             for step in plan.dependencies:
@@ -170,7 +169,7 @@ class Runner:
 
     def _started(self, run: Run, step: Step) -> Part:
         script = step.script
-        path = str(self._surroundings.config_path(script, run.number))
+        path = str(self._surroundings.config_path)
         own = {CONFIG: path, **({RUN: str(run.number)} if script.ours else {})}
         launch = Launch(
             file=script.file,

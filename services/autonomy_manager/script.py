@@ -1,6 +1,6 @@
 """What is known of one script, and how it is started."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -8,7 +8,6 @@ from msgspec import Struct
 
 from pebble.errors import PebbleError
 from pebble.services.autonomy_manager.forms import Setting, SettingError, Value, arguments, effective, shown
-from pebble.services.autonomy_manager.needs import Needs
 
 
 class StartError(PebbleError):
@@ -39,17 +38,7 @@ class Script(Struct, frozen=True, kw_only=True):
     dependencies: tuple[Dependency, ...] = ()
     environment: dict[str, str] = {}
     ours: bool = False  # it uses pebble.script, which signs its drive commands and stops the wheels at its end
-    arbitrate: bool = True  # sign the drive commands of one that is not
     broken: str = ""  # why it cannot be started
-    instead_of: str = ""  # why the robot's own copy of it, which would go first, cannot be started
-    needs: Needs = Needs()
-    size: tuple[int, int] | None = None  # of the pictures that it must ask for, if it reads them raw
-    more: tuple[str, ...] = ()  # options that no setting has
-
-    @property
-    def needs_gate(self) -> bool:
-        """Whether its drive commands pass a gate, which signs them."""
-        return self.arbitrate and not self.ours
 
 
 class Step(Struct, frozen=True):
@@ -94,33 +83,4 @@ def _step(script: Script, config: Mapping[str, Any], failed: str) -> tuple[Step,
         values = effective(script.settings, config)
     except SettingError as error:
         raise StartError(f"{failed}: {error}") from None
-    if problem := wrong_size(script, values):
-        raise StartError(f"{failed}: {problem}")
-    return Step(script, (*arguments(script.settings, values), *script.more)), values
-
-
-def wrong_size(script: Script, values: Mapping[str, Value]) -> str:
-    """Why the pictures that ``script`` asks for are not the camera's; 0 or nothing means the config's size."""
-    if script.size is None:
-        return ""
-    given = {setting.arg: values[setting.key] for setting in script.settings}
-    wanted = tuple(given.get(option) or own for option, own in zip(("--width", "--height"), script.size, strict=True))
-    if wanted == script.size:
-        return ""
-    asked, sent = ("x".join(map(str, size)) for size in (wanted, script.size))
-    return f"it asks for {asked}, the camera sends {sent}: tags would be misplaced"
-
-
-def size_problems(scripts: Mapping[str, Script]) -> Iterator[str]:
-    """Where a config makes scripts ask for pictures of another size than the camera's."""
-    for script in scripts.values():
-        own = {setting.key: setting.default for setting in script.settings}
-        if problem := wrong_size(script, own):
-            yield f"{script.file}.args: {problem}"
-        for dependency in script.dependencies:
-            other = scripts.get(dependency.file)
-            if other is None:
-                continue
-            values = {setting.key: dependency.config.get(setting.key, setting.default) for setting in other.settings}
-            if problem := wrong_size(other, values):
-                yield f"{script.file}.dependencies.{other.file}: {problem}"
+    return Step(script, tuple(arguments(script.settings, values))), values

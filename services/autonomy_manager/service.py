@@ -6,7 +6,7 @@ import logging
 import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import msgspec
 from msgspec.structs import replace
@@ -30,23 +30,15 @@ from pebble.runtime.process import view_of
 from pebble.runtime.runs import LocalScripts, following, next_run
 from pebble.runtime.service import Service, on
 from pebble.services.autonomy_manager.child import Processes, Spawn
-from pebble.services.autonomy_manager.gate.activity import SILENT_S
-from pebble.services.autonomy_manager.gate.config_copy import broker_of
-from pebble.services.autonomy_manager.local_media import LocalMedia
 from pebble.services.autonomy_manager.motor_owners import OVERRIDDEN, Baseline, MotorOwners
 from pebble.services.autonomy_manager.offer import Offer
 from pebble.services.autonomy_manager.runner import Runner
 from pebble.services.autonomy_manager.script import Plan, Script, StartError, UnknownScriptError, plan
-from pebble.transports import QoS
-
-if TYPE_CHECKING:
-    from pebble.services.autonomy_manager.gate.gate import Gate
 
 _START = frozenset(("start", "run", "play", "enable", "enabled", "on"))
 _HALTS_S = (0.1, 0.3)  # after the first one
 _HOLD_S = HOLD_MS / 1000
 _SCAN_S = 5.0  # between two looks into the folder of scripts
-_LOOK_S = 2.0  # between two looks at whether a script waits
 _CLOSE_S = 1.0  # for scripts to end after SIGTERM when this process ends; it is killed after 3 s
 
 
@@ -72,13 +64,13 @@ class AutonomyManager(Service):
         self._overridden_until = self._refused_until = float("-inf")
         self._status: AutonomyStatus | None = None
         self._connected_before = False
-        self._media, self._began = LocalMedia(self.config), 0.0
-        self._gate: tuple[int, Gate] | None = None  # of the present run, if one of its scripts needs it
+        self._signs = True  # the newest run's script signs what it drives; else its commands look like a person's
+        self._moves = False  # what looks like a person's has moved the wheels: perhaps a script that does not sign
+        self._person_moves = False  # the newest command that is certainly a person's
 
     def start(self) -> None:
         if self._offer.begin():
             self.timers.add(self.clock(), self._offer.scan, period=_SCAN_S)
-        self.timers.add(self.clock(), self._look, period=_LOOK_S)
         self.changed()
 
     def stop(self) -> None:
@@ -88,8 +80,7 @@ class AutonomyManager(Service):
     def on_connected(self) -> None:
         if not self._connected_before:  # a predecessor may have been killed together with its script
             self._connected_before = True
-            if self.config.security.named:
-                self.listen(CONTROL_STATE, self._control)
+            self.listen(CONTROL_STATE, self._control)
             try:
                 self.halt(next_run(self.config, self._owners.barred))
             except PebbleError as error:
@@ -137,11 +128,6 @@ class AutonomyManager(Service):
         problem = self._owners.refusal
         if not problem and self.clock() < self._refused_until:
             problem = f"{OVERRIDDEN} just now: start it again in {_HOLD_S:g} s"
-        if any(step.script.needs_gate for step in (wanted.main, *wanted.dependencies)):
-            try:
-                broker_of(self.config)
-            except PebbleError as error:
-                problem = str(error)
         if problem:
             raise StartError(f"Failed to start {wanted.main.script.file}: {problem}")
 
@@ -151,7 +137,7 @@ class AutonomyManager(Service):
     def motor_owner(self, state: EstopState, owner: str) -> None:
         self._owners.receive(owner, state)
         run = self._runner.unfinished
-        if run is not None and (why := self._owners.ending(run.number, run.baseline)):
+        if run is not None and (why := self._owners.ending(run.number, run.baseline, self._signs)):
             self._runner.stop(why)
 
     def _control(self, state: ControlState, owner: str) -> None:
@@ -159,15 +145,19 @@ class AutonomyManager(Service):
 
     @on(DRIVE, direct=True)
     def drive(self, drive: Drive, _arrived: float) -> None:
-        """On the transport's thread. A person's commands all mean the same here."""
-        if not drive.signed:
-            if (gate := self._gate) is not None:
-                gate[1].override(self.addresses[DRIVE].topic, _HOLD_S)
+        """On the transport's thread. Without a key, a script that does not sign and a person are not told apart."""
+        if drive.signed:
+            if isinstance(drive.run, int):
+                self._owners.note_run(drive.run)
+        elif drive.source == self.name:
+            return
+        elif self._signs or drive.key:
+            self._person_moves = drive.moves
             self.post(self._person_drives, newest_of="person")
             if not drive.moves and drive.valid_ms == 0:
                 self.post(self._person_stops, newest_of="person stops")
-        elif isinstance(drive.run, int):
-            self._owners.note_run(drive.run)
+        else:
+            self._moves = drive.moves
 
     def _person_drives(self) -> None:
         now = self.clock()
@@ -181,60 +171,51 @@ class AutonomyManager(Service):
     def _person_stops(self) -> None:
         """The arbiter bars what starts during the hold of such a zero, too: it may have been asked for before."""
         self._refused_until = self.clock() + _HOLD_S
+        self._end_unsigned()
 
     def _check_override(self) -> None:
         if self.clock() < self._overridden_until:
             self.call_at(self._overridden_until, self._check_override)
-        else:
-            self.changed()
+            return
+        if self._person_moves:  # and has not let go: the connection was lost
+            self._end_unsigned()
+        self.changed()
+
+    def _end_unsigned(self) -> None:
+        """End a script that does not sign; one that does, the arbiter ends."""
+        if self._runner.active is not None and not self._signs:
+            self._runner.stop(OVERRIDDEN)
 
     # -- what a runner needs
 
-    def begin_run(self) -> tuple[int, Baseline]:
+    @property
+    def config_path(self) -> Path:
+        return self.config.path or self.config.folder
+
+    def begin_run(self, plan: Plan) -> tuple[int, Baseline]:
         if refusal := self._owners.refusal:
             raise StartError(refusal)
-        self._began = self.clock()
         self._local.hold()
         try:
             run = self._owners.newest_run = next_run(self.config, self._owners.barred, self._owners.newest_run)
         except PebbleError:
             self._local.release()
             raise
+        self._signs, self._moves = plan.main.script.ours, False
         for step in self._owners.steps_to(run):
             self.halt(step)
         return run, self._owners.baseline()
 
-    def config_path(self, script: Script, run: int) -> Path:
-        if not script.needs_gate:
-            return self.config.path or self.config.folder
-        if self._gate is None:
-            from pebble.services.autonomy_manager.gate.gate import (
-                Gate,  # asyncio and ssl cost 2 MB, which few robots need
-            )
-
-            gate = Gate(self.config, self._publish_signed, run)
-            gate.open()
-            self._gate = (run, gate)
-            if (left := self._overridden_until - self.clock()) > 0:
-                gate.override(self.addresses[DRIVE].topic, left)
-        return self._gate[1].config_path
-
     def end_run(self, run: int) -> None:
-        if self._gate is not None and self._gate[0] == run:
-            self._gate[1].close()
-            self._gate = None
         self._owners.note_run(following(run))  # a person may bar it, too, before the next run
         self.halt(following(run))  # bars this run: a process of it may have escaped
         self._local.release()
 
     def halt(self, run: int) -> None:
-        if self._gate is not None and self._gate[0] == run:
-            self._gate[1].halt()
         self.publish(DRIVE, Drive(source=SCRIPT, run=run))
-
-    def _publish_signed(self, topic: str, payload: bytes) -> None:
-        """On a thread of the gate."""
-        self.transport.publish(topic, payload, qos=QoS.DELIVERED)
+        if self._moves and not self._owners.held:  # who has control moves the wheels, and no script that does not sign
+            self._moves = False
+            self.publish(DRIVE, Drive(source=self.name))
 
     def halt_repeatedly(self, run: int) -> None:
         self.halt(run)
@@ -271,35 +252,7 @@ class AutonomyManager(Service):
             config=None if self._runner.config is None else dict(self._runner.config),
         )
         overridden = main is not None and self.clock() < self._overridden_until
-        waiting_for = self._waiting_for() if main is not None else ""
-        return replace(
-            status,
-            overridden=True if overridden else msgspec.UNSET,
-            waiting_for=waiting_for or msgspec.UNSET,
-        )
+        return replace(status, overridden=True if overridden else msgspec.UNSET)
 
     def _publish_files(self, found: list[dict[str, object]]) -> None:
         self.publish(AUTONOMY_FILES, AutonomyFiles(files=found, timestamp=time.time()))
-
-    def _look(self) -> None:
-        """A script that begins to wait says nothing: ask again and again."""
-        if self._runner.active is not None:
-            self.changed()
-
-    def _waiting_for(self) -> str:
-        """What the present run waits for; empty: it does something, or that is unknown."""
-        run = self._runner.active
-        if run is None or self.clock() - self._began < SILENT_S:
-            return ""
-        for step, part in zip(run.plan.dependencies, run.dependencies, strict=False):
-            if not part.ended and (absent := self._media.absent(step.script.needs)):
-                return f"{part.file}, which waits for {absent}"
-        activity = None if self._gate is None else self._gate[1].activity
-        if activity is not None and not activity.silent:
-            return ""
-        needs = run.plan.main.script.needs
-        known = self._media.absent(needs)
-        if known or activity is None:
-            return known
-        media = {"pictures": needs.pictures, "sound": needs.sound, "hall samples": needs.hall}
-        return next((what for what, needed in media.items() if needed), activity.waits_for)

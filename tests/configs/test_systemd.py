@@ -16,8 +16,8 @@ from tests.kit import npm
 from tests.support import ROOT
 
 UNITS = ROOT / "configs" / "systemd"
-NAMES = ("pebble", "pebble-update", "pebble-web", "pebble-record", "pebble-hub", "pebble-gateway")
-ROBOT, UPDATE, PAGE, RECORDER, HUB, GATEWAY = (UNITS / f"{name}.service" for name in NAMES)
+NAMES = ("pebble", "pebble-update", "pebble-web", "pebble-record", "pebble-hub", "pebble-gateway", "pebble-gstreamer")
+ROBOT, UPDATE, *OTHERS = (UNITS / f"{name}.service" for name in NAMES)
 MOST_EXPOSED = 20  # tenths, of systemd-analyze
 #: What every unit says, whatever systemd-analyze makes of the rest.
 CONFINED = {
@@ -69,7 +69,7 @@ MODULES = {
 }
 RESTART, REBOOT = "org.freedesktop.systemd1.manage-units", "org.freedesktop.login1.reboot"
 
-units = pytest.mark.parametrize("unit", [ROBOT, UPDATE, PAGE, RECORDER, HUB, GATEWAY], ids=lambda path: path.stem)
+units = pytest.mark.parametrize("unit", [ROBOT, UPDATE, *OTHERS], ids=lambda path: path.stem)
 
 
 def service(unit: str) -> dict[str, list[str]]:

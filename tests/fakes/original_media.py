@@ -1,7 +1,6 @@
 """What the stand-ins for scripts of the original have in common, without any code of it: config, paho, local media.
 
-They import nothing of Pebble, and run with the system's Python, too. There pictures come through GStreamer, as in the
-original; another OpenCV has none of it, and reads the socket by the stand-in for ``shmsrc``.
+They import nothing of Pebble, and run with the system's Python, whose OpenCV has GStreamer.
 """
 
 from __future__ import annotations
@@ -16,10 +15,7 @@ import cv2
 import numpy as np
 import paho.mqtt.client as paho
 
-from tests.kit.shm_reader import ShmReader
-
 RETRY_S = 2.0
-_HAS_GSTREAMER = any(line.split()[:2] == ["GStreamer:", "YES"] for line in cv2.getBuildInformation().splitlines())
 
 
 class Robot:
@@ -52,12 +48,12 @@ def pictures(video: dict[str, Any]) -> Iterator[Any]:
     """The camera's, for ever; after a loss the socket is opened again, 2 s later."""
     path, width, height, fps = video["socket_path"], video["width"], video["height"], video["fps"]
     while True:
-        yield from (_gstreamer if _HAS_GSTREAMER else _wire)(path, width, height, fps)
+        yield from _read(path, width, height, fps)
         print("source unavailable", flush=True)  # noqa: T201 - a script's output is its log
         time.sleep(RETRY_S)
 
 
-def _gstreamer(path: str, width: int, height: int, fps: int) -> Iterator[Any]:
+def _read(path: str, width: int, height: int, fps: int) -> Iterator[Any]:
     capture = cv2.VideoCapture(
         f"shmsrc socket-path={path} is-live=true do-timestamp=true ! "
         f"video/x-raw,format=BGR,width={width},height={height},framerate={fps}/1 ! appsink max-buffers=1 drop=true",
@@ -71,17 +67,6 @@ def _gstreamer(path: str, width: int, height: int, fps: int) -> Iterator[Any]:
             yield picture
     finally:
         capture.release()
-
-
-def _wire(path: str, width: int, height: int, _fps: int) -> Iterator[Any]:
-    try:
-        with ShmReader(Path(path)) as reader:
-            while True:
-                data = reader.read(1.0)
-                if data is not None:
-                    yield np.frombuffer(data, np.uint8).reshape(height, width, 3)
-    except (OSError, EOFError):
-        return
 
 
 class Tags:

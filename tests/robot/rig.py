@@ -29,7 +29,7 @@ _LISTENS = (b"forwarding between the robot and its remote side", b"to the local 
 PROGRAMS = (
     *("zenoh_hub", "announcer", "serial_mcu_bridge", "av_daemon", "mqtt_bridge", "mqtt_mirror"),
     *("camera_publisher", "audio_publisher", "audio_receiver", "video_stream"),
-    *("soundboard_handler", "autonomy_manager", "gstreamer_mirror"),
+    *("soundboard_handler", "autonomy_manager"),
 )
 #: A camera and a microphone for ``av_daemon``.
 DEVICES = {

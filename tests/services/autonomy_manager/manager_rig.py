@@ -43,12 +43,12 @@ class ManagerRig(ProgramRobot):
         self._ends.callback(self.end)
 
     def script(self, name: str, text: str = SLEEPER, file: str = "run.py", **section: Any) -> Path:
-        """Write a script; its own drive commands count as a person's, because nothing here needs a gate."""
+        """Write a script."""
         folder = self.root / name
         folder.mkdir()
         (folder / file).write_text(text)
         (folder / file).chmod(stat.S_IRWXU)
-        self.section["scripts"][name] = {"arbitrate": False, **section}
+        self.section["scripts"][name] = section
         return folder
 
     def start(self, *command: str) -> None:

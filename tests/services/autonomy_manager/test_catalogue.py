@@ -14,8 +14,10 @@ import pytest
 
 from pebble.config import Config, parse
 from pebble.services.autonomy_manager import catalogue as catalogue_module
+from pebble.services.autonomy_manager import interpreter as interpreter_module
 from pebble.services.autonomy_manager.catalogue import MAX_SCRIPTS, Catalogue, files, roots
 from pebble.services.autonomy_manager.forms import Setting, form
+from pebble.services.autonomy_manager.interpreter import interpreter, lacking
 from pebble.services.autonomy_manager.script import Script
 
 ANSWER = '{"label": "Walk", "configs": [{"key": "speed", "arg": "--speed"}, {"key": "laps", "arg": "--laps"}]}'
@@ -58,7 +60,7 @@ def test_folders_with_an_entry_point_are_scripts(tmp_path: Path, caplog: pytest.
     (tmp_path / "elsewhere").symlink_to(tmp_path / "beta")
     found = scripts(tmp_path, scripts={"off": {"enabled": False}, "other": {"entrypoint": "main.py"}})
     assert list(found) == ["Alpha", "beta", "elsewhere", "other"]
-    assert found["beta"].command == (sys.executable, str(tmp_path / "beta/run.py"))
+    assert found["beta"].command == ("/usr/bin/python3", str(tmp_path / "beta/run.py"))
     assert "'bad]name' is not offered: rename its folder" in caplog.text
     assert scripts(tmp_path / "missing") == {}
 
@@ -98,9 +100,9 @@ def test_one_of_ours_is_asked_once_and_no_other(tmp_path: Path) -> None:
     found = scanned(catalogue)
     assert (tmp_path / "walk/asked").read_text() == "x"
     assert not (tmp_path / "foreign/asked").exists()
-    assert (found["walk"].label, found["walk"].ours, found["walk"].needs_gate) == ("Walk", True, False)
+    assert (found["walk"].label, found["walk"].ours, found["walk"].command[0]) == ("Walk", True, sys.executable)
     assert [setting.key for setting in found["walk"].settings] == ["speed", "laps"]
-    assert (found["foreign"].settings, found["foreign"].needs_gate) == ((), True)
+    assert (found["foreign"].settings, found["foreign"].ours) == ((), False)
 
 
 def test_the_config_comes_first_but_one_of_ours_knows_its_options(
@@ -116,21 +118,6 @@ def test_the_config_comes_first_but_one_of_ours_knows_its_options(
     ]
     assert (walk.label, [dependency.file for dependency in walk.dependencies]) == ("Wander", ["eyes"])
     assert "walk has no setting marker: ignored" in caplog.text
-
-
-def test_the_originals_scripts_have_forms_that_a_config_completes(tmp_path: Path) -> None:
-    for name in ("apriltag-locations", "apriltag-odom-follow", "wheel-odometry"):
-        write(tmp_path, name, "import argparse")
-    args = [{"key": "width", "type": "int", "default": 640, "arg": "--width"}]
-    found = scripts(tmp_path, scripts={"apriltag-locations": {"args": args}})
-    by_key = {setting.key: setting for setting in found["apriltag-locations"].settings}
-    assert (len(by_key), by_key["width"].default, by_key["width"].min) == (8, 640, None)
-    assert [dependency.file for dependency in found["apriltag-odom-follow"].dependencies] == [
-        "apriltag-locations",
-        "wheel-odometry",
-    ]
-    write(tmp_path, "wheel-odometry", PRETENDS)
-    assert [setting.key for setting in scripts(tmp_path)["wheel-odometry"].settings] == ["speed", "laps"]
 
 
 def test_any_program_with_a_manifest_is_a_script(tmp_path: Path) -> None:
@@ -179,19 +166,18 @@ def test_a_broken_script_is_not_started_and_the_reason_is_logged_once(
     assert scanned(catalogue)["follow"].broken == ""
 
 
-def test_only_a_script_without_a_gate_gets_the_password_of_the_robots_broker(tmp_path: Path) -> None:
-    for name in ("foreign", "trusted"):
-        write(tmp_path, name)
+def test_a_script_gets_the_password_of_the_robots_broker_and_no_other(tmp_path: Path) -> None:
+    write(tmp_path, "foreign")
     raw = {
         "robot": {"id": "rover"},
         "local_mqtt": {"username": "rob", "password_env": "LOCAL"},
         "services": {
             "mqtt_bridge": {"remote_mqtt": {"username": "rob", "password_env": "UPLINK"}},
-            "autonomy_manager": {"autonomy_root": str(tmp_path), "scripts": {"trusted": {"arbitrate": False}}},
+            "autonomy_manager": {"autonomy_root": str(tmp_path)},
         },
     }
     found = scanned(Catalogue(parse(raw, folder=tmp_path, env={"LOCAL": "near", "UPLINK": "topsecret"})))
-    assert {name: script.environment for name, script in found.items()} == {"foreign": {}, "trusted": {"LOCAL": "near"}}
+    assert found["foreign"].environment == {"LOCAL": "near"}
 
 
 def test_the_list_is_bounded(tmp_path: Path) -> None:
@@ -228,3 +214,45 @@ def test_a_file_is_parsed_again_only_when_it_has_changed(tmp_path: Path, monkeyp
     entry.write_text("pass  # changed")
     scanned(catalogue)
     assert parsed == [entry, entry]
+
+
+SHMSRC = "import cv2\nPIPE = 'shmsrc socket-path=x ! appsink'\ncv2.VideoCapture(PIPE, cv2.CAP_GSTREAMER)"
+
+
+@pytest.mark.parametrize(
+    ("text", "lacks"),
+    [
+        ("import json, os.path\nfrom . import near\nfrom msgspec import json as other\nX = 1", []),
+        ("import nump, msgspec\nfrom nowhere.part import name", ["nump", "nowhere"]),
+        ("import beside, above.part", []),
+        ("try:\n    import nump\nexcept ImportError:\n    nump = None\ndef show():\n    import nowhere", []),
+        ("import cv2", []),
+        (SHMSRC, ["cv2 with GStreamer"]),
+        (SHMSRC.replace("cv2", "nocv"), ["nocv"]),
+        ("print 'of another Python'", []),
+        ("raise SystemExit('it was run')", []),
+    ],
+)
+def test_what_a_script_lacks_is_found_without_running_it(tmp_path: Path, text: str, lacks: list[str]) -> None:
+    """The wheel's OpenCV has no GStreamer."""
+    entry = write(tmp_path, "walk", text)
+    write(tmp_path, "walk", "raise SystemExit('it was run')", "beside.py")
+    (tmp_path / "above").mkdir()
+    assert lacking((sys.executable, str(entry)), entry.parent, {}) == lacks
+
+
+@pytest.mark.parametrize(
+    ("configured", "ours", "there", "python"),
+    [
+        ("/opt/python", True, "system", "/opt/python"),
+        (None, True, "system", sys.executable),
+        (None, False, "system", "system"),
+        (None, False, "other", sys.executable),
+    ],
+)
+def test_the_python_of_a_script(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, configured: str | None, ours: bool, there: str, python: str
+) -> None:
+    monkeypatch.setattr(interpreter_module, "SYSTEM", tmp_path / "system")
+    (tmp_path / there).touch()
+    assert interpreter(configured, ours=ours).removeprefix(f"{tmp_path}/") == python

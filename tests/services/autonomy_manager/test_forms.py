@@ -11,7 +11,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pebble.services.autonomy_manager.builtin_forms import DEPENDENCIES, SETTINGS
 from pebble.services.autonomy_manager.forms import MAX_TEXT, Setting, SettingError, arguments, effective, form
 
 SPEED = Setting(key="speed", type="float", default=0.5, arg="--speed", min=0.05, max=1)
@@ -136,17 +135,3 @@ def test_a_command_cannot_name_a_file_on_the_robot() -> None:
     assert Setting(key="record", arg="--record-file").names_file, "by its name on the command line"
     assert Setting(key="log_file", type="enum").names_file, "without options it is any text"
     assert not Setting(key="profile", arg="--profile").names_file
-
-
-def test_the_originals_three_scripts_have_their_forms() -> None:
-    assert {name: len(settings) for name, settings in SETTINGS.items()} == {
-        "wheel-odometry": 1,
-        "apriltag-locations": 8,
-        "apriltag-odom-follow": 32,
-    }
-    follow = effective(SETTINGS["apriltag-odom-follow"], {})
-    wanted = {"tag_id": 13, "tag_size_m": 0.25, "target_distance_m": 0.6, "control_rate_hz": 10.0}
-    assert {key: follow[key] for key in wanted} == wanted
-    assert "log_file" not in follow
-    for file, config in DEPENDENCIES["apriltag-odom-follow"]:
-        assert {key: effective(SETTINGS[file], config)[key] for key in config} == config

@@ -11,9 +11,7 @@ import pytest
 
 from pebble.runtime.runs import SUPERSEDED
 from pebble.services.autonomy_manager.forms import Setting
-from pebble.services.autonomy_manager.local_media import LocalMedia
 from pebble.services.autonomy_manager.motor_owners import OVERRIDDEN
-from pebble.services.autonomy_manager.needs import Needs
 from pebble.services.autonomy_manager.script import Dependency, Script
 from tests.services.autonomy_manager.fake_children import Bench, FakeChild
 from tests.support import until
@@ -24,7 +22,7 @@ TERM, KILL = signal.SIGTERM, signal.SIGKILL
 
 def script(file: str, *dependencies: str, **more: Any) -> Script:
     needs = tuple(map(Dependency, dependencies))
-    fields = {"settings": (SPEED,), "ours": True, "needs": Needs(modules=(file,)), **more}
+    fields = {"settings": (SPEED,), "ours": True, **more}
     return Script(file=file, label=file, command=(file,), folder=Path(), dependencies=needs, **fields)
 
 
@@ -32,7 +30,7 @@ SCRIPTS = {
     entry.file: entry
     for entry in (
         *(script("walk"), script("sing"), script("eyes"), script("wheel"), script("follow", "eyes", "wheel")),
-        script("old", ours=False, arbitrate=False),
+        script("old", ours=False),
     )
 }
 IDLE = {
@@ -227,20 +225,6 @@ def test_what_cannot_be_started_ends_what_was_started_for_it(bench: Bench) -> No
     bench.start("walk")
 
 
-def test_without_a_broker_a_script_that_speaks_mqtt_is_refused(tmp_path: Path) -> None:
-    scripts = {"old": script("old", ours=False)}
-    bench = Bench(tmp_path, scripts)
-    config = bench.service.config
-    bench.service.config = type(config)(  # the same robot on Zenoh
-        **{name: getattr(config, name) for name in config.__struct_fields__ if name != "transport"},
-        transport=type(config.transport)(kind="zenoh"),
-    )
-    bench.command({"action": "start", "file": "old"})
-    why = "it speaks MQTT, and this robot has no broker: set transport.mqtt_mirror"
-    assert bench.becomes(error=f"Failed to start old: {why}")
-    bench.close()
-
-
 # -- motor owners
 
 
@@ -312,27 +296,54 @@ def test_the_status_shows_that_a_person_drives(bench: Bench) -> None:
     assert bench.status["running"] is True
 
 
-def test_a_script_that_gets_nothing_is_shown_as_waiting(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A script without a gate shows only by its local media whether it waits."""
-    there = {"eyes": "pictures"}
-    monkeypatch.setattr(LocalMedia, "absent", lambda _media, needs: there.get(needs.modules[0], ""))
-    walk = bench.start("walk")
-    bench.advance(60)
-    assert "waiting_for" not in bench.status
-    walk.end(0)
-    eyes = bench.start("eyes")
-    bench.advance(9)
-    assert "waiting_for" not in bench.status, "it may be starting"
-    bench.advance(2)
-    assert bench.becomes(running=True, waiting_for="pictures")
-    there["eyes"] = ""
-    bench.advance(2)
-    assert until(lambda: "waiting_for" not in bench.status, 3)
-    there["eyes"] = "pictures"
-    eyes.end(0)
-    bench.start("follow")
-    bench.advance(11)
-    assert bench.becomes(running=True, waiting_for="eyes, which waits for pictures")
+KEY = {"key": "0badf00d"}
+
+
+@pytest.mark.parametrize(
+    ("drives", "status"),
+    [
+        ([{"z": 0.5}, {"z": 0.0, "valid_ms": 0}], {"running": True}),
+        ([{"z": 0.5, **KEY}], {"running": True, "overridden": True}),
+        ([{"z": 0.5, **KEY}, {"z": 0.0, **KEY}, {"z": 0.4}], {"running": True, "overridden": True}),
+        ([{"z": 0.0, "valid_ms": 0, **KEY}], {"error": OVERRIDDEN, "overridden": True}),
+    ],
+    ids=["its own commands", "a person with control", "who lets go", "who stops"],
+)
+def test_who_has_control_is_told_from_a_script_that_does_not_sign(
+    bench: Bench, drives: list[dict[str, Any]], status: dict[str, Any]
+) -> None:
+    old = bench.start("old")
+    for drive in drives:
+        bench.drive(**drive)
+    bench.quiet()
+    bench.owner(barred=bench.drives[0]["run"] + 9)  # as its own zeros may bar it
+    assert bench.becomes(**status)
+    assert ("overridden" in bench.status) == ("overridden" in status)
+    assert old.signals == ([TERM] if "error" in status else [])
+
+
+def test_a_script_that_does_not_sign_ends_when_the_connection_of_who_drives_is_lost(bench: Bench) -> None:
+    old = bench.start("old")
+    bench.drive(z=0.5, **KEY)
+    assert bench.becomes(overridden=True)
+    bench.advance(2.1)
+    assert bench.becomes(error=OVERRIDDEN)
+    assert old.signals == [TERM]
+
+
+@pytest.mark.parametrize(("holder", "zeros"), [("", 1), ("page-1/ann", 0)])
+def test_the_wheels_of_a_script_that_does_not_sign_stop_with_it(bench: Bench, holder: str, zeros: int) -> None:
+    """A signed zero is refused for 2 s after what looks like a person's command; who has control is not stopped."""
+    bench.holder(holder)
+    old = bench.start("old")
+    bench.drive(z=0.5)
+    bench.quiet()
+    bench.stop(old)
+    old.end(-TERM)
+    assert bench.becomes(**IDLE)
+    zero = {"x": 0.0, "z": 0.0, "y": 0.0, "source": "autonomy_manager"}
+    assert until(lambda: bench.drives[-1].get("run", 0) > bench.drives[1]["run"])
+    assert bench.drives.count(zero) == zeros
 
 
 def test_a_run_by_hand_ends_the_script_with_that_reason(bench: Bench) -> None:

@@ -461,9 +461,9 @@ AUTONOMY: Rows = {
         result = [running, dependencies, config, error];""", ["true" in payload, [], [], ""]) for payload in ODD},
     "a status of a robot": ("""
         const dependencies = [{ file: "wheel-odometry", pid: 8, running: true }, { file: 3, running: 1 }, "x"];
-        result = statusOf({ running: true, file: "follow", pid: 7, overridden: true, waiting_for: "tags",
+        result = statusOf({ running: true, file: "follow", pid: 7, overridden: true,
           error: null, config: { tag_id: 5 }, dependencies });""", {
-        "running": True, "file": "follow", "pid": 7, "waits": True, "waitingFor": "tags", "error": "",
+        "running": True, "file": "follow", "pid": 7, "waits": True, "error": "",
         "config": [["tag_id", 5]],
         "dependencies": [{"file": "wheel-odometry", "running": True}, {"file": "?", "running": False}]}),
     "since when a script runs": ("""

@@ -303,8 +303,6 @@ def test_what_runs_and_its_end(opened: Tab, robot: Robot) -> None:
     assert lines == ["● wheel-odometry runs", "✖ locations does not run"]
     robot.show("autonomy-status", running(overridden=True))
     assert opened.until(lambda: "waits: a person drives" in text(opened, "script-state"))
-    robot.show("autonomy-status", running(waiting_for="pictures at /tmp/x.sock"))
-    assert opened.until(lambda: "april-follow waits for pictures at /tmp/x.sock, " in text(opened, "script-state"))
     opened.test("end-script").click()
     assert opened.until(lambda: robot.asked("autonomy-command") == [{"action": "stop"}])
     robot.show("autonomy-status", IDLE | {"error": "april-follow exited with code 1"})

@@ -7,7 +7,7 @@ import { inner, isObject } from "../parts/words.js";
 const MOST_DEPENDENCIES = 16;
 
 /**
- * @typedef {{running: boolean, file: string, waits: boolean, waitingFor: string, error: string, pid: unknown,
+ * @typedef {{running: boolean, file: string, waits: boolean, error: string, pid: unknown,
  *   dependencies: {file: string, running: boolean}[], config: [string, unknown][]}} Status
  */
 
@@ -22,7 +22,6 @@ export function statusOf(payload) {
     running,
     file: text(status.file) || (running ? "A script" : ""),
     waits: status.overridden === true,
-    waitingFor: text(status.waiting_for),
     error: text(status.error),
     pid: status.pid,
     dependencies: parts

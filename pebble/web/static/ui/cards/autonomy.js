@@ -62,10 +62,10 @@ function Row({ script, isOpen, onOpen, ...parts }) {
 }
 
 /** What a script does, as far as is known. */
-function how({ waits, waitingFor }, past) {
+function how({ waits }, past) {
   if (waits) return " waits: a person drives";
   if (past) return " ran when it was last seen";
-  return waitingFor ? ` waits for ${plain(waitingFor)}` : " runs";
+  return " runs";
 }
 
 /** What runs, and the end of it. */

@@ -386,7 +386,7 @@ function ScriptFact({ at, online }) {
   const status = useValue(at, "autonomy-status");
   if (!status?.running) return null;
   if (!online) return html`<${Fact} icon="script">script: not known<//>`;
-  return html`<${Fact} icon="script" className="">script: ${plain(status.file ?? "?")}${status.waiting_for ? ", waiting" : ""}<//>`;
+  return html`<${Fact} icon="script" className="">script: ${plain(status.file ?? "?")}<//>`;
 }
 
 /** In a word or two, what a component reports that is no robot. */

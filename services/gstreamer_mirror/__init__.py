@@ -1,1 +1,0 @@
-"""Offers pictures and sound at GStreamer's local sockets, for programs that read them with ``shmsrc``."""
