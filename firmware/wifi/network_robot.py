@@ -52,7 +52,7 @@ class NetworkRobot:
         if ("open", "login", "named").index(get(settings, "security", "level", "open")) == 2:
             from common import names  # type: ignore[assignment]
         words = "drive", "free", "refuse"
-        strangers = words.index(get(settings, "security", "strangers", words[2 if names else 0]))
+        strangers = words.index(get(settings, "security", "strangers", words[2 if names else 1]))
         topics = b"estop", b"drive-values", b"control", b"control/take", b"estop-reset"
         plain = _TOPICS if not names else _DRIVE + 1 if strangers == 2 else _CONTROL + 1
         self.session = Session(settings, root, topics, plain, names, wrap, self._take)

@@ -24,6 +24,13 @@ _PROBE_S: Final = 1.0
 _DELIVER_S: Final = 0.01  # for them at a time: whatever else is due must not wait for a flood
 
 
+def problem_of(transport: Transport) -> str:
+    """Return why nothing should be sent now, in one line; empty if all is well."""
+    if transport.state is not State.CONNECTED:
+        return transport.problem or "not connected yet"
+    return "it does not answer" if transport.outgoing.stalled_s > ANSWER_S else ""
+
+
 class Broker:
     """Handlers and watchers run on the event loop; subscribing waits for the broker, so it does not happen there."""
 
@@ -59,9 +66,7 @@ class Broker:
     @property
     def problem(self) -> str:
         """Why nothing should be sent to it now, in one line; empty if all is well."""
-        if not self.connected:
-            return self.transport.problem or "not connected yet"
-        return "it does not answer" if self.transport.outgoing.stalled_s > ANSWER_S else ""
+        return problem_of(self.transport)
 
     @property
     def not_received(self) -> str:

@@ -7,6 +7,8 @@ from collections.abc import Callable, Sequence
 from enum import StrEnum
 from typing import NamedTuple
 
+from pebble.contract.payloads import EstopState
+
 SILENT_S = 1.5  # a robot is not called silent before
 RESET_S = 0.6  # robots refuse whoever has not paused for 0.5 s after a reset
 LATE_S = 0.6  # of a round trip, or of a command: one that takes longer is not sent, or moves nothing
@@ -73,3 +75,23 @@ _APPLIES: dict[Code, Callable[[Situation], bool]] = {
 def first_reason(situation: Situation, order: Sequence[Code] = ORDER) -> Code | None:
     """The reason that counts; None: nothing speaks against driving."""
     return next((code for code in order if _APPLIES[code](situation)), None)
+
+
+_WORDS = {
+    Code.SILENT: "{name} is silent",
+    Code.UNSEEN: "{name} has not been seen yet",
+    Code.STOPPED: "Stopped by {by}",
+    Code.STOPPING: "Emergency stop",
+    Code.RESET: "It was just reset: wait a moment",
+    Code.UNKNOWN: "{name} has not published what it can do",
+    Code.NO_DRIVE: "This component does not drive",
+    Code.LEASE: "{driven} is driving",
+    Code.LISTENING: "Take control to drive",
+    Code.SCRIPT: "A script is driving: stop it first",
+}
+
+
+def words(code: Code | None, name: str, *, stopped: EstopState | None = None, driven: str = "") -> str:
+    """Return a reason for people; "" for none, and for those that only one program has. ``driven``: by whom."""
+    by = stopped.by if stopped is not None and stopped.by else "unknown"
+    return _WORDS.get(code, "").format(name=name, by=by, driven=driven) if code is not None else ""

@@ -21,19 +21,19 @@ class Security(Section, frozen=True, kw_only=True):
     strangers: Annotated[
         Strangers | None,
         doc(
-            "Drive commands without a key of control: obeyed, only while nobody has control, or never. "
-            "Unset: `drive`, at `named` `refuse`."
+            "Drive commands without a key of control: always obeyed, only while nobody has control, or never. "
+            "Unset: `free`, at `named` `refuse`."
         ),
     ] = None
 
     @property
     def unnamed(self) -> Strangers:
         """What becomes of drive commands without a key of control."""
-        return self.strangers or ("refuse" if self.level == "named" else "drive")
+        return self.strangers or ("refuse" if self.level == "named" else "free")
 
     def on_board(self) -> dict[str, str]:
         """The section `security` of a board's private_config.json; empty: what it does without one."""
-        if self.level == "open" and self.unnamed == "drive":
+        if self.level == "open" and self.unnamed == "free":
             return {}
         return {"level": self.level, "strangers": self.unnamed}
 

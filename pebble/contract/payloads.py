@@ -302,7 +302,7 @@ class ControlState(Payload, frozen=True, kw_only=True):
     device: str = ""
     asks: str = ""  # who asks for control meanwhile, the first one
     asks_id: str = ""  # "": nobody does
-    others: bool = False  # a command without a key has moved something in the last 2 s, while somebody has control
+    others: bool = False  # a command without a key has moved something in the last 2 s
     named: bool = False  # the broker vouches for the names
     boot: str = ""  # random at each start of the owner, as in its emergency stop
 

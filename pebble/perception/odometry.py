@@ -95,7 +95,7 @@ class _Wheel:
 class Odometry:
     """Feed it every command and sample. ``watchdog_s`` and ``strangers`` are those of the motor owner."""
 
-    def __init__(self, geometry: WheelGeometry, *, watchdog_s: float, strangers: str = "drive", now: float) -> None:
+    def __init__(self, geometry: WheelGeometry, *, watchdog_s: float, strangers: str = "free", now: float) -> None:
         self.pose = self._base = WheelPose()
         self.distance_mm = 0.0
         self._part = _Part()

@@ -161,9 +161,10 @@ def test_the_demo_and_simulations_are_not_warned() -> None:
 @pytest.mark.parametrize(
     ("security", "unnamed"),
     [
-        ({}, "drive"),
-        ({"level": "login"}, "drive"),
-        ({"level": "login", "strangers": "free"}, "free"),
+        ({}, "free"),
+        ({"strangers": "drive"}, "drive"),
+        ({"level": "login"}, "free"),
+        ({"level": "login", "strangers": "drive"}, "drive"),
         ({"level": "named"}, "refuse"),
         ({"level": "named", "strangers": "free"}, "free"),
     ],

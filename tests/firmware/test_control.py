@@ -23,9 +23,11 @@ def run(drill: Drill, seconds: float) -> None:
     drill.run(drill.seconds + seconds)
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_two_drivers_and_only_who_has_control_moves_by_a_key(kind: str) -> None:
-    drill = online(kind)
+@pytest.mark.parametrize(("kind", "security", "others"), [
+    *((kind, {}, False) for kind in KINDS), ("benjr", {"level": "login", "strangers": "drive"}, True),
+])  # fmt: skip
+def test_two_drivers_and_only_who_has_control_moves_by_a_key(kind: str, security: dict[str, str], others: bool) -> None:
+    drill = online(kind, security=security)
     assert drill.control() == {
         "by": "", "id": "", "key": "", "device": "", "asks": "", "asks_id": "", "others": False, "named": False,
         "boot": drill.state()["boot"],
@@ -52,12 +54,14 @@ def test_two_drivers_and_only_who_has_control_moves_by_a_key(kind: str) -> None:
     drill.command(0, 0.5, key=otto["key"])
     run(drill, 0.2)
     assert any(drill.outputs())
-    drill.command(0, 0.7)  # as ever without a key
+    run(drill, 1.0)
+    assert moves(drill, "drive-values", z=0.7) is others
     run(drill, 0.5)
-    assert drill.control()["others"]
+    assert drill.control()["others"] is others
     drill.request("bbbbbbbb", want="release")
     run(drill, 0.5)
     assert drill.control()["key"] == ""
+    assert moves(drill, "drive-values", z=0.7)
 
 
 @pytest.mark.parametrize("kind", KINDS)

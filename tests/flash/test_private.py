@@ -49,8 +49,8 @@ def test_a_list_of_brokers_goes_along_and_each_shows_its_own_name() -> None:
     ("security", "section"),
     [
         ({"level": "open"}, None),
-        ({"strangers": "free"}, {"level": "open", "strangers": "free"}),
-        ({"level": "login"}, {"level": "login", "strangers": "drive"}),
+        ({"strangers": "drive"}, {"level": "open", "strangers": "drive"}),
+        ({"level": "login"}, {"level": "login", "strangers": "free"}),
         ({"level": "named"}, {"level": "named", "strangers": "refuse"}),
         ({"level": "named", "strangers": "drive"}, {"level": "named", "strangers": "drive"}),
     ],

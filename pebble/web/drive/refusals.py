@@ -4,7 +4,7 @@ import time
 from collections.abc import Callable
 
 from pebble.client.broker import Broker
-from pebble.client.drive_reasons import SCRIPT_ORDER, SERVER_ORDER, Code, Situation, first_reason
+from pebble.client.drive_reasons import SCRIPT_ORDER, SERVER_ORDER, Code, Situation, first_reason, words
 from pebble.client.named_topics import why_not
 from pebble.client.robot_view import RobotView
 from pebble.web import messages as m
@@ -44,29 +44,13 @@ class Refusals:
         """Why no script may begin now."""
         by = self._moved_by(robot.base)
         situation = self._situation(robot)._replace(driven=bool(by) and not robot.arbitrates)
-        match first_reason(situation, SCRIPT_ORDER):
-            case Code.UNSEEN:
-                return f"{robot.name} has not been seen yet"
-            case Code.STOPPED:
-                return "Stopped: reset it first"
-            case Code.LEASE:
-                return f"{by} is driving"
-        return ""
+        code = first_reason(situation, SCRIPT_ORDER)
+        return "Stopped: reset it first" if code is Code.STOPPED else words(code, robot.name, driven=by)
 
     def _situation(self, robot: RobotView) -> Situation:
         return robot.situation(time.monotonic())._replace(problem=self._broker.problem)
 
     def _words(self, robot: RobotView, code: Code | None) -> str:
-        match code:
-            case Code.BROKER:
-                return f"The server cannot reach the broker: {self._broker.problem}"
-            case Code.NO_DRIVE:
-                return "This component does not drive"
-            case Code.STOPPED:
-                by = robot.stopped_by
-                return f"Stopped by {by.by or 'unknown'}" if by else "Stopped"
-            case Code.RESET:
-                return "It was just reset: wait a moment"
-            case Code.SILENT:
-                return f"{robot.name} is silent"
-        return ""
+        if code is Code.BROKER:
+            return f"The server cannot reach the broker: {self._broker.problem}"
+        return words(code, robot.name, stopped=robot.stopped_by)

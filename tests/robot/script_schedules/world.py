@@ -16,7 +16,7 @@ from pebble.client.estop import new_name
 from tests.kit.stalls import Stalls
 from tests.robot.rig import Rig
 from tests.robot.script_schedules.alive import Alive
-from tests.robot.script_schedules.rules import by_script, problems
+from tests.robot.script_schedules.rules import by_person, by_script, problems
 from tests.robot.script_schedules.schedules import ACTIVE_S, FILES, Schedule, Step
 from tests.robot.stop_schedules.history import History
 from tests.robot.stop_schedules.people import Driver
@@ -186,6 +186,13 @@ class World:
         self._start(Step(0.0, "start", FILES[0]))
         if not until(lambda: any(by_script(wheels) for _, wheels in self.rig.mcu.drives(began)), _MOVES_S):
             return [f"a script does not drive: {self._status()}"]
+        self.person.drive()
+        if not until(lambda: any(by_person(wheels) for _, wheels in self.rig.mcu.drives(began)), _ANSWER_S):
+            return ["a person does not drive beside a script"]
+        let_go = time.monotonic()
+        self.person.zero()
+        if not until(lambda: any(by_script(wheels) for _, wheels in self.rig.mcu.drives(let_go)), _HOLD_S + _ANSWER_S):
+            return ["a script does not go on after a person has let go"]
         stopped = time.monotonic()
         self.person.zero(final=True)
         if not until(lambda: self.rig.mcu.drives(stopped) and not self.rig.mcu.moving(stopped), _ANSWER_S):
@@ -227,7 +234,8 @@ class World:
 
 def _write_scripts(root: Path) -> None:
     """The scripts of :data:`FILES`."""
-    stubborn = _STUBBORN + _FOLLOW
+    future = "from __future__ import annotations\n"  # stays in front
+    stubborn = _FOLLOW.replace(future, future + _STUBBORN)
     for name, text in {"follow": _FOLLOW, "stubborn": stubborn, "busy": _BUSY}.items():
         (root / name).mkdir()
         (root / name / "run.py").write_text(text)

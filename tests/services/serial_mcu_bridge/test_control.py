@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import operator
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -13,6 +14,8 @@ from pebble.client.control import ControlClient, RobotControl
 from pebble.config import Security
 from pebble.contract import CONTROL_STATE, codec
 from pebble.contract.payloads import ControlRequest, ControlState, Drive
+from pebble.motion.arbiter import PERSON, REFUSED, Arbiter
+from pebble.motion.latch import Latch
 from pebble.runtime.robot_estop import RobotEstop
 from pebble.services.serial_mcu_bridge.motion.control import Control
 from pebble.transports.memory import MemoryHub
@@ -70,6 +73,44 @@ def test_where_names_are_checked_the_key_counts_with_its_account() -> None:
     assert control.state().key == state.key
 
 
+#: What has happened, as a row: when, who has control, and which script runs.
+SITUATIONS = {
+    "nobody has control": (5.0, [], []),
+    "a person has control": (5.0, ["ann"], []),
+    "a script runs": (5.0, [], [17]),
+    "a script runs, and a person has control": (5.0, ["ann"], [17]),
+    "the robot starts": (0.0, [], []),
+}
+#: In which of them a drive command without a key moves the motors.
+MOVE = {
+    None: {"nobody has control", "a script runs", "the robot starts"},
+    "free": {"nobody has control", "a script runs", "the robot starts"},
+    "drive": set(SITUATIONS),
+    "refuse": set(),
+}
+
+
+@pytest.mark.parametrize("situation", SITUATIONS)
+@pytest.mark.parametrize("strangers", MOVE)
+def test_what_a_sender_without_a_key_may_do(strangers: Any, situation: str) -> None:
+    now, people, runs = SITUATIONS[situation]
+    control = Control(Security(strangers=strangers), lambda _state: None, 0.0)
+    latch, ms = Latch(control.boot, 8, operator.sub), int(1000 * now)
+    arbiter = Arbiter(latch, control.lease, 0, operator.sub, 750)
+    for by in people:
+        control.request(ControlRequest(id="aaaaaaaa", by=by), over=False, now=now)
+    for run in runs:
+        assert arbiter.judge(True, run, -1, ms) == 750
+    moves = situation in MOVE[strangers]
+    assert arbiter.judge(True, PERSON, -1, ms) == (750 if moves else REFUSED)
+    assert [arbiter.judge(True, run, -1, ms) for run in runs] == [REFUSED if moves else 750 for _ in runs]
+    assert arbiter.judge(False, PERSON, -1, ms) == 0
+    assert arbiter.stop("00000000000000aa", "", "", 0)
+    assert arbiter.judge(False, PERSON, -1, ms) == 0
+    assert latch.reset(control.boot, 1, 0, ms)
+    assert (arbiter.judge(False, PERSON, -1, ms), latch.latched) == (0, False)
+
+
 # -- a service, an MCU and operators
 
 
@@ -101,14 +142,15 @@ def test_who_has_control_drives_and_keys_of_before_do_not(bench: Bench) -> None:
     assert until(lambda: bench.lines.count(STOPPED) > halts, 5)
     bench.drive(0.4, key=ann)
     assert bench.moves(0.5, key=otto)
-    assert bench.moves(0.6)  # as ever without a key
-    assert until(lambda: bench.world.newest("control/serial")["others"], 5)
+    bench.drive(0.6)  # without a key
+    assert until(lambda: bench.service.counters["stranger"] == 2, 5)
     bench.drive(0.0)
     assert until(lambda: bench.lines[-1] == STOPPED, 5)
     bench.send("control", OTTO | {"want": "release"})
     assert held(bench, "") == ""
-    assert "M 0.400 0.400" not in bench.lines
-    assert bench.service.counters["stranger"] == 1
+    assert not {"M 0.400 0.400", "M 0.600 0.600"} & set(bench.lines)
+    assert bench.moves(0.7)
+    assert until(lambda: bench.world.newest("control/serial")["others"], 5)
 
 
 def test_a_restart_ends_control_and_its_key_is_void(bench: Bench) -> None:
@@ -138,24 +180,6 @@ def test_a_strangers_zero_after_a_reset_frees_no_stick_that_is_held(bench: Bench
     bench.drive(0.0, key=key)
     assert bench.moves(0.5, key=key)
     assert not {"M 0.200 0.200", "M 0.300 0.300", "M 0.400 0.400"} & set(bench.lines)
-
-
-@pytest.mark.parametrize(("strangers", "free", "held_by_ann"), [("drive", True, True), ("free", True, False),
-                                                               ("refuse", False, False)])  # fmt: skip
-def test_what_strangers_may_do(tmp_path: Path, strangers: Any, free: bool, held_by_ann: bool) -> None:
-    bench = Bench(tmp_path, "goob", security={"strangers": strangers})
-    try:
-        bench.drive(0.1)
-        assert not free or bench.line("M 0.100 0.100")
-        bench.send("control", ANN)
-        key = held(bench, "ann")
-        bench.drive(0.2)
-        assert not held_by_ann or bench.line("M 0.200 0.200")  # else the zero may replace it
-        bench.drive(0.0)
-        assert bench.moves(0.3, key=key)
-        assert ("M 0.100 0.100" in bench.lines, "M 0.200 0.200" in bench.lines) == (free, held_by_ann)
-    finally:
-        bench.close()
 
 
 def test_of_two_motor_owners_that_answer_differently_the_first_by_name_decides(tmp_path: Path) -> None:

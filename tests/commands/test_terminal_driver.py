@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from pebble.client.terminal.driver import TerminalDriver
+from pebble.commands.terminal.driver import TerminalDriver
 from pebble.transports import Message
 from tests.client.estop_robot import Robot, outgoing
 
@@ -20,13 +20,11 @@ TICK = 0.05
 class Cab:
     """A driver at a terminal, and the robot, in virtual time."""
 
-    def __init__(self, *, take_over: bool = False, heartbeat: bool = True, **more: Any) -> None:
+    def __init__(self, *, heartbeat: bool = True, **more: Any) -> None:
         self.robot = Robot(GOOB, "serial", **more)
-        self.driver = TerminalDriver(
-            GOOB, by="ann@desk", device="terminal", speed=0.6, turn=0.8, take_over=take_over, heartbeat=heartbeat
-        )
+        self.driver = TerminalDriver(GOOB, by="ann@desk", device="terminal", speed=0.6, turn=0.8, heartbeat=heartbeat)
         self.now, self.heartbeats = 0.0, heartbeat
-        self.problem, self.late_s = "", 0.0
+        self.problem = ""
         self.sent: list[Message] = []
 
     def receive(self, *messages: Message) -> None:
@@ -40,7 +38,7 @@ class Cab:
             if self.heartbeats and tick % 5 == 0:
                 self.receive(outgoing(GOOB, "online", {"t": int(1000 * (WALL + self.now))}))
             self.driver.press([key] if key else [], self.now)
-            self.sent += self.driver.tick(self.now, problem=self.problem, late_s=self.late_s)
+            self.sent += self.driver.tick(self.now, self.problem)
             self.now = round(self.now + TICK, 6)
         return [json.loads(message.payload) for message in self.sent[start:] if message.topic == DRIVE]
 
@@ -68,7 +66,7 @@ def test_a_held_key_drives_until_04_s_after_its_last_repetition(key: str, x: flo
     after = cab.run(1.0)
     moving = [command for command in after if command["x"] or command["z"]]
     assert 6 <= len(moving) <= 8
-    assert [(command["x"], command["z"]) for command in after[len(moving) :]] == [(0, 0)] * 3
+    assert after[len(moving) :] == [{"x": 0, "z": 0, "y": 0}]
 
 
 def test_no_wheel_is_faster_than_1() -> None:
@@ -81,9 +79,8 @@ def test_no_wheel_is_faster_than_1() -> None:
 #: What speaks against driving, and what the status says.
 REASONS = [
     ("problem", "no connection: it was lost"),
-    ("late", "commands are late"),
-    ("silent", "goob is silent or offline"),
-    ("stopped", "emergency stop"),
+    ("silent", "goob is silent"),
+    ("stopped", "Emergency stop"),
 ]
 
 
@@ -93,14 +90,13 @@ def test_a_reason_ends_the_drive_and_the_keys_must_be_released(event: str, words
     assert cab.run(0.5, "w")[-1]["z"] == 0.6
     before, heartbeats = len(cab.sent), cab.heartbeats
     cab.problem = "it was lost" if event == "problem" else ""
-    cab.late_s = 1.0 if event == "late" else 0.0
     cab.heartbeats = event != "silent"
     cab.driver.press(["!"] if event == "stopped" else [], cab.now)
     commands = cab.run(3.0, "w")
     assert words in cab.driver.status()
     assert commands[-3:] == [{"x": 0, "z": 0, "y": 0, "valid_ms": 0}] * 3
     assert any(message.topic == ESTOP for message in cab.sent[before:]) is (event == "stopped")
-    cab.problem, cab.late_s, cab.heartbeats = "", 0.0, heartbeats
+    cab.problem, cab.heartbeats = "", heartbeats
     cab.receive(*(owner.state() for owner in cab.robot.owners))
     assert [command for command in cab.run(2.0, "w") if command["z"]] == []
     assert cab.moves() is (event != "stopped")
@@ -132,6 +128,5 @@ def test_a_layout_without_latin_letters_is_named() -> None:
 def test_who_leaves_sends_a_last_zero_and_nothing_more_than_twice_after_it() -> None:
     cab = Cab().ready()
     cab.run(0.5, "w")
-    halted = [json.loads(message.payload) for message in cab.driver.halt(cab.now, leave=True) if message.topic == DRIVE]
-    assert halted == [{"x": 0, "z": 0, "y": 0, "valid_ms": 0}]
-    assert cab.run(0.5) == halted * 2
+    cab.driver.end(cab.now, leave=True)
+    assert cab.run(1.0) == [{"x": 0, "z": 0, "y": 0, "valid_ms": 0}] * 3
