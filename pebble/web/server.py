@@ -23,12 +23,11 @@ from pebble.fleet.database import DatabaseError
 from pebble.fleet.people import People
 from pebble.fleet.roles import Session
 from pebble.runtime.by_name import ByName
-from pebble.transports import Message
+from pebble.transports import Message, Subscription
 from pebble.transports.clock import since_boot as clock
 from pebble.web import messages as m
 from pebble.web.drive.drivers import Drivers
 from pebble.web.gateways import Gateways
-from pebble.web.known_robots import SavedRobots
 from pebble.web.media.chosen_sources import ChosenSources
 from pebble.web.media.pictures_and_sound import PicturesAndSound
 from pebble.web.media.robot_streams import OwnHosts
@@ -44,7 +43,6 @@ PEOPLE_S = 0.5  # between two looks at whether people or sessions were changed
 _REFRESH_S = 0.25
 _MANY_WAIT = 16 * 1024  # bytes that the broker has not confirmed
 _ESTOP_METRIC = "web/estop"
-_DAY_S = 24 * 3600
 
 
 class Server:
@@ -57,19 +55,19 @@ class Server:
         self.robots, self.stops = Robots(), Stops(self._has_sent)
         self.drivers = Drivers(self.broker, self.robots)
         self.media = PicturesAndSound(settings.broker, self.robots, self._note_talk)
-        self.saved = SavedRobots(people)
-        known = self.robots.before = self.saved.robots
         self.broker.is_named = self.media.connection.broker.is_named = self._is_named
-        self.broker.is_known = lambda topic: "/".join(topic.split("/", 3)[:3]) in known
         self.open_components = OpenComponents(self.broker, self.robots, self.spawn)
         # What is drawn over the picture comes from there.
         self.sources = ChosenSources(people, self.robots, OwnHosts(settings), self.open_components.update)
-        self.by_name = ByName(FLEET, lambda ref: ref in known or ref in self.open_components)
-        self.robots.on_forget = self.by_name.forget
+        self.by_name = ByName(FLEET, self._is_wanted)
+        self.robots.is_wanted = self._is_wanted
+        self.robots.is_kept = lambda ref: self._is_wanted(ref) or self.stops.sends_to(ref)
+        self.robots.on_forget = self._ask_anew
+        self._of_all: list[Subscription] = []
         self.robot_audits = RobotAudits(
             self.broker,
             audit,
-            known.__contains__,
+            self.robots.components.__contains__,
             self.robots.components.__contains__,
             lambda ref: self.drivers.robot(ref).pace.answer_s,
         )
@@ -85,7 +83,7 @@ class Server:
         self._show_broker()
         for channel in (*FLEET, *SYNONYMS):
             deferred = channel is ONLINE or channel in SYNONYMS
-            await self.broker.subscribe(channel.filter("+/+/+"), self.receive, deferred=deferred)
+            self._of_all.append(await self.broker.subscribe(channel.filter("+/+/+"), self.receive, deferred=deferred))
         await self.broker.subscribe(AUDIT.filter("+/+/+"), self.robot_audits.receive, deferred=True)
         gateways = Gateways()
         await self.broker.subscribe(
@@ -135,6 +133,12 @@ class Server:
             for one in (ref, *(page for page, source in self.robots.sources.items() if source == ref)):
                 self.open_components.update(one)
 
+    def _ask_anew(self, ref: str) -> None:
+        """What this robot has published is not known any more, although it has been delivered."""
+        self.by_name.forget(ref)
+        for subscription in self._of_all:
+            subscription.renew()
+
     def _moved(self, ref: str, host: str, first: bool) -> None:
         self.drivers.moved(ref)
         if host:
@@ -155,6 +159,7 @@ class Server:
             problem=self.broker.problem,
             not_received=self.broker.not_received,
             robots_omitted=self.robots.omitted,
+            stops_omitted=self.stops.omitted(clock()),
         )
         self.robots.set_server_metric("", "web/broker", view)
 
@@ -172,12 +177,14 @@ class Server:
         by = f"{session.user} on {device}" if device else session.user
         if ref and not _is_base(ref):
             return
-        known, before = [one.robot for one in self.robots.components.values()], tuple(self.saved.robots)
-        self._send(
-            self.stops.press(ref, name, by=by, why=why, now=clock(), known=known, before=before, user=session.user)
-        )
+        known = [component.robot for component in self.robots.components.values()]
+        self._send(self.stops.press(ref, name, by=by, why=why, now=clock(), known=known, user=session.user))
         self.show_stops()
         self.audit.write("stop", ref=ref or "all", user=session.user, device=device, address=address, detail=why)
+
+    def _is_wanted(self, ref: str) -> bool:
+        """True if a page has it open, drives it or has stopped it."""
+        return ref in self.open_components or self.drivers.drives(ref) or self.stops.names(ref)
 
     # -- names
 
@@ -223,7 +230,6 @@ class Server:
                     refresh_at = now + _REFRESH_S
                     self.robots.refresh(time.monotonic())
                     self._show_broker()
-                    self._remember_robots()
                     self.robot_audits.tick(now)
             except (
                 Exception
@@ -236,16 +242,6 @@ class Server:
             with suppress(DatabaseError):  # which the looks at sessions report
                 self.people_version = await asyncio.to_thread(self.people.version)
             await asyncio.sleep(PEOPLE_S)
-
-    def operated(self, ref: str) -> None:
-        """A person drives this robot from here."""
-        self.saved.robots.operated(ref, int(time.time() // _DAY_S))
-
-    def _remember_robots(self) -> None:
-        for component in self.robots.components.values():
-            self.saved.robots.seen(component.robot, component.rank, int(time.time() // _DAY_S))
-        if (saving := self.saved.save()) is not None:
-            self.spawn(saving)
 
     def show_stops(self) -> None:
         """Let pages see what has changed of emergency stops."""

@@ -8,7 +8,7 @@ from itertools import pairwise
 import pytest
 
 from pebble.client import estop
-from pebble.client.estop import MAX_PASSED, MAX_ROBOTS, Progress, StopSender, new_name, send
+from pebble.client.estop import MAX_ROBOTS, Progress, StopSender, new_name, send
 from pebble.transports import Message, QoS
 from tests.client.estop_robot import Robot, capabilities, outgoing
 
@@ -267,22 +267,15 @@ LATCH = Robot(GOOB, "serial").owners[0].latch
 STATE = ("estop/serial", LATCH.state(True))
 BAD_STATE = ("estop/serial", {"latched": "no"})
 
-#: What strangers publish for each of their components, then the real robot, and whether it gets a place of theirs.
+#: What strangers publish for each of their components, and then the real robot.
 CROWDS = [
-    ([HEARTBEAT], [HEARTBEAT], False),
-    ([HEARTBEAT], [PICTURE], False),
-    ([HEARTBEAT], [BAD_STATE], False),
-    ([HEARTBEAT], [CAPABILITIES], True),
-    ([HEARTBEAT], [HEARTBEAT, CAPABILITIES], True),
-    ([HEARTBEAT], [STATE], True),
-    ([HEARTBEAT, BAD_STATE], [CAPABILITIES], True),
-    ([RETAINED], [HEARTBEAT], True),
-    ([RETAINED], [PICTURE], True),
-    ([RETAINED], [RETAINED], False),
-    ([CAPABILITIES], [HEARTBEAT], False),
-    ([CAPABILITIES, HEARTBEAT], [STATE], True),
-    ([STATE], [CAPABILITIES], False),
-    ([STATE, CAPABILITIES, HEARTBEAT], [STATE, CAPABILITIES, HEARTBEAT], False),
+    ([HEARTBEAT], [HEARTBEAT]),
+    ([HEARTBEAT], [PICTURE]),
+    ([HEARTBEAT, BAD_STATE], [CAPABILITIES]),
+    ([RETAINED], [HEARTBEAT]),
+    ([RETAINED], [RETAINED]),
+    ([CAPABILITIES, HEARTBEAT], [STATE]),
+    ([STATE, CAPABILITIES, HEARTBEAT], [STATE, CAPABILITIES, HEARTBEAT]),
 ]
 
 
@@ -300,9 +293,9 @@ def places(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> i
 
 
 @pytest.mark.parametrize("hold", [False, True])
-@pytest.mark.parametrize(("theirs", "own", "has_place"), CROWDS)
+@pytest.mark.parametrize(("theirs", "own"), CROWDS)
 def test_a_crowd_of_strangers_keeps_the_stop_from_no_robot(
-    places: int, theirs: list[tuple[str, object]], own: list[tuple[str, object]], *, has_place: bool, hold: bool
+    places: int, theirs: list[tuple[str, object]], own: list[tuple[str, object]], *, hold: bool
 ) -> None:
     stop, sent = sender(hold=hold), []
     for step in range(20):
@@ -314,7 +307,7 @@ def test_a_crowd_of_strangers_keeps_the_stop_from_no_robot(
     assert sent[0] == 0.0
     assert max(later - earlier for earlier, later in pairwise([*sent, 5.0])) <= 0.5
     assert len(sent) <= 10, "at most twice a second"
-    assert (GOOB in stop.robots, len(stop.robots)) == (has_place, places)
+    assert (GOOB in stop.robots, len(stop.robots)) == (False, places)
     assert stop.omitted
     assert not stop.confirmed
 
@@ -324,33 +317,25 @@ def publish_quietly(stop: StopSender, base: str, bodies: list[tuple[str, object]
         stop.receive(outgoing(base, metric, body, retain=metric == "status"), now)
 
 
-def test_a_robot_without_a_place_gets_the_stop_for_a_minute_and_more_often_rather_than_less() -> None:
-    stop = sender()
-    for number in range(MAX_ROBOTS + MAX_PASSED + 1):
-        publish_quietly(stop, f"pebble/robots/r{number}", [HEARTBEAT], 0.0)
-    first, last = f"pebble/robots/r{MAX_ROBOTS}", f"pebble/robots/r{MAX_ROBOTS + MAX_PASSED}"
-    assert len({topic for topic in topics(stop.tick(0.0)) if topic.endswith("/estop")}) == MAX_ROBOTS + MAX_PASSED + 1
-    assert topics(publish(stop, last, [HEARTBEAT], 0.1)) == []
-    assert f"{first}/incoming/estop" in topics(publish(stop, first, [HEARTBEAT], 0.1))
-    assert f"{first}/incoming/estop" in topics(publish(stop, first, [HEARTBEAT], 59.0))
-    assert publish(stop, first, [HEARTBEAT], 60.0) == []
-    assert stop.finished
+def test_robots_without_a_place_get_the_stop_for_a_minute_however_many() -> None:
+    stop, crowd = sender(), [f"pebble/robots/r{number}" for number in range(4 * MAX_ROBOTS)]
+    for base in crowd:
+        publish_quietly(stop, base, [HEARTBEAT], 0.0)
+    assert {f"{base}/incoming/estop" for base in crowd} <= set(topics(stop.tick(0.0)))
+    last = f"{crowd[-1]}/incoming/estop"
+    sent = [last in topics(publish(stop, crowd[-1], [HEARTBEAT], now)) for now in (0.1, 0.6, 0.7, 59.0, 60.0)]
+    assert (sent, stop.finished) == ([False, True, False, True, False], True)
 
 
-def test_robots_known_from_before_are_stopped_unheard_and_keep_their_places() -> None:
+def test_robots_that_the_caller_knows_are_stopped_unheard_and_confirm_it_in_a_crowd() -> None:
+    robot = Robot(GOOB, "serial")
     stop = StopSender(new_name(), by="", why="", now=0.0, robots=None, known=[GOOB])
-    assert topics(stop.tick(0.0)) == [ESTOP, DRIVE]
     for number in range(MAX_ROBOTS + 5):
         publish_quietly(stop, f"pebble/robots/r{number}", [CAPABILITIES, HEARTBEAT], 0.1)
-    assert topics(stop.tick(0.5))[:2] == [ESTOP, DRIVE], "before those of strangers"
-
-
-def test_a_confirmation_counts_although_strangers_fill_every_place() -> None:
-    stop, robot = sender(), Robot(GOOB, "serial")
-    for number in range(MAX_ROBOTS):
-        publish_quietly(stop, f"pebble/robots/r{number}", [CAPABILITIES, HEARTBEAT], 0.1)
-    receive(stop, *robot.take(publish(stop, GOOB, [HEARTBEAT], 0.2)), robot.capabilities(), now=0.3)
-    assert (robot.owners[0].latch.latched, stop.robots[GOOB].progress) == (True, Progress.CONFIRMED)
+    first = stop.tick(0.1)
+    assert topics(first)[:2] == [ESTOP, DRIVE]
+    receive(stop, *robot.take(first[:1]), robot.capabilities(), now=0.3)
+    assert stop.robots[GOOB].progress is Progress.CONFIRMED
     assert not stop.confirmed, "others are omitted"
 
 

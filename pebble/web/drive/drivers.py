@@ -56,6 +56,10 @@ class Drivers:
         self._turn(robot, now)
         return had
 
+    def drives(self, ref: str) -> bool:
+        """True if a page has control of that robot."""
+        return ref in self._driven and self._driven[ref].tab is not None
+
     def restore(self, token: str, tab: Tab) -> None:
         """A page has connected again: it asks for what it had, but no gesture goes on.
 
