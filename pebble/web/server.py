@@ -11,7 +11,9 @@ from typing import Any
 import msgspec
 
 from pebble.client.broker import Broker
+from pebble.client.connection import in_small_segments
 from pebble.client.estop import send
+from pebble.client.heartbeats import Heartbeats
 from pebble.client.page.settings import WebSettings
 from pebble.client.robot_topics import FLEET, SYNONYMS
 from pebble.config.security import SecurityLevel
@@ -23,7 +25,7 @@ from pebble.fleet.database import DatabaseError
 from pebble.fleet.people import People
 from pebble.fleet.roles import Session
 from pebble.runtime.by_name import ByName
-from pebble.transports import Message, Subscription
+from pebble.transports import Message, QoS, Subscription
 from pebble.transports.clock import since_boot as clock
 from pebble.web import messages as m
 from pebble.web.drive.drivers import Drivers
@@ -51,11 +53,15 @@ class Server:
     def __init__(self, settings: WebSettings, people: People, audit: Audit) -> None:
         self.settings, self.people, self.audit = settings, people, audit
         self._base = Identity("pebble", SERVERS, f"{settings.name}-{secrets.token_hex(2)}").base
-        self.broker = Broker(settings.broker)
+        self.broker, self.stop_broker = (
+            Broker(in_small_segments(settings.broker), name) for name in ("pebble-web", "pebble-web-stops")
+        )
         self.robots, self.stops = Robots(), Stops(self._has_sent)
         self.drivers = Drivers(self.broker, self.robots)
         self.media = PicturesAndSound(settings.broker, self.robots, self._note_talk)
-        self.broker.is_named = self.media.connection.broker.is_named = self._is_named
+        for broker in (self.broker, self.stop_broker, self.media.connection.broker):
+            broker.is_named = self._is_named
+        self._heartbeats: Heartbeats | None = None  # while a stop of all goes to further robots
         self.open_components = OpenComponents(self.broker, self.robots, self.spawn)
         # What is drawn over the picture comes from there.
         self.sources = ChosenSources(people, self.robots, OwnHosts(settings), self.open_components.update)
@@ -77,7 +83,7 @@ class Server:
     async def open(self) -> None:
         """Connect to the broker and subscribe. Raises TransportError for settings that can never work."""
         self.broker.on_move(self._moved)
-        await self.broker.open()
+        await asyncio.gather(self.broker.open(), self.stop_broker.open())
         self.broker.on_state(self._show_broker)
         self.broker.on_state(self.drivers.renew_keys)
         self._show_broker()
@@ -104,7 +110,9 @@ class Server:
             await asyncio.gather(*self._tasks, return_exceptions=True)
         finally:
             await self.media.close()
-            await asyncio.gather(self.media.connection.close(), self.broker.close())
+            if self._heartbeats is not None:
+                await asyncio.to_thread(self._heartbeats.close)
+            await asyncio.gather(self.media.connection.close(), self.stop_broker.close(), self.broker.close())
 
     def spawn(self, work: Coroutine[Any, Any, None]) -> None:
         """Run it until it ends or the server does."""
@@ -166,11 +174,27 @@ class Server:
     # -- to the broker
 
     def _send(self, messages: list[Message]) -> None:
-        send(self.broker.publish, messages)
+        """Publish messages of stops: on a connection on which nothing arrives, for which they would wait."""
+        send(self._publish_stop, messages)
+
+    def _publish_stop(self, topic: str, payload: bytes, *, qos: QoS) -> bool:
+        return any(broker.publish(topic, payload, qos=qos) for broker in (self.stop_broker, self.broker))
+
+    def _hear(self, now: float) -> None:
+        """Stop further robots while a stop of all goes to them, by heartbeats that wait for nothing else."""
+        if self._heartbeats is None:
+            if self.stops.collecting:
+                self._heartbeats = Heartbeats(in_small_segments(self.settings.broker))
+            return
+        for message in self._heartbeats.take():
+            self._send(self.stops.receive(message, now))
+        if not self.stops.collecting:
+            heartbeats, self._heartbeats = self._heartbeats, None
+            self.spawn(asyncio.to_thread(heartbeats.close))
 
     def _has_sent(self) -> bool:
         """Whether little waits to be sent. To repeat the stop of a thousand robots before would only delay its end."""
-        return self.broker.transport.outgoing.waiting < _MANY_WAIT
+        return self.stop_broker.transport.outgoing.waiting < _MANY_WAIT
 
     def stop(self, ref: str, name: str, session: Session, device: str, why: str, address: str = "") -> None:
         """An emergency stop of one component, or of all (""): sent at once, and repeated until it is confirmed."""
@@ -224,6 +248,7 @@ class Server:
                 self.broker.deliver()
                 now = clock()
                 self.drivers.tick(now)
+                self._hear(now)
                 self._send(self.stops.tick(now))
                 self.show_stops()
                 if now >= refresh_at:

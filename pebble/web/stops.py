@@ -95,6 +95,11 @@ class Stops:
         """True if there is a stop of this robot, or one of all that has a place for it."""
         return any(ref in sender.robots for sender, _ in self._senders.values())
 
+    @property
+    def collecting(self) -> bool:
+        """True while a stop of all goes to further robots."""
+        return "" in self._names and self._senders[self._names[""]][0].collecting
+
     def omitted(self, now: float) -> bool:
         """True if a stop was sent to robots that cannot confirm it, because there is no room for more."""
         return now - self._crowded_at < _SHOWN_S or any(sender.omitted for sender, _ in self._senders.values())

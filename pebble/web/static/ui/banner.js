@@ -314,7 +314,7 @@ function PressBanner() {
   }
   const whom = pressed.ref ? nameIn(store, pressed.ref) : "all robots";
   if (age < NO_ANSWER_MS) {
-    return html`<${Banner} kind="warn" icon="stop"><p role="alert">STOP of ${whom}: sent…</p><//>`;
+    return html`<${Banner} kind="warn" icon="stop"><p role="alert">STOP of ${whom}: being sent…</p><//>`;
   }
   if (!pressed.reached) {
     return html`<${Banner} kind="bad">
