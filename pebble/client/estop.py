@@ -23,6 +23,7 @@ GIVE_UP_S = 60.0
 MAX_ROBOTS = 2000  # to which a stop of all is repeated; one beyond gets it whenever anything arrives from it
 
 _ZERO = codec.encode(DRIVE, Drive(valid_ms=0))
+_ZEROS = "it has motors that no stop can hold: they get zeros"
 _END_SCRIPT = codec.encode(AUTONOMY_COMMAND, AutonomyCommand(action="stop"))
 
 
@@ -36,7 +37,7 @@ class Progress(Enum):
     WAITING = "waiting"
     CONFIRMED = "confirmed"
     OLD = "old"  # it has no emergency stop: zeros are sent while the stop lasts, and it cannot be latched
-    SPARED = "spared"  # among all robots: it offers neither driving nor an emergency stop
+    SPARED = "spared"  # among all robots: it says that it does not drive; it gets the stop once, and is not waited for
     NOT_CONFIRMED = "not confirmed"  # it is no longer sent to
 
 
@@ -101,16 +102,21 @@ class RobotStop:
         if not self.estop.has_capabilities:
             return "it has not published its capabilities" if self.live else "nothing was received: it may be off"
         if not self.estop.available:
+            if self.estop.zeros:
+                return _ZEROS
             return "its broker refuses emergency stops, so it gets zeros" if self.estop.drives else "it does not drive"
         if not self.estop.owners:
             return "its capabilities list no valid motor owners"
-        why = ", ".join(f"{owner} {why}" for owner, why in self.unconfirmed.items())
+        why = ", ".join(
+            [f"{owner} {why}" for owner, why in self.unconfirmed.items()] + [_ZEROS] * bool(self.estop.zeros)
+        )
         return why if self.live else f"{why}: it may be off"
 
     @property
     def sending(self) -> bool:
         """Whether the stop is repeated."""
-        return not self._given_up and (self._names_due or self.progress in (Progress.WAITING, Progress.OLD))
+        is_due = self._names_due or self._sent_at == float("-inf") or self.progress in (Progress.WAITING, Progress.OLD)
+        return not self._given_up and is_due
 
     def receive(self, message: Message, now: float) -> None:
         self.live = self.live or not message.retain
@@ -126,7 +132,7 @@ class RobotStop:
             {owner: self.estop.states[owner].boot for owner in self.estop.owners if self._lists_it(owner)}
         )
         if self.confirmed_s is None:
-            if self.estop.owners and self.estop.available and not self.unconfirmed:
+            if self.estop.owners and self.estop.available and not (self.unconfirmed or self.estop.zeros):
                 self.confirmed_s = now - self._began
         elif self._order.hold and not all(map(self._has_taken_it, self.estop.owners)):
             self.confirmed_s = None  # it has restarted, and saved nothing
@@ -140,10 +146,11 @@ class RobotStop:
         messages = []
         if not self.estop.old:
             messages.append(_message(ESTOP, ESTOP.topic(self.estop.base), self._order.payload))
-        elif not self._script_ended:
+        if (self.estop.old or self.estop.zeros) and not self._script_ended:
             self._script_ended = True
             messages.append(_message(AUTONOMY_COMMAND, self.estop.script_topic, _END_SCRIPT))
-        messages.append(_message(DRIVE, self.estop.drive_topic, _ZERO))
+        topics = dict.fromkeys((self.estop.drive_topic, *self.estop.zeros))
+        messages += [_message(DRIVE, topic, _ZERO) for topic in topics]
         return [one for one in messages if not self._order.own_only or _is_incoming(one.topic, self.estop.base)]
 
     def give_up(self) -> None:

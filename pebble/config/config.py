@@ -16,6 +16,7 @@ from pebble.config.reader import Reader
 from pebble.config.rules.between_keys import CHECKS
 from pebble.config.rules.exposure import warn_if_readable
 from pebble.config.tree import Root, SerialBridge, SerialBridges
+from pebble.contract import DRIVE
 from pebble.contract.identity import Identity
 from pebble.contract.serial_protocols import SERIAL_PROTOCOLS
 from pebble.errors import ConfigError
@@ -85,6 +86,12 @@ class Config(Root, frozen=True, kw_only=True):
         """Those of the enabled serial lines that drive motors."""
         lines = self.serial_instances().items()
         return {name: line for name, line in lines if SERIAL_PROTOCOLS[line.protocol].drives}
+
+    @property
+    def zeros(self) -> tuple[str, ...]:
+        """The drive topics of what moves the robot and cannot latch: to it a stop is a zero."""
+        ros = self.services.ros1_bridge
+        return (ros.topics.drive_values or DRIVE.topic(self.base),) if ros.enabled and ros.drive.enabled else ()
 
     def media_programs(self) -> tuple[str, ...]:
         """The on-demand programs for pictures and sound, by the services' names."""

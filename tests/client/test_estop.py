@@ -193,6 +193,48 @@ def test_a_person_may_end_it() -> None:
     assert stop.robots[GOOB].progress is Progress.NOT_CONFIRMED
 
 
+#: What may wrongly be taken for something that does not drive, and how often a stop of all is sent to it in 2 s.
+MOVERS: dict[str, tuple[Message, int]] = {
+    "no capabilities": (outgoing(GOOB, "online", {"t": 1}), 4),
+    "a board of the original": (outgoing(GOOB, "online", {"t": 1, "subscribes": ["incoming/drive-values"]}), 4),
+    "another type": (outgoing("pebble/lamps/mini", "online", {"t": 1}), 4),
+    "an unknown section": (capabilities(GOOB, {"arm": {"available": True}}), 4),
+    "a drive section that is none": (capabilities(GOOB, {"drive": ["x"], "estop": 5}), 4),
+    "capabilities that are none": (outgoing(GOOB, "capabilities", [1]), 4),
+    "driving without a stop": (capabilities(GOOB, {"drive": {"available": True}}), 4),
+    "no driving, with a stop": (
+        capabilities(GOOB, {"drive": {"available": False}, "estop": {"available": True, "owners": ["arm"]}}),
+        4,
+    ),
+    "ROS beside it": (capabilities(GOOB, {"drive": {"available": True}, "estop": {"zeros": [DRIVE]}}), 4),
+    "it says that it does not drive": (capabilities(GOOB, {"drive": {"available": False}, "estop": {}}), 1),
+}
+
+
+@pytest.mark.parametrize(("message", "times"), MOVERS.values(), ids=MOVERS)
+def test_a_stop_of_all_reaches_what_may_move(message: Message, times: int) -> None:
+    stop = sender()
+    receive(stop, message, now=0.0)
+    base = message.topic.partition("/outgoing/")[0]
+    sent = [topics(stop.tick(now)) for now in (0.0, 0.5, 1.0, 1.5)]
+    assert sum(f"{base}/incoming/drive-values" in some for some in sent) == times
+
+
+@pytest.mark.parametrize("owners", [[], ["serial"]])
+def test_what_no_stop_can_hold_gets_zeros_for_a_minute_and_is_never_confirmed(owners: list[str]) -> None:
+    ros = f"{GOOB}/incoming/ros/drive"
+    section = {
+        "available": bool(owners),
+        "owners": owners,
+        "zeros": [ros, 5, "pebble/robots/fred/incoming/drive-values"],
+    }
+    stop, robot = sender(GOOB), Robot(GOOB, *owners, estop=section)
+    receive(stop, robot.capabilities(), *robot.take(stop.tick(0.0)), now=0.1)
+    assert topics(stop.tick(0.5)) == [ESTOP, f"{GOOB}/incoming/autonomy-command", DRIVE, ros]
+    assert stop.robots[GOOB].why == "it has motors that no stop can hold: they get zeros"
+    assert (sent_times(stop, 100.0)[-1], stop.robots[GOOB].progress) == (59.5, Progress.NOT_CONFIRMED)
+
+
 # -- all robots
 
 
@@ -230,7 +272,8 @@ def test_a_component_that_does_not_drive_is_spared_once_that_is_known() -> None:
     receive(stop, capabilities(GOOB, {"drive": {"available": False}}), now=0.1)
     assert (stop.tick(0.5), stop.robots[GOOB].progress) == ([], Progress.SPARED)
     receive(stop, capabilities(FRED, {"drive": {"available": False}}), now=0.6)
-    assert stop.tick(0.6) == []
+    assert topics(stop.tick(0.6)) == [f"{FRED}/incoming/autonomy-command", f"{FRED}/incoming/drive-values"]
+    assert (stop.tick(1.2), stop.robots[FRED].progress) == ([], Progress.SPARED)
     assert not stop.confirmed, "no robot was stopped"
 
 

@@ -100,8 +100,7 @@ class Drivers:
 
     def stop(self, ref: str, by: str) -> None:
         """A zero from anybody, who need not drive."""
-        view = self._robots.view(ref)
-        if view is not None and (view.drives or not view.capabilities):
+        if self._robots.view(ref) is not None:
             self._publish(self.robot(ref).stop(clock()), by)
 
     # -- of robots
