@@ -14,6 +14,7 @@ import pebble
 from pebble.config import Config
 from pebble.config.autonomy import Script as ScriptSection
 from pebble.config.home import in_home
+from pebble.contract.identity import meant
 from pebble.services.autonomy_manager import builtin_forms
 from pebble.services.autonomy_manager.describe import (
     MANIFEST,
@@ -123,13 +124,17 @@ class Catalogue:
         if len(name) > _LONGEST_NAME or not name.isprintable() or "]" in name:
             self._complain(name[:_LONGEST_NAME], "%r is not offered: rename its folder", name)
             return False
-        return self._section.scripts.get(name, ScriptSection()).enabled
+        return self._section_of(name).enabled
+
+    def _section_of(self, name: str) -> ScriptSection:
+        sections = self._section.scripts
+        return sections.get(meant(sections, name), ScriptSection())
 
     def _script(
         self, name: str, folder: Path, before_asking: Callable[[], object], *, own: bool = False
     ) -> Script | None:
         """``own``: Pebble's own instead of the robot's copy, for which the config says how to run it."""
-        section = self._section.scripts.get(name, ScriptSection())
+        section = self._section_of(name)
         key = name
         if own:
             section, key = replace(section, entrypoint="run.py", python=None, cwd=None), _own_key(name)
