@@ -370,6 +370,14 @@ def test_robots_without_a_place_get_the_stop_for_a_minute_however_many() -> None
     assert (sent, stop.finished) == ([False, True, False, True, False], True)
 
 
+def test_a_stop_that_is_ended_goes_to_no_robot_without_a_place(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(estop, "MAX_ROBOTS", 0)
+    stop = sender()
+    publish_quietly(stop, GOOB, [HEARTBEAT], 0.0)
+    stop.end()
+    assert stop.tick(0.0) == []
+
+
 def test_robots_that_the_caller_knows_are_stopped_unheard_and_confirm_it_in_a_crowd() -> None:
     robot = Robot(GOOB, "serial")
     stop = StopSender(new_name(), by="", why="", now=0.0, robots=None, known=[GOOB])
@@ -434,7 +442,7 @@ def test_a_hold_stops_a_robot_again_that_has_lost_its_memory_and_no_other() -> N
     receive(stop, restarted.owners[0].state(), now=20.0)
     assert topics(stop.tick(20.0)) == [ESTOP, DRIVE]
     receive(stop, *restarted.take(stop.tick(20.5)), now=20.6)
-    assert stop.confirmed
+    assert stop.robots[GOOB].confirmed_s == pytest.approx(0.6)
 
 
 def test_a_hold_is_not_disturbed_by_later_stops_of_others() -> None:
