@@ -291,7 +291,7 @@ class Robots:
             self.omitted += 1
             if not self.is_wanted(ref):
                 return None
-            newest = next((one for one in reversed(self.components) if not self.is_kept(one)), None)
+            newest = next((other for other in reversed(self.components) if not self.is_kept(other)), None)
             if newest is not None:
                 self.forget(newest)
             self.on_forget(ref)  # what it published before found no place: it is asked for
