@@ -1,4 +1,4 @@
-"""Stands before a real broker, and hands out its retained messages as others do: late, or for exact names only."""
+"""Stands before a real broker, and hands out its messages late, for exact names only, or none after a long one."""
 
 from __future__ import annotations
 
@@ -13,10 +13,14 @@ _NO_BRIDGE_MODE = b"\x20\x02\x00\x01"
 
 
 class SparingBroker:
-    """``late_s``: how long after it was asked for a retained message comes; ``by_name``: not for wildcards."""
+    """``late_s``: how long after it was asked for a retained message comes; ``by_name``: not for wildcards.
 
-    def __init__(self, to: int, *, late_s: float = 0.0, by_name: bool = False) -> None:
+    ``longest``: bytes of a packet; a longer one, and what comes after it on its connection, never arrives.
+    """
+
+    def __init__(self, to: int, *, late_s: float = 0.0, by_name: bool = False, longest: int = 1 << 28) -> None:
         self.port, self._to, self._late_s, self._by_name = free_port(), to, late_s, by_name
+        self._longest, self.stalled = longest, 0
         self._loop = asyncio.new_event_loop()
         self._loop.run_until_complete(asyncio.start_server(self._serve, "127.0.0.1", self.port))
         self._thread = threading.Thread(target=self._loop.run_forever, daemon=True)
@@ -48,6 +52,9 @@ class SparingBroker:
         with suppress(OSError, asyncio.IncompleteReadError):
             while True:
                 first, packet, body = await packet_of(reader)
+                if len(packet) > self._longest:
+                    self.stalled += 1
+                    await reader.read(-1)
                 named = any(body[: 2 + int.from_bytes(body[:2], "big")] in one for one in asked)
                 if first & 0xF1 != _PUBLISH | 1:
                     writer.write(packet)

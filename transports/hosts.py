@@ -38,11 +38,16 @@ def addresses_of(host: str, port: int) -> list[Address]:
     return list(dict.fromkeys(Address(family, place) for family, _type, _protocol, _name, place in found))
 
 
-def dial(address: Address, timeout: float | None = None) -> socket.socket:
-    """A TCP connection; the same ``timeout`` goes on for what follows, TLS. Raises OSError."""
+def dial(address: Address, timeout: float | None = None, *, max_segment: int = 0) -> socket.socket:
+    """A TCP connection; the same ``timeout`` goes on for what follows, TLS. Raises OSError.
+
+    ``max_segment``: bytes of one segment; 0: the system's.
+    """
     sock = socket.socket(address.family, socket.SOCK_STREAM)
     try:
         sock.settimeout(CONNECT_TIMEOUT_S if timeout is None else timeout)
+        if max_segment:
+            sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_MAXSEG, max_segment)
         sock.connect(address.place)
     except BaseException:
         sock.close()

@@ -44,6 +44,8 @@ class MqttSettings:
     sends_retained: bool = True
     #: Filters of topics that are sent even to a broker that hangs up on them.
     vital: tuple[str, ...] = ()
+    #: Bytes of one TCP segment, in both directions; 0: as many as the way seems to take. Some ways lose large ones.
+    max_segment: int = 0
     dscp: int = 0  # of our packets (RFC 2474), where the system permits it: 46 is served before 10
 
     def each(self) -> tuple["MqttSettings", ...]:

@@ -14,8 +14,6 @@ Handler = Callable[[Message, float], None]  # the message, and the monotonic tim
 MAX_MESSAGES: Final = 10_000
 MAX_BYTES: Final = 64 << 20  # of their payloads
 MAX_DEFERRED: Final = 5_000  # heartbeats, which come again, take no room from what is sent once
-KNOWN_MESSAGES: Final = 1_000  # of each of these numbers, which only robots known from before may use
-KNOWN_BYTES: Final = 8 << 20
 
 
 class Arrived:
@@ -26,13 +24,11 @@ class Arrived:
         self._waiting: deque[tuple[Handler, Message, float]] = deque()
         self._put_bytes = self._got_bytes = 0  # each written by one thread
 
-    def put(self, handler: Handler, message: Message, at: float, *, deferred: bool = False, known: bool = True) -> bool:
+    def put(self, handler: Handler, message: Message, at: float, *, deferred: bool = False) -> bool:
         """False if there is no room for it."""
         size = len(message.payload)
-        most, most_bytes = MAX_DEFERRED if deferred else MAX_MESSAGES, MAX_BYTES
-        if not known:
-            most, most_bytes = most - KNOWN_MESSAGES, most_bytes - KNOWN_BYTES
-        if len(self._waiting) >= most or self._put_bytes - self._got_bytes + size > most_bytes:
+        most = MAX_DEFERRED if deferred else MAX_MESSAGES
+        if len(self._waiting) >= most or self._put_bytes - self._got_bytes + size > MAX_BYTES:
             self.dropped += 1
             if self.dropped & (self.dropped - 1) == 0:  # the 1st, 2nd, 4th, 8th …
                 log.warning("%d messages dropped, the last on %s: too many at once", self.dropped, message.topic)

@@ -42,8 +42,6 @@ class Broker:
         self._watchers: list[Callable[[], None]] = []
         self._arrived = Arrived()
         self._woken = False  # deliver is about to be called
-        #: Whether a topic is one of a robot known from before, for which room is reserved.
-        self.is_known: Callable[[str], bool] = lambda _topic: True
         #: Whether a robot, by its base, takes commands only with a name.
         self.is_named: Callable[[str], bool] = lambda _base: False
         self.names = NamedTopics(settings.username or "", lambda base: self.is_named(base))
@@ -148,8 +146,7 @@ class Broker:
         """
 
         def take(message: Message) -> None:
-            known = self.is_known(message.topic)
-            if not self._arrived.put(handler, message, time.monotonic(), deferred=deferred, known=known):
+            if not self._arrived.put(handler, message, time.monotonic(), deferred=deferred):
                 on_refused()
             elif not deferred:
                 self._wake()

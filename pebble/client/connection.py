@@ -26,7 +26,8 @@ log = logging.getLogger(__name__)
 
 _STEP_S = 0.005  # between two looks at a condition
 _LATE_S = 0.25  # some brokers send what is retained so long after they have acknowledged a subscription
-_OPEN_TIMEOUT_S = 3.0
+OPEN_TIMEOUT_S = 3.0
+SEGMENT = 1200  # bytes of TCP in a packet: with all headers 1280, which every way takes (RFC 8200, section 5)
 _FIND_S = 1.0  # where several brokers are heard: longer than a robot takes between two heartbeats
 _WAITING = 10_000  # messages that wait to be printed before new ones are dropped
 
@@ -61,16 +62,37 @@ def target_of(robot: str | None, options: Target) -> Target:
 def connected(target: Target) -> Iterator[tuple[Transport, Names]]:
     """Connect, and disconnect at the end. Raises PebbleError with a remedy if the connection fails."""
     kind, settings, names, where = resolve(target)
-    transport = operators(f"pebble-tool-{os.getpid()}", kind, settings)
-    with closing(transport.open(_OPEN_TIMEOUT_S)):
+    transport = operators(f"pebble-tool-{os.getpid()}", kind, in_small_segments(settings))
+    with closing(transport.open(OPEN_TIMEOUT_S)):
         if transport.state is not State.CONNECTED:
-            why = transport.problem or f"no answer within {_OPEN_TIMEOUT_S:g} s"
+            why = transport.problem or f"no answer within {OPEN_TIMEOUT_S:g} s"
             raise TransportError(f"cannot connect to {where}: {why}")
         if isinstance(transport, EveryHost) and names.base != ANY_ROBOT and not transport.find(names.base, _FIND_S):
             log.info("%s is heard at no host", names.base)
         not_received = _report_missing(transport)
         yield transport, names
         _report_missing(transport, not_received)  # what was subscribed to meanwhile may be refused
+
+
+@contextmanager
+def listening(target: Target, sender: Transport) -> Iterator[Transport]:
+    """A second connection to where ``sender`` is, not waited for: what it receives holds up nothing that is sent.
+
+    It is ``sender`` itself where each client needs an id of its own, and within a robot's Zenoh network.
+    """
+    kind, settings, _, _ = resolve(target)
+    if not isinstance(settings, MqttSettings) or settings.client_id is not None:
+        yield sender
+        return
+    transport = operators(f"pebble-tool-{os.getpid()}-listening", kind, in_small_segments(settings))
+    with closing(transport.open(0.0)):
+        yield transport
+        _report_missing(transport)
+
+
+def in_small_segments(settings: Any) -> Any:
+    """The same settings for a way that may lose large packets."""
+    return replace(settings, max_segment=SEGMENT) if isinstance(settings, MqttSettings) else settings
 
 
 def _report_missing(transport: Transport, before: str = "") -> str:

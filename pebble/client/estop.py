@@ -10,7 +10,6 @@ from typing import NamedTuple
 
 from pebble.client.driveable import Driveable, driveable_of
 from pebble.client.estop_states import RobotEstop
-from pebble.client.rank import Rank, RankedTable
 from pebble.contract import AUTONOMY_COMMAND, DRIVE, ESTOP, STATUS, Channel, codec
 from pebble.contract.identity import Direction, parse_topic
 from pebble.contract.levels import silent_after
@@ -22,9 +21,9 @@ REPEAT_S = 0.5
 COLLECT_S = silent_after(link="thin")  # so long a stop of all is sent to further robots, which may be at any level
 GIVE_UP_S = 60.0
 MAX_ROBOTS = 2000  # to which a stop of all is repeated; one beyond gets it whenever anything arrives from it
-MAX_PASSED = 4096  # robots beyond whose last stop is remembered; where there are more, they get it more often
 
 _ZERO = codec.encode(DRIVE, Drive(valid_ms=0))
+_ZEROS = "it has motors that no stop can hold: they get zeros"
 _END_SCRIPT = codec.encode(AUTONOMY_COMMAND, AutonomyCommand(action="stop"))
 
 
@@ -38,7 +37,7 @@ class Progress(Enum):
     WAITING = "waiting"
     CONFIRMED = "confirmed"
     OLD = "old"  # it has no emergency stop: zeros are sent while the stop lasts, and it cannot be latched
-    SPARED = "spared"  # among all robots: it offers neither driving nor an emergency stop
+    SPARED = "spared"  # among all robots: it says that it does not drive; it gets the stop once, and is not waited for
     NOT_CONFIRMED = "not confirmed"  # it is no longer sent to
 
 
@@ -55,13 +54,12 @@ class Order(NamedTuple):
 class RobotStop:
     """The stop of one robot: what is sent to it when, and whether it is confirmed."""
 
-    def __init__(self, base: str, order: Order, now: float, *, known: bool = False) -> None:
+    def __init__(self, base: str, order: Order, now: float) -> None:
         self.estop = RobotEstop(base)
         self.live = False  # anything but retained messages has arrived from it
         self.driveable: Driveable | None = None  # as its status says
         self.confirmed_s: float | None = None  # how long it took; None: it is not confirmed
         self.next: float = now  # when to send again, unless it is confirmed or spared
-        self.rank = Rank(known=known)
         self._order, self._began = order, now
         self._sent_at = float("-inf")
         self._script_ended = False
@@ -104,34 +102,37 @@ class RobotStop:
         if not self.estop.has_capabilities:
             return "it has not published its capabilities" if self.live else "nothing was received: it may be off"
         if not self.estop.available:
+            if self.estop.zeros:
+                return _ZEROS
             return "its broker refuses emergency stops, so it gets zeros" if self.estop.drives else "it does not drive"
         if not self.estop.owners:
             return "its capabilities list no valid motor owners"
-        why = ", ".join(f"{owner} {why}" for owner, why in self.unconfirmed.items())
+        why = ", ".join(
+            [f"{owner} {why}" for owner, why in self.unconfirmed.items()] + [_ZEROS] * bool(self.estop.zeros)
+        )
         return why if self.live else f"{why}: it may be off"
 
     @property
     def sending(self) -> bool:
         """Whether the stop is repeated."""
-        return not self._given_up and (self._names_due or self.progress in (Progress.WAITING, Progress.OLD))
+        is_due = self._names_due or self._sent_at == float("-inf") or self.progress in (Progress.WAITING, Progress.OLD)
+        return not self._given_up and is_due
 
     def receive(self, message: Message, now: float) -> None:
-        if not (self.live or message.retain):
-            self.live, self.rank = True, self.rank._replace(live=True)
+        self.live = self.live or not message.retain
         if message.topic == self._status_topic:
             self.driveable = driveable_of(message.payload)
             return
         known = self.estop.has_capabilities
         if not self.estop.receive(message):
             return
-        self.rank = max(self.rank, Rank.of(self.estop, known=self.rank.known, live=self.live))
         if self.estop.has_capabilities and not known:
             self.next, self._names_due = now, self.estop.named  # its topics may be others
         self._boots.update(
             {owner: self.estop.states[owner].boot for owner in self.estop.owners if self._lists_it(owner)}
         )
         if self.confirmed_s is None:
-            if self.estop.owners and self.estop.available and not self.unconfirmed:
+            if self.estop.owners and self.estop.available and not (self.unconfirmed or self.estop.zeros):
                 self.confirmed_s = now - self._began
         elif self._order.hold and not all(map(self._has_taken_it, self.estop.owners)):
             self.confirmed_s = None  # it has restarted, and saved nothing
@@ -139,16 +140,17 @@ class RobotStop:
             self.next = max(now, self._sent_at + REPEAT_S)
 
     def tick(self, now: float, *, again: bool = True) -> list[Message]:
-        if not self.sending or now < self.next or not (again or self._sent_at == float("-inf")):
+        if now < self.next or not self.sending or not (again or self._sent_at == float("-inf")):
             return []
         self._sent_at, self.next, self._names_due = now, now + REPEAT_S, False
         messages = []
         if not self.estop.old:
             messages.append(_message(ESTOP, ESTOP.topic(self.estop.base), self._order.payload))
-        elif not self._script_ended:
+        if (self.estop.old or self.estop.zeros) and not self._script_ended:
             self._script_ended = True
             messages.append(_message(AUTONOMY_COMMAND, self.estop.script_topic, _END_SCRIPT))
-        messages.append(_message(DRIVE, self.estop.drive_topic, _ZERO))
+        topics = dict.fromkeys((self.estop.drive_topic, *self.estop.zeros))
+        messages += [_message(DRIVE, topic, _ZERO) for topic in topics]
         return [one for one in messages if not self._order.own_only or _is_incoming(one.topic, self.estop.base)]
 
     def give_up(self) -> None:
@@ -195,22 +197,20 @@ class StopSender:
         """``name`` is that of :func:`new_name`; ``robots`` are base topics, None: all robots that publish anything.
 
         ``known``: with all robots, those that get it without having published anything. ``own_only``: topics that a
-        robot's capabilities name are used only if they are its own.
+        robot's capabilities name are used only if they are its own. Neither list is cut.
         """
         if not is_name(name):
             raise ValueError(f"{name!r} is not 16 hex digits")
         _, by, why = stop_of({"by": by, "why": why})
         payload = codec.encode(ESTOP, EstopCommand(stop=name, by=by, why=why))
         self.order = Order(name, payload, named=robots is not None, hold=hold, own_only=own_only)
-        self.robots = RankedTable[RobotStop](MAX_ROBOTS)
+        self.robots = {base: RobotStop(base, self.order, now) for base in (known if robots is None else robots)}
         self.omitted = 0  # messages of robots for which ``robots`` had no room
-        self._known = frozenset(known)
         self._began = self._now = now
         self._ended = False
-        self._passed: dict[str, float] = {}  # when the stop was sent to a robot that is not in ``robots``
+        self._passed: set[str] = set()  # robots that are not in ``robots`` and got the stop
+        self._passed_at = float("-inf")  # since then
         self._passing: list[Message] = []  # such stops, to be sent now
-        for base in self._known if robots is None else robots:  # whoever has named them answers for their number
-            self.robots[base] = self._stop_of(base, now)
 
     @property
     def collecting(self) -> bool:
@@ -253,19 +253,18 @@ class StopSender:
             robot.receive(message, now)
         # An empty message removes what was retained: it is no sign of a robot.
         elif self.collecting and message.payload and not address.identity.is_server:
-            self._receive_first(base, address.metric, message, now)
+            self._receive_first(base, message, now)
 
     def tick(self, now: float, *, again: bool = True) -> list[Message]:
-        """What to publish now, to the robots of the highest rank first; some of it again in 0.5 s.
+        """What to publish now; some of it again in 0.5 s.
 
         ``again`` False: only to robots that it was not sent to yet, because what was sent still waits.
         """
         self._now = now
         if not self.order.hold and now >= self._began + GIVE_UP_S:
             self.end()
-        due = sorted((one for one in self.robots.values() if one.next <= now), key=lambda one: one.rank, reverse=True)
         passing, self._passing = self._passing, []
-        return [message for robot in due for message in robot.tick(now, again=again)] + passing
+        return [message for robot in self.robots.values() for message in robot.tick(now, again=again)] + passing
 
     def tick_robot(self, base: str, now: float, *, again: bool = True) -> list[Message]:
         """What ``tick`` would return of this robot, from which a message was just received."""
@@ -285,27 +284,19 @@ class StopSender:
         """A robot that is not in ``robots`` gets the stop again only when anything arrives from it: for a minute."""
         return GIVE_UP_S if self.omitted else COLLECT_S
 
-    def _receive_first(self, base: str, metric: str, message: Message, now: float) -> None:
+    def _receive_first(self, base: str, message: Message, now: float) -> None:
         """Take a message of a robot that is not in ``robots``."""
-        full = len(self.robots) >= MAX_ROBOTS
-        self.omitted += full
-        was_sent = now - self._passed.get(base, float("-inf")) < REPEAT_S
-        at_most = Rank.at_most(metric, known=base in self._known, live=not message.retain)
-        if was_sent and self.robots.refuses(at_most):
-            return
-        robot = self._stop_of(base, now)
+        robot = RobotStop(base, self.order, now)
         robot.receive(message, now)
-        if self.robots.make_room(robot.rank, self.robots.pop):
+        if len(self.robots) < MAX_ROBOTS:
             self.robots[base] = robot
-        elif not was_sent and (messages := robot.tick(now)):
-            self._passing += messages
-            self._passed.pop(base, None)
-            if len(self._passed) >= MAX_PASSED:
-                del self._passed[next(iter(self._passed))]  # the oldest
-            self._passed[base] = now
-
-    def _stop_of(self, base: str, now: float) -> RobotStop:
-        return RobotStop(base, self.order, now, known=base in self._known)
+            return
+        self.omitted += 1
+        if now >= self._passed_at + REPEAT_S:
+            self._passed, self._passed_at = set(), now
+        if base not in self._passed:
+            self._passed.add(base)
+            self._passing += robot.tick(now)
 
 
 def send(publish: Callable[..., bool], messages: Iterable[Message]) -> None:

@@ -4,7 +4,7 @@ import difflib
 from collections.abc import Iterator
 
 from pebble.contract import CHANNELS, INCOMING, OUTGOING, Channel, channel_of
-from pebble.contract.identity import Identity, parse_topic
+from pebble.contract.identity import Identity, composed, parse_topic
 from pebble.errors import PebbleError
 from pebble.runtime.addresses import Addresses
 from pebble.transports.topics import is_pattern
@@ -77,7 +77,7 @@ def base_of(robot: str) -> str:
         levels = [*_USUAL.split("/")[:2], robot]
     if len(levels) != 3:
         raise NamingError(f'--robot {robot}: give its id, or "system/type/id"')
-    return Identity(*levels).base
+    return Identity(*map(composed, levels)).base
 
 
 def id_of(base: str) -> str:

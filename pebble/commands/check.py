@@ -297,8 +297,8 @@ def _local_media(config: Config) -> Iterator[str]:
     for name, path in devices.sockets().items():
         yield f"{forms[name]} at {path}, by examples/gstreamer_sockets.py"
     for line in config.motor_lines().values():
-        if (name := config.hall_memory(line)) is not None:
-            yield f"hall samples in the shared memory {name}"
+        if (memory := config.hall_memory(line)) is not None:
+            yield f"hall samples in the shared memory {memory}"
 
 
 def _security(config: Config) -> Iterator[tuple[str, str]]:

@@ -8,18 +8,30 @@ import socket
 import sys
 import threading
 import time
-from contextlib import suppress
-from functools import partial
+from collections.abc import Iterator
+from contextlib import closing, contextmanager, suppress
 from typing import Annotated
 
 import typer
 
-from pebble.client.connection import Listener, Target, connected, put_names, target_of, wait_for
-from pebble.client.discovery import ALL_OUTGOING, Discovery
+from pebble.client.connection import (
+    Listener,
+    Target,
+    connected,
+    in_small_segments,
+    listening,
+    put_names,
+    resolve,
+    target_of,
+    wait_for,
+)
+from pebble.client.discovery import Discovery
 from pebble.client.driveable import Driveable
 from pebble.client.estop import Progress, RobotStop, StopSender, new_name, send
 from pebble.client.estop_states import Reset, RobotEstop
+from pebble.client.heartbeats import Heartbeats
 from pebble.client.names import id_of
+from pebble.client.robot_topics import SYNONYMS
 from pebble.client.robot_view import RobotView
 from pebble.commands.options import with_target
 from pebble.commands.terminal import show
@@ -29,10 +41,11 @@ from pebble.contract.levels import LEVELS
 from pebble.errors import PebbleError, TransportError
 from pebble.runtime.by_name import ByName, ask_beside
 from pebble.runtime.signals import interrupted_by_signals
-from pebble.transports import Message, State, Transport
+from pebble.transports import Message, MqttSettings, QoS, State, Transport
 
 _VERBS = ("reset", "status")
 _TICK_S = 0.25
+_HEARD_S = 0.02  # between two looks at heartbeats
 _ON_ITS_WAY_S = 0.05  # between the thread that has received a message and this one
 _REPORT_PERIOD_S = 0.05
 _QUICK_S = 1.0  # an answer within this time needs no line before it
@@ -116,27 +129,47 @@ def me(account: str | None = None) -> str:
 
 
 def _stop(target: Target, why: str, *, every: bool, hold: bool) -> int:
+    """What is sent has a connection of its own, on which nothing arrives."""
     with interrupted_by_signals(), connected(target) as (transport, names):
         robots = None if every else [names.base]
         sender = StopSender(new_name(), by=me(names.account), why=why, now=time.monotonic(), robots=robots, hold=hold)
         put_names(transport, names, lambda base: base in sender.robots and sender.robots[base].estop.named)
-        report = _Report(sender)
+        outbox = _Outbox(transport, sender)
+        outbox.publish()
+        report = _Report(sender, outbox)
         try:
-            _publish(transport, sender)
-            listener, subscribing = _listen(transport, [ALL_OUTGOING] if every else _filters(names.base))
-            by_name = ByName([STATUS])
-            ask_beside(transport, by_name)
-            while not sender.finished:
-                _receive(listener, sender, by_name, _until_due(sender))
-                _publish(transport, sender)
-                report.connection("" if transport.state is State.CONNECTED else transport.problem or "no connection")
-                report.update(time.monotonic())
-            subscribing.join(_ANSWER_S)  # a status tells whether the motors obey, and may come after the confirmation
-            _receive(listener, sender, by_name, _ON_ITS_WAY_S)
+            with _heartbeats(target, every=every) as heartbeats, listening(target, transport) as second:
+                listener, subscribing = _listen(second, _filters(names.base))
+                by_name = ByName([STATUS])
+                ask_beside(second, by_name)
+                while not sender.finished:
+                    for message in heartbeats.take() if heartbeats else ():
+                        sender.receive(message, time.monotonic())
+                    outbox.publish()
+                    _receive(listener, sender, by_name, _until_due(sender, hears=heartbeats is not None))
+                    outbox.publish()
+                    report.connection(
+                        "" if transport.state is State.CONNECTED else transport.problem or "no connection"
+                    )
+                    report.update(time.monotonic())
+                subscribing.join(_ANSWER_S)  # a status tells whether the motors obey, and may come after it
+                wait_for(lambda: second.state is State.CONNECTED, _ANSWER_S)
+                _receive(listener, sender, by_name, _ON_ITS_WAY_S)
         except KeyboardInterrupt:
             sender.end()
         report.end()
     return 0 if sender.confirmed else 1
+
+
+@contextmanager
+def _heartbeats(target: Target, *, every: bool) -> Iterator[Heartbeats | None]:
+    """Of all robots, whom a stop of all goes to; within a robot there are none."""
+    _, settings, _, _ = resolve(target)
+    if not every or not isinstance(settings, MqttSettings) or settings.client_id is not None:
+        yield None
+        return
+    with closing(Heartbeats(in_small_segments(settings))) as heartbeats:
+        yield heartbeats
 
 
 def _listen(transport: Transport, filters: list[str]) -> tuple[Listener, threading.Thread]:
@@ -153,12 +186,12 @@ def _listen(transport: Transport, filters: list[str]) -> tuple[Listener, threadi
 
 
 def _filters(base: str) -> list[str]:
-    return [channel.filter(base) for channel in (ESTOP_STATE, STATUS, CAPABILITIES, ONLINE)]
+    return [channel.filter(base) for channel in (ESTOP_STATE, CAPABILITIES, STATUS, ONLINE, *SYNONYMS)]
 
 
-def _until_due(sender: StopSender) -> float:
-    due = sender.due
-    return _TICK_S if due is None else min(_TICK_S, due - time.monotonic())
+def _until_due(sender: StopSender, *, hears: bool) -> float:
+    due, most = sender.due, _HEARD_S if hears and sender.collecting else _TICK_S
+    return most if due is None else min(most, due - time.monotonic())
 
 
 def _receive(listener: Listener, sender: StopSender, by_name: ByName, left: float) -> None:
@@ -172,15 +205,36 @@ def _receive(listener: Listener, sender: StopSender, by_name: ByName, left: floa
         left = 0.0
 
 
-def _publish(transport: Transport, sender: StopSender) -> None:
-    send(partial(transport.publish, urgent=True), sender.tick(time.monotonic()))  # waits for no acknowledgement
+class _Outbox:
+    """Publishes a stop, and knows to which robots it has left."""
+
+    def __init__(self, transport: Transport, sender: StopSender) -> None:
+        self._transport, self._sender = transport, sender
+        self._waiting: set[str] = set()
+        self._left: set[str] = set()
+
+    def publish(self) -> None:
+        send(self._accepts, self._sender.tick(time.monotonic()))  # waits for no acknowledgement
+
+    def has_sent(self, base: str) -> bool:
+        """True once a stop of this robot has arrived at the other end of the connection."""
+        if self._transport.state is State.CONNECTED and not self._transport.outgoing.waiting:
+            self._left |= self._waiting
+            self._waiting.clear()
+        return base in self._left
+
+    def _accepts(self, topic: str, payload: bytes, *, qos: QoS) -> bool:
+        accepted = self._transport.publish(topic, payload, qos=qos, urgent=True)
+        if accepted and topic.count("/") > 2:
+            self._waiting.add("/".join(topic.split("/", 3)[:3]))
+        return accepted
 
 
 class _Report:
     """Prints a line whenever the stop of a robot has got further."""
 
-    def __init__(self, sender: StopSender) -> None:
-        self._sender = sender
+    def __init__(self, sender: StopSender, outbox: _Outbox) -> None:
+        self._sender, self._outbox = sender, outbox
         self._lines: dict[str, str] = {}  # the last one of each robot
         self._problem = ""
         self._began = self._updated = time.monotonic()
@@ -208,10 +262,10 @@ class _Report:
 
     def _print(self, *, patient: bool) -> None:
         for base, robot in list(self._sender.robots.items()):
-            line = _line(robot, patient=patient)
-            if robot.driveable is not None and robot.driveable.doubt:
+            line = _line(robot, patient=patient, sent=self._outbox.has_sent(base))
+            if line and robot.driveable is not None and robot.driveable.doubt:
                 line += f"; its status says: {robot.driveable.doubt}"
-            if self._lines.get(base) != line:
+            if self._lines.get(base, "") != line:
                 self._lines[base] = line
                 _echo(shown(f"{id_of(base)}: {line}"))
 
@@ -224,7 +278,7 @@ def _echo(line: str, *, err: bool = False) -> None:
         show.discard_output(sys.stderr if err else sys.stdout)
 
 
-def _line(robot: RobotStop, *, patient: bool) -> str:
+def _line(robot: RobotStop, *, patient: bool, sent: bool) -> str:
     match robot.progress:
         case Progress.CONFIRMED if not robot.estop.latched:
             return "was stopped, and reset since"
@@ -239,6 +293,8 @@ def _line(robot: RobotStop, *, patient: bool) -> str:
             return "does not drive"
         case Progress.NOT_CONFIRMED:
             return f"NOT CONFIRMED, no longer sent: {robot.why}"
+    if not sent:
+        return "" if patient else "STOP NOT SENT YET: it waits for the network"
     return "stop sent" if patient else f"stop sent, not confirmed yet: {robot.why}"
 
 
@@ -246,14 +302,14 @@ def _line(robot: RobotStop, *, patient: bool) -> str:
 
 
 def _reset(target: Target) -> int:
-    with connected(target) as (transport, names):
+    with connected(target) as (transport, names), listening(target, transport) as second:
         view, name = RobotView(names.base), shown(id_of(names.base))
         robot = view.estop
         put_names(transport, names, lambda base: base == robot.base and robot.named)
-        robot.subscribe(transport)
-        transport.subscribe(LINK.topic(robot.base), lambda one: view.receive(LINK, one, 0.0, 0.0), direct=True)
+        robot.subscribe(second)
+        second.subscribe(LINK.topic(robot.base), lambda one: view.receive(LINK, one, 0.0, 0.0), direct=True)
         wait_for(lambda: robot.has_capabilities, _ANSWER_S)
-        transport.ask(robot.missing)  # the capabilities may have come after the subscription
+        second.ask(robot.missing)  # the capabilities may have come after the subscription
         wait_for(lambda: not robot.missing, _ANSWER_S)
         if not robot.states:
             raise PebbleError(f"{name} publishes no emergency stop: {_absent(robot)}")

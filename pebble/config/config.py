@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import msgspec
 from msgspec.structs import asdict, replace
 
 from pebble.config.home import in_home
@@ -16,6 +17,8 @@ from pebble.config.reader import Reader
 from pebble.config.rules.between_keys import CHECKS
 from pebble.config.rules.exposure import warn_if_readable
 from pebble.config.tree import Root, SerialBridge, SerialBridges
+from pebble.config.types import Topic
+from pebble.contract import DRIVE
 from pebble.contract.identity import Identity
 from pebble.contract.serial_protocols import SERIAL_PROTOCOLS
 from pebble.errors import ConfigError
@@ -85,6 +88,17 @@ class Config(Root, frozen=True, kw_only=True):
         """Those of the enabled serial lines that drive motors."""
         lines = self.serial_instances().items()
         return {name: line for name, line in lines if SERIAL_PROTOCOLS[line.protocol].drives}
+
+    @property
+    def zeros(self) -> tuple[str, ...]:
+        """The drive topics of what moves the robot and cannot latch: to it a stop is a zero."""
+        ros = self.services.ros1_bridge
+        if not ros.get("enabled") or not _object(ros, "drive").get("enabled", True):
+            return ()
+        try:
+            return (msgspec.convert(_object(ros, "topics").get("drive_values"), Topic),)
+        except msgspec.ValidationError:  # it names none, or one that no message may have
+            return (DRIVE.topic(self.base),)
 
     def media_programs(self) -> tuple[str, ...]:
         """The on-demand programs for pictures and sound, by the services' names."""
@@ -214,3 +228,9 @@ def resolved(config: Config) -> dict[str, Any]:
             "serial_instances": list(config.serial_instances()),
         }
     }
+
+
+def _object(section: Mapping[str, Any], key: str) -> Mapping[str, Any]:
+    """The object at ``key`` of a section that is not checked; empty where something else is."""
+    value = section.get(key)
+    return value if isinstance(value, dict) else {}

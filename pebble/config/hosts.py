@@ -7,6 +7,7 @@ from urllib.parse import unquote
 
 from pebble.config.secret_text import without_secrets
 from pebble.config.visible import hidden
+from pebble.contract.identity import untypeable
 from pebble.errors import PebbleError
 
 _SCHEME = re.compile(r"([A-Za-z][A-Za-z0-9+.-]*)://")
@@ -106,6 +107,13 @@ def no_login(text: str) -> str:
     if without_secrets(text) != text:
         raise HostError("holds a login or a password, and is shown to everybody: remove it")
     return text
+
+
+def typeable(text: str) -> str:
+    """A name that people type, such as a robot's. Raises HostError for one that they cannot."""
+    if why := untypeable(text):
+        raise HostError(why)
+    return no_login(text)
 
 
 def no_url(text: str) -> str:

@@ -16,7 +16,7 @@ _RESERVED = "(?:[^/]+/){3}(?:incoming|outgoing)/(?:estop|(?:by|control|from|to|n
 _TOPIC = rf"^(?!\$)(?!{_RESERVED})(?!(?:[^/]*/){{200}})[^{_BAD}]{{1,250}}$(?!\n)"
 
 # ``expected`` completes a problem's text "must be …, not …".
-Level = Annotated[str, Meta(pattern=LEVEL, extra={"expected": LEVEL_RULE, "parse": hosts.no_login})]
+Level = Annotated[str, Meta(pattern=LEVEL, extra={"expected": LEVEL_RULE, "parse": hosts.typeable})]
 Topic = Annotated[
     str,
     Meta(

@@ -104,6 +104,9 @@ class EstopOffer(Payload, frozen=True, kw_only=True):
     reset_topic: str | UnsetType = UNSET
     owners: list[str] | UnsetType = UNSET  # the names of all motor owners: a stop is confirmed when each reports it
     status_topics: list[str] | UnsetType = UNSET  # of their states, in the order of `owners`
+    zeros: list[str] | UnsetType = (
+        UNSET  # drive topics of what moves and no stop can hold: while it is sent, zeros go there
+    )
 
 
 class LightsOffer(Payload, frozen=True, kw_only=True):

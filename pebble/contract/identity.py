@@ -1,8 +1,11 @@
 """The identity of a component, three levels of a topic, and how topics are built and parsed."""
 
+import json
 import re
+from collections.abc import Iterable
 from enum import StrEnum
 from functools import lru_cache
+from unicodedata import normalize
 
 from msgspec import Struct
 
@@ -83,6 +86,26 @@ class ParsedTopic(Struct, frozen=True):
     @property
     def topic(self) -> str:
         return f"{self.identity.base}/{self.direction}/{self.metric}"
+
+
+def composed(name: str) -> str:
+    """Return a name as keyboards write it: one letter with its accent, not two (Unicode's NFC)."""
+    return normalize("NFC", name)
+
+
+def untypeable(name: str) -> str:
+    """Return why people cannot type this name, with what to write instead; empty: they can."""
+    if name in (".", ".."):
+        return "is a folder, and no name: write another"
+    return "" if composed(name) == name else f"has a letter that no keyboard writes: write {json.dumps(composed(name))}"
+
+
+def meant(names: Iterable[str], typed: str) -> str:
+    """Return which of these names is typed, or else looks the same; ``typed`` itself if none does."""
+    if typed.isascii():
+        return typed
+    alike = [name for name in names if composed(name) == composed(typed)]
+    return typed if typed in alike or not alike else alike[0]
 
 
 def parse_topic(topic: str) -> ParsedTopic | None:

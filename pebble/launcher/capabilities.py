@@ -128,14 +128,14 @@ def _motor(
 ) -> tuple[offers.DriveOffer, offers.EstopOffer, offers.LightsOffer, offers.TelemetryOffer]:
     """Drive, stop, lights and telemetry of the serial line to the motor MCU, with *its* effective topics."""
     lines = config.motor_lines()
-    present = bool(lines)
+    present, moves = bool(lines), bool(lines or config.zeros)
     name, line = next(iter(lines.items())) if lines else ("", config.services.serial_mcu_bridge)
     if name:
         addresses = Addresses(view_of(config, name))
     drive = offers.DriveOffer(
-        available=present,
-        controls=present,
-        topic=addresses[c.DRIVE].topic,
+        available=moves,
+        controls=moves,
+        topic=addresses[c.DRIVE].topic if present or not config.zeros else config.zeros[0],
         arbitrates=present or UNSET,
         axes=["x", "z"] if present else UNSET,  # a line has speeds of two wheels
         control=(present and "control" not in lacking) or UNSET,
@@ -170,6 +170,7 @@ def _estop(config: Config, instances: list[str]) -> offers.EstopOffer:
         reset_topic=c.ESTOP_RESET.topic(config.base),
         owners=owners,
         status_topics=[c.ESTOP_STATE.topic(config.base, owner=owner) for owner in owners],
+        zeros=list(config.zeros) or UNSET,
     )
 
 

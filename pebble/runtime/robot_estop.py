@@ -41,6 +41,7 @@ class RobotEstop:
         self.drives = True  # False: its capabilities exclude drive commands. Readers assume what is missing
         self.drive_topic = DRIVE.topic(base)
         self.script_topic = AUTONOMY_COMMAND.topic(base)
+        self.zeros: tuple[str, ...] = ()  # further drive topics, of what no stop can hold
         self.owners: tuple[str, ...] = ()  # as its capabilities list them
         self._states: dict[str, EstopState] = {}
         self._capabilities_topic = CAPABILITIES.topic(base)
@@ -116,6 +117,9 @@ class RobotEstop:
         self.drives = drive.get("available") is not False
         self.drive_topic = self._topic(drive.get("topic"), DRIVE)
         self.script_topic = self._topic(_section(value, "autonomy").get("command_topic"), AUTONOMY_COMMAND)
+        zeros = estop.get("zeros")
+        listed = zeros[:MAX_OWNERS] if isinstance(zeros, list) else ()
+        self.zeros = tuple(dict.fromkeys(self._topic(topic, DRIVE) for topic in listed))
         self.has_capabilities = True  # last: other threads may read meanwhile
         return True
 

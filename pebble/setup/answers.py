@@ -12,7 +12,7 @@ from msgspec.structs import asdict
 from pebble.config import hosts
 from pebble.config.text_files import read_password
 from pebble.config.web import is_loopback
-from pebble.contract.identity import LEVEL, LEVEL_RULE
+from pebble.contract.identity import LEVEL, LEVEL_RULE, untypeable
 from pebble.contract.names import NAME
 from pebble.contract.serial_protocols import SERIAL_PROTOCOLS
 from pebble.errors import PebbleError
@@ -135,6 +135,8 @@ def combined(earlier: Answers, given: Mapping[str, Any]) -> Answers:
 def _mistakes(earlier: Answers, answers: Answers) -> Iterator[str]:
     if answers.id is not None and not re.search(LEVEL, answers.id):
         yield f"id: must be {LEVEL_RULE}, not {answers.id!r}"
+    elif answers.id is not None and (why := untypeable(answers.id)):
+        yield f"id: {why}"
     if earlier.id not in (None, answers.id):
         yield f"id: this robot is {earlier.id}; docs/life-of-a-robot.md says how it gets another name"
     if answers.broker == HERE and answers.account == PAGE:

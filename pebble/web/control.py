@@ -304,7 +304,6 @@ class Control:
             return
 
         def granted() -> None:
-            server.operated(op.ref)
             self._audit("take over" if op.over else "take", op.ref)
 
         if not op.over and (state := server.drivers.robot(op.ref).published) is not None and state.id:

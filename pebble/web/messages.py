@@ -403,6 +403,8 @@ class BrokerView(Struct, frozen=True, kw_only=True):
     #: What the server is not sent although it is connected, such as by one of several brokers, and why.
     not_received: str
     robots_omitted: int
+    #: Whether a stop was sent to robots that cannot confirm it, because there is no room for more.
+    stops_omitted: bool
 
 
 class PictureFrom(Struct, frozen=True, kw_only=True):

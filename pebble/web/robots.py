@@ -14,7 +14,6 @@ from typing import Any, NamedTuple
 import msgspec
 
 from pebble import contract as c
-from pebble.client.rank import Rank, RankedTable
 from pebble.client.robot_topics import FLEET, SYNONYMS, names, section_of
 from pebble.client.robot_view import RobotView
 from pebble.contract import channel_of, codec, is_reserved
@@ -29,7 +28,6 @@ from pebble.web.restarts import Restarts
 log = logging.getLogger(__name__)
 
 MAX_COMPONENTS, MAX_METRICS, MAX_VALUE_BYTES = 2000, 200, 64 * 1024
-_SHARES = 16  # shares of a rank: of eight, so half of the places are left for what is known from before
 _MAX_CLIPS_BYTES = 400 * 1024  # of the list of clips, which has up to 256 KiB of names
 LARGE_BYTES = 16 * 1024  # a value beyond holds up a slow connection: one is sent, then the page has to answer
 MAX_STATE_BYTES = 128 * 1024  # of values in one message: pings, by which pages drive, do not wait for thousands
@@ -52,8 +50,8 @@ class _Value(NamedTuple):
 class Component:
     """One component, by the messages it publishes."""
 
-    def __init__(self, ref: str, rank: Rank) -> None:
-        self.ref, self.rank = ref, rank
+    def __init__(self, ref: str) -> None:
+        self.ref = ref
         self.robot = RobotView(ref)
         self.values: dict[str, _Value] = {}
         self.bytes = 0  # of the values
@@ -67,10 +65,6 @@ class Component:
     def live(self) -> bool:
         """Whether anything but retained messages has arrived from it."""
         return self.robot.liveness.received_at is not None
-
-    def update_rank(self, *, known: bool) -> None:
-        """It falls once the component is silent: what was there long ago must not keep out what is there now."""
-        self.rank = Rank.of(self.robot.estop, known=known, live=self.live and self.sent_online is not False)
 
     def take_heartbeat(self, message: Message, now: float, wall: float) -> bool:
         """Take a heartbeat; whether the component ends with it."""
@@ -116,8 +110,10 @@ class Robots:
     """All components. Only the event loop calls it."""
 
     def __init__(self) -> None:
-        self.components = RankedTable[Component](MAX_COMPONENTS, MAX_COMPONENTS // _SHARES)
-        self.before: Collection[str] = ()  # robots that are known from before
+        self.components: dict[str, Component] = {}
+        #: Robots that get a place in any case, and those that lose it to none: they are open, driven or stopped.
+        self.is_wanted: Callable[[str], bool] = lambda _ref: False
+        self.is_kept: Callable[[str], bool] = lambda _ref: False
         self.omitted = 0  # messages of components, metrics and values beyond the limits
         self.interests: set[Interest] = set()
         self.on_forget: Callable[[str], object] = lambda _: None
@@ -232,7 +228,7 @@ class Robots:
 
         ``channel``: how it is read, if the contract does not have it.
         """
-        component = self.components.get(ref) or self._add(ref, metric, message)
+        component = self.components.get(ref) or self._add(ref)
         channel = channel or _channel(metric)
         if component is None or channel is None:
             return
@@ -266,7 +262,6 @@ class Robots:
         Whether a component is there is sent at once. What is merely older than before is sent of what is open, and of a
         third of the others, or fewer: no page has to draw all of them at once, and a thousand robots are no flood.
         """
-        self.components.ranks_have_changed()
         older: list[Component] = []
         opened = {interest.watched for interest in self.interests}
         every_s = max(_REFRESH_S, len(self.components) / _REFRESHES_PER_S)
@@ -285,43 +280,33 @@ class Robots:
 
     def _refresh(self, component: Component, now: float) -> None:
         component.sent_online, component.refreshed_at = component.robot.online(now), now
-        component.update_rank(known=self._is_known(component.ref))
         self.set_server_metric(component.ref, "web/liveness", component.view(now))
         if c.ONLINE.metric in component.values:
             self._mark(component.ref, c.ONLINE.metric)
 
-    def _is_known(self, ref: str) -> bool:
-        """From before, or to a person who has it open."""
-        return ref in self.before or any(interest.watched == ref for interest in self.interests)
-
-    def _add(self, ref: str, metric: str, message: Message) -> Component | None:
-        known, live = self._is_known(ref), not message.retain
+    def _add(self, ref: str) -> Component | None:
         if len(self.components) >= MAX_COMPONENTS:
             if not self.omitted:
-                log.warning("more than %d components at this broker: pages do not show all", MAX_COMPONENTS)
+                log.warning("more than %d components at this broker: give it accounts", MAX_COMPONENTS)
             self.omitted += 1
-        if self.components.refuses(Rank.at_most(metric, known=known, live=live)):
-            return None
-        rank = Rank.of_message(ref, message, known=known, live=live)
-        if not self.components.make_room(rank, self.forget):
-            return None
-        component = self.components[ref] = Component(ref, rank)
+            if not self.is_wanted(ref):
+                return None
+            newest = next((other for other in reversed(self.components) if not self.is_kept(other)), None)
+            if newest is not None:
+                self.forget(newest)
+            self.on_forget(ref)  # what it published before found no place: it is asked for
+        component = self.components[ref] = Component(ref)
         return component
 
     def _has_room(self, component: Component, metric: str, channel: c.Channel, grows: int) -> bool:
-        """Whether there is room for a value, if necessary after removing components of a lower rank that have more."""
         is_new = metric not in component.values
         if is_new and len(component.values) >= MAX_METRICS and channel.is_pattern and not component.lists(metric):
             return False
-        if component.bytes + grows <= RESERVED_BYTES:
-            return True
-        while self._bytes + grows > MAX_BYTES - MAX_COMPONENTS * RESERVED_BYTES:
-            lowest = self.components.below(component.rank, lambda one: one.bytes > RESERVED_BYTES)
-            if lowest is None:
-                return False
-            self.forget(lowest)
-            self.omitted += 1
-        return True
+        return (
+            component.bytes + grows <= RESERVED_BYTES
+            or self._bytes + grows <= MAX_BYTES - MAX_COMPONENTS * RESERVED_BYTES
+            or self.is_kept(component.ref)
+        )
 
     def _store(self, component: Component, metric: str, channel: c.Channel, message: Message, now: float) -> bool:
         """Check and store the value; False if it is refused."""
@@ -363,8 +348,7 @@ class Robots:
             robot.remembered[message.topic] = message  # the table of values bounds how many
         if channel in (c.CAPABILITIES, c.ESTOP_STATE):
             before = robot.capabilities
-            if robot.receive_stop(channel, message, now):
-                component.update_rank(known=self._is_known(component.ref))
+            robot.receive_stop(channel, message, now)
             robot.capabilities = robot.capabilities or before  # empty ones take nothing away
         elif channel in (c.CONTROL_STATE, c.LINK):
             robot.receive(channel, message, now, 0.0)

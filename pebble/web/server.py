@@ -11,7 +11,9 @@ from typing import Any
 import msgspec
 
 from pebble.client.broker import Broker
+from pebble.client.connection import in_small_segments
 from pebble.client.estop import send
+from pebble.client.heartbeats import Heartbeats
 from pebble.client.page import WebSettings
 from pebble.client.robot_topics import FLEET, SYNONYMS
 from pebble.config.security import SecurityLevel
@@ -23,11 +25,10 @@ from pebble.fleet.database import DatabaseError
 from pebble.fleet.people import People
 from pebble.fleet.roles import Session
 from pebble.runtime.by_name import ByName
-from pebble.transports import Message
+from pebble.transports import Message, QoS, Subscription
 from pebble.transports.clock import since_boot as clock
 from pebble.web import messages as m
 from pebble.web.drive.drivers import Drivers
-from pebble.web.known_robots import SavedRobots
 from pebble.web.media.chosen_sources import ChosenSources
 from pebble.web.media.pictures_and_sound import PicturesAndSound
 from pebble.web.media.robot_streams import OwnHosts
@@ -42,7 +43,6 @@ PEOPLE_S = 0.5  # between two looks at whether people or sessions were changed
 _REFRESH_S = 0.25
 _MANY_WAIT = 16 * 1024  # bytes that the broker has not confirmed
 _ESTOP_METRIC = "web/estop"
-_DAY_S = 24 * 3600
 
 
 class Server:
@@ -51,32 +51,36 @@ class Server:
     def __init__(self, settings: WebSettings, people: People, audit: Audit) -> None:
         self.settings, self.people, self.audit = settings, people, audit
         self._base = Identity("pebble", SERVERS, f"{settings.name}-{secrets.token_hex(2)}").base
-        self.broker = Broker(settings.broker)
+        self.broker, self.stop_broker = (
+            Broker(in_small_segments(settings.broker), name) for name in ("pebble-web", "pebble-web-stops")
+        )
         self.robots, self.stops = Robots(), Stops(self._has_sent)
         self.drivers = Drivers(self.broker, self.robots)
         self.media = PicturesAndSound(settings.broker, self.robots, self._note_talk)
-        self.saved = SavedRobots(people)
-        known = self.robots.before = self.saved.robots
-        self.broker.is_named = self.media.connection.broker.is_named = self._is_named
-        self.broker.is_known = lambda topic: "/".join(topic.split("/", 3)[:3]) in known
+        for broker in (self.broker, self.stop_broker, self.media.connection.broker):
+            broker.is_named = self._is_named
+        self._heartbeats: Heartbeats | None = None  # while a stop of all goes to further robots
         self.open_components = OpenComponents(self.broker, self.robots, self.spawn)
         # What is drawn over the picture comes from there.
         self.sources = ChosenSources(people, self.robots, OwnHosts(settings), self.open_components.update)
-        self.by_name = ByName(FLEET, lambda ref: ref in known or ref in self.open_components)
-        self.robots.on_forget = self.by_name.forget
+        self.by_name = ByName(FLEET, self._is_wanted)
+        self.robots.is_wanted = self._is_wanted
+        self.robots.is_kept = lambda ref: self._is_wanted(ref) or self.stops.sends_to(ref)
+        self.robots.on_forget = self._ask_anew
+        self._of_all: list[Subscription] = []
         self.people_version = (0, 0, 0)
         self._tasks: set[asyncio.Task[None]] = set()
 
     async def open(self) -> None:
         """Connect to the broker and subscribe. Raises TransportError for settings that can never work."""
         self.broker.on_move(self._moved)
-        await self.broker.open()
+        await asyncio.gather(self.broker.open(), self.stop_broker.open())
         self.broker.on_state(self._show_broker)
         self.broker.on_state(self.drivers.renew_keys)
         self._show_broker()
         for channel in (*FLEET, *SYNONYMS):
             deferred = channel is ONLINE or channel in SYNONYMS
-            await self.broker.subscribe(channel.filter("+/+/+"), self.receive, deferred=deferred)
+            self._of_all.append(await self.broker.subscribe(channel.filter("+/+/+"), self.receive, deferred=deferred))
         self.spawn(self._tick())
         if self.settings.login:
             self.spawn(self._watch_people())
@@ -92,7 +96,9 @@ class Server:
             await asyncio.gather(*self._tasks, return_exceptions=True)
         finally:
             await self.media.close()
-            await asyncio.gather(self.media.connection.close(), self.broker.close())
+            if self._heartbeats is not None:
+                await asyncio.to_thread(self._heartbeats.close)
+            await asyncio.gather(self.media.connection.close(), self.stop_broker.close(), self.broker.close())
 
     def spawn(self, work: Coroutine[Any, Any, None]) -> None:
         """Run it until it ends or the server does."""
@@ -121,6 +127,12 @@ class Server:
             for one in (ref, *(page for page, source in self.robots.sources.items() if source == ref)):
                 self.open_components.update(one)
 
+    def _ask_anew(self, ref: str) -> None:
+        """What this robot has published is not known any more, although it has been delivered."""
+        self.by_name.forget(ref)
+        for subscription in self._of_all:
+            subscription.renew()
+
     def _moved(self, ref: str, host: str, first: bool) -> None:
         self.drivers.moved(ref)
         if host:
@@ -132,29 +144,48 @@ class Server:
             problem=self.broker.problem,
             not_received=self.broker.not_received,
             robots_omitted=self.robots.omitted,
+            stops_omitted=self.stops.omitted(clock()),
         )
         self.robots.set_server_metric("", "web/broker", view)
 
     # -- to the broker
 
     def _send(self, messages: list[Message]) -> None:
-        send(self.broker.publish, messages)
+        """Publish messages of stops: on a connection on which nothing arrives, for which they would wait."""
+        send(self._publish_stop, messages)
+
+    def _publish_stop(self, topic: str, payload: bytes, *, qos: QoS) -> bool:
+        return any(broker.publish(topic, payload, qos=qos) for broker in (self.stop_broker, self.broker))
+
+    def _hear(self, now: float) -> None:
+        """Stop further robots while a stop of all goes to them, by heartbeats that wait for nothing else."""
+        if self._heartbeats is None:
+            if self.stops.collecting:
+                self._heartbeats = Heartbeats(in_small_segments(self.settings.broker))
+            return
+        for message in self._heartbeats.take():
+            self._send(self.stops.receive(message, now))
+        if not self.stops.collecting:
+            heartbeats, self._heartbeats = self._heartbeats, None
+            self.spawn(asyncio.to_thread(heartbeats.close))
 
     def _has_sent(self) -> bool:
         """Whether little waits to be sent. To repeat the stop of a thousand robots before would only delay its end."""
-        return self.broker.transport.outgoing.waiting < _MANY_WAIT
+        return self.stop_broker.transport.outgoing.waiting < _MANY_WAIT
 
     def stop(self, ref: str, name: str, session: Session, device: str, why: str, address: str = "") -> None:
         """An emergency stop of one component, or of all (""): sent at once, and repeated until it is confirmed."""
         by = f"{session.user} on {device}" if device else session.user
         if ref and not _is_base(ref):
             return
-        known, before = [one.robot for one in self.robots.components.values()], tuple(self.saved.robots)
-        self._send(
-            self.stops.press(ref, name, by=by, why=why, now=clock(), known=known, before=before, user=session.user)
-        )
+        known = [component.robot for component in self.robots.components.values()]
+        self._send(self.stops.press(ref, name, by=by, why=why, now=clock(), known=known, user=session.user))
         self.show_stops()
         self.audit.write("stop", ref=ref or "all", user=session.user, device=device, address=address, detail=why)
+
+    def _is_wanted(self, ref: str) -> bool:
+        """True if a page has it open, drives it or has stopped it."""
+        return ref in self.open_components or self.drivers.drives(ref) or self.stops.names(ref)
 
     # -- names
 
@@ -194,13 +225,13 @@ class Server:
                 self.broker.deliver()
                 now = clock()
                 self.drivers.tick(now)
+                self._hear(now)
                 self._send(self.stops.tick(now))
                 self.show_stops()
                 if now >= refresh_at:
                     refresh_at = now + _REFRESH_S
                     self.robots.refresh(time.monotonic())
                     self._show_broker()
-                    self._remember_robots()
             except (
                 Exception
             ):  # one faulty round must not end all later ones, on which the end of silent gestures depends
@@ -212,16 +243,6 @@ class Server:
             with suppress(DatabaseError):  # which the looks at sessions report
                 self.people_version = await asyncio.to_thread(self.people.version)
             await asyncio.sleep(PEOPLE_S)
-
-    def operated(self, ref: str) -> None:
-        """A person drives this robot from here."""
-        self.saved.robots.operated(ref, int(time.time() // _DAY_S))
-
-    def _remember_robots(self) -> None:
-        for component in self.robots.components.values():
-            self.saved.robots.seen(component.robot, component.rank, int(time.time() // _DAY_S))
-        if (saving := self.saved.save()) is not None:
-            self.spawn(saving)
 
     def show_stops(self) -> None:
         """Let pages see what has changed of emergency stops."""

@@ -3,10 +3,10 @@
 The robot remembers the stop; see docs/emergency-stop.md.
 """
 
-from collections.abc import Callable, Collection, Iterable
+import logging
+from collections.abc import Callable, Iterable
 
 from pebble.client.estop import COLLECT_S, Progress, RobotStop, StopSender
-from pebble.client.rank import Rank
 from pebble.client.robot_view import RobotView
 from pebble.contract.identity import parse_topic
 from pebble.runtime.robot_estop import RobotEstop
@@ -14,9 +14,9 @@ from pebble.transports import Message
 from pebble.web import messages as m
 from pebble.web.pace import STOP_WAITS_S, Pace
 
-MAX_STOPS = 512  # that are being sent at once: more than one of each robot that is known from before
-MAX_SAME = 64  # of them for the same robot, or for all: the newest are sent,
-MAX_EACH = 4  # and of those by one user
+log = logging.getLogger(__name__)
+
+MAX_STOPS = 2000  # that are repeated and confirmed at once: one of each robot
 _SHOWN_S = 60.0  # so long pages see how a finished stop ended
 
 _SENDING = {
@@ -37,8 +37,10 @@ class Stops:
         self.changed: set[str] = set()  # robots whose view may be another one now
         self._senders: dict[str, tuple[StopSender, float]] = {}  # by name, the newest last
         self._over: set[str] = set()  # those that send nothing more: to ask a thousand robots at each heartbeat is slow
-        self._users: dict[str, str] = {}  # who has pressed each of them
+        self._users: dict[str, str | None] = {}  # who has pressed each of them; None: several people, one after another
         self._refs: dict[str, str] = {}  # for which robot; "": all
+        self._names: dict[str, str] = {}  # the stop of each robot, or of all
+        self._crowded_at = float("-inf")  # when one was ended for lack of room
         self._shown: dict[str, tuple[str, str]] = {}  # by robot: progress and words, as pages see them
         self._paces: dict[str, Pace] = {}  # by person
 
@@ -51,23 +53,22 @@ class Stops:
         why: str,
         now: float,
         known: Iterable[RobotView],
-        before: Collection[str] = (),
         user: str = "",
     ) -> list[Message]:
-        """Stop one robot, or all if ``ref`` is "".
+        """Stop one robot, or all if ``ref`` is "": it takes the place of the stop that was sent to the same.
 
-        ``known`` are the robots from which messages were received; those known from ``before`` are stopped with
-        all, too.
+        ``known`` are the robots from which messages were received.
         """
         if name in self._senders:
             return []
-        self._make_room(ref, user)
-        sender = StopSender(name, by=by, why=why, now=now, robots=[ref] if ref else None, known=before, own_only=True)
-        self._senders[name], self._users[name], self._refs[name] = (sender, now), user, ref
-        for robot in known:
-            if not ref or robot.base == ref:
-                for message in robot.remembered.values():
-                    sender.receive(message, now)
+        robots = [robot for robot in known if ref in ("", robot.base)]
+        named, bases = [ref] if ref else None, [robot.base for robot in robots]
+        sender = StopSender(name, by=by, why=why, now=now, robots=named, known=bases, own_only=True)
+        self._users[name] = user if self._replaced(ref, user, now) else None
+        self._senders[name], self._refs[name], self._names[ref] = (sender, now), ref, name
+        for robot in robots:
+            for message in robot.remembered.values():
+                sender.receive(message, now)
         self.changed |= set(sender.robots)
         return self.tick(now)
 
@@ -83,8 +84,25 @@ class Stops:
             self.changed |= set(sender.robots)
 
     def user(self, name: str) -> str | None:
-        """Who has pressed this stop; None if it is not known here."""
+        """Who has pressed this stop; None: it is not known here, or stands for that of another person as well."""
         return self._users.get(name)
+
+    def names(self, ref: str) -> bool:
+        """True if there is a stop of this robot alone."""
+        return ref in self._names
+
+    def sends_to(self, ref: str) -> bool:
+        """True if there is a stop of this robot, or one of all that has a place for it."""
+        return any(ref in sender.robots for sender, _ in self._senders.values())
+
+    @property
+    def collecting(self) -> bool:
+        """True while a stop of all goes to further robots."""
+        return "" in self._names and self._senders[self._names[""]][0].collecting
+
+    def omitted(self, now: float) -> bool:
+        """True if a stop was sent to robots that cannot confirm it, because there is no room for more."""
+        return now - self._crowded_at < _SHOWN_S or any(sender.omitted for sender, _ in self._senders.values())
 
     def receive(self, message: Message, now: float) -> list[Message]:
         """Take a message of a robot; returns what to publish to this robot now."""
@@ -92,8 +110,9 @@ class Stops:
         if address is None:
             return []
         ref, messages = address.identity.base, []
-        for name, (sender, began) in self._senders.items():
-            if self._refs[name] in ("", ref) and (name not in self._over or now - began < COLLECT_S):
+        for name in [self._names[key] for key in (ref, "") if key in self._names]:
+            sender, began = self._senders[name]
+            if name not in self._over or now - began < COLLECT_S:
                 sender.receive(message, now)
                 messages += sender.tick_robot(ref, now, again=self._repeats)
                 self._note_progress(sender, ref)
@@ -135,28 +154,32 @@ class Stops:
         if ref in sender.robots and self._shown.get(ref) != _progress(sender.robots[ref]):
             self.changed.add(ref)
 
-    def _make_room(self, ref: str, user: str) -> None:
-        same = [name for name, one in self._refs.items() if one == ref]
-        same.sort(key=lambda name: not self._senders[name][0].finished)  # stable: else the oldest first
-        own = [name for name in same if self._users[name] == user]
-        for name in {*same[: max(0, len(same) - MAX_SAME + 1)], *own[: max(0, len(own) - MAX_EACH + 1)]}:
+    def _replaced(self, ref: str, user: str, now: float) -> bool:
+        """Make room for a stop, first that of an older one of the same; True if the new one is this user's alone."""
+        is_own = True
+        if (older := self._names.get(ref)) is not None:
+            is_own = older in self._over or self._users[older] == user
+            self._remove(older)
+        while len(self._senders) >= MAX_STOPS:
+            name = min(self._senders, key=self._worth)
+            if name not in self._over:
+                self._crowded_at = now
+                log.warning("more than %d stops at once: that of %s is not confirmed", MAX_STOPS, self._refs[name])
             self._remove(name)
-        if len(self._senders) >= MAX_STOPS:
-            newest = {one: name for name, one in self._refs.items() if not self._senders[name][0].finished}
-            self._remove(min(self._senders, key=lambda name: self._worth(name, newest.get(self._refs[name]))))
+        return is_own
 
-    def _worth(self, name: str, newest: str | None) -> tuple[bool, bool, bool, Rank]:
-        """What is confirmed goes first, then what a newer stop stops as well, then robots that may be invented."""
-        sender, ref = self._senders[name][0], self._refs[name]
-        rank = sender.robots[ref].rank if ref else Rank()
-        return not sender.finished, name == newest, not ref, rank
+    def _worth(self, name: str) -> tuple[bool, bool, bool]:
+        """Of equal ones the oldest goes: what is over, what nothing was heard of, what is of one robot alone."""
+        robots = self._senders[name][0].robots.values()
+        heard = not self._refs[name] or any(robot.live or robot.estop.has_capabilities for robot in robots)
+        return name not in self._over, heard, not self._refs[name]
 
     def _remove(self, name: str) -> None:
         sender, _ = self._senders.pop(name)
         sender.end()
         self.changed |= set(sender.robots)
         self._over.discard(name)
-        del self._users[name], self._refs[name]
+        del self._users[name], self._names[self._refs.pop(name)]
 
     def _newest(self, ref: str) -> tuple[str, RobotStop | None]:
         for name, (sender, _) in reversed(self._senders.items()):

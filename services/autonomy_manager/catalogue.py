@@ -15,6 +15,7 @@ import pebble
 from pebble.config import Config
 from pebble.config.autonomy import Script as ScriptSection
 from pebble.config.home import in_home
+from pebble.contract.identity import meant
 from pebble.services.autonomy_manager.describe import (
     MANIFEST,
     BrokenScriptError,
@@ -104,10 +105,14 @@ class Catalogue:
         if len(name) > _LONGEST_NAME or not name.isprintable() or "]" in name:
             self._complain(name[:_LONGEST_NAME], "%r is not offered: rename its folder", name)
             return False
-        return self._section.scripts.get(name, ScriptSection()).enabled
+        return self._section_of(name).enabled
+
+    def _section_of(self, name: str) -> ScriptSection:
+        sections = self._section.scripts
+        return sections.get(meant(sections, name), ScriptSection())
 
     def _script(self, name: str, folder: Path, before_asking: Callable[[], object]) -> Script | None:
-        section = self._section.scripts.get(name, ScriptSection())
+        section = self._section_of(name)
         entry, manifest = folder / section.entrypoint, folder / MANIFEST
         described = self._manifests.get(name, [manifest], lambda: _manifest(manifest)) or Description()
         if not described.command and not entry.is_file():

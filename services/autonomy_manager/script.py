@@ -6,6 +6,7 @@ from typing import Any
 
 from msgspec import Struct
 
+from pebble.contract.identity import meant
 from pebble.errors import PebbleError
 from pebble.services.autonomy_manager.forms import Setting, SettingError, Value, arguments, effective, shown
 
@@ -58,7 +59,7 @@ class Plan(Struct, frozen=True):
 
 def plan(scripts: Mapping[str, Script], file: str, config: Mapping[str, Any]) -> Plan:
     """Check a start. Raises StartError."""
-    script = scripts.get(file)
+    script = scripts.get(meant(scripts, file))
     if script is None:
         raise UnknownScriptError(f"Unknown autonomy file: {shown(file)}")
     if script.broken:
@@ -70,7 +71,7 @@ def plan(scripts: Mapping[str, Script], file: str, config: Mapping[str, Any]) ->
 
 def _dependency(scripts: Mapping[str, Script], file: str, dependency: Dependency) -> Step:
     failed = f"Failed to start {file}"
-    script = scripts.get(dependency.file)
+    script = scripts.get(meant(scripts, dependency.file))
     if script is None:
         raise UnknownScriptError(f"{failed}: Dependency script not found: {shown(dependency.file)}")
     if script.broken:

@@ -8,6 +8,7 @@ from msgspec import Struct
 
 from pebble.config.home import in_home
 from pebble.contract import MEDIA_REPORT, SOUNDBOARD_COMMAND, SOUNDBOARD_FILES, SOUNDBOARD_STATUS
+from pebble.contract.identity import meant
 from pebble.contract.payloads import STOP_WORDS, MediaReport, SoundboardCommand, SoundboardFiles, SoundboardStatus
 from pebble.runtime.service import Service, on
 from pebble.services.soundboard_handler.clips import Clip, Clips
@@ -92,6 +93,8 @@ class SoundboardHandler(Service):
             self._error = "Play command missing file"
             return None
         clip = self._clips.find(name) or self._clips.find(name.strip())
+        if clip is None and not name.isascii():
+            clip = self._clips.find(meant(self._clips.scan(), name.strip()))
         if clip is None:
             self._error = f"Sound file not found: {name[:_LONGEST_NAME]}"
             return None

@@ -8,7 +8,7 @@ from itertools import pairwise
 import pytest
 
 from pebble.client import estop
-from pebble.client.estop import MAX_PASSED, MAX_ROBOTS, Progress, StopSender, new_name, send
+from pebble.client.estop import MAX_ROBOTS, Progress, StopSender, new_name, send
 from pebble.transports import Message, QoS
 from tests.client.estop_robot import Robot, capabilities, outgoing
 
@@ -193,6 +193,48 @@ def test_a_person_may_end_it() -> None:
     assert stop.robots[GOOB].progress is Progress.NOT_CONFIRMED
 
 
+#: What may wrongly be taken for something that does not drive, and how often a stop of all is sent to it in 2 s.
+MOVERS: dict[str, tuple[Message, int]] = {
+    "no capabilities": (outgoing(GOOB, "online", {"t": 1}), 4),
+    "a board of the original": (outgoing(GOOB, "online", {"t": 1, "subscribes": ["incoming/drive-values"]}), 4),
+    "another type": (outgoing("pebble/lamps/mini", "online", {"t": 1}), 4),
+    "an unknown section": (capabilities(GOOB, {"arm": {"available": True}}), 4),
+    "a drive section that is none": (capabilities(GOOB, {"drive": ["x"], "estop": 5}), 4),
+    "capabilities that are none": (outgoing(GOOB, "capabilities", [1]), 4),
+    "driving without a stop": (capabilities(GOOB, {"drive": {"available": True}}), 4),
+    "no driving, with a stop": (
+        capabilities(GOOB, {"drive": {"available": False}, "estop": {"available": True, "owners": ["arm"]}}),
+        4,
+    ),
+    "ROS beside it": (capabilities(GOOB, {"drive": {"available": True}, "estop": {"zeros": [DRIVE]}}), 4),
+    "it says that it does not drive": (capabilities(GOOB, {"drive": {"available": False}, "estop": {}}), 1),
+}
+
+
+@pytest.mark.parametrize(("message", "times"), MOVERS.values(), ids=MOVERS)
+def test_a_stop_of_all_reaches_what_may_move(message: Message, times: int) -> None:
+    stop = sender()
+    receive(stop, message, now=0.0)
+    base = message.topic.partition("/outgoing/")[0]
+    sent = [topics(stop.tick(now)) for now in (0.0, 0.5, 1.0, 1.5)]
+    assert sum(f"{base}/incoming/drive-values" in some for some in sent) == times
+
+
+@pytest.mark.parametrize("owners", [[], ["serial"]])
+def test_what_no_stop_can_hold_gets_zeros_for_a_minute_and_is_never_confirmed(owners: list[str]) -> None:
+    ros = f"{GOOB}/incoming/ros/drive"
+    section = {
+        "available": bool(owners),
+        "owners": owners,
+        "zeros": [ros, 5, "pebble/robots/fred/incoming/drive-values"],
+    }
+    stop, robot = sender(GOOB), Robot(GOOB, *owners, estop=section)
+    receive(stop, robot.capabilities(), *robot.take(stop.tick(0.0)), now=0.1)
+    assert topics(stop.tick(0.5)) == [ESTOP, f"{GOOB}/incoming/autonomy-command", DRIVE, ros]
+    assert stop.robots[GOOB].why == "it has motors that no stop can hold: they get zeros"
+    assert (sent_times(stop, 100.0)[-1], stop.robots[GOOB].progress) == (59.5, Progress.NOT_CONFIRMED)
+
+
 # -- all robots
 
 
@@ -230,7 +272,8 @@ def test_a_component_that_does_not_drive_is_spared_once_that_is_known() -> None:
     receive(stop, capabilities(GOOB, {"drive": {"available": False}}), now=0.1)
     assert (stop.tick(0.5), stop.robots[GOOB].progress) == ([], Progress.SPARED)
     receive(stop, capabilities(FRED, {"drive": {"available": False}}), now=0.6)
-    assert stop.tick(0.6) == []
+    assert topics(stop.tick(0.6)) == [f"{FRED}/incoming/autonomy-command", f"{FRED}/incoming/drive-values"]
+    assert (stop.tick(1.2), stop.robots[FRED].progress) == ([], Progress.SPARED)
     assert not stop.confirmed, "no robot was stopped"
 
 
@@ -267,22 +310,15 @@ LATCH = Robot(GOOB, "serial").owners[0].latch
 STATE = ("estop/serial", LATCH.state(True))
 BAD_STATE = ("estop/serial", {"latched": "no"})
 
-#: What strangers publish for each of their components, then the real robot, and whether it gets a place of theirs.
+#: What strangers publish for each of their components, and then the real robot.
 CROWDS = [
-    ([HEARTBEAT], [HEARTBEAT], False),
-    ([HEARTBEAT], [PICTURE], False),
-    ([HEARTBEAT], [BAD_STATE], False),
-    ([HEARTBEAT], [CAPABILITIES], True),
-    ([HEARTBEAT], [HEARTBEAT, CAPABILITIES], True),
-    ([HEARTBEAT], [STATE], True),
-    ([HEARTBEAT, BAD_STATE], [CAPABILITIES], True),
-    ([RETAINED], [HEARTBEAT], True),
-    ([RETAINED], [PICTURE], True),
-    ([RETAINED], [RETAINED], False),
-    ([CAPABILITIES], [HEARTBEAT], False),
-    ([CAPABILITIES, HEARTBEAT], [STATE], True),
-    ([STATE], [CAPABILITIES], False),
-    ([STATE, CAPABILITIES, HEARTBEAT], [STATE, CAPABILITIES, HEARTBEAT], False),
+    ([HEARTBEAT], [HEARTBEAT]),
+    ([HEARTBEAT], [PICTURE]),
+    ([HEARTBEAT, BAD_STATE], [CAPABILITIES]),
+    ([RETAINED], [HEARTBEAT]),
+    ([RETAINED], [RETAINED]),
+    ([CAPABILITIES, HEARTBEAT], [STATE]),
+    ([STATE, CAPABILITIES, HEARTBEAT], [STATE, CAPABILITIES, HEARTBEAT]),
 ]
 
 
@@ -300,9 +336,9 @@ def places(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> i
 
 
 @pytest.mark.parametrize("hold", [False, True])
-@pytest.mark.parametrize(("theirs", "own", "has_place"), CROWDS)
+@pytest.mark.parametrize(("theirs", "own"), CROWDS)
 def test_a_crowd_of_strangers_keeps_the_stop_from_no_robot(
-    places: int, theirs: list[tuple[str, object]], own: list[tuple[str, object]], *, has_place: bool, hold: bool
+    places: int, theirs: list[tuple[str, object]], own: list[tuple[str, object]], *, hold: bool
 ) -> None:
     stop, sent = sender(hold=hold), []
     for step in range(20):
@@ -314,7 +350,7 @@ def test_a_crowd_of_strangers_keeps_the_stop_from_no_robot(
     assert sent[0] == 0.0
     assert max(later - earlier for earlier, later in pairwise([*sent, 5.0])) <= 0.5
     assert len(sent) <= 10, "at most twice a second"
-    assert (GOOB in stop.robots, len(stop.robots)) == (has_place, places)
+    assert (GOOB in stop.robots, len(stop.robots)) == (False, places)
     assert stop.omitted
     assert not stop.confirmed
 
@@ -324,33 +360,33 @@ def publish_quietly(stop: StopSender, base: str, bodies: list[tuple[str, object]
         stop.receive(outgoing(base, metric, body, retain=metric == "status"), now)
 
 
-def test_a_robot_without_a_place_gets_the_stop_for_a_minute_and_more_often_rather_than_less() -> None:
+def test_robots_without_a_place_get_the_stop_for_a_minute_however_many() -> None:
+    stop, crowd = sender(), [f"pebble/robots/r{number}" for number in range(4 * MAX_ROBOTS)]
+    for base in crowd:
+        publish_quietly(stop, base, [HEARTBEAT], 0.0)
+    assert {f"{base}/incoming/estop" for base in crowd} <= set(topics(stop.tick(0.0)))
+    last = f"{crowd[-1]}/incoming/estop"
+    sent = [last in topics(publish(stop, crowd[-1], [HEARTBEAT], now)) for now in (0.1, 0.6, 0.7, 59.0, 60.0)]
+    assert (sent, stop.finished) == ([False, True, False, True, False], True)
+
+
+def test_a_stop_that_is_ended_goes_to_no_robot_without_a_place(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(estop, "MAX_ROBOTS", 0)
     stop = sender()
-    for number in range(MAX_ROBOTS + MAX_PASSED + 1):
-        publish_quietly(stop, f"pebble/robots/r{number}", [HEARTBEAT], 0.0)
-    first, last = f"pebble/robots/r{MAX_ROBOTS}", f"pebble/robots/r{MAX_ROBOTS + MAX_PASSED}"
-    assert len({topic for topic in topics(stop.tick(0.0)) if topic.endswith("/estop")}) == MAX_ROBOTS + MAX_PASSED + 1
-    assert topics(publish(stop, last, [HEARTBEAT], 0.1)) == []
-    assert f"{first}/incoming/estop" in topics(publish(stop, first, [HEARTBEAT], 0.1))
-    assert f"{first}/incoming/estop" in topics(publish(stop, first, [HEARTBEAT], 59.0))
-    assert publish(stop, first, [HEARTBEAT], 60.0) == []
-    assert stop.finished
+    publish_quietly(stop, GOOB, [HEARTBEAT], 0.0)
+    stop.end()
+    assert stop.tick(0.0) == []
 
 
-def test_robots_known_from_before_are_stopped_unheard_and_keep_their_places() -> None:
+def test_robots_that_the_caller_knows_are_stopped_unheard_and_confirm_it_in_a_crowd() -> None:
+    robot = Robot(GOOB, "serial")
     stop = StopSender(new_name(), by="", why="", now=0.0, robots=None, known=[GOOB])
-    assert topics(stop.tick(0.0)) == [ESTOP, DRIVE]
     for number in range(MAX_ROBOTS + 5):
         publish_quietly(stop, f"pebble/robots/r{number}", [CAPABILITIES, HEARTBEAT], 0.1)
-    assert topics(stop.tick(0.5))[:2] == [ESTOP, DRIVE], "before those of strangers"
-
-
-def test_a_confirmation_counts_although_strangers_fill_every_place() -> None:
-    stop, robot = sender(), Robot(GOOB, "serial")
-    for number in range(MAX_ROBOTS):
-        publish_quietly(stop, f"pebble/robots/r{number}", [CAPABILITIES, HEARTBEAT], 0.1)
-    receive(stop, *robot.take(publish(stop, GOOB, [HEARTBEAT], 0.2)), robot.capabilities(), now=0.3)
-    assert (robot.owners[0].latch.latched, stop.robots[GOOB].progress) == (True, Progress.CONFIRMED)
+    first = stop.tick(0.1)
+    assert topics(first)[:2] == [ESTOP, DRIVE]
+    receive(stop, *robot.take(first[:1]), robot.capabilities(), now=0.3)
+    assert stop.robots[GOOB].progress is Progress.CONFIRMED
     assert not stop.confirmed, "others are omitted"
 
 
@@ -406,7 +442,7 @@ def test_a_hold_stops_a_robot_again_that_has_lost_its_memory_and_no_other() -> N
     receive(stop, restarted.owners[0].state(), now=20.0)
     assert topics(stop.tick(20.0)) == [ESTOP, DRIVE]
     receive(stop, *restarted.take(stop.tick(20.5)), now=20.6)
-    assert stop.confirmed
+    assert stop.robots[GOOB].confirmed_s == pytest.approx(0.6)
 
 
 def test_a_hold_is_not_disturbed_by_later_stops_of_others() -> None:

@@ -28,6 +28,11 @@ def test_names_to_listen_to(name: str, filters: list[str]) -> None:
     assert Names(GOOB).filters(name) == filters
 
 
+@pytest.mark.parametrize("typed", ["bär", "ba\u0308r", "pebble/robots/ba\u0308r"])
+def test_an_id_is_typed_in_one_form(typed: str) -> None:
+    assert base_of(typed) == "pebble/robots/b\u00e4r"
+
+
 def test_names_to_publish_to() -> None:
     names = Names(base_of("goob"))
     assert names.topic("audio") == f"{GOOB}/incoming/audio"

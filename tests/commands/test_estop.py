@@ -21,8 +21,10 @@ from pebble.transports import Message, MqttSettings, State, create
 from tests.client.estop_robot import Robot, outgoing
 from tests.commands.command_line import Run, config_file, program, running
 from tests.fakes.bad_brokers import BEHAVIOURS, resolving, serving
+from tests.sparing_broker import SparingBroker
 from tests.support import Broker, until
 from tests.tcp_proxy import TcpProxy
+from tests.web.served import Served
 
 _numbers = itertools.count(1)
 
@@ -343,6 +345,62 @@ def test_a_slow_network_does_not_delay_repetitions(robot_on: Make, broker: Broke
     ):
         assert until(lambda: len(times) >= 2, 30)
     assert times[1] - times[0] < 1.7, "two seconds if it waited for its subscriptions"
+
+
+#: What a broker keeps, too long to arrive, of a stranger or of the robot itself, and who stops the robot all the same.
+KEPT = {
+    "capabilities of a stranger": ("pebble/robots/attic", "capabilities", ("estop", "--all")),
+    "its own capabilities": ("", "capabilities", ("estop", "--all")),
+    "its own status": ("", "status", ("estop", "--all")),
+    "a heartbeat of a stranger": ("pebble/robots/attic", "online", ("estop", "--all")),
+    "a state of a stranger": ("pebble/robots/attic", "estop/x", ("estop", "--all", "--hold")),
+    "its own capabilities, by name": ("", "capabilities", ("estop", "{id}")),
+    "a state that a stranger invents of it": ("", "estop/invented", ("estop", "{id}")),
+    "capabilities of a stranger, on a page": ("pebble/robots/attic", "capabilities", ("page", "")),
+    "a heartbeat of a stranger, on a page": ("pebble/robots/attic", "online", ("page", "")),
+    "its own capabilities, on its page": ("", "capabilities", ("page", "{base}")),
+    "capabilities of a stranger, in its status": ("pebble/robots/attic", "capabilities", ("estop", "status", "{id}")),
+    "capabilities of a stranger, at its reset": ("pebble/robots/attic", "capabilities", ("estop", "reset", "{id}")),
+}
+
+
+@pytest.mark.parametrize(("base", "metric", "words"), KEPT.values(), ids=KEPT)
+def test_a_stop_waits_for_nothing_that_a_broker_keeps(
+    broker: Broker, robot_on: Make, base: str, metric: str, words: tuple[str, ...]
+) -> None:
+    robot = robot_on("serial")
+    kept, heartbeat = f"{base or robot.base}/outgoing/{metric}", Heartbeat(robot)
+    robot.publish(Message(kept, json.dumps({"value": "x" * 5000}).encode()))
+    sparing = SparingBroker(broker.port, longest=1500)
+    program_, *more = (word.format(id=robot.id, base=robot.base) for word in words)
+    with ExitStack() as opened:
+        for end in (sparing.close, heartbeat.stop, lambda: robot.publish(Message(kept, b""))):
+            opened.callback(end)
+        if more[0] in ("reset", "status"):
+            robot.stop()
+            out, err = program(program_, *more, f"--url=mqtt://127.0.0.1:{sparing.port}").communicate(timeout=40)
+            assert (": free" if more[0] == "reset" else "stopped by ann@desk") in out, err
+            return
+        robot.deaf = True
+        if program_ == "page":
+            page = opened.enter_context(opened.enter_context(Served(sparing.port)).page())
+            page.send("estop", ref=more[0], stop="a" * 16)
+        else:
+            opened.enter_context(running(program_, *more, f"--url=mqtt://127.0.0.1:{sparing.port}"))
+        assert until(lambda: robot.count("estop") > 3, 10), "it is repeated"
+        assert sparing.stalled or metric == "online"
+
+
+def test_a_stop_counts_as_sent_once_it_has_left(robot_on: Make, broker: Broker) -> None:
+    robot = robot_on("serial")
+    robot.deaf = True
+    with (
+        TcpProxy(broker.port) as proxy,
+        running("estop", robot.id, f"--url=mqtt://127.0.0.1:{proxy.port}") as process,
+    ):
+        assert until(lambda: robot.count("estop") >= 1, 30)
+        assert process.stdout is not None
+        assert process.stdout.readline() == f"{robot.id}: stop sent\n"
 
 
 def test_a_config_file_leads_to_the_robots_own_side_and_to_the_remote_one(

@@ -87,6 +87,17 @@ def test_what_is_meant_stays(tmp_path: Path) -> None:
         assert problems(tmp_path, raw) == ""
 
 
+@pytest.mark.parametrize("key", ["id", "type", "system"])
+@pytest.mark.parametrize(
+    ("name", "way_out"), [("ba\u0308r", '"b\\u00e4r"'), (".", "write another"), ("..", "write another"), ("bär", "")]
+)
+def test_a_name_that_nobody_can_type_is_refused_with_what_to_write(
+    tmp_path: Path, key: str, name: str, way_out: str
+) -> None:
+    found = problems(tmp_path, config(f"robot/{key}", name))
+    assert (f"robot.{key}: " in found, found.count("\n"), way_out in found) == (bool(way_out), 0, True)
+
+
 def test_a_key_that_looks_like_another(tmp_path: Path) -> None:
     found = problems(tmp_path, config(f"{REMOTE}/ho\u200bst", "x"))
     assert 'has a key "host" that holds U+200B' in found

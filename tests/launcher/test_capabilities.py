@@ -306,6 +306,34 @@ def test_a_motor_that_is_an_instance_is_advertised_under_its_own_names() -> None
     assert value["estop"]["owners"] == ["base"]
 
 
+@pytest.mark.parametrize(
+    ("services", "moves", "owners", "zeros"),
+    [
+        ({}, False, [], None),
+        ({"ros1_bridge": {"enabled": False}}, False, [], None),
+        ({"ros1_bridge": {"enabled": True, "drive": {"enabled": False}}}, False, [], None),
+        ({"ros1_bridge": {"enabled": True}}, True, [], [f"{BASE}/incoming/drive-values"]),
+        ({"ros1_bridge": {"enabled": True, "topics": {"drive_values": "a/b"}}}, True, [], ["a/b"]),
+        ({"serial_mcu_bridge": MOTOR}, True, ["serial"], None),
+        (
+            {"serial_mcu_bridge": MOTOR, "ros1_bridge": {"enabled": True}},
+            True,
+            ["serial"],
+            [f"{BASE}/incoming/drive-values"],
+        ),
+    ],
+)
+def test_what_ros_moves_drives_and_gets_zeros_at_a_stop(
+    services: dict[str, Any], moves: bool, owners: list[str], zeros: list[str] | None
+) -> None:
+    value = of(**services)
+    assert (value["drive"]["available"], value["estop"]["owners"], value["estop"].get("zeros")) == (
+        moves,
+        owners,
+        zeros,
+    )
+
+
 def test_without_an_emergency_stop_no_owner_is_listed() -> None:
     wheels = {name: {"enabled": True, "serial": {"port": f"/dev/{name}"}} for name in ("left", "right")}
     raw = {"robot": {"id": "rover"}, "services": {"serial_mcu_bridge": {"instances": wheels}}}

@@ -162,7 +162,12 @@ def fleet(now: int) -> list[Value]:
     """Four robots, one of them off, and three components of other types."""
     lamp = liveness(latency_ms=900.0, whole_seconds=True)
     return [
-        ("", "web/broker", {"connected": True, "problem": "", "not_received": "", "robots_omitted": 0}, 0),
+        (
+            "",
+            "web/broker",
+            {"connected": True, "problem": "", "not_received": "", "robots_omitted": 0, "stops_omitted": False},
+            0,
+        ),
         *goob(now),
         *robot(now, FRED, "mqtt", 11.8, charging=True),
         (FRED, "autonomy-status", {"running": True, "timestamp": now / 1000, "file": "apriltag-follow"}, 1000),
@@ -363,6 +368,7 @@ NO_BROKER = {
     "problem": "connection refused by 10.0.0.2:8883",
     "not_received": "",
     "robots_omitted": 0,
+    "stops_omitted": False,
 }
 NOT_RECEIVED = "messages come from only 1 of 2 brokers: broker spare.lab:8884 refused us: not authorized"
 ONE_BROKER = NO_BROKER | {"connected": True, "problem": "", "not_received": NOT_RECEIVED}

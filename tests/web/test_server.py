@@ -3,19 +3,20 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import pytest
 
 from pebble.client.page import WebSettings
+from pebble.client.robot_view import RobotView
 from pebble.fleet.audit import Audit
 from pebble.fleet.people import People
 from pebble.transports import Message, MqttSettings
 from pebble.web import robots as robots_module
+from pebble.web.drive.driven_robot import Tab
 from pebble.web.robots import Interest, Robots
 from pebble.web.server import Server
-from tests.web.served import FREE
 
 _CAPABILITIES = {"t": 1, "value": {"drive": {"available": True}, "estop": {"available": True, "owners": ["serial"]}}}
 
@@ -50,37 +51,56 @@ def test_what_no_topic_may_be_called_is_refused_and_nothing_else(server: Server,
     assert server.broker.publish(topic, b"{}") is False
 
 
-#: What speaks for a robot beside strangers who publish capabilities: what it has published, and whether it is known.
-ROBOTS = {
-    "it has a stop": ([published(GOOB, "estop/serial", FREE, retain=True)], False),
-    "it is known from before": ([published(GOOB, "capabilities", _CAPABILITIES, retain=True)], True),
-    "it is alive": (
-        [published(GOOB, "capabilities", _CAPABILITIES), published(GOOB, "online", {"t": 1, "online": True})],
-        False,
+#: What a page does with a robot, whether it gets a place that way, and whether it keeps one.
+USES: dict[str, tuple[Callable[[Server], object], tuple[bool, bool]]] = {
+    "nothing": (lambda _: None, (False, False)),
+    "it is open": (lambda server: server.open_components.open(GOOB), (True, True)),
+    "it is driven": (lambda server: setattr(server.drivers.robot(GOOB), "tab", Tab("", "ann", "")), (True, True)),
+    "it is stopped": (
+        lambda server: server.stops.press(GOOB, "a" * 16, by="", why="", now=1.0, known=[]),
+        (True, True),
+    ),
+    "all are stopped": (
+        lambda server: server.stops.press("", "a" * 16, by="", why="", now=1.0, known=[RobotView(GOOB)]),
+        (False, True),
     ),
 }
 
 
-@pytest.mark.parametrize(("messages", "known"), ROBOTS.values(), ids=ROBOTS)
-def test_strangers_keep_no_robot_out_and_push_none_out(
-    monkeypatch: pytest.MonkeyPatch, messages: list[Message], known: bool
+@pytest.mark.parametrize(("use", "expected"), USES.values(), ids=USES)
+def test_a_robot_keeps_its_place_while(
+    server: Server, monkeypatch: pytest.MonkeyPatch, use: Callable[[Server], object], expected: tuple[bool, bool]
+) -> None:
+    monkeypatch.setattr(server.open_components, "update", lambda _ref: None)
+    use(server)
+    assert (server.robots.is_wanted(GOOB), server.robots.is_kept(GOOB)) == expected
+
+
+@pytest.mark.parametrize(
+    ("comes", "wanted", "kept", "stays"),
+    [
+        ("first", False, False, False),
+        ("first", False, True, True),
+        ("first", True, True, True),
+        ("last", False, False, False),
+        ("last", True, True, True),
+    ],
+)
+def test_no_crowd_takes_the_place_of_a_robot_that_a_page_uses(
+    monkeypatch: pytest.MonkeyPatch, comes: str, wanted: bool, kept: bool, stays: bool
 ) -> None:
     monkeypatch.setattr(robots_module, "MAX_COMPONENTS", 20)
-    robots = Robots()
-    robots.before = {GOOB} if known else ()
-
-    def flood() -> None:
-        for number in range(25):
-            robots.receive(published(f"pebble/robots/e{number}", "capabilities", _CAPABILITIES), 1.0)
-
-    flood()
-    for message in messages:
-        robots.receive(message, 1.0)
-    robots.refresh(1.0)
-    assert GOOB in robots.components
-    flood()
-    flood()
-    assert GOOB in robots.components
+    robots, opened = Robots(), [f"pebble/robots/open{number}" for number in range(30)]
+    robots.is_wanted = lambda ref: ref in opened or (wanted and ref == GOOB)
+    robots.is_kept = lambda ref: ref in opened or (kept and ref == GOOB)
+    crowd = [f"pebble/robots/e{number}" for number in range(25)]
+    for ref in [GOOB, *crowd] if comes == "first" else [*crowd, GOOB]:
+        robots.receive(published(ref, "capabilities", _CAPABILITIES), 1.0)
+    assert len(robots.components) == 20
+    for ref in opened:
+        robots.receive(published(ref, "online", {"t": 1}), 1.0)
+    assert set(robots.components) == {*opened, *[GOOB] * stays}
+    assert robots.omitted
 
 
 def test_pages_get_what_a_stranger_subscribes_to_until_it_publishes_what_it_can_do() -> None:

@@ -16,12 +16,12 @@ from pebble.runtime.robot_estop import RobotEstop
 from pebble.transports import Message, MqttSettings
 from pebble.web import stops as stops_module
 from pebble.web.server import Server
-from pebble.web.stops import MAX_EACH, Stops
+from pebble.web.stops import Stops
 from tests.support import cases
 
 A, B = "pebble/robots/a", "pebble/robots/b"
 FIRST = "f" * 16
-MOST, SAME = cases(96, stops_module.MAX_STOPS), cases(12, stops_module.MAX_SAME)  # of stops, as these tests have it
+MOST = cases(96, stops_module.MAX_STOPS)  # of stops, as these tests have it
 
 
 def press(stops: Stops, ref: str, user: str = "ann") -> str:
@@ -50,8 +50,7 @@ def capabilities_of(ref: str) -> Message:
 def test_other_stops_end_none_that_is_repeated(
     monkeypatch: pytest.MonkeyPatch, ref: str, others: list[tuple[str, str]]
 ) -> None:
-    for name, value in {"MAX_STOPS": MOST, "MAX_SAME": SAME}.items():
-        monkeypatch.setattr(stops_module, name, value)
+    monkeypatch.setattr(stops_module, "MAX_STOPS", MOST)
     stops = Stops()
     press(stops, ref)
     if ref:
@@ -86,16 +85,31 @@ def test_a_stop_that_is_over_asks_none_of_its_robots_at_each_heartbeat(monkeypat
     assert (stops.tick(1.0 + GIVE_UP_S), asked) == ([], [])
 
 
-def test_a_stop_that_makes_room_for_others_is_shown_no_longer() -> None:
+@pytest.mark.parametrize(
+    ("ref", "users", "may_end"),
+    [(A, ["ann", "ann"], "ann"), (A, ["ann", "eve"], None), ("", ["ann", "eve", "eve"], None), (A, ["eve"], "eve")],
+)
+def test_a_newer_stop_of_the_same_takes_the_place_of_the_older(ref: str, users: list[str], may_end: str | None) -> None:
+    """Who presses after another person may not end what stands for both."""
+    stops, names = Stops(), list[str]()
+    for user in users:
+        names.append(press(stops, ref, user))
+        stops.receive(capabilities_of(A), 1.0)
+    assert [stops.user(name) for name in names] == [None] * (len(users) - 1) + [may_end]
+    assert stops.view(RobotEstop(A)).stop == names[-1]
+    assert [one.topic for one in stops.tick(1.6)].count(ESTOP.topic(A)) == 1
+
+
+def test_a_stop_that_is_no_longer_confirmed_for_lack_of_room_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(stops_module, "MAX_STOPS", 2)
     stops = Stops()
-    stops.press(A, FIRST, by="ann", why="", now=0.0, known=[], user="ann")
-    assert stops.view(RobotEstop(A)).sending == "sent"
+    press(stops, A)
+    press(stops, B)
+    assert not stops.omitted(1.0)
     stops.changed.clear()
-    for number in range(MAX_EACH):
-        stops.press(A, f"{number:016x}", by="ann", why="", now=1.0, known=[], user="ann")
-    assert stops.user(FIRST) is None
+    press(stops, "pebble/robots/c")
     assert A in stops.changed
-    assert stops.view(RobotEstop(A)).stop == f"{MAX_EACH - 1:016x}"
+    assert (stops.view(RobotEstop(A)).sending, stops.omitted(1.0), stops.omitted(99.0)) == ("", True, False)
 
 
 @pytest.mark.parametrize("topic", [f"{B}/incoming/drive-values", f"{A}/outgoing/status"])

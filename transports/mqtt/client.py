@@ -163,7 +163,7 @@ class Client:
     def open(self) -> None:
         """Connect, and send CONNECT. Raises OSError; ValueError for a host that cannot be a name."""
         opening = self._opening
-        sock = dial(opening.address)
+        sock = dial(opening.address, max_segment=opening.settings.max_segment)
         try:
             sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
             sock.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER)

@@ -79,7 +79,10 @@ def _transport(reader: Reader, transport: TransportSection, path: Path) -> Trans
 
 def _services(reader: Reader, services: Services, path: Path) -> Services:
     if services.ros1_bridge.get("enabled"):
-        reader.notes.warning((*path, "ros1_bridge"), "is enabled, but arrives in a later release; skipped")
+        reader.notes.warning(
+            (*path, "ros1_bridge"),
+            "is enabled, but arrives in a later release; skipped, and a stop sends zeros to one that runs",
+        )
     if services.video_stream.enabled and not services.video_stream.command:
         reader.notes.doubt((*path, "video_stream", "command"), "is missing, write the program that streams the video")
     if services.soundboard_handler.enabled and not services.soundboard_handler.playback.player_command:

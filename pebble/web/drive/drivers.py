@@ -56,6 +56,10 @@ class Drivers:
         self._turn(robot, now)
         return had
 
+    def drives(self, ref: str) -> bool:
+        """True if a page has control of that robot."""
+        return ref in self._driven and self._driven[ref].tab is not None
+
     def restore(self, token: str, tab: Tab) -> None:
         """A page has connected again: it asks for what it had, but no gesture goes on.
 
@@ -96,8 +100,7 @@ class Drivers:
 
     def stop(self, ref: str, by: str) -> None:
         """A zero from anybody, who need not drive."""
-        view = self._robots.view(ref)
-        if view is not None and (view.drives or not view.capabilities):
+        if self._robots.view(ref) is not None:
             self._publish(self.robot(ref).stop(clock()), by)
 
     # -- of robots

@@ -326,6 +326,7 @@ export interface BrokerView {
   problem: string;
   not_received: string;
   robots_omitted: number;
+  stops_omitted: boolean;
 }
 
 export interface Metrics {

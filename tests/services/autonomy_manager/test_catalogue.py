@@ -51,6 +51,14 @@ def scripts(folder: Path, **section: Any) -> dict[str, Script]:
     return scanned(Catalogue(config(folder, **section)))
 
 
+def test_a_section_of_the_config_is_that_of_a_folder_whose_name_looks_the_same(tmp_path: Path) -> None:
+    write(tmp_path, "ba\u0308r")
+    assert [list(scripts(tmp_path, scripts={"b\u00e4r": {"enabled": on}})) for on in (True, False)] == [
+        ["ba\u0308r"],
+        [],
+    ]
+
+
 def test_folders_with_an_entry_point_are_scripts(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     for name in ("beta", "Alpha", ".hidden", "_draft", "off", "bad]name"):
         write(tmp_path, name)

@@ -38,6 +38,13 @@ def test_a_plan_has_the_dependencies_with_their_own_settings() -> None:
     assert found.config == {"speed": 0.1}
 
 
+@pytest.mark.parametrize(("there", "typed"), [("ba\u0308r", "b\u00e4r"), ("b\u00e4r", "ba\u0308r"), ("bar", "bar")])
+def test_a_script_is_started_by_a_name_that_looks_the_same(there: str, typed: str) -> None:
+    found = plan({"x": script("x", Dependency(typed)), there: script(there)}, "x", {})
+    assert [step.script.file for step in found.dependencies] == [there]
+    assert plan({there: script(there)}, typed, {}).main.script.file == there
+
+
 @pytest.mark.parametrize(
     ("file", "config", "error"),
     [

@@ -50,6 +50,13 @@ def test_a_clip_is_listed_played_as_it_is_and_over(
     assert both.became(playing=True, file="warn/Alarm.WAV")
 
 
+def test_a_clip_is_played_by_a_name_that_looks_the_same(both: Soundboard) -> None:
+    write_wav(both.sounds / "ba\u0308r.wav", tone(2.0))
+    both.start()
+    both.play("b\u00e4r.wav")
+    assert both.became(playing=True, file="ba\u0308r.wav", error=None)
+
+
 def test_retained_commands_are_refused_also_after_a_restart(both: Soundboard) -> None:
     write_wav(both.sounds / "a.wav", tone(0.1))
     both.send({"action": "play", "file": "a.wav"}, retain=True)

@@ -295,8 +295,9 @@ function tally({ pressed }, store) {
   if (!pressed || pressed.ref || Date.now() - pressed.at > SHOWN_MS) return null;
   const sent = stops(store).filter(({ stop, sending }) => stop === pressed.stop && sending !== "spared");
   const confirmed = sent.filter(({ sending }) => sending === "confirmed").length;
+  const all = confirmed === sent.length && !store.get("", "web/broker")?.value?.stops_omitted;
   return sent.length > 1 &&
-    html`<b data-test="tally">STOP ALL: ${confirmed === sent.length ? "all" : `${confirmed} of`} ${sent.length} confirmed.</b>`;
+    html`<b data-test="tally">STOP ALL: ${all ? "all" : `${confirmed} of`} ${sent.length} confirmed.</b>`;
 }
 
 /** A stop that was pressed here and of which no robot shows anything yet. */
@@ -313,7 +314,7 @@ function PressBanner() {
   }
   const whom = pressed.ref ? nameIn(store, pressed.ref) : "all robots";
   if (age < NO_ANSWER_MS) {
-    return html`<${Banner} kind="warn" icon="stop"><p role="alert">STOP of ${whom}: sent…</p><//>`;
+    return html`<${Banner} kind="warn" icon="stop"><p role="alert">STOP of ${whom}: being sent…</p><//>`;
   }
   if (!pressed.reached) {
     return html`<${Banner} kind="bad">

@@ -44,7 +44,7 @@ export function Fleet() {
   useModel(settings);
   useTick(1000); // robots come and go
   const refs = useRefs();
-  const omitted = useValue("", "web/broker")?.robots_omitted ?? 0;
+  const { robots_omitted: omitted = 0, stops_omitted: unconfirmed = false } = useValue("", "web/broker") ?? {};
   const [filter, setFilter] = useState(kept.filter);
   kept.filter = filter;
   const present = new Set(refs.filter((ref) => isPresent(store, ref)));
@@ -84,7 +84,11 @@ export function Fleet() {
     ${omitted > 0 &&
     html`<p class="dim" data-test="omitted">
       Too much is sent at this broker: beside these ${total}, ${omitted} messages of further components, or values, are
-      not shown. STOP ALL reaches all.
+      not shown. STOP ALL reaches all. Give the broker accounts.
+    </p>`}
+    ${unconfirmed &&
+    html`<p role="alert" data-test="stops-omitted">
+      There are more robots or stops than fit: the others got the stop, NOT CONFIRMED.
     </p>`}
     ${total === 0 && html`<${Empty} />`}
     ${total > 0 && !shown.length && !shownAway.length && html`<p class="empty">Nothing matches “${filter}”.</p>`}

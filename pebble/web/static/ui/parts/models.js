@@ -375,7 +375,7 @@ export class Offers {
 
   /** Whether a stop means anything to it. */
   get stops() {
-    return this.assumed || this.drives || Object.keys(this.section("estop")).length > 0;
+    return this.isRobot || this.drives || Object.keys(this.section("estop")).length > 0;
   }
 
   get hasVideo() {
