@@ -1,5 +1,6 @@
 """The SQLite file of people, sessions and the audit log: opened, and followed while others replace it."""
 
+import errno
 import os
 import sqlite3
 from collections.abc import Callable, Iterator, Sequence
@@ -129,8 +130,11 @@ class Database:
         """Raises OSError and sqlite3.Error."""
         path = self._path
         if path is not None:
-            os.close(os.open(path, os.O_RDWR))  # it may be gone again: SQLite would make an empty one
-            path.chmod(0o600)
+            if path.is_dir():
+                raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
+            path.chmod(
+                0o600
+            )  # raises where it is gone: SQLite would make an empty one. To open and close it ends locks
         where = ":memory:" if path is None else str(path)
         connection = sqlite3.connect(where, timeout=_BUSY_S, isolation_level=None, check_same_thread=False)
         connection.execute("PRAGMA journal_mode = WAL")

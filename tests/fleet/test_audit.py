@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import sqlite3
+import subprocess
+import sys
 import threading
 import time
 from contextlib import closing
@@ -12,6 +14,7 @@ import pytest
 
 from pebble.fleet import audit as audit_module
 from pebble.fleet.audit import OTHERS, Audit
+from pebble.fleet.people import People
 from pebble.runtime.row_writer import DIFFERENT, OF_STRANGERS
 from tests.support import until
 
@@ -72,6 +75,19 @@ def test_long_and_odd_texts_are_stored() -> None:
     assert len(log.read(1)[0].ref) == 200
     assert log.read(1)[0].detail == "? '; DROP TABLE audit; --"
     log.close()
+
+
+def test_who_reads_the_rows_in_another_process_takes_none_away(tmp_path: Path) -> None:
+    file = tmp_path / "people.sqlite"
+    people, log = People(file), Audit(file)
+    for number in range(3):
+        log.write("stop", detail=f"{number}")
+        assert until(lambda number=number: len(log.read(9)) == number + 1)
+        program = f"import sqlite3; print(len(list(sqlite3.connect({str(file)!r}).execute('SELECT * FROM audit'))))"
+        seen = subprocess.run([sys.executable, "-c", program], check=True, capture_output=True)
+        assert int(seen.stdout) == number + 1
+    log.close()
+    people.close()
 
 
 def test_many_threads_write(tmp_path: Path) -> None:

@@ -128,12 +128,13 @@ def test_who_adds_a_row_never_waits_and_what_finds_no_room_is_counted(
     assert "audit: 1" not in caplog.text
 
 
-@pytest.mark.parametrize("further", [0, 2])
+@pytest.mark.parametrize(("rows", "step_s"), [(1, 0.0), (3, 0.0), (WAITING + 5, WINDOW_S / DIFFERENT)])
 def test_rows_that_cannot_be_stored_at_the_end_are_counted(
-    store: Store, caplog: pytest.LogCaptureFixture, further: int
+    store: Store, caplog: pytest.LogCaptureFixture, rows: int, step_s: float
 ) -> None:
     store.fails = True
-    for _ in range(1 + further):
-        store.add("stop")
+    for number in range(rows):
+        store.now += step_s
+        store.add("stop", number if step_s else 0)
     assert store.end() == []
-    assert f"audit: {1 + further} rows are lost" in caplog.text
+    assert f"audit: {rows} rows are lost" in caplog.text

@@ -160,6 +160,7 @@ def test_a_flood_of_refusals_hides_no_act(log: Log) -> None:
 def test_the_log_is_the_robots_own_and_turns_over(log: Log, monkeypatch: pytest.MonkeyPatch) -> None:
     assert until(log.path.exists)
     assert stat.S_IMODE(log.path.stat().st_mode) == 0o600
+    assert stat.S_IMODE(log.path.parent.stat().st_mode) == 0o700
     monkeypatch.setattr(audit_module, "_MOST_BYTES", 300)
     log.path.write_bytes(b"a" * 299 + b"\n")
     for number in range(2):
