@@ -32,6 +32,7 @@ class CountedMedia(MediaReceiver):
 
     def __init__(self, transport: Transport, base: str) -> None:
         super().__init__(transport, base)
+        self._transport = transport
         self.counted: Counter[str] = Counter()
         self.watched: set[Medium] = set()  # that others have requested
         self.was_watched = False
