@@ -31,10 +31,10 @@ def drive(
     *,
     target: Target,
 ) -> int:
-    """Drive a robot with the keys of this terminal; it prints them.
+    """Drive a robot with the keys of this terminal, which it prints. What interrupts a drive ends it: press anew.
 
-    A key counts as held for 0.4 s after its last repetition. What interrupts a drive ends it: let go, and press again.
-    Only `pebble estop reset` ends an emergency stop.
+    \b
+        pebble drive goob.json
     """
     from pebble.client.terminal.keys import check_terminal, opened
 
