@@ -238,7 +238,6 @@ ROWS = {
     "reboot, restart, update, mirror": [
         f"incoming/{{by}}flags/{one}" for one in ("reboot", "service-restart", "git-pull", "remote-mirror")
     ],
-    "read the audit": ["incoming/{by}audit-read"],
     "commands and flags that the contract does not know": ["incoming/{by}junk", "incoming/{by}flags/junk"],
     "pose as this robot": ["outgoing/online", "outgoing/control/serial", "outgoing/junk"],
     "pose as another or a new robot": ["pebble/robots/new/outgoing/online", "pebble/robots/new/incoming/junk"],
@@ -246,7 +245,7 @@ ROWS = {
     "pose as a page server otherwise": ["pebble/servers/x1/outgoing/online"],
 }
 SHOWN = {
-    "see what the robot publishes, and its flags": ["outgoing/online", "outgoing/audit", "incoming/flags/x"],
+    "see what the robot publishes, and its flags": ["outgoing/online", "incoming/flags/x"],
     "see commands of others": ["incoming/drive-values", "incoming/audio-stream", "incoming/by/otto/drive-values"],
 }
 COLUMNS = {
