@@ -25,7 +25,7 @@ from pebble.contract import (
     Kind,
     codec,
 )
-from pebble.contract.payloads import AutonomyCommand
+from pebble.contract.payloads import AutonomyCommand, EstopCommand
 from pebble.errors import PayloadError
 from pebble.forwarding.routing import Drop
 from pebble.services.mqtt_bridge.audit_rows import ROBOT, AuditRows, Row, sender
@@ -129,6 +129,11 @@ class Acts:
                 while waiting and now - waiting[0][0] >= _AFTER_S:
                     at, payload = waiting.pop(0)
                     self._follow(topic, payload, at)
+
+    def unconfirmed(self, owner: str, stop: EstopCommand) -> None:
+        """A motor owner has no emergency stop any more, and has not confirmed this stop."""
+        with self.lock:
+            self._act("stop-unconfirmed", *sender(None, stop.by), {"owner": owner})
 
     # -- what commands tell
 
