@@ -242,12 +242,13 @@ class TestStops:
         do(world, "start")
         world.local.publish(MIRROR_FLAG, TRUE, retain=True)
         world.run()
-        for name, (client, _) in zip(("local", "remote"), sides(world), strict=True):
-            client.publish(STOP, name.encode(), retain=True)
+        local, remote = b'{"stop":"00000000000000a1"}', b'{"stop":"00000000000000b2"}'
+        for stop, (client, _) in zip((local, remote), sides(world), strict=True):
+            client.publish(STOP, stop, retain=True)
         do(world, "cut mend away back")
-        assert world.remote.payloads(STOP) == [b"local"]
-        assert world.local.payloads(STOP) == [b"remote"]
-        assert world.retained(STOP) == (b"local", b"remote")  # each its publisher's own
+        assert world.remote.payloads(STOP) == [local]
+        assert world.local.payloads(STOP) == [remote]
+        assert world.retained(STOP) == (local, remote)  # each its publisher's own
 
     def test_one_from_before_anything_is_forwarded_is_not_delivered_later(self, world: World) -> None:
         """Its sender repeats it. A stop from before an outage must not stop the robot after it."""
