@@ -232,7 +232,7 @@ def _line(robot: RobotStop, *, patient: bool) -> str:
             took = f"after {robot.confirmed_s:.2f} s"
             if robot.saved:
                 return f"stopped and confirmed {took}"
-            return f"stopped {took}, not saved yet" if robot.sending else f"stopped {took}, NOT SAVED: a restart frees it"
+            return f"stopped {took}, {'not saved yet' if robot.sending else 'NOT SAVED: a restart frees it'}"
         case Progress.OLD if robot.sending:
             return "old firmware: zeros are sent, it cannot be latched"
         case Progress.OLD:

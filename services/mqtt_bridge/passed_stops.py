@@ -86,6 +86,15 @@ class PassedStops:
         self._lock = threading.Lock()
         self._passed: dict[str, float] = {}  # by name, when it was passed first; the oldest first
 
+    def __len__(self) -> int:
+        """Return how many names are remembered."""
+        return len(self._passed)
+
+    @property
+    def pending(self) -> dict[str, Pending]:
+        """The stops that are not confirmed, by owner."""
+        return {key: owner.pending for key, owner in self._owners.items() if owner.pending is not None}
+
     def accept(self, payload: bytes) -> list[bytes]:
         """Return what to publish for a stop that has a name; an owner that was reset since gets no copy of it."""
         if not is_stop(payload):
@@ -114,22 +123,17 @@ class PassedStops:
     def repeat(self) -> list[bytes]:
         """Return what to publish again, on the local side only; call it every ``REPEAT_S``."""
         with self._lock:
-            return [
-                _addressed(owner.pending.stop, key)
-                for key, owner in self._owners.items()
-                if owner.pending is not None and owner.withdrawn_at is None
-            ]
+            waiting = self.pending.items()
+            return [_addressed(one.stop, key) for key, one in waiting if self._owners[key].withdrawn_at is None]
 
     def give_up(self) -> list[tuple[str, EstopCommand]]:
         """End the stops of owners that were withdrawn for too long; returns them, with the owner of each."""
         now, ended = self._clock(), []
         with self._lock:
-            for key, owner in self._owners.items():
-                pending, withdrawn_at = owner.pending, owner.withdrawn_at
-                if pending is None or withdrawn_at is None:
-                    continue
-                if now - max(withdrawn_at, pending.at) > WITHDRAWN_S:
-                    owner.pending = None
+            for key, pending in self.pending.items():
+                since = self._owners[key].withdrawn_at
+                if since is not None and now - max(since, pending.at) > WITHDRAWN_S:
+                    self._owners[key].pending = None
                     ended.append((key, pending.stop))
         return ended
 

@@ -52,7 +52,7 @@ if TYPE_CHECKING:
 
 #: After the barrier, for brokers that pass messages between connections with a delay.
 _PROBE_WAIT_S = 0.1
-_AGAIN_WAIT_S = 1.0  # once a probe has come back: by a slow way it would be forwarded in circles until the next one does
+_AGAIN_WAIT_S = 1.0  # once a probe has come back: its way may be slow
 _RETRY_S = 1.0
 _IGNORED = (Drop.ECHO, Drop.LATE, Drop.PROBE)  # nothing that a person or a program requests of the bridge now
 LEFTOVERS_AFTER_S = 30.0  # by then all services have published what they retain; so long after the start, or later

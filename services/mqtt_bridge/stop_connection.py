@@ -88,9 +88,9 @@ def _shortened(message: Message) -> Message:
 class StopConnection:
     """Keeps the second connection, as long as the broker lets it.
 
-    ``pass_on`` gets each of its stops, but for a nameless one that came over the main connection before, on its thread; ``main`` tells
-    whether that one is there, and messages are forwarded. Call :meth:`check` once a second and :meth:`main_lost`, on
-    the service's thread.
+    ``pass_on`` gets each of its stops, on its thread; not one without a name that came over the main connection before.
+    ``main`` tells whether that one is there, and messages are forwarded. Call :meth:`check` once a second and
+    :meth:`main_lost`, on the service's thread.
     """
 
     def __init__(

@@ -6,7 +6,6 @@ tests/services/serial_mcu_bridge/test_control.py.
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -132,7 +131,7 @@ def test_it_is_repeated_until_confirmed(owners: tuple[str, ...], history: str) -
 
 def test_a_stop_that_is_given_up_is_told_once() -> None:
     robot = Robot(TWO)
-    for word in "a serial! 60s 1s serial! 99s".split():
+    for word in ("a", "serial!", "60s", "1s", "serial!", "99s"):
         robot.do(word)
     assert robot.given_up == ["a>serial"]
 

@@ -159,7 +159,8 @@ def test_what_strangers_may_do(tmp_path: Path, strangers: Any, free: bool, held_
 
 
 @pytest.mark.parametrize(
-    ("owner", "latches"), [({"owner": "right"}, False), ({"owner": "left"}, True), ({"owner": "else"}, True), ({}, True)]
+    ("owner", "latches"),
+    [({"owner": "right"}, False), ({"owner": "left"}, True), ({"owner": "else"}, True), ({}, True)],
 )
 def test_a_stop_that_is_repeated_for_another_listed_owner_is_ignored(
     tmp_path: Path, owner: dict[str, str], *, latches: bool
