@@ -251,7 +251,7 @@ class TestStops:
         named = b'{"stop":"00000000000000a1","by":"ann/otto"}'
         (unread,) = {*received(world, "by/ann/estop", press, b"?")} - {named}
         assert codec.decode(ESTOP, unread).by == "ann"
-        assert {*received(world, "by/ann/estop", press, retain=True)} == {named}  # live, although it asks to be retained
+        assert {*received(world, "by/ann/estop", press, retain=True)} == {named}  # live: passes
 
     def test_no_transport_skips_one_below_a_name(self, world: World) -> None:
         start(world)

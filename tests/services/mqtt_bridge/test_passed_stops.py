@@ -111,7 +111,7 @@ MEMBERS: dict[str, tuple[tuple[str, ...], str]] = {
     "newest is who was passed first last": (ONE, "a b a =b>serial serial+b ="),
     "a bridge that restarts forgets": (TWO, "a bridge ="),
     "a withdrawn owner gets nothing, and may come back": (TWO, "a serial! =a>tail 59s serial0 =a>serial,a>tail"),
-    "a withdrawn owner is given up": (TWO, "serial! a 59s serial! 2s serial0 =a>tail a :a>all"),
+    "a withdrawn owner is given up": (TWO, "serial! a 59s serial! 1s serial0 =a>tail a :a>all"),
     "a copy after a reset goes to nobody": (ONE, "a serial+a serial-a a : ="),
     "a copy goes to the owner that was not reset": (TWO, "a serial+a tail+a serial-a a :a>tail"),
     "a copy after a reset that was not shown latched": (ONE, "serial0 a serial-a a : ="),
