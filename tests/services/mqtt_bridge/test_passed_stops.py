@@ -13,6 +13,7 @@ from msgspec import UNSET
 
 from pebble.contract import ESTOP, ESTOP_STATE, codec
 from pebble.contract.payloads import EstopCommand, EstopState
+from pebble.services.mqtt_bridge.acts import Acts
 from pebble.services.mqtt_bridge.passed_stops import NAMES, PassedStops, is_named, named
 from tests.forwarding.virtual import World
 from tests.services.mqtt_bridge.stop_schedules import ENGINE, FAULTS
@@ -185,6 +186,32 @@ def test_the_bridge_repeats_it_on_the_robots_side_only(monkeypatch: pytest.Monke
     world.run(3)
     assert len(world.local.on(STOP)) == before
     assert not world.remote.on(STOP)
+
+
+def test_what_a_withdrawn_owner_has_not_confirmed_is_told(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    world = World("bridge", monkeypatch)
+    world.start(serial={"enabled": True, "serial": {"port": "/dev/serial"}})
+    world.run()
+    told: list[tuple[str, object]] = []
+    monkeypatch.setattr(Acts, "unconfirmed", lambda _acts, owner, stop: told.append((owner, stop.by)))
+    world.remote.publish(STOP, b'{"by": "ann"}')
+    world.run(0)
+    before = len(world.local.on(STOP))
+    world.local.publish(ESTOP_STATE.topic("", owner="serial")[1:], b"", retain=True)
+    world.run(70)
+    assert len(world.local.on(STOP)) <= before + 1
+    assert told == [("serial", "ann")]
+    assert "is not confirmed by serial" in caplog.text
+
+
+def test_a_row_of_the_audit_names_the_owner() -> None:
+    acts = Acts("pebble/robots/rover", ONE, lambda: 5.0, lambda: 7.0)
+    acts.unconfirmed("serial", EstopCommand(by="ann"))
+    assert acts.acts.take(5.0, all_of_them=True) == [
+        {"t": 7.0, "what": "stop-unconfirmed", "who": "ann?", "owner": "serial"}
+    ]
 
 
 def test_the_mirror_keeps_a_repetition_for_one_owner_on_the_robots_own_transport(
