@@ -5,17 +5,20 @@ docs/bridge.md explains when it forwards, and when it refuses to.
 
 import sys
 import time
+from collections.abc import Iterable
 from functools import partial
 from typing import Any
 
+from msgspec import UNSET
+
 from pebble.config import Mqtt
-from pebble.contract import BRIDGE_PROBE, ONLINE, codec
+from pebble.contract import BRIDGE_PROBE, ESTOP, ONLINE, codec
 from pebble.contract.levels import silent_after
 from pebble.errors import ConfigError, PayloadError
 from pebble.forwarding.forwarder import barrier
 from pebble.forwarding.probes import PROBE_REQUEST, Probes
 from pebble.forwarding.routing import MIRROR, Side
-from pebble.forwarding.service import ForwardingService
+from pebble.forwarding.service import CHECK_AGAIN_S, CHECK_SOON_S, ForwardingService
 from pebble.forwarding.side import Gate
 from pebble.runtime.connections import mirror_transport
 from pebble.runtime.process import run
@@ -120,12 +123,12 @@ class MqttMirror(ForwardingService):
             self._request_probe()
 
     def found_one_broker(self) -> None:
-        self._is_operators = True
-        self._refuse("is the remote one, which the bridge serves already")
+        first, self._is_operators = not self._is_operators, True
+        self._refuse("is the remote one, which the bridge serves already", CHECK_SOON_S if first else CHECK_AGAIN_S)
 
-    def _refuse(self, why: str) -> None:
+    def _refuse(self, why: str, seconds: float = CHECK_AGAIN_S) -> None:
         """Forward nothing until the next check: the address may lead to another broker by then."""
-        self.forward_nothing()
+        self.forward_nothing(seconds)
         if why != self._refused:
             self._refused = why
             address = f"{self._broker.host}:{self._broker.port}"
@@ -136,6 +139,11 @@ class MqttMirror(ForwardingService):
             self.connected(Side.REMOTE, epoch)
 
     # -- the transports' threads
+
+    def pass_stop(self, side: Side, payload: bytes) -> Iterable[bytes]:
+        """The bridge's repetitions for one motor owner stay on the robot's own transport."""
+        addressed = side is Side.LOCAL and bool(payload) and codec.decode(ESTOP, payload).owner is not UNSET
+        return () if addressed else (payload,)
 
     def receive_local(self, message: Message) -> None:
         if message.topic not in self._watched:

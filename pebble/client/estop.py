@@ -1,6 +1,7 @@
-"""Sends an emergency stop until it is confirmed. Pure: the caller publishes, receives and waits.
+"""Sends an emergency stop until it is confirmed and saved. Pure: the caller publishes, receives and waits.
 
-The robot remembers the stop; the sender repeats it until each motor owner has published that it is stopped.
+*Confirmed* means that each motor owner has published that it is stopped by this stop, *saved* that the owner would be
+so after a power cut. The sender repeats the stop until both hold, or an owner says that it cannot save.
 """
 
 import secrets
@@ -67,6 +68,7 @@ class RobotStop:
         self._names_due = False  # it was sent before it was known that the robot reads topics with a name
         self._status_topic = STATUS.topic(base)
         self._boots: dict[str, str] = {}  # by owner, the newest one in which it has listed this stop
+        self._settled = False  # each owner that had listed it has saved it, cannot save anything, or was reset
 
     @property
     def progress(self) -> Progress:
@@ -81,7 +83,7 @@ class RobotStop:
 
     @property
     def saved(self) -> bool:
-        """Whether every owner has saved its state, so that it survives a power cut."""
+        """True if every owner has saved its newest state, so that it survives a power cut."""
         states = self.estop.states
         return bool(self.estop.owners) and all(
             owner in states and states[owner].persisted is True for owner in self.estop.owners
@@ -115,7 +117,9 @@ class RobotStop:
     @property
     def sending(self) -> bool:
         """Whether the stop is repeated."""
-        is_due = self._names_due or self._sent_at == float("-inf") or self.progress in (Progress.WAITING, Progress.OLD)
+        unsettled = self.progress is Progress.CONFIRMED and not self._settled
+        unsent = self._names_due or self._sent_at == float("-inf")
+        is_due = unsent or unsettled or self.progress in (Progress.WAITING, Progress.OLD)
         return not self._given_up and is_due
 
     def receive(self, message: Message, now: float) -> None:
@@ -134,10 +138,12 @@ class RobotStop:
         if self.confirmed_s is None:
             if self.estop.owners and self.estop.available and not (self.unconfirmed or self.estop.zeros):
                 self.confirmed_s = now - self._began
-        elif self._order.hold and not all(map(self._has_taken_it, self.estop.owners)):
-            self.confirmed_s = None  # it has restarted, and saved nothing
-            self._began = now
+        elif (self._order.hold or not self._settled) and self.unconfirmed:
+            self.confirmed_s, self._settled = None, False  # it has restarted, and saved nothing
+            self._began = now if self._order.hold else self._began
             self.next = max(now, self._sent_at + REPEAT_S)
+        if self.confirmed_s is not None and not self._settled:
+            self._settled = all(map(self._survives, self.estop.owners))
 
     def tick(self, now: float, *, again: bool = True) -> list[Message]:
         if now < self.next or not self.sending or not (again or self._sent_at == float("-inf")):
@@ -158,9 +164,11 @@ class RobotStop:
         self._given_up = True
 
     def _lacks(self, owner: str) -> str:
-        if not self._lists_it(owner):
-            return "has not confirmed"
-        return "has not saved it" if self.estop.states[owner].persisted is False else ""
+        return "" if self._has_taken_it(owner) else "has not confirmed"
+
+    def _survives(self, owner: str) -> bool:
+        state = self.estop.states.get(owner)
+        return state is not None and (state.persisted is not False or not state.latched)
 
     def _lists_it(self, owner: str) -> bool:
         state = self.estop.states.get(owner)

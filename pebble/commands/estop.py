@@ -284,7 +284,9 @@ def _line(robot: RobotStop, *, patient: bool, sent: bool) -> str:
             return "was stopped, and reset since"
         case Progress.CONFIRMED:
             took = f"after {robot.confirmed_s:.2f} s"
-            return f"stopped and confirmed {took}" if robot.saved else f"stopped {took}, NOT SAVED: a restart frees it"
+            if robot.saved:
+                return f"stopped and confirmed {took}"
+            return f"stopped {took}, {'not saved yet' if robot.sending else 'NOT SAVED: a restart frees it'}"
         case Progress.OLD if robot.sending:
             return "old firmware: zeros are sent, it cannot be latched"
         case Progress.OLD:

@@ -22,7 +22,7 @@ from pebble.contract.payloads import (
     SoundboardCommand,
 )
 from pebble.errors import PayloadError
-from pebble.motion.latch import stop_of
+from pebble.motion.latch import fields, stop_of
 
 MAX_COMMAND_BYTES = 64 * 1024
 MAX_DEPTH = 32
@@ -112,10 +112,12 @@ def _stop(channel: Channel, raw: bytes) -> EstopCommand:
     if not raw:
         raise PayloadError(f"{channel.metric}: empty")
     try:
-        name, by, why = stop_of(plain(channel, raw))
+        body = plain(channel, raw)
     except PayloadError:
         return EstopCommand()
-    return EstopCommand(stop=name or UNSET, by=by, why=why)
+    name, by, why = stop_of(body)
+    owner = fields(body).get("owner")
+    return EstopCommand(stop=name or UNSET, by=by, why=why, owner=owner if isinstance(owner, str) else UNSET)
 
 
 def is_blank(raw: bytes) -> bool:

@@ -88,6 +88,7 @@ class EstopCommand(Payload, frozen=True, kw_only=True):
     stop: str | UnsetType = UNSET
     by: str | UnsetType = UNSET  # who stops, at most 32 ASCII characters
     why: str | UnsetType = UNSET  # at most 40
+    owner: str | UnsetType = UNSET  # on the robot only: other motor owners of it ignore this repetition
 
 
 class EstopReset(Payload, frozen=True, kw_only=True):

@@ -13,7 +13,7 @@ import itertools
 import logging
 import time
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 
 import msgspec
 
@@ -87,6 +87,7 @@ class Forwarder:
     ``names`` knows the senders of messages on the remote side, where they are checked.
     ``on_value(subject, payload)`` is called, on any thread and with a lock held, with each new value of a two-way
     retained topic.
+    ``pass_stop(side, payload)`` returns what passes of a stop that was received there.
     """
 
     def __init__(
@@ -98,10 +99,12 @@ class Forwarder:
         winner: Side,
         names: Names | None = None,
         on_value: Callable[[Subject, bytes], None] = lambda _subject, _payload: None,
+        pass_stop: Callable[[Side, bytes], Iterable[bytes]] = lambda _side, payload: (payload,),
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self.counters = Counters()
         self._subjects, self._rules, self._names, self._clock = subjects, rules, names, clock
+        self._pass_stop = pass_stop
         self.sides = Sides(
             (side, SideState(side, transport, self.counters, clock, wins=side is winner))
             for side, transport in transports.items()
@@ -280,6 +283,11 @@ class Forwarder:
         is_event = subject.kind is Kind.EVENT and message.qos is QoS.DELIVERED
         if self.sides.gate is not Gate.OPEN:
             return self._hold_event(there, message) if is_event else Drop.CLOSED
+        if subject.is_stop:
+            payloads = list(self._pass_stop(here.side, message.payload))
+            for payload in payloads:
+                self.publisher.publish(there, subject, Message(message.topic, payload, message.qos), forward)
+            return forward if payloads else Drop.RESET
         if is_event:
             self.publisher.note_return(there, subject, message)
             there.events.send(message)

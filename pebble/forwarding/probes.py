@@ -25,7 +25,10 @@ def new_probe(now_ms: int) -> bytes:
 
 
 class Probes:
-    """Compares the probes that the bridge announces with those received from a broker, in either order."""
+    """Compares the probes that the bridge announces with those received from a broker, in either order.
+
+    Each counts once: a copy that a client keeps sending, or has retained, proves nothing.
+    """
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -35,13 +38,20 @@ class Probes:
     def announce(self, payload: bytes) -> bool:
         """The bridge has announced ``payload``; returns whether the broker has sent it already."""
         with self._lock:
-            self._announced.append(payload)
-            return payload in self._seen
+            return _match(payload, self._seen, self._announced)
 
     def see(self, payload: bytes) -> bool:
         """The broker has sent ``payload``; returns whether the bridge has announced it."""
         if len(payload) > _MAX_BYTES:
             return False
         with self._lock:
-            self._seen.append(payload)
-            return payload in self._announced
+            return _match(payload, self._announced, self._seen)
+
+
+def _match(payload: bytes, others: deque[bytes], own: deque[bytes]) -> bool:
+    """Whether the other side has had it and no match since; else it waits for that."""
+    if payload in others:
+        others.remove(payload)
+        return True
+    own.append(payload)
+    return False

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Iterable
 from functools import partial
 from typing import Any, ClassVar
 
@@ -20,6 +21,7 @@ from pebble.runtime.service import Service, every
 from pebble.transports import Message, State, Subscription, Transport
 
 CHECK_AGAIN_S = 30.0  # while nothing is forwarded
+CHECK_SOON_S = 1.0  # after the first sign that two sides are one: it may have been a copy
 
 
 class Status(Struct, frozen=True):
@@ -58,6 +60,7 @@ class ForwardingService(Service, ABC):
             winner=self.winner,
             names=self.names,
             on_value=self.on_value,
+            pass_stop=self.pass_stop,
             clock=self.clock,
         )
         self.epoch = 0  # grows whenever the remote side is not connected: what carries an older one is dropped
@@ -93,6 +96,10 @@ class ForwardingService(Service, ABC):
 
     def on_value(self, subject: Subject, payload: bytes) -> None:
         """React to the value on which both sides agree; on any thread, with a lock held."""
+
+    def pass_stop(self, side: Side, payload: bytes) -> Iterable[bytes]:  # noqa: ARG002
+        """Return what passes of a stop that was received on ``side``; on any thread."""
+        return (payload,)
 
     @abstractmethod
     def connected(self, side: Side, epoch: int) -> None:
@@ -185,14 +192,14 @@ class ForwardingService(Service, ABC):
         """React to the finding that the two sides are, or may be, one broker."""
         self.forward_nothing()
 
-    def forward_nothing(self) -> None:
-        """Forward nothing until the next check: at a reconnect, or in 30 s."""
+    def forward_nothing(self, seconds: float = CHECK_AGAIN_S) -> None:
+        """Forward nothing until the next check: at a reconnect, or in so many seconds."""
         self.forwarder.shut()  # again: it may just have been opened
         self.unsubscribe(Side.REMOTE)
-        self.check_later()
+        self.check_later(seconds)
 
-    def check_later(self) -> None:
-        self.call_at(self.clock() + CHECK_AGAIN_S, partial(self._check_if_shut, self.epoch))
+    def check_later(self, seconds: float = CHECK_AGAIN_S) -> None:
+        self.call_at(self.clock() + seconds, partial(self._check_if_shut, self.epoch))
 
     def _check_if_shut(self, epoch: int) -> None:
         if self.forwarder.gate is Gate.SHUT:

@@ -77,8 +77,13 @@ class SameBrokerProbe:
     # -- the transports' threads
 
     def proves_same_broker(self, message: Message) -> bool:
-        """Whether ``message``, received on the local side on :attr:`topic`, is one of our probes."""
-        if message.payload not in tuple(self._sent):
+        """Whether ``message``, received on the local side on :attr:`topic`, is one of our probes, for the first time.
+
+        A copy that a client keeps sending, or has retained, proves nothing.
+        """
+        try:
+            self._sent.remove(message.payload)
+        except ValueError:
             return False
         self._same_in_round = self._round
         return True

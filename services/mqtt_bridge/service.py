@@ -1,10 +1,24 @@
 """The bridge as a process: forwarding, heartbeat, same-broker probe, system actions and media requests."""
 
+from collections.abc import Iterable
 from contextlib import suppress
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
-from pebble.contract import BRIDGE_PROBE, CONTROL_STATE, DRIVE, ESTOP, LINK, ONLINE, REMOTE_MIRROR, Channel, codec
+import msgspec
+
+from pebble.contract import (
+    BRIDGE_PROBE,
+    CONTROL_STATE,
+    DRIVE,
+    ESTOP,
+    ESTOP_STATE,
+    LINK,
+    ONLINE,
+    REMOTE_MIRROR,
+    Channel,
+    codec,
+)
 from pebble.contract.levels import LEVELS
 from pebble.contract.names import with_name
 from pebble.contract.payloads import ControlState
@@ -13,7 +27,7 @@ from pebble.forwarding.forwarder import Routed, barrier
 from pebble.forwarding.names import Names
 from pebble.forwarding.retained_window import INITIAL_SYNC_S
 from pebble.forwarding.routing import TABLE_A1, Drop, Forward, Side
-from pebble.forwarding.service import ForwardingService
+from pebble.forwarding.service import CHECK_SOON_S, ForwardingService
 from pebble.forwarding.side import Gate
 from pebble.forwarding.subjects import Subject
 from pebble.runtime.connections import remote_transport, stops_transport
@@ -27,16 +41,18 @@ from pebble.services.mqtt_bridge.leftovers import Leftovers
 from pebble.services.mqtt_bridge.media import MEDIA
 from pebble.services.mqtt_bridge.motor_owners import CHECK_S, MotorOwners
 from pebble.services.mqtt_bridge.own_requests import OwnRequests
+from pebble.services.mqtt_bridge.passed_stops import REPEAT_S, PassedStops, named
 from pebble.services.mqtt_bridge.private_topics import PrivateTopics
 from pebble.services.mqtt_bridge.same_broker import SameBrokerProbe, now_ms
 from pebble.services.mqtt_bridge.uplink import POLL_S, Uplink
-from pebble.transports import Message, State, Transport
+from pebble.transports import Message, QoS, State, Transport
 
 if TYPE_CHECKING:
     from pebble.services.mqtt_bridge.stop_connection import StopConnection
 
 #: After the barrier, for brokers that pass messages between connections with a delay.
 _PROBE_WAIT_S = 0.1
+_AGAIN_WAIT_S = 1.0  # once a probe has come back: its way may be slow
 _RETRY_S = 1.0
 _IGNORED = (Drop.ECHO, Drop.LATE, Drop.PROBE)  # nothing that a person or a program requests of the bridge now
 LEFTOVERS_AFTER_S = 30.0  # by then all services have published what they retain; so long after the start, or later
@@ -68,6 +84,7 @@ class MqttBridge(ForwardingService):
         self._same_broker = SameBrokerProbe(self.config, self.transport, self.remote, self.clock)
         notifier = Notifier()
         self._owners = MotorOwners(self.config.base, self.config.motor_owners, notifier)
+        self._passed_stops = PassedStops(self.config.motor_owners, self.clock)
         self._audit = Audit(self.config, self.clock)
         decides = min(self.config.motor_owners, default="")
         self._control_topic = CONTROL_STATE.topic(self.config.base, owner=decides) if decides else ""
@@ -223,7 +240,8 @@ class MqttBridge(ForwardingService):
             return
         round_ = self._same_broker.begin_round(self.subjects.topics(DRIVE)[0])
         if round_ is not None:
-            self.call_at(self.clock() + _PROBE_WAIT_S, partial(self._end_round, round_))
+            wait_s = _PROBE_WAIT_S if self.forwarder.gate is Gate.WAITING else _AGAIN_WAIT_S
+            self.call_at(self.clock() + wait_s, partial(self._end_round, round_))
 
     def _end_round(self, round_: int) -> None:
         """Open the gate if no probe came back. A connection that was lost meanwhile brings a new round."""
@@ -244,7 +262,7 @@ class MqttBridge(ForwardingService):
         self.log.info("forwarding between the robot and its remote side")
 
     def found_one_broker(self) -> None:
-        self.forward_nothing()
+        self.forward_nothing(CHECK_SOON_S)
         self._publish_heartbeat(at_once=True)
         self.log.info(
             "the local and the remote side are one broker, or something else forwards outgoing/# to the local one: "
@@ -265,6 +283,14 @@ class MqttBridge(ForwardingService):
     @every(CHECK_S)
     def _check_owners(self) -> None:
         self._owners.check(self.clock())
+        for owner, stop in self._passed_stops.give_up():
+            self.log.error("an emergency stop is not confirmed by %s, which has withdrawn its own", owner)
+            self._audit.note("stop-not-confirmed", owner=owner, stop=str(stop.stop))
+
+    @every(REPEAT_S)
+    def _repeat_stops(self) -> None:
+        for payload in self._passed_stops.repeat():
+            self.transport.publish(self._stop_topic, payload, qos=QoS.DELIVERED, urgent=True)
 
     # -- the transports' threads
 
@@ -284,6 +310,7 @@ class MqttBridge(ForwardingService):
             return
         if message.topic in self._owners.topics:
             self._owners.receive(message.topic)
+            self._follow_owner(self._owners.topics[message.topic], message.payload)
         if message.topic == self._control_topic:
             self._follow_control(message.payload)
         self._leftovers.note_local(message)
@@ -309,9 +336,23 @@ class MqttBridge(ForwardingService):
         topic = message.topic if self.names is None else self.names[message.topic].topic
         if epoch != self.epoch or self._private.is_known(topic):
             return
-        if topic == self._stop_topic and self._has_passed(message):
+        if topic == self._stop_topic:
+            if not self._has_passed(message):
+                self._receive_stop(message)
             return
         self._react(Side.REMOTE, message, self.forwarder.receive(Side.REMOTE, message))
+
+    def _receive_stop(self, message: Message) -> None:
+        """Name it before anything else, so that whatever waits for an answer knows it by the same name."""
+        message = msgspec.structs.replace(message, payload=named(message.payload))
+        self._react(Side.REMOTE, message, self.forwarder.receive(Side.REMOTE, message))
+
+    def pass_stop(self, side: Side, payload: bytes) -> Iterable[bytes]:
+        return self._passed_stops.accept(payload) if side is Side.REMOTE else (payload,)
+
+    def _follow_owner(self, owner: str, payload: bytes) -> None:
+        with suppress(PayloadError):
+            self._passed_stops.follow(owner, codec.decode(ESTOP_STATE, payload) if payload else None)
 
     def _has_passed(self, message: Message) -> bool:
         """Whether this stop has come over the connection that stops have of their own."""
@@ -320,7 +361,7 @@ class MqttBridge(ForwardingService):
     def _pass_stop(self, message: Message) -> None:
         """Forward a stop of that connection. While the robot's own stops are mirrored, they come back there."""
         if not self.forwarder.mirroring.on:
-            self._react(Side.REMOTE, message, self.forwarder.receive(Side.REMOTE, message))
+            self._receive_stop(message)
 
     def _react(self, side: Side, message: Message, routed: Routed) -> None:
         """Do what the message requests of the bridge itself, whether or not a remote side is connected.

@@ -2,8 +2,8 @@
 
 A broker sends what it has for a client in order, and drops what comes while that waits. So one account that floods a
 robot with messages which it may write would hold up, or lose, the stop of another. On a connection that is subscribed
-to nothing else no stop waits. The main connection still receives every stop, too: each counts once, whichever way is
-faster, and without this connection all is as it was.
+to nothing else no stop waits. The main connection still receives every stop, too. A stop with a name passes both times,
+for motor owners know it by that; of the others each counts once, whichever way is faster.
 """
 
 import logging
@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterable
 from enum import Enum
 
 from pebble.contract.codec import MAX_COMMAND_BYTES
+from pebble.services.mqtt_bridge.passed_stops import is_named
 from pebble.transports import Message, State, Subscription, Transport
 
 log = logging.getLogger(__name__)
@@ -34,7 +35,7 @@ class Way(Enum):
 
 
 class Copies:
-    """Recognises the second copy of a stop that comes both ways. Any thread may use it.
+    """Recognises the second copy of a stop without a name that comes both ways. Any thread may use it.
 
     No stop is lost for it: one that only the main connection has had, while the other was dead and this was not known
     yet, is returned by :meth:`lost`.
@@ -87,9 +88,9 @@ def _shortened(message: Message) -> Message:
 class StopConnection:
     """Keeps the second connection, as long as the broker lets it.
 
-    ``pass_on`` gets each of its stops that did not come over the main connection before, on its thread; ``main`` tells
-    whether that one is there, and messages are forwarded. Call :meth:`check` once a second and :meth:`main_lost`, on
-    the service's thread.
+    ``pass_on`` gets each of its stops, on its thread; not one without a name that came over the main connection before.
+    ``main`` tells whether that one is there, and messages are forwarded. Call :meth:`check` once a second and
+    :meth:`main_lost`, on the service's thread.
     """
 
     def __init__(
@@ -127,8 +128,8 @@ class StopConnection:
         return bool(subscriptions) and self._transport.state is State.CONNECTED and not self._refused
 
     def is_copy(self, message: Message) -> bool:
-        """Whether a stop that the main connection has received has passed already."""
-        return self._copies.is_copy(Way.MAIN, message, other=self.listens)
+        """Whether a stop that the main connection has received has passed already, and has no name."""
+        return not is_named(message.payload) and self._copies.is_copy(Way.MAIN, message, other=self.listens)
 
     def check(self) -> None:
         now = self._clock()
@@ -190,7 +191,7 @@ class StopConnection:
     def _receive(self, message: Message) -> None:
         if message.retain:  # an old one: live ones have no such mark on this connection
             return
-        if not self._copies.is_copy(Way.STOPS, message, other=self._main()):
+        if is_named(message.payload) or not self._copies.is_copy(Way.STOPS, message, other=self._main()):
             self._pass_on(message)
 
     def _on_state(self, state: State) -> None:

@@ -10,7 +10,7 @@ import pytest
 from pebble.client import estop
 from pebble.client.estop import MAX_ROBOTS, Progress, StopSender, new_name, send
 from pebble.transports import Message, QoS
-from tests.client.estop_robot import Robot, capabilities, outgoing
+from tests.client.estop_robot import Owner, Robot, capabilities, outgoing
 
 GOOB, FRED = "pebble/robots/goob", "pebble/robots/fred"
 ESTOP, DRIVE = f"{GOOB}/incoming/estop", f"{GOOB}/incoming/drive-values"
@@ -94,12 +94,27 @@ def test_an_owner_that_cannot_save_confirms_all_the_same(persisted: bool | None,
 def test_it_goes_on_until_the_state_is_on_disk() -> None:
     stop, robot = sender(GOOB), Robot(GOOB, "serial", persisted=False)
     receive(stop, robot.capabilities(), *robot.take(stop.tick(0.0)), now=0.1)
-    assert stop.robots[GOOB].why == "serial has not saved it"
+    assert (stop.confirmed, stop.robots[GOOB].saved, stop.finished) == (True, False, False)
     assert topics(stop.tick(0.6)) == [ESTOP, DRIVE]
     assert robot.owners[0].latch.count == 1
     robot.owners[0].persisted = True
     receive(stop, robot.owners[0].state(), now=0.7)
-    assert stop.confirmed
+    assert (stop.confirmed, stop.robots[GOOB].saved, stop.finished) == (True, True, True)
+
+
+def test_under_a_flood_of_stops_an_obeyed_one_is_confirmed_and_a_restart_before_it_is_saved_repeats_it() -> None:
+    """Each new stop has to be saved again, and takes the place of an older name."""
+    stop, robot = sender(GOOB), Robot(GOOB, "left", "right", persisted=False)
+    left, right = robot.take(stop.tick(0.0))
+    receive(stop, robot.capabilities(), left, now=0.1)
+    for _ in range(20):
+        robot.take(sender(GOOB).tick(0.0))
+    receive(stop, robot.owners[0].state(), right, now=0.2)
+    assert (stop.confirmed, stop.robots[GOOB].saved, stop.finished) == (True, False, False)
+    robot.owners[0] = Owner(GOOB, "left", boot="ffffffff", persisted=True)
+    receive(stop, robot.owners[0].state(), now=0.3)
+    assert (stop.confirmed, stop.robots[GOOB].unconfirmed) == (False, {"left": "has not confirmed"})
+    assert topics(stop.tick(0.8)) == [ESTOP, DRIVE]
 
 
 def test_a_robot_that_never_answers_is_given_up_after_a_minute() -> None:

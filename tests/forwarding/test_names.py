@@ -242,15 +242,16 @@ class TestStops:
         start(world)
         press = b'{"stop":"00000000000000a1","by":"otto"}'
         claimed = press.replace(b"otto", b"otto?")
-        assert received(world, STOP, press, b"?") == [claimed, b"?"]
+        assert {*received(world, STOP, press)} == {claimed}  # over both connections
         for names in ("Ann", "a/by/b"):
             world.remote.publish(f"incoming/by/{names}/estop", press)
         world.run(1)
-        assert world.local.payloads("incoming/estop")[2:] == [claimed, claimed]
+        assert {*world.local.payloads("incoming/estop")} == {claimed}
         assert world.service.dropped()["misnamed"] == 0
         named = b'{"stop":"00000000000000a1","by":"ann/otto"}'
-        assert received(world, "by/ann/estop", press, b"?") == [named, b"?"]
-        assert received(world, "by/ann/estop", press, retain=True) == [named]  # live, although it asks to be retained
+        (unread,) = {*received(world, "by/ann/estop", press, b"?")} - {named}
+        assert codec.decode(ESTOP, unread).by == "ann"
+        assert {*received(world, "by/ann/estop", press, retain=True)} == {named}  # live: passes
 
     def test_no_transport_skips_one_below_a_name(self, world: World) -> None:
         start(world)

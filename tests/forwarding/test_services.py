@@ -242,12 +242,13 @@ class TestStops:
         do(world, "start")
         world.local.publish(MIRROR_FLAG, TRUE, retain=True)
         world.run()
-        for name, (client, _) in zip(("local", "remote"), sides(world), strict=True):
-            client.publish(STOP, name.encode(), retain=True)
+        local, remote = b'{"stop":"00000000000000a1"}', b'{"stop":"00000000000000b2"}'
+        for stop, (client, _) in zip((local, remote), sides(world), strict=True):
+            client.publish(STOP, stop, retain=True)
         do(world, "cut mend away back")
-        assert world.remote.payloads(STOP) == [b"local"]
-        assert world.local.payloads(STOP) == [b"remote"]
-        assert world.retained(STOP) == (b"local", b"remote")  # each its publisher's own
+        assert world.remote.payloads(STOP) == [local]
+        assert world.local.payloads(STOP) == [remote]
+        assert world.retained(STOP) == (local, remote)  # each its publisher's own
 
     def test_one_from_before_anything_is_forwarded_is_not_delivered_later(self, world: World) -> None:
         """Its sender repeats it. A stop from before an outage must not stop the robot after it."""
@@ -358,6 +359,17 @@ class TestOneBroker:
         one.run()
         assert ran == ["flags/git-pull"]
 
+    @pytest.mark.parametrize("retain", [False, True])
+    def test_a_copied_probe_counts_once_and_for_seconds(self, bridge: World, retain: bool) -> None:
+        do(bridge, "start")
+        probe = bridge.remote.on("outgoing/bridge-probe")[-1].payload
+        for number in range(20):
+            bridge.local.publish("outgoing/bridge-probe", probe, retain=retain)
+            bridge.run(1)
+            bridge.remote.publish(DRIVE, b"%d" % number)
+        bridge.run()
+        assert len(bridge.local.on(DRIVE)) >= 15
+
     def test_a_way_that_comes_later_and_goes_again(self, bridge: World) -> None:
         """Probes find it as if another bridge had begun to join the two brokers, without a reconnect."""
         do(bridge, "start")
@@ -437,6 +449,17 @@ class TestWrongBroker:
             apart.run(0.1)
         apart.run()
         assert apart.running[1].gate is Gate.OPEN
+        apart.remote.publish(DRIVE, b"after")
+        apart.run()
+        assert apart.local.payloads(DRIVE) == [b"after"]
+
+    @pytest.mark.parametrize("retain", [False, True])
+    def test_a_copied_probe_stops_it_once_and_for_seconds(self, apart: World, retain: bool) -> None:
+        """A client that reads the operators' broker knows the bridge's probes."""
+        (probe, *_) = [one.payload for one in apart.local.on("outgoing/bridge-probe") if b"nonce" in one.payload]
+        for _ in range(20):
+            apart.remote.publish("outgoing/bridge-probe", probe, retain=retain)
+            apart.run(1)
         apart.remote.publish(DRIVE, b"after")
         apart.run()
         assert apart.local.payloads(DRIVE) == [b"after"]

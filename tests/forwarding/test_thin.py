@@ -282,7 +282,7 @@ class TestCommands:
         world = start()
         world.uplink.way = FULL
         world.run(0.2)
-        for suffix, payload in ((DRIVE, b'{"z": 0.5}'), (DRIVE, b'{"z": 0}'), (STOP, b'{"stop": "a1"}')):
+        for suffix, payload in ((DRIVE, b'{"z": 0.5}'), (DRIVE, b'{"z": 0}'), (STOP, b'{"stop": "00000000000000a1"}')):
             world.local.seen.clear()
             world.remote.publish(suffix, payload, qos=qos)
             world.run(0)

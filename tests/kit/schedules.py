@@ -29,6 +29,7 @@ ENGINES = {
     "owners": "tests.robot.lockstep.two_owners",
     "driving_lockstep": "tests.web.driving_lockstep.schedules",
     "control": "tests.robot.control_schedules",
+    "stops": "tests.services.mqtt_bridge.stop_schedules",
     "ages": "tests.forwarding.age_schedules",
     "thin": "tests.robot.thin_schedules",
 }

@@ -3,13 +3,13 @@
 What is promised, exactly:
 
 * No wheel turns while its owner is latched, after its command's deadline, or by a run that is barred.
-* A stop is confirmed only after every owner that the robot lists has executed it and has answered. Until then, for at
-  most 60 s or as long as a hold lasts, its sender sends the stop and a final zero every 0.5 s; after it, nothing.
+* A stop is confirmed only after every owner that the robot lists has executed it and has answered. Until it is saved,
+  too, for at most 60 s or as long as a hold lasts, its sender sends it and a final zero every 0.5 s; then nothing.
 * A state with ``persisted`` true is on the disk: of a board whether it is stopped, of others the names, too.
-* A stop that is confirmed survives a power cut of every owner, unless a reset that was asked for after it has ended
-  it, or the owner's file has been removed. A file that is damaged or cannot be read counts as a stop.
+* A stop that is confirmed and saved survives a power cut of every owner, unless a reset that was asked for after it has
+  ended it, or the owner's file has been removed. A file that is damaged or cannot be read counts as a stop.
   An owner that can save nothing (``persisted`` null) confirms, but is free after a power cut: its sender must report
-  it as not saved. An owner whose writing fails (``persisted`` false) is stopped, but never confirmed.
+  it as not saved. An owner whose writing fails (``persisted`` false) is stopped, and its sender goes on.
 * A reset ends a stop only if its ``boot`` and ``count`` are the newest and it was read less than 1 s ago, so it never
   ends a stop that was given after it was asked for.
 * Once everything works, senders and holds come to rest, and one reset by a person who looked ends every stop.
@@ -95,7 +95,7 @@ class Rules:
         """A sender takes its stop as confirmed; ``state`` is the newest one that it has received from this owner."""
         if state is None or name not in self.counted:
             raise ViolatedError("a stop is confirmed without an owner that has executed it and answered")
-        if state["persisted"] is not None:
+        if state["persisted"]:
             self.confirmed[name] = state["order"]
 
     def saved(self, durable: Any, names: bool) -> None:

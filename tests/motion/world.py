@@ -353,6 +353,7 @@ class Sender:
         self.name, self.given, self.owners, self.hold = name, given, owners, hold
         self.began, self.sent_at, self.ended = now, now - FOREVER, False
         self.states: dict[int, dict[str, Any]] = {}
+        self.settled = False  # confirmed, and every owner that can save it has, or was reset
         self._stop = cores.StopSender(name, by="anna", why="", now=now / 1000, robots=[BASE], hold=hold)
         estop = {"available": True, "owners": [f"mcu{owner}" for owner in range(owners)]}
         self._stop.receive(_published("capabilities", {"t": 1, "value": {"estop": estop}}), now / 1000)
@@ -367,7 +368,7 @@ class Sender:
 
     @property
     def at_rest(self) -> bool:
-        return bool(self._stop.finished or self._stop.confirmed)
+        return bool(self._stop.finished or self.settled)
 
     def receive(self, owner: int, state: dict[str, Any], now: int) -> None:
         self.states[owner] = state
@@ -375,18 +376,22 @@ class Sender:
         if message is None:
             message = state["message"] = _published(f"estop/mcu{owner}", state)
         self._stop.receive(message, now / 1000)
+        states = self.states.values()
+        self.settled = self.confirmed and (
+            self.settled or all(state["persisted"] is not False or not state["latched"] for state in states)
+        )
 
     def tick(self, now: int) -> list[bool]:
         """What is sent: True for the stop, False for a final zero."""
-        silent = self.confirmed or self.ended or (not self.hold and now > self.began + GIVE_UP_MS)
+        silent = self.settled or self.ended or (not self.hold and now > self.began + GIVE_UP_MS)
         due = now > self.sent_at + REPEAT_MS and (self.hold or now < self.began + GIVE_UP_MS)
         sent = [message.topic.endswith("/estop") for message in self._stop.tick(now / 1000)]
         if sent:
-            check(not silent, "a stop is repeated that is confirmed, ended or 60 s old")
+            check(not silent, "a stop is repeated that is confirmed and saved, ended or 60 s old")
             check(now >= self.sent_at + REPEAT_MS, "a stop is repeated too soon")
             self.sent_at = now
         elif due:
-            check(silent, "a stop that is not confirmed is not repeated")
+            check(silent, "a stop that is not confirmed, or not saved, is not repeated")
         check(sent in ([], [True, False]), "a stop is sent without a zero after it")
         return sent
 
@@ -561,7 +566,7 @@ class World:
             self.senders.pop(0)
         name, hold, owners = f"{self.presses:016x}", b % 4 == 0, len(self.owners) + (b % 16 == 1)
         self.senders.append(Sender(self.cores, name, self.order, self.now, owners, hold))
-        self._note_confirmed(self.senders[-1], False)
+        self._note_confirmed(self.senders[-1], (False, False))
         self.do_send(len(self.senders) - 1, b)
 
     def do_nameless(self, a: int, b: int) -> None:
@@ -587,12 +592,12 @@ class World:
             self._manage(owner, state)
         elif self.senders:
             sender = self.senders[who % len(self.senders)]
-            before = sender.confirmed
+            before = sender.confirmed, sender.settled
             sender.receive(owner, state, self.now)
             self._note_confirmed(sender, before)
 
-    def _note_confirmed(self, sender: Sender, before: bool) -> None:
-        if before or not sender.confirmed:
+    def _note_confirmed(self, sender: Sender, before: tuple[bool, bool]) -> None:
+        if before == (sender.confirmed, sender.settled) or not sender.confirmed:
             return
         check(sender.owners == len(self.owners), "a stop is confirmed without an answer of every owner")
         for index, owner in enumerate(self.owners):

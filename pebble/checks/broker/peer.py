@@ -31,7 +31,7 @@ _QUIET_S = 0.3  # of silence, and four round trips: then nothing more comes
 _STEP_S = 0.05
 _KEEPALIVE_S = 60
 _AT_ONCE = 1000  # packets
-_MOST = 50_000  # messages that are kept; a probe sends a thousand
+_MOST, _MOST_BYTES = 50_000, 128_000_000  # messages of one connection; a probe sends a thousand
 _TRIES = 3  # to take back what is retained
 _RESET = struct.pack("ii", 1, 0)  # SO_LINGER that turns close() into a reset
 
@@ -66,6 +66,7 @@ class Peer(packets.Listener):
         self.pongs: list[int] = []  # how many messages had been received at each answer to a ping
         self.code: int | None = None  # of CONNACK
         self.problem = ""
+        self._bytes = 0  # of payloads
         self._trial, self.base = trial, base
         self._client = Client(opening, self, bridge=bridge)
         self._client.open()
@@ -134,16 +135,23 @@ class Peer(packets.Listener):
         """Read what has come, and write what waits."""
         client = self._client
         try:
-            while client.receive():
-                while client.read(_AT_ONCE):
+            while not self._flooded and client.receive():
+                while not self._flooded and client.read(_AT_ONCE):
                     pass
         except packets.MalformedError as error:
             self.problem = f"it sends what is no MQTT: {error}"
+            client.close()
+        if self._flooded:
+            self.problem = "it does not stop sending"
             client.close()
         if client.owes:
             client.acknowledge()
         if client.waiting:
             client.write()
+
+    @property
+    def _flooded(self) -> bool:
+        return len(self.received) >= _MOST or self._bytes > _MOST_BYTES
 
     def on_accepted(self, accepted: packets.Accepted) -> None:
         del accepted
@@ -154,6 +162,7 @@ class Peer(packets.Listener):
         self.problem = reasons.connection_refused(code)
 
     def on_publication(self, topic: bytes, payload: bytes, first: int) -> None:
+        self._bytes += len(payload)
         below = topic.decode(errors="replace").removeprefix(f"{self.base}/")
         self.received.append(Received(below, payload, bool(first & packets.RETAIN), time.monotonic()))
 

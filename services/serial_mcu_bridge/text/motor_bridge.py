@@ -118,7 +118,8 @@ class MotorBridge(SerialService):
 
     @on(c.ESTOP, direct=True)
     def receive_stop(self, stop: EstopCommand, _arrived: float) -> None:
-        self._judge_soon(self._waiting.put_stop(stop))
+        if stop.owner not in self._control.peers:  # the bridge repeats it for one that has not confirmed it
+            self._judge_soon(self._waiting.put_stop(stop))
 
     @on(c.ESTOP_RESET, direct=True)
     def receive_reset(self, reset: EstopReset, arrived: float) -> None:

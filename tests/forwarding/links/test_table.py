@@ -15,6 +15,7 @@ from functools import partial
 from itertools import product
 from pathlib import Path
 from typing import Any, Final
+from zlib import crc32
 
 import pytest
 
@@ -111,7 +112,10 @@ class Cell:
         return self.qos == 1 and self.topic != STOP and (self.retain or self.kind is Kind.EVENT)
 
     def payload(self, situation: str) -> bytes:
-        return f"{situation}: QoS {self.qos}, {'retained' if self.retain else 'live'}".encode()
+        """A stop has a name: the bridge gives one to others, and so changes their bytes."""
+        text = f"{situation}: QoS {self.qos}, {'retained' if self.retain else 'live'}"
+        stop = f'{{"stop":"{crc32(text.encode()):016x}","why":"{text}"}}'
+        return (stop if self.topic == STOP else text).encode()
 
     def arrives(self, situation: str) -> tuple[bytes, int, bool]:
         """Same bytes; flags of the contract are always retained; to the robot with the channel's QoS at least."""
@@ -158,7 +162,7 @@ class TableRig(Rig):
         """What came across, by topic."""
         came: Arrived = {}
         for message in (message for client in self.clients.values() for message in list(client.seen)):
-            if message.payload.startswith(f"{situation}:".encode()):
+            if f"{situation}: ".encode() in message.payload:
                 came.setdefault(message.topic.removeprefix(f"{self.base}/"), []).append(_shape(message))
         return came
 
@@ -462,7 +466,7 @@ class TestBridge:
         """After the gate was shut the bridge subscribes anew, on connections that have been up for long."""
         bridge = rig.start()
         for client in (rig.local, rig.remote):
-            client.publish(STOP, b"old", retain=True)
+            client.publish(STOP, PRESS, retain=True)
         rig.local.publish(MIRROR_FLAG, TRUE, retain=True)
         assert until(lambda: rig.local.on(STOP) and bridge.status.mirroring)
         bridge.forwarder.shut()
@@ -471,7 +475,7 @@ class TestBridge:
         assert until(lambda: rig.gate is Gate.OPEN and REMOTE in bridge.status.subscribed)
         rig.after_all(REMOTE)
         rig.after_all(LOCAL)
-        assert rig.local.payloads(STOP) == [b"old"]  # the live one
+        assert rig.local.payloads(STOP) == [PRESS]  # the live one
         assert not rig.remote.on(STOP)
 
     def test_an_uplink_that_goes_silent(self, rig: TableRig) -> None:

@@ -30,6 +30,7 @@ def make_config(
     av_daemon: dict[str, Any] | None = None,
     transport: dict[str, Any] | None = None,
     security: dict[str, Any] | None = None,
+    serial: dict[str, Any] | None = None,
     **bridge: Any,
 ) -> Config:
     """A robot with a bridge; further keywords are keys of services.mqtt_bridge."""
@@ -40,6 +41,7 @@ def make_config(
         "local_mqtt": local_mqtt or {},
         "services": {
             "av_daemon": av_daemon or {},
+            "serial_mcu_bridge": serial or {},
             "mqtt_bridge": {"enabled": True, "remote_mqtt": {"host": "127.0.0.1"}, **bridge},
         },
     }

@@ -25,7 +25,7 @@ STOPPED = "M 0.000 0.000"
 class Bench:
     """The service in a thread of its own, an MCU, and an operator on the same network: in memory, or at a broker.
 
-    Several share a ``hub``: each is one motor owner of the robot, the ``instance``.
+    Several share a ``hub``: each is one motor owner of the robot, the ``instance``. ``peer`` is listed as another one.
     """
 
     service: MotorBridge
@@ -40,6 +40,7 @@ class Bench:
         hub: MemoryHub | None = None,
         instance: str = "",
         security: Any = None,
+        peer: str = "",
         **section: Any,
     ) -> None:
         folder.mkdir(exist_ok=True)
@@ -47,7 +48,10 @@ class Bench:
         self.mcu = PtyMcu(kind, folder / "tty")
         self.mcu.__enter__()
         serial = {"enabled": True, "serial": {"port": str(folder / "tty")}, **section}
-        serial = {"instances": {instance: serial}} if instance else serial
+        lines = {instance: serial}
+        if peer:
+            lines[peer] = {**serial, "serial": {"port": str(folder / peer)}}
+        serial = {"instances": lines} if instance else serial
         transport = {"kind": "mqtt", "state_dir": str(folder / "state"), "run_dir": str(folder / "run")}
         bridge = {"enabled": True, "remote_mqtt": {"host": "localhost", "port": 1}}  # needed where names are checked
         services = {"serial_mcu_bridge": serial, "mqtt_bridge": bridge}

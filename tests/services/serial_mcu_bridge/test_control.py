@@ -182,6 +182,24 @@ def test_a_strangers_zero_after_a_reset_frees_no_stick_that_is_held(bench: Bench
     assert not {"M 0.200 0.200", "M 0.300 0.300", "M 0.400 0.400"} & set(bench.lines)
 
 
+@pytest.mark.parametrize(
+    ("owner", "latches"),
+    [({"owner": "right"}, False), ({"owner": "left"}, True), ({"owner": "else"}, True), ({}, True)],
+)
+def test_a_stop_that_is_repeated_for_another_listed_owner_is_ignored(
+    tmp_path: Path, owner: dict[str, str], *, latches: bool
+) -> None:
+    bench = Bench(tmp_path, "goob", instance="left", peer="right")
+    try:
+        assert until(lambda: bench.world.on("estop/left"), 5)
+        bench.send("estop", {"stop": "a" * 16, **owner})
+        bench.send("control", ANN)  # judged after it
+        assert until(lambda: bench.world.newest("control/left").get("by") == "ann", 5)
+        assert until(lambda: bench.world.newest("estop/left")["latched"] is latches, 5)
+    finally:
+        bench.close()
+
+
 def test_of_two_motor_owners_that_answer_differently_the_first_by_name_decides(tmp_path: Path) -> None:
     """One is started again while another client has both: that one gives the second back, and asks anew."""
     hub = MemoryHub()

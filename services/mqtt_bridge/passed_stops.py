@@ -1,0 +1,151 @@
+"""Passes a stop on to every motor owner until that owner has confirmed it. Kept in memory only; no I/O.
+
+A stop that is sent once must not be lost because an owner restarts or stands still. For each owner the newest stop
+waits, and is repeated, until a state of that owner names it. No bound of what is remembered here drops a stop.
+"""
+
+import secrets
+import threading
+from collections.abc import Callable, Iterable
+from math import inf
+from typing import Any
+
+import msgspec
+from msgspec import UNSET, Struct
+
+from pebble.contract import ESTOP, codec
+from pebble.contract.payloads import EstopCommand, EstopState
+
+REPEAT_S = 0.5
+WITHDRAWN_S = 60.0  # so long an owner may have no emergency stop before its pending one ends
+NAMES = 1024  # of stops: a minute of 17 in a second
+
+
+def is_stop(payload: bytes) -> bool:
+    """True unless it removes a retained message, or looks for cycles: any other payload is a stop."""
+    return bool(payload) and not codec.is_blank(payload)
+
+
+def is_named(payload: bytes) -> bool:
+    return is_stop(payload) and codec.decode(ESTOP, payload).stop is not UNSET
+
+
+def named(payload: bytes) -> bytes:
+    """Return a stop of the remote side with a name, and without the owner that only the bridge may add."""
+    if not is_stop(payload):
+        return payload
+    stop = codec.decode(ESTOP, payload)
+    if stop.stop is not UNSET and stop.owner is UNSET:
+        return payload
+    name = secrets.token_hex(8) if stop.stop is UNSET else stop.stop
+    return _encoded(stop, stop=name, owner=UNSET)
+
+
+class Pending(Struct, frozen=True):
+    """A stop that an owner has not confirmed; ``first``: when it was passed first, ``at``: when it began to wait."""
+
+    stop: EstopCommand
+    first: float
+    at: float
+
+
+class Owner:
+    """What is known of one motor owner. A new one has not been heard."""
+
+    def __init__(self) -> None:
+        self.state: EstopState | None = None
+        self.pending: Pending | None = None
+        self.freed_at = -inf  # when it was last seen free after a stop
+        self.withdrawn_at: float | None = None  # since when it publishes that it has no emergency stop
+
+    def confirms(self, name: str) -> bool:
+        """True if its newest state names this stop and would survive a restart, or shows that it was reset."""
+        state = self.state
+        return state is not None and name in state.recent and (state.persisted is not False or not state.latched)
+
+    def follow(self, state: EstopState | None, now: float) -> None:
+        """Note its newest state; None: it has withdrawn that."""
+        before, self.state = self.state, state
+        if state is None:
+            self.withdrawn_at = now if self.withdrawn_at is None else self.withdrawn_at
+            return
+        self.withdrawn_at = None
+        # A restart proves no reset: the file may be older than the stop.
+        if before is not None and before.boot == state.boot and not state.latched:
+            self.freed_at = now if before.latched or state.count > before.count else self.freed_at
+        if self.pending is not None and self.confirms(str(self.pending.stop.stop)):
+            self.pending = None
+
+
+class PassedStops:
+    """Remembers the stops that were passed, and which owners have not confirmed theirs. Any thread may use it."""
+
+    def __init__(self, owners: Iterable[str], clock: Callable[[], float]) -> None:
+        self._owners = {owner: Owner() for owner in owners}
+        self._clock = clock
+        self._lock = threading.Lock()
+        self._passed: dict[str, float] = {}  # by name, when it was passed first; the oldest first
+
+    def __len__(self) -> int:
+        """Return how many names are remembered."""
+        return len(self._passed)
+
+    @property
+    def pending(self) -> dict[str, Pending]:
+        """The stops that are not confirmed, by owner."""
+        return {key: owner.pending for key, owner in self._owners.items() if owner.pending is not None}
+
+    def accept(self, payload: bytes) -> list[bytes]:
+        """Return what to publish for a stop that has a name; an owner that was reset since gets no copy of it."""
+        if not is_stop(payload):
+            return [payload]
+        stop = codec.decode(ESTOP, payload)
+        now, name = self._clock(), str(stop.stop)
+        with self._lock:
+            first = self._passed.setdefault(name, now)
+            if len(self._passed) > NAMES:
+                del self._passed[next(iter(self._passed))]
+            waits = {key for key, owner in self._owners.items() if _waits(owner, name)}
+            ended = {key for key, owner in self._owners.items() if owner.freed_at > first} - waits
+            if ended:
+                return [_addressed(stop, key) for key in self._owners if key not in ended]
+            for key, owner in self._owners.items():
+                newer = owner.pending is not None and owner.pending.first > first
+                if key not in waits and not newer and not owner.confirms(name):
+                    owner.pending = Pending(stop, first, now)
+        return [payload]
+
+    def follow(self, owner: str, state: EstopState | None) -> None:
+        """Note the newest state of an owner; None: it was withdrawn."""
+        with self._lock:
+            self._owners[owner].follow(state, self._clock())
+
+    def repeat(self) -> list[bytes]:
+        """Return what to publish again, on the local side only; call it every ``REPEAT_S``."""
+        with self._lock:
+            waiting = self.pending.items()
+            return [_addressed(one.stop, key) for key, one in waiting if self._owners[key].withdrawn_at is None]
+
+    def give_up(self) -> list[tuple[str, EstopCommand]]:
+        """End the stops of owners that were withdrawn for too long; returns them, with the owner of each."""
+        now, ended = self._clock(), []
+        with self._lock:
+            for key, pending in self.pending.items():
+                since = self._owners[key].withdrawn_at
+                if since is not None and now - max(since, pending.at) > WITHDRAWN_S:
+                    self._owners[key].pending = None
+                    ended.append((key, pending.stop))
+        return ended
+
+
+def _waits(owner: Owner, name: str) -> bool:
+    return owner.pending is not None and owner.pending.stop.stop == name
+
+
+def _addressed(stop: EstopCommand, owner: str) -> bytes:
+    return _encoded(stop, owner=owner)
+
+
+def _encoded(command: EstopCommand, **fields: Any) -> bytes:
+    kept = {"by": command.by or UNSET, "why": command.why or UNSET}
+    return codec.encode(ESTOP, msgspec.structs.replace(command, **(kept | fields)))

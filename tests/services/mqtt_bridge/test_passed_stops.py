@@ -1,0 +1,232 @@
+"""A stop is passed on until every motor owner has confirmed it: members of that kind as rows, and random schedules.
+
+What becomes of it at whole robots, on both transports, is tried by tests/robot; what an owner obeys in
+tests/services/serial_mcu_bridge/test_control.py.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+from msgspec import UNSET
+
+from pebble.contract import ESTOP, ESTOP_STATE, codec
+from pebble.contract.payloads import EstopCommand, EstopState
+from pebble.services.mqtt_bridge.audit import Audit
+from pebble.services.mqtt_bridge.passed_stops import NAMES, PassedStops, is_named, named
+from tests.forwarding.virtual import World
+from tests.services.mqtt_bridge.stop_schedules import ENGINE, FAULTS
+from tests.support import cases
+
+STOP = "incoming/estop"
+NAME = {letter: letter * 16 for letter in "abc"}
+FREE = EstopState(
+    latched=False, boot="00000001", count=0, recent=[], by="", why="", since=0, persisted=True, reset_refused=None
+)  # fmt: skip
+
+
+def payload(letter: str, **fields: Any) -> bytes:
+    return codec.encode(ESTOP, EstopCommand(stop=NAME[letter], **fields))
+
+
+class Robot:
+    """The bridge's memory of some owners, and their newest states, in histories of words.
+
+    ``a`` a stop comes; ``serial+a`` this owner names it and has saved it, ``?`` has not, ``*`` cannot, ``-`` was reset;
+    ``serial0`` it restarts free, ``serial!`` withdraws its state; ``bridge`` restarts; ``fill`` 1,024 other stops come;
+    ``3s`` time passes; ``=a>serial,tail`` is what is repeated now, ``:…`` what the last stop was passed to.
+    """
+
+    def __init__(self, owners: tuple[str, ...]) -> None:
+        self.owners, self.now = owners, 100.0
+        self.states = dict.fromkeys(owners, FREE)
+        self.given_up: list[str] = []
+        self.passed: list[bytes] = []
+        self.bridge()
+
+    def bridge(self) -> None:
+        self.stops = PassedStops(self.owners, lambda: self.now)
+
+    def do(self, word: str) -> None:
+        self.now += 0.01
+        if word in NAME:
+            self.passed = self.stops.accept(payload(word))
+        elif word == "bridge":
+            self.bridge()
+        elif word == "fill":
+            for number in range(NAMES):
+                self.stops.accept(codec.encode(ESTOP, EstopCommand(stop=f"{number:016x}")))
+        elif word[-1] == "s" and word[:-1].isdigit():
+            self.now += int(word[:-1])
+            self.given_up += [f"{stop.stop}>{owner}"[15:] for owner, stop in self.stops.give_up()]
+        elif word[0] in "=:":
+            assert _addresses(self.stops.repeat() if word[0] == "=" else self.passed) == word[1:], word
+        else:
+            self._tell(word.rstrip("+?*-!0abc"), word)
+
+    def _tell(self, owner: str, word: str) -> None:
+        mark, letter = word.removeprefix(owner)[:1], word.removeprefix(owner)[1:]
+        before = self.states[owner]
+        if mark == "!":
+            self.stops.follow(owner, None)
+            return
+        if mark == "0":
+            state = replace_state(FREE, boot=f"{int(before.boot) + 1:08}")
+        else:
+            new = NAME[letter] not in before.recent
+            state = replace_state(
+                before,
+                latched=mark != "-",
+                count=before.count + new,
+                recent=[NAME[letter], *before.recent] if new else before.recent,
+                persisted={"?": False, "*": None}.get(mark, True),
+            )
+        self.states[owner] = state
+        self.stops.follow(owner, state)
+
+
+def replace_state(state: EstopState, **fields: Any) -> EstopState:
+    return EstopState(**{name: fields.get(name, getattr(state, name)) for name in state.__struct_fields__})
+
+
+def _addresses(payloads: list[bytes]) -> str:
+    stops = [codec.decode(ESTOP, one) for one in payloads]
+    return ",".join(f"{str(stop.stop)[0]}>{'all' if stop.owner is UNSET else stop.owner}" for stop in stops)
+
+
+ONE, TWO = ("serial",), ("serial", "tail")
+MEMBERS: dict[str, tuple[tuple[str, ...], str]] = {
+    "a robot without a motor owner": ((), "a :a>all ="),
+    "a single owner": (ONE, "a :a>all =a>serial serial?a =a>serial serial+a = a ="),
+    "one that was never heard": (ONE, "a 300s =a>serial"),
+    "two owners": (TWO, "a =a>serial,a>tail serial+a =a>tail tail?a =a>tail tail+a ="),
+    "of an owner that restarts": (ONE, "serial0 a =a>serial serial0 =a>serial serial+a ="),
+    "killed before its file is written": (ONE, "a serial?a serial0 =a>serial serial+a ="),
+    "frozen, a newer state before it": (ONE, "a serial+b =a>serial serial+a ="),
+    "whose state shows it reset before it was saved": (ONE, "a serial?a serial-a ="),
+    "that was reset by an older command at its thaw": (ONE, "serial+b a serial-b =a>serial serial+a ="),
+    "that cannot save": (ONE, "a serial*a = serial0 ="),
+    "whose state names it before it is passed": (ONE, "serial+a a ="),
+    "the newest counts": (ONE, "a b =b>serial"),
+    "newest is who was passed first last": (ONE, "a b a =b>serial serial+b ="),
+    "a bridge that restarts forgets": (TWO, "a bridge ="),
+    "a withdrawn owner gets nothing, and may come back": (TWO, "a serial! =a>tail 59s serial0 =a>serial,a>tail"),
+    "a withdrawn owner is given up": (TWO, "serial! a 59s serial! 1s serial0 =a>tail a :a>all"),
+    "a copy after a reset goes to nobody": (ONE, "a serial+a serial-a a : ="),
+    "a copy goes to the owner that was not reset": (TWO, "a serial+a tail+a serial-a a :a>tail"),
+    "a copy after a reset that was not shown latched": (ONE, "serial0 a serial-a a : ="),
+    "a copy that waits passes": (TWO, "a serial?a b serial?b serial-b b :b>tail"),
+    "a restart proves no reset": (ONE, "a serial+a serial0 a :a>all =a>serial"),
+    "a new stop after a reset": (ONE, "a serial+a serial-a b :b>all =b>serial"),
+    "names have a bound, stops have none": (ONE, "a serial+a serial-a fill a :a>all =0>serial"),
+}
+
+
+@pytest.mark.parametrize(("owners", "history"), MEMBERS.values(), ids=MEMBERS)
+def test_it_is_repeated_until_confirmed(owners: tuple[str, ...], history: str) -> None:
+    robot = Robot(owners)
+    for word in history.split():
+        robot.do(word)
+
+
+def test_a_stop_that_is_given_up_is_told_once() -> None:
+    robot = Robot(TWO)
+    for word in ("a", "serial!", "60s", "1s", "serial!", "99s"):
+        robot.do(word)
+    assert robot.given_up == ["a>serial"]
+
+
+@pytest.mark.parametrize(
+    ("raw", "by", "why"),
+    [
+        (b"{}", "", ""),
+        (b"\xff", "", ""),
+        (b'{"stop": "x", "by": "ann", "why": "dog"}', "ann", "dog"),
+        (b'{"value": {"by": "ann"}}', "ann", ""),
+        (b"x" * 100_000, "", ""),
+    ],
+)
+def test_one_without_a_name_gets_one(raw: bytes, by: str, why: str) -> None:
+    first, second = (codec.decode(ESTOP, named(raw)) for _ in range(2))
+    assert (first.by, first.why, len(first.stop), is_named(raw)) == (by, why, 16, False)
+    assert first.stop != second.stop
+
+
+@pytest.mark.parametrize("raw", [b"", b"   ", payload("a"), b'{"stop": "aaaaaaaaaaaaaaaa", "more": 1}'])
+def test_what_has_a_name_or_is_no_stop_passes_as_it_is(raw: bytes) -> None:
+    assert named(raw) == raw
+    assert PassedStops(ONE, lambda: 0.0).accept(raw) == [raw]
+
+
+def test_only_the_bridge_says_for_whom_one_is() -> None:
+    assert named(payload("a", owner="tail", by="ann")) == payload("a", by="ann")
+
+
+@pytest.mark.parametrize("mirroring", [False, True])
+def test_the_bridge_repeats_it_on_the_robots_side_only(monkeypatch: pytest.MonkeyPatch, *, mirroring: bool) -> None:
+    world = World("bridge", monkeypatch)
+    serial, tail = ({"enabled": True, "serial": {"port": f"/dev/{name}"}} for name in TWO)
+    world.start(serial={**serial, "instances": {"tail": tail}})
+    world.run()
+    if mirroring:
+        world.local.publish("incoming/flags/remote-mirror", b"true", retain=True)
+        world.run()
+    world.remote.publish(STOP, b"{}")
+    world.run(1.9)
+    first, *repeated = [codec.decode(ESTOP, one) for one in world.local.payloads(STOP)]
+    assert first.owner is UNSET
+    assert [stop.owner for stop in repeated[:4]] == ["serial", "tail"] * 2
+    assert {stop.stop for stop in repeated} == {first.stop}
+    for owner in TWO:
+        state = replace_state(FREE, latched=True, count=1, recent=[first.stop])
+        world.local.publish(ESTOP_STATE.topic("", owner=owner)[1:], codec.encode(ESTOP_STATE, state), retain=True)
+    world.run(1)
+    before = len(world.local.on(STOP))
+    world.run(3)
+    assert len(world.local.on(STOP)) == before
+    assert not world.remote.on(STOP)
+
+
+def test_what_a_withdrawn_owner_has_not_confirmed_is_told(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    world = World("bridge", monkeypatch)
+    world.start(serial={"enabled": True, "serial": {"port": "/dev/serial"}})
+    world.run()
+    told: list[tuple[str, object]] = []
+    monkeypatch.setattr(Audit, "note", lambda _audit, what, **row: told.append((what, row.get("owner"))))
+    world.remote.publish(STOP, b'{"by": "ann"}')
+    world.run(0)
+    before = len(world.local.on(STOP))
+    world.local.publish(ESTOP_STATE.topic("", owner="serial")[1:], b"", retain=True)
+    world.run(70)
+    assert len(world.local.on(STOP)) <= before + 1
+    assert told == [("stop-not-confirmed", "serial")]
+    assert "is not confirmed by serial" in caplog.text
+
+
+def test_the_mirror_keeps_a_repetition_for_one_owner_on_the_robots_own_transport(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    world = World("mirror", monkeypatch)
+    world.start()
+    world.run()
+    for stop in (payload("a", owner="tail"), payload("b"), b"\xff"):
+        world.local.publish(STOP, stop)
+    world.run()
+    assert world.remote.payloads(STOP) == [payload("b"), b"\xff"]
+
+
+# -- random schedules
+
+
+def test_no_schedule_loses_a_stop_or_undoes_a_reset() -> None:
+    broken = [result for result in ENGINE.run("", 1, range(cases(40, 400))) if result.problems]
+    assert not broken, "python -m tests.kit.schedules stops --seed 1"
+
+
+@pytest.mark.parametrize(("fault", "schedules"), [("one owner's confirmation ends it for all", range(10))])
+def test_a_planted_fault_is_found(fault: str, schedules: range) -> None:
+    assert fault in FAULTS
+    assert any(ENGINE.violation(fault, number) for number in schedules)
