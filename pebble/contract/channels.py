@@ -196,6 +196,9 @@ CONTROL_STATE = _c("control/{owner}", Kind.STATE, p.ControlState,
 CONTROL_TURN = _c("control-turn/{owner}", Kind.EVENT, p.ControlTurn,
                   "Where a robot has several motor owners: what the first grants, and what the others follow.",
                   rate_hz=2, remote=False)  # fmt: skip
+CONTROL_VOUCHED = _c("control-vouched", Kind.EVENT, p.ControlVouched,
+                     "Over which time the bridge has passed on in time all that it was sent.",
+                     rate_hz=2, remote=False)  # fmt: skip
 LINK = _c("link", Kind.STATE, p.LinkState, "What the link to the remote broker carries; only where it may be thin.")
 AUDIT = _c("audit", Kind.STATE, p.AuditState, "The newest line of each chain of the audit, for others to note.")
 AUDIT_LINES = _c("audit-lines", Kind.EVENT, p.AuditLines, "Lines of the audit that were requested, as stored.")
@@ -279,7 +282,7 @@ _PATTERNS = [
 ]
 
 
-_RESERVED = frozenset(("audit", "by", "control", "control-turn", "from", "to", "neighbours"))
+_RESERVED = frozenset(("audit", "by", "control", "control-turn", "control-vouched", "from", "to", "neighbours"))
 
 
 def is_reserved(metric: str) -> bool:
