@@ -131,6 +131,12 @@ class Bridge(ServiceProcess):
         assert connection is not None
         connection.lose(seconds)
 
+    def find(self) -> None:
+        """Find what was lost."""
+        for connection in (self._local, self.remote):
+            if connection is not None:
+                connection.find()
+
     def leave(self) -> None:
         super().leave()
         if self._local is not None:

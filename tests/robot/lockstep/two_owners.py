@@ -50,7 +50,7 @@ _FOR_MS = (1000, 3000, 3000, 10_000)
 _STEERS_S = (0.3, 1.0, 2.0, 4.0, 8.0)
 _LOST_S = (*_DOWN_S, 40.0)
 _FLOODS_S = (1.5, 4.0, 9.0, 34.0)
-_LAGS_S = (0.6, 0.8, 1.5, 4.0, 6.0)
+_LAGS_S = (0.6, 0.8, 1.5, 2.5, 4.0)
 
 
 def configuration(folder: Path, strangers: str, *, bridged: bool = False) -> Config:
@@ -101,7 +101,7 @@ class TwoOwners:
             owner.start()
         if self.bridge is not None:
             self.bridge.start()
-            self.scheduler.run(4.0)
+            self.scheduler.run(1.5)
         self._check_again()
         self.scheduler.run(0.8)
 
@@ -289,7 +289,9 @@ class TwoOwners:
             process.delay = 0.0
             process.thaw()
         self.outside.calm()
-        self.scheduler.run(8.2 if bridges else 3.2)
+        for bridge in bridges:
+            bridge.find()
+        self.scheduler.run(5.2 if bridges else 3.2)
         for driver in self.drivers.values():
             driver.let_go(release=driver.name != STRANGER)
         self.scheduler.run(0.2)
@@ -304,7 +306,7 @@ class TwoOwners:
         drivers = [self.driver_of(name) for name in self.owners]
         self.scheduler.check(drivers == ["ann", "ann"], "who has control does not drive both owners")
         ann.let_go(release=False)
-        self.scheduler.run(5.0)
+        self.scheduler.run(4.7)
         self.scheduler.check(self._shown[1] == "", "who is silent keeps control")
 
 
