@@ -11,6 +11,7 @@ import msgspec
 
 from pebble.config import Config
 from pebble.services.mqtt_bridge import service as bridge_module
+from pebble.services.mqtt_bridge.audit import Audit
 from pebble.services.mqtt_bridge.service import MqttBridge
 from pebble.transports import Answer, Message, clock
 from pebble.transports.mqtt.read_age import BrokerDelay
@@ -103,6 +104,16 @@ class Remote(Connection):
             self._delay.delivered()
 
 
+class Unwritten(Audit):
+    """An audit without a thread, which would write and publish in real time."""
+
+    def start(self) -> None:
+        """Nothing is written."""
+
+    def close(self) -> None:
+        """Nothing waits."""
+
+
 class Bridge(ServiceProcess):
     """The bridge between ``inside`` and ``outside``."""
 
@@ -117,7 +128,7 @@ class Bridge(ServiceProcess):
             return self.remote
 
         self._local = Connection(self, inside)
-        with patch.object(bridge_module, "remote_transport", remote):
+        with patch.object(bridge_module, "remote_transport", remote), patch.object(bridge_module, "Audit", Unwritten):
             return MqttBridge(config, self._local, clock=self.scheduler.clock)
 
     def thaw(self) -> None:

@@ -132,6 +132,11 @@ class TwoOwners:
         self.check()
         self.scheduler.after(_CHECK_S, self._check_again)
 
+    @property
+    def holder(self) -> str:
+        """Who has control, as the first owner shows; empty: nobody."""
+        return next((driver.name for driver in self.drivers.values() if driver.id == self._shown[1]), "")
+
     def driver_of(self, name: str) -> str:
         """Who moves this owner; empty: it stands still."""
         command = self._command(self.owners[name])
