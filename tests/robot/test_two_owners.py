@@ -222,7 +222,9 @@ SILENCE: dict[str, tuple[Any, ...]] = {
     "it is taken over at once all the same": (
         *(*ANN_DRIVES, (1.0, "bridge", "kill", 4.0), (6.5, "eve", "hold", 3000, TAKE), (6.6, "held by", "eve")),
     ),
-    "it is released at once all the same": (*ANN_DRIVES, (1.0, "broker", "flood", 1.0, 0.8), (3.0, "ann", "let_go"), (3.1, "held by", "")),
+    "it is released at once all the same": (
+        *(*ANN_DRIVES, (1.0, "bridge", "kill", 4.0), (6.5, "ann", "let_go"), (6.6, "held by", "")),
+    ),
 }  # fmt: skip
 
 
