@@ -62,19 +62,19 @@ class Holders:
                 self._scheduler.check(now - last < _MOST_S + _TICK_S, "control does not end after 30 s")
         if (turn.boot, turn.turn) == (held.boot, held.turn):
             return
+        self._held, since, self._since = turn, self._since, now
         if held.key and turn.boot == held.boot and turn.turn == held.turn + 1 and held.id != turn.id:
-            self._passed_on(held, turn, drivers)
-        self._held, self._since = turn, now
+            self._passed_on(held, since, turn, drivers)
 
-    def _passed_on(self, held: ControlTurn, turn: ControlTurn, drivers: Mapping[str, Driver]) -> None:
+    def _passed_on(self, held: ControlTurn, since: float, turn: ControlTurn, drivers: Mapping[str, Driver]) -> None:
         now = self._scheduler.now
         if now - drivers[held.id].let_go_at < _SETTLED_S:
             return
         if turn.key and now - drivers[turn.id].took_at < _SETTLED_S:
             return
-        heard = sorted([*self._heard[held.id], *self._heard[held.key], self._since])
+        heard = sorted([*self._heard[held.id], *self._heard[held.key], since])
         silent = now - heard[-1] >= _MOST_S - _ROUND_S or self._was_without(heard, self._for_s[held.id])
-        moved = sorted([*self._moved[held.key], self._since])
+        moved = sorted([*self._moved[held.key], since])
         idle = now - moved[-1] >= _MOST_S - _ROUND_S or self._was_without(moved, _IDLE_S)
         self._scheduler.check(silent or (idle and turn.key != ""), "control is lost, though its holder was not silent")
 
