@@ -114,7 +114,7 @@ class BrokerDelay:
         self._delivered = self._read
 
     def delivery(self, now: float) -> tuple[float, float]:
-        """How long ago the newest answer was asked for before which all is delivered; how late it, or the next one, is."""
+        """How long ago the newest answer was asked for before which all is delivered; how late it or the next is."""
         sent_at, took = self._delivered
         waits = now - self._asked[0][1] if self._asked else 0.0
         return now - sent_at, max(took, waits) - self._shortest
