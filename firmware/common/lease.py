@@ -94,7 +94,8 @@ class Lease:
 
     def quiet_ms(self, since: int, now: int) -> int:
         """For how long the holder has sent nothing that counts."""
-        return self._diff(now, since)
+        quiet: int = self._diff(now, since)
+        return quiet
 
     def take(self, client: tuple, ms: int, now: int) -> None:
         """Control passes on to this client, or becomes free."""

@@ -32,7 +32,8 @@ class Holders:
         self._heard: defaultdict[str, list[float]] = defaultdict(list)  # by id, or key: at the operators' broker
         self._moved: defaultdict[str, list[float]] = defaultdict(list)  # by key
         self._for_s: dict[str, float] = {}  # by id: the shortest
-        self._arrived: dict[str, float] = {}  # by id, or key: at the owner, the newest
+        self._arrived: defaultdict[str, float] = defaultdict(float)  # by id, or key: at the owner, the newest
+        self._moves_arrived: defaultdict[str, float] = defaultdict(float)  # by key: the same
         self._vouched: list[float] = []  # until when, as the bridge has said
         self._held = ControlTurn(boot="", turn=0)
         self._since = 0.0
@@ -42,13 +43,16 @@ class Holders:
         fields = _fields(message)
         for name in self._names(message, fields):
             self._heard[name].append(self._scheduler.now)
-            if fields.get("x") or fields.get("z"):
+            if _moves(fields):
                 self._moved[name].append(self._scheduler.now)
 
     def arrived(self, message: Message) -> None:
         """The first owner has a message."""
-        for name in self._names(message, _fields(message)):
+        fields = _fields(message)
+        for name in self._names(message, fields):
             self._arrived[name] = self._scheduler.now
+            if _moves(fields):
+                self._moves_arrived[name] = self._scheduler.now
 
     def vouched(self, vouched: ControlVouched) -> None:
         self._vouched = [*self._vouched, vouched.end / 1000][-20:]
@@ -57,7 +61,7 @@ class Holders:
         """The first owner shows who has control."""
         now, held = self._scheduler.now, self._held
         if turn.key:
-            last = max(self._arrived.get(name, 0.0) for name in (turn.id, turn.key))
+            last = max(self._arrived[turn.id], self._arrived[turn.key])
             if turn.key == held.key:
                 self._scheduler.check(now - last < _MOST_S + _TICK_S, "control does not end after 30 s")
         if (turn.boot, turn.turn) == (held.boot, held.turn):
@@ -73,14 +77,16 @@ class Holders:
         if turn.key and now - drivers[turn.id].took_at < _SETTLED_S:
             return
         heard = sorted([*self._heard[held.id], *self._heard[held.key], since])
-        silent = now - heard[-1] >= _MOST_S - _ROUND_S or self._was_without(heard, self._for_s[held.id])
+        arrived = max(self._arrived[held.id], self._arrived[held.key])
+        silent = now - arrived >= _MOST_S - _ROUND_S or self._was_without(heard, self._for_s[held.id])
         moved = sorted([*self._moved[held.key], since])
-        idle = now - moved[-1] >= _MOST_S - _ROUND_S or self._was_without(moved, _IDLE_S)
+        arrived = max(self._moves_arrived[held.key], since)
+        idle = now - arrived >= _MOST_S - _ROUND_S or self._was_without(moved, _IDLE_S)
         self._scheduler.check(silent or (idle and turn.key != ""), "control is lost, though its holder was not silent")
 
     def _was_without(self, times: list[float], seconds: float) -> bool:
         """True if there is a moment until which the bridge has vouched, and nothing came for so long before."""
-        before = [(end, bisect_right(times, end + _ROUND_S)) for end in self._vouched]
+        before = [(end, bisect_right(times, end - _ROUND_S)) for end in self._vouched]
         return any(at and end - times[at - 1] >= seconds - _ROUND_S for end, at in before)
 
     def _names(self, message: Message, fields: dict[str, Any]) -> list[str]:
@@ -91,6 +97,10 @@ class Holders:
             self._for_s[fields["id"]] = min(self._for_s.get(fields["id"], 10.0), fields["for_ms"] / 1000)
             return [fields["id"]]
         return [key for key in fields.get("key", "").split(" ") if key] if message.topic == _DRIVE else []
+
+
+def _moves(fields: dict[str, Any]) -> bool:
+    return bool(fields.get("x") or fields.get("z"))
 
 
 def _fields(message: Message) -> dict[str, Any]:
