@@ -87,15 +87,10 @@ class Lease:
         if self.asker and diff(now, self._asked) >= self._wait:
             self.asker = ()
             self.changed = True
-        if self._held and self.quiet_ms(self._held_from, now) >= 5000:
+        if self._held and diff(now, self._held_from) >= 5000:
             self._held = False
-        if self.key and (self.quiet_ms(self._since, now) >= self._limit_ms or (self.asker and not self._held)):
+        if self.key and (diff(now, self._since) >= self._limit_ms or (self.asker and not self._held)):
             self._end(now)
-
-    def quiet_ms(self, since: int, now: int) -> int:
-        """For how long the holder has sent nothing that counts."""
-        quiet: int = self._diff(now, since)
-        return quiet
 
     def take(self, client: tuple, ms: int, now: int) -> None:
         """Control passes on to this client, or becomes free."""

@@ -3,6 +3,7 @@
 from pebble.motion.lease import Lease
 
 MOST_QUIET_MS = 30_000  # so long control lasts without a message of its holder, whatever else happens
+_IDLE_MS, _OTHERS_MS = 5000, 2000  # as in Lease
 
 
 class VouchedLease(Lease):
@@ -23,13 +24,23 @@ class VouchedLease(Lease):
         """Messages of before may not have been received here, though they were passed on."""
         self._received_all_since = now
 
-    def quiet_ms(self, since: int, now: int) -> int:
+    def tick(self, now: int) -> None:
+        """Let what is over end, as in Lease, which boards share and whose memory has no room for a method more.
+
+        Nothing of what counts as quiet is remembered: it may count no more.
+        """
+        if self.others and now - self._received >= _OTHERS_MS:
+            self.others, self.changed = False, True
+        if self.asker and now - self._asked >= self._wait:
+            self.asker, self.changed = (), True
+        self._held = self.key != "" and self._quiet_ms(self._held_from, now) < _IDLE_MS
+        if self.key and (self._quiet_ms(self._since, now) >= self._limit_ms or (self.asker and not self._held)):
+            self._end(now)
+
+    def _quiet_ms(self, since: int, now: int) -> int:
+        """For how long the holder has sent nothing that counts."""
         quiet = now - since
         if self.vouched is None or quiet >= MOST_QUIET_MS:
             return quiet
         begin, end = self.vouched
         return end - max(since, begin)
-
-    def tick(self, now: int) -> None:
-        self._held = self.key != ""  # computed anew: what counted as quiet may count no more
-        super().tick(now)
