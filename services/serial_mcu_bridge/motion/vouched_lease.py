@@ -2,7 +2,7 @@
 
 from pebble.motion.lease import Lease
 
-MOST_QUIET_MS = 30_000  # so long control lasts without a message of its holder, whatever else happens
+ENDS_AFTER_MS = 30_000  # so long control lasts without a message of its holder, whatever else happens
 _IDLE_MS, _OTHERS_MS = 5000, 2000  # as in Lease
 
 
@@ -40,7 +40,7 @@ class VouchedLease(Lease):
     def _quiet_ms(self, since: int, now: int) -> int:
         """For how long the holder has sent nothing that counts."""
         quiet = now - since
-        if self.vouched is None or quiet >= MOST_QUIET_MS:
+        if self.vouched is None or quiet >= ENDS_AFTER_MS:
             return quiet
         begin, end = self.vouched
         return end - max(since, begin)

@@ -147,13 +147,13 @@ class MotorBridge(SerialService):
         if not message.retain:
             self._judge_soon(self._waiting.put_turn(names["owner"], turn))
 
-    @on(c.CONTROL_VOUCHED, direct=True)
-    def receive_vouched(self, vouched: ControlVouched, _arrived: float) -> None:
-        self._judge_soon(self._waiting.put_vouched(vouched))
-
     @on(c.DRIVE, direct=True)
     def receive_drive(self, drive: Drive, arrived: float) -> None:
         self._judge_soon(self._waiting.put_drive(drive, arrived))
+
+    @on(c.CONTROL_VOUCHED, direct=True)
+    def receive_vouched(self, vouched: ControlVouched, _arrived: float) -> None:
+        self._judge_soon(self._waiting.put_vouched(vouched))
 
     def _judge_soon(self, was_empty: bool) -> None:
         if was_empty and not self.run_if_idle(self.judge):
