@@ -56,6 +56,9 @@ class Answer:
     number: int  # counts the answers of one connection
     seconds: float
     queue_s: float | None  # by so much TCP's own round trips are longer than the shortest; None: the system cannot tell
+    #: All that waited for us when this answer was asked for, so many seconds ago, has been delivered.
+    delivered_s: float = 0.0
+    late_s: float = 0.0  # by so much longer than usual it took, or the next one takes
 
 
 Handler = Callable[[Message], None]

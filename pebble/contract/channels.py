@@ -182,6 +182,9 @@ CONTROL_STATE = _c("control/{owner}", Kind.STATE, p.ControlState,
 CONTROL_TURN = _c("control-turn/{owner}", Kind.EVENT, p.ControlTurn,
                   "Where a robot has several motor owners: what the first grants, and what the others follow.",
                   rate_hz=2, remote=False)  # fmt: skip
+CONTROL_VOUCHED = _c("control-vouched", Kind.EVENT, p.ControlVouched,
+                     "Over which time the bridge has passed on in time all that it was sent.",
+                     rate_hz=2, remote=False)  # fmt: skip
 LINK = _c("link", Kind.STATE, p.LinkState, "What the link to the remote broker carries; only where it may be thin.")
 BRIDGE_PROBE = _c("bridge-probe", Kind.EVENT, p.AnyObject,
                   "By it the bridge detects that two of the robot's connections lead to one broker, "
@@ -259,7 +262,7 @@ _PATTERNS = [
 ]
 
 
-_RESERVED = frozenset(("by", "control", "control-turn", "from", "to", "neighbours"))
+_RESERVED = frozenset(("by", "control", "control-turn", "control-vouched", "from", "to", "neighbours"))
 
 
 def is_reserved(metric: str) -> bool:

@@ -325,6 +325,13 @@ class ControlTurn(Payload, frozen=True, kw_only=True, omit_defaults=True):
     barred: Annotated[int, Meta(ge=0, le=LAST_RUN)] = 0  # no run up to this one moves anything
 
 
+class ControlVouched(Payload, frozen=True, kw_only=True):
+    """A time, by the machine's clock since its start, in which the bridge has passed on all that it was to."""
+
+    begin: Annotated[int, Meta(ge=0, le=LARGEST_MS)] = field(name="from")
+    end: Annotated[int, Meta(ge=0, le=LARGEST_MS)] = field(name="to")
+
+
 class LinkState(Payload, frozen=True, kw_only=True):
     """What the way between a robot and its remote broker carries now, as its bridge measures it."""
 

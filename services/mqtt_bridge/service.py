@@ -10,6 +10,7 @@ import msgspec
 from pebble.contract import (
     BRIDGE_PROBE,
     CONTROL_STATE,
+    CONTROL_VOUCHED,
     DRIVE,
     ESTOP,
     ESTOP_STATE,
@@ -45,6 +46,7 @@ from pebble.services.mqtt_bridge.passed_stops import REPEAT_S, PassedStops, name
 from pebble.services.mqtt_bridge.private_topics import PrivateTopics
 from pebble.services.mqtt_bridge.same_broker import SameBrokerProbe, now_ms
 from pebble.services.mqtt_bridge.uplink import POLL_S, Uplink
+from pebble.services.mqtt_bridge.vouching import PERIOD_S, Vouching
 from pebble.transports import Message, QoS, State, Transport
 
 if TYPE_CHECKING:
@@ -66,7 +68,7 @@ class MqttBridge(ForwardingService):
     """Forwards by Table A.1, once its two sides are known not to be one broker."""
 
     name = "mqtt_bridge"
-    publishes = (ONLINE, BRIDGE_PROBE)
+    publishes = (ONLINE, BRIDGE_PROBE, CONTROL_VOUCHED)
     client_name = "local-bridge"
     rules = TABLE_A1
     probed_sides = (Side.REMOTE,)
@@ -96,6 +98,9 @@ class MqttBridge(ForwardingService):
         own, sparing = ((), False) if self._uplink is None else ((LINK,), True)
         self._leftovers = Leftovers(self.config.base, self.subjects, self.remote, *own, sparing=sparing)
         self._leftover_timer: Timer | None = None
+        asks = section.remote is None or section.remote.kind == "mqtt"
+        self._vouching = Vouching(self.remote, self.clock(), None if asks else self._silence_s)
+        self._local_changes = 0  # of the connection
         self._stop_topic = ESTOP.topic(self.config.base)
         self._stops = self._make_stops()
         self.transport.judge_topics(is_invented=lambda topic: self.subjects.invented(topic.encode()) is not None)
@@ -110,6 +115,12 @@ class MqttBridge(ForwardingService):
     @property
     def _stop_filters(self) -> list[str]:
         return [self._stop_topic, *([with_name(self._stop_topic, "+")] if self.config.security.named else [])]
+
+    @property
+    def _silence_s(self) -> float:
+        """After so long a silent remote side is lost."""
+        section = self.config.services.mqtt_bridge
+        return section.remote_mqtt.silence_seconds if section.remote is None else section.remote.lease_ms / 1000
 
     def make_names(self) -> Names | None:
         security = self.config.security
@@ -126,9 +137,7 @@ class MqttBridge(ForwardingService):
             return None
         from pebble.services.mqtt_bridge.stop_connection import StopConnection  # only who needs it pays for it
 
-        section = self.config.services.mqtt_bridge
-        silence_s = section.remote_mqtt.silence_seconds if section.remote is None else section.remote.lease_ms / 1000
-        notices_s = silence_s + _NOTICED_S
+        notices_s = self._silence_s + _NOTICED_S
         make = partial(StopConnection, transport, self._stop_filters, self._pass_stop, self._forwards, self.clock)
         uplink = self._uplink
         if uplink is None:
@@ -280,6 +289,19 @@ class MqttBridge(ForwardingService):
     def _send_media_requests(self) -> None:
         self._requests.send()
 
+    @every(PERIOD_S)
+    def _vouch(self) -> None:
+        """Tell the motor owners up to when they have been sent everything."""
+        if not self.config.motor_owners:
+            return
+        gate, counters = self.forwarder.gate, self.forwarder.counters
+        passes = self._same_broker.both_connected and (
+            gate is Gate.SHUT or (gate is Gate.OPEN and bool(self.subscriptions[Side.REMOTE]))
+        )
+        dropped = counters[f"{Side.REMOTE.value}: {Drop.LATE.value}"], self.transport.counters["dropped"]
+        losses = gate, self.epoch, self._local_changes, counters[f"{Side.LOCAL.value}: refused"], *dropped
+        self.publish(CONTROL_VOUCHED, self._vouching.check(passes, losses, self.clock()))
+
     @every(CHECK_S)
     def _check_owners(self) -> None:
         self._owners.check(self.clock())
@@ -297,6 +319,7 @@ class MqttBridge(ForwardingService):
     def on_side_state(self, side: Side, state: State) -> None:
         if side is Side.LOCAL:
             self._owners.connected()
+            self._local_changes += 1
         super().on_side_state(side, state)
 
     def receive_local(self, message: Message) -> None:

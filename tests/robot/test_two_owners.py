@@ -1,4 +1,4 @@
-"""Two motor owners are one robot: the table of who drives both, random schedules, and what is shown.
+"""Two motor owners are one robot: tables of who drives both, and of what is no silence; random schedules.
 
 ``python -m tests.kit.schedules owners`` runs thousands. The world in virtual time checks its own rules all the time.
 """
@@ -36,14 +36,26 @@ def config(tmp_path_factory: pytest.TempPathFactory) -> Config:
     return configuration(Path(tmp_path_factory.mktemp("own")), "free")
 
 
+@pytest.fixture(scope="module")
+def bridged(tmp_path_factory: pytest.TempPathFactory) -> Config:
+    return configuration(Path(tmp_path_factory.mktemp("own")), "free", bridged=True)
+
+
 def perform(config: Config, events: tuple[Any, ...]) -> TwoOwners:
-    """``(seconds, who or which owner, what, ...)``; ``(seconds, "moved by", first, second)`` is what must be then."""
+    """``(seconds, who or which owner, what, ...)``.
+
+    ``(seconds, "moved by", first, second)`` and ``(seconds, "held by", who)`` are what must be then.
+    """
     world = TwoOwners(0, (config,))
     begun = world.scheduler.now
     for at, who, what, *rest in sorted(events, key=lambda event: event[0]):
         world.scheduler.run(begun + at - world.scheduler.now)
+        arguments = [argument for argument in rest if not isinstance(argument, dict)]
+        fields = next((argument for argument in rest if isinstance(argument, dict)), {})
         if who == "moved by":
             assert [world.driver_of(name) for name in world.owners] == [what, *rest], f"after {at} s"
+        elif who == "held by":
+            assert world.holder == what, f"after {at} s"
         elif what == "frozen":
             world.freeze(world.owners[who], *rest)
         elif what == "killed":
@@ -51,9 +63,8 @@ def perform(config: Config, events: tuple[Any, ...]) -> TwoOwners:
         elif what == "retained":
             world.do_retain(1, -1)  # the newest turn, with a time of now
         else:
-            arguments = [argument for argument in rest if not isinstance(argument, dict)]
-            fields = next((argument for argument in rest if isinstance(argument, dict)), {})
-            getattr(world.drivers[who], what)(*arguments, **fields)
+            others = {"broker": world.outside, "bridge": world.bridge, FIRST: world.owners[FIRST].connection}
+            getattr(others.get(who) or world.drivers[who], what)(*arguments, **fields)
     return world
 
 
@@ -137,6 +148,94 @@ MEMBERS: dict[str, tuple[Any, ...]] = {
         *((2.7, "moved by", "", ""), (4.0, "moved by", "", "")),
     ),
 }  # fmt: skip
+
+
+ANN_HOLDS = (0, "ann", "hold", 3000)
+EVE_WAITS = (0.5, "eve", "hold")
+LATE_S = 4.0
+
+#: With a bridge: what holds up, or loses, the messages of who has control, and who has it when.
+SILENCE: dict[str, tuple[Any, ...]] = {
+    "none: who is silent loses control": (
+        *(ANN_HOLDS, (5.0, "held by", "ann"), (5.1, "ann", "let_go", {"release": False})),
+        *((7.5, "held by", "ann"), (9.6, "held by", "")),
+    ),
+    "none: who moves nothing gives way": (ANN_HOLDS, EVE_WAITS, (4.5, "held by", "ann"), (7.0, "held by", "eve")),
+    "a flood by a viewer": (
+        *(ANN_HOLDS, (1.0, "broker", "flood", 9.0, LATE_S), *((at, "held by", "ann") for at in (5.0, 9.0, 14.0, 18.0))),
+    ),
+    "a flood by a stranger, who asks 50 times a second": (
+        *(*ANN_DRIVES, (1.0, "broker", "flood", 9.0, LATE_S), (1.0, "eve", "hold", 3000, {"period_s": 0.02})),
+        *((at, "held by", "ann") for at in (5.0, 9.0, 14.0, 18.0)),
+    ),
+    "a flood of which only drive commands are too old": (
+        *(*ANN_DRIVES, EVE_WAITS, (1.0, "broker", "flood", 9.0, 0.8)),
+        *((at, "held by", "ann") for at in (5.0, 9.0, 14.0, 18.0)),
+    ),
+    "a flood, and who has control has gone: as soon as that shows": (
+        *(ANN_HOLDS, (1.0, "broker", "flood", 9.0, LATE_S), (2.0, "ann", "let_go", {"release": False})),
+        *((12.0, "held by", "ann"), (20.0, "held by", "")),
+    ),
+    "a flood without end: 30 s": (
+        *(ANN_HOLDS, (1.0, "broker", "flood", 60.0, LATE_S), (2.0, "ann", "let_go", {"release": False})),
+        *((29.9, "held by", "ann"), (31.5, "held by", "")),
+    ),
+    "a flood without end, and another asks: 30 s": (
+        *(ANN_HOLDS, EVE_WAITS, (1.0, "broker", "flood", 60.0, 2.5)),
+        *((29.9, "held by", "ann"), (30.5, "held by", "eve")),
+    ),
+    "a broker that stalls": (
+        *(*ANN_DRIVES, EVE_WAITS, (1.0, "broker", "stall", 1.9), (3.0, "broker", "stall", 1.9)),
+        *((at, "held by", "ann") for at in (3.0, 5.0, 7.0, 9.0)),
+    ),
+    "a bridge that restarts": (
+        *(*ANN_DRIVES, EVE_WAITS, (1.0, "bridge", "kill", 7.0)),
+        *((at, "held by", "ann") for at in (5.0, 7.5, 12.0)),
+    ),
+    "a bridge that freezes": (
+        *(*ANN_DRIVES, EVE_WAITS, (1.0, "bridge", "freeze"), (8.0, "bridge", "thaw")),
+        *((at, "held by", "ann") for at in (5.0, 8.1, 12.0)),
+    ),
+    "a bridge that loses the robot's broker": (
+        *(*ANN_DRIVES, EVE_WAITS, (1.0, "bridge", "lose", 6.0, {"local": True})),
+        *((at, "held by", "ann") for at in (5.0, 7.1, 12.0)),
+    ),
+    "Wi-Fi lost for 31 s: 30": (
+        *(ANN_HOLDS, (1.0, "bridge", "lose", 31.0, {"local": False}), (30.0, "held by", "ann"), (31.5, "held by", "")),
+        (34.0, "held by", "ann"),
+    ),
+    "a first owner that freezes": (
+        *(*ANN_DRIVES, EVE_WAITS, (1.0, FIRST, "frozen", 7.0)),
+        *((at, "held by", "ann") for at in (8.1, 9.0, 12.0)),
+    ),
+    "a first owner that freezes for a moment": (
+        *(*ANN_DRIVES, (1.0, FIRST, "frozen", 1.9)),
+        *((at, "held by", "ann") for at in (3.0, 4.0, 5.0)),
+    ),
+    "a first owner that loses its connection": (
+        *(*ANN_DRIVES, EVE_WAITS, (1.0, FIRST, "lose", 7.0)),
+        *((at, "held by", "ann") for at in (8.1, 9.0, 12.0)),
+    ),
+    "the second follows all the time": (
+        *(*ANN_DRIVES, (1.0, "broker", "flood", 4.0, LATE_S), (9.5, "moved by", "ann", "ann")),
+    ),
+    "it is taken over at once all the same": (
+        *(*ANN_DRIVES, (1.0, "bridge", "kill", 4.0), (6.5, "eve", "hold", 3000, TAKE), (6.6, "held by", "eve")),
+    ),
+    "it is released at once all the same": (
+        *(*ANN_DRIVES, (1.0, "bridge", "kill", 4.0), (6.5, "ann", "let_go"), (6.6, "held by", "")),
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", SILENCE)
+def test_what_is_no_silence(bridged: Config, name: str) -> None:
+    perform(bridged, SILENCE[name])
+
+
+def test_without_a_bridge_all_time_counts(config: Config) -> None:
+    leave = (3.05, "ann", "let_go", {"release": False})
+    perform(config, (ANN_HOLDS, leave, (5.9, "held by", "ann"), (6.4, "held by", "")))
 
 
 @pytest.mark.parametrize("name", MEMBERS)

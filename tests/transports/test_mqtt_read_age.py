@@ -125,6 +125,17 @@ class TestBrokerDelay:
         delay.answered(6.0)
         assert self.at(delay, 6.0) == 4.0
 
+    def test_what_is_delivered_was_sent_before_the_newest_answer_was_asked_for(self, delay: BrokerDelay) -> None:
+        for sent_at in (1.0, 1.5, 2.0):
+            delay.asked(sent_at, clear=False)
+        for at, happens, delivered in (
+            *((2.1, lambda: None, (2.1, 1.0)), (2.2, lambda: delay.answered(2.2), (2.2, 0.6))),
+            *((2.3, delay.delivered, (1.3, 1.1)), (2.3, lambda: delay.answered(2.3), (1.3, 1.1))),
+            *((2.4, lambda: delay.answered(2.4), (1.4, 1.1)), (2.4, delay.delivered, (0.4, 0.3))),
+        ):
+            happens()
+            assert tuple(round(one, 3) for one in delay.delivery(at)) == delivered, at
+
     def test_an_answer_without_a_ping_is_none(self, delay: BrokerDelay) -> None:
         delay.answered(1.0)
         assert self.at(delay, 1.0) == 0

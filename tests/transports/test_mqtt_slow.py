@@ -82,11 +82,17 @@ class TestPatience:
             assert first is not None
             assert (first.number, first.queue_s is not None) == (1, True)
             assert 0.3 < first.seconds < 0.6
+            assert (first.delivered_s, first.late_s) == (
+                pytest.approx(first.seconds, abs=0.05),
+                pytest.approx(0.3, abs=0.2),
+            )
             link.idle(1.5)  # the next one is not answered
             second = link.connection.answer
             assert second is not None
             assert second.number == 1
             assert second.seconds > 0.9
+            assert second.delivered_s > 1.5
+            assert second.late_s > 0.7
 
 
 class TestSocket:

@@ -194,6 +194,7 @@ class Connection:
             if owes:
                 with self._lock:
                     client.acknowledge()
+        incoming.age.delay.delivered()
         if incoming.age.has_retained:
             incoming.age.note_handled()
         if self._in_flight.answered:
@@ -381,7 +382,9 @@ class Connection:
                 return None
             number, seconds = self._in_flight.newest_answer(clock.since_boot())
             shortest, present = shortest_round_trip_s(sock), present_round_trip_s(sock)
-            return Answer(number, seconds, max(0.0, present - shortest) if shortest else None) if number else None
+            queue_s = max(0.0, present - shortest) if shortest else None
+            delivered_s, late_s = self.incoming.age.delay.delivery(clock.since_boot())
+            return Answer(number, seconds, queue_s, delivered_s, late_s) if number else None
 
     @property
     def confirmed(self) -> Limits:

@@ -69,6 +69,7 @@ class BrokerDelay:
     def __init__(self) -> None:
         #: Unanswered pings: since when what comes before the answer may have waited, when sent, do they say something.
         self._asked: deque[tuple[float, float, bool]] = deque()
+        self._read = self._delivered = 0.0, 0.0  # the newest answer: when it was asked for, and how long it took
         self._shortest = _FAR_S
         self._newest = 0.0  # seconds until the newest answer
         self._came_at = 0.0  # when something was received last
@@ -92,6 +93,7 @@ class BrokerDelay:
         """The oldest ping was answered."""
         if self._asked:
             _, sent_at, clear = self._asked.popleft()
+            self._read = sent_at, now - sent_at
             self._newest = now - sent_at if clear else 0.0
             self.usual(now - sent_at)
         near = self._shortest <= _NEAR_S
@@ -106,6 +108,16 @@ class BrokerDelay:
         while self._asked and self._asked[0][1] < sent_at:
             self._asked.popleft()
         self._newest = min(self._newest, now - sent_at)
+
+    def delivered(self) -> None:
+        """All that was read has been delivered."""
+        self._delivered = self._read
+
+    def delivery(self, now: float) -> tuple[float, float]:
+        """How long ago the newest answer was asked for before which all is delivered; how late it or the next is."""
+        sent_at, took = self._delivered
+        waits = now - self._asked[0][1] if self._asked else 0.0
+        return now - sent_at, max(took, waits) - self._shortest
 
     def seconds(self, now: float, round_trip_s: Callable[[], float]) -> float:
         """What is received at ``now`` waited so long; ``round_trip_s`` asks for TCP's present one, if that matters."""

@@ -7,7 +7,7 @@ import sys
 from collections.abc import Callable
 
 from pebble.config import Security
-from pebble.contract.payloads import ControlRequest, ControlState, ControlTurn, Drive
+from pebble.contract.payloads import ControlRequest, ControlState, ControlTurn, ControlVouched, Drive
 from pebble.runtime.rate_limit import RateLimitedLog
 from pebble.services.serial_mcu_bridge.motion.paced import Paced
 from pebble.services.serial_mcu_bridge.motion.shared_lease import SharedLease, lease_of
@@ -34,12 +34,17 @@ class Control:
         owner: str = "",
         owners: tuple[str, ...] = (),
         show_turn: Callable[[], object] = lambda: None,
+        bridged: bool = False,
     ) -> None:
-        """``owners``: all of the robot; if there are others, ``show_turn()`` is to send them :meth:`turn`."""
+        """``owners``: all of the robot; if there are others, ``show_turn()`` is to send them :meth:`turn`.
+
+        ``bridged``: silence counts only while :meth:`vouch` says so.
+        """
         self.boot = secrets.token_hex(4)  # of this life of the motor owner
         self._named = security.named
         strangers = ("drive", "free", "refuse").index(security.unnamed)
         self.lease = lease_of(owner, owners, self.boot, _ms(now), operator.sub, secrets.token_hex, strangers)
+        self.lease.vouched = (_ms(now), _ms(now)) if bridged else None
         self._shared = self.lease if isinstance(self.lease, SharedLease) else None
         self._turns = Paced(show_turn, _TURNS_PER_S)
         self._turn_due = None if self._shared is None else now
@@ -74,6 +79,14 @@ class Control:
             self.lease.release(client, _ms(now))
         else:
             self.lease.hold(client, int(request.for_ms), over, _ms(now))
+
+    def vouch(self, vouched: ControlVouched, now: float) -> None:
+        """Take what the bridge says."""
+        self.lease.vouch(vouched.begin, vouched.end, _ms(now))
+
+    def doubt(self, now: float) -> None:
+        """Messages of before may have been lost between the bridge and here."""
+        self.lease.doubt(_ms(now))
 
     def account(self, drive: Drive) -> str | None:
         """Return whose command this is, "" where names are not checked; None: it is from a program of the robot."""

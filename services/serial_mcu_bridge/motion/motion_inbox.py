@@ -5,9 +5,18 @@ from itertools import chain
 
 from msgspec import Struct
 
-from pebble.contract.payloads import SCRIPT, ControlRequest, ControlTurn, Drive, EstopCommand, EstopReset
+from pebble.contract.payloads import (
+    SCRIPT,
+    ControlRequest,
+    ControlTurn,
+    ControlVouched,
+    Drive,
+    EstopCommand,
+    EstopReset,
+)
 from pebble.motion.arbiter import PERSON, UNKNOWN_RUN
 from pebble.services.serial_mcu_bridge.motion.control import Control
+from pebble.transports import State
 
 _STOPS = 8  # as many names as a latch remembers
 _RESETS = 8
@@ -45,6 +54,8 @@ class Batch(Struct):
     resets: list[ReceivedReset]
     requests: list[ReceivedRequest]
     turns: list[tuple[str, ControlTurn]]
+    lost: bool  # messages may have been
+    vouched: ControlVouched | None
     drives: list[ReceivedDrive]
 
 
@@ -64,6 +75,8 @@ class MotionInbox:
         self._resets: list[ReceivedReset] = []
         self._requests: dict[tuple[str, str], ReceivedRequest] = {}  # by sender, the newest sender last
         self._turns: dict[str, ControlTurn] = {}  # by owner
+        self._lost = False
+        self._vouched: ControlVouched | None = None
         self._drives: dict[int, list[ReceivedDrive]] = {}  # the same
 
     def put_stop(self, stop: EstopCommand) -> bool:
@@ -102,6 +115,18 @@ class MotionInbox:
             self._turns[owner] = turn
             return was_empty
 
+    def put_vouched(self, vouched: ControlVouched) -> bool:
+        with self._lock:
+            was_empty = self._empty
+            self._vouched = vouched
+            return was_empty
+
+    def note_state(self, state: State) -> None:
+        """A connection that is lost loses messages; nothing is to be done until others have come."""
+        if state is not State.CONNECTED:
+            with self._lock:
+                self._lost = True
+
     def put_drive(self, drive: Drive, now: float) -> bool:
         with self._lock:
             was_empty = self._empty
@@ -120,13 +145,17 @@ class MotionInbox:
         """Return all that waits, and forget it."""
         with self._lock:
             drives = list(chain.from_iterable(self._drives.values()))
-            batch = Batch(self._stops, self._resets, list(self._requests.values()), list(self._turns.items()), drives)
+            requests, turns = list(self._requests.values()), list(self._turns.items())
+            batch = Batch(self._stops, self._resets, requests, turns, self._lost, self._vouched, drives)
             self._stops, self._resets, self._requests, self._turns, self._drives = [], [], {}, {}, {}
+            self._lost, self._vouched = False, None
             return batch
 
     @property
     def _empty(self) -> bool:
-        return not (self._drives or self._stops or self._resets or self._requests or self._turns)
+        return not (
+            self._drives or self._stops or self._resets or self._requests or self._turns or self._vouched is not None
+        )
 
     def _drop(self, waiting: list[EstopCommand] | list[ReceivedReset]) -> None:
         del waiting[0]

@@ -8,19 +8,19 @@ from abc import abstractmethod
 from typing import Any
 
 from pebble.contract.payloads import ControlTurn
-from pebble.motion.lease import Lease
+from pebble.services.serial_mcu_bridge.motion.vouched_lease import VouchedLease
 
 FOLLOWS_MS = 1500  # so long after it was sent a turn is followed; it is repeated every 500
 SETTLES_MS = FOLLOWS_MS + 100
 
 
-class SharedLease(Lease):
+class SharedLease(VouchedLease):
     """A lease that refuses motion for as long as the owners may differ."""
 
     until = sys.maxsize  # when everything stops, unless another turn is received before
 
     def __init__(self, peers: frozenset[str], now: int, *lease: Any) -> None:
-        """``peers``: whose turns are given to :meth:`receive`; ``lease``: what else Lease needs."""
+        """``peers``: whose turns are given to :meth:`receive`; ``lease``: what else VouchedLease needs."""
         super().__init__(now, *lease)
         self.peers = peers
 
@@ -110,9 +110,9 @@ class FollowingLease(SharedLease):
         """Do nothing: the first owner ends what is over."""
 
 
-def lease_of(owner: str, owners: tuple[str, ...], boot: str, *lease: Any) -> Lease:
-    """Return the lease of ``owner``, one of the robot's ``owners``; ``lease``: what Lease needs."""
+def lease_of(owner: str, owners: tuple[str, ...], boot: str, *lease: Any) -> VouchedLease:
+    """Return the lease of ``owner``, one of the robot's ``owners``; ``lease``: what VouchedLease needs."""
     others, first = frozenset(owners) - {owner}, min(owners, default=owner)
     if not others:
-        return Lease(*lease)
+        return VouchedLease(*lease)
     return FirstLease(boot, others, *lease) if owner == first else FollowingLease(frozenset({first}), *lease)

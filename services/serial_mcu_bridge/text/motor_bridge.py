@@ -12,6 +12,7 @@ from pebble.contract.payloads import (
     ControlRequest,
     ControlState,
     ControlTurn,
+    ControlVouched,
     Drive,
     EstopCommand,
     EstopReset,
@@ -80,6 +81,7 @@ class MotorBridge(SerialService):
             self._owner,
             self.config.motor_owners,
             self._show_turn,
+            bridged=self.config.services.mqtt_bridge.enabled,
         )
         self._waiting = MotionInbox(self._control)
         self.state_file = StateFile(self.config.state_file(f"estop-{self._owner}"), self._on_saved)
@@ -135,6 +137,7 @@ class MotorBridge(SerialService):
 
     def set_up(self) -> None:
         """Receive the turns of other motor owners as well, where there are any."""
+        self.transport.on_state(self._waiting.note_state)
         super().set_up()
         receive = self.refusals.reader(c.CONTROL_TURN, self._receive_turn)
         for owner in self._control.peers:
@@ -148,6 +151,10 @@ class MotorBridge(SerialService):
     @on(c.DRIVE, direct=True)
     def receive_drive(self, drive: Drive, arrived: float) -> None:
         self._judge_soon(self._waiting.put_drive(drive, arrived))
+
+    @on(c.CONTROL_VOUCHED, direct=True)
+    def receive_vouched(self, vouched: ControlVouched, _arrived: float) -> None:
+        self._judge_soon(self._waiting.put_vouched(vouched))
 
     def _judge_soon(self, was_empty: bool) -> None:
         if was_empty and not self.run_if_idle(self.judge):
@@ -174,6 +181,10 @@ class MotorBridge(SerialService):
             self._control.receive_turn(owner, turn, self.clock())
             self._guard.bar(turn.barred, self.clock())
             self._note_control()
+        if batch.lost:
+            self._control.doubt(self.clock())
+        if batch.vouched is not None:
+            self._control.vouch(batch.vouched, self.clock())
         for received in batch.drives:
             if latches or not (batch.stops and received.drive.moves):
                 self._drive(received)
@@ -192,6 +203,7 @@ class MotorBridge(SerialService):
         now, drive = self.clock(), received.drive
         if drive.moves and now - received.at > WAIT_LIMIT_S:
             self.count_late(c.DRIVE)
+            self._control.doubt(now)
             return
         valid_s = self._guard.judge(drive, now)
         self._note_control()
@@ -210,6 +222,7 @@ class MotorBridge(SerialService):
         now = self.clock()
         if now - received.at > c.CONTROL.waits_s and not received.request.ends():
             self.count_late(c.CONTROL)
+            self._control.doubt(now)
             return
         self._control.request(received.request, received.over, now)
         self._note_control()

@@ -269,3 +269,10 @@ def test_what_a_request_is() -> None:
         ({"id": "3f2a91c0", "by": 1}, None), ({"id": "3f2a91c0", "device": None}, None),
     ):  # fmt: skip
         assert request_of(fields) == request, fields
+
+
+def test_keys_of_several_owners_are_shorter_than_80_letters() -> None:
+    own = lease()
+    own.hold(ANN, 3000, False, after(0))
+    for others, holds in ((0, True), (70, True), (71, False), (700, False)):
+        assert own.holds(("x" * others + " " if others else "") + own.key, "") is holds

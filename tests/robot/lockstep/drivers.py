@@ -30,6 +30,7 @@ class Driver(Process):
         self._stops: dict[str, Any] = {}
         self._commands = commands
         self._wants = self._gesture = 0
+        self.let_go_at = self.took_at = -1e9
         self._connection = Connection(self, network).open(0.0)
         self._connection.subscribe(f"{BASE}/outgoing/#", self._receive, direct=True)
 
@@ -38,6 +39,7 @@ class Driver(Process):
     def hold(self, for_ms: int = 3000, *, take: bool = False, period_s: float = 1.0, seconds: float = 1e9) -> None:
         """Ask, and go on asking."""
         self._wants += 1
+        self.took_at = self.scheduler.now if take else self.took_at
         self._ask(self._wants, for_ms, take, period_s, self.scheduler.now + seconds)
 
     def _ask(self, number: int, for_ms: int, take: bool, period_s: float, until: float) -> None:
@@ -49,6 +51,7 @@ class Driver(Process):
 
     def let_go(self, *, release: bool = True) -> None:
         """Release control, or lose the connection."""
+        self.let_go_at = self.scheduler.now
         self._wants += 1
         self._gesture += 1
         if release:

@@ -84,7 +84,7 @@ class Connection(MemoryTransport):
         if self._attached is not None:
             self._attached = 0  # no era of any hub
             self._work()
-        self.network.scheduler.after(seconds, self._find)
+        self.network.scheduler.after(seconds, self.find)
 
     def silent(self, seconds: float) -> None:
         """The process was frozen for so long: what has waited is lost with the connection."""
@@ -117,7 +117,7 @@ class Connection(MemoryTransport):
         self.number += 1
         super()._connect()
 
-    def _find(self) -> None:
+    def find(self) -> None:
         self._away = False
         self.wake()
 

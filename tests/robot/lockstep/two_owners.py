@@ -6,6 +6,11 @@ Every step is possible at any time, and does nothing where it has no meaning, so
 * The first owner, by name, is moved only by who has control of it, or without a key while nobody has.
 * The second one is moved only by whom the first has named less than 1.5 s ago.
 * In the end, when everything works, who takes control drives both.
+
+Every other layout has a bridge, persons are beyond it, and floods hold up what they send. Then, too:
+
+* Nobody loses control by silence or idleness, unless the operators' broker had nothing of theirs for so long.
+* Control ends 30 s after the last message of its holder that the first owner was sent.
 """
 
 from __future__ import annotations
@@ -19,12 +24,14 @@ from itertools import count
 from pathlib import Path
 
 from pebble.config import Config, load
-from pebble.contract import CONTROL_STATE, CONTROL_TURN, codec
+from pebble.contract import CONTROL_STATE, CONTROL_TURN, CONTROL_VOUCHED, codec
 from pebble.runtime.process import view_of
 from pebble.transports import Message, QoS
 from tests.kit.schedules import Engine, Outcome, RandomSteps, Steps, perform_steps
+from tests.robot.lockstep.bridge import Bridge, Outside
 from tests.robot.lockstep.commands import Command, Commands
 from tests.robot.lockstep.drivers import BASE, SCRIPT, STRANGER, Driver
+from tests.robot.lockstep.holders import Holders
 from tests.robot.lockstep.network import Network
 from tests.robot.lockstep.owner import Disk, Owner, Wheels
 from tests.robot.lockstep.processes import Process
@@ -41,16 +48,22 @@ _DOWN_S = (0.02, 0.3, 0.8, 1.2, 3.0)
 _FROZEN_S = (0.05, 0.3, 0.9, 1.4, 2.2, 5.0)
 _FOR_MS = (1000, 3000, 3000, 10_000)
 _STEERS_S = (0.3, 1.0, 2.0, 4.0, 8.0)
+_LOST_S = (*_DOWN_S, 40.0)
+_FLOODS_S = (1.5, 4.0, 9.0, 34.0)
+_LAGS_S = (0.6, 0.8, 1.5, 2.5, 4.0)
 
 
-def configuration(folder: Path, strangers: str) -> Config:
+def configuration(folder: Path, strangers: str, *, bridged: bool = False) -> Config:
     """A robot of two motor owners, whose files are in ``folder``."""
     lines = {"enabled": True, "serial": {"port": str(folder / "tty")}}
     lines["instances"] = {FIRST: {"serial": {"port": str(folder / "tty-arm")}}}
     transport = {"kind": "mqtt", "state_dir": str(folder / "state"), "run_dir": str(folder / "run")}
     raw = {"robot": {"id": "goob"}, "transport": transport, "local_mqtt": {"host": "127.0.0.1"}}
     raw |= {"services": {"serial_mcu_bridge": lines}, "security": {"strangers": strangers}}
-    path = folder / f"{strangers}.json"
+    if bridged:
+        heartbeat, remote = {"enabled": False}, {"host": "127.0.0.1"}
+        raw["services"]["mqtt_bridge"] = {"enabled": True, "heartbeat": heartbeat, "remote_mqtt": remote}  # type: ignore[index]
+    path = folder / f"{strangers}-{bridged}.json"
     path.write_text(json.dumps(raw))
     return load(path)
 
@@ -62,7 +75,10 @@ class TwoOwners:
         config = configs[layout % len(configs)]
         self.scheduler = Scheduler(10_000.0)
         self.commands = Commands()
-        self.network = Network(self.scheduler, lambda _process, _message: None, self._published)
+        self.network = Network(self.scheduler, self._arrived, self._published)
+        self.holders = Holders(self.scheduler, FIRST)
+        self.outside = Outside(self.scheduler, self.holders.heard)
+        self.bridge = Bridge(self.network, self.outside, config) if config.services.mqtt_bridge.enabled else None
         numbers = count(1)
         disk: Disk = {}
         self.owners = {
@@ -72,7 +88,9 @@ class TwoOwners:
             )
             for name in (FIRST, SECOND)
         }  # fmt: skip
-        self.drivers = {name: Driver(name, self.network, self.commands) for name in ("ann", "eve", STRANGER)}
+        away = self.network if self.bridge is None else self.outside
+        networks = {"ann": away, "eve": away, STRANGER: self.network}
+        self.drivers = {name: Driver(name, network, self.commands) for name, network in networks.items()}
         self.moved: set[tuple[str, str]] = set()  # (owner, driver)
         self._granted: list[tuple[float, str]] = []  # when, and to whose id; what the first tells the second
         self._shown = (0.0, "")  # the same; what it tells everybody: both are lost while it has no connection
@@ -81,6 +99,9 @@ class TwoOwners:
         for owner in self.owners.values():
             owner.after = partial(self._turned, owner)
             owner.start()
+        if self.bridge is not None:
+            self.bridge.start()
+            self.scheduler.run(1.5)
         self._check_again()
         self.scheduler.run(0.8)
 
@@ -91,8 +112,16 @@ class TwoOwners:
             turn = codec.decode(CONTROL_TURN, message.payload)
             self._recorded = [*self._recorded, message][-8:]
             self._granted = [*self._granted, (self.scheduler.now, turn.id)][-100:]
+            if self.bridge is not None:
+                self.holders.granted(turn, {driver.id: driver for driver in self.drivers.values()})
         elif process is self.owners[FIRST] and message.topic == CONTROL_STATE.topic(BASE, owner=FIRST):
             self._shown = self.scheduler.now, codec.decode(CONTROL_STATE, message.payload).id
+        elif message.topic == CONTROL_VOUCHED.topic(BASE):
+            self.holders.vouched(codec.decode(CONTROL_VOUCHED, message.payload))
+
+    def _arrived(self, process: Process, message: Message) -> None:
+        if process is self.owners[FIRST]:
+            self.holders.arrived(message)
 
     def _turned(self, owner: Owner) -> None:
         late = self.scheduler.now > owner.wheels.deadline + owner.slack + _MS
@@ -102,6 +131,11 @@ class TwoOwners:
     def _check_again(self) -> None:
         self.check()
         self.scheduler.after(_CHECK_S, self._check_again)
+
+    @property
+    def holder(self) -> str:
+        """Who has control, as the first owner shows; empty: nobody."""
+        return next((driver.name for driver in self.drivers.values() if driver.id == self._shown[1]), "")
 
     def driver_of(self, name: str) -> str:
         """Who moves this owner; empty: it stands still."""
@@ -141,6 +175,9 @@ class TwoOwners:
 
     def do_wait(self, a: int, b: int) -> None:
         self.scheduler.run(_WAITS_S[b % len(_WAITS_S)])
+
+    def do_linger(self, a: int, b: int) -> None:
+        self.scheduler.run(16.0)
 
     def do_hold(self, a: int, b: int) -> None:
         self._person(a).hold(_FOR_MS[b % len(_FOR_MS)])
@@ -193,8 +230,28 @@ class TwoOwners:
             process.freeze()
             self.scheduler.after(seconds, process.thaw)
 
+    def do_lag(self, a: int, b: int) -> None:
+        """A flood: what persons send waits at their broker."""
+        self.outside.flood(_FLOODS_S[b % len(_FLOODS_S)], _LAGS_S[a % len(_LAGS_S)])
+
+    def do_stall(self, a: int, b: int) -> None:
+        self.outside.stall(_LAGS_S[b % len(_LAGS_S)])
+
+    def do_bridge(self, a: int, b: int) -> None:
+        """The bridge is killed, frozen, or loses a connection."""
+        if self.bridge is None or not self.bridge.alive or self.bridge.frozen:
+            return
+        if a % 4 == 0:
+            self.bridge.kill(_DOWN_S[b % len(_DOWN_S)])
+        elif a % 4 == 1:
+            self.freeze(self.bridge, _FROZEN_S[b % len(_FROZEN_S)])
+        else:
+            self.bridge.lose(_LOST_S[b % len(_LOST_S)], local=a % 8 == 2)
+
     def do_delay(self, a: int, b: int) -> None:
         process: Process = self._anybody(a) if a % 2 else self._owner(a // 2)
+        if a == 4 and self.bridge is not None:
+            process = self.bridge
         process.delay = _DELAYS_S[b % len(_DELAYS_S)]
 
     def do_lose(self, a: int, b: int) -> None:
@@ -232,10 +289,14 @@ class TwoOwners:
 
     def rest(self) -> None:
         """Everything works again; then who takes control drives both."""
-        for process in (*self.owners.values(), *self.drivers.values()):
+        bridges = () if self.bridge is None else (self.bridge,)
+        for process in (*self.owners.values(), *self.drivers.values(), *bridges):
             process.delay = 0.0
             process.thaw()
-        self.scheduler.run(3.2)
+        self.outside.calm()
+        for bridge in bridges:
+            bridge.find()
+        self.scheduler.run(5.2 if bridges else 3.2)
         for driver in self.drivers.values():
             driver.let_go(release=driver.name != STRANGER)
         self.scheduler.run(0.2)
@@ -249,11 +310,18 @@ class TwoOwners:
         self.scheduler.run(0.3)
         drivers = [self.driver_of(name) for name in self.owners]
         self.scheduler.check(drivers == ["ann", "ann"], "who has control does not drive both owners")
+        ann.let_go(release=False)
+        self.scheduler.run(4.7)
+        self.scheduler.check(self._shown[1] == "", "who is silent keeps control")
 
 
 _ALL = {
     "wait": 34, "hold": 5, "take": 5, "flood": 3, "let_go": 5, "steer": 12, "stranger": 5, "old_key": 3, "script": 3,
     "zero": 3, "stop": 1, "reset": 2, "kill": 5, "freeze": 6, "delay": 3, "lose": 2, "repeat": 3, "retain": 2,
+}  # fmt: skip
+_FLOODED = {
+    "wait": 34, "hold": 8, "take": 3, "let_go": 2, "steer": 12, "lag": 8, "stall": 4, "bridge": 5, "freeze": 2,
+    "kill": 1, "lose": 2, "delay": 3, "stranger": 2, "linger": 1,
 }  # fmt: skip
 _HANDOVERS = {
     "wait": 30, "take": 10, "hold": 4, "let_go": 8, "steer": 16, "stranger": 8, "old_key": 4, "freeze": 4, "kill": 3,
@@ -264,7 +332,8 @@ _HANDOVERS = {
 @contextmanager
 def _configs(_kind: str) -> Iterator[tuple[Config, ...]]:
     with tempfile.TemporaryDirectory(prefix="pbl") as folder:
-        yield tuple(configuration(Path(folder), strangers) for strangers in ("free", "refuse"))
+        kinds = [(strangers, bridged) for bridged in (False, True) for strangers in ("free", "refuse")]
+        yield tuple(configuration(Path(folder), strangers, bridged=bridged) for strangers, bridged in kinds)
 
 
 def _perform(configs: tuple[Config, ...], schedule: Steps) -> Outcome:
@@ -277,7 +346,7 @@ def _perform(configs: tuple[Config, ...], schedule: Steps) -> Outcome:
 
 ENGINE = Engine(
     draw=RandomSteps(
-        *(_ALL, _HANDOVERS),
+        *(_ALL, _HANDOVERS, _FLOODED),
         length=36,
         layouts=4,
         begin=[("take", 0, None), ("steer", 0, None), ("wait", 0, None)],

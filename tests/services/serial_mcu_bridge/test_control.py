@@ -13,7 +13,7 @@ import pytest
 from pebble.client.control import ControlClient, RobotControl
 from pebble.config import Security
 from pebble.contract import CONTROL_STATE, codec
-from pebble.contract.payloads import ControlRequest, ControlState, Drive
+from pebble.contract.payloads import ControlRequest, ControlState, ControlVouched, Drive
 from pebble.motion.arbiter import PERSON, REFUSED, Arbiter
 from pebble.motion.latch import Latch
 from pebble.runtime.robot_estop import RobotEstop
@@ -109,6 +109,62 @@ def test_what_a_sender_without_a_key_may_do(strangers: Any, situation: str) -> N
     assert arbiter.judge(False, PERSON, -1, ms) == 0
     assert latch.reset(control.boot, 1, 0, ms)
     assert (arbiter.judge(False, PERSON, -1, ms), latch.latched) == (0, False)
+
+
+def run_down(control: Control) -> float:
+    """Do what is due until nothing is; when that was."""
+    now = 0.0
+    while control.due is not None:
+        now = control.due
+        control.tick(now)
+        control.note(now)
+    return now
+
+
+def test_that_others_drive_is_shown_until_two_seconds_later() -> None:
+    states: list[ControlState] = []
+    control = Control(Security(), states.append, 0.0)
+    control.lease.refuses(True, False, "", "", 0)
+    control.note(0.0)
+    assert run_down(control) == pytest.approx(2.0, abs=0.3)
+    assert [state.others for state in states] == [True, False]
+
+
+def test_a_state_is_repeated() -> None:
+    states: list[ControlState] = []
+    control = Control(Security(), states.append, 0.0)
+    control.note(0.0)
+    control.repeat_state(5.0)
+    assert states == [control.state()] * 2
+
+
+#: Is there a bridge, until when does it vouch, when was something lost here; and when control ends without a message.
+ENDS: dict[str, tuple[bool, float | None, float | None, float]] = {
+    "no bridge": (False, None, None, 3.0),
+    "no bridge, and something was lost": (False, None, 2.0, 3.0),
+    "a bridge that says nothing": (True, None, None, 30.0),
+    "a bridge that vouches for all of it": (True, 3.0, None, 10.0),
+    "a bridge that vouches for too little": (True, 2.9, None, 30.0),
+    "something was lost": (True, 3.0, 2.0, 30.0),
+}
+
+
+@pytest.mark.parametrize(("bridged", "vouched_s", "lost_s", "ends_s"), ENDS.values(), ids=ENDS)
+def test_when_control_ends(bridged: bool, vouched_s: float | None, lost_s: float | None, ends_s: float) -> None:
+    control = Control(Security(), lambda _state: None, 0.0, bridged=bridged)
+    control.request(ControlRequest(id="aaaaaaaa", by="ann"), over=False, now=0.0)
+    control.note(0.0)
+    if lost_s is not None:
+        control.doubt(lost_s)
+    now = 0.0
+    while control.lease.key:
+        assert control.due is not None
+        now = control.due
+        if vouched_s is not None and now >= 10.0:
+            control.vouch(ControlVouched(begin=0, end=round(1000 * vouched_s)), now)
+        control.tick(now)
+        control.note(now)
+    assert now == pytest.approx(ends_s, abs=0.3)
 
 
 # -- a service, an MCU and operators

@@ -5,9 +5,10 @@ import random
 import pytest
 
 from pebble.config import Security
-from pebble.contract.payloads import ControlRequest, ControlTurn, Drive, EstopCommand, EstopReset
+from pebble.contract.payloads import ControlRequest, ControlTurn, ControlVouched, Drive, EstopCommand, EstopReset
 from pebble.services.serial_mcu_bridge.motion.control import Control
 from pebble.services.serial_mcu_bridge.motion.motion_inbox import MotionInbox
+from pebble.transports import State
 
 NAMES = [f"{number:016x}" for number in range(20)]
 
@@ -167,3 +168,25 @@ def test_the_newest_turn_of_each_owner_waits_and_is_taken_once() -> None:
     assert inbox.take().turns == []
     assert inbox.put_drive(ZERO, 0.0)
     assert not inbox.put_turn("arm", arm)
+
+
+def test_the_newest_time_that_the_bridge_vouches_for_waits_and_is_taken_once() -> None:
+    inbox = empty()
+    newest = ControlVouched(begin=1, end=3)
+    assert inbox.put_vouched(ControlVouched(begin=1, end=2))
+    assert not inbox.put_vouched(newest)
+    assert not inbox.put_drive(ZERO, 0.0)
+    assert inbox.take().vouched == newest
+    assert inbox.take().vouched is None
+    assert inbox.put_drive(ZERO, 0.0)
+
+
+@pytest.mark.parametrize(("states", "lost"), [
+    ((), False), ((State.CONNECTED,), False), ((State.CONNECTING,), True), ((State.CONNECTING, State.CONNECTED), True),
+])  # fmt: skip
+def test_a_connection_that_was_lost_is_known_once(states: tuple[State, ...], lost: bool) -> None:
+    inbox = empty()
+    for state in states:
+        inbox.note_state(state)
+    assert inbox.put_drive(ZERO, 0.0)  # which itself is nothing to wake up for
+    assert [inbox.take().lost for _ in range(2)] == [lost, False]

@@ -7,6 +7,7 @@ import threading
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing
 from pathlib import Path
+from typing import Any
 
 import msgspec
 import pytest
@@ -27,14 +28,14 @@ SCRIPT = Drive(z=0.5, source="autonomy", run=7)
 class Rig:
     """A guard on a clock that the test moves; writes end when the test waits for them."""
 
-    def __init__(self, path: Path, owners: tuple[str, ...] = ()) -> None:
+    def __init__(self, path: Path, owners: tuple[str, ...] = (), **security: Any) -> None:
         self.now = 100.0
         self.states: list[EstopState] = []
         self.counters = Counters()
         self._results: list[tuple[int, bool]] = []
         self.file = StateFile(path, lambda number, succeeded: self._results.append((number, succeeded)))
         self.barred_file = StateFile(path.with_name("barred.json"))
-        self.control = Control(Security(), lambda _state: None, self.now, "serial", owners)
+        self.control = Control(Security(**security), lambda _state: None, self.now, "serial", owners)
         self.guard = MotorGuard(
             self.file, self.barred_file, self.states.append, self.counters, self.control, watchdog_s=0.75, now=self.now
         )
@@ -287,11 +288,72 @@ def test_a_person_who_was_lost_bars_the_run_at_the_end_of_the_hold_without_any_f
     assert rig.guard.judge(Drive(z=1, valid_ms=400), rig.now) == 0.4
     assert rig.guard.due is not None
     rig.advance(1.9)
-    assert rig.state.barred == 6
+    assert (rig.state.barred, rig.guard.due) == (6, pytest.approx(rig.now + 0.11))
     rig.advance(0.2)
     rig.advance(1)
     assert rig.states[-1].barred == 7
     assert rig.guard.due is None
+
+
+def test_a_script_waits_for_two_seconds_after_the_start(make: Make) -> None:
+    rig = make()
+    for seconds, limit in ((1.998, None), (0.001, None), (0.001, 0.75)):
+        rig.now += seconds
+        assert rig.guard.judge(SCRIPT, rig.now) == limit
+
+
+def test_what_is_barred_is_written_again_once_its_file_is_removed(rig: Rig) -> None:
+    rig.guard.judge(Drive(source="autonomy", run=8), rig.now)
+    for _ in range(2):
+        assert until(lambda: rig.barred_file.in_place and not rig.barred_file.busy)
+        rig.barred_file.path.unlink()
+        rig.guard.save_again()
+    assert until(lambda: rig.barred_file.load() == 7)
+
+
+#: What happens before a command that is refused, which one, how it is counted, and what the log says.
+REFUSED: dict[str, tuple[tuple[str, ...], Drive, str, str]] = {
+    "stopped": (("stop",), Drive(z=1), "latched", "the robot is stopped"),
+    "no zero since the reset": (("stop", "reset"), Drive(z=1), "overruled", "after the reset no zero and no pause"),
+    "a person drives": (("drive",), SCRIPT, "overruled", "run 7 has to wait"),
+    "its run has ended": (("script", "zero", "wait"), SCRIPT, "overruled", "run 7 has ended"),
+    "a key of nobody": ((), Drive(z=1, key="00000000"), "stranger", "its key of control is not the one of now"),
+}
+
+
+@pytest.mark.parametrize(("before", "drive", "counted", "why"), REFUSED.values(), ids=REFUSED)
+def test_why_a_command_is_refused(
+    rig: Rig, caplog: pytest.LogCaptureFixture, before: tuple[str, ...], drive: Drive, counted: str, why: str
+) -> None:
+    happens: dict[str, Callable[[], object]] = {
+        "stop": rig.stop,
+        "reset": lambda: rig.reset(rig.state),
+        "drive": lambda: rig.guard.judge(Drive(z=1), rig.now),
+        "script": lambda: rig.guard.judge(SCRIPT, rig.now),
+        "zero": lambda: rig.guard.judge(Drive(valid_ms=0), rig.now),
+        "wait": lambda: rig.advance(3),
+    }
+    for event in before:
+        happens[event]()
+    assert rig.guard.judge(drive, rig.now) is None
+    assert rig.counters[counted] == 1
+    assert f"refused a drive command: {why}" in caplog.text
+
+
+def test_a_program_of_the_robot_is_no_stranger_where_names_are_checked(path: Path) -> None:
+    with closing(Rig(path, level="named", strangers="refuse")) as rig:
+        rig.stop()
+        assert rig.guard.judge(Drive(z=1), rig.now) is None
+        assert (rig.counters["latched"], rig.counters["stranger"]) == (1, 0)
+
+
+@pytest.mark.parametrize(("count", "age_s", "says"), [(7, 0.0, True), (1, 2.0, True), (1, 0.0, False)])
+def test_a_refused_reset_is_logged(
+    rig: Rig, caplog: pytest.LogCaptureFixture, count: int, age_s: float, says: bool
+) -> None:
+    rig.stop()
+    rig.guard.reset(EstopReset(boot=rig.state.boot, count=count), age_s, rig.now)
+    assert ("refused a reset" in caplog.text, rig.state.latched) == (says, says)
 
 
 def test_the_largest_state_has_400_bytes_at_most(rig: Rig) -> None:

@@ -112,6 +112,8 @@ class Human:
     def unblock(self, now: float) -> None:
         if self.blocked_from is None:
             return
+        if self.acted >= self.blocked_from:  # of which the page learns now
+            self.acted = now
         for press in (*self.held.values(), *self.ended):
             if press.pending:
                 press.until = min(press.until, max(now, press.until - STALL_S))

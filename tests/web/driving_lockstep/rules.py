@@ -73,6 +73,7 @@ class Rules:
         self._received: dict[Any, float] = {}  # the newest command of that gesture
         self._newest_command: Command | None = None
         self._gap_s = 0.0  # between the newest two
+        self._lost = 0  # the newest command before an outage
         self._holder = ""  # the client to which the robot has given control
         self.published = 0  # commands that move
         self.reachable: Callable[[], bool] = lambda: True  # the broker, by the server
@@ -187,6 +188,11 @@ class Rules:
             needs_server=False,
         )
 
+    def broker_is_lost(self) -> None:
+        """Zeros are lost until it is back: what was forwarded before stops at its deadline."""
+        self._lost = self.published
+        self.server_stands_still()
+
     def let_go(self, page: int, first: int, wait_s: float, why: str, disturbed: Callable[[], object]) -> None:
         """Motion ends at a page that can act; the server knows after ``wait_s``, unless ``disturbed`` changes."""
         number = len(self.sent)
@@ -244,7 +250,8 @@ class Rules:
         def look() -> None:
             if faults == self.faults and before == disturbed():
                 command = self.turning()
-                self._check(command is None or not which(command), why)
+                past = command is None or (needs_server and command.number <= self._lost)
+                self._check(past or not which(command), why)
 
         if self.reachable() if needs_server else self.owner_up():  # else another deadline stops the wheels
             self._scheduler.after(after_s + self.path_s() + _EPS, look)

@@ -275,7 +275,8 @@ class World:
         else:
             self.show_pad(slot, (0.0, 0.0, 0.0))
         if not human.held and not human.pad_frozen and not (human.mac and human.meta):
-            self._at_rest(slot, "everything is released", late=0.06 if name == "pad" else 0.0)
+            late = max((press.until - self.now for press in human.ended), default=0.0)  # of a gamepad
+            self._at_rest(slot, "everything is released", late=max(0.0, late))
 
     def do_tap(self, a: int, b: int) -> None:
         slot, _human = self._human(a)
@@ -606,7 +607,7 @@ class World:
         """The broker restarts."""
         if self.network.era is None:
             return
-        self.rules.server_stands_still()
+        self.rules.broker_is_lost()
         self.network.stop(forget=a % 4 == 3)
         self.scheduler.after(_OUTAGES_S[b % len(_OUTAGES_S)], self.find_broker)
 
@@ -619,7 +620,7 @@ class World:
     def do_lose(self, a: int, b: int) -> None:
         """The server's connection to the broker is lost."""
         if self.server.alive and self.server.connection is not None:
-            self.rules.server_stands_still()
+            self.rules.broker_is_lost()
             self.server.connection.lose(_OUTAGES_S[b % len(_OUTAGES_S)])
 
     def do_owner(self, a: int, b: int) -> None:

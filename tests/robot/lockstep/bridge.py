@@ -1,0 +1,154 @@
+"""The bridge of a robot in virtual time: the real service, and operators' messages that wait for it at their broker."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+from unittest.mock import patch
+
+import msgspec
+
+from pebble.config import Config
+from pebble.services.mqtt_bridge import service as bridge_module
+from pebble.services.mqtt_bridge.audit import Audit
+from pebble.services.mqtt_bridge.service import MqttBridge
+from pebble.transports import Answer, Message, clock
+from pebble.transports.mqtt.read_age import BrokerDelay
+from tests.robot.lockstep.network import Connection, Network
+from tests.robot.lockstep.processes import Process, ServiceProcess
+from tests.robot.lockstep.scheduler import Scheduler
+
+_TRAVEL_S = 0.001
+_PING_S = 0.45
+
+
+class Outside(Network):
+    """The operators' broker: all that it has for the bridge waits in one queue; ``heard(sender, message)``."""
+
+    def __init__(self, scheduler: Scheduler, heard: Callable[[Process, Message], None]) -> None:
+        super().__init__(scheduler, lambda _process, _message: None, lambda _process, _message: None)
+        self._heard = heard
+        self._floods: list[tuple[float, float]] = []  # until when what comes has to wait so long
+        self._stalled_until = self._free_at = 0.0
+
+    def flood(self, seconds: float, lag_s: float) -> None:
+        self._floods.append((self.scheduler.now + seconds, lag_s))
+
+    def stall(self, seconds: float) -> None:
+        """Send nothing for so long."""
+        self._stalled_until = self.scheduler.now + seconds
+
+    def calm(self) -> None:
+        """End floods and stalls."""
+        self._floods, self._stalled_until = [], 0.0
+
+    def arrival(self) -> float:
+        """When the bridge has what comes now."""
+        now = self.scheduler.now
+        lag_s = max((lag_s for until, lag_s in self._floods if now < until), default=0.0)
+        self._free_at = max(self._free_at, now + lag_s + _TRAVEL_S, self._stalled_until)
+        return self._free_at
+
+    def _send(self, delivery: Any, client: Connection, number: int, sender: Process | None) -> None:
+        if not isinstance(client, Remote) or sender is None:
+            super()._send(delivery, client, number, sender)
+            return
+        at = max(self.scheduler.now + _TRAVEL_S + sender.delay, self._last.get((sender, client), 0.0))
+        self._last[sender, client] = at
+        self.scheduler.at(at, lambda: self._queue(delivery, client, number, sender))
+
+    def _queue(self, delivery: Any, client: Remote, number: int, sender: Process) -> None:
+        self._heard(sender, delivery.message)
+        came = self.scheduler.now
+
+        def arrive() -> None:
+            since = clock.since_boot() - (self.scheduler.now - came)  # the machine's clock stands still meanwhile
+            message = msgspec.structs.replace(delivery.message, waiting_since=since)
+            client.arrive(replace(delivery, message=message), number)
+
+        self.scheduler.at(self.arrival(), lambda: client.process.do(arrive))
+
+
+class Remote(Connection):
+    """The bridge's connection to the operators' broker, which answers pings behind what waits there."""
+
+    def __init__(self, process: Process, network: Outside) -> None:
+        super().__init__(process, network)
+        self._outside, self._delay, self._answers = network, BrokerDelay(), 0
+
+    @property
+    def answer(self) -> Answer | None:
+        delivered_s, late_s = self._delay.delivery(self.network.scheduler.now)
+        return Answer(self._answers, 0.0, None, delivered_s, late_s) if self._answers else None
+
+    def _connect(self) -> None:
+        super()._connect()
+        self._delay, self._answers = BrokerDelay(), 0
+        self._delay.usual(2 * _TRAVEL_S)
+        self._ping(self.number)
+
+    def _ping(self, number: int) -> None:
+        if number != self.number or not self._present:
+            return
+        if not self.process.frozen:
+            self._delay.asked(self.network.scheduler.now, clear=True)
+            at = self._outside.arrival() + self.process.delay
+            self.network.scheduler.at(at, lambda: self.process.do(lambda: self._pong(number)))
+        self.network.scheduler.after(_PING_S, lambda: self._ping(number))
+
+    def _pong(self, number: int) -> None:
+        if number == self.number:
+            self._answers += 1
+            self._delay.answered(self.network.scheduler.now)
+            self._delay.delivered()
+
+
+class Unwritten(Audit):
+    """An audit without a thread, which would write and publish in real time."""
+
+    def start(self) -> None:
+        """Nothing is written."""
+
+    def close(self) -> None:
+        """Nothing waits."""
+
+
+class Bridge(ServiceProcess):
+    """The bridge between ``inside`` and ``outside``."""
+
+    def __init__(self, inside: Network, outside: Outside, config: Config) -> None:
+        super().__init__("bridge", inside.scheduler, lambda process: self._service(inside, outside, config))
+        self.remote: Remote | None = None
+        self._local: Connection | None = None
+
+    def _service(self, inside: Network, outside: Outside, config: Config) -> MqttBridge:
+        def remote(*_arguments: Any, **_options: Any) -> Remote:
+            self.remote = Remote(self, outside)
+            return self.remote
+
+        self._local = Connection(self, inside)
+        with patch.object(bridge_module, "remote_transport", remote), patch.object(bridge_module, "Audit", Unwritten):
+            return MqttBridge(config, self._local, clock=self.scheduler.clock)
+
+    def thaw(self) -> None:
+        if self.frozen and self._local is not None:
+            self._local.silent(self.scheduler.now - self.frozen_at)
+        super().thaw()
+
+    def lose(self, seconds: float, *, local: bool) -> None:
+        """Lose one of the two connections for so long."""
+        connection = self._local if local else self.remote
+        assert connection is not None
+        connection.lose(seconds)
+
+    def find(self) -> None:
+        """Find what was lost."""
+        for connection in (self._local, self.remote):
+            if connection is not None:
+                connection.find()
+
+    def leave(self) -> None:
+        super().leave()
+        if self._local is not None:
+            self._local.network.crash(self._local)
