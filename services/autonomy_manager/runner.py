@@ -24,7 +24,9 @@ log = logging.getLogger(__name__)
 class Surroundings(Protocol):
     """What a runner needs of its service."""
 
-    config_path: Path  # of the robot
+    @property
+    def config_path(self) -> Path:
+        """Return the path of the robot's config."""
 
     def begin_run(self, plan: Plan) -> tuple[int, Baseline]:
         """Return the number of a new run. Raises PebbleError if none may start now."""
