@@ -294,8 +294,8 @@ def _local_media(config: Config) -> Iterator[str]:
     """What programs of the original find on the robot besides MQTT."""
     devices = config.services.av_daemon
     forms = {"video": "pictures", "audio": "sound"}
-    for name, path in devices.sockets().items():
-        yield f"{forms[name]} at {path}, by examples/gstreamer_sockets.py"
+    for section, path in devices.sockets().items():
+        yield f"{forms[section]} at {path}, by examples/gstreamer_sockets.py"
     for line in config.motor_lines().values():
         if (memory := config.hall_memory(line)) is not None:
             yield f"hall samples in the shared memory {memory}"

@@ -26,7 +26,7 @@ from pebble.transports.topics import matches
 if TYPE_CHECKING:
     from pebble.cameras import Picture
 
-#: What no script publishes, and why; the gate of `autonomy_manager` drops the same from scripts of others.
+#: What no script publishes, and why.
 _REFUSED = {
     DRIVE: "use robot.drive() to move",
     TO_NEIGHBOUR: "use robot.neighbour(…).drive()",

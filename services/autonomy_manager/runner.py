@@ -26,7 +26,7 @@ class Surroundings(Protocol):
 
     @property
     def config_path(self) -> Path:
-        """Return the robot's config file."""
+        """Return the path of the robot's config."""
 
     def begin_run(self, plan: Plan) -> tuple[int, Baseline]:
         """Return the number of a new run. Raises PebbleError if none may start now."""

@@ -317,6 +317,7 @@ class Rig:
             if self.mirror:
                 assert self.local is not None
                 own["mqtt_mirror"] = {"host": "127.0.0.1", "port": self.local.port}
+                return {"local_mqtt": own["mqtt_mirror"], "transport": own}  # where scripts of others look for it
             return {"transport": own}
         # localhost here and 127.0.0.1 there: one broker under two names must be recognised
         port = self.remote.port if self.kind == "single" or self.local is None else self.local.port

@@ -33,6 +33,7 @@ pytestmark = [
     ),
 ]
 PERSON = {"x": 0, "z": -0.4}
+MIA = {"id": "aaaaaaaa", "by": "mia", "for_ms": 3000}
 PERSONS_WHEELS = (-0.4, -0.4)
 LEAST_RATE = cases(5, 10)  # of 15 pictures a second: others may use this machine
 MOST_S = 40.0  # to find the tag and drive to it
@@ -40,6 +41,8 @@ MOST_S = 40.0  # to find the tag and drive to it
 
 class OriginalRig(WorldRig):
     """A robot in a world with the original's local media, and stand-ins for its scripts in the system's Python."""
+
+    sockets: Child | None = None
 
     def __init__(self, kind: str) -> None:
         self.shm = f"pebble-test-{os.getpid()}-{kind}"
@@ -49,7 +52,6 @@ class OriginalRig(WorldRig):
             "original-follow": {"dependencies": needs},
             "original-odometry": {"args": name},
         }
-        self.person: dict[str, Any] = {}
         super().__init__(
             kind, mirror=kind == "zenoh", pictures_socket=True, scripts=scripts,
             serial_mcu_bridge={"odometry_shm": {"name": self.shm}}, top={"security": {"strangers": "free"}},
@@ -62,8 +64,9 @@ class OriginalRig(WorldRig):
         self.sockets = Child([sys.executable, str(program), str(self.config)], cwd=ROOT)
 
     def close(self) -> None:
-        self.sockets.terminate()
-        self.sockets.wait(10)
+        if self.sockets is not None:
+            self.sockets.terminate()
+            self.sockets.wait(10)
         super().close()
         (Path("/dev/shm") / self.shm).unlink(missing_ok=True)
 
@@ -112,18 +115,21 @@ def test_all_at_once_follow_a_tag_obey_a_person_and_end(rig: OriginalRig) -> Non
     assert after["gaps"] == 0
     assert (after["samples"] - before["samples"]) / (time.monotonic() - since) > 30, "50 are sent"
 
+    rig.operator.send("incoming/control", MIA)
+    assert until(lambda: rig.operator.last("outgoing/control/serial").json.get("id") == MIA["id"], 5)
+    key = rig.operator.last("outgoing/control/serial").json["key"]
     began = time.monotonic()
     for _ in range(20):
-        rig.operator.send("incoming/drive-values", PERSON)
+        rig.operator.send("incoming/drive-values", {**PERSON, "key": key})
         time.sleep(0.05)
+    assert until(lambda: rig.script()["overridden"])
     released = time.monotonic()
-    rig.operator.send("incoming/drive-values", {"x": 0, "z": 0})
+    rig.operator.send("incoming/drive-values", {"x": 0, "z": 0, "key": key})
+    rig.operator.send("incoming/control", {**MIA, "want": "release"})
     assert until(lambda: rig.mcu.moving(released + 0.5), 10), "the script goes on"
     wheels = [one for at, one in rig.mcu.drives(began) if at < released]
     first = wheels.index(PERSONS_WHEELS)
     assert set(wheels[first:]) == {PERSONS_WHEELS}, "and nothing of the script's in between"
-    ways = [seen.json["value"]["x_mm"] - after["x_mm"] for seen in rig.operator.on("outgoing/wheel-odometry", began)]
-    assert min(ways) < -50, "a person's reverse is counted as that, while the script wants to go ahead"
     assert rig.arrives()
 
     rig.end()
@@ -138,6 +144,7 @@ def test_one_follows_a_tag_with_the_pictures_alone(rig: OriginalRig) -> None:
     began = time.monotonic()
     assert rig.arrives(), rig.log.read_text()[-3000:]
     assert rate(rig, began) >= LEAST_RATE
+    assert rig.sockets is not None
     rig.sockets.kill()
     killed = time.monotonic()
     rig.offer()
