@@ -165,8 +165,7 @@ class Drill:
         self._pairs = [getattr(pins, name, None) for name in ("LEFT", "RIGHT", "GROUSERS")]
         host = self.random.choice(("10.0.0.2", "broker.test", "broker.local"))
         settings = {"robot": {"id": "rover"}, "wifi": {"ssid": "home", "password": "secret"}, "mqtt": {"host": host}}
-        if self.named:
-            settings["security"] = {"level": "named", "strangers": "drive"}
+        settings["security"] = {"level": "named" if self.named else "open", "strangers": "drive"}
         return self.board.load(self.kind, settings)
 
     def cut_power(self) -> None:

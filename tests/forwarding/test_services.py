@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import logging
-import sys
 import time
 from collections.abc import Callable
 from itertools import groupby
@@ -209,12 +208,6 @@ class TestOneShots:
     def test_actions_from_the_local_side_run_without_uplink(self, bridge: World, ran: list[str]) -> None:
         do(bridge, "alone")
         bridge.local.publish(REBOOT, TRUE)
-        bridge.run()
-        assert ran == ["flags/reboot"]
-
-    def test_retained_actions_run_if_the_config_allows_it(self, bridge: World, ran: list[str]) -> None:
-        bridge.local.publish(REBOOT, TRUE, retain=True)
-        bridge.start(reboot_control={"command": [sys.executable], "ignore_retained": False})
         bridge.run()
         assert ran == ["flags/reboot"]
 
@@ -623,11 +616,11 @@ class TestHeartbeat:
         assert bridge.remote.payloads(ONLINE) == [b'{"t": 1}']
 
     def test_renamed(self, bridge: World) -> None:
-        bridge.start(heartbeat={"topic": f"{BASE}/outgoing/alive", "qos": 0, "retain": False})
+        bridge.start(heartbeat={"topic": f"{BASE}/outgoing/alive"})
         bridge.run()
         bridge.local.publish(ONLINE, b"mine")
         bridge.run()
-        assert bridge.remote.on("outgoing/alive")[0].retain_requested is False
+        assert bridge.remote.on("outgoing/alive")
         assert bridge.remote.payloads(ONLINE) == [b"mine"]
 
 

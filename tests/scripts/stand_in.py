@@ -9,8 +9,8 @@ import time
 from collections import defaultdict
 from typing import Any
 
-from pebble.contract import DRIVE, NEIGHBOUR_VALUE, TOUCH_SENSORS, WHEEL_ODOMETRY, Channel, codec
-from pebble.contract.payloads import Drive, TouchSensors, TouchValues, WheelOdometry
+from pebble.contract import DRIVE, TOUCH_SENSORS, Channel, codec
+from pebble.contract.payloads import Drive, TouchSensors, TouchValues
 from pebble.transports import Message, QoS
 from pebble.transports.frames import FrameInfo, FrameWriter
 from tests.perception.test_tags import SIZE, picture
@@ -18,7 +18,6 @@ from tests.script.station import Station
 from tests.support import ROOT
 
 FPS = 15
-_FREDS = {"robot": "fred", "metric": WHEEL_ODOMETRY.metric}
 
 
 class Sensors:
@@ -63,14 +62,6 @@ class Sensors:
             time.sleep(max(0.0, due - time.monotonic()))
         self._publish(DRIVE, Drive())
         return mm
-
-    def both_at(self, ahead_m: float) -> bool:
-        """Publish where this robot and its neighbour fred are, by their odometry; True."""
-        for channel, names, x_m in ((WHEEL_ODOMETRY, {}, 0.0), (NEIGHBOUR_VALUE, _FREDS, ahead_m)):
-            value = {"x_mm": 1000 * x_m, "y_mm": 0.0, "heading_rad": 0.0}
-            raw = codec.encode(WHEEL_ODOMETRY, WheelOdometry(value=value, timestamp=time.time()))
-            self.station.transport.publish(channel.topic(self.station.config.base, **names), raw, qos=QoS.LATEST)
-        return True
 
     def close(self) -> None:
         self._ended.set()

@@ -92,19 +92,6 @@ def test_following_by_odometry_uses_what_two_other_scripts_publish(sensors: Sens
     assert until(station.rests)
 
 
-def test_another_robot_is_followed_by_the_odometry_of_both_and_not_without_it(sensors: Sensors) -> None:
-    station = sensors.station
-    station.received.clear()
-    script = sensors.start("follow")
-    assert until(lambda: sensors.both_at(0.0) and len(station.received) > 5, 30), "at the distance that it holds"
-    assert until(lambda: sensors.both_at(0.4) and station.moves(), 10), "it went on"
-    assert station.received[-1].drive.z >= 0.3
-    assert until(lambda: sensors.both_at(0.0) and station.rests(), 10)
-    assert until(lambda: sensors.both_at(0.4) and station.moves(), 10)
-    assert until(station.rests, 10), "neither odometry comes any more"
-    assert "waits for the odometry of " in end(script)
-
-
 @pytest.mark.parametrize("names", [("apriltag-follow",), ("apriltag-locations", "apriltag-odom-follow")])
 def test_of_two_tags_with_one_id_a_follower_keeps_to_the_one_that_it_has(
     sensors: Sensors, names: tuple[str, ...]

@@ -361,9 +361,9 @@ HISTORIES = {
         ann drives 1: Let go first
         ann drives 2: go""",
     "a stop is forwarded without a driver": "stop: final",
-    "a stop is forwarded to what may drive only": """
+    "a stop is forwarded to what says that it does not drive": """
         robot drives not
-        stop
+        stop: final
         robot tells nothing
         stop: final""",
     "a robot that is at another broker needs a new gesture": """

@@ -294,15 +294,6 @@ def test_new_firmware_while_it_runs(rig: SerialRig) -> None:
     assert rig.world.payloads("mcu/lamp-1/lamp")[-1]["value"] == {"level": 6.5}
 
 
-def test_an_inertial_channel_configured_as_retained_is_cleared(memory_rig: SerialRig) -> None:
-    mcu, _ = memory_rig.up(IMU, publish={"low_rate_retain": True})
-    mcu.send(wire.frame(wire.SAMPLE, motion(), 1), wire.frame(wire.STATE, summary(), 2))
-    assert memory_rig.got("sensors/imu")
-    assert memory_rig.world.on("sensors/imu")[0].retain_requested
-    mcu.unplug()
-    assert memory_rig.cleared("sensors/imu")
-
-
 def test_a_stopping_bridge_clears_its_retained_messages(rig: SerialRig) -> None:
     mcu, running = rig.up(LAMP)
     mcu.send(wire.frame(wire.STATE, b"\x0b", 2))

@@ -161,9 +161,7 @@ class WebServer(Process):
         self.alive = True
         self.lives += 1
         self.loop = VirtualLoop(self.scheduler.clock)
-        connection = BrokerConnection(self, self._network)
-        connection.rewrite = self._rewrite
-        with patch.object(broker, "operators", lambda *_: connection):
+        with patch.object(broker, "operators", self._connection):
             self.server = server.Server(
                 WebSettings(broker=MqttSettings(host="fair"), server="fair"), _Nothing(), _Nothing()
             )  # type: ignore[arg-type]
@@ -171,6 +169,11 @@ class WebServer(Process):
         drivers.updated, drivers.tick = self._watched(drivers.updated), self._watched(drivers.tick)
         self.loop.create_task(self.server.open())
         self.wake()
+
+    def _connection(self, *_: Any) -> BrokerConnection:
+        connection = BrokerConnection(self, self._network)
+        connection.rewrite = self._rewrite
+        return connection
 
     def driven(self, ref: str) -> Any:
         """Who drives that robot, as the server knows it."""

@@ -255,7 +255,7 @@ function stopProgress(view, name, age) {
 
 const REFUSED = {
   count: "another stop came after the one you saw",
-  boot: "it has started anew since then; look again",
+  boot: "it has restarted since; look again",
   old: "the reset arrived too late; try again",
 };
 
@@ -296,8 +296,7 @@ function tally({ pressed }, store) {
   const sent = stops(store).filter(({ stop, sending }) => stop === pressed.stop && sending !== "spared");
   const confirmed = sent.filter(({ sending }) => sending === "confirmed").length;
   const all = confirmed === sent.length && !store.get("", "web/broker")?.value?.stops_omitted;
-  return sent.length > 1 &&
-    html`<b data-test="tally">STOP ALL: ${all ? "all" : `${confirmed} of`} ${sent.length} confirmed.</b>`;
+  return sent.length > 1 && html`<b data-test="tally">STOP ALL: ${all ? "all" : `${confirmed} of`} ${sent.length} confirmed.</b>`;
 }
 
 /** A stop that was pressed here and of which no robot shows anything yet. */
@@ -314,7 +313,7 @@ function PressBanner() {
   }
   const whom = pressed.ref ? nameIn(store, pressed.ref) : "all robots";
   if (age < NO_ANSWER_MS) {
-    return html`<${Banner} kind="warn" icon="stop"><p role="alert">STOP of ${whom}: being sent…</p><//>`;
+    return html`<${Banner} kind="warn" icon="stop"><p role="alert">STOP of ${whom}: sending…</p><//>`;
   }
   if (!pressed.reached) {
     return html`<${Banner} kind="bad">
