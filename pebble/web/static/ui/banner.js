@@ -238,7 +238,7 @@ function stopProgress(view, name, age) {
   switch (view.sending) {
     case "sent":
       if (age > NO_ANSWER_MS) return { kind: "bad", text: `STOP NOT CONFIRMED by ${name}, and sent again…${more}` };
-      return { kind: "wait", text: `STOP is being sent to ${name}…${more}` };
+      return { kind: "wait", text: `Sending STOP to ${name}…${more}` };
     case "confirmed":
       return view.sending_text && age < SHOWN_MS ? { kind: "wait", text: `${name} ${view.sending_text}` } : null;
     case "old":
