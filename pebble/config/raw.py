@@ -113,7 +113,7 @@ def deep_merge(under: Any, over: Any) -> Any:
 def _shared(raw: Any) -> dict[str, Any]:
     level = _at(raw, "log_level")
     services = {name: {"log_level": level} for name in _SERVICES}
-    return {"services": services, "web_interface": {"log_level": level}}
+    return {"services": services}
 
 
 def _with_instances(raw: Any) -> Any:

@@ -5,17 +5,14 @@ from typing import Annotated, ClassVar
 
 from pebble.config.transport import Mqtt
 from pebble.config.types import (
-    EMPTY,
     BrokerHost,
     File,
     Host,
     Level,
-    LogLevel,
     NameOfPage,
     Port,
     Section,
     ServiceSection,
-    Variables,
     doc,
 )
 
@@ -23,7 +20,7 @@ from pebble.config.types import (
 class WebHandler(ServiceSection, frozen=True, kw_only=True):
     """Runs the operator page on the robot; `web_interface` sets it up. It needs `pip install 'pebble-robot[web]'`."""
 
-    env: Annotated[Variables, doc("Environment variables to add.")] = EMPTY
+    retired: ClassVar = {"env": "the robot's unit sets variables for all: `systemctl edit pebble`"}
 
 
 class WebMqtt(Mqtt, frozen=True, kw_only=True):
@@ -50,9 +47,9 @@ class WebInterface(Section, frozen=True, kw_only=True):
     retired: ClassVar = {
         **dict.fromkeys(("robots", "robot_discovery"), "robots are found by their messages, and named by `robot.name`"),
         "mqtt_history": "`services.recorder` records into files",
+        "log_level": "services.web_handler has one",
     }
 
-    log_level: Annotated[LogLevel, doc("Log level of `pebble web`; the root's log_level unless set.")] = "INFO"
     host: Annotated[
         Host, doc("Address to listen on; one that other machines reach needs tls and a user (`pebble web user add`).")
     ] = "127.0.0.1"

@@ -131,10 +131,8 @@ def _av_daemon(config: Config) -> Program:
 
 def _web_handler(config: Config) -> Program:
     """The operator page; its module is above the launcher, which only starts it, and may miss what it imports."""
-    arguments, environment = (str(config.path),), config.services.web_handler.env
-    return Program(
-        "web_handler", "pebble.web.run", arguments, Stage.CONNECTION, preloaded=False, environment=environment
-    )
+    arguments = (str(config.path),)
+    return Program("web_handler", "pebble.web.run", arguments, Stage.CONNECTION, preloaded=False)
 
 
 def _on_demand(config: Config, name: str) -> Program:

@@ -281,7 +281,6 @@ class TestInheritance:
         assert config.log_level_of("mqtt_bridge") == config.services.mqtt_bridge.log_level == "DEBUG"
         assert config.log_level_of("launcher") == config.services.launcher.log_level == "WARNING"
         assert config.log_level_of("zenoh_hub") == "WARNING"
-        assert config.web_interface.log_level == "WARNING"
 
     def test_an_instance_has_its_own_log_level(self) -> None:
         imu = {"log_level": "ERROR", "serial": {"port": "/dev/imu"}}

@@ -530,10 +530,10 @@ def test_the_launcher_of_a_robot_without_media_carries_nothing_for_them() -> Non
 
 
 def test_the_operator_page_is_one_more_connection_and_is_imported_by_its_own_process_only() -> None:
-    services = {"web_handler": {"enabled": True, "env": {"MARK": "w"}}}
+    services = {"web_handler": {"enabled": True}}
     page = programs(_parsed(services=services))[-1]
     assert (page.name, page.module, page.arguments) == ("web_handler", "pebble.web.run", ("None",))
-    assert (page.stage, page.on_demand, page.environment) == (Stage.CONNECTION, False, {"MARK": "w"})
+    assert (page.stage, page.on_demand) == (Stage.CONNECTION, False)
     assert page.module not in shared_modules(_parsed(services=services), [page])
     assert "web_handler" not in [row[0] for row in _table(services={"web_handler": {"enabled": False}})]
 
