@@ -13,7 +13,7 @@ from tests.life.conftest import NEW, OLD, Packages
 from tests.life.robots import Robot
 from tests.support import until
 
-UNITS = ("pebble.service", "pebble-slot.service")
+UNITS = ("pebble.service", "pebble-slot.service", "pebble-gstreamer.service")
 
 
 def test_twice_built_is_equal_byte_for_byte(packages: Packages, tmp_path: Path) -> None:
