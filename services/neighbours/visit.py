@@ -30,8 +30,7 @@ class Visit:
     ) -> None:
         self._begin, self._number, self._publish, self._local_runs = begin, number, publish, local_runs
         self._who = ("", 0)  # robot and its run that drive this one, or did so last
-        self._sender = DriveSender(0, publish)  # of the run above
-        self._sender.end("none has begun", 0.0)
+        self._sender = DriveSender(0, publish)  # of that run; before the first one it never drives
         self._states: Mapping[str, EstopState] = {}
         self._received = 0  # the newest number of all commands here
         self._person_at = float("-inf")
