@@ -10,7 +10,7 @@ from pathlib import Path
 
 from pebble.fleet import broker_files, certificates
 from pebble.fleet.folder import ACL, CONF, PASSWORDS, PID, ZENOH, Fleet, FleetError, Server, save
-from pebble.fleet.whole_file import write
+from pebble.runtime.whole_file import write
 
 _LOOPBACK = "127.0.0.1"
 _PLUGIN = "dynamic_security"  # in the name of its library

@@ -13,7 +13,7 @@ from cryptography.hazmat.primitives.hashes import SHA256
 from cryptography.hazmat.primitives.serialization import Encoding, NoEncryption, PrivateFormat, load_pem_private_key
 
 from pebble.fleet.certificates import CertificateError
-from pebble.fleet.whole_file import write
+from pebble.runtime.whole_file import write
 
 SERVER_DAYS = 397  # the longest that browsers accept
 _AUTHORITY_DAYS = 3650

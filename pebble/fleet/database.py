@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from pebble.errors import PebbleError
-from pebble.fleet.whole_file import give_as
+from pebble.runtime.whole_file import give_as
 from pebble.transports.own_file import OwnFile
 
 _BUSY_S = 5.0  # another process may be writing

@@ -15,7 +15,7 @@ from pebble.contract.identity import SERVERS, Identity
 from pebble.contract.names import NAME
 from pebble.errors import ConfigError, PebbleError
 from pebble.fleet.roles import GATEWAYS, Account, Extra, ProgramRole, Rule, add_up, rules
-from pebble.fleet.whole_file import write
+from pebble.runtime.whole_file import write
 
 FLEET, CONF, PID, ACL, PASSWORDS = "fleet.json", "mosquitto.conf", "mosquitto.pid", "acl", "passwords"
 ZENOH = "zenoh.json"

@@ -6,10 +6,10 @@ import threading
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-from pebble.contract import DRIVE, NEIGHBOUR_VALUE, NEIGHBOURS, TO_NEIGHBOUR, Channel, codec
+from pebble.contract import DRIVE, NEIGHBOURS, TO_NEIGHBOUR, Channel, codec
+from pebble.contract.identity import Identity
 from pebble.contract.payloads import SCRIPT, Drive, Neighbours
 from pebble.errors import PebbleError
-from pebble.runtime.addresses import Addresses
 from pebble.script.wheels import Wheels
 from pebble.transports import QoS, Transport
 
@@ -25,9 +25,8 @@ class Way(NamedTuple):
     """What a neighbour needs of its robot. ``check`` raises once the script is to end."""
 
     transport: Transport
-    addresses: Addresses
     wheels: Wheels
-    receive: Callable[[str, Channel, Callable[..., None]], None]
+    latest: Callable[[Channel, float], Any]  # payload of the neighbour
     check: Callable[[], None]
     clock: Callable[[], float]
 
@@ -35,16 +34,15 @@ class Way(NamedTuple):
 class Neighbour:
     """Robot ``name``; ``me`` is this one. :meth:`pebble.script.Robot.neighbour` makes it. Any thread may use it."""
 
-    def __init__(self, name: str, me: str, way: Way) -> None:
+    def __init__(self, name: str, me: Identity, way: Way) -> None:
         self.name = name
-        self._me, self._way = me, way
-        self._newest: dict[str, tuple[Any, float]] = {}  # by metric: the payload, and when it arrived
-        self._topic = TO_NEIGHBOUR.topic(way.addresses.base, robot=name)
+        self._me, self._way = me.id, way
+        self._topic = TO_NEIGHBOUR.topic(me.base, robot=name)
         self._sent_at = float("-inf")
         self._moves = False  # the newest command does
         self._over = False
         self._lock = threading.Lock()  # else the last command might come after the final zero
-        self._receive(NEIGHBOURS)
+        way.latest(NEIGHBOURS, PRESENT_S)  # subscribes
 
     @property
     def online(self) -> bool:
@@ -58,8 +56,7 @@ class Neighbour:
         this one's in ``listens``.
         """
         self._way.check()
-        self._receive(channel)
-        return self._fresh(channel, max_age)
+        return self._way.latest(channel, max_age)
 
     def drive(self, x: float = 0.0, z: float = 0.0, y: float = 0.0) -> bool:
         """Drive it, as :meth:`Robot.drive` does this one, for 0.3 s at most. False: that has no effect, as far as is
@@ -102,12 +99,8 @@ class Neighbour:
 
     @property
     def _state(self) -> Neighbours | None:
-        state: Neighbours | None = self._fresh(NEIGHBOURS, PRESENT_S)
+        state: Neighbours | None = self._way.latest(NEIGHBOURS, PRESENT_S)
         return state
-
-    def _fresh(self, channel: Channel, max_age: float) -> Any:
-        value, at = self._newest[channel.metric]
-        return value if self._way.clock() - at <= max_age else None
 
     def _send(self, command: Drive) -> bool:
         raw = codec.encode(TO_NEIGHBOUR, command)
@@ -116,12 +109,3 @@ class Neighbour:
                 return False
             self._moves = command.moves
             return self._way.transport.publish(self._topic, raw, qos=QoS.DELIVERED, urgent=True)
-
-    def _receive(self, channel: Channel) -> None:
-        metric = channel.metric
-        if metric not in self._newest:
-            self._newest[metric] = None, float("-inf")
-            topic = NEIGHBOUR_VALUE.topic(self._way.addresses.base, robot=self.name, metric=metric)
-            self._way.receive(
-                topic, channel, lambda value, **_: self._newest.update({metric: (value, self._way.clock())})
-            )

@@ -7,10 +7,21 @@ import os
 import threading
 import time
 from collections.abc import Callable, Iterator
+from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from pebble.config import Config
-from pebble.contract import AUTONOMY_COMMAND, DRIVE, ESTOP_RESET, ESTOP_STATE, TO_NEIGHBOUR, Channel, Kind, codec
+from pebble.contract import (
+    AUTONOMY_COMMAND,
+    DRIVE,
+    ESTOP_RESET,
+    ESTOP_STATE,
+    NEIGHBOUR_VALUE,
+    TO_NEIGHBOUR,
+    Channel,
+    Kind,
+    codec,
+)
 from pebble.contract.payloads import Drive
 from pebble.errors import PebbleError
 from pebble.runtime.addresses import Addresses
@@ -183,8 +194,9 @@ class Robot:
             section = self.config.services.neighbours
             if not section.enabled or name not in section.listens:
                 raise PebbleError(f'robot.neighbour: {name!r} is not in services.neighbours.listens: add "{name}": []')
-            way = Way(self._transport, self._addresses, self._wheels, self._receive, self._check, self._clock)
-            found = self._neighbours[name] = Neighbour(name, self.config.identity.id, way)
+            latest = _Latest(partial(self._subscribe_to, name), self._clock)
+            way = Way(self._transport, self._wheels, latest.of, self._check, self._clock)
+            found = self._neighbours[name] = Neighbour(name, self.config.identity, way)
         return found
 
     def sleep(self, seconds: float) -> None:
@@ -243,6 +255,9 @@ class Robot:
 
     def _subscribe(self, channel: Channel, handler: Callable[..., None]) -> None:
         self._receive(self._addresses[channel].topic, channel, handler)
+
+    def _subscribe_to(self, robot: str, channel: Channel, handler: Callable[..., None]) -> None:
+        self._receive(NEIGHBOUR_VALUE.topic(self.config.base, robot=robot, metric=channel.metric), channel, handler)
 
     def _receive(self, topic: str, channel: Channel, handler: Callable[..., None]) -> None:
         receive = self._refusals.reader(channel, lambda _message, value, names: handler(value, **names))

@@ -10,8 +10,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from pebble.errors import PebbleError
-from pebble.fleet.whole_file import is_root, write
 from pebble.runtime.places import Places
+from pebble.runtime.whole_file import is_root, write
 
 ROBOTS = "root:pebble"  # what the robot reads, and only root changes
 ROBOT = "pebble:pebble"

@@ -1,6 +1,5 @@
 """The newest run of each other robot that has begun here: each begins once, also over a restart of this program."""
 
-import os
 from collections.abc import Collection
 from pathlib import Path
 from typing import Annotated
@@ -8,43 +7,31 @@ from typing import Annotated
 import msgspec
 
 from pebble.contract.payloads import LAST_RUN
+from pebble.errors import PebbleError
 from pebble.motion.arbiter import newer
+from pebble.runtime.whole_file import write
 
 _decode = msgspec.json.Decoder(dict[str, Annotated[int, msgspec.Meta(gt=0, le=LAST_RUN)]]).decode
 
 
-class Begun:
-    """``names`` are the robots that may begin any. A run that is not newer than the last one of its robot never does.
+def begin(path: Path, names: Collection[str], name: str, run: int) -> str:
+    """Return why this run of robot ``name`` cannot begin; empty: it has, and does not again.
 
-    A file that cannot be read, or written, lets none begin until it is there again: else one that a person has stopped
-    would go on after a restart.
+    ``path`` holds the newest run of each of ``names``, the robots that may begin any. A file that cannot be read, or
+    written, lets none begin until it is there again: else one that a person has stopped would go on after a restart.
     """
-
-    def __init__(self, path: Path, names: Collection[str]) -> None:
-        self._path, self._names = path, names
-
-    def begin(self, name: str, run: int) -> str:
-        """Return why this run cannot begin; empty: it has, and does not again."""
-        try:
-            newest = _decode(self._path.read_bytes())
-        except FileNotFoundError:
-            newest = {}
-        except (OSError, msgspec.MsgspecError):
-            return f"{self._path} cannot be read: delete it while the scripts of other robots are stopped"
-        if not newer(run, newest.get(name, 0)):
-            return "it was ended here: start it again"
-        try:
-            self._write({other: last for other, last in newest.items() if other in self._names} | {name: run})
-        except OSError as error:
-            return f"{self._path} cannot be written: {error.strerror}"
-        return ""
-
-    def _write(self, newest: dict[str, int]) -> None:
-        new = self._path.with_suffix(".new")
-        self._path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
-        new.unlink(missing_ok=True)
-        with new.open("xb") as file:
-            file.write(msgspec.json.encode(newest))
-            file.flush()
-            os.fsync(file.fileno())
-        new.replace(self._path)
+    try:
+        newest = _decode(path.read_bytes())
+    except FileNotFoundError:
+        newest = {}
+    except (OSError, msgspec.MsgspecError):
+        return f"{path} cannot be read: delete it while the scripts of other robots are stopped"
+    if not newer(run, newest.get(name, 0)):
+        return "it was ended here: start it again"
+    newest = {other: last for other, last in newest.items() if other in names} | {name: run}
+    try:
+        path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+        write(path, msgspec.json.encode(newest), 0o600, PebbleError)
+    except (OSError, PebbleError) as error:
+        return f"its beginning cannot be written: {error}"
+    return ""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from functools import partial
 from typing import Any
 
@@ -28,7 +27,7 @@ from pebble.runtime.robot_estop import RobotEstop
 from pebble.runtime.runs import LocalScripts, next_run
 from pebble.runtime.service import WAIT_LIMIT_S, Service, every, on
 from pebble.script.neighbour import PRESENT_S
-from pebble.services.neighbours.begun import Begun
+from pebble.services.neighbours.begun import begin
 from pebble.services.neighbours.visit import Visit
 from pebble.transports import Message, QoS, Transport
 
@@ -51,8 +50,8 @@ class NeighboursService(Service):
         self._others = {name: Identity(me.system, me.type, name) for name in self._section.listens}
         self._local = LocalScripts(self.config)
         self._estop = RobotEstop(self.config.base)
-        begun = Begun(self.config.state_file("neighbour-runs"), self._section.commanded)
-        self._visit = Visit(begun.begin, self._number, self._drive, self._local_runs)
+        begins = partial(begin, self.config.state_file("neighbour-runs"), self._section.commanded)
+        self._visit = Visit(begins, self._number, partial(self.publish, DRIVE), self._local_runs)
         self._received_at: dict[str, float] = {}
         self._state: Neighbours | None = None
 
@@ -157,8 +156,7 @@ class NeighboursService(Service):
     @on(DRIVE, direct=True)
     def drive(self, drive: Drive, _arrived: float) -> None:
         """On the transport's thread. A person's commands all mean the same here."""
-        job: Callable[[], None] = lambda: self._visit.received(drive, self.clock())  # noqa: E731
-        self.post(job, newest_of="script" if drive.signed else "person")
+        self.post(lambda: self._visit.received(drive, self.clock()), newest_of="script" if drive.signed else "person")
 
     # -- what a visit needs
 
@@ -174,9 +172,6 @@ class NeighboursService(Service):
     def _local_runs(self) -> bool:
         with self._local.none_runs() as free:
             return not free
-
-    def _drive(self, command: Drive) -> bool:
-        return self.publish(DRIVE, command)
 
     def _set_timer(self) -> None:
         if (due := self._visit.due) is not None:

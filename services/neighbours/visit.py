@@ -30,7 +30,7 @@ class Visit:
     ) -> None:
         self._begin, self._number, self._publish, self._local_runs = begin, number, publish, local_runs
         self._who = ("", 0)  # robot and its run that drive this one, or did so last
-        self._sender: DriveSender | None = None
+        self._sender = DriveSender(0, publish)  # of that run; before the first one it never drives
         self._states: Mapping[str, EstopState] = {}
         self._received = 0  # the newest number of all commands here
         self._person_at = float("-inf")
@@ -40,18 +40,13 @@ class Visit:
         """A command of a robot that may drive this one. False: it has no effect."""
         if not drive.signed or not isinstance(drive.run, int):
             return False  # no script's: it could neither be ended nor told from the next one
-        if self._who != (name, drive.run):
-            if not drive.moves:
-                return False  # it moves nothing here
-            self._start(name, drive.run, now)
-        sender = self._sender
-        if sender is None or self._who != (name, drive.run):
+        if self._who != (name, drive.run) and not (drive.moves and self._starts(name, drive.run, now)):
             return False
-        if drive.moves and not sender.ended(now) and self._local_runs():
-            sender.end(LOCAL, now)
-        sender.owners(self._states, now)
+        if drive.moves and not self._sender.ended(now) and self._local_runs():
+            self._sender.end(LOCAL, now)
+        self._sender.owners(self._states, now)
         valid = drive.valid_ms if isinstance(drive.valid_ms, int) else VALID_MS
-        return sender.drive(Drive(x=drive.x, z=drive.z, y=drive.y, valid_ms=min(valid, VALID_MS)), now)
+        return self._sender.drive(Drive(x=drive.x, z=drive.z, y=drive.y, valid_ms=min(valid, VALID_MS)), now)
 
     def owners(self, states: Mapping[str, EstopState], now: float) -> None:
         self._states = states
@@ -65,34 +60,33 @@ class Visit:
             return
         if isinstance(drive.run, int):
             self._received = newest((self._received, drive.run))
-        if self._sender is not None:
-            self._sender.receive(drive, now)
+        self._sender.receive(drive, now)
 
     def tick(self, now: float) -> None:
-        if self._sender is not None:
-            self._sender.owners(self._states, now)
-            self._sender.tick(now)
-            self._sender.ended(now)
+        self._sender.owners(self._states, now)
+        self._sender.tick(now)
+        self._sender.ended(now)
 
     def end(self, why: str, now: float) -> None:
-        if self._sender is not None:
-            self._sender.end(why, now)
+        self._sender.end(why, now)
 
     @property
     def due(self) -> float | None:
         """When to call :meth:`tick`; None: not before something happens."""
-        return None if self._sender is None else self._sender.due
+        return self._sender.due
 
     def driver(self, now: float) -> str:
         """Whose run drives this robot; empty: none does."""
-        return self._who[0] if self._sender is not None and not self._sender.ended(now) else ""
+        return "" if self._sender.ended(now) else self._who[0]
 
     def refused(self, now: float) -> dict[str, NeighbourRefusal]:
         """By robot its newest run here, while that has no effect."""
-        why = "" if self._sender is None else self._sender.refusal(now)
-        return self._refused | ({self._who[0]: NeighbourRefusal(run=self._who[1], why=why)} if why else {})
+        name, run = self._who
+        why = self._sender.refusal(now) if name else ""
+        return self._refused | ({name: NeighbourRefusal(run=run, why=why)} if why else {})
 
-    def _start(self, name: str, run: int, now: float) -> None:
+    def _starts(self, name: str, run: int, now: float) -> bool:
+        """True if this run drives from now on."""
         why = self._begin(name, run) or (PERSON if now - self._person_at < HOLD_S else "")
         barred = newest(state.last_barred for state in self._states.values())
         number = None if why else self._number(barred, self._received)
@@ -100,9 +94,9 @@ class Visit:
             known = self._refused.get(name)
             if known is None or known.run != run:  # else the first reason is the one to know
                 self._refused[name] = NeighbourRefusal(run=run, why=why or LOCAL)
-            return
-        if self._sender is not None:
-            self._sender.end(SUPERSEDED, now)
-            self._refused = self.refused(now)
+            return False
+        self.end(SUPERSEDED, now)
+        self._refused = self.refused(now)
         self._refused.pop(name, None)
         self._who, self._sender = (name, run), DriveSender(number, self._publish)
+        return True

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import shutil
 import subprocess
 from pathlib import Path
 
@@ -10,10 +11,10 @@ import pytest
 
 from tests.kit.machine import Machine
 from tests.life.conftest import NEW, OLD, Packages
-from tests.life.robots import Robot
+from tests.life.robots import CONFIG, Robot
 from tests.support import until
 
-UNITS = ("pebble.service", "pebble-slot.service")
+UNITS = ("pebble.service", "pebble-slot.service", "pebble-gstreamer.service")
 
 
 def test_twice_built_is_equal_byte_for_byte(packages: Packages, tmp_path: Path) -> None:
@@ -34,6 +35,19 @@ def test_units_are_clean_and_confined(machine: Machine) -> None:
     assert [unit for unit in UNITS if machine.exposure(unit) > 2.0] == []
     assert machine.run("dpkg", "--verify", "pebble-robot") == ""
     assert machine.run("/bin/sh", "-c", "setpriv --reuid nobody --clear-groups pebble --version") == f"pebble {OLD}\n"
+
+
+@pytest.mark.skipif(shutil.which("gst-launch-1.0") is None, reason="GStreamer is not installed")
+def test_the_sockets_of_gstreamer_are_there_with_the_robot_once_their_unit_is_enabled(machine: Machine) -> None:
+    robot, path, unit = Robot(machine), "/run/pebble/video.sock", "pebble-gstreamer.service"
+    devices = CONFIG["services"]["av_daemon"]
+    sockets = {**devices, "video": {**devices["video"], "socket_path": path}}
+    robot.configure({**CONFIG, "services": {**CONFIG["services"], "av_daemon": sockets}})
+    robot.plug_in()
+    assert machine.run("systemctl", "is-enabled", unit, check=False) == "disabled\n"
+    machine.run("systemctl", "enable", unit)
+    robot.start()
+    assert until(lambda: machine.succeeds("test", "-S", path), 60, step=1), machine.journal(unit)
 
 
 def test_a_newer_package_is_built_beside_and_the_older_one_is_one_command_away(

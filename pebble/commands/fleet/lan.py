@@ -23,7 +23,7 @@ from pebble.fleet import applying, certificates, folder, pieces
 from pebble.fleet.broker_files import new_password
 from pebble.fleet.folder import CONF, Fleet, FleetError, Server
 from pebble.fleet.roles import Account, ProgramRole
-from pebble.fleet.whole_file import write
+from pebble.runtime.whole_file import write
 
 HUB_FILE, GATEWAY_FILE, ROBOTS = "hub.json", "gateway.json", "robots"
 _LOCK = ".up"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -12,7 +13,7 @@ from pebble.contract.payloads import SCRIPT, Drive, EstopState
 from pebble.motion.arbiter import PERSON, Arbiter
 from pebble.motion.latch import Latch
 from pebble.motion.lease import Lease
-from pebble.services.neighbours.begun import Begun
+from pebble.services.neighbours.begun import begin
 from pebble.services.neighbours.visit import Visit
 
 NAMES = ("goob", "ann")
@@ -32,8 +33,7 @@ class Fred:
         self.wait(3)
 
     def restart(self) -> None:
-        begin = Begun(self.file, NAMES).begin
-        self.visit = Visit(begin, self._number, self.publish, lambda: self.local is not None)
+        self.visit = Visit(partial(begin, self.file, NAMES), self._number, self.publish, lambda: self.local is not None)
 
     def start_owner(self) -> None:
         latch = Latch(f"boot{next(self._boots)}", 8, self._diff)
