@@ -129,7 +129,7 @@ def test_all_at_once_follow_a_tag_obey_a_person_and_end(rig: OriginalRig) -> Non
     assert until(lambda: rig.mcu.moving(released + 0.5), 10), "the script goes on"
     wheels = [one for at, one in rig.mcu.drives(began) if at < released]
     first = wheels.index(PERSONS_WHEELS)
-    assert set(wheels[first:]) == {PERSONS_WHEELS}, "and nothing of the script's in between"
+    assert set(wheels[first:]) - {(0.0, 0.0)} == {PERSONS_WHEELS}, "only zeros of the script's count in between"
     assert rig.arrives()
 
     rig.end()
