@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import threading
 from contextlib import suppress
+from socket import IPPROTO_TCP, TCP_MAXSEG
 
 from tests.support import free_port
 
@@ -16,11 +17,12 @@ class SparingBroker:
     """``late_s``: how long after it was asked for a retained message comes; ``by_name``: not for wildcards.
 
     ``longest``: bytes of a packet; a longer one, and what comes after it on its connection, never arrives.
+    ``segment``: bytes of TCP that the newest client takes at once.
     """
 
     def __init__(self, to: int, *, late_s: float = 0.0, by_name: bool = False, longest: int = 1 << 28) -> None:
         self.port, self._to, self._late_s, self._by_name = free_port(), to, late_s, by_name
-        self._longest, self.stalled = longest, 0
+        self._longest, self.stalled, self.segment = longest, 0, 0
         self._loop = asyncio.new_event_loop()
         self._loop.run_until_complete(asyncio.start_server(self._serve, "127.0.0.1", self.port))
         self._thread = threading.Thread(target=self._loop.run_forever, daemon=True)
@@ -32,6 +34,7 @@ class SparingBroker:
 
     async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         asked: list[bytes] = []
+        self.segment = writer.get_extra_info("socket").getsockopt(IPPROTO_TCP, TCP_MAXSEG)
         with suppress(OSError, asyncio.IncompleteReadError):
             to_reader, to_writer = await asyncio.open_connection("127.0.0.1", self._to)
             back = asyncio.ensure_future(self._back(to_reader, writer, asked))

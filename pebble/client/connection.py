@@ -17,7 +17,7 @@ from pebble.config import Config, load
 from pebble.config.text_files import password as password
 from pebble.errors import ConfigError, PebbleError, TransportError
 from pebble.runtime.addresses import Addresses
-from pebble.runtime.connections import REMOTE_RECONNECT_S, local_settings, mqtt_settings, zenoh_settings
+from pebble.runtime.connections import REMOTE_RECONNECT_S, SEGMENT, local_settings, mqtt_settings, zenoh_settings
 from pebble.runtime.every_host import EveryHost, operators
 from pebble.runtime.robot_estop import RobotEstop
 from pebble.transports import Message, MqttSettings, QoS, State, Transport
@@ -27,7 +27,6 @@ log = logging.getLogger(__name__)
 _STEP_S = 0.005  # between two looks at a condition
 _LATE_S = 0.25  # some brokers send what is retained so long after they have acknowledged a subscription
 OPEN_TIMEOUT_S = 3.0
-SEGMENT = 1200  # bytes of TCP in a packet: with all headers 1280, which every way takes (RFC 8200, section 5)
 _FIND_S = 1.0  # where several brokers are heard: longer than a robot takes between two heartbeats
 _WAITING = 10_000  # messages that wait to be printed before new ones are dropped
 

@@ -28,6 +28,7 @@ _VITAL_STATES = (
 _ALL_VITAL = (*_VITAL_STATES, f"{_ANY}/{c.INCOMING}/#")
 
 LOCAL_RECONNECT_S, REMOTE_RECONNECT_S = 0.5, 2.0
+SEGMENT = 1200  # bytes of TCP in a packet: with all headers 1280, which every way takes (RFC 8200, section 5)
 _BRIDGE, _STOPS = "remote-bridge", "remote-stops"
 #: RFC 4594: what must not wait, and what may be dropped last of what can. Where a link may be thin.
 _EXPEDITED, _ASSURED = 46, 10
@@ -116,11 +117,16 @@ def stops_transport(config: Config) -> Transport | None:
     if config.security.level == "open" and (bridge.remote is not None or bridge.link.profile == "wide"):
         return None
     if bridge.remote is None:
-        settings = mqtt_settings(bridge.remote_mqtt, reconnect_max_s=REMOTE_RECONNECT_S, program=_STOPS)
+        settings = _live_only(mqtt_settings(bridge.remote_mqtt, reconnect_max_s=REMOTE_RECONNECT_S, program=_STOPS))
         return create("mqtt", _name(config, "mqtt", _STOPS), with_choice(config, settings, _STOPS))
     if bridge.remote.kind != "zenoh":  # what another transport makes of a second connection is not known
         return None
     return create("zenoh", _name(config, "zenoh", _STOPS), _remote_settings(config, bridge.remote))
+
+
+def _live_only(settings: MqttSettings) -> MqttSettings:
+    """Return the settings of a connection that no retained message holds up: MQTT 5 lets it ask for none."""
+    return replace_settings(settings, max_segment=SEGMENT, sends_retained=False)
 
 
 def mirror_transport(config: Config, mirror: Mqtt, name: str) -> Transport:
@@ -208,7 +214,7 @@ def gateway_transports(
         _robots_transport(gateway, base, run_dir),
         create("mqtt", f"{base}/forwards", forwards),
         create("mqtt", f"{base}/presence", apart, will=will),
-        create("mqtt", f"{base}/stops", apart),
+        create("mqtt", f"{base}/stops", _live_only(apart)),
     )
 
 

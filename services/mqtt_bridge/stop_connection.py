@@ -14,7 +14,7 @@ from enum import Enum
 
 from pebble.contract.codec import MAX_COMMAND_BYTES
 from pebble.services.mqtt_bridge.passed_stops import is_named
-from pebble.transports import Message, State, Subscription, Transport
+from pebble.transports import Message, State, Transport
 
 log = logging.getLogger(__name__)
 
@@ -59,30 +59,27 @@ class Copies:
             if found is not None:
                 expected.remove(found)
                 if way is Way.MAIN:
-                    self._dropped.append((now, _shortened(message)))
+                    short = message.payload[:MAX_COMMAND_BYTES]  # a stop as well: it cannot be read
+                    self._dropped.append((now, Message(message.topic, short, message.qos)))
                 return True
             if other and not message.retain:  # one with the retain flag may be an old one, of which there is no copy
                 there, wait_s = (Way.STOPS, _PROMPT_S) if way is Way.MAIN else (Way.MAIN, _BEHIND_S)
                 self._expected[there].append((key, now + wait_s))
             return False
 
-    def lost(self, way: Way) -> list[Message]:
-        """That connection was lost: no copy comes. Returns the stops that only the other way may have had."""
+    def forget(self) -> None:
+        """Expect no copy: a connection was lost."""
         with self._lock:
-            self._expected[way].clear()
-            if way is Way.MAIN:
-                return []
-            self._expected[Way.MAIN].clear()
-            since, found = self._clock() - self._notices_s, list(self._dropped)
+            for expected in self._expected.values():
+                expected.clear()
+
+    def lost(self) -> list[Message]:
+        """The connection of stops was lost. Returns the stops that only the main one may have had."""
+        self.forget()
+        with self._lock:
+            since, dropped = self._clock() - self._notices_s, list(self._dropped)
             self._dropped.clear()
-        return [message for at, message in found if at >= since]
-
-
-def _shortened(message: Message) -> Message:
-    """What cannot be read is a stop as well."""
-    if len(message.payload) <= MAX_COMMAND_BYTES:
-        return message
-    return Message(message.topic, message.payload[:MAX_COMMAND_BYTES], message.qos)
+        return [message for at, message in dropped if at >= since]
 
 
 class StopConnection:
@@ -113,7 +110,6 @@ class StopConnection:
         self._transport, self._filters, self._clock = transport, tuple(filters), clock
         self._pass_on, self._main = pass_on, main
         self._copies = Copies(clock, notices_s)
-        self._subscriptions: list[Subscription] = []
         self._failing_since = self._off_until = float("-inf")
         self._connected_at = float("inf")
         self._kicks = 0
@@ -124,8 +120,7 @@ class StopConnection:
     @property
     def listens(self) -> bool:
         """Whether stops come this way."""
-        subscriptions = self._subscriptions
-        return bool(subscriptions) and self._transport.state is State.CONNECTED and not self._refused
+        return self._transport.state is State.CONNECTED and not self._transport.not_received
 
     def is_copy(self, message: Message) -> bool:
         """Whether a stop that the main connection has received has passed already, and has no name."""
@@ -134,8 +129,7 @@ class StopConnection:
     def check(self) -> None:
         now = self._clock()
         if not self._wanted():
-            if self._transport.state is not State.CLOSED:
-                self.close()
+            self.close()
         elif not self._main():
             self._failing_since = now
         elif self._transport.state is State.CLOSED:
@@ -144,36 +138,29 @@ class StopConnection:
                 self._open()
         elif self.listens:
             self._failing_since = now
-            if now - self._connected_at > _KICKED_S:
-                self._kicks = 0
-                self._report(True)
+            self._report(True)
         elif now - self._failing_since > self._grace_s:
-            self._give_up("the broker refuses to subscribe it" if self._refused else self._transport.problem, _AGAIN_S)
+            self._give_up(self._transport.not_received or self._transport.problem, _AGAIN_S)
 
     def main_lost(self, *, ended: bool) -> None:
         """``ended``: the broker has closed it."""
-        self._copies.lost(Way.MAIN)
-        if ended and self.listens and self._clock() - self._connected_at < _KICKED_S:
+        self._copies.forget()
+        if self._clock() - self._connected_at >= _KICKED_S:
+            self._kicks = 0
+        elif ended and self.listens:
             self._kicks += 1
             if self._kicks >= _KICKS:
                 self._give_up("the broker ends the main one for it", float("inf"))
 
     def close(self) -> None:
-        self._subscriptions = []
         self._transport.close()
-
-    @property
-    def _refused(self) -> bool:
-        return any(one.refused for one in self._subscriptions)
 
     def _open(self) -> None:
         self._transport.open(timeout=0.0)
-        self._subscriptions = [
-            self._transport.subscribe(one, self._receive, echo=False, direct=True) for one in self._filters
-        ]
+        self._transport.subscribe_all(dict.fromkeys(self._filters, self._receive), direct=True)
 
     def _give_up(self, why: str, seconds: float) -> None:
-        self._off_until, self._kicks = self._clock() + seconds, 0
+        self._off_until = self._clock() + seconds
         self.close()
         self._report(False, why)
 
@@ -198,6 +185,6 @@ class StopConnection:
         if state is State.CONNECTED:
             self._connected_at = self._clock()
             return
-        doubtful = self._copies.lost(Way.STOPS)
+        doubtful = self._copies.lost()
         for message in doubtful if state is State.CONNECTING else ():
             self._pass_on(message)

@@ -84,6 +84,11 @@ class Connection(MemoryTransport):
         """The broker drops what waits, without a word."""
         self._inbox.clear()
 
+    def refuse(self) -> None:
+        """The broker delivers nothing of what it is subscribed to."""
+        for subscription in self._subscriptions:
+            subscription.refused = True
+
     def lead_to(self, hub: Hub) -> None:
         """The connection is lost, and the address leads to another broker from now on."""
         self._on_hub_stopped()

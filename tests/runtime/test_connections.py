@@ -2,13 +2,29 @@
 
 from __future__ import annotations
 
+from contextlib import ExitStack, closing
 from pathlib import Path
+from typing import Any
 
+import msgspec
 import pytest
 
 from pebble.config import parse
-from pebble.runtime.connections import local_settings, mqtt_settings, remote_transport
+from pebble.config.gateway_file import GatewayFile
+from pebble.contract import ESTOP
+from pebble.runtime.connections import (
+    SEGMENT,
+    gateway_transports,
+    local_settings,
+    mqtt_settings,
+    remote_transport,
+    stops_transport,
+)
+from pebble.services.gateway.gateway import will
+from pebble.transports import MqttSettings, create
 from pebble.transports.topics import matches
+from tests.sparing_broker import SparingBroker
+from tests.support import Broker, until
 
 BASE = "pebble/robots/goob"
 
@@ -40,3 +56,28 @@ def test_vital_topics_are_never_withheld(topic: str, remote: bool, local: bool, 
     settings = (remote_transport(config, "remote-bridge").settings, local_settings(config))  # type: ignore[attr-defined]
     assert [any(matches(one, topic) for one in each.vital) for each in settings] == [remote, local]
     assert any(matches(one, topic) for one in tool.vital) == (local and not topic.startswith("site/"))
+
+
+@pytest.mark.parametrize("program", ["bridge", "gateway"])
+def test_a_live_stop_waits_for_none_that_a_broker_keeps(program: str, tmp_path: Path) -> None:
+    topic, broker = ESTOP.topic(BASE), Broker(tmp_path)
+    sparing = SparingBroker(broker.port, longest=1500)
+    mqtt: dict[str, Any] = {"host": "127.0.0.1", "port": sparing.port, "protocol": "5"}
+    bridge = {"security": {"level": "login"}, "services": {"mqtt_bridge": {"enabled": True, "remote_mqtt": mqtt}}}
+    gateway = msgspec.convert({"boards": mqtt, "mqtt": mqtt}, GatewayFile)
+    stops = {
+        "bridge": stops_transport(parse({"robot": {"id": "goob"}, **bridge}, folder=tmp_path, env={})),
+        "gateway": gateway_transports(gateway, gateway.mqtt, tmp_path, will("gate"))[-1],
+    }[program]
+    received: list[bytes] = []
+    with ExitStack() as opened:
+        opened.callback(broker.stop)
+        opened.callback(sparing.close)
+        sender = opened.enter_context(closing(create("mqtt", "ann", MqttSettings(host="127.0.0.1", port=broker.port))))
+        sender.open()
+        sender.publish(topic, b"x" * 5000, retain=True)
+        opened.enter_context(closing(stops)).open()
+        stops.subscribe(topic, lambda message: received.append(message.payload), direct=True)
+        sender.publish(topic, b"stop")
+        assert until(lambda: received == [b"stop"])
+        assert sparing.segment <= SEGMENT
