@@ -55,8 +55,8 @@ class Batch(Struct):
     requests: list[ReceivedRequest]
     turns: list[tuple[str, ControlTurn]]
     lost: bool  # messages may have been
-    vouched: ControlVouched | None
     drives: list[ReceivedDrive]
+    vouched: ControlVouched | None
 
 
 class MotionInbox:
@@ -146,7 +146,7 @@ class MotionInbox:
         with self._lock:
             drives = list(chain.from_iterable(self._drives.values()))
             requests, turns = list(self._requests.values()), list(self._turns.items())
-            batch = Batch(self._stops, self._resets, requests, turns, self._lost, self._vouched, drives)
+            batch = Batch(self._stops, self._resets, requests, turns, self._lost, drives, self._vouched)
             self._stops, self._resets, self._requests, self._turns, self._drives = [], [], {}, {}, {}
             self._lost, self._vouched = False, None
             return batch

@@ -183,11 +183,11 @@ class MotorBridge(SerialService):
             self._note_control()
         if batch.lost:
             self._control.doubt(self.clock())
-        if batch.vouched is not None:
-            self._control.vouch(batch.vouched, self.clock())
         for received in batch.drives:
             if latches or not (batch.stops and received.drive.moves):
                 self._drive(received)
+        if batch.vouched is not None:  # the drive commands of before it must count first, or be missed
+            self._control.vouch(batch.vouched, self.clock())
         self._arm_guard()
         if self._waiting.dropped:
             self._count_dropped()
