@@ -264,7 +264,7 @@ class StopSender:
             self._receive_first(base, message, now)
 
     def tick(self, now: float, *, again: bool = True) -> list[Message]:
-        """What to publish now; some of it again in 0.5 s.
+        """Return what to publish now; some of it again in 0.5 s.
 
         ``again`` False: only to robots that it was not sent to yet, because what was sent still waits.
         """

@@ -44,7 +44,7 @@ class Notes:
             notes[:] = [note for note in notes if holds(own, note.path) or not holds(merged, note.path)]
 
     def warning_lines(self) -> tuple[str, ...]:
-        """One line per warning; the keys that are no longer used share one."""
+        """Return one line per warning; the keys that are no longer used share one."""
         return (*_unused(self.retired), *map(str, self.warnings))
 
 

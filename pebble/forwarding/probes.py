@@ -49,7 +49,7 @@ class Probes:
 
 
 def _match(payload: bytes, others: deque[bytes], own: deque[bytes]) -> bool:
-    """Whether the other side has had it and no match since; else it waits for that."""
+    """Return True if the other side has had it and no match since; else it waits for that."""
     if payload in others:
         others.remove(payload)
         return True

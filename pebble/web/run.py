@@ -23,7 +23,7 @@ log = logging.getLogger(__name__)
 
 
 class Ready(msgspec.Struct):
-    """What the process prints when the page of settings in JSON can be opened."""
+    """The output of the process once the page of settings in JSON can be opened."""
 
     url: str
 

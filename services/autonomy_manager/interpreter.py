@@ -1,4 +1,4 @@
-"""Which Python runs a script, and what a script that does not import pebble lacks there."""
+"""The Python that runs a script, and what a script that does not import pebble lacks there."""
 
 import ast
 import sys

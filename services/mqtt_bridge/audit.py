@@ -144,5 +144,5 @@ def _sender(by: str | None, command: Any = None) -> str:
 
 
 def _place(by: str | None) -> dict[str, str]:
-    """Where a command came from."""
+    """Return where a command came from."""
     return {"from": "robot" if by == ROBOT else "operators"}

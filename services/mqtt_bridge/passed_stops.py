@@ -50,7 +50,7 @@ class Pending(Struct, frozen=True):
 
 
 class Owner:
-    """What is known of one motor owner. A new one has not been heard."""
+    """The known state of one motor owner. A new one has not been heard."""
 
     def __init__(self) -> None:
         self.state: EstopState | None = None

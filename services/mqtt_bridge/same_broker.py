@@ -77,7 +77,7 @@ class SameBrokerProbe:
     # -- the transports' threads
 
     def proves_same_broker(self, message: Message) -> bool:
-        """Whether ``message``, received on the local side on :attr:`topic`, is one of our probes, for the first time.
+        """True if ``message``, received on the local side on :attr:`topic`, is one of our probes, for the first time.
 
         A copy that a client keeps sending, or has retained, proves nothing.
         """

@@ -123,7 +123,7 @@ class StopConnection:
         return self._transport.state is State.CONNECTED and not self._transport.not_received
 
     def is_copy(self, message: Message) -> bool:
-        """Whether a stop that the main connection has received has passed already, and has no name."""
+        """True if a stop that the main connection has received has passed already, and has no name."""
         return not is_named(message.payload) and self._copies.is_copy(Way.MAIN, message, other=self.listens)
 
     def check(self) -> None:

@@ -36,7 +36,7 @@ class Vouching:
         return ControlVouched(begin=round(1000 * self._begin), end=round(1000 * self._end))
 
     def _delivered_s(self) -> float | None:
-        """How long ago all was sent that is delivered; None: it is late."""
+        """Return how long ago all was sent that is delivered; None: it is late."""
         if self._noticed_s is not None:
             return self._noticed_s
         answer = self._remote.answer
