@@ -128,7 +128,7 @@ class Server:
                 self.open_components.update(one)
 
     def _ask_anew(self, ref: str) -> None:
-        """Forget what this robot has published, although it has been delivered."""
+        """Ask again for what this robot has published, although it has been delivered."""
         self.by_name.forget(ref)
         for subscription in self._of_all:
             subscription.renew()

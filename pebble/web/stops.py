@@ -84,7 +84,7 @@ class Stops:
             self.changed |= set(sender.robots)
 
     def user(self, name: str) -> str | None:
-        """Return who has pressed this stop; None: it is not known here, or stands for that of another person as well."""
+        """Return who has pressed this stop; None: not known here, or it stands for another person as well."""
         return self._users.get(name)
 
     def names(self, ref: str) -> bool:
