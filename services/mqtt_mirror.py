@@ -26,6 +26,7 @@ from pebble.transports import Message, QoS, State, Transport
 
 _FRESH = 1.5  # times what counts as silence: so old a heartbeat is current
 CHECK_S = 1.0  # before anything is forwarded: by then the bridge's probe has arrived
+_ARRIVAL_S = 0.25  # between two looks whether the bridge's probe has arrived at the remote broker
 _REQUEST_PERIOD_S = 1.0  # at most one request so often, when heartbeats on the broker are the reason
 
 
@@ -54,6 +55,8 @@ class MqttMirror(ForwardingService):
         self._fresh_s = _FRESH * silent_after(bridge.heartbeat.interval_seconds, bridge.link.slowest)
         self._probes = Probes()
         self._announced = False  # the bridge has sent a probe since the newest check began
+        self._under_way = b""  # the bridge's newest probe until its second announcement: the remote broker has it
+        self._slowest_s = bridge.remote_mqtt.silence_seconds if bridge.remote is None else 0.0
         self._requested_at = float("-inf")
         self._is_operators = False  # by the newest check the broker is the operators', not one of the robot's
         self._refused = ""  # why nothing is mirrored, as logged
@@ -95,9 +98,15 @@ class MqttMirror(ForwardingService):
             for topic in sorted(self._watched)
         ]
         self._request_probe()
-        self.call_at(self.clock() + (CHECK_S if self._watched else 0.0), partial(self._begin, epoch))
+        begins = self.clock() + (CHECK_S if self._watched else 0.0)
+        self.call_at(begins, partial(self._begin, epoch, begins + self._slowest_s))
 
-    def _begin(self, epoch: int) -> None:
+    def _begin(self, epoch: int, latest: float) -> None:
+        """Forward from now on, unless a probe is under way; by ``latest`` the bridge has noticed a dead connection."""
+        if self._under_way and self.clock() < latest:
+            self.call_at(self.clock() + _ARRIVAL_S, partial(self._begin, epoch, latest))
+            return
+        barrier(self.remote, self._probe_topic)
         if epoch != self.epoch or self.forwarder.gate is not Gate.WAITING:
             return
         if self._is_operators and not self._announced:  # the bridge has sent no probe since: it may still be theirs
@@ -150,6 +159,10 @@ class MqttMirror(ForwardingService):
             self.forwarder.receive(Side.LOCAL, message)
         elif message.topic == self._probe_topic:
             self._announced = True
+            if message.payload == self._under_way:
+                self._under_way = b""
+                return
+            self._under_way = message.payload
             if self._probes.announce(message.payload):
                 self.shut()
         # else a heartbeat: only the bridge publishes it; one from the broker is a reason to request a probe

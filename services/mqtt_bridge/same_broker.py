@@ -21,8 +21,9 @@ _PERIOD_S = 1.0
 class SameBrokerProbe:
     """Sends probes in rounds, and remembers in which round one was received on the local side.
 
-    On a robot with a mirror each probe is also announced on the robot's own transport; the mirror compares it with
-    what it receives from its broker.
+    On a robot with a mirror each probe is also announced on the robot's own transport: when it is sent, and once more
+    when the remote broker has it, or the connection is lost. The mirror compares it with what it receives from its
+    broker, and waits in between.
     """
 
     def __init__(self, config: Config, local: Transport, remote: Transport, clock: Callable[[], float]) -> None:
@@ -33,6 +34,7 @@ class SameBrokerProbe:
         self._local, self._remote, self._clock = local, remote, clock
         self._sent: deque[bytes] = deque(maxlen=_REMEMBERED)
         self._sent_at = float("-inf")
+        self._under_way: bytes | None = None  # announced, and not known to be at the remote broker
         self._round = 0
         self._same_in_round = -1  # the newest round in which both sides were one broker
 
@@ -46,13 +48,27 @@ class SameBrokerProbe:
         payload = new_probe(now_ms())
         self._sent.append(payload)
         if self.announces and self._remote.state is State.CONNECTED:
-            self._local.publish(self.topic, payload, qos=QoS.DELIVERED)
+            self._under_way = payload
+            self._announce(payload)
         return self._remote.publish(self.topic, payload, qos=QoS.DELIVERED)
 
     def send_again(self) -> None:
         """Send a new probe, at most one per second."""
         if self._clock() - self._sent_at >= _PERIOD_S:
             self.send()
+
+    def report_arrival(self, *, lost: bool = False) -> None:
+        """Announce the newest probe once more if the remote broker has it by now, or never will (``lost``)."""
+        if self._under_way is None:
+            return
+        answer = self._remote.answer
+        arrived = answer is not None and answer.delivered_s < self._clock() - self._sent_at
+        if arrived or lost:
+            self._announce(self._under_way)
+            self._under_way = None
+
+    def _announce(self, payload: bytes) -> None:
+        self._local.publish(self.topic, payload, qos=QoS.DELIVERED)
 
     def answer_request(self) -> None:
         if self._remote.state is State.CONNECTED:

@@ -60,6 +60,7 @@ _IGNORED = (Drop.ECHO, Drop.LATE, Drop.PROBE)  # nothing that a person or a prog
 LEFTOVERS_AFTER_S = 30.0  # by then all services have published what they retain; so long after the start, or later
 _LOGGED = 200  # characters of a topic
 _CHECK_STOPS_S, _NOTICED_S = 1.0, 1.0
+_ARRIVAL_S = 0.25  # between two looks whether a probe has arrived, for which the mirror waits
 _THIN_GRACE_S = 30.0  # over a thin link, while a client floods it
 ASK_S = 0.2  # between two questions about what is left at the remote broker
 
@@ -231,8 +232,10 @@ class MqttBridge(ForwardingService):
         return self.forwarder.gate is Gate.OPEN and self.remote.state is State.CONNECTED
 
     def disconnected(self, side: Side) -> None:
-        if side is Side.REMOTE and self._stops is not None:
-            self._stops.main_lost(ended=self.remote.was_ended)
+        if side is Side.REMOTE:
+            self._same_broker.report_arrival(lost=True)
+            if self._stops is not None:
+                self._stops.main_lost(ended=self.remote.was_ended)
         self._look_later()
         super().disconnected(side)
 
@@ -301,6 +304,10 @@ class MqttBridge(ForwardingService):
         dropped = counters[f"{Side.REMOTE.value}: {Drop.LATE.value}"], self.transport.counters["dropped"]
         losses = gate, self.epoch, self._local_changes, counters[f"{Side.LOCAL.value}: refused"], *dropped
         self.publish(CONTROL_VOUCHED, self._vouching.check(passes, losses, self.clock()))
+
+    @every(_ARRIVAL_S)
+    def _report_arrival(self) -> None:
+        self._same_broker.report_arrival()
 
     @every(CHECK_S)
     def _check_owners(self) -> None:

@@ -17,7 +17,8 @@ from pebble.forwarding.routing import Side
 from pebble.forwarding.service import CHECK_AGAIN_S
 from pebble.forwarding.side import Gate
 from pebble.services.mqtt_bridge.actions import SystemActions
-from tests.forwarding.virtual import Hub, World
+from pebble.transports.base import Answer
+from tests.forwarding.virtual import Hub, Running, World
 from tests.services.mqtt_bridge.bridge_rig import BASE, Client
 
 DRIVE, STOP, RESET = "incoming/drive-values", "incoming/estop", "incoming/estop-reset"
@@ -425,6 +426,30 @@ class TestWrongBroker:
         assert not self.is_mirrored(mirror)
         (error,) = errors(caplog)
         assert "127.0.0.1:1883 is the remote one" in error
+
+    @pytest.mark.parametrize(
+        ("end", "waits_s"),
+        [
+            (lambda bridge: None, 3.0),  # by then the bridge has noticed that it has no connection
+            (lambda bridge: setattr(bridge.uplink, "reply", Answer(2, 0.0, None)), 1.5),
+            (lambda bridge: bridge.uplink.cut(), 1.5),
+        ],
+        ids=["nothing", "it arrives", "the connection is lost"],
+    )
+    def test_it_waits_for_a_probe_that_is_under_way(
+        self, mirror: World, end: Callable[[Running], object], waits_s: float
+    ) -> None:
+        bridge = mirror.start("bridge", broker=Hub(), enabled=True)
+        mirror.run()
+        bridge.uplink.reply = Answer(1, 0.0, None, delivered_s=9.0)
+        waiting = mirror.start("mirror", enabled=True)
+        began = mirror.now
+        mirror.run(1.49)
+        end(bridge)
+        while waiting.gate is Gate.WAITING:
+            mirror.run(0.01)
+        assert waits_s <= mirror.now - began < waits_s + 0.6
+        assert waiting.gate is Gate.OPEN
 
     def test_one_that_later_turns_out_to_be_the_remote_one_too(self, apart: World) -> None:
         """Its address may lead elsewhere after a reconnect."""

@@ -39,7 +39,7 @@ class Connection(MemoryTransport):
         self._away = self._held = False
         self._stopping = True  # until it is opened
         self.way = Outgoing()  # what a service measures of it
-        self.reply: Answer | None = None
+        self.reply: Answer | None = Answer(0, 0.0, None)
         self.late_s = 0.0  # so long what arrives has waited at the broker
         self.renewed: list[float] = []  # when the service has asked for another connection
         self._world = world
