@@ -16,7 +16,7 @@ from pebble.contract import BRIDGE_PROBE, ESTOP, ONLINE, codec
 from pebble.contract.levels import silent_after
 from pebble.errors import ConfigError, PayloadError
 from pebble.forwarding.forwarder import barrier
-from pebble.forwarding.probes import PROBE_REQUEST, Probes
+from pebble.forwarding.probes import NO_PROBE, PROBE_REQUEST, Probes
 from pebble.forwarding.routing import MIRROR, Side
 from pebble.forwarding.service import CHECK_AGAIN_S, CHECK_SOON_S, ForwardingService
 from pebble.forwarding.side import Gate
@@ -27,7 +27,7 @@ from pebble.transports import Message, QoS, State, Transport
 _FRESH = 1.5  # times what counts as silence: so old a heartbeat is current
 CHECK_S = 1.0  # before anything is forwarded: by then the bridge's probe has arrived
 _ARRIVAL_S = 0.25  # between two looks whether the bridge's probe has arrived at the remote broker
-_REQUEST_PERIOD_S = 1.0  # at most one request so often, when heartbeats on the broker are the reason
+_REQUEST_PERIOD_S = 1.0  # at most one request so often, but for those of a new connection
 
 
 class MqttMirror(ForwardingService):
@@ -55,7 +55,7 @@ class MqttMirror(ForwardingService):
         self._fresh_s = _FRESH * silent_after(bridge.heartbeat.interval_seconds, bridge.link.slowest)
         self._probes = Probes()
         self._announced = False  # the bridge has sent a probe since the newest check began
-        self._under_way = b""  # the bridge's newest probe until its second announcement: the remote broker has it
+        self._under_way = False  # the bridge has not announced yet that no probe is under way
         self._slowest_s = bridge.remote_mqtt.silence_seconds if bridge.remote is None else 0.0
         self._requested_at = float("-inf")
         self._is_operators = False  # by the newest check the broker is the operators', not one of the robot's
@@ -91,7 +91,7 @@ class MqttMirror(ForwardingService):
     def _check_broker(self, epoch: int) -> None:
         """Wait for probes of the bridge from that broker, before anything is forwarded."""
         self.forwarder.rearm()
-        self._announced = False
+        self._announced, self._under_way = False, bool(self._watched)
         self.unsubscribe(Side.REMOTE)
         self.subscriptions[Side.REMOTE] = [
             self.remote.subscribe(topic, self._from_broker_watched, echo=False, direct=True)
@@ -102,8 +102,9 @@ class MqttMirror(ForwardingService):
         self.call_at(begins, partial(self._begin, epoch, begins + self._slowest_s))
 
     def _begin(self, epoch: int, latest: float) -> None:
-        """Forward from now on, unless a probe is under way; by ``latest`` the bridge has noticed a dead connection."""
+        """Forward from now on, unless a probe may be under way; by ``latest`` no bridge has a connection without it."""
         if self._under_way and self.clock() < latest:
+            self._request_again()
             self.call_at(self.clock() + _ARRIVAL_S, partial(self._begin, epoch, latest))
             return
         barrier(self.remote, self._probe_topic)
@@ -126,8 +127,8 @@ class MqttMirror(ForwardingService):
             self._requested_at = self.clock()
             self.transport.publish(self._probe_topic, PROBE_REQUEST, qos=QoS.DELIVERED)
 
-    def _suspect(self) -> None:
-        """A heartbeat like the robot's came from the broker: it is the remote one, or a client there sent it."""
+    def _request_again(self) -> None:
+        """Request a probe, at most one per second."""
         if self.clock() - self._requested_at >= _REQUEST_PERIOD_S:
             self._request_probe()
 
@@ -158,12 +159,9 @@ class MqttMirror(ForwardingService):
         if message.topic not in self._watched:
             self.forwarder.receive(Side.LOCAL, message)
         elif message.topic == self._probe_topic:
-            self._announced = True
-            if message.payload == self._under_way:
-                self._under_way = b""
-                return
-            self._under_way = message.payload
-            if self._probes.announce(message.payload):
+            self._under_way = message.payload != NO_PROBE
+            self._announced |= self._under_way
+            if self._under_way and self._probes.announce(message.payload):
                 self.shut()
         # else a heartbeat: only the bridge publishes it; one from the broker is a reason to request a probe
 
@@ -178,7 +176,7 @@ class MqttMirror(ForwardingService):
             if self._probes.see(message.payload):
                 self.shut()
         elif self._is_fresh(message):
-            self.post_message(ONLINE, self._suspect, newest_of="suspect")
+            self.post_message(ONLINE, self._request_again, newest_of="suspect")
 
     def _is_fresh(self, message: Message) -> bool:
         """Whether a heartbeat is current: a retained one may be old. Its sender uses the same clock."""

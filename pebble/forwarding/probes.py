@@ -18,6 +18,9 @@ _MAX_BYTES = 256  # of a probe
 #: Published by the mirror on the robot's own transport: the bridge answers with a new probe.
 PROBE_REQUEST: Final = codec.encode(BRIDGE_PROBE, {"question": True})
 
+#: Published by the bridge there: its newest probe has arrived at the remote broker, or it has no connection.
+NO_PROBE: Final = codec.encode(BRIDGE_PROBE, {"question": False})
+
 
 def new_probe(now_ms: int) -> bytes:
     """A payload that no other client can have published before."""

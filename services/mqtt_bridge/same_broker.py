@@ -11,7 +11,7 @@ from collections.abc import Callable
 from pebble.config import Config
 from pebble.contract import BRIDGE_PROBE
 from pebble.forwarding.forwarder import barrier
-from pebble.forwarding.probes import PROBE_REQUEST, new_probe
+from pebble.forwarding.probes import NO_PROBE, PROBE_REQUEST, new_probe
 from pebble.transports import Message, QoS, State, Transport
 
 _REMEMBERED = 64  # probes that may still arrive
@@ -21,9 +21,8 @@ _PERIOD_S = 1.0
 class SameBrokerProbe:
     """Sends probes in rounds, and remembers in which round one was received on the local side.
 
-    On a robot with a mirror each probe is also announced on the robot's own transport: when it is sent, and once more
-    when the remote broker has it, or the connection is lost. The mirror compares it with what it receives from its
-    broker, and waits in between.
+    On a robot with a mirror each probe is also announced on the robot's own transport. The mirror compares it with what
+    it receives from its broker, until it is announced that no probe is under way.
     """
 
     def __init__(self, config: Config, local: Transport, remote: Transport, clock: Callable[[], float]) -> None:
@@ -34,7 +33,7 @@ class SameBrokerProbe:
         self._local, self._remote, self._clock = local, remote, clock
         self._sent: deque[bytes] = deque(maxlen=_REMEMBERED)
         self._sent_at = float("-inf")
-        self._under_way: bytes | None = None  # announced, and not known to be at the remote broker
+        self._under_way = False  # a probe that was announced: it is not known to be at the remote broker
         self._round = 0
         self._same_in_round = -1  # the newest round in which both sides were one broker
 
@@ -48,7 +47,7 @@ class SameBrokerProbe:
         payload = new_probe(now_ms())
         self._sent.append(payload)
         if self.announces and self._remote.state is State.CONNECTED:
-            self._under_way = payload
+            self._under_way = True
             self._announce(payload)
         return self._remote.publish(self.topic, payload, qos=QoS.DELIVERED)
 
@@ -57,15 +56,17 @@ class SameBrokerProbe:
         if self._clock() - self._sent_at >= _PERIOD_S:
             self.send()
 
-    def report_arrival(self, *, lost: bool = False) -> None:
-        """Announce the newest probe once more if the remote broker has it by now, or never will (``lost``)."""
-        if self._under_way is None:
-            return
+    def report_arrival(self) -> None:
+        """Announce that the remote broker has the newest probe, once it has answered something that was sent later."""
         answer = self._remote.answer
-        arrived = answer is not None and answer.delivered_s < self._clock() - self._sent_at
-        if arrived or lost:
-            self._announce(self._under_way)
-            self._under_way = None
+        if self._under_way and answer is not None and answer.delivered_s < self._clock() - self._sent_at:
+            self.report_none()
+
+    def report_none(self) -> None:
+        """Announce that no probe is under way."""
+        self._under_way = False
+        if self.announces:
+            self._announce(NO_PROBE)
 
     def _announce(self, payload: bytes) -> None:
         self._local.publish(self.topic, payload, qos=QoS.DELIVERED)
@@ -73,6 +74,8 @@ class SameBrokerProbe:
     def answer_request(self) -> None:
         if self._remote.state is State.CONNECTED:
             self.send()
+        else:
+            self.report_none()
 
     def begin_round(self, remote_topic: str) -> int | None:
         """Send a probe and wait, bounded, until it would have arrived; None if a connection was lost meanwhile.

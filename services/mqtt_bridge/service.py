@@ -233,7 +233,7 @@ class MqttBridge(ForwardingService):
 
     def disconnected(self, side: Side) -> None:
         if side is Side.REMOTE:
-            self._same_broker.report_arrival(lost=True)
+            self._same_broker.report_none()
             if self._stops is not None:
                 self._stops.main_lost(ended=self.remote.was_ended)
         self._look_later()
