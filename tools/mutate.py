@@ -1,10 +1,11 @@
-"""Changes single places of Python files, one at a time, and runs the tests that reach them: does one fail?
+"""Changes single places of Python files and page modules, one at a time, and runs the tests: does one fail?
 
 A change that no test notices survives: no test asserts what the line does, or the line is not needed. Tests run in a
 copy of the tree, collected once; for each change, a forked process replaces the code of its function and runs the rows
 that reach its line: programs that tests start do not have it. A line that runs while tests are imported (a constant, a
 class body, a default) is changed in the copy and tried by all rows in a new process, which takes seconds. Calls that
-log are counted apart. A hang counts as killed. JavaScript is not changed.
+log are counted apart. A hang counts as killed. A page module is changed in the copy and tried by all rows; those of
+tests/web/modules, which run in Node, if no others are named. What is inside its strings and templates is not changed.
 """
 
 import argparse
@@ -42,6 +43,18 @@ FAILED = re.compile(r"^(?:FAILED|ERROR) (\S+::.*?)(?: - .*)?$", re.MULTILINE)  #
 PAIRS: list[Any] = [(ast.FloorDiv, ast.Mult), (ast.Mult, ast.Div), (ast.Add, ast.Sub), (ast.And, ast.Or)]
 PAIRS += [(ast.Lt, ast.LtE), (ast.Gt, ast.GtE), (ast.Eq, ast.NotEq), (ast.Is, ast.IsNot), (ast.In, ast.NotIn)]
 SWAPPED = {second: first for first, second in PAIRS} | dict(PAIRS)
+#: Of a page module: what is left out, the beginning of a function, and what is changed, by operator.
+SCRIPT = re.compile(
+    r"""//[^\n]*|/\*.*?\*/|'(?:\\.|[^'\\\n])*'|"(?:\\.|[^"\\\n])*"|`(?:\\.|[^`\\])*`"""
+    r"|^(?:export )?(?:async )?(?:function|class) (?P<function>\w+)"
+    r"|^  (?:static |async |get |set )*(?P<method>#?\w+)\([^\n]*\{$"
+    r"|(?P<compare> (?:[<>]=?|[!=]==) )|(?P<logic> (?:&&|\|\|) )|(?P<arithmetic> [-+*/] )|(?P<not>!(?=[\w(]))"
+    r"|(?P<constant>(?<![\w.])(?:true|false|\d+(?:\.\d+)?)(?!\w))|(?P<return>\breturn (?=[^;\n]))|(?P<if>\bif \((?!!))",
+    re.DOTALL | re.MULTILINE,
+)
+SCRIPT_WORDS = {"<": "<=", "<=": "<", ">": ">=", ">=": ">", "===": "!==", "!==": "===", "&&": "||", "||": "&&"}
+SCRIPT_WORDS |= {"+": "-", "-": "+", "*": "/", "/": "*", "!": "", "true": "false", "false": "true"}
+SCRIPT_WORDS |= {"return": "return void", "if (": "if (true || "}
 Mutant = tuple[dict[str, Any], set[tuple[str, int]], bytes]  # a record, the lines that run when it does, the new text
 
 
@@ -74,6 +87,24 @@ def mutants(file: str, text: bytes) -> Iterator[Mutant]:
     return walk(ast.parse(text), "", 0)
 
 
+def script_mutants(file: str, text: bytes) -> Iterator[Mutant]:
+    """Yield the mutants of a page module, named like those of :func:`mutants`."""
+    words, function = text.decode(), "<module>"
+    numbers: Counter[str] = Counter()
+    for match in SCRIPT.finditer(words):
+        operator, old = match.lastgroup, match.group()
+        if operator in ("function", "method"):
+            function = match.group(operator)
+        elif operator is not None:
+            stripped = old.strip()
+            new = old.replace(stripped, SCRIPT_WORDS.get(stripped, f"({stripped} + 1)"))
+            name, line = f"{file}:{function}:{operator}", words.count("\n", 0, match.start()) + 1
+            numbers[name] += 1
+            change = f"{stripped} -> {new.strip()}"
+            record = {"name": f"{name}:{numbers[name]}", "file": file, "line": line, "change": change}
+            yield record, {(file, line)}, (words[: match.start()] + new + words[match.end() :]).encode()
+
+
 def replacements(node: Any) -> Iterator[tuple[str, Any, ast.AST]]:
     """Yield the changes of this node, each once: the operator, the part that goes, and the one that comes."""
     match node:
@@ -100,7 +131,9 @@ def replacements(node: Any) -> Iterator[tuple[str, Any, ast.AST]]:
 
 
 def tests_that_import(files: list[str]) -> list[str]:
-    """Return the test files whose imports lead to one of these files in the end."""
+    """Return the test files whose imports lead to one of these files in the end; those of page modules are a folder."""
+    if all(file.endswith(".js") for file in files):
+        return ["tests/web/modules"]
     packages = {"tests", *(path.parent.name for path in ROOT.glob("*/__init__.py"))}
     graph = grimp.build_graph(*packages, exclude_type_checking_imports=True, cache_dir=None)
     places = {name: (ROOT / f"{name.replace('.', '/')}.py").resolve() for name in graph.modules}
@@ -200,7 +233,8 @@ class Trial:
                 self.functions[self.file_of(code.co_filename), code.co_qualname, code.co_firstlineno].append(function)
         gc.freeze()
         for file, text in self.texts.items():
-            drawn = sorted(mutants(file, text), key=lambda mutant: crc32(mutant[0]["name"].encode(), self.options.seed))
+            found = script_mutants(file, text) if file.endswith(".js") else mutants(file, text)
+            drawn = sorted(found, key=lambda mutant: crc32(mutant[0]["name"].encode(), self.options.seed))
             report(file, len(drawn), [self.attempt(*mutant) for mutant in drawn[: self.options.n or None]])
         return True
 
@@ -242,13 +276,17 @@ class Trial:
     def attempt(self, record: dict[str, Any], reached_by: set[tuple[str, int]], text: bytes) -> dict[str, Any]:
         """Run rows with a mutant; write and return the result."""
         start, file = time.monotonic(), record["file"]
-        swaps = [] if reached_by & self.imported else self.swaps(file, text)
+        script = file.endswith(".js")
+        swaps = [] if script or reached_by & self.imported else self.swaps(file, text)
         names = [name for name in self.rows if not swaps or reached_by & self.lines[name]]
         seconds = sum(self.rows[name][0] for name in names)
         seconds += sum(self.slowest[path] for path in {self.items[name].path for name in names})
         self.failed.write_text("")
-        work = (lambda: self.run_swapped(swaps, names)) if swaps else (lambda: self.run_new(file, text))
-        survived = not names or forked(work, 5 * seconds + (5 if swaps else 60))
+        if script:
+            (self.tree / file).write_bytes(text)
+        in_fork = swaps or script
+        work = (lambda: self.run_swapped(swaps, names)) if in_fork else (lambda: self.run_new(file, text))
+        survived = not names or forked(work, 5 * seconds + (5 if in_fork else 60))
         (self.tree / file).write_bytes(self.texts[file])
         record |= {"rows": len(names), "killers": FAILED.findall(self.failed.read_text())}
         record["result"] = "killed" if not survived else "survived" if names else "not reached"
@@ -321,7 +359,7 @@ def spare(results: Iterable[Iterable[str]]) -> int:
 def main() -> int:
     """Run what the command line says; return the exit code."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("files", nargs="*", type=Path, metavar="FILE", help="a Python file of the tree in this folder")
+    parser.add_argument("files", nargs="*", type=Path, metavar="FILE", help="a file of the tree in this folder")
     parser.add_argument("--tests", nargs="+", metavar="PATH", help="what to run (default: tests that import a FILE)")
     parser.add_argument("--thorough", action="store_true", help="run rows marked thorough, too; never page and alone")
     parser.add_argument("--n", type=int, default=30, help="mutants for each FILE, drawn at random (30; 0: all)")
@@ -334,8 +372,8 @@ def main() -> int:
     if options.compare or options.spare:
         return compare(*options.compare) if options.compare else spare(options.spare)
     for path in options.files:
-        if not (path.is_file() and path.suffix == ".py" and path.resolve().is_relative_to(ROOT)):
-            sys.exit(f"mutate.py: {path} is no Python file below {ROOT}")
+        if not (path.is_file() and path.suffix in (".py", ".js") and path.resolve().is_relative_to(ROOT)):
+            sys.exit(f"mutate.py: {path} is no Python file or page module below {ROOT}")
     files = [str(path.resolve().relative_to(ROOT)) for path in options.files]
     tests = options.tests or tests_that_import(files)
     if not tests:
