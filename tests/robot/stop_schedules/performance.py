@@ -20,7 +20,7 @@ _ANSWER_S = 1.5
 _MOVES_S = 2.0
 _STILL_S = 1.5
 _REPEATED_S = 6.0  # a broker that was restored may have an older state until its owner repeats it
-_RESETS = 5  # a person looks and resets so often at most
+_RESETS = 9  # tries of _ANSWER_S: an owner that was killed five times in a minute starts after ten seconds
 
 _runs = iter(range(1, 1_000_000_000))
 
