@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from pebble.contract.payloads import EstopState
+from pebble.motion.arbiter import newer
 from tests.robot.stop_schedules.history import Event, History
 from tests.robot.stop_schedules.people import speed_of_run
 from tests.robot.stop_schedules.schedules import ROBOTS
@@ -92,7 +93,7 @@ class _Rules:
     def _barred(self) -> Iterator[str]:
         """Within one life of the owner: what is barred is not saved."""
         for at, state in self._states:
-            barred = [run for run in self._runs() if state.barred and run <= state.barred]
+            barred = [run for run in self._runs() if state.barred and not newer(run, state.barred)]
             if barred and not any(at - _FAULT_PAST_S < death < at for death in self._deaths):
                 last = min([death for death in self._deaths if death >= at] + [self._until])
                 yield from self._moved_by(barred, at + self._reaction(at), last, "after it is barred")
