@@ -32,7 +32,6 @@ class MqttSettings:
     #: For brokers that admit only ids they know. None: one that cannot be guessed, which no other client can take over.
     client_id: str | None = None
     protocol: str = "3.1.1"  # or "5"
-    client: str = "pebble"  # the library below the transport, or "paho"
     #: Request exact ``echo=False`` and the retain flag of live messages from the broker (bridge mode on 3.1.1,
     #: noLocal and retain-as-published on 5). See T7 and T16 in docs/transports.md.
     as_published: bool = False

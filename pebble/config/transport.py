@@ -36,6 +36,8 @@ class Tls(Section, frozen=True, kw_only=True):
 class Mqtt(Section, frozen=True, kw_only=True):
     """One MQTT broker."""
 
+    retired: ClassVar = {"client": "Pebble's own is used; paho is a transport of its own, see docs/transports.md"}
+
     host: Annotated[BrokerHost, doc("Name or address of the broker.")] = "127.0.0.1"
     port: Annotated[Port, doc("TCP port of the broker.")] = 1883
     hosts: Annotated[
@@ -60,10 +62,6 @@ class Mqtt(Section, frozen=True, kw_only=True):
     password_env: Annotated[str | None, doc("Environment variable that holds the password.")] = None
     tls: Annotated[Tls, doc("Encryption.")] = Tls()
     protocol: Annotated[Literal["3.1.1", "5"], doc("Version of MQTT to use.")] = "3.1.1"
-    client: Annotated[
-        Literal["pebble", "paho"],
-        doc("Library that speaks MQTT: Pebble's own, or paho, which takes half as much processor time again."),
-    ] = "pebble"
     silence_seconds: Annotated[
         Silence, doc("A connection that does not answer for this many seconds is closed and opened again.")
     ] = 2.0

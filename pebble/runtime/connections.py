@@ -277,7 +277,6 @@ def mqtt_settings(
         tls=tls_settings(mqtt.tls),
         client_id=f"{client_id}-{program}" if client_id and program else client_id,
         protocol=mqtt.protocol,
-        client=mqtt.client,
         as_published=as_published,
         reconnect_max_s=reconnect_max_s,
         silence_s=mqtt.silence_seconds,

@@ -18,8 +18,7 @@ from pebble.transports.base import Answer, Message, Outgoing, QoS
 from pebble.transports.counters import Counters
 from pebble.transports.mqtt.bridge_mode import Result
 from pebble.transports.mqtt.broker_limits import EVERYTHING, Limits
-from pebble.transports.mqtt.client import Opening, TlsLateError, keep_unsent, one_packet
-from pebble.transports.mqtt.client_kinds import AnyClient, client_class
+from pebble.transports.mqtt.client import Client, Opening, TlsLateError, keep_unsent, one_packet
 from pebble.transports.mqtt.ending import Absent, Lost, Refused, Silent, TlsLate
 from pebble.transports.mqtt.incoming import OVERSLEPT_S, Incoming, Sink
 from pebble.transports.mqtt.outgoing import (
@@ -76,6 +75,7 @@ class Connection:
         where: str,
         as_published: bool,
         limits: Limits = EVERYTHING,
+        client_class: type[Client] = Client,
     ) -> None:
         self.opened_s = 0.0  # so long TCP and TLS took
         self.dialling = True  # connect(2) or a TLS handshake may be blocking, and cannot be interrupted
@@ -91,7 +91,7 @@ class Connection:
         self.pings = self.incoming.pings
         self._poll = SocketPoll()
         bridge = as_published and opening.settings.protocol != "5"
-        self._client: AnyClient = client_class(opening.settings.client)(opening, self.incoming, bridge=bridge)
+        self._client = client_class(opening, self.incoming, bridge=bridge)
 
     # -- opening and closing
 

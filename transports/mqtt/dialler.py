@@ -13,7 +13,7 @@ from pebble.transports.mqtt import client_ids
 from pebble.transports.mqtt.bridge_mode import Attempt, BridgeMode, Result
 from pebble.transports.mqtt.broker_limits import EVERYTHING, BrokerLimits, Limits
 from pebble.transports.mqtt.chosen_host import HostChoice
-from pebble.transports.mqtt.client import Opening
+from pebble.transports.mqtt.client import Client, Opening
 from pebble.transports.mqtt.connection import Connection, Owner
 from pebble.transports.mqtt.ending import Absent, Lost, Refused, Silent, TlsLate
 from pebble.transports.settings import MqttSettings
@@ -41,10 +41,12 @@ class _Alone:
 class Dialler:
     """Remembers how the attempts at a broker have ended, and makes the next one."""
 
-    def __init__(self, client_id: str, settings: MqttSettings, will: Message | None) -> None:
+    def __init__(
+        self, client_id: str, settings: MqttSettings, will: Message | None, client_class: type[Client] = Client
+    ) -> None:
         # It stays the same over reconnects: the broker closes our own half-dead connection at once.
         self._client_id = client_ids.unique(client_id) if settings.client_id is None else settings.client_id
-        self._settings, self._will = settings, will
+        self._settings, self._will, self._client_class = settings, will, client_class
         self.hosts = HostChoice(settings, self._accepts_login)
         self.turns = Turns(self.hosts.next_round)
         self.moved = False  # the newest connection is to another host than the one before
@@ -109,6 +111,7 @@ class Dialler:
             _Alone(),
             where=str(place),
             as_published=False,
+            client_class=self._client_class,
         )
         try:
             connection.connect(threading.Event())
@@ -153,6 +156,7 @@ class Dialler:
             where=self.where,
             as_published=as_published,
             limits=self.limits.limits,
+            client_class=self._client_class,
         )
         return self.attempt
 

@@ -4,7 +4,7 @@ import random
 from math import inf
 
 from pebble.transports import clock
-from pebble.transports.mqtt.client_kinds import AnyClient
+from pebble.transports.mqtt.client import Client
 from pebble.transports.mqtt.outgoing import InFlightTable, PendingAck, unconfirmed_bytes
 from pebble.transports.mqtt.read_age import ReadAge
 from pebble.transports.settings import MqttSettings
@@ -40,7 +40,7 @@ class Pings:
         """The broker has accepted us."""
         self.due_at = now + self._interval_s
 
-    def send(self, client: AnyClient, ack: PendingAck | None = None) -> None:
+    def send(self, client: Client, ack: PendingAck | None = None) -> None:
         sock = client.socket
         ahead = client.unwritten + (0 if sock is None else unconfirmed_bytes(sock))
         now = clock.since_boot()
@@ -50,7 +50,7 @@ class Pings:
         self._age.delay.asked(now, clear=ahead <= _CLEAR)
         client.ping()
 
-    def send_after_stall(self, client: AnyClient, now: float) -> None:
+    def send_after_stall(self, client: Client, now: float) -> None:
         """Send one for each time without reading: its answer comes after what has waited at the broker meanwhile."""
         since = self._age.waiting.checked_at
         if since != self._stalled_since:

@@ -8,11 +8,12 @@ import threading
 import time
 from collections.abc import Callable, Collection, Mapping, Sequence
 from math import ceil
+from typing import ClassVar
 
 from pebble.errors import TransportError
 from pebble.transports import clock
 from pebble.transports.base import Answer, Message, Outgoing, QoS, State, Subscription, Transport
-from pebble.transports.mqtt.client_kinds import client_class
+from pebble.transports.mqtt.client import Client
 from pebble.transports.mqtt.connection import Connection, ignore
 from pebble.transports.mqtt.dialler import Dialler
 from pebble.transports.mqtt.ending import Leaving, Lost, Silent
@@ -55,15 +56,16 @@ class _Run:
 class MqttTransport(Transport):
     """docs/transports.md explains how it implements each promise."""
 
+    client_class: ClassVar[type[Client]] = Client
+
     def __init__(self, client_id: str, settings: MqttSettings, *, will: Message | None = None) -> None:
         super().__init__(client_id, will=will)
         if settings.protocol not in ("3.1.1", "5"):
             raise TransportError(f'protocol must be "3.1.1" or "5", not "{settings.protocol}"')
-        client_class(settings.client)  # a package that is missing is an error now, not in a thread
         self.settings = settings
         self.as_published = settings.as_published
         self.exact_echo = settings.as_published or settings.protocol == "5"
-        self._dialler = Dialler(client_id, settings, will)
+        self._dialler = Dialler(client_id, settings, will, self.client_class)
         self._connection: Connection | None = None  # the newest one, once it can be used
         self._filters = BrokerFilters()
         self._own_message_filter = OwnMessageFilter()
