@@ -5,6 +5,7 @@ import math
 import os
 import statistics
 from collections.abc import Callable, Iterable, Sequence
+from contextlib import suppress
 from itertools import pairwise
 from typing import Any, TextIO
 
@@ -50,8 +51,9 @@ def body(payload: bytes, width: int) -> str:
         return "(empty: removes the retained message)"
     plain = parsed(payload)
     if plain is not None:
-        line = json.dumps(plain, ensure_ascii=False)
-        return shown(line if len(line) <= width else json.dumps(plain, ensure_ascii=False, indent=2))
+        with suppress(RecursionError):
+            line = json.dumps(plain, ensure_ascii=False)
+            return shown(line if len(line) <= width else json.dumps(plain, ensure_ascii=False, indent=2))
     known = recognised(payload)
     if known is None and _is_text(payload):
         return shown(payload.decode())
@@ -60,11 +62,9 @@ def body(payload: bytes, width: int) -> str:
 
 def parsed(payload: bytes) -> Any:
     """The JSON value; None if it is not JSON (or is ``null``)."""
-    if codec.too_deep(payload):
-        return None
     try:
         return json.loads(payload)
-    except ValueError:
+    except (ValueError, RecursionError):
         return None
 
 
