@@ -29,7 +29,7 @@ def of_certificate(fleet: Fleet, name: str) -> dict[str, Any]:
     roles = fleet.accounts[name].roles
     at_hub = _at_hub(fleet, name, certificates.CA_CERT, name)
     if ProgramRole.HUB in roles:
-        return hub_file(name) | {"connect": [], "journal": f"{name}.journal"}
+        return hub_file(name) | {"journal": f"{name}.journal"}
     if ProgramRole.ROBOT in roles:
         remote = {"kind": "zenoh", **at_hub}
         return {**_who(fleet, name), "services": {"mqtt_bridge": {"enabled": True, "remote": remote}}}

@@ -399,7 +399,7 @@ def _print_certificate(place: Path, fleet: Fleet, name: str, files: tuple[Path, 
         f"Move the key to its machine, with copies of {copies} beside it. `pebble fleet check` watches the date."
     )
     if ProgramRole.HUB in roles:
-        typer.echo(f"And a copy of {_shown(place / ZENOH)}. The file of that hub, with the other hubs in connect:")
+        typer.echo(f"And a copy of {_shown(place / ZENOH)}. The file of that hub:")
     if piece := pieces.of_certificate(fleet, name):
         typer.echo(json.dumps(piece, indent=2))
 
