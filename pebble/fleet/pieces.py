@@ -13,12 +13,8 @@ HUB_PORT = 7447
 
 def of_broker(fleet: Fleet, name: str, secret: str, *, board: bool) -> dict[str, Any]:
     """Return what a robot needs in its config to be at the fleet's broker."""
-    server, *others = fleet.brokers
-    places: dict[str, Any] = {"host": server.host, "port": server.port}
-    if others:
-        places = {"hosts": [one.host if one.port == server.port else host_and_port(one) for one in fleet.brokers]}
-        places["port"] = server.port
-    login = places | {"username": name, "password": secret}
+    server = fleet.brokers[0]
+    login = {"host": server.host, "port": server.port, "username": name, "password": secret}
     link = login | {"tls": {"enabled": True, "ca_cert": certificates.CA_CERT}}
     found = {"local_mqtt": link} if board else {"services": {"mqtt_bridge": {"enabled": True, "remote_mqtt": link}}}
     return {**_who(fleet, name), **found}

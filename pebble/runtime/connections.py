@@ -91,19 +91,11 @@ def remote_transport(config: Config, name: str, *, will: Message | None = None) 
         remote, program = bridge.remote_mqtt, "" if name == _BRIDGE else name
         settings = mqtt_settings(remote, as_published=True, reconnect_max_s=REMOTE_RECONNECT_S, program=program)
         settings = replace_settings(settings, vital=(*_VITAL_STATES, *_renamed_vital(config)))
-        settings = with_choice(config, settings, name)
         if bridge.link.profile != "wide":
             settings = replace_settings(settings, dscp=_EXPEDITED if name == _BRIDGE else _ASSURED)
         return create("mqtt", _name(config, "mqtt", name), settings, will=will)
     kind = bridge.remote.kind
     return create(kind, _name(config, kind, name), _remote_settings(config, bridge.remote), will=will)
-
-
-def with_choice(config: Config, settings: MqttSettings, program: str) -> MqttSettings:
-    """The bridge chooses one of several hosts, and the robot's other programs connect there."""
-    if not settings.hosts:
-        return settings
-    return replace_settings(settings, chosen=config.run_dir() / "remote-host", follows=program != _BRIDGE)
 
 
 def stops_transport(config: Config) -> Transport | None:
@@ -118,7 +110,7 @@ def stops_transport(config: Config) -> Transport | None:
         return None
     if bridge.remote is None:
         settings = _live_only(mqtt_settings(bridge.remote_mqtt, reconnect_max_s=REMOTE_RECONNECT_S, program=_STOPS))
-        return create("mqtt", _name(config, "mqtt", _STOPS), with_choice(config, settings, _STOPS))
+        return create("mqtt", _name(config, "mqtt", _STOPS), settings)
     if bridge.remote.kind != "zenoh":  # what another transport makes of a second connection is not known
         return None
     return create("zenoh", _name(config, "zenoh", _STOPS), _remote_settings(config, bridge.remote))
@@ -269,7 +261,6 @@ def mqtt_settings(
     return MqttSettings(
         host=mqtt.host,
         port=mqtt.port,
-        hosts=mqtt.places if mqtt.hosts else (),
         keepalive_s=mqtt.keepalive,
         username=mqtt.username,
         password=mqtt.password,

@@ -447,7 +447,7 @@ class TestMistakes:
         ("path", "nearest"),
         [
             ("services.mqtt_bridge.heartbeet", 'did you mean "heartbeat"?'),
-            ("services.mqtt_bridge.remote_mqtt.hots", 'did you mean "hosts"?'),
+            ("services.mqtt_bridge.remote_mqtt.hots", 'did you mean "host"?'),
             ("services.serial_mcu_bridge.serial.baudrate", 'did you mean "baud"?'),
             ("transports", 'did you mean "transport"?'),
             ("services.web", 'the nearest is "web_handler" of autonomy_manager, '),

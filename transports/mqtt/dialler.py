@@ -2,17 +2,15 @@
 
 import threading
 import time
-from collections.abc import Callable, Mapping
 from dataclasses import replace
 
 from pebble.transports.base import Message
 from pebble.transports.counters import Counters
 from pebble.transports.credentials import Credentials
-from pebble.transports.hosts import CONNECT_TIMEOUT_S, Address, Place, Turns
+from pebble.transports.hosts import Address, Place, Turns
 from pebble.transports.mqtt import client_ids
 from pebble.transports.mqtt.bridge_mode import Attempt, BridgeMode, Result
 from pebble.transports.mqtt.broker_limits import EVERYTHING, BrokerLimits, Limits
-from pebble.transports.mqtt.chosen_host import HostChoice
 from pebble.transports.mqtt.client import Client, Opening
 from pebble.transports.mqtt.connection import Connection, Owner
 from pebble.transports.mqtt.ending import Absent, Lost, Refused, Silent, TlsLate
@@ -20,22 +18,6 @@ from pebble.transports.settings import MqttSettings
 
 _ENDING_S = 1.0  # so long a broker that ends may still accept connections, and hang up on them
 _HESITATION_S = 0.5  # a CONNACK that takes longer comes over a very slow connection, or from a suspended broker
-
-
-class _Alone:
-    """The owner of a connection that only logs in."""
-
-    def note_answers(self, refused: Mapping[str, bool]) -> None:
-        pass
-
-    def note_refusal(self, topic: str, why: str) -> None:
-        pass
-
-    def is_stop(self, _topic: str, /) -> bool:
-        return False
-
-    def skips_retained(self, _topic: bytes, /) -> bool:
-        return True
 
 
 class Dialler:
@@ -47,9 +29,7 @@ class Dialler:
         # It stays the same over reconnects: the broker closes our own half-dead connection at once.
         self._client_id = client_ids.unique(client_id) if settings.client_id is None else settings.client_id
         self._settings, self._will, self._client_class = settings, will, client_class
-        self.hosts = HostChoice(settings, self._accepts_login)
-        self.turns = Turns(self.hosts.next_round)
-        self.moved = False  # the newest connection is to another host than the one before
+        self.turns = Turns(Place(settings.host, settings.port))
         self.attempt: Connection | None = None  # the newest connection, in any state
         self.stalled = False  # the broker may have been suspended, and have old messages to forward first
         self._credentials: Credentials | None = None
@@ -86,42 +66,6 @@ class Dialler:
         """The broker in words, with the address if its host has several."""
         return self.turns.where
 
-    # -- one of several hosts
-
-    def succeeded(self) -> str:
-        """The connection can be used; returns which addresses failed before it, and how."""
-        self.hosts.connected(self.turns.place)
-        return self.turns.succeeded()
-
-    def leave(self, idle_s: Callable[[], float]) -> str:
-        """Why to leave this host now, see `HostChoice.why_leave`; the next turn is another host's then."""
-        if why := self.hosts.why_leave(idle_s):
-            self.turns.begin_anew()
-        return why
-
-    def _accepts_login(self, place: Place, address: Address) -> bool:
-        """On a thread of :attr:`hosts`."""
-        assert self._credentials is not None  # noqa: S101 - there is a connection
-        password, given = self._credentials.password(), self._settings.client_id
-        settings = replace(self._settings, host=place.host, port=place.port, password=password)
-        id_ = client_ids.unique("pebble_return") if given is None else f"{given}-return"
-        connection = Connection(
-            Opening(id_, settings, self._credentials.context(), None, address, CONNECT_TIMEOUT_S),
-            Counters(),
-            _Alone(),
-            where=str(place),
-            as_published=False,
-            client_class=self._client_class,
-        )
-        try:
-            connection.connect(threading.Event())
-            connection.disconnect()
-        except Lost:
-            return False
-        finally:
-            connection.discard()
-        return True
-
     # -- one attempt
 
     def connect(self, owner: Owner, counters: Counters, stopping: threading.Event) -> Connection:
@@ -141,14 +85,12 @@ class Dialler:
                 connection.discard()
         self._note_result(Result.ACCEPTED)
         self.turns.opened(connection.opened_s)
-        self.moved = self.hosts.moves_to(self.turns.place)
         return connection
 
     def _make(self, will: Message | None, owner: Owner, counters: Counters, *, as_published: bool) -> Connection:
         assert self._address is not None  # noqa: S101 - both callers run at an address
         assert self._credentials is not None  # noqa: S101 - and while it is open
-        place, password = self.turns.place, self._credentials.password()
-        settings = replace(self._settings, host=place.host, port=place.port, password=password)
+        settings = replace(self._settings, password=self._credentials.password())
         self.attempt = Connection(
             Opening(self._client_id, settings, self._credentials.context(), will, self._address, self.turns.patience_s),
             counters,
@@ -227,7 +169,7 @@ class Dialler:
         if self._is_last_attempt and not asks_again:
             failed = turns.failed(problem.removeprefix(f"{self.where} "), held_s)
             if turns.several:
-                problem = f"broker {failed}" if turns.has_hosts else f"broker {turns.place}: {failed}"
+                problem = f"broker {turns.place}: {failed}"
         if asks_again and held_s <= 0:
             return "", False
         return problem, held_s > 0 or turns.is_over or not turns.several

@@ -15,10 +15,6 @@ class Silent(Lost):
     """The other side does not answer."""
 
 
-class Leaving(Exception):  # noqa: N818  (an event, not a mistake)
-    """We have left this host for another one. Its text explains why."""
-
-
 class Absent(Lost):
     """Nothing listens there."""
 

@@ -16,7 +16,7 @@ from pebble.transports.base import Answer, Message, Outgoing, QoS, State, Subscr
 from pebble.transports.mqtt.client import Client
 from pebble.transports.mqtt.connection import Connection, ignore
 from pebble.transports.mqtt.dialler import Dialler
-from pebble.transports.mqtt.ending import Leaving, Lost, Silent
+from pebble.transports.mqtt.ending import Lost, Silent
 from pebble.transports.mqtt.filters import BrokerFilters, OwnMessageFilter, overlap
 from pebble.transports.mqtt.outgoing import PendingAck
 from pebble.transports.mqtt.refused_topics import RefusedTopics
@@ -34,7 +34,7 @@ _RETRY_S = 0.05  # second attempt to connect; doubles up to settings.reconnect_m
 _CATCH_UP_S = 0.5  # time for a broker that was suspended to deliver its backlog before we subscribe
 _STEADY_S = 2.0  # after a connection this long the first retry is immediate
 _REPEAT_LOG_S = 30.0  # between two equal log lines
-_SUBSCRIBED, _PUBLISHED = "subscriptions", "publications"  # what a host may refuse
+_IDLE_S = 60.0  # the connection wakes up earlier, for its pings
 _TRIED_S = 1.0  # after which a connection shows what the broker has
 
 
@@ -83,11 +83,6 @@ class MqttTransport(Transport):
     @property
     def untried(self) -> bool:
         return self._dialler.turns.untried
-
-    @property
-    def host(self) -> str:
-        dialler = self._dialler
-        return str(dialler.turns.place) if dialler.hosts.several and self._connection is not None else ""
 
     @property
     def outgoing(self) -> Outgoing:
@@ -222,10 +217,6 @@ class MqttTransport(Transport):
             began, problem = time.monotonic(), "failed unexpectedly"
             try:
                 self._run_connection(run)
-            except Leaving as leaving:
-                self.problem, self.was_ended, failures = str(leaving), False, 0
-                self._log(logging.INFO, str(leaving))
-                continue
             except Lost as lost:
                 connected = self._state is State.CONNECTED
                 self.was_ended = self._dialler.is_gone(lost, connected=connected, was_ended=self.was_ended)
@@ -274,13 +265,11 @@ class MqttTransport(Transport):
         tried_at = time.monotonic() + _TRIED_S
         try:
             self._synchronize(connection, run.stopping)
-            if failed := self._dialler.succeeded():
+            if failed := self._dialler.turns.succeeded():
                 self._log(logging.INFO, f"connected to {connection.where}; before it {failed}")
             while not run.stopping.is_set():
                 receive = self._deliver_all if self._retention.current is None else self._deliver_and_note
-                connection.pump(self._dialler.hosts.patience_s, receive)
-                if leaving := self._dialler.leave(self.idle_s):
-                    self._leave(connection, leaving)
+                connection.pump(_IDLE_S, receive)
                 if run.renewal:
                     connection.disconnect()
                     raise Lost(run.renewal)
@@ -312,8 +301,7 @@ class MqttTransport(Transport):
                 self._own.remember(message, sent=self._send(message, False))
 
     def _check_retention(self, connection: Connection) -> None:
-        """Report which of our retained messages the broker does not have. Raises Lost where another may have them."""
-        check = self._retention.current
+        """Report which of our retained messages the broker does not have."""
         missing = [
             topic
             for topic in self._retention.proceed(
@@ -329,17 +317,6 @@ class MqttTransport(Transport):
                 connection.where,
                 named(missing),
             )
-        if check is None or self._retention.current is check:
-            return
-        hosts = self._dialler.hosts
-        if not missing or len(missing) < len(check.topics):
-            hosts.accepted(_PUBLISHED)
-            return
-        if hosts.several:
-            self._retention.forget()
-        if hosts.refused(_PUBLISHED, self._dialler.turns.place):
-            connection.disconnect()
-            raise Lost("it has nothing of what was published")
 
     def _own_topics_apart(self, connection: Connection) -> list[str]:
         """Topics of our retained messages that the broker should have, and that no subscription of ours receives."""
@@ -381,8 +358,6 @@ class MqttTransport(Transport):
         self._initial_sync(known)
         if not self.is_slow:  # it costs as much as a beginning
             self._retention.begin(self._dialler.address, now)
-            if self._retention.current is None:
-                self._dialler.hosts.accepted(_PUBLISHED)
 
     def _let_catch_up(self, connection: Connection, stopping: threading.Event) -> None:
         """Wait before subscribing: a broker that was suspended first forwards old messages of others."""
@@ -408,7 +383,7 @@ class MqttTransport(Transport):
         if self.will is not None and found.get(self.will.topic) == self.will.payload:
             del found[self.will.topic]  # our own will, published although we were running
         older = {topic for topic, payload in found.items() if topic not in unsure and payload != own[topic].payload}
-        self.went_back = bool(older) or self._dialler.moved  # another host may have any older value
+        self.went_back = bool(older)
         return (found.keys() - older) | (proved or set())
 
     def _find_few(
@@ -496,22 +471,9 @@ class MqttTransport(Transport):
             for subscription in subscriptions:
                 if overlap(subscription.filter, filter_):  # the filter that covers it: no other one overlaps
                     subscription.refused = is_refused
-        hosts, run = self._dialler.hosts, self._network
-        if not all(one.refused for one in subscriptions):
-            hosts.accepted(_SUBSCRIBED)
-        elif run is not None and subscriptions and hosts.refused(_SUBSCRIBED, self._dialler.turns.place):
-            run.renewal = "it refuses all that is subscribed to"
 
     def note_refusal(self, topic: str, why: str) -> None:
         self._refused.report(self._dialler.where, topic, why)
-
-    def _leave(self, connection: Connection, why: str) -> None:
-        """End the connection in order: who is still at this broker learns of it by our will. Raises Leaving."""
-        self._set_state(State.CONNECTING)
-        with self._publishing:  # what is published from now on waits for the next connection
-            pass
-        self._finish(connection, self.will, self._deliver_all)  # a stop that comes just now counts
-        raise Leaving(why)
 
     def _finish(
         self, connection: Connection, will: Message | None, receive: Callable[[list[Message]], None] = ignore

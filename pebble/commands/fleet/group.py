@@ -374,7 +374,7 @@ def _print_account(place: Path, fleet: Fleet, name: str, secret: str, how: str, 
         typer.echo(f"For its config, which no other user may read, with a copy of {ca} beside it:")
         typer.echo(json.dumps(pieces.of_broker(fleet, name, secret, board=board), indent=2))
         return
-    url = f"mqtts://{name}@" + ",".join(pieces.host_and_port(server) for server in fleet.brokers)
+    url = f"mqtts://{name}@{pieces.host_and_port(fleet.brokers[0])}"
     if ProgramRole.PAGE in account.roles:
         typer.echo(f"    pebble web --url {url} --ca-cert {ca} --password-file FILE")
     elif ProgramRole.HUB in account.roles:
