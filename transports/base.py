@@ -237,9 +237,6 @@ class Transport(ABC):
     #: Whether the way to the other end is slow: keep little in the kernel, where nothing can go ahead of what waits,
     #: and wait longer for answers, with fewer questions. Set by :meth:`suit_link`; a backend may ignore it.
     is_slow: bool = False
-    #: A retained topic of ours whose value changes often. On a slow link one question is enough after an outage: if the
-    #: other end still has its newest value, it has kept our other topics as well. Empty: each of them is asked for.
-    proof: str = ""
     #: What is published in place of a message, in this order; the outcome of the first is that of :meth:`publish`.
     #: None: the message itself.
     forms: Callable[[Message], Iterable[Message]] | None = None

@@ -5,6 +5,7 @@ from pathlib import Path
 
 from pebble.config.hosts import HostError, split
 from pebble.errors import PebbleError
+from pebble.runtime.connections import ALL_VITAL
 from pebble.transports import MqttSettings, TlsSettings, ZenohSettings
 
 FORMS = "mqtt://HOST[:PORT], mqtts://… or zenoh:RUN_DIR"
@@ -66,6 +67,7 @@ def _mqtt(url: str, password: str | None, ca_cert: Path | None) -> MqttSettings:
         host=parts.host,
         port=port,
         username=parts.user,
+        vital=ALL_VITAL,
         password=password,
         tls=TlsSettings(ca_cert=ca_cert) if encrypted else None,
     )

@@ -25,7 +25,7 @@ _VITAL_STATES = (
     *(one.filter(_ANY) for one in (c.ONLINE, c.HEARTBEAT, c.CAPABILITIES, c.ESTOP_STATE)),
     f"{_ANY}/+/control/#",
 )
-_ALL_VITAL = (*_VITAL_STATES, f"{_ANY}/{c.INCOMING}/#")
+ALL_VITAL = (*_VITAL_STATES, f"{_ANY}/{c.INCOMING}/#")
 
 LOCAL_RECONNECT_S, REMOTE_RECONNECT_S = 0.5, 2.0
 SEGMENT = 1200  # bytes of TCP in a packet: with all headers 1280, which every way takes (RFC 8200, section 5)
@@ -78,7 +78,7 @@ def local_settings(config: Config, as_published: bool = False) -> Any:
     kind = config.transport.kind
     if kind == "mqtt":
         settings = mqtt_settings(config.local_mqtt, as_published=as_published, reconnect_max_s=LOCAL_RECONNECT_S)
-        return replace_settings(settings, vital=(*_ALL_VITAL, *_renamed_vital(config)))
+        return replace_settings(settings, vital=(*ALL_VITAL, *_renamed_vital(config)))
     if kind == "zenoh":
         return zenoh_settings(config)
     return config.transport.settings
@@ -271,7 +271,7 @@ def mqtt_settings(
         as_published=as_published,
         reconnect_max_s=reconnect_max_s,
         silence_s=mqtt.silence_seconds,
-        vital=_ALL_VITAL,
+        vital=ALL_VITAL,
     )
 
 

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 from pebble.client.url import UrlError, settings_of
+from pebble.runtime.connections import ALL_VITAL
 from pebble.transports import MqttSettings, ZenohSettings
 
 
@@ -19,7 +21,7 @@ from pebble.transports import MqttSettings, ZenohSettings
     ],
 )
 def test_mqtt_urls(url: str, settings: MqttSettings) -> None:
-    assert settings_of(url) == ("mqtt", settings)
+    assert settings_of(url) == ("mqtt", replace(settings, vital=ALL_VITAL))
 
 
 def test_encrypted_urls_and_run_directories(tmp_path: Path) -> None:

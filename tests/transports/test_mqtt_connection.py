@@ -282,11 +282,3 @@ def test_a_discarded_connection_sends_nothing_more(link: Link) -> None:
     link.connection.discard()
     with pytest.raises(ConnectionResetError):
         list(iter(lambda: link.other.recv(1 << 20), b""))
-
-
-def test_a_ping_follows_the_next_message_of_a_topic_that_may_be_at_fault(link: Link) -> None:
-    link.connection.pings.doubtful.add("a")
-    for topic in ("b", "a", "a"):
-        link.connection.publish(Message(topic, b""))
-    message = b"\x30\3\0\1"
-    assert link.written() == message + b"b" + message + b"a" + packets.PINGREQ + message + b"a"

@@ -31,7 +31,6 @@ from pebble.transports.mqtt.outgoing import (
 )
 from pebble.transports.mqtt.packets import Filter
 from pebble.transports.mqtt.poll import SocketPoll
-from pebble.transports.mqtt.suspects import Written
 
 UNACKED_LIMIT = 1000  # DELIVERED messages the broker has not acknowledged; beyond it they are refused,
 UNACKED_RESERVE = 100  # except so many stops: the messages before them may be those of strangers
@@ -303,9 +302,6 @@ class Connection:
             message.topic, message.payload, int(message.qos), retain=message.retain, expires_s=expires_s
         )
         self._in_flight.sent(message, mid, clock.since_boot())
-        if (doubtful := self.pings.doubtful) and message.topic in doubtful:
-            doubtful.discard(message.topic)
-            self.pings.send(self._client)
 
     def subscribe(self, filters: Iterable[tuple[str, bool]], qos: QoS = QoS.DELIVERED) -> PendingAck:
         """Subscribe to filters, each with its noLocal option (MQTT 5 only)."""
@@ -386,27 +382,17 @@ class Connection:
             delivered_s, late_s = self.incoming.age.delay.delivery(clock.since_boot())
             return Answer(number, seconds, queue_s, delivered_s, late_s) if number else None
 
-    @property
-    def confirmed(self) -> Limits:
-        """What this connection has shown the broker to have."""
-        return Limits(self._in_flight.has_retained, int(self._in_flight.has_acknowledged))
-
-    def is_unconfirmed(self, topic: str) -> bool:
-        """Whether the broker may lack the newest retained message of ``topic``."""
-        with self._lock:
-            return self._in_flight.is_unconfirmed(topic)
-
     def unconfirmed_retained(self) -> list[Message]:
         """Retained messages that the broker may not have received, oldest first."""
         with self._lock:
             return self._in_flight.unconfirmed_retained()
 
-    def has_accepted(self, topic: str, size: int) -> bool:
-        """Whether the broker has answered a ping after a message of ``topic`` that was as large."""
-        with self._lock:
-            return self._in_flight.has_accepted(topic, size)
+    @property
+    def has_confirmed(self) -> bool:
+        """True if the broker has confirmed a retained message or one of QoS 1."""
+        return self._in_flight.has_confirmed
 
-    def written_before_loss(self) -> dict[str, Written] | None:
+    def written_before_loss(self) -> dict[str, int] | None:
         """What the other side may have closed the connection for; None: it has not, or for another reason."""
         with self._lock:
             ending = self.incoming.ending

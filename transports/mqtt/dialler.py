@@ -10,7 +10,7 @@ from pebble.transports.credentials import Credentials
 from pebble.transports.hosts import Address, Place, Turns
 from pebble.transports.mqtt import client_ids
 from pebble.transports.mqtt.bridge_mode import Attempt, BridgeMode, Result
-from pebble.transports.mqtt.broker_limits import EVERYTHING, BrokerLimits, Limits
+from pebble.transports.mqtt.broker_limits import EVERYTHING, BrokerLimits
 from pebble.transports.mqtt.client import Client, Opening
 from pebble.transports.mqtt.connection import Connection, Owner
 from pebble.transports.mqtt.ending import Absent, Lost, Refused, Silent, TlsLate
@@ -55,11 +55,6 @@ class Dialler:
             self._bridge_mode, self.limits = BridgeMode(), BrokerLimits()
         self._address = address
         self.limits.begin(time.monotonic())
-
-    @property
-    def address(self) -> str:
-        """The address of the newest attempt, in words; empty before that."""
-        return "" if self._address is None else self._address.text
 
     @property
     def where(self) -> str:
@@ -128,22 +123,13 @@ class Dialler:
 
     def _note_result(self, result: Result) -> None:
         self._bridge_mode.note(result)
-        if self._will is not None or result is Result.ACCEPTED:  # without a will nothing is left to refuse
-            self.limits.note_connect(result, time.monotonic(), last=self._is_last_attempt)
+        if self._will is not None and (self._is_last_attempt or result is not Result.HUNG_UP):
+            self.limits.note_connect(result, time.monotonic())
 
     def _note_probe(self, result: Result) -> None:
         if self._bridge_mode.next_attempt is Attempt.PROBE:
             self._bridge_mode.note(result)
         self.limits.note_probe(result)
-
-    def tries_less(self, connection: Connection, *, held: bool) -> bool:
-        """Whether the connection may be lost because of what the broker lacks: the next one uses less."""
-        now = time.monotonic()
-        if (lacks := connection.incoming.ending.lacks) is not None:
-            self.limits.note_connect(lacks, now, last=True)
-            return True
-        in_flight = Limits(bool(connection.unconfirmed_retained()), int(connection.unacked > 0))
-        return self.limits.note_loss(in_flight, connection.confirmed, now, held=held)
 
     def is_gone(self, lost: Lost, *, connected: bool, was_ended: bool) -> bool:
         """Whether the other end is gone: nothing listens, or it hangs up as one that is just ending does."""

@@ -38,7 +38,6 @@ class Ending:
         self.where, self._settings = where, settings
         self.begun = False  # it has refused us, or sent DISCONNECT
         self.refusal: Refused | None = None
-        self.lacks: Result | None = None  # why it has ended the connection, if it lacks something
         self.reason = ""  # that of its DISCONNECT
         self.may_concern_message = False  # that reason
         self._taken_over = True  # may be: MQTT 3.1.1 has no words for it
@@ -54,7 +53,6 @@ class Ending:
         self.begun, self.reason = True, f"{self.where} closed the connection: {reasons.words(code)}"
         self._taken_over = code == reasons.TAKEN_OVER
         self.may_concern_message = reasons.may_concern_message(code)
-        self.lacks = _LACKS.get(code)
 
     def lost(self, *, accepted: bool) -> Lost:
         """The other side has closed the connection, which it had ``accepted``."""

@@ -29,8 +29,6 @@ class Pings:
         self._stalled_since = (
             age.waiting.checked_at
         )  # when the last time without reading began, for which a ping was sent
-        #: Topics whose next message is followed by a ping at once: its answer shows that the broker accepts it.
-        self.doubtful: set[str] = set()
 
     def joins(self, now: float) -> bool:
         """Whether a ping goes along with the message that is sent at ``now``."""
