@@ -11,7 +11,7 @@ import threading
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
-from typing import Protocol
+from typing import Protocol, TypeVar
 
 from pebble.transports import clock, hosts
 from pebble.transports.base import Answer, Message, Outgoing, QoS
@@ -32,6 +32,8 @@ from pebble.transports.mqtt.outgoing import (
 from pebble.transports.mqtt.packets import Filter
 from pebble.transports.mqtt.poll import SocketPoll
 
+T = TypeVar("T")
+FILTERS = 8  # in one packet: AWS IoT closes the connection for more
 UNACKED_LIMIT = 1000  # DELIVERED messages the broker has not acknowledged; beyond it they are refused,
 UNACKED_RESERVE = 100  # except so many stops: the messages before them may be those of strangers
 _OVERHEAD = 1 + 4 + 2 + 2 + 1 + 5  # bytes of a PUBLISH besides topic and payload, at most: with an expiry
@@ -309,21 +311,21 @@ class Connection:
         wanted = [
             Filter(text, most, no_local, self.incoming.as_published, sends_retained) for text, no_local in filters
         ]
-        return self._request(lambda: self._client.subscribe(wanted), wanted, [one.text for one in wanted])
+        return self._request(self._client.subscribe, wanted, [one.text for one in wanted])
 
     def unsubscribe(self, filters: list[str]) -> PendingAck:
-        return self._request(lambda: self._client.unsubscribe(filters), filters, [])
+        return self._request(self._client.unsubscribe, filters, [])
 
-    def _request(self, send: Callable[[], int], filters: Sequence[object], asked: list[str]) -> PendingAck:
+    def _request(self, send: Callable[[Sequence[T]], int], filters: Sequence[T], asked: Sequence[str]) -> PendingAck:
+        """Send a few filters in each packet, and return the answer to the last one, which follows the others."""
         ack = PendingAck()
-        if not filters:
-            ack.complete()
-            return ack
         with self._lock:
-            if self._client.socket is None:
+            for at in range(0, len(filters), FILTERS):
+                if self._client.socket is not None:
+                    ack = PendingAck()
+                    self._in_flight.ask(send(filters[at : at + FILTERS]), ack, asked[at : at + FILTERS])
+            if not filters or self._client.socket is None:
                 ack.complete()
-            else:
-                self._in_flight.ask(send(), ack, asked)
         self.wake()
         return ack
 
@@ -341,7 +343,7 @@ class Connection:
 
     @property
     def _lost(self) -> Lost:
-        return self.incoming.ending.lost(accepted=self.incoming.accepted is not None)
+        return self.incoming.ending.lost(accepted=self.incoming.accepted is not None, asked=self._in_flight.asked)
 
     @property
     def has_room(self) -> bool:

@@ -216,6 +216,11 @@ class InFlightTable:
         self.answered.append(ack)
         return filters
 
+    @property
+    def asked(self) -> list[str]:
+        """The filters of each SUBSCRIBE that is not answered."""
+        return [filter_ for _, filters in self._requests.values() for filter_ in filters]
+
     def complete(self) -> None:
         """Complete the answered requests, once the messages received before the answers have been delivered."""
         answered, self.answered = self.answered, []

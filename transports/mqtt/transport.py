@@ -24,7 +24,6 @@ from pebble.transports.settings import MqttSettings
 
 log = logging.getLogger(__name__)
 
-_ASKED = 8  # topics of one SUBSCRIBE: AWS IoT closes the connection for more
 _ANSWER_S = 2.0  # longest wait for a SUBACK, and for the retained messages after it
 _CLOSING_S = 1.0  # longest wait for unacknowledged messages when closing
 _DIALLING_S = 0.2  # longest wait for a thread that may be in connect(2)
@@ -164,22 +163,17 @@ class MqttTransport(Transport):
                 ack.wait(deadline - time.monotonic())
 
     def ask(self, topics: Collection[str]) -> None:
-        deadline, rest, acks = time.monotonic() + _ANSWER_S, list(topics), list[PendingAck]()
-        while rest:
-            asked, rest = rest[:_ASKED], rest[_ASKED:]
-            acks += self._ask(asked)
-        for ack in acks:
-            ack.wait(deadline - time.monotonic())
-
-    def _ask(self, topics: list[str]) -> list[PendingAck]:
+        deadline = time.monotonic() + _ANSWER_S
         with self._filters.lock:
             connection, names = self._connection, [topic for topic in topics if topic not in self._filters]
             if connection is None or not names:
-                return []
+                return
             for name in names:
                 self._own_message_filter.subscribe_again(name)
             asked = connection.subscribe([(name, self._no_local(name)) for name in names], QoS.LATEST)
-            return [asked, connection.ping(), connection.unsubscribe(names)]
+            acks = [asked, connection.ping(), connection.unsubscribe(names)]
+        for ack in acks:
+            ack.wait(deadline - time.monotonic())
 
     def _undeclare(self, subscription: Subscription) -> None:
         with self._filters.lock:
