@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 
 CONNECT_TIMEOUT_S = 2.0  # for each of TCP and TLS, and again for the broker's CONNACK (T12)
 HANDSHAKE_S = 10.0  # for TLS while bytes arrive, and where it took long: at 9.6 kbit/s two certificates of RSA take 3 s
+SMALL_SEGMENT = 1200  # bytes of TCP in a packet: with all headers 1280, which every way takes (RFC 8200, section 5)
 STEADY_S = 30.0  # an address that held a connection for so long is tried once more before the others
 _LONGEST = 8  # addresses whose failures are described one by one
 

@@ -17,9 +17,10 @@ from pebble.config import Config, load
 from pebble.config.text_files import password as password
 from pebble.errors import ConfigError, PebbleError, TransportError
 from pebble.runtime.addresses import Addresses
-from pebble.runtime.connections import REMOTE_RECONNECT_S, SEGMENT, local_settings, mqtt_settings, zenoh_settings
+from pebble.runtime.connections import REMOTE_RECONNECT_S, local_settings, mqtt_settings, zenoh_settings
 from pebble.runtime.robot_estop import RobotEstop
 from pebble.transports import Message, MqttSettings, QoS, State, Transport, create
+from pebble.transports.hosts import SMALL_SEGMENT
 
 log = logging.getLogger(__name__)
 
@@ -87,7 +88,7 @@ def listening(target: Target, sender: Transport) -> Iterator[Transport]:
 
 def in_small_segments(settings: Any) -> Any:
     """The same settings for a way that may lose large packets."""
-    return replace(settings, max_segment=SEGMENT) if isinstance(settings, MqttSettings) else settings
+    return replace(settings, max_segment=SMALL_SEGMENT) if isinstance(settings, MqttSettings) else settings
 
 
 def _report_missing(transport: Transport, before: str = "") -> str:

@@ -12,6 +12,7 @@ from pebble.config import Config, Mqtt, RemoteConnection, RemoteMqtt, SerialBrid
 from pebble.errors import ConfigError, TransportError
 from pebble.runtime.addresses import Addresses
 from pebble.transports import Message, MqttSettings, TlsSettings, Transport, ZenohSettings, check_kind, create
+from pebble.transports.hosts import SMALL_SEGMENT
 from pebble.transports.socket_paths import FRAMES_SOCKET, PEER_SOCKET, fits_socket
 
 if TYPE_CHECKING:
@@ -28,7 +29,6 @@ _VITAL_STATES = (
 ALL_VITAL = (*_VITAL_STATES, f"{_ANY}/{c.INCOMING}/#")
 
 LOCAL_RECONNECT_S, REMOTE_RECONNECT_S = 0.5, 2.0
-SEGMENT = 1200  # bytes of TCP in a packet: with all headers 1280, which every way takes (RFC 8200, section 5)
 _BRIDGE, _STOPS = "remote-bridge", "remote-stops"
 #: RFC 4594: what must not wait, and what may be dropped last of what can. Where a link may be thin.
 _EXPEDITED, _ASSURED = 46, 10
@@ -118,7 +118,7 @@ def stops_transport(config: Config) -> Transport | None:
 
 def _live_only(settings: MqttSettings) -> MqttSettings:
     """Return the settings of a connection that no retained message holds up: MQTT 5 lets it ask for none."""
-    return replace_settings(settings, max_segment=SEGMENT, sends_retained=False)
+    return replace_settings(settings, max_segment=SMALL_SEGMENT, sends_retained=False)
 
 
 def mirror_transport(config: Config, mirror: Mqtt, name: str) -> Transport:

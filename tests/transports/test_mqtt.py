@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import logging
+import os
 import re
 import socket
 import subprocess
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -1165,3 +1166,33 @@ def test_tls_mistakes_are_one_clear_error(clients: Clients, wrong: dict[str, Any
         client.open(1)
     assert client.state is State.CLOSED
     client.close()
+
+
+class Hole(TcpProxy):
+    """A way that loses what is larger than a packet, unless the sender's segments are small."""
+
+    def passes(self, data: bytes) -> bool:
+        if len(data) < 1400 or self.segments() < 1300:
+            return True
+        time.sleep(0.6)
+        return False
+
+    def segments(self) -> int:
+        """The largest segment of this process's connections to it."""
+        sizes = [0]
+        for link in list(Path("/proc/self/fd").iterdir()):
+            with suppress(OSError, IndexError), socket.socket(fileno=os.dup(int(link.name))) as copy:
+                if copy.getpeername()[1] == self.port:
+                    sizes.append(copy.getsockopt(socket.IPPROTO_TCP, socket.TCP_MAXSEG))
+        return max(sizes)
+
+
+def test_where_large_packets_are_lost_segments_become_small(
+    broker: Broker, clients: Clients, topic: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    with Hole(broker.port) as hole:
+        robot, late, received = clients(hole.port, "robot", silence_s=0.2), clients(broker.port), Received()
+        robot.publish(topic, bytes(3000), qos=DELIVERED, retain=True)
+        late.subscribe(topic, received)
+        assert until(lambda: received.payloads == [bytes(3000)], 20)
+        assert len([line for line in caplog.messages if "lose large packets" in line]) == 1

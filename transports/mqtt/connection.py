@@ -390,6 +390,11 @@ class Connection:
             return self._in_flight.unconfirmed_retained()
 
     @property
+    def lost_bytes(self) -> int:
+        """The bytes of the largest message for which the broker was silent to the end of the connection."""
+        return self._in_flight.lost_bytes
+
+    @property
     def has_confirmed(self) -> bool:
         """True if the broker has confirmed a retained message or one of QoS 1."""
         return self._in_flight.has_confirmed

@@ -7,7 +7,7 @@ from dataclasses import replace
 from pebble.transports.base import Message
 from pebble.transports.counters import Counters
 from pebble.transports.credentials import Credentials
-from pebble.transports.hosts import Address, Place, Turns
+from pebble.transports.hosts import SMALL_SEGMENT, Address, Place, Turns
 from pebble.transports.mqtt import client_ids
 from pebble.transports.mqtt.bridge_mode import Attempt, BridgeMode, Result
 from pebble.transports.mqtt.broker_limits import EVERYTHING, BrokerLimits
@@ -17,6 +17,8 @@ from pebble.transports.mqtt.ending import Absent, Lost, Refused, Silent, TlsLate
 from pebble.transports.settings import MqttSettings
 
 _ENDING_S = 1.0  # so long a broker that ends may still accept connections, and hang up on them
+_LARGE = 1000  # bytes from which a message fills a packet, which some ways lose without a word
+_LARGE_LOST = 3  # such losses in a row, and connections have small segments
 _HESITATION_S = 0.5  # a CONNACK that takes longer comes over a very slow connection, or from a suspended broker
 
 
@@ -36,6 +38,7 @@ class Dialler:
         self._address: Address | None = None
         self._bridge_mode, self.limits = BridgeMode(), BrokerLimits()  # of the broker at this address
         self.reported = EVERYTHING  # what the log says it has
+        self._large_lost = 0  # connections in a row that went silent on something large
         self._gone_at = float("-inf")  # when the broker was last known to be gone
 
     def open(self) -> None:
@@ -85,7 +88,8 @@ class Dialler:
     def _make(self, will: Message | None, owner: Owner, counters: Counters, *, as_published: bool) -> Connection:
         assert self._address is not None  # noqa: S101 - both callers run at an address
         assert self._credentials is not None  # noqa: S101 - and while it is open
-        settings = replace(self._settings, password=self._credentials.password())
+        segment = SMALL_SEGMENT if self.loses_large else self._settings.max_segment
+        settings = replace(self._settings, password=self._credentials.password(), max_segment=segment)
         self.attempt = Connection(
             Opening(self._client_id, settings, self._credentials.context(), will, self._address, self.turns.patience_s),
             counters,
@@ -131,12 +135,20 @@ class Dialler:
             self._bridge_mode.note(result)
         self.limits.note_probe(result)
 
+    @property
+    def loses_large(self) -> bool:
+        """True if the way to the broker seems to lose large packets: connections have small segments from then on."""
+        return self._large_lost >= _LARGE_LOST and not self._settings.max_segment
+
     def is_gone(self, lost: Lost, *, connected: bool, was_ended: bool) -> bool:
         """Whether the other end is gone: nothing listens, or it hangs up as one that is just ending does."""
         now, silent = time.monotonic(), isinstance(lost, Silent)  # then it may be we who stood still
         self.stalled |= silent
         if isinstance(lost, TlsLate):
             self.turns.was_slow()
+        large = silent and self.attempt is not None and self.attempt.lost_bytes > _LARGE
+        if not self.loses_large and (silent or isinstance(lost, TlsLate)):  # a certificate is large, too
+            self._large_lost = self._large_lost + 1 if large or not silent else 0
         if connected:
             self._gone_at = now
             return not silent

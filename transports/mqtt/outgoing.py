@@ -141,6 +141,7 @@ class InFlightTable:
         self._written: dict[str, tuple[float, int]] = {}
         self._accepted: dict[str, tuple[float, int]] = {}  # that an answered ping followed.
         self._ping_number = self._pong_number = 0
+        self.lost_bytes = 0  # of the largest message for which the other side was silent to the end
         self._newest_s = 0.0  # how long the newest answer to a ping took
 
     # -- messages
@@ -264,6 +265,8 @@ class InFlightTable:
 
     def end(self) -> None:
         """Complete everything: no answer can come any more."""
+        first = self._pings[0][2] if self._pings else self._written
+        self.lost_bytes = max((size for _, size in first.values()), default=0)
         self.complete()
         for ack in [*(ack for ack, _ in self._requests.values()), *(ack for _, ack, _ in self._pings if ack)]:
             ack.complete()

@@ -199,7 +199,11 @@ class MqttTransport(Transport):
                 self._run_connection(run)
             except Lost as lost:
                 connected = self._state is State.CONNECTED
+                before = self._dialler.loses_large
                 self.was_ended = self._dialler.is_gone(lost, connected=connected, was_ended=self.was_ended)
+                if self._dialler.loses_large and not before:
+                    text = "the way there seems to lose large packets (a wrong MTU?): from now on they are small"
+                    log.warning("%s: %s: %s", self.client_id, self._dialler.where, text)
                 problem = str(lost)
             except Exception:  # any error must lead to a reconnect, never end the thread
                 log.exception("%s: unexpected failure of the connection", self.client_id)
