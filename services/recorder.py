@@ -10,7 +10,7 @@ from pebble.recordings.recorder import metrics
 from pebble.recordings.recorder.recorder import Recorder
 from pebble.recordings.recorder.settings import Options
 from pebble.recordings.recorder.source import Source
-from pebble.runtime.connections import REMOTE_RECONNECT_S, local_settings, mqtt_settings, with_choice
+from pebble.runtime.connections import REMOTE_RECONNECT_S, local_settings, mqtt_settings
 from pebble.runtime.process import run
 from pebble.runtime.service import Service, every
 
@@ -63,15 +63,8 @@ class RobotRecorder(Service):
             return
         if bridge.remote is not None or not bridge.remote_mqtt.host:
             raise ConfigError("services.recorder.remote: needs services.mqtt_bridge.remote_mqtt.host")
-        yield (
-            "remote",
-            "mqtt",
-            with_choice(
-                self.config,
-                mqtt_settings(bridge.remote_mqtt, reconnect_max_s=REMOTE_RECONNECT_S, program="recorder"),
-                "recorder",
-            ),
-        )
+        settings = mqtt_settings(bridge.remote_mqtt, reconnect_max_s=REMOTE_RECONNECT_S, program="recorder")
+        yield "remote", "mqtt", settings
 
 
 if __name__ == "__main__":

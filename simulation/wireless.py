@@ -32,7 +32,7 @@ Motors = tuple[float, float]
 class BrokerAddress:
     """Address and login of a robot's broker; ``ca`` (DER) or ``tls`` enables TLS."""
 
-    host: str | tuple[str, ...]  # several: it uses one at a time
+    host: str
     port: int
     username: str | None = None
     password: str | None = None
@@ -40,14 +40,13 @@ class BrokerAddress:
     ca: Path | None = None
 
     def __str__(self) -> str:
-        return ", ".join(f"{one}:{self.port}" for one in ([self.host] if isinstance(self.host, str) else self.host))
+        return f"{self.host}:{self.port}"
 
     def settings(self) -> dict[str, Any]:
         """Return the section ``mqtt`` of a private_config.json."""
         login = {"username": self.username, "password": self.password}
         tls: Any = {"ca": _CA_FILE} if self.ca is not None else self.tls
-        host = self.host if isinstance(self.host, str) else list(self.host)
-        return {"host": host, "port": self.port, "tls": tls, **{k: v for k, v in login.items() if v is not None}}
+        return {"host": self.host, "port": self.port, "tls": tls, **{k: v for k, v in login.items() if v is not None}}
 
 
 class WirelessRobot:

@@ -45,7 +45,7 @@ schedules) # the shortest schedule that violates a rule is printed, or the seed 
     ;;
 page) $python -m pytest --workers 8 -m page tests/web ;;
 looks) $python -m tests.web.looks ;;
-fleet) tests --workers 2 --timeout 900 -s tests/transports/zenoh/test_mesh.py tests/fleet ;;
+fleet) tests --workers 2 --timeout 900 -s tests/fleet ;;
 brokers)
     sh tests/brokers/install.sh
     $python -m pytest -ra tests/transports/test_brokers.py tests/transports/test_client_ids.py tests/brokers

@@ -237,12 +237,6 @@ class Transport(ABC):
     #: Whether the way to the other end is slow: keep little in the kernel, where nothing can go ahead of what waits,
     #: and wait longer for answers, with fewer questions. Set by :meth:`suit_link`; a backend may ignore it.
     is_slow: bool = False
-    #: A retained topic of ours whose value changes often. On a slow link one question is enough after an outage: if the
-    #: other end still has its newest value, it has kept our other topics as well. Empty: each of them is asked for.
-    proof: str = ""
-    #: For how many seconds nothing was done that a change of host would disturb; the owner knows. At 0 one with several
-    #: hosts stays where it is as long as it can.
-    idle_s: Callable[[], float] = staticmethod(lambda: 0.0)
     #: What is published in place of a message, in this order; the outcome of the first is that of :meth:`publish`.
     #: None: the message itself.
     forms: Callable[[Message], Iterable[Message]] | None = None
@@ -276,11 +270,6 @@ class Transport(ABC):
     def answer(self) -> Answer | None:
         """How long an answer takes now; None while there is none, and from a backend that asks nothing."""
         return None
-
-    @property
-    def host(self) -> str:
-        """The host and port of the other end, where it is one of several that a backend may use; else empty."""
-        return ""
 
     @property
     def untried(self) -> bool:

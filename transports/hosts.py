@@ -1,11 +1,12 @@
-"""Every address of every host gets its turn, whatever way the one before failed."""
+"""Every address of a host gets its turn, whatever way the one before failed."""
 
 import socket
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 CONNECT_TIMEOUT_S = 2.0  # for each of TCP and TLS, and again for the broker's CONNACK (T12)
 HANDSHAKE_S = 10.0  # for TLS while bytes arrive, and where it took long: at 9.6 kbit/s two certificates of RSA take 3 s
+SMALL_SEGMENT = 1200  # bytes of TCP in a packet: with all headers 1280, which every way takes (RFC 8200, section 5)
 STEADY_S = 30.0  # an address that held a connection for so long is tried once more before the others
 _LONGEST = 8  # addresses whose failures are described one by one
 
@@ -63,64 +64,36 @@ def described(failures: dict[str, str]) -> str:
 
 
 class Turns:
-    """Whose turn it is among the addresses of all hosts. Each host is resolved anew in each round, when it is due.
+    """Whose turn it is among the addresses of one host, which is resolved anew in each round.
 
-    A round ends when each address has failed once; only then there is a pause. ``places`` is asked when one begins.
+    A round ends when each address has failed once; only then there is a pause.
     """
 
-    def __init__(
-        self, places: Callable[[], Sequence[Place]], resolve: Callable[[str, int], list[Address]] = addresses_of
-    ) -> None:
-        self._places, self._resolve = places, resolve
-        self.place = places()[0]  # whose turn it is
-        self._due: list[Place] = []  # of this round: hosts that are not resolved yet,
-        self._left: list[Address] = []  # and addresses of the newest one; the first one has its turn
-        self.has_hosts = self._has_addresses = False  # several of them in this round, and of this host
-        self._steady: tuple[Place, Address] | None = None  # has lost a connection that held for long: begins the next
+    def __init__(self, place: Place, resolve: Callable[[str, int], list[Address]] = addresses_of) -> None:
+        self.place, self._resolve = place, resolve
+        self._left: list[Address] = []  # of this round; the first one has its turn
+        self.several = False  # another address has its turn after a failure, without a pause
+        self._steady: Address | None = None  # has lost a connection that held for long: begins the next round
         self._is_first = True  # round
         self._failures: dict[str, str] = {}  # why each address failed last, without a success since
         self._slow: set[Address] = set()  # where TLS took long, or was not there in time
 
     def address(self) -> Address:
         """The address whose turn it is; may wait for a resolver. Raises OSError, ValueError."""
-        if self.is_over:
-            places, steady = self._places(), self._steady and self._steady[0]
-            self._due = sorted(places, key=lambda one: one != steady)
-            self.has_hosts = len(places) > 1
-            names = {str(one) for one in places}
-            if self.has_hosts:
-                self._failures = {one: why for one, why in self._failures.items() if one.split(" ")[0] in names}
-        while not self._left:
-            self.place = self._due.pop(0)
-            try:
-                self._begin_host()
-            except (OSError, ValueError) as error:
-                if not self._due:
-                    raise
-                self._note(str(self.place), f"cannot be reached: {error}")
-        return self._left[0]
-
-    def _begin_host(self) -> None:
-        self._has_addresses = False
-        found = self._resolve(*self.place)
-        if not found:
-            raise OSError("it has no address")
-        steady = self._steady[1] if self._steady and self._steady[0] == self.place else None
-        self._left = sorted(found, key=lambda one: one != steady)
-        self._steady, self._has_addresses = None, len(found) > 1
-        if not self.has_hosts:
+        if not self._left:
+            found = self._resolve(*self.place)
+            if not found:
+                raise OSError("it has no address")
+            self._left = sorted(found, key=lambda one: one != self._steady)
+            self._steady, self.several = None, len(found) > 1
             self._slow &= set(found)
             self._failures = {one.text: self._failures[one.text] for one in found if one.text in self._failures}
-
-    @property
-    def several(self) -> bool:
-        """Whether another address has its turn after a failure, without a pause."""
-        return self.has_hosts or self._has_addresses
+        return self._left[0]
 
     @property
     def where(self) -> str:
-        """The broker whose turn it is, in words; with its address if the host has several."""
-        return f"broker {self.place}" + (f" at {self._left[0].text}" if self._has_addresses and self._left else "")
+        """The broker in words; with its address if the host has several."""
+        return f"broker {self.place}" + (f" at {self._left[0].text}" if self.several and self._left else "")
 
     @property
     def untried(self) -> bool:
@@ -146,33 +119,17 @@ class Turns:
         return failed
 
     def failed(self, why: str, held_s: float = 0.0) -> str:
-        """The connection at the address was not made, or is lost after ``held_s``.
-
-        Returns how each address failed. The next one has its turn; `is_over` says whether that begins a new round.
-        """
+        """The connection at the address was not made, or is lost after ``held_s``. Returns how each address failed."""
         if not self._left:  # the name was not resolved
-            if not self.has_hosts:
-                return why
-            self._note(str(self.place), why)
-            self._is_first = False
-            return described(self._failures)
+            return why
         address = self._left.pop(0)
-        text = address.text if self._has_addresses or not self.has_hosts else ""
-        self._note(f"{self.place} {text}".rstrip() if self.has_hosts else text, why)
+        self._failures.pop(address.text, None)
+        self._failures[address.text] = why
         if held_s >= STEADY_S:
-            self._steady = self.place, address
-            self.begin_anew()
+            self._steady, self._left = address, []
         self._is_first &= not self.is_over
         return described(self._failures)
 
-    def _note(self, name: str, why: str) -> None:
-        self._failures.pop(name, None)
-        self._failures[name] = why
-
-    def begin_anew(self) -> None:
-        """The next turn begins a new round."""
-        self._due, self._left = [], []
-
     @property
     def is_over(self) -> bool:
-        return not self._left and not self._due
+        return not self._left

@@ -1,6 +1,6 @@
 """The connection settings of the backends: plain data, so that reading a config imports no client library."""
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 
 
@@ -20,10 +20,6 @@ class MqttSettings:
 
     host: str
     port: int = 1883
-    #: Several brokers, the preferred one first, whose ``host`` and ``port`` are above. One at a time is used.
-    hosts: tuple[tuple[str, int], ...] = ()
-    chosen: Path | None = None  # where the program that chooses among them tells the others which one it uses
-    follows: bool = False  # this is one of the others
     keepalive_s: int = 15
     username: str | None = None
     password: str | None = field(default=None, repr=False)
@@ -32,7 +28,6 @@ class MqttSettings:
     #: For brokers that admit only ids they know. None: one that cannot be guessed, which no other client can take over.
     client_id: str | None = None
     protocol: str = "3.1.1"  # or "5"
-    client: str = "pebble"  # the library below the transport, or "paho"
     #: Request exact ``echo=False`` and the retain flag of live messages from the broker (bridge mode on 3.1.1,
     #: noLocal and retain-as-published on 5). See T7 and T16 in docs/transports.md.
     as_published: bool = False
@@ -47,11 +42,6 @@ class MqttSettings:
     #: Bytes of one TCP segment, in both directions; 0: as many as the way seems to take. Some ways lose large ones.
     max_segment: int = 0
     dscp: int = 0  # of our packets (RFC 2474), where the system permits it: 46 is served before 10
-
-    def each(self) -> tuple["MqttSettings", ...]:
-        """The same for each host alone."""
-        each = self.hosts or ((self.host, self.port),)
-        return tuple(replace(self, host=host, port=port, hosts=(), chosen=None, follows=False) for host, port in each)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

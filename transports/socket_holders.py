@@ -9,19 +9,19 @@ _SHOWN = 60  # characters of a command
 _LISTENS = "0A"  # in /proc/net/tcp
 
 
-def processes_with(inodes: Collection[str]) -> Iterator[tuple[Path, dict[Path, str], set[str]]]:
-    """The processes that hold some of these sockets: folder in /proc, all its descriptors, and which it holds."""
+def _processes_with(inodes: Collection[str]) -> Iterator[tuple[Path, set[str]]]:
+    """Yield the processes that hold some of these sockets: their folders in /proc, and which they hold."""
     for process in Path("/proc").glob("[0-9]*"):
         with suppress(OSError):
-            links = {}
+            links = []
             for entry in (process / "fd").iterdir():
                 with suppress(OSError):  # closed meanwhile
-                    links[entry] = str(entry.readlink())
-            if held := {link[8:-1] for link in links.values() if link.startswith("socket:[")}.intersection(inodes):
-                yield process, links, held
+                    links.append(str(entry.readlink()))
+            if held := {link[8:-1] for link in links if link.startswith("socket:[")}.intersection(inodes):
+                yield process, held
 
 
-def command_of(process: int) -> str:
+def _command_of(process: int) -> str:
     """Its command, safe to print: a process may choose any bytes."""
     try:
         words = Path(f"/proc/{process}/cmdline").read_text(encoding="utf-8", errors="replace")
@@ -44,8 +44,8 @@ def port_holder(port: int) -> str:
                 fields = line.split()
                 if fields[3] == _LISTENS and fields[1].endswith(f":{port:04X}"):
                     users[fields[9]] = fields[7]
-    for process, _, held in processes_with(users):
-        return f" (by process {process.name} of user {users[held.pop()]}: {command_of(int(process.name))})"
+    for process, held in _processes_with(users):
+        return f" (by process {process.name} of user {users[held.pop()]}: {_command_of(int(process.name))})"
     if users:
         return f" (by a process of user {users.popitem()[1]}: sudo ss -ltnp 'sport = :{port}')"
     return ""

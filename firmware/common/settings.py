@@ -28,16 +28,13 @@ def get(settings: dict, section: str, name: str, default=None):
     return value
 
 
-def hosts(settings: dict) -> list:
-    """Return names or IPv4 addresses of brokers. Raises ValueError, which repeats nothing: a login may be in it."""
-    names = get(settings, "mqtt", "host")
-    if not isinstance(names, list):
-        names = [names]
-    for name in names or ("",):
-        for char in name or " ":
-            if char in "/:@[]*,%\\" or not " " < char < "\x7f":
-                raise ValueError("mqtt.host must be a name or address alone: write broker.example, and port beside it")
-    return names
+def host(settings: dict) -> str:
+    """Return the broker's name or IPv4 address. Raises ValueError, which repeats nothing: a login may be in it."""
+    name = get(settings, "mqtt", "host")
+    for char in name if isinstance(name, str) and name else "/":
+        if char in "/:@[]*,%\\" or not " " < char < "\x7f":
+            raise ValueError("mqtt.host must be a name or address alone: write broker.example, and port beside it")
+    return name
 
 
 def base(system: str, kind: str, name: str) -> bytes:

@@ -22,7 +22,6 @@ class Connection:
         self.reason = ""  # of the last loss or failure
         self.losses = 0
         self.failures = 0  # attempts that failed, and connections lost early: the next address has its turn
-        self.limit_ms = 8000  # TLS needs it; where there are other brokers, one that is hung gets less
         self._since = self._received = self._wait = 0
         self._next_wait = _FIRST_WAIT_MS
 
@@ -44,7 +43,7 @@ class Connection:
         elif state == "offline" or (state == "waiting" and age >= self._wait):
             self.move("resolving", now)
             return "resolve"
-        elif state != "waiting" and age >= {"resolving": 3500, "connecting": self.limit_ms, "subscribing": 2000}[state]:
+        elif state != "waiting" and age >= {"resolving": 3500, "connecting": 8000, "subscribing": 2000}[state]:
             self.reason = state + " took too long"
             return "drop"
         return ""

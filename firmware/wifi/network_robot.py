@@ -116,7 +116,6 @@ class NetworkRobot:
             if self.body.drive(*self._next[:3]):
                 self.deadman.limit_ms = self._limit_ms
                 self.deadman.feed(now)
-                self.session.last = now
             else:
                 self.deadman.rest()
 

@@ -7,7 +7,7 @@ from binascii import hexlify
 
 from micropython import const
 
-from common.settings import get, hosts
+from common.settings import get, host
 from common.ticks import diff
 from wifi import mqtt
 from wifi.connection import Connection
@@ -18,8 +18,6 @@ _LONGEST_PAYLOAD = const(512)
 _LONGEST_TOPIC = const(58)  # below the base: /incoming/by/{account}/drive-values
 _OUTGOING = const(420)  # plus three topics: room for a state and the 20 PUBACKs that a broker waits for
 _CHUNKS = const(4)  # reads per turn, at most
-_HUNG_MS = const(2000)  # for TCP and CONNACK, where there are other brokers
-_REST_MS = const(1800000)  # at rest, before a robot at another broker tries the first one
 _CALM_MS = const(3000)  # with the flood's last two seconds five: the next attempt is soon
 _PACE_MS = const(30)  # between two writes, so that acknowledgements share packets
 # Writes in flight, as far as pings tell. An ESP8266 queues eight; the ninth blocks for up to ten seconds, even if the
@@ -37,7 +35,7 @@ class Session:
         ValueError.
         """
         self.settings = settings
-        self.hosts = hosts(settings)
+        self.host = host(settings)
         self.root = root
         # A broker disconnects a client when another one uses the same id: so it cannot be guessed, and is the same
         # until the next boot. A broker must accept 23 bytes of it, and may refuse more (3.1.3.1).
@@ -47,9 +45,6 @@ class Session:
         self.wrap = wrap
         self._take = take
         self.connection = Connection()
-        self.last = 0  # when motors moved, or the connection to another broker than the first one was made
-        if len(self.hosts) > 1 and not wrap:
-            self.connection.limit_ms = _HUNG_MS
         self._open: Stream | None = None  # to the broker; before that, the query for its address
         self._in_flight = 0  # writes that may not have arrived yet
         self._behind = 0  # those after the last ping
@@ -73,11 +68,7 @@ class Session:
             self._paused = connection.reason == "silence" and diff(now, self._received) < 500
             raise OSError(connection.reason)
         if due == "resolve":
-            turn, count = connection.failures, len(self.hosts)
-            self._open = query_name(self.hosts[turn % count], server, now, turn // count)  # type: ignore[assignment]
-        if connection.state == "online" and diff(now, self.last) >= _REST_MS and connection.failures % len(self.hosts):
-            connection.failures = 0
-            raise OSError("back to the first broker")
+            self._open = query_name(self.host, server, now, connection.failures)  # type: ignore[assignment]
         if connection.state == "resolving":
             self._connect(now, clock)
             return False
@@ -92,11 +83,10 @@ class Session:
         self._open.socket.close()
         self._open = None
         settings = self.settings
-        host = self.hosts[self.connection.failures % len(self.hosts)]  # as when it was asked for
         if not address:
-            raise OSError("no address for " + host)
+            raise OSError("no address for " + self.host)
         if self.wrap:
-            self.wrap.host = host
+            self.wrap.host = self.host
             self.wrap.set_time(clock.read(now))
         self._open = Stream(address, get(settings, "mqtt", "port", 8883 if self.wrap else 1883), self.wrap)
         self.client.restart()

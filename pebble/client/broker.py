@@ -11,16 +11,13 @@ from typing import Final
 
 from pebble.client.arrived import Arrived, Handler
 from pebble.client.named_topics import NamedTopics
-from pebble.contract import BRIDGE_PROBE, codec
 from pebble.errors import TransportError
 from pebble.runtime.by_name import EACH_S, ByName
-from pebble.runtime.every_host import EveryHost, operators
-from pebble.transports import Message, MqttSettings, QoS, State, Subscription, Transport
+from pebble.transports import Message, MqttSettings, QoS, State, Subscription, Transport, create
 
 log = logging.getLogger(__name__)
 
 ANSWER_S: Final = 0.25  # a broker that acknowledges nothing for longer would deliver commands late, all at once
-_PROBE_S: Final = 1.0
 _DELIVER_S: Final = 0.01  # for them at a time: whatever else is due must not wait for a flood
 
 
@@ -36,7 +33,7 @@ class Broker:
 
     def __init__(self, settings: MqttSettings, name: str = "pebble-web") -> None:
         """``name``: what the broker's log calls it."""
-        self.transport: Transport = operators(f"{name}-{secrets.token_hex(4)}", "mqtt", settings)
+        self.transport: Transport = create("mqtt", f"{name}-{secrets.token_hex(4)}", settings)
         self.transport.on_state(lambda _state: self._call(self._notify))
         self._loop: asyncio.AbstractEventLoop | None = None
         self._watchers: list[Callable[[], None]] = []
@@ -68,32 +65,8 @@ class Broker:
 
     @property
     def not_received(self) -> str:
-        """What is not heard although there is a connection, such as one of several brokers, and why, in one line."""
+        """What is not heard although there is a connection, and why, in one line."""
         return self.transport.not_received if self.connected else ""
-
-    async def prove_hosts(self, base: str) -> None:
-        """Where there are several brokers, publish a probe below ``base`` every second, until it is cancelled.
-
-        It proves that each of them delivers what this account publishes.
-        """
-        if not isinstance(self.transport, EveryHost):
-            return
-        self.transport.proof_topic = topic = BRIDGE_PROBE.topic(base)
-        await self.subscribe(topic, lambda _message, _at: None, deferred=True)
-        while True:
-            self.publish(topic, codec.encode(BRIDGE_PROBE, {"t": int(1000 * time.time())}))
-            await asyncio.sleep(_PROBE_S)
-
-    def on_move(self, watcher: Callable[[str, str, bool], None]) -> None:
-        """Call ``watcher`` when a robot is found at one of several brokers, or at another one than before.
-
-        It gets the robot's base, host and port of the broker, and whether it is the preferred one.
-        """
-        transport = self.transport
-        if isinstance(transport, EveryHost):
-            transport.moved = lambda base: self._call(
-                lambda: watcher(base, transport.host_of(base), transport.is_first(base))
-            )
 
     async def open(self) -> None:
         """Start connecting, and wait a moment for success. Raises TransportError for settings that can never work."""

@@ -17,17 +17,16 @@ from pebble.config import Config, load
 from pebble.config.text_files import password as password
 from pebble.errors import ConfigError, PebbleError, TransportError
 from pebble.runtime.addresses import Addresses
-from pebble.runtime.connections import REMOTE_RECONNECT_S, SEGMENT, local_settings, mqtt_settings, zenoh_settings
-from pebble.runtime.every_host import EveryHost, operators
+from pebble.runtime.connections import REMOTE_RECONNECT_S, local_settings, mqtt_settings, zenoh_settings
 from pebble.runtime.robot_estop import RobotEstop
-from pebble.transports import Message, MqttSettings, QoS, State, Transport
+from pebble.transports import Message, MqttSettings, QoS, State, Transport, create
+from pebble.transports.hosts import SMALL_SEGMENT
 
 log = logging.getLogger(__name__)
 
 _STEP_S = 0.005  # between two looks at a condition
 _LATE_S = 0.25  # some brokers send what is retained so long after they have acknowledged a subscription
 OPEN_TIMEOUT_S = 3.0
-_FIND_S = 1.0  # where several brokers are heard: longer than a robot takes between two heartbeats
 _WAITING = 10_000  # messages that wait to be printed before new ones are dropped
 
 
@@ -61,13 +60,11 @@ def target_of(robot: str | None, options: Target) -> Target:
 def connected(target: Target) -> Iterator[tuple[Transport, Names]]:
     """Connect, and disconnect at the end. Raises PebbleError with a remedy if the connection fails."""
     kind, settings, names, where = resolve(target)
-    transport = operators(f"pebble-tool-{os.getpid()}", kind, in_small_segments(settings))
+    transport = create(kind, f"pebble-tool-{os.getpid()}", in_small_segments(settings))
     with closing(transport.open(OPEN_TIMEOUT_S)):
         if transport.state is not State.CONNECTED:
             why = transport.problem or f"no answer within {OPEN_TIMEOUT_S:g} s"
             raise TransportError(f"cannot connect to {where}: {why}")
-        if isinstance(transport, EveryHost) and names.base != ANY_ROBOT and not transport.find(names.base, _FIND_S):
-            log.info("%s is heard at no host", names.base)
         not_received = _report_missing(transport)
         yield transport, names
         _report_missing(transport, not_received)  # what was subscribed to meanwhile may be refused
@@ -83,7 +80,7 @@ def listening(target: Target, sender: Transport) -> Iterator[Transport]:
     if not isinstance(settings, MqttSettings) or settings.client_id is not None:
         yield sender
         return
-    transport = operators(f"pebble-tool-{os.getpid()}-listening", kind, in_small_segments(settings))
+    transport = create(kind, f"pebble-tool-{os.getpid()}-listening", in_small_segments(settings))
     with closing(transport.open(0.0)):
         yield transport
         _report_missing(transport)
@@ -91,7 +88,7 @@ def listening(target: Target, sender: Transport) -> Iterator[Transport]:
 
 def in_small_segments(settings: Any) -> Any:
     """The same settings for a way that may lose large packets."""
-    return replace(settings, max_segment=SEGMENT) if isinstance(settings, MqttSettings) else settings
+    return replace(settings, max_segment=SMALL_SEGMENT) if isinstance(settings, MqttSettings) else settings
 
 
 def _report_missing(transport: Transport, before: str = "") -> str:

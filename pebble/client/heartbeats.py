@@ -8,8 +8,7 @@ from dataclasses import replace
 from pebble.client.connection import OPEN_TIMEOUT_S, wait_for
 from pebble.client.robot_topics import SYNONYMS
 from pebble.contract import ONLINE
-from pebble.runtime.every_host import operators
-from pebble.transports import Message, MqttSettings, State, Transport
+from pebble.transports import Message, MqttSettings, State, Transport, create
 
 _FILTERS = [channel.filter("+/+/+") for channel in (ONLINE, *SYNONYMS)]
 _WAITING = 10_000  # heartbeats, of which the oldest goes: it comes again
@@ -40,7 +39,7 @@ class Heartbeats:
 
     def _open(self) -> None:
         for settings in (replace(self._settings, protocol="5", sends_retained=False), self._settings):
-            transport = self._transport = operators(f"pebble-heartbeats-{os.getpid()}", "mqtt", settings)
+            transport = self._transport = create("mqtt", f"pebble-heartbeats-{os.getpid()}", settings)
             transport.open(0.0)
             wait_for(lambda: transport.state is not State.CONNECTING or transport.problem, OPEN_TIMEOUT_S)  # noqa: B023
             if self._closed.is_set():

@@ -5,9 +5,10 @@ from pathlib import Path
 
 from pebble.config.hosts import HostError, split
 from pebble.errors import PebbleError
+from pebble.runtime.connections import ALL_VITAL
 from pebble.transports import MqttSettings, TlsSettings, ZenohSettings
 
-FORMS = "mqtt://HOST[:PORT][,HOST[:PORT]…], mqtts://… or zenoh:RUN_DIR"
+FORMS = "mqtt://HOST[:PORT], mqtts://… or zenoh:RUN_DIR"
 _PORTS = {"mqtt": 1883, "mqtts": 8883}
 
 
@@ -45,7 +46,8 @@ def _zenoh(path: str) -> ZenohSettings:
 
 
 def _mqtt(url: str, password: str | None, ca_cert: Path | None) -> MqttSettings:
-    url, *more = url.split(",")
+    if "," in url:
+        raise UrlError(f"--url names one broker: a name that has the addresses of all, or that of a cluster: {FORMS}")
     try:
         parts = split(url)
     except HostError as error:
@@ -57,29 +59,15 @@ def _mqtt(url: str, password: str | None, ca_cert: Path | None) -> MqttSettings:
         )
     if parts.rest.strip("/"):
         raise UrlError(f"--url must end after the port; topics are named separately: {FORMS}")
-    others = [_another(one, parts.scheme) for one in more]
     port = _PORTS[parts.scheme] if parts.port is None else parts.port
-    if len({(host.lower(), port) for host, port in ((parts.host, port), *others)}) <= len(others):
-        raise UrlError("--url names a broker twice: leave one of them")
     encrypted = parts.scheme == "mqtts"
     if ca_cert is not None and not encrypted:
         raise UrlError("--ca-cert has no use with mqtt://: use mqtts://")
     return MqttSettings(
         host=parts.host,
         port=port,
-        hosts=((parts.host, port), *others) if others else (),
         username=parts.user,
+        vital=ALL_VITAL,
         password=password,
         tls=TlsSettings(ca_cert=ca_cert) if encrypted else None,
     )
-
-
-def _another(text: str, scheme: str) -> tuple[str, int]:
-    """A further broker of a list, with the same login and encryption."""
-    try:
-        parts = split(f"{scheme}://{text}")
-    except HostError as error:
-        raise UrlError(f"--url {error}; use {FORMS}") from None
-    if parts.user is not None or parts.rest.strip("/"):
-        raise UrlError(f"--url: after a comma only a further HOST[:PORT], all have the same login: {FORMS}")
-    return parts.host, _PORTS[scheme] if parts.port is None else parts.port

@@ -11,7 +11,7 @@ import typer
 
 from pebble.config import Config, Mqtt, load, resolved
 from pebble.config.neighbours import Neighbours
-from pebble.config.rules.doors import places_of
+from pebble.config.rules.doors import place_of
 from pebble.config.secret_text import shown_user, without_secrets
 from pebble.config.visible import shown
 from pebble.contract import CHANNELS, MEDIA_STATUS, STATUS, TOUCH_SENSORS, Channel
@@ -156,9 +156,8 @@ def _print(config: Config, path: Path, scripts: Mapping[str, Script]) -> None:
         for name, script in scripts.items():
             grid.add_row(Text("script", style="dim"), Text(shown(name)), Text(shown(_fitness(script))))
         console.print(Padding(grid, (1, 0, 0, 2)))
-    from pebble.checks.who import unknown_brokers
 
-    if warnings := [*config.warnings, *unknown_brokers(config)]:
+    if warnings := config.warnings:
         grid = Table.grid(padding=(0, 2))
         for warning in warnings:
             grid.add_row(Text("warning", style="yellow"), Text(warning))
@@ -274,7 +273,7 @@ def _scripts(config: Config) -> list[tuple[str, str]]:
     bridge, shared = config.services.mqtt_bridge, config.transport.mqtt_mirror
     if config.transport.kind == "mqtt":
         elsewhere = bridge.remote is not None and bridge.remote.kind != "mqtt"
-        apart = elsewhere or not places_of(bridge.remote_mqtt) & places_of(config.local_mqtt)
+        apart = elsewhere or place_of(bridge.remote_mqtt) != place_of(config.local_mqtt)
         shared = None if bridge.enabled and apart else config.local_mqtt
     if shared is None:
         return []
@@ -286,8 +285,7 @@ def _mqtt(mqtt: Mqtt) -> str:
     password = "" if mqtt.username is None or mqtt.password is None else ", password ***"
     name = " without a check of the name" if mqtt.tls.insecure else ""
     tls = f"TLS{name}" if mqtt.tls.enabled else "not encrypted"
-    places = ", else ".join(f"{host}:{port}" for host, port in mqtt.places)
-    return f"{places}, MQTT {mqtt.protocol}, {user}{password}, {tls}"
+    return f"{mqtt.host}:{mqtt.port}, MQTT {mqtt.protocol}, {user}{password}, {tls}"
 
 
 def _local_media(config: Config) -> Iterator[str]:

@@ -165,8 +165,6 @@ def _settings_at(url: str, password_file: Path | None, ca_cert: Path | None) -> 
         raise UrlError(str(error).replace("--url", "--broker").replace(FORMS, _FORMS)) from None
     if not isinstance(settings, MqttSettings):
         raise UrlError(f"--broker must be {_FORMS}")
-    if settings.hosts:
-        raise UrlError("--broker judges one broker: use one HOST[:PORT], and the command again for each further one")
     return settings
 
 

@@ -210,12 +210,10 @@ def _address(broker: str, password_file: Path | None, ca_cert: Path | None) -> t
             raise UrlError(str(error).replace("--url", "--broker")) from None
     if not isinstance(settings, MqttSettings):
         raise PebbleError("--broker: robots with Wi-Fi use MQTT only: mqtt://HOST[:PORT]")
-    if any(port != settings.port for _, port in settings.hosts):
-        raise PebbleError("--broker: robots with Wi-Fi use one port for all hosts")
     tls = settings.tls
     return (
         BrokerAddress(
-            host=tuple(host for host, _ in settings.hosts) or settings.host,
+            host=settings.host,
             port=settings.port,
             username=settings.username,
             password=settings.password,

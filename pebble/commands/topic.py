@@ -6,8 +6,6 @@ import math
 import shutil
 import sys
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from functools import cache
 from typing import Annotated
 
@@ -26,7 +24,6 @@ from pebble.contract.identity import parse_topic
 from pebble.errors import PayloadError, PebbleError, TransportError
 from pebble.media.rate_meter import RateMeter
 from pebble.runtime.by_name import ByName, ask_beside
-from pebble.runtime.every_host import EveryHost
 from pebble.transports import Message, QoS, Transport
 from pebble.transports.topics import is_pattern
 
@@ -75,10 +72,8 @@ def list_(
         pebble topic list -c goob.json
         pebble topic list 'pebble/+/+/outgoing/#' --url mqtt://127.0.0.1 -s 5
     """
-    with _connected(target) as (transport, names):
+    with connected(target) as (transport, names):
         listing, by_name = show.Listing(names), ByName(CHANNELS)
-        if isinstance(transport, EveryHost):
-            listing.host_of = transport.host_of
 
         def note(message: Message) -> None:
             by_name.receive(message, time.monotonic())
@@ -119,7 +114,7 @@ def echo(
         pebble topic echo capabilities -c goob.json --raw -n 1 | jq .value.drive
     """
     printed = 0
-    with _connected(target) as (transport, names):
+    with connected(target) as (transport, names):
         robot = _estop(transport, names, topic)
         if robot is not None and robot.stopped_by is not None:
             typer.echo(f"pebble: {show.stopped_line(robot, time.time())}", err=True)
@@ -169,7 +164,7 @@ def pub(
         pebble topic pub flags/mqtt-video true -c fred.json
         pebble topic pub lights-flash @party.json --url mqtt://127.0.0.1 -r goob
     """
-    with _connected(target) as (transport, names):
+    with connected(target) as (transport, names):
         message = draft(names, topic, payload, retain=retain, qos=qos, force=force)
         for warning in message.warnings:
             typer.echo(f"pebble: warning: {warning}", err=True)
@@ -199,7 +194,7 @@ def hz(topic: Name, window: WindowOption = 100, seconds: SecondsOption = None, *
         pebble topic hz front-camera --url mqtt://127.0.0.1 -r goob
     """
     meter = RateMeter(window_s=math.inf, limit=window + 1)
-    with _connected(target) as (transport, names):
+    with connected(target) as (transport, names):
         listener = Listener(transport, names.filters(topic))
         end, report_at, reported = _end(seconds), time.monotonic() + _REPORT_PERIOD_S, 0
         while time.monotonic() < end:
@@ -212,15 +207,6 @@ def hz(topic: Name, window: WindowOption = 100, seconds: SecondsOption = None, *
                 reported = meter.count
         _warn_of_dropped(listener)
     return 0 if meter.count else 1
-
-
-@contextmanager
-def _connected(target: Target) -> Iterator[tuple[Transport, Names]]:
-    """It tells at which of several brokers the robot is."""
-    with connected(target) as (transport, names):
-        if isinstance(transport, EveryHost) and (host := transport.host_of(names.base)):
-            typer.echo(f"pebble: {shown(names.base)} is at broker {host}", err=True)
-        yield transport, names
 
 
 def _print_rate(meter: RateMeter, *, silent: bool) -> None:

@@ -11,7 +11,7 @@ from pebble.config.problems import Notes
 from pebble.config.raw import decode, plain, read_text
 from pebble.config.reader import Reader
 from pebble.config.rules.between_keys import CHECKS
-from pebble.config.rules.doors import places_of
+from pebble.config.rules.doors import place_of
 from pebble.config.transport import Mqtt, ZenohSection
 from pebble.config.types import EMPTY, Account, Level, Section, doc
 from pebble.contract.identity import GATEWAYS, SERVERS, Identity
@@ -82,12 +82,7 @@ def _check_sides(notes: Notes, gateway: GatewayFile, operators: Mqtt | None) -> 
         notes.problem(("boards",), "must be left out beside hub: write a second file for it, with an id of its own")
     if gateway.hub.listen:
         notes.problem(("hub", "listen"), "must be left out: a gateway is a client of hubs")
-    if operators is not None and operators.hosts:
-        why = "cannot be several: write host, and run a gateway of its own for another broker"
-        notes.problem(("mqtt", "hosts"), why)
-    if boards is not None and boards.hosts:
-        notes.problem(("boards", "hosts"), "cannot be several: write host")
-    if boards is not None and operators is not None and places_of(boards) & places_of(operators):
+    if boards is not None and operators is not None and place_of(boards) == place_of(operators):
         notes.problem(("mqtt",), "is also boards: operators reach these robots there without a gateway")
 
 

@@ -49,27 +49,6 @@ def broker_host(text: str) -> str:
     return found
 
 
-def broker_place(text: str) -> str:
-    """A broker of a list, with or without a port, in one spelling. Raises HostError."""
-    if text.count(":") != 1 and not text.startswith("["):
-        return broker_host(text)
-    if _SCHEME.match(text) or "@" in text:
-        return _host(text, keys=False)  # which refuses it
-    found = split(text)
-    if found.rest:
-        raise HostError(f"{_shown(found)} holds a path: write {_quoted(found.host)}")
-    name = broker_host(found.host)
-    return name if found.port is None else f"[{name}]:{found.port}" if ":" in name else f"{name}:{found.port}"
-
-
-def place_of(text: str, port: int) -> tuple[str, int]:
-    """Host and port of what `broker_place` returned; ``port`` where it has none."""
-    if text.startswith("[") or text.count(":") == 1:
-        name, _, own = text.rpartition(":")
-        return name.strip("[]"), int(own)
-    return text, port
-
-
 def name_of_page(text: str) -> str:
     """A host with or without a port, as browsers send it. Raises HostError."""
     if text.count(":") == 1 and not _SCHEME.match(text):

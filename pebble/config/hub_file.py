@@ -17,7 +17,7 @@ from pebble.errors import ConfigError
 
 
 class HubFile(ZenohSection, frozen=True, kw_only=True):
-    """A hub: where it listens, and which other hubs it is linked to."""
+    """A hub: where it listens, and to which Zenoh routers it connects."""
 
     run_dir: Annotated[File | None, doc("Folder of its socket and lock; unset: one of its own.")] = None
     journal: Annotated[File | None, doc("File for what it retains; unset: memory only.")] = None

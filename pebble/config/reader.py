@@ -65,7 +65,9 @@ class Reader:
             if key == name or (name.endswith("*") and key.startswith(name[:-1])):
                 self.notes.retired.append(problems.Note(path, replacement))
                 return
-        if key not in known:
+        if key in kind.refused:
+            self.notes.problem(path[:-1], f"{key} {kind.refused[key]}")
+        elif key not in known:
             self.notes.problem(path, f"unknown key, {problems.nearest(key, known)}")
 
     def _missing(self, field: FieldInfo, path: problems.Path) -> Any:

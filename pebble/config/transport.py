@@ -4,11 +4,9 @@ from typing import Annotated, Any, ClassVar, Literal
 
 from msgspec import Meta, field
 
-from pebble.config.hosts import place_of
 from pebble.config.types import (
     Account,
     BrokerHost,
-    BrokerPlace,
     ClientId,
     CommonName,
     Endpoint,
@@ -36,16 +34,14 @@ class Tls(Section, frozen=True, kw_only=True):
 class Mqtt(Section, frozen=True, kw_only=True):
     """One MQTT broker."""
 
+    retired: ClassVar = {"client": "Pebble's own is used; paho is a transport of its own, see docs/transports.md"}
+    refused: ClassVar = {
+        "hosts": "is no key any more: write host, a name that has the addresses of all or that of a cluster "
+        "(docs/fleet.md, One broker)"
+    }
+
     host: Annotated[BrokerHost, doc("Name or address of the broker.")] = "127.0.0.1"
     port: Annotated[Port, doc("TCP port of the broker.")] = 1883
-    hosts: Annotated[
-        tuple[BrokerPlace, ...],
-        doc(
-            "Instead of host: up to eight brokers that know nothing of each other, the first one preferred. Each is a "
-            "name or address, with a port after a colon if it has another one. A robot uses one at a time, and "
-            "operators hear all; login and encryption are the same. See docs/fleet.md."
-        ),
-    ] = ()
     keepalive: Annotated[
         int,
         Meta(
@@ -60,18 +56,9 @@ class Mqtt(Section, frozen=True, kw_only=True):
     password_env: Annotated[str | None, doc("Environment variable that holds the password.")] = None
     tls: Annotated[Tls, doc("Encryption.")] = Tls()
     protocol: Annotated[Literal["3.1.1", "5"], doc("Version of MQTT to use.")] = "3.1.1"
-    client: Annotated[
-        Literal["pebble", "paho"],
-        doc("Library that speaks MQTT: Pebble's own, or paho, which takes half as much processor time again."),
-    ] = "pebble"
     silence_seconds: Annotated[
         Silence, doc("A connection that does not answer for this many seconds is closed and opened again.")
     ] = 2.0
-
-    @property
-    def places(self) -> tuple[tuple[str, int], ...]:
-        """Host and port of each broker, the preferred one first."""
-        return tuple(place_of(one, self.port) for one in self.hosts) or ((self.host, self.port),)
 
 
 class RemoteMqtt(Mqtt, frozen=True, kw_only=True):

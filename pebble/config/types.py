@@ -38,7 +38,6 @@ Endpoint = Annotated[
 ]
 Host = Annotated[str, Meta(extra={"parse": hosts.host})]
 BrokerHost = Annotated[str, Meta(extra={"parse": hosts.broker_host})]
-BrokerPlace = Annotated[str, Meta(extra={"parse": hosts.broker_place})]
 Device = Annotated[str, Meta(extra={"parse": hosts.no_login})]
 NameOfPage = Annotated[str, Meta(extra={"parse": hosts.name_of_page})]
 CommonName = Annotated[
@@ -116,6 +115,8 @@ class Section(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
     #: Keys that are accepted and do nothing, with what replaces them; a final ``*`` stands for any ending.
     retired: ClassVar[Mapping[str, str]] = {}
+    #: Keys of earlier versions that are errors, and what to write.
+    refused: ClassVar[Mapping[str, str]] = {}
 
     @classmethod
     def all_retired(cls) -> dict[str, str]:

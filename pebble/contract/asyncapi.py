@@ -21,7 +21,7 @@ _LEVELS: Final = {
 
 
 def document() -> str:
-    """The whole of docs/asyncapi.yaml. Needs PyYAML."""
+    """Return the whole of asyncapi.yaml. Needs PyYAML."""
     found = schemas()
     described: dict[str, Any] = {
         "asyncapi": "3.0.0",

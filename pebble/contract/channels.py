@@ -186,9 +186,12 @@ CONTROL_VOUCHED = _c("control-vouched", Kind.EVENT, p.ControlVouched,
                      "Over which time the bridge has passed on in time all that it was sent.",
                      rate_hz=2, remote=False)  # fmt: skip
 LINK = _c("link", Kind.STATE, p.LinkState, "What the link to the remote broker carries; only where it may be thin.")
-BRIDGE_PROBE = _c("bridge-probe", Kind.EVENT, p.AnyObject,
-                  "By it the bridge detects that two of the robot's connections lead to one broker, "
-                  "and a page server (`{system}/servers/{id}`) that each of several brokers delivers.")  # fmt: skip
+BRIDGE_PROBE = _c(
+    "bridge-probe",
+    Kind.EVENT,
+    p.AnyObject,
+    "By it the bridge detects that two of the robot's connections lead to one broker.",
+)
 LOGS = _c("logs", Kind.STREAM, p.LogRecord, "Log lines of all services.", override="services.launcher.logs.topic")
 
 # -- outgoing: telemetry

@@ -25,9 +25,7 @@ from pebble.errors import PayloadError
 from pebble.motion.latch import fields, stop_of
 
 MAX_COMMAND_BYTES = 64 * 1024
-MAX_DEPTH = 32
 
-_USUAL_BYTES = 256  # of a drive command, at most
 _LONGEST_MS = 1e12  # of a command's validity; far beyond every watchdog
 _LATEST_STAMP = 253_402_300_800_000  # the year 10000 in ms: later times are invalid
 
@@ -36,7 +34,6 @@ _numeric = re.compile(r"\s*[+-]?(\d+(\.\d*)?|\.\d+)([eE][+-]?\d+)?\s*", re.ASCII
 #: All of UTF-8 but printable ASCII, by which every JSON text begins and ends: a byte order mark, a C string's NUL,
 #: white space. The bytes above are in no UTF-8: what they are around is no text.
 _AROUND = bytes(byte for byte in range(0xF5) if not 0x21 <= byte <= 0x7E)
-_SQUARE, _NO_BRACKETS = bytes.maketrans(b"{}", b"[]"), bytes(set(range(256)) - set(b"[]{}"))
 _KEYS_SHOWN, _SHOWN = 8, 20  # of a payload that is not understood, and characters of each
 _encoder = msgspec.json.Encoder()
 _decoder = msgspec.json.Decoder()
@@ -63,8 +60,6 @@ def decode(channel: Channel, raw: bytes, remark: Remark | None = None) -> Any:
     """
     if channel.payload is bytes:
         return raw
-    if channel.payload is Drive and (drive := _usual_drive(raw)) is not None:
-        return drive
     if channel.payload is EstopCommand:
         return _stop(channel, raw)
     decoded = plain(channel, raw)
@@ -85,13 +80,13 @@ def plain(channel: Channel, raw: bytes) -> Any:
     if channel.direction == INCOMING and len(raw) > MAX_COMMAND_BYTES:
         raise PayloadError(f"{channel.metric}: {len(raw)} bytes, more than {MAX_COMMAND_BYTES}")
     text = trim(raw)
-    if too_deep(text):
-        raise PayloadError(f"{channel.metric}: nested deeper than {MAX_DEPTH}")
     try:
         text.decode()  # msgspec checks only the strings it keeps
         return _decoder.decode(text)
     except UnicodeDecodeError:
         raise PayloadError(f"{channel.metric}: not UTF-8: send UTF-8") from None
+    except RecursionError:
+        raise PayloadError(f"{channel.metric}: nested too deep") from None
     except msgspec.DecodeError as error:
         if b"\0" in raw.strip(_AROUND):
             raise PayloadError(f"{channel.metric}: not JSON before its NUL: if it is UTF-16, send UTF-8") from None
@@ -123,25 +118,6 @@ def _stop(channel: Channel, raw: bytes) -> EstopCommand:
 def is_blank(raw: bytes) -> bool:
     """Whether ``raw`` is white space only: by such payloads bridges look for cycles, and everybody ignores them."""
     return bool(raw) and raw.isspace()
-
-
-def too_deep(raw: bytes) -> bool:
-    """True if this JSON is nested deeper than MAX_DEPTH. Looks at brackets outside strings, without parsing.
-
-    Byte by byte, 64 KB of brackets would take a Pi many times as long as to parse them, and anybody may send them.
-    """
-    most = MAX_DEPTH + 1  # ``count`` takes fifty times as long where there are few
-    if len(raw) - len(raw.replace(b"[", b"", most).replace(b"{", b"", most)) <= MAX_DEPTH:
-        return False
-    if b"\\" in raw:
-        raw = raw.replace(b"\\\\", b"").replace(b'\\"', b"")
-    left = b"".join(raw.split(b'"')[::2]).translate(_SQUARE, _NO_BRACKETS)  # what is outside strings
-    for _ in range(MAX_DEPTH):
-        shorter = left.replace(b"[]", b"")  # the innermost level
-        if len(shorter) == len(left):
-            break
-        left = shorter
-    return b"[]" in left or left.count(b"[") > MAX_DEPTH
 
 
 def _boolean(channel: Channel, plain: Any) -> bool:
@@ -225,36 +201,6 @@ _DRIVE_MORE: dict[str, Callable[[Any], bool]] = {
     "by": lambda value: isinstance(value, str),
     "group": lambda value: isinstance(value, bool),
 }
-
-
-#: The fields of a drive command and no others: what is in keys that are not read has to be valid, too.
-_drive_decoder: msgspec.json.Decoder[Any] = msgspec.json.Decoder(
-    msgspec.defstruct(
-        "UsualDrive",
-        [(field.name, field.type, field.default) for field in msgspec.structs.fields(Drive)],
-        forbid_unknown_fields=True,
-    )
-)
-
-
-def _usual_drive(raw: bytes) -> Drive | None:
-    """A bare command of numbers, which is what nearly all are; None: it is none, or needs a closer look. Hot."""
-    if len(raw) > _USUAL_BYTES or raw.count(b"{") != 1 or not raw.isascii():
-        return None
-    if b'"z"' not in raw and b'"x"' not in raw and b'"y"' not in raw:  # it names no axis, or escapes the name
-        return None
-    try:
-        found = _drive_decoder.decode(raw)
-        drive = Drive(
-            x=found.x, z=found.z, y=found.y, source=found.source, run=found.run, valid_ms=found.valid_ms,
-            key=found.key, t=found.t, by=found.by, group=found.group,
-        )  # fmt: skip
-    except (msgspec.DecodeError, ValueError):
-        return None
-    usual = (drive.source != SCRIPT or drive.run is not UNSET) and (
-        drive.valid_ms is UNSET or 1 <= drive.valid_ms < _LONGEST_MS
-    )
-    return drive if usual else None
 
 
 #: The numbers of a command and what one is that cannot be read, by payload.

@@ -21,7 +21,7 @@ _NUMERIC = r"^\s*[+-]?([0-9]+(\.[0-9]*)?|\.[0-9]+)([eE][+-]?[0-9]+)?\s*$"
 def schemas() -> dict[str, Any]:
     """One document: ``topics`` maps ``incoming/drive-values`` to its schema, ``$defs`` holds the structs.
 
-    Binary topics are absent. Limits that a schema cannot express (64 KB, 32 levels, NaN) are in docs/topics.md.
+    Binary topics are absent. Limits that a schema cannot express (64 KB, NaN) are in docs/topics.md.
     """
     json_channels = [channel for channel in CHANNELS if channel.payload is not bytes]
     structs = list(dict.fromkeys(channel.payload for channel in json_channels if channel.payload is not bool))

@@ -55,7 +55,7 @@ def private_files(config: Config, firmware: Firmware, *, ssid: str, wifi_passwor
             },
             "wifi": {"ssid": ssid, "password": Secret(wifi_password)},
             "mqtt": {
-                "host": _hosts(broker),
+                "host": broker.host,
                 "port": broker.port,
                 **({"username": broker.username} if broker.username is not None else {}),
                 **({"password": Secret(broker.password)} if broker.password is not None else {}),
@@ -69,17 +69,7 @@ def private_files(config: Config, firmware: Firmware, *, ssid: str, wifi_passwor
 
 def check_broker(config: Config) -> None:
     """Raise ConfigError for a broker address that no board can reach."""
-    for host, _ in config.local_mqtt.places:
-        _check_host(config, host)
-
-
-def _hosts(broker: Mqtt) -> str | list[str]:
-    if len({port for _, port in broker.places}) > 1:
-        raise ConfigError("local_mqtt.hosts: a board uses one port for all, leave out what follows the colons")
-    return [host for host, _ in broker.places] if broker.hosts else broker.host
-
-
-def _check_host(config: Config, host: str) -> None:
+    host = config.local_mqtt.host
     if host == "example" or host.endswith(_NO_BROKER):
         where = config.path or "the config"
         raise ConfigError(f"local_mqtt.host: {host} is only an example; set your broker's address in a copy of {where}")
@@ -109,8 +99,7 @@ def _tls(broker: Mqtt, firmware: Firmware) -> tuple[Any, bytes | None]:
         raise ConfigError("local_mqtt.tls.ca_cert: a board has no certificates of its own; set the broker's authority")
     if tls.insecure:
         raise ConfigError("local_mqtt.tls.insecure: a board with ca_cert checks the host name too; remove one of them")
-    name = {} if broker.hosts else {"server_name": broker.host}  # of several each has its own
-    return {"ca": f"/{CA_FILE}", **name}, _der(tls.ca_cert)
+    return {"ca": f"/{CA_FILE}", "server_name": broker.host}, _der(tls.ca_cert)
 
 
 def _der(path: Path) -> bytes:

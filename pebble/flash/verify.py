@@ -12,8 +12,7 @@ from pebble.contract import ONLINE
 from pebble.errors import DeviceError
 from pebble.flash.boards import Firmware
 from pebble.runtime.connections import LOCAL_RECONNECT_S, mqtt_settings
-from pebble.runtime.every_host import operators
-from pebble.transports import Message, QoS, State
+from pebble.transports import Message, QoS, State, create
 
 BROKER_S = 5.0
 HEARTBEAT_S = 60.0  # boot, Wi-Fi, DHCP, DNS
@@ -26,7 +25,7 @@ def at_broker(config: Config, timeout_s: float = HEARTBEAT_S) -> str:
     broker = config.local_mqtt
     received: queue.Queue[Message] = queue.Queue()
     settings = mqtt_settings(broker, reconnect_max_s=LOCAL_RECONNECT_S)
-    transport = operators(f"{config.base}/flash", "mqtt", settings)
+    transport = create("mqtt", f"{config.base}/flash", settings)
     with closing(transport.open(BROKER_S)):
         if transport.state is not State.CONNECTED:
             why = transport.problem or f"no answer within {BROKER_S:g} s"

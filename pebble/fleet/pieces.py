@@ -13,12 +13,8 @@ HUB_PORT = 7447
 
 def of_broker(fleet: Fleet, name: str, secret: str, *, board: bool) -> dict[str, Any]:
     """Return what a robot needs in its config to be at the fleet's broker."""
-    server, *others = fleet.brokers
-    places: dict[str, Any] = {"host": server.host, "port": server.port}
-    if others:
-        places = {"hosts": [one.host if one.port == server.port else host_and_port(one) for one in fleet.brokers]}
-        places["port"] = server.port
-    login = places | {"username": name, "password": secret}
+    server = fleet.brokers[0]
+    login = {"host": server.host, "port": server.port, "username": name, "password": secret}
     link = login | {"tls": {"enabled": True, "ca_cert": certificates.CA_CERT}}
     found = {"local_mqtt": link} if board else {"services": {"mqtt_bridge": {"enabled": True, "remote_mqtt": link}}}
     return {**_who(fleet, name), **found}
@@ -29,7 +25,7 @@ def of_certificate(fleet: Fleet, name: str) -> dict[str, Any]:
     roles = fleet.accounts[name].roles
     at_hub = _at_hub(fleet, name, certificates.CA_CERT, name)
     if ProgramRole.HUB in roles:
-        return hub_file(name) | {"connect": [], "journal": f"{name}.journal"}
+        return hub_file(name) | {"journal": f"{name}.journal"}
     if ProgramRole.ROBOT in roles:
         remote = {"kind": "zenoh", **at_hub}
         return {**_who(fleet, name), "services": {"mqtt_bridge": {"enabled": True, "remote": remote}}}

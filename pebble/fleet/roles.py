@@ -41,7 +41,7 @@ class ProgramRole(StrEnum):
     NEIGHBOUR = "neighbour"  # what a robot is to the other robots at the hub of a LAN
     GATEWAY = "gateway"
     BOARDS = "boards"  # a gateway at the broker of a LAN, where the robots are that it carries
-    HUB = "hub"  # a Zenoh hub that is linked to others, which carries what all accounts send
+    HUB = "hub"  # a Zenoh hub or router, which carries what all accounts send
 
 
 _EVERYBODY = frozenset({Right.LOOK, Right.STOP})
@@ -57,7 +57,7 @@ _RIGHTS: Mapping[str, frozenset[Right]] = {
     ProgramRole.ROBOT: frozenset(),  # robots and gateways have the topics of their own bases
     ProgramRole.GATEWAY: frozenset(),
     ProgramRole.BOARDS: frozenset(),
-    ProgramRole.HUB: frozenset(),  # at a broker; at other hubs everything
+    ProgramRole.HUB: frozenset(),  # at a broker; at a hub everything
 }
 ROLES = tuple(_RIGHTS)
 #: Roles that go with no other one.

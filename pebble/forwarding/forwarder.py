@@ -242,15 +242,24 @@ class Forwarder:
             if refused in _WARNED:
                 self._warn(refused, message.topic[:_LOGGED])
             return refused
-        if (self.cycles.closed_ways or not here.transport.exact_echo) and self.publisher.is_echo(
-            here, subject, message
-        ):
-            return Drop.ECHO
-        if self.sides.gate is Gate.OPEN:
-            finding = self.cycles.examine(side, subject, message)
-            if finding is not Finding.PASS and (drop := self._act_on(finding, side, subject, message, forward)):
+        for check in self._ADMISSION:
+            if (drop := check(self, here, subject, message, forward)) is not None:
                 return drop
         return forward
+
+    def _echo(self, here: SideState, subject: Subject, message: Message, _forward: Forward) -> Drop | None:
+        if not self.cycles.closed_ways and here.transport.exact_echo:
+            return None
+        return Drop.ECHO if self.publisher.is_echo(here, subject, message) else None
+
+    def _cycle(self, here: SideState, subject: Subject, message: Message, forward: Forward) -> Drop | None:
+        if self.sides.gate is not Gate.OPEN:
+            return None
+        finding = self.cycles.examine(here.side, subject, message)
+        return None if finding is Finding.PASS else self._act_on(finding, here.side, subject, message, forward)
+
+    #: Why a message that a route and a bound admit does not pass, in this order: an echo is no cycle.
+    _ADMISSION = (_echo, _cycle)
 
     def _pass(
         self, here: SideState, subject: Subject, message: Message, forward: Forward, account: str = ""
@@ -259,26 +268,43 @@ class Forwarder:
 
         ``account`` is that of its sender, where names are checked.
         """
-        if subject.kind.one_shot:
-            waited_s = message.waited_s
-            if forward.stamped and STAMP_LETTER in message.payload and STAMP in message.payload:
-                waited_s = self.ages.waited_s(subject, message, account)
-            if waited_s > subject.waits_s and not ends_something(subject, message):
-                if forward.stamped and STAMP not in message.payload:  # else its sender keeps to the pace of the link
-                    self.ages.late.add(self._clock())
-                return Drop.LATE
-            if forward.stamped:
-                self.ages.late.count = 0
+        if subject.kind.one_shot and self._is_late(subject, message, forward, account):
+            return Drop.LATE
         if forward.unsigned:
-            passing = unsigned(message.payload)
-            if passing is not message.payload:
-                self._quiet_log.warning(Drop.SIGNED.name, "%s: %s", message.topic[:_LOGGED], Drop.SIGNED.value)
-                if passing is None:
-                    return Drop.SIGNED
-                message = Message(message.topic, passing, message.qos)
-                self.counters.add(f"{here.side.value}: zeros of a script, passed as a person's")
+            passing = self._without_script(here, message)
+            if passing is None:
+                return Drop.SIGNED
+            message = passing
         if forward.retain:
             return self.retained.receive(here, subject, message, forward)
+        return self._deliver(here, subject, message, forward)
+
+    def _is_late(self, subject: Subject, message: Message, forward: Forward, account: str) -> bool:
+        """True if what happens once has waited for too long, and does not only end something."""
+        waited_s = message.waited_s
+        if forward.stamped and STAMP_LETTER in message.payload and STAMP in message.payload:
+            waited_s = self.ages.waited_s(subject, message, account)
+        if waited_s > subject.waits_s and not ends_something(subject, message):
+            if forward.stamped and STAMP not in message.payload:  # else its sender keeps to the pace of the link
+                self.ages.late.add(self._clock())
+            return True
+        if forward.stamped:
+            self.ages.late.count = 0
+        return False
+
+    def _without_script(self, here: SideState, message: Message) -> Message | None:
+        """Return a drive command that is no script's, or what of a script's ends motion; None: nothing of it passes."""
+        passing = unsigned(message.payload)
+        if passing is message.payload:
+            return message
+        self._quiet_log.warning(Drop.SIGNED.name, "%s: %s", message.topic[:_LOGGED], Drop.SIGNED.value)
+        if passing is None:
+            return None
+        self.counters.add(f"{here.side.value}: zeros of a script, passed as a person's")
+        return Message(message.topic, passing, message.qos)
+
+    def _deliver(self, here: SideState, subject: Subject, message: Message, forward: Forward) -> Forward | Drop:
+        """Publish what is not retained; hold an event while the gate waits."""
         there = self.sides[here.side.other]
         is_event = subject.kind is Kind.EVENT and message.qos is QoS.DELIVERED
         if self.sides.gate is not Gate.OPEN:

@@ -1,21 +1,16 @@
 """Decides which value of a retained topic counts if both sides may publish it (a flag). Pure.
 
-The rules:
-
-1. A live message always counts, whichever side publishes it.
-2. A retained message that a subscription brings counts only where nothing else is known. At a reconnect the *winner*
-   side is right. Retained messages of the other side fill what the winner does not have; they are held back until the
-   winner's have arrived.
-3. A side that lost a value receives it again. So does a side that has gone back, restored from an earlier save: a
-   retained message of it that is an earlier value counts as old.
-4. Silence does not mean that a side has no value: a retained message of the winner that arrives after it was sent the
-   other side's value counts, and the winner receives it again.
+A live message always counts, whichever side publishes it. `resolve` has the rules of retained messages that a
+subscription brings: at a reconnect the *winner* side is right, and the other one, the *loser*, fills what it does not
+have. A side that lost a value receives it again, and so does one that was restored from an earlier save. Silence does
+not mean that a side has no value: one of the winner may arrive after it was sent the loser's.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import Enum
+from typing import NamedTuple
 
 from pebble.forwarding.routing import Side
 from pebble.transports.bounds import BoundedTable
@@ -46,6 +41,52 @@ class LastValue:
         if payload == self.payload:
             return LastValue(payload, side, self.earlier)
         return LastValue(payload, side, (*self.earlier, hash(self.payload))[-_EARLIER:])
+
+
+class Known(NamedTuple):
+    """What is known of a topic when one side sends a retained message on it."""
+
+    last: LastValue | None  # the newest value, whichever side published it
+    winner: Side
+    went_back: bool = False  # the sender has older values than it had a moment ago
+    overtaken: bool = False  # the loser has changed it while the winner was away, or since the winner seemed to lack it
+    offered: bool = False  # the winner seemed to lack it, and was sent the loser's value
+    awaits_winner: bool = False  # the winner's retained messages have not arrived
+
+
+def resolve(sender: Side, payload: bytes, known: Known) -> Resolution:
+    """Return what a retained message means. The first line that fits counts; a live message always passes.
+
+    | sender | what is known                                     | value             | then      |
+    |--------|---------------------------------------------------|-------------------|-----------|
+    | winner | the loser has changed it meanwhile                | any               | OVERTAKEN |
+    | winner | the winner went back                              | an earlier one    | CORRECT   |
+    | winner | any                                               | the newest one    | KNOWN     |
+    | winner | it was offered the loser's value                  | another one       | RESTORE   |
+    | winner | any                                               | another one       | PASS      |
+    | loser  | nothing, and the winner's messages have to arrive | any               | HOLD      |
+    | loser  | nothing, and they have arrived                    | any               | PASS      |
+    | loser  | any                                               | the newest one    | KNOWN     |
+    | loser  | the newest one is the winner's                    | another one       | CORRECT   |
+    | loser  | the loser went back                               | an earlier one    | CORRECT   |
+    | loser  | the newest one is the loser's                     | another one       | PASS      |
+    """
+    last = known.last
+    is_newest = last is not None and last.payload == payload
+    is_earlier = known.went_back and not is_newest and last is not None and hash(payload) in last.earlier
+    if sender is known.winner:
+        if known.overtaken:
+            return Resolution.OVERTAKEN
+        if is_earlier:
+            return Resolution.CORRECT
+        if is_newest:
+            return Resolution.KNOWN
+        return Resolution.RESTORE if known.offered else Resolution.PASS
+    if last is None:
+        return Resolution.HOLD if known.awaits_winner else Resolution.PASS
+    if is_newest:
+        return Resolution.KNOWN
+    return Resolution.CORRECT if last.side is known.winner or is_earlier else Resolution.PASS
 
 
 class Reconciliation:
@@ -102,7 +143,7 @@ class Reconciliation:
             self._received[side].add(topic)
         resolution = Resolution.PASS
         if retained:
-            resolution = self._resolve_retained(side, topic, payload, went_back=went_back)
+            resolution = resolve(side, payload, self._known(topic, went_back=went_back))
         if resolution is Resolution.HOLD:
             self._held[topic] = payload
         elif resolution in (Resolution.PASS, Resolution.RESTORE):
@@ -146,22 +187,15 @@ class Reconciliation:
         last = self._last.get(topic)
         self._last[topic] = LastValue(payload, side) if last is None else last.then(payload, side)
 
-    def _resolve_retained(self, side: Side, topic: str, payload: bytes, *, went_back: bool) -> Resolution:
-        last = self._last.get(topic)
-        if side is self._winner:
-            if topic in self._overtaken or topic in self._newer:
-                return Resolution.OVERTAKEN
-            if went_back and last is not None and last.payload != payload and hash(payload) in last.earlier:
-                return Resolution.CORRECT
-            if last is not None and last.payload == payload:
-                return Resolution.KNOWN
-            return Resolution.RESTORE if topic in self._offered else Resolution.PASS
-        if last is None:
-            return Resolution.PASS if self._synchronized[self._winner] else Resolution.HOLD
-        if last.payload == payload:
-            return Resolution.KNOWN
-        older = last.side is self._winner or (went_back and hash(payload) in last.earlier)
-        return Resolution.CORRECT if older else Resolution.PASS
+    def _known(self, topic: str, *, went_back: bool) -> Known:
+        return Known(
+            self._last.get(topic),
+            winner=self._winner,
+            went_back=went_back,
+            overtaken=topic in self._overtaken or topic in self._newer,
+            offered=topic in self._offered,
+            awaits_winner=not self._synchronized[self._winner],
+        )
 
     def _may_come_late(self, topic: str) -> bool:
         """Whether the winner may still have an old value: silence does not mean that it has none."""

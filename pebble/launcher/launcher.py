@@ -67,7 +67,8 @@ class Launcher:
         """
         config = self._config
         own_records = OwnRecords(self._logs, config.log_level_of("launcher"))
-        with own_records, RunLock(config.run_dir(), config.base, config.path or config.folder) as lock, self._signals:
+        in_state_dir = config.state_file("launcher").with_suffix(".lock")
+        with own_records, RunLock(config.run_dir(), config.base, in_state_dir) as lock, self._signals:
             try:
                 self._reactor.every(_RUN_DIR_S, lambda: self._keep(lock))
                 self._start()

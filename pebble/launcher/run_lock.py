@@ -1,4 +1,4 @@
-"""One launcher per robot: the run directory with the lock file in it, and a name that other launchers find."""
+"""One launcher per robot: a lock file in its run directory and one in its state directory."""
 
 import logging
 import os
@@ -6,8 +6,7 @@ from pathlib import Path
 from typing import Self
 
 from pebble.config import LAUNCHER_LOCK
-from pebble.errors import PebbleError
-from pebble.launcher.machine_name import MachineName
+from pebble.errors import PebbleError, TransportError
 from pebble.transports.peers import FileLock, make_private
 
 log = logging.getLogger(__name__)
@@ -16,49 +15,48 @@ log = logging.getLogger(__name__)
 class RunLock:
     """Makes the run directory for this user alone and holds its lock; the kernel releases it however the process ends.
 
-    A second lock is independent of the environment, which determines the run directory: a name, of which there is one
-    on a machine for a robot and the config file it is started from.
+    A second lock is in the state directory, for launchers whose environment names another run directory.
 
     Raises PebbleError when another process holds a lock, or when the directory cannot be trusted.
     """
 
-    def __init__(self, run_dir: Path, robot: str, config: Path) -> None:
-        self._run_dir, self._robot, self._config = run_dir, robot, config
+    def __init__(self, run_dir: Path, robot: str, state_lock: Path) -> None:
+        self._run_dir, self._robot, self._state_path = run_dir, robot, state_lock
         self.path = run_dir / LAUNCHER_LOCK
         self._lock: FileLock | None = None
-        self._name: MachineName | None = None
+        self._state_lock: FileLock | None = None
         self._problem = ""
 
     def take(self) -> Self:
         make_private(self._run_dir, close=True)
-        self._lock = FileLock.take(self.path)
-        if self._lock is None:
-            holder = (
-                self.path.read_text(errors="replace", encoding="utf-8").strip("\0\n").partition("\n")[0] or "(unknown)"
-            )
-            raise PebbleError(
-                f"{self._robot} already runs: process {holder} holds {self.path}; end it there with Ctrl-C"
-            )
+        self._lock = self._taken(self.path)
         try:
-            self._name = MachineName.take(self._robot, self._config)
+            self._state_path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+            self._state_lock = self._taken(self._state_path)
+        except (OSError, TransportError) as error:
+            log.warning("a launcher with another run directory is not noticed: %s", error)
         except PebbleError:
             self.release()
             raise
         self._write()
         return self
 
+    def _taken(self, path: Path) -> FileLock:
+        if (lock := FileLock.take(path)) is not None:
+            return lock
+        holder = path.read_text(errors="replace", encoding="utf-8").strip("\0\n").partition("\n")[0] or "(unknown)"
+        raise PebbleError(f"{self._robot} already runs: process {holder} holds {path}; end it there with Ctrl-C")
+
     def _write(self) -> None:
-        if self._lock is not None:
-            self._lock.write(f"{os.getpid()}\n{self._robot}\n".encode())
+        for lock in (self._lock, self._state_lock):
+            if lock is not None:
+                lock.write(f"{os.getpid()}\n{self._robot}\n".encode())
 
     def keep(self) -> None:
         """Make the directory and the lock again if they were removed, by a cleaner or a logout; call it every second.
 
-        It also answers the launchers that ask who holds the robot's name. Raises PebbleError if another launcher has
-        taken the lock.
+        Raises PebbleError if another launcher has taken the lock.
         """
-        if self._name is not None:
-            self._name.answer()
         lock, problem = self._lock, ""
         try:
             if lock is None or lock.in_place:
@@ -84,13 +82,11 @@ class RunLock:
         self._problem = problem
 
     def release(self) -> None:
-        """Release the locks. The file stays, with the process id of the last launcher and its robot."""
-        if self._name is not None:
-            self._name.close()
-            self._name = None
-        if self._lock is not None:
-            self._lock.release(remove=False)
-            self._lock = None
+        """Release the locks. The files stay, with the process id of the last launcher and its robot."""
+        for lock in (self._lock, self._state_lock):
+            if lock is not None:
+                lock.release(remove=False)
+        self._lock = self._state_lock = None
 
     def __enter__(self) -> Self:
         return self.take()

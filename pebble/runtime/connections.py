@@ -12,6 +12,7 @@ from pebble.config import Config, Mqtt, RemoteConnection, RemoteMqtt, SerialBrid
 from pebble.errors import ConfigError, TransportError
 from pebble.runtime.addresses import Addresses
 from pebble.transports import Message, MqttSettings, TlsSettings, Transport, ZenohSettings, check_kind, create
+from pebble.transports.hosts import SMALL_SEGMENT
 from pebble.transports.socket_paths import FRAMES_SOCKET, PEER_SOCKET, fits_socket
 
 if TYPE_CHECKING:
@@ -25,10 +26,9 @@ _VITAL_STATES = (
     *(one.filter(_ANY) for one in (c.ONLINE, c.HEARTBEAT, c.CAPABILITIES, c.ESTOP_STATE)),
     f"{_ANY}/+/control/#",
 )
-_ALL_VITAL = (*_VITAL_STATES, f"{_ANY}/{c.INCOMING}/#")
+ALL_VITAL = (*_VITAL_STATES, f"{_ANY}/{c.INCOMING}/#")
 
 LOCAL_RECONNECT_S, REMOTE_RECONNECT_S = 0.5, 2.0
-SEGMENT = 1200  # bytes of TCP in a packet: with all headers 1280, which every way takes (RFC 8200, section 5)
 _BRIDGE, _STOPS = "remote-bridge", "remote-stops"
 #: RFC 4594: what must not wait, and what may be dropped last of what can. Where a link may be thin.
 _EXPEDITED, _ASSURED = 46, 10
@@ -78,7 +78,7 @@ def local_settings(config: Config, as_published: bool = False) -> Any:
     kind = config.transport.kind
     if kind == "mqtt":
         settings = mqtt_settings(config.local_mqtt, as_published=as_published, reconnect_max_s=LOCAL_RECONNECT_S)
-        return replace_settings(settings, vital=(*_ALL_VITAL, *_renamed_vital(config)))
+        return replace_settings(settings, vital=(*ALL_VITAL, *_renamed_vital(config)))
     if kind == "zenoh":
         return zenoh_settings(config)
     return config.transport.settings
@@ -91,19 +91,11 @@ def remote_transport(config: Config, name: str, *, will: Message | None = None) 
         remote, program = bridge.remote_mqtt, "" if name == _BRIDGE else name
         settings = mqtt_settings(remote, as_published=True, reconnect_max_s=REMOTE_RECONNECT_S, program=program)
         settings = replace_settings(settings, vital=(*_VITAL_STATES, *_renamed_vital(config)))
-        settings = with_choice(config, settings, name)
         if bridge.link.profile != "wide":
             settings = replace_settings(settings, dscp=_EXPEDITED if name == _BRIDGE else _ASSURED)
         return create("mqtt", _name(config, "mqtt", name), settings, will=will)
     kind = bridge.remote.kind
     return create(kind, _name(config, kind, name), _remote_settings(config, bridge.remote), will=will)
-
-
-def with_choice(config: Config, settings: MqttSettings, program: str) -> MqttSettings:
-    """The bridge chooses one of several hosts, and the robot's other programs connect there."""
-    if not settings.hosts:
-        return settings
-    return replace_settings(settings, chosen=config.run_dir() / "remote-host", follows=program != _BRIDGE)
 
 
 def stops_transport(config: Config) -> Transport | None:
@@ -118,7 +110,7 @@ def stops_transport(config: Config) -> Transport | None:
         return None
     if bridge.remote is None:
         settings = _live_only(mqtt_settings(bridge.remote_mqtt, reconnect_max_s=REMOTE_RECONNECT_S, program=_STOPS))
-        return create("mqtt", _name(config, "mqtt", _STOPS), with_choice(config, settings, _STOPS))
+        return create("mqtt", _name(config, "mqtt", _STOPS), settings)
     if bridge.remote.kind != "zenoh":  # what another transport makes of a second connection is not known
         return None
     return create("zenoh", _name(config, "zenoh", _STOPS), _remote_settings(config, bridge.remote))
@@ -126,7 +118,7 @@ def stops_transport(config: Config) -> Transport | None:
 
 def _live_only(settings: MqttSettings) -> MqttSettings:
     """Return the settings of a connection that no retained message holds up: MQTT 5 lets it ask for none."""
-    return replace_settings(settings, max_segment=SEGMENT, sends_retained=False)
+    return replace_settings(settings, max_segment=SMALL_SEGMENT, sends_retained=False)
 
 
 def mirror_transport(config: Config, mirror: Mqtt, name: str) -> Transport:
@@ -269,7 +261,6 @@ def mqtt_settings(
     return MqttSettings(
         host=mqtt.host,
         port=mqtt.port,
-        hosts=mqtt.places if mqtt.hosts else (),
         keepalive_s=mqtt.keepalive,
         username=mqtt.username,
         password=mqtt.password,
@@ -277,11 +268,10 @@ def mqtt_settings(
         tls=tls_settings(mqtt.tls),
         client_id=f"{client_id}-{program}" if client_id and program else client_id,
         protocol=mqtt.protocol,
-        client=mqtt.client,
         as_published=as_published,
         reconnect_max_s=reconnect_max_s,
         silence_s=mqtt.silence_seconds,
-        vital=_ALL_VITAL,
+        vital=ALL_VITAL,
     )
 
 

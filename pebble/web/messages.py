@@ -324,13 +324,6 @@ class Liveness(Struct, frozen=True, kw_only=True):
     whole_seconds: bool  # its clock counts whole seconds: latency says nothing
 
 
-class HostView(Struct, frozen=True, kw_only=True):
-    """``web/host``: at which of several brokers the component is; not sent where the server knows only one."""
-
-    host: str  # and its port
-    first: bool  # it is the preferred one
-
-
 class OwnerState(Struct, frozen=True, kw_only=True):
     """One motor owner in EstopView."""
 
@@ -400,7 +393,7 @@ class BrokerView(Struct, frozen=True, kw_only=True):
 
     connected: bool
     problem: str
-    #: What the server is not sent although it is connected, such as by one of several brokers, and why.
+    #: What the server is not sent although it is connected, and why.
     not_received: str
     robots_omitted: int
     #: Whether a stop was sent to robots that cannot confirm it, because there is no room for more.
@@ -435,7 +428,6 @@ class RestartsView(Struct, frozen=True, kw_only=True):
 
 SERVER_METRICS: dict[str, type] = {
     "web/liveness": Liveness,
-    "web/host": HostView,
     "web/estop": EstopView,
     "web/driver": DriverView,
     "web/picture": PictureView,

@@ -73,7 +73,6 @@ class Server:
 
     async def open(self) -> None:
         """Connect to the broker and subscribe. Raises TransportError for settings that can never work."""
-        self.broker.on_move(self._moved)
         await asyncio.gather(self.broker.open(), self.stop_broker.open())
         self.broker.on_state(self._show_broker)
         self.broker.on_state(self.drivers.renew_keys)
@@ -85,7 +84,6 @@ class Server:
         if self.settings.login:
             self.spawn(self._watch_people())
         self.spawn(self.broker.ask(self.by_name))
-        self.spawn(self.broker.prove_hosts(self._base))
 
     async def close(self) -> None:
         """Stop what pages move, then disconnect."""
@@ -132,11 +130,6 @@ class Server:
         self.by_name.forget(ref)
         for subscription in self._of_all:
             subscription.renew()
-
-    def _moved(self, ref: str, host: str, first: bool) -> None:
-        self.drivers.moved(ref)
-        if host:
-            self.robots.set_server_metric(ref, "web/host", m.HostView(host=host, first=first))
 
     def _show_broker(self) -> None:
         view = m.BrokerView(

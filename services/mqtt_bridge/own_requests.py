@@ -33,12 +33,11 @@ class OwnRequests:
         self.actions = SystemActions(section, folder=config.state_dir(), clock=service.clock)
         self._media = MediaRequests(Media(config.on_demand_programs(), earlier_requests()), notifier.request)
         self._hold = Hold(config.on_demand_programs(), notifier.hold)
-        self._moved_at = self._clock()  # of the newest command that moves something
         self._messages: dict[str, Callable[[bytes], None]] = {
             **{row.request.suffix: partial(self._on_media_request, row.request) for row in MEDIA},
             **{row.channel.suffix: partial(self._on_action, row.channel) for row in ACTIONS},
         }
-        if section.link.profile != "wide" or section.remote_mqtt.hosts:
+        if section.link.profile != "wide":
             self._messages[DRIVE.suffix] = self._on_drive
         self._flags: dict[str, Callable[[bytes], None]] = {
             **{row.flag.suffix: partial(self._on_media_flag, row.flag) for row in MEDIA},
@@ -56,10 +55,6 @@ class OwnRequests:
         reaction = self._flags.get(channel.suffix)
         if reaction is not None:
             reaction(payload)
-
-    def idle_s(self) -> float:
-        """Seconds for which the robot was not driven."""
-        return self._clock() - self._moved_at
 
     def send(self) -> None:
         """Tell the launcher which media programs are to run, and which wait."""
@@ -80,8 +75,6 @@ class OwnRequests:
         """On a thin link pictures and sound wait while a person drives; who the robot obeys is decided elsewhere."""
         with suppress(PayloadError):
             command: Drive = codec.decode(DRIVE, payload)
-            if command.moves:
-                self._moved_at = self._clock()
             thin = self._uplink is not None and self._uplink.level is LEVELS["thin"]
             if thin and command.moves and command.source != SCRIPT:
                 self._post(DRIVE, lambda: self._hold.drive(self._clock()), newest_of="hold")

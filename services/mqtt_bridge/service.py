@@ -106,7 +106,6 @@ class MqttBridge(ForwardingService):
         self._stops = self._make_stops()
         self.transport.judge_topics(is_invented=lambda topic: self.subjects.invented(topic.encode()) is not None)
         self.remote.judge_topics(skips_retained=partial(self.forwarder.skips_retained, Side.REMOTE), delivers_late=True)
-        self.remote.idle_s = self._requests.idle_s
 
     @property
     def winner(self) -> Side:

@@ -89,7 +89,6 @@ class Uplink:
         self._quiet_log = RateLimitedLog(log, period_s=60.0)
         self._heartbeat_at = self._flooded_at = -inf
         self._shed = 0
-        remote.proof = address.topic
         self._suit_transport()
 
     @property

@@ -19,7 +19,7 @@ from pebble.checks.broker import login
 from pebble.checks.broker.account import robot_account
 from pebble.checks.broker.login_attempt import LoginAttempt, attempt
 from pebble.checks.check import CheckResult, State
-from pebble.checks.who import unknown_brokers, who_drives
+from pebble.checks.who import who_drives
 from pebble.config import load, parse
 from pebble.transports.settings import MqttSettings, TlsSettings
 from tests.fleet.brokers import FleetBroker, accounts
@@ -348,17 +348,6 @@ def test_who_can_drive_is_shown_by_the_level_and_by_the_fleet_beside_the_config(
     (tmp_path / "fleet.json").write_text(json.dumps(fleet))
     found = list(who_drives(load(config)))
     assert [f"{result.state.value} {result.text}" for result in found] == expected
-
-
-def test_a_second_broker_that_the_fleet_does_not_have_is_named(tmp_path: Path) -> None:
-    config = tmp_path / "goob.json"
-    remote = {"hosts": ["broker.lab", "spare.lab:8884"], "port": 8883, "username": "goob", "tls": {"enabled": True}}
-    services = {"mqtt_bridge": {"enabled": True, "remote_mqtt": remote}}
-    config.write_text(json.dumps({"robot": {"id": "goob"}, "security": {"level": "login"}, "services": services}))
-    fleet = {"level": "login", "brokers": [{"host": "broker.lab", "port": 8883}]}
-    (tmp_path / "fleet.json").write_text(json.dumps(fleet))
-    (found,) = unknown_brokers(load(config))
-    assert "spare.lab:8884 is no broker of" in found
 
 
 def test_a_fleet_that_cannot_be_read_is_named(tmp_path: Path) -> None:

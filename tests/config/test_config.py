@@ -387,7 +387,6 @@ class TestMistakes:
             ("local_mqtt.port", True, "must be a whole number"),
             ("local_mqtt.keepalive", -1, "must be a whole number from 0 to 65535"),
             ("local_mqtt.protocol", "4", 'must be "3.1.1" or "5"'),
-            ("local_mqtt.client", "pahoo", 'must be "pebble" or "paho"'),
             ("local_mqtt.silence_seconds", 0, "must be a number above 0 and at most 5"),
             ("local_mqtt.silence_seconds", 5.1, "must be a number above 0 and at most 5, not 5.1"),
             ("services.mqtt_bridge.remote_mqtt.silence_seconds", 60, "must be a number above 0 and at most 5, not 60"),
@@ -448,7 +447,7 @@ class TestMistakes:
         ("path", "nearest"),
         [
             ("services.mqtt_bridge.heartbeet", 'did you mean "heartbeat"?'),
-            ("services.mqtt_bridge.remote_mqtt.hots", 'did you mean "hosts"?'),
+            ("services.mqtt_bridge.remote_mqtt.hots", 'did you mean "host"?'),
             ("services.serial_mcu_bridge.serial.baudrate", 'did you mean "baud"?'),
             ("transports", 'did you mean "transport"?'),
             ("services.web", 'the nearest is "web_handler" of autonomy_manager, '),

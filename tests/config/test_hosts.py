@@ -154,31 +154,13 @@ def _remote(**keys: object) -> dict[str, object]:
     return {"robot": {"id": "r"}, "services": {"mqtt_bridge": {"enabled": True, "remote_mqtt": keys}}}
 
 
-def test_a_list_of_brokers_is_brought_into_one_spelling() -> None:
-    mqtt = _parse(_remote(hosts=["a.lan.", "b.lan:8883", "::1", "[::2]:7"], port=1884)).services.mqtt_bridge.remote_mqtt
-    assert mqtt.places == (("a.lan", 1884), ("b.lan", 8883), ("::1", 1884), ("::2", 7))
-    assert (mqtt.host, mqtt.port) == mqtt.places[0]
-    assert _parse(_remote(hosts=["a.lan"])) == _parse(_remote(host="a.lan"))
-
-
-@pytest.mark.parametrize(
-    ("keys", "problem"),
-    [
-        ({"host": "c", "hosts": ["a", "b"]}, "host: is given beside hosts, which takes its place: leave out host"),
-        ({"hosts": ["a", "b", "A:1883"]}, "hosts: names A:1883 twice, leave one of them"),
-        ({"hosts": [f"b{number}" for number in range(9)]}, "hosts: must be 8 at most, not 9"),
-        ({"hosts": ["mqtt://b:1883"]}, "is a URL: write"),
-        ({"hosts": ["ann:s3cr3t@b"]}, "holds a login"),
-        ({"hosts": ["b/topic:7"]}, "holds a path"),
-    ],
-)
-def test_what_is_wrong_with_a_list_is_named(keys: dict[str, object], problem: str) -> None:
+@pytest.mark.parametrize("hosts", [["a"], ["a", "b:1884"], ["mqtt://ann:s3cr3t@b"]])
+@pytest.mark.parametrize("section", ["services.mqtt_bridge.remote_mqtt", "local_mqtt", "web_interface.mqtt"])
+def test_a_list_of_brokers_is_one_error_that_says_so(section: str, hosts: list[str]) -> None:
+    raw: dict[str, object] = {"hosts": hosts}
+    for key in reversed(section.split(".")):
+        raw = {key: raw} | ({"enabled": True} if key == "remote_mqtt" else {})
     with pytest.raises(ConfigError) as caught:
-        _parse(_remote(**keys))
-    assert problem in str(caught.value)
-    assert "s3cr3t" not in str(caught.value)
-
-
-def test_a_robots_own_broker_is_one() -> None:
-    with pytest.raises(ConfigError, match=r"local_mqtt\.hosts: cannot be several"):
-        _parse({"robot": {"id": "r"}, "local_mqtt": {"hosts": ["a", "b"]}})
+        _parse({"robot": {"id": "r"}, **raw})
+    (problem,) = caught.value.problems
+    assert problem.startswith(f"{section}: hosts is no key any more: write host, a name that has")

@@ -1,4 +1,4 @@
-"""docs/asyncapi.yaml is valid for AsyncAPI's own schema, and has every channel."""
+"""The AsyncAPI document is valid for AsyncAPI's own schema, and has every channel."""
 
 from __future__ import annotations
 
@@ -8,15 +8,11 @@ from functools import reduce
 from typing import Any
 
 import jsonschema
-import pytest
 import yaml
 
-from pebble.contract import CHANNELS, asyncapi
+from pebble.contract import CHANNELS
 from pebble.contract.asyncapi import document
-from pebble.contract.docs import ASYNCAPI
-from pebble.contract.schemas import schemas
 from tests.kit.npm import package
-from tests.support import ROOT
 
 
 def references(part: Any) -> Iterator[str]:
@@ -52,14 +48,3 @@ def test_it_is_valid_and_has_every_channel() -> None:
 def test_every_reference_names_a_part() -> None:
     whole = yaml.safe_load(document())
     assert all(at(whole, reference) for reference in references(whole))
-
-
-def test_a_field_that_was_renamed_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The file in docs/ is not that of a contract in which one field has another name."""
-    text = json.dumps(schemas())
-    assert '"reset_refused"' in text
-    monkeypatch.setattr(asyncapi, "schemas", lambda: json.loads(text.replace('"reset_refused"', '"reset_denied"')))
-    file = ROOT / "docs" / ASYNCAPI
-    assert asyncapi.document() != file.read_text()
-    monkeypatch.undo()
-    assert asyncapi.document() == file.read_text()

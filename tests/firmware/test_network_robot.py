@@ -274,32 +274,6 @@ def test_every_address_of_its_broker_has_a_turn_and_the_one_that_worked_comes_ag
     assert (drill.robot.session.connection.state, drill.robot.session.connection.losses) == ("online", losses + 1)
 
 
-def test_of_two_brokers_it_uses_one_and_returns_to_the_first_when_it_has_rested() -> None:
-    drill = Drill("minilamp", 1)
-    drill.network.hosts = {"a.test": "10.0.0.1", "b.test": "10.0.0.2", "pool.ntp.org": "10.0.0.3"}  # one answers
-    settings = {"robot": {"id": "rover"}, "wifi": {"ssid": "home"}, "mqtt": {"host": ["a.test", "b.test"]}}
-    drill.robot = drill.board.load("minilamp", settings)
-    drill.run(40)
-    session = drill.robot.session
-    losses = session.connection.losses
-
-    def rest(minutes: int) -> None:
-        """Have it rest for so long, without the time that takes."""
-        session.last = (session.last - 60_000 * minutes) % (1 << 30)  # as ticks wrap
-        drill.run(drill.seconds + 10)
-
-    assert session.connection.state == "online"
-    rest(29)
-    assert session.connection.losses == losses
-    rest(1)
-    assert (session.connection.state, session.connection.losses) == ("online", losses + 2), "a has failed again"
-    drill.network.hosts["a.test"] = "10.0.0.2"
-    rest(30)
-    assert (session.connection.state, session.connection.losses) == ("online", losses + 3)
-    rest(30)
-    assert session.connection.losses == losses + 3, "it is at the first one"
-
-
 class FakeSocket:
     """Takes everything at once; ``reads``, ``datagrams`` and ``writes`` are what it returns, ``sent`` what it got."""
 

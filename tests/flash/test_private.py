@@ -35,16 +35,6 @@ def test_the_settings_hold_identity_wifi_and_broker() -> None:
     assert private.ca is None
 
 
-def test_a_list_of_brokers_goes_along_and_each_shows_its_own_name() -> None:
-    listed = config(host="", hosts=["a.lab", "b.lab"], tls={"enabled": True, "ca_cert": str(CA)})
-    mqtt = private_files(listed, C6, ssid="Lab", wifi_password="").settings["mqtt"]
-    assert (mqtt["host"], mqtt["tls"]) == (["a.lab", "b.lab"], {"ca": "/ca.der"})
-    with pytest.raises(ConfigError, match="one port for all"):
-        private_files(config(host="", hosts=["a.lab", "b.lab:1884"]), D1, ssid="Lab", wifi_password="")
-    with pytest.raises(ConfigError, match="the board itself"):
-        check_broker(config(host="", hosts=["a.lab", "127.0.0.1"]))
-
-
 @pytest.mark.parametrize(
     ("security", "section"),
     [

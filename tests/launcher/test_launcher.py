@@ -262,7 +262,7 @@ def test_the_lock_of_a_killed_launcher_is_free_at_once(launch: Launch) -> None:
     robot.process.wait(10)
     try:
         assert not gone(pid)
-        with RunLock(robot.run_dir, BASE, robot.config):
+        with RunLock(robot.run_dir, BASE, robot.run_dir / "state.lock"):
             pass
     finally:
         os.kill(pid, signal.SIGKILL)

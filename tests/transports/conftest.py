@@ -12,30 +12,28 @@ from pathlib import Path
 import pytest
 
 from tests.transports.memory_net import MemoryNet
-from tests.transports.mqtt_net import MqttNet
+from tests.transports.mqtt_net import MqttNet, PahoNet
 from tests.transports.net import Net
 from tests.transports.zenoh_net import ZenohNet
 
-NETS: dict[str, Callable[[Path, str], Net]] = {
-    "memory": lambda _folder, _client: MemoryNet(),
-    "mqtt311": lambda folder, client: MqttNet(folder, "3.1.1", client),
-    "mqtt5": lambda folder, client: MqttNet(folder, "5", client),
-    "zenoh": lambda folder, _client: ZenohNet(folder),
+NETS: dict[str, Callable[[Path], Net]] = {
+    "memory": lambda _folder: MemoryNet(),
+    "mqtt311": lambda folder: MqttNet(folder, "3.1.1"),
+    "mqtt5": lambda folder: MqttNet(folder, "5"),
+    "zenoh": ZenohNet,
+    "paho311": lambda folder: PahoNet(folder, "3.1.1"),
+    "paho5": lambda folder: PahoNet(folder, "5"),
 }
 _numbers = itertools.count(1)
 
 
-#: A kind, and the client library below it.
-KINDS = [(kind, "") for kind in NETS] + [
-    pytest.param((kind, "paho"), marks=pytest.mark.thorough) for kind in ("mqtt311", "mqtt5")
-]
+KINDS = [pytest.param(kind, marks=[pytest.mark.thorough] if kind.startswith("paho") else []) for kind in NETS]
 
 
-@pytest.fixture(scope="module", params=KINDS, ids=lambda one: "-".join(filter(None, one)))
+@pytest.fixture(scope="module", params=KINDS)
 def network(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Net]:
     """One per module and kind; its broker or hub is started."""
-    kind, client = request.param
-    net = NETS[kind](tmp_path_factory.mktemp("net"), client or "pebble")
+    net = NETS[request.param](tmp_path_factory.mktemp("net"))
     net.start_network()
     yield net
     net.stop()

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import sys
+import tomllib
 from pathlib import Path
 from typing import Any, ClassVar
 
-from pebble.transports import MqttSettings
-from tests.support import Broker
+from pebble.transports import GROUP, MqttSettings
+from tests.support import ROOT, Broker
 from tests.transports.net import Net
 
 
@@ -14,13 +16,13 @@ class MqttNet(Net):
     kind = "mqtt"
     patient: ClassVar[dict[str, Any]] = {"silence_s": 20.0}
 
-    def __init__(self, folder: Path, protocol: str, client: str) -> None:
+    def __init__(self, folder: Path, protocol: str) -> None:
         super().__init__()
-        self._library = {"protocol": protocol, "client": client}
+        self._protocol = protocol
         self._broker = Broker(folder, persistence=True)
 
     def settings(self, **changes: Any) -> Any:
-        settings = {"host": "127.0.0.1", "port": self._broker.port, **self._library, **changes}
+        settings = {"host": "127.0.0.1", "port": self._broker.port, "protocol": self._protocol, **changes}
         return MqttSettings(**settings)
 
     def echoless_settings(self) -> Any:
@@ -52,3 +54,23 @@ class MqttNet(Net):
     def stop(self) -> None:
         self.close_clients()
         self._broker.kill()
+
+
+class PahoNet(MqttNet):
+    """The same broker, and the transport of the extension, found as that of a package that is installed."""
+
+    kind = "paho"
+
+    def __init__(self, folder: Path, protocol: str) -> None:
+        super().__init__(folder, protocol)
+        points = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["entry-points"][GROUP]
+        self._offers = folder / "offers"
+        package = self._offers / "extension-1.dist-info"
+        package.mkdir(parents=True)
+        (package / "METADATA").write_text("Name: extension\nVersion: 1\n")
+        (package / "entry_points.txt").write_text(f"[{GROUP}]\npaho = {points['paho']}\n")
+        sys.path.append(str(self._offers))
+
+    def stop(self) -> None:
+        super().stop()
+        sys.path.remove(str(self._offers))

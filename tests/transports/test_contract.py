@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import base64
+import os
 import pickle
 import random
 import subprocess
@@ -854,7 +855,8 @@ if raises:
 def test_T17_a_process_that_forgets_to_close_still_exits(net: Net, base: str, raises: bool) -> None:
     settings = net.portable_settings()
     recipe = base64.b64encode(pickle.dumps((net.kind, settings, base, raises))).decode()
-    ended = subprocess.run([sys.executable, "-c", FORGETFUL, recipe], cwd=ROOT, timeout=30, check=False)
+    env = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
+    ended = subprocess.run([sys.executable, "-c", FORGETFUL, recipe], cwd=ROOT, env=env, timeout=30, check=False)
     assert ended.returncode == (3 if raises else 0)
 
 

@@ -9,7 +9,7 @@ from importlib.metadata import EntryPoint, EntryPoints
 import pytest
 
 from pebble.errors import TransportError
-from pebble.transports import GROUP, MqttSettings, State, create
+from pebble.transports import GROUP, State, create
 from pebble.transports.memory import MemoryHub, MemoryTransport
 from tests.support import ROOT
 
@@ -58,21 +58,3 @@ create("mqtt", "client", MqttSettings(host="localhost"))
 assert "zenoh" not in sys.modules, "mqtt does not need zenoh"
 """
     subprocess.run([sys.executable, "-c", program], cwd=ROOT, check=True, timeout=30)
-
-
-@pytest.mark.parametrize(
-    ("client", "missing", "words"),
-    [
-        ("paho", "paho", '"client": "paho" needs a package that is missing .*: pip install paho-mqtt, or leave out'),
-        ("own", "none", 'client must be "pebble" or "paho", not "own"'),
-    ],
-)
-def test_a_client_library_that_cannot_be_used_is_one_clear_error(
-    monkeypatch: pytest.MonkeyPatch, client: str, missing: str, words: str
-) -> None:
-    monkeypatch.delitem(sys.modules, "pebble.transports.mqtt.paho_client", raising=False)
-    for name in [missing, *(name for name in sys.modules if name.startswith(f"{missing}."))]:
-        monkeypatch.setitem(sys.modules, name, None)  # which is how Python notes that there is none
-    with pytest.raises(TransportError, match=words) as error:
-        create("mqtt", "client", MqttSettings(host="localhost", client=client))
-    assert "\n" not in str(error.value)

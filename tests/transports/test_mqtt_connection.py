@@ -17,7 +17,8 @@ from pebble.transports.hosts import addresses_of
 from pebble.transports.mqtt import packets
 from pebble.transports.mqtt.client import Opening
 from pebble.transports.mqtt.connection import Connection
-from pebble.transports.mqtt.ending import Silent
+from pebble.transports.mqtt.ending import Lost, Silent
+from pebble.transports.mqtt.packets import Filter
 from pebble.transports.mqtt.transport import MqttTransport
 from tests.support import until
 from tests.transports.test_mqtt_packets import packet
@@ -284,9 +285,19 @@ def test_a_discarded_connection_sends_nothing_more(link: Link) -> None:
         list(iter(lambda: link.other.recv(1 << 20), b""))
 
 
-def test_a_ping_follows_the_next_message_of_a_topic_that_may_be_at_fault(link: Link) -> None:
-    link.connection.pings.doubtful.add("a")
-    for topic in ("b", "a", "a"):
-        link.connection.publish(Message(topic, b""))
-    message = b"\x30\3\0\1"
-    assert link.written() == message + b"b" + message + b"a" + packets.PINGREQ + message + b"a"
+def test_a_packet_has_eight_filters_at_most_and_what_was_asked_is_named_when_the_connection_is_lost(link: Link) -> None:
+    names = [f"t/{number}" for number in range(20)]
+    link.connection.subscribe([(name, False) for name in names])
+    ack = link.connection.unsubscribe(names)
+    filters = [Filter(name, 1) for name in names]
+    parts = (filters[:8], filters[8:16], filters[16:])
+    packed = [packets.subscribe(mid, part, modern=False) for mid, part in enumerate(parts, 1)]
+    assert link.written().startswith(b"".join(packed))
+    for mid, count in enumerate(map(len, parts)):
+        link.sends(packet(0x90, bytes((0, mid + 1)) + b"\1" * count), packet(0xB0, bytes((0, mid + 4))))
+        link.connection.pump(1.0, link.messages.extend)
+        assert ack.done is (mid == 2)
+    link.connection.subscribe([(name, False) for name in names])
+    link.other.close()
+    with pytest.raises(Lost, match="asked to deliver t/0, t/1, t/2 and 17 more"):
+        list(iter(lambda: link.connection.pump(1.0, link.messages.extend), ""))

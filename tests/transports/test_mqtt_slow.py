@@ -14,7 +14,6 @@ import pytest
 from pebble.transports import Message, MqttSettings, QoS, State, create
 from pebble.transports.mqtt import packets
 from pebble.transports.mqtt.ending import Silent
-from pebble.transports.mqtt.retention import RetainedProof
 from pebble.transports.mqtt.transport import MqttTransport
 from tests.support import Broker, until
 from tests.tcp_proxy import TcpProxy
@@ -128,31 +127,6 @@ def message(topic: str, payload: bytes = b"x") -> Message:
     return Message(topic, payload, QoS.DELIVERED, retain=True)
 
 
-class TestProof:
-    """What is sent: names of topics, and values of the proof, with ``!`` where the one before is confirmed."""
-
-    @pytest.mark.parametrize(
-        ("history", "proving", "unproved"),
-        [
-            ("", "", ""),
-            ("a b", "", ""),
-            ("=1", "1", ""),
-            ("a =1 b c", "1", "b c"),
-            ("=1 a =2 b", "1 2", "a b"),  # either may be the newest one of the broker
-            ("=1 a !=2 b", "1 2", "a b"),  # 1 was confirmed; whether 2 arrives is not known
-            ("=1 a !=2 b !=3 c", "2 3", "b c"),
-            ("=1 a =2 b =3 !=4 c", "3 4", "c"),
-        ],
-    )
-    def test_histories(self, history: str, proving: str, unproved: str) -> None:
-        proof = RetainedProof(PROOF)
-        for word in history.split():
-            value = word.partition("=")[2]
-            proof.sent(message(PROOF, value.encode()) if value else message(word), confirmed=word[0] == "!")
-        assert [one for one in "01234" if proof.proves(one.encode())] == proving.split()
-        assert proof.unproved == set(unproved.split())
-
-
 class Recorder(TcpProxy):
     """Keeps what clients send."""
 
@@ -179,7 +153,6 @@ class Robot:
         self.proxy = proxy
         settings = MqttSettings(host="127.0.0.1", port=proxy.port, reconnect_max_s=0.1)
         self.transport = create("mqtt", "robot", settings, will=message(WILL, b"offline"))
-        self.transport.proof = PROOF
         self.transport.suit_link(slow=slow)
         self.transport.open(10)
         for topic in STATES:
@@ -237,40 +210,3 @@ def test_a_connection_made_anew_publishes_no_will(broker: Broker, recorder: Reco
         assert until(lambda: seen.messages)
         assert wills.messages == []
     robot.transport.close()
-
-
-class TestBeginning:
-    @pytest.fixture
-    def robot(self, broker: Broker, recorder: Recorder) -> Iterator[Robot]:
-        robot = Robot(broker, recorder)
-        yield robot
-        robot.transport.close()
-
-    def test_asks_for_little_where_the_broker_has_lost_nothing(self, robot: Robot, broker: Broker) -> None:
-        robot.publish(STATES[3], b"after the proof")
-        robot.confirm()
-        assert robot.reconnects(lambda: robot.publish(STATES[5], b"meanwhile")) == [3, 5]
-        assert len(robot.proxy.sent) < 600
-        found = values(broker)
-        assert [found[STATES[number]] for number in (3, 4, 5)] == [b"after the proof", b"old", b"meanwhile"]
-
-    def test_asks_for_all_where_it_has_not(self, robot: Robot, broker: Broker) -> None:
-        broker.kill()
-        assert robot.reconnects(broker.start) == ALL
-        assert until(lambda: set(values(broker)) == {*STATES, PROOF})
-
-    def test_notices_an_older_save(self, robot: Robot, broker: Broker) -> None:
-        """Which has a value of the proof, too, and one that is not much older."""
-        broker.save()
-        robot.publish(STATES[7], b"newer")
-        for number in range(3, 6):
-            robot.publish(PROOF, b"%d" % number)
-            robot.confirm()
-        broker.kill()
-        assert robot.reconnects(broker.start) == ALL
-        assert until(lambda: values(broker)[STATES[7]] == b"newer")
-
-    def test_asks_for_all_on_a_wide_link(self, broker: Broker, recorder: Recorder) -> None:
-        robot = Robot(broker, recorder, slow=False)
-        assert robot.reconnects() == ALL
-        robot.transport.close()

@@ -13,13 +13,13 @@ from unittest import mock
 
 import pytest
 
+from pebble.extensions.paho.client import PahoClient
 from pebble.transports import create
 from pebble.transports.hosts import CONNECT_TIMEOUT_S, Address
-from pebble.transports.mqtt.client import Opening
-from pebble.transports.mqtt.client_kinds import client_class
+from pebble.transports.mqtt.client import Client, Opening
 from pebble.transports.settings import MqttSettings, TlsSettings
 from pebble.transports.tls import make_context
-from tests.support import ROOT, Broker, further, until
+from tests.support import ROOT, Broker, until
 from tests.tcp_proxy import TcpProxy
 
 CERTS = ROOT / "tests" / "data" / "tls"
@@ -106,16 +106,13 @@ class SlowHello(TcpProxy):
 _HELD_S = 1.3
 
 
-@pytest.mark.parametrize("kind", ["pebble", further("paho")])
-def test_what_is_slow_is_remembered(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str) -> None:
+def test_what_is_slow_is_remembered(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The first attempt ends before an answer can be there; the next one waits, and so does each that follows."""
     monkeypatch.setattr("pebble.transports.hosts.CONNECT_TIMEOUT_S", 1.0)
     files = [f"cafile {CERTS}/ca.crt", f"certfile {CERTS}/server.crt", f"keyfile {CERTS}/server.key"]
     broker = Broker(tmp_path, *files)
     with SlowHello(broker.port) as proxy:
-        settings = MqttSettings(
-            host="localhost", port=proxy.port, tls=TlsSettings(ca_cert=CERTS / "ca.crt"), client=kind
-        )
+        settings = MqttSettings(host="localhost", port=proxy.port, tls=TlsSettings(ca_cert=CERTS / "ca.crt"))
         with create("mqtt", "tool", settings) as transport:
             assert until(lambda: transport.counters["connected"] == 1, 30)
             first = proxy.held
@@ -128,13 +125,13 @@ def test_what_is_slow_is_remembered(tmp_path: Path, monkeypatch: pytest.MonkeyPa
 _PIECE, _PIECE_S = 150, 0.4  # bytes at 3 kbit/s
 
 
-@pytest.mark.parametrize("kind", ["pebble", "paho"])
+@pytest.mark.parametrize("client_class", [Client, PahoClient])
 @pytest.mark.parametrize("silent_after", [1000, 2])
-def test_a_handshake_may_take_long_while_bytes_arrive(silent_after: int, kind: str) -> None:
+def test_a_handshake_may_take_long_while_bytes_arrive(silent_after: int, client_class: type[Client]) -> None:
     context = make_context(TlsSettings(ca_cert=CERTS / "ca.crt"))
     with closing(SlowServer(silent_after)) as server:
         opening = Opening("id", MqttSettings(host="localhost"), context, None, server.address)
-        client = client_class(kind)(opening, mock.Mock(), bridge=False)
+        client = client_class(opening, mock.Mock(), bridge=False)
         began = time.monotonic()
         with nullcontext() if silent_after > 2 else pytest.raises(TimeoutError, match="TLS handshake"):
             client.open()

@@ -114,8 +114,6 @@ class World:
                 self.views[ref].capabilities = {}
             case ["takes", "names"]:
                 self.nameless = "goob takes commands with names only"
-            case ["moves", "host"]:
-                self.drivers.moved(ref)
 
     def perform_page(self, who: str, ref: str, what: list[str]) -> None:
         if what == ["returns"]:
@@ -366,12 +364,6 @@ HISTORIES = {
         stop: final
         robot tells nothing
         stop: final""",
-    "a robot that is at another broker needs a new gesture": """
-        ann takes
-        ann drives 1: go
-        robot moves host: final
-        ann drives 1: Let go first
-        ann drives 2: go""",
     # -- control
     "without control nothing moves": """
         ann drives 1: Take control to drive

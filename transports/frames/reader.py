@@ -17,9 +17,8 @@ import zenoh
 from pebble.errors import TransportError
 from pebble.transports import segments
 from pebble.transports.counters import Counters
-from pebble.transports.frames import reclaim, shared_memory, views
+from pebble.transports.frames import shared_memory, views
 from pebble.transports.frames.frame import Frame, FrameInfo, decode
-from pebble.transports.frames.reclaim import WriterMemory
 from pebble.transports.frames.session import METADATA, SharingError, StreamNames, open_reading
 from pebble.transports.peers import prepare_run_dir
 from pebble.transports.wakeup import Wakeup
@@ -28,9 +27,9 @@ from pebble.transports.zenoh.session import check_process, close_at_exit, close_
 
 log = logging.getLogger(__name__)
 
-#: Bytes of shared memory that a reader may have mapped besides that of the current writer. Memory of dead writers is
-#: reclaimed where possible; beyond this limit the reader receives frames as bytes, and `problem` explains it.
-LEFT_MAPPED_LIMIT = 256 << 20
+#: Bytes that a reader may have mapped. Zenoh leaves the memory of dead writers mapped until the process ends (zenoh
+#: #2787): beyond this limit the reader receives frames as bytes, and `problem` explains it.
+MAPPED_LIMIT = 256 << 20
 
 _T = TypeVar("_T")
 
@@ -57,7 +56,8 @@ class FrameReader:
         self._count_received, self._count_shared = map(self.counters.adder, ("received", "shared"))
         self.problem = ""
         self._latest: _LatestFrames[_Arrival] = _LatestFrames(depth)  # closed while the reader is
-        self.running = RunningWriters()
+        self.running: set[int] = set()  # ids of writers
+        self._seen: set[int] = set()  # those that were counted
         self._order = _Order()
         self._sharing_ended = threading.Event()
         self._lacked_room = False  # in shared memory, when the session was opened
@@ -148,7 +148,6 @@ class FrameReader:
             check_process(self._pid)
             if self._sharing_ended.is_set():
                 self._reopen()
-            reclaim.reclaim()
             arrival = self._latest.take(end)
             frame = None if arrival is None or self._sharing_ended.is_set() else self._frame(arrival)
             if frame is not None:
@@ -165,17 +164,13 @@ class FrameReader:
                 yield frame
 
     def _frame(self, arrival: _Arrival) -> Frame | None:
-        info, payload, memory = arrival
+        info, payload = arrival
         buffer = payload.as_shm()
         if buffer is None:
             self.counters.add("copied")
             return Frame(info, _copy(bytes(payload)), shared=False)
         self._count_shared()
-        memory = memory or self.running.get(info.writer)  # its first frame may come before its token
-        if memory is None or reclaim.is_reclaimed(memory):
-            self.counters.add("torn")  # of a writer that has ended: its memory may have been reclaimed
-            return None
-        view = views.array(buffer, len(payload), owner=memory)
+        view = views.array(buffer, len(payload))
         if self._views and view is not None:
             return Frame(info, view, shared=True, buffer=buffer)
         own = _copy(bytes(buffer)) if view is None else view.copy()
@@ -198,41 +193,39 @@ class FrameReader:
         if missed:
             self.counters.add("missed", missed)
         self._count_received()
-        if skipped := self._latest.put((info, sample.payload, self.running.get(info.writer))):
+        if skipped := self._latest.put((info, sample.payload)):
             self.counters.add("skipped", skipped)
 
     def _on_writer(self, sample: zenoh.Sample) -> None:
         try:
-            writer_id, memory = self._names.writer_of(str(sample.key_expr))
+            writer_id, size, segment = self._names.writer_of(str(sample.key_expr))
         except ValueError:
             self.counters.add("refused")
             return
         if sample.kind != zenoh.SampleKind.PUT:
-            self.running.pop(writer_id, None)
+            self.running.discard(writer_id)
             return
-        new = writer_id not in self.running.seen
+        new = writer_id not in self._seen
         if new:
-            self.running.seen.add(writer_id)
+            self._seen.add(writer_id)
             self.counters.add("writers")
-        self.running[writer_id] = memory
-        if new and memory.size and self._lacked_room:  # it has found room: so may this reader
+        self.running.add(writer_id)
+        if new and size and self._lacked_room:  # it has found room: so may this reader
             self._lacked_room = False
             self._reopen_soon("")
-        if memory.size and self.shared and (problem := self._why_not_map(memory)):
+        if size and self.shared and (problem := self._why_not_map(size, segment)):
             self._reopen_soon(problem)
 
-    def _why_not_map(self, memory: WriterMemory) -> str:
-        if reclaim.is_reclaimed(memory):
-            return f"the writer of {self._names.stream} was taken for dead: its frames come as bytes until a restart"
-        if memory.file and any(file.endswith(memory.file) for _, _, file in segments.mappings()):
+    def _why_not_map(self, size: int, segment: str) -> str:
+        mapped = segments.mappings()
+        if any(file.endswith(segment) for _, _, file in mapped):
             return ""  # as before: only the connection was lost
-        left = reclaim.unclaimed_bytes()
-        if left > LEFT_MAPPED_LIMIT:
+        if (left := sum(end - start for start, end, _ in mapped)) > MAPPED_LIMIT:
             return (
                 f"writers of {self._names.stream} were restarted so often that {left >> 20} MiB of their memory are "
                 "lost until this process is restarted: from now on it gets frames as bytes"
             )
-        needed = memory.size + METADATA
+        needed = size + METADATA
         return "" if shared_memory.lockable(needed) else self._memlock_problem(needed)
 
     def _reopen_soon(self, problem: str) -> None:
@@ -254,15 +247,7 @@ class FrameReader:
         return shared_memory.memlock_problem(size, f"a reader of {self._names.stream}")
 
 
-_Arrival = tuple[FrameInfo, zenoh.ZBytes, WriterMemory | None]
-
-
-class RunningWriters(dict[int, WriterMemory]):
-    """The memory of the writers that run, by their ids; ``seen``: those that were counted."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.seen: set[int] = set()
+_Arrival = tuple[FrameInfo, zenoh.ZBytes]
 
 
 class _Order:

@@ -10,7 +10,6 @@ from pathlib import Path
 import zenoh
 
 from pebble.errors import TransportError
-from pebble.transports.frames.reclaim import WriterMemory, writer_memory
 from pebble.transports.settings import ZenohSettings
 from pebble.transports.socket_paths import check_socket_path
 from pebble.transports.zenoh.session import open_session, session_config
@@ -46,11 +45,10 @@ class StreamNames:
         """The token of a running writer: it includes how many bytes it shares, and in which segment."""
         return f"{self.writers.removesuffix('*/*/*')}{writer_id:x}/{size}/{segment or '-'}"
 
-    def writer_of(self, token: str) -> tuple[int, WriterMemory]:
-        """The id and the memory of the writer with this token. Raises ValueError if it is not a writer's token."""
+    def writer_of(self, token: str) -> tuple[int, int, str]:
+        """The id of the writer with this token, how many bytes it shares, and in which segment. Raises ValueError."""
         *_, writer_id, size, segment = token.split("/")
-        number = int(writer_id, 16)
-        return number, writer_memory("" if segment == "-" else segment, int(size), self.lock_path(number))
+        return int(writer_id, 16), int(size), segment
 
     def lock_path(self, writer_id: int) -> Path:
         """The file that this writer locks while it is open."""

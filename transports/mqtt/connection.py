@@ -11,15 +11,14 @@ import threading
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
-from typing import Protocol
+from typing import Protocol, TypeVar
 
 from pebble.transports import clock, hosts
 from pebble.transports.base import Answer, Message, Outgoing, QoS
 from pebble.transports.counters import Counters
 from pebble.transports.mqtt.bridge_mode import Result
 from pebble.transports.mqtt.broker_limits import EVERYTHING, Limits
-from pebble.transports.mqtt.client import Opening, TlsLateError, keep_unsent, one_packet
-from pebble.transports.mqtt.client_kinds import AnyClient, client_class
+from pebble.transports.mqtt.client import Client, Opening, TlsLateError, keep_unsent, one_packet
 from pebble.transports.mqtt.ending import Absent, Lost, Refused, Silent, TlsLate
 from pebble.transports.mqtt.incoming import OVERSLEPT_S, Incoming, Sink
 from pebble.transports.mqtt.outgoing import (
@@ -32,8 +31,9 @@ from pebble.transports.mqtt.outgoing import (
 )
 from pebble.transports.mqtt.packets import Filter
 from pebble.transports.mqtt.poll import SocketPoll
-from pebble.transports.mqtt.suspects import Written
 
+T = TypeVar("T")
+FILTERS = 8  # in one packet: AWS IoT closes the connection for more
 UNACKED_LIMIT = 1000  # DELIVERED messages the broker has not acknowledged; beyond it they are refused,
 UNACKED_RESERVE = 100  # except so many stops: the messages before them may be those of strangers
 _OVERHEAD = 1 + 4 + 2 + 2 + 1 + 5  # bytes of a PUBLISH besides topic and payload, at most: with an expiry
@@ -76,6 +76,7 @@ class Connection:
         where: str,
         as_published: bool,
         limits: Limits = EVERYTHING,
+        client_class: type[Client] = Client,
     ) -> None:
         self.opened_s = 0.0  # so long TCP and TLS took
         self.dialling = True  # connect(2) or a TLS handshake may be blocking, and cannot be interrupted
@@ -91,7 +92,7 @@ class Connection:
         self.pings = self.incoming.pings
         self._poll = SocketPoll()
         bridge = as_published and opening.settings.protocol != "5"
-        self._client: AnyClient = client_class(opening.settings.client)(opening, self.incoming, bridge=bridge)
+        self._client = client_class(opening, self.incoming, bridge=bridge)
 
     # -- opening and closing
 
@@ -303,9 +304,6 @@ class Connection:
             message.topic, message.payload, int(message.qos), retain=message.retain, expires_s=expires_s
         )
         self._in_flight.sent(message, mid, clock.since_boot())
-        if (doubtful := self.pings.doubtful) and message.topic in doubtful:
-            doubtful.discard(message.topic)
-            self.pings.send(self._client)
 
     def subscribe(self, filters: Iterable[tuple[str, bool]], qos: QoS = QoS.DELIVERED) -> PendingAck:
         """Subscribe to filters, each with its noLocal option (MQTT 5 only)."""
@@ -313,21 +311,21 @@ class Connection:
         wanted = [
             Filter(text, most, no_local, self.incoming.as_published, sends_retained) for text, no_local in filters
         ]
-        return self._request(lambda: self._client.subscribe(wanted), wanted, [one.text for one in wanted])
+        return self._request(self._client.subscribe, wanted, [one.text for one in wanted])
 
     def unsubscribe(self, filters: list[str]) -> PendingAck:
-        return self._request(lambda: self._client.unsubscribe(filters), filters, [])
+        return self._request(self._client.unsubscribe, filters, [])
 
-    def _request(self, send: Callable[[], int], filters: Sequence[object], asked: list[str]) -> PendingAck:
+    def _request(self, send: Callable[[Sequence[T]], int], filters: Sequence[T], asked: Sequence[str]) -> PendingAck:
+        """Send a few filters in each packet, and return the answer to the last one, which follows the others."""
         ack = PendingAck()
-        if not filters:
-            ack.complete()
-            return ack
         with self._lock:
-            if self._client.socket is None:
+            for at in range(0, len(filters), FILTERS):
+                if self._client.socket is not None:
+                    ack = PendingAck()
+                    self._in_flight.ask(send(filters[at : at + FILTERS]), ack, asked[at : at + FILTERS])
+            if not filters or self._client.socket is None:
                 ack.complete()
-            else:
-                self._in_flight.ask(send(), ack, asked)
         self.wake()
         return ack
 
@@ -345,7 +343,7 @@ class Connection:
 
     @property
     def _lost(self) -> Lost:
-        return self.incoming.ending.lost(accepted=self.incoming.accepted is not None)
+        return self.incoming.ending.lost(accepted=self.incoming.accepted is not None, asked=self._in_flight.asked)
 
     @property
     def has_room(self) -> bool:
@@ -386,27 +384,22 @@ class Connection:
             delivered_s, late_s = self.incoming.age.delay.delivery(clock.since_boot())
             return Answer(number, seconds, queue_s, delivered_s, late_s) if number else None
 
-    @property
-    def confirmed(self) -> Limits:
-        """What this connection has shown the broker to have."""
-        return Limits(self._in_flight.has_retained, int(self._in_flight.has_acknowledged))
-
-    def is_unconfirmed(self, topic: str) -> bool:
-        """Whether the broker may lack the newest retained message of ``topic``."""
-        with self._lock:
-            return self._in_flight.is_unconfirmed(topic)
-
     def unconfirmed_retained(self) -> list[Message]:
         """Retained messages that the broker may not have received, oldest first."""
         with self._lock:
             return self._in_flight.unconfirmed_retained()
 
-    def has_accepted(self, topic: str, size: int) -> bool:
-        """Whether the broker has answered a ping after a message of ``topic`` that was as large."""
-        with self._lock:
-            return self._in_flight.has_accepted(topic, size)
+    @property
+    def lost_bytes(self) -> int:
+        """The bytes of the largest message for which the broker was silent to the end of the connection."""
+        return self._in_flight.lost_bytes
 
-    def written_before_loss(self) -> dict[str, Written] | None:
+    @property
+    def has_confirmed(self) -> bool:
+        """True if the broker has confirmed a retained message or one of QoS 1."""
+        return self._in_flight.has_confirmed
+
+    def written_before_loss(self) -> dict[str, int] | None:
         """What the other side may have closed the connection for; None: it has not, or for another reason."""
         with self._lock:
             ending = self.incoming.ending

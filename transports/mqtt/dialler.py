@@ -2,58 +2,43 @@
 
 import threading
 import time
-from collections.abc import Callable, Mapping
 from dataclasses import replace
 
 from pebble.transports.base import Message
 from pebble.transports.counters import Counters
 from pebble.transports.credentials import Credentials
-from pebble.transports.hosts import CONNECT_TIMEOUT_S, Address, Place, Turns
+from pebble.transports.hosts import SMALL_SEGMENT, Address, Place, Turns
 from pebble.transports.mqtt import client_ids
 from pebble.transports.mqtt.bridge_mode import Attempt, BridgeMode, Result
-from pebble.transports.mqtt.broker_limits import EVERYTHING, BrokerLimits, Limits
-from pebble.transports.mqtt.chosen_host import HostChoice
-from pebble.transports.mqtt.client import Opening
+from pebble.transports.mqtt.broker_limits import EVERYTHING, BrokerLimits
+from pebble.transports.mqtt.client import Client, Opening
 from pebble.transports.mqtt.connection import Connection, Owner
 from pebble.transports.mqtt.ending import Absent, Lost, Refused, Silent, TlsLate
 from pebble.transports.settings import MqttSettings
 
 _ENDING_S = 1.0  # so long a broker that ends may still accept connections, and hang up on them
+_LARGE = 1000  # bytes from which a message fills a packet, which some ways lose without a word
+_LARGE_LOST = 3  # such losses in a row, and connections have small segments
 _HESITATION_S = 0.5  # a CONNACK that takes longer comes over a very slow connection, or from a suspended broker
-
-
-class _Alone:
-    """The owner of a connection that only logs in."""
-
-    def note_answers(self, refused: Mapping[str, bool]) -> None:
-        pass
-
-    def note_refusal(self, topic: str, why: str) -> None:
-        pass
-
-    def is_stop(self, _topic: str, /) -> bool:
-        return False
-
-    def skips_retained(self, _topic: bytes, /) -> bool:
-        return True
 
 
 class Dialler:
     """Remembers how the attempts at a broker have ended, and makes the next one."""
 
-    def __init__(self, client_id: str, settings: MqttSettings, will: Message | None) -> None:
+    def __init__(
+        self, client_id: str, settings: MqttSettings, will: Message | None, client_class: type[Client] = Client
+    ) -> None:
         # It stays the same over reconnects: the broker closes our own half-dead connection at once.
         self._client_id = client_ids.unique(client_id) if settings.client_id is None else settings.client_id
-        self._settings, self._will = settings, will
-        self.hosts = HostChoice(settings, self._accepts_login)
-        self.turns = Turns(self.hosts.next_round)
-        self.moved = False  # the newest connection is to another host than the one before
+        self._settings, self._will, self._client_class = settings, will, client_class
+        self.turns = Turns(Place(settings.host, settings.port))
         self.attempt: Connection | None = None  # the newest connection, in any state
         self.stalled = False  # the broker may have been suspended, and have old messages to forward first
         self._credentials: Credentials | None = None
         self._address: Address | None = None
         self._bridge_mode, self.limits = BridgeMode(), BrokerLimits()  # of the broker at this address
         self.reported = EVERYTHING  # what the log says it has
+        self._large_lost = 0  # connections in a row that went silent on something large
         self._gone_at = float("-inf")  # when the broker was last known to be gone
 
     def open(self) -> None:
@@ -75,49 +60,9 @@ class Dialler:
         self.limits.begin(time.monotonic())
 
     @property
-    def address(self) -> str:
-        """The address of the newest attempt, in words; empty before that."""
-        return "" if self._address is None else self._address.text
-
-    @property
     def where(self) -> str:
         """The broker in words, with the address if its host has several."""
         return self.turns.where
-
-    # -- one of several hosts
-
-    def succeeded(self) -> str:
-        """The connection can be used; returns which addresses failed before it, and how."""
-        self.hosts.connected(self.turns.place)
-        return self.turns.succeeded()
-
-    def leave(self, idle_s: Callable[[], float]) -> str:
-        """Why to leave this host now, see `HostChoice.why_leave`; the next turn is another host's then."""
-        if why := self.hosts.why_leave(idle_s):
-            self.turns.begin_anew()
-        return why
-
-    def _accepts_login(self, place: Place, address: Address) -> bool:
-        """On a thread of :attr:`hosts`."""
-        assert self._credentials is not None  # noqa: S101 - there is a connection
-        password, given = self._credentials.password(), self._settings.client_id
-        settings = replace(self._settings, host=place.host, port=place.port, password=password)
-        id_ = client_ids.unique("pebble_return") if given is None else f"{given}-return"
-        connection = Connection(
-            Opening(id_, settings, self._credentials.context(), None, address, CONNECT_TIMEOUT_S),
-            Counters(),
-            _Alone(),
-            where=str(place),
-            as_published=False,
-        )
-        try:
-            connection.connect(threading.Event())
-            connection.disconnect()
-        except Lost:
-            return False
-        finally:
-            connection.discard()
-        return True
 
     # -- one attempt
 
@@ -138,14 +83,13 @@ class Dialler:
                 connection.discard()
         self._note_result(Result.ACCEPTED)
         self.turns.opened(connection.opened_s)
-        self.moved = self.hosts.moves_to(self.turns.place)
         return connection
 
     def _make(self, will: Message | None, owner: Owner, counters: Counters, *, as_published: bool) -> Connection:
         assert self._address is not None  # noqa: S101 - both callers run at an address
         assert self._credentials is not None  # noqa: S101 - and while it is open
-        place, password = self.turns.place, self._credentials.password()
-        settings = replace(self._settings, host=place.host, port=place.port, password=password)
+        segment = SMALL_SEGMENT if self.loses_large else self._settings.max_segment
+        settings = replace(self._settings, password=self._credentials.password(), max_segment=segment)
         self.attempt = Connection(
             Opening(self._client_id, settings, self._credentials.context(), will, self._address, self.turns.patience_s),
             counters,
@@ -153,6 +97,7 @@ class Dialler:
             where=self.where,
             as_published=as_published,
             limits=self.limits.limits,
+            client_class=self._client_class,
         )
         return self.attempt
 
@@ -182,22 +127,18 @@ class Dialler:
 
     def _note_result(self, result: Result) -> None:
         self._bridge_mode.note(result)
-        if self._will is not None or result is Result.ACCEPTED:  # without a will nothing is left to refuse
-            self.limits.note_connect(result, time.monotonic(), last=self._is_last_attempt)
+        if self._will is not None and (self._is_last_attempt or result is not Result.HUNG_UP):
+            self.limits.note_connect(result, time.monotonic())
 
     def _note_probe(self, result: Result) -> None:
         if self._bridge_mode.next_attempt is Attempt.PROBE:
             self._bridge_mode.note(result)
         self.limits.note_probe(result)
 
-    def tries_less(self, connection: Connection, *, held: bool) -> bool:
-        """Whether the connection may be lost because of what the broker lacks: the next one uses less."""
-        now = time.monotonic()
-        if (lacks := connection.incoming.ending.lacks) is not None:
-            self.limits.note_connect(lacks, now, last=True)
-            return True
-        in_flight = Limits(bool(connection.unconfirmed_retained()), int(connection.unacked > 0))
-        return self.limits.note_loss(in_flight, connection.confirmed, now, held=held)
+    @property
+    def loses_large(self) -> bool:
+        """True if the way to the broker seems to lose large packets: connections have small segments from then on."""
+        return self._large_lost >= _LARGE_LOST and not self._settings.max_segment
 
     def is_gone(self, lost: Lost, *, connected: bool, was_ended: bool) -> bool:
         """Whether the other end is gone: nothing listens, or it hangs up as one that is just ending does."""
@@ -205,6 +146,9 @@ class Dialler:
         self.stalled |= silent
         if isinstance(lost, TlsLate):
             self.turns.was_slow()
+        large = silent and self.attempt is not None and self.attempt.lost_bytes > _LARGE
+        if not self.loses_large and (silent or isinstance(lost, TlsLate)):  # a certificate is large, too
+            self._large_lost = self._large_lost + 1 if large or not silent else 0
         if connected:
             self._gone_at = now
             return not silent
@@ -223,7 +167,7 @@ class Dialler:
         if self._is_last_attempt and not asks_again:
             failed = turns.failed(problem.removeprefix(f"{self.where} "), held_s)
             if turns.several:
-                problem = f"broker {failed}" if turns.has_hosts else f"broker {turns.place}: {failed}"
+                problem = f"broker {turns.place}: {failed}"
         if asks_again and held_s <= 0:
             return "", False
         return problem, held_s > 0 or turns.is_over or not turns.several

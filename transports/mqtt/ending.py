@@ -4,6 +4,7 @@ from pebble.transports.mqtt import reasons
 from pebble.transports.mqtt.bridge_mode import Result
 from pebble.transports.settings import MqttSettings
 
+_SHOWN = 3  # filters
 _LACKS = {reasons.NO_RETAIN: Result.RETAIN_REFUSED, reasons.NO_QOS: Result.QOS_REFUSED}
 
 
@@ -13,10 +14,6 @@ class Lost(Exception):  # noqa: N818  (an event, not a mistake)
 
 class Silent(Lost):
     """The other side does not answer."""
-
-
-class Leaving(Exception):  # noqa: N818  (an event, not a mistake)
-    """We have left this host for another one. Its text explains why."""
 
 
 class Absent(Lost):
@@ -42,7 +39,6 @@ class Ending:
         self.where, self._settings = where, settings
         self.begun = False  # it has refused us, or sent DISCONNECT
         self.refusal: Refused | None = None
-        self.lacks: Result | None = None  # why it has ended the connection, if it lacks something
         self.reason = ""  # that of its DISCONNECT
         self.may_concern_message = False  # that reason
         self._taken_over = True  # may be: MQTT 3.1.1 has no words for it
@@ -58,11 +54,13 @@ class Ending:
         self.begun, self.reason = True, f"{self.where} closed the connection: {reasons.words(code)}"
         self._taken_over = code == reasons.TAKEN_OVER
         self.may_concern_message = reasons.may_concern_message(code)
-        self.lacks = _LACKS.get(code)
 
-    def lost(self, *, accepted: bool) -> Lost:
-        """The other side has closed the connection, which it had ``accepted``."""
+    def lost(self, *, accepted: bool, asked: list[str]) -> Lost:
+        """Return why the other side has closed a connection that it had ``accepted``, and was ``asked`` filters on."""
         why, id_ = self.reason or f"{self.where} closed the connection", self._settings.client_id
         if id_ is not None and accepted and self._taken_over:
             why += f' (does another client use the client id "{id_}"? a broker lets in only the newest)'
+        if asked:
+            more = f" and {len(asked) - _SHOWN} more" if len(asked) > _SHOWN else ""
+            why += f", asked to deliver {', '.join(asked[:_SHOWN])}{more}"
         return Lost(why)

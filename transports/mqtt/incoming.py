@@ -7,7 +7,7 @@ from pebble.transports import clock
 from pebble.transports.base import Message, QoS
 from pebble.transports.counters import Counters
 from pebble.transports.mqtt import reasons
-from pebble.transports.mqtt.client_kinds import AnyClient
+from pebble.transports.mqtt.client import Client
 from pebble.transports.mqtt.ending import Ending, Lost, Silent
 from pebble.transports.mqtt.outgoing import InFlightTable
 from pebble.transports.mqtt.packets import ANY_QOS, RETAIN, Accepted, MalformedError
@@ -70,7 +70,7 @@ class Incoming:
             self._counters.add("silences")
             raise Silent(f"{self.ending.where} has not answered for {limit:.1f} s")
 
-    def read(self, client: AnyClient, now: float) -> None:
+    def read(self, client: Client, now: float) -> None:
         """Read up to a batch: several times, where more than fits at once has come, or a piece of what TLS unpacks.
 
         ``now``: a time before anything is read. Raises Lost.
@@ -108,7 +108,7 @@ class Incoming:
         if not self.more:
             waiting.empty(age.received_at)
 
-    def _end(self, client: AnyClient) -> None:
+    def _end(self, client: Client) -> None:
         if self.ending.refusal is not None:
             raise self.ending.refusal
         client.close()

@@ -14,7 +14,6 @@ from contextlib import suppress
 from dataclasses import dataclass
 
 from pebble.transports.base import Message, QoS
-from pebble.transports.mqtt.suspects import SMALL, TOPICS, WINDOW_S, Written
 
 try:
     import fcntl
@@ -28,6 +27,9 @@ BACKLOG_MESSAGES = 64  # that are not retained
 BACKLOG_BYTES = 256 * 1024  # of their payloads; one message may always wait, whatever its size
 ROUND_TRIPS = 8  # answer times that are remembered
 
+WINDOW_S = 1.0  # a broker that hangs up because of a message does it so soon after the message was written
+SMALL = 256  # bytes that every broker takes: smaller messages count as so large
+TOPICS = 1000  # that are remembered
 _TCP_INFO = getattr(socket, "TCP_INFO", None)  # Linux only
 _RTT = struct.Struct("@I")  # microseconds
 _RTT_AT, _MIN_RTT_AT = 68, 148  # bytes; in struct tcp_info (linux/tcp.h): tcpi_rtt, and since 4.5 tcpi_min_rtt
@@ -129,8 +131,8 @@ class InFlightTable:
         self._round_trips: deque[float] = deque(maxlen=ROUND_TRIPS)  # the latest, seconds
         self._unacked: dict[int, tuple[str, float]] = {}  # by message id: the topic, and when sent
         self._acked_at = float("-inf")  # the newest acknowledgement
+        self.has_confirmed = False  # the broker, a DELIVERED or a retained message
         self._unconfirmed: dict[str, _Unconfirmed] = {}  # newest retained message of each topic, oldest first
-        self.has_acknowledged = self.has_retained = False  # the broker, a DELIVERED or a retained message
         self._requests: dict[int, tuple[PendingAck, Sequence[str]]] = {}  # unanswered, with the filters of a SUBSCRIBE
         self.answered: list[PendingAck] = []  # and not completed yet
         #: Unanswered: when sent, what waits for it, and what was written before it and after the ping before.
@@ -139,6 +141,7 @@ class InFlightTable:
         self._written: dict[str, tuple[float, int]] = {}
         self._accepted: dict[str, tuple[float, int]] = {}  # that an answered ping followed.
         self._ping_number = self._pong_number = 0
+        self.lost_bytes = 0  # of the largest message for which the other side was silent to the end
         self._newest_s = 0.0  # how long the newest answer to a ping took
 
     # -- messages
@@ -181,29 +184,23 @@ class InFlightTable:
         """Process a PUBACK: when its message was sent; None if it belongs to no known message."""
         if mid not in self._unacked:
             return None
-        self._acked_at, self.has_acknowledged = now, True
+        self._acked_at, self.has_confirmed = now, True
         topic, sent_at = self._unacked.pop(mid)
         if topic in self._unconfirmed and self._unconfirmed[topic].mid == mid:
             del self._unconfirmed[topic]
-            self.has_retained = True
         return sent_at
 
     def topic_of(self, mid: int) -> str | None:
         """The topic of a DELIVERED message that is not acknowledged; None: there is no such message."""
         return self._unacked[mid][0] if mid in self._unacked else None
 
-    def has_accepted(self, topic: str, size: int) -> bool:
-        """Whether the answer to a ping has followed a message of ``topic`` that was as large."""
-        return topic in self._accepted and size <= self._accepted[topic][1]
-
-    def first_written(self, now: float) -> dict[str, Written]:
-        """Topics with a message within the last `WINDOW_S` that was the first one on them, or the largest."""
-        since = now - WINDOW_S - self.round_trip_s
-        found = {topic: Written(size, True) for topic, (at, size) in self._accepted.items() if at >= since}
+    def first_written(self, now: float) -> dict[str, int]:
+        """Return the bytes by topic of what was written lately, and was its first message or largest, not yet read."""
+        found: dict[str, int] = {}
         for written in (*(written for _, _, written in self._pings), self._written):
             for topic, (at, size) in written.items():
-                if at >= since and not self.has_accepted(topic, size):
-                    found[topic] = Written(max(size, found[topic].size if topic in found else 0))
+                if at >= now - WINDOW_S - self.round_trip_s:
+                    found[topic] = max(size, found.get(topic, 0))
         return found
 
     # -- requests and pings
@@ -219,6 +216,11 @@ class InFlightTable:
         ack, filters = self._requests.pop(mid)
         self.answered.append(ack)
         return filters
+
+    @property
+    def asked(self) -> list[str]:
+        """The filters of each SUBSCRIBE that is not answered."""
+        return [filter_ for _, filters in self._requests.values() for filter_ in filters]
 
     def complete(self) -> None:
         """Complete the answered requests, once the messages received before the answers have been delivered."""
@@ -244,7 +246,7 @@ class InFlightTable:
             _note(self._accepted, topic, at, max(size, SMALL))
         for topic in [t for t, entry in self._unconfirmed.items() if entry.ping and entry.ping <= self._pong_number]:
             del self._unconfirmed[topic]
-            self.has_retained = True
+            self.has_confirmed = True
         if ack is not None:
             self.answered.append(ack)
 
@@ -261,12 +263,10 @@ class InFlightTable:
         waits = now - self._pings[0][0] if self._pings else 0.0
         return self._pong_number, max(self._newest_s, waits)
 
-    def is_unconfirmed(self, topic: str) -> bool:
-        """Whether the broker may lack the newest retained message of ``topic``."""
-        return topic in self._unconfirmed
-
     def end(self) -> None:
         """Complete everything: no answer can come any more."""
+        first = self._pings[0][2] if self._pings else self._written
+        self.lost_bytes = max((size for _, size in first.values()), default=0)
         self.complete()
         for ack in [*(ack for ack, _ in self._requests.values()), *(ack for _, ack, _ in self._pings if ack)]:
             ack.complete()

@@ -4,7 +4,7 @@ import random
 from math import inf
 
 from pebble.transports import clock
-from pebble.transports.mqtt.client_kinds import AnyClient
+from pebble.transports.mqtt.client import Client
 from pebble.transports.mqtt.outgoing import InFlightTable, PendingAck, unconfirmed_bytes
 from pebble.transports.mqtt.read_age import ReadAge
 from pebble.transports.settings import MqttSettings
@@ -29,8 +29,6 @@ class Pings:
         self._stalled_since = (
             age.waiting.checked_at
         )  # when the last time without reading began, for which a ping was sent
-        #: Topics whose next message is followed by a ping at once: its answer shows that the broker accepts it.
-        self.doubtful: set[str] = set()
 
     def joins(self, now: float) -> bool:
         """Whether a ping goes along with the message that is sent at ``now``."""
@@ -40,7 +38,7 @@ class Pings:
         """The broker has accepted us."""
         self.due_at = now + self._interval_s
 
-    def send(self, client: AnyClient, ack: PendingAck | None = None) -> None:
+    def send(self, client: Client, ack: PendingAck | None = None) -> None:
         sock = client.socket
         ahead = client.unwritten + (0 if sock is None else unconfirmed_bytes(sock))
         now = clock.since_boot()
@@ -50,7 +48,7 @@ class Pings:
         self._age.delay.asked(now, clear=ahead <= _CLEAR)
         client.ping()
 
-    def send_after_stall(self, client: AnyClient, now: float) -> None:
+    def send_after_stall(self, client: Client, now: float) -> None:
         """Send one for each time without reading: its answer comes after what has waited at the broker meanwhile."""
         since = self._age.waiting.checked_at
         if since != self._stalled_since:

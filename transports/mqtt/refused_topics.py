@@ -1,62 +1,119 @@
-"""Topics on which a broker takes no messages: it says so, or it hangs up on them."""
+"""Topics on which a broker takes no messages: it says so on MQTT 5, or hangs up on them, as 3.1.1 has no words for it.
+
+A topic is withheld after three losses in a row, each soon after a message on it. Where that is true of several, they
+are tried one at a time from then on, so that only the one at fault stays withheld. Pure but for the log.
+"""
 
 import logging
-import time
 from collections.abc import Iterator, Mapping
 from math import inf
+from typing import NamedTuple
 
 from pebble.transports.base import Message
 from pebble.transports.bounds import BoundedTable
-from pebble.transports.mqtt.connection import Connection
-from pebble.transports.mqtt.suspects import TOPICS, Kind, SuspectTopics, Written
-from pebble.transports.topics import MAX_BYTES
+from pebble.transports.mqtt.outgoing import TOPICS, WINDOW_S
+from pebble.transports.topics import MAX_BYTES, matches
 
 log = logging.getLogger(__name__)
 
-_TRY_S = 0.25  # between two looks whether a topic that is withheld may be tried
-_NOT_TAKEN_S = 600.0  # between two log lines about one topic that the broker does not take
+LOSSES = 3  # of connections in a row, after which a topic is withheld
+QUIET_S = 2.0  # after a loss, before a topic is tried
+RETRY_S = 60.0  # between two trials of a topic that is at fault
+LARGE = 4096  # bytes from which the size of a message is the most likely reason: smaller ones are still sent
+_NOT_TAKEN_S = 600.0  # between two log lines about one topic
+
+
+class Withheld(NamedTuple):
+    """Messages of one topic that are not sent: those of ``size`` bytes and more, until it is tried."""
+
+    size: int
+    tried_at: float
+
+
+class Trial(NamedTuple):
+    """A topic that was withheld and is sent again: it is free at ``ends_at``, unless the connection is lost before."""
+
+    topic: str
+    ends_at: float
 
 
 class RefusedTopics:
-    """The transport's lock of publishing guards all but `report`."""
+    """``vital``: filters of topics that are never withheld, except for their size. The lock of publishing guards it."""
 
     def __init__(self, client_id: str, vital: tuple[str, ...]) -> None:
-        self._client_id = client_id
-        self.suspects = SuspectTopics(vital)
-        self.withheld = self.suspects.withheld
+        self._client_id, self._vital = client_id, vital
+        self._losses: dict[str, int] = {}  # in a row, by topic
+        self.withheld: dict[str, Withheld] = {}
+        self._trial: Trial | None = None
+        self._quiet_at = -inf  # from then on what else is sent was accepted, so that a trial shows something
         #: Topics on which the broker takes no messages: why, and when that was last in the log.
         self.not_taken = BoundedTable[tuple[str, float]](TOPICS, TOPICS * MAX_BYTES, lambda _: 0)
-        self.arrived_at = -inf  # the newest message
-        self._tried_at = 0.0  # when it was last looked whether one of them may be tried
 
-    def note_loss(self, where: str, written: Mapping[str, Written] | None) -> None:
-        assessment = self.suspects.lost(written, time.monotonic())
-        if assessment is not None:
-            level = logging.WARNING if assessment.kind is Kind.SUSPECTED else logging.ERROR
-            log.log(level, "%s: %s", self._client_id, assessment.text(where))
+    def accepts(self, message: Message) -> bool:
+        """True if it may be sent."""
+        entry = self.withheld.get(message.topic)
+        if entry is None or len(message.payload) < entry.size:
+            return True
+        return self._trial is not None and self._trial.topic == message.topic
 
-    def report(self, where: str, topic: str, why: str, level: int = logging.WARNING) -> None:
+    def admits(self, message: Message, now: float) -> bool:
+        """True if it may be sent; the next one of a topic that is due is its trial."""
+        if self._trial is None and not self.accepts(message) and self._is_due(message.topic, now):
+            self._trial = Trial(message.topic, now + WINDOW_S)
+        return self.accepts(message)
+
+    def _is_due(self, topic: str, now: float) -> bool:
+        return now >= max(self.withheld[topic].tried_at, self._quiet_at)
+
+    def due(self, own: Mapping[str, Message], where: str, now: float) -> Iterator[Message]:
+        """Yield the retained message that is to be sent now, because its topic is tried; end the trial before."""
+        if self._trial is not None:
+            if now < self._trial.ends_at:
+                return
+            topic, self._trial = self._trial.topic, None
+            self.withheld.pop(topic, None)
+            if self.not_taken.pop(topic, None) is not None:
+                log.info("%s: %s accepts messages on %s again", self._client_id, where, topic)
+        for topic in self.withheld:
+            if topic in own and self._is_due(topic, now):
+                self._trial = Trial(topic, now + WINDOW_S)
+                yield own[topic]
+                return
+
+    def note_loss(self, where: str, written: Mapping[str, int] | None, now: float) -> None:
+        """The connection is lost. ``written``: bytes by topic, just before; None: for no message's sake."""
+        written, trial, self._trial = written or {}, self._trial, None
+        self._quiet_at = now + QUIET_S
+        if trial is not None and {topic for topic in written if not self._is_vital(topic)} == {trial.topic}:
+            self._blame(where, trial.topic, written[trial.topic], now)
+            return
+        self._losses = {topic: self._losses.get(topic, 0) + 1 for topic in written}
+        often = {topic: written[topic] for topic, losses in self._losses.items() if losses >= LOSSES}
+        large = {topic: size for topic, size in often.items() if size >= LARGE}
+        suspects = large or {topic: size for topic, size in often.items() if not self._is_vital(topic)}
+        if len(suspects) == 1:
+            self._blame(where, *suspects.popitem(), now)
+        elif suspects:
+            self.withheld |= {topic: Withheld(0, now) for topic in suspects if len(self.withheld) < TOPICS}
+        elif all(map(self._is_vital, written)):
+            for topic, size in often.items():
+                why = f"{_closes(size)}, without which this account cannot run a robot"
+                self.report(where, topic, why, now, logging.ERROR)
+
+    def _blame(self, where: str, topic: str, size: int, now: float) -> None:
+        if topic in self.withheld or len(self.withheld) < TOPICS:
+            self.withheld[topic] = Withheld(size // 2 if size >= LARGE else 0, now + RETRY_S)
+        self.report(where, topic, f"{_closes(size)}, so it is not sent but for a trial each minute", now, logging.ERROR)
+
+    def _is_vital(self, topic: str) -> bool:
+        return any(matches(filter_, topic) for filter_ in self._vital)
+
+    def report(self, where: str, topic: str, why: str, now: float, level: int = logging.WARNING) -> None:
         """Log it once for each topic, and again after a while: any number of messages may follow."""
-        now = time.monotonic()
         if now - self.not_taken.get(topic, ("", -inf))[1] >= _NOT_TAKEN_S:
             self.not_taken[topic] = why, now
             log.log(level, "%s: %s does not take a message on %s: %s", self._client_id, where, topic, why)
 
-    def to_try(self, connection: Connection, own: Mapping[str, Message]) -> Iterator[Message]:
-        """What is to be sent now: the newest of a topic that the broker accepts again, and the next one to try."""
-        now = time.monotonic()
-        confirmed = self.suspects.confirm(now, connection.has_accepted)
-        if confirmed is not None:
-            tried, reported = confirmed
-            if reported:
-                log.info("%s: %s accepts messages on %s again", self._client_id, connection.where, tried.topic)
-            if (newest := own.get(tried.topic)) is not None and newest is not tried:
-                yield newest
-        elif now - self._tried_at < _TRY_S:
-            return
-        self._tried_at = now
-        for topic in self.suspects.due(now, self.arrived_at):
-            message = own.get(topic)
-            if message is not None and not self.suspects.accepts(message):
-                yield message
-                return
+
+def _closes(size: int) -> str:
+    return f"it closes the connection when {size} bytes are published there"

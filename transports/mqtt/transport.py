@@ -8,24 +8,22 @@ import threading
 import time
 from collections.abc import Callable, Collection, Mapping, Sequence
 from math import ceil
+from typing import ClassVar
 
 from pebble.errors import TransportError
 from pebble.transports import clock
 from pebble.transports.base import Answer, Message, Outgoing, QoS, State, Subscription, Transport
-from pebble.transports.mqtt.client_kinds import client_class
+from pebble.transports.mqtt.client import Client
 from pebble.transports.mqtt.connection import Connection, ignore
 from pebble.transports.mqtt.dialler import Dialler
-from pebble.transports.mqtt.ending import Leaving, Lost, Silent
+from pebble.transports.mqtt.ending import Lost, Silent
 from pebble.transports.mqtt.filters import BrokerFilters, OwnMessageFilter, overlap
 from pebble.transports.mqtt.outgoing import PendingAck
-from pebble.transports.mqtt.refused_topics import RefusedTopics
-from pebble.transports.mqtt.retention import RetainedProof, RetentionChecks
-from pebble.transports.mqtt.suspects import is_large, named
+from pebble.transports.mqtt.refused_topics import LARGE, RefusedTopics
 from pebble.transports.settings import MqttSettings
 
 log = logging.getLogger(__name__)
 
-_ASKED = 8  # topics of one SUBSCRIBE: AWS IoT closes the connection for more
 _ANSWER_S = 2.0  # longest wait for a SUBACK, and for the retained messages after it
 _CLOSING_S = 1.0  # longest wait for unacknowledged messages when closing
 _DIALLING_S = 0.2  # longest wait for a thread that may be in connect(2)
@@ -33,8 +31,8 @@ _RETRY_S = 0.05  # second attempt to connect; doubles up to settings.reconnect_m
 _CATCH_UP_S = 0.5  # time for a broker that was suspended to deliver its backlog before we subscribe
 _STEADY_S = 2.0  # after a connection this long the first retry is immediate
 _REPEAT_LOG_S = 30.0  # between two equal log lines
-_SUBSCRIBED, _PUBLISHED = "subscriptions", "publications"  # what a host may refuse
 _TRIED_S = 1.0  # after which a connection shows what the broker has
+_IDLE_S = 60.0  # the connection wakes up earlier, for its pings
 
 
 class _Run:
@@ -55,22 +53,21 @@ class _Run:
 class MqttTransport(Transport):
     """docs/transports.md explains how it implements each promise."""
 
+    client_class: ClassVar[type[Client]] = Client
+
     def __init__(self, client_id: str, settings: MqttSettings, *, will: Message | None = None) -> None:
         super().__init__(client_id, will=will)
         if settings.protocol not in ("3.1.1", "5"):
             raise TransportError(f'protocol must be "3.1.1" or "5", not "{settings.protocol}"')
-        client_class(settings.client)  # a package that is missing is an error now, not in a thread
         self.settings = settings
         self.as_published = settings.as_published
         self.exact_echo = settings.as_published or settings.protocol == "5"
-        self._dialler = Dialler(client_id, settings, will)
+        self._dialler = Dialler(client_id, settings, will, self.client_class)
         self._connection: Connection | None = None  # the newest one, once it can be used
         self._filters = BrokerFilters()
         self._own_message_filter = OwnMessageFilter()
         self._network: _Run | None = None
         self._refused = RefusedTopics(client_id, settings.vital)
-        self._retention = RetentionChecks()
-        self._retained_proof: RetainedProof | None = None
         self._logged = ("", 0.0)  # the newest problem in the log, and when it went there
 
     @property
@@ -81,11 +78,6 @@ class MqttTransport(Transport):
     @property
     def untried(self) -> bool:
         return self._dialler.turns.untried
-
-    @property
-    def host(self) -> str:
-        dialler = self._dialler
-        return str(dialler.turns.place) if dialler.hosts.several and self._connection is not None else ""
 
     @property
     def outgoing(self) -> Outgoing:
@@ -114,7 +106,6 @@ class MqttTransport(Transport):
 
     def _open(self, timeout: float) -> None:  # noqa: ARG002  (base waits)
         self._dialler.open()
-        self._retained_proof = RetainedProof(self.proof) if self.proof else None
         if self._network is not None:
             self._network.join(_ANSWER_S)  # closed while it was dialling
         self._network = _Run(self._run, f"pebble-mqtt {self.client_id}")
@@ -138,25 +129,16 @@ class MqttTransport(Transport):
             return False
         if not connection.takes(message):
             why = f"{len(message.payload)} bytes, but it takes packets of {connection.max_packet} at most"
-            self._refused.report(connection.where, message.topic, why, logging.ERROR)
+            self._refused.report(connection.where, message.topic, why, time.monotonic(), logging.ERROR)
             self.counters.add("too_large")
             return True
-        tried = False
-        if self._refused.withheld and not self._refused.suspects.accepts(message):
-            tried = self._refused.suspects.tries(message, time.monotonic(), self._refused.arrived_at)
-            if not tried:
-                self.counters.add("withheld")
-                return True  # as if it were sent: nothing may wait behind it
-            connection.pings.doubtful.add(message.topic)
+        if self._refused.withheld and not self._refused.admits(message, time.monotonic()):
+            self.counters.add("withheld")
+            return True  # as if it were sent: nothing may wait behind it
         expires_s = ceil(self.settings.silence_s) if urgent and not message.retain else None
         if message.retain:
             self._own_message_filter.note_own(message)
-            if self._retained_proof is not None:
-                self._retained_proof.sent(message, confirmed=not connection.is_unconfirmed(self._retained_proof.topic))
-        accepted = connection.publish(message, expires_s=expires_s)
-        if tried and not accepted:
-            self._refused.suspects.give_up()
-        return accepted
+        return connection.publish(message, expires_s=expires_s)
 
     def _declare(self, subscription: Subscription) -> None:
         self._declare_all([subscription])
@@ -181,22 +163,17 @@ class MqttTransport(Transport):
                 ack.wait(deadline - time.monotonic())
 
     def ask(self, topics: Collection[str]) -> None:
-        deadline, rest, acks = time.monotonic() + _ANSWER_S, list(topics), list[PendingAck]()
-        while rest:
-            asked, rest = rest[:_ASKED], rest[_ASKED:]
-            acks += self._ask(asked)
-        for ack in acks:
-            ack.wait(deadline - time.monotonic())
-
-    def _ask(self, topics: list[str]) -> list[PendingAck]:
+        deadline = time.monotonic() + _ANSWER_S
         with self._filters.lock:
             connection, names = self._connection, [topic for topic in topics if topic not in self._filters]
             if connection is None or not names:
-                return []
+                return
             for name in names:
                 self._own_message_filter.subscribe_again(name)
             asked = connection.subscribe([(name, self._no_local(name)) for name in names], QoS.LATEST)
-            return [asked, connection.ping(), connection.unsubscribe(names)]
+            acks = [asked, connection.ping(), connection.unsubscribe(names)]
+        for ack in acks:
+            ack.wait(deadline - time.monotonic())
 
     def _undeclare(self, subscription: Subscription) -> None:
         with self._filters.lock:
@@ -220,13 +197,13 @@ class MqttTransport(Transport):
             began, problem = time.monotonic(), "failed unexpectedly"
             try:
                 self._run_connection(run)
-            except Leaving as leaving:
-                self.problem, self.was_ended, failures = str(leaving), False, 0
-                self._log(logging.INFO, str(leaving))
-                continue
             except Lost as lost:
                 connected = self._state is State.CONNECTED
+                before = self._dialler.loses_large
                 self.was_ended = self._dialler.is_gone(lost, connected=connected, was_ended=self.was_ended)
+                if self._dialler.loses_large and not before:
+                    text = "the way there seems to lose large packets (a wrong MTU?): from now on they are small"
+                    log.warning("%s: %s: %s", self.client_id, self._dialler.where, text)
                 problem = str(lost)
             except Exception:  # any error must lead to a reconnect, never end the thread
                 log.exception("%s: unexpected failure of the connection", self.client_id)
@@ -272,13 +249,10 @@ class MqttTransport(Transport):
         tried_at = time.monotonic() + _TRIED_S
         try:
             self._synchronize(connection, run.stopping)
-            if failed := self._dialler.succeeded():
+            if failed := self._dialler.turns.succeeded():
                 self._log(logging.INFO, f"connected to {connection.where}; before it {failed}")
             while not run.stopping.is_set():
-                receive = self._deliver_all if self._retention.current is None else self._deliver_and_note
-                connection.pump(self._dialler.hosts.patience_s, receive)
-                if leaving := self._dialler.leave(self.idle_s):
-                    self._leave(connection, leaving)
+                connection.pump(_IDLE_S, self._deliver_all)
                 if run.renewal:
                     connection.disconnect()
                     raise Lost(run.renewal)
@@ -288,69 +262,28 @@ class MqttTransport(Transport):
                     self._sync_retained(self._own.keys())
                 if self._refused.withheld:
                     self._try_withheld(connection)
-                if self._retention.current is not None:
-                    self._check_retention(connection)
         except Silent:
             with self._publishing:
-                self._refused.note_loss(connection.where, None)
+                self._refused.note_loss(connection.where, None, time.monotonic())
             raise
         except Lost:
             # First whether it lacks what all such messages need: else each of their topics would seem to be at fault.
-            less = self._dialler.tries_less(connection, held=time.monotonic() > tried_at)
-            written = connection.written_before_loss()
-            if not (less or self._dialler.limits.undecided) or is_large(written):
+            written, now = connection.written_before_loss(), time.monotonic()
+            lacks = written is not None and self._dialler.limits.note_loss(
+                unconfirmed=connection.unacked > 0 or bool(connection.unconfirmed_retained()),
+                confirmed=connection.has_confirmed,
+                now=now,
+            )
+            if not lacks or max((written or {}).values(), default=0) >= LARGE:
                 with self._publishing:
-                    self._refused.note_loss(connection.where, written)
+                    self._refused.note_loss(connection.where, written, now)
             raise
 
     def _try_withheld(self, connection: Connection) -> None:
-        """See whether the broker accepts the message that is tried, and send the next one that is retained."""
+        """Send what is retained on a topic that is tried again."""
         with self._publishing:
-            for message in self._refused.to_try(connection, self._own):
+            for message in self._refused.due(self._own, connection.where, time.monotonic()):
                 self._own.remember(message, sent=self._send(message, False))
-
-    def _check_retention(self, connection: Connection) -> None:
-        """Report which of our retained messages the broker does not have. Raises Lost where another may have them."""
-        check = self._retention.current
-        missing = [
-            topic
-            for topic in self._retention.proceed(
-                connection, time.monotonic(), lambda: self._own_topics_apart(connection)
-            )
-            if topic in self._own and topic not in self.not_taken
-        ]
-        if missing:
-            log.warning(
-                "%s: %s has not kept what was published on %s: may this account publish there and read it, "
-                "and does the broker keep retained messages?",
-                self.client_id,
-                connection.where,
-                named(missing),
-            )
-        if check is None or self._retention.current is check:
-            return
-        hosts = self._dialler.hosts
-        if not missing or len(missing) < len(check.topics):
-            hosts.accepted(_PUBLISHED)
-            return
-        if hosts.several:
-            self._retention.forget()
-        if hosts.refused(_PUBLISHED, self._dialler.turns.place):
-            connection.disconnect()
-            raise Lost("it has nothing of what was published")
-
-    def _own_topics_apart(self, connection: Connection) -> list[str]:
-        """Topics of our retained messages that the broker should have, and that no subscription of ours receives."""
-        with self._filters.lock:
-            filters = list(self._filters)
-        with self._publishing:
-            return [
-                topic
-                for topic, message in self._own.items()
-                if message.payload and topic not in self._own.shared and self._accepts(connection, message)
-                if connection.limits.retain
-                if topic not in self.not_taken and not any(overlap(topic, filter_) for filter_ in filters)
-            ]
 
     def _report_limits(self, connection: Connection) -> None:
         limits = connection.limits
@@ -372,15 +305,7 @@ class MqttTransport(Transport):
             copied = connection.ping()
         self._await(connection, subscribed, stopping, self._deliver_all)
         self._await(connection, copied, stopping, self._deliver_all)
-        now = time.monotonic()
-        with self._publishing:
-            self._refused.suspects.connected(now)
-            connection.pings.doubtful |= self._refused.suspects.doubtful
         self._initial_sync(known)
-        if not self.is_slow:  # it costs as much as a beginning
-            self._retention.begin(self._dialler.address, now)
-            if self._retention.current is None:
-                self._dialler.hosts.accepted(_PUBLISHED)
 
     def _let_catch_up(self, connection: Connection, stopping: threading.Event) -> None:
         """Wait before subscribing: a broker that was suspended first forwards old messages of others."""
@@ -400,31 +325,12 @@ class MqttTransport(Transport):
             unsure = self._own.shared | {
                 topic for topic, message in own.items() if not self._accepts(connection, message)
             }
-        found, proved = self._find_few(connection, own, stopping) if self.is_slow else ({}, None)
-        if proved is None:
-            found = self._find(connection, list(own), stopping)
+        found = self._find(connection, list(own), stopping)
         if self.will is not None and found.get(self.will.topic) == self.will.payload:
             del found[self.will.topic]  # our own will, published although we were running
         older = {topic for topic, payload in found.items() if topic not in unsure and payload != own[topic].payload}
-        self.went_back = bool(older) or self._dialler.moved  # another host may have any older value
-        return (found.keys() - older) | (proved or set())
-
-    def _find_few(
-        self, connection: Connection, own: Mapping[str, Message], stopping: threading.Event
-    ) -> tuple[dict[str, bytes], set[str] | None]:
-        """What the broker has of few topics, and of which others that proves that it has them; None: of none."""
-        proof = self._retained_proof
-        if proof is None:
-            return {}, None
-        asked = {topic for topic in proof.unproved if topic in own} | {proof.topic}
-        found = self._find(connection, sorted(asked), stopping)
-        value = found.pop(proof.topic, b"")
-        if not proof.proves(value):
-            return {}, None
-        asked -= {topic for topic in asked if topic == proof.topic and topic in own and own[topic].payload == value}
-        if self.will is not None:
-            asked.add(self.will.topic)  # the broker has published it in place of ours
-        return found, {topic for topic, one in own.items() if topic not in asked and self._accepts(connection, one)}
+        self.went_back = bool(older)
+        return found.keys() - older
 
     def _find(self, connection: Connection, topics: list[str], stopping: threading.Event) -> dict[str, bytes]:
         """What the broker has retained on these topics."""
@@ -442,7 +348,7 @@ class MqttTransport(Transport):
 
     def _accepts(self, connection: Connection, message: Message) -> bool:
         """Whether the broker has, as far as is known, accepted this retained message."""
-        return connection.takes(message) and self._refused.suspects.accepts(message)
+        return connection.takes(message) and self._refused.accepts(message)
 
     def _await(
         self,
@@ -463,14 +369,7 @@ class MqttTransport(Transport):
                 raise Silent(f"{connection.where} does not answer")
             connection.pump(left, receive)
 
-    def _deliver_and_note(self, messages: list[Message]) -> None:
-        if self._retention.current is not None:
-            self._retention.current.note(messages, time.monotonic())
-        self._deliver_all(messages)
-
     def _deliver_all(self, messages: list[Message]) -> None:
-        if self._refused.withheld:
-            self._refused.arrived_at = time.monotonic()
         subscriptions = self._subscriptions
         for message in messages:
             self.count_received()
@@ -486,30 +385,14 @@ class MqttTransport(Transport):
     def note_answers(self, refused: Mapping[str, bool]) -> None:
         if self._connection is None:
             return  # to the query of our own retained messages
-        if self._retention.current is not None:
-            for filter_ in [filter_ for filter_, is_refused in refused.items() if is_refused]:
-                self._retention.current.refused(filter_)
         subscriptions = list(self._subscriptions)
         for filter_, is_refused in refused.items():
             for subscription in subscriptions:
                 if overlap(subscription.filter, filter_):  # the filter that covers it: no other one overlaps
                     subscription.refused = is_refused
-        hosts, run = self._dialler.hosts, self._network
-        if not all(one.refused for one in subscriptions):
-            hosts.accepted(_SUBSCRIBED)
-        elif run is not None and subscriptions and hosts.refused(_SUBSCRIBED, self._dialler.turns.place):
-            run.renewal = "it refuses all that is subscribed to"
 
     def note_refusal(self, topic: str, why: str) -> None:
-        self._refused.report(self._dialler.where, topic, why)
-
-    def _leave(self, connection: Connection, why: str) -> None:
-        """End the connection in order: who is still at this broker learns of it by our will. Raises Leaving."""
-        self._set_state(State.CONNECTING)
-        with self._publishing:  # what is published from now on waits for the next connection
-            pass
-        self._finish(connection, self.will, self._deliver_all)  # a stop that comes just now counts
-        raise Leaving(why)
+        self._refused.report(self._dialler.where, topic, why, time.monotonic())
 
     def _finish(
         self, connection: Connection, will: Message | None, receive: Callable[[list[Message]], None] = ignore

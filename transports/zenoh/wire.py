@@ -26,13 +26,9 @@ from pebble.transports.zenoh.callbacks import direct
 RETAINED = "@retain/"  # + key: the newest retained message, put before the live one and queried by subscribers
 SYNC = "@sync/"  # + name: answers with how many retained messages this session has sent
 UP = "@up/"  # + name: liveliness token of a hub
-RENEWAL = "."  # + number, after that name: the same hub, which has something that its clients should ask for
 LIVE = "@live/"  # + name: liveliness token of a client
 HELLO = "@hub/hello"  # query: name, digests of retained messages, will; the answer lists the keys the hub lacks
 BYE = "@hub/bye"  # query: remove my will, I have published it myself
-PUBLISHED = "@hub/spoken"  # put by a hub: the will of this client was published, others forget it
-MERGE = "@hub/merge/"  # + name of a hub: query of another one that was away from it
-STATE = "@hub/state/"  # + name of a hub: query of people
 # Clients from other machines that have an account say hello and goodbye under it: @hub/hello/<account>. Their sessions
 # are named <account>~…
 OF = "~"

@@ -21,23 +21,25 @@ def brokers(config: Config) -> Iterator[CheckResult]:
         is_remote = mqtt is bridge.remote_mqtt
         answer_s = LEVELS[bridge.link.slowest if is_remote else "wide"].answer_s
         patient = partial(attempt, timeout_s=max(TIMEOUT_S, answer_s))
-        for settings in mqtt_settings(mqtt, reconnect_max_s=REMOTE_RECONNECT_S, program="doctor").each():
-            results = list(broker(name, settings, patient, level=level))
-            yield from results
-            if is_remote and results[0].state is State.OK:
-                yield from robot_account(results[0].what, settings, config.base, answer_s, level)
-            if is_loopback(settings.host):
-                yield from beyond_loopback(name, settings, own_addresses())
+        settings = mqtt_settings(mqtt, reconnect_max_s=REMOTE_RECONNECT_S, program="doctor")
+        results = list(broker(name, settings, patient, level=level))
+        yield from results
+        if is_remote and results[0].state is State.OK:
+            yield from robot_account(results[0].what, settings, config.base, answer_s, level)
+        if is_loopback(settings.host):
+            yield from beyond_loopback(name, settings, own_addresses())
 
 
 def page_brokers(config: Config) -> Iterator[CheckResult]:
-    """Check that each broker of an operator page that has its own lets it in, and delivers what all robots send."""
+    """Check that the broker of an operator page that has its own lets it in, and delivers what all robots send."""
     mqtt, level = config.web_interface.mqtt, config.security.level
-    for settings in mqtt_settings(mqtt, reconnect_max_s=REMOTE_RECONNECT_S).each() if mqtt.host else ():
-        results = list(broker("page's broker", settings, level=level))
-        yield from results
-        if not any(result.state is State.FAILED for result in results):
-            yield from page_account(results[0].what, settings, level)
+    if not mqtt.host:
+        return
+    settings = mqtt_settings(mqtt, reconnect_max_s=REMOTE_RECONNECT_S)
+    results = list(broker("page's broker", settings, level=level))
+    yield from results
+    if not any(result.state is State.FAILED for result in results):
+        yield from page_account(results[0].what, settings, level)
 
 
 def _brokers(config: Config) -> Iterator[tuple[str, Mqtt]]:

@@ -374,7 +374,7 @@ def _print_account(place: Path, fleet: Fleet, name: str, secret: str, how: str, 
         typer.echo(f"For its config, which no other user may read, with a copy of {ca} beside it:")
         typer.echo(json.dumps(pieces.of_broker(fleet, name, secret, board=board), indent=2))
         return
-    url = f"mqtts://{name}@" + ",".join(pieces.host_and_port(server) for server in fleet.brokers)
+    url = f"mqtts://{name}@{pieces.host_and_port(fleet.brokers[0])}"
     if ProgramRole.PAGE in account.roles:
         typer.echo(f"    pebble web --url {url} --ca-cert {ca} --password-file FILE")
     elif ProgramRole.HUB in account.roles:
@@ -399,7 +399,7 @@ def _print_certificate(place: Path, fleet: Fleet, name: str, files: tuple[Path, 
         f"Move the key to its machine, with copies of {copies} beside it. `pebble fleet check` watches the date."
     )
     if ProgramRole.HUB in roles:
-        typer.echo(f"And a copy of {_shown(place / ZENOH)}. The file of that hub, with the other hubs in connect:")
+        typer.echo(f"And a copy of {_shown(place / ZENOH)}. The file of that hub:")
     if piece := pieces.of_certificate(fleet, name):
         typer.echo(json.dumps(piece, indent=2))
 

@@ -4,7 +4,8 @@ import json
 import math
 import os
 import statistics
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
+from contextlib import suppress
 from itertools import pairwise
 from typing import Any, TextIO
 
@@ -50,8 +51,9 @@ def body(payload: bytes, width: int) -> str:
         return "(empty: removes the retained message)"
     plain = parsed(payload)
     if plain is not None:
-        line = json.dumps(plain, ensure_ascii=False)
-        return shown(line if len(line) <= width else json.dumps(plain, ensure_ascii=False, indent=2))
+        with suppress(RecursionError):
+            line = json.dumps(plain, ensure_ascii=False)
+            return shown(line if len(line) <= width else json.dumps(plain, ensure_ascii=False, indent=2))
     known = recognised(payload)
     if known is None and _is_text(payload):
         return shown(payload.decode())
@@ -60,11 +62,9 @@ def body(payload: bytes, width: int) -> str:
 
 def parsed(payload: bytes) -> Any:
     """The JSON value; None if it is not JSON (or is ``null``)."""
-    if codec.too_deep(payload):
-        return None
     try:
         return json.loads(payload)
-    except ValueError:
+    except (ValueError, RecursionError):
         return None
 
 
@@ -162,7 +162,6 @@ class Listing:
         self.names = names
         self.records: dict[str, TopicRecord] = {}
         self.omitted = 0  # messages of topics beyond the limit
-        self.host_of: Callable[[str], str] = lambda _base: ""  # of several brokers: at which one a robot is
 
     def add(self, message: Message, now: float) -> None:
         if message.topic not in self.records and len(self.records) >= _TOPIC_LIMIT:
@@ -192,8 +191,7 @@ def print_listing(listing: Listing, now: float, wall: float) -> None:
         address = parse_topic(topic)
         if address is not None and address.identity.base != base:
             base = address.identity.base
-            host = listing.host_of(base)
-            table.add_row(Text(shown(base) + (f" at broker {host}" if host else ""), style="bold"))
+            table.add_row(Text(shown(base), style="bold"))
         name = topic if address is None else f"  {address.direction}/{address.metric}"
         kind, style = _kind(listing.names, topic)
         table.add_row(Text(shown(name)), *_cells(listing.records[topic], now, wall), Text(kind, style=style))

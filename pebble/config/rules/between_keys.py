@@ -26,7 +26,6 @@ from pebble.contract import DRIVE, OUTGOING, channel_of, is_reserved
 from pebble.contract.identity import GATEWAYS, SERVERS
 
 MOST_NEIGHBOURS, MOST_METRICS = 16, 32  # of one robot; metrics of one neighbour
-_MOST_HOSTS = 8  # in a list of brokers: each that is hung takes two seconds of a round
 _TLS = ("tls/", "quic/")  # endpoints of Zenoh that are encrypted
 _LONGEST_TEXT = 65535  # bytes of a user name or password (MQTT 3.1.1, section 1.5.3)
 _VARIABLE = re.compile("[A-Z_][A-Z0-9_]*").fullmatch  # as they are usually written; else it may be a password
@@ -41,8 +40,6 @@ def _root(reader: Reader, root: Root, _path: Path) -> Root:
         )
     if root.robot.type in (SERVERS, GATEWAYS):
         reader.notes.problem(("robot", "type"), f'must not be "{root.robot.type}": those are no robots')
-    if platform == "linux" and root.local_mqtt.hosts:
-        reader.notes.problem(("local_mqtt", "hosts"), "cannot be several: write host, the broker inside the robot")
     if platform != "linux" and kind != "mqtt":
         reader.notes.doubt(("transport", "kind"), f'must be "mqtt" where robot.platform is "{platform}"')
     if not reader.notes.problems:
@@ -241,7 +238,6 @@ def _web_tls(reader: Reader, tls: WebTls, path: Path) -> WebTls:
 
 
 def _mqtt(reader: Reader, mqtt: Mqtt, path: Path) -> Mqtt:
-    mqtt = _with_hosts(reader, mqtt, path)
     given = [key for key in ("password", "password_file", "password_env") if getattr(mqtt, key) is not None]
     if len(given) > 1:
         reader.notes.problem((*path, given[1]), f"is a second password beside {given[0]}, leave one of them")
@@ -261,26 +257,6 @@ def _mqtt(reader: Reader, mqtt: Mqtt, path: Path) -> Mqtt:
     if len(password.encode()) > _LONGEST_TEXT:
         reader.notes.problem((*path, *given), f"holds more than MQTT carries, {_LONGEST_TEXT} bytes")
     return replace(mqtt, password=Secret(password))
-
-
-def _with_hosts(reader: Reader, mqtt: Mqtt, path: Path) -> Mqtt:
-    """``host`` and ``port`` are those of the first one."""
-    if not mqtt.hosts:
-        return mqtt
-    if mqtt.host not in ("", Mqtt().host, mqtt.places[0][0]):
-        reader.notes.problem(
-            (*path, "host"),
-            f"is given beside hosts, which takes its place: leave out host ({mqtt.host})",
-        )
-    if len(mqtt.hosts) > _MOST_HOSTS:
-        reader.notes.problem((*path, "hosts"), f"must be {_MOST_HOSTS} at most, not {len(mqtt.hosts)}")
-    places = [(host.lower(), port) for host, port in mqtt.places]
-    if twice := [host for place, host in enumerate(mqtt.hosts) if places[place] in places[:place]]:
-        reader.notes.problem((*path, "hosts"), f"names {twice[0]} twice, leave one of them")
-    if path[-1] == "mqtt_mirror":
-        reader.notes.problem((*path, "hosts"), "cannot be several: write host, the broker on the robot")
-    (host, port), hosts = mqtt.places[0], tuple(f"[{h}]:{p}" if ":" in h else f"{h}:{p}" for h, p in mqtt.places)
-    return replace(mqtt, host=host, port=port, hosts=hosts if len(hosts) > 1 else ())
 
 
 def _variable(reader: Reader, name: str, path: Path) -> str | None:

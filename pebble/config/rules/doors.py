@@ -28,9 +28,7 @@ def check_doors(notes: Notes, root: Root) -> None:
 
 def warning_of_open(root: Root) -> str:
     """What the level ``open`` means where other machines reach the robot; empty: none does, or it is another level."""
-    hosts = [
-        f"broker {host}" for _, mqtt in _robots_brokers(root) for host, _port in mqtt.places if not is_loopback(host)
-    ]
+    hosts = [f"broker {mqtt.host}" for _, mqtt in _robots_brokers(root) if not is_loopback(mqtt.host)]
     places = [*hosts, *(endpoint for _, endpoint in _endpoints(root))]
     if root.security.level != "open" or not places:
         return ""
@@ -44,12 +42,11 @@ def _robots_brokers(root: Root) -> Iterator[tuple[Path, Mqtt]]:
 def _check_links(notes: Notes, root: Root) -> None:
     level = root.security.level
     for path, mqtt in brokers(root):
-        far = next((host for host, _ in mqtt.places if not is_loopback(host)), None)
-        if far is None:
+        if is_loopback(mqtt.host):
             continue
         if not mqtt.tls.enabled and root.robot.platform != "esp8266":  # which has no memory for it
             notes.problem(
-                (*path, "tls", "enabled"), f'must be true at security.level "{level}": {far} is another machine'
+                (*path, "tls", "enabled"), f'must be true at security.level "{level}": {mqtt.host} is another machine'
             )
         if mqtt.tls.enabled and mqtt.tls.insecure:
             notes.problem((*path, "tls", "insecure"), f'must be false at security.level "{level}"')
@@ -132,11 +129,11 @@ def _check_sides(notes: Notes, root: Root) -> None:
         if path[0] == "transport":
             notes.problem(path, f"{endpoint}: must be on loopback: {why}, which are not checked there")
     remote, local = bridge.remote_mqtt, root.local_mqtt
-    if bridge.enabled and transport.kind == "mqtt" and bridge.remote is None and places_of(remote) & places_of(local):
+    if bridge.enabled and transport.kind == "mqtt" and bridge.remote is None and place_of(remote) == place_of(local):
         place = ("services", "mqtt_bridge", "remote_mqtt", "host")
         notes.problem(place, f"must be another broker than local_mqtt: {why}, between the two")
 
 
-def places_of(mqtt: Mqtt) -> set[tuple[str, int]]:
-    """Host and port of each broker; all names of this machine are one."""
-    return {("" if is_loopback(host) else host, port) for host, port in mqtt.places}
+def place_of(mqtt: Mqtt) -> tuple[str, int]:
+    """Return host and port; all names of this machine are one."""
+    return ("" if is_loopback(mqtt.host) else mqtt.host), mqtt.port

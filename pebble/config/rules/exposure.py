@@ -34,8 +34,8 @@ def warn_of_logins_in_clear(notes: Notes, root: Root) -> None:
 
 
 def is_near(mqtt: Mqtt) -> bool:
-    """Whether no broker of this section is on another machine."""
-    return all(is_loopback(host) for host, _ in mqtt.places)
+    """Whether the broker of this section is on this machine."""
+    return is_loopback(mqtt.host)
 
 
 def warn_of_known_id(notes: Notes, root: Root) -> None:

@@ -109,10 +109,6 @@ class Drivers:
         """A robot has published what it can do, or who has control."""
         self._publish(self.robot(ref).update(clock()))
 
-    def moved(self, ref: str) -> None:
-        """A robot is at another broker: what moves it has an end there, and begins anew."""
-        self._publish(self.robot(ref).interrupt(clock()))
-
     def renew_keys(self) -> None:
         """The connection to the broker is another one."""
         for robot in self._driven.values():

@@ -256,11 +256,6 @@ export interface Liveness {
   whole_seconds: boolean;
 }
 
-export interface HostView {
-  host: string;
-  first: boolean;
-}
-
 export interface EstopView {
   available: boolean;
   latched: boolean;
@@ -331,7 +326,6 @@ export interface BrokerView {
 
 export interface Metrics {
   "web/liveness": Liveness;
-  "web/host": HostView;
   "web/estop": EstopView;
   "web/driver": DriverView;
   "web/picture": PictureView;

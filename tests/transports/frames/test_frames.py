@@ -20,6 +20,7 @@ import pytest
 from pebble.errors import TransportError
 from pebble.transports import segments
 from pebble.transports.frames import FrameInfo, FrameReader, FrameWriter
+from pebble.transports.frames import reader as frame_reader
 from pebble.transports.frames.frame import encode
 from pebble.transports.frames.session import METADATA, StreamNames, open_writing
 from pebble.transports.peers import prepare_run_dir
@@ -326,14 +327,19 @@ def test_what_is_not_a_frame_is_refused(tmp_path: Path) -> None:
         assert reader.counters["refused"] == 4
 
 
-def test_a_shared_frame_of_a_life_that_is_over_is_not_shown(tmp_path: Path) -> None:
-    """Its memory may have been reclaimed meanwhile, and may be all zeros."""
+@needs_shared_memory
+def test_past_a_limit_of_mapped_memory_frames_come_as_bytes_and_the_reader_reports_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(frame_reader, "MAPPED_LIMIT", -1)
     with FrameWriter(tmp_path, "camera", capacity=100_000) as writer, FrameReader(tmp_path, "camera") as reader:
-        assert until(lambda: writer.wanted and reader.writers == 1)
-        reader.running.clear()  # as when the writer's token is gone
-        assert writer.write(b"\1" * 100_000, FrameInfo())
-        assert reader.read(0.5) is None
-        assert reader.counters["torn"] == 1
+        assert until(lambda: "until this process is restarted" in reader.problem and reader.read(0) is None)
+        assert until(lambda: writer.wanted and writer.write(b"\1" * 100_000, FrameInfo()) and reader.read(1))
+        frame = None
+        while frame is None:
+            writer.write(b"\1" * 100_000, FrameInfo())
+            frame = reader.read(0.2)
+        assert not frame.shared
 
 
 def test_late_frames_of_a_replaced_writer_are_ignored(tmp_path: Path) -> None:

@@ -9,7 +9,6 @@ from __future__ import annotations
 import errno
 import logging
 import socket
-import time
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -25,7 +24,6 @@ from pebble.transports.settings import TlsSettings, ZenohSettings
 from pebble.transports.socket_holders import why_not
 from pebble.transports.zenoh.access import Access, read_access
 from pebble.transports.zenoh.hub.admission import Admission
-from pebble.transports.zenoh.hub.history import History
 from pebble.transports.zenoh.hub.journal import Journal
 from pebble.transports.zenoh.hub.store import HubStore
 from pebble.transports.zenoh.hub.worker import HubWorker
@@ -34,11 +32,6 @@ from pebble.transports.zenoh.presence import Barrier
 from pebble.transports.zenoh.session import HUB_SOCKET, close_at_exit, close_session, open_session, session_config
 
 log = logging.getLogger(__name__)
-
-#: Before a linked hub is there again under another id. Zenoh's routers think about a router that is gone for 0.1 s, and
-#: one that comes meanwhile is told by one of them nothing, for ever (20 of 30 times at once, 13 after 0.05 s, 0 of 40
-#: after 0.15 s).
-_FORGET_S = 0.3
 
 
 class ZenohHub:
@@ -105,8 +98,7 @@ class ZenohHub:
         if lock is None or worker is None:
             return
         try:
-            cut = self._store is not None and self._store.has_history and worker.is_cut()
-            if lock.in_place and self._listening.in_place and not self._is_renewed() and not cut:
+            if lock.in_place and self._listening.in_place and not self._is_renewed():
                 return
             self._lock = lock if lock.in_place else self._take_lock()
         except (OSError, TransportError) as error:
@@ -117,19 +109,14 @@ class ZenohHub:
         if lock is not self._lock:
             lock.release()
         found = self._listening.in_place
-        if found and not self._is_renewed() and not cut:
+        if found and not self._is_renewed():
             return
         self._used = self._newest
         if self._session is not None:
-            worker.hold_wills()
             close_session(self._session)
-            if worker.has_met_others:
-                time.sleep(_FORGET_S)
         self._problem = ""
         self._listen(worker)
-        if found and cut:
-            log.warning("the hub hung, or did not see another one it is connected to: it has made its connections anew")
-        elif found:
+        if found:
             log.info("the hub uses renewed certificates or rules")
         else:
             log.warning("the socket of the hub was removed from %s, it has made a new one", self._settings.run_dir)
@@ -167,9 +154,8 @@ class ZenohHub:
 
     def _start(self) -> None:
         journal = None if self._settings.journal is None else Journal(self._settings.journal)
-        linked = bool(self._settings.listen or self._settings.connect)  # others may be
         reserved = tuple(topic_to_key(topic) + "/" for topic in self._settings.reserved)
-        self._store = store = HubStore(reserved, History() if linked else None, self._settings.max_wills)
+        self._store = store = HubStore(reserved, self._settings.max_wills)
         self._worker = HubWorker(self.name, store, self._admission, journal, self.counters)
         self._listen(self._worker)
 

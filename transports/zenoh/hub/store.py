@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator
 
-from pebble.transports.zenoh.hub.history import History
-from pebble.transports.zenoh.hub.merge import Row, Value
 from pebble.transports.zenoh.hub.records import Record, Retained, StoredWill, robot_of
 from pebble.transports.zenoh.keymap import topic_to_key
 from pebble.transports.zenoh.wire import Hello, Will, digest
@@ -25,15 +23,12 @@ class HubStore:
     """The newest retained message of every key and the wills of running clients, bounded in bytes and in number.
 
     What has no room is refused, and changes nothing. A part of the room is for keys that begin with one of
-    ``reserved``. ``history``: of a hub that others are linked to.
+    ``reserved``.
     """
 
-    def __init__(
-        self, reserved: tuple[str, ...] = (), history: History | None = None, max_wills: int | None = None
-    ) -> None:
+    def __init__(self, reserved: tuple[str, ...] = (), max_wills: int | None = None) -> None:
         self.refused = 0  # records there was no room for
         self._reserved = reserved
-        self._history = history
         self._max_wills = MAX_WILLS if max_wills is None else max_wills
         self._retained: dict[str, Retained] = {}
         self._wills: dict[str, Will] = {}
@@ -42,19 +37,16 @@ class HubStore:
 
     def empty(self) -> HubStore:
         """An empty one with the same room."""
-        return HubStore(self._reserved, None if self._history is None else History(), self._max_wills)
+        return HubStore(self._reserved, self._max_wills)
 
-    def apply(self, record: Record, age_s: float = 0.0) -> bool:
-        """Store a record, which is ``age_s`` seconds old; False if it changes nothing or there is no room."""
-        if isinstance(record, Retained):
-            return self._store_retained(record, age_s)
-        return self._store_will(record)
+    def apply(self, record: Record) -> bool:
+        """Store a record; False if it changes nothing or there is no room."""
+        return self._store_retained(record) if isinstance(record, Retained) else self._store_will(record)
 
     def take_over(self, newer: HubStore) -> None:
-        """Apply what another store has, which is newer than all that is here, at its age."""
+        """Apply what another store has, which is newer than all that is here."""
         for record in newer.records():
-            age_s = newer.age_s(record.key) if isinstance(record, Retained) else 0.0
-            self.apply(record, age_s)
+            self.apply(record)
 
     def get(self, key: str) -> Retained | None:
         return self._retained.get(key)
@@ -70,8 +62,6 @@ class HubStore:
 
     def records(self) -> Iterator[Record]:
         """The records that make an equal store."""
-        if self._history is not None:
-            yield from self._history.removals()
         yield from self._retained.values()
         for name, will in self._wills.items():
             yield StoredWill(name, will)
@@ -86,50 +76,10 @@ class HubStore:
     def _differs(self, key: str, own: int | None, name: str) -> bool:
         retained = self._retained.get(key)
         if retained is None:
-            return own is not None and (self._history is None or not self._history.removed_by_another(key, own, name))
+            return own is not None
         return retained.stamp.origin == name and digest(retained.payload) != own
 
-    # -- among several hubs
-
-    @property
-    def has_history(self) -> bool:
-        """Whether other hubs may merge with it."""
-        return self._history is not None
-
-    def age_s(self, key: str) -> float:
-        return 0.0 if self._history is None else self._history.age_s(key)
-
-    def know(self, ages: Mapping[str, float]) -> None:
-        """How old are those of ``ages`` that were here before a restart."""
-        for key, age_s in ages.items():
-            if self._history is not None:
-                self._history.know(key, age_s)
-
-    def table(self) -> dict[str, Row]:
-        """What is here, and what was removed, for another hub."""
-        removals = () if self._history is None else self._history.removals()
-        return {record.key: self._row(record) for record in (*removals, *self._retained.values())}
-
-    def row(self, key: str) -> Row | None:
-        record = self._last(key)
-        return None if record is None else self._row(record)
-
-    def _last(self, key: str) -> Retained | None:
-        """What is retained, or the removal of it."""
-        return self._retained.get(key) or (None if self._history is None else self._history.removal(key))
-
-    def _row(self, record: Retained) -> Row:
-        stamp, of = record.stamp, digest(record.payload) if record.payload else None
-        return Row(of, stamp.origin, stamp.retained_count, self.age_s(record.key))
-
-    def values(self, keys: Iterable[str]) -> Iterator[Value]:
-        """The rows of ``keys`` with their payloads."""
-        for key in keys:
-            if (record := self._last(key)) is not None:
-                stamp = record.stamp
-                yield Value(key, record.payload, stamp.qos, stamp.retained_count, stamp.origin, self.age_s(key))
-
-    def _store_retained(self, record: Retained, age_s: float) -> bool:
+    def _store_retained(self, record: Retained) -> bool:
         before = self._retained.get(record.key)
         after = record if record.payload else None
         if not self._resize(record.key, _size(after) - _size(before)):
@@ -139,8 +89,6 @@ class HubStore:
             self._retained.pop(record.key, None)
         else:
             self._retained[record.key] = record
-        if self._history is not None and (after or before or age_s):  # else nothing was removed
-            self._history.add(record, age_s, None if before is None else digest(before.payload))
         return before != after
 
     def _store_will(self, record: StoredWill) -> bool:

@@ -33,20 +33,19 @@ class WaitingQueries:
     def forget_all(self) -> None:
         self._received.clear()
 
-    def add(self, needs: dict[str, int], query: zenoh.Query, now: float, *, merging: bool) -> bool:
-        """Have it wait; False: it is to be answered now. While hubs are ``merging`` nothing is complete."""
-        if len(self._waiting) >= QUERIES or (self._has_arrived(needs) and not merging):
+    def add(self, needs: dict[str, int], query: zenoh.Query, now: float) -> bool:
+        """Have it wait; False: it is to be answered now."""
+        if len(self._waiting) >= QUERIES or self._has_arrived(needs):
             return False
         self._waiting.append((now + PATIENCE_S, needs, query))
         self._awaited.update(needs)
-        self._looks = self._looks or merging
         return True
 
-    def due(self, merging_until: float) -> float:
+    def due(self) -> float:
         """When to :meth:`take`; infinite if nothing waits."""
         if not self._waiting:
             return float("inf")
-        return merging_until if self._looks else max(self._waiting[0][0], merging_until)
+        return float("-inf") if self._looks else self._waiting[0][0]
 
     def take(self, now: float) -> list[zenoh.Query]:
         """Those that have waited for long enough, or for nothing more."""

@@ -55,7 +55,6 @@ function Row({ at, metric, name, online, streams = false, children: words }) {
 function Heartbeat({ at }) {
   useTick(500);
   const entry = useMetric(at, "web/liveness");
-  const host = useValue(at, "web/host")?.host;
   const liveness = entry?.value;
   if (!liveness) return null;
   const age = liveness.silent_s === null ? null : 1000 * liveness.silent_s + entry.age; // ms: at the server, and since
@@ -77,8 +76,7 @@ function Heartbeat({ at }) {
     <div>
       <dt>Latency</dt>
       <dd>${late}</dd>
-    </div>
-    ${host && html`<div><dt>Broker</dt><dd>${host}</dd></div>`}`;
+    </div>`;
 }
 
 /** Which robots of its LAN it receives, and whose script drives it. */

@@ -113,7 +113,7 @@ function matcher(store, filter) {
   const text = (ref) => {
     const { name, description } = looksOf(ref, value(ref, "capabilities"));
     const is = [isPresent(store, ref) ? "online" : "offline", value(ref, "web/estop")?.latched ? "stopped" : ""];
-    return [ref, name, description, value(ref, "web/driver")?.by, value(ref, "web/host")?.host, ...is].join(" ").toLowerCase();
+    return [ref, name, description, value(ref, "web/driver")?.by, ...is].join(" ").toLowerCase();
   };
   return (ref) => !words.length || ((all) => words.every((word) => all.includes(word)))(text(ref));
 }
@@ -292,12 +292,6 @@ function DoubtFact({ at }) {
   return text ? html`<${Told} sign=${no ? "▲" : "?"} className=${no ? "bad" : "dim"}>${text}<//>` : null;
 }
 
-/** The broker where it is, if that is not the preferred one. */
-function HostFact({ at }) {
-  const view = useValue(at, "web/host");
-  return view && !view.first && html`<${Fact}>broker ${view.host}<//>`;
-}
-
 /** ``plain``: without a picture. @param {{at: string, plain?: boolean}} props */
 function FleetCard({ at, plain }) {
   const { commands, settings, connection } = usePage();
@@ -328,7 +322,6 @@ function FleetCard({ at, plain }) {
       <ul class="facts">
         <${BatteryFact} at=${at} online=${connection.isOpen} />
         ${connection.isOpen && html`<${DoubtFact} at=${at} />`}
-        <${HostFact} at=${at} />
         <${DriverFact} at=${at} offers=${offers} online=${connection.isOpen} estop=${estop} pictured=${pictured} />
         <${ScriptFact} at=${at} online=${connection.isOpen} />
         ${typeOf(at) !== "robots" ? html`<${StatusFact} at=${at} />` : html`<${ServiceFact} at=${at} />`}

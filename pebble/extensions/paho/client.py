@@ -1,7 +1,4 @@
-"""The same as `client.Client`, by paho: ``"client": "paho"`` in the MQTT section of a config chooses it.
-
-It costs about half as much again in processor time, and 5 MB.
-"""
+"""The same as Pebble's own client of MQTT, by paho. It costs about half as much again in processor time, and 5 MB."""
 
 import socket
 import ssl
@@ -87,7 +84,7 @@ class _Paho(paho.Client):
 
 
 class PahoClient:
-    """See `client.Client`."""
+    """A client with the methods of `pebble.transports.mqtt.client.Client`."""
 
     def __init__(self, opening: Opening, listener: Listener, *, bridge: bool) -> None:
         client_id, settings, context, will, *_ = opening

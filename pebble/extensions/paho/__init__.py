@@ -1,0 +1,1 @@
+"""MQTT by the package paho-mqtt, as a transport that is found by its entry point."""

@@ -1,0 +1,181 @@
+"""Brokers that hang up on a message cost its topic; links that are lost for other reasons cost none for long."""
+
+from __future__ import annotations
+
+import logging
+from collections import Counter
+from collections.abc import Callable
+
+import pytest
+
+from pebble.transports import Message
+from pebble.transports.mqtt.outgoing import InFlightTable
+from pebble.transports.mqtt.refused_topics import RefusedTopics
+from tests.support import further
+
+STEP_S = 0.02
+ROUND_TRIP_S = 0.04
+VITAL = ("r/online", "r/capabilities", "r/estop/+")
+#: Seconds between two messages of each topic, the bytes of one, and whether it is retained.
+ROBOT = {
+    "r/online": (0.25, 20, True),
+    "r/estop/wheels": (30.0, 60, True),
+    "r/capabilities": (1e9, 3000, True),
+    "r/status": (5.0, 400, True),
+    "r/charging": (5.0, 20, True),
+    "r/touch": (0.02, 50, False),
+    "r/imu": (0.2, 300, False),
+    "r/rare": (20.0, 50, False),
+}
+Refuses = Callable[[str, int, float], bool]
+
+
+class World:
+    """One robot's connections to one broker, in virtual time. The link is lost ``losses`` times, each ``every_s``."""
+
+    def __init__(self, refuses: Refuses, *, every_s: float = 1e9, losses: int = 0, **sizes: int) -> None:
+        self.refuses, self.every_s, self.left = refuses, every_s, losses
+        self.sizes = {topic: sizes.get(topic.rpartition("/")[2], size) for topic, (_, size, _) in ROBOT.items()}
+        self.topics = RefusedTopics("robot", VITAL)
+        self.now, self.losses, self.arrived = 0.0, 0, Counter[str]()
+        self.connect()
+
+    def connect(self) -> None:
+        self.in_flight, self.began, self.lost_at = InFlightTable(), self.now, 1e9
+        self.pongs: list[float] = []
+        self.ping_at, self.hang_up_at = self.now + 0.5, 1e9
+        for topic, (_, _, retained) in ROBOT.items():
+            if retained:
+                self.publish(self.message(topic))
+
+    def message(self, topic: str) -> Message:
+        return Message(topic, bytes(self.sizes[topic]))
+
+    def publish(self, message: Message) -> None:
+        if not self.topics.admits(message, self.now):
+            return
+        self.in_flight.sent(message, 0, self.now)
+        if self.refuses(message.topic, len(message.payload), self.now):
+            self.hang_up_at = min(self.hang_up_at, self.now + ROUND_TRIP_S)
+        elif self.hang_up_at > self.now + ROUND_TRIP_S:
+            self.arrived[message.topic] += 1
+
+    def lose(self) -> None:
+        self.losses, self.lost_at = self.losses + 1, self.now
+        self.topics.note_loss("broker", self.in_flight.first_written(self.now), self.now)
+
+    def run(self, seconds: float) -> World:
+        for step in range(round(self.now / STEP_S), round((self.now + seconds) / STEP_S)):
+            self.now = step * STEP_S
+            if self.lost_at < 1e9:
+                if self.now - self.lost_at >= 0.1:
+                    self.connect()
+                continue
+            while self.pongs and self.pongs[0] <= self.now and self.pongs[0] < self.hang_up_at:
+                self.pongs.pop(0)
+                self.in_flight.pong(self.now)
+            if self.now >= self.hang_up_at or (self.left and self.now - self.began >= self.every_s):
+                self.left -= self.now < self.hang_up_at
+                self.lose()
+                continue
+            own = {topic: self.message(topic) for topic, (_, _, retained) in ROBOT.items() if retained}
+            for message in self.topics.due(own, "broker", self.now):
+                self.publish(message)
+            for topic, (period_s, _, _) in ROBOT.items():
+                every = max(1, round(period_s / STEP_S))
+                if step % every == every - 1:
+                    self.publish(self.message(topic))
+            if self.now >= self.ping_at:
+                self.ping_at = self.now + 0.45
+                self.in_flight.ping(self.now, None)
+                self.pongs.append(self.now + ROUND_TRIP_S)
+        self.now = round(self.now + STEP_S, 2)
+        return self
+
+    def rates(self, seconds: float) -> dict[str, float]:
+        """Return what share of each topic's messages arrives from now on."""
+        before = self.arrived.copy()
+        self.run(seconds)
+        periods = {topic: period for topic, (period, _, _) in ROBOT.items() if period <= seconds / 4}
+        return {topic: (self.arrived[topic] - before[topic]) * period / seconds for topic, period in periods.items()}
+
+
+def on(*topics: str) -> Refuses:
+    return lambda topic, _size, _now: topic in topics
+
+
+@pytest.mark.parametrize(
+    "topics",
+    [("r/touch",), ("r/status",), further(("r/rare",)), ("r/touch", "r/status"), further(("r/imu", "r/charging"))],
+)
+def test_what_a_broker_hangs_up_on_costs_that_topic(topics: tuple[str, ...]) -> None:
+    world = World(on(*topics)).run(300)
+    assert set(world.topics.withheld) == set(topics) == set(world.topics.not_taken)
+    losses = world.losses
+    rates = world.rates(120)
+    assert world.losses - losses <= 3 * len(topics), "each is tried about once a minute"
+    assert [topic for topic, share in rates.items() if topic not in topics and share < 0.9] == []
+
+
+def test_a_topic_that_is_allowed_again_is_used_again(caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level(logging.INFO)
+    world = World(lambda topic, _size, now: topic == "r/touch" and now < 100).run(99)
+    assert set(world.topics.withheld) == {"r/touch"}
+    world.run(70)
+    assert not world.topics.withheld
+    assert "accepts messages on r/touch again" in caplog.messages[-1]
+    assert world.rates(10)["r/touch"] > 0.95
+
+
+@pytest.mark.parametrize("topic", ["r/online", "r/estop/wheels", "r/capabilities"])
+def test_a_vital_topic_is_never_withheld_and_an_error_names_it(topic: str) -> None:
+    world = World(lambda name, _size, now: name == topic and now < 100).run(99)
+    assert topic in world.topics.not_taken
+    assert topic not in world.topics.withheld
+    world.run(90)
+    assert not world.topics.withheld
+    assert min(world.rates(20).values()) > 0.9
+
+
+@pytest.mark.parametrize("topic", ["r/capabilities", "r/status", "r/imu"])
+def test_a_message_beyond_the_limit_of_a_broker_costs_only_messages_of_that_size(topic: str) -> None:
+    world = World(lambda _topic, size, _now: size > 10_000, **{topic[2:]: 24_000}).run(60)
+    assert set(world.topics.withheld) == set(world.topics.not_taken) == {topic}
+    losses, world.sizes[topic] = world.losses, 8_000
+    before = world.arrived[topic]
+    world.publish(world.message(topic))
+    assert world.arrived[topic] > before
+    world.run(60)
+    assert world.losses == losses
+
+
+@pytest.mark.parametrize("every_s", [0.1, 0.3, 1.0, further(3.0), 10.0])
+def test_a_link_that_is_lost_20_times_costs_topics_for_a_minute_at_most(every_s: float) -> None:
+    world = World(on(), every_s=every_s, losses=20).run(21 * (every_s + 0.12))
+    assert world.losses == 20
+    assert every_s < 1.5 or not world.topics.not_taken
+    world.run(75)
+    assert not world.topics.withheld
+    assert min(world.rates(20).values()) > 0.95
+
+
+def test_a_broker_that_hangs_up_for_another_reason_costs_no_topic() -> None:
+    """Such as one with a quota of messages: it has accepted the topics before, on the same connection."""
+    count = Counter[str]()
+
+    def refuses(_topic: str, _size: int, _now: float) -> bool:
+        count["all"] += 1
+        return count["all"] % 200 == 0
+
+    world = World(refuses).run(100)
+    assert world.losses > 20
+    assert not world.topics.not_taken
+
+
+def test_what_is_remembered_is_bounded() -> None:
+    topics, in_flight = RefusedTopics("robot", ()), InFlightTable()
+    for number in range(5000):
+        in_flight.sent(Message(f"t/{number}", b""), 0, 1.0)
+    for _ in range(3):
+        topics.note_loss("broker", in_flight.first_written(1.1), 1.1)
+    assert len(topics.withheld) == 1000
