@@ -16,14 +16,14 @@ from typing import Any, Final
 import msgspec
 
 from pebble.errors import ConfigError, DeviceError
-from pebble.media.world.pose_page import PERIOD_S, PosePage, page_path
-from pebble.media.world.poses import RobotPose
-from pebble.media.world.world_file import World, read_world
 from pebble.simulation.board import BoardState
 from pebble.simulation.mcu import actions
 from pebble.simulation.motion import Pose, RobotMotion
 from pebble.simulation.pty import PtyMcu
+from pebble.simulation.world.pose_page import PERIOD_S, PosePage, page_path
+from pebble.simulation.world.poses import RobotPose
 from pebble.simulation.world.walls import Floor, start_pose
+from pebble.simulation.world.world_file import World, read_world
 
 _SAMPLES_PER_REPORT = round(0.1 / PERIOD_S)
 _SIGNALS = {signal.SIGTERM, signal.SIGINT, signal.SIGHUP}

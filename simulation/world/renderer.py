@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pebble.media.scene import noise
-from pebble.media.world.poses import RobotPose, Track, poses_at
-from pebble.media.world.scene import Image, Scene, Surface
-from pebble.media.world.world_file import World
+from pebble.simulation.world.poses import RobotPose, Track, poses_at
+from pebble.simulation.world.scene import Image, Scene, Surface
+from pebble.simulation.world.world_file import World
 
 _NEAR_M: Final = 0.05  # nothing nearer is drawn
 _BESIDE_PX = 64.0  # beyond the picture's edges surfaces are cut off
