@@ -12,31 +12,24 @@ import sys
 from collections.abc import Callable
 
 from pebble.config import config_of_process
-from pebble.contract import WHEEL_ODOMETRY
 from pebble.errors import PebbleError
 from pebble.launcher.announcer_pipe import Envelope, next_envelope
-from pebble.launcher.odometry_watch import OdometryWatch
 from pebble.launcher.reactor import Reactor
-from pebble.runtime.addresses import Addresses
 from pebble.runtime.connections import local_transport
-from pebble.runtime.parent import ALIVE_PERIOD_S, Notifier, ProvidedFeatures, set_log_level, set_up_logging
+from pebble.runtime.parent import ALIVE_PERIOD_S, Notifier, set_log_level, set_up_logging
 from pebble.runtime.process import exit_at_the_latest
 from pebble.transports import Message, State, Transport
 
 _STDIN = 0
-_WATCH_S = 0.5
 
 log = logging.getLogger(__name__)
 
 
 class Announcer:
-    """Publishes the envelopes that arrive on ``pipe``; states again on every new connection, records only once.
+    """Publishes the envelopes that arrive on ``pipe``; states again on every new connection, records only once."""
 
-    It notifies the launcher of messages on ``odometry_topic``, because capabilities list them.
-    """
-
-    def __init__(self, pipe: int, transport: Transport, odometry_topic: str) -> None:
-        self._pipe, self._transport, self._odometry_topic = pipe, transport, odometry_topic
+    def __init__(self, pipe: int, transport: Transport) -> None:
+        self._pipe, self._transport = pipe, transport
         self._states: dict[str, Message] = {}
         self._reactor = Reactor()
         self._wake = os.eventfd(0, os.EFD_CLOEXEC | os.EFD_NONBLOCK)
@@ -48,13 +41,10 @@ class Announcer:
         self._reactor.watch(self._pipe, self._receive)
         self._reactor.watch(self._wake, self._publish_states)
         self._reactor.every(ALIVE_PERIOD_S, notify.alive)
-        odometry = OdometryWatch(self._odometry_topic, ProvidedFeatures(notify))
-        self._reactor.every(_WATCH_S, odometry.poll)
         self._transport.on_state(self._on_state)
         notify.ready()
         try:
             self._transport.open(timeout=0.0)
-            odometry.start(self._transport)
             self._reactor.run_until(lambda: self._stopping)
             self._receive_rest()
         finally:
@@ -97,13 +87,13 @@ class Announcer:
             os.eventfd_write(self._wake, 1)
 
 
-def run(make_transport: Callable[[Message], Transport], odometry_topic: str) -> int:
+def run(make_transport: Callable[[Message], Transport]) -> int:
     """Publish what arrives on stdin through ``make_transport(will)``; returns the exit code."""
     try:
         will = next_envelope(_STDIN)
         if will is None:  # the launcher has ended already
             return 0
-        announcer = Announcer(_STDIN, make_transport(will.message), odometry_topic)
+        announcer = Announcer(_STDIN, make_transport(will.message))
     except PebbleError as error:
         log.error("the launcher publishes nothing: %s", error)
         return 1
@@ -129,8 +119,7 @@ def main(arguments: list[str]) -> int:
         log.error("%s", error)
         return 1
     set_log_level(config.log_level_of("launcher"))
-    topic = Addresses(config)[WHEEL_ODOMETRY].topic
-    return run(lambda will: local_transport(config, "launcher", will=will), topic)
+    return run(lambda will: local_transport(config, "launcher", will=will))
 
 
 if __name__ == "__main__":

@@ -7,14 +7,14 @@ from collections.abc import Callable
 _EXPECTED = frozenset({"estop", "control"})
 _MOST_REPORTS = 256  # of all processes; a self-describing MCU names its own outlets
 
-_report = re.compile(r"(LACKS|HAS) (estop|control|wheel-odometry|outlets/[^/]{1,64}/(?:status|power))").fullmatch
+_report = re.compile(r"(LACKS|HAS) (estop|control|outlets/[^/]{1,64}/(?:status|power))").fullmatch
 
 
 class Features:
     """Handles ``LACKS <feature>`` and ``HAS <feature>``; ``on_change()`` is called when a property changes.
 
-    ``estop``: the emergency stop. ``control``: requests for control are answered. ``wheel-odometry``: it is being
-    published. ``outlets/NAME/status`` and ``outlets/NAME/power``: the contract's topics of an outlet are in use.
+    ``estop``: the emergency stop. ``control``: requests for control are answered. ``outlets/NAME/status`` and
+    ``outlets/NAME/power``: the contract's topics of an outlet are in use.
     """
 
     def __init__(self, on_change: Callable[[], None]) -> None:

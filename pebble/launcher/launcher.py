@@ -10,9 +10,7 @@ from pebble.config import Config
 from pebble.config.rules.doors import warning_of_open
 from pebble.errors import ConfigError, PebbleError
 from pebble.launcher.child import Child
-from pebble.launcher.config_watch import ConfigWatch
 from pebble.launcher.driveable import Driveable
-from pebble.launcher.dropped import Dropped
 from pebble.launcher.features import Features
 from pebble.launcher.log_forwarding import LogForwarder, OwnRecords
 from pebble.launcher.on_demand import OnDemand
@@ -27,7 +25,6 @@ from pebble.runtime.connections import check_connections
 from pebble.runtime.parent import LAUNCHER_PID
 from pebble.transports import segments
 
-_CONFIG_POLL_S = 2.0
 _RUN_DIR_S = 1.0
 _ORPHANS_S = 1.0
 _REAP_S = 2.0  # the kernel needs this long at most to end what was killed
@@ -50,13 +47,9 @@ class Launcher:
         self._supervisors = [self._supervise(program) for program in (programs(config) if table is None else table)]
         self._on_demand = OnDemand(self._reactor, self._supervisors)
         self._features = Features(lambda: self._status.capabilities_changed())
-        self._dropped = Dropped()
         self._driveable = self._driveable_by({supervisor.program.name for supervisor in self._supervisors})
-        self._status = StatusPublisher(
-            config, self._reactor, self._supervisors, self._features, self._dropped, self._driveable
-        )
+        self._status = StatusPublisher(config, self._reactor, self._supervisors, self._features, self._driveable)
         self._logs = LogForwarder(self._status.publish_log)
-        self._config_watch = ConfigWatch(config)
         self._signals = StopSignals(self._kill_all)
         self._lost = False  # another launcher has taken the run directory
 
@@ -94,7 +87,6 @@ class Launcher:
         for warning in (*self._config.warnings, warning_of_open(self._config)):
             if warning:
                 log.warning("%s", warning)
-        self._reactor.every(_CONFIG_POLL_S, self._config_watch.poll)
         if os.getpid() == 1:
             self._reactor.every(_ORPHANS_S, self._reap_orphans)
         self._status.start()
@@ -128,14 +120,11 @@ class Launcher:
             self._logs.child_line(program.name, pid, line, published=not program.reads_announcer_pipe)
 
     def _receive_note(self, program: Program, line: str) -> None:
-        if self._dropped.receive(program.name, line):
-            self._status.changed()
-        elif not self._driveable.receive(program.name, line) and not self._features.receive(program.name, line):
+        if not self._driveable.receive(program.name, line) and not self._features.receive(program.name, line):
             self._on_demand.receive(program, line)
 
     def _ended(self, program: Program) -> None:
         self._features.ended(program.name)
-        self._dropped.ended(program.name)
         self._driveable.ended(program.name)
         self._on_demand.ended(program)
 

@@ -5,15 +5,12 @@ import time
 from collections.abc import Sequence
 from typing import Any
 
-from msgspec import UNSET
-
 from pebble.config import Config
 from pebble.contract import CAPABILITIES, LOGS, STATUS, Channel, codec
 from pebble.contract.payloads import Capabilities, LogRecord, ServiceState, Status
 from pebble.launcher.announcer_pipe import AnnouncerPipe
 from pebble.launcher.capabilities import capabilities
 from pebble.launcher.driveable import Driveable
-from pebble.launcher.dropped import Dropped
 from pebble.launcher.features import Features
 from pebble.launcher.process_supervisor import ProcessSupervisor
 from pebble.launcher.reactor import Reactor
@@ -35,12 +32,11 @@ class StatusPublisher:
         reactor: Reactor,
         supervisors: Sequence[ProcessSupervisor],
         features: Features,
-        dropped: Dropped,
         driveable: Driveable,
     ) -> None:
         self._config, self._addresses = config, Addresses(config)
-        self._reactor, self._supervisors, self._features = reactor, supervisors, features
-        self._dropped, self._driveable = dropped, driveable
+        self._reactor, self._supervisors = reactor, supervisors
+        self._features, self._driveable = features, driveable
         self._pipe = AnnouncerPipe(reactor)
         self._systemd = SystemdNotifier()
         self._status_due = self._capabilities_due = False
@@ -123,12 +119,11 @@ class StatusPublisher:
         return Status(t=_now_ms(), value=value)
 
     def _state(self, supervisor: ProcessSupervisor) -> ServiceState:
-        policy, dropped = supervisor.policy, self._dropped[supervisor.program.name]
+        policy = supervisor.policy
         return ServiceState(
             state="held" if supervisor.held else policy.state,
             restarts=policy.restarts,
             last_exit=policy.last_exit,
-            dropped=dropped or UNSET,
         )
 
     def _publish_capabilities(self) -> None:

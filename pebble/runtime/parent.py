@@ -8,7 +8,7 @@ import re
 import shutil
 import signal
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -22,7 +22,6 @@ WANTED = "PEBBLE_WANTED"  # "name=encoding …": running programs that a predece
 ENCODING = "PEBBLE_ENCODING"  # the encoding in the request that started this media program
 LAUNCHER_PID = "PEBBLE_LAUNCHER_PID"
 ALIVE_PERIOD_S = 1.0
-DROPPED_PERIOD_S = 10.0
 _WHY = 200  # characters of a reason
 LOG_FORMAT = "%(asctime)s [%(levelname)s] %(message)s"  # what the launcher's log forwarding reads (paper A.8.7)
 TAG = re.compile(r"\[([^\]]+) (\d+)\] (.*)", re.DOTALL)  # of a line by ``tagged``
@@ -157,11 +156,6 @@ class Notifier:
         """
         return self._write(f"{'LACKS' if lacking else 'HAS'} {feature}\n".encode())
 
-    def dropped(self, counts: Mapping[str, int]) -> bool:
-        """Report how many messages were dropped since the start. False: the launcher was too busy, repeat it."""
-        words = " ".join(f"{reason}={number}" for reason, number in counts.items())
-        return self._write(f"DROPPED {words}\n".encode())
-
     def local(self, *, connected: bool, why: str = "") -> bool:
         """Report whether this process is connected to its siblings. False: the launcher was too busy, repeat it."""
         return self._write(f"LOCAL {int(connected)} {_one_line(why)}".rstrip().encode() + b"\n")
@@ -202,20 +196,6 @@ class LocalConnection:
         """``problem`` is why it is not connected. Reported if it has changed."""
         found = (connected, "" if connected else problem)
         if found != self._reported and self._notifier.local(connected=connected, why=found[1]):
-            self._reported = found
-
-
-class DroppedMessages:
-    """Reports to the launcher how many messages this process has dropped: call :meth:`report` regularly."""
-
-    def __init__(self, notifier: Notifier) -> None:
-        self._notifier = notifier
-        self._reported: dict[str, int] = {}
-
-    def report(self, counts: Mapping[str, int]) -> None:
-        """``counts``: all since the start, by reason. Reported if it has changed."""
-        found = {reason: number for reason, number in counts.items() if number}
-        if found != self._reported and self._notifier.dropped(found):
             self._reported = found
 
 

@@ -15,8 +15,6 @@ from pebble.runtime.connections import local_transport
 from pebble.runtime.environment import withhold
 from pebble.runtime.parent import (
     ALIVE_PERIOD_S,
-    DROPPED_PERIOD_S,
-    DroppedMessages,
     LocalConnection,
     Notifier,
     set_log_level,
@@ -67,7 +65,7 @@ def _serve(service_class: type[Service], config: Config, instance: str) -> int:
     transport = local_transport(config, service_class.client_name or name, as_published=service_class.as_published)
     service = service_class(config, transport, instance=instance)
     notify = Notifier()
-    dropped, local = DroppedMessages(notify), LocalConnection(notify)
+    local = LocalConnection(notify)
 
     def quit_(_signal: int, _frame: object) -> None:
         exit_at_the_latest()
@@ -80,7 +78,6 @@ def _serve(service_class: type[Service], config: Config, instance: str) -> int:
     signal.signal(signal.SIGTERM, quit_)
     signal.signal(signal.SIGINT, quit_)
     service.timers.add(service.clock(), alive, period=ALIVE_PERIOD_S)
-    service.timers.add(service.clock(), lambda: dropped.report(service.dropped()), period=DROPPED_PERIOD_S)
     service.run(ready=notify.ready)
     return 0
 

@@ -44,11 +44,11 @@ def test_the_end_of_a_process_ends_what_it_reported() -> None:
 def test_what_is_not_expected_is_there_while_any_process_has_it() -> None:
     recorder = Recorder()
     for program, line in [("a", "LACKS"), ("a", "HAS"), ("b", "HAS"), ("a", "LACKS")]:
-        assert recorder.features.receive(program, f"{line} wheel-odometry")
-    assert recorder.features.found == {"wheel-odometry"}
+        assert recorder.features.receive(program, f"{line} outlets/o/power")
+    assert recorder.features.found == {"outlets/o/power"}
     assert not recorder.features.lacking
     recorder.features.ended("b")
-    assert recorder.changes == [{"wheel-odometry"}, set()]
+    assert recorder.changes == [{"outlets/o/power"}, set()]
 
 
 def test_an_outlet_may_have_any_name_and_there_are_limits() -> None:
