@@ -8,7 +8,7 @@ from typing import Any
 from pebble.config import problems, text_files
 from pebble.config.tree import Services
 from pebble.config.types import ServiceSection
-from pebble.config.visible import hidden, without_hidden
+from pebble.config.visible import hidden, shown
 from pebble.errors import ConfigError
 
 _SERVICES = tuple(name for name in Services.__struct_fields__ if isinstance(getattr(Services(), name), ServiceSection))
@@ -40,20 +40,11 @@ def decode(text: str, name: str) -> Any:
         return json.loads(text, object_pairs_hook=Pairs)
     except json.JSONDecodeError as error:
         place = f"{name}: line {error.lineno}, column {error.colno}"
-        raise ConfigError(f"{place}: not JSON: {error.msg}{_hint(text, error.pos)}") from None
+        raise ConfigError(f"{place}: not JSON: {error.msg}") from None
     except RecursionError:
         raise ConfigError(f"{name}: nested too deeply") from None
     except ValueError as error:  # a number of thousands of digits
         raise ConfigError(f"{name}: not JSON: {error}") from None
-
-
-def _hint(text: str, position: int) -> str:
-    rest, before = text[position:].lstrip(), text[:position].rstrip()
-    if rest[:1] in ("}", "]") and before.endswith(","):
-        return "; leave out the comma before it"
-    if rest.startswith(("//", "/*", "#")):
-        return '; a comment is a key that starts with //, such as {"// why": "because"}'
-    return ""
 
 
 def plain(raw: Any, notes: problems.Notes, path: problems.Path = ()) -> Any:
@@ -70,7 +61,7 @@ def plain(raw: Any, notes: problems.Notes, path: problems.Path = ()) -> Any:
     if isinstance(raw, float) and not math.isfinite(raw):
         notes.problem(path, f"must be a number, not {raw}")
         return None
-    if isinstance(raw, str) and (flaw := hidden(raw, words=_is_words(path), inside=path[-1:] != ("password",))):
+    if isinstance(raw, str) and (flaw := hidden(raw, words=_is_words(path))):
         notes.problem(path, flaw)
         return ""
     return raw
@@ -82,7 +73,7 @@ def _object(pairs: Pairs, notes: problems.Notes, path: problems.Path) -> dict[st
         if key.startswith("//"):
             continue
         if flaw := hidden(key):
-            notes.problem(path, f'has a key "{without_hidden(key)}" that {flaw}')
+            notes.problem(path, f'has a key "{shown(key)}" that {flaw}')
             continue
         if key in data:
             notes.problem((*path, key), "occurs twice in one object, leave one of them")

@@ -397,11 +397,11 @@ class TestMistakes:
             ("local_mqtt.host", 5, "must be text, not 5"),
             ("local_mqtt.tls.ca_cert", 5, "must be a path, not 5"),
             ("local_mqtt.password_file", "~nobody-at-all/x", "names a home folder that"),
-            ("local_mqtt.password_file", "a\x00b", "holds U+0000 (NUL) after 1 characters: remove it"),
-            ("transport.run_dir", "a\x00b", "holds U+0000 (NUL)"),
-            ("transport.journal", "a\x00b", "holds U+0000 (NUL)"),
-            ("services.mqtt_bridge.reboot_control.command", "a\x00b", "holds U+0000 (NUL)"),
-            ("services.av_daemon.env", {"A\x00B": ""}, 'has a key "AB" that holds U+0000 (NUL)'),
+            ("local_mqtt.password_file", "a\x00b", "holds U+0000, which is not shown: remove it"),
+            ("transport.run_dir", "a\x00b", "holds U+0000"),
+            ("transport.journal", "a\x00b", "holds U+0000"),
+            ("services.mqtt_bridge.reboot_control.command", "a\x00b", "holds U+0000"),
+            ("services.av_daemon.env", {"A\x00B": ""}, 'has a key "A\\u0000B" that holds U+0000'),
             ("services.av_daemon.env", {"A=B": "c"}, "must be the name of a variable, without ="),
             ("services.autonomy_manager.env", {"": "c"}, "must be the name of a variable, without ="),
             ("local_mqtt.username", "ü" * 40_000, "is longer than MQTT carries, 65535 bytes"),
@@ -414,7 +414,7 @@ class TestMistakes:
             ("services.mqtt_bridge.heartbeat.interval_seconds", 0.049, "must be a number from 0.05 to 3600, not 0.049"),
             ("services.mqtt_bridge.heartbeat.enabled", "true", 'must be true or false, not the text "true"'),
             ("services.mqtt_bridge.heartbeat.topic", "$SYS/x", "must be a topic"),
-            ("services.mqtt_bridge.heartbeat.topic", "half \ud800", "holds half a character"),
+            ("services.mqtt_bridge.heartbeat.topic", "half \ud800", "holds U+D800"),
             ("services.mqtt_bridge.reboot_control.command", "sudo 'oops", "cannot be split into words: No closing quo"),
             ("services.mqtt_bridge.reboot_control.command", {"a": 1}, "must be a list […], not an object"),
             ("services.mqtt_bridge.reboot_control.env", [], "must be an object {…}, not a list"),
@@ -590,7 +590,7 @@ class TestFiles:
         ("text", "expected"),
         [
             ('{\n "robot": {"id": "a",}\n}', "robot.json: line 2, column 22: not JSON: "),
-            ('{"a": 1,\n // no\n "b": 2}', "a comment is a key that starts with //"),
+            ('{"a": 1,\n // no\n "b": 2}', "line 2, column 2: not JSON"),
             ("", "robot.json: line 1, column 1: not JSON"),
             ("[" * 100_000, "robot.json: nested too deeply"),
             *((_nested(levels), "transport.settings: is nested more than 50 levels deep") for levels in (60, 600, 900)),
@@ -605,10 +605,6 @@ class TestFiles:
         with pytest.raises(ConfigError) as caught:
             load(written(tmp_path, text))
         assert expected in caught.value.problems[0]
-
-    def test_a_trailing_comma_is_recognised(self, tmp_path: Path) -> None:
-        text = '{"robot": {"id": "a"},\n}'
-        assert file_problem(written(tmp_path, text)).endswith("leave out the comma before it")
 
     def test_repeated_comments_are_welcome(self, tmp_path: Path) -> None:
         assert load(written(tmp_path, '{"//": 1, "//": 2, "robot": {"id": "a"}}')).base == "pebble/robots/a"
@@ -752,8 +748,8 @@ class TestWebInterface:
         [
             ({"tls": {"certificate": "a"}}, "tls.key: is missing, it belongs to certificate"),
             ({"tls": {"key": "a"}}, "tls.certificate: is missing, it belongs to key"),
-            ({"host": "http://x/"}, 'host: "http://x/" is a URL: write "x"'),
-            ({"names": ["fair.local", "a b"]}, "names[1]: must be a name or address"),
+            ({"host": "http://x/"}, "host: must be a name or a whole address"),
+            ({"names": ["fair.local", "a b"]}, "names[1]: must be a name or a whole address"),
             ({"server": "a/b"}, "server: must be a topic level"),
             ({"port": 0}, "port: must be a whole number from 1 to 65535"),
         ],
