@@ -16,7 +16,7 @@ from pebble.checks.users import user_name
 from pebble.checks.who import who_drives
 from pebble.client.connection import Target, connected
 from pebble.client.page import require_packages, settings_of
-from pebble.config import Config
+from pebble.config import LAUNCHER_LOCK, Config
 from pebble.contract import STATUS
 from pebble.errors import PebbleError
 from pebble.fleet import certificates
@@ -69,6 +69,17 @@ def state_directory(path: Path) -> CheckResult:
             f"sudo install -d -m 700 -o {user_name(os.geteuid())} {path}, or set transport.state_dir",
         )
     return ok(str(path) if existing == path else f"{path} will be created")
+
+
+def config_of_running(config: Config) -> Iterator[CheckResult]:
+    """Find a file that has changed since the robot was started with it."""
+    lock = config.run_dir() / LAUNCHER_LOCK
+    if config.path is None or not launcher_runs(config.run_dir()):
+        return
+    if config.path.stat().st_mtime > lock.stat().st_mtime:
+        yield warn(f"{config.path} has changed since the robot read it", "start the robot again")
+    else:
+        yield ok(f"{config.path}, as the robot runs")
 
 
 def leftover_sockets(run_dir: Path, answers: Callable[[Path], bool]) -> CheckResult:
@@ -145,6 +156,7 @@ def _page_certificate(file: Path) -> CheckResult:
 ROBOT: tuple[Check[Config], ...] = (
     Check("security", who_drives),
     Check("run directory", lambda config: run_directory(config.run_dir(), os.geteuid())),
+    Check("config", config_of_running),
     Check("sockets", lambda config: leftover_sockets(config.run_dir(), is_listening)),
     Check("state directory", lambda config: state_directory(config.state_dir())),
     Check("serial port", devices.serial_ports),

@@ -12,7 +12,6 @@ from typing import Final
 from pebble.client.arrived import Arrived, Handler
 from pebble.client.named_topics import NamedTopics
 from pebble.errors import TransportError
-from pebble.runtime.by_name import EACH_S, ByName
 from pebble.transports import Message, MqttSettings, QoS, State, Subscription, Transport, create
 
 log = logging.getLogger(__name__)
@@ -125,14 +124,6 @@ class Broker:
                 self._wake()
 
         return await asyncio.to_thread(self.transport.subscribe, filter_, take, qos=qos, direct=True)
-
-    async def ask(self, by_name: ByName) -> None:
-        """Ask for what is missing, of one robot after another, until it is cancelled."""
-        self.on_state(lambda: None if self.connected else by_name.reset())
-        while True:
-            await asyncio.sleep(EACH_S)
-            if self.connected and (topics := by_name.take(time.monotonic())):
-                await asyncio.to_thread(self.transport.ask, topics)
 
     def deliver(self) -> None:
         """Hand over what has arrived, in its order; the rest after whatever else is due, if that takes long."""

@@ -39,7 +39,6 @@ from pebble.config.visible import shown
 from pebble.contract import CAPABILITIES, ESTOP_STATE, LINK, ONLINE, STATUS
 from pebble.contract.levels import LEVELS
 from pebble.errors import PebbleError, TransportError
-from pebble.runtime.by_name import ByName, ask_beside
 from pebble.runtime.signals import interrupted_by_signals
 from pebble.transports import Message, MqttSettings, QoS, State, Transport
 
@@ -140,13 +139,11 @@ def _stop(target: Target, why: str, *, every: bool, hold: bool) -> int:
         try:
             with _heartbeats(target, every=every) as heartbeats, listening(target, transport) as second:
                 listener, subscribing = _listen(second, _filters(names.base))
-                by_name = ByName([STATUS])
-                ask_beside(second, by_name)
                 while not sender.finished:
                     for message in heartbeats.take() if heartbeats else ():
                         sender.receive(message, time.monotonic())
                     outbox.publish()
-                    _receive(listener, sender, by_name, _until_due(sender, hears=heartbeats is not None))
+                    _receive(listener, sender, _until_due(sender, hears=heartbeats is not None))
                     outbox.publish()
                     report.connection(
                         "" if transport.state is State.CONNECTED else transport.problem or "no connection"
@@ -154,7 +151,7 @@ def _stop(target: Target, why: str, *, every: bool, hold: bool) -> int:
                     report.update(time.monotonic())
                 subscribing.join(_ANSWER_S)  # a status tells whether the motors obey, and may come after it
                 wait_for(lambda: second.state is State.CONNECTED, _ANSWER_S)
-                _receive(listener, sender, by_name, _ON_ITS_WAY_S)
+                _receive(listener, sender, _ON_ITS_WAY_S)
         except KeyboardInterrupt:
             sender.end()
         report.end()
@@ -194,14 +191,13 @@ def _until_due(sender: StopSender, *, hears: bool) -> float:
     return most if due is None else min(most, due - time.monotonic())
 
 
-def _receive(listener: Listener, sender: StopSender, by_name: ByName, left: float) -> None:
+def _receive(listener: Listener, sender: StopSender, left: float) -> None:
     """Handle what has arrived; wait for something if nothing has, for ``left`` seconds."""
     for _ in range(_BATCH):
         message = listener.next(left)
         if message is None:
             return
         sender.receive(message, time.monotonic())
-        by_name.receive(message, time.monotonic())
         left = 0.0
 
 
@@ -333,16 +329,14 @@ def _reset(target: Target) -> int:
 
 def _status(target: Target, *, every: bool) -> int:
     with connected(target) as (transport, names):
-        discovery, by_name = Discovery(), ByName([STATUS])
+        discovery = Discovery()
 
         def take(message: Message) -> None:
             discovery.receive(message, time.monotonic(), time.time())
-            by_name.receive(message, time.monotonic())
 
         is_remote = target.remote or str(target.url).startswith("mqtt")  # within a robot there is no heartbeat
         for channel in (ESTOP_STATE, STATUS, CAPABILITIES, *((ONLINE, LINK) if is_remote else ())):
             transport.subscribe(channel.filter(names.base), take, direct=True)
-        ask_beside(transport, by_name)
         if not every:
             wait_for(
                 lambda: names.base in discovery.robots and discovery.robots[names.base].estop.has_capabilities,

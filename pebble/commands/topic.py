@@ -19,12 +19,11 @@ from pebble.commands.options import with_target
 from pebble.commands.terminal import show
 from pebble.commands.topic_contract import contract
 from pebble.config.visible import shown
-from pebble.contract import CHANNELS, DRIVE, ONLINE, codec
+from pebble.contract import DRIVE, codec
 from pebble.contract.identity import parse_topic
 from pebble.errors import PayloadError, PebbleError, TransportError
 from pebble.media.rate_meter import RateMeter
-from pebble.runtime.by_name import ByName, ask_beside
-from pebble.transports import Message, QoS, Transport
+from pebble.transports import QoS, Transport
 from pebble.transports.topics import is_pattern
 
 _TICK_S = 0.2
@@ -73,21 +72,13 @@ def list_(
         pebble topic list 'pebble/+/+/outgoing/#' --url mqtt://127.0.0.1 -s 5
     """
     with connected(target) as (transport, names):
-        listing, by_name = show.Listing(names), ByName(CHANNELS)
-
-        def note(message: Message) -> None:
-            by_name.receive(message, time.monotonic())
-
-        if filter_ is not None:
-            transport.subscribe(ONLINE.filter(names.base), note, direct=True)
+        listing = show.Listing(names)
         listener = Listener(transport, [filter_ or ("#" if target.robot is None else f"{names.base}/#")])
-        ask_beside(transport, by_name)
         end = time.monotonic() + seconds
         while (left := end - time.monotonic()) > 0:
             message = listener.next(left)
             if message is not None:
                 listing.add(message, time.monotonic())
-                note(message)
         show.print_listing(listing, time.monotonic(), time.time())
         for line in show.remarks(listing, time.time()):
             typer.echo(line)

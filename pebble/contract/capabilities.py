@@ -126,7 +126,7 @@ class TelemetryOffer(Payload, frozen=True, kw_only=True):
     touch_topic: str | UnsetType = UNSET
     charging_topic: str | UnsetType = UNSET
     charging_level_topic: str | UnsetType = UNSET
-    wheel_odometry: bool = False  # true while it is being published
+    wheel_odometry: bool = False  # scripts can measure it
     wheel_odometry_topic: str | UnsetType = UNSET
     imu: bool = False
     imu_topic: str | UnsetType = UNSET

@@ -359,7 +359,6 @@ class ServiceState(Payload, frozen=True, kw_only=True):
     state: Literal["init", "ready", "restarting", "failed", "stopped", "held"]  # held: it waits while people drive
     restarts: int = 0
     last_exit: str | None = None  # for example "exit code 1" or "signal 9"
-    dropped: dict[str, int] | UnsetType = UNSET  # messages since its start, by which bound was reached; absent: none
 
 
 class Status(Payload, frozen=True, kw_only=True):

@@ -16,7 +16,6 @@ from pebble.foxglove.json_channels import json_spec
 from pebble.foxglove.media_feed import MediaFeed
 from pebble.foxglove.server import Server, protobuf_spec
 from pebble.recordings.exports.foxglove_messages import Converted, Schemas, Telemetry, as_object, stamped, time_of
-from pebble.runtime.by_name import ByName
 from pebble.transports import Message
 from pebble.transports.topics import matches
 
@@ -37,7 +36,6 @@ class Robots:
 
     def __init__(self, broker: Broker, server: Server, schemas: Schemas) -> None:
         self.bases: set[str] = set()
-        self.by_name = ByName((*FLEET, *WATCHED))
         self._refused = 0  # messages that are no JSON, and those of a robot too many
         self._broker, self._server, self._schemas = broker, server, schemas
         self._telemetry = Telemetry(schemas)
@@ -65,7 +63,6 @@ class Robots:
         if not self._knows(address.identity):
             self._refused += 1
             return
-        self.by_name.receive(message, at)
         channel = channel_of(f"{address.direction}/{address.metric}")
         if channel is CAPABILITIES:
             self._update(address.identity.base, message.payload)

@@ -75,7 +75,7 @@ async def _show(settings: Settings, broker: Broker, robots: Robots, on_ready: Ca
     for filter_ in filters(settings.base):
         await broker.subscribe(filter_, robots.receive)
     on_ready()
-    await broker.ask(robots.by_name)
+    await asyncio.Event().wait()
 
 
 @contextlib.contextmanager

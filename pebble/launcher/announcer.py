@@ -12,49 +12,40 @@ import sys
 from collections.abc import Callable
 
 from pebble.config import config_of_process
-from pebble.contract import WHEEL_ODOMETRY
 from pebble.errors import PebbleError
 from pebble.launcher.announcer_pipe import Envelope, next_envelope
-from pebble.launcher.odometry_watch import OdometryWatch
 from pebble.launcher.reactor import Reactor
-from pebble.runtime.addresses import Addresses
 from pebble.runtime.connections import local_transport
-from pebble.runtime.parent import ALIVE_PERIOD_S, Notifier, ProvidedFeatures, set_log_level, set_up_logging
+from pebble.runtime.parent import ALIVE_PERIOD_S, Notifier, set_log_level, set_up_logging
 from pebble.runtime.process import exit_at_the_latest
 from pebble.transports import Message, State, Transport
+from pebble.transports.wakeup import WakeupPipe
 
 _STDIN = 0
-_WATCH_S = 0.5
 
 log = logging.getLogger(__name__)
 
 
 class Announcer:
-    """Publishes the envelopes that arrive on ``pipe``; states again on every new connection, records only once.
+    """Publishes the envelopes that arrive on ``pipe``; states again on every new connection, records only once."""
 
-    It notifies the launcher of messages on ``odometry_topic``, because capabilities list them.
-    """
-
-    def __init__(self, pipe: int, transport: Transport, odometry_topic: str) -> None:
-        self._pipe, self._transport, self._odometry_topic = pipe, transport, odometry_topic
+    def __init__(self, pipe: int, transport: Transport) -> None:
+        self._pipe, self._transport = pipe, transport
         self._states: dict[str, Message] = {}
         self._reactor = Reactor()
-        self._wake = os.eventfd(0, os.EFD_CLOEXEC | os.EFD_NONBLOCK)
+        self._wake = WakeupPipe()
         self._stopping = False
         os.set_blocking(pipe, False)
 
     def run(self, notify: Notifier) -> None:
         """Run until :meth:`stop` or the end of the pipe; then publish what is still in it, and the will."""
         self._reactor.watch(self._pipe, self._receive)
-        self._reactor.watch(self._wake, self._publish_states)
+        self._reactor.watch(self._wake.fileno(), self._publish_states)
         self._reactor.every(ALIVE_PERIOD_S, notify.alive)
-        odometry = OdometryWatch(self._odometry_topic, ProvidedFeatures(notify))
-        self._reactor.every(_WATCH_S, odometry.poll)
         self._transport.on_state(self._on_state)
         notify.ready()
         try:
             self._transport.open(timeout=0.0)
-            odometry.start(self._transport)
             self._reactor.run_until(lambda: self._stopping)
             self._receive_rest()
         finally:
@@ -63,7 +54,7 @@ class Announcer:
     def stop(self) -> None:
         """End :meth:`run` soon. Safe from signal handlers."""
         self._stopping = True
-        os.eventfd_write(self._wake, 1)
+        self._wake.set()
 
     def _receive(self) -> None:
         envelope = next_envelope(self._pipe)
@@ -85,7 +76,7 @@ class Announcer:
         self._publish(envelope.message)
 
     def _publish_states(self) -> None:
-        os.eventfd_read(self._wake)
+        self._wake.clear()
         for message in self._states.values():
             self._publish(message)
 
@@ -94,16 +85,16 @@ class Announcer:
 
     def _on_state(self, state: State) -> None:
         if state is State.CONNECTED:
-            os.eventfd_write(self._wake, 1)
+            self._wake.set()
 
 
-def run(make_transport: Callable[[Message], Transport], odometry_topic: str) -> int:
+def run(make_transport: Callable[[Message], Transport]) -> int:
     """Publish what arrives on stdin through ``make_transport(will)``; returns the exit code."""
     try:
         will = next_envelope(_STDIN)
         if will is None:  # the launcher has ended already
             return 0
-        announcer = Announcer(_STDIN, make_transport(will.message), odometry_topic)
+        announcer = Announcer(_STDIN, make_transport(will.message))
     except PebbleError as error:
         log.error("the launcher publishes nothing: %s", error)
         return 1
@@ -128,9 +119,8 @@ def main(arguments: list[str]) -> int:
     except PebbleError as error:
         log.error("%s", error)
         return 1
-    set_log_level(config.log_level_of("launcher"))
-    topic = Addresses(config)[WHEEL_ODOMETRY].topic
-    return run(lambda will: local_transport(config, "launcher", will=will), topic)
+    set_log_level(config.log_level)
+    return run(lambda will: local_transport(config, "launcher", will=will))
 
 
 if __name__ == "__main__":

@@ -26,7 +26,7 @@ def capabilities(
 
     ``lacking`` and ``found`` are what its processes report at present (pebble.launcher.features).
     """
-    drive, estop, lights, telemetry = _motor(config, addresses, lacking, found)
+    drive, estop, lights, telemetry = _motor(config, addresses, lacking)
     soundboard, autonomy = config.services.soundboard_handler, config.services.autonomy_manager
     value = offers.CapabilitiesValue(
         identity=_identity(config),
@@ -124,7 +124,7 @@ def _system(config: Config, addresses: Addresses) -> offers.SystemOffer:
 
 
 def _motor(
-    config: Config, addresses: Addresses, lacking: Collection[str], found: Collection[str]
+    config: Config, addresses: Addresses, lacking: Collection[str]
 ) -> tuple[offers.DriveOffer, offers.EstopOffer, offers.LightsOffer, offers.TelemetryOffer]:
     """Drive, stop, lights and telemetry of the serial line to the motor MCU, with *its* effective topics."""
     lines = config.motor_lines()
@@ -147,13 +147,14 @@ def _motor(
         flash_topic=addresses[c.LIGHTS_FLASH].topic,
     )
     imu, imu_topic = _imu(config)
+    touch = present and line.telemetry.publish_touch_sensors
     telemetry = offers.TelemetryOffer(
-        touch_sensors=present and line.telemetry.publish_touch_sensors,
+        touch_sensors=touch,
         charging_status=present,
         touch_topic=addresses[c.TOUCH_SENSORS].topic,
         charging_topic=addresses[c.CHARGING_STATUS].topic,
         charging_level_topic=addresses[c.CHARGING_LEVEL].topic,
-        wheel_odometry=c.WHEEL_ODOMETRY.metric in found,
+        wheel_odometry=touch and config.services.autonomy_manager.enabled,
         wheel_odometry_topic=addresses[c.WHEEL_ODOMETRY].topic,
         imu=imu,
         imu_topic=imu_topic,

@@ -2,17 +2,16 @@
 
 import logging
 import os
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Sequence
 from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
 from pebble.config import Config
 from pebble.config.rules.doors import warning_of_open
 from pebble.errors import ConfigError, PebbleError
 from pebble.launcher.child import Child
-from pebble.launcher.config_watch import ConfigWatch
 from pebble.launcher.driveable import Driveable
-from pebble.launcher.dropped import Dropped
 from pebble.launcher.features import Features
 from pebble.launcher.log_forwarding import LogForwarder, OwnRecords
 from pebble.launcher.on_demand import OnDemand
@@ -23,11 +22,11 @@ from pebble.launcher.restart_policy import RestartPolicy
 from pebble.launcher.run_lock import RunLock
 from pebble.launcher.sd_notify import SystemdNotifier
 from pebble.launcher.status import StatusPublisher
+from pebble.runtime import notes
 from pebble.runtime.connections import check_connections
 from pebble.runtime.parent import LAUNCHER_PID
 from pebble.transports import segments
 
-_CONFIG_POLL_S = 2.0
 _RUN_DIR_S = 1.0
 _ORPHANS_S = 1.0
 _REAP_S = 2.0  # the kernel needs this long at most to end what was killed
@@ -50,13 +49,17 @@ class Launcher:
         self._supervisors = [self._supervise(program) for program in (programs(config) if table is None else table)]
         self._on_demand = OnDemand(self._reactor, self._supervisors)
         self._features = Features(lambda: self._status.capabilities_changed())
-        self._dropped = Dropped()
         self._driveable = self._driveable_by({supervisor.program.name for supervisor in self._supervisors})
-        self._status = StatusPublisher(
-            config, self._reactor, self._supervisors, self._features, self._dropped, self._driveable
-        )
+        self._status = StatusPublisher(config, self._reactor, self._supervisors, self._features, self._driveable)
+        self._handlers: dict[type[notes.Note], Callable[[Program, Any], None]] = {
+            notes.Wanted: self._on_demand.want,
+            notes.Held: self._on_demand.hold,
+            notes.Feature: lambda program, note: self._features.receive(program.name, note),
+            notes.Local: lambda program, note: self._driveable.local(program.name, note),
+            notes.Mcu: lambda program, note: self._driveable.mcu(program.name, note),
+            notes.Reach: lambda program, note: self._driveable.reach(program.name, note),
+        }
         self._logs = LogForwarder(self._status.publish_log)
-        self._config_watch = ConfigWatch(config)
         self._signals = StopSignals(self._kill_all)
         self._lost = False  # another launcher has taken the run directory
 
@@ -66,7 +69,7 @@ class Launcher:
         Raises PebbleError if the robot runs already or its run directory cannot be used. Main thread only.
         """
         config = self._config
-        own_records = OwnRecords(self._logs, config.log_level_of("launcher"))
+        own_records = OwnRecords(self._logs, config.log_level)
         in_state_dir = config.state_file("launcher").with_suffix(".lock")
         with own_records, RunLock(config.run_dir(), config.base, in_state_dir) as lock, self._signals:
             try:
@@ -95,7 +98,6 @@ class Launcher:
         for warning in (*self._config.warnings, warning_of_open(self._config)):
             if warning:
                 log.warning("%s", warning)
-        self._reactor.every(_CONFIG_POLL_S, self._config_watch.poll)
         if os.getpid() == 1:
             self._reactor.every(_ORPHANS_S, self._reap_orphans)
         self._status.start()
@@ -107,7 +109,7 @@ class Launcher:
             self._reactor,
             spawn=self._spawn,
             on_line=lambda pid, line: self._log_line(program, pid, line),
-            on_note=lambda line: self._receive_note(program, line),
+            on_note=lambda note: self._receive_note(program, note),
             on_change=lambda: self._status.changed(),
             on_end=lambda: self._ended(program),
             is_stopping=self._stop_requested,
@@ -128,15 +130,11 @@ class Launcher:
         else:
             self._logs.child_line(program.name, pid, line, published=not program.reads_announcer_pipe)
 
-    def _receive_note(self, program: Program, line: str) -> None:
-        if self._dropped.receive(program.name, line):
-            self._status.changed()
-        elif not self._driveable.receive(program.name, line) and not self._features.receive(program.name, line):
-            self._on_demand.receive(program, line)
+    def _receive_note(self, program: Program, note: notes.Note) -> None:
+        self._handlers[type(note)](program, note)
 
     def _ended(self, program: Program) -> None:
         self._features.ended(program.name)
-        self._dropped.ended(program.name)
         self._driveable.ended(program.name)
         self._on_demand.ended(program)
 
@@ -149,9 +147,7 @@ class Launcher:
             os.close(stdin)
 
     def _environment_of(self, program: Program) -> dict[str, str]:
-        """The config's variables replace inherited ones, and never those that the launcher itself sets."""
-        own = {LAUNCHER_PID: str(os.getpid()), **self._on_demand.environment(program)}
-        return {**self._environment, **program.environment, **own}
+        return {**self._environment, LAUNCHER_PID: str(os.getpid()), **self._on_demand.environment(program)}
 
     def _reap_orphans(self) -> None:
         reap({supervisor.pid for supervisor in self._supervisors if supervisor.pid is not None})

@@ -5,17 +5,22 @@ from collections.abc import Callable
 from enum import Enum, auto
 from functools import partial
 
+import msgspec
+
 from pebble.launcher.child import Child
+from pebble.launcher.log_forwarding import text_of
 from pebble.launcher.pipes import Pipes
 from pebble.launcher.programs import Program
 from pebble.launcher.reactor import Reactor
 from pebble.launcher.restart_policy import LOOP_EXITS, LOOP_WINDOW_S, RestartPolicy
+from pebble.runtime import notes
+from pebble.runtime.exits import ASKS_S, has_ended
 from pebble.runtime.timers import Timer
 
 log = logging.getLogger(__name__)
 
 
-class State(Enum):
+class ProgramState(Enum):
     """What the program does, and with it what the supervisor's one timer is for."""
 
     IDLE = auto()  # no child; started by request() or start()
@@ -28,14 +33,14 @@ class State(Enum):
     STOPPED = auto()  # no child, and never another
 
 
-_ACTIVE = (State.WAITING, State.RUNNING, State.STUCK, State.REPLACED)
+_ACTIVE = (ProgramState.WAITING, ProgramState.RUNNING, ProgramState.STUCK, ProgramState.REPLACED)
 
 
 class ProcessSupervisor:
     """One program, its restart policy and its present child. All methods belong to the reactor's thread.
 
     An on-demand program is started by :meth:`request`, any other by :meth:`start`. ``on_line(pid, line)`` gets the
-    child's output, ``on_note(line)`` its notes other than READY and ALIVE; ``on_change()`` is called when the state
+    child's output, ``on_note(note)`` its notes other than Ready and Alive; ``on_change()`` is called when the state
     that is reported may have changed, ``on_end()`` whenever a child has ended. While ``is_stopping()``, whatever ends
     stays ended: the programs of other stages may still have their turn.
     """
@@ -48,13 +53,13 @@ class ProcessSupervisor:
         *,
         spawn: Callable[[Program], Child],
         on_line: Callable[[int, str], None],
-        on_note: Callable[[str], None],
+        on_note: Callable[[notes.Note], None],
         on_change: Callable[[], None],
         on_end: Callable[[], None],
         is_stopping: Callable[[], bool],
     ) -> None:
         self.program, self.policy = program, policy
-        self.state = State.IDLE
+        self.state = ProgramState.IDLE
         self.shown = not program.on_demand  # in the robot's status: on-demand programs from their first request on
         self.held = False  # an on-demand program is requested, and waits for its turn
         self._reactor, self._spawn = reactor, spawn
@@ -63,6 +68,7 @@ class ProcessSupervisor:
         self._child: Child | None = None
         self._pipes: Pipes | None = None  # of the newest child
         self._timer: Timer | None = None
+        self._nonsense_logged = False
 
     @property
     def running(self) -> bool:
@@ -82,12 +88,12 @@ class ProcessSupervisor:
     def request(self) -> None:
         """Run an on-demand program: now, or as soon as its child that is being stopped has ended."""
         self.held = False
-        if self.state not in (State.IDLE, State.RELEASED):
+        if self.state not in (ProgramState.IDLE, ProgramState.RELEASED):
             return
         log.info("%s is requested", self.program.name)
         self.shown = True
-        if self.state is State.RELEASED:
-            self.state = State.REPLACED
+        if self.state is ProgramState.RELEASED:
+            self.state = ProgramState.REPLACED
         else:
             self._start_after_request()
 
@@ -99,10 +105,10 @@ class ProcessSupervisor:
         if self.state not in _ACTIVE:
             return
         log.info("%s is released", self.program.name)
-        if self.state is State.REPLACED:
-            self.state = State.RELEASED
+        if self.state is ProgramState.REPLACED:
+            self.state = ProgramState.RELEASED
             return
-        self._end_child(State.RELEASED, State.IDLE)
+        self._end_child(ProgramState.RELEASED, ProgramState.IDLE)
         if self._child is not None:
             self._timer = self._reactor.after(self.program.stop_timeout_s, self._kill_overdue)
 
@@ -123,16 +129,16 @@ class ProcessSupervisor:
         except OSError as error:
             self._restart(f"could not start: {error}")
             return
-        self.state = State.RUNNING
-        self._pipes = Pipes(child, self._reactor, partial(self._on_line, child.pid), self._noted)
-        self._reactor.watch(child.exited, lambda: self._exited(child))
+        self.state = ProgramState.RUNNING
+        self._pipes = Pipes(child, self._reactor, partial(self._printed, child.pid), self._noted)
+        self._watch_exit(child)
         self._check_at(self.policy.stuck_at)
         self._on_change()
 
     def stop(self) -> None:
         """Ask the child to end, and start no other."""
         self.held = False
-        self._end_child(State.STOPPING, State.STOPPED)
+        self._end_child(ProgramState.STOPPING, ProgramState.STOPPED)
 
     def kill(self) -> None:
         """Kill the child. The reactor notices its exit like any other."""
@@ -141,16 +147,27 @@ class ProcessSupervisor:
 
     # -- what the child tells
 
-    def _noted(self, line: str) -> None:
-        if line == "ALIVE":
+    def _printed(self, pid: int, line: bytes) -> None:
+        if text := text_of(line):
+            self._on_line(pid, text)
+
+    def _noted(self, line: bytes) -> None:
+        try:
+            note = notes.decode(line)
+        except msgspec.DecodeError:
+            if not self._nonsense_logged:
+                self._nonsense_logged = True
+                log.warning("%s wrote what is no note, ignored: %.80s", self.program.name, text_of(line))
+            return
+        if isinstance(note, notes.Alive):
             self.policy.alive(self._reactor.now())
-        elif line == "READY":
+        elif isinstance(note, notes.Ready):
             self._ready()
         else:
-            self._on_note(line)
+            self._on_note(note)
 
     def _ready(self) -> None:
-        if self.state is not State.RUNNING:  # too late
+        if self.state is not ProgramState.RUNNING:  # too late
             return
         self.policy.ready(self._reactor.now())
         self._check_at(self.policy.stuck_at)  # from now on signs of life come more often
@@ -166,7 +183,7 @@ class ProcessSupervisor:
             self.start()
 
     def _start_in(self, wait_s: float) -> None:
-        self.state = State.WAITING
+        self.state = ProgramState.WAITING
         self._timer = self._reactor.after(wait_s, self.start)
 
     def _check_at(self, due: float) -> None:
@@ -178,7 +195,7 @@ class ProcessSupervisor:
             self._check_at(self.policy.stuck_at)
             return
         log.error("%s gives no sign of life: killed", self.program.name)
-        self.state = State.STUCK
+        self.state = ProgramState.STUCK
         self.kill()
 
     def _kill_overdue(self) -> None:
@@ -192,7 +209,7 @@ class ProcessSupervisor:
 
     # -- the end of a child
 
-    def _end_child(self, ending: State, ended: State) -> None:
+    def _end_child(self, ending: ProgramState, ended: ProgramState) -> None:
         """Ask the child to end. The state is ``ending``, or already ``ended`` if there is none."""
         self._cancel_timer()
         if self._child is not None:
@@ -203,26 +220,42 @@ class ProcessSupervisor:
             self.policy.stopped(None)
             self._on_change()
 
+    def _watch_exit(self, child: Child) -> None:
+        if child.exited is not None:
+            self._reactor.watch(child.exited, lambda: self._exited(child))
+            return
+
+        def ask() -> None:
+            if has_ended(child.pid):
+                self._exited(child)
+            else:
+                self._reactor.after(ASKS_S, ask)
+
+        ask()
+
     def _exited(self, child: Child) -> None:
         child.kill()  # what it started must not go on without it; until it is reaped the group's number is its own
         if self._pipes is not None:
             self._pipes.close()
-        self._reactor.forget(child.exited)
+        if child.exited is not None:
+            self._reactor.forget(child.exited)
         how = child.end()
         self._child = None
         self._cancel_timer()
-        if self.state not in (State.RUNNING, State.STUCK):
+        if self.state not in (ProgramState.RUNNING, ProgramState.STUCK):
             self._ended_as_asked(how)
         elif self._is_stopping():
             log.info("%s ended (%s) before its turn to stop", self.program.name, how)
             self._ended_as_asked(how)
         else:
-            self._restart("stuck, killed" if self.state is State.STUCK else how)
+            self._restart("stuck, killed" if self.state is ProgramState.STUCK else how)
         self._on_end()
 
     def _ended_as_asked(self, how: str) -> None:
-        again = self.state is State.REPLACED
-        self.state = State.IDLE if self.state in (State.RELEASED, State.REPLACED) else State.STOPPED
+        again = self.state is ProgramState.REPLACED
+        self.state = (
+            ProgramState.IDLE if self.state in (ProgramState.RELEASED, ProgramState.REPLACED) else ProgramState.STOPPED
+        )
         self.policy.stopped(how)
         self._on_change()
         if again:

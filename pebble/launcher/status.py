@@ -5,15 +5,12 @@ import time
 from collections.abc import Sequence
 from typing import Any
 
-from msgspec import UNSET
-
 from pebble.config import Config
 from pebble.contract import CAPABILITIES, LOGS, STATUS, Channel, codec
 from pebble.contract.payloads import Capabilities, LogRecord, ServiceState, Status
 from pebble.launcher.announcer_pipe import AnnouncerPipe
 from pebble.launcher.capabilities import capabilities
 from pebble.launcher.driveable import Driveable
-from pebble.launcher.dropped import Dropped
 from pebble.launcher.features import Features
 from pebble.launcher.process_supervisor import ProcessSupervisor
 from pebble.launcher.reactor import Reactor
@@ -35,12 +32,11 @@ class StatusPublisher:
         reactor: Reactor,
         supervisors: Sequence[ProcessSupervisor],
         features: Features,
-        dropped: Dropped,
         driveable: Driveable,
     ) -> None:
         self._config, self._addresses = config, Addresses(config)
-        self._reactor, self._supervisors, self._features = reactor, supervisors, features
-        self._dropped, self._driveable = dropped, driveable
+        self._reactor, self._supervisors = reactor, supervisors
+        self._features, self._driveable = features, driveable
         self._pipe = AnnouncerPipe(reactor)
         self._systemd = SystemdNotifier()
         self._status_due = self._capabilities_due = False
@@ -56,7 +52,7 @@ class StatusPublisher:
         interval_s = self._config.services.defaults.retained_publish_interval_seconds
         if self._systemd.watchdog_period_s is not None:
             self._reactor.every(self._systemd.watchdog_period_s, self._systemd.watchdog)
-        if launcher.enabled and launcher.capabilities.enabled:
+        if launcher.enabled:
             self._publish_capabilities()
             self._reactor.every(interval_s, self._publish_capabilities)
         self.changed()
@@ -74,8 +70,7 @@ class StatusPublisher:
 
     def capabilities_changed(self) -> None:
         """What the processes report has changed: publish soon."""
-        launcher = self._config.services.launcher
-        if launcher.enabled and launcher.capabilities.enabled and not self._capabilities_due:
+        if self._config.services.launcher.enabled and not self._capabilities_due:
             self._capabilities_due = True
             self._reactor.after(_STATUS_PAUSE_S, self._publish_capabilities)
 
@@ -123,12 +118,11 @@ class StatusPublisher:
         return Status(t=_now_ms(), value=value)
 
     def _state(self, supervisor: ProcessSupervisor) -> ServiceState:
-        policy, dropped = supervisor.policy, self._dropped[supervisor.program.name]
+        policy = supervisor.policy
         return ServiceState(
             state="held" if supervisor.held else policy.state,
             restarts=policy.restarts,
             last_exit=policy.last_exit,
-            dropped=dropped or UNSET,
         )
 
     def _publish_capabilities(self) -> None:

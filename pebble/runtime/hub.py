@@ -8,7 +8,6 @@ pebble.runtime.process, which would be a good part of this small process.
 import logging
 import sys
 import threading
-import time
 from dataclasses import replace
 from pathlib import Path
 from typing import Final
@@ -18,7 +17,7 @@ import msgspec
 from pebble.contract import CHANNELS, INCOMING, Kind
 from pebble.contract.names import BY
 from pebble.errors import PebbleError
-from pebble.runtime.parent import ALIVE_PERIOD_S, DROPPED_PERIOD_S, DroppedMessages, Notifier, set_up_logging
+from pebble.runtime.parent import ALIVE_PERIOD_S, Notifier, set_up_logging
 from pebble.runtime.signals import EndSignal
 from pebble.transports.settings import ZenohSettings
 from pebble.transports.zenoh.hub import ZenohHub
@@ -53,17 +52,15 @@ def main(arguments: list[str]) -> int:
 def run_hub(settings: ZenohSettings, stop: EndSignal | threading.Event) -> None:
     """Run a hub until ``stop`` is set. Raises TransportError if it cannot open."""
     notify = Notifier()
-    dropped, due = DroppedMessages(notify), time.monotonic()
     hub = ZenohHub(replace(settings, wills=(*WILLS, *settings.wills), unretained=UNRETAINED)).open()
     try:
         notify.ready()
         while not stop.wait(ALIVE_PERIOD_S):
             notify.alive()
             hub.look()
-            if time.monotonic() >= due:
-                due += DROPPED_PERIOD_S
-                dropped.report({"no_room": hub.refused, "wills": hub.refused_wills})
     finally:
+        if hub.refused or hub.refused_wills:
+            log.info("refused in all: %d retained messages, %d wills", hub.refused, hub.refused_wills)
         hub.close()
 
 

@@ -15,10 +15,8 @@ from pebble.runtime.connections import local_transport
 from pebble.runtime.environment import withhold
 from pebble.runtime.parent import (
     ALIVE_PERIOD_S,
-    DROPPED_PERIOD_S,
-    DroppedMessages,
-    LocalConnection,
     Notifier,
+    Reported,
     set_log_level,
     set_up_logging,
 )
@@ -49,8 +47,7 @@ def run(
     try:
         config = config_of_process(arguments[0])
         withhold(config.password_variables)
-        program = f"{service_class.name}:{instance}" if instance else service_class.name
-        set_log_level(config.log_level_of(program))
+        set_log_level(config.log_level)
         view = view_of(config, instance)
         return _serve(service_class if choose is None else choose(view), view, instance)
     except PebbleError as error:
@@ -67,7 +64,7 @@ def _serve(service_class: type[Service], config: Config, instance: str) -> int:
     transport = local_transport(config, service_class.client_name or name, as_published=service_class.as_published)
     service = service_class(config, transport, instance=instance)
     notify = Notifier()
-    dropped, local = DroppedMessages(notify), LocalConnection(notify)
+    local = Reported(notify.local)
 
     def quit_(_signal: int, _frame: object) -> None:
         exit_at_the_latest()
@@ -75,12 +72,12 @@ def _serve(service_class: type[Service], config: Config, instance: str) -> int:
 
     def alive() -> None:
         notify.alive()
-        local.report(transport.state is State.CONNECTED, transport.problem)
+        connected = transport.state is State.CONNECTED
+        local.report(connected, "" if connected else transport.problem)
 
     signal.signal(signal.SIGTERM, quit_)
     signal.signal(signal.SIGINT, quit_)
     service.timers.add(service.clock(), alive, period=ALIVE_PERIOD_S)
-    service.timers.add(service.clock(), lambda: dropped.report(service.dropped()), period=DROPPED_PERIOD_S)
     service.run(ready=notify.ready)
     return 0
 

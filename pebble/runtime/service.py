@@ -133,7 +133,7 @@ class Service:
         self._on_stop.callback(callback)
 
     def dropped(self) -> dict[str, int]:
-        """How many messages were dropped since the start because a bound was reached, by reason: for the status."""
+        """How many messages were dropped since the start because a bound was reached, by reason: for the log."""
         return bounds_reached(self.transport.counters) | {"late": self.counters["late"]}
 
     def publish(self, channel: Channel, value: Any, **names: str) -> bool:
@@ -265,9 +265,11 @@ class Service:
             with self._on_stop:
                 self.stop()
         finally:
-            totals, dropped = self.log_limited.totals(), self._inbox.dropped
-            if totals or dropped:
-                self.log.info("refused in all: %s; dropped from the inbox: %d", totals or "nothing", dropped)
+            counts = {**self.dropped(), "inbox": self._inbox.dropped}
+            dropped = {reason: count for reason, count in counts.items() if count}
+            for words, numbers in (("refused in all", self.log_limited.totals()), ("dropped in all", dropped)):
+                if numbers:
+                    self.log.info("%s: %s", words, numbers)
             self.transport.close()
 
     def _set_timers(self) -> None:

@@ -17,14 +17,13 @@ from pebble.client.heartbeats import Heartbeats
 from pebble.client.page import WebSettings
 from pebble.client.robot_topics import FLEET, SYNONYMS
 from pebble.config.security import SecurityLevel
-from pebble.contract import CAPABILITIES, CONTROL_STATE, LINK, ONLINE, channel_of
+from pebble.contract import CAPABILITIES, CONTROL_STATE, ONLINE, channel_of
 from pebble.contract.identity import SERVERS, Identity, parse_topic
 from pebble.errors import ConfigError
 from pebble.fleet.audit import Audit
 from pebble.fleet.database import DatabaseError
 from pebble.fleet.people import People
 from pebble.fleet.roles import Session
-from pebble.runtime.by_name import ByName
 from pebble.transports import Message, QoS, Subscription
 from pebble.transports.clock import since_boot as clock
 from pebble.web import messages as m
@@ -63,7 +62,6 @@ class Server:
         self.open_components = OpenComponents(self.broker, self.robots, self.spawn)
         # What is drawn over the picture comes from there.
         self.sources = ChosenSources(people, self.robots, OwnHosts(settings), self.open_components.update)
-        self.by_name = ByName(FLEET, self._is_wanted)
         self.robots.is_wanted = self._is_wanted
         self.robots.is_kept = lambda ref: self._is_wanted(ref) or self.stops.sends_to(ref)
         self.robots.on_forget = self._ask_anew
@@ -83,7 +81,6 @@ class Server:
         self.spawn(self._tick())
         if self.settings.login:
             self.spawn(self._watch_people())
-        self.spawn(self.broker.ask(self.by_name))
 
     async def close(self) -> None:
         """Stop what pages move, then disconnect."""
@@ -113,8 +110,6 @@ class Server:
         ref = address.identity.base
         self.robots.receive(message, now)
         self._send(self.stops.receive(message, clock()))
-        if address.metric in (ONLINE.metric, LINK.metric) or ref in self.robots.components:
-            self.by_name.receive(message, now)  # what found no place is asked for
         if ref not in self.robots.components:
             return
         if address.metric != ONLINE.metric or self.robots.value(ref, _ESTOP_METRIC) is None:
@@ -125,9 +120,8 @@ class Server:
             for one in (ref, *(page for page, source in self.robots.sources.items() if source == ref)):
                 self.open_components.update(one)
 
-    def _ask_anew(self, ref: str) -> None:
+    def _ask_anew(self, _ref: str) -> None:
         """Ask again for what this robot has published, although it has been delivered."""
-        self.by_name.forget(ref)
         for subscription in self._of_all:
             subscription.renew()
 

@@ -4,59 +4,22 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable, Mapping
+from importlib import import_module
+from typing import TYPE_CHECKING
 
 from pebble.config.media import CameraCapture
 from pebble.errors import DeviceError, NotRunningError
-from pebble.media.world.pose_page import PoseReader, page_path
-from pebble.media.world.poses import Track
-from pebble.media.world.renderer import Renderer
-from pebble.media.world.scene import Image
-from pebble.media.world.world_file import open_world, split_device
 from pebble.services.av_daemon.source import Bytes, Capture
 from pebble.services.av_daemon.synthetic import Pacer
 from pebble.transports.frames import FrameInfo
 
+if TYPE_CHECKING:
+    from pebble.simulation.world.robot_view import RobotView
+
 _WAIT_S = 10.0  # for a world that is not running yet, while the camera is opened
 _SILENCE_S = 3.0  # for one that is running no longer
 _POLL_S = 0.1
-STALE_S = 1.0  # a world that has written nothing for so long does not run
-
-
-class RobotView:
-    """What is seen now from the robot that ``device`` (``world.json#goob``) names.
-
-    Raises DeviceError for a file or robot that is wrong, NotRunningError while the world does not run.
-    """
-
-    def __init__(self, device: str, width: int, height: int, clock_ns: Callable[[], int] = time.monotonic_ns) -> None:
-        self._path, self._robot = split_device(device)
-        world = open_world(self._path, self._robot)
-        self._clock_ns = clock_ns
-        self._latency_ns = round(world.camera.latency_ms * 1e6)
-        self._renderer = Renderer(world, self._robot, width, height)
-        self._tracks: Mapping[str, Track] = {}
-        try:
-            self._page = PoseReader(page_path(self._path))
-        except (OSError, ValueError):
-            raise self._not_running() from None
-        self.look()
-
-    def look(self) -> int:
-        """Choose the moment of the next picture; returns it, monotonic ns. Raises NotRunningError."""
-        self._tracks = self._page.tracks()
-        track = self._tracks.get(self._robot)
-        if track is None or not self._page.is_valid or self._clock_ns() - track.newest.ns > STALE_S * 1e9:
-            raise self._not_running()
-        self._at_ns = track.newest.ns - self._latency_ns
-        return self._at_ns
-
-    def draw(self, out: Image) -> None:
-        """Draw the picture of the moment that ``look`` returned, into an array of shape (height, width, 3)."""
-        self._renderer.render(self._tracks, self._at_ns, out)
-
-    def _not_running(self) -> NotRunningError:
-        return NotRunningError(f"the world does not run, start it: pebble sim world {self._path}")
+_VIEW = "pebble.simulation.world.robot_view"  # loaded by the robots that have one
 
 
 class WorldCamera:
@@ -96,10 +59,11 @@ class WorldCamera:
         self._pacer.interrupt()
 
     def _wait_for_view(self, seconds: float) -> RobotView:
-        deadline = time.monotonic() + seconds
+        video, deadline = self._video, time.monotonic() + seconds
         while True:
             try:
-                return RobotView(self._video.device, self._video.width, self._video.height)
+                view: RobotView = import_module(_VIEW).RobotView(video.device, video.width, video.height)
+                return view
             except NotRunningError:
                 if time.monotonic() >= deadline:
                     raise

@@ -9,14 +9,14 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from pebble.errors import DeviceError
-from pebble.media.world.pose_page import PERIOD_S
-from pebble.media.world.poses import RobotPose, Sample, Track
-from pebble.media.world.renderer import Renderer
-from pebble.media.world.scene import Image
-from pebble.media.world.world_file import LONGEST_EXPOSURE_MS, LONGEST_LATENCY_MS, World
 from pebble.simulation.board import SimulatedMcu
 from pebble.simulation.motion import Pose, RobotMotion
+from pebble.simulation.world.pose_page import PERIOD_S
+from pebble.simulation.world.poses import RobotPose, Sample, Track
+from pebble.simulation.world.renderer import Renderer
+from pebble.simulation.world.surfaces import Image
 from pebble.simulation.world.walls import Floor, start_pose
+from pebble.simulation.world.world_file import LONGEST_EXPOSURE_MS, LONGEST_LATENCY_MS, World
 
 STEP_S: Final = 0.005  # one turn of the firmware's loop
 _STEPS_PER_SAMPLE = round(PERIOD_S / STEP_S)

@@ -13,12 +13,12 @@ from pebble.config import parse
 from pebble.contract import DRIVE, Channel
 from pebble.contract.payloads import Drive
 from pebble.errors import PebbleError
-from pebble.media.world.world_file import read_world
 from pebble.runtime.addresses import Addresses
 from pebble.script import Robot, Stopped
 from pebble.script.drive_sender import DriveSender
 from pebble.script.robot import check_publish
 from pebble.simulation.world.lockstep import STEP_S, LockstepRobot, LockstepWorld
+from pebble.simulation.world.world_file import read_world
 
 _WATCHDOG_S = 0.75  # of serial_mcu_bridge
 _PATIENCE = 10_000  # calls during which no time passes

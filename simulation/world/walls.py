@@ -9,8 +9,8 @@ from __future__ import annotations
 import math
 import threading
 
-from pebble.media.world.world_file import World
 from pebble.simulation.motion import Pose
+from pebble.simulation.world.world_file import World
 
 _HALVINGS = 12  # of a move that is not free, to find the contact: of 8 mm, 2 µm are left
 _ROUNDING_MM = 1e-6

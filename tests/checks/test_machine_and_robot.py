@@ -125,6 +125,17 @@ def test_run_directory(tmp_path: Path) -> None:
     assert robot.run_directory(tmp_path / "file", uid).text.endswith("is not a directory")
 
 
+def test_a_config_that_has_changed_since_the_start_is_found(tmp_path: Path) -> None:
+    file, lock = tmp_path / "goob.json", tmp_path / "run" / "launcher.lock"
+    lock.parent.mkdir()
+    file.write_text(json.dumps({"robot": {"id": "goob"}, "transport": {"kind": "mqtt", "run_dir": str(lock.parent)}}))
+    assert list(robot.config_of_running(load(file))) == []
+    lock.write_text(f"{os.getpid()}\n")
+    assert [found.state for found in robot.config_of_running(load(file))] == [State.OK]
+    os.utime(lock, (1, 1))
+    assert [found.state for found in robot.config_of_running(load(file))] == [State.WARN]
+
+
 def test_leftover_sockets_are_found(tmp_path: Path) -> None:
     assert robot.leftover_sockets(tmp_path / "missing", robot.is_listening).state is State.OK
     with socket.socket(socket.AF_UNIX) as living, socket.socket(socket.AF_UNIX) as dying:

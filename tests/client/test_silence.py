@@ -16,17 +16,10 @@ from pebble.client.scripts import RobotScripts
 from pebble.contract import LINK, ONLINE
 from pebble.contract.levels import LEVELS, link_of, silent_after
 from pebble.contract.payloads import LinkLevel
-from pebble.runtime.by_name import ByName
 from pebble.transports import Message
 
 BASE = "pebble/robots/goob"
 NEAR_S = 0.1
-ROBOTS = 8  # for which there is a place
-
-
-@pytest.fixture(autouse=True)
-def few_places(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("pebble.runtime.by_name.MAX_ROBOTS", ROBOTS)
 
 
 def link(level: LinkLevel, base: str = BASE) -> Message:
@@ -52,19 +45,9 @@ def printed_by_estop_status(level: LinkLevel, after_s: float) -> bool:
     return not discovery.awaits_heartbeat(after_s)
 
 
-def gives_its_place_to_another(level: LinkLevel, after_s: float) -> bool:
-    by_name = ByName()
-    for number in range(ROBOTS):
-        by_name.receive(heartbeat(f"{BASE}{number}"), 0.0)
-        by_name.receive(link(level, f"{BASE}{number}"), 0.0)
-    by_name.receive(heartbeat(), after_s)
-    return not by_name.omitted
-
-
 MEMBERS: dict[str, tuple[Callable[[LinkLevel, float], bool], dict[LinkLevel, float]]] = {
     "a page, or a terminal": (shown_by_a_page_or_terminal, {"wide": 2, "narrow": 3, "thin": 5}),
     "pebble estop status": (printed_by_estop_status, {"wide": 2, "narrow": 3, "thin": 5}),
-    "who asks robots by name": (gives_its_place_to_another, {"wide": 2, "narrow": 3, "thin": 5}),
 }
 
 
@@ -97,13 +80,3 @@ def test_a_first_robot_is_awaited_as_one_of_which_nothing_is_known() -> None:
     discovery.receive(link("thin"), 0.0, 0.0)
     discovery.receive(heartbeat(), 1.0, 1.0)
     assert not discovery.awaits_heartbeat(1.0)
-
-
-def test_a_link_that_is_removed_is_wide() -> None:
-    by_name = ByName()
-    for number in range(ROBOTS):
-        one = f"{BASE}{number}"
-        for message in (heartbeat(one), link("thin", one), Message(LINK.topic(one), b"")):
-            by_name.receive(message, 0.0)
-    by_name.receive(heartbeat(), 2.1)
-    assert not by_name.omitted

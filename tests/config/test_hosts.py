@@ -12,8 +12,6 @@ from pebble.config.hosts import HostError, broker_host, endpoint, name_of_page
 from pebble.errors import ConfigError, PebbleError
 from pebble.fleet.certificates import init
 
-LOGIN = ', and the login into "username" and "password_file"'
-
 
 @pytest.mark.parametrize(
     ("text", "host"),
@@ -31,46 +29,14 @@ def test_what_is_understood(text: str, host: str) -> None:
 @pytest.mark.parametrize(
     ("text", "instead"),
     [
-        ("mqtt://broker.example", '"mqtt://broker.example" is a URL: write "host": "broker.example"'),
-        ("tcp://b:1883", '"tcp://b:1883" is a URL: write "host": "b", "port": 1883'),
-        ("MQTTS://b/", '"mqtts://b/" is a URL: write "host": "b", "port": 8883, "tls": {"enabled": true}'),
-        ("ws://b:80/mqtt", '"ws://b:80/…" is a URL: write "host": "b", "port": 80 (the broker\'s port of MQTT'),
-        ("b:1883", '"b:1883" holds a port: write "host": "b", "port": 1883'),
-        ("[::1]", '"[::1]" has brackets: write "host": "::1"'),
-        ("[fe80::1%eth0]:1", '"[fe80::1%eth0]:1" holds a port: write "host": "fe80::1%eth0", "port": 1'),
-        ("b/", '"b/" holds a path: write "host": "b"'),
-        ("rover:s3cr3t@192.0.2.7", f'"***@192.0.2.7" holds a login: write "host": "192.0.2.7"{LOGIN}'),
-        ("s3cr3t@b", f'"***@b" holds a login: write "host": "b"{LOGIN}'),
-        ("mqtt://u:s3@cr3t@b:1", f'"mqtt://***@b:1" is a URL: write "host": "b", "port": 1{LOGIN}'),
-        ("mqtt://u:s3 cr3t@b", f'"mqtt://***@b" is a URL: write "host": "b"{LOGIN}'),
-        ("http://u:s3cr3t@b:8883/path?x#y", '"http://***@b:8883/…" is a URL: write "host": "b", "port": 8883, and the'),
-        ("mqtt://u:s3/cr3t@b", "holds an @ after a / or ?: "),
-        ("rover:s3cr3t", "holds a port that is no number from 1 to 65535"),
-        ("mqtt://rover:s3cr3t", "holds a port that is no number"),
-        ("b:0", "holds a port that is no number"),
-        *((text, "ends with a : and no port") for text in ("b:", "mqtt://b:/", "[::1]:")),
-        ("1883:s3cr3t", "is no whole address"),
-        ("rover%3As3cr3t%40b", "must be a name or address"),
-        *((text, "is no whole address") for text in ("1.2.3", "999.1.1.1", "127.1", "2130706433", "0x7f.1")),
-        ("010.0.0.1", "is no whole address"),
-        *((text, "must be a name or address") for text in ("a b", "a..b", "-a", ".", "b\\c", "/run/m.sock", "u" * 64)),
-        ("u." * 130, "must be a name or address"),
-        ("tls/b:7447", "must be a name or address"),
-        ("mqtt://", "must be a name or address"),
-        ("[b]", "must be an address in brackets"),
-        ("[::1", "must be an address in brackets"),
-        ("mqtt://::1:1883", "holds an IPv6 address without brackets"),
+        *((text, "must be a name or a whole address, such as") for text in (
+            "mqtt://broker.example", "b:1883", "[::1]", "b/", "u:s3cr3t@b", "mqtt://u:s3/cr3t@b", "1883:s3cr3t", "*",
+            "1.2.3", "999.1.1.1", "127.1", "2130706433", "0x7f.1", "010.0.0.1", "a b", "a..b", "-a", ".", "b\\c", "",
+            "/run/m.sock", "u" * 64, "u." * 130, "a,b", "fe80::1%", "straße.example", "\uff11\uff12\uff17.0.0.1",
+        )),
         ("fe80::1", 'names no network card: write "fe80::1%eth0"'),
-        ("fe80::1%", "must name a network card after the %"),
-        ("*", "must be one name or address"),
-        ("a,b", "is a list"),
-        ("straße.example", "holds a letter that name services spell in several ways"),
-        ("\uff11\uff12\uff17.0.0.1", "holds a letter that name services spell in several ways"),
-        ("b ", "ends with U+0020 (space): remove it"),
-        ("\tb", "starts with U+0009 (tab): remove it"),
-        ("b\n", "ends with U+000A (line feed): remove it"),
-        ("b\0", "ends with U+0000 (NUL): remove it"),
-        ("br\u200boker", "holds U+200B (zero width space) after 2 characters: remove it"),
+        *((text, "starts or ends with a blank") for text in ("b ", " b")),
+        *((f"b{char}", f"holds U+{ord(char):04X}, which is not shown") for char in "\t\n\0\u200b"),
     ],
 )  # fmt: skip
 def test_what_is_refused(text: str, instead: str) -> None:
@@ -110,7 +76,7 @@ def test_every_key_that_names_a_host_reads_it_so(place: str, value: object) -> N
 @pytest.mark.parametrize(
     "url",
     ["mqtt://rover:s3cr3t@b", "mqtt://rover:s3cr3t", "mqtt://rover:s3/cr3t@b", "mqtt://bro\nker", "mqtt://b ",
-     "mqtt://127.1", "mqtt://b,", "mqtt://b,c:", "mqtt://u:s3cr3t@[::1", "tcp://u:s3cr3t@b"],
+     "mqtt://127.1", "mqtt://b,", "mqtt://u:s3cr3t@[::1", "tcp://u:s3cr3t@b"],
 )  # fmt: skip
 def test_so_does_the_command_line(url: str, tmp_path: Path) -> None:
     for read in (settings_of, lambda text: init(tmp_path, [text])):
@@ -122,7 +88,7 @@ def test_so_does_the_command_line(url: str, tmp_path: Path) -> None:
 def test_endpoints_and_names_of_the_page() -> None:
     for text in ("tcp/0.0.0.0:0", "tls/[::]:7447?rel=1", "udp/224.0.0.224:7446#iface=eth0", "serial//dev/ttyUSB0"):
         assert endpoint(text) == text
-    assert [name_of_page(name) for name in ("Fair.local:8443", "fair.local.")] == ["Fair.local:8443", "fair.local"]
+    assert [name_of_page(name) for name in ("Fair.local:8443", "fair.local.")] == ["fair.local:8443", "fair.local"]
 
 
 @pytest.mark.parametrize(

@@ -24,4 +24,4 @@ def make_transport(will: Message) -> Transport:
 
 if __name__ == "__main__":
     set_up_logging("INFO")
-    sys.exit(announcer.run(make_transport, "odometry"))
+    sys.exit(announcer.run(make_transport))

@@ -27,7 +27,7 @@ class ConnectedAnnouncer:
         self.pipe = AnnouncerPipe(Reactor())
         self._descriptor = self.pipe.connect(Message("will", b"{}"))
         os.read(self._descriptor, 1000)  # the will; the transport has it already
-        self.announcer = Announcer(self._descriptor, self.transport, "odometry")
+        self.announcer = Announcer(self._descriptor, self.transport)
         self._thread = threading.Thread(target=self.announcer.run, args=(Notifier(),))
         self._thread.start()
         assert until(lambda: self.transport.state is State.CONNECTED)

@@ -125,9 +125,8 @@ def test_a_robot_without_services_still_lists_everything() -> None:
 
 def test_what_processes_report_is_listed() -> None:
     config = parse({"robot": {"id": "rover"}}, folder=Path("/robots"), env={})
-    found = {"wheel-odometry", "outlets/o2/status", "outlets/o1/power", "outlets/o1/status"}
+    found = {"outlets/o2/status", "outlets/o1/power", "outlets/o1/status"}
     value = capabilities(config, Addresses(config), found=found)
-    assert value["telemetry"]["wheel_odometry"]
     o1 = {"status_topic": f"{BASE}/outgoing/outlets/o1/status", "command_topic": f"{BASE}/incoming/outlets/o1/power"}
     o2 = {"status_topic": f"{BASE}/outgoing/outlets/o2/status"}
     assert value["outlets"] == {

@@ -21,6 +21,7 @@ from pebble.launcher.launcher import Launcher
 from pebble.launcher.programs import Program, Stage, programs, shared_modules
 from pebble.launcher.run_lock import RunLock
 from pebble.runtime.parent import NOTIFY_FD
+from tests.fakes.seccomp import CALLS
 from tests.launcher.robot import BASE, CONNECTION, DEVICE, LOCAL_TRANSPORT, Launch, lines_of
 from tests.support import ROOT, gone, until
 
@@ -57,11 +58,10 @@ def test_what_is_switched_off_is_not_published(launch: Launch) -> None:
     robot = launch(
         ("bridge", "talker", CONNECTION),
         restart_delay_seconds=0,
-        capabilities={"enabled": False},
         logs={"enabled": False},
     )
     assert until(lambda: robot.states().get("bridge") == "failed", 20)
-    assert not robot.published("capabilities")
+    assert robot.published("capabilities")
     assert not robot.published("logs")
 
 
@@ -102,6 +102,27 @@ def test_a_killed_child_is_started_again_at_once(launch: Launch) -> None:
     assert len(robot.events("bridge", "start")) == 1
 
 
+@pytest.mark.skipif(not CALLS, reason="the numbers of system calls of this machine are not known")
+@pytest.mark.parametrize(
+    ("call", "error", "named"),
+    [
+        ("pidfd_open", "EPERM", ["pidfd_open is denied here (Operation not permitted)"]),
+        ("pidfd_open", "ENOSYS", ["pidfd_open is denied here (Function not implemented)"]),
+        ("eventfd2", "EPERM", []),
+        ("prctl", "EPERM", []),  # then nothing ends with a launcher that is killed
+        ("mlock2", "EPERM", []),
+    ],
+)
+def test_a_robot_runs_where_a_system_call_is_denied(launch: Launch, call: str, error: str, named: list[str]) -> None:
+    robot = launch(("serial", "good", DEVICE), ("bridge", "good", CONNECTION), options=(f"deny {call} {error}",))
+    assert robot.ready("serial", "bridge")
+    os.kill(robot.events("serial", "start")[0], signal.SIGKILL)
+    assert until(lambda: len(robot.events("serial", "ready")) == 2, 20)
+    assert robot.stop() == 0
+    assert robot.stderr().count("is denied") == len(named)
+    assert all(text in robot.stderr() for text in named)
+
+
 def test_a_child_that_starts_again_gets_the_config_of_its_launcher(launch: Launch) -> None:
     robot = launch(("serial", "configured", DEVICE))
     assert robot.ready("serial")
@@ -109,7 +130,6 @@ def test_a_child_that_starts_again_gets_the_config_of_its_launcher(launch: Launc
     os.kill(robot.events("serial", "start")[0], signal.SIGKILL)
     assert until(lambda: len(robot.events("serial", "ready")) == 2, 20)
     assert len(robot.events("serial", f"config:{BASE}")) == 2
-    assert until(lambda: f"{robot.config} has changed" in robot.stderr(), 20)
 
 
 def test_a_crash_loop_is_visible_and_not_hot(launch: Launch) -> None:
@@ -332,7 +352,7 @@ def test_what_ends_while_the_robot_stops_is_not_started_again(launch: Launch) ->
     assert robot.ready("hub", "bridge")
     robot.process.send_signal(signal.SIGINT)
     assert until(lambda: "[launcher] stopping" in robot.stderr())
-    crashes = robot.stderr().count("serial ended")
+    crashes = robot.stderr().count("again in")
     os.kill(robot.events("hub", "start")[0], signal.SIGKILL)
     assert until(lambda: "hub ended (signal 9) before its turn to stop" in robot.stderr())
     assert until(lambda: robot.states().get("serial") == "stopped", 30), "it was waiting for its next start"
@@ -442,11 +462,7 @@ def test_an_mqtt_robot_has_no_hub() -> None:
     assert arm == ("serial_mcu_bridge:arm", "pebble.services.serial_mcu_bridge", ("None", "arm"), Stage.DEVICE)
 
 
-DEVICES = {"enabled": True, "env": {"MARK": "d"}}
-CONTROLS = {
-    "video_control": {"env": {"MARK": "v"}},
-    "audio_control": {"env": {"MARK": "a"}},
-}
+DEVICES = {"enabled": True}
 
 
 MEDIA_MODULES = {"pebble.transports.frames", "pebble.media.sound"}
@@ -470,7 +486,7 @@ def _programs(devices: dict[str, Any], **bridge: Any) -> dict[str, Program]:
 
 
 def test_camera_and_microphone_start_with_the_robot_and_media_only_when_they_are_requested() -> None:
-    table = _programs(DEVICES, **CONTROLS)
+    table = _programs(DEVICES)
     assert list(table) == [
         *("announcer", "av_daemon", "mqtt_bridge"),
         *("camera_publisher", "audio_publisher", "audio_receiver"),
@@ -479,9 +495,6 @@ def test_camera_and_microphone_start_with_the_robot_and_media_only_when_they_are
     assert [name for name, program in table.items() if program.may_request] == ["mqtt_bridge"]
     assert [name for name, program in table.items() if program.preloaded] == ["announcer", "mqtt_bridge"]
     assert (table["av_daemon"].stage, table["camera_publisher"].stage) == (Stage.DEVICE, Stage.CONNECTION)
-    assert table["av_daemon"].environment == {"MARK": "d"}
-    environments = [table[name].environment for name in list(table)[3:]]
-    assert environments == [{"MARK": "v"}, {"MARK": "a"}, {"MARK": "a"}]
 
 
 @pytest.mark.parametrize(
@@ -577,9 +590,9 @@ def test_the_hub_process_notifies_that_it_is_ready_and_stops_when_asked(tmp_path
     with subprocess.Popen(command, cwd=ROOT, env=environment, pass_fds=(notes,)) as hub, os.fdopen(read_end) as signs:
         try:
             os.close(notes)
-            assert signs.readline() == "READY\n"
+            assert json.loads(signs.readline()) == {"note": "ready"}
             assert (tmp_path / "run" / "hub.sock").exists()
-            assert signs.readline() == "ALIVE\n"
+            assert json.loads(signs.readline()) == {"note": "alive"}
             hub.terminate()
             assert hub.wait(10) == 0
         finally:

@@ -245,7 +245,7 @@ def test_what_is_too_large_is_refused_before_it_is_decoded() -> None:
     assert inflate(zlib.compress(bytes(1000)), 1000) == bytes(1000)
     jpeg = cv2.imencode(".jpg", picture(0))[1].tobytes()
     at = jpeg.index(b"\xff\xc0") + 5
-    for height, width in ((4097, 16), (16, 4097), (65535, 65535), (0, 64), (48, 0), (4096, 4096), (480, 640)):
+    for height, width in ((4097, 16), (16, 4097), (65535, 65535), (0, 64), (48, 0)):
         with pytest.raises(PayloadError):
             jpeg_size(jpeg[:at] + struct.pack(">HH", height, width) + jpeg[at + 4 :])
 

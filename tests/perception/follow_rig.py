@@ -8,13 +8,13 @@ import re
 from typing import Any, NamedTuple
 
 from pebble.contract.payloads import Drive, TouchValues
-from pebble.media.world.world_file import parse_world
 from pebble.perception.follow import Command, Follower, FollowSettings
 from pebble.perception.odom_follow import OdomFollower, OdomFollowSettings, Pose
 from pebble.perception.odometry import Odometry, WheelGeometry
 from pebble.perception.rate import Rate
 from pebble.perception.tags import TagFinder
 from pebble.simulation.world.lockstep import LockstepWorld
+from pebble.simulation.world.world_file import parse_world
 
 TAG = 13
 TARGET_M = 0.6

@@ -10,8 +10,7 @@ from typing import Any
 
 import pytest
 
-from tests.robot.operator import Operator
-from tests.robot.rig import BASE, STOP, Rig
+from tests.robot.rig import STOP, Rig
 from tests.support import ROOT, gone, until
 
 pytestmark = pytest.mark.alone  # deadlines are checked
@@ -32,17 +31,6 @@ def rig(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Rig]:
 def status(rig: Rig) -> dict[str, Any]:
     seen = rig.operator.last("outgoing/autonomy-status")
     return {} if seen is None else dict(seen.json)
-
-
-def odometry(rig: Rig) -> bool:
-    seen = rig.operator.last("outgoing/capabilities")
-    return seen is not None and bool(seen.json["value"]["telemetry"]["wheel_odometry"])
-
-
-def published(local: Operator) -> bool:
-    """Publish odometry once, as a program on the robot does."""
-    local.send("outgoing/wheel-odometry", {"value": {"x_mm": 1, "y_mm": 0}, "timestamp": time.time()})
-    return True
 
 
 def started(rig: Rig) -> int:
@@ -67,9 +55,6 @@ def control(rig: Rig, **wanted: Any) -> dict[str, Any]:
 
 
 def test_a_person_with_control_goes_first_and_every_end_of_the_script_stops_the_wheels(rig: Rig) -> None:
-    assert rig.local is not None
-    local = Operator(rig.local.port, BASE)
-    assert not odometry(rig)
     pid = started(rig)
 
     assert until(lambda: control(rig).get("id") == "aaaaaaaa", step=0.1)
@@ -80,7 +65,6 @@ def test_a_person_with_control_goes_first_and_every_end_of_the_script_stops_the_
         time.sleep(0.05)
     released = time.monotonic()
     control(rig, want="release")
-    assert until(lambda: published(local) and odometry(rig), step=0.1), "a program on the robot publishes it"
     assert until(lambda: rig.mcu.moving(released + 0.5), 5), "the script goes on"
     lines = rig.mcu.drives(began)
     first = next(index for index, (_, wheels) in enumerate(lines) if by_person(wheels))
@@ -99,4 +83,3 @@ def test_a_person_with_control_goes_first_and_every_end_of_the_script_stops_the_
     assert until(lambda: rig.mcu.drives(killed) and not rig.mcu.moving(killed), 2)
     ended = next(at for at, wheels in rig.mcu.drives(killed) if wheels == STOP)
     assert ended - killed < 0.9
-    local.close()

@@ -11,9 +11,9 @@ import time
 from pathlib import Path
 from typing import Any
 
-from pebble.media.world.pose_page import PoseReader, page_path
-from pebble.media.world.poses import RobotPose
 from pebble.simulation.loudspeaker import Playback, playbacks
+from pebble.simulation.world.pose_page import PoseReader, page_path
+from pebble.simulation.world.poses import RobotPose
 from pebble.simulation.world.program import port_path, trace_path
 from tests.robot.rig import Motors, Rig
 from tests.support import ROOT, Child, until

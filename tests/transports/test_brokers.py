@@ -13,8 +13,6 @@ import pytest
 
 from pebble.client.connection import Target, connected, subscribed_stop
 from pebble.client.discovery import ALL_OUTGOING, Discovery
-from pebble.contract import CHANNELS
-from pebble.runtime.by_name import ByName, ask_beside
 from pebble.transports import Message, MqttSettings, QoS, State
 from pebble.transports.mqtt.transport import MqttTransport
 from tests.forwarding.links.rig import MqttEnd, Rig, Side
@@ -163,8 +161,8 @@ def test_an_operators_flag_is_not_overwritten_by_a_robot_that_starts(broker: Bro
 
 
 def test_an_operators_tool_finds_the_states_of_an_idle_robot(broker: Broker, base: str) -> None:
-    """Its heartbeat is all that comes to a wildcard by itself from brokers that send retained messages by name."""
-    front, done = SparingBroker(broker.port, by_name=True), threading.Event()
+    """By wildcards, and those of one robot also where a broker sends retained messages for exact names only."""
+    front = SparingBroker(broker.port, by_name=True)
     drives = {"drive": {"topic": f"{base}/incoming/drive-values"}}
     estop = {"available": True, "owners": ["serial"], "status_topics": [f"{base}/outgoing/estop/serial"]}
     states: dict[str, Any] = {"capabilities": {"t": 1, "value": {**drives, "estop": estop}}}
@@ -174,26 +172,15 @@ def test_an_operators_tool_finds_the_states_of_an_idle_robot(broker: Broker, bas
         for name, value in states.items():
             robot.publish(f"{base}/outgoing/{name}", json.dumps(value).encode(), qos=QoS.DELIVERED, retain=True)
 
-        def heartbeat() -> None:
-            while not done.wait(0.1):
-                robot.publish(f"{base}/outgoing/online", b'{"t": 1}', qos=QoS.DELIVERED, retain=True)
-
-        with beside(heartbeat, done):
-            for port in (broker.port, front.port):
-                discovery, by_name = Discovery(), ByName(CHANNELS)
-
-                def take(message: Message) -> None:
-                    discovery.receive(message, 0.0, 0.0)  # noqa: B023
-                    by_name.receive(message, time.monotonic())  # noqa: B023
-
-                with connected(Target(url=f"mqtt://127.0.0.1:{port}")) as (tool, _):
-                    tool.subscribe(ALL_OUTGOING, take, direct=True)
-                    ask_beside(tool, by_name)
-                    assert until(lambda: base in discovery.robots and discovery.robots[base].volts)  # noqa: B023
-                    assert until(lambda: discovery.robots[base].latched)  # noqa: B023
-                with connected(Target(url=f"mqtt://127.0.0.1:{port}", robot=base)) as (tool, _):
-                    one = subscribed_stop(tool, base)
-                    assert until(lambda: [state.by for state in one.latched.values()] == ["ann"])  # noqa: B023
+        discovery = Discovery()
+        with connected(Target(url=f"mqtt://127.0.0.1:{broker.port}")) as (tool, _):
+            tool.subscribe(ALL_OUTGOING, lambda message: discovery.receive(message, 0.0, 0.0), direct=True)
+            assert until(lambda: base in discovery.robots and discovery.robots[base].volts)
+            assert until(lambda: discovery.robots[base].latched)
+        for port in (broker.port, front.port):
+            with connected(Target(url=f"mqtt://127.0.0.1:{port}", robot=base)) as (tool, _):
+                one = subscribed_stop(tool, base)
+                assert until(lambda: [state.by for state in one.latched.values()] == ["ann"])  # noqa: B023
     front.close()
 
 

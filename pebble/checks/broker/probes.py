@@ -45,7 +45,7 @@ PROBES = (
     ),
     _probe(
         _WILDCARDS,
-        "programs that do not ask by name do not see a robot at rest; ours ask",
+        "operators see a robot at rest after its next state, or if they name it",
         retention.by_wildcard,
         _retains,
     ),
@@ -91,8 +91,8 @@ def assessment(states: Mapping[str, State]) -> list[str]:
     if broken:
         return [f"robots cannot use it with this account: {', '.join(broken)}"]
     limits = [name for name, state in states.items() if state is State.WARN]
-    at_rest = {State.OK: "by + and #, and by name", State.SKIPPED: "not at all"}
-    seen = at_rest.get(states.get(_WILDCARDS, State.SKIPPED), "only by asking for their exact names, as ours do")
+    at_rest = {State.OK: "too", State.SKIPPED: "not at all"}
+    seen = at_rest.get(states.get(_WILDCARDS, State.SKIPPED), "after their next state, or by name")
     return [
         f"robots can use it{', with limits: ' + ', '.join(limits) if limits else ''}",
         f"operators see robots at rest {seen}",

@@ -6,9 +6,7 @@ from dataclasses import replace
 from functools import partial
 from typing import Any, Final
 
-from pebble.contract import CHANNELS
 from pebble.recordings.recorder.recorder import Recorder
-from pebble.runtime.by_name import ByName, ask_beside
 from pebble.transports import Message, MqttSettings, QoS, State, Transport, create
 from pebble.transports.topics import matches
 
@@ -143,17 +141,15 @@ class _Copies:
         id_ = settings.client_id and f"{settings.client_id}-retained"
         plain = replace(settings, as_published=False, sends_retained=True, max_qos=0, client_id=id_)
         self._transport = create("mqtt", "pebble-recorder-retained", plain)
-        self._by_name = ByName(CHANNELS)
         self._transport.on_state(self._watch)
         self._transport.open(0.0)
         for filter_, receive in _once(filters, self._receive):
             self._transport.subscribe(filter_, receive, direct=True)
-        ask_beside(self._transport, self._by_name)
 
     @property
     def is_done(self) -> bool:
         now = time.monotonic()
-        return (now - self._quiet_since > _QUIET_S and not self._by_name.waits) or now > self._ends_at
+        return now - self._quiet_since > _QUIET_S or now > self._ends_at
 
     @property
     def failed(self) -> bool:
@@ -169,7 +165,6 @@ class _Copies:
             self._quiet_since = time.monotonic()
 
     def _receive(self, message: Message) -> None:
-        self._by_name.receive(message, time.monotonic())
         if message.retain:
             self._quiet_since = time.monotonic()
             self._record(message)

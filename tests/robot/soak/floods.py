@@ -129,9 +129,6 @@ def main() -> int:
                 grown = f"{one.mb:.1f} ({one.program})"
                 table.add_row(name, when, *cells, grown, f"{one.lines:.1f}", "" if one.good else "WRONG")
                 terminal.print(f"{name}, {when}: {one}", highlight=False)
-            status = world.rig.operator.last("outgoing/status")
-            dropped = {} if status is None else status.json["value"]["services"]["mqtt_bridge"].get("dropped", {})
-            terminal.print(f"    dropped by the bridge, as its status says: {dropped}", highlight=False)
         finally:
             world.close()
     terminal.print(table)

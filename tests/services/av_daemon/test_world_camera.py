@@ -13,12 +13,12 @@ import pytest
 
 from pebble.config.media import CameraCapture
 from pebble.errors import DeviceError, NotRunningError
-from pebble.media.world.pose_page import PosePage, page_path
-from pebble.media.world.poses import RobotPose
-from pebble.media.world.world_file import read_world
 from pebble.services.av_daemon import sources, world_camera
 from pebble.services.av_daemon.health import Health
 from pebble.services.av_daemon.world_camera import WorldCamera
+from pebble.simulation.world.pose_page import PosePage, page_path
+from pebble.simulation.world.poses import RobotPose
+from pebble.simulation.world.world_file import read_world
 from pebble.transports.frames.frame import picture
 from tests.services.av_daemon.av_rig import grabbed, options
 from tests.simulation.world.worlds import CLEAR, projected, tags_in

@@ -146,9 +146,9 @@ def test_the_launcher_is_notified_however_busy_it_is(
     bench = start()
     assert until(lambda: not bench.service.announced)
     assert os.read(notes, filled) == b"." * filled
-    assert until(lambda: readable(notes) == b"LACKS estop\n")
+    assert until(lambda: readable(notes) == b'{"note":"feature","name":"estop","has":false}\n')
     refuse(broker, bench)
-    assert until(lambda: readable(notes) == b"HAS estop\n")
+    assert until(lambda: readable(notes) == b'{"note":"feature","name":"estop","has":true}\n')
     for descriptor in (notes, end):
         os.close(descriptor)
 

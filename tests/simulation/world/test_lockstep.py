@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 
 from pebble.errors import DeviceError
-from pebble.media.world.world_file import World, parse_world
 from pebble.services.serial_mcu_bridge.pebble_serial_v1.frame import END, Frame, Type, decode, encode
 from pebble.services.serial_mcu_bridge.pebble_serial_v1.manifest import parse_describe
 from pebble.services.serial_mcu_bridge.pebble_serial_v1.struct_v1 import unpack
 from pebble.services.serial_mcu_bridge.text.goob_base import drive_line, mix
 from pebble.simulation.motion import FULL_SPEED_MM_S, TRACK_MM
 from pebble.simulation.world.lockstep import CameraMode, LockstepRobot, LockstepWorld
+from pebble.simulation.world.world_file import World, parse_world
 from tests.simulation.world.worlds import CLEAR, projected, tags_in
 
 pytestmark = pytest.mark.computing

@@ -19,10 +19,10 @@ import serial
 
 import pebble.simulation.world
 from pebble.errors import PebbleError
-from pebble.media.world.pose_page import PoseReader, page_path
-from pebble.media.world.poses import RobotPose, Track
 from pebble.simulation.trace import read_trace
 from pebble.simulation.world import program
+from pebble.simulation.world.pose_page import PoseReader, page_path
+from pebble.simulation.world.poses import RobotPose, Track
 from pebble.simulation.world.program import imu_port_path, port_path, trace_path
 from tests.support import Child, until
 

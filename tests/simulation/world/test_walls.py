@@ -7,10 +7,10 @@ from typing import Any
 
 import pytest
 
-from pebble.media.world.world_file import parse_world
 from pebble.simulation.motion import FULL_SPEED_MM_S, Pose
 from pebble.simulation.world.lockstep import LockstepWorld
 from pebble.simulation.world.walls import Floor
+from pebble.simulation.world.world_file import parse_world
 from tests.simulation.world.worlds import world_of
 
 WALL = {"x1": 1.0, "y1": 1.0, "x2": 1.0, "y2": -1.0}

@@ -10,10 +10,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from pebble.media.world.poses import RobotPose, Sample, Track
-from pebble.media.world.renderer import Renderer
-from pebble.media.world.scene import Image
-from pebble.media.world.world_file import World, parse_world
+from pebble.simulation.world.poses import RobotPose, Sample, Track
+from pebble.simulation.world.renderer import Renderer
+from pebble.simulation.world.surfaces import Image
+from pebble.simulation.world.world_file import World, parse_world
 
 CLEAR = {"noise": 0.0, "blur": 0.0}
 

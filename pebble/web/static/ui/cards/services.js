@@ -59,7 +59,7 @@ function Service({ at, view, name, online, one, times }) {
   const bad = state === "failed" || state === "restarting";
   const often = times.filter((t) => store.now() - t < RECENT_MS).length >= OFTEN;
   const entry = isObject(one) ? one : {};
-  const words = [restartWords(entry, times, store.now()), droppedWords(entry.dropped)].filter(Boolean).join("; ");
+  const words = restartWords(entry, times, store.now());
   const logs = () => {
     logViewOf(store, at).choose({ service: name, rank: 0, search: "" });
     view?.reveal("logs");
@@ -89,13 +89,6 @@ function SerialLine({ name, online, line }) {
     <span class="services-state">${online ? "" : "was "}${plain(state)}</span>
     ${words && html`<span class="services-more">${words}</span>`}
   </li>`;
-}
-
-/** @param {unknown} dropped messages by reason: "too_large" @returns {string} */
-function droppedWords(dropped) {
-  const counts = Object.entries(isObject(dropped) ? dropped : {}).filter(([, count]) => Number.isFinite(count));
-  if (!counts.length) return "";
-  return `dropped: ${counts.map(([reason, count]) => `${count} ${plain(reason).replaceAll("_", " ")}`).join(", ")}`;
 }
 
 /** @param {Record<string, any>} one @param {readonly number[]} times epoch ms @param {number} now @returns {string} */

@@ -9,9 +9,9 @@ import cv2
 import numpy as np
 import pytest
 
-from pebble.media.world.poses import RobotPose, Sample, Track
-from pebble.media.world.renderer import Renderer
-from pebble.media.world.scene import Image
+from pebble.simulation.world.poses import RobotPose, Sample, Track
+from pebble.simulation.world.renderer import Renderer
+from pebble.simulation.world.surfaces import Image
 from tests.simulation.world.worlds import CLEAR, at_rest, projected, seen, tags_in, world_of
 
 WALL = {"x1": 1.0, "y1": 1.0, "x2": 1.0, "y2": -1.0}

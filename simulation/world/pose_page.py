@@ -18,8 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pebble.errors import DeviceError
-from pebble.media.world.poses import RobotPose, Sample, Track
-from pebble.media.world.world_file import LONGEST_NAME, MOST_ROBOTS
+from pebble.simulation.world.poses import RobotPose, Sample, Track
+from pebble.simulation.world.world_file import LONGEST_NAME, MOST_ROBOTS
 
 PERIOD_S: Final = 0.02  # between samples
 _SAMPLES = 64  # per robot: 1.28 s

@@ -6,7 +6,7 @@ import math
 
 import pytest
 
-from pebble.media.world.poses import RobotPose, Sample, Track
+from pebble.simulation.world.poses import RobotPose, Sample, Track
 
 TRACK = Track([Sample(100, RobotPose(0, 0, 3.0)), Sample(200, RobotPose(1, -2, -3.0)), Sample(300, RobotPose(1, 0, 0))])
 

@@ -7,8 +7,8 @@ from typing import Any, Final, NamedTuple, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from pebble.media.world.poses import RobotPose
-from pebble.media.world.world_file import Wall, World
+from pebble.simulation.world.poses import RobotPose
+from pebble.simulation.world.world_file import Wall, World
 
 MODULE_PX: Final = 32  # of a tag's texture; halves to 1 without a rest
 _SIDE, _TAG_SIDE = 1.6, 1.2  # of a robot's box and of the tag on it, in radii: the box is about as wide as the circle
@@ -33,7 +33,7 @@ class Surface(NamedTuple):
     textures: tuple[Image, ...] = ()
 
 
-class Scene:
+class Surfaces:
     """The surfaces that a robot's camera may see."""
 
     def __init__(self, world: World) -> None:

@@ -10,7 +10,7 @@ import pytest
 
 import pebble.simulation.world
 from pebble.errors import ConfigError, DeviceError
-from pebble.media.world.world_file import open_world, parse_world, read_world, split_device
+from pebble.simulation.world.world_file import open_world, parse_world, read_world, split_device
 
 ROOM = Path(pebble.simulation.world.__file__).with_name("room.json")
 GOOB = {"x": 0.0, "y": 0.0}

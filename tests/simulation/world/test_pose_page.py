@@ -10,16 +10,16 @@ from pathlib import Path
 import pytest
 
 from pebble.errors import DeviceError
-from pebble.media.world import pose_page
-from pebble.media.world.pose_page import PosePage, PoseReader, page_path
-from pebble.media.world.poses import RobotPose
+from pebble.simulation.world import pose_page
+from pebble.simulation.world.pose_page import PosePage, PoseReader, page_path
+from pebble.simulation.world.poses import RobotPose
 from tests.support import Child, until
 
 BUSY = """
 import sys, time
 from pathlib import Path
-from pebble.media.world.pose_page import PosePage
-from pebble.media.world.poses import RobotPose
+from pebble.simulation.world.pose_page import PosePage
+from pebble.simulation.world.poses import RobotPose
 page = PosePage(Path(sys.argv[1]), ["goob", "fred"])
 ns = 0
 while True:
