@@ -56,7 +56,6 @@ class Control:
         self._why_not = ""  # why this page may not drive at all
         self._logs = LogReader()
         self._large_due = False  # whether the page has received the last large value
-        self._series: deque[str] = deque()  # metrics of the watched component whose past is still to be sent
         self._moved: set[str] = set()  # robots that this lease has moved, for the audit
 
     async def serve(self) -> None:
@@ -176,7 +175,6 @@ class Control:
                 self._tab.clock.echo(op.n, op.t, clock())
                 self._logs.echoed()
                 self._large_due = True
-                self._post_series()
             case m.DriveOp():
                 self._drive(op)
             case m.StopOp():
@@ -189,8 +187,6 @@ class Control:
                 self._reset(op)
             case m.Watch():
                 self._watch(op.ref)
-                if op.series:
-                    self._series = deque(self._server.robots.recent.metrics(op.ref))
             case m.ReadLogs():
                 if op.ref == self._interest.watched:
                     self._logs.begin(op.origin, op.after, on=op.on)
@@ -282,7 +278,6 @@ class Control:
             return
         self._server.robots.watch(self._interest, ref)
         self._logs.end()
-        self._series.clear()
         if ref:
             self._server.watch(ref)
         if before:
@@ -332,13 +327,6 @@ class Control:
 
     # -- to the page
 
-    def _post_series(self) -> None:
-        """One at each echo: on a slow connection pings never wait behind more than that."""
-        if self._series:
-            ref, metric = self._interest.watched, self._series.popleft()
-            points = self._server.robots.recent.points(ref, metric, time.monotonic())
-            self._post(m.Series(ref=ref, metric=metric, now=1000 * time.time(), points=points))
-
     def _post(self, message: m.ToPage) -> None:
         self._waiting.append(message)
         self._wake.set()
@@ -378,7 +366,7 @@ class Control:
         await self._send_logs()
 
     async def _send_logs(self) -> None:
-        """One part at each echo, as _post_series."""
+        """Send one part at each echo: on a slow connection pings never wait behind more than that."""
         ref = self._interest.watched
         lines = self._server.robots.logs.get(ref)
         if lines is not None and (run := self._logs.take(lines)) is not None:

@@ -43,13 +43,9 @@ class Echo(_FromPage, frozen=True, kw_only=True, tag="echo"):
 
 
 class Watch(_FromPage, frozen=True, kw_only=True, tag="watch"):
-    """The component whose page is open; "" is none. Its further metrics are sent from now on.
-
-    ``series``: also what the server has of them from before, now; a page that opens plots asks this again.
-    """
+    """The component whose page is open; "" is none. Its further metrics are sent from now on."""
 
     ref: Ref
-    series: bool = False
 
 
 class ReadLogs(_FromPage, frozen=True, kw_only=True, tag="read-logs"):
@@ -283,15 +279,6 @@ class Done(_ToPage, frozen=True, kw_only=True, tag="done"):
     n: int = 0
 
 
-class Series(_ToPage, frozen=True, kw_only=True, tag="series"):
-    """What the server has of a metric of the watched component from before: ``[age in ms, value]``, oldest first."""
-
-    ref: str
-    metric: str
-    now: float
-    points: tuple[tuple[float, Any], ...]
-
-
 class Bye(_ToPage, frozen=True, kw_only=True, tag="bye"):
     """The last message of a connection that the server closes. ``again``: whether to connect again."""
 
@@ -307,7 +294,7 @@ class TalkAnswer(Struct, frozen=True, kw_only=True):
     why: str = ""  # it is not, for people
 
 
-ToPage: TypeAlias = Welcome | Ping | State | Logs | Refused | Done | Series | Bye
+ToPage: TypeAlias = Welcome | Ping | State | Logs | Refused | Done | Bye
 
 
 # -- values of the server's own metrics
@@ -427,12 +414,6 @@ class FlagsView(Struct, frozen=True, kw_only=True):
     mqtt_video: bool | None = None
 
 
-class RestartsView(Struct, frozen=True, kw_only=True):
-    """``web/restarts``: when services of the component were seen to restart, in epoch ms; the newest 16 of each."""
-
-    times: dict[str, tuple[int, ...]]
-
-
 SERVER_METRICS: dict[str, type] = {
     "web/liveness": Liveness,
     "web/host": HostView,
@@ -443,6 +424,5 @@ SERVER_METRICS: dict[str, type] = {
     "web/picture-from": PictureFrom,
     "web/stream-address": StreamAddress,
     "web/flags": FlagsView,
-    "web/restarts": RestartsView,
     "web/broker": BrokerView,
 }

@@ -80,7 +80,6 @@ class OpenComponents:
     def open(self, ref: str) -> None:
         self._pages[ref] += 1
         self._robots.logs.setdefault(ref, LogLines())
-        self._robots.recent.open(ref)
         self.update(ref)
 
     def close(self, ref: str) -> None:
@@ -137,7 +136,6 @@ class OpenComponents:
         self._flags.pop(ref, None)
         self._robots.logs.pop(ref, None)
         self._robots.remove_server_metric(ref, _FLAGS_METRIC)
-        self._robots.recent.close(ref)
         if ref not in self._robots.components:
             self._robots.forget(ref)
 

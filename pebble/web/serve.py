@@ -24,7 +24,8 @@ _LARGEST_MESSAGE = 64 * 1024
 _END_S = 1
 REQUEST_S = 10.0  # from a connection to its first whole request
 UNREAD_S = 60.0  # in which a client reads something of what it is sent
-_WAITING = 128  # connections to be accepted; asyncio accepts as many at once
+_ACCEPT = 16  # connections at once; what the last ones have sent is read before the next ones come
+_WAITING = 2048  # connections to be accepted
 _ALL_ADDRESSES = ("0.0.0.0", "::")  # noqa: S104 - compared, not listened on
 
 
@@ -42,7 +43,7 @@ async def _serve(settings: WebSettings, listener: socket.socket, on_ready: Calla
     if config.ssl is not None and settings.certificate is not None:
         renew_certificate(config.ssl, settings.certificate, settings.key)
     server = uvicorn.Server(config)
-    watching = asyncio.ensure_future(_report(server, url_of(settings, listener), on_ready))
+    watching = asyncio.ensure_future(_report(server, listener, url_of(settings, listener), on_ready))
     try:
         await server.serve(sockets=[listener])
     finally:
@@ -51,9 +52,12 @@ async def _serve(settings: WebSettings, listener: socket.socket, on_ready: Calla
         raise PebbleError("the operator page did not start: the lines above say why")
 
 
-async def _report(server: uvicorn.Server, url: str, on_ready: Callable[[str], None] | None) -> None:
+async def _report(
+    server: uvicorn.Server, listener: socket.socket, url: str, on_ready: Callable[[str], None] | None
+) -> None:
     while not server.started:
         await asyncio.sleep(0.02)
+    listener.listen(_WAITING)  # asyncio lets as many wait as it accepts at once
     if on_ready is not None:
         on_ready(url)
 
@@ -99,7 +103,7 @@ def server_config(settings: WebSettings) -> uvicorn.Config:
         ws_ping_interval=2.0,
         ws_ping_timeout=4.0,
         timeout_graceful_shutdown=_END_S,
-        backlog=_WAITING,  # no limit_concurrency: strangers would use it up, and keep out a stop
+        backlog=_ACCEPT,  # no limit_concurrency: strangers would use it up, and keep out a stop
     )
 
 

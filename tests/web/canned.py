@@ -66,8 +66,6 @@ class State:
     still: bool = False  # cameras show flat colours, and a few pictures only
     at: int = 0  # ms epoch, at which the server's time stands still; 0: it does not
     logs: Callable[[int], list[Any]] = field(default=lambda _now: [])  # lines of the component that is open
-    #: Points of messages.Series, by component and metric.
-    series: Callable[[int], dict[tuple[str, str], list[Any]]] = field(default=lambda _now: {})
     refused: str = ""  # why nothing that is asked of a robot is done
     recordings: bool = False  # those of tests.web.recorded are offered
     days: tuple[int, str] | None = None  # status and text that a list of recorded days is answered with; status 0: none
@@ -212,8 +210,6 @@ class CannedServer:
                     lines = state.logs(self.now())
                     logs = {"op": "logs", "ref": message["ref"], "origin": "canned", "first": 213, "lines": lines}
                     await self._send(websocket, logs)
-                if message["op"] == "watch" and message.get("series"):
-                    await self._send_series(websocket, state, message["ref"])
                 if message["op"] != "echo" and "n" in message:
                     answer = {"op": "refused", "why": state.refused, "g": -1} if state.refused else {"op": "done"}
                     await self._send(
@@ -265,12 +261,6 @@ class CannedServer:
 
     async def _send_state(self, websocket: WebSocket, values: list[Value]) -> None:
         await self._send(websocket, {"op": "state", "now": self.now(), "set": values, "gone": []})
-
-    async def _send_series(self, websocket: WebSocket, state: State, watched: str) -> None:
-        for (ref, metric), points in state.series(self.now()).items():
-            if ref == watched:
-                series = {"op": "series", "ref": ref, "metric": metric, "now": self.now(), "points": points}
-                await self._send(websocket, series)
 
     async def _send(self, websocket: WebSocket, message: dict[str, Any]) -> None:
         if websocket.application_state is WebSocketState.CONNECTED:

@@ -92,7 +92,6 @@ class Page:
         self.refused: list[dict[str, Any]] = []
         self.done: list[dict[str, Any]] = []
         self.logs: list[dict[str, Any]] = []  # with their lines
-        self.series: list[dict[str, Any]] = []
         self.welcome: dict[str, Any] = {}
         self.bye: dict[str, Any] = {}
         self.closed = False
@@ -163,8 +162,6 @@ class Page:
                 self.state |= {(ref, metric): value for ref, metric, value, _ in message["set"]}
                 for ref in message["gone"]:
                     self.state = {key: value for key, value in self.state.items() if key[0] != ref}
-            case "series":
-                self.series.append(message)
             case "logs":
                 self.logs.append(message)
             case "done":

@@ -287,33 +287,6 @@ def test_an_address_of_a_stream_is_remembered_and_may_be_shown(served, page, rob
     assert until(lambda: [one.detail for one in audit.read(9) if one.what == "stream-address"] == noted)
 
 
-def test_a_page_that_opens_a_plot_is_sent_what_was_before(served, page, robot):
-    page.send("watch", ref=robot.base)
-
-    def received():
-        robot.publish("sensors/imu", {"value": {"accel_norm_g": 0}})
-        return page.value(robot.base, "sensors/imu")
-
-    assert until(received)
-    for number in range(1, 6):
-        time.sleep(0.2)  # at most 10 a second are remembered
-        robot.publish("sensors/imu", {"value": {"accel_norm_g": number}})
-    robot.publish("charging-level", {"value": 7.9, "unit": "v"})
-    assert until(lambda: page.value(robot.base, "charging-level"))
-    assert page.series == []
-    with served.page() as other:
-        assert other.knows(robot.base)
-        other.send("watch", ref=robot.base, series=True)
-        assert until(lambda: len(other.series) == 2, 3)
-        battery, imu = other.series
-    assert (battery["metric"], imu["metric"]) == ("charging-level", "sensors/imu")
-    assert [value["value"]["accel_norm_g"] for _, value in imu["points"]][-5:] == [1, 2, 3, 4, 5]
-    ages = [age for age, _ in imu["points"]]
-    assert ages == sorted(ages, reverse=True)
-    assert 0 <= ages[-1] < ages[0] < 10_000
-    assert abs(imu["now"] - 1000 * time.time()) < 5000
-
-
 def test_what_is_drawn_over_a_picture_comes_with_it(served, broker, page, robot):
     with RecordingRobot(broker.port, f"{robot.base}-eye") as eye:
         assert page.knows(eye.base)

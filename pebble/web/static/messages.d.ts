@@ -17,7 +17,6 @@ export interface Echo {
 export interface Watch {
   op: "watch";
   ref: string;
-  series?: boolean;
 }
 
 export interface ReadLogs {
@@ -198,14 +197,6 @@ export interface Done {
   n?: number;
 }
 
-export interface Series {
-  op: "series";
-  ref: string;
-  metric: string;
-  now: number;
-  points: [number, any][];
-}
-
 export interface Bye {
   op: "bye";
   why: string;
@@ -317,10 +308,6 @@ export interface FlagsView {
   mqtt_video?: boolean | null;
 }
 
-export interface RestartsView {
-  times: Record<string, number[]>;
-}
-
 export interface BrokerView {
   connected: boolean;
   problem: string;
@@ -339,10 +326,9 @@ export interface Metrics {
   "web/picture-from": PictureFrom;
   "web/stream-address": StreamAddress;
   "web/flags": FlagsView;
-  "web/restarts": RestartsView;
   "web/broker": BrokerView;
 }
 
 export type FromPage = Hello | Echo | Watch | ReadLogs | Lease | DriveOp | StopOp | EstopOp | EstopEndOp | EstopResetOp | EncodingOp | PictureFromOp | StreamAddressOp | LightsOp | SoundboardOp | AutonomyOp | OutletOp | McuOp | ActionOp | FlagOp;
 
-export type ToPage = Welcome | Ping | State | Logs | Refused | Done | Series | Bye;
+export type ToPage = Welcome | Ping | State | Logs | Refused | Done | Bye;
