@@ -208,11 +208,6 @@ class People:
         rows = self._rows("SELECT value FROM settings WHERE key = ?", key)
         return str(rows[0][0]) if rows else None
 
-    def all(self, prefix: str) -> dict[str, str]:
-        """The settings whose keys begin with this, by the rest of the key."""
-        found = self._rows("SELECT key, value FROM settings WHERE substr(key, 1, ?) = ?", len(prefix), prefix)
-        return {str(key)[len(prefix) :]: str(value) for key, value in found}
-
     def set(self, key: str, value: str | None) -> None:
         """None removes it."""
         if value is None:

@@ -192,28 +192,14 @@ class Control:
                     self._logs.begin(op.origin, op.after, on=op.on)
             case m.Lease():
                 self._lease(op)
-            case m.EncodingOp():
-                if self._may("drive", op):
-                    self._server.media.pictures.pin(op.ref, op.encoding)
             case m.PictureFromOp():
                 if self._may("drive", op):
-                    self._server.sources.choose_picture(op.ref, op.source)
-            case m.StreamAddressOp():
-                self._stream_address(op)
+                    self._server.sources.choose(op.ref, op.source)
             case m.Hello():
                 raise Leave("hello comes only once")
             case _:
                 self._command(op)
         self._wake.set()
-
-    def _stream_address(self, op: m.StreamAddressOp) -> None:
-        """Sets the value for all, and of any host: hence only those who look after robots may."""
-        if not self._may("system", op):
-            return
-        if why := self._server.sources.choose_stream(op.ref, op.url):
-            self._refuse(op, why)
-        else:
-            self._audit(_tag(op), op.ref, detail=op.url)
 
     def _command(self, op: m.RobotOp) -> None:
         """Publish what is asked of a robot, once: nothing repeats it, and the robot's states tell what came of it."""

@@ -115,25 +115,11 @@ class EstopResetOp(_FromPage, frozen=True, kw_only=True, tag="estop-reset"):
     owners: Annotated[tuple[ShownOwner, ...], Meta(max_length=16)]
 
 
-class EncodingOp(_FromPage, frozen=True, kw_only=True, tag="encoding"):
-    """Pin the encoding of a robot's pictures for all its viewers; "" is automatic."""
-
-    ref: Ref
-    encoding: Short
-
-
 class PictureFromOp(_FromPage, frozen=True, kw_only=True, tag="picture-from"):
     """Show the picture of ``source`` on the page of ``ref``, for everybody, from now on; "" is its own."""
 
     ref: Ref
     source: Ref
-
-
-class StreamAddressOp(_FromPage, frozen=True, kw_only=True, tag="stream-address"):
-    """Offer the stream at ``url`` on the page of this component, for everybody; "" is the one that it reports."""
-
-    ref: Ref
-    url: Annotated[str, Meta(max_length=500)]
 
 
 class _Asked(_FromPage, frozen=True, kw_only=True):
@@ -204,8 +190,8 @@ class FlagOp(_Asked, frozen=True, kw_only=True, tag="flag"):
 RobotOp: TypeAlias = LightsOp | SoundboardOp | AutonomyOp | OutletOp | McuOp | ActionOp | FlagOp
 
 FromPage: TypeAlias = (
-    Hello | Echo | Watch | ReadLogs | Lease | DriveOp | StopOp | EstopOp | EstopEndOp | EstopResetOp | EncodingOp
-    | PictureFromOp | StreamAddressOp | RobotOp
+    Hello | Echo | Watch | ReadLogs | Lease | DriveOp | StopOp | EstopOp | EstopEndOp | EstopResetOp
+    | PictureFromOp | RobotOp
 )  # fmt: skip
 
 
@@ -369,7 +355,6 @@ class PictureView(Struct, frozen=True, kw_only=True):
     per_second: float
     kbits: float
     viewers: int
-    pinned: str
 
 
 class SoundView(Struct, frozen=True, kw_only=True):
@@ -400,12 +385,6 @@ class PictureFrom(Struct, frozen=True, kw_only=True):
     source: str
 
 
-class StreamAddress(Struct, frozen=True, kw_only=True):
-    """``web/stream-address``: of the stream that was entered for this component; "" is the one that it reports."""
-
-    url: str
-
-
 class FlagsView(Struct, frozen=True, kw_only=True):
     """``web/flags``: the flags of the component that is open, as the broker has them; null: it has none."""
 
@@ -422,7 +401,6 @@ SERVER_METRICS: dict[str, type] = {
     "web/picture": PictureView,
     "web/sound": SoundView,
     "web/picture-from": PictureFrom,
-    "web/stream-address": StreamAddress,
     "web/flags": FlagsView,
     "web/broker": BrokerView,
 }

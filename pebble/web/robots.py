@@ -116,7 +116,6 @@ class Robots:
         self.on_forget: Callable[[str], object] = lambda _: None
         self.logs: dict[str, LogLines] = {}  # of watched components
         self.sources: dict[str, str] = {}  # the components whose pictures are shown on the pages of others
-        self.streams: dict[str, str] = {}  # addresses that people have entered, by component
         self._server: dict[tuple[str, str], _Value] = {}
         self._bytes = 0
 

@@ -31,7 +31,6 @@ from pebble.web import messages as m
 from pebble.web.drive.drivers import Drivers
 from pebble.web.media.chosen_sources import ChosenSources
 from pebble.web.media.pictures_and_sound import PicturesAndSound
-from pebble.web.media.robot_streams import OwnHosts
 from pebble.web.open_components import OpenComponents
 from pebble.web.robots import Robots
 from pebble.web.stops import Stops
@@ -62,7 +61,7 @@ class Server:
         self._heartbeats: Heartbeats | None = None  # while a stop of all goes to further robots
         self.open_components = OpenComponents(self.broker, self.robots, self.spawn)
         # What is drawn over the picture comes from there.
-        self.sources = ChosenSources(people, self.robots, OwnHosts(settings), self.open_components.update)
+        self.sources = ChosenSources(people, self.robots, self.open_components.update)
         self.by_name = ByName(FLEET, self._is_wanted)
         self.robots.is_wanted = self._is_wanted
         self.robots.is_kept = lambda ref: self._is_wanted(ref) or self.stops.sends_to(ref)

@@ -70,7 +70,6 @@ class State:
     recordings: bool = False  # those of tests.web.recorded are offered
     days: tuple[int, str] | None = None  # status and text that a list of recorded days is answered with; status 0: none
     audit: list[Any] = field(default_factory=list)  # of a robot, as it is read
-    frames: str = ""  # origins that the page may show in a frame; {port} is the server's, here and in all values
 
 
 class CannedServer:
@@ -162,10 +161,7 @@ class CannedServer:
         return Route(route.path, days)
 
     async def _page(self, request: Request) -> Response:
-        headers = _headers()
-        if self.state.frames:
-            headers["content-security-policy"] += f"; frame-src {self._filled(self.state.frames)}"
-        return self.static.page(request, headers)
+        return self.static.page(request, _headers())
 
     async def _stream(self, _request: Request) -> Response:
         """A page that a robot may show in a frame."""

@@ -67,7 +67,7 @@ def estop(now: int, by: str = "", *, sending: str = "", text: str = "", why: str
 
 def flow(state: str = "flowing", why: str = "") -> dict[str, Any]:
     sent = {"encoding": "pbvz", "per_second": 10.0, "kbits": 212.0}
-    return {"state": state, "why": why, "viewers": 2, "pinned": ""} | sent
+    return {"state": state, "why": why, "viewers": 2} | sent
 
 
 def sound(state: str = "rest", why: str = "", *, talker: str = "") -> dict[str, Any]:
@@ -401,7 +401,7 @@ STATES: dict[str, State] = {
     "free": of(GOOB_PATH),
     "odometry": SENSORS,
     "overlays": of(GOOB_PATH, MINE, at(GOOB, "video-overlays", OVERLAYS), logs=logs),
-    "own-stream": of(GOOB_PATH, MINE, with_stream(f"{STREAM}/stream"), logs=logs, frames=STREAM),
+    "own-stream": of(GOOB_PATH, MINE, with_stream(f"{STREAM}/stream"), logs=logs),
     "taken": of(GOOB_PATH, BOB_DRIVES),
     "kept": of(GOOB_PATH, keeping(by="bob", device="phone"), welcome=MAY_TAKE),
     "kept-and-asked": of(GOOB_PATH, keeping(by="bob", device="phone", asking=True, others=True), welcome=MAY_TAKE),

@@ -5,9 +5,6 @@ from __future__ import annotations
 import itertools
 import time
 
-import httpx
-
-from pebble.web.server import Server
 from tests.support import until
 from tests.web.served import RecordingRobot, Served
 
@@ -260,31 +257,6 @@ def test_a_picture_of_another_component_is_remembered(served, page, robot):
     other = next(ref for ref, metric in page.state if metric == "web/liveness" and ref != robot.base)
     page.send("picture-from", ref=robot.base, source=other)
     assert until(lambda: page.value(robot.base, "web/picture-from", "source") == other)
-
-
-def test_an_address_of_a_stream_is_remembered_and_may_be_shown(served, page, robot):
-    def policy():
-        found = httpx.get(f"{served.origin}/r/{robot.base}").headers["content-security-policy"]
-        return found.partition("frame-src ")[2]
-
-    robot.publish("status", {"value": {"webrtc_url": "http://own.local:1/cam"}}, retain=True)
-    page.send("watch", ref=robot.base)
-    assert until(lambda: page.value(robot.base, "web/stream-address", "url") == "")
-    assert until(lambda: policy() == "http://own.local:1")
-    page.send("stream-address", ref=robot.base, url="http://camera.local:8889/cam")
-    assert until(lambda: page.value(robot.base, "web/stream-address", "url") == "http://camera.local:8889/cam")
-    assert policy() == "http://camera.local:8889"
-    for url in ("javascript:alert(1)", "http://u:p@camera.local/", "http://a.b; script-src *"):
-        page.refused.clear()
-        page.send("stream-address", ref=robot.base, url=url)
-        assert until(lambda: page.refused and "http://" in page.refused[-1]["why"]), url
-    again = Server(served.settings, served.app.state.people, served.app.state.audit)  # as after a restart
-    assert again.robots.streams == {robot.base: "http://camera.local:8889/cam"}
-    page.send("stream-address", ref=robot.base, url="")
-    assert until(lambda: policy() == "http://own.local:1")
-    noted = ["http://camera.local:8889/cam", ""]
-    audit = served.app.state.audit  # has a row once an address is in use
-    assert until(lambda: [one.detail for one in audit.read(9) if one.what == "stream-address"] == noted)
 
 
 def test_what_is_drawn_over_a_picture_comes_with_it(served, broker, page, robot):

@@ -22,7 +22,7 @@ _METHODS = ("GET", "HEAD", "POST")
 CONTENT_SECURITY_POLICY = (
     "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' blob:; font-src 'self'; "
     "connect-src 'self'; worker-src 'self'; media-src 'self' blob:; manifest-src 'self'; base-uri 'none'; "
-    "form-action 'self'; frame-ancestors 'none'"
+    "form-action 'self'; frame-ancestors 'none'; frame-src http: https:"  # streams of robots, by a person's click
 )
 _split = re.compile(r"(\[[0-9a-f:.]+\]|[^\[\]:@/\s]+)(?::\d{1,5})?", re.ASCII | re.IGNORECASE).fullmatch
 #: Added to each response that does not set them itself.

@@ -68,22 +68,10 @@ export interface EstopResetOp {
   owners: ShownOwner[];
 }
 
-export interface EncodingOp {
-  op: "encoding";
-  ref: string;
-  encoding: string;
-}
-
 export interface PictureFromOp {
   op: "picture-from";
   ref: string;
   source: string;
-}
-
-export interface StreamAddressOp {
-  op: "stream-address";
-  ref: string;
-  url: string;
 }
 
 export interface LightsOp {
@@ -283,7 +271,6 @@ export interface PictureView {
   per_second: number;
   kbits: number;
   viewers: number;
-  pinned: string;
 }
 
 export interface SoundView {
@@ -296,10 +283,6 @@ export interface SoundView {
 
 export interface PictureFrom {
   source: string;
-}
-
-export interface StreamAddress {
-  url: string;
 }
 
 export interface FlagsView {
@@ -324,11 +307,10 @@ export interface Metrics {
   "web/picture": PictureView;
   "web/sound": SoundView;
   "web/picture-from": PictureFrom;
-  "web/stream-address": StreamAddress;
   "web/flags": FlagsView;
   "web/broker": BrokerView;
 }
 
-export type FromPage = Hello | Echo | Watch | ReadLogs | Lease | DriveOp | StopOp | EstopOp | EstopEndOp | EstopResetOp | EncodingOp | PictureFromOp | StreamAddressOp | LightsOp | SoundboardOp | AutonomyOp | OutletOp | McuOp | ActionOp | FlagOp;
+export type FromPage = Hello | Echo | Watch | ReadLogs | Lease | DriveOp | StopOp | EstopOp | EstopEndOp | EstopResetOp | PictureFromOp | LightsOp | SoundboardOp | AutonomyOp | OutletOp | McuOp | ActionOp | FlagOp;
 
 export type ToPage = Welcome | Ping | State | Logs | Refused | Done | Bye;
