@@ -1,11 +1,10 @@
 """The scripts of a robot as its autonomy_manager publishes them, and commands that start and stop them."""
 
-import math
 from collections.abc import Sequence
 from typing import Any
 
 from pebble.client.names import Names
-from pebble.contract import AUTONOMY_COMMAND, AUTONOMY_FILES, AUTONOMY_STATUS, CAPABILITIES, LINK, codec
+from pebble.contract import AUTONOMY_COMMAND, AUTONOMY_FILES, AUTONOMY_STATUS, CAPABILITIES, LINK, codec, forms
 from pebble.contract.levels import LEVELS, level_of
 from pebble.contract.payloads import AutonomyCommand, AutonomyStatus, LinkLevel
 from pebble.errors import PayloadError, PebbleError
@@ -80,60 +79,36 @@ class RobotScripts:
 
 def settings(entry: Entry, words: Sequence[str]) -> dict[str, Any]:
     """The settings that words such as ``--tag-id 5 --no-search`` select in a script's form. Raises PebbleError."""
-    form = [one for one in entry.get("configs") or () if isinstance(one, dict) and isinstance(one.get("key"), str)]
-    options = {option: (one, value) for one in form for option, value in options_of(one)}
+    form = forms.listed(entry.get("configs"))
+    options = {option: (setting, value) for setting in form for option, value in options_of(setting)}
     chosen: dict[str, Any] = {}
     rest = iter(words)
     for word in rest:
-        option, given, value = word.partition("=")
+        option, given, text = word.partition("=")
         if option not in options:
             known = ", ".join(options) or "it has none"
             raise PebbleError(f"{option} is no option of {entry['file']}: {known}")
-        one, fixed = options[option]
-        if fixed is None and not given:
-            following = next(rest, None)
-            if following is None:
+        setting, value = options[option]
+        if value is None and not given:
+            text = next(rest, "")
+            if not text:
                 raise PebbleError(f"{option} needs a value")
-            value = following
-        chosen[one["key"]] = fixed if fixed is not None else _value(option, str(one.get("type")), value)
-        _check_bounds(f"{option} of {entry['file']}", chosen[one["key"]], one)
+        try:
+            chosen[setting.key] = forms.accepted(setting, text) if value is None else value
+        except forms.SettingError as error:
+            raise PebbleError(f"{option} of {entry['file']}: {error}") from None
     return chosen
 
 
-def _check_bounds(name: str, value: Any, one: Entry) -> None:
-    """Raises PebbleError for a value that the robot would refuse."""
-    least, most, options = one.get("min"), one.get("max"), one.get("options")
-    if one.get("type") in ("int", "float"):
-        if isinstance(least, int | float) and value < least:
-            raise PebbleError(f"{name}: {value} is too little, it is at least {least}")
-        if isinstance(most, int | float) and value > most:
-            raise PebbleError(f"{name}: {value} is too much, it is at most {most}")
-    elif one.get("type") == "enum" and isinstance(options, list) and value not in map(str, options):
-        raise PebbleError(f"{name}: {value!r} is not one of {', '.join(map(str, options))}")
-
-
-def options_of(one: Entry) -> list[tuple[str, bool | None]]:
-    """The options of a form's entry: first the script's own, then those made of its key; for flags with their value."""
-    key = str(one.get("key", "")).replace("_", "-")
-    on = _distinct(one.get("arg"), f"--{key}")
-    if one.get("type") != "bool":
+def options_of(setting: forms.Setting) -> list[tuple[str, bool | None]]:
+    """The options of a setting: first the script's own, then those made of its key; for flags with their value."""
+    key = setting.key.replace("_", "-")
+    on = _distinct(setting.arg, f"--{key}")
+    if setting.type != "bool":
         return [(option, None) for option in on]
-    off = _distinct(one.get("arg_false"), f"--no-{key}")
+    off = _distinct(setting.arg_false, f"--no-{key}")
     return [*((option, True) for option in on), *((option, False) for option in off)]
 
 
-def _distinct(own: object, made: str) -> list[str]:
-    return list(dict.fromkeys((own, made))) if isinstance(own, str) and own.startswith("--") else [made]
-
-
-def _value(option: str, type_: str, text: str) -> Any:
-    try:
-        if type_ == "int":
-            return int(text)
-        if type_ == "float" and math.isfinite(number := float(text)):
-            return number
-    except ValueError:
-        pass
-    if type_ in ("int", "float"):
-        raise PebbleError(f"{option}: {text!r} is not a number")
-    return text
+def _distinct(own: str | None, made: str) -> list[str]:
+    return list(dict.fromkeys((own, made))) if own and own.startswith("--") else [made]

@@ -511,5 +511,5 @@ def test_an_address_is_entered_and_taken_back(show: Show, server: CannedServer) 
         assert "own stream" in opened.page.frame_locator("[data-test=stream]").locator("body").inner_text(timeout=5000)
         opened.test("stream-address").click()
         opened.test("unset-stream").click()
-        assert opened.until(lambda: opened.test("stream").count() == 0)
+        assert opened.until(lambda: opened.test("unset-stream").count() == 0)
         assert opened.complaints() == []
