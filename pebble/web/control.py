@@ -11,6 +11,7 @@ from typing import Any
 import msgspec
 from starlette.websockets import WebSocket, WebSocketDisconnect, WebSocketState
 
+from pebble.client.drive_reasons import WORDS
 from pebble.client.estop_states import Reset
 from pebble.fleet.database import DatabaseError
 from pebble.fleet.roles import Session, page_rights
@@ -31,7 +32,6 @@ CHECK_S = 5.0  # between two looks at whether the session still exists, while no
 _WATCH_COST = 20  # it subscribes to so many topics
 _WAITING = 64  # messages that wait to be sent, besides the state
 _NOT_NOTED = ("op", "ref", "n", "config")  # settings of a script may be secret
-_RELOAD = "This page is older than the server: reload it"
 
 _decoder = msgspec.json.Decoder(m.FromPage)
 
@@ -102,9 +102,9 @@ class Control:
         drives = settings.plain_http_drive or self._is_secure()
         version = self._websocket.app.state.version
         if not drives:
-            self._why_not = "This connection is not encrypted: driving is switched off"
+            self._why_not = WORDS["plain"]
         elif hello.version != version:
-            self._why_not = _RELOAD
+            self._why_not = WORDS["reload"]
         self._post(
             m.Welcome(
                 server=settings.name,
@@ -117,6 +117,7 @@ class Control:
                 token=self._tab.token,
                 now=1000 * time.time(),
                 drives=drives,
+                words=WORDS,
                 recordings=settings.recordings is not None,
             )
         )

@@ -213,6 +213,7 @@ class Welcome(_ToPage, frozen=True, kw_only=True, tag="welcome"):
     now: float
     recordings: bool = False  # whether this server has some to look at
     drives: bool = True  # False: the page came over plain http from another machine, where driving is switched off
+    words: dict[str, str] = {}  # why nothing is driven, for people
 
 
 class Ping(_ToPage, frozen=True, kw_only=True, tag="ping"):

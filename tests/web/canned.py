@@ -31,6 +31,7 @@ from starlette.responses import HTMLResponse, JSONResponse, Response
 from starlette.routing import Route, WebSocketRoute
 from starlette.websockets import WebSocket, WebSocketDisconnect, WebSocketState
 
+from pebble.client.drive_reasons import WORDS
 from pebble.client.page import WebSettings
 from pebble.contract.packets import Codec, Picture, PictureKind, Sound
 from pebble.fleet.audit import Audit
@@ -235,6 +236,7 @@ class CannedServer:
             "token": "canned",
             "now": self.now(),
             "drives": True,
+            "words": WORDS,
         }
         return usual | state.welcome
 

@@ -216,7 +216,7 @@ def test_a_robot_without_drive_is_not_driven(broker, served):
         assert page.take(base)
         page.drive(base, 1, z=0.5)
         assert until(lambda: page.refused)
-        assert page.refused[0]["why"] == "This component does not drive"
+        assert page.refused[0]["why"] == f"{base.rpartition('/')[2]} does not drive"
         assert tower.drives() == []
 
 
@@ -234,7 +234,7 @@ def test_a_page_of_another_version_does_not_drive(served, robot):
         assert page.knows(robot.base)
         page.send("lease", ref=robot.base, take=True)
         assert until(lambda: page.refused)
-        assert "reload" in page.refused[0]["why"]
+        assert "load it again" in page.refused[0]["why"]
 
 
 def test_servers_share_a_robot_that_keeps_no_control(broker, page, robot):

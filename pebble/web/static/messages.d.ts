@@ -145,6 +145,7 @@ export interface Welcome {
   now: number;
   recordings?: boolean;
   drives?: boolean;
+  words?: Record<string, string>;
 }
 
 export interface Ping {

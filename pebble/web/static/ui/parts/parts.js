@@ -1,8 +1,8 @@
 // Small parts of many widgets.
 
 import * as browser from "../../core/browser.js";
-import { Boundary, html, useEffect, useLater, useModel, usePage, usePart, useRef, useState, useTick, useValue } from "./hooks.js";
-import { Model, Route, read, write } from "./models.js";
+import { Boundary, html, useEffect, useLater, usePage, usePart, useRef, useState, useTick, useValue } from "./hooks.js";
+import { Route, read } from "./models.js";
 import { chargeWords, drawing, hasFace, looksOf } from "./looks.js";
 import { reported, roughly } from "./words.js";
 
@@ -198,27 +198,13 @@ export function Extra({ of, part, what, source, ...props }) {
   return body && html`<${Boundary} key=${source} what=${what}><${body[part]} source=${source} ...${props} /><//>`;
 }
 
-/** The addresses of streams that were entered in this browser. */
-class Streams extends Model {
-  /** @param {string} ref @returns {string} "" none */
-  of(ref) {
-    const url = read(`stream ${ref}`, "");
-    return typeof url === "string" ? url : "";
-  }
-
-  /** @param {string} ref @param {string} url */
-  set(ref, url) {
-    write(`stream ${ref}`, url);
-    this.changed();
-  }
-}
-
-export const streams = new Streams();
+/** The stream that was entered for it in this browser; "" none. @param {string} at @returns {string} */
+export const useEntered = (at) => useValue(at, "web/entered") ?? read(`stream ${at}`, "");
 
 /** The address of its own stream: what was entered, else what it reports; "" none. @param {string} at */
 export function useStream(at) {
   const own = reported(useValue(at, "status"));
-  return useModel(streams).of(at) || own;
+  return useEntered(at) || own;
 }
 
 /** What people call it. @param {string} at @returns {string} */

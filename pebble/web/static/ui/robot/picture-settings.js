@@ -1,9 +1,9 @@
 // How the pictures of a component come, and where from.
 
 import { refusal } from "../../core/stream.js";
-import { html, useModel, usePage, useRefs, useState, useTick, useValue } from "../parts/hooks.js";
-import { Offers } from "../parts/models.js";
-import { Extra, Face, Why, streams, useName } from "../parts/parts.js";
+import { html, usePage, useRefs, useState, useTick, useValue } from "../parts/hooks.js";
+import { Offers, write } from "../parts/models.js";
+import { Extra, Face, Why, useEntered, useName } from "../parts/parts.js";
 import { useReasons, whyNotEnd } from "../parts/why-not.js";
 import { nameIn } from "../parts/looks.js";
 
@@ -73,12 +73,14 @@ function PictureFrom({ at, source, offers, more }) {
 
 /** Enter the address of a stream, for this browser: of a camera that is beside the robot, for example. */
 function StreamAddress({ source }) {
-  const current = useModel(streams).of(source);
+  const { store } = usePage();
+  const current = useEntered(source);
   const [typed, type] = useState(/** @type {string | null} */ (null)); // null: as it is
   const address = (typed ?? current).trim();
   const why = address && refusal(address, location);
   const set = (url) => {
-    streams.set(source, url);
+    write(`stream ${source}`, url);
+    store.set(source, "web/entered", url);
     type(null);
   };
   return html`<details class="stream-address">
