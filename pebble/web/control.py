@@ -209,7 +209,7 @@ class Control:
         if why := (self._why_not if robot_commands.moves(op) else "") or self._server.drivers.refusals.of_op(op):
             self._refuse(op, why)
             return
-        message = robot_commands.publication(op, self._server.robots.topic)
+        message = robot_commands.publication(op, self._server.robots.capabilities(op.ref))
         if not self._server.broker.publish(
             message.topic,
             message.payload,

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import msgspec
 
 from pebble import contract as c
-from pebble.client.robot_topics import FLEET, SYNONYMS, names, section_of
+from pebble.client.robot_topics import FLEET, SYNONYMS, topic_of
 from pebble.client.robot_view import RobotView
 from pebble.contract import channel_of, codec, is_reserved
 from pebble.contract.identity import LEVEL, Direction, parse_topic
@@ -130,10 +130,9 @@ class Robots:
         component = self.components.get(ref)
         return {} if component is None else component.robot.capabilities
 
-    def topic(self, ref: str, section: str, key: str, channel: c.Channel) -> str:
-        """The topic that the capabilities name, if they may; else the channel's own."""
-        topic = str(section_of(self.capabilities(ref), section).get(key))
-        return topic if names(ref, topic, channel) else channel.topic(ref)
+    def topic(self, ref: str, channel: c.Channel) -> str:
+        """Return the topic that the component's capabilities name for ``channel``, else the channel's own."""
+        return topic_of(ref, self.capabilities(ref), channel)
 
     def aliases(self, ref: str) -> list[str]:
         """The metrics, none of the contract's, under which its microcontrollers say that they publish."""

@@ -131,7 +131,7 @@ class SoundStream(MediaStream[SoundPage, SoundView]):
                 return
             self._begin(page, talk, now)
         if self._talk is not None and self._talk.takes(piece, now):
-            topic = self._robots.topic(self.ref, "audio", "uplink_topic", AUDIO_STREAM)
+            topic = self._robots.topic(self.ref, AUDIO_STREAM)
             packet = self._voice.packet(sound, time.time())
             if not self._broker.publish(topic, packet, qos=QoS(AUDIO_STREAM.default_qos)):
                 self._interrupt("The server cannot reach the broker")
