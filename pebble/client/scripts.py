@@ -1,12 +1,13 @@
 """The scripts of a robot as its autonomy_manager publishes them, and commands that start and stop them."""
 
 from collections.abc import Sequence
+from contextlib import suppress
 from typing import Any
 
 from pebble.client.names import Names
+from pebble.client.robot_view import RobotView
 from pebble.contract import AUTONOMY_COMMAND, AUTONOMY_FILES, AUTONOMY_STATUS, CAPABILITIES, LINK, codec, forms
-from pebble.contract.levels import LEVELS, level_of
-from pebble.contract.payloads import AutonomyCommand, AutonomyStatus, LinkLevel
+from pebble.contract.payloads import AutonomyCommand, AutonomyStatus
 from pebble.errors import PayloadError, PebbleError
 from pebble.transports import Message, QoS, Transport
 
@@ -21,41 +22,37 @@ class RobotScripts:
     """Which scripts one robot offers, and what runs. Other threads may read while it receives."""
 
     def __init__(self, names: Names) -> None:
+        self.robot = RobotView(names.base)
         self.files: dict[str, Entry] | None = None  # by name; None: the robot has not published any list
-        self.status: AutonomyStatus | None = None
         self.answers = 0  # statuses that arrived live
-        self.named = False  # it takes commands only with the name of their sender
-        self._link: LinkLevel = "wide"
-        self._topics = {channel.metric: names.topic(channel.metric) for channel in _RECEIVED}
+        self._channels = {names.topic(channel.metric): channel for channel in _RECEIVED}
         self._command_topic = names.topic(AUTONOMY_COMMAND.metric)
+
+    @property
+    def status(self) -> AutonomyStatus | None:
+        """It is what runs; None: the robot has not published it."""
+        return self.robot.autonomy
 
     @property
     def answer_s(self) -> float:
         """A robot whose status has not changed so long after a command does not follow it."""
-        return max(_STARTS_S, LEVELS[self._link].answer_s)
+        return max(_STARTS_S, self.robot.pace.answer_s)
 
     def subscribe(self, transport: Transport) -> None:
         """Receive from ``transport``; when this returns, what is retained has arrived."""
-        for topic in self._topics.values():
+        for topic in self._channels:
             transport.subscribe(topic, self.receive, direct=True)
 
     def receive(self, message: Message) -> None:
         """Update from a message of this robot; what is malformed is ignored."""
-        if len(message.payload) > _BYTES:
-            return
-        try:
-            if message.topic == self._topics[AUTONOMY_FILES.metric]:
+        channel, before = self._channels.get(message.topic), self.status
+        if channel is not AUTONOMY_FILES:
+            self.robot.receive(channel, message, 0.0, 0.0)
+            self.answers += self.status is not before and not message.retain
+        elif len(message.payload) <= _BYTES:
+            with suppress(PayloadError):
                 listed = codec.decode(AUTONOMY_FILES, message.payload).files
                 self.files = {entry["file"]: entry for entry in listed if isinstance(entry.get("file"), str)}
-            elif message.topic == self._topics[LINK.metric]:
-                self._link = level_of(message.payload)
-            elif message.topic == self._topics[CAPABILITIES.metric]:
-                self.named = codec.decode(CAPABILITIES, message.payload).value.get("named") is True
-            elif message.topic == self._topics[AUTONOMY_STATUS.metric]:
-                self.status = codec.decode(AUTONOMY_STATUS, message.payload)
-                self.answers += not message.retain
-        except PayloadError:
-            return
 
     def start(self, transport: Transport, file: str, words: Sequence[str]) -> bool:
         """Command a start with the options in ``words``; False: it was not sent. Raises PebbleError."""
@@ -90,9 +87,10 @@ def settings(entry: Entry, words: Sequence[str]) -> dict[str, Any]:
             raise PebbleError(f"{option} is no option of {entry['file']}: {known}")
         setting, value = options[option]
         if value is None and not given:
-            text = next(rest, "")
-            if not text:
+            following = next(rest, None)
+            if following is None:
                 raise PebbleError(f"{option} needs a value")
+            text = following
         try:
             chosen[setting.key] = forms.accepted(setting, text) if value is None else value
         except forms.SettingError as error:

@@ -60,7 +60,7 @@ def create_app(settings: WebSettings) -> Starlette:
         state.server, state.audit, state.stops = server, audit, server.stops
         state.recordings = archive
         state.robots, state.broker = server.robots, server.broker
-        state.media, state.sound = server.media.pictures, server.media.sound
+        state.media, state.sound = server.pictures, server.sound
         await server.open()
         try:
             yield

@@ -127,7 +127,7 @@ def _scripts(robot: str, target: Target) -> Iterator[tuple[Transport, RobotScrip
     """The connection, what the robot has published about its scripts, and its name."""
     with connected(target_of(robot, target)) as (transport, names):
         scripts = RobotScripts(names)
-        put_names(transport, names, lambda base: base == names.base and scripts.named)
+        put_names(transport, names, lambda base: base == names.base and scripts.robot.named)
         scripts.subscribe(transport)
         wait_for(lambda: scripts.files is not None and scripts.status is not None, 1.0)
         yield transport, scripts, shown(id_of(names.base))
