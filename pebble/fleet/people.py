@@ -116,10 +116,6 @@ class People:
         self._change_one(name, "UPDATE people SET salt = ?, hash = ? WHERE name = ?", salt, hashed, name)
         self._change("DELETE FROM sessions WHERE name = ?", name)
 
-    def end_sessions(self) -> None:
-        """Everybody has to log in again."""
-        self._change("DELETE FROM sessions")
-
     def set_role(self, name: str, role: Role) -> None:
         """Counts for running sessions, too. Raises PeopleError."""
         self._change_one(name, "UPDATE people SET role = ? WHERE name = ?", role.value, name)

@@ -150,9 +150,9 @@ def _add(parser: argparse.ArgumentParser, setting: Setting) -> None:
     if setting.type == "bool":
         flags = parser.add_mutually_exclusive_group()
         word = "on" if setting.default else "off"
-        flags.add_argument(setting.arg, dest=setting.key, action="store_true", default=None,
+        flags.add_argument(str(setting.arg), dest=setting.key, action="store_true", default=None,
                            help=f"{setting.label} (default: {word})")  # fmt: skip
-        flags.add_argument(setting.arg_false, dest=setting.key, action="store_false", default=None,
+        flags.add_argument(str(setting.arg_false), dest=setting.key, action="store_false", default=None,
                            help=argparse.SUPPRESS if word == "off" else "the opposite")  # fmt: skip
         return
     parser.add_argument(

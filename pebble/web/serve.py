@@ -11,6 +11,7 @@ from pathlib import Path
 
 import uvicorn
 from uvicorn.protocols.http.h11_impl import H11Protocol
+from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIOProtocol
 
 from pebble.client.page import WebSettings
 from pebble.errors import PebbleError
@@ -24,6 +25,7 @@ _LARGEST_MESSAGE = 64 * 1024
 _END_S = 1
 REQUEST_S = 10.0  # from a connection to its first whole request
 UNREAD_S = 60.0  # in which a client reads something of what it is sent
+PING_S, PONG_S = 2.0, 4.0  # between two pings on a WebSocket, and for the answer
 _ACCEPT = 16  # connections at once; what the last ones have sent is read before the next ones come
 _WAITING = 2048  # connections to be accepted
 _ALL_ADDRESSES = ("0.0.0.0", "::")  # noqa: S104 - compared, not listened on
@@ -85,6 +87,13 @@ class HttpProtocol(H11Protocol):
             self.transport.abort()
 
 
+class WebSocketProtocol(WebSocketsSansIOProtocol):
+    """A connection that ends at once if no ping is answered: what still waits to be sent holds up no end of control."""
+
+    def keepalive_timeout(self) -> None:
+        self.transport.abort()
+
+
 def server_config(settings: WebSettings) -> uvicorn.Config:
     return uvicorn.Config(
         create_app(settings),
@@ -97,11 +106,11 @@ def server_config(settings: WebSettings) -> uvicorn.Config:
         proxy_headers=False,  # else any local program chooses the address by which logins are counted
         date_header=False,
         http=HttpProtocol,
-        ws="websockets-sansio",
+        ws=WebSocketProtocol,
         ws_per_message_deflate=False,  # pictures are compressed already: it would double the time they take
         ws_max_size=_LARGEST_MESSAGE,
-        ws_ping_interval=2.0,
-        ws_ping_timeout=4.0,
+        ws_ping_interval=PING_S,
+        ws_ping_timeout=PONG_S,
         timeout_graceful_shutdown=_END_S,
         backlog=_ACCEPT,  # no limit_concurrency: strangers would use it up, and keep out a stop
     )

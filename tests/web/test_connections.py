@@ -46,6 +46,19 @@ def test_who_reads_nothing_is_closed(broker: Broker, monkeypatch: pytest.MonkeyP
         assert until(lambda: not served.open, 10)
 
 
+def test_who_answers_no_ping_is_closed_though_it_is_sent_more_than_it_reads(
+    broker: Broker, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(serve, "PING_S", 0.2)
+    monkeypatch.setattr(serve, "PONG_S", 0.2)
+    with Served(broker.port) as served, socket.socket() as client:
+        client.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+        client.connect(("127.0.0.1", served.port))
+        client.sendall(UPGRADE.replace(b"Host: x", b"Host: localhost\r\nOrigin: http://localhost") + b"\r\n")
+        assert until(lambda: len(served.open) == 1)
+        assert until(lambda: not served.open, 4)
+
+
 def _is_closed(client: socket.socket) -> bool:
     client.settimeout(0.05)
     try:

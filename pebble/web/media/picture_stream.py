@@ -68,18 +68,12 @@ class PictureStream(MediaStream[PageViewer, PictureView]):
         """The newest key frame and the differences since, if pictures are flowing."""
         return list(self._chain) if self._arrivals.flowing(time.monotonic()) else []
 
-    @property
-    def seq(self) -> int:
-        """The number of the newest frame."""
-        return self._seq
-
     # -- pictures
 
     def receive(self, payload: bytes) -> None:
         now = time.monotonic()
         header, fits = self._sequence.take(payload), self._sequence.complete
         if header is None:
-            self.refused += 1
             return
         self._note(header.encoding, len(payload), now)
         self._extend_chain(payload, header, fits=fits)
