@@ -87,6 +87,17 @@ def test_main_options_are_some_of_its_options(tmp_path: Path, more: str, end: st
     assert (run.stdout, run.stderr.splitlines()[-1]) == ("", end)
 
 
+def test_the_help_says_what_each_option_takes() -> None:
+    parser = OneLineParser(prog="run.py")
+    parse(Options, ["--tag-size-m", "1"], parser)
+    words = " ".join(parser.format_help().split())
+    for part in (
+        "Tag Size (m) (at least 0.01; required)", "Tag ID (0 to 34; default: 13)", "Limit (at least 1; default: none)",
+        "Speed (one of slow, fast, automatic; default: slow)", "Note (default: )", "Search (default: on)",
+    ):  # fmt: skip
+        assert part in words
+
+
 def test_what_is_not_given_has_its_default() -> None:
     assert parsed() == Options(tag_size_m=0.25, power=1.0)
 
