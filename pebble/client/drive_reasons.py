@@ -1,8 +1,10 @@
-"""Why a robot is not driven: the reasons, the order in which they count, and the limits they have in common. Pure.
+"""Why a robot is not driven: the reasons, their order and their words, and the limits they have in common. Pure.
 
-The page's own reasons are in ``web/static/core/reasons.js``; ``tests/vectors/drive_reasons.json`` is run by both.
+When the page's own reasons apply is in ``web/static/core/reasons.js``; ``tests/vectors/drive_reasons.json`` is run by
+both. docs/words.md has the table of words.
 """
 
+from collections import defaultdict
 from collections.abc import Callable, Sequence
 from enum import StrEnum
 from typing import NamedTuple
@@ -77,21 +79,45 @@ def first_reason(situation: Situation, order: Sequence[Code] = ORDER) -> Code | 
     return next((code for code in order if _APPLIES[code](situation)), None)
 
 
-_WORDS = {
-    Code.SILENT: "{name} is silent",
-    Code.UNSEEN: "{name} has not been seen yet",
-    Code.STOPPED: "Stopped by {by}",
-    Code.STOPPING: "Emergency stop",
-    Code.RESET: "It was just reset: wait a moment",
-    Code.UNKNOWN: "{name} has not published what it can do",
-    Code.NO_DRIVE: "This component does not drive",
-    Code.LEASE: "{driven} is driving",
-    Code.LISTENING: "Take control to drive",
-    Code.SCRIPT: "A script is driving: stop it first",
+#: What people are told: on the page, which gets the table from its server, in a terminal, and by the server.
+WORDS = {
+    "broker": "The server cannot reach the broker: {problem}",
+    "failed": "This page does not work ({part}): load it again",
+    "reload": "This page is older than the server: load it again",
+    "plain": "Driving needs https: this connection is not encrypted",
+    "role": "Log in as driver to drive",
+    "hidden": "This page is in the background",
+    "silent": "{name} is silent{since}",
+    "unseen": "{name} has not been seen yet",
+    "stopped": "Stopped by {by}",
+    "stopping": "Emergency stop",
+    "reset": "It was just reset: wait a moment",
+    "unknown": "{name} has not published what it can do",
+    "no-drive": "{name} does not drive",
+    "free": "Take control to drive",
+    "listening": "Take control to drive",
+    "idle": "{who} has control, but does not drive",
+    "lease": "{who} is driving",
+    "kept": "{who} has control",
+    "asked": "{who} is asked for control",
+    "loading": "This screen is still loading",
+    "dialog": "Close the panel first",
+    "script": "{script} is driving: stop it first",
+    "picture": "The picture is {age} s old",
+    "picture-none": "There is no picture yet",
+    "picture-waits": "Pictures wait while you drive",
+    "picture-unknown": "How old this stream is, is not known",
+    "late": "Commands are late{by_ms}",
+    "pad": "The gamepad stands still: move its stick to neutral and back",
+    "focus": "Click this page first: keys go to another window",
+    "release": "Let go first",
 }
 
 
-def words(code: Code | None, name: str, *, stopped: EstopState | None = None, driven: str = "") -> str:
-    """Return a reason for people; "" for none, and for those that only one program has. ``driven``: by whom."""
+def words(
+    code: str | None, name: str = "", *, stopped: EstopState | None = None, driven: str = "", problem: str = ""
+) -> str:
+    """Return the sentence of a state for people; "" for none. ``driven``: by whom."""
     by = stopped.by if stopped is not None and stopped.by else "unknown"
-    return _WORDS.get(code, "").format(name=name, by=by, driven=driven) if code is not None else ""
+    values = {"name": name, "by": by, "who": driven, "script": "A script", "problem": problem}
+    return WORDS.get(code or "", "").format_map(defaultdict(str, values))

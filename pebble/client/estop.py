@@ -33,9 +33,9 @@ def new_name() -> str:
 
 
 class Progress(Enum):
-    """How far the stop of one robot is."""
+    """How far the stop of one robot is, as pages are told."""
 
-    WAITING = "waiting"
+    WAITING = "sent"
     CONFIRMED = "confirmed"
     OLD = "old"  # it has no emergency stop: zeros are sent while the stop lasts, and it cannot be latched
     SPARED = "spared"  # among all robots: it says that it does not drive; it gets the stop once, and is not waited for

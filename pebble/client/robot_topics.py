@@ -32,8 +32,44 @@ WATCHED = tuple(
     and channel not in SYNONYMS
     and channel.kind is not c.Kind.EVENT
 )
-#: Flags, by the section of the capabilities whose ``flag_topic`` may name another topic for it.
+#: Flags, by the section of the capabilities that may name another topic for it.
 FLAGS = {"": c.REMOTE_MIRROR, "audio": c.MQTT_AUDIO, "video": c.MQTT_VIDEO}
+#: Where capabilities may name another topic for a channel: section and key.
+PLACES: dict[c.Channel, tuple[str, str]] = {
+    **{flag: (section, "flag_topic") for section, flag in FLAGS.items()},
+    c.DRIVE: ("drive", "topic"),
+    c.LIGHTS_SOLID: ("lights", "solid_topic"),
+    c.LIGHTS_FLASH: ("lights", "flash_topic"),
+    c.SOUNDBOARD_COMMAND: ("soundboard", "command_topic"),
+    c.SOUNDBOARD_FILES: ("soundboard", "files_topic"),
+    c.SOUNDBOARD_STATUS: ("soundboard", "status_topic"),
+    c.AUTONOMY_COMMAND: ("autonomy", "command_topic"),
+    c.AUTONOMY_FILES: ("autonomy", "files_topic"),
+    c.AUTONOMY_STATUS: ("autonomy", "status_topic"),
+    c.CAMERA: ("video", "topic"),
+    c.VIDEO_CONTROL: ("video", "command_topic"),
+    c.VIDEO_OVERLAYS: ("video", "overlays_topic"),
+    c.AUDIO: ("audio", "topic"),
+    c.AUDIO_CONTROL: ("audio", "command_topic"),
+    c.AUDIO_STREAM: ("audio", "uplink_topic"),
+    c.TOUCH_SENSORS: ("telemetry", "touch_topic"),
+    c.CHARGING_STATUS: ("telemetry", "charging_topic"),
+    c.CHARGING_LEVEL: ("telemetry", "charging_level_topic"),
+    c.WHEEL_ODOMETRY: ("telemetry", "wheel_odometry_topic"),
+    c.IMU: ("telemetry", "imu_topic"),
+}
+
+
+def named_topic(ref: str, capabilities: dict[str, Any], channel: c.Channel) -> str | None:
+    """Return the topic that capabilities name for this channel; None if they name none, or may not name it."""
+    section, key = PLACES[channel]
+    topic = section_of(capabilities, section).get(key)
+    return str(topic) if names(ref, topic, channel) else None
+
+
+def topic_of(ref: str, capabilities: dict[str, Any], channel: c.Channel) -> str:
+    """Return the topic that capabilities name for this channel, else the channel's own."""
+    return named_topic(ref, capabilities, channel) or channel.topic(ref)
 
 
 def section_of(capabilities: dict[str, Any], name: str) -> dict[str, Any]:

@@ -9,9 +9,8 @@ from pebble.client.control import RobotControl
 from pebble.client.drive_reasons import SILENT_S, Situation
 from pebble.client.driveable import Driveable, driveable_of
 from pebble.client.pace_of_link import Pace, pace_of, way_s
-from pebble.client.robot_topics import section_of
+from pebble.client.robot_topics import named_topic, section_of
 from pebble.contract import codec
-from pebble.contract.identity import is_of_another
 from pebble.contract.levels import link_of, silent_after
 from pebble.contract.payloads import AutonomyStatus, EstopState, Heartbeat, LinkLevel, LinkState, Orientation
 from pebble.errors import PayloadError
@@ -221,13 +220,9 @@ class RobotView:
         """At what rate, and how, commands go to it; also while it is gone, for when it is back over the same link."""
         return pace_of(self.link)
 
-    @property
-    def drive_topic(self) -> str | None:
-        """The topic of its drive commands; None until its capabilities have arrived."""
-        return self._topic("drive", "topic")
-
-    def lights_topic(self, *, flash: bool) -> str | None:
-        return self._topic("lights", "flash_topic" if flash else "solid_topic")
+    def topic(self, channel: c.Channel) -> str | None:
+        """Return the topic that its capabilities name for ``channel``; None: none, or none of its own."""
+        return named_topic(self.base, self.capabilities, channel)
 
     def offers(self, section: str) -> bool:
         """Whether that section of its capabilities, for example ``video``, can be requested."""
@@ -235,7 +230,7 @@ class RobotView:
 
     def ready(self, now: float) -> bool:
         """Whether it is online, with a known drive topic."""
-        return self.drive_topic is not None and self.liveness.online(now) is True
+        return self.topic(c.DRIVE) is not None and self.liveness.online(now) is True
 
     def online(self, now: float) -> bool | None:
         """Whether people are told that it is there: as its heartbeats say, but not silent after less than 1.5 s."""
@@ -253,10 +248,6 @@ class RobotView:
             arbitrates=self.arbitrates,
             script=script is not None and script.running,
         )
-
-    def _topic(self, section: str, key: str) -> str | None:
-        topic = section_of(self.capabilities, section).get(key)
-        return topic if isinstance(topic, str) and not is_of_another(topic, self.base) else None
 
 
 _TELEMETRY = (c.CHARGING_LEVEL, c.CHARGING_STATUS, c.IMU, c.AUTONOMY_STATUS)

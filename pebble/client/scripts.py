@@ -1,13 +1,13 @@
 """The scripts of a robot as its autonomy_manager publishes them, and commands that start and stop them."""
 
-import math
 from collections.abc import Sequence
+from contextlib import suppress
 from typing import Any
 
 from pebble.client.names import Names
-from pebble.contract import AUTONOMY_COMMAND, AUTONOMY_FILES, AUTONOMY_STATUS, CAPABILITIES, LINK, codec
-from pebble.contract.levels import LEVELS, level_of
-from pebble.contract.payloads import AutonomyCommand, AutonomyStatus, LinkLevel
+from pebble.client.robot_view import RobotView
+from pebble.contract import AUTONOMY_COMMAND, AUTONOMY_FILES, AUTONOMY_STATUS, CAPABILITIES, LINK, codec, forms
+from pebble.contract.payloads import AutonomyCommand, AutonomyStatus
 from pebble.errors import PayloadError, PebbleError
 from pebble.transports import Message, QoS, Transport
 
@@ -22,41 +22,37 @@ class RobotScripts:
     """Which scripts one robot offers, and what runs. Other threads may read while it receives."""
 
     def __init__(self, names: Names) -> None:
+        self.robot = RobotView(names.base)
         self.files: dict[str, Entry] | None = None  # by name; None: the robot has not published any list
-        self.status: AutonomyStatus | None = None
         self.answers = 0  # statuses that arrived live
-        self.named = False  # it takes commands only with the name of their sender
-        self._link: LinkLevel = "wide"
-        self._topics = {channel.metric: names.topic(channel.metric) for channel in _RECEIVED}
+        self._channels = {names.topic(channel.metric): channel for channel in _RECEIVED}
         self._command_topic = names.topic(AUTONOMY_COMMAND.metric)
+
+    @property
+    def status(self) -> AutonomyStatus | None:
+        """It is what runs; None: the robot has not published it."""
+        return self.robot.autonomy
 
     @property
     def answer_s(self) -> float:
         """A robot whose status has not changed so long after a command does not follow it."""
-        return max(_STARTS_S, LEVELS[self._link].answer_s)
+        return max(_STARTS_S, self.robot.pace.answer_s)
 
     def subscribe(self, transport: Transport) -> None:
         """Receive from ``transport``; when this returns, what is retained has arrived."""
-        for topic in self._topics.values():
+        for topic in self._channels:
             transport.subscribe(topic, self.receive, direct=True)
 
     def receive(self, message: Message) -> None:
         """Update from a message of this robot; what is malformed is ignored."""
-        if len(message.payload) > _BYTES:
-            return
-        try:
-            if message.topic == self._topics[AUTONOMY_FILES.metric]:
+        channel, before = self._channels.get(message.topic), self.status
+        if channel is not AUTONOMY_FILES:
+            self.robot.receive(channel, message, 0.0, 0.0)
+            self.answers += self.status is not before and not message.retain
+        elif len(message.payload) <= _BYTES:
+            with suppress(PayloadError):
                 listed = codec.decode(AUTONOMY_FILES, message.payload).files
                 self.files = {entry["file"]: entry for entry in listed if isinstance(entry.get("file"), str)}
-            elif message.topic == self._topics[LINK.metric]:
-                self._link = level_of(message.payload)
-            elif message.topic == self._topics[CAPABILITIES.metric]:
-                self.named = codec.decode(CAPABILITIES, message.payload).value.get("named") is True
-            elif message.topic == self._topics[AUTONOMY_STATUS.metric]:
-                self.status = codec.decode(AUTONOMY_STATUS, message.payload)
-                self.answers += not message.retain
-        except PayloadError:
-            return
 
     def start(self, transport: Transport, file: str, words: Sequence[str]) -> bool:
         """Command a start with the options in ``words``; False: it was not sent. Raises PebbleError."""
@@ -80,60 +76,37 @@ class RobotScripts:
 
 def settings(entry: Entry, words: Sequence[str]) -> dict[str, Any]:
     """The settings that words such as ``--tag-id 5 --no-search`` select in a script's form. Raises PebbleError."""
-    form = [one for one in entry.get("configs") or () if isinstance(one, dict) and isinstance(one.get("key"), str)]
-    options = {option: (one, value) for one in form for option, value in options_of(one)}
+    form = forms.listed(entry.get("configs"))
+    options = {option: (setting, value) for setting in form for option, value in options_of(setting)}
     chosen: dict[str, Any] = {}
     rest = iter(words)
     for word in rest:
-        option, given, value = word.partition("=")
+        option, given, text = word.partition("=")
         if option not in options:
             known = ", ".join(options) or "it has none"
             raise PebbleError(f"{option} is no option of {entry['file']}: {known}")
-        one, fixed = options[option]
-        if fixed is None and not given:
+        setting, value = options[option]
+        if value is None and not given:
             following = next(rest, None)
             if following is None:
                 raise PebbleError(f"{option} needs a value")
-            value = following
-        chosen[one["key"]] = fixed if fixed is not None else _value(option, str(one.get("type")), value)
-        _check_bounds(f"{option} of {entry['file']}", chosen[one["key"]], one)
+            text = following
+        try:
+            chosen[setting.key] = forms.accepted(setting, text) if value is None else value
+        except forms.SettingError as error:
+            raise PebbleError(f"{option} of {entry['file']}: {error}") from None
     return chosen
 
 
-def _check_bounds(name: str, value: Any, one: Entry) -> None:
-    """Raises PebbleError for a value that the robot would refuse."""
-    least, most, options = one.get("min"), one.get("max"), one.get("options")
-    if one.get("type") in ("int", "float"):
-        if isinstance(least, int | float) and value < least:
-            raise PebbleError(f"{name}: {value} is too little, it is at least {least}")
-        if isinstance(most, int | float) and value > most:
-            raise PebbleError(f"{name}: {value} is too much, it is at most {most}")
-    elif one.get("type") == "enum" and isinstance(options, list) and value not in map(str, options):
-        raise PebbleError(f"{name}: {value!r} is not one of {', '.join(map(str, options))}")
-
-
-def options_of(one: Entry) -> list[tuple[str, bool | None]]:
-    """The options of a form's entry: first the script's own, then those made of its key; for flags with their value."""
-    key = str(one.get("key", "")).replace("_", "-")
-    on = _distinct(one.get("arg"), f"--{key}")
-    if one.get("type") != "bool":
+def options_of(setting: forms.Setting) -> list[tuple[str, bool | None]]:
+    """The options of a setting: first the script's own, then those made of its key; for flags with their value."""
+    key = setting.key.replace("_", "-")
+    on = _distinct(setting.arg, f"--{key}")
+    if setting.type != "bool":
         return [(option, None) for option in on]
-    off = _distinct(one.get("arg_false"), f"--no-{key}")
+    off = _distinct(setting.arg_false, f"--no-{key}")
     return [*((option, True) for option in on), *((option, False) for option in off)]
 
 
-def _distinct(own: object, made: str) -> list[str]:
-    return list(dict.fromkeys((own, made))) if isinstance(own, str) and own.startswith("--") else [made]
-
-
-def _value(option: str, type_: str, text: str) -> Any:
-    try:
-        if type_ == "int":
-            return int(text)
-        if type_ == "float" and math.isfinite(number := float(text)):
-            return number
-    except ValueError:
-        pass
-    if type_ in ("int", "float"):
-        raise PebbleError(f"{option}: {text!r} is not a number")
-    return text
+def _distinct(own: str | None, made: str) -> list[str]:
+    return list(dict.fromkeys((own, made))) if own and own.startswith("--") else [made]

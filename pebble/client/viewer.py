@@ -9,8 +9,8 @@ from collections import deque
 from collections.abc import Callable
 from typing import Any, Literal
 
+from pebble.client.robot_topics import topic_of
 from pebble.contract import AUDIO_CONTROL, CAPABILITIES, MQTT_AUDIO, MQTT_VIDEO, VIDEO_CONTROL, Channel, codec
-from pebble.contract.identity import is_of_another
 from pebble.contract.payloads import MediaRequest
 from pebble.errors import PayloadError, PebbleError
 from pebble.transports import Message, QoS, Subscription, Transport
@@ -133,29 +133,27 @@ class Viewer:
         return medium in self._received_at
 
     def _is_raised(self, medium: Medium) -> bool:
-        flag, end = self.topic(medium, "flag_topic", _FLAGS[medium]), self._subscribed_at[medium] + _FLAG_S
+        flag, end = self.topic(_FLAGS[medium]), self._subscribed_at[medium] + _FLAG_S
         while flag not in self._flags and time.monotonic() < end:
             time.sleep(_FLAG_S / 20)
         return self._flags.get(flag, False)
 
     def _set_flag(self, medium: Medium, *, up: bool) -> None:
-        topic = self.topic(medium, "flag_topic", _FLAGS[medium])
+        topic = self.topic(_FLAGS[medium])
         self._flags[topic] = up
         self._transport.publish(
             topic, codec.encode(_FLAGS[medium], up), qos=QoS.DELIVERED, retain=True, shared=True, urgent=True
         )
 
     def _send(self, medium: Medium, request: MediaRequest) -> None:
-        topic = self.topic(medium, "command_topic", _CONTROLS[medium])
+        topic = self.topic(_CONTROLS[medium])
         payload = codec.encode(_CONTROLS[medium], request)
         self.sent.append(payload)
         self._transport.publish(topic, payload, qos=QoS.DELIVERED, urgent=True)
 
-    def topic(self, medium: Medium, key: str, channel: Channel) -> str:
-        """The effective topic that capabilities list under ``key``, else the channel's own."""
-        topic = self.capabilities.get(medium, {}).get(key)
-        own = isinstance(topic, str) and not is_of_another(topic, self.base)
-        return str(topic) if own else channel.topic(self.base)
+    def topic(self, channel: Channel) -> str:
+        """Return the topic that capabilities name for ``channel``, else the channel's own."""
+        return topic_of(self.base, self.capabilities, channel)
 
     # -- the transport's threads
 
@@ -168,7 +166,7 @@ class Viewer:
         self._has_capabilities.set()
 
     def _subscribe(self, medium: Medium) -> None:
-        flag = self.topic(medium, "flag_topic", _FLAGS[medium])
+        flag = self.topic(_FLAGS[medium])
 
         def on_flag(message: Message) -> None:
             try:

@@ -40,8 +40,7 @@ class CountedMedia(MediaReceiver):
     def watch_requests(self) -> None:
         """Notice the requests of others from now on; to be called once the capabilities are known."""
         for medium, channel in _CONTROLS.items():
-            topic = self.viewer.topic(medium, "command_topic", channel)
-            self._transport.subscribe(topic, partial(self._requested, medium, channel))
+            self._transport.subscribe(self.viewer.topic(channel), partial(self._requested, medium, channel))
 
     def ask(self, medium: Medium, encoding: str) -> None:
         """Request an encoding, unless a person has requested one; raises PebbleError if the robot does not offer it."""

@@ -266,9 +266,10 @@ class Operator:
 
     def _perform(self, step: Step) -> None:
         began, flash = time.monotonic(), isinstance(step.lights, LightsFlash)
-        lights = codec.encode(c.LIGHTS_FLASH if flash else c.LIGHTS_SOLID, step.lights)
+        channel = c.LIGHTS_FLASH if flash else c.LIGHTS_SOLID
+        lights = codec.encode(channel, step.lights)
         for robot in self._robots:
-            self._publish(robot.lights_topic(flash=flash), lights)
+            self._publish(robot.topic(channel), lights)
         released = self._hold(step.drive, step.drive_s)
         if step.sends_stop:
             released = self._drive(STOP)

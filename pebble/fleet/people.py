@@ -116,10 +116,6 @@ class People:
         self._change_one(name, "UPDATE people SET salt = ?, hash = ? WHERE name = ?", salt, hashed, name)
         self._change("DELETE FROM sessions WHERE name = ?", name)
 
-    def end_sessions(self) -> None:
-        """Everybody has to log in again."""
-        self._change("DELETE FROM sessions")
-
     def set_role(self, name: str, role: Role) -> None:
         """Counts for running sessions, too. Raises PeopleError."""
         self._change_one(name, "UPDATE people SET role = ? WHERE name = ?", role.value, name)
@@ -207,11 +203,6 @@ class People:
     def get(self, key: str) -> str | None:
         rows = self._rows("SELECT value FROM settings WHERE key = ?", key)
         return str(rows[0][0]) if rows else None
-
-    def all(self, prefix: str) -> dict[str, str]:
-        """The settings whose keys begin with this, by the rest of the key."""
-        found = self._rows("SELECT key, value FROM settings WHERE substr(key, 1, ?) = ?", len(prefix), prefix)
-        return {str(key)[len(prefix) :]: str(value) for key, value in found}
 
     def set(self, key: str, value: str | None) -> None:
         """None removes it."""

@@ -1,13 +1,8 @@
-"""A script's options: a msgspec Struct becomes the form that operators see, and a command line becomes the Struct.
-
-The entries of a form are those of the contract's autonomy-files (paper A.8.11).
-"""
+"""A script's options: a msgspec Struct becomes the form that operators see, and a command line becomes the Struct."""
 
 from __future__ import annotations
 
 import argparse
-import math
-import re
 import sys
 import typing
 from collections.abc import Callable
@@ -15,9 +10,11 @@ from typing import Any, Literal, NoReturn, TypeVar
 
 import msgspec
 from msgspec import NODEFAULT, inspect
+from msgspec.structs import replace
+
+from pebble.contract.forms import Setting, SettingError, Value, accepted
 
 Options = TypeVar("Options", bound=msgspec.Struct)
-Entry = dict[str, Any]
 
 _KINDS: dict[type[inspect.Type], str] = {
     inspect.BoolType: "bool",
@@ -26,20 +23,18 @@ _KINDS: dict[type[inspect.Type], str] = {
     inspect.StrType: "string",
     inspect.LiteralType: "enum",
 }
-_NOUNS = {"int": "a whole number", "float": "a number", "string": "a text", "enum": "a choice"}
 _RESERVED = ("config", "describe", "help")  # options that every script has
-_whole = re.compile(r"[+-]?\d+", re.ASCII).fullmatch
 
 
-def form(options: type[msgspec.Struct]) -> list[Entry]:
-    """One entry per field. Raises TypeError that names the field and what to write instead."""
+def form(options: type[msgspec.Struct]) -> list[Setting]:
+    """One setting per field. Raises TypeError that names the field and what to write instead."""
     hints = typing.get_type_hints(options)
-    entries = [_entry(field, hints[field.name]) for field in inspect.type_info(options).fields]  # type: ignore[attr-defined]
-    words = [entry[word] for entry in entries for word in ("arg", "arg_false") if word in entry]
+    settings = [_setting(field, hints[field.name]) for field in inspect.type_info(options).fields]  # type: ignore[attr-defined]
+    words = [word for setting in settings for word in (setting.arg, setting.arg_false) if word]
     for word in words:
         if words.count(word) > 1 or word.removeprefix("--") in _RESERVED:
             raise TypeError(f"option {word.removeprefix('--')}: {word} means something else already: rename the field")
-    return entries
+    return settings
 
 
 def parse(
@@ -49,14 +44,13 @@ def parse(
 
     Words that are wrong end the process with exit code 2 and one line on stderr.
     """
-    entries = form(options)
-    for entry in entries:
-        _add(parser, entry)
-    namespace = parser.parse_args(_joined(arguments, entries))
-    values = vars(namespace)
-    given = {entry["key"]: values[entry["key"]] for entry in entries if values[entry["key"]] is not None}
+    settings = form(options)
+    for setting in settings:
+        _add(parser, setting)
+    namespace = parser.parse_args(_joined(arguments, settings))
+    values = {setting.key: getattr(namespace, setting.key) for setting in settings}
     try:
-        return msgspec.convert(given, options), namespace
+        return msgspec.convert({key: value for key, value in values.items() if value is not None}, options), namespace
     except msgspec.ValidationError as error:
         parser.error(str(error))
 
@@ -72,35 +66,30 @@ class OneLineParser(argparse.ArgumentParser):
         raise SystemExit(2)
 
 
-# -- a field becomes an entry
+# -- a field becomes a setting
 
 
-def _entry(field: inspect.Field, hint: Any) -> Entry:
+def _setting(field: inspect.Field, hint: Any) -> Setting:
     kind, meta, optional = _plain(field.type, field.name)
     name = field.encode_name
     flag = meta.get("arg", name.replace("_", "-"))
-    type_ = _kind(kind, field.name)
-    entry: Entry = {
-        "key": name,
-        "label": meta.get("title", name.replace("_", " ").capitalize()),
-        "type": type_,
-        "default": _default(field, type_),
-        "arg": f"--{flag}",
-    }
-    if field.required or meta.get("required"):
-        entry["required"] = True
-    for bound, key in (("ge", "min"), ("le", "max")):
-        if getattr(kind, bound, None) is not None:
-            entry[key] = getattr(kind, bound)
-    if "step" in meta:
-        entry["step"] = meta["step"]
-    if type_ == "enum":
-        entry["options"] = _choices(hint)
-    if type_ == "bool":
-        if optional:
-            raise TypeError(f"option {field.name}: a bool is true or false: write `bool`, without None")
-        entry["mode"], entry["arg_false"] = "flag", f"--no-{flag}"
-    return entry
+    is_flag = (type_ := _kind(kind, field.name)) == "bool"
+    if is_flag and optional:
+        raise TypeError(f"option {field.name}: a bool is true or false: write `bool`, without None")
+    setting = Setting(
+        key=name,
+        label=meta.get("title", name.replace("_", " ").capitalize()),
+        type=type_,
+        arg=f"--{flag}",
+        required=field.required or bool(meta.get("required")),
+        min=getattr(kind, "ge", None),
+        max=getattr(kind, "le", None),
+        step=meta.get("step"),
+        options=_choices(hint) if type_ == "enum" else (),
+        mode="flag" if is_flag else None,
+        arg_false=f"--no-{flag}" if is_flag else None,
+    )
+    return replace(setting, default=_default(field, setting))
 
 
 def _plain(kind: inspect.Type, name: str) -> tuple[Any, dict[str, Any], bool]:
@@ -129,7 +118,7 @@ def _choices(hint: Any) -> list[str]:
     return next((found for one in typing.get_args(hint) if (found := _choices(one))), [])
 
 
-def _kind(kind: Any, name: str) -> str:
+def _kind(kind: Any, name: str) -> Any:
     found = _KINDS.get(type(kind))
     if found is None:
         what = type(kind).__name__.removesuffix("Type").lower()
@@ -142,98 +131,66 @@ def _kind(kind: Any, name: str) -> str:
     return found
 
 
-def _default(field: inspect.Field, type_: str) -> Any:
+def _default(field: inspect.Field, setting: Setting) -> Value:
     """The default as JSON, so that the same script always has the same form."""
     if field.default_factory is not NODEFAULT:
         raise TypeError(f"option {field.name}: its default must be a plain value, not a function")
     if field.default is NODEFAULT or field.default is None:
         return None
-    allowed = {"bool": bool, "int": int, "float": (int, float), "string": str, "enum": str}[type_]
-    fits = isinstance(field.default, allowed) and (type_ == "bool" or not isinstance(field.default, bool))  # type: ignore[arg-type]
-    if not fits or not math.isfinite(field.default if type_ == "float" else 0):
-        raise TypeError(
-            f"option {field.name}: its default {field.default!r} is not {_NOUNS.get(type_, 'true or false')}"
-        )
-    kind, _, _ = _plain(field.type, field.name)
-    low, high = getattr(kind, "ge", None), getattr(kind, "le", None)
-    if (low is not None and field.default < low) or (high is not None and field.default > high):
-        raise TypeError(f"option {field.name}: its default {field.default!r} is outside of its own bounds")
-    if type_ == "enum" and field.default not in kind.values:
-        raise TypeError(f"option {field.name}: its default {field.default!r} is not one of its choices")
-    return float(field.default) if type_ == "float" else field.default
+    try:
+        return accepted(setting, field.default)
+    except SettingError as error:
+        raise TypeError(f"option {field.name}: its default {field.default!r} is refused: {error}") from None
 
 
-# -- an entry becomes an option of the command line
+# -- a setting becomes an option of the command line
 
 
-def _add(parser: argparse.ArgumentParser, entry: Entry) -> None:
-    if entry["type"] == "bool":
+def _add(parser: argparse.ArgumentParser, setting: Setting) -> None:
+    if setting.type == "bool":
         flags = parser.add_mutually_exclusive_group()
-        word = "on" if entry["default"] else "off"
-        flags.add_argument(entry["arg"], dest=entry["key"], action="store_true", default=None,
-                           help=f"{entry['label']} (default: {word})")  # fmt: skip
-        flags.add_argument(entry["arg_false"], dest=entry["key"], action="store_false", default=None,
+        word = "on" if setting.default else "off"
+        flags.add_argument(str(setting.arg), dest=setting.key, action="store_true", default=None,
+                           help=f"{setting.label} (default: {word})")  # fmt: skip
+        flags.add_argument(str(setting.arg_false), dest=setting.key, action="store_false", default=None,
                            help=argparse.SUPPRESS if word == "off" else "the opposite")  # fmt: skip
         return
     parser.add_argument(
-        entry["arg"],
-        dest=entry["key"],
-        metavar=entry["type"].upper(),
-        type=_converter(entry),
-        required=entry.get("required", False) and entry["default"] is None,
-        help=_help(entry),
+        str(setting.arg),
+        dest=setting.key,
+        metavar=setting.type.upper(),
+        type=str if setting.type == "string" else _converter(setting),
+        required=setting.required and setting.default is None,
+        help=_help(setting),
     )
 
 
-def _help(entry: Entry) -> str:
-    low, high, options = entry.get("min"), entry.get("max"), entry.get("options")
-    notes = [f"one of {', '.join(options)}"] if options else []
-    if low is not None and high is not None:
-        notes.append(f"{low:g} to {high:g}")
-    elif low is not None or high is not None:
-        notes.append(f"at least {low:g}" if low is not None else f"at most {high:g}")
-    notes.append("required" if entry.get("required") else f"default: {_shown(entry['default'])}")
-    return f"{entry['label']} ({'; '.join(notes)})".replace("%", "%%")
+def _help(setting: Setting) -> str:
+    notes = [f"one of {', '.join(map(str, setting.options))}"] if setting.options else []
+    if setting.min is not None and setting.max is not None:
+        notes.append(f"{setting.min:g} to {setting.max:g}")
+    elif setting.min is not None:
+        notes.append(f"at least {setting.min:g}")
+    elif setting.max is not None:
+        notes.append(f"at most {setting.max:g}")
+    default = "none" if setting.default is None else str(setting.default)
+    notes.append("required" if setting.required else f"default: {default}")
+    return f"{setting.label} ({'; '.join(notes)})".replace("%", "%%")
 
 
-def _shown(default: object) -> str:
-    return "none" if default is None else str(default)
-
-
-def _converter(entry: Entry) -> Callable[[str], object]:
+def _converter(setting: Setting) -> Callable[[str], object]:
     def convert(text: str) -> object:
         try:
-            value = _value(entry["type"], text)
-        except ValueError:
-            raise argparse.ArgumentTypeError(f"{text!r} is not {_NOUNS[entry['type']]}") from None
-        if "options" in entry and value not in entry["options"]:
-            raise argparse.ArgumentTypeError(f"{text!r} is not one of {', '.join(entry['options'])}")
-        if "min" in entry and value < entry["min"]:
-            raise argparse.ArgumentTypeError(f"{text} is below the minimum {entry['min']:g}")
-        if "max" in entry and value > entry["max"]:
-            raise argparse.ArgumentTypeError(f"{text} is above the maximum {entry['max']:g}")
-        return value
+            return accepted(setting, text)
+        except SettingError as error:
+            raise argparse.ArgumentTypeError(str(error)) from None
 
     return convert
 
 
-def _value(type_: str, text: str) -> Any:
-    """Raises ValueError."""
-    if type_ == "int":
-        if not _whole(text):
-            raise ValueError
-        return int(text)
-    if type_ == "float":
-        number = float(text)
-        if not math.isfinite(number):
-            raise ValueError
-        return number
-    return text
-
-
-def _joined(arguments: list[str], entries: list[Entry]) -> list[str]:
+def _joined(arguments: list[str], settings: list[Setting]) -> list[str]:
     """``--x -1e-05`` as ``--x=-1e-05``: argparse takes some numbers for options."""
-    valued = {entry["arg"] for entry in entries if entry["type"] != "bool"}
+    valued = {setting.arg for setting in settings if setting.type != "bool"}
     joined: list[str] = []
     words = iter(arguments)
     for word in words:

@@ -95,15 +95,15 @@ def _describe(
     first: Sequence[str],
     needs: Mapping[str, Mapping[str, Any]],
 ) -> None:
-    configs = [] if options is None else form(options)
-    keys = [entry["key"] for entry in configs]
+    settings = [] if options is None else form(options)
+    keys = [setting.key for setting in settings]
     unknown = [key for key in first if key not in keys]
     if unknown or len(first) > MOST_MAIN:
         wrong = f"there is no option {unknown[0]}" if unknown else f"{len(first)} are more than {MOST_MAIN}"
         raise TypeError(f"main_options: {wrong}")
     description = {
         **{key: value for key, value in {**words, "main": list(first)}.items() if value},
-        "configs": configs,
+        "configs": [setting.entry() for setting in settings],
         "dependencies": [{"file": file, "config": dict(config)} for file, config in needs.items()],
     }
     sys.stdout.write(msgspec.json.encode(description).decode() + "\n")

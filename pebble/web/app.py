@@ -27,9 +27,8 @@ from pebble.fleet.database import DatabaseError
 from pebble.fleet.people import People
 from pebble.fleet.roles import Session, page_rights
 from pebble.web.access import login
-from pebble.web.access.guard import CONTENT_SECURITY_POLICY, Guard
+from pebble.web.access.guard import Guard
 from pebble.web.control import CHECK_S, Control
-from pebble.web.media import robot_streams
 from pebble.web.messages import EstopOp
 from pebble.web.recordings import routes as recordings
 from pebble.web.recordings.routes import Recordings
@@ -37,7 +36,7 @@ from pebble.web.server import PEOPLE_S, Server
 from pebble.web.static_files import FOREVER, NO_STORE, StaticFiles, root_of
 
 _AUDIT_ROWS = 200  # that a page shows; `pebble web audit` prints more
-_ENCODINGS = frozenset({"json", "pbvd", "pbvz", "h264", "jpeg"})
+_ENCODINGS = frozenset({"json", "pbvd", "h264", "jpeg"})
 _estop_decoder = msgspec.json.Decoder(EstopOp)
 
 
@@ -61,7 +60,7 @@ def create_app(settings: WebSettings) -> Starlette:
         state.server, state.audit, state.stops = server, audit, server.stops
         state.recordings = archive
         state.robots, state.broker = server.robots, server.broker
-        state.media, state.sound = server.media.pictures, server.media.sound
+        state.media, state.sound = server.pictures, server.sound
         await server.open()
         try:
             yield
@@ -106,16 +105,7 @@ async def _page(request: Request) -> Response:
         wanted = request.url.path + ("?watch" if "watch" in request.query_params else "")
         then = "" if wanted == "/" else f"?next={quote(wanted)}"
         return Response(status_code=303, headers={"location": f"{root_of(request)}login{then}", **NO_STORE})
-    return _static_of(request).page(request, {**NO_STORE, **_policy(request)})
-
-
-def _policy(request: Request) -> dict[str, str]:
-    """The page may show the streams of robots in a frame: exactly the origins that they report now."""
-    robots, ref = request.app.state.robots, request.path_params.get("ref", "")
-    allowed = robot_streams.origins(robots, ref, request.app.state.server.sources.own_hosts)
-    if not allowed:
-        return {}
-    return {"content-security-policy": f"{CONTENT_SECURITY_POLICY}; frame-src {' '.join(allowed)}"}
+    return _static_of(request).page(request, NO_STORE)
 
 
 async def _static(request: Request) -> Response:

@@ -11,6 +11,7 @@ from typing import Any
 import msgspec
 from starlette.websockets import WebSocket, WebSocketDisconnect, WebSocketState
 
+from pebble.client.drive_reasons import WORDS
 from pebble.client.estop_states import Reset
 from pebble.fleet.database import DatabaseError
 from pebble.fleet.roles import Session, page_rights
@@ -31,7 +32,6 @@ CHECK_S = 5.0  # between two looks at whether the session still exists, while no
 _WATCH_COST = 20  # it subscribes to so many topics
 _WAITING = 64  # messages that wait to be sent, besides the state
 _NOT_NOTED = ("op", "ref", "n", "config")  # settings of a script may be secret
-_RELOAD = "This page is older than the server: reload it"
 
 _decoder = msgspec.json.Decoder(m.FromPage)
 
@@ -56,7 +56,6 @@ class Control:
         self._why_not = ""  # why this page may not drive at all
         self._logs = LogReader()
         self._large_due = False  # whether the page has received the last large value
-        self._series: deque[str] = deque()  # metrics of the watched component whose past is still to be sent
         self._moved: set[str] = set()  # robots that this lease has moved, for the audit
 
     async def serve(self) -> None:
@@ -103,9 +102,9 @@ class Control:
         drives = settings.plain_http_drive or self._is_secure()
         version = self._websocket.app.state.version
         if not drives:
-            self._why_not = "This connection is not encrypted: driving is switched off"
+            self._why_not = WORDS["plain"]
         elif hello.version != version:
-            self._why_not = _RELOAD
+            self._why_not = WORDS["reload"]
         self._post(
             m.Welcome(
                 server=settings.name,
@@ -118,6 +117,7 @@ class Control:
                 token=self._tab.token,
                 now=1000 * time.time(),
                 drives=drives,
+                words=WORDS,
                 recordings=settings.recordings is not None,
             )
         )
@@ -176,7 +176,6 @@ class Control:
                 self._tab.clock.echo(op.n, op.t, clock())
                 self._logs.echoed()
                 self._large_due = True
-                self._post_series()
             case m.DriveOp():
                 self._drive(op)
             case m.StopOp():
@@ -189,35 +188,19 @@ class Control:
                 self._reset(op)
             case m.Watch():
                 self._watch(op.ref)
-                if op.series:
-                    self._series = deque(self._server.robots.recent.metrics(op.ref))
             case m.ReadLogs():
                 if op.ref == self._interest.watched:
                     self._logs.begin(op.origin, op.after, on=op.on)
             case m.Lease():
                 self._lease(op)
-            case m.EncodingOp():
-                if self._may("drive", op):
-                    self._server.media.pictures.pin(op.ref, op.encoding)
             case m.PictureFromOp():
                 if self._may("drive", op):
-                    self._server.sources.choose_picture(op.ref, op.source)
-            case m.StreamAddressOp():
-                self._stream_address(op)
+                    self._server.sources.choose(op.ref, op.source)
             case m.Hello():
                 raise Leave("hello comes only once")
             case _:
                 self._command(op)
         self._wake.set()
-
-    def _stream_address(self, op: m.StreamAddressOp) -> None:
-        """Sets the value for all, and of any host: hence only those who look after robots may."""
-        if not self._may("system", op):
-            return
-        if why := self._server.sources.choose_stream(op.ref, op.url):
-            self._refuse(op, why)
-        else:
-            self._audit(_tag(op), op.ref, detail=op.url)
 
     def _command(self, op: m.RobotOp) -> None:
         """Publish what is asked of a robot, once: nothing repeats it, and the robot's states tell what came of it."""
@@ -226,7 +209,7 @@ class Control:
         if why := (self._why_not if robot_commands.moves(op) else "") or self._server.drivers.refusals.of_op(op):
             self._refuse(op, why)
             return
-        message = robot_commands.publication(op, self._server.robots.topic)
+        message = robot_commands.publication(op, self._server.robots.capabilities(op.ref))
         if not self._server.broker.publish(
             message.topic,
             message.payload,
@@ -282,7 +265,6 @@ class Control:
             return
         self._server.robots.watch(self._interest, ref)
         self._logs.end()
-        self._series.clear()
         if ref:
             self._server.watch(ref)
         if before:
@@ -332,13 +314,6 @@ class Control:
 
     # -- to the page
 
-    def _post_series(self) -> None:
-        """One at each echo: on a slow connection pings never wait behind more than that."""
-        if self._series:
-            ref, metric = self._interest.watched, self._series.popleft()
-            points = self._server.robots.recent.points(ref, metric, time.monotonic())
-            self._post(m.Series(ref=ref, metric=metric, now=1000 * time.time(), points=points))
-
     def _post(self, message: m.ToPage) -> None:
         self._waiting.append(message)
         self._wake.set()
@@ -378,7 +353,7 @@ class Control:
         await self._send_logs()
 
     async def _send_logs(self) -> None:
-        """One part at each echo, as _post_series."""
+        """Send one part at each echo: on a slow connection pings never wait behind more than that."""
         ref = self._interest.watched
         lines = self._server.robots.logs.get(ref)
         if lines is not None and (run := self._logs.take(lines)) is not None:

@@ -43,13 +43,9 @@ class Echo(_FromPage, frozen=True, kw_only=True, tag="echo"):
 
 
 class Watch(_FromPage, frozen=True, kw_only=True, tag="watch"):
-    """The component whose page is open; "" is none. Its further metrics are sent from now on.
-
-    ``series``: also what the server has of them from before, now; a page that opens plots asks this again.
-    """
+    """The component whose page is open; "" is none. Its further metrics are sent from now on."""
 
     ref: Ref
-    series: bool = False
 
 
 class ReadLogs(_FromPage, frozen=True, kw_only=True, tag="read-logs"):
@@ -119,25 +115,11 @@ class EstopResetOp(_FromPage, frozen=True, kw_only=True, tag="estop-reset"):
     owners: Annotated[tuple[ShownOwner, ...], Meta(max_length=16)]
 
 
-class EncodingOp(_FromPage, frozen=True, kw_only=True, tag="encoding"):
-    """Pin the encoding of a robot's pictures for all its viewers; "" is automatic."""
-
-    ref: Ref
-    encoding: Short
-
-
 class PictureFromOp(_FromPage, frozen=True, kw_only=True, tag="picture-from"):
     """Show the picture of ``source`` on the page of ``ref``, for everybody, from now on; "" is its own."""
 
     ref: Ref
     source: Ref
-
-
-class StreamAddressOp(_FromPage, frozen=True, kw_only=True, tag="stream-address"):
-    """Offer the stream at ``url`` on the page of this component, for everybody; "" is the one that it reports."""
-
-    ref: Ref
-    url: Annotated[str, Meta(max_length=500)]
 
 
 class _Asked(_FromPage, frozen=True, kw_only=True):
@@ -208,8 +190,8 @@ class FlagOp(_Asked, frozen=True, kw_only=True, tag="flag"):
 RobotOp: TypeAlias = LightsOp | SoundboardOp | AutonomyOp | OutletOp | McuOp | ActionOp | FlagOp
 
 FromPage: TypeAlias = (
-    Hello | Echo | Watch | ReadLogs | Lease | DriveOp | StopOp | EstopOp | EstopEndOp | EstopResetOp | EncodingOp
-    | PictureFromOp | StreamAddressOp | RobotOp
+    Hello | Echo | Watch | ReadLogs | Lease | DriveOp | StopOp | EstopOp | EstopEndOp | EstopResetOp
+    | PictureFromOp | RobotOp
 )  # fmt: skip
 
 
@@ -231,6 +213,7 @@ class Welcome(_ToPage, frozen=True, kw_only=True, tag="welcome"):
     now: float
     recordings: bool = False  # whether this server has some to look at
     drives: bool = True  # False: the page came over plain http from another machine, where driving is switched off
+    words: dict[str, str] = {}  # why nothing is driven, for people
 
 
 class Ping(_ToPage, frozen=True, kw_only=True, tag="ping"):
@@ -283,15 +266,6 @@ class Done(_ToPage, frozen=True, kw_only=True, tag="done"):
     n: int = 0
 
 
-class Series(_ToPage, frozen=True, kw_only=True, tag="series"):
-    """What the server has of a metric of the watched component from before: ``[age in ms, value]``, oldest first."""
-
-    ref: str
-    metric: str
-    now: float
-    points: tuple[tuple[float, Any], ...]
-
-
 class Bye(_ToPage, frozen=True, kw_only=True, tag="bye"):
     """The last message of a connection that the server closes. ``again``: whether to connect again."""
 
@@ -307,7 +281,7 @@ class TalkAnswer(Struct, frozen=True, kw_only=True):
     why: str = ""  # it is not, for people
 
 
-ToPage: TypeAlias = Welcome | Ping | State | Logs | Refused | Done | Series | Bye
+ToPage: TypeAlias = Welcome | Ping | State | Logs | Refused | Done | Bye
 
 
 # -- values of the server's own metrics
@@ -375,7 +349,6 @@ class PictureView(Struct, frozen=True, kw_only=True):
     per_second: float
     kbits: float
     viewers: int
-    pinned: str
 
 
 class SoundView(Struct, frozen=True, kw_only=True):
@@ -406,24 +379,12 @@ class PictureFrom(Struct, frozen=True, kw_only=True):
     source: str
 
 
-class StreamAddress(Struct, frozen=True, kw_only=True):
-    """``web/stream-address``: of the stream that was entered for this component; "" is the one that it reports."""
-
-    url: str
-
-
 class FlagsView(Struct, frozen=True, kw_only=True):
     """``web/flags``: the flags of the component that is open, as the broker has them; null: it has none."""
 
     remote_mirror: bool | None = None
     mqtt_audio: bool | None = None
     mqtt_video: bool | None = None
-
-
-class RestartsView(Struct, frozen=True, kw_only=True):
-    """``web/restarts``: when services of the component were seen to restart, in epoch ms; the newest 16 of each."""
-
-    times: dict[str, tuple[int, ...]]
 
 
 SERVER_METRICS: dict[str, type] = {
@@ -433,8 +394,6 @@ SERVER_METRICS: dict[str, type] = {
     "web/picture": PictureView,
     "web/sound": SoundView,
     "web/picture-from": PictureFrom,
-    "web/stream-address": StreamAddress,
     "web/flags": FlagsView,
-    "web/restarts": RestartsView,
     "web/broker": BrokerView,
 }

@@ -1,6 +1,6 @@
-"""Generates parts of docs/web-messages.md and the page's messages.d.ts from messages.py.
+"""Generates messages.d.ts and parts of docs/web-messages.md from messages.py, and the table of docs/words.md.
 
-Program: ``python -m pebble.web.messages_docs`` writes both; a test checks that they are current.
+Program: ``python -m pebble.web.messages_docs`` writes them; a test checks that they are current.
 """
 
 import inspect
@@ -12,12 +12,14 @@ from typing import Any, get_args
 import msgspec
 from msgspec import inspect as types
 
+from pebble.client import drive_reasons
 from pebble.contract.capabilities import RobotIdentity
 from pebble.contract.docs import filled
 from pebble.web import messages
 
 _ROOT = Path(__file__).parents[2]
 DOCS = _ROOT / "docs" / "web-messages.md"
+WORDS = _ROOT / "docs" / "words.md"
 DECLARATIONS = Path(__file__).parent / "static" / "messages.d.ts"
 
 
@@ -30,6 +32,12 @@ def markdown() -> str:
     parts += ["## Metrics of the server\n", *map(_section, _views())]
     texts = {"messages": "\n".join(parts), "TalkAnswer": _section(messages.TalkAnswer)}
     return filled(DOCS.read_text(encoding="utf-8"), texts)
+
+
+def words() -> str:
+    """docs/words.md with its table."""
+    rows = [f"| `{code}` | {text} |" for code, text in drive_reasons.WORDS.items()]
+    return filled(WORDS.read_text(encoding="utf-8"), {"words": "\n".join(["| state | sentence |", "|---|---|", *rows])})
 
 
 def declarations() -> str:
@@ -111,8 +119,9 @@ def _script(kind: Any) -> str:
 
 
 def main() -> None:
-    """Write both files."""
+    """Write the three files."""
     DOCS.write_text(markdown(), encoding="utf-8")
+    WORDS.write_text(words(), encoding="utf-8")
     DECLARATIONS.write_text(declarations(), encoding="utf-8")
 
 

@@ -12,7 +12,7 @@ from msgspec.structs import replace
 
 from pebble import contract as c
 from pebble.client.broker import Broker
-from pebble.client.robot_topics import FLAGS, WATCHED, names, section_of
+from pebble.client.robot_topics import FLAGS, PLACES, WATCHED
 from pebble.contract import codec
 from pebble.contract.identity import Direction
 from pebble.contract.payloads import AnyObject
@@ -31,18 +31,12 @@ STEP_S = 1.0  # between two changes of what is received of one component: capabi
 #: The component and channel of what a topic carries, where its own name does not tell them.
 _Carried = tuple[str, c.Channel] | None
 
-#: Channels whose topic capabilities may name, by its section and key there.
-_NAMED: dict[tuple[str, str], c.Channel] = {
-    ("telemetry", "touch_topic"): c.TOUCH_SENSORS,
-    ("telemetry", "charging_topic"): c.CHARGING_STATUS,
-    ("telemetry", "charging_level_topic"): c.CHARGING_LEVEL,
-    ("telemetry", "wheel_odometry_topic"): c.WHEEL_ODOMETRY,
-    ("telemetry", "imu_topic"): c.IMU,
-    ("soundboard", "files_topic"): c.SOUNDBOARD_FILES,
-    ("soundboard", "status_topic"): c.SOUNDBOARD_STATUS,
-    ("autonomy", "files_topic"): c.AUTONOMY_FILES,
-    ("autonomy", "status_topic"): c.AUTONOMY_STATUS,
-}
+#: Channels for which capabilities may name a topic that is subscribed to, besides overlays and flags.
+_NAMED = [
+    channel
+    for channel in PLACES
+    if channel.direction == Direction.OUTGOING and channel.payload is not bytes and channel is not c.VIDEO_OVERLAYS
+]
 #: Fields of FlagsView.
 _FLAG_FIELDS = {flag: flag.metric.removeprefix("flags/").replace("-", "_") for flag in FLAGS.values()}
 
@@ -80,7 +74,6 @@ class OpenComponents:
     def open(self, ref: str) -> None:
         self._pages[ref] += 1
         self._robots.logs.setdefault(ref, LogLines())
-        self._robots.recent.open(ref)
         self.update(ref)
 
     def close(self, ref: str) -> None:
@@ -137,7 +130,6 @@ class OpenComponents:
         self._flags.pop(ref, None)
         self._robots.logs.pop(ref, None)
         self._robots.remove_server_metric(ref, _FLAGS_METRIC)
-        self._robots.recent.close(ref)
         if ref not in self._robots.components:
             self._robots.forget(ref)
 
@@ -198,20 +190,19 @@ class OpenComponents:
     def _filters(self, ref: str) -> dict[str, _Carried]:
         """Every channel's own topic, flags, what capabilities and manifests name, and overlays of its picture."""
         filters: dict[str, _Carried] = {channel.filter(ref): None for channel in WATCHED}
-        for (section, key), channel in _NAMED.items():
-            self._add(filters, ref, section, key, channel)
+        for channel in _NAMED:
+            self._add(filters, ref, channel)
         for metric in self._robots.aliases(ref):
             alias = c.Channel(metric=metric, kind=c.Kind.STREAM, payload=AnyObject)
             filters.setdefault(f"{ref}/{Direction.OUTGOING}/{metric}", (ref, alias))
-        for section, flag in FLAGS.items():
-            filters[self._robots.topic(ref, section, "flag_topic", flag)] = (ref, flag)
+        for flag in FLAGS.values():
+            filters[self._robots.topic(ref, flag)] = (ref, flag)
         source = self._robots.sources.get(ref, ref)
         filters.setdefault(c.VIDEO_OVERLAYS.filter(source), None)
-        self._add(filters, source, "video", "overlays_topic", c.VIDEO_OVERLAYS)
+        self._add(filters, source, c.VIDEO_OVERLAYS)
         return filters
 
-    def _add(self, filters: dict[str, _Carried], ref: str, section: str, key: str, channel: c.Channel) -> None:
-        """The topic that the capabilities name, if they may."""
-        topic = section_of(self._robots.capabilities(ref), section).get(key)
-        if names(ref, topic, channel) and topic != channel.topic(ref):
-            filters.setdefault(str(topic), (ref, channel))
+    def _add(self, filters: dict[str, _Carried], ref: str, channel: c.Channel) -> None:
+        topic = self._robots.topic(ref, channel)
+        if topic != channel.topic(ref):
+            filters.setdefault(topic, (ref, channel))

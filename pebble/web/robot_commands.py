@@ -1,33 +1,27 @@
 """What a page asks of a robot, besides driving: which right it needs, and what is then published. Pure."""
 
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import msgspec
 
 from pebble import contract as c
-from pebble.client.robot_topics import FLAGS, section_of
+from pebble.client.robot_topics import FLAGS, PLACES, names, section_of, topic_of
 from pebble.contract import Channel, codec
 from pebble.contract import payloads as p
 from pebble.fleet.roles import right_of
 from pebble.transports import Message, QoS
 from pebble.web import messages as m
 
-#: The topic of a channel of one component: its section and key of the capabilities, and the channel's own.
-TopicOf = Callable[[str, str, str, Channel], str]
-
 
 class _Command(NamedTuple):
     channel: Channel
     value: Any
-    section: str = ""  # of the capabilities that may name another topic; with dots: a section of a section
-    key: str = ""
     names: dict[str, str] = {}  # of the channel's topic  # noqa: RUF012 - never changed
 
 
 _ACTIONS = {"reboot": c.REBOOT, "service-restart": c.SERVICE_RESTART, "git-pull": c.GIT_PULL}
 _DESCRIBE = c.MCU_DESCRIBE.metric.rpartition("/")[2]  # on this topic bridges ask each other whose device it is
-_FLAGS = {flag.metric.removeprefix("flags/"): (flag, section) for section, flag in FLAGS.items()}
+_FLAGS = {flag.metric.removeprefix("flags/"): flag for flag in FLAGS.values()}
 
 
 def right(op: m.RobotOp) -> str:
@@ -55,8 +49,9 @@ def refusal(op: m.RobotOp, capabilities: dict[str, Any]) -> str:
     if isinstance(op, m.McuOp) and op.name == _DESCRIBE:
         return f"{op.name} is no command of a microcontroller"
     command = _command(op)
-    offered = section_of(capabilities, command.section) if command.section else {}
-    kind = command.key.removesuffix("_topic")  # lights that do not flash: {"solid": true, "flash": false}
+    section, key = PLACES.get(command.channel, ("", ""))
+    offered = section_of(capabilities, section)
+    kind = key.removesuffix("_topic")  # lights that do not flash: {"solid": true, "flash": false}
     if isinstance(op, m.ActionOp):
         offered = next(filter(None, (section_of(capabilities, section) for section in _sections(op))), {})
     if isinstance(op, m.OutletOp):
@@ -68,24 +63,24 @@ def refusal(op: m.RobotOp, capabilities: dict[str, Any]) -> str:
     return f"{name} takes no {metric} commands" if refused else ""
 
 
-def publication(op: m.RobotOp, topic_of: TopicOf) -> Message:
+def publication(op: m.RobotOp, capabilities: dict[str, Any]) -> Message:
     command = _command(op)
     channel = command.channel
     if isinstance(op, m.ActionOp):
-        topic = _action_topic(op, channel, topic_of)
-    elif command.section:
-        topic = topic_of(op.ref, command.section, command.key, channel)
+        topic = _action_topic(op, channel, capabilities)
+    elif channel in PLACES:
+        topic = topic_of(op.ref, capabilities, channel)
     else:
         topic = channel.topic(op.ref, **command.names)
     qos = QoS(channel.default_qos)
     return Message(topic, codec.encode(channel, command.value), qos=qos, retain=channel.default_retain)
 
 
-def _action_topic(op: m.ActionOp, channel: Channel, topic_of: TopicOf) -> str:
+def _action_topic(op: m.ActionOp, channel: Channel, capabilities: dict[str, Any]) -> str:
     """The first that the capabilities name."""
-    usual = channel.topic(op.ref)
-    topics = (topic_of(op.ref, section, key, channel) for section in _sections(op) for key in ("flag_topic", "topic"))
-    return next((topic for topic in topics if topic != usual), usual)
+    sections = (section_of(capabilities, section) for section in _sections(op))
+    topics = (section.get(key) for section in sections for key in ("flag_topic", "topic"))
+    return next((str(topic) for topic in topics if names(op.ref, topic, channel)), channel.topic(op.ref))
 
 
 def _sections(op: m.ActionOp) -> list[str]:
@@ -97,18 +92,16 @@ def _sections(op: m.ActionOp) -> list[str]:
 def _command(op: m.RobotOp) -> _Command:
     match op:
         case m.LightsOp(r=r, g=g, b=b, period=None):
-            return _Command(c.LIGHTS_SOLID, p.LightsSolid(r=r, g=g, b=b), "lights", "solid_topic")
+            return _Command(c.LIGHTS_SOLID, p.LightsSolid(r=r, g=g, b=b))
         case m.LightsOp(r=r, g=g, b=b, period=period):
-            return _Command(c.LIGHTS_FLASH, p.LightsFlash(r=r, g=g, b=b, period=period or 0), "lights", "flash_topic")
+            return _Command(c.LIGHTS_FLASH, p.LightsFlash(r=r, g=g, b=b, period=period or 0))
         case m.SoundboardOp(file=file, repeat=repeat):
             play = p.SoundboardCommand(action="play", enabled=True, file=file, repeat=repeat or msgspec.UNSET)
             stop = p.SoundboardCommand(action="stop", enabled=False)
-            return _Command(c.SOUNDBOARD_COMMAND, play if file else stop, "soundboard", "command_topic")
+            return _Command(c.SOUNDBOARD_COMMAND, play if file else stop)
         case m.AutonomyOp(file=file, config=config):
             start = p.AutonomyCommand(action="start", file=file, config=config)
-            return _Command(
-                c.AUTONOMY_COMMAND, start if file else p.AutonomyCommand(action="stop"), "autonomy", "command_topic"
-            )
+            return _Command(c.AUTONOMY_COMMAND, start if file else p.AutonomyCommand(action="stop"))
         case m.OutletOp(outlet=outlet, on=on):
             return _Command(c.OUTLET_COMMAND, p.OutletCommand(on=on), names={"outlet": outlet})
         case m.McuOp(uid=uid, name=name, value=value):
@@ -116,5 +109,4 @@ def _command(op: m.RobotOp) -> _Command:
         case m.ActionOp(name=name):
             return _Command(_ACTIONS[name], True)
         case m.FlagOp(name=name, on=on):
-            channel, section = _FLAGS[name]
-            return _Command(channel, on, section, "flag_topic")
+            return _Command(_FLAGS[name], on)

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import msgspec
 
 from pebble import contract as c
-from pebble.client.robot_topics import FLEET, SYNONYMS, names, section_of
+from pebble.client.robot_topics import FLEET, SYNONYMS, topic_of
 from pebble.client.robot_view import RobotView
 from pebble.contract import channel_of, codec, is_reserved
 from pebble.contract.identity import LEVEL, Direction, parse_topic
@@ -22,8 +22,6 @@ from pebble.errors import PayloadError
 from pebble.transports import Message
 from pebble.web import messages as m
 from pebble.web.log_lines import LogLines
-from pebble.web.recent import Recent
-from pebble.web.restarts import Restarts
 
 log = logging.getLogger(__name__)
 
@@ -58,7 +56,6 @@ class Component:
         self.aliases: dict[str, tuple[str, ...]] = {}  # by metric of the manifest that declares them
         self.sent_online: bool | None = None
         self.refreshed_at = float("-inf")
-        self.restarts = Restarts()
         self._stamps: deque[int] = deque(maxlen=_STAMPS)
 
     @property
@@ -118,9 +115,7 @@ class Robots:
         self.interests: set[Interest] = set()
         self.on_forget: Callable[[str], object] = lambda _: None
         self.logs: dict[str, LogLines] = {}  # of watched components
-        self.recent = Recent()
         self.sources: dict[str, str] = {}  # the components whose pictures are shown on the pages of others
-        self.streams: dict[str, str] = {}  # addresses that people have entered, by component
         self._server: dict[tuple[str, str], _Value] = {}
         self._bytes = 0
 
@@ -135,10 +130,9 @@ class Robots:
         component = self.components.get(ref)
         return {} if component is None else component.robot.capabilities
 
-    def topic(self, ref: str, section: str, key: str, channel: c.Channel) -> str:
-        """The topic that the capabilities name, if they may; else the channel's own."""
-        topic = str(section_of(self.capabilities(ref), section).get(key))
-        return topic if names(ref, topic, channel) else channel.topic(ref)
+    def topic(self, ref: str, channel: c.Channel) -> str:
+        """Return the topic that the component's capabilities name for ``channel``, else the channel's own."""
+        return topic_of(ref, self.capabilities(ref), channel)
 
     def aliases(self, ref: str) -> list[str]:
         """The metrics, none of the contract's, under which its microcontrollers say that they publish."""
@@ -240,7 +234,6 @@ class Robots:
             if (raw := codec.trim(message.payload)) != message.payload:  # pages get it as it is
                 message = msgspec.structs.replace(message, payload=raw)
             if self._store(component, metric, channel, message, now):
-                self.recent.receive(ref, metric, message, now)
                 self._interpret(component, metric, channel, message, now)
 
     def forget(self, ref: str) -> None:
@@ -248,7 +241,6 @@ class Robots:
         component = self.components.pop(ref, None)
         if component is not None:
             self._bytes -= component.bytes
-        self.recent.forget(ref)
         self.on_forget(ref)
         for key in [key for key in self._server if key[0] == ref]:
             del self._server[key]
@@ -361,8 +353,6 @@ class Robots:
                 self._refresh(component, now)  # it may be back before the next round
         elif channel is c.STATUS:
             self._announce(component, message, now)
-            if component.restarts.receive(message.payload, int(1000 * time.time()), dated=not message.retain):
-                self.set_server_metric(component.ref, "web/restarts", component.restarts.view())
 
     def _announce(self, component: Component, message: Message, now: float) -> None:
         """Pages get what it announces as its capabilities, until it publishes them."""

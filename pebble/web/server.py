@@ -29,8 +29,9 @@ from pebble.transports.clock import since_boot as clock
 from pebble.web import messages as m
 from pebble.web.drive.drivers import Drivers
 from pebble.web.media.chosen_sources import ChosenSources
-from pebble.web.media.pictures_and_sound import PicturesAndSound
-from pebble.web.media.robot_streams import OwnHosts
+from pebble.web.media.connection import MediaConnection
+from pebble.web.media.pictures import MediaHub
+from pebble.web.media.sound import SoundHub
 from pebble.web.open_components import OpenComponents
 from pebble.web.robots import Robots
 from pebble.web.stops import Stops
@@ -55,13 +56,15 @@ class Server:
         )
         self.robots, self.stops = Robots(), Stops(self._has_sent)
         self.drivers = Drivers(self.broker, self.robots)
-        self.media = PicturesAndSound(settings.broker, self.robots, self._note_talk)
-        for broker in (self.broker, self.stop_broker, self.media.connection.broker):
+        self.media = MediaConnection(Broker(settings.broker, "pebble-web-media"))
+        self.pictures = MediaHub(self.media, self.robots)
+        self.sound = SoundHub(self.media, self.robots, self._note_talk)
+        for broker in (self.broker, self.stop_broker, self.media.broker):
             broker.is_named = self._is_named
         self._heartbeats: Heartbeats | None = None  # while a stop of all goes to further robots
         self.open_components = OpenComponents(self.broker, self.robots, self.spawn)
         # What is drawn over the picture comes from there.
-        self.sources = ChosenSources(people, self.robots, OwnHosts(settings), self.open_components.update)
+        self.sources = ChosenSources(people, self.robots, self.open_components.update)
         self.robots.is_wanted = self._is_wanted
         self.robots.is_kept = lambda ref: self._is_wanted(ref) or self.stops.sends_to(ref)
         self.robots.on_forget = self._ask_anew
@@ -90,10 +93,10 @@ class Server:
                 task.cancel()
             await asyncio.gather(*self._tasks, return_exceptions=True)
         finally:
-            await self.media.close()
+            await asyncio.gather(self.pictures.close(), self.sound.close())
             if self._heartbeats is not None:
                 await asyncio.to_thread(self._heartbeats.close)
-            await asyncio.gather(self.media.connection.close(), self.stop_broker.close(), self.broker.close())
+            await asyncio.gather(self.media.close(), self.stop_broker.close(), self.broker.close())
 
     def spawn(self, work: Coroutine[Any, Any, None]) -> None:
         """Run it until it ends or the server does."""

@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterable
 from pebble.client.estop import COLLECT_S, Progress, RobotStop, StopSender
 from pebble.client.robot_view import RobotView
 from pebble.contract.identity import parse_topic
+from pebble.contract.payloads import EstopState
 from pebble.runtime.robot_estop import RobotEstop
 from pebble.transports import Message
 from pebble.web import messages as m
@@ -18,14 +19,6 @@ log = logging.getLogger(__name__)
 
 MAX_STOPS = 2000  # that are repeated and confirmed at once: one of each robot
 _SHOWN_S = 60.0  # so long pages see how a finished stop ended
-
-_SENDING = {
-    Progress.WAITING: "sent",
-    Progress.CONFIRMED: "confirmed",
-    Progress.OLD: "old",
-    Progress.SPARED: "spared",
-    Progress.NOT_CONFIRMED: "not confirmed",
-}
 
 
 class Stops:
@@ -144,7 +137,7 @@ class Stops:
             by="" if by is None else by.by,
             why="" if by is None else by.why,
             since=0 if by is None else by.since,
-            owners=tuple(_owner(owner, estop) for owner in estop.states),
+            owners=tuple(_owner(owner, state) for owner, state in estop.states.items()),
             sending=sending,
             sending_text=text,
             stop=name,
@@ -191,20 +184,10 @@ class Stops:
 def _progress(stop: RobotStop) -> tuple[str, str]:
     progress = stop.progress
     if progress is Progress.CONFIRMED and not stop.saved:
-        return _SENDING[progress], "stopped, but not saved: after a power cut it is free"
-    return _SENDING[progress], stop.why
+        return progress.value, "stopped, but not saved: after a power cut it is free"
+    return progress.value, stop.why
 
 
-def _owner(owner: str, estop: RobotEstop) -> m.OwnerState:
-    state = estop.states[owner]
-    return m.OwnerState(
-        owner=owner,
-        latched=state.latched,
-        boot=state.boot,
-        count=state.count,
-        by=state.by,
-        why=state.why,
-        since=state.since,
-        persisted=state.persisted,
-        reset_refused=state.reset_refused,
-    )
+def _owner(owner: str, state: EstopState) -> m.OwnerState:
+    fields = {name: getattr(state, name) for name in m.OwnerState.__struct_fields__ if name != "owner"}
+    return m.OwnerState(owner=owner, **fields)

@@ -15,6 +15,7 @@ import pebble
 from pebble.config import Config
 from pebble.config.autonomy import Script as ScriptSection
 from pebble.config.home import in_home
+from pebble.contract.forms import MAX_SETTINGS, Setting, form
 from pebble.contract.identity import meant
 from pebble.services.autonomy_manager.describe import (
     MANIFEST,
@@ -27,7 +28,6 @@ from pebble.services.autonomy_manager.describe import (
     stamp,
 )
 from pebble.services.autonomy_manager.environment import environment, local_login
-from pebble.services.autonomy_manager.forms import MAX_SETTINGS, Setting, form
 from pebble.services.autonomy_manager.interpreter import interpreter
 from pebble.services.autonomy_manager.script import Dependency, Script
 

@@ -16,9 +16,9 @@ import msgspec
 from msgspec import Struct
 
 from pebble.config.text_files import NotTextError, text_of
+from pebble.contract.forms import MAX_SETTINGS, Setting
 from pebble.contract.payloads import LONGEST_SUMMARY, MOST_MAIN
 from pebble.runtime.parent import tied_to_parent
-from pebble.services.autonomy_manager.forms import MAX_SETTINGS, Setting
 
 MANIFEST = "script.json"
 _LIMIT_S = 20.0

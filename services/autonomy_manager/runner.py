@@ -10,11 +10,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Protocol
 
+from pebble.contract.forms import Value
 from pebble.errors import PebbleError
 from pebble.runtime.runs import CONFIG, RUN
 from pebble.services.autonomy_manager.child import Child, Launch, Spawn
 from pebble.services.autonomy_manager.environment import environment
-from pebble.services.autonomy_manager.forms import Value
 from pebble.services.autonomy_manager.motor_owners import Baseline
 from pebble.services.autonomy_manager.script import Plan, Step
 

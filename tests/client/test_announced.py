@@ -10,6 +10,7 @@ import pytest
 from pebble import contract as c
 from pebble.client.announced import announced
 from pebble.client.robot_view import RobotView
+from pebble.contract import DRIVE
 from pebble.transports import Message
 
 BASE = "pebble/robots/stranger"
@@ -52,7 +53,7 @@ def test_it_is_driven_until_it_publishes_capabilities(channel: c.Channel, key: s
     made = payload(**{key: LIST if key == "subscribes" else {"subscribes": LIST}})
     robot.receive(channel, Message(channel.topic(BASE), made), now=1.0, wall=1710969600.0)
     assert robot.drives
-    assert robot.drive_topic == f"{BASE}/incoming/drive-values"
+    assert robot.topic(DRIVE) == f"{BASE}/incoming/drive-values"
     assert not robot.estop.has_capabilities
     capable = Message(c.CAPABILITIES.topic(BASE), payload(value={"drive": {"available": False}}))
     robot.receive(c.CAPABILITIES, capable, now=1.1, wall=1710969600.1)

@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 
+from pebble import contract as c
 from pebble.client.discovery import Discovery
 from pebble.client.robot_view import MAX_REMEMBERED, RobotView
 from pebble.contract import LINK
@@ -128,9 +129,9 @@ def test_recorded_robots_are_ready_once_they_published_how_to_drive_them() -> No
         at[message.channel.topic] = (message.log_ns - first) / 1e9
     for base in ROBOTS:
         before = discovered(at[f"{base}/outgoing/capabilities"] - 0.01)
-        assert not any(seen.drive_topic for name, seen in before.robots.items() if name == base)
+        assert not any(seen.topic(c.DRIVE) for name, seen in before.robots.items() if name == base)
     seen = discovered().robots[GOOB]
-    assert (seen.transport, seen.drive_topic) == ("zenoh", f"{GOOB}/incoming/drive-values")
+    assert (seen.transport, seen.topic(c.DRIVE)) == ("zenoh", f"{GOOB}/incoming/drive-values")
 
 
 def test_recorded_robots_are_online_until_their_recording_ends() -> None:
@@ -150,7 +151,7 @@ def test_topics_of_another_robot_in_capabilities_are_not_used() -> None:
     publish(
         discovery, "capabilities", {"schema": "pebble-capabilities/v1", "t": 1, "value": value}, now=0.6, retain=True
     )
-    assert (seen.drive_topic, seen.lights_topic(flash=False), seen.ready(0.6)) == (None, None, False)
+    assert (seen.topic(c.DRIVE), seen.topic(c.LIGHTS_SOLID), seen.ready(0.6)) == (None, None, False)
     assert seen.estop.drive_topic == f"{BASE}/incoming/drive-values"
 
 

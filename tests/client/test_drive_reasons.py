@@ -21,7 +21,7 @@ GOOD, WRONG, LIMITS = VECTORS["good"], VECTORS["wrong"], VECTORS["limits"]
 #: A page on which nothing is wrong, but for what the vector says.
 _PAGE = """
 const page = (one) => ({
-  name: "goob", open: true, drives: true, rights: ["drive"], focus: true, pictureAgeMs: null, failed: "",
+  name: "goob", words: {}, open: true, drives: true, rights: ["drive"], focus: true, pictureAgeMs: null, failed: "",
   broker: one.problem, liveness: { online: one.online, silent_s: 2 }, estop: { latched: one.latched, by: "eve" },
   freeForMs: 1000 * one.free_s, capabilities: { drive: { available: one.drives, arbitrates: one.arbitrates } },
   driver: one.driven ? { by: "bob" } : { by: "ann", you: true }, script: { running: one.script },

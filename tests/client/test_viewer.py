@@ -145,7 +145,7 @@ def test_requests_go_to_no_other_robot() -> None:
     with MemoryTransport("viewer", robot.hub) as transport:
         viewer = Viewer(transport, BASE, lambda _medium, _payload: None)
         viewer.wait_for_capabilities(5)
-        assert viewer.topic("video", "command_topic", VIDEO_CONTROL) == REQUEST
+        assert viewer.topic(VIDEO_CONTROL) == REQUEST
 
 
 def test_without_a_receiver_it_receives_no_media_but_learns_of_them(

@@ -257,16 +257,6 @@ def test_settings(people: People) -> None:
     assert people.get("estop") == "b"
 
 
-def test_settings_of_one_kind(people: People) -> None:
-    for key in ("stream pebble/robots/goob", "stream pebble/robots/%", "streams x", "other"):
-        people.set(key, f"value of {key}")
-    assert people.all("stream ") == {
-        "pebble/robots/goob": "value of stream pebble/robots/goob",
-        "pebble/robots/%": "value of stream pebble/robots/%",
-    }
-    assert people.all("none ") == {}
-
-
 def test_a_file_that_is_no_database(tmp_path: Path) -> None:
     file = tmp_path / "people.sqlite"
     file.write_text("no database, but long enough to be read as one" * 10)

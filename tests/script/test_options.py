@@ -38,7 +38,10 @@ def parsed(*arguments: str) -> Options:
 
 
 def test_the_form_is_the_expected_one_byte_for_byte() -> None:
-    assert msgspec.json.format(msgspec.json.encode(form(Options)), indent=1) + b"\n" == GOLDEN.read_bytes()
+    assert (
+        msgspec.json.format(msgspec.json.encode([setting.entry() for setting in form(Options)]), indent=1) + b"\n"
+        == GOLDEN.read_bytes()
+    )
 
 
 def test_two_processes_describe_a_script_alike(tmp_path: Path) -> None:
@@ -84,6 +87,17 @@ def test_main_options_are_some_of_its_options(tmp_path: Path, more: str, end: st
     assert (run.stdout, run.stderr.splitlines()[-1]) == ("", end)
 
 
+def test_the_help_says_what_each_option_takes() -> None:
+    parser = OneLineParser(prog="run.py")
+    parse(Options, ["--tag-size-m", "1"], parser)
+    words = " ".join(parser.format_help().split())
+    for part in (
+        "Tag Size (m) (at least 0.01; required)", "Tag ID (0 to 34; default: 13)", "Limit (at least 1; default: none)",
+        "Speed (one of slow, fast, automatic; default: slow)", "Note (default: )", "Search (default: on)",
+    ):  # fmt: skip
+        assert part in words
+
+
 def test_what_is_not_given_has_its_default() -> None:
     assert parsed() == Options(tag_size_m=0.25, power=1.0)
 
@@ -104,12 +118,12 @@ def test_a_command_line(arguments: str, key: str, value: object) -> None:
 @pytest.mark.parametrize(
     ("arguments", "problem"),
     [
-        (["--tag-id", "x"], "--tag-id: 'x' is not a whole number"),
-        (["--tag-id", "1_0"], "--tag-id: '1_0' is not a whole number"),
-        (["--tag-id", "-4"], "--tag-id: -4 is below the minimum 0"),
-        (["--tag-id", "35"], "--tag-id: 35 is above the maximum 34"),
-        (["--power", "nan"], "--power: 'nan' is not a number"),
-        (["--speed", "fastest"], "--speed: 'fastest' is not one of slow, fast, automatic"),
+        (["--tag-id", "x"], "--tag-id: tag_id must be a whole number"),
+        (["--tag-id", "1_0"], "--tag-id: tag_id must be a whole number"),
+        (["--tag-id", "-4"], "--tag-id: tag_id below minimum 0"),
+        (["--tag-id", "35"], "--tag-id: tag_id above maximum 34"),
+        (["--power", "nan"], "--power: power must be a number"),
+        (["--speed", "fastest"], "--speed: Invalid option 'fastest' for speed"),
         (["--tag", "3"], "unrecognized arguments: --tag 3"),
         (["--limit"], "--limit: expected one argument"),
         (None, "run.py: the following arguments are required: --tag-size-m (see --help)\n"),
@@ -134,11 +148,11 @@ def test_a_wrong_command_line_is_one_line(
         (Literal[1, 2], 1, "option x: a Literal must list strings only"),
         (Annotated[float, Meta(gt=0)], 1.0, "option x: the bounds of a form belong to it: write ge instead of gt"),
         (bool | None, None, "option x: a bool is true or false"),
-        (int, 1.5, "option x: its default 1.5 is not a whole number"),
-        (int, True, "option x: its default True is not a whole number"),
-        (float, float("inf"), "option x: its default inf is not a number"),
-        (Annotated[int, Meta(ge=3)], 1, "option x: its default 1 is outside of its own bounds"),
-        (Literal["a"], "b", "option x: its default 'b' is not one of its choices"),
+        (int, 1.5, "option x: its default 1.5 is refused: x must be a whole number"),
+        (int, True, "option x: its default True is refused: x must be a whole number"),
+        (float, float("inf"), "option x: its default inf is refused: x must be a finite number"),
+        (Annotated[int, Meta(ge=3)], 1, "option x: its default 1 is refused: x below minimum 3"),
+        (Literal["a"], "b", "option x: its default 'b' is refused: Invalid option 'b' for x"),
     ],
 )
 def test_what_cannot_become_a_form_is_named(kind: Any, default: object, problem: str) -> None:
@@ -162,8 +176,8 @@ class Renamed(Struct):
 
 def test_an_option_may_have_another_name_than_its_key() -> None:
     size, state = form(Renamed)
-    assert (size["key"], size["arg"], size["required"], size["default"]) == ("tag_size_m", "--marker-size", True, 0.25)
-    assert (state["arg"], state["arg_false"]) == ("--tuned", "--no-tuned")
+    assert (size.key, size.arg, size.required, size.default) == ("tag_size_m", "--marker-size", True, 0.25)
+    assert (state.arg, state.arg_false) == ("--tuned", "--no-tuned")
     given = parse(Renamed, ["--marker-size", "0.5", "--tuned"], OneLineParser(prog="run.py"))[0]
     assert (given.tag_size_m, given.use_state) == (0.5, True)
     assert parse(Renamed, [], OneLineParser(prog="run.py"))[0].tag_size_m == 0.25

@@ -31,6 +31,7 @@ from starlette.responses import HTMLResponse, JSONResponse, Response
 from starlette.routing import Route, WebSocketRoute
 from starlette.websockets import WebSocket, WebSocketDisconnect, WebSocketState
 
+from pebble.client.drive_reasons import WORDS
 from pebble.client.page import WebSettings
 from pebble.contract.packets import Codec, Picture, PictureKind, Sound
 from pebble.fleet.audit import Audit
@@ -66,13 +67,10 @@ class State:
     still: bool = False  # cameras show flat colours, and a few pictures only
     at: int = 0  # ms epoch, at which the server's time stands still; 0: it does not
     logs: Callable[[int], list[Any]] = field(default=lambda _now: [])  # lines of the component that is open
-    #: Points of messages.Series, by component and metric.
-    series: Callable[[int], dict[tuple[str, str], list[Any]]] = field(default=lambda _now: {})
     refused: str = ""  # why nothing that is asked of a robot is done
     recordings: bool = False  # those of tests.web.recorded are offered
     days: tuple[int, str] | None = None  # status and text that a list of recorded days is answered with; status 0: none
     audit: list[Any] = field(default_factory=list)  # of a robot, as it is read
-    frames: str = ""  # origins that the page may show in a frame; {port} is the server's, here and in all values
 
 
 class CannedServer:
@@ -164,10 +162,7 @@ class CannedServer:
         return Route(route.path, days)
 
     async def _page(self, request: Request) -> Response:
-        headers = _headers()
-        if self.state.frames:
-            headers["content-security-policy"] += f"; frame-src {self._filled(self.state.frames)}"
-        return self.static.page(request, headers)
+        return self.static.page(request, _headers())
 
     async def _stream(self, _request: Request) -> Response:
         """A page that a robot may show in a frame."""
@@ -212,8 +207,6 @@ class CannedServer:
                     lines = state.logs(self.now())
                     logs = {"op": "logs", "ref": message["ref"], "origin": "canned", "first": 213, "lines": lines}
                     await self._send(websocket, logs)
-                if message["op"] == "watch" and message.get("series"):
-                    await self._send_series(websocket, state, message["ref"])
                 if message["op"] != "echo" and "n" in message:
                     answer = {"op": "refused", "why": state.refused, "g": -1} if state.refused else {"op": "done"}
                     await self._send(
@@ -243,6 +236,7 @@ class CannedServer:
             "token": "canned",
             "now": self.now(),
             "drives": True,
+            "words": WORDS,
         }
         return usual | state.welcome
 
@@ -265,12 +259,6 @@ class CannedServer:
 
     async def _send_state(self, websocket: WebSocket, values: list[Value]) -> None:
         await self._send(websocket, {"op": "state", "now": self.now(), "set": values, "gone": []})
-
-    async def _send_series(self, websocket: WebSocket, state: State, watched: str) -> None:
-        for (ref, metric), points in state.series(self.now()).items():
-            if ref == watched:
-                series = {"op": "series", "ref": ref, "metric": metric, "now": self.now(), "points": points}
-                await self._send(websocket, series)
 
     async def _send(self, websocket: WebSocket, message: dict[str, Any]) -> None:
         if websocket.application_state is WebSocketState.CONNECTED:

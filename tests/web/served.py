@@ -19,7 +19,6 @@ from pebble.contract import ESTOP_STATE, ONLINE, codec
 from pebble.contract.names import without_name
 from pebble.contract.payloads import EstopState, Heartbeat
 from pebble.transports import Message, MqttSettings, QoS, create
-from pebble.web.access.connections import Loop
 from pebble.web.serve import listen, server_config
 from tests.client.control_robot import KeepingRobot
 from tests.support import until
@@ -37,7 +36,7 @@ class Served:
         self.settings = WebSettings(**{"broker": broker, "port": 0, "server": "hall", **settings})
         self.listener = listen(self.settings)
         self.port = int(self.listener.getsockname()[1])
-        self._uvicorn = uvicorn.Server(server_config(self.settings, self.listener))
+        self._uvicorn = uvicorn.Server(server_config(self.settings))
         self._thread = threading.Thread(target=self._run, name="served", daemon=True)
 
     @property
@@ -47,6 +46,11 @@ class Served:
     @property
     def version(self) -> str:
         return str(self.app.state.version)
+
+    @property
+    def open(self) -> set[Any]:
+        """The connections that are open."""
+        return self._uvicorn.server_state.connections
 
     @property
     def origin(self) -> str:
@@ -67,8 +71,7 @@ class Served:
         return Page(self, **options)
 
     def _run(self) -> None:
-        with asyncio.Runner(loop_factory=Loop) as runner:
-            runner.run(self._uvicorn.serve(sockets=[self.listener]))
+        asyncio.run(self._uvicorn.serve(sockets=[self.listener]))
 
 
 class Page:
@@ -89,7 +92,6 @@ class Page:
         self.refused: list[dict[str, Any]] = []
         self.done: list[dict[str, Any]] = []
         self.logs: list[dict[str, Any]] = []  # with their lines
-        self.series: list[dict[str, Any]] = []
         self.welcome: dict[str, Any] = {}
         self.bye: dict[str, Any] = {}
         self.closed = False
@@ -160,8 +162,6 @@ class Page:
                 self.state |= {(ref, metric): value for ref, metric, value, _ in message["set"]}
                 for ref in message["gone"]:
                     self.state = {key: value for key, value in self.state.items() if key[0] != ref}
-            case "series":
-                self.series.append(message)
             case "logs":
                 self.logs.append(message)
             case "done":

@@ -67,7 +67,7 @@ def estop(now: int, by: str = "", *, sending: str = "", text: str = "", why: str
 
 def flow(state: str = "flowing", why: str = "") -> dict[str, Any]:
     sent = {"encoding": "pbvz", "per_second": 10.0, "kbits": 212.0}
-    return {"state": state, "why": why, "viewers": 2, "pinned": ""} | sent
+    return {"state": state, "why": why, "viewers": 2} | sent
 
 
 def sound(state: str = "rest", why: str = "", *, talker: str = "") -> dict[str, Any]:
@@ -138,7 +138,6 @@ def goob(now: int) -> list[Value]:
         (GOOB, "touch-sensors", {"value": {"a0": 512, "a1": 498, "a2": 730}, "unit": "adc"}, 20),
         (GOOB, "media-status", media(now), 2000),
         (GOOB, "status", services(), 4000),
-        (GOOB, "web/restarts", {"times": {"autonomy_manager": [now - 42_000, now - 6000]}}, 0),
         (GOOB, "web/flags", {"remote_mirror": None, "mqtt_audio": False, "mqtt_video": True}, 0),
     ]
 
@@ -287,22 +286,6 @@ def touch(now: int) -> dict[str, Any]:
     return {"value": value, "unit": "adc"}
 
 
-def past(now_ms: int) -> dict[tuple[str, str], list[Any]]:
-    """What the server remembers of goob; there was no connection to it for 20 s."""
-    now = now_ms / 1000
-
-    def points(made: Callable[[float], Any], every: float, span: float) -> list[Any]:
-        ages = [every * number for number in range(int(span / every), 0, -1)]
-        return [[1000 * age, made(now - age)] for age in ages if not 40 < age < 60]
-
-    return {
-        (GOOB, "charging-level"): points(lambda at: {"value": 7.92 + (now - at) / 4000, "unit": "v"}, 5, 600),
-        (GOOB, "wheel-odometry"): points(odometry, 0.2, 45),
-        (GOOB, "sensors/imu"): points(lambda at: attitude(int(1000 * at)), 0.5, 120),
-        (GOOB, "touch-sensors"): points(lambda at: touch(int(1000 * at)), 0.25, 120),
-    }
-
-
 MINE = at(GOOB, "web/driver", driver("alice", "laptop", you=True))
 DRIVING = State(GOOB_PATH, changed(fleet, MINE), LIVE, logs=logs)
 _ACTS = (
@@ -338,7 +321,7 @@ MOVING: tuple[Callable[[int], Value], ...] = (
     lambda now: (GOOB, "touch-sensors", touch(now), 0),
     lambda now: (GOOB, "wheel-odometry", odometry(now / 1000), 0),
 )
-SENSORS = replace(DRIVING, values=changed(fleet, MINE, *MOVING), series=past)
+SENSORS = replace(DRIVING, values=changed(fleet, MINE, *MOVING))
 STREAM = "http://localhost:{port}"
 
 
@@ -418,7 +401,7 @@ STATES: dict[str, State] = {
     "free": of(GOOB_PATH),
     "odometry": SENSORS,
     "overlays": of(GOOB_PATH, MINE, at(GOOB, "video-overlays", OVERLAYS), logs=logs),
-    "own-stream": of(GOOB_PATH, MINE, with_stream(f"{STREAM}/stream"), logs=logs, frames=STREAM),
+    "own-stream": of(GOOB_PATH, MINE, with_stream(f"{STREAM}/stream"), logs=logs),
     "taken": of(GOOB_PATH, BOB_DRIVES),
     "kept": of(GOOB_PATH, keeping(by="bob", device="phone"), welcome=MAY_TAKE),
     "kept-and-asked": of(GOOB_PATH, keeping(by="bob", device="phone", asking=True, others=True), welcome=MAY_TAKE),

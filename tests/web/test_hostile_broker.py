@@ -196,7 +196,6 @@ def test_capabilities_that_name_other_topics(server: ServerProcess, broker: Brok
                 page.send("estop", ref=EVIL, stop=f"{number:016x}")
                 owners = [{"owner": "serial", "boot": "b", "count": number}]
                 page.send("estop-reset", ref=EVIL, owners=owners)
-                page.send("encoding", ref=EVIL, encoding="json")
                 assert until(lambda evil=evil: any(name.endswith("/estop") for name in evil.topics()))
                 page.send("estop-end", stop=f"{number:016x}")
                 page.send("watch", ref="")

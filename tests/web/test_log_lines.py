@@ -1,4 +1,4 @@
-"""The log lines that the server has for pages, and when services were seen to restart."""
+"""The log lines that the server has for pages."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pebble.web.log_lines import MAX_BYTES, MAX_LINE_BYTES, MAX_LINES, PART_BYTES, LogLines, line_of
-from pebble.web.restarts import MAX_SERVICES, MAX_TIMES, Restarts
 
 
 def read(lines: LogLines, after: int = 0) -> list[tuple[int, list[object]]]:
@@ -67,41 +66,3 @@ def test_a_message_to_a_page_is_short_but_has_a_line() -> None:
     runs = read(taken(*[json.dumps("x" * 2000).encode()] * 30))
     assert max(len(json.dumps(run)) for _, run in runs) <= PART_BYTES + 100
     assert len(read(taken(json.dumps("x" * (MAX_LINE_BYTES - 10)).encode()))) == 1
-
-
-def status(**restarts: object) -> bytes:
-    return json.dumps({"value": {"services": {name: {"restarts": count} for name, count in restarts.items()}}}).encode()
-
-
-def test_restarts_are_dated_when_they_are_seen() -> None:
-    seen = Restarts()
-    assert not seen.receive(status(a=3, b=0), 1000)  # how long ago these were is unknown
-    assert not seen.receive(status(a=3, b=0), 2000)
-    assert seen.receive(status(a=3, b=2), 3000)
-    assert seen.receive(status(a=4, b=2), 4000)
-    assert seen.view().times == {"b": (3000, 3000), "a": (4000,)}
-    assert not seen.receive(status(a=0, b=0), 5000)  # the whole robot was restarted
-    assert seen.receive(status(a=1, b=0), 6000)
-    assert not seen.receive(status(a=8, b=0), 7000, dated=False)  # the broker was away meanwhile
-    assert seen.receive(status(a=9, b=0), 8000)
-    assert seen.view().times["a"] == (4000, 6000, 8000)
-
-
-def test_only_the_newest_restarts_of_some_services_are_remembered() -> None:
-    seen = Restarts()
-    names = [f"s{number}" for number in range(MAX_SERVICES + 10)]
-    seen.receive(status(**dict.fromkeys(names, 0)), 1)
-    seen.receive(status(**dict.fromkeys(names, 10**30)), 2)
-    assert len(seen.view().times) == MAX_SERVICES
-    assert set(map(len, seen.view().times.values())) == {MAX_TIMES}
-
-
-SCALARS = (
-    st.none() | st.booleans() | st.integers() | st.text(max_size=5) | st.floats(allow_nan=False, allow_infinity=False)
-)
-KEYS = st.sampled_from(["value", "services", "a", "restarts"])
-
-
-@given(st.recursive(SCALARS, lambda inside: st.lists(inside, max_size=3) | st.dictionaries(KEYS, inside, max_size=3)))
-def test_a_status_may_be_of_any_shape(value: object) -> None:
-    Restarts().receive(json.dumps(value).encode(), 1)

@@ -12,6 +12,7 @@ decoder = msgspec.json.Decoder(messages.FromPage)
 def test_the_documents_are_current():
     assert messages_docs.DOCS.read_text() == re.sub(r"\n{3,}", "\n\n", messages_docs.markdown())
     assert messages_docs.DECLARATIONS.read_text() == messages_docs.declarations()
+    assert messages_docs.WORDS.read_text() == messages_docs.words()
 
 
 def test_what_a_page_sends_is_understood():

@@ -234,23 +234,6 @@ def _audit(served: Served, ref: str) -> list[Any]:
     return [entry for entry in served.app.state.audit.read(100) if entry.ref == ref and entry.what == "action"]
 
 
-# -- restarts
-
-
-def test_restarts_are_dated_for_pages_that_come_later(served, broker, robot) -> None:
-    def services(count: int) -> dict[str, Any]:
-        return {"value": {"services": {"imu": {"state": "ready", "restarts": count, "last_exit": "signal 9"}}}}
-
-    with Page(served) as page:
-        assert page.knows(robot.base)
-        robot.publish("status", services(1), retain=True)
-        assert until(lambda: page.value(robot.base, "status") == services(1))
-        robot.publish("status", services(2), retain=True)
-        assert until(lambda: len((page.value(robot.base, "web/restarts") or {}).get("times", {}).get("imu", [])) == 1)
-    with Page(served) as later:
-        assert until(lambda: later.value(robot.base, "web/restarts") is not None)
-
-
 # -- opened and closed
 
 

@@ -107,7 +107,7 @@ def published(asked: Any, capabilities: dict[str, Any]) -> Message:
     robots = Robots()
     payload = msgspec.json.encode({"schema": "pebble-capabilities/v1", "t": 1, "value": capabilities})
     robots.receive(Message(f"{BASE}/outgoing/capabilities", payload), 0.0)
-    return robot_commands.publication(asked, robots.topic)
+    return robot_commands.publication(asked, robots.capabilities(asked.ref))
 
 
 @pytest.mark.parametrize(("fields", "metric", "value", "retain"), PUBLISHED)
@@ -269,7 +269,7 @@ def test_without_driving_nothing_is_moved_or_switched_on(served: Served, robot: 
         assert page.knows(robot.base)
         for fields in moving:
             ask(page, robot.base, **fields)
-        assert all("reload" in why for why in refusals(page, len(moving)))
+        assert all("load it again" in why for why in refusals(page, len(moving)))
         ask(page, robot.base, "autonomy", file="")
         ask(page, robot.base, "outlet", outlet="o1", on=False)
         assert until(lambda: len(asked_of(robot)) == 2, 3), asked_of(robot)

@@ -3,17 +3,15 @@
 from collections.abc import Collection, Sequence
 from typing import Final
 
-BEST_FIRST: Final = ("h264", "pbvz", "pbvd", "json")
+BEST_FIRST: Final = ("h264", "pbvd", "json")
 _BETTER_AFTER_S: Final = 5.0  # a viewer that reloads its page comes back within this time
 
 
-def best(offered: Collection[str], viewers: Sequence[frozenset[str]], pinned: str = "") -> str | None:
-    """The best of what most viewers decode; None: whatever the robot sends.
+def best(offered: Collection[str], viewers: Sequence[frozenset[str]]) -> str | None:
+    """Return the best of what most viewers decode; None: whatever the robot sends.
 
-    ``offered`` is empty for robots that do not list encodings. A pin counts for all viewers.
+    ``offered`` is empty for robots that do not list encodings.
     """
-    if pinned in offered:
-        return pinned
     known = [encoding for encoding in BEST_FIRST if encoding in offered]
     return max(known, key=lambda encoding: sum(encoding in can for can in viewers), default=None)
 
@@ -22,7 +20,6 @@ class EncodingChoice:
     """Changes at once where a viewer needs it, and back to a better encoding only after a while."""
 
     def __init__(self) -> None:
-        self.pinned = ""
         self.current: str | None = None
         self._wanted_since: tuple[str | None, float] = (None, 0.0)
 
@@ -30,10 +27,10 @@ class EncodingChoice:
         """The encoding to request now. Without viewers nothing changes."""
         if not viewers and self.current in offered:
             return self.current
-        wanted = best(offered, viewers, self.pinned)
+        wanted = best(offered, viewers)
         if wanted != self._wanted_since[0]:
             self._wanted_since = (wanted, now)
-        if not self._suits(offered, viewers) or wanted == self.pinned or now - self._wanted_since[1] >= _BETTER_AFTER_S:
+        if not self._suits(offered, viewers) or now - self._wanted_since[1] >= _BETTER_AFTER_S:
             self.current = wanted
         return self.current
 

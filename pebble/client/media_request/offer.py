@@ -2,14 +2,14 @@
 
 from typing import Any, Final, NamedTuple
 
-from pebble.client.robot_topics import FLAGS, names
+from pebble.client.robot_topics import PLACES, names
 from pebble.client.viewer import Medium
-from pebble.contract import AUDIO, AUDIO_CONTROL, CAMERA, VIDEO_CONTROL, Channel
+from pebble.contract import AUDIO, AUDIO_CONTROL, CAMERA, MQTT_AUDIO, MQTT_VIDEO, VIDEO_CONTROL, Channel
 
-#: The channels whose topics capabilities may name, by its key in the medium's section.
-NAMED: Final[dict[Medium, dict[str, Channel]]] = {
-    "video": {"topic": CAMERA, "command_topic": VIDEO_CONTROL, "flag_topic": FLAGS["video"]},
-    "audio": {"topic": AUDIO, "command_topic": AUDIO_CONTROL, "flag_topic": FLAGS["audio"]},
+#: The channels of a medium, for which capabilities may name topics.
+CHANNELS: Final[dict[Medium, tuple[Channel, ...]]] = {
+    "video": (CAMERA, VIDEO_CONTROL, MQTT_VIDEO),
+    "audio": (AUDIO, AUDIO_CONTROL, MQTT_AUDIO),
 }
 
 
@@ -46,7 +46,8 @@ def refusal(ref: str, capabilities: dict[str, Any], medium: Medium) -> str:
         return words.lacking
     if section.get("controls") is not True:
         return words.fixed
-    for key, channel in NAMED[medium].items():
+    for channel in CHANNELS[medium]:
+        key = PLACES[channel][1]
         if section.get(key) is not None and not names(ref, section[key], channel):
             return f"its capabilities name a topic for {words.name} that is not its own ({key})"
     return ""

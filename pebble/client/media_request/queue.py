@@ -45,7 +45,6 @@ class MediaQueue:
     def __init__(self) -> None:
         self.waiting = True  # for a key frame
         self.overflowed = False  # waiting because the page is too slow
-        self.skipped = 0
         self.window = WINDOW
         self.ack_s = 0.0  # how long the last frame took to be drawn and acknowledged
         self.late_acks = 0  # in a row; of frames that were under way together one counts
@@ -58,15 +57,14 @@ class MediaQueue:
         if frame.keyframe:
             self._begin_at(frame)
         elif self.waiting:
-            self.skipped += 1
+            return
         elif self._has_room(frame):
             self._queue.append(frame)
         elif self._skips_early(frame):
             self.waiting = True  # what is in the queue is still sent
-            self.skipped += 1
         else:
             self.overflowed = True
-            self.wait_for_keyframe(1)
+            self.wait_for_keyframe()
 
     def take(self, now: float) -> Frame | None:
         """The frame to send now; None if there is none, or too many are under way."""
@@ -99,9 +97,8 @@ class MediaQueue:
         """Frames that are under way say nothing of those that follow."""
         self.late_acks, self._late_at = 0, now
 
-    def wait_for_keyframe(self, skipped: int = 0) -> None:
+    def wait_for_keyframe(self) -> None:
         """Skip everything before the next key frame."""
-        self.skipped += len(self._queue) + skipped
         self._queue.clear()
         self.waiting = True
 
@@ -144,7 +141,6 @@ class ViewerQueue(MediaQueue):
         super().__init__()
         self.can = can
         self.rescued = False
-        self.small = False  # in the rescue stream it gets small pictures
         self.new = True  # it has received no picture, and no key frame was requested for it
         self._undecodable: set[str] = set()
         self._waiting_since = self._direct_since = now
@@ -176,7 +172,6 @@ class ViewerQueue(MediaQueue):
             self.rescued = False
             self._direct_since = now
             self.forget_lateness(now)
-        self.small = False
 
     def offer_rescue(self, frame: Frame) -> None:
         """Offer a picture of the rescue stream: only the newest counts."""
@@ -203,8 +198,7 @@ class ViewerQueue(MediaQueue):
 
     def rescue(self, now: float) -> None:
         """Change to the rescue stream: because the page is slow, for a while; else until the next key frame."""
-        self.small = self.is_thin
-        if self.overflowed or self.small:
+        if self.overflowed or self.is_thin:
             self._retry_s = _FIRST_RETRY_S if now - self._direct_since > _RECOVERED_S else self._retry_s
             self._retry_at = now + self._retry_s
             self._retry_s = min(_LAST_RETRY_S, 2 * self._retry_s)
@@ -229,7 +223,7 @@ def assess(viewers: Collection[ViewerQueue], encoding: str, now: float, *, can_r
     new; a slow viewer among fast ones gets the rescue stream instead, and so does one whose connection is thin.
     """
     for viewer in viewers if can_rescue else ():
-        if (viewer.is_thin and not viewer.small) or not (viewer.rescued or viewer.decodes(encoding)):
+        if not viewer.rescued and (viewer.is_thin or not viewer.decodes(encoding)):
             viewer.rescue(now)
     direct = [viewer for viewer in viewers if not viewer.rescued and viewer.decodes(encoding)]
     patience = 0.0 if encoding == "h264" else _JPEG_PATIENCE_S

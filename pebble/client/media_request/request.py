@@ -10,7 +10,8 @@ from typing import Any, Final
 
 from pebble.client.broker import Broker
 from pebble.client.driveable import is_held
-from pebble.client.media_request.offer import NAMED, WORDS, offered, refusal
+from pebble.client.media_request.offer import CHANNELS, WORDS, offered, refusal
+from pebble.client.robot_topics import named_topic
 from pebble.client.viewer import Medium, Viewer
 from pebble.errors import PebbleError
 
@@ -36,7 +37,7 @@ class MediaRequest:
         self._broker = broker
         self._inbox = _Inbox(broker, lambda payload: None if self._viewer is None else receive(payload))
         self._viewer: Viewer | None = None
-        self._topics: list[object] = []  # that the capabilities listed at the request
+        self._topics: list[str | None] = []  # that the capabilities named at the request
         self._wanted = self._closing = False
         self._wanted_at = float("-inf")  # the last time
         self._wakeup = asyncio.Event()
@@ -105,7 +106,7 @@ class MediaRequest:
             await asyncio.to_thread(self._viewer.request_keyframe, known)
 
     async def _follow(self, capabilities: dict[str, Any], encoding: str | None) -> None:
-        topics = [capabilities[self.medium].get(key) for key in NAMED[self.medium]]
+        topics = [named_topic(self.ref, capabilities, channel) for channel in CHANNELS[self.medium]]
         viewer = self._viewer
         if viewer is None or topics != self._topics:
             await self._withdraw()

@@ -4,7 +4,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
@@ -13,6 +13,7 @@ from pebble.client.names import id_of
 from pebble.client.scripts import RobotScripts, options_of
 from pebble.commands.options import RobotArgument, with_target
 from pebble.config.visible import shown
+from pebble.contract import forms
 from pebble.contract.payloads import AutonomyStatus
 from pebble.errors import PebbleError, TransportError
 from pebble.transports import Transport
@@ -55,8 +56,8 @@ def list_(robot: RobotArgument, *, target: Target) -> int:
         for file, entry in scripts.files.items():
             label = str(entry.get("label") or file)
             _print(file if label == file else f"{file}: {label}")
-            for one in entry.get("configs") or ():
-                _print(f"    {_option(one)}")
+            for setting in forms.listed(entry.get("configs")):
+                _print(f"    {_option(setting)}")
         if scripts.status is not None:
             _print_status(scripts.status)
     return 0
@@ -126,7 +127,7 @@ def _scripts(robot: str, target: Target) -> Iterator[tuple[Transport, RobotScrip
     """The connection, what the robot has published about its scripts, and its name."""
     with connected(target_of(robot, target)) as (transport, names):
         scripts = RobotScripts(names)
-        put_names(transport, names, lambda base: base == names.base and scripts.named)
+        put_names(transport, names, lambda base: base == names.base and scripts.robot.named)
         scripts.subscribe(transport)
         wait_for(lambda: scripts.files is not None and scripts.status is not None, 1.0)
         yield transport, scripts, shown(id_of(names.base))
@@ -167,15 +168,16 @@ def _print_status(status: AutonomyStatus) -> None:
         _print(f"error: {status.error}")
 
 
-def _option(one: dict[str, Any]) -> str:
+def _option(setting: forms.Setting) -> str:
     """``--tag-id INT  Tag ID (default: 13)``."""
-    kind, options = str(one.get("type")), options_of(one)
-    first = {value: option for option, value in reversed(options)}
-    shown = f"[{first[True]} | {first[False]}]" if kind == "bool" else f"{first[None]} {kind.upper()}"
-    notes = [", ".join(map(str, one["options"]))] if one.get("options") else []
-    notes += [f"{word} {one[word]}" for word in ("min", "max") if word in one]
-    notes.append("required" if one.get("required") else f"default: {one.get('default')}")
-    return f"{shown:32}  {one.get('label')} ({'; '.join(notes)})"
+    first = {value: option for option, value in reversed(options_of(setting))}
+    flag = setting.type == "bool"
+    shown = f"[{first[True]} | {first[False]}]" if flag else f"{first[None]} {setting.type.upper()}"
+    notes = [", ".join(map(str, setting.options))] if setting.options else []
+    notes += [f"min {setting.min}"] if setting.min is not None else []
+    notes += [f"max {setting.max}"] if setting.max is not None else []
+    notes.append("required" if setting.required else f"default: {setting.default}")
+    return f"{shown:32}  {setting.label or setting.key} ({'; '.join(notes)})"
 
 
 def _print(line: str) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import ipaddress
+import re
 import socket
 
 from starlette.datastructures import Headers, MutableHeaders
@@ -12,17 +13,18 @@ from starlette.responses import PlainTextResponse
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from pebble.client.page import WebSettings
+from pebble.config.web import is_loopback
 from pebble.fleet import certificates
 
 MAX_BODY = 16 * 1024
 BODY_S = 10.0  # for a body to arrive
-_DEFAULT_PORTS = {"http": 80, "ws": 80, "https": 443, "wss": 443}
 _METHODS = ("GET", "HEAD", "POST")
 CONTENT_SECURITY_POLICY = (
     "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' blob:; font-src 'self'; "
     "connect-src 'self'; worker-src 'self'; media-src 'self' blob:; manifest-src 'self'; base-uri 'none'; "
-    "form-action 'self'; frame-ancestors 'none'"
+    "form-action 'self'; frame-ancestors 'none'; frame-src http: https:"  # streams of robots, by a person's click
 )
+_split = re.compile(r"(\[[0-9a-f:.]+\]|[^\[\]:@/\s]+)(?::\d{1,5})?", re.ASCII | re.IGNORECASE).fullmatch
 #: Added to each response that does not set them itself.
 _HEADERS = {
     "content-security-policy": CONTENT_SECURITY_POLICY,
@@ -40,7 +42,8 @@ class Guard:
     """ASGI middleware: refuses foreign hosts, foreign origins and large bodies, and adds the security headers.
 
     SameSite cookies do not keep out a page on another port of the same host, and a host name can be made to resolve to
-    this machine: therefore Host must be a known name, and Origin must be that host for each WebSocket and each POST.
+    this machine: therefore Host must be a known name, or an address, and Origin must be that host for each WebSocket
+    and each POST.
     """
 
     def __init__(self, app: ASGIApp, *, settings: WebSettings) -> None:
@@ -57,7 +60,7 @@ class Guard:
 
     async def _websocket(self, scope: Scope, receive: Receive, send: Send) -> None:
         headers = Headers(scope=scope)
-        if self._is_known(scope, headers) and _is_own_origin(scope, headers):
+        if self._is_known(headers) and _is_own_origin(scope, headers):
             await self._app(scope, receive, send)
             return
         await receive()
@@ -86,7 +89,7 @@ class Guard:
 
     def _refusal(self, scope: Scope, headers: Headers) -> tuple[int, str] | None:
         """Status and text, if this request must not go on."""
-        if not self._is_known(scope, headers):
+        if not self._is_known(headers):
             return 421, "this server has another name; start `pebble web` with --name for each name that it may have"
         if scope["method"] not in _METHODS:
             return 405, "use GET or POST"
@@ -97,24 +100,19 @@ class Guard:
                 return 415, "send JSON as application/json"
         return None
 
-    def _is_known(self, scope: Scope, headers: Headers) -> bool:
+    def _is_known(self, headers: Headers) -> bool:
         hosts = headers.getlist("host")
-        parsed = _split(hosts[0], _DEFAULT_PORTS[scope["scheme"]]) if len(hosts) == 1 else None
-        if parsed is None:
+        parts = _split(hosts[0]) if len(hosts) == 1 else None
+        if parts is None:
             return False
-        host, port = parsed
-        own_address, own_port = scope.get("server") or ("", None)
-        if f"{host}:{port}" in self._names:  # a name with its own port, as behind a forwarded one
-            return True
-        if port != own_port:
-            return False
-        wildcard = "*." + host.partition(".")[2]
-        return host in self._names or wildcard in self._names or host == canonical(own_address)
+        name = canonical(parts[1])
+        return is_address(name) or not self._names.isdisjoint((name, "*." + name.partition(".")[2]))
 
 
 def host_names(settings: WebSettings) -> frozenset[str]:
-    """The names by which browsers may address the server, besides the address at which a request arrives."""
-    names: set[str] = {"127.0.0.1", "::1", "localhost", *settings.names}
+    """The names by which browsers may address the server, besides addresses."""
+    names: set[str] = {"localhost"}
+    names |= {parts[1] for name in settings.names if (parts := _split(name)) is not None}  # behind a forwarded port
     if not is_loopback(settings.host):
         names.add(settings.host)
         own = socket.gethostname()
@@ -123,33 +121,22 @@ def host_names(settings: WebSettings) -> frozenset[str]:
     return frozenset(map(canonical, names))
 
 
-def is_loopback(host: str) -> bool:
+def is_address(name: str) -> bool:
     try:
-        return ipaddress.ip_address(host).is_loopback
+        ipaddress.ip_address(name)
     except ValueError:
-        return host == "localhost"
+        return False
+    return True
 
 
 def canonical(name: str) -> str:
-    """One spelling of a host name or address; also of ``name:port``."""
+    """One spelling of a host name or address."""
     try:
         address = ipaddress.ip_address(name.strip("[]").partition("%")[0])
     except ValueError:
         return name.lower().rstrip(".")
     mapped = getattr(address, "ipv4_mapped", None)
     return str(mapped or address)
-
-
-def _split(host: str, default_port: int) -> tuple[str, int] | None:
-    """Name and port of a Host header; None for what no browser sends."""
-    name, colon, port = host.rpartition(":")
-    if not colon or host.endswith("]"):
-        name, port = host, str(default_port)
-    if name.startswith("[") != name.endswith("]") or (":" in name and not name.startswith("[")):
-        return None
-    if not name or not port.isascii() or not port.isdigit() or len(port) > 5:
-        return None
-    return canonical(name), int(port)
 
 
 def _is_own_origin(scope: Scope, headers: Headers) -> bool:

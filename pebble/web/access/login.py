@@ -76,8 +76,6 @@ def session_of(connection: HTTPConnection) -> Session | None:
         session = named(LOCAL, connection.query_params.get("name", ""))
     elif token := connection.cookies.get(_cookie(settings)):
         session = connection.app.state.people.session(token)
-    if session is not None and connection.client is not None:
-        connection.app.state.recognise(connection.client, session.user if settings.login else "")
     return session
 
 

@@ -13,6 +13,7 @@ from typing import NamedTuple
 from msgspec.structs import replace
 
 from pebble.client.control import IDLE_S, ControlClient
+from pebble.client.drive_reasons import WORDS, Code, words
 from pebble.client.pace_of_link import WIDE, Pace
 from pebble.client.robot_view import RobotView
 from pebble.contract.payloads import ControlState, Drive
@@ -25,7 +26,7 @@ REPEATS_S = (0.1, 0.2)  # after a zero of the server's own
 TAKEN_FROM_IDLE_S = 5.0  # a driver who has not moved for so long is not asked
 AWAITED_S = 5.0  # a page that connects again
 
-LET_GO = "Let go first"
+LET_GO = WORDS["release"]
 ZERO, FINAL_ZERO = Drive(), Drive(valid_ms=0)
 
 
@@ -199,7 +200,7 @@ class DrivenRobot:
             self._changed.add(self.ref)
             return []
         if self.tab is not tab and not over and (who := self._active(now)):
-            failed(f"{who} is driving")
+            failed(words(Code.LEASE, driven=who))
             return []
         commands = [] if self.tab is tab else self._give(tab, None, now)
         granted()
@@ -354,14 +355,14 @@ class DrivenRobot:
     def _why_not(self, tab: Tab, op: DriveOp, now: float) -> str:
         if self.tab is not tab:
             other = self._active(now)
-            return f"{other} is driving" if other else "Take control to drive"
+            return words(Code.LEASE if other else Code.LISTENING, driven=other)
         if tab.moves is not None and (tab.gesture != op.g or tab.moves is not self):
             return LET_GO  # the end of the one before was lost
         if tab.moves is not None and now - self._received_at > SILENCE_S:
             return LET_GO  # the page stood still, or this process
         if problem := tab.clock.problem(now):
             return problem[0].upper() + problem[1:]
-        return "Commands are late" if tab.clock.late(op.t, now) else ""
+        return words(Code.LATE) if tab.clock.late(op.t, now) else ""
 
     def _zero(self, tab: Tab, op: DriveOp, now: float) -> list[Command]:
         """Forward it always. At the end of a gesture it is the release."""

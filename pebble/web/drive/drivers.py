@@ -134,7 +134,7 @@ class Drivers:
         """Publish drive commands of a person, each to the robot's own topic; False if one was not accepted."""
         accepted = True
         for ref, drive, qos in commands:
-            topic = self._robots.topic(ref, "drive", "topic", DRIVE)
+            topic = self._robots.topic(ref, DRIVE)
             accepted = self._broker.publish(topic, codec.encode(DRIVE, drive), qos=qos, by=by) and accepted
         if self._changed:
             self._robots.mark_drivers(set(self._changed))

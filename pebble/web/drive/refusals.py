@@ -51,6 +51,4 @@ class Refusals:
         return robot.situation(time.monotonic())._replace(problem=self._broker.problem)
 
     def _words(self, robot: RobotView, code: Code | None) -> str:
-        if code is Code.BROKER:
-            return f"The server cannot reach the broker: {self._broker.problem}"
-        return words(code, robot.name, stopped=robot.stopped_by)
+        return words(code, robot.name, stopped=robot.stopped_by, problem=self._broker.problem)

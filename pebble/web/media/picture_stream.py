@@ -12,7 +12,7 @@ from pebble.client.media_request.queue import NO_FRAME, Frame, ViewerQueue, asse
 from pebble.media.picture_header import PictureHeader, PictureSequence
 from pebble.web.media import rescue
 from pebble.web.media.connection import MediaConnection
-from pebble.web.media.rescue import FULL, SMALL, Form, RescuedPicture, RescueStream
+from pebble.web.media.rescue import RescuedPicture, RescueStream
 from pebble.web.media.stream import MediaStream
 from pebble.web.messages import PictureView
 from pebble.web.robots import Robots
@@ -26,6 +26,10 @@ _HEAD: Final = struct.Struct(">IB")
 _RESCUE_HEAD: Final = struct.Struct(">IBQ")
 
 
+#: What is shown of a robot whose pictures no page watches.
+AT_REST: Final = PictureView(state="rest", why="", encoding="", per_second=0, kbits=0, viewers=0)
+
+
 class PageViewer:
     """One page's queue, and how its sender is woken."""
 
@@ -37,10 +41,9 @@ class PageViewer:
 class PictureStream(MediaStream[PageViewer, PictureView]):
     """Gives the pictures of one robot to each viewer's queue."""
 
-    def __init__(self, connection: MediaConnection, robots: Robots, ref: str, pinned: str, show: Show) -> None:
-        super().__init__(connection, robots, ref, "video", show, rest(pinned))
+    def __init__(self, connection: MediaConnection, robots: Robots, ref: str, show: Show) -> None:
+        super().__init__(connection, robots, ref, "video", show, AT_REST)
         self.choice = EncodingChoice()
-        self.choice.pinned = pinned
         self._rescue = RescueStream(self._on_rescued)
         self._sequence = PictureSequence()
         self._chain: list[bytes] = []  # the newest key frame and all pictures since; empty: it would be too long
@@ -48,10 +51,6 @@ class PictureStream(MediaStream[PageViewer, PictureView]):
         self._seq = 0
 
     # -- pages
-
-    def pin(self, encoding: str) -> None:
-        self.choice.pinned = encoding
-        self._request.wake()
 
     def acknowledge(self, viewer: PageViewer, seq: int, what: int) -> None:
         """Take a page's answer: 0 drawn, 1 a key frame is wanted, 2 this encoding cannot be decoded there."""
@@ -69,18 +68,12 @@ class PictureStream(MediaStream[PageViewer, PictureView]):
         """The newest key frame and the differences since, if pictures are flowing."""
         return list(self._chain) if self._arrivals.flowing(time.monotonic()) else []
 
-    @property
-    def seq(self) -> int:
-        """The number of the newest frame."""
-        return self._seq
-
     # -- pictures
 
     def receive(self, payload: bytes) -> None:
         now = time.monotonic()
         header, fits = self._sequence.take(payload), self._sequence.complete
         if header is None:
-            self.refused += 1
             return
         self._note(header.encoding, len(payload), now)
         self._extend_chain(payload, header, fits=fits)
@@ -119,14 +112,13 @@ class PictureStream(MediaStream[PageViewer, PictureView]):
             viewer.queue.lost(now)
         self._request.wake()
 
-    def _on_rescued(self, form: Form, picture: RescuedPicture) -> None:
+    def _on_rescued(self, picture: RescuedPicture) -> None:
         seq = self._next_seq()
         data = _RESCUE_HEAD.pack(seq, 1, picture.captured_ms) + picture.jpeg
         frame = Frame(seq, data, "jpeg", keyframe=True)
         for viewer in self.viewers:
-            if viewer.queue.small is (form is SMALL):
-                viewer.queue.offer_rescue(frame)
-                viewer.wakeup.set()
+            viewer.queue.offer_rescue(frame)
+            viewer.wakeup.set()
 
     def _next_seq(self) -> int:
         self._seq = (self._seq + 1) % NO_FRAME  # NO_FRAME itself is no number
@@ -157,9 +149,7 @@ class PictureStream(MediaStream[PageViewer, PictureView]):
         can_rescue = not changing and not rescue.unavailable(self._arrivals.encoding)
         queues = [viewer.queue for viewer in self.viewers]
         wanted = assess(queues, self._arrivals.encoding, now, can_rescue=can_rescue)
-        small = {queue.small for queue in queues if queue.rescued}
-        if can_rescue and small:
-            self._rescue.forms = [SMALL if one else FULL for one in small]
+        if can_rescue and any(queue.rescued for queue in queues):
             self._rescue.start(self._chain)
             wanted = wanted or not self._chain  # it begins at a key frame, too
         else:
@@ -179,19 +169,13 @@ class PictureStream(MediaStream[PageViewer, PictureView]):
             per_second=rate,
             kbits=kbits,
             viewers=len(self.viewers),
-            pinned=self.choice.pinned,
         )
 
     def _end(self) -> None:
         self._rescue.stop()
-        self._show(self.ref, rest(self.choice.pinned))
+        self._show(self.ref, AT_REST)
 
     def _problem(self) -> str:
         lacking = sum(not viewer.queue.decodes(self._arrivals.encoding) for viewer in self.viewers)
         problem = rescue.unavailable(self._arrivals.encoding)
         return f"{lacking} of {len(self.viewers)} browsers cannot show it: {problem}" if problem and lacking else ""
-
-
-def rest(pinned: str) -> PictureView:
-    """What is shown of a robot whose pictures no page watches."""
-    return PictureView(state="rest", why="", encoding="", per_second=0, kbits=0, viewers=0, pinned=pinned)

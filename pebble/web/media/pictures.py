@@ -8,11 +8,10 @@ from weakref import WeakKeyDictionary
 
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
-from pebble.client.media_request.encoding_choice import BEST_FIRST
 from pebble.contract import CAMERA
 from pebble.web.media.connection import MediaConnection
-from pebble.web.media.picture_stream import PageViewer, PictureStream, rest
-from pebble.web.media.rescue import RescuedPicture, newest_jpeg
+from pebble.web.media.picture_stream import PageViewer, PictureStream
+from pebble.web.media.rescue import newest_jpeg
 from pebble.web.media.stream import Streams
 from pebble.web.messages import PictureView
 from pebble.web.robots import Robots
@@ -29,7 +28,6 @@ class MediaHub:
         self._connection, self._robots = connection, robots
         self._streams = Streams(CAMERA, connection, self._make)
         self._snapshots: WeakKeyDictionary[PictureStream, _Snapshot] = WeakKeyDictionary()
-        self._pinned: dict[str, str] = {}
 
     async def serve(self, websocket: WebSocket, ref: str, can: frozenset[str]) -> None:
         """Send the pictures of ``ref`` to a page that decodes ``can``, until either end closes the socket."""
@@ -41,18 +39,6 @@ class MediaHub:
             lambda _: _send(websocket, viewer),
             lambda stream: _receive(websocket, stream, viewer),
         )
-
-    def pin(self, ref: str, encoding: str) -> None:
-        """Request this encoding for all viewers; "" is automatic. One that the robot does not offer has no effect."""
-        if encoding not in BEST_FIRST or not self._robots.capabilities(ref):
-            self._pinned.pop(ref, None)
-        else:
-            self._pinned[ref] = encoding
-        stream = self._streams.get(ref)
-        if stream is not None:
-            stream.pin(self._pinned.get(ref, ""))
-        else:
-            self._show(ref, rest(self._pinned.get(ref, "")))
 
     async def snapshot(self, ref: str) -> bytes | None:
         """The newest picture as a JPEG, if pictures are flowing; it starts no camera."""
@@ -66,7 +52,7 @@ class MediaHub:
         await self._streams.close()
 
     def _make(self, ref: str) -> PictureStream:
-        return PictureStream(self._connection, self._robots, ref, self._pinned.get(ref, ""), self._show)
+        return PictureStream(self._connection, self._robots, ref, self._show)
 
     def _show(self, ref: str, view: PictureView) -> None:
         if self._robots.capabilities(ref):
@@ -78,7 +64,7 @@ class _Snapshot:
 
     def __init__(self) -> None:
         self._lock = asyncio.Lock()
-        self._taken: RescuedPicture | None = None
+        self._taken: bytes | None = None
         self._taken_at = float("-inf")
 
     async def take(self, stream: PictureStream) -> bytes | None:
@@ -89,7 +75,7 @@ class _Snapshot:
             if time.monotonic() - self._taken_at > _SNAPSHOT_S:
                 self._taken = await asyncio.to_thread(newest_jpeg, chain)
                 self._taken_at = time.monotonic()
-            return None if self._taken is None else self._taken.jpeg
+            return self._taken
 
 
 async def _send(websocket: WebSocket, viewer: PageViewer) -> None:

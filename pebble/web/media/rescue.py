@@ -1,8 +1,8 @@
 """Pictures as plain JPEGs, for pages that cannot decode a robot's encoding, or whose connection cannot carry it.
 
-One stream per robot for all who need it: the server decodes, and sends at most five pictures a second, always the
-newest; over a thin connection smaller ones, because a large one would delay everything else. cv2 and PyAV are
-imported with the first picture, for they take memory that most servers never need.
+One stream per robot for all who need it: the server decodes, and sends at most five small pictures a second, always the
+newest: a large one would delay everything else on a thin connection. cv2 and PyAV are imported with the first picture,
+for they take memory that most servers never need.
 """
 
 from __future__ import annotations
@@ -17,18 +17,9 @@ if TYPE_CHECKING:
     from pebble.media.decode import Decoded, VideoDecoder
 
 PERIOD_S: Final = 0.2
+WIDTH: Final = 480  # pixels, at most
+_QUALITY: Final = 50
 _MAX_WAITING_BYTES: Final = 16 << 20
-
-
-class Form(NamedTuple):
-    """What the pictures are like."""
-
-    quality: int
-    width: int | None = None  # pixels, at most; None: as they come
-
-
-FULL: Final = Form(60)
-SMALL: Final = Form(40, 320)
 
 
 class RescuedPicture(NamedTuple):
@@ -41,17 +32,16 @@ def unavailable(encoding: str) -> str:
     return f"this server cannot convert h264: it {pyav.INSTALL}" if encoding == "h264" and not pyav.installed() else ""
 
 
-def newest_jpeg(payloads: Sequence[bytes]) -> RescuedPicture | None:
-    """The last picture of a key frame and the differences after it. Takes milliseconds: call it on a thread."""
+def newest_jpeg(payloads: Sequence[bytes]) -> bytes | None:
+    """Return the last picture of a key frame and the differences after it, as large as it is. Call it on a thread."""
     decoded = _newest(_make_decoder(), payloads)
-    return None if decoded is None else _encode(decoded, FULL)
+    return None if decoded is None else _encode(decoded.picture)
 
 
 class RescueStream:
-    """Converts the pictures of one robot while it is started, to all ``forms``. All methods run on the event loop."""
+    """Converts the pictures of one robot while it is started. All methods run on the event loop."""
 
-    def __init__(self, ready: Callable[[Form, RescuedPicture], None]) -> None:
-        self.forms: Sequence[Form] = ()
+    def __init__(self, ready: Callable[[RescuedPicture], None]) -> None:
         self._ready = ready
         self._pending: list[bytes] = []
         self._fed = asyncio.Event()
@@ -89,8 +79,8 @@ class RescueStream:
             await self._fed.wait()
             self._fed.clear()
             batch, self._pending = self._pending, []
-            for form, picture in await asyncio.to_thread(_convert, decoder, batch, self.forms):
-                self._ready(form, picture)
+            if (picture := await asyncio.to_thread(_convert, decoder, batch)) is not None:
+                self._ready(picture)
             await asyncio.sleep(PERIOD_S)
 
 
@@ -100,11 +90,9 @@ def _make_decoder() -> VideoDecoder:
     return VideoDecoder()
 
 
-def _convert(
-    decoder: VideoDecoder, payloads: Sequence[bytes], forms: Sequence[Form]
-) -> list[tuple[Form, RescuedPicture]]:
+def _convert(decoder: VideoDecoder, payloads: Sequence[bytes]) -> RescuedPicture | None:
     newest = _newest(decoder, payloads)
-    return [] if newest is None else [(form, _encode(newest, form)) for form in forms]
+    return None if newest is None else RescuedPicture(_encode(newest.picture, WIDTH), newest.captured_ms or 0)
 
 
 def _newest(decoder: VideoDecoder, payloads: Sequence[bytes]) -> Decoded | None:
@@ -114,13 +102,10 @@ def _newest(decoder: VideoDecoder, payloads: Sequence[bytes]) -> Decoded | None:
     return newest
 
 
-def _encode(decoded: Decoded, form: Form) -> RescuedPicture:
+def _encode(picture: Any, width: int | None = None) -> bytes:
     import cv2
 
-    picture: Any = decoded.picture
-    height, width = picture.shape[:2]
-    if form.width is not None and width > form.width:
-        size = (form.width, max(1, height * form.width // width))
-        picture = cv2.resize(picture, size, interpolation=cv2.INTER_AREA)
-    jpeg = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, form.quality])[1]
-    return RescuedPicture(jpeg.tobytes(), decoded.captured_ms or 0)
+    height, own_width = picture.shape[:2]
+    if width is not None and own_width > width:
+        picture = cv2.resize(picture, (width, max(1, height * width // own_width)), interpolation=cv2.INTER_AREA)
+    return cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])[1].tobytes()

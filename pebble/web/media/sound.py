@@ -41,7 +41,6 @@ class SoundQueue:
     """The packets that wait for one page: the oldest is dropped for the newest. Pure."""
 
     def __init__(self) -> None:
-        self.dropped = 0
         self._queue: deque[bytes] = deque()
         self._bytes = self._sent = self._received = 0
 
@@ -50,7 +49,6 @@ class SoundQueue:
         self._bytes += len(payload)
         while len(self._queue) > MAX_PACKETS or self._bytes > MAX_BYTES:
             self._bytes -= len(self._queue.popleft())
-            self.dropped += 1
 
     def take(self) -> bytes | None:
         """The packet to send now; None if there is none, or too many are under way."""
@@ -107,7 +105,6 @@ class SoundStream(MediaStream[SoundPage, SoundView]):
     def receive(self, payload: bytes) -> None:
         encoding = _encoding(payload)
         if not encoding:
-            self.refused += 1
             return
         self._note(encoding, len(payload), time.monotonic())
         for viewer in self.viewers:
@@ -131,7 +128,7 @@ class SoundStream(MediaStream[SoundPage, SoundView]):
                 return
             self._begin(page, talk, now)
         if self._talk is not None and self._talk.takes(piece, now):
-            topic = self._robots.topic(self.ref, "audio", "uplink_topic", AUDIO_STREAM)
+            topic = self._robots.topic(self.ref, AUDIO_STREAM)
             packet = self._voice.packet(sound, time.time())
             if not self._broker.publish(topic, packet, qos=QoS(AUDIO_STREAM.default_qos)):
                 self._interrupt("The server cannot reach the broker")

@@ -74,7 +74,6 @@ class MediaStream(ABC, Generic[ViewerT, ViewT]):
         """``show`` tells pages of the robot's view; ``view`` is that of one at rest, which is shown already."""
         self.ref = ref
         self.viewers: set[ViewerT] = set()
-        self.refused = 0  # payloads that are nothing of this medium, or too large
         self.view = view  # as shown last
         self._shown_at = float("-inf")
         self._connection, self._broker, self._robots, self._show = connection, connection.broker, robots, show

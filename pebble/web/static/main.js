@@ -34,8 +34,6 @@ function join() {
     name: () => String(settings.name).slice(0, 32),
     onLogs: (message) => connection.onLogs?.(message),
     onDone: (message) => connection.answered(message),
-    onSeries: (message) =>
-      store.metrics(message.ref).length && store.set(message.ref, `web/series/${message.metric}`, message),
     onBye: (message) => {
       connection.bye = message.again ? null : message;
       connection.changed();

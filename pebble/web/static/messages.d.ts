@@ -17,7 +17,6 @@ export interface Echo {
 export interface Watch {
   op: "watch";
   ref: string;
-  series?: boolean;
 }
 
 export interface ReadLogs {
@@ -69,22 +68,10 @@ export interface EstopResetOp {
   owners: ShownOwner[];
 }
 
-export interface EncodingOp {
-  op: "encoding";
-  ref: string;
-  encoding: string;
-}
-
 export interface PictureFromOp {
   op: "picture-from";
   ref: string;
   source: string;
-}
-
-export interface StreamAddressOp {
-  op: "stream-address";
-  ref: string;
-  url: string;
 }
 
 export interface LightsOp {
@@ -158,6 +145,7 @@ export interface Welcome {
   now: number;
   recordings?: boolean;
   drives?: boolean;
+  words?: Record<string, string>;
 }
 
 export interface Ping {
@@ -196,14 +184,6 @@ export interface Done {
   cmd: string;
   ref: string;
   n?: number;
-}
-
-export interface Series {
-  op: "series";
-  ref: string;
-  metric: string;
-  now: number;
-  points: [number, any][];
 }
 
 export interface Bye {
@@ -287,7 +267,6 @@ export interface PictureView {
   per_second: number;
   kbits: number;
   viewers: number;
-  pinned: string;
 }
 
 export interface SoundView {
@@ -302,18 +281,10 @@ export interface PictureFrom {
   source: string;
 }
 
-export interface StreamAddress {
-  url: string;
-}
-
 export interface FlagsView {
   remote_mirror?: boolean | null;
   mqtt_audio?: boolean | null;
   mqtt_video?: boolean | null;
-}
-
-export interface RestartsView {
-  times: Record<string, number[]>;
 }
 
 export interface BrokerView {
@@ -331,12 +302,10 @@ export interface Metrics {
   "web/picture": PictureView;
   "web/sound": SoundView;
   "web/picture-from": PictureFrom;
-  "web/stream-address": StreamAddress;
   "web/flags": FlagsView;
-  "web/restarts": RestartsView;
   "web/broker": BrokerView;
 }
 
-export type FromPage = Hello | Echo | Watch | ReadLogs | Lease | DriveOp | StopOp | EstopOp | EstopEndOp | EstopResetOp | EncodingOp | PictureFromOp | StreamAddressOp | LightsOp | SoundboardOp | AutonomyOp | OutletOp | McuOp | ActionOp | FlagOp;
+export type FromPage = Hello | Echo | Watch | ReadLogs | Lease | DriveOp | StopOp | EstopOp | EstopEndOp | EstopResetOp | PictureFromOp | LightsOp | SoundboardOp | AutonomyOp | OutletOp | McuOp | ActionOp | FlagOp;
 
-export type ToPage = Welcome | Ping | State | Logs | Refused | Done | Series | Bye;
+export type ToPage = Welcome | Ping | State | Logs | Refused | Done | Bye;

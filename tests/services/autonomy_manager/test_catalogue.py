@@ -13,10 +13,10 @@ import msgspec
 import pytest
 
 from pebble.config import Config, parse
+from pebble.contract.forms import Setting, form
 from pebble.services.autonomy_manager import catalogue as catalogue_module
 from pebble.services.autonomy_manager import interpreter as interpreter_module
 from pebble.services.autonomy_manager.catalogue import MAX_SCRIPTS, Catalogue, files, roots
-from pebble.services.autonomy_manager.forms import Setting, form
 from pebble.services.autonomy_manager.interpreter import interpreter, lacking
 from pebble.services.autonomy_manager.script import Script
 

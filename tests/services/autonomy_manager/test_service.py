@@ -9,8 +9,8 @@ from typing import Any
 
 import pytest
 
+from pebble.contract.forms import Setting
 from pebble.runtime.runs import SUPERSEDED
-from pebble.services.autonomy_manager.forms import Setting
 from pebble.services.autonomy_manager.motor_owners import OVERRIDDEN
 from pebble.services.autonomy_manager.script import Dependency, Script
 from tests.services.autonomy_manager.fake_children import Bench, FakeChild

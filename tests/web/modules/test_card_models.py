@@ -6,7 +6,7 @@ import json
 from collections.abc import Callable
 from typing import Any
 
-from pebble.services.autonomy_manager.forms import Setting, SettingError, effective
+from pebble.contract.forms import Setting, SettingError, effective
 from tests.web.in_node import Rows, Script, evaluate, rows
 
 _STORED = """

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
 from typing import Any
 
 import pytest
 
+from pebble.client.drive_reasons import WORDS
 from tests.web.in_node import STATIC, Rows, Script, evaluate, rows
 
 # -- gestures: what is sent is listed as [gesture, z, final]
@@ -183,7 +185,7 @@ const mends = [
 """
 
 
-reasons = Script({"core/reasons.js": "driveReason, offReason"}, _SITUATION)
+reasons = Script({"core/reasons.js": "driveReason, offReason"}, _SITUATION + f"situation.words = {json.dumps(WORDS)};")
 
 
 def test_the_first_reason_counts() -> None:

@@ -23,7 +23,7 @@ const facts = {
   capabilities: { value: { drive: { available: true } } },
 };
 for (const [metric, value] of Object.entries(facts)) store.set(REF, metric, value);
-const you = { drives: true, rights: ["drive"] };
+const you = { drives: true, rights: ["drive"], words: {} };
 const socket = { state: "open", you, roundTripMs: 5, restart() {}, send: (op) => done.push(op.op) };
 const estop = { press: (_, why) => done.push(`estop: ${why}`) };
 const driver = new Driver({ socket, store, estop, reload: () => false });

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from tests.web.in_node import Rows, Script, evaluate, rows
+from tests.web.in_node import Rows, Script, rows
 
 _MODULES = {"core/series.js": "* as core", "core/plot-choices.js": "* as plots", "core/trail.js": "* as trail"}
 _PREPARED = """
@@ -60,45 +60,9 @@ TRAILS = {
 }
 # fmt: off
 RUN: Rows = {
-    "the past comes before what is live": ("""
-        one.push(10_000, 5); one.push(10_200, 6);
-        one.past([[8000, 1], [9000, 2], [9990, 5], [10_190, 6]]);
-        result = shown(one);""", [[8000, 1], [9000, 2], [10_000, 5], [10_200, 6]]),
-    "the past may arrive before anything live and twice": ("""
-        const past = [[8000, 1], [9000, 2], [9990, 5]];
-        one.past(past); one.push(10_000, 5); one.push(10_400, 6); one.past([...past, [10_390, 6]]);
-        result = shown(one);""", [[8000, 1], [9000, 2], [9990, 5], [10_400, 6]]),
-    "after a reconnect nothing is there twice and time never goes back": ("""
-        for (const [at, value] of [[1000, 1], [2000, 2], [3000, 3]]) one.push(at, value);
-        one.begin();
-        one.push(2990, 3);              // the newest value is sent again, and seems to be older
-        one.past([[2000, 2], [3004, 3]]);
-        one.push(9000, 4);
-        one.begin();
-        one.push(14_000, 8);
-        one.past([[1000, 1], [9010, 4], [10_000, 5], [11_000, 6], [13_990, 8]]);
-        one.push(13_000, 7);
-        result = shown(one);""", [[1000, 1], [2000, 2], [3000, 3], [9000, 4], [10_000, 5], [11_000, 6], [14_000, 8]]),
     "a value that is sent again a little later is no new one": (
         "one.push(1000, 1); one.begin(); one.push(1700, 1); one.push(2700, 1); result = shown(one);",
         [[1000, 1], [2700, 1]]),
-    # The server's values 1, 2, 3 … of 10 Hz arrive live, late by up to 100 ms, while connections come and go.
-    "random reconnects leave times growing and every value once": ("""
-        let seed = 7;
-        const random = () => (seed = (seed * 48271) % 2147483647) / 2147483647;
-        result = [];
-        for (let round = 0; round < 200; round++) {
-          const series = new core.Series(core.numbers, { spanMs: 1e9, most: 1e6 });
-          let open = true, asked = 0;
-          for (let n = 1; n < 300; n++) {
-            if (random() < 0.02) { open = !open; if (open) { series.begin(); asked = n + Math.floor(20 * random()); } }
-            if (open && random() < 0.9) series.push(n * 100 + 100 * random() * 0.9, n);
-            if (open && n === asked) series.past(Array.from({ length: n }, (_, i) => [100 * (i + 1), i + 1]));
-          }
-          const values = series.rows.map((row) => row.value);
-          const grows = (list) => list.every((one, index) => !index || one > list[index - 1]);
-          if (!grows(series.times) || !grows(values)) result.push([round, values]);
-        }""", []),
     "it is bounded in number and time": ("""
         for (let at = 0; at < 20_000; at++) one.push(at, at);
         const count = one.times.length;
@@ -106,8 +70,7 @@ RUN: Rows = {
         result = [count, one.times.length <= 183, one.times.at(-1) - one.times[0] < 183_000];""",
         [pytest.approx(1000, abs=63), True, True]),
     "what is cleared does not come back": ("""
-        one.push(1000, 1); one.push(2000, 2); one.clear(2500);
-        one.past([[500, 0], [1000, 1], [2000, 2]]); one.push(3000, 3);
+        one.push(1000, 1); one.push(2000, 2); one.clear(2500); one.push(3000, 3);
         result = shown(one);""", [[3000, 3]]),
     "a slow metric has longer gaps":
         ("for (let at = 0; at < 60_000; at += 5000) one.push(at, 1); result = one.gapMs;", 17_500),
@@ -153,24 +116,6 @@ def test_gaps_are_gaps() -> None:
     result = [one.columns(["value"], 600, 6400), one.gapMs];"""
     columns = [[500, 1000, 1500, 1501, 6000], [500, 1000, 1500, None, 6000]]
     assert run(steps) == [columns, 2000]
-
-
-def test_the_past_is_dropped_when_another_component_is_opened() -> None:
-    steps = """
-    const store = new Store(undefined, (flush) => flush());
-    const [goob, lamp] = ["pebble/robots/goob", "pebble/robots/minilamp"];
-    const commands = { askSeries: () => true };
-    const page = { store, connection: { isOpen: true, onChange: () => () => {} }, commands, driver: { ref: goob } };
-    const limits = { spanMs: 1e6, most: 1000 };
-    store.set(goob, "charge", 7);
-    const series = recorderOf(page, goob).follow("charge", "charge", (payload) => ({ value: payload }), limits);
-    store.set(goob, "web/series/charge", { now: store.now(), points: [[5000, 1]] });
-    store.set(goob, "web/series/imu", { now: store.now(), points: [] });
-    result = [series.rows.map((row) => row.value)];
-    recorderOf(page, lamp);
-    result.push(store.metrics(goob));"""
-    modules = {"core/store.js": "Store", "ui/parts/recorder.js": "recorderOf"}
-    assert evaluate(modules, steps) == [[1, 7], ["charge"]]
 
 
 @rows((run, RUN))

@@ -89,7 +89,7 @@ def test_the_service_that_keeps_restarting_is_found(at_goob: Console, stage: Sta
         assert at_goob.tab.until(lambda: child(stage, SERVICE) != 0)
         os.kill(child(stage, SERVICE), signal.SIGKILL)
         assert at_goob.tab.until(lambda count=count: f"restarted {count}×" in row.inner_text()), row.inner_text()
-    assert re.search(r"the last time \d s ago; 2× in the last 10 min; last exit: signal 9", row.inner_text())
+    assert "restarted 2×; last exit: signal 9" in row.inner_text()
     at_goob.test(f"logs-of-{SERVICE}").click()
     assert at_goob.tab.until(lambda: at_goob.test("log-service").input_value() == SERVICE, 2)
     at_goob.test("log-service").select_option("")

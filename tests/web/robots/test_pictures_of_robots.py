@@ -54,13 +54,6 @@ def test_the_fleet_never_starts_a_camera(browser: Browser, stage: Stage, wire: W
 def test_the_camera_runs_while_its_picture_is_shown(browser: Browser, stage: Stage, wire: Wire) -> None:
     with console(browser, stage, "fred") as robot, used(robot):
         assert robot.tab.until(lambda: wire.camera("fred"), 5)
-        robot.tab.gear()
-        robot.test("encoding").select_option("json")
-        assert robot.tab.until(
-            lambda: wire.last("fred/incoming/front-camera") == {"enabled": True, "encoding": "json"}, 5
-        )
-        assert robot.tab.until("window.pebble.video.info?.encoding === 'json'")
-        robot.test("encoding").select_option("")
         assert robot.tab.until("window.pebble.video.info?.encoding === 'h264'")
         robot.test("video").click()
         assert robot.tab.until("window.pebble.video.ref === ''", 1)

@@ -100,8 +100,6 @@ export class ControlSocket {
         return this.options.onRefused?.(message);
       case "done":
         return this.options.onDone?.(message);
-      case "series":
-        return this.options.onSeries?.(message);
       case "logs":
         return this.options.onLogs?.(message);
       case "bye":

@@ -129,6 +129,7 @@ export class Driver {
       reload: this.reload(),
       drives: this.socket.you?.drives !== false,
       rights: this.socket.you?.rights ?? [],
+      words: this.socket.you?.words ?? {},
       hidden: document.hidden,
       focus: document.hasFocus(),
       dialog: document.querySelector("dialog[open]") !== null,

@@ -6,7 +6,6 @@ const IDLE_MS = 5500; // the server lets a driver be replaced after 5 s without 
 export const SLOW_MS = 300; // from this round trip on, the speed is limited
 const LATE_MS = 600;
 export const SLOW_SPEED = 0.4;
-const LET_GO = "Let go first"; // the server says the same
 const RESET_MS = 600; // after a reset robots refuse a driver who has not paused for 0.5 s
 
 /** @typedef {{code: string, text: string, action?: Action, also?: Action}} Reason */
@@ -15,6 +14,7 @@ const RESET_MS = 600; // after a reset robots refuse a driver who has not paused
 /**
  * @typedef {object} Situation
  * @property {string} name of the component
+ * @property {Record<string, string>} words of the server, by code
  * @property {boolean} open whether the control socket is
  * @property {boolean} [connecting] for the first time
  * @property {string} broker why the server cannot reach the broker; "" it can
@@ -45,7 +45,7 @@ const RESET_MS = 600; // after a reset robots refuse a driver who has not paused
 /** Why nothing may be commanded at all. @param {Situation} s @returns {Reason|null} */
 export function offReason(s) {
   if (!s.open) return s.connecting ? reason("connecting", "Connecting to the server…") : reason("server", "No connection to the server");
-  if (s.broker) return reason("broker", `The server cannot reach the broker: ${s.broker}`);
+  if (s.broker) return say(s, "broker", { problem: s.broker });
   return null;
 }
 
@@ -55,60 +55,63 @@ export function driveReason(s) {
 }
 
 function pageReason(s) {
-  if (s.failed) return reason("failed", `This page does not work (${s.failed}): load it again`, { label: "Reload", kind: "reload" });
-  if (s.reload) return reason("reload", "This page is older than the server", { label: "Reload", kind: "reload" });
-  if (!s.drives) return reason("plain", "Driving needs https: this connection is not encrypted");
-  if (!s.rights.includes("drive")) return reason("role", "Log in as driver to drive", { label: "Log in", kind: "login" });
-  if (s.hidden) return reason("hidden", "This page is in the background");
+  if (s.failed) return { ...say(s, "failed", { part: s.failed }), action: RELOAD };
+  if (s.reload) return { ...say(s, "reload"), action: RELOAD };
+  if (!s.drives) return say(s, "plain");
+  if (!s.rights.includes("drive")) return { ...say(s, "role"), action: { label: "Log in", kind: "login" } };
+  if (s.hidden) return say(s, "hidden");
   return null;
 }
 
 function robotReason(s) {
-  if (!s.liveness || s.liveness.online === false) return reason("silent", silence(s));
-  if (s.estop?.latched) return reason("stopped", `Stopped by ${s.estop.by || "unknown"}`);
-  if (s.freeForMs < RESET_MS) return reason("reset", "It was just reset: wait a moment");
+  if (!s.liveness || s.liveness.online === false) return say(s, "silent", { name: s.name, since: silence(s) });
+  if (s.estop?.latched) return say(s, "stopped", { by: s.estop.by || "unknown" });
+  if (s.freeForMs < RESET_MS) return say(s, "reset");
   const drive = s.capabilities.drive;
-  if (drive?.available !== true || drive.controls === false) return reason("no-drive", `${s.name} does not drive`);
+  if (drive?.available !== true || drive.controls === false) return say(s, "no-drive", { name: s.name });
   return null;
 }
 
 function silence(s) {
   const since = s.liveness?.silent_s;
-  return since === null || since === undefined ? `${s.name} is offline` : `${s.name} is silent for ${Math.round(since)} s`;
+  return since === null || since === undefined ? "" : ` for ${Math.round(since)} s`;
 }
 
 function leaseReason(s) {
   if (s.driver?.you) return null;
   if (!s.driver?.by) {
     const runs = s.script?.running ? `${scriptName(s) || "A script"} runs. ` : "";
-    return reason("free", `${runs}Take control to drive`, { label: "Take control", kind: "take" });
+    const { code, text } = say(s, "free");
+    return { code, text: runs + text, action: TAKE };
   }
   const who = s.driver.device ? `${s.driver.by} (${s.driver.device})` : s.driver.by;
   if (s.driver.keeps) return askReason(s, who);
   if (s.driverIdleMs >= IDLE_MS) {
-    return reason("idle", `${who} has control, but does not drive`, { label: "Take control", kind: "take" });
+    return { ...say(s, "idle", { who }), action: TAKE };
   }
-  return reason("lease", `${who} is driving`, OVER);
+  return { ...say(s, "lease", { who }), action: OVER };
 }
 
+const RELOAD = /** @type {const} */ ({ label: "Reload", kind: "reload" });
+const TAKE = /** @type {const} */ ({ label: "Take control", kind: "take" });
 const OVER = /** @type {const} */ ({ label: "Hold to take over", kind: "take-over" });
 
 /** The robot itself decides: who drives it is asked, and who rests does not keep it. */
-function askReason({ driver, rights }, who) {
-  const also = rights.includes("take") ? OVER : undefined;
-  if (driver.asking) return { ...reason("asked", `${who} is asked for control`, { label: "Do not ask", kind: "give-up" }), also };
-  return { ...reason("lease", `${who} has control`, { label: "Ask for it", kind: "ask" }), also };
+function askReason(s, who) {
+  const also = s.rights.includes("take") ? OVER : undefined;
+  if (s.driver.asking) return { ...say(s, "asked", { who }), action: { label: "Do not ask", kind: "give-up" }, also };
+  return { ...say(s, "kept", { who }), code: "lease", action: { label: "Ask for it", kind: "ask" }, also };
 }
 
 function momentReason(s) {
-  if (s.loading) return reason("loading", "This screen is still loading");
-  if (s.dialog) return reason("dialog", "Close the panel first");
-  if (s.script?.running && s.capabilities.drive?.arbitrates !== true) return scriptReason(scriptName(s));
-  if (s.pictureAgeMs !== null && !(s.pictureAgeMs >= 0 && s.pictureAgeMs <= PICTURE_OLD_MS) && !s.inSight) return reason("picture", oldPicture(s), SEE);
-  if (s.roundTripMs >= LATE_MS) return reason("late", `Commands are late (${Math.round(s.roundTripMs)} ms)`);
-  if (s.padFrozen) return reason("pad", "The gamepad stands still: move its stick to neutral and back");
-  if (s.fromKeys && !s.focus) return reason("focus", "Click this page first: keys go to another window");
-  if (s.mustRelease) return reason("release", s.refusal && s.refusal !== LET_GO ? `${LET_GO}. It was: ${s.refusal}` : LET_GO);
+  if (s.loading) return say(s, "loading");
+  if (s.dialog) return say(s, "dialog");
+  if (s.script?.running && s.capabilities.drive?.arbitrates !== true) return scriptReason(s, scriptName(s));
+  if (s.pictureAgeMs !== null && !(s.pictureAgeMs >= 0 && s.pictureAgeMs <= PICTURE_OLD_MS) && !s.inSight) return { ...oldPicture(s), code: "picture", action: SEE };
+  if (s.roundTripMs >= LATE_MS) return say(s, "late", { by_ms: ` (${Math.round(s.roundTripMs)} ms)` });
+  if (s.padFrozen) return say(s, "pad");
+  if (s.fromKeys && !s.focus) return say(s, "focus");
+  if (s.mustRelease) return released(s);
   return null;
 }
 
@@ -117,20 +120,31 @@ function scriptName(s) {
   return typeof file === "string" ? file.slice(0, 40) : "";
 }
 
-function scriptReason(name) {
+function scriptReason(s, name) {
   const action = { label: `Stop ${name || "the script"}`, kind: "stop-script" };
-  return reason("script", `${name || "A script"} is driving: stop it first`, action);
+  return { ...say(s, "script", { script: name || "A script" }), action };
+}
+
+/** The server gives the same reason while a gesture that it has ended lasts. */
+function released(s) {
+  const { code, text } = say(s, "release");
+  return { code, text: s.refusal && s.refusal !== text ? `${text}. It was: ${s.refusal}` : text };
 }
 
 const SEE = { label: "I can see the robot", kind: "see" };
 
 function oldPicture(s) {
-  if (s.pictureAgeMs < 0) return "Pictures wait while you drive";
-  if (Number.isNaN(s.pictureAgeMs)) return "How old this stream is, is not known";
-  if (!Number.isFinite(s.pictureAgeMs)) return "There is no picture yet";
-  return `The picture is ${(s.pictureAgeMs / 1000).toFixed(1)} s old`;
+  if (s.pictureAgeMs < 0) return say(s, "picture-waits");
+  if (Number.isNaN(s.pictureAgeMs)) return say(s, "picture-unknown");
+  if (!Number.isFinite(s.pictureAgeMs)) return say(s, "picture-none");
+  return say(s, "picture", { age: (s.pictureAgeMs / 1000).toFixed(1) });
 }
 
-export function reason(code, text, action) {
-  return action ? { code, text, action } : { code, text };
+/** A state in the server's words, of which docs/words.md has the table. @returns {Reason} */
+function say(s, code, values = {}) {
+  return { code, text: (s.words[code] ?? code).replace(/{(\w+)}/g, (_, name) => values[name] ?? "") };
+}
+
+export function reason(code, text) {
+  return { code, text };
 }

@@ -1,8 +1,7 @@
-/** One metric over time: the server's past, then live values. Pure: times are passed in, in ms of the page's clock. */
+/** One metric over time. Pure: times are passed in, in ms of the page's clock. */
 
 import { isObject } from "./json.js";
 
-const SEAM_MS = 250; // the same value may arrive a little earlier or later by the two ways
 const REPEAT_MS = 1500; // after a new connection the newest value is sent again
 const GAP_MS = 2000; // at least so long without a value is a gap
 const GAP_PERIODS = 3.5;
@@ -72,34 +71,6 @@ export class Series {
     this.times.push(at);
     this.rows.push(row);
     this.trim(at);
-  }
-
-  /** What was sent before, oldest first; only what is missing is taken. @param {[number, unknown][]} points */
-  past(points) {
-    const times = [];
-    const rows = [];
-    let last = this.until + SEAM_MS;
-    for (const [at, payload] of points) {
-      const row = at > last && at < this.since - SEAM_MS ? this.pick(payload) : null;
-      if (!row || (rows.length && !this.differs(row, rows[rows.length - 1], at - times[times.length - 1]))) continue;
-      last = at;
-      times.push(at);
-      rows.push(row);
-    }
-    const end = this.since === Infinity ? (times.at(-1) ?? this.until) : this.since;
-    if (rows.length) {
-      let index = this.times.length;
-      while (index > 0 && this.times[index - 1] > this.until) index--;
-      this.times.splice(index, 0, ...times);
-      this.rows.splice(index, 0, ...rows);
-      this.version++;
-      if (this.newestAt < times[times.length - 1]) {
-        this.newestAt = times[times.length - 1];
-        this.newest = rows[rows.length - 1];
-      }
-      this.trim(this.newestAt);
-    }
-    this.until = Math.max(this.until, end);
   }
 
   /** @param {number} now */

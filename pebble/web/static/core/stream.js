@@ -1,7 +1,6 @@
 /** The stream that a robot serves itself, or that was entered for it: whether the page may show it in a frame. Pure. */
 
 const LONGEST = 500;
-/** The same rule as the server's: what that does not allow, the page's policy refuses. */
 const ADDRESS = /^https?:\/\/([a-z0-9]([a-z0-9.-]{0,252}[a-z0-9])?|\[[0-9a-f:.]{2,45}\])(:[0-9]{1,5})?([/?#][!-~]*)?$/i;
 
 /**

@@ -10,10 +10,7 @@ export function install(page) {
   /** Of a robot: the number that the answer carries, see Connection.answers; 0: it was not sent. */
   const ask = (op) => (socket.send({ ...op, n: ++asked }) ? asked : 0);
   Object.assign(commands, {
-    askSeries: (ref) => socket.send({ op: "watch", ref, series: true }),
-    setEncoding: (ref, encoding) => socket.send({ op: "encoding", ref, encoding }),
     setPictureFrom: (ref, source) => socket.send({ op: "picture-from", ref, source }),
-    setStreamAddress: (ref, url) => socket.send({ op: "stream-address", ref, url }),
     /** @param {string} ref @param {{r: number, g: number, b: number, period?: number}} colour each 0..1; seconds */
     setLights: (ref, colour) => ask({ op: "lights", ref, ...colour }),
     playSound: (ref, file, repeat = false) => ask({ op: "soundboard", ref, file, repeat }),

@@ -1,22 +1,17 @@
 // The services of a robot: which are well, which restart, and where their log lines are.
 
-import { html, useOnline, usePage, useTick, useValue } from "../parts/hooks.js";
+import { html, useOnline, usePage, useValue } from "../parts/hooks.js";
 import { logViewOf } from "../parts/log-view.js";
 import { plain } from "../parts/more-words.js";
-import { inner, isObject, mediaOf, roughly } from "../parts/words.js";
+import { inner, isObject, mediaOf } from "../parts/words.js";
 
 const MOST = 64;
-const RECENT_MS = 600_000;
-const OFTEN = 3; // restarts within that time
-const NOTED = 16; // the server's newest
 const SIGNS = { ready: "●", init: "○", restarting: "▲", failed: "✖", stopped: "■" };
 
 export function Services({ at, view }) {
   const { services, mcu } = inner(useValue(at, "status")) ?? {};
-  const times = useValue(at, "web/restarts")?.times ?? {};
   const online = useOnline(at);
   const media = mediaOf(useValue(at, "media-status"));
-  useTick(5000);
   if (!isObject(services)) return html`<p class="dim">It reports no services.</p>`;
   const names = Object.keys(services);
   return html`<ul class="services-list">
@@ -30,7 +25,6 @@ export function Services({ at, view }) {
           name=${name}
           online=${online}
           one=${services[name]}
-          times=${Object.hasOwn(times, name) ? times[name] : []}
         />`,
       )}
     ${names.length > MOST && html`<li class="dim">… ${names.length - MOST} more</li>`}
@@ -53,19 +47,18 @@ function mediaWords(report) {
   return report.running ? plain(report.doing ?? "running") : "rests";
 }
 
-function Service({ at, view, name, online, one, times }) {
+function Service({ at, view, name, online, one }) {
   const { store } = usePage();
   const state = plain(isObject(one) ? one.state : one);
   const bad = state === "failed" || state === "restarting";
-  const often = times.filter((t) => store.now() - t < RECENT_MS).length >= OFTEN;
   const entry = isObject(one) ? one : {};
-  const words = restartWords(entry, times, store.now());
+  const words = restartWords(entry);
   const logs = () => {
     logViewOf(store, at).choose({ service: name, rank: 0, search: "" });
     view?.reveal("logs");
   };
-  return html`<li class=${online ? (bad ? "bad" : often ? "often" : "") : "dim"} data-test=${`service-${name}`}>
-    <i aria-hidden="true">${often && !bad ? SIGNS.restarting : Object.hasOwn(SIGNS, state) ? SIGNS[state] : "○"}</i>
+  return html`<li class=${online ? (bad ? "bad" : "") : "dim"} data-test=${`service-${name}`}>
+    <i aria-hidden="true">${Object.hasOwn(SIGNS, state) ? SIGNS[state] : "○"}</i>
     <span class="services-name">${name.replaceAll("_", " ")}</span>
     <span class="services-state">${online ? "" : "was "}${state}</span>
     <button type="button" class="quiet" aria-label=${`Logs of ${name}`} data-test=${`logs-of-${name}`} onClick=${logs}>
@@ -91,17 +84,8 @@ function SerialLine({ name, online, line }) {
   </li>`;
 }
 
-/** @param {Record<string, any>} one @param {readonly number[]} times epoch ms @param {number} now @returns {string} */
-function restartWords(one, times, now) {
-  const count = Number.isFinite(one.restarts) ? one.restarts : 0;
-  if (count <= 0) return "";
-  const recent = times.filter((t) => now - t < RECENT_MS).length;
-  const last = times.length ? `the last time ${roughly(Math.max(0, now - times[times.length - 1]))} ago` : "before the server looked";
-  return [
-    `restarted ${count}×, ${last}`,
-    recent > 1 && `${recent}×${recent >= NOTED ? " or more" : ""} in the last 10 min`,
-    one.last_exit && `last exit: ${plain(one.last_exit)}`,
-  ]
-    .filter(Boolean)
-    .join("; ");
+/** @param {Record<string, any>} one @returns {string} */
+function restartWords(one) {
+  if (!(one.restarts > 0)) return "";
+  return [`restarted ${plain(one.restarts)}×`, one.last_exit && `last exit: ${plain(one.last_exit)}`].filter(Boolean).join("; ");
 }

@@ -2,7 +2,7 @@
 
 import * as browser from "../../core/browser.js";
 import { Boundary, html, useEffect, useLater, usePage, usePart, useRef, useState, useTick, useValue } from "./hooks.js";
-import { Route } from "./models.js";
+import { Route, read } from "./models.js";
 import { chargeWords, drawing, hasFace, looksOf } from "./looks.js";
 import { reported, roughly } from "./words.js";
 
@@ -198,10 +198,13 @@ export function Extra({ of, part, what, source, ...props }) {
   return body && html`<${Boundary} key=${source} what=${what}><${body[part]} source=${source} ...${props} /><//>`;
 }
 
+/** The stream that was entered for it in this browser; "" none. @param {string} at @returns {string} */
+export const useEntered = (at) => useValue(at, "web/entered") ?? read(`stream ${at}`, "");
+
 /** The address of its own stream: what was entered, else what it reports; "" none. @param {string} at */
 export function useStream(at) {
   const own = reported(useValue(at, "status"));
-  return useValue(at, "web/stream-address")?.url || own;
+  return useEntered(at) || own;
 }
 
 /** What people call it. @param {string} at @returns {string} */

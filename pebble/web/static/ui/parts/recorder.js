@@ -2,9 +2,6 @@
 
 import { Series } from "../../core/series.js";
 
-const ASKS_MS = 2000; // between two requests for the past: several widgets open at once
-const PAST = "web/series/"; // where main.js puts what the server has, by metric
-
 const recorders = new WeakMap(); // by store
 
 /** @param {any} page the services @param {string} ref @returns {Recorder} the one of this component */
@@ -18,21 +15,13 @@ export function recorderOf(page, ref) {
 }
 
 class Recorder {
-  constructor({ store, connection, commands, driver }, ref) {
+  constructor({ store }, ref) {
     this.store = store;
-    this.commands = commands;
-    this.driver = driver;
     this.ref = ref;
     /** @type {Map<string, Series>} */
     this.all = new Map();
-    this.askedAt = -Infinity;
-    let open = connection.isOpen;
-    const unsubscribe = connection.onChange(() => {
-      if (connection.isOpen && !open) this.ask(); // what was sent meanwhile
-      open = connection.isOpen;
-    });
     /** @type {(() => void)[]} */
-    this.ends = [unsubscribe];
+    this.ends = [];
   }
 
   /**
@@ -46,7 +35,6 @@ class Recorder {
     if (!series) {
       this.all.set(key, (series = new Series(pick, limits)));
       this.record(series, metric);
-      if (this.store.clock() - this.askedAt > ASKS_MS) this.ask();
     }
     return series;
   }
@@ -56,40 +44,21 @@ class Recorder {
     for (const series of this.all.values()) series.restart();
   }
 
-  ask() {
-    if (this.driver.ref !== this.ref) return; // another one is open meanwhile
-    if (this.commands.askSeries(this.ref)) this.askedAt = this.store.clock();
-  }
-
   /** @param {Series} series @param {string} metric */
   record(series, metric) {
     const { store, ref } = this;
     let known = null; // the store makes another one for each connection
-    const newest = () => {
+    const live = () => {
       const entry = store.get(ref, metric) ?? null;
       if (known && entry !== known) series.begin();
       known = entry;
-      return entry;
-    };
-    const live = () => {
-      const entry = newest();
       if (entry) series.push(entry.receivedAt, entry.value);
     };
-    const past = () => {
-      const message = store.get(ref, PAST + metric)?.value;
-      if (!message) return;
-      newest();
-      const now = message.now - store.offset; // the server's time, on the page's clock
-      series.past(message.points.map(([age, payload]) => [now - age, payload]));
-    };
     live();
-    past();
-    this.ends.push(store.subscribe(ref, metric, live), store.subscribe(ref, PAST + metric, past));
+    this.ends.push(store.subscribe(ref, metric, live));
   }
 
   close() {
     for (const end of this.ends) end();
-    const { store, ref } = this;
-    for (const metric of store.metrics(ref)) if (metric.startsWith(PAST)) store.drop(ref, metric);
   }
 }

@@ -2,7 +2,7 @@
 
 import * as more from "../../core/browser-more.js";
 import { MIXED, refusal } from "../../core/stream.js";
-import { html, useEffect, useMetrics, useModel, usePage, useRef, useState, useValue } from "../parts/hooks.js";
+import { html, useEffect, useMetrics, useModel, usePage, useRef, useValue } from "../parts/hooks.js";
 import { Model, read, write } from "../parts/models.js";
 import { Icon, Why, useName, useStream } from "../parts/parts.js";
 import { NewestOverlays, STALE_MS, contained, drawOverlays } from "../../media/overlays.js";
@@ -157,17 +157,7 @@ export function fileName(source, ms) {
 /** Open the stream that the robot serves by itself, or that was entered for it, and what to know of it. */
 function Stream({ source, wanted }) {
   const { video, driver } = usePage();
-  const [blocked, block] = useState(""); // the address that the page's policy refused
   const address = useStream(source);
-  useEffect(() => {
-    const violated = (event) => {
-      if (event.effectiveDirective !== "frame-src") return;
-      block(video.stream);
-      show(video, driver, "");
-    };
-    document.addEventListener("securitypolicyviolation", violated);
-    return () => document.removeEventListener("securitypolicyviolation", violated);
-  }, []);
   if (!address && !video.stream) return null;
   if (video.stream) {
     return html`<div class="stream-tools">
@@ -194,9 +184,6 @@ function Stream({ source, wanted }) {
     ${why && html`<${Why} id="why-stream">${why}<//>`}
     ${refused === MIXED &&
     html`<a class="button" href=${address} target="_blank" rel="noopener noreferrer">Open it in another tab</a>`}
-    ${blocked === address &&
-    html`<p class="why" role="status">This address is known only since the page was loaded.</p>
-      <button type="button" data-test="reload-stream" onClick=${() => location.reload()}>Reload</button>`}
   </div>`;
 }
 

@@ -2,35 +2,19 @@
 
 import { refusal } from "../../core/stream.js";
 import { html, usePage, useRefs, useState, useTick, useValue } from "../parts/hooks.js";
-import { Offers } from "../parts/models.js";
-import { Extra, Face, Why, useName } from "../parts/parts.js";
+import { Offers, write } from "../parts/models.js";
+import { Extra, Face, Why, useEntered, useName } from "../parts/parts.js";
 import { useReasons, whyNotEnd } from "../parts/why-not.js";
 import { nameIn } from "../parts/looks.js";
 
-const ENCODINGS = ["h264", "pbvz", "pbvd", "json", "jpeg"];
-
-/** Encoding and source, which count for everybody who looks at this component; and how the picture comes. */
+/** Its source, which counts for everybody who looks at this component; and how the picture comes. */
 export function PictureSettings({ at, source, offers, video, extras }) {
   const page = useReasons(at);
   const view = useValue(source, "web/picture");
-  const listed = offers.section("video").encodings;
-  const encodings = ENCODINGS.filter((one) => !Array.isArray(listed) || listed.includes(one) || one === view?.pinned);
   const why = whyNotEnd(page);
   const more = { disabled: Boolean(why), "aria-describedby": why ? "why-picture" : undefined };
   return html`<div class="picture-settings">
     <${PictureFrom} at=${at} source=${source} offers=${offers} more=${more} />
-    <label class="field"
-      ><span>Encoding <small>for everybody who watches</small></span>
-      <select
-        data-test="encoding"
-        value=${view?.pinned ?? ""}
-        ...${more}
-        onChange=${(event) => page.commands.setEncoding(source, event.currentTarget.value)}
-      >
-        <option value="">automatic</option>
-        ${encodings.map((one) => html`<option key=${one} value=${one}>${one}</option>`)}
-      </select></label
-    >
     ${why && html`<${Why} id="why-picture">${why}<//>`}
     <${Extra} of=${extras} part="Tools" what="More of the picture" source=${source} wanted=${video?.wanted ?? true} />
     <${StreamAddress} key=${source} source=${source} />
@@ -87,15 +71,16 @@ function PictureFrom({ at, source, offers, more }) {
   >`;
 }
 
-/** Enter the address of a stream, for everybody: of a camera that is beside the robot, for example. */
+/** Enter the address of a stream, for this browser: of a camera that is beside the robot, for example. */
 function StreamAddress({ source }) {
-  const page = useReasons(source);
-  const current = useValue(source, "web/stream-address")?.url ?? "";
+  const { store } = usePage();
+  const current = useEntered(source);
   const [typed, type] = useState(/** @type {string | null} */ (null)); // null: as it is
   const address = (typed ?? current).trim();
-  const why = whyNotEnd(page, "system") || (address && refusal(address, location));
+  const why = address && refusal(address, location);
   const set = (url) => {
-    page.commands.setStreamAddress(source, url);
+    write(`stream ${source}`, url);
+    store.set(source, "web/entered", url);
     type(null);
   };
   return html`<details class="stream-address">
@@ -121,9 +106,7 @@ function StreamAddress({ source }) {
       /></label>
       <button data-test="set-stream" disabled=${Boolean(why) || !address || address === current}>Use it</button>
       ${current &&
-      html`<button type="button" data-test="unset-stream" disabled=${whyNotEnd(page, "system") !== ""} onClick=${() => set("")}>
-        Use it no more
-      </button>`}
+      html`<button type="button" data-test="unset-stream" onClick=${() => set("")}>Use it no more</button>`}
       ${why && html`<${Why} id="why-stream-address">${why}<//>`}
     </form>
   </details>`;

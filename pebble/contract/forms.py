@@ -1,16 +1,21 @@
-"""The settings of a script: what operators see of them, and which of their values are accepted. Pure."""
+"""The settings of a script: what operators see of them, and which of their values are accepted. Pure.
+
+The manager that starts scripts, scripts themselves and programs of operators use these forms (paper A.8.11).
+"""
 
 import math
 import re
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from decimal import Decimal
 from typing import Any, Literal
 
-from msgspec import Struct
+from msgspec import Struct, ValidationError, convert
 
 MAX_SETTINGS = 64  # of one script
 MAX_TEXT = 256  # characters of a value
 
+_TYPES = ("string", "int", "float", "bool", "enum")
 _SHOWN = 100  # characters of a refused value
 _TRUE = frozenset(("1", "true", "yes", "on", "enabled", "enable"))
 _FALSE = frozenset(("0", "false", "no", "off", "disabled", "disable"))
@@ -67,6 +72,15 @@ class Setting(Struct, frozen=True, kw_only=True):
         return entry
 
 
+def listed(configs: object) -> list[Setting]:
+    """Return the settings that a robot lists of a script. What is none is left out; an unknown type is text."""
+    settings = []
+    for entry in configs if isinstance(configs, list) else ():
+        with suppress(ValidationError, TypeError, KeyError):
+            settings.append(convert(entry if entry["type"] in _TYPES else {**entry, "type": "string"}, Setting))
+    return settings
+
+
 def form(settings: Sequence[Setting]) -> list[dict[str, Any]]:
     """The entries that operators may set."""
     return [setting.entry() for setting in settings if not setting.names_file]
@@ -83,7 +97,7 @@ def effective(settings: Sequence[Setting], wanted: Mapping[str, Any]) -> dict[st
         if raw is None and setting.required:
             raise SettingError(f"Missing required config field '{setting.key}'")
         raw = setting.default if raw is None else raw
-        values[setting.key] = None if raw is None else _value(setting, raw)
+        values[setting.key] = None if raw is None else accepted(setting, raw)
     return values
 
 
@@ -101,7 +115,8 @@ def arguments(settings: Sequence[Setting], values: Mapping[str, Value]) -> list[
     return words
 
 
-def _value(setting: Setting, raw: Any) -> Value:
+def accepted(setting: Setting, raw: Any) -> Value:
+    """Return the value that ``raw``, of JSON or of a command line, gives this setting. Raises SettingError."""
     match setting.type:
         case "bool":
             return _bool(setting.key, raw)
