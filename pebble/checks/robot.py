@@ -1,9 +1,8 @@
 """Checks of the robot on this machine, by its config. They change nothing; an unreachable broker takes seconds."""
 
 import os
-import socket
 import stat
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 from pebble.checks import devices, media
@@ -12,7 +11,6 @@ from pebble.checks.check import SOON_DAYS, Check, CheckResult, State, failed, ok
 from pebble.checks.machine import MACHINE
 from pebble.checks.observer import Observer
 from pebble.checks.recorder import recorder
-from pebble.checks.users import user_name
 from pebble.checks.who import who_drives
 from pebble.client.connection import Target, connected
 from pebble.client.page import require_packages, settings_of
@@ -47,14 +45,12 @@ def run_directory(path: Path, uid: int) -> CheckResult:
         parent = next(folder for folder in path.parents if folder.exists())
         if os.access(parent, os.W_OK | os.X_OK):
             return ok(f"{path} will be created")
-        return failed(f"{path} cannot be created", f"sudo install -d -m 700 -o {user_name(os.geteuid())} {path}")
+        return failed(f"{path} cannot be created", f"sudo install -d -m 700 -o $USER {path}")
     status = path.lstat()
     if not stat.S_ISDIR(status.st_mode):
         return failed(f"{path} is not a directory", f"rm {path}")
     if status.st_uid != uid:
-        return failed(
-            f"{path} belongs to {user_name(status.st_uid)}, not to you", f"sudo chown {user_name(uid)} {path}"
-        )
+        return failed(f"{path} belongs to another user", f"sudo chown $USER {path}")
     if status.st_mode & 0o077:
         return warn(f"{path} is open to other users", f"chmod 700 {path}")
     return ok(str(path))
@@ -66,31 +62,9 @@ def state_directory(path: Path) -> CheckResult:
     if not existing.is_dir() or not os.access(existing, os.W_OK | os.X_OK):
         return warn(
             f"{path} cannot be written: an emergency stop ends with a power cut",
-            f"sudo install -d -m 700 -o {user_name(os.geteuid())} {path}, or set transport.state_dir",
+            f"sudo install -d -m 700 -o $USER {path}, or set transport.state_dir",
         )
     return ok(str(path) if existing == path else f"{path} will be created")
-
-
-def leftover_sockets(run_dir: Path, answers: Callable[[Path], bool]) -> CheckResult:
-    """Find sockets without a listening process; harmless, the next start removes those it uses."""
-    sockets = sorted(run_dir.glob("*.sock")) if os.access(run_dir, os.R_OK) else []
-    dead = [path for path in sockets if not answers(path)]
-    if dead:
-        return warn(f"left over from processes that are gone: {len(dead)}", "rm " + " ".join(map(str, dead)))
-    return ok(f"{len(sockets)} in use" if sockets else "none: the robot is not up")
-
-
-def is_listening(path: Path) -> bool:
-    """True if a process listens on this socket; one that is busy, or of another user, counts."""
-    with socket.socket(socket.AF_UNIX) as client:
-        client.settimeout(1.0)
-        try:
-            client.connect(os.fspath(path))
-        except (ConnectionRefusedError, FileNotFoundError):
-            return False
-        except OSError:
-            return True
-    return True
 
 
 # -- what it does
@@ -145,7 +119,6 @@ def _page_certificate(file: Path) -> CheckResult:
 ROBOT: tuple[Check[Config], ...] = (
     Check("security", who_drives),
     Check("run directory", lambda config: run_directory(config.run_dir(), os.geteuid())),
-    Check("sockets", lambda config: leftover_sockets(config.run_dir(), is_listening)),
     Check("state directory", lambda config: state_directory(config.state_dir())),
     Check("serial port", devices.serial_ports),
     Check("driving", driving),

@@ -1,7 +1,6 @@
 """Who can drive a robot now: in words, and by name where the folder of its fleet is at hand."""
 
 from collections.abc import Iterator
-from contextlib import suppress
 from pathlib import Path
 
 from pebble.checks.check import CheckResult, ok, some_of, warn
@@ -38,20 +37,6 @@ def who_drives(config: Config) -> Iterator[CheckResult]:
             "leave out security.strangers once all clients have names",
             _WHO,
         )
-
-
-def unknown_brokers(config: Config) -> Iterator[str]:
-    """Name those of several brokers that the fleet beside the config does not have: no file has their rules."""
-    remote = config.services.mqtt_bridge.remote_mqtt
-    for folder in _folders(config) if config.security.level != "open" and len(remote.hosts) > 1 else ():
-        with suppress(FleetError):  # of which the doctor tells
-            brokers = load(folder).brokers
-            known = {(broker.host, port) for broker in brokers for port in (broker.port, broker.unencrypted)}
-            for host, port in remote.places:
-                if (host, port) not in known:
-                    where = f"services.mqtt_bridge.remote_mqtt.hosts: {host}:{port}"
-                    doctor = "`pebble doctor` tries whether it lets everybody write"
-                    yield f"{where} is no broker of {folder / FLEET}, by this name: {doctor}"
 
 
 def _accounts(fleet: Fleet) -> str:
