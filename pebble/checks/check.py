@@ -12,7 +12,6 @@ from typing import Final, Generic, TypeVar
 from pebble.errors import PebbleError
 
 SOON_DAYS: Final = 14  # before its end, a certificate is warned of
-_TRIES: Final = 3  # of a check whose failure is doubtful
 
 Subject = TypeVar("Subject")
 
@@ -96,11 +95,9 @@ def _results(check: Check[Subject], subject: Subject, is_doubtful: Callable[[], 
     first = check.run(subject)
     if not isinstance(first, CheckResult):
         return first
-    for _ in range(_TRIES - 1):
-        if first.state is not State.FAILED or not is_doubtful():
-            break
-        again = check.run(subject)
-        if isinstance(again, CheckResult) and again.state is State.OK:
-            text = f"{again.text}; tried again, because this machine stalled: {first.text}, at first"
-            return (replace(again, text=text),)
+    if first.state is State.FAILED and is_doubtful():
+        for again in _results(check, subject, lambda: False):
+            if again.state is State.OK:
+                text = f"{again.text}; tried again, because this machine stalled: {first.text}, at first"
+                return (replace(again, text=text),)
     return (first,)

@@ -7,22 +7,15 @@ from pathlib import Path
 
 from pebble.checks import devices, media
 from pebble.checks.broker.of_config import brokers, page_brokers
-from pebble.checks.check import SOON_DAYS, Check, CheckResult, State, failed, ok, run, warn
+from pebble.checks.check import SOON_DAYS, Check, CheckResult, failed, ok, run, warn
 from pebble.checks.machine import MACHINE
-from pebble.checks.observer import Observer
 from pebble.checks.recorder import recorder
 from pebble.checks.who import who_drives
-from pebble.client.connection import Target, connected
 from pebble.client.page import require_packages, settings_of
 from pebble.config import Config
-from pebble.contract import STATUS
 from pebble.errors import PebbleError
 from pebble.fleet import certificates
-from pebble.runtime.parent import launcher_runs
 from pebble.transports.socket_paths import FRAMES_SOCKET, fits_socket
-
-_ANSWER_S = 2.0
-_DRIVEABLE = {"yes": State.OK, "unknown": State.WARN, "no": State.FAILED}
 
 
 def run_checks(config: Config | None) -> Iterator[CheckResult]:
@@ -70,25 +63,6 @@ def state_directory(path: Path) -> CheckResult:
 # -- what it does
 
 
-def driving(config: Config) -> Iterator[CheckResult]:
-    """Read on its own side whether it can be driven; nothing if it has no motors, or does not run."""
-    if not config.motor_lines() or not launcher_runs(config.run_dir()):
-        return
-    target = Target(config=config.path, program="doctor")
-    try:
-        with connected(target) as (transport, names):
-            robot = Observer(target, transport, names, names.base, [STATUS.filter(names.base)])
-            robot.wait(lambda: robot.view.driveable, _ANSWER_S)
-    except PebbleError as error:
-        yield failed(f"nothing reaches the running robot: {error}")
-        return
-    drives = robot.view.driveable
-    if drives is None:
-        yield warn("the running robot does not say whether it can be driven")
-    else:
-        yield CheckResult(_DRIVEABLE[drives.state], drives.doubt or "commands reach the motors")
-
-
 def operator_page(config: Config) -> Iterator[CheckResult]:
     """Check that the page that the robot itself serves can start; if it has users, only its own user can read that."""
     if not config.services.web_handler.enabled:
@@ -121,7 +95,6 @@ ROBOT: tuple[Check[Config], ...] = (
     Check("run directory", lambda config: run_directory(config.run_dir(), os.geteuid())),
     Check("state directory", lambda config: state_directory(config.state_dir())),
     Check("serial port", devices.serial_ports),
-    Check("driving", driving),
     Check("camera", media.cameras),
     Check("microphone", media.microphone),
     Check("codecs", media.codecs),

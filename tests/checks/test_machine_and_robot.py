@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import mmap
 import os
 import resource
 import socket
@@ -19,7 +18,7 @@ from pebble.checks.broker import login
 from pebble.checks.broker.account import robot_account
 from pebble.checks.broker.login_attempt import LoginAttempt, attempt
 from pebble.checks.check import CheckResult, State
-from pebble.checks.who import unknown_brokers, who_drives
+from pebble.checks.who import who_drives
 from pebble.config import load, parse
 from pebble.transports.settings import MqttSettings, TlsSettings
 from tests.fleet.brokers import FleetBroker, accounts
@@ -53,13 +52,6 @@ def levels(findings: Iterator[CheckResult]) -> list[str]:
 
 
 # -- the machine
-
-
-def test_packages() -> None:
-    assert machine.installed("paho-mqtt").state is State.OK
-    missing = machine.installed("no-such-package")
-    assert missing.state is State.FAILED
-    assert missing.fix.endswith("-m pip install no-such-package")
 
 
 def test_memory_lock() -> None:
@@ -97,18 +89,6 @@ def test_clock_synchronisation_by_systemd(
     assert machine.synchronised() is None
 
 
-def test_segments_in_use_are_no_leftovers(tmp_path: Path) -> None:
-    used, left = tmp_path / "1.zenoh", tmp_path / "2.zenoh"
-    assert machine.leftover_segments(tmp_path, Path("/proc")).state is State.OK
-    used.write_bytes(bytes(4096))
-    with used.open("r+b") as file, mmap.mmap(file.fileno(), 4096):
-        assert machine.leftover_segments(tmp_path, Path("/proc")).state is State.OK
-        left.write_bytes(bytes(4096))
-        finding = machine.leftover_segments(tmp_path, Path("/proc"))
-    assert finding.state is State.WARN
-    assert finding.fix == f"rm {left}"
-
-
 # -- the robot
 
 
@@ -123,18 +103,6 @@ def test_run_directory(tmp_path: Path) -> None:
     assert robot.run_directory(tmp_path / ("x" * 100), uid).state is State.FAILED
     (tmp_path / "file").touch()
     assert robot.run_directory(tmp_path / "file", uid).text.endswith("is not a directory")
-
-
-def test_leftover_sockets_are_found(tmp_path: Path) -> None:
-    assert robot.leftover_sockets(tmp_path / "missing", robot.is_listening).state is State.OK
-    with socket.socket(socket.AF_UNIX) as living, socket.socket(socket.AF_UNIX) as dying:
-        living.bind(str(tmp_path / "living.sock"))
-        living.listen()
-        assert robot.leftover_sockets(tmp_path, robot.is_listening).text == "1 in use"
-        dying.bind(str(tmp_path / "dead.sock"))
-        finding = robot.leftover_sockets(tmp_path, robot.is_listening)
-    assert finding.state is State.WARN
-    assert finding.fix == f"rm {tmp_path / 'dead.sock'}"
 
 
 def test_serial_port(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -298,9 +266,7 @@ def test_a_whole_robot_is_examined(tmp_path: Path, open_broker: Broker) -> None:
     findings = list(robot.run_checks(load(path)))
     failed = [finding.what.split(" ")[0] for finding in findings if finding.state is State.FAILED]
     assert failed == ["serial", "remote"]
-    assert {"eclipse-zenoh", "memory lock", "clock", "shared memory", "run directory", "sockets"} <= {
-        finding.what for finding in findings
-    }
+    assert {"memory lock", "clock", "run directory"} <= {finding.what for finding in findings}
     assert [finding for finding in findings if finding.state is not State.OK and not finding.fix] == []
 
 
@@ -348,17 +314,6 @@ def test_who_can_drive_is_shown_by_the_level_and_by_the_fleet_beside_the_config(
     (tmp_path / "fleet.json").write_text(json.dumps(fleet))
     found = list(who_drives(load(config)))
     assert [f"{result.state.value} {result.text}" for result in found] == expected
-
-
-def test_a_second_broker_that_the_fleet_does_not_have_is_named(tmp_path: Path) -> None:
-    config = tmp_path / "goob.json"
-    remote = {"hosts": ["broker.lab", "spare.lab:8884"], "port": 8883, "username": "goob", "tls": {"enabled": True}}
-    services = {"mqtt_bridge": {"enabled": True, "remote_mqtt": remote}}
-    config.write_text(json.dumps({"robot": {"id": "goob"}, "security": {"level": "login"}, "services": services}))
-    fleet = {"level": "login", "brokers": [{"host": "broker.lab", "port": 8883}]}
-    (tmp_path / "fleet.json").write_text(json.dumps(fleet))
-    (found,) = unknown_brokers(load(config))
-    assert "spare.lab:8884 is no broker of" in found
 
 
 def test_a_fleet_that_cannot_be_read_is_named(tmp_path: Path) -> None:

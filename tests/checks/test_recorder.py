@@ -19,7 +19,6 @@ from tests.recordings.playing import GOOB, Line, js, ms, write
 
 HOUR = "2023/11/14/20231114T221320Z-000001.state.mcap"
 BEGAN = ms(0) / 1000
-GB = 1 << 30
 
 
 def findings(folder: Path, now: float = BEGAN + 1000, **section: Any) -> list[CheckResult]:
@@ -122,22 +121,6 @@ def test_damaged_files_are_named(tmp_path: Path) -> None:
     path.rename(path.with_name(f"{path.name}.damaged"))
     (found,) = [one for one in findings(tmp_path) if "damaged files are kept" in one.text]
     assert (found.state, f"{path}.damaged" in found.text) == (State.WARN, True)
-
-
-def test_how_long_there_is_room(tmp_path: Path) -> None:
-    assert "is not known yet" in findings(tmp_path)[-1].text
-    path = recorded(tmp_path, seconds=3600.0)
-    assert "days at this rate" in findings(tmp_path, keep_bytes=0)[-1].text
-    limited = findings(tmp_path, keep_bytes=10 * path.stat().st_size)[-1]
-    assert (limited.state, limited.text) == (State.OK, "the last 10.0 hours are kept")
-
-
-def test_little_room_is_warned_of(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    path = recorded(tmp_path, seconds=3600.0)
-    usage = type("Usage", (), {"free": GB + 5 * path.stat().st_size})
-    monkeypatch.setattr("pebble.checks.recorder.shutil.disk_usage", lambda _folder: usage)
-    found = findings(tmp_path, keep_bytes=0, free_bytes=GB)[-1]
-    assert (found.state, found.text) == (State.WARN, "for 5.0 hours at this rate; then the oldest are deleted")
 
 
 def test_links_are_left_alone(tmp_path: Path) -> None:

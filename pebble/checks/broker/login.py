@@ -24,27 +24,19 @@ def broker(
 
     Above the level ``open`` one that lets everybody in is no mere warning.
     """
-    what = f"{name} {settings.host}:{settings.port}"
-    for result in _logins(settings, log_in, time.time() if now is None else now, level):
-        yield replace(result, what=what)
-
-
-def _logins(
-    settings: MqttSettings, log_in: Callable[..., LoginAttempt], now: float, level: SecurityLevel
-) -> Iterator[CheckResult]:
-    host, is_here = settings.host, is_loopback(settings.host)
+    what, is_here = f"{name} {settings.host}:{settings.port}", is_loopback(settings.host)
     answer = log_in(settings, login=True)
     if answer.code is None:
-        start = "sudo systemctl start mosquitto" if is_here else f"nc -vz {host} {settings.port}"
-        yield failed(f"cannot be reached: {answer.problem}", start)
+        start = "sudo systemctl start mosquitto" if is_here else f"nc -vz {settings.host} {settings.port}"
+        yield failed(f"cannot be reached: {answer.problem}", start, what)
         return
-    yield _own_login(settings, answer)
+    yield replace(_own_login(settings, answer), what=what)
     if answer.problem and not is_here:
-        fix = f"correct the addresses of {host} in your DNS, or start the brokers there"
-        yield warn(f"has addresses that do not answer: {answer.problem}", fix)
+        fix = f"correct the addresses of {settings.host} in your DNS, or start the brokers there"
+        yield warn(f"has addresses that do not answer: {answer.problem}", fix, what)
     without_name = answer if settings.username is None else log_in(settings, login=False)
-    yield _anonymous_login(without_name, level, is_here=is_here)
-    yield _encryption(settings, answer, now, is_here=is_here)
+    yield replace(_anonymous_login(without_name, level, is_here=is_here), what=what)
+    yield replace(_encryption(settings, answer, time.time() if now is None else now, is_here=is_here), what=what)
 
 
 def _own_login(settings: MqttSettings, answer: LoginAttempt) -> CheckResult:

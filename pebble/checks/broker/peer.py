@@ -9,16 +9,13 @@ import secrets
 import select
 import socket
 import struct
-import threading
 import time
-from collections import deque
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, nullcontext, suppress
-from dataclasses import dataclass, replace
-from typing import Any
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import replace
+from typing import NamedTuple
 
 from pebble.errors import TransportError
-from pebble.runtime.signals import handled_by
 from pebble.transports.base import Message
 from pebble.transports.credentials import Credentials
 from pebble.transports.hosts import Address
@@ -31,8 +28,7 @@ _QUIET_S = 0.3  # of silence, and four round trips: then nothing more comes
 _STEP_S = 0.05
 _KEEPALIVE_S = 60
 _AT_ONCE = 1000  # packets
-_MOST, _MOST_BYTES = 50_000, 128_000_000  # messages of one connection; a probe sends a thousand
-_TRIES = 3  # to take back what is retained
+_MOST = 5_000  # messages that one connection reads; a probe sends a thousand
 _RESET = struct.pack("ii", 1, 0)  # SO_LINGER that turns close() into a reset
 
 NAME = "pebble-doctor-of-a-broker"  # as long as the names of a robot's programs
@@ -46,9 +42,8 @@ class RefusedError(TransportError):
         self.code = code
 
 
-@dataclass(frozen=True, slots=True)
-class Received:
-    """``topic`` is below that of the probe; ``at``: when it was read (monotonic)."""
+class Received(NamedTuple):
+    """A message. ``topic`` is below that of the probe; ``at``: when it was read (monotonic)."""
 
     topic: str
     payload: bytes
@@ -60,13 +55,12 @@ class Peer(packets.Listener):
     """One connection, which reads in :meth:`BrokerTrial.wait`. Topics are below ``base``; whole ones if it is empty."""
 
     def __init__(self, trial: BrokerTrial, base: str, opening: Opening, *, bridge: bool) -> None:
-        self.received: deque[Received] = deque(maxlen=_MOST)
+        self.received: list[Received] = []
         self.acks: dict[int, int] = {}  # by message id: the code of MQTT 5
         self.granted: dict[int, bytes] = {}
         self.pongs: list[int] = []  # how many messages had been received at each answer to a ping
         self.code: int | None = None  # of CONNACK
         self.problem = ""
-        self._bytes = 0  # of payloads
         self._trial, self.base = trial, base
         self._client = Client(opening, self, bridge=bridge)
         self._client.open()
@@ -135,23 +129,16 @@ class Peer(packets.Listener):
         """Read what has come, and write what waits."""
         client = self._client
         try:
-            while not self._flooded and client.receive():
-                while not self._flooded and client.read(_AT_ONCE):
+            while len(self.received) < _MOST and client.receive():
+                while client.read(_AT_ONCE):
                     pass
         except packets.MalformedError as error:
             self.problem = f"it sends what is no MQTT: {error}"
-            client.close()
-        if self._flooded:
-            self.problem = "it does not stop sending"
             client.close()
         if client.owes:
             client.acknowledge()
         if client.waiting:
             client.write()
-
-    @property
-    def _flooded(self) -> bool:
-        return len(self.received) >= _MOST or self._bytes > _MOST_BYTES
 
     def on_accepted(self, accepted: packets.Accepted) -> None:
         del accepted
@@ -162,7 +149,6 @@ class Peer(packets.Listener):
         self.problem = reasons.connection_refused(code)
 
     def on_publication(self, topic: bytes, payload: bytes, first: int) -> None:
-        self._bytes += len(payload)
         below = topic.decode(errors="replace").removeprefix(f"{self.base}/")
         self.received.append(Received(below, payload, bool(first & packets.RETAIN), time.monotonic()))
 
@@ -270,36 +256,16 @@ class BrokerTrial:
             if not self.wait(lambda: seen() > before, quiet_s):  # noqa: B023
                 return
 
-    # -- what is left there
-
     def close(self) -> None:
-        """Remove all that is retained. Signals wait meanwhile."""
-        with _undisturbed():
-            self.begin("end")
-            for _ in range(_TRIES):
-                if not self.left:
-                    break
-                with suppress(TransportError):
-                    self._remove()
-
-    def _remove(self) -> None:
+        """Remove all that is retained; what the broker does not take back stays in ``left``."""
+        self.begin("end")
+        if not self.left:
+            return
         self.base = ""
-        peer = self.peer()
-        numbers = {topic: peer.publish(topic, b"", qos=self.qos, retain=True) for topic in list(self.left)}
-        done = self.wait(lambda: set(numbers.values()) <= peer.acks.keys() or peer.closed) if self.qos else peer.ping()
-        if done and not peer.closed:
-            self.left = {}
-        else:
-            self.left = {topic: None for topic, mid in numbers.items() if mid not in peer.acks}
-
-
-@contextmanager
-def _undisturbed() -> Iterator[None]:
-    """Let no signal interrupt what takes a moment; on other threads none does."""
-
-    def later(_signal: int, _frame: Any) -> None:
-        pass
-
-    on_main = threading.current_thread() is threading.main_thread()
-    with handled_by(later) if on_main else nullcontext():
-        yield
+        with suppress(TransportError):
+            peer = self.peer()
+            for topic in list(self.left):
+                peer.publish(topic, b"", retain=True)
+            if peer.ping():
+                self.left = {}
+            peer.leave()

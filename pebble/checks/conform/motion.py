@@ -12,7 +12,7 @@ import msgspec
 
 from pebble import contract as c
 from pebble.checks.check import Check, CheckResult, State, failed, ok, skipped
-from pebble.checks.conform.checks import commanded, controls, drives, free, freed, reset, stop, stops
+from pebble.checks.conform.checks import BY, commanded, controls, drives, free, freed, reset, stop, stops
 from pebble.checks.conform.control import DRIVES_S, SPEED, STEP_S, UNSEEN, Driver, named
 from pebble.checks.observer import ANSWER_S, Observer
 
@@ -68,18 +68,20 @@ def _are_wheels(value: Any) -> bool:
 
 
 @contextmanager
-def _at_the_wheel(robot: Observer) -> Iterator[Driver]:
-    """Take control and let go, so that a wait after a reset is over; at the end, too."""
-    driver = Driver(robot)
-    if robot.view.controlled:
-        driver.asks(for_ms=10_000)
-        robot.answers(lambda: driver.holds)
-    driver.send()
-    robot.wait(lambda: moves_until(robot, time.monotonic()) != float("inf"), ANSWER_S)
+def at_the_wheel(robot: Observer, by: str = BY, answer_s: float = ANSWER_S) -> Iterator[Driver]:
+    """Take control if it is free, and let go, so that a wait after a reset is over; at the end, too."""
+    driver = Driver(robot, by)
     try:
+        if robot.view.controlled:
+            driver.asks(for_ms=10_000)
+            robot.answers(lambda: driver.holds, answer_s)
+        if driver.may_drive:
+            driver.send()
+            robot.wait(lambda: moves_until(robot, time.monotonic()) != float("inf"), ANSWER_S)
         yield driver
     finally:
-        driver.send()
+        if driver.may_drive:
+            driver.send(valid_ms=0)
         driver.leaves()
 
 
@@ -111,13 +113,13 @@ def _moved(robot: Observer, since: float, why: str, fix: str) -> CheckResult:
 
 
 def dead_man(robot: Observer) -> CheckResult:
-    with _at_the_wheel(robot) as driver:
+    with at_the_wheel(robot) as driver:
         return _rest(robot, *driver.drive(), RESTS_S)
 
 
 def valid_ms(robot: Observer) -> CheckResult:
     """Drive by commands with a short time, and with one that is too long."""
-    with _at_the_wheel(robot) as driver:
+    with at_the_wheel(robot) as driver:
         outcome = _rest(robot, *driver.drive(valid_ms=150), 0.15)
         if outcome.state is not State.OK:
             return outcome
@@ -127,7 +129,7 @@ def valid_ms(robot: Observer) -> CheckResult:
 
 def zero(robot: Observer) -> CheckResult:
     """Send a zero that is not the driver's: it needs no key."""
-    with _at_the_wheel(robot) as driver:
+    with at_the_wheel(robot) as driver:
         began, _ = driver.drive()
         return _rest(robot, began, driver.send(key=_OTHER_KEY), 0.1, "a zero with another key")
 
@@ -138,7 +140,7 @@ def steering(robot: Observer) -> CheckResult:
         ({"z": SPEED}, (1, 1)),
         ({"z": -SPEED, "wrapped": True}, (-1, -1)),
     )
-    with _at_the_wheel(robot) as driver:
+    with at_the_wheel(robot) as driver:
         for fields, signs in ways:
             wheels = _moves(robot, driver.drive(DRIVES_S / 2, **fields)[0])
             if wheels is None:
@@ -151,7 +153,7 @@ def steering(robot: Observer) -> CheckResult:
 
 def stop_moving(robot: Observer) -> CheckResult:
     """Go on with commands, and begin again after the stick was let go; they move nothing."""
-    with _at_the_wheel(robot) as driver:
+    with at_the_wheel(robot) as driver:
         began, _ = driver.drive()
         at = time.monotonic()
         stop(robot, secrets.token_hex(8))
@@ -164,7 +166,7 @@ def stop_moving(robot: Observer) -> CheckResult:
 
 def reset_waits(robot: Observer) -> CheckResult:
     """Hold the stick down meanwhile. A zero of another ends no wait while one has control."""
-    with _at_the_wheel(robot) as driver:
+    with at_the_wheel(robot) as driver:
         stop(robot, secrets.token_hex(8))
         began, _ = driver.drive(2 * STEP_S)  # from before the reset on: a pause would end the wait
         reset(robot)
@@ -187,7 +189,7 @@ def reset_waits(robot: Observer) -> CheckResult:
 
 
 def not_a_number(robot: Observer) -> CheckResult:
-    with _at_the_wheel(robot):
+    with at_the_wheel(robot):
         began = time.monotonic()
         for number in (b"NaN", b"Infinity", b"1e999", b'"nan"', b"null"):
             robot.send(c.DRIVE, b'{"x": 0, "z": %s}' % number)
@@ -195,7 +197,7 @@ def not_a_number(robot: Observer) -> CheckResult:
 
 
 def clamped(robot: Observer) -> CheckResult:
-    with _at_the_wheel(robot) as driver:
+    with at_the_wheel(robot) as driver:
         wheels = _moves(robot, driver.drive(DRIVES_S / 2, z=9, x=-9)[0])
     if wheels is None:
         return skipped(_NOT_SHOWN, _SHOW_IT)
@@ -210,7 +212,7 @@ def clamped(robot: Observer) -> CheckResult:
 def foreign_key(robot: Observer) -> CheckResult:
     """Drive with another's key while one has control, and while none has."""
     why, fix = "it moves by another's key", "refuse what moves and has another key"
-    with _at_the_wheel(robot) as driver:
+    with at_the_wheel(robot) as driver:
         outcome = _moved(robot, driver.drive(key=_OTHER_KEY)[0], why, fix)
     if outcome.state is not State.OK:
         return outcome
@@ -218,7 +220,7 @@ def foreign_key(robot: Observer) -> CheckResult:
 
 
 def control_passes(robot: Observer) -> CheckResult:
-    with _at_the_wheel(robot) as driver:
+    with at_the_wheel(robot) as driver:
         began, _ = driver.drive()
         key, second = driver.key, Driver(robot)
         at = second.takes()
@@ -230,14 +232,14 @@ def control_passes(robot: Observer) -> CheckResult:
 
 
 def keyless(robot: Observer) -> CheckResult:
-    with _at_the_wheel(robot) as driver:
+    with at_the_wheel(robot) as driver:
         began, _ = driver.drive(key="")
         return _moved(robot, began, "it moves by a command without a key", "at level named refuse those")
 
 
 def foreign_account(robot: Observer) -> CheckResult:
     """Send the key of control behind another account, and behind none."""
-    with _at_the_wheel(robot) as driver:
+    with at_the_wheel(robot) as driver:
         command = msgspec.json.encode({"x": 0, "z": SPEED, "key": driver.key})
         began = time.monotonic()
         delivered = [robot.send_as(account, c.DRIVE, command) for account in (_OTHER_ACCOUNT, "")]

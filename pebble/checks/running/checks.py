@@ -182,16 +182,17 @@ def leftovers(robot: RobotUnderTest) -> CheckResult:
     here = [side for side in robot.sides if side.is_here(robot.config)]
     if not here:
         return skipped("other ids at a broker elsewhere are other robots")
+    others: set[str] = set()
     for side in here:
-        gone = sorted(side.others.keys() - side.live)
-        if gone:
+        topics, live = side.others()
+        others |= topics.keys()
+        if gone := sorted(topics.keys() - live):
             names = some_of([id_of(base) for base in gone], _SHOWN)
             remote = "" if side.own else " --remote"
-            topic = shlex.quote(min(side.others[gone[0]]))  # anybody may have chosen it
+            topic = shlex.quote(min(topics[gone[0]]))  # anybody may have chosen it
             fix = f"if they are gone: pebble topic pub {topic} '' --retain --force -c CONFIG{remote}, and so on"
             return failed(f"{len(gone)} that send no heartbeat: {names}", fix)
-    others = len({base for side in here for base in side.others})
-    return ok(f"none; {others} other robots are there" if others else "none")
+    return ok(f"none; {len(others)} other robots are there" if others else "none")
 
 
 _BOTH = (running, operators_side)

@@ -37,8 +37,8 @@ def _stopped(robot: RobotUnderTest, name: str) -> CheckResult:
         side.publish(sender.tick(time.monotonic()))
         return sender.confirmed
 
-    with side.heard_by(sender.receive):
-        robot.wait(confirmed, _CONFIRMED_S)
+    side.listeners.append(sender.receive)
+    robot.wait(confirmed, _CONFIRMED_S)
     if not sender.confirmed:
         return failed(
             f"NOT CONFIRMED after {_CONFIRMED_S:g} s: {stopped.why}", "pebble doctor CONFIG; pebble estop CONFIG"
