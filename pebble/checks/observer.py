@@ -72,15 +72,12 @@ class Observer:
     def read(self) -> None:
         while self._arrived:
             message, at, wall = self._arrived.popleft()
-            self.receive(message, at, wall)
+            record = self.record_of(message, at)
+            self.records.append(record)
+            self._of[record.channel].append(record)
+            self.view.receive(record.channel, message, at, wall)
             for listener in self.listeners:
                 listener(message, at)
-
-    def receive(self, message: Message, at: float, wall: float) -> None:
-        record = self.record_of(message, at)
-        self.records.append(record)
-        self._of[record.channel].append(record)
-        self.view.receive(record.channel, message, at, wall)
 
     def record_of(self, message: Message, at: float) -> Record:
         channel = self.channel_of(message.topic)

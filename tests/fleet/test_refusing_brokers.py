@@ -154,8 +154,7 @@ def test_a_tool_names_it(first: FleetBroker, second: FleetBroker, refusal: str, 
 def test_the_doctor_names_it(first: FleetBroker, second: FleetBroker, refusal: str, tmp_path: Path) -> None:
     REFUSALS[refusal][0](second, "page")
     (tmp_path / "page").write_text(first.passwords["page"])
-    places = {f"{HOST}:{one.port}" for one in (first, second)}
-    mqtt = {"hosts": sorted(places), "username": "page", "password_file": str(tmp_path / "page")}
+    mqtt = {"host": HOST, "port": second.port, "username": "page", "password_file": str(tmp_path / "page")}
     mqtt |= {"tls": {"enabled": True, "ca_cert": str(first.folder / CA_CERT)}}
     file = tmp_path / "page.json"
     file.write_text(json.dumps({"robot": {"id": "hall"}, "web_interface": {"mqtt": mqtt}}))

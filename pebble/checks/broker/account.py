@@ -29,17 +29,24 @@ def robot_account(
     base: str,
     answer_s: float = LEVELS["wide"].answer_s,
     level: SecurityLevel = "open",
+    reads: str = "",
 ) -> Iterator[CheckResult]:
     """Publish probes, which no program takes for anything else, below ``base``, and see when they come back.
 
     After ``answer_s`` one counts as lost. Above the level ``open`` one that poses as another robot has to be.
+    ``reads``: a filter that the broker must grant besides.
     """
     try:
         with _logged_in(settings, answer_s) as (trial, peer):
+            if reads and (peer.subscribe(reads) or b"\xff")[0] >= REFUSED:
+                text = f"a page with this account does not hear robots: the broker refuses it {reads}"
+                yield failed(text, "pebble fleet check; its role is page", what)
+                return
             topic = BRIDGE_PROBE.topic(base)
             peer.subscribe(topic)
             is_back, refusal = _echo(trial, peer, topic)
-            if refusal or not (is_back or settings.protocol == "5"):  # which says what it refuses
+            tells = settings.protocol == "5" and not reads  # what it refuses
+            if refusal or not (is_back or tells):
                 why = refusal or "it does not come back (or may this account not read it?)"
                 fix = f"allow it to write and read {topic.rpartition('/')[0]}/# on the broker"
                 yield failed(f"this account may not publish to {topic}: {why}", fix, what)
@@ -55,25 +62,8 @@ def robot_account(
 
 def page_account(what: str, settings: MqttSettings, level: SecurityLevel = "open") -> Iterator[CheckResult]:
     """Check that a page server with this account is sent what robots publish, and may publish itself."""
-    why = ""
-    try:
-        with _logged_in(settings, LEVELS["wide"].answer_s) as (trial, peer):
-            topic, states = BRIDGE_PROBE.topic(Identity("pebble", SERVERS, "doctor").base), ONLINE.filter("+/+/+")
-            if (peer.subscribe(states) or b"\xff")[0] >= REFUSED:
-                why = f"the broker refuses it {states}"
-            else:
-                peer.subscribe(topic)
-                is_back, refusal = _echo(trial, peer, topic)
-                why = "" if is_back else refusal or f"what it publishes on {topic} does not come back"
-            if not why:
-                yield ok("delivers what robots send, and takes what a page publishes", what=what)
-                if level != "open":
-                    yield _rules(what, trial, peer, topic)
-    except TransportError as error:
-        why = str(error)
-    if why:
-        fix = "pebble fleet check; its role is page"
-        yield failed(f"a page with this account does not hear robots: {why}", fix, what)
+    base, states = Identity("pebble", SERVERS, "doctor").base, ONLINE.filter("+/+/+")
+    return robot_account(what, settings, base, level=level, reads=states)
 
 
 @contextmanager

@@ -264,8 +264,7 @@ class BrokerTrial:
         self.base = ""
         with suppress(TransportError):
             peer = self.peer()
-            for topic in list(self.left):
-                peer.publish(topic, b"", retain=True)
-            if peer.ping():
+            numbers = {peer.publish(topic, b"", qos=self.qos, retain=True) for topic in list(self.left)}
+            if self.wait(lambda: numbers <= peer.acks.keys()) if self.qos else peer.ping():
                 self.left = {}
             peer.leave()

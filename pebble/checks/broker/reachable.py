@@ -1,12 +1,12 @@
 """Checks whether a broker that is meant for its machine alone also answers on the network."""
 
-import subprocess
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
 
 from pebble.checks.broker import MOSQUITTO
 from pebble.checks.broker.login_attempt import attempt
 from pebble.checks.check import CheckResult, ok, warn
+from pebble.checks.machine import printed
 from pebble.transports.settings import MqttSettings
 
 _TIMEOUT_S = 1.0  # these addresses are this machine's own
@@ -37,8 +37,4 @@ def beyond_loopback(name: str, settings: MqttSettings, addresses: Iterable[str])
 
 def own_addresses() -> list[str]:
     """Return the addresses of this machine on its networks; none on systems whose ``hostname`` does not tell them."""
-    try:
-        command = ["hostname", "-I"]
-        return subprocess.run(command, capture_output=True, text=True, timeout=_TIMEOUT_S, check=False).stdout.split()
-    except (OSError, subprocess.TimeoutExpired):
-        return []
+    return printed("hostname", "-I").split()
