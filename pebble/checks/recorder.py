@@ -1,4 +1,4 @@
-"""Checks of a robot's own recorder: does it run, and did it miss anything?"""
+"""Checks of a robot's own recorder: does it run, and is any file damaged?"""
 
 import json
 import time
@@ -10,12 +10,10 @@ from typing import Any, Final
 from pebble.checks.check import CheckResult, failed, ok, warn
 from pebble.config import Config
 from pebble.errors import PebbleError
-from pebble.recordings import catalogue
 from pebble.recordings.recorder.folder import Entry, Folder
 from pebble.recordings.recorder.metrics import STATUS
 
 _SILENT_S: Final = 30.0  # it writes its numbers every ten seconds
-_HOUR_S, _DAY_S = 3600.0, 86_400.0
 
 
 def recorder(config: Config, now: float | None = None) -> Iterator[CheckResult]:
@@ -33,7 +31,7 @@ def recorder(config: Config, now: float | None = None) -> Iterator[CheckResult]:
     try:
         entries = Folder(folder).entries()
         yield _running(folder, now, entries)
-        yield from _missed(entries, now)
+        yield from _damaged(entries)
     except (PebbleError, OSError) as error:
         yield failed(f"{folder} cannot be read: {error}")
 
@@ -64,23 +62,8 @@ def _status(folder: Path) -> dict[str, Any]:
     return status if isinstance(status, dict) else {}
 
 
-def _missed(entries: list[Entry], now: float) -> Iterator[CheckResult]:
-    """Find gaps of the last hour, and messages that damage has taken in the last day."""
-    newest = [entry for entry in entries if now - entry.ended <= _HOUR_S and not entry.is_media]
-    since_ms = 1000 * (now - _HOUR_S)
-    gaps = [
-        event
-        for event in catalogue.events(entry.path for entry in newest if entry.is_active or entry.is_finished)
-        if event["event"] == "gap" and event["t"] >= since_ms
-    ]
-    if gaps:
-        why = str(gaps[-1].get("why", "unknown"))[:100]
-        yield warn(f"{len(gaps)} gaps in the last hour, the last one because of: {why}")
+def _damaged(entries: list[Entry]) -> Iterator[CheckResult]:
     damaged = [entry for entry in entries if not (entry.is_finished or entry.is_active)]
     if damaged:
         text = f"{len(damaged)} damaged files are kept, beside what could be read of them: {damaged[0].path}"
         yield warn(text, "pebble recordings rm FILE deletes one")
-    finished = [entry for entry in entries if entry.is_finished and now - entry.ended <= _DAY_S]
-    missing = sum(catalogue.look_at(entry.path).missing for entry in finished)
-    if missing:
-        yield warn(f"{missing} messages of the last day are missing: files were damaged")

@@ -13,7 +13,6 @@ import pytest
 from pebble.checks.check import CheckResult, State
 from pebble.checks.recorder import recorder
 from pebble.config import parse
-from pebble.recordings.files.rewrite import rewrite
 from pebble.recordings.recorder.folder import Folder
 from tests.recordings.playing import GOOB, Line, js, ms, write
 
@@ -84,30 +83,6 @@ def test_files_that_were_left(tmp_path: Path) -> None:
     path.rename(path.with_name(f"{path.name}.active"))
     found = findings(tmp_path)[0]
     assert (found.state, found.fix) == (State.WARN, f"pebble recordings mend {tmp_path}")
-
-
-def test_gaps_of_the_last_hour_and_no_older_ones(tmp_path: Path) -> None:
-    def gap(at: float) -> Line:
-        return Line(
-            at, "$recorder/events", js(t=ms(at), event="gap", since=ms(at - 1), until=ms(at), why="broker lost")
-        )
-
-    recorded(tmp_path, gap(10), gap(800))
-    texts = [found.text for found in findings(tmp_path, BEGAN + 3900)]
-    assert "1 gaps in the last hour, the last one because of: broker lost" in texts
-    assert not [found for found in findings(tmp_path, BEGAN + 9000) if "gap" in found.text]
-
-
-def test_damage_is_counted(tmp_path: Path) -> None:
-    lines = [Line(at, f"{GOOB}/outgoing/sensors/imu", js(t=ms(at), n=at)) for at in range(1, 300)]
-    path = recorded(tmp_path, *lines)
-    data = bytearray(path.read_bytes())
-    data[400:420] = bytes(20)
-    path.write_bytes(data)
-    rewrite(path, tmp_path / "copy")
-    (tmp_path / "copy").replace(path)
-    os.utime(path, (BEGAN + 900, BEGAN + 900))
-    assert any("messages of the last day are missing: files were damaged" in one.text for one in findings(tmp_path))
 
 
 def test_without_the_package_it_fails(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -70,8 +70,7 @@ def page_account(what: str, settings: MqttSettings, level: SecurityLevel = "open
 def _logged_in(settings: MqttSettings, answer_s: float) -> Iterator[tuple[BrokerTrial, Peer]]:
     """Log one client in with the account, for whole topics. Raises TransportError."""
     with reached(settings, "") as trial:
-        trial.begin("account")
-        trial.base, trial.patience_s = "", answer_s
+        trial.patience_s = answer_s
         yield trial, trial.peer(protocol=settings.protocol)
 
 

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 
-from pebble.checks.broker.peer import BrokerTrial, RefusedError
+from pebble.checks.broker.peer import BrokerTrial
 from pebble.errors import TransportError
 from pebble.transports.hosts import Address, addresses_of, described
 from pebble.transports.mqtt import reasons
@@ -47,29 +47,20 @@ def attempt(settings: MqttSettings, *, login: bool, timeout_s: float = TIMEOUT_S
         return LoginAttempt(problem=error.strerror or str(error))
     answered, failures = LoginAttempt(), {}
     for address in addresses:
-        tried = _attempt(settings, address, timeout_s)
-        if tried.code is None:
-            failures[f"{address.text}:"] = tried.problem
-        else:
-            answered = tried
-        if tried.code == 0 or len(addresses) == 1:
-            break
-    return tried if len(addresses) == 1 else replace(answered, problem=described(failures))
-
-
-def _attempt(settings: MqttSettings, address: Address, timeout_s: float) -> LoginAttempt:
-    began = time.monotonic()
-    try:
-        trial = BrokerTrial(settings, address, "", patience_s=timeout_s)
-        peer = trial.peer()
-    except RefusedError as error:
-        return LoginAttempt(code=error.code, problem="" if error.code else str(error))
-    except TransportError as error:
-        return LoginAttempt(problem=str(error))
-    took_ms = 1000 * (time.monotonic() - began)
-    expires = _expiry(peer.sockets[0])
-    trial.close()
-    return LoginAttempt(code=0, took_ms=took_ms, expires=expires, address=address)
+        began = time.monotonic()
+        try:
+            trial = BrokerTrial(settings, address, "", patience_s=timeout_s)
+            expires = _expiry(trial.peer().sock)
+        except TransportError as error:
+            if (code := getattr(error, "code", None)) is None:
+                failures[f"{address.text}:"] = str(error)
+            else:
+                answered = LoginAttempt(code=code)
+            continue
+        answered = LoginAttempt(code=0, took_ms=1000 * (time.monotonic() - began), expires=expires, address=address)
+        trial.close()
+        break
+    return replace(answered, problem=described(failures) if len(addresses) > 1 else "".join(failures.values()))
 
 
 def _expiry(sock: object) -> float | None:

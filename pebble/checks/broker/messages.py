@@ -37,10 +37,9 @@ _ODD_TOPICS = {
 
 def rights(trial: BrokerTrial) -> CheckResult:
     """Publish and read; and find out for the other probes whether there is QoS 1, and whether anything is retained."""
-    below = trial.root.rpartition("/")[0]
     fix = (
         "use a robot's account and its topics: --below pebble/robots/ID; "
-        f"or allow these ({MOSQUITTO}an acl_file with topic readwrite {below}/#)"
+        f"or allow these ({MOSQUITTO}an acl_file with topic readwrite {trial.below}/#)"
     )
     reader, writer = trial.peer(), trial.peer()
     granted = reader.subscribe("#", qos=0)
@@ -63,7 +62,9 @@ def rights(trial: BrokerTrial) -> CheckResult:
     ]
     if lacks:
         return warn("; ".join(lacks), f"{MOSQUITTO}max_qos 2, retain_available true")
-    return ok(f"this account publishes and reads below {below}/; a round trip takes {1000 * trial.round_trip_s:.1f} ms")
+    return ok(
+        f"this account publishes and reads below {trial.below}/; a round trip takes {1000 * trial.round_trip_s:.1f} ms"
+    )
 
 
 def _acknowledges(trial: BrokerTrial) -> bool:
@@ -204,7 +205,7 @@ def overlaps(trial: BrokerTrial) -> CheckResult:
 def as_published(trial: BrokerTrial) -> CheckResult:
     lacks = {}
     for words, protocol, bridge in (("bridge mode of 3.1.1", "3.1.1", True), ("MQTT 5", "5", False)):
-        trial.begin(f"as-published-{protocol}")
+        trial.begin()
         try:
             peer = trial.peer(protocol=protocol, bridge=bridge)
             lacks[words] = _lacks_of_flags(trial, peer, modern=protocol == "5")

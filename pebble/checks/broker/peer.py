@@ -6,7 +6,6 @@ The transports hide what a broker lacks; here that is the result.
 from __future__ import annotations
 
 import secrets
-import select
 import socket
 import struct
 import time
@@ -25,7 +24,7 @@ from pebble.transports.settings import MqttSettings
 
 ANSWER_S = 3.0  # within which a broker answers, and four round trips
 _QUIET_S = 0.3  # of silence, and four round trips: then nothing more comes
-_STEP_S = 0.05
+_STEP_S = 0.001  # between two looks at what has come
 _KEEPALIVE_S = 60
 _AT_ONCE = 1000  # packets
 _MOST = 5_000  # messages that one connection reads; a probe sends a thousand
@@ -97,14 +96,14 @@ class Peer(packets.Listener):
 
     def cut(self) -> None:
         """Reset the connection: the broker publishes the will."""
-        if self._client.socket is not None:
-            self._client.socket.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, _RESET)
+        if self.sock is not None:
+            self.sock.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, _RESET)
         self._client.close()
 
     def acknowledge_late(self) -> None:
         """Let the kernel confirm what comes as late as it does for a program that sends nothing itself."""
-        if self._client.socket is not None and hasattr(socket, "TCP_QUICKACK"):
-            self._client.socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_QUICKACK, 0)
+        if self.sock is not None and hasattr(socket, "TCP_QUICKACK"):
+            self.sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_QUICKACK, 0)
 
     # -- what it saw
 
@@ -113,9 +112,8 @@ class Peer(packets.Listener):
         return self._client.socket is None
 
     @property
-    def sockets(self) -> tuple[socket.socket | None, bool]:
-        """Return the socket, and whether something waits to be written to it."""
-        return self._client.socket, bool(self._client.waiting)
+    def sock(self) -> socket.socket | None:
+        return self._client.socket
 
     def payloads(self, topic: str | None = None) -> list[bytes]:
         return [message.payload for message in self.received if topic in (None, message.topic)]
@@ -176,7 +174,7 @@ class Peer(packets.Listener):
 class BrokerTrial:
     """Peers at one broker, and what they left there. ``address``: of the host, one that accepted a login.
 
-    Everything is below ``{below}/{random digits}``, and what is retained there is removed by :meth:`close`.
+    Each probe has topics below ``{below}/{random digits}``, and what is retained there is removed by :meth:`close`.
     """
 
     def __init__(
@@ -188,8 +186,7 @@ class BrokerTrial:
         patience_s: float = ANSWER_S,
     ) -> None:
         self.settings, self.restart = settings, restart  # which has the broker restarted
-        self.root = f"{below}/{secrets.token_hex(8)}"
-        self.base = self.root  # of the probe that is made now
+        self.below, self.base = below, ""  # and that of the probe that is made now
         self.round_trip_s, self.patience_s = 0.0, patience_s
         self.qos, self.retains, self.wildcards = 1, True, True  # as found out by the first probe
         self._address = address
@@ -197,11 +194,11 @@ class BrokerTrial:
         self.left: dict[str, None] = {}  # topics that are retained, and not removed yet, in their order
         self._credentials = Credentials(settings)
 
-    def begin(self, name: str) -> None:
+    def begin(self) -> None:
         """Let the peers of the last probe leave, and give this one topics of its own."""
         for peer in self._peers:
             peer.leave()
-        self._peers, self.base = [], f"{self.root}/{name}"
+        self._peers, self.base = [], f"{self.below}/{secrets.token_hex(8)}"
 
     def peer(self, *, protocol: str = "3.1.1", bridge: bool = False, will: Message | None = None) -> Peer:
         """Connect a client, or raise RefusedError; the topic of ``will`` is below the probe's."""
@@ -237,12 +234,9 @@ class BrokerTrial:
                 peer.pump()
             if condition():
                 return True
-            left = end - time.monotonic()
-            sockets = [peer.sockets for peer in self._peers]
-            reading = [sock for sock, _ in sockets if sock is not None]
-            if left <= 0 or not reading:
+            if time.monotonic() >= end or all(peer.closed for peer in self._peers):
                 return False
-            select.select(reading, [sock for sock, writes in sockets if sock and writes], [], min(left, _STEP_S))
+            time.sleep(_STEP_S)
 
     def wait_quiet(self, *peers: Peer) -> None:
         """Wait until nothing more comes to these peers."""
@@ -258,7 +252,7 @@ class BrokerTrial:
 
     def close(self) -> None:
         """Remove all that is retained; what the broker does not take back stays in ``left``."""
-        self.begin("end")
+        self.begin()
         if not self.left:
             return
         self.base = ""
