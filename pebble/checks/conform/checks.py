@@ -72,8 +72,7 @@ def heartbeat(robot: Observer) -> CheckResult:
     beats = robot.of(c.ONLINE)
     if not beats:
         return failed("none arrived", 'publish {"t": <epoch ms>} on outgoing/online every 0.25 s to 1 s')
-    wrong = [beat.wrong for beat in beats if beat.wrong]
-    if wrong:
+    if wrong := [beat.wrong for beat in beats if beat.wrong]:
         return failed(wrong[0], 'its payload is {"t": <epoch milliseconds, an integer>}')
     gaps = [after.at - before.at for before, after in pairwise(beats)]
     interval = robot.view.liveness.interval_s
@@ -93,9 +92,8 @@ def clock(robot: Observer) -> CheckResult:
         return skipped("there is no heartbeat")
     off = newest[0].value.t / 1000 - time.time() + (time.monotonic() - newest[0].at)
     if abs(off) > _CLOCK_S:
-        return failed(
-            f"its clock is {abs(off):.0f} s {'ahead' if off > 0 else 'behind'}", "set it, by SNTP for example"
-        )
+        text = f"its clock is {abs(off):.0f} s {'ahead' if off > 0 else 'behind'}"
+        return failed(text, "set it, by SNTP for example")
     return ok(f"{1000 * off:+.0f} ms")
 
 
@@ -230,12 +228,12 @@ def owners(robot: Observer) -> CheckResult:
 
 def stop(robot: Observer, name: str) -> bool:
     robot.send(c.ESTOP, EstopCommand(stop=name, by=BY, why=_WHY))
-    return robot.answers(lambda: _has(robot, name))
 
+    def latches() -> bool:
+        owners = states(robot).values()
+        return bool(owners) and all(state.latched and name in state.recent for state in owners)
 
-def _has(robot: Observer, name: str) -> bool:
-    by_owner = states(robot)
-    return bool(by_owner) and all(state.latched and name in state.recent for state in by_owner.values())
+    return robot.answers(latches)
 
 
 def _counts(robot: Observer) -> dict[str, int]:
