@@ -1,7 +1,6 @@
 """Checks of the robot on this machine, by its config. They change nothing; an unreachable broker takes seconds."""
 
 import os
-import stat
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -15,7 +14,6 @@ from pebble.client.page import require_packages, settings_of
 from pebble.config import Config
 from pebble.errors import PebbleError
 from pebble.fleet import certificates
-from pebble.transports.socket_paths import FRAMES_SOCKET, fits_socket
 
 
 def run_checks(config: Config | None) -> Iterator[CheckResult]:
@@ -28,27 +26,6 @@ def run_checks(config: Config | None) -> Iterator[CheckResult]:
         yield from (result for _, result in run(ROBOT, config))
 
 
-# -- its folders
-
-
-def run_directory(path: Path, uid: int) -> CheckResult:
-    if not fits_socket(path / FRAMES_SOCKET):
-        return failed(f"{path} is too long for unix sockets", "set transport.run_dir to a shorter path")
-    if not path.exists():
-        parent = next(folder for folder in path.parents if folder.exists())
-        if os.access(parent, os.W_OK | os.X_OK):
-            return ok(f"{path} will be created")
-        return failed(f"{path} cannot be created", f"sudo install -d -m 700 -o $USER {path}")
-    status = path.lstat()
-    if not stat.S_ISDIR(status.st_mode):
-        return failed(f"{path} is not a directory", f"rm {path}")
-    if status.st_uid != uid:
-        return failed(f"{path} belongs to another user", f"sudo chown $USER {path}")
-    if status.st_mode & 0o077:
-        return warn(f"{path} is open to other users", f"chmod 700 {path}")
-    return ok(str(path))
-
-
 def state_directory(path: Path) -> CheckResult:
     """Find a place where an emergency stop cannot be saved: it would end with a power cut."""
     existing = next(folder for folder in (path, *path.parents) if os.access(folder, os.F_OK))
@@ -58,9 +35,6 @@ def state_directory(path: Path) -> CheckResult:
             f"sudo install -d -m 700 -o $USER {path}, or set transport.state_dir",
         )
     return ok(str(path) if existing == path else f"{path} will be created")
-
-
-# -- what it does
 
 
 def operator_page(config: Config) -> Iterator[CheckResult]:
@@ -92,7 +66,6 @@ def _page_certificate(file: Path) -> CheckResult:
 
 ROBOT: tuple[Check[Config], ...] = (
     Check("security", who_drives),
-    Check("run directory", lambda config: run_directory(config.run_dir(), os.geteuid())),
     Check("state directory", lambda config: state_directory(config.state_dir())),
     Check("serial port", devices.serial_ports),
     Check("camera", media.cameras),

@@ -92,19 +92,6 @@ def test_clock_synchronisation_by_systemd(
 # -- the robot
 
 
-def test_run_directory(tmp_path: Path) -> None:
-    own, uid = tmp_path / "run", os.geteuid()
-    assert robot.run_directory(own, uid).text.endswith("will be created")
-    own.mkdir(mode=0o700)
-    assert robot.run_directory(own, uid).state is State.OK
-    own.chmod(0o755)
-    assert robot.run_directory(own, uid) == CheckResult(State.WARN, f"{own} is open to other users", f"chmod 700 {own}")
-    assert robot.run_directory(own, uid + 1).fix.startswith("sudo chown")
-    assert robot.run_directory(tmp_path / ("x" * 100), uid).state is State.FAILED
-    (tmp_path / "file").touch()
-    assert robot.run_directory(tmp_path / "file", uid).text.endswith("is not a directory")
-
-
 def test_serial_port(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     missing = devices.serial_port(tmp_path / "ttyACM0", "a.b")
     assert missing.state is State.FAILED
@@ -266,7 +253,7 @@ def test_a_whole_robot_is_examined(tmp_path: Path, open_broker: Broker) -> None:
     findings = list(robot.run_checks(load(path)))
     failed = [finding.what.split(" ")[0] for finding in findings if finding.state is State.FAILED]
     assert failed == ["serial", "remote"]
-    assert {"memory lock", "clock", "run directory"} <= {finding.what for finding in findings}
+    assert {"memory lock", "clock", "state directory"} <= {finding.what for finding in findings}
     assert [finding for finding in findings if finding.state is not State.OK and not finding.fix] == []
 
 

@@ -67,12 +67,13 @@ class Driver:
 
     @property
     def key(self) -> str:
-        """Return the key of its control; empty while it has none."""
-        return str(self.state.key) if self.state and self.state.id == self.id else ""
+        """Return the keys of its control, one of each motor owner; empty while it has none."""
+        keys = [state.key for state in self._robot.view.control.states if state.id == self.id]
+        return " ".join(keys) if self.holds else ""
 
     @property
     def holds(self) -> bool:
-        return self.key != ""
+        return self.state is not None and self.state.id == self.id and self.state.key != ""
 
     @property
     def may_drive(self) -> bool:
