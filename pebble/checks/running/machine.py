@@ -86,10 +86,7 @@ def disk(robot: RobotUnderTest) -> CheckResult:
     """Check that stops, people and the audit can go on being saved."""
     folder = Path(os.path.normpath(robot.config.state_dir()))  # a config may name it by ../..
     existing = next(place for place in (folder, *folder.parents) if place.exists())
-    return disk_of(folder, os.statvfs(existing))
-
-
-def disk_of(folder: Path, room: os.statvfs_result) -> CheckResult:
+    room = os.statvfs(existing)
     free, whole = room.f_bavail * room.f_frsize, room.f_blocks * room.f_frsize
     text = f"{free / 1e9:.1f} of {whole / 1e9:.1f} GB are free at {folder}"
     if room.f_flag & os.ST_RDONLY:
