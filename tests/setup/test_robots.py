@@ -97,8 +97,8 @@ def test_a_name_that_was_changed_in_the_config_keeps_its_account(root: Path) -> 
     ("user", "password", "shown"),
     [
         ("goob", None, []),
-        ("goob", "wrong-password", ["not authorised"]),
-        ("eve", None, ["not authorised"]),
+        ("goob", "wrong-password", ["not authorized"]),
+        ("eve", None, ["not authorized"]),
     ],
     ids=("right", "wrong password", "no account"),
 )

@@ -5,12 +5,14 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 
 from pebble.checks.broker import MOSQUITTO
-from pebble.checks.broker.login_attempt import REFUSED_ID, REFUSED_LOGINS, LoginAttempt, attempt
+from pebble.checks.broker.login_attempt import LoginAttempt, attempt
 from pebble.checks.check import SOON_DAYS, CheckResult, failed, ok, warn
 from pebble.config.secret_text import shown_user
 from pebble.config.security import SecurityLevel
 from pebble.config.web import is_loopback
 from pebble.transports.settings import MqttSettings
+
+_REFUSED_ID = 2  # a return code of CONNACK (MQTT 3.1.1, table 3.1)
 
 
 def broker(
@@ -42,10 +44,9 @@ def broker(
 def _own_login(settings: MqttSettings, answer: LoginAttempt) -> CheckResult:
     if answer.code == 0:
         return ok(f"answers, and lets it in within {answer.took_ms:.1f} ms")
-    if answer.code == REFUSED_ID:
-        fix = "let it admit any client id, or set remote_mqtt.client_id to one that it knows"
-        return failed("refuses the client id", fix)
-    why = REFUSED_LOGINS.get(answer.code or 0, f"code {answer.code}")
+    why = answer.refusal
+    if answer.code == _REFUSED_ID:
+        return failed(why, "let it admit any client id, or set remote_mqtt.client_id to one that it knows")
     if settings.username is None:
         return failed(f"refuses the login: {why}", "set username and password_file of this broker")
     user = shown_user(settings.username)

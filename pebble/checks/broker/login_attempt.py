@@ -13,9 +13,6 @@ from pebble.transports.mqtt import reasons
 from pebble.transports.settings import MqttSettings
 
 TIMEOUT_S = 3.0
-REFUSED_ID = 2
-#: Return codes of CONNACK (MQTT 3.1.1, table 3.1) that concern the login.
-REFUSED_LOGINS = {4: "user name or password is wrong", 5: "not authorised"}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -30,6 +27,11 @@ class LoginAttempt:
     problem: str = ""
     expires: float | None = None  # the broker's certificate, in epoch seconds
     address: Address | None = None  # that accepted the login
+
+    @property
+    def refusal(self) -> str:
+        """Return why there was no login; empty: it was accepted."""
+        return self.problem if self.code is None else reasons.connection_refused(self.code) * bool(self.code)
 
 
 def attempt(settings: MqttSettings, *, login: bool, timeout_s: float = TIMEOUT_S) -> LoginAttempt:
@@ -74,8 +76,7 @@ def reached(settings: MqttSettings, below: str, restart: Callable[[], bool] | No
     """Try the broker at the address that accepts a login; at the end everything is removed. Raises TransportError."""
     answer = attempt(settings, login=True)
     if answer.address is None:
-        why = answer.problem or reasons.connection_refused(answer.code or 0)
-        raise TransportError(f"broker {settings.host}:{settings.port} cannot be used: {why}")
+        raise TransportError(f"broker {settings.host}:{settings.port} cannot be used: {answer.refusal}")
     trial = BrokerTrial(settings, answer.address, below, restart)
     try:
         yield trial
