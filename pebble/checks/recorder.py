@@ -31,7 +31,9 @@ def recorder(config: Config, now: float | None = None) -> Iterator[CheckResult]:
     try:
         entries = Folder(folder).entries()
         yield _running(folder, now, entries)
-        yield from _damaged(entries)
+        if damaged := [entry for entry in entries if not (entry.is_finished or entry.is_active)]:
+            text = f"{len(damaged)} damaged files are kept, beside what could be read of them: {damaged[0].path}"
+            yield warn(text, "pebble recordings rm FILE deletes one")
     except (PebbleError, OSError) as error:
         yield failed(f"{folder} cannot be read: {error}")
 
@@ -60,10 +62,3 @@ def _status(folder: Path) -> dict[str, Any]:
     except (OSError, ValueError):
         return {}
     return status if isinstance(status, dict) else {}
-
-
-def _damaged(entries: list[Entry]) -> Iterator[CheckResult]:
-    damaged = [entry for entry in entries if not (entry.is_finished or entry.is_active)]
-    if damaged:
-        text = f"{len(damaged)} damaged files are kept, beside what could be read of them: {damaged[0].path}"
-        yield warn(text, "pebble recordings rm FILE deletes one")

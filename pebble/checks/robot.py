@@ -51,17 +51,15 @@ def operator_page(config: Config) -> Iterator[CheckResult]:
         yield warn("is not encrypted: passwords can be read", "pebble cert init")
     else:
         yield ok(f"port {settings.port} of {settings.host}")
-    if settings.certificate is not None:
-        yield _page_certificate(settings.certificate)
-
-
-def _page_certificate(file: Path) -> CheckResult:
+    if settings.certificate is None:
+        return
     try:
-        days = certificates.show(file).days_left
+        days = certificates.show(settings.certificate).days_left
     except certificates.CertificateError as error:
-        return failed(str(error), "pebble cert init")
+        yield failed(str(error), "pebble cert init")
+        return
     text = f"its certificate ends in {days:.0f} days"
-    return ok(text) if days >= SOON_DAYS else warn(text, "pebble cert renew")
+    yield ok(text) if days >= SOON_DAYS else warn(text, "pebble cert renew")
 
 
 ROBOT: tuple[Check[Config], ...] = (

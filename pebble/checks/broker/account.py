@@ -5,7 +5,6 @@ from __future__ import annotations
 import secrets
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import replace
 
 from pebble.checks.broker.login_attempt import reached
@@ -37,7 +36,9 @@ def robot_account(
     ``reads``: a filter that the broker must grant besides.
     """
     try:
-        with _logged_in(settings, answer_s) as (trial, peer):
+        with reached(settings, "") as trial:
+            trial.patience_s = answer_s
+            peer = trial.peer(protocol=settings.protocol)
             if reads and (peer.subscribe(reads) or b"\xff")[0] >= REFUSED:
                 text = f"a page with this account does not hear robots: the broker refuses it {reads}"
                 yield failed(text, "pebble fleet check; its role is page", what)
@@ -64,14 +65,6 @@ def page_account(what: str, settings: MqttSettings, level: SecurityLevel = "open
     """Check that a page server with this account is sent what robots publish, and may publish itself."""
     base, states = Identity("pebble", SERVERS, "doctor").base, ONLINE.filter("+/+/+")
     return robot_account(what, settings, base, level=level, reads=states)
-
-
-@contextmanager
-def _logged_in(settings: MqttSettings, answer_s: float) -> Iterator[tuple[BrokerTrial, Peer]]:
-    """Log one client in with the account, for whole topics. Raises TransportError."""
-    with reached(settings, "") as trial:
-        trial.patience_s = answer_s
-        yield trial, trial.peer(protocol=settings.protocol)
 
 
 def _echo(trial: BrokerTrial, peer: Peer, topic: str) -> tuple[bool, str]:

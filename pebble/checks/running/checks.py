@@ -8,7 +8,7 @@ from itertools import pairwise
 
 from pebble.checks.check import Check, CheckResult, failed, ok, skipped, some_of
 from pebble.checks.running import available, machine, why_not_free
-from pebble.checks.running.media import picture, sound
+from pebble.checks.running.media import received
 from pebble.checks.running.robot import RobotUnderTest, Side
 from pebble.checks.running.stops import retained_commands, stop
 from pebble.checks.running.wheels import wheels
@@ -200,8 +200,8 @@ CHECKS: tuple[Check[RobotUnderTest], ...] = (
     Check("battery", battery, (running, motors)),
     Check("leftovers", leftovers, (running,)),
     Check("page", machine.page),
-    Check("picture", picture, (*_BOTH, account)),
-    Check("sound", sound, (*_BOTH, account)),
+    Check("picture", lambda robot: received(robot, "video", "camera"), (*_BOTH, account)),
+    Check("sound", lambda robot: received(robot, "audio", "microphone"), (*_BOTH, account)),
     Check("retained commands", retained_commands, (*_BOTH, account, motors, free)),
     Check("stop", stop, (running, motors, free)),
 )
