@@ -67,16 +67,11 @@ class Check(Generic[Subject]):
 
 
 def run(
-    checks: Iterable[Check[Subject]],
-    subject: Subject,
-    *,
-    refresh: Callable[[], object] = lambda: None,
-    is_doubtful: Callable[[], bool] = lambda: False,
+    checks: Iterable[Check[Subject]], subject: Subject, *, refresh: Callable[[], object] = lambda: None
 ) -> Iterator[tuple[Check[Subject], CheckResult]]:
     """Run one check after the other, and return the results with their subject's name.
 
-    ``refresh`` reads what has arrived before each. A failure for which ``is_doubtful`` returns True afterwards is tried
-    again; only a pass takes it back, because a failed check may leave a robot in which the next try is skipped.
+    ``refresh`` reads what has arrived before each.
     """
     for check in checks:
         refresh()
@@ -84,20 +79,8 @@ def run(
             continue
         why = next((why for need in check.needs if (why := need(subject))), "")
         try:
-            for result in (skipped(why),) if why else _results(check, subject, is_doubtful):
+            results = skipped(why) if why else check.run(subject)
+            for result in (results,) if isinstance(results, CheckResult) else results:
                 yield check, replace(result, what=result.what or check.name)
         except (PebbleError, OSError) as error:  # a connection was lost
             yield check, failed(str(error), "run it again", what=check.name)
-
-
-def _results(check: Check[Subject], subject: Subject, is_doubtful: Callable[[], bool]) -> Iterable[CheckResult]:
-    is_doubtful()  # what was before does not count
-    first = check.run(subject)
-    if not isinstance(first, CheckResult):
-        return first
-    if first.state is State.FAILED and is_doubtful():
-        for again in _results(check, subject, lambda: False):
-            if again.state is State.OK:
-                text = f"{again.text}; tried again, because this machine stalled: {first.text}, at first"
-                return (replace(again, text=text),)
-    return (first,)

@@ -24,7 +24,6 @@ ANSWER_S = 1.0  # within which a robot answers
 _STEP_S = 0.005
 _MOST = 50_000  # messages that are kept; a robot at rest sends some ten a second
 _RETAINED_S = 1.0  # some brokers send what is retained a moment after the subscription
-_STALL_S = 0.1  # a failure tells nothing while this machine stalls for so long
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,7 +53,6 @@ class Observer:
         #: When its wheels changed (monotonic), and to what, left and right: from where it is seen besides.
         self.eyes: Callable[[], list[tuple[float, list[float]]]] = list
         self._of: defaultdict[c.Channel | None, deque[Record]] = defaultdict(lambda: deque(maxlen=_MOST))
-        self._stalled_s = 0.0  # the longest time that this program waited in vain to go on
         self._slowest_s = ANSWER_S / 4  # of its answers
         self._arrived: deque[tuple[Message, float, float]] = deque(maxlen=_MOST)
         put_names(transport, names, lambda of: of == base and self.view.named)
@@ -109,20 +107,13 @@ class Observer:
                 return True
             if time.monotonic() >= end:
                 return False
-            slept = time.monotonic()
             time.sleep(_STEP_S)
-            self._stalled_s = max(self._stalled_s, time.monotonic() - slept)
 
     def look(self, seconds: float) -> float:
         """Let time pass; return when that began."""
         began = time.monotonic()
         self.wait(lambda: False, seconds)
         return began
-
-    def has_stalled(self) -> bool:
-        """True if this program could not go on in time since this was asked last."""
-        stalled_s, self._stalled_s = self._stalled_s, 0.0
-        return stalled_s >= _STALL_S
 
     def answers(self, condition: Callable[[], object], seconds: float = ANSWER_S) -> bool:
         """True if the robot does what was asked, in time."""
