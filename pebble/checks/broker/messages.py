@@ -241,7 +241,7 @@ def last_will(trial: BrokerTrial) -> CheckResult:
     trial.wait(lambda: reader.received)
     began = time.monotonic()
     robot.cut()
-    if not trial.wait(lambda: b"gone" in reader.payloads(), 2 * trial.answer_s):
+    if not trial.wait(lambda: b"gone" in reader.payloads(), 3 * trial.answer_s):
         return warn("none is published when a connection is reset", "allow wills (an access list may forbid them)")
     seconds = time.monotonic() - began
     if seconds > _WILL_S + trial.round_trip_s:
