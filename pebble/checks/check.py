@@ -12,7 +12,6 @@ from typing import Final, Generic, TypeVar
 from pebble.errors import PebbleError
 
 SOON_DAYS: Final = 14  # before its end, a certificate is warned of
-_TRIES: Final = 3  # of a check whose failure is doubtful
 
 Subject = TypeVar("Subject")
 
@@ -68,16 +67,11 @@ class Check(Generic[Subject]):
 
 
 def run(
-    checks: Iterable[Check[Subject]],
-    subject: Subject,
-    *,
-    refresh: Callable[[], object] = lambda: None,
-    is_doubtful: Callable[[], bool] = lambda: False,
+    checks: Iterable[Check[Subject]], subject: Subject, *, refresh: Callable[[], object] = lambda: None
 ) -> Iterator[tuple[Check[Subject], CheckResult]]:
     """Run one check after the other, and return the results with their subject's name.
 
-    ``refresh`` reads what has arrived before each. A failure for which ``is_doubtful`` returns True afterwards is tried
-    again; only a pass takes it back, because a failed check may leave a robot in which the next try is skipped.
+    ``refresh`` reads what has arrived before each.
     """
     for check in checks:
         refresh()
@@ -85,22 +79,8 @@ def run(
             continue
         why = next((why for need in check.needs if (why := need(subject))), "")
         try:
-            for result in (skipped(why),) if why else _results(check, subject, is_doubtful):
+            results = skipped(why) if why else check.run(subject)
+            for result in (results,) if isinstance(results, CheckResult) else results:
                 yield check, replace(result, what=result.what or check.name)
         except (PebbleError, OSError) as error:  # a connection was lost
             yield check, failed(str(error), "run it again", what=check.name)
-
-
-def _results(check: Check[Subject], subject: Subject, is_doubtful: Callable[[], bool]) -> Iterable[CheckResult]:
-    is_doubtful()  # what was before does not count
-    first = check.run(subject)
-    if not isinstance(first, CheckResult):
-        return first
-    for _ in range(_TRIES - 1):
-        if first.state is not State.FAILED or not is_doubtful():
-            break
-        again = check.run(subject)
-        if isinstance(again, CheckResult) and again.state is State.OK:
-            text = f"{again.text}; tried again, because this machine stalled: {first.text}, at first"
-            return (replace(again, text=text),)
-    return (first,)

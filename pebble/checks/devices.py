@@ -7,7 +7,6 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from pebble.checks.check import CheckResult, failed, ok, warn
-from pebble.checks.users import group_name, user_name
 from pebble.config import Config
 
 _NUMBERED = re.compile(r"(ttyACM|ttyUSB|video)[0-9]+")  # the number depends on the order of plugging in
@@ -52,7 +51,6 @@ def serial_port(path: Path, key: str, names: Path = _SERIAL_NAMES) -> CheckResul
     if not stat.S_ISCHR(status.st_mode):
         return failed(f"{path} is not a device", f"correct {key}")
     if not os.access(path, os.R_OK | os.W_OK):
-        group = group_name(status.st_gid)
-        fix = f"sudo usermod -aG {group} {user_name(os.geteuid())}, then log in again"
-        return failed(f"{path} may only be used by {group}", fix)
+        fix = f"sudo usermod -aG $(stat -c %G {path}) $USER, then log in again"
+        return failed(f"{path} may only be used by its owner and its group", fix)
     return usable(path, f"{path} readable and writable", key, names)

@@ -2,7 +2,7 @@
 
 import os
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 from pebble.checks import devices
@@ -15,20 +15,18 @@ from pebble.services.soundboard_handler.playback import Players
 _DEVICE = "services.av_daemon.video.device"
 _LIBCAMERA = ("rpicam-vid", "libcamera-vid")
 
-Which = Callable[[str], str | None]
 
-
-def cameras(config: Config, folder: Path = Path("/dev"), which: Which = shutil.which) -> Iterator[CheckResult]:
+def cameras(config: Config, folder: Path = Path("/dev")) -> Iterator[CheckResult]:
     """Check the camera, if it has one. ``folder``: of device files."""
     daemon = config.services.av_daemon
     if daemon.enabled and daemon.video.enabled:
-        yield camera(daemon.video.backend, daemon.video.device, folder, which)
+        yield camera(daemon.video.backend, daemon.video.device, folder)
 
 
-def microphone(config: Config, which: Which = shutil.which) -> Iterator[CheckResult]:
+def microphone(config: Config) -> Iterator[CheckResult]:
     daemon = config.services.av_daemon
     if daemon.enabled and daemon.audio.enabled and daemon.audio.source != "synthetic":
-        yield _program(("arecord",), "sudo apt install alsa-utils", which)
+        yield _program(("arecord",), "sudo apt install alsa-utils")
 
 
 def codecs(config: Config, *, installed: bool | None = None) -> Iterator[CheckResult]:
@@ -47,11 +45,11 @@ def codecs(config: Config, *, installed: bool | None = None) -> Iterator[CheckRe
         yield ok(f"PyAV is not installed: no H.264, no Opus ({fix})")
 
 
-def sockets_of_the_original(config: Config, which: Which = shutil.which) -> Iterator[CheckResult]:
+def sockets_of_the_original(config: Config) -> Iterator[CheckResult]:
     """Look for what serves the sockets that scripts of the original read, and what would offer them there."""
     for name, path in config.services.av_daemon.sockets().items():
         what = f"{name} for the original's scripts"
-        if which("gst-launch-1.0") is None:
+        if shutil.which("gst-launch-1.0") is None:
             fix = "sudo apt install gstreamer1.0-tools gstreamer1.0-plugins-base gstreamer1.0-plugins-bad"
             yield warn(f"GStreamer, which serves {path}, is not installed", fix, what)
         elif not path.is_socket():
@@ -60,11 +58,11 @@ def sockets_of_the_original(config: Config, which: Which = shutil.which) -> Iter
             yield ok(str(path), what=what)
 
 
-def camera(backend: str, device: str, folder: Path, which: Which) -> CheckResult:
+def camera(backend: str, device: str, folder: Path) -> CheckResult:
     if backend == "synthetic":
         return ok("synthetic: needs no device")
     if backend != "v4l2":
-        return _program(_LIBCAMERA, "sudo apt install rpicam-apps", which)
+        return _program(_LIBCAMERA, "sudo apt install rpicam-apps")
     names = folder / "v4l"
     path = folder / f"video{device}" if device.isdecimal() else Path(device)
     if "://" in device:
@@ -76,19 +74,19 @@ def camera(backend: str, device: str, folder: Path, which: Which) -> CheckResult
     return devices.usable(path, f"{path} readable and writable", _DEVICE, names)
 
 
-def _program(names: tuple[str, ...], fix: str, which: Which) -> CheckResult:
+def _program(names: tuple[str, ...], fix: str) -> CheckResult:
     """Look for one of ``names``."""
-    name = next((name for name in names if which(name) is not None), None)
+    name = next((name for name in names if shutil.which(name) is not None), None)
     return failed(f"{' or '.join(names)} is not installed", fix) if name is None else ok(f"uses {name}")
 
 
-def loudspeaker(config: Config, which: Which = shutil.which) -> Iterator[CheckResult]:
+def loudspeaker(config: Config) -> Iterator[CheckResult]:
     """Look for the players of sounds and of an operator's voice, if it plays them."""
     services, players = config.services, Players.of(config)
     talk_back = services.av_daemon.enabled and services.av_daemon.audio.enabled
     commands = [players.wav] * services.soundboard_handler.enabled + [players.raw] * talk_back
     for name in dict.fromkeys(command[0] for command in commands):
-        if which(name) is not None:
+        if shutil.which(name) is not None:
             yield ok(f"uses {name}")
             continue
         install = f"install {name}, or name another player in the config"

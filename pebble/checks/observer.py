@@ -24,7 +24,6 @@ ANSWER_S = 1.0  # within which a robot answers
 _STEP_S = 0.005
 _MOST = 50_000  # messages that are kept; a robot at rest sends some ten a second
 _RETAINED_S = 1.0  # some brokers send what is retained a moment after the subscription
-_STALL_S = 0.1  # a failure tells nothing while this machine stalls for so long
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,12 +49,10 @@ class Observer:
         self.base, self.target, self.transport, self.account = base, target, transport, names.account
         self.view = RobotView(base)
         self.records: deque[Record] = deque(maxlen=_MOST)
-        self.dropped = 0  # messages that came faster than they were read
         self.listeners: list[Callable[[Message, float], None]] = []  # get each message, and when it arrived (monotonic)
         #: When its wheels changed (monotonic), and to what, left and right: from where it is seen besides.
         self.eyes: Callable[[], list[tuple[float, list[float]]]] = list
         self._of: defaultdict[c.Channel | None, deque[Record]] = defaultdict(lambda: deque(maxlen=_MOST))
-        self._stalled_s = 0.0  # the longest time that this program waited in vain to go on
         self._slowest_s = ANSWER_S / 4  # of its answers
         self._arrived: deque[tuple[Message, float, float]] = deque(maxlen=_MOST)
         put_names(transport, names, lambda of: of == base and self.view.named)
@@ -63,7 +60,6 @@ class Observer:
             transport.subscribe(filter_, self._take, qos=QoS.DELIVERED, direct=True)
 
     def _take(self, message: Message) -> None:
-        self.dropped += len(self._arrived) == _MOST
         self._arrived.append((message, time.monotonic(), time.time()))
 
     # -- what arrives
@@ -74,34 +70,23 @@ class Observer:
     def read(self) -> None:
         while self._arrived:
             message, at, wall = self._arrived.popleft()
-            self.receive(message, at, wall)
+            record = self.record_of(message, at)
+            self.records.append(record)
+            self._of[record.channel].append(record)
+            self.view.receive(record.channel, message, at, wall)
             for listener in self.listeners:
                 listener(message, at)
 
-    @contextmanager
-    def heard_by(self, listener: Callable[[Message, float], None]) -> Iterator[None]:
-        """Let ``listener`` hear what arrives until the block ends."""
-        self.listeners.append(listener)
-        try:
-            yield
-        finally:
-            self.listeners.remove(listener)
-
-    def receive(self, message: Message, at: float, wall: float) -> None:
-        record = self.record_of(message, at)
-        self.records.append(record)
-        self._of[record.channel].append(record)
-        self.view.receive(record.channel, message, at, wall)
-
     def record_of(self, message: Message, at: float) -> Record:
         channel = self.channel_of(message.topic)
-        record = Record(at, message.topic.removeprefix(f"{self.base}/"), message.payload, message.retain, channel)
-        if channel is None or not message.payload:
-            return record
+        value, wrong = None, ""
         try:
-            return replace(record, value=codec.decode(channel, message.payload))
+            if channel is not None and message.payload:
+                value = codec.decode(channel, message.payload)
         except PayloadError as error:
-            return replace(record, wrong=str(error))
+            wrong = str(error)
+        metric = message.topic.removeprefix(f"{self.base}/")
+        return Record(at, metric, message.payload, message.retain, channel, value, wrong)
 
     def of(self, channel: c.Channel, since: float = 0.0, *, retained: bool = False) -> list[Record]:
         """Return its live messages of a channel, or with ``retained`` all."""
@@ -122,9 +107,7 @@ class Observer:
                 return True
             if time.monotonic() >= end:
                 return False
-            slept = time.monotonic()
             time.sleep(_STEP_S)
-            self._stalled_s = max(self._stalled_s, time.monotonic() - slept)
 
     def look(self, seconds: float) -> float:
         """Let time pass; return when that began."""
@@ -132,15 +115,10 @@ class Observer:
         self.wait(lambda: False, seconds)
         return began
 
-    def has_stalled(self) -> bool:
-        """True if this program could not go on in time since this was asked last."""
-        stalled_s, self._stalled_s = self._stalled_s, 0.0
-        return stalled_s >= _STALL_S
-
-    def answers(self, condition: Callable[[], object]) -> bool:
+    def answers(self, condition: Callable[[], object], seconds: float = ANSWER_S) -> bool:
         """True if the robot does what was asked, in time."""
         began = time.monotonic()
-        done = self.wait(condition, ANSWER_S)
+        done = self.wait(condition, seconds)
         if done:
             self._slowest_s = max(self._slowest_s, time.monotonic() - began)
         return done
@@ -177,7 +155,7 @@ class Observer:
         """Publish a command with another account in its topic, or "": without one; True if the broker delivers it."""
         payload = value if isinstance(value, bytes) else codec.encode(channel, value)
         topic = channel.topic(self.base)
-        with self._beside("conform-other", c.INCOMING) as (beside, messages):
+        with self.beside("conform-other", f"{self.base}/{c.INCOMING}/#") as (beside, messages):
             beside.publish(with_name(topic, account) if account else topic, payload, qos=QoS.DELIVERED, urgent=True)
             return self.wait(lambda: any(message.payload == payload for message in list(messages)), _RETAINED_S)
 
@@ -188,17 +166,18 @@ class Observer:
 
     def retained(self) -> list[Record]:
         """Return what the broker has retained of it and for it, as one gets it who connects now."""
-        with self._beside("conform-retained", c.OUTGOING, c.INCOMING) as (_, messages):
+        filters = (f"{self.base}/{direction}/#" for direction in (c.OUTGOING, c.INCOMING))
+        with self.beside("conform-retained", *filters) as (_, messages):
             self.look(_RETAINED_S)
         return [self.record_of(message, 0.0) for message in list(messages) if message.retain and message.payload]
 
     @contextmanager
-    def _beside(self, program: str, *directions: str) -> Iterator[tuple[Transport, deque[Message]]]:
-        """Connect again, to see what arrives there; each direction is a subscription, as some brokers refuse one."""
+    def beside(self, program: str, *filters: str) -> Iterator[tuple[Transport, deque[Message]]]:
+        """Connect again, to see what arrives there; each filter is a subscription, as some brokers refuse one."""
         messages: deque[Message] = deque(maxlen=_MOST)
         with connected(replace(self.target, program=program)) as (beside, _):
-            for direction in directions:
-                beside.subscribe(f"{self.base}/{direction}/#", messages.append, qos=QoS.DELIVERED, direct=True)
+            for filter_ in filters:
+                beside.subscribe(filter_, messages.append, qos=QoS.DELIVERED, direct=True)
             yield beside, messages
 
 

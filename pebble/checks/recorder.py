@@ -1,10 +1,8 @@
-"""Checks of a robot's own recorder: does it run, did it miss anything, and for how long is there room?"""
+"""Checks of a robot's own recorder: does it run, and is any file damaged?"""
 
 import json
-import shutil
 import time
 from collections.abc import Iterator
-from datetime import datetime
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Final
@@ -12,17 +10,10 @@ from typing import Any, Final
 from pebble.checks.check import CheckResult, failed, ok, warn
 from pebble.config import Config
 from pebble.errors import PebbleError
-from pebble.recordings import catalogue
 from pebble.recordings.recorder.folder import Entry, Folder
 from pebble.recordings.recorder.metrics import STATUS
-from pebble.recordings.recorder.settings import Options
 
-_ROOM: Final = "recorder's room"
 _SILENT_S: Final = 30.0  # it writes its numbers every ten seconds
-_HOUR_S, _DAY_S = 3600.0, 86_400.0
-_LITTLE_S: Final = _DAY_S  # room for less is warned of
-_SHORTEST_S: Final = 600.0  # of recording, to know a rate
-_STAMP: Final = len("20261120T232921Z")
 
 
 def recorder(config: Config, now: float | None = None) -> Iterator[CheckResult]:
@@ -40,8 +31,9 @@ def recorder(config: Config, now: float | None = None) -> Iterator[CheckResult]:
     try:
         entries = Folder(folder).entries()
         yield _running(folder, now, entries)
-        yield from _missed(entries, now)
-        yield _room(folder, entries, section.keep_bytes, Options().free_bytes)
+        if damaged := [entry for entry in entries if not (entry.is_finished or entry.is_active)]:
+            text = f"{len(damaged)} damaged files are kept, beside what could be read of them: {damaged[0].path}"
+            yield warn(text, "pebble recordings rm FILE deletes one")
     except (PebbleError, OSError) as error:
         yield failed(f"{folder} cannot be read: {error}")
 
@@ -70,49 +62,3 @@ def _status(folder: Path) -> dict[str, Any]:
     except (OSError, ValueError):
         return {}
     return status if isinstance(status, dict) else {}
-
-
-def _missed(entries: list[Entry], now: float) -> Iterator[CheckResult]:
-    """Find gaps of the last hour, and messages that damage has taken in the last day."""
-    newest = [entry for entry in entries if now - entry.ended <= _HOUR_S and not entry.is_media]
-    since_ms = 1000 * (now - _HOUR_S)
-    gaps = [
-        event
-        for event in catalogue.events(entry.path for entry in newest if entry.is_active or entry.is_finished)
-        if event["event"] == "gap" and event["t"] >= since_ms
-    ]
-    if gaps:
-        why = str(gaps[-1].get("why", "unknown"))[:100]
-        yield warn(f"{len(gaps)} gaps in the last hour, the last one because of: {why}")
-    damaged = [entry for entry in entries if not (entry.is_finished or entry.is_active)]
-    if damaged:
-        text = f"{len(damaged)} damaged files are kept, beside what could be read of them: {damaged[0].path}"
-        yield warn(text, "pebble recordings rm FILE deletes one")
-    finished = [entry for entry in entries if entry.is_finished and now - entry.ended <= _DAY_S]
-    missing = sum(catalogue.look_at(entry.path).missing for entry in finished)
-    if missing:
-        yield warn(f"{missing} messages of the last day are missing: files were damaged")
-
-
-def _room(folder: Path, entries: list[Entry], keep_bytes: int, free_bytes: int) -> CheckResult:
-    """Tell for how long there is room at the rate of the last files."""
-    span_s, size = _rate(entries)
-    room = max(0, shutil.disk_usage(folder).free - free_bytes)
-    if span_s < _SHORTEST_S or not size:
-        return ok(f"{room / 1e9:.1f} GB; how long that lasts is not known yet", what=_ROOM)
-    rate = size / span_s
-    if keep_bytes and keep_bytes < room + sum(entry.size for entry in entries):
-        return ok(f"the last {keep_bytes / rate / _HOUR_S:.1f} hours are kept", what=_ROOM)
-    lasts_s = room / rate
-    if lasts_s < _LITTLE_S and not keep_bytes:
-        text = f"for {lasts_s / _HOUR_S:.1f} hours at this rate; then the oldest are deleted"
-        return warn(text, "services.recorder.keep_media_days, or a larger disk", what=_ROOM)
-    return ok(f"for {lasts_s / _DAY_S:.1f} days at this rate", what=_ROOM)
-
-
-def _rate(entries: list[Entry]) -> tuple[float, int]:
-    """Return seconds and bytes of the finished files of the last day; their names tell when they began."""
-    last = max((entry.ended for entry in entries), default=0.0)
-    newest = [entry for entry in entries if last - entry.ended <= _DAY_S and not entry.is_active]
-    stamps = [datetime.strptime(entry.path.name[:_STAMP], "%Y%m%dT%H%M%S%z").timestamp() for entry in newest]
-    return last - min(stamps, default=last), sum(entry.size for entry in newest)

@@ -156,10 +156,9 @@ def _print(config: Config, path: Path, scripts: Mapping[str, Script]) -> None:
         for name, script in scripts.items():
             grid.add_row(Text("script", style="dim"), Text(shown(name)), Text(shown(_fitness(script))))
         console.print(Padding(grid, (1, 0, 0, 2)))
-
-    if warnings := config.warnings:
+    if config.warnings:
         grid = Table.grid(padding=(0, 2))
-        for warning in warnings:
+        for warning in config.warnings:
             grid.add_row(Text("warning", style="yellow"), Text(warning))
         console.print(Padding(grid, (1, 0, 0, 2)))
 

@@ -47,7 +47,7 @@ def conform(
             if not observer.records:
                 raise PebbleError(f"nothing came from {observer.base} within {_LOOKS_S:g} s: is it on, at this broker?")
             checks = (*CHECKS, *CONTROL, *(MOVING if may_move else ()), *LAST)
-            for check, result in run(checks, observer, refresh=observer.read, is_doubtful=observer.has_stalled):
+            for check, result in run(checks, observer, refresh=observer.read):
                 printer.take(result, check.why)
             unasked = [] if may_move else [check.name for check in MOVING if check.binds(observer)]
     skips = printer.names("skipped")

@@ -1,7 +1,8 @@
 """Finds and hides what is secret in a config: by its keys, and in its texts as secret_text does."""
 
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from msgspec.structs import fields
 
@@ -9,6 +10,20 @@ from pebble.config.secret_text import HIDDEN, is_secret, is_secret_option, shown
 from pebble.config.types import Secret, Section
 
 _HARMLESS = ("password_file", "password_env")
+
+Value = TypeVar("Value")
+
+
+def values_of(section: object, kind: type[Value]) -> Iterator[Value]:
+    """Yield all values of one kind in a config, such as its secrets, or the files that it names."""
+    if isinstance(section, kind):
+        yield section
+    elif isinstance(section, Section):
+        for field in fields(section):
+            yield from values_of(getattr(section, field.name), kind)
+    elif isinstance(section, dict):
+        for item in section.values():
+            yield from values_of(item, kind)
 
 
 def holds_secret(value: Any, key: str = "") -> bool:

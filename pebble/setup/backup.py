@@ -19,11 +19,10 @@ from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
 
 import msgspec
-from msgspec.structs import fields
 
 from pebble.client.page import people_of
 from pebble.config import Config, load
-from pebble.config.types import Section
+from pebble.config.masking import values_of
 from pebble.errors import PebbleError
 from pebble.fleet.folder import FLEET
 from pebble.runtime.places import Places
@@ -107,7 +106,7 @@ def _files(places: Places, config: Config) -> Iterator[Path]:
     without = [_here(places, folder) for _, folder in _left_out(config)]
     for folder in (places.etc, places.state, _here(places, config.state_dir())):
         yield from _below(folder, without)
-    named = [places.broker, people_of(config), *_of_config(config)]
+    named = [places.broker, people_of(config), *values_of(config, Path)]
     if places.broker.is_file():
         named += map(Path, _BROKER_FILES.findall(places.broker.read_text(encoding="utf-8", errors="replace")))
     for path in named:
@@ -137,18 +136,6 @@ def _below(place: Path, without: Iterable[Path]) -> Iterator[Path]:
     for path in sorted(place.rglob("*")):
         if path.is_file() and not any(path.is_relative_to(folder) for folder in without):
             yield path
-
-
-def _of_config(value: object) -> Iterator[Path]:
-    """Yield the files that a config names, such as certificates."""
-    if isinstance(value, Path):
-        yield value
-    elif isinstance(value, Section):
-        for field_ in fields(value):
-            yield from _of_config(getattr(value, field_.name))
-    elif isinstance(value, dict):
-        for item in value.values():
-            yield from _of_config(item)
 
 
 def _add(backup: Backup, root: Path, file: Path) -> None:

@@ -8,7 +8,7 @@ from pathlib import Path
 import typer
 from rich.console import Console
 
-from pebble.checks.broker.login_attempt import REFUSED_LOGINS, attempt
+from pebble.checks.broker.login_attempt import attempt
 from pebble.demo.phone import show_qr
 from pebble.fleet import certificates
 from pebble.runtime.connections import REMOTE_RECONNECT_S, mqtt_settings
@@ -82,10 +82,7 @@ def _refusal(places: Places) -> str:
     config = load_config(places)
     assert config is not None  # noqa: S101 - it has just been written
     remote = config.services.mqtt_bridge.remote_mqtt
-    found = attempt(mqtt_settings(remote, reconnect_max_s=REMOTE_RECONNECT_S, program="setup"), login=True)
-    if found.code == 0:
-        return ""
-    return found.problem if found.code is None else REFUSED_LOGINS.get(found.code, f"code {found.code}")
+    return attempt(mqtt_settings(remote, reconnect_max_s=REMOTE_RECONNECT_S, program="setup"), login=True).refusal
 
 
 def _has_page(job: Job) -> bool:

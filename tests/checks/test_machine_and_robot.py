@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import mmap
 import os
 import resource
 import socket
@@ -55,13 +54,6 @@ def levels(findings: Iterator[CheckResult]) -> list[str]:
 # -- the machine
 
 
-def test_packages() -> None:
-    assert machine.installed("paho-mqtt").state is State.OK
-    missing = machine.installed("no-such-package")
-    assert missing.state is State.FAILED
-    assert missing.fix.endswith("-m pip install no-such-package")
-
-
 def test_memory_lock() -> None:
     assert machine.memory_lock(resource.RLIM_INFINITY, root=False).state is State.OK
     assert machine.memory_lock(64 * MEGABYTE, root=False).state is State.OK
@@ -97,32 +89,7 @@ def test_clock_synchronisation_by_systemd(
     assert machine.synchronised() is None
 
 
-def test_segments_in_use_are_no_leftovers(tmp_path: Path) -> None:
-    used, left = tmp_path / "1.zenoh", tmp_path / "2.zenoh"
-    assert machine.leftover_segments(tmp_path, Path("/proc")).state is State.OK
-    used.write_bytes(bytes(4096))
-    with used.open("r+b") as file, mmap.mmap(file.fileno(), 4096):
-        assert machine.leftover_segments(tmp_path, Path("/proc")).state is State.OK
-        left.write_bytes(bytes(4096))
-        finding = machine.leftover_segments(tmp_path, Path("/proc"))
-    assert finding.state is State.WARN
-    assert finding.fix == f"rm {left}"
-
-
 # -- the robot
-
-
-def test_run_directory(tmp_path: Path) -> None:
-    own, uid = tmp_path / "run", os.geteuid()
-    assert robot.run_directory(own, uid).text.endswith("will be created")
-    own.mkdir(mode=0o700)
-    assert robot.run_directory(own, uid).state is State.OK
-    own.chmod(0o755)
-    assert robot.run_directory(own, uid) == CheckResult(State.WARN, f"{own} is open to other users", f"chmod 700 {own}")
-    assert robot.run_directory(own, uid + 1).fix.startswith("sudo chown")
-    assert robot.run_directory(tmp_path / ("x" * 100), uid).state is State.FAILED
-    (tmp_path / "file").touch()
-    assert robot.run_directory(tmp_path / "file", uid).text.endswith("is not a directory")
 
 
 def test_a_config_that_has_changed_since_the_start_is_found(tmp_path: Path) -> None:
@@ -134,18 +101,6 @@ def test_a_config_that_has_changed_since_the_start_is_found(tmp_path: Path) -> N
     assert [found.state for found in robot.config_of_running(load(file))] == [State.OK]
     os.utime(lock, (1, 1))
     assert [found.state for found in robot.config_of_running(load(file))] == [State.WARN]
-
-
-def test_leftover_sockets_are_found(tmp_path: Path) -> None:
-    assert robot.leftover_sockets(tmp_path / "missing", robot.is_listening).state is State.OK
-    with socket.socket(socket.AF_UNIX) as living, socket.socket(socket.AF_UNIX) as dying:
-        living.bind(str(tmp_path / "living.sock"))
-        living.listen()
-        assert robot.leftover_sockets(tmp_path, robot.is_listening).text == "1 in use"
-        dying.bind(str(tmp_path / "dead.sock"))
-        finding = robot.leftover_sockets(tmp_path, robot.is_listening)
-    assert finding.state is State.WARN
-    assert finding.fix == f"rm {tmp_path / 'dead.sock'}"
 
 
 def test_serial_port(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -309,9 +264,7 @@ def test_a_whole_robot_is_examined(tmp_path: Path, open_broker: Broker) -> None:
     findings = list(robot.run_checks(load(path)))
     failed = [finding.what.split(" ")[0] for finding in findings if finding.state is State.FAILED]
     assert failed == ["serial", "remote"]
-    assert {"eclipse-zenoh", "memory lock", "clock", "shared memory", "run directory", "sockets"} <= {
-        finding.what for finding in findings
-    }
+    assert {"memory lock", "clock", "state directory"} <= {finding.what for finding in findings}
     assert [finding for finding in findings if finding.state is not State.OK and not finding.fix] == []
 
 

@@ -13,13 +13,11 @@ import pytest
 from pebble.checks.check import CheckResult, State
 from pebble.checks.recorder import recorder
 from pebble.config import parse
-from pebble.recordings.files.rewrite import rewrite
 from pebble.recordings.recorder.folder import Folder
 from tests.recordings.playing import GOOB, Line, js, ms, write
 
 HOUR = "2023/11/14/20231114T221320Z-000001.state.mcap"
 BEGAN = ms(0) / 1000
-GB = 1 << 30
 
 
 def findings(folder: Path, now: float = BEGAN + 1000, **section: Any) -> list[CheckResult]:
@@ -87,30 +85,6 @@ def test_files_that_were_left(tmp_path: Path) -> None:
     assert (found.state, found.fix) == (State.WARN, f"pebble recordings mend {tmp_path}")
 
 
-def test_gaps_of_the_last_hour_and_no_older_ones(tmp_path: Path) -> None:
-    def gap(at: float) -> Line:
-        return Line(
-            at, "$recorder/events", js(t=ms(at), event="gap", since=ms(at - 1), until=ms(at), why="broker lost")
-        )
-
-    recorded(tmp_path, gap(10), gap(800))
-    texts = [found.text for found in findings(tmp_path, BEGAN + 3900)]
-    assert "1 gaps in the last hour, the last one because of: broker lost" in texts
-    assert not [found for found in findings(tmp_path, BEGAN + 9000) if "gap" in found.text]
-
-
-def test_damage_is_counted(tmp_path: Path) -> None:
-    lines = [Line(at, f"{GOOB}/outgoing/sensors/imu", js(t=ms(at), n=at)) for at in range(1, 300)]
-    path = recorded(tmp_path, *lines)
-    data = bytearray(path.read_bytes())
-    data[400:420] = bytes(20)
-    path.write_bytes(data)
-    rewrite(path, tmp_path / "copy")
-    (tmp_path / "copy").replace(path)
-    os.utime(path, (BEGAN + 900, BEGAN + 900))
-    assert any("messages of the last day are missing: files were damaged" in one.text for one in findings(tmp_path))
-
-
 def test_without_the_package_it_fails(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("pebble.checks.recorder.find_spec", lambda _: None)
     (found,) = findings(tmp_path)
@@ -122,22 +96,6 @@ def test_damaged_files_are_named(tmp_path: Path) -> None:
     path.rename(path.with_name(f"{path.name}.damaged"))
     (found,) = [one for one in findings(tmp_path) if "damaged files are kept" in one.text]
     assert (found.state, f"{path}.damaged" in found.text) == (State.WARN, True)
-
-
-def test_how_long_there_is_room(tmp_path: Path) -> None:
-    assert "is not known yet" in findings(tmp_path)[-1].text
-    path = recorded(tmp_path, seconds=3600.0)
-    assert "days at this rate" in findings(tmp_path, keep_bytes=0)[-1].text
-    limited = findings(tmp_path, keep_bytes=10 * path.stat().st_size)[-1]
-    assert (limited.state, limited.text) == (State.OK, "the last 10.0 hours are kept")
-
-
-def test_little_room_is_warned_of(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    path = recorded(tmp_path, seconds=3600.0)
-    usage = type("Usage", (), {"free": GB + 5 * path.stat().st_size})
-    monkeypatch.setattr("pebble.checks.recorder.shutil.disk_usage", lambda _folder: usage)
-    found = findings(tmp_path, keep_bytes=0, free_bytes=GB)[-1]
-    assert (found.state, found.text) == (State.WARN, "for 5.0 hours at this rate; then the oldest are deleted")
 
 
 def test_links_are_left_alone(tmp_path: Path) -> None:

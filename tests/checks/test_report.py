@@ -69,7 +69,7 @@ def test_what_is_in_it_and_what_is_not(places: Places, tmp_path: Path, run: Run)
 
 
 def test_each_secret_of_the_machine_is_known(places: Places) -> None:
-    known = secrets_of(places, config_of(places)).known.keys()
+    known = secrets_of(places, config_of(places)).known
     wanted = {
         *(MQTT, ROBOT, "sentinel-of-the-unit", "sentinel of the network", "sentinel-of-wpa", "sentinel-of-systemd"),
         *("c2VudGluZWwtb2YtdGhlLWhvc3Qta2V5", "sentinel-in-a-url", "sentinel-in-json"),

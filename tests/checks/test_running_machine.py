@@ -89,9 +89,12 @@ DISKS = [
 
 
 @pytest.mark.parametrize(("free", "files", "flags", "state", "text"), DISKS)
-def test_the_disk(free: int, files: int, flags: int, state: str, text: str) -> None:
+def test_the_disk(
+    free: int, files: int, flags: int, state: str, text: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     found = os.statvfs_result((1 << 20, 1 << 20, 10_000, free, free, 100, files, files, flags, 255))
-    judged(machine.disk_of(Path("/var/lib/pebble"), found), state, text)
+    monkeypatch.setattr(os, "statvfs", lambda _: found)
+    judged(machine.disk(under_test(tmp_path)), state, text)
 
 
 @contextmanager

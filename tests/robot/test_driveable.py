@@ -63,12 +63,10 @@ def test_an_unplugged_board_is_named_everywhere_until_it_is_back(rig: Rig) -> No
     assert shows(rig, "no", f"serial: cannot open {rig.mcu.port}")
     assert _mcu(rig)["state"] == "absent"
     assert f"CANNOT BE DRIVEN OR STOPPED: serial: cannot open {rig.mcu.port}" in pebble("estop", rig.config, "--remote")
-    doubts = [pebble("estop", "status", rig.config, "--remote"), pebble("doctor", rig.config)]
-    assert all(f"serial: cannot open {rig.mcu.port}" in " ".join(text.split()) for text in doubts), doubts
+    assert f"serial: cannot open {rig.mcu.port}" in " ".join(pebble("estop", "status", rig.config, "--remote").split())
     rig.mcu.command("replug")  # type: ignore[attr-defined]
     assert shows(rig, "yes")
     assert _mcu(rig) == {"state": "ready", "heard_ms": 0}
-    assert "commands reach the motors" in pebble("doctor", rig.config)
 
 
 def test_a_motor_owner_that_ends_drives_nothing_until_it_is_back(rig: Rig) -> None:

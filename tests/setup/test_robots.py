@@ -97,8 +97,8 @@ def test_a_name_that_was_changed_in_the_config_keeps_its_account(root: Path) -> 
     ("user", "password", "shown"),
     [
         ("goob", None, []),
-        ("goob", "wrong-password", ["not authorised"]),
-        ("eve", None, ["not authorised"]),
+        ("goob", "wrong-password", ["not authorized (bad user name or password?)"]),
+        ("eve", None, ["not authorized (bad user name or password?)"]),
     ],
     ids=("right", "wrong password", "no account"),
 )

@@ -5,7 +5,6 @@ from __future__ import annotations
 import secrets
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import replace
 
 from pebble.checks.broker.login_attempt import reached
@@ -29,17 +28,26 @@ def robot_account(
     base: str,
     answer_s: float = LEVELS["wide"].answer_s,
     level: SecurityLevel = "open",
+    reads: str = "",
 ) -> Iterator[CheckResult]:
     """Publish probes, which no program takes for anything else, below ``base``, and see when they come back.
 
     After ``answer_s`` one counts as lost. Above the level ``open`` one that poses as another robot has to be.
+    ``reads``: a filter that the broker must grant besides.
     """
     try:
-        with _logged_in(settings, answer_s) as (trial, peer):
+        with reached(settings, "") as trial:
+            trial.patience_s = answer_s
+            peer = trial.peer(protocol=settings.protocol)
+            if reads and (peer.subscribe(reads) or b"\xff")[0] >= REFUSED:
+                text = f"a page with this account does not hear robots: the broker refuses it {reads}"
+                yield failed(text, "pebble fleet check; its role is page", what)
+                return
             topic = BRIDGE_PROBE.topic(base)
             peer.subscribe(topic)
             is_back, refusal = _echo(trial, peer, topic)
-            if refusal or not (is_back or settings.protocol == "5"):  # which says what it refuses
+            tells = settings.protocol == "5" and not reads  # what it refuses
+            if refusal or not (is_back or tells):
                 why = refusal or "it does not come back (or may this account not read it?)"
                 fix = f"allow it to write and read {topic.rpartition('/')[0]}/# on the broker"
                 yield failed(f"this account may not publish to {topic}: {why}", fix, what)
@@ -55,34 +63,8 @@ def robot_account(
 
 def page_account(what: str, settings: MqttSettings, level: SecurityLevel = "open") -> Iterator[CheckResult]:
     """Check that a page server with this account is sent what robots publish, and may publish itself."""
-    why = ""
-    try:
-        with _logged_in(settings, LEVELS["wide"].answer_s) as (trial, peer):
-            topic, states = BRIDGE_PROBE.topic(Identity("pebble", SERVERS, "doctor").base), ONLINE.filter("+/+/+")
-            if (peer.subscribe(states) or b"\xff")[0] >= REFUSED:
-                why = f"the broker refuses it {states}"
-            else:
-                peer.subscribe(topic)
-                is_back, refusal = _echo(trial, peer, topic)
-                why = "" if is_back else refusal or f"what it publishes on {topic} does not come back"
-            if not why:
-                yield ok("delivers what robots send, and takes what a page publishes", what=what)
-                if level != "open":
-                    yield _rules(what, trial, peer, topic)
-    except TransportError as error:
-        why = str(error)
-    if why:
-        fix = "pebble fleet check; its role is page"
-        yield failed(f"a page with this account does not hear robots: {why}", fix, what)
-
-
-@contextmanager
-def _logged_in(settings: MqttSettings, answer_s: float) -> Iterator[tuple[BrokerTrial, Peer]]:
-    """Log one client in with the account, for whole topics. Raises TransportError."""
-    with reached(settings, "") as trial:
-        trial.begin("account")
-        trial.base, trial.patience_s = "", answer_s
-        yield trial, trial.peer(protocol=settings.protocol)
+    base, states = Identity("pebble", SERVERS, "doctor").base, ONLINE.filter("+/+/+")
+    return robot_account(what, settings, base, level=level, reads=states)
 
 
 def _echo(trial: BrokerTrial, peer: Peer, topic: str) -> tuple[bool, str]:

@@ -5,12 +5,14 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 
 from pebble.checks.broker import MOSQUITTO
-from pebble.checks.broker.login_attempt import REFUSED_ID, REFUSED_LOGINS, LoginAttempt, attempt
+from pebble.checks.broker.login_attempt import LoginAttempt, attempt
 from pebble.checks.check import SOON_DAYS, CheckResult, failed, ok, warn
 from pebble.config.secret_text import shown_user
 from pebble.config.security import SecurityLevel
 from pebble.config.web import is_loopback
 from pebble.transports.settings import MqttSettings
+
+_REFUSED_ID = 2  # a return code of CONNACK (MQTT 3.1.1, table 3.1)
 
 
 def broker(
@@ -24,36 +26,27 @@ def broker(
 
     Above the level ``open`` one that lets everybody in is no mere warning.
     """
-    what = f"{name} {settings.host}:{settings.port}"
-    for result in _logins(settings, log_in, time.time() if now is None else now, level):
-        yield replace(result, what=what)
-
-
-def _logins(
-    settings: MqttSettings, log_in: Callable[..., LoginAttempt], now: float, level: SecurityLevel
-) -> Iterator[CheckResult]:
-    host, is_here = settings.host, is_loopback(settings.host)
+    what, is_here = f"{name} {settings.host}:{settings.port}", is_loopback(settings.host)
     answer = log_in(settings, login=True)
     if answer.code is None:
-        start = "sudo systemctl start mosquitto" if is_here else f"nc -vz {host} {settings.port}"
-        yield failed(f"cannot be reached: {answer.problem}", start)
+        start = "sudo systemctl start mosquitto" if is_here else f"nc -vz {settings.host} {settings.port}"
+        yield failed(f"cannot be reached: {answer.problem}", start, what)
         return
-    yield _own_login(settings, answer)
+    yield replace(_own_login(settings, answer), what=what)
     if answer.problem and not is_here:
-        fix = f"correct the addresses of {host} in your DNS, or start the brokers there"
-        yield warn(f"has addresses that do not answer: {answer.problem}", fix)
+        fix = f"correct the addresses of {settings.host} in your DNS, or start the brokers there"
+        yield warn(f"has addresses that do not answer: {answer.problem}", fix, what)
     without_name = answer if settings.username is None else log_in(settings, login=False)
-    yield _anonymous_login(without_name, level, is_here=is_here)
-    yield _encryption(settings, answer, now, is_here=is_here)
+    yield replace(_anonymous_login(without_name, level, is_here=is_here), what=what)
+    yield replace(_encryption(settings, answer, time.time() if now is None else now, is_here=is_here), what=what)
 
 
 def _own_login(settings: MqttSettings, answer: LoginAttempt) -> CheckResult:
     if answer.code == 0:
         return ok(f"answers, and lets it in within {answer.took_ms:.1f} ms")
-    if answer.code == REFUSED_ID:
-        fix = "let it admit any client id, or set remote_mqtt.client_id to one that it knows"
-        return failed("refuses the client id", fix)
-    why = REFUSED_LOGINS.get(answer.code or 0, f"code {answer.code}")
+    why = answer.refusal
+    if answer.code == _REFUSED_ID:
+        return failed(why, "let it admit any client id, or set remote_mqtt.client_id to one that it knows")
     if settings.username is None:
         return failed(f"refuses the login: {why}", "set username and password_file of this broker")
     user = shown_user(settings.username)

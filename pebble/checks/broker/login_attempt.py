@@ -6,16 +6,13 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 
-from pebble.checks.broker.peer import BrokerTrial, RefusedError
+from pebble.checks.broker.peer import BrokerTrial
 from pebble.errors import TransportError
 from pebble.transports.hosts import Address, addresses_of, described
 from pebble.transports.mqtt import reasons
 from pebble.transports.settings import MqttSettings
 
 TIMEOUT_S = 3.0
-REFUSED_ID = 2
-#: Return codes of CONNACK (MQTT 3.1.1, table 3.1) that concern the login.
-REFUSED_LOGINS = {4: "user name or password is wrong", 5: "not authorised"}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -30,6 +27,11 @@ class LoginAttempt:
     problem: str = ""
     expires: float | None = None  # the broker's certificate, in epoch seconds
     address: Address | None = None  # that accepted the login
+
+    @property
+    def refusal(self) -> str:
+        """Return why there was no login; empty: it was accepted."""
+        return self.problem if self.code is None else reasons.connection_refused(self.code) * bool(self.code)
 
 
 def attempt(settings: MqttSettings, *, login: bool, timeout_s: float = TIMEOUT_S) -> LoginAttempt:
@@ -47,29 +49,20 @@ def attempt(settings: MqttSettings, *, login: bool, timeout_s: float = TIMEOUT_S
         return LoginAttempt(problem=error.strerror or str(error))
     answered, failures = LoginAttempt(), {}
     for address in addresses:
-        tried = _attempt(settings, address, timeout_s)
-        if tried.code is None:
-            failures[f"{address.text}:"] = tried.problem
-        else:
-            answered = tried
-        if tried.code == 0 or len(addresses) == 1:
-            break
-    return tried if len(addresses) == 1 else replace(answered, problem=described(failures))
-
-
-def _attempt(settings: MqttSettings, address: Address, timeout_s: float) -> LoginAttempt:
-    began = time.monotonic()
-    try:
-        trial = BrokerTrial(settings, address, "", patience_s=timeout_s)
-        peer = trial.peer()
-    except RefusedError as error:
-        return LoginAttempt(code=error.code, problem="" if error.code else str(error))
-    except TransportError as error:
-        return LoginAttempt(problem=str(error))
-    took_ms = 1000 * (time.monotonic() - began)
-    expires = _expiry(peer.sockets[0])
-    trial.close()
-    return LoginAttempt(code=0, took_ms=took_ms, expires=expires, address=address)
+        began = time.monotonic()
+        try:
+            trial = BrokerTrial(settings, address, "", patience_s=timeout_s)
+            expires = _expiry(trial.peer().sock)
+        except TransportError as error:
+            if (code := getattr(error, "code", None)) is None:
+                failures[f"{address.text}:"] = str(error)
+            else:
+                answered = LoginAttempt(code=code)
+            continue
+        answered = LoginAttempt(code=0, took_ms=1000 * (time.monotonic() - began), expires=expires, address=address)
+        trial.close()
+        break
+    return replace(answered, problem=described(failures) if len(addresses) > 1 else "".join(failures.values()))
 
 
 def _expiry(sock: object) -> float | None:
@@ -83,8 +76,7 @@ def reached(settings: MqttSettings, below: str, restart: Callable[[], bool] | No
     """Try the broker at the address that accepts a login; at the end everything is removed. Raises TransportError."""
     answer = attempt(settings, login=True)
     if answer.address is None:
-        why = answer.problem or reasons.connection_refused(answer.code or 0)
-        raise TransportError(f"broker {settings.host}:{settings.port} cannot be used: {why}")
+        raise TransportError(f"broker {settings.host}:{settings.port} cannot be used: {answer.refusal}")
     trial = BrokerTrial(settings, answer.address, below, restart)
     try:
         yield trial

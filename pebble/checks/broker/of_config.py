@@ -8,18 +8,25 @@ from pebble.checks.broker.login import broker
 from pebble.checks.broker.login_attempt import TIMEOUT_S, attempt
 from pebble.checks.broker.reachable import beyond_loopback, own_addresses
 from pebble.checks.check import CheckResult, State
-from pebble.config import Config, Mqtt
+from pebble.config import Config
+from pebble.config.rules import exposure
 from pebble.config.web import is_loopback
 from pebble.contract.levels import LEVELS
 from pebble.runtime.connections import REMOTE_RECONNECT_S, mqtt_settings
 
+#: By the config section of each broker that the robot uses.
+_NAMES = {"local_mqtt": "local broker", "mqtt_mirror": "mirror's broker", "remote_mqtt": "remote broker"}
+
 
 def brokers(config: Config) -> Iterator[CheckResult]:
     """Check each broker that the robot uses: its login, its account, and where else it answers."""
-    level, bridge = config.security.level, config.services.mqtt_bridge
-    for name, mqtt in _brokers(config):
-        is_remote = mqtt is bridge.remote_mqtt
-        answer_s = LEVELS[bridge.link.slowest if is_remote else "wide"].answer_s
+    level, link = config.security.level, config.services.mqtt_bridge.link
+    sections = {str(path[-1]): mqtt for path, mqtt in exposure.brokers(config)}
+    for section, name in _NAMES.items():
+        if (mqtt := sections.get(section)) is None:
+            continue
+        is_remote = section == "remote_mqtt"
+        answer_s = LEVELS[link.slowest if is_remote else "wide"].answer_s
         patient = partial(attempt, timeout_s=max(TIMEOUT_S, answer_s))
         settings = mqtt_settings(mqtt, reconnect_max_s=REMOTE_RECONNECT_S, program="doctor")
         results = list(broker(name, settings, patient, level=level))
@@ -40,13 +47,3 @@ def page_brokers(config: Config) -> Iterator[CheckResult]:
     yield from results
     if not any(result.state is State.FAILED for result in results):
         yield from page_account(results[0].what, settings, level)
-
-
-def _brokers(config: Config) -> Iterator[tuple[str, Mqtt]]:
-    bridge, transport = config.services.mqtt_bridge, config.transport
-    if transport.kind == "mqtt":
-        yield "local broker", config.local_mqtt
-    if transport.mqtt_mirror is not None:
-        yield "mirror's broker", transport.mqtt_mirror
-    if bridge.enabled and (bridge.remote is None or bridge.remote.kind == "mqtt"):
-        yield "remote broker", bridge.remote_mqtt

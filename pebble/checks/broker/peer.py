@@ -6,19 +6,15 @@ The transports hide what a broker lacks; here that is the result.
 from __future__ import annotations
 
 import secrets
-import select
 import socket
 import struct
-import threading
 import time
-from collections import deque
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, nullcontext, suppress
-from dataclasses import dataclass, replace
-from typing import Any
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import replace
+from typing import NamedTuple
 
 from pebble.errors import TransportError
-from pebble.runtime.signals import handled_by
 from pebble.transports.base import Message
 from pebble.transports.credentials import Credentials
 from pebble.transports.hosts import Address
@@ -28,11 +24,10 @@ from pebble.transports.settings import MqttSettings
 
 ANSWER_S = 3.0  # within which a broker answers, and four round trips
 _QUIET_S = 0.3  # of silence, and four round trips: then nothing more comes
-_STEP_S = 0.05
+_STEP_S = 0.001  # between two looks at what has come
 _KEEPALIVE_S = 60
 _AT_ONCE = 1000  # packets
-_MOST, _MOST_BYTES = 50_000, 128_000_000  # messages of one connection; a probe sends a thousand
-_TRIES = 3  # to take back what is retained
+_MOST = 5_000  # messages that one connection reads; a probe sends a thousand
 _RESET = struct.pack("ii", 1, 0)  # SO_LINGER that turns close() into a reset
 
 NAME = "pebble-doctor-of-a-broker"  # as long as the names of a robot's programs
@@ -46,9 +41,8 @@ class RefusedError(TransportError):
         self.code = code
 
 
-@dataclass(frozen=True, slots=True)
-class Received:
-    """``topic`` is below that of the probe; ``at``: when it was read (monotonic)."""
+class Received(NamedTuple):
+    """A message. ``topic`` is below that of the probe; ``at``: when it was read (monotonic)."""
 
     topic: str
     payload: bytes
@@ -60,13 +54,12 @@ class Peer(packets.Listener):
     """One connection, which reads in :meth:`BrokerTrial.wait`. Topics are below ``base``; whole ones if it is empty."""
 
     def __init__(self, trial: BrokerTrial, base: str, opening: Opening, *, bridge: bool) -> None:
-        self.received: deque[Received] = deque(maxlen=_MOST)
+        self.received: list[Received] = []
         self.acks: dict[int, int] = {}  # by message id: the code of MQTT 5
         self.granted: dict[int, bytes] = {}
         self.pongs: list[int] = []  # how many messages had been received at each answer to a ping
         self.code: int | None = None  # of CONNACK
         self.problem = ""
-        self._bytes = 0  # of payloads
         self._trial, self.base = trial, base
         self._client = Client(opening, self, bridge=bridge)
         self._client.open()
@@ -103,14 +96,14 @@ class Peer(packets.Listener):
 
     def cut(self) -> None:
         """Reset the connection: the broker publishes the will."""
-        if self._client.socket is not None:
-            self._client.socket.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, _RESET)
+        if self.sock is not None:
+            self.sock.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, _RESET)
         self._client.close()
 
     def acknowledge_late(self) -> None:
         """Let the kernel confirm what comes as late as it does for a program that sends nothing itself."""
-        if self._client.socket is not None and hasattr(socket, "TCP_QUICKACK"):
-            self._client.socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_QUICKACK, 0)
+        if self.sock is not None and hasattr(socket, "TCP_QUICKACK"):
+            self.sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_QUICKACK, 0)
 
     # -- what it saw
 
@@ -119,9 +112,8 @@ class Peer(packets.Listener):
         return self._client.socket is None
 
     @property
-    def sockets(self) -> tuple[socket.socket | None, bool]:
-        """Return the socket, and whether something waits to be written to it."""
-        return self._client.socket, bool(self._client.waiting)
+    def sock(self) -> socket.socket | None:
+        return self._client.socket
 
     def payloads(self, topic: str | None = None) -> list[bytes]:
         return [message.payload for message in self.received if topic in (None, message.topic)]
@@ -135,23 +127,16 @@ class Peer(packets.Listener):
         """Read what has come, and write what waits."""
         client = self._client
         try:
-            while not self._flooded and client.receive():
-                while not self._flooded and client.read(_AT_ONCE):
+            while len(self.received) < _MOST and client.receive():
+                while client.read(_AT_ONCE):
                     pass
         except packets.MalformedError as error:
             self.problem = f"it sends what is no MQTT: {error}"
-            client.close()
-        if self._flooded:
-            self.problem = "it does not stop sending"
             client.close()
         if client.owes:
             client.acknowledge()
         if client.waiting:
             client.write()
-
-    @property
-    def _flooded(self) -> bool:
-        return len(self.received) >= _MOST or self._bytes > _MOST_BYTES
 
     def on_accepted(self, accepted: packets.Accepted) -> None:
         del accepted
@@ -162,7 +147,6 @@ class Peer(packets.Listener):
         self.problem = reasons.connection_refused(code)
 
     def on_publication(self, topic: bytes, payload: bytes, first: int) -> None:
-        self._bytes += len(payload)
         below = topic.decode(errors="replace").removeprefix(f"{self.base}/")
         self.received.append(Received(below, payload, bool(first & packets.RETAIN), time.monotonic()))
 
@@ -190,7 +174,7 @@ class Peer(packets.Listener):
 class BrokerTrial:
     """Peers at one broker, and what they left there. ``address``: of the host, one that accepted a login.
 
-    Everything is below ``{below}/{random digits}``, and what is retained there is removed by :meth:`close`.
+    Each probe has topics below ``{below}/{random digits}``, and what is retained there is removed by :meth:`close`.
     """
 
     def __init__(
@@ -202,8 +186,7 @@ class BrokerTrial:
         patience_s: float = ANSWER_S,
     ) -> None:
         self.settings, self.restart = settings, restart  # which has the broker restarted
-        self.root = f"{below}/{secrets.token_hex(8)}"
-        self.base = self.root  # of the probe that is made now
+        self.below, self.base = below, ""  # and that of the probe that is made now
         self.round_trip_s, self.patience_s = 0.0, patience_s
         self.qos, self.retains, self.wildcards = 1, True, True  # as found out by the first probe
         self._address = address
@@ -211,11 +194,11 @@ class BrokerTrial:
         self.left: dict[str, None] = {}  # topics that are retained, and not removed yet, in their order
         self._credentials = Credentials(settings)
 
-    def begin(self, name: str) -> None:
+    def begin(self) -> None:
         """Let the peers of the last probe leave, and give this one topics of its own."""
         for peer in self._peers:
             peer.leave()
-        self._peers, self.base = [], f"{self.root}/{name}"
+        self._peers, self.base = [], f"{self.below}/{secrets.token_hex(8)}"
 
     def peer(self, *, protocol: str = "3.1.1", bridge: bool = False, will: Message | None = None) -> Peer:
         """Connect a client, or raise RefusedError; the topic of ``will`` is below the probe's."""
@@ -251,12 +234,9 @@ class BrokerTrial:
                 peer.pump()
             if condition():
                 return True
-            left = end - time.monotonic()
-            sockets = [peer.sockets for peer in self._peers]
-            reading = [sock for sock, _ in sockets if sock is not None]
-            if left <= 0 or not reading:
+            if time.monotonic() >= end or all(peer.closed for peer in self._peers):
                 return False
-            select.select(reading, [sock for sock, writes in sockets if sock and writes], [], min(left, _STEP_S))
+            time.sleep(_STEP_S)
 
     def wait_quiet(self, *peers: Peer) -> None:
         """Wait until nothing more comes to these peers."""
@@ -270,36 +250,15 @@ class BrokerTrial:
             if not self.wait(lambda: seen() > before, quiet_s):  # noqa: B023
                 return
 
-    # -- what is left there
-
     def close(self) -> None:
-        """Remove all that is retained. Signals wait meanwhile."""
-        with _undisturbed():
-            self.begin("end")
-            for _ in range(_TRIES):
-                if not self.left:
-                    break
-                with suppress(TransportError):
-                    self._remove()
-
-    def _remove(self) -> None:
+        """Remove all that is retained; what the broker does not take back stays in ``left``."""
+        self.begin()
+        if not self.left:
+            return
         self.base = ""
-        peer = self.peer()
-        numbers = {topic: peer.publish(topic, b"", qos=self.qos, retain=True) for topic in list(self.left)}
-        done = self.wait(lambda: set(numbers.values()) <= peer.acks.keys() or peer.closed) if self.qos else peer.ping()
-        if done and not peer.closed:
-            self.left = {}
-        else:
-            self.left = {topic: None for topic, mid in numbers.items() if mid not in peer.acks}
-
-
-@contextmanager
-def _undisturbed() -> Iterator[None]:
-    """Let no signal interrupt what takes a moment; on other threads none does."""
-
-    def later(_signal: int, _frame: Any) -> None:
-        pass
-
-    on_main = threading.current_thread() is threading.main_thread()
-    with handled_by(later) if on_main else nullcontext():
-        yield
+        with suppress(TransportError):
+            peer = self.peer()
+            numbers = {peer.publish(topic, b"", qos=self.qos, retain=True) for topic in list(self.left)}
+            if self.wait(lambda: numbers <= peer.acks.keys()) if self.qos else peer.ping():
+                self.left = {}
+            peer.leave()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable, Iterator, Mapping
 
 from pebble.checks.broker import messages, retention
@@ -19,7 +18,7 @@ def _probe(
     """Return a probe on topics of its own, with new connections."""
 
     def tried(trial: BrokerTrial) -> CheckResult:
-        trial.begin(re.sub(r"\W+", "-", name).strip("-"))
+        trial.begin()
         try:
             return test(trial)
         except RefusedError as error:

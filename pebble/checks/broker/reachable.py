@@ -1,34 +1,15 @@
-"""Checks whether a broker answers where it should not: on the network, or without encryption."""
+"""Checks whether a broker that is meant for its machine alone also answers on the network."""
 
-import subprocess
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
 
 from pebble.checks.broker import MOSQUITTO
 from pebble.checks.broker.login_attempt import attempt
 from pebble.checks.check import CheckResult, ok, warn
-from pebble.config.web import is_loopback
+from pebble.checks.machine import printed
 from pebble.transports.settings import MqttSettings
 
-_UNENCRYPTED = 1883
 _TIMEOUT_S = 1.0  # these addresses are this machine's own
-
-
-def other_doors(name: str, settings: MqttSettings) -> Iterator[CheckResult]:
-    """Try its port at this machine's addresses, if it is meant for this machine alone; and its port without TLS."""
-    if is_loopback(settings.host):
-        yield from beyond_loopback(name, settings, own_addresses())
-    if settings.tls is None:
-        return
-    what = f"{name} {settings.host}:{_UNENCRYPTED}"
-    plain = replace(settings, port=_UNENCRYPTED, tls=None)
-    code = attempt(plain, login=False).code  # without the password: it could be read
-    if code is None:
-        yield ok("does not answer without encryption", what=what)
-        return
-    more = ", and accepts clients without a name" if code == 0 else ""
-    fix = f"{MOSQUITTO}listener {_UNENCRYPTED} 127.0.0.1, or none there"
-    yield warn(f"also answers without encryption{more}", fix, what)
 
 
 def beyond_loopback(name: str, settings: MqttSettings, addresses: Iterable[str]) -> Iterator[CheckResult]:
@@ -56,8 +37,4 @@ def beyond_loopback(name: str, settings: MqttSettings, addresses: Iterable[str])
 
 def own_addresses() -> list[str]:
     """Return the addresses of this machine on its networks; none on systems whose ``hostname`` does not tell them."""
-    try:
-        command = ["hostname", "-I"]
-        return subprocess.run(command, capture_output=True, text=True, timeout=_TIMEOUT_S, check=False).stdout.split()
-    except (OSError, subprocess.TimeoutExpired):
-        return []
+    return printed("hostname", "-I").split()

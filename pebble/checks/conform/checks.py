@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import secrets
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from itertools import pairwise
 
 import msgspec
 
 from pebble import contract as c
 from pebble.checks.check import Check, CheckResult, State, failed, ok, skipped, some_of
-from pebble.checks.observer import ANSWER_S, Observer, Record
+from pebble.checks.observer import ANSWER_S, Observer
 from pebble.checks.running import available, why_not_free
 from pebble.client.robot_topics import section_of
+from pebble.client.robot_view import RobotView
 from pebble.contract.capabilities import CapabilitiesValue
 from pebble.contract.identity import parse_topic
 from pebble.contract.levels import silent_after
@@ -25,6 +26,7 @@ _LARGEST_STATE = 400  # bytes of a state of the emergency stop
 _REPEATED = (c.CHARGING_STATUS, c.CHARGING_LEVEL)  # boards of the original repeat them every 5 s instead
 _SLOWEST_S = 1.25  # between heartbeats, by their mean; they are to come each second
 BY, _WHY = "conform", "conformance test"
+END_IT = "end it on incoming/estop-reset"
 
 _LONG = b"[" * 2000
 _LONGS, _BURSTS = 25, 2  # mosquitto sends nothing more while 20 are unacknowledged, but one for each that is so late
@@ -36,16 +38,13 @@ _LARGE = b"x" * 70_000  # once: small boards take a while to read it
 # -- what a check needs: empty, or why it is lacking
 
 
-def drives(robot: Observer) -> str:
-    return "" if robot.view.drives else "its capabilities offer no driving"
+def _offered(what: str, offers: Callable[[RobotView], bool]) -> Callable[[Observer], str]:
+    return lambda robot: "" if offers(robot.view) else f"its capabilities offer no {what}"
 
 
-def stops(robot: Observer) -> str:
-    return "" if robot.view.estop.available else "its capabilities offer no emergency stop"
-
-
-def controls(robot: Observer) -> str:
-    return "" if robot.view.controlled else "its capabilities offer no control"
+drives = _offered("driving", lambda view: view.drives)
+stops = _offered("emergency stop", lambda view: view.estop.available)
+controls = _offered("control", lambda view: view.controlled)
 
 
 def free(robot: Observer) -> str:
@@ -73,8 +72,7 @@ def heartbeat(robot: Observer) -> CheckResult:
     beats = robot.of(c.ONLINE)
     if not beats:
         return failed("none arrived", 'publish {"t": <epoch ms>} on outgoing/online every 0.25 s to 1 s')
-    wrong = [beat.wrong for beat in beats if beat.wrong]
-    if wrong:
+    if wrong := [beat.wrong for beat in beats if beat.wrong]:
         return failed(wrong[0], 'its payload is {"t": <epoch milliseconds, an integer>}')
     gaps = [after.at - before.at for before, after in pairwise(beats)]
     interval = robot.view.liveness.interval_s
@@ -94,20 +92,23 @@ def clock(robot: Observer) -> CheckResult:
         return skipped("there is no heartbeat")
     off = newest[0].value.t / 1000 - time.time() + (time.monotonic() - newest[0].at)
     if abs(off) > _CLOCK_S:
-        return failed(
-            f"its clock is {abs(off):.0f} s {'ahead' if off > 0 else 'behind'}", "set it, by SNTP for example"
-        )
+        text = f"its clock is {abs(off):.0f} s {'ahead' if off > 0 else 'behind'}"
+        return failed(text, "set it, by SNTP for example")
     return ok(f"{1000 * off:+.0f} ms")
 
 
 # -- what it publishes
 
 
+def _none_of(wrong: Collection[str], fix: str, fine: str, what: str = "") -> CheckResult:
+    """Return a failure that names the first ones of what is wrong; ``what`` is before them."""
+    return failed(f"{what}{some_of(sorted(wrong))}", fix) if wrong else ok(fine)
+
+
 def payloads(robot: Observer) -> CheckResult:
     wrong = {record.metric: record.wrong for record in robot.records if record.wrong}
-    if wrong:
-        return failed(some_of(wrong.values()), "docs/topics.md has each payload")
-    return ok(f"{len({record.metric for record in robot.records if record.channel})} kinds of messages")
+    kinds = {record.metric for record in robot.records if record.channel}
+    return _none_of(wrong.values(), "docs/topics.md has each payload", f"{len(kinds)} kinds of messages")
 
 
 def numbers(robot: Observer) -> CheckResult:
@@ -118,47 +119,36 @@ def numbers(robot: Observer) -> CheckResult:
                 msgspec.json.decode(record.payload)
             except (msgspec.DecodeError, UnicodeDecodeError, RecursionError):
                 strange.add(record.metric)
-    if strange:
-        fix = "NaN, Infinity and comments are no JSON: leave the field out"
-        return failed(f"not JSON: {some_of(sorted(strange))}", fix)
-    return ok("all JSON is JSON")
+    fix = "NaN, Infinity and comments are no JSON: leave the field out"
+    return _none_of(strange, fix, "all JSON is JSON", "not JSON: ")
 
 
 def sizes(robot: Observer) -> CheckResult:
-    def limit(record: Record) -> int:
-        return _LARGEST_STATE if record.channel is c.ESTOP_STATE else _LARGEST
-
-    large = {
-        f"{record.metric} has {len(record.payload)} bytes, more than {limit(record)}"
-        for record in robot.records
-        if (record.channel is None or record.channel.payload is not bytes) and len(record.payload) > limit(record)
-    }
-    return failed(some_of(sorted(large)), "send less: readers drop it") if large else ok("no message is too large")
+    large = set()
+    for record in robot.records:
+        most = _LARGEST_STATE if record.channel is c.ESTOP_STATE else _LARGEST
+        if len(record.payload) > most and (record.channel is None or record.channel.payload is not bytes):
+            large.add(f"{record.metric} has {len(record.payload)} bytes, more than {most}")
+    return _none_of(large, "send less: readers drop it", "no message is too large")
 
 
 def retained(robot: Observer) -> CheckResult:
     there = {record.metric for record in robot.retained()}
     live = {record.metric: record.channel for record in robot.records if record.channel and record.payload}
     must = {metric for metric, channel in live.items() if channel.default_retain and channel not in _REPEATED}
-    lacks = sorted(must - there)
-    if lacks:
-        return failed(f"not retained: {some_of(lacks)}", "publish it with the retain flag: who connects later lacks it")
-    stale = sorted(
-        metric
-        for metric in there & set(live)
-        if not live[metric].default_retain and live[metric] is not c.MCU_VALUE  # whose manifest decides it
-    )
-    if stale:
-        return failed(f"retained: {some_of(stale)}", "publish it without the retain flag: it is news only once")
-    return ok(f"{len(there)} states")
+    if lacks := must - there:
+        fix = "publish it with the retain flag: who connects later lacks it"
+        return failed(f"not retained: {some_of(sorted(lacks))}", fix)
+    of_manifests = {metric for metric, channel in live.items() if channel is c.MCU_VALUE}  # which decide it
+    stale = {metric for metric in there & live.keys() if not live[metric].default_retain} - of_manifests
+    fix = "publish it without the retain flag: it is news only once"
+    return _none_of(stale, fix, f"{len(there)} states", "retained: ")
 
 
 def stale_commands(robot: Observer) -> CheckResult:
     parked = sorted(record.metric for record in robot.retained() if record.channel and record.channel.one_shot)
-    if parked:
-        topic = f"{robot.base}/{parked[0]}"
-        return failed(some_of(parked), f"remove it: mosquitto_pub -r -n -t '{topic}'; and find who publishes it so")
-    return ok("none")
+    topic = f"{robot.base}/{''.join(parked[:1])}"
+    return _none_of(parked, f"remove it: mosquitto_pub -r -n -t '{topic}'; and find who publishes it so", "none")
 
 
 # -- what it offers
@@ -176,14 +166,13 @@ def capabilities(robot: Observer) -> CheckResult:
 
 
 def own_topics(robot: Observer) -> CheckResult:
-    foreign = sorted(
+    foreign = {
         f"{path} is {topic}"
         for path, topic in _topics(robot.view.capabilities, "")
         if not topic.startswith(f"{robot.base}/") or parse_topic(topic) is None
-    )
-    if foreign:
-        return failed(some_of(foreign), f"topics in capabilities begin with {robot.base}/: others are not used")
-    return ok("all are its own")
+    }
+    fix = f"topics in capabilities begin with {robot.base}/: others are not used"
+    return _none_of(foreign, fix, "all are its own")
 
 
 def _topics(value: object, path: str) -> Iterator[tuple[str, str]]:
@@ -233,19 +222,18 @@ def states(robot: Observer) -> dict[str, EstopState]:
 
 def owners(robot: Observer) -> CheckResult:
     lacks = [topic.removeprefix(f"{robot.base}/") for topic in robot.view.estop.missing]
-    if lacks:
-        return failed(f"no state of {some_of(lacks)}", "publish it, retained, for each owner that capabilities list")
-    return ok(", ".join(sorted(states(robot))))
+    fix = "publish it, retained, for each owner that capabilities list"
+    return _none_of(lacks, fix, ", ".join(sorted(states(robot))), "no state of ")
 
 
 def stop(robot: Observer, name: str) -> bool:
     robot.send(c.ESTOP, EstopCommand(stop=name, by=BY, why=_WHY))
-    return robot.answers(lambda: _has(robot, name))
 
+    def latches() -> bool:
+        owners = states(robot).values()
+        return bool(owners) and all(state.latched and name in state.recent for state in owners)
 
-def _has(robot: Observer, name: str) -> bool:
-    by_owner = states(robot)
-    return bool(by_owner) and all(state.latched and name in state.recent for state in by_owner.values())
+    return robot.answers(latches)
 
 
 def _counts(robot: Observer) -> dict[str, int]:
@@ -275,7 +263,7 @@ def while_stopped(test: Callable[[Observer, str], CheckResult]) -> Callable[[Obs
         finally:
             is_free = freed(robot)
         if not is_free and outcome.state is not State.FAILED:
-            return failed("a reset with its boot and count does not end it", "end it on incoming/estop-reset")
+            return failed("a reset with its boot and count does not end it", END_IT)
         return outcome
 
     return run

@@ -13,6 +13,7 @@ from pebble import contract as c
 from pebble.checks.check import Check, CheckResult, failed, ok, skipped
 from pebble.checks.conform.checks import BY, commanded, controls, drives, free, states, stops, while_stopped
 from pebble.checks.observer import ANSWER_S, Observer
+from pebble.client.pace_of_link import ms
 from pebble.contract.payloads import ControlRequest, ControlState, EstopReset
 
 _SHORTEST_MS = 1000  # control ends so long after the last request or command, or later
@@ -26,11 +27,11 @@ UNSEEN = "its broker does not show this account that it delivers such a message"
 class Driver:
     """A program of a person who requests control, and drives with its key, if it has one."""
 
-    def __init__(self, robot: Observer) -> None:
-        self._robot, self.id = robot, secrets.token_hex(4)
+    def __init__(self, robot: Observer, by: str = BY) -> None:
+        self._robot, self._by, self.id = robot, by, secrets.token_hex(4)
 
     def request(self, want: Literal["hold", "release"] = "hold", for_ms: float = _SHORTEST_MS) -> ControlRequest:
-        return ControlRequest(id=self.id, want=want, for_ms=for_ms, by=BY)
+        return ControlRequest(id=self.id, want=want, for_ms=for_ms, by=self._by)
 
     def asks(self, want: Literal["hold", "release"] = "hold", for_ms: float = _SHORTEST_MS) -> None:
         self._robot.send(c.CONTROL, self.request(want, for_ms))
@@ -51,11 +52,13 @@ class Driver:
         return self._robot.send(c.DRIVE, msgspec.json.encode({"value": command} if wrapped else command))
 
     def drive(self, seconds: float = DRIVES_S, *, z: object = SPEED, **fields: Any) -> tuple[float, float]:
-        """Send commands for so long; return when the first and the last one left."""
+        """Send commands for so long, at the pace of its link; return when the first and the last one left."""
         began = last = time.monotonic()
+        pace = self._robot.view.pace
         while time.monotonic() < began + seconds:
-            last = self.send(z, **fields)
-            self._robot.look(STEP_S)
+            dated = {"t": ms(time.monotonic()), "valid_ms": pace.valid_ms} if pace.stamped else {}
+            last = self.send(z, **dated | fields)
+            self._robot.look(max(STEP_S, pace.step_s))
         return began, last
 
     @property
@@ -64,12 +67,18 @@ class Driver:
 
     @property
     def key(self) -> str:
-        """Return the key of its control; empty while it has none."""
-        return str(self.state.key) if self.state and self.state.id == self.id else ""
+        """Return the keys of its control, one of each motor owner; empty while it has none."""
+        keys = [state.key for state in self._robot.view.control.states if state.id == self.id]
+        return " ".join(keys) if self.holds else ""
 
     @property
     def holds(self) -> bool:
-        return self.key != ""
+        return self.state is not None and self.state.id == self.id and self.state.key != ""
+
+    @property
+    def may_drive(self) -> bool:
+        """True if no other one has the robot."""
+        return self.holds or not self._robot.view.controlled
 
 
 def _with_control(test: Callable[[Observer, Driver], CheckResult]) -> Callable[[Observer], CheckResult]:

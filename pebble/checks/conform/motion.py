@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import secrets
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
@@ -12,7 +12,7 @@ import msgspec
 
 from pebble import contract as c
 from pebble.checks.check import Check, CheckResult, State, failed, ok, skipped
-from pebble.checks.conform.checks import commanded, controls, drives, free, freed, reset, stop, stops
+from pebble.checks.conform.checks import BY, END_IT, commanded, controls, drives, free, freed, reset, stop, stops
 from pebble.checks.conform.control import DRIVES_S, SPEED, STEP_S, UNSEEN, Driver, named
 from pebble.checks.observer import ANSWER_S, Observer
 
@@ -68,19 +68,29 @@ def _are_wheels(value: Any) -> bool:
 
 
 @contextmanager
-def _at_the_wheel(robot: Observer) -> Iterator[Driver]:
-    """Take control and let go, so that a wait after a reset is over; at the end, too."""
-    driver = Driver(robot)
-    if robot.view.controlled:
-        driver.asks(for_ms=10_000)
-        robot.answers(lambda: driver.holds)
-    driver.send()
-    robot.wait(lambda: moves_until(robot, time.monotonic()) != float("inf"), ANSWER_S)
+def at_the_wheel(robot: Observer, by: str = BY, answer_s: float = ANSWER_S) -> Iterator[Driver]:
+    """Take control if it is free, and let go, so that a wait after a reset is over; at the end, too."""
+    driver = Driver(robot, by)
     try:
+        if robot.view.controlled:
+            driver.asks(for_ms=10_000)
+            robot.answers(lambda: driver.holds, answer_s)
+        if driver.may_drive:
+            driver.send()
+            robot.wait(lambda: moves_until(robot, time.monotonic()) != float("inf"), ANSWER_S)
         yield driver
     finally:
-        driver.send()
+        if driver.may_drive:
+            driver.send(valid_ms=0)
         driver.leaves()
+
+
+def _driven(test: Callable[[Observer, Driver], CheckResult]) -> Callable[[Observer], CheckResult]:
+    def run(robot: Observer) -> CheckResult:
+        with at_the_wheel(robot) as driver:
+            return test(robot, driver)
+
+    return run
 
 
 def _rest(robot: Observer, began: float, last: float, limit_s: float, what: str = "the last command") -> CheckResult:
@@ -110,93 +120,80 @@ def _moved(robot: Observer, since: float, why: str, fix: str) -> CheckResult:
     return failed(why, fix) if until > since else ok("it moves nothing")
 
 
-def dead_man(robot: Observer) -> CheckResult:
-    with _at_the_wheel(robot) as driver:
-        return _rest(robot, *driver.drive(), RESTS_S)
+def _dead_man(robot: Observer, driver: Driver) -> CheckResult:
+    return _rest(robot, *driver.drive(), RESTS_S)
 
 
-def valid_ms(robot: Observer) -> CheckResult:
+def _valid_ms(robot: Observer, driver: Driver) -> CheckResult:
     """Drive by commands with a short time, and with one that is too long."""
-    with _at_the_wheel(robot) as driver:
-        outcome = _rest(robot, *driver.drive(valid_ms=150), 0.15)
-        if outcome.state is not State.OK:
-            return outcome
-        last = _rest(robot, *driver.drive(0.2, valid_ms=4000), RESTS_S)
-        return outcome if last.state is State.OK else failed(f"valid_ms 4000: {last.text}", last.fix)
+    outcome = _rest(robot, *driver.drive(valid_ms=150), 0.15)
+    if outcome.state is not State.OK:
+        return outcome
+    last = _rest(robot, *driver.drive(0.2, valid_ms=4000), RESTS_S)
+    return outcome if last.state is State.OK else failed(f"valid_ms 4000: {last.text}", last.fix)
 
 
-def zero(robot: Observer) -> CheckResult:
+def _zero(robot: Observer, driver: Driver) -> CheckResult:
     """Send a zero that is not the driver's: it needs no key."""
-    with _at_the_wheel(robot) as driver:
-        began, _ = driver.drive()
-        return _rest(robot, began, driver.send(key=_OTHER_KEY), 0.1, "a zero with another key")
+    began, _ = driver.drive()
+    return _rest(robot, began, driver.send(key=_OTHER_KEY), 0.1, "a zero with another key")
 
 
-def steering(robot: Observer) -> CheckResult:
+def _steering(robot: Observer, driver: Driver) -> CheckResult:
     ways: tuple[tuple[dict[str, Any], tuple[int, int]], ...] = (
         ({"z": 0, "x": SPEED}, (1, -1)),
         ({"z": SPEED}, (1, 1)),
         ({"z": -SPEED, "wrapped": True}, (-1, -1)),
     )
-    with _at_the_wheel(robot) as driver:
-        for fields, signs in ways:
-            wheels = _moves(robot, driver.drive(DRIVES_S / 2, **fields)[0])
-            if wheels is None:
-                return skipped(_NOT_SHOWN, _SHOW_IT)
-            if [speed * sign > 0 for speed, sign in zip(wheels, signs, strict=False)] != [True, True]:
-                sent = f"x {fields.get('x', 0):g}, z {fields['z']:g}" + " within value" * ("wrapped" in fields)
-                return failed(f"at {sent} its wheels do {wheels}", "left is z + x, right is z - x, also within value")
+    for fields, signs in ways:
+        wheels = _moves(robot, driver.drive(DRIVES_S / 2, **fields)[0])
+        if wheels is None:
+            return skipped(_NOT_SHOWN, _SHOW_IT)
+        if [speed * sign > 0 for speed, sign in zip(wheels, signs, strict=False)] != [True, True]:
+            sent = f"x {fields.get('x', 0):g}, z {fields['z']:g}" + " within value" * ("wrapped" in fields)
+            return failed(f"at {sent} its wheels do {wheels}", "left is z + x, right is z - x, also within value")
     return ok("x to the right, z ahead")
 
 
-def stop_moving(robot: Observer) -> CheckResult:
+def _stop_moving(robot: Observer, driver: Driver) -> CheckResult:
     """Go on with commands, and begin again after the stick was let go; they move nothing."""
-    with _at_the_wheel(robot) as driver:
-        began, _ = driver.drive()
-        at = time.monotonic()
-        stop(robot, secrets.token_hex(8))
-        driver.drive()
-        driver.send()
-        driver.drive(DRIVES_S / 2)
-        outcome = _rest(robot, began, at, 0.25, "the stop")
-    return outcome if freed(robot) else failed("a reset does not end the stop", "end it on incoming/estop-reset")
+    began, _ = driver.drive()
+    at = time.monotonic()
+    stop(robot, secrets.token_hex(8))
+    driver.drive()
+    driver.send()
+    driver.drive(DRIVES_S / 2)
+    outcome = _rest(robot, began, at, 0.25, "the stop")
+    return outcome if freed(robot) else failed("a reset does not end the stop", END_IT)
 
 
-def reset_waits(robot: Observer) -> CheckResult:
+def _reset_waits(robot: Observer, driver: Driver) -> CheckResult:
     """Hold the stick down meanwhile. A zero of another ends no wait while one has control."""
-    with _at_the_wheel(robot) as driver:
-        stop(robot, secrets.token_hex(8))
-        began, _ = driver.drive(2 * STEP_S)  # from before the reset on: a pause would end the wait
-        reset(robot)
-        driver.drive(DRIVES_S / 2)
-        if robot.view.controlled:
-            driver.send(key=_OTHER_KEY)
-        driver.drive()
-        outcome = _moved(
-            robot,
-            began,
-            "a stick that is held down moves it after a reset",
-            "wait for a zero of who has control, or for 0.5 s without commands",
-        )
-        if outcome.state is State.OK:
-            driver.send()
-            outcome = _rest(robot, *driver.drive(), RESTS_S)
-    if robot.wait(lambda: not robot.view.latched, ANSWER_S):
-        return outcome
-    return failed("a reset does not end the stop", "end it on incoming/estop-reset")
+    stop(robot, secrets.token_hex(8))
+    began, _ = driver.drive(2 * STEP_S)  # from before the reset on: a pause would end the wait
+    reset(robot)
+    driver.drive(DRIVES_S / 2)
+    if robot.view.controlled:
+        driver.send(key=_OTHER_KEY)
+    driver.drive()
+    why = "a stick that is held down moves it after a reset"
+    outcome = _moved(robot, began, why, "wait for a zero of who has control, or for 0.5 s without commands")
+    if outcome.state is State.OK:
+        driver.send()
+        outcome = _rest(robot, *driver.drive(), RESTS_S)
+    is_free = robot.wait(lambda: not robot.view.latched, ANSWER_S)
+    return outcome if is_free else failed("a reset does not end the stop", END_IT)
 
 
-def not_a_number(robot: Observer) -> CheckResult:
-    with _at_the_wheel(robot):
-        began = time.monotonic()
-        for number in (b"NaN", b"Infinity", b"1e999", b'"nan"', b"null"):
-            robot.send(c.DRIVE, b'{"x": 0, "z": %s}' % number)
-        return _moved(robot, began, "it moves by a command that is no number", "refuse NaN and infinity")
+def _not_a_number(robot: Observer, _driver: Driver) -> CheckResult:
+    began = time.monotonic()
+    for number in (b"NaN", b"Infinity", b"1e999", b'"nan"', b"null"):
+        robot.send(c.DRIVE, b'{"x": 0, "z": %s}' % number)
+    return _moved(robot, began, "it moves by a command that is no number", "refuse NaN and infinity")
 
 
-def clamped(robot: Observer) -> CheckResult:
-    with _at_the_wheel(robot) as driver:
-        wheels = _moves(robot, driver.drive(DRIVES_S / 2, z=9, x=-9)[0])
+def _clamped(robot: Observer, driver: Driver) -> CheckResult:
+    wheels = _moves(robot, driver.drive(DRIVES_S / 2, z=9, x=-9)[0])
     if wheels is None:
         return skipped(_NOT_SHOWN, _SHOW_IT)
     if not wheels:
@@ -207,43 +204,39 @@ def clamped(robot: Observer) -> CheckResult:
     return ok(f"{largest:g} at most")
 
 
-def foreign_key(robot: Observer) -> CheckResult:
+def _foreign_key(robot: Observer, driver: Driver) -> CheckResult:
     """Drive with another's key while one has control, and while none has."""
     why, fix = "it moves by another's key", "refuse what moves and has another key"
-    with _at_the_wheel(robot) as driver:
-        outcome = _moved(robot, driver.drive(key=_OTHER_KEY)[0], why, fix)
+    outcome = _moved(robot, driver.drive(key=_OTHER_KEY)[0], why, fix)
     if outcome.state is not State.OK:
         return outcome
+    driver.leaves()
     return _moved(robot, driver.drive(DRIVES_S / 2, key=_OTHER_KEY)[0], f"{why} while no one has control", fix)
 
 
-def control_passes(robot: Observer) -> CheckResult:
-    with _at_the_wheel(robot) as driver:
-        began, _ = driver.drive()
-        key, second = driver.key, Driver(robot)
-        at = second.takes()
-        robot.answers(lambda: second.holds)
-        driver.drive(key=key)
-        outcome = _rest(robot, began, at, 0.25, "another took control")
-        second.leaves()
+def _control_passes(robot: Observer, driver: Driver) -> CheckResult:
+    began, _ = driver.drive()
+    key, second = driver.key, Driver(robot)
+    at = second.takes()
+    robot.answers(lambda: second.holds)
+    driver.drive(key=key)
+    outcome = _rest(robot, began, at, 0.25, "another took control")
+    second.leaves()
     return outcome
 
 
-def keyless(robot: Observer) -> CheckResult:
-    with _at_the_wheel(robot) as driver:
-        began, _ = driver.drive(key="")
-        return _moved(robot, began, "it moves by a command without a key", "at level named refuse those")
+def _keyless(robot: Observer, driver: Driver) -> CheckResult:
+    began, _ = driver.drive(key="")
+    return _moved(robot, began, "it moves by a command without a key", "at level named refuse those")
 
 
-def foreign_account(robot: Observer) -> CheckResult:
+def _foreign_account(robot: Observer, driver: Driver) -> CheckResult:
     """Send the key of control behind another account, and behind none."""
-    with _at_the_wheel(robot) as driver:
-        command = msgspec.json.encode({"x": 0, "z": SPEED, "key": driver.key})
-        began = time.monotonic()
-        delivered = [robot.send_as(account, c.DRIVE, command) for account in (_OTHER_ACCOUNT, "")]
-        outcome = _moved(
-            robot, began, "it moves by a key that another sends", "a key counts with the account that asked for it"
-        )
+    command = msgspec.json.encode({"x": 0, "z": SPEED, "key": driver.key})
+    began = time.monotonic()
+    delivered = [robot.send_as(account, c.DRIVE, command) for account in (_OTHER_ACCOUNT, "")]
+    fix = "a key counts with the account that asked for it"
+    outcome = _moved(robot, began, "it moves by a key that another sends", fix)
     return outcome if all(delivered) or outcome.state is State.FAILED else skipped(UNSEEN)
 
 
@@ -251,16 +244,16 @@ _MOVES = (drives, free, commanded)
 _BY_TURNS = (*_MOVES, controls)
 
 MOVING: tuple[Check[Observer], ...] = (
-    Check("dead man", dead_man, _MOVES, "a driver may vanish at any moment"),
-    Check("validity", valid_ms, _MOVES, "a command tells how long it counts, but never long"),
-    Check("zero", zero, _MOVES, "who lets go expects it to stop at once, and anyone may halt it"),
-    Check("steering", steering, _MOVES, "a person must know where it will go"),
-    Check("no number", not_a_number, _MOVES, "a speed that is no number must not be one"),
-    Check("clamps", clamped, _MOVES, "motors get no more than everything"),
-    Check("foreign key", foreign_key, _BY_TURNS, "who had control before must not drive on"),
-    Check("control passes", control_passes, _BY_TURNS, "the next driver must not get a robot that moves"),
-    Check("stop moving", stop_moving, (*_MOVES, stops), "a stopped robot does not move, whatever is sent"),
-    Check("reset waits", reset_waits, (*_MOVES, stops), "who resets must not be surprised by a stick"),
-    Check("keyless", keyless, _BY_TURNS, "where names are checked, who drives is known", binds=named),
-    Check("foreign account", foreign_account, _BY_TURNS, "a key can be read by all", binds=named),
+    Check("dead man", _driven(_dead_man), _MOVES, "a driver may vanish at any moment"),
+    Check("validity", _driven(_valid_ms), _MOVES, "a command tells how long it counts, but never long"),
+    Check("zero", _driven(_zero), _MOVES, "who lets go expects it to stop at once, and anyone may halt it"),
+    Check("steering", _driven(_steering), _MOVES, "a person must know where it will go"),
+    Check("no number", _driven(_not_a_number), _MOVES, "a speed that is no number must not be one"),
+    Check("clamps", _driven(_clamped), _MOVES, "motors get no more than everything"),
+    Check("foreign key", _driven(_foreign_key), _BY_TURNS, "who had control before must not drive on"),
+    Check("control passes", _driven(_control_passes), _BY_TURNS, "the next driver must not get a robot that moves"),
+    Check("stop moving", _driven(_stop_moving), (*_MOVES, stops), "a stopped robot does not move, whatever is sent"),
+    Check("reset waits", _driven(_reset_waits), (*_MOVES, stops), "who resets must not be surprised by a stick"),
+    Check("keyless", _driven(_keyless), _BY_TURNS, "where names are checked, who drives is known", binds=named),
+    Check("foreign account", _driven(_foreign_account), _BY_TURNS, "a key can be read by all", binds=named),
 )

@@ -11,11 +11,10 @@ from pathlib import Path
 from typing import NamedTuple
 from urllib.parse import quote
 
-from msgspec.structs import fields
-
 from pebble.config import Config
+from pebble.config.masking import values_of
 from pebble.config.secret_text import HIDDEN
-from pebble.config.types import Secret, Section
+from pebble.config.types import Secret
 from pebble.runtime.places import Places
 
 _SHORTEST = 4  # characters: a shorter one is in every text
@@ -40,9 +39,9 @@ _keys = re.compile(r"-----BEGIN [A-Z ]*PRIVATE KEY-----\n(.*?)-----END", re.DOTA
 
 
 class Secrets(NamedTuple):
-    """Secrets, ``known`` with where they are written; ``unread`` files may hold more, ``short`` have too short ones."""
+    """Secrets of a machine; ``unread`` files may hold more, and ``short`` ones have one that is too short."""
 
-    known: dict[str, str]
+    known: frozenset[str]
     unread: tuple[str, ...]
     short: tuple[str, ...]
 
@@ -56,22 +55,22 @@ class Secrets(NamedTuple):
 
 def secrets_of(places: Places, config: Config | None, more: Collection[Path] = ()) -> Secrets:
     """Return what is known on this machine. ``more``: further files and folders that may hold some."""
-    values = [] if config is None else [(str(value), f"the config's {key}") for key, value in _texts(config, Secret)]
     folders = [path for pattern in _PLACES for path in sorted(places.root.glob(pattern))]
+    values: list[tuple[str, str]] = []  # and where each is written
     if config is not None:
-        folders += [config.folder, config.state_dir()]
-        folders += [file for _, value in _texts(config, Path) if (file := Path(str(value))).is_file()]
+        folders += [config.folder, config.state_dir(), *filter(Path.is_file, values_of(config, Path))]
+        values += [(str(secret), "the config") for secret in values_of(config, Secret)]
         values += [(value, f"${name}") for name in config.password_variables if (value := os.environ.get(name))]
-    unread: list[str] = []
+    unread: set[str] = set()
     for file in dict.fromkeys(_walk([*folders, *more], unread)):
         try:
-            if file.stat().st_size <= _LARGEST:
+            if file.is_file() and file.stat().st_size <= _LARGEST:
                 values += [(value, str(file)) for value in values_in(file.name, file.read_bytes())]
         except OSError:
-            unread.append(str(file))
-    known = {value: where for value, where in reversed(values) if len(value) >= _SHORTEST}
+            unread.add(str(file))
+    known = frozenset(value for value, _ in values if len(value) >= _SHORTEST)
     short = {where for value, where in values if len(value) < _SHORTEST}
-    return Secrets(known, tuple(sorted(set(unread))), tuple(sorted(short)))
+    return Secrets(known, tuple(sorted(unread)), tuple(sorted(short)))
 
 
 def values_in(name: str, raw: bytes) -> Iterator[str]:
@@ -99,29 +98,13 @@ def _decoded(value: str) -> str:
         return value
 
 
-def _texts(value: object, kind: type, key: str = "") -> Iterator[tuple[str, object]]:
-    """Return the values of one kind in a config, and their keys."""
-    if isinstance(value, kind):
-        yield key, value
-    elif isinstance(value, Section):
-        for field in fields(value):
-            yield from _texts(getattr(value, field.name), kind, f"{key}.{field.encode_name}".lstrip("."))
-    elif isinstance(value, dict):
-        for name, item in value.items():
-            yield from _texts(item, kind, f"{key}.{name}")
-
-
-def _walk(places: Iterable[Path], unread: list[str]) -> Iterator[Path]:
-    def note(error: OSError) -> None:
-        if not isinstance(error, FileNotFoundError | NotADirectoryError):
-            unread.append(str(error.filename))
-
+def _walk(places: Iterable[Path], unread: set[str]) -> Iterator[Path]:
     for place in places:
         if place.is_file():
             yield place
-            continue
-        for folder, _, names in os.walk(place, onerror=note):
-            yield from (file for name in sorted(names) if (file := Path(folder, name)).is_file())
+        elif place.is_dir():
+            for folder, _, names in os.walk(place, onerror=lambda error: unread.add(str(error.filename))):
+                yield from (Path(folder, name) for name in sorted(names))
 
 
 def _forms(value: str) -> Iterator[str]:

@@ -8,7 +8,7 @@ from itertools import pairwise
 
 from pebble.checks.check import Check, CheckResult, failed, ok, skipped, some_of
 from pebble.checks.running import available, machine, why_not_free
-from pebble.checks.running.media import picture, sound
+from pebble.checks.running.media import received
 from pebble.checks.running.robot import RobotUnderTest, Side
 from pebble.checks.running.stops import retained_commands, stop
 from pebble.checks.running.wheels import wheels
@@ -74,11 +74,8 @@ def _unready(robot: RobotUnderTest) -> list[str]:
     """``held`` ones wait while people drive over a thin link, and ``stopped`` ones until they are requested."""
     if not robot.inside.status:
         return ["its status has not arrived: is it starting?"]
-    wanted = set(robot.config.on_demand_programs())
-    states = _states(robot).items()
-    return [
-        f"{name} is {state}" for name, state in states if state != "ready" and not (name in wanted or state == "held")
-    ]
+    states = {name: state for name, state in _states(robot).items() if state not in ("ready", "held")}
+    return [f"{name} is {states[name]}" for name in sorted(states.keys() - {*robot.config.on_demand_programs()})]
 
 
 def heartbeats(robot: RobotUnderTest) -> CheckResult:
@@ -90,17 +87,17 @@ def heartbeats(robot: RobotUnderTest) -> CheckResult:
     if not section.enabled:
         return skipped("services.mqtt_bridge.heartbeat is off")
 
+    seen = side.view.liveness
+
     def longest() -> float:
-        link = side.view.liveness.link
-        interval_s = max(section.interval_seconds, LEVELS[link].heartbeat_s)
-        late_s = side.view.liveness.average_latency_s or 0.0
-        return max(silent_after(interval_s, link, late_s), _LONGEST_GAP * interval_s)
+        interval_s = max(section.interval_seconds, LEVELS[seen.link].heartbeat_s)
+        return max(silent_after(interval_s, seen.link, seen.average_latency_s or 0.0), _LONGEST_GAP * interval_s)
 
     if not robot.wait(lambda: side.heartbeats, robot.patience_s):
         return failed("none arrives", "pebble doctor CONFIG")
     if not robot.wait(lambda: _gap(side) <= longest(), 3 * _IN_A_ROW * longest()):
         return failed(f"gaps of {_gap(side):.1f} s, where {longest():.1f} s is the longest", "pebble doctor CONFIG")
-    late = side.view.liveness.average_latency_s
+    late = seen.average_latency_s
     shown = "" if late is None else f", {1000 * late:.0f} ms on the way"
     return ok(f"{_IN_A_ROW} in a row, the longest gap {_gap(side):.2f} s{shown}")
 
@@ -108,23 +105,19 @@ def heartbeats(robot: RobotUnderTest) -> CheckResult:
 def _gap(side: Side) -> float:
     """Return the longest one between the newest heartbeats; infinite until there are enough."""
     newest = side.heartbeats[-_IN_A_ROW:]
-    if len(newest) < _IN_A_ROW:
-        return math.inf
-    return max(after - before for before, after in pairwise(newest))
+    gaps = [after - before for before, after in pairwise(newest)]
+    return max(gaps) if len(newest) == _IN_A_ROW else math.inf
 
 
 def capabilities(robot: RobotUnderTest) -> CheckResult:
     """Check that it offers, on both sides, what its config has."""
     wanted = {*available(expected_capabilities(robot.config, Addresses(robot.config)))} - {"outlets"}  # with a device
-    lacking: dict[str, str] = {}
     for side in robot.sides:
         where = "" if side.own else " to operators"
         if not side.view.estop.has_capabilities:
             return failed(f"it has not published them{where}", _LOG)
-        for name in sorted(wanted - {*available(side.view.capabilities)}):
-            lacking.setdefault(name, f"{name}{where}")
-    if lacking:
-        return failed(f"it does not offer {', '.join(lacking.values())}", _LOG)
+        if lacking := sorted(wanted - {*available(side.view.capabilities)}):
+            return failed(f"it does not offer {', '.join(lacking)}{where}", _LOG)
     return ok(", ".join(sorted(wanted)) or "none")
 
 
@@ -137,16 +130,15 @@ def boards(robot: RobotUnderTest) -> CheckResult:
     if not lines:
         return skipped("it has no serial line")
 
-    def ready() -> bool:
-        return all(_mcu(robot, name).get("state") == "ready" for name in lines)
+    def absent() -> list[str]:
+        return [name for name in lines if _mcu(robot, name).get("state") != "ready"]
 
-    robot.wait(ready, robot.patience_s)
-    robot.wait(lambda: robot.view.driveable is None or robot.view.driveable.state != "unknown", _JUDGED_S * ready())
-    for name, port in lines.items():
-        mcu = _mcu(robot, name)
-        if mcu.get("state") != "ready":
-            why = mcu.get("why") or _MCU_STATES.get(str(mcu.get("state")), "its state is not known")
-            return failed(f"{name} ({port}): {why}", f"plug it in, then: ls -l /dev/serial/by-id/; {_LOG}")
+    robot.wait(lambda: not absent(), robot.patience_s)
+    if names := absent():
+        mcu = _mcu(robot, names[0])
+        why = mcu.get("why") or _MCU_STATES.get(str(mcu.get("state")), "its state is not known")
+        return failed(f"{names[0]} ({lines[names[0]]}): {why}", f"plug it in, then: ls -l /dev/serial/by-id/; {_LOG}")
+    robot.wait(lambda: robot.view.driveable is None or robot.view.driveable.state != "unknown", _JUDGED_S)
     drives = robot.view.driveable
     if drives is not None and drives.state == "no":
         return failed(f"its motors are not reached: {drives.why}", _LOG)
@@ -182,16 +174,17 @@ def leftovers(robot: RobotUnderTest) -> CheckResult:
     here = [side for side in robot.sides if side.is_here(robot.config)]
     if not here:
         return skipped("other ids at a broker elsewhere are other robots")
+    others: set[str] = set()
     for side in here:
-        gone = sorted(side.others.keys() - side.live)
-        if gone:
+        topics, live = side.others()
+        others |= topics.keys()
+        if gone := sorted(topics.keys() - live):
             names = some_of([id_of(base) for base in gone], _SHOWN)
             remote = "" if side.own else " --remote"
-            topic = shlex.quote(min(side.others[gone[0]]))  # anybody may have chosen it
+            topic = shlex.quote(min(topics[gone[0]]))  # anybody may have chosen it
             fix = f"if they are gone: pebble topic pub {topic} '' --retain --force -c CONFIG{remote}, and so on"
             return failed(f"{len(gone)} that send no heartbeat: {names}", fix)
-    others = len({base for side in here for base in side.others})
-    return ok(f"none; {others} other robots are there" if others else "none")
+    return ok(f"none; {len(others)} other robots are there" if others else "none")
 
 
 _BOTH = (running, operators_side)
@@ -207,8 +200,8 @@ CHECKS: tuple[Check[RobotUnderTest], ...] = (
     Check("battery", battery, (running, motors)),
     Check("leftovers", leftovers, (running,)),
     Check("page", machine.page),
-    Check("picture", picture, (*_BOTH, account)),
-    Check("sound", sound, (*_BOTH, account)),
+    Check("picture", lambda robot: received(robot, "video", "camera"), (*_BOTH, account)),
+    Check("sound", lambda robot: received(robot, "audio", "microphone"), (*_BOTH, account)),
     Check("retained commands", retained_commands, (*_BOTH, account, motors, free)),
     Check("stop", stop, (running, motors, free)),
 )

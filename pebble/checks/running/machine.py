@@ -3,13 +3,12 @@
 import os
 import shutil
 import ssl
-import subprocess
 import time
 from collections.abc import Mapping
-from http.client import HTTPException
+from contextlib import closing
+from http import HTTPStatus
+from http.client import HTTPConnection, HTTPException, HTTPSConnection
 from pathlib import Path
-from urllib.error import HTTPError
-from urllib.request import HTTPSHandler, ProxyHandler, build_opener
 
 from pebble.checks import machine as this_machine
 from pebble.checks.check import SOON_DAYS, CheckResult, State, failed, ok, skipped
@@ -20,7 +19,6 @@ from pebble.fleet import certificates
 
 UNIT = "pebble.service"
 _PROPERTIES = ("LoadState", "ActiveState", "SubState", "UnitFileState", "NRestarts", "Result")
-_SYSTEMCTL_S = 5.0
 _PAGE_S = 5.0
 _LEAST_FREE = 200_000_000  # bytes: logs, the audit and an update's states go on for weeks
 _LEAST_SHARE = 0.02
@@ -36,12 +34,10 @@ def unit(robot: RobotUnderTest) -> CheckResult:
         return skipped(f"{UNIT} would run {robot.places.config}, which is another file")
     if shutil.which("systemctl") is None or not Path("/run/systemd/system").is_dir():
         return skipped("there is no systemd here")
-    command = ["systemctl", "show", UNIT, *(f"--property={name}" for name in _PROPERTIES)]
-    try:
-        done = subprocess.run(command, capture_output=True, text=True, timeout=_SYSTEMCTL_S, check=False)
-    except (OSError, subprocess.TimeoutExpired):
+    shown = this_machine.printed("systemctl", "show", UNIT, *(f"--property={name}" for name in _PROPERTIES))
+    if not shown:
         return failed("systemd does not answer", "systemctl status")
-    return unit_of(dict(line.partition("=")[::2] for line in done.stdout.splitlines()))
+    return unit_of(dict(line.partition("=")[::2] for line in shown.splitlines()))
 
 
 def unit_of(properties: Mapping[str, str]) -> CheckResult:
@@ -90,10 +86,7 @@ def disk(robot: RobotUnderTest) -> CheckResult:
     """Check that stops, people and the audit can go on being saved."""
     folder = Path(os.path.normpath(robot.config.state_dir()))  # a config may name it by ../..
     existing = next(place for place in (folder, *folder.parents) if place.exists())
-    return disk_of(folder, os.statvfs(existing))
-
-
-def disk_of(folder: Path, room: os.statvfs_result) -> CheckResult:
+    room = os.statvfs(existing)
     free, whole = room.f_bavail * room.f_frsize, room.f_blocks * room.f_frsize
     text = f"{free / 1e9:.1f} of {whole / 1e9:.1f} GB are free at {folder}"
     if room.f_flag & os.ST_RDONLY:
@@ -121,14 +114,13 @@ def page(robot: RobotUnderTest) -> CheckResult:
     shown = f"[{host}]" if ":" in host else host
     where = f"{'http' if context is None else 'https'}://{shown}:{settings.port}/"
     try:
-        build_opener(ProxyHandler({}), HTTPSHandler(context=context)).open(where, timeout=_PAGE_S).close()
-    except HTTPError as error:
-        return failed(f"{where} answers {error.code}", "journalctl -u pebble -n 50")
+        status = _status(host, settings.port, context)
+    except ssl.SSLCertVerificationError as error:
+        return failed(f"{where} shows another certificate, or one that ended: {error.verify_message}", _RENEW)
     except (OSError, HTTPException) as error:
-        reason = getattr(error, "reason", error)
-        if isinstance(reason, ssl.SSLCertVerificationError):
-            return failed(f"{where} shows another certificate, or one that ended: {reason.verify_message}", _RENEW)
-        return failed(f"{where} does not answer: {reason}", "pebble doctor CONFIG; journalctl -u pebble -n 50")
+        return failed(f"{where} does not answer: {error}", "pebble doctor CONFIG; journalctl -u pebble -n 50")
+    if status >= HTTPStatus.BAD_REQUEST:
+        return failed(f"{where} answers {status}", "journalctl -u pebble -n 50")
     if days is None:
         return ok(f"{where} answers, without encryption")
     if days < SOON_DAYS:
@@ -137,6 +129,14 @@ def page(robot: RobotUnderTest) -> CheckResult:
 
 
 _RENEW = "pebble cert renew, then restart the robot"
+
+
+def _status(host: str, port: int, context: ssl.SSLContext | None) -> int:
+    plain = HTTPConnection(host, port, timeout=_PAGE_S)
+    page = plain if context is None else HTTPSConnection(host, port, timeout=_PAGE_S, context=context)
+    with closing(page):
+        page.request("GET", "/")
+        return page.getresponse().status
 
 
 def _trusting(certificate: Path | None) -> tuple[ssl.SSLContext | None, float | None]:

@@ -12,15 +12,7 @@ _LOG = "pebble doctor CONFIG; journalctl -u pebble -n 50"
 _PROGRAMS: dict[Medium, str] = {"video": "camera_publisher", "audio": "audio_publisher"}
 
 
-def picture(robot: RobotUnderTest) -> CheckResult:
-    return _received(robot, "video", "camera")
-
-
-def sound(robot: RobotUnderTest) -> CheckResult:
-    return _received(robot, "audio", "microphone")
-
-
-def _received(robot: RobotUnderTest, medium: Medium, device: str) -> CheckResult:
+def received(robot: RobotUnderTest, medium: Medium, device: str) -> CheckResult:
     if _PROGRAMS[medium] not in robot.config.media_programs():
         return skipped(f"it has no {device}")
     assert robot.operators is not None  # noqa: S101 - the table says so

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import pwd
+from collections import defaultdict
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
@@ -21,29 +22,24 @@ from pebble.contract.identity import parse_topic
 from pebble.errors import PebbleError
 from pebble.runtime.addresses import Addresses
 from pebble.runtime.places import Places
-from pebble.transports import Message, Transport
+from pebble.transports import Transport
 
 PATIENCE_S, RESTS_S = 3.0, 0.75
-_MAX_IDS = 1000  # other robots at a broker of this machine
+_HEARTBEATS_S = 2.5  # within which a robot at a broker of this machine sends one
 _STATES = (c.ONLINE, c.CAPABILITIES, c.STATUS, c.ESTOP_STATE)
 _WATCHED = (*_STATES, c.CONTROL_STATE, c.LINK, c.CHARGING_LEVEL, c.CHARGING_STATUS, c.AUTONOMY_STATUS)
 _ANY = "+/+/+"
 
 
 class Side(Observer):
-    """A side of the robot, and what other robots have left there."""
+    """A side of the robot."""
 
     def __init__(self, config: Config, target: Target, transport: Transport, names: Names, *, own: bool) -> None:
         """``own``: the robot's own side, where its processes meet."""
         self.own = own
-        self.others: dict[str, set[str]] = {}  # retained topics by the base of another robot
-        self.live: set[str] = set()  # other robots that send heartbeats
         self._addresses = Addresses(config)
-        filters = {self._addresses[channel].topic for channel in (*_WATCHED, *((c.TOUCH_SENSORS,) if own else ()))}
-        if self.is_here(config):  # each message comes once: of filters that overlap, only the wider ones
-            filters -= {channel.filter(config.base) for channel in _STATES}
-            filters |= {channel.filter(_ANY) for channel in _STATES}
-        super().__init__(target, transport, names, config.base, sorted(filters))
+        watched = (*_WATCHED, c.TOUCH_SENSORS) if own else _WATCHED
+        super().__init__(target, transport, names, config.base, [self._addresses[channel].topic for channel in watched])
 
     def is_here(self, config: Config) -> bool:
         """True if it ends on this machine: what other robots have left there can only be left over."""
@@ -61,21 +57,21 @@ class Side(Observer):
     def channel_of(self, topic: str) -> c.Channel | None:
         return self._addresses.channel(topic)
 
-    def receive(self, message: Message, at: float, wall: float) -> None:
-        if message.topic.startswith(f"{self.base}/") or self.channel_of(message.topic) is not None:
-            super().receive(message, at, wall)
-        else:
-            self._note_other(message)
-
-    def _note_other(self, message: Message) -> None:
-        address = parse_topic(message.topic)
-        if address is None or address.identity.is_server:
-            return
-        base = address.identity.base
-        if address.metric == c.ONLINE.metric and not message.retain:
-            self.live.add(base)
-        elif message.retain and message.payload and (base in self.others or len(self.others) < _MAX_IDS):
-            self.others.setdefault(base, set()).add(message.topic)
+    def others(self) -> tuple[dict[str, list[str]], set[str]]:
+        """Return the retained topics of each other robot, by its base, and which of these robots send heartbeats."""
+        topics: defaultdict[str, list[str]] = defaultdict(list)
+        live: set[str] = set()
+        with self.beside("selftest-others", *(channel.filter(_ANY) for channel in _STATES)) as (_, messages):
+            self.look(_HEARTBEATS_S)
+        for message in list(messages):
+            address = parse_topic(message.topic)
+            if address is None or address.identity.is_server or address.identity.base == self.base:
+                continue
+            if message.retain and message.payload:
+                topics[address.identity.base].append(message.topic)
+            elif address.metric == c.ONLINE.metric:
+                live.add(address.identity.base)
+        return topics, live
 
     @property
     def status(self) -> dict[str, object]:

@@ -4,7 +4,6 @@ import time
 
 from pebble.checks.check import CheckResult, failed, ok, skipped
 from pebble.checks.running.robot import RobotUnderTest
-from pebble.client.connection import connected
 from pebble.client.estop import StopSender, new_name
 from pebble.client.estop_states import Reset
 from pebble.contract import ESTOP_RESET, ESTOP_STATE, codec
@@ -19,32 +18,28 @@ _NO_BOOT, _NO_COUNT = "selftest", 1_000_000  # of no start of a motor owner, and
 def stop(robot: RobotUnderTest) -> CheckResult:
     """Stop it as operators do, and end exactly this stop on its own side."""
     before = {owner: state.recent for owner, state in robot.view.estop.states.items()}
-    name = new_name()
-    try:
-        outcome = _stopped(robot, name)
-    finally:  # also when this is interrupted: what it has stopped, it ends
-        left = _ended(robot, name, before)
-    return failed(left, "pebble estop reset CONFIG") if left else outcome
-
-
-def _stopped(robot: RobotUnderTest, name: str) -> CheckResult:
-    side = robot.way
+    side, name = robot.way, new_name()
     sender = StopSender(name, by=robot.by, why=_WHY, now=time.monotonic(), robots=[robot.config.base])
     stopped = sender.robots[robot.config.base]
     stopped.estop = side.view.estop  # as it is known already, with its topics
+    side.listeners.append(sender.receive)
 
     def confirmed() -> bool:
         side.publish(sender.tick(time.monotonic()))
         return sender.confirmed
 
-    with side.heard_by(sender.receive):
+    try:
         robot.wait(confirmed, _CONFIRMED_S)
-    if not sender.confirmed:
-        return failed(
-            f"NOT CONFIRMED after {_CONFIRMED_S:g} s: {stopped.why}", "pebble doctor CONFIG; pebble estop CONFIG"
-        )
+        took_s, why = stopped.confirmed_s, stopped.why
+    finally:  # also when this is interrupted: what it has stopped, it ends
+        left = _ended(robot, name, before)
+    if left:
+        return failed(left, "pebble estop reset CONFIG")
+    if took_s is None:
+        text = f"NOT CONFIRMED after {_CONFIRMED_S:g} s: {why}"
+        return failed(text, "pebble doctor CONFIG; pebble estop CONFIG")
     from_ = "its own side" if side.own else "operators"
-    return ok(f"confirmed {stopped.confirmed_s:.2f} s after {from_} sent it, and ended by name")
+    return ok(f"confirmed {took_s:.2f} s after {from_} sent it, and ended by name")
 
 
 def _ended(robot: RobotUnderTest, name: str, before: dict[str, list[str]]) -> str:
@@ -80,24 +75,23 @@ def retained_commands(robot: RobotUnderTest) -> CheckResult:
     if state.reset_refused is not None:
         return skipped("it refused a reset before, which looks the same", "run it again")
     topic, metric = ESTOP_RESET.topic(robot.config.base), ESTOP_STATE.suffix.format(owner=owner)
-    old = codec.encode(ESTOP_RESET, EstopReset(boot=_NO_BOOT, count=0, by=_WHY))
-    live = EstopReset(boot=state.boot, count=state.count + _NO_COUNT, by=_WHY)
     began = time.monotonic()
 
     def refused() -> set[str | None]:
         states = [record for record in operators.of(ESTOP_STATE, began) if record.metric == metric]
         return {record.value.reset_refused for record in states if record.value is not None}
 
-    # It puts no name into the topic: nothing with one is retained.
-    with connected(operators.target) as (beside, _):
+    def leave(payload: bytes) -> None:
+        beside.publish(topic, payload, qos=QoS.DELIVERED, retain=True, remember=False)
+        robot.wait(lambda: beside.outgoing.waiting == 0, robot.patience_s)
+
+    with operators.beside("selftest") as (beside, _):  # it puts no name into the topic: nothing with one is retained
         try:
-            beside.publish(topic, old, qos=QoS.DELIVERED, retain=True, remember=False)
-            robot.wait(lambda: beside.outgoing.waiting == 0, robot.patience_s)
-            operators.send(ESTOP_RESET, live)
+            leave(codec.encode(ESTOP_RESET, EstopReset(boot=_NO_BOOT, count=0, by=_WHY)))
+            operators.send(ESTOP_RESET, EstopReset(boot=state.boot, count=state.count + _NO_COUNT, by=_WHY))
             robot.wait(lambda: "count" in refused(), robot.patience_s)
         finally:
-            beside.publish(topic, b"", qos=QoS.DELIVERED, retain=True, remember=False)
-            robot.wait(lambda: beside.outgoing.waiting == 0, robot.patience_s)
+            leave(b"")
     if "boot" in refused():
         return failed("it read a retained command as if it were sent now", "pebble doctor CONFIG")
     if "count" not in refused():

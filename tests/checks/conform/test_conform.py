@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from pebble.checks.check import Check, State, failed, ok
+from pebble.checks.check import Check, State
 from pebble.checks.check import run as run_checks
 from pebble.checks.conform.checks import CHECKS, LAST
 from pebble.checks.conform.control import CONTROL, UNSEEN
@@ -226,7 +226,7 @@ Found = dict[str, tuple[State, str]]
 
 
 def judged(robot: Observer, *checks: Check[Observer]) -> Found:
-    results = run_checks(checks, robot, refresh=robot.read, is_doubtful=robot.has_stalled)
+    results = run_checks(checks, robot, refresh=robot.read)
     return {check.name: (result.state, result.text) for check, result in results}
 
 
@@ -316,15 +316,6 @@ def test_a_robot_whose_disk_is_slow_passes(broker: Broker, tmp_path: Path) -> No
     arguments, target = at_open(broker)
     with switched_on([*program, *with_stop_file(arguments, tmp_path)], target) as robot:
         assert lacking(judged(robot, ALL["stop"], ALL["stop moving"], ALL["reset waits"])) == {}
-
-
-def test_a_failure_while_this_machine_stalls_is_tried_again_and_says_so() -> None:
-    answers = iter((failed("it is late"), ok("in time")))
-    stalls = iter((False, True, False))
-    check: Check[None] = Check("answer", lambda _: next(answers))
-    ((_, result),) = run_checks([check], None, is_doubtful=lambda: next(stalls))
-    text = "in time; tried again, because this machine stalled: it is late, at first"
-    assert (result.state, result.text) == (State.OK, text)
 
 
 def test_what_was_not_judged_is_no_pass(
