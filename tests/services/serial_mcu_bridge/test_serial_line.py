@@ -1,6 +1,5 @@
 """The serial line against a real pty: the stop first and last, newest lines, unplugged ports, blocked readers."""
 
-import logging
 import os
 import signal
 import subprocess
@@ -275,33 +274,6 @@ def test_a_stuck_reader_does_not_block_and_finds_no_old_commands_later(stuck: St
     assert len(stuck.seen()) < 5000
     host.line.drive(drive_line(0.4, 0.4))
     assert until(lambda: stuck.seen().endswith(STOP + drive_line(0.4, 0.4)))
-
-
-@pytest.mark.parametrize("reports", [True, False])
-def test_a_reader_that_stands_still_finds_at_most_a_second_of_drive_lines(
-    stuck: StuckDevice, connect: Connect, caplog: pytest.LogCaptureFixture, reports: bool
-) -> None:
-    caplog.set_level(logging.INFO)
-    host, driven = connect(stuck.path, boot_s=0.05), drive_line(0.4, 0.4)
-    assert until(host.is_ready)
-    host.line.input.reports_at_rest = reports  # of a board that does not, nothing can be known
-    os.write(stuck.master, b"T 1 2 3\n")
-    assert until(lambda: host.line.input.received > 0)
-    stuck.seen()
-    end = time.monotonic() + 1.6
-    while time.monotonic() < end:
-        assert host.line.drive(driven)
-        time.sleep(0.05)
-    unread = stuck.seen().split(STOP)[-2 if reports else -1]
-    assert (host.line.input.unread > 0) == reports
-    assert stuck.seen().endswith(STOP if reports else driven)
-    assert 5 <= unread.count(driven) < (24 if reports else 99)
-    assert [text for text in caplog.messages if "perhaps not read" in text] == [
-        f"{stuck.path}: silent for 1 s, and perhaps not read: stopped until it reports again"
-    ] * reports
-    assert sum("pseudo-terminal" in text for text in caplog.messages) == 1
-    os.write(stuck.master, b"T 1 2 3\n")  # it reads again
-    assert until(lambda: host.line.drive(driven) and stuck.seen().endswith(driven))
 
 
 def test_a_stuck_reader_does_not_delay_the_end_and_finds_the_stop(stuck: StuckDevice, connect: Connect) -> None:
