@@ -47,7 +47,7 @@ class CameraCapture(Section, frozen=True, kw_only=True):
     device: Annotated[
         str, doc("Device of a v4l2 camera, or a file or URL; of a synthetic one, `world.json#goob`: a simulated robot.")
     ] = "/dev/video0"
-    capture_format: Annotated[str, doc("`auto`, `raw`, `mjpeg`, or a pixel format such as `yuyv`.")] = "auto"
+    capture_format: Annotated[str, doc("Of v4l2: `auto`, `raw`, `mjpeg`, or a pixel format such as `yuyv`.")] = "auto"
     camera_name: Annotated[str | None, doc("Which libcamera camera; unset: the first.")] = None
     camera_controls: Annotated[dict[str, Any], doc("Settings passed to the camera unchanged.")] = field(
         default_factory=dict
