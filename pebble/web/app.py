@@ -37,7 +37,7 @@ from pebble.web.server import PEOPLE_S, Server
 from pebble.web.static_files import FOREVER, NO_STORE, StaticFiles, root_of
 
 _AUDIT_ROWS = 200  # that a page shows; `pebble web audit` prints more
-_ENCODINGS = frozenset({"json", "pbvd", "pbvz", "h264", "jpeg"})
+_ENCODINGS = frozenset({"json", "pbvd", "h264", "jpeg"})
 _estop_decoder = msgspec.json.Decoder(EstopOp)
 
 

@@ -18,10 +18,10 @@ from pebble.client.media_request.queue import (
     assess,
 )
 
-ALL = frozenset({"h264", "pbvz", "pbvd", "json", "jpeg"})
+ALL = frozenset({"h264", "pbvd", "json", "jpeg"})
 
 
-def frame(seq: int, keyframe: bool = False, encoding: str = "pbvz", size: int = 3000) -> Frame:
+def frame(seq: int, keyframe: bool = False, encoding: str = "pbvd", size: int = 3000) -> Frame:
     return Frame(seq, bytes(size), encoding, keyframe)
 
 
@@ -34,7 +34,7 @@ def drained(queue: MediaQueue, now: float = 0.0) -> list[int]:
     return seqs
 
 
-def show(viewer: ViewerQueue, seq: int, at: float, acknowledged: float, encoding: str = "pbvz") -> None:
+def show(viewer: ViewerQueue, seq: int, at: float, acknowledged: float, encoding: str = "pbvd") -> None:
     """A key frame on its way to a page, by the rescue stream if it gets that."""
     one = frame(seq, keyframe=True, encoding="jpeg" if viewer.rescued else encoding)
     if viewer.rescued:
@@ -45,7 +45,7 @@ def show(viewer: ViewerQueue, seq: int, at: float, acknowledged: float, encoding
     viewer.acknowledge(seq, acknowledged)
 
 
-def offered(viewer: ViewerQueue, seq: int, at: float, encoding: str = "pbvz") -> tuple[bool, bool]:
+def offered(viewer: ViewerQueue, seq: int, at: float, encoding: str = "pbvd") -> tuple[bool, bool]:
     """Whether it is rescued, and gets small pictures, after this key frame."""
     viewer.offer_direct(frame(seq, keyframe=True, encoding=encoding), at)
     return viewer.rescued, viewer.small
@@ -245,8 +245,8 @@ def test_a_new_viewer_among_others_gets_one_key_frame_and_then_the_rescue_stream
 
 def test_jpegs_have_key_frames_of_their_own() -> None:
     some = [ViewerQueue(ALL, 0.0)]
-    assert not assess(some, "pbvz", 0.5, can_rescue=True)
-    assert assess(some, "pbvz", 1.5, can_rescue=True)
+    assert not assess(some, "pbvd", 0.5, can_rescue=True)
+    assert assess(some, "pbvd", 1.5, can_rescue=True)
     assert not some[0].rescued
 
 
@@ -266,7 +266,7 @@ def test_what_cannot_be_decoded_is_rescued_until_it_can() -> None:
     assert viewer.rescued
 
 
-@pytest.mark.parametrize("encoding", ["h264", "pbvz"])
+@pytest.mark.parametrize("encoding", ["h264", "pbvd"])
 def test_over_a_thin_connection_small_pictures_come_from_the_rescue_stream(encoding: str) -> None:
     viewer, now = ViewerQueue(ALL, 0.0), 0.0
     for seq in range(2):
@@ -283,7 +283,7 @@ def test_one_late_acknowledgement_is_no_thin_connection() -> None:
     viewer = ViewerQueue(ALL, 0.0)
     for seq, late_s in enumerate((2.0, 0.1, 2.0, 0.1)):
         show(viewer, seq, 0.0, late_s)
-        assert not assess([viewer], "pbvz", late_s, can_rescue=True)
+        assert not assess([viewer], "pbvd", late_s, can_rescue=True)
     assert not viewer.rescued
 
 
@@ -291,7 +291,7 @@ def test_small_pictures_that_are_late_as_well_do_not_put_off_the_return() -> Non
     viewer = ViewerQueue(ALL, 0.0)
     for seq in range(18):
         show(viewer, seq, seq / 2, seq / 2 + 0.5)
-        assess([viewer], "pbvz", seq / 2 + 0.5, can_rescue=True)
+        assess([viewer], "pbvd", seq / 2 + 0.5, can_rescue=True)
         assert viewer.small == (seq > 0)
     assert offered(viewer, 18, 11.0) == (False, False)
 
@@ -303,7 +303,7 @@ def test_frames_that_were_under_way_together_are_late_once() -> None:
         assert viewer.take(0.0)
     for seq in range(2):
         viewer.acknowledge(seq, 2.0 + seq / 10)
-    assert not assess([viewer], "pbvz", 2.2, can_rescue=True)
+    assert not assess([viewer], "pbvd", 2.2, can_rescue=True)
     assert not viewer.rescued
 
 
@@ -319,15 +319,15 @@ def test_a_page_that_cannot_decode_gets_small_pictures_only_if_it_has_to() -> No
 
 # -- the encoding
 
-OFFERED = ("json", "pbvd", "pbvz", "h264")
+OFFERED = ("json", "pbvd", "h264")
 
 
 @pytest.mark.parametrize(
     ("viewers", "pinned", "wanted"),
     [
         ([ALL], "", "h264"),
-        ([ALL, ALL - {"h264"}], "", "pbvz"),
-        ([ALL - {"h264"}, ALL - {"pbvz"}], "", "pbvd"),
+        ([ALL, ALL - {"h264"}], "", "pbvd"),
+        ([ALL - {"h264"}, ALL - {"h264", "pbvd"}], "", "json"),
         ([frozenset({"h264"}), frozenset({"json"})], "", "h264"),
         ([ALL, frozenset({"json"})], "", "json"),
         ([ALL], "json", "json"),
@@ -347,11 +347,11 @@ def test_robots_that_list_no_encodings_send_what_they_send() -> None:
 def test_it_gets_worse_at_once_and_better_after_a_while() -> None:
     choice, plain = EncodingChoice(), ALL - {"h264"}
     assert choice.update(OFFERED, [ALL], 0.0) == "h264"
-    assert choice.update(OFFERED, [ALL, plain], 1.0) == "pbvz"
-    assert choice.update(OFFERED, [ALL], 2.0) == "pbvz"
-    assert choice.update(OFFERED, [], 3.0) == "pbvz"
-    assert choice.update(OFFERED, [ALL, plain], 4.0) == "pbvz"
-    assert choice.update(OFFERED, [ALL], 5.0) == "pbvz"
+    assert choice.update(OFFERED, [ALL, plain], 1.0) == "pbvd"
+    assert choice.update(OFFERED, [ALL], 2.0) == "pbvd"
+    assert choice.update(OFFERED, [], 3.0) == "pbvd"
+    assert choice.update(OFFERED, [ALL, plain], 4.0) == "pbvd"
+    assert choice.update(OFFERED, [ALL], 5.0) == "pbvd"
     assert choice.update(OFFERED, [ALL], 10.0) == "h264"
     choice.pinned = "json"
     assert choice.update(OFFERED, [ALL], 10.1) == "json"
@@ -362,5 +362,5 @@ def test_it_gets_worse_at_once_and_better_after_a_while() -> None:
 
 def test_without_viewers_it_stays() -> None:
     choice, plain = EncodingChoice(), ALL - {"h264"}
-    assert [choice.update(OFFERED, [plain][at:], 10.0 * at) for at in range(4)] == ["pbvz"] * 4
+    assert [choice.update(OFFERED, [plain][at:], 10.0 * at) for at in range(4)] == ["pbvd"] * 4
     assert choice.update(("json",), [], 40.0) == "json"

@@ -66,13 +66,13 @@ def drawn(one: Tab) -> list[dict[str, Any]]:
 
 def test_chromium_decodes_everything(browser: Browser, served: Served, robot: PictureRobot) -> None:
     with showing(browser, served) as one:
-        assert one.page.evaluate("window.can") == ["h264", "pbvz", "pbvd", "json", "jpeg"]
+        assert one.page.evaluate("window.can") == ["h264", "pbvd", "json", "jpeg"]
         assert one.until("window.drawn.length > 20")
         assert one.errors + one.violations == []
     assert robot.requests[0] == {"enabled": True, "encoding": "h264"}
 
 
-@pytest.mark.parametrize("encoding", ["h264", "pbvz", "pbvd", "json"])
+@pytest.mark.parametrize("encoding", ["h264", "pbvd", "json"])
 def test_every_picture_is_drawn_in_order_and_soon(
     browser: Browser, served: Served, robot: PictureRobot, encoding: str
 ) -> None:
@@ -99,7 +99,7 @@ def test_a_page_that_decodes_nothing_is_shown_jpegs(browser: Browser, served: Se
 
 def test_a_slow_page_is_shown_what_is_new(browser: Browser, served: Served, robot: PictureRobot) -> None:
     """Drawing takes 0.2 s; the robot sends 15 a second."""
-    with showing(browser, served, ["pbvz"]) as one:
+    with showing(browser, served, ["pbvd"]) as one:
         assert one.until("window.drawn.length > 3")
         one.page.evaluate("window.delay = 200")
         one.page.wait_for_timeout(1500)
@@ -110,7 +110,7 @@ def test_a_slow_page_is_shown_what_is_new(browser: Browser, served: Served, robo
 
 def test_after_a_lost_connection_pictures_come_again(browser: Browser, broker: Broker, robot: PictureRobot) -> None:
     with Served(broker.port) as first, tab(browser, f"{first.origin}/healthz") as one:
-        one.page.evaluate(SHOW, [f"/static/{first.version}/media/pictures.js", ["pbvz"]])
+        one.page.evaluate(SHOW, [f"/static/{first.version}/media/pictures.js", ["pbvd"]])
         assert one.until(lambda: REF in first.app.state.robots.components)
         one.page.evaluate("ref => window.pictures.show(ref)", REF)
         assert one.until("window.drawn.length > 3")

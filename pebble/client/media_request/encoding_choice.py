@@ -3,7 +3,7 @@
 from collections.abc import Collection, Sequence
 from typing import Final
 
-BEST_FIRST: Final = ("h264", "pbvz", "pbvd", "json")
+BEST_FIRST: Final = ("h264", "pbvd", "json")
 _BETTER_AFTER_S: Final = 5.0  # a viewer that reloads its page comes back within this time
 
 

@@ -54,7 +54,7 @@ export class Pictures {
     const can = [];
     if (await decodesH264()) can.push("h264");
     if (browser.find("createImageBitmap") && browser.find("DecompressionStream")) {
-      if (readsBack()) can.push("pbvz", "pbvd", "json");
+      if (readsBack()) can.push("pbvd", "json");
       can.push("jpeg");
     }
     return can;

@@ -7,7 +7,7 @@ import { Extra, Face, Why, useName } from "../parts/parts.js";
 import { useReasons, whyNotEnd } from "../parts/why-not.js";
 import { nameIn } from "../parts/looks.js";
 
-const ENCODINGS = ["h264", "pbvz", "pbvd", "json", "jpeg"];
+const ENCODINGS = ["h264", "pbvd", "json", "jpeg"];
 
 /** Encoding and source, which count for everybody who looks at this component; and how the picture comes. */
 export function PictureSettings({ at, source, offers, video, extras }) {
