@@ -204,6 +204,8 @@ IMU_FAST = _c("sensors/imu-fast", Kind.STREAM, p.ImuFast, "Every sample of the i
 IMU = _c("sensors/imu", Kind.STREAM, p.Imu, "Summary of the inertial sensor.", rate_hz=5, qos=1,
          override=_serial("low_rate"))  # fmt: skip
 MCU_DESCRIBE = _c("mcu/{uid}/describe", Kind.STATE, p.McuManifest, "Manifest of a self-describing MCU.")
+MCU_LOCAL_ONLY = _c("mcu/{uid}/local-only", Kind.STATE, p.McuLocalOnly,
+                    "The topics of a self-describing MCU that stay on the robot.", remote=False)  # fmt: skip
 MCU_VALUE = _c("mcu/{uid}/{name}", Kind.STREAM, p.McuSample,
                "A value of a self-describing MCU; its manifest defines QoS and retain.")  # fmt: skip
 OUTLET_STATUS = _c("outlets/{outlet}/status", Kind.STATE, p.OutletStatus, "State of an outlet.")

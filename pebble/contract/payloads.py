@@ -463,6 +463,10 @@ class McuManifest(Payload, frozen=True, kw_only=True):
     interfaces: list[dict[str, Any]]
 
 
+class McuLocalOnly(Payload, frozen=True, kw_only=True):
+    topics: list[str]  # below the robot's base: outgoing/mcu/lamp-1/temperature
+
+
 class McuSample(Payload, frozen=True, kw_only=True):
     """One reading of a self-describing MCU's interface."""
 
