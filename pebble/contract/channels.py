@@ -196,6 +196,9 @@ CHARGING_STATUS = _c("charging-status", Kind.STATE, p.ChargingStatus, "On the ch
                      override=_serial("charging_status"))  # fmt: skip
 CHARGING_LEVEL = _c("charging-level", Kind.STATE, p.ChargingLevel, "Battery voltage.",
                     rate_hz=0.2, override=_serial("charging_level"))  # fmt: skip
+MOTOR_POWER = _c("motor-power/{owner}", Kind.STREAM, p.MotorPower,
+                 "What a motor owner commands its wheels, for odometry.",
+                 rate_hz=20, qos=1, remote=False)  # fmt: skip
 TOUCH_SENSORS = _c("touch-sensors", Kind.STREAM, p.TouchSensors, "Raw touch or hall readings.",
                    rate_hz=50, qos=1, override=_serial("touch_sensors"))  # fmt: skip
 IMU_FAST = _c("sensors/imu-fast", Kind.STREAM, p.ImuFast, "Every sample of the inertial sensor.",

@@ -521,6 +521,11 @@ class AutonomyStatus(Payload, frozen=True, kw_only=True):
     overridden: bool | UnsetType = UNSET  # true while a person drives, and the script has to wait
 
 
+class MotorPower(Payload, frozen=True, kw_only=True):
+    left: float  # −1..1
+    right: float
+
+
 class WheelOdometry(Payload, frozen=True, kw_only=True):
     """Dead reckoning from the wheels; the fields of ``value`` vary by producer (paper A.8.12)."""
 

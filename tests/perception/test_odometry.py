@@ -7,7 +7,6 @@ import random
 
 import pytest
 
-from pebble.contract.payloads import ControlState, Drive, EstopState
 from pebble.perception.odometry import WheelGeometry
 from pebble.simulation.motion import FULL_SPEED_MM_S, TRACK_MM
 from tests.perception.wheels_rig import WheelsRig
@@ -107,41 +106,6 @@ def test_a_push_without_a_command_is_of_unknown_direction() -> None:
     value = rig.odometry.value()
     assert value["unknown_direction_events"] > 2
     assert (value["x_mm"], value["left_mm"]) == (before["x_mm"], before["left_mm"])
-
-
-def test_commands_that_the_robot_refuses_change_no_direction() -> None:
-    rig = WheelsRig(geometry=ONE_SENSOR)
-    person = Drive(z=0.5)
-    for _ in range(20):
-        rig.command(person)
-        rig.odometry.drive(Drive(z=-0.9, source="autonomy", run=3), rig.now)  # a script waits while a person drives
-        rig.wait(0.1)
-    rig.stop()
-    assert rig.error_mm() < 3
-
-
-def test_under_control_only_commands_with_the_present_key_count() -> None:
-    rig = WheelsRig(geometry=ONE_SENSOR)
-    for key, power in (("0badf00d", 0.5), ("91f3d869", -0.5)):
-        rig.odometry.control(ControlState(boot="b", by="ann", id="3f2a91c0", key=key))
-        for _ in range(10):
-            rig.command(Drive(z=power, key=key))
-            rig.odometry.drive(Drive(z=-power, key="00000000"), rig.now)  # of a driver before
-            rig.wait(0.1)
-        rig.stop()
-        assert rig.error_mm() < 3
-    assert rig.odometry.value()["distance_mm"] > 100
-
-
-def test_while_the_robot_is_stopped_no_command_counts() -> None:
-    rig = WheelsRig(geometry=ONE_SENSOR)
-    rig.drive(2.0, z=0.5)
-    rig.stop(1.0)
-    state = EstopState(latched=True, boot="b", count=1, recent=[], by="", why="", since=0, barred=4)
-    rig.odometry.owner(state)
-    rig.odometry.drive(Drive(z=1.0), rig.now)
-    rig.wait(2.0)
-    assert rig.odometry.value()["left_stall_events"] == 0, "nothing was commanded"
 
 
 def test_an_inertial_sensor_that_lies_otherwise_is_not_believed() -> None:
