@@ -174,7 +174,10 @@ class Media(Section, frozen=True, kw_only=True):
 class Playback(Section, frozen=True, kw_only=True):
     """Where sounds are and what plays them; decoded ones are played by the audio receiver's command."""
 
-    retired: ClassVar = dict.fromkeys(("stop_timeout", "scan_interval"), ONE_VALUE)
+    retired: ClassVar = {
+        **dict.fromkeys(("stop_timeout", "scan_interval"), ONE_VALUE),
+        "volume": "clips are played as recorded: set the loudspeaker's volume, or the player's",
+    }
 
     directory: Annotated[File | None, doc("Folder of the sounds; unset: `~/sounds`.")] = None
     player_command: Annotated[Command, doc("Plays wav files; `{file}` stands for the sound, else it comes last.")] = (
@@ -182,7 +185,6 @@ class Playback(Section, frozen=True, kw_only=True):
     )
     cwd: Annotated[File | None, doc("Folder to run the player in.")] = None
     env: Annotated[Variables, doc("Environment variables to add.")] = EMPTY
-    volume: Annotated[float, Meta(ge=0, le=1, description="1: as recorded; less: wav files are decoded, too.")] = 1.0
 
 
 class SoundboardHandler(ServiceSection, frozen=True, kw_only=True):

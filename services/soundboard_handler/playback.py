@@ -26,14 +26,13 @@ class Players(Struct, frozen=True):
     wav: Sequence[str]
     raw: Sequence[str]
     device: str
-    volume: float
     cwd: Path | None
     env: dict[str, str]
 
     @classmethod
     def of(cls, config: Config) -> Players:
         playback, raw = config.services.soundboard_handler.playback, config.services.mqtt_bridge.media.audio_receiver
-        return cls(playback.player_command, raw.command, raw.device, playback.volume, playback.cwd, playback.env)
+        return cls(playback.player_command, raw.command, raw.device, playback.cwd, playback.env)
 
     def command(self, path: Path) -> list[str]:
         """``{file}`` stands for the path; without one it is the last word."""
@@ -67,8 +66,8 @@ class Playback:
         self._feed: Feed | None = None
 
     def start(self) -> None:
-        if self.clip.encoded or self._players.volume != 1.0:
-            self._feed = Feed(self.clip.path, self._players.volume, lambda: self._post(self._opened))
+        if self.clip.encoded:
+            self._feed = Feed(self.clip.path, lambda: self._post(self._opened))
         else:
             self._start_player(self._players.command(self.clip.path))
 
