@@ -7,6 +7,8 @@ import random
 
 import pytest
 
+from pebble.contract.payloads import MotorPower
+from pebble.perception.motor_power import Directions
 from pebble.perception.odometry import WheelGeometry
 from pebble.simulation.motion import FULL_SPEED_MM_S, TRACK_MM
 from tests.perception.wheels_rig import WheelsRig
@@ -106,6 +108,16 @@ def test_a_push_without_a_command_is_of_unknown_direction() -> None:
     value = rig.odometry.value()
     assert value["unknown_direction_events"] > 2
     assert (value["x_mm"], value["left_mm"]) == (before["x_mm"], before["left_mm"])
+
+
+@pytest.mark.parametrize(("coasted_s", "directions"), [(0.0, (1, -1)), (0.35, (1, -1)), (0.36, (0, 0)), (9.0, (0, 0))])
+def test_a_direction_stays_for_as_long_as_wheels_coast(coasted_s: float, directions: tuple[int, int]) -> None:
+    power = Directions(0.0)
+    assert power.at(0.0) == ((0.0, 0), (0.0, 0))
+    power.command(MotorPower(left=0.5, right=-0.02), 0.0)
+    assert power.at(0.5) == ((0.5, 1), (-0.02, -1))
+    power.command(MotorPower(left=0.0, right=0.01), 1.0)
+    assert power.at(1.0 + coasted_s) == ((0.0, directions[0]), (0.01, directions[1]))
 
 
 def test_an_inertial_sensor_that_lies_otherwise_is_not_believed() -> None:
