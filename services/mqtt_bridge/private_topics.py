@@ -14,7 +14,7 @@ from pebble.transports import Message
 
 _DEVICES = 256  # remembered; a robot has a handful
 _WAITING = 256  # retained values that wait for a list
-_QUESTION = "/" + MCU_DESCRIBE.metric.rpartition("/")[2]
+_QUESTION, _LIST = ("/" + channel.metric.rpartition("/")[2] for channel in (MCU_DESCRIBE, MCU_LOCAL_ONLY))
 _MARK = b'"device_uid"'  # in every value under an alias: the MCU it belongs to
 
 
@@ -43,9 +43,8 @@ class PrivateTopics:
         with self._lock:
             if not message.payload:
                 self._waiting.pop(message.topic, None)  # removed: nothing to forward any more
-            uid = MCU_LOCAL_ONLY.names(message.topic).get("uid")
-            if uid is not None and message.topic == MCU_LOCAL_ONLY.topic(self._base, uid=uid):
-                self._learn(uid, message.payload)
+            if message.topic.startswith(self._values) and message.topic.endswith(_LIST):
+                self._learn(message.topic.removeprefix(self._values).removesuffix(_LIST), message.payload)
                 waiting, self._waiting = self._waiting, {}
                 return [admitted for held in waiting.values() for admitted in self._judge(held)]
             return self._judge(message)
