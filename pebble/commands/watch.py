@@ -29,7 +29,7 @@ UrlOption = Annotated[
     str | None, typer.Option(help="mqtt://[USER@]HOST[:PORT] or mqtts://… of the operators' broker.", metavar="URL")
 ]
 EncodingOption = Annotated[
-    str | None, typer.Option("--encoding", "-e", help="json, pbvd, pbvz or h264. [default: the robot's]")
+    str | None, typer.Option("--encoding", "-e", help="json, pbvd or h264. [default: the robot's]")
 ]
 
 

@@ -47,7 +47,7 @@ class CameraCapture(Section, frozen=True, kw_only=True):
     device: Annotated[
         str, doc("Device of a v4l2 camera, or a file or URL; of a synthetic one, `world.json#goob`: a simulated robot.")
     ] = "/dev/video0"
-    capture_format: Annotated[str, doc("`auto`, `raw`, `mjpeg`, or a pixel format such as `yuyv`.")] = "auto"
+    capture_format: Annotated[str, doc("Of v4l2: `auto`, `raw`, `mjpeg`, or a pixel format such as `yuyv`.")] = "auto"
     camera_name: Annotated[str | None, doc("Which libcamera camera; unset: the first.")] = None
     camera_controls: Annotated[dict[str, Any], doc("Settings passed to the camera unchanged.")] = field(
         default_factory=dict
@@ -181,13 +181,13 @@ class Playback(Section, frozen=True, kw_only=True):
     retired: ClassVar = {
         **dict.fromkeys(("stop_timeout", "scan_interval"), ONE_VALUE),
         **dict.fromkeys(("cwd", "env"), COMMAND),
+        "volume": "clips are played as recorded: set the loudspeaker's volume, or the player's",
     }
 
     directory: Annotated[File | None, doc("Folder of the sounds; unset: `~/sounds`.")] = None
     player_command: Annotated[Command, doc("Plays wav files; `{file}` stands for the sound, else it comes last.")] = (
         "aplay",
     )
-    volume: Annotated[float, Meta(ge=0, le=1, description="1: as recorded; less: wav files are decoded, too.")] = 1.0
 
 
 class SoundboardHandler(ServiceSection, frozen=True, kw_only=True):

@@ -244,6 +244,10 @@ class SerialBridge(ServiceSection, frozen=True, kw_only=True):
     ] = None
     safety: Annotated[SerialSafety, doc("When to stop.")] = SerialSafety()
     topics: Annotated[SerialTopics, doc("Other names for topics.")] = SerialTopics()
+    aliases: Annotated[
+        dict[str, str],
+        doc('Which of several boards has a channel, by its uid: `{"sensors/imu": "imu-1"}`; unset: neither of two.'),
+    ] = EMPTY
     instances: Annotated[
         dict[str, "SerialBridge"], doc("Further lines by name, each with the keys that differ from this section.")
     ] = EMPTY

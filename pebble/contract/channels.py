@@ -199,6 +199,9 @@ CHARGING_STATUS = _c("charging-status", Kind.STATE, p.ChargingStatus, "On the ch
                      override=_serial("charging_status"))  # fmt: skip
 CHARGING_LEVEL = _c("charging-level", Kind.STATE, p.ChargingLevel, "Battery voltage.",
                     rate_hz=0.2, override=_serial("charging_level"))  # fmt: skip
+MOTOR_POWER = _c("motor-power/{owner}", Kind.STREAM, p.MotorPower,
+                 "What a motor owner commands its wheels, for odometry.",
+                 rate_hz=20, qos=1, remote=False)  # fmt: skip
 TOUCH_SENSORS = _c("touch-sensors", Kind.STREAM, p.TouchSensors, "Raw touch or hall readings.",
                    rate_hz=50, qos=1, override=_serial("touch_sensors"))  # fmt: skip
 IMU_FAST = _c("sensors/imu-fast", Kind.STREAM, p.ImuFast, "Every sample of the inertial sensor.",
@@ -207,6 +210,8 @@ IMU_FAST = _c("sensors/imu-fast", Kind.STREAM, p.ImuFast, "Every sample of the i
 IMU = _c("sensors/imu", Kind.STREAM, p.Imu, "Summary of the inertial sensor.", rate_hz=5, qos=1,
          override=_serial("low_rate"))  # fmt: skip
 MCU_DESCRIBE = _c("mcu/{uid}/describe", Kind.STATE, p.McuManifest, "Manifest of a self-describing MCU.")
+MCU_LOCAL_ONLY = _c("mcu/{uid}/local-only", Kind.STATE, p.McuLocalOnly,
+                    "The topics of a self-describing MCU that stay on the robot.", remote=False)  # fmt: skip
 MCU_VALUE = _c("mcu/{uid}/{name}", Kind.STREAM, p.McuSample,
                "A value of a self-describing MCU; its manifest defines QoS and retain.")  # fmt: skip
 OUTLET_STATUS = _c("outlets/{outlet}/status", Kind.STATE, p.OutletStatus, "State of an outlet.")

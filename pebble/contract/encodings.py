@@ -2,7 +2,7 @@
 
 from typing import Final, Literal, TypeAlias, get_args
 
-VideoEncoding: TypeAlias = Literal["json", "pbvd", "pbvz", "h264"]
+VideoEncoding: TypeAlias = Literal["json", "pbvd", "h264"]
 SoundEncoding: TypeAlias = Literal["pcm", "opus"]
 ALL_VIDEO: Final[tuple[VideoEncoding, ...]] = get_args(VideoEncoding)
 ALL_SOUND: Final[tuple[SoundEncoding, ...]] = get_args(SoundEncoding)

@@ -462,6 +462,10 @@ class McuManifest(Payload, frozen=True, kw_only=True):
     interfaces: list[dict[str, Any]]
 
 
+class McuLocalOnly(Payload, frozen=True, kw_only=True):
+    topics: list[str]  # below the robot's base: outgoing/mcu/lamp-1/temperature
+
+
 class McuSample(Payload, frozen=True, kw_only=True):
     """One reading of a self-describing MCU's interface."""
 
@@ -514,6 +518,11 @@ class AutonomyStatus(Payload, frozen=True, kw_only=True):
     config: dict[str, Any] | None = None  # the effective settings
     controls: bool = True
     overridden: bool | UnsetType = UNSET  # true while a person drives, and the script has to wait
+
+
+class MotorPower(Payload, frozen=True, kw_only=True):
+    left: float  # −1..1
+    right: float
 
 
 class WheelOdometry(Payload, frozen=True, kw_only=True):

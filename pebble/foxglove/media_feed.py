@@ -33,7 +33,7 @@ log = logging.getLogger(__name__)
 
 MAX_WAITING, MAX_WAITING_BYTES = 100, 8 << 20  # payloads received and not yet converted: 2 s of sound
 _AS_CONFIGURED: Final = None  # joins what runs already, in whatever encoding
-_WITHOUT_PYAV: Final[dict[Medium, tuple[str, ...]]] = {"video": ("pbvz", "pbvd", "json"), "audio": ("pcm",)}
+_WITHOUT_PYAV: Final[dict[Medium, tuple[str, ...]]] = {"video": ("pbvd", "json"), "audio": ("pcm",)}
 _CHANNEL: Final = {"video": CAMERA, "audio": AUDIO}
 
 

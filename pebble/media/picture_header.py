@@ -18,7 +18,7 @@ _LATEST_MS: Final = 253_402_300_800_000  # the year 10000
 KINDS: Final = {
     PictureKind.JPEG: ("pbvd", True),
     PictureKind.DELTA_JPEG: ("pbvd", False),
-    PictureKind.ZLIB_JPEG: ("pbvz", True),
+    PictureKind.ZLIB_JPEG: ("pbvz", True),  # of recordings: robots no longer send it
     PictureKind.ZLIB_DELTA_JPEG: ("pbvz", False),
 }
 

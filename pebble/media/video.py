@@ -1,6 +1,5 @@
 """Video encoders by name: a picture in, one MQTT payload out."""
 
-import zlib
 from abc import ABC, abstractmethod
 from typing import Final, Protocol
 
@@ -41,7 +40,7 @@ def make_encoder(
     quality: float = DEFAULT_QUALITY,
     bitrate: int | None = None,
 ) -> VideoEncoder:
-    """The encoder called ``name``: json, pbvd, pbvz or h264.
+    """The encoder called ``name``: json, pbvd or h264.
 
     ``keyframe_interval``: pictures from one key frame to the next; None means as many as come in a third of a second
     (the paper's rule), for h264 in four. Raises ConfigError for an unknown name, PebbleError saying what to install.
@@ -54,8 +53,6 @@ def make_encoder(
             return JsonEncoder(interval, quality)
         case "pbvd":
             return PbvdEncoder(interval, quality)
-        case "pbvz":
-            return PbvzEncoder(interval, quality)
         case "h264":
             return H264VideoEncoder(fps, interval, quality, bitrate)
     raise ConfigError(f"video encoding {name!r}: unknown; there are {', '.join(ALL_VIDEO)}")
@@ -67,7 +64,7 @@ def _packet(kind: PictureKind, frame: int, captured_ms: int, body: bytes, flags:
 
 
 class _JpegEncoder(ABC):
-    """The common part of the three encodings made of JPEGs."""
+    """The common part of the encodings made of JPEGs."""
 
     optimize = True
 
@@ -113,16 +110,6 @@ class PbvdEncoder(_JpegEncoder):
     def _pack(self, jpeg: bytes, keyframe: bool, frame: int, captured_ms: int) -> bytes:
         kind = PictureKind.JPEG if keyframe else PictureKind.DELTA_JPEG
         return _packet(kind, frame, captured_ms, jpeg)
-
-
-class PbvzEncoder(_JpegEncoder):
-    """A binary header and the JPEG compressed by zlib, which shortens its tables and empty blocks."""
-
-    name = "pbvz"
-
-    def _pack(self, jpeg: bytes, keyframe: bool, frame: int, captured_ms: int) -> bytes:
-        kind = PictureKind.ZLIB_JPEG if keyframe else PictureKind.ZLIB_DELTA_JPEG
-        return _packet(kind, frame, captured_ms, zlib.compress(jpeg, 9))
 
 
 class H264VideoEncoder:

@@ -11,10 +11,10 @@ from typing import Any, NamedTuple
 
 from msgspec import Struct
 
-from pebble.contract.payloads import ControlState, Drive, EstopState, ImuFast, TouchValues
+from pebble.contract.payloads import ImuFast, MotorPower, TouchValues
 from pebble.perception.gyro import GyroHeading
 from pebble.perception.hall import HallSample, HallWheel
-from pebble.perception.motor_power import MotorPower
+from pebble.perception.motor_power import Directions
 
 _MOVING_S = 0.45  # a robot counts as moving so long after its last motion
 _STALL_S = 0.32
@@ -93,15 +93,15 @@ class _Wheel:
 
 
 class Odometry:
-    """Feed it every command and sample. ``watchdog_s`` and ``strangers`` are those of the motor owner."""
+    """Feed it every power that the wheels are commanded, and every sample."""
 
-    def __init__(self, geometry: WheelGeometry, *, watchdog_s: float, strangers: str = "free", now: float) -> None:
+    def __init__(self, geometry: WheelGeometry, now: float) -> None:
         self.pose = self._base = WheelPose()
         self.distance_mm = 0.0
         self._part = _Part()
         self._was_ready = True
         self._geometry = geometry
-        self._power = MotorPower(watchdog_s, strangers, now)
+        self._power = Directions(now)
         self._left, self._right = map(_Wheel, geometry.step_mm)
         self._gyro = GyroHeading()
         self._heading_source = "wheels"
@@ -111,15 +111,8 @@ class Odometry:
     def moving(self, now: float) -> bool:
         return now - max(self._left.turned_at, self._right.turned_at) < _MOVING_S
 
-    def drive(self, drive: Drive, now: float) -> None:
-        """A drive command; those that the motor owner refuses change nothing."""
-        self._power.command(drive, now)
-
-    def owner(self, state: EstopState) -> None:
-        self._power.owner(state)
-
-    def control(self, state: ControlState) -> None:
-        self._power.control(state)
+    def power(self, power: MotorPower, now: float) -> None:
+        self._power.command(power, now)
 
     def imu(self, imu: ImuFast, now: float) -> None:
         """A sample of the inertial sensor."""

@@ -10,10 +10,8 @@ from pebble.errors import PebbleError
 from pebble.perception.camera_model import CameraModel, Floats
 
 FAMILY = "APRILTAG_25H9"  # the original's default, in its spelling
-_HIDDEN_S = 0.7  # a tag that is out of sight for longer is lost, as followers have it: another one may be chosen
 _PICTURE = "a picture is a numpy array of (height, width, 3) bytes, blue first, or (height, width)"
 _HINTS = {(4,): ": leave out the last with picture[:, :, :3]", (1,): ": use picture[:, :, 0]"}
-_AS_LARGE = 0.9  # of two areas: the difference is noise
 
 
 class Place(NamedTuple):
@@ -94,7 +92,7 @@ class TagFinder:
     def find(self, picture: Any) -> list[Tag]:
         """All tags in an array of (height, width, 3) bytes, blue first, or (height, width), in the order of their ids.
 
-        Of several with one id the largest is the first; see :class:`TagChoice`.
+        Of several with one id the largest is the first.
 
         Pictures are used as they come: av_daemon has rotated them. Raises PebbleError for anything else.
         """
@@ -120,79 +118,9 @@ def _checked(picture: Any) -> Any:
     return np.ascontiguousarray(picture)
 
 
-class TagChoice:
-    """Chooses the same one of several tags with one id, from picture to picture.
-
-    It is the one nearest to the last chosen one, as seen from the camera; at first, and 0.7 s after that was seen last,
-    the largest; of equally large ones the leftmost. While the chosen one alone is hidden, none is chosen.
-    """
-
-    def __init__(self, tag_id: int) -> None:
-        self.count = 0  # of the tags with this id in the last picture
-        self.remark = ""  # which one was chosen, if there were several
-        self._id = tag_id
-        self._last: Place | None = None
-        self._seen_at = float("-inf")
-        self._others: list[Place] = []  # of the newest picture that had others, if that is not long ago
-        self._others_at = float("-inf")
-
-    def choose(self, tags: Sequence[Tag], now: float) -> Tag | None:
-        """The tag to use of those in a picture; None: it is not there. ``now`` is in seconds of any clock."""
-        same = [tag for tag in tags if tag.id == self._id]
-        self.count, self.remark = len(same), ""
-        if now - self._seen_at > _HIDDEN_S:
-            self._last = None
-        if now - self._others_at > _HIDDEN_S:
-            self._others = []
-        chosen = self._chosen(same)
-        if others := [tag.place for tag in same if tag is not chosen]:
-            self._others, self._others_at = others, now
-        if chosen is None:
-            if same:
-                self.remark = f"the tag with id {self._id} is hidden: another one with this id is used if it stays so"
-            return None
-        if others:
-            degrees, why = math.degrees(chosen.angle_rad), "nearest to the last one" if self._last else "the largest"
-            where = f"{abs(degrees):.0f} degrees to the {'left' if degrees < 0.0 else 'right'}"
-            self.remark = f"{len(same)} tags with id {self._id}: using the one {where}, {why}"
-        self._last, self._seen_at = chosen.place, now
-        return chosen
-
-    def _chosen(self, same: list[Tag]) -> Tag | None:
-        last = self._last
-        if last is None:
-            largest = max((tag.area for tag in same), default=0.0)
-            return min((tag for tag in same if tag.area >= _AS_LARGE * largest), key=_corner, default=None)
-        places = [
-            (_apart(tag.place, last), _corner(tag), tag)
-            for tag in same
-            if all(_apart(tag.place, last) <= _apart(tag.place, other) for other in self._others)
-        ]
-        return min(places, key=lambda place: place[:2], default=(None, None, None))[2]
-
-
-class TagOrder:
-    """Sorts the tags of each picture by id, and of one id the same tag first as in the picture before."""
-
-    def __init__(self) -> None:
-        self.remarks: list[str] = []  # on the last picture
-        self._choices: dict[int, TagChoice] = {}  # not more than the family has ids
-
-    def sort(self, tags: Sequence[Tag], now: float) -> list[Tag]:
-        choices = {tag.id: self._choices.setdefault(tag.id, TagChoice(tag.id)) for tag in tags}
-        chosen = {number: choice.choose(tags, now) for number, choice in choices.items()}
-        self.remarks = [choice.remark for choice in choices.values() if choice.remark]
-        return sorted(tags, key=lambda tag: (tag.id, tag is not chosen[tag.id], -tag.area))
-
-
-def _corner(tag: Tag) -> tuple[float, float]:
-    return float(tag.corners[:, 0].min()), float(tag.corners[:, 1].min())
-
-
-def _apart(one: Place, other: Place) -> float:
-    """How different two places look from the camera: by their angle, and by the ratio of their distances."""
-    ratio = (one.distance_m + 0.001) / (other.distance_m + 0.001)
-    return math.hypot(one.angle_rad - other.angle_rad, math.log(ratio))
+def largest(tags: Sequence[Tag], tag_id: int) -> Tag | None:
+    """Return the tag with this id that looks largest; None: there is none."""
+    return max((tag for tag in tags if tag.id == tag_id), key=lambda tag: tag.area, default=None)
 
 
 def _dictionary(aruco: Any, family: str) -> Any:

@@ -1,4 +1,4 @@
-"""Files that are there whole or not at all, and may hold secrets."""
+"""Files that are there whole or not at all, also after a power cut, and may hold secrets."""
 
 import os
 from pathlib import Path
@@ -23,11 +23,12 @@ def write(
 ) -> None:
     """Replace the file at once: never half of it, never readable by others for a moment. Raises ``error``.
 
+    After a power cut the file holds the old content or the new one.
     ``owner`` None: for root it stays the file of its owner, who may be a broker that reads it.
     """
     temporary = file.with_name(f".{file.name}.new")
     try:
-        temporary.unlink(missing_ok=True)
+        temporary.unlink(missing_ok=True)  # left by a power cut; to open a FIFO would wait for ever
         with os.fdopen(os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "wb") as output:
             # By the descriptor: in a folder of somebody else's its name may be a link by now.
             open_file = output.fileno() if os.chmod in os.supports_fd else temporary
@@ -40,5 +41,25 @@ def write(
             output.flush()
             os.fsync(output.fileno())
         temporary.replace(file)
+        sync_folder(file.parent)
     except OSError as why:
         raise error(f"{file}: {why.strerror}") from None
+
+
+def make_folder(folder: Path) -> None:
+    """Make a folder and those above it, durably. Raises OSError."""
+    if not folder.is_dir():
+        make_folder(folder.parent)
+        folder.mkdir(mode=0o700, exist_ok=True)
+        sync_folder(folder.parent)
+
+
+def sync_folder(folder: Path) -> None:
+    """Make the names in a folder durable, where the system can. Raises OSError."""
+    if os.name != "posix":
+        return
+    descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)

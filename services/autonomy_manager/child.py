@@ -19,8 +19,9 @@ from typing import Protocol
 from msgspec import Struct
 
 from pebble.errors import PebbleError
+from pebble.runtime import child
 from pebble.runtime.exits import ASKS_S, exit_descriptor, has_ended
-from pebble.runtime.parent import tagged, tied_to_parent
+from pebble.runtime.parent import tagged
 from pebble.services.autonomy_manager.guard import Guard
 from pebble.services.autonomy_manager.output import Output
 
@@ -93,30 +94,14 @@ class Processes:
 
 
 class Process:
-    """A child process in a group of its own, and the thread that reads its output and waits for its end."""
+    """A process, and the thread that reads its output and waits for its end."""
 
     def __init__(self, launch: Launch) -> None:
         _check_program(Path(launch.command[0]))
-        self._pipe, write_end = os.pipe2(os.O_CLOEXEC)
-        try:
-            self._process = subprocess.Popen(
-                tied_to_parent(launch.command, launch.tie),
-                cwd=launch.folder,
-                env=launch.environment,
-                stdin=subprocess.DEVNULL,
-                stdout=write_end,
-                stderr=write_end,
-                start_new_session=True,
-            )
-        except BaseException:
-            os.close(self._pipe)
-            raise
-        finally:
-            os.close(write_end)
-        self.pid = self._process.pid
+        output = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT}
+        self._child = child.Child(launch.command, launch.environment, launch.folder, launch.tie, **output)
+        self.pid = self._child.pid
         self._file = launch.file
-        self._lock = threading.Lock()  # no signal once it is reaped: its number may be another process's by then
-        self._running = True
         self._thread: threading.Thread | None = None
 
     def watch(self, ended: Callable[[int], None]) -> None:
@@ -126,13 +111,10 @@ class Process:
 
     @property
     def running(self) -> bool:
-        return self._running
+        return self._child.code is None
 
     def signal(self, number: signal.Signals) -> None:
-        with self._lock:
-            if self._running:
-                with suppress(ProcessLookupError):
-                    os.killpg(self.pid, number)
+        self._child.signal(number)
 
     def wait(self, timeout_s: float) -> None:
         if self._thread is not None:
@@ -145,17 +127,12 @@ class Process:
             self._read_until_exit()
         except OSError:
             log.exception("the output of %s cannot be read", self._file)
-        os.close(self._pipe)
-        with self._lock:
-            with suppress(ProcessLookupError, PermissionError):
-                os.killpg(self.pid, signal.SIGKILL)  # what it started must not go on without it
-            code = self._process.wait()
-            self._running = False
-        ended(code)
+        self._child.pipe("stdout").close()
+        ended(self._child.finish(0.0))
 
     def _read_until_exit(self) -> None:
         """Return when the process has ended and its output is read; it is not reaped yet."""
-        pipe, output = self._pipe, Output(self._write, self._warn, time.monotonic())
+        pipe, output = self._child.pipe("stdout").fileno(), Output(self._write, self._warn, time.monotonic())
         os.set_blocking(pipe, False)
         exited = exit_descriptor(self.pid)
         poll = select.poll()

@@ -2,12 +2,8 @@
 
 import ast
 import logging
-import os
-import signal
-import subprocess
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import suppress
 from pathlib import Path
 from tempfile import TemporaryFile
 from typing import IO, Any
@@ -18,7 +14,7 @@ from msgspec import Struct
 from pebble.config.text_files import NotTextError, text_of
 from pebble.contract.forms import MAX_SETTINGS, Setting
 from pebble.contract.payloads import LONGEST_SUMMARY, MOST_MAIN
-from pebble.runtime.parent import tied_to_parent
+from pebble.runtime.child import Child
 
 MANIFEST = "script.json"
 _LIMIT_S = 20.0
@@ -133,25 +129,13 @@ def answer_of(command: Sequence[str], folder: Path, environment: Mapping[str, st
     limited = ["nice", "-n", _NICE, "prlimit", f"--fsize={_LONGEST + 1}", *command]
     with TemporaryFile() as output, TemporaryFile() as errors:
         try:
-            process = subprocess.Popen(
-                tied_to_parent(limited),
-                cwd=folder,
-                env=dict(environment),
-                stdin=subprocess.DEVNULL,
-                stdout=output,
-                stderr=errors,
-                start_new_session=True,  # what it starts ends with it
-            )
+            process = Child(limited, environment, folder, stdout=output, stderr=errors)
         except (OSError, ValueError) as error:
             raise DescribeError(f"cannot be asked: {error}") from None
-        try:
-            code = process.wait(_LIMIT_S)
-        except subprocess.TimeoutExpired:
-            raise DescribeError(f"{name} takes longer than {_LIMIT_S:g} s") from None
-        finally:
-            with suppress(ProcessLookupError):
-                os.killpg(process.pid, signal.SIGKILL)
-            process.wait()
+        code = process.wait(_LIMIT_S)
+        process.finish(0.0)
+        if code is None:
+            raise DescribeError(f"{name} takes longer than {_LIMIT_S:g} s")
         answer, reason = _content(output), _content(errors)[-_REASON_BYTES:].decode(errors="replace")
     if code != 0:
         last = reason.strip().rpartition("\n")[2]

@@ -3,16 +3,16 @@
 import fcntl
 import os
 import select
+import signal
 import subprocess
 import time
 from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import IO, cast
 
 from pebble.errors import DeviceError
+from pebble.runtime.child import Child, how_ended
 from pebble.runtime.environment import child_environment
-from pebble.runtime.parent import tied_to_parent
 
 SILENCE_S = 3.0  # without output: the device hangs
 _FIRST_SILENCE_S = 10.0  # it may take its time to start
@@ -30,17 +30,10 @@ class CaptureProgram:
         self._errors = b""
         self._silence_s = _FIRST_SILENCE_S
         try:
-            self._process = subprocess.Popen(
-                tied_to_parent(command),
-                env=child_environment(),
-                stdin=subprocess.DEVNULL,
-                stdout=subprocess.PIPE,
-                stderr=subprocess.PIPE,
-                bufsize=0,
-            )
-        except (OSError, subprocess.SubprocessError) as error:
+            self._child = Child(command, child_environment(), stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+        except (OSError, ValueError) as error:
             raise DeviceError(f"cannot start {self.name}: {error}") from error
-        self._pipes = cast(tuple[IO[bytes], IO[bytes]], (self._process.stdout, self._process.stderr))
+        self._pipes = (self._child.pipe("stdout"), self._child.pipe("stderr"))
         self._out, self._err = (pipe.fileno() for pipe in self._pipes)
         os.set_blocking(self._out, False)
         os.set_blocking(self._err, False)
@@ -70,18 +63,14 @@ class CaptureProgram:
 
     def interrupt(self) -> None:
         """From any thread: kill it, which makes a waiting ``read`` fail."""
-        self._process.kill()
+        self._child.signal(signal.SIGKILL)
 
     def close(self) -> None:
         """Terminate it, and kill it if it does not end in time."""
-        self._process.terminate()
+        self._child.signal(signal.SIGTERM)
         for pipe in self._pipes:  # frees a program that is blocked in a write
             pipe.close()
-        try:
-            self._process.wait(_STOP_S)
-        except subprocess.TimeoutExpired:
-            self._process.kill()
-            self._process.wait()
+        self._child.finish(_STOP_S)
 
     def _read_errors(self) -> None:
         chunk = os.read(self._err, 4096)
@@ -91,13 +80,11 @@ class CaptureProgram:
             self._poll.unregister(self._err)
 
     def _end(self) -> str:
-        with suppress(subprocess.TimeoutExpired):
-            self._process.wait(0.5)
+        code = self._child.wait(0.5)
         with suppress(BlockingIOError, KeyError):  # nothing more now, or end of file
             for _ in range(_LAST_READS):
                 self._read_errors()
-        code = self._process.poll()
-        how = "closed its output" if code is None else f"exit code {code}" if code >= 0 else f"signal {-code}"
+        how = "closed its output" if code is None else how_ended(code)
         return f"{self.name} ended: {how}{self._last_error()}"
 
     def _last_error(self) -> str:

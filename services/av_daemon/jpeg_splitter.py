@@ -19,7 +19,6 @@ class JpegSplitter:
         self._buffer = bytearray()
         self._segment = 2  # where the next segment of the first picture begins
         self._searched = 0  # in its scan the end is not before here; 0 before the scan
-        self.skipped = 0  # bytes that belong to no picture
 
     def feed(self, chunk: bytes) -> list[bytes]:
         """The pictures that are complete now."""
@@ -30,12 +29,12 @@ class JpegSplitter:
         while self._at_start():
             end = self._end()
             if end < 0:
-                self._skip(1)  # no JPEG after all: look for the next start
+                self._cut(1)  # no JPEG after all: look for the next start
             elif end:
                 yield bytes(self._buffer[:end])
                 self._cut(end)
             elif len(self._buffer) > self._limit:
-                self._skip(len(self._buffer))
+                self._cut(len(self._buffer))
             else:
                 return
 
@@ -43,9 +42,9 @@ class JpegSplitter:
         """Bring the start of a picture to the front; False while there is none."""
         start = self._buffer.find(_START)
         if start < 0:
-            self._skip(len(self._buffer) - self._buffer.endswith(_START[:1]))
+            self._cut(len(self._buffer) - self._buffer.endswith(_START[:1]))
         elif start:
-            self._skip(start)
+            self._cut(start)
         return start >= 0
 
     def _end(self) -> int:
@@ -64,10 +63,6 @@ class JpegSplitter:
         found = self._buffer.find(_END, self._searched)
         self._searched = max(self._searched, len(self._buffer) - 1)
         return found + 2 if found >= 0 else 0
-
-    def _skip(self, count: int) -> None:
-        self.skipped += count
-        self._cut(count)
 
     def _cut(self, count: int) -> None:
         if count:

@@ -11,7 +11,7 @@ from msgspec.structs import replace
 from pebble.config.media import AvDaemon
 from pebble.errors import DeviceError, PayloadError
 from pebble.services.av_daemon.alsa import CHUNK_S, AlsaMicrophone
-from pebble.services.av_daemon.libcamera import open_libcamera
+from pebble.services.av_daemon.libcamera import LibcameraCamera
 from pebble.services.av_daemon.source import Bytes, Capture, Source, opencv
 from pebble.services.av_daemon.synthetic import SyntheticCamera, SyntheticMicrophone
 from pebble.services.av_daemon.v4l2 import V4l2Camera
@@ -43,7 +43,7 @@ def microphone(options: AvDaemon, start: float) -> Opener:
 def picture_bytes(options: AvDaemon) -> int:
     video = options.video
     pixels = video.width * video.height
-    compressed = video.backend in _LIBCAMERA and video.capture_format in ("auto", "mjpeg") and not video.rotate_degrees
+    compressed = video.backend in _LIBCAMERA and not video.rotate_degrees
     return pixels if compressed else 3 * pixels  # no camera needs 8 bits per pixel for a JPEG
 
 
@@ -60,7 +60,7 @@ def _camera(options: AvDaemon, start: float) -> Source:
     if options.video.backend == "synthetic":
         return SyntheticCamera(options.video, start)
     if options.video.backend in _LIBCAMERA:
-        return open_libcamera(options)
+        return LibcameraCamera(options)
     return V4l2Camera(options.video)
 
 

@@ -363,7 +363,7 @@ class MqttBridge(ForwardingService):
 
     def receive_remote(self, epoch: int, message: Message) -> None:
         topic = message.topic if self.names is None else self.names[message.topic].topic
-        if epoch != self.epoch or self._private.is_known(topic):
+        if epoch != self.epoch or self._private.stays(topic):
             return
         if topic == self._stop_topic:
             if not self._has_passed(message):

@@ -9,7 +9,7 @@ import msgspec
 from pebble.contract.payloads import LAST_RUN
 from pebble.errors import PebbleError
 from pebble.motion.arbiter import newer
-from pebble.runtime.whole_file import write
+from pebble.runtime.whole_file import make_folder, write
 
 _decode = msgspec.json.Decoder(dict[str, Annotated[int, msgspec.Meta(gt=0, le=LAST_RUN)]]).decode
 
@@ -30,7 +30,7 @@ def begin(path: Path, names: Collection[str], name: str, run: int) -> str:
         return "it was ended here: start it again"
     newest = {other: last for other, last in newest.items() if other in names} | {name: run}
     try:
-        path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+        make_folder(path.parent)
         write(path, msgspec.json.encode(newest), 0o600, PebbleError)
     except (OSError, PebbleError) as error:
         return f"its beginning cannot be written: {error}"

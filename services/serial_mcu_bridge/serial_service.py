@@ -101,8 +101,7 @@ class SerialService(Service, ABC):
         idle, (opened, number) = now - line.output.sent_until >= CHECK_S, self._understood
         number = number if opened == line.opened else 0
         state, silent_ms = self._silence.check(line.state, line.opened, number, now, idle=idle)
-        line.input.reports_at_rest = self._silence.reports_at_rest
-        misread = silent_ms is None and line.state is LineState.READY and line.input.received > 0
+        misread = silent_ms is None and line.state is LineState.READY and line.received > 0
         self._reported.report(state, silent_ms, _MISREAD if misread and self._misread else line.problem)
         self._misread = misread  # a line may be under way
 

@@ -19,10 +19,10 @@ class Feed:
     No more is decoded than the pipe to the player holds.
     """
 
-    def __init__(self, path: Path, volume: float, opened: Callable[[], None]) -> None:
+    def __init__(self, path: Path, opened: Callable[[], None]) -> None:
         self.rate = self.channels = 0
         self.problem = ""  # why it ended early; empty if everything was written, or the player took no more
-        self._path, self._volume, self._opened = path, volume, opened
+        self._path, self._opened = path, opened
         self._pipes: SimpleQueue[IO[bytes] | None] = SimpleQueue()
         threading.Thread(target=self._run, name="pebble-feed", daemon=True).start()
 
@@ -44,7 +44,7 @@ class Feed:
                 self._opened()
                 pipe = self._pipes.get()
                 if pipe is not None:
-                    for chunk in file.chunks(self._volume):
+                    for chunk in file.chunks():
                         pipe.write(chunk)
         except BrokenPipeError:
             log.debug("the player has ended before the clip")

@@ -2,22 +2,18 @@
 
 from __future__ import annotations
 
-import os
 import signal
 import subprocess
-import threading
 from collections.abc import Callable, Sequence
-from contextlib import suppress
 from functools import partial
 from pathlib import Path
-from typing import IO, Any
 
 from msgspec import Struct
 
 from pebble.config import Config
 from pebble.media.player import filled
+from pebble.runtime.child import Child
 from pebble.runtime.environment import child_environment
-from pebble.runtime.parent import tied_to_parent
 from pebble.services.soundboard_handler.clips import Clip
 from pebble.services.soundboard_handler.feed import Feed
 
@@ -30,27 +26,20 @@ class Players(Struct, frozen=True):
     wav: Sequence[str]
     raw: Sequence[str]
     device: str
-    volume: float
 
     @classmethod
     def of(cls, config: Config) -> Players:
         playback, raw = config.services.soundboard_handler.playback, config.services.mqtt_bridge.media.audio_receiver
-        return cls(playback.player_command, raw.command, raw.device, playback.volume)
+        return cls(playback.player_command, raw.command, raw.device)
 
     def command(self, path: Path) -> list[str]:
         """``{file}`` stands for the path; without one it is the last word."""
         words = [word.replace("{file}", str(path)) for word in self.wav]
         return words if words != list(self.wav) else [*words, str(path)]
 
-    def started(self, words: list[str], stdin: int | IO[bytes], **options: Any) -> subprocess.Popen[bytes]:
-        """Start a player in a process group of its own; it ends with the calling thread. Raises OSError, ValueError."""
-        return subprocess.Popen(
-            tied_to_parent(words),
-            stdin=stdin,
-            env=child_environment(),
-            start_new_session=True,  # what the player starts is stopped with it
-            **options,
-        )
+    def started(self, words: list[str], stdin: int) -> Child:
+        """Start a player; it ends with the calling thread. Raises OSError, ValueError."""
+        return Child(words, child_environment(), stdin=stdin)
 
     def raw_command(self, rate: int, channels: int) -> list[str]:
         return filled(self.raw, rate=rate, channels=channels, device=self.device)
@@ -64,7 +53,7 @@ class Playback:
 
     def __init__(self, clip: Clip, players: Players, post: Post, on_change: Callable[[Playback], None]) -> None:
         self.clip = clip
-        self.process: subprocess.Popen[bytes] | None = None
+        self.process: Child | None = None
         self.ended = self.stopped = False
         self.problem = ""
         self.exit_code = 0
@@ -73,8 +62,8 @@ class Playback:
         self._feed: Feed | None = None
 
     def start(self) -> None:
-        if self.clip.encoded or self._players.volume != 1.0:
-            self._feed = Feed(self.clip.path, self._players.volume, lambda: self._post(self._opened))
+        if self.clip.encoded:
+            self._feed = Feed(self.clip.path, lambda: self._post(self._opened))
         else:
             self._start_player(self._players.command(self.clip.path))
 
@@ -82,23 +71,20 @@ class Playback:
         """End soon: at once if there is no player yet. How a stopped player exits is no error."""
         self.stopped = True
         if self.process is not None:
-            self._signal(signal.SIGTERM)
+            self.process.signal(signal.SIGTERM)
         elif not self.ended:
             self.ended = True
             if self._feed is not None:
                 self._feed.cancel()
 
     def kill(self) -> None:
-        self._signal(signal.SIGKILL)
+        if self.process is not None:
+            self.process.signal(signal.SIGKILL)
 
     def wait(self, timeout: float) -> None:
         """Until the player has ended, or killed after ``timeout`` seconds."""
         if self.process is not None:
-            with suppress(subprocess.TimeoutExpired):
-                self.process.wait(timeout)
-            with suppress(ProcessLookupError):
-                os.killpg(self.process.pid, signal.SIGKILL)
-            self.process.wait()
+            self.process.finish(timeout)
 
     def _opened(self) -> None:
         """The clip's format is known, or that it has none."""
@@ -110,8 +96,8 @@ class Playback:
         self._start_player(self._players.raw_command(self._feed.rate, self._feed.channels))
         if self.process is None:
             self._feed.cancel()
-        elif self.process.stdin is not None:
-            self._feed.write_to(self.process.stdin)
+        else:
+            self._feed.write_to(self.process.pipe("stdin"))
 
     def _start_player(self, words: list[str]) -> None:
         """On this thread, because the player ends with the thread that has started it."""
@@ -120,20 +106,11 @@ class Playback:
         except (OSError, ValueError) as error:
             self._fail(str(error))
             return
-        threading.Thread(target=self._wait, args=(self.process.pid,), name="pebble-player", daemon=True).start()
+        self.process.watch(lambda code: self._post(partial(self._finished, code)))
         self._post(self._on_change)
 
-    def _wait(self, pid: int) -> None:
-        """On a thread of its own. The process remains a zombie, so that ``_reap`` cannot kill another of its number."""
-        with suppress(ChildProcessError):  # the service ends, and has waited itself
-            os.waitid(os.P_PID, pid, os.WEXITED | os.WNOWAIT)
-        self._post(self._reap)
-
-    def _reap(self) -> None:
-        if self.process is None:
-            return
-        self._signal(signal.SIGKILL)  # what it has left behind
-        self.exit_code = self.process.wait()
+    def _finished(self, code: int) -> None:
+        self.exit_code = code
         if not self.stopped and self.exit_code != 0:
             self.problem = f"player exited with code {self.exit_code}"
         elif not self.stopped and self._feed is not None:
@@ -144,8 +121,3 @@ class Playback:
     def _fail(self, why: str) -> None:
         self.problem, self.ended = f"Failed to start playback: {why}", True
         self._post(self._on_change)
-
-    def _signal(self, number: int) -> None:
-        if self.process is not None and not self.ended:
-            with suppress(ProcessLookupError):
-                os.killpg(self.process.pid, number)

@@ -117,7 +117,8 @@ def test_delivery_rules_are_those_of_the_wire() -> None:
 def test_what_stays_on_the_robot_and_what_never_passes_the_bridge() -> None:
     inside = [channel.metric for channel in CHANNELS if not channel.remote]
     assert inside == [
-        *("control-turn/{owner}", "control-vouched", "sensors/imu-fast", "media-report/{program}"),
+        *("control-turn/{owner}", "control-vouched", "motor-power/{owner}", "sensors/imu-fast"),
+        *("mcu/{uid}/local-only", "media-report/{program}"),
         *("from/{robot}/drive-values", "to/{robot}/drive-values", "neighbours/{robot}/{metric}"),
     ]
     assert {channel.suffix for channel in CHANNELS if not channel.bridged} == {

@@ -23,7 +23,7 @@ def main() -> None:
     parser = argparse.ArgumentParser()
     for name in ("width", "height", "framerate"):
         parser.add_argument(f"--{name}", type=float, required=True)
-    parser.add_argument("--codec", required=True)
+    parser.add_argument("--codec", choices=["mjpeg"], required=True)
     options, _others = parser.parse_known_args()
     kind = os.environ.get("FAKE", "")
     if kind == "refuses":
@@ -37,15 +37,9 @@ def main() -> None:
         if kind == "ends" and number == 5:
             return
         scene.render(number, picture)
-        sys.stdout.buffer.write(coded(picture, options.codec))
+        sys.stdout.buffer.write(cv2.imencode(".jpg", picture)[1].tobytes())
         sys.stdout.buffer.flush()
         time.sleep(max(0.0, begin + (number + 1) / options.framerate - time.monotonic()))
-
-
-def coded(picture: np.ndarray, codec: str) -> bytes:
-    if codec == "mjpeg":
-        return cv2.imencode(".jpg", picture)[1].tobytes()
-    return cv2.cvtColor(picture, cv2.COLOR_BGR2YUV_I420).tobytes()
 
 
 if __name__ == "__main__":

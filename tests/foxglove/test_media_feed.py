@@ -112,7 +112,7 @@ def test_without_pyav_nothing_is_requested_that_needs_it(monkeypatch: pytest.Mon
     audio.update(everything)
     assert (video.encoding(), audio.encoding()) == (None, None)
     monkeypatch.setitem(sys.modules, "av", None)
-    assert (video.encoding(), audio.encoding()) == ("pbvz", "pcm")
+    assert (video.encoding(), audio.encoding()) == ("pbvd", "pcm")
 
 
 def test_what_is_nothing_of_this_medium_or_too_large_is_refused() -> None:

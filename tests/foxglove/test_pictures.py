@@ -119,7 +119,7 @@ def test_a_client_that_comes_later_begins_with_a_key_frame(broker: Broker) -> No
         assert until(lambda: robot.requests[-1] == WITHDRAWN, 20)
 
 
-@pytest.mark.parametrize("encoding", ["json", "pbvd", "pbvz", "h264"])
+@pytest.mark.parametrize("encoding", ["json", "pbvd", "h264"])
 def test_pictures_of_every_encoding_become_jpegs(broker: Broker, encoding: str) -> None:
     with filming(broker, encoding=encoding) as robot, live(broker) as server:
         watcher = Watcher(server.address)

@@ -57,7 +57,7 @@ def test_a_robot_without_services_still_lists_everything() -> None:
             "height": 480,
             "fps": 15,
             "encoding": "json",
-            "encodings": ["json", "pbvd", "pbvz", "h264"],
+            "encodings": ["json", "pbvd", "h264"],
         },
         "audio": {
             "available": False,
@@ -213,12 +213,12 @@ def test_pictures_and_sound_are_there_with_their_device_and_on_request_with_a_br
 
 
 def test_encodings_are_those_of_this_installation(monkeypatch: pytest.MonkeyPatch) -> None:
-    publishers = {"video_publisher": {"encoding": "pbvz"}, "audio_publisher": {"encoding": "opus"}}
+    publishers = {"video_publisher": {"encoding": "pbvd"}, "audio_publisher": {"encoding": "opus"}}
     value = of(mqtt_bridge={"media": publishers})
-    assert (value["video"]["encoding"], value["audio"]["encoding"]) == ("pbvz", "opus")
+    assert (value["video"]["encoding"], value["audio"]["encoding"]) == ("pbvd", "opus")
     monkeypatch.setattr("pebble.media.pyav.find_spec", lambda _name: None)
     value = of()
-    assert (value["video"]["encodings"], value["audio"]["encodings"]) == (["json", "pbvd", "pbvz"], ["pcm"])
+    assert (value["video"]["encodings"], value["audio"]["encodings"]) == (["json", "pbvd"], ["pcm"])
 
 
 @pytest.mark.parametrize(

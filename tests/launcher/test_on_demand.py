@@ -194,10 +194,10 @@ def test_each_start_gets_the_encoding_that_was_requested_last(launch: Launch) ->
     assert robot.ready("bridge")
     robot.order("bridge", "media 1 h264")
     assert robot.ready("media")
-    robot.order("bridge", "media 1 pbvz")
+    robot.order("bridge", "media 1 pbvd")
     os.kill(robot.events("bridge", "start")[0], signal.SIGKILL)
-    assert until(lambda: robot.events("bridge", "before:media=pbvz") or robot.events("bridge", "before:media=h264"))
-    robot.order("bridge", "media 1 pbvz", "other 1")
+    assert until(lambda: robot.events("bridge", "before:media=pbvd") or robot.events("bridge", "before:media=h264"))
+    robot.order("bridge", "media 1 pbvd", "other 1")
     assert until(lambda: "may not request" in robot.stderr()), "it has been received"
     os.kill(robot.events("media", "start")[0], signal.SIGKILL)
     assert until(lambda: len(environment_notes(robot)) == 2)
@@ -205,7 +205,7 @@ def test_each_start_gets_the_encoding_that_was_requested_last(launch: Launch) ->
     assert until(lambda: robot.events("media", "stop"))
     robot.order("bridge", "media 1")
     assert until(lambda: len(environment_notes(robot)) == 3)
-    assert [note.rpartition(":")[2] for note in environment_notes(robot)] == ["h264", "pbvz", "None"]
+    assert [note.rpartition(":")[2] for note in environment_notes(robot)] == ["h264", "pbvd", "None"]
 
 
 def environment_notes(robot: Robot) -> list[str]:

@@ -21,7 +21,7 @@ from pebble.media.video import make_encoder
 from tests.recordings.demo_robots import FRED, MEDIA, recorded
 
 T0 = 1_710_969_600_000
-FORMS = ("json", "pbvd", "pbvz", "h264")
+FORMS = ("json", "pbvd", "h264")
 
 
 def picture(number: int, width: int = 64, height: int = 48) -> np.ndarray:
@@ -100,7 +100,7 @@ def test_cut_short_anywhere_it_is_not_shown(name: str, number: int) -> None:
         assert decoder.wants_keyframe
 
 
-@pytest.mark.parametrize("name", ["json", "pbvz", "h264"])
+@pytest.mark.parametrize("name", ["json", "h264"])
 def test_any_flipped_bit_of_the_body_is_found(name: str) -> None:
     packets = stream(name, count=2)
     whole = [VideoDecoder().feed(packets[0])] * 2
@@ -131,8 +131,9 @@ def test_a_recorded_camera_counts_its_pictures_in_every_form() -> None:
     shown = [decoder.feed(packet) for packet in packets]
     seen = [one for one in shown if one is not None]
     assert len(seen) == len(packets) > 80
-    assert list(dict.fromkeys(one.encoding for one in seen)) == list(FORMS)
-    for name in FORMS:
+    forms = ["json", "pbvd", "pbvz", "h264"]
+    assert list(dict.fromkeys(one.encoding for one in seen)) == forms
+    for name in forms:
         counts = [read_counter(one.picture) for one in seen if one.encoding == name]
         assert None not in counts
         assert all(0 < after - before <= 2 for before, after in itertools.pairwise(counts)), name
@@ -165,7 +166,7 @@ def test_raw_jpeg_is_a_key_frame_without_number_and_time() -> None:
 
 def test_the_picture_belongs_to_the_caller() -> None:
     spoilt, untouched = VideoDecoder(), VideoDecoder()
-    for packet in stream("pbvz"):
+    for packet in stream("pbvd"):
         one, other = spoilt.feed(packet), untouched.feed(packet)
         assert one is not None
         assert other is not None

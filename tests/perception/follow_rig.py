@@ -7,12 +7,13 @@ import random
 import re
 from typing import Any, NamedTuple
 
-from pebble.contract.payloads import Drive, TouchValues
+from pebble.contract.payloads import MotorPower, TouchValues
 from pebble.perception.follow import Command, Follower, FollowSettings
 from pebble.perception.odom_follow import OdomFollower, OdomFollowSettings, Pose
 from pebble.perception.odometry import Odometry, WheelGeometry
 from pebble.perception.rate import Rate
 from pebble.perception.tags import TagFinder
+from pebble.services.serial_mcu_bridge.text.goob_base import mix
 from pebble.simulation.world.lockstep import LockstepWorld
 from pebble.simulation.world.world_file import parse_world
 
@@ -49,7 +50,7 @@ class FollowRig:
         self._finder = TagFinder()
         self._hidden = hidden
         self._rate = Rate(10.0)
-        self._odometry = Odometry(WheelGeometry(), watchdog_s=0.75, now=0.0)
+        self._odometry = Odometry(WheelGeometry(), 0.0)
         self._received = b""
         self._vision = None if by_odometry else Follower(FollowSettings())
         self._both = OdomFollower(OdomFollowSettings()) if by_odometry else None
@@ -64,7 +65,8 @@ class FollowRig:
             command = self._see(now)
             if command is not None:
                 self.reasons.append(command.reason)
-                self._odometry.drive(Drive(x=command.x, z=command.z), now)
+                left, right = mix(command.x, command.z)
+                self._odometry.power(MotorPower(left=left, right=right), now)
                 self.robot.drive(command.x, command.z)
             if len(path) < now * 2:
                 pose = self.robot.pose

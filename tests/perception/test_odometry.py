@@ -7,7 +7,8 @@ import random
 
 import pytest
 
-from pebble.contract.payloads import ControlState, Drive, EstopState
+from pebble.contract.payloads import MotorPower
+from pebble.perception.motor_power import Directions
 from pebble.perception.odometry import WheelGeometry
 from pebble.simulation.motion import FULL_SPEED_MM_S, TRACK_MM
 from tests.perception.wheels_rig import WheelsRig
@@ -109,39 +110,14 @@ def test_a_push_without_a_command_is_of_unknown_direction() -> None:
     assert (value["x_mm"], value["left_mm"]) == (before["x_mm"], before["left_mm"])
 
 
-def test_commands_that_the_robot_refuses_change_no_direction() -> None:
-    rig = WheelsRig(geometry=ONE_SENSOR)
-    person = Drive(z=0.5)
-    for _ in range(20):
-        rig.command(person)
-        rig.odometry.drive(Drive(z=-0.9, source="autonomy", run=3), rig.now)  # a script waits while a person drives
-        rig.wait(0.1)
-    rig.stop()
-    assert rig.error_mm() < 3
-
-
-def test_under_control_only_commands_with_the_present_key_count() -> None:
-    rig = WheelsRig(geometry=ONE_SENSOR)
-    for key, power in (("0badf00d", 0.5), ("91f3d869", -0.5)):
-        rig.odometry.control(ControlState(boot="b", by="ann", id="3f2a91c0", key=key))
-        for _ in range(10):
-            rig.command(Drive(z=power, key=key))
-            rig.odometry.drive(Drive(z=-power, key="00000000"), rig.now)  # of a driver before
-            rig.wait(0.1)
-        rig.stop()
-        assert rig.error_mm() < 3
-    assert rig.odometry.value()["distance_mm"] > 100
-
-
-def test_while_the_robot_is_stopped_no_command_counts() -> None:
-    rig = WheelsRig(geometry=ONE_SENSOR)
-    rig.drive(2.0, z=0.5)
-    rig.stop(1.0)
-    state = EstopState(latched=True, boot="b", count=1, recent=[], by="", why="", since=0, barred=4)
-    rig.odometry.owner(state)
-    rig.odometry.drive(Drive(z=1.0), rig.now)
-    rig.wait(2.0)
-    assert rig.odometry.value()["left_stall_events"] == 0, "nothing was commanded"
+@pytest.mark.parametrize(("coasted_s", "directions"), [(0.0, (1, -1)), (0.35, (1, -1)), (0.36, (0, 0)), (9.0, (0, 0))])
+def test_a_direction_stays_for_as_long_as_wheels_coast(coasted_s: float, directions: tuple[int, int]) -> None:
+    power = Directions(0.0)
+    assert power.at(0.0) == ((0.0, 0), (0.0, 0))
+    power.command(MotorPower(left=0.5, right=-0.02), 0.0)
+    assert power.at(0.5) == ((0.5, 1), (-0.02, -1))
+    power.command(MotorPower(left=0.0, right=0.01), 1.0)
+    assert power.at(1.0 + coasted_s) == ((0.0, directions[0]), (0.01, directions[1]))
 
 
 def test_an_inertial_sensor_that_lies_otherwise_is_not_believed() -> None:

@@ -12,7 +12,7 @@ import pytest
 
 from pebble.errors import ConfigError, PebbleError
 from pebble.perception.camera_model import CALIBRATION, CameraModel
-from pebble.perception.tags import Place, Tag, TagChoice, TagFinder, TagGeometry, TagOrder
+from pebble.perception.tags import Place, Tag, TagFinder, TagGeometry, largest
 
 SIZE = (640, 480)
 EDGE_M = 0.25
@@ -133,7 +133,7 @@ def test_a_file_that_is_no_calibration_is_named(tmp_path: Path, text: str) -> No
 
 # -- several tags with one id
 
-LEFT, RIGHT, FAR, NEAR, BEHIND = (1.0, -0.3), (1.0, 0.3), (2.0, 0.1), (0.7, 0.1), (1.02, -0.28)  # metres, radians
+RIGHT, FAR = (1.0, 0.3), (2.0, 0.1)  # metres, radians
 
 
 def seen(distance_m: float, angle_rad: float, *, number: int = 13, edge: float | None = None) -> Tag:
@@ -143,55 +143,9 @@ def seen(distance_m: float, angle_rad: float, *, number: int = 13, edge: float |
     return Tag(number, corners, Place(distance_m, angle_rad))
 
 
-@pytest.mark.parametrize(
-    ("pictures", "chosen"),
-    [  # of pictures 0.1 s apart: where tags are, and which one is chosen
-        ([[FAR, NEAR]], [NEAR]),
-        ([[RIGHT, LEFT]], [LEFT]),
-        ([[(1.03, -0.3), RIGHT], [(0.97, -0.3), RIGHT]], [(1.03, -0.3), (0.97, -0.3)]),
-        ([[RIGHT], [LEFT, RIGHT], [RIGHT, LEFT]], [RIGHT, RIGHT, RIGHT]),
-        ([[FAR, NEAR], [FAR, NEAR], [NEAR, FAR]], [NEAR] * 3),
-        ([[FAR], [FAR, NEAR], [NEAR, FAR], [(1.8, 0.1), (0.6, 0.1)]], [FAR, FAR, FAR, (1.8, 0.1)]),
-        ([[LEFT, RIGHT], [RIGHT], [LEFT, RIGHT]], [LEFT, None, LEFT]),
-        ([[LEFT, RIGHT], [LEFT], [RIGHT], [LEFT], [RIGHT], [RIGHT, LEFT]], [LEFT, LEFT, None, LEFT, None, LEFT]),
-        ([[LEFT, RIGHT], *[[RIGHT]] * 9], [LEFT, *[None] * 6, RIGHT, RIGHT, RIGHT]),
-        ([[LEFT, RIGHT], [], [], [LEFT, RIGHT]], [LEFT, None, None, LEFT]),
-        ([[FAR], [FAR, NEAR], *[[]] * 8, [FAR, NEAR]], [FAR, FAR, *[None] * 8, NEAR]),
-        ([[LEFT, RIGHT, FAR], [FAR, RIGHT], [FAR, RIGHT, LEFT]], [LEFT, None, LEFT]),
-        ([[LEFT, BEHIND], [BEHIND, LEFT], [BEHIND, LEFT]], [LEFT] * 3),
-        ([[LEFT], [(1.0, -0.1)], [(1.0, 0.2)], [(0.5, 0.6)]], [LEFT, (1.0, -0.1), (1.0, 0.2), (0.5, 0.6)]),
-        ([[LEFT, LEFT], [LEFT, LEFT]], [LEFT, LEFT]),
-        ([[]], [None]),
-    ],
-)
-def test_the_same_one_of_several_tags_is_chosen(pictures: list[list[Any]], chosen: list[Any]) -> None:
-    choice = TagChoice(13)
-    for number, (places, wanted) in enumerate(zip(pictures, chosen, strict=True)):
-        tag = choice.choose([seen(*place) for place in places] + [seen(0.5, 0.0, number=7)], number * 0.1)
-        assert (None if tag is None else tag.place) == wanted, f"picture {number}"
-        assert choice.count == len(places)
-        assert bool(choice.remark) == (len(places) > 1 or (tag is None and len(places) > 0))
-
-
-def test_the_choice_reports_which_one_it_is() -> None:
-    choice = TagChoice(13)
-    choice.choose([seen(*LEFT), seen(*RIGHT, edge=200.0)], 0.0)
-    assert choice.remark == "2 tags with id 13: using the one 17 degrees to the right, the largest"
-    choice.choose([seen(*LEFT, edge=300.0), seen(*RIGHT), seen(*FAR)], 0.1)
-    assert choice.remark == "3 tags with id 13: using the one 17 degrees to the right, nearest to the last one"
-    choice.choose([seen(*LEFT)], 0.2)
-    assert "hidden" in choice.remark
-
-
-def test_a_program_that_takes_the_first_tag_of_an_id_gets_the_same_one_in_each_picture() -> None:
-    order, firsts = TagOrder(), []
-    for number in range(10):
-        far, near = seen(*FAR, edge=50.0 + number % 2), seen(*RIGHT, edge=51.0 - number % 2)
-        tags = order.sort([seen(*LEFT, number=20), near, far, seen(*LEFT, number=4)], number * 0.1)
-        assert [tag.id for tag in tags] == [4, 13, 13, 20]
-        firsts.append(tags[1].place)
-        assert len(order.remarks) == 1
-    assert set(firsts) == {firsts[0]}
+def test_the_largest_of_several_is_chosen() -> None:
+    tags = [seen(*FAR), seen(*RIGHT), seen(0.5, 0.0, number=7)]
+    assert (largest(tags, 13), largest(tags, 1), largest([], 13)) == (tags[1], None, None)
 
 
 def test_the_finder_lists_all_tags_of_an_id_the_largest_first() -> None:

@@ -8,14 +8,13 @@ import re
 from collections.abc import Iterator
 from itertools import count
 
-from pebble.contract.payloads import Drive, ImuFast, ImuFastValues, Orientation, TouchValues, Vector
+from pebble.contract.payloads import Drive, ImuFast, ImuFastValues, MotorPower, Orientation, TouchValues, Vector
 from pebble.perception.odometry import Odometry, WheelGeometry
 from pebble.simulation.board import SimulatedMcu
 from pebble.simulation.motion import TRACK_MM
 
 TICK_S = 0.01
 REPEAT_S = 0.1  # of a drive command
-WATCHDOG_S = 0.75
 _touch = re.compile(rb"T a0=(\d+) a1=(\d+) a2=(\d+)").fullmatch
 
 
@@ -38,7 +37,7 @@ class WheelsRig:
         self.mcu = SimulatedMcu("goob", self.now)
         self.motion = self.mcu.motion
         self.start_mm = self.motion.left_mm, self.motion.right_mm = start_mm
-        self.odometry = Odometry(geometry or WheelGeometry(), watchdog_s=WATCHDOG_S, now=self.now)
+        self.odometry = Odometry(geometry or WheelGeometry(), self.now)
         self._gyro, self._noise, self._sign = gyro, noise, gyro_sign
         self._random = random.Random(1)
         self._received = b""
@@ -58,7 +57,7 @@ class WheelsRig:
 
     def command(self, drive: Drive) -> None:
         left, right = (max(-1.0, min(1.0, power)) for power in (drive.z + drive.x, drive.z - drive.x))
-        self.odometry.drive(drive, self.now)
+        self.odometry.power(MotorPower(left=left, right=right), self.now)
         self._take(self.mcu.receive(b"M %.3f %.3f\n" % (left, right), self.now))
 
     def wait(self, seconds: float) -> None:

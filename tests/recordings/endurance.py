@@ -27,7 +27,7 @@ from pebble.transports import Message, MqttSettings, QoS, Transport, create
 from tests.own_memory import own_mb
 from tests.support import quarters, until
 
-ENCODINGS = ("json", "pbvd", "pbvz", "h264")
+ENCODINGS = ("json", "pbvd", "h264")
 _SAMPLE_S, _DRIVE_S, _CHANGE_S = 20.0, 10.0, 60.0
 _PERIOD_S = 0.05  # of drive commands
 _DIGEST = 8  # bytes of each payload that are compared

@@ -9,8 +9,8 @@ import time
 from collections import defaultdict
 from typing import Any
 
-from pebble.contract import DRIVE, TOUCH_SENSORS, Channel, codec
-from pebble.contract.payloads import Drive, TouchSensors, TouchValues
+from pebble.contract import MOTOR_POWER, TOUCH_SENSORS, Channel, codec
+from pebble.contract.payloads import MotorPower, TouchSensors, TouchValues
 from pebble.transports import Message, QoS
 from pebble.transports.frames import FrameInfo, FrameWriter
 from tests.perception.test_tags import SIZE, picture
@@ -55,12 +55,12 @@ class Sensors:
         mm, due = 0.0, time.monotonic()
         for sample in range(round(50 * seconds)):
             if sample % 5 == 0:
-                self._publish(DRIVE, Drive(z=power))
+                self._publish(MOTOR_POWER, MotorPower(left=power, right=power), owner="goob")
             mm += 380 * power / 50
             self._touch(mm)
             due += 1 / 50
             time.sleep(max(0.0, due - time.monotonic()))
-        self._publish(DRIVE, Drive())
+        self._publish(MOTOR_POWER, MotorPower(left=0.0, right=0.0), owner="goob")
         return mm
 
     def close(self) -> None:
@@ -73,9 +73,11 @@ class Sensors:
         level, second = (round(512 + 297 * part) for part in (math.sin(phase), -math.cos(phase)))
         self._publish(TOUCH_SENSORS, TouchSensors(value=TouchValues(a0=level, a1=level, a2=second)))
 
-    def _publish(self, channel: Channel, value: Any) -> None:
+    def _publish(self, channel: Channel, value: Any, **names: str) -> None:
         raw = codec.encode(channel, value)
-        self.station.transport.publish(channel.topic(self.station.config.base), raw, qos=QoS(channel.default_qos))
+        self.station.transport.publish(
+            channel.topic(self.station.config.base, **names), raw, qos=QoS(channel.default_qos)
+        )
 
     def _receive(self, topic: str, message: Message) -> None:
         self.messages[topic].append(json.loads(message.payload))

@@ -83,7 +83,7 @@ def _log(at: int) -> dict[str, Any]:
 def _capabilities(_at: int) -> dict[str, Any]:
     value = {
         "transport": {"kind": "zenoh"},
-        "video": {"available": True, "controls": True, "encodings": ["pbvz"]},
+        "video": {"available": True, "controls": True, "encodings": ["pbvd"]},
         "audio": {"available": True, "controls": True, "encodings": ["pcm"]},
         "drive": {"available": True, "controls": True},
     }

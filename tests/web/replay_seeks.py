@@ -26,7 +26,7 @@ from tests.web.browser import Tab, tab
 from tests.web.page_soak import memory
 from tests.web.served import Served
 
-ENCODINGS = ("json", "pbvd", "pbvz", "h264")
+ENCODINGS = ("json", "pbvd", "h264")
 SIZE = (640, 480)
 _MINUTE_S = 60
 #: Resolves with milliseconds until a picture was drawn, and when that was received.

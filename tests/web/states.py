@@ -34,7 +34,7 @@ def capabilities(kind: str, *, video: bool = True, drive: bool = True) -> dict[s
         "schema": "pebble-capabilities/v1",
         "value": {
             "transport": {"kind": kind},
-            "video": {"available": video, "controls": video, "encodings": ["h264", "pbvz", "pbvd", "json"]},
+            "video": {"available": video, "controls": video, "encodings": ["h264", "pbvd", "json"]},
             "audio": {"available": video, "controls": video, "encodings": ["pcm", "opus"]},
             "drive": {"available": drive, "controls": drive, "arbitrates": True, "axes": ["x", "z"]},
             "system": {
@@ -66,7 +66,7 @@ def estop(now: int, by: str = "", *, sending: str = "", text: str = "", why: str
 
 
 def flow(state: str = "flowing", why: str = "") -> dict[str, Any]:
-    sent = {"encoding": "pbvz", "per_second": 10.0, "kbits": 212.0}
+    sent = {"encoding": "pbvd", "per_second": 10.0, "kbits": 212.0}
     return {"state": state, "why": why, "viewers": 2} | sent
 
 

@@ -9,8 +9,9 @@ from pebble.recordings.files.recorded import RecordingError
 from pebble.recordings.files.rewrite import Rewritten, rewrite
 from pebble.recordings.library import SUFFIX
 from pebble.recordings.recorder.background import Background
-from pebble.recordings.recorder.folder import DAMAGED, finished_path, rename, sync_folder
+from pebble.recordings.recorder.folder import DAMAGED, finished_path, rename
 from pebble.recordings.recorder.lane import OpenFile
+from pebble.runtime.whole_file import sync_folder
 
 log = logging.getLogger(__name__)
 

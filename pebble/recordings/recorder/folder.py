@@ -14,6 +14,7 @@ from typing import BinaryIO, Final
 from pebble.recordings.files.recorded import RecordingError
 from pebble.recordings.files.rewrite import PART
 from pebble.recordings.library import ACTIVE, SUFFIX
+from pebble.runtime.whole_file import sync_folder
 from pebble.transports.own_file import OwnFile
 
 STATE: Final = "state"
@@ -162,12 +163,3 @@ def rename(path: Path, target: Path) -> None:
         raise FileExistsError(errno.EEXIST, "there is another file of this name", str(target))
     path.rename(target)
     sync_folder(path.parent)
-
-
-def sync_folder(folder: Path) -> None:
-    """Make names durable. Raises OSError."""
-    descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)

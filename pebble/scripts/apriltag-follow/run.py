@@ -8,13 +8,11 @@ from msgspec import Meta, Struct, convert
 
 from pebble import Robot, run
 from pebble.contract import APRILTAG_DATA, VIDEO_OVERLAYS
-from pebble.contract.renaming import renamed
 from pebble.perception.camera_model import HFOV_DEG, CameraModel
 from pebble.perception.follow import Follower, FollowSettings
 from pebble.perception.overlays import overlays, tag_data
 from pebble.perception.rate import Rate
-from pebble.perception.tags import FAMILY, TagChoice, TagFinder
-from pebble.runtime.rate_limit import RateLimitedLog
+from pebble.perception.tags import FAMILY, TagFinder, largest
 
 SOURCE = Path(__file__).parent.name
 
@@ -48,31 +46,25 @@ class Options(Struct, kw_only=True):
     lost_timeout_s: Annotated[float, Meta(ge=0, le=60, title="Lost Timeout (s)", extra={"arg": "lost-timeout"})] = 0.7
     marker_dictionary: Annotated[str, Meta(title="Tag Dictionary")] = FAMILY
     hfov_deg: Annotated[float, Meta(ge=20, le=160, title="Field of View (deg), without a calibration")] = HFOV_DEG
-    topic: Annotated[str, Meta(title="Tag Data Topic")] = ""
-    overlays_topic: Annotated[str, Meta(title="Overlays Topic")] = ""
 
 
 def main(robot: Robot, options: Options) -> None:
-    followed = renamed(APRILTAG_DATA, options.topic, robot.config.base)
-    drawn = renamed(VIDEO_OVERLAYS, options.overlays_topic, robot.config.base)
     camera = CameraModel.find([Path(__file__).parent, robot.config.folder], options.hfov_deg)
     finder = TagFinder(options.tag_size_m, camera, options.marker_dictionary)
-    choice, log = TagChoice(options.tag_id), RateLimitedLog(robot.log, period_s=10.0)
     follower = Follower(convert(options, FollowSettings, from_attributes=True))
     rate, size = Rate(options.control_rate_hz), (0, 0)
-    robot.publish_at_end(followed, lambda: tag_data(options.tag_id, None, size, time.time()))
-    robot.publish_at_end(drawn, lambda: overlays(SOURCE, [], size, time.time()))
+    robot.publish_at_end(APRILTAG_DATA, lambda: tag_data(options.tag_id, None, size, time.time()))
+    robot.publish_at_end(VIDEO_OVERLAYS, lambda: overlays(SOURCE, [], size, time.time()))
     for picture in robot.camera():
         if not rate.due(time.monotonic()):
             continue
         size = (picture.shape[1], picture.shape[0])
-        tag = choice.choose(finder.find(picture), time.monotonic())
-        if choice.remark:
-            log.warning("tags", "%s", choice.remark)
+        tags = [tag for tag in finder.find(picture) if tag.id == options.tag_id]
+        tag = largest(tags, options.tag_id)
         command = follower.step(time.monotonic(), tag and tag.place)
         robot.drive(command.x, command.z)
-        robot.publish(followed, tag_data(options.tag_id, tag, size, time.time(), choice.count))
-        robot.publish(drawn, overlays(SOURCE, [tag] if tag else [], size, time.time()))
+        robot.publish(APRILTAG_DATA, tag_data(options.tag_id, tag, size, time.time(), len(tags)))
+        robot.publish(VIDEO_OVERLAYS, overlays(SOURCE, [tag] if tag else [], size, time.time()))
 
 
 if __name__ == "__main__":

@@ -8,12 +8,10 @@ from msgspec import Meta, Struct, convert
 
 from pebble import Robot, run
 from pebble.contract import APRILTAG_DATA, APRILTAG_LOCATIONS, WHEEL_ODOMETRY
-from pebble.contract.renaming import renamed
 from pebble.perception.camera_model import CameraModel
 from pebble.perception.odom_follow import OdomFollower, OdomFollowSettings, pose_of
 from pebble.perception.overlays import tag_data, tags_in
-from pebble.perception.tags import Tag, TagChoice, TagGeometry
-from pebble.runtime.rate_limit import RateLimitedLog
+from pebble.perception.tags import Tag, TagGeometry, largest
 
 POSE_AGE_S = 1.0  # odometry is published twice a second at rest
 
@@ -23,7 +21,7 @@ Length = Annotated[float, Meta(ge=0)]
 
 
 class Options(Struct):
-    """The original's settings; a tag that is lost is searched for, and min_wheel_pwm is accepted and unused."""
+    """The original's settings; a tag that is lost is searched for."""
 
     tag_id: Annotated[int, Meta(ge=0, title="Tag ID", extra={"arg": "marker-id"})] = 13
     tag_size_m: Annotated[
@@ -42,14 +40,11 @@ class Options(Struct):
     forward_cone_deg: Annotated[float, Meta(ge=5, le=75, title="Forward Cone (deg)")] = 18.0
     forward_min_power: Annotated[Power, Meta(title="Forward Min Power")] = 0.8
     forward_max_power: Annotated[Power, Meta(title="Forward Max Power")] = 1.0
-    tags_topic: Annotated[str, Meta(title="Tags Topic")] = ""
-    odom_topic: Annotated[str, Meta(title="Odom Topic")] = ""
     control_rate_hz: Annotated[float, Meta(ge=1, title="Control Rate (Hz)", extra={"arg": "rate"})] = 10.0
     turn_power: Annotated[float, Meta(ge=0.05, le=1, title="Turn Power")] = 0.5
     turn_pulse_s: Annotated[float, Meta(ge=0.02, title="Turn Pulse (s)", extra={"arg": "turn-pulse"})] = 0.08
     turn_cooldown_s: Annotated[float, Meta(ge=0, title="Turn Cooldown (s)", extra={"arg": "turn-cooldown"})] = 0.18
     odom_goal_tolerance_m: Annotated[float, Meta(ge=0.01, title="Odom Goal Tolerance (m)")] = 0.06
-    min_wheel_pwm: Annotated[Power, Meta(title="Min Wheel PWM")] = 0.3
     odom_heading_kp: Annotated[float, Meta(ge=0.1, title="Odom Heading Kp")] = 1.5
     odom_distance_kp: Annotated[float, Meta(ge=0.1, title="Odom Distance Kp")] = 1.4
     odom_min_drive_power: Annotated[Power, Meta(title="Odom Min Drive Power")] = 0.35
@@ -66,42 +61,35 @@ class Options(Struct):
 
 
 def main(robot: Robot, options: Options) -> None:
-    base = robot.config.base
-    tags, odometry = (
-        renamed(APRILTAG_LOCATIONS, options.tags_topic, base),
-        renamed(WHEEL_ODOMETRY, options.odom_topic, base),
-    )
     camera = CameraModel.find([Path(__file__).parent, robot.config.folder])
     geometry = TagGeometry(options.tag_size_m, camera)
-    choice, log = TagChoice(options.tag_id), RateLimitedLog(robot.log, period_s=10.0)
     follower = OdomFollower(convert(options, OdomFollowSettings, from_attributes=True))
     robot.publish_at_end(APRILTAG_DATA, lambda: tag_data(options.tag_id, None, (0, 0), time.time()))
+    tags: list[Tag] = []
     tag: Tag | None = None
     seen, due = None, time.monotonic()
     while True:
         now = time.monotonic()
-        newest = robot.latest(tags, options.tag_timeout_s)
-        pose = pose_of(robot.latest(odometry, POSE_AGE_S))
+        newest = robot.latest(APRILTAG_LOCATIONS, options.tag_timeout_s)
+        pose = pose_of(robot.latest(WHEEL_ODOMETRY, POSE_AGE_S))
         if newest is not seen:
             seen = newest
-            tag = choice.choose(tags_in(newest, options.tag_id, geometry), now) if newest else None
-            if newest and choice.remark:
-                log.warning("tags", "%s", choice.remark)
+            tags = tags_in(newest, options.tag_id, geometry) if newest else []
+            tag = largest(tags, options.tag_id)
             follower.see(now, tag and tag.place, pose)
         command = follower.step(now, pose)
         robot.drive(command.x, command.z)
         size = (newest.frame_width, newest.frame_height) if newest else (0, 0)
-        robot.publish(APRILTAG_DATA, tag_data(options.tag_id, tag, size, time.time(), choice.count))
+        robot.publish(APRILTAG_DATA, tag_data(options.tag_id, tag, size, time.time(), len(tags)))
         due = max(due + 1 / options.control_rate_hz, now)
         robot.sleep(due - time.monotonic())
 
 
 if __name__ == "__main__":  # the scripts that it needs are named after their topics
-    frames = {"width": 1280, "height": 720, "fps": 15.0}
     run(
         main,
         label="Follow a tag, also out of sight",
         summary="Drives to a printed tag, and on to where it was last while it is out of sight.",
         main_options=("tag_id", "target_distance_m", "tag_size_m"),
-        needs={APRILTAG_LOCATIONS.metric: frames, WHEEL_ODOMETRY.metric: {"use_tune_state": False}},
+        needs={APRILTAG_LOCATIONS.metric: {}, WHEEL_ODOMETRY.metric: {"use_tune_state": False}},
     )

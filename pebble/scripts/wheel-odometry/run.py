@@ -1,4 +1,4 @@
-"""Publishes where the robot is, from its wheels' hall sensors and the commands that its motors obey."""
+"""Publishes where the robot is, from its wheels' hall sensors and what its motors are commanded."""
 
 import json
 import math
@@ -10,9 +10,8 @@ from typing import Annotated, Any, Literal
 from msgspec import Meta, Struct, convert
 
 from pebble import Robot, run
-from pebble.contract import CONTROL_STATE, DRIVE, ESTOP_STATE, IMU_FAST, TOUCH_SENSORS, WHEEL_ODOMETRY
+from pebble.contract import IMU_FAST, MOTOR_POWER, TOUCH_SENSORS, WHEEL_ODOMETRY
 from pebble.contract.payloads import WheelOdometry
-from pebble.contract.renaming import renamed
 from pebble.perception.odometry import Odometry, WheelGeometry
 from pebble.perception.rate import Rate
 from pebble.runtime.rate_limit import RateLimitedLog
@@ -39,17 +38,10 @@ class Options(Struct):
     right_mm_per_event: Annotated[float, Meta(ge=0, le=1000, title="Right Step (mm), 0: by geometry")] = 0.0
     publish_rate_hz: Annotated[float, Meta(ge=1, le=50, title="Rate While Moving (Hz)")] = 20.0
     idle_publish_rate_hz: Annotated[float, Meta(ge=0.2, le=50, title="Rate at Rest (Hz)")] = 2.0
-    topic: Annotated[str, Meta(title="Topic")] = ""
 
 
 def main(robot: Robot, options: Options) -> None:
-    channel = renamed(WHEEL_ODOMETRY, options.topic, robot.config.base)
-    odometry = Odometry(
-        geometry(robot, options),
-        watchdog_s=robot.config.services.serial_mcu_bridge.safety.drive_timeout_seconds,
-        strangers=robot.config.security.unnamed,
-        now=time.monotonic(),
-    )
+    odometry = Odometry(geometry(robot, options), time.monotonic())
     inputs: queue.Queue[tuple[Callable[..., None], Any, float]] = queue.Queue(WAITING)
 
     log = RateLimitedLog(robot.log)
@@ -68,11 +60,9 @@ def main(robot: Robot, options: Options) -> None:
     def touched(touch: Any, now: float) -> None:
         odometry.touch(touch.value, now)
 
-    robot.on(DRIVE, take(odometry.drive))
+    robot.on(MOTOR_POWER, take(odometry.power))
     robot.on(TOUCH_SENSORS, take(touched))
     robot.on(IMU_FAST, take(odometry.imu))
-    robot.on(ESTOP_STATE, take(lambda state, _now: odometry.owner(state)))
-    robot.on(CONTROL_STATE, take(lambda state, _now: odometry.control(state)))
     rate = Rate(options.publish_rate_hz)
     silent_at: float | None = time.monotonic() + SILENCE_S  # None: a sample has arrived, or the warning is logged
     while True:
@@ -89,7 +79,7 @@ def main(robot: Robot, options: Options) -> None:
         rate.hz = options.publish_rate_hz if odometry.moving(now) else options.idle_publish_rate_hz
         if rate.due(now):
             payload = WheelOdometry(source=WHEEL_ODOMETRY.metric, value=odometry.value(), timestamp=time.time())
-            robot.publish(channel, payload)
+            robot.publish(WHEEL_ODOMETRY, payload)
 
 
 def geometry(robot: Robot, options: Options) -> WheelGeometry:

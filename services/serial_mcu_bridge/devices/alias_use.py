@@ -1,7 +1,7 @@
 """The aliases of a device that are in use: those that no other device claims."""
 
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 
 from pebble.services.serial_mcu_bridge.devices.device import Alias, Device, Route
 from pebble.services.serial_mcu_bridge.devices.peers import PeerDevices
@@ -17,8 +17,10 @@ class AliasUse:
         peers: PeerDevices,
         begin: Callable[[Device, Route, Alias], Subscription | None],
         end: Callable[[Alias], None],
+        owners: Mapping[str, str],
     ) -> None:
-        self._log, self._peers, self._begin, self._end = log, peers, begin, end
+        """``owners``: the uid that the config names for a channel; no other device has it then."""
+        self._log, self._peers, self._begin, self._end, self._owners = log, peers, begin, end, owners
         self.permitted = False  # other devices have had time to object
         self._device: Device | None = None
         self.used: dict[str, tuple[Alias, Subscription | None]] = {}  # by claim
@@ -53,8 +55,9 @@ class AliasUse:
         self._rivals.clear()
 
     def _update(self, device: Device, route: Route, alias: Alias) -> None:
-        rivals = self._peers.claimants(alias.claim)
-        self._log_conflict(device, alias.claim, rivals)
+        owner = self._owners.get(alias.claim.partition("/")[2])
+        rivals = self._peers.claimants(alias.claim) if owner is None else [owner] if owner != device.uid else []
+        self._log_conflict(device, alias.claim, rivals, owner)
         if rivals:
             self._release(alias.claim)
         elif self.permitted and alias.claim not in self.used:
@@ -68,11 +71,13 @@ class AliasUse:
                 subscription.close()
             self._end(alias)
 
-    def _log_conflict(self, device: Device, claim: str, rivals: list[str]) -> None:
+    def _log_conflict(self, device: Device, claim: str, rivals: list[str], owner: str | None) -> None:
         before = self._rivals.pop(claim, [])
         if rivals:
             self._rivals[claim] = rivals
-        if rivals and not before:
+        if rivals and not before and owner is not None:
+            self._log.info("%s: %s is %s's by the config", device.uid, claim, owner)
+        elif rivals and not before:
             others = " and ".join(rivals)
             text = "%s and %s both claim %s: neither has it until one of them leaves, both use mcu/… only"
             self._log.warning(text, device.uid, others, claim)

@@ -6,7 +6,7 @@ import time
 from functools import partial
 from typing import Any
 
-from pebble.contract import IMU, IMU_FAST, MCU_COMMAND, MCU_DESCRIBE, MCU_VALUE, Channel, Kind, codec
+from pebble.contract import IMU, IMU_FAST, MCU_COMMAND, MCU_DESCRIBE, MCU_LOCAL_ONLY, MCU_VALUE, Channel, Kind, codec
 from pebble.contract.payloads import McuManifest, McuSample
 from pebble.errors import DeviceError, PayloadError
 from pebble.runtime.parent import Notifier, ProvidedFeatures
@@ -56,7 +56,7 @@ _UID_QUERY = Channel(
 class DescribedBridge(SerialService):
     """Publishes the topics of one MCU while it is connected, and clears its retained messages when it has gone."""
 
-    publishes = (MCU_DESCRIBE, MCU_VALUE, IMU_FAST, IMU)
+    publishes = (MCU_DESCRIBE, MCU_LOCAL_ONLY, MCU_VALUE, IMU_FAST, IMU)
     end = END
     boot_s = 0.0  # bytes that are no frame are skipped
     retry_s = 0.25  # the topics exist within 2 s of plugging in
@@ -72,7 +72,7 @@ class DescribedBridge(SerialService):
         self.device: Device | None = None
         self._published_states: dict[int, tuple[Reading, int]] = {}  # newest of each state interface, its epoch ms
         self._generic: list[Subscription] = []  # of the device that was described last, connected or not
-        self.aliases = AliasUse(self.log, self._peers, self._begin_alias, self._end_alias)
+        self.aliases = AliasUse(self.log, self._peers, self._begin_alias, self._end_alias, self.options.aliases)
         self._features = ProvidedFeatures(Notifier())
         self._timer: Timer | None = None
 
@@ -113,6 +113,7 @@ class DescribedBridge(SerialService):
         for uid in self._peers.left_over(self.clock()):
             self.log.info("%s: its retained manifest is stale; cleared", uid)
             self.clear(MCU_DESCRIBE, uid=uid)
+            self.clear(MCU_LOCAL_ONLY, uid=uid)
             self.aliases.update()
         self._perform(self._uid.tick(self.clock()))
         self._arm()
@@ -229,7 +230,8 @@ class DescribedBridge(SerialService):
         for subscription in subscriptions:
             subscription.close()
         self._listen_generic(device, private=False)  # a reader of the manifest may send commands at once
-        self.publish(MCU_DESCRIBE, device.payload, uid=device.uid)  # then the MQTT bridge knows what is private
+        self.publish(MCU_LOCAL_ONLY, device.local_only, uid=device.uid)
+        self.publish(MCU_DESCRIBE, device.payload, uid=device.uid)
         self._listen_generic(device, private=True)
         for reading, received_ms in self._published_states.values():  # received before we held the uid
             self.publish(device.routes[reading.interface.id].generic, device.sample(reading, received_ms))
@@ -253,6 +255,7 @@ class DescribedBridge(SerialService):
             if route.generic.kind is Kind.STATE:
                 self.retract(route.generic)
         self.retract(MCU_DESCRIBE, uid=device.uid)
+        self.retract(MCU_LOCAL_ONLY, uid=device.uid)
 
     def _listen_generic(self, device: Device, *, private: bool) -> None:
         self._generic += [

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from pebble import contract as c
-from pebble.contract.payloads import McuManifest, McuSample, Payload
+from pebble.contract.payloads import McuLocalOnly, McuManifest, McuSample, Payload
 from pebble.runtime.addresses import Addresses
 from pebble.services.serial_mcu_bridge.devices import imu
 from pebble.services.serial_mcu_bridge.devices.aliases import Claims, claims
@@ -57,6 +57,13 @@ class Device:
     def has_motion(self) -> bool:
         """Whether there is an inertial sensor, which sends continuously."""
         return any(route.interface.profile == imu.MOTION for route in self.routes.values())
+
+    @property
+    def local_only(self) -> McuLocalOnly:
+        """Return the topics of its interfaces that stay on the robot."""
+        routes = [route for route in self.routes.values() if route.interface.local_only]
+        aliases = [route.alias.claim for route in routes if route.alias is not None]
+        return McuLocalOnly(topics=[*(route.generic.suffix for route in routes), *aliases])
 
     def sample(self, reading: Reading, t: int) -> McuSample:
         """Return the payload of the generic topic."""

@@ -17,8 +17,6 @@ class Outbox:
     """
 
     def __init__(self, stop: bytes, drive_timeout_s: float) -> None:
-        self.superseded = 0  # lines that a newer one replaced before they were sent
-        self.expired = 0  # drive lines that became a stop
         self._stop, self._drive_timeout = stop, drive_timeout_s
         self.waiting: dict[str, _Waiting] = {}  # by kind
 
@@ -40,15 +38,11 @@ class Outbox:
         if kind is None:
             return None
         waiting = self.waiting.pop(kind)
-        if now <= waiting.expires:
-            return waiting.line
-        self.expired += 1
-        return self._stop
+        return waiting.line if now <= waiting.expires else self._stop
 
     def clear(self) -> None:
         self.waiting.clear()
 
     def _place(self, kind: str, waiting: _Waiting) -> None:
-        if self.waiting.pop(kind, None) is not None:
-            self.superseded += 1
+        self.waiting.pop(kind, None)
         self.waiting[kind] = waiting

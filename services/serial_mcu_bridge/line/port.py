@@ -13,7 +13,6 @@ import serial
 from pebble.errors import DeviceError
 
 _CHUNK = 4096
-_PTY_MAJORS = range(136, 144)  # of the ends that programs open (Linux, Documentation/admin-guide/devices.txt)
 
 
 class Port:
@@ -30,8 +29,6 @@ class Port:
         except (OSError, ValueError, termios.error) as error:  # SerialException is an OSError
             raise DeviceError(f"cannot open {path}: {_reason(error)}") from error
         self._fd = int(self._serial.fileno())  # -1 once it is closed: the number may then be another file's
-        #: Whether :meth:`queued` knows nothing: a pty holds 20 kB for a program that does not read (measured).
-        self.hides_queue = os.major(os.fstat(self._fd).st_rdev) in _PTY_MAJORS
 
     def fileno(self) -> int:
         return self._fd

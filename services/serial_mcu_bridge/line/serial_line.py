@@ -10,7 +10,6 @@ from enum import Enum
 from typing import NamedTuple
 
 from pebble.errors import DeviceError
-from pebble.services.serial_mcu_bridge.line.input import UNREAD_S, Input
 from pebble.services.serial_mcu_bridge.line.outbox import Outbox
 from pebble.services.serial_mcu_bridge.line.output import Output
 from pebble.services.serial_mcu_bridge.line.port import Port
@@ -53,10 +52,6 @@ class SerialLine:
     ``stop`` is the line that stops the motors, empty where there are none; ``drive_timeout_s`` the age at which a drive
     line expires. ``end`` is what ends a text line, or a frame; empty where nothing is ever sent.
     ``retry_s`` is the longest wait between two attempts to open the device.
-
-    A pseudo-terminal hides how much its reader has left unread. There a device that ``reports_at_rest`` gets a stop
-    instead of drive lines once it has been silent for 1 s, and nothing more until it is heard: else it might obey
-    commands that are minutes old.
     """
 
     def __init__(
@@ -75,7 +70,7 @@ class SerialLine:
     ) -> None:
         self.opened = 0  # how often the device was opened
         self.refused = 0  # lines refused because there was no device
-        self.input = Input()
+        self.received = 0  # chunks of bytes from the device since it was opened and has booted
         self._opening = _Opening(path, baud, boot_s, read_timeout_s, retry_s)
         self._on_bytes, self._on_state = on_bytes, on_state
         self._thread = threading.Thread(target=self._run, name=f"pebble-serial {path}", daemon=True)
@@ -106,9 +101,6 @@ class SerialLine:
 
         One that could not be sent for ``valid_s``, or for ``drive_timeout_s``, becomes a stop.
         """
-        if self._may_be_unread():
-            self.input.unread += 1
-            return self._stop_unread()
         outbox = self.output.outbox
         return self._hand_over(lambda now: outbox.drive(line, now, valid_s), line if valid_s > 0 else b"")
 
@@ -141,20 +133,6 @@ class SerialLine:
         self._wakeup.close()
 
     # -- any thread
-
-    def _may_be_unread(self) -> bool:
-        port = self._port
-        hidden = port is not None and port.hides_queue and self.input.reports_at_rest
-        return hidden and self._state is LineState.READY and time.monotonic() - self.input.at > UNREAD_S
-
-    def _stop_unread(self) -> bool:
-        """Send one stop in place of all drive lines until the device is heard again."""
-        if self.input.stopped:
-            return True
-        self.input.stopped = True
-        text = "%s: silent for %g s, and perhaps not read: stopped until it reports again"
-        log.warning(text, self._opening.path, UNREAD_S)
-        return self.halt()
 
     def _hand_over(self, place: Callable[[float], None], line: bytes) -> bool:
         """Write ``line`` at once, on the caller's thread, or ``place`` it in the outbox if it has to wait."""
@@ -210,7 +188,7 @@ class SerialLine:
     def _attach(self, port: Port) -> None:
         with self._lock:
             self.opened += 1
-            self.input.received = 0
+            self.received = 0
             self._port, self._failure = port, None
             self.output.begin(port)
             self.output.write(port, time.monotonic(), ready=False)
@@ -223,7 +201,7 @@ class SerialLine:
         now, boot_s = time.monotonic(), self._opening.boot_s
         ready_at, path_check_at = now + boot_s, now + _PATH_CHECK_S
         if boot_s <= 0:
-            self._become_ready(port)  # before the first byte is read: it must not be discarded
+            self._become_ready()  # before the first byte is read: it must not be discarded
         while not self._closing:
             ready = {fd for fd, _ in poller.poll(1000 * self._poll_timeout(ready_at - now))}
             if wakeup in ready:
@@ -232,7 +210,7 @@ class SerialLine:
                 self._receive(port.read())
             now = time.monotonic()
             if self._state is LineState.BOOTING and now >= ready_at:
-                self._become_ready(port)
+                self._become_ready()
             self._write_waiting(port, now)
             if now >= path_check_at:
                 path_check_at = now + _PATH_CHECK_S
@@ -247,16 +225,13 @@ class SerialLine:
 
     def _receive(self, chunk: bytes) -> None:
         if chunk and self._state is LineState.READY:
-            self.input.receive(time.monotonic())
+            self.received += 1
             self._on_bytes(chunk)
 
-    def _become_ready(self, port: Port) -> None:
+    def _become_ready(self) -> None:
         with self._lock:
             self.output.sending += self.output.stop
-            self.input.begin(time.monotonic())
         self._set_state(LineState.READY)
-        if port.hides_queue and self.output.stop:
-            log.info("%s is a pseudo-terminal: a reader that stands still may obey drive lines late", port.path)
 
     def _write_waiting(self, port: Port, now: float) -> None:
         """Write what waits; raise DeviceError for a device that has gone or accepts nothing."""

@@ -21,11 +21,6 @@ class Silence:
         self._counted_at = 0.0
         self._in_row = 0
 
-    @property
-    def reports_at_rest(self) -> bool:
-        """Whether the board sends something of its own accord, at least once a second."""
-        return self._in_row >= _REGULAR
-
     def check(self, state: LineState, opened: int, received: int, now: float, *, idle: bool) -> tuple[str, int | None]:
         """The state of the line, and how long ago its board was heard: 0, 1000 or 10000 ms, at least.
 
@@ -44,5 +39,5 @@ class Silence:
             return state.value, None
         age_s = now - self._received_at
         if age_s >= _SILENT_S:
-            return "silent" if self.reports_at_rest else state.value, 10_000
+            return "silent" if self._in_row >= _REGULAR else state.value, 10_000
         return state.value, 0 if age_s < _RECENT_S else 1_000

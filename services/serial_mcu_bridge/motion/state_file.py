@@ -8,7 +8,9 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from pebble.errors import PebbleError
 from pebble.runtime.rate_limit import RateLimitedLog
+from pebble.runtime.whole_file import make_folder, write
 from pebble.transports.own_file import OwnFile
 
 log = logging.getLogger(__name__)
@@ -114,35 +116,11 @@ class StateFile:
 
     def _write(self, value: Any) -> bool:
         """Replace the file in one step: after a power cut it holds the old value or the new one."""
-        new = self.path.with_suffix(".new")
         try:
-            _make(self.path.parent)
-            new.unlink(missing_ok=True)  # left by a power cut; opening a FIFO would wait for ever
-            with new.open("xb") as file:
-                file.write(json.dumps(value).encode())
-                file.flush()
-                os.fsync(file.fileno())
-            new.replace(self.path)
+            make_folder(self.path.parent)
+            write(self.path, json.dumps(value).encode(), 0o600, PebbleError)
             self._own = OwnFile(self.path)
-            _sync(self.path.parent)  # else a power cut may undo the renaming
-        except OSError as error:
-            self._log.log("failed", logging.ERROR, "%s cannot be written: %s", self.path, error.strerror)
+        except (PebbleError, OSError) as error:
+            self._log.log("failed", logging.ERROR, "the state cannot be written: %s", error)
             return False
         return True
-
-
-def _make(folder: Path) -> None:
-    """Make a folder and those above it, so that they survive a power cut, too."""
-    if folder.is_dir():
-        return
-    _make(folder.parent)
-    folder.mkdir(mode=0o700, exist_ok=True)
-    _sync(folder.parent)
-
-
-def _sync(folder: Path) -> None:
-    descriptor = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)

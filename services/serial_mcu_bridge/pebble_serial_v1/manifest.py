@@ -15,8 +15,8 @@ from pebble.services.serial_mcu_bridge.pebble_serial_v1.struct_v1 import Field, 
 from pebble.transports.topics import MAX_BYTES
 
 PROTOCOL: Final = "pebble_serial_v1"
-#: The level below ``mcu/{uid}/`` that is the topic of the manifest itself.
-RESERVED: Final = "describe"
+#: The levels below ``mcu/{uid}/`` that are the topic of the manifest itself, and of the list of what is local_only.
+RESERVED, LOCAL_ONLY = "describe", "local-only"
 
 MOST_INTERFACES = 64  # with 64 fields each they exceed FRAME_LIMIT: frame.py says what fits
 _MOST_FIELDS = 64  # of one interface
@@ -175,8 +175,8 @@ def _interface(reader: _Reader) -> Interface:
     encoding, count = reader.take(_ENCODING)
     _check_level("interface name", name)
     _check_channel(name, channel)
-    if name == RESERVED:
-        raise PayloadError(f'interface name "{RESERVED}" is taken')
+    if name in (RESERVED, LOCAL_ONLY):
+        raise PayloadError(f'interface name "{name}" is taken')
     if number == 0:
         raise PayloadError(f"{name}: id 0 is the protocol's own")
     if encoding not in _ENCODINGS:

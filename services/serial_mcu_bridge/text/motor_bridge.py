@@ -19,6 +19,7 @@ from pebble.contract.payloads import (
     EstopState,
     LightsFlash,
     LightsSolid,
+    MotorPower,
     TouchSensors,
     TouchValues,
 )
@@ -66,7 +67,7 @@ class MotorBridge(SerialService):
 
     publishes = (
         *(c.ESTOP_STATE, c.CONTROL_STATE, c.CONTROL_TURN),
-        *(c.TOUCH_SENSORS, c.CHARGING_STATUS, c.CHARGING_LEVEL),
+        *(c.MOTOR_POWER, c.TOUCH_SENSORS, c.CHARGING_STATUS, c.CHARGING_LEVEL),
     )
     protocol: ClassVar[MotorProtocol] = goob_base
     stop_line = goob_base.STOP
@@ -96,6 +97,7 @@ class MotorBridge(SerialService):
             watchdog_s=self.options.safety.drive_timeout_seconds,
             now=self.clock(),
         )
+        self._power = (0.0, 0.0)  # of the left and the right wheel, as published
         self._deadline: Timer | None = None  # stops the motors unless a command arrives; None: they are stopped
         self._guard_timer: Timer | None = None
         self.announced = True  # that it latches, to operators
@@ -217,8 +219,10 @@ class MotorBridge(SerialService):
         if valid_s <= 0:
             self._halt()
             return
-        self.line.drive(self.protocol.drive_line(*self.protocol.mix(drive.x, drive.z)), valid_s)
+        power = self.protocol.mix(drive.x, drive.z)
+        self.line.drive(self.protocol.drive_line(*power), valid_s)
         self._set_deadline(now + valid_s)
+        self._show_power(*power)
 
     def _answer(self, received: ReceivedRequest) -> None:
         now = self.clock()
@@ -237,6 +241,13 @@ class MotorBridge(SerialService):
     def _halt(self) -> None:
         self._set_deadline(None)
         self.line.halt()
+        self._show_power(0.0, 0.0)
+
+    def _show_power(self, left: float, right: float) -> None:
+        """Publish what the wheels are commanded, if it has changed and what their sensors say is published."""
+        if self._publishes_touch and (left, right) != self._power:
+            self._power = left, right
+            self.publish(c.MOTOR_POWER, MotorPower(left=left, right=right), owner=self._owner)
 
     def _set_deadline(self, due: float | None) -> None:
         if self._deadline is not None:

@@ -137,14 +137,14 @@ def check_numbers(film: Film, first: int = 0) -> None:
     assert wrong == []
 
 
-FORMS = [("json", "pcm", 16_000), ("pbvd", "opus", 16_000), ("pbvz", "pcm", 44_100), ("h264", "opus", 48_000)]
+FORMS = [("json", "pcm", 44_100), ("pbvd", "opus", 16_000), ("h264", "opus", 48_000)]
 
 
 @pytest.mark.parametrize(
     ("ending", "encoding", "codec", "rate"),
     [
-        *((ending, *form) for ending, form in zip((".mp4", ".mkv", ".mkv", ".mp4"), FORMS, strict=True)),
-        *(further(ending, *form) for ending, form in zip((".mkv", ".mp4", ".mp4", ".mkv"), FORMS, strict=True)),
+        *((ending, *form) for ending, form in zip((".mp4", ".mkv", ".mp4"), FORMS, strict=True)),
+        *(further(ending, *form) for ending, form in zip((".mkv", ".mp4", ".mkv"), FORMS, strict=True)),
     ],
 )
 def test_pictures_and_sound_are_where_they_were_received(

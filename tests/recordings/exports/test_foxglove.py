@@ -111,7 +111,7 @@ def converted(tmp_path: Path, messages: list[Recorded]) -> tuple[File, dict[str,
     return File(target), counts
 
 
-@pytest.mark.parametrize("name", ["json", "pbvd", "pbvz"])
+@pytest.mark.parametrize("name", ["json", "pbvd"])
 def test_pictures_become_jpegs(tmp_path: Path, name: str) -> None:
     file, counts = converted(tmp_path, pictures(name, 8))
     assert counts == {"CompressedImage": 8}

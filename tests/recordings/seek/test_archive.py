@@ -24,7 +24,7 @@ from tests.recordings.playing import FRED, GOOB, THEN_NS, Line, js, ms, unpacked
 from tests.recordings.seek.filming import CAMERA, FPS, SCENES, film
 
 SECONDS = 30
-ENCODINGS = ("json", "pbvd", "pbvz", "h264")
+ENCODINGS = ("json", "pbvd", "h264")
 
 
 @pytest.fixture(scope="module", params=["finished", "being written"])

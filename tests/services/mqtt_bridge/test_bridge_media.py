@@ -202,7 +202,7 @@ class TestBridge:
             (b"true", "1"),
             (TRUE, "1"),
             (b'{"enabled": true, "encoding": "h264", "keyframe": true}', "1 h264"),
-            (b'{"value": {"enabled": true, "encoding": "pbvz"}}', "1 pbvz"),
+            (b'{"value": {"enabled": true, "encoding": "pbvd"}}', "1 pbvd"),
         ],
     )
     def test_forms_of_a_request(self, bridge: AskingBridge, asked: bytes, wanted: str) -> None:

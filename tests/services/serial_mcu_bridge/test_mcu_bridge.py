@@ -62,7 +62,7 @@ def test_it_is_found_within_two_seconds_and_publishes_its_manifest(rig: SerialRi
     assert rig.world.first("sensors/imu-fast") - mcu.plugged_at < 2
     (described,) = rig.world.payloads("mcu/goob-imu-nano/describe")
     assert described["schema_hash"] == "goob-imu-v2"
-    assert rig.world.received[0].topic == f"{rig.base}/outgoing/mcu/goob-imu-nano/describe"
+    assert rig.world.received[0].topic == f"{rig.base}/outgoing/mcu/goob-imu-nano/local-only"
     late = rig.listener("late")
     assert until(lambda: late.on("mcu/goob-imu-nano/describe"))
     assert late.on("mcu/goob-imu-nano/describe")[0].retain
@@ -132,10 +132,10 @@ def test_qos_and_retain_follow_the_interface(rig: SerialRig) -> None:
     assert rig.got("mcu/lamp-1/glow")
     assert rig.values("lights/lamp") == [{"level": 5.5}]
     late = rig.listener("late")
-    assert until(lambda: len(late.received) >= 3)
+    assert until(lambda: len(late.received) >= 4)
     time.sleep(0.2)
     assert sorted(m.topic.removeprefix(f"{rig.base}/outgoing/") for m in late.received) == [
-        "lights/lamp", "mcu/lamp-1/describe", "mcu/lamp-1/lamp",
+        "lights/lamp", "mcu/lamp-1/describe", "mcu/lamp-1/lamp", "mcu/lamp-1/local-only",
     ]  # fmt: skip
     assert {int(m.qos) for m in rig.world.on("mcu/lamp-1/button") + rig.world.on("lights/lamp")} == {1}
     assert {int(m.qos) for m in rig.world.on("mcu/lamp-1/glow")} == {0}

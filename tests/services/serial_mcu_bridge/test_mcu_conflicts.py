@@ -63,6 +63,25 @@ def test_of_two_that_start_together_neither_publishes_under_the_alias(rig: Seria
     assert rig.world.on("sensors/imu-fast") == []
 
 
+def test_of_two_that_claim_one_channel_that_of_the_config_has_it(
+    memory_rig: SerialRig, caplog: pytest.LogCaptureFixture
+) -> None:
+    one, two = memory_rig.mcu(imu("imu-1"), "one"), memory_rig.mcu(imu("imu-2"), "two", plugged=False)
+    caplog.set_level(logging.INFO)
+    for name in ("one", "two"):
+        memory_rig.bridge(name, aliases={"sensors/imu-fast": "imu-2"})
+    one.stream(50, motion(1000))
+    two.stream(50, motion(2000))
+    assert memory_rig.got("mcu/imu-1/imu_fast")
+    assert until(lambda: "imu-1: outgoing/sensors/imu-fast is imu-2's by the config" in caplog.text)
+    time.sleep(0.5)
+    assert memory_rig.world.on("sensors/imu-fast") == [], "nor before it is plugged in"
+    two.plug()
+    assert memory_rig.got("sensors/imu-fast")
+    assert {body["value"]["accel_mps2"]["x"] for body in memory_rig.world.payloads("sensors/imu-fast")} == {2.0}
+    assert not [text for text in caplog.messages if "claim outgoing/sensors/imu-fast" in text]
+
+
 def test_a_contested_state_is_not_retained_and_a_contested_command_moves_nothing(rig: SerialRig) -> None:
     one, two = rig.mcu(LAMP, "one"), rig.mcu(LAMP.but(uid="lamp-2"), "two", plugged=False)
     rig.bridge("one")

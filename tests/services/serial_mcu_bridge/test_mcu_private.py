@@ -2,22 +2,17 @@
 
 from __future__ import annotations
 
-import itertools
 import json
 import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import msgspec
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from pebble.forwarding.side import Gate
 from pebble.services.mqtt_bridge.private_topics import PrivateTopics
 from pebble.services.mqtt_bridge.service import MqttBridge
-from pebble.services.serial_mcu_bridge.pebble_serial_v1.manifest import parse_describe
 from pebble.transports import Message, MqttSettings, create
 from tests.kit.board import SerialRig, motion
 from tests.kit.robot import BASE, Listener, Running
@@ -39,12 +34,14 @@ SPY = M("spy-1", (
 PRIVATE = ("mcu/spy-1/fast", "lab/fast", "mcu/spy-1/secret", "lab/secret", "mcu/spy-1/imu_fast", "lab/imu-fast")
 
 
-def manifest(which: M = SPY) -> bytes:
-    return msgspec.json.encode(parse_describe(which.describe()).payload())
+DESCRIBE, LIST = "mcu/spy-1/describe", "mcu/spy-1/local-only"
+LISTED = tuple(f"outgoing/{metric}" for metric in PRIVATE)
+COMMANDS = ("incoming/mcu/spy-1/tune", "incoming/lab/tune")
 
 
-def described(which: M = SPY, uid: str = "spy-1") -> Message:
-    return Message(f"{OUT}/mcu/{uid}/describe", manifest(which), retain_requested=True)
+def local_only(*topics: str, uid: str = "spy-1") -> Message:
+    payload = json.dumps({"topics": topics}).encode()
+    return Message(f"{OUT}/mcu/{uid}/local-only", payload, retain_requested=True)
 
 
 def sample(interface: str, uid: str = "spy-1") -> bytes:
@@ -61,273 +58,109 @@ def cleared(metric: str) -> Message:
     return Message(f"{OUT}/{metric}", b"", retain_requested=True)
 
 
-def but(flags: int, *interfaces: I) -> Message:
-    """A manifest of the same MCU with these interfaces, all with these flags."""
-    return described(SPY.but(interfaces=tuple(I(**{**vars(one), "flags": flags}) for one in interfaces)))
-
-
-@pytest.fixture
-def topics() -> PrivateTopics:
-    return PrivateTopics(BASE)
-
-
-def passed(topics: PrivateTopics, message: Message) -> list[str]:
-    return [admitted.topic.removeprefix(f"{OUT}/") for admitted in topics.admit(message)]
-
-
 FAST, SLOW = ("mcu/spy-1/fast", "lab/fast"), ("mcu/spy-1/slow", "lab/slow")
-DESCRIBE = "mcu/spy-1/describe"
 SECRET = value("mcu/spy-1/secret", retain_requested=True)
+KNOWN = local_only(*LISTED)
 NONSENSE = (b"", b"{", b'{"device_uid": 5}', b'["device_uid"]', b"\xff\xfe", sample("slow"))
 #: What is offered one after the other, and what passes then: the message, nothing, or the topics that are named.
 HISTORIES: dict[str, list[tuple[Message, bool | list[str]]]] = {
-    "what is private stays, and what is not passes": [
-        (described(), True),
-        *((value(metric), False) for metric in (*FAST, "mcu/spy-1/secret", "lab/secret")),
+    "what is listed stays, and what is not passes": [
+        (KNOWN, False),
+        *((value(metric), False) for metric in PRIVATE),
         *((value(metric), True) for metric in SLOW),
     ],
-    "a private value before its manifest is dropped": [
-        *((value(metric, "fast"), False) for metric in (*FAST, "anywhere/else")),
-        (described(), True),
-        *((value(metric, "fast"), False) for metric in (*FAST, "anywhere/else")),
+    "before the list nothing of the MCU passes but its manifest": [
+        *((value(metric), False) for metric in (*FAST, *SLOW)),
+        (value("anywhere/else", "fast"), False),
+        (Message(f"{OUT}/{DESCRIBE}", b"{}", retain_requested=True), True),
+        (KNOWN, False),
+        *((value(metric), False) for metric in FAST),
+        *((value(metric), True) for metric in SLOW),
     ],
     # Retained messages arrive in any order, and later subscribers need the state of a socket.
     **{
-        f"a value with {flag} waits for its manifest": [
+        f"a value with {flag} waits for the list": [
             *((value(metric, **{flag: True}), False) for metric in (*SLOW, "lab/secret")),
-            (described(), [DESCRIBE, *SLOW]),
-            (described(), True),
+            (KNOWN, [*SLOW]),
+            (KNOWN, False),
         ]
         for flag in ("retain", "retain_requested")
     },
     "a retained value that was cleared is not forwarded later": [
         *(step for one in SLOW for step in ((value(one, retain=True), False), (cleared(one), True))),
-        (described(), True),
+        (KNOWN, False),
     ],
-    "published while private, it stays so after new firmware made it public: the manifest first": [
-        *((described(), True), (SECRET, False)),
-        *((but(wire.RETAIN, *SPY.interfaces), True), (SECRET, True)),
+    "a board that restarts: nothing passes until it is described again, and its states are cleared": [
+        (KNOWN, False),
+        (cleared(LIST), False),
+        (cleared("mcu/spy-1/slow"), True),
+        (cleared("mcu/spy-1/secret"), False),
+        *((value(metric), False) for metric in (*FAST, *SLOW)),
+        (KNOWN, False),
+        *((value(metric), True) for metric in SLOW),
     ],
-    "published while private, it stays so after new firmware made it public: the value first": [
-        *((SECRET, False), (described(), True)),
-        *((but(wire.RETAIN, *SPY.interfaces), True), (SECRET, True)),
+    "a manifest that changes makes public what was private": [
+        (KNOWN, False),
+        (SECRET, False),
+        (local_only(), False),
+        (SECRET, True),
     ],
-    "new firmware may hide what was public": [
-        *((described(), True), (cleared(DESCRIBE), True), (value("lab/slow"), False)),
-        *((but(wire.LOCAL_ONLY, *SPY.interfaces[:2]), True), (value("lab/slow"), False)),
+    "a manifest that changes makes private what was public": [
+        *((local_only(), False), (value("lab/slow"), True)),
+        *((local_only("outgoing/lab/slow"), False), (value("lab/slow"), False)),
     ],
-    "retracting always passes unless it is private": [
-        *((described(), True), (cleared("mcu/spy-1/slow"), True), (cleared("mcu/spy-1/secret"), False))
+    "two boards with one alias: the list of each counts, and neither speaks for the other": [
+        (local_only(), False),
+        (value("lab/slow", retain=True), True),
+        (Message(f"{OUT}/lab/slow", sample("slow", "spy-2"), retain=True), False),
+        (local_only("outgoing/lab/slow", uid="spy-2"), False),
+        (value("lab/slow"), False),
+        (value("mcu/spy-1/slow"), True),
+    ],
+    "a list that cannot be read lets nothing pass, of this MCU": [
+        *((KNOWN, False), (local_only(uid="spy-2"), False)),
+        (Message(f"{OUT}/{LIST}", b'{"topics": 5}', retain_requested=True), False),
+        *((value("lab/slow"), False), (value("mcu/spy-2/slow"), True)),
+    ],
+    "a list keeps no stop and no control of the robot back": [
+        (local_only("outgoing/estop-state/goob", "outgoing/control/goob"), False),
+        *((Message(f"{OUT}/{metric}", b"{}"), True) for metric in ("estop-state/goob", "control/goob")),
     ],
     "nonsense is neither an error nor held back": [
-        (described(), True),
+        (KNOWN, False),
         *((Message(f"{OUT}/strange", payload), True) for payload in NONSENSE),
         (value("lab/slow"), True),
-    ],
-    "a manifest that cannot be read concerns no other MCU": [
-        (described(SPY, "spy-2"), ["mcu/spy-2/describe"]),
-        (Message(f"{OUT}/{DESCRIBE}", b"nonsense", retain_requested=True), False),
-        (Message(f"{OUT}/mcu/spy-2/slow", b"1"), True),
     ],
 }
 
 
 @pytest.mark.parametrize("history", HISTORIES.values(), ids=HISTORIES)
-def test_what_passes(topics: PrivateTopics, history: list[tuple[Message, bool | list[str]]]) -> None:
+def test_what_passes(history: list[tuple[Message, bool | list[str]]]) -> None:
+    topics = PrivateTopics(BASE)
     for message, passes in history:
         expected = [message.topic.removeprefix(f"{OUT}/")] if passes is True else passes or []
-        assert passed(topics, message) == expected, message
+        assert [admitted.topic.removeprefix(f"{OUT}/") for admitted in topics.admit(message)] == expected, message
 
 
-def test_which_topics_are_known_as_private(topics: PrivateTopics) -> None:
-    """Uid queries do not leave the robot; other messages are not concerned."""
-    incoming = [f"{BASE}/incoming/{metric}" for metric in ("mcu/spy-1/describe", "mcu/spy-1/tune", "lab/tune")]
-    public = [f"{BASE}/incoming/lab/set", f"{BASE}/incoming/mcu/spy-1/set", f"{OUT}/mcu/spy-1/describe"]
-    assert [topics.is_known(topic) for topic in (*incoming, *public)] == [True] + [False] * 5
-    topics.admit(described())
-    assert [topics.is_known(topic) for topic in (*incoming, *public)] == [True] * 3 + [False] * 3
-    for topic in (f"{OUT}/charging-level", f"{BASE}/incoming/drive-values", "elsewhere/entirely"):
-        assert topics.admit(Message(topic, b'{"value": 1}')) == [Message(topic, b'{"value": 1}')]
+def test_which_commands_stay() -> None:
+    """Requests for a manifest do not leave the robot, nor commands to an MCU without a list."""
+    topics = PrivateTopics(BASE)
+    incoming = [f"{BASE}/incoming/{metric}" for metric in ("mcu/spy-1/describe", "mcu/spy-1/tune", "mcu/spy-1/set")]
+    aliases = [f"{BASE}/incoming/{metric}" for metric in ("lab/tune", "lab/set", "estop", "drive-values")]
+    assert [topics.stays(topic) for topic in (*incoming, *aliases)] == [True] * 3 + [False] * 4
+    topics.admit(local_only(*COMMANDS, "incoming/estop"))
+    assert [topics.stays(topic) for topic in (*incoming, *aliases)] == [True, True, False, True, False, False, False]
 
 
-def test_memory_is_bounded(topics: PrivateTopics) -> None:
+def test_memory_is_bounded() -> None:
+    topics = PrivateTopics(BASE)
     for number in range(300):
-        assert passed(topics, value(f"lab/slow-{number}", "slow", retain=True)) == []
-    assert len(topics.admit(described())) == 1 + 256, "waiting values"
+        assert topics.admit(value(f"lab/slow-{number}", "slow", retain=True)) == []
+    assert len(topics.admit(KNOWN)) == 256, "waiting values"
     for number in range(300):
-        topics.admit(described(SPY, f"spy-{number}"))
+        topics.admit(local_only(uid=f"spy-{number}"))
     slow = [Message(f"{OUT}/mcu/spy-{number}/slow", b"{}") for number in range(300)]
     assert sum(len(topics.admit(message)) for message in slow) == 256, "MCUs"
-
-
-# -- manifests that are only partly readable
-
-PLAIN: dict[str, Any] = json.loads(manifest())
-#: Replacements for any value of a manifest; ``...`` removes the key.
-ODD = (..., None, 5, -0.5, True, "", "nonsense", "a/b", "+", "x" * 5000, [], {}, [None], {"a": 1})
-GIVEN = ODD[1:]
-#: The generic topic and the alias of each interface.
-TOPICS = {
-    one["name"]: [f"{way}/mcu/spy-1/{one['name']}", f"{way}/{one['channel']}"]
-    for one in PLAIN["interfaces"]
-    for way in ["incoming" if one["dir"] == "in" else "outgoing"]
-}
-BY_NAME: dict[str, dict[str, Any]] = {one["name"]: one for one in PLAIN["interfaces"]}
-HIDDEN = {name for name in TOPICS if BY_NAME[name].get("local_only")}
-PUBLIC = set(TOPICS) - HIDDEN
-#: Replacements that are valid: other names.
-MEANT = {"name": ("nonsense",), "channel": ("", "nonsense", "a/b")}
-
-
-def without_holes(plain: dict[str, Any]) -> dict[str, Any]:
-    return {key: given for key, given in plain.items() if given is not ...}
-
-
-def announced(raw: bytes | dict[str, Any]) -> Message:
-    payload = raw if isinstance(raw, bytes) else json.dumps(without_holes(raw)).encode()
-    return Message(f"{OUT}/mcu/spy-1/describe", payload, retain_requested=True)
-
-
-def with_interface(which: str, entry: object) -> dict[str, Any]:
-    return {**PLAIN, "interfaces": [entry if one["name"] == which else one for one in PLAIN["interfaces"]]}
-
-
-def opened() -> Message:
-    """Return a manifest of the same MCU with all interfaces public."""
-    return announced({**PLAIN, "interfaces": [{**one, "local_only": False} for one in PLAIN["interfaces"]]})
-
-
-def leaving(topics: PrivateTopics) -> set[str]:
-    """Return the interfaces of which any message passes: with a full, a partial or an unrelated body."""
-    left = set()
-    for name, suffixes in TOPICS.items():
-        bodies = [sample(name), b'{"device_uid": "spy-1", "interface": "%s"}' % name.encode(), b'{"speed": 1}']
-        for suffix, body in itertools.product(suffixes, bodies):
-            left |= {name for _ in topics.admit(Message(f"{BASE}/{suffix}", body))}
-    return left
-
-
-#: Manifests, and the interfaces that leave the robot with each.
-PARTLY_READABLE: dict[str, list[tuple[dict[str, Any], set[str]]]] = {
-    "whole": [(PLAIN, PUBLIC)],
-    "the interfaces alone": [({"interfaces": PLAIN["interfaces"]}, PUBLIC)],
-    "the rest of a manifest is missing or odd": [
-        ({**PLAIN, key: odd}, PUBLIC) for key in PLAIN.keys() - {"interfaces"} for odd in ODD
-    ],
-    "the rest of an interface is missing or odd": [
-        (with_interface(which, without_holes({**BY_NAME[which], key: odd})), PUBLIC)
-        for which in HIDDEN
-        for key in {key for one in PLAIN["interfaces"] for key in one} - {"local_only"}
-        for odd in ODD
-        if odd not in MEANT.get(key, ())
-    ],
-    "only false makes an interface public": [
-        (with_interface(which, {**BY_NAME[which], "local_only": odd}), PUBLIC - {which})
-        for which in TOPICS
-        for odd in GIVEN
-    ],
-    "an interface that cannot be read stays, and the others do not": [
-        (with_interface(which, odd), PUBLIC - {which}) for which in TOPICS for odd in GIVEN
-    ],
-}
-
-
-@pytest.mark.parametrize("manifests", PARTLY_READABLE.values(), ids=PARTLY_READABLE)
-def test_of_a_partly_readable_manifest_what_is_public_leaves(manifests: list[tuple[dict[str, Any], set[str]]]) -> None:
-    for plain, public in manifests:
-        topics = PrivateTopics(BASE)
-        topics.admit(opened())
-        assert leaving(topics) == set(TOPICS)
-        assert passed(topics, announced(plain)) == ["mcu/spy-1/describe"]
-        assert leaving(topics) == public, plain
-        unread = set(TOPICS) - public
-        assert {name for name in TOPICS if topics.is_known(f"{BASE}/{TOPICS[name][1]}")} == unread, plain
-
-
-@pytest.mark.parametrize(
-    "raw",
-    [
-        *({**PLAIN, "interfaces": odd} for odd in ODD if odd != []),
-        *(json.dumps(odd).encode() for odd in GIVEN),
-        b"nonsense",
-        manifest()[:-1],
-        manifest().replace(b"spy-1", b"\xff"),
-        b'{"a": ' + b"[" * 50 + b"]" * 50 + b"," + manifest()[1:],
-    ],
-)
-def test_without_interfaces_nothing_of_the_mcu_leaves(topics: PrivateTopics, raw: bytes | dict[str, Any]) -> None:
-    assert passed(topics, announced(raw)) == []
-    assert [suffix for suffixes in TOPICS.values() for suffix in suffixes[:1]
-            if topics.admit(Message(f"{BASE}/{suffix}", b"1"))] == []  # fmt: skip
-    topics.admit(opened())
-    assert passed(topics, announced(raw)) == []
-    assert leaving(topics) == set()
-    assert all(topics.is_known(f"{BASE}/{suffix}") for suffixes in TOPICS.values() for suffix in suffixes)
-    topics.admit(announced(PLAIN))
-    assert leaving(topics) == PUBLIC
-
-
-_json = st.recursive(
-    st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False) | st.text(max_size=8),
-    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=8), inner, max_size=3),
-    max_leaves=8,
-)
-_interface = st.fixed_dictionaries(
-    {},
-    optional={
-        "name": st.sampled_from(sorted(TOPICS)) | _json,
-        "dir": st.sampled_from(["in", "out"]) | _json,
-        "channel": st.sampled_from(sorted(suffixes[1].partition("/")[2] for suffixes in TOPICS.values())) | _json,
-        "local_only": st.booleans() | _json,
-        "encoding": _json,
-    },
-)
-_manifest = st.fixed_dictionaries(
-    {}, optional={"interfaces": st.lists(_interface | _json, max_size=5) | _json, "schema_version": _json, "x": _json}
-)
-
-
-@settings(max_examples=cases(100, 400))
-@given(st.lists(_manifest | _json, min_size=1, max_size=3))
-def test_all_readable_parts_of_any_manifest_are_retained(manifests: list[Any]) -> None:
-    topics = PrivateTopics(BASE)
-    topics.admit(opened())
-    for plain in manifests:
-        topics.admit(announced(json.dumps(plain).encode()))
-    entries = [one for one in as_list(as_dict(plain).get("interfaces")) if isinstance(one, dict)]
-    private = {
-        (way, str(one.get(key)))
-        for one in entries
-        for key, way in itertools.product(("name", "channel"), ways(one))
-        if one.get("local_only", False) is not False
-    }
-    public = {
-        str(one.get("name")) for one in entries if one.get("local_only", False) is False and "outgoing" in ways(one)
-    }
-    messages = {
-        (name, suffix): Message(f"{BASE}/{suffix}", body)
-        for name, suffixes in TOPICS.items()
-        for suffix, body in zip(suffixes, (b"1", sample(name)), strict=True)
-    }
-    left = {place for place, message in messages.items() if topics.admit(message)}
-    assert {name for name, suffix in left if suffix.startswith("outgoing/")} <= public
-    assert {(suffix.partition("/")[0], name) for name, suffix in left} & private == set()
-    raw = {suffix for _, suffix in messages if topics.admit(Message(f"{BASE}/{suffix}", b"1"))}
-    assert {(suffix.partition("/")[0], suffix.partition("/")[2]) for suffix in raw} & private == set()
-
-
-def as_dict(plain: object) -> dict[str, Any]:
-    return plain if isinstance(plain, dict) else {}
-
-
-def as_list(plain: object) -> list[Any]:
-    return plain if isinstance(plain, list) else []
-
-
-def ways(one: dict[str, Any]) -> tuple[str, ...]:
-    """Return the directions of an interface; both if its direction is not readable."""
-    given_ = one.get("dir")
-    return ("incoming",) if given_ == "in" else ("outgoing",) if given_ == "out" else ("incoming", "outgoing")
 
 
 # -- with real bridges

@@ -80,7 +80,7 @@ def test_a_damaged_file_differs_from_none(tmp_path: Path, content: bytes | None)
 def test_a_fifo_in_its_place_is_a_damaged_file_and_is_replaced(tmp_path: Path) -> None:
     path = tmp_path / "estop.json"
     os.mkfifo(path)
-    os.mkfifo(path.with_suffix(".new"))
+    os.mkfifo(tmp_path / ".estop.json.new")
     saved = Saved(path)
     assert isinstance(saved.file.load(), Unreadable)
     saved.file.save({"latched": True})
@@ -91,7 +91,7 @@ def test_a_fifo_in_its_place_is_a_damaged_file_and_is_replaced(tmp_path: Path) -
 def test_a_link_in_place_of_the_new_file_is_not_followed(tmp_path: Path) -> None:
     path, other = tmp_path / "estop.json", tmp_path / "other"
     other.write_text("kept")
-    path.with_suffix(".new").symlink_to(other)
+    (tmp_path / ".estop.json.new").symlink_to(other)
     saved = Saved(path)
     saved.file.save({})
     saved.file.close()
@@ -122,7 +122,7 @@ def test_a_place_below_a_file_cannot_be_written(tmp_path: Path) -> None:
 def test_a_leftover_of_a_power_cut_does_not_matter(tmp_path: Path) -> None:
     path = tmp_path / "estop.json"
     path.write_text('{"latched": true}')
-    path.with_suffix(".new").write_text('{"latched": fal')
+    (tmp_path / ".estop.json.new").write_text('{"latched": fal')
     saved = Saved(path)
     assert saved.file.load() == {"latched": True}
     saved.file.save({"latched": False})

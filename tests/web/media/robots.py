@@ -40,7 +40,7 @@ VIDEO: dict[str, Any] = {
     "topic": CAMERA,
     "command_topic": f"{REF}/incoming/front-camera",
     "flag_topic": f"{REF}/incoming/flags/mqtt-video",
-    "encodings": ["json", "pbvd", "pbvz", "h264"],
+    "encodings": ["json", "pbvd", "h264"],
 }
 AUDIO: dict[str, Any] = {
     "available": True,
@@ -51,7 +51,7 @@ AUDIO: dict[str, Any] = {
     "flag_topic": f"{REF}/incoming/flags/mqtt-audio",
     "encodings": ["pcm", "opus"],
 }
-EVERYTHING = frozenset({"h264", "pbvz", "pbvd", "json", "jpeg", "opus", "pcm"})
+EVERYTHING = frozenset({"h264", "pbvd", "json", "jpeg", "opus", "pcm"})
 RATE, PIECE = 16_000, 320
 
 

@@ -1,0 +1,91 @@
+"""A program that a service starts: in a group of its own, and ended with the service, however that ends."""
+
+import os
+import signal
+import subprocess
+import threading
+import time
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from pathlib import Path
+from typing import IO, Any
+
+from pebble.runtime.parent import tied_to_parent
+
+_POLL_S = 0.01
+
+
+class Child:
+    """A running program; what it starts is killed when it has ended. Any thread may call any method.
+
+    It gets ``tie`` when the thread that starts it has ended. Raises OSError and ValueError if it cannot be started.
+    ``streams`` are ``stdin`` (nothing unless given), ``stdout`` and ``stderr``, as subprocess has them.
+    """
+
+    def __init__(
+        self,
+        command: Sequence[str],
+        environment: Mapping[str, str],
+        cwd: Path | None = None,
+        tie: signal.Signals = signal.SIGKILL,
+        **streams: Any,
+    ) -> None:
+        self._process: subprocess.Popen[bytes] = subprocess.Popen(
+            tied_to_parent(command, tie),
+            cwd=cwd,
+            env=environment,
+            start_new_session=True,
+            **{"stdin": subprocess.DEVNULL, **streams},
+        )
+        self.pid = self._process.pid
+        self.code: int | None = None  # of its exit, or minus the signal that ended it; None until that is noticed
+        self._lock = threading.Lock()  # no signal once it is reaped: its number may be another process's by then
+
+    def pipe(self, name: str) -> IO[bytes]:
+        """Return this end of a stream for which ``subprocess.PIPE`` was given."""
+        found: IO[bytes] = getattr(self._process, name)
+        return found
+
+    def signal(self, number: int) -> None:
+        """Send a signal to its group, if it still runs."""
+        with self._lock:
+            if self.code is None:
+                with suppress(ProcessLookupError):
+                    os.killpg(self.pid, number)
+
+    def wait(self, timeout_s: float = float("inf")) -> int | None:
+        """Wait for its end, at most so long; returns ``code``."""
+        deadline = time.monotonic() + timeout_s
+        while self.code is None and not self._has_ended(wait=timeout_s == float("inf")):
+            if time.monotonic() >= deadline:
+                return None
+            time.sleep(_POLL_S)
+        with self._lock:
+            if self.code is None:
+                with suppress(ProcessLookupError, PermissionError):
+                    os.killpg(self.pid, signal.SIGKILL)
+                self.code = self._process.wait()
+        return self.code
+
+    def finish(self, timeout_s: float) -> int:
+        """Wait for its end, at most so long, then kill it; returns ``code``."""
+        if self.wait(timeout_s) is None:
+            self.signal(signal.SIGKILL)
+        return self.wait() or 0
+
+    def watch(self, ended: Callable[[int], None]) -> None:
+        """Call ``ended(code)`` on a thread of its own when it has ended."""
+        name = f"pebble-child {self.pid}"
+        threading.Thread(target=lambda: ended(self.wait() or 0), name=name, daemon=True).start()
+
+    def _has_ended(self, *, wait: bool) -> bool:
+        """True if it is a zombie, or reaped by another thread."""
+        try:
+            return os.waitid(os.P_PID, self.pid, os.WEXITED | os.WNOWAIT | (0 if wait else os.WNOHANG)) is not None
+        except ChildProcessError:
+            return True
+
+
+def how_ended(code: int) -> str:
+    """Return an exit code in words: ``exit code 1`` or ``signal 9``."""
+    return f"exit code {code}" if code >= 0 else f"signal {-code}"
