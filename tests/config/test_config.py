@@ -94,10 +94,10 @@ class TestMeaning:
         assert pitcam.serial_instances() == {}
 
     def test_zero_and_false_are_values(self) -> None:
-        services = {"mqtt_bridge": {"heartbeat": {"enabled": False}}, "soundboard_handler": {"playback": {"volume": 0}}}
+        services = {"mqtt_bridge": {"heartbeat": {"enabled": False}}, "recorder": {"keep_bytes": 0}}
         config = read(at("services", services))
         assert not config.services.mqtt_bridge.heartbeat.enabled
-        assert config.services.soundboard_handler.playback.volume == 0
+        assert config.services.recorder.keep_bytes == 0
 
     @pytest.mark.parametrize("nothing", ["", None])
     def test_an_empty_string_and_null_mean_not_set(self, nothing: str | None) -> None:
