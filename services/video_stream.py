@@ -32,8 +32,7 @@ class VideoStream(Service):
         try:
             self._program = subprocess.Popen(
                 tied_to_parent(options.command),
-                cwd=options.cwd,
-                env=child_environment(options.env),
+                env=child_environment(),
                 stdin=subprocess.DEVNULL,
                 start_new_session=True,  # what it starts ends with it
             )

@@ -19,7 +19,6 @@ from pebble.config.tree import Heartbeat as Heartbeat
 from pebble.config.tree import Launcher as Launcher
 from pebble.config.tree import MqttBridge as MqttBridge
 from pebble.config.tree import SerialBridge as SerialBridge
-from pebble.config.tree import SerialBridges as SerialBridges
 from pebble.config.tree import Services as Services
 from pebble.config.tree import SystemControl as SystemControl
 from pebble.config.types import Secret as Secret

@@ -5,6 +5,7 @@ from typing import Annotated, Any, ClassVar, Literal
 from pebble.config.types import (
     EMPTY,
     ONE_VALUE,
+    UNIT,
     File,
     HandlerTopics,
     Seconds,
@@ -61,7 +62,7 @@ class Script(Section, frozen=True, kw_only=True):
 class AutonomyManager(ServiceSection, frozen=True, kw_only=True):
     """Runs one autonomy script at a time."""
 
-    retired: ClassVar = {"scan_interval_seconds": ONE_VALUE}
+    retired: ClassVar = {"scan_interval_seconds": ONE_VALUE, "env": UNIT}
 
     autonomy_root: Annotated[
         str, doc("Folder of scripts. Relative: seen from the config's folder, and Pebble's own are offered, too.")
@@ -71,6 +72,5 @@ class AutonomyManager(ServiceSection, frozen=True, kw_only=True):
         Literal["resume", "stop"],
         doc("When a person drives: `resume` lets the script go on once the person has let go, `stop` ends it."),
     ] = "resume"
-    env: Annotated[Variables, doc("Environment variables to add.")] = EMPTY
     topics: Annotated[HandlerTopics, doc("Other names for topics.")] = HandlerTopics()
     scripts: Annotated[dict[str, Script], doc("Scripts by folder.")] = EMPTY

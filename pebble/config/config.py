@@ -12,11 +12,11 @@ from msgspec.structs import asdict, replace
 
 from pebble.config.home import in_home
 from pebble.config.masking import holds_secret, masked
-from pebble.config.raw import Pairs, decode, inherit, plain, read_text
+from pebble.config.raw import Pairs, decode, plain, read_text, with_instances
 from pebble.config.reader import Reader
 from pebble.config.rules.between_keys import CHECKS
 from pebble.config.rules.exposure import warn_if_readable
-from pebble.config.tree import Root, SerialBridge, SerialBridges
+from pebble.config.tree import Root, SerialBridge
 from pebble.config.types import Topic
 from pebble.contract import DRIVE
 from pebble.contract.identity import Identity
@@ -62,14 +62,6 @@ class Config(Root, frozen=True, kw_only=True):
     def motor_owner(instance: str) -> str:
         """What the motor owner of a serial line is called in ``outgoing/estop/{owner}``."""
         return instance or "serial"
-
-    def log_level_of(self, service: str) -> str:
-        """The log level of a process: ``mqtt_bridge``, ``serial_mcu_bridge:imu``, or any other name for the root's."""
-        name, _, instance = service.partition(":")
-        section = getattr(self.services, name, None)
-        if instance and isinstance(section, SerialBridges):
-            section = section.instances.get(instance, section)
-        return str(getattr(section, "log_level", self.log_level))
 
     def serial_instances(self) -> dict[str, SerialBridge]:
         """The enabled serial lines, one process each, by instance name; the service's own entry is ``""``."""
@@ -148,7 +140,7 @@ def parse(raw: dict[str, Any], *, folder: Path, env: Mapping[str, str]) -> Confi
 def _config(raw: Any, path: Path | None, folder: Path, env: Mapping[str, str]) -> Config:
     reader = Reader(folder, env, CHECKS)
     own = plain(raw, reader.notes)
-    merged = inherit(own)
+    merged = with_instances(own)
     root = reader.section(Root, merged)
     reader.notes.forget_inherited(own, merged)
     if path is not None and holds_secret(own):

@@ -7,8 +7,9 @@ from msgspec import Meta, field
 
 from pebble.config.types import (
     BY_CONTRACT,
-    EMPTY,
+    COMMAND,
     ONE_VALUE,
+    UNIT,
     AudioChannels,
     BitsPerSecond,
     Command,
@@ -22,7 +23,6 @@ from pebble.config.types import (
     Section,
     ServiceSection,
     Topic,
-    Variables,
     doc,
 )
 from pebble.contract.encodings import SoundEncoding, VideoEncoding
@@ -81,9 +81,11 @@ class Microphone(Section, frozen=True, kw_only=True):
 class AvDaemon(ServiceSection, frozen=True, kw_only=True):
     """Owns the camera and the microphone."""
 
-    retired: ClassVar = dict.fromkeys(("restart_delay_seconds", "stop_timeout_seconds", "cwd"), ONE_VALUE)
+    retired: ClassVar = {
+        **dict.fromkeys(("restart_delay_seconds", "stop_timeout_seconds", "cwd"), ONE_VALUE),
+        "env": UNIT,
+    }
 
-    env: Annotated[Variables, doc("Environment variables to add.")] = EMPTY
     video: Annotated[CameraCapture, doc("Camera.")] = CameraCapture()
     audio: Annotated[Microphone, doc("Microphone.")] = Microphone()
 
@@ -102,9 +104,9 @@ class AvDaemon(ServiceSection, frozen=True, kw_only=True):
 class VideoStream(ServiceSection, frozen=True, kw_only=True):
     """Runs a third party's streaming program while operators request video."""
 
+    retired: ClassVar = dict.fromkeys(("cwd", "env"), COMMAND)
+
     command: Annotated[Command, doc("The program and its arguments, without a shell; required where enabled.")] = ()
-    cwd: Annotated[File | None, doc("Folder to run in; unset: the launcher's.")] = None
-    env: Annotated[Variables, doc("Environment variables to add.")] = EMPTY
     webrtc_url: Annotated[str | None, doc("Where its pictures are shown; operator pages find it in the status.")] = None
 
 
@@ -149,12 +151,14 @@ class AudioPublisher(Section, frozen=True, kw_only=True):
 class AudioReceiver(Section, frozen=True, kw_only=True):
     """Sound from operators."""
 
-    retired: ClassVar = {"qos": BY_CONTRACT["qos"], **dict.fromkeys(("queue_limit", "concealment_ms"), ONE_VALUE)}
+    retired: ClassVar = {
+        "qos": BY_CONTRACT["qos"],
+        **dict.fromkeys(("queue_limit", "concealment_ms"), ONE_VALUE),
+        **dict.fromkeys(("rate", "channels"), "each packet has its own"),
+    }
 
     topic: Annotated[Topic | None, doc("Instead of `{base}/incoming/audio-stream`.")] = None
     device: Annotated[str, doc("ALSA device to play on.")] = "default"
-    rate: Annotated[SampleRate, doc("Samples per second before the first packet.")] = 16000
-    channels: Annotated[AudioChannels, doc("Channels before the first packet.")] = 1
     command: Annotated[
         Command, doc("Plays sound from its standard input; `{rate}`, `{channels}` and `{device}` are filled in.")
     ] = ("aplay", "-q", "-t", "raw", "-f", "S16_LE", "-c", "{channels}", "-r", "{rate}", "-D", "{device}", "-")
@@ -174,14 +178,15 @@ class Media(Section, frozen=True, kw_only=True):
 class Playback(Section, frozen=True, kw_only=True):
     """Where sounds are and what plays them; decoded ones are played by the audio receiver's command."""
 
-    retired: ClassVar = dict.fromkeys(("stop_timeout", "scan_interval"), ONE_VALUE)
+    retired: ClassVar = {
+        **dict.fromkeys(("stop_timeout", "scan_interval"), ONE_VALUE),
+        **dict.fromkeys(("cwd", "env"), COMMAND),
+    }
 
     directory: Annotated[File | None, doc("Folder of the sounds; unset: `~/sounds`.")] = None
     player_command: Annotated[Command, doc("Plays wav files; `{file}` stands for the sound, else it comes last.")] = (
         "aplay",
     )
-    cwd: Annotated[File | None, doc("Folder to run the player in.")] = None
-    env: Annotated[Variables, doc("Environment variables to add.")] = EMPTY
     volume: Annotated[float, Meta(ge=0, le=1, description="1: as recorded; less: wav files are decoded, too.")] = 1.0
 
 

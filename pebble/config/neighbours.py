@@ -1,24 +1,23 @@
 """The config section of robots that hear and drive each other on a LAN."""
 
-from typing import Annotated
+from typing import Annotated, ClassVar
 
-from msgspec import Meta
-
-from pebble.config.transport import ZenohSection
-from pebble.config.types import EMPTY, Account, Level, ServiceSection, Topic, doc
+from pebble.config.transport import ZenohClient
+from pebble.config.types import EMPTY, ONE_VALUE, Account, Level, ServiceSection, Topic, doc
 
 
-class Lan(ZenohSection, frozen=True, kw_only=True):
+class Lan(ZenohClient, frozen=True, kw_only=True):
     """The hub where robots meet. They are its clients: none listens."""
+
+    retired: ClassVar = {"lease_ms": ONE_VALUE, "settings": "the hub is of Zenoh", "listen": "robots meet at a hub"}
 
     account: Annotated[
         Account, doc("The account of `pebble fleet add … --role neighbour` at a hub with `access`: the name (CN) in "
                      "tls.client_cert.")
     ] = ""  # fmt: skip
-    lease_ms: Annotated[
-        # A link that stood still for less than this delivers what waited; commands should not be among it.
-        int, Meta(ge=100, le=5000, description="A hub that is silent for this many milliseconds is gone.")
-    ] = 500
+
+    #: A link that stood still for less than this delivers what waited; commands should not be among it.
+    lease_ms: ClassVar[int] = 500
 
 
 class Neighbours(ServiceSection, frozen=True, kw_only=True):

@@ -1,4 +1,4 @@
-"""From a config file to plain data: JSON with `//` keys as comments, and shared values copied to where they count."""
+"""From a config file to plain data: JSON with `//` keys as comments, and what instances share copied to them."""
 
 import json
 import math
@@ -6,12 +6,9 @@ from pathlib import Path
 from typing import Any
 
 from pebble.config import problems, text_files
-from pebble.config.tree import Services
-from pebble.config.types import ServiceSection
 from pebble.config.visible import hidden, shown
 from pebble.errors import ConfigError
 
-_SERVICES = tuple(name for name in Services.__struct_fields__ if isinstance(getattr(Services(), name), ServiceSection))
 _WORDS = ("command", "player_command", "env", "robots", "robot_discovery")
 _DEEPEST = 50  # levels: far more than any section has, and few enough for whatever reads it later
 
@@ -86,11 +83,6 @@ def _is_words(path: problems.Path) -> bool:
     return "topics" not in path and any(key in _WORDS for key in path)
 
 
-def inherit(raw: Any) -> Any:
-    """``raw`` with the root's log level in every service, and merged instances."""
-    return _with_instances(deep_merge(_shared(raw), raw))
-
-
 def deep_merge(under: Any, over: Any) -> Any:
     """``under`` updated by ``over``: objects key by key, all else whole. An empty string or null changes nothing."""
     if over is None or over == "":
@@ -101,13 +93,8 @@ def deep_merge(under: Any, over: Any) -> Any:
     return merged | {key: value for key, value in under.items() if key not in over}  # problems follow the file's order
 
 
-def _shared(raw: Any) -> dict[str, Any]:
-    level = _at(raw, "log_level")
-    services = {name: {"log_level": level} for name in _SERVICES}
-    return {"services": services}
-
-
-def _with_instances(raw: Any) -> Any:
+def with_instances(raw: Any) -> Any:
+    """Return ``raw`` with the keys of a serial line in its instances."""
     serial = _at(raw, "services", "serial_mcu_bridge")
     instances = _at(serial, "instances")
     if not isinstance(instances, dict):

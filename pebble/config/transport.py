@@ -6,6 +6,7 @@ from msgspec import Meta, field
 
 from pebble.config.hosts import place_of
 from pebble.config.types import (
+    ONE_VALUE,
     Account,
     BrokerHost,
     BrokerPlace,
@@ -36,6 +37,8 @@ class Tls(Section, frozen=True, kw_only=True):
 class Mqtt(Section, frozen=True, kw_only=True):
     """One MQTT broker."""
 
+    retired: ClassVar = {"keepalive": ONE_VALUE}
+
     host: Annotated[BrokerHost, doc("Name or address of the broker.")] = "127.0.0.1"
     port: Annotated[Port, doc("TCP port of the broker.")] = 1883
     hosts: Annotated[
@@ -46,14 +49,6 @@ class Mqtt(Section, frozen=True, kw_only=True):
             "operators hear all; login and encryption are the same. See docs/fleet.md."
         ),
     ] = ()
-    keepalive: Annotated[
-        int,
-        Meta(
-            ge=0,
-            le=65535,
-            description="The broker closes a connection after 1.5 times as many seconds without a message; 0: never.",
-        ),
-    ] = 15
     username: Annotated[str | None, doc("Login; unset: anonymous.")] = None
     password: Annotated[Password | None, doc("The password itself; better one of the next two.")] = None
     password_file: Annotated[File | None, doc("File that holds the password; a final newline is removed.")] = None
@@ -75,7 +70,7 @@ class Mqtt(Section, frozen=True, kw_only=True):
 
 
 class RemoteMqtt(Mqtt, frozen=True, kw_only=True):
-    """The remote broker, which operators connect to."""
+    """A broker that operators connect to."""
 
     host: Annotated[BrokerHost, doc("Name or address of the broker; required when the bridge is enabled.")] = ""
     client_id: Annotated[
@@ -87,15 +82,20 @@ class RemoteMqtt(Mqtt, frozen=True, kw_only=True):
     ] = None
 
 
-class ZenohSection(Section, frozen=True, kw_only=True):
-    """Where a Zenoh session listens and connects, beyond the robot's own processes."""
+class ZenohClient(Section, frozen=True, kw_only=True):
+    """Where a Zenoh session connects, beyond the robot's own processes."""
+
+    connect: Annotated[tuple[Endpoint, ...], doc("Zenoh endpoints to connect to.")] = ()
+    tls: Annotated[Tls, doc("Certificates for `tls/` and `quic/` endpoints.")] = Tls()
+
+
+class ZenohSection(ZenohClient, frozen=True, kw_only=True):
+    """Where a Zenoh session listens and connects."""
 
     listen: Annotated[
         tuple[Endpoint, ...],
         doc("Zenoh endpoints to listen on, for other machines; `tls/` and `quic/` need tls.ca_cert."),
     ] = ()
-    connect: Annotated[tuple[Endpoint, ...], doc("Zenoh endpoints to connect to.")] = ()
-    tls: Annotated[Tls, doc("Certificates for `tls/` and `quic/` endpoints.")] = Tls()
     lease_ms: Annotated[
         # Messages that a silent connection delays for less are delivered: at most 5 s, as types.Silence.
         int, Meta(ge=100, le=5000, description="A Zenoh peer that is silent for this many milliseconds is gone.")

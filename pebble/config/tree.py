@@ -65,9 +65,12 @@ class Defaults(Section, frozen=True, kw_only=True):
 class CapabilitiesSection(Section, frozen=True, kw_only=True):
     """The message that lists what the robot can do."""
 
-    retired: ClassVar = {"publish_interval_seconds": "services.defaults has one for all", **BY_CONTRACT}
+    retired: ClassVar = {
+        "publish_interval_seconds": "services.defaults has one for all",
+        "enabled": "services.launcher.enabled is for capabilities and logs",
+        **BY_CONTRACT,
+    }
 
-    enabled: Annotated[bool, doc("Publish it.")] = True
     topic: Annotated[Topic | None, doc("Instead of `{base}/outgoing/capabilities`.")] = None
 
 
@@ -133,22 +136,6 @@ class SystemControl(Section, frozen=True, kw_only=True):
 _MEDIA_PROGRAMS = "the media services choose their programs, and services.mqtt_bridge.media configures them"
 
 
-class MediaControl(Section, frozen=True, kw_only=True):
-    """How the media programs are run while they are requested."""
-
-    retired: ClassVar = {
-        **{
-            f"{prefix}{key}": _MEDIA_PROGRAMS
-            for prefix in ("", "publisher_", "receiver_")
-            for key in ("command", "cwd")
-        },
-        **dict.fromkeys(("publisher_env", "receiver_env"), "`env` is for all of them"),
-        "stop_timeout": ONE_VALUE,
-    }
-
-    env: Annotated[Variables, doc("Environment variables to add.")] = EMPTY
-
-
 class Link(Section, frozen=True, kw_only=True):
     """What the way to the remote broker carries, and what is sent accordingly; `docs/thin-links.md` explains it."""
 
@@ -166,14 +153,14 @@ class Link(Section, frozen=True, kw_only=True):
 class MqttBridge(ServiceSection, frozen=True, kw_only=True):
     """The robot's connection to its operators: heartbeat, forwarding, flags and system commands."""
 
+    retired: ClassVar = dict.fromkeys(("video_control", "audio_control"), _MEDIA_PROGRAMS)
+
     remote_mqtt: Annotated[RemoteMqtt, doc("The remote broker, which operators connect to.")] = RemoteMqtt()
     remote: Annotated[RemoteConnection | None, doc("Used instead of remote_mqtt when set.")] = None
     topics: Annotated[BridgeTopics, doc("Other names for topics.")] = BridgeTopics()
     heartbeat: Annotated[Heartbeat, doc("Sign of life.")] = Heartbeat()
     link: Annotated[Link, doc("A thin link.")] = Link()
     media: Annotated[Media, doc("Pictures and sound, to and from operators.")] = Media()
-    video_control: Annotated[MediaControl, doc("Running the camera publisher.")] = MediaControl()
-    audio_control: Annotated[MediaControl, doc("Running the audio programs.")] = MediaControl()
     reboot_control: Annotated[
         SystemControl, doc("What `flags/reboot` runs, for example `systemctl --no-ask-password reboot`.")
     ] = SystemControl()
@@ -207,9 +194,10 @@ class SerialTelemetry(Section, frozen=True, kw_only=True):
 class OdometryRing(Section, frozen=True, kw_only=True):
     """The shared memory in which the original's `wheel-odometry` finds every raw hall-sensor sample."""
 
+    retired: ClassVar = {"slots": ONE_VALUE}
+
     enabled: Annotated[bool, doc("Write it.")] = True
     name: Annotated[SharedMemoryName | None, doc("Its name; unset: `{system}_{type}_{id}_odometry_raw`.")] = None
-    slots: Annotated[int, Meta(ge=64, le=65_535, description="How many samples it holds, 32 bytes each.")] = 2048
 
 
 class SerialSafety(Section, frozen=True, kw_only=True):
@@ -241,7 +229,7 @@ class SerialTopics(Section, frozen=True, kw_only=True):
 
 
 class SerialBridge(ServiceSection, frozen=True, kw_only=True):
-    """One serial line to an MCU; one process each."""
+    """A serial line to an MCU, and further lines as instances of it; one process each."""
 
     retired: ClassVar = {
         "health": "a device that is gone is searched for, and an IMU that is silent is restarted",
@@ -256,13 +244,8 @@ class SerialBridge(ServiceSection, frozen=True, kw_only=True):
     ] = None
     safety: Annotated[SerialSafety, doc("When to stop.")] = SerialSafety()
     topics: Annotated[SerialTopics, doc("Other names for topics.")] = SerialTopics()
-
-
-class SerialBridges(SerialBridge, frozen=True, kw_only=True):
-    """The serial line to the motor MCU, and further lines as instances of it."""
-
     instances: Annotated[
-        dict[str, SerialBridge], doc("Further lines by name, each with the keys that differ from this section.")
+        dict[str, "SerialBridge"], doc("Further lines by name, each with the keys that differ from this section.")
     ] = EMPTY
 
 
@@ -274,7 +257,7 @@ class Services(Section, frozen=True, kw_only=True):
     av_daemon: Annotated[AvDaemon, doc("Camera and microphone.")] = AvDaemon()
     mqtt_bridge: Annotated[MqttBridge, doc("Connection to operators.")] = MqttBridge()
     ros1_bridge: Annotated[dict[str, Any], doc("The original's connection to ROS 1: read, and not used.")] = EMPTY
-    serial_mcu_bridge: Annotated[SerialBridges, doc("Serial line to the motor MCU.")] = SerialBridges()
+    serial_mcu_bridge: Annotated[SerialBridge, doc("Serial line to the motor MCU.")] = SerialBridge()
     video_stream: Annotated[VideoStream, doc("A streaming program of a third party.")] = VideoStream()
     soundboard_handler: Annotated[SoundboardHandler, doc("Plays sounds.")] = SoundboardHandler()
     autonomy_manager: Annotated[AutonomyManager, doc("Runs autonomy scripts.")] = AutonomyManager()

@@ -98,6 +98,8 @@ def doc(text: str) -> Meta:
 
 #: Why a key is retired whose value is a constant.
 ONE_VALUE = "one value serves all robots"
+UNIT = "the robot's unit sets variables for all: `systemctl edit pebble`"
+COMMAND = "a command may begin with `env -C FOLDER NAME=VALUE`"
 #: The delivery of a channel, which no config changes (paper 4.3 and 4.4).
 BY_CONTRACT: Mapping[str, str] = dict.fromkeys(("qos", "retain"), "the contract fixes QoS and retain flag")
 
@@ -126,10 +128,12 @@ class Section(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
 class ServiceSection(Section, frozen=True, kw_only=True):
     """The keys of every service's section."""
 
-    retired: ClassVar = {"retained_publish_interval_seconds": "services.defaults has one for all"}
+    retired: ClassVar = {
+        "retained_publish_interval_seconds": "services.defaults has one for all",
+        "log_level": "the one of the file is for all services",
+    }
 
     enabled: Annotated[bool, doc("Start this service.")] = False
-    log_level: Annotated[LogLevel, doc("How much this service logs; the root's log_level unless set.")] = "INFO"
 
 
 class HandlerTopics(Section, frozen=True, kw_only=True):

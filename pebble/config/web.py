@@ -3,9 +3,9 @@
 import ipaddress
 from typing import Annotated, ClassVar
 
-from pebble.config.transport import Mqtt
+from pebble.config.transport import RemoteMqtt
 from pebble.config.types import (
-    BrokerHost,
+    UNIT,
     File,
     Host,
     Level,
@@ -20,15 +20,7 @@ from pebble.config.types import (
 class WebHandler(ServiceSection, frozen=True, kw_only=True):
     """Runs the operator page on the robot; `web_interface` sets it up. It needs `pip install 'pebble-robot[web]'`."""
 
-    retired: ClassVar = {"env": "the robot's unit sets variables for all: `systemctl edit pebble`"}
-
-
-class WebMqtt(Mqtt, frozen=True, kw_only=True):
-    """The broker that robots connect to."""
-
-    host: Annotated[
-        BrokerHost, doc("Name or address of the broker; unset: the robot's own, services.mqtt_bridge.remote_mqtt.")
-    ] = ""
+    retired: ClassVar = {"env": UNIT}
 
 
 class WebTls(Section, frozen=True, kw_only=True):
@@ -47,7 +39,7 @@ class WebInterface(Section, frozen=True, kw_only=True):
     retired: ClassVar = {
         **dict.fromkeys(("robots", "robot_discovery"), "robots are found by their messages, and named by `robot.name`"),
         "mqtt_history": "`services.recorder` records into files",
-        "log_level": "services.web_handler has one",
+        "log_level": "the one of the file is for all services",
     }
 
     host: Annotated[
@@ -64,7 +56,9 @@ class WebInterface(Section, frozen=True, kw_only=True):
         bool, doc("Serve other machines without encryption: everybody on the network can read passwords and pictures.")
     ] = False
     plain_http_drive: Annotated[bool, doc("Allow driving from there, too.")] = False
-    mqtt: Annotated[WebMqtt, doc("The broker that robots connect to.")] = WebMqtt()
+    mqtt: Annotated[
+        RemoteMqtt, doc("The broker that robots connect to; without host: services.mqtt_bridge.remote_mqtt.")
+    ] = RemoteMqtt()
     recordings: Annotated[
         File | None, doc("Folder of recordings to look at on the page; unset: that of services.recorder, if it runs.")
     ] = None

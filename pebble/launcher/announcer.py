@@ -118,7 +118,7 @@ def main(arguments: list[str]) -> int:
     except PebbleError as error:
         log.error("%s", error)
         return 1
-    set_log_level(config.log_level_of("launcher"))
+    set_log_level(config.log_level)
     return run(lambda will: local_transport(config, "launcher", will=will))
 
 

@@ -59,7 +59,7 @@ class Launcher:
         Raises PebbleError if the robot runs already or its run directory cannot be used. Main thread only.
         """
         config = self._config
-        own_records = OwnRecords(self._logs, config.log_level_of("launcher"))
+        own_records = OwnRecords(self._logs, config.log_level)
         with own_records, RunLock(config.run_dir(), config.base, config.path or config.folder) as lock, self._signals:
             try:
                 self._reactor.every(_RUN_DIR_S, lambda: self._keep(lock))
@@ -137,9 +137,7 @@ class Launcher:
             os.close(stdin)
 
     def _environment_of(self, program: Program) -> dict[str, str]:
-        """The config's variables replace inherited ones, and never those that the launcher itself sets."""
-        own = {LAUNCHER_PID: str(os.getpid()), **self._on_demand.environment(program)}
-        return {**self._environment, **program.environment, **own}
+        return {**self._environment, LAUNCHER_PID: str(os.getpid()), **self._on_demand.environment(program)}
 
     def _reap_orphans(self) -> None:
         reap({supervisor.pid for supervisor in self._supervisors if supervisor.pid is not None})

@@ -45,7 +45,6 @@ class Program(Struct, frozen=True):
     on_demand: bool = False  # runs only while it is requested
     preloaded: bool = True  # False: its imports are needed by few, and would cost every process their memory
     entry: str = ""  # what the package that is run begins with; "": the module is no package
-    environment: dict[str, str] = {}
     stop_timeout_s: float = 10.0  # after this an on-demand program that was released is killed
 
 
@@ -125,8 +124,7 @@ def _serial_line(config: Config, instance: str, line: SerialBridge) -> Program:
 
 
 def _av_daemon(config: Config) -> Program:
-    environment = config.services.av_daemon.env
-    return _service(config, "av_daemon", Stage.DEVICE, preloaded=False, environment=environment)
+    return _service(config, "av_daemon", Stage.DEVICE, preloaded=False)
 
 
 def _web_handler(config: Config) -> Program:
@@ -139,9 +137,7 @@ def _on_demand(config: Config, name: str) -> Program:
     """A program that the bridge requests while operators want its video or audio."""
     if name == "video_stream":
         return _service(config, name, Stage.CONNECTION, on_demand=True)
-    bridge = config.services.mqtt_bridge
-    control = bridge.video_control if name == "camera_publisher" else bridge.audio_control
-    return _service(config, name, Stage.CONNECTION, on_demand=True, preloaded=False, environment=control.env)
+    return _service(config, name, Stage.CONNECTION, on_demand=True, preloaded=False)
 
 
 def _announcer(config: Config) -> Program:

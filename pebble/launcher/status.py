@@ -52,7 +52,7 @@ class StatusPublisher:
         interval_s = self._config.services.defaults.retained_publish_interval_seconds
         if self._systemd.watchdog_period_s is not None:
             self._reactor.every(self._systemd.watchdog_period_s, self._systemd.watchdog)
-        if launcher.enabled and launcher.capabilities.enabled:
+        if launcher.enabled:
             self._publish_capabilities()
             self._reactor.every(interval_s, self._publish_capabilities)
         self.changed()
@@ -70,8 +70,7 @@ class StatusPublisher:
 
     def capabilities_changed(self) -> None:
         """What the processes report has changed: publish soon."""
-        launcher = self._config.services.launcher
-        if launcher.enabled and launcher.capabilities.enabled and not self._capabilities_due:
+        if self._config.services.launcher.enabled and not self._capabilities_due:
             self._capabilities_due = True
             self._reactor.after(_STATUS_PAUSE_S, self._publish_capabilities)
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 from msgspec.structs import replace
 
 from pebble import contract as c
-from pebble.config import Config, Mqtt, RemoteConnection, RemoteMqtt, SerialBridges, Tls
+from pebble.config import Config, Mqtt, RemoteConnection, RemoteMqtt, Tls
 from pebble.errors import ConfigError, TransportError
 from pebble.runtime.addresses import Addresses
 from pebble.transports import Message, MqttSettings, TlsSettings, Transport, ZenohSettings, check_kind, create
@@ -249,8 +249,7 @@ def _renamed_vital(config: Config) -> tuple[str, ...]:
 def _renamed(config: Config) -> Iterator[tuple[c.Channel, str]]:
     """The channels that this config renames, and their topics, those of every serial line included."""
     own = config.services.serial_mcu_bridge  # in the process of one line: that one
-    lines = config.serial_instances().values() if isinstance(own, SerialBridges) else ()
-    for line in (own, *lines):
+    for line in (own, *config.serial_instances().values()):
         addresses = Addresses(replace(config, services=replace(config.services, serial_mcu_bridge=line)))
         for channel in c.CHANNELS:
             topic = addresses[channel].topic
@@ -270,7 +269,6 @@ def mqtt_settings(
         host=mqtt.host,
         port=mqtt.port,
         hosts=mqtt.places if mqtt.hosts else (),
-        keepalive_s=mqtt.keepalive,
         username=mqtt.username,
         password=mqtt.password,
         password_file=mqtt.password_file,

@@ -47,8 +47,7 @@ def run(
     try:
         config = config_of_process(arguments[0])
         withhold(config.password_variables)
-        program = f"{service_class.name}:{instance}" if instance else service_class.name
-        set_log_level(config.log_level_of(program))
+        set_log_level(config.log_level)
         view = view_of(config, instance)
         return _serve(service_class if choose is None else choose(view), view, instance)
     except PebbleError as error:

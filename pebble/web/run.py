@@ -62,7 +62,7 @@ def settings_or_all_problems(config: Config) -> WebSettings:
 def _settings_of_process(path: str) -> WebSettings:
     """The settings of a page that people can use. Raises ConfigError with everything that is missing."""
     config = config_of_process(path)
-    set_log_level(config.log_level_of("web_handler"))
+    set_log_level(config.log_level)
     settings = settings_or_all_problems(config)
     if problems := _without_user(config):
         raise ConfigError(problems)

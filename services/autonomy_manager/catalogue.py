@@ -123,7 +123,7 @@ class Catalogue:
 
             def question() -> Description:
                 before_asking()
-                return ask(command, folder, environment(self._section.env, section.env))
+                return ask(command, folder, environment(section.env))
 
             answer = self._answers.get(name, [entry], question)
             broken = self._answers.broken(name)
@@ -137,7 +137,7 @@ class Catalogue:
             summary=described.summary,
             main=tuple(described.main),
             dependencies=_dependencies(name, section, described),
-            environment={**self._login, **self._section.env, **section.env},
+            environment={**self._login, **section.env},
             ours=ours,
             broken=broken,
         )

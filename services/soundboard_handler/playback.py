@@ -31,13 +31,11 @@ class Players(Struct, frozen=True):
     raw: Sequence[str]
     device: str
     volume: float
-    cwd: Path | None
-    env: dict[str, str]
 
     @classmethod
     def of(cls, config: Config) -> Players:
         playback, raw = config.services.soundboard_handler.playback, config.services.mqtt_bridge.media.audio_receiver
-        return cls(playback.player_command, raw.command, raw.device, playback.volume, playback.cwd, playback.env)
+        return cls(playback.player_command, raw.command, raw.device, playback.volume)
 
     def command(self, path: Path) -> list[str]:
         """``{file}`` stands for the path; without one it is the last word."""
@@ -46,13 +44,10 @@ class Players(Struct, frozen=True):
 
     def started(self, words: list[str], stdin: int | IO[bytes], **options: Any) -> subprocess.Popen[bytes]:
         """Start a player in a process group of its own; it ends with the calling thread. Raises OSError, ValueError."""
-        if self.cwd is not None and "/" in words[0]:
-            words = [str(self.cwd / words[0]), *words[1:]]  # as exec would find it
         return subprocess.Popen(
             tied_to_parent(words),
             stdin=stdin,
-            cwd=self.cwd,
-            env=child_environment(self.env),
+            env=child_environment(),
             start_new_session=True,  # what the player starts is stopped with it
             **options,
         )

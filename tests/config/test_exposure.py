@@ -33,7 +33,7 @@ LOCAL = {"username": "ann", "password": "hunter2"}
         {"local_mqtt": LOCAL},
         {"transport": {"kind": "x", "settings": {"token": "t"}}},
         {"services": {"av_daemon": {"video": {"device": "rtsp://me:pw@cam.example/"}}}},
-        {"services": {"av_daemon": {"env": {"API_KEY": "k"}}}},
+        {"services": {"mqtt_bridge": {"reboot_control": {"env": {"API_KEY": "k"}}}}},
     ],
 )
 @pytest.mark.parametrize(("mode", "count"), [(0o644, 1), (0o640, 0), (0o600, 0)])
@@ -47,7 +47,10 @@ def test_a_config_with_a_secret_that_everybody_can_read(
 
 
 def test_a_config_without_a_secret_may_be_read_by_everybody(tmp_path: Path) -> None:
-    keys = {"local_mqtt": {"username": "ann", "password_env": "PW"}, "services": {"av_daemon": {"env": {"A": "b"}}}}
+    keys = {
+        "local_mqtt": {"username": "ann", "password_env": "PW"},
+        "services": {"mqtt_bridge": {"reboot_control": {"env": {"A": "b"}}}},
+    }
     assert load(written(tmp_path, 0o644, **keys), env={"PW": "hunter2"}).warnings == ()
 
 

@@ -15,7 +15,6 @@ from pebble.errors import ConfigError
 LAN = {"connect": ["tls/hub.lab:7447"]}
 WRONG: list[tuple[dict[str, Any], str]] = [
     ({"lan": {}}, r"lan\.connect: is missing"),
-    ({"lan": LAN | {"listen": ["tcp/0.0.0.0:7447"]}}, r"lan\.listen: must be left out"),
     ({"lan": LAN | {"account": "goob-lan"}}, r"lan\.account: needs tls\.client_cert"),
     ({"shares": ["front-camera"]}, "front-camera cannot be shared"),
     ({"listens": {"fred": ["control/wheels"]}}, "control/wheels cannot be shared"),

@@ -187,15 +187,6 @@ def test_rapidly_changing_requests_start_few_processes(launch: Launch) -> None:
     assert len(robot.events("media", "start")) <= 2 + time.monotonic() - began
 
 
-def test_an_environment_of_its_own(launch: Launch) -> None:
-    own = {"environment": {"MARK": "red", "PEBBLE_ENCODING": "x"}}
-    robot = launch(ASKER, media("curious about itself", **own), env={"MARK": "blue"})
-    assert robot.ready("bridge")
-    robot.order("bridge", "media 1")
-    assert robot.ready("media")
-    assert environment_notes(robot) == ["env:red:somewhere-else:None"]
-
-
 def test_each_start_gets_the_encoding_that_was_requested_last(launch: Launch) -> None:
     robot = launch(ASKER, media("curious about itself"))
     assert robot.ready("bridge")

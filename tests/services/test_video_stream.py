@@ -36,7 +36,7 @@ class Stream(ProgramRobot):
 
     def __init__(self, port: int, *command: str) -> None:
         super().__init__("mqtt", port, {}, robot="pitcam")
-        section = {"command": command, "cwd": str(self.folder), "env": {"STREAM_NAME": "pit"}}
+        section = {"command": ["env", "-C", str(self.folder), "STREAM_NAME=pit", *command]}
         bridge = {"enabled": True, "remote_mqtt": REMOTE}
         self.raw["services"] = {"mqtt_bridge": bridge, "video_stream": {"enabled": True, **section}}
         self.write()

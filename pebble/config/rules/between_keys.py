@@ -18,10 +18,10 @@ from pebble.config.rules.exposure import warn_if_readable, warn_of_known_id, war
 from pebble.config.rules.shared_topics import shared_topics
 from pebble.config.secret_text import without_login
 from pebble.config.text_files import NotTextError, read_text
-from pebble.config.transport import Mqtt, Tls, TransportSection
-from pebble.config.tree import MqttBridge, Root, SerialBridge, SerialBridges, Services
+from pebble.config.transport import Mqtt, RemoteMqtt, Tls, TransportSection
+from pebble.config.tree import MqttBridge, Root, SerialBridge, Services
 from pebble.config.types import Secret
-from pebble.config.web import WebInterface, WebMqtt, WebTls
+from pebble.config.web import WebInterface, WebTls
 from pebble.contract import DRIVE, OUTGOING, channel_of, is_reserved
 from pebble.contract.identity import GATEWAYS, SERVERS
 
@@ -120,8 +120,6 @@ def _neighbours(reader: Reader, section: Neighbours, path: Path) -> Neighbours:
     problem, lan = reader.notes.problem, section.lan
     if section.enabled and not lan.connect:
         reader.notes.doubt((*path, "lan", "connect"), 'is missing, write where the hub listens: ["tls/hub.lab:7447"]')
-    if lan.listen:
-        problem((*path, "lan", "listen"), "must be left out: robots meet at a hub")
     if lan.account and (not lan.tls.enabled or lan.tls.client_cert is None):
         problem((*path, "lan", "account"), "needs tls.client_cert, in which it is the name")
     for key, names in (("commanded", section.commanded), ("listens", section.listens)):
@@ -164,7 +162,11 @@ def _bridge(reader: Reader, bridge: MqttBridge, path: Path) -> MqttBridge:
     return bridge
 
 
-def _serial(reader: Reader, serial: SerialBridges, path: Path) -> SerialBridges:
+def _serial(reader: Reader, serial: SerialBridge, path: Path) -> SerialBridge:
+    if "instances" in path:
+        if serial.instances:
+            reader.notes.problem((*path, "instances"), "must be left out: an instance has none")
+        return serial
     lines = {(*path, "instances", name): line for name, line in serial.instances.items()}
     if serial.serial.port is not None or not any(line.enabled for line in lines.values()):
         lines = {path: serial, **lines}
@@ -220,7 +222,7 @@ def _web(reader: Reader, web: WebInterface, path: Path) -> WebInterface:
             f"other machines reach {web.host}, so the page starts only with a certificate and a user: run "
             f"`pebble cert init` and `pebble web user add`, write web_interface.tls; or leave out host",
         )
-    if not web.mqtt.host and web.mqtt != WebMqtt():
+    if not web.mqtt.host and web.mqtt != RemoteMqtt():
         reader.notes.warning((*path, "mqtt"), "not used: it has no host, so the page connects to the robot's broker")
     if web.plain_http and web.tls.certificate is not None:
         reader.notes.warning((*path, "plain_http"), "has no effect: there is a certificate, so the page is https")
@@ -320,7 +322,7 @@ CHECKS = _table(
     (VideoStream, _video_stream),
     (MqttBridge, _bridge),
     (Neighbours, _neighbours),
-    (SerialBridges, _serial),
+    (SerialBridge, _serial),
     (Tls, _tls),
     (Mqtt, _mqtt),
     (WebTls, _web_tls),

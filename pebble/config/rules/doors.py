@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from pebble.config.problems import Notes, Path
 from pebble.config.rules.exposure import brokers
 from pebble.config.rules.shared_topics import renamed_commands
-from pebble.config.transport import Mqtt, ZenohSection
+from pebble.config.transport import Mqtt, ZenohClient
 from pebble.config.tree import Root
 from pebble.config.web import is_loopback
 
@@ -90,9 +90,9 @@ def _endpoints(root: Root) -> Iterator[tuple[Path, str]]:
             yield (*path, key), endpoint
 
 
-def _zenoh_sections(root: Root) -> dict[Path, ZenohSection]:
+def _zenoh_sections(root: Root) -> dict[Path, ZenohClient]:
     transport, bridge = root.transport, root.services.mqtt_bridge
-    found: dict[Path, ZenohSection] = {("transport",): transport} if transport.kind == "zenoh" else {}
+    found: dict[Path, ZenohClient] = {("transport",): transport} if transport.kind == "zenoh" else {}
     if bridge.enabled and bridge.remote is not None and bridge.remote.kind == "zenoh":
         found["services", "mqtt_bridge", "remote"] = bridge.remote
     if root.services.neighbours.enabled:
@@ -100,9 +100,9 @@ def _zenoh_sections(root: Root) -> dict[Path, ZenohSection]:
     return found
 
 
-def _each(sections: dict[Path, ZenohSection]) -> Iterator[tuple[Path, str, str]]:
+def _each(sections: dict[Path, ZenohClient]) -> Iterator[tuple[Path, str, str]]:
     for path, section in sections.items():
-        yield from ((path, key, one) for key in ("listen", "connect") for one in getattr(section, key))
+        yield from ((path, key, one) for key in ("listen", "connect") for one in getattr(section, key, ()))
 
 
 def _place(endpoint: str) -> tuple[str, str]:

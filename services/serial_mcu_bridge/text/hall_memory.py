@@ -29,7 +29,7 @@ class HallMemory:
     A reader maps it once and reads on while its number grows: so one that exists is used again, and continued.
     """
 
-    def __init__(self, name: str, slots: int) -> None:
+    def __init__(self, name: str, slots: int = 2048) -> None:
         self._path, self._slots = SHM / name.removeprefix("/"), slots
         self._size = _HEADER.size + slots * _SLOT.size
         self._number = 0

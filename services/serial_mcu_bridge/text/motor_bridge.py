@@ -104,8 +104,8 @@ class MotorBridge(SerialService):
         self._splitter = LineSplitter()
 
     def _make_hall_memory(self) -> HallMemory | None:
-        name, ring = self.config.hall_memory(self.options), self.options.odometry_shm
-        return None if name is None or ring is None else HallMemory(name, ring.slots)
+        name = self.config.hall_memory(self.options)
+        return None if name is None else HallMemory(name)
 
     def start(self) -> None:
         self.on_stop(self.state_file.close)

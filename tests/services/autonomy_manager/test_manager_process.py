@@ -226,7 +226,7 @@ def test_scripts_inherit_nothing_of_the_launchers(mqtt: ManagerRig, monkeypatch:
     found = "[dict(os.environ), os.getpgid(0) == os.getpid(), sys.stdin.read()]"
     text = f"import json, os, sys\njson.dump({found}, open('env', 'w'))"
     folder = mqtt.script("look", text, env={"TEA": "hot"})
-    mqtt.section["env"] = {"TEA": "cold", "CUP": "1"}
+    monkeypatch.setenv("CUP", "1")
     mqtt.start()
     mqtt.launch("look")
     assert until(lambda: mqtt.status.get("running") is False and (folder / "env").exists() and not alive(str(folder)))

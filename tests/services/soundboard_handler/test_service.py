@@ -135,20 +135,6 @@ def test_a_player_that_is_missing_is_reported(make: Make) -> None:
     assert board.became(playing=False, error=error)
 
 
-def test_the_players_command_folder_and_environment_are_the_configs(make: Make) -> None:
-    board = make(cwd="tools", env={"VOICE": "high"}, player_command=["./play", "--file={file}", "-v"])
-    (board.folder / "tools").mkdir()
-    script = board.folder / "tools" / "play"
-    script.write_text('#!/bin/sh\necho "$VOICE $PWD $*" > called.new; mv called.new called; exec sleep 60\n')
-    script.chmod(0o755)
-    path = write_wav(board.sounds / "a.wav", tone(0.1))
-    board.start()
-    board.play("a.wav")
-    assert until((board.folder / "tools" / "called").exists)
-    called = (board.folder / "tools" / "called").read_text()
-    assert called == f"high {board.folder}/tools --file={path} -v\n"
-
-
 def test_a_new_clip_replaces_the_one_before(board: Soundboard) -> None:
     for name in ("a", "b", "c"):
         write_wav(board.sounds / f"{name}.wav", tone(30))
@@ -168,11 +154,11 @@ def test_a_new_clip_replaces_the_one_before(board: Soundboard) -> None:
     assert [status["playing"] for status in board.statuses].count(False) == 1, "only before the first"
 
 
-def test_a_new_player_waits_for_the_end_of_the_one_before(make: Make) -> None:
-    slow = "echo begin >> log; trap 'sleep 0.2; echo end >> log; exit' TERM; while :; do sleep 0.01; done"
-    board = make(player_command=["sh", "-c", slow], cwd=".")
+def test_a_new_player_waits_for_the_end_of_the_one_before(make: Make, tmp_path: Path) -> None:
+    log = tmp_path / "log"
+    slow = f"echo begin >> {log}; trap 'sleep 0.2; echo end >> {log}; exit' TERM; while :; do sleep 0.01; done"
+    board = make(player_command=["sh", "-c", slow])
     board.with_clip("a.wav", 0.1)
-    log = board.folder / "log"
     for number in range(3):
         board.play("a.wav")
         assert until(lambda count=number: log.exists() and log.read_text().count("begin") == count + 1)
@@ -181,11 +167,12 @@ def test_a_new_player_waits_for_the_end_of_the_one_before(make: Make) -> None:
     assert log.read_text() == "begin\nend\n" * 3
 
 
-def test_what_a_player_leaves_behind_ends_with_it(make: Make) -> None:
-    board = make(player_command=["sh", "-c", "sleep 60 & echo $! > child.new; mv child.new child"], cwd=".")
+def test_what_a_player_leaves_behind_ends_with_it(make: Make, tmp_path: Path) -> None:
+    child = tmp_path / "child"
+    board = make(player_command=["sh", "-c", f"sleep 60 & echo $! > {child}.new; mv {child}.new {child}"])
     board.with_clip("a.wav", 0.1).play("a.wav")
-    assert until((board.folder / "child").exists)
-    assert until(lambda: gone(int((board.folder / "child").read_text())))
+    assert until(child.exists)
+    assert until(lambda: gone(int(child.read_text())))
     assert board.became(playing=False, error=None)
 
 
@@ -198,13 +185,11 @@ def test_how_a_stopped_player_exits_is_no_error(make: Make) -> None:
     assert board.refused({"action": "stop"}) is None, "there is nothing to stop"
 
 
-def test_a_player_that_ignores_the_stop_is_killed_with_what_it_started(make: Make) -> None:
-    board = make(
-        player_command=["sh", "-c", "trap '' TERM; sleep 60 & echo $! > ../child; while :; do sleep 0.02; done"],
-        stop_timeout=0.2, cwd="sounds",
-    )  # fmt: skip
+def test_a_player_that_ignores_the_stop_is_killed_with_what_it_started(make: Make, tmp_path: Path) -> None:
+    child = tmp_path / "child"
+    deaf = f"trap '' TERM; sleep 60 & echo $! > {child}; while :; do sleep 0.02; done"
+    board = make(player_command=["sh", "-c", deaf])
     board.with_clip("a.wav", 0.1).play("a.wav")
-    child = board.folder / "child"
     assert until(lambda: child.exists() and child.read_text().endswith("\n"))
     board.send(False)
     assert board.became(playing=False, error=None)
