@@ -18,6 +18,7 @@ from pebble.launcher.reactor import Reactor
 from pebble.runtime.connections import local_transport
 from pebble.runtime.parent import ALIVE_PERIOD_S, Notifier, set_log_level, set_up_logging
 from pebble.runtime.process import exit_at_the_latest
+from pebble.runtime.wakeup_pipe import WakeupPipe
 from pebble.transports import Message, State, Transport
 
 _STDIN = 0
@@ -32,14 +33,14 @@ class Announcer:
         self._pipe, self._transport = pipe, transport
         self._states: dict[str, Message] = {}
         self._reactor = Reactor()
-        self._wake = os.eventfd(0, os.EFD_CLOEXEC | os.EFD_NONBLOCK)
+        self._wake = WakeupPipe()
         self._stopping = False
         os.set_blocking(pipe, False)
 
     def run(self, notify: Notifier) -> None:
         """Run until :meth:`stop` or the end of the pipe; then publish what is still in it, and the will."""
         self._reactor.watch(self._pipe, self._receive)
-        self._reactor.watch(self._wake, self._publish_states)
+        self._reactor.watch(self._wake.fileno(), self._publish_states)
         self._reactor.every(ALIVE_PERIOD_S, notify.alive)
         self._transport.on_state(self._on_state)
         notify.ready()
@@ -53,7 +54,7 @@ class Announcer:
     def stop(self) -> None:
         """End :meth:`run` soon. Safe from signal handlers."""
         self._stopping = True
-        os.eventfd_write(self._wake, 1)
+        self._wake.set()
 
     def _receive(self) -> None:
         envelope = next_envelope(self._pipe)
@@ -75,7 +76,7 @@ class Announcer:
         self._publish(envelope.message)
 
     def _publish_states(self) -> None:
-        os.eventfd_read(self._wake)
+        self._wake.clear()
         for message in self._states.values():
             self._publish(message)
 
@@ -84,7 +85,7 @@ class Announcer:
 
     def _on_state(self, state: State) -> None:
         if state is State.CONNECTED:
-            os.eventfd_write(self._wake, 1)
+            self._wake.set()
 
 
 def run(make_transport: Callable[[Message], Transport]) -> int:

@@ -9,6 +9,7 @@ from typing import NoReturn
 from pebble.config import Config
 from pebble.launcher.forked import become
 from pebble.launcher.programs import Program
+from pebble.runtime.exits import exit_descriptor
 
 _READ_BYTES = 65_536
 _SIGNALS = signal.valid_signals()
@@ -18,7 +19,8 @@ class Child:
     """A process of its own group, so that a terminal's Ctrl-C reaches only the launcher and no grandchild outlives it.
 
     ``output`` (stdout and stderr, in order), ``notes`` (READY and ALIVE lines) and ``exited`` are descriptors to wait
-    on. ``stdin`` stays the caller's. Forks: only for a process with one thread and without sessions. Raises OSError.
+    on; ``exited`` is None where it has to be asked (pebble.runtime.exits). ``stdin`` stays the caller's. Forks: only
+    for a process with one thread and without sessions. Raises OSError.
     """
 
     def __init__(self, program: Program, environment: Mapping[str, str], config: Config, *, stdin: int) -> None:
@@ -56,12 +58,13 @@ class Child:
         self._reaped = True  # first: a signal handler may come in between
         code = os.waitstatus_to_exitcode(os.waitpid(self.pid, 0)[1])
         for descriptor in (self.output, self.notes, self.exited):
-            os.close(descriptor)
+            if descriptor is not None:
+                os.close(descriptor)
         return f"signal {-code}" if code < 0 else f"exit code {code}"
 
-    def _watch_exit(self) -> int:
+    def _watch_exit(self) -> int | None:
         try:
-            return os.pidfd_open(self.pid)
+            return exit_descriptor(self.pid)
         except OSError:  # no descriptors left: a child whose end would go unnoticed must not live
             self.kill()
             os.waitpid(self.pid, 0)

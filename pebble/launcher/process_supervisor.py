@@ -10,6 +10,7 @@ from pebble.launcher.pipes import Pipes
 from pebble.launcher.programs import Program
 from pebble.launcher.reactor import Reactor
 from pebble.launcher.restart_policy import LOOP_EXITS, LOOP_WINDOW_S, RestartPolicy
+from pebble.runtime.exits import ASKS_S, has_ended
 from pebble.runtime.timers import Timer
 
 log = logging.getLogger(__name__)
@@ -125,7 +126,7 @@ class ProcessSupervisor:
             return
         self.state = State.RUNNING
         self._pipes = Pipes(child, self._reactor, partial(self._on_line, child.pid), self._noted)
-        self._reactor.watch(child.exited, lambda: self._exited(child))
+        self._watch_exit(child)
         self._check_at(self.policy.stuck_at)
         self._on_change()
 
@@ -203,11 +204,25 @@ class ProcessSupervisor:
             self.policy.stopped(None)
             self._on_change()
 
+    def _watch_exit(self, child: Child) -> None:
+        if child.exited is not None:
+            self._reactor.watch(child.exited, lambda: self._exited(child))
+            return
+
+        def ask() -> None:
+            if has_ended(child.pid):
+                self._exited(child)
+            else:
+                self._reactor.after(ASKS_S, ask)
+
+        ask()
+
     def _exited(self, child: Child) -> None:
         child.kill()  # what it started must not go on without it; until it is reaped the group's number is its own
         if self._pipes is not None:
             self._pipes.close()
-        self._reactor.forget(child.exited)
+        if child.exited is not None:
+            self._reactor.forget(child.exited)
         how = child.end()
         self._child = None
         self._cancel_timer()

@@ -19,6 +19,7 @@ from typing import Protocol
 from msgspec import Struct
 
 from pebble.errors import PebbleError
+from pebble.runtime.exits import ASKS_S, exit_descriptor, has_ended
 from pebble.runtime.parent import tagged, tied_to_parent
 from pebble.services.autonomy_manager.guard import Guard
 from pebble.services.autonomy_manager.output import Output
@@ -156,14 +157,17 @@ class Process:
         """Return when the process has ended and its output is read; it is not reaped yet."""
         pipe, output = self._pipe, Output(self._write, self._warn, time.monotonic())
         os.set_blocking(pipe, False)
-        exited = os.pidfd_open(self.pid)
+        exited = exit_descriptor(self.pid)
         poll = select.poll()
         poll.register(pipe, select.POLLIN)
-        poll.register(exited, select.POLLIN)
+        if exited is not None:
+            poll.register(exited, select.POLLIN)
+        tick_ms = _TICK_MS if exited is not None else round(1000 * ASKS_S)
         try:
-            ready = {}
-            while exited not in ready:
-                ready = dict(poll.poll(_TICK_MS))
+            has_exited = False
+            while not has_exited:
+                ready = dict(poll.poll(tick_ms))
+                has_exited = has_ended(self.pid) if exited is None else exited in ready
                 output.tick(time.monotonic())
                 if pipe in ready and not _read(pipe, output):
                     poll.unregister(pipe)  # it closed its stdout and stderr
@@ -174,7 +178,8 @@ class Process:
                     break
             output.end()
         finally:
-            os.close(exited)
+            if exited is not None:
+                os.close(exited)
 
     def _warn(self, text: str) -> None:
         self._write(f"{time.strftime('%H:%M:%S')} [WARNING] {text}".encode())

@@ -3,7 +3,8 @@
 TABLE is JSON: a list of [name, module, arguments, stage] and perhaps an object of what else a program is; what is
 published goes to RECORD. Options: those of fake_announcer, ``hasty`` (2 s without a sign of life is stuck),
 ``signal`` (a stop signal comes while the first child is being started), ``tireless`` (nothing is a crash loop),
-``forgetful`` (requests of an ended program expire after 1 s), ``missing`` (one more program, which does not exist).
+``forgetful`` (requests of an ended program expire after 1 s), ``missing`` (one more program, which does not exist),
+``deny CALL ERRNO`` (the kernel refuses this system call, as in a container).
 """
 
 import json
@@ -19,6 +20,7 @@ from pebble.errors import PebbleError  # noqa: E402
 from pebble.launcher import launcher, on_demand, restart_policy  # noqa: E402
 from pebble.launcher.child import Child  # noqa: E402
 from pebble.launcher.programs import Program, Stage  # noqa: E402
+from tests.fakes.seccomp import deny  # noqa: E402
 
 
 class SignalledChild(Child):
@@ -41,6 +43,9 @@ if "forgetful" in options:
     on_demand.OUTLIVE_S = 1.0
 if "missing" in options:
     table.append(Program("missing", "no_such_module", (), Stage.CONNECTION))
+for option in options:
+    if option.startswith("deny "):
+        deny(*option.split()[1:])
 if "signal" in options:
     launcher.Child = SignalledChild  # type: ignore[misc]
 try:

@@ -21,6 +21,7 @@ from pebble.launcher.launcher import Launcher
 from pebble.launcher.programs import Program, Stage, programs, shared_modules
 from pebble.launcher.run_lock import RunLock
 from pebble.runtime.parent import NOTIFY_FD
+from tests.fakes.seccomp import CALLS
 from tests.launcher.robot import BASE, CONNECTION, DEVICE, LOCAL_TRANSPORT, Launch, lines_of
 from tests.support import ROOT, gone, until
 
@@ -99,6 +100,27 @@ def test_a_killed_child_is_started_again_at_once(launch: Launch) -> None:
     again = {"state": "ready", "restarts": 1, "last_exit": "signal 9"}
     assert until(lambda: robot.services()["serial"] == again)
     assert len(robot.events("bridge", "start")) == 1
+
+
+@pytest.mark.skipif(not CALLS, reason="the numbers of system calls of this machine are not known")
+@pytest.mark.parametrize(
+    ("call", "error", "named"),
+    [
+        ("pidfd_open", "EPERM", ["pidfd_open is denied here (Operation not permitted)"]),
+        ("pidfd_open", "ENOSYS", ["pidfd_open is denied here (Function not implemented)"]),
+        ("eventfd2", "EPERM", []),
+        ("prctl", "EPERM", []),  # then nothing ends with a launcher that is killed
+        ("mlock2", "EPERM", []),
+    ],
+)
+def test_a_robot_runs_where_a_system_call_is_denied(launch: Launch, call: str, error: str, named: list[str]) -> None:
+    robot = launch(("serial", "good", DEVICE), ("bridge", "good", CONNECTION), options=(f"deny {call} {error}",))
+    assert robot.ready("serial", "bridge")
+    os.kill(robot.events("serial", "start")[0], signal.SIGKILL)
+    assert until(lambda: len(robot.events("serial", "ready")) == 2, 20)
+    assert robot.stop() == 0
+    assert robot.stderr().count("is denied") == len(named)
+    assert all(text in robot.stderr() for text in named)
 
 
 def test_a_child_that_starts_again_gets_the_config_of_its_launcher(launch: Launch) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import signal
 from pathlib import Path
@@ -44,3 +45,17 @@ def test_others_start(first: str, tmp_path: Path) -> None:
     process.watch(codes.append)
     process.wait(10)
     assert codes == [7]
+
+
+def test_the_end_of_a_script_is_noticed_where_pidfd_open_is_denied(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def denied(_pid: int) -> int:
+        raise PermissionError(errno.EPERM, "Operation not permitted")
+
+    monkeypatch.setattr(os, "pidfd_open", denied)
+    codes: list[int] = []
+    process = started(script(tmp_path, "#!/bin/sh\nexit 3\n", 0o755))
+    process.watch(codes.append)
+    process.wait(10)
+    assert codes == [3]
