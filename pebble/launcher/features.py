@@ -1,17 +1,16 @@
 """What the robot offers at present, as its processes report it: capabilities follow. Pure."""
 
-import re
 from collections.abc import Callable
+
+from pebble.runtime.notes import Feature
 
 #: A robot has these unless a process reports that it lacks them; all others it has while a process reports them.
 _EXPECTED = frozenset({"estop", "control"})
 _MOST_REPORTS = 256  # of all processes; a self-describing MCU names its own outlets
 
-_report = re.compile(r"(LACKS|HAS) (estop|control|outlets/[^/]{1,64}/(?:status|power))").fullmatch
-
 
 class Features:
-    """Handles ``LACKS <feature>`` and ``HAS <feature>``; ``on_change()`` is called when a property changes.
+    """Handles the note Feature; ``on_change()`` is called when a property changes.
 
     ``estop``: the emergency stop. ``control``: requests for control are answered. ``outlets/NAME/status`` and
     ``outlets/NAME/power``: the contract's topics of an outlet are in use.
@@ -31,17 +30,13 @@ class Features:
         """Further features that at least one process has."""
         return self._present - _EXPECTED
 
-    def receive(self, program: str, line: str) -> bool:
-        """Handle a note of ``program``; False if it is none of these."""
-        match = _report(line)
-        if match is None:
-            return False
-        report, differs = {(program, match[2])}, (match[1] == "LACKS") == (match[2] in _EXPECTED)
-        if not differs:
+    def receive(self, program: str, note: Feature) -> None:
+        """Handle a note of ``program``."""
+        report = {(program, note.name)}
+        if note.has is (note.name in _EXPECTED):
             self._set(self._reports - report)
         elif len(self._reports) < _MOST_REPORTS:
             self._set(self._reports | report)
-        return True
 
     def ended(self, program: str) -> None:
         """Forget what a process reported that has ended."""

@@ -2,9 +2,10 @@
 
 import logging
 import os
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Sequence
 from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
 from pebble.config import Config
 from pebble.config.rules.doors import warning_of_open
@@ -21,6 +22,7 @@ from pebble.launcher.restart_policy import RestartPolicy
 from pebble.launcher.run_lock import RunLock
 from pebble.launcher.sd_notify import SystemdNotifier
 from pebble.launcher.status import StatusPublisher
+from pebble.runtime import notes
 from pebble.runtime.connections import check_connections
 from pebble.runtime.parent import LAUNCHER_PID
 from pebble.transports import segments
@@ -49,6 +51,14 @@ class Launcher:
         self._features = Features(lambda: self._status.capabilities_changed())
         self._driveable = self._driveable_by({supervisor.program.name for supervisor in self._supervisors})
         self._status = StatusPublisher(config, self._reactor, self._supervisors, self._features, self._driveable)
+        self._handlers: dict[type[notes.Note], Callable[[Program, Any], None]] = {
+            notes.Wanted: self._on_demand.want,
+            notes.Held: self._on_demand.hold,
+            notes.Feature: lambda program, note: self._features.receive(program.name, note),
+            notes.Local: lambda program, note: self._driveable.local(program.name, note),
+            notes.Mcu: lambda program, note: self._driveable.mcu(program.name, note),
+            notes.Reach: lambda program, note: self._driveable.reach(program.name, note),
+        }
         self._logs = LogForwarder(self._status.publish_log)
         self._signals = StopSignals(self._kill_all)
         self._lost = False  # another launcher has taken the run directory
@@ -98,7 +108,7 @@ class Launcher:
             self._reactor,
             spawn=self._spawn,
             on_line=lambda pid, line: self._log_line(program, pid, line),
-            on_note=lambda line: self._receive_note(program, line),
+            on_note=lambda note: self._receive_note(program, note),
             on_change=lambda: self._status.changed(),
             on_end=lambda: self._ended(program),
             is_stopping=self._stop_requested,
@@ -119,9 +129,8 @@ class Launcher:
         else:
             self._logs.child_line(program.name, pid, line, published=not program.reads_announcer_pipe)
 
-    def _receive_note(self, program: Program, line: str) -> None:
-        if not self._driveable.receive(program.name, line) and not self._features.receive(program.name, line):
-            self._on_demand.receive(program, line)
+    def _receive_note(self, program: Program, note: notes.Note) -> None:
+        self._handlers[type(note)](program, note)
 
     def _ended(self, program: Program) -> None:
         self._features.ended(program.name)

@@ -1,25 +1,23 @@
 """Programs that run only while they are requested: which program may request them, and what follows from its exit."""
 
 import logging
-import re
 from collections.abc import Iterable
 
+from pebble.config.visible import shown
 from pebble.launcher.process_supervisor import ProcessSupervisor
 from pebble.launcher.programs import Program
 from pebble.launcher.reactor import Reactor
+from pebble.runtime.notes import Held, Wanted
 from pebble.runtime.parent import ENCODING, WANTED
 
 #: Requests of a program that has ended count for this long; then its successor must have repeated them.
 OUTLIVE_S = 5.0
 
-_request = re.compile(r"WANT (\S{1,64}) ([01])(?: ([a-z0-9]{1,16}))?", re.ASCII).fullmatch
-_hold = re.compile(r"HOLD (\S{1,64}) ([01])", re.ASCII).fullmatch
-
 log = logging.getLogger(__name__)
 
 
 class OnDemand:
-    """Handles ``WANT <program> 1|0 [encoding]`` and ``HOLD <program> 1|0`` from a program that may request others.
+    """Handles the notes Wanted and Held from a program that may request others.
 
     One that is requested does not run while it is held. For one thread only.
     """
@@ -31,7 +29,7 @@ class OnDemand:
         self._held: set[str] = set()
         self._encodings: dict[str, str] = {}  # that a program is to begin with, whenever it is started
         self._until: dict[str, float] = {}  # when requests of a program that has ended expire
-        self._refused: set[str] = set()  # programs whose first refused line has been logged
+        self._refused: set[str] = set()  # programs whose first refused note has been logged
 
     @property
     def requested(self) -> tuple[str, ...]:
@@ -43,28 +41,24 @@ class OnDemand:
             return {WANTED: " ".join(f"{name}={self._encodings[name]}" for name in self.requested)}
         return {ENCODING: self._encodings[program.name]} if program.on_demand else {}
 
-    def receive(self, sender: Program, line: str) -> None:
-        """Handle a note of ``sender`` that is no sign of life."""
-        found = _request(line) or _hold(line)
-        supervisor = self._supervisors.get(found[1]) if found else None
-        if found is None or supervisor is None or not sender.may_request:
-            self._refuse(sender, line)
+    def want(self, sender: Program, note: Wanted) -> None:
+        """Request a program, or release it."""
+        if not self._may(sender, note):
             return
-        name, on = found[1], found[2] == "1"
-        if line.startswith("HOLD "):
-            (self._held.add if on else self._held.discard)(name)
-        else:
-            self._note(name, on, found[3] or "", supervisor)
-        self._follow(name)
-
-    def _note(self, name: str, wanted: bool, encoding: str, supervisor: ProcessSupervisor) -> None:
-        """A program is requested, or released."""
-        (self._wanted.add if wanted else self._wanted.discard)(name)
-        changed = encoding != self._encodings.get(name, "")
-        self._encodings[name] = encoding
+        name, supervisor = note.program, self._supervisors[note.program]
+        (self._wanted.add if note.on else self._wanted.discard)(name)
+        changed = note.encoding != self._encodings.get(name, "")
+        self._encodings[name] = note.encoding
         self._until.pop(name, None)
         if changed and supervisor.requested and supervisor.policy.state != "ready":
             supervisor.release()  # one that still starts would not receive the new encoding
+        self._follow(name)
+
+    def hold(self, sender: Program, note: Held) -> None:
+        """Let a program wait, or no longer."""
+        if self._may(sender, note):
+            (self._held.add if note.on else self._held.discard)(note.program)
+            self._follow(note.program)
 
     def _follow(self, name: str) -> None:
         supervisor = self._supervisors[name]
@@ -97,7 +91,10 @@ class OnDemand:
             self._wanted.discard(name)
             self._follow(name)
 
-    def _refuse(self, sender: Program, line: str) -> None:
-        if sender.name not in self._refused:
+    def _may(self, sender: Program, note: Wanted | Held) -> bool:
+        """Return True if ``sender`` may request this program; a refusal is logged once."""
+        may = sender.may_request and note.program in self._supervisors
+        if not may and sender.name not in self._refused:
             self._refused.add(sender.name)
-            log.warning("%s may not request this, ignored: %.80s", sender.name, line)
+            log.warning("%s may not request %s, ignored", sender.name, shown(note.program))
+        return may

@@ -5,11 +5,15 @@ from collections.abc import Callable
 from enum import Enum, auto
 from functools import partial
 
+import msgspec
+
 from pebble.launcher.child import Child
+from pebble.launcher.log_forwarding import text_of
 from pebble.launcher.pipes import Pipes
 from pebble.launcher.programs import Program
 from pebble.launcher.reactor import Reactor
 from pebble.launcher.restart_policy import LOOP_EXITS, LOOP_WINDOW_S, RestartPolicy
+from pebble.runtime import notes
 from pebble.runtime.exits import ASKS_S, has_ended
 from pebble.runtime.timers import Timer
 
@@ -36,7 +40,7 @@ class ProcessSupervisor:
     """One program, its restart policy and its present child. All methods belong to the reactor's thread.
 
     An on-demand program is started by :meth:`request`, any other by :meth:`start`. ``on_line(pid, line)`` gets the
-    child's output, ``on_note(line)`` its notes other than READY and ALIVE; ``on_change()`` is called when the state
+    child's output, ``on_note(note)`` its notes other than Ready and Alive; ``on_change()`` is called when the state
     that is reported may have changed, ``on_end()`` whenever a child has ended. While ``is_stopping()``, whatever ends
     stays ended: the programs of other stages may still have their turn.
     """
@@ -49,7 +53,7 @@ class ProcessSupervisor:
         *,
         spawn: Callable[[Program], Child],
         on_line: Callable[[int, str], None],
-        on_note: Callable[[str], None],
+        on_note: Callable[[notes.Note], None],
         on_change: Callable[[], None],
         on_end: Callable[[], None],
         is_stopping: Callable[[], bool],
@@ -64,6 +68,7 @@ class ProcessSupervisor:
         self._child: Child | None = None
         self._pipes: Pipes | None = None  # of the newest child
         self._timer: Timer | None = None
+        self._nonsense_logged = False
 
     @property
     def running(self) -> bool:
@@ -125,7 +130,7 @@ class ProcessSupervisor:
             self._restart(f"could not start: {error}")
             return
         self.state = State.RUNNING
-        self._pipes = Pipes(child, self._reactor, partial(self._on_line, child.pid), self._noted)
+        self._pipes = Pipes(child, self._reactor, partial(self._printed, child.pid), self._noted)
         self._watch_exit(child)
         self._check_at(self.policy.stuck_at)
         self._on_change()
@@ -142,13 +147,24 @@ class ProcessSupervisor:
 
     # -- what the child tells
 
-    def _noted(self, line: str) -> None:
-        if line == "ALIVE":
+    def _printed(self, pid: int, line: bytes) -> None:
+        if text := text_of(line):
+            self._on_line(pid, text)
+
+    def _noted(self, line: bytes) -> None:
+        try:
+            note = notes.decode(line)
+        except msgspec.DecodeError:
+            if not self._nonsense_logged:
+                self._nonsense_logged = True
+                log.warning("%s wrote what is no note, ignored: %.80s", self.program.name, text_of(line))
+            return
+        if isinstance(note, notes.Alive):
             self.policy.alive(self._reactor.now())
-        elif line == "READY":
+        elif isinstance(note, notes.Ready):
             self._ready()
         else:
-            self._on_note(line)
+            self._on_note(note)
 
     def _ready(self) -> None:
         if self.state is not State.RUNNING:  # too late

@@ -8,15 +8,16 @@ import re
 import shutil
 import signal
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 from pebble.config import LAUNCHER_LOCK
 from pebble.config.secret_text import without_secrets
 from pebble.config.visible import shown
+from pebble.runtime import notes
 
-#: A pipe to the launcher: "READY" once, "ALIVE" every second, and the other notes of :class:`Notifier`.
+#: A pipe to the launcher, for the notes of :class:`Notifier`.
 NOTIFY_FD = "PEBBLE_NOTIFY_FD"
 WANTED = "PEBBLE_WANTED"  # "name=encoding …": running programs that a predecessor of this process requested
 ENCODING = "PEBBLE_ENCODING"  # the encoding in the request that started this media program
@@ -130,10 +131,10 @@ class Notifier:
         self._no_launcher_logged = False
 
     def ready(self) -> None:
-        self._write(b"READY\n")
+        self._write(notes.Ready())
 
     def alive(self) -> None:
-        self._write(b"ALIVE\n")
+        self._write(notes.Alive())
 
     def request(self, program: str, request: ProgramRequest) -> bool:
         """Request or release an on-demand program. False: the launcher was too busy, repeat it.
@@ -143,39 +144,38 @@ class Notifier:
         if self._fd is None and not self._no_launcher_logged:
             self._no_launcher_logged = True
             log.info("there is no launcher to start %s", program)
-        return self._write(f"WANT {program} {int(request.on)} {request.encoding}".rstrip().encode() + b"\n")
+        return self._write(notes.Wanted(program, request.on, request.encoding))
 
     def hold(self, program: str, on: bool) -> bool:
         """Let an on-demand program wait, at most until this process ends, or no longer; as :meth:`request`."""
-        return self._write(f"HOLD {program} {int(on)}\n".encode())
+        return self._write(notes.Held(program, on))
 
-    def lacks(self, feature: str, lacking: bool) -> bool:
-        """Report that this process cannot provide ``feature``, or can, until it ends; the capabilities follow.
+    def feature(self, name: str, has: bool) -> bool:
+        """Report that this process can provide a feature, or cannot, until it ends; the capabilities follow.
 
         Features are listed in pebble.launcher.features. False: the launcher was too busy, repeat it.
         """
-        return self._write(f"{'LACKS' if lacking else 'HAS'} {feature}\n".encode())
+        return self._write(notes.Feature(name, has))
 
-    def local(self, *, connected: bool, why: str = "") -> bool:
+    def local(self, connected: bool, why: str = "") -> bool:
         """Report whether this process is connected to its siblings. False: the launcher was too busy, repeat it."""
-        return self._write(f"LOCAL {int(connected)} {_one_line(why)}".rstrip().encode() + b"\n")
+        return self._write(notes.Local(connected, _one_line(why)))
 
     def mcu(self, state: str, silent_ms: int | None, why: str = "") -> bool:
-        """Report on this process's serial line, as :mod:`pebble.launcher.driveable` reads it. False: repeat it."""
-        age = "-" if silent_ms is None else silent_ms
-        return self._write(f"MCU {state} {age} {_one_line(why)}".rstrip().encode() + b"\n")
+        """Report on this process's serial line, as :class:`notes.Mcu` has it. False: repeat it."""
+        return self._write(notes.Mcu(state, silent_ms, _one_line(why)))  # type: ignore[arg-type]  # the launcher checks
 
     def reaches(self, owner: str, reached: bool) -> bool:
         """Report whether what a motor owner publishes arrives here. False: the launcher was too busy, repeat it."""
-        return self._write(f"{'REACHES' if reached else 'MISSES'} {owner}\n".encode())
+        return self._write(notes.Reach(owner, reached))
 
-    def _write(self, line: bytes) -> bool:
+    def _write(self, note: notes.Note) -> bool:
         if self._fd is None:
             return True
         try:
-            os.write(self._fd, line)  # a line is short: the pipe takes all of it or nothing
+            os.write(self._fd, notes.encode(note) + b"\n")  # short: the pipe takes all of it or nothing
         except OSError:  # the launcher is gone or busy: the next sign of life may reach it
-            log.debug("the launcher did not take %s", line)
+            log.debug("the launcher did not take %s", note)
             return False
         return True
 
@@ -185,18 +185,17 @@ def _one_line(text: str) -> str:
     return "".join(one if one.isprintable() else " " for one in without_secrets(text))[:_WHY].strip()
 
 
-class LocalConnection:
-    """Reports to the launcher whether this process is connected to its siblings: call :meth:`report` regularly."""
+class Reported:
+    """A value that the launcher is told when it has changed, and again until it takes it."""
 
-    def __init__(self, notifier: Notifier) -> None:
-        self._notifier = notifier
-        self._reported: tuple[bool, str] | None = None
+    def __init__(self, send: Callable[..., bool], *known: object) -> None:
+        """``known``: what the launcher takes for granted."""
+        self._send, self._known = send, known
 
-    def report(self, connected: bool, problem: str) -> None:
-        """``problem`` is why it is not connected. Reported if it has changed."""
-        found = (connected, "" if connected else problem)
-        if found != self._reported and self._notifier.local(connected=connected, why=found[1]):
-            self._reported = found
+    def report(self, *value: object) -> None:
+        """Report ``value`` if the launcher does not know it; call it regularly."""
+        if value != self._known and self._send(*value):
+            self._known = value
 
 
 class ProvidedFeatures:
@@ -210,5 +209,5 @@ class ProvidedFeatures:
     def report(self) -> None:
         """Report what has changed, also what the launcher was too busy for before."""
         for name in sorted(self._reported ^ self.names):
-            if self._notifier.lacks(name, name not in self.names):
+            if self._notifier.feature(name, name in self.names):
                 self._reported ^= {name}

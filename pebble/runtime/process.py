@@ -15,8 +15,8 @@ from pebble.runtime.connections import local_transport
 from pebble.runtime.environment import withhold
 from pebble.runtime.parent import (
     ALIVE_PERIOD_S,
-    LocalConnection,
     Notifier,
+    Reported,
     set_log_level,
     set_up_logging,
 )
@@ -64,7 +64,7 @@ def _serve(service_class: type[Service], config: Config, instance: str) -> int:
     transport = local_transport(config, service_class.client_name or name, as_published=service_class.as_published)
     service = service_class(config, transport, instance=instance)
     notify = Notifier()
-    local = LocalConnection(notify)
+    local = Reported(notify.local)
 
     def quit_(_signal: int, _frame: object) -> None:
         exit_at_the_latest()
@@ -72,7 +72,8 @@ def _serve(service_class: type[Service], config: Config, instance: str) -> int:
 
     def alive() -> None:
         notify.alive()
-        local.report(transport.state is State.CONNECTED, transport.problem)
+        connected = transport.state is State.CONNECTED
+        local.report(connected, "" if connected else transport.problem)
 
     signal.signal(signal.SIGTERM, quit_)
     signal.signal(signal.SIGINT, quit_)

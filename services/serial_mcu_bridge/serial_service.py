@@ -9,7 +9,7 @@ from typing import Any, ClassVar
 from pebble.config import Config, SerialBridge
 from pebble.contract.serial_protocols import SERIAL_PROTOCOLS
 from pebble.errors import ConfigError, DeviceError
-from pebble.runtime.parent import Notifier
+from pebble.runtime.parent import Notifier, Reported
 from pebble.runtime.rate_limit import RateLimitedLog
 from pebble.runtime.service import Service, every
 from pebble.services.serial_mcu_bridge.line.serial_line import LineState, SerialLine
@@ -41,7 +41,7 @@ class SerialService(Service, ABC):
         self._misread = False
         self._understood = (0, 0)  # which opening of the line, and how often its board was heard since
         self.notifier = Notifier()
-        self._reported: tuple[str, int | None, str] | None = None  # of the MCU, to the launcher
+        self._reported = Reported(self.notifier.mcu)
         self.line = SerialLine(
             section.serial.port,
             section.serial.baud,
@@ -103,10 +103,8 @@ class SerialService(Service, ABC):
         state, silent_ms = self._silence.check(line.state, line.opened, number, now, idle=idle)
         line.input.reports_at_rest = self._silence.reports_at_rest
         misread = silent_ms is None and line.state is LineState.READY and line.input.received > 0
-        found = state, silent_ms, _MISREAD if misread and self._misread else line.problem
+        self._reported.report(state, silent_ms, _MISREAD if misread and self._misread else line.problem)
         self._misread = misread  # a line may be under way
-        if found != self._reported and self.notifier.mcu(*found):
-            self._reported = found
 
     def _queue_input(self, chunk: bytes) -> None:
         """On the reading thread, which also parses it if the service is idle.

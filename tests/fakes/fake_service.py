@@ -12,6 +12,7 @@ import time
 from pathlib import Path
 
 from pebble.config import config_of_process
+from pebble.runtime import notes
 from pebble.runtime.parent import NOTIFY_FD, Notifier, ProgramRequest, earlier_requests, requested_encoding
 
 WORDS = """12:00:00 [WARNING] mind the gap
@@ -49,7 +50,7 @@ def ask(notify: Notifier) -> None:
     """Send the requests that a test appends to the file ``JOURNAL.orders.NAME``: ``media 1 h264``.
 
     ``half media 1`` sends it in two pieces, ``noise media 1`` after 100 kB of anything. ``lacks estop`` and
-    ``has estop`` are reports, as is ``dropped too_large=3``; ``hold media 1`` lets it wait.
+    ``has estop`` are reports; ``hold media 1`` lets it wait.
     """
     orders = Path(f"{sys.argv[3]}.orders.{sys.argv[1]}")
     orders.write_text("")  # those of the previous process are old
@@ -61,13 +62,11 @@ def ask(notify: Notifier) -> None:
             for line in lines:
                 first, *rest = line.split()
                 if first in ("half", "noise"):
-                    blurt(first, f"WANT {' '.join(rest)}\n".encode())
+                    blurt(first, notes.encode(notes.Wanted(rest[0], rest[1] == "1", *rest[2:])) + b"\n")
                 elif first in ("lacks", "has"):
-                    notify.lacks(rest[0], first == "lacks")
+                    notify.feature(rest[0], first == "has")
                 elif first == "hold":
                     notify.hold(rest[0], rest[1] == "1")
-                elif first == "dropped":
-                    notify.dropped({reason: int(number) for reason, number in (word.split("=") for word in rest)})
                 else:
                     notify.request(first, ProgramRequest(rest[0] == "1", *rest[1:]))
             notify.alive()

@@ -5,9 +5,9 @@ from __future__ import annotations
 import os
 import signal
 
-import pytest
-
 from pebble.launcher.features import Features
+from pebble.runtime import notes
+from pebble.runtime.notes import Feature
 from tests.launcher.robot import CONNECTION, Launch
 from tests.support import until
 
@@ -25,16 +25,16 @@ class Recorder:
 
 def test_a_feature_is_lacking_while_any_process_lacks_it() -> None:
     recorder = Recorder()
-    for program, line in [("left", "LACKS"), ("left", "LACKS"), ("right", "LACKS"), ("left", "HAS"), ("other", "HAS")]:
-        assert recorder.features.receive(program, f"{line} estop")
+    for program, has in [("left", False), ("left", False), ("right", False), ("left", True), ("other", True)]:
+        recorder.features.receive(program, Feature("estop", has))
     assert recorder.changes == [{"estop"}]
-    recorder.features.receive("right", "HAS estop")
+    recorder.features.receive("right", Feature("estop", True))
     assert recorder.changes == [{"estop"}, set()]
 
 
 def test_the_end_of_a_process_ends_what_it_reported() -> None:
     recorder = Recorder()
-    recorder.features.receive("left", "LACKS estop")
+    recorder.features.receive("left", Feature("estop", False))
     recorder.features.ended("right")
     assert recorder.features.lacking == {"estop"}
     recorder.features.ended("left")
@@ -43,8 +43,8 @@ def test_the_end_of_a_process_ends_what_it_reported() -> None:
 
 def test_what_is_not_expected_is_there_while_any_process_has_it() -> None:
     recorder = Recorder()
-    for program, line in [("a", "LACKS"), ("a", "HAS"), ("b", "HAS"), ("a", "LACKS")]:
-        assert recorder.features.receive(program, f"{line} outlets/o/power")
+    for program, has in [("a", False), ("a", True), ("b", True), ("a", False)]:
+        recorder.features.receive(program, Feature("outlets/o/power", has))
     assert recorder.features.found == {"outlets/o/power"}
     assert not recorder.features.lacking
     recorder.features.ended("b")
@@ -53,32 +53,13 @@ def test_what_is_not_expected_is_there_while_any_process_has_it() -> None:
 
 def test_an_outlet_may_have_any_name_and_there_are_limits() -> None:
     recorder = Recorder()
-    assert recorder.features.receive("a", "HAS outlets/Küche 1/power")
-    for number in range(300):
-        recorder.features.receive("a", f"HAS outlets/{number}/status")
+    for name in ("Küche 1/power", *(f"{number}/status" for number in range(300))):
+        note = notes.decode(notes.encode(Feature(f"outlets/{name}", True)))
+        assert isinstance(note, Feature)
+        recorder.features.receive("a", note)
     assert len(recorder.features.found) == 256
-    assert recorder.features.receive("a", "LACKS outlets/1/status")
+    recorder.features.receive("a", Feature("outlets/1/status", False))
     assert len(recorder.features.found) == 255
-
-
-@pytest.mark.parametrize(
-    "line",
-    [
-        "",
-        "LACKS",
-        "LACKS ",
-        "LACKS drive",
-        "lacks estop",
-        "LACKS estop 1",
-        "LACKS estop\n",
-        "WANT media 1",
-        "HAS outlets/a/b",
-    ],
-)
-def test_other_lines_are_no_reports(line: str) -> None:
-    recorder = Recorder()
-    assert not recorder.features.receive("left", line)
-    assert recorder.changes == []
 
 
 def test_capabilities_are_published_again_when_a_process_reports_and_when_it_ends(launch: Launch) -> None:
@@ -89,4 +70,4 @@ def test_capabilities_are_published_again_when_a_process_reports_and_when_it_end
     assert until(lambda: len(robot.published("capabilities")) == 2)
     os.kill(robot.events("motors", "start")[0], signal.SIGKILL)
     assert until(lambda: len(robot.published("capabilities")) == 3)
-    assert "motors may not request this, ignored: LACKS nothing" in robot.stderr()
+    assert "motors wrote what is no note, ignored: " in robot.stderr()

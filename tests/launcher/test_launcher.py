@@ -590,9 +590,9 @@ def test_the_hub_process_notifies_that_it_is_ready_and_stops_when_asked(tmp_path
     with subprocess.Popen(command, cwd=ROOT, env=environment, pass_fds=(notes,)) as hub, os.fdopen(read_end) as signs:
         try:
             os.close(notes)
-            assert signs.readline() == "READY\n"
+            assert json.loads(signs.readline()) == {"note": "ready"}
             assert (tmp_path / "run" / "hub.sock").exists()
-            assert signs.readline() == "ALIVE\n"
+            assert json.loads(signs.readline()) == {"note": "alive"}
             hub.terminate()
             assert hub.wait(10) == 0
         finally:

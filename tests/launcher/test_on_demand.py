@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import os
 import signal
 import socket
@@ -12,6 +11,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
 
+import msgspec
 import pytest
 
 from pebble.launcher import on_demand
@@ -19,6 +19,8 @@ from pebble.launcher.on_demand import OnDemand
 from pebble.launcher.process_supervisor import ProcessSupervisor
 from pebble.launcher.programs import Program, Stage
 from pebble.launcher.reactor import Reactor
+from pebble.runtime import notes
+from pebble.runtime.notes import Held, Wanted
 from tests.launcher.robot import CONNECTION, DEVICE, Launch, Robot, Row, lines_of
 from tests.support import gone, until
 
@@ -91,8 +93,8 @@ def test_a_program_runs_if_it_is_requested_and_not_held(
     programs = OnDemand(reactor, [cast(ProcessSupervisor, supervisor)])
     bridge = Program("bridge", "bridge", (), Stage.CONNECTION, may_request=True)
     acts: dict[str, Callable[[str], object]] = {
-        "W": lambda rest: programs.receive(bridge, f"WANT media {rest}"),
-        "H": lambda rest: programs.receive(bridge, f"HOLD media {rest}"),
+        "W": lambda rest: programs.want(bridge, Wanted("media", rest == "1")),
+        "H": lambda rest: programs.hold(bridge, Held("media", rest == "1")),
         "d": lambda _: programs.ended(bridge),
         "e": lambda _: programs.ended(bridge) or reactor.run_until(lambda: not programs.requested, 10),
     }
@@ -224,8 +226,8 @@ def test_only_the_bridge_may_request_and_only_existing_programs(launch: Launch) 
     assert robot.ready("bridge", "other")
     robot.order("other", "media 1", "media 1", "media 1")
     robot.order("bridge", "nothing 1", "other 0", "nothing 1")
-    refusal = "bridge may not request this, ignored: WANT nothing 1"
-    assert until(lambda: refusal in robot.stderr() and "other may not request this" in robot.stderr())
+    refusal = "bridge may not request nothing, ignored"
+    assert until(lambda: refusal in robot.stderr() and "other may not request media" in robot.stderr())
     robot.order("bridge", "media 0")
     assert until(lambda: robot.states() == {"bridge": "ready", "other": "ready", "announcer": "ready"})
     assert robot.stderr().count("may not request") == 2, "one line each"
@@ -277,10 +279,10 @@ class TestBridgeThatDies:
         reactor, supervisor = Reactor(), StandIn()
         bridge = Program("bridge", "bridge", (), Stage.CONNECTION, may_request=True)
         programs = OnDemand(reactor, [cast(ProcessSupervisor, supervisor)])
-        programs.receive(bridge, "WANT media 1")
+        programs.want(bridge, Wanted("media", True))
         reactor.every(0.1, lambda: programs.ended(bridge))
         assert reactor.run_until(lambda: not supervisor.requested, 10)
-        programs.receive(bridge, "WANT media 1")
+        programs.want(bridge, Wanted("media", True))
         assert not reactor.run_until(lambda: not supervisor.requested, 0.2), "that was another request"
         reactor.close()
 
@@ -291,8 +293,8 @@ def test_one_that_still_starts_begins_again_with_what_is_requested_now(state: st
     supervisor = StandIn(state)
     programs = OnDemand(Reactor(), [cast(ProcessSupervisor, supervisor)])
     bridge = Program("bridge", "bridge", (), Stage.CONNECTION, may_request=True)
-    for line in ("WANT media 1", "WANT media 1", "WANT media 1 h264"):
-        programs.receive(bridge, line)
+    for encoding in ("", "", "h264"):
+        programs.want(bridge, Wanted("media", True, encoding))
     assert (supervisor.requested, supervisor.releases) == (True, releases)
 
 
@@ -300,27 +302,25 @@ def test_one_that_still_starts_begins_again_with_what_is_requested_now(state: st
     "line",
     [
         "",
-        "WANT",
-        "WANT media",
-        "WANT media 2",
-        "WANT media yes",
-        "want media 1",
-        "WANT  1",
-        "READY?",
-        "WANT media 1 H264",
-        "WANT media 1 a b",
-        "HOLD media",
-        "HOLD media 1 h264",
-        "\ufffd" * 9,
+        "WANT media 1",
+        "{}",
+        "[]",
+        '{"note":"wanted","program":"media"}',
+        '{"note":"wanted","program":"media","on":2}',
+        '{"note":"wanted","program":"media","on":true,"encoding":"H264"}',
+        '{"note":"wanted","program":"","on":true}',
+        '{"note":"held","program":"media"}',
+        '{"note":"feature","name":"drive","has":true}',
+        '{"note":"feature","name":"outlets/a/b","has":true}',
+        '{"note":"mcu","state":"well","silent_ms":0}',
+        '{"note":"mcu","state":"ready","silent_ms":40}',
+        '{"note":"local","connected":"1"}',
+        '{"note":"reach","owner":"a"}',
     ],
 )
-def test_nonsense_is_ignored(line: str, caplog: pytest.LogCaptureFixture) -> None:
-    caplog.set_level(logging.WARNING)
-    supervisor = StandIn()
-    programs = OnDemand(Reactor(), [cast(ProcessSupervisor, supervisor)])
-    programs.receive(Program("bridge", "bridge", (), Stage.CONNECTION, may_request=True), line)
-    assert not supervisor.requested
-    assert len(caplog.records) == 1
+def test_nonsense_is_no_note(line: str) -> None:
+    with pytest.raises(msgspec.DecodeError):
+        notes.decode(line)
 
 
 class StandIn:

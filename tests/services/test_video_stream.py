@@ -34,9 +34,11 @@ REMOTE = {"host": "far", "username": "pit", "password_env": "UPLINK"}
 class Stream(ProgramRobot):
     """The service as a process of its own, with ``command`` to run."""
 
-    def __init__(self, port: int, *command: str) -> None:
+    def __init__(self, port: int, *command: str, there: bool = True) -> None:
+        """``there``: in the robot's folder, with a variable of its own."""
         super().__init__("mqtt", port, {}, robot="pitcam")
-        section = {"command": ["env", "-C", str(self.folder), "STREAM_NAME=pit", *command]}
+        place = ("env", "-C", str(self.folder), "STREAM_NAME=pit") if there else ()
+        section = {"command": [*place, *command]}
         bridge = {"enabled": True, "remote_mqtt": REMOTE}
         self.raw["services"] = {"mqtt_bridge": bridge, "video_stream": {"enabled": True, **section}}
         self.write()
@@ -55,7 +57,7 @@ Make = Callable[..., Stream]
 def make(local: Broker, monkeypatch: pytest.MonkeyPatch) -> Iterator[Make]:
     monkeypatch.setenv("UPLINK", "topsecret")
     with ExitStack() as ends:
-        yield lambda *command: ends.enter_context(Stream(local.port, *command))
+        yield lambda *command, **options: ends.enter_context(Stream(local.port, *command, **options))
 
 
 DEAF = "import signal; signal.signal(signal.SIGTERM, signal.SIG_IGN)\n"
@@ -89,7 +91,7 @@ def test_a_killed_service_leaves_no_program(make: Make) -> None:
 def test_a_program_that_ends_or_never_starts_ends_the_service_with_the_reason(
     make: Make, command: list[str], reason: str
 ) -> None:
-    process = make(*command).process
+    process = make(*command, there=False).process
     assert process.wait(15) == 1
     assert reason in process.printed
 

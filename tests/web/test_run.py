@@ -76,7 +76,7 @@ def test_it_reports_that_it_is_ready_and_alive_and_ends_by_a_signal(tmp_path: Pa
     )
     os.close(writer)
     with os.fdopen(reader) as notes:
-        assert [notes.readline() for _ in range(3)] == ["READY\n", "ALIVE\n", "ALIVE\n"]
+        assert [json.loads(notes.readline())["note"] for _ in range(3)] == ["ready", "alive", "alive"]
         with urllib.request.urlopen(f"http://127.0.0.1:{port}/healthz", timeout=5) as answer:
             assert answer.status == 200
         page.terminate()

@@ -24,6 +24,7 @@ from pebble.contract.payloads import (
 )
 from pebble.errors import TransportError
 from pebble.runtime.lines import LineSplitter
+from pebble.runtime.parent import Reported
 from pebble.runtime.service import WAIT_LIMIT_S, every, on
 from pebble.runtime.timers import Timer
 from pebble.services.serial_mcu_bridge.line.serial_line import LineState
@@ -97,8 +98,9 @@ class MotorBridge(SerialService):
         )
         self._deadline: Timer | None = None  # stops the motors unless a command arrives; None: they are stopped
         self._guard_timer: Timer | None = None
-        self.announced = self._notified = True  # that it latches: to operators, and to the launcher
-        self._lacks_control = False  # as the launcher knows it
+        self.announced = True  # that it latches, to operators
+        self._estop_note = Reported(self.notifier.feature, "estop", True)
+        self._control_note = Reported(self.notifier.feature, "control", True)
         self._charging: ChargingStatus | None = None
         self._hall = self._make_hall_memory()
         self._splitter = LineSplitter()
@@ -262,11 +264,8 @@ class MotorBridge(SerialService):
         if self._latches is not self.announced:
             self.announced = self._latches
             self._announce()
-        lacks_control = self.refused(c.CONTROL)
-        if lacks_control is not self._lacks_control and self.notifier.lacks("control", lacks_control):
-            self._lacks_control = lacks_control
-        if self._notified is not self.announced and self.notifier.lacks("estop", not self.announced):
-            self._notified = self.announced
+        self._control_note.report("control", not self.refused(c.CONTROL))
+        self._estop_note.report("estop", self.announced)
 
     def _announce(self) -> None:
         if self.announced:

@@ -20,6 +20,8 @@ from pebble.config.media import AudioPublisher, VideoPublisher
 from pebble.contract import AUDIO_CONTROL, MQTT_AUDIO, MQTT_VIDEO, VIDEO_CONTROL
 from pebble.contract.payloads import MediaRequest
 from pebble.launcher.programs import Stage
+from pebble.runtime import notes
+from pebble.runtime.notes import Held, Wanted
 from pebble.runtime.parent import NOTIFY_FD, WANTED, ProgramRequest
 from pebble.services.mqtt_bridge.media import MEDIA, Media
 from pebble.transports import Message, MqttSettings, create
@@ -109,25 +111,25 @@ class AskingBridge(World):
         self._read, self.write = os.pipe()
         os.set_blocking(self._read, False)
         monkeypatch.setenv(NOTIFY_FD, str(self.write))
-        self.asked: list[str] = []
+        self.asked: list[notes.Note] = []
 
     def begin(self, **section: Any) -> None:
         self.start(av_daemon=DEVICES, **section)
         self.run()
 
-    def wanted(self, program: str, note: str = "WANT", *, after: float = 3.0) -> str:
-        """What the launcher was told about a program last."""
+    def wanted(self, program: str, kind: type[Wanted | Held] = Wanted, *, after: float = 3.0) -> str:
+        """What the launcher was told about a program last: ``1 h264``."""
         self.run(after)
         with suppress(BlockingIOError):
-            self.asked += os.read(self._read, 1_000_000).decode().splitlines()
-        start = f"{note} {program} "
-        reported = [line.removeprefix(start) for line in self.asked if line.startswith(start)]
-        return reported[-1] if reported else ""
+            self.asked += map(notes.decode, os.read(self._read, 1_000_000).splitlines())
+        told = [note for note in self.asked if isinstance(note, kind) and note.program == program]
+        return f"{int(told[-1].on)} {getattr(told[-1], 'encoding', '')}".rstrip() if told else ""
 
     def fill(self) -> None:
         """The launcher is busy: there is no room for a further request."""
         os.set_blocking(self.write, False)
-        for line in (b"ALIVE\n" * 100, b"ALIVE\n"):
+        alive = notes.encode(notes.Alive()) + b"\n"
+        for line in (alive * 100, alive):
             with suppress(BlockingIOError):
                 while True:
                     os.write(self.write, line)
@@ -165,7 +167,7 @@ class TestBridge:
             if request is not None:
                 either.remote.publish(VIDEO, request)
             assert either.wanted(CAMERA) == wanted
-        assert not any("audio" in line and line.endswith("1") for line in either.asked)
+        assert not any("audio" in note.program and note.on for note in either.asked if isinstance(note, Wanted))
 
     @each_side
     def test_either_side_may_set_the_flag_and_ask(self, either: AskingBridge, side: str) -> None:
@@ -235,7 +237,7 @@ class TestBridge:
         either.remote.publish(VIDEO_FLAG, TRUE, retain=True)
         either.begin()
         assert either.wanted(CAMERA) == "1 h264"
-        assert f"WANT {CAMERA} 0" not in either.asked
+        assert Wanted(CAMERA, False) not in either.asked
 
     @pytest.mark.parametrize(
         ("profile", "drive", "held"),
@@ -252,16 +254,16 @@ class TestBridge:
     ) -> None:
         bridge.begin(link={"profile": profile})
         bridge.remote.publish(DRIVE, drive)
-        assert [bridge.wanted(program, "HOLD", after=0.0) for program in ALL] == [held, held, ""]
+        assert [bridge.wanted(program, Held, after=0.0) for program in ALL] == [held, held, ""]
         bridge.run(1.8)
         bridge.remote.publish(DRIVE, b'{"z": 0}')
-        assert bridge.wanted(CAMERA, "HOLD", after=3.1) == held
-        assert bridge.wanted(CAMERA, "HOLD", after=1.2) == held.replace("1", "0")
+        assert bridge.wanted(CAMERA, Held, after=3.1) == held
+        assert bridge.wanted(CAMERA, Held, after=1.2) == held.replace("1", "0")
 
     def test_what_a_script_drives_holds_nothing_up(self, bridge: AskingBridge) -> None:
         bridge.begin(link={"profile": "thin"})
         bridge.local.publish(DRIVE, b'{"z": 0.5, "source": "autonomy", "run": 1}')
-        assert bridge.wanted(CAMERA, "HOLD") == ""
+        assert bridge.wanted(CAMERA, Held) == ""
 
     def test_a_request_is_sent_again_to_a_busy_launcher(self, bridge: AskingBridge) -> None:
         bridge.begin()

@@ -10,6 +10,7 @@ from contextlib import suppress
 
 import pytest
 
+from pebble.runtime import notes
 from pebble.runtime.parent import NOTIFY_FD
 from pebble.services.serial_mcu_bridge.devices import imu, peers
 from pebble.services.serial_mcu_bridge.pebble_serial_v1 import host
@@ -25,25 +26,25 @@ from tests.support import cases, until
 def test_the_launcher_is_notified_of_outlets_while_they_are_in_use(
     memory_rig: SerialRig, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    notes, end = os.pipe()
+    pipe, end = os.pipe()
     monkeypatch.setenv(NOTIFY_FD, str(end))
-    os.set_blocking(notes, False)
+    os.set_blocking(pipe, False)
     mcu, written = memory_rig.mcu(STATION), bytearray()
     memory_rig.bridge()
     features = sorted(f"outlets/o{number}/{what}" for number in range(1, 5) for what in ("status", "power"))
 
-    def notified(word: str) -> bool:
+    def notified(has: bool) -> bool:
         with suppress(BlockingIOError):
-            written.extend(os.read(notes, 10_000))
-        lines = [line for line in written.decode().splitlines() if not line.startswith("MCU ")]
-        return lines == [f"{word} {feature}" for feature in features]
+            written.extend(os.read(pipe, 10_000))
+        received = [note for note in map(notes.decode, written.splitlines()) if not isinstance(note, notes.Mcu)]
+        return received == [notes.Feature(feature, has) for feature in features]
 
-    assert until(lambda: notified("HAS"))
+    assert until(lambda: notified(True))
     written.clear()
     mcu.unplug()
-    assert until(lambda: notified("LACKS"))
+    assert until(lambda: notified(False))
     memory_rig.close()
-    os.close(notes)
+    os.close(pipe)
     os.close(end)
 
 

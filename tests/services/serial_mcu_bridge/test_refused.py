@@ -146,9 +146,9 @@ def test_the_launcher_is_notified_however_busy_it_is(
     bench = start()
     assert until(lambda: not bench.service.announced)
     assert os.read(notes, filled) == b"." * filled
-    assert until(lambda: readable(notes) == b"LACKS estop\n")
+    assert until(lambda: readable(notes) == b'{"note":"feature","name":"estop","has":false}\n')
     refuse(broker, bench)
-    assert until(lambda: readable(notes) == b"HAS estop\n")
+    assert until(lambda: readable(notes) == b'{"note":"feature","name":"estop","has":true}\n')
     for descriptor in (notes, end):
         os.close(descriptor)
 
@@ -159,7 +159,7 @@ def readable(descriptor: int) -> bytes:
         lines = os.read(descriptor, 1000).splitlines(keepends=True)
     except BlockingIOError:
         return b""
-    return b"".join(line for line in lines if not line.startswith(b"MCU "))
+    return b"".join(line for line in lines if b'"note":"mcu"' not in line)
 
 
 def test_a_refused_drive_topic_ends_the_process_with_what_to_change(
