@@ -16,12 +16,12 @@ from typing import Any, Self, TypeVar
 
 from pebble.errors import DeviceError
 from pebble.runtime.lines import LineSplitter
-from pebble.runtime.wakeup_pipe import WakeupPipe
 from pebble.simulation.board import BoardState, SimulatedMcu
 from pebble.simulation.bodies import Pair
 from pebble.simulation.micropython.board import UID
 from pebble.simulation.motion import Pose, RobotMotion
 from pebble.simulation.trace import Entry, Event, Trace, motors_entry
+from pebble.transports.wakeup import WakeupPipe
 
 _NO_HOST_S = 0.005  # a master whose slave is closed is always "ready", so it is polled with this period
 _LATE_S = 0.03  # that a turn of the MCU may come after its time

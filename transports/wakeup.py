@@ -1,7 +1,9 @@
-"""An event that wakes the one thread waiting for new work."""
+"""What wakes the one thread that waits: for new work, or for descriptors."""
 
+import socket
 import threading
 import time
+from contextlib import suppress
 
 
 class Wakeup:
@@ -27,3 +29,32 @@ class Wakeup:
     def wait(self, end: float | None) -> bool:
         """Wait until it is set or ``end`` (monotonic seconds) is reached; reset it and return whether it was set."""
         return self._lock.acquire(timeout=-1 if end is None else max(0.0, end - time.monotonic()))
+
+
+class WakeupPipe:
+    """One thread polls it beside its devices, any other or a signal sets it; a set before a poll counts."""
+
+    def __init__(self) -> None:
+        self._reader, self._writer = socket.socketpair()  # Windows polls no pipes
+        self._reader.setblocking(False)
+        self._writer.setblocking(False)
+
+    def fileno(self) -> int:
+        return self._reader.fileno()
+
+    @property
+    def set_fileno(self) -> int:
+        """What sets it when a byte is written to it: for ``signal.set_wakeup_fd``."""
+        return self._writer.fileno()
+
+    def set(self) -> None:
+        with suppress(OSError):  # full: it wakes up anyway; or closed
+            self._writer.send(b"!")
+
+    def clear(self) -> None:
+        with suppress(BlockingIOError):
+            self._reader.recv(65_536)
+
+    def close(self) -> None:
+        self._reader.close()
+        self._writer.close()

@@ -18,8 +18,8 @@ from pebble.launcher.reactor import Reactor
 from pebble.runtime.connections import local_transport
 from pebble.runtime.parent import ALIVE_PERIOD_S, Notifier, set_log_level, set_up_logging
 from pebble.runtime.process import exit_at_the_latest
-from pebble.runtime.wakeup_pipe import WakeupPipe
 from pebble.transports import Message, State, Transport
+from pebble.transports.wakeup import WakeupPipe
 
 _STDIN = 0
 

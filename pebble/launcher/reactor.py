@@ -2,13 +2,13 @@
 
 import selectors
 import signal
-import socket
 import time
 from collections.abc import Callable
 from types import FrameType
 from typing import Any, Self
 
 from pebble.runtime.timers import Timer, Timers
+from pebble.transports.wakeup import WakeupPipe
 
 _SIGNALS = (signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
 _TURN_S = 1.0  # the longest wait of one turn
@@ -97,20 +97,18 @@ class StopSignals:
         self._on_repeat = on_repeat
         self._previous: dict[signal.Signals, Any] = {}
         self._previous_wakeup = -1
-        self._written, self._read = socket.socketpair()
-        self._written.setblocking(False)
-        self._read.setblocking(False)
+        self._wakeup = WakeupPipe()
 
     @property
     def descriptor(self) -> int:
-        return self._read.fileno()
+        return self._wakeup.fileno()
 
     def drain(self) -> None:
         """Read what made :attr:`descriptor` readable."""
-        self._read.recv(64)
+        self._wakeup.clear()
 
     def __enter__(self) -> Self:
-        self._previous_wakeup = signal.set_wakeup_fd(self._written.fileno(), warn_on_full_buffer=False)
+        self._previous_wakeup = signal.set_wakeup_fd(self._wakeup.set_fileno, warn_on_full_buffer=False)
         for number in _SIGNALS:
             if signal.getsignal(number) is not signal.SIG_IGN:
                 self._previous[number] = signal.signal(number, self._receive)
@@ -120,8 +118,7 @@ class StopSignals:
         for number, handler in self._previous.items():
             signal.signal(number, handler)
         signal.set_wakeup_fd(self._previous_wakeup)
-        self._written.close()
-        self._read.close()
+        self._wakeup.close()
 
     def _receive(self, _number: int, _frame: FrameType | None) -> None:
         self.received += 1

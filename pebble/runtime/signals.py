@@ -1,12 +1,13 @@
 """The signals that end a program: waited for, handled in a ``with`` block, or turned into KeyboardInterrupt."""
 
-import os
 import select
 import signal
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from types import FrameType
 from typing import Any
+
+from pebble.transports.wakeup import WakeupPipe
 
 _NAMES = ("SIGINT", "SIGTERM", "SIGHUP")  # the last one is unknown to Windows
 
@@ -18,16 +19,16 @@ class EndSignal:
     """
 
     def __init__(self) -> None:
-        self._read, self._write = os.pipe()
+        self._wakeup = WakeupPipe()
         for number in (signal.SIGTERM, signal.SIGINT):
             signal.signal(number, lambda *_: self.set())
 
     def set(self) -> None:
-        os.write(self._write, b".")
+        self._wakeup.set()
 
     def wait(self, timeout: float | None = None) -> bool:
         """Whether it is set within ``timeout`` seconds."""
-        return bool(select.select([self._read], [], [], timeout)[0])
+        return bool(select.select([self._wakeup], [], [], timeout)[0])
 
 
 @contextmanager

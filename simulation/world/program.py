@@ -24,6 +24,7 @@ from pebble.simulation.world.pose_page import PERIOD_S, PosePage, page_path
 from pebble.simulation.world.poses import RobotPose
 from pebble.simulation.world.walls import Floor, start_pose
 from pebble.simulation.world.world_file import World, read_world
+from pebble.transports.wakeup import WakeupPipe
 
 _SAMPLES_PER_REPORT = round(0.1 / PERIOD_S)
 _SIGNALS = {signal.SIGTERM, signal.SIGINT, signal.SIGHUP}
@@ -77,17 +78,17 @@ class EndRequest:
     """
 
     def __init__(self) -> None:
-        self._reader, self._writer = os.pipe2(os.O_NONBLOCK | os.O_CLOEXEC)
-        signal.set_wakeup_fd(self._writer, warn_on_full_buffer=False)
+        self._wakeup = WakeupPipe()
+        signal.set_wakeup_fd(self._wakeup.set_fileno, warn_on_full_buffer=False)
         for number in _SIGNALS:
             signal.signal(number, lambda *_: None)
 
     def send(self) -> None:
         """From any thread."""
-        os.write(self._writer, b"\0")
+        self._wakeup.set()
 
     def wait(self, seconds: float) -> bool:
-        return bool(select.select([self._reader], [], [], seconds)[0])
+        return bool(select.select([self._wakeup], [], [], seconds)[0])
 
 
 def port_path(folder: Path, robot: str) -> Path:

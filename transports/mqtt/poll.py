@@ -2,19 +2,18 @@
 
 import select
 import socket
-from contextlib import suppress
 from math import ceil
+
+from pebble.transports.wakeup import WakeupPipe
 
 
 class SocketPoll:
     """Waits until a socket is readable or has an error, or (with ``write``) writable, or `wake` was called."""
 
     def __init__(self) -> None:
-        self._wake_read, self._wake_write = socket.socketpair()
-        self._wake_read.setblocking(False)
-        self._wake_write.setblocking(False)
+        self._wakeup = WakeupPipe()
         self.registered = False
-        self._sock, self._wake, self._write = -1, self._wake_read.fileno(), False
+        self._sock, self._wake, self._write = -1, self._wakeup.fileno(), False
         self._poll = select.poll() if hasattr(select, "poll") else None  # Windows has none
 
     def register(self, sock: socket.socket) -> None:
@@ -38,7 +37,7 @@ class SocketPoll:
                 else:
                     readable, writable = bool(seen & ~select.POLLOUT), bool(seen & select.POLLOUT)
         if woken:
-            self._wake_read.recv(4096)
+            self._wakeup.clear()
         return readable, writable, woken
 
     def _select(self, seconds: float, *, write: bool) -> tuple[bool, bool, bool]:
@@ -50,9 +49,7 @@ class SocketPoll:
 
     def wake(self) -> None:
         """Make `wait` return; for other threads."""
-        with suppress(OSError):  # full of wake-ups already, or closed
-            self._wake_write.send(b"\0")
+        self._wakeup.set()
 
     def close(self) -> None:
-        self._wake_read.close()
-        self._wake_write.close()
+        self._wakeup.close()

@@ -10,11 +10,11 @@ from enum import Enum
 from typing import NamedTuple
 
 from pebble.errors import DeviceError
-from pebble.runtime.wakeup_pipe import WakeupPipe
 from pebble.services.serial_mcu_bridge.line.input import UNREAD_S, Input
 from pebble.services.serial_mcu_bridge.line.outbox import Outbox
 from pebble.services.serial_mcu_bridge.line.output import Output
 from pebble.services.serial_mcu_bridge.line.port import Port
+from pebble.transports.wakeup import WakeupPipe
 
 log = logging.getLogger(__name__)
 
