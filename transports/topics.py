@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Callable
+from functools import lru_cache
 
 from pebble.errors import TransportError
 
@@ -19,25 +20,10 @@ _WILDCARD = re.compile(r"/?[+#]")
 _FORBIDDEN = re.compile(f"[\x00-\x1f\x7f-\x9f{_NON_CHARACTERS}]")
 
 
-class _Translations(dict[str, str]):
-    """What was translated before is looked up without a call of Python's; every message needs several of them."""
-
-    def __init__(self, translate: Callable[[str], str]) -> None:
-        super().__init__()
-        self._translate = translate
-
-    def __missing__(self, topic: str) -> str:
-        translated = self._translate(topic)
-        if len(topic) <= REMEMBERED_LENGTH:
-            if len(self) >= _REMEMBERED:
-                self.clear()
-            self[topic] = translated
-        return translated
-
-
 def remembered(translate: Callable[[str], str]) -> Callable[[str], str]:
-    """``translate``, which remembers what it returned for topics of the usual length; 2 MB at most."""
-    return _Translations(translate).__getitem__
+    """Return ``translate``, which remembers what it returned for topics of the usual length; 2 MB at most."""
+    cached = lru_cache(_REMEMBERED)(translate)
+    return lambda topic: cached(topic) if len(topic) <= REMEMBERED_LENGTH else translate(topic)
 
 
 def _check(what: str, text: str) -> None:
