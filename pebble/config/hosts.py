@@ -20,7 +20,7 @@ class HostError(PebbleError):
     """What is wrong with a host, and what to write instead; it repeats nothing of what was written."""
 
 
-class Address(NamedTuple):
+class UrlParts(NamedTuple):
     """The parts of a URL, or of another text that names a host."""
 
     scheme: str  # in lower case; "" without one
@@ -117,7 +117,7 @@ def no_url(text: str) -> str:
     return no_login(text)
 
 
-def split(text: str) -> Address:
+def split(text: str) -> UrlParts:
     """Take a URL, or ``[user@]host[:port]``, apart. Raises HostError."""
     if flaw := hidden(text):
         raise HostError(flaw)
@@ -130,7 +130,7 @@ def split(text: str) -> Address:
         raise HostError("must end with HOST, HOST:PORT or [ADDRESS]:PORT, with a port from 1 to 65535") from None
     if port == 0:
         raise HostError("holds the port 0: write one from 1 to 65535")
-    return Address(
+    return UrlParts(
         scheme=parts.scheme,
         user=None if parts.username is None else unquote(parts.username),
         password=None if parts.password is None else unquote(parts.password),
@@ -140,7 +140,7 @@ def split(text: str) -> Address:
     )
 
 
-def _only_place(text: str) -> Address:
+def _only_place(text: str) -> UrlParts:
     """Return the parts of ``HOST[:PORT]``. Raises HostError."""
     address = split(text)
     if address.scheme or address.rest or address.user is not None:

@@ -14,7 +14,7 @@ from pebble.simulation.motion import Pose, RobotMotion
 from pebble.simulation.world.pose_page import PERIOD_S
 from pebble.simulation.world.poses import RobotPose, Sample, Track
 from pebble.simulation.world.renderer import Renderer
-from pebble.simulation.world.scene import Image
+from pebble.simulation.world.surfaces import Image
 from pebble.simulation.world.walls import Floor, start_pose
 from pebble.simulation.world.world_file import LONGEST_EXPOSURE_MS, LONGEST_LATENCY_MS, World
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from pebble.media.scene import noise
 from pebble.simulation.world.poses import RobotPose, Track, poses_at
-from pebble.simulation.world.scene import Image, Scene, Surface
+from pebble.simulation.world.surfaces import Image, Surface, Surfaces
 from pebble.simulation.world.world_file import World
 
 _NEAR_M: Final = 0.05  # nothing nearer is drawn
@@ -36,7 +36,7 @@ class Renderer:
         cv2.setNumThreads(1)
         self._cv2: Any = cv2
         self._lens, self._me = world.camera, me
-        self._scene = Scene(world)
+        self._surfaces = Surfaces(world)
         self._width, self._height = width, height
         self._focal = width / 2 / math.tan(math.radians(world.camera.hfov_deg / 2))
         self._middle = ((width - 1) / 2, (height - 1) / 2)
@@ -83,7 +83,7 @@ class Renderer:
         me = poses[self._me]
         np.copyto(out, self._background)
         self._draw_floor(me, out)
-        surfaces = self._scene.surfaces(poses, self._me)
+        surfaces = self._surfaces.surfaces(poses, self._me)
         if not surfaces:
             return
         plan, parts = self._seen(surfaces, me)

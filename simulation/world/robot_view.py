@@ -9,7 +9,7 @@ from pebble.errors import NotRunningError
 from pebble.simulation.world.pose_page import PoseReader, page_path
 from pebble.simulation.world.poses import Track
 from pebble.simulation.world.renderer import Renderer
-from pebble.simulation.world.scene import Image
+from pebble.simulation.world.surfaces import Image
 from pebble.simulation.world.world_file import open_world, split_device
 
 STALE_S = 1.0  # a world that has written nothing for so long does not run

@@ -60,7 +60,7 @@ class Tag(Section, frozen=True, kw_only=True):
     size_m: Length = 0.25
 
 
-class Place(Section, frozen=True, kw_only=True):
+class Start(Section, frozen=True, kw_only=True):
     """A robot where it starts: a round body, seen as a box with ``tag`` on all four sides."""
 
     kind: Literal["goob", "fred"] = "goob"
@@ -122,7 +122,7 @@ class World(Section, frozen=True, kw_only=True):
     family: Literal["APRILTAG_16h5", "APRILTAG_25h9", "APRILTAG_36h10", "APRILTAG_36h11"] = "APRILTAG_25h9"
     camera: Lens = Lens()
     tags: tuple[Tag, ...] = ()
-    robots: Annotated[dict[str, Place], doc("By their names.")] = EMPTY
+    robots: Annotated[dict[str, Start], doc("By their names.")] = EMPTY
     room: Room | None = None
     walls: tuple[Wall, ...] = ()
 
@@ -193,7 +193,7 @@ def _check_tags(world: World, notes: Notes) -> None:
             notes.problem(path, f"must be below {count}, the number of tags in {world.family}, not {number}")
 
 
-def _check_robots(robots: Mapping[str, Place], notes: Notes) -> None:
+def _check_robots(robots: Mapping[str, Start], notes: Notes) -> None:
     if not 1 <= len(robots) <= MOST_ROBOTS:
         notes.problem(("robots",), f"must be 1 to {MOST_ROBOTS} robots, not {len(robots)}")
     for name in robots:

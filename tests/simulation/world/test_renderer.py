@@ -11,7 +11,7 @@ import pytest
 
 from pebble.simulation.world.poses import RobotPose, Sample, Track
 from pebble.simulation.world.renderer import Renderer
-from pebble.simulation.world.scene import Image
+from pebble.simulation.world.surfaces import Image
 from tests.simulation.world.worlds import CLEAR, at_rest, projected, seen, tags_in, world_of
 
 WALL = {"x1": 1.0, "y1": 1.0, "x2": 1.0, "y2": -1.0}

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from pebble.simulation.world.poses import RobotPose, Sample, Track
 from pebble.simulation.world.renderer import Renderer
-from pebble.simulation.world.scene import Image
+from pebble.simulation.world.surfaces import Image
 from pebble.simulation.world.world_file import World, parse_world
 
 CLEAR = {"noise": 0.0, "blur": 0.0}

@@ -33,7 +33,7 @@ class Surface(NamedTuple):
     textures: tuple[Image, ...] = ()
 
 
-class Scene:
+class Surfaces:
     """The surfaces that a robot's camera may see."""
 
     def __init__(self, world: World) -> None:
