@@ -18,7 +18,7 @@ _SIGNALS = signal.valid_signals()
 class Child:
     """A process of its own group, so that a terminal's Ctrl-C reaches only the launcher and no grandchild outlives it.
 
-    ``output`` (stdout and stderr, in order), ``notes`` (READY and ALIVE lines) and ``exited`` are descriptors to wait
+    ``output`` (stdout and stderr, in order), ``notes`` (pebble.runtime.notes) and ``exited`` are descriptors to wait
     on; ``exited`` is None where it has to be asked (pebble.runtime.exits). ``stdin`` stays the caller's. Forks: only
     for a process with one thread and without sessions. Raises OSError.
     """

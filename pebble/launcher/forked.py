@@ -19,7 +19,7 @@ from pebble.config import Config, hand_over
 from pebble.launcher.programs import Program
 from pebble.runtime.parent import NOTIFY_FD, die_with_launcher
 
-_NOTES = 3  # the descriptor of READY and ALIVE, next after stdin, stdout and stderr
+_NOTES = 3  # the descriptor of notes, next after stdin, stdout and stderr
 _PR_SET_NAME, _NAME_BYTES = 15, 15
 _SIGNALS = signal.valid_signals()  # each call makes the set anew
 
