@@ -77,7 +77,7 @@ def config_of_running(config: Config) -> Iterator[CheckResult]:
     if config.path is None or not launcher_runs(config.run_dir()):
         return
     if config.path.stat().st_mtime > lock.stat().st_mtime:
-        yield warn(f"{config.path} has changed since the robot started", "start the robot again: it goes on without")
+        yield warn(f"{config.path} has changed since the robot read it", "start the robot again")
     else:
         yield ok(f"{config.path}, as the robot runs")
 

@@ -22,7 +22,7 @@ class Wanted(Struct, frozen=True, tag_field="note", tag="wanted"):
 
     program: _Name
     on: bool
-    encoding: Annotated[str, Meta(pattern="^[a-z0-9]{0,16}$")] = ""
+    encoding: Annotated[str, Meta(pattern=r"^[a-z0-9]{0,16}$(?!\n)")] = ""
 
 
 class Held(Struct, frozen=True, tag_field="note", tag="held"):
@@ -35,7 +35,7 @@ class Held(Struct, frozen=True, tag_field="note", tag="held"):
 class Feature(Struct, frozen=True, tag_field="note", tag="feature"):
     """The process has, or lacks, what the capabilities list: pebble.launcher.features."""
 
-    name: Annotated[str, Meta(pattern="^(estop|control|outlets/[^/]{1,64}/(status|power))$")]
+    name: Annotated[str, Meta(pattern=r"^(estop|control|outlets/[^/]{1,64}/(status|power))$(?!\n)")]
     has: bool
 
 

@@ -311,6 +311,7 @@ def test_one_that_still_starts_begins_again_with_what_is_requested_now(state: st
         '{"note":"wanted","program":"","on":true}',
         '{"note":"held","program":"media"}',
         '{"note":"feature","name":"drive","has":true}',
+        '{"note":"feature","name":"estop\\n","has":true}',
         '{"note":"feature","name":"outlets/a/b","has":true}',
         '{"note":"mcu","state":"well","silent_ms":0}',
         '{"note":"mcu","state":"ready","silent_ms":40}',
