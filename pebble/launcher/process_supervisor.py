@@ -20,7 +20,7 @@ from pebble.runtime.timers import Timer
 log = logging.getLogger(__name__)
 
 
-class State(Enum):
+class ProgramState(Enum):
     """What the program does, and with it what the supervisor's one timer is for."""
 
     IDLE = auto()  # no child; started by request() or start()
@@ -33,7 +33,7 @@ class State(Enum):
     STOPPED = auto()  # no child, and never another
 
 
-_ACTIVE = (State.WAITING, State.RUNNING, State.STUCK, State.REPLACED)
+_ACTIVE = (ProgramState.WAITING, ProgramState.RUNNING, ProgramState.STUCK, ProgramState.REPLACED)
 
 
 class ProcessSupervisor:
@@ -59,7 +59,7 @@ class ProcessSupervisor:
         is_stopping: Callable[[], bool],
     ) -> None:
         self.program, self.policy = program, policy
-        self.state = State.IDLE
+        self.state = ProgramState.IDLE
         self.shown = not program.on_demand  # in the robot's status: on-demand programs from their first request on
         self.held = False  # an on-demand program is requested, and waits for its turn
         self._reactor, self._spawn = reactor, spawn
@@ -88,12 +88,12 @@ class ProcessSupervisor:
     def request(self) -> None:
         """Run an on-demand program: now, or as soon as its child that is being stopped has ended."""
         self.held = False
-        if self.state not in (State.IDLE, State.RELEASED):
+        if self.state not in (ProgramState.IDLE, ProgramState.RELEASED):
             return
         log.info("%s is requested", self.program.name)
         self.shown = True
-        if self.state is State.RELEASED:
-            self.state = State.REPLACED
+        if self.state is ProgramState.RELEASED:
+            self.state = ProgramState.REPLACED
         else:
             self._start_after_request()
 
@@ -105,10 +105,10 @@ class ProcessSupervisor:
         if self.state not in _ACTIVE:
             return
         log.info("%s is released", self.program.name)
-        if self.state is State.REPLACED:
-            self.state = State.RELEASED
+        if self.state is ProgramState.REPLACED:
+            self.state = ProgramState.RELEASED
             return
-        self._end_child(State.RELEASED, State.IDLE)
+        self._end_child(ProgramState.RELEASED, ProgramState.IDLE)
         if self._child is not None:
             self._timer = self._reactor.after(self.program.stop_timeout_s, self._kill_overdue)
 
@@ -129,7 +129,7 @@ class ProcessSupervisor:
         except OSError as error:
             self._restart(f"could not start: {error}")
             return
-        self.state = State.RUNNING
+        self.state = ProgramState.RUNNING
         self._pipes = Pipes(child, self._reactor, partial(self._printed, child.pid), self._noted)
         self._watch_exit(child)
         self._check_at(self.policy.stuck_at)
@@ -138,7 +138,7 @@ class ProcessSupervisor:
     def stop(self) -> None:
         """Ask the child to end, and start no other."""
         self.held = False
-        self._end_child(State.STOPPING, State.STOPPED)
+        self._end_child(ProgramState.STOPPING, ProgramState.STOPPED)
 
     def kill(self) -> None:
         """Kill the child. The reactor notices its exit like any other."""
@@ -167,7 +167,7 @@ class ProcessSupervisor:
             self._on_note(note)
 
     def _ready(self) -> None:
-        if self.state is not State.RUNNING:  # too late
+        if self.state is not ProgramState.RUNNING:  # too late
             return
         self.policy.ready(self._reactor.now())
         self._check_at(self.policy.stuck_at)  # from now on signs of life come more often
@@ -183,7 +183,7 @@ class ProcessSupervisor:
             self.start()
 
     def _start_in(self, wait_s: float) -> None:
-        self.state = State.WAITING
+        self.state = ProgramState.WAITING
         self._timer = self._reactor.after(wait_s, self.start)
 
     def _check_at(self, due: float) -> None:
@@ -195,7 +195,7 @@ class ProcessSupervisor:
             self._check_at(self.policy.stuck_at)
             return
         log.error("%s gives no sign of life: killed", self.program.name)
-        self.state = State.STUCK
+        self.state = ProgramState.STUCK
         self.kill()
 
     def _kill_overdue(self) -> None:
@@ -209,7 +209,7 @@ class ProcessSupervisor:
 
     # -- the end of a child
 
-    def _end_child(self, ending: State, ended: State) -> None:
+    def _end_child(self, ending: ProgramState, ended: ProgramState) -> None:
         """Ask the child to end. The state is ``ending``, or already ``ended`` if there is none."""
         self._cancel_timer()
         if self._child is not None:
@@ -242,18 +242,20 @@ class ProcessSupervisor:
         how = child.end()
         self._child = None
         self._cancel_timer()
-        if self.state not in (State.RUNNING, State.STUCK):
+        if self.state not in (ProgramState.RUNNING, ProgramState.STUCK):
             self._ended_as_asked(how)
         elif self._is_stopping():
             log.info("%s ended (%s) before its turn to stop", self.program.name, how)
             self._ended_as_asked(how)
         else:
-            self._restart("stuck, killed" if self.state is State.STUCK else how)
+            self._restart("stuck, killed" if self.state is ProgramState.STUCK else how)
         self._on_end()
 
     def _ended_as_asked(self, how: str) -> None:
-        again = self.state is State.REPLACED
-        self.state = State.IDLE if self.state in (State.RELEASED, State.REPLACED) else State.STOPPED
+        again = self.state is ProgramState.REPLACED
+        self.state = (
+            ProgramState.IDLE if self.state in (ProgramState.RELEASED, ProgramState.REPLACED) else ProgramState.STOPPED
+        )
         self.policy.stopped(how)
         self._on_change()
         if again:
