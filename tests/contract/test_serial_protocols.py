@@ -43,6 +43,6 @@ except ConfigError as error:
 def test_a_new_row_is_all_that_a_protocol_needs_besides_its_service() -> None:
     done = subprocess.run([sys.executable, "-c", PROGRAM], capture_output=True, text=True, check=True)
     bridge, drives, in_schema, in_docs, error = done.stdout.splitlines()
-    assert (bridge, drives, in_schema, in_docs) == ("ImuBridge", "True", "2", "True")
+    assert (bridge, drives, in_schema, in_docs) == ("ImuBridge", "True", "1", "True")
     assert "services.serial_mcu_bridge.protocol" in error
     assert '"lamp_v1"' in error

@@ -167,7 +167,7 @@ class TestBridge:
             if request is not None:
                 either.remote.publish(VIDEO, request)
             assert either.wanted(CAMERA) == wanted
-        assert not any("audio" in line and line.endswith("1") for line in either.asked)
+        assert not any("audio" in note.program and note.on for note in either.asked if isinstance(note, Wanted))
 
     @each_side
     def test_either_side_may_set_the_flag_and_ask(self, either: AskingBridge, side: str) -> None:

@@ -159,7 +159,7 @@ def readable(descriptor: int) -> bytes:
         lines = os.read(descriptor, 1000).splitlines(keepends=True)
     except BlockingIOError:
         return b""
-    return b"".join(line for line in lines if not line.startswith(b"MCU "))
+    return b"".join(line for line in lines if b'"note":"mcu"' not in line)
 
 
 def test_a_refused_drive_topic_ends_the_process_with_what_to_change(
