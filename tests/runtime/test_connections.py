@@ -13,7 +13,6 @@ from pebble.config import parse
 from pebble.config.gateway_file import GatewayFile
 from pebble.contract import ESTOP
 from pebble.runtime.connections import (
-    SEGMENT,
     gateway_transports,
     local_settings,
     mqtt_settings,
@@ -22,6 +21,7 @@ from pebble.runtime.connections import (
 )
 from pebble.services.gateway.gateway import will
 from pebble.transports import MqttSettings, create
+from pebble.transports.hosts import SMALL_SEGMENT
 from pebble.transports.topics import matches
 from tests.sparing_broker import SparingBroker
 from tests.support import Broker, until
@@ -80,4 +80,4 @@ def test_a_live_stop_waits_for_none_that_a_broker_keeps(program: str, tmp_path: 
         stops.subscribe(topic, lambda message: received.append(message.payload), direct=True)
         sender.publish(topic, b"stop")
         assert until(lambda: received == [b"stop"])
-        assert sparing.segment <= SEGMENT
+        assert sparing.segment <= SMALL_SEGMENT

@@ -18,8 +18,9 @@ NONE = Limits(retain=False, qos=0)
 NO_RETAIN, NO_QOS, NO_WILL = Limits(retain=False), Limits(qos=0), Limits(will=False)
 RESULTS = {"accepts": Result.ACCEPTED, "hangs up": Result.HUNG_UP, "no retain": Result.RETAIN_REFUSED}
 RESULTS |= {"no QoS": Result.QOS_REFUSED, "refuses": Result.FAILED}
-#: Whether messages with QoS 1 or retained ones were unconfirmed, and others confirmed.
-LOSSES = {"loses": (True, False), "loses confirmed": (True, True), "loses idle": (False, False)}
+#: Whether messages with QoS 1 or retained ones were unconfirmed, others confirmed, and the connection held for a while.
+LOSSES = {"loses": (True, False, False), "loses confirmed": (True, True, False), "loses idle": (False, False, False)}
+LOSSES |= {"loses held": (True, False, True)}
 
 
 @pytest.mark.parametrize(
@@ -48,6 +49,9 @@ LOSSES = {"loses": (True, False), "loses confirmed": (True, True), "loses idle":
         (["accepts", *["loses"] * 8], NONE),
         (["accepts", *["loses"] * 9], EVERYTHING),  # less did not help
         (["accepts", *["loses"] * 30], EVERYTHING),
+        (["accepts", "loses held"] * 20, EVERYTHING),
+        (["accepts", *["loses"] * 6, "loses held", *["loses"] * 5], NO_QOS),
+        (["accepts", *["loses"] * 6, *["loses idle"] * 3], EVERYTHING),  # less did not help
     ],
 )
 def test_what_is_tried_next(events: list[str], limits: Limits) -> None:
@@ -59,7 +63,8 @@ def test_what_is_tried_next(events: list[str], limits: Limits) -> None:
                 learning.note_probe(Result.FAILED)
             learning.note_connect(RESULTS[event], now)
         elif event in LOSSES:
-            learning.note_loss(unconfirmed=LOSSES[event][0], confirmed=LOSSES[event][1], now=now)
+            unconfirmed, confirmed, held = LOSSES[event]
+            learning.note_loss(unconfirmed=unconfirmed, confirmed=confirmed, held=held, now=now)
         elif event == "probed":
             assert learning.wants_probe
             learning.note_probe(Result.ACCEPTED)

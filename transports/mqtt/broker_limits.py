@@ -96,13 +96,14 @@ class BrokerLimits:
         elif answered and result is not Result.ACCEPTED:
             self.limits = EVERYTHING  # the will was not the reason
 
-    def note_loss(self, *, unconfirmed: bool, confirmed: bool, now: float) -> bool:
+    def note_loss(self, *, unconfirmed: bool, confirmed: bool, held: bool, now: float) -> bool:
         """Note that the broker has closed a connection; return True if that may be for what it lacks.
 
-        ``unconfirmed``, ``confirmed``: there were retained messages or such of QoS 1.
+        ``unconfirmed``, ``confirmed``: there were retained messages or such of QoS 1. ``held``: for a while.
         """
         self._is_decided |= confirmed
-        if self._is_decided or not unconfirmed:
+        tries_less = self._losses >= _LOSSES  # then none is on its way that could be the reason, and less did not help
+        if self._is_decided or held or not (unconfirmed or tries_less):
             self._losses = 0
             return False
         self._losses += 1

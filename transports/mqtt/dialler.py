@@ -64,8 +64,6 @@ class Dialler:
         """The broker in words, with the address if its host has several."""
         return self.turns.where
 
-    # -- one attempt
-
     def connect(self, owner: Owner, counters: Counters, stopping: threading.Event) -> Connection:
         """A connection that is accepted. Raises Lost."""
         if self.limits.wants_probe or (self._asks_for_bridge_mode and self._bridge_mode.next_attempt is Attempt.PROBE):
@@ -133,7 +131,8 @@ class Dialler:
     def _note_probe(self, result: Result) -> None:
         if self._bridge_mode.next_attempt is Attempt.PROBE:
             self._bridge_mode.note(result)
-        self.limits.note_probe(result)
+        if self._will is not None:  # without one nothing was left out
+            self.limits.note_probe(result)
 
     @property
     def loses_large(self) -> bool:

@@ -272,6 +272,7 @@ class MqttTransport(Transport):
             lacks = written is not None and self._dialler.limits.note_loss(
                 unconfirmed=connection.unacked > 0 or bool(connection.unconfirmed_retained()),
                 confirmed=connection.has_confirmed,
+                held=now > tried_at,
                 now=now,
             )
             if not lacks or max((written or {}).values(), default=0) >= LARGE:

@@ -329,17 +329,18 @@ def test_what_is_not_a_frame_is_refused(tmp_path: Path) -> None:
 
 @needs_shared_memory
 def test_past_a_limit_of_mapped_memory_frames_come_as_bytes_and_the_reader_reports_it(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    net: FramesNet, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(frame_reader, "MAPPED_LIMIT", -1)
-    with FrameWriter(tmp_path, "camera", capacity=100_000) as writer, FrameReader(tmp_path, "camera") as reader:
-        assert until(lambda: "until this process is restarted" in reader.problem and reader.read(0) is None)
-        assert until(lambda: writer.wanted and writer.write(b"\1" * 100_000, FrameInfo()) and reader.read(1))
-        frame = None
-        while frame is None:
-            writer.write(b"\1" * 100_000, FrameInfo())
-            frame = reader.read(0.2)
-        assert not frame.shared
+    with FrameReader(net.folder, "camera") as reader:
+        net.writer(size=VGA, rate=60)
+
+        def comes_as_bytes() -> bool:
+            frame = reader.read(1)
+            return frame is not None and not frame.shared
+
+        assert until(comes_as_bytes, 20)
+        assert "until this process is restarted" in reader.problem
 
 
 def test_late_frames_of_a_replaced_writer_are_ignored(tmp_path: Path) -> None:
