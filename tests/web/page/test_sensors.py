@@ -160,8 +160,7 @@ def test_a_pause_and_a_closed_card_draw_nothing(sensors: Tab) -> None:
     sensors.page.wait_for_timeout(150)
     assert drawings(sensors, "plots", 700) == 0
     sensors.test("plots-pause").click()
-    sensors.test("menu-plots").click()
-    sensors.page.get_by_text("Close Plots").click()
+    sensors.page.get_by_label("Close Plots").click()
     assert sensors.until("!document.querySelector('.plot-lines')")
     assert drawings(sensors, "plots", 400) == 0
     sensors.page.get_by_label("Open Plots").click()

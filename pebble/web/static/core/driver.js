@@ -2,7 +2,7 @@
 
 import * as browser from "./browser.js";
 import { Gesture, PERIOD_MS, STALL_MS } from "./gesture.js";
-import { DRIVE_KEYS, Inputs, PAD_ESTOP, USUAL } from "./inputs.js";
+import { DRIVE_KEYS, Inputs, PadStops } from "./inputs.js";
 import { SLOW_MS, SLOW_SPEED, driveReason } from "./reasons.js";
 import { callAll } from "./store.js";
 
@@ -39,9 +39,9 @@ export class Driver {
     this.onSpace = null;
     /** @type {import("./actions.js").Actions | null} which keys and buttons these are; fetched later */
     this.actions = null;
-    /** @type {{read: (shown: any, now: number) => void, [part: string]: any} | null} a PadInput, fetched later; until then gamepads only stop */
+    this.padStops = new PadStops();
+    /** @type {import("./pads.js").Pads | null} fetched later; until then gamepads only stop */
     this.pads = null;
-    this.padLatches = this.padStops = 0; // gamepads that press it
     this.mine = false;
     this.passedOver = ""; // who was not let drive
     this.idleFrom = Infinity; // since when the lease is not used
@@ -357,13 +357,10 @@ export class Driver {
 
   readPads() {
     const shown = browser.gamepads() ?? [];
-    if (this.pads) return this.pads.read(shown, performance.now());
-    const isPressed = (pad, index) => browser.attempt(() => pad.buttons[index].pressed, false);
-    const pressing = (buttons) => shown.filter((pad) => buttons.every((index) => isPressed(pad, index))).length;
-    const [latches, stops] = [pressing(PAD_ESTOP), pressing([USUAL.buttons.stop])];
-    if (latches > this.padLatches) this.latch("gamepad");
-    if (stops > this.padStops) this.space();
-    Object.assign(this, { padLatches: latches, padStops: stops });
+    const stop = this.padStops.read(shown); // before all that may fail
+    if (stop === "latch") this.latch("gamepad");
+    else if (stop) this.space();
+    this.pads?.read(shown, performance.now());
   }
 
   update() {
@@ -393,7 +390,7 @@ export class Driver {
   changed() {
     const { x, z, y } = this.output;
     const { ref, pads, sliders, inSight, typing } = this;
-    const pad = pads && [pads.choice.key, pads.reasons()];
+    const pad = pads && [pads.key, pads.reasons()];
     const shown = JSON.stringify([ref, this.reason(), x, z, y, pad, sliders, inSight, typing, this.hintedAt, this.asks]);
     if (shown === this.shown) return;
     this.shown = shown;

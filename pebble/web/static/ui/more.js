@@ -4,11 +4,10 @@ import { ROOT } from "../core/browser.js";
 import * as more from "../core/browser-more.js";
 import { Actions } from "../core/actions.js";
 import { Awake } from "../core/awake.js";
-import { PadInput } from "../core/pad-input.js";
+import { Pads } from "../core/pads.js";
 import { install as installCommands } from "./commands.js";
 import { lacks } from "./parts/lacks.js";
 import { WATCHES } from "./parts/models.js";
-import { pads } from "./parts/pads.js";
 
 export { keepWhole } from "./mend.js";
 
@@ -30,8 +29,7 @@ export function install(page) {
   );
   installCommands(page);
   driver.onControlLost = (by, idleMs) => page.connection.show(controlEnd(by, idleMs));
-  page.pads = pads;
-  driver.pads = new PadInput(driver, (id) => pads.mappingOf(id));
+  driver.pads = new Pads(driver);
   new Wall(page).start();
   const missing = lacks().join(" ");
   if (missing) page.connection.show(missing);
