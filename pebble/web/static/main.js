@@ -83,8 +83,7 @@ const follow = () => page.driver.select(route.ref);
 route.onChange(follow);
 page.driver.start();
 follow();
-const root = document.getElementById("app");
-render(h(Page.Provider, { value: page }, h(Boundary, { what: "This page", vital: true }, h(App))), root);
+render(h(Page.Provider, { value: page }, h(Boundary, { what: "This page", vital: true }, h(App))), document.getElementById("app"));
 page.connection.socket.connect();
 withRest(fetchMore);
 if (!route.ref) fetchRest();
@@ -103,10 +102,6 @@ async function fetchMore() {
     return fetchMore();
   }
   more.install(page);
-  more.keepWhole(root, () => {
-    page.driver.leave();
-    location.reload();
-  });
 }
 
 Object.assign(window, { pebble: page }); // for tests, and for people who look into it

@@ -126,42 +126,6 @@ MAPPING: Rows = {
 # fmt: on
 
 
-# -- the screen that stays on
-
-_AWAKE = """
-globalThis.document = { hidden: false };
-let [asked, released, granted] = [0, 0, true];
-const locks = { async request() {
-  asked += 1;
-  if (!granted) throw new Error("the battery is low");
-  return { released: false, async release() { this.released = true; released += 1; } };
-} };
-const awake = new Awake(locks);
-"""
-
-
-awake = Script({"core/awake.js": "Awake"}, _AWAKE, "result = [asked, released];")
-
-
-# fmt: off
-AWAKE: Rows = {
-    "the screen stays on from when it is wanted until it is not":
-        ("for (const on of [false, true, true, false, false]) await awake.want(on);", [1, 1]),
-    "what the browser has taken away is asked for again when the page is seen": ("""
-        await awake.want(true); awake.lock.released = document.hidden = true; await awake.want(true);
-        document.hidden = false; await awake.want(true);""", [2, 0]),
-    "what is granted too late is given back":
-        ("const late = awake.want(true); awake.want(true); await awake.want(false); await late;", [1, 1]),
-    "a browser that refuses is asked again":
-        ("granted = false; await awake.want(true); granted = true; await awake.want(true);", [2, 0]),
-    "a browser that cannot is left alone":
-        ("await new Awake(undefined).want(true);", [0, 0]),
-    "a browser that fails is left alone":
-        ("locks.request = () => { throw new Error('denied'); }; await awake.want(true);", [0, 0]),
-}
-# fmt: on
-
-
 # -- what is joined to the page later; ``later`` runs what it does each second
 
 _MORE = """
@@ -175,7 +139,9 @@ define("document", {
   querySelector: () => dialog, createElement: () => ({}), head: { append() {} }, addEventListener() {},
   documentElement: { toggleAttribute() {} },
 });
-define("navigator", {});
+const lock = { released: false, release() { seen.push("off"); this.released = true; } };
+const request = async () => (seen.push("on"), Object.assign(lock, { released: false }));
+define("navigator", { wakeLock: { request } });
 define("setInterval", (run) => (later = run));
 define("fetch", async () => ({ ok: healthy }));
 performance.now = () => now;
@@ -200,15 +166,22 @@ def test_behind_an_open_panel_there_is_only_the_help() -> None:
     assert more('key("KeyM"); dialog = {}; key("KeyM"); key("Slash", "?");') == ["mute", "help"]
 
 
+def test_the_screen_stays_on_while_this_page_has_control() -> None:
+    steps = """page.connection.isOpen = true; let you = false; page.store.get = () => ({ value: { you } });
+    for (you of [false, true, true, false, false, true]) { later(); await turn(); }
+    lock.released = true; later(); await turn();"""
+    assert more(steps) == ["on", "off", "on", "on"]
+
+
 def test_a_wall_screen_loads_itself_again_only_from_a_server_that_answers() -> None:
     steps = """page.connection.bye = { why: "" }; healthy = false;
     for (now = 0; now < 20_000; now += 1000) { later(); await turn(); }
     result = seen.length; healthy = true;
     for (; now < 27_000; now += 1000) { later(); await turn(); }
     result = [result, seen];"""
-    assert more(steps, "?watch") == [0, ["reload"]]
+    assert more(steps, "?watch") == [1, ["on", "reload"]]
 
 
-@rows((actions, ACTIONS), (mapping, MAPPING), (awake, AWAKE))
+@rows((actions, ACTIONS), (mapping, MAPPING))
 def test_each(found: Callable[[], Any], expected: Any) -> None:
     assert found() == expected
