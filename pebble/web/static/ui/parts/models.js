@@ -193,12 +193,12 @@ export class Panels extends Model {
   }
 }
 
-/** Which cards of one kind of component are closed or hidden. Those for engineers are closed until they are opened. */
+/** Which cards of a component are closed or hidden. Those for engineers are closed until they are opened. */
 export class CardView extends Model {
-  /** @param {string} kind */
-  constructor(kind) {
+  /** @param {string} ref */
+  constructor(ref) {
     super();
-    this.key = `cards ${kind}`;
+    this.key = `cards ${ref}`;
     const stored = read(this.key, null);
     this.closed = new Set(list(stored?.closed));
     this.opened = new Set(list(stored?.opened));
@@ -288,13 +288,6 @@ export class Offers {
   /** What it is called, and looks like: name, description, colour and picture, as far as it says so. */
   get identity() {
     return this.section("identity");
-  }
-
-  /** Robots of one kind share which of their cards are closed: the same body, else the same sections. */
-  get kind() {
-    const { picture } = this.identity;
-    if (typeof picture === "string" && picture) return picture;
-    return [this.isRobot ? "" : "no robot", ...Object.keys(this.value).filter((name) => this.has(name)).sort()].join(" ");
   }
 
   get hasLights() {

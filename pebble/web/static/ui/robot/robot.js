@@ -16,8 +16,7 @@ import { typeOf } from "../parts/words.js";
 
 export function Robot({ at, layout, drawer, onPanel }) {
   const offers = new Offers(at, useValue(at, "capabilities"), useMetrics(at));
-  const { kind } = offers;
-  const view = useMemo(() => new CardView(kind), [kind]);
+  const view = useMemo(() => new CardView(at), [at]);
   useModel(view);
   const source = useValue(at, "web/picture-from")?.source || at;
   const stream = useStream(at);
