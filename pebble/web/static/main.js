@@ -47,12 +47,15 @@ function join() {
     },
   });
   const estop = new Estop(socket);
-  const driver = new Driver({ socket, store, estop, reload: () => connection.isOld });
+  const page = {
+    nameOf: (ref) => nameIn(store, ref),
+    isOld: () => connection.isOld,
+    isLoading: () => !isHere(PARTS.robot),
+    pictureAge: () => (!video.ref ? null : video.waits ? -1 : video.age().ms),
+  };
+  const driver = new Driver({ socket, store, estop, page });
   connection.socket = socket;
   estop.onChange = () => connection.changed();
-  driver.nameOf = (ref) => nameIn(store, ref);
-  driver.loading = () => !isHere(PARTS.robot);
-  driver.pictureAge = () => (!video.ref ? null : video.waits ? -1 : video.age().ms);
   video.pictures = new Pictures(
     (bitmap, info) => {
       video.draw(bitmap, info);

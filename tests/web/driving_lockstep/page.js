@@ -34,7 +34,7 @@ function load(page, ref) {
     onRefused: (message) => driver.refused(message),
     onChange: () => driver.changed(),
   });
-  const driver = new Driver({ socket, store, estop: new Estop(socket), reload: () => false });
+  const driver = new Driver({ socket, store, estop: new Estop(socket) });
   driver.pads = new Pads(driver);
   page.driver = driver;
   page.socket = socket;

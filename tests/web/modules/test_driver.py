@@ -26,8 +26,8 @@ for (const [metric, value] of Object.entries(facts)) store.set(REF, metric, valu
 const you = { drives: true, rights: ["drive"] };
 const socket = { state: "open", you, roundTripMs: 5, restart() {}, send: (op) => done.push(op.op) };
 const estop = { press: (_, why) => done.push(`estop: ${why}`) };
-const driver = new Driver({ socket, store, estop, reload: () => false });
-driver.ref = REF;
+const driver = new Driver({ socket, store, estop });
+driver.select(REF);
 driver.pads = new Pads(driver);
 driver.onInterrupt = () => done.push("ended");
 driver.actions = new Actions((id, phase) => done.push(`${id} ${phase}`));
@@ -66,8 +66,8 @@ ENDS = [
     "driver.release()",
     "driver.select('')",
     "driver.lost()",
-    "driver.updatedAt -= 300; driver.tick()",
-    "driver.clockBase -= 1000; driver.tick()",
+    "driver.clock.lookedAt -= 300; driver.tick()",
+    "driver.clock.base -= 1000; driver.tick()",
     "key('MetaLeft', { key: 'Meta' })",
     "driver.refused({ cmd: 'drive', ref: REF, g: 1, why: 'Commands are late' })",
     "dialog = {}; driver.tick()",

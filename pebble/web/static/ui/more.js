@@ -25,7 +25,7 @@ export function install(page) {
     () => driver.ref !== "" && document.querySelector("dialog[open]") === null,
   );
   installCommands(page);
-  driver.onControlLost = (by, idleMs) => page.connection.show(controlEnd(by, idleMs));
+  driver.lease.onLost = (by, idleMs) => page.connection.show(controlEnd(by, idleMs));
   driver.pads = new Pads(driver);
   new Wall(page).start();
   const missing = lacks().join(" ");
