@@ -31,7 +31,7 @@ RATE = 16_000
 _SURE = 0.96  # more than any test needs
 #: Records what the page plays; as a worklet hands it over.
 TAP = """async () => {
-  const { node } = await pebble.sound.model.speaker;
+  const { node } = pebble.sound.model.speaker;
   window.recorded = [];
   window.recordedAt = []; // seconds of the sound's clock
   node.port.onmessage = ({ data }) => recordedAt.push(data.at) && recorded.push(data.left);

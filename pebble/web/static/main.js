@@ -45,12 +45,15 @@ function join() {
     },
   });
   const estop = new Estop(socket);
-  const driver = new Driver({ socket, store, estop, reload: () => connection.isOld });
+  const page = {
+    nameOf: (ref) => nameIn(store, ref),
+    isOld: () => connection.isOld,
+    isLoading: () => !isHere(PARTS.robot),
+    pictureAge: () => (!video.ref ? null : video.waits ? -1 : video.age().ms),
+  };
+  const driver = new Driver({ socket, store, estop, page });
   connection.socket = socket;
   estop.onChange = () => connection.changed();
-  driver.nameOf = (ref) => nameIn(store, ref);
-  driver.loading = () => !isHere(PARTS.robot);
-  driver.pictureAge = () => (!video.ref ? null : video.waits ? -1 : video.age().ms);
   video.pictures = new Pictures(
     (bitmap, info) => {
       video.draw(bitmap, info);
@@ -81,8 +84,7 @@ const follow = () => page.driver.select(route.ref);
 route.onChange(follow);
 page.driver.start();
 follow();
-const root = document.getElementById("app");
-render(h(Page.Provider, { value: page }, h(Boundary, { what: "This page", vital: true }, h(App))), root);
+render(h(Page.Provider, { value: page }, h(Boundary, { what: "This page", vital: true }, h(App))), document.getElementById("app"));
 page.connection.socket.connect();
 withRest(fetchMore);
 if (!route.ref) fetchRest();
@@ -101,10 +103,6 @@ async function fetchMore() {
     return fetchMore();
   }
   more.install(page);
-  more.keepWhole(root, () => {
-    page.driver.leave();
-    location.reload();
-  });
 }
 
 Object.assign(window, { pebble: page }); // for tests, and for people who look into it

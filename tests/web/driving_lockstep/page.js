@@ -14,8 +14,7 @@ const core = (name) => import(new URL(name, folder));
 const { ControlSocket } = await core("control-socket.js");
 const { Driver } = await core("driver.js");
 const { Estop } = await core("estop.js");
-const { USUAL } = await core("inputs.js");
-const { PadInput } = await core("pad-input.js");
+const { Pads } = await core("pads.js");
 const { Store } = await core("store.js");
 
 const VERSION = "1";
@@ -35,8 +34,8 @@ function load(page, ref) {
     onRefused: (message) => driver.refused(message),
     onChange: () => driver.changed(),
   });
-  const driver = new Driver({ socket, store, estop: new Estop(socket), reload: () => false });
-  driver.pads = new PadInput(driver, () => USUAL);
+  const driver = new Driver({ socket, store, estop: new Estop(socket) });
+  driver.pads = new Pads(driver);
   page.driver = driver;
   page.socket = socket;
   page.pointer = null;

@@ -80,17 +80,10 @@ RUN: Rows = {
     "a payload of a thousand numbers is cut": ("""
         const value = Object.fromEntries(Array.from({ length: 1000 }, (_, i) => [`n${i}`, i]));
         result = [{ value }, Array(1000).fill(1)].map((one) => Object.keys(core.numbers(one)).length);""", [24, 8]),
-    "what may be added of a metric": ("""
+    "the plots of all numbers of a metric": ("""
         const payload = { value: { temp_c: 31, gyro: { x: 1, y: 2, z: 3 }, text: "x" } };
-        result = plots.choices("sensors/imu", payload).map(({ title, fields }) => [title, fields.join()]);""",
-        [[f"sensors/imu {one}", fields] for one, fields in {
-            "gyro": "gyro.x,gyro.y,gyro.z", "temp_c": "temp_c", **{f"gyro.{axis}": f"gyro.{axis}" for axis in "xyz"},
-        }.items()]),
-    **{f"what was remembered wrongly is no plot: {stored}": (f"result = plots.restored({stored});", []) for stored in (
-        "null", "7", "'x'", "{}", "[null, 7, {}]", "[{ id: 'a', title: 'a', metric: 'a', fields: [7] }]")},
-    "not more than six plots are remembered": ("""
-        const plot = (n) => ({ id: `m ${n}`, title: `m ${n}`, metric: "m", fields: [`${n}`] });
-        result = plots.restored(Array.from({ length: 9 }, (_, n) => plot(n))).length;""", 6),
+        result = plots.plotsOf("sensors/imu", payload).map(({ title, fields }) => [title, fields.join()]);""",
+        [["sensors/imu temp_c", "temp_c"], ["sensors/imu gyro", "gyro.x,gyro.y,gyro.z"]]),
     "a component at rest leaves few poses": ("""
         const path = new core.Series(trail.poseOf, { spanMs: 3_600_000, most: 4000, differs: trail.differs });
         for (let at = 0; at < 100_000; at += 50) path.push(at, { value: { x_mm: 1, y_mm: 0 } });

@@ -120,7 +120,7 @@ SOUND: Rows = {
     "why a talk has failed is known until the next one or another component": ("""
         const denied = () => Object.assign(new Error("no"), { name: "NotAllowedError" });
         await talk(true); await answer(denied()); result = [sound.problem, sound.talking];
-        sound.endedAt = -Infinity; sound.step(); result.push(sound.problem !== "");
+        sound.voice.endedAt = -Infinity; sound.step(); result.push(sound.problem !== "");
         await talk(false); await talk(true); result.push(sound.problem);
         await talk(false); await answer(denied()); result.push(sound.problem !== "");
         go("pebble/robots/minilamp"); result.push(sound.problem);""",

@@ -103,12 +103,12 @@ def _scroll_to(selector: str) -> Act:
     return lambda page: page.locator(selector).first.scroll_into_view_if_needed()
 
 
-#: A gamepad in use, and its panel.
+#: The help with a gamepad in use.
 _PAD = """const buttons = Array.from({ length: 11 }, (_, i) => ({ pressed: i === 3 }));
 const one = { id: "Logitech Logitech Attack 3", index: 0, connected: true, timestamp: 1, mapping: "",
   axes: [0.31, -0.84, 1], buttons };
 navigator.getGamepads = () => [one];
-pebble.panels.show("gamepad");"""
+pebble.panels.show("help");"""
 
 
 def _drive(page: Page) -> None:
@@ -234,8 +234,6 @@ SCREENS = [
     Screen("settings", "driving", _press(".me"), ("desktop",)),
     Screen("help", "driving", _do("pebble.panels.show('help')")),
     Screen("gamepad", "driving", _do(_PAD)),
-    Screen("gamepad-asks", "driving", _do(_PAD, "[data-test=pad-learn]")),
-    Screen("no-gamepad", "driving", _do("pebble.panels.show('gamepad')"), ("desktop",)),
     Screen("open-on-phone", "fleet", _do("pebble.panels.show('phone')")),
     Screen("left-handed", "driving", _do("pebble.settings.set('side', 'left')"), ("landscape",)),
     Screen("reset-asked", "stopped", _press(".banner-actions button")),

@@ -74,7 +74,7 @@ def test_a_driver_sees_that_the_robot_can_no_longer_be_driven_and_then_that_it_c
             opened.page.wait_for_timeout(300)  # what is replaced before it is drawn nobody sees
             assert opened.until(f"{SHOWN} === '{chip}{hint}'"), opened.page.evaluate(SHOWN)
         opened.test("bell").click()
-        assert opened.until("document.querySelector('.notice-driveable')?.innerText.includes('can be driven again 2')")
+        assert opened.until("document.querySelector('.notice-driveable')?.innerText.includes('can be driven again')")
 
 
 STOPPED = """(refs) => refs.forEach((ref) => pebble.store.set(

@@ -341,10 +341,7 @@ def test_h264_shows_every_picture_in_order(page: Any, pages: MediaPages) -> None
 def test_h264_after_faults(page: Any, pages: MediaPages) -> None:
     packets = stream("h264", 30, size=(320, 240), interval=10, quality=40)
     assert h264_counters(page, pages, [*packets[:4], *packets[5:12]]) == [0, 1, 2, 3, 10, 11]
-    broken = packets[5][:-30] + b"x" + packets[5][-29:]
-    assert h264_counters(page, pages, [*packets[:5], broken, *packets[6:12]]) == [0, 1, 2, 3, 4, 10, 11]
     assert h264_counters(page, pages, [*packets[:3], packets[2], *packets[3:12]]) == [0, 1, 2, 10, 11]
-    assert h264_counters(page, pages, [*packets[:3], packets[3][:-8], *packets[4:11]]) == [0, 1, 2, 10]
     smaller = stream("h264", 4, size=(320, 180), interval=4, quality=40)
     assert h264_counters(page, pages, [*packets[:3], *smaller, *packets[10:12]]) == [0, 1, 2, 0, 1, 2, 3, 10, 11]
     mixed = [*packets[:2], *stream("pbvd", 2, size=(320, 240), quality=60), *packets[2:4], *packets[10:12]]

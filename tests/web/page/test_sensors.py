@@ -160,8 +160,7 @@ def test_a_pause_and_a_closed_card_draw_nothing(sensors: Tab) -> None:
     sensors.page.wait_for_timeout(150)
     assert drawings(sensors, "plots", 700) == 0
     sensors.test("plots-pause").click()
-    sensors.test("menu-plots").click()
-    sensors.page.get_by_text("Close Plots").click()
+    sensors.page.get_by_label("Close Plots").click()
     assert sensors.until("!document.querySelector('.plot-lines')")
     assert drawings(sensors, "plots", 400) == 0
     sensors.page.get_by_label("Open Plots").click()
@@ -171,25 +170,19 @@ def test_a_pause_and_a_closed_card_draw_nothing(sensors: Tab) -> None:
 FETCHED = "performance.getEntriesByType('resource').some(({ name }) => /uPlot/.test(name))"
 
 
-def test_a_plot_is_added_remembered_and_removed(show: Show) -> None:
+def test_all_numbers_of_a_metric_are_plotted_and_remembered(show: Show) -> None:
     with show(replace(SENSORS, path="/")) as opened:
         opened.page.locator("[data-test^=card-]").first.wait_for()
         assert not opened.page.evaluate(FETCHED)  # it comes with the plots only
         opened.page.goto(opened.page.url + SENSORS.path.lstrip("/"))
-        see(opened, "plots-add")
-        add = opened.test("plots-add")
-        add.select_option("sensors/imu accel_mps2")
+        see(opened, "plots-of")
+        opened.test("plots-of").select_option("sensors/imu")
         figure = opened.test("plot-sensors/imu accel_mps2")
         assert opened.until(lambda: figure.locator("li").count() == 3)
         opened.page.reload()
         figure.wait_for()
-        for field in ("x_mm", "y_mm", "heading_rad", "distance_mm"):
-            add.select_option(f"wheel-odometry {field}")
-        add.select_option("sensors/imu temp_c")
-        assert add.is_disabled()
-        assert "remove one" in opened.page.locator("#why-plots").inner_text()
-        opened.page.get_by_label("Remove sensors/imu temp_c").click()
-        assert add.is_enabled()
+        opened.test("plots-of").select_option("")
+        assert opened.until(lambda: figure.count() == 0)
         assert opened.complaints() == []
 
 

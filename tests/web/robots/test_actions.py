@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -13,7 +11,7 @@ from playwright.sync_api import Browser
 
 from tests.web.browser import Tab, answer, tab
 from tests.web.canned import CannedServer, Show
-from tests.web.console import FORWARD, LEFT, RIGHT, Console, Wheels, Wire, console, pad, used
+from tests.web.console import FORWARD, LEFT, Console, Wheels, Wire, console, pad, used
 from tests.web.stage import Stage
 from tests.web.states import STATES
 
@@ -177,99 +175,6 @@ def test_the_buttons_of_a_gamepad_stop(at_benjr: Console, wire: Wire) -> None:
     assert at_benjr.tab.until(lambda: wire.latched("benjr"), 2)
     assert at_benjr.rests()
     assert at_benjr.because("stopped", within=2)  # else the next test would not see what it has to reset
-
-
-# -- mappings of gamepads
-
-_SWAPPED = {
-    "x": {"axis": 3, "invert": True},
-    "z": {"axis": 2, "invert": True},
-    "deadZone": 0.2,
-    "buttons": {"stop": 5, "talk": 2, "auxiliary": -1},
-}
-
-
-def _pad(*axes: float, pressed: tuple[int, ...] = ()) -> dict[str, Any]:
-    return {**pad(0, 0, *pressed, name="Odd pad"), "axes": list(axes or (0, 0, 0, 0))}
-
-
-@pytest.fixture
-def with_odd_pad(at_benjr: Console) -> Iterator[Console]:
-    """A gamepad whose mapping was set up in this browser."""
-    at_benjr.page.evaluate("(mapping) => pebble.pads.set('Odd pad', mapping)", _SWAPPED)
-    yield at_benjr
-    at_benjr.pads(_pad())
-    at_benjr.page.wait_for_timeout(120)
-    at_benjr.page.evaluate("() => pebble.pads.set('Odd pad', null)")
-
-
-def test_a_mapping_decides_what_a_gamepad_drives(with_odd_pad: Console) -> None:
-    robot = with_odd_pad
-    assert _drives(robot, _pad(0, 0, -1, 0), wheels=FORWARD)
-    assert _drives(robot, _pad(0, 0, 0, -1), wheels=RIGHT)
-    robot.pads(_pad(1, 1, 0.1, 0.1))
-    assert robot.rests()
-    assert robot.stays_at_rest()
-    robot.pads(_pad(pressed=(2,)))
-    assert robot.tab.until(lambda: _calls(robot) == [["talk", True]], 1)
-    robot.pads(_pad())
-    assert robot.tab.until(lambda: _calls(robot)[-1] == ["talk", False], 1)
-
-
-def test_the_buttons_of_a_mapping_stop_and_the_emergency_stop_is_always_there(
-    with_odd_pad: Console, wire: Wire
-) -> None:
-    robot = with_odd_pad
-    assert _drives(robot, _pad(0, 0, -1, 0), wheels=FORWARD)
-    robot.pads(_pad(0, 0, -1, 0, pressed=(5,)))
-    assert robot.rests()
-    assert not wire.latched("benjr")
-    robot.pads(_pad(0, 0, -1, 0, pressed=(5, 8)))
-    robot.page.wait_for_timeout(120)
-    robot.pads(_pad(0, 0, -1, 0, pressed=(5, 8, 9)))
-    assert robot.tab.until(lambda: wire.latched("benjr"), 2)
-    assert robot.stays_at_rest()
-    robot.pads(_pad())
-    robot.take()
-
-
-def _asks(robot: Console, text: str, expected: bool) -> bool:
-    return robot.tab.until(lambda: (text in robot.test("pad-ask").inner_text()) is expected, 2)
-
-
-def test_the_wizard_learns_a_gamepad_without_moving_anything(at_benjr: Console) -> None:
-    robot, began = at_benjr, time.monotonic_ns()
-    robot.pads(_pad())
-    robot.test("settings").click()
-    robot.test("open-gamepad").click()
-    robot.test("pad-learn").click()
-    for asked, shown in [
-        ("stick forward", _pad(0, 0, 0, 1)),
-        ("stick to the right", _pad(0, -1, 0, 0)),
-        ("Stop for now", _pad(pressed=(3,))),
-    ]:
-        assert _asks(robot, asked, True)
-        robot.pads(shown)
-        assert _asks(robot, asked, False)
-        robot.pads(_pad())
-    while robot.test("pad-skip").count():
-        assert robot.tab.until(lambda: robot.test("pad-ask").inner_text() != "Let go", 2)
-        robot.test("pad-skip").click()
-        robot.page.wait_for_timeout(120)
-    assert not robot.stage.wheels_turning("benjr", since_ns=began)
-    stored = json.loads(robot.page.evaluate("localStorage.getItem('pebble pads')"))["Odd pad"]
-    assert stored["z"] == {"axis": 3, "invert": False}
-    assert stored["x"] == {"axis": 1, "invert": True}
-    assert stored["buttons"]["stop"] == 3
-    robot.pads(_pad(0, 0, 0, 1))
-    assert robot.tab.until(lambda: "forward 100 %" in robot.test("pad-result").inner_text(), 2)
-    assert robot.stays_at_rest()
-    robot.page.keyboard.press("Escape")
-    assert robot.stays_at_rest()  # it is still pushed
-    assert _drives(robot, _pad(0, 0, 0, 1), wheels=FORWARD)
-    robot.pads(_pad())
-    assert robot.rests()
-    robot.page.evaluate("() => pebble.pads.set('Odd pad', null)")
 
 
 # -- screens that only watch

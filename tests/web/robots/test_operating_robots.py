@@ -18,7 +18,7 @@ from tests.web.stage import Stage
 pytestmark = [pytest.mark.alone, pytest.mark.page]  # deadlines are checked
 
 SERVICE = "soundboard_handler"
-_RESTARTED = r"Restart Pebble: asked \d\d:\d\d:\d\d; heartbeat gone \d\d:\d\d:\d\d; back \d\d:\d\d:\d\d"
+_RESTARTED = r"Restart Pebble: asked \d\d:\d\d"
 
 
 @pytest.fixture(scope="module")
@@ -96,7 +96,7 @@ def test_the_service_that_keeps_restarting_is_found(at_goob: Console, stage: Sta
     at_goob.test("bell").click()
     notice = at_goob.page.locator(".notice-service")
     assert notice.count() == 1
-    assert re.search(rf"Goob service {SERVICE} .* \(signal 9\) 2×", notice.inner_text()), notice.inner_text()
+    assert re.search(rf"Goob service {SERVICE} .* \(signal 9\)", notice.inner_text()), notice.inner_text()
     at_goob.page.keyboard.press("Escape")
     assert at_goob.tab.until("document.querySelector('dialog[open]') === null", 2)
 
@@ -107,7 +107,7 @@ def restarted(robot: Console) -> bool:
 
 
 def restarts(robot: Console) -> bool:
-    """Ask for it until it was seen: on a busy machine the hold may have ended early, or the robot was not there."""
+    """Ask until it was asked: on a busy machine the hold may have ended early, or the robot was not there."""
     for _ in range(3):
         if not robot.test("ask-hold").count():
             robot.uncover("service-restart").click()
@@ -117,9 +117,7 @@ def restarts(robot: Console) -> bool:
     return False
 
 
-def test_a_restart_is_asked_gone_and_back_and_moves_nothing(
-    browser: Browser, at_goob: Console, stage: Stage, people: Path
-) -> None:
+def test_a_restart_is_asked_and_moves_nothing(browser: Browser, at_goob: Console, stage: Stage, people: Path) -> None:
     """While another page drives: its gesture is over, and it may go on with a new one."""
     with console(browser, stage, "goob") as driver:
         driver.test("video").click()  # its picture would end the gesture, too
@@ -151,9 +149,8 @@ def test_troubles_of_another_robot_are_listed(at_goob: Console, stage: Stage, wi
     assert at_goob.tab.until(lambda: "MiniLAMP is offline" in spoken.inner_text(), 10), spoken.inner_text()
     at_goob.test("bell").click()
     lines = at_goob.page.locator(".notice", has_text="MiniLAMP").all_inner_texts()
-    newest = [" ".join(text.split()) for text in lines[:2]]
-    assert re.fullmatch(r"✖ MiniLAMP is offline \d\d:\d\d", newest[0])
-    assert re.fullmatch(r"■ MiniLAMP was stopped by eve \d\d:\d\d", newest[1])
+    (newest,) = [" ".join(text.split()) for text in lines]
+    assert re.fullmatch(r"✖ MiniLAMP is offline \d\d:\d\d", newest)
     at_goob.page.locator(".notice-link", has_text="MiniLAMP").first.click()
     assert at_goob.tab.until("window.pebble.driver.ref === 'pebble/robots/minilamp'", 2)
 

@@ -66,8 +66,6 @@ export const ACTIONS = [
 ];
 
 const BOUND = ACTIONS.filter((action) => !action.driving);
-/** What a mapping of a gamepad may give a button to, in the order in which people are asked. */
-export const PAD_ACTIONS = ACTIONS.filter((action) => action.button !== undefined);
 
 /** @param {Action} action @param {import("./inputs.js").Mapping} mapping @returns {number} -1: none */
 export const buttonOf = (action, mapping) => mapping.buttons[action.id] ?? action.button ?? -1;
@@ -85,7 +83,6 @@ export class Actions {
   constructor(act, isOpen = () => true) {
     this.act = act;
     this.isOpen = isOpen;
-    this.padOff = false; // its buttons are being learned
     /** @type {Map<string, string>} actions that are held, and by what */
     this.held = new Map();
     this.padName = "";
@@ -120,7 +117,7 @@ export class Actions {
       const is = pad?.buttons[buttonOf(action, mapping)]?.pressed === true;
       if (is) this.pressed.add(action.id);
       else this.pressed.delete(action.id);
-      if (is && !was && !isNew && !this.padOff) this.begin(action, "gamepad");
+      if (is && !was && !isNew) this.begin(action, "gamepad");
       if ((!is || isNew) && this.held.get(action.id) === "gamepad") this.end(action.id);
     }
   }

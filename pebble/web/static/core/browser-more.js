@@ -30,5 +30,9 @@ const blind = /** @type {any} */ ({ observe: nothing, disconnect: nothing });
 /** @param {ResizeObserverCallback} fn @returns {ResizeObserver} */
 export const sizes = (fn) => attempt(() => new ResizeObserver(fn), blind);
 
-/** @param {(seen: boolean) => void} fn @returns {IntersectionObserver} */
-export const sight = (fn) => attempt(() => new IntersectionObserver((all) => fn(all[all.length - 1].isIntersecting)), blind);
+/** @param {(seen: boolean) => void} fn @param {string} [rootMargin] around the screen @returns {IntersectionObserver} */
+export const sight = (fn, rootMargin = "0px") =>
+  attempt(
+    () => new IntersectionObserver((all) => fn(all[all.length - 1].isIntersecting), { rootMargin }),
+    /** @type {any} */ ({ observe: () => fn(true), disconnect: nothing }),
+  );

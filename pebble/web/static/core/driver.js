@@ -2,35 +2,39 @@
 
 import * as browser from "./browser.js";
 import { Gesture, PERIOD_MS, STALL_MS } from "./gesture.js";
-import { DRIVE_KEYS, Inputs, PAD_ESTOP, USUAL } from "./inputs.js";
+import { DRIVE_KEYS, Inputs, PadStops } from "./inputs.js";
+import { Lease } from "./lease.js";
+import { PageClock } from "./page-clock.js";
 import { SLOW_MS, SLOW_SPEED, driveReason } from "./reasons.js";
 import { callAll } from "./store.js";
 
-const SUSPENDED_MS = 500; // between the wall clock and the page's own
 const TWICE_MS = 600; // Escape, pressed twice
 const PRESSED = "button, [role=button], summary, a, input[type=checkbox], input[type=radio]"; // by the space bar, too
 const TYPING = "input:not([type=range]):not([type=checkbox]):not([type=radio]), select, textarea, [contenteditable]";
 
+/**
+ * What the page shows of the robot: ``pictureAge`` in ms; NaN: unknown; null: none is wanted here. ``isLoading``: what
+ * shows the picture and the reasons is not here yet. ``isOld``: it is older than the server.
+ * @typedef {{nameOf: (ref: string) => string, isOld: () => boolean, isLoading: () => boolean, pictureAge: () => number | null}} PageView
+ */
+
 export class Driver {
-  /** @param {{socket: any, store: any, estop: any, reload: () => boolean}} parts */
-  constructor({ socket, store, estop, reload }) {
+  /**
+   * @param {{socket: any, store: any, estop: any, page?: Partial<PageView>}} parts ``page``: what the page shows
+   */
+  constructor({ socket, store, estop, page = {} }) {
     this.socket = socket;
     this.store = store;
     this.estop = estop;
-    this.reload = reload;
+    /** @type {PageView} */
+    this.page = { nameOf: (ref) => ref.split("/").pop() ?? "", isOld: () => false, isLoading: () => false, pictureAge: () => null, ...page };
+    this.lease = new Lease(store, socket);
+    this.clock = new PageClock();
     this.ref = "";
     this.inputs = new Inputs();
     this.gesture = new Gesture((command) => this.socket.send({ op: "drive", ref: this.ref, ...command }));
     this.sliders = { speed: 0.6, turn: 0.6, balance: 0 };
     this.inSight = false; // the driver sees the robot itself
-    /** @type {() => number|null} the age of the picture in ms; NaN: unknown; null: none is wanted here */
-    this.pictureAge = () => null;
-    /** @type {(ref: string) => string} what people call it */
-    this.nameOf = (ref) => ref.split("/").pop() ?? "";
-    /** @type {() => boolean} whether what shows the picture and the reasons is not here yet */
-    this.loading = () => false;
-    /** @type {(by: string, idleMs: number) => void} called when this page loses the lease: to ``by``, or "" */
-    this.onControlLost = () => {};
     /** @type {() => void} called when something ends gestures: a talk ends with them */
     this.onInterrupt = () => {};
     /** @type {(id: string, phase: "down" | "up") => void} what else keys and buttons do; "up" is of those that are held */
@@ -39,15 +43,11 @@ export class Driver {
     this.onSpace = null;
     /** @type {import("./actions.js").Actions | null} which keys and buttons these are; fetched later */
     this.actions = null;
-    /** @type {{read: (shown: any, now: number) => void, [part: string]: any} | null} a PadInput, fetched later; until then gamepads only stop */
+    this.padStops = new PadStops();
+    /** @type {import("./pads.js").Pads | null} fetched later; until then gamepads only stop */
     this.pads = null;
-    this.padLatches = this.padStops = 0; // gamepads that press it
-    this.mine = false;
-    this.passedOver = ""; // who was not let drive
-    this.idleFrom = Infinity; // since when the lease is not used
     this.output = { x: 0, z: 0, y: 0 };
     this.escapeAt = -Infinity;
-    this.updatedAt = -Infinity;
     this.latchedAt = -Infinity; // when the component was last seen stopped
     /** @type {Set<string>} parts of the page that do not work */
     this.failed = new Set();
@@ -56,7 +56,6 @@ export class Driver {
     this.tried = false;
     /** @type {import("./reasons.js").Reason|null} why nothing moves it, whatever is sent; found by what is fetched later */
     this.doubt = null;
-    this.clockBase = Date.now() - performance.now();
     /** @type {Set<() => void>} */
     this.watchers = new Set();
     this.shown = "";
@@ -82,7 +81,7 @@ export class Driver {
     this.interrupt();
     this.gesture.repeats = []; // they would be sent to the other one
     this.ref = ref;
-    this.mine = false;
+    this.lease.select(ref);
     this.inSight = false;
     this.latchedAt = -Infinity;
     this.refusal = "";
@@ -122,11 +121,11 @@ export class Driver {
     const value = (metric) => this.store.get(this.ref, metric)?.value;
     const broker = this.store.get("", "web/broker")?.value;
     return {
-      name: this.nameOf(this.ref),
+      name: this.page.nameOf(this.ref),
       open: this.socket.state === "open" && !this.socket.outdated, // what is known is of the last connection
       connecting: this.socket.state === "connecting" || (this.socket.state === "open" && this.socket.outdated),
       broker: broker?.problem ?? "",
-      reload: this.reload(),
+      reload: this.page.isOld(),
       drives: this.socket.you?.drives !== false,
       rights: this.socket.you?.rights ?? [],
       words: this.socket.you?.words ?? {},
@@ -138,11 +137,11 @@ export class Driver {
       estop: value("web/estop"),
       freeForMs: performance.now() - this.latchedAt,
       capabilities: value("capabilities")?.value ?? {},
-      driver: value("web/driver"),
-      driverIdleMs: this.idleMs(),
+      driver: this.lease.view,
+      driverIdleMs: this.lease.idleMs(),
       script: value("autonomy-status"),
-      loading: this.loading(),
-      pictureAgeMs: this.pictureAge(),
+      loading: this.page.isLoading(),
+      pictureAgeMs: this.page.pictureAge(),
       inSight: this.inSight,
       roundTripMs: this.socket.roundTripMs,
       failed: [...this.failed][0] ?? "",
@@ -152,35 +151,21 @@ export class Driver {
     };
   }
 
-  /** How long the holder of the lease has not driven. */
-  idleMs() {
-    const entry = this.store.get(this.ref, "web/driver");
-    const idle = entry?.value.idle_s;
-    return typeof idle === "number" ? 1000 * idle + entry.age : -1;
-  }
-
   take(over = false) {
     this.interrupt();
-    this.socket.send({ op: "lease", ref: this.ref, take: true, over });
-  }
-
-  /** Who asks this page for control, and was not refused; "" nobody. */
-  get asks() {
-    const view = this.store.get(this.ref, "web/driver")?.value;
-    return view?.you && view.asks !== this.passedOver ? view.asks : "";
+    this.lease.take(over);
   }
 
   /** Do not let drive who asks now. */
   keep() {
-    this.passedOver = this.asks;
+    this.lease.keep();
     this.changed();
   }
 
   /** Give control back, or ask for it no more. */
   release() {
     this.interrupt();
-    this.mine = false;
-    this.socket.send({ op: "lease", ref: this.ref, take: false });
+    this.lease.release();
   }
 
   /** The space bar: stops the robot, with or without the lease. */
@@ -336,42 +321,22 @@ export class Driver {
   }
 
   watchLease() {
-    const view = this.store.get(this.ref, "web/driver")?.value;
-    if (this.socket.state !== "open" || !view) return;
-    const now = performance.now();
-    if (this.mine && !view.you) this.onControlLost(view.by, Math.max(0, now - this.idleFrom));
-    this.mine = view.you;
-    if (!view.asks) this.passedOver = "";
-    const idle = this.idleMs();
-    if (this.mine) this.idleFrom = idle < 0 ? Infinity : now - idle;
-  }
-
-  /** Where the page's clock stands still while the machine is suspended, only the other one shows it. */
-  checkClock(now) {
-    const base = Date.now() - now;
-    const jump = Math.abs(base - this.clockBase);
-    this.clockBase = base;
-    if (jump <= SUSPENDED_MS) return;
-    this.leave();
-    this.socket.restart();
+    this.lease.watch();
   }
 
   readPads() {
     const shown = browser.gamepads() ?? [];
-    if (this.pads) return this.pads.read(shown, performance.now());
-    const isPressed = (pad, index) => browser.attempt(() => pad.buttons[index].pressed, false);
-    const pressing = (buttons) => shown.filter((pad) => buttons.every((index) => isPressed(pad, index))).length;
-    const [latches, stops] = [pressing(PAD_ESTOP), pressing([USUAL.buttons.stop])];
-    if (latches > this.padLatches) this.latch("gamepad");
-    if (stops > this.padStops) this.space();
-    Object.assign(this, { padLatches: latches, padStops: stops });
+    const stop = this.padStops.read(shown); // before all that may fail
+    if (stop === "latch") this.latch("gamepad");
+    else if (stop) this.space();
+    this.pads?.read(shown, performance.now());
   }
 
   update() {
     const now = performance.now();
-    if (now - this.updatedAt > STALL_MS) this.leave(); // the page stood still: releases may have been lost
-    this.updatedAt = now;
-    this.checkClock(now);
+    const gap = this.clock.look(now);
+    if (gap) this.leave();
+    if (gap === "suspended") this.socket.restart();
     if (this.store.get(this.ref, "web/estop")?.value.latched) this.latchedAt = now;
     const situation = this.ref ? this.situation() : null;
     const why = situation && driveReason({ ...situation, mustRelease: false });
@@ -393,9 +358,9 @@ export class Driver {
   /** Notify watchers, if what they show is another than before. */
   changed() {
     const { x, z, y } = this.output;
-    const { ref, pads, sliders, inSight, typing } = this;
-    const pad = pads && [pads.choice.key, pads.reasons()];
-    const shown = JSON.stringify([ref, this.reason(), x, z, y, pad, sliders, inSight, typing, this.hintedAt, this.asks]);
+    const { ref, pads, sliders, inSight, typing, lease } = this;
+    const pad = pads && [pads.key, pads.reasons()];
+    const shown = JSON.stringify([ref, this.reason(), x, z, y, pad, sliders, inSight, typing, this.hintedAt, lease.asks]);
     if (shown === this.shown) return;
     this.shown = shown;
     callAll(this.watchers);

@@ -1,5 +1,7 @@
 /** What keys, stick, buttons and gamepad ask for, as one vector. Pure: events are passed in by driver.js. */
 
+import { attempt } from "./browser.js";
+
 export const LEFT = ["KeyA", "ArrowLeft"];
 export const RIGHT = ["KeyD", "ArrowRight"];
 export const FORWARD = ["KeyW", "ArrowUp"];
@@ -8,7 +10,8 @@ export const UP = ["KeyQ"];
 export const DOWN = ["KeyE"];
 export const DRIVE_KEYS = new Set([...LEFT, ...RIGHT, ...FORWARD, ...BACK, ...UP, ...DOWN]);
 
-const DEAD_ZONE = 0.1;
+const DEAD_ZONE = 0.1; // of the stick on the page
+const PAD_DEAD_ZONE = 0.15; // worn sticks rest so far from the middle
 const FROZEN_MS = 3000; // a deflected gamepad that drives, and whose time stands still, may be gone
 export const PAD_ESTOP = [8, 9]; // buttons that no mapping has
 
@@ -21,16 +24,49 @@ export const PAD_ESTOP = [8, 9]; // buttons that no mapping has
 /**
  * What of a gamepad does what. ``auxiliary``, while held: the horizontal axis is the auxiliary one. Buttons of other
  * actions are where actions.js says unless they are here, too; -1 is none.
- * @typedef {{x: Axis, z: Axis, deadZone: number, buttons: Record<string, number>}} Mapping
+ * @typedef {{x: Axis, z: Axis, buttons: Record<string, number>}} Mapping
  */
 
-/** @type {Mapping} of the standard layout, and of the Attack 3 */
+/** @type {Mapping} of the standard layout */
 export const USUAL = {
   x: { axis: 0, invert: false },
   z: { axis: 1, invert: true },
-  deadZone: DEAD_ZONE,
   buttons: { stop: 0, auxiliary: 1 },
 };
+
+/** Mappings of gamepads without the standard layout, by what their id has. @type {(Mapping & {id: RegExp})[]} */
+export const MAPPINGS = [
+  { id: /attack 3/i, ...USUAL },
+  { id: /046d-c216|dual action/i, ...USUAL, buttons: { stop: 1, auxiliary: 2 } }, // Logitech F310 at D: its buttons begin with X
+];
+
+/** @param {{id: string, mapping: string}} pad @returns {Mapping} */
+export const mappingOf = ({ id, mapping }) => (mapping !== "standard" && MAPPINGS.find((known) => known.id.test(id))) || USUAL;
+
+/** Presses of the buttons that stop, on every gamepad. */
+export class PadStops {
+  /** @type {Set<string>} what is pressed, by gamepad */
+  pressed = new Set();
+
+  /**
+   * Take what the browser shows. A button that is pressed when a gamepad appears counts: browsers show a gamepad only
+   * after a button was pressed, and this may be it.
+   * @param {readonly any[]} shown with holes @returns {"" | "stop" | "latch"} what was pressed since the last time
+   */
+  read(shown) {
+    const before = this.pressed;
+    this.pressed = new Set(shown.flatMap((pad, place) => stopsOf(pad).map((kind) => `${kind} ${place} ${attempt(() => pad.id, "")}`)));
+    const isNew = (kind) => [...this.pressed].some((press) => press.startsWith(kind) && !before.has(press));
+    return isNew("latch") ? "latch" : isNew("stop") ? "stop" : "";
+  }
+}
+
+/** @returns {("stop" | "latch")[]} */
+function stopsOf(pad) {
+  const isPressed = (index) => attempt(() => pad.buttons[index].pressed === true, false);
+  const stops = isPressed(attempt(() => mappingOf(pad).buttons.stop, USUAL.buttons.stop));
+  return [...(PAD_ESTOP.every(isPressed) ? /** @type {const} */ (["latch"]) : []), ...(stops ? /** @type {const} */ (["stop"]) : [])];
+}
 
 export class Inputs {
   constructor() {
@@ -176,9 +212,9 @@ export class Inputs {
  * What the stick of a gamepad asks for.
  * @param {Pad} pad @param {Mapping} mapping @returns {{x: number, z: number, y: number} | null} null: it has no such axes
  */
-export function padVector({ axes, buttons }, { x, z, deadZone, buttons: { auxiliary } }) {
-  const read = ({ axis, invert }) => (axis < 0 ? 0 : zone(axes[axis], deadZone) * (invert ? -1 : 1));
-  if (![x, z].every(({ axis }) => axis < 0 || Number.isFinite(axes[axis]))) return null;
+export function padVector({ axes, buttons }, { x, z, buttons: { auxiliary } }) {
+  const read = ({ axis, invert }) => zone(axes[axis], PAD_DEAD_ZONE) * (invert ? -1 : 1);
+  if (![x, z].every(({ axis }) => Number.isFinite(axes[axis]))) return null;
   const [across, ahead] = [read(x) + 0, read(z) + 0]; // without -0
   return buttons[auxiliary]?.pressed === true ? { x: 0, z: ahead, y: across } : { x: across, z: ahead, y: 0 };
 }

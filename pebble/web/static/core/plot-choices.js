@@ -1,10 +1,8 @@
-/** Which plots there are: the usual ones, and those that a person adds. Pure. */
+/** Which plots there are: the usual ones, and those of all numbers of a metric. Pure. */
 
 import { numbers } from "./series.js";
 
-export const MOST_ADDED = 6;
-export const MOST_LINES = 6;
-const MOST_CHOICES = 200;
+const MOST_LINES = 6;
 const MINUTES = 60_000;
 
 /**
@@ -63,39 +61,23 @@ export function fieldsOf(plot, row) {
 export const nameOfLine = (field, plot) => (field === "value" ? plot.title.toLowerCase() : field.slice(field.lastIndexOf(".") + 1));
 
 /**
- * What may be added of one metric: every number, and every group of two to six.
+ * All numbers of one metric: those that stand together in it in one plot, every other one in its own.
  * @param {string} metric @param {unknown} payload @returns {Plot[]}
  */
-export function choices(metric, payload) {
-  const names = Object.keys(numbers(payload) ?? {});
+export function plotsOf(metric, payload) {
   /** @type {Map<string, string[]>} */
   const groups = new Map();
-  for (const name of names) {
-    const group = name.includes(".") ? name.slice(0, name.lastIndexOf(".")) : "";
-    groups.set(group, [...(groups.get(group) ?? []), name]);
+  for (const field of Object.keys(numbers(payload) ?? {})) {
+    const group = field.includes(".") ? field.slice(0, field.lastIndexOf(".")) : field;
+    groups.set(group, [...(groups.get(group) ?? []), field]);
   }
-  const together = [...groups].filter(([group, fields]) => group && fields.length > 1 && fields.length <= MOST_LINES);
-  /** @type {[string, string[]][]} */
-  const alone = names.map((name) => [name, [name]]);
-  return [...together, ...alone].slice(0, MOST_CHOICES).map(([name, fields]) => ({
-    id: `${metric} ${name}`,
-    title: name === "value" ? metric : `${metric} ${name}`,
+  return [...groups].map(([group, fields]) => ({
+    id: `${metric} ${group}`,
+    title: group === "value" ? metric : `${metric} ${group}`,
     metric,
     fields,
   }));
 }
-
-/** What was remembered, if it is a list of plots. @param {unknown} stored @returns {Plot[]} */
-export function restored(stored) {
-  const plots = (Array.isArray(stored) ? stored : []).filter(isPlot).slice(0, MOST_ADDED);
-  return plots.map(({ id, title, metric, fields }) => ({ id, title, metric, fields: fields.slice(0, MOST_LINES) }));
-}
-
-const isText = (value) => typeof value === "string" && value.length > 0 && value.length < 300;
-
-/** @param {any} one */
-const isPlot = (one) =>
-  isText(one?.id) && isText(one.title) && isText(one.metric) && Array.isArray(one.fields) && one.fields.every(isText);
 
 /** A range of values with some room around, and not less than ``least``. @returns {[number, number]} */
 export function spread(low, high, least = 0) {

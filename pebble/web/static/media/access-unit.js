@@ -1,32 +1,9 @@
-// Access units of H.264: their seal, their NAL units, and the codec string of a key frame. Pure.
+// Access units of H.264: their NAL units, and the codec string of a key frame. Pure.
 
 import { PayloadError } from "./errors.js";
 import { MAX_BYTES } from "./jpeg.js";
 
 const [IDR, SPS, PPS] = [5, 7, 8];
-const SEAL = [0, 0, 0, 1, 0x1f]; // a NAL unit of type 31, which decoders skip: the CRC-32 of all before it
-const SEAL_BYTES = SEAL.length + 5;
-const TABLE = Uint32Array.from({ length: 256 }, (_, byte) => {
-  let crc = byte;
-  for (let bit = 0; bit < 8; bit++) crc = crc & 1 ? 0xedb88320 ^ (crc >>> 1) : crc >>> 1;
-  return crc >>> 0;
-});
-
-/**
- * The unit without its seal; throws PayloadError if that is missing or wrong.
- * @param {Uint8Array} sealed
- * @returns {Uint8Array}
- */
-export function unseal(sealed) {
-  const length = Math.max(0, sealed.length - SEAL_BYTES);
-  const unit = sealed.subarray(0, length);
-  const crc = crc32(unit);
-  const expected = [...SEAL, ...[28, 21, 14, 7, 0].map((shift) => ((crc >>> shift) & 0x7f) | 0x80)];
-  if (sealed.length < SEAL_BYTES || expected.some((byte, index) => sealed[length + index] !== byte)) {
-    throw new PayloadError("h264: cut short or damaged");
-  }
-  return unit;
-}
 
 /**
  * Throws PayloadError unless this is Annex B, and a key frame exactly if `keyframe`.
@@ -69,11 +46,4 @@ function nalUnits(unit) {
 function codecString(/** @type {Uint8Array} */ unit, /** @type {number} */ at) {
   const bytes = [unit[at + 1], unit[at + 2], unit[at + 3]].map((byte) => (byte ?? 0).toString(16).padStart(2, "0"));
   return `avc1.${bytes.join("")}`;
-}
-
-/** @param {Uint8Array} bytes */
-function crc32(bytes) {
-  let crc = 0xffffffff;
-  for (let i = 0; i < bytes.length; i++) crc = TABLE[(crc ^ bytes[i]) & 0xff] ^ (crc >>> 8);
-  return (crc ^ 0xffffffff) >>> 0;
 }

@@ -1,7 +1,7 @@
 // Decodes access units of H.264 with WebCodecs, one picture for each.
 
 import * as browser from "../core/browser.js";
-import { checkUnit, unseal } from "./access-unit.js";
+import { checkUnit } from "./access-unit.js";
 import { PayloadError, UnsupportedError } from "./errors.js";
 
 const HELD_MS = 150; // some decoders give a picture out only when the next one comes
@@ -27,12 +27,11 @@ export class H264Decoder {
   /**
    * The newest picture that is ready, with its label; null if the decoder holds it back. Throws PayloadError for what
    * is damaged, UnsupportedError where this browser has no decoder.
-   * @param {Uint8Array} sealed
+   * @param {Uint8Array} unit with its seal, which decoders skip
    * @param {boolean} keyframe
    * @param {any} label returned with the picture of this unit; null: that one is not waited for, nor given out
    */
-  async decode(sealed, keyframe, label) {
-    const unit = unseal(sealed);
+  async decode(unit, keyframe, label) {
     const codec = checkUnit(unit, keyframe);
     try {
       await this.submit(unit, codec, label);

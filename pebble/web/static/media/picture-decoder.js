@@ -5,9 +5,9 @@ import { Sequence, inflate, readPayload } from "./decode.js";
 import { addDifference } from "./delta.js";
 import { PayloadError, UnsupportedError } from "./errors.js";
 import { H264Decoder } from "./h264.js";
-import { checkJpeg } from "./jpeg.js";
+import { checked } from "./jpeg.js";
 
-// Neither a profile nor a turn may change a pixel: a difference would not fit any more.
+// No profile may change a pixel: a difference would not fit any more.
 const AS_IT_IS = /** @type {const} */ ({ colorSpaceConversion: "none", premultiplyAlpha: "none" });
 
 /**
@@ -126,7 +126,7 @@ export class PictureDecoder {
  * @returns {Promise<ImageBitmap>}
  */
 export async function decodeJpeg(bytes) {
-  const { width, height, plain } = checkJpeg(bytes);
+  const { width, height, plain } = checked(bytes);
   let bitmap;
   try {
     bitmap = await browser.find("createImageBitmap")(new Blob([/** @type {any} */ (plain)], { type: "image/jpeg" }), AS_IT_IS);

@@ -1,41 +1,55 @@
-// What the worker of sound pushes, to the loudspeaker: by an AudioWorklet, or without one, by what browsers had before.
+// The loudspeaker of this page: what the worker of sound pushes is played by an AudioWorklet.
 
 import * as browser from "../core/browser.js";
-import { Ring } from "./ring.js";
 
-const BLOCK = 1024;
-const LIMIT_S = 1;
 const WORKLET = new URL("./playout-worklet.js", import.meta.url).href;
 
-/**
- * @param {AudioContext} context
- * @returns {Promise<{node: AudioNode, attach: (port: MessagePort) => void}>} ``attach`` gives it the port of a worker
- */
-export async function makeSpeaker(context) {
-  if (!context.audioWorklet) return oldSpeaker(context);
-  await context.audioWorklet.addModule(WORKLET);
-  const options = { numberOfInputs: 0, outputChannelCount: [2] };
-  const node = new (browser.find("AudioWorkletNode"))(context, "pebble-playout", options);
-  return { node, attach: (port) => node.port.postMessage({ port }, [port]) };
-}
+export class Speaker {
+  constructor() {
+    /** @type {AudioContext|null} */
+    this.context = null;
+    /** @type {GainNode|null} */
+    this.gain = null;
+    /** @type {AudioWorkletNode|null} */
+    this.node = null;
+    /** @type {Promise<void>|null} */
+    this.opening = null;
+  }
 
-/** @param {AudioContext} context */
-function oldSpeaker(context) {
-  const node = context.createScriptProcessor(BLOCK, 0, 2);
-  let ring = new Ring(LIMIT_S * context.sampleRate);
-  let played = 0;
-  /** @type {MessagePort|null} */
-  let worker = null;
-  node.onaudioprocess = ({ outputBuffer }) => {
-    ring.pull(outputBuffer.getChannelData(0), outputBuffer.getChannelData(1));
-    played += BLOCK;
-    worker?.postMessage({ played, removed: ring.removed });
-  };
-  const attach = (/** @type {MessagePort} */ port) => {
-    worker?.close();
-    worker = port;
-    ring = new Ring(LIMIT_S * context.sampleRate);
-    port.onmessage = ({ data }) => ring.push(data.left, data.right);
-  };
-  return { node, attach };
+  /** To be called in a click. @returns {AudioContext} running as soon as the browser lets it */
+  start() {
+    if (!this.context) {
+      this.context = new (browser.find("AudioContext"))({ latencyHint: "interactive" });
+      this.gain = this.context.createGain();
+      this.gain.connect(this.context.destination);
+    }
+    this.context.resume();
+    return this.context;
+  }
+
+  /** @returns {Promise<void>} once it can play; an error is thrown where it cannot */
+  async ready() {
+    this.opening ??= this.open(this.start());
+    try {
+      await this.opening;
+    } catch (error) {
+      this.opening = null; // the next one tries again
+      throw error;
+    }
+  }
+
+  /** @param {AudioContext} context */
+  async open(context) {
+    await context.audioWorklet.addModule(WORKLET);
+    this.node = new (browser.find("AudioWorkletNode"))(context, "pebble-playout", { numberOfInputs: 0, outputChannelCount: [2] });
+    this.node.connect(/** @type {GainNode} */ (this.gain));
+  }
+
+  /** Play what comes by this port. @param {MessagePort} port of the worker */
+  attach = (port) => this.node?.port.postMessage({ port }, [port]);
+
+  /** @param {boolean} muted */
+  mute(muted) {
+    if (this.gain) this.gain.gain.value = muted ? 0 : 1;
+  }
 }

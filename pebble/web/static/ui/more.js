@@ -3,14 +3,10 @@
 import { ROOT } from "../core/browser.js";
 import * as more from "../core/browser-more.js";
 import { Actions } from "../core/actions.js";
-import { Awake } from "../core/awake.js";
-import { PadInput } from "../core/pad-input.js";
+import { Pads } from "../core/pads.js";
 import { install as installCommands } from "./commands.js";
 import { lacks } from "./parts/lacks.js";
 import { WATCHES } from "./parts/models.js";
-import { pads } from "./parts/pads.js";
-
-export { keepWhole } from "./mend.js";
 
 const WATCHING = ["help", "mute"]; // what can be asked of a screen that only watches
 const STEP = 0.1; // of the speed, for each press
@@ -29,9 +25,8 @@ export function install(page) {
     () => driver.ref !== "" && document.querySelector("dialog[open]") === null,
   );
   installCommands(page);
-  driver.onControlLost = (by, idleMs) => page.connection.show(controlEnd(by, idleMs));
-  page.pads = pads;
-  driver.pads = new PadInput(driver, (id) => pads.mappingOf(id));
+  driver.lease.onLost = (by, idleMs) => page.connection.show(controlEnd(by, idleMs));
+  driver.pads = new Pads(driver);
   new Wall(page).start();
   const missing = lacks().join(" ");
   if (missing) page.connection.show(missing);
@@ -90,7 +85,8 @@ class Doer {
 class Wall {
   constructor(page) {
     this.page = page;
-    this.awake = new Awake(more.wakeLock());
+    /** @type {WakeLockSentinel | null} */
+    this.lock = null;
     this.uselessSince = Infinity;
   }
 
@@ -102,8 +98,15 @@ class Wall {
   check() {
     const { connection, driver, store } = this.page;
     const drives = connection.isOpen && store.get(driver.ref, "web/driver")?.value.you === true;
-    this.awake.want(WATCHES || drives);
+    this.keepAwake(WATCHES || drives);
     if (WATCHES) this.recover(connection);
+  }
+
+  /** Browsers allow it over https; they take the lock away when the page is hidden. */
+  async keepAwake(wanted) {
+    if (wanted === (this.lock?.released === false) || document.hidden) return;
+    if (!wanted) this.lock?.release();
+    this.lock = wanted ? ((await more.wakeLock()?.request("screen").catch(() => null)) ?? null) : null;
   }
 
   /** Load the page again when it is older than the server, or the server has ended its session. */

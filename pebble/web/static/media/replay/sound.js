@@ -1,7 +1,7 @@
 // The sound of a recording, at the speed at which it was recorded, together with its pictures.
 
 import * as browser from "../../core/browser.js";
-import { makeSpeaker } from "../speaker.js";
+import { Speaker } from "../speaker.js";
 
 const BUFFERED_MS = 65; // in the jitter buffer, and at the loudspeaker: see playout.js
 const LATEST_MS = 500; // sound is not shifted further
@@ -21,9 +21,7 @@ export class ReplaySound {
     this.soundDelay = NaN;
     /** @type {import("../playout.js").Stats | null} */
     this.stats = null;
-    /** @type {AudioContext | null} */
-    this.context = null;
-    /** @type {{node: AudioNode, attach: (port: MessagePort) => void} | null} */
+    /** @type {Speaker | null} */
     this.speaker = null;
     /** @type {Worker | null} */
     this.worker = null;
@@ -35,11 +33,10 @@ export class ReplaySound {
     this.problem = "";
     this.onChange();
     try {
-      const context = (this.context ??= new (browser.find("AudioContext"))({ latencyHint: "interactive" }));
-      context.resume();
-      const speaker = (this.speaker ??= await makeSpeaker(context));
+      this.speaker ??= new Speaker();
+      this.speaker.start();
+      await this.speaker.ready();
       if (!this.on) return; // stopped meanwhile
-      speaker.node.connect(context.destination);
       this.worker ??= this.open();
       this.reset();
       this.adjust();
@@ -61,7 +58,11 @@ export class ReplaySound {
     this.worker?.terminate();
     this.worker = null;
     this.context?.close();
-    this.context = this.speaker = null;
+    this.speaker = null;
+  }
+
+  get context() {
+    return this.speaker?.context ?? null;
   }
 
   /** @param {boolean} runs */

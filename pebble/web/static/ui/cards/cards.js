@@ -36,9 +36,6 @@ export const HUD = styled(async () => (await import("../robot/hud.js")).Hud, "pi
 /** What belongs to a picture besides it. */
 export const EXTRAS = styled(() => import("../robot/picture-extras.js"), "picture.css");
 
-/** What can be done with a card. */
-export const MENU = styled(async () => (await import("./card-menu.js")).CardMenu, "panels.css");
-
 /** @type {CardKind[]} */
 export const CARDS = [
   {

@@ -1,11 +1,11 @@
 // Values over the last minutes. What draws them is fetched with this card; nothing is drawn while it is closed.
 
 import { numbers } from "../../core/series.js";
-import { MOST_ADDED, USUAL, choices, fieldsOf, limitsOf, nameOfLine, restored } from "../../core/plot-choices.js";
+import { USUAL, fieldsOf, limitsOf, nameOfLine, plotsOf } from "../../core/plot-choices.js";
 import { html, useMetrics, useOnline, usePage, useState, useTick } from "../parts/hooks.js";
 import { read, write } from "../parts/models.js";
 import { Nothing } from "../parts/nothing.js";
-import { Gone, Icon, Why, isGone } from "../parts/parts.js";
+import { Gone, Icon, isGone } from "../parts/parts.js";
 import { Lines } from "./plot.js";
 import { recorderOf } from "../parts/recorder.js";
 import { plain } from "../parts/more-words.js";
@@ -15,39 +15,28 @@ const WORDS_MS = 500; // between two changes of the numbers
 const MOST_METRICS = 60; // in the list
 
 export function Plots({ at }) {
+  const { store } = usePage();
   const metrics = useMetrics(at);
   const [paused, pause] = useState(false);
-  const [added, setAdded] = useState(() => restored(read(`plots ${at}`, [])));
-  const change = (plots) => {
-    write(`plots ${at}`, plots);
-    setAdded(plots);
-  };
+  const [chosen, choose] = useState(() => String(read(`plots of ${at}`, "")));
   const [all, showAll] = useState(() => read("plots all", false) === true);
   const known = USUAL.filter(({ metric }) => metrics.includes(metric));
   const usual = known.filter(({ first }) => first || all);
   const more = known.length - known.filter(({ first }) => first).length;
+  const whole = chosen ? plotsOf(chosen, store.get(at, chosen)?.value) : [];
   const toggle = () => {
     write("plots all", !all);
     showAll(!all);
   };
-  const parts = { at, paused };
-  const empty = !known.length && !added.length;
+  const change = (metric) => {
+    write(`plots of ${at}`, metric);
+    choose(metric);
+  };
   return html`<div class="plots">
-    ${empty && html`<${Nothing} icon="plot" what="Nothing to plot yet">Any number that is received can be drawn.<//>`}
-    ${usual.map((plot) => html`<${Figure} key=${plot.id} plot=${plot} ...${parts} />`)}
-    ${added.map(
-      (plot) => html`<${Figure}
-        key=${plot.id}
-        plot=${plot}
-        ...${parts}
-        onRemove=${(event) => {
-          event.currentTarget.closest(".plots").querySelector("select").focus();
-          change(added.filter((one) => one.id !== plot.id));
-        }}
-      />`,
-    )}
+    ${!known.length && !chosen && html`<${Nothing} icon="plot" what="Nothing to plot yet">Any number that is received can be drawn.<//>`}
+    ${[...usual, ...whole].map((plot) => html`<${Figure} key=${plot.id} plot=${plot} at=${at} paused=${paused} />`)}
     <div class="plot-tools">
-      ${!empty &&
+      ${(known.length > 0 || chosen) &&
       html`<button type="button" data-test="plots-pause" onClick=${() => pause(!paused)}>
         <${Icon} name=${paused ? "play" : "halt"} />${paused ? "Go on" : "Pause"}
       </button>`}
@@ -55,12 +44,12 @@ export function Plots({ at }) {
       html`<button type="button" data-test="plots-all" aria-expanded=${all} onClick=${toggle}>
         ${all ? `Hide ${more}` : `${more} more`}
       </button>`}
-      <${Add} at=${at} metrics=${metrics} added=${added} onAdd=${(plot) => change([...added, plot])} />
+      <${Choose} at=${at} metrics=${metrics} chosen=${chosen} onChoose=${change} />
     </div>
   </div>`;
 }
 
-function Figure({ at, plot, paused, onRemove }) {
+function Figure({ at, plot, paused }) {
   const page = usePage();
   const limits = limitsOf(plot.metric);
   const series = recorderOf(page, at).follow("numbers", plot.metric, numbers, limits);
@@ -75,10 +64,6 @@ function Figure({ at, plot, paused, onRemove }) {
   return html`<figure class="plot" data-test=${name} aria-label=${`${plot.title}, last ${minutes} minutes`}>
     <figcaption>
       <b>${plot.title}</b> <small>${minutes} min</small>
-      ${onRemove &&
-      html`<button type="button" class="quiet" aria-label=${`Remove ${plot.title}`} onClick=${onRemove}>
-        <${Icon} name="close" />
-      </button>`}
     </figcaption>
     <${Lines}
       key=${fields.join()}
@@ -109,45 +94,17 @@ function words(series, field, plot, payload) {
 }
 
 /** A list of everything that has numbers. */
-function Add({ at, metrics, added, onAdd }) {
+function Choose({ at, metrics, chosen, onChoose }) {
   const { store } = usePage();
   useTick(2000); // payloads get more fields
-  const shown = new Set(added.map(({ id }) => id));
-  const groups = metrics
-    .filter((metric) => !metric.startsWith("web/"))
-    .sort()
-    .slice(0, MOST_METRICS)
-    .map((metric) => ({ metric, plots: choices(metric, store.get(at, metric)?.value) }))
-    .filter(({ plots }) => plots.length);
-  if (!groups.length && !added.length) return null;
-  const full = added.length >= MOST_ADDED ? `Not more than ${MOST_ADDED}: remove one first` : "";
-  const why = full || (groups.length ? "" : "Nothing with numbers was received yet");
-  const choose = ({ currentTarget }) => {
-    const chosen = groups.flatMap(({ plots }) => plots).find(({ id }) => id === currentTarget.value);
-    currentTarget.value = "";
-    if (chosen) onAdd(chosen);
-  };
+  const having = metrics.filter((metric) => !metric.startsWith("web/") && numbers(store.get(at, metric)?.value));
+  const listed = [...new Set([...having.sort().slice(0, MOST_METRICS), chosen])].filter(Boolean);
+  if (!listed.length) return null;
   return html`<label class="field"
-      ><span>Add a plot</span>
-      <select
-        data-test="plots-add"
-        value=""
-        disabled=${why !== ""}
-        aria-describedby=${why ? "why-plots" : undefined}
-        onChange=${choose}
-      >
-        <option value="">choose…</option>
-        ${groups.map(
-          ({ metric, plots }) => html`<optgroup key=${metric} label=${metric}>
-            ${plots
-              .filter(({ id }) => !shown.has(id))
-              .map(({ id, fields, title }) => html`<option key=${id} value=${id}>${optionWords(fields, title)}</option>`)}
-          </optgroup>`,
-        )}
-      </select></label
-    >
-    ${why && html`<${Why} id="why-plots">${why}<//>`}`;
+    ><span>All numbers of</span>
+    <select data-test="plots-of" value=${chosen} onChange=${(event) => onChoose(event.currentTarget.value)}>
+      <option value="">choose…</option>
+      ${listed.map((metric) => html`<option key=${metric} value=${metric}>${metric}</option>`)}
+    </select></label
+  >`;
 }
-
-const optionWords = (fields, title) =>
-  fields.length > 1 ? `${title.slice(title.indexOf(" ") + 1)}: ${fields.map((one) => one.slice(one.lastIndexOf(".") + 1)).join(", ")}` : fields[0];

@@ -1,17 +1,15 @@
 // What can be done to the whole robot: restart, reboot, update; and the flags that allow pictures and sound.
 
-import { Outcome, bootsOf, lacks } from "../../core/outcome.js";
 import { useAnswer } from "../parts/asking.js";
-import { html, useEffect, useModel, usePage, useState, useTick, useValue } from "../parts/hooks.js";
+import { html, useEffect, usePage, useState, useTick, useValue } from "../parts/hooks.js";
 import { logViewOf } from "../parts/log-view.js";
-import { Model } from "../parts/models.js";
 import { Panel } from "../panels/panel.js";
 import { HoldButton, Icon, Why, useName } from "../parts/parts.js";
 import { useReasons, whyNot, whyNotEnd } from "../parts/why-not.js";
 import { plain } from "../parts/more-words.js";
-import { clockTime, driverName } from "../parts/words.js";
+import { clockTime, driverName, isObject } from "../parts/words.js";
 
-/** @typedef {import("../../core/outcome.js").Action} Action */
+/** @typedef {"reboot" | "service-restart" | "git-pull"} Action */
 
 /** @type {Record<Action, {title: string, effects: (name: string) => string[]}>} */
 const ACTIONS = {
@@ -40,8 +38,16 @@ const ACTIONS = {
 
 export function System({ at, offers, view }) {
   const page = useReasons(at);
-  const [asked, ask] = useState(/** @type {Action | ""} */ (""));
-  useEffect(() => ask(""), [at]);
+  const [asks, ask] = useState(/** @type {Action | ""} */ (""));
+  const [asked, set] = useState(/** @type {{action: Action, n: number, at: number} | null} */ (null));
+  useEffect(() => {
+    ask("");
+    set(null);
+  }, [at]);
+  const held = (action) => {
+    set({ action, n: page.commands.act(at, action), at: page.store.now() });
+    ask("");
+  };
   return html`<div class="system">
     <div class="system-actions">
       ${Object.keys(ACTIONS).map((action) => {
@@ -62,8 +68,8 @@ export function System({ at, offers, view }) {
       })}
     </div>
     <${AuditButton} at=${at} />
-    ${asked && html`<${Ask} at=${at} action=${asked} offers=${offers} onClose=${() => ask("")} />`}
-    <${LastOutcome} at=${at} view=${view} />
+    ${asks && html`<${Ask} at=${at} action=${asks} offers=${offers} onHeld=${() => held(asks)} onClose=${() => ask("")} />`}
+    ${asked && html`<${Asked} at=${at} asked=${asked} view=${view} />`}
     <${Flags} at=${at} offers=${offers} />
   </div>`;
 }
@@ -91,23 +97,19 @@ function AuditButton({ at }) {
 const whyNotAct = (page, at, offers, action) =>
   whyNot(page, at, "", "system") || lacks(action, offers.known ? offers.value : undefined);
 
-function Ask({ at, action, offers, onClose }) {
+function Ask({ at, action, offers, onHeld, onClose }) {
   const page = useReasons(at);
   const name = useName(at);
   const { title, effects } = ACTIONS[action];
   const why = whyNotAct(page, at, offers, action);
-  const held = () => {
-    begin(page, at, action);
-    onClose();
-  };
   return html`<${Panel} id="ask" title=${`${title}: ${name}`} onClose=${onClose}>
     <div class="system-ask">
       <ul>
         ${effects(name).map((text) => html`<li key=${text}>${text}</li>`)}
         <${Now} at=${at} />
       </ul>
-      <p class="dim">The robot does not acknowledge this. The page shows what is seen of it.</p>
-      <${HoldButton} test="ask-hold" disabled=${Boolean(why)} describedBy=${why ? "ask-why" : undefined} onHeld=${held}
+      <p class="dim">The robot does not acknowledge this: its header says when it is away, and when it is back.</p>
+      <${HoldButton} test="ask-hold" disabled=${Boolean(why)} describedBy=${why ? "ask-why" : undefined} onHeld=${onHeld}
         >Hold 1 s: ${title}<//
       >
       ${why && html`<${Why} id="ask-why">${why}<//>`}
@@ -124,90 +126,39 @@ function Now({ at }) {
   ${script?.running === true && html`<li><b>The script ${plain(script.file)} is running.</b></li>`}`;
 }
 
-// -- what came of it
-
-/** Follows the states of one robot after an action was asked for, whatever is shown meanwhile. */
-class Watch extends Model {
-  /** @param {any} page @param {string} ref @param {Action} action */
-  constructor(page, ref, action) {
-    super();
-    this.page = page;
-    this.ref = ref;
-    this.outcome = new Outcome(action, page.store.now(), boots(page.store, ref));
-    this.n = 0; // of the command
-    const see = () => this.see();
-    this.ends = [
-      page.store.subscribe(ref, "web/liveness", see),
-      page.store.subscribe(ref, "web/estop", see),
-      page.connection.onChange(see),
-    ];
-    this.timer = setInterval(see, 1000);
-  }
-
-  see() {
-    const { store, connection } = this.page;
-    const answer = connection.answers.get(this.n);
-    if (answer?.op === "refused") this.outcome.refused = answer.why;
-    const entry = store.get(this.ref, "web/liveness");
-    const silent = entry?.value.silent_s;
-    this.outcome.see(
-      {
-        connected: connection.isOpen && !connection.socket.outdated,
-        online: entry?.value.online ?? null,
-        heartbeatAt: typeof silent === "number" ? store.now() - 1000 * silent - entry.age : null,
-        boots: boots(store, this.ref),
-      },
-      store.now(),
-    );
-    if (this.outcome.isOver(store.now())) this.end();
-    this.changed();
-  }
-
-  end() {
-    clearInterval(this.timer);
-    this.ends.splice(0).forEach((end) => end());
-  }
-}
-
-const boots = (store, ref) => bootsOf(store.get(ref, "web/estop")?.value?.owners);
-
-const NOTHING = new Model();
-/** @type {Map<string, Watch>} */
-const watches = new Map();
-const begun = new Model();
-
-function begin(page, ref, action) {
-  watches.get(ref)?.end();
-  const watch = new Watch(page, ref, action);
-  watches.set(ref, watch);
-  watch.n = page.commands.act(ref, action);
-  if (!watch.n) watch.outcome.refused = "no connection to the server";
-  begun.changed();
-}
-
-function LastOutcome({ at, view }) {
+/** What became of the last action, which the robot does not acknowledge: its header and its log lines tell the rest. */
+function Asked({ at, asked: { action, n, at: time }, view }) {
   const { store } = usePage();
-  useModel(begun);
-  const watch = watches.get(at);
-  useModel(watch ?? NOTHING);
-  useTick(watch ? 1000 : 0);
-  const { seen, waits } = watch ? outcomeWords(watch.outcome, store.now()) : { seen: "", waits: "" };
+  const answer = useAnswer(n);
+  const refused = n ? answer.op === "refused" && answer.why : "no connection to the server";
   const logs = () => {
-    logViewOf(store, at).choose({ service: "", rank: 0, search: watch?.outcome.action ?? "" });
+    logViewOf(store, at).choose({ service: "", rank: 0, search: action });
     view?.reveal("logs");
   };
-  return html`<div class=${watch ? "system-outcome" : ""} data-test="outcome">
-    <p><span role="status">${seen}</span>${waits && `; ${waits}`}</p>
-    ${watch &&
-    html`<button type="button" data-test="outcome-logs" onClick=${logs}><${Icon} name="list" />Its log lines</button>`}
+  return html`<div class="system-outcome" data-test="outcome">
+    <p role="status"><b>${ACTIONS[action].title}:</b> ${refused ? `not asked: ${refused}` : `asked ${clockTime(time)}`}</p>
+    <button type="button" data-test="outcome-logs" onClick=${logs}><${Icon} name="list" />Its log lines</button>
   </div>`;
 }
 
-/** ``waits`` counts seconds: it is not read aloud. */
-function outcomeWords(outcome, now) {
-  const waits = outcome.refused ? "" : outcome.conclusion(now);
-  const words = outcome.words(now, clockTime).filter((one) => one !== waits);
-  return { seen: html`<b>${ACTIONS[outcome.action].title}:</b> ${words.join("; ")}`, waits };
+const SPELLINGS = {
+  reboot: ["reboot"],
+  "service-restart": ["service_restart", "service-restart"],
+  "git-pull": ["git_pull", "git-pull"],
+};
+
+/**
+ * Why a robot does not offer an action, by its capabilities in any of the original's spellings; "" it does. A robot
+ * without capabilities is assumed to.
+ * @param {Action} action @param {any} capabilities their value; undefined: unknown @returns {string}
+ */
+export function lacks(action, capabilities) {
+  if (!isObject(capabilities)) return "";
+  const system = isObject(capabilities.system) ? capabilities.system : {};
+  const entry = SPELLINGS[action].map((name) => system[name] ?? capabilities[name]).find((known) => known !== undefined);
+  if (entry === true) return "";
+  if (!isObject(entry) || entry.available === false) return "This robot does not offer it";
+  return entry.controls === false ? "Not set up on this robot" : "";
 }
 
 // -- flags

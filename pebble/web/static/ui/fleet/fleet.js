@@ -1,6 +1,7 @@
 // All components at a glance: who is there, who drives, what is stopped.
 
 import { ROOT } from "../../core/browser.js";
+import * as more from "../../core/browser-more.js";
 import { doubtOf } from "./doubt.js";
 import { Bands, progressOf } from "../banner.js";
 import { Liveness } from "../header.js";
@@ -11,11 +12,9 @@ import {
   useMetric,
   useModel,
   usePage,
-  usePart,
   useRef,
   useRefs,
   useState,
-  styled,
   useTick,
   useValue,
 } from "../parts/hooks.js";
@@ -29,13 +28,12 @@ import { battery, driverName, inner, isObject, kindOf, nameOf, roughly, typeOf }
 const THUMBNAIL_MS = 10_000;
 const LIVE_MS = 12_000; // a thumbnail that young is of now
 const DENSE = 13; // so many components are shown in small cards, and by what they need
-const MANY = 100; // beyond, only those on the screen are drawn
+const MANY = 100; // beyond, cards have no pictures, and only those near the screen are drawn
 const NEEDS_MS = 10_000; // so long a card stays among those that need a look
 const LOW_PERCENT = 20;
 const isRobot = (ref) => typeOf(ref) === "robots";
 const SORTS = { name: "name", type: "type", battery: "battery" };
 
-const MANY_PART = styled(async () => (await import("./many.js")).Many, "many.css");
 const kept = { filter: "" }; // while a robot is looked at
 
 export function Fleet() {
@@ -62,7 +60,6 @@ export function Fleet() {
   const others = total - robots.length;
   const dense = total >= DENSE;
   const many = total > MANY;
-  const { body: Many } = usePart(MANY_PART, many);
   const needing = useNeeding(store, dense ? shown : []);
   const groups = [
     { title: dense ? "Need a look" : "", list: shown.filter((ref) => dense ? needing.has(ref) : isRobot(ref)) },
@@ -92,15 +89,13 @@ export function Fleet() {
     </p>`}
     ${total === 0 && html`<${Empty} />`}
     ${total > 0 && !shown.length && !shownAway.length && html`<p class="empty">Nothing matches “${filter}”.</p>`}
-    ${many
-      ? Many && html`<${Many} groups=${groups} away=${shownAway} card=${plainCardOf} row=${rowOf} />`
-      : groups.map(({ title, list }) => html`<${Group} key=${title} title=${title} dense=${dense} refs=${list} />`)}
+    ${groups.map(({ title, list }) => html`<${Group} key=${title} title=${title} dense=${dense} plain=${many} refs=${list} />`)}
     ${total > 0 && !dense && !WATCHES && html`<${FirstTime} refs=${there} />`}
-    ${!many && shownAway.length > 0 &&
+    ${shownAway.length > 0 &&
     html`<section class="away" aria-labelledby="away-title">
       <h2 id="away-title">Offline</h2>
-      <ul>
-        ${shownAway.map((ref) => html`<li key=${ref} class="away-item">${rowOf(ref)}</li>`)}
+      <ul class=${many ? "many" : ""}>
+        ${shownAway.map((ref) => html`<${Item} key=${ref} at=${ref} many=${many} draw=${rowOf} />`)}
       </ul>
     </section>`}
   </div>`;
@@ -459,18 +454,30 @@ function AwayRow({ at }) {
  * One list of cards. Each card is drawn again only when it changes by itself: Preact passes over a node that it has drawn
  * before, in the same list.
  */
-function Group({ title, dense, refs }) {
+function Group({ title, dense, plain, refs }) {
   const cards = useRef(new Map());
   const old = cards.current;
-  cards.current = new Map(refs.map((ref) => [ref, old.get(ref) ?? html`<li key=${ref}>${cardOf(ref)}</li>`]));
+  cards.current = new Map(refs.map((ref) => [ref, old.get(ref) ?? html`<${Item} key=${ref} at=${ref} many=${plain} draw=${cardOf} />`]));
   return html`<section aria-label=${title || "Robots"}>
     ${title && html`<h2 class="fleet-group">${title}</h2>`}
-    <ul class=${`fleet-cards ${dense ? "dense" : ""}`}>
+    <ul class=${`fleet-cards ${dense ? "dense" : ""} ${plain ? "many" : ""}`}>
       ${[...cards.current.values()]}
     </ul>
   </section>`;
 }
 
-const cardOf = (ref, plain = false) => html`<${Boundary} what=${nameOf(ref)}><${FleetCard} at=${ref} plain=${plain} /><//>`;
-const plainCardOf = (ref) => cardOf(ref, true);
+/** A component in a list. Of ``many`` only those near the screen are drawn: all at once would hold up keys and STOP. */
+function Item({ at, many, draw }) {
+  const place = useRef(null);
+  const [seen, see] = useState(!many);
+  useEffect(() => {
+    if (!many) return see(true);
+    const sight = more.sight(see, "600px");
+    sight.observe(place.current);
+    return () => sight.disconnect();
+  }, [many]);
+  return html`<li ref=${place}>${seen && draw(at, many)}</li>`;
+}
+
+const cardOf = (ref, plain) => html`<${Boundary} what=${nameOf(ref)}><${FleetCard} at=${ref} plain=${plain} /><//>`;
 const rowOf = (ref) => html`<${AwayRow} at=${ref} />`;

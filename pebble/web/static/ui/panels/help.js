@@ -1,10 +1,10 @@
 // Everything that keys, gamepad and fingers do here, and how stopping works.
 
 import { ACTIONS, buttonName, buttonOf } from "../../core/actions.js";
+import { USUAL, mappingOf } from "../../core/inputs.js";
 import { useExtraAxis } from "../parts/axes.js";
 import { html, useModel, usePage } from "../parts/hooks.js";
 import { useKeyNames } from "../parts/keyboard.js";
-import { pads } from "../parts/pads.js";
 import { Panel } from "./panel.js";
 import { Icon } from "../parts/parts.js";
 
@@ -33,11 +33,11 @@ export function HelpPanel({ onClose }) {
 function Bindings() {
   const { driver } = usePage();
   useModel(driver);
-  useModel(pads);
   const name = useKeyNames();
   const extra = useExtraAxis();
-  const mapping = pads.mappingOf(driver.pads?.pad?.id ?? "");
-  const standard = driver.pads?.pad?.mapping === "standard";
+  const pad = driver.pads?.pad;
+  const mapping = pad ? mappingOf(pad) : USUAL;
+  const standard = pad?.mapping === "standard";
   return html`<section class="panel-text" aria-label="Keys, gamepad and touch">
     <ul class="bindings">
       ${ACTIONS.filter(({ id }) => extra || id !== "auxiliary").map(
@@ -53,7 +53,7 @@ function Bindings() {
     </ul>
     <p class="dim">
       Keys count where they lie: other keyboards have other letters there. They do nothing while you type in a field.
-      Buttons are those of ${driver.pads?.pad?.id || "a usual gamepad"}.
+      Buttons are those of ${pad ? pad.id : "a usual gamepad: connect one, click this page and press a button of it; browsers show it only then"}.
     </p>
   </section>`;
 }

@@ -1,7 +1,7 @@
 // The address of this screen as a QR code; or why a phone cannot open it.
 
 import { ROOT } from "../../core/browser.js";
-import { qrCode, pathOf } from "../../core/qr.js";
+import { generate } from "../../vendor/lean-qr.mjs";
 import { html, useModel, usePage } from "../parts/hooks.js";
 import { Route } from "../parts/models.js";
 import { Panel } from "./panel.js";
@@ -21,15 +21,13 @@ export const isLoopback = (host) => /^(127\.[\d.]+|0\.0\.0\.0|\[::1?\]|localhost
 
 function Code({ at }) {
   const name = useName(at);
-  const whole = location.origin + Route.path(at, false);
-  const grid = qrCode(whole);
-  const address = grid ? whole : location.origin + ROOT;
+  const address = location.origin + Route.path(at, false);
   return html`<div class="panel-text">
-    <${Drawn} grid=${grid ?? qrCode(address)} text=${address} />
+    <${Drawn} text=${address} />
     <p class="address" data-test="address">${address}</p>
     <p>
-      ${at && grid ? `Opens ${name}.` : "Opens the list of all robots."} The phone has to be in this network, and
-      its user logs in; there is no password in the code.
+      ${at ? `Opens ${name}.` : "Opens the list of all robots."} The phone has to be in this network, and its user logs
+      in; there is no password in the code.
     </p>
     ${location.protocol === "https:" &&
     html`<p class="dim">
@@ -38,9 +36,11 @@ function Code({ at }) {
   </div>`;
 }
 
-function Drawn({ grid, text }) {
-  if (!grid) return html`<p>This address is too long for a code.</p>`;
-  const size = grid.length + 2 * QUIET;
+function Drawn({ text }) {
+  const code = /** @type {any} */ (generate)(text);
+  const lines = Array.from({ length: code.size }, (_, at) => at);
+  const path = lines.flatMap((y) => lines.flatMap((x) => (code.get(x, y) ? `M${x} ${y}h1v1h-1z` : []))).join("");
+  const size = code.size + 2 * QUIET;
   return html`<svg
     class="qr"
     role="img"
@@ -49,7 +49,7 @@ function Drawn({ grid, text }) {
     shape-rendering="crispEdges"
   >
     <rect x=${-QUIET} y=${-QUIET} width=${size} height=${size} fill="#fff" />
-    <path d=${pathOf(grid)} fill="#000" />
+    <path d=${path} fill="#000" />
   </svg>`;
 }
 

@@ -19,7 +19,6 @@ const RIGHTS = {
 };
 const MORE = [
   { name: "help", icon: "help", text: "Keys, and how stopping works" },
-  { name: "gamepad", icon: "pad", text: "Set up a gamepad" },
   { name: "phone", icon: "phone", text: "Open on a phone" },
 ];
 
@@ -57,10 +56,6 @@ export function SettingsPanel({ onClose }) {
       <//>`}
     </fieldset>
     <div class="panel-links">
-      ${settings.cards &&
-      html`<button type="button" class="wide" data-test="arrange" onClick=${() => (settings.cards.reset(), onClose())}>
-        <${Icon} name="list" />Arrange the cards as new
-      </button>`}
       <div onClick=${onClose}><${RecordingsLink} at=${driver.ref} className="button wide" /></div>
       ${MORE.map(
         ({ name, icon, text }) => html`<button

@@ -206,7 +206,7 @@ export class Boundary extends Component {
     if (!error) return children;
     return html`<p class="failed" role="alert">
       ${what} failed: ${String(error.message ?? error)}
-      <button type="button" onClick=${() => this.fails(null)}>Try again</button>
+      <button type="button" onClick=${() => location.reload()}>Reload</button>
       ${vital && html`<button type="button" class="stop" onPointerDown=${() => this.context.commands.stop("")}>STOP ALL</button>`}
     </p>`;
   }

@@ -127,8 +127,6 @@ function below(folder) {
 export class Settings extends Model {
   constructor() {
     super();
-    /** @type {CardView | null} those of the component that is open */
-    this.cards = null;
     this.theme = read("theme", "auto");
     this.thumbnails = read("thumbnails", true) === true;
     this.begun = list(read("begun", [])); // of what is shown to who is here for the first time
@@ -184,7 +182,7 @@ export class Settings extends Model {
 export class Panels extends Model {
   shown = "";
 
-  /** @param {"" | "settings" | "help" | "gamepad" | "phone"} name */
+  /** @param {"" | "settings" | "help" | "phone"} name */
   show(name) {
     this.shown = name;
     this.changed();
@@ -195,24 +193,16 @@ export class Panels extends Model {
   }
 }
 
-const MOST_HEIGHTS = 40; // of cards, for each number of columns
-
-/**
- * How the viewer arranged the cards of one kind of component: their order, which are closed or hidden, and how high
- * they were. Those for engineers are closed until they are opened.
- */
+/** Which cards of a component are closed or hidden. Those for engineers are closed until they are opened. */
 export class CardView extends Model {
-  /** @param {string} kind @param {string} [before] whose arrangement counts while this kind has none */
-  constructor(kind, before = "") {
+  /** @param {string} ref */
+  constructor(ref) {
     super();
-    this.key = `cards ${kind}`;
-    const stored = read(this.key, null) ?? (before ? read(`cards ${before}`, {}) : {});
+    this.key = `cards ${ref}`;
+    const stored = read(this.key, null);
     this.closed = new Set(list(stored?.closed));
     this.opened = new Set(list(stored?.opened));
     this.hidden = new Set(list(stored?.hidden));
-    this.order = list(stored?.order);
-    this.heights = heights(stored?.heights);
-    this.arranged = 0; // how often cards got new places
     this.wanted = ""; // a card that is to be looked at now
   }
 
@@ -245,62 +235,11 @@ export class CardView extends Model {
     this.save();
   }
 
-  /** @template {{id: string}} C @param {C[]} cards @returns {C[]} in the viewer's order; new ones where they usually are */
-  sorted(cards) {
-    const place = ({ id }) => this.order.indexOf(id);
-    const known = cards.filter((card) => place(card) >= 0).sort((a, b) => place(a) - place(b));
-    return cards.map((card) => (place(card) < 0 ? card : /** @type {C} */ (known.shift())));
-  }
-
-  /** @param {string[]} ids as they are now @param {string} id that is moved @param {-1 | 1} by */
-  move(ids, id, by) {
-    const at = ids.indexOf(id);
-    const order = ids.filter((one) => one !== id);
-    order.splice(Math.max(0, at + by), 0, id);
-    this.order = order;
-    this.arranged++;
-    this.save();
-  }
-
-  /** Forget the arrangement. */
-  reset() {
-    for (const set of [this.closed, this.opened, this.hidden]) set.clear();
-    this.order = [];
-    this.heights = {};
-    this.arranged++;
-    this.save();
-  }
-
-  /** @param {number} columns @param {string} id @returns {number} px that the card had last time; 0: not known */
-  heightOf(columns, id) {
-    return this.heights[columns]?.[id] ?? 0;
-  }
-
-  /** @param {number} columns @param {Record<string, number>} seen px by card */
-  remember(columns, seen) {
-    const before = JSON.stringify(this.heights);
-    this.heights = heights({ ...this.heights, [columns]: { ...this.heights[columns], ...seen } });
-    if (JSON.stringify(this.heights) !== before) this.write();
-  }
-
-  write() {
-    const { closed, opened, hidden, order, heights } = this;
-    write(this.key, { closed: [...closed], opened: [...opened], hidden: [...hidden], order, heights });
-  }
-
   save() {
-    this.write();
+    const { closed, opened, hidden } = this;
+    write(this.key, { closed: [...closed], opened: [...opened], hidden: [...hidden] });
     this.changed();
   }
-}
-
-/** @param {unknown} stored @returns {Record<string, Record<string, number>>} px by number of columns and card */
-function heights(stored) {
-  const counts = Object.entries(isObject(stored) ? stored : {}).filter(([count, of]) => /^[1-9]$/.test(count) && isObject(of));
-  const plausible = ([, px]) => Number.isInteger(px) && px > 0 && px < 5000;
-  return Object.fromEntries(
-    counts.map(([count, of]) => [count, Object.fromEntries(Object.entries(of).filter(plausible).slice(-MOST_HEIGHTS))]),
-  );
 }
 
 /** What this browser remembers. @param {string} name @param {any} otherwise @returns {any} */
@@ -349,13 +288,6 @@ export class Offers {
   /** What it is called, and looks like: name, description, colour and picture, as far as it says so. */
   get identity() {
     return this.section("identity");
-  }
-
-  /** Robots of one kind share how their cards are arranged: the same body, else the same sections. */
-  get kind() {
-    const { picture } = this.identity;
-    if (typeof picture === "string" && picture) return picture;
-    return [this.isRobot ? "" : "no robot", ...Object.keys(this.value).filter((name) => this.has(name)).sort()].join(" ");
   }
 
   get hasLights() {

@@ -118,12 +118,11 @@ export function Live({ entry, online = true, children }) {
 }
 
 /**
- * ``isFirst``: it is closed until it is opened. ``ids``: the cards among which ``menu`` moves it. ``place``: attributes
- * that say where it is in the columns.
- * @param {{title: string, id: string, icon?: string, aside?: any, view?: any, isFirst?: boolean, ids?: string[], menu?: any,
+ * ``isFirst``: it is closed until it is opened. ``place``: attributes that say where it is in the columns.
+ * @param {{title: string, id: string, icon?: string, aside?: any, view?: any, isFirst?: boolean,
  *   className?: string, place?: Record<string, string>, style?: any, children: any}} props
  */
-export function Card({ title, id, icon, aside, view, isFirst = false, ids, menu, className = "", place, style, children }) {
+export function Card({ title, id, icon, aside, view, isFirst = false, className = "", place, style, children }) {
   const closed = view?.isClosed(id, isFirst) ?? false;
   return html`<section
     class=${`card ${closed ? "closed" : ""} ${className}`}
@@ -137,8 +136,10 @@ export function Card({ title, id, icon, aside, view, isFirst = false, ids, menu,
       <h2 id=${`${id}-title`}>${title}</h2>
       ${aside}
       ${view &&
-      (closed || !ids) &&
-      html`<button
+      html`<button type="button" class="quiet" data-test=${`hide-${id}`} aria-label=${`Hide ${title}`} onClick=${() => view.hide(id)}>
+        <${Icon} name="close" />
+      </button>
+      <button
         type="button"
         class="quiet"
         aria-expanded=${!closed}
@@ -147,7 +148,6 @@ export function Card({ title, id, icon, aside, view, isFirst = false, ids, menu,
       >
         <${Icon} name=${closed ? "down" : "up"} />
       </button>`}
-      ${menu && !closed && html`<${menu} ...${{ title, id, view, isFirst, ids }} />`}
     </header>
     ${!closed && html`<div class="card-body">${children}</div>`}
   </section>`;

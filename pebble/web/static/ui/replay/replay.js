@@ -174,12 +174,11 @@ function Cards({ at }) {
   const [view] = useState(() => new CardView(`replay ${at}`));
   useModel(view);
   const cards = CARDS.filter((card) => !card.sends && !LEFT_OUT.includes(card.id) && card.wants(offers));
-  const shown = view.sorted(cards.filter(({ id }) => !view.hidden.has(id)));
-  const ids = shown.map(({ id }) => id);
+  const shown = cards.filter(({ id }) => !view.hidden.has(id));
   const narrow = shown.filter(({ engineers }) => !engineers);
   const half = Math.ceil(narrow.length / 2);
   const columns = [narrow.slice(0, half), narrow.slice(half)].filter((one) => one.length);
-  const draw = (card) => html`<${Card} key=${card.id} id=${card.id} title=${card.title} icon=${card.icon} view=${view} ids=${ids}>
+  const draw = (card) => html`<${Card} key=${card.id} id=${card.id} title=${card.title} icon=${card.icon} view=${view}>
     <${Boundary} what=${card.title}><${Part} part=${card.part} now at=${at} offers=${offers} view=${view} /><//>
   <//>`;
   return html`<div class="cards">

@@ -8,26 +8,19 @@ const ROW = 4; // px of a row of the grid: cards end at multiples of it
 const SIDE = 340; // the last column, if there is one for driving
 const LEAST = 440; // of each other column
 const EQUAL = 24; // px by which a column has to be shorter to be chosen: tops rise along the list
-const REMEMBER_MS = 2000; // after the last change of a height
 
 /** @param {number} width px @param {boolean} hasSide @returns {number} */
-export const columnsOf = (width, hasSide) => {
+const columnsOf = (width, hasSide) => {
   const side = hasSide ? SIDE + GAP : 0;
   return Math.max(1 - Number(hasSide), Math.floor((width - side + GAP) / (LEAST + GAP))) + Number(hasSide);
 };
-
-const PAGE = 1920; // px, at most
-const PADDING = 48;
-
-/** How many there will be on this window. @param {boolean} hasSide @returns {number} */
-export const expected = (hasSide) => columnsOf(Math.min(PAGE, document.documentElement.clientWidth) - PADDING, hasSide);
 
 /**
  * Where each card is: its column, and its first row. ``homes`` are the columns that were chosen before.
  * @param {{id: string, rows: number, span?: "main" | "all", side?: boolean}[]} cards in their order
  * @param {number} count of columns @param {boolean} hasSide @param {Map<string, number>} homes @returns {Map<string, [number, number, number]>} top, column, span
  */
-export function placed(cards, count, hasSide, homes) {
+function placed(cards, count, hasSide, homes) {
   const ends = Array(count).fill(0);
   const places = new Map();
   for (const { id, rows, span, side } of cards) {
@@ -49,15 +42,12 @@ function shortest(ends) {
 
 /** Places the children of one grid. Their order in the document is that of keyboard and screen reader: it stays. */
 class Columns {
-  /** @param {HTMLElement} grid @param {import("../parts/models.js").CardView} view */
-  constructor(grid, view) {
+  /** @param {HTMLElement} grid */
+  constructor(grid) {
     this.grid = grid;
-    this.view = view;
     this.homes = new Map();
     this.count = 0;
-    this.arranged = view.arranged;
     this.seen = new Set();
-    this.timer = 0;
     this.observer = more.sizes(() => this.place());
     this.follow(grid);
   }
@@ -70,13 +60,13 @@ class Columns {
   }
 
   place() {
-    const { grid, view, homes } = this;
+    const { grid, homes } = this;
     const cards = /** @type {HTMLElement[]} */ ([...grid.children]);
     cards.forEach((card) => this.follow(card));
     const hasSide = cards.some((card) => card.dataset.at === "side" && card.offsetHeight > 0);
     const count = columnsOf(grid.clientWidth, hasSide);
-    if (count !== this.count || view.arranged !== this.arranged) homes.clear();
     if (count !== this.count) {
+      homes.clear();
       const side = hasSide && count > 1 ? ` ${SIDE}px` : "";
       grid.style.gridTemplateColumns = `repeat(${side ? count - 1 : count}, minmax(0, 1fr))${side}`;
       for (const card of cards) {
@@ -85,47 +75,33 @@ class Columns {
         card.style.gridArea = `auto / ${at === "side" ? count : 1} / auto / span ${span ? wide : 1}`;
       }
     }
-    Object.assign(this, { count, arranged: view.arranged });
+    this.count = count;
     const known = cards.map((card) => {
       const { card: id = "", span, at } = card.dataset;
       const rows = card.offsetHeight ? Math.ceil((card.offsetHeight + GAP) / ROW) : 0;
       return { id, rows, span: /** @type {any} */ (span), side: at === "side", card };
     });
     const places = placed(known, count, hasSide, homes); // all was read before anything is written
-    let moved = false;
     for (const { id, rows, card } of known) {
       const [top, at, wide] = places.get(id) ?? [0, 0, 1];
       const area = `${top + 1} / ${at + 1} / span ${Math.max(1, rows)} / span ${wide}`;
-      if (card.style.gridArea === area) continue;
-      card.style.gridArea = area;
-      moved = true;
+      if (card.style.gridArea !== area) card.style.gridArea = area; // this runs with each message, too
     }
-    if (!moved) return; // this runs with each message, too
-    clearTimeout(this.timer);
-    this.timer = setTimeout(() => this.remember(), REMEMBER_MS);
-  }
-
-  /** What is still loading has no height of its own. */
-  remember() {
-    const cards = /** @type {NodeListOf<HTMLElement>} */ (this.grid.querySelectorAll(":scope > .card"));
-    const whole = [...cards].filter((card) => !card.querySelector(".loading"));
-    this.view.remember(this.count, Object.fromEntries(whole.map((card) => [card.dataset.card, card.offsetHeight])));
   }
 
   close() {
-    clearTimeout(this.timer);
     this.observer.disconnect();
   }
 }
 
-/** @param {import("../parts/models.js").CardView} view @returns {{current: any}} for the ``ref`` of the grid */
-export function useColumns(view) {
+/** @returns {{current: any}} for the ``ref`` of the grid */
+export function useColumns() {
   const grid = useRef(null);
   const columns = useRef(/** @type {Columns | null} */ (null));
   useLayoutEffect(() => {
-    columns.current = new Columns(grid.current, view);
+    columns.current = new Columns(grid.current);
     return () => columns.current?.close();
-  }, [view]);
+  }, []);
   useLayoutEffect(() => columns.current?.place());
   return grid;
 }

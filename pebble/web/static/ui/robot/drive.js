@@ -39,7 +39,7 @@ export function Slot({ at }) {
   const name = useName(at);
   const script = useValue(at, "autonomy-status");
   const why = reason?.code === "broker" && !connected ? "The server cannot reach the broker" : reason?.text;
-  const asks = mine ? driver.asks : "";
+  const asks = mine ? driver.lease.asks : "";
   const person = asks.slice(asks.lastIndexOf("/") + 1); // without the account of the server
   const also = view?.others && view.by ? "Someone else drives, too" : "";
   const text = [why ?? (mine ? `You are driving ${name}` : ""), asks && `${asks} asks to drive`, also].filter(Boolean).join(". ");
@@ -98,12 +98,13 @@ const origin = (view) => [view?.device, view?.keeps && `name ${view.checked ? ""
 
 function ReasonAction({ action }) {
   const { commands, driver } = usePage();
-  const hinted = driver.hintedAt > -Infinity && performance.now() - driver.hintedAt < FLASH_MS;
-  useLater(hinted ? FLASH_MS - (performance.now() - driver.hintedAt) : Infinity);
+  const { hintedAt } = driver;
+  const hinted = performance.now() - hintedAt < FLASH_MS;
+  useLater(hinted ? FLASH_MS - (performance.now() - hintedAt) : Infinity);
   switch (action?.kind) {
     case "take":
       return html`<button
-        key=${hinted ? driver.hintedAt : "take"}
+        key=${hinted ? hintedAt : "take"}
         type="button"
         class=${`primary ${hinted ? "flash" : ""}`}
         data-test="take"

@@ -2,8 +2,8 @@
 
 import * as browser from "../../core/browser.js";
 import { Bands } from "../banner.js";
-import { CARDS, DRIVE, EXTRAS, HUD, MENU, NO_CAMERA, PICTURE, TABS, VOICE, hasMap } from "../cards/cards.js";
-import { expected, useColumns } from "./columns.js";
+import { CARDS, DRIVE, EXTRAS, HUD, NO_CAMERA, PICTURE, TABS, VOICE, hasMap } from "../cards/cards.js";
+import { useColumns } from "./columns.js";
 import { DriveCard, DrivePad, Slot, Speed } from "./drive.js";
 import {
   Boundary, fetchRest, html, useEffect, useMemo, useMetric, useMetrics, useModel, usePage, usePart, useState, useTick, useValue,
@@ -16,14 +16,8 @@ import { typeOf } from "../parts/words.js";
 
 export function Robot({ at, layout, drawer, onPanel }) {
   const offers = new Offers(at, useValue(at, "capabilities"), useMetrics(at));
-  const { kind } = offers;
-  const view = useMemo(() => new CardView(kind, at), [kind]);
+  const view = useMemo(() => new CardView(at), [at]);
   useModel(view);
-  const { settings } = usePage();
-  useEffect(() => {
-    settings.cards = view;
-    return () => (settings.cards = null);
-  }, [view]);
   const source = useValue(at, "web/picture-from")?.source || at;
   const stream = useStream(at);
   const hasVideo = offers.hasVideo || source !== at || stream !== "";
@@ -84,9 +78,8 @@ function Desktop({ at, offers, view, video, source }) {
   const cards = wanted(offers, view).filter(({ part }) => part !== VOICE || !video);
   const usual = cards.filter(({ engineers }) => !engineers);
   const side = !offers.drives && video ? usual[0] : null;
-  const columns = expected(!WATCHES && (offers.drives || side !== null));
-  const shown = (card) => html`<${CardOf} key=${card.id} card=${card} among=${card.engineers ? cards.filter(isEngineers) : usual} ...${{ at, offers, view, columns }} side=${card === side} />`;
-  const grid = useColumns(view);
+  const shown = (card) => html`<${CardOf} key=${card.id} card=${card} ...${{ at, offers, view }} side=${card === side} />`;
+  const grid = useColumns();
   return html`<div class="robot">
     <h1 class="sr">${useName(at)}</h1>
     ${!video && !offers.drives && html`<${Bands} at=${at} />`}
@@ -134,7 +127,7 @@ function Portrait({ at, offers, view, video, source, onPanel }) {
   const here = cards.filter((card) => tabOf(card) === tab);
   const usual = here.filter((card) => !card.engineers);
   const engineers = here.filter(isEngineers);
-  const shown = (among) => (card) => html`<${CardOf} key=${card.id} card=${card} among=${among} ...${{ at, offers, view }} />`;
+  const shown = (card) => html`<${CardOf} key=${card.id} card=${card} ...${{ at, offers, view }} />`;
   return html`<div class="robot">
     <h1 class="sr">${useName(at)}</h1>
     ${tab === "drive" &&
@@ -161,14 +154,14 @@ function Portrait({ at, offers, view, video, source, onPanel }) {
     </div>`}
     ${tab !== "drive" && html`<${Bands} at=${at} />`}
     <div class="cards">
-      ${usual.map(shown(usual))}
+      ${usual.map(shown)}
       ${tab === "more" &&
       video &&
       html`<${Card} id="picture" title="Picture" icon="camera"
         ><${Part} part=${PICTURE} at=${at} source=${source} offers=${offers} video=${video} extras=${EXTRAS}
       /><//>`}
       ${tab !== "more" && html`<${Hidden} cards=${hidden(view).filter((card) => tabOf(card) === tab)} view=${view} />`}
-      ${engineers.length > 0 && html`<h2 class="engineers-head">For engineers</h2>`} ${engineers.map(shown(engineers))}
+      ${engineers.length > 0 && html`<h2 class="engineers-head">For engineers</h2>`} ${engineers.map(shown)}
       ${tab === "more" &&
       html`<${Missing} at=${at} offers=${offers} view=${view} hasVideo=${Boolean(video)} />
         <${MoreSettings} onPanel=${onPanel} view=${view} />`}
@@ -210,7 +203,7 @@ function Immersive({ at, offers, view, video, source, drawer, onPanel }) {
       html`<${Card} id="picture" title="Picture" icon="camera"
         ><${Part} part=${PICTURE} at=${at} source=${source} offers=${offers} video=${video} extras=${EXTRAS}
       /><//>`}
-      ${cards.map((card) => html`<${CardOf} key=${card.id} card=${card} among=${cards} ...${{ at, offers, view }} />`)}
+      ${cards.map((card) => html`<${CardOf} key=${card.id} card=${card} ...${{ at, offers, view }} />`)}
       <${MoreSettings} onPanel=${onPanel} view=${view} />
     </aside>`}
   </div>`;
@@ -259,41 +252,23 @@ function SettingsWords() {
 }
 
 const wanted = (offers, view) =>
-  view.sorted(CARDS.filter((card) => card.wants(offers) && !view.hidden.has(card.id) && !(WATCHES && card.sends)));
+  CARDS.filter((card) => card.wants(offers) && !view.hidden.has(card.id) && !(WATCHES && card.sends));
 
-/** Until its part is here it keeps the height that it had last time. */
-function CardOf({ card, among, at, offers, view, columns = 0, side = false }) {
+/** Until its part is here the height that it usually has is kept free. */
+function CardOf({ card, at, offers, view, side = false }) {
   const { body, failed } = usePart(card.part);
-  const menu = usePart(MENU).body;
   return html`<${Card}
     id=${card.id}
     title=${card.title}
     icon=${card.icon}
     view=${view}
     isFirst=${isEngineers(card)}
-    ids=${among.map(({ id }) => id)}
-    menu=${menu}
     className=${isEngineers(card) ? "of-engineers" : ""}
     place=${side ? { "data-at": "side" } : undefined}
-    style=${useHeight(view, columns, card, Boolean(body) || failed)}
+    style=${body || failed || !card.height ? undefined : { minHeight: `${card.height}px` }}
   >
     <${Boundary} what=${card.title}><${Part} part=${card.part} lines=${5} at=${at} offers=${offers} view=${view} /><//>
   <//>`;
-}
-
-const SETTLE_MS = 1500; // after it is here, its values come, and lines are drawn
-
-/** @returns {{minHeight: string} | undefined} for the style of a card */
-function useHeight(view, columns, { id, height = 0 }, isHere) {
-  const [settled, settle] = useState(false);
-  useEffect(() => {
-    if (!isHere) return undefined;
-    const timer = setTimeout(() => settle(true), SETTLE_MS);
-    return () => clearTimeout(timer);
-  }, [isHere]);
-  if (settled) return undefined;
-  const px = view.heightOf(columns, id) || (isHere ? 0 : height);
-  return px ? { minHeight: `${px}px` } : undefined;
 }
 
 /** What is not on this page, and why. */

@@ -4,7 +4,7 @@ import * as browser from "../../core/browser.js";
 import * as more from "../../core/browser-more.js";
 import { device } from "../../core/control-socket.js";
 import { Microphone } from "../../media/microphone.js";
-import { makeSpeaker } from "../../media/speaker.js";
+import { Speaker } from "../../media/speaker.js";
 import { Model, Offers } from "../parts/models.js";
 import { nameIn } from "../parts/looks.js";
 
@@ -13,9 +13,67 @@ const STEP_MS = 200; // while a person talks: the page tells the worker that it 
 const KEEP_MS = 5000; // so long the robot's loudspeaker stays ready after a talk
 const OWN_MS = 1500; // so long after a talk its name is still shown by the server
 
-/** @typedef {{number: number, on: boolean}} Talk ``on``: the server takes it */
-
 /** @typedef {import("../../media/playout.js").Stats} Stats */
+
+/** The worker of sound, while it is connected to one component. */
+class Link {
+  constructor() {
+    /** @type {Worker|null} */
+    this.worker = null;
+    this.ref = ""; // of the component
+    this.name = ""; // whose connection it is
+    this.isOpen = false;
+    /** @type {Stats|null} */
+    this.stats = null;
+  }
+
+  /**
+   * @param {{ref: string, name: string, port: MessagePort|null, rate: number|undefined}} of ``port``: where sound is
+   * played; null: this is only for talking @param {(message: any) => void} onMessage
+   */
+  open({ ref, name, port, rate }, onMessage) {
+    this.close();
+    Object.assign(this, { ref, name });
+    const worker = browser.worker(WORKER);
+    worker.onmessage = ({ data }) => worker === this.worker && onMessage(data);
+    worker.postMessage({ op: "open", ref, name, device: device(), port, rate }, port ? [port] : []);
+    this.worker = worker;
+  }
+
+  /** @param {any} message @param {MessagePort[]} [ports] */
+  send(message, ports = []) {
+    this.worker?.postMessage(message, ports);
+  }
+
+  close() {
+    this.worker?.terminate();
+    Object.assign(this, { worker: null, ref: "", isOpen: false, stats: null });
+  }
+}
+
+/** What a person says: one talk after the other. */
+class Voice {
+  constructor() {
+    this.held = false; // key or button: a talk that was interrupted does not go on
+    /** @type {{number: number, on: boolean}|null} ``on``: the server takes it */
+    this.talk = null;
+    this.count = 0;
+    this.endedAt = -Infinity; // the last talk
+    this.timer = 0;
+    /** @type {Microphone|null} */
+    this.microphone = null;
+  }
+
+  begin() {
+    return (this.talk = { number: ++this.count, on: false });
+  }
+
+  end() {
+    this.talk = null;
+    this.endedAt = performance.now();
+    this.microphone?.release();
+  }
+}
 
 export class Sound extends Model {
   /** @param {any} page its services */
@@ -24,36 +82,34 @@ export class Sound extends Model {
     this.store = store;
     this.connection = connection;
     this.route = route;
-    this.ref = ""; // of the component that the worker is connected to
-    this.name = ""; // whose connection it is
     this.listening = false;
     this.muted = false;
-    /** @type {Talk|null} */
-    this.talking = null;
-    this.held = false; // key or button: a talk that was interrupted does not go on
     this.problem = ""; // of the last attempt to listen or talk
-    this.open = false; // whether the worker is connected
-    /** @type {Stats|null} */
-    this.stats = null;
-    this.talks = 0;
-    this.endedAt = -Infinity; // the last talk
-    /** @type {AudioContext|null} */
-    this.context = null;
-    /** @type {GainNode|null} */
-    this.gain = null;
-    /** @type {Promise<{node: AudioNode, attach: (port: MessagePort) => void}>|null} */
-    this.speaker = null;
-    /** @type {Microphone|null} */
-    this.microphone = null;
-    /** @type {Worker|null} */
-    this.worker = null;
-    this.timer = 0;
+    this.speaker = new Speaker();
+    this.link = new Link();
+    this.voice = new Voice();
     route.onChange(() => {
-      if (route.ref === this.ref) return;
+      if (route.ref === this.link.ref) return;
       this.problem = "";
       this.leave();
     });
-    connection.onChange(() => this.worker && connection.isOpen && connection.you.user !== this.name && this.leave());
+    connection.onChange(() => this.worker && connection.isOpen && connection.you.user !== this.link.name && this.leave());
+  }
+
+  get worker() {
+    return this.link.worker;
+  }
+
+  get context() {
+    return this.speaker.context;
+  }
+
+  get stats() {
+    return this.link.stats;
+  }
+
+  get talking() {
+    return this.voice.talk;
   }
 
   // -- listening
@@ -67,19 +123,16 @@ export class Sound extends Model {
     this.problem = "";
     const { ref } = this.route;
     try {
-      const context = this.start();
+      this.speaker.start();
       this.adjust();
       this.changed();
-      this.speaker ??= makeSpeaker(context);
-      const { node, attach } = await this.speaker;
-      node.connect(/** @type {GainNode} */ (this.gain));
+      await this.speaker.ready();
       if (!this.listening || this.route.ref !== ref) return; // stopped meanwhile
       this.silence();
       const { port1, port2 } = new MessageChannel();
-      attach(port2);
+      this.speaker.attach(port2);
       this.connect(ref, port1);
     } catch (error) {
-      this.speaker = null;
       this.leave();
       this.problem = `Sound cannot be played: ${/** @type {Error} */ (error).message}`;
     }
@@ -101,11 +154,11 @@ export class Sound extends Model {
 
   /** Key or button: held or released. @param {boolean} on */
   talk(on) {
-    if (on && !this.held) {
-      this.held = true;
+    if (on && !this.voice.held) {
+      this.voice.held = true;
       this.begin();
     } else if (!on) {
-      this.held = false;
+      this.voice.held = false;
       this.silence();
     }
   }
@@ -113,60 +166,57 @@ export class Sound extends Model {
   async begin() {
     const why = this.talkReason();
     if (why) return this.connection.show(`Not done: ${why}`);
-    /** @type {Talk} */
-    const talk = { number: ++this.talks, on: false };
+    const talk = this.voice.begin();
     const { ref } = this.route;
-    this.talking = talk;
     this.problem = "";
     const problem = await this.speak(talk, ref).catch((error) => `Talking has failed: ${error.message}`);
     if (this.talking === talk && problem) this.silence(problem);
     if (this.talking) return;
-    this.microphone?.close(); // it was released, perhaps to answer the browser's question
+    this.voice.microphone?.close(); // it was released, perhaps to answer the browser's question
     if (problem && this.route.ref === ref) this.problem = problem;
     this.changed();
   }
 
-  /** @param {Talk} talk @param {string} ref @returns {Promise<string>} why it cannot begin; "" it has, or has ended */
+  /** @param {{number: number}} talk @param {string} ref @returns {Promise<string>} why it cannot begin; "" it has, or has ended */
   async speak(talk, ref) {
-    const context = this.start();
+    const { voice } = this;
+    const context = this.speaker.start();
     this.adjust();
     if (!this.worker) this.connect(ref, null);
-    clearInterval(this.timer);
-    this.timer = setInterval(() => this.step(), STEP_MS);
+    clearInterval(voice.timer);
+    voice.timer = setInterval(() => this.step(), STEP_MS);
     this.changed();
-    const microphone = (this.microphone ??= new Microphone(context));
+    const microphone = (voice.microphone ??= new Microphone(context));
     const problem = await microphone.open();
     if (problem || this.talking !== talk) return problem;
     const { port1, port2 } = new MessageChannel();
     microphone.attach(port2);
-    this.worker?.postMessage({ op: "talk", talk: talk.number, rate: context.sampleRate, port: port1 }, [port1]);
+    this.link.send({ op: "talk", talk: talk.number, rate: context.sampleRate, port: port1 }, [port1]);
     return "";
   }
 
   /** While a talk lasts: its worker ends it unless the page shows that it runs; a dialog ends it, too. */
   step() {
-    if (!this.talking && performance.now() - this.endedAt > KEEP_MS) {
-      clearInterval(this.timer);
+    if (!this.talking && performance.now() - this.voice.endedAt > KEEP_MS) {
+      clearInterval(this.voice.timer);
       if (!this.listening) this.leave();
     } else if (this.talking && document.querySelector("dialog[open]")) this.silence();
-    else if (this.talking) this.worker?.postMessage({ op: "alive" });
+    else if (this.talking) this.link.send({ op: "alive" });
   }
 
   /** What ends a gesture ends a talk; where the page is hidden, or frozen, no timer would close the microphone. */
   interrupt() {
-    this.held = false;
+    this.voice.held = false;
     this.silence();
-    this.microphone?.close();
+    this.voice.microphone?.close();
   }
 
   /** End the talk. @param {string} [why] if the person did not */
   silence(why = "") {
     if (!this.talking) return;
-    this.talking = null;
-    this.endedAt = performance.now();
+    this.voice.end();
     if (why && why !== this.talkReason()) this.problem = why; // a reason that lasts is beside the button
-    this.worker?.postMessage({ op: "end" });
-    this.microphone?.release();
+    this.link.send({ op: "end" });
     this.adjust();
     this.changed();
   }
@@ -176,54 +226,29 @@ export class Sound extends Model {
   /** The page leaves this component, or stops listening. */
   leave() {
     this.silence();
-    clearInterval(this.timer);
-    this.microphone?.close();
+    clearInterval(this.voice.timer);
+    this.voice.microphone?.close();
     this.listening = false;
-    this.disconnect();
+    this.link.close();
     this.context?.suspend();
     this.changed();
   }
 
-  /** @returns {AudioContext} running as soon as the browser lets it */
-  start() {
-    if (!this.context) {
-      this.context = new (browser.find("AudioContext"))({ latencyHint: "interactive" });
-      this.gain = this.context.createGain();
-      this.gain.connect(this.context.destination);
-    }
-    this.context.resume();
-    return this.context;
-  }
-
   /** Nothing is heard while a person talks: it would come back by the microphone. */
   adjust() {
-    if (this.gain) this.gain.gain.value = this.muted || this.talking ? 0 : 1;
+    this.speaker.mute(this.muted || this.talking !== null);
   }
 
   /** @param {string} ref @param {MessagePort|null} port where sound is played; null: this is only for talking */
   connect(ref, port) {
-    this.disconnect();
-    this.ref = ref;
-    this.name = this.connection.you?.user ?? "";
-    const worker = browser.worker(WORKER);
-    worker.onmessage = ({ data }) => worker === this.worker && this.take(data);
-    const message = { op: "open", ref, name: this.name, device: device(), port, rate: this.context?.sampleRate };
-    worker.postMessage(message, port ? [port] : []);
-    this.worker = worker;
-  }
-
-  disconnect() {
-    this.worker?.terminate();
-    this.worker = null;
-    this.ref = "";
-    this.open = false;
-    this.stats = null;
+    const name = this.connection.you?.user ?? "";
+    this.link.open({ ref, name, port, rate: this.context?.sampleRate }, (message) => this.take(message));
   }
 
   /** @param {any} message of the worker */
   take({ stats, connection, answer }) {
-    if (stats) this.stats = stats;
-    if (connection) this.open = connection === "open";
+    if (stats) this.link.stats = stats;
+    if (connection) this.link.isOpen = connection === "open";
     if (connection === "lost") this.silence("The connection was lost");
     if (answer && this.talking?.number === answer.talk) {
       if (answer.on) this.talking.on = true;
@@ -239,7 +264,7 @@ export class Sound extends Model {
     if (!this.connection.isOpen) return "No connection to the server";
     if (this.store.get("", "web/broker")?.value.connected === false) return "The server cannot reach the broker";
     if (!this.offers.has("audio")) return `${nameIn(this.store, this.route.ref)} has no sound`;
-    return browser.find("AudioContext") ? "" : "This browser plays no sound";
+    return browser.find("AudioWorkletNode") ? "" : "Needs https";
   }
 
   /** @returns {string} why this page cannot talk now; "" it can */
@@ -261,7 +286,7 @@ export class Sound extends Model {
   /** @returns {string} who else talks to this component */
   get talker() {
     const talker = this.store.get(this.route.ref, "web/sound")?.value.talker ?? "";
-    const own = talker === this.connection.you?.user && performance.now() - this.endedAt < OWN_MS;
+    const own = talker === this.connection.you?.user && performance.now() - this.voice.endedAt < OWN_MS;
     return this.talking || own ? "" : talker;
   }
 

@@ -125,7 +125,7 @@ function words(sound, view, name) {
   if (talking) return talking.on ? `${name} plays your voice.` : "One moment…";
   if (sound.problem || !listening) return sound.problem;
   const muted = sound.muted ? "muted · " : "";
-  if (!sound.open) return "Connecting…";
+  if (!sound.link.isOpen) return "Connecting…";
   if (view?.state === "refused") return `${name} refuses: ${view.why}`;
   if (["silent", "held"].includes(view?.state)) return `Waits for sound: ${view.why || "none comes"}`;
   if (!stats?.received) return view?.why || "Waits for sound…";
