@@ -164,10 +164,7 @@ class CannedServer:
         return Route(route.path, days)
 
     async def _page(self, request: Request) -> Response:
-        headers = _headers()
-        if self.state.frames:
-            headers["content-security-policy"] += f"; frame-src {self._filled(self.state.frames)}"
-        return self.static.page(request, headers)
+        return self.static.page(request, self._filled(self.state.frames))
 
     async def _stream(self, _request: Request) -> Response:
         """A page that a robot may show in a frame."""
@@ -188,7 +185,7 @@ class CannedServer:
         return JSONResponse(self.state.audit)
 
     async def _post(self, request: Request) -> Response:
-        self.posted.append((request.path_params["name"], await request.json()))
+        self.posted.append((request.path_params["name"], json.loads(await request.body() or "{}")))  # a form has none
         return JSONResponse({})
 
     # -- sockets

@@ -35,7 +35,7 @@ const LOW_PERCENT = 20;
 const isRobot = (ref) => typeOf(ref) === "robots";
 const SORTS = { name: "name", type: "type", battery: "battery" };
 
-const MANY_PART = styled(async () => (await import("./many.js")).Many, "many.css");
+const MANY_PART = styled(async (again) => (await import("./many.js" + again)).Many, "many.css");
 const kept = { filter: "" }; // while a robot is looked at
 
 export function Fleet() {

@@ -207,6 +207,12 @@ export class Sound extends Model {
     this.name = this.connection.you?.user ?? "";
     const worker = browser.worker(WORKER);
     worker.onmessage = ({ data }) => worker === this.worker && this.take(data);
+    worker.onerror = ({ message = "a part of this page is missing" }) => {
+      if (worker !== this.worker) return;
+      this.leave();
+      this.problem = `Sound has failed: ${message}. Try again`;
+      this.changed();
+    };
     const message = { op: "open", ref, name: this.name, device: device(), port, rate: this.context?.sampleRate };
     worker.postMessage(message, port ? [port] : []);
     this.worker = worker;
