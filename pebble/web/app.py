@@ -196,9 +196,8 @@ def _plain(_request: Request, status: int, text: str) -> Response:
 
 def _stopped_page(request: Request, status: int, text: str) -> Response:
     static = _static_of(request)
-    page = (
-        static.files["stopped.html"].decode().replace("{root}", root_of(request)).replace("{text}", html.escape(text))
-    )
+    page = static.files["stopped.html"].decode()
+    page = page.replace("{root}", root_of(request)).replace("{text}", html.escape(text))
     return HTMLResponse(page, status, headers={**NO_STORE, "referrer-policy": "same-origin"})
 
 

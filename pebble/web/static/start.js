@@ -2,7 +2,7 @@
 {
   const WAIT_MS = /** @type {any} */ (globalThis).pebbleWaitMs ?? 10_000; // tests wait less
   const LOOK = ";font:bold 1.4em sans-serif;display:inline-block;padding:.5em;border:2px solid #b3001b";
-  const here = new Set();
+  const here = new WeakSet();
   let tries = 0;
   let late = false;
   let whole = false; // it shows a STOP, and with its looks
@@ -34,7 +34,7 @@
     link.style = `color:#b3001b${LOOK}`;
   };
 
-  document.addEventListener("load", ({ target }) => here.add(target), true);
+  document.addEventListener("load", ({ target }) => target && here.add(target), true);
   document.addEventListener("error", ({ target }) => whole || retry(target), true);
   look();
 

@@ -58,7 +58,9 @@ _SHOWS = """() => {
   });
   if (!red) return "";
   if (form && !form.hidden) return form.firstElementChild.innerText;
-  return words("#app .failed, #app .problem") || words("#app main .loading-words") || "the page";
+  const loading = document.querySelector("#app main .loading") ? "Loading…" : "";
+  const [picture] = words("#app .cover").match(/.*missing.*/) ?? [""];
+  return words("#app .failed") || picture || loading || "the page";
 }"""
 
 

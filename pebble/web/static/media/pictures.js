@@ -110,7 +110,8 @@ export class Pictures {
   }
 
   startWorker() {
-    const fail = ({ message = "a part of this page is missing" }) => this.change({ problem: `pictures cannot be decoded here: ${message}` });
+    const fail = ({ message = "a part of this page is missing" }) =>
+      this.change({ problem: `Pictures cannot be decoded here: ${message}` });
     try {
       const worker = browser.worker(new URL("./video-worker.js", import.meta.url));
       worker.onmessage = ({ data }) => this.take(data);
