@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from typing import Any
+from unicodedata import normalize
 
 from pebble.contract.names import NAME
 from pebble.errors import PebbleError
@@ -131,17 +132,19 @@ class People:
     # -- sessions
 
     def check(self, name: str, password: str, address: str) -> User | None:
-        """The person with this password. Blocks for some 20 ms, the same for unknown names. Raises TooManyTriesError.
+        """The person with this password. Blocks for some 20 ms, with accents 60, the same for unknown names.
 
-        A name whose tries are used up can still log in from an address where it has a session: others cannot keep a
-        person out.
+        Raises TooManyTriesError. A name whose tries are used up still logs in from an address where it has a session:
+        others cannot keep a person out.
         """
         self._count_try(name, address)
         known = name if NAME.fullmatch(name) else ""
         rows = self._rows("SELECT name, role, salt, hash FROM people WHERE name = ?", known)
         found, role, salt, expected = rows[0] if rows else ("", "", b"no such person..", self._no_hash)
-        given = _hash(password[:MAX_PASSWORD], salt)
-        if not hmac.compare_digest(given, expected) or not found or len(password) > MAX_PASSWORD:
+        typed = password[: 2 * MAX_PASSWORD]  # so long may one be whose accents are letters of their own
+        given = [_hash(spelling, salt) for spelling in _spellings(typed)]
+        is_right = any(hmac.compare_digest(one, expected) for one in given)
+        if not is_right or not found or len(normalize("NFC", typed)) > MAX_PASSWORD:
             return None
         self._addresses.give_back(network_of(address))
         self._names.give_back(name)
@@ -265,10 +268,16 @@ def has_user(path: Path, name: str = "") -> bool:
 
 
 def usable(password: str) -> str:
-    """The password, if it can be one. Raises PeopleError."""
+    """Return the password as it is stored, with accents as most keyboards write them (NFC). Raises PeopleError."""
+    password = normalize("NFC", password)
     if not MIN_PASSWORD <= len(password) <= MAX_PASSWORD:
         raise PeopleError(f"a password has {MIN_PASSWORD} to {MAX_PASSWORD} characters")
     return password
+
+
+def _spellings(password: str) -> set[str]:
+    """Return how it is stored, and how earlier versions stored it: as typed, on macOS with accents of their own."""
+    return {normalize("NFC", password), password, normalize("NFD", password)}
 
 
 @cache

@@ -3,20 +3,22 @@
 from __future__ import annotations
 
 import asyncio
+import html
 import re
+import secrets
 import time
 from collections.abc import AsyncIterator, Callable, Coroutine
 from contextlib import asynccontextmanager
 from functools import cache
 from importlib.resources import files
 from typing import Any
-from urllib.parse import quote
+from urllib.parse import parse_qsl, quote
 
 import msgspec
 from starlette.applications import Starlette
 from starlette.middleware import Middleware
 from starlette.requests import Request
-from starlette.responses import PlainTextResponse, Response
+from starlette.responses import HTMLResponse, PlainTextResponse, Response
 from starlette.routing import Route, WebSocketRoute
 from starlette.types import Lifespan
 from starlette.websockets import WebSocket
@@ -27,15 +29,17 @@ from pebble.fleet.database import DatabaseError
 from pebble.fleet.people import People
 from pebble.fleet.roles import Session, page_rights
 from pebble.web.access import login
-from pebble.web.access.guard import Guard
+from pebble.web.access.guard import FORM, STOP_PATH, Guard, content_type
 from pebble.web.control import CHECK_S, Control
 from pebble.web.messages import EstopOp
 from pebble.web.recordings import routes as recordings
 from pebble.web.recordings.routes import Recordings
-from pebble.web.server import PEOPLE_S, Server
+from pebble.web.server import PEOPLE_S, TICK_S, Server
 from pebble.web.static_files import FOREVER, NO_STORE, StaticFiles, root_of
 
 _AUDIT_ROWS = 200  # that a page shows; `pebble web audit` prints more
+_CONFIRM_S = 1.5  # so long a form waits for what it tells
+_NAMED = 20  # robots, in words
 _ENCODINGS = frozenset({"json", "pbvd", "h264", "jpeg"})
 _estop_decoder = msgspec.json.Decoder(EstopOp)
 
@@ -87,7 +91,7 @@ def _app(settings: WebSettings, lifespan: Lifespan[Starlette]) -> Starlette:
             Route("/ca.pem", _authority),
             Route("/healthz", _health),
             Route("/api/snapshot.jpg", _snapshot),
-            Route("/api/estop", _estop, methods=["POST"]),
+            Route(STOP_PATH, _estop, methods=["POST"]),
             Route("/api/audit", _audit),
             *login.routes(),
             *recordings.routes(),
@@ -105,13 +109,13 @@ async def _page(request: Request) -> Response:
         wanted = request.url.path + ("?watch" if "watch" in request.query_params else "")
         then = "" if wanted == "/" else f"?next={quote(wanted)}"
         return Response(status_code=303, headers={"location": f"{root_of(request)}login{then}", **NO_STORE})
-    return _static_of(request).page(request, NO_STORE)
+    return _static_of(request).page(request)
 
 
 async def _static(request: Request) -> Response:
     static = _static_of(request)
     name = request.path_params["name"]
-    current = request.path_params["version"] == static.version and not name.endswith(".html")
+    current = static.is_current(request.path_params["version"]) and not name.endswith(".html")
     return static.answer(request, name, FOREVER) if current else PlainTextResponse("not found", 404)
 
 
@@ -144,18 +148,53 @@ async def _snapshot(request: Request) -> Response:
 
 
 async def _estop(request: Request) -> Response:
-    """The way to stop that is left to a page whose control socket is down."""
+    """The way to stop that is left to a page whose control socket is down, or, as a plain form, that does not start."""
+    answer = _stopped_page if content_type(request.headers) == FORM else _plain
     session = login.session_of(request)
     if session is None:
-        return PlainTextResponse("log in first", 401)
+        return answer(request, 401, "log in first")
     try:
-        op = _estop_decoder.decode(await request.body())
+        op = await _estop_op(request)
     except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
-        return PlainTextResponse(str(error), 400)
+        return answer(request, 400, str(error))
     address = "" if request.client is None else request.client.host
-    await asyncio.sleep(_server_of(request).stops.waits_s(session.user, time.monotonic()))
-    request.app.state.server.stop(op.ref, op.stop, session, "", op.why, address)
-    return PlainTextResponse("sent", 202)
+    server = _server_of(request)
+    await asyncio.sleep(server.stops.waits_s(session.user, time.monotonic()))
+    server.stop(op.ref, op.stop, session, "", op.why, address)
+    if answer is _plain:
+        return _plain(request, 202, "sent")
+    until = time.monotonic() + _CONFIRM_S
+    while server.stops.robots_of(op.stop)[1] and time.monotonic() < until:
+        await asyncio.sleep(TICK_S)
+    return _stopped_page(request, 202, _stop_words(server, op.stop))
+
+
+async def _estop_op(request: Request) -> EstopOp:
+    if content_type(request.headers) != FORM:
+        return _estop_decoder.decode(await request.body())
+    fields = dict(parse_qsl((await request.body()).decode()))
+    return msgspec.convert({"ref": "", "stop": secrets.token_hex(8), "why": "form", **fields, "op": "estop"}, EstopOp)
+
+
+def _stop_words(server: Server, name: str) -> str:
+    if not server.broker.connected:
+        return "NOT SENT YET: the server cannot reach the broker."
+    done, missing = server.stops.robots_of(name)
+    words = "" if done or missing else " No robot has been heard of yet: assume that they move."
+    words += f" Confirmed by {len(done)} of {len(done) + len(missing)}." if done else ""
+    words += f" NOT CONFIRMED yet by {', '.join(missing[:_NAMED])}{' …' if missing[_NAMED:] else ''}" if missing else ""
+    return f"Sent, and repeated for a minute until all have confirmed it.{words}"
+
+
+def _plain(_request: Request, status: int, text: str) -> Response:
+    return PlainTextResponse(text, status)
+
+
+def _stopped_page(request: Request, status: int, text: str) -> Response:
+    static = _static_of(request)
+    page = static.files["stopped.html"].decode()
+    page = page.replace("{root}", root_of(request)).replace("{text}", html.escape(text))
+    return HTMLResponse(page, status, headers={**NO_STORE, "referrer-policy": "same-origin"})
 
 
 async def _audit(request: Request) -> Response:

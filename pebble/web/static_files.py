@@ -1,5 +1,6 @@
 """The files of the page, read once: what is not among them cannot be requested."""
 
+import base64
 import gzip
 import hashlib
 import posixpath
@@ -9,6 +10,8 @@ from importlib.resources.abc import Traversable
 
 from starlette.requests import Request
 from starlette.responses import PlainTextResponse, Response
+
+from pebble.web.access.guard import CONTENT_SECURITY_POLICY
 
 NO_STORE = {"cache-control": "no-store"}
 FOREVER = {"cache-control": "public, max-age=31536000, immutable"}
@@ -26,11 +29,13 @@ _TYPES = {
 _PACKED = {"png", "woff2"}  # compressed already
 _VERSION = b"{version}"  # in the pages, replaced by that of the files
 _ROOT = b"{root}"  # replaced by root_of(): a proxy may show the server below a path that only browsers know
+_START = b"{start}"  # replaced by start.js, which needs no request of its own
 _MODULES = b"{modules}"  # replaced by links to all that is imported: browsers need not discover them one by one
 #: index.html, with what that screen needs
 _SCREENS = {"fleet.html": "ui/fleet/fleet.js", "robot.html": "ui/robot/robot.js"}
 _SHEETS = {"fleet.html": "fleet.css"}  # that the screen needs beside app.css
 _IMPORT = re.compile(rb'^(?:import|export|\}).*?"(\.\.?/[^"]+)";?$', re.MULTILINE)
+_AGAIN = re.compile(r"\.\d{1,4}")  # after the version: the same files once more, for a page that has lost one
 _COMMENTS = re.compile(r"^[ \t]*(?:/\*.*?\*/|//[^\n]*)[ \t]*$", re.MULTILINE | re.DOTALL)
 _CASTS = re.compile(r"/\*\* @[^\n]*?\*/ ")  # types within a line
 _LINE_ENDS = re.compile(r"(?<=\S)[ \t]+//[ ][^\"'`\n]*$", re.MULTILINE)  # one with quotes may be the end of a string
@@ -47,7 +52,10 @@ class StaticFiles:
         for name, content in self.files.items():
             digest.update(f"{name}\0{len(content)}\0".encode() + content)
         self.version = digest.hexdigest()[:12]
-        index = self.files.pop("index.html")
+        start = self.files.pop("start.js").strip()
+        hashed = f"'sha256-{base64.b64encode(hashlib.sha256(start).digest()).decode()}'"
+        self._policy = CONTENT_SECURITY_POLICY.replace("script-src", f"script-src {hashed}")
+        index = self.files.pop("index.html").replace(_START, start)
         for name, screen in _SCREENS.items():
             links = [_link(one) for one in (screen, *self._imported("main.js", screen))]
             if name in _SHEETS:
@@ -57,6 +65,7 @@ class StaticFiles:
         for name in self.files:
             if name.endswith(".html"):
                 self.files[name] = self.files[name].replace(_VERSION, self.version.encode())
+        self._first = {"main.js", *self._imported("main.js")}
         self._packed = {name: _packed(name, content) for name, content in self.files.items()}
 
     def _imported(self, *names: str) -> list[str]:
@@ -70,17 +79,35 @@ class StaticFiles:
                     waiting.append(other)
         return [name for name in found if name not in names]
 
-    def page(self, request: Request, headers: dict[str, str]) -> Response:
+    def page(self, request: Request) -> Response:
         """The operator page; which screen it shows is up to its address."""
+        # with no-referrer, browsers do not say where a form comes from
+        headers = {**NO_STORE, "content-security-policy": self._policy, "referrer-policy": "same-origin"}
         name = "robot.html" if request.url.path.startswith("/r/") else "fleet.html"
         content = self.files[name].replace(_ROOT, root_of(request).encode())
         return _response(request, name, content, _packed(name, content), headers)
 
+    def is_current(self, version: str) -> bool:
+        """True if this version, of an address, is that of the files."""
+        return _AGAIN.sub("", version) == self.version
+
     def answer(self, request: Request, name: str, headers: dict[str, str]) -> Response:
-        """The file ``name``, compressed if the browser takes that; 404 if there is none."""
+        """The file ``name``, compressed if the browser takes that; 404 if there is none.
+
+        With a number as query it is a module that is fetched again because one that it imports was lost: those have the
+        query, too, but for the ones that run since the start.
+        """
         if name not in self.files:
             return PlainTextResponse("not found", 404)
+        if (query := request.scope.get("query_string", b"")).isdigit():
+            content = _IMPORT.sub(lambda found: self._renewed(name, found, query[:4]), self.files[name])
+            return _response(request, name, content, _packed(name, content), headers)
         return _response(request, name, self.files[name], self._packed[name], headers)
+
+    def _renewed(self, name: str, found: re.Match[bytes], query: bytes) -> bytes:
+        path = found[1]
+        whole = posixpath.normpath(posixpath.join(posixpath.dirname(name), path.decode()))
+        return found[0] if whole in self._first else found[0].replace(path, path + b"?" + query)
 
 
 def root_of(request: Request) -> str:

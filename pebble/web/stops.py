@@ -76,6 +76,12 @@ class Stops:
             sender.end()
             self.changed |= set(sender.robots)
 
+    def robots_of(self, name: str) -> tuple[list[str], list[str]]:
+        """Return the robots that have confirmed this stop, or have no motors, and those that have not."""
+        robots = self._senders[name][0].robots if name in self._senders else {}
+        done = {ref: stop.progress in (Progress.CONFIRMED, Progress.SPARED) for ref, stop in robots.items()}
+        return [ref for ref in done if done[ref]], [ref for ref in done if not done[ref]]
+
     def user(self, name: str) -> str | None:
         """Return who has pressed this stop; None: not known here, or it stands for another person as well."""
         return self._users.get(name)

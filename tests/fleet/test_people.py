@@ -13,6 +13,7 @@ from pathlib import Path
 import pytest
 
 from pebble.errors import PebbleError
+from pebble.fleet.broker_files import new_password
 from pebble.fleet.database import DatabaseError
 from pebble.fleet.people import SESSION_S, People, PeopleError, TooManyTriesError, User, has_user
 from pebble.fleet.roles import LOCAL, Role, page_rights
@@ -63,6 +64,28 @@ def test_the_local_session_is_admin() -> None:
 
 def test_the_right_password_is_accepted(people: People) -> None:
     assert people.check("alice", PASSWORD, HERE) == User("alice", Role.DRIVER)
+
+
+UMLAUT = {"one letter": "Schl\u00fcssel", "two letters, as on macOS": "Schlu\u0308ssel"}
+
+
+@pytest.mark.parametrize("typed", UMLAUT)
+@pytest.mark.parametrize("stored", [*UMLAUT, *(f"earlier version: {how}" for how in UMLAUT)])
+def test_a_password_is_right_in_either_spelling_of_its_accents(
+    people: People, monkeypatch: pytest.MonkeyPatch, stored: str, typed: str
+) -> None:
+    earlier, _, how = stored.rpartition(": ")
+    if earlier:
+        monkeypatch.setattr("pebble.fleet.people.usable", lambda password: password)
+    people.set_password("alice", UMLAUT[how])
+    people.add("bob", UMLAUT[how], Role.VIEWER)
+    assert [people.check(name, UMLAUT[typed], HERE) is None for name in ("alice", "bob")] == [False, False]
+    assert people.check("alice", "Schlussel", HERE) is None
+
+
+def test_passwords_of_brokers_have_no_accents() -> None:
+    """They are ours alone, so that the broker need not know two spellings."""
+    assert new_password().isascii()
 
 
 @pytest.mark.parametrize(
@@ -147,7 +170,7 @@ def test_names_that_could_be_part_of_a_topic_are_refused(people: People, name: s
         people.add(name, PASSWORD, Role.VIEWER)
 
 
-@pytest.mark.parametrize("password", ["", "1234567", "x" * 257])
+@pytest.mark.parametrize("password", ["", "1234567", "x" * 257, "o\u0308" * 7])
 def test_the_length_of_a_password(people: People, password: str) -> None:
     with pytest.raises(PeopleError, match="a password has 8 to 256 characters"):
         people.add("bob", password, Role.VIEWER)

@@ -162,7 +162,7 @@ class CannedServer:
         return Route(route.path, days)
 
     async def _page(self, request: Request) -> Response:
-        return self.static.page(request, _headers())
+        return self.static.page(request)
 
     async def _stream(self, _request: Request) -> Response:
         """A page that a robot may show in a frame."""
@@ -183,7 +183,7 @@ class CannedServer:
         return JSONResponse(self.state.audit)
 
     async def _post(self, request: Request) -> Response:
-        self.posted.append((request.path_params["name"], await request.json()))
+        self.posted.append((request.path_params["name"], json.loads(await request.body() or "{}")))  # a form has none
         return JSONResponse({})
 
     # -- sockets

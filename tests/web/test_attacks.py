@@ -98,12 +98,16 @@ def test_it_posts_nothing(hall: Hall, driver: Page, everything: Everything) -> N
         for path in paths:
             for origin in foreign(hall):
                 headers = {} if origin is None else {"origin": origin}
-                answer = client.post(path, json=body, headers=headers)
-                assert (answer.status_code, answer.text) == (403, "this request comes from another site\n"), path
-                assert "set-cookie" not in answer.headers
+                for answer in (
+                    client.post(path, json=body, headers=headers),
+                    client.post(path, data=body, headers=headers),
+                ):
+                    assert (answer.status_code, answer.text) == (403, "this request comes from another site\n"), path
+                    assert "set-cookie" not in answer.headers
             form = {"origin": hall.served.origin}
-            assert client.post(path, data=body, headers=form).status_code == 415
             assert client.post(path, files={"a": b"b"}, headers=form).status_code == 415
+        for path in {*paths} - {"/api/estop"}:
+            assert client.post(path, data=body, headers=form).status_code == 415
         assert client.get("/").status_code == 200, "the session has ended"
     assert not {topic for topic in everything.incoming() if topic.endswith("/estop")}
 
@@ -165,6 +169,8 @@ def test_without_a_session_there_is_nothing(hall: Hall, driver: Page, everything
                 if path not in PUBLIC:
                     answer = client.post(path, json=body, headers={"origin": hall.served.origin})
                     assert answer.status_code == 401, (kind, path)
+            form = client.post("/api/estop", data=body, headers={"origin": hall.served.origin})
+            assert (form.status_code, "log in first" in form.text) == (401, True), kind
     assert not {topic for topic in everything.incoming() if topic.endswith("/estop")}
 
 

@@ -378,6 +378,17 @@ def test_the_name_of_a_page_without_a_login_counts_for_its_voice_and_for_a_stop_
     assert until(lambda: {("talk", "Alice", "phone", "127.0.0.1"), ("stop", "Alice", "", "127.0.0.1")} <= noted())
 
 
+def test_a_plain_form_stops_and_says_who_has_confirmed_it(served, robot):
+    url, headers = f"{served.origin}/api/estop", {"origin": served.origin}
+    with Page(served) as page, httpx.Client(headers=headers) as client:
+        assert page.knows(robot.base)
+        answer = client.post(url, data={"ref": robot.base, "why": "no page"})
+        assert until(lambda: robot.latched)
+        assert (answer.status_code, answer.headers["content-type"]) == (202, "text/html; charset=utf-8")
+        assert "Confirmed by 1 of 1." in answer.text
+        assert client.post(url, data={"stop": "<b>"}).status_code == 400
+
+
 def test_without_a_login_a_page_gives_its_own_name(served, robot) -> None:
     with Page(served, name="Alice \u202e", device="phone") as alice, Page(served) as other:
         assert alice.welcome["user"] == "Alice ?"

@@ -19,6 +19,8 @@ from pebble.fleet import certificates
 MAX_BODY = 16 * 1024
 BODY_S = 10.0  # for a body to arrive
 _METHODS = ("GET", "HEAD", "POST")
+_JSON, FORM = "application/json", "application/x-www-form-urlencoded"
+STOP_PATH = "/api/estop"  # takes a plain form as well, of a page that does not start
 CONTENT_SECURITY_POLICY = (
     "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' blob:; font-src 'self'; "
     "connect-src 'self'; worker-src 'self'; media-src 'self' blob:; manifest-src 'self'; base-uri 'none'; "
@@ -96,7 +98,7 @@ class Guard:
         if scope["method"] == "POST":
             if not _is_own_origin(scope, headers):
                 return 403, "this request comes from another site"
-            if headers.get("content-type", "").partition(";")[0].strip().lower() != "application/json":
+            if content_type(headers) not in ((_JSON, FORM) if scope["path"] == STOP_PATH else (_JSON,)):
                 return 415, "send JSON as application/json"
         return None
 
@@ -107,6 +109,11 @@ class Guard:
             return False
         name = canonical(parts[1])
         return is_address(name) or not self._names.isdisjoint((name, "*." + name.partition(".")[2]))
+
+
+def content_type(headers: Headers) -> str:
+    """Return the kind of a request's body, without its parameters."""
+    return headers.get("content-type", "").partition(";")[0].strip().lower()
 
 
 def host_names(settings: WebSettings) -> frozenset[str]:

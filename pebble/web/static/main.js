@@ -90,17 +90,17 @@ withRest(fetchMore);
 if (!route.ref) fetchRest();
 setTimeout(() => {
   fetchRest();
-  Promise.allSettled(Object.values(PARTS).map(fetchPart));
+  Promise.allSettled(Object.values(PARTS).map((part) => fetchPart(part)));
 }, REST_MS);
 
 /** What keys, gamepads, cards and wall screens do besides; as often as it takes. @returns {Promise<void>} */
-async function fetchMore() {
+async function fetchMore(failures = 0) {
   let more;
   try {
-    more = await import("./ui/more.js");
+    more = await import("./ui/more.js" + (failures ? `?${failures}` : ""));
   } catch {
     await new Promise((resolve) => setTimeout(resolve, REST_MS));
-    return fetchMore();
+    return fetchMore(failures + 1);
   }
   more.install(page);
 }

@@ -88,6 +88,14 @@ DRIVER: Rows = {
         process.on("uncaughtException", () => {});
         driver.onInterrupt = () => { throw new Error("no"); };
         driver.latch("button"); result = done;""", ["estop: button"]),
+    "a list that closes without a choice was closed by Escape": ("""
+        const list = { value: "a", matches: () => false, closest() { return this.open ? this : null; } };
+        document.activeElement = list;
+        const close = (value) => {
+          list.open = true; driver.tick(); Object.assign(list, { open: false, value }); driver.tick(); };
+        close("b"); key("Escape"); const chosen = done.length;
+        driver.escapes.pressedAt = -Infinity; close("b"); key("Escape"); result = [chosen, ...done];""",
+        [0, "estop: Escape twice"]),
     "a space bar that is held stops again and again": (
         "key('Space'); key('Space', { repeat: true }); await null;", ["stop", "stop", "ended", "ended"]),
     "a space bar that is held on a button stops once": ("""

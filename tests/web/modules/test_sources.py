@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import base64
 import gzip
+import hashlib
 import re
 import subprocess
 from collections.abc import Iterable
@@ -14,6 +16,7 @@ import pytest
 from starlette.requests import Request
 
 import pebble.web
+from pebble.web.access.guard import CONTENT_SECURITY_POLICY
 from pebble.web.static_files import StaticFiles, stripped
 from tests.kit.npm import package
 from tests.support import some
@@ -123,9 +126,14 @@ def test_the_font_is_sent_as_it_is_and_early() -> None:
     assert f'url("{FONT}")' in (STATIC / "app.css").read_text()
 
 
-def test_markup_has_no_script_and_no_style_of_its_own() -> None:
+def test_markup_has_no_style_of_its_own_and_one_script_whose_hash_the_policy_names() -> None:
+    static = StaticFiles(files("pebble.web") / "static")
+    answer = static.page(Request({"type": "http", "path": "/", "raw_path": b"/", "headers": []}))
+    (script,) = re.findall(rb"<script>(.*?)</script>", bytes(answer.body), re.DOTALL)
+    source = f" 'sha256-{base64.b64encode(hashlib.sha256(script).digest()).decode()}'"
+    assert answer.headers["content-security-policy"].replace(source, "") == CONTENT_SECURITY_POLICY
     for path in STATIC.glob("*.html"):
-        markup = path.read_text()
+        markup = path.read_text().replace("<script>{start}</script>", "")
         assert not re.search(r"<script(?![^>]*\bsrc=)|<style|\sstyle=|\son[a-z]+=", markup), path.name
 
 

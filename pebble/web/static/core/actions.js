@@ -41,7 +41,7 @@ export const ACTIONS = [
   {
     id: "estop",
     words: "STOP: emergency stop, until it is reset",
-    keyWords: "Ctrl+Space, or Esc twice",
+    keyWords: "Ctrl+Enter (⌘+Enter), Ctrl+Space, or Esc twice",
     pad: `buttons ${PAD_ESTOP.map((index) => index + 1).join(" and ")} together`,
     touch: "STOP",
     driving: true,

@@ -71,11 +71,16 @@ export const fullScreen = {
   get on() {
     return attempt(() => Boolean(document.fullscreenElement), false);
   },
+  left: false, // by a button of the page, not by a key
   toggle() {
+    this.left = this.on;
     const change = () => (this.on ? document.exitFullscreen() : document.documentElement.requestFullscreen());
     attempt(change, undefined)?.catch(nothing);
   },
 };
+
+/** @returns {any} the list, or other chooser, that is open over the page; null: none, or this browser does not tell */
+export const openList = () => attempt(() => document.activeElement.closest("select:open, input:open"), null);
 
 /** @param {URL | string} url of a module @returns {Worker} or an error is thrown */
 export const worker = (url) => new Worker(url, { type: "module" });

@@ -1,6 +1,7 @@
 /** Ties inputs, gesture and control socket together: from events of the browser to drive commands. */
 
 import * as browser from "./browser.js";
+import { Escapes } from "./escapes.js";
 import { Gesture, PERIOD_MS, STALL_MS } from "./gesture.js";
 import { DRIVE_KEYS, Inputs, PadStops } from "./inputs.js";
 import { Lease } from "./lease.js";
@@ -8,7 +9,6 @@ import { PageClock } from "./page-clock.js";
 import { SLOW_MS, SLOW_SPEED, driveReason } from "./reasons.js";
 import { callAll } from "./store.js";
 
-const TWICE_MS = 600; // Escape, pressed twice
 const PRESSED = "button, [role=button], summary, a, input[type=checkbox], input[type=radio]"; // by the space bar, too
 const TYPING = "input:not([type=range]):not([type=checkbox]):not([type=radio]), select, textarea, [contenteditable]";
 
@@ -47,7 +47,7 @@ export class Driver {
     /** @type {import("./pads.js").Pads | null} fetched later; until then gamepads only stop */
     this.pads = null;
     this.output = { x: 0, z: 0, y: 0 };
-    this.escapeAt = -Infinity;
+    this.escapes = new Escapes(() => this.latch("Escape twice"));
     this.latchedAt = -Infinity; // when the component was last seen stopped
     /** @type {Set<string>} parts of the page that do not work */
     this.failed = new Set();
@@ -68,6 +68,7 @@ export class Driver {
     for (const name of ["blur", "pagehide"]) addEventListener(name, () => this.leave());
     document.addEventListener("freeze", () => this.leave());
     document.addEventListener("visibilitychange", () => document.hidden && this.leave());
+    document.addEventListener("fullscreenchange", () => this.escapes.fullScreenChanged());
     document.addEventListener("contextmenu", () => this.interrupt());
     browser.onTurn(() => this.interrupt());
     for (const name of ["focusin", "focusout"]) document.addEventListener(name, () => this.changed());
@@ -239,13 +240,11 @@ export class Driver {
 
   keyDown(event) {
     if (isMeta(event)) this.leave(); // macOS does not report which keys are released while it is held
-    if (event.code === "Escape" && !event.repeat) {
-      if (performance.now() - this.escapeAt < TWICE_MS) this.latch("Escape twice");
-      this.escapeAt = performance.now();
-    }
-    if (event.code === "Space" && event.ctrlKey) {
+    if (event.code === "Escape" && !event.repeat) this.escapes.press();
+    const stop = stopKeys(event);
+    if (stop) {
       event.preventDefault();
-      if (!event.repeat) this.latch("Ctrl+Space");
+      if (!event.repeat) this.latch(stop);
       return;
     }
     if (event.target.matches?.(TYPING)) return;
@@ -294,10 +293,10 @@ export class Driver {
   }
 
   tick() {
-    for (const part of /** @type {const} */ (["readPads", "update", "watchLease"])) this.attempt(part);
+    for (const part of /** @type {const} */ (["readPads", "update", "watchLease", "watchLists"])) this.attempt(part);
   }
 
-  /** What fails ends the gesture and is said; the others go on. @param {"readPads" | "update" | "watchLease"} part */
+  /** What fails ends the gesture and is said; the others go on. @param {"readPads" | "update" | "watchLease" | "watchLists"} part */
   attempt(part) {
     try {
       this[part]();
@@ -318,6 +317,10 @@ export class Driver {
       this.output = { x: 0, z: 0, y: 0 };
     }
     queueMicrotask(() => this.changed());
+  }
+
+  watchLists() {
+    this.escapes.look();
   }
 
   watchLease() {
@@ -374,6 +377,12 @@ function isOld(at) {
 
 function isMeta(event) {
   return event.key === "Meta" || event.key === "OS";
+}
+
+/** The keys of an emergency stop; "" none. Input methods may take Ctrl+Space. */
+function stopKeys({ code, ctrlKey, metaKey }) {
+  if (code.endsWith("Enter") && (ctrlKey || metaKey)) return "Ctrl+Enter";
+  return code === "Space" && ctrlKey ? "Ctrl+Space" : "";
 }
 
 /** Arrows move a slider that has the focus; letters drive also then. */

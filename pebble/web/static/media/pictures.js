@@ -87,7 +87,6 @@ export class Pictures {
     socket.binaryType = "arraybuffer";
     socket.onopen = () => this.change({ connection: "open" });
     socket.onmessage = ({ data }) => {
-      this.wait = FIRST_WAIT_MS;
       this.worker?.postMessage({ connection, message: data }, [data]);
     };
     socket.onclose = () => {
@@ -111,11 +110,17 @@ export class Pictures {
   }
 
   startWorker() {
-    const fail = ({ message }) => this.change({ problem: `pictures cannot be decoded here: ${message}` });
+    const fail = ({ message = "a part of this page is missing" }) =>
+      this.change({ problem: `Pictures cannot be decoded here: ${message}` });
     try {
       const worker = browser.worker(new URL("./video-worker.js", import.meta.url));
       worker.onmessage = ({ data }) => this.take(data);
-      worker.onerror = fail;
+      worker.onerror = (event) => {
+        fail(event);
+        if (event.message || worker !== this.worker) return;
+        this.worker = null; // it could not be fetched: the next connection has another one
+        this.socket?.close();
+      };
       return worker;
     } catch (error) {
       fail(error);
@@ -127,6 +132,7 @@ export class Pictures {
   take(made) {
     const { bitmap } = made;
     const current = made.connection === this.connection;
+    this.wait = FIRST_WAIT_MS;
     try {
       if (current && bitmap) this.draw(bitmap, made);
       else if (current) this.change({ waiting: made.what !== DRAWN, problem: made.problem });

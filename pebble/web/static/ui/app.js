@@ -8,13 +8,13 @@ import { Part, useName } from "./parts/parts.js";
 
 /** What is fetched when it is first shown, so that the first screen is there soon; main.js fetches the rest later. */
 export const PARTS = {
-  fleet: styled(async () => (await import("./fleet/fleet.js")).Fleet, "fleet.css"),
-  robot: async () => (await import("./robot/robot.js")).Robot,
-  panels: styled(async () => (await fetchRest(), await import("./panels/panels.js")).Panels, "panels.css", "notices.css"),
+  fleet: styled(async (again) => (await import("./fleet/fleet.js" + again)).Fleet, "fleet.css"),
+  robot: async (again) => (await import("./robot/robot.js" + again)).Robot,
+  panels: styled(async (again) => (await fetchRest(), await import("./panels/panels.js" + again)).Panels, "panels.css", "notices.css"),
 };
 
 /** Not among them: few people look at recordings. */
-const REPLAY = styled(async () => (await import("./replay/replay.js")).Replay, "replay.css", "picture.css");
+const REPLAY = styled(async (again) => (await import("./replay/replay.js" + again)).Replay, "replay.css", "picture.css");
 
 /** @returns {"desktop" | "portrait" | "immersive"} how the page is laid out */
 export function useLayout() {

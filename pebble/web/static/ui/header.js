@@ -175,7 +175,7 @@ function ConnectionState({ at }) {
   return socket.roundTripMs > LATE_MS ? html`<span class="chip plain late">slow: ${span(socket.roundTripMs)}</span>` : null;
 }
 
-const BELL = styled(async () => (await import("./fleet/notices.js")).Bell, "notices.css", "panels.css");
+const BELL = styled(async (again) => (await import("./fleet/notices.js" + again)).Bell, "notices.css", "panels.css");
 
 /** Fetched later. Where there is little room only their number is shown, with the settings. */
 function Notices(props) {

@@ -9,32 +9,32 @@ import { styled } from "../parts/hooks.js";
  * that are kept free for it until it is here. ``sends``: it is for commands only, so screens that only watch are
  * without it.
  * @typedef {{id: string, title: string, icon: string, tab: string, wants: (offers: any) => boolean,
- *   part: () => Promise<any>, engineers?: boolean, height?: number, sends?: boolean}} CardKind
+ *   part: (again: string) => Promise<any>, engineers?: boolean, height?: number, sends?: boolean}} CardKind
  */
 
 /** Which keys drive. */
-export const KEYS = styled(async () => (await import("../robot/key-hints.js")).KeyHints, "panels.css");
+export const KEYS = styled(async (again) => (await import("../robot/key-hints.js" + again)).KeyHints, "panels.css");
 
 /** How the inputs are scaled, and the extra axis. */
-export const DRIVE = styled(async () => (await import("../robot/drive-settings.js")).DriveSettings, "panels.css");
+export const DRIVE = styled(async (again) => (await import("../robot/drive-settings.js" + again)).DriveSettings, "panels.css");
 
 /** How the picture comes, and where from. */
-export const PICTURE = styled(async () => (await import("../robot/picture-settings.js")).PictureSettings, "picture.css");
+export const PICTURE = styled(async (again) => (await import("../robot/picture-settings.js" + again)).PictureSettings, "picture.css");
 
 /** Where else a picture may come from. */
-export const NO_CAMERA = styled(async () => (await import("../robot/picture-settings.js")).NoCamera, "picture.css");
+export const NO_CAMERA = styled(async (again) => (await import("../robot/picture-settings.js" + again)).NoCamera, "picture.css");
 
 /** Listening and talking; a desktop has them below the picture. */
-export const VOICE = styled(async () => (await import("../robot/sound.js")).SoundControls, "sound.css");
+export const VOICE = styled(async (again) => (await import("../robot/sound.js" + again)).SoundControls, "sound.css");
 
 /** How the sound comes. */
-export const SOUND_FACTS = styled(async () => (await import("../robot/sound.js")).SoundFacts, "sound.css");
+export const SOUND_FACTS = styled(async (again) => (await import("../robot/sound.js" + again)).SoundFacts, "sound.css");
 
 /** What lies over a picture that is the whole page. */
-export const HUD = styled(async () => (await import("../robot/hud.js")).Hud, "picture.css", "map.css");
+export const HUD = styled(async (again) => (await import("../robot/hud.js" + again)).Hud, "picture.css", "map.css");
 
 /** What belongs to a picture besides it. */
-export const EXTRAS = styled(() => import("../robot/picture-extras.js"), "picture.css");
+export const EXTRAS = styled((again) => import("../robot/picture-extras.js" + again), "picture.css");
 
 /** @type {CardKind[]} */
 export const CARDS = [
@@ -46,7 +46,7 @@ export const CARDS = [
     tab: "more",
     height: 220,
     wants: (offers) => offers.has("autonomy"),
-    part: styled(async () => (await import("./autonomy.js")).Autonomy, "commands.css"),
+    part: styled(async (again) => (await import("./autonomy.js" + again)).Autonomy, "commands.css"),
   },
   {
     id: "telemetry",
@@ -55,7 +55,7 @@ export const CARDS = [
     tab: "sensors",
     height: 400,
     wants: () => true,
-    part: async () => (await import("./telemetry.js")).Telemetry,
+    part: async (again) => (await import("./telemetry.js" + again)).Telemetry,
   },
   {
     id: "map",
@@ -64,7 +64,7 @@ export const CARDS = [
     tab: "sensors",
     height: 412,
     wants: (offers) => offers.received("wheel-odometry") || offers.received("localization-pose"),
-    part: styled(async () => (await import("./map.js")).Odometry, "map.css"),
+    part: styled(async (again) => (await import("./map.js" + again)).Odometry, "map.css"),
   },
   {
     id: "plots",
@@ -73,7 +73,7 @@ export const CARDS = [
     tab: "sensors",
     height: 540,
     wants: () => true,
-    part: styled(async () => (await import("./plots.js")).Plots, "plots.css", "vendor/uPlot.css"),
+    part: styled(async (again) => (await import("./plots.js" + again)).Plots, "plots.css", "vendor/uPlot.css"),
   },
   {
     id: "lights",
@@ -83,7 +83,7 @@ export const CARDS = [
     tab: "more",
     height: 210,
     wants: (offers) => offers.hasLights,
-    part: styled(async () => (await import("./lights.js")).Lights, "commands.css"),
+    part: styled(async (again) => (await import("./lights.js" + again)).Lights, "commands.css"),
   },
   {
     id: "voice",
@@ -102,7 +102,7 @@ export const CARDS = [
     tab: "sound",
     height: 510,
     wants: (offers) => offers.has("soundboard"),
-    part: styled(async () => (await import("./sounds.js")).Sounds, "commands.css"),
+    part: styled(async (again) => (await import("./sounds.js" + again)).Sounds, "commands.css"),
   },
   {
     id: "outlets",
@@ -112,7 +112,7 @@ export const CARDS = [
     tab: "more",
     height: 280,
     wants: (offers) => offers.section("outlets").available === true || offers.received("outlets/"),
-    part: styled(async () => (await import("./outlets.js")).Outlets, "devices.css"),
+    part: styled(async (again) => (await import("./outlets.js" + again)).Outlets, "devices.css"),
   },
   {
     id: "services",
@@ -121,7 +121,7 @@ export const CARDS = [
     icon: "list",
     tab: "more",
     wants: (offers) => offers.isRobot && offers.received("status"),
-    part: styled(async () => (await import("./services.js")).Services, "system.css"),
+    part: styled(async (again) => (await import("./services.js" + again)).Services, "system.css"),
   },
   {
     id: "mcus",
@@ -131,7 +131,7 @@ export const CARDS = [
     icon: "chip",
     tab: "more",
     wants: (offers) => offers.metrics.some((metric) => metric.endsWith("/describe")),
-    part: styled(async () => (await import("./mcus.js")).Mcus, "devices.css"),
+    part: styled(async (again) => (await import("./mcus.js" + again)).Mcus, "devices.css"),
   },
   {
     id: "logs",
@@ -140,7 +140,7 @@ export const CARDS = [
     icon: "list",
     tab: "more",
     wants: (offers) => offers.isRobot,
-    part: styled(async () => (await import("./logs.js")).Logs, "system.css"),
+    part: styled(async (again) => (await import("./logs.js" + again)).Logs, "system.css"),
   },
   {
     id: "values",
@@ -149,7 +149,7 @@ export const CARDS = [
     icon: "list",
     tab: "more",
     wants: () => true,
-    part: styled(async () => (await import("./values.js")).Values, "devices.css"),
+    part: styled(async (again) => (await import("./values.js" + again)).Values, "devices.css"),
   },
   {
     id: "system",
@@ -159,7 +159,7 @@ export const CARDS = [
     icon: "power",
     tab: "more",
     wants: (offers) => offers.has("system"),
-    part: styled(async () => (await import("./system.js")).System, "system.css", "panels.css"),
+    part: styled(async (again) => (await import("./system.js" + again)).System, "system.css", "panels.css"),
   },
 ];
 

@@ -18,7 +18,8 @@ export function HelpPanel({ onClose }) {
         <li>
           <b>STOP</b> holds it: nothing moves it before somebody who may drive resets it, by holding the button for a
           second. Everybody may press it, also without having control. Its keys count for every robot where no single one
-          is shown.
+          is shown. Where you type Chinese, Japanese or Korean, and on macOS, Ctrl+Space may switch the input method: use
+          Ctrl+Enter.
         </li>
       </ul>
       <p class="warn-box">

@@ -116,10 +116,10 @@ export function useMedia(query) {
 }
 
 const RETRY_MS = 1000;
-const TRIES = 3; // older browsers remember that a module could not be fetched: only a reload helps them
+const TRIES = 3;
 const fetched = new Map(); // parts of the page that are here, by what fetches them
 
-/** @param {() => Promise<any>} part @returns {boolean} whether it can be shown at once */
+/** @param {(again: string) => Promise<any>} part @returns {boolean} whether it can be shown at once */
 export const isHere = (part) => fetched.has(part);
 
 let begin;
@@ -131,14 +131,17 @@ export const fetchRest = () => (begin(), rest);
 /** @param {() => Promise<any>} first fetches what all the rest needs */
 export const withRest = (first) => (rest = rest.then(first));
 
-/** @param {() => Promise<any>} part fetched now, so that it is here when it is shown */
-export async function fetchPart(part) {
-  if (!isHere(part)) fetched.set(part, await part());
+/**
+ * @param {(again: string) => Promise<any>} part fetched now, so that it is here when it is shown
+ * @param {number} [failures] of before: browsers remember that a module was lost, but not under another address
+ */
+export async function fetchPart(part, failures = 0) {
+  if (!isHere(part)) fetched.set(part, await part(failures ? `?${failures}` : ""));
 }
 
 /**
  * A part of the page, fetched when it is first shown. ``failed``: it will not come any more.
- * @param {() => Promise<any>} part the same one each time @param {boolean} [now] without waiting for fetchRest()
+ * @param {(again: string) => Promise<any>} part the same one each time @param {boolean} [now] without waiting for fetchRest()
  * @returns {{body: any, failed: boolean}}
  */
 export function usePart(part, now = false) {
@@ -151,11 +154,11 @@ export function usePart(part, now = false) {
     async function attempt() {
       try {
         if (!now) await rest;
-        await fetchPart(part);
+        await fetchPart(part, failures.current);
       } catch (error) {
         console.error(error);
         failures.current++;
-        if (!over) timer = setTimeout(attempt, RETRY_MS);
+        if (!over) timer = setTimeout(attempt, RETRY_MS * failures.current);
       }
       if (!over) redraw();
     }
@@ -214,12 +217,12 @@ export class Boundary extends Component {
 
 /**
  * Fetches a part of the page together with its style sheets, beside app.css; for usePart() and Part.
- * @param {() => Promise<any>} fetch @param {...string} sheets "cards.css" @returns {() => Promise<any>}
+ * @param {(again: string) => Promise<any>} fetch @param {...string} sheets "cards.css" @returns {(again: string) => Promise<any>}
  */
 export const styled =
   (fetch, ...sheets) =>
-  async () =>
-    (await Promise.all([fetch(), ...sheets.map(fetchStyle)]))[0];
+  async (again) =>
+    (await Promise.all([fetch(again), ...sheets.map(fetchStyle)]))[0];
 
 const sheets = new Map(); // promises, by name
 

@@ -30,12 +30,14 @@ class Link {
   /**
    * @param {{ref: string, name: string, port: MessagePort|null, rate: number|undefined}} of ``port``: where sound is
    * played; null: this is only for talking @param {(message: any) => void} onMessage
+   * @param {(why: string) => void} onFailed
    */
-  open({ ref, name, port, rate }, onMessage) {
+  open({ ref, name, port, rate }, onMessage, onFailed) {
     this.close();
     Object.assign(this, { ref, name });
     const worker = browser.worker(WORKER);
     worker.onmessage = ({ data }) => worker === this.worker && onMessage(data);
+    worker.onerror = ({ message = "a part of this page is missing" }) => worker === this.worker && onFailed(message);
     worker.postMessage({ op: "open", ref, name, device: device(), port, rate }, port ? [port] : []);
     this.worker = worker;
   }
@@ -242,7 +244,12 @@ export class Sound extends Model {
   /** @param {string} ref @param {MessagePort|null} port where sound is played; null: this is only for talking */
   connect(ref, port) {
     const name = this.connection.you?.user ?? "";
-    this.link.open({ ref, name, port, rate: this.context?.sampleRate }, (message) => this.take(message));
+    const of = { ref, name, port, rate: this.context?.sampleRate };
+    this.link.open(of, (message) => this.take(message), (why) => {
+      this.leave();
+      this.problem = `Sound has failed: ${why}. Try again`;
+      this.changed();
+    });
   }
 
   /** @param {any} message of the worker */

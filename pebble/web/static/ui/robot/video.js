@@ -149,6 +149,7 @@ function useCover(control, source) {
   if (online === false) return `${name} is silent${old}`;
   if (view?.state === "refused") return `No picture: ${view.why || "the robot refuses"}`;
   if (video.info) return `The picture has stopped${old}`;
+  if (video.state?.connection === "lost" && video.state.problem) return video.state.problem;
   if (view?.why) return view.why;
   return view?.state === "silent" ? "The camera sends nothing" : "Waiting for the first picture…";
 }

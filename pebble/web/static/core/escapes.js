@@ -1,0 +1,37 @@
+/** Presses of Escape, also those of which the browser shows no key: it leaves full screen by them, or closes a list. */
+
+import * as browser from "./browser.js";
+
+const TWICE_MS = 600;
+
+export class Escapes {
+  /** @param {() => void} onTwice */
+  constructor(onTwice) {
+    this.onTwice = onTwice;
+    this.pressedAt = -Infinity;
+    /** @type {{value: string} | null} */
+    this.list = null; // that is open
+    this.value = ""; // as it was when it was opened
+  }
+
+  press() {
+    const now = performance.now();
+    if (now - this.pressedAt < TWICE_MS) this.onTwice();
+    this.pressedAt = now;
+  }
+
+  /** To be called when full screen has begun or ended. */
+  fullScreenChanged() {
+    const { on, left } = browser.fullScreen;
+    if (!on && !left) this.press();
+  }
+
+  /** To be called every 50 ms: nothing tells that a list has closed. */
+  look() {
+    const list = browser.openList();
+    if (list === this.list) return;
+    if (this.list && this.list.value === this.value) this.press();
+    this.list = list;
+    this.value = list?.value;
+  }
+}
