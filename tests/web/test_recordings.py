@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import io
 import json
 import multiprocessing
 import os
@@ -96,8 +95,7 @@ def test_a_timeline_that_failed_stays_so_until_a_person_tries_again_and_is_index
     assert [step & (online | driven | pictures | sound) for step in found["activity"]] == [
         online | driven | pictures | sound
     ] * len(found["activity"])
-    assert len(found["activity"]) == len(found["video"]) == len(found["audio"]) == len(found["rest"]) == 4
-    assert found["audio"][1] == pytest.approx(50 * 664 * 8 / 1000, abs=0.1)  # as in the paper, Table 4.1
+    assert len(found["activity"]) == 4
     assert [round(one["until"] - one["since"]) // 1000 for one in found["sessions"]] == [SECONDS + 10]
     assert len(list(folder.rglob("*.parquet"))) == 2
     began = time.monotonic()
@@ -112,16 +110,6 @@ def test_a_segment_is_what_was_recorded(archive: Served) -> None:
     assert answer.headers["x-complete"] == "1"
     assert sum(bool(flags & Flag.CHAIN) for _, flags, _, _ in found) == FPS  # key frames come every two seconds
     assert get(archive, "segment", robot=GOOB, at=ms(100), **{"for": 2000}).headers["x-next"] == ""
-
-
-def test_a_picture_a_strip_of_them_and_nothing_where_there_is_none(archive: Served) -> None:
-    answer = get(archive, "frame", robot=GOOB, at=ms(20), w=160)
-    assert answer.headers["content-type"] == "image/jpeg"
-    assert abs(float(answer.headers["x-captured-ms"]) - ms(20)) < 1000 / FPS
-    assert av.open(io.BytesIO(answer.content), format="mjpeg").streams.video[0].width == 160
-    assert get(archive, "frame", robot=GOOB, at=ms(-60)).status_code == 404
-    strip = get(archive, "strip", robot=GOOB, since=ms(0), step=10_000, count=4, w=160)
-    assert av.open(io.BytesIO(strip.content), format="mjpeg").streams.video[0].width == 640
 
 
 @pytest.mark.parametrize("form", ["mkv", further("mp4"), "mcap"])
@@ -186,9 +174,6 @@ def test_one_export_at_a_time_it_can_be_ended_and_one_that_failed_has_a_reason(
         ("segment", {"robot": "goob", "at": 0, "for": 1}, 'robot: "goob" is none: write system/type/id'),
         ("segment", {"robot": "a/b/#", "at": 0, "for": 1}, 'robot: "a/b/#" is none'),
         ("timeline", {"robot": GOOB, "day": "../../etc"}, 'day: "../../etc" is none: write 2026-11-20'),
-        ("strip", {"robot": GOOB, "since": 0, "step": 1, "count": 999}, "count: a number from 0 to 24"),
-        ("strip", {"robot": GOOB, "since": 0, "step": 1, "count": 0}, "count is at least 1"),
-        ("frame", {"robot": GOOB}, "at: a number from 0 to"),
     ],
 )
 def test_a_bad_question_gets_one_line(archive: Served, path: str, parameters: dict[str, Any], line: str) -> None:
@@ -261,8 +246,6 @@ def test_recorded_commands_reach_no_robot(archive: Served, broker: Broker, folde
     reference = Reference(broker.port)
     for seek in (0, 1):
         get(archive, "segment", robot=GOOB, at=ms(3), **{"for": 5000, "seek": seek})
-    for path, more in (("frame", {"at": ms(3)}), ("strip", {"since": ms(0), "step": 1000, "count": 3})):
-        get(archive, path, robot=GOOB, **more)
     marker = f"{GOOB}/outgoing/marker"
     reference.transport.publish(marker, b"{}")
     assert until(lambda: reference.of(marker) == [b"{}"], 5)

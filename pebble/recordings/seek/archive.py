@@ -99,7 +99,7 @@ class Archive:
                     break
         return sorted(found[:LOG_LINES], key=lambda one: one.log_ns)
 
-    def pictures(self, robot: str, at_ns: int, *, keyframe_only: bool = False) -> list[Recorded]:
+    def pictures(self, robot: str, at_ns: int) -> list[Recorded]:
         """The last picture before ``at_ns``, and before it all from its key frame on; empty if there is none."""
         chain: list[Recorded] = []
         size = 0
@@ -110,7 +110,7 @@ class Archive:
             size += len(one.payload)
             if is_keyframe(one.payload):
                 chain.reverse()
-                return chain[:1] if keyframe_only else chain
+                return chain
             if size > _CHAIN_BYTES:
                 break
         return []

@@ -1,4 +1,4 @@
-"""The routes of recordings: days, timelines, what a robot published at any time, thumbnails, films. Nothing is sent."""
+"""The routes of recordings: days, timelines, what a robot published at any time, films. Nothing is sent."""
 
 from __future__ import annotations
 
@@ -22,7 +22,6 @@ from pebble.contract.identity import Identity
 from pebble.errors import PebbleError
 from pebble.recordings.seek import questions
 from pebble.recordings.seek.segment import LONGEST_MS
-from pebble.recordings.seek.thumbnails import MOST, WIDEST
 from pebble.transports.clock import since_boot as clock
 from pebble.web.access import login
 from pebble.web.recordings.archive_process import ArchiveProcess, BusyError, Job
@@ -199,8 +198,6 @@ def routes() -> list[Route]:
         Route("/archive/days", _answered(_days)),
         Route("/archive/timeline", _answered(_timeline)),
         Route("/archive/segment", _answered(_segment)),
-        Route("/archive/frame", _answered(_frame)),
-        Route("/archive/strip", _answered(_strip)),
         Route("/archive/exports", _answered(_begin_export), methods=["POST"]),
         Route("/archive/exports/{id}", _answered(_export)),
         Route("/archive/exports/{id}/file", _answered(_file)),
@@ -247,25 +244,6 @@ async def _segment(request: Request, recordings: Recordings) -> Response:
     headers = {"x-next": "" if made.next_ms is None else repr(made.next_ms), "x-complete": str(int(made.complete))}
     headers["content-length"] = str(len(made.data))
     return StreamingResponse(_pieces(made.data), media_type="application/octet-stream", headers=headers)
-
-
-async def _frame(request: Request, recordings: Recordings) -> Response:
-    at_ms, width = _number(request, "at", _LATEST_MS), int(_number(request, "w", WIDEST, 0.0))
-    made = await recordings.process.ask(questions.frame, _robot(request), at_ms, width)
-    if made is None:
-        return PlainTextResponse("there is no picture at this time", 404)
-    return Response(made.jpeg, media_type="image/jpeg", headers={"x-captured-ms": repr(made.captured_ms)})
-
-
-async def _strip(request: Request, recordings: Recordings) -> Response:
-    since_ms, step_ms = _number(request, "since", _LATEST_MS), _number(request, "step", 86_400_000.0)
-    count, width = int(_number(request, "count", MOST)), int(_number(request, "w", 320, 160.0))
-    if not count or width < 16:
-        raise BadQuestionError("count is at least 1, and w at least 16")
-    return Response(
-        await recordings.process.ask(questions.strip, _robot(request), since_ms, step_ms, count, width),
-        media_type="image/jpeg",
-    )
 
 
 async def _begin_export(request: Request, recordings: Recordings) -> Response:

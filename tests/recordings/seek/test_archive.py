@@ -6,10 +6,9 @@ import random
 from collections.abc import Iterator
 from pathlib import Path
 
-import cv2
-import numpy as np
 import pytest
 
+from pebble.media.decode import VideoDecoder
 from pebble.media.scene import read_counter
 from pebble.recordings.files.recorded import Recorded
 from pebble.recordings.library import files, merged
@@ -19,7 +18,6 @@ from pebble.recordings.seek.archive import Archive
 from pebble.recordings.seek.days import Days
 from pebble.recordings.seek.file import SeekableFile
 from pebble.recordings.seek.segment import Flag, segment
-from pebble.recordings.seek.thumbnails import frame, strip
 from tests.recordings.playing import FRED, GOOB, THEN_NS, Line, js, ms, unpacked, write
 from tests.recordings.seek.filming import CAMERA, FPS, SCENES, film
 
@@ -48,6 +46,10 @@ def moments(count: int = 25) -> list[int]:
     """Nanoseconds, at random and at messages."""
     chance = random.Random(7)
     return [THEN_NS + round(1e9 * chance.uniform(0.5, SECONDS)) for _ in range(count)] + [THEN_NS + 12 * 10**9]
+
+
+def at_ns(seconds: float) -> int:
+    return THEN_NS + round(seconds * 1e9)
 
 
 def texts(messages: list[Recorded]) -> list[tuple[int, str, bytes]]:
@@ -98,13 +100,13 @@ def test_the_picture_at_a_time_is_the_one_that_was_there(tmp_path: Path, encodin
     chance = random.Random(3)
     for _ in range(8):
         number = chance.randrange(10 * FPS)
-        made = frame(archive, GOOB, ms(number / FPS) + 20)
+        decoder = VideoDecoder()
+        *_, made = (decoder.feed(one.payload) for one in archive.pictures(GOOB, at_ns(number / FPS + 0.02)))
         assert made is not None
-        shown = cv2.imdecode(np.frombuffer(made.jpeg, np.uint8), cv2.IMREAD_COLOR)
-        assert read_counter(shown) == number % SCENES
-        assert abs(made.captured_ms - ms(number / FPS)) <= 1
-    assert frame(archive, GOOB, ms(-1)) is None
-    assert frame(archive, GOOB, ms(30)) is None, "an old picture is shown as one of this time"
+        assert read_counter(made.picture) == number % SCENES
+        assert abs((made.captured_ms or 0) - ms(number / FPS)) <= 1
+    assert archive.pictures(GOOB, at_ns(-1)) == []
+    assert archive.pictures(GOOB, at_ns(30)) == [], "an old picture is shown as one of this time"
     archive.close()
 
 
@@ -132,14 +134,6 @@ def test_a_gap_leads_to_what_follows_it(archive: Archive) -> None:
     assert segment(archive, GOOB, ms(-100), 2000, seek=False, media=True).next_ms == ms(0)
     after = segment(archive, GOOB, ms(SECONDS + 5), 2000, seek=False, media=True)
     assert (after.data, after.next_ms) == (b"", None)
-
-
-def test_thumbnails_stand_side_by_side_and_grey_where_there_is_none(archive: Archive) -> None:
-    made = strip(archive, GOOB, ms(-20), 10_000, 4, 160)
-    shown = cv2.imdecode(np.frombuffer(made, np.uint8), cv2.IMREAD_COLOR)
-    assert shown.shape == (90, 640, 3)
-    spread = [float(shown[:, begin : begin + 160].std()) for begin in range(0, 640, 160)]
-    assert max(spread[:2]) < 3 < 10 < min(spread[2:])
 
 
 def test_a_day_names_its_robots_and_gaps(tmp_path: Path) -> None:

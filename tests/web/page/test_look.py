@@ -86,8 +86,8 @@ def _do(script: str, *selectors: str) -> Act:
 
 
 def _timeline(page: Page) -> None:
-    """The day is here, and its pictures."""
-    page.locator(".timeline-strip img").wait_for(timeout=30_000)
+    """The day is here."""
+    page.wait_for_function("pebble.replay?.timeline", timeout=30_000)
     page.locator("[data-card=values] dl").wait_for()
 
 

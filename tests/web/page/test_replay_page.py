@@ -6,7 +6,6 @@ import re
 from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
-from urllib.parse import quote
 
 import numpy as np
 import pytest
@@ -99,19 +98,6 @@ def test_a_time_in_the_address_is_shown_and_follows_seeks(replay: Tab):
     seek(replay, AT + 12_345)
     assert shown(replay, AT + 12_300)
     assert replay.until(lambda: replay.page.url.endswith(f"/replay/{ROBOT}?at={AT + 12_345}"))
-
-
-def test_the_picture_is_the_one_of_that_time(replay: Tab):
-    """Pixel by pixel the one that the server makes of it, but for its compression."""
-    script = f"""async (address) => {{ {PIXELS}
-      const bitmap = await createImageBitmap(await (await fetch(address)).blob());
-      const other = new OffscreenCanvas(bitmap.width, bitmap.height);
-      other.getContext("2d").drawImage(bitmap, 0, 0);
-      const [a, b] = [pixelsOf(pebble.replay.video.canvas), pixelsOf(other)];
-      return a.length === b.length ? a.reduce((sum, one, i) => sum + Math.abs(one - b[i]), 0) / a.length : 999;
-    }}"""
-    difference = replay.page.evaluate(script, f"/archive/frame?robot={quote(ROBOT)}&at={AT}&w=480")
-    assert difference < 4
 
 
 def test_playing_and_its_keys(replay: Tab):
@@ -311,7 +297,6 @@ def test_the_timeline_is_zoomed_moved_and_clicked(replay: Tab):
     assert replay.until(lambda: abs(position(replay) - (since + 15_000)) < 200)
     replay.page.mouse.move(box["x"] + box["width"] / 2, box["y"] + 60)
     replay.test("hover").wait_for()
-    assert replay.until("document.querySelector('.timeline-hover img')?.naturalWidth === 160")
     replay.page.mouse.down()
     replay.page.mouse.move(box["x"] + box["width"] / 4, box["y"] + 60, steps=5)
     replay.page.mouse.up()
@@ -319,7 +304,6 @@ def test_the_timeline_is_zoomed_moved_and_clicked(replay: Tab):
     replay.page.mouse.wheel(0, 400)
     assert replay.until(lambda: canvas.evaluate(shown_ms)[1] - canvas.evaluate(shown_ms)[0] > 200_000)
     assert abs(position(replay) - (since + 15_000)) < 200  # none of this was a click
-    assert replay.until("document.querySelector('.timeline-strip img')?.naturalWidth >= 160")
 
 
 def test_sessions_lead_to_their_beginning(replay: Tab):

@@ -14,8 +14,7 @@ export class RefusedError extends Error {}
  * @typedef {{frames: Frame[], problem: string, until: number, next: number | null, complete: boolean, bytes: number}} Segment
  * ``next``: where the next message is; null: nothing follows
  * @typedef {{since: number, until: number, why?: string}} Stretch
- * @typedef {{from: number, step: number, activity: number[], video: number[], audio: number[], rest: number[],
- *   gaps: Stretch[], outages: Stretch[], sessions: Stretch[]}} Timeline
+ * @typedef {{from: number, step: number, activity: number[], gaps: Stretch[], outages: Stretch[], sessions: Stretch[]}} Timeline
  * @typedef {{day: string, robots: string[], bytes: number, first: number, last: number, gaps: number, unread: string[],
  *   driven?: Record<string, number>}} Day ``driven``: seconds by robot
  * @typedef {{state: "running" | "ready" | "failed", done: number, why: string, name: string, bytes: number}} ExportState
@@ -67,16 +66,6 @@ export class Archive {
       complete: answer.headers.get("x-complete") !== "0",
       bytes: bytes.byteLength,
     };
-  }
-
-  /** @param {string} robot @param {number} at @param {number} w @returns {string} the address of a picture */
-  static frame(robot, at, w) {
-    return `${ROOT}archive/frame?${query({ robot, at: Math.round(at), w })}`;
-  }
-
-  /** @param {string} robot @param {number} since @param {number} step @param {number} count @returns {string} */
-  static strip(robot, since, step, count) {
-    return `${ROOT}archive/strip?${query({ robot, since: Math.round(since), step: Math.round(step), count, w: 160 })}`;
   }
 
   /** @param {string} robot @param {Stretch} stretch @param {"mkv" | "mp4" | "mcap"} as @returns {Promise<string>} its id */

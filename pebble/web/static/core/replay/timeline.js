@@ -85,35 +85,23 @@ export class View {
 }
 
 /**
- * What each column of pixels shows: the bits of its steps together, and the most kbit/s.
+ * What each column of pixels shows: the bits of its steps together.
  * @param {import("./archive.js").Timeline} timeline @param {View} view @param {number} width
- * @returns {{bits: Uint8Array, kbits: Float64Array}}
+ * @returns {Uint8Array}
  */
 export function columns(timeline, view, width) {
   const { from, step, activity } = timeline;
   const bits = new Uint8Array(width);
-  const kbits = new Float64Array(width);
   const first = Math.max(0, Math.floor((view.from - from) / step));
   const last = Math.min(activity.length - 1, Math.floor((view.to - from) / step));
   for (let index = first; index <= last; index++) {
     const at = from + index * step;
     const left = Math.max(0, Math.floor(view.x(at, width)));
     const right = Math.min(width, Math.max(left + 1, Math.floor(view.x(at + step, width))));
-    const value = kbitsAt(timeline, index);
-    for (let x = left; x < right; x++) {
-      bits[x] |= activity[index];
-      if (value > kbits[x]) kbits[x] = value;
-    }
+    for (let x = left; x < right; x++) bits[x] |= activity[index];
   }
-  return { bits, kbits };
+  return bits;
 }
-
-/** @param {import("./archive.js").Timeline} timeline @param {number} index @returns {number} of everything together */
-const kbitsAt = ({ video, audio, rest }, index) => (video[index] ?? 0) + (audio[index] ?? 0) + (rest[index] ?? 0);
-
-/** @param {import("./archive.js").Timeline} timeline @returns {number} the most kbit/s of the day; at least 1 */
-export const mostKbits = (timeline) =>
-  timeline.activity.reduce((most, _, index) => Math.max(most, kbitsAt(timeline, index)), 1);
 
 const MARGIN = 0.04; // of what is seen
 

@@ -1,8 +1,7 @@
 // The day on a canvas: what was going on, what is missing, and where the replay is.
 
 import * as browser from "../../core/browser.js";
-import { Archive } from "../../core/replay/archive.js";
-import { ROWS, columns, holding, mostKbits } from "../../core/replay/timeline.js";
+import { ROWS, columns, holding } from "../../core/replay/timeline.js";
 import { html, useEffect, useModel, useRef, useState, useTick } from "../parts/hooks.js";
 import { shortTime } from "../parts/more-words.js";
 import { clockTime } from "../parts/words.js";
@@ -13,15 +12,10 @@ const AXIS = 20;
 const SESSIONS = 12;
 const ROW = 13;
 const GAP = 3;
-const BAND = 34; // of the bandwidth
-const HEIGHT = AXIS + SESSIONS + GAP + ROWS.length * (ROW + GAP) + BAND;
+const HEIGHT = AXIS + SESSIONS + GAP + ROWS.length * (ROW + GAP);
 const TICK_PX = 76;
 const STEP_MS = 50; // between two looks whether it has to be drawn again
 const CLICK_PX = 5;
-const HOVER_MS = 150; // before a picture is fetched
-const STRIP_MS = 350;
-const STRIP_PX = 116; // of one picture, at least
-const MOST_STRIP = 24;
 const ZOOM = 1.6;
 
 export function TimelineCard({ replay }) {
@@ -57,7 +51,6 @@ export function TimelineCard({ replay }) {
       <ul class="timeline-rows" aria-hidden="true">
         <li class="timeline-used">Used</li>
         ${ROWS.map(({ id, title }) => html`<li key=${id} class=${`row-${id}`}>${title}</li>`)}
-        <li class="timeline-rate">Bandwidth<br />${timeline && rateWords(mostKbits(timeline))}</li>
       </ul>
       <div class="timeline-place">
         <canvas
@@ -79,13 +72,10 @@ export function TimelineCard({ replay }) {
           ${dayProblem && html`<button type="button" data-test="try-again" onClick=${() => replay.tryAgain()}>Try again</button>`}
         </div>`}
       </div>
-      <${Strip} replay=${replay} shown=${shown} />
     </div>
     <${Legend} timeline=${timeline} />
   </section>`;
 }
-
-const rateWords = (most) => `≤ ${most >= 1000 ? `${(most / 1000).toFixed(1)} Mbit/s` : `${Math.round(most)} kbit/s`}`;
 
 function coverWords(indexing, problem) {
   if (problem) return `✖ ${problem}`;
@@ -104,14 +94,8 @@ function Legend({ timeline }) {
   </ul>`;
 }
 
-/** What was there, and its picture. */
+/** What was there. */
 function Hover({ replay, x, at }) {
-  const [address, fetchIt] = useState("");
-  useEffect(() => {
-    const timer = setTimeout(() => fetchIt(Archive.frame(replay.ref, Math.round(at / 1000) * 1000, 160)), HOVER_MS);
-    fetchIt("");
-    return () => clearTimeout(timer);
-  }, [at]);
   const { timeline } = replay;
   const gap = holding(timeline?.gaps ?? [], at);
   const place = useRef(null);
@@ -121,30 +105,7 @@ function Hover({ replay, x, at }) {
     place.current.style.transform = `translateX(${left}px)`;
   });
   return html`<div class="timeline-hover" ref=${place} data-test="hover">
-    ${address && html`<img alt="" src=${address} onError=${(event) => (event.currentTarget.hidden = true)} />`}
     <b>${clockTime(at)}</b>${gap && html`<span>not recorded: ${gap.why || "no reason is known"}</span>`}
-  </div>`;
-}
-
-/** Pictures of the part that is seen. */
-function Strip({ replay, shown }) {
-  const place = useRef(null);
-  const [address, setAddress] = useState("");
-  const [failed, fail] = useState(false);
-  const has = Boolean(replay.timeline?.activity.some((bits) => bits & 64));
-  useEffect(() => {
-    if (!has) return undefined;
-    const timer = setTimeout(() => {
-      const { view } = replay;
-      const count = Math.max(1, Math.min(MOST_STRIP, Math.floor((place.current?.clientWidth ?? 0) / STRIP_PX)));
-      const step = view.span / count;
-      fail(false);
-      setAddress(Archive.strip(replay.ref, view.from + step / 2, step, count));
-    }, STRIP_MS);
-    return () => clearTimeout(timer);
-  }, [shown, has]);
-  return html`<div class="timeline-strip" ref=${place}>
-    ${has && address && html`<img alt="" data-test="strip" src=${address} hidden=${failed} onError=${() => fail(true)} />`}
   </div>`;
 }
 
@@ -280,9 +241,8 @@ class Painter {
     this.axis();
     if (!timeline) return;
     for (const { since, until } of timeline.sessions) this.area(since, until, colours.accent, AXIS, AXIS + SESSIONS - 2);
-    const { bits, kbits } = columns(timeline, this.view, Math.ceil(this.width));
+    const bits = columns(timeline, this.view, Math.ceil(this.width));
     ROWS.forEach(({ bit, id }, index) => this.row(bits, bit, colours[`row-${id}`], rowTop(index)));
-    this.band(kbits, mostKbits(timeline));
     for (const { since, until } of timeline.outages) this.hatch(since, until, colours.dim, 9, rowTop(0), rowTop(0) + ROW);
     for (const { since, until } of timeline.gaps) this.hatch(since, until, colours.bad, 6, AXIS, HEIGHT);
   }
@@ -332,15 +292,6 @@ class Painter {
       if (end > x) context.fillRect(x, top, end - x, ROW);
       x = Math.max(end, x + 1);
     }
-  }
-
-  band(kbits, most) {
-    const { context, colours } = this;
-    context.fillStyle = colours.accent;
-    kbits.forEach((value, x) => {
-      const height = Math.max(value > 0 ? 1 : 0, (value / most) * (BAND - 6));
-      context.fillRect(x, HEIGHT - height, 1, height);
-    });
   }
 
   hatch(since, until, colour, apart, top, bottom) {
