@@ -26,8 +26,6 @@ from pebble.recordings.files.rewrite import write_copy
 from pebble.recordings.library import ACTIVE, Damages, merged, problems, robot_of
 from pebble.recordings.seek.archive import Archive
 from pebble.recordings.seek.days import Days
-from pebble.recordings.seek.segment import Segment
-from pebble.recordings.seek.segment import segment as make_segment
 from pebble.recordings.traffic.timeline import timeline as make_timeline
 from pebble.runtime.parent import end_with_parent
 
@@ -67,10 +65,6 @@ def files(robot: str, since_ns: int, until_ns: int) -> tuple[list[str], bool]:
     """The recordings of a robot in a period, and whether one of them is still being written."""
     found = [str(file.path) for file in _archive.files(robot, since_ns, until_ns)]
     return found, any(path.endswith(ACTIVE) for path in found)
-
-
-def segment(robot: str, at_ms: float, for_ms: float, *, seek: bool, media: bool) -> Segment:
-    return make_segment(_archive, robot, at_ms, for_ms, seek=seek, media=media)
 
 
 # -- jobs, each in a process of its own: they take long

@@ -17,8 +17,7 @@ from pebble.recordings.recorder.lane import CARRIED, Item, OpenFile
 from pebble.recordings.seek.archive import Archive
 from pebble.recordings.seek.days import Days
 from pebble.recordings.seek.file import SeekableFile
-from pebble.recordings.seek.segment import Flag, segment
-from tests.recordings.playing import FRED, GOOB, THEN_NS, Line, js, ms, unpacked, write
+from tests.recordings.playing import FRED, GOOB, THEN_NS, Line, js, ms, write
 from tests.recordings.seek.filming import CAMERA, FPS, SCENES, film
 
 SECONDS = 30
@@ -108,32 +107,6 @@ def test_the_picture_at_a_time_is_the_one_that_was_there(tmp_path: Path, encodin
     assert archive.pictures(GOOB, at_ns(-1)) == []
     assert archive.pictures(GOOB, at_ns(30)) == [], "an old picture is shown as one of this time"
     archive.close()
-
-
-def test_a_segment_begins_with_the_state_and_the_chain_of_its_picture(archive: Archive) -> None:
-    made = segment(archive, GOOB, ms(13.5), 2000, seek=True, media=True)
-    found = list(unpacked(made.data))
-    chain = [payload for _, flags, _, payload in found if flags & Flag.CHAIN]
-    assert len(chain) == round(1.5 * FPS) + 1  # key frames come every two seconds
-    state = {metric for _, flags, metric, _ in found if flags & Flag.STATE}
-    assert {"online", "capabilities", "sensors/imu", "charging-level", "logs", "drive-values"} == state
-    live = [one for one in found if not one[1] & (Flag.STATE | Flag.CHAIN)]
-    assert sum(bool(flags & Flag.PICTURE) for _, flags, _, _ in live) == 2 * FPS
-    assert sum(bool(flags & Flag.SOUND) for _, flags, _, _ in live) == 100
-    assert all(flags & Flag.INCOMING for _, flags, metric, _ in found if metric == "drive-values")
-    assert made.next_ms == ms(15.5)
-    assert made.complete
-
-
-def test_without_media_there_are_no_pictures(archive: Archive) -> None:
-    made = segment(archive, GOOB, ms(10), 2000, seek=True, media=False)
-    assert not [flags for _, flags, _, _ in unpacked(made.data) if flags & (Flag.PICTURE | Flag.SOUND)]
-
-
-def test_a_gap_leads_to_what_follows_it(archive: Archive) -> None:
-    assert segment(archive, GOOB, ms(-100), 2000, seek=False, media=True).next_ms == ms(0)
-    after = segment(archive, GOOB, ms(SECONDS + 5), 2000, seek=False, media=True)
-    assert (after.data, after.next_ms) == (b"", None)
 
 
 def test_a_day_names_its_robots_and_gaps(tmp_path: Path) -> None:

@@ -1,18 +1,13 @@
 /** The recordings of the server, as its /archive/ offers them. No framework, no DOM. */
 
 import { ROOT } from "../browser.js";
-import { readFrames } from "./frames.js";
 
-const MOST_BYTES = 24_000_000; // of one segment: the server ends one at 8 MB of pictures
 const INDEXING_MS = 500; // between two questions for a day that is being indexed
 
 /** The server has answered, and asking the same again changes nothing: ``message`` is what it says. */
 export class RefusedError extends Error {}
 
 /**
- * @typedef {import("./frames.js").Frame} Frame
- * @typedef {{frames: Frame[], problem: string, until: number, next: number | null, complete: boolean, bytes: number}} Segment
- * ``next``: where the next message is; null: nothing follows
  * @typedef {{since: number, until: number, why?: string}} Stretch
  * @typedef {{from: number, step: number, activity: number[], gaps: Stretch[], outages: Stretch[], sessions: Stretch[]}} Timeline
  * @typedef {{day: string, robots: string[], bytes: number, first: number, last: number, gaps: number, unread: string[],
@@ -46,26 +41,6 @@ export class Archive {
       onIndexing(value.indexing ?? 0);
       await delay(INDEXING_MS, signal);
     }
-  }
-
-  /**
-   * @param {string} robot @param {number} at epoch ms @param {number} lasts ms @param {boolean} seek @param {AbortSignal} signal
-   * @returns {Promise<Segment>}
-   */
-  async segment(robot, at, lasts, seek, signal) {
-    const asked = query({ robot, at: Math.floor(at), for: Math.ceil(lasts), ...(seek ? { seek: 1 } : {}) });
-    const answer = await this.get(`${ROOT}archive/segment?${asked}`, signal);
-    const bytes = await answer.arrayBuffer();
-    if (bytes.byteLength > MOST_BYTES) throw new RefusedError(`${bytes.byteLength} bytes in one segment are too many`);
-    const until = Math.floor(at) + Math.ceil(lasts);
-    const next = answer.headers.get("x-next") ?? "";
-    return {
-      ...readFrames(bytes),
-      until,
-      next: next === "" || !Number.isFinite(Number(next)) ? null : Math.max(until, Number(next)),
-      complete: answer.headers.get("x-complete") !== "0",
-      bytes: bytes.byteLength,
-    };
   }
 
   /** @param {string} robot @param {Stretch} stretch @param {"mkv" | "mp4" | "mcap"} as @returns {Promise<string>} its id */
