@@ -98,6 +98,7 @@ def _app(settings: WebSettings, lifespan: Lifespan[Starlette]) -> Starlette:
             WebSocketRoute("/ws/control", _control),
             WebSocketRoute("/ws/media", _media),
             WebSocketRoute("/ws/sound", _sound),
+            WebSocketRoute("/ws/replay", _replay),
         ],
         lifespan=lifespan,
         middleware=[Middleware(Guard, settings=settings)],
@@ -237,6 +238,22 @@ async def _sound(websocket: WebSocket) -> None:
     await _serve(websocket, lambda ref, can, session: sound.serve(websocket, ref, can, session, device, address))
 
 
+async def _replay(websocket: WebSocket) -> None:
+    """Play a recording for one page, as long as its session is what it was. Nothing is sent to a robot."""
+    archive: Recordings | None = websocket.app.state.recordings
+    session = login.session_of(websocket)
+    if session is None or archive is None:
+        await websocket.close(4401)
+        return
+    try:
+        ref, at_ms = recordings.robot_and_time(websocket)
+    except recordings.BadQuestionError as error:
+        await websocket.close(4400, str(error)[:100])
+        return
+    await websocket.accept()
+    await _while_allowed(websocket, session, archive.viewers.serve(websocket, ref, at_ms))
+
+
 async def _serve(
     websocket: WebSocket, serve: Callable[[str, frozenset[str], Session], Coroutine[Any, Any, None]]
 ) -> None:
@@ -247,9 +264,14 @@ async def _serve(
         return
     await websocket.accept()
     can = frozenset(re.findall(r"[a-z0-9]+", websocket.query_params.get("can", "")))
+    await _while_allowed(websocket, session, serve(ref, can, session))
+
+
+async def _while_allowed(websocket: WebSocket, session: Session, work: Coroutine[Any, Any, None]) -> None:
+    """Do the work for a socket until it is done, or its session is revoked."""
     server: Server = websocket.app.state.server
     people, check_at = server.people_version, time.monotonic() + CHECK_S
-    serving = asyncio.ensure_future(serve(ref, can, session))
+    serving = asyncio.ensure_future(work)
     try:
         while not (await asyncio.wait({serving}, timeout=PEOPLE_S))[0]:
             if people == server.people_version and time.monotonic() < check_at:

@@ -186,6 +186,27 @@ class FlagOp(_Asked, frozen=True, kw_only=True, tag="flag"):
     on: bool
 
 
+class Seek(_FromPage, frozen=True, kw_only=True, tag="seek"):
+    """Play on from another time. ``at``: epoch milliseconds."""
+
+    at: Stamp
+
+
+class Play(_FromPage, frozen=True, kw_only=True, tag="play"):
+    """Play, or pause."""
+
+    on: bool
+
+
+class Speed(_FromPage, frozen=True, kw_only=True, tag="speed"):
+    """Play at another speed."""
+
+    speed: Annotated[float, Meta(ge=0.1, le=10)]
+
+
+#: All that a page can ask for on the socket of a recording.
+FromReplay: TypeAlias = Seek | Play | Speed
+
 #: What is published as it is asked for; see robot_commands.py.
 RobotOp: TypeAlias = LightsOp | SoundboardOp | AutonomyOp | OutletOp | McuOp | ActionOp | FlagOp
 
@@ -266,6 +287,17 @@ class Done(_ToPage, frozen=True, kw_only=True, tag="done"):
     n: int = 0
 
 
+class Played(_ToPage, frozen=True, kw_only=True, tag="played"):
+    """Where a recording is, a few times a second and after each change. Times are epoch milliseconds."""
+
+    at: float
+    on: bool  # it is being played
+    speed: float
+    begins: bool = False  # a seek has arrived: what was sent before is void
+    ended: bool = False  # nothing follows
+    skipped: tuple[float, float] | None = None  # a time without messages that was left out
+
+
 class Bye(_ToPage, frozen=True, kw_only=True, tag="bye"):
     """The last message of a connection that the server closes. ``again``: whether to connect again."""
 
@@ -282,6 +314,8 @@ class TalkAnswer(Struct, frozen=True, kw_only=True):
 
 
 ToPage: TypeAlias = Welcome | Ping | State | Logs | Refused | Done | Bye
+
+ToReplay: TypeAlias = Played | State | Logs | Bye
 
 
 # -- values of the server's own metrics

@@ -29,6 +29,8 @@ def markdown() -> str:
     parts = [f"{_summary(messages)} {about}\n".replace("``", "`")]
     parts += ["## From the page\n", *map(_section, get_args(messages.FromPage))]
     parts += ["## From the server\n", *map(_section, get_args(messages.ToPage))]
+    replay = *get_args(messages.FromReplay), messages.Played
+    parts += ["## On the socket of a recording\n", *map(_section, replay)]
     parts += ["## Metrics of the server\n", *map(_section, _views())]
     texts = {"messages": "\n".join(parts), "TalkAnswer": _section(messages.TalkAnswer)}
     return filled(DOCS.read_text(encoding="utf-8"), texts)
@@ -46,6 +48,8 @@ def declarations() -> str:
     for struct in (
         *get_args(messages.FromPage),
         *get_args(messages.ToPage),
+        *get_args(messages.FromReplay),
+        messages.Played,
         messages.ShownOwner,
         messages.TalkAnswer,
         RobotIdentity,

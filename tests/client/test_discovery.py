@@ -15,7 +15,6 @@ from pebble.contract import LINK
 from pebble.transports import Message
 from tests.recordings.demo_robots import DRIVE, GOOB, MINILAMP, ROBOTS, messages, received, values
 from tests.support import ROOT
-from tests.web.in_node import evaluate
 
 BASE = "pebble/robots/goob"
 WALL = 1_760_000_000.0
@@ -87,25 +86,6 @@ def test_what_heartbeats_show(row: dict[str, Any]) -> None:
         liveness.heartbeat(at, late_s)
     found = [(at, robot.online(at), liveness.latency_s, liveness.average_latency_s) for at, *_ in row["seen"]]
     assert [*chain(*found)] == pytest.approx([*chain(*row["seen"])], abs=1e-6)
-
-
-def test_recorded_heartbeats_show_the_same() -> None:
-    steps = (
-        f"const rows = {json.dumps([*LIVENESS.values()])};"
-        + """
-    result = rows.map(({ link = [], heartbeats, seen }) => {
-      const beats = new Heartbeats(), start = 1e12, seconds = (ms) => (ms === null ? null : ms / 1000);
-      for (const level of link) beats.receiveLink(level === null ? undefined : { level });
-      for (const [at, late] of heartbeats) beats.receive(start + 1000 * at, { t: start + 1000 * (at - late) });
-      return seen.flatMap(([at]) => {
-        const { online, latency_ms, average_latency_ms } = beats.view(start + 1000 * at);
-        return [at, online, seconds(latency_ms), seconds(average_latency_ms)];
-      });
-    });"""
-    )
-    found = evaluate({"core/replay/liveness.js": "Heartbeats"}, steps)
-    for row, seen in zip(LIVENESS.values(), found, strict=True):
-        assert seen == pytest.approx([*chain(*row["seen"])], abs=1e-6), row
 
 
 def test_strangers_fill_no_memory_and_keep_no_capabilities_out() -> None:

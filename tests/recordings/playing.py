@@ -3,18 +3,16 @@
 from __future__ import annotations
 
 import json
-import struct
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from pebble.contract.packets import KEY_FRAME, Codec, Picture, PictureKind, Sound
 from pebble.recordings.files.recorded import Channel
 from pebble.recordings.files.writer import RecordingWriter
-from pebble.recordings.replay.player import Player
+from pebble.recordings.replay.player import BusOutput, Player
 from pebble.recordings.replay.rules import Options, Rules
 from pebble.recordings.replay.source import ReplaySource
-from pebble.recordings.seek.segment import Flag
 from pebble.recordings.stamps import stamp_ns
 from pebble.transports import Message
 
@@ -67,16 +65,6 @@ def write(path: Path, lines: Iterable[Line], *, finished: bool = True) -> Path:
     return path
 
 
-def unpacked(segment: bytes) -> Iterator[tuple[float, Flag, str, bytes]]:
-    """Yield received (epoch ms), flags, metric and payload of each message in a segment, as pages read it."""
-    head, at = struct.Struct(">IdBH"), 0
-    while at < len(segment):
-        length, received_ms, flags, size = head.unpack_from(segment, at)
-        body = segment[at + head.size : at + 4 + length]
-        yield received_ms, Flag(flags), body[:size].decode(), body[size:]
-        at += 4 + length
-
-
 class VirtualTime:
     """A clock that only waiting moves on."""
 
@@ -110,8 +98,9 @@ class Stage:
         self.actions: list[tuple[float, Any]] = []  # what to do at a time, in order
         source = ReplaySource([path] if isinstance(path, Path) else path)
         self.rules = Rules(options or Options(), source.channels)
-        clocks = {"now": self.time.now, "wall_ns": self.time.wall_ns, "wait": self._wait}
-        self.player = Player(source, self.rules, self._publish, **clocks, **playing)
+        output = BusOutput(self.rules, self._publish, self.time.wall_ns)
+        clocks = {"now": self.time.now, "wait": self._wait}
+        self.player = Player(source, self.rules.publishes, output, **clocks, **playing)
 
     def run(self) -> Stage:
         self.player.run()

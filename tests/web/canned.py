@@ -98,6 +98,7 @@ class CannedServer:
                 WebSocketRoute("/ws/control", self._control),
                 WebSocketRoute("/ws/media", self._media),
                 WebSocketRoute("/ws/sound", self._sound),
+                WebSocketRoute("/ws/replay", self._replay),
             ],
             lifespan=self._life,
         )
@@ -218,6 +219,10 @@ class CannedServer:
             for task in tasks:
                 task.cancel()
             await asyncio.gather(*tasks, return_exceptions=True)
+
+    async def _replay(self, websocket: WebSocket) -> None:
+        await websocket.accept()
+        await self._app.state.recordings.viewers.serve(websocket, *recordings.robot_and_time(websocket))
 
     def _note(self, message: dict[str, Any]) -> None:
         _decoder.decode(json.dumps(message))  # what the real server would refuse is an error here

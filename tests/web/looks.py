@@ -57,7 +57,7 @@ _HERE = """!document.querySelector('.loading') && document.fonts.status === 'loa
   [...document.images].every((one) => one.complete || one.hidden) &&
   (!pebble.video.ref || Boolean(pebble.video.info))"""
 #: The first picture of a recording is drawn, and its timeline.
-_REPLAYED = "Boolean(pebble.replay?.drawnAt && document.querySelector('.timeline-strip img'))"
+_REPLAYED = "Boolean(pebble.replay?.video.info && pebble.replay.day.timeline)"
 
 Pixels = npt.NDArray[np.uint8]
 

@@ -32,11 +32,11 @@ _MINUTE_S = 60
 #: Resolves with milliseconds until a picture was drawn, and when that was received.
 _SEEK = """(at) => new Promise((resolve) => {
   const { replay } = window.pebble;
-  const before = replay.player.seeks, began = performance.now();
+  const began = performance.now();
   replay.seek(at);
   const look = () => {
-    const drawn = replay.drawnAt;
-    if (drawn && drawn.seeks > before && drawn.now >= began) resolve([drawn.now - began, drawn.receivedMs]);
+    const { info } = replay.video;
+    if (!replay.feed.seeking && info) resolve([performance.now() - began, info.receivedMs]);
     else if (performance.now() - began > 10000) resolve([Infinity, 0]);
     else setTimeout(look, 1);
   };
@@ -70,7 +70,7 @@ def measure(browser: Browser, broker: Broker, encoding: str, seconds: float, see
         with Served(broker.port, recordings=root) as served:
             url = f"{served.origin}/replay/{GOOB}?at={ms(10):.0f}"
             with tab(browser, url, script=_SENT) as opened:
-                assert opened.until("Boolean(window.pebble?.replay?.drawnAt)", 60), opened.complaints()
+                assert opened.until("Boolean(window.pebble?.replay?.video.info)", 60), opened.complaints()
                 took, wrong, memories = [], 0, []
                 for number in range(seeks):
                     at = ms(chance.uniform(5, seconds - 5))

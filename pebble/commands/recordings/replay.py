@@ -26,7 +26,7 @@ from pebble.errors import PebbleError
 from pebble.recordings.catalogue import check_name, look_at
 from pebble.recordings.library import files, problems
 from pebble.recordings.replay.pace import FASTEST, SLOWEST
-from pebble.recordings.replay.player import Player
+from pebble.recordings.replay.player import BusOutput, Player
 from pebble.recordings.replay.robots import Make, ReplayedRobots
 from pebble.recordings.replay.rules import SYSTEM, Options, Rules
 from pebble.recordings.replay.source import ReplaySource
@@ -94,10 +94,10 @@ def replay(
     source, rules = _read(recordings, options)
     slowest, console = _WITH_COMMANDS if incoming else SLOWEST, _Console()
     make_player = partial(
-        Player, source, rules, now=time.monotonic, wall_ns=time.time_ns, wait=console.wait,
+        Player, source, rules.publishes, now=time.monotonic, wait=console.wait,
         since_ns=since_ns, until_ns=until_ns, speed=speed, slowest=slowest, loop=loop, paused=paused,
     )  # fmt: skip
-    player = _play(console, _maker(*connection), list(rules.robots), make_player)
+    player = _play(console, _maker(*connection), rules, make_player)
     typer.echo(f"{player.sent} sent, {player.skipped} skipped")
     unread = report_unread(problems(source.damages))
     return unread if console.ended in ("", "SIGINT", END) else 1
@@ -120,13 +120,13 @@ def _read(recordings: list[Path], options: Options) -> tuple[ReplaySource, Rules
     return source, rules
 
 
-def _play(console: _Console, make: Make, bases: list[str], make_player: Callable[..., Player]) -> Player:
+def _play(console: _Console, make: Make, rules: Rules, make_player: Callable[..., Player]) -> Player:
     """Play to the end, for these robots. Raises TransportError."""
-    terminal = _has_terminal()
+    terminal, bases = _has_terminal(), list(rules.robots)
     with ExitStack() as stack:
         stack.enter_context(handled_by(console.on_signal))
         robots = ReplayedRobots(make, bases, wall_ms=lambda: time.time_ns() // 1_000_000)
-        player = make_player(stack.enter_context(robots).publish)
+        player = make_player(BusOutput(rules, stack.enter_context(robots).publish, time.time_ns))
         typer.echo(f"{', '.join(map(shown, bases))}{': ' + _KEYS if terminal else ''}")
         sys.stdout.flush()
         if terminal:

@@ -1,13 +1,13 @@
 """Publishes a recording again, in its order and at its pace. Pure: clocks, waiting and publishing are passed in."""
 
 from collections.abc import Callable, Iterator
-from typing import Final
+from typing import Final, Protocol
 
+from pebble.recordings.files.reader import Chooses
 from pebble.recordings.files.recorded import Recorded
 from pebble.recordings.library import FOREVER_NS
 from pebble.recordings.replay.pace import SLOWEST, Pace
 from pebble.recordings.replay.rules import Rules, zero
-from pebble.recordings.replay.source import ReplaySource
 from pebble.transports import Message
 
 _TICK_S: Final = 0.05  # at least so often the caller can act
@@ -18,7 +18,39 @@ _TRIES: Final = 50  # for the last zero
 _LATE_S: Final = 0.5
 
 
-class Output:
+class Source(Protocol):
+    """What a player reads."""
+
+    def messages(self, since_ns: int, until_ns: int) -> Iterator[Recorded]:
+        """Yield those of a period by the time at which they were received."""
+        ...
+
+    def state_before(self, at_ns: int, publishes: Chooses) -> list[Recorded]:
+        """Return what a subscriber would know at a time, the pictures that the next one builds on last."""
+        ...
+
+
+class Output(Protocol):
+    """Where a player sends messages."""
+
+    sent: int
+    skipped: int
+
+    @property
+    def moves(self) -> bool:
+        """True if something may be moving because of what was sent."""
+        ...
+
+    def send(self, message: Recorded, position_ns: int) -> bool:
+        """Return whether it is done; else it is tried again."""
+        ...
+
+    def halt(self) -> None:
+        """Stop what moves."""
+        ...
+
+
+class BusOutput:
     """Publishes recorded messages again, and a zero after those that move something.
 
     ``publish`` returns False for what it cannot take now; ``wall_ns`` is the time since 1970.
@@ -57,23 +89,23 @@ class Output:
 class Reading:
     """Where a replay is in its recording, in what is published; ``skipped`` counts the messages between."""
 
-    def __init__(self, source: ReplaySource, rules: Rules, until_ns: int) -> None:
+    def __init__(self, source: Source, publishes: Chooses, until_ns: int) -> None:
         self.next: Recorded | None = None
         self.state: list[Recorded] = []  # to be sent before the next message, the last one first
         self.skipped = 0
-        self._source, self._rules, self._until_ns = source, rules, until_ns
+        self._source, self._publishes, self._until_ns = source, publishes, until_ns
         self._messages: Iterator[Recorded] = iter(())
 
     def open(self, since_ns: int) -> None:
         """Go on from another time, with the state and the pictures that a decoder needs by then."""
         self._messages = self._source.messages(since_ns, self._until_ns)
-        self.state = self._source.state_before(since_ns, self._rules.publishes)[::-1] if since_ns else []
+        self.state = self._source.state_before(since_ns, self._publishes)[::-1] if since_ns else []
         self.advance()
 
     def advance(self) -> None:
         """Find the next message that is published; those between take no time."""
         for message in self._messages:
-            if self._rules.publishes(message.channel):
+            if self._publishes(message.channel):
                 self.next = message
                 return
             self.skipped += 1
@@ -85,12 +117,11 @@ class Player:
 
     def __init__(
         self,
-        source: ReplaySource,
-        rules: Rules,
-        publish: Callable[[Message], bool],
+        source: Source,
+        publishes: Chooses,
+        output: Output,
         *,
         now: Callable[[], float],
-        wall_ns: Callable[[], int],
         wait: Callable[[float], None],
         since_ns: int = 0,
         until_ns: int = FOREVER_NS,
@@ -98,20 +129,23 @@ class Player:
         slowest: float = SLOWEST,
         loop: bool = False,
         paused: bool = False,
+        stays: bool = False,
+        longest_gap_ns: int = FOREVER_NS,
     ) -> None:
-        """``publish`` returns False for what it cannot take now; ``wait`` waits for up to so many seconds.
+        """``wait`` waits for up to so many seconds; ``now`` never goes back, in seconds.
 
-        ``now`` never goes back, in seconds; ``wall_ns`` is the time since 1970.
+        With ``stays`` it is paused at the end, and each time is a position, also one before the first message. Of a
+        time without messages at most ``longest_gap_ns`` is played.
         """
-        self.paused, self.ended = False, False
-        self._reading = Reading(source, rules, until_ns)
-        self._output = Output(rules, publish, wall_ns)
+        self.paused, self.ended = paused, False
+        self.at_end = False  # it is paused there
+        self._reading = Reading(source, publishes, until_ns)
+        self._output = output
         self._pace = Pace(now, speed=speed, slowest=slowest)
         self._now, self._wait = now, wait
-        self._since_ns, self._loop = since_ns, loop
+        self._since_ns, self._loop, self._stays, self._longest_gap_ns = since_ns, loop, stays, longest_gap_ns
         self._begins_ns = 0  # the first message
         self._waited = 0.0
-        self._wants_pause = paused
 
     @property
     def sent(self) -> int:
@@ -120,6 +154,11 @@ class Player:
     @property
     def skipped(self) -> int:
         return self._reading.skipped + self._output.skipped
+
+    @property
+    def restores(self) -> bool:
+        """True while the state before the newest seek is being sent."""
+        return bool(self._reading.state)
 
     @property
     def position_ns(self) -> int:
@@ -141,11 +180,9 @@ class Player:
     def run(self) -> None:
         """Play to the end, or until :meth:`stop`; whatever moves is stopped then, also after an error."""
         try:
-            self._open(self._since_ns)
-            if self._reading.next is not None:
+            self._open(self._since_ns, self._since_ns if self._stays else 0)
+            if self._reading.next is not None and not self._stays:
                 self._begins_ns = self._reading.next.log_ns
-            if self._wants_pause:
-                self.pause()
             while not self.ended:
                 self._step()
         finally:
@@ -160,6 +197,8 @@ class Player:
         self._output.halt()
 
     def resume(self) -> None:
+        if self.at_end:
+            self.seek(self.position_ns)  # more may have been recorded meanwhile
         self.paused = False
         self._pace.go_on_from(self._pace.from_ns)
 
@@ -173,20 +212,21 @@ class Player:
         self.ended = True
 
     def _open(self, since_ns: int, position_ns: int = 0) -> None:
+        self.at_end = False
         self._reading.open(since_ns)
         first_ns = position_ns if self._reading.next is None else self._reading.next.log_ns
         self._pace.go_on_from(max(since_ns, position_ns) if position_ns else first_ns)
 
     def _step(self) -> None:
         now, reading = self._now(), self._reading
-        if self.paused:
-            self._output.halt()
-            self._pass(_TICK_S)
-        elif now - self._waited > _TICK_S:
+        if now - self._waited > _TICK_S:
             self._pass(0.0)
         elif reading.state:
             if self._send(reading.state[-1], self._pace.from_ns):
                 reading.state.pop()
+        elif self.paused:
+            self._output.halt()
+            self._pass(_TICK_S)
         elif reading.next is None:
             self._end()
         else:
@@ -194,7 +234,9 @@ class Player:
 
     def _play(self, message: Recorded, now: float) -> None:
         due_s = self._pace.due_s(message.log_ns, now)
-        if due_s > _NOW_S:
+        if message.log_ns - self._pace.reached_ns > self._longest_gap_ns:
+            self._pace.go_on_from(message.log_ns)
+        elif due_s > _NOW_S:
             self._pass(min(due_s, _TICK_S))
             return
         if due_s < -_LATE_S:
@@ -218,5 +260,8 @@ class Player:
         if self._loop and self._begins_ns:
             self._pass(_TICK_S)  # a recording may be one message
             self._open(self._begins_ns)
+        elif self._stays:
+            self.pause()
+            self.at_end = True
         else:
             self.stop()

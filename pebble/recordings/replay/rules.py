@@ -94,7 +94,7 @@ class Rules:
             if moves is None:
                 return None
         if address.declared is c.CAPABILITIES and payload:
-            payload = self._capabilities(payload, address)
+            payload = harmless(payload, address.recorded.base, address.base)
             if not payload:
                 return None
         return Outgoing(Message(address.topic, shifted(payload, by_ns), address.qos), moves)
@@ -145,24 +145,6 @@ class Rules:
         # A script's number would bar the runs of the robot's own scripts.
         return None if command.signed else command.moves
 
-    def _capabilities(self, payload: bytes, address: _Address) -> bytes:
-        """Its topics below the new base, and no offers of what is not there; empty if it cannot be read.
-
-        Pages publish to the topics that they find here: unchanged, they would drive the real robot.
-        """
-        try:
-            plain = codec.plain(c.CAPABILITIES, payload)
-        except PayloadError:
-            return b""
-        if not isinstance(plain, dict) or not isinstance(plain.get("value"), dict):
-            return b""
-        value = {name: self._section(name, each, address) for name, each in plain["value"].items()}
-        return msgspec.json.encode({**plain, "value": value})
-
-    def _section(self, name: str, section: Any, address: _Address) -> Any:
-        section = _rebased(section, f"{address.recorded.base}/", f"{address.base}/")
-        return section if name in _WATCHED else _without_controls(section, drives=name == "drive")
-
     def _add(self, channel: Channel) -> None:
         address = self._address(channel)
         if address is None:
@@ -174,6 +156,26 @@ class Rules:
             raise ReplayError(
                 f"{self.robots[address.base]} and {base} would both be {address.base}: choose one by --only '{base}/#'"
             )
+
+
+def harmless(payload: bytes, recorded: str, base: str) -> bytes:
+    """Return capabilities with their topics below ``base``, and no offers of what is not there; b"" if unreadable.
+
+    Pages publish to the topics that they find here: unchanged, they would drive the real robot.
+    """
+    try:
+        plain = codec.plain(c.CAPABILITIES, payload)
+    except PayloadError:
+        return b""
+    if not isinstance(plain, dict) or not isinstance(plain.get("value"), dict):
+        return b""
+    value = {name: _section(name, section, recorded, base) for name, section in plain["value"].items()}
+    return msgspec.json.encode({**plain, "value": value})
+
+
+def _section(name: str, section: Any, recorded: str, base: str) -> Any:
+    section = _rebased(section, f"{recorded}/", f"{base}/")
+    return section if name in _WATCHED else _without_controls(section, drives=name == "drive")
 
 
 def zero(topic: str) -> Message:

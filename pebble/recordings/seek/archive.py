@@ -50,10 +50,10 @@ class Archive:
         while self._open:
             self._open.popitem()[1].close()
 
-    def messages(self, robot: str, since_ns: int, until_ns: int, *, media: bool = True) -> list[Recorded]:
+    def messages(self, robot: str, since_ns: int, until_ns: int) -> list[Recorded]:
         """What a robot published, and what was sent to it, from ``since_ns`` to before ``until_ns``."""
         found: list[Recorded] = []
-        for file in self.files(robot, since_ns, until_ns, media=media):
+        for file in self.files(robot, since_ns, until_ns):
             for chunk in _within(file, file.channels_of(robot), since_ns, until_ns):
                 found += (
                     one
@@ -61,7 +61,7 @@ class Archive:
                     if since_ns <= one.log_ns < until_ns and _is_of(one.channel, robot) and not is_carried(one.channel)
                 )
         found.sort(key=lambda one: one.log_ns)
-        return found if media else [one for one in found if not is_media(one.payload)]
+        return found
 
     def state(self, robot: str, at_ns: int) -> list[Recorded]:
         """The newest message of each topic of a robot before ``at_ns``, without media, the oldest first."""
@@ -99,7 +99,7 @@ class Archive:
                     break
         return sorted(found[:LOG_LINES], key=lambda one: one.log_ns)
 
-    def pictures(self, robot: str, at_ns: int, *, keyframe_only: bool = False) -> list[Recorded]:
+    def pictures(self, robot: str, at_ns: int) -> list[Recorded]:
         """The last picture before ``at_ns``, and before it all from its key frame on; empty if there is none."""
         chain: list[Recorded] = []
         size = 0
@@ -110,7 +110,7 @@ class Archive:
             size += len(one.payload)
             if is_keyframe(one.payload):
                 chain.reverse()
-                return chain[:1] if keyframe_only else chain
+                return chain
             if size > _CHAIN_BYTES:
                 break
         return []

@@ -26,11 +26,6 @@ from pebble.recordings.files.rewrite import write_copy
 from pebble.recordings.library import ACTIVE, Damages, merged, problems, robot_of
 from pebble.recordings.seek.archive import Archive
 from pebble.recordings.seek.days import Days
-from pebble.recordings.seek.segment import Segment
-from pebble.recordings.seek.segment import segment as make_segment
-from pebble.recordings.seek.thumbnails import Frame
-from pebble.recordings.seek.thumbnails import frame as make_frame
-from pebble.recordings.seek.thumbnails import strip as make_strip
 from pebble.recordings.traffic.timeline import timeline as make_timeline
 from pebble.runtime.parent import end_with_parent
 
@@ -70,18 +65,6 @@ def files(robot: str, since_ns: int, until_ns: int) -> tuple[list[str], bool]:
     """The recordings of a robot in a period, and whether one of them is still being written."""
     found = [str(file.path) for file in _archive.files(robot, since_ns, until_ns)]
     return found, any(path.endswith(ACTIVE) for path in found)
-
-
-def segment(robot: str, at_ms: float, for_ms: float, *, seek: bool, media: bool) -> Segment:
-    return make_segment(_archive, robot, at_ms, for_ms, seek=seek, media=media)
-
-
-def frame(robot: str, at_ms: float, width: int) -> Frame | None:
-    return make_frame(_archive, robot, at_ms, width)
-
-
-def strip(robot: str, since_ms: float, step_ms: float, count: int, width: int) -> bytes:
-    return make_strip(_archive, robot, since_ms, step_ms, count, width)
 
 
 # -- jobs, each in a process of its own: they take long

@@ -1,4 +1,4 @@
-"""One day of one robot, in steps: what it was used for, its bandwidth, its sessions, outages and gaps."""
+"""One day of one robot, in steps: what it was used for, its sessions, outages and gaps."""
 # ruff: noqa: S608  (what is put into queries are constants of this project and numbers)
 
 from pathlib import Path
@@ -7,7 +7,6 @@ from typing import Any, Final
 from msgspec import Struct, field
 
 from pebble.contract.channels import HEARTBEAT, ONLINE, OUTGOING
-from pebble.recordings.traffic import results as traffic
 from pebble.recordings.traffic.activity import Activity
 from pebble.recordings.traffic.analysis import recorder_events
 from pebble.recordings.traffic.duck import connected
@@ -41,12 +40,6 @@ _ACTIVITY: Final = f"""
                ELSE 0 END)
     FROM messages GROUP BY step
 """
-_KBITS: Final = f"""
-    SELECT second // {STEP_S} AS step,
-           CASE WHEN family IN ('{traffic.VIDEO}', '{traffic.AUDIO}') THEN family ELSE 'rest' END AS part,
-           (sum(bytes) * 8 / 1000 / {STEP_S})::DOUBLE
-    FROM seconds GROUP BY ALL
-"""
 
 
 class Stretch(Struct, frozen=True):
@@ -58,14 +51,11 @@ class Stretch(Struct, frozen=True):
 
 
 class Timeline(Struct, rename={"from_ms": "from"}):
-    """A day. The lists have one number for each step from ``from_ms`` (epoch milliseconds) on."""
+    """A day. ``activity`` has one number for each step from ``from_ms`` (epoch milliseconds) on."""
 
     from_ms: int
     step: int = 1000 * STEP_S
     activity: list[int] = field(default_factory=list)
-    video: list[float] = field(default_factory=list)  # kbit/s
-    audio: list[float] = field(default_factory=list)
-    rest: list[float] = field(default_factory=list)
     gaps: list[Stretch] = field(default_factory=list)
     outages: list[Stretch] = field(default_factory=list)
     sessions: list[Stretch] = field(default_factory=list)
@@ -105,10 +95,6 @@ def _stepped(connection: Any) -> Timeline:
     count = max(activity) - first + 1
     made = Timeline(1000 * STEP_S * first)
     made.activity = [activity.get(first + number, 0) for number in range(count)]
-    made.video, made.audio, made.rest = ([0.0] * count for _ in range(3))
-    lists = {traffic.VIDEO: made.video, traffic.AUDIO: made.audio, "rest": made.rest}
-    for step, part, kbits in connection.execute(_KBITS).fetchall():
-        lists[part][step - first] = round(kbits, 1)
     return made
 
 

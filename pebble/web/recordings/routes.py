@@ -1,12 +1,11 @@
-"""The routes of recordings: days, timelines, what a robot published at any time, thumbnails, films. Nothing is sent."""
+"""The routes of recordings: days, timelines, films. Nothing is sent."""
 
 from __future__ import annotations
 
-import asyncio
 import math
 import secrets
 import tempfile
-from collections.abc import AsyncIterator, Awaitable, Callable
+from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -14,24 +13,22 @@ from typing import Annotated, Any, Final, Literal
 
 import msgspec
 from msgspec import Meta, Struct
-from starlette.requests import Request
-from starlette.responses import FileResponse, JSONResponse, PlainTextResponse, Response, StreamingResponse
+from starlette.requests import HTTPConnection, Request
+from starlette.responses import FileResponse, JSONResponse, PlainTextResponse, Response
 from starlette.routing import Route
 
 from pebble.contract.identity import Identity
 from pebble.errors import PebbleError
 from pebble.recordings.seek import questions
-from pebble.recordings.seek.segment import LONGEST_MS
-from pebble.recordings.seek.thumbnails import MOST, WIDEST
 from pebble.transports.clock import since_boot as clock
 from pebble.web.access import login
 from pebble.web.recordings.archive_process import ArchiveProcess, BusyError, Job
+from pebble.web.recordings.viewers import Viewers
 
 _NONE: Final = "this server has no recordings: start it with --recordings DIR"
 _LONGEST_EXPORT_MS: Final = 3_600_000.0
 _ACTIVE_S: Final = 30.0  # a timeline of files that are being written is made anew after this time
 _TIMELINES: Final = 16  # that are remembered
-_PIECE: Final = 64 << 10
 _LATEST_MS: Final = 9.0e12  # in the year 2255
 
 _Ref = Annotated[str, Meta(max_length=200)]
@@ -87,6 +84,7 @@ class Recordings:
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         self.process = ArchiveProcess(folder)
+        self.viewers = Viewers(folder)
         self._scratch = tempfile.TemporaryDirectory(prefix="pebble-replay-")
         self._timelines: dict[tuple[str, str], _Timeline] = {}
         self._export: _Export | None = None
@@ -198,9 +196,6 @@ def routes() -> list[Route]:
     return [
         Route("/archive/days", _answered(_days)),
         Route("/archive/timeline", _answered(_timeline)),
-        Route("/archive/segment", _answered(_segment)),
-        Route("/archive/frame", _answered(_frame)),
-        Route("/archive/strip", _answered(_strip)),
         Route("/archive/exports", _answered(_begin_export), methods=["POST"]),
         Route("/archive/exports/{id}", _answered(_export)),
         Route("/archive/exports/{id}/file", _answered(_file)),
@@ -237,35 +232,6 @@ async def _timeline(request: Request, recordings: Recordings) -> Response:
     asked = request.query_params
     made = await recordings.timeline(asked.get("day", ""), _robot(request), again=asked.get("again") == "1")
     return JSONResponse({"indexing": made}, 202) if isinstance(made, float) else _json(made)
-
-
-async def _segment(request: Request, recordings: Recordings) -> Response:
-    at_ms, for_ms = _number(request, "at", _LATEST_MS), _number(request, "for", LONGEST_MS)
-    seek, media = request.query_params.get("seek") == "1", request.query_params.get("media") != "0"
-    ask = recordings.process.ask
-    made = await ask(questions.segment, _robot(request), at_ms, for_ms, seek=seek, media=media)
-    headers = {"x-next": "" if made.next_ms is None else repr(made.next_ms), "x-complete": str(int(made.complete))}
-    headers["content-length"] = str(len(made.data))
-    return StreamingResponse(_pieces(made.data), media_type="application/octet-stream", headers=headers)
-
-
-async def _frame(request: Request, recordings: Recordings) -> Response:
-    at_ms, width = _number(request, "at", _LATEST_MS), int(_number(request, "w", WIDEST, 0.0))
-    made = await recordings.process.ask(questions.frame, _robot(request), at_ms, width)
-    if made is None:
-        return PlainTextResponse("there is no picture at this time", 404)
-    return Response(made.jpeg, media_type="image/jpeg", headers={"x-captured-ms": repr(made.captured_ms)})
-
-
-async def _strip(request: Request, recordings: Recordings) -> Response:
-    since_ms, step_ms = _number(request, "since", _LATEST_MS), _number(request, "step", 86_400_000.0)
-    count, width = int(_number(request, "count", MOST)), int(_number(request, "w", 320, 160.0))
-    if not count or width < 16:
-        raise BadQuestionError("count is at least 1, and w at least 16")
-    return Response(
-        await recordings.process.ask(questions.strip, _robot(request), since_ms, step_ms, count, width),
-        media_type="image/jpeg",
-    )
 
 
 async def _begin_export(request: Request, recordings: Recordings) -> Response:
@@ -305,18 +271,16 @@ async def _end_export(request: Request, recordings: Recordings) -> Response:
     return JSONResponse({})
 
 
-async def _pieces(data: bytes) -> AsyncIterator[bytes]:
-    """Commands and stops of other pages pass in between."""
-    for begin in range(0, len(data), _PIECE):
-        yield data[begin : begin + _PIECE]
-        await asyncio.sleep(0)
-
-
 def _json(data: bytes) -> Response:
     return Response(data, media_type="application/json")
 
 
-def _robot(request: Request) -> str:
+def robot_and_time(connection: HTTPConnection) -> tuple[str, float]:
+    """Return whose recording a page wants to look at, and from when on. Raises BadQuestionError."""
+    return _robot(connection), _number(connection, "at", _LATEST_MS)
+
+
+def _robot(request: HTTPConnection) -> str:
     text = request.query_params.get("robot", "")
     levels = text.split("/")
     try:
@@ -325,8 +289,8 @@ def _robot(request: Request) -> str:
         raise BadQuestionError(f'robot: "{text[:100]}" is none: write system/type/id') from None
 
 
-def _number(request: Request, name: str, most: float, otherwise: float | None = None) -> float:
-    text: Any = request.query_params.get(name, otherwise)
+def _number(request: HTTPConnection, name: str, most: float) -> float:
+    text: Any = request.query_params.get(name)
     try:
         value = float(text)
     except (TypeError, ValueError):

@@ -192,6 +192,31 @@ export interface Bye {
   again: boolean;
 }
 
+export interface Seek {
+  op: "seek";
+  at: number;
+}
+
+export interface Play {
+  op: "play";
+  on: boolean;
+}
+
+export interface Speed {
+  op: "speed";
+  speed: number;
+}
+
+export interface Played {
+  op: "played";
+  at: number;
+  on: boolean;
+  speed: number;
+  begins?: boolean;
+  ended?: boolean;
+  skipped?: [number, number] | null;
+}
+
 export interface ShownOwner {
   owner: string;
   boot: string;

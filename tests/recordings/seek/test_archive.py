@@ -6,10 +6,9 @@ import random
 from collections.abc import Iterator
 from pathlib import Path
 
-import cv2
-import numpy as np
 import pytest
 
+from pebble.media.decode import VideoDecoder
 from pebble.media.scene import read_counter
 from pebble.recordings.files.recorded import Recorded
 from pebble.recordings.library import files, merged
@@ -18,9 +17,7 @@ from pebble.recordings.recorder.lane import CARRIED, Item, OpenFile
 from pebble.recordings.seek.archive import Archive
 from pebble.recordings.seek.days import Days
 from pebble.recordings.seek.file import SeekableFile
-from pebble.recordings.seek.segment import Flag, segment
-from pebble.recordings.seek.thumbnails import frame, strip
-from tests.recordings.playing import FRED, GOOB, THEN_NS, Line, js, ms, unpacked, write
+from tests.recordings.playing import FRED, GOOB, THEN_NS, Line, js, ms, write
 from tests.recordings.seek.filming import CAMERA, FPS, SCENES, film
 
 SECONDS = 30
@@ -48,6 +45,10 @@ def moments(count: int = 25) -> list[int]:
     """Nanoseconds, at random and at messages."""
     chance = random.Random(7)
     return [THEN_NS + round(1e9 * chance.uniform(0.5, SECONDS)) for _ in range(count)] + [THEN_NS + 12 * 10**9]
+
+
+def at_ns(seconds: float) -> int:
+    return THEN_NS + round(seconds * 1e9)
 
 
 def texts(messages: list[Recorded]) -> list[tuple[int, str, bytes]]:
@@ -98,48 +99,14 @@ def test_the_picture_at_a_time_is_the_one_that_was_there(tmp_path: Path, encodin
     chance = random.Random(3)
     for _ in range(8):
         number = chance.randrange(10 * FPS)
-        made = frame(archive, GOOB, ms(number / FPS) + 20)
+        decoder = VideoDecoder()
+        *_, made = (decoder.feed(one.payload) for one in archive.pictures(GOOB, at_ns(number / FPS + 0.02)))
         assert made is not None
-        shown = cv2.imdecode(np.frombuffer(made.jpeg, np.uint8), cv2.IMREAD_COLOR)
-        assert read_counter(shown) == number % SCENES
-        assert abs(made.captured_ms - ms(number / FPS)) <= 1
-    assert frame(archive, GOOB, ms(-1)) is None
-    assert frame(archive, GOOB, ms(30)) is None, "an old picture is shown as one of this time"
+        assert read_counter(made.picture) == number % SCENES
+        assert abs((made.captured_ms or 0) - ms(number / FPS)) <= 1
+    assert archive.pictures(GOOB, at_ns(-1)) == []
+    assert archive.pictures(GOOB, at_ns(30)) == [], "an old picture is shown as one of this time"
     archive.close()
-
-
-def test_a_segment_begins_with_the_state_and_the_chain_of_its_picture(archive: Archive) -> None:
-    made = segment(archive, GOOB, ms(13.5), 2000, seek=True, media=True)
-    found = list(unpacked(made.data))
-    chain = [payload for _, flags, _, payload in found if flags & Flag.CHAIN]
-    assert len(chain) == round(1.5 * FPS) + 1  # key frames come every two seconds
-    state = {metric for _, flags, metric, _ in found if flags & Flag.STATE}
-    assert {"online", "capabilities", "sensors/imu", "charging-level", "logs", "drive-values"} == state
-    live = [one for one in found if not one[1] & (Flag.STATE | Flag.CHAIN)]
-    assert sum(bool(flags & Flag.PICTURE) for _, flags, _, _ in live) == 2 * FPS
-    assert sum(bool(flags & Flag.SOUND) for _, flags, _, _ in live) == 100
-    assert all(flags & Flag.INCOMING for _, flags, metric, _ in found if metric == "drive-values")
-    assert made.next_ms == ms(15.5)
-    assert made.complete
-
-
-def test_without_media_there_are_no_pictures(archive: Archive) -> None:
-    made = segment(archive, GOOB, ms(10), 2000, seek=True, media=False)
-    assert not [flags for _, flags, _, _ in unpacked(made.data) if flags & (Flag.PICTURE | Flag.SOUND)]
-
-
-def test_a_gap_leads_to_what_follows_it(archive: Archive) -> None:
-    assert segment(archive, GOOB, ms(-100), 2000, seek=False, media=True).next_ms == ms(0)
-    after = segment(archive, GOOB, ms(SECONDS + 5), 2000, seek=False, media=True)
-    assert (after.data, after.next_ms) == (b"", None)
-
-
-def test_thumbnails_stand_side_by_side_and_grey_where_there_is_none(archive: Archive) -> None:
-    made = strip(archive, GOOB, ms(-20), 10_000, 4, 160)
-    shown = cv2.imdecode(np.frombuffer(made, np.uint8), cv2.IMREAD_COLOR)
-    assert shown.shape == (90, 640, 3)
-    spread = [float(shown[:, begin : begin + 160].std()) for begin in range(0, 640, 160)]
-    assert max(spread[:2]) < 3 < 10 < min(spread[2:])
 
 
 def test_a_day_names_its_robots_and_gaps(tmp_path: Path) -> None:

@@ -20,7 +20,6 @@ from pebble.transports import MqttSettings
 from pebble.transports import clock as message_clock
 from pebble.web import control, robots, server
 from pebble.web.drive import drivers, refusals
-from pebble.web.media import pictures_and_sound
 from tests.robot.lockstep.network import Connection, Network
 from tests.robot.lockstep.processes import Process
 from tests.web.driving_lockstep.pages import EPOCH
@@ -83,7 +82,7 @@ def virtual() -> Iterator[None]:
         stack.enter_context(patch.object(message_clock, "since_boot", TIME.monotonic))
         for module in (server, control, broker):
             stack.enter_context(patch.object(module, "secrets", secrets))
-        stack.enter_context(patch.object(pictures_and_sound, "MediaHub", _Nothing))
+        stack.enter_context(patch.object(server, "MediaHub", _Nothing))
         yield
 
 

@@ -86,9 +86,8 @@ def _do(script: str, *selectors: str) -> Act:
 
 
 def _timeline(page: Page) -> None:
-    """The day is here, and its pictures."""
-    page.locator(".timeline-strip img").wait_for(timeout=30_000)
-    page.locator("[data-card=values] dl").wait_for()
+    """The day is here."""
+    page.wait_for_function("pebble.replay?.day.timeline", timeout=30_000)
 
 
 def _recordings_link(page: Page) -> None:
@@ -277,9 +276,8 @@ SCREENS = [
     Screen("bell", "driving", _trouble, ("desktop", "phone")),
     Screen("own-name", "operating", _press(".me"), ("desktop",)),
     Screen("replay-timeline", "replay", _timeline, ("desktop", "phone", "landscape", "small")),
-    Screen("replay-day", "replay", _timeline, ("phone",), _at(".timeline")),
-    Screen("replay-marked", "replay-gap", _timeline, ("desktop",), _at(".replay-bench", "[data-test=mark-in]")),
-    Screen("replay-cards", "replay", _timeline, ("desktop",), _at(".replay-body > .cards")),
+    Screen("replay-days", "replay", _timeline, hold=_press("[data-test=open-days]")),
+    Screen("replay-marked", "replay-gap", _timeline, hold=_press("[data-test=open-download]", "[data-test=mark-in]")),
     Screen("recordings-link", "driving-recorded", _recordings_link, ("desktop",)),
 ]
 CASES = [(screen, size) for screen in SCREENS for size in screen.sizes]

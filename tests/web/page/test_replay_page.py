@@ -6,7 +6,6 @@ import re
 from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
-from urllib.parse import quote
 
 import numpy as np
 import pytest
@@ -21,12 +20,12 @@ from tests.web.states import STATES
 pytest.importorskip("duckdb")  # it makes timelines
 pytestmark = [pytest.mark.page, pytest.mark.timeout(180)]
 
-SEGMENTS, TIMELINE = re.compile("/archive/segment"), re.compile("/archive/timeline")
+TIMELINE = re.compile("/archive/timeline")
 AT = START + 30_000
 #: What every page sends of itself, on any screen.
 USUAL = {"hello", "echo", "watch"}
-_DRAWN = """(at) => { const { player, drawnAt } = window.pebble?.replay ?? {};
-  return Boolean(drawnAt) && drawnAt.seeks === player.seeks && drawnAt.receivedMs === at; }"""
+_DRAWN = """(at) => { const { feed, video } = window.pebble?.replay ?? {};
+  return Boolean(feed) && !feed.seeking && video.info?.receivedMs === at; }"""
 
 
 @pytest.fixture
@@ -34,7 +33,7 @@ def replay(show: Show, server: CannedServer) -> Iterator[Tab]:
     """Half a minute after the begin, paused; whatever a test does there, no robot is sent anything."""
     with show(STATES["replay"]) as opened:
         assert shown(opened, AT)
-        assert opened.until("!!window.pebble?.replay?.timeline", 30)
+        assert opened.until("!!window.pebble?.replay?.day.timeline", 30)
         yield opened
         assert {message["op"] for message in server.received} <= USUAL
         assert [message["ref"] for message in server.sent("watch")] == [""] * len(server.sent("watch"))
@@ -46,13 +45,8 @@ def shown(opened: Tab, at: int, within: float = 15.0) -> bool:
     return opened.until(lambda: opened.page.evaluate(_DRAWN, at), within)
 
 
-def shown_any(opened: Tab, at: int) -> bool:
-    """Whether the picture that was received at this time is drawn, however it came to be."""
-    return opened.until(f"pebble.replay.drawnAt?.receivedMs === {at}", 15)
-
-
 def position(opened: Tab) -> float:
-    return float(opened.page.evaluate("pebble.replay.player.position"))
+    return float(opened.page.evaluate("pebble.replay.feed.position"))
 
 
 def seek(opened: Tab, at: float) -> None:
@@ -66,20 +60,21 @@ def stored(opened: Tab, metric: str) -> Any:
 def test_the_way_to_a_day_and_a_robot(show: Show) -> None:
     with show(replace(STATES["recordings"], path="/")) as opened:
         opened.page.get_by_role("link", name="Recordings", exact=True).click()
-        assert opened.until("window.pebble?.replay?.drawnAt", 30)  # a picture is there at once
-        assert GAP[1] <= position(opened) < GAP[1] + 10_000  # the first one of the newest session
+        assert opened.until("window.pebble?.replay?.video.info", 30)  # a picture is there at once
+        assert GAP[1] <= position(opened) <= GAP[1] + 20_000  # the first one of the newest session
+        opened.test("open-days").click()
         opened.page.get_by_role("link", name="All days").click()
         day = opened.test(f"day-{DAY}")
         day.wait_for()
         assert "10:00 to 10:06" in day.inner_text()
         assert "1 gap" in day.inner_text()
         day.get_by_role("link", name="goob").click()
-        assert opened.until("window.pebble?.replay?.player.seeks > 0", 30)
-        assert START - 10_000 <= position(opened) <= START  # where its first session begins
+        assert opened.until("window.pebble?.replay?.feed.seeks > 0", 30)
+        assert START <= position(opened) <= START + 10_000  # the first picture of its first session
         opened.test("badge").get_by_role("link").click()
         assert opened.until(lambda: opened.page.url.endswith(f"/r/{ROBOT}"))
         opened.page.get_by_role("link", name="Recordings", exact=True).click()
-        assert opened.until("window.pebble?.replay?.player.seeks > 0", 30)
+        assert opened.until("window.pebble?.replay?.feed.seeks > 0", 30)
         opened.page.go_back()
         assert opened.until("pebble.route.ref !== '' && pebble.replay === null")
         # Who leaves the robot's page so soon closes its line for pictures before that is there.
@@ -101,60 +96,51 @@ def test_a_time_in_the_address_is_shown_and_follows_seeks(replay: Tab):
     assert replay.until(lambda: replay.page.url.endswith(f"/replay/{ROBOT}?at={AT + 12_345}"))
 
 
-def test_the_picture_is_the_one_of_that_time(replay: Tab):
-    """Pixel by pixel the one that the server makes of it, but for its compression."""
-    script = f"""async (address) => {{ {PIXELS}
-      const bitmap = await createImageBitmap(await (await fetch(address)).blob());
-      const other = new OffscreenCanvas(bitmap.width, bitmap.height);
-      other.getContext("2d").drawImage(bitmap, 0, 0);
-      const [a, b] = [pixelsOf(pebble.replay.video.canvas), pixelsOf(other)];
-      return a.length === b.length ? a.reduce((sum, one, i) => sum + Math.abs(one - b[i]), 0) / a.length : 999;
-    }}"""
-    difference = replay.page.evaluate(script, f"/archive/frame?robot={quote(ROBOT)}&at={AT}&w=480")
-    assert difference < 4
-
-
 def test_playing_and_its_keys(replay: Tab):
     keys = replay.page.keyboard
     keys.press("Space")
-    assert replay.until("pebble.replay.player.playing")
+    assert replay.until("pebble.replay.feed.played.on")
     assert replay.until(lambda: position(replay) > AT + 1500)
-    assert replay.until("pebble.replay.drawnAt.receivedMs > pebble.replay.player.position - 400")
+    assert replay.until("pebble.replay.video.info.receivedMs > pebble.replay.feed.position - 400")
     keys.press("Space")
-    assert replay.until("!pebble.replay.player.playing")
-    at = position(replay)
+    assert replay.until("!pebble.replay.feed.played.on")
     for key, step in (("ArrowRight", 10_000), ("Shift+ArrowLeft", -60_000), ("ArrowLeft", -10_000)):
         before = position(replay)
         keys.press(key)
-        assert position(replay) == max(0, before + step), key
-    assert at > AT
+        assert position(replay) == pytest.approx(before + step, abs=1), key
     for key, speed in (("+", 2), ("+", 4), ("-", 2)):
         keys.press(key)
-        assert replay.page.evaluate("pebble.replay.player.speed") == speed
+        assert replay.until(f"pebble.replay.feed.played.speed === {speed}"), key
     keys.press("End")
     assert replay.until(lambda: END - 10_000 <= position(replay) <= END + 10_000)
     keys.press("Home")
-    assert replay.until(lambda: START - 10_000 <= position(replay) <= START)
+    assert replay.until(lambda: START <= position(replay) <= START + 10_000)
 
 
-def test_one_picture_on_and_back(replay: Tab):
-    for key, at in ((".", AT + 100), (".", AT + 200), (",", AT + 100), (".", AT + 200)):
-        replay.page.keyboard.press(key)
-        assert shown_any(replay, at), key
-    replay.test("picture-back").click()
-    assert shown_any(replay, AT + 100)
+def test_another_day_is_opened(replay: Tab):
+    replay.test("open-days").click()
+    replay.page.locator("[data-test=replay-day] option").nth(1).wait_for(state="attached")
+    replay.test("replay-day").select_option("2026-11-21")
+    assert replay.until("pebble.replay.day.name === '2026-11-21' && !pebble.replay.feed.seeking", 30)
 
 
-def test_the_month_shows_what_was_recorded_and_how_long_it_was_driven(replay: Tab):
-    month = replay.test("month")
-    month.locator("button").first.wait_for()
-    names = [one.get_attribute("aria-label") for one in month.locator("button").all()]
-    assert names[0] == "Saturday, 21 November 2026, not driven"
-    assert names[1].startswith("Sunday, 22 November 2026, driven for ")
-    assert month.locator("[aria-current]").inner_text() == "22"
-    assert month.locator("button i").last.bounding_box()["width"] > 5
-    replay.test("day-2026-11-21").click()
-    assert replay.until("pebble.replay.day === '2026-11-21' && !pebble.replay.player.seeking", 30)
+@pytest.mark.parametrize("size", ["desktop", "phone"])
+def test_the_bar_shows_what_was_recorded_and_leads_there(show: Show, size) -> None:
+    with show(STATES["replay"], size) as opened:
+        assert shown(opened, AT)
+        assert opened.until("!!window.pebble?.replay?.day.timeline", 30)
+        bar = opened.test("bar")
+        for _ in ("the day", "this session only"):
+            box = bar.bounding_box()
+            since, until = (float(bar.get_attribute(name) or 0) for name in ("min", "max"))
+            assert box is not None
+            opened.page.mouse.click(box["x"] + 8 + (box["width"] - 16) / 5, box["y"] + box["height"] / 2)
+            assert opened.until(lambda: abs(position(opened) - (since + (until - since) / 5)) < (until - since) / 50)  # noqa: B023
+            opened.test("near").click()
+        assert START - 10_000 <= since < until <= GAP[0] + 10_000
+        assert opened.page.locator(".player-marks > .gap").count() <= 1
+        assert opened.page.locator(".player-marks > .drive").count() == 1
+        assert opened.complaints() == []
 
 
 def test_a_key_in_a_list_is_not_the_replays(replay: Tab):
@@ -168,7 +154,9 @@ def test_the_cards_show_that_time_and_none_of_them_sends(replay: Tab):
     assert stored(replay, "web/liveness")["latency_ms"] == pytest.approx(42, abs=0.01)
     cards = replay.page.locator("[data-card]").evaluate_all("(all) => all.map((one) => one.dataset.card)")
     assert {"telemetry", "map", "plots", "logs", "values"} <= set(cards)
-    assert not {"lights", "sounds", "autonomy", "outlets", "mcus", "system", "voice"} & set(cards)
+    for card in ("logs", "values"):
+        replay.page.locator(f"[data-card={card}] .card-head button").first.click()  # those for engineers are closed
+    assert not {"lights", "sounds", "autonomy", "outlets", "mcus", "system", "drive"} & set(cards)
     assert replay.until(lambda: "7.91 V" in replay.page.locator("[data-card=telemetry]").inner_text())
     assert replay.until(lambda: "line 10" in replay.test("log-lines").inner_text())
     assert "line 11" not in replay.test("log-lines").inner_text()
@@ -181,7 +169,7 @@ def test_the_cards_show_that_time_and_none_of_them_sends(replay: Tab):
 
 
 def test_plots_and_the_trail_grow_while_it_plays_and_begin_anew_with_a_seek(replay: Tab):
-    replay.page.evaluate("pebble.replay.player.setSpeed(8)")
+    replay.page.evaluate("pebble.replay.feed.setSpeed(8)")
     replay.test("play").click()
     trail = """async () => {
       const { recorderOf } = await import(`/static/${pebble.connection.version}/ui/parts/recorder.js`);
@@ -189,14 +177,7 @@ def test_plots_and_the_trail_grow_while_it_plays_and_begin_anew_with_a_seek(repl
     assert replay.until(lambda: len(replay.page.evaluate(trail)) > 8)
     replay.test("play").click()
     seek(replay, START + 5000)
-    assert replay.until(lambda: replay.page.evaluate(trail) == [START + 5000])
-
-
-def test_what_was_sent_is_shown_and_not_sent_again(replay: Tab):
-    assert replay.until(lambda: "forward 0." in replay.test("sent-drive").inner_text())
-    assert "drive-values" in replay.test("sent").inner_text()
-    seek(replay, START + 60_500)
-    assert replay.until(lambda: "at rest" in replay.test("sent-drive").inner_text())
+    assert replay.until(lambda: replay.page.evaluate(trail) in ([START + 5000], [START + 4800]))
 
 
 def test_overlays_are_those_of_that_time(replay: Tab):
@@ -215,7 +196,7 @@ def test_a_gap_is_left_out_and_explained(replay: Tab):
     replay.test("skipped").wait_for()
     assert replay.test("skipped").inner_text() == "Skipped 3 min 20 s: no connection to the broker"
     assert position(replay) >= GAP[1]
-    assert replay.until(f"pebble.replay.drawnAt.receivedMs >= {GAP[1]}")
+    assert replay.until(f"pebble.replay.video.info.receivedMs >= {GAP[1]}")
 
 
 def test_the_end_of_the_recording_is_shown(replay: Tab):
@@ -230,31 +211,6 @@ def test_a_time_at_which_nothing_was_recorded(show: Show) -> None:
         assert opened.until(lambda: "No picture was recorded here" in opened.test("cover").inner_text(), 15)
 
 
-def test_a_server_that_fails_is_asked_again(replay: Tab):
-    replay.test("play").click()
-    replay.page.route(SEGMENTS, lambda route: route.fulfill(status=503, body="the disk is gone"))
-    replay.test("problem").wait_for()
-    assert "the disk is gone. Trying again…" in replay.test("problem").inner_text()
-    replay.page.unroute(SEGMENTS)
-    assert replay.until("!pebble.replay.player.problem && !pebble.replay.player.waiting")
-    at = position(replay)
-    assert replay.until(lambda: position(replay) > at + 500)
-    replay.console[:] = [line for line in replay.console if "503" not in line]  # Chromium's own line for each
-
-
-def test_a_damaged_answer_is_played_as_far_as_it_is_whole(replay: Tab):
-    def cut(route: Route) -> None:
-        answer = route.fetch()
-        route.fulfill(response=answer, body=answer.body()[:-9])
-
-    replay.page.route(SEGMENTS, cut)
-    seek(replay, AT + 5000)
-    assert shown(replay, AT + 5000)
-    replay.test("problem").wait_for()
-    assert "cut short at byte" in replay.test("problem").inner_text()
-    replay.page.unroute(SEGMENTS)
-
-
 def test_a_day_that_is_being_indexed(show: Show) -> None:
     answers = iter(range(1, 3))
 
@@ -267,8 +223,8 @@ def test_a_day_that_is_being_indexed(show: Show) -> None:
 
     with show(STATES["replay"], routes={TIMELINE: indexing}) as opened:
         opened.page.get_by_text("This day is being indexed: 25 %").wait_for()
-        assert opened.until("!!window.pebble?.replay?.timeline", 30)
-        opened.page.get_by_text("not recorded (1)").wait_for()
+        assert opened.until("!!window.pebble?.replay?.day.timeline", 30)
+        opened.page.get_by_text("not recorded (1)").first.wait_for()
 
 
 @pytest.mark.parametrize("size", ["desktop", "phone"])
@@ -290,44 +246,18 @@ def test_a_day_that_cannot_be_indexed_is_tried_again_by_people_only(
         before = len(asked)
         assert before <= 2
         opened.test("try-again").click()
-        assert opened.until("!!window.pebble?.replay?.timeline", 30)
+        assert opened.until("!!window.pebble?.replay?.day.timeline", 30)
         assert len(asked) == before + 1
 
 
-def test_the_timeline_is_zoomed_moved_and_clicked(replay: Tab):
-    canvas = replay.test("timeline")
-    box = canvas.bounding_box()
-    assert box is not None
-    shown_ms = "(canvas) => [Number(canvas.dataset.from), Number(canvas.dataset.to)]"
-    since, until = canvas.evaluate(shown_ms)
-    replay.test("zoom-day").click()
-    assert replay.until(lambda: canvas.evaluate(shown_ms)[1] - canvas.evaluate(shown_ms)[0] == 86_400_000)
-    for _ in range(40):
-        replay.test("zoom-in").click()
-    assert replay.until(lambda: canvas.evaluate(shown_ms)[1] - canvas.evaluate(shown_ms)[0] == 60_000)
-    since, until = canvas.evaluate(shown_ms)
-    assert since <= AT <= until
-    replay.page.mouse.click(box["x"] + box["width"] / 4, box["y"] + 60)
-    assert replay.until(lambda: abs(position(replay) - (since + 15_000)) < 200)
-    replay.page.mouse.move(box["x"] + box["width"] / 2, box["y"] + 60)
-    replay.test("hover").wait_for()
-    assert replay.until("document.querySelector('.timeline-hover img')?.naturalWidth === 160")
-    replay.page.mouse.down()
-    replay.page.mouse.move(box["x"] + box["width"] / 4, box["y"] + 60, steps=5)
-    replay.page.mouse.up()
-    assert replay.until(lambda: abs(canvas.evaluate(shown_ms)[0] - since - 15_000) < 200)
-    replay.page.mouse.wheel(0, 400)
-    assert replay.until(lambda: canvas.evaluate(shown_ms)[1] - canvas.evaluate(shown_ms)[0] > 200_000)
-    assert abs(position(replay) - (since + 15_000)) < 200  # none of this was a click
-    assert replay.until("document.querySelector('.timeline-strip img')?.naturalWidth >= 160")
-
-
 def test_sessions_lead_to_their_beginning(replay: Tab):
+    replay.test("open-days").click()
     replay.test("session").last.click()
     assert replay.until(lambda: GAP[1] - 10_000 <= position(replay) <= GAP[1])
 
 
 def test_a_stretch_is_downloaded_and_a_download_is_cancelled(replay: Tab):
+    replay.test("open-download").click()
     replay.test("mark-in").click()
     seek(replay, AT + 4000)
     replay.test("mark-out").click()
@@ -369,81 +299,45 @@ def test_space_stops_robots_again_once_the_page_is_left(show: Show, server: Cann
         assert opened.until(lambda: server.sent("stop") == [{"op": "stop", "ref": ROBOT}])
 
 
-def test_two_hundred_seeks_leave_nothing_behind(show: Show, server: CannedServer) -> None:
-    """Bitmaps are closed, requests given up, and there is one worker."""
-    counting = """const made = window.made = { open: 0, workers: 0 };
-      const close = ImageBitmap.prototype.close; const drawn = CanvasRenderingContext2D.prototype.drawImage;
-      const known = new WeakSet();
-      CanvasRenderingContext2D.prototype.drawImage = function (image, ...more) {
-        if (image instanceof ImageBitmap && !known.has(image)) { known.add(image); made.open++; }
-        return drawn.call(this, image, ...more);
-      };
-      ImageBitmap.prototype.close = function () { if (known.delete(this)) made.open--; return close.call(this); };
-      const { Worker: Old } = window;
-      window.Worker = class extends Old { constructor(...all) { super(...all); made.workers++; } };"""
-    seeks = """async (times) => { const { replay } = pebble;
-    const later = (ms) => new Promise((go) => setTimeout(go, ms));
-      for (const at of times) { const { seeks } = replay.player; replay.seek(at); const end = performance.now() + 4000;
-        while (performance.now() < end && !(replay.player.seeks > seeks && replay.drawnAt.seeks ===
-        replay.player.seeks)) await later(2); }
-      return [replay.player.seeks, replay.drawnAt.seeks]; }"""
-    with show(STATES["replay"], script=counting) as opened:
-        assert shown(opened, AT)
-        times = [START + (7919 * number) % 85_000 + 1000 for number in range(240)]
-        cdp = opened.cdp()
-        opened.page.evaluate(seeks, times[:40])
-        cdp.send("HeapProfiler.collectGarbage")
-        before = opened.page.evaluate("performance.memory.usedJSHeapSize")
-        arrived, drawn = opened.page.evaluate(seeks, times[40:])
-        assert arrived == drawn == 241
-        cdp.send("HeapProfiler.collectGarbage")
-        grown = opened.page.evaluate("performance.memory.usedJSHeapSize") - before
-        assert opened.page.evaluate("made") == {"open": 0, "workers": 1}
-        assert grown < 8_000_000
-        assert opened.page.evaluate("pebble.replay.player.bytes") < 16_000_000
-        assert opened.complaints() == []
-
-
 def test_sound_is_played_at_its_own_speed_only_and_after_a_click(replay: Tab):
     assert replay.page.evaluate("pebble.replay.sound.context") is None
     replay.test("play").click()
-    replay.test("replay-sound").click()
-    assert replay.until("pebble.replay.sound.stats?.received > 20 && pebble.replay.sound.context.state === 'running'")
+    replay.test("listen").click()
+    assert replay.until("pebble.replay.sound.stats?.received > 20 && pebble.replay.sound.stats.bufferedMs > 0")
     assert replay.page.evaluate("pebble.replay.sound.stats.refused") == 0
-    assert replay.until("pebble.replay.sound.stats.bufferedMs > 0")
+    assert replay.test("talk").count() == 0
     replay.test("speed").select_option("2")
     replay.page.get_by_text("Sound is played at speed ×1 only").wait_for()
-    assert replay.until("pebble.replay.sound.context.state === 'suspended'")
     replay.test("speed").select_option("1")
-    assert replay.until("pebble.replay.sound.context.state === 'running' && pebble.replay.sound.stats?.received > 20")
-    replay.test("replay-sound").click()
-    assert replay.until("pebble.replay.sound.context.state === 'suspended'")
+    seek(replay, AT)
+    assert replay.until("!pebble.replay.feed.seeking && pebble.replay.sound.stats?.received > 20")
+    replay.test("listen").click()
+    assert replay.until("pebble.replay.sound.worker === null")
 
 
 #: Records what is played, and when pictures are drawn: of each block its time, and of each picture when it was
 #: received.
-_LISTEN = """() => { const { sound } = pebble.replay; const { context } = sound;
+_LISTEN = """async () => { const { sound } = pebble.replay; const { context } = sound;
   Object.assign(window, { blocks: [], drawn: [] });
-  sound.speaker.node.port.onmessage = ({ data }) => {
+  const { node } = await sound.speaker;
+  node.port.onmessage = ({ data }) => {
     const { contextTime, performanceTime } = context.getOutputTimestamp();
     blocks.push([performanceTime + 1000 * (data.at - contextTime), [...data.left]]);
   };
-  sound.speaker.node.port.postMessage({ taps: true });
-  const draw = pebble.replay.draw;
-  pebble.replay.pictures.draw = (bitmap, info) => { draw.call(pebble.replay, bitmap, info);
+  node.port.postMessage({ taps: true });
+  const draw = pebble.replay.pictures.canvasDraw;
+  pebble.replay.pictures.canvasDraw = (bitmap, info) => { draw(bitmap, info);
     drawn.push([performance.now(), info.capturedMs]); };
 }"""
 
 
 def test_sound_and_pictures_are_together(replay: Tab):
-    """What was captured at one time is heard and seen within 80 ms; on a busy machine not always."""
+    """What was captured at one time is heard and seen within 150 ms; on a busy machine not always."""
     replay.test("play").click()
-    replay.test("replay-sound").click()
+    replay.test("listen").click()
     assert replay.until("pebble.replay.sound.stats?.received > 20")
-    seek(replay, AT)
-    assert replay.until("pebble.replay.drawnAt.seeks === pebble.replay.player.seeks")
     replay.page.evaluate(_LISTEN)
-    assert any(abs(_apart(replay)) < 80 for _ in range(4))
+    assert any(abs(_apart(replay)) < 150 for _ in range(4))
 
 
 def _apart(opened: Tab) -> float:
@@ -472,21 +366,36 @@ def test_a_snapshot_is_named_after_the_time_at_which_it_was_taken(replay: Tab):
     assert download.value.suggested_filename == "goob-2026-11-22T10-00-29.png"
 
 
-def test_a_phone_has_all_of_it_and_fingers_move_the_day(show: Show) -> None:
-    with show(STATES["replay"], "phone") as opened:
+def test_two_hundred_seeks_leave_nothing_behind(show: Show, server: CannedServer) -> None:
+    """Bitmaps are closed, and there is one worker and one socket."""
+    counting = """const made = window.made = { open: 0, workers: 0, sockets: 0 };
+      const close = ImageBitmap.prototype.close; const drawn = CanvasRenderingContext2D.prototype.drawImage;
+      const known = new WeakSet();
+      CanvasRenderingContext2D.prototype.drawImage = function (image, ...more) {
+        if (image instanceof ImageBitmap && !known.has(image)) { known.add(image); made.open++; }
+        return drawn.call(this, image, ...more);
+      };
+      ImageBitmap.prototype.close = function () { if (known.delete(this)) made.open--; return close.call(this); };
+      const { Worker: Old, WebSocket: OldSocket } = window;
+      window.Worker = class extends Old { constructor(...all) { super(...all); made.workers++; } };
+      window.WebSocket = class extends OldSocket {
+        constructor(url) { super(url); made.sockets += /replay/.test(url); } };"""
+    seeks = """async (times) => { const { replay } = pebble;
+    const later = (ms) => new Promise((go) => setTimeout(go, ms));
+      for (const at of times) { replay.seek(at); const end = performance.now() + 4000;
+        while (performance.now() < end && (replay.feed.seeking || !replay.video.info)) await later(2); }
+      return [replay.feed.seeks, replay.video.info?.receivedMs]; }"""
+    with show(STATES["replay"], script=counting) as opened:
         assert shown(opened, AT)
-        assert opened.until("!!window.pebble?.replay?.timeline", 30)
-        canvas = opened.test("timeline")
-        canvas.scroll_into_view_if_needed()
-        box = canvas.bounding_box()
-        assert box is not None
-        shown_ms = "(canvas) => [Number(canvas.dataset.from), Number(canvas.dataset.to)]"
-        since, until = canvas.evaluate(shown_ms)
-        opened.page.touchscreen.tap(box["x"] + box["width"] / 10, box["y"] + 60)
-        assert opened.until(lambda: abs(position(opened) - (since + (until - since) / 10)) < 3000)
-        middle, y, cdp = box["x"] + box["width"] / 2, box["y"] + 60, opened.cdp()
-        for kind, apart in (("touchStart", 20), ("touchMove", 40), ("touchMove", 80), ("touchEnd", 0)):
-            points = [{"x": middle - apart, "y": y, "id": 1}, {"x": middle + apart, "y": y, "id": 2}]
-            cdp.send("Input.dispatchTouchEvent", {"type": kind, "touchPoints": points if apart else []})
-        assert opened.until(lambda: canvas.evaluate(shown_ms)[1] - canvas.evaluate(shown_ms)[0] < (until - since) / 2)
+        times = [START + (7919 * number) % 85_000 + 1000 for number in range(240)]
+        cdp = opened.cdp()
+        opened.page.evaluate(seeks, times[:40])
+        cdp.send("HeapProfiler.collectGarbage")
+        before = opened.page.evaluate("performance.memory.usedJSHeapSize")
+        arrived, drawn = opened.page.evaluate(seeks, times[40:])
+        assert (arrived, drawn) == (241, times[-1] // 100 * 100)
+        cdp.send("HeapProfiler.collectGarbage")
+        grown = opened.page.evaluate("performance.memory.usedJSHeapSize") - before
+        assert opened.page.evaluate("made") == {"open": 0, "workers": 1, "sockets": 1}
+        assert grown < 8_000_000
         assert opened.complaints() == []

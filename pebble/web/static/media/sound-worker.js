@@ -30,12 +30,13 @@ let aliveAt = 0;
 self.onmessage = ({ data }) => {
   aliveAt = performance.now();
   if (data.op === "open") open(data);
+  else if (data.op === "take") playout?.take(data.payload);
   else if (data.op === "talk") talk(data);
   else if (data.op === "end") end();
 };
 
 /**
- * ``port`` null: this page only talks; ``name`` and ``device``: whose it is
+ * ``ref`` "": packets come by messages; ``port`` null: this page only talks; ``name`` and ``device``: whose it is
  * @param {{ref: string, port: MessagePort|null, rate: number, name: string, device: string}} message
  */
 async function open(message) {
@@ -45,7 +46,8 @@ async function open(message) {
     can = (await decodesOpus()) ? "opus,pcm" : "pcm";
     setInterval(() => self.postMessage({ stats: playout?.stats() }), STATS_MS);
   }
-  connect();
+  if (ref) connect();
+  else self.postMessage({ connection: "open" });
 }
 
 function connect() {

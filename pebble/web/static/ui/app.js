@@ -14,7 +14,7 @@ export const PARTS = {
 };
 
 /** Not among them: few people look at recordings. */
-const REPLAY = styled(async (again) => (await import("./replay/replay.js" + again)).Replay, "replay.css", "picture.css");
+const REPLAY = styled(async (again) => (await import("./replay/replay.js" + again)).Replay, "replay.css");
 
 /** @returns {"desktop" | "portrait" | "immersive"} how the page is laid out */
 export function useLayout() {

@@ -1,21 +1,15 @@
 /** The recordings of the server, as its /archive/ offers them. No framework, no DOM. */
 
 import { ROOT } from "../browser.js";
-import { readFrames } from "./frames.js";
 
-const MOST_BYTES = 24_000_000; // of one segment: the server ends one at 8 MB of pictures
 const INDEXING_MS = 500; // between two questions for a day that is being indexed
 
 /** The server has answered, and asking the same again changes nothing: ``message`` is what it says. */
 export class RefusedError extends Error {}
 
 /**
- * @typedef {import("./frames.js").Frame} Frame
- * @typedef {{frames: Frame[], problem: string, until: number, next: number | null, complete: boolean, bytes: number}} Segment
- * ``next``: where the next message is; null: nothing follows
  * @typedef {{since: number, until: number, why?: string}} Stretch
- * @typedef {{from: number, step: number, activity: number[], video: number[], audio: number[], rest: number[],
- *   gaps: Stretch[], outages: Stretch[], sessions: Stretch[]}} Timeline
+ * @typedef {{from: number, step: number, activity: number[], gaps: Stretch[], outages: Stretch[], sessions: Stretch[]}} Timeline
  * @typedef {{day: string, robots: string[], bytes: number, first: number, last: number, gaps: number, unread: string[],
  *   driven?: Record<string, number>}} Day ``driven``: seconds by robot
  * @typedef {{state: "running" | "ready" | "failed", done: number, why: string, name: string, bytes: number}} ExportState
@@ -47,36 +41,6 @@ export class Archive {
       onIndexing(value.indexing ?? 0);
       await delay(INDEXING_MS, signal);
     }
-  }
-
-  /**
-   * @param {string} robot @param {number} at epoch ms @param {number} lasts ms @param {boolean} seek @param {AbortSignal} signal
-   * @returns {Promise<Segment>}
-   */
-  async segment(robot, at, lasts, seek, signal) {
-    const asked = query({ robot, at: Math.floor(at), for: Math.ceil(lasts), ...(seek ? { seek: 1 } : {}) });
-    const answer = await this.get(`${ROOT}archive/segment?${asked}`, signal);
-    const bytes = await answer.arrayBuffer();
-    if (bytes.byteLength > MOST_BYTES) throw new RefusedError(`${bytes.byteLength} bytes in one segment are too many`);
-    const until = Math.floor(at) + Math.ceil(lasts);
-    const next = answer.headers.get("x-next") ?? "";
-    return {
-      ...readFrames(bytes),
-      until,
-      next: next === "" || !Number.isFinite(Number(next)) ? null : Math.max(until, Number(next)),
-      complete: answer.headers.get("x-complete") !== "0",
-      bytes: bytes.byteLength,
-    };
-  }
-
-  /** @param {string} robot @param {number} at @param {number} w @returns {string} the address of a picture */
-  static frame(robot, at, w) {
-    return `${ROOT}archive/frame?${query({ robot, at: Math.round(at), w })}`;
-  }
-
-  /** @param {string} robot @param {number} since @param {number} step @param {number} count @returns {string} */
-  static strip(robot, since, step, count) {
-    return `${ROOT}archive/strip?${query({ robot, since: Math.round(since), step: Math.round(step), count, w: 160 })}`;
   }
 
   /** @param {string} robot @param {Stretch} stretch @param {"mkv" | "mp4" | "mcap"} as @returns {Promise<string>} its id */

@@ -1,17 +1,17 @@
 // Which day and which robot.
 
 import { Archive } from "../../core/replay/archive.js";
+import { holding } from "../../core/replay/timeline.js";
 import { Bands } from "../banner.js";
 import { ROOT } from "../../core/browser.js";
-import { html, useEffect, useModel, usePage, useState } from "../parts/hooks.js";
+import { html, useEffect, usePage, useState } from "../parts/hooks.js";
 import { Icon, RouteLink } from "../parts/parts.js";
 import { recordingsOf } from "../fleet/recordings-link.js";
 import { iconOf } from "../fleet/fleet.js";
 import { nameIn } from "../parts/looks.js";
 import { shortTime } from "../parts/more-words.js";
-import { clockTime } from "../parts/words.js";
+import { clockTime, span } from "../parts/words.js";
 
-const date = new Intl.DateTimeFormat("en-GB", { weekday: "short", day: "numeric", month: "short", year: "numeric" });
 const short = new Intl.DateTimeFormat("en-GB", { day: "numeric", month: "short" });
 const utc = new Intl.DateTimeFormat("en-GB", {
   weekday: "long",
@@ -20,9 +20,6 @@ const utc = new Intl.DateTimeFormat("en-GB", {
   year: "numeric",
   timeZone: "UTC",
 });
-
-/** @param {number} ms epoch @returns {string} Sun, 22 Nov 2026 */
-export const dayWords = (ms) => date.format(ms);
 
 /** @param {number} ms epoch @returns {string} 22 Nov, 10:03:12 */
 export const timeWords = (ms) => `${short.format(ms)}, ${clockTime(ms)}`;
@@ -35,8 +32,6 @@ export function sizeWords(bytes) {
   if (bytes < 1e6) return `${Math.max(1, Math.round(bytes / 1e3))} kB`;
   return bytes < 1e9 ? `${(bytes / 1e6).toFixed(bytes < 1e7 ? 1 : 0)} MB` : `${(bytes / 1e9).toFixed(1)} GB`;
 }
-
-const monthWords = new Intl.DateTimeFormat("en-GB", { month: "long", year: "numeric", timeZone: "UTC" });
 
 /** @returns {{days: import("../../core/replay/archive.js").Day[] | null, problem: string, again: () => void}} */
 function useDays() {
@@ -116,88 +111,49 @@ function Day({ one: { day, robots, bytes, first, last, gaps, unread } }) {
 export function Elsewhere({ at, replay }) {
   const { route, store } = usePage();
   const { days } = useDays();
-  useModel(replay);
-  const { day } = replay;
+  const { name } = replay.day;
   const known = days ?? [];
-  const robots = [...new Set([at, ...(known.find((one) => one.day === day)?.robots ?? [])])].sort();
-  const own = known.filter((one) => one.robots.includes(at));
-  const open = (other) => {
-    history.replaceState(null, "", addressOf(at, other.day));
-    replay.player.pause(); // else its own day would be opened again
-    const first = () => replay.timeline.sessions[0]?.since ?? other.first;
-    replay.openDay(other.day, () => replay.seekPicture(first()));
-  };
+  const robots = [...new Set([at, ...(known.find(({ day }) => day === name)?.robots ?? [])])].sort();
+  const others = [...new Set([name, ...known.filter((day) => day.robots.includes(at)).map(({ day }) => day)])].filter(Boolean);
+  const go = (path) => route.open(path);
   return html`<div class="replay-elsewhere">
-    <div class="replay-robot">
-      <label class="field"
-        ><span>Robot</span
-        ><select
-          data-test="replay-robot"
-          value=${at}
-          onChange=${(event) => route.open(`${recordingsOf(event.currentTarget.value)}?at=${Math.round(replay.player.position)}`)}
-        >
-          ${robots.map((ref) => html`<option key=${ref} value=${ref}>${nameIn(store, ref)}</option>`)}
-        </select></label
+    <label class="field"
+      ><span>Robot</span
+      ><select
+        data-test="replay-robot"
+        value=${at}
+        onChange=${(event) => go(`${recordingsOf(event.currentTarget.value)}?at=${Math.round(replay.feed.position)}`)}
       >
-      <${RouteLink} path=${ALL_DAYS} className="button" label="All days with recordings">All days<//>
-    </div>
-    <${Calendar} key=${day.slice(0, 7)} at=${at} day=${day} days=${own} onOpen=${open} />
+        ${robots.map((ref) => html`<option key=${ref} value=${ref}>${nameIn(store, ref)}</option>`)}
+      </select></label
+    >
+    <label class="field"
+      ><span>Day</span
+      ><select data-test="replay-day" value=${name} onChange=${(event) => replay.openDay(event.currentTarget.value)}>
+        ${others.map((day) => html`<option key=${day} value=${day}>${longDay(day)}</option>`)}
+      </select></label
+    >
+    <${RouteLink} path=${ALL_DAYS} className="button" label="All days with recordings">All days<//>
   </div>`;
 }
 
-const MOST_BAR = 18; // pixels
-
-/** A month, in which the recorded days can be opened; the bar below a day is how long it was driven. */
-function Calendar({ at, day, days, onOpen }) {
-  const [month, turn] = useState(day.slice(0, 7));
-  const months = [...new Set([...days.map((one) => one.day.slice(0, 7)), day.slice(0, 7)])].filter(Boolean).sort();
-  if (!month) return null;
-  const index = months.indexOf(month);
-  const driven = (one) => one.driven?.[at] ?? 0;
-  const inside = days.filter((one) => one.day.startsWith(month));
-  const most = Math.max(60, ...inside.map(driven));
-  const first = Date.parse(`${month}-01T00:00:00Z`);
-  const before = (new Date(first).getUTCDay() + 6) % 7; // weeks begin on Monday
-  const [year, number] = month.split("-").map(Number);
-  const count = new Date(Date.UTC(year, number, 0)).getUTCDate();
-  const cells = Array.from({ length: count }, (_, n) => `${month}-${String(n + 1).padStart(2, "0")}`);
-  const arrow = (step, name) => html`<button
-    type="button"
-    class=${`quiet ${step > 0 ? "turned" : ""}`}
-    aria-label=${name}
-    disabled=${!months[index + step]}
-    aria-describedby=${months[index + step] ? undefined : "why-month"}
-    onClick=${() => turn(months[index + step])}
-  >
-    <${Icon} name="back" />
-  </button>`;
-  const cell = (name) => {
-    const one = inside.find((known) => known.day === name);
-    if (!one) return html`<li key=${name}><span class="dim">${Number(name.slice(8))}</span></li>`;
-    const minutes = Math.round(driven(one) / 60);
-    const words = driven(one) ? `, driven for ${minutes < 1 ? "less than a minute" : `${minutes} min`}` : ", not driven";
-    return html`<li key=${name}>
-      <button
-        type="button"
-        data-test=${`day-${name}`}
-        aria-current=${name === day ? "date" : undefined}
-        aria-label=${`${longDay(name)}${words}`}
-        onClick=${() => onOpen(one)}
-      >
-        ${Number(name.slice(8))}<i style=${{ width: `${Math.round((MOST_BAR * driven(one)) / most)}px` }}></i>
-      </button>
-    </li>`;
-  };
-  return html`<section class="card month" aria-label="Days with recordings">
-    <div class="month-head">${arrow(-1, "Earlier month")}
-      <h2>${monthWords.format(first)}</h2>
-      ${arrow(1, "Later month")}
-    </div>
-    <ul class="month-days" data-test="month">
-      ${["M", "T", "W", "T", "F", "S", "S"].map((name, n) => html`<li key=${`w${n}`} class="dim" aria-hidden="true">${name}</li>`)}
-      ${Array.from({ length: before }, (_, n) => html`<li key=${`b${n}`} aria-hidden="true"></li>`)} ${cells.map(cell)}
-    </ul>
-    <p class="dim">The bar below a day is how long it was driven.</p>
-    <span class="sr" id="why-month">No other month on that side has recordings</span>
-  </section>`;
+/** When it was used that day. */
+export function Sessions({ replay }) {
+  const { day, feed } = replay;
+  if (!day.sessions.length) return html`<p class="dim">${day.timeline ? "It was not used that day." : "…"}</p>`;
+  const now = holding(day.sessions, feed.position);
+  return html`<ol class="sessions">
+    ${day.sessions.map(
+      (session) => html`<li key=${session.since}>
+        <button
+          type="button"
+          data-test="session"
+          aria-current=${session === now ? "true" : undefined}
+          onClick=${() => replay.seek(session.since)}
+        >
+          <span>${clockTime(session.since)} – ${clockTime(session.until)}</span> <small>${span(session.until - session.since)}</small>
+        </button>
+      </li>`,
+    )}
+  </ol>`;
 }

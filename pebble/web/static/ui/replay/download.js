@@ -1,21 +1,27 @@
 // A stretch of the recording as a film, or as it was recorded.
 
 import { Archive, delay } from "../../core/replay/archive.js";
-import { html, useEffect, useModel, useRef, useState, useTick } from "../parts/hooks.js";
+import { html, useEffect, useRef, useState } from "../parts/hooks.js";
 import { Icon, Why } from "../parts/parts.js";
 import { clockTime } from "../parts/words.js";
 import { sizeWords } from "./choose.js";
-import { long } from "./picture.js";
 
 const POLL_MS = 500;
 const LONGEST_MS = 3_600_000;
 const FORMS = { mkv: "Film (MKV)", mp4: "Film (MP4)", mcap: "Raw (MCAP)" };
 
+/** @param {number} ms @returns {string} 3 min 20 s */
+export function long(ms) {
+  const s = Math.round(ms / 1000);
+  const parts = [[Math.floor(s / 3600), "h"], [Math.floor(s / 60) % 60, "min"], [s % 60, "s"]];
+  return parts.filter(([count]) => count).map(([count, unit]) => `${count} ${unit}`).join(" ") || "0 s";
+}
+
 /** One export at a time, from the request to its file. */
 function useExport(replay) {
   const [job, setJob] = useState(/** @type {any} */ (null)); // {id, state, done, why, name, bytes}
   const current = useRef(/** @type {{id: string, abort: AbortController} | null} */ (null));
-  const { archive } = replay;
+  const { archive } = replay.day;
   const end = () => {
     const job = current.current;
     current.current = null;
@@ -46,30 +52,28 @@ function useExport(replay) {
 }
 
 export function Download({ replay }) {
-  useModel(replay);
-  useTick(500);
   const [as, choose] = useState("mkv");
   const { job, begin, end } = useExport(replay);
-  const { player, stretch } = replay;
+  const { feed, stretch, marked } = replay;
   const lasts = stretch.until - stretch.since;
   const running = job?.state === "running";
-  const why = player.seeks ? (lasts > LONGEST_MS ? "At most one hour: mark a shorter stretch" : "") : "Nothing is open yet";
+  const why = feed.seeks ? (lasts > LONGEST_MS ? "At most one hour: mark a shorter stretch" : "") : "Nothing is open yet";
   return html`<div class="download">
     <p>
-      <b data-test="stretch">${player.seeks ? `${clockTime(stretch.since)} – ${clockTime(stretch.until)}` : "–"}</b>
-      <span class="dim"> ${player.seeks && long(lasts)}</span>
+      <b data-test="stretch">${feed.seeks ? `${clockTime(stretch.since)} – ${clockTime(stretch.until)}` : "–"}</b>
+      <span class="dim"> ${feed.seeks && long(lasts)}</span>
     </p>
     <div class="download-marks">
-      <button type="button" data-test="mark-in" onClick=${() => replay.mark("markIn", player.position)}>Begin here</button>
-      <button type="button" data-test="mark-out" onClick=${() => replay.mark("markOut", player.position)}>End here</button>
-      ${replay.marked &&
+      <button type="button" data-test="mark-in" onClick=${() => replay.mark("since", feed.position)}>Begin here</button>
+      <button type="button" data-test="mark-out" onClick=${() => replay.mark("until", feed.position)}>End here</button>
+      ${marked.any &&
       html`<button
         type="button"
         class="quiet"
         data-test="mark-clear"
         onClick=${() => {
-          replay.mark("markIn", null);
-          replay.mark("markOut", null);
+          replay.mark("since", null);
+          replay.mark("until", null);
         }}
       >
         Clear

@@ -1,27 +1,22 @@
-// One component's recordings, opened: the player, and everything of the page that shows what it plays.
+// One component's recording, opened: the server's player feeds what the page of a live robot is made of.
 
 import { Archive } from "../../core/replay/archive.js";
-import { CHAIN, INCOMING, PICTURE, SOUND, STATE } from "../../core/replay/frames.js";
-import { Incoming } from "../../core/replay/incoming.js";
-import { Heartbeats } from "../../core/replay/liveness.js";
-import { Player, SPEEDS } from "../../core/replay/player.js";
-import { View, dayOf, extentOf, stretchOf } from "../../core/replay/timeline.js";
+import { Feed, SPEEDS } from "../../core/replay/feed.js";
+import { dayOf, firstOf, startOf, stretchOf } from "../../core/replay/timeline.js";
+import { LogBook } from "../../core/logs.js";
 import { Store } from "../../core/store.js";
 import { ReplayPictures } from "../../media/replay/pictures.js";
-import { ReplaySound } from "../../media/replay/sound.js";
-import { LogBook } from "../../core/logs.js";
+import { recordingsOf } from "../fleet/recordings-link.js";
 import { logViewOf } from "../parts/log-view.js";
 import { Model } from "../parts/models.js";
-import { recordingsOf } from "../fleet/recordings-link.js";
 import { recorderOf } from "../parts/recorder.js";
+import { span } from "../parts/words.js";
 import { Video } from "../robot/video-model.js";
+import { ReplaySound } from "./sound.js";
 
-const TICK_MS = 20;
-const LIVENESS_MS = 500;
-const END_MS = 2000; // before the last message
 const ADDRESS_MS = 400; // browsers limit how often it may change
-const PICTURE_WITHIN_MS = 10_000; // a picture that was asked for and is not loaded by then is not shown
-const text = new TextDecoder();
+const LOADING_MS = 400; // a seek that takes longer is shown
+const OLD_MS = 2000; // as of a live picture
 
 /** The connection of a recording: always there, and nothing is sent by it. */
 class Recorded extends Model {
@@ -32,8 +27,8 @@ class Recorded extends Model {
     this.isOpen = true;
     this.state = "open";
     this.you = null;
+    this.socket = { outdated: false };
     this.answers = new Map();
-    /** @type {any} */
     this.onLogs = null;
   }
 
@@ -46,82 +41,140 @@ class Recorded extends Model {
   }
 }
 
+/** The picture of a recording: it is always of the same component. */
+class RecordedVideo extends Video {
+  show() {}
+}
+
 /** @param {string} ref */
 const inertDriver = (ref) => ({
   ref,
   onChange: () => () => {},
   interrupt() {},
   changed() {},
+  fail() {},
   reason: () => ({ code: "replay", text: "This is a recording" }),
 });
 
-export class Replay extends Model {
-  /** @param {any} page the live one's services @param {string} ref */
-  constructor(page, ref) {
+/** One day of a recording: what it holds, once the server has indexed it. */
+export class Day extends Model {
+  /** @param {string} ref */
+  constructor(ref) {
     super();
     this.ref = ref;
     this.archive = new Archive();
-    this.player = new Player({
-      load: (at, lasts, seek, signal) => this.archive.segment(ref, at, lasts, seek, signal),
-      deliver: (frames) => this.take(frames),
-      reset: () => this.forget(),
-      changed: () => this.follow(),
-      busy: () => this.pictures.busy,
-      soundLead: () => this.sound.lead,
-    });
-    this.store = new Store(() => this.player.position);
-    this.store.offset = 0; // its clock is the time of the recording
-    this.video = new Video(this.store);
-    this.video.ref = ref;
-    this.pictures = new ReplayPictures((bitmap, info) => this.draw(bitmap, info), () => this.changed());
-    this.sound = new ReplaySound(() => this.changed());
-    this.incoming = new Incoming();
-    this.heartbeats = new Heartbeats();
-    /** @type {any} for tests: the last picture that was drawn */
-    this.drawnAt = null;
-    this.logs = 0;
-    this.shownAt = -Infinity;
-    /** @type {number | null} */
-    this.markIn = null;
-    /** @type {number | null} */
-    this.markOut = null;
-    // -- the day
-    this.day = "";
-    this.view = new View(dayOf(Date.now()));
+    this.name = ""; // 2026-11-22
     /** @type {import("../../core/replay/archive.js").Timeline | null} */
     this.timeline = null;
     this.indexing = -1; // share; -1: it is not
-    this.dayProblem = "";
+    this.problem = "";
     this.then = () => {}; // once the timeline is here
-    this.start = () => {}; // choose a day
-    this.wantedAt = -Infinity; // when the next picture was asked for, by the page's clock; -Infinity: it was not
-    this.dayAbort = new AbortController();
-    this.connection = new Recorded(page.connection);
+    this.abort = new AbortController();
+  }
+
+  /** @param {string} name @param {() => void} [then] @param {boolean} [again] after a failure */
+  async open(name, then = () => {}, again = false) {
+    if (name === this.name && !this.problem) return;
+    this.abort.abort();
+    const { signal } = (this.abort = new AbortController());
+    Object.assign(this, { name, then, timeline: null, indexing: -1, problem: "" });
+    this.changed();
+    const index = (share) => {
+      this.indexing = share;
+      this.changed();
+    };
+    try {
+      this.timeline = await this.archive.timeline(name, this.ref, index, signal, again);
+      then();
+    } catch (error) {
+      if (signal.aborted) return;
+      this.problem = /** @type {Error} */ (error).message;
+    }
+    index(-1);
+  }
+
+  get sessions() {
+    return this.timeline?.sessions ?? [];
+  }
+
+  /** @returns {Promise<string>} the newest one; "": there is none, see ``problem`` */
+  async newest() {
+    let day;
+    try {
+      day = (await this.archive.days(this.abort.signal)).find(({ robots }) => robots.includes(this.ref));
+      this.problem = day ? "" : `There is no recording of ${this.ref}`;
+    } catch (error) {
+      this.problem = /** @type {Error} */ (error).message;
+    }
+    this.changed();
+    return day?.day ?? "";
+  }
+}
+
+/** What a person has marked for a download. */
+class Marked {
+  /** @type {number | null} */
+  since = null;
+  /** @type {number | null} */
+  until = null;
+
+  /** @param {"since" | "until"} name @param {number | null} at */
+  set(name, at) {
+    this[name] = at;
+    if (this.since === null || this.until === null || this.since < this.until) return;
+    this[name === "since" ? "until" : "since"] = null;
+  }
+
+  get any() {
+    return this.since !== null || this.until !== null;
+  }
+}
+
+export class Replay extends Model {
+  /** @param {any} live the page's services @param {string} ref */
+  constructor(live, ref) {
+    super();
+    this.ref = ref;
+    this.feed = new Feed(ref, {
+      begin: () => this.begin(),
+      take: (message) => this.take(message),
+      picture: (...picture) => this.pictures.feed(...picture),
+      sound: (payload) => this.sound.feed(payload),
+      changed: () => this.follow(),
+    });
+    this.store = new Store(() => this.feed.position);
+    this.store.offset = 0; // its clock is the time of the recording
+    this.isOutdated = false; // what the store has is of before a seek
+    this.isHere = false; // the first state is
+    this.video = new RecordedVideo(this.store);
+    this.video.ref = ref;
+    this.pictures = new ReplayPictures((bitmap, info) => this.video.draw(bitmap, info), () => this.changed());
+    this.day = new Day(ref);
+    this.day.onChange(() => this.changed());
+    this.marked = new Marked();
     /** What widgets get instead of the page's own services. */
     this.page = {
-      ...page,
+      ...live,
+      recording: this,
       store: this.store,
-      connection: this.connection,
+      connection: new Recorded(live.connection),
       video: this.video,
       driver: inertDriver(ref),
-      commands: { askSeries: () => 0, readLogs: () => 0 },
-      sound: null,
+      commands: { readLogs: () => 0, stop: (of) => of === "" && live.commands.stop("") },
       estop: null,
     };
-    this.timers = [setInterval(() => this.tick(), TICK_MS), setInterval(() => this.shareLiveness(), LIVENESS_MS)];
+    this.sound = new ReplaySound(this.page, ref);
+    this.page.sound = { model: this.sound };
     this.addressTimer = 0;
-    this.closed = false;
-    this.speed = 1;
   }
 
   close() {
-    this.closed = true;
-    this.timers.forEach(clearInterval);
     clearTimeout(this.addressTimer);
-    this.dayAbort.abort();
-    this.player.close();
-    this.pictures.close();
-    this.sound.close();
+    this.day.abort.abort();
+    this.feed.close();
+    this.pictures.stop();
+    this.sound.leave();
+    this.sound.context?.close();
     this.store.clear();
     this.video.canvas.remove();
     this.video.canvas.width = this.video.canvas.height = 0; // gives its memory back at once
@@ -129,222 +182,105 @@ export class Replay extends Model {
 
   // -- what people do
 
+  /** Go where the address says: ?at=MS, else ?day=2026-11-22, else the newest day. */
+  async start() {
+    const query = new URLSearchParams(location.search);
+    const at = Number(query.get("at") || NaN);
+    if (Number.isFinite(at)) return this.seek(at);
+    const asked = query.get("day") ?? "";
+    const day = Number.isFinite(startOf(asked)) ? asked : await this.day.newest();
+    if (day) this.day.open(day, () => this.feed.seeks || this.seek(firstOf(this.day, asked ? 0 : -1)));
+  }
+
   /** @param {number} ms */
   seek(ms) {
-    if (!Number.isFinite(ms) || this.closed) return;
-    this.wantedAt = -Infinity;
-    this.openDay(dayOf(ms));
-    this.player.seek(ms);
+    if (!Number.isFinite(ms)) return;
+    this.day.open(dayOf(ms));
+    this.feed.seek(ms);
+  }
+
+  /** The first session of another day. @param {string} name */
+  openDay(name) {
+    this.feed.play(false); // else its own day would be opened again
+    this.day.open(name, () => this.feed.seek(firstOf(this.day)));
   }
 
   /** @param {number} ms from where it is */
   step(ms) {
-    this.seek(this.player.position + ms);
+    this.seek(this.feed.position + ms);
   }
 
-  /** To where a picture is: to the first one from there on, if there is none of before. @param {number} ms */
-  seekPicture(ms) {
-    this.seek(ms);
-    this.wantedAt = performance.now();
-  }
-
-  /** One picture on or back. @param {1 | -1} way */
-  stepPicture(way) {
-    this.player.pause();
-    if (way > 0) {
-      this.wantedAt = performance.now();
-      this.goToPicture();
-    } else if (this.video.info) this.seek(this.video.info.receivedMs - 1);
-  }
-
-  /** The picture that was asked for, once it is loaded. */
-  goToPicture() {
-    if (this.wantedAt === -Infinity || this.player.seeking) return;
-    const next = this.player.nextPicture;
-    if (next) this.player.go(next.at);
-    const { complete, playing } = this.player;
-    if (next || complete || playing || performance.now() - this.wantedAt > PICTURE_WITHIN_MS) this.wantedAt = -Infinity;
+  toggle() {
+    this.feed.play(!this.feed.played.on);
   }
 
   /** @param {1 | -1} steps */
   faster(steps) {
-    const index = SPEEDS.indexOf(this.player.speed) + steps;
-    if (SPEEDS[index]) this.player.setSpeed(SPEEDS[index]);
+    this.feed.setSpeed(SPEEDS[SPEEDS.indexOf(this.feed.played.speed) + steps]);
   }
 
-  /** The end of what was recorded that day. */
-  get last() {
-    if (!this.timeline) return NaN;
-    const { from, step, activity } = this.timeline;
-    return from + step * (activity.findLastIndex((bits) => bits !== 0) + 1) - END_MS;
-  }
-
-  toggle() {
-    if (this.player.playing) this.player.pause();
-    else this.player.play();
-  }
-
-  /** @param {"markIn" | "markOut"} name @param {number | null} at */
+  /** @param {"since" | "until"} name @param {number | null} at */
   mark(name, at) {
-    this[name] = at;
-    if (this.markIn !== null && this.markOut !== null && this.markIn >= this.markOut) {
-      if (name === "markIn") this.markOut = null;
-      else this.markIn = null;
-    }
+    this.marked.set(name, at);
     this.changed();
   }
 
   /** What is downloaded. */
   get stretch() {
-    return stretchOf(this.markIn, this.markOut, this.timeline?.sessions ?? [], this.player.position);
+    return stretchOf(this.marked.since, this.marked.until, this.day.sessions, this.feed.position);
   }
 
-  /** The same, once a person has marked it. */
-  get marked() {
-    return this.markIn === null && this.markOut === null ? null : this.stretch;
+  // -- what the player sends
+
+  /** A seek has arrived: everything begins anew. */
+  begin() {
+    this.isOutdated = true;
+    this.video.forget();
+    this.pictures.begin();
+    this.sound.begin();
   }
 
-  /** After what is in dayProblem. */
-  tryAgain() {
-    if (this.day) return this.openDay(this.day, this.then, true);
-    this.dayProblem = "";
-    this.changed();
-    return this.start();
-  }
-
-  /** @param {string} day @param {() => void} [then] once its timeline is here @param {boolean} [again] after a failure */
-  async openDay(day, then = () => {}, again = false) {
-    if (this.closed || (day === this.day && !this.dayProblem)) return;
-    this.dayAbort.abort();
-    const { signal } = (this.dayAbort = new AbortController());
-    if (day !== this.day) this.view = new View(day);
-    this.day = day;
-    this.then = then;
-    this.timeline = null;
-    this.indexing = -1;
-    this.dayProblem = "";
-    this.changed();
-    try {
-      this.timeline = await this.archive.timeline(day, this.ref, (share) => this.index(share), signal, again);
-      this.view.show(...extentOf(this.timeline, this.view));
-      then();
-    } catch (error) {
-      if (signal.aborted) return;
-      this.dayProblem = /** @type {Error} */ (error).message;
+  take(message) {
+    if (message.op === "logs") return logViewOf(this.store, this.ref).take(message);
+    if (this.isOutdated) this.forget(); // the first state has all that there is
+    for (const [ref, metric, value, age] of message.set) {
+      if (value === null) this.store.drop(ref, metric);
+      else this.store.set(ref, metric, value, age);
     }
-    this.indexing = -1;
-    this.changed();
+    return undefined;
   }
 
-  /** @param {number} share */
-  index(share) {
-    this.indexing = share;
-    this.changed();
+  forget() {
+    this.isOutdated = false;
+    this.isHere = true;
+    this.store.clear();
+    recorderOf(this.page, this.ref).restart();
+    logViewOf(this.store, this.ref).book = new LogBook();
   }
 
-  // -- what the player does
-
-  tick() {
-    this.player.tick();
-    this.goToPicture();
-    const { position, playing } = this.player;
-    this.sound.run(playing && this.player.speed === 1 && !this.player.waiting);
-    if (this.player.speed !== this.speed) {
-      this.speed = this.player.speed;
-      this.sound.reset();
-    }
-    if (playing && dayOf(position) !== this.day) this.openDay(dayOf(position));
-  }
-
-  /** Its state has changed: seeks and pauses are in the address. */
+  /** Seeks and pauses are in the address; playing leads to the next day. */
   follow() {
+    const { position, played } = this.feed;
+    this.sound.problem = played.speed === 1 ? "" : "Sound is played at speed ×1 only";
+    if (played.on && dayOf(position) !== this.day.name) this.day.open(dayOf(position));
     this.changed();
     clearTimeout(this.addressTimer);
     this.addressTimer = setTimeout(() => {
-      const path = `${recordingsOf(this.ref)}?at=${Math.round(this.player.position)}`;
+      const path = `${recordingsOf(this.ref)}?at=${Math.round(position)}`;
       if (location.pathname + location.search !== path) history.replaceState(null, "", path);
     }, ADDRESS_MS);
   }
 
-  /** A seek has arrived: everything begins anew. */
-  forget() {
-    this.store.clear();
-    this.video.forget();
-    this.pictures.reset();
-    this.sound.reset();
-    this.incoming.clear();
-    this.heartbeats = new Heartbeats();
-    recorderOf(this.page, this.ref).restart();
-    logViewOf(this.store, this.ref).book = new LogBook();
-    this.logs = 0;
+  // -- of the picture
+
+  /** Why there is no picture of this time; "" there is. */
+  get cover() {
+    const { feed, pictures, video } = this;
+    if (feed.problem) return feed.problem;
+    if (feed.seeking) return performance.now() - feed.soughtAt > LOADING_MS ? "Loading…" : "";
+    if (!video.info) return pictures.state.problem || "No picture was recorded here";
+    const old = feed.position - video.info.receivedMs;
+    return old > OLD_MS ? `No picture was recorded here · this one is ${span(old)} older` : pictures.state.problem;
   }
 
-  /** @param {import("../../core/replay/frames.js").Frame[]} frames that are due */
-  take(frames) {
-    const pictures = [];
-    const lines = [];
-    for (const frame of frames) {
-      if (frame.flags & INCOMING) this.takeIncoming(frame);
-      else if (frame.flags & PICTURE) pictures.push(frame);
-      else if (frame.flags & SOUND) this.sound.take(frame);
-      else if (frame.flags & CHAIN) continue; // neither a picture nor a sound: nothing builds on it
-      else this.takeValue(frame, lines);
-    }
-    if (pictures.length) this.pictures.take(pictures);
-    if (lines.length) this.takeLines(lines);
-  }
-
-  /** @param {import("../../core/replay/frames.js").Frame} frame */
-  takeIncoming({ at, metric, payload, flags }) {
-    const value = flags & (PICTURE | SOUND) ? undefined : parsed(payload);
-    if (!(flags & STATE)) this.incoming.take(at, metric, value, payload.length);
-  }
-
-  /** @param {import("../../core/replay/frames.js").Frame} frame @param {unknown[]} lines of logs */
-  takeValue({ at, metric, payload }, lines) {
-    const value = payload.length ? parsed(payload) : undefined;
-    if (metric === "link") this.heartbeats.receiveLink(value);
-    if (!payload.length) return this.store.drop(this.ref, metric); // nothing is retained any more
-    if (value === undefined) return undefined;
-    if (metric === "logs") lines.push(value);
-    this.store.set(this.ref, metric, value, this.player.position - at);
-    if (metric !== "online") return undefined;
-    this.heartbeats.receive(at, value);
-    return this.shareLiveness();
-  }
-
-  /** @param {unknown[]} lines */
-  takeLines(lines) {
-    const first = this.logs + 1;
-    this.logs += lines.length;
-    logViewOf(this.store, this.ref).take({ ref: this.ref, origin: "recording", first, lines });
-  }
-
-  /** What the server tells of a live component. */
-  shareLiveness() {
-    if (this.heartbeats.receivedAt === -Infinity) return;
-    const view = this.heartbeats.view(this.player.position);
-    const old = this.store.get(this.ref, "web/liveness")?.value;
-    const now = performance.now();
-    if (old && old.online === view.online && now - this.shownAt < LIVENESS_MS) return;
-    this.shownAt = now;
-    this.store.set(this.ref, "web/liveness", view);
-  }
-
-  /** @param {ImageBitmap} bitmap @param {import("../../media/replay/pictures.js").RecordedInfo} info */
-  draw(bitmap, info) {
-    this.video.draw(bitmap, info);
-    this.sound.drew(info.receivedMs, info.capturedMs);
-    const { capturedMs, receivedMs } = info;
-    this.drawnAt = { time: this.player.position, capturedMs, receivedMs, now: performance.now(), seeks: this.player.seeks };
-  }
-}
-
-/** @param {Uint8Array} payload @returns {unknown} undefined: it is no JSON */
-function parsed(payload) {
-  try {
-    return JSON.parse(text.decode(payload));
-  } catch {
-    return undefined;
-  }
 }

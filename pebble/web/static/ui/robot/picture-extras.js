@@ -74,6 +74,7 @@ function Overlays({ source }) {
     const sizes = more.sizes(draw);
     sizes.observe(video.canvas);
     const unsubscribe = store.subscribe(source, OVERLAYS, take);
+    take(); // of a recording that is paused nothing follows
     return () => {
       unsubscribe();
       sizes.disconnect();

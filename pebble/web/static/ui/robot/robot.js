@@ -14,7 +14,8 @@ import { Card, Face, Icon, Part, StopButton, useName, useStream } from "../parts
 import { Stage, useVideo } from "./video.js";
 import { typeOf } from "../parts/words.js";
 
-export function Robot({ at, layout, drawer, onPanel }) {
+/** ``stage``: what shows the picture; ``watches``: without cards that only send. */
+export function Robot({ at, layout, drawer, onPanel, stage = Stage, watches }) {
   const offers = new Offers(at, useValue(at, "capabilities"), useMetrics(at));
   const view = useMemo(() => new CardView(at), [at]);
   useModel(view);
@@ -28,7 +29,7 @@ export function Robot({ at, layout, drawer, onPanel }) {
   useEffect(() => {
     if (!awaits) fetchRest();
   }, [awaits]);
-  const parts = { at, offers, view, video: hasVideo ? video : null, source };
+  const parts = { at, offers, view, video: hasVideo ? video : null, source, stage, watches };
   if (!known) return html`<${Unknown} at=${at} layout=${layout} />`;
   if (layout === "immersive") return html`<${Immersive} ...${parts} drawer=${drawer} onPanel=${onPanel} />`;
   if (layout === "portrait") return html`<${Portrait} ...${parts} onPanel=${onPanel} />`;
@@ -74,8 +75,8 @@ function Unknown({ at, layout }) {
   </div>`;
 }
 
-function Desktop({ at, offers, view, video, source }) {
-  const cards = wanted(offers, view).filter(({ part }) => part !== VOICE || !video);
+function Desktop({ at, offers, view, video, source, stage, watches }) {
+  const cards = wanted(offers, view, watches).filter(({ part }) => part !== VOICE || !video);
   const usual = cards.filter(({ engineers }) => !engineers);
   const side = !offers.drives && video ? usual[0] : null;
   const shown = (card) => html`<${CardOf} key=${card.id} card=${card} ...${{ at, offers, view }} side=${card === side} />`;
@@ -86,7 +87,7 @@ function Desktop({ at, offers, view, video, source }) {
     <div class="bench" ref=${grid}>
       ${video &&
       html`<${Boundary} what="The picture"
-        ><${Stage} at=${at} video=${video} source=${source} offers=${offers} layout="desktop"
+        ><${stage} at=${at} video=${video} source=${source} offers=${offers} layout="desktop"
       /><//>`}
       ${!video && offers.drives && html`<${NoPicture} at=${at} offers=${offers} />`}
       ${offers.drives && html`<${Boundary} vital what="Driving"><${DriveCard} at=${at} offers=${offers} /><//>`}
@@ -108,9 +109,9 @@ const NoPicture = ({ at, offers }) => html`<div class="stage no-picture" data-sp
   <${Part} part=${NO_CAMERA} lines=${1} at=${at} offers=${offers} />
 </div>`;
 
-function Portrait({ at, offers, view, video, source, onPanel }) {
+function Portrait({ at, offers, view, video, source, stage, watches, onPanel }) {
   const [chosen, choose] = useState("");
-  const cards = wanted(offers, view);
+  const cards = wanted(offers, view, watches);
   const first = Boolean(video) || offers.drives;
   const tabOf = (card) => {
     if (first && !offers.drives && card.tab === "sensors") return "drive";
@@ -134,7 +135,7 @@ function Portrait({ at, offers, view, video, source, onPanel }) {
     html`<div class="phone-drive">
       ${video
         ? html`<${Boundary} what="The picture"
-            ><${Stage} at=${at} video=${video} source=${source} offers=${offers} view=${view} layout="portrait"
+            ><${stage} at=${at} video=${video} source=${source} offers=${offers} view=${view} layout="portrait"
           /><//>`
         : html`<${NoPicture} at=${at} offers=${offers} />`}
       ${offers.drives &&
@@ -251,8 +252,8 @@ function SettingsWords() {
   return `Settings and notices${unread ? ` (${unread} new)` : ""}`;
 }
 
-const wanted = (offers, view) =>
-  CARDS.filter((card) => card.wants(offers) && !view.hidden.has(card.id) && !(WATCHES && card.sends));
+const wanted = (offers, view, watches = WATCHES) =>
+  CARDS.filter((card) => card.wants(offers) && !view.hidden.has(card.id) && !(watches && card.sends));
 
 /** Until its part is here the height that it usually has is kept free. */
 function CardOf({ card, at, offers, view, side = false }) {

@@ -32,7 +32,7 @@ export function SoundControls({ at, place = "card" }) {
       >
         <${Icon} name=${listening ? "halt" : "sound"} /><span>${listening ? (inBar ? "Silence" : "Stop listening") : "Listen"}</span>
       </button>
-      <${TalkButton} sound=${sound} noListening=${noListening} short=${short} />
+      ${!page.recording && html`<${TalkButton} sound=${sound} noListening=${noListening} short=${short} />`}
       ${listening &&
       (place === "bar" || !inBar) &&
       html`<button type="button" data-test="mute" aria-pressed=${muted} onClick=${() => sound.toggleMute()}>
@@ -47,7 +47,7 @@ export function SoundControls({ at, place = "card" }) {
 
 /** One line in what is left of the bar: why something is off, or is not heard. Numbers are behind the gear. */
 function Note({ sound, noListening, text }) {
-  const noTalking = sound.talking ? "" : sound.talkReason();
+  const noTalking = sound.talking || usePage().recording ? "" : sound.talkReason();
   const well = text.includes("buffered");
   const said = useCalm(well ? "Listening" : text);
   return html`<p class="bar-note" title=${(well ? "" : text) || noListening || noTalking}>
@@ -79,7 +79,7 @@ function State({ text }) {
 
 /** Under the buttons that are off; once, if it is the same for both. */
 function Reasons({ sound, noListening }) {
-  const noTalking = sound.talking ? "" : sound.talkReason();
+  const noTalking = sound.talking || usePage().recording ? "" : sound.talkReason();
   return html`${noListening && html`<${Why} id="why-listen">${noListening}<//>`}
   ${noTalking && noTalking !== noListening && html`<${Why} id="why-talk">${noTalking}<//>`}`;
 }
