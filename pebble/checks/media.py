@@ -1,4 +1,4 @@
-"""Checks of camera, microphone, codecs and loudspeaker."""
+"""Checks of camera, microphone and loudspeaker."""
 
 import os
 import shutil
@@ -8,8 +8,6 @@ from pathlib import Path
 from pebble.checks import devices
 from pebble.checks.check import CheckResult, failed, ok, warn
 from pebble.config import Config
-from pebble.contract.encodings import NEED_PYAV
-from pebble.media import pyav
 from pebble.services.soundboard_handler.playback import Players
 
 _DEVICE = "services.av_daemon.video.device"
@@ -27,35 +25,6 @@ def microphone(config: Config) -> Iterator[CheckResult]:
     daemon = config.services.av_daemon
     if daemon.enabled and daemon.audio.enabled and daemon.audio.source != "synthetic":
         yield _program(("arecord",), "sudo apt install alsa-utils")
-
-
-def codecs(config: Config, *, installed: bool | None = None) -> Iterator[CheckResult]:
-    """Look for H.264 and Opus; missing codecs are an error only if the config selects them."""
-    if not config.services.av_daemon.enabled:
-        return
-    if pyav.installed() if installed is None else installed:
-        yield ok("H.264 and Opus are available")
-        return
-    sent = config.services.mqtt_bridge.media
-    asked = [name for name in (sent.video_publisher.encoding, sent.audio_publisher.encoding) if name in NEED_PYAV]
-    fix = "pip install 'pebble-robot[media]'"
-    if asked:
-        yield failed(f"PyAV is not installed, so there is no {' and no '.join(asked)}", fix)
-    else:
-        yield ok(f"PyAV is not installed: no H.264, no Opus ({fix})")
-
-
-def sockets_of_the_original(config: Config) -> Iterator[CheckResult]:
-    """Look for what serves the sockets that scripts of the original read, and what would offer them there."""
-    for name, path in config.services.av_daemon.sockets().items():
-        what = f"{name} for the original's scripts"
-        if shutil.which("gst-launch-1.0") is None:
-            fix = "sudo apt install gstreamer1.0-tools gstreamer1.0-plugins-base gstreamer1.0-plugins-bad"
-            yield warn(f"GStreamer, which serves {path}, is not installed", fix, what)
-        elif not path.is_socket():
-            yield warn(f"there is no {path} now", "run examples/gstreamer_sockets.py: docs/original-scripts.md", what)
-        else:
-            yield ok(str(path), what=what)
 
 
 def camera(backend: str, device: str, folder: Path) -> CheckResult:

@@ -81,8 +81,6 @@ ROBOT: tuple[Check[Config], ...] = (
     Check("serial port", devices.serial_ports),
     Check("camera", media.cameras),
     Check("microphone", media.microphone),
-    Check("codecs", media.codecs),
-    Check("sockets of the original", media.sockets_of_the_original),
     Check("loudspeaker", media.loudspeaker),
     Check("operator page", operator_page),
     Check("page's broker", page_brokers),

@@ -1,8 +1,7 @@
-"""Checks of camera, microphone, codecs and loudspeaker."""
+"""Checks of camera, microphone and loudspeaker."""
 
 from __future__ import annotations
 
-import socket
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -10,13 +9,12 @@ from typing import Any
 import pytest
 
 from pebble.checks.check import State
-from pebble.checks.media import camera, cameras, codecs, loudspeaker, microphone, sockets_of_the_original
+from pebble.checks.media import camera, cameras, loudspeaker, microphone
 from pebble.config import Config, parse
 
 
-def config_of(devices: dict[str, Any], **sent: Any) -> Config:
-    services = {"av_daemon": devices, "mqtt_bridge": {"media": sent}}
-    return parse({"robot": {"id": "rover"}, "services": services}, folder=Path.cwd(), env={})
+def config_of(devices: dict[str, Any]) -> Config:
+    return parse({"robot": {"id": "rover"}, "services": {"av_daemon": devices}}, folder=Path.cwd(), env={})
 
 
 Programs = Callable[..., None]
@@ -38,15 +36,15 @@ def only(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Programs:
 @pytest.mark.usefixtures("only")
 def test_a_robot_without_camera_and_microphone_needs_nothing(tmp_path: Path) -> None:
     config = config_of({"enabled": False})
-    assert [*cameras(config, tmp_path), *microphone(config), *codecs(config)] == []
+    assert [*cameras(config, tmp_path), *microphone(config)] == []
 
 
 def test_everything_there(tmp_path: Path, only: Programs) -> None:
     only("arecord")
     (tmp_path / "video0").touch()
     config = config_of({"enabled": True, "video": {"device": "0"}})
-    results = [*cameras(config, tmp_path), *microphone(config), *codecs(config)]
-    assert [result.state for result in results] == [State.OK] * 3
+    results = [*cameras(config, tmp_path), *microphone(config)]
+    assert [result.state for result in results] == [State.OK] * 2
 
 
 @pytest.mark.usefixtures("only")
@@ -74,20 +72,6 @@ def test_the_player_of_sounds(player: str, state: State, fix: str, only: Program
     assert (result.state, result.fix.startswith(fix)) == (state, True)
 
 
-def test_sockets_for_scripts_of_the_original(tmp_path: Path, only: Programs) -> None:
-    path = tmp_path / "v.sock"
-    config = config_of({"enabled": True, "video": {"backend": "synthetic", "socket_path": str(path)}})
-    (missing,) = sockets_of_the_original(config)
-    only("gst-launch-1.0")
-    (unserved,) = sockets_of_the_original(config)
-    socket.socket(socket.AF_UNIX).bind(str(path))
-    (served,) = sockets_of_the_original(config)
-    assert [result.state for result in (missing, unserved, served)] == [State.WARN, State.WARN, State.OK]
-    assert (missing.text, unserved.text) == (
-        f"GStreamer, which serves {path}, is not installed", f"there is no {path} now"
-    )  # fmt: skip
-
-
 @pytest.mark.parametrize(
     ("backend", "level"), [("synthetic", State.OK), ("libcamera", State.FAILED), ("picamera2", State.FAILED)]
 )
@@ -95,17 +79,3 @@ def test_other_cameras(backend: str, level: State, tmp_path: Path, only: Program
     assert camera(backend, "", tmp_path).state is level
     only("rpicam-vid")
     assert camera(backend, "", tmp_path).state is State.OK
-
-
-@pytest.mark.parametrize(
-    ("sent", "level"),
-    [
-        ({}, State.OK),
-        ({"video_publisher": {"encoding": "h264"}}, State.FAILED),
-        ({"audio_publisher": {"encoding": "opus"}}, State.FAILED),
-    ],
-)
-def test_codecs_are_missed_where_they_are_asked_for(sent: dict[str, Any], level: State) -> None:
-    config = config_of({"enabled": True}, **sent)
-    assert [result.state for result in codecs(config, installed=False)] == [level]
-    assert [result.state for result in codecs(config, installed=True)] == [State.OK]
