@@ -23,7 +23,8 @@ _FORBIDDEN = re.compile(f"[\x00-\x1f\x7f-\x9f{_NON_CHARACTERS}]")
 def remembered(translate: Callable[[str], str]) -> Callable[[str], str]:
     """Return ``translate``, which remembers what it returned for topics of the usual length; 2 MB at most."""
     cached = lru_cache(_REMEMBERED)(translate)
-    return lambda topic: cached(topic) if len(topic) <= REMEMBERED_LENGTH else translate(topic)
+    usual = lambda topic: isinstance(topic, str) and len(topic) <= REMEMBERED_LENGTH
+    return lambda topic: cached(topic) if usual(topic) else translate(topic)
 
 
 def _check(what: str, text: str) -> None:

@@ -86,7 +86,7 @@ def test_what_it_retains_is_removed_when_it_is_interrupted(number: signal.Signal
         (["doctor", "--broker", "zenoh:/tmp"], "--broker must be mqtt://"),
         (["doctor", "--broker", "broker.lab"], "--broker must be mqtt://"),
         (["doctor", "--broker", "mqtt://ann:secret@broker.lab"], "--broker holds a password"),
-        (["doctor", "--broker", "mqtt://broker.lab,spare.lab"], "--broker judges one broker"),
+        (["doctor", "--broker", "mqtt://broker.lab,spare.lab"], "--broker names one broker"),
         (["doctor", "--broker", "mqtt://127.0.0.1:PORT", "--below", "pebble/+"], "contains a wildcard"),
         (["doctor", "--broker", "mqtt://127.0.0.1:1", "robot.json"], "leave out the config file"),
     ],

@@ -232,6 +232,8 @@ def test_what_has_no_name_takes_no_place_of_what_has_one(world: World, metric: s
 
 def test_private_interfaces_stay_private_under_a_name(world: World) -> None:
     start(world)
+    world.local.publish("outgoing/mcu/u1/local-only", b'{"topics": []}', retain=True)
+    world.run()
     assert received(world, "by/ann/mcu/u1/describe", b"{}") == []
     assert received(world, "by/ann/mcu/u1/blink", b"{}") == [b'{"by":"ann"}']
 

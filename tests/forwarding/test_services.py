@@ -31,6 +31,7 @@ ONE_SHOTS = (
     *("incoming/soundboard-command", "incoming/autonomy-command", "incoming/something-new"),
 )
 TRUE, FALSE = b"true", b"false"
+NOTHING_LOCAL = b'{"topics": []}'  # of what an MCU has
 Make = Callable[..., World]
 
 
@@ -565,6 +566,8 @@ class TestLeftovers:
     ) -> None:
         bridge.start(**section)
         bridge.run()
+        for uid in ("m1", "m2"):
+            bridge.local.publish(f"outgoing/mcu/{uid}/local-only", NOTHING_LOCAL, retain=True)
         for name in (*self.GONE, *self.STAYS):
             bridge.local.publish(f"outgoing/{name}", b'{"interfaces": [{"name": "range"}]}', retain=True)
         bridge.run()
@@ -593,6 +596,8 @@ class TestPrivate:
             {"name": "c", "channel": "estop/mcu", "dir": "out", "local_only": True},
         ]  # fmt: skip
         manifest = json.dumps({"device_uid": "imu-1", "interfaces": interfaces}).encode()
+        local = ["outgoing/mcu/imu-1/fast", "outgoing/sensors/extra", STOP, RESET, "outgoing/estop/mcu"]
+        bridge.local.publish("outgoing/mcu/imu-1/local-only", json.dumps({"topics": local}).encode(), retain=True)
         bridge.local.publish("outgoing/mcu/imu-1/describe", manifest, retain=True)
         passes = ("outgoing/mcu/imu-1/slow", "outgoing/estop/mcu")
         private = ("outgoing/mcu/imu-1/fast", "outgoing/sensors/extra")

@@ -16,5 +16,5 @@ def test_the_launcher_has_one_thread_and_only_its_own_sockets(kind: str) -> None
         assert len(list((launcher / "task").iterdir())) == 1
         opened = [path.readlink().name for path in (launcher / "fd").iterdir()]
         sockets = [name for name in opened if name.startswith("socket:")]
-        assert len(sockets) == 4, "two for its stop signals, one to the announcer, one that other launchers find"
+        assert len(sockets) == 3, "two for its stop signals, one to the announcer"
         assert "announcer" in rig.processes()

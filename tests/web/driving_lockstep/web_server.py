@@ -160,7 +160,7 @@ class WebServer(Process):
         self.alive = True
         self.lives += 1
         self.loop = VirtualLoop(self.scheduler.clock)
-        with patch.object(broker, "operators", self._connection):
+        with patch.object(broker, "create", self._connection):
             self.server = server.Server(
                 WebSettings(broker=MqttSettings(host="fair"), server="fair"), _Nothing(), _Nothing()
             )  # type: ignore[arg-type]
