@@ -35,7 +35,7 @@ class Options(Struct, kw_only=True):
 
 
 class Companion:
-    """Where another robot is, seen from this one. Each odometry has a frame of its own, so only motions count.
+    """The place of another robot, seen from this one. Each odometry has a frame of its own, so only motions count.
 
     ``ahead_m`` and ``left_m``: where the other one stands at the first call, heading as this one does.
     """

@@ -39,7 +39,7 @@ class WebSettings:
 
     @property
     def name(self) -> str:
-        """What it is called on pages and for other servers."""
+        """The name of this server on pages and for other servers."""
         return self.server or socket.gethostname().partition(".")[0] or "server"
 
 

@@ -128,7 +128,7 @@ def me(account: str | None = None) -> str:
 
 
 def _stop(target: Target, why: str, *, every: bool, hold: bool) -> int:
-    """What is sent has a connection of its own, on which nothing arrives."""
+    """Send stops over a connection of their own, on which nothing arrives."""
     with interrupted_by_signals(), connected(target) as (transport, names):
         robots = None if every else [names.base]
         sender = StopSender(new_name(), by=me(names.account), why=why, now=time.monotonic(), robots=robots, hold=hold)

@@ -274,7 +274,7 @@ _RESERVED = frozenset(("by", "control", "control-turn", "control-vouched", "from
 
 
 def is_reserved(metric: str) -> bool:
-    """Whether only the robot itself may define ``metric``, in either direction: who stops and drives it."""
+    """Return True if only the robot itself may define ``metric``, in either direction: who stops and drives it."""
     family = metric.partition("/")[0]
     return family.startswith("estop") or family in _RESERVED
 
