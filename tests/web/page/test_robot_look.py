@@ -207,7 +207,7 @@ def test_what_experts_set_is_behind_the_gear(show: Show) -> None:
         _ready(opened)
         assert not opened.test("picture-facts").is_visible()
         opened.gear()
-        assert "pbvd 640×360" in opened.test("picture-facts").inner_text()
+        assert "pbvz 640×360" in opened.test("picture-facts").inner_text()
         opened.page.keyboard.press("Escape")
         assert not opened.test("picture-facts").is_visible()
 
