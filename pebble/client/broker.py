@@ -64,7 +64,7 @@ class Broker:
 
     @property
     def not_received(self) -> str:
-        """What is not heard although there is a connection, and why, in one line."""
+        """Return what is not heard although there is a connection, and why, in one line."""
         return self.transport.not_received if self.connected else ""
 
     async def open(self) -> None:

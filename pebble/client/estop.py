@@ -33,7 +33,7 @@ def new_name() -> str:
 
 
 class Progress(Enum):
-    """How far the stop of one robot is, as pages are told."""
+    """The progress of the stop of one robot, as pages are told."""
 
     WAITING = "sent"
     CONFIRMED = "confirmed"

@@ -17,7 +17,7 @@ _RULE = 'must be a name or a whole address, such as "broker.lan" or "192.168.1.7
 
 
 class HostError(PebbleError):
-    """What is wrong with a host, and what to write instead; it repeats nothing of what was written."""
+    """An error that says what is wrong with a host and what to write; it repeats nothing of what was written."""
 
 
 class UrlParts(NamedTuple):

@@ -71,14 +71,14 @@ class RemoteMqtt(Mqtt, frozen=True, kw_only=True):
 
 
 class ZenohClient(Section, frozen=True, kw_only=True):
-    """Where a Zenoh session connects, beyond the robot's own processes."""
+    """Addresses to which a Zenoh session connects, beyond the robot's own processes."""
 
     connect: Annotated[tuple[Endpoint, ...], doc("Zenoh endpoints to connect to.")] = ()
     tls: Annotated[Tls, doc("Certificates for `tls/` and `quic/` endpoints.")] = Tls()
 
 
 class ZenohSection(ZenohClient, frozen=True, kw_only=True):
-    """Where a Zenoh session listens and connects."""
+    """Addresses at which a Zenoh session listens, and to which it connects."""
 
     listen: Annotated[
         tuple[Endpoint, ...],

@@ -34,7 +34,7 @@ def warn_of_logins_in_clear(notes: Notes, root: Root) -> None:
 
 
 def is_near(mqtt: Mqtt) -> bool:
-    """Whether the broker of this section is on this machine."""
+    """Return True if the broker of this section is on this machine."""
     return is_loopback(mqtt.host)
 
 
