@@ -46,10 +46,6 @@ def some_of(names: Collection[str], most: int = 3) -> str:
     return ", ".join(islice(names, most)) + more
 
 
-def _always(_subject: object) -> bool:
-    return True
-
-
 @dataclass(frozen=True, slots=True)
 class Check(Generic[Subject]):
     """One row of a table of checks.
@@ -63,7 +59,7 @@ class Check(Generic[Subject]):
     run: Callable[[Subject], CheckResult | Iterable[CheckResult]]
     needs: tuple[Callable[[Subject], str], ...] = ()
     why: str = ""
-    binds: Callable[[Subject], bool] = _always
+    binds: Callable[[Subject], bool] = lambda _: True
 
 
 def run(

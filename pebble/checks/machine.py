@@ -4,12 +4,13 @@ import os
 import subprocess
 import time
 from resource import RLIM_INFINITY, RLIMIT_MEMLOCK, getrlimit
+from typing import Any
 
 from pebble.checks.check import Check, CheckResult, failed, ok, warn
+from pebble.errors import PebbleError
 
 _ENOUGH_LOCKED = 64 * 1024 * 1024  # a camera's pool of frames at 1080p
 _BUILT = 1735689600  # 2025: a clock before this has not been set
-_PROGRAM_S = 5.0
 
 
 def memory_lock(limit: int, *, root: bool) -> CheckResult:
@@ -38,11 +39,25 @@ def synchronised() -> bool | None:
     return {"yes": True, "no": False}.get(answer.strip())
 
 
+def output_of(program: str, *arguments: str, seconds: float = 5.0, **user: Any) -> str:
+    """Return what a program of the system prints; ``user`` is as whom it runs. Raises PebbleError."""
+    command: tuple[str, ...] = (program, *arguments)
+    try:
+        done = subprocess.run(command, capture_output=True, timeout=seconds, check=False, cwd="/", **user)
+    except FileNotFoundError:
+        raise PebbleError(f"{program} is not installed") from None
+    except (OSError, subprocess.TimeoutExpired) as error:
+        raise PebbleError(str(error)) from None
+    if done.returncode and not done.stdout:
+        raise PebbleError(f"{program} ended with {done.returncode}: {done.stderr.decode(errors='replace')[-300:]}")
+    return str(done.stdout, errors="replace")
+
+
 def printed(*command: str) -> str:
     """Return what a program of the system prints; nothing if it is not there, or does not end."""
     try:
-        return subprocess.run(command, capture_output=True, text=True, timeout=_PROGRAM_S, check=False).stdout
-    except (OSError, subprocess.TimeoutExpired):
+        return output_of(*command)
+    except PebbleError:
         return ""
 
 

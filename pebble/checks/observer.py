@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import secrets
 import time
 from collections import defaultdict, deque
 from collections.abc import Callable, Iterable, Iterator
@@ -11,17 +10,16 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from pebble import contract as c
-from pebble.client.connection import Target, connected, put_names
+from pebble.client.connection import Target, connected, put_names, wait_for
 from pebble.client.names import Names
+from pebble.client.robot_topics import section_of
 from pebble.client.robot_view import RobotView
-from pebble.contract import channel_of, codec
+from pebble.contract import codec
 from pebble.contract.names import with_name
-from pebble.contract.payloads import ControlRequest
 from pebble.errors import PayloadError
 from pebble.transports import Message, QoS, Transport
 
 ANSWER_S = 1.0  # within which a robot answers
-_STEP_S = 0.005
 _MOST = 50_000  # messages that are kept; a robot at rest sends some ten a second
 _RETAINED_S = 1.0  # some brokers send what is retained a moment after the subscription
 
@@ -42,12 +40,10 @@ class Record:
 class Observer:
     """The messages of one robot at one connection. :meth:`wait` lets time pass and reads them."""
 
-    def __init__(
-        self, target: Target, transport: Transport, names: Names, base: str, filters: Iterable[str] = ()
-    ) -> None:
+    def __init__(self, target: Target, transport: Transport, names: Names, filters: Iterable[str] = ()) -> None:
         """``filters``: instead of all that the robot publishes."""
-        self.base, self.target, self.transport, self.account = base, target, transport, names.account
-        self.view = RobotView(base)
+        self.base, self.target, self.transport, self.account = names.base, target, transport, names.account
+        self._names, self.view = names, RobotView(self.base)
         self.records: deque[Record] = deque(maxlen=_MOST)
         self.listeners: list[Callable[[Message, float], None]] = []  # get each message, and when it arrived (monotonic)
         #: When its wheels changed (monotonic), and to what, left and right: from where it is seen besides.
@@ -55,17 +51,14 @@ class Observer:
         self._of: defaultdict[c.Channel | None, deque[Record]] = defaultdict(lambda: deque(maxlen=_MOST))
         self._slowest_s = ANSWER_S / 4  # of its answers
         self._arrived: deque[tuple[Message, float, float]] = deque(maxlen=_MOST)
-        put_names(transport, names, lambda of: of == base and self.view.named)
-        for filter_ in filters or (f"{base}/{c.OUTGOING}/#",):
+        put_names(transport, names, lambda base: base == self.base and self.view.named)
+        for filter_ in filters or (f"{self.base}/{c.OUTGOING}/#",):
             transport.subscribe(filter_, self._take, qos=QoS.DELIVERED, direct=True)
 
     def _take(self, message: Message) -> None:
         self._arrived.append((message, time.monotonic(), time.time()))
 
     # -- what arrives
-
-    def channel_of(self, topic: str) -> c.Channel | None:
-        return channel_of(topic.removeprefix(f"{self.base}/"))
 
     def read(self) -> None:
         while self._arrived:
@@ -78,7 +71,7 @@ class Observer:
                 listener(message, at)
 
     def record_of(self, message: Message, at: float) -> Record:
-        channel = self.channel_of(message.topic)
+        channel = self._names.channel(message.topic)
         value, wrong = None, ""
         try:
             if channel is not None and message.payload:
@@ -100,14 +93,12 @@ class Observer:
 
     def wait(self, condition: Callable[[], object], seconds: float) -> bool:
         """Read what arrives until ``condition``; return False if it does not hold within ``seconds``."""
-        end = time.monotonic() + seconds
-        while True:
+
+        def holds() -> object:
             self.read()
-            if condition():
-                return True
-            if time.monotonic() >= end:
-                return False
-            time.sleep(_STEP_S)
+            return condition()
+
+        return wait_for(holds, seconds)
 
     def look(self, seconds: float) -> float:
         """Let time pass; return when that began."""
@@ -140,12 +131,6 @@ class Observer:
         self.transport.publish(channel.topic(self.base), payload, qos=QoS(channel.default_qos), urgent=True)
         return time.monotonic()
 
-    def publish(self, messages: Iterable[Message]) -> bool:
-        """Publish all at once; return False if one was not accepted."""
-        publish = self.transport.publish
-        accepted = [publish(message.topic, message.payload, qos=message.qos, urgent=True) for message in messages]
-        return all(accepted)
-
     def sent(self, seconds: float) -> float:
         """Wait until the broker has all that was sent, so long at most; return when."""
         self.wait(lambda: self.transport.outgoing.waiting == 0, seconds)
@@ -158,11 +143,6 @@ class Observer:
         with self.beside("conform-other", f"{self.base}/{c.INCOMING}/#") as (beside, messages):
             beside.publish(with_name(topic, account) if account else topic, payload, qos=QoS.DELIVERED, urgent=True)
             return self.wait(lambda: any(message.payload == payload for message in list(messages)), _RETAINED_S)
-
-    def reads_commands(self) -> bool:
-        """True if this client may read what is sent to the robot: a request that changes nothing comes back."""
-        account = (self.account or "") if self.view.named else ""
-        return self.send_as(account, c.CONTROL, ControlRequest(id=secrets.token_hex(4), want="release"))
 
     def retained(self) -> list[Record]:
         """Return what the broker has retained of it and for it, as one gets it who connects now."""
@@ -185,6 +165,20 @@ class Observer:
 def observed(target: Target, seconds: float) -> Iterator[Observer]:
     """Connect, and look on for so long. Raises PebbleError."""
     with connected(target) as (transport, names):
-        observer = Observer(target, transport, names, names.base)
+        observer = Observer(target, transport, names)
         observer.look(seconds)
         yield observer
+
+
+def why_not_free(view: RobotView) -> str:
+    """Return who has the robot, or has stopped it: a test takes nothing from them. Empty if it is free."""
+    if view.stopped_by is not None:
+        return f"it is stopped by {view.stopped_by.by or 'unknown'}, which only a person ends"
+    if view.autonomy is not None and view.autonomy.running:
+        return f"the script {view.autonomy.file} is running"
+    return f"{view.control.who} drives it" if view.control.who else ""
+
+
+def available(capabilities: dict[str, Any]) -> Iterator[str]:
+    """Return the sections of a robot's capabilities that are available."""
+    return (name for name in capabilities if section_of(capabilities, name).get("available") is True)

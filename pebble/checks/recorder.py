@@ -16,12 +16,12 @@ from pebble.recordings.recorder.metrics import STATUS
 _SILENT_S: Final = 30.0  # it writes its numbers every ten seconds
 
 
-def recorder(config: Config, now: float | None = None) -> Iterator[CheckResult]:
-    """Check the recorder of a robot that has one. ``now``: seconds since 1970."""
+def recorder(config: Config) -> Iterator[CheckResult]:
+    """Check the recorder of a robot that has one."""
     section = config.services.recorder
     if not section.enabled:
         return
-    now, folder = time.time() if now is None else now, section.place
+    folder = section.place
     if find_spec("mcap") is None:
         yield failed("the package mcap is not installed: it records nothing", 'pip install "pebble-robot[record]"')
         return
@@ -30,7 +30,7 @@ def recorder(config: Config, now: float | None = None) -> Iterator[CheckResult]:
         return
     try:
         entries = Folder(folder).entries()
-        yield _running(folder, now, entries)
+        yield _running(folder, entries)
         if damaged := [entry for entry in entries if not (entry.is_finished or entry.is_active)]:
             text = f"{len(damaged)} damaged files are kept, beside what could be read of them: {damaged[0].path}"
             yield warn(text, "pebble recordings rm FILE deletes one")
@@ -38,7 +38,7 @@ def recorder(config: Config, now: float | None = None) -> Iterator[CheckResult]:
         yield failed(f"{folder} cannot be read: {error}")
 
 
-def _running(folder: Path, now: float, entries: list[Entry]) -> CheckResult:
+def _running(folder: Path, entries: list[Entry]) -> CheckResult:
     if not Folder.is_in_use(folder):
         left = sum(entry.is_active for entry in entries)
         if left:
@@ -46,7 +46,7 @@ def _running(folder: Path, now: float, entries: list[Entry]) -> CheckResult:
             return warn(text, f"pebble recordings mend {folder}")
         return ok("does not run now")
     status = _status(folder)
-    silent_s = now - float(status.get("at", 0.0))
+    silent_s = time.time() - float(status.get("at", 0.0))
     if silent_s > _SILENT_S:
         return warn(f"has stood still for {silent_s:.0f} s", "pebble up")
     if status.get("blocked"):

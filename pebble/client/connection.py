@@ -185,8 +185,9 @@ def subscribed_stop(transport: Transport, base: str) -> RobotEstop:
     return robot
 
 
-def wait_for(condition: Callable[[], object], seconds: float) -> None:
-    """Return once ``condition`` is true, or after so long."""
+def wait_for(condition: Callable[[], object], seconds: float) -> bool:
+    """Wait until ``condition`` is true; return False if it is not within ``seconds``."""
     end = time.monotonic() + seconds
-    while not condition() and time.monotonic() < end:
+    while not (is_met := bool(condition())) and time.monotonic() < end:
         time.sleep(_STEP_S)
+    return is_met

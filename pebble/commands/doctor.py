@@ -169,10 +169,9 @@ def _settings_at(url: str, password_file: Path | None, ca_cert: Path | None) -> 
 
 def _broker(settings: MqttSettings, below: str, *, restart: bool, as_json: bool) -> int:
     """Print what is wrong with a broker, and what to type. Returns 0, 1 with limits, 2 if robots cannot use it."""
-    from pebble.checks.broker.login import broker
+    from pebble.checks.broker.login import beyond_loopback, broker, own_addresses
     from pebble.checks.broker.login_attempt import reached
     from pebble.checks.broker.probes import assessment, judge
-    from pebble.checks.broker.reachable import beyond_loopback, own_addresses
     from pebble.checks.check import State
 
     check_topic(below)

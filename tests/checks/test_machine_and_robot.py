@@ -7,18 +7,17 @@ import os
 import resource
 import socket
 import subprocess
-from collections.abc import Callable, Iterator
-from dataclasses import replace
+import time
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 import pytest
 
-from pebble.checks import devices, machine, robot
+from pebble.checks import machine, robot
 from pebble.checks.broker import login
 from pebble.checks.broker.account import robot_account
 from pebble.checks.broker.login_attempt import LoginAttempt, attempt
 from pebble.checks.check import CheckResult, State
-from pebble.checks.who import who_drives
 from pebble.config import load, parse
 from pebble.transports.settings import MqttSettings, TlsSettings
 from tests.fleet.brokers import FleetBroker, accounts
@@ -47,7 +46,7 @@ def closed_broker(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Broker]:
     broker.stop()
 
 
-def levels(findings: Iterator[CheckResult]) -> list[str]:
+def levels(findings: Iterable[CheckResult]) -> list[str]:
     return [finding.state.value for finding in findings]
 
 
@@ -103,24 +102,12 @@ def test_a_config_that_has_changed_since_the_start_is_found(tmp_path: Path) -> N
     assert [found.state for found in robot.config_of_running(load(file))] == [State.WARN]
 
 
-def test_serial_port(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    missing = devices.serial_port(tmp_path / "ttyACM0", "a.b")
-    assert missing.state is State.FAILED
-    assert "plugged in" in missing.text
-    (tmp_path / "file").touch()
-    assert devices.serial_port(tmp_path / "file", "a.b").text.endswith("is not a device")
-    tty = os.ttyname(os.openpty()[1])
-    assert devices.serial_port(Path(tty), "a.b").state is State.OK
-    monkeypatch.setattr(os, "access", lambda *_: False)
-    assert devices.serial_port(Path(tty), "a.b").fix.startswith("sudo usermod -aG ")
-
-
 # -- brokers
 
 
 def test_an_open_broker_on_this_machine_is_fine(open_broker: Broker) -> None:
     findings = list(login.broker("local broker", MqttSettings(host="127.0.0.1", port=open_broker.port)))
-    assert levels(iter(findings)) == ["ok", "ok", "ok"]
+    assert levels(findings) == ["ok", "ok", "ok"]
     assert " ms" in findings[0].text
     assert "anonymous" in findings[1].text
 
@@ -185,35 +172,42 @@ def test_a_broker_that_hangs_up_on_what_is_published_is_found(open_broker: Broke
     assert (finding.state, "hangs up" in finding.text) == (State.FAILED, True)
 
 
-def probe_returning(own: LoginAttempt, without_login: LoginAttempt) -> Callable[..., LoginAttempt]:
-    return lambda _settings, *, login: own if login else without_login
+def let_in(**answer: float) -> LoginAttempt:
+    return LoginAttempt(code=0, **answer)
 
 
-def test_an_open_or_unencrypted_broker_elsewhere_is_a_warning() -> None:
-    let_in, shut_out = LoginAttempt(code=0, took_ms=3.0), LoginAttempt(code=5)
-    plain = MqttSettings(host="broker.example", username="ann", password="geheim")
-    tls = MqttSettings(host="broker.example", port=8883, username="ann", password="geheim", tls=TlsSettings())
-    assert levels(login.broker("b", plain, probe_returning(let_in, let_in))) == ["ok", "warn", "warn"]
-    assert levels(login.broker("b", plain, probe_returning(let_in, shut_out))) == ["ok", "ok", "warn"]
-    assert levels(login.broker("b", tls, probe_returning(let_in, shut_out))) == ["ok", "ok", "ok"]
-    anyone = replace(tls, tls=TlsSettings(insecure=True))
-    *_, last = login.broker("b", anyone, probe_returning(let_in, shut_out))
-    assert (last.state, last.fix) == (State.WARN, "set tls.insecure to false")
+def valid_for(days: int) -> LoginAttempt:
+    return let_in(expires=time.time() + days * 86400)
 
 
-@pytest.mark.parametrize(
-    ("days", "level", "text"),
-    [
-        (3, State.WARN, "its certificate expires in 3 days"),
-        (15, State.OK, "encrypted, its certificate for 15 more days"),
-        (397, State.OK, "encrypted, its certificate for 397 more days"),
-    ],
-)
-def test_the_days_of_a_brokers_certificate(days: int, level: State, text: str) -> None:
-    answer, shut_out = LoginAttempt(code=0, expires=1000.0 + days * 86400), LoginAttempt(code=5)
-    settings = MqttSettings(host="b", username="ann", password="geheim", tls=TlsSettings())
-    *_, last = login.broker("b", settings, probe_returning(answer, shut_out), 1000.0)
-    assert (last.state, last.text) == (level, text)
+TLS, ANY_NAME = TlsSettings(), TlsSettings(insecure=True)
+SHUT_OUT = LoginAttempt(code=5)
+#: Its encryption, its answers to the login of the config and to an anonymous one, and what is found.
+ELSEWHERE = [
+    (None, let_in(), let_in(), ["ok", "warn", "warn"], "is not encrypted"),
+    (None, let_in(), SHUT_OUT, ["ok", "ok", "warn"], "is not encrypted"),
+    (TLS, let_in(), SHUT_OUT, ["ok", "ok", "ok"], "encrypted"),
+    (ANY_NAME, let_in(), SHUT_OUT, ["ok", "ok", "warn"], "set tls.insecure to false"),
+    (TLS, valid_for(3), SHUT_OUT, ["ok", "ok", "warn"], "its certificate expires in 3 days"),
+    (TLS, valid_for(15), SHUT_OUT, ["ok", "ok", "ok"], "encrypted, its certificate for 15 more days"),
+    (TLS, valid_for(397), SHUT_OUT, ["ok", "ok", "ok"], "encrypted, its certificate for 397 more days"),
+]
+
+
+@pytest.mark.parametrize(("tls", "own", "anonymous", "states", "words"), ELSEWHERE)
+def test_a_broker_elsewhere(
+    tls: TlsSettings | None,
+    own: LoginAttempt,
+    anonymous: LoginAttempt,
+    states: list[str],
+    words: str,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(login, "attempt", lambda _, *, login, timeout_s: own if login else anonymous)
+    settings = MqttSettings(host="broker.example", username="ann", password="geheim", tls=tls)
+    findings = list(login.broker("b", settings))
+    assert levels(findings) == states
+    assert words in f"{findings[-1].text}; {findings[-1].fix}"
 
 
 def test_the_certificate_of_a_fleets_broker_is_read(tmp_path: Path) -> None:
@@ -310,7 +304,7 @@ def test_who_can_drive_is_shown_by_the_level_and_by_the_fleet_beside_the_config(
     roles = {name: {"roles": [role]} for name, role in accounts.items()}
     fleet = {"level": "login", "brokers": [{"host": "broker.lab", "port": 8883}], "accounts": roles}
     (tmp_path / "fleet.json").write_text(json.dumps(fleet))
-    found = list(who_drives(load(config)))
+    found = list(robot.who_drives(load(config)))
     assert [f"{result.state.value} {result.text}" for result in found] == expected
 
 
@@ -318,6 +312,6 @@ def test_a_fleet_that_cannot_be_read_is_named(tmp_path: Path) -> None:
     config = tmp_path / "goob.json"
     config.write_text(json.dumps({"robot": {"id": "goob"}, "security": {"level": "login"}}))
     (tmp_path / "fleet.json").write_text("{")
-    (finding,) = list(who_drives(load(config)))[1:]
+    (finding,) = list(robot.who_drives(load(config)))[1:]
     assert finding.state is State.WARN
     assert "fleet.json" in finding.text

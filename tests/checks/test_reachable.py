@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from pebble.checks.broker.reachable import beyond_loopback, own_addresses
+from pebble.checks.broker.login import beyond_loopback, own_addresses
 from pebble.checks.check import State
 from pebble.checks.robot import run_checks
 from pebble.config import parse

@@ -79,7 +79,7 @@ def _scene(operator: list[str | Path], broker: Broker, folder: Path) -> Iterator
     )
     try:
         with connected(target) as (transport, names):
-            seen = Observer(target, transport, names, names.base, [f"{names.base}/#"])
+            seen = Observer(target, transport, names, [f"{names.base}/#"])
             assert seen.wait(lambda: seen.view.estop.states, 30)
             person = Child([str(word) for word in (*operator, *arguments)], stdin=subprocess.PIPE, **quiet)
             try:

@@ -12,8 +12,8 @@ from pathlib import Path
 import pytest
 
 from pebble.checks.broker.account import robot_account
-from pebble.checks.broker.of_config import page_brokers
 from pebble.checks.check import State
+from pebble.checks.robot import page_brokers
 from pebble.config import load
 from pebble.fleet.broker_files import passwords_in
 from pebble.fleet.certificates import CA_CERT

@@ -1,33 +1,31 @@
-"""Checks whom a broker lets in, and whether others can read what is sent to it."""
+"""Checks whom a broker lets in, where it answers, and whether others can read what is sent to it."""
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
 
 from pebble.checks.broker import MOSQUITTO
-from pebble.checks.broker.login_attempt import LoginAttempt, attempt
+from pebble.checks.broker.login_attempt import TIMEOUT_S, LoginAttempt, attempt
 from pebble.checks.check import SOON_DAYS, CheckResult, failed, ok, warn
+from pebble.checks.machine import printed
 from pebble.config.secret_text import shown_user
 from pebble.config.security import SecurityLevel
 from pebble.config.web import is_loopback
 from pebble.transports.settings import MqttSettings
 
 _REFUSED_ID = 2  # a return code of CONNACK (MQTT 3.1.1, table 3.1)
+_HERE_S = 1.0  # within which an address of this machine answers
 
 
 def broker(
-    name: str,
-    settings: MqttSettings,
-    log_in: Callable[..., LoginAttempt] = attempt,
-    now: float | None = None,
-    level: SecurityLevel = "open",
+    name: str, settings: MqttSettings, level: SecurityLevel = "open", answer_s: float = TIMEOUT_S
 ) -> Iterator[CheckResult]:
     """Check that it answers, accepts the config's login, refuses anonymous ones, and is encrypted.
 
     Above the level ``open`` one that lets everybody in is no mere warning.
     """
     what, is_here = f"{name} {settings.host}:{settings.port}", is_loopback(settings.host)
-    answer = log_in(settings, login=True)
+    answer = attempt(settings, login=True, timeout_s=answer_s)
     if answer.code is None:
         start = "sudo systemctl start mosquitto" if is_here else f"nc -vz {settings.host} {settings.port}"
         yield failed(f"cannot be reached: {answer.problem}", start, what)
@@ -36,9 +34,9 @@ def broker(
     if answer.problem and not is_here:
         fix = f"correct the addresses of {settings.host} in your DNS, or start the brokers there"
         yield warn(f"has addresses that do not answer: {answer.problem}", fix, what)
-    without_name = answer if settings.username is None else log_in(settings, login=False)
+    without_name = answer if settings.username is None else attempt(settings, login=False, timeout_s=answer_s)
     yield replace(_anonymous_login(without_name, level, is_here=is_here), what=what)
-    yield replace(_encryption(settings, answer, time.time() if now is None else now, is_here=is_here), what=what)
+    yield replace(_encryption(settings, answer, is_here=is_here), what=what)
 
 
 def _own_login(settings: MqttSettings, answer: LoginAttempt) -> CheckResult:
@@ -65,14 +63,40 @@ def _anonymous_login(answer: LoginAttempt, level: SecurityLevel, *, is_here: boo
     )
 
 
-def _encryption(settings: MqttSettings, answer: LoginAttempt, now: float, *, is_here: bool) -> CheckResult:
+def _encryption(settings: MqttSettings, answer: LoginAttempt, *, is_here: bool) -> CheckResult:
     if settings.tls is None:
         if is_here:
             return ok("not encrypted, which is fine on this machine")
         return warn("is not encrypted: commands and passwords can be read on the network", "set tls.enabled to true")
-    days = None if answer.expires is None else (answer.expires - now) / 86400
+    days = None if answer.expires is None else (answer.expires - time.time()) / 86400
     if days is not None and days < SOON_DAYS:
         return warn(f"its certificate expires in {days:.0f} days", "renew the broker's certificate")
     if settings.tls.insecure:
         return warn("encrypted, but the name in its certificate is not checked", "set tls.insecure to false")
     return ok("encrypted" if days is None else f"encrypted, its certificate for {days:.0f} more days")
+
+
+def beyond_loopback(name: str, settings: MqttSettings, addresses: Iterable[str]) -> Iterator[CheckResult]:
+    """Try the port of a broker that is meant for its machine alone at each of ``addresses``."""
+    tls = None if settings.tls is None else replace(settings.tls, insecure=True)  # its certificate names the loopback
+    codes = {
+        address: attempt(replace(settings, host=address, tls=tls), login=False, timeout_s=_HERE_S).code
+        for address in addresses
+    }
+    what = f"{name} {settings.host}:{settings.port}"
+    answering = [address for address, code in codes.items() if code is not None]
+    if open_ := [address for address, code in codes.items() if code == 0]:
+        yield warn(
+            f"also answers at {', '.join(open_)} and accepts anonymous logins: the network can drive the robot",
+            f"{MOSQUITTO}listener {settings.port} 127.0.0.1, or allow_anonymous false and a password_file",
+            what,
+        )
+    elif answering:
+        yield ok(f"also answers at {', '.join(answering)}, and refuses anonymous logins there", what=what)
+    elif codes:
+        yield ok(f"does not answer at {', '.join(codes)}", what=what)
+
+
+def own_addresses() -> list[str]:
+    """Return the addresses of this machine on its networks; none on systems whose ``hostname`` does not tell them."""
+    return printed("hostname", "-I").split()

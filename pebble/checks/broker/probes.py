@@ -27,7 +27,6 @@ def _probe(
     return Check(name, tried, needs, costs)
 
 
-_retains, _restart = retention.retains, retention.is_restarted
 PROBES = (
     _probe(_RIGHTS, "nothing else can be tried", messages.rights),
     _probe("names of topics", "a robot with such a name is not heard, or loses its connection", messages.topics),
@@ -46,15 +45,15 @@ PROBES = (
         _WILDCARDS,
         "operators see a robot at rest after its next state, or if they name it",
         retention.by_wildcard,
-        _retains,
+        retention.retains,
     ),
     _probe(
         "retained, before an answer to a ping",
         "a robot that comes back may send states once more; a flag may come twice",
         retention.before_pong,
-        _retains,
+        retention.retains,
     ),
-    _probe("newest last", "other programs show an old value; ours drop it", retention.order, _retains),
+    _probe("newest last", "other programs show an old value; ours drop it", retention.order, retention.retains),
     _probe(_BRIDGE_MODE, "own messages come back and are filtered by comparison; no mirror", messages.as_published),
     _probe(
         "will",
@@ -70,8 +69,8 @@ PROBES = (
         "retained, after a restart",
         "running robots send their states again within 2 s; those of robots that are off, and flags, are lost",
         retention.restarted,
-        _retains,
-        _restart,
+        retention.retains,
+        retention.is_restarted,
     ),
 )
 

@@ -11,14 +11,13 @@ import msgspec
 
 from pebble import contract as c
 from pebble.checks.check import Check, CheckResult, State, failed, ok, skipped, some_of
-from pebble.checks.observer import ANSWER_S, Observer
-from pebble.checks.running import available, why_not_free
+from pebble.checks.observer import ANSWER_S, Observer, available, why_not_free
 from pebble.client.robot_topics import section_of
 from pebble.client.robot_view import RobotView
 from pebble.contract.capabilities import CapabilitiesValue
 from pebble.contract.identity import parse_topic
 from pebble.contract.levels import silent_after
-from pebble.contract.payloads import EstopCommand, EstopReset, EstopState
+from pebble.contract.payloads import ControlRequest, EstopCommand, EstopReset
 
 _CLOCK_S = 60.0  # that its clock may differ
 _LARGEST = 64 * 1024  # bytes of JSON
@@ -60,9 +59,10 @@ def commanded(robot: Observer) -> str:
 
 
 def readable(robot: Observer) -> str:
-    if why := commanded(robot):
-        return why
-    return "" if robot.reads_commands() else "its broker does not let this account read incoming/: use an admin's"
+    """Send a request that changes nothing, and see whether the broker delivers it here, too."""
+    account = (robot.account or "") if robot.view.named else ""
+    is_read = robot.send_as(account, c.CONTROL, ControlRequest(id=secrets.token_hex(4), want="release"))
+    return "" if is_read else "its broker does not let this account read incoming/: use an admin's"
 
 
 # -- signs of life
@@ -216,32 +216,28 @@ def junk(robot: Observer) -> CheckResult:
 # -- the emergency stop
 
 
-def states(robot: Observer) -> dict[str, EstopState]:
-    return robot.view.estop.states
-
-
 def owners(robot: Observer) -> CheckResult:
     lacks = [topic.removeprefix(f"{robot.base}/") for topic in robot.view.estop.missing]
     fix = "publish it, retained, for each owner that capabilities list"
-    return _none_of(lacks, fix, ", ".join(sorted(states(robot))), "no state of ")
+    return _none_of(lacks, fix, ", ".join(sorted(robot.view.estop.states)), "no state of ")
 
 
 def stop(robot: Observer, name: str) -> bool:
     robot.send(c.ESTOP, EstopCommand(stop=name, by=BY, why=_WHY))
 
     def latches() -> bool:
-        owners = states(robot).values()
+        owners = robot.view.estop.states.values()
         return bool(owners) and all(state.latched and name in state.recent for state in owners)
 
     return robot.answers(latches)
 
 
 def _counts(robot: Observer) -> dict[str, int]:
-    return {owner: state.count for owner, state in states(robot).items()}
+    return {owner: state.count for owner, state in robot.view.estop.states.items()}
 
 
 def reset(robot: Observer, *, boot: str = "", more: int = 0) -> None:
-    for state in states(robot).values():
+    for state in robot.view.estop.states.values():
         robot.send(c.ESTOP_RESET, EstopReset(boot=boot or state.boot, count=state.count + more, by=BY))
 
 
@@ -338,7 +334,7 @@ def _driven(robot: Observer, _name: str) -> CheckResult:
     return ok("a drive command does not end it")
 
 
-_STOP = (stops, free, commanded)
+_STOP, _READ = (stops, free, commanded), (commanded, readable)
 
 CHECKS: tuple[Check[Observer], ...] = (
     Check("heartbeat", heartbeat, why="without it the robot is shown as offline, and not driven"),
@@ -347,7 +343,7 @@ CHECKS: tuple[Check[Observer], ...] = (
     Check("numbers", numbers, why="NaN is no JSON, and no speed"),
     Check("sizes", sizes, why="boards and pages have little room"),
     Check("retained", retained, why="who connects later must know its state, and must not take old news for new"),
-    Check("parked commands", stale_commands, (readable,), "a command that a broker keeps is obeyed at every start"),
+    Check("parked commands", stale_commands, _READ, "a command that a broker keeps is obeyed at every start"),
     Check("capabilities", capabilities, why="pages offer what they list, and no more"),
     Check("own topics", own_topics, why="topics of others are not used"),
     Check("identity", identity, why="it is known by its topics"),

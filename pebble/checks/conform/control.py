@@ -11,7 +11,7 @@ import msgspec
 
 from pebble import contract as c
 from pebble.checks.check import Check, CheckResult, failed, ok, skipped
-from pebble.checks.conform.checks import BY, commanded, controls, drives, free, states, stops, while_stopped
+from pebble.checks.conform.checks import BY, commanded, controls, drives, free, stops, while_stopped
 from pebble.checks.observer import ANSWER_S, Observer
 from pebble.client.pace_of_link import ms
 from pebble.contract.payloads import ControlRequest, ControlState, EstopReset
@@ -165,7 +165,7 @@ def _nameless(robot: Observer, _name: str) -> CheckResult:
         return skipped(UNSEEN)
     if robot.happens(lambda: stranger.holds):
         return failed("it gives control to a request without an account", fix)
-    for state in states(robot).values():
+    for state in robot.view.estop.states.values():
         robot.send_as("", c.ESTOP_RESET, EstopReset(boot=state.boot, count=state.count, by=BY))
     if robot.happens(lambda: not robot.view.latched):
         return failed("a reset without an account ends a stop", fix)

@@ -6,6 +6,7 @@ import secrets
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from math import inf
 from typing import Any
 
 import msgspec
@@ -20,8 +21,10 @@ RESTS_S = 0.75  # after the last command, at the latest
 LATE_S = 0.5  # until a report of it is here
 _SWING = 30  # of a hall sensor's value: less is noise
 _OTHER_KEY, _OTHER_ACCOUNT = "0badf00d", "conform-other"
-_NOT_SHOWN = "nothing that it publishes shows whether it moves"
-_SHOW_IT = 'publish {"value": {"wheels": [left, right]}} on outgoing/status whenever they change, or touch-sensors'
+_NOT_SHOWN = skipped(
+    "nothing that it publishes shows whether it moves",
+    'publish {"value": {"wheels": [left, right]}} on outgoing/status whenever they change, or touch-sensors',
+)
 
 
 def moves_until(robot: Observer, since: float) -> float | None:
@@ -29,21 +32,24 @@ def moves_until(robot: Observer, since: float) -> float | None:
 
     It is shown by ``wheels`` in the status, which is published on change, or by readings of hall sensors.
     """
-    turning = [(at, any(wheels)) for at, wheels in _shown(robot)]
-    readings = [record for record in robot.of(c.TOUCH_SENSORS) if record.value]
-    touches = [(reading.at, msgspec.structs.astuple(reading.value.value)) for reading in readings]
-    if not turning and not touches:
+    reports = _shown(robot)
+    readings = [(record.at, record.value.value) for record in robot.of(c.TOUCH_SENSORS) if record.value]
+    if not reports and not readings:
         return None
-    last, level = 0.0, touches[0][1] if touches else ()
-    for index, (_, moving) in enumerate(turning):
-        end = turning[index + 1][0] if index + 1 < len(turning) else float("inf")
-        if moving and end > since:
-            last = end
-    for at, values in touches:
-        if any(abs(value - before) > _SWING for value, before in zip(values, level, strict=True)):
+    ends = [*(at for at, _ in reports[1:]), inf]  # a report holds until the next one
+    turns = [end for (_, wheels), end in zip(reports, ends, strict=False) if any(wheels)]
+    return max((at for at in (*turns, *_swings(readings)) if at > since), default=0.0)
+
+
+def _swings(readings: list[tuple[float, Any]]) -> Iterator[float]:
+    """Return when a hall sensor's value differed from that at the last swing by more than noise."""
+    level: tuple[int, ...] = ()
+    for at, sensors in readings:
+        values = msgspec.structs.astuple(sensors)
+        if any(abs(value - before) > _SWING for value, before in zip(values, level or values, strict=True)):
+            yield at
             level = values
-            last = max(last, at) if at > since else last
-    return last
+        level = level or values
 
 
 def _shown(robot: Observer) -> list[tuple[float, list[float]]]:
@@ -77,7 +83,7 @@ def at_the_wheel(robot: Observer, by: str = BY, answer_s: float = ANSWER_S) -> I
             robot.answers(lambda: driver.holds, answer_s)
         if driver.may_drive:
             driver.send()
-            robot.wait(lambda: moves_until(robot, time.monotonic()) != float("inf"), ANSWER_S)
+            robot.wait(lambda: moves_until(robot, time.monotonic()) != inf, ANSWER_S)
         yield driver
     finally:
         if driver.may_drive:
@@ -102,11 +108,11 @@ def rested(robot: Observer, began: float, last: float, limit_s: float, what: str
     """Judge what was seen of a robot that was driven from ``began`` to ``last``, and had to rest soon after."""
     until = moves_until(robot, began)
     if until is None:
-        return skipped(_NOT_SHOWN, _SHOW_IT)
+        return _NOT_SHOWN
     if until == 0.0:
         return failed("its commands do not move it", "drive by incoming/drive-values, live ones")
     if until > last + limit_s + LATE_S / 2:
-        shown = "still moves" if until == float("inf") else f"moved for {until - last:.2f} s"
+        shown = "still moves" if until == inf else f"moved for {until - last:.2f} s"
         return failed(f"it {shown} after {what}", f"stop {limit_s:g} s after {what}, at the latest")
     return ok(f"it rests {max(0.0, until - last):.2f} s after {what}")
 
@@ -116,7 +122,7 @@ def _moved(robot: Observer, since: float, why: str, fix: str) -> CheckResult:
     robot.look(robot.patience_s)
     until = moves_until(robot, since)
     if until is None:
-        return skipped(_NOT_SHOWN, _SHOW_IT)
+        return _NOT_SHOWN
     return failed(why, fix) if until > since else ok("it moves nothing")
 
 
@@ -148,7 +154,7 @@ def _steering(robot: Observer, driver: Driver) -> CheckResult:
     for fields, signs in ways:
         wheels = _moves(robot, driver.drive(DRIVES_S / 2, **fields)[0])
         if wheels is None:
-            return skipped(_NOT_SHOWN, _SHOW_IT)
+            return _NOT_SHOWN
         if [speed * sign > 0 for speed, sign in zip(wheels, signs, strict=False)] != [True, True]:
             sent = f"x {fields.get('x', 0):g}, z {fields['z']:g}" + " within value" * ("wrapped" in fields)
             return failed(f"at {sent} its wheels do {wheels}", "left is z + x, right is z - x, also within value")
@@ -195,7 +201,7 @@ def _not_a_number(robot: Observer, _driver: Driver) -> CheckResult:
 def _clamped(robot: Observer, driver: Driver) -> CheckResult:
     wheels = _moves(robot, driver.drive(DRIVES_S / 2, z=9, x=-9)[0])
     if wheels is None:
-        return skipped(_NOT_SHOWN, _SHOW_IT)
+        return _NOT_SHOWN
     if not wheels:
         return failed("x -9, z 9 does not move it", "clamp both axes to -1..1, and obey")
     largest = max(map(abs, wheels))

@@ -10,8 +10,6 @@ def write_new(file: Path, content: bytes) -> None:
     """Write a file that was not there before, whole or not at all. Raises PebbleError."""
     try:
         file.touch(0o600, exist_ok=False)
-    except FileExistsError:
-        raise PebbleError(f"{file} exists: name another file, or remove it") from None
     except OSError as error:
         raise PebbleError(f"{file}: cannot be written: {error.strerror}") from None
     try:

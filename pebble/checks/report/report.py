@@ -6,8 +6,6 @@ import io
 import json
 import os
 import platform
-import shutil
-import subprocess
 import sys
 import time
 import zipfile
@@ -17,6 +15,7 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
+from pebble.checks.machine import output_of
 from pebble.checks.report.secrets_here import Secrets, secrets_of
 from pebble.checks.robot import run_checks
 from pebble.checks.running.robot import user_of
@@ -36,10 +35,6 @@ _PROGRAM_S = 20.0
 _LONGEST_PART = 8 << 20  # bytes
 _STATES_S = 1.0  # until all have come
 _UNITS = ("etc/systemd/system", "usr/lib/systemd/system", "lib/systemd/system", "usr/local/lib/systemd/system")
-
-
-class MissingError(PebbleError):
-    """A part that cannot be had here. Example: ``journalctl is not installed``."""
 
 
 @dataclass(frozen=True)
@@ -117,26 +112,26 @@ def _config(here: Here) -> str:
 
 def _doctor(here: Here) -> str:
     results = run_checks(here.config)
-    return (
-        "".join(f"{result.state:<7}  {result.what}: {result.text}  {result.fix}\n" for result in results) + here.problem
-    )
+    lines = [f"{result.state:<7}  {result.what}: {result.text}  {result.fix}\n" for result in results]
+    return "".join(lines) + here.problem
 
 
 def _status(here: Here) -> str:
     """Return what the robot's own side publishes and retains; asked as its user, as root may not."""
     if here.config is None:
-        raise MissingError("the config cannot be read")
+        raise PebbleError("the config cannot be read")
     user, file = user_of(here.config.run_dir()), str(here.file.absolute())
     who: dict[str, Any] = {} if user is None else {"user": user.pw_uid, "group": user.pw_gid, "extra_groups": []}
     topics = f"{here.config.base}/{OUTGOING}/#"
     echo = ("-m", "pebble.cli", "topic", "echo", topics, "--seconds", str(_STATES_S), "--config", file)
-    return _printed(sys.executable, *echo, **who)
+    return output_of(sys.executable, *echo, seconds=_PROGRAM_S, **who)
 
 
 def _journal(here: Here) -> str:
     root = [] if here.places.root == Path("/") else [f"--root={here.places.root}"]
     units = [word for name in ("pebble*", "mosquitto*") for word in ("--unit", name)]
-    return _printed("journalctl", *root, *units, f"--lines={_JOURNAL_LINES}", "--no-pager", "--output=short-iso")
+    options = (f"--lines={_JOURNAL_LINES}", "--no-pager", "--output=short-iso")
+    return output_of("journalctl", *root, *units, *options, seconds=_PROGRAM_S)
 
 
 def _versions(here: Here) -> str:
@@ -153,7 +148,7 @@ def _files(*patterns: str) -> Part:
     def part(here: Here) -> str:
         files = sorted({file for pattern in patterns for file in here.places.root.glob(pattern)})
         if not files:
-            raise MissingError("there are no such files")
+            raise PebbleError("there are no such files")
         return "\n".join(map(_described, files)) + "\n"
 
     return part
@@ -169,19 +164,7 @@ def _described(path: Path) -> str:
 
 def _programs(*commands: tuple[str, ...]) -> Part:
     """Return the part with what these commands print."""
-    return lambda _here: "".join(_printed(*command) for command in commands)
-
-
-def _printed(program: str, *arguments: str, **who: Any) -> str:
-    if shutil.which(program) is None:
-        raise MissingError(f"{program} is not installed")
-    command = [program, *arguments]
-    done: subprocess.CompletedProcess[bytes] = subprocess.run(
-        command, capture_output=True, timeout=_PROGRAM_S, check=False, cwd="/", **who
-    )
-    if done.returncode and not done.stdout:
-        raise MissingError(f"{program} ended with {done.returncode}: {done.stderr.decode(errors='replace')[-300:]}")
-    return done.stdout.decode(errors="replace")
+    return lambda _here: "".join(output_of(*command, seconds=_PROGRAM_S) for command in commands)
 
 
 #: In the order in which a reader wants them.

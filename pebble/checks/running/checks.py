@@ -7,11 +7,10 @@ import shlex
 from itertools import pairwise
 
 from pebble.checks.check import Check, CheckResult, failed, ok, skipped, some_of
-from pebble.checks.running import available, machine, why_not_free
-from pebble.checks.running.media import received
-from pebble.checks.running.robot import RobotUnderTest, Side
-from pebble.checks.running.stops import retained_commands, stop
-from pebble.checks.running.wheels import wheels
+from pebble.checks.observer import available, why_not_free
+from pebble.checks.running import machine
+from pebble.checks.running.operating import received, retained_commands, stop, wheels
+from pebble.checks.running.robot import RobotSide, RobotUnderTest
 from pebble.client.names import id_of
 from pebble.client.robot_topics import section_of
 from pebble.contract.levels import LEVELS, silent_after
@@ -66,13 +65,13 @@ def processes(robot: RobotUnderTest) -> CheckResult:
 
 
 def _states(robot: RobotUnderTest) -> dict[str, str]:
-    status = robot.inside.status
+    status = robot.own_side.status
     return {name: str(section_of(status, f"services.{name}").get("state")) for name in section_of(status, "services")}
 
 
 def _unready(robot: RobotUnderTest) -> list[str]:
     """``held`` ones wait while people drive over a thin link, and ``stopped`` ones until they are requested."""
-    if not robot.inside.status:
+    if not robot.own_side.status:
         return ["its status has not arrived: is it starting?"]
     states = {name: state for name, state in _states(robot).items() if state not in ("ready", "held")}
     return [f"{name} is {states[name]}" for name in sorted(states.keys() - {*robot.config.on_demand_programs()})]
@@ -102,7 +101,7 @@ def heartbeats(robot: RobotUnderTest) -> CheckResult:
     return ok(f"{_IN_A_ROW} in a row, the longest gap {_gap(side):.2f} s{shown}")
 
 
-def _gap(side: Side) -> float:
+def _gap(side: RobotSide) -> float:
     """Return the longest one between the newest heartbeats; infinite until there are enough."""
     newest = side.heartbeats[-_IN_A_ROW:]
     gaps = [after - before for before, after in pairwise(newest)]
@@ -154,7 +153,7 @@ _MCU_STATES = {"silent": "its board has stopped sending", "absent": "there is no
 
 
 def _mcu(robot: RobotUnderTest, name: str) -> dict[str, object]:
-    return section_of(section_of(robot.inside.status, "mcu"), name)
+    return section_of(section_of(robot.own_side.status, "mcu"), name)
 
 
 def battery(robot: RobotUnderTest) -> CheckResult:

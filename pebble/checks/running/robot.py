@@ -11,8 +11,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from pebble import contract as c
+from pebble.checks.conform.motion import RESTS_S
 from pebble.checks.observer import Observer
-from pebble.client.connection import Target, connected
+from pebble.client.connection import Target, connected, wait_for
 from pebble.client.names import Names
 from pebble.client.robot_view import RobotView
 from pebble.config import Config
@@ -24,22 +25,22 @@ from pebble.runtime.addresses import Addresses
 from pebble.runtime.places import Places
 from pebble.transports import Transport
 
-PATIENCE_S, RESTS_S = 3.0, 0.75
+PATIENCE_S = 3.0
 _HEARTBEATS_S = 2.5  # within which a robot at a broker of this machine sends one
 _STATES = (c.ONLINE, c.CAPABILITIES, c.STATUS, c.ESTOP_STATE)
 _WATCHED = (*_STATES, c.CONTROL_STATE, c.LINK, c.CHARGING_LEVEL, c.CHARGING_STATUS, c.AUTONOMY_STATUS)
 _ANY = "+/+/+"
 
 
-class Side(Observer):
-    """A side of the robot."""
+class RobotSide(Observer):
+    """A side of the robot: where its processes meet, or where its operators do."""
 
     def __init__(self, config: Config, target: Target, transport: Transport, names: Names, *, own: bool) -> None:
-        """``own``: the robot's own side, where its processes meet."""
+        """``own``: the robot's own side."""
         self.own = own
         self._addresses = Addresses(config)
         watched = (*_WATCHED, c.TOUCH_SENSORS) if own else _WATCHED
-        super().__init__(target, transport, names, config.base, [self._addresses[channel].topic for channel in watched])
+        super().__init__(target, transport, names, [self._addresses[channel].topic for channel in watched])
 
     def is_here(self, config: Config) -> bool:
         """True if it ends on this machine: what other robots have left there can only be left over."""
@@ -53,9 +54,6 @@ class Side(Observer):
         self.transport.ask([self._addresses[channel].topic for channel in _WATCHED if not channel.is_pattern])
         self.wait(lambda: estop.has_capabilities, patience_s)
         self.transport.ask([*estop.missing, *estop.missing_control])
-
-    def channel_of(self, topic: str) -> c.Channel | None:
-        return self._addresses.channel(topic)
 
     def others(self) -> tuple[dict[str, list[str]], set[str]]:
         """Return the retained topics of each other robot, by its base, and which of these robots send heartbeats."""
@@ -94,29 +92,29 @@ class RobotUnderTest:
     by: str  # who tests it, for stops and control: ann@goob
     patience_s: float  # for a picture, a sound, and other answers
     rests_s: float  # so long after the last command wheels may turn
-    own: Side | None = None
-    operators: Side | None = None
+    own: RobotSide | None = None
+    operators: RobotSide | None = None
     why_own: str = ""
     why_operators: str = ""
 
     @property
-    def sides(self) -> list[Side]:
+    def sides(self) -> list[RobotSide]:
         return [side for side in (self.own, self.operators) if side is not None]
 
     @property
-    def way(self) -> Side:
+    def commanding_side(self) -> RobotSide:
         """Return the side from which it is commanded: that of its operators, if it is reached."""
-        return self.operators or self.inside
+        return self.operators or self.own_side
 
     @property
-    def inside(self) -> Side:
+    def own_side(self) -> RobotSide:
         """Return its own side, which the check needs."""
         assert self.own is not None  # noqa: S101
         return self.own
 
     @property
     def view(self) -> RobotView:
-        return self.inside.view
+        return self.own_side.view
 
     def read(self) -> None:
         for side in self.sides:
@@ -129,7 +127,7 @@ class RobotUnderTest:
             self.read()
             return condition()
 
-        return self.sides[0].wait(holds, seconds) if self.sides else bool(condition())
+        return wait_for(holds, seconds)
 
 
 def user_of(folder: Path) -> pwd.struct_passwd | None:
@@ -155,11 +153,11 @@ def reached(
     robot = RobotUnderTest(config=config, places=places, by=by, patience_s=patience_s, rests_s=rests_s)
     with ExitStack() as stack:
 
-        def connect(*, own: bool) -> tuple[Side | None, str]:
+        def connect(*, own: bool) -> tuple[RobotSide | None, str]:
             target = Target(config=config.path, remote=not own, program="selftest")
             try:
                 transport, names = stack.enter_context(connected(target))
-                return Side(config, target, transport, names, own=own), ""
+                return RobotSide(config, target, transport, names, own=own), ""
             except PebbleError as error:
                 return None, str(error)
 
