@@ -5,13 +5,12 @@ from pathlib import Path
 import typer
 
 from pebble.runtime.places import Places
+from pebble.runtime.whole_file import write_new
 from pebble.setup import backup as backups
 
 
 def backup(file: Path, places: Places) -> int:
     """Write the tar file, and read it again."""
-    from pebble.checks.report.new_file import write_new
-
     if file.exists():
         raise typer.BadParameter(f"{file} exists: name another file, or remove it")
     made = backups.make(places)

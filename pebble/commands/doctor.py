@@ -19,6 +19,7 @@ from pebble.errors import PebbleError
 from pebble.runtime.environment import withhold
 from pebble.runtime.places import Places
 from pebble.runtime.signals import interrupted_by_signals
+from pebble.runtime.whole_file import write_new
 from pebble.transports import MqttSettings
 from pebble.transports.topics import check_topic
 
@@ -136,8 +137,7 @@ def _running(config: Path, places: Places, *, may_move: bool, as_json: bool) -> 
 
 def _report(file: Path, config: Path | None, places: Places) -> int:
     """Write the zip file; without a config it is about the installed robot."""
-    from pebble.checks.report.new_file import write_new  # of Linux only
-    from pebble.checks.report.report import make
+    from pebble.checks.report.report import make  # of Linux only
 
     if file.exists():
         raise typer.BadParameter(f"{file} exists: name another file, or remove it")

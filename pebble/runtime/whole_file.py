@@ -46,6 +46,22 @@ def write(
         raise error(f"{file}: {why.strerror}") from None
 
 
+def write_new(file: Path, content: bytes) -> None:
+    """Write a file for people that was not there before, where others cannot read it. Raises PebbleError."""
+    try:
+        file.touch(0o600, exist_ok=False)
+    except OSError as error:
+        raise PebbleError(f"{file}: cannot be written: {error.strerror}") from None
+    try:
+        if file.stat().st_mode & 0o077:
+            why = "others can read every file on its file system: name one on another, or mount it umask=077"
+            raise PebbleError(f"{file}: {why}")
+        write(file, content, 0o600, PebbleError)
+    except BaseException:
+        file.unlink(missing_ok=True)
+        raise
+
+
 def make_folder(folder: Path) -> None:
     """Make a folder and those above it, durably. Raises OSError."""
     if not folder.is_dir():

@@ -46,18 +46,13 @@ def rights(trial: BrokerTrial) -> CheckResult:
     if not granted or granted[0] >= REFUSED:
         return failed(f"this account may not subscribe to {trial.base}/#", fix)
     mid = writer.publish("x", qos=1)
-    is_whole = trial.wait(lambda: (mid in writer.acks and reader.received) or writer.closed) and not writer.closed
-    if is_whole:
+    trial.wait(lambda: (mid in writer.acks and reader.received) or writer.closed)
+    has_qos_1 = mid in writer.acks and bool(reader.received) and not writer.closed
+    if has_qos_1:
         trial.round_trip_s = min(1.0, time.monotonic() - began)
-    else:
-        writer = trial.peer()
-        writer.publish("x")
-        if not trial.wait(lambda: reader.received or writer.closed):
-            may = "publish" if _is_forbidden(trial) else "read"
-            return failed(f"this account may not {may} {trial.base}/x, and is not told", fix)
-        if writer.closed:
-            return failed(f"it hangs up on what this account publishes to {trial.base}/x", fix)
-    trial.qos = int(is_whole and granted == b"\x01")
+    elif why := _why_unread(trial, reader):
+        return failed(why, fix)
+    trial.qos = int(has_qos_1 and granted == b"\x01")
     kept = _kept(trial)
     trial.retains = kept is not None
     if kept is not None and not kept.retain:
@@ -70,6 +65,16 @@ def rights(trial: BrokerTrial) -> CheckResult:
         return warn("; ".join(lacks), f"{MOSQUITTO}max_qos 2, retain_available true")
     took = f"a round trip takes {1000 * trial.round_trip_s:.1f} ms"
     return ok(f"this account publishes and reads below {trial.below}/; {took}")
+
+
+def _why_unread(trial: BrokerTrial, reader: Peer) -> str:
+    """Publish without QoS 1, too; return why even that is not read, or nothing."""
+    writer = trial.peer()
+    writer.publish("x")
+    if not trial.wait(lambda: reader.received or writer.closed):
+        may = "publish" if _is_forbidden(trial) else "read"
+        return f"this account may not {may} {trial.base}/x, and is not told"
+    return f"it hangs up on what this account publishes to {trial.base}/x" if writer.closed else ""
 
 
 def _kept(trial: BrokerTrial) -> Received | None:

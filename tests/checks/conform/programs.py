@@ -142,11 +142,11 @@ def at_open(broker: Broker) -> tuple[Command, Target]:
     return ["mine", "127.0.0.1", str(broker.port)], Target(url=f"mqtt://127.0.0.1:{broker.port}", robot="mine")
 
 
-def at_named(broker: Named, folder: Path, program: str, other: str) -> tuple[Command, Target]:
-    """The same for accounts: that of the program, and that of the other side."""
-    for name in (program, other):
+def at_named(broker: Named, folder: Path) -> tuple[Command, Target]:
+    """Return the same for accounts: ``mine`` of the robot, and ``ann`` of the other side."""
+    for name in PASSWORDS:
         (folder / name).write_text(broker.passwords[name])
         (folder / name).chmod(0o600)
-    url, ca = f"mqtts://{other}@{HOST}:{broker.port}", broker.folder / CA_CERT
-    target = Target(url=url, robot="mine", password_file=folder / other, ca_cert=ca)
-    return ["mine", HOST, str(broker.port), program, folder / program, ca], target
+    url, ca = f"mqtts://ann@{HOST}:{broker.port}", broker.folder / CA_CERT
+    target = Target(url=url, robot="mine", password_file=folder / "ann", ca_cert=ca)
+    return ["mine", HOST, str(broker.port), "mine", folder / "mine", ca], target

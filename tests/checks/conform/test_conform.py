@@ -7,7 +7,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -187,27 +187,20 @@ NAMED_VIOLATIONS = (
 )
 
 
-class Machine:
-    """The computer of the robot, which can be switched off and on."""
+Place = tuple[Command, Target]
 
-    def __init__(self, command: Sequence[str | Path]) -> None:
-        self._command = [str(one) for one in command]
-        self._process: subprocess.Popen[bytes] | None = None
 
-    def on(self) -> None:
-        self._process = Child(self._command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-
-    def off(self) -> None:
-        assert self._process is not None
-        self._process.kill()
-        self._process.wait()
+def changed(folder: Path, old: str, new: str) -> Command:
+    """Return the sample in Python with ``new`` in place of ``old``."""
+    return [sys.executable, mutant(ROBOT_PY, folder, old, new)]
 
 
 @contextmanager
-def switched_on(command: Sequence[str | Path], target: Target) -> Iterator[Observer]:
-    """A robot, and who looks at it through its broker."""
-    machine = Machine(command)
-    machine.on()
+def switched_on(program: Command, place: Place, folder: Path) -> Iterator[Observer]:
+    """A robot, which saves its stop in ``folder``, and who looks at it through its broker."""
+    arguments, target = place
+    command = [*program, *arguments[:3], folder / "stop.json", *arguments[3:]]
+    process = Child([str(word) for word in command], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     try:
         with observed(target, LOOKS_S) as robot:
             robot.wait(lambda: robot.view.capabilities, 30)
@@ -215,33 +208,28 @@ def switched_on(command: Sequence[str | Path], target: Target) -> Iterator[Obser
             robot.wait(lambda: len(robot.of(ONLINE)) > 2, LOOKS_S)  # its interval is seen by three of them
             yield robot
     finally:
-        machine.off()
+        process.kill()
+        process.wait()
 
 
-def with_stop_file(arguments: Command, folder: Path) -> Command:
-    return [*arguments[:3], folder / "stop.json", *arguments[3:]]
+Results = dict[str, tuple[State, str]]
 
 
-Found = dict[str, tuple[State, str]]
-
-
-def judged(robot: Observer, *checks: Check[Observer]) -> Found:
+def judged(robot: Observer, *checks: Check[Observer]) -> Results:
     results = run_checks(checks, robot, refresh=robot.read)
     return {check.name: (result.state, result.text) for check, result in results}
 
 
-def lacking(found: Found) -> Found:
-    return {name: one for name, one in found.items() if one[0] is not State.OK}
+def lacking(results: Results) -> Results:
+    return {name: result for name, result in results.items() if result[0] is not State.OK}
 
 
 @pytest.mark.parametrize("sample", [ROBOTS[0], *map(further, ROBOTS[1:])])
 def test_a_sample_robot_passes(broker: Broker, tmp_path: Path, sample: Sample) -> None:
-    program = sample(tmp_path)
-    arguments, target = at_open(broker)
-    with switched_on([*program, *with_stop_file(arguments, tmp_path)], target) as robot:
-        found = judged(robot, *ALL.values())
-    assert lacking(found) == {}
-    assert len(found) >= 20
+    with switched_on(sample(tmp_path), at_open(broker), tmp_path) as robot:
+        results = judged(robot, *ALL.values())
+    assert lacking(results) == {}
+    assert len(results) >= 20
 
 
 #: What a driver's account is not shown at a broker that checks names.
@@ -262,12 +250,10 @@ REFUSED = {
         *(further(believing, one, {}) for one in ROBOTS),
     ],
 )
-def test_it_passes_where_names_are_checked(hall: Hall, tmp_path: Path, sample: Sample, unseen: Found) -> None:
+def test_it_passes_where_names_are_checked(hall: Hall, tmp_path: Path, sample: Sample, unseen: Results) -> None:
     program = sample(tmp_path)
-    with hall(tmp_path / "hall") as broker:
-        arguments, target = at_named(broker, tmp_path, "mine", "ann")
-        with switched_on([*program, *with_stop_file(arguments, tmp_path)], target) as robot:
-            assert lacking(judged(robot, *ALL.values())) == unseen
+    with hall(tmp_path / "hall") as broker, switched_on(program, at_named(broker, tmp_path), tmp_path) as robot:
+        assert lacking(judged(robot, *ALL.values())) == unseen
 
 
 @pytest.mark.thorough
@@ -275,28 +261,22 @@ def test_it_passes_where_names_are_checked(hall: Hall, tmp_path: Path, sample: S
 @pytest.mark.parametrize("sample", ROBOTS)
 def test_it_passes_at_another_broker(tmp_path: Path, sample: Sample) -> None:
     program = sample(tmp_path)
-    with ended(NATS.make(tmp_path)) as broker:
-        arguments, target = at_open(broker)
-        with switched_on([*program, *with_stop_file(arguments, tmp_path)], target) as robot:
-            assert lacking(judged(robot, *ALL.values())) == {}
+    with ended(NATS.make(tmp_path)) as broker, switched_on(program, at_open(broker), tmp_path) as robot:
+        assert lacking(judged(robot, *ALL.values())) == {}
 
 
 @pytest.mark.parametrize(("name", "reason", "old", "new"), some(VIOLATIONS, 10))
 def test_a_violation_is_found(broker: Broker, tmp_path: Path, name: str, reason: str, old: str, new: str) -> None:
-    program = [sys.executable, mutant(ROBOT_PY, tmp_path, old, new)]
-    arguments, target = at_open(broker)
-    with switched_on([*program, *with_stop_file(arguments, tmp_path)], target) as robot:
+    with switched_on(changed(tmp_path, old, new), at_open(broker), tmp_path) as robot:
         state, text = judged(robot, ALL[name])[name]
     assert (state, reason in text) == (State.FAILED, True), text
 
 
 @pytest.mark.parametrize(("name", "reason", "old", "new"), some(NAMED_VIOLATIONS, 5))
 def test_a_violation_at_level_named_is_found(tmp_path: Path, name: str, reason: str, old: str, new: str) -> None:
-    program = [sys.executable, mutant(ROBOT_PY, tmp_path, old, new)]
-    with believing(tmp_path / "hall") as broker:
-        arguments, target = at_named(broker, tmp_path, "mine", "ann")
-        with switched_on([*program, *with_stop_file(arguments, tmp_path)], target) as robot:
-            state, text = judged(robot, ALL[name])[name]
+    program = changed(tmp_path, old, new)
+    with believing(tmp_path / "hall") as broker, switched_on(program, at_named(broker, tmp_path), tmp_path) as robot:
+        state, text = judged(robot, ALL[name])[name]
     assert (state, reason in text) == (State.FAILED, True), text
 
 
@@ -304,17 +284,14 @@ def test_a_violation_at_level_named_is_found(tmp_path: Path, name: str, reason: 
 def test_a_library_that_acknowledges_no_long_message_is_found(broker: Broker, tmp_path: Path) -> None:
     """The sample subscribes with QoS 0, because PubSubClient is one."""
     copy = mutant(ROBOT_PY.with_name("robot.cpp"), tmp_path, '"incoming/#").c_str(), 0)', '"incoming/#").c_str(), 1)')
-    program = sketch(copy, tmp_path / "robot")
-    arguments, target = at_open(broker)
-    with switched_on([*program, *with_stop_file(arguments, tmp_path)], target) as robot:
+    with switched_on(sketch(copy, tmp_path / "robot"), at_open(broker), tmp_path) as robot:
         assert [*lacking(judged(robot, ALL["junk"], ALL["long messages"]))] == ["long messages"]
 
 
 @pytest.mark.thorough
 def test_a_robot_whose_disk_is_slow_passes(broker: Broker, tmp_path: Path) -> None:
-    program = [sys.executable, mutant(ROBOT_PY, tmp_path, "os.fsync(file.fileno())", "time.sleep(0.7)")]
-    arguments, target = at_open(broker)
-    with switched_on([*program, *with_stop_file(arguments, tmp_path)], target) as robot:
+    program = changed(tmp_path, "os.fsync(file.fileno())", "time.sleep(0.7)")
+    with switched_on(program, at_open(broker), tmp_path) as robot:
         assert lacking(judged(robot, ALL["stop"], ALL["stop moving"], ALL["reset waits"])) == {}
 
 
