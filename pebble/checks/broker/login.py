@@ -85,9 +85,9 @@ def beyond_loopback(name: str, settings: MqttSettings, addresses: Iterable[str])
     }
     what = f"{name} {settings.host}:{settings.port}"
     answering = [address for address, code in codes.items() if code is not None]
-    if open_ := [address for address, code in codes.items() if code == 0]:
+    if anonymous := [address for address, code in codes.items() if code == 0]:
         yield warn(
-            f"also answers at {', '.join(open_)} and accepts anonymous logins: the network can drive the robot",
+            f"also answers at {', '.join(anonymous)} and accepts anonymous logins: the network can drive the robot",
             f"{MOSQUITTO}listener {settings.port} 127.0.0.1, or allow_anonymous false and a password_file",
             what,
         )

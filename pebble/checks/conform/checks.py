@@ -327,7 +327,7 @@ def _wrong_reset(robot: Observer, _name: str) -> CheckResult:
     return ok("it is refused")
 
 
-def _driven(robot: Observer, _name: str) -> CheckResult:
+def _holds(robot: Observer, _name: str) -> CheckResult:
     robot.send(c.DRIVE, b'{"x": 0, "z": 0}')
     if robot.happens(lambda: not robot.view.latched):
         return failed("a drive command ends the stop", "only a reset ends it")
@@ -352,7 +352,7 @@ CHECKS: tuple[Check[Observer], ...] = (
     Check("stop", while_stopped(_confirmed), _STOP, "people must see that it has stopped"),
     Check("stop once", _repeated, _STOP, "stops are repeated until they are confirmed"),
     Check("stop unread", while_stopped(_unreadable), _STOP, "a stop must not fail for a comma"),
-    Check("stop holds", while_stopped(_driven), _STOP, "only a person ends it"),
+    Check("stop holds", while_stopped(_holds), _STOP, "only a person ends it"),
     Check("reset refused", while_stopped(_wrong_reset), _STOP, "a reset must end only the stop that its sender saw"),
 )
 
