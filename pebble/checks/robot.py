@@ -27,7 +27,7 @@ from pebble.runtime.parent import launcher_runs
 #: By the config section of each broker that the robot uses.
 _BROKERS = {"local_mqtt": "local broker", "mqtt_mirror": "mirror's broker", "remote_mqtt": "remote broker"}
 _WHO = "who can drive"
-_MOST_NAMES = 12  # in one line
+_NAMES_SHOWN = 12  # in one line
 _DRIVERS = {
     "open": "every program that reaches its broker, which here only this machine's do",
     "login": "every account of its broker with a role that drives; which one sent a command is not checked",
@@ -73,7 +73,7 @@ def _accounts(fleet: Fleet) -> str:
         for name, account in fleet.accounts.items()
         if Right.DRIVE in rights(account.roles, fleet.level)
     ]
-    return f"{some_of(names, _MOST_NAMES) or 'no account'}; programs on the robot itself, too"
+    return f"{some_of(names, _NAMES_SHOWN) or 'no account'}; programs on the robot itself, too"
 
 
 def _folders(config: Config) -> list[Path]:
