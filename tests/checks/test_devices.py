@@ -63,7 +63,7 @@ def test_ports_and_cameras_are_asked_for_it(tmp_path: Path) -> None:
     link(tmp_path, {"by-id/usb-board": "ttyACM3"})
     assert serial_port(tmp_path / "ttyACM0", KEY, tmp_path / "serial").fix.startswith(f"set {KEY} to ")
     (tmp_path / "serial").rename(tmp_path / "v4l")
-    result = camera("v4l2", "0", tmp_path)
+    result = camera("v4l2", str(tmp_path / "video0"), tmp_path)
     assert result.fix == f"set services.av_daemon.video.device to {tmp_path}/v4l/by-id/usb-board"
 
 
