@@ -44,23 +44,11 @@ def test_links_lead_somewhere(document: Path) -> None:
 
 
 DECISIONS = sorted((ROOT / "docs" / "decisions").glob("*.md"))
-#: The files that a decision named when it was written, and where they are now.
-NOW_AT = re.compile(r"^Now at: (.+)\.$", re.MULTILINE)
-MOVED = re.compile(r"`([^`]+)` → `[^`]+`")
 
 
 @pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: str(path.relative_to(ROOT)))
 def test_files_it_names_exist(document: Path) -> None:
-    text = document.read_text()
-    moved = MOVED.findall("".join(NOW_AT.findall(text)))
-    assert [name for name in CODE.findall(text) if name not in moved and not _exists(name)] == []
-
-
-@pytest.mark.parametrize("decision", DECISIONS, ids=lambda path: path.stem)
-def test_a_decision_explains_no_path_without_need(decision: Path) -> None:
-    text = decision.read_text()
-    moved, rest = MOVED.findall("".join(NOW_AT.findall(text))), NOW_AT.sub("", text)
-    assert [old for old in moved if _exists(old) or f"`{old}`" not in rest] == []
+    assert [name for name in CODE.findall(document.read_text()) if not _exists(name)] == []
 
 
 def test_every_page_can_be_found_from_the_index() -> None:
