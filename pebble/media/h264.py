@@ -42,17 +42,15 @@ def quality_to_crf(quality: float) -> float:
 
 
 class H264Encoder:
-    """BGR pictures to access units.
+    """BGR pictures to access units; ``interval``: pictures from one key frame to the next.
 
     ``bitrate`` (bits per second) may change at any time; None means constant quality, ``quality`` as of a JPEG.
     Another size or kind of control, or more bitrate than ever before, starts a new encoder, with a key frame.
     """
 
-    def __init__(self, *, fps: float, interval: int, quality: float, bitrate: int | None = None) -> None:
-        self.quality = quality
-        self.bitrate = bitrate
-        self.interval = interval
+    def __init__(self, fps: float, interval: int) -> None:
         self.keyframe = False  # was the last one a key frame?
+        self._interval = interval
         self._rate = Fraction(fps).limit_denominator(1000)
         self._av = pyav.load("h264")
         try:
@@ -65,12 +63,12 @@ class H264Encoder:
         self._count = 0
         self._i420: Pixels | None = None
 
-    def encode(self, picture: Pixels, *, keyframe: bool = False) -> bytes:
+    def encode(self, picture: Pixels, quality: float, bitrate: int | None, *, keyframe: bool = False) -> bytes:
         """One access unit. A last odd row or column is left out: colour is stored for two by two pixels."""
         height, width = picture.shape[0] & ~1, picture.shape[1] & ~1
         if min(height, width) < SMALLEST_EDGE:
             raise PebbleError(f"h264: a picture of {picture.shape[1]}x{picture.shape[0]} is too small")
-        context = self._ready(width, height)
+        context = self._ready(width, height, quality, bitrate)
         even, buffer = picture[:height, :width], self._fitting(width, height)
         self._i420 = cast(Pixels, cv2.cvtColor(even, cv2.COLOR_BGR2YUV_I420, buffer))
         frame = self._av.VideoFrame.from_ndarray(self._i420, "yuv420p")
@@ -86,31 +84,29 @@ class H264Encoder:
         self.keyframe = any(packet.is_keyframe for packet in packets)
         return seal(b"".join(bytes(packet) for packet in packets))
 
-    def _ready(self, width: int, height: int) -> av.VideoCodecContext:
-        control = self.quality if self.bitrate is None else None
-        settings = (width, height, control, self.interval)
-        bitrate = max(_LOWEST_BITRATE, self.bitrate or 0)
-        if self._context is None or self._opened_for != settings or bitrate > self._most_bitrate:
-            self._context = self._open(width, height, bitrate)
-            self._opened_for = settings
-            self._most_bitrate = bitrate
-        elif self.bitrate is not None:
-            self._context.bit_rate = bitrate  # x264 takes it over with the next picture
+    def _ready(self, width: int, height: int, quality: float, bitrate: int | None) -> av.VideoCodecContext:
+        settings = (width, height, quality if bitrate is None else None)
+        rate = max(_LOWEST_BITRATE, bitrate or 0)
+        if self._context is None or self._opened_for != settings or rate > self._most_bitrate:
+            self._context = self._open(width, height, quality, None if bitrate is None else rate)
+            self._opened_for, self._most_bitrate = settings, rate
+        elif bitrate is not None:
+            self._context.bit_rate = rate  # x264 takes it over with the next picture
         return self._context
 
-    def _open(self, width: int, height: int, bitrate: int) -> av.VideoCodecContext:
+    def _open(self, width: int, height: int, quality: float, bitrate: int | None) -> av.VideoCodecContext:
         context: av.VideoCodecContext = self._av.CodecContext.create("libx264", "w")
         context.width, context.height, context.pix_fmt = width, height, "yuv420p"
         context.time_base, context.framerate = 1 / self._rate, self._rate
-        context.gop_size = self.interval
+        context.gop_size = self._interval
         context.max_b_frames = 0
         context.thread_count = 1  # zerolatency would cut the picture into a slice per thread
         context.colorspace = 6  # SMPTE 170M, what cv2 converts to
         context.color_range = 1  # 16..235
         # No look-ahead, no waiting; veryfast: 3 ms for 640x480 where medium takes 10 and saves nothing at this latency.
         options = {"preset": "veryfast", "tune": "zerolatency", "forced-idr": "1", "x264-params": "scenecut=0"}
-        if self.bitrate is None:
-            options["crf"] = f"{quality_to_crf(self.quality):.2f}"
+        if bitrate is None:
+            options["crf"] = f"{quality_to_crf(quality):.2f}"
         else:
             context.bit_rate = bitrate
             options |= {"maxrate": str(bitrate), "bufsize": str(int(bitrate * _VBV_SECONDS))}
