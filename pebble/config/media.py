@@ -166,6 +166,14 @@ class AudioReceiver(Section, frozen=True, kw_only=True):
         int, Meta(ge=0, le=1000, description="Sound buffered against uneven arrival; increased when necessary.")
     ] = 60
 
+    def words(self, rate: int, channels: int) -> list[str]:
+        """Return ``command`` for such sound."""
+        values = {"{rate}": str(rate), "{channels}": str(channels), "{device}": self.device}
+        words = list(self.command)
+        for name, value in values.items():
+            words = [word.replace(name, value) for word in words]
+        return words
+
 
 class Media(Section, frozen=True, kw_only=True):
     """Pictures and sound, to and from operators."""

@@ -11,10 +11,10 @@ from pebble.contract.names import with_name
 from pebble.contract.payloads import MediaReport
 from pebble.errors import DeviceError
 from pebble.media.jitter import JitterBuffer
-from pebble.media.player import Player
 from pebble.media.rate_meter import RateMeter
 from pebble.runtime.connections import remote_transport
 from pebble.runtime.service import Service, every
+from pebble.services.audio_receiver.player import Player
 from pebble.transports import Message, QoS, State
 
 _IDLE_S = 0.5  # between two checks whether it has been silent for long
@@ -95,7 +95,7 @@ class AudioReceiver(Service):
         self._buffer = JitterBuffer(target_ms=settings.latency_ms)
         self._playback = PlaybackThread(
             self._buffer,
-            lambda stopping: Player(settings.command, settings.device, stopping),
+            lambda stopping: Player(settings, stopping),
             lambda: self.post(self._on_end),
         )
         self._remote = remote_transport(self.config, "audio-receiver")
