@@ -13,7 +13,7 @@ from pebble.forwarding.forwarder import Mirroring
 from pebble.runtime.parent import Notifier, earlier_requests
 from pebble.runtime.service import Service
 from pebble.services.mqtt_bridge.actions import ACTIONS, SystemActions
-from pebble.services.mqtt_bridge.media import MEDIA, Hold, Media, MediaRequests
+from pebble.services.mqtt_bridge.media import MEDIA, Hold, Media
 from pebble.services.mqtt_bridge.uplink import Uplink
 
 
@@ -31,7 +31,7 @@ class OwnRequests:
         self._service, self._post, self._clock = service, service.post_message, service.clock
         self._mirroring, self._uplink = mirroring, uplink
         self.actions = SystemActions(section, folder=config.state_dir(), clock=service.clock)
-        self._media = MediaRequests(Media(config.on_demand_programs(), earlier_requests()), notifier.request)
+        self._media = Media(config.on_demand_programs(), earlier_requests(), notifier.request)
         self._hold = Hold(config.on_demand_programs(), notifier.hold)
         self._messages: dict[str, Callable[[bytes], None]] = {
             **{row.request.suffix: partial(self._on_media_request, row.request) for row in MEDIA},

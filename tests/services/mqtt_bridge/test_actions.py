@@ -12,7 +12,7 @@ import pytest
 
 from pebble.config import SystemControl
 from pebble.contract import CHANNELS, GIT_PULL, REBOOT, Channel, Kind
-from pebble.services.mqtt_bridge.actions import ACTIONS, OUTPUT_BYTES, Action, Row, SystemActions
+from pebble.services.mqtt_bridge.actions import ACTIONS, Action, Row, SystemActions
 from tests.services.mqtt_bridge.bridge_rig import make_config
 from tests.support import until
 
@@ -110,14 +110,6 @@ def test_its_words_and_its_output_stay_in_a_file_on_the_robot(tmp_path: Path, ca
     assert output.stat().st_mode & 0o777 == 0o600
 
 
-def test_the_file_holds_the_newest_run_and_a_part_of_endless_output(tmp_path: Path) -> None:
-    action = Action(row(GIT_PULL), control("print('x' * 1_000_000)"), folder=tmp_path, clock=Clock())
-    for _ in range(2):
-        assert action.request()
-        assert finished(action)
-        assert until(lambda: (tmp_path / "git-pull.log").stat().st_size == OUTPUT_BYTES)
-
-
 def test_runs_also_where_no_file_can_be_written(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level(logging.INFO)
     (tmp_path / "state").touch()  # a file where the folder is expected
@@ -154,11 +146,3 @@ def test_a_flood_of_requests_is_a_few_lines_of_the_log(
             actions.request(row.channel)
     assert until(lambda: threading.active_count() == threads)
     assert len(caplog.records) <= 10 * max(1.0, time.monotonic() - before)
-
-
-def test_leaves_no_thread_behind(tmp_path: Path) -> None:
-    before = threading.active_count()
-    action = Action(row(REBOOT), control("pass"), folder=tmp_path, clock=Clock())
-    assert action.request()
-    assert finished(action)
-    assert until(lambda: threading.active_count() == before)
