@@ -18,7 +18,6 @@ CAMERA, MICROPHONE = "camera", "microphone"  # the names of the streams
 _NUMBERS_S = 5.0  # between messages that differ in numbers alone: once a second they filled a tenth of a 64 kbit/s link
 _NUMBER = re.compile(r"[0-9.]+")
 SILENCE_S: Final = 5.0  # after which a program that has reported has ended
-_PROGRAM_LIMIT = 32
 
 
 class Reports:
@@ -26,12 +25,8 @@ class Reports:
 
     def __init__(self) -> None:
         self._reports: dict[str, tuple[float, MediaReport]] = {}
-        self.refused = 0  # reports of more programs than any robot has
 
     def put(self, program: str, report: MediaReport, now: float) -> None:
-        if program not in self._reports and len(self.current(now)) >= _PROGRAM_LIMIT:
-            self.refused += 1
-            return
         self._reports[program] = (now, report)
 
     def current(self, now: float) -> dict[str, MediaReport]:
