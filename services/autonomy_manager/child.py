@@ -76,16 +76,17 @@ class Processes:
         self._guard.begin()
         process = Process(launch)
 
-        def on_end(code: int) -> None:
-            self._guard.remove(process.pid)
-            ended(code)
-
         try:
-            self._guard.add(process.pid, launch.tie)
+            release = self._guard.watch(process.pid, launch.tie)
         except OSError:
             process.signal(signal.SIGKILL)
-            process.watch(self._guard.remove)
+            process.watch(lambda _code: None)
             raise
+
+        def on_end(code: int) -> None:
+            release()
+            ended(code)
+
         process.watch(on_end)
         return process
 
