@@ -26,16 +26,6 @@ class Decoded:
     encoding: str  # json | pbvd | pbvz | h264 | jpeg
 
 
-@dataclass(slots=True)
-class DecodeCounters:
-    """Every payload is counted as one of ``pictures``, ``refused`` and ``waiting``."""
-
-    pictures: int = 0
-    refused: int = 0  # garbage, damaged, too large
-    waiting: int = 0  # differences without what they build on
-    gaps: int = 0  # times that the numbering was broken
-
-
 class VideoDecoder:
     """Decodes the payloads of one topic: json, pbvd, pbvz, h264 and raw JPEG, in any order.
 
@@ -44,7 +34,6 @@ class VideoDecoder:
     """
 
     def __init__(self) -> None:
-        self.counters = DecodeCounters()
         self.wants_keyframe = False  # request one, at most once a second
         self.problem = ""  # why the last payload was refused, for display
         self._last: PictureHeader | None = None  # None: the next difference builds on nothing
@@ -56,34 +45,17 @@ class VideoDecoder:
         try:
             header, body = _read(payload)
             if not follows(self._last, header):
-                self._wait()
+                self._reset()
                 return None
-            self._count_gap(header)
             picture = self._decode(header, body)
         except PebbleError as error:
-            self._refuse(str(error))
+            self.problem = str(error)
+            self._reset()
             self.wants_keyframe = isinstance(error, PayloadError)  # against a missing library a key frame does not help
             return None
         self._last = header
         self.wants_keyframe = False
-        self.counters.pictures += 1
         return Decoded(picture, header.captured_ms, header.frame, header.keyframe, header.encoding)
-
-    def _count_gap(self, header: PictureHeader) -> None:
-        """A key frame needs nothing before it, yet frames before it may be lost. (Numbers that fall: a new sender.)"""
-        last = self._last
-        if last is not None and last.encoding == header.encoding and last.frame is not None and header.frame:
-            self.counters.gaps += header.frame > last.frame + 1
-
-    def _wait(self) -> None:
-        self.counters.waiting += 1
-        self.counters.gaps += self._last is not None
-        self._reset()
-
-    def _refuse(self, problem: str) -> None:
-        self.counters.refused += 1
-        self.problem = problem
-        self._reset()
 
     def _reset(self) -> None:
         self._last = self._reference = None

@@ -35,7 +35,7 @@ class JpegDelta:
         self._reference: Pixels | None = None
         self._difference: Pixels | None = None
 
-    def encode(self, picture: Pixels, quality: float, _bitrate: int | None = None, *, keyframe: bool = False) -> bytes:
+    def encode(self, picture: Pixels, quality: float, *, keyframe: bool = False) -> bytes:
         """Return a JPEG of ``quality`` (1..100). Another size than before makes a full picture by itself."""
         reference = self._reference if self._chained else None
         self.keyframe = keyframe or reference is None or reference.shape != picture.shape

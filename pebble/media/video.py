@@ -1,6 +1,6 @@
 """Video encoders by name: a picture in, one MQTT payload out."""
 
-from typing import Final, Protocol
+from typing import Final
 
 from pebble.contract.encodings import ALL_VIDEO
 from pebble.contract.packets import KEY_FRAME, SEQUENCE_LIMIT, Picture, PictureKind
@@ -18,26 +18,18 @@ DEFAULT_QUALITY: Final = 10
 _H264_INTERVAL_S: Final = 4.0  # a receiver that misses a frame requests a key frame; this is for receivers that cannot
 
 
-class Codec(Protocol):
-    """Compresses pictures, BGR, one after the other."""
-
-    keyframe: bool  # was the last one a full picture?
-
-    def encode(self, picture: Pixels, quality: float, bitrate: int | None, *, keyframe: bool = False) -> bytes: ...
-
-
 class VideoEncoder:
     """One stream to one topic; frames are numbered from 0, by one."""
 
-    def __init__(self, name: str, codec: Codec, quality: float, bitrate: int | None) -> None:
-        """``quality``, 1..100 as of a JPEG, and ``bitrate``, of h264 only (None: constant quality), may change."""
-        self.name, self.quality, self.bitrate = name, quality, bitrate
+    def __init__(self, name: str, codec: H264Encoder | JpegDelta, quality: float) -> None:
+        """``quality``, 1..100 as of a JPEG, may change."""
+        self.name, self.quality = name, quality
         self.last_was_keyframe = False
         self._codec, self._frame = codec, 0
 
     def encode(self, picture: Pixels, captured_ms: int, *, keyframe: bool = False) -> bytes:
         """``picture``: BGR, uint8, (height, width, 3), only read. ``keyframe``: make this one a full picture."""
-        body = self._codec.encode(picture, self.quality, self.bitrate, keyframe=keyframe)
+        body = self._codec.encode(picture, self.quality, keyframe=keyframe)
         self.last_was_keyframe = full = self._codec.keyframe
         frame, self._frame = self._frame, (self._frame + 1) % SEQUENCE_LIMIT
         if self.name == "json":
@@ -54,7 +46,6 @@ def make_encoder(
     fps: float,
     keyframe_interval: int | None = None,
     quality: float = DEFAULT_QUALITY,
-    bitrate: int | None = None,
 ) -> VideoEncoder:
     """The encoder called ``name``: json, pbvd or h264.
 
@@ -67,4 +58,4 @@ def make_encoder(
     if name not in ALL_VIDEO:
         raise ConfigError(f"video encoding {name!r}: unknown; there are {', '.join(ALL_VIDEO)}")
     codec = H264Encoder(fps, interval) if name == "h264" else JpegDelta(interval)
-    return VideoEncoder(name, codec, quality, bitrate)
+    return VideoEncoder(name, codec, quality)

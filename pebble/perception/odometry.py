@@ -14,12 +14,13 @@ from msgspec import Struct
 from pebble.contract.payloads import ImuFast, MotorPower, TouchValues
 from pebble.perception.gyro import GyroHeading
 from pebble.perception.hall import HallSample, HallWheel
-from pebble.perception.motor_power import Directions
 
 _MOVING_S = 0.45  # a robot counts as moving so long after its last motion
 _STALL_S = 0.32
 _NOISE_MM = 1.0  # less is no motion
 _UNCHANGED_S = 0.3  # without motion and power the robot is at rest
+_HOLD_S = 0.35  # wheels coast so long
+_LEAST_POWER = 0.02
 
 
 class WheelGeometry(Struct, frozen=True, kw_only=True):
@@ -90,6 +91,31 @@ class _Wheel:
             self.stalls += 1
             self._idle_since = math.inf
         return distance
+
+
+class Directions:
+    """The power of both motors, and the direction in which each wheel may turn: a single sensor does not show it."""
+
+    def __init__(self, now: float) -> None:
+        self._power = (0.0, 0.0)  # left, right
+        self._signs = [0, 0]
+        self._signs_until = [now, now]
+
+    def command(self, power: MotorPower, now: float) -> None:
+        self._note_signs(now)
+        self._power = (power.left, power.right)
+
+    def at(self, now: float) -> tuple[tuple[float, int], tuple[float, int]]:
+        """Power and possible direction of the left and the right wheel; a direction remains while wheels coast."""
+        self._note_signs(now)
+        left, right = (s if now <= until else 0 for s, until in zip(self._signs, self._signs_until, strict=True))
+        return (self._power[0], left), (self._power[1], right)
+
+    def _note_signs(self, now: float) -> None:
+        for wheel, power in enumerate(self._power):
+            if abs(power) >= _LEAST_POWER:
+                self._signs[wheel] = 1 if power > 0.0 else -1
+                self._signs_until[wheel] = now + _HOLD_S
 
 
 class Odometry:

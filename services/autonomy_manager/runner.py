@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 from pebble.contract.forms import Value
 from pebble.errors import PebbleError
 from pebble.runtime.runs import CONFIG, RUN
-from pebble.services.autonomy_manager.child import Child, Launch, Spawn
+from pebble.services.autonomy_manager.child import Launch, Process, Spawn
 from pebble.services.autonomy_manager.environment import environment
 from pebble.services.autonomy_manager.motor_owners import Baseline
 from pebble.services.autonomy_manager.script import Plan, Step
@@ -28,7 +28,7 @@ class Part:
     """A process of a run."""
 
     file: str
-    child: Child
+    child: Process
     ended: bool = False
 
 

@@ -4,7 +4,7 @@ import re
 import time
 from typing import Any, Final
 
-from msgspec.structs import replace
+import msgspec
 
 from pebble.contract import MEDIA_REPORT, MEDIA_STATUS
 from pebble.contract.payloads import MediaReport, MediaStatus
@@ -106,20 +106,6 @@ class AvDaemon(Service):
         self._streams.append(Stream(name, writer, open_source))
 
 
-def _states(value: dict[str, MediaReport]) -> dict[str, MediaReport]:
+def _states(value: dict[str, MediaReport]) -> str:
     """Without the numbers, which change all the time."""
-    return {
-        name: replace(
-            report,
-            doing=_words(report.doing),
-            last_error=_words(report.last_error),
-            rate=None,
-            bitrate=None,
-            dropped=None,
-        )
-        for name, report in value.items()
-    }
-
-
-def _words(text: str | None) -> str | None:
-    return text and _NUMBER.sub("", text)
+    return _NUMBER.sub("", msgspec.json.encode(value).decode())

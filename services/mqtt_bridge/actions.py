@@ -113,14 +113,6 @@ class Action:
         self._log.log("ended", level, "%s ended with exit code %d, its output %s", self.name, code, where)
 
 
-class SystemActions:
-    """The whole table, for one robot's config."""
-
-    def __init__(self, section: MqttBridge, *, folder: Path, clock: Callable[[], float] = time.monotonic) -> None:
-        self._actions = {
-            row.channel: Action(row, getattr(section, row.section), folder=folder, clock=clock) for row in ACTIONS
-        }
-
-    def request(self, channel: Channel) -> bool:
-        """Run the command of ``channel``; False if it is refused."""
-        return self._actions[channel].request()
+def system_actions(section: MqttBridge, folder: Path, clock: Callable[[], float]) -> dict[Channel, Action]:
+    """Return the whole table, for one robot's config."""
+    return {row.channel: Action(row, getattr(section, row.section), folder=folder, clock=clock) for row in ACTIONS}

@@ -79,18 +79,10 @@ class Clips:
 
     def _can_be_named(self, name: str) -> bool:
         """Commands are UTF-8, and a backslash in them is a slash."""
-        if _is_utf8(name) and "\\" not in name:
+        if name.isprintable() and "\\" not in name:
             return True
         self.problem = self.problem or f"{name!r} cannot be named in commands: rename it"
         return False
-
-
-def _is_utf8(name: str) -> bool:
-    try:
-        name.encode()
-    except UnicodeEncodeError:
-        return False
-    return True
 
 
 def _expanded(name: str) -> Path:

@@ -47,14 +47,12 @@ def test_after_a_lost_frame_nothing_until_the_next_key_frame(name: str) -> None:
     assert decoder.wants_keyframe
     assert frames(decoder, packets[6:9]) == [6, 7, 8]
     assert not decoder.wants_keyframe
-    assert (decoder.counters.gaps, decoder.counters.waiting, decoder.counters.pictures) == (1, 2, 6)
 
 
 @pytest.mark.parametrize("name", FORMS)
-def test_a_frame_lost_before_a_key_frame_is_counted_and_harmless(name: str) -> None:
-    packets, decoder = stream(name), VideoDecoder()
-    assert frames(decoder, packets[:5] + packets[6:8]) == [0, 1, 2, 3, 4, 6, 7]
-    assert decoder.counters.gaps == 1
+def test_a_frame_lost_before_a_key_frame_is_harmless(name: str) -> None:
+    packets = stream(name)
+    assert frames(VideoDecoder(), packets[:5] + packets[6:8]) == [0, 1, 2, 3, 4, 6, 7]
 
 
 @pytest.mark.parametrize("name", FORMS)
@@ -62,7 +60,6 @@ def test_joined_between_key_frames(name: str) -> None:
     decoder = VideoDecoder()
     assert not decoder.wants_keyframe
     assert frames(decoder, stream(name)[3:8]) == [None, None, None, 6, 7]
-    assert decoder.counters.gaps == 0
 
 
 @pytest.mark.parametrize("name", FORMS)
@@ -86,7 +83,6 @@ def test_a_new_sender_whose_number_fits_by_chance_is_detected_by_its_time(name: 
 def test_anything_refused_breaks_the_chain(name: str, bad: bytes) -> None:
     packets, decoder = stream(name), VideoDecoder()
     assert frames(decoder, [*packets[:2], bad, *packets[2:7]]) == [0, 1, None, None, None, None, None, 6]
-    assert decoder.counters.refused == 1
     assert decoder.problem
 
 

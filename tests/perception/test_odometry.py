@@ -8,8 +8,7 @@ import random
 import pytest
 
 from pebble.contract.payloads import MotorPower
-from pebble.perception.motor_power import Directions
-from pebble.perception.odometry import WheelGeometry
+from pebble.perception.odometry import Directions, WheelGeometry
 from pebble.simulation.motion import FULL_SPEED_MM_S, TRACK_MM
 from tests.perception.wheels_rig import WheelsRig
 from tests.support import cases, some

@@ -12,7 +12,7 @@ import pytest
 
 from pebble.config import SystemControl
 from pebble.contract import CHANNELS, GIT_PULL, REBOOT, Channel, Kind
-from pebble.services.mqtt_bridge.actions import ACTIONS, Action, Row, SystemActions
+from pebble.services.mqtt_bridge.actions import ACTIONS, Action, Row, system_actions
 from tests.services.mqtt_bridge.bridge_rig import make_config
 from tests.support import until
 
@@ -93,8 +93,8 @@ def test_runs_without_a_shell_in_its_folder_with_its_environment(tmp_path: Path)
 
 def test_a_line_of_text_is_split_as_a_shell_would(tmp_path: Path) -> None:
     section = {"git_pull_control": {"command": f'{sys.executable} -c \'open("made here", "w")\'', "cwd": str(tmp_path)}}
-    actions = SystemActions(make_config(**section).services.mqtt_bridge, folder=tmp_path)
-    assert actions.request(next(row.channel for row in ACTIONS if row.section == "git_pull_control"))
+    actions = system_actions(make_config(**section).services.mqtt_bridge, tmp_path, Clock())
+    assert actions[GIT_PULL].request()
     assert until(lambda: (tmp_path / "made here").exists())
 
 
@@ -139,10 +139,10 @@ def test_a_flood_of_requests_is_a_few_lines_of_the_log(
 ) -> None:
     caplog.set_level(logging.DEBUG)
     controls = {row.section: {"command": list(command), "cwd": str(tmp_path)} for row in ACTIONS}
-    actions = SystemActions(make_config(**controls).services.mqtt_bridge, folder=tmp_path)
+    actions = system_actions(make_config(**controls).services.mqtt_bridge, tmp_path, time.monotonic)
     threads, before = threading.active_count(), time.monotonic()
     for _ in range(40):
         for row in ACTIONS:
-            actions.request(row.channel)
+            actions[row.channel].request()
     assert until(lambda: threading.active_count() == threads)
     assert len(caplog.records) <= 10 * max(1.0, time.monotonic() - before)
