@@ -12,6 +12,7 @@ from pebble.perception.tags import Place
 _BLIND_S = 6.0  # at most, since the tag was seen
 _SLOW_RAD = math.radians(40.0)  # off the goal; the more beyond, the slower
 _LEAST_SHARE = 0.2
+_TURN_POWER = 0.6
 
 
 class Pose(NamedTuple):
@@ -95,5 +96,5 @@ class OdomFollower:
         power = min(settings.odom_max_drive_power, max(floor, settings.odom_distance_kp * distance))
         if abs(off) > _SLOW_RAD:
             power *= max(_LEAST_SHARE, 1.0 - (abs(off) - _SLOW_RAD) / (math.pi - _SLOW_RAD))
-        x = -share * settings.odom_turn_power
+        x = -share * _TURN_POWER
         return Command(x, min(power, 1.0 - abs(x)), "odometry")
