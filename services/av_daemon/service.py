@@ -16,6 +16,7 @@ from pebble.transports.frames import FrameWriter
 
 CAMERA, MICROPHONE = "camera", "microphone"  # the names of the streams
 _NUMBERS_S = 5.0  # between messages that differ in numbers alone: once a second they filled a tenth of a 64 kbit/s link
+_PROGRAM_LIMIT = 32
 _NUMBER = re.compile(r"[0-9.]+")
 SILENCE_S: Final = 5.0  # after which a program that has reported has ended
 
@@ -27,7 +28,8 @@ class Reports:
         self._reports: dict[str, tuple[float, MediaReport]] = {}
 
     def put(self, program: str, report: MediaReport, now: float) -> None:
-        self._reports[program] = (now, report)
+        if program in self._reports or len(self._reports) < _PROGRAM_LIMIT:
+            self._reports[program] = (now, report)
 
     def current(self, now: float) -> dict[str, MediaReport]:
         """The reports of the last SILENCE_S seconds, by program name."""

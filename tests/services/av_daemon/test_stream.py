@@ -312,3 +312,11 @@ class TestReports:
         assert list(reports.current(104.9)) == ["audio_publisher", "camera_publisher"]
         assert list(reports.current(105.1)) == ["audio_publisher"]
         assert reports.current(108.1) == {}
+
+    def test_it_has_room_for_every_robot_and_no_more(self) -> None:
+        reports, running = Reports(), MediaReport(running=True)
+        for number in range(1000):
+            reports.put(f"program-{number}", running, 100.0)
+        reports.put("program-0", MediaReport(running=False), 101.0)
+        assert len(reports.current(101.0)) == 32
+        assert not reports.current(101.0)["program-0"].running
