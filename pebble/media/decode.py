@@ -9,7 +9,7 @@ from pebble.media import pyav
 from pebble.media.h264 import H264Decoder
 from pebble.media.jpeg import MAX_BYTES, Pixels, decode_jpeg
 from pebble.media.jpeg_delta import add
-from pebble.media.json_video import JsonPicture, inflate
+from pebble.media.json_video import inflate, jpeg_of
 from pebble.media.picture_header import PictureHeader, follows, read_header
 
 MAX_PAYLOAD: Final = MAX_BYTES * 3 // 2  # base64 takes a third more
@@ -89,7 +89,7 @@ def _read(payload: bytes) -> tuple[PictureHeader, bytes]:
         case "jpeg":
             return header, payload
         case "json":
-            return header, JsonPicture.unpack(payload).jpeg
+            return header, jpeg_of(payload)
         case "h264" if not pyav.installed():
             raise PebbleError(f"h264 {pyav.INSTALL}")
         case "pbvz":

@@ -105,10 +105,10 @@ def _read_json(payload: bytes) -> PictureHeader | None:
         head = _json.decode(payload)
     except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError, ValueError):
         return None
-    return PictureHeader("json", head.keyframe, head.id, milliseconds(head.timestamp))
+    return PictureHeader("json", head.keyframe, head.id, _milliseconds(head.timestamp))
 
 
-def milliseconds(stamp: float | None) -> int | None:
+def _milliseconds(stamp: float | None) -> int | None:
     if stamp is None or not 0 < stamp < _LATEST_MS:  # nor NaN: then neither is true
         return None
     return _plausible(round(stamp if stamp >= _MILLISECONDS_FROM else stamp * 1000))

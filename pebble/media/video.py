@@ -5,11 +5,10 @@ from typing import Final
 from pebble.contract.encodings import ALL_VIDEO
 from pebble.contract.packets import KEY_FRAME, SEQUENCE_LIMIT, Picture, PictureKind
 from pebble.errors import ConfigError
-from pebble.media import pyav
+from pebble.media import json_video, pyav
 from pebble.media.h264 import H264Encoder
 from pebble.media.jpeg import Pixels
 from pebble.media.jpeg_delta import JpegDelta
-from pebble.media.json_video import JsonPicture
 
 #: Those this installation can make.
 VIDEO_ENCODINGS: Final = pyav.available(ALL_VIDEO)
@@ -33,7 +32,7 @@ class VideoEncoder:
         self.last_was_keyframe = full = self._codec.keyframe
         frame, self._frame = self._frame, (self._frame + 1) % SEQUENCE_LIMIT
         if self.name == "json":
-            return JsonPicture(frame, full, captured_ms, body).pack()
+            return json_video.pack(frame, full, captured_ms, body)
         captured_ms = max(0, captured_ms)  # no header has times before 1970: a clock that is not set counts as unknown
         if self.name == "h264":
             return Picture(PictureKind.H264, frame, captured_ms, body, KEY_FRAME if full else 0).pack()

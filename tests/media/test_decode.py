@@ -13,9 +13,10 @@ import pytest
 
 from pebble.contract.packets import Picture, PictureKind
 from pebble.errors import PayloadError
+from pebble.media import json_video
 from pebble.media.decode import MAX_PAYLOAD, Decoded, VideoDecoder
 from pebble.media.jpeg import decode_jpeg, jpeg_size
-from pebble.media.json_video import JsonPicture, inflate
+from pebble.media.json_video import inflate
 from pebble.media.scene import read_counter
 from pebble.media.video import make_encoder
 from tests.recordings.demo_robots import FRED, MEDIA, recorded
@@ -201,7 +202,7 @@ def test_a_difference_of_another_size() -> None:
     ],
 )
 def test_stamps(stamp: str, captured_ms: int | None) -> None:
-    packet = JsonPicture(0, True, None, cv2.imencode(".jpg", picture(0))[1].tobytes()).pack()
+    packet = json_video.pack(0, True, None, cv2.imencode(".jpg", picture(0))[1].tobytes())
     shown = VideoDecoder().feed(packet.replace(b'"timestamp":null', b'"timestamp":' + stamp.encode()))
     assert shown is not None
     assert shown.captured_ms == captured_ms
