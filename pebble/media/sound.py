@@ -77,11 +77,11 @@ class SoundEncoder:
 
     @property
     def part_way(self) -> bool:
-        """Does an unfinished packet already hold encoded sound?"""
+        """True if an unfinished packet already holds encoded sound."""
         return bool(self._ready)
 
     def encode(self, pcm: bytes, captured_ms: int) -> list[bytes]:
-        """No, one or several PBAT packets; ``captured_ms`` is epoch time of the first sample."""
+        """Return no, one or several PBAT packets; ``captured_ms`` is epoch time of the first sample."""
         packets = []
         if self._intake.has_gap(captured_ms):
             self._ready = []
@@ -112,7 +112,7 @@ def make_sound_encoder(
     sent_channels: int | None = None,
     numbers: Iterator[int] | None = None,
 ) -> SoundEncoder:
-    """``rate`` and ``channels`` are those of the input; ``sent_…`` those on the wire, as far as the encoding has them.
+    """Make an encoder of what has ``rate`` and ``channels``, to ``sent_…`` as far as the encoding has them.
 
     Opus packets last ``chunk_ms`` rounded up to 20, 40 or 60, and ``bundle`` of them (at most 3) share a PBAT packet.
     Raises PebbleError for an unknown name and for one this installation cannot make.

@@ -27,7 +27,7 @@ class VideoEncoder:
         self._codec, self._frame = codec, 0
 
     def encode(self, picture: Pixels, captured_ms: int, *, keyframe: bool = False) -> bytes:
-        """``picture``: BGR, uint8, (height, width, 3), only read. ``keyframe``: make this one a full picture."""
+        """Return one MQTT payload. ``picture``: BGR, uint8, (height, width, 3), only read. ``keyframe``: a full one."""
         body = self._codec.encode(picture, self.quality, keyframe=keyframe)
         self.last_was_keyframe = full = self._codec.keyframe
         frame, self._frame = self._frame, (self._frame + 1) % SEQUENCE_LIMIT

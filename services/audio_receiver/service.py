@@ -82,7 +82,7 @@ class AudioReceiver(Service):
     # -- the transport's thread
 
     def _on_packet(self, message: Message) -> None:
-        """A retained packet is refused, because it is old."""
+        """Queue a packet; a retained one is refused, because it is old."""
         if message.retain:
             self.counters.add("stale")
             return

@@ -58,7 +58,7 @@ def roots(config: Config, own: Path = _OWN_SCRIPTS) -> tuple[Path, ...]:
 
 
 class _Answer(NamedTuple):
-    """What a script publishes about itself, and why it has no settings or cannot be started."""
+    """The description of a script, and why it has no settings or cannot be started."""
 
     description: Description
     ours: bool = False
@@ -144,7 +144,7 @@ class Catalogue:
     def _answer(
         self, name: str, folder: Path, entry: Path, section: ScriptSection, before_asking: Callable[[], object]
     ) -> _Answer:
-        """Remembers it until the script's files change, and a failure for a minute."""
+        """Return what its files say; remembered until they change, a failure for a minute."""
         version = entry, stamp(entry), stamp(folder / MANIFEST)
         known, before, until = self._answers.get(name, (None, _Answer(Description()), 0.0))
         if known == version and self._clock() < until:
@@ -157,7 +157,7 @@ class Catalogue:
         return answer
 
     def _asked(self, folder: Path, entry: Path, section: ScriptSection, before_asking: Callable[[], object]) -> _Answer:
-        """To parse a script may take a second, and to ask one of ours 20 s."""
+        """Read the files, and ask the script if it is one of ours: that takes up to 20 s."""
         described, problem = Description(), ""
         try:
             described = read_manifest(folder / MANIFEST) or described

@@ -32,7 +32,7 @@ class JpegSplitter:
 
 
 def _end(buffer: bytearray) -> int:
-    """Where the first picture ends; 0: not yet known; -1: it is none.
+    """Return where the first picture ends; 0: not yet known; -1: it is none.
 
     Segments before the scan are stepped over by their lengths: a preview inside them has an end marker, too.
     """

@@ -109,5 +109,5 @@ class AvDaemon(Service):
 
 
 def _states(value: dict[str, MediaReport]) -> str:
-    """Without the numbers, which change all the time."""
+    """Return its text without numbers, which change all the time."""
     return _NUMBER.sub("", msgspec.json.encode(value).decode())

@@ -65,7 +65,7 @@ class Playback:
 
     @property
     def _words(self) -> list[str]:
-        """The player of a wav file: ``{file}`` stands for its path, which is the last word otherwise."""
+        """Return the player of a wav file: ``{file}`` stands for its path, which is the last word otherwise."""
         command, path = list(self._config.soundboard_handler.playback.player_command), str(self.clip.path)
         words = [word.replace("{file}", path) for word in command]
         return words if words != command else [*words, path]
