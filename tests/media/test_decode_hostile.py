@@ -68,6 +68,7 @@ class Attack:
                     assert shown is not None, honest.problem
                     self.truth[packet] = shown.picture
         self.decoder = VideoDecoder()
+        self.fed = 0
         self.lied = False  # something unverifiable was shown, and no honest key frame since
         self.seen: Counter[str] = Counter()
         self.form = "json"
@@ -113,6 +114,7 @@ class Attack:
     def feed(self, packet: bytes, right: bytes | None, kind: str = "honest") -> None:
         """``right``: the honest packet whose picture this may show; None: that is unknown."""
         shown = self.decoder.feed(packet)
+        self.fed += 1
         self.seen[f"{kind}: {'shown' if shown else 'hidden'}"] += 1
         right = packet if packet in self.truth else right
         if shown is not None:
