@@ -1,14 +1,12 @@
 """Pictures as JSON: id, keyframe, base64 of the zlib of a JPEG, seconds (paper 8.8)."""
 
 import zlib
-from typing import Annotated, Final
+from typing import Annotated
 
 import msgspec
 
 from pebble.errors import PayloadError
 from pebble.media.jpeg import MAX_BYTES
-
-_MAX_TEXT: Final = MAX_BYTES * 4 // 3 + 1024
 
 
 class _Message(msgspec.Struct):
@@ -30,8 +28,6 @@ def pack(frame: int, keyframe: bool, captured_ms: int | None, jpeg: bytes) -> by
 
 def jpeg_of(raw: bytes) -> bytes:
     """Return the JPEG in a message. Raises PayloadError for anything that is no complete one."""
-    if len(raw) > _MAX_TEXT:
-        raise PayloadError(f"JSON picture: {len(raw)} bytes")
     try:
         packed = _decoder.decode(raw).data
     except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError, ValueError) as error:

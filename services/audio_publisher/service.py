@@ -104,9 +104,9 @@ class AudioPublisher(Service):
         encoder = self._encoder_for(info.rate, info.channels)
         first_ms = info.captured_ms - round(1000 * len(pcm) / (2 * info.channels * info.rate))
         for packet in encoder.encode(pcm, first_ms):
-            self._send(packet, now)
+            self._send_packet(packet, now)
 
-    def _send(self, packet: bytes, now: float) -> None:
+    def _send_packet(self, packet: bytes, now: float) -> None:
         may_send, address = self._rate.may_send(self.encoding), self._address
         if not may_send or not self._remote.publish(address.topic, packet, qos=QoS(address.qos)):
             self.counters.add("dropped")

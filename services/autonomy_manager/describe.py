@@ -4,7 +4,7 @@ import ast
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from tempfile import TemporaryFile
-from typing import IO, Any
+from typing import IO
 
 import msgspec
 from msgspec import Struct
@@ -13,6 +13,7 @@ from pebble.config.text_files import NotTextError, text_of
 from pebble.contract.forms import MAX_SETTINGS, Setting
 from pebble.contract.payloads import LONGEST_SUMMARY, MOST_MAIN
 from pebble.runtime.child import Child
+from pebble.services.autonomy_manager.script import Dependency
 
 MANIFEST = "script.json"
 _LIMIT_S = 20.0
@@ -20,13 +21,6 @@ _LONGEST = 256 * 1024  # bytes of an answer or a manifest
 _LONGEST_SOURCE = 1024 * 1024
 _REASON_BYTES = 2000  # of what a failing script wrote
 _NICE = "10"  # lower than the robot's own processes
-
-
-class Need(Struct, frozen=True, forbid_unknown_fields=True):
-    """Another script that this one needs."""
-
-    file: str
-    config: dict[str, Any] = {}
 
 
 class Description(Struct, frozen=True):
@@ -39,7 +33,7 @@ class Description(Struct, frozen=True):
     summary: str = ""
     main: list[str] = []
     configs: list[Setting] = []
-    dependencies: list[Need] = []
+    dependencies: list[Dependency] = []
     command: list[str] = []
 
     def __post_init__(self) -> None:
