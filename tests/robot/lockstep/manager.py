@@ -62,7 +62,7 @@ class Manager(ServiceProcess):
             config,
             Connection(self, network),
             clock=self.scheduler.clock,
-            spawn=self._spawn,  # type: ignore[arg-type]
+            spawn=self._spawn,
             scripts={name: _described(name) for name in NAMES},
         )
 

@@ -83,7 +83,7 @@ class Bench:
         self.drives: list[dict[str, Any]] = []
         self.world.transport.subscribe(f"{BASE}/incoming/drive-values", self._on_drive, direct=True)
         transport = network.robots_transport(config, "autonomy")
-        self.service = AutonomyManager(config, transport, clock=self.clock, spawn=self.children, scripts=scripts)  # type: ignore[arg-type]
+        self.service = AutonomyManager(config, transport, clock=self.clock, spawn=self.children, scripts=scripts)
         self.running = Running(self.service)
         assert until(lambda: self.drives and self.world.newest_raw("autonomy-status"))
 

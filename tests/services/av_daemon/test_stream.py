@@ -40,7 +40,7 @@ class Streams:
     def __call__(
         self, writer: Remembering, open_source: Callable[[], Source], *, delay: float = 0.05, rest_s: float = 0.2
     ) -> Stream:
-        stream = Stream("camera", writer, open_source, first_delay_s=delay, rest_s=rest_s)  # type: ignore[arg-type]
+        stream = Stream("camera", writer, open_source, first_delay_s=delay, rest_s=rest_s)
         self._all.append(stream)
         return stream
 
