@@ -8,7 +8,6 @@ from pathlib import Path
 
 from pebble.checks.check import CheckResult, failed, ok, warn
 from pebble.config import Config
-from pebble.services.soundboard_handler.playback import Players
 
 _NUMBERED = re.compile(r"(ttyACM|ttyUSB|video)[0-9]+")  # the number depends on the order of plugging in
 _METADATA = re.compile(r"-video-index(?!0$)")  # another device file of the same camera
@@ -81,9 +80,10 @@ def _program(names: tuple[str, ...], fix: str) -> CheckResult:
 
 def loudspeaker(config: Config) -> Iterator[CheckResult]:
     """Look for the players of sounds and of an operator's voice, if it plays them."""
-    services, players = config.services, Players.of(config)
+    services = config.services
     talk_back = services.av_daemon.enabled and services.av_daemon.audio.enabled
-    commands = [players.wav] * services.soundboard_handler.enabled + [players.raw] * talk_back
+    wav, raw = services.soundboard_handler.playback.player_command, services.mqtt_bridge.media.audio_receiver.command
+    commands = [wav] * services.soundboard_handler.enabled + [raw] * talk_back
     for name in dict.fromkeys(command[0] for command in commands):
         if shutil.which(name) is not None:
             yield ok(f"uses {name}")

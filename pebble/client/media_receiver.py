@@ -4,7 +4,8 @@ import time
 
 from pebble.client.estop_states import RobotEstop
 from pebble.client.viewer import Medium, Viewer
-from pebble.media.decode import Decoded, VideoDecoder, encoding_of
+from pebble.media.decode import Decoded, VideoDecoder
+from pebble.media.picture_header import read_header
 from pebble.media.rate_meter import RateMeter
 from pebble.media.sound import ReceivedSound, SoundDecoder
 from pebble.transports import Transport
@@ -72,9 +73,8 @@ class MediaReceiver:
         picture = self._video.feed(payload)
         age_s = None if picture is None or picture.captured_ms is None else time.time() - picture.captured_ms / 1000
         self.pictures.add(time.monotonic(), len(payload), age_s)
-        encoding = encoding_of(payload) if picture is None else picture.encoding
-        if encoding is not None:
-            self.encoding["video"] = encoding
+        if (header := read_header(payload)) is not None:
+            self.encoding["video"] = header.encoding
         if picture is not None:
             self.newest = picture
             self.on_picture(picture)

@@ -11,7 +11,6 @@ from pebble.config.types import (
     ONE_VALUE,
     UNIT,
     AudioChannels,
-    BitsPerSecond,
     Command,
     Count,
     File,
@@ -113,7 +112,13 @@ class VideoStream(ServiceSection, frozen=True, kw_only=True):
 class VideoPublisher(Section, frozen=True, kw_only=True):
     """Pictures for operators."""
 
-    retired: ClassVar = {**_INPUT, "source_*": _SOURCE, "reconnect_seconds": ONE_VALUE, "profile": "nothing reads it"}
+    retired: ClassVar = {
+        **_INPUT,
+        "source_*": _SOURCE,
+        "reconnect_seconds": ONE_VALUE,
+        "profile": "nothing reads it",
+        "bitrate": "h264 has the quality of jpeg_quality, and less on a slow connection",
+    }
 
     encoding: Annotated[VideoEncoding, doc("How pictures are sent unless a request names another encoding.")] = "json"
     topic: Annotated[Topic | None, doc("Instead of `{base}/outgoing/front-camera`.")] = None
@@ -127,7 +132,6 @@ class VideoPublisher(Section, frozen=True, kw_only=True):
     target_fps: Annotated[FramesPerSecond | None, doc("Where publish_fps is not set.")] = None
     keyframe_interval: Annotated[Count | None, doc("Frames from one full picture to the next; unset: fps / 3.")] = None
     jpeg_quality: Annotated[int, Meta(ge=1, le=100, description="1 is worst and smallest.")] = 10
-    bitrate: Annotated[BitsPerSecond | None, doc("Of h264, at most; unset: quality as jpeg_quality.")] = None
     rotate_degrees: Annotated[Rotation, doc("Clockwise, in addition to the camera's section.")] = 0
 
 
@@ -165,6 +169,14 @@ class AudioReceiver(Section, frozen=True, kw_only=True):
     latency_ms: Annotated[
         int, Meta(ge=0, le=1000, description="Sound buffered against uneven arrival; increased when necessary.")
     ] = 60
+
+    def words(self, rate: int, channels: int) -> list[str]:
+        """Return ``command`` for such sound."""
+        values = {"{rate}": str(rate), "{channels}": str(channels), "{device}": self.device}
+        words = list(self.command)
+        for name, value in values.items():
+            words = [word.replace(name, value) for word in words]
+        return words
 
 
 class Media(Section, frozen=True, kw_only=True):

@@ -71,7 +71,6 @@ Silence = Annotated[float, Meta(gt=0, le=5)]
 Pixels = Annotated[int, Meta(ge=1, le=16384)]
 FramesPerSecond = Annotated[float, Meta(gt=0, le=1000)]
 Rotation = Literal[0, 90, 180, 270]
-BitsPerSecond = Annotated[int, Meta(ge=10_000, le=100_000_000)]
 SampleRate = Annotated[int, Meta(ge=4000, le=384_000)]
 AudioChannels = Annotated[int, Meta(ge=1, le=8)]
 #: A list of words, or one line that is split as a shell would; it is never run by a shell.

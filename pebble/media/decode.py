@@ -3,14 +3,14 @@
 from dataclasses import dataclass
 from typing import Final
 
-from pebble.contract.packets import KEY_FRAME, PBVD, Picture, PictureKind
+from pebble.contract.packets import Picture
 from pebble.errors import PayloadError, PebbleError
 from pebble.media import pyav
 from pebble.media.h264 import H264Decoder
-from pebble.media.jpeg import MAX_BYTES, SOI, Pixels, decode_jpeg
+from pebble.media.jpeg import MAX_BYTES, Pixels, decode_jpeg
 from pebble.media.jpeg_delta import add
-from pebble.media.json_video import JsonPicture, inflate
-from pebble.media.picture_header import KINDS, PictureHeader, follows, plausible
+from pebble.media.json_video import inflate, jpeg_of
+from pebble.media.picture_header import PictureHeader, follows, read_header
 
 MAX_PAYLOAD: Final = MAX_BYTES * 3 // 2  # base64 takes a third more
 
@@ -26,16 +26,6 @@ class Decoded:
     encoding: str  # json | pbvd | pbvz | h264 | jpeg
 
 
-@dataclass(slots=True)
-class DecodeCounters:
-    """Every payload is counted as one of ``pictures``, ``refused`` and ``waiting``."""
-
-    pictures: int = 0
-    refused: int = 0  # garbage, damaged, too large
-    waiting: int = 0  # differences without what they build on
-    gaps: int = 0  # times that the numbering was broken
-
-
 class VideoDecoder:
     """Decodes the payloads of one topic: json, pbvd, pbvz, h264 and raw JPEG, in any order.
 
@@ -44,7 +34,6 @@ class VideoDecoder:
     """
 
     def __init__(self) -> None:
-        self.counters = DecodeCounters()
         self.wants_keyframe = False  # request one, at most once a second
         self.problem = ""  # why the last payload was refused, for display
         self._last: PictureHeader | None = None  # None: the next difference builds on nothing
@@ -56,34 +45,17 @@ class VideoDecoder:
         try:
             header, body = _read(payload)
             if not follows(self._last, header):
-                self._wait()
+                self._reset()
                 return None
-            self._count_gap(header)
             picture = self._decode(header, body)
         except PebbleError as error:
-            self._refuse(str(error))
+            self.problem = str(error)
+            self._reset()
             self.wants_keyframe = isinstance(error, PayloadError)  # against a missing library a key frame does not help
             return None
         self._last = header
         self.wants_keyframe = False
-        self.counters.pictures += 1
         return Decoded(picture, header.captured_ms, header.frame, header.keyframe, header.encoding)
-
-    def _count_gap(self, header: PictureHeader) -> None:
-        """A key frame needs nothing before it, yet frames before it may be lost. (Numbers that fall: a new sender.)"""
-        last = self._last
-        if last is not None and last.encoding == header.encoding and last.frame is not None and header.frame:
-            self.counters.gaps += header.frame > last.frame + 1
-
-    def _wait(self) -> None:
-        self.counters.waiting += 1
-        self.counters.gaps += self._last is not None
-        self._reset()
-
-    def _refuse(self, problem: str) -> None:
-        self.counters.refused += 1
-        self.problem = problem
-        self._reset()
 
     def _reset(self) -> None:
         self._last = self._reference = None
@@ -106,39 +78,20 @@ class VideoDecoder:
         return self._reference.copy()
 
 
-def encoding_of(payload: bytes) -> str | None:
-    """The encoding of a payload by its first bytes, valid or not; None if unknown."""
-    if payload.startswith(b"{"):
-        return "json"
-    try:
-        kind = Picture.unpack(payload).kind
-    except PayloadError:
-        return None
-    return "h264" if kind == PictureKind.H264 else KINDS[PictureKind(kind)][0] if kind in KINDS else None
-
-
 def _read(payload: bytes) -> tuple[PictureHeader, bytes]:
-    """The encodings differ in their first bytes. Raises PayloadError for everything else."""
+    """Return the header and what has to be decoded. Raises PayloadError for everything that is no picture."""
     if len(payload) > MAX_PAYLOAD:
         raise PayloadError(f"{len(payload)} bytes, more than {MAX_PAYLOAD}")
-    if payload.startswith(PBVD):
-        return _read_pbvd(Picture.unpack(payload))
-    if payload.startswith(SOI):
-        return PictureHeader("jpeg", True, None, None), payload
-    if payload[:1] in (b"{", b" ", b"\t", b"\r", b"\n"):
-        message = JsonPicture.unpack(payload)
-        return PictureHeader("json", message.keyframe, message.frame, message.captured_ms), message.jpeg
-    raise PayloadError("none of the forms of a picture")
-
-
-def _read_pbvd(packet: Picture) -> tuple[PictureHeader, bytes]:
-    captured_ms = plausible(packet.captured_ms)
-    if packet.kind == PictureKind.H264:
-        if not pyav.installed():
+    header = read_header(payload)
+    if header is None:
+        raise PayloadError("none of the forms of a picture")
+    match header.encoding:
+        case "jpeg":
+            return header, payload
+        case "json":
+            return header, jpeg_of(payload)
+        case "h264" if not pyav.installed():
             raise PebbleError(f"h264 {pyav.INSTALL}")
-        return PictureHeader("h264", bool(packet.flags & KEY_FRAME), packet.frame, captured_ms), packet.body
-    if packet.kind not in KINDS:
-        raise PayloadError(f"PBVD: kind {packet.kind} is unknown")
-    encoding, keyframe = KINDS[PictureKind(packet.kind)]
-    body = inflate(packet.body, MAX_BYTES) if encoding == "pbvz" else packet.body
-    return PictureHeader(encoding, keyframe, packet.frame, captured_ms), body
+        case "pbvz":
+            return header, inflate(Picture.unpack(payload).body, MAX_BYTES)
+    return header, Picture.unpack(payload).body

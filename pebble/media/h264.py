@@ -8,7 +8,6 @@ all before it. Neither a PBVD packet nor a slice has a length, and FFmpeg shows 
 from __future__ import annotations
 
 import math
-import re
 import zlib
 from fractions import Fraction
 from typing import TYPE_CHECKING, Final, cast
@@ -17,19 +16,15 @@ import cv2
 
 from pebble.errors import PayloadError, PebbleError
 from pebble.media import pyav
-from pebble.media.jpeg import MAX_BYTES, MAX_EDGE, Pixels
+from pebble.media.jpeg import MAX_EDGE, Pixels
 
 if TYPE_CHECKING:
     import av
 
 SMALLEST_EDGE: Final = 16  # one macroblock
 
-_IDR, _SPS, _PPS = 5, 7, 8
-_nal_types = re.compile(rb"\x00\x00\x01(.)", re.DOTALL).findall
 _SEAL: Final = b"\x00\x00\x00\x01\x1f"
 _SEAL_BYTES: Final = len(_SEAL) + 5
-_VBV_SECONDS: Final = 0.5  # of the bitrate that a single picture may take
-_LOWEST_BITRATE: Final = 10_000
 _WORST_CRF: Final = 51.0
 
 
@@ -42,17 +37,14 @@ def quality_to_crf(quality: float) -> float:
 
 
 class H264Encoder:
-    """BGR pictures to access units.
+    """BGR pictures to access units; ``interval``: pictures from one key frame to the next.
 
-    ``bitrate`` (bits per second) may change at any time; None means constant quality, ``quality`` as of a JPEG.
-    Another size or kind of control, or more bitrate than ever before, starts a new encoder, with a key frame.
+    Another size or quality starts a new encoder, with a key frame.
     """
 
-    def __init__(self, *, fps: float, interval: int, quality: float, bitrate: int | None = None) -> None:
-        self.quality = quality
-        self.bitrate = bitrate
-        self.interval = interval
+    def __init__(self, fps: float, interval: int) -> None:
         self.keyframe = False  # was the last one a key frame?
+        self._interval = interval
         self._rate = Fraction(fps).limit_denominator(1000)
         self._av = pyav.load("h264")
         try:
@@ -61,16 +53,15 @@ class H264Encoder:
             raise PebbleError("h264: this PyAV was built without libx264") from None
         self._context: av.VideoCodecContext | None = None
         self._opened_for: tuple[object, ...] = ()
-        self._most_bitrate = 0
         self._count = 0
         self._i420: Pixels | None = None
 
-    def encode(self, picture: Pixels, *, keyframe: bool = False) -> bytes:
+    def encode(self, picture: Pixels, quality: float, *, keyframe: bool = False) -> bytes:
         """One access unit. A last odd row or column is left out: colour is stored for two by two pixels."""
         height, width = picture.shape[0] & ~1, picture.shape[1] & ~1
         if min(height, width) < SMALLEST_EDGE:
             raise PebbleError(f"h264: a picture of {picture.shape[1]}x{picture.shape[0]} is too small")
-        context = self._ready(width, height)
+        context = self._ready(width, height, quality)
         even, buffer = picture[:height, :width], self._fitting(width, height)
         self._i420 = cast(Pixels, cv2.cvtColor(even, cv2.COLOR_BGR2YUV_I420, buffer))
         frame = self._av.VideoFrame.from_ndarray(self._i420, "yuv420p")
@@ -86,35 +77,24 @@ class H264Encoder:
         self.keyframe = any(packet.is_keyframe for packet in packets)
         return seal(b"".join(bytes(packet) for packet in packets))
 
-    def _ready(self, width: int, height: int) -> av.VideoCodecContext:
-        control = self.quality if self.bitrate is None else None
-        settings = (width, height, control, self.interval)
-        bitrate = max(_LOWEST_BITRATE, self.bitrate or 0)
-        if self._context is None or self._opened_for != settings or bitrate > self._most_bitrate:
-            self._context = self._open(width, height, bitrate)
-            self._opened_for = settings
-            self._most_bitrate = bitrate
-        elif self.bitrate is not None:
-            self._context.bit_rate = bitrate  # x264 takes it over with the next picture
+    def _ready(self, width: int, height: int, quality: float) -> av.VideoCodecContext:
+        settings = (width, height, quality)
+        if self._context is None or self._opened_for != settings:
+            self._context, self._opened_for = self._open(width, height, quality), settings
         return self._context
 
-    def _open(self, width: int, height: int, bitrate: int) -> av.VideoCodecContext:
+    def _open(self, width: int, height: int, quality: float) -> av.VideoCodecContext:
         context: av.VideoCodecContext = self._av.CodecContext.create("libx264", "w")
         context.width, context.height, context.pix_fmt = width, height, "yuv420p"
         context.time_base, context.framerate = 1 / self._rate, self._rate
-        context.gop_size = self.interval
+        context.gop_size = self._interval
         context.max_b_frames = 0
         context.thread_count = 1  # zerolatency would cut the picture into a slice per thread
         context.colorspace = 6  # SMPTE 170M, what cv2 converts to
         context.color_range = 1  # 16..235
         # No look-ahead, no waiting; veryfast: 3 ms for 640x480 where medium takes 10 and saves nothing at this latency.
         options = {"preset": "veryfast", "tune": "zerolatency", "forced-idr": "1", "x264-params": "scenecut=0"}
-        if self.bitrate is None:
-            options["crf"] = f"{quality_to_crf(self.quality):.2f}"
-        else:
-            context.bit_rate = bitrate
-            options |= {"maxrate": str(bitrate), "bufsize": str(int(bitrate * _VBV_SECONDS))}
-        context.options = options
+        context.options = options | {"crf": f"{quality_to_crf(quality):.2f}"}
         return context
 
     def _fitting(self, width: int, height: int) -> Pixels | None:
@@ -141,13 +121,11 @@ class H264Decoder:
             raise PayloadError(f"h264: {error}") from None
 
     def _frame(self, unit: bytes, keyframe: bool) -> av.VideoFrame:
-        unit = unseal(unit)
-        check_unit(unit, keyframe)
         if self._context is None:
             if not keyframe:
                 raise PayloadError("h264: no key frame yet")
             self._context = self._open()
-        frames = self._context.decode(self._av.Packet(unit))
+        frames = self._context.decode(self._av.Packet(unseal(unit)))
         if len(frames) != 1:
             raise PayloadError(f"h264: {len(frames)} pictures in what should be one")
         if frames[0].is_corrupt:
@@ -187,16 +165,3 @@ def unseal(sealed: bytes) -> bytes:
     if seal(unit) != sealed:
         raise PayloadError("h264: cut short or damaged")
     return unit
-
-
-def check_unit(unit: bytes, keyframe: bool) -> None:
-    """Raise PayloadError unless this is Annex B, and a key frame exactly if ``keyframe``."""
-    if len(unit) > MAX_BYTES:
-        raise PayloadError(f"h264: {len(unit)} bytes, more than {MAX_BYTES}")
-    if not unit.startswith((b"\x00\x00\x00\x01", b"\x00\x00\x01")):
-        raise PayloadError("h264: no start code")
-    types = {byte[0] & 31 for byte in _nal_types(unit)}
-    if keyframe and not types >= {_IDR, _SPS, _PPS}:
-        raise PayloadError("h264: a key frame without its parameter sets or its picture")
-    if not keyframe and types & {_IDR, _SPS}:
-        raise PayloadError("h264: a key frame that is not marked as one")

@@ -1,18 +1,12 @@
 """Pictures as JSON: id, keyframe, base64 of the zlib of a JPEG, seconds (paper 8.8)."""
 
-from __future__ import annotations
-
 import zlib
-from dataclasses import dataclass
-from typing import Annotated, Final
+from typing import Annotated
 
 import msgspec
 
 from pebble.errors import PayloadError
 from pebble.media.jpeg import MAX_BYTES
-from pebble.media.picture_header import milliseconds
-
-_MAX_TEXT: Final = MAX_BYTES * 4 // 3 + 1024
 
 
 class _Message(msgspec.Struct):
@@ -26,31 +20,19 @@ _encoder = msgspec.json.Encoder()
 _decoder = msgspec.json.Decoder(_Message)
 
 
-@dataclass(frozen=True, slots=True)
-class JsonPicture:
-    """One message. ``jpeg``: a full picture, or a difference plus 128. ``captured_ms``: epoch, None if implausible."""
+def pack(frame: int, keyframe: bool, captured_ms: int | None, jpeg: bytes) -> bytes:
+    """Return one message. ``jpeg``: a full picture, or a difference plus 128."""
+    seconds = None if captured_ms is None else captured_ms / 1000
+    return _encoder.encode(_Message(frame, keyframe, zlib.compress(jpeg), seconds))
 
-    frame: int
-    keyframe: bool
-    captured_ms: int | None
-    jpeg: bytes
 
-    def pack(self) -> bytes:
-        packed = zlib.compress(self.jpeg)
-        seconds = None if self.captured_ms is None else self.captured_ms / 1000
-        return _encoder.encode(_Message(self.frame, self.keyframe, packed, seconds))
-
-    @classmethod
-    def unpack(cls, raw: bytes) -> JsonPicture:
-        """Raises PayloadError for anything that is no complete message."""
-        if len(raw) > _MAX_TEXT:
-            raise PayloadError(f"JSON picture: {len(raw)} bytes")
-        try:
-            message = _decoder.decode(raw)
-        except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError, ValueError) as error:
-            raise PayloadError(f"JSON picture: {error}") from None
-        jpeg = inflate(message.data, MAX_BYTES)
-        return cls(message.id, message.keyframe, milliseconds(message.timestamp), jpeg)
+def jpeg_of(raw: bytes) -> bytes:
+    """Return the JPEG in a message. Raises PayloadError for anything that is no complete one."""
+    try:
+        packed = _decoder.decode(raw).data
+    except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError, ValueError) as error:
+        raise PayloadError(f"JSON picture: {error}") from None
+    return inflate(packed, MAX_BYTES)
 
 
 def inflate(packed: bytes, limit: int) -> bytes:

@@ -15,7 +15,7 @@ _LONGEST_STEP_MS: Final = 5000
 _MILLISECONDS_FROM: Final = 1e11  # a timestamp as large as this is in milliseconds
 _LATEST_MS: Final = 253_402_300_800_000  # the year 10000
 
-KINDS: Final = {
+_KINDS: Final = {
     PictureKind.JPEG: ("pbvd", True),
     PictureKind.DELTA_JPEG: ("pbvd", False),
     PictureKind.ZLIB_JPEG: ("pbvz", True),  # of recordings: robots no longer send it
@@ -91,12 +91,12 @@ def _read_pbvd(payload: bytes) -> PictureHeader | None:
         head = Picture.unpack(payload[:_HEADER_BYTES])
     except PayloadError:
         return None
-    captured_ms = plausible(head.captured_ms)
+    captured_ms = _plausible(head.captured_ms)
     if head.kind == PictureKind.H264:
         return PictureHeader("h264", bool(head.flags & KEY_FRAME), head.frame, captured_ms)
-    if head.kind not in KINDS:
+    if head.kind not in _KINDS:
         return None
-    encoding, keyframe = KINDS[PictureKind(head.kind)]
+    encoding, keyframe = _KINDS[PictureKind(head.kind)]
     return PictureHeader(encoding, keyframe, head.frame, captured_ms)
 
 
@@ -105,15 +105,15 @@ def _read_json(payload: bytes) -> PictureHeader | None:
         head = _json.decode(payload)
     except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError, ValueError):
         return None
-    return PictureHeader("json", head.keyframe, head.id, milliseconds(head.timestamp))
+    return PictureHeader("json", head.keyframe, head.id, _milliseconds(head.timestamp))
 
 
-def milliseconds(stamp: float | None) -> int | None:
+def _milliseconds(stamp: float | None) -> int | None:
     if stamp is None or not 0 < stamp < _LATEST_MS:  # nor NaN: then neither is true
         return None
-    return plausible(round(stamp if stamp >= _MILLISECONDS_FROM else stamp * 1000))
+    return _plausible(round(stamp if stamp >= _MILLISECONDS_FROM else stamp * 1000))
 
 
-def plausible(captured_ms: int) -> int | None:
+def _plausible(captured_ms: int) -> int | None:
     """A moment that can be written as a date, or None."""
     return captured_ms if 0 < captured_ms < _LATEST_MS else None

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Final, Protocol
+from typing import Final
 
 import numpy as np
 
@@ -24,61 +24,10 @@ _LONGEST_S = 1.0  # of one packet: the most the original can be configured to se
 _GAP_MS = 60  # a capture time further than this from where the last chunk ended: sound is missing between them
 
 
-class SoundEncoder(Protocol):
-    """Takes any amount of s16le and returns whole packets; the rest waits for more samples."""
-
-    @property
-    def name(self) -> str: ...
-    @property
-    def rate(self) -> int:
-        """The sample rate of what is sent, Hz."""
-
-    @property
-    def channels(self) -> int:
-        """The channels of what is sent."""
-
-    @property
-    def part_way(self) -> bool:
-        """Does an unfinished packet already hold encoded sound?"""
-
-    def encode(self, pcm: bytes, captured_ms: int) -> list[bytes]:
-        """No, one or several PBAT packets; ``captured_ms`` is epoch time of the first sample."""
-
-
 def sequence_numbers() -> Iterator[int]:
     """1, 2, 3 … 0xFFFFFFFF, 1 …: one for each packet of a process, whatever its encoding."""
     while True:
         yield from range(1, SEQUENCE_LIMIT)
-
-
-def make_sound_encoder(
-    name: str,
-    *,
-    rate: int,
-    channels: int,
-    chunk_ms: int = 20,
-    bitrate: int = 24_000,
-    bundle: int = 1,
-    sent_rate: int | None = None,
-    sent_channels: int | None = None,
-    numbers: Iterator[int] | None = None,
-) -> SoundEncoder:
-    """``rate`` and ``channels`` are those of the input; ``sent_…`` those on the wire, as far as the encoding has them.
-
-    Opus packets last ``chunk_ms`` rounded up to 20, 40 or 60, and ``bundle`` of them (at most 3) share a PBAT packet.
-    Raises PebbleError for an unknown name and for one this installation cannot make.
-    """
-    numbers = sequence_numbers() if numbers is None else numbers
-    rate_out, channels_out = sent_rate or rate, sent_channels or channels
-    if name == "pcm":
-        rate_out = rate_out if rate_out <= _HIGHEST_PCM_RATE else opus.RATES[-1]
-        return _PcmEncoder(_Intake(rate, channels, rate_out, channels_out), chunk_ms, numbers)
-    if name == "opus":
-        rate_out = next((known for known in opus.RATES if known >= rate_out), opus.RATES[-1])
-        intake = _Intake(rate, channels, rate_out, channels_out if channels_out <= 2 else 1)
-        frame_ms = next((known for known in opus.FRAMES_MS if known >= chunk_ms), opus.FRAMES_MS[-1])
-        return _OpusPackets(intake, frame_ms, bitrate, min(max(bundle, 1), opus.BUNDLE_LIMIT), numbers)
-    raise PebbleError(f'there is no sound encoding "{name}": use {" or ".join(SOUND_ENCODINGS)}')
 
 
 class _Intake:
@@ -110,59 +59,76 @@ class _Intake:
         self._next_ms = captured_ms + 1000 * len(fed) / self._fed_rate
 
 
-class _PcmEncoder:
-    """Codec 1: the samples as they are."""
+class SoundEncoder:
+    """Takes any amount of s16le and returns whole packets; the rest waits for more samples.
 
-    name = "pcm"
-    part_way = False
+    ``bundle`` Opus packets are in one of ours; without ``codec`` it holds the samples as they are.
+    """
 
-    def __init__(self, intake: _Intake, chunk_ms: int, numbers: Iterator[int]) -> None:
-        self.rate, self.channels = intake.rate, intake.channels
-        self._intake, self._numbers = intake, numbers
-        self._size = min(max(1, self.rate * chunk_ms // 1000), _HIGHEST_PCM_RATE)
-
-    def encode(self, pcm: bytes, captured_ms: int) -> list[bytes]:
-        self._intake.has_gap(captured_ms)
-        return [self._packet(frame, first_ms) for frame, first_ms in self._intake.frames(pcm, captured_ms, self._size)]
-
-    def _packet(self, frame: Samples, first_ms: int) -> bytes:
-        body, number, first_ms = to_bytes(frame), next(self._numbers), max(0, first_ms)
-        return Sound(Codec.PCM16LE, self.channels, self.rate, len(frame), number, first_ms, body).pack()
-
-
-class _OpusPackets:
-    """Codec 2: see pebble.media.opus."""
-
-    name = "opus"
-
-    def __init__(self, intake: _Intake, frame_ms: int, bitrate: int, bundle: int, numbers: Iterator[int]) -> None:
-        self.rate, self.channels = intake.rate, intake.channels
-        self._intake, self._numbers, self._bundle = intake, numbers, bundle
-        self._encoder = OpusEncoder(self.rate, self.channels, frame_ms=frame_ms, bitrate=bitrate)
+    def __init__(
+        self, intake: _Intake, numbers: Iterator[int], frame_ms: int, codec: OpusEncoder | None = None, bundle: int = 1
+    ) -> None:
+        self.name = "pcm" if codec is None else "opus"
+        self.rate, self.channels = intake.rate, intake.channels  # of what is sent
+        self._intake, self._numbers, self._codec, self._bundle = intake, numbers, codec, bundle
+        self._samples = min(max(1, self.rate * frame_ms // 1000), _HIGHEST_PCM_RATE)
         self._ready: list[bytes] = []
         self._ready_ms = 0  # when the first of them was captured
 
     @property
     def part_way(self) -> bool:
+        """True if an unfinished packet already holds encoded sound."""
         return bool(self._ready)
 
     def encode(self, pcm: bytes, captured_ms: int) -> list[bytes]:
+        """Return no, one or several PBAT packets; ``captured_ms`` is epoch time of the first sample."""
         packets = []
         if self._intake.has_gap(captured_ms):
             self._ready = []
-        for frame, first_ms in self._intake.frames(pcm, captured_ms, self._encoder.samples):
+        for frame, first_ms in self._intake.frames(pcm, captured_ms, self._samples):
             if not self._ready:
                 self._ready_ms = first_ms
-            self._ready += self._encoder.encode(frame)
+            self._ready += [to_bytes(frame)] if self._codec is None else self._codec.encode(frame)
             if len(self._ready) >= self._bundle:
                 packets.append(self._packet())
         return packets
 
     def _packet(self) -> bytes:
-        samples, body = len(self._ready) * self._encoder.samples, opus.join(self._ready)
-        self._ready = []
-        number, first_ms = next(self._numbers), max(0, self._ready_ms)
-        return Sound(Codec.OPUS, self.channels, self.rate, samples, number, first_ms, body).pack()
+        ready, self._ready = self._ready, []
+        samples, first_ms = len(ready) * self._samples, max(0, self._ready_ms)
+        codec, body = (Codec.PCM16LE, ready[0]) if self._codec is None else (Codec.OPUS, opus.join(ready))
+        return Sound(codec, self.channels, self.rate, samples, next(self._numbers), first_ms, body).pack()
+
+
+def make_sound_encoder(
+    name: str,
+    *,
+    rate: int,
+    channels: int,
+    chunk_ms: int = 20,
+    bitrate: int = 24_000,
+    bundle: int = 1,
+    sent_rate: int | None = None,
+    sent_channels: int | None = None,
+    numbers: Iterator[int] | None = None,
+) -> SoundEncoder:
+    """Make an encoder of what has ``rate`` and ``channels``, to ``sent_…`` as far as the encoding has them.
+
+    Opus packets last ``chunk_ms`` rounded up to 20, 40 or 60, and ``bundle`` of them (at most 3) share a PBAT packet.
+    Raises PebbleError for an unknown name and for one this installation cannot make.
+    """
+    numbers = sequence_numbers() if numbers is None else numbers
+    rate_out, channels_out = sent_rate or rate, sent_channels or channels
+    if name == "pcm":
+        rate_out = rate_out if rate_out <= _HIGHEST_PCM_RATE else opus.RATES[-1]
+        return SoundEncoder(_Intake(rate, channels, rate_out, channels_out), numbers, chunk_ms)
+    if name == "opus":
+        rate_out = next((known for known in opus.RATES if known >= rate_out), opus.RATES[-1])
+        intake = _Intake(rate, channels, rate_out, channels_out if channels_out <= 2 else 1)
+        frame_ms = next((known for known in opus.FRAMES_MS if known >= chunk_ms), opus.FRAMES_MS[-1])
+        codec = OpusEncoder(rate_out, intake.channels, frame_ms=frame_ms, bitrate=bitrate)
+        return SoundEncoder(intake, numbers, frame_ms, codec, min(max(bundle, 1), opus.BUNDLE_LIMIT))
+    raise PebbleError(f'there is no sound encoding "{name}": use {" or ".join(SOUND_ENCODINGS)}')
 
 
 @dataclass(frozen=True, slots=True)

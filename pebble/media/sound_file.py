@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import wave
 from collections.abc import Iterator
-from contextlib import ExitStack
+from itertools import chain
 from pathlib import Path
-from typing import Any, Final, Self
+from typing import Final, Self
 
 from pebble.errors import PebbleError
 from pebble.media import pyav
-from pebble.media.pcm import Samples, to_bytes
+from pebble.media.pcm import to_bytes
 
 #: PyAV's names of the formats, by the ending of the file: what a file holds does not choose its reader, because some
 #: formats of FFmpeg are lists of other files and hosts.
@@ -22,42 +22,36 @@ class SoundFile:
 
     def __init__(self, path: Path) -> None:
         """Raises PebbleError if there is no sound in it, and OSError if it cannot be read."""
-        self._name = path.name
-        self._resources = ExitStack()
-        self.rate, self.channels, self._pieces = self._decoded(path)
+        self._name, self._av = path.name, pyav.load(path.suffix.removeprefix("."))
+        try:
+            self._container = self._av.open(str(path), format=_FORMATS[path.suffix.lower()])
+        except (self._av.error.FFmpegError, ValueError) as error:
+            raise self._undecodable(error) from None
+        self._stream = next(iter(self._container.streams.audio), None)
+        if self._stream is None or not self._stream.rate or not self._stream.channels:
+            self.close()
+            raise PebbleError(f"there is no sound in {path.name}")
+        self.rate, self.channels = self._stream.rate, min(2, self._stream.channels)
 
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._resources.close()
+        self.close()
+
+    def close(self) -> None:
+        self._container.close()
 
     def chunks(self) -> Iterator[bytes]:
         """Interleaved s16le until the end. Raises PebbleError where it cannot be decoded."""
-        for samples in self._pieces:
-            yield to_bytes(samples)
-
-    def _decoded(self, path: Path) -> tuple[int, int, Iterator[Samples]]:
-        av = pyav.load(path.suffix.removeprefix("."))
+        layout = "mono" if self.channels == 1 else "stereo"
         try:
-            container = self._resources.enter_context(av.open(str(path), format=_FORMATS[path.suffix.lower()]))
-            stream = next(iter(container.streams.audio), None)
-            if stream is None or not stream.rate or not stream.channels:
-                raise PebbleError(f"there is no sound in {self._name}")
-            rate, channels = stream.rate, 1 if stream.channels == 1 else 2
-            resampler = av.AudioResampler(format="s16", layout="mono" if channels == 1 else "stereo", rate=rate)
-        except (av.error.FFmpegError, ValueError) as error:
+            resampler = self._av.AudioResampler(format="s16", layout=layout, rate=self.rate)
+            for frame in chain(self._container.decode(self._stream), [None]):
+                for samples in resampler.resample(frame):
+                    yield to_bytes(samples.to_ndarray())
+        except (self._av.error.FFmpegError, ValueError) as error:
             raise self._undecodable(error) from None
-
-        def pieces() -> Iterator[Samples]:
-            try:
-                for frame in container.decode(stream):
-                    yield from _resampled(resampler, frame, channels)
-                yield from _resampled(resampler, None, channels)
-            except (av.error.FFmpegError, ValueError) as error:
-                raise self._undecodable(error) from None
-
-        return rate, channels, pieces()
 
     def _undecodable(self, error: Exception) -> PebbleError:
         return PebbleError(f"{self._name} cannot be decoded: {getattr(error, 'strerror', None) or error}")
@@ -70,8 +64,3 @@ def write_wav(path: Path, samples: bytes, rate: int) -> None:
         file.setsampwidth(2)
         file.setframerate(rate)
         file.writeframes(samples)
-
-
-def _resampled(resampler: Any, frame: Any, channels: int) -> Iterator[Samples]:
-    for made in resampler.resample(frame):
-        yield made.to_ndarray().reshape(-1, channels)

@@ -6,9 +6,9 @@ direction in which it was last seen. The settings are the original's, by its nam
 """
 
 import math
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
-from msgspec import Struct
+from msgspec import Meta, Struct
 
 from pebble.perception.tags import Place
 
@@ -23,26 +23,50 @@ _NEAR_M = 0.1  # beyond the wanted distance: a tag that is lost here has grown o
 _AWAY_S = 0.6
 _AWAY_POWER = 0.15
 
+Power = Annotated[float, Meta(ge=0, le=1)]
+Gain = Annotated[float, Meta(ge=0)]
+Length = Annotated[float, Meta(ge=0)]
+
 
 class FollowSettings(Struct, frozen=True, kw_only=True):
-    """Distances in m, times in s, powers 0..1."""
+    """The settings of a script that follows a tag, also by odometry: distances in m, times in s, powers 0..1."""
 
-    target_distance_m: float = 0.6
-    distance_threshold_m: float = 0.05
-    standoff_hysteresis_m: float = 0.03
-    forward_cone_deg: float = 18.0
-    vision_forward_kp: float = 2.0  # power per m
-    vision_reverse_kp: float = 2.0
-    vision_forward_floor_distance_m: float = 0.2  # beyond threshold and this, at least the minimum power
-    forward_min_power: float = 0.8
-    forward_max_power: float = 1.0
-    turn_power: float = 0.5
-    turn_pulse_s: float = 0.08
-    turn_cooldown_s: float = 0.18
-    search_pause_s: float = 0.35
-    search_reverse_after_s: float = 0.0  # 0: never
-    lost_timeout_s: float = 0.7
-    tag_timeout_s: float = 0.35
+    tag_id: Annotated[int, Meta(ge=0, title="Tag ID", extra={"arg": "marker-id"})] = 13
+    tag_size_m: Annotated[
+        float, Meta(ge=0.01, title="Tag Size (m)", extra={"arg": "marker-size", "required": True})
+    ] = 0.25
+    target_distance_m: Annotated[
+        float, Meta(ge=0.05, title="Target Distance (m)", extra={"arg": "target-distance"})
+    ] = 0.6
+    distance_threshold_m: Annotated[
+        Length, Meta(title="Distance Threshold (m)", extra={"arg": "distance-threshold"})
+    ] = 0.05
+    standoff_hysteresis_m: Annotated[Length, Meta(title="Standoff Hysteresis (m)")] = 0.03
+    vision_forward_kp: Annotated[Gain, Meta(title="Vision Forward Kp")] = 2.0
+    vision_reverse_kp: Annotated[Gain, Meta(title="Vision Reverse Kp")] = 2.0
+    #: Beyond the threshold and this, at least the minimum power.
+    vision_forward_floor_distance_m: Annotated[Length, Meta(title="Vision Floor Dist (m)")] = 0.2
+    forward_cone_deg: Annotated[float, Meta(ge=5, le=75, title="Forward Cone (deg)")] = 18.0
+    forward_min_power: Annotated[Power, Meta(title="Forward Min Power")] = 0.8
+    forward_max_power: Annotated[Power, Meta(title="Forward Max Power")] = 1.0
+    control_rate_hz: Annotated[float, Meta(ge=1, title="Control Rate (Hz)", extra={"arg": "rate"})] = 10.0
+    turn_power: Annotated[float, Meta(ge=0.05, le=1, title="Turn Power")] = 0.5
+    turn_pulse_s: Annotated[float, Meta(ge=0.02, title="Turn Pulse (s)", extra={"arg": "turn-pulse"})] = 0.08
+    turn_cooldown_s: Annotated[float, Meta(ge=0, title="Turn Cooldown (s)", extra={"arg": "turn-cooldown"})] = 0.18
+    odom_goal_tolerance_m: Annotated[float, Meta(ge=0.01, title="Odom Goal Tolerance (m)")] = 0.06
+    odom_heading_kp: Annotated[float, Meta(ge=0.1, title="Odom Heading Kp")] = 1.5
+    odom_distance_kp: Annotated[float, Meta(ge=0.1, title="Odom Distance Kp")] = 1.4
+    odom_min_drive_power: Annotated[Power, Meta(title="Odom Min Drive Power")] = 0.35
+    odom_max_drive_power: Annotated[Power, Meta(title="Odom Max Drive Power")] = 0.9
+    odom_brake_distance_m: Annotated[Length, Meta(title="Odom Brake Distance (m)")] = 0.25
+    search_pause_s: Annotated[float, Meta(ge=0, title="Search Pause (s)", extra={"arg": "search-pause"})] = 0.35
+    search_reverse_after_s: Annotated[
+        float, Meta(ge=0, title="Search Reverse After (s)", extra={"arg": "search-reverse-after"})
+    ] = 0.0
+    lost_timeout_s: Annotated[float, Meta(ge=0, title="Lost Timeout (s)", extra={"arg": "lost-timeout"})] = 0.7
+    tag_timeout_s: Annotated[float, Meta(ge=0.05, title="Tag Timeout (s)", extra={"arg": "tag-timeout"})] = 0.35
+    min_goal_advance_m: Annotated[Length, Meta(title="Min Goal Advance (m)")] = 0.1
+    goal_hold_s: Annotated[float, Meta(ge=0, title="Goal Hold (s)")] = 0.4
 
 
 class Command(NamedTuple):

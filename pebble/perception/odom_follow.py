@@ -12,20 +12,7 @@ from pebble.perception.tags import Place
 _BLIND_S = 6.0  # at most, since the tag was seen
 _SLOW_RAD = math.radians(40.0)  # off the goal; the more beyond, the slower
 _LEAST_SHARE = 0.2
-
-
-class OdomFollowSettings(FollowSettings, frozen=True, kw_only=True):
-    """Distances in m, times in s, powers 0..1."""
-
-    min_goal_advance_m: float = 0.10  # nearer goals are not worth the way
-    odom_goal_tolerance_m: float = 0.06
-    goal_hold_s: float = 0.4
-    odom_heading_kp: float = 1.5  # of the turn power per quarter turn
-    odom_distance_kp: float = 1.4  # power per m
-    odom_turn_power: float = 0.6
-    odom_min_drive_power: float = 0.35
-    odom_max_drive_power: float = 0.9
-    odom_brake_distance_m: float = 0.25  # nearer, there is no minimum power
+_TURN_POWER = 0.6
 
 
 class Pose(NamedTuple):
@@ -62,7 +49,7 @@ def _number(value: dict[str, Any], *names: str) -> float | None:
 class OdomFollower:
     """Call ``see`` for every picture, and ``step`` at a steady rate of about 10 Hz."""
 
-    def __init__(self, settings: OdomFollowSettings) -> None:
+    def __init__(self, settings: FollowSettings) -> None:
         self.settings = settings
         self._vision = Follower(replace(settings, tag_timeout_s=0.0))  # how old a place may be is decided here
         self._place: Place | None = None
@@ -109,5 +96,5 @@ class OdomFollower:
         power = min(settings.odom_max_drive_power, max(floor, settings.odom_distance_kp * distance))
         if abs(off) > _SLOW_RAD:
             power *= max(_LEAST_SHARE, 1.0 - (abs(off) - _SLOW_RAD) / (math.pi - _SLOW_RAD))
-        x = -share * settings.odom_turn_power
+        x = -share * _TURN_POWER
         return Command(x, min(power, 1.0 - abs(x)), "odometry")

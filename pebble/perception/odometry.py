@@ -7,38 +7,47 @@ an inertial sensor.
 
 import math
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple
 
-from msgspec import Struct
+from msgspec import Meta, Struct
 
 from pebble.contract.payloads import ImuFast, MotorPower, TouchValues
 from pebble.perception.gyro import GyroHeading
 from pebble.perception.hall import HallSample, HallWheel
-from pebble.perception.motor_power import Directions
 
 _MOVING_S = 0.45  # a robot counts as moving so long after its last motion
 _STALL_S = 0.32
 _NOISE_MM = 1.0  # less is no motion
 _UNCHANGED_S = 0.3  # without motion and power the robot is at rest
+_HOLD_S = 0.35  # wheels coast so long
+_LEAST_POWER = 0.02
 
 
-class WheelGeometry(Struct, frozen=True, kw_only=True):
-    """Wheels, magnets of alternating poles, and the ADC channels of their sensors; ``quadrature`` "" means none."""
+Pin = Literal["a0", "a1", "a2"]
 
-    diameter_mm: float = 61.0
-    track_mm: float = 130.5
-    magnets: int = 10  # per wheel: one step each
-    left: str = "a0"
-    right: str = "a1"
-    quadrature: str = "a2"  # of the left wheel, a quarter of a wave later
-    left_step_mm: float = 0.0  # measured; 0: by diameter and magnets
-    right_step_mm: float = 0.0
+
+class OdometrySettings(Struct, frozen=True, kw_only=True):
+    """Wheels, magnets of alternating poles, and the ADC channels of their sensors."""
+
+    use_tune_state: Annotated[bool, Meta(title="Use Tune State")] = False
+    wheel_diameter_mm: Annotated[float, Meta(ge=1, le=1000, title="Wheel Diameter (mm)")] = 61.0
+    track_width_mm: Annotated[float, Meta(ge=1, le=5000, title="Track Width (mm)")] = 130.5
+    magnets: Annotated[int, Meta(ge=1, le=200, title="Magnets per Wheel")] = 10
+    left_channel: Annotated[Pin, Meta(title="Left Sensor")] = "a0"
+    right_channel: Annotated[Pin, Meta(title="Right Sensor")] = "a1"
+    second_channel: Annotated[
+        Literal["a0", "a1", "a2", "none"], Meta(title="Second Left Sensor, a quarter wave away")
+    ] = "a2"
+    left_mm_per_event: Annotated[float, Meta(ge=0, le=1000, title="Left Step (mm), 0: by geometry")] = 0.0
+    right_mm_per_event: Annotated[float, Meta(ge=0, le=1000, title="Right Step (mm), 0: by geometry")] = 0.0
+    publish_rate_hz: Annotated[float, Meta(ge=1, le=50, title="Rate While Moving (Hz)")] = 20.0
+    idle_publish_rate_hz: Annotated[float, Meta(ge=0.2, le=50, title="Rate at Rest (Hz)")] = 2.0
 
     @property
     def step_mm(self) -> tuple[float, float]:
-        """A step of the left and of the right wheel."""
-        step = math.pi * self.diameter_mm / self.magnets
-        return self.left_step_mm or step, self.right_step_mm or step
+        """A step of the left and of the right wheel, one for each magnet."""
+        step = math.pi * self.wheel_diameter_mm / self.magnets
+        return self.left_mm_per_event or step, self.right_mm_per_event or step
 
 
 class WheelPose(NamedTuple):
@@ -92,17 +101,42 @@ class _Wheel:
         return distance
 
 
+class Directions:
+    """The power of both motors, and the direction in which each wheel may turn: a single sensor does not show it."""
+
+    def __init__(self, now: float) -> None:
+        self._power = (0.0, 0.0)  # left, right
+        self._signs = [0, 0]
+        self._signs_until = [now, now]
+
+    def command(self, power: MotorPower, now: float) -> None:
+        self._note_signs(now)
+        self._power = (power.left, power.right)
+
+    def at(self, now: float) -> tuple[tuple[float, int], tuple[float, int]]:
+        """Power and possible direction of the left and the right wheel; a direction remains while wheels coast."""
+        self._note_signs(now)
+        left, right = (s if now <= until else 0 for s, until in zip(self._signs, self._signs_until, strict=True))
+        return (self._power[0], left), (self._power[1], right)
+
+    def _note_signs(self, now: float) -> None:
+        for wheel, power in enumerate(self._power):
+            if abs(power) >= _LEAST_POWER:
+                self._signs[wheel] = 1 if power > 0.0 else -1
+                self._signs_until[wheel] = now + _HOLD_S
+
+
 class Odometry:
     """Feed it every power that the wheels are commanded, and every sample."""
 
-    def __init__(self, geometry: WheelGeometry, now: float) -> None:
+    def __init__(self, settings: OdometrySettings, now: float) -> None:
         self.pose = self._base = WheelPose()
         self.distance_mm = 0.0
         self._part = _Part()
         self._was_ready = True
-        self._geometry = geometry
+        self._settings = settings
         self._power = Directions(now)
-        self._left, self._right = map(_Wheel, geometry.step_mm)
+        self._left, self._right = map(_Wheel, settings.step_mm)
         self._gyro = GyroHeading()
         self._heading_source = "wheels"
         self._samples = self._published = 0
@@ -123,15 +157,15 @@ class Odometry:
     def touch(self, values: TouchValues, now: float) -> None:
         """A sample of the hall sensors."""
         self._samples += 1
-        geometry, (left_power, right_power) = self._geometry, self._power.at(now)
-        second = getattr(values, geometry.quadrature) if geometry.quadrature else None
-        left = self._left.update(HallSample(getattr(values, geometry.left), second, *left_power), now)
-        right = self._right.update(HallSample(getattr(values, geometry.right), None, *right_power), now)
+        settings, (left_power, right_power) = self._settings, self._power.at(now)
+        second = None if settings.second_channel == "none" else getattr(values, settings.second_channel)
+        left = self._left.update(HallSample(getattr(values, settings.left_channel), second, *left_power), now)
+        right = self._right.update(HallSample(getattr(values, settings.right_channel), None, *right_power), now)
         self._powered = left_power[0] != 0.0 or right_power[0] != 0.0
         self._move(left, right, now)
 
     def _move(self, left: float, right: float, now: float) -> None:
-        turn = (right - left) / self._geometry.track_mm
+        turn = (right - left) / self._settings.track_width_mm
         measured = self._gyro.take(turn, now)
         self._heading_source = "wheels" if measured is None else "gyro"
         part = self._part

@@ -148,12 +148,9 @@ def _default(field: inspect.Field, setting: Setting) -> Value:
 
 def _add(parser: argparse.ArgumentParser, setting: Setting) -> None:
     if setting.type == "bool":
-        flags = parser.add_mutually_exclusive_group()
-        word = "on" if setting.default else "off"
-        flags.add_argument(str(setting.arg), dest=setting.key, action="store_true", default=None,
-                           help=f"{setting.label} (default: {word})")  # fmt: skip
-        flags.add_argument(str(setting.arg_false), dest=setting.key, action="store_false", default=None,
-                           help=argparse.SUPPRESS if word == "off" else "the opposite")  # fmt: skip
+        help_ = f"{setting.label} (default: {'on' if setting.default else 'off'})"
+        action = argparse.BooleanOptionalAction
+        parser.add_argument(str(setting.arg), dest=setting.key, action=action, default=None, help=help_)
         return
     parser.add_argument(
         str(setting.arg),

@@ -7,6 +7,7 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+from weakref import WeakSet
 
 if TYPE_CHECKING:
     from pebble.cameras import Camera, Picture
@@ -18,18 +19,15 @@ class Pictures:
     def __init__(self, run_dir: Path) -> None:
         self._run_dir = run_dir
         self._changing = threading.Lock()
-        self._cameras: list[Camera] = []
+        self._cameras: WeakSet[Camera] = WeakSet()
         self._polled: Camera | None = None
         self._last: Picture | None = None
         self._closed = False
 
     def every(self, **options: Any) -> Iterator[Picture]:
         """All pictures from now on, the newest each time; see `pebble.camera`."""
-        view = self._open(**options)
-        try:
+        with self._open(**options) as view:
             yield from view
-        finally:
-            self._close(view)
 
     def newest(self, max_age: float) -> Picture | None:
         """The newest picture, if it was captured within the last ``max_age`` seconds. Does not wait."""
@@ -44,10 +42,10 @@ class Pictures:
         return self._last
 
     def close(self) -> None:
-        """Ends all loops over pictures."""
+        """End all loops over pictures."""
         with self._changing:
             self._closed = True
-            cameras, self._cameras = self._cameras, []
+            cameras = list(self._cameras)
         for view in cameras:
             view.close()
 
@@ -56,14 +54,8 @@ class Pictures:
 
         view = camera(self._run_dir, **options)
         with self._changing:
-            self._cameras.append(view)
+            self._cameras.add(view)
             closed = self._closed
         if closed:
             view.close()
         return view
-
-    def _close(self, view: Camera) -> None:
-        with self._changing:
-            if view in self._cameras:
-                self._cameras.remove(view)
-        view.close()

@@ -1,17 +1,19 @@
-"""Sends the microphone's sound to operators."""
+"""Sends the microphone's sound to operators: as few late packets as possible."""
 
 import threading
 from typing import Any
 
 from pebble.contract import AUDIO, AUDIO_CONTROL, MEDIA_REPORT
 from pebble.contract.payloads import MediaReport, MediaRequest
-from pebble.errors import DeviceError
+from pebble.errors import DeviceError, PebbleError
+from pebble.media.rate_meter import RateMeter
+from pebble.media.sound import SOUND_ENCODINGS, SoundEncoder, make_sound_encoder, sequence_numbers
 from pebble.runtime.connections import remote_transport
 from pebble.runtime.parent import requested_encoding
 from pebble.runtime.service import Service, every, on
-from pebble.services.audio_publisher.sender import Sender, known_encoding
+from pebble.services.audio_publisher.rate_control import RateController, Step
 from pebble.transports import QoS, State
-from pebble.transports.frames import FrameReader
+from pebble.transports.frames import FrameInfo, FrameReader
 
 _DEPTH = 10  # chunks of 20 ms that may wait for the sender: the rest of what may be late
 _QUIET_S = 2.0  # without sound from the microphone before that is reported
@@ -19,7 +21,10 @@ _END_S = 1.0  # for the microphone's thread to end
 
 
 class AudioPublisher(Service):
-    """A thread reads, encodes and sends; the service's thread handles requests and reports."""
+    """A thread reads, encodes and sends; the service's thread handles requests and reports.
+
+    ``counters``: packets, bytes (sent), dropped (no connection, or one that is too slow), refused (not sound).
+    """
 
     name = "audio_publisher"
     publishes = (MEDIA_REPORT, AUDIO)
@@ -27,21 +32,21 @@ class AudioPublisher(Service):
 
     def __init__(self, *arguments: Any, **options: Any) -> None:
         super().__init__(*arguments, **options)
-        self._options = self.config.services.mqtt_bridge.media.audio_publisher
+        self._options = section = self.config.services.mqtt_bridge.media.audio_publisher
         self._stopping = False
         self._received_at = self.clock()
         self._remote = remote_transport(self.config, "audio-publisher")
-        address = self.addresses[AUDIO]
-        self._sender = Sender(
-            self._options,
-            self._remote,
-            address.topic,
-            QoS(address.qos),
-            self.counters,
-            self._received_at,
-            thin=self.config.services.mqtt_bridge.link.profile != "wide",
+        self._address = self.addresses[AUDIO]
+        thin = self.config.services.mqtt_bridge.link.profile != "wide"
+        self._rate = RateController(
+            section.bundle, section.bitrate, self._received_at, lambda: self._remote.outgoing, thin=thin
         )
-        self._sender.requested = known_encoding(requested_encoding(), self._options.encoding)
+        self._meter, self._numbers = RateMeter(), sequence_numbers()
+        self._requested = self._known(requested_encoding())
+        self._encoder: SoundEncoder | None = None
+        self._made_for: tuple[object, ...] = ()  # encoding, rate, channels and step
+        self._problem = ""  # why sound is not sent as requested
+        self.reduced = ""  # because of a slow connection
         self._reader = FrameReader(self.config.run_dir(), "microphone", sharing=False, depth=_DEPTH)
         self._thread = threading.Thread(target=self._read, name="pebble-microphone", daemon=True)
 
@@ -60,7 +65,16 @@ class AudioPublisher(Service):
     @on(AUDIO_CONTROL)
     def control(self, request: MediaRequest) -> None:
         if request.enabled:  # else the launcher is about to stop this process
-            self._sender.requested = known_encoding(request.encoding, self._options.encoding)
+            self._requested = self._known(request.encoding)
+
+    def _known(self, requested: str | None) -> str:
+        """The requested encoding if this installation has it, else the configured one."""
+        return requested if requested is not None and requested in SOUND_ENCODINGS else self._options.encoding
+
+    @property
+    def encoding(self) -> str:
+        """The encoding of what is sent."""
+        return self._options.encoding if self._encoder is None else self._encoder.name
 
     # -- the microphone's thread
 
@@ -68,7 +82,7 @@ class AudioPublisher(Service):
         try:
             for frame in self._reader:
                 self._received_at = self.clock()
-                self._sender.take(frame.info, frame.data.tobytes(), self._received_at)
+                self.take(frame.info, frame.data.tobytes(), self._received_at)
                 frame.release()
         finally:
             self.post(self._on_end)
@@ -77,47 +91,105 @@ class AudioPublisher(Service):
         if not self._stopping:
             raise DeviceError("the thread that reads the microphone has ended")  # the launcher restarts this process
 
+    def take(self, info: FrameInfo, pcm: bytes, now: float) -> None:
+        """Send one chunk as the microphone gave it, at the monotonic time ``now``."""
+        if info.format != "s16le" or not (0 < info.rate <= 384_000 and 0 < info.channels <= 8):
+            self.counters.add("refused")
+            return
+        if not self._connected:
+            self.counters.add("dropped")
+            self._rate.connection_lost()
+            return
+        self._rate.poll(now, self.encoding)
+        encoder = self._encoder_for(info.rate, info.channels)
+        first_ms = info.captured_ms - round(1000 * len(pcm) / (2 * info.channels * info.rate))
+        for packet in encoder.encode(pcm, first_ms):
+            self._send_packet(packet, now)
+
+    def _send_packet(self, packet: bytes, now: float) -> None:
+        may_send, address = self._rate.may_send(self.encoding), self._address
+        if not may_send or not self._remote.publish(address.topic, packet, qos=QoS(address.qos)):
+            self.counters.add("dropped")
+            return
+        self._rate.sent(len(packet), now)
+        self._meter.add(now, len(packet))
+        self.counters.add("packets")
+        self.counters.add("bytes", len(packet))
+
+    def _encoder_for(self, rate: int, channels: int) -> SoundEncoder:
+        """The present one, or a new one if anything about it has to change; another step waits for a packet's end."""
+        step = self._rate.step if self._requested == "opus" else self._rate.configured
+        needed = (self._requested, rate, channels, step)
+        same_sound = needed[:-1] == self._made_for[:-1]
+        if self._encoder is None or (needed != self._made_for and not (same_sound and self._encoder.part_way)):
+            self._made_for = needed
+            self._encoder = self._make(*needed)
+            self.reduced = step.reduced if self._encoder.name == "opus" else ""
+            reduced = f", with {self.reduced}" if self.reduced else ""
+            self.log.info("sound is sent as %s%s", _format(self._encoder), reduced)
+        return self._encoder
+
+    def _make(self, name: str, rate: int, channels: int, step: Step) -> SoundEncoder:
+        """The encoder called ``name``; where it cannot be made, the one that every robot has and every client reads."""
+        options = self._options
+        self._problem = ""
+        for attempt in (name, "pcm"):
+            try:
+                return make_sound_encoder(
+                    attempt,
+                    rate=rate,
+                    channels=channels,
+                    chunk_ms=options.chunk_ms,
+                    bitrate=step.bitrate,
+                    bundle=step.bundle,
+                    sent_rate=options.rate,
+                    sent_channels=options.channels,
+                    numbers=self._numbers,
+                )
+            except PebbleError as error:
+                self._problem = str(error)
+                self.log.warning("sound cannot be sent as %s: %s", attempt, error)
+        raise PebbleError(self._problem)
+
     # -- the report
 
     @every(1.0)
     def _report(self) -> None:
-        sender, now = self._sender, self.clock()
-        bitrate = sender.meter.bitrate(now)
-        self.publish(
-            MEDIA_REPORT,
-            MediaReport(
-                running=True,
-                doing=self._doing(bitrate),
-                encoding=sender.encoding,
-                rate=round(sender.meter.rate(now), 2),
-                bitrate=round(bitrate),
-                dropped=self._dropped(),
-                reduced=sender.reduced or None,
-                last_error=self._trouble(),
-            ),
-            program=self.name,
+        now, lost = self.clock(), self._reader.counters
+        bitrate = self._meter.bitrate(now)
+        report = MediaReport(
+            running=True,
+            doing=self._doing(bitrate),
+            encoding=self.encoding,
+            rate=round(self._meter.rate(now), 2),
+            bitrate=round(bitrate),
+            # Chunks that this process was too slow for, and packets that the connection was too slow for.
+            dropped=self.counters["dropped"] + lost["skipped"] + lost["missed"] + lost["torn"],
+            reduced=self.reduced or None,
+            last_error=self._trouble(now) or None,
         )
-
-    def _dropped(self) -> int:
-        """Chunks that this process was too slow for, and packets that the connection was too slow for."""
-        lost = self._reader.counters
-        return self.counters["dropped"] + lost["skipped"] + lost["missed"] + lost["torn"]
+        self.publish(MEDIA_REPORT, report, program=self.name)
 
     def _doing(self, bitrate: float) -> str:
         if not self._connected:
             return "rests: the remote side is away"
-        if not self._sender.format:
+        if self._encoder is None:
             return "waits for the microphone"
-        return f"{self._sender.format}, {bitrate / 1000:.0f} kbit/s"
+        return f"{_format(self._encoder)}, {bitrate / 1000:.0f} kbit/s"
 
-    def _trouble(self) -> str | None:
+    def _trouble(self, now: float) -> str:
         if not self._connected:
-            return self._remote.problem or None
-        quiet_s = self.clock() - self._received_at
+            return self._remote.problem
+        quiet_s = now - self._received_at
         if quiet_s > _QUIET_S:
             return f"no sound from the microphone for {quiet_s:.0f} s"
-        return self._sender.problem or self._reader.problem or None
+        return self._problem or self._reader.problem
 
     @property
     def _connected(self) -> bool:
         return self._remote.state is State.CONNECTED
+
+
+def _format(encoder: SoundEncoder) -> str:
+    shape = {1: "mono", 2: "stereo"}.get(encoder.channels, f"{encoder.channels} channels")
+    return f"{encoder.name} {encoder.rate / 1000:g} kHz {shape}"

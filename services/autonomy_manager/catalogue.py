@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import logging
 import os
+import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from functools import partial
 from pathlib import Path
+from typing import NamedTuple
 
 import msgspec
 from msgspec.structs import asdict, replace
@@ -20,8 +22,8 @@ from pebble.contract.identity import meant
 from pebble.services.autonomy_manager.describe import (
     MANIFEST,
     BrokenScriptError,
+    DescribeError,
     Description,
-    Descriptions,
     ask,
     is_ours,
     read_manifest,
@@ -33,9 +35,8 @@ from pebble.services.autonomy_manager.script import Dependency, Script
 
 MAX_SCRIPTS = 256
 _LONGEST_NAME = 100
-_LONGEST_FORM = 16 * 1024  # bytes
 _LONGEST_FILES = 256 * 1024  # bytes of all forms together
-_MAX_DEPENDENCIES = 8
+_RETRY_S = 60.0  # after a failure: it may have been a busy machine's
 _OWN_SCRIPTS = Path(pebble.__file__).parent / "scripts"
 
 log = logging.getLogger(__name__)
@@ -56,15 +57,25 @@ def roots(config: Config, own: Path = _OWN_SCRIPTS) -> tuple[Path, ...]:
     return (*beside, own)
 
 
+class _Answer(NamedTuple):
+    """The description of a script, and why it has no settings or cannot be started."""
+
+    description: Description
+    ours: bool = False
+    problem: str = ""
+    broken: bool = False
+
+
 class Catalogue:
     """Scans the folders. For one thread, because to ask a script takes up to 20 s."""
 
-    def __init__(self, config: Config, *, asks: bool = True) -> None:
+    def __init__(self, config: Config, *, asks: bool = True, clock: Callable[[], float] = time.monotonic) -> None:
         """``asks`` is False for a list of scripts without the settings of ours."""
         self._config, self._section, self._asks = config, config.services.autonomy_manager, asks
         self._roots, self._login = roots(config), local_login(config)
-        self._manifests, self._answers = Descriptions(), Descriptions()
-        self._ours: dict[str, tuple[object, bool, str]] = {}  # by name: version, whether it is ours, what is wrong
+        self._clock = clock
+        #: By name: the version of its files, what they say, and until when that counts.
+        self._answers: dict[str, tuple[object, _Answer, float]] = {}
         self._scanned = False
         self._complained: set[str] = set()  # names with a warning in the log
 
@@ -78,9 +89,7 @@ class Catalogue:
                 if (script := self._script(name, folder, before_asking)) is not None:
                     scripts[name] = script
                     break
-        for descriptions in (self._manifests, self._answers):
-            descriptions.retain_only(set(folders))
-        self._ours = {name: answer for name, answer in self._ours.items() if name in folders}
+        self._answers = {name: answer for name, answer in self._answers.items() if name in folders}
         self._scanned = True
         found(scripts)
 
@@ -113,52 +122,63 @@ class Catalogue:
 
     def _script(self, name: str, folder: Path, before_asking: Callable[[], object]) -> Script | None:
         section = self._section_of(name)
-        entry, manifest = folder / section.entrypoint, folder / MANIFEST
-        described = self._manifests.get(name, [manifest], lambda: _manifest(manifest)) or Description()
+        entry = folder / section.entrypoint
+        answer = self._answer(name, folder, entry, section, before_asking)
+        described = answer.description
         if not described.command and not entry.is_file():
             return None
-        ours, broken = (False, "") if described.command else self._is_ours(name, entry, section)
-        command = self._command(folder, entry, section, described, ours=ours)
-        if ours and self._asks:
-
-            def question() -> Description:
-                before_asking()
-                return ask(command, folder, environment(section.env))
-
-            answer = self._answers.get(name, [entry], question)
-            broken = self._answers.broken(name)
-            described = _merged(described, answer or Description())
         return Script(
             file=name,
             label=(section.display_name or described.label or name)[:_LONGEST_NAME],
-            command=command,
+            command=self._command(folder, entry, section, described, ours=answer.ours),
             folder=section.cwd or folder,
-            settings=self._settings(name, section, described, ours=ours),
+            settings=self._settings(name, section, described, ours=answer.ours),
             summary=described.summary,
             main=tuple(described.main),
             dependencies=_dependencies(name, section, described),
             environment={**self._login, **section.env},
-            ours=ours,
-            broken=broken,
+            ours=answer.ours,
+            broken=answer.problem if answer.broken else "",
         )
 
-    def _is_ours(self, name: str, entry: Path, section: ScriptSection) -> tuple[bool, str]:
-        """Whether it is ours, and why it cannot be started; parsed only when it has changed, which may take a second.
+    def _answer(
+        self, name: str, folder: Path, entry: Path, section: ScriptSection, before_asking: Callable[[], object]
+    ) -> _Answer:
+        """Return what its files say; remembered until they change, a failure for a minute."""
+        version = entry, stamp(entry), stamp(folder / MANIFEST)
+        known, before, until = self._answers.get(name, (None, _Answer(Description()), 0.0))
+        if known == version and self._clock() < until:
+            return before
+        answer = self._asked(folder, entry, section, before_asking)
+        if answer.problem and answer.problem != before.problem:
+            what = "cannot be started" if answer.broken else "is offered without settings"
+            log.warning("%s %s: %s", name, what, answer.problem)
+        self._answers[name] = version, answer, self._clock() + _RETRY_S if answer.problem else float("inf")
+        return answer
 
-        What another Python runs may be written for that.
-        """
-        before, now = self._ours.get(name), stamp(entry)
-        if before is not None and before[0] == now:
-            return before[1:]
-        ours, broken = False, ""
+    def _asked(self, folder: Path, entry: Path, section: ScriptSection, before_asking: Callable[[], object]) -> _Answer:
+        """Read the files, and ask the script if it is one of ours: that takes up to 20 s."""
+        described, problem = Description(), ""
+        try:
+            described = read_manifest(folder / MANIFEST) or described
+        except DescribeError as error:
+            problem = str(error)
+        if described.command:
+            return _Answer(described)
         try:
             ours = is_ours(entry)
         except BrokenScriptError as error:
-            if section.python is None:
-                broken = str(error)
-                log.warning("%s cannot be started: %s", name, broken)
-        self._ours[name] = (now, ours, broken)
-        return ours, broken
+            if section.python is not None:  # what another Python runs may be written for that
+                return _Answer(described, problem=problem)
+            return _Answer(described, problem=str(error), broken=True)
+        if not ours or not self._asks:
+            return _Answer(described, ours, problem)
+        before_asking()
+        command = self._command(folder, entry, section, described, ours=True)
+        try:
+            return _Answer(_merged(described, ask(command, folder, environment(section.env))), True, problem)
+        except DescribeError as error:
+            return _Answer(described, True, str(error), isinstance(error, BrokenScriptError))
 
     def _command(
         self, folder: Path, entry: Path, section: ScriptSection, described: Description, *, ours: bool
@@ -189,8 +209,7 @@ class Catalogue:
         for setting in own.values():
             merged.setdefault(setting.key, setting)
         settings = tuple(merged.values())
-        size = len(msgspec.json.encode(form(settings)))
-        if len(settings) > MAX_SETTINGS or size > _LONGEST_FORM:
+        if len(settings) > MAX_SETTINGS:
             self._complain(name, "%s is offered without settings: %d are too many", name, len(settings))
             return ()
         return settings
@@ -228,10 +247,6 @@ def _inside(root: Path) -> list[Path]:
         return []
 
 
-def _manifest(path: Path) -> Description:
-    return read_manifest(path) or Description()
-
-
 def _merged(first: Description, second: Description) -> Description:
     """What ``first`` leaves open is taken from ``second``."""
     keys = {setting.key for setting in first.configs}
@@ -256,4 +271,4 @@ def _dependencies(name: str, section: ScriptSection, described: Description) -> 
     else:
         chosen = ((each.file, each.config) for each in described.dependencies)
     by_file = {file: Dependency(file, dict(config)) for file, config in chosen if file != name}
-    return tuple(by_file.values())[:_MAX_DEPENDENCIES]
+    return tuple(by_file.values())

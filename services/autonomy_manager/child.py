@@ -1,7 +1,5 @@
 """One process of a script: started, read, signalled, and watched to its end."""
 
-from __future__ import annotations
-
 import logging
 import os
 import re
@@ -14,12 +12,11 @@ import time
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
-from typing import Protocol
 
 from msgspec import Struct
 
 from pebble.errors import PebbleError
-from pebble.runtime import child
+from pebble.runtime.child import Child
 from pebble.runtime.exits import ASKS_S, exit_descriptor, has_ended
 from pebble.runtime.parent import tagged
 from pebble.services.autonomy_manager.guard import Guard
@@ -44,48 +41,30 @@ class Launch(Struct, frozen=True):
     tie: signal.Signals
 
 
-class Child(Protocol):
-    """A process that was started."""
-
-    pid: int
-
-    @property
-    def running(self) -> bool:
-        """False once its end has been noticed."""
-
-    def signal(self, number: signal.Signals) -> None:
-        """Send a signal to its process group, if it still runs."""
-
-    def wait(self, timeout_s: float) -> None:
-        """Wait until it has ended, at most so long."""
-
-
-#: Starts a process. The function gets its exit code, or minus the signal that ended it, on any thread.
-#: Raises OSError or ValueError.
-Spawn = Callable[[Launch, Callable[[int], None]], Child]
-
-
 class Processes:
     """Starts real processes. Only on the main thread: the kernel ties a process to the thread that starts it."""
 
     def __init__(self, lock: Path) -> None:
         self._guard = Guard(lock)
 
-    def __call__(self, launch: Launch, ended: Callable[[int], None]) -> Child:
-        """The first call waits until no script of an earlier manager is alive. Raises PebbleError if one stays."""
+    def __call__(self, launch: Launch, ended: Callable[[int], None]) -> "Process":
+        """Start a process; ``ended`` gets its exit code, or minus the signal that ended it, on any thread.
+
+        The first call waits until no script of an earlier manager is alive. Raises PebbleError if one stays.
+        """
         self._guard.begin()
         process = Process(launch)
-
-        def on_end(code: int) -> None:
-            self._guard.remove(process.pid)
-            ended(code)
-
         try:
-            self._guard.add(process.pid, launch.tie)
+            release = self._guard.watch(process.pid, launch.tie)
         except OSError:
             process.signal(signal.SIGKILL)
-            process.watch(self._guard.remove)
+            process.watch(lambda _code: None)
             raise
+
+        def on_end(code: int) -> None:
+            release()
+            ended(code)
+
         process.watch(on_end)
         return process
 
@@ -99,7 +78,7 @@ class Process:
     def __init__(self, launch: Launch) -> None:
         _check_program(Path(launch.command[0]))
         output = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT}
-        self._child = child.Child(launch.command, launch.environment, launch.folder, launch.tie, **output)
+        self._child = Child(launch.command, launch.environment, launch.folder, launch.tie, **output)
         self.pid = self._child.pid
         self._file = launch.file
         self._thread: threading.Thread | None = None
@@ -188,3 +167,7 @@ def _read(pipe: int, output: Output) -> bool:
         return False
     output.feed(data, time.monotonic())
     return bool(data)
+
+
+#: Starts a process, as :class:`Processes` does.
+Spawn = Callable[[Launch, Callable[[int], None]], Process]

@@ -1,12 +1,10 @@
 """Asks a script what it is: its `script.json`, or the script itself with `--describe` if it is one of ours."""
 
 import ast
-import logging
-import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from tempfile import TemporaryFile
-from typing import IO, Any
+from typing import IO
 
 import msgspec
 from msgspec import Struct
@@ -15,23 +13,14 @@ from pebble.config.text_files import NotTextError, text_of
 from pebble.contract.forms import MAX_SETTINGS, Setting
 from pebble.contract.payloads import LONGEST_SUMMARY, MOST_MAIN
 from pebble.runtime.child import Child
+from pebble.services.autonomy_manager.script import Dependency
 
 MANIFEST = "script.json"
 _LIMIT_S = 20.0
 _LONGEST = 256 * 1024  # bytes of an answer or a manifest
 _LONGEST_SOURCE = 1024 * 1024
 _REASON_BYTES = 2000  # of what a failing script wrote
-_RETRY_S = 60.0  # after a failure: it may have been a busy machine's
 _NICE = "10"  # lower than the robot's own processes
-
-log = logging.getLogger(__name__)
-
-
-class Need(Struct, frozen=True, forbid_unknown_fields=True):
-    """Another script that this one needs."""
-
-    file: str
-    config: dict[str, Any] = {}
 
 
 class Description(Struct, frozen=True):
@@ -44,7 +33,7 @@ class Description(Struct, frozen=True):
     summary: str = ""
     main: list[str] = []
     configs: list[Setting] = []
-    dependencies: list[Need] = []
+    dependencies: list[Dependency] = []
     command: list[str] = []
 
     def __post_init__(self) -> None:
@@ -162,42 +151,6 @@ def _parse(raw: bytes, source: str) -> Description:
         return msgspec.json.decode(text, type=Description)
     except (msgspec.DecodeError, ValueError, RecursionError, NotTextError) as error:
         raise DescribeError(f"{source}: {error}") from None
-
-
-class Descriptions:
-    """Remembers answers until the script's files change, and failures for a minute. For one thread."""
-
-    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
-        self._clock = clock
-        self._answers: dict[str, tuple[object, float, Description | DescribeError]] = {}
-
-    def get(self, name: str, files: Sequence[Path], make: Callable[[], Description]) -> Description | None:
-        """``make()``, or what it returned for the same ``files``; None if it fails, which is logged."""
-        stamps = [stamp(file) for file in files]
-        before = self._answers.get(name)
-        if (
-            before is not None
-            and before[0] == stamps
-            and (isinstance(before[2], Description) or self._clock() < before[1])
-        ):
-            return before[2] if isinstance(before[2], Description) else None
-        result: Description | DescribeError
-        try:
-            result = make()
-        except DescribeError as failure:
-            result = failure
-            if before is None or str(before[2]) != str(failure):
-                log.warning("%s is offered without settings: %s", name, failure)
-        self._answers[name] = (stamps, self._clock() + _RETRY_S, result)
-        return result if isinstance(result, Description) else None
-
-    def broken(self, name: str) -> str:
-        """Why this script cannot be started; empty: it can, as far as is known."""
-        answer = self._answers.get(name)
-        return str(answer[2]) if answer is not None and isinstance(answer[2], BrokenScriptError) else ""
-
-    def retain_only(self, names: set[str]) -> None:
-        self._answers = {name: answer for name, answer in self._answers.items() if name in names}
 
 
 def stamp(file: Path) -> tuple[int, int] | None:

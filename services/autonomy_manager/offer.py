@@ -3,7 +3,6 @@
 import logging
 import threading
 from collections.abc import Callable, Mapping
-from typing import Protocol
 
 from pebble.config import Config
 from pebble.services.autonomy_manager.catalogue import Catalogue, files
@@ -12,19 +11,13 @@ from pebble.services.autonomy_manager.script import Script
 log = logging.getLogger(__name__)
 
 
-class Post(Protocol):
-    """How the thread that lists hands over to the service's thread."""
-
-    def __call__(self, job: Callable[[], None], /, *, newest_of: str) -> None: ...
-
-
 class Offer:
     """All but the listing itself runs on the service's thread; ``on_change`` gets the new `autonomy-files`."""
 
     def __init__(
         self,
         config: Config,
-        post: Post,
+        post: Callable[..., None],
         on_change: Callable[[list[dict[str, object]]], None],
         fixed: Mapping[str, Script] | None,
     ) -> None:

@@ -28,9 +28,6 @@ class Output:
 
     def feed(self, data: bytes, now: float) -> None:
         self.tick(now)
-        if self._left == 0:
-            self._skip(data)
-            return
         for line in self._lines.feed(data):
             self._line(line)
 
@@ -56,14 +53,6 @@ class Output:
             return
         self._left -= 1
         self._write(line)
-
-    def _skip(self, data: bytes) -> None:
-        """Only count: to split megabytes into lines that are dropped would cost more than the script."""
-        complete, separator, rest = data.rpartition(b"\n")
-        if separator:
-            self._dropped += complete.count(b"\n") + 1
-            self._lines.reset()
-        self._lines.feed(rest)
 
     def _report(self) -> None:
         if self._dropped:

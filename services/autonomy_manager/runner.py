@@ -5,49 +5,22 @@ from __future__ import annotations
 import logging
 import signal
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
-from pathlib import Path
-from typing import Protocol
+from typing import TYPE_CHECKING
 
 from pebble.contract.forms import Value
 from pebble.errors import PebbleError
 from pebble.runtime.runs import CONFIG, RUN
-from pebble.services.autonomy_manager.child import Child, Launch, Spawn
+from pebble.services.autonomy_manager.child import Launch, Process, Spawn
 from pebble.services.autonomy_manager.environment import environment
 from pebble.services.autonomy_manager.motor_owners import Baseline
 from pebble.services.autonomy_manager.script import Plan, Step
 
+if TYPE_CHECKING:
+    from pebble.services.autonomy_manager.service import AutonomyManager
+
 log = logging.getLogger(__name__)
-
-
-class Surroundings(Protocol):
-    """What a runner needs of its service."""
-
-    @property
-    def config_path(self) -> Path:
-        """Return the path of the robot's config."""
-
-    def begin_run(self, plan: Plan) -> tuple[int, Baseline]:
-        """Return the number of a new run. Raises PebbleError if none may start now."""
-
-    def halt(self, run: int) -> None:
-        """Stop the wheels now."""
-
-    def halt_repeatedly(self, run: int) -> None:
-        """Stop the wheels now and again: a command of a dead process may still be in a queue."""
-
-    def end_run(self, run: int) -> None:
-        """All processes of this run have ended."""
-
-    def later(self, seconds: float, job: Callable[[], None]) -> None:
-        """Call ``job`` on the service's thread."""
-
-    def on_thread(self, job: Callable[[], None]) -> None:
-        """Call ``job`` on the service's thread, from any thread."""
-
-    def changed(self) -> None:
-        """What is published has changed."""
 
 
 @dataclass
@@ -55,7 +28,7 @@ class Part:
     """A process of a run."""
 
     file: str
-    child: Child
+    child: Process
     ended: bool = False
 
 
@@ -78,9 +51,9 @@ class Run:
 class Runner:
     """All methods belong to the service's thread."""
 
-    def __init__(self, surroundings: Surroundings, spawn: Spawn, stop_timeout_s: float) -> None:
+    def __init__(self, service: AutonomyManager, spawn: Spawn, stop_timeout_s: float) -> None:
         self.error: str | None = None
-        self._surroundings, self._spawn, self._stop_timeout_s = surroundings, spawn, stop_timeout_s
+        self._service, self._spawn, self._stop_timeout_s = service, spawn, stop_timeout_s
         self._run: Run | None = None
         self._next: Plan | None = None
 
@@ -111,7 +84,7 @@ class Runner:
     def refuse(self, error: str) -> None:
         """A start is not possible; what runs goes on."""
         self.error = error
-        self._surroundings.changed()
+        self._service.changed()
 
     def start(self, plan: Plan) -> None:
         """Start ``plan`` once what runs has ended; only the newest one counts."""
@@ -133,17 +106,17 @@ class Runner:
         run = self._run
         if run is None:
             return
-        self._surroundings.halt(run.number)
+        self._service.halt(run.number)
         for number in (signal.SIGTERM, signal.SIGKILL):
             end = time.monotonic() + wait_s
             for part in run.parts:
                 part.child.signal(number)
             for part in run.parts:
                 part.child.wait(end - time.monotonic())
-        self._surroundings.halt(run.number)
+        self._service.halt(run.number)
         self._run = None
-        self._surroundings.end_run(run.number)
-        self._surroundings.changed()
+        self._service.end_run(run.number)
+        self._service.changed()
 
     # -- starting
 
@@ -151,14 +124,14 @@ class Runner:
         if self._run is None and self._next is not None:
             wanted, self._next = self._next, None
             self._begin(wanted)
-        self._surroundings.changed()
+        self._service.changed()
 
     def _begin(self, plan: Plan) -> None:
         file = plan.main.script.file
         try:
-            number, baseline = self._surroundings.begin_run(plan)
+            number, baseline = self._service.begin_run(plan)
             self._run = run = Run(number, plan, baseline)
-            self._surroundings.halt(number)  # the motor owner knows the run: who stops now, stops it before it drives
+            self._service.halt(number)  # the motor owner knows the run: who stops now, stops it before it drives
             for step in plan.dependencies:
                 run.dependencies.append(self._started(run, step))
             run.main = self._started(run, plan.main)
@@ -171,7 +144,7 @@ class Runner:
 
     def _started(self, run: Run, step: Step) -> Part:
         script = step.script
-        path = str(self._surroundings.config_path)
+        path = str(self._service.config_path)
         own = {CONFIG: path, **({RUN: str(run.number)} if script.ours else {})}
         launch = Launch(
             file=script.file,
@@ -183,7 +156,7 @@ class Runner:
         part: Part
 
         def on_end(code: int) -> None:
-            self._surroundings.on_thread(lambda: self._on_end(run, part, code))
+            self._service.post_first(lambda: self._on_end(run, part, code))
 
         part = Part(script.file, self._spawn(launch, on_end))
         return part
@@ -196,7 +169,7 @@ class Runner:
         if run is None or run.ending:
             return
         run.ending = True
-        self._surroundings.halt(run.number)
+        self._service.halt(run.number)
         if run.main is not None and not run.main.ended:
             self._terminate(run.main)
         else:
@@ -217,7 +190,7 @@ class Runner:
                 part.child.signal(signal.SIGKILL)
 
         part.child.signal(signal.SIGTERM)
-        self._surroundings.later(self._stop_timeout_s, kill)
+        self._service.later(self._stop_timeout_s, kill)
 
     def _on_end(self, run: Run, part: Part, code: int) -> None:
         part.ended = True
@@ -226,7 +199,7 @@ class Runner:
         how = f"exited with code {code}" if code >= 0 else f"was ended by signal {-code}"
         log.info("%s %s", part.file, how)
         if part is run.main:
-            self._surroundings.halt_repeatedly(run.number)
+            self._service.halt_repeatedly(run.number)
             if not run.ending:
                 run.ending = True
                 self.error = f"{part.file} {how}" if code else None
@@ -241,4 +214,4 @@ class Runner:
     def _forget_if_ended(self, run: Run) -> None:
         if all(part.ended for part in run.parts):
             self._run = None
-            self._surroundings.end_run(run.number)
+            self._service.end_run(run.number)

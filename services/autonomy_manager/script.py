@@ -19,7 +19,7 @@ class UnknownScriptError(StartError):
     """It names a script that is not listed, or not yet."""
 
 
-class Dependency(Struct, frozen=True):
+class Dependency(Struct, frozen=True, forbid_unknown_fields=True):
     """Another script that runs while a script runs, and its settings."""
 
     file: str

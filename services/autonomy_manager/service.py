@@ -193,6 +193,7 @@ class AutonomyManager(Service):
         return self.config.path or self.config.folder
 
     def begin_run(self, plan: Plan) -> tuple[int, Baseline]:
+        """Return the number of a new run. Raises PebbleError if none may start now."""
         if refusal := self._owners.refusal:
             raise StartError(refusal)
         self._local.hold()
@@ -207,26 +208,26 @@ class AutonomyManager(Service):
         return run, self._owners.baseline()
 
     def end_run(self, run: int) -> None:
+        """All processes of this run have ended."""
         self._owners.note_run(following(run))  # a person may bar it, too, before the next run
         self.halt(following(run))  # bars this run: a process of it may have escaped
         self._local.release()
 
     def halt(self, run: int) -> None:
+        """Stop the wheels now."""
         self.publish(DRIVE, Drive(source=SCRIPT, run=run))
         if self._moves and not self._owners.held:  # who has control moves the wheels, and no script that does not sign
             self._moves = False
             self.publish(DRIVE, Drive(source=self.name))
 
     def halt_repeatedly(self, run: int) -> None:
+        """Stop the wheels now and again: a command of a dead process may still be in a queue."""
         self.halt(run)
         for seconds in _HALTS_S:
             self.later(seconds, lambda: self.halt(run))
 
     def later(self, seconds: float, job: Callable[[], None]) -> None:
         self.call_at(self.clock() + seconds, job)
-
-    def on_thread(self, job: Callable[[], None]) -> None:
-        self.post_first(job)
 
     def changed(self) -> None:
         """Publish the status if it differs from the last one; only once between two scripts."""

@@ -4,7 +4,6 @@ import logging
 import threading
 import time
 from collections.abc import Callable
-from typing import Protocol
 
 import numpy as np
 from msgspec.structs import replace
@@ -12,33 +11,11 @@ from msgspec.structs import replace
 from pebble.errors import NotRunningError, PebbleError
 from pebble.services.av_daemon.health import Health
 from pebble.services.av_daemon.source import Bytes, Capture, Source
-from pebble.transports.counters import Counters
-from pebble.transports.frames import FrameInfo
+from pebble.transports.frames import FrameInfo, FrameWriter
 
 log = logging.getLogger(__name__)
 
 _POLL_S = 0.1  # how soon the first reader is noticed
-
-
-class Slot(Protocol):
-    @property
-    def array(self) -> Bytes: ...
-    def send(self, info: FrameInfo) -> bool: ...
-    def drop(self) -> None: ...
-
-
-class Writer(Protocol):
-    """The part of a FrameWriter that a capturer uses."""
-
-    counters: Counters
-    problem: str
-
-    @property
-    def wanted(self) -> bool: ...
-    @property
-    def readers(self) -> int: ...
-    def write(self, data: Bytes, info: FrameInfo) -> bool: ...
-    def slot(self, size: int) -> Slot | None: ...
 
 
 class Capturer:
@@ -50,7 +27,7 @@ class Capturer:
     def __init__(
         self,
         name: str,
-        writer: Writer,
+        writer: FrameWriter,
         open_source: Callable[[], Source],
         health: Health,
         *,

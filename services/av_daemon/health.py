@@ -1,7 +1,5 @@
 """The health of one device: written by its thread, reported by the service. Times are passed in."""
 
-import threading
-
 from msgspec.structs import replace
 
 from pebble.contract.payloads import MediaReport
@@ -15,11 +13,10 @@ _GOOD_RUN_S = 10.0  # after which a failure is the first again
 
 
 class Health:
-    """Safe from any thread. The delay before a failed device is opened again doubles with each failure."""
+    """Written by one thread at a time, read by any. The delay before a failed device is opened again doubles."""
 
     def __init__(self, first_delay_s: float = FIRST_DELAY_S) -> None:
         self._first_delay_s = first_delay_s
-        self._lock = threading.Lock()
         self._doing = "starts"
         self._deadline: float | None = None  # for the next frame; None: none is expected
         self._opened_at = 0.0
@@ -33,55 +30,50 @@ class Health:
     # -- the device's thread
 
     def idle(self) -> None:
-        with self._lock:
-            self._no_frames("rests: nobody reads")
+        self._no_frames("rests: nobody reads")
 
     def opening(self, now: float) -> None:
-        with self._lock:
-            self._no_frames("opens the device")
-            self._restarts += self._failures > 0
-            self._opened_at = now
-            self._deadline = now + _OPENING_S
+        self._no_frames("opens the device")
+        self._restarts += self._failures > 0
+        self._opened_at = now
+        self._deadline = now + _OPENING_S
 
     def frame(self, info: FrameInfo, now: float, *, skipped: int = 0) -> None:
-        with self._lock:
-            self._dropped += skipped
-            self._info, self._doing = info, "runs"
-            self._meter.add(now)
-            self._deadline = now + _SILENCE_S
-            if now - self._opened_at >= _GOOD_RUN_S:
-                self._failures = 0
+        self._dropped += skipped
+        self._info, self._doing = info, "runs"
+        self._meter.add(now)
+        self._deadline = now + _SILENCE_S
+        if now - self._opened_at >= _GOOD_RUN_S:
+            self._failures = 0
 
     def failed(self, why: str, *, expected: bool = False) -> float:
         """Returns how long to wait before the device is opened again; not longer each time for one that is expected."""
-        with self._lock:
-            doublings = 0 if expected else self._failures
-            delay: float = min(self._first_delay_s * 2**doublings, max(_LONGEST_DELAY_S, self._first_delay_s))
-            self._failures = min(doublings + 1, 32)
-            self._last_error = why
-            self._no_frames(f"failed, opens it again in {delay:g} s")
-            return delay
+        doublings = 0 if expected else self._failures
+        delay: float = min(self._first_delay_s * 2**doublings, max(_LONGEST_DELAY_S, self._first_delay_s))
+        self._failures = min(doublings + 1, 32)
+        self._last_error = why
+        self._no_frames(f"failed, opens it again in {delay:g} s")
+        return delay
 
     # -- the service's thread
 
     def overdue(self, now: float) -> bool:
         """Should the device have opened, or given a frame, by now?"""
-        with self._lock:
-            return self._deadline is not None and now > self._deadline
+        deadline = self._deadline
+        return deadline is not None and now > deadline
 
     def report(self, now: float) -> MediaReport:
-        with self._lock:
-            report = MediaReport(
-                running=self._info is not None,
-                doing=self._doing,
-                restarts=self._restarts,
-                dropped=self._dropped,
-                last_error=self._last_error,
-            )
-            info = self._info
-            if info is None:
-                return report
-            rate = round(self._meter.rate(now), 1)
+        info = self._info
+        report = MediaReport(
+            running=info is not None,
+            doing=self._doing,
+            restarts=self._restarts,
+            dropped=self._dropped,
+            last_error=self._last_error,
+        )
+        if info is None:
+            return report
+        rate = round(self._meter.rate(now), 1)
         return replace(report, encoding=info.format, rate=rate, width=info.width or None, height=info.height or None)
 
     def _no_frames(self, doing: str) -> None:

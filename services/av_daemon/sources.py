@@ -13,7 +13,7 @@ from pebble.errors import DeviceError, PayloadError
 from pebble.services.av_daemon.alsa import CHUNK_S, AlsaMicrophone
 from pebble.services.av_daemon.libcamera import LibcameraCamera
 from pebble.services.av_daemon.source import Bytes, Capture, Source, opencv
-from pebble.services.av_daemon.synthetic import SyntheticCamera, SyntheticMicrophone
+from pebble.services.av_daemon.synthetic import SyntheticCamera, SyntheticMicrophone, WorldCamera
 from pebble.services.av_daemon.v4l2 import V4l2Camera
 from pebble.transports.frames.frame import picture
 
@@ -54,8 +54,6 @@ def chunk_bytes(options: AvDaemon) -> int:
 
 def _camera(options: AvDaemon, start: float) -> Source:
     if options.video.backend == "synthetic" and "#" in options.video.device:
-        from pebble.services.av_daemon.world_camera import WorldCamera  # only who needs it pays for it
-
         return WorldCamera(options.video, start)
     if options.video.backend == "synthetic":
         return SyntheticCamera(options.video, start)

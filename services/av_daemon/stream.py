@@ -7,9 +7,10 @@ from collections.abc import Callable
 from msgspec.structs import replace
 
 from pebble.contract.payloads import MediaReport
-from pebble.services.av_daemon.capturer import Capturer, Writer
+from pebble.services.av_daemon.capturer import Capturer
 from pebble.services.av_daemon.health import FIRST_DELAY_S, Health
 from pebble.services.av_daemon.source import Source
+from pebble.transports.frames import FrameWriter
 
 log = logging.getLogger(__name__)
 
@@ -23,7 +24,7 @@ class Stream:
     def __init__(
         self,
         name: str,
-        writer: Writer,
+        writer: FrameWriter,
         open_source: Callable[[], Source],
         *,
         first_delay_s: float = FIRST_DELAY_S,

@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import threading
 import time
+from abc import ABC, abstractmethod
 from collections.abc import Callable
+from importlib import import_module
+from typing import TYPE_CHECKING
 
 from pebble.config.media import CameraCapture, Microphone
 from pebble.errors import DeviceError
@@ -13,6 +16,9 @@ from pebble.media.speech import Speech
 from pebble.services.av_daemon.alsa import CHUNK_S
 from pebble.services.av_daemon.source import Bytes, Capture
 from pebble.transports.frames import FrameInfo
+
+if TYPE_CHECKING:
+    from pebble.simulation.world.robot_view import RobotView
 
 _BEHIND = 10  # chunks of sound that are made up for after a delay
 
@@ -30,20 +36,14 @@ class Pacer:
         self._interrupted = threading.Event()
 
     def next(self) -> int:
-        """Wait for the next turn; returns its number, counted from ``start``."""
+        """Wait for the next turn; returns its number, counted from ``start``. Raises DeviceError if interrupted."""
         self._turn += 1
         late = self._now() - self._turn
         self.skipped = late if late > self._behind else 0
         self._turn += self.skipped
-        self._interrupted.wait(max(0.0, self.due(self._turn) - self._clock()))
-        return self._turn
-
-    def turn(self) -> int:
-        """The same; raises DeviceError if the wait was interrupted."""
-        turn = self.next()
-        if self.interrupted:
+        if self._interrupted.wait(max(0.0, self.due(self._turn) - self._clock())):
             raise DeviceError("interrupted")
-        return turn
+        return self._turn
 
     def due(self, turn: int) -> float:
         return self._start + turn / self._rate
@@ -51,32 +51,15 @@ class Pacer:
     def interrupt(self) -> None:
         self._interrupted.set()
 
-    @property
-    def interrupted(self) -> bool:
-        return self._interrupted.is_set()
-
     def _now(self) -> int:
         """The latest turn that is due."""
         return int((self._clock() - self._start) * self._rate)
 
 
-class SyntheticCamera:
-    """The scene, frame ``n`` at ``start + n / fps``: its counter goes on without readers."""
+class ComputedDevice:
+    """A camera or microphone of which nothing is ever open."""
 
-    def __init__(self, video: CameraCapture, start: float) -> None:
-        self._scene = Scene(video.width, video.height)
-        self._shape = (video.height, video.width, 3)
-        self._size = video.height * video.width * 3
-        self._info = FrameInfo(format="bgr24", width=video.width, height=video.height, stride=3 * video.width)
-        self._pacer = Pacer(video.fps, start=start)
-
-    def grab(self) -> Capture:
-        number = self._pacer.turn()
-
-        def draw(target: Bytes) -> None:
-            self._scene.render(number, target.reshape(self._shape))
-
-        return Capture(self._info, self._size, draw=draw, skipped=self._pacer.skipped)
+    _pacer: Pacer
 
     def close(self) -> None:
         """Nothing is open."""
@@ -85,7 +68,68 @@ class SyntheticCamera:
         self._pacer.interrupt()
 
 
-class SyntheticMicrophone:
+class ComputedCamera(ComputedDevice, ABC):
+    """Draws a picture at each turn; turns are counted without readers, too."""
+
+    def __init__(self, video: CameraCapture, start: float) -> None:
+        self._shape = (video.height, video.width, 3)
+        self._info = FrameInfo(format="bgr24", width=video.width, height=video.height, stride=3 * video.width)
+        self._pacer = Pacer(video.fps, start=start)
+
+    @abstractmethod
+    def look(self, turn: int) -> int:
+        """Choose the picture to draw; returns its moment in ns, 0: now."""
+
+    @abstractmethod
+    def draw(self, picture: Bytes) -> None:
+        """Draw it into an array of shape (height, width, 3)."""
+
+    def grab(self) -> Capture:
+        at_ns = self.look(self._pacer.next())
+        return Capture(
+            self._info,
+            self._info.stride * self._info.height,
+            draw=lambda target: self.draw(target.reshape(self._shape)),
+            at_ns=at_ns,
+            skipped=self._pacer.skipped,
+        )
+
+
+class SyntheticCamera(ComputedCamera):
+    """The scene, frame ``n`` at ``start + n / fps``."""
+
+    def __init__(self, video: CameraCapture, start: float) -> None:
+        super().__init__(video, start)
+        self._scene = Scene(video.width, video.height)
+        self._turn = 0
+
+    def look(self, turn: int) -> int:
+        self._turn = turn
+        return 0
+
+    def draw(self, picture: Bytes) -> None:
+        self._scene.render(self._turn, picture)
+
+
+class WorldCamera(ComputedCamera):
+    """What is seen from the robot that ``device`` (``world.json#goob``) names, in a world whose program shares poses.
+
+    The moment of a picture is when the robots were where it shows them. Raises NotRunningError while there is no world.
+    """
+
+    def __init__(self, video: CameraCapture, start: float) -> None:
+        super().__init__(video, start)
+        view = import_module("pebble.simulation.world.robot_view")  # only who needs it pays for it
+        self._view: RobotView = view.RobotView(video.device, video.width, video.height)
+
+    def look(self, _turn: int) -> int:
+        return self._view.look()
+
+    def draw(self, picture: Bytes) -> None:
+        self._view.draw(picture)
+
+
+class SyntheticMicrophone(ComputedDevice):
     """Speech in chunks of 20 ms; sample ``n`` was recorded at ``start + n / rate``."""
 
     def __init__(self, audio: Microphone, start: float) -> None:
@@ -95,13 +139,7 @@ class SyntheticMicrophone:
         self._pacer = Pacer(audio.rate / self._count, behind=_BEHIND, start=start)
 
     def grab(self) -> Capture:
-        turn = self._pacer.turn()  # a chunk is complete when the next one begins
+        turn = self._pacer.next()  # a chunk is complete when the next one begins
         samples = self._speech.samples((turn - 1) * self._count, self._count)
         at_ns = int(self._pacer.due(turn) * 1e9)
         return Capture(self._info, samples.nbytes, samples, at_ns=at_ns, skipped=self._pacer.skipped)
-
-    def close(self) -> None:
-        """Nothing is open."""
-
-    def interrupt(self) -> None:
-        self._pacer.interrupt()

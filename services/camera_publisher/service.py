@@ -103,7 +103,6 @@ class CameraPublisher(Service):
             fps=self._fps,
             keyframe_interval=options.keyframe_interval if applies else None,
             quality=options.jpeg_quality,
-            bitrate=options.bitrate,
         )
 
     # -- the connection
@@ -160,10 +159,8 @@ class CameraPublisher(Service):
             self._sent(picture, payload, now)
 
     def _encode(self, picture: Pixels, captured_ms: int) -> bytes:
-        step, quality, bitrate = self._rate.step, self._options.jpeg_quality, self._options.bitrate
-        self._encoder.quality = max(min(quality, _WORST_QUALITY), round(quality * step.quality))
-        if bitrate is not None:
-            self._encoder.bitrate = round(bitrate * step.bytes)
+        quality = self._options.jpeg_quality
+        self._encoder.quality = max(min(quality, _WORST_QUALITY), round(quality * self._rate.step.quality))
         return self._encoder.encode(picture, captured_ms, keyframe=self._keyframes.due(self.clock()))
 
     def _throw_away(self, why: str) -> None:

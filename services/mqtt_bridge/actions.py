@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final
 
 from pebble.config import MqttBridge, SystemControl
 from pebble.contract import GIT_PULL, REBOOT, SERVICE_RESTART, Channel
@@ -19,9 +19,7 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-#: Of one run's output that are saved; the rest is read and dropped.
-OUTPUT_BYTES: Final = 256 * 1024
-_CHUNK = 65536
+_NEW_FILE: Final = os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC | os.O_NOFOLLOW
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,56 +80,39 @@ class Action:
         import subprocess  # 0.4 MB of every robot's memory, for a command that few robots run
 
         self._log.log("running", logging.WARNING, "%s: running its command", self.name)
+        output, where = subprocess.DEVNULL, f"is in {self._output}"
+        try:
+            self._output.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+            output = os.open(self._output, _NEW_FILE, 0o600)
+        except OSError as error:
+            where = f"is lost: {error.strerror}: {self._output}"
         try:
             self._process = subprocess.Popen(
                 self.control.command,
                 cwd=self.control.cwd,
                 env=child_environment(self.control.env),
                 stdin=subprocess.DEVNULL,
-                stdout=subprocess.PIPE,
+                stdout=output,
                 stderr=subprocess.STDOUT,
                 start_new_session=True,  # a command that restarts this process must survive its end
             )
         except OSError as error:
             self._log.log("failed", logging.ERROR, "%s failed: its command or cwd: %s", self.name, error.strerror)
             return False
-        threading.Thread(target=self._follow, args=(self._process,), name=f"action {self.name}", daemon=True).start()
+        finally:
+            if output != subprocess.DEVNULL:
+                os.close(output)
+        name = f"action {self.name}"
+        threading.Thread(target=self._follow, args=(self._process, where), name=name, daemon=True).start()
         return True
 
-    def _follow(self, process: "subprocess.Popen[bytes]") -> None:
-        """Save the command's output, and log its exit code."""
-        assert process.stdout is not None  # noqa: S101  (PIPE above)
-        where = f"is in {self._output}"
-        with process.stdout as output:
-            try:
-                _save(output, self._output)
-            except OSError as error:
-                where = f"is lost: {error.strerror}: {self._output}"
-            while output.read(_CHUNK):  # the command must not wait for a full pipe
-                pass
+    def _follow(self, process: "subprocess.Popen[bytes]", where: str) -> None:
+        """Log the command's exit code."""
         code = process.wait()
         level = logging.INFO if code == 0 else logging.ERROR
         self._log.log("ended", level, "%s ended with exit code %d, its output %s", self.name, code, where)
 
 
-class SystemActions:
-    """The whole table, for one robot's config."""
-
-    def __init__(self, section: MqttBridge, *, folder: Path, clock: Callable[[], float] = time.monotonic) -> None:
-        self._actions = {
-            row.channel: Action(row, getattr(section, row.section), folder=folder, clock=clock) for row in ACTIONS
-        }
-
-    def request(self, channel: Channel) -> bool:
-        """Run the command of ``channel``; False if it is refused."""
-        return self._actions[channel].request()
-
-
-def _save(output: IO[bytes], path: Path) -> None:
-    """Replace the file by the beginning of ``output``, as it is written. Raises OSError."""
-    path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
-    flags = os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC | os.O_NOFOLLOW
-    with os.fdopen(os.open(path, flags, 0o600), "wb", buffering=0) as file:
-        left = OUTPUT_BYTES
-        while left and (chunk := os.read(output.fileno(), min(left, _CHUNK))):
-            left -= file.write(chunk)
+def system_actions(section: MqttBridge, folder: Path, clock: Callable[[], float]) -> dict[Channel, Action]:
+    """Return the whole table, for one robot's config."""
+    return {row.channel: Action(row, getattr(section, row.section), folder=folder, clock=clock) for row in ACTIONS}

@@ -34,58 +34,48 @@ _NO: Final = ProgramRequest(on=False)
 
 
 class Media:
-    """The newest flag and request of each medium of a robot that has ``programs``.
+    """The newest flag and request of each medium of a robot that has ``programs``; the launcher is sent each change.
 
     ``running`` are the programs that an earlier bridge process had requested. They count as requested, because a
     request is never retained and the operator does not know that the bridge was restarted. Until the flag of a medium
     is known, its programs are left as they are, except that a request may stop them.
+    ``send_one`` returns False if the launcher is busy; this never waits for it.
     """
 
-    def __init__(self, programs: Collection[str], running: Mapping[str, ProgramRequest] | None = None) -> None:
-        self._programs = programs
+    def __init__(
+        self,
+        programs: Collection[str],
+        running: Mapping[str, ProgramRequest] | None = None,
+        send_one: Callable[[str, ProgramRequest], bool] = lambda _program, _request: True,
+    ) -> None:
+        self._programs, self._send_one = programs, send_one
         self._allowed: dict[Row, bool] = {}
         self._requested = {row: _first(row, running or {}) for row in MEDIA}
+        self._sent: dict[str, ProgramRequest] = {}  # by program
 
     def allow(self, flag: Channel, allowed: bool) -> None:
         self._allowed[_ROWS[flag.suffix]] = allowed
+        self.send()
 
     def request(self, channel: Channel, request: MediaRequest) -> None:
         """The newest request counts as a whole: a missing or unknown encoding means the configured one."""
         row = _ROWS[channel.suffix]
         encoding = request.encoding if request.encoding in row.encodings else None
         self._requested[row] = ProgramRequest(request.enabled, encoding or "")
+        self.send()
 
     def requests(self) -> dict[str, ProgramRequest]:
         """By program; without those whose flag has to be known first."""
-        found: dict[str, ProgramRequest] = {}
+        requests: dict[str, ProgramRequest] = {}
         for row, request in self._requested.items():
             if not request.on or row in self._allowed:
                 allowed = request.on and self._allowed[row]
-                found |= dict.fromkeys(row.programs, request if allowed else _NO)
-        return {name: request for name, request in found.items() if name in self._programs}
-
-
-class MediaRequests:
-    """Sends the launcher each change of what :class:`Media` requests; ``send_one`` returns False if it is busy.
-
-    The launcher starts and stops the programs; this never waits for it.
-    """
-
-    def __init__(self, media: Media, send_one: Callable[[str, ProgramRequest], bool]) -> None:
-        self._media, self._send_one = media, send_one
-        self._sent: dict[str, ProgramRequest] = {}  # by program
-
-    def allow(self, flag: Channel, allowed: bool) -> None:
-        self._media.allow(flag, allowed)
-        self.send()
-
-    def request(self, channel: Channel, request: MediaRequest) -> None:
-        self._media.request(channel, request)
-        self.send()
+                requests |= dict.fromkeys(row.programs, request if allowed else _NO)
+        return {name: request for name, request in requests.items() if name in self._programs}
 
     def send(self) -> None:
         """Send what has changed, and again what the launcher did not accept."""
-        for program, request in self._media.requests().items():
+        for program, request in self.requests().items():
             if self._sent.get(program) != request and self._send_one(program, request):
                 self._sent[program] = request
 

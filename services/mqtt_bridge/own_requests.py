@@ -12,8 +12,8 @@ from pebble.errors import PayloadError
 from pebble.forwarding.forwarder import Mirroring
 from pebble.runtime.parent import Notifier, earlier_requests
 from pebble.runtime.service import Service
-from pebble.services.mqtt_bridge.actions import ACTIONS, SystemActions
-from pebble.services.mqtt_bridge.media import MEDIA, Hold, Media, MediaRequests
+from pebble.services.mqtt_bridge.actions import ACTIONS, system_actions
+from pebble.services.mqtt_bridge.media import MEDIA, Hold, Media
 from pebble.services.mqtt_bridge.uplink import Uplink
 
 
@@ -30,8 +30,8 @@ class OwnRequests:
         config, section = service.config, service.config.services.mqtt_bridge
         self._service, self._post, self._clock = service, service.post_message, service.clock
         self._mirroring, self._uplink = mirroring, uplink
-        self.actions = SystemActions(section, folder=config.state_dir(), clock=service.clock)
-        self._media = MediaRequests(Media(config.on_demand_programs(), earlier_requests()), notifier.request)
+        self.actions = system_actions(section, config.state_dir(), service.clock)
+        self._media = Media(config.on_demand_programs(), earlier_requests(), notifier.request)
         self._hold = Hold(config.on_demand_programs(), notifier.hold)
         self._messages: dict[str, Callable[[bytes], None]] = {
             **{row.request.suffix: partial(self._on_media_request, row.request) for row in MEDIA},
@@ -96,4 +96,4 @@ class OwnRequests:
             return None
 
     def _run_action(self, channel: Channel) -> None:
-        self._service.counters.add("actions" if self.actions.request(channel) else "actions_refused")
+        self._service.counters.add("actions" if self.actions[channel].request() else "actions_refused")

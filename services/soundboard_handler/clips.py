@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Iterator
 from itertools import accumulate, islice
 from pathlib import Path
@@ -15,6 +16,7 @@ _WAV = ".wav"
 _NEED_PYAV = (".mp3", ".ogg", ".flac")
 _MOST = 100_000  # files that a scan looks at: the folder may be / by mistake
 _LONGEST_LIST = 256 * 1024  # bytes of all names: the list is published again and again, to every operator
+_no_utf8 = re.compile("[\ud800-\udfff]").search
 
 
 class Clip(Struct, frozen=True):
@@ -79,18 +81,10 @@ class Clips:
 
     def _can_be_named(self, name: str) -> bool:
         """Commands are UTF-8, and a backslash in them is a slash."""
-        if _is_utf8(name) and "\\" not in name:
+        if "\\" not in name and not _no_utf8(name):
             return True
         self.problem = self.problem or f"{name!r} cannot be named in commands: rename it"
         return False
-
-
-def _is_utf8(name: str) -> bool:
-    try:
-        name.encode()
-    except UnicodeEncodeError:
-        return False
-    return True
 
 
 def _expanded(name: str) -> Path:

@@ -4,45 +4,22 @@ from __future__ import annotations
 
 import signal
 import subprocess
-from collections.abc import Callable, Sequence
+import threading
+from collections.abc import Callable
+from contextlib import suppress
 from functools import partial
-from pathlib import Path
-
-from msgspec import Struct
+from typing import IO, TYPE_CHECKING
 
 from pebble.config import Config
-from pebble.media.player import filled
+from pebble.errors import PebbleError
 from pebble.runtime.child import Child
 from pebble.runtime.environment import child_environment
 from pebble.services.soundboard_handler.clips import Clip
-from pebble.services.soundboard_handler.feed import Feed
+
+if TYPE_CHECKING:
+    from pebble.media.sound_file import SoundFile
 
 Post = Callable[[Callable[[], None]], None]
-
-
-class Players(Struct, frozen=True):
-    """The programs that play: ``wav`` gets a file, ``raw`` samples on its standard input."""
-
-    wav: Sequence[str]
-    raw: Sequence[str]
-    device: str
-
-    @classmethod
-    def of(cls, config: Config) -> Players:
-        playback, raw = config.services.soundboard_handler.playback, config.services.mqtt_bridge.media.audio_receiver
-        return cls(playback.player_command, raw.command, raw.device)
-
-    def command(self, path: Path) -> list[str]:
-        """``{file}`` stands for the path; without one it is the last word."""
-        words = [word.replace("{file}", str(path)) for word in self.wav]
-        return words if words != list(self.wav) else [*words, str(path)]
-
-    def started(self, words: list[str], stdin: int) -> Child:
-        """Start a player; it ends with the calling thread. Raises OSError, ValueError."""
-        return Child(words, child_environment(), stdin=stdin)
-
-    def raw_command(self, rate: int, channels: int) -> list[str]:
-        return filled(self.raw, rate=rate, channels=channels, device=self.device)
 
 
 class Playback:
@@ -51,31 +28,31 @@ class Playback:
     It is called when the player runs (``process`` is set), and when the playback has ended.
     """
 
-    def __init__(self, clip: Clip, players: Players, post: Post, on_change: Callable[[Playback], None]) -> None:
+    def __init__(self, clip: Clip, config: Config, post: Post, on_change: Callable[[Playback], None]) -> None:
         self.clip = clip
         self.process: Child | None = None
         self.ended = self.stopped = False
-        self.problem = ""
+        self.problem = self._decoding_problem = ""
         self.exit_code = 0
-        self._players, self._post = players, post
+        self._config, self._post = config.services, post
         self._on_change = partial(on_change, self)
-        self._feed: Feed | None = None
 
     def start(self) -> None:
-        if self.clip.encoded:
-            self._feed = Feed(self.clip.path, lambda: self._post(self._opened))
-        else:
-            self._start_player(self._players.command(self.clip.path))
+        """On the service's thread, because a player ends with the thread that has started it."""
+        try:
+            if self.clip.encoded:
+                self._start_decoded()
+            else:
+                self._start_player(self._words, subprocess.DEVNULL)
+        except (PebbleError, OSError, ValueError) as error:
+            self.problem, self.ended = f"Failed to start playback: {error}", True
+        self._post(self._on_change)
 
     def stop(self) -> None:
-        """End soon: at once if there is no player yet. How a stopped player exits is no error."""
+        """End soon. How a stopped player exits is no error."""
         self.stopped = True
         if self.process is not None:
             self.process.signal(signal.SIGTERM)
-        elif not self.ended:
-            self.ended = True
-            if self._feed is not None:
-                self._feed.cancel()
 
     def kill(self) -> None:
         if self.process is not None:
@@ -86,38 +63,41 @@ class Playback:
         if self.process is not None:
             self.process.finish(timeout)
 
-    def _opened(self) -> None:
-        """The clip's format is known, or that it has none."""
-        if self.ended or self._feed is None:
-            return
-        if self._feed.problem:
-            self._fail(self._feed.problem)
-            return
-        self._start_player(self._players.raw_command(self._feed.rate, self._feed.channels))
-        if self.process is None:
-            self._feed.cancel()
-        else:
-            self._feed.write_to(self.process.pipe("stdin"))
+    @property
+    def _words(self) -> list[str]:
+        """Return the player of a wav file: ``{file}`` stands for its path, which is the last word otherwise."""
+        command, path = list(self._config.soundboard_handler.playback.player_command), str(self.clip.path)
+        words = [word.replace("{file}", path) for word in command]
+        return words if words != command else [*words, path]
 
-    def _start_player(self, words: list[str]) -> None:
-        """On this thread, because the player ends with the thread that has started it."""
+    def _start_decoded(self) -> None:
+        """Decode on a thread of its own: no more than the pipe to the player holds."""
+        from pebble.media.sound_file import SoundFile  # only where a clip is decoded: it costs memory
+
+        file = SoundFile(self.clip.path)
         try:
-            self.process = self._players.started(words, subprocess.DEVNULL if self._feed is None else subprocess.PIPE)
-        except (OSError, ValueError) as error:
-            self._fail(str(error))
-            return
-        self.process.watch(lambda code: self._post(partial(self._finished, code)))
-        self._post(self._on_change)
+            words = self._config.mqtt_bridge.media.audio_receiver.words(file.rate, file.channels)
+            player = self._start_player(words, subprocess.PIPE)
+        except (OSError, ValueError):
+            file.close()
+            raise
+        threading.Thread(target=self._feed, args=(file, player.pipe("stdin")), name="pebble-feed", daemon=True).start()
+
+    def _start_player(self, words: list[str], stdin: int) -> Child:
+        self.process = player = Child(words, child_environment(), stdin=stdin)
+        player.watch(lambda code: self._post(partial(self._finished, code)))
+        return player
+
+    def _feed(self, file: SoundFile, pipe: IO[bytes]) -> None:
+        with suppress(OSError), file, pipe:  # OSError: the player has ended before the clip
+            try:
+                for chunk in file.chunks():
+                    pipe.write(chunk)
+            except PebbleError as error:
+                self._decoding_problem = str(error)
 
     def _finished(self, code: int) -> None:
-        self.exit_code = code
-        if not self.stopped and self.exit_code != 0:
-            self.problem = f"player exited with code {self.exit_code}"
-        elif not self.stopped and self._feed is not None:
-            self.problem = self._feed.problem
-        self.ended = True
+        self.exit_code, self.ended = code, True
+        if not self.stopped:
+            self.problem = f"player exited with code {code}" if code else self._decoding_problem
         self._on_change()
-
-    def _fail(self, why: str) -> None:
-        self.problem, self.ended = f"Failed to start playback: {why}", True
-        self._post(self._on_change)

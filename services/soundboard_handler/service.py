@@ -12,7 +12,7 @@ from pebble.contract.identity import meant
 from pebble.contract.payloads import STOP_WORDS, MediaReport, SoundboardCommand, SoundboardFiles, SoundboardStatus
 from pebble.runtime.service import Service, on
 from pebble.services.soundboard_handler.clips import Clip, Clips
-from pebble.services.soundboard_handler.playback import Playback, Players
+from pebble.services.soundboard_handler.playback import Playback
 
 _PLAY = ("play", "start", "on", "enable", "enabled")
 _AT_ONCE_S = 1.0  # a player that fails so soon may not have got the device
@@ -42,7 +42,6 @@ class SoundboardHandler(Service):
         super().__init__(*arguments, **options)
         self._section = self.config.services.soundboard_handler
         self._clips = Clips(self._section.playback.directory or in_home("~/sounds"))
-        self._players = Players.of(self.config)
         self._listed: list[str] | None = None
         self._scan_problem = ""
         self._playback: Playback | None = None
@@ -128,7 +127,7 @@ class SoundboardHandler(Service):
         self._playback = None
         if self._request is not None:
             self._request.starts += 1
-            self._playback = Playback(self._request.clip, self._players, self.post_first, self._changed)
+            self._playback = Playback(self._request.clip, self.config, self.post_first, self._changed)
             self._playback.start()
         else:
             self._publish_status()

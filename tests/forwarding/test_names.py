@@ -12,7 +12,7 @@ from pebble.contract.rights import WRITES, Right
 from pebble.forwarding.names import Names, Signed
 from pebble.forwarding.routing import TABLE_A1, Drop, Side
 from pebble.forwarding.subjects import Subjects
-from pebble.services.mqtt_bridge.actions import SystemActions
+from pebble.services.mqtt_bridge.actions import Action
 from pebble.transports import Message
 from tests.forwarding.network import Client, Network, Node, Way, bridge
 from tests.forwarding.virtual import World
@@ -211,7 +211,7 @@ def test_what_passes_and_what_does_not(world: World) -> None:
 
 def test_actions_and_requests_of_the_bridge_itself_need_a_name(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
     ran: list[str] = []
-    monkeypatch.setattr(SystemActions, "request", lambda _actions, channel: bool(ran.append(channel.metric)) or True)
+    monkeypatch.setattr(Action, "request", lambda action: bool(ran.append(action.name)) or True)
     start(world)
     for suffix in (REBOOT, "by/ann/by/otto/flags/reboot", "by/Ann/flags/reboot"):
         assert received(world, suffix, b"true") == []

@@ -16,7 +16,7 @@ from pebble.forwarding.probes import PROBE_REQUEST
 from pebble.forwarding.routing import Side
 from pebble.forwarding.service import CHECK_AGAIN_S
 from pebble.forwarding.side import Gate
-from pebble.services.mqtt_bridge.actions import SystemActions
+from pebble.services.mqtt_bridge.actions import Action
 from pebble.transports.base import Answer
 from tests.forwarding.virtual import Hub, Running, World
 from tests.services.mqtt_bridge.bridge_rig import BASE, Client
@@ -54,7 +54,7 @@ def bridge(make: Make) -> World:
 def ran(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """The actions that would have run."""
     ran: list[str] = []
-    monkeypatch.setattr(SystemActions, "request", lambda _actions, channel: bool(ran.append(channel.metric)) or True)
+    monkeypatch.setattr(Action, "request", lambda action: bool(ran.append(action.name)) or True)
     return ran
 
 
@@ -214,7 +214,7 @@ class TestOneShots:
         assert ran == ["flags/reboot"]
 
     def test_one_that_fails_in_the_bridge_ends_nothing(self, bridge: World, monkeypatch: pytest.MonkeyPatch) -> None:
-        monkeypatch.setattr(SystemActions, "request", lambda _actions, _channel: 1 / 0)
+        monkeypatch.setattr(Action, "request", lambda _action: 1 / 0)
         do(bridge, "start")
         bridge.remote.publish(GIT_PULL, TRUE)
         bridge.remote.publish(DRIVE, b"1")

@@ -49,7 +49,6 @@ def test_what_is_sent_is_shown(name: str) -> None:
         assert shown.keyframe is (number % 5 == 0)
         assert shown.picture.flags.writeable
         assert cv2.PSNR(shown.picture, picture(number)) > 22
-    assert decoder.counters.pictures == 12
     assert not decoder.wants_keyframe
 
 
@@ -101,30 +100,6 @@ def test_quality_changes_while_running(name: str) -> None:
     assert all(decoder.feed(packet) for packet in fine + coarse)
 
 
-def test_bitrate_changes_while_running_without_a_key_frame() -> None:
-    encoder, decoder = make_encoder("h264", fps=15, keyframe_interval=1000, bitrate=300_000), VideoDecoder()
-    random = np.random.default_rng(1)
-    busy = [np.roll(random.integers(0, 255, (240, 320, 3), np.uint8), n, 1) for n in range(60)]
-    packets = []
-    for number, frame in enumerate(busy):
-        if number == 30:
-            encoder.bitrate = 100_000
-        packets.append(encoder.encode(frame, T0 + number * 66))
-        assert encoder.last_was_keyframe is (number == 0)
-    assert all(decoder.feed(packet) for packet in packets)
-    assert sum(map(len, packets[45:])) < 0.6 * sum(map(len, packets[15:30]))
-
-
-def test_more_bitrate_than_the_encoder_was_opened_for_begins_anew() -> None:
-    encoder = make_encoder("h264", fps=15, keyframe_interval=1000, bitrate=100_000)
-    send(encoder, 3)
-    encoder.bitrate = 200_000
-    send(encoder, 1, first=3)
-    assert encoder.last_was_keyframe
-    send(encoder, 1, first=4)
-    assert not encoder.last_was_keyframe
-
-
 def test_h264_of_an_odd_size_leaves_out_the_last_row_and_column() -> None:
     shown = VideoDecoder().feed(make_encoder("h264", fps=15).encode(picture(0, 161, 121), T0))
     assert shown is not None
@@ -137,7 +112,8 @@ def test_h264_is_annex_b_with_parameter_sets_in_every_key_frame() -> None:
     encoder = make_encoder("h264", fps=15, keyframe_interval=4)
     for number, packet in enumerate(send(encoder, 9)):
         assert packet[:7] == bytes([*b"PBVD", 1, 5, number % 4 == 0])
-        h264.check_unit(h264.unseal(packet[19:]), keyframe=number % 4 == 0)
+        assert h264.unseal(packet[19:]).startswith(b"\0\0\0\1")
+        assert (VideoDecoder().feed(packet) is not None) is (number % 4 == 0)
 
 
 @pytest.mark.thorough

@@ -9,8 +9,8 @@ from typing import Any, NamedTuple
 
 from pebble.contract.payloads import MotorPower, TouchValues
 from pebble.perception.follow import Command, Follower, FollowSettings
-from pebble.perception.odom_follow import OdomFollower, OdomFollowSettings, Pose
-from pebble.perception.odometry import Odometry, WheelGeometry
+from pebble.perception.odom_follow import OdomFollower, Pose
+from pebble.perception.odometry import Odometry, OdometrySettings
 from pebble.perception.rate import Rate
 from pebble.perception.tags import TagFinder
 from pebble.services.serial_mcu_bridge.text.goob_base import mix
@@ -50,10 +50,10 @@ class FollowRig:
         self._finder = TagFinder()
         self._hidden = hidden
         self._rate = Rate(10.0)
-        self._odometry = Odometry(WheelGeometry(), 0.0)
+        self._odometry = Odometry(OdometrySettings(), 0.0)
         self._received = b""
         self._vision = None if by_odometry else Follower(FollowSettings())
-        self._both = OdomFollower(OdomFollowSettings()) if by_odometry else None
+        self._both = OdomFollower(FollowSettings()) if by_odometry else None
         self.reasons: list[str] = []
 
     def run(self, seconds: float) -> Result:

@@ -9,7 +9,7 @@ import pytest
 
 from pebble.contract.payloads import WheelOdometry
 from pebble.perception.follow import Command, Follower, FollowSettings
-from pebble.perception.odom_follow import OdomFollower, OdomFollowSettings, Pose, pose_of
+from pebble.perception.odom_follow import OdomFollower, Pose, pose_of
 from pebble.perception.rate import Rate
 from pebble.perception.tags import Place
 from tests.perception.follow_rig import CAMERAS, WITHIN_M, FollowRig
@@ -98,9 +98,9 @@ def test_a_rate_repeats_nothing_and_may_be_raised() -> None:
 # -- by odometry
 
 
-def blind(*, settings: OdomFollowSettings | None = None, place: Place = FAR) -> OdomFollower:
+def blind(*, settings: FollowSettings | None = None, place: Place = FAR) -> OdomFollower:
     """A tag was seen at 0 s from the origin."""
-    robot = OdomFollower(settings or OdomFollowSettings())
+    robot = OdomFollower(settings or FollowSettings())
     robot.see(0.0, place, Pose(0.0, 0.0, 0.0))
     robot.step(0.0, Pose(0.0, 0.0, 0.0))
     return robot

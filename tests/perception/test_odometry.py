@@ -8,13 +8,12 @@ import random
 import pytest
 
 from pebble.contract.payloads import MotorPower
-from pebble.perception.motor_power import Directions
-from pebble.perception.odometry import WheelGeometry
+from pebble.perception.odometry import Directions, OdometrySettings
 from pebble.simulation.motion import FULL_SPEED_MM_S, TRACK_MM
 from tests.perception.wheels_rig import WheelsRig
 from tests.support import cases, some
 
-ONE_SENSOR = WheelGeometry(quadrature="")
+ONE_SENSOR = OdometrySettings(second_channel="none")
 FIELDS = """
     x_mm y_mm heading_rad heading_deg left_mm right_mm distance_mm left_crossings right_crossings
     unknown_direction_events left_step_total right_step_total left_mm_per_step right_mm_per_step
@@ -25,7 +24,7 @@ FIELDS = """
 
 @pytest.mark.parametrize(("power", "start"), some([(0.1, 1), (0.4, 3), (0.7, 5), (1.0, 7), (-1.0, 2)], 2))
 @pytest.mark.parametrize("geometry", [None, ONE_SENSOR])
-def test_2_m_straight_are_right_within_10_mm(power: float, start: int, geometry: WheelGeometry | None) -> None:
+def test_2_m_straight_are_right_within_10_mm(power: float, start: int, geometry: OdometrySettings | None) -> None:
     rig = WheelsRig(geometry=geometry, start_mm=(start * 5.3, start * 3.7))
     rig.wait(0.5)
     rig.drive(2000 / FULL_SPEED_MM_S / abs(power), z=power)

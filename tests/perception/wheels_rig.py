@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from itertools import count
 
 from pebble.contract.payloads import Drive, ImuFast, ImuFastValues, MotorPower, Orientation, TouchValues, Vector
-from pebble.perception.odometry import Odometry, WheelGeometry
+from pebble.perception.odometry import Odometry, OdometrySettings
 from pebble.simulation.board import SimulatedMcu
 from pebble.simulation.motion import TRACK_MM
 
@@ -29,7 +29,7 @@ class WheelsRig:
         *,
         gyro: bool = False,
         noise: float = 0.0,
-        geometry: WheelGeometry | None = None,
+        geometry: OdometrySettings | None = None,
         start_mm: tuple[float, float] = (0.0, 0.0),
         gyro_sign: float = 1.0,
     ) -> None:
@@ -37,7 +37,7 @@ class WheelsRig:
         self.mcu = SimulatedMcu("goob", self.now)
         self.motion = self.mcu.motion
         self.start_mm = self.motion.left_mm, self.motion.right_mm = start_mm
-        self.odometry = Odometry(geometry or WheelGeometry(), self.now)
+        self.odometry = Odometry(geometry or OdometrySettings(), self.now)
         self._gyro, self._noise, self._sign = gyro, noise, gyro_sign
         self._random = random.Random(1)
         self._received = b""

@@ -24,5 +24,5 @@ def test_without_samples_it_names_the_key_once(
     robot.sleep.side_effect = [None] * 9 + [Stopped(0)]
     monkeypatch.setattr(time, "monotonic", itertools.count().__next__)
     with pytest.raises(Stopped):
-        script["main"](robot, script["Options"]())
+        script["main"](robot, script["OdometrySettings"]())
     assert caplog.text.count("services.serial_mcu_bridge.telemetry.publish_touch_sensors") == 1

@@ -5,14 +5,15 @@ import math
 import queue
 import time
 from collections.abc import Callable
-from typing import Annotated, Any, Literal
+from typing import Any
 
-from msgspec import Meta, Struct, convert
+from msgspec import convert
+from msgspec.structs import replace
 
 from pebble import Robot, run
 from pebble.contract import IMU_FAST, MOTOR_POWER, TOUCH_SENSORS, WHEEL_ODOMETRY
 from pebble.contract.payloads import WheelOdometry
-from pebble.perception.odometry import Odometry, WheelGeometry
+from pebble.perception.odometry import Odometry, OdometrySettings
 from pebble.perception.rate import Rate
 from pebble.runtime.rate_limit import RateLimitedLog
 
@@ -21,27 +22,9 @@ WAITING = 500  # inputs: 3 s of samples
 SILENCE_S = 3.0  # without a sample: none is published
 NO_SAMPLES = "no hall sensors: set services.serial_mcu_bridge.telemetry.publish_touch_sensors to true"
 
-Pin = Literal["a0", "a1", "a2"]
 
-
-class Options(Struct):
-    use_tune_state: Annotated[bool, Meta(title="Use Tune State")] = False
-    wheel_diameter_mm: Annotated[float, Meta(ge=1, le=1000, title="Wheel Diameter (mm)")] = 61.0
-    track_width_mm: Annotated[float, Meta(ge=1, le=5000, title="Track Width (mm)")] = 130.5
-    magnets: Annotated[int, Meta(ge=1, le=200, title="Magnets per Wheel")] = 10
-    left_channel: Annotated[Pin, Meta(title="Left Sensor")] = "a0"
-    right_channel: Annotated[Pin, Meta(title="Right Sensor")] = "a1"
-    second_channel: Annotated[
-        Literal["a0", "a1", "a2", "none"], Meta(title="Second Left Sensor, a quarter wave away")
-    ] = "a2"
-    left_mm_per_event: Annotated[float, Meta(ge=0, le=1000, title="Left Step (mm), 0: by geometry")] = 0.0
-    right_mm_per_event: Annotated[float, Meta(ge=0, le=1000, title="Right Step (mm), 0: by geometry")] = 0.0
-    publish_rate_hz: Annotated[float, Meta(ge=1, le=50, title="Rate While Moving (Hz)")] = 20.0
-    idle_publish_rate_hz: Annotated[float, Meta(ge=0.2, le=50, title="Rate at Rest (Hz)")] = 2.0
-
-
-def main(robot: Robot, options: Options) -> None:
-    odometry = Odometry(geometry(robot, options), time.monotonic())
+def main(robot: Robot, options: OdometrySettings) -> None:
+    odometry = Odometry(tuned(robot, options), time.monotonic())
     inputs: queue.Queue[tuple[Callable[..., None], Any, float]] = queue.Queue(WAITING)
 
     log = RateLimitedLog(robot.log)
@@ -82,19 +65,11 @@ def main(robot: Robot, options: Options) -> None:
             robot.publish(WHEEL_ODOMETRY, payload)
 
 
-def geometry(robot: Robot, options: Options) -> WheelGeometry:
-    """By the options; with use_tune_state, the values of the original's tuning program win over the geometry."""
-    tuned = tune_state(robot) if options.use_tune_state else {}
-    return WheelGeometry(
-        diameter_mm=options.wheel_diameter_mm,
-        track_mm=tuned.get("track_width_mm", options.track_width_mm),
-        magnets=options.magnets,
-        left=options.left_channel,
-        right=options.right_channel,
-        quadrature="" if options.second_channel == "none" else options.second_channel,
-        left_step_mm=options.left_mm_per_event or tuned.get("left_mm_per_event", 0.0),
-        right_step_mm=options.right_mm_per_event or tuned.get("right_mm_per_event", 0.0),
-    )
+def tuned(robot: Robot, options: OdometrySettings) -> OdometrySettings:
+    """With use_tune_state, the values of the original's tuning program win over the geometry."""
+    state = tune_state(robot) if options.use_tune_state else {}
+    steps = {key: getattr(options, key) or state.get(key, 0.0) for key in ("left_mm_per_event", "right_mm_per_event")}
+    return replace(options, track_width_mm=state.get("track_width_mm", options.track_width_mm), **steps)
 
 
 def tune_state(robot: Robot) -> dict[str, float]:

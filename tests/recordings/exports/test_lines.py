@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pebble.media.json_video import JsonPicture
+from pebble.media import json_video
 from pebble.recordings.exports import lines
 from pebble.recordings.exports.lines import BadLine, read_lines, write_lines
 from pebble.recordings.files.recorded import Channel, Recorded, RecordingError
@@ -84,7 +84,7 @@ def test_a_line_of_ours() -> None:
         (b"[" * 60_000, {"payload_text"}),
         (b"9" * 400, {"payload_text", "payload_json"}),
         (b"\xff\xd8\xff", set()),
-        (JsonPicture(1, True, 1, bytes(range(256)) * 999).pack(), {"payload_text", "payload_json"}),
+        (json_video.pack(1, True, 1, bytes(range(256)) * 999), {"payload_text", "payload_json"}),
     ],
 )
 def test_payloads_are_readable_where_they_are_text_or_json(payload: bytes, readable: set[str]) -> None:

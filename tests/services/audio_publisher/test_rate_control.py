@@ -5,7 +5,6 @@ from __future__ import annotations
 import pytest
 
 from pebble.services.audio_publisher.rate_control import LevelControl, Step, steps
-from pebble.services.audio_publisher.sender import known_encoding
 
 
 def watch(levels: LevelControl, age_s: float, begin: float, seconds: float) -> list[float]:
@@ -95,7 +94,3 @@ def test_steps_back_are_tried_ever_more_rarely() -> None:
     assert tries[0] > 5
     assert tries == sorted(tries)
     assert tries[-1] > 4 * tries[0]
-
-
-def test_what_a_request_means() -> None:
-    assert [known_encoding(asked, "opus") for asked in ("pcm", "opus", "mp3", None)] == ["pcm", "opus", "opus", "opus"]

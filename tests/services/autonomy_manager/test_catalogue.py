@@ -191,7 +191,7 @@ def test_a_script_gets_the_password_of_the_robots_broker_and_no_other(tmp_path: 
 def test_the_list_is_bounded(tmp_path: Path) -> None:
     for number in range(MAX_SCRIPTS + 5):
         write(tmp_path, f"s{number:03}")
-    many = [{"key": f"k{number}", "label": "x" * 1000} for number in range(30)]
+    many = [{"key": f"k{number}"} for number in range(65)]
     found = scripts(tmp_path, scripts={"s000": {"args": many}})
     assert len(found) == MAX_SCRIPTS
     assert found["s000"].settings == ()
@@ -222,6 +222,18 @@ def test_a_file_is_parsed_again_only_when_it_has_changed(tmp_path: Path, monkeyp
     entry.write_text("pass  # changed")
     scanned(catalogue)
     assert parsed == [entry, entry]
+
+
+def test_a_failure_is_logged_once_and_tried_again_after_a_minute(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    entry = write(tmp_path, "walk", PRETENDS.replace(repr(ANSWER), "'no answer'"))
+    now = [0.0]
+    catalogue = Catalogue(config(tmp_path), clock=lambda: now[0])
+    for now[0] in (0.0, 59.0, 61.0, 70.0):
+        assert scanned(catalogue)["walk"].settings == ()
+    assert (entry.parent / "asked").read_text() == "xx"
+    assert caplog.text.count("walk is offered without settings: its --describe: JSON is malformed") == 1
 
 
 SHMSRC = "import cv2\nPIPE = 'shmsrc socket-path=x ! appsink'\ncv2.VideoCapture(PIPE, cv2.CAP_GSTREAMER)"

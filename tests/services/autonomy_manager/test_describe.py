@@ -1,9 +1,8 @@
-"""Which files are asked what they are, and what becomes of their answers."""
+"""Which files are asked what they are, and which answers count."""
 
 from __future__ import annotations
 
 import json
-import logging
 import os
 import sys
 from pathlib import Path
@@ -14,7 +13,6 @@ from pebble.services.autonomy_manager import describe
 from pebble.services.autonomy_manager.describe import (
     DescribeError,
     Description,
-    Descriptions,
     ask,
     is_ours,
     read_manifest,
@@ -128,43 +126,6 @@ def test_what_operators_read_first_is_short(tmp_path: Path, text: str, why: str)
     (tmp_path / "script.json").write_text(text)
     with pytest.raises(DescribeError, match=why):
         read_manifest(tmp_path / "script.json")
-
-
-class Asked:
-    """Counts the questions, and fails while ``error`` is set."""
-
-    def __init__(self) -> None:
-        self.times, self.error = 0, ""
-
-    def __call__(self) -> Description:
-        self.times += 1
-        if self.error:
-            raise DescribeError(self.error)
-        return Description(label=str(self.times))
-
-
-def test_an_answer_holds_until_the_file_changes(entry: Path) -> None:
-    entry.write_text("1")
-    question, known = Asked(), Descriptions(clock=lambda: 0.0)
-    answers = [known.get("a", [entry], question) for _ in range(3)]
-    assert question.times == 1
-    assert {answer.label for answer in answers if answer} == {"1"}
-    entry.write_text("22")
-    known.get("a", [entry], question)
-    known.retain_only(set())
-    known.get("a", [entry], question)
-    assert question.times == 3
-
-
-def test_a_failure_is_logged_once_and_tried_again_after_a_minute(entry: Path, caplog: pytest.LogCaptureFixture) -> None:
-    now = [0.0]
-    question, known = Asked(), Descriptions(clock=lambda: now[0])
-    question.error = "no camera"
-    for now[0] in (0.0, 59.0, 61.0, 70.0):
-        with caplog.at_level(logging.WARNING):
-            assert known.get("walk", [entry], question) is None
-    assert question.times == 2
-    assert [record.getMessage() for record in caplog.records] == ["walk is offered without settings: no camera"]
 
 
 @pytest.mark.parametrize(

@@ -1,9 +1,8 @@
-"""The camera of a robot in a simulated world, which may start later, end, and start again."""
+"""The camera of a robot in a simulated world, which may not run."""
 
 from __future__ import annotations
 
 import json
-import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -13,9 +12,9 @@ import pytest
 
 from pebble.config.media import CameraCapture
 from pebble.errors import DeviceError, NotRunningError
-from pebble.services.av_daemon import sources, world_camera
+from pebble.services.av_daemon import sources
 from pebble.services.av_daemon.health import Health
-from pebble.services.av_daemon.world_camera import WorldCamera
+from pebble.services.av_daemon.synthetic import WorldCamera
 from pebble.simulation.world.pose_page import PosePage, page_path
 from pebble.simulation.world.poses import RobotPose
 from pebble.simulation.world.world_file import read_world
@@ -42,12 +41,6 @@ def page(path: Path) -> Iterator[PosePage]:
     running = PosePage(page_path(path), ["goob"])
     yield running
     running.close()
-
-
-@pytest.fixture(autouse=True)
-def _impatient(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(world_camera, "_WAIT_S", 0.0)
-    monkeypatch.setattr(world_camera, "_SILENCE_S", 0.0)
 
 
 def stand(page: PosePage, x: float = 0.0, *, ago_s: float = 0.0) -> int:
@@ -94,50 +87,19 @@ def test_the_error_without_a_world_names_the_command_that_starts_it(path: Path) 
         camera_of(path)
 
 
-def test_a_world_that_starts_later_is_waited_for(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(world_camera, "_WAIT_S", 30.0)
-    pages: list[PosePage] = []
-
-    def start() -> None:
-        pages.append(PosePage(page_path(path), ["goob"]))
-        stand(pages[0])
-
-    threading.Timer(0.2, start).start()
-    camera = camera_of(path)
-    assert grabbed(camera)
-    pages[0].close()
-
-
-def test_the_wait_can_be_interrupted(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    page = PosePage(page_path(path), ["goob"])
-    stand(page)
-    camera = camera_of(path)
-    page.close()
-    monkeypatch.setattr(world_camera, "_SILENCE_S", 60.0)
-    threading.Timer(0.1, camera.interrupt).start()
-    with pytest.raises(DeviceError, match="interrupted"):
-        camera.grab()
-
-
 def test_a_world_that_is_silent_is_not_running(path: Path, page: PosePage) -> None:
     stand(page, ago_s=1.5)
     with pytest.raises(NotRunningError):
         camera_of(path)
 
 
-def test_a_world_that_ends_and_starts_with_another_scene_is_seen_again(path: Path) -> None:
+def test_a_world_that_ends_is_not_running(path: Path) -> None:
     page = PosePage(page_path(path), ["goob"])
     stand(page)
     camera = camera_of(path)
-    assert set(tags_in(picture(*reversed(grabbed(camera))))) == {13}
     page.close()
     with pytest.raises(NotRunningError):
         camera.grab()
-    write(path, tag=21)
-    page = PosePage(page_path(path), ["goob"])
-    stand(page)
-    assert set(tags_in(picture(*reversed(grabbed(camera))))) == {21}
-    page.close()
 
 
 @pytest.mark.parametrize(

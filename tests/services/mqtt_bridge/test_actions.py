@@ -12,7 +12,7 @@ import pytest
 
 from pebble.config import SystemControl
 from pebble.contract import CHANNELS, GIT_PULL, REBOOT, Channel, Kind
-from pebble.services.mqtt_bridge.actions import ACTIONS, OUTPUT_BYTES, Action, Row, SystemActions
+from pebble.services.mqtt_bridge.actions import ACTIONS, Action, Row, system_actions
 from tests.services.mqtt_bridge.bridge_rig import make_config
 from tests.support import until
 
@@ -93,8 +93,8 @@ def test_runs_without_a_shell_in_its_folder_with_its_environment(tmp_path: Path)
 
 def test_a_line_of_text_is_split_as_a_shell_would(tmp_path: Path) -> None:
     section = {"git_pull_control": {"command": f'{sys.executable} -c \'open("made here", "w")\'', "cwd": str(tmp_path)}}
-    actions = SystemActions(make_config(**section).services.mqtt_bridge, folder=tmp_path)
-    assert actions.request(next(row.channel for row in ACTIONS if row.section == "git_pull_control"))
+    actions = system_actions(make_config(**section).services.mqtt_bridge, tmp_path, Clock())
+    assert actions[GIT_PULL].request()
     assert until(lambda: (tmp_path / "made here").exists())
 
 
@@ -108,14 +108,6 @@ def test_its_words_and_its_output_stay_in_a_file_on_the_robot(tmp_path: Path, ca
     assert "TOKEN" not in caplog.text
     assert output.read_text() == "pulls from https://deploy:ghp_TOKEN@git.example\n"
     assert output.stat().st_mode & 0o777 == 0o600
-
-
-def test_the_file_holds_the_newest_run_and_a_part_of_endless_output(tmp_path: Path) -> None:
-    action = Action(row(GIT_PULL), control("print('x' * 1_000_000)"), folder=tmp_path, clock=Clock())
-    for _ in range(2):
-        assert action.request()
-        assert finished(action)
-        assert until(lambda: (tmp_path / "git-pull.log").stat().st_size == OUTPUT_BYTES)
 
 
 def test_runs_also_where_no_file_can_be_written(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
@@ -147,18 +139,10 @@ def test_a_flood_of_requests_is_a_few_lines_of_the_log(
 ) -> None:
     caplog.set_level(logging.DEBUG)
     controls = {row.section: {"command": list(command), "cwd": str(tmp_path)} for row in ACTIONS}
-    actions = SystemActions(make_config(**controls).services.mqtt_bridge, folder=tmp_path)
+    actions = system_actions(make_config(**controls).services.mqtt_bridge, tmp_path, time.monotonic)
     threads, before = threading.active_count(), time.monotonic()
     for _ in range(40):
         for row in ACTIONS:
-            actions.request(row.channel)
+            actions[row.channel].request()
     assert until(lambda: threading.active_count() == threads)
     assert len(caplog.records) <= 10 * max(1.0, time.monotonic() - before)
-
-
-def test_leaves_no_thread_behind(tmp_path: Path) -> None:
-    before = threading.active_count()
-    action = Action(row(REBOOT), control("pass"), folder=tmp_path, clock=Clock())
-    assert action.request()
-    assert finished(action)
-    assert until(lambda: threading.active_count() == before)

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from pebble.client.media_request.queue import NO_FRAME
-from pebble.media.decode import VideoDecoder, encoding_of
+from pebble.media.decode import VideoDecoder
 from pebble.media.picture_header import follows, read_header
 from pebble.media.scene import read_counter
 from pebble.media.video import make_encoder
@@ -30,6 +30,11 @@ def robot() -> PictureRobot:
 
 def jpeg(number: int = 0) -> bytes:
     return cv2.imencode(".jpg", np.full((48, 64, 3), 40 + number % 150, np.uint8))[1].tobytes()
+
+
+def encoding_of(payload: bytes) -> str | None:
+    header = read_header(payload)
+    return header and header.encoding
 
 
 # -- the encoding

@@ -19,8 +19,8 @@ import pytest
 from playwright.sync_api import Browser
 
 from pebble.contract.packets import Picture, PictureKind
+from pebble.media import json_video
 from pebble.media.decode import VideoDecoder
-from pebble.media.json_video import JsonPicture
 from pebble.media.scene import Scene, noise, read_counter
 from pebble.media.video import make_encoder
 from tests.support import ROOT, cases
@@ -296,7 +296,7 @@ def test_limits_of_zlib(check: Any) -> None:
 
 
 def test_json_as_strict_as_ours(check: Any) -> None:
-    good = JsonPicture(7, True, T0, jpeg(np.full((16, 16, 3), 99, np.uint8))).pack()
+    good = json_video.pack(7, True, T0, jpeg(np.full((16, 16, 3), 99, np.uint8)))
     message = json.loads(good)
     changed = [
         *({**message, "id": number} for number in (-1, 1.5, 2**53, 2**53 - 1, "7", None, True)),

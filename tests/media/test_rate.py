@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from pebble.media.in_flight import InFlight
+from pebble.media.rate import InFlight
 
 
 def test_messages_are_acknowledged_in_order() -> None:
