@@ -31,11 +31,11 @@ from pebble.services.autonomy_manager.environment import environment, local_logi
 from pebble.services.autonomy_manager.interpreter import interpreter
 from pebble.services.autonomy_manager.script import Dependency, Script
 
-MAX_SCRIPTS = 256
+MAX_SCRIPTS = 256  # that are listed
 _LONGEST_NAME = 100
 _LONGEST_FORM = 16 * 1024  # bytes
 _LONGEST_FILES = 256 * 1024  # bytes of all forms together
-_MAX_DEPENDENCIES = 8
+_MAX_DEPENDENCIES = 8  # of one script
 _OWN_SCRIPTS = Path(pebble.__file__).parent / "scripts"
 
 log = logging.getLogger(__name__)

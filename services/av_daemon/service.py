@@ -18,7 +18,7 @@ CAMERA, MICROPHONE = "camera", "microphone"  # the names of the streams
 _NUMBERS_S = 5.0  # between messages that differ in numbers alone: once a second they filled a tenth of a 64 kbit/s link
 _NUMBER = re.compile(r"[0-9.]+")
 SILENCE_S: Final = 5.0  # after which a program that has reported has ended
-_PROGRAM_LIMIT = 32
+_PROGRAM_LIMIT = 32  # media programs whose reports are read
 
 
 class Reports:
