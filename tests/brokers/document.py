@@ -1,4 +1,4 @@
-"""Judges each broker that can run here: ``python -m tests.brokers.document`` prints what docs/brokers.md has a table of."""
+"""Judges each broker that can run here, and prints what docs/brokers.md has a table of: ``tests.brokers.document``."""
 
 from __future__ import annotations
 
