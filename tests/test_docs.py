@@ -42,6 +42,19 @@ def test_links_lead_somewhere(document: Path) -> None:
     assert broken == []
 
 
+ANCHOR = re.compile(r"\]\((?!https?:)([^)#]*)#([^)]+)\)")
+
+
+@pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: str(path.relative_to(ROOT)))
+def test_anchors_are_headings(document: Path) -> None:
+    def anchors(path: Path) -> set[str]:
+        headings = re.findall(r"^#+ (.+)$", path.read_text(), re.MULTILINE)
+        return {re.sub(r"[^\w -]", "", heading.lower()).replace(" ", "-") for heading in headings}
+
+    links = ANCHOR.findall(document.read_text())
+    assert [link for link in links if link[1] not in anchors(document.parent / (link[0] or document.name))] == []
+
+
 DECISIONS = sorted((ROOT / "docs" / "decisions").glob("*.md"))
 #: The files that a decision named when it was written, and where they are now.
 NOW_AT = re.compile(r"^Now at: (.+)\.$", re.MULTILINE)
