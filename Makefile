@@ -6,7 +6,7 @@ DEBIAN := sh tools/debian-packages.sh
 
 .DEFAULT_GOAL := help
 unexport PYTHONDONTWRITEBYTECODE  # every test starts programs: compiling them each time would cost a third of the time
-.PHONY: help demo test check long report lock release clean
+.PHONY: help demo test check docs long report lock release clean
 
 help:
 	@echo "make demo              four simulated robots, on Zenoh, on MQTT and on MCUs, driven through a broker; Ctrl-C ends it"
@@ -15,6 +15,7 @@ help:
 	@echo "make test              all checks and tests, some rows of each rule, some seven minutes; THOROUGH=1: all rows"
 	@echo "make test QUICK=1      what to run before each commit: lint, types, contract, bridge, transports, motion; a minute and a half"
 	@echo "make check             lint, types and imports only"
+	@echo "make docs              write build/docs: tables of all topics, config keys, web messages, words and bounds; schemas"
 	@echo "make long PART=stops   one of the parts that take long; make long lists them"
 	@echo "make report            run every comparison, 95 minutes; writes build/report; QUICK=1: fewer cases, six minutes"
 	@echo "make lock              write requirements.txt anew from pyproject.toml; UPGRADE=1: with the newest versions"
@@ -55,6 +56,12 @@ check: .venv/.ready-dev
 	@$(VENV) -m mypy
 	@$(VENV) -m tests.firmware.types
 	@echo "pebble: lint, types and imports are in order"
+
+docs: .venv/.ready-dev
+	@$(VENV) -m pebble.contract.docs build/docs
+	@$(VENV) -m pebble.config.schema build/docs
+	@$(VENV) -m pebble.web.messages_docs build/docs
+	@$(VENV) tools/bounds.py build/docs
 
 long: .venv/.ready-dev
 	@sh tools/long.sh "$(PART)"

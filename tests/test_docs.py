@@ -20,19 +20,18 @@ from pebble.checks.conform.control import CONTROL, named
 from pebble.checks.conform.motion import MOVING
 from pebble.commands.app import application
 from tests.support import ROOT
+from tools.bounds import bounds
 
-GENERATED = ("topics.md", "configuration.md", "web-messages.md", "words.md")
 DOCUMENTS = [
     ROOT / "README.md",
     ROOT / "CHANGELOG.md",
-    *(path for path in sorted((ROOT / "docs").rglob("*.md")) if path.name not in GENERATED),
+    *sorted((ROOT / "docs").rglob("*.md")),
 ]
-BOUNDS = ROOT / "docs" / "bounds.md"
 LINK = re.compile(r"\]\((?!https?:)([^)#]+)")
 #: `folder/`, `folder/file.py` or `file.py`; what begins like a topic below a robot's identity is none, and what is
 #: below build/ is written by a run
 CODE = re.compile(
-    r"`((?!(?:incoming|outgoing|flags|sensors|mcu|by|build)/)(?:[\w.-]+/)+[\w.-]*|[\w-]+\.(?:py|md|toml|json))`"
+    r"`((?!(?:incoming|outgoing|flags|sensors|mcu|by|build|pebble/robots|system)/)(?:[\w.-]+/)+[\w.-]*|[\w-]+\.(?:py|md|toml|json))`"
 )
 OURS = ("pebble", "transports", "services", "simulation", "bench", "rig", "firmware")
 
@@ -41,6 +40,19 @@ OURS = ("pebble", "transports", "services", "simulation", "bench", "rig", "firmw
 def test_links_lead_somewhere(document: Path) -> None:
     broken = [link for link in LINK.findall(document.read_text()) if not (document.parent / link).exists()]
     assert broken == []
+
+
+ANCHOR = re.compile(r"\]\((?!https?:)([^)#]*)#([^)]+)\)")
+
+
+@pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: str(path.relative_to(ROOT)))
+def test_anchors_are_headings(document: Path) -> None:
+    def anchors(path: Path) -> set[str]:
+        headings = re.findall(r"^#+ (.+)$", path.read_text(), re.MULTILINE)
+        return {re.sub(r"[^\w -]", "", heading.lower()).replace(" ", "-") for heading in headings}
+
+    links = ANCHOR.findall(document.read_text())
+    assert [link for link in links if link[1] not in anchors(document.parent / (link[0] or document.name))] == []
 
 
 DECISIONS = sorted((ROOT / "docs" / "decisions").glob("*.md"))
@@ -55,7 +67,6 @@ def test_every_page_can_be_found_from_the_index() -> None:
     index = (ROOT / "docs" / "README.md").read_text()
     linked = {(ROOT / "docs" / link).resolve() for link in LINK.findall(index)}
     pages = {path for path in DOCUMENTS if path.is_relative_to(ROOT / "docs") and path not in DECISIONS}
-    pages |= {ROOT / "docs" / name for name in GENERATED}
     assert pages - linked - {ROOT / "docs" / "README.md"} == set()
 
 
@@ -117,28 +128,8 @@ def test_extras_targets_and_modules_are_ones_that_exist() -> None:
     assert [module for module in sorted(modules) if find_spec(module) is None] == []
 
 
-#: Names of constants that limit what others can add, and tokens of docs/bounds.md such as `web/stops.py:MAX_STOPS`.
-BOUND = re.compile(
-    r"^((?:\w+, )*(?:_?(?:MAX|MOST)(?:_[A-Z_]+)?|_?(?:[A-Z]+_)*(?:LIMIT|RESERVE|WAITING|REMEMBERED|TOPICS)))"
-    r"(?:: Final)? = \(?[\w ]*\d",
-    re.MULTILINE,
-)
-TOKEN = re.compile(r"`([\w/.-]+\.(?:py|js)):([\w,]+)`")
-LISTED = [(path, name) for path, names in TOKEN.findall(BOUNDS.read_text()) for name in names.split(",")]
-
-
-def test_the_table_of_bounds_names_each() -> None:
-    sources = [path for folder in OURS for path in (ROOT / folder).rglob("*.py")]
-    shown = {path: str(path.relative_to(ROOT)).removeprefix("pebble/") for path in sources}
-    others = ("demo/", "bench/", "rig/", "simulation/", "perception/")  # nothing of strangers is counted there
-    found = {
-        (name, constant)
-        for path, name in shown.items()
-        if not name.startswith(others)
-        for constants in BOUND.findall(path.read_text())
-        for constant in constants.split(", ")
-    }
-    assert found - set(LISTED) == set(), "add a row to docs/bounds.md"
+def test_each_bound_has_a_comment_that_says_what_it_bounds() -> None:
+    assert [f"{bound.file}: {bound.name}" for bound in bounds() if not bound.why] == []
 
 
 def test_each_file_of_the_samples_is_named_and_short() -> None:
@@ -158,14 +149,6 @@ def test_each_check_is_beside_its_duty_and_counted() -> None:
     )
     assert f"NOT JUDGED: {moving} with --may-move" in text
     assert f"checks: {at_rest}, warnings: 0, failures: 0" in text
-
-
-def test_the_table_of_bounds_names_nothing_else() -> None:
-    def defines(path: str, name: str) -> bool:
-        file = ROOT / path if path.startswith("firmware/") else ROOT / "pebble" / path
-        return bool(re.search(rf"^(?:export )?(?:const )?(?:\w+, )*{name}\b", file.read_text(), re.MULTILINE))
-
-    assert [one for one in LISTED if not defines(*one)] == []
 
 
 def _exists(name: str) -> bool:

@@ -10,7 +10,7 @@ MAX_BYTES = 1024  # our own limit; MQTT's is 65,535
 MAX_LEVELS = 200  # mosquitto closes the connection beyond it (TOPIC_HIERARCHY_LIMIT)
 
 REMEMBERED_LENGTH = 128  # characters of topics whose translations are remembered: strangers' may have 64 KB each
-_REMEMBERED = 4096
+_REMEMBERED = 4096  # topics whose levels are remembered
 
 # Control characters and Unicode non-characters: MQTT lets a receiver close the connection on them, and mosquitto does.
 _NON_CHARACTERS = "\ufdd0-\ufdef" + "".join(

@@ -11,7 +11,7 @@ log = logging.getLogger(__name__)
 
 Handler = Callable[[Message, float], None]  # the message, and the monotonic time at which it arrived
 
-MAX_MESSAGES: Final = 10_000
+MAX_MESSAGES: Final = 10_000  # that wait for the program; a new one is dropped
 MAX_BYTES: Final = 64 << 20  # of their payloads
 MAX_DEFERRED: Final = 5_000  # heartbeats, which come again, take no room from what is sent once
 

@@ -1,7 +1,7 @@
 """Why a robot is not driven: the reasons, their order and their words, and the limits they have in common. Pure.
 
 When the page's own reasons apply is in ``web/static/core/reasons.js``; ``tests/vectors/drive_reasons.json`` is run by
-both. docs/words.md has the table of words.
+both. `make docs` writes the table of words.
 """
 
 from collections import defaultdict

@@ -37,8 +37,11 @@ _FIXED = {_LAUNCHER: STATUS, "av_daemon": MEDIA_STATUS}
 
 
 def check(
-    configs: Annotated[list[Path], typer.Argument(help="Config files.", metavar="CONFIG…", show_default=False)],
+    configs: Annotated[
+        list[Path] | None, typer.Argument(help="Config files.", metavar="CONFIG…", show_default=False)
+    ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print only the keys and their values.")] = False,
+    keys: Annotated[bool, typer.Option("--keys", help="Print what each key means, and its default.")] = False,
 ) -> int:
     """Report all mistakes of a config at once, or print a summary of it.
 
@@ -46,7 +49,15 @@ def check(
         pebble check configs/goob.json
         pebble check configs/*.json
         pebble check --json configs/goob.json | jq .services.mqtt_bridge.heartbeat
+        pebble check --keys | grep recorder
     """
+    if keys:
+        from pebble.config.schema import keys_text  # few checks need it
+
+        typer.echo(keys_text(), nl=False)
+        return 0
+    if not configs:
+        raise typer.BadParameter("name a config", param_hint="CONFIG…")
     good = [_check(path, as_json=as_json, first=path is configs[0]) for path in configs]
     return 0 if all(good) else 1
 

@@ -53,7 +53,7 @@ def _unused(retired: list[Note]) -> Iterator[str]:
     reasons = dict.fromkeys(note.text for note in retired)
     if len(reasons) > _FEW_REASONS:
         names = ", ".join(dict.fromkeys(show_path(note.path[-2:]) for note in retired))
-        yield without_secrets(f"no longer used, delete them: {names}; docs/configuration.md says what replaces each")
+        yield without_secrets(f"no longer used, delete them: {names}; `pebble check --keys` says what replaces each")
         return
     for text in reasons:
         groups: dict[Path, list[str]] = {}

@@ -1,9 +1,11 @@
-"""Writes configs/schema.json for editors and the tables of docs/configuration.md.
+"""Writes configs/schema.json for editors, and tables of all keys.
 
-Run ``python -m pebble.config.schema`` after every change of a section.
+Run ``python -m pebble.config.schema`` after every change of a section. With a folder it writes the tables there, which
+``pebble check --keys`` prints.
 """
 
 import json
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, get_args, get_origin
@@ -15,10 +17,9 @@ from msgspec.structs import FieldInfo, fields
 from pebble.config.reader import expected, unwrap
 from pebble.config.tree import Root
 from pebble.config.types import Section
-from pebble.contract.docs import filled
 
 SCHEMA_FILE = Path("configs", "schema.json")
-DOCS_FILE = Path("docs", "configuration.md")
+KEYS_FILE = "configuration.md"
 
 
 def schema_text() -> str:
@@ -59,9 +60,9 @@ def _subclasses(kind: type[Section]) -> Iterator[type[Section]]:
         yield from _subclasses(child)
 
 
-def docs_text(current: str) -> str:
-    """``current`` with its generated part replaced."""
-    return filled(current, {"keys": "".join(_chapters(Root, "", {}))})
+def keys_text() -> str:
+    """Return a table of the keys of each section, with their whole names, defaults and meanings."""
+    return "".join(["# Keys of a config\n\n", *_chapters(Root, "", {})]).rstrip("\n") + "\n"
 
 
 def _chapters(kind: type[Section], path: str, places: dict[type[Section], str]) -> Iterator[str]:
@@ -70,17 +71,17 @@ def _chapters(kind: type[Section], path: str, places: dict[type[Section], str]) 
     inner: list[tuple[type[Section], str]] = []
     rows = []
     for field in sorted(fields(kind), key=lambda field: not field.required):
-        section, place = _section_of(field), f"{path}.{field.encode_name}".removeprefix(".")
+        section, key = _section_of(field), f"{path}.{field.encode_name}".removeprefix(".")
         if section is None:
-            rows.append(_row(field))
+            rows.append(f"| `{key}` | {_default(field)} | {_meaning(field)}{_allowed(field)} |\n")
             continue
-        place += {dict: ".<name>", tuple: "[]"}.get(get_origin(unwrap(field.type)[0]), "")
+        place = key + {dict: ".<name>", tuple: "[]"}.get(get_origin(unwrap(field.type)[0]), "")
         like = f"keys as in `{places[section]}`" if section in places else "keys below"
-        rows.append(f"| `{field.encode_name}` | | {_meaning(field)} ({like}) |\n")
+        rows.append(f"| `{key}` | | {_meaning(field)} ({like}) |\n")
         if section not in places:
             places[section] = place
             inner.append((section, place))
-    yield f"### {f'`{path}`' if path else 'The whole file'}\n\n"
+    yield f"## {f'`{path}`' if path else 'The whole file'}\n\n"
     yield f"{kind.__doc__}\n\n| key | default | meaning |\n|---|---|---|\n{''.join(rows)}\n"
     for text in dict.fromkeys(kind.all_retired().values()):
         keys = ", ".join(f"`{key}`" for key, replacement in kind.all_retired().items() if replacement == text)
@@ -93,10 +94,6 @@ def _section_of(field: FieldInfo) -> type[Section] | None:
     kind, _ = unwrap(field.type)
     inner = get_args(kind)[-1] if get_origin(kind) is dict else get_args(kind)[0] if get_origin(kind) is tuple else kind
     return inner if isinstance(inner, type) and issubclass(inner, Section) else None
-
-
-def _row(field: FieldInfo) -> str:
-    return f"| `{field.encode_name}` | {_default(field)} | {_meaning(field)}{_allowed(field)} |\n"
 
 
 def _meaning(field: FieldInfo) -> str:
@@ -127,12 +124,15 @@ def _default(field: FieldInfo) -> str:
     return f"`{msgspec.json.encode(field.default).decode()}`"
 
 
-def write(root: Path) -> None:
-    """Write both files below ``root``, the project's folder."""
-    (root / SCHEMA_FILE).write_text(schema_text(), encoding="utf-8")
-    docs = root / DOCS_FILE
-    docs.write_text(docs_text(docs.read_text(encoding="utf-8")), encoding="utf-8")
+def main(arguments: list[str]) -> None:
+    """Write the tables of all keys into the given folder; without one, the schema of this checkout."""
+    if arguments:
+        folder = Path(arguments[0])
+        folder.mkdir(parents=True, exist_ok=True)
+        (folder / KEYS_FILE).write_text(keys_text(), encoding="utf-8")
+    else:
+        (Path(__file__).resolve().parents[2] / SCHEMA_FILE).write_text(schema_text(), encoding="utf-8")
 
 
 if __name__ == "__main__":
-    write(Path(__file__).resolve().parent.parent.parent)
+    main(sys.argv[1:])

@@ -1,7 +1,7 @@
 """The topic contract: every channel, declared once.
 
-Topics, delivery rules, bridge routing, capabilities, docs/topics.md and the JSON Schemas are derived from CHANNELS
-and written nowhere else. Sources: paper Tables 3.1 and A.2 to A.6.
+Topics, delivery rules, bridge routing, capabilities, tables of topics and JSON Schemas are derived from CHANNELS and
+written nowhere else. Sources: paper Tables 3.1 and A.2 to A.6.
 """
 
 import math

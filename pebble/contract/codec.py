@@ -24,7 +24,7 @@ from pebble.contract.payloads import (
 from pebble.errors import PayloadError
 from pebble.motion.latch import fields, stop_of
 
-MAX_COMMAND_BYTES = 64 * 1024
+MAX_COMMAND_BYTES = 64 * 1024  # a larger command is refused; as a stop it is one without a name
 
 _LONGEST_MS = 1e12  # of a command's validity; far beyond every watchdog
 _LATEST_STAMP = 253_402_300_800_000  # the year 10000 in ms: later times are invalid

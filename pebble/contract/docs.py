@@ -1,10 +1,10 @@
-"""Writes docs/topics.md, payloads.schema.json and asyncapi.yaml: ``python -m pebble.contract.docs [FOLDER]``."""
+"""Writes tables of all topics, payloads.schema.json and asyncapi.yaml: ``python -m pebble.contract.docs FOLDER``."""
 
 import inspect
 import json
 import re
 import sys
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from functools import cache
 from pathlib import Path
 from types import NoneType, UnionType
@@ -20,26 +20,14 @@ from pebble.contract.schemas import schemas
 
 TOPICS, SCHEMAS, ASYNCAPI = "topics.md", "payloads.schema.json", "asyncapi.yaml"
 
-_DOCS = Path(__file__).resolve().parents[2] / "docs"
-_GENERATED = re.compile(r"(<!-- generated: (\w+) -->\n?).*?(<!-- end of generated: \2 -->)", re.DOTALL)
 _JSON_TYPES = {Any: "any", NoneType: "null", bool: "boolean", int: "integer", float: "number", str: "string"}
 
 
-def filled(document: str, parts: Mapping[str, str]) -> str:
-    """``document`` with these parts, by name, between its marks."""
-    text = _GENERATED.sub(lambda found: f"{found[1]}\n{parts[found[2]]}\n{found[3]}", document)
-    return re.sub(r"\n{3,}", "\n\n", text)
-
-
 def topics_document() -> str:
-    """The whole of docs/topics.md."""
+    """Return the tables of all topics, and of the fields of all payloads."""
     kinds = _table(("kind", "direction", "QoS", "retained", "meaning"), map(_kind_row, Kind))
     channels = (section for direction in (INCOMING, OUTGOING) for section in _direction(direction))
-    parts = {
-        "channels": "\n".join(["## Kinds\n", kinds, *channels]),
-        "payloads": "\n".join(["## Payloads\n", *map(_payload, _structs())]),
-    }
-    return filled((_DOCS / TOPICS).read_text(encoding="utf-8"), parts)
+    return "\n".join(["# Topics\n", "## Kinds\n", kinds, *channels, "## Payloads\n", *map(_payload, _structs())])
 
 
 def travels(channel: Channel) -> str:
@@ -195,8 +183,9 @@ def documents() -> dict[str, str]:
 
 
 def main(arguments: list[str]) -> None:
-    """Write the files into the given folder, or into docs/ of this checkout."""
-    folder = Path(arguments[0]) if arguments else _DOCS
+    """Write the files into the given folder."""
+    folder = Path(arguments[0])
+    folder.mkdir(parents=True, exist_ok=True)
     for name, text in documents().items():
         (folder / name).write_text(text, encoding="utf-8")
 

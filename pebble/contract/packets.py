@@ -15,7 +15,7 @@ from pebble.errors import PayloadError
 PBAT: Final = b"PBAT"
 PBVD: Final = b"PBVD"
 VERSION: Final = 1
-SEQUENCE_LIMIT: Final = 1 << 32
+SEQUENCE_LIMIT: Final = 1 << 32  # numbers begin again
 
 _SOUND = struct.Struct(">4sBBBBHHIQ")  # 24 bytes
 _PICTURE = struct.Struct(">4sBBBIQ")  # 19 bytes

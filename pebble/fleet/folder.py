@@ -20,7 +20,7 @@ from pebble.runtime.whole_file import write
 FLEET, CONF, PID, ACL, PASSWORDS = "fleet.json", "mosquitto.conf", "mosquitto.pid", "acl", "passwords"
 ZENOH = "zenoh.json"
 PORT, PLAIN_PORT = 8883, 1883  # of MQTT over TLS, and without
-MAX_ACCOUNTS = 10_000
+MAX_ACCOUNTS = 10_000  # of one fleet
 _LOCK = ".lock"
 _NO_LINK = getattr(os, "O_NOFOLLOW", 0)  # which Windows lacks
 _METRIC = re.compile(r"[^/#$+\x00-\x20\x7f]+|\+")  # one level

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pebble.transports import Message, State, Transport
 from pebble.transports.counters import Counters
 
-LIMIT = 256
+LIMIT = 256  # events of an outage; the oldest is dropped
 #: A dead connection accepts messages until its silence is detected (2 s by default). Events published so shortly before
 #: the loss are sent again: QoS 1 allows duplicates, and no loss.
 RESEND_S = 3.0

@@ -21,7 +21,7 @@ from pebble.transports.topics import matches
 
 log = logging.getLogger(__name__)
 
-MOST_ROBOTS: Final = 500
+MOST_ROBOTS: Final = 500  # that are shown; further ones are counted
 _MEDIA: Final[tuple[Medium, ...]] = ("video", "audio")
 
 

@@ -10,7 +10,7 @@ from pebble.errors import PayloadError
 
 #: More than any camera of a robot needs: bytes of one picture, and pixels along an edge.
 MAX_BYTES: Final = 8 << 20
-MAX_EDGE: Final = 4096
+MAX_EDGE: Final = 4096  # pixels
 
 SOI: Final = b"\xff\xd8"
 _EOI: Final = b"\xff\xd9"

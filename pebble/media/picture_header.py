@@ -7,7 +7,7 @@ import msgspec
 from pebble.contract.packets import KEY_FRAME, PBVD, SEQUENCE_LIMIT, Picture, PictureKind
 from pebble.errors import PayloadError
 
-MAX_PAYLOAD: Final = 4 << 20
+MAX_PAYLOAD: Final = 4 << 20  # bytes of one picture
 _HEADER_BYTES: Final = 19
 _SOI: Final = b"\xff\xd8"
 #: With more time between two pictures, or less than none, the sender may have restarted and the number fits by chance.

@@ -5,7 +5,7 @@ from collections import deque
 from typing import Final, NamedTuple
 
 WINDOW_S: Final = 3.0
-_LIMIT: Final = 1000
+_LIMIT: Final = 1000  # messages of the last seconds that are counted
 
 
 class Arrival(NamedTuple):

@@ -17,7 +17,7 @@ from pebble.transports.counters import Counters
 #: Those this installation can make.
 SOUND_ENCODINGS: Final = pyav.available(ALL_SOUND)
 
-CHANNELS_LIMIT: Final = 8
+CHANNELS_LIMIT: Final = 8  # channels of one stream of sound
 LOWEST_RATE: Final = 4000  # Hz; a player would fail with less
 _HIGHEST_PCM_RATE = 65_535  # what the header can express
 _LONGEST_S = 1.0  # of one packet: the most the original can be configured to send

@@ -12,7 +12,7 @@ from pebble.contract.payloads import SCRIPT, Drive, EstopState
 from pebble.motion.arbiter import HOLD_MS, newer
 from pebble.runtime.runs import SUPERSEDED
 
-MAX_PER_S = 50
+MAX_PER_S = 50  # drive commands of a script; the newest takes its turn, a zero goes at once
 HOLD_S = HOLD_MS / 1000  # so long after a person's last command scripts are refused
 _SLOT_S = 0.021  # between commands: with an early zero and the final one, at most MAX_PER_S in any second
 _MAX_OWNERS = 64  # whose last state is remembered

@@ -78,7 +78,7 @@ def config_of(answers: Answers, places: Places) -> dict[str, Any]:
             "service_restart_control": {"command": [*_SYSTEMCTL, "--no-block", "restart", UNIT]},
         }
     config: dict[str, Any] = {
-        "//": "Written by `pebble setup`. What is changed here by hand stays; docs/configuration.md lists all keys.",
+        "//": "Written by `pebble setup`. What is changed here by hand stays; `pebble check --keys` lists all keys.",
         "robot": {"id": answers.id},
         "security": {"level": "login"},
         "transport": {"kind": "zenoh", "state_dir": _from_etc(places, places.state)},

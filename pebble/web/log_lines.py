@@ -9,9 +9,9 @@ import msgspec
 from pebble.contract import LOGS, codec
 from pebble.errors import PayloadError
 
-MAX_LINES: Final = 500
+MAX_LINES: Final = 500  # of one component; the oldest goes
 MAX_BYTES: Final = 256 * 1024  # of all lines together
-MAX_LINE_BYTES: Final = 16 * 1024
+MAX_LINE_BYTES: Final = 16 * 1024  # of one line
 PART_BYTES: Final = 16 * 1024  # of one message to a page: echoes, without which it does not drive, wait behind it
 
 

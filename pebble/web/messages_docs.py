@@ -1,10 +1,12 @@
-"""Generates messages.d.ts and parts of docs/web-messages.md from messages.py, and the table of docs/words.md.
+"""Generates messages.d.ts from messages.py, and tables of these messages and of the words for people.
 
-Program: ``python -m pebble.web.messages_docs`` writes them; a test checks that they are current.
+Program: ``python -m pebble.web.messages_docs`` writes messages.d.ts; a test checks that it is current. With a folder it
+writes the tables there.
 """
 
 import inspect
 import json
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, get_args
@@ -14,32 +16,28 @@ from msgspec import inspect as types
 
 from pebble.client import drive_reasons
 from pebble.contract.capabilities import RobotIdentity
-from pebble.contract.docs import filled
 from pebble.web import messages
 
-_ROOT = Path(__file__).parents[2]
-DOCS = _ROOT / "docs" / "web-messages.md"
-WORDS = _ROOT / "docs" / "words.md"
 DECLARATIONS = Path(__file__).parent / "static" / "messages.d.ts"
 
 
 def markdown() -> str:
-    """docs/web-messages.md with its generated parts replaced."""
-    about = (messages.__doc__ or "").partition("\n")[2].strip().partition("docs/web-messages.md")[0].strip()
-    parts = [f"{_summary(messages)} {about}\n".replace("``", "`")]
+    """Return the tables of all messages between page and server."""
+    about = (inspect.getdoc(messages) or "").replace("``", "`")
+    parts = [f"# Messages between page and server\n\n{about}\n"]
     parts += ["## From the page\n", *map(_section, get_args(messages.FromPage))]
     parts += ["## From the server\n", *map(_section, get_args(messages.ToPage))]
     replay = *get_args(messages.FromReplay), messages.Played
     parts += ["## On the socket of a recording\n", *map(_section, replay)]
     parts += ["## Metrics of the server\n", *map(_section, _views())]
-    texts = {"messages": "\n".join(parts), "TalkAnswer": _section(messages.TalkAnswer)}
-    return filled(DOCS.read_text(encoding="utf-8"), texts)
+    parts += ["## On the connection of a voice\n", _section(messages.TalkAnswer)]
+    return "\n".join(parts)
 
 
 def words() -> str:
-    """docs/words.md with its table."""
+    """Return the table of sentences for the states in which a robot is not driven."""
     rows = [f"| `{code}` | {text} |" for code, text in drive_reasons.WORDS.items()]
-    return filled(WORDS.read_text(encoding="utf-8"), {"words": "\n".join(["| state | sentence |", "|---|---|", *rows])})
+    return "\n".join(["# Words for people\n", "| state | sentence |", "|---|---|", *rows, ""])
 
 
 def declarations() -> str:
@@ -86,10 +84,6 @@ def _default(field: Any) -> str:
     return f"`{json.dumps(value)}`"
 
 
-def _summary(thing: object) -> str:
-    return (inspect.getdoc(thing) or "").partition("\n")[0]
-
-
 def _words(kind: Any) -> str:
     return _script(kind).replace("|", "or")
 
@@ -122,12 +116,16 @@ def _script(kind: Any) -> str:
     return "any"
 
 
-def main() -> None:
-    """Write the three files."""
-    DOCS.write_text(markdown(), encoding="utf-8")
-    WORDS.write_text(words(), encoding="utf-8")
-    DECLARATIONS.write_text(declarations(), encoding="utf-8")
+def main(arguments: list[str]) -> None:
+    """Write the tables into the given folder; without one, messages.d.ts of this checkout."""
+    if not arguments:
+        DECLARATIONS.write_text(declarations(), encoding="utf-8")
+        return
+    folder = Path(arguments[0])
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "web-messages.md").write_text(markdown(), encoding="utf-8")
+    (folder / "words.md").write_text(words(), encoding="utf-8")
 
 
 if __name__ == "__main__":
-    main()
+    main(sys.argv[1:])

@@ -25,7 +25,7 @@ from pebble.web.log_lines import LogLines
 
 log = logging.getLogger(__name__)
 
-MAX_COMPONENTS, MAX_METRICS, MAX_VALUE_BYTES = 2000, 200, 64 * 1024
+MAX_COMPONENTS, MAX_METRICS, MAX_VALUE_BYTES = 2000, 200, 64 * 1024  # components; metrics of one; bytes of a value
 _MAX_CLIPS_BYTES = 400 * 1024  # of the list of clips, which has up to 256 KiB of names
 LARGE_BYTES = 16 * 1024  # a value beyond holds up a slow connection: one is sent, then the page has to answer
 MAX_STATE_BYTES = 128 * 1024  # of values in one message: pings, by which pages drive, do not wait for thousands

@@ -33,7 +33,7 @@ from pebble.services.autonomy_manager.environment import environment, local_logi
 from pebble.services.autonomy_manager.interpreter import interpreter
 from pebble.services.autonomy_manager.script import Dependency, Script
 
-MAX_SCRIPTS = 256
+MAX_SCRIPTS = 256  # that are listed
 _LONGEST_NAME = 100
 _LONGEST_FILES = 256 * 1024  # bytes of all forms together
 _RETRY_S = 60.0  # after a failure: it may have been a busy machine's

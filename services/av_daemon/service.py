@@ -16,7 +16,7 @@ from pebble.transports.frames import FrameWriter
 
 CAMERA, MICROPHONE = "camera", "microphone"  # the names of the streams
 _NUMBERS_S = 5.0  # between messages that differ in numbers alone: once a second they filled a tenth of a 64 kbit/s link
-_PROGRAM_LIMIT = 32
+_PROGRAM_LIMIT = 32  # media programs whose reports are read
 _NUMBER = re.compile(r"[0-9.]+")
 SILENCE_S: Final = 5.0  # after which a program that has reported has ended
 

@@ -32,7 +32,7 @@ log = logging.getLogger(__name__)
 
 TICK_S = 0.1
 FLOOD_S = 2.0  # so long after a flood of stops others may wait behind it
-MAX_ROBOTS = 1000
+MAX_ROBOTS = 1000  # that one gateway carries; further ones with a warning
 SILENT_S = 30.0  # without a heartbeat a robot is carried so long: three of the slowest pace
 #: Robots that begin in one turn: they wait together for hub and broker. What moves is taken for old while a turn lasts
 #: longer than Beginning.LONG_S.

@@ -23,6 +23,13 @@ def test_every_config_we_ship_is_right(run: Run, path: Path) -> None:
     assert max(map(len, run.out.splitlines())) <= 80
 
 
+def test_check_prints_what_each_key_means(run: Run) -> None:
+    assert run("check", "--keys") == 0
+    assert "| `services.mqtt_bridge.remote_mqtt.host` | `\"\"` |" in run.out
+    assert run("check") == 2
+    assert "name a config" in run.err
+
+
 def test_check_knows_which_transports_there_are(run: Run, tmp_path: Path) -> None:
     assert run("check", config_file(tmp_path, transport={"kind": "zenho"})) == 1
     assert 'transport.kind: no transport "zenho": known are ' in run.err

@@ -164,7 +164,7 @@ class TestOriginal:
         (gone,) = [line for line in load(ORIGINAL, env={}).warnings if "no longer used" in line]
         for key in ("video.shm_size", "audio_publisher.input_shm", "mqtt_bridge.video_control", "heartbeat.qos"):
             assert f" {key}," in gone
-        assert gone.endswith("; docs/configuration.md says what replaces each")
+        assert gone.endswith("; `pebble check --keys` says what replaces each")
 
     def test_few_of_them_are_reported_with_what_replaces_them(self) -> None:
         config = read(at("services.mqtt_bridge.heartbeat", {"qos": 0, "retain": False}))

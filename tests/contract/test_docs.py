@@ -1,4 +1,4 @@
-"""The generated documents are complete and those that lie in docs/."""
+"""The generated documents are complete, and docs/topics.md names every topic and shows payloads that are valid."""
 
 from __future__ import annotations
 
@@ -20,12 +20,21 @@ from pebble.contract.payloads import ChargingLevel, Drive, Heartbeat, TouchSenso
 from pebble.contract.schemas import schemas
 from tests.support import ROOT
 
+PAGE = (ROOT / "docs" / "topics.md").read_text()
 topics_document = functools.cache(topic_docs.topics_document)  # takes half a second
 
 
-@pytest.mark.parametrize("name", [topic_docs.TOPICS, topic_docs.SCHEMAS])
-def test_the_file_in_docs_is_generated_from_the_contract(name: str) -> None:
-    assert (ROOT / "docs" / name).read_text() == topic_docs.documents()[name], "run: python -m pebble.contract.docs"
+#: Rows of docs/topics.md: a topic below the robot, and an example in JSON.
+ROWS = dict(re.findall(r"^\| `((?:incoming|outgoing)/[^`]+)` \|.*?(?:`([^`]+)`.*)?\|$", PAGE, re.MULTILINE))
+
+
+def test_the_page_names_each_topic() -> None:
+    assert set(ROWS) == {channel.suffix for channel in CHANNELS}
+
+
+@pytest.mark.parametrize("channel", [channel for channel in CHANNELS if ROWS.get(channel.suffix, "")[:1] in ("{", "t")])
+def test_an_example_of_the_page_is_valid(channel: Channel) -> None:
+    codec.decode(channel, ROWS[channel.suffix].encode())
 
 
 def test_running_the_module_writes_the_files(tmp_path: Path) -> None:

@@ -109,7 +109,7 @@ def test_four_hundred_robots_are_soon_carried_again(tmp_path: Path) -> None:
 
 @pytest.mark.thorough
 def test_what_a_command_takes_through_a_gateway(tmp_path: Path) -> None:
-    """A figure for docs/fleet.md: how long commands take, and those that a robot at the broker itself receives."""
+    """A figure for docs/many.md: how long commands take, and those that a robot at the broker itself receives."""
     with world(tmp_path, 2, proxied=False) as hall:
         assert until(lambda: len(hall.robots[0].commands) > cases(200, 1000), 60)
         sys.stdout.write(f"\np50 in ms through a gateway, and without: {hall.p50_ms()}\n")

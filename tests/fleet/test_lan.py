@@ -31,7 +31,7 @@ from tests.transports.zenoh_net import HubProcess
 
 pytestmark = [pytest.mark.alone, pytest.mark.thorough, needs_root]
 COUNT, HUB_PORT, BROKER_PORT = 1000, 7447, 1883
-LIMIT_MS = 20.0  # on a machine that does other things; docs/fleet.md and docs/neighbours.md have what was measured
+LIMIT_MS = 20.0  # on a machine that does other things; docs/neighbours.md has what was measured
 BASE, FRED = "pebble/robots/r0", "pebble/robots/fred"
 
 

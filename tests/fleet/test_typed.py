@@ -1,4 +1,4 @@
-"""The six commands and files of docs/fleet.md and docs/neighbours.md as printed; only hosts and ports are others."""
+"""The six commands and files of docs/many.md and docs/neighbours.md as printed; only hosts and ports are others."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def start(line: str, folder: Path, port: int, stack: ExitStack) -> None:
 def test_a_gateway_in_six_commands(tmp_path: Path) -> None:
     port, hub = free_port(), free_port()
     here = {f"{host}:7447": f"127.0.0.1:{hub}" for host in ("broker.lab", "0.0.0.0")}
-    section = Section("fleet.md", "Gateways", {**here, "broker.lab": "127.0.0.1", "8883": str(port)})
+    section = Section("many.md", "Gateways", {**here, "broker.lab": "127.0.0.1", "8883": str(port)})
     *accounts, start_hub, start_gateway = section.lines
     run(f"pebble fleet init hall --host 127.0.0.1 --port {port}", tmp_path)
     with ExitStack() as stack:
@@ -100,7 +100,7 @@ def test_two_robots_of_a_lan_receive_each_other_in_six_commands(tmp_path: Path) 
 
 def test_two_robots_of_a_lan_and_a_board_receive_each_other_in_six_commands(tmp_path: Path) -> None:
     hub, port = free_port(), free_port()
-    section = Section("fleet.md", "A LAN with boards", {"hub.lab": "127.0.0.1"})
+    section = Section("many.md", "A LAN with boards", {"hub.lab": "127.0.0.1"})
     make, *starts, _ = section.lines
     run(f"{make} --port {port}", tmp_path)
     lan = tmp_path / "lan"

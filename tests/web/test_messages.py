@@ -1,18 +1,27 @@
 """The messages between page and server, and what is generated from them."""
 
-import re
+from typing import get_args
 
 import msgspec
 
+from pebble.client import drive_reasons
 from pebble.web import messages, messages_docs
 
 decoder = msgspec.json.Decoder(messages.FromPage)
 
 
-def test_the_documents_are_current():
-    assert messages_docs.DOCS.read_text() == re.sub(r"\n{3,}", "\n\n", messages_docs.markdown())
+def test_the_declarations_are_current():
     assert messages_docs.DECLARATIONS.read_text() == messages_docs.declarations()
-    assert messages_docs.WORDS.read_text() == messages_docs.words()
+
+
+def test_the_tables_have_each_message_and_each_word(tmp_path):
+    messages_docs.main([str(tmp_path)])
+    text = (tmp_path / "web-messages.md").read_text()
+    tags = [f"### `{struct.__struct_config__.tag}`" for name in ("FromPage", "ToPage", "FromReplay")
+            for struct in get_args(getattr(messages, name))]  # fmt: skip
+    assert [tag for tag in [*tags, "### TalkAnswer"] if tag not in text] == []
+    words = (tmp_path / "words.md").read_text()
+    assert [code for code in drive_reasons.WORDS if f"| `{code}` |" not in words] == []
 
 
 def test_what_a_page_sends_is_understood():

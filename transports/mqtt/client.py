@@ -23,7 +23,7 @@ from pebble.transports.settings import MqttSettings
 SEND_BUFFER = 64 * 1024  # bytes in the kernel for a slow connection: with its default a stream would lag by minutes
 _PIECE = 64 * 1024  # bytes that are read at once
 _ENDING_S = 0.2  # after DISCONNECT
-_MOST_IDS = 65_535
+_MOST_IDS = 65_535  # MQTT's packet identifiers have 16 bits
 _NOTSENT_LOWAT = getattr(socket, "TCP_NOTSENT_LOWAT", None)  # not on Windows
 _CORK = getattr(socket, "TCP_CORK", None)  # Linux only
 _NOT_NOW = (BlockingIOError, ssl.SSLWantReadError, ssl.SSLWantWriteError)

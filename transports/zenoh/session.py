@@ -1,7 +1,6 @@
 """Configures, opens and closes the Zenoh sessions of a robot, those of the hub and of its peers alike.
 
-Zenoh's defaults are not used: they listen on all interfaces and join multicast groups. Reasons and measurements are in
-docs/transports.md.
+Zenoh's defaults are not used: they listen on all interfaces and join multicast groups.
 """
 
 import json
@@ -22,7 +21,8 @@ if TYPE_CHECKING:
     from pebble.transports.zenoh.access import Access
 
 # By default connections are accepted, opened and read on separate runtimes: a received message wakes a thread that only
-# wakes another one; docs/transports.md has what that costs. Sending has its own runtime, because a callback may send.
+# wakes another one (11.3 wake-ups in a round trip instead of 7.1, 1.15 times the time one way at 20 Hz). Sending has
+# its own runtime, because a callback may send.
 # There are more threads than connections, so that one is left to wait for the sockets when all others are in callbacks
 # that wait (.callbacks); each takes 15 KB.
 _RUNTIME = "(acc: (handover: rx), net: (handover: rx), rx: (worker_threads: 16))"

@@ -1,8 +1,8 @@
 """The Zenoh transport: processes exchange messages directly, and a hub stores retained messages and wills.
 
-Every process is a peer connected to every sibling process, so that live messages do not need the hub
-(docs/transports.md). A *client* is one ZenohTransport, of either mode: a peer, or with ``settings.client`` a session in
-Zenoh's client mode, which reaches others only through the hub. *Siblings* are the other peers of the run directory.
+Every process is a peer connected to every sibling process, so that live messages do not need the hub. A *client* is one
+ZenohTransport, of either mode: a peer, or with ``settings.client`` a session in Zenoh's client mode, which reaches
+others only through the hub. *Siblings* are the other peers of the run directory.
 """
 
 from __future__ import annotations

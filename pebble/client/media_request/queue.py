@@ -17,9 +17,9 @@ SLOW_ACK_S, FAST_ACK_S = 0.15, 0.12
 SMALL_WINDOW, SMALL_BYTES = 8, 4096
 #: A connection is thin, or far away, if two frames one after the other take longer: commands and echoes wait meanwhile.
 THIN_ACK_S, THIN_FRAMES = 0.4, 2
-MAX_FRAMES: Final = 4
+MAX_FRAMES: Final = 4  # that wait for a viewer; the oldest goes
 SLOW_FRAMES: Final = 1  # JPEG encodings on a slow connection: the next key frame is near, and shows what is newer
-MAX_QUEUED_BYTES: Final = 4 << 20
+MAX_QUEUED_BYTES: Final = 4 << 20  # of these frames
 NO_FRAME: Final = 0xFFFF_FFFF  # the number in an acknowledgement of no frame
 
 _FRESH_FRAMES: Final = 2  # with no more than these in the queue, a key frame does not replace them

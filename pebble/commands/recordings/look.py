@@ -21,7 +21,7 @@ from pebble.recordings.catalogue import FileInfo, Query
 from pebble.recordings.files.recorded import RecordingError
 from pebble.recordings.library import Damages, files, merged, problems, robot_in
 
-_SHOWN_TOPICS = 30
+_SHOWN_TOPICS = 30  # of one recording; the rest is counted
 _ONE_LINE = 1 << 20  # columns
 _CHECKED = 256 << 20  # bytes of files that are read as a whole without being asked to
 Check = Annotated[bool, typer.Option("--check", help="Read all of it; without, of much only the summaries.")]

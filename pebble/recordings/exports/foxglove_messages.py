@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from pebble.media.sound import SoundDecoder
 
 QUALITY: Final = 85  # of the JPEGs that are made of pictures, 1 to 100
-MOST_CHANNELS: Final = 8192
+MOST_CHANNELS: Final = 8192  # of one export; further ones are left out and counted
 #: What media become, and the endings of their topics.
 VIDEO, IMAGE, SOUND = ("CompressedVideo", "video"), ("CompressedImage", "image"), ("RawAudio", "sound")
 

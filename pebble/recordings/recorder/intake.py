@@ -19,8 +19,8 @@ EVENTS: Final = "$recorder/events"
 #: The retained values of a connection are fetched anew: those that are known are no more.
 FORGET: Final = "$recorder/forget"
 _COST: Final = 300  # bytes of memory that a message takes beside its topic and payload
-_MOST_WAITING: Final = 1 << 20
-_MOST_EVENTS: Final = 1000
+_MOST_WAITING: Final = 1 << 20  # messages that wait to be written; the oldest is dropped, with an event
+_MOST_EVENTS: Final = 1000  # events that wait to be written
 _MOST_ROBOTS: Final = 1000  # whose newest message is remembered
 
 

@@ -24,7 +24,7 @@ _LOG_NS: Final = 600 * 10**9
 _CHAIN_NS, _CHAIN_BYTES = 15 * 10**9, 8 << 20
 LIST_S: Final = 1.0  # between two looks at the folder
 _LONGEST_FILE_NS: Final = 25 * 3600 * 10**9
-_MOST_OPEN: Final = 64
+_MOST_OPEN: Final = 64  # files that are open at once
 _NAME: Final = re.compile(r"(?P<stamp>\d{8}T\d{6}Z)-\d{6,}\.(?P<lane>.+?)\.mcap(?:\.active)?")
 
 

@@ -16,7 +16,7 @@ from pebble.client.page import WebSettings
 from pebble.config.web import is_loopback
 from pebble.fleet import certificates
 
-MAX_BODY = 16 * 1024
+MAX_BODY = 16 * 1024  # bytes of a request
 BODY_S = 10.0  # for a body to arrive
 _METHODS = ("GET", "HEAD", "POST")
 _JSON, FORM = "application/json", "application/x-www-form-urlencoded"

@@ -21,7 +21,7 @@ Show = Callable[[str, PictureView], None]
 
 _CHANGE_S: Final = 1.0  # a new encoding begins with a key frame within this time: viewers need no help meanwhile
 _MAX_CHAIN: Final = 240  # pictures since a key frame
-_MAX_CHAIN_BYTES: Final = 8 << 20
+_MAX_CHAIN_BYTES: Final = 8 << 20  # of these pictures
 _HEAD: Final = struct.Struct(">IB")
 _RESCUE_HEAD: Final = struct.Struct(">IBQ")
 

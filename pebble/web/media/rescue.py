@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 PERIOD_S: Final = 0.2
 WIDTH: Final = 480  # pixels, at most
 _QUALITY: Final = 50
-_MAX_WAITING_BYTES: Final = 16 << 20
+_MAX_WAITING_BYTES: Final = 16 << 20  # of pictures that wait to be converted
 
 
 class RescuedPicture(NamedTuple):

@@ -25,11 +25,11 @@ from pebble.web.robots import Robots
 
 SOUND_METRIC: Final = "web/sound"
 ENCODINGS: Final = ("opus", "pcm")  # the best first
-MAX_PAYLOAD: Final = 256 << 10
+MAX_PAYLOAD: Final = 256 << 10  # bytes of one packet
 WINDOW: Final = 32  # packets sent and not acknowledged: what waits in a slow connection cannot be taken back
 MAX_PACKETS, MAX_BYTES = 10, 256 << 10  # that wait before it
 _NAMES: Final = {Codec.OPUS: "opus", Codec.PCM16LE: "pcm"}
-_MAX_ANSWERS: Final = 8
+_MAX_ANSWERS: Final = 8  # that wait for one page
 _HEAD: Final = struct.Struct(">BI")
 _PIECE: Final = struct.Struct(">BII")
 _RECEIVED, _VOICE, _END = range(3)  # what a page sends

@@ -14,7 +14,7 @@ from starlette.websockets import WebSocket, WebSocketDisconnect
 from pebble.web import messages as m
 from pebble.web.recordings import playing
 
-MOST: Final = 8
+MOST: Final = 8  # pages that replay at once
 _decoder = msgspec.json.Decoder(m.FromReplay)
 
 

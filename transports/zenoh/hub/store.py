@@ -14,7 +14,7 @@ log = logging.getLogger(__name__)
 MAX_BYTES = 64 << 20  # of retained messages and wills together
 ROBOT_BYTES = 8 << 20  # of them for the keys of one robot, at a hub of several: none fills the room of all
 RESERVED_BYTES = 16 << 20  # of them, for keys that are reserved: other clients cannot fill these
-MAX_WILLS = 1000
+MAX_WILLS = 1000  # of all sessions; a further one is refused
 RESERVED_WILLS = 100  # of them, for the same keys
 OVERHEAD = 400  # bytes of Python's objects for one record, about
 

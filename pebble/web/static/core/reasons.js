@@ -140,7 +140,7 @@ function oldPicture(s) {
   return say(s, "picture", { age: (s.pictureAgeMs / 1000).toFixed(1) });
 }
 
-/** A state in the server's words, of which docs/words.md has the table. @returns {Reason} */
+/** A state in the server's words, of which WORDS in pebble/client/drive_reasons.py has the table. @returns {Reason} */
 function say(s, code, values = {}) {
   return { code, text: (s.words[code] ?? code).replace(/{(\w+)}/g, (_, name) => values[name] ?? "") };
 }
