@@ -11,7 +11,7 @@ import logging
 import socket
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import zenoh
 
@@ -24,12 +24,14 @@ from pebble.transports.settings import TlsSettings, ZenohSettings
 from pebble.transports.socket_holders import why_not
 from pebble.transports.zenoh.access import Access, read_access
 from pebble.transports.zenoh.hub.admission import Admission
-from pebble.transports.zenoh.hub.journal import Journal
 from pebble.transports.zenoh.hub.store import HubStore
 from pebble.transports.zenoh.hub.worker import HubWorker
 from pebble.transports.zenoh.keymap import topic_to_key
 from pebble.transports.zenoh.presence import Barrier
 from pebble.transports.zenoh.session import HUB_SOCKET, close_at_exit, close_session, open_session, session_config
+
+if TYPE_CHECKING:
+    from pebble.transports.zenoh.hub.journal import Journal
 
 log = logging.getLogger(__name__)
 
@@ -59,8 +61,7 @@ class ZenohHub:
     @property
     def retained(self) -> dict[str, bytes]:
         """What it retains, by topic."""
-        store = self._newest_store
-        return {} if store is None else {one.key: one.payload for one in store.retained()}
+        return {} if self._store is None else {one.key: one.payload for one in self._store.retained()}
 
     @property
     def refused_wills(self) -> int:
@@ -69,13 +70,7 @@ class ZenohHub:
     @property
     def refused(self) -> int:
         """Retained messages and wills there was no room for."""
-        store = self._newest_store
-        return 0 if store is None else store.refused
-
-    @property
-    def _newest_store(self) -> HubStore | None:
-        """The worker's, which it replaces once its journal is read."""
-        return self._store if self._worker is None else self._worker.store
+        return 0 if self._store is None else self._store.refused
 
     def open(self) -> ZenohHub:
         """Start. Raises TransportError if the run directory has a hub already, or cannot be used."""
@@ -153,7 +148,7 @@ class ZenohHub:
         return lock
 
     def _start(self) -> None:
-        journal = None if self._settings.journal is None else Journal(self._settings.journal)
+        journal = None if (file := self._settings.journal) is None else _journal(file)
         reserved = tuple(topic_to_key(topic) + "/" for topic in self._settings.reserved)
         self._store = store = HubStore(reserved, self._settings.max_wills)
         self._worker = HubWorker(self.name, store, self._admission, journal, self.counters)
@@ -192,6 +187,12 @@ class ZenohHub:
             log.error("%s; the robot runs without it: end that process and start the robot again", fact)
             return False
         return True
+
+
+def _journal(file: Path) -> Journal:
+    from pebble.transports.zenoh.hub.journal import Journal  # sqlite3, 2.5 MB
+
+    return Journal(file)
 
 
 def _renewed(tls: TlsSettings) -> Renewed[Any]:

@@ -19,12 +19,30 @@ class Retained(msgspec.Struct, frozen=True, array_like=True, tag="kept"):
     payload: bytes
     stamp: Stamp
 
+    @property
+    def id(self) -> str:
+        """The name of the record that it replaces."""
+        return f"kept {self.key}"
+
+    @property
+    def is_removal(self) -> bool:
+        return not self.payload
+
 
 class StoredWill(msgspec.Struct, frozen=True, array_like=True, tag="will"):
     """A client's will, or its withdrawal."""
 
     name: str
     will: Will | None
+
+    @property
+    def id(self) -> str:
+        """The name of the record that it replaces."""
+        return f"will {self.name}"
+
+    @property
+    def is_removal(self) -> bool:
+        return self.will is None
 
 
 Record = Retained | StoredWill

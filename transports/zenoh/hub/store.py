@@ -35,18 +35,9 @@ class HubStore:
         self._bytes = {True: 0, False: 0}  # by whether the key is reserved
         self._bytes_of: dict[str, int] = {}  # by robot, if none is reserved
 
-    def empty(self) -> HubStore:
-        """An empty one with the same room."""
-        return HubStore(self._reserved, self._max_wills)
-
     def apply(self, record: Record) -> bool:
         """Store a record; False if it changes nothing or there is no room."""
         return self._store_retained(record) if isinstance(record, Retained) else self._store_will(record)
-
-    def take_over(self, newer: HubStore) -> None:
-        """Apply what another store has, which is newer than all that is here."""
-        for record in newer.records():
-            self.apply(record)
 
     def get(self, key: str) -> Retained | None:
         return self._retained.get(key)
