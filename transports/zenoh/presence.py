@@ -57,11 +57,6 @@ class HubWatch:
             self._changed.wait_for(lambda: self.closed or self._view.version != seen, timeout)
             return None if self.closed else self._view
 
-    def reset(self) -> None:
-        """Forget the hubs of a session that was closed; the next one has to be followed."""
-        with self._changed:
-            self._change(hubs=frozenset())
-
     def wait_closed(self, timeout: float) -> None:
         with self._changed:
             self._changed.wait_for(lambda: self.closed, timeout)

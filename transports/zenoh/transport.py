@@ -44,7 +44,6 @@ log = logging.getLogger(__name__)
 OPEN_SYNC_S = 1.0  # the longest wait for siblings that do not answer, when opening,
 SYNC_S = 0.5  # and when subscribing or reconnecting to the hub
 _RETRY_S = 0.2
-_LOOK_S = 1.0  # between two looks at the files of this process in the run directory
 
 
 class ZenohTransport(Transport):
@@ -69,7 +68,6 @@ class ZenohTransport(Transport):
         self._publishers.declared.clear()
         self._loopback = LoopbackQueue(self.counters)
         self._opened = threading.Event()
-        self._lost = ""  # why this process cannot listen where others look for it
         self._thread: threading.Thread | None = None
 
     @property
@@ -177,14 +175,10 @@ class ZenohTransport(Transport):
         if self.settings.client and not self._start_client():
             return
         seen, linked = 0, 0  # version of the newest view handled; its connection that works, 0: none
-        look_s = None if self._presence is None else _LOOK_S
         self._wait_for_siblings_once()
         watch = self._hub.watch
-        while (view := watch.wait(seen, _RETRY_S if watch.hubs and not linked else look_s)) is not None:
+        while (view := watch.wait(seen, _RETRY_S if watch.hubs and not linked else None)) is not None:
             try:
-                if self._presence is not None and not (self._session and self._presence.in_place):
-                    linked = 0 if self._listen_again(self._presence) else linked
-                    continue
                 linked = self._follow(view, seen, linked)
             except Exception:  # any error must lead to a reconnect, never end the thread
                 if self._hub.watch.closed:
@@ -193,50 +187,6 @@ class ZenohTransport(Transport):
                 linked = 0
                 self._hub.watch.wait_closed(HUB_ANSWER_S)
             seen = view.version
-
-    def _listen_again(self, presence: PresenceLock) -> bool:
-        """Open a new session where processes that start now find this one; False if that cannot be: then keep the old.
-
-        Its files, or the whole run directory, were removed: by a cleaner of old files, or when a user logged out.
-        """
-        try:
-            prepare_run_dir(self.settings.run_dir)
-            presence.renew()
-        except (OSError, TransportError) as error:
-            self._report_lost(f"{error}. Until then processes that start again do not reach this one")
-            self._hub.watch.wait_closed(_LOOK_S)
-            return False
-        self._end_session()
-        try:
-            self._listen(presence)
-        except TransportError as error:  # it was removed again
-            self._report_lost(str(error))
-            self._hub.watch.wait_closed(_LOOK_S)
-            return True
-        self._lost = ""
-        log.warning("%s: its socket was removed from %s, it has made a new one", self.client_id, self.settings.run_dir)
-        self._wait_for_siblings_once()
-        return True
-
-    def _end_session(self) -> None:
-        """Close the session without its will: another one of this process follows."""
-        self._set_state(State.CONNECTING)
-        with self._publishing, self._hub.lock:
-            session, self._session = self._session, None
-            self._publishers.declared.clear()
-        if session is None:
-            return
-        with contextlib.suppress(zenoh.ZError):
-            self._hub.leave(session)
-        with self._connecting:
-            close_session(session)
-            self._subscribers.clear()
-        self._hub.watch.reset()
-
-    def _report_lost(self, problem: str) -> None:
-        if problem != self._lost:
-            self._lost = problem
-            log.error("%s: its socket was removed, and it cannot make a new one: %s", self.client_id, problem)
 
     def _wait_for_siblings_once(self) -> None:
         try:

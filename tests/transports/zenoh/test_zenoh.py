@@ -33,7 +33,7 @@ from pebble.transports.zenoh.hub import journal as hub_journal
 from pebble.transports.zenoh.hub import store as hub_store
 from pebble.transports.zenoh.hub.records import Retained, StoredWill
 from pebble.transports.zenoh.hub.store import HubStore
-from tests.support import ROOT, free_port, some, until
+from tests.support import ROOT, free_port, until
 from tests.transports.forked import Forked
 from tests.transports.zenoh_net import HubProcess
 
@@ -184,65 +184,12 @@ def test_retained_messages_published_without_a_hub_arrive_live_and_reach_it_late
     assert until(lambda: [m.payload for m in late] == [b"news"])
 
 
-@pytest.mark.parametrize(
-    "remove",
-    some(
-        [
-            lambda run: shutil.rmtree(run),
-            lambda run: run.rename(run.with_name("moved")),
-            lambda run: (run.rename(run.with_name("moved")), run.mkdir(0o700)),
-            lambda run: [path.unlink() for path in run.glob("*.sock")],
-            lambda run: [path.unlink() for path in run.glob("*.seat")],
-            lambda run: [path.unlink() for path in run.iterdir() if path.suffix != ".sock"],
-            lambda run: (run / "hub.sock").unlink(),
-        ],
-        3,
-    ),
-)
-def test_what_was_removed_from_the_run_directory_is_made_again(robot: Robot, remove: Callable[[Path], object]) -> None:
-    """Those that run go on with each other, and those that start now reach them, and what the hub has stored."""
-    received: list[Message] = []
-    wills: list[Message] = []
-    old = robot.client("old", will=Message("gone", b"old"))
-    other = robot.client("other")
-    other.subscribe("gone", wills.append)
-    old.subscribe("to/old", received.append)
-    other.publish("kept", b"1", qos=DELIVERED, retain=True, remember=False)
-    robot.hub.wait_until_stored()
-    remove(robot.run_dir)
-    assert until(lambda: _works(robot, received))
-    count = len(received)
-    assert until(lambda: other.publish("to/old", b"again") and len(received) > count, step=0.1)
-    late: list[Message] = []
-    robot.client("late").subscribe("kept", late.append)
-    assert until(lambda: [message.payload for message in late] == [b"1"])
-    assert wills == []
-
-
-def _works(robot: Robot, received: list[Message]) -> bool:
-    """Whether a process that starts now is connected to the hub and reaches the others."""
-    count = len(received)
-    if not robot.run_dir.is_dir():
-        return False
-    with contextlib.closing(create("zenoh", "new", robot.settings).open(1)) as new:
-        return new.state is State.CONNECTED and until(
-            lambda: new.publish("to/old", b"new") and len(received) > count, 0.5, step=0.05
-        )
-
-
-def test_a_run_directory_that_cannot_be_made_again_is_reported_and_taken_up_later(
-    robot: Robot, caplog: pytest.LogCaptureFixture
-) -> None:
-    received: list[Message] = []
-    old, other = robot.client("old"), robot.client("other")
-    old.subscribe("to/old", received.append)
-    robot.run_dir.rename(robot.run_dir.with_name("moved"))
-    robot.run_dir.write_text("in the way")
-    assert until(lambda: "its socket was removed, and it cannot make a new one" in caplog.text)
-    assert other.publish("to/old", b"1", qos=DELIVERED)  # meanwhile those that run go on
-    assert until(lambda: received)
-    robot.run_dir.unlink()
-    assert until(lambda: _works(robot, received))
+def test_a_hub_whose_files_were_removed_ends(tmp_path: Path) -> None:
+    with contextlib.closing(ZenohHub(ZenohSettings(run_dir=tmp_path / "run")).open()) as hub:
+        hub.look()
+        shutil.rmtree(tmp_path / "run")
+        with pytest.raises(TransportError, match="was removed: this hub ends"):
+            hub.look()
 
 
 @pytest.mark.thorough

@@ -17,7 +17,6 @@ import zenoh
 
 from pebble.errors import TransportError
 from pebble.transports.counters import Counters
-from pebble.transports.own_file import OwnFile
 from pebble.transports.peers import FileLock, PeerRegistry, new_name, prepare_run_dir
 from pebble.transports.renewed import Renewed
 from pebble.transports.settings import TlsSettings, ZenohSettings
@@ -48,11 +47,9 @@ class ZenohHub:
         self._worker: HubWorker | None = None
         self._store: HubStore | None = None
         self._admission = Admission(settings.wills, settings.unretained)
-        self._listening = OwnFile(self._socket)
         self._certificates = None if settings.tls is None else _renewed(settings.tls)
         self._access = None if (file := settings.access) is None else Renewed([file], lambda: read_access(file))
         self._used = self._newest
-        self._problem = ""  # why clients that start now do not reach this hub
 
     @property
     def _socket(self) -> Path:
@@ -84,37 +81,22 @@ class ZenohHub:
         return self
 
     def look(self) -> None:
-        """Listen again, with all that is stored, if the socket is gone or a certificate or rule changed; call often.
+        """Listen again, with all that is stored, if a certificate or rule changed; call often.
 
-        A cleaner of old files removes sockets, or a logout. Zenoh reads certificates and rules when a session begins.
-        Raises TransportError if it cannot listen there again.
+        Zenoh reads certificates and rules when a session begins. Raises TransportError if it cannot listen there again,
+        or if its files were removed: who started this hub starts another one.
         """
-        lock, worker = self._lock, self._worker
-        if lock is None or worker is None:
+        if self._lock is None or self._worker is None:
             return
-        try:
-            if lock.in_place and self._listening.in_place and not self._is_renewed():
-                return
-            self._lock = lock if lock.in_place else self._take_lock()
-        except (OSError, TransportError) as error:
-            if str(error) != self._problem:
-                self._problem = str(error)
-                log.error("the hub cannot be reached by what starts now: its files were removed, and %s", error)
-            return
-        if lock is not self._lock:
-            lock.release()
-        found = self._listening.in_place
-        if found and not self._is_renewed():
+        if not self._lock.in_place:
+            raise TransportError(f"{self._lock.path} was removed: this hub ends, as what starts now does not reach it")
+        if not self._is_renewed():
             return
         self._used = self._newest
         if self._session is not None:
             close_session(self._session)
-        self._problem = ""
-        self._listen(worker)
-        if found:
-            log.info("the hub uses renewed certificates or rules")
-        else:
-            log.warning("the socket of the hub was removed from %s, it has made a new one", self._settings.run_dir)
+        self._listen(self._worker)
+        log.info("the hub uses renewed certificates or rules")
 
     @property
     def _newest(self) -> tuple[object, Access | None]:
@@ -165,7 +147,6 @@ class ZenohHub:
             self._session = open_session(config)
         except zenoh.ZError as error:
             raise TransportError(f"the hub cannot open {self._socket}: {error}") from None
-        self._listening = OwnFile(self._socket)
         Barrier(self._session, self.name, lambda: 0)
         worker.serve(self._session)
 
