@@ -519,7 +519,7 @@ def recalled(path: Path) -> dict[str, bytes]:
 def test_a_client_connects_to_a_hub_that_has_no_room_for_all_it_retains(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    settings = ZenohSettings(run_dir=tmp_path, reserved=("robot/outgoing",))
+    settings = ZenohSettings(run_dir=tmp_path)
     hub = ZenohHub(settings).open()
     try:
         with create("zenoh", "client", settings) as client:
@@ -528,8 +528,7 @@ def test_a_client_connects_to_a_hub_that_has_no_room_for_all_it_retains(
             assert until(lambda: len(hub.retained) == 2)
             hub.close()
             assert until(lambda: client.state is not State.CONNECTED)
-            monkeypatch.setattr(hub_store, "MAX_BYTES", 10_000)
-            monkeypatch.setattr(hub_store, "RESERVED_BYTES", 5_000)
+            monkeypatch.setattr(hub_store, "MAX_BYTES", 5_000)
             hub = ZenohHub(settings).open()
             assert until(lambda: client.state is State.CONNECTED)
             assert hub.retained.keys() == {"robot/outgoing/x"}
@@ -846,7 +845,7 @@ def test_a_taken_port_keeps_no_robot_from_its_hub(
         fact = f"transport.listen: {endpoint}: Address already in use (by process {os.getpid()} of user {os.getuid()}: "
         with pytest.raises(TransportError, match=re.escape(fact)):  # its endpoints are all that it is for
             ZenohHub(settings).open()
-        hub = ZenohHub(replace(settings, reserved=("x/y/z/outgoing",))).open()
+        hub = ZenohHub(replace(settings, of_robot=True)).open()
         hub.close()
         assert fact in caplog.text
         assert "the robot runs without it: end that process and start the robot again" in caplog.text

@@ -25,7 +25,6 @@ from pebble.transports.zenoh.access import Access, read_access
 from pebble.transports.zenoh.hub.admission import Admission
 from pebble.transports.zenoh.hub.store import HubStore
 from pebble.transports.zenoh.hub.worker import HubWorker
-from pebble.transports.zenoh.keymap import topic_to_key
 from pebble.transports.zenoh.presence import Barrier
 from pebble.transports.zenoh.session import HUB_SOCKET, close_at_exit, close_session, open_session, session_config
 
@@ -131,8 +130,7 @@ class ZenohHub:
 
     def _start(self) -> None:
         journal = None if (file := self._settings.journal) is None else _journal(file)
-        reserved = tuple(topic_to_key(topic) + "/" for topic in self._settings.reserved)
-        self._store = store = HubStore(reserved, self._settings.max_wills)
+        self._store = store = HubStore(self._settings.max_wills)
         self._worker = HubWorker(self.name, store, self._admission, journal, self.counters)
         self._listen(self._worker)
 
@@ -163,7 +161,7 @@ class ZenohHub:
             if not isinstance(error, OSError) or error.errno != errno.EADDRINUSE:
                 return True  # Zenoh says what is wrong with it
             fact = f"transport.listen: {endpoint}: {why_not(error, int(port))}"
-            if not self._settings.reserved:
+            if not self._settings.of_robot:
                 raise TransportError(f"{fact}; end it, or name another port") from None
             log.error("%s; the robot runs without it: end that process and start the robot again", fact)
             return False

@@ -7,11 +7,6 @@ import msgspec
 from pebble.transports.zenoh.wire import Stamp, Will
 
 
-def robot_of(key: str) -> str:
-    """The levels of ``key`` that are a robot's base: an account of a robot retains there only."""
-    return "/".join(key.split("/", 3)[:3])
-
-
 class Retained(msgspec.Struct, frozen=True, array_like=True, tag="kept"):
     """One retained message, or the removal of one if ``payload`` is empty."""
 

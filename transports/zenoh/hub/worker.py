@@ -17,10 +17,9 @@ from pebble.transports.counters import Counters
 from pebble.transports.zenoh import wire
 from pebble.transports.zenoh.callbacks import direct
 from pebble.transports.zenoh.hub.admission import Admission
-from pebble.transports.zenoh.hub.intake import Intake
+from pebble.transports.zenoh.hub.intake import Intake, Task
 from pebble.transports.zenoh.hub.records import Record, Retained, StoredWill
 from pebble.transports.zenoh.hub.store import HubStore
-from pebble.transports.zenoh.hub.turns import Task
 from pebble.transports.zenoh.hub.waiting import WaitingQueries
 from pebble.transports.zenoh.hub.wills import WillTimes
 from pebble.transports.zenoh.keymap import topic_to_key
@@ -56,14 +55,13 @@ class HubWorker:
             self.post(self._await_return)
         self._session = session
         # Its own messages would wait for room in the queue that this thread empties.
-        others, retain = zenoh.Locality.REMOTE, direct(partial(self._intake.retain, self._store_retained))
-        session.declare_subscriber(wire.RETAINED + "**", retain, allowed_origin=others)
+        retain = direct(lambda sample: self._intake.receive(partial(self._store_retained, sample), len(sample.payload)))
+        session.declare_subscriber(wire.RETAINED + "**", retain, allowed_origin=zenoh.Locality.REMOTE)
         session.declare_queryable(wire.RETAINED + "**", direct(partial(self._intake.ask, self._query)), complete=True)
         for what, work in ((wire.HELLO, self._on_hello), (wire.BYE, self._on_bye)):
-            session.declare_queryable(what, self._queued(work))
-            session.declare_queryable(f"{what}/*", direct(partial(self._intake.greet, work)))
-        come = direct(partial(self._intake.come, self._on_client))
-        session.liveliness().declare_subscriber(wire.LIVE + "*", come, history=True)
+            for key in (what, f"{what}/*"):
+                session.declare_queryable(key, direct(partial(self._intake.greet, work)))
+        session.liveliness().declare_subscriber(wire.LIVE + "*", self._queued(self._on_client), history=True)
         session.liveliness().declare_subscriber(wire.UP + "*", direct(self._on_hub), history=True)
         self._token = session.liveliness().declare_token(wire.UP + self._name)
         if not self._thread.is_alive():
@@ -128,17 +126,15 @@ class HubWorker:
             needs = wire.decode_counts(_payload(query))
         except (ValueError, msgspec.DecodeError):
             query.drop()  # type: ignore[no-untyped-call]
-            self._intake.answered()
             raise
         if not self._waiting.add(needs, query, time.monotonic()):
             self._answer(query)
 
     def _answer_waiting(self) -> None:
         for query in self._waiting.take(time.monotonic()):
-            self._intake.in_turn(self._answer, query)
+            self._intake.ask(self._answer, query)
 
     def _answer(self, query: zenoh.Query) -> None:
-        self._intake.answered()
         with query:
             for retained in self._selected(query.key_expr):
                 query.reply(wire.RETAINED + retained.key, retained.payload, attachment=retained.stamp.pack())
@@ -157,7 +153,7 @@ class HubWorker:
     def _on_hello(self, query: zenoh.Query) -> None:
         with query:
             account = wire.account_of(str(query.key_expr), wire.HELLO)
-            admitted = self._admission.hello(account, wire.decode_hello(_payload(query)), self._store.wills())
+            admitted = self._admission.hello(account, wire.decode_hello(_payload(query)))
             if admitted is None:
                 return
             hello = admitted
@@ -194,8 +190,7 @@ class HubWorker:
     def _on_client(self, sample: zenoh.Sample) -> None:
         name = str(sample.key_expr).removeprefix(wire.LIVE)
         if sample.kind == zenoh.SampleKind.PUT:
-            if self._admission.sessions(name, self.alive_clients):
-                self.alive_clients.add(name)
+            self.alive_clients.add(name)
             self._wills.forget(name)
             return
         self.alive_clients.discard(name)
