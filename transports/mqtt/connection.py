@@ -207,7 +207,7 @@ class Connection:
         if not poll.registered:
             self._register()
         if client.socket is None:
-            raise self._lost
+            raise self.incoming.lost
         blocked, waiting = bool(client.waiting), incoming.age.waiting
         began = now = clock.since_boot()
         wait = min(timeout, self.pings.due_at - began)
@@ -229,7 +229,7 @@ class Connection:
     def _register(self) -> None:
         with self._lock:
             if self._client.socket is None:
-                raise self._lost
+                raise self.incoming.lost
             self._poll.register(self._client.socket)
 
     def _write(self) -> None:
@@ -334,16 +334,12 @@ class Connection:
     @property
     def where(self) -> str:
         """The broker, in words."""
-        return self.incoming.ending.where
+        return self.incoming.where
 
     @property
     def socket(self) -> socket.socket | None:
         """None once it is lost."""
         return self._client.socket
-
-    @property
-    def _lost(self) -> Lost:
-        return self.incoming.ending.lost(accepted=self.incoming.accepted is not None, asked=self._in_flight.asked)
 
     @property
     def has_room(self) -> bool:
@@ -402,7 +398,7 @@ class Connection:
     def written_before_loss(self) -> dict[str, int] | None:
         """What the other side may have closed the connection for; None: it has not, or for another reason."""
         with self._lock:
-            ending = self.incoming.ending
-            if not (ending.may_concern_message or (self._client.hung_up and not ending.reason)):
+            incoming = self.incoming
+            if not (incoming.may_concern_message or (self._client.hung_up and not incoming.reason)):
                 return None
             return self._in_flight.first_written(clock.since_boot())

@@ -20,7 +20,7 @@ from pebble.errors import TransportError
 from pebble.transports import clock
 from pebble.transports.ages import MessageAges
 from pebble.transports.base import Message, QoS, State, Subscription, Transport
-from pebble.transports.peers import PresenceLock, new_name, prepare_run_dir
+from pebble.transports.peers import PeerRegistry, PresenceLock, new_name, prepare_run_dir
 from pebble.transports.settings import ZenohSettings
 from pebble.transports.topics import is_pattern
 from pebble.transports.zenoh import wire
@@ -28,7 +28,7 @@ from pebble.transports.zenoh.callbacks import direct
 from pebble.transports.zenoh.hub_connection import GOODBYE_S, HUB_ANSWER_S, HubConnection
 from pebble.transports.zenoh.keymap import filter_to_key, key_to_topic
 from pebble.transports.zenoh.loopback_queue import LoopbackQueue
-from pebble.transports.zenoh.presence import HubView, Siblings
+from pebble.transports.zenoh.presence import Barrier, HubView
 from pebble.transports.zenoh.publishers import Publishers
 from pebble.transports.zenoh.session import (
     HUB_SOCKET,
@@ -52,6 +52,7 @@ class ZenohTransport(Transport):
     def __init__(self, client_id: str, settings: ZenohSettings, *, will: Message | None = None) -> None:
         super().__init__(client_id, will=will)
         self.settings = settings
+        self._elsewhere = bool(settings.client and settings.connect)  # its hub is, with siblings that it does not know
         self._connecting = threading.RLock()  # held while subscribing, and while a connection is made
         self._subscribers: dict[Subscription, zenoh.Subscriber[None]] = {}
         self._publishers = Publishers(lambda topic: self.is_invented(topic))
@@ -62,7 +63,8 @@ class ZenohTransport(Transport):
         self._hub.open()
         self._pid = os.getpid()
         self._ages = MessageAges(wire.BOOT, self.settings.lease_ms / 1000)
-        self._siblings = Siblings(self.settings)
+        self._siblings = PeerRegistry(self.settings.run_dir)
+        self._barrier: Barrier | None = None  # of the newest session
         self._presence: PresenceLock | None = None
         self._session: zenoh.Session | None = None
         self._publishers.declared.clear()
@@ -136,7 +138,7 @@ class ZenohTransport(Transport):
                 return False
             self._hub.name, self._session = name, session
             self._publishers.declared.clear()
-        self._siblings.begin(session, name, self._hub.watch, lambda: self._hub.retained_count)
+        self._barrier = Barrier(session, name, lambda: self._hub.retained_count, by_name=self._elsewhere)
         with self._connecting:
             for subscription in self._subscriptions:
                 self._start(session, subscription)
@@ -163,7 +165,7 @@ class ZenohTransport(Transport):
             if will is not None:
                 self._send(will, False)
                 self._hub.leave(session)
-            self._siblings.synchronize(GOODBYE_S)  # when they answer, they have received our last messages
+            self._synchronize(GOODBYE_S)  # when they answer, they have received our last messages
         except zenoh.ZError as error:
             log.warning("%s could not close in order: %s", self.client_id, error)
         finally:
@@ -188,9 +190,20 @@ class ZenohTransport(Transport):
                 self._hub.watch.wait_closed(HUB_ANSWER_S)
             seen = view.version
 
+    def _synchronize(self, timeout: float) -> dict[str, int]:
+        """Wait until all that run surely know our declarations; return how many retained messages each has sent."""
+        if self._barrier is None:
+            return {}
+
+        def expected() -> dict[str, str]:
+            siblings = {} if self._elsewhere else self._siblings.ready(but=self._hub.name)
+            return siblings | dict.fromkeys(self._hub.watch.hubs, "the hub")
+
+        return self._barrier.synchronize(expected, timeout)
+
     def _wait_for_siblings_once(self) -> None:
         try:
-            self._siblings.synchronize(OPEN_SYNC_S)
+            self._synchronize(OPEN_SYNC_S)
         except zenoh.ZError as error:  # closed meanwhile
             log.debug("%s could not synchronize with its siblings: %s", self.client_id, error)
         self._opened.set()
@@ -253,7 +266,7 @@ class ZenohTransport(Transport):
             with self._hub.lock:
                 self._hub.renew()
                 self._renew()
-            counts = self._siblings.synchronize(SYNC_S)  # after _renew: messages received live meanwhile are newer
+            counts = self._synchronize(SYNC_S)  # after _renew: messages received live meanwhile are newer
             self._hub.fetch(self._session, list(self._subscribers), counts)
 
     # -- sending
@@ -290,7 +303,7 @@ class ZenohTransport(Transport):
             with contextlib.suppress(zenoh.ZError):  # closed meanwhile: then nothing is received any more
                 for subscription in subscriptions:
                     self._start(session, subscription)
-                counts = self._siblings.synchronize(SYNC_S)
+                counts = self._synchronize(SYNC_S)
                 if self._state is State.CONNECTED:
                     self._hub.fetch(session, subscriptions, counts)
 
