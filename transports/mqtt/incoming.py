@@ -4,7 +4,7 @@ import logging
 from typing import Protocol
 
 from pebble.transports import clock
-from pebble.transports.base import Message, QoS
+from pebble.transports.base import Message, QoS, TopicPolicy
 from pebble.transports.counters import Counters
 from pebble.transports.mqtt import reasons
 from pebble.transports.mqtt.bridge_mode import Result
@@ -29,8 +29,7 @@ _LACKS = {reasons.NO_RETAIN: Result.RETAIN_REFUSED, reasons.NO_QOS: Result.QOS_R
 class Sink(Protocol):
     """What is called on the network thread with the connection's lock held: it must neither wait nor publish."""
 
-    def skips_retained(self, topic: bytes, /) -> bool:
-        """Whether a retained message of this topic is not wanted."""
+    policy: TopicPolicy
 
     def note_refusal(self, topic: str, why: str) -> None:
         """The broker does not take a message of this topic (MQTT 5)."""
@@ -110,7 +109,7 @@ class Incoming:
             if self._packets == before:
                 break
             unread, now = left, clock.since_boot()
-        if size and self.pings.is_patient:  # any sign of life: answers wait behind what others have published
+        if size and self.pings.is_thin:  # any sign of life: answers wait behind what others have published
             self.answered_at = clock.since_boot()
         if age.has_retained or (size and self._packets == first):  # the latter is a piece of a long message
             age.note_arriving()
@@ -205,7 +204,7 @@ class Incoming:
         if self.messages:
             return False  # what came before may change the answer
         try:
-            skipped = self._sink.skips_retained(topic)
+            skipped = self._sink.policy.skips_retained(topic)
         except Exception:  # foreign code on our thread
             log.exception("asking whether to skip a retained message of %r failed", topic)
             return False

@@ -55,7 +55,7 @@ class ZenohTransport(Transport):
         self._elsewhere = bool(settings.client and settings.connect)  # its hub is, with siblings that it does not know
         self._connecting = threading.RLock()  # held while subscribing, and while a connection is made
         self._subscribers: dict[Subscription, zenoh.Subscriber[None]] = {}
-        self._publishers = Publishers(lambda topic: self.is_invented(topic))
+        self._publishers = Publishers(lambda topic: self.policy.is_invented(topic))
         self._hub = HubConnection(client_id, will, self._own, self.count_received, settings.account)
         self._reset()
 
@@ -347,7 +347,7 @@ class ZenohTransport(Transport):
         Retained messages are accepted in any case, because they are not sent again; and stops: none is ever too late.
         """
         topic = key_to_topic(str(sample.key_expr))
-        if not stamp.boot or self.is_stop(topic):
+        if not stamp.boot or self.policy.is_stop(topic):
             return False
         age_s = self._ages.age_s(stamp.boot, topic, stamp.sent_ns / 1e9, now)
         if stamp.retain_requested or age_s <= self._ages.late_s:
