@@ -10,10 +10,10 @@ from pebble.transports.mqtt import reasons
 from pebble.transports.mqtt.bridge_mode import Result
 from pebble.transports.mqtt.client import Client
 from pebble.transports.mqtt.ending import Lost, Refused, Silent
-from pebble.transports.mqtt.outgoing import InFlightTable
+from pebble.transports.mqtt.outgoing import InFlightTable, readable_bytes
 from pebble.transports.mqtt.packets import ANY_QOS, RETAIN, Accepted, MalformedError
 from pebble.transports.mqtt.pings import Pings
-from pebble.transports.mqtt.read_age import ReadAge, readable_bytes
+from pebble.transports.mqtt.read_age import ReadAge
 from pebble.transports.settings import MqttSettings
 from pebble.transports.topics import MAX_BYTES
 

@@ -238,7 +238,7 @@ class ZenohTransport(Transport):
         sent: set[str] = set()
         while (left := end - time.monotonic()) > 0:  # looked at once: Zenoh refuses what is not positive
             with self._publishing:  # which takes a moment on a busy machine
-                hello = self._hub.hello(session)
+                hello = self._hub.hello()
             lacking = self._hub.greet(session, hello, left)
             if lacking is None:
                 return False
