@@ -106,7 +106,7 @@ class Intake:
 
     def _has_room(self, size: int) -> bool:
         """Return True for a task that is larger than all the room if it would have it to itself."""
-        return not self._tasks or self._bytes + size <= QUEUE_BYTES
+        return not self._bytes or self._bytes + size <= QUEUE_BYTES
 
     def _note_dropped(self) -> None:
         self.dropped += 1
