@@ -28,7 +28,7 @@ class EndSignal:
         signal.set_wakeup_fd(self._wakeup.set_fileno, warn_on_full_buffer=False)
         for number in _numbers():
             if signal.getsignal(number) is not signal.SIG_IGN:
-                signal.signal(number, lambda *_: None)
+                signal.signal(number, lambda *_: self.set())
 
     def set(self) -> None:
         self._wakeup.set()
