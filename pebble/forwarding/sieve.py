@@ -1,26 +1,24 @@
 """What leaves a robot over a thin link: of each stream the newest, so often, and nothing that can wait for room.
 
+Pure: the owner guards it, and passes on what comes out of it.
+
 Stops and whatever else is on its way *to* the robot never come here, nor do flags, and states that are ``prompt``.
 """
 
-import threading
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from enum import IntEnum
 from math import inf
 
 from msgspec import Struct
 
 from pebble.contract import Kind
-from pebble.forwarding.routing import Drop, Forward, Side
-from pebble.forwarding.side import Gate, Sides, SideState
+from pebble.forwarding.routing import Forward
 from pebble.forwarding.subjects import Subject
 from pebble.transports import Message, QoS
 from pebble.transports.counters import Counters
 
 TOPICS = 512  # of which the newest message waits, or is known to have been sent
 OVERDUE_S = 10.0  # what has waited for so long gives way no more
-
-Pass = Callable[[SideState, Subject, Message, Forward], Forward | Drop]
 
 
 class Rank(IntEnum):
@@ -42,9 +40,7 @@ class Waiting(Struct, frozen=True):
 
 
 class Sieve:
-    """Pure: the owner guards it, and passes on what comes out of it.
-
-    ``takes(rank, size)`` is whether so many bytes are sent now; times are those of ``clock``.
+    """``takes(rank, size)`` is whether so many bytes are sent now; times are those of ``clock``.
 
     ``stream_s``: seconds between two messages of a stream, at least. Counted as ``thinned`` are those that more of
     their stream followed, and as ``shed`` messages for which there was no room while there was a newer one.
@@ -152,48 +148,3 @@ def _rank(subject: Subject, message: Message) -> Rank | None:
     if subject.kind is Kind.STREAM or (subject.kind is Kind.EVENT and message.qos is QoS.LATEST):
         return Rank.STREAM
     return Rank.STATE if subject.kind is Kind.STATE else None
-
-
-class Sifter:
-    """Passes messages on by ``pass_``, which publishes one on the other side, or says why not; thread-safe."""
-
-    def __init__(self, sides: Sides, pass_: Pass) -> None:
-        self._sides, self._pass = sides, pass_
-        self._sieve: Sieve | None = None
-        self._lock = threading.RLock()  # so that a message which has waited is not sent after a newer one
-        #: Passes a message on now or later. Hot.
-        self.forward = pass_
-
-    def use(self, sieve: Sieve | None) -> None:
-        """From now on what leaves the robot passes ``sieve``, whose owner calls :meth:`send_waiting`; None: no more."""
-        with self._lock:
-            before, self._sieve = self._sieve, sieve
-            self.forward = self._pass if sieve is None else self._sift
-            events = self._sides[Side.REMOTE].events
-            events.has_room = None if sieve is None else sieve.takes_event
-            if before is not None and sieve is None:
-                self._send(before.empty())
-                events.resume()
-
-    def send_waiting(self) -> None:
-        """Send what waits in the sieve, as far as there is room."""
-        with self._lock:
-            if self._sieve is not None:
-                self._send(self._sieve.due(Rank.STATE))
-                self._sides[Side.REMOTE].events.resume()
-                self._send(self._sieve.due(Rank.STREAM))
-
-    def _send(self, waiting: Iterable[Waiting]) -> None:
-        here = self._sides[Side.LOCAL]
-        for one in waiting:
-            if isinstance(self._pass(here, one.subject, one.message, one.forward), Forward):
-                here.count_forwarded()
-
-    def _sift(self, here: SideState, subject: Subject, message: Message, forward: Forward) -> Forward | Drop:
-        if here.side is not Side.LOCAL or subject.prompt:
-            return self._pass(here, subject, message, forward)
-        with self._lock:
-            sieve = self._sieve
-            if sieve is not None and self._sides.gate is Gate.OPEN and sieve.keeps(subject, message, forward):
-                return Drop.NO_ROOM
-            return self._pass(here, subject, message, forward)
