@@ -105,13 +105,14 @@ class Subscription:
         As-published connections cannot distinguish retained from live; their backend sets ``repeat`` when it is sure
         that the message is a repetition.
         """
+        transport = self._transport
         with self._lock:
             if self._closed:
                 return
             if not self._delivered_topics.has(message.topic):
                 self._delivered_topics[message.topic] = None
-            elif repeat if self._transport.as_published else message.retain and not self._transport.delivers_late:
-                self._transport.counters.add("stale")
+            elif repeat if transport.as_published else message.retain and not transport.policy.delivers_late:
+                transport.counters.add("stale")
                 return
             if self._thread is None:
                 self._call(message)
@@ -208,6 +209,25 @@ class Subscriptions:
             return found
 
 
+@dataclass(slots=True)
+class TopicPolicy:
+    """What the owner of a transport knows of topics and wants of retained messages; it sets them before it opens it."""
+
+    #: Whether a topic is one of stops: where a backend refuses messages because too many wait, it still takes these.
+    is_stop: Callable[[str], bool] = lambda _topic: False
+    #: Whether a topic is one of any number that strangers invent: a backend then stores nothing for it.
+    is_invented: Callable[[str], bool] = lambda _topic: False
+    #: Whether retained messages of a topic (UTF-8) may be discarded before anything else is done with them: strangers
+    #: plant 100,000. Called with locks held: it must neither wait nor publish. A backend may ignore it.
+    skips_retained: Callable[[bytes], bool] = lambda _topic: False
+    #: Deliver a retained message also after a live one of its topic (T8): the live one may have been our own. The owner
+    #: then decides which of them counts.
+    delivers_late: bool = False
+    #: What is published in place of a message, in this order; the outcome of the first is that of
+    #: :meth:`Transport.publish`. None: the message itself.
+    forms: Callable[[Message], Iterable[Message]] | None = None
+
+
 class Transport(ABC):
     """One client of a publish/subscribe network: the shared behaviour; a backend supplies the abstract methods.
 
@@ -224,27 +244,15 @@ class Transport(ABC):
     #: Whether the newest connection ended because the other end went down, and it was down at every try since: then no
     #: client can have published there meanwhile without our receiving it.
     was_ended: bool = True
-    #: Deliver a retained message also after a live one of its topic (T8): the live one may have been our own. The owner
-    #: then decides which of them counts.
-    delivers_late: bool = False
-    #: Whether retained messages of a topic (UTF-8) may be discarded before anything else is done with them: strangers
-    #: plant 100,000. Called with locks held: it must neither wait nor publish. A backend may ignore it.
-    skips_retained: Callable[[bytes], bool] = staticmethod(lambda _topic: False)
-    #: Whether a topic is one of any number that strangers invent: a backend then stores nothing for it.
-    is_invented: Callable[[str], bool] = staticmethod(lambda _topic: False)
-    #: Whether a topic is one of stops: where a backend refuses messages because too many wait, it still takes these.
-    is_stop: Callable[[str], bool] = staticmethod(lambda _topic: False)
-    #: Whether the way to the other end is slow: keep little in the kernel, where nothing can go ahead of what waits,
+    #: Whether the link to the other end is thin: keep little in the kernel, where nothing can go ahead of what waits,
     #: and wait longer for answers, with fewer questions. Set by :meth:`suit_link`; a backend may ignore it.
-    is_slow: bool = False
-    #: What is published in place of a message, in this order; the outcome of the first is that of :meth:`publish`.
-    #: None: the message itself.
-    forms: Callable[[Message], Iterable[Message]] | None = None
+    is_thin: bool = False
 
     def __init__(self, client_id: str, *, will: Message | None = None) -> None:
         if will is not None:
             check_topic(will.topic)
         self.client_id, self.will = client_id, will
+        self.policy = TopicPolicy()
         self.counters = Counters()
         self._count_sent, self.count_received = map(self.counters.adder, ("sent", "received"))
         #: One line that explains why there is no connection; empty while there is one.
@@ -283,24 +291,9 @@ class Transport(ABC):
         more = f" and {len(refused) - _NAMED} more" if len(refused) > _NAMED else ""
         return f"it refuses to deliver {', '.join(refused[:_NAMED])}{more}" if refused else ""
 
-    def judge_topics(
-        self,
-        *,
-        is_stop: Callable[[str], bool] | None = None,
-        is_invented: Callable[[str], bool] | None = None,
-        skips_retained: Callable[[bytes], bool] | None = None,
-        delivers_late: bool | None = None,
-        forms: Callable[[Message], Iterable[Message]] | None = None,
-    ) -> None:
-        """Set what the owner knows of topics and wants of retained messages, before :meth:`open`; None: as it was."""
-        self.is_stop, self.is_invented = is_stop or self.is_stop, is_invented or self.is_invented
-        self.skips_retained = skips_retained or self.skips_retained
-        self.forms = forms or self.forms
-        self.delivers_late = self.delivers_late if delivers_late is None else delivers_late
-
-    def suit_link(self, *, slow: bool) -> None:
-        """Suit the way to the other end, from now on: see `is_slow`."""
-        self.is_slow = slow
+    def suit_link(self, *, thin: bool) -> None:
+        """Suit the link to the other end, from now on: see `is_thin`."""
+        self.is_thin = thin
 
     def renew_connection(self, why: str) -> None:  # noqa: B027 - where no other end keeps messages, nothing is to be done
         """End the connection and make another: what waits for it at the other end is dropped there."""
@@ -369,10 +362,10 @@ class Transport(ABC):
         if not isinstance(payload, bytes):
             raise TransportError(f"payload of {topic} must be bytes, not {type(payload).__name__}")
         message = Message(topic, payload, qos if type(qos) is QoS else QoS(qos), retain)
-        if self.forms is None:
+        if (forms := self.policy.forms) is None:
             return self._publish(message, urgent=urgent, remember=remember, shared=shared)
-        each = [self._publish(one, urgent=urgent, remember=remember, shared=shared) for one in self.forms(message)]
-        return each[0]
+        first, *_ = [self._publish(form, urgent=urgent, remember=remember, shared=shared) for form in forms(message)]
+        return first
 
     def _publish(self, message: Message, *, urgent: bool, remember: bool, shared: bool) -> bool:
         with self._publishing:

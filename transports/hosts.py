@@ -11,7 +11,7 @@ STEADY_S = 30.0  # an address that held a connection for so long is tried once m
 _LONGEST = 8  # addresses whose failures are described one by one
 
 
-class Place(NamedTuple):
+class HostPort(NamedTuple):
     """A host as it is named in a config, and its port."""
 
     host: str
@@ -63,14 +63,14 @@ def described(failures: dict[str, str]) -> str:
     return "; ".join(some) + (f"; and {more} more" if more else "")
 
 
-class Turns:
+class AddressRound:
     """Whose turn it is among the addresses of one host, which is resolved anew in each round.
 
     A round ends when each address has failed once; only then there is a pause.
     """
 
-    def __init__(self, place: Place, resolve: Callable[[str, int], list[Address]] = addresses_of) -> None:
-        self.place, self._resolve = place, resolve
+    def __init__(self, host_port: HostPort, resolve: Callable[[str, int], list[Address]] = addresses_of) -> None:
+        self.host_port, self._resolve = host_port, resolve
         self._left: list[Address] = []  # of this round; the first one has its turn
         self.several = False  # another address has its turn after a failure, without a pause
         self._steady: Address | None = None  # has lost a connection that held for long: begins the next round
@@ -81,7 +81,7 @@ class Turns:
     def address(self) -> Address:
         """The address whose turn it is; may wait for a resolver. Raises OSError, ValueError."""
         if not self._left:
-            found = self._resolve(*self.place)
+            found = self._resolve(*self.host_port)
             if not found:
                 raise OSError("it has no address")
             self._left = sorted(found, key=lambda one: one != self._steady)
@@ -93,7 +93,7 @@ class Turns:
     @property
     def where(self) -> str:
         """The broker in words; with its address if the host has several."""
-        return f"broker {self.place}" + (f" at {self._left[0].text}" if self.several and self._left else "")
+        return f"broker {self.host_port}" + (f" at {self._left[0].text}" if self.several and self._left else "")
 
     @property
     def untried(self) -> bool:

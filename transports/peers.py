@@ -17,7 +17,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from pebble.errors import TransportError
-from pebble.transports.own_file import OwnFile, identity
+from pebble.transports.own_file import identity
 from pebble.transports.socket_paths import check_socket_path
 
 log = logging.getLogger(__name__)
@@ -122,44 +122,20 @@ class FileLock:
 
 
 class PresenceLock:
-    """The lock that marks one running process in the run directory, and the path of its socket.
-
-    One thread may renew it while another releases it.
-    """
+    """The lock that marks one running process in the run directory, and the path of its socket."""
 
     def __init__(self, run_dir: Path, name: str, owner: str, lock: FileLock) -> None:
         self.name, self._owner = name, owner
         self.socket = run_dir / f"{name}.sock"
         self._lock = lock
-        self._listening = OwnFile(self.socket)
         self._changing = threading.Lock()  # guards what follows, and the descriptor of the lock
         self._released = False
 
     def ready(self) -> None:
         """Mark the process as reachable: from now on newcomers wait for its answer."""
-        self._listening = OwnFile(self.socket)
         with self._changing:
             if not self._released:
                 self._lock.write(self._owner.encode() or b"?")
-
-    @property
-    def in_place(self) -> bool:
-        """Whether newcomers find this process; a folder that cannot be read is no answer."""
-        try:
-            return self._lock.in_place and self._listening.in_place
-        except OSError:
-            return True
-
-    def renew(self) -> None:
-        """Lock a file that was removed again; not `ready` any more. Raises TransportError if there can be none."""
-        with self._changing:
-            if self._released:
-                return
-            if not self._lock.in_place:
-                lock = FileLock.wait(self._lock.path)
-                self._lock.release()
-                self._lock = lock
-            self._lock.write(b"")
 
     def release(self) -> None:
         _clear_socket(self.socket)

@@ -56,7 +56,7 @@ class ZenohSettings:
     lease_ms: int = 2000
     client: bool = False  # a short-lived tool: connects to the hub only, opens no socket of its own
     journal: Path | None = None  # where the hub stores retained messages and wills; only the hub reads it
-    reserved: tuple[str, ...] = ()  # topics below these have room of their own in the hub
+    of_robot: bool = False  # a robot's hub runs without an endpoint whose port is taken
     #: Whether the hub takes a will, by filters of its topic: the last one that matches decides; without one it does.
     wills: tuple[tuple[str, bool], ...] = ()
     unretained: tuple[str, ...] = ()  # filters of topics on which the hub retains nothing

@@ -41,7 +41,7 @@ class Broker:
         #: Whether a robot, by its base, takes commands only with a name.
         self.is_named: Callable[[str], bool] = lambda _base: False
         self.names = NamedTopics(settings.username or "", lambda base: self.is_named(base))
-        self.transport.judge_topics(forms=self.names.forms)
+        self.transport.policy.forms = self.names.forms
 
     @property
     def loop(self) -> asyncio.AbstractEventLoop:

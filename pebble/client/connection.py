@@ -120,7 +120,7 @@ def _account(settings: Any) -> str | None:
 def put_names(transport: Transport, names: Names, is_named: Callable[[str], bool]) -> None:
     """From now on commands have this client's name in their topics, to robots that take them only so."""
     if names.account is not None:
-        transport.judge_topics(forms=NamedTopics(names.account, is_named).forms)
+        transport.policy.forms = NamedTopics(names.account, is_named).forms
 
 
 def _of_config(config: Config, target: Target) -> tuple[str, Any, Names, str]:

@@ -21,7 +21,7 @@ MOST_BOARDS = 16  # of one file that have neighbours: each has two connections a
 
 
 class GatewayHub(ZenohSection, frozen=True, kw_only=True):
-    """The hub, or several that are linked."""
+    """The hub."""
 
     account: Annotated[Account, doc("Its account at a hub with `access`: the name (CN) in tls.client_cert.")] = ""
 

@@ -121,7 +121,7 @@ class Forwarder:
         self.mirroring = Mirroring(self.sides)
         self.sifter = Sifter(self.sides, self._pass)
         for transport in transports.values():
-            transport.judge_topics(is_stop=self._is_stop)
+            transport.policy.is_stop = self._is_stop
 
     @property
     def gate(self) -> Gate:
@@ -167,7 +167,7 @@ class Forwarder:
     # -- the receiving threads
 
     def skips_retained(self, side: Side, topic: bytes) -> bool:
-        """Whether a retained message of ``topic`` does not pass, whatever it is: for Transport.skips_retained."""
+        """Whether a retained message of ``topic`` does not pass, whatever it is: for TopicPolicy.skips_retained."""
         kind = self._subjects.invented(topic)
         if self._names is not None and topic.endswith(_STOP) and self._is_stop(topic.decode(errors="replace")):
             return False  # it may be a live one

@@ -119,7 +119,7 @@ class RetainedTopics:
     def _reconcile(self, here: SideState, subject: Subject, message: Message, *, old: bool) -> Drop | None:
         """Why a two-way message must not pass; None if it may."""
         side, topic, payload, transport = here.side, message.topic, message.payload, here.transport
-        if message.retain and topic in here.seen and transport.delivers_late and not transport.as_published:
+        if message.retain and topic in here.seen and transport.policy.delivers_late and not transport.as_published:
             return Drop.KNOWN  # older than what was seen
         if len(here.seen) < _MAX_WAITING:
             here.seen.add(topic)

@@ -165,7 +165,10 @@ class Launcher:
         if self._lost:
             return
         try:
-            lock.keep()
+            if lock.keep():
+                log.warning("%s was removed and is made again: all programs start again", lock.path)
+                for supervisor in self._supervisors:
+                    supervisor.restart()
         except PebbleError as error:
             self._lost = True
             log.error("%s", error)

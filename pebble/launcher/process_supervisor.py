@@ -140,6 +140,11 @@ class ProcessSupervisor:
         self.held = False
         self._end_child(ProgramState.STOPPING, ProgramState.STOPPED)
 
+    def restart(self) -> None:
+        """Ask the child to end; if it was to run, another one is started."""
+        if self._child is not None:
+            self._child.terminate()
+
     def kill(self) -> None:
         """Kill the child. The reactor notices its exit like any other."""
         if self._child is not None:

@@ -52,15 +52,16 @@ class RunLock:
             if lock is not None:
                 lock.write(f"{os.getpid()}\n{self._robot}\n".encode())
 
-    def keep(self) -> None:
+    def keep(self) -> bool:
         """Make the directory and the lock again if they were removed, by a cleaner or a logout; call it every second.
 
-        Raises PebbleError if another launcher has taken the lock.
+        Returns True if it did: nothing that starts now reaches what runs. Raises PebbleError if another launcher has
+        taken the lock.
         """
         lock, problem = self._lock, ""
         try:
             if lock is None or lock.in_place:
-                return
+                return False
             make_private(self._run_dir, close=True)
             fresh = FileLock.take(self.path)
         except (OSError, PebbleError) as error:
@@ -71,7 +72,6 @@ class RunLock:
             lock.release()
             self._lock = fresh
             self._write()
-            log.warning("%s was removed: it is made again", self.path)
         if problem and problem != self._problem:
             log.error(
                 "%s was removed: what starts again reaches none of the robot's other processes until it can be made "
@@ -80,6 +80,7 @@ class RunLock:
                 problem,
             )
         self._problem = problem
+        return not problem
 
     def release(self) -> None:
         """Release the locks. The files stay, with the process id of the last launcher and its robot."""

@@ -167,7 +167,7 @@ def hub_settings(config: Config) -> ZenohSettings:
         access=transport.access,
         lease_ms=transport.lease_ms,
         journal=transport.journal,
-        reserved=(f"{config.base}/{c.OUTGOING}",),
+        of_robot=True,
         wills=tuple(dict.fromkeys(_renamed_wills(config))),
     )
 

@@ -12,7 +12,6 @@ class LineSplitter:
 
     def __init__(self, limit: int = LINE_LIMIT, end: bytes = b"\n", *, truncate: bool = False) -> None:
         self.discarded_lines = 0  # lines that were longer than the limit
-        self.discarded_bytes = 0
         self._limit, self._separator, self._truncate = limit, end, truncate
         self._tail = b""
         self._skipping = False  # inside the rest of a line that was too long
@@ -46,7 +45,6 @@ class LineSplitter:
 
     def _grow(self, part: bytes, lines: list[bytes]) -> None:
         if self._skipping:
-            self.discarded_bytes += len(part)
             return
         self._tail += part
         if len(self._tail) > self._limit:
@@ -54,6 +52,5 @@ class LineSplitter:
             if returned:
                 lines.append(self._tail[:returned])
             self.discarded_lines += 1
-            self.discarded_bytes += len(self._tail) - returned
             self._tail = b""
             self._skipping = True

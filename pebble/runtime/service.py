@@ -98,7 +98,7 @@ class Service:
     ) -> None:
         self.config, self.transport, self.instance, self.clock = config, transport, instance, clock
         self.addresses = Addresses(config)
-        transport.judge_topics(is_stop=self.addresses[ESTOP].topic.__eq__)
+        transport.policy.is_stop = self.addresses[ESTOP].topic.__eq__
         self.log = logging.getLogger(f"pebble.{self.name}")
         self.counters = Counters()
         self.timers = Timers()

@@ -12,16 +12,23 @@ from pebble.transports.wakeup import WakeupPipe
 _NAMES = ("SIGINT", "SIGTERM", "SIGHUP")  # the last one is unknown to Windows
 
 
+def _numbers() -> list[signal.Signals]:
+    return [getattr(signal, name) for name in _NAMES if hasattr(signal, name)]
+
+
 class EndSignal:
-    """It is set by SIGTERM and SIGINT, or by :meth:`set`, and stays so.
+    """It is set by what ends a program, or by :meth:`set`, and stays so. Make it on the main thread.
 
     A handler must not set an event: it may have interrupted the wait for it, which holds its lock, and waits for ever.
+    A thread that a library started may receive the signal, which then interrupts no wait: so the pipe is written to.
     """
 
     def __init__(self) -> None:
         self._wakeup = WakeupPipe()
-        for number in (signal.SIGTERM, signal.SIGINT):
-            signal.signal(number, lambda *_: self.set())
+        signal.set_wakeup_fd(self._wakeup.set_fileno, warn_on_full_buffer=False)
+        for number in _numbers():
+            if signal.getsignal(number) is not signal.SIG_IGN:
+                signal.signal(number, lambda *_: self.set())
 
     def set(self) -> None:
         self._wakeup.set()
@@ -34,8 +41,7 @@ class EndSignal:
 @contextmanager
 def handled_by(handler: Callable[[int, FrameType | None], Any], *more: int) -> Iterator[None]:
     """Call ``handler`` for what ends a program, and for ``more``, inside the block. Main thread only."""
-    numbers = [getattr(signal, name) for name in _NAMES if hasattr(signal, name)]
-    before = {number: signal.signal(number, handler) for number in (*numbers, *more)}
+    before = {number: signal.signal(number, handler) for number in (*_numbers(), *more)}
     try:
         yield
     finally:

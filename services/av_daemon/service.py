@@ -80,7 +80,7 @@ class AvDaemon(Service):
     def look(self) -> None:
         """End, to be started again, when what readers need was removed, or room in /dev/shm is there at last."""
         if not all(writer.in_place for writer in self._writers):
-            raise DeviceError("the socket or the shared memory of the frames was removed: starting again with new ones")
+            raise DeviceError("the shared memory of the frames was removed: starting again with a new one")
         if any(writer.may_share for writer in self._writers):
             raise DeviceError("there is room for the frames in shared memory now: starting again to use it")
 

@@ -117,11 +117,11 @@ class Gateway:
 
     def open(self) -> None:
         for transport in (self._hub, self._stops, self._presence, self._broker):
-            transport.judge_topics(is_stop=is_stop)
+            transport.policy.is_stop = is_stop
             transport.on_state(self._on_state)
         self._presence.on_state(self._on_presence)
-        self._hub.judge_topics(is_invented=self._is_invented)
-        self._broker.judge_topics(skips_retained=self._skips_retained, delivers_late=True)
+        self._hub.policy.is_invented = self._is_invented
+        self._broker.policy.skips_retained, self._broker.policy.delivers_late = self._skips_retained, True
         for transport in (self._hub, self._stops, self._presence, self._broker):
             transport.open(timeout=0.0)
         for base in self._filters:
@@ -194,7 +194,7 @@ class Gateway:
             for base in waiting[:TOGETHER]
         ]
         for transport in (hub, broker):
-            transport.judge_topics(is_stop=is_stop)  # of all robots, not of the newest one
+            transport.policy.is_stop = is_stop  # of all robots, not of the newest one
         self._has_begun = True
         self._carried |= {robot.base: robot for robot in robots}
         with self._beginning:

@@ -104,8 +104,9 @@ class MqttBridge(ForwardingService):
         self._local_changes = 0  # of the connection
         self._stop_topic = ESTOP.topic(self.config.base)
         self._stops = self._make_stops()
-        self.transport.judge_topics(is_invented=lambda topic: self.subjects.invented(topic.encode()) is not None)
-        self.remote.judge_topics(skips_retained=partial(self.forwarder.skips_retained, Side.REMOTE), delivers_late=True)
+        self.transport.policy.is_invented = lambda topic: self.subjects.invented(topic.encode()) is not None
+        self.remote.policy.skips_retained = partial(self.forwarder.skips_retained, Side.REMOTE)
+        self.remote.policy.delivers_late = True
 
     @property
     def winner(self) -> Side:
@@ -142,7 +143,7 @@ class MqttBridge(ForwardingService):
         uplink = self._uplink
         if uplink is None:
             return make(notices_s=notices_s)
-        transport.suit_link(slow=True)
+        transport.suit_link(thin=True)
         notices_s = max(notices_s, LEVELS["thin"].silent_s + _NOTICED_S)
         return make(notices_s=notices_s, grace_s=_THIN_GRACE_S, wanted=lambda: uplink.is_flooded)
 

@@ -113,7 +113,7 @@ class StopConnection:
         self._failing_since = self._off_until = float("-inf")
         self._connected_at = float("inf")
         self._kicks = 0
-        transport.judge_topics(is_stop=lambda _topic: True)  # it is subscribed to nothing else
+        transport.policy.is_stop = lambda _topic: True  # it is subscribed to nothing else
         self._reported: bool | None = None  # the log says that it is there, or that it is not
         transport.on_state(self._on_state)
 

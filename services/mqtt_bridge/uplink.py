@@ -157,7 +157,7 @@ class Uplink:
         self._report.publish(now)
 
     def _suit_transport(self) -> None:
-        self._remote.suit_link(slow=self._meter.level != "wide")
+        self._remote.suit_link(thin=self._meter.level != "wide")
 
     def _takes(self, rank: Rank, size: int) -> bool:
         with self._guard:

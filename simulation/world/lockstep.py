@@ -8,7 +8,6 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from pebble.errors import DeviceError
 from pebble.simulation.board import SimulatedMcu
 from pebble.simulation.motion import Pose, RobotMotion
 from pebble.simulation.world.pose_page import PERIOD_S
@@ -90,12 +89,11 @@ class LockstepRobot:
         self.name = name
         self.motion = RobotMotion(start_pose(world, name), floor.mover(name))
         self.mcu = SimulatedMcu(world.robots[name].kind, 0.0, motion=self.motion)
-        self.imu = SimulatedMcu("goob_imu", 0.0, motion=self.motion) if world.robots[name].imu else None
         self.tracks: dict[str, Track] = {}
         self._world, self._camera = world, camera
         self._renderer: Renderer | None = None  # made for the first picture: not every test has OpenCV to load
         self._now = 0.0
-        self._output = self._imu_output = b""
+        self._output = b""
         self._samples: deque[Sample] = deque(maxlen=_SAMPLES)
         self._pictures = 0  # due until the last one that was taken
 
@@ -119,17 +117,6 @@ class LockstepRobot:
     def read(self) -> bytes:
         """What the MCU has sent since the last call."""
         output, self._output = self._output, b""
-        return output
-
-    def write_imu(self, data: bytes) -> None:
-        """Send to the MCU of the inertial sensor, which the world file must give the robot."""
-        if self.imu is None:
-            raise DeviceError(f'{self.name} has no inertial sensor, write "imu": true into the world file')
-        self._imu_output += self.imu.receive(data, self._now)
-
-    def read_imu(self) -> bytes:
-        """What the MCU of the inertial sensor has sent since the last call."""
-        output, self._imu_output = self._imu_output, b""
         return output
 
     def drive(self, x: float, z: float) -> None:
@@ -157,9 +144,6 @@ class LockstepRobot:
     def tick(self, now: float) -> None:
         self._now = now
         self._output += self.mcu.tick(now)
-        if self.imu is not None:
-            self.mcu.body.advance()  # the motion that it measures
-            self._imu_output += self.imu.tick(now)
 
     def sample(self) -> None:
         self._samples.append(Sample(round(self._now * 1e9), self.pose))

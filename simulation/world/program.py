@@ -2,8 +2,6 @@
 
 import math
 import os
-import select
-import signal
 import sys
 import tempfile
 import threading
@@ -16,6 +14,7 @@ from typing import Any, Final
 import msgspec
 
 from pebble.errors import ConfigError, DeviceError
+from pebble.runtime.signals import EndSignal
 from pebble.simulation.board import BoardState
 from pebble.simulation.mcu import actions
 from pebble.simulation.motion import Pose, RobotMotion
@@ -24,10 +23,8 @@ from pebble.simulation.world.pose_page import PERIOD_S, PosePage, page_path
 from pebble.simulation.world.poses import RobotPose
 from pebble.simulation.world.walls import Floor, start_pose
 from pebble.simulation.world.world_file import World, read_world
-from pebble.transports.wakeup import WakeupPipe
 
 _SAMPLES_PER_REPORT = round(0.1 / PERIOD_S)
-_SIGNALS = {signal.SIGTERM, signal.SIGINT, signal.SIGHUP}
 
 ROOM: Final = Path(__file__).with_name("room.json")  # 4 m wide, four tags, Goob and Fred
 
@@ -49,7 +46,7 @@ def run(
     ``folder`` is for serial ports, ``trace`` for what MCUs receive, ROBOT.trace.jsonl. ``report``: write a
     :class:`Snapshot` to standard output ten times a second.
     """
-    end, path = EndRequest(), file.absolute()
+    end, path = EndSignal(), file.absolute()
     world = _read(path)
     folder = folder or Path(tempfile.gettempdir(), f"pebble-world-{path.stem}")
     try:
@@ -69,26 +66,6 @@ def run(
             threading.Thread(target=_run_commands, args=(mcus, end), name="pebble-world control", daemon=True).start()
         _publish_poses(page, mcus, end, report=report)
     return 0
-
-
-class EndRequest:
-    """A signal, or a call of ``send``, that ends the program. Make it on the main thread.
-
-    Signals are handled, not blocked: the threads that NumPy starts when it is imported would still receive them.
-    """
-
-    def __init__(self) -> None:
-        self._wakeup = WakeupPipe()
-        signal.set_wakeup_fd(self._wakeup.set_fileno, warn_on_full_buffer=False)
-        for number in _SIGNALS:
-            signal.signal(number, lambda *_: None)
-
-    def send(self) -> None:
-        """From any thread."""
-        self._wakeup.set()
-
-    def wait(self, seconds: float) -> bool:
-        return bool(select.select([self._wakeup], [], [], seconds)[0])
 
 
 def port_path(folder: Path, robot: str) -> Path:
@@ -144,7 +121,7 @@ def _imus(world: World, motions: Mapping[str, RobotMotion], folder: Path) -> Mcu
     }
 
 
-def _publish_poses(page: PosePage, mcus: Mcus, end: EndRequest, *, report: bool) -> None:
+def _publish_poses(page: PosePage, mcus: Mcus, end: EndSignal, *, report: bool) -> None:
     """Write samples to the page until the end is requested."""
     due, count = time.monotonic(), 0
     while not end.wait(max(0.0, due - time.monotonic())):
@@ -189,11 +166,11 @@ def _write(text: bytes) -> bool:
     return True
 
 
-def _run_commands(mcus: Mcus, end: EndRequest) -> None:
+def _run_commands(mcus: Mcus, end: EndSignal) -> None:
     for line in sys.stdin:
         if problem := _command(mcus, line.split()):
             sys.stderr.write(f"{line.strip()!r}: {problem}\n")
-    end.send()
+    end.set()
 
 
 def _command(mcus: Mcus, words: list[str]) -> str:

@@ -16,6 +16,7 @@ from pebble.checks.broker.account import robot_account
 from pebble.rig.processes import Processes, python
 from pebble.transports.settings import MqttSettings
 from tests.bench.impair.conftest import namespaces_permitted as namespaces_permitted
+from tests.sparing_broker import SparingBroker
 from tests.support import Broker
 
 DELAY = Shape(delay_ms=40)
@@ -53,9 +54,13 @@ def test_doctor_names_a_broker_that_holds_small_messages_back(
     assert ("fix: in mosquitto.conf: set_tcp_nodelay true" in found) == (not options)
 
 
-def test_a_round_trip_too_short_to_matter_is_not_judged(tmp_path: Path) -> None:
+@pytest.mark.parametrize("loses_large", [False, True])
+def test_a_round_trip_too_short_to_matter_is_not_judged(tmp_path: Path, loses_large: bool) -> None:
     broker = Broker(tmp_path)
-    settings = MqttSettings(host="127.0.0.1", port=broker.port)
-    found = [result.text for result in robot_account("b", settings, "pebble/robots/goob")]
+    way = SparingBroker(broker.port, longest=1500 if loses_large else 1 << 28)
+    settings = MqttSettings(host="127.0.0.1", port=way.port)
+    accepts, *more = [result.text for result in robot_account("b", settings, "pebble/robots/goob")]
+    way.close()
     broker.stop()
-    assert found == ["accepts what this account publishes"]
+    assert accepts == "accepts what this account publishes"
+    assert ["seems to lose large packets" in text for text in more] == [True] * loses_large

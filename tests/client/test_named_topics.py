@@ -87,7 +87,7 @@ def test_a_transport_publishes_the_forms_and_a_robot_may_change_its_level_meanwh
     hub = MemoryHub()
     with MemoryTransport("robot", hub) as robot, MemoryTransport("client", hub) as client:
         robot.subscribe(f"{GOOB}/incoming/#", lambda one: received.append(one.topic[len(GOOB) + 10 :]), direct=True)
-        client.judge_topics(forms=NamedTopics("ann", lambda base: base in named).forms)
+        client.policy.forms = NamedTopics("ann", lambda base: base in named).forms
         flag, estop = f"{GOOB}/incoming/flags/mqtt-video", f"{GOOB}/incoming/estop"
         assert client.publish(flag, b"true", qos=QoS.DELIVERED, retain=True)
         assert client.publish(estop, b"{}", qos=QoS.DELIVERED)

@@ -24,7 +24,6 @@ from pebble.fleet.roles import Account
 from pebble.transports import QoS, TlsSettings, ZenohSettings, create
 from pebble.transports.zenoh import session as zenoh_session
 from pebble.transports.zenoh import wire
-from pebble.transports.zenoh.hub.admission import SESSIONS
 from tests.fleet import test_attempts
 from tests.fleet.test_attempts import ACCOUNTS, FRED, GOOB, TOPICS
 from tests.fleet.zenoh_account import Plan
@@ -203,29 +202,6 @@ def test_a_robot_leaves_a_will_for_itself_and_no_one_else_leaves_any(hall: Hall)
     assert until(lambda: name_of_will["lamp"] in hall.of("lamp"))
     hall.mark("wills")
     assert {topic for name in name_of_will for topic in hall.of(name)} == {name_of_will["lamp"]}
-
-
-def test_an_account_with_many_sessions_takes_no_ones_will(hall: Hall) -> None:
-    """The hub keeps a number of sessions and wills of one account; those of another have their own room."""
-    last = "pebble/robots/fred/outgoing/last"
-    hello = partial(wire.Hello, retained_count=0, own={})
-    hall.received.clear()
-    with raw(hall.settings("fred")) as session:
-        tokens = []
-        for number in range(SESSIONS + 5):
-            will = wire.Will(f"pebble/robots/fred/outgoing/w{number}", b"fred", QoS.DELIVERED, False, f"{number}")
-            greeting = wire.encode(hello(name=f"fred~{number}", will=will))
-            assert [one.ok for one in session.get(wire.asked(wire.HELLO, "fred"), payload=greeting, timeout=10)]
-            tokens.append(session.liveliness().declare_token(f"{wire.LIVE}fred~{number}"))
-        with hall.account("lamp", will="pebble/lamps/lamp/outgoing/online"):
-            pass  # killed
-        assert until(lambda: hall.of("lamp")), "another account's will is published"
-        assert hall.of("fred") == set()
-    assert until(lambda: len(hall.of("fred")) == SESSIONS), hall.of("fred")
-    with hall.account("fred", will=last):
-        pass
-    assert until(lambda: last in hall.of("fred")), "there is room again"
-    assert len(hall.of("fred")) == SESSIONS + 1
 
 
 @contextmanager

@@ -259,7 +259,7 @@ class TestStops:
         for metric, skipped in (("by/ann/estop", False), ("by/ann/x", True), ("by/a/by/b/estop", False)):
             topic = f"{BASE}/incoming/{metric}".encode()
             assert world.service.forwarder.skips_retained(Side.REMOTE, topic) == skipped, metric
-            assert world.uplink.is_stop(topic.decode()) == (not skipped)
+            assert world.uplink.policy.is_stop(topic.decode()) == (not skipped)
 
     def test_a_retained_one_stops_nothing(self, world: World) -> None:
         for suffix in ("incoming/estop", "incoming/by/ann/estop"):

@@ -657,6 +657,6 @@ class TestHeartbeat:
 @pytest.mark.parametrize("side", list(Side))
 def test_a_stop_is_taken_where_too_many_messages_wait(world: World, side: Side) -> None:
     do(world, "start")
-    is_stop = {Side.LOCAL: world.here, Side.REMOTE: world.uplink}[side].is_stop
+    is_stop = {Side.LOCAL: world.here, Side.REMOTE: world.uplink}[side].policy.is_stop
     found = {suffix: is_stop(f"{BASE}/{suffix}") for suffix in (STOP, RESET, "outgoing/estop/mcu", DRIVE, f"{STOP}/x")}
     assert found == {suffix: suffix == STOP for suffix in found}

@@ -107,8 +107,10 @@ def test_a_folder_that_cannot_be_made_is_named(tmp_path: Path) -> None:
 def test_what_was_removed_is_locked_again(tmp_path: Path, remove: Callable[[Path], object]) -> None:
     run, state_lock = tmp_path / "run", tmp_path / "state.lock"
     with RunLock(run, "x/y/z", state_lock) as lock:
+        assert not lock.keep()
         remove(run)
-        lock.keep()
+        assert lock.keep()
+        assert not lock.keep()
         assert lock.path.read_text() == f"{os.getpid()}\nx/y/z\n"
         with pytest.raises(PebbleError, match=f"holds {lock.path}"):
             RunLock(run, "x/y/other", tmp_path / "other.lock").take()
@@ -121,11 +123,11 @@ def test_what_cannot_be_locked_again_is_reported_once_and_tried_again(
     with RunLock(run, "x/y/z", tmp_path / "state.lock") as lock:
         shutil.rmtree(run)
         run.write_text("in the way")
-        lock.keep()
-        lock.keep()
+        assert not lock.keep()
+        assert not lock.keep()
         assert [record.levelname for record in caplog.records] == ["ERROR"]
         run.unlink()
-        lock.keep()
+        assert lock.keep()
         assert lock.path.exists()
 
 

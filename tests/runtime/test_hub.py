@@ -5,6 +5,8 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
+import threading
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +19,7 @@ from pebble.runtime.hub import WILLS
 from pebble.transports import Message, QoS, ZenohSettings, create
 from pebble.transports.zenoh import wire
 from pebble.transports.zenoh.hub.admission import Admission
-from pebble.transports.zenoh.hub.intake import ASKED_BYTES, HELLOS, Intake
+from pebble.transports.zenoh.hub.intake import ASKED_BYTES, QUEUE_BYTES, SENDERS, Intake
 from pebble.transports.zenoh.hub.journal import Journal
 from pebble.transports.zenoh.hub.records import StoredWill
 from pebble.transports.zenoh.wire import Will
@@ -112,7 +114,7 @@ def test_those_of_a_journal(settings: ZenohSettings, topic: str) -> None:
         "a": Will(topic, b'{"z":0.6}', QoS.DELIVERED, False, "a"),
         "b": Will("status", b"gone", QoS.DELIVERED, True),
     }
-    journal.rewrite(msgspec.msgpack.encode(StoredWill(name, will)) for name, will in wills.items())
+    journal.rewrite((name, msgspec.msgpack.encode(StoredWill(name, will))) for name, will in wills.items())
     journal.close()
     hub = HubProcess(settings.run_dir)
     hub.settings = settings
@@ -125,7 +127,7 @@ def test_those_of_a_journal(settings: ZenohSettings, topic: str) -> None:
         assert until(lambda: received[-1].topic == "the/last")
     assert [message.topic for message in received] == ["status", "the/last"]
     hub.kill()
-    assert topic.encode() not in settings.journal.read_bytes()
+    assert topic.encode() not in b"".join(Journal(settings.journal).load())
 
 
 class Asked:
@@ -138,23 +140,50 @@ class Asked:
         self.dropped = True
 
 
-def test_hellos_of_one_account_that_wait_are_few_and_short() -> None:
-    intake = Intake()
-    greeted: list[Asked] = []
-
-    def greet(account: str, size: int = 1) -> bool:
-        asked: Any = Asked(f"@hub/hello/{account}", size)
-        intake.greet(greeted.append, asked)
-        return not asked.dropped
-
-    assert [greet("vera") for _ in range(HELLOS + 2)] == [True] * HELLOS + [False] * 2
-    assert greet("otto", ASKED_BYTES)
-    assert not greet("otto", ASKED_BYTES + 1)
+def test_a_query_follows_each_task_and_too_large_a_hello_is_not_answered() -> None:
+    intake, done = Intake(), list[str]()
+    for number in range(3):
+        asked: Any = Asked("@retain/**", 1)
+        intake.ask(lambda _query, number=number: done.append(f"query {number}"), asked)  # type: ignore[misc]
+        intake.put(partial(done.append, f"task {number}"))
+    large: Any = Asked("@hub/hello/vera", ASKED_BYTES + 1)
+    intake.greet(lambda _query: done.append("hello"), large)
+    assert large.dropped
     intake.end()
     while (task := intake.take(0)) is not None:
         task()
-    assert len(greeted) == HELLOS + 1
-    assert greet("vera"), "there is room again"
+    assert done == ["task 0", "query 0", "task 1", "query 1", "task 2", "query 2"]
+
+
+def test_beyond_the_room_eight_senders_wait_and_what_others_send_is_dropped(caplog: pytest.LogCaptureFixture) -> None:
+    intake, done = Intake(), list[int]()
+    intake.receive(partial(done.append, 0), QUEUE_BYTES + 1)
+    senders = [
+        threading.Thread(target=intake.receive, args=(partial(done.append, number), 1), daemon=True)
+        for number in range(1, SENDERS + 3)
+    ]
+    for sender in senders:
+        sender.start()
+    assert until(lambda: intake.dropped == 2)
+    assert "the hub receives more than it can store" in caplog.text
+    for _ in range(SENDERS + 1):
+        task = intake.take(5)
+        assert task is not None
+        task()
+    assert len(done) == SENDERS + 1
+    assert done[0] == 0
+
+
+def test_it_waits_for_a_task_and_for_no_longer_than_it_should() -> None:
+    intake, done = Intake(), list[int]()
+    task = intake.take(0.01)
+    assert task is not None
+    task()
+    threading.Timer(0.05, partial(intake.put, partial(done.append, 1))).start()
+    task = intake.take(20)
+    assert task is not None
+    task()
+    assert done == [1]
 
 
 @pytest.mark.parametrize(("waits_s", "works"), [(3.0, True), (0.0, False)])
@@ -170,7 +199,6 @@ def test_a_query_that_no_one_waits_for_any_more_is_not_answered(
     assert task is not None
     task()
     assert (asked.dropped, worked == [asked]) == (not works, works)
-    assert intake.asked == works, "it holds its place until it is answered"
 
 
 def test_each_client_is_logged_once_and_a_flood_of_them_not_without_end(caplog: pytest.LogCaptureFixture) -> None:

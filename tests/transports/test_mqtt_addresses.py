@@ -17,7 +17,7 @@ from typing import Any
 import pytest
 
 from pebble.transports import MqttSettings, QoS, State, Transport, create
-from pebble.transports.hosts import HANDSHAKE_S, STEADY_S, Address, Place, Turns
+from pebble.transports.hosts import HANDSHAKE_S, STEADY_S, Address, AddressRound, HostPort
 from pebble.transports.settings import TlsSettings
 from tests.fakes.bad_brokers import BEHAVIOURS, mute, serving, showing
 from tests.support import ROOT, Broker, free_port, some, until
@@ -207,7 +207,7 @@ A, B, C = (Address(socket.AF_INET, (f"10.0.0.{number}", 1883)) for number in (1,
 )
 def test_whose_turn_it_is(answers: list[list[Address]], held: list[float], tried: list[Address]) -> None:
     rounds = iter([*answers, *answers[-1:] * 9])
-    turns, seen = Turns(Place("b", 1883), lambda _host, _port: next(rounds)), []
+    turns, seen = AddressRound(HostPort("b", 1883), lambda _host, _port: next(rounds)), []
     for seconds in held:
         seen.append(turns.address())
         assert turns.several is (len(answers[0]) > 1)
@@ -216,8 +216,8 @@ def test_whose_turn_it_is(answers: list[list[Address]], held: list[float], tried
 
 
 #: How an attempt went: TLS was silent for too long, nothing listens, or TCP and TLS took so long.
-WENT: dict[str, Callable[[Turns], object]] = {
-    "late": Turns.was_slow,
+WENT: dict[str, Callable[[AddressRound], object]] = {
+    "late": AddressRound.was_slow,
     "lost": lambda _turns: None,
     "3": lambda turns: turns.opened(3.0),
     "0.1": lambda turns: turns.opened(0.1),
@@ -234,7 +234,7 @@ WENT: dict[str, Callable[[Turns], object]] = {
     ],
 )
 def test_where_tls_took_long_it_may_be_silent_for_longer(attempts: str, patient: str) -> None:
-    turns, seen = Turns(Place("b", 1883), lambda _host, _port: [A, B]), ""
+    turns, seen = AddressRound(HostPort("b", 1883), lambda _host, _port: [A, B]), ""
     for word in attempts.split():
         turns.address()
         seen += "-+"[turns.patience_s == HANDSHAKE_S]
@@ -245,4 +245,4 @@ def test_where_tls_took_long_it_may_be_silent_for_longer(attempts: str, patient:
 
 def test_a_name_without_addresses_is_a_problem() -> None:
     with pytest.raises(OSError, match="no address"):
-        Turns(Place("b", 1883), lambda _host, _port: []).address()
+        AddressRound(HostPort("b", 1883), lambda _host, _port: []).address()

@@ -7,7 +7,8 @@ import socket
 
 import pytest
 
-from pebble.transports.mqtt.read_age import BrokerDelay, WaitingTime, readable_bytes
+from pebble.transports.mqtt.outgoing import readable_bytes
+from pebble.transports.mqtt.read_age import BrokerDelay, WaitingTime
 
 
 def test_bytes_that_come_into_an_empty_socket_have_not_waited() -> None:

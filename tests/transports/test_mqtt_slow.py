@@ -33,14 +33,14 @@ class TestPatience:
         self, monkeypatch: pytest.MonkeyPatch, silence_s: float, round_trip_s: float, limit_s: float
     ) -> None:
         with closing(Link(monkeypatch, silence_s, round_trip_s)) as link:
-            link.connection.suit(slow=True)
+            link.connection.suit(thin=True)
             link.idle(limit_s - 0.2)
             with pytest.raises(Silent, match=f"has not answered for {limit_s} s"):
                 link.idle(0.4)
 
     def test_a_ping_at_least_every_second_and_a_half(self, monkeypatch: pytest.MonkeyPatch) -> None:
         with closing(Link(monkeypatch)) as link:
-            link.connection.suit(slow=True)
+            link.connection.suit(thin=True)
             asked = 0
             for _ in range(200):
                 link.idle(0.05)
@@ -49,7 +49,7 @@ class TestPatience:
 
     def test_a_ping_that_is_soon_due_goes_along_with_a_message(self, monkeypatch: pytest.MonkeyPatch) -> None:
         with closing(Link(monkeypatch)) as link:
-            link.connection.suit(slow=True)
+            link.connection.suit(thin=True)
             written = []
             for _ in range(20):
                 link.connection.publish(message("slow/online"))
@@ -63,7 +63,7 @@ class TestPatience:
 
     def test_anything_is_a_sign_of_life(self, monkeypatch: pytest.MonkeyPatch) -> None:
         with closing(Link(monkeypatch)) as link:
-            link.connection.suit(slow=True)
+            link.connection.suit(thin=True)
             for _ in range(20):
                 link.idle(2.0)
                 link.sends(sent(b"live"))
@@ -100,7 +100,7 @@ class TestSocket:
             assert link.connection.socket is not None
             sizes = []
             for slow in (False, True, False):
-                link.connection.suit(slow=slow)
+                link.connection.suit(thin=slow)
                 sizes.append(link.connection.socket.getsockopt(socket.IPPROTO_TCP, socket.TCP_NOTSENT_LOWAT))
         assert sizes == [0, 4096, 0]
 
@@ -153,7 +153,7 @@ class Robot:
         self.proxy = proxy
         settings = MqttSettings(host="127.0.0.1", port=proxy.port, reconnect_max_s=0.1)
         self.transport = create("mqtt", "robot", settings, will=message(WILL, b"offline"))
-        self.transport.suit_link(slow=slow)
+        self.transport.suit_link(thin=slow)
         self.transport.open(10)
         for topic in STATES:
             self.publish(topic, b"old")

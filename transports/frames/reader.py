@@ -58,7 +58,8 @@ class FrameReader:
         self._latest: _LatestFrames[_Arrival] = _LatestFrames(depth)  # closed while the reader is
         self.running: set[int] = set()  # ids of writers
         self._seen: set[int] = set()  # those that were counted
-        self._order = _Order()
+        self._newest = 0, 0  # the frame that has arrived: its writer and number
+        self._replaced = -1  # the writer before that
         self._sharing_ended = threading.Event()
         self._lacked_room = False  # in shared memory, when the session was opened
         self._changing = threading.Lock()
@@ -187,7 +188,7 @@ class FrameReader:
         if info is None:
             self.counters.add("refused")
             return
-        missed = self._order.missed(info)
+        missed = self._missed(info)
         if missed < 0:
             return
         if missed:
@@ -195,6 +196,16 @@ class FrameReader:
         self._count_received()
         if skipped := self._latest.put((info, sample.payload)):
             self.counters.add("skipped", skipped)
+
+    def _missed(self, info: FrameInfo) -> int:
+        """Return how many frames were lost before this one; -1: it is not newer."""
+        writer, number = self._newest
+        if info.writer == self._replaced or (info.writer == writer and info.sequence <= number):
+            return -1  # of a writer that was replaced; or sent as bytes, overtaken by a shared one: counted as missed
+        if info.writer != writer:
+            self._replaced = writer
+        self._newest = info.writer, info.sequence
+        return info.sequence - number - 1 if info.writer == writer else 0
 
     def _on_writer(self, sample: zenoh.Sample) -> None:
         try:
@@ -248,27 +259,6 @@ class FrameReader:
 
 
 _Arrival = tuple[FrameInfo, zenoh.ZBytes]
-
-
-class _Order:
-    """The newest frame that has arrived: its writer and number, and the writer before that."""
-
-    def __init__(self) -> None:
-        self._writer, self._number, self._previous = 0, 0, -1
-
-    def missed(self, info: FrameInfo) -> int:
-        """How many frames were lost before this one; -1: it is not newer."""
-        missed = 0
-        if info.writer == self._writer:
-            if info.sequence <= self._number:
-                return -1  # sent as bytes and overtaken by a shared frame: counted as missed then
-            missed = info.sequence - self._number - 1
-        elif info.writer == self._previous:
-            return -1  # a late frame of a writer that was replaced
-        else:
-            self._previous = self._writer
-        self._writer, self._number = info.writer, info.sequence
-        return missed
 
 
 class _LatestFrames(Generic[_T]):

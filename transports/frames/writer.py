@@ -21,7 +21,6 @@ from pebble.transports.frames import shared_memory, views
 from pebble.transports.frames.frame import FrameInfo, encode
 from pebble.transports.frames.session import METADATA, SharingError, StreamNames, open_writing
 from pebble.transports.frames.shared_memory import MARGIN, Chunk, SharedPool
-from pebble.transports.own_file import OwnFile
 from pebble.transports.peers import FileLock, prepare_run_dir
 from pebble.transports.zenoh.session import check_process, close_at_exit, close_session
 
@@ -66,7 +65,8 @@ class FrameWriter:
         #: For small messages, and for pictures sent as bytes.
         self._publishers: tuple[zenoh.Publisher, zenoh.Publisher] | None = None
         self._pool: SharedPool | None = None
-        self._files: tuple[FileLock, list[OwnFile]] | None = None  # without which readers that start now get nothing
+        self._lock: FileLock | None = None
+        self._memory: Path | None = None
         self._tokens: list[Any] = []
         self._readers: set[str] = set()
 
@@ -81,7 +81,7 @@ class FrameWriter:
         self._sequence = 0
         session = self._session = self._open_session()
         self._pid = os.getpid()
-        lock = FileLock.wait(self._names.lock_path(self._writer_id))  # another writer may be checking it
+        self._lock = FileLock.wait(self._names.lock_path(self._writer_id))  # another writer may be checking it
         close_at_exit(self)
         self._pool = self._make_pool()
         self._retry_at = _NEVER
@@ -98,24 +98,13 @@ class FrameWriter:
             liveliness.declare_subscriber(self._names.readers, follow, history=True),
             liveliness.declare_token(self._names.writer(self._writer_id, size, segment)),
         ]
-        needed = [self._names.socket, lock.path, *([segments.SHM / segment] if segment else [])]
-        self._files = lock, [file for file in map(OwnFile, needed) if file.in_place]
+        self._memory = segments.SHM / segment if segment else None
         return self
 
     @property
     def in_place(self) -> bool:
-        """False: readers that start now get nothing from this writer, and would from one that is opened now.
-
-        Its files may be removed: by a cleaner of old ones, or with a user's shared memory when the user logs out.
-        """
-        try:
-            if self._files is None or all(file.in_place for file in self._files[1]):
-                return True
-            prepare_run_dir(self._names.folder)
-        except (OSError, TransportError) as error:
-            log.debug("the frames of %s: %s", self._names.stream, error)
-            return True
-        return False
+        """True unless its shared memory was removed, as at a user's logout: readers that start now get nothing."""
+        return self._memory is None or self._memory.exists()
 
     @property
     def may_share(self) -> bool:
@@ -170,9 +159,8 @@ class FrameWriter:
             close_session(session)
             self._tokens.clear()
             self._readers.clear()
-            files, self._files = self._files, None
-            if files is not None:
-                files[0].release()
+            if self._lock is not None:
+                self._lock.release()
 
     def __enter__(self) -> Self:
         return self.open()

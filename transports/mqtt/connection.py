@@ -39,7 +39,7 @@ UNACKED_RESERVE = 100  # except so many stops: the messages before them may be t
 _OVERHEAD = 1 + 4 + 2 + 2 + 1 + 5  # bytes of a PUBLISH besides topic and payload, at most: with an expiry
 _FRESH_S = 0.05  # what is in a socket that was empty so recently counts as having come just now
 _UNWRITTEN = 1 << 20  # bytes of DELIVERED messages that wait where the broker has no QoS 1; beyond it they are refused
-_UNSENT = 4 * 1024  # bytes in the kernel beyond those on their way, over a slow way
+_UNSENT = 4 * 1024  # bytes in the kernel beyond those on their way, over a thin link
 _UNREACHED: dict[type[Exception], type[Lost]] = {ConnectionRefusedError: Absent, TlsLateError: TlsLate}
 _BY_SYSTEM = 0  # as the system has it
 _QUICKACK = getattr(socket, "TCP_QUICKACK", None)  # Linux only
@@ -52,9 +52,6 @@ class Owner(Sink, Protocol):
 
     def note_answers(self, refused: Mapping[str, bool]) -> None:
         """The broker has answered these filters; each is refused or not (T21). Called on the network thread."""
-
-    def is_stop(self, topic: str, /) -> bool:
-        """Whether a topic is one of stops, for which there is room when there is none for others."""
 
 
 def ignore(_messages: list[Message]) -> None:
@@ -150,13 +147,13 @@ class Connection:
         """Make `pump` return; for other threads."""
         self._poll.wake()
 
-    def suit(self, *, slow: bool) -> None:
-        """Suit the way to the broker: see `Transport.is_slow`."""
+    def suit(self, *, thin: bool) -> None:
+        """Suit the link to the broker: see `Transport.is_thin`."""
         with self._lock:
             sock = self._client.socket
-            if sock is not None and slow is not self.pings.is_patient:
-                keep_unsent(sock, _UNSENT if slow else _BY_SYSTEM)
-            self.pings.is_patient = slow
+            if sock is not None and thin is not self.pings.is_thin:
+                keep_unsent(sock, _UNSENT if thin else _BY_SYSTEM)
+            self.pings.is_thin = thin
 
     # -- the network thread
 
@@ -207,7 +204,7 @@ class Connection:
         if not poll.registered:
             self._register()
         if client.socket is None:
-            raise self._lost
+            raise self.incoming.lost
         blocked, waiting = bool(client.waiting), incoming.age.waiting
         began = now = clock.since_boot()
         wait = min(timeout, self.pings.due_at - began)
@@ -229,7 +226,7 @@ class Connection:
     def _register(self) -> None:
         with self._lock:
             if self._client.socket is None:
-                raise self._lost
+                raise self.incoming.lost
             self._poll.register(self._client.socket)
 
     def _write(self) -> None:
@@ -246,7 +243,7 @@ class Connection:
         sock = self._client.socket
         if _QUICKACK is not None and sock is not None:
             try:  # noqa: SIM105  (hot)
-                sock.setsockopt(socket.IPPROTO_TCP, _QUICKACK, _ONCE if self.pings.is_patient else 1)
+                sock.setsockopt(socket.IPPROTO_TCP, _QUICKACK, _ONCE if self.pings.is_thin else 1)
             except OSError:  # the other side has just gone
                 pass
 
@@ -267,7 +264,7 @@ class Connection:
                 return False
             if message.qos is QoS.DELIVERED and self._in_flight.unacked >= UNACKED_LIMIT and self._is_full(message):
                 return False
-            if not limits.qos and client.unwritten > _UNWRITTEN and not self._owner.is_stop(message.topic):
+            if not limits.qos and client.unwritten > _UNWRITTEN and not self._owner.policy.is_stop(message.topic):
                 return False
             if message.retain and limits.retain:
                 self._in_flight.accept(message)
@@ -295,7 +292,7 @@ class Connection:
 
     def _is_full(self, message: Message) -> bool:
         beyond = self._in_flight.unacked - UNACKED_LIMIT
-        return beyond >= UNACKED_RESERVE or not self._owner.is_stop(message.topic)
+        return beyond >= UNACKED_RESERVE or not self._owner.policy.is_stop(message.topic)
 
     def _write_publish(self, message: Message, expires_s: int | None) -> None:
         if self.limits is not EVERYTHING:
@@ -334,16 +331,12 @@ class Connection:
     @property
     def where(self) -> str:
         """The broker, in words."""
-        return self.incoming.ending.where
+        return self.incoming.where
 
     @property
     def socket(self) -> socket.socket | None:
         """None once it is lost."""
         return self._client.socket
-
-    @property
-    def _lost(self) -> Lost:
-        return self.incoming.ending.lost(accepted=self.incoming.accepted is not None, asked=self._in_flight.asked)
 
     @property
     def has_room(self) -> bool:
@@ -402,7 +395,7 @@ class Connection:
     def written_before_loss(self) -> dict[str, int] | None:
         """What the other side may have closed the connection for; None: it has not, or for another reason."""
         with self._lock:
-            ending = self.incoming.ending
-            if not (ending.may_concern_message or (self._client.hung_up and not ending.reason)):
+            incoming = self.incoming
+            if not (incoming.may_concern_message or (self._client.hung_up and not incoming.reason)):
                 return None
             return self._in_flight.first_written(clock.since_boot())

@@ -7,7 +7,7 @@ from dataclasses import replace
 from pebble.transports.base import Message
 from pebble.transports.counters import Counters
 from pebble.transports.credentials import Credentials
-from pebble.transports.hosts import SMALL_SEGMENT, Address, Place, Turns
+from pebble.transports.hosts import SMALL_SEGMENT, Address, AddressRound, HostPort
 from pebble.transports.mqtt import client_ids
 from pebble.transports.mqtt.bridge_mode import Attempt, BridgeMode, Result
 from pebble.transports.mqtt.broker_limits import EVERYTHING, BrokerLimits
@@ -31,7 +31,7 @@ class Dialler:
         # It stays the same over reconnects: the broker closes our own half-dead connection at once.
         self._client_id = client_ids.unique(client_id) if settings.client_id is None else settings.client_id
         self._settings, self._will, self._client_class = settings, will, client_class
-        self.turns = Turns(Place(settings.host, settings.port))
+        self.addresses = AddressRound(HostPort(settings.host, settings.port))
         self.attempt: Connection | None = None  # the newest connection, in any state
         self.stalled = False  # the broker may have been suspended, and have old messages to forward first
         self._credentials: Credentials | None = None
@@ -51,9 +51,9 @@ class Dialler:
         """Raises Lost if the name of the broker has no address."""
         self.attempt = None  # a resolver cannot be interrupted
         try:
-            address = self.turns.address()
+            address = self.addresses.address()
         except (OSError, ValueError) as error:
-            raise Lost(f"{self.turns.where} cannot be reached: {error}") from None
+            raise Lost(f"{self.addresses.where} cannot be reached: {error}") from None
         if address != self._address:
             self._bridge_mode, self.limits = BridgeMode(), BrokerLimits()
         self._address = address
@@ -62,7 +62,7 @@ class Dialler:
     @property
     def where(self) -> str:
         """The broker in words, with the address if its host has several."""
-        return self.turns.where
+        return self.addresses.where
 
     def connect(self, owner: Owner, counters: Counters, stopping: threading.Event) -> Connection:
         """A connection that is accepted. Raises Lost."""
@@ -80,7 +80,7 @@ class Dialler:
             if connection.incoming.accepted is None:
                 connection.discard()
         self._note_result(Result.ACCEPTED)
-        self.turns.opened(connection.opened_s)
+        self.addresses.opened(connection.opened_s)
         return connection
 
     def _make(self, will: Message | None, owner: Owner, counters: Counters, *, as_published: bool) -> Connection:
@@ -89,7 +89,9 @@ class Dialler:
         segment = SMALL_SEGMENT if self.loses_large else self._settings.max_segment
         settings = replace(self._settings, password=self._credentials.password(), max_segment=segment)
         self.attempt = Connection(
-            Opening(self._client_id, settings, self._credentials.context(), will, self._address, self.turns.patience_s),
+            Opening(
+                self._client_id, settings, self._credentials.context(), will, self._address, self.addresses.patience_s
+            ),
             counters,
             owner,
             where=self.where,
@@ -144,7 +146,7 @@ class Dialler:
         now, silent = time.monotonic(), isinstance(lost, Silent)  # then it may be we who stood still
         self.stalled |= silent
         if isinstance(lost, TlsLate):
-            self.turns.was_slow()
+            self.addresses.was_slow()
         large = silent and self.attempt is not None and self.attempt.lost_bytes > _LARGE
         if not self.loses_large and (silent or isinstance(lost, TlsLate)):  # a certificate is large, too
             self._large_lost = self._large_lost + 1 if large or not silent else 0
@@ -162,11 +164,11 @@ class Dialler:
 
         Returns the problem in words, empty if it is none yet, and whether it is worth a line in the log.
         """
-        turns, asks_again = self.turns, self.limits.asks_again
+        addresses, asks_again = self.addresses, self.limits.asks_again
         if self._is_last_attempt and not asks_again:
-            failed = turns.failed(problem.removeprefix(f"{self.where} "), held_s)
-            if turns.several:
-                problem = f"broker {turns.place}: {failed}"
+            failed = addresses.failed(problem.removeprefix(f"{self.where} "), held_s)
+            if addresses.several:
+                problem = f"broker {addresses.host_port}: {failed}"
         if asks_again and held_s <= 0:
             return "", False
-        return problem, held_s > 0 or turns.is_over or not turns.several
+        return problem, held_s > 0 or addresses.is_over or not addresses.several

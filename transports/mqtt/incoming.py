@@ -4,15 +4,16 @@ import logging
 from typing import Protocol
 
 from pebble.transports import clock
-from pebble.transports.base import Message, QoS
+from pebble.transports.base import Message, QoS, TopicPolicy
 from pebble.transports.counters import Counters
 from pebble.transports.mqtt import reasons
+from pebble.transports.mqtt.bridge_mode import Result
 from pebble.transports.mqtt.client import Client
-from pebble.transports.mqtt.ending import Ending, Lost, Silent
-from pebble.transports.mqtt.outgoing import InFlightTable
+from pebble.transports.mqtt.ending import Lost, Refused, Silent
+from pebble.transports.mqtt.outgoing import InFlightTable, readable_bytes
 from pebble.transports.mqtt.packets import ANY_QOS, RETAIN, Accepted, MalformedError
 from pebble.transports.mqtt.pings import Pings
-from pebble.transports.mqtt.read_age import ReadAge, readable_bytes
+from pebble.transports.mqtt.read_age import ReadAge
 from pebble.transports.settings import MqttSettings
 from pebble.transports.topics import MAX_BYTES
 
@@ -21,20 +22,21 @@ log = logging.getLogger(__name__)
 OVERSLEPT_S = 0.1  # poll took so much longer than asked for: the process was stopped, or the machine suspended
 _LOGGED = 200  # bytes of a topic
 _BATCH = 64  # messages read in a row before they are delivered
+_SHOWN = 3  # filters
+_LACKS = {reasons.NO_RETAIN: Result.RETAIN_REFUSED, reasons.NO_QOS: Result.QOS_REFUSED}
 
 
 class Sink(Protocol):
     """What is called on the network thread with the connection's lock held: it must neither wait nor publish."""
 
-    def skips_retained(self, topic: bytes, /) -> bool:
-        """Whether a retained message of this topic is not wanted."""
+    policy: TopicPolicy
 
     def note_refusal(self, topic: str, why: str) -> None:
         """The broker does not take a message of this topic (MQTT 5)."""
 
 
 class Incoming:
-    """Listens to the client of a connection. Not locked: the connection is."""
+    """Listens to the client of a connection. Not locked: the connection is. ``where`` is the broker, in words."""
 
     def __init__(
         self,
@@ -50,7 +52,11 @@ class Incoming:
         self.silence_s = settings.silence_s
         self.as_published = as_published
         self.accepted: Accepted | None = None  # what the broker said when it accepted us
-        self.ending = Ending(where, settings)
+        self.where, self._settings = where, settings
+        self._refusal: Refused | None = None
+        self.reason = ""  # that of its DISCONNECT
+        self.may_concern_message = False  # that reason
+        self._taken_over = True  # may be: MQTT 3.1.1 has no words for it
         self.messages: list[Message] = []  # read, and not delivered yet
         self.answers: dict[str, bool] = {}  # filters answered since that was last looked at: refused?
         self.more = False  # a batch ended before the socket was empty
@@ -68,7 +74,7 @@ class Incoming:
         silence_s = now - max(self.answered_at, self.age.arriving_at)
         if silence_s > self.silence_s and silence_s > (limit := self.pings.silence_limit_s):
             self._counters.add("silences")
-            raise Silent(f"{self.ending.where} has not answered for {limit:.1f} s")
+            raise Silent(f"{self.where} has not answered for {limit:.1f} s")
 
     def read(self, client: Client, now: float) -> None:
         """Read up to a batch: several times, where more than fits at once has come, or a piece of what TLS unpacks.
@@ -90,9 +96,11 @@ class Incoming:
             try:
                 left = client.read(_BATCH - (before - first))
             except MalformedError as error:
-                raise Lost(f"{self.ending.where} does not speak MQTT: {error}") from None
-            if self.ending.begun:
-                self._end(client)
+                raise Lost(f"{self.where} does not speak MQTT: {error}") from None
+            if self._refusal is not None:
+                raise self._refusal
+            if self.reason:
+                client.close()
             size += unread - left
             self.more = left > 0 or not client.drained
             if not self.more:
@@ -101,17 +109,23 @@ class Incoming:
             if self._packets == before:
                 break
             unread, now = left, clock.since_boot()
-        if size and self.pings.is_patient:  # any sign of life: answers wait behind what others have published
+        if size and self.pings.is_thin:  # any sign of life: answers wait behind what others have published
             self.answered_at = clock.since_boot()
         if age.has_retained or (size and self._packets == first):  # the latter is a piece of a long message
             age.note_arriving()
         if not self.more:
             waiting.empty(age.received_at)
 
-    def _end(self, client: Client) -> None:
-        if self.ending.refusal is not None:
-            raise self.ending.refusal
-        client.close()
+    @property
+    def lost(self) -> Lost:
+        """Why the other side has closed the connection."""
+        why, id_ = self.reason or f"{self.where} closed the connection", self._settings.client_id
+        if id_ is not None and self.accepted is not None and self._taken_over:
+            why += f' (does another client use the client id "{id_}"? a broker lets in only the newest)'
+        if asked := self._in_flight.asked:
+            more = f" and {len(asked) - _SHOWN} more" if len(asked) > _SHOWN else ""
+            why += f", asked to deliver {', '.join(asked[:_SHOWN])}{more}"
+        return Lost(why)
 
     # -- called by the client
 
@@ -132,10 +146,16 @@ class Incoming:
 
     def on_refused(self, code: int) -> None:
         self._note_connack()
-        self.ending.refuse(code)
+        refused = f"{self.where} refused us: "
+        if code == reasons.PROTOCOL_REFUSED and self._settings.protocol != "5":
+            self._refusal = Refused(refused + Result.PROTOCOL_REFUSED.value, Result.PROTOCOL_REFUSED)
+        else:
+            self._refusal = Refused(refused + reasons.connection_refused(code), _LACKS.get(code, Result.FAILED))
 
     def on_disconnect(self, code: int) -> None:
-        self.ending.disconnect(code)
+        self.reason = f"{self.where} closed the connection: {reasons.words(code)}"
+        self._taken_over = code == reasons.TAKEN_OVER
+        self.may_concern_message = reasons.may_concern_message(code)
 
     def on_pong(self) -> None:
         self._note_answer()
@@ -149,7 +169,7 @@ class Incoming:
         refused = [f"{filter_} ({reasons.words(code)})" for filter_, code in answers if code >= reasons.FAILURE]
         if refused:
             self._counters.add("subscriptions_refused")
-            log.warning("%s refused to subscribe us to %s", self.ending.where, ", ".join(refused))
+            log.warning("%s refused to subscribe us to %s", self.where, ", ".join(refused))
 
     def on_puback(self, mid: int, code: int) -> None:
         now = clock.since_boot()
@@ -184,7 +204,7 @@ class Incoming:
         if self.messages:
             return False  # what came before may change the answer
         try:
-            skipped = self._sink.skips_retained(topic)
+            skipped = self._sink.policy.skips_retained(topic)
         except Exception:  # foreign code on our thread
             log.exception("asking whether to skip a retained message of %r failed", topic)
             return False
@@ -196,4 +216,4 @@ class Incoming:
     def on_too_long(self, topic: bytes, length: int) -> None:
         self._packets += 1
         self._counters.add("too_long")
-        log.debug("%s sent %d bytes on %r…: discarded", self.ending.where, length, topic[:_LOGGED])
+        log.debug("%s sent %d bytes on %r…: discarded", self.where, length, topic[:_LOGGED])

@@ -286,11 +286,20 @@ def unconfirmed_bytes(sock: socket.socket) -> int:
 
     0 where the system does not say.
     """
+    return _kernel_bytes(sock, "TIOCOUTQ")
+
+
+def readable_bytes(sock: socket.socket | None) -> int:
+    """Bytes that the kernel has received and we have not read (FIONREAD); 0 where the system does not say."""
+    return 0 if sock is None else _kernel_bytes(sock, "FIONREAD")
+
+
+def _kernel_bytes(sock: socket.socket, request: str) -> int:
     size = bytearray(4)
     if not _can_measure:
         return 0
     with suppress(OSError, ValueError):  # closed, or no TCP
-        fcntl.ioctl(sock.fileno(), termios.TIOCOUTQ, size)
+        fcntl.ioctl(sock.fileno(), getattr(termios, request), size)
     return int.from_bytes(size, sys.byteorder)
 
 

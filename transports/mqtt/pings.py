@@ -11,8 +11,8 @@ from pebble.transports.settings import MqttSettings
 
 _CLEAR = 8 * 1024  # bytes ahead of a ping that do not delay it much
 _LEAST_S = 0.05  # between two pings, however short the allowed silence
-_PATIENT_S, _PATIENT_TRIPS, _PATIENT_INTERVAL_S = 5.0, 8, 1.5  # over a slow way: the limit, and between two pings
-_EARLY_S = 0.6  # over a slow way a ping goes along with a message: half of its packets are saved
+_THIN_S, _THIN_TRIPS, _THIN_INTERVAL_S = 5.0, 8, 1.5  # over a thin link: the limit, and between two pings
+_EARLY_S = 0.6  # over a thin link a ping goes along with a message: half of its packets are saved
 _LEAST_SHARE = 0.75  # of the interval between pings: answers to regular ones could not be told apart
 
 
@@ -23,8 +23,8 @@ class Pings:
         self._in_flight, self._age = in_flight, age
         self._silence_s = max(settings.silence_s, 4 * _LEAST_S)
         self._interval_s = max(_LEAST_S, min(settings.silence_s, settings.keepalive_s or inf) / 4)  # keepalive 0: none
-        self._patient_interval_s = min(_PATIENT_INTERVAL_S, (settings.keepalive_s or inf) / 2)
-        self.is_patient = False
+        self._thin_interval_s = min(_THIN_INTERVAL_S, (settings.keepalive_s or inf) / 2)
+        self.is_thin = False
         self.due_at = inf  # once accepted they are sent regularly: other answers come only to what we publish
         self._stalled_since = (
             age.waiting.checked_at
@@ -32,7 +32,7 @@ class Pings:
 
     def joins(self, now: float) -> bool:
         """Whether a ping goes along with the message that is sent at ``now``."""
-        return self.is_patient and now >= self.due_at - _EARLY_S
+        return self.is_thin and now >= self.due_at - _EARLY_S
 
     def begin(self, now: float) -> None:
         """The broker has accepted us."""
@@ -42,7 +42,7 @@ class Pings:
         sock = client.socket
         ahead = client.unwritten + (0 if sock is None else unconfirmed_bytes(sock))
         now = clock.since_boot()
-        interval_s = self._patient_interval_s if self.is_patient else self._interval_s
+        interval_s = self._thin_interval_s if self.is_thin else self._interval_s
         self.due_at = now + interval_s * random.uniform(_LEAST_SHARE, 1.0)  # noqa: S311  (no secret)
         self._in_flight.ping(now, ack)
         self._age.delay.asked(now, clear=ahead <= _CLEAR)
@@ -60,6 +60,6 @@ class Pings:
     @property
     def silence_limit_s(self) -> float:
         """After so long without an answer the broker is silent."""
-        if self.is_patient:
-            return max(self._silence_s, _PATIENT_S, _PATIENT_TRIPS * self._in_flight.round_trip_s)
+        if self.is_thin:
+            return max(self._silence_s, _THIN_S, _THIN_TRIPS * self._in_flight.round_trip_s)
         return max(self._silence_s, 4 * self._in_flight.round_trip_s)

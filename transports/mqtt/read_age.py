@@ -1,22 +1,12 @@
 """Since when what is read may have waited (T19): in the kernel, which does not say when it came, or at the broker."""
 
 import socket
-import sys
 from collections import deque
 from collections.abc import Callable
-from contextlib import suppress
 from math import inf
 
 from pebble.transports import clock
 from pebble.transports.mqtt.outgoing import present_round_trip_s
-
-try:
-    import fcntl
-    import termios
-except ImportError:  # Windows has neither
-    _can_measure = False
-else:
-    _can_measure = True
 
 _FAR_S = 1.0  # no round trip of a usable link is longer
 _NOTICED_S = 0.1
@@ -160,13 +150,3 @@ class ReadAge:
         """Retained messages were handled: that may have taken longer than an answer may."""
         self.note_arriving()
         self.has_retained = False
-
-
-def readable_bytes(sock: socket.socket | None) -> int:
-    """Bytes that the kernel has received and we have not read (FIONREAD); 0 where the system does not say."""
-    size = bytearray(4)
-    if sock is None or not _can_measure:
-        return 0
-    with suppress(OSError, ValueError):  # closed, or no socket
-        fcntl.ioctl(sock.fileno(), termios.FIONREAD, size)
-    return int.from_bytes(size, sys.byteorder)

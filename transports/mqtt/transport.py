@@ -77,7 +77,7 @@ class MqttTransport(Transport):
 
     @property
     def untried(self) -> bool:
-        return self._dialler.turns.untried
+        return self._dialler.addresses.untried
 
     @property
     def outgoing(self) -> Outgoing:
@@ -89,11 +89,11 @@ class MqttTransport(Transport):
         connection = self._connection
         return None if connection is None else connection.answer
 
-    def suit_link(self, *, slow: bool) -> None:
-        super().suit_link(slow=slow)
+    def suit_link(self, *, thin: bool) -> None:
+        super().suit_link(thin=thin)
         attempt = self._dialler.attempt
         if attempt is not None:
-            attempt.suit(slow=slow)
+            attempt.suit(thin=thin)
 
     def renew_connection(self, why: str) -> None:
         run, connection = self._network, self._connection
@@ -218,7 +218,7 @@ class MqttTransport(Transport):
             if held_s > _STEADY_S:
                 failures = 0
             self._set_state(State.CONNECTING)
-            if self._dialler.turns.several and not self._dialler.turns.is_over:
+            if self._dialler.addresses.several and not self._dialler.addresses.is_over:
                 continue  # the next address
             pause = min(self.settings.reconnect_max_s, _RETRY_S * 2 ** (failures - 1)) if failures else 0.0
             if not self._dialler.limits.asks_again:
@@ -230,7 +230,7 @@ class MqttTransport(Transport):
         self._dialler.begin()
         connection = self._dialler.connect(self, self.counters, run.stopping)
         run.renewal = ""
-        connection.suit(slow=self.is_slow)
+        connection.suit(thin=self.is_thin)
         try:
             if self.settings.as_published:
                 as_published = connection.incoming.as_published
@@ -249,7 +249,7 @@ class MqttTransport(Transport):
         tried_at = time.monotonic() + _TRIED_S
         try:
             self._synchronize(connection, run.stopping)
-            if failed := self._dialler.turns.succeeded():
+            if failed := self._dialler.addresses.succeeded():
                 self._log(logging.INFO, f"connected to {connection.where}; before it {failed}")
             while not run.stopping.is_set():
                 connection.pump(_IDLE_S, self._deliver_all)
@@ -363,7 +363,7 @@ class MqttTransport(Transport):
             if stopping.is_set():
                 raise Lost("closed")
             since, answer_s = max(asked_at, connection.incoming.age.arriving_at), _ANSWER_S
-            if connection.pings.is_patient:
+            if connection.pings.is_thin:
                 since, answer_s = max(since, connection.incoming.answered_at), connection.pings.silence_limit_s
             left = since + answer_s - clock.since_boot()
             if left < 0:

@@ -17,7 +17,6 @@ from pebble.transports.zenoh.presence import HubWatch
 from pebble.transports.zenoh.publishers import remember_first
 
 HUB_ANSWER_S = 1.0
-OTHERS_S = 0.2  # so long an answer of one hub waits for those of the others, which give each other what they lack
 FETCH_S = 0.7  # the longest wait for the hub's retained messages, which it may delay for half a second
 GOODBYE_S = 0.3  # the longest wait for an answer when closing
 
@@ -73,19 +72,18 @@ class HubConnection:
 
     # -- queries
 
-    def hello(self, session: zenoh.Session) -> bytes:
+    def hello(self) -> bytes:
         """Our will, and what we have published."""
         gone: dict[str, int | None] = {topic_to_key(topic): None for topic in self._removed}
         retained: dict[str, int | None] = {
             topic_to_key(topic): wire.digest(own.payload) for topic, own in self._own.items() if own.payload
         }
-        of = str(session.info.zid())
-        return wire.encode(wire.Hello(self.name, self.retained_count, self._will, gone | retained, of))
+        return wire.encode(wire.Hello(self.name, self.retained_count, self._will, gone | retained))
 
     def greet(self, session: zenoh.Session, hello: bytes, timeout: float) -> set[str] | None:
-        """The topics that the hub lacks; None: no hub answers in time."""
-        answers = wire.ask(session, wire.asked(wire.HELLO, self._account), hello, timeout, others_s=OTHERS_S)
-        return {key_to_topic(key) for answer in answers for key in wire.decode_keys(answer)} if answers else None
+        """Return the topics that the hub lacks; None: no hub answers in time."""
+        answer = wire.ask(session, wire.asked(wire.HELLO, self._account), hello, timeout)
+        return None if answer is None else {key_to_topic(key) for key in wire.decode_keys(answer)}
 
     def leave(self, session: zenoh.Session) -> None:
         """Have our will forgotten."""

@@ -6,13 +6,10 @@ import logging
 import threading
 import time
 from collections.abc import Callable
-from pathlib import Path
 
 import msgspec
 import zenoh
 
-from pebble.transports.peers import PeerRegistry, PresenceLock
-from pebble.transports.settings import ZenohSettings
 from pebble.transports.zenoh.callbacks import direct
 from pebble.transports.zenoh.wire import LIVE, SYNC, UP, pack_count, unpack_count
 
@@ -56,11 +53,6 @@ class HubWatch:
         with self._changed:
             self._changed.wait_for(lambda: self.closed or self._view.version != seen, timeout)
             return None if self.closed else self._view
-
-    def reset(self) -> None:
-        """Forget the hubs of a session that was closed; the next one has to be followed."""
-        with self._changed:
-            self._change(hubs=frozenset())
 
     def wait_closed(self, timeout: float) -> None:
         with self._changed:
@@ -170,34 +162,3 @@ class Barrier:
     def _answer(self, query: zenoh.Query) -> None:
         with query:
             query.reply(SYNC + self._name, pack_count(self._retained_count()))
-
-
-class Siblings:
-    """The other processes of a run directory: found by the files that they lock, and waited for."""
-
-    def __init__(self, settings: ZenohSettings) -> None:
-        self._settings = settings
-        self._registry = PeerRegistry(settings.run_dir)
-        self._barrier: Barrier | None = None
-        self._expected: Callable[[], dict[str, str]] = dict
-
-    def register(self, owner: str) -> PresenceLock:
-        return self._registry.register(owner)
-
-    def sockets(self, *, but: str) -> list[Path]:
-        return self._registry.sockets(but=but)
-
-    def begin(self, session: zenoh.Session, name: str, hub: HubWatch, retained_count: Callable[[], int]) -> None:
-        """There is a new session of this process, called ``name``, and with ``retained_count()`` retained messages."""
-
-        remote = bool(self._settings.client and self._settings.connect)
-
-        def expected() -> dict[str, str]:
-            siblings = {} if remote else self._registry.ready(but=name)
-            return siblings | dict.fromkeys(hub.hubs, "the hub")
-
-        self._expected, self._barrier = expected, Barrier(session, name, retained_count, by_name=remote)
-
-    def synchronize(self, timeout: float) -> dict[str, int]:
-        """Wait until all that run surely know our declarations; returns how many retained messages each has sent."""
-        return {} if self._barrier is None else self._barrier.synchronize(self._expected, timeout)

@@ -20,7 +20,7 @@ from pebble.errors import TransportError
 from pebble.transports import clock
 from pebble.transports.ages import MessageAges
 from pebble.transports.base import Message, QoS, State, Subscription, Transport
-from pebble.transports.peers import PresenceLock, new_name, prepare_run_dir
+from pebble.transports.peers import PeerRegistry, PresenceLock, new_name, prepare_run_dir
 from pebble.transports.settings import ZenohSettings
 from pebble.transports.topics import is_pattern
 from pebble.transports.zenoh import wire
@@ -28,7 +28,7 @@ from pebble.transports.zenoh.callbacks import direct
 from pebble.transports.zenoh.hub_connection import GOODBYE_S, HUB_ANSWER_S, HubConnection
 from pebble.transports.zenoh.keymap import filter_to_key, key_to_topic
 from pebble.transports.zenoh.loopback_queue import LoopbackQueue
-from pebble.transports.zenoh.presence import HubView, Siblings
+from pebble.transports.zenoh.presence import Barrier, HubView
 from pebble.transports.zenoh.publishers import Publishers
 from pebble.transports.zenoh.session import (
     HUB_SOCKET,
@@ -44,7 +44,6 @@ log = logging.getLogger(__name__)
 OPEN_SYNC_S = 1.0  # the longest wait for siblings that do not answer, when opening,
 SYNC_S = 0.5  # and when subscribing or reconnecting to the hub
 _RETRY_S = 0.2
-_LOOK_S = 1.0  # between two looks at the files of this process in the run directory
 
 
 class ZenohTransport(Transport):
@@ -53,9 +52,10 @@ class ZenohTransport(Transport):
     def __init__(self, client_id: str, settings: ZenohSettings, *, will: Message | None = None) -> None:
         super().__init__(client_id, will=will)
         self.settings = settings
+        self._elsewhere = bool(settings.client and settings.connect)  # its hub is, with siblings that it does not know
         self._connecting = threading.RLock()  # held while subscribing, and while a connection is made
         self._subscribers: dict[Subscription, zenoh.Subscriber[None]] = {}
-        self._publishers = Publishers(lambda topic: self.is_invented(topic))
+        self._publishers = Publishers(lambda topic: self.policy.is_invented(topic))
         self._hub = HubConnection(client_id, will, self._own, self.count_received, settings.account)
         self._reset()
 
@@ -63,13 +63,13 @@ class ZenohTransport(Transport):
         self._hub.open()
         self._pid = os.getpid()
         self._ages = MessageAges(wire.BOOT, self.settings.lease_ms / 1000)
-        self._siblings = Siblings(self.settings)
+        self._siblings = PeerRegistry(self.settings.run_dir)
+        self._barrier: Barrier | None = None  # of the newest session
         self._presence: PresenceLock | None = None
         self._session: zenoh.Session | None = None
         self._publishers.declared.clear()
         self._loopback = LoopbackQueue(self.counters)
         self._opened = threading.Event()
-        self._lost = ""  # why this process cannot listen where others look for it
         self._thread: threading.Thread | None = None
 
     @property
@@ -138,7 +138,7 @@ class ZenohTransport(Transport):
                 return False
             self._hub.name, self._session = name, session
             self._publishers.declared.clear()
-        self._siblings.begin(session, name, self._hub.watch, lambda: self._hub.retained_count)
+        self._barrier = Barrier(session, name, lambda: self._hub.retained_count, by_name=self._elsewhere)
         with self._connecting:
             for subscription in self._subscriptions:
                 self._start(session, subscription)
@@ -165,7 +165,7 @@ class ZenohTransport(Transport):
             if will is not None:
                 self._send(will, False)
                 self._hub.leave(session)
-            self._siblings.synchronize(GOODBYE_S)  # when they answer, they have received our last messages
+            self._synchronize(GOODBYE_S)  # when they answer, they have received our last messages
         except zenoh.ZError as error:
             log.warning("%s could not close in order: %s", self.client_id, error)
         finally:
@@ -177,14 +177,10 @@ class ZenohTransport(Transport):
         if self.settings.client and not self._start_client():
             return
         seen, linked = 0, 0  # version of the newest view handled; its connection that works, 0: none
-        look_s = None if self._presence is None else _LOOK_S
         self._wait_for_siblings_once()
         watch = self._hub.watch
-        while (view := watch.wait(seen, _RETRY_S if watch.hubs and not linked else look_s)) is not None:
+        while (view := watch.wait(seen, _RETRY_S if watch.hubs and not linked else None)) is not None:
             try:
-                if self._presence is not None and not (self._session and self._presence.in_place):
-                    linked = 0 if self._listen_again(self._presence) else linked
-                    continue
                 linked = self._follow(view, seen, linked)
             except Exception:  # any error must lead to a reconnect, never end the thread
                 if self._hub.watch.closed:
@@ -194,53 +190,20 @@ class ZenohTransport(Transport):
                 self._hub.watch.wait_closed(HUB_ANSWER_S)
             seen = view.version
 
-    def _listen_again(self, presence: PresenceLock) -> bool:
-        """Open a new session where processes that start now find this one; False if that cannot be: then keep the old.
+    def _synchronize(self, timeout: float) -> dict[str, int]:
+        """Wait until all that run surely know our declarations; return how many retained messages each has sent."""
+        if self._barrier is None:
+            return {}
 
-        Its files, or the whole run directory, were removed: by a cleaner of old files, or when a user logged out.
-        """
-        try:
-            prepare_run_dir(self.settings.run_dir)
-            presence.renew()
-        except (OSError, TransportError) as error:
-            self._report_lost(f"{error}. Until then processes that start again do not reach this one")
-            self._hub.watch.wait_closed(_LOOK_S)
-            return False
-        self._end_session()
-        try:
-            self._listen(presence)
-        except TransportError as error:  # it was removed again
-            self._report_lost(str(error))
-            self._hub.watch.wait_closed(_LOOK_S)
-            return True
-        self._lost = ""
-        log.warning("%s: its socket was removed from %s, it has made a new one", self.client_id, self.settings.run_dir)
-        self._wait_for_siblings_once()
-        return True
+        def expected() -> dict[str, str]:
+            siblings = {} if self._elsewhere else self._siblings.ready(but=self._hub.name)
+            return siblings | dict.fromkeys(self._hub.watch.hubs, "the hub")
 
-    def _end_session(self) -> None:
-        """Close the session without its will: another one of this process follows."""
-        self._set_state(State.CONNECTING)
-        with self._publishing, self._hub.lock:
-            session, self._session = self._session, None
-            self._publishers.declared.clear()
-        if session is None:
-            return
-        with contextlib.suppress(zenoh.ZError):
-            self._hub.leave(session)
-        with self._connecting:
-            close_session(session)
-            self._subscribers.clear()
-        self._hub.watch.reset()
-
-    def _report_lost(self, problem: str) -> None:
-        if problem != self._lost:
-            self._lost = problem
-            log.error("%s: its socket was removed, and it cannot make a new one: %s", self.client_id, problem)
+        return self._barrier.synchronize(expected, timeout)
 
     def _wait_for_siblings_once(self) -> None:
         try:
-            self._siblings.synchronize(OPEN_SYNC_S)
+            self._synchronize(OPEN_SYNC_S)
         except zenoh.ZError as error:  # closed meanwhile
             log.debug("%s could not synchronize with its siblings: %s", self.client_id, error)
         self._opened.set()
@@ -275,7 +238,7 @@ class ZenohTransport(Transport):
         sent: set[str] = set()
         while (left := end - time.monotonic()) > 0:  # looked at once: Zenoh refuses what is not positive
             with self._publishing:  # which takes a moment on a busy machine
-                hello = self._hub.hello(session)
+                hello = self._hub.hello()
             lacking = self._hub.greet(session, hello, left)
             if lacking is None:
                 return False
@@ -303,7 +266,7 @@ class ZenohTransport(Transport):
             with self._hub.lock:
                 self._hub.renew()
                 self._renew()
-            counts = self._siblings.synchronize(SYNC_S)  # after _renew: messages received live meanwhile are newer
+            counts = self._synchronize(SYNC_S)  # after _renew: messages received live meanwhile are newer
             self._hub.fetch(self._session, list(self._subscribers), counts)
 
     # -- sending
@@ -340,7 +303,7 @@ class ZenohTransport(Transport):
             with contextlib.suppress(zenoh.ZError):  # closed meanwhile: then nothing is received any more
                 for subscription in subscriptions:
                     self._start(session, subscription)
-                counts = self._siblings.synchronize(SYNC_S)
+                counts = self._synchronize(SYNC_S)
                 if self._state is State.CONNECTED:
                     self._hub.fetch(session, subscriptions, counts)
 
@@ -384,7 +347,7 @@ class ZenohTransport(Transport):
         Retained messages are accepted in any case, because they are not sent again; and stops: none is ever too late.
         """
         topic = key_to_topic(str(sample.key_expr))
-        if not stamp.boot or self.is_stop(topic):
+        if not stamp.boot or self.policy.is_stop(topic):
             return False
         age_s = self._ages.age_s(stamp.boot, topic, stamp.sent_ns / 1e9, now)
         if stamp.retain_requested or age_s <= self._ages.late_s:

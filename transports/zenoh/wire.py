@@ -128,14 +128,13 @@ class Will(msgspec.Struct, frozen=True, array_like=True):
 class Hello(msgspec.Struct, frozen=True, array_like=True):
     """``own`` has a digest for each retained key of this client, None for one it has removed.
 
-    ``session`` is the id by which Zenoh knows it. A field may be added at the end: msgspec skips what it does not know.
+    A field may be added at the end: msgspec skips what it does not know.
     """
 
     name: str
     retained_count: int
     will: Will | None
     own: dict[str, int | None]
-    session: str = ""
 
 
 digest = crc32
@@ -151,12 +150,10 @@ def asked(what: str, account: str) -> str:
     return f"{what}/{account}" if account else what
 
 
-def ask(
-    session: zenoh.Session, key: str, payload: bytes, timeout: float, *, others_s: float = float("inf")
-) -> list[bytes]:
-    """What all that have this key answer within ``timeout`` seconds, and within ``others_s`` after the first one.
+def ask(session: zenoh.Session, key: str, payload: bytes, timeout: float) -> bytes | None:
+    """Return the answer of the hub; None: there is none within ``timeout`` seconds.
 
-    Where one of them has just died, a router that does not know it yet waits for its answer to the end.
+    Where a hub has just died, the query ends for others long after the next hub has answered it.
     """
     came: queue.SimpleQueue[zenoh.Reply | None] = queue.SimpleQueue()
     session.get(
@@ -168,14 +165,12 @@ def ask(
         payload=payload,
         **BLOCK,
     )
-    answers: list[bytes] = []
     end = time.monotonic() + timeout + _LATE_S
     with contextlib.suppress(queue.Empty):
         while (reply := came.get(timeout=max(0.0, end - time.monotonic()))) is not None:
             if reply.ok is not None:
-                end = end if answers else min(end, time.monotonic() + others_s)
-                answers.append(reply.ok.payload.to_bytes())
-    return answers
+                return reply.ok.payload.to_bytes()
+    return None
 
 
 def account_of(key: str, what: str) -> str:

@@ -19,6 +19,7 @@ from pebble.errors import TransportError
 from pebble.forwarding.probes import new_probe
 from pebble.transports import MqttSettings
 
+_LARGE = 1000  # bytes of a nonce, written as 2 kB: more than a packet carries
 _MATTERS_S = 0.02  # a shorter round trip delays nothing that people notice: our own programs acknowledge at once
 
 
@@ -57,6 +58,9 @@ def robot_account(
                 yield _rules(what, trial, peer, topic)
             if is_back and trial.round_trip_s >= _MATTERS_S:
                 yield replace(held_back(trial, peer, peer, topic), what=f"small messages at {what}")
+            if is_back and not _echo(trial, peer, topic, _LARGE)[0]:
+                text = "a message of 2 kB does not come back, small ones do: the way there seems to lose large packets"
+                yield warn(text, "set a smaller MTU at its network card, or let ICMP pass", what)
     except TransportError as error:
         yield warn(f"cannot be published to: {error}", what=what)
 
@@ -67,9 +71,9 @@ def page_account(what: str, settings: MqttSettings, level: SecurityLevel = "open
     return robot_account(what, settings, base, level=level, reads=states)
 
 
-def _echo(trial: BrokerTrial, peer: Peer, topic: str) -> tuple[bool, str]:
+def _echo(trial: BrokerTrial, peer: Peer, topic: str, nonce_bytes: int = 8) -> tuple[bool, str]:
     """Publish a probe; True if it comes back, and why the broker does not take it, as far as it tells."""
-    payload, began = new_probe(time.time_ns() // 1_000_000), time.monotonic()
+    payload, began = new_probe(time.time_ns() // 1_000_000, nonce_bytes), time.monotonic()
     mid = peer.publish(topic, payload, qos=1)
 
     def refusal() -> str:

@@ -101,7 +101,7 @@ def test_it_is_neither_made_where_everybody_is_let_in_nor_before_messages_are_fo
         world.stop()
     start(world)
     assert world.stops.state is State.CLOSED
-    assert world.stops.is_stop(STOP), "it is never too late"
+    assert world.stops.policy.is_stop(STOP), "it is never too late"
 
 
 @pytest.mark.parametrize(

@@ -103,6 +103,5 @@ def test_a_stream_without_end_is_thrown_away_up_to_the_next_zero() -> None:
         found += splitter.feed(chunk)
     assert found == [good[:-1], good[:-1]], "the first frame after the endless one is discarded with it"
     assert splitter.discarded_lines == 1
-    assert splitter.discarded_bytes == 50_000 + len(good) - 1
     splitter = LineSplitter(FRAME_LIMIT, frame.END)
     assert splitter.feed(b"x" * FRAME_LIMIT + b"\0" + b"x" * (FRAME_LIMIT + 1) + b"\0") == [b"x" * FRAME_LIMIT]

@@ -9,12 +9,8 @@ import time
 import numpy as np
 import pytest
 
-from pebble.errors import DeviceError
-from pebble.services.serial_mcu_bridge.pebble_serial_v1.frame import END, Frame, Type, decode, encode
-from pebble.services.serial_mcu_bridge.pebble_serial_v1.manifest import parse_describe
-from pebble.services.serial_mcu_bridge.pebble_serial_v1.struct_v1 import unpack
 from pebble.services.serial_mcu_bridge.text.goob_base import drive_line, mix
-from pebble.simulation.motion import FULL_SPEED_MM_S, TRACK_MM
+from pebble.simulation.motion import FULL_SPEED_MM_S
 from pebble.simulation.world.lockstep import CameraMode, LockstepRobot, LockstepWorld
 from pebble.simulation.world.world_file import World, parse_world
 from tests.simulation.world.worlds import CLEAR, projected, tags_in
@@ -130,25 +126,3 @@ def test_a_robot_is_put_down_elsewhere() -> None:
     assert picture is not None
     expected = projected(world(), 13, (1.5, -0.2, math.radians(10)))
     assert np.abs(tags_in(picture.pixels)[13] - expected).max() < 1.0
-
-
-def test_the_inertial_sensor_turns_with_the_robot() -> None:
-    robots = {"goob": {"x": 0.0, "y": 0.0, "imu": True}, "fred": {"kind": "fred", "x": 1.0, "y": 0.0}}
-    simulated = LockstepWorld(parse_world({"robots": robots}))
-    goob, fred = simulated.robots.values()
-    with pytest.raises(DeviceError, match='fred has no inertial sensor, write "imu": true'):
-        fred.write_imu(b"")
-    goob.write_imu(encode(Frame(Type.DESCRIBE_REQ)))
-    simulated.run(3.0)  # its calibration
-    described = frames(goob.read_imu())
-    fast = parse_describe(next(frame.payload for frame in described if frame.type == Type.DESCRIBE)).interfaces[0]
-    goob.drive(x=-0.2, z=0.0)
-    simulated.run(0.8)
-    samples = [unpack(fast.fields, frame.payload) for frame in frames(goob.read_imu()) if frame.type == Type.SAMPLE]
-    assert len(samples) == pytest.approx(80, abs=2)
-    true_rate = math.degrees((goob.motion.right_mm_s - goob.motion.left_mm_s) / TRACK_MM)
-    assert np.mean([sample["gz"] for sample in samples[-30:]]) == pytest.approx(true_rate, rel=0.02)
-
-
-def frames(data: bytes) -> list[Frame]:
-    return [decode(stuffed) for stuffed in data.split(END) if stuffed]

@@ -125,7 +125,7 @@ def test_it_ends_at_once_where_standard_input_has_ended_already(room: Path) -> N
 @pytest.fixture
 def refused(monkeypatch: pytest.MonkeyPatch) -> Callable[[Path], str]:
     """What is wrong with a room that is not run, in this process, whose signals stay as they are."""
-    monkeypatch.setattr(program, "EndRequest", lambda: None)
+    monkeypatch.setattr(program, "EndSignal", lambda: None)
 
     def refuse(room: Path) -> str:
         with pytest.raises(PebbleError) as error:

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import logging
-
 import pytest
 
 from pebble.transports import QoS
 from pebble.transports.zenoh.access import HubAccount
-from pebble.transports.zenoh.hub.admission import SESSIONS, Admission
+from pebble.transports.zenoh.hub.admission import Admission
 from pebble.transports.zenoh.hub.records import Retained
 from pebble.transports.zenoh.wire import Hello, Stamp, Will, account_of, asked
 
@@ -28,14 +26,14 @@ def admission() -> Admission:
 
 
 def test_a_robot_leaves_its_will_and_learns_what_the_hub_lacks_of_it(admission: Admission) -> None:
-    hello = admission.hello("goob", Hello("goob~1", 3, WILL, OWN), [])
+    hello = admission.hello("goob", Hello("goob~1", 3, WILL, OWN))
     assert hello is not None
     assert hello.will == Will(WILL.topic, b"0", QoS.DELIVERED, True, "goob~goob-bridge"), "nobody else's predecessor"
     assert (hello.retained_count, hello.own) == (3, {f"{GOOB}/outgoing/online": 1})
 
 
 def test_a_person_leaves_nothing(admission: Admission, caplog: pytest.LogCaptureFixture) -> None:
-    hello = admission.hello("otto", Hello("otto~1", 0, WILL, OWN), [])
+    hello = admission.hello("otto", Hello("otto~1", 0, WILL, OWN))
     assert hello == Hello("otto~1", 0, None, {})
     assert admission.refused == 1
     assert caplog.messages == [
@@ -48,24 +46,8 @@ def test_a_person_leaves_nothing(admission: Admission, caplog: pytest.LogCapture
     ("account", "name"), [("otto", "goob~1"), ("otto", "otto"), ("otto", "0badf00d"), ("x", "x~1")]
 )
 def test_a_session_is_named_after_its_account(admission: Admission, account: str, name: str) -> None:
-    assert admission.hello(account, Hello(name, 0, None, {}), []) is None
-    assert admission.hello("", Hello(name, 0, WILL, OWN), []) == Hello(name, 0, WILL, OWN), "from this machine"
-
-
-def test_an_account_fills_neither_the_sessions_nor_the_wills(
-    admission: Admission, caplog: pytest.LogCaptureFixture
-) -> None:
-    alive, stored = {"fred~1", "0badf00d"}, {"fred~1", "0badf00d"}
-    with caplog.at_level(logging.ERROR):
-        for number in range(5 * SESSIONS):
-            name = f"goob~{number}"
-            alive |= {name} if admission.sessions(name, alive) else set()
-            hello = admission.hello("goob", Hello(name, 0, WILL, {}), stored)
-            stored |= {name} if hello is not None and hello.will is not None else set()
-    assert (len(alive), len(stored)) == (SESSIONS + 2, SESSIONS + 2)
-    assert admission.sessions("goob~0", alive)
-    assert admission.sessions("fred~2", alive)
-    assert admission.sessions("another", alive | {f"local-{number}" for number in range(100)})
+    assert admission.hello(account, Hello(name, 0, None, {})) is None
+    assert admission.hello("", Hello(name, 0, WILL, OWN)) == Hello(name, 0, WILL, OWN), "from this machine"
 
 
 def test_nothing_is_retained_under_a_name(admission: Admission) -> None:

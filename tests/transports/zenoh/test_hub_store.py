@@ -8,7 +8,7 @@ from msgspec.structs import replace
 from pebble.transports import QoS
 from pebble.transports.zenoh.hub import store as hub_store
 from pebble.transports.zenoh.hub.records import Record, Retained, StoredWill
-from pebble.transports.zenoh.hub.store import MAX_WILLS, RESERVED_WILLS, HubStore
+from pebble.transports.zenoh.hub.store import HubStore
 from pebble.transports.zenoh.wire import Hello, Stamp, Will, digest
 
 WILL = Will("status", b"gone", QoS.DELIVERED, True)
@@ -69,9 +69,8 @@ def test_its_records_make_an_equal_store() -> None:
 
 @pytest.fixture
 def small(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Room for 100 bytes, 40 of them reserved."""
+    """Room for 100 bytes."""
     monkeypatch.setattr(hub_store, "MAX_BYTES", 100)
-    monkeypatch.setattr(hub_store, "RESERVED_BYTES", 40)
     monkeypatch.setattr(hub_store, "OVERHEAD", 0)
     monkeypatch.setattr(hub_store, "MAX_WILLS", 1)
 
@@ -99,50 +98,3 @@ def test_what_has_no_room_is_refused_and_leaves_the_others_and_its_own_older_val
 def test_long_names_take_room_too() -> None:
     made = store(retained("a", b"1", "x" * 1000), StoredWill("client", Will("a", b"", QoS.DELIVERED, True, "x" * 1000)))
     assert (made.retained(), made.wills(), made.refused) == ([], set(), 2)
-
-
-@pytest.mark.usefixtures("small")
-def test_at_a_hub_of_several_no_robot_fills_the_room_of_all(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(hub_store, "ROBOT_BYTES", 50)
-    made = store(*(retained(f"a/b/{name}", bytes(25)) for name in ("x/1", "x/2", "y/1", "y/2")))
-    assert [one.key for one in made.retained()] == ["a/b/x/1", "a/b/y/1"]
-    made.apply(retained("a/b/x/1", b""))
-    assert made.apply(retained("a/b/x/2", bytes(25)))
-
-
-@pytest.mark.usefixtures("small")
-def test_what_others_store_leaves_the_reserved_room() -> None:
-    made = HubStore(("robot/outgoing/",))
-    for number in range(10):
-        made.apply(retained(f"robot/incoming/{number}", bytes(10)))
-    made.apply(StoredWill("stranger", Will("elsewhere", bytes(40), QoS.DELIVERED, True)))
-    assert len(made.retained()) == 2
-    assert made.wills() == set()
-    assert made.apply(retained("robot/outgoing/state", bytes(20)))
-    assert not made.apply(retained("robot/outgoing/state", bytes(90)))
-    made = store(*made.records())
-    assert len(made.retained()) == 3
-
-
-def test_wills_of_others_leave_places_for_those_of_the_reserved_keys() -> None:
-    made, will = HubStore(("robot/outgoing/",)), Will("elsewhere", b"", QoS.DELIVERED, True)
-    for number in range(MAX_WILLS):
-        made.apply(StoredWill(f"stranger{number}", will))
-    own = Will("robot/outgoing/online", b"", QoS.DELIVERED, True)
-    assert [made.apply(StoredWill(f"own{number}", own)) for number in range(RESERVED_WILLS + 1)] == [
-        *[True] * RESERVED_WILLS,
-        False,
-    ]
-
-
-@pytest.mark.usefixtures("small")
-def test_the_reserved_may_use_all_room_and_return_it() -> None:
-    made = HubStore(("robot/outgoing/",))
-    state = retained("robot/outgoing/state", bytes(80))
-    assert made.apply(state)
-    assert not made.apply(retained("robot/incoming/x", b"1"))
-    assert made.apply(retained(state.key, b"1"))
-    assert made.apply(retained("robot/incoming/x", bytes(40)))
-    assert not made.apply(retained("robot/incoming/y", bytes(20)))
-    assert made.apply(retained("robot/incoming/x", b""))
-    assert made.apply(retained("robot/incoming/y", bytes(40)))

@@ -11,25 +11,25 @@ import logging
 import socket
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import zenoh
 
 from pebble.errors import TransportError
 from pebble.transports.counters import Counters
-from pebble.transports.own_file import OwnFile
 from pebble.transports.peers import FileLock, PeerRegistry, new_name, prepare_run_dir
 from pebble.transports.renewed import Renewed
 from pebble.transports.settings import TlsSettings, ZenohSettings
 from pebble.transports.socket_holders import why_not
 from pebble.transports.zenoh.access import Access, read_access
 from pebble.transports.zenoh.hub.admission import Admission
-from pebble.transports.zenoh.hub.journal import Journal
 from pebble.transports.zenoh.hub.store import HubStore
 from pebble.transports.zenoh.hub.worker import HubWorker
-from pebble.transports.zenoh.keymap import topic_to_key
 from pebble.transports.zenoh.presence import Barrier
 from pebble.transports.zenoh.session import HUB_SOCKET, close_at_exit, close_session, open_session, session_config
+
+if TYPE_CHECKING:
+    from pebble.transports.zenoh.hub.journal import Journal
 
 log = logging.getLogger(__name__)
 
@@ -46,11 +46,9 @@ class ZenohHub:
         self._worker: HubWorker | None = None
         self._store: HubStore | None = None
         self._admission = Admission(settings.wills, settings.unretained)
-        self._listening = OwnFile(self._socket)
         self._certificates = None if settings.tls is None else _renewed(settings.tls)
         self._access = None if (file := settings.access) is None else Renewed([file], lambda: read_access(file))
         self._used = self._newest
-        self._problem = ""  # why clients that start now do not reach this hub
 
     @property
     def _socket(self) -> Path:
@@ -59,8 +57,7 @@ class ZenohHub:
     @property
     def retained(self) -> dict[str, bytes]:
         """What it retains, by topic."""
-        store = self._newest_store
-        return {} if store is None else {one.key: one.payload for one in store.retained()}
+        return {} if self._store is None else {one.key: one.payload for one in self._store.retained()}
 
     @property
     def refused_wills(self) -> int:
@@ -69,13 +66,7 @@ class ZenohHub:
     @property
     def refused(self) -> int:
         """Retained messages and wills there was no room for."""
-        store = self._newest_store
-        return 0 if store is None else store.refused
-
-    @property
-    def _newest_store(self) -> HubStore | None:
-        """The worker's, which it replaces once its journal is read."""
-        return self._store if self._worker is None else self._worker.store
+        return 0 if self._store is None else self._store.refused
 
     def open(self) -> ZenohHub:
         """Start. Raises TransportError if the run directory has a hub already, or cannot be used."""
@@ -89,37 +80,22 @@ class ZenohHub:
         return self
 
     def look(self) -> None:
-        """Listen again, with all that is stored, if the socket is gone or a certificate or rule changed; call often.
+        """Listen again, with all that is stored, if a certificate or rule changed; call often.
 
-        A cleaner of old files removes sockets, or a logout. Zenoh reads certificates and rules when a session begins.
-        Raises TransportError if it cannot listen there again.
+        Zenoh reads certificates and rules when a session begins. Raises TransportError if it cannot listen there again,
+        or if its files were removed: who started this hub starts another one.
         """
-        lock, worker = self._lock, self._worker
-        if lock is None or worker is None:
+        if self._lock is None or self._worker is None:
             return
-        try:
-            if lock.in_place and self._listening.in_place and not self._is_renewed():
-                return
-            self._lock = lock if lock.in_place else self._take_lock()
-        except (OSError, TransportError) as error:
-            if str(error) != self._problem:
-                self._problem = str(error)
-                log.error("the hub cannot be reached by what starts now: its files were removed, and %s", error)
-            return
-        if lock is not self._lock:
-            lock.release()
-        found = self._listening.in_place
-        if found and not self._is_renewed():
+        if not self._lock.in_place:
+            raise TransportError(f"{self._lock.path} was removed: this hub ends, as what starts now does not reach it")
+        if not self._is_renewed():
             return
         self._used = self._newest
         if self._session is not None:
             close_session(self._session)
-        self._problem = ""
-        self._listen(worker)
-        if found:
-            log.info("the hub uses renewed certificates or rules")
-        else:
-            log.warning("the socket of the hub was removed from %s, it has made a new one", self._settings.run_dir)
+        self._listen(self._worker)
+        log.info("the hub uses renewed certificates or rules")
 
     @property
     def _newest(self) -> tuple[object, Access | None]:
@@ -153,9 +129,8 @@ class ZenohHub:
         return lock
 
     def _start(self) -> None:
-        journal = None if self._settings.journal is None else Journal(self._settings.journal)
-        reserved = tuple(topic_to_key(topic) + "/" for topic in self._settings.reserved)
-        self._store = store = HubStore(reserved, self._settings.max_wills)
+        journal = None if (file := self._settings.journal) is None else _journal(file)
+        self._store = store = HubStore(self._settings.max_wills)
         self._worker = HubWorker(self.name, store, self._admission, journal, self.counters)
         self._listen(self._worker)
 
@@ -170,7 +145,6 @@ class ZenohHub:
             self._session = open_session(config)
         except zenoh.ZError as error:
             raise TransportError(f"the hub cannot open {self._socket}: {error}") from None
-        self._listening = OwnFile(self._socket)
         Barrier(self._session, self.name, lambda: 0)
         worker.serve(self._session)
 
@@ -187,11 +161,17 @@ class ZenohHub:
             if not isinstance(error, OSError) or error.errno != errno.EADDRINUSE:
                 return True  # Zenoh says what is wrong with it
             fact = f"transport.listen: {endpoint}: {why_not(error, int(port))}"
-            if not self._settings.reserved:
+            if not self._settings.of_robot:
                 raise TransportError(f"{fact}; end it, or name another port") from None
             log.error("%s; the robot runs without it: end that process and start the robot again", fact)
             return False
         return True
+
+
+def _journal(file: Path) -> Journal:
+    from pebble.transports.zenoh.hub.journal import Journal  # sqlite3, 2.5 MB
+
+    return Journal(file)
 
 
 def _renewed(tls: TlsSettings) -> Renewed[Any]:

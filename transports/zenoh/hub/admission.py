@@ -4,7 +4,7 @@ A command that was left as a will would be published as a fresh one, any time la
 """
 
 import logging
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 
 from msgspec.structs import replace
 
@@ -16,7 +16,6 @@ from pebble.transports.zenoh.wire import OF, Hello, Will
 
 log = logging.getLogger(__name__)
 
-SESSIONS = 20  # of one account, and as many wills
 _CLIENTS = 100  # whose first refusal is logged
 _LOGGED = 200  # characters of a topic or a client's id
 
@@ -46,8 +45,8 @@ class Admission:
     def takes(self, topic: str) -> bool:
         return next((taken for filter_, taken in self._wills if matches(filter_, topic)), True)
 
-    def hello(self, account: str, hello: Hello, stored: Collection[str]) -> Hello | None:
-        """``hello`` without what this account may not; None: it is not answered. ``stored``: sessions with a will.
+    def hello(self, account: str, hello: Hello) -> Hello | None:
+        """Return ``hello`` without what this account may not; None: it is not answered.
 
         Its certificate allows an account to ask under its own name only.
         """
@@ -59,28 +58,19 @@ class Admission:
             return None
         offered = hello.own if known.retains else {}
         own = {key: digest for key, digest in offered.items() if _any(known.retains, key_to_topic(key))}
-        return replace(hello, will=self._of_account(account, known, hello, stored), own=own)
+        return replace(hello, will=self._of_account(account, known, hello.will), own=own)
 
     def owns(self, account: str, session: str) -> bool:
         return not account or session.startswith(account + OF)
 
-    def sessions(self, name: str, alive: Collection[str]) -> bool:
-        """Whether there is room for one more session with this name beside those that are ``alive``."""
-        account, of, _ = name.partition(OF)
-        return not of or name in alive or sum(one.startswith(account + OF) for one in alive) < SESSIONS
-
-    def _of_account(self, account: str, known: HubAccount, hello: Hello, stored: Collection[str]) -> Will | None:
-        will = hello.will
+    def _of_account(self, account: str, known: HubAccount, will: Will | None) -> Will | None:
         if will is None:
             return None
         will = replace(will, client=f"{account}{OF}{will.client}")  # so that it is no one else's predecessor
-        if not _any(known.wills, will.topic):
-            self._refuse_will(will, "an account leaves a will for its own robot only")
-            return None
-        if hello.name not in stored and sum(self.owns(account, one) for one in stored) >= SESSIONS:
-            self._refuse_will(will, f"it has left {SESSIONS} already")
-            return None
-        return will
+        if _any(known.wills, will.topic):
+            return will
+        self._refuse_will(will, "an account leaves a will for its own robot only")
+        return None
 
     def _refuse_will(self, will: Will, why: str) -> None:
         self.refused += 1

@@ -1,112 +1,122 @@
-"""What arrives at a hub takes a place and waits for its turn on the hub's thread: callbacks of Zenoh's threads."""
+"""What arrives at a hub waits for the hub's thread: tasks and queries of Zenoh's threads, within bounds."""
 
 from __future__ import annotations
 
-import time
+import logging
+import threading
+from collections import deque
 from collections.abc import Callable
+from time import monotonic
 
 import zenoh
 
 from pebble.transports.zenoh import wire
-from pebble.transports.zenoh.hub.records import robot_of
 from pebble.transports.zenoh.hub.store import OVERHEAD
-from pebble.transports.zenoh.hub.turns import Places, Task, Turns
 
-ASKED = 2000  # queries that wait for the hub's thread; beyond it …
-SENDERS = 8  # … their senders wait, each connection in its turn; more would take the threads that receive stops
-HELLOS = 8  # of one account that wait
-ASKED_BYTES = 128 << 10  # of one hello, some 2,000 retained topics, or query
-RETAINING_BYTES = 1 << 20  # of retained messages of one robot that wait; beyond it their senders wait, as above
-COMING = 100  # sessions of one account that come or go; the same
+log = logging.getLogger(__name__)
 
+QUEUE_BYTES = 2 << 20  # of tasks that wait, some 5,000; beyond it …
+SENDERS = 8  # … their senders wait; more would take the threads that receive stops
+QUERIES = 10_000  # that wait
+ASKED_BYTES = 1 << 20  # of one hello or query
+
+Task = Callable[[], None]
 _OnQuery = Callable[[zenoh.Query], None]
-_OnSample = Callable[[zenoh.Sample], None]
 
 
 class Intake:
-    """One queue for all messages and queries, in the order of their arrival, and room for each sender that is bounded.
-
-    Each method but :meth:`take`, :meth:`end` and :meth:`answered` queues ``work``, which the hub's thread does.
-    """
+    """Tasks in the order of their arrival, with a query after each of them: neither keeps the other waiting."""
 
     def __init__(self) -> None:
-        self._turns = Turns()
-        self._asking, self._greeting = Places(ASKED, SENDERS), Places(HELLOS)
-        self._retaining, self._coming = Places(RETAINING_BYTES, SENDERS), Places(COMING, SENDERS)
-        self.take, self.end = self._turns.take, self._turns.end
+        self.dropped = 0  # tasks
+        self._lock = threading.Lock()
+        self._changed, self._room = threading.Condition(self._lock), threading.Condition(self._lock)
+        self._tasks, self._queries = deque[tuple[Task, int]](), deque[Task]()
+        self._bytes = self._outside = 0  # of the tasks; senders that wait for room
+        self._ended = self._was_task = False
 
-    def put(self, work: Task) -> None:
-        self._turns.put(work)
+    def put(self, task: Task) -> None:
+        """Queue a task of the hub, or that a client has come or gone."""
+        with self._lock:
+            self._tasks.append((task, 0))
+            self._changed.notify()
 
-    def retain(self, work: _OnSample, sample: zenoh.Sample) -> None:
-        """A message is to be stored, in the room that waiting ones of its robot have: others come in between."""
-        name = robot_of(str(sample.key_expr).removeprefix(wire.RETAINED))
-        size = OVERHEAD + len(sample.payload)
-
-        def store() -> None:
-            self._retaining.leave(name, size)
-            work(sample)
-
-        if self._retaining.take(name, size):
-            self.put(store)
-
-    def come(self, work: _OnSample, sample: zenoh.Sample) -> None:
-        """A client is there, or is gone; those of an account in the room that it has."""
-        account, of, _ = str(sample.key_expr).removeprefix(wire.LIVE).partition(wire.OF)
-
-        def note() -> None:
-            if of:
-                self._coming.leave(account)
-            work(sample)
-
-        if not of or self._coming.take(account):
-            self.put(note)
+    def receive(self, task: Task, size: int) -> None:
+        """Queue what was received, ``size`` bytes. Wait for room, unless too many others do: then drop it."""
+        size += OVERHEAD
+        with self._lock:
+            if self._outside or not self._has_room(size):
+                if self._outside >= SENDERS:
+                    self._note_dropped()
+                    return
+                self._outside += 1
+                self._room.wait_for(lambda: self._has_room(size))
+                self._outside -= 1
+            self._tasks.append((task, size))
+            self._bytes += size
+            self._changed.notify()
+            self._room.notify()
 
     def greet(self, work: _OnQuery, query: zenoh.Query) -> None:
-        """An account says hello or goodbye."""
-        account = str(query.key_expr).rpartition("/")[2]
-
-        def greet() -> None:
-            self._greeting.leave(account)
-            work(query)
-
-        if _admits(query, self._greeting, account):
-            self._turns.ask("hellos", account, greet)
+        """Queue a hello or goodbye, which is a task."""
+        if (size := _size(query)) <= ASKED_BYTES:
+            self.receive(lambda: work(query), size)
+        else:
+            query.drop()  # type: ignore[no-untyped-call]
 
     def ask(self, work: _OnQuery, query: zenoh.Query) -> None:
-        """A query for retained messages holds its place until it is :meth:`answered`."""
-        if _admits(query, self._asking, ""):
-            self.in_turn(work, query)
+        """Queue a query. It is answered with nothing if too many wait, or once nothing waits for its answer."""
+        came = monotonic()
 
-    def in_turn(self, work: _OnQuery, query: zenoh.Query) -> None:
-        """A query that has its place comes in turn with those for other keys, as a hub is not told who asks.
-
-        One that has waited for too long is dropped.
-        """
-        came = time.monotonic()
-
-        def turn() -> None:
-            if time.monotonic() - came < wire.RETAINED_ANSWER_S:
+        def answer() -> None:
+            if monotonic() - came < wire.RETAINED_ANSWER_S:
                 work(query)
             else:
                 query.drop()  # type: ignore[no-untyped-call]
-                self.answered()
 
-        self._turns.ask("queries", str(query.key_expr), turn)
+        with self._lock:
+            admitted = len(self._queries) < QUERIES and _size(query) <= ASKED_BYTES
+            if admitted:
+                self._queries.append(answer)
+                self._changed.notify()
+        if not admitted:
+            query.drop()  # type: ignore[no-untyped-call]
 
-    def answered(self) -> None:
-        """A query has had its answer, or gets none."""
-        self._asking.leave()
+    def end(self) -> None:
+        """Have :meth:`take` return None once nothing is left."""
+        with self._lock:
+            self._ended = True
+            self._changed.notify()
 
-    @property
-    def asked(self) -> int:
-        """How many queries hold a place."""
-        return self._asking.taken.get("", 0)
+    def take(self, timeout: float | None) -> Task | None:
+        """Return what is to be done next, what does nothing after ``timeout`` seconds, or None at the end."""
+        with self._lock:
+            if not (self._tasks or self._queries or self._ended) and not self._changed.wait(timeout):
+                return _nothing
+            if self._queries and (self._was_task or not self._tasks):
+                self._was_task = False
+                return self._queries.popleft()
+            if not self._tasks:
+                return None if self._ended else _nothing
+            self._was_task = True
+            task, size = self._tasks.popleft()
+            self._bytes -= size
+            self._room.notify()
+            return task
+
+    def _has_room(self, size: int) -> bool:
+        """Return True for a task that is larger than all the room if it would have it to itself."""
+        return not self._bytes or self._bytes + size <= QUEUE_BYTES
+
+    def _note_dropped(self) -> None:
+        self.dropped += 1
+        if self.dropped & (self.dropped - 1) == 0:  # the 1st, 2nd, 4th, 8th…
+            log.error("the hub receives more than it can store: %d messages dropped so far", self.dropped)
 
 
-def _admits(query: zenoh.Query, places: Places, name: str) -> bool:
-    """Whether there is a place for a query that is short enough; else it is answered with nothing."""
-    admitted = (query.payload is None or len(query.payload) <= ASKED_BYTES) and places.take(name)
-    if not admitted:
-        query.drop()  # type: ignore[no-untyped-call]
-    return admitted
+def _size(query: zenoh.Query) -> int:
+    return 0 if query.payload is None else len(query.payload)
+
+
+def _nothing() -> None:
+    """Time has passed."""

@@ -7,11 +7,6 @@ import msgspec
 from pebble.transports.zenoh.wire import Stamp, Will
 
 
-def robot_of(key: str) -> str:
-    """The levels of ``key`` that are a robot's base: an account of a robot retains there only."""
-    return "/".join(key.split("/", 3)[:3])
-
-
 class Retained(msgspec.Struct, frozen=True, array_like=True, tag="kept"):
     """One retained message, or the removal of one if ``payload`` is empty."""
 
@@ -19,12 +14,30 @@ class Retained(msgspec.Struct, frozen=True, array_like=True, tag="kept"):
     payload: bytes
     stamp: Stamp
 
+    @property
+    def id(self) -> str:
+        """The name of the record that it replaces."""
+        return f"kept {self.key}"
+
+    @property
+    def is_removal(self) -> bool:
+        return not self.payload
+
 
 class StoredWill(msgspec.Struct, frozen=True, array_like=True, tag="will"):
     """A client's will, or its withdrawal."""
 
     name: str
     will: Will | None
+
+    @property
+    def id(self) -> str:
+        """The name of the record that it replaces."""
+        return f"will {self.name}"
+
+    @property
+    def is_removal(self) -> bool:
+        return self.will is None
 
 
 Record = Retained | StoredWill

@@ -5,48 +5,32 @@ from __future__ import annotations
 import logging
 from collections.abc import Iterator
 
-from pebble.transports.zenoh.hub.records import Record, Retained, StoredWill, robot_of
-from pebble.transports.zenoh.keymap import topic_to_key
+from pebble.transports.zenoh.hub.records import Record, Retained, StoredWill
 from pebble.transports.zenoh.wire import Hello, Will, digest
 
 log = logging.getLogger(__name__)
 
 MAX_BYTES = 64 << 20  # of retained messages and wills together
-ROBOT_BYTES = 8 << 20  # of them for the keys of one robot, at a hub of several: none fills the room of all
-RESERVED_BYTES = 16 << 20  # of them, for keys that are reserved: other clients cannot fill these
 MAX_WILLS = 1000  # of all sessions; a further one is refused
-RESERVED_WILLS = 100  # of them, for the same keys
 OVERHEAD = 400  # bytes of Python's objects for one record, about
 
 
 class HubStore:
     """The newest retained message of every key and the wills of running clients, bounded in bytes and in number.
 
-    What has no room is refused, and changes nothing. A part of the room is for keys that begin with one of
-    ``reserved``.
+    What has no room is refused, and changes nothing.
     """
 
-    def __init__(self, reserved: tuple[str, ...] = (), max_wills: int | None = None) -> None:
+    def __init__(self, max_wills: int | None = None) -> None:
         self.refused = 0  # records there was no room for
-        self._reserved = reserved
         self._max_wills = MAX_WILLS if max_wills is None else max_wills
         self._retained: dict[str, Retained] = {}
         self._wills: dict[str, Will] = {}
-        self._bytes = {True: 0, False: 0}  # by whether the key is reserved
-        self._bytes_of: dict[str, int] = {}  # by robot, if none is reserved
-
-    def empty(self) -> HubStore:
-        """An empty one with the same room."""
-        return HubStore(self._reserved, self._max_wills)
+        self._bytes = 0
 
     def apply(self, record: Record) -> bool:
         """Store a record; False if it changes nothing or there is no room."""
         return self._store_retained(record) if isinstance(record, Retained) else self._store_will(record)
-
-    def take_over(self, newer: HubStore) -> None:
-        """Apply what another store has, which is newer than all that is here."""
-        for record in newer.records():
-            self.apply(record)
 
     def get(self, key: str) -> Retained | None:
         return self._retained.get(key)
@@ -82,7 +66,7 @@ class HubStore:
     def _store_retained(self, record: Retained) -> bool:
         before = self._retained.get(record.key)
         after = record if record.payload else None
-        if not self._resize(record.key, _size(after) - _size(before)):
+        if not self._resize(_size(after) - _size(before)):
             self._refuse(f"retained message of {record.key}")
             return False
         if after is None:
@@ -94,33 +78,22 @@ class HubStore:
     def _store_will(self, record: StoredWill) -> bool:
         name, before, after = record.name, self._wills.get(record.name), record.will
         if after is not None:
-            key = topic_to_key(after.topic)
-            outside = self._reserved and not key.startswith(self._reserved)
-            most = self._max_wills - RESERVED_WILLS if outside else self._max_wills
-            full = before is None and len(self._wills) >= most
-            if full or not self._resize(key, _size(after)):
+            full = before is None and len(self._wills) >= self._max_wills
+            if full or not self._resize(_size(after)):
                 self._refuse(f"will of {name}")
                 return False
             self._wills[name] = after
         elif before is not None:
             del self._wills[name]
         if before is not None:
-            self._resize(topic_to_key(before.topic), -_size(before))
+            self._resize(-_size(before))
         return before != after
 
-    def _resize(self, key: str, grown: int) -> bool:
-        """Account for ``grown`` bytes more, or less, of ``key``; False if there is no room for them."""
-        reserved, robot = key.startswith(self._reserved), robot_of(key)
-        of_robot = 0 if self._reserved else self._bytes_of.get(robot, 0) + grown
-        if grown > 0:
-            full = sum(self._bytes.values()) + grown > MAX_BYTES or of_robot > ROBOT_BYTES
-            if full or (self._reserved and not reserved and self._bytes[False] + grown > MAX_BYTES - RESERVED_BYTES):
-                return False
-        self._bytes[reserved] += grown
-        if of_robot:
-            self._bytes_of[robot] = of_robot
-        else:
-            self._bytes_of.pop(robot, None)
+    def _resize(self, grown: int) -> bool:
+        """Account for ``grown`` bytes more, or less; False if there is no room for them."""
+        if grown > 0 and self._bytes + grown > MAX_BYTES:
+            return False
+        self._bytes += grown
         return True
 
     def _refuse(self, what: str) -> None:

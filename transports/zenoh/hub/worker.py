@@ -7,7 +7,7 @@ import threading
 import time
 from collections.abc import Callable
 from functools import partial
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import msgspec
 import zenoh
@@ -17,14 +17,15 @@ from pebble.transports.counters import Counters
 from pebble.transports.zenoh import wire
 from pebble.transports.zenoh.callbacks import direct
 from pebble.transports.zenoh.hub.admission import Admission
-from pebble.transports.zenoh.hub.intake import Intake
-from pebble.transports.zenoh.hub.journal import Journal
+from pebble.transports.zenoh.hub.intake import Intake, Task
 from pebble.transports.zenoh.hub.records import Record, Retained, StoredWill
 from pebble.transports.zenoh.hub.store import HubStore
-from pebble.transports.zenoh.hub.turns import Task
 from pebble.transports.zenoh.hub.waiting import WaitingQueries
 from pebble.transports.zenoh.hub.wills import WillTimes
 from pebble.transports.zenoh.keymap import topic_to_key
+
+if TYPE_CHECKING:
+    from pebble.transports.zenoh.hub.journal import Journal
 
 log = logging.getLogger(__name__)
 
@@ -38,7 +39,6 @@ class HubWorker:
         self, name: str, store: HubStore, admission: Admission, journal: Journal | None, counters: Counters
     ) -> None:
         self._store, self._journal, self._counters, self._admission = store, journal, counters, admission
-        self._recalled = False  # the records of the journal
         self.alive_clients: set[str] = set()
         self._name, self._wills = name, WillTimes()
         self._has_met = False  # another hub
@@ -47,11 +47,7 @@ class HubWorker:
         self._session: zenoh.Session | None = None
         self._thread = threading.Thread(target=self._run, name="pebble-hub", daemon=True)
         if journal is not None:
-            self._write_journal(journal)
-
-    @property
-    def store(self) -> HubStore:
-        return self._store
+            self._recall(journal)
 
     def serve(self, session: zenoh.Session) -> None:
         """Serve the clients of ``session`` instead of those of the one before, which is closed."""
@@ -59,14 +55,13 @@ class HubWorker:
             self.post(self._await_return)
         self._session = session
         # Its own messages would wait for room in the queue that this thread empties.
-        others, retain = zenoh.Locality.REMOTE, direct(partial(self._intake.retain, self._store_retained))
-        session.declare_subscriber(wire.RETAINED + "**", retain, allowed_origin=others)
+        retain = direct(lambda sample: self._intake.receive(partial(self._store_retained, sample), len(sample.payload)))
+        session.declare_subscriber(wire.RETAINED + "**", retain, allowed_origin=zenoh.Locality.REMOTE)
         session.declare_queryable(wire.RETAINED + "**", direct(partial(self._intake.ask, self._query)), complete=True)
         for what, work in ((wire.HELLO, self._on_hello), (wire.BYE, self._on_bye)):
-            session.declare_queryable(what, self._queued(work))
-            session.declare_queryable(f"{what}/*", direct(partial(self._intake.greet, work)))
-        come = direct(partial(self._intake.come, self._on_client))
-        session.liveliness().declare_subscriber(wire.LIVE + "*", come, history=True)
+            for key in (what, f"{what}/*"):
+                session.declare_queryable(key, direct(partial(self._intake.greet, work)))
+        session.liveliness().declare_subscriber(wire.LIVE + "*", self._queued(self._on_client), history=True)
         session.liveliness().declare_subscriber(wire.UP + "*", direct(self._on_hub), history=True)
         self._token = session.liveliness().declare_token(wire.UP + self._name)
         if not self._thread.is_alive():
@@ -96,8 +91,8 @@ class HubWorker:
             self._do(task)
             self._answer_waiting()
             self._publish_due_wills()
-            if self._journal is not None and self._journal.rewrite_due:
-                self._do(partial(self._write_journal, self._journal))
+            if self._journal is not None and time.monotonic() >= self._journal.rewrite_at:
+                self._write_journal(self._journal)
 
     def _do(self, task: Task) -> None:
         try:
@@ -112,12 +107,9 @@ class HubWorker:
             log.exception("the hub failed on one of its tasks")
 
     def _pause(self) -> float | None:
-        now = time.monotonic()
-        pauses = [self._wills.next_due - now, self._waiting.due() - now]
-        if self._journal is not None:
-            pauses.append(self._journal.wait_s)
-        pause = max(0.0, min(pauses))
-        return None if pause == _NEVER else pause
+        again = _NEVER if self._journal is None else self._journal.rewrite_at
+        due = min(self._wills.next_due, self._waiting.due(), again)
+        return None if due == _NEVER else max(0.0, due - time.monotonic())
 
     # -- retained messages
 
@@ -134,17 +126,15 @@ class HubWorker:
             needs = wire.decode_counts(_payload(query))
         except (ValueError, msgspec.DecodeError):
             query.drop()  # type: ignore[no-untyped-call]
-            self._intake.answered()
             raise
         if not self._waiting.add(needs, query, time.monotonic()):
             self._answer(query)
 
     def _answer_waiting(self) -> None:
         for query in self._waiting.take(time.monotonic()):
-            self._intake.in_turn(self._answer, query)
+            self._intake.ask(self._answer, query)
 
     def _answer(self, query: zenoh.Query) -> None:
-        self._intake.answered()
         with query:
             for retained in self._selected(query.key_expr):
                 query.reply(wire.RETAINED + retained.key, retained.payload, attachment=retained.stamp.pack())
@@ -163,7 +153,7 @@ class HubWorker:
     def _on_hello(self, query: zenoh.Query) -> None:
         with query:
             account = wire.account_of(str(query.key_expr), wire.HELLO)
-            admitted = self._admission.hello(account, wire.decode_hello(_payload(query)), self._store.wills())
+            admitted = self._admission.hello(account, wire.decode_hello(_payload(query)))
             if admitted is None:
                 return
             hello = admitted
@@ -200,8 +190,7 @@ class HubWorker:
     def _on_client(self, sample: zenoh.Sample) -> None:
         name = str(sample.key_expr).removeprefix(wire.LIVE)
         if sample.kind == zenoh.SampleKind.PUT:
-            if self._admission.sessions(name, self.alive_clients):
-                self.alive_clients.add(name)
+            self.alive_clients.add(name)
             self._wills.forget(name)
             return
         self.alive_clients.discard(name)
@@ -241,40 +230,26 @@ class HubWorker:
 
     # -- store and journal
 
-    def apply(self, record: Record) -> bool:
-        """Store what is admitted of ``record``; returns whether that changed anything."""
+    def apply(self, record: Record) -> None:
+        """Store what is admitted of ``record``."""
         admitted = self._admission.admitted(record)
-        changed = admitted is not None and self._store.apply(admitted)
-        if changed and self._journal is not None:
-            self._journal.append(wire.encode(admitted))
-        return changed
+        if admitted is not None and self._store.apply(admitted) and self._journal is not None:
+            self._journal.put(admitted.id, None if admitted.is_removal else wire.encode(admitted))
 
-    def _write_journal(self, journal: Journal) -> None:
-        """Write all records anew, together with those of an earlier hub: these are read once, as soon as they can be.
-
-        Never before: the file would be lost.
-        """
-        if journal.appeared:
-            self._recalled = False
-        self._recalled = self._recalled or self._recall(journal)
-        if self._recalled:
-            journal.rewrite(map(wire.encode, self._store.records()))
-
-    def _recall(self, journal: Journal) -> bool:
-        loaded = journal.load()
-        if loaded is None:
-            return False
-        earlier, decode = self._store.empty(), msgspec.msgpack.Decoder(Record).decode
-        for data in loaded:
+    def _recall(self, journal: Journal) -> None:
+        """Store what an earlier hub has stored, and only that from now on."""
+        decode = msgspec.msgpack.Decoder(Record).decode
+        for data in journal.load():
             try:
                 if (record := self._admission.admitted(decode(data))) is not None:
-                    earlier.apply(record)
+                    self._store.apply(record)
             except msgspec.DecodeError as error:
                 log.warning("journal %s has a record of another kind: %s", journal.path, error)
-        earlier.take_over(self._store)
-        self._store = earlier
+        self._write_journal(journal)
         self._await_wills()
-        return True
+
+    def _write_journal(self, journal: Journal) -> None:
+        journal.rewrite((record.id, wire.encode(record)) for record in self._store.records())
 
     def _await_return(self) -> None:
         """Clients of a session that was closed have as long to come back as after a restart."""
