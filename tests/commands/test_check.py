@@ -25,7 +25,7 @@ def test_every_config_we_ship_is_right(run: Run, path: Path) -> None:
 
 def test_check_prints_what_each_key_means(run: Run) -> None:
     assert run("check", "--keys") == 0
-    assert "| `services.mqtt_bridge.remote_mqtt.host` | `\"\"` |" in run.out
+    assert '| `services.mqtt_bridge.remote_mqtt.host` | `""` |' in run.out
     assert run("check") == 2
     assert "name a config" in run.err
 
