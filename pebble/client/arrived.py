@@ -1,6 +1,7 @@
-"""Messages on their way from the transport's thread to the event loop. Neither locks nor waits."""
+"""Messages on their way from threads of the transport to the event loop. It never waits for room."""
 
 import logging
+import threading
 from collections import deque
 from collections.abc import Callable
 from typing import Final
@@ -17,30 +18,33 @@ MAX_DEFERRED: Final = 5_000  # heartbeats, which come again, take no room from w
 
 
 class Arrived:
-    """One thread alone puts, another alone gets."""
+    """Any thread puts, the event loop alone gets."""
 
     def __init__(self) -> None:
         self.dropped = 0
         self._waiting: deque[tuple[Handler, Message, float]] = deque()
-        self._put_bytes = self._got_bytes = 0  # each written by one thread
+        self._bytes = 0
+        self._lock = threading.Lock()  # guards these
 
     def put(self, handler: Handler, message: Message, at: float, *, deferred: bool = False) -> bool:
         """False if there is no room for it."""
         size = len(message.payload)
         most = MAX_DEFERRED if deferred else MAX_MESSAGES
-        if len(self._waiting) >= most or self._put_bytes - self._got_bytes + size > MAX_BYTES:
+        with self._lock:
+            if len(self._waiting) < most and self._bytes + size <= MAX_BYTES:
+                self._bytes += size
+                self._waiting.append((handler, message, at))
+                return True
             self.dropped += 1
-            if self.dropped & (self.dropped - 1) == 0:  # the 1st, 2nd, 4th, 8th …
-                log.warning("%d messages dropped, the last on %s: too many at once", self.dropped, message.topic)
-            return False
-        self._put_bytes += size
-        self._waiting.append((handler, message, at))
-        return True
+        if self.dropped & (self.dropped - 1) == 0:  # the 1st, 2nd, 4th, 8th …
+            log.warning("%d messages dropped, the last on %s: too many at once", self.dropped, message.topic)
+        return False
 
     def get(self) -> tuple[Handler, Message, float] | None:
         """The oldest; None if there is none."""
-        if not self._waiting:
-            return None
-        one = self._waiting.popleft()
-        self._got_bytes += len(one[1].payload)
-        return one
+        with self._lock:
+            if not self._waiting:
+                return None
+            arrived = self._waiting.popleft()
+            self._bytes -= len(arrived[1].payload)
+            return arrived

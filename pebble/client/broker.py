@@ -118,12 +118,17 @@ class Broker:
         """
 
         def take(message: Message) -> None:
-            if not self._arrived.put(handler, message, time.monotonic(), deferred=deferred):
+            if not self.hand_over(handler, message, deferred=deferred):
                 on_refused()
-            elif not deferred:
-                self._wake()
 
         return await asyncio.to_thread(self.transport.subscribe, filter_, take, qos=qos, direct=True)
+
+    def hand_over(self, handler: Handler, message: Message, *, deferred: bool = False) -> bool:
+        """Have the event loop handle a message that has come on another thread; False if there is no room for it."""
+        has_room = self._arrived.put(handler, message, time.monotonic(), deferred=deferred)
+        if has_room and not deferred:
+            self._wake()
+        return has_room
 
     def deliver(self) -> None:
         """Hand over what has arrived, in its order; the rest after whatever else is due, if that takes long."""

@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 import asyncio
-import threading
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
-from typing import Any
 
 import pytest
 
 from pebble.client.broker import Broker
 from pebble.client.media_request import request as module
 from pebble.client.media_request.request import MediaRequest
-from tests.web.media.robots import CAMERA, REF, VIDEO, PictureRobot, broker_on, status_of, until
+from tests.web.media.robots import REF, VIDEO, PictureRobot, broker_on, status_of, until
 
 pytestmark = pytest.mark.anyio
 
@@ -33,18 +31,6 @@ class Requested:
         self.received: list[bytes] = []
         self.steps = 0
         self.request = MediaRequest(self.broker, REF, "video", self.received.append)
-        self.taken = threading.Event()  # the request has handled one more picture, in a thread of its subscription
-        subscribe = self.broker.transport.subscribe
-
-        def noted(filter_: str, handler: Callable[..., None], **options: Any) -> Any:
-            def handle(*message: Any) -> None:
-                handler(*message)
-                if filter_ == CAMERA:
-                    self.taken.set()
-
-            return subscribe(filter_, handle, **options)
-
-        self.broker.transport.subscribe = noted  # type: ignore[method-assign]
 
     async def step(self) -> None:
         self.steps += 1
@@ -63,20 +49,6 @@ class Requested:
             await task
             await self.broker.close()
             self.robot.close()
-
-
-@pytest.mark.parametrize(("count", "size", "most"), [(2100, 1, 2000), (20, 1 << 20, 16)])
-async def test_what_arrives_while_the_event_loop_is_late_is_bounded(count: int, size: int, most: int) -> None:
-    one = Requested()
-    async with one.running():
-        for _ in range(count):
-            one.robot.send(bytes(size))
-            assert one.taken.wait(10), "the loop takes nothing meanwhile"
-            one.taken.clear()
-        await until(lambda: len(one.received) >= most)
-        one.robot.send(b"later")
-        await until(lambda: one.received[-1:] == [b"later"])
-        assert len(one.received) == most + 1
 
 
 async def test_it_is_withdrawn_once_there_is_a_broker_again(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -3,7 +3,6 @@
 import asyncio
 import contextlib
 import logging
-import threading
 import time
 from collections.abc import Awaitable, Callable
 from typing import Any, Final
@@ -14,6 +13,7 @@ from pebble.client.media_request.offer import CHANNELS, WORDS, offered, refusal
 from pebble.client.robot_topics import named_topic
 from pebble.client.viewer import Medium, Viewer
 from pebble.errors import PebbleError
+from pebble.transports import Message
 
 log = logging.getLogger(__name__)
 
@@ -21,7 +21,6 @@ LINGER_S: Final = 5.0  # unwanted, before the request is withdrawn: a page that 
 TICK_S: Final = 0.5
 _PROGRAMS: Final[dict[Medium, str]] = {"video": "camera_publisher", "audio": "audio_publisher"}
 _WAITS: Final[dict[Medium, str]] = {"video": "Pictures wait for driving", "audio": "it waits for driving"}
-_MAX_PENDING, _MAX_PENDING_BYTES = 2000, 16 << 20  # received, and not yet taken by the event loop
 
 
 class MediaRequest:
@@ -34,8 +33,7 @@ class MediaRequest:
         self.encoding: str | None = None  # as requested; None: as configured, or nothing is requested
         self.waits = ""  # why the robot, which knows of it, sends nothing for now: nothing is repeated
         self.requested_at = float("-inf")
-        self._broker = broker
-        self._inbox = _Inbox(broker, lambda payload: None if self._viewer is None else receive(payload))
+        self._broker, self._receive = broker, receive
         self._viewer: Viewer | None = None
         self._topics: list[str | None] = []  # that the capabilities named at the request
         self._wanted = self._closing = False
@@ -110,7 +108,7 @@ class MediaRequest:
         viewer = self._viewer
         if viewer is None or topics != self._topics:
             await self._withdraw()
-            viewer = Viewer(self._broker.transport, self.ref, lambda _, payload: self._inbox.put(payload), capabilities)
+            viewer = Viewer(self._broker.transport, self.ref, self._hand_over, capabilities)
             self._viewer, self._topics = viewer, topics
         elif encoding == self.encoding:
             viewer.capabilities = capabilities
@@ -123,6 +121,14 @@ class MediaRequest:
         except PebbleError:
             await self._withdraw()
             raise
+
+    def _hand_over(self, _medium: Medium, payload: bytes) -> None:
+        """Called on a thread of the transport. What finds no room is noticed by the numbers of what follows."""
+        self._broker.hand_over(self._take, Message(self.ref, payload))
+
+    def _take(self, message: Message, _at: float) -> None:
+        if self._viewer is not None:
+            self._receive(message.payload)
 
     async def _withdraw(self) -> None:
         viewer, self._viewer = self._viewer, None
@@ -145,28 +151,3 @@ class MediaRequest:
             async with asyncio.timeout(max(0.001, began + TICK_S - time.monotonic())):
                 await self._wakeup.wait()
         self._wakeup.clear()
-
-
-class _Inbox:
-    """Payloads on their way from a thread of the transport to the event loop."""
-
-    def __init__(self, broker: Broker, receive: Callable[[bytes], None]) -> None:
-        self._broker, self._receive = broker, receive
-        self._pending = self._pending_bytes = 0
-        self._lock = threading.Lock()  # guards these two
-
-    def put(self, payload: bytes) -> None:
-        size = len(payload)
-        with self._lock:
-            if self._pending >= _MAX_PENDING or self._pending_bytes + size > _MAX_PENDING_BYTES:
-                return  # the event loop is far behind; what is missing is noticed by the numbers
-            self._pending += 1
-            self._pending_bytes += size
-        with contextlib.suppress(RuntimeError):  # the loop has ended
-            self._broker.loop.call_soon_threadsafe(self._take, payload)
-
-    def _take(self, payload: bytes) -> None:
-        with self._lock:
-            self._pending -= 1
-            self._pending_bytes -= len(payload)
-        self._receive(payload)
