@@ -124,7 +124,7 @@ class People:
     def list(self) -> list[User]:
         return [User(name, Role(role)) for name, role in self._rows("SELECT name, role FROM people ORDER BY name")]
 
-    def version(self) -> tuple[int, int, int]:
+    def version(self) -> tuple[int, int]:
         """Another one after each change of people and sessions, by whatever process. Raises DatabaseError."""
         with self._lock:
             return self._database.version()

@@ -68,7 +68,7 @@ class Server:
         self.robots.is_kept = lambda ref: self._is_wanted(ref) or self.stops.sends_to(ref)
         self.robots.on_forget = self._ask_anew
         self._of_all: list[Subscription] = []
-        self.people_version = (0, 0, 0)
+        self.people_version = (0, 0)
         self._tasks: set[asyncio.Task[None]] = set()
 
     async def open(self) -> None:
