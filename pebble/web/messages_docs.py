@@ -1,15 +1,13 @@
-"""Generates messages.d.ts and parts of docs/web-messages.md from messages.py, and the table of docs/words.md.
+"""Generates messages.d.ts from messages.py, and the table of docs/words.md.
 
 Program: ``python -m pebble.web.messages_docs`` writes them; a test checks that they are current.
 """
 
-import inspect
 import json
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, get_args
 
-import msgspec
 from msgspec import inspect as types
 
 from pebble.client import drive_reasons
@@ -18,22 +16,8 @@ from pebble.contract.docs import filled
 from pebble.web import messages
 
 _ROOT = Path(__file__).parents[2]
-DOCS = _ROOT / "docs" / "web-messages.md"
 WORDS = _ROOT / "docs" / "words.md"
 DECLARATIONS = Path(__file__).parent / "static" / "messages.d.ts"
-
-
-def markdown() -> str:
-    """docs/web-messages.md with its generated parts replaced."""
-    about = (messages.__doc__ or "").partition("\n")[2].strip().partition("docs/web-messages.md")[0].strip()
-    parts = [f"{_summary(messages)} {about}\n".replace("``", "`")]
-    parts += ["## From the page\n", *map(_section, get_args(messages.FromPage))]
-    parts += ["## From the server\n", *map(_section, get_args(messages.ToPage))]
-    replay = *get_args(messages.FromReplay), messages.Played
-    parts += ["## On the socket of a recording\n", *map(_section, replay)]
-    parts += ["## Metrics of the server\n", *map(_section, _views())]
-    texts = {"messages": "\n".join(parts), "TalkAnswer": _section(messages.TalkAnswer)}
-    return filled(DOCS.read_text(encoding="utf-8"), texts)
 
 
 def words() -> str:
@@ -73,27 +57,6 @@ def _views() -> Iterator[type]:
     yield from messages.SERVER_METRICS.values()
 
 
-def _section(struct: type) -> str:
-    info: Any = types.type_info(struct)
-    title = f"`{info.tag}`" if info.tag is not None else struct.__name__
-    rows = [f"| `{one.name}` | {_words(one.type)} | {'' if one.required else _default(one)} |" for one in info.fields]
-    table = ["| field | type | default |", "|---|---|---|", *rows, ""] if rows else []
-    return "\n".join([f"### {title}\n", inspect.cleandoc(struct.__doc__ or "").replace("``", "`"), "", *table])
-
-
-def _default(field: Any) -> str:
-    value = field.default if field.default_factory is msgspec.NODEFAULT else field.default_factory()
-    return f"`{json.dumps(value)}`"
-
-
-def _summary(thing: object) -> str:
-    return (inspect.getdoc(thing) or "").partition("\n")[0]
-
-
-def _words(kind: Any) -> str:
-    return _script(kind).replace("|", "or")
-
-
 def _script(kind: Any) -> str:
     match kind:
         case types.Metadata():
@@ -123,8 +86,7 @@ def _script(kind: Any) -> str:
 
 
 def main() -> None:
-    """Write the three files."""
-    DOCS.write_text(markdown(), encoding="utf-8")
+    """Write the two files."""
     WORDS.write_text(words(), encoding="utf-8")
     DECLARATIONS.write_text(declarations(), encoding="utf-8")
 
