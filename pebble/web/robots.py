@@ -28,8 +28,7 @@ MAX_COMPONENTS, MAX_METRICS, MAX_VALUE_BYTES = 2000, 200, 64 * 1024
 _MAX_CLIPS_BYTES = 400 * 1024  # of the list of clips, which has up to 256 KiB of names
 LARGE_BYTES = 16 * 1024  # a value beyond holds up a slow connection: one is sent, then the page has to answer
 MAX_STATE_BYTES = 128 * 1024  # of values in one message: pings, by which pages drive, do not wait for thousands
-MAX_BYTES = 64 * 1024 * 1024  # of all values together
-RESERVED_BYTES = 16 * 1024  # of them for each component, whatever the others send
+MAX_BYTES = 32 * 1024 * 1024  # of all values together, but for those of components that are open, driven or stopped
 MAX_ALIASES = 64  # of one component: topics that its microcontrollers declare besides the contract's
 _REFRESH_S = 1.0  # values that change with every heartbeat are sent this often,
 _REFRESHES_PER_S = 100  # but of so many components at most, and of those that are open
@@ -50,7 +49,6 @@ class Component:
         self.ref = ref
         self.robot = RobotView(ref)
         self.values: dict[str, _Value] = {}
-        self.bytes = 0  # of the values
         self.aliases: dict[str, tuple[str, ...]] = {}  # by metric of the manifest that declares them
         self.sent_online: bool | None = None
         self.refreshed_at = float("-inf")
@@ -226,7 +224,7 @@ class Robots:
         """Remove a component, also one that was never there; it comes back with its next message."""
         component = self.components.pop(ref, None)
         if component is not None:
-            self._bytes -= component.bytes
+            self._bytes -= sum(len(bytes(value.raw)) for value in component.values.values())
         self.on_forget(ref)
         for key in [key for key in self._server if key[0] == ref]:
             del self._server[key]
@@ -277,14 +275,12 @@ class Robots:
         return component
 
     def _has_room(self, component: Component, metric: str, channel: c.Channel, grows: int) -> bool:
+        if component.lists(metric):
+            return True
         is_new = metric not in component.values
-        if is_new and len(component.values) >= MAX_METRICS and channel.is_pattern and not component.lists(metric):
+        if is_new and len(component.values) >= MAX_METRICS and channel.is_pattern:
             return False
-        return (
-            component.bytes + grows <= RESERVED_BYTES
-            or self._bytes + grows <= MAX_BYTES - MAX_COMPONENTS * RESERVED_BYTES
-            or self.is_kept(component.ref)
-        )
+        return self._bytes + grows <= MAX_BYTES or self.is_kept(component.ref)
 
     def _store(self, component: Component, metric: str, channel: c.Channel, message: Message, now: float) -> bool:
         """Check and store the value; False if it is refused."""
@@ -300,7 +296,6 @@ class Robots:
         except PayloadError:
             return False
         self._bytes += grows
-        component.bytes += grows
         component.values[metric] = _Value(msgspec.Raw(message.payload), now)
         if channel is not c.ONLINE:
             self._mark(component.ref, metric)
@@ -311,7 +306,6 @@ class Robots:
         old = component.values.pop(metric, None)
         if old is not None:
             self._bytes -= len(bytes(old.raw))
-            component.bytes -= len(bytes(old.raw))
             self._mark(component.ref, metric)
         component.aliases.pop(metric, None)
 
