@@ -101,34 +101,22 @@ class Broker:
             log.warning("not published: %s", error)
             return False
 
-    async def subscribe(
-        self,
-        filter_: str,
-        handler: Handler,
-        *,
-        qos: QoS = QoS.DELIVERED,
-        deferred: bool = False,
-        on_refused: Callable[[], None] = lambda: None,
-    ) -> Subscription:
+    async def subscribe(self, filter_: str, handler: Handler, *, deferred: bool = False) -> Subscription:
         """Deliver what matches ``filter_`` until it is unsubscribed.
 
         ``deferred``: with the next call of ``deliver``, or before the next message that is not. To wake the event loop
-        for each heartbeat of a hundred robots costs more than the heartbeats. ``on_refused`` is called on the
-        transport's thread for a message that is dropped because too many have arrived.
+        for each heartbeat of a hundred robots costs more than the heartbeats.
         """
 
         def take(message: Message) -> None:
-            if not self.hand_over(handler, message, deferred=deferred):
-                on_refused()
+            self.hand_over(handler, message, deferred=deferred)
 
-        return await asyncio.to_thread(self.transport.subscribe, filter_, take, qos=qos, direct=True)
+        return await asyncio.to_thread(self.transport.subscribe, filter_, take, qos=QoS.DELIVERED, direct=True)
 
-    def hand_over(self, handler: Handler, message: Message, *, deferred: bool = False) -> bool:
-        """Have the event loop handle a message that has come on another thread; False if there is no room for it."""
-        has_room = self._arrived.put(handler, message, time.monotonic(), deferred=deferred)
-        if has_room and not deferred:
+    def hand_over(self, handler: Handler, message: Message, *, deferred: bool = False) -> None:
+        """Have the event loop handle a message that has come on another thread, if there is room for it."""
+        if self._arrived.put(handler, message, time.monotonic(), deferred=deferred) and not deferred:
             self._wake()
-        return has_room
 
     def deliver(self) -> None:
         """Hand over what has arrived, in its order; the rest after whatever else is due, if that takes long."""

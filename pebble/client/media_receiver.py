@@ -1,13 +1,16 @@
-"""Receives one robot's pictures and sound, measures their rate and age, and whether the robot is stopped."""
+"""Receives one robot's pictures and sound, and measures their rate and age."""
 
+import threading
 import time
 
-from pebble.client.estop_states import RobotEstop
+from pebble.client.robot_view import RobotView
 from pebble.client.viewer import Medium, Viewer
+from pebble.contract import CAPABILITIES
+from pebble.errors import PebbleError
 from pebble.media.decode import Decoded, VideoDecoder, encoding_of
 from pebble.media.rate_meter import RateMeter
 from pebble.media.sound import ReceivedSound, SoundDecoder
-from pebble.transports import Transport
+from pebble.transports import Message, Transport
 
 
 class MediaReceiver:
@@ -17,18 +20,19 @@ class MediaReceiver:
     """
 
     def __init__(self, transport: Transport, base: str) -> None:
-        self.name = base.rpartition("/")[2]
+        self.robot = RobotView(base)  # by its capabilities
         self.newest: Decoded | None = None
         self.pictures, self.sounds = RateMeter(), RateMeter()
         self.encoding: dict[Medium, str] = {}  # of the last payload
-        self.estop = RobotEstop(base)
-        self.estop.subscribe(transport)
         self._video, self._audio = VideoDecoder(), SoundDecoder()
         self.viewer = Viewer(transport, base, self._on_payload)
+        self._is_known = threading.Event()
+        self._capabilities = transport.subscribe(CAPABILITIES.topic(base), self._on_capabilities)
 
     def wait_for_capabilities(self, timeout: float) -> None:
         """Wait for the robot's capabilities; raises PebbleError on timeout."""
-        self.viewer.wait_for_capabilities(timeout)
+        if not self._is_known.wait(timeout):
+            raise PebbleError(f"{self.robot.base} publishes no capabilities: is the robot up, and is this its broker?")
 
     def request(self, encoding: str | None, *, sound: bool) -> None:
         """Request pictures, and sound if the robot has it. Raises PebbleError if it has no pictures."""
@@ -52,6 +56,7 @@ class MediaReceiver:
         return f"{self.encoding[medium]} {rate:.0f}/s {meter.bitrate(now) / 1000:.0f} kbit/s{age}"
 
     def close(self) -> None:
+        self._capabilities.close()
         self.viewer.close()
 
     def on_picture(self, picture: Decoded) -> None:
@@ -60,7 +65,13 @@ class MediaReceiver:
     def on_sound(self, received: ReceivedSound) -> None:
         """Override to get every packet of sound; runs on a thread of the transport."""
 
-    # -- the transport's threads, one per medium
+    # -- the transport's threads
+
+    def _on_capabilities(self, message: Message) -> None:
+        self.robot.receive(CAPABILITIES, message, 0.0, 0.0)
+        self.viewer.capabilities = self.robot.capabilities
+        if self.robot.estop.has_capabilities:
+            self._is_known.set()
 
     def _on_payload(self, medium: Medium, payload: bytes) -> None:
         if medium == "video":

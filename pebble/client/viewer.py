@@ -1,21 +1,17 @@
-"""Requests one robot's pictures and sound as an operator does: reads capabilities, sets flags, sends requests."""
+"""Requests one robot's pictures and sound as an operator does: sets flags, sends requests."""
 
 from __future__ import annotations
 
-import logging
-import threading
 import time
 from collections import deque
 from collections.abc import Callable
 from typing import Any, Literal
 
 from pebble.client.robot_topics import topic_of
-from pebble.contract import AUDIO_CONTROL, CAPABILITIES, MQTT_AUDIO, MQTT_VIDEO, VIDEO_CONTROL, Channel, codec
+from pebble.contract import AUDIO_CONTROL, MQTT_AUDIO, MQTT_VIDEO, VIDEO_CONTROL, Channel, codec
 from pebble.contract.payloads import MediaRequest
 from pebble.errors import PayloadError, PebbleError
 from pebble.transports import Message, QoS, Subscription, Transport
-
-log = logging.getLogger(__name__)
 
 Medium = Literal["video", "audio"]
 _CONTROLS: dict[Medium, Channel] = {"video": VIDEO_CONTROL, "audio": AUDIO_CONTROL}
@@ -32,23 +28,21 @@ class Viewer:
 
     ``on_payload(medium, payload)`` runs on a thread of the transport. :meth:`close` withdraws the requests made by
     :meth:`request` and lowers the flags it raised; what was running before stays. A flag that another operator lowers
-    stays lowered. ``on_payload`` None: another connection of the caller receives the media, which calls
-    :meth:`note_received`, so that they are transmitted once.
+    stays lowered.
     """
 
     def __init__(
         self,
         transport: Transport,
         base: str,
-        on_payload: Callable[[Medium, bytes], None] | None,
+        on_payload: Callable[[Medium, bytes], None],
         capabilities: dict[str, Any] | None = None,
     ) -> None:
-        """``capabilities``: those to go by; None: what the robot publishes."""
+        """``capabilities``: the robot's, as far as they are known."""
         self.base = base
         self.capabilities = capabilities or {}
         self.sent: deque[bytes] = deque(maxlen=_SENT)  # own requests: what else arrives on their topic is from others
         self._transport, self._on_payload = transport, on_payload
-        self._has_capabilities = threading.Event()
         self._flags: dict[str, bool] = {}  # by topic: the retained value
         self._raised: set[Medium] = set()
         self._requested: set[Medium] = set()
@@ -58,13 +52,6 @@ class Viewer:
         self._received_at: dict[Medium, float] = {}
         self._keyframe_at = float("-inf")
         self._subscriptions: list[Subscription] = []
-        if capabilities is None:
-            self._subscriptions.append(transport.subscribe(CAPABILITIES.topic(base), self._on_capabilities))
-
-    def wait_for_capabilities(self, timeout: float) -> None:
-        """Wait for the robot's capabilities; raises PebbleError on timeout."""
-        if not self._has_capabilities.wait(timeout):
-            raise PebbleError(f"{self.base} publishes no capabilities: is the robot up, and is this its broker?")
 
     def request(self, medium: Medium, encoding: str | None = None) -> None:
         """Start ``medium`` in ``encoding``, or as configured. Raises PebbleError if the robot does not offer it."""
@@ -85,10 +72,6 @@ class Viewer:
             self._raised.add(medium)
             self._set_flag(medium, up=True)
         self._send_request(medium)
-
-    def note_received(self, medium: Medium) -> None:
-        """A payload of ``medium`` has arrived now."""
-        self._received_at[medium] = time.monotonic()
 
     def repeat_requests(self) -> None:
         """Call this now and then: sends each request again while no payload arrives."""
@@ -157,14 +140,6 @@ class Viewer:
 
     # -- the transport's threads
 
-    def _on_capabilities(self, message: Message) -> None:
-        try:
-            self.capabilities = codec.decode(CAPABILITIES, message.payload).value
-        except PayloadError as error:
-            log.warning("capabilities of %s cannot be decoded: %s", self.base, error)
-            return
-        self._has_capabilities.set()
-
     def _subscribe(self, medium: Medium) -> None:
         flag = self.topic(_FLAGS[medium])
 
@@ -177,11 +152,11 @@ class Viewer:
                 self._raised.discard(medium)  # another operator has lowered it, so raising it again is theirs, too
 
         self._subscriptions.append(self._transport.subscribe(flag, on_flag, echo=False, direct=True))
-        media, on_payload = self.capabilities[medium].get("topic"), self._on_payload
-        if isinstance(media, str) and on_payload is not None:
+        media = self.capabilities[medium].get("topic")
+        if isinstance(media, str):
 
             def on_media(message: Message) -> None:
-                self.note_received(medium)
-                on_payload(medium, message.payload)
+                self._received_at[medium] = time.monotonic()
+                self._on_payload(medium, message.payload)
 
             self._subscriptions.append(self._transport.subscribe(media, on_media, qos=QoS.LATEST))

@@ -85,7 +85,7 @@ class MediaViewer:
     def begin(self, bases: Iterable[str], *, once: bool = False) -> None:
         """Start requesting media of the robots with these base topics, round after round or ``once``."""
         self._transport.open(timeout=0.0)
-        self.received = {robot.name: robot for robot in [CountedMedia(self._transport, base) for base in bases]}
+        self.received = {view.robot.name: view for view in [CountedMedia(self._transport, base) for base in bases]}
         turns = range(ROUND) if once else count()
         self._thread = threading.Thread(target=self._run, args=(turns,), name=_NAME, daemon=True)
         self._thread.start()

@@ -5,11 +5,13 @@ import logging
 import time
 from collections import deque
 from collections.abc import Callable
-from typing import Any, Final, NamedTuple
+from typing import Final, NamedTuple
 
 from pebble.client.broker import Broker
 from pebble.client.media_request.offer import offered, refusal
 from pebble.client.media_request.request import MediaRequest
+from pebble.client.robot_topics import topic_of
+from pebble.client.robot_view import RobotView
 from pebble.client.viewer import Medium
 from pebble.contract import AUDIO, CAMERA
 from pebble.contract.packets import PBAT
@@ -142,14 +144,13 @@ class Conversion:
 class MediaFeed:
     """What one medium of one robot is requested for, and what arrives of it; ``run`` is its task on the event loop."""
 
-    def __init__(self, broker: Broker, server: Server, schemas: Schemas, ref: str, medium: Medium) -> None:
+    def __init__(self, broker: Broker, server: Server, schemas: Schemas, robot: RobotView, medium: Medium) -> None:
         self.wants_keyframe = False  # a client has subscribed, or a picture is missing
         self._refused = 0  # payloads that are nothing of this medium, or too large
-        self._ref, self._medium = ref, medium
-        self._channels = _Channels(server, schemas, _CHANNEL[medium].topic(ref))
+        self._robot, self._medium = robot, medium
+        self._channels = _Channels(server, schemas, _CHANNEL[medium].topic(robot.base))
         self._conversion = Conversion(self._channels, schemas, medium)
-        self._request = MediaRequest(broker, ref, medium, self.receive)
-        self._capabilities: dict[str, Any] = {}
+        self._request = MediaRequest(broker, robot.base, medium, self.receive)
         self._sequence = PictureSequence()
         self._arriving = ""  # the encoding of the newest picture
         self._problem = ""  # as shown
@@ -169,19 +170,14 @@ class MediaFeed:
         """What has been received, and is not yet converted."""
         return tuple(self._conversion.waiting)
 
-    def update(self, capabilities: dict[str, Any]) -> list[str]:
-        """Take new capabilities; returns the channels that it has by them, which stay."""
-        self._capabilities = capabilities
-        channels = []
-        if not refusal(self._ref, capabilities, self._medium):
-            self._channels.topic = capabilities[self._medium].get("topic") or _CHANNEL[self._medium].topic(self._ref)
+    def update(self) -> list[str]:
+        """Take note of new capabilities; returns the channels that it has by them, which stay."""
+        channels, base = [], self._robot.base
+        if not refusal(base, self._robot.capabilities, self._medium):
+            self._channels.topic = topic_of(base, self._robot.capabilities, _CHANNEL[self._medium])
             channels = [self._channels.declare(*kind) for kind in self._kinds()]
         self._request.want(self._is_wanted())
         return channels
-
-    def take_status(self, status: bytes) -> None:
-        """Take what the robot publishes of its programs: while it holds this medium back, nothing is requested."""
-        self._request.take_status(status)
 
     def wake(self, ending: str, *, subscribed: bool) -> None:
         """Take note that a client has subscribed, or unsubscribed."""
@@ -204,7 +200,7 @@ class MediaFeed:
 
     def encoding(self) -> str | None:
         """The encoding to request: H.264 where a client wants it as it is, else what any viewer already gets."""
-        known = offered(self._capabilities, self._medium)
+        known = offered(self._robot.capabilities, self._medium)
         if self._channels.subscribed(VIDEO[1]) and "h264" in known:
             return "h264"
         if pyav.installed():
@@ -229,7 +225,7 @@ class MediaFeed:
     def _kinds(self) -> tuple[tuple[str, str], ...]:
         if self._medium == "audio":
             return (SOUND,)
-        return (VIDEO, IMAGE) if "h264" in offered(self._capabilities, "video") else (IMAGE,)
+        return (VIDEO, IMAGE) if "h264" in offered(self._robot.capabilities, "video") else (IMAGE,)
 
     def _is_wanted(self) -> bool:
         return any(self._channels.subscribed(ending) for _, ending in (VIDEO, IMAGE, SOUND))
@@ -242,7 +238,7 @@ class MediaFeed:
             self._arriving = ""
 
     async def _step(self) -> None:
-        await self._request.follow(self._capabilities, self.encoding)
+        await self._request.follow(self._robot, self.encoding())
         if not self._is_wanted():
             return
         if not self._request.problem and (self.wants_keyframe or self._conversion.lacks_keyframe()):
@@ -257,7 +253,7 @@ class MediaFeed:
     def _report(self, problem: str) -> None:
         """Show a new problem in Foxglove, once."""
         if problem and problem != self._problem:
-            log.warning("the %s of %s: %s", self._medium, self._ref, problem)
+            log.warning("the %s of %s: %s", self._medium, self._robot.base, problem)
             self._channels.report(problem)
         self._problem = problem
 

@@ -1,8 +1,8 @@
 """What a page and the server send each other on the control socket: JSON text, one struct per ``op``.
 
 ``ref`` is a component's base topic, ``pebble/robots/goob``; "" is the server itself. Page clocks (``t``) are
-milliseconds of ``performance.now()``; server stamps (``now``) are epoch milliseconds. docs/web-messages.md has what else
-the sockets carry; the page's ``messages.d.ts`` is generated from these structs.
+milliseconds of ``performance.now()``; server stamps (``now``) are epoch milliseconds. docs/web-messages.md has what
+else the sockets carry; the page's ``messages.d.ts`` is generated from these structs.
 """
 
 from typing import Annotated, Any, Literal, TypeAlias

@@ -104,7 +104,7 @@ class OpenComponents:
                     await self._broker.unsubscribe(done.pop(filter_))
                 for filter_ in [filter_ for filter_ in wanted if filter_ not in done]:
                     try:
-                        done[filter_] = await self._subscribe(ref, filter_)
+                        done[filter_] = await self._broker.subscribe(filter_, self._receiver(ref, filter_))
                     except PebbleError as error:
                         if filter_ not in failed:
                             failed.add(filter_)
@@ -131,18 +131,6 @@ class OpenComponents:
         self._robots.remove_server_metric(ref, _FLAGS_METRIC)
         if ref not in self._robots.components:
             self._robots.forget(ref)
-
-    async def _subscribe(self, ref: str, filter_: str) -> Subscription:
-        receiver = self._receiver(ref, filter_)
-        if filter_ != c.LOGS.topic(ref):
-            return await self._broker.subscribe(filter_, receiver)
-
-        def count() -> None:
-            lines = self._robots.logs.get(ref)
-            if lines is not None:
-                lines.refused += 1
-
-        return await self._broker.subscribe(filter_, receiver, on_refused=count)
 
     def _receiver(self, ref: str, filter_: str) -> Callable[[Message, float], None]:
         def take(message: Message, now: float) -> None:

@@ -11,6 +11,9 @@ import pytest
 from pebble.client.broker import Broker
 from pebble.client.media_request import request as module
 from pebble.client.media_request.request import MediaRequest
+from pebble.client.robot_view import RobotView
+from pebble.contract import STATUS
+from pebble.transports import Message
 from tests.web.media.robots import REF, VIDEO, PictureRobot, broker_on, status_of, until
 
 pytestmark = pytest.mark.anyio
@@ -30,11 +33,16 @@ class Requested:
         self.broker = broker_on(self.robot.hub)
         self.received: list[bytes] = []
         self.steps = 0
+        self.view = RobotView(REF)
+        self.view.capabilities = {"video": VIDEO}
         self.request = MediaRequest(self.broker, REF, "video", self.received.append)
+
+    def status(self, camera: str) -> None:
+        self.view.receive(STATUS, Message(STATUS.topic(REF), status_of(camera)), 0.0, 0.0)
 
     async def step(self) -> None:
         self.steps += 1
-        await self.request.follow({"video": VIDEO}, lambda: "json")
+        await self.request.follow(self.view, "json")
 
     @asynccontextmanager
     async def running(self) -> AsyncIterator[None]:
@@ -68,18 +76,19 @@ async def test_it_is_withdrawn_once_there_is_a_broker_again(monkeypatch: pytest.
 
 async def test_nothing_is_asked_of_a_robot_that_waits() -> None:
     one = Requested()
-    one.request.take_status(status_of("held"))
-    assert one.request.waits == "Pictures wait for driving"
+    one.status("held")
     await one.broker.open()
     one.request.want(True)
     for _ in range(3):
         await one.step()
     await one.request.request_keyframe("json")
+    assert one.request.waits == "Pictures wait for driving"
     assert one.robot.published == []
-    one.request.take_status(status_of("running"))
+    one.status("running")
     await one.step()
     await until(lambda: one.robot.encodings == ["json"])
-    one.request.take_status(status_of("held"))
+    one.status("held")
+    await one.step()
     await one.request.request_keyframe("json")
     one.request.close()
     await one.request.run(one.step)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Iterator
-from unittest.mock import MagicMock
 
 import pytest
 
@@ -21,10 +20,8 @@ REQUEST, FLAG, CAMERA = (
     f"{BASE}/incoming/flags/mqtt-video",
     f"{BASE}/outgoing/front-camera",
 )
-CAN = (
-    b'{"t":1,"schema":"pebble-capabilities/v1","value":{"video":{"available":true,"controls":true,'
-    b'"topic":"pebble/robots/goob/outgoing/front-camera","encodings":["json","h264"]}}}'
-)
+VIDEO = {"available": True, "controls": True, "topic": CAMERA, "encodings": ["json", "h264"]}
+CAN = {"video": VIDEO}
 
 
 class Robot:
@@ -35,7 +32,6 @@ class Robot:
         self.transport = MemoryTransport("robot", self.hub).open()
         self.requests: list[bytes] = []
         self.flags: list[bytes] = []
-        self.transport.publish(f"{BASE}/outgoing/capabilities", CAN, qos=QoS.DELIVERED, retain=True)
         self.transport.subscribe(REQUEST, lambda message: self.requests.append(message.payload), direct=True)
         self.transport.subscribe(FLAG, lambda message: self.flags.append(message.payload), echo=False, direct=True)
 
@@ -58,9 +54,7 @@ def transport(robot: Robot) -> Iterator[MemoryTransport]:
 
 @pytest.fixture
 def viewer(transport: MemoryTransport) -> Viewer:
-    viewer = Viewer(transport, BASE, lambda _medium, _payload: None)
-    viewer.wait_for_capabilities(5)
-    return viewer
+    return Viewer(transport, BASE, lambda _medium, _payload: None, CAN)
 
 
 def test_it_raises_the_flag_and_requests_and_undoes_both(robot: Robot, viewer: Viewer) -> None:
@@ -138,25 +132,6 @@ def test_with_an_encoding_as_well_a_flag_that_was_up_stays_up(robot: Robot, view
 
 
 def test_requests_go_to_no_other_robot() -> None:
-    robot = Robot()
-    foreign = b'"controls":true,"command_topic":"pebble/robots/fred/incoming/front-camera"'
-    capabilities = CAN.replace(b'"controls":true', foreign)
-    robot.transport.publish(f"{BASE}/outgoing/capabilities", capabilities, qos=QoS.DELIVERED, retain=True)
-    with MemoryTransport("viewer", robot.hub) as transport:
-        viewer = Viewer(transport, BASE, lambda _medium, _payload: None)
-        viewer.wait_for_capabilities(5)
-        assert viewer.topic(VIDEO_CONTROL) == REQUEST
-
-
-def test_without_a_receiver_it_receives_no_media_but_learns_of_them(
-    robot: Robot, transport: MemoryTransport, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    subscribe = MagicMock(wraps=transport.subscribe)
-    monkeypatch.setattr(transport, "subscribe", subscribe)
-    viewer = Viewer(transport, BASE, None)
-    viewer.wait_for_capabilities(5)
-    viewer.note_received("video")
-    viewer.request("video")  # another viewer's pictures arrive already
-    assert [call.args[0] for call in subscribe.call_args_list] == [f"{BASE}/outgoing/capabilities", FLAG]
-    viewer.close()
-    assert robot.requests == []
+    foreign = {"video": {**VIDEO, "command_topic": "pebble/robots/fred/incoming/front-camera"}}
+    with MemoryTransport("viewer", MemoryHub()) as transport:
+        assert Viewer(transport, BASE, lambda *_: None, foreign).topic(VIDEO_CONTROL) == REQUEST

@@ -1,5 +1,6 @@
 """What of a robot's pictures and sound may be requested, by its capabilities. Pure."""
 
+from collections.abc import Collection, Sequence
 from typing import Any, Final, NamedTuple
 
 from pebble.client.robot_topics import PLACES, names
@@ -11,6 +12,9 @@ CHANNELS: Final[dict[Medium, tuple[Channel, ...]]] = {
     "video": (CAMERA, VIDEO_CONTROL, MQTT_VIDEO),
     "audio": (AUDIO, AUDIO_CONTROL, MQTT_AUDIO),
 }
+
+
+BEST_FIRST: Final[dict[Medium, tuple[str, ...]]] = {"video": ("h264", "pbvd", "json"), "audio": ("opus", "pcm")}
 
 
 class Words(NamedTuple):
@@ -51,3 +55,9 @@ def refusal(ref: str, capabilities: dict[str, Any], medium: Medium) -> str:
         if section.get(key) is not None and not names(ref, section[key], channel):
             return f"its capabilities name a topic for {words.name} that is not its own ({key})"
     return ""
+
+
+def best(medium: Medium, encodings: Collection[str], viewers: Sequence[frozenset[str]]) -> str | None:
+    """Return the best of what most viewers can show or play; None: whatever the robot sends, as it lists none."""
+    known = [encoding for encoding in BEST_FIRST[medium] if encoding in encodings]
+    return max(known, key=lambda encoding: sum(encoding in can for can in viewers), default=None)

@@ -25,8 +25,7 @@ NO_FRAME: Final = 0xFFFF_FFFF  # the number in an acknowledgement of no frame
 _FRESH_FRAMES: Final = 2  # with no more than these in the queue, a key frame does not replace them
 _JPEG_PATIENCE_S: Final = 1.0  # JPEG encodings have a key frame each third of a second, unless configured otherwise
 _RESCUE_AFTER_S: Final = 1.5  # of waiting for a key frame of h264
-_FIRST_RETRY_S, _LAST_RETRY_S = 10.0, 160.0  # in the rescue stream, before the robot's own pictures are tried again
-_RECOVERED_S: Final = 60.0
+_RETRY_S: Final = 60.0  # in the rescue stream, before the robot's own pictures are tried again
 
 
 @dataclass(frozen=True, slots=True)
@@ -143,9 +142,8 @@ class ViewerQueue(MediaQueue):
         self.rescued = False
         self.new = True  # it has received no picture, and no key frame was requested for it
         self._undecodable: set[str] = set()
-        self._waiting_since = self._direct_since = now
+        self._waiting_since = now
         self._retry_at = 0.0
-        self._retry_s = _FIRST_RETRY_S
 
     def decodes(self, encoding: str) -> bool:
         return encoding in self.can and encoding not in self._undecodable
@@ -156,22 +154,17 @@ class ViewerQueue(MediaQueue):
 
     def offer_direct(self, frame: Frame, now: float) -> None:
         """Offer one of the robot's own pictures; a page in the rescue stream returns at a key frame."""
-        if self.rescued and frame.keyframe and now >= self._retry_at:
-            self._retry(frame, now)
         if self.rescued:
-            return
+            if not (frame.keyframe and now >= self._retry_at and self.decodes(frame.encoding)):
+                return
+            self.rescued = False
+            self.forget_lateness(now)
         was_waiting = self.waiting
         self.offer(frame)
         if not self.waiting:
             self.new = False
         elif not was_waiting:
             self._waiting_since = now
-
-    def _retry(self, frame: Frame, now: float) -> None:
-        if self.decodes(frame.encoding):
-            self.rescued = False
-            self._direct_since = now
-            self.forget_lateness(now)
 
     def offer_rescue(self, frame: Frame) -> None:
         """Offer a picture of the rescue stream: only the newest counts."""
@@ -199,9 +192,7 @@ class ViewerQueue(MediaQueue):
     def rescue(self, now: float) -> None:
         """Change to the rescue stream: because the page is slow, for a while; else until the next key frame."""
         if self.overflowed or self.is_thin:
-            self._retry_s = _FIRST_RETRY_S if now - self._direct_since > _RECOVERED_S else self._retry_s
-            self._retry_at = now + self._retry_s
-            self._retry_s = min(_LAST_RETRY_S, 2 * self._retry_s)
+            self._retry_at = now + _RETRY_S
         self.rescued = True
         self.wait_for_keyframe()
         self.overflowed = False

@@ -8,9 +8,9 @@ from collections.abc import Awaitable, Callable
 from typing import Any, Final
 
 from pebble.client.broker import Broker
-from pebble.client.driveable import is_held
 from pebble.client.media_request.offer import CHANNELS, WORDS, offered, refusal
 from pebble.client.robot_topics import named_topic
+from pebble.client.robot_view import RobotView
 from pebble.client.viewer import Medium, Viewer
 from pebble.errors import PebbleError
 from pebble.transports import Message
@@ -47,10 +47,6 @@ class MediaRequest:
         self._wanted = wanted
         self.wake()
 
-    def take_status(self, status: bytes) -> None:
-        """Take what the robot publishes of its programs: it may hold the one that sends this medium."""
-        self.waits = _WAITS[self.medium] if is_held(status, _PROGRAMS[self.medium]) else ""
-
     def wake(self) -> None:
         """Take the next step soon."""
         self._wakeup.set()
@@ -83,17 +79,18 @@ class MediaRequest:
         finally:
             await self._withdraw()
 
-    async def follow(self, capabilities: dict[str, Any], encoding: Callable[[], str | None]) -> None:
-        """Request it if it is wanted, as these capabilities allow it, in ``encoding()``; call it with each step."""
+    async def follow(self, robot: RobotView, encoding: str | None) -> None:
+        """Request it if it is wanted, as the robot allows it; call it with each step."""
+        capabilities = robot.capabilities
+        self.waits = _WAITS[self.medium] if robot.holds(_PROGRAMS[self.medium]) else ""
         self.problem = refusal(self.ref, capabilities, self.medium)
         if self.problem:
             await self._withdraw()
             return
-        chosen = encoding()
         if not self._wanted or self.waits:
             return
         try:
-            await self._follow(capabilities, chosen)
+            await self._follow(capabilities, encoding)
         except PebbleError as error:
             self.problem = str(error)
 

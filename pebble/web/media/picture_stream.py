@@ -6,8 +6,7 @@ import time
 from typing import Final
 
 from pebble.client.broker import Broker
-from pebble.client.media_request.encoding_choice import BEST_FIRST, EncodingChoice
-from pebble.client.media_request.offer import offered
+from pebble.client.media_request.offer import BEST_FIRST, best, offered
 from pebble.client.media_request.queue import NO_FRAME, Frame, ViewerQueue, assess
 from pebble.media.picture_header import PictureHeader, PictureSequence
 from pebble.web.media import rescue
@@ -38,7 +37,6 @@ class PictureStream(MediaStream[PageViewer, PictureView]):
 
     def __init__(self, broker: Broker, robots: Robots, ref: str) -> None:
         super().__init__(broker, robots, ref, "video", "web/picture", _AT_REST)
-        self.choice = EncodingChoice()
         self._rescue = RescueStream(self._on_rescued)
         self._sequence = PictureSequence()
         self._chain: list[bytes] = []  # the newest key frame and all pictures since; empty: it would be too long
@@ -131,18 +129,16 @@ class PictureStream(MediaStream[PageViewer, PictureView]):
     # -- requests, and key frames
 
     async def _follow(self) -> None:
-        capabilities = self._robots.capabilities(self.ref)
-        await self._request.follow(capabilities, lambda: self._choose(offered(capabilities, "video")))
+        robot = self.robot
+        await self._request.follow(robot, best("video", offered(robot.capabilities, "video"), self._can()))
         if not self._request.problem:
             await self._help_viewers()
 
-    def _choose(self, encodings: tuple[str, ...]) -> str | None:
-        return self.choice.update(encodings, self._can(), time.monotonic())
-
     def _can(self) -> list[frozenset[str]]:
         """What each viewer decodes. For one that decodes nothing, what this server converts counts."""
-        converted = frozenset(name for name in BEST_FIRST if not rescue.unavailable(name))
-        return [viewer.queue.can & frozenset(BEST_FIRST) or converted for viewer in self.viewers]
+        known = frozenset(BEST_FIRST["video"])
+        converted = frozenset(name for name in known if not rescue.unavailable(name))
+        return [viewer.queue.can & known or converted for viewer in self.viewers]
 
     async def _help_viewers(self) -> None:
         """Request a key frame, or begin the rescue stream, if viewers need it."""

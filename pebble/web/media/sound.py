@@ -11,7 +11,7 @@ import msgspec
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from pebble.client.broker import Broker
-from pebble.client.media_request.offer import offered, refusal
+from pebble.client.media_request.offer import BEST_FIRST, best, offered, refusal
 from pebble.contract import AUDIO, AUDIO_STREAM
 from pebble.contract.packets import Codec, Sound
 from pebble.errors import PayloadError
@@ -23,7 +23,6 @@ from pebble.web.messages import SoundView, TalkAnswer
 from pebble.web.pace import Pace
 from pebble.web.robots import Robots
 
-ENCODINGS: Final = ("opus", "pcm")  # the best first
 MAX_PAYLOAD: Final = 256 << 10
 WINDOW: Final = 32  # packets sent and not acknowledged: what waits in a slow connection cannot be taken back
 MAX_PACKETS, MAX_BYTES = 10, 256 << 10  # that wait before it
@@ -144,17 +143,17 @@ class SoundStream(MediaStream[SoundPage, SoundView]):
             return f"The role {page.session.role} may not do this"
         if self._talker is not None and self._talker is not page:
             return f"{self._talker.session.user} is talking"
-        return self._unheard() or refusal(self.ref, self._robots.capabilities(self.ref), "audio")
+        return self._unheard() or refusal(self.ref, self.robot.capabilities, "audio")
 
     def _unheard(self) -> str:
         """Why the robot would not hear it now; empty if it does."""
         if problem := self._broker.problem:
             return f"The server cannot reach the broker: {problem}"
-        component = self._robots.components.get(self.ref)
-        if component is not None and component.robot.online(time.monotonic()) is False:
-            return f"{component.robot.name} is silent"
-        if component is not None and component.robot.slow_s is not None:  # commands would wait behind a voice
-            return f"The connection of {component.robot.name} is too slow for a voice"
+        robot = self.robot
+        if robot.online(time.monotonic()) is False:
+            return f"{robot.name} is silent"
+        if robot.slow_s is not None:  # commands would wait behind a voice
+            return f"The connection of {robot.name} is too slow for a voice"
         return ""
 
     def _release(self, now: float) -> None:
@@ -178,10 +177,10 @@ class SoundStream(MediaStream[SoundPage, SoundView]):
 
     async def _follow(self) -> None:
         self._release(time.monotonic())
-        capabilities = self._robots.capabilities(self.ref)
-        if why := refusal(self.ref, capabilities, "audio") or self._unheard():
+        robot = self.robot
+        if why := refusal(self.ref, robot.capabilities, "audio") or self._unheard():
             self._interrupt(why)
-        await self._request.follow(capabilities, lambda: best(offered(capabilities, "audio"), self._listening()))
+        await self._request.follow(robot, best("audio", offered(robot.capabilities, "audio"), self._listening()))
 
     def _listening(self) -> list[frozenset[str]]:
         return [viewer.can for viewer in self.viewers if viewer.can]
@@ -211,17 +210,10 @@ class SoundHub(Streams[SoundStream]):
         self, websocket: WebSocket, ref: str, can: frozenset[str], session: Session, device: str = "", address: str = ""
     ) -> None:
         """Serve a page that plays ``can`` and may talk, until either end closes the socket."""
-        page = SoundPage(can & frozenset(ENCODINGS), session, device, address)
+        page = SoundPage(can & frozenset(BEST_FIRST["audio"]), session, device, address)
         await self.let_view(
             websocket, ref, page, lambda _: _send(websocket, page), lambda stream: _receive(websocket, stream, page)
         )
-
-
-def best(offered: tuple[str, ...], listeners: list[frozenset[str]]) -> str | None:
-    """The encoding to request: one that every listener plays, if there is one. None: whatever the robot sends."""
-    known = [name for name in ENCODINGS if name in offered]
-    played = [name for name in known if all(name in can for can in listeners)]
-    return next(iter(played or reversed(known)), None)
 
 
 def _encoding(payload: bytes) -> str:

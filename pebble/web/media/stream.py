@@ -13,8 +13,9 @@ from starlette.websockets import WebSocket
 from pebble.client.broker import Broker
 from pebble.client.media_request.request import TICK_S, MediaRequest
 from pebble.client.robot_topics import own_topic
+from pebble.client.robot_view import RobotView
 from pebble.client.viewer import Medium
-from pebble.contract import STATUS, Channel
+from pebble.contract import Channel
 from pebble.contract.identity import Direction
 from pebble.media.rate_meter import RateMeter
 from pebble.web.robots import Robots
@@ -94,6 +95,11 @@ class MediaStream(ABC, Generic[ViewerT, ViewT]):
         self._request.close()
         await self.task
 
+    @property
+    def robot(self) -> RobotView:
+        """It is the robot as far as it is known."""
+        return self._robots.view(self.ref) or RobotView(self.ref)
+
     # -- of each medium
 
     @abstractmethod
@@ -121,7 +127,6 @@ class MediaStream(ABC, Generic[ViewerT, ViewT]):
             self._show(self._at_rest)
 
     async def _step(self) -> None:
-        self._request.take_status(bytes(self._robots.value(self.ref, STATUS.metric) or b""))
         self._report()
         await self._follow()
         self._report()
