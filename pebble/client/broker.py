@@ -109,14 +109,11 @@ class Broker:
         """
 
         def take(message: Message) -> None:
-            self.hand_over(handler, message, deferred=deferred)
+            has_room = self._arrived.put(handler, message, time.monotonic(), deferred=deferred)
+            if has_room and not deferred:
+                self._wake()
 
         return await asyncio.to_thread(self.transport.subscribe, filter_, take, qos=QoS.DELIVERED, direct=True)
-
-    def hand_over(self, handler: Handler, message: Message, *, deferred: bool = False) -> None:
-        """Have the event loop handle a message that has come on another thread, if there is room for it."""
-        if self._arrived.put(handler, message, time.monotonic(), deferred=deferred) and not deferred:
-            self._wake()
 
     def deliver(self) -> None:
         """Hand over what has arrived, in its order; the rest after whatever else is due, if that takes long."""

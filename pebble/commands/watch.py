@@ -73,7 +73,7 @@ def _received(target: Target, encoding: str | None) -> Picture:
     with connected(target) as (transport, names), closing(MediaReceiver(transport, names.base)) as receiver:
         put_names(transport, names, lambda base: base == names.base and receiver.robot.named)
         receiver.wait_for_capabilities(_CAPABILITIES_TIMEOUT_S)
-        receiver.request(encoding, sound=False)
+        receiver.request("video", encoding)
         end = time.monotonic() + _FIRST_PICTURE_S
         while receiver.newest is None:
             if time.monotonic() > end:

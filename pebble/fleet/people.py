@@ -252,9 +252,9 @@ def _exists(name: str) -> PeopleError:
     return PeopleError(f"{name} exists already: change the password or the role, or remove {name}")
 
 
-def has_user(path: Path, name: str = "") -> bool:
+def has_user(path: Path | None, name: str = "") -> bool:
     """Return True if the database knows this person, or without a name anybody. Raises DatabaseError."""
-    if not path.exists():
+    if path is None or not path.exists():
         return False
     # Writes nothing. What is in a write-ahead log is read, too, which needs a file of SQLite's that only then is there
     unchanged = "" if path.with_name(f"{path.name}-wal").exists() else "&immutable=1"

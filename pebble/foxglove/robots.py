@@ -6,9 +6,9 @@ import time
 from typing import Final
 
 from pebble.client.broker import Broker
+from pebble.client.media_request.offer import Medium
 from pebble.client.robot_topics import FLEET, SYNONYMS, WATCHED
 from pebble.client.robot_view import RobotView
-from pebble.client.viewer import Medium
 from pebble.contract import CAPABILITIES, STATUS, Channel
 from pebble.contract.channels import channel_of
 from pebble.contract.identity import parse_topic

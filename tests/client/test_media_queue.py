@@ -6,7 +6,7 @@ import random
 
 import pytest
 
-from pebble.client.media_request.offer import best
+from pebble.client.media_request.offer import Medium, best
 from pebble.client.media_request.queue import (
     MAX_FRAMES,
     MAX_QUEUED_BYTES,
@@ -17,7 +17,6 @@ from pebble.client.media_request.queue import (
     ViewerQueue,
     assess,
 )
-from pebble.client.viewer import Medium
 
 ALL = frozenset({"h264", "pbvd", "json", "jpeg"})
 

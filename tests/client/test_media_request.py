@@ -9,8 +9,8 @@ from contextlib import asynccontextmanager
 import pytest
 
 from pebble.client.broker import Broker
-from pebble.client.media_request import request as module
-from pebble.client.media_request.request import MediaRequest
+from pebble.client.media_request import shared
+from pebble.client.media_request.shared import SharedRequest
 from pebble.client.robot_view import RobotView
 from pebble.contract import STATUS
 from pebble.transports import Message
@@ -35,7 +35,7 @@ class Requested:
         self.steps = 0
         self.view = RobotView(REF)
         self.view.capabilities = {"video": VIDEO}
-        self.request = MediaRequest(self.broker, REF, "video", self.received.append)
+        self.request = SharedRequest(self.broker, REF, "video", self.received.append)
 
     def status(self, camera: str) -> None:
         self.view.receive(STATUS, Message(STATUS.topic(REF), status_of(camera)), 0.0, 0.0)
@@ -60,7 +60,7 @@ class Requested:
 
 
 async def test_it_is_withdrawn_once_there_is_a_broker_again(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(module, "LINGER_S", 0.0)
+    monkeypatch.setattr(shared, "LINGER_S", 0.0)
     there = [True]
     monkeypatch.setattr(Broker, "connected", property(lambda _: there[0]))
     one = Requested()

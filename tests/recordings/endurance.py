@@ -71,7 +71,7 @@ class Operator:
         for viewer in self._viewers:
             for medium, wanted in (("video", encoding), ("audio", None)):
                 try:
-                    viewer.viewer.request(medium, wanted)  # type: ignore[arg-type]
+                    viewer.request(medium, wanted)  # type: ignore[arg-type]
                 except PebbleError:  # it has none
                     continue
 

@@ -5,7 +5,7 @@ import time
 from pebble.checks.check import CheckResult, failed, ok, skipped
 from pebble.checks.running.robot import RobotUnderTest
 from pebble.client.media_receiver import MediaReceiver
-from pebble.client.viewer import Medium
+from pebble.client.media_request.offer import Medium
 from pebble.errors import PebbleError
 
 _LOG = "pebble doctor CONFIG; journalctl -u pebble -n 50"
@@ -20,7 +20,7 @@ def received(robot: RobotUnderTest, medium: Medium, device: str) -> CheckResult:
     try:
         receiver.wait_for_capabilities(robot.patience_s)
         began = time.monotonic()
-        receiver.viewer.request(medium)
+        receiver.request(medium)
         if not robot.wait(lambda: _arrived(receiver, medium), robot.patience_s):
             return failed(f"none came from the {device} within {robot.patience_s:g} s", _LOG)
         took = time.monotonic() - began

@@ -1,11 +1,12 @@
 """What of a robot's pictures and sound may be requested, by its capabilities. Pure."""
 
 from collections.abc import Collection, Sequence
-from typing import Any, Final, NamedTuple
+from typing import Any, Final, Literal, NamedTuple
 
 from pebble.client.robot_topics import PLACES, names
-from pebble.client.viewer import Medium
 from pebble.contract import AUDIO, AUDIO_CONTROL, CAMERA, MQTT_AUDIO, MQTT_VIDEO, VIDEO_CONTROL, Channel
+
+Medium = Literal["video", "audio"]
 
 #: The channels of a medium, for which capabilities may name topics.
 CHANNELS: Final[dict[Medium, tuple[Channel, ...]]] = {

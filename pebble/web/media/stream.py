@@ -11,10 +11,10 @@ from typing import Any, Final, Generic, TypeVar
 from starlette.websockets import WebSocket
 
 from pebble.client.broker import Broker
-from pebble.client.media_request.request import TICK_S, MediaRequest
+from pebble.client.media_request.offer import Medium
+from pebble.client.media_request.shared import TICK_S, SharedRequest
 from pebble.client.robot_topics import own_topic
 from pebble.client.robot_view import RobotView
-from pebble.client.viewer import Medium
 from pebble.contract import Channel
 from pebble.contract.identity import Direction
 from pebble.media.rate_meter import RateMeter
@@ -78,7 +78,7 @@ class MediaStream(ABC, Generic[ViewerT, ViewT]):
         self.view = self._at_rest = view  # as shown last
         self._shown_at = float("-inf")
         self._broker, self._robots, self._metric = broker, robots, metric
-        self._request = MediaRequest(broker, ref, medium, self.receive)
+        self._request = SharedRequest(broker, ref, medium, self.receive)
         self._arrivals = Arrivals()
         self.task = asyncio.create_task(self._run())
 

@@ -17,7 +17,7 @@ import numpy as np
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from pebble.client.broker import Broker
-from pebble.client.viewer import Medium
+from pebble.client.media_request.offer import Medium
 from pebble.contract.packets import Sound
 from pebble.fleet.roles import Role, Session
 from pebble.media.scene import Scene
