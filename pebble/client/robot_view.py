@@ -89,7 +89,7 @@ class RobotView:
         self.reset_at = float("-inf")  # when its emergency stop ended, as far as it was seen
         self.remembered: dict[str, Message] = {}  # by topic: what an emergency stop that begins later needs to know
         self.capabilities: dict[str, Any] = {}
-        self._status = b""
+        self._status = b""  # the newest
         self.link: LinkState | None = None  # what the way to its broker carries; None: everything
         self.autonomy: AutonomyStatus | None = None
         self.volts: float | None = None
@@ -134,9 +134,10 @@ class RobotView:
             self.attitude = payload.value.orientation_deg
         elif channel is c.AUTONOMY_STATUS:
             self.autonomy = payload
-        elif not message.retain:  # a heartbeat that is retained is no sign of life
-            self.liveness.heartbeat(now, wall - payload.t / 1000, online=payload.online is not False, t=payload.t)
+        else:
             self._announce(message.payload)
+            if not message.retain:  # a heartbeat that is retained is no sign of life
+                self.liveness.heartbeat(now, wall - payload.t / 1000, online=payload.online is not False, t=payload.t)
 
     def _announce(self, payload: bytes) -> None:
         """Take what a heartbeat or status lists, unless it publishes capabilities."""
