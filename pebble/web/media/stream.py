@@ -63,15 +63,7 @@ class MediaStream(ABC, Generic[ViewerT, ViewT]):
     ``task`` ends once the request is withdrawn; until then viewers may join again.
     """
 
-    def __init__(
-        self,
-        broker: Broker,
-        robots: Robots,
-        ref: str,
-        medium: Medium,
-        metric: str,
-        view: ViewT,
-    ) -> None:
+    def __init__(self, broker: Broker, robots: Robots, ref: str, medium: Medium, metric: str, view: ViewT) -> None:
         """Pages are shown ``metric``; ``view`` is that of a robot at rest, which they are shown already."""
         self.ref = ref
         self.viewers: set[ViewerT] = set()
