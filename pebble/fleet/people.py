@@ -203,16 +203,13 @@ class People:
 
     # -- settings of the server
 
-    def get(self, key: str) -> str | None:
+    def get(self, key: str) -> str:
+        """Return a setting; "" if it was never set."""
         rows = self._rows("SELECT value FROM settings WHERE key = ?", key)
-        return str(rows[0][0]) if rows else None
+        return str(rows[0][0]) if rows else ""
 
-    def set(self, key: str, value: str | None) -> None:
-        """None removes it."""
-        if value is None:
-            self._change("DELETE FROM settings WHERE key = ?", key)
-        else:
-            self._change("INSERT OR REPLACE INTO settings (key, value) VALUES (?, ?)", key, value)
+    def set(self, key: str, value: str) -> None:
+        self._change("INSERT OR REPLACE INTO settings (key, value) VALUES (?, ?)", key, value)
 
     # -- inside
 

@@ -274,7 +274,7 @@ def test_the_file_is_for_its_owner_and_holds_no_password_and_no_token(tmp_path: 
 
 
 def test_settings(people: People) -> None:
-    assert people.get("estop") is None
+    assert people.get("estop") == ""
     people.set("estop", "a")
     people.set("estop", "b")
     assert people.get("estop") == "b"
