@@ -47,7 +47,7 @@ class Waiting(NamedTuple):
 
 
 class MediaFeed:
-    """What one medium of one robot is requested for, and what arrives of it; ``run`` is its task on the event loop.
+    """The request for one medium of one robot, and what arrives of it; ``run`` is its task on the event loop.
 
     Payloads are converted on a thread, a few at a time: pictures that are decoded take milliseconds.
     """

@@ -134,7 +134,7 @@ class Server:
     # -- threads of the SDK
 
     def on_subscribe(self, client: Client, channel: ChannelView) -> None:
-        """Send a client what was last published there.."""
+        """Send a client what was last published there."""
         topic = channel.topic
         with self._lock:
             self._subscribers.setdefault(topic, set()).add(client.id)

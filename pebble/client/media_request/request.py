@@ -1,4 +1,4 @@
-"""What a robot is sent so that it sends its pictures or sound, and what is taken back afterwards. Pure."""
+"""The request for a robot's pictures or sound: what it is sent for them, and what is taken back afterwards. Pure."""
 
 from collections import deque
 from typing import Any, Final
@@ -60,7 +60,7 @@ class ViewerRequest:
         return False
 
     def tick(self, now: float) -> list[Message]:
-        """What to send now; without a payload the request is repeated."""
+        """Return what to send now; without a payload the request is repeated."""
         if self.settled:
             is_quiet = now - max(self._sent_at, self._received_at) > _REPEAT_S
             return [self._ask(now)] if is_quiet else []

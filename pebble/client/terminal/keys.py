@@ -80,7 +80,7 @@ class Terminal:
                 _write(f"\r{line[: max(10, shutil.get_terminal_size().columns) - 1]}{_ERASE_REST}")
 
     def suspend(self, prepare: Callable[[], object]) -> None:
-        """After Ctrl-Z: prepare for standing still, then stand still until this process goes on. Main thread only."""
+        """Stand still after Ctrl-Z, once that is prepared, until this process goes on. Main thread only."""
         if not self._suspended:
             return
         prepare()

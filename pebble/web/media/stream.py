@@ -89,7 +89,7 @@ class MediaStream(ABC, Generic[ViewerT, ViewT]):
 
     @property
     def robot(self) -> RobotView:
-        """It is the robot as far as it is known."""
+        """It is the robot, as far as it is known."""
         return self._robots.view(self.ref) or RobotView(self.ref)
 
     # -- of each medium
