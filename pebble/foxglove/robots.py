@@ -15,7 +15,7 @@ from pebble.contract.identity import parse_topic
 from pebble.foxglove.json_channels import json_spec
 from pebble.foxglove.media_feed import MediaFeed
 from pebble.foxglove.server import Server, protobuf_spec
-from pebble.recordings.exports.foxglove_messages import Converted, Schemas, Telemetry, as_object, stamped, time_of
+from pebble.recordings.exports.foxglove_messages import Schemas, Telemetry, as_object, stamped, time_of
 from pebble.transports import Message
 from pebble.transports.topics import matches
 
@@ -99,19 +99,12 @@ class Robots:
         remember = message.retain or (channel is not None and channel.default_retain)
         converted = self._telemetry.convert(topic, payload)
         if converted is not None:
-            self._publish_converted(converted, topic, payload, at_ns, remember=remember)
-        if converted is None or converted.beside:
-            self._publish_json(channel, topic, payload, at_ns, remember=remember)
-
-    def _publish_converted(
-        self, converted: Converted, topic: str, payload: bytes, at_ns: int, *, remember: bool
-    ) -> None:
-        made, topic = converted.message, f"{topic}/{converted.ending}"
-        if not self._server.declared(topic):
-            self._server.declare(protobuf_spec(topic, made, self._schemas))
-        self._server.publish(topic, stamped(made, time_of(payload, at_ns)), at_ns, remember=remember)
-
-    def _publish_json(self, channel: Channel | None, topic: str, payload: bytes, at_ns: int, *, remember: bool) -> None:
+            made, below = converted.message, f"{topic}/{converted.ending}"
+            if not self._server.declared(below):
+                self._server.declare(protobuf_spec(below, made, self._schemas))
+            self._server.publish(below, stamped(made, time_of(payload, at_ns)), at_ns, remember=remember)
+        if converted is not None and not converted.beside:
+            return
         data = as_object(payload)
         if data is None:
             self._refused += 1

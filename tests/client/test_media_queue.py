@@ -13,7 +13,6 @@ from pebble.client.media_request.queue import (
     NO_FRAME,
     THIN_ACK_S,
     Frame,
-    MediaQueue,
     ViewerQueue,
     assess,
 )
@@ -25,7 +24,7 @@ def frame(seq: int, keyframe: bool = False, encoding: str = "pbvd", size: int = 
     return Frame(seq, bytes(size), encoding, keyframe)
 
 
-def drained(queue: MediaQueue, now: float = 0.0) -> list[int]:
+def drained(queue: ViewerQueue, now: float = 0.0) -> list[int]:
     """Take and acknowledge everything."""
     seqs = []
     while (one := queue.take(now)) is not None:
@@ -52,14 +51,14 @@ def offered(viewer: ViewerQueue, seq: int, at: float, encoding: str = "pbvd") ->
 
 
 def test_it_begins_at_a_key_frame() -> None:
-    queue = MediaQueue()
+    queue = ViewerQueue(ALL, 0.0)
     for one in (frame(1), frame(2), frame(3, keyframe=True), frame(4)):
         queue.offer(one)
     assert drained(queue) == [3, 4]
 
 
 def test_two_are_under_way_and_one_when_acknowledgements_are_late() -> None:
-    queue = MediaQueue()
+    queue = ViewerQueue(ALL, 0.0)
     for seq in range(4):
         queue.offer(frame(seq, keyframe=seq == 0))
     assert [queue.take(0.0), queue.take(0.0), queue.take(0.0)] == [frame(0, keyframe=True), frame(1), None]
@@ -75,7 +74,7 @@ def test_two_are_under_way_and_one_when_acknowledgements_are_late() -> None:
 
 @pytest.mark.parametrize(("size", "most"), [(100, 8), (500, 8), (1000, 4), (3000, 2)])
 def test_more_are_under_way_if_they_are_small(size: int, most: int) -> None:
-    queue, taken = MediaQueue(), 0
+    queue, taken = ViewerQueue(ALL, 0.0), 0
     for seq in range(20):
         queue.offer(frame(seq, keyframe=True, size=size))
         taken += queue.take(0.0) is not None
@@ -87,7 +86,7 @@ def test_more_are_under_way_if_they_are_small(size: int, most: int) -> None:
 
 
 def test_an_overflow_skips_everything_up_to_the_next_key_frame() -> None:
-    queue = MediaQueue()
+    queue = ViewerQueue(ALL, 0.0)
     for seq in range(MAX_FRAMES + 3):
         queue.offer(frame(seq, keyframe=seq == 0))
     assert queue.waiting
@@ -100,7 +99,7 @@ def test_an_overflow_skips_everything_up_to_the_next_key_frame() -> None:
 
 
 def test_bytes_are_bounded_as_well() -> None:
-    queue = MediaQueue()
+    queue = ViewerQueue(ALL, 0.0)
     queue.offer(frame(0, keyframe=True, size=MAX_QUEUED_BYTES))
     queue.offer(frame(1, size=1))
     assert queue.waiting
@@ -109,7 +108,7 @@ def test_bytes_are_bounded_as_well() -> None:
 
 
 def test_a_key_frame_replaces_what_waits_for_a_slow_page_only() -> None:
-    fast, slow = MediaQueue(), MediaQueue()
+    fast, slow = ViewerQueue(ALL, 0.0), ViewerQueue(ALL, 0.0)
     for queue, took in ((fast, 0.01), (slow, 0.5)):
         queue.offer(frame(0, keyframe=True))
         queue.take(0.0)
@@ -121,7 +120,7 @@ def test_a_key_frame_replaces_what_waits_for_a_slow_page_only() -> None:
 
 
 def test_a_slow_page_gets_few_differences_and_the_next_key_frame_soon() -> None:
-    queue = MediaQueue()
+    queue = ViewerQueue(ALL, 0.0)
     queue.offer(frame(0, keyframe=True))
     queue.take(0.0)
     queue.acknowledge(0, 0.3)
@@ -153,7 +152,7 @@ def test_what_is_sent_can_always_be_decoded(seed: int) -> None:
 
 
 def test_an_unknown_acknowledgement_is_ignored() -> None:
-    queue = MediaQueue()
+    queue = ViewerQueue(ALL, 0.0)
     queue.offer(frame(0, keyframe=True))
     queue.take(0.0)
     assert queue.acknowledge(7, 9.0) is None

@@ -38,10 +38,16 @@ class Frame:
     keyframe: bool  # needs no picture before it
 
 
-class MediaQueue:
-    """The frames that wait for one page, and those under way."""
+class ViewerQueue:
+    """The frames that wait for one page, and those under way.
 
-    def __init__(self) -> None:
+    They are the robot's own pictures or, if the page cannot use them, those of the rescue stream.
+    """
+
+    def __init__(self, can: frozenset[str], now: float) -> None:
+        self.can = can
+        self.rescued = False
+        self.new = True  # it has received no picture, and no key frame was requested for it
         self.waiting = True  # for a key frame
         self.overflowed = False  # waiting because the page is too slow
         self.window = WINDOW
@@ -50,6 +56,9 @@ class MediaQueue:
         self._late_at = float("-inf")  # the newest of them
         self._queue: deque[Frame] = deque()
         self._under_way: dict[int, tuple[float, Frame]] = {}
+        self._undecodable: set[str] = set()
+        self._waiting_since = now
+        self._retry_at = 0.0
 
     def offer(self, frame: Frame) -> None:
         """Queue a frame, or skip it."""
@@ -132,18 +141,7 @@ class MediaQueue:
     def _queued_bytes(self) -> int:
         return sum(len(frame.data) for frame in self._queue)
 
-
-class ViewerQueue(MediaQueue):
-    """The queue of one page, which gets the robot's own pictures or, if it cannot use them, the rescue stream."""
-
-    def __init__(self, can: frozenset[str], now: float) -> None:
-        super().__init__()
-        self.can = can
-        self.rescued = False
-        self.new = True  # it has received no picture, and no key frame was requested for it
-        self._undecodable: set[str] = set()
-        self._waiting_since = now
-        self._retry_at = 0.0
+    # -- the robot's own pictures, or the rescue stream
 
     def decodes(self, encoding: str) -> bool:
         return encoding in self.can and encoding not in self._undecodable
