@@ -200,7 +200,7 @@ class _Operator(MediaReceiver):
         """Return the ms from the request to the first picture. Raises PebbleError if none comes."""
         self.wait_for_capabilities(UP_S)
         began_ns = time.monotonic_ns()
-        self.request(self._encoding, sound=False)
+        self.request("video", self._encoding)
         while not self._first_ns:
             time.sleep(_POLL_S)
             self.poll()

@@ -132,10 +132,10 @@ def _use(testbed: Testbed, seconds: float) -> None:
 
         for receiver in receivers:
             receiver.wait_for_capabilities(_READY_S)
-            receiver.viewer.request("video", "json")
-            receiver.viewer.request("audio", "pcm")
+            receiver.request("video", "json")
+            receiver.request("audio", "pcm")
         end = time.monotonic() + _READY_S
-        while silent := [one.name for one in receivers if len(one.encoding) < 2]:
+        while silent := [one.robot.name for one in receivers if len(one.encoding) < 2]:
             poll()
             if time.monotonic() > end:
                 raise PebbleError(f"no pictures or no sound came from {', '.join(silent)}")

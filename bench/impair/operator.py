@@ -22,9 +22,9 @@ from pebble.bench.clients import all_ready, drive_of
 from pebble.bench.impair.metrics import Arrival, Command, Heartbeat, OperatorReport, Plan, Record, Sound, Window
 from pebble.bench.usage import wall_clock_ahead_ns
 from pebble.client.media_receiver import MediaReceiver
+from pebble.client.media_request.offer import Medium
 from pebble.client.robot_view import RobotView
 from pebble.client.scripted_operator import ScriptedOperator, paced
-from pebble.client.viewer import Medium
 from pebble.contract import ONLINE, SOUNDBOARD_COMMAND, SOUNDBOARD_STATUS, STATUS, Channel, codec
 from pebble.contract.payloads import Heartbeat as Online
 from pebble.contract.payloads import SoundboardCommand
@@ -124,7 +124,7 @@ class TrialOperator:
         """Requests a medium, and waits for its first message."""
         subscriber = MediaSubscriber(self._media, self._base)
         subscriber.wait_for_capabilities(_KNOWN_S)
-        subscriber.viewer.request(medium, encoding)
+        subscriber.request(medium, encoding)
         _wait(lambda: bool(subscriber.seen or subscriber.received), _FIRST_S, subscriber.poll)
         return closing(subscriber)
 

@@ -5,17 +5,22 @@ from __future__ import annotations
 import asyncio
 import logging
 import secrets
+import threading
 import time
+from collections import deque
 from collections.abc import Callable
 from typing import Final
 
-from pebble.client.arrived import Arrived, Handler
 from pebble.client.named_topics import NamedTopics
 from pebble.errors import TransportError
 from pebble.transports import Message, MqttSettings, QoS, State, Subscription, Transport, create
 
 log = logging.getLogger(__name__)
 
+Handler = Callable[[Message, float], None]  # the message, and the monotonic time at which it arrived
+
+MAX_MESSAGES: Final = 10_000  # on their way to the event loop
+MAX_BYTES: Final = 64 << 20  # of their payloads
 ANSWER_S: Final = 0.25  # a broker that acknowledges nothing for longer would deliver commands late, all at once
 _DELIVER_S: Final = 0.01  # for them at a time: whatever else is due must not wait for a flood
 
@@ -25,6 +30,37 @@ def problem_of(transport: Transport) -> str:
     if transport.state is not State.CONNECTED:
         return transport.problem or "not connected yet"
     return "it does not answer" if transport.outgoing.stalled_s > ANSWER_S else ""
+
+
+class Arrived:
+    """Messages on their way to the event loop, which alone gets them. Any thread puts, and never waits for room."""
+
+    def __init__(self) -> None:
+        self.dropped = 0
+        self._waiting: deque[tuple[Handler, Message, float]] = deque()
+        self._bytes = 0
+        self._lock = threading.Lock()  # guards these
+
+    def put(self, handler: Handler, message: Message, at: float) -> None:
+        """Queue a message; one for which there is no room is dropped."""
+        size = len(message.payload)
+        with self._lock:
+            if len(self._waiting) < MAX_MESSAGES and self._bytes + size <= MAX_BYTES:
+                self._bytes += size
+                self._waiting.append((handler, message, at))
+                return
+            self.dropped += 1
+        if self.dropped & (self.dropped - 1) == 0:  # the 1st, 2nd, 4th, 8th …
+            log.warning("%d messages dropped, the last on %s: too many at once", self.dropped, message.topic)
+
+    def get(self) -> tuple[Handler, Message, float] | None:
+        """Return the oldest; None if there is none."""
+        with self._lock:
+            if not self._waiting:
+                return None
+            arrived = self._waiting.popleft()
+            self._bytes -= len(arrived[1].payload)
+            return arrived
 
 
 class Broker:
@@ -101,29 +137,19 @@ class Broker:
             log.warning("not published: %s", error)
             return False
 
-    async def subscribe(
-        self,
-        filter_: str,
-        handler: Handler,
-        *,
-        qos: QoS = QoS.DELIVERED,
-        deferred: bool = False,
-        on_refused: Callable[[], None] = lambda: None,
-    ) -> Subscription:
+    async def subscribe(self, filter_: str, handler: Handler, *, deferred: bool = False) -> Subscription:
         """Deliver what matches ``filter_`` until it is unsubscribed.
 
         ``deferred``: with the next call of ``deliver``, or before the next message that is not. To wake the event loop
-        for each heartbeat of a hundred robots costs more than the heartbeats. ``on_refused`` is called on the
-        transport's thread for a message that is dropped because too many have arrived.
+        for each heartbeat of a hundred robots costs more than the heartbeats.
         """
 
         def take(message: Message) -> None:
-            if not self._arrived.put(handler, message, time.monotonic(), deferred=deferred):
-                on_refused()
-            elif not deferred:
+            self._arrived.put(handler, message, time.monotonic())
+            if not deferred:
                 self._wake()
 
-        return await asyncio.to_thread(self.transport.subscribe, filter_, take, qos=qos, direct=True)
+        return await asyncio.to_thread(self.transport.subscribe, filter_, take, qos=QoS.DELIVERED, direct=True)
 
     def deliver(self) -> None:
         """Hand over what has arrived, in its order; the rest after whatever else is due, if that takes long."""

@@ -1,14 +1,20 @@
-"""Receives one robot's pictures and sound, measures their rate and age, and whether the robot is stopped."""
+"""Receives one robot's pictures and sound, and measures their rate and age."""
 
+import threading
 import time
 
-from pebble.client.estop_states import RobotEstop
-from pebble.client.viewer import Medium, Viewer
+from pebble.client.media_request.offer import Medium
+from pebble.client.media_request.request import ViewerRequest, send
+from pebble.client.robot_view import RobotView
+from pebble.contract import CAPABILITIES
+from pebble.errors import PebbleError
 from pebble.media.decode import Decoded, VideoDecoder
 from pebble.media.picture_header import read_header
 from pebble.media.rate_meter import RateMeter
 from pebble.media.sound import ReceivedSound, SoundDecoder
-from pebble.transports import Transport
+from pebble.transports import Message, QoS, Subscription, Transport
+
+_STEP_S = 0.02  # until a request is sent
 
 
 class MediaReceiver:
@@ -18,30 +24,42 @@ class MediaReceiver:
     """
 
     def __init__(self, transport: Transport, base: str) -> None:
-        self.name = base.rpartition("/")[2]
+        self.robot = RobotView(base)  # by its capabilities
         self.newest: Decoded | None = None
         self.pictures, self.sounds = RateMeter(), RateMeter()
         self.encoding: dict[Medium, str] = {}  # of the last payload
-        self.estop = RobotEstop(base)
-        self.estop.subscribe(transport)
         self._video, self._audio = VideoDecoder(), SoundDecoder()
-        self.viewer = Viewer(transport, base, self._on_payload)
+        self.requests: dict[Medium, ViewerRequest] = {}
+        self._transport = transport
+        self._subscriptions: list[Subscription] = []
+        self._is_known = threading.Event()
+        self._subscriptions.append(transport.subscribe(CAPABILITIES.topic(base), self._on_capabilities))
 
     def wait_for_capabilities(self, timeout: float) -> None:
         """Wait for the robot's capabilities; raises PebbleError on timeout."""
-        self.viewer.wait_for_capabilities(timeout)
+        if not self._is_known.wait(timeout):
+            raise PebbleError(f"{self.robot.base} publishes no capabilities: is the robot up, and is this its broker?")
 
-    def request(self, encoding: str | None, *, sound: bool) -> None:
-        """Request pictures, and sound if the robot has it. Raises PebbleError if it has no pictures."""
-        self.viewer.request("video", encoding)
-        if sound and self.viewer.capabilities.get("audio", {}).get("available"):
-            self.viewer.request("audio")
+    def request(self, medium: Medium, encoding: str | None = None) -> None:
+        """Request a medium in ``encoding``, or as configured. Raises PebbleError if the robot does not offer it."""
+        request = self.requests.get(medium) or ViewerRequest(self.robot.base, medium, self.robot.capabilities)
+        request.want(encoding, time.monotonic())
+        if medium not in self.requests:
+            self.requests[medium] = request
+            self._subscribe(medium, request)
+            request.want(encoding, time.monotonic())  # from now on a retained flag, and what flows already, arrives
+        while not request.settled:
+            send(self._transport, request.tick(time.monotonic()))
+            time.sleep(_STEP_S)
 
     def poll(self) -> None:
         """Call this a few times a second: repeats unanswered requests, and requests a key frame if one is missing."""
-        self.viewer.repeat_requests()
-        if self._video.wants_keyframe:
-            self.viewer.request_keyframe(self.encoding.get("video"))
+        now = time.monotonic()
+        for request in list(self.requests.values()):
+            if request.settled:
+                send(self._transport, request.tick(now))
+        if self._video.wants_keyframe and "video" in self.requests:
+            send(self._transport, self.requests["video"].keyframe(self.encoding.get("video"), now))
 
     def summary(self, medium: Medium, now: float) -> str:
         """A line for display: ``h264 10/s 212 kbit/s, 45 ms``; empty while nothing arrives."""
@@ -53,7 +71,11 @@ class MediaReceiver:
         return f"{self.encoding[medium]} {rate:.0f}/s {meter.bitrate(now) / 1000:.0f} kbit/s{age}"
 
     def close(self) -> None:
-        self.viewer.close()
+        """Withdraw what was requested."""
+        for request in list(self.requests.values()):
+            send(self._transport, request.end())
+        for subscription in self._subscriptions:
+            subscription.close()
 
     def on_picture(self, picture: Decoded) -> None:
         """Override to get every picture, not only the newest; runs on a thread of the transport."""
@@ -61,13 +83,24 @@ class MediaReceiver:
     def on_sound(self, received: ReceivedSound) -> None:
         """Override to get every packet of sound; runs on a thread of the transport."""
 
-    # -- the transport's threads, one per medium
+    # -- the transport's threads
 
-    def _on_payload(self, medium: Medium, payload: bytes) -> None:
-        if medium == "video":
-            self._on_video(payload)
-        else:
-            self._on_audio(payload)
+    def _on_capabilities(self, message: Message) -> None:
+        self.robot.receive(CAPABILITIES, message, 0.0, 0.0)
+        if self.robot.estop.has_capabilities:
+            self._is_known.set()
+
+    def _subscribe(self, medium: Medium, request: ViewerRequest) -> None:
+        def on_media(message: Message) -> None:
+            request.receive(message, time.monotonic())
+            (self._on_video if medium == "video" else self._on_audio)(message.payload)
+
+        def on_flag(message: Message) -> None:
+            request.receive(message, time.monotonic())
+
+        subscribe = self._transport.subscribe
+        self._subscriptions.append(subscribe(request.flag_topic, on_flag, echo=False, direct=True))
+        self._subscriptions.append(subscribe(request.media_topic, on_media, qos=QoS.LATEST))
 
     def _on_video(self, payload: bytes) -> None:
         picture = self._video.feed(payload)

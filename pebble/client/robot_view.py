@@ -1,24 +1,26 @@
 """The robot as an operator's program sees it: whether it is there, what it can do, and what holds it. Pure."""
 
 from collections import deque
+from contextlib import suppress
 from typing import Any
 
 from pebble import contract as c
 from pebble.client.announced import announced
 from pebble.client.control import RobotControl
 from pebble.client.drive_reasons import SILENT_S, Situation
-from pebble.client.driveable import Driveable, driveable_of
+from pebble.client.driveable import Driveable, driveable_of, is_held
 from pebble.client.pace_of_link import Pace, pace_of, way_s
-from pebble.client.robot_topics import named_topic, section_of
+from pebble.client.robot_topics import SYNONYMS, named_topic, section_of
 from pebble.contract import codec
 from pebble.contract.levels import link_of, silent_after
-from pebble.contract.payloads import AutonomyStatus, EstopState, Heartbeat, LinkLevel, LinkState, Orientation
+from pebble.contract.payloads import AutonomyStatus, EstopState, LinkLevel, LinkState, Orientation
 from pebble.errors import PayloadError
 from pebble.runtime.robot_estop import RobotEstop
 from pebble.transports import Message
 
 MAX_REMEMBERED = 64  # topics of one robot
 _HISTORY = 10
+_STAMPS = 5  # heartbeats by which a clock of whole seconds is recognised
 
 
 class Liveness:
@@ -30,9 +32,12 @@ class Liveness:
         self.link: LinkLevel = "wide"  # as its bridge measures it
         self._intervals: deque[float] = deque(maxlen=_HISTORY)
         self._latencies: deque[float] = deque(maxlen=_HISTORY)
+        self._stamps: deque[int] = deque(maxlen=_STAMPS)
         self.latency_s: float | None = None  # of the newest heartbeat; None if its clock is wrong
 
-    def heartbeat(self, now: float, latency_s: float, *, online: bool = True) -> None:
+    def heartbeat(self, now: float, latency_s: float, *, online: bool = True, t: int = 1) -> None:
+        """Take note of a heartbeat with the time ``t``, in milliseconds of its own clock."""
+        self._stamps.append(t)
         if self.received_at is not None and 0.05 <= now - self.received_at <= 10.0:
             self._intervals.append(now - self.received_at)
         self.latency_s = max(0.0, latency_s) if -1.0 <= latency_s <= 10.0 else None
@@ -49,6 +54,11 @@ class Liveness:
     def interval_s(self) -> float | None:
         """It is the mean time between the last ten heartbeats."""
         return _mean(self._intervals)
+
+    @property
+    def whole_seconds(self) -> bool:
+        """True if its clock counts whole seconds: latency says nothing."""
+        return len(self._stamps) == _STAMPS and all(stamp % 1000 == 0 for stamp in self._stamps)
 
     def age_s(self, now: float) -> float | None:
         return None if self.received_at is None else now - self.received_at
@@ -79,7 +89,7 @@ class RobotView:
         self.reset_at = float("-inf")  # when its emergency stop ended, as far as it was seen
         self.remembered: dict[str, Message] = {}  # by topic: what an emergency stop that begins later needs to know
         self.capabilities: dict[str, Any] = {}
-        self.driveable: Driveable | None = None  # as its status says
+        self._status = b""  # the newest
         self.link: LinkState | None = None  # what the way to its broker carries; None: everything
         self.autonomy: AutonomyStatus | None = None
         self.volts: float | None = None
@@ -96,78 +106,69 @@ class RobotView:
     def receive(self, channel: c.Channel | None, message: Message, now: float, wall: float) -> None:
         """Take a message of it that arrived at ``now`` (monotonic) and ``wall`` (epoch seconds).
 
-        What it says is known from ``channel``. A malformed one changes nothing: the last valid state stays.
+        What it says is known from ``channel``. A malformed one changes nothing: the last valid state stays. An empty
+        one removes what was retained.
         """
-        if channel is c.ONLINE:
-            self.heartbeat(message, now, wall)
-        elif channel in (c.CAPABILITIES, c.ESTOP_STATE):
-            self.receive_stop(channel, message, now)
+        if channel in _FOR_STOPS:
+            self._remember(message)
+        if channel in (c.CAPABILITIES, c.ESTOP_STATE):
+            self._receive_stop(channel, message, now)
         elif channel is c.CONTROL_STATE:
             self.control.receive(message)
         elif channel is c.LINK:
-            self._receive_link(message)
+            self.link = link_of(message.payload)  # absent or unreadable it is wide
+            self.liveness.link = "wide" if self.link is None else self.link.level
         elif channel is c.STATUS:
-            self.driveable = driveable_of(message.payload)
-            self.announce(message.payload)
-        elif channel in _TELEMETRY:
-            try:
-                self._receive_telemetry(channel, codec.decode(channel, message.payload))
-            except PayloadError:
-                return
+            self._status = message.payload
+            self._announce(message.payload)
+        elif channel in _DECODED:
+            with suppress(PayloadError):
+                self._receive_decoded(channel, message, codec.decode(channel, message.payload), now, wall)
 
-    def heartbeat(self, message: Message, now: float, wall: float) -> Heartbeat | None:
-        """Take a heartbeat; None if it is no sign of life: a retained or malformed one."""
-        if message.retain:
-            return None
-        try:
-            payload: Heartbeat = codec.decode(c.ONLINE, message.payload)
-        except PayloadError:
-            return None
-        self.liveness.heartbeat(now, wall - payload.t / 1000, online=payload.online is not False)
-        self.announce(message.payload)
-        return payload
-
-    def announce(self, payload: bytes) -> bool:
-        """Take what a heartbeat or status lists, unless it publishes capabilities; whether that is something else."""
-        if self.capabilities and "announced" not in self.capabilities:
-            return False
-        found = announced(self.base, payload)
-        changed = bool(found) and found != self.capabilities
-        self.capabilities = found or self.capabilities
-        return changed
-
-    def receive_stop(self, channel: c.Channel | None, message: Message, now: float) -> bool:
-        """Take capabilities, or the state of a motor owner; whether they say something of its emergency stop."""
-        latched = self.latched
-        changed = self.estop.receive(message)
-        if latched and not self.latched:
-            self.reset_at = now
-        if channel is c.CAPABILITIES:
-            try:
-                self.capabilities = codec.decode(c.CAPABILITIES, message.payload).value
-            except PayloadError:
-                return changed
-        return changed
-
-    def remember(self, message: Message) -> None:
-        """Keep it for an emergency stop that begins later; invented owners keep no capabilities out."""
-        if len(self.remembered) < MAX_REMEMBERED or message.topic in (
-            *self.remembered,
-            c.CAPABILITIES.topic(self.base),
-        ):
-            self.remembered[message.topic] = message
-
-    def _receive_telemetry(self, channel: c.Channel, payload: Any) -> None:
+    def _receive_decoded(self, channel: c.Channel, message: Message, payload: Any, now: float, wall: float) -> None:
         if channel is c.CHARGING_LEVEL:
             self.volts = payload.value
         elif channel is c.CHARGING_STATUS:
             self.charging = payload.value
         elif channel is c.IMU:
             self.attitude = payload.value.orientation_deg
-        else:
+        elif channel is c.AUTONOMY_STATUS:
             self.autonomy = payload
+        else:
+            self._announce(message.payload)
+            if not message.retain:  # a heartbeat that is retained is no sign of life
+                self.liveness.heartbeat(now, wall - payload.t / 1000, online=payload.online is not False, t=payload.t)
+
+    def _announce(self, payload: bytes) -> None:
+        """Take what a heartbeat or status lists, unless it publishes capabilities."""
+        if not self.capabilities or "announced" in self.capabilities:
+            found = announced(self.base, payload)
+            self.capabilities = self.capabilities if found == self.capabilities else found or self.capabilities
+
+    def _receive_stop(self, channel: c.Channel, message: Message, now: float) -> None:
+        """Take capabilities, or the state of a motor owner. Empty capabilities take nothing away."""
+        latched = self.latched
+        self.estop.receive(message)
+        if latched and not self.latched:
+            self.reset_at = now
+        if channel is c.CAPABILITIES:
+            with suppress(PayloadError):
+                self.capabilities = codec.decode(c.CAPABILITIES, message.payload).value or self.capabilities
+
+    def _remember(self, message: Message) -> None:
+        """Keep it for an emergency stop that begins later; invented owners keep no capabilities out."""
+        known = (*self.remembered, c.CAPABILITIES.topic(self.base))
+        if not message.payload:
+            self.remembered.pop(message.topic, None)
+        elif len(self.remembered) < MAX_REMEMBERED or message.topic in known:
+            self.remembered[message.topic] = message
 
     # -- what is known
+
+    @property
+    def live(self) -> bool:
+        """True if anything but retained messages has arrived from it."""
+        return self.liveness.received_at is not None
 
     @property
     def transport(self) -> str:
@@ -199,10 +200,14 @@ class RobotView:
         """Whether it decides itself which person drives it."""
         return section_of(self.capabilities, "drive").get("control") is True
 
-    def _receive_link(self, message: Message) -> None:
-        """Absent or unreadable it is wide."""
-        self.link = link_of(message.payload)
-        self.liveness.link = "wide" if self.link is None else self.link.level
+    @property
+    def driveable(self) -> Driveable | None:
+        """It is what its status says of its motors."""
+        return driveable_of(self._status)
+
+    def holds(self, program: str) -> bool:
+        """True if that program is requested, and waits while people drive over a thin link."""
+        return is_held(self._status, program)
 
     @property
     def named(self) -> bool:
@@ -250,4 +255,5 @@ class RobotView:
         )
 
 
-_TELEMETRY = (c.CHARGING_LEVEL, c.CHARGING_STATUS, c.IMU, c.AUTONOMY_STATUS)
+_FOR_STOPS = (c.ONLINE, c.CAPABILITIES, c.ESTOP_STATE)
+_DECODED = (c.ONLINE, *SYNONYMS, c.CHARGING_LEVEL, c.CHARGING_STATUS, c.IMU, c.AUTONOMY_STATUS)

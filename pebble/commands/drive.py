@@ -10,10 +10,11 @@ import typer
 from pebble.client.broker import problem_of
 from pebble.client.connection import Target, connected, put_names, target_of
 from pebble.client.terminal.key_decoder import END
+from pebble.client.terminal.keys import Terminal, has_terminal, opened
 from pebble.commands.estop import me
 from pebble.commands.options import RobotArgument, with_target
 from pebble.commands.terminal.driver import PERIOD_S, TerminalDriver
-from pebble.commands.terminal.loop import TerminalLoop
+from pebble.errors import PebbleError
 from pebble.transports import Message, QoS, Transport
 from pebble.transports.clock import since_boot as clock
 
@@ -36,9 +37,11 @@ def drive(
     \b
         pebble drive goob.json
     """
-    from pebble.client.terminal.keys import check_terminal, opened
-
-    check_terminal()
+    if not has_terminal():
+        raise PebbleError(
+            "driving by keys needs a terminal of Linux or macOS: use `pebble web`, or in a program `pebble topic pub "
+            "drive-values`"
+        )
     target = target_of(robot, target)
     with connected(target) as (transport, names):
         by, device = me(names.account), f"terminal on {socket.gethostname()}"
@@ -47,14 +50,13 @@ def drive(
         put_names(transport, names, lambda base: base == names.base and driver.robot.named)
         typer.echo(_KEYS)
         with opened() as terminal:
-            loop = TerminalLoop(terminal, clock)
-            _drive(transport, driver, loop)
+            _drive(transport, driver, terminal)
     if driver.unconfirmed:
         typer.echo(f"pebble: the emergency stop of {driver.name} is NOT CONFIRMED", err=True)
-    return 0 if loop.ended in ("SIGINT", END) else 1
+    return 0 if terminal.ended in ("SIGINT", END) else 1
 
 
-def _drive(transport: Transport, driver: TerminalDriver, loop: TerminalLoop) -> None:
+def _drive(transport: Transport, driver: TerminalDriver, terminal: Terminal) -> None:
     """Pass keys and messages to the driver, and what it returns to the transport, until the terminal ends."""
     arrived = deque[tuple[Message, float, float]](maxlen=_ARRIVED)
 
@@ -77,11 +79,11 @@ def _drive(transport: Transport, driver: TerminalDriver, loop: TerminalLoop) -> 
     for filter_ in driver.filters:
         transport.subscribe(filter_, receive, qos=QoS.DELIVERED, direct=True)
     try:
-        while not loop.ended:
-            keys = loop.keys(PERIOD_S)
+        while not terminal.ended:
+            keys = terminal.keys(PERIOD_S)
             driver.press(keys, clock())
             tick()
-            loop.show(driver.status, at_once=bool(keys))
-            loop.suspend(lambda: end(leave=False))
+            terminal.show(driver.status, at_once=bool(keys))
+            terminal.suspend(lambda: end(leave=False))
     finally:
         end(leave=True)

@@ -71,13 +71,13 @@ def _received(target: Target, encoding: str | None) -> Picture:
     from pebble.client.media_receiver import MediaReceiver
 
     with connected(target) as (transport, names), closing(MediaReceiver(transport, names.base)) as receiver:
-        put_names(transport, names, lambda base: base == names.base and receiver.estop.named)
+        put_names(transport, names, lambda base: base == names.base and receiver.robot.named)
         receiver.wait_for_capabilities(_CAPABILITIES_TIMEOUT_S)
-        receiver.request(encoding, sound=False)
+        receiver.request("video", encoding)
         end = time.monotonic() + _FIRST_PICTURE_S
         while receiver.newest is None:
             if time.monotonic() > end:
-                raise PebbleError(f"no picture came from {receiver.name} within {_FIRST_PICTURE_S:.0f} s")
+                raise PebbleError(f"no picture came from {receiver.robot.name} within {_FIRST_PICTURE_S:.0f} s")
             receiver.poll()
             time.sleep(_TICK_S)
         return receiver.newest.picture

@@ -11,7 +11,8 @@ from functools import partial
 from itertools import count
 
 from pebble.client.media_receiver import MediaReceiver
-from pebble.client.viewer import Medium
+from pebble.client.media_request.offer import Medium
+from pebble.client.robot_topics import topic_of
 from pebble.contract import AUDIO_CONTROL, VIDEO_CONTROL, Channel, codec
 from pebble.contract.encodings import ALL_SOUND, ALL_VIDEO
 from pebble.errors import PayloadError, PebbleError
@@ -40,12 +41,13 @@ class CountedMedia(MediaReceiver):
     def watch_requests(self) -> None:
         """Notice the requests of others from now on; to be called once the capabilities are known."""
         for medium, channel in _CONTROLS.items():
-            self._transport.subscribe(self.viewer.topic(channel), partial(self._requested, medium, channel))
+            topic = topic_of(self.robot.base, self.robot.capabilities, channel)
+            self._transport.subscribe(topic, partial(self._requested, medium, channel))
 
     def ask(self, medium: Medium, encoding: str) -> None:
         """Request an encoding, unless a person has requested one; raises PebbleError if the robot does not offer it."""
         if medium not in self.watched:
-            self.viewer.request(medium, encoding)
+            self.request(medium, encoding)
 
     def missing(self) -> list[str]:
         """Return the encodings of which nothing arrived; none if people have chosen theirs meanwhile."""
@@ -58,8 +60,9 @@ class CountedMedia(MediaReceiver):
         self.counted[received.encoding] += 1
 
     def _requested(self, medium: Medium, channel: Channel, message: Message) -> None:
-        if message.payload in self.viewer.sent:
-            self.viewer.sent.remove(message.payload)
+        own = self.requests.get(medium)
+        if own is not None and message.payload in own.sent:
+            own.sent.remove(message.payload)
             return
         try:
             request = codec.decode(channel, message.payload)
@@ -68,7 +71,8 @@ class CountedMedia(MediaReceiver):
         self.was_watched = True
         if request.enabled:
             self.watched.add(medium)
-            self.viewer.hand_over(medium)
+            if own is not None:
+                own.leave()
         else:
             self.watched.discard(medium)
 
@@ -85,7 +89,7 @@ class MediaViewer:
     def begin(self, bases: Iterable[str], *, once: bool = False) -> None:
         """Start requesting media of the robots with these base topics, round after round or ``once``."""
         self._transport.open(timeout=0.0)
-        self.received = {robot.name: robot for robot in [CountedMedia(self._transport, base) for base in bases]}
+        self.received = {view.robot.name: view for view in [CountedMedia(self._transport, base) for base in bases]}
         turns = range(ROUND) if once else count()
         self._thread = threading.Thread(target=self._run, args=(turns,), name=_NAME, daemon=True)
         self._thread.start()

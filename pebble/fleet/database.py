@@ -1,10 +1,10 @@
-"""The SQLite file of people, sessions and the audit log: opened, and followed while others replace it."""
+"""The SQLite file of people, sessions and the audit log."""
 
 import errno
 import os
 import sqlite3
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -35,8 +35,7 @@ def _create(path: Path) -> None:
 class Database:
     """A connection for use under a lock, each statement a transaction. ``path`` None: in memory.
 
-    A file that has taken the place of this one, as a backup, is opened. While there is none the connection goes on:
-    then what is written is lost with this process.
+    If its file is removed, or another one takes its place, the connection goes on with the one that it has opened.
 
     A new file, and what SQLite writes beside it, may be read by its owner only. Raises PebbleError if it cannot be
     opened; ``upgrade`` changes the tables of older versions.
@@ -45,17 +44,15 @@ class Database:
     def __init__(
         self, path: Path | None, tables: str, upgrade: Callable[[sqlite3.Connection], None] = lambda _connection: None
     ) -> None:
-        self._path, self._tables, self._upgrade = path, tables, upgrade
-        self._own: OwnFile | None = None
-        self._beside: list[tuple[Path, OwnFile]] = []
-        self._closed = True
-        self.opened = 0  # files so far
+        self._path = path
         try:
             if path is not None:
                 path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
                 if not path.exists():
                     _create(path)
-            self._open()
+            self._connection = _connection(path, tables)
+            upgrade(self._connection)
+            self._own = None if path is None else OwnFile(path)
         except (OSError, sqlite3.Error) as error:
             why = DatabaseError(path, error).why
             raise PebbleError(f"{path}: cannot be used: {why}; name another file with --people FILE") from None
@@ -63,25 +60,24 @@ class Database:
     @property
     def removed(self) -> str:
         """An error if its file is not where others find it; else empty."""
-        gone = self._own is not None and not self._own.in_place and not self._own.replaced
-        return f"{self._path} was removed: put it back, or start the page again" if gone else ""
+        gone = self._own is not None and not self._own.in_place
+        return f"{self._path} was removed or replaced: put it back, or start the page again" if gone else ""
 
     def rows(self, statement: str, values: Sequence[Any] = ()) -> list[Any]:
         """Raises DatabaseError."""
         with self._errors():
-            return self._current().execute(statement, values).fetchall()
+            return self._connection.execute(statement, values).fetchall()
 
     def execute(self, statement: str, values: Sequence[Any] = ()) -> sqlite3.Cursor:
         """Raises DatabaseError; IntegrityError for what the tables forbid."""
         with self._errors():
-            return self._current().execute(statement, values)
+            return self._connection.execute(statement, values)
 
-    def version(self) -> tuple[int, int, int]:
+    def version(self) -> tuple[int, int]:
         """Another one after each change, by this process or any other. Raises DatabaseError."""
         with self._errors():
-            connection = self._current()
-            (by_others,) = connection.execute("PRAGMA data_version").fetchone()
-            return self.opened, by_others, connection.total_changes
+            (by_others,) = self._connection.execute("PRAGMA data_version").fetchone()
+            return by_others, self._connection.total_changes
 
     @contextmanager
     def _errors(self) -> Iterator[None]:
@@ -92,18 +88,11 @@ class Database:
         except (OSError, sqlite3.Error) as error:
             raise DatabaseError(self._path, error) from None
 
-    def _current(self) -> sqlite3.Connection:
-        if self._own is not None and self._own.replaced:
-            self._close()
-        if self._closed:
-            self._open()
-        return self._connection
-
     @contextmanager
     def transaction(self) -> Iterator[sqlite3.Connection]:
         """All that is executed on the connection, or nothing. Raises DatabaseError."""
         with self._errors():
-            connection = self._current()
+            connection = self._connection
             connection.execute("BEGIN IMMEDIATE")
             try:
                 yield connection
@@ -115,36 +104,17 @@ class Database:
     def close(self) -> None:
         self._connection.close()
 
-    def _close(self) -> None:
-        """Another file has taken the place of this one."""
-        self._closed = True
-        with suppress(sqlite3.Error):  # it may come back
-            self._connection.execute("PRAGMA wal_checkpoint(TRUNCATE)")
-        self._connection.close()
-        for path, beside in self._beside:  # SQLite would read it as changes of the new file
-            if beside.in_place:
-                path.unlink()
-        self._beside = []
 
-    def _open(self) -> None:
-        """Raises OSError and sqlite3.Error."""
-        path = self._path
-        if path is not None:
-            if path.is_dir():
-                raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
-            path.chmod(
-                0o600
-            )  # raises where it is gone: SQLite would make an empty one. To open and close it ends locks
-        where = ":memory:" if path is None else str(path)
-        connection = sqlite3.connect(where, timeout=_BUSY_S, isolation_level=None, check_same_thread=False)
-        connection.execute("PRAGMA journal_mode = WAL")
-        connection.execute("PRAGMA synchronous = NORMAL")
-        connection.execute("PRAGMA foreign_keys = ON")
-        connection.executescript(self._tables)
-        self._upgrade(connection)
-        self.opened += 1
-        self._connection, self._closed = connection, False
-        if path is not None:
-            self._own = OwnFile(path)
-            beside = (path.with_name(path.name + end) for end in ("-wal", "-shm"))
-            self._beside = [(file, OwnFile(file)) for file in beside]
+def _connection(path: Path | None, tables: str) -> sqlite3.Connection:
+    """Open the file, and make the tables that it lacks. Raises OSError and sqlite3.Error."""
+    if path is not None:
+        if path.is_dir():
+            raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
+        path.chmod(0o600)
+    where = ":memory:" if path is None else str(path)
+    connection = sqlite3.connect(where, timeout=_BUSY_S, isolation_level=None, check_same_thread=False)
+    connection.execute("PRAGMA journal_mode = WAL")
+    connection.execute("PRAGMA synchronous = NORMAL")
+    connection.execute("PRAGMA foreign_keys = ON")
+    connection.executescript(tables)
+    return connection

@@ -124,7 +124,7 @@ class People:
     def list(self) -> list[User]:
         return [User(name, Role(role)) for name, role in self._rows("SELECT name, role FROM people ORDER BY name")]
 
-    def version(self) -> tuple[int, int, int]:
+    def version(self) -> tuple[int, int]:
         """Another one after each change of people and sessions, by whatever process. Raises DatabaseError."""
         with self._lock:
             return self._database.version()
@@ -203,16 +203,13 @@ class People:
 
     # -- settings of the server
 
-    def get(self, key: str) -> str | None:
+    def get(self, key: str) -> str:
+        """Return a setting; "" if it was never set."""
         rows = self._rows("SELECT value FROM settings WHERE key = ?", key)
-        return str(rows[0][0]) if rows else None
+        return str(rows[0][0]) if rows else ""
 
-    def set(self, key: str, value: str | None) -> None:
-        """None removes it."""
-        if value is None:
-            self._change("DELETE FROM settings WHERE key = ?", key)
-        else:
-            self._change("INSERT OR REPLACE INTO settings (key, value) VALUES (?, ?)", key, value)
+    def set(self, key: str, value: str) -> None:
+        self._change("INSERT OR REPLACE INTO settings (key, value) VALUES (?, ?)", key, value)
 
     # -- inside
 
@@ -252,9 +249,9 @@ def _exists(name: str) -> PeopleError:
     return PeopleError(f"{name} exists already: change the password or the role, or remove {name}")
 
 
-def has_user(path: Path, name: str = "") -> bool:
+def has_user(path: Path | None, name: str = "") -> bool:
     """Return True if the database knows this person, or without a name anybody. Raises DatabaseError."""
-    if not path.exists():
+    if path is None or not path.exists():
         return False
     # Writes nothing. What is in a write-ahead log is read, too, which needs a file of SQLite's that only then is there
     unchanged = "" if path.with_name(f"{path.name}-wal").exists() else "&immutable=1"

@@ -5,12 +5,13 @@ import logging
 import time
 from collections import deque
 from collections.abc import Callable
-from typing import Any, Final, NamedTuple
+from typing import Final, NamedTuple
 
 from pebble.client.broker import Broker
-from pebble.client.media_request.offer import offered, refusal
-from pebble.client.media_request.request import MediaRequest
-from pebble.client.viewer import Medium
+from pebble.client.media_request.offer import Medium, offered, refusal
+from pebble.client.media_request.shared import SharedRequest
+from pebble.client.robot_topics import topic_of
+from pebble.client.robot_view import RobotView
 from pebble.contract import AUDIO, CAMERA
 from pebble.contract.packets import PBAT
 from pebble.errors import PebbleError
@@ -37,29 +38,6 @@ _WITHOUT_PYAV: Final[dict[Medium, tuple[str, ...]]] = {"video": ("pbvd", "json")
 _CHANNEL: Final = {"video": CAMERA, "audio": AUDIO}
 
 
-class _Channels:
-    """The channels of one medium of one robot in Foxglove."""
-
-    def __init__(self, server: Server, schemas: Schemas, topic: str) -> None:
-        self.topic = topic  # the robot's; the channels are below it
-        self._server, self._schemas = server, schemas
-
-    def declare(self, schema: str, ending: str) -> str:
-        topic = f"{self.topic}/{ending}"
-        if not self._server.declared(topic):
-            self._server.declare(protobuf_spec(topic, self._schemas.make(schema), self._schemas))
-        return topic
-
-    def subscribed(self, ending: str) -> bool:
-        return self._server.subscribed(f"{self.topic}/{ending}")
-
-    def publish(self, ending: str, data: bytes, at_ns: int) -> None:
-        self._server.publish(f"{self.topic}/{ending}", data, at_ns)
-
-    def report(self, problem: str) -> None:
-        self._server.report(f"{self.topic}: {problem}")
-
-
 class Waiting(NamedTuple):
     """A payload that waits for conversion."""
 
@@ -68,120 +46,35 @@ class Waiting(NamedTuple):
     complete: bool  # no picture is missing before it
 
 
-class Conversion:
-    """Converts and publishes payloads on a thread, a few at a time: pictures that are decoded take milliseconds."""
+class MediaFeed:
+    """The request for one medium of one robot, and what arrives of it; ``run`` is its task on the event loop.
 
-    def __init__(self, channels: _Channels, schemas: Schemas, medium: Medium) -> None:
-        self.dropped = 0  # too many at once
-        self.refused = 0  # damaged, or without what they build on
-        self.problem = ""  # why the newest payload was not published
+    Payloads are converted on a thread, a few at a time: pictures that are decoded take milliseconds.
+    """
+
+    def __init__(self, broker: Broker, server: Server, schemas: Schemas, robot: RobotView, medium: Medium) -> None:
+        self.wants_keyframe = False  # a client has subscribed, or a picture is missing
+        self.dropped = 0  # payloads that were too many at once
+        self.refused = 0  # those that are nothing of this medium, too large, damaged, or without what they build on
         self.waiting: deque[Waiting] = deque()
         self._waiting_bytes = 0
-        self._channels, self._medium = channels, medium
-        self._media = Media(schemas)
         self._work = asyncio.Event()
-
-    def put(self, payload: bytes, *, complete: bool) -> bool:
-        """Convert this payload soon; False if others had to be dropped for it."""
-        self.waiting.append(Waiting(payload, time.time_ns(), complete))
-        self._waiting_bytes += len(payload)
-        before = self.dropped
-        while len(self.waiting) > MAX_WAITING or self._waiting_bytes > MAX_WAITING_BYTES:
-            self._drop()
-        self._work.set()
-        return self.dropped == before
-
-    def lacks_keyframe(self) -> bool:
-        return self._channels.subscribed(IMAGE[1]) and self._media.decoder(self._channels.topic).wants_keyframe
-
-    async def run(self) -> None:
-        """Convert until it is cancelled."""
-        while True:
-            await self._work.wait()
-            self._work.clear()
-            batch = list(self.waiting)
-            self.waiting.clear()
-            self._waiting_bytes = 0
-            await asyncio.to_thread(self._convert, batch)
-
-    def _drop(self) -> None:
-        """Drop the oldest; of pictures all, because each builds on those before it."""
-        count = len(self.waiting) if self._medium == "video" else 1
-        for _ in range(count):
-            self._waiting_bytes -= len(self.waiting.popleft().payload)
-        self.dropped += count
-
-    # -- on a thread
-
-    def _convert(self, batch: list[Waiting]) -> None:
-        for one in batch:
-            for convert, ending in self._converters(one):
-                if self._channels.subscribed(ending):
-                    self._publish(convert, one)
-
-    def _converters(self, one: Waiting) -> list[tuple[Callable[[str, bytes], Converted | None], str]]:
-        if self._medium == "audio":
-            return [(self._media.sound, SOUND[1])]
-        image = (self._media.image, IMAGE[1])
-        return [(self._media.video, VIDEO[1]), image] if one.complete and is_h264(one.payload) else [image]
-
-    def _publish(self, convert: Callable[[str, bytes], Converted | None], one: Waiting) -> None:
-        try:
-            converted, self.problem = convert(self._channels.topic, one.payload), ""
-        except PebbleError as error:  # Opus without PyAV
-            converted, self.problem = None, str(error)
-        if converted is None:
-            self.refused += 1
-            return
-        data = stamped(converted.message, time_of(one.payload, one.at_ns))
-        if len(data) > MAX_BYTES:
-            self.problem = f"{len(data)} bytes at once, more than {MAX_BYTES}: reduce size or quality"
-        self._channels.publish(converted.ending, data, one.at_ns)
-
-
-class MediaFeed:
-    """What one medium of one robot is requested for, and what arrives of it; ``run`` is its task on the event loop."""
-
-    def __init__(self, broker: Broker, server: Server, schemas: Schemas, ref: str, medium: Medium) -> None:
-        self.wants_keyframe = False  # a client has subscribed, or a picture is missing
-        self._refused = 0  # payloads that are nothing of this medium, or too large
-        self._ref, self._medium = ref, medium
-        self._channels = _Channels(server, schemas, _CHANNEL[medium].topic(ref))
-        self._conversion = Conversion(self._channels, schemas, medium)
-        self._request = MediaRequest(broker, ref, medium, self.receive)
-        self._capabilities: dict[str, Any] = {}
+        self._robot, self._medium = robot, medium
+        self._server, self._schemas, self._media = server, schemas, Media(schemas)
+        self._topic = _CHANNEL[medium].topic(robot.base)  # the robot's; the channels are below it
+        self._request = SharedRequest(broker, robot.base, medium, self.receive)
         self._sequence = PictureSequence()
         self._arriving = ""  # the encoding of the newest picture
-        self._problem = ""  # as shown
+        self._problem = self._reported = ""  # why the newest payload was not published; as shown
 
-    @property
-    def dropped(self) -> int:
-        """Payloads that were too many at once."""
-        return self._conversion.dropped
-
-    @property
-    def refused(self) -> int:
-        """Payloads that are nothing of this medium, damaged, or without what they build on."""
-        return self._refused + self._conversion.refused
-
-    @property
-    def waiting(self) -> tuple[Waiting, ...]:
-        """What has been received, and is not yet converted."""
-        return tuple(self._conversion.waiting)
-
-    def update(self, capabilities: dict[str, Any]) -> list[str]:
-        """Take new capabilities; returns the channels that it has by them, which stay."""
-        self._capabilities = capabilities
-        channels = []
-        if not refusal(self._ref, capabilities, self._medium):
-            self._channels.topic = capabilities[self._medium].get("topic") or _CHANNEL[self._medium].topic(self._ref)
-            channels = [self._channels.declare(*kind) for kind in self._kinds()]
+    def update(self) -> list[str]:
+        """Take note of new capabilities; returns the channels that it has by them, which stay."""
+        channels, base = [], self._robot.base
+        if not refusal(base, self._robot.capabilities, self._medium):
+            self._topic = topic_of(base, self._robot.capabilities, _CHANNEL[self._medium])
+            channels = [self._declared(*kind) for kind in self._kinds()]
         self._request.want(self._is_wanted())
         return channels
-
-    def take_status(self, status: bytes) -> None:
-        """Take what the robot publishes of its programs: while it holds this medium back, nothing is requested."""
-        self._request.take_status(status)
 
     def wake(self, ending: str, *, subscribed: bool) -> None:
         """Take note that a client has subscribed, or unsubscribed."""
@@ -192,20 +85,34 @@ class MediaFeed:
         """Request and convert until it is cancelled; then withdraw the request."""
         async with asyncio.TaskGroup() as tasks:
             tasks.create_task(self._run_requests())
-            tasks.create_task(self._conversion.run())
+            tasks.create_task(self._run_conversion())
 
     def receive(self, payload: bytes) -> None:
         known = self._take_picture(payload) if self._medium == "video" else payload.startswith(PBAT)
         if not known or len(payload) > MAX_PAYLOAD:
-            self._refused += 1
-        elif not self._conversion.put(payload, complete=self._sequence.complete) and self._medium == "video":
+            self.refused += 1
+            return
+        self.waiting.append(Waiting(payload, time.time_ns(), self._sequence.complete))
+        self._waiting_bytes += len(payload)
+        while len(self.waiting) > MAX_WAITING or self._waiting_bytes > MAX_WAITING_BYTES:
+            self._drop()
+        self._work.set()
+
+    def _drop(self) -> None:
+        """Drop the oldest; of pictures all, because each builds on those before it."""
+        is_video = self._medium == "video"
+        count = len(self.waiting) if is_video else 1
+        for _ in range(count):
+            self._waiting_bytes -= len(self.waiting.popleft().payload)
+        self.dropped += count
+        if is_video:
             self._sequence.interrupt()
             self.wants_keyframe = True
 
     def encoding(self) -> str | None:
         """The encoding to request: H.264 where a client wants it as it is, else what any viewer already gets."""
-        known = offered(self._capabilities, self._medium)
-        if self._channels.subscribed(VIDEO[1]) and "h264" in known:
+        known = offered(self._robot.capabilities, self._medium)
+        if self._subscribed(VIDEO[1]) and "h264" in known:
             return "h264"
         if pyav.installed():
             return _AS_CONFIGURED
@@ -229,10 +136,20 @@ class MediaFeed:
     def _kinds(self) -> tuple[tuple[str, str], ...]:
         if self._medium == "audio":
             return (SOUND,)
-        return (VIDEO, IMAGE) if "h264" in offered(self._capabilities, "video") else (IMAGE,)
+        return (VIDEO, IMAGE) if "h264" in offered(self._robot.capabilities, "video") else (IMAGE,)
 
     def _is_wanted(self) -> bool:
-        return any(self._channels.subscribed(ending) for _, ending in (VIDEO, IMAGE, SOUND))
+        return any(self._subscribed(ending) for _, ending in (VIDEO, IMAGE, SOUND))
+
+    def _declared(self, schema: str, ending: str) -> str:
+        """Declare a channel, unless it is; returns its topic."""
+        topic = f"{self._topic}/{ending}"
+        if not self._server.declared(topic):
+            self._server.declare(protobuf_spec(topic, self._schemas.make(schema), self._schemas))
+        return topic
+
+    def _subscribed(self, ending: str) -> bool:
+        return self._server.subscribed(f"{self._topic}/{ending}")
 
     async def _run_requests(self) -> None:
         while True:
@@ -242,10 +159,10 @@ class MediaFeed:
             self._arriving = ""
 
     async def _step(self) -> None:
-        await self._request.follow(self._capabilities, self.encoding)
+        await self._request.follow(self._robot, self.encoding())
         if not self._is_wanted():
             return
-        if not self._request.problem and (self.wants_keyframe or self._conversion.lacks_keyframe()):
+        if not self._request.problem and (self.wants_keyframe or self._decoder_lacks_keyframe()):
             await self._request_keyframe()
         self._report(self._request.problem or self._request.waits or self._why_nothing_is_shown())
 
@@ -254,14 +171,53 @@ class MediaFeed:
         if self._arriving and self._request.encoding in (_AS_CONFIGURED, self._arriving):
             await self._request.request_keyframe(self._arriving)
 
+    def _decoder_lacks_keyframe(self) -> bool:
+        return self._subscribed(IMAGE[1]) and self._media.decoder(self._topic).wants_keyframe
+
     def _report(self, problem: str) -> None:
         """Show a new problem in Foxglove, once."""
-        if problem and problem != self._problem:
-            log.warning("the %s of %s: %s", self._medium, self._ref, problem)
-            self._channels.report(problem)
-        self._problem = problem
+        if problem and problem != self._reported:
+            log.warning("the %s of %s: %s", self._medium, self._robot.base, problem)
+            self._server.report(f"{self._topic}: {problem}")
+        self._reported = problem
 
     def _why_nothing_is_shown(self) -> str:
-        if self._arriving == "h264" and self._channels.subscribed(IMAGE[1]) and not pyav.installed():
+        if self._arriving == "h264" and self._subscribed(IMAGE[1]) and not pyav.installed():
             return f"h264 {pyav.INSTALL}"
-        return self._conversion.problem
+        return self._problem
+
+    # -- conversion, on a thread
+
+    async def _run_conversion(self) -> None:
+        while True:
+            await self._work.wait()
+            self._work.clear()
+            batch = list(self.waiting)
+            self.waiting.clear()
+            self._waiting_bytes = 0
+            await asyncio.to_thread(self._convert, batch)
+
+    def _convert(self, batch: list[Waiting]) -> None:
+        for waiting in batch:
+            for convert, ending in self._converters(waiting):
+                if self._subscribed(ending):
+                    self._publish(convert, waiting)
+
+    def _converters(self, waiting: Waiting) -> list[tuple[Callable[[str, bytes], Converted | None], str]]:
+        if self._medium == "audio":
+            return [(self._media.sound, SOUND[1])]
+        image = (self._media.image, IMAGE[1])
+        return [(self._media.video, VIDEO[1]), image] if waiting.complete and is_h264(waiting.payload) else [image]
+
+    def _publish(self, convert: Callable[[str, bytes], Converted | None], waiting: Waiting) -> None:
+        try:
+            converted, self._problem = convert(self._topic, waiting.payload), ""
+        except PebbleError as error:  # Opus without PyAV
+            converted, self._problem = None, str(error)
+        if converted is None:
+            self.refused += 1
+            return
+        data = stamped(converted.message, time_of(waiting.payload, waiting.at_ns))
+        if len(data) > MAX_BYTES:
+            self._problem = f"{len(data)} bytes at once, more than {MAX_BYTES}: reduce size or quality"
+        self._server.publish(f"{self._topic}/{converted.ending}", data, waiting.at_ns)

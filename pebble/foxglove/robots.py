@@ -3,19 +3,19 @@
 import asyncio
 import logging
 import time
-from typing import Any, Final
+from typing import Final
 
 from pebble.client.broker import Broker
+from pebble.client.media_request.offer import Medium
 from pebble.client.robot_topics import FLEET, SYNONYMS, WATCHED
-from pebble.client.viewer import Medium
-from pebble.contract import CAPABILITIES, STATUS, Channel, codec
+from pebble.client.robot_view import RobotView
+from pebble.contract import CAPABILITIES, STATUS, Channel
 from pebble.contract.channels import channel_of
-from pebble.contract.identity import Identity, parse_topic
-from pebble.errors import PayloadError
+from pebble.contract.identity import parse_topic
 from pebble.foxglove.json_channels import json_spec
 from pebble.foxglove.media_feed import MediaFeed
 from pebble.foxglove.server import Server, protobuf_spec
-from pebble.recordings.exports.foxglove_messages import Converted, Schemas, Telemetry, as_object, stamped, time_of
+from pebble.recordings.exports.foxglove_messages import Schemas, Telemetry, as_object, stamped, time_of
 from pebble.transports import Message
 from pebble.transports.topics import matches
 
@@ -35,15 +35,14 @@ class Robots:
     """Only the event loop calls it."""
 
     def __init__(self, broker: Broker, server: Server, schemas: Schemas) -> None:
-        self.bases: set[str] = set()
+        self.robots: dict[str, RobotView] = {}
         self._refused = 0  # messages that are no JSON, and those of a robot too many
         self._broker, self._server, self._schemas = broker, server, schemas
         self._telemetry = Telemetry(schemas)
         self._feeds: dict[tuple[str, Medium], MediaFeed] = {}
         self._by_channel: dict[str, MediaFeed] = {}
         self._tasks: set[asyncio.Task[None]] = set()
-        self._named: set[str] = set()  # robots that take requests only with a name
-        broker.is_named = self._named.__contains__
+        broker.is_named = lambda base: base in self.robots and self.robots[base].named
 
     @property
     def dropped(self) -> int:
@@ -60,15 +59,17 @@ class Robots:
         address = parse_topic(message.topic)
         if address is None or address.identity.is_server or not message.payload:
             return
-        if not self._knows(address.identity):
+        robot = self._robot(address.identity.base)
+        if robot is None:
             self._refused += 1
             return
         channel = channel_of(f"{address.direction}/{address.metric}")
+        if channel in (CAPABILITIES, STATUS):
+            robot.receive(channel, message, at, time.time())
         if channel is CAPABILITIES:
-            self._update(address.identity.base, message.payload)
-        elif channel is STATUS:
             for medium in _MEDIA:
-                self._feed(address.identity.base, medium).take_status(message.payload)
+                feed = self._feed(robot, medium)
+                self._by_channel.update(dict.fromkeys(feed.update(), feed))
         self._publish(channel, message, time.time_ns() - round((time.monotonic() - at) * 1e9))
 
     def wake(self, topic: str, *, subscribed: bool) -> None:
@@ -84,10 +85,11 @@ class Robots:
         if self._tasks:
             await asyncio.wait(self._tasks, timeout=timeout)
 
-    def _knows(self, identity: Identity) -> bool:
-        if identity.base not in self.bases and len(self.bases) < MOST_ROBOTS:
-            self.bases.add(identity.base)
-        return identity.base in self.bases
+    def _robot(self, base: str) -> RobotView | None:
+        """Return that robot; None: there are too many."""
+        if base not in self.robots and len(self.robots) < MOST_ROBOTS:
+            self.robots[base] = RobotView(base)
+        return self.robots.get(base)
 
     # -- telemetry
 
@@ -97,19 +99,12 @@ class Robots:
         remember = message.retain or (channel is not None and channel.default_retain)
         converted = self._telemetry.convert(topic, payload)
         if converted is not None:
-            self._publish_converted(converted, topic, payload, at_ns, remember=remember)
-        if converted is None or converted.beside:
-            self._publish_json(channel, topic, payload, at_ns, remember=remember)
-
-    def _publish_converted(
-        self, converted: Converted, topic: str, payload: bytes, at_ns: int, *, remember: bool
-    ) -> None:
-        made, topic = converted.message, f"{topic}/{converted.ending}"
-        if not self._server.declared(topic):
-            self._server.declare(protobuf_spec(topic, made, self._schemas))
-        self._server.publish(topic, stamped(made, time_of(payload, at_ns)), at_ns, remember=remember)
-
-    def _publish_json(self, channel: Channel | None, topic: str, payload: bytes, at_ns: int, *, remember: bool) -> None:
+            made, below = converted.message, f"{topic}/{converted.ending}"
+            if not self._server.declared(below):
+                self._server.declare(protobuf_spec(below, made, self._schemas))
+            self._server.publish(below, stamped(made, time_of(payload, at_ns)), at_ns, remember=remember)
+        if converted is not None and not converted.beside:
+            return
         data = as_object(payload)
         if data is None:
             self._refused += 1
@@ -120,21 +115,11 @@ class Robots:
 
     # -- pictures and sound
 
-    def _update(self, base: str, payload: bytes) -> None:
-        try:
-            capabilities: dict[str, Any] = codec.decode(CAPABILITIES, payload).value
-        except PayloadError:  # the last valid ones stay
-            return
-        (self._named.add if capabilities.get("named") is True else self._named.discard)(base)
-        for medium in _MEDIA:
-            feed = self._feed(base, medium)
-            self._by_channel.update(dict.fromkeys(feed.update(capabilities), feed))
-
-    def _feed(self, base: str, medium: Medium) -> MediaFeed:
-        if (feed := self._feeds.get((base, medium))) is not None:
+    def _feed(self, robot: RobotView, medium: Medium) -> MediaFeed:
+        if (feed := self._feeds.get((robot.base, medium))) is not None:
             return feed
-        feed = self._feeds[base, medium] = MediaFeed(self._broker, self._server, self._schemas, base, medium)
-        task = asyncio.create_task(feed.run(), name=f"the {medium} of {base}")
+        feed = self._feeds[robot.base, medium] = MediaFeed(self._broker, self._server, self._schemas, robot, medium)
+        task = asyncio.create_task(feed.run(), name=f"the {medium} of {robot.base}")
         self._tasks.add(task)
         task.add_done_callback(_log_error)
         return feed

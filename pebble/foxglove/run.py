@@ -64,7 +64,7 @@ async def serve(
             async with asyncio.timeout(_CLOSE_S):
                 await broker.close()
     dropped = server.dropped + robots.dropped + broker.dropped
-    return Summary(len(robots.bases), server.published, dropped, robots.refused)
+    return Summary(len(robots.robots), server.published, dropped, robots.refused)
 
 
 async def _show(settings: Settings, broker: Broker, robots: Robots, on_ready: Callable[[], None]) -> None:

@@ -71,7 +71,7 @@ class Server:
                 host=host,
                 port=port,
                 capabilities=[],  # looking only: no client may publish, call or set anything
-                server_listener=_Listener(self._subscribe, self._unsubscribe),
+                server_listener=self,
                 context=self._context,
                 message_backlog_size=BACKLOG,
             )
@@ -133,32 +133,22 @@ class Server:
 
     # -- threads of the SDK
 
-    def _subscribe(self, topic: str, client: int) -> None:
+    def on_subscribe(self, client: Client, channel: ChannelView) -> None:
+        """Send a client what was last published there."""
+        topic = channel.topic
         with self._lock:
-            self._subscribers.setdefault(topic, set()).add(client)
+            self._subscribers.setdefault(topic, set()).add(client.id)
             remembered = self._remembered.get(topic)
-        channel = self._channels.get(topic)
-        if remembered is not None and channel is not None:
-            channel.log(remembered.data, log_time=remembered.log_ns, sink_id=client)
+        declared = self._channels.get(topic)
+        if remembered is not None and declared is not None:
+            declared.log(remembered.data, log_time=remembered.log_ns, sink_id=client.id)
         self._on_change(topic, True)
 
-    def _unsubscribe(self, topic: str, client: int) -> None:
-        with self._lock:
-            self._subscribers.get(topic, set()).discard(client)
-        self._on_change(topic, False)
-
-
-class _Listener:
-    """What the SDK calls. The rest of a listener belongs to capabilities that the server does not have."""
-
-    def __init__(self, subscribe: Callable[[str, int], None], unsubscribe: Callable[[str, int], None]) -> None:
-        self._subscribe, self._unsubscribe = subscribe, unsubscribe
-
-    def on_subscribe(self, client: Client, channel: ChannelView) -> None:
-        self._subscribe(channel.topic, client.id)
-
     def on_unsubscribe(self, client: Client, channel: ChannelView) -> None:
-        self._unsubscribe(channel.topic, client.id)
+        """Take note that a client has unsubscribed, or left."""
+        with self._lock:
+            self._subscribers.get(channel.topic, set()).discard(client.id)
+        self._on_change(channel.topic, False)
 
 
 def _sdk() -> Any:

@@ -27,17 +27,13 @@ class LogLines:
 
     def __init__(self) -> None:
         self.origin = secrets.token_hex(4)
-        self.refused = 0  # lines for which the queue of what has arrived had no room; counted by the transport's thread
-        self._counted = 0  # of those
         self._lines: deque[tuple[int, msgspec.Raw]] = deque()
         self._bytes = 0
         self._number = 0  # of the newest line, with those that were dropped
 
     def add(self, payload: bytes) -> None:
         """Take a payload of the log topic; one that cannot be shown counts as dropped."""
-        refused = self.refused
-        self._number += 1 + refused - self._counted
-        self._counted = refused
+        self._number += 1
         line = line_of(payload)
         if line is None:
             return

@@ -414,7 +414,10 @@ class PictureFrom(Struct, frozen=True, kw_only=True):
 
 
 class FlagsView(Struct, frozen=True, kw_only=True):
-    """``web/flags``: the flags of the component that is open, as the broker has them; null: it has none."""
+    """``web/flags``: the flags of the component that is open, as the broker has them; null: it has none.
+
+    One that is removed while the server has no broker is not noticed.
+    """
 
     remote_mirror: bool | None = None
     mqtt_audio: bool | None = None

@@ -1,17 +1,15 @@
-"""Generates messages.d.ts from messages.py, and tables of these messages and of the words for people.
+"""Generates messages.d.ts from messages.py, and the table of the words for people.
 
 Program: ``python -m pebble.web.messages_docs`` writes messages.d.ts; a test checks that it is current. With a folder it
-writes the tables there.
+writes the table there.
 """
 
-import inspect
 import json
 import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, get_args
 
-import msgspec
 from msgspec import inspect as types
 
 from pebble.client import drive_reasons
@@ -19,19 +17,6 @@ from pebble.contract.capabilities import RobotIdentity
 from pebble.web import messages
 
 DECLARATIONS = Path(__file__).parent / "static" / "messages.d.ts"
-
-
-def markdown() -> str:
-    """Return the tables of all messages between page and server."""
-    about = (inspect.getdoc(messages) or "").replace("``", "`")
-    parts = [f"# Messages between page and server\n\n{about}\n"]
-    parts += ["## From the page\n", *map(_section, get_args(messages.FromPage))]
-    parts += ["## From the server\n", *map(_section, get_args(messages.ToPage))]
-    replay = *get_args(messages.FromReplay), messages.Played
-    parts += ["## On the socket of a recording\n", *map(_section, replay)]
-    parts += ["## Metrics of the server\n", *map(_section, _views())]
-    parts += ["## On the connection of a voice\n", _section(messages.TalkAnswer)]
-    return "\n".join(parts)
 
 
 def words() -> str:
@@ -71,23 +56,6 @@ def _views() -> Iterator[type]:
     yield from messages.SERVER_METRICS.values()
 
 
-def _section(struct: type) -> str:
-    info: Any = types.type_info(struct)
-    title = f"`{info.tag}`" if info.tag is not None else struct.__name__
-    rows = [f"| `{one.name}` | {_words(one.type)} | {'' if one.required else _default(one)} |" for one in info.fields]
-    table = ["| field | type | default |", "|---|---|---|", *rows, ""] if rows else []
-    return "\n".join([f"### {title}\n", inspect.cleandoc(struct.__doc__ or "").replace("``", "`"), "", *table])
-
-
-def _default(field: Any) -> str:
-    value = field.default if field.default_factory is msgspec.NODEFAULT else field.default_factory()
-    return f"`{json.dumps(value)}`"
-
-
-def _words(kind: Any) -> str:
-    return _script(kind).replace("|", "or")
-
-
 def _script(kind: Any) -> str:
     match kind:
         case types.Metadata():
@@ -117,13 +85,12 @@ def _script(kind: Any) -> str:
 
 
 def main(arguments: list[str]) -> None:
-    """Write the tables into the given folder; without one, messages.d.ts of this checkout."""
+    """Write the table into the given folder; without one, messages.d.ts of this checkout."""
     if not arguments:
         DECLARATIONS.write_text(declarations(), encoding="utf-8")
         return
     folder = Path(arguments[0])
     folder.mkdir(parents=True, exist_ok=True)
-    (folder / "web-messages.md").write_text(markdown(), encoding="utf-8")
     (folder / "words.md").write_text(words(), encoding="utf-8")
 
 

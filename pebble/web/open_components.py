@@ -61,7 +61,6 @@ class OpenComponents:
         self._following: set[str] = set()  # components whose task runs
         self._wanted: dict[str, dict[str, _Carried]] = {}  # by component and filter
         self._flags: dict[str, FlagsView] = {}
-        broker.on_state(self._forget_flags)
 
     @property
     def known(self) -> set[str]:
@@ -105,7 +104,7 @@ class OpenComponents:
                     await self._broker.unsubscribe(done.pop(filter_))
                 for filter_ in [filter_ for filter_ in wanted if filter_ not in done]:
                     try:
-                        done[filter_] = await self._subscribe(ref, filter_)
+                        done[filter_] = await self._broker.subscribe(filter_, self._receiver(ref, filter_))
                     except PebbleError as error:
                         if filter_ not in failed:
                             failed.add(filter_)
@@ -132,18 +131,6 @@ class OpenComponents:
         self._robots.remove_server_metric(ref, _FLAGS_METRIC)
         if ref not in self._robots.components:
             self._robots.forget(ref)
-
-    async def _subscribe(self, ref: str, filter_: str) -> Subscription:
-        receiver = self._receiver(ref, filter_)
-        if filter_ != c.LOGS.topic(ref):
-            return await self._broker.subscribe(filter_, receiver)
-
-        def count() -> None:
-            lines = self._robots.logs.get(ref)
-            if lines is not None:
-                lines.refused += 1
-
-        return await self._broker.subscribe(filter_, receiver, on_refused=count)
 
     def _receiver(self, ref: str, filter_: str) -> Callable[[Message, float], None]:
         def take(message: Message, now: float) -> None:
@@ -172,20 +159,6 @@ class OpenComponents:
     def _show_flags(self, ref: str, view: FlagsView) -> None:
         self._flags[ref] = view
         self._robots.set_server_metric(ref, _FLAGS_METRIC, view)
-
-    def _forget_flags(self) -> None:
-        """They arrive again with the next connection, except those that are removed meanwhile."""
-        if self._broker.connected:
-            self._broker.loop.call_later(self._step_s, self._show_all_flags)
-            return
-        for ref in list(self._flags):
-            del self._flags[ref]
-            self._robots.remove_server_metric(ref, _FLAGS_METRIC)
-
-    def _show_all_flags(self) -> None:
-        if self._broker.connected:
-            for ref in self._subscriptions:
-                self._show_flags(ref, self._flags.get(ref, FlagsView()))
 
     def _filters(self, ref: str) -> dict[str, _Carried]:
         """Every channel's own topic, flags, what capabilities and manifests name, and overlays of its picture."""

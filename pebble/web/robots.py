@@ -6,7 +6,6 @@ No queue forms: a slow page receives the newest value less often. A page that co
 import logging
 import re
 import time
-from collections import deque
 from collections.abc import Callable, Collection, Iterator
 from itertools import chain
 from typing import Any, NamedTuple
@@ -14,7 +13,7 @@ from typing import Any, NamedTuple
 import msgspec
 
 from pebble import contract as c
-from pebble.client.robot_topics import FLEET, SYNONYMS, topic_of
+from pebble.client.robot_topics import FLEET, topic_of
 from pebble.client.robot_view import RobotView
 from pebble.contract import channel_of, codec, is_reserved
 from pebble.contract.identity import LEVEL, Direction, parse_topic
@@ -29,13 +28,11 @@ MAX_COMPONENTS, MAX_METRICS, MAX_VALUE_BYTES = 2000, 200, 64 * 1024  # component
 _MAX_CLIPS_BYTES = 400 * 1024  # of the list of clips, which has up to 256 KiB of names
 LARGE_BYTES = 16 * 1024  # a value beyond holds up a slow connection: one is sent, then the page has to answer
 MAX_STATE_BYTES = 128 * 1024  # of values in one message: pings, by which pages drive, do not wait for thousands
-MAX_BYTES = 64 * 1024 * 1024  # of all values together
-RESERVED_BYTES = 16 * 1024  # of them for each component, whatever the others send
+MAX_BYTES = 64 * 1024 * 1024  # of all values together, but for those of components that are open, driven or stopped
 MAX_ALIASES = 64  # of one component: topics that its microcontrollers declare besides the contract's
 _REFRESH_S = 1.0  # values that change with every heartbeat are sent this often,
 _REFRESHES_PER_S = 100  # but of so many components at most, and of those that are open
 _LONGEST_ALIAS = 200  # characters
-_STAMPS = 5  # heartbeats by which a clock of whole seconds is recognised
 
 _is_level = re.compile(LEVEL).search
 
@@ -52,40 +49,27 @@ class Component:
         self.ref = ref
         self.robot = RobotView(ref)
         self.values: dict[str, _Value] = {}
-        self.bytes = 0  # of the values
         self.aliases: dict[str, tuple[str, ...]] = {}  # by metric of the manifest that declares them
         self.sent_online: bool | None = None
         self.refreshed_at = float("-inf")
-        self._stamps: deque[int] = deque(maxlen=_STAMPS)
-
-    @property
-    def live(self) -> bool:
-        """Whether anything but retained messages has arrived from it."""
-        return self.robot.liveness.received_at is not None
-
-    def take_heartbeat(self, message: Message, now: float, wall: float) -> bool:
-        """Take a heartbeat; whether the component ends with it."""
-        payload = self.robot.heartbeat(message, now, wall)
-        if payload is None:
-            return False
-        self._stamps.append(payload.t)
-        return payload.online is False
-
-    def view(self, now: float) -> m.Liveness:
-        liveness = self.robot.liveness
-        return m.Liveness(
-            online=self.robot.online(now),
-            silent_s=liveness.age_s(now),
-            latency_ms=_ms(liveness.latency_s),
-            average_latency_ms=_ms(liveness.average_latency_s),
-            interval_ms=_ms(liveness.interval_s),
-            whole_seconds=len(self._stamps) == _STAMPS and all(stamp % 1000 == 0 for stamp in self._stamps),
-        )
 
     def lists(self, metric: str) -> bool:
         """Whether this is the state of a motor owner that its capabilities list."""
         states, owners = (c.ESTOP_STATE, c.CONTROL_STATE), self.robot.estop.owners
         return metric in [state.metric.format(owner=owner) for state in states for owner in owners]
+
+
+def liveness_of(robot: RobotView, now: float) -> m.Liveness:
+    """Return whether it is there, as pages are shown it."""
+    liveness = robot.liveness
+    return m.Liveness(
+        online=robot.online(now),
+        silent_s=liveness.age_s(now),
+        latency_ms=_ms(liveness.latency_s),
+        average_latency_ms=_ms(liveness.average_latency_s),
+        interval_ms=_ms(liveness.interval_s),
+        whole_seconds=liveness.whole_seconds,
+    )
 
 
 def _ms(seconds: float | None) -> float | None:
@@ -228,19 +212,19 @@ class Robots:
             return
         if channel is c.LOGS:
             self._log(component, message)
-        elif not message.payload:
-            self._remove_value(component, metric, message, now)
-        else:
-            if (raw := codec.trim(message.payload)) != message.payload:  # pages get it as it is
-                message = msgspec.structs.replace(message, payload=raw)
-            if self._store(component, metric, channel, message, now):
-                self._interpret(component, metric, channel, message, now)
+            return
+        if not message.payload:
+            self._remove_value(component, metric)
+        elif (raw := codec.trim(message.payload)) != message.payload:  # pages get it as it is
+            message = msgspec.structs.replace(message, payload=raw)
+        if not message.payload or self._store(component, metric, channel, message, now):
+            self._interpret(component, metric, channel, message, now)
 
     def forget(self, ref: str) -> None:
         """Remove a component, also one that was never there; it comes back with its next message."""
         component = self.components.pop(ref, None)
         if component is not None:
-            self._bytes -= component.bytes
+            self._bytes -= sum(len(bytes(value.raw)) for value in component.values.values())
         self.on_forget(ref)
         for key in [key for key in self._server if key[0] == ref]:
             del self._server[key]
@@ -261,7 +245,7 @@ class Robots:
             age_s = now - component.refreshed_at
             if component.robot.online(now) is not component.sent_online or age_s == float("inf"):
                 self._refresh(component, now)
-            elif age_s >= _REFRESH_S and (component.live or component.sent_online is not None):
+            elif age_s >= _REFRESH_S and (component.robot.live or component.sent_online is not None):
                 if component.ref in opened:
                     self._refresh(component, now)
                 elif age_s >= every_s:
@@ -272,7 +256,7 @@ class Robots:
 
     def _refresh(self, component: Component, now: float) -> None:
         component.sent_online, component.refreshed_at = component.robot.online(now), now
-        self.set_server_metric(component.ref, "web/liveness", component.view(now))
+        self.set_server_metric(component.ref, "web/liveness", liveness_of(component.robot, now))
         if c.ONLINE.metric in component.values:
             self._mark(component.ref, c.ONLINE.metric)
 
@@ -291,14 +275,12 @@ class Robots:
         return component
 
     def _has_room(self, component: Component, metric: str, channel: c.Channel, grows: int) -> bool:
+        if component.lists(metric):
+            return True
         is_new = metric not in component.values
-        if is_new and len(component.values) >= MAX_METRICS and channel.is_pattern and not component.lists(metric):
+        if is_new and len(component.values) >= MAX_METRICS and channel.is_pattern:
             return False
-        return (
-            component.bytes + grows <= RESERVED_BYTES
-            or self._bytes + grows <= MAX_BYTES - MAX_COMPONENTS * RESERVED_BYTES
-            or self.is_kept(component.ref)
-        )
+        return self._bytes + grows <= MAX_BYTES or self.is_kept(component.ref)
 
     def _store(self, component: Component, metric: str, channel: c.Channel, message: Message, now: float) -> bool:
         """Check and store the value; False if it is refused."""
@@ -314,52 +296,31 @@ class Robots:
         except PayloadError:
             return False
         self._bytes += grows
-        component.bytes += grows
         component.values[metric] = _Value(msgspec.Raw(message.payload), now)
         if channel is not c.ONLINE:
             self._mark(component.ref, metric)
         return True
 
-    def _remove_value(self, component: Component, metric: str, message: Message, now: float) -> None:
+    def _remove_value(self, component: Component, metric: str) -> None:
         """An empty message removes what was retained."""
         old = component.values.pop(metric, None)
         if old is not None:
             self._bytes -= len(bytes(old.raw))
-            component.bytes -= len(bytes(old.raw))
             self._mark(component.ref, metric)
         component.aliases.pop(metric, None)
-        component.robot.remembered.pop(message.topic, None)
-        component.robot.receive_stop(None, message, now)
-        component.robot.control.receive(message)
-        if metric == c.LINK.metric:
-            component.robot.receive(c.LINK, message, now, 0.0)
 
     def _interpret(self, component: Component, metric: str, channel: c.Channel, message: Message, now: float) -> None:
-        robot = component.robot
-        if channel in (c.CAPABILITIES, c.ESTOP_STATE, c.ONLINE):
-            robot.remembered[message.topic] = message  # the table of values bounds how many
-        if channel in (c.CAPABILITIES, c.ESTOP_STATE):
-            before = robot.capabilities
-            robot.receive_stop(channel, message, now)
-            robot.capabilities = robot.capabilities or before  # empty ones take nothing away
-        elif channel in (c.CONTROL_STATE, c.LINK):
-            robot.receive(channel, message, now, 0.0)
-        elif channel is c.MCU_DESCRIBE:
+        robot, before = component.robot, component.robot.capabilities
+        robot.receive(channel, message, now, time.time() - (time.monotonic() - now))
+        if channel is c.MCU_DESCRIBE and message.payload:
             component.aliases[metric] = _aliases(message.payload)
-        elif channel is c.ONLINE or channel in SYNONYMS:
-            self._announce(component, message, now)
-            arrived = time.time() - (time.monotonic() - now)
-            if component.take_heartbeat(message, now, arrived) and component.sent_online is not False:
-                self._refresh(component, now)  # it may be back before the next round
-        elif channel is c.STATUS:
-            self._announce(component, message, now)
-
-    def _announce(self, component: Component, message: Message, now: float) -> None:
-        """Pages get what it announces as its capabilities, until it publishes them."""
-        if component.robot.announce(message.payload):
-            payload = msgspec.json.encode({"t": int(1000 * time.time()), "value": component.robot.capabilities})
-            made = Message(c.CAPABILITIES.topic(component.ref), payload)
-            self._store(component, c.CAPABILITIES.metric, c.CAPABILITIES, made, now)
+        if robot.capabilities is not before and "announced" in robot.capabilities:
+            # Pages get what it announces as its capabilities, until it publishes them.
+            payload = msgspec.json.encode({"t": int(1000 * time.time()), "value": robot.capabilities})
+            announced = Message(c.CAPABILITIES.topic(component.ref), payload)
+            self._store(component, c.CAPABILITIES.metric, c.CAPABILITIES, announced, now)
+        if robot.liveness.reported_offline and component.sent_online is not False:
+            self._refresh(component, now)  # it may be back before the next round
 
     def _log(self, component: Component, message: Message) -> None:
         lines = self.logs.get(component.ref)

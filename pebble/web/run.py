@@ -15,7 +15,7 @@ import msgspec
 from pebble.client.page import WebSettings, has_login, people_of, require_packages, settings_of
 from pebble.config import Config, config_of_process
 from pebble.errors import ConfigError, PebbleError
-from pebble.fleet.people import People
+from pebble.fleet.people import has_user
 from pebble.runtime.parent import ALIVE_PERIOD_S, Notifier, set_log_level, set_up_logging
 from pebble.runtime.process import exit_at_the_latest
 
@@ -81,17 +81,12 @@ def _decoded(fields: str) -> WebSettings:
 
 def _without_user(config: Config) -> list[str]:
     """The problem that a login is needed and there is no user; empty if all is well."""
-    if not has_login(config.web_interface):
+    file = people_of(config)
+    if not has_login(config.web_interface) or has_user(file):
         return []
-    people = People(people_of(config))
-    try:
-        if people.list():
-            return []
-    finally:
-        people.close()
     return [
-        f"web_interface.people: {people_of(config)} has no user: run "
-        f"`pebble web user add NAME --people {people_of(config)}` as the user who runs the robot"
+        f"web_interface.people: {file} has no user: run `pebble web user add NAME --people {file}` as the user who "
+        "runs the robot"
     ]
 
 

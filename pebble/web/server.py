@@ -29,7 +29,6 @@ from pebble.transports.clock import since_boot as clock
 from pebble.web import messages as m
 from pebble.web.drive.drivers import Drivers
 from pebble.web.media.chosen_sources import ChosenSources
-from pebble.web.media.connection import MediaConnection
 from pebble.web.media.pictures import MediaHub
 from pebble.web.media.sound import SoundHub
 from pebble.web.open_components import OpenComponents
@@ -56,10 +55,10 @@ class Server:
         )
         self.robots, self.stops = Robots(), Stops(self._has_sent)
         self.drivers = Drivers(self.broker, self.robots)
-        self.media = MediaConnection(Broker(settings.broker, "pebble-web-media"))
+        self.media = Broker(settings.broker, "pebble-web-media")  # what it carries holds up no command
         self.pictures = MediaHub(self.media, self.robots)
         self.sound = SoundHub(self.media, self.robots, self._note_talk)
-        for broker in (self.broker, self.stop_broker, self.media.broker):
+        for broker in (self.broker, self.stop_broker, self.media):
             broker.is_named = self._is_named
         self._heartbeats: Heartbeats | None = None  # while a stop of all goes to further robots
         self.open_components = OpenComponents(self.broker, self.robots, self.spawn)
@@ -69,12 +68,12 @@ class Server:
         self.robots.is_kept = lambda ref: self._is_wanted(ref) or self.stops.sends_to(ref)
         self.robots.on_forget = self._ask_anew
         self._of_all: list[Subscription] = []
-        self.people_version = (0, 0, 0)
+        self.people_version = (0, 0)
         self._tasks: set[asyncio.Task[None]] = set()
 
     async def open(self) -> None:
         """Connect to the broker and subscribe. Raises TransportError for settings that can never work."""
-        await asyncio.gather(self.broker.open(), self.stop_broker.open())
+        await asyncio.gather(self.broker.open(), self.stop_broker.open(), self.media.open())
         self.broker.on_state(self._show_broker)
         self.broker.on_state(self.drivers.renew_keys)
         self._show_broker()

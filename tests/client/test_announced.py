@@ -57,5 +57,5 @@ def test_it_is_driven_until_it_publishes_capabilities(channel: c.Channel, key: s
     assert not robot.estop.has_capabilities
     capable = Message(c.CAPABILITIES.topic(BASE), payload(value={"drive": {"available": False}}))
     robot.receive(c.CAPABILITIES, capable, now=1.1, wall=1710969600.1)
-    assert not robot.announce(made)
+    robot.receive(channel, Message(channel.topic(BASE), made), now=1.2, wall=1710969600.2)
     assert not robot.drives

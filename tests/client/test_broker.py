@@ -10,9 +10,7 @@ from contextlib import asynccontextmanager
 
 import pytest
 
-from pebble.client import arrived
-from pebble.client.arrived import Arrived
-from pebble.client.broker import Broker
+from pebble.client.broker import MAX_BYTES, MAX_MESSAGES, Arrived, Broker, Handler
 from pebble.transports import Message, QoS
 from pebble.transports.memory import MemoryHub, MemoryTransport
 from tests.web.media.robots import broker_on, until
@@ -26,38 +24,29 @@ def ignore(_message: Message, _at: float) -> None:
     pass
 
 
-def test_messages_stay_in_order_whatever_is_deferred() -> None:
+def test_messages_stay_in_order_and_are_bounded(caplog: pytest.LogCaptureFixture) -> None:
     waiting = Arrived()
-    for number in range(6):
-        assert waiting.put(ignore, message(str(number)), float(number), deferred=number % 2 == 0)
-    taken = [waiting.get() for _ in range(7)]
-    assert [(one[1].topic, one[2]) for one in taken if one] == [(str(number), number) for number in range(6)]
-    assert taken[6] is None
-
-
-def test_deferred_messages_leave_room_for_the_others(caplog: pytest.LogCaptureFixture) -> None:
-    waiting = Arrived()
-    flood = [waiting.put(ignore, message("beat"), 0.0, deferred=True) for _ in range(arrived.MAX_MESSAGES)]
-    assert sum(flood) == arrived.MAX_DEFERRED
-    others = [waiting.put(ignore, message("state"), 0.0) for _ in range(arrived.MAX_MESSAGES)]
-    assert sum(others) == arrived.MAX_MESSAGES - arrived.MAX_DEFERRED
-    assert waiting.dropped == arrived.MAX_MESSAGES
-    assert 0 < len(caplog.records) < 20
-    assert waiting.get()
-    assert waiting.put(ignore, message("state"), 0.0)
+    for number in range(MAX_MESSAGES + 100):
+        waiting.put(ignore, message(str(number)), float(number))
+    assert waiting.dropped == 100
+    assert 0 < len(caplog.records) < 10
+    taken = [waiting.get() for _ in range(MAX_MESSAGES + 1)]
+    assert [(one[1].topic, one[2]) for one in taken if one] == [(str(number), number) for number in range(MAX_MESSAGES)]
+    assert taken[-1] is None
 
 
 def test_bytes_are_bounded_and_given_back() -> None:
-    waiting, half = Arrived(), arrived.MAX_BYTES // 2
-    assert waiting.put(ignore, message("a", half), 0.0)
-    assert waiting.put(ignore, message("b", half), 0.0)
-    assert not waiting.put(ignore, message("c"), 0.0)
+    waiting, half = Arrived(), MAX_BYTES // 2
+    for topic, size in (("a", half), ("b", half), ("c", 1)):
+        waiting.put(ignore, message(topic, size), 0.0)
+    assert waiting.dropped == 1
     assert waiting.get()
-    assert waiting.put(ignore, message("c"), 0.0)
+    waiting.put(ignore, message("c"), 0.0)
+    assert waiting.dropped == 1
 
 
 @asynccontextmanager
-async def receiving(handler: arrived.Handler) -> AsyncIterator[tuple[Broker, MemoryTransport]]:
+async def receiving(handler: Handler) -> AsyncIterator[tuple[Broker, MemoryTransport]]:
     """A connection that receives everything, and another one that publishes."""
     hub = MemoryHub()
     broker = broker_on(hub)

@@ -36,7 +36,8 @@ class World:
     def client(self, by: str = "ann") -> ControlClient:
         view = RobotView(GOOB)
         owners = [one.name for one in self.robot.owners]
-        view.receive_stop(CAPABILITIES, capabilities(GOOB, {"estop": {"available": True, "owners": owners}}), self.now)
+        listed = capabilities(GOOB, {"estop": {"available": True, "owners": owners}})
+        view.receive(CAPABILITIES, listed, self.now, self.now)
         client = ControlClient(view.control, by=by, device="desk", pace_of=lambda: self.pace)
         self.clients.append(client)
         self.receive(self.robot.states())

@@ -11,7 +11,7 @@ import pytest
 from pebble import contract as c
 from pebble.client.discovery import Discovery
 from pebble.client.robot_view import MAX_REMEMBERED, RobotView
-from pebble.contract import LINK
+from pebble.contract import CAPABILITIES, ESTOP_STATE, LINK
 from pebble.transports import Message
 from tests.recordings.demo_robots import DRIVE, GOOB, MINILAMP, ROBOTS, messages, received, values
 from tests.support import ROOT
@@ -91,12 +91,12 @@ def test_what_heartbeats_show(row: dict[str, Any]) -> None:
 def test_strangers_fill_no_memory_and_keep_no_capabilities_out() -> None:
     seen = RobotView(BASE)
     known = Message(f"{BASE}/outgoing/estop/serial", b"1")
-    capabilities = Message(f"{BASE}/outgoing/capabilities", b"2")
-    for message in [known, *(Message(f"{BASE}/outgoing/estop/{n}", b"") for n in range(100)), capabilities]:
-        seen.remember(message)
+    for message in [known, *(Message(f"{BASE}/outgoing/estop/{n}", b"0") for n in range(100))]:
+        seen.receive(ESTOP_STATE, message, 0.0, 0.0)
+    capabilities, newer = Message(f"{BASE}/outgoing/capabilities", b"2"), Message(known.topic, b"3")
+    seen.receive(CAPABILITIES, capabilities, 0.0, 0.0)
     assert len(seen.remembered) == MAX_REMEMBERED + 1
-    newer = Message(known.topic, b"3")
-    seen.remember(newer)
+    seen.receive(ESTOP_STATE, newer, 0.0, 0.0)
     assert (seen.remembered[known.topic], seen.remembered[capabilities.topic]) == (newer, capabilities)
 
 

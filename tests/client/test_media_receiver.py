@@ -20,7 +20,8 @@ def test_every_recorded_picture_and_sound_is_received(recording: Plays) -> None:
         receiver.on_picture = pictures.append  # type: ignore[method-assign]
         receiver.on_sound = sounds.append  # type: ignore[method-assign]
         receiver.wait_for_capabilities(5)
-        receiver.request(None, sound=True)
+        receiver.request("video")
+        receiver.request("audio")
         recording(MEDIA, hub)
         sent = recorded(MEDIA, f"{FRED}/outgoing/front-camera"), recorded(MEDIA, f"{FRED}/outgoing/audio")
         assert until(lambda: (len(pictures), len(sounds)) == (len(sent[0]), len(sent[1])))

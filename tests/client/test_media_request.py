@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 import asyncio
-import threading
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
-from typing import Any
 
 import pytest
 
 from pebble.client.broker import Broker
-from pebble.client.media_request import request as module
-from pebble.client.media_request.request import MediaRequest
-from tests.web.media.robots import CAMERA, REF, VIDEO, PictureRobot, broker_on, status_of, until
+from pebble.client.media_request import shared
+from pebble.client.media_request.shared import SharedRequest
+from pebble.client.robot_view import RobotView
+from pebble.contract import STATUS
+from pebble.transports import Message
+from tests.web.media.robots import REF, VIDEO, PictureRobot, broker_on, status_of, until
 
 pytestmark = pytest.mark.anyio
 
@@ -32,23 +33,16 @@ class Requested:
         self.broker = broker_on(self.robot.hub)
         self.received: list[bytes] = []
         self.steps = 0
-        self.request = MediaRequest(self.broker, REF, "video", self.received.append)
-        self.taken = threading.Event()  # the request has handled one more picture, in a thread of its subscription
-        subscribe = self.broker.transport.subscribe
+        self.view = RobotView(REF)
+        self.view.capabilities = {"video": VIDEO}
+        self.request = SharedRequest(self.broker, REF, "video", self.received.append)
 
-        def noted(filter_: str, handler: Callable[..., None], **options: Any) -> Any:
-            def handle(*message: Any) -> None:
-                handler(*message)
-                if filter_ == CAMERA:
-                    self.taken.set()
-
-            return subscribe(filter_, handle, **options)
-
-        self.broker.transport.subscribe = noted  # type: ignore[method-assign]
+    def status(self, camera: str) -> None:
+        self.view.receive(STATUS, Message(STATUS.topic(REF), status_of(camera)), 0.0, 0.0)
 
     async def step(self) -> None:
         self.steps += 1
-        await self.request.follow({"video": VIDEO}, lambda: "json")
+        await self.request.follow(self.view, "json")
 
     @asynccontextmanager
     async def running(self) -> AsyncIterator[None]:
@@ -65,22 +59,8 @@ class Requested:
             self.robot.close()
 
 
-@pytest.mark.parametrize(("count", "size", "most"), [(2100, 1, 2000), (20, 1 << 20, 16)])
-async def test_what_arrives_while_the_event_loop_is_late_is_bounded(count: int, size: int, most: int) -> None:
-    one = Requested()
-    async with one.running():
-        for _ in range(count):
-            one.robot.send(bytes(size))
-            assert one.taken.wait(10), "the loop takes nothing meanwhile"
-            one.taken.clear()
-        await until(lambda: len(one.received) >= most)
-        one.robot.send(b"later")
-        await until(lambda: one.received[-1:] == [b"later"])
-        assert len(one.received) == most + 1
-
-
 async def test_it_is_withdrawn_once_there_is_a_broker_again(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(module, "LINGER_S", 0.0)
+    monkeypatch.setattr(shared, "LINGER_S", 0.0)
     there = [True]
     monkeypatch.setattr(Broker, "connected", property(lambda _: there[0]))
     one = Requested()
@@ -96,18 +76,19 @@ async def test_it_is_withdrawn_once_there_is_a_broker_again(monkeypatch: pytest.
 
 async def test_nothing_is_asked_of_a_robot_that_waits() -> None:
     one = Requested()
-    one.request.take_status(status_of("held"))
-    assert one.request.waits == "Pictures wait for driving"
+    one.status("held")
     await one.broker.open()
     one.request.want(True)
     for _ in range(3):
         await one.step()
     await one.request.request_keyframe("json")
+    assert one.request.waits == "Pictures wait for driving"
     assert one.robot.published == []
-    one.request.take_status(status_of("running"))
+    one.status("running")
     await one.step()
     await until(lambda: one.robot.encodings == ["json"])
-    one.request.take_status(status_of("held"))
+    one.status("held")
+    await one.step()
     await one.request.request_keyframe("json")
     one.request.close()
     await one.request.run(one.step)

@@ -8,7 +8,7 @@ from msgspec import UNSET
 
 from pebble.client.pace_of_link import WIDE, Pace, pace_of
 from pebble.client.robot_view import RobotView
-from pebble.contract import LINK
+from pebble.contract import LINK, ONLINE
 from pebble.contract.levels import link_of
 from pebble.contract.payloads import Drive, LinkLevel, LinkState
 from pebble.transports import QoS
@@ -73,7 +73,7 @@ def test_who_drives_keeps_to_the_pace_of_a_link_that_is_lost_for_a_while() -> No
     robot.receive(LINK, outgoing(GOOB, "link", msgspec.to_builtins(link("thin", 4)), retain=True), 1.0, 1.0)
     assert robot.pace.valid_ms == 750
     for online in (False, True):
-        robot.heartbeat(outgoing(GOOB, "online", {"t": 1, "online": online}), 2.0, 2.0)
+        robot.receive(ONLINE, outgoing(GOOB, "online", {"t": 1, "online": online}), 2.0, 2.0)
         assert robot.pace.valid_ms == 750
     robot.receive(LINK, outgoing(GOOB, "link", 7), 3.0, 3.0)
     assert robot.pace is WIDE

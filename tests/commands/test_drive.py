@@ -397,7 +397,7 @@ def test_a_broker_that_is_gone_and_comes_back(drive: Drive, lamp: Lamp, broker: 
 
 def test_without_a_terminal_there_is_one_line(run: Run) -> None:
     assert run("drive", "minilamp", "--url", "mqtt://127.0.0.1") == 1
-    assert run.err.startswith("pebble: driving by keys needs a terminal; ")
+    assert run.err.startswith("pebble: driving by keys needs a terminal of Linux or macOS: use `pebble web`, ")
     assert run.err.count("\n") == 1
 
 

@@ -2,9 +2,9 @@
 
 import pytest
 
-from pebble.client.media_request import request
+from pebble.client.media_request import shared
 
 
 @pytest.fixture(autouse=True)
 def _short_linger(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(request, "LINGER_S", 0.4)
+    monkeypatch.setattr(shared, "LINGER_S", 0.4)

@@ -8,6 +8,7 @@ import sys
 import numpy as np
 import pytest
 
+from pebble.client.robot_view import RobotView
 from pebble.contract import CAPABILITIES, STATUS, codec
 from pebble.contract.packets import PBAT
 from pebble.contract.payloads import Capabilities
@@ -21,6 +22,9 @@ from pebble.recordings.exports.foxglove_messages import Schemas
 from pebble.transports import Message
 from pebble.transports.memory import MemoryHub
 from tests.web.media.robots import AUDIO, REF, VIDEO, PictureRobot, broker_on, status_of, until
+
+ROBOT = RobotView(REF)
+ROBOT.capabilities = {"video": VIDEO, "audio": AUDIO}
 
 
 @pytest.fixture
@@ -41,7 +45,7 @@ def pictures(count: int, keyframe_interval: int = 10) -> list[bytes]:
 async def _feed(medium: str, payloads: list[bytes]) -> MediaFeed:
     """Payloads that come while the conversion does not get on."""
     broker = broker_on(MemoryHub())
-    feed = MediaFeed(broker, Server("test", lambda _topic, _on: None), Schemas(), REF, medium)  # type: ignore[arg-type]
+    feed = MediaFeed(broker, Server("test", lambda _topic, _on: None), Schemas(), ROBOT, medium)  # type: ignore[arg-type]
     for payload in payloads:
         feed.receive(payload)
     return feed
@@ -106,10 +110,9 @@ def test_pictures_that_build_on_a_dropped_one_go_with_it() -> None:
 
 
 def test_without_pyav_nothing_is_requested_that_needs_it(monkeypatch: pytest.MonkeyPatch) -> None:
-    everything = {"video": VIDEO, "audio": AUDIO}
     video, audio = feed("video", []), feed("audio", [])
-    video.update(everything)
-    audio.update(everything)
+    video.update()
+    audio.update()
     assert (video.encoding(), audio.encoding()) == (None, None)
     monkeypatch.setitem(sys.modules, "av", None)
     assert (video.encoding(), audio.encoding()) == ("pbvd", "pcm")

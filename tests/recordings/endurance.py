@@ -17,7 +17,7 @@ from collections import defaultdict
 from pathlib import Path
 
 from pebble.bench.usage import cpu_s
-from pebble.client.viewer import Viewer
+from pebble.client.media_receiver import MediaReceiver
 from pebble.contract import DRIVE, codec
 from pebble.contract.payloads import Drive
 from pebble.errors import PebbleError
@@ -51,7 +51,7 @@ class Operator:
 
     def __init__(self, port: int, bases: list[str]) -> None:
         self._transport, self._bases = _client(port, "operator"), bases
-        self._viewers = [Viewer(self._transport, base, lambda _medium, _payload: None) for base in bases]
+        self._viewers = [MediaReceiver(self._transport, base) for base in bases]
         self._encodings = itertools.cycle(ENCODINGS)
         self._changed_at = float("-inf")
         self._began = time.monotonic()
@@ -62,7 +62,7 @@ class Operator:
             self._changed_at = now
             self._watch(next(self._encodings))
         for viewer in self._viewers:
-            viewer.repeat_requests()
+            viewer.poll()
         if int((now - self._began) / _DRIVE_S) % 2 == 0:
             for base in self._bases:
                 self._transport.publish(DRIVE.topic(base), codec.encode(DRIVE, Drive(x=0.0, z=0.4)), urgent=True)

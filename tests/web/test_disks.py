@@ -42,29 +42,11 @@ def _moved(disk: SmallDisk) -> Iterator[None]:
         (away / file.name).rename(file)
 
 
-@contextmanager
-def _damaged(disk: SmallDisk) -> Iterator[None]:
-    with _moved(disk):
-        (disk.root / "people.sqlite").write_bytes(b"no database, but long enough to be read as one" * 100)
-        yield
-
-
-@contextmanager
-def _unreadable(disk: SmallDisk) -> Iterator[None]:
-    """A folder is in its place."""
-    with _moved(disk):
-        (disk.root / "people.sqlite").mkdir()
-        yield
-        (disk.root / "people.sqlite").rmdir()
-
-
 #: What happens to the disk, how a login is answered meanwhile, and what the log says.
 FAULTS: dict[str, tuple[Fault, int, str]] = {
     "full": (SmallDisk.full, 503, "people.sqlite: database or disk is full: nobody can log in"),
-    "unmounted": (_hidden, 200, "people.sqlite was removed: put it back"),
-    "removed": (_moved, 200, "people.sqlite was removed: put it back"),
-    "damaged": (_damaged, 503, "people.sqlite: file is not a database: nobody can log in"),
-    "a folder": (_unreadable, 503, "people.sqlite: Is a directory: nobody can log in"),
+    "unmounted": (_hidden, 200, "people.sqlite was removed or replaced: put it back"),
+    "removed": (_moved, 200, "people.sqlite was removed or replaced: put it back"),
 }
 
 

@@ -1,7 +1,5 @@
 """The messages between page and server, and what is generated from them."""
 
-from typing import get_args
-
 import msgspec
 
 from pebble.client import drive_reasons
@@ -14,12 +12,8 @@ def test_the_declarations_are_current():
     assert messages_docs.DECLARATIONS.read_text() == messages_docs.declarations()
 
 
-def test_the_tables_have_each_message_and_each_word(tmp_path):
+def test_the_table_has_each_word(tmp_path):
     messages_docs.main([str(tmp_path)])
-    text = (tmp_path / "web-messages.md").read_text()
-    tags = [f"### `{struct.__struct_config__.tag}`" for name in ("FromPage", "ToPage", "FromReplay")
-            for struct in get_args(getattr(messages, name))]  # fmt: skip
-    assert [tag for tag in [*tags, "### TalkAnswer"] if tag not in text] == []
     words = (tmp_path / "words.md").read_text()
     assert [code for code in drive_reasons.WORDS if f"| `{code}` |" not in words] == []
 

@@ -11,7 +11,7 @@ from pebble.checks.running.robot import RobotUnderTest
 from pebble.client.estop import StopSender, new_name, send
 from pebble.client.estop_states import Reset
 from pebble.client.media_receiver import MediaReceiver
-from pebble.client.viewer import Medium
+from pebble.client.media_request.offer import Medium
 from pebble.contract import ESTOP_RESET, ESTOP_STATE, codec
 from pebble.contract.payloads import EstopReset
 from pebble.errors import PebbleError
@@ -46,7 +46,7 @@ def received(robot: RobotUnderTest, medium: Medium, device: str) -> CheckResult:
     try:
         receiver.wait_for_capabilities(robot.patience_s)
         began = time.monotonic()
-        receiver.viewer.request(medium)
+        receiver.request(medium)
         if not robot.wait(arrived, robot.patience_s):
             return failed(f"none came from the {device} within {robot.patience_s:g} s", _LOG)
         took_s = time.monotonic() - began

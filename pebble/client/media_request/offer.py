@@ -1,16 +1,21 @@
 """What of a robot's pictures and sound may be requested, by its capabilities. Pure."""
 
-from typing import Any, Final, NamedTuple
+from collections.abc import Collection, Sequence
+from typing import Any, Final, Literal, NamedTuple
 
 from pebble.client.robot_topics import PLACES, names
-from pebble.client.viewer import Medium
 from pebble.contract import AUDIO, AUDIO_CONTROL, CAMERA, MQTT_AUDIO, MQTT_VIDEO, VIDEO_CONTROL, Channel
+
+Medium = Literal["video", "audio"]
 
 #: The channels of a medium, for which capabilities may name topics.
 CHANNELS: Final[dict[Medium, tuple[Channel, ...]]] = {
     "video": (CAMERA, VIDEO_CONTROL, MQTT_VIDEO),
     "audio": (AUDIO, AUDIO_CONTROL, MQTT_AUDIO),
 }
+
+
+BEST_FIRST: Final[dict[Medium, tuple[str, ...]]] = {"video": ("h264", "pbvd", "json"), "audio": ("opus", "pcm")}
 
 
 class Words(NamedTuple):
@@ -51,3 +56,9 @@ def refusal(ref: str, capabilities: dict[str, Any], medium: Medium) -> str:
         if section.get(key) is not None and not names(ref, section[key], channel):
             return f"its capabilities name a topic for {words.name} that is not its own ({key})"
     return ""
+
+
+def best(medium: Medium, encodings: Collection[str], viewers: Sequence[frozenset[str]]) -> str | None:
+    """Return the best of what most viewers can show or play; None: whatever the robot sends, as it lists none."""
+    known = [encoding for encoding in BEST_FIRST[medium] if encoding in encodings]
+    return max(known, key=lambda encoding: sum(encoding in can for can in viewers), default=None)

@@ -25,8 +25,7 @@ NO_FRAME: Final = 0xFFFF_FFFF  # the number in an acknowledgement of no frame
 _FRESH_FRAMES: Final = 2  # with no more than these in the queue, a key frame does not replace them
 _JPEG_PATIENCE_S: Final = 1.0  # JPEG encodings have a key frame each third of a second, unless configured otherwise
 _RESCUE_AFTER_S: Final = 1.5  # of waiting for a key frame of h264
-_FIRST_RETRY_S, _LAST_RETRY_S = 10.0, 160.0  # in the rescue stream, before the robot's own pictures are tried again
-_RECOVERED_S: Final = 60.0
+_RETRY_S: Final = 60.0  # in the rescue stream, before the robot's own pictures are tried again
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,10 +38,16 @@ class Frame:
     keyframe: bool  # needs no picture before it
 
 
-class MediaQueue:
-    """The frames that wait for one page, and those under way."""
+class ViewerQueue:
+    """The frames that wait for one page, and those under way.
 
-    def __init__(self) -> None:
+    They are the robot's own pictures or, if the page cannot use them, those of the rescue stream.
+    """
+
+    def __init__(self, can: frozenset[str], now: float) -> None:
+        self.can = can
+        self.rescued = False
+        self.new = True  # it has received no picture, and no key frame was requested for it
         self.waiting = True  # for a key frame
         self.overflowed = False  # waiting because the page is too slow
         self.window = WINDOW
@@ -51,6 +56,9 @@ class MediaQueue:
         self._late_at = float("-inf")  # the newest of them
         self._queue: deque[Frame] = deque()
         self._under_way: dict[int, tuple[float, Frame]] = {}
+        self._undecodable: set[str] = set()
+        self._waiting_since = now
+        self._retry_at = 0.0
 
     def offer(self, frame: Frame) -> None:
         """Queue a frame, or skip it."""
@@ -133,19 +141,7 @@ class MediaQueue:
     def _queued_bytes(self) -> int:
         return sum(len(frame.data) for frame in self._queue)
 
-
-class ViewerQueue(MediaQueue):
-    """The queue of one page, which gets the robot's own pictures or, if it cannot use them, the rescue stream."""
-
-    def __init__(self, can: frozenset[str], now: float) -> None:
-        super().__init__()
-        self.can = can
-        self.rescued = False
-        self.new = True  # it has received no picture, and no key frame was requested for it
-        self._undecodable: set[str] = set()
-        self._waiting_since = self._direct_since = now
-        self._retry_at = 0.0
-        self._retry_s = _FIRST_RETRY_S
+    # -- the robot's own pictures, or the rescue stream
 
     def decodes(self, encoding: str) -> bool:
         return encoding in self.can and encoding not in self._undecodable
@@ -156,22 +152,17 @@ class ViewerQueue(MediaQueue):
 
     def offer_direct(self, frame: Frame, now: float) -> None:
         """Offer one of the robot's own pictures; a page in the rescue stream returns at a key frame."""
-        if self.rescued and frame.keyframe and now >= self._retry_at:
-            self._retry(frame, now)
         if self.rescued:
-            return
+            if not (frame.keyframe and now >= self._retry_at and self.decodes(frame.encoding)):
+                return
+            self.rescued = False
+            self.forget_lateness(now)
         was_waiting = self.waiting
         self.offer(frame)
         if not self.waiting:
             self.new = False
         elif not was_waiting:
             self._waiting_since = now
-
-    def _retry(self, frame: Frame, now: float) -> None:
-        if self.decodes(frame.encoding):
-            self.rescued = False
-            self._direct_since = now
-            self.forget_lateness(now)
 
     def offer_rescue(self, frame: Frame) -> None:
         """Offer a picture of the rescue stream: only the newest counts."""
@@ -199,9 +190,7 @@ class ViewerQueue(MediaQueue):
     def rescue(self, now: float) -> None:
         """Change to the rescue stream: because the page is slow, for a while; else until the next key frame."""
         if self.overflowed or self.is_thin:
-            self._retry_s = _FIRST_RETRY_S if now - self._direct_since > _RECOVERED_S else self._retry_s
-            self._retry_at = now + self._retry_s
-            self._retry_s = min(_LAST_RETRY_S, 2 * self._retry_s)
+            self._retry_at = now + _RETRY_S
         self.rescued = True
         self.wait_for_keyframe()
         self.overflowed = False

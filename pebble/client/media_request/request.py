@@ -1,172 +1,119 @@
-"""One robot's pictures or sound, requested while they are wanted and a while longer, however many want them."""
+"""The request for a robot's pictures or sound: what it is sent for them, and what is taken back afterwards. Pure."""
 
-import asyncio
-import contextlib
-import logging
-import threading
-import time
-from collections.abc import Awaitable, Callable
+from collections import deque
 from typing import Any, Final
 
-from pebble.client.broker import Broker
-from pebble.client.driveable import is_held
-from pebble.client.media_request.offer import CHANNELS, WORDS, offered, refusal
-from pebble.client.robot_topics import named_topic
-from pebble.client.viewer import Medium, Viewer
-from pebble.errors import PebbleError
+from pebble.client.media_request.offer import CHANNELS, Medium, offered
+from pebble.client.robot_topics import topic_of
+from pebble.contract import codec
+from pebble.contract.payloads import MediaRequest
+from pebble.errors import PayloadError, PebbleError
+from pebble.transports import Message, QoS, Transport
 
-log = logging.getLogger(__name__)
-
-LINGER_S: Final = 5.0  # unwanted, before the request is withdrawn: a page that reloads is back by then
-TICK_S: Final = 0.5
-_PROGRAMS: Final[dict[Medium, str]] = {"video": "camera_publisher", "audio": "audio_publisher"}
-_WAITS: Final[dict[Medium, str]] = {"video": "Pictures wait for driving", "audio": "it waits for driving"}
-_MAX_PENDING, _MAX_PENDING_BYTES = 2000, 16 << 20  # received, and not yet taken by the event loop
+_REPEAT_S: Final = 2.0  # without a payload before a request is repeated
+_FLAG_S: Final = 0.2  # a retained flag arrives within this time of subscribing
+_JOIN_S: Final = 0.4  # a stream that is already running delivers a payload within this time
+_KEYFRAME_S: Final = 1.0
+_SENT: Final = 20
 
 
-class MediaRequest:
-    """The request for one medium of one robot. Only the event loop calls it, its coroutines only in :meth:`run`."""
+class ViewerRequest:
+    """One medium of one robot. Times are seconds of a monotonic clock.
 
-    def __init__(self, broker: Broker, ref: str, medium: Medium, receive: Callable[[bytes], None]) -> None:
-        """``receive`` gets each payload."""
-        self.ref, self.medium = ref, medium
-        self.problem = ""  # why it is not requested
-        self.encoding: str | None = None  # as requested; None: as configured, or nothing is requested
-        self.waits = ""  # why the robot, which knows of it, sends nothing for now: nothing is repeated
-        self.requested_at = float("-inf")
-        self._broker = broker
-        self._inbox = _Inbox(broker, lambda payload: None if self._viewer is None else receive(payload))
-        self._viewer: Viewer | None = None
-        self._topics: list[str | None] = []  # that the capabilities named at the request
-        self._wanted = self._closing = False
-        self._wanted_at = float("-inf")  # the last time
-        self._wakeup = asyncio.Event()
+    Subscribe to ``flag_topic`` and ``media_topic``, pass what arrives to :meth:`receive`, and publish what the other
+    methods return by :func:`send`. What was running before stays, and a flag that another operator lowers stays
+    lowered.
+    """
 
-    def want(self, wanted: bool) -> None:
-        """Say whether anything shows or plays it now."""
-        if wanted or self._wanted:
-            self._wanted_at = time.monotonic()
-        self._wanted = wanted
-        self.wake()
+    def __init__(self, base: str, medium: Medium, capabilities: dict[str, Any]) -> None:
+        self.sent: deque[bytes] = deque(maxlen=_SENT)  # own requests: what else arrives on their topic is from others
+        self.settled = False  # it was sent, or nothing has to be: else call :meth:`tick` often
+        topics = (topic_of(base, capabilities, channel) for channel in CHANNELS[medium])
+        self.media_topic, self.control_topic, self.flag_topic = topics
+        self.section: dict[str, Any] = capabilities.get(medium) or {}  # of the newest capabilities
+        self._base, self._medium = base, medium
+        _, self._control, self._flag = CHANNELS[medium]
+        self._encoding: str | None = None
+        self._is_up: bool | None = None  # the flag; None: not known
+        self._raised = self._requested = False
+        self._began_at = self._sent_at = self._received_at = self._keyframe_at = float("-inf")
 
-    def take_status(self, status: bytes) -> None:
-        """Take what the robot publishes of its programs: it may hold the one that sends this medium."""
-        self.waits = _WAITS[self.medium] if is_held(status, _PROGRAMS[self.medium]) else ""
+    def want(self, encoding: str | None, now: float) -> None:
+        """Want the medium in ``encoding``, or as configured. Raises PebbleError if the robot does not offer it."""
+        if not (self.section.get("available") and self.section.get("controls")):
+            raise PebbleError(f"{self._base} offers no {self._medium}")
+        listed = self._encodings()
+        if encoding is not None and listed and encoding not in listed:
+            raise PebbleError(f"{self._base} cannot send {self._medium} as {encoding}, only as {', '.join(listed)}")
+        self._encoding, self._began_at, self.settled = encoding, now, False
 
-    def wake(self) -> None:
-        """Take the next step soon."""
-        self._wakeup.set()
-
-    def close(self) -> None:
-        """Let :meth:`run` end now."""
-        self._closing = True
-        self.wake()
-
-    async def wait_until_wanted(self) -> None:
-        while not self._wanted:
-            self._wakeup.clear()
-            await self._wakeup.wait()
-
-    async def run(self, step: Callable[[], Awaitable[None]]) -> None:
-        """Await ``step`` twice a second, and soon if it is woken, until nothing has wanted the request for a while.
-
-        At the end, also if it is cancelled, the request is withdrawn.
-        """
+    def receive(self, message: Message, now: float) -> bool:
+        """Take a message of one of its topics; True if it is a payload of the medium."""
+        if message.topic != self.flag_topic:
+            self._received_at = now
+            return True
         try:
-            while not self._closing:
-                if not self._is_over():
-                    began = time.monotonic()
-                    await step()
-                    await self._pause(began)
-                    continue
-                await self._withdraw()
-                if self._is_over():  # else something has come to want it meanwhile
-                    return
-        finally:
-            await self._withdraw()
+            self._is_up = bool(message.payload) and bool(codec.decode(self._flag, message.payload))
+        except PayloadError:  # a malformed flag counts as lowered
+            self._is_up = False
+        self._raised = self._raised and self._is_up  # one that was lowered is another operator's to raise
+        return False
 
-    async def follow(self, capabilities: dict[str, Any], encoding: Callable[[], str | None]) -> None:
-        """Request it if it is wanted, as these capabilities allow it, in ``encoding()``; call it with each step."""
-        self.problem = refusal(self.ref, capabilities, self.medium)
-        if self.problem:
-            await self._withdraw()
-            return
-        chosen = encoding()
-        if not self._wanted or self.waits:
-            return
-        try:
-            await self._follow(capabilities, chosen)
-        except PebbleError as error:
-            self.problem = str(error)
+    def tick(self, now: float) -> list[Message]:
+        """Return what to send now; without a payload the request is repeated."""
+        if self.settled:
+            is_quiet = now - max(self._sent_at, self._received_at) > _REPEAT_S
+            return [self._ask(now)] if is_quiet else []
+        if self._encoding is None and self._received_at > float("-inf"):
+            self.settled, self._sent_at = True, now  # another operator has requested it: change nothing
+            return []
+        waits_s = 0.0 if self._is_up is not None else _FLAG_S
+        if now < self._began_at + (_JOIN_S if self._encoding is None else waits_s):
+            return []
+        self.settled, asked = True, [self._ask(now)]
+        if not self._is_up:
+            self._is_up = self._raised = True
+            asked.insert(0, self._flag_message(up=True))
+        return asked
 
-    async def request_keyframe(self, encoding: str) -> None:
-        """Request a key frame in the encoding that arrives; the viewer lets one pass each second."""
-        if self._viewer is not None and not self.waits:
-            known = encoding if encoding in offered(self._viewer.capabilities, self.medium) else None
-            await asyncio.to_thread(self._viewer.request_keyframe, known)
+    def keyframe(self, encoding: str | None, now: float) -> list[Message]:
+        """Request a full picture in the encoding that arrives, at most once a second."""
+        if now - self._keyframe_at < _KEYFRAME_S:
+            return []
+        self._keyframe_at = now
+        known = encoding if encoding in self._encodings() else None
+        return [self._message(MediaRequest(enabled=True, encoding=known, keyframe=True))]
 
-    async def _follow(self, capabilities: dict[str, Any], encoding: str | None) -> None:
-        topics = [named_topic(self.ref, capabilities, channel) for channel in CHANNELS[self.medium]]
-        viewer = self._viewer
-        if viewer is None or topics != self._topics:
-            await self._withdraw()
-            viewer = Viewer(self._broker.transport, self.ref, lambda _, payload: self._inbox.put(payload), capabilities)
-            self._viewer, self._topics = viewer, topics
-        elif encoding == self.encoding:
-            viewer.capabilities = capabilities
-            await asyncio.to_thread(viewer.repeat_requests)
-            return
-        viewer.capabilities = capabilities
-        self.encoding, self.requested_at = encoding, time.monotonic()
-        try:
-            await asyncio.to_thread(viewer.request, self.medium, encoding)
-        except PebbleError:
-            await self._withdraw()
-            raise
+    def leave(self) -> None:
+        """Leave the medium to another operator, who has requested it, too."""
+        self._requested = self._raised = False
 
-    async def _withdraw(self) -> None:
-        viewer, self._viewer = self._viewer, None
-        self.encoding, self.requested_at = None, float("-inf")
-        if viewer is not None:
-            try:
-                await asyncio.to_thread(viewer.close)
-            except PebbleError as error:
-                log.warning("the %s of %s: %s", WORDS[self.medium].name, self.ref, error)
+    def end(self) -> list[Message]:
+        """Withdraw the request, and lower the flag that was down before."""
+        messages = [self._message(MediaRequest(enabled=False))] if self._requested else []
+        messages += [self._flag_message(up=False)] if self._raised else []
+        self.leave()
+        return messages
 
-    def _is_over(self) -> bool:
-        """A request is not withdrawn while there is no broker: the robot would go on sending afterwards."""
-        idle = not self._wanted and time.monotonic() - self._wanted_at >= LINGER_S
-        return idle and (self._broker.connected or self._viewer is None)
+    def _encodings(self) -> tuple[str, ...]:
+        return offered({self._medium: self.section}, self._medium)
 
-    async def _pause(self, began: float) -> None:
-        """A step that is needed earlier comes a tenth of a second after the last one."""
-        await asyncio.sleep(max(0.0, began + TICK_S / 5 - time.monotonic()))
-        with contextlib.suppress(TimeoutError):  # wait_for of Python 3.11 loses a cancellation that meets a wakeup
-            async with asyncio.timeout(max(0.001, began + TICK_S - time.monotonic())):
-                await self._wakeup.wait()
-        self._wakeup.clear()
+    def _ask(self, now: float) -> Message:
+        self._sent_at, self._requested = now, True
+        return self._message(MediaRequest(enabled=True, encoding=self._encoding))
+
+    def _message(self, request: MediaRequest) -> Message:
+        payload = codec.encode(self._control, request)
+        self.sent.append(payload)
+        return Message(self.control_topic, payload, QoS.DELIVERED)
+
+    def _flag_message(self, *, up: bool) -> Message:
+        return Message(self.flag_topic, codec.encode(self._flag, up), QoS.DELIVERED, retain=True)
 
 
-class _Inbox:
-    """Payloads on their way from a thread of the transport to the event loop."""
-
-    def __init__(self, broker: Broker, receive: Callable[[bytes], None]) -> None:
-        self._broker, self._receive = broker, receive
-        self._pending = self._pending_bytes = 0
-        self._lock = threading.Lock()  # guards these two
-
-    def put(self, payload: bytes) -> None:
-        size = len(payload)
-        with self._lock:
-            if self._pending >= _MAX_PENDING or self._pending_bytes + size > _MAX_PENDING_BYTES:
-                return  # the event loop is far behind; what is missing is noticed by the numbers
-            self._pending += 1
-            self._pending_bytes += size
-        with contextlib.suppress(RuntimeError):  # the loop has ended
-            self._broker.loop.call_soon_threadsafe(self._take, payload)
-
-    def _take(self, payload: bytes) -> None:
-        with self._lock:
-            self._pending -= 1
-            self._pending_bytes -= len(payload)
-        self._receive(payload)
+def send(transport: Transport, messages: list[Message]) -> None:
+    """Publish what a request returns. Raises TransportError."""
+    for message in messages:
+        transport.publish(
+            message.topic, message.payload, qos=message.qos, retain=message.retain, shared=message.retain, urgent=True
+        )

@@ -6,36 +6,33 @@ import shutil
 import signal
 import sys
 import threading
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from types import FrameType
-from typing import Any, TextIO
+from typing import Any
 
-from pebble.errors import PebbleError
+from pebble.client.terminal.key_decoder import END, KeyDecoder
+from pebble.config.visible import shown
 from pebble.runtime.signals import handled_by
 
 _READ = 4096
-_HIDE_CURSOR, _SHOW_CURSOR, _ERASE_REST = b"\x1b[?25l", b"\x1b[?25h", b"\x1b[K"
+_SHOW_PERIOD_S = 0.1
+_HIDE_CURSOR, _SHOW_CURSOR, _ERASE_REST = "\x1b[?25l", "\x1b[?25h", "\x1b[K"
 
 
 class Terminal:
-    """Standard input as keys, and one status line below the shell's lines; see :func:`opened`.
+    """Standard input as keys, and one status line below the shell's lines; see :func:`opened`."""
 
-    ``ended`` says why it is over: a signal, or a terminal that is gone. ``suspended`` is set by Ctrl-Z.
-    """
-
-    def __init__(self, keys: TextIO) -> None:
+    def __init__(self) -> None:
         import termios
 
-        self.ended = ""
-        self.suspended = self._continued = False
-        self._termios = termios
-        self._fd = keys.fileno()
+        self.ended = ""  # why it is over: a signal, Ctrl-D, or a terminal that is gone
+        self._suspended = self._continued = False  # by Ctrl-Z, and after it
+        self._termios, self._fd = termios, sys.stdin.fileno()
         self._before: list[Any] = termios.tcgetattr(self._fd)
-        self._out = _output()
-        self._wakeup, self._waker = os.pipe()
-        os.set_blocking(self._wakeup, False)
-        os.set_blocking(self._waker, False)
+        self._decoder = KeyDecoder()
+        self._line, self._shown_at = "", float("-inf")
 
     def start(self) -> None:
         """Turn off echo and lines; Ctrl-C and Ctrl-Z stay signals, and Ctrl-S holds nothing back."""
@@ -45,103 +42,86 @@ class Terminal:
         mode = self._termios.tcgetattr(self._fd)
         mode[0] &= ~self._termios.IXON
         self._termios.tcsetattr(self._fd, self._termios.TCSANOW, mode)
-        self._write(_HIDE_CURSOR)
+        _write(_HIDE_CURSOR)
 
     def restore(self) -> None:
         """Restores the terminal; keys that were not read are forgotten, so that no shell gets them."""
-        self._write(b"\r\n" + _SHOW_CURSOR)
+        _write("\r\n" + _SHOW_CURSOR)
         with suppress(self._termios.error, OSError):
             self._termios.tcsetattr(self._fd, self._termios.TCSAFLUSH, self._before)
 
-    def close(self) -> None:
-        for descriptor in (self._out, self._wakeup, self._waker):
-            os.close(descriptor)
-
-    def read(self, timeout: float) -> bytes:
-        """What was typed; waits up to ``timeout`` seconds for something, or for a signal."""
+    def keys(self, seconds: float) -> list[str]:
+        """Wait up to ``seconds`` for keys."""
         if self._continued:  # a shell may have changed the mode of the terminal meanwhile
             self._continued = False
             self.start()
+        data, is_gone, due = b"", False, self._decoder.due
+        wait_s = seconds if due is None else min(seconds, due - time.monotonic())
         try:
-            ready = select.select([self._fd, self._wakeup], [], [], max(0.0, timeout))[0]
-            if self._wakeup in ready:
-                with suppress(BlockingIOError):
-                    os.read(self._wakeup, _READ)
-            if self._fd not in ready or self.ended or self.suspended:
-                return b""
-            data = os.read(self._fd, _READ)
+            is_ready = bool(select.select([self._fd], [], [], max(0.0, wait_s))[0])
+            if is_ready and not (self.ended or self._suspended):
+                data = os.read(self._fd, _READ)
+                is_gone = not data
         except OSError:  # EIO: its other end was closed, or this process is in the background for good
-            data = b""
-        if not data:
+            is_gone = True
+        if is_gone:
             self.ended = self.ended or "the terminal is gone"
-        return data
+        keys = self._decoder.feed(data, time.monotonic())
+        self.ended = END if END in keys else self.ended
+        return keys
 
-    def show(self, line: str) -> None:
-        """Replace the status line; a terminal that is busy misses it."""
-        width = max(10, shutil.get_terminal_size().columns)
-        self._write(b"\r" + line[: width - 1].encode(errors="replace") + _ERASE_REST)
+    def show(self, status: Callable[[], str], *, at_once: bool) -> None:
+        """Show the status if it has changed, a few times a second unless ``at_once``."""
+        now = time.monotonic()
+        if at_once or now - self._shown_at >= _SHOW_PERIOD_S:
+            self._shown_at = now
+            if (line := shown(status())) != self._line:
+                self._line = line
+                _write(f"\r{line[: max(10, shutil.get_terminal_size().columns) - 1]}{_ERASE_REST}")
 
-    def stand_still(self) -> None:
-        """Suspend this process as Ctrl-Z usually does; returns when it goes on. Main thread only."""
+    def suspend(self, prepare: Callable[[], object]) -> None:
+        """Stand still after Ctrl-Z, once that is prepared, until this process goes on. Main thread only."""
+        if not self._suspended:
+            return
+        prepare()
         self.restore()
         signal.signal(signal.SIGTSTP, signal.SIG_DFL)
         signal.pthread_kill(threading.get_ident(), signal.SIGTSTP)  # to this thread: it acts before the next line
-        signal.signal(signal.SIGTSTP, self._on_signal)
-        self.suspended, self._continued = False, True
+        signal.signal(signal.SIGTSTP, self.on_signal)
+        self._suspended, self._continued = False, True
+        self._line = ""  # a shell has written over it
 
-    @contextmanager
-    def signals(self) -> Iterator[None]:
-        """Note signals, and wake :meth:`read` up."""
-        with handled_by(self._on_signal, signal.SIGQUIT, signal.SIGTSTP, signal.SIGCONT):
-            waker = signal.set_wakeup_fd(self._waker, warn_on_full_buffer=False)
-            try:
-                yield
-            finally:
-                signal.set_wakeup_fd(waker)
-
-    def _on_signal(self, number: int, _frame: FrameType | None) -> None:
+    def on_signal(self, number: int, _frame: FrameType | None) -> None:
+        """Note a signal."""
         if number == signal.SIGTSTP:
-            self.suspended = True
+            self._suspended = True
         elif number == signal.SIGCONT:
             self._continued = True
         else:
             self.ended = self.ended or signal.Signals(number).name
 
-    def _write(self, data: bytes) -> None:
-        with suppress(OSError):
-            os.write(self._out, data)
+
+def _write(text: str) -> None:
+    with suppress(OSError):
+        os.write(sys.stdout.fileno(), text.encode(errors="replace"))
 
 
-def _output() -> int:
-    """A descriptor of the terminal that alone does not block: a shell shares standard output."""
-    try:
-        return os.open("/dev/tty", os.O_WRONLY | os.O_NOCTTY | os.O_NONBLOCK)
-    except OSError:  # this process has no controlling terminal
-        return os.dup(sys.stdout.fileno())
-
-
-def check_terminal() -> None:
-    """Raise PebbleError if this process has no terminal that :func:`opened` can use."""
-    if not (sys.stdin.isatty() and sys.stdout.isatty()):
-        raise PebbleError(
-            "driving by keys needs a terminal; a program publishes with `pebble topic pub drive-values`, or is a script"
-        )
+def has_terminal() -> bool:
+    """True if keys can be read: not in a pipe, and not on Windows."""
     try:
         import termios  # noqa: F401
     except ImportError:
-        raise PebbleError("driving by keys needs a terminal of Linux or macOS: use `pebble web` here") from None
+        return False
+    return sys.stdin.isatty() and sys.stdout.isatty()
 
 
 @contextmanager
 def opened() -> Iterator[Terminal]:
     """The terminal of this process, restored at the end."""
-    terminal = Terminal(sys.stdin)
-    try:
-        with terminal.signals():
+    terminal = Terminal()
+    with handled_by(terminal.on_signal, signal.SIGQUIT, signal.SIGTSTP, signal.SIGCONT):
+        try:
             terminal.start()
-            try:
-                yield terminal
-            finally:
-                terminal.restore()
-    finally:
-        terminal.close()
+            yield terminal
+        finally:
+            terminal.restore()

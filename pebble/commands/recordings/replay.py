@@ -16,11 +16,11 @@ import typer
 
 from pebble.client.connection import password
 from pebble.client.terminal.key_decoder import END, LEFT, RIGHT, SPACE
+from pebble.client.terminal.keys import Terminal, has_terminal, opened
 from pebble.client.url import settings_of
 from pebble.commands.options import CaCert, PasswordFile
 from pebble.commands.recordings.options import Since, Until, period
 from pebble.commands.recordings.report import report_unread
-from pebble.commands.terminal.loop import TerminalLoop
 from pebble.config.visible import shown
 from pebble.errors import PebbleError
 from pebble.recordings.catalogue import check_name, look_at
@@ -85,7 +85,7 @@ def replay(
         pebble replay walk.mcap --url mqtt://127.0.0.1 --base test --incoming
     """
     options = Options(system=base or SYSTEM, incoming=incoming, only=tuple(only or ()))
-    if paused and not _has_terminal():
+    if paused and not has_terminal():
         raise PebbleError("--paused needs a terminal, whose space key goes on")
     if incoming and speed < _WITH_COMMANDS:
         raise PebbleError(f"--speed {speed:g} would drive a robot for longer than it was: leave out --incoming")
@@ -122,7 +122,7 @@ def _read(recordings: list[Path], options: Options) -> tuple[ReplaySource, Rules
 
 def _play(console: _Console, make: Make, rules: Rules, make_player: Callable[..., Player]) -> Player:
     """Play to the end, for these robots. Raises TransportError."""
-    terminal, bases = _has_terminal(), list(rules.robots)
+    terminal, bases = has_terminal(), list(rules.robots)
     with ExitStack() as stack:
         stack.enter_context(handled_by(console.on_signal))
         robots = ReplayedRobots(make, bases, wall_ms=lambda: time.time_ns() // 1_000_000)
@@ -143,17 +143,6 @@ def _maker(kind: str, settings: object) -> Make:
     return make
 
 
-def _has_terminal() -> bool:
-    """Whether keys can be read: not in a pipe, and not on Windows."""
-    if not (sys.stdin.isatty() and sys.stdout.isatty()):
-        return False
-    try:
-        import termios  # noqa: F401
-    except ImportError:
-        return False
-    return True
-
-
 class _Console:
     """Waits for the player; meanwhile keys, signals and the state of the connection are looked at."""
 
@@ -161,7 +150,7 @@ class _Console:
         self.ended = ""  # why, if not by the end of the recording
         self._player: Player | None = None
         self._robots: ReplayedRobots | None = None
-        self._loop: TerminalLoop | None = None
+        self._terminal: Terminal | None = None
         self._problem = ""
 
     def attach(self, player: Player, robots: ReplayedRobots) -> None:
@@ -171,28 +160,26 @@ class _Console:
 
     @contextmanager
     def keys(self) -> Iterator[None]:
-        from pebble.client.terminal.keys import opened
-
         with opened() as terminal:
-            self._loop = TerminalLoop(terminal, time.monotonic)
+            self._terminal = terminal
             try:
                 yield
             finally:
-                self._loop = None
+                self._terminal = None
 
     def wait(self, seconds: float) -> None:
         player, robots = self._player, self._robots
         if player is None or robots is None:
             return
-        if self._loop is None:
+        if self._terminal is None:
             time.sleep(seconds)
             self._report(robots.problem)
         else:
-            for key in self._loop.keys(seconds):
+            for key in self._terminal.keys(seconds):
                 self._press(key, player)
-            self._loop.suspend(player.pause)
-            self.ended = self.ended or self._loop.ended
-            self._loop.show(lambda: status(player, robots.problem), at_once=False)
+            self._terminal.suspend(player.pause)
+            self.ended = self.ended or self._terminal.ended
+            self._terminal.show(lambda: status(player, robots.problem), at_once=False)
         if self.ended and not player.ended:
             player.stop()
 

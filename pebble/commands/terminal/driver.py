@@ -52,10 +52,7 @@ class TerminalDriver:
         return [channel.filter(self.robot.base) for channel in (*channels, *([c.LINK] if self._heartbeat else []))]
 
     def receive(self, message: Message, now: float, wall: float) -> None:
-        channel = channel_of(message.topic.removeprefix(f"{self.robot.base}/"))
-        self.robot.receive(channel, message, now, wall)
-        if channel not in (c.CONTROL_STATE, c.LINK):
-            self.robot.remember(message)
+        self.robot.receive(channel_of(message.topic.removeprefix(f"{self.robot.base}/")), message, now, wall)
         if self.stop is not None:
             self.stop.receive(message, now)
 

@@ -17,13 +17,14 @@ from pebble.client.connection import password as broker_password
 from pebble.client.page import require_packages
 from pebble.client.url import settings_of as settings_of_url
 from pebble.commands.options import CaCert, PasswordFile, host_of
-from pebble.commands.web.people import PEOPLE, TLS, PeopleOption, default_folder, opened, register_people
+from pebble.commands.web.people import PEOPLE, TLS, PeopleOption, default_folder, register_people
 from pebble.config import load
 from pebble.config.hosts import name_of_page
 from pebble.config.web import WebTls, is_loopback
 from pebble.contract.names import NAME
 from pebble.errors import PebbleError
 from pebble.fleet.certificates import CA_CERT, SERVER_CERT, SERVER_KEY, own_names
+from pebble.fleet.people import has_user
 from pebble.runtime.connections import REMOTE_RECONNECT_S
 from pebble.transports import MqttSettings
 
@@ -164,7 +165,7 @@ def _of_config(file: Path, options: dict[str, Any], folder: Path | None) -> tupl
     settings = settings_or_all_problems(msgspec.structs.replace(config, web_interface=allowed))
     # `pebble web user add ann` does not know the config: its people count until the robot's own page has some.
     shared = default_folder() / PEOPLE
-    if settings.login and web.people is None and not _has_user(settings.people) and _has_user(shared):
+    if settings.login and web.people is None and not has_user(settings.people) and has_user(shared):
         settings = replace(settings, people=shared)
     return settings, web.plain_http
 
@@ -179,14 +180,7 @@ def _missing(settings: WebSettings, *, plain: bool, empty: bool) -> list[str]:
     if not settings.login and not empty:
         return []
     missing = [] if (settings.certificate is not None or plain) and not empty else ["certificate"]
-    return missing if _has_user(settings.people) else [*missing, "user"]
-
-
-def _has_user(people: Path | None) -> bool:
-    if people is None or not people.exists():
-        return False
-    with opened(people) as database:
-        return bool(database.list())
+    return missing if has_user(settings.people) else [*missing, "user"]
 
 
 def _print_missing(settings: WebSettings, missing: list[str], folder: Path) -> None:

@@ -28,7 +28,7 @@ class ChosenSources:
     def show(self, ref: str) -> None:
         """Send pages what was chosen for this component."""
         try:
-            source = self._people.get(_PICTURE + ref) or ""
+            source = self._people.get(_PICTURE + ref)
         except DatabaseError as error:
             log.warning("where the picture of %s comes from is not known: %s", ref, error)
             return

@@ -3,31 +3,25 @@
 import asyncio
 import struct
 import time
-from collections.abc import Callable
 from typing import Final
 
-from pebble.client.media_request.encoding_choice import BEST_FIRST, EncodingChoice
-from pebble.client.media_request.offer import offered
+from pebble.client.broker import Broker
+from pebble.client.media_request.offer import BEST_FIRST, best, offered
 from pebble.client.media_request.queue import NO_FRAME, Frame, ViewerQueue, assess
 from pebble.media.picture_header import PictureHeader, PictureSequence
 from pebble.web.media import rescue
-from pebble.web.media.connection import MediaConnection
 from pebble.web.media.rescue import RescuedPicture, RescueStream
 from pebble.web.media.stream import MediaStream
 from pebble.web.messages import PictureView
 from pebble.web.robots import Robots
-
-Show = Callable[[str, PictureView], None]
 
 _CHANGE_S: Final = 1.0  # a new encoding begins with a key frame within this time: viewers need no help meanwhile
 _MAX_CHAIN: Final = 240  # pictures since a key frame
 _MAX_CHAIN_BYTES: Final = 8 << 20  # of these pictures
 _HEAD: Final = struct.Struct(">IB")
 _RESCUE_HEAD: Final = struct.Struct(">IBQ")
-
-
-#: What is shown of a robot whose pictures no page watches.
-AT_REST: Final = PictureView(state="rest", why="", encoding="", per_second=0, kbits=0, viewers=0)
+_SNAPSHOT_S: Final = 0.5  # a snapshot this recent is used again
+_AT_REST: Final = PictureView(state="rest", why="", encoding="", per_second=0, kbits=0, viewers=0)
 
 
 class PageViewer:
@@ -41,14 +35,16 @@ class PageViewer:
 class PictureStream(MediaStream[PageViewer, PictureView]):
     """Gives the pictures of one robot to each viewer's queue."""
 
-    def __init__(self, connection: MediaConnection, robots: Robots, ref: str, show: Show) -> None:
-        super().__init__(connection, robots, ref, "video", show, AT_REST)
-        self.choice = EncodingChoice()
+    def __init__(self, broker: Broker, robots: Robots, ref: str) -> None:
+        super().__init__(broker, robots, ref, "video", "web/picture", _AT_REST)
         self._rescue = RescueStream(self._on_rescued)
         self._sequence = PictureSequence()
         self._chain: list[bytes] = []  # the newest key frame and all pictures since; empty: it would be too long
         self._chain_bytes = 0
         self._seq = 0
+        self._taking = asyncio.Lock()  # guards the snapshot
+        self._snapshot: bytes | None = None
+        self._snapshot_at = float("-inf")
 
     # -- pages
 
@@ -64,9 +60,15 @@ class PictureStream(MediaStream[PageViewer, PictureView]):
         if what:
             self._request.wake()
 
-    def chain(self) -> list[bytes]:
-        """The newest key frame and the differences since, if pictures are flowing."""
-        return list(self._chain) if self._arrivals.flowing(time.monotonic()) else []
+    async def snapshot(self) -> bytes | None:
+        """Return the newest picture as a JPEG, if pictures are flowing."""
+        async with self._taking:
+            if not self._chain or not self._arrivals.flowing(time.monotonic()):
+                return None
+            if time.monotonic() - self._snapshot_at > _SNAPSHOT_S:
+                self._snapshot = await asyncio.to_thread(rescue.newest_jpeg, list(self._chain))
+                self._snapshot_at = time.monotonic()
+            return self._snapshot
 
     # -- pictures
 
@@ -127,18 +129,16 @@ class PictureStream(MediaStream[PageViewer, PictureView]):
     # -- requests, and key frames
 
     async def _follow(self) -> None:
-        capabilities = self._robots.capabilities(self.ref)
-        await self._request.follow(capabilities, lambda: self._choose(offered(capabilities, "video")))
+        robot = self.robot
+        await self._request.follow(robot, best("video", offered(robot.capabilities, "video"), self._can()))
         if not self._request.problem:
             await self._help_viewers()
 
-    def _choose(self, encodings: tuple[str, ...]) -> str | None:
-        return self.choice.update(encodings, self._can(), time.monotonic())
-
     def _can(self) -> list[frozenset[str]]:
         """What each viewer decodes. For one that decodes nothing, what this server converts counts."""
-        converted = frozenset(name for name in BEST_FIRST if not rescue.unavailable(name))
-        return [viewer.queue.can & frozenset(BEST_FIRST) or converted for viewer in self.viewers]
+        known = frozenset(BEST_FIRST["video"])
+        converted = frozenset(name for name in known if not rescue.unavailable(name))
+        return [viewer.queue.can & known or converted for viewer in self.viewers]
 
     async def _help_viewers(self) -> None:
         """Request a key frame, or begin the rescue stream, if viewers need it."""
@@ -173,7 +173,6 @@ class PictureStream(MediaStream[PageViewer, PictureView]):
 
     def _end(self) -> None:
         self._rescue.stop()
-        self._show(self.ref, AT_REST)
 
     def _problem(self) -> str:
         lacking = sum(not viewer.queue.decodes(self._arrivals.encoding) for viewer in self.viewers)

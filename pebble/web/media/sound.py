@@ -10,21 +10,19 @@ from typing import Final
 import msgspec
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
-from pebble.client.media_request.offer import offered, refusal
+from pebble.client.broker import Broker
+from pebble.client.media_request.offer import BEST_FIRST, best, offered, refusal
 from pebble.contract import AUDIO, AUDIO_STREAM
 from pebble.contract.packets import Codec, Sound
 from pebble.errors import PayloadError
 from pebble.fleet.roles import Session, page_rights
 from pebble.transports import QoS
-from pebble.web.media.connection import MediaConnection
 from pebble.web.media.stream import MediaStream, Streams
 from pebble.web.media.talk import PIECE_BYTES, SILENT_S, Talk, Voice
 from pebble.web.messages import SoundView, TalkAnswer
 from pebble.web.pace import Pace
 from pebble.web.robots import Robots
 
-SOUND_METRIC: Final = "web/sound"
-ENCODINGS: Final = ("opus", "pcm")  # the best first
 MAX_PAYLOAD: Final = 256 << 10  # bytes of one packet
 WINDOW: Final = 32  # packets sent and not acknowledged: what waits in a slow connection cannot be taken back
 MAX_PACKETS, MAX_BYTES = 10, 256 << 10  # that wait before it
@@ -33,6 +31,7 @@ _MAX_ANSWERS: Final = 8  # that wait for one page
 _HEAD: Final = struct.Struct(">BI")
 _PIECE: Final = struct.Struct(">BII")
 _RECEIVED, _VOICE, _END = range(3)  # what a page sends
+_AT_REST: Final = SoundView(state="rest", why="", encoding="", listeners=0, talker="")
 
 NoteTalk = Callable[[str, Session, str, str], None]  # component, session, device and address, for the audit log
 
@@ -84,15 +83,8 @@ class SoundPage:
 class SoundStream(MediaStream[SoundPage, SoundView]):
     """Gives the sound of one robot to each listener's queue, and one talker's voice to the robot."""
 
-    def __init__(
-        self,
-        connection: MediaConnection,
-        robots: Robots,
-        ref: str,
-        show: Callable[[str, SoundView], None],
-        note: NoteTalk,
-    ) -> None:
-        super().__init__(connection, robots, ref, "audio", show, rest())
+    def __init__(self, broker: Broker, robots: Robots, ref: str, note: NoteTalk) -> None:
+        super().__init__(broker, robots, ref, "audio", "web/sound", _AT_REST)
         self._voice = Voice()
         self._note_talk = note
         self._talk: Talk | None = None
@@ -151,17 +143,17 @@ class SoundStream(MediaStream[SoundPage, SoundView]):
             return f"The role {page.session.role} may not do this"
         if self._talker is not None and self._talker is not page:
             return f"{self._talker.session.user} is talking"
-        return self._unheard() or refusal(self.ref, self._robots.capabilities(self.ref), "audio")
+        return self._unheard() or refusal(self.ref, self.robot.capabilities, "audio")
 
     def _unheard(self) -> str:
         """Why the robot would not hear it now; empty if it does."""
         if problem := self._broker.problem:
             return f"The server cannot reach the broker: {problem}"
-        component = self._robots.components.get(self.ref)
-        if component is not None and component.robot.online(time.monotonic()) is False:
-            return f"{component.robot.name} is silent"
-        if component is not None and component.robot.slow_s is not None:  # commands would wait behind a voice
-            return f"The connection of {component.robot.name} is too slow for a voice"
+        robot = self.robot
+        if robot.online(time.monotonic()) is False:
+            return f"{robot.name} is silent"
+        if robot.slow_s is not None:  # commands would wait behind a voice
+            return f"The connection of {robot.name} is too slow for a voice"
         return ""
 
     def _release(self, now: float) -> None:
@@ -185,10 +177,10 @@ class SoundStream(MediaStream[SoundPage, SoundView]):
 
     async def _follow(self) -> None:
         self._release(time.monotonic())
-        capabilities = self._robots.capabilities(self.ref)
-        if why := refusal(self.ref, capabilities, "audio") or self._unheard():
+        robot = self.robot
+        if why := refusal(self.ref, robot.capabilities, "audio") or self._unheard():
             self._interrupt(why)
-        await self._request.follow(capabilities, lambda: best(offered(capabilities, "audio"), self._listening()))
+        await self._request.follow(robot, best("audio", offered(robot.capabilities, "audio"), self._listening()))
 
     def _listening(self) -> list[frozenset[str]]:
         return [viewer.can for viewer in self.viewers if viewer.can]
@@ -207,45 +199,21 @@ class SoundStream(MediaStream[SoundPage, SoundView]):
         lacking = sum(self._arrivals.encoding not in can for can in listening)
         return f"{lacking} of {len(listening)} browsers cannot play {self._arrivals.encoding}" if lacking else ""
 
-    def _end(self) -> None:
-        self._show(self.ref, rest())
 
-
-class SoundHub:
+class SoundHub(Streams[SoundStream]):
     """All streams of sound. Only the event loop calls it."""
 
-    def __init__(self, connection: MediaConnection, robots: Robots, note: NoteTalk) -> None:
-        self._robots = robots
-        self._streams = Streams(AUDIO, connection, lambda ref: SoundStream(connection, robots, ref, self._show, note))
+    def __init__(self, broker: Broker, robots: Robots, note: NoteTalk) -> None:
+        super().__init__(AUDIO, lambda ref: SoundStream(broker, robots, ref, note))
 
     async def serve(
         self, websocket: WebSocket, ref: str, can: frozenset[str], session: Session, device: str = "", address: str = ""
     ) -> None:
         """Serve a page that plays ``can`` and may talk, until either end closes the socket."""
-        page = SoundPage(can & frozenset(ENCODINGS), session, device, address)
-        await self._streams.serve(
+        page = SoundPage(can & frozenset(BEST_FIRST["audio"]), session, device, address)
+        await self.let_view(
             websocket, ref, page, lambda _: _send(websocket, page), lambda stream: _receive(websocket, stream, page)
         )
-
-    async def close(self) -> None:
-        """Withdraw all requests."""
-        await self._streams.close()
-
-    def _show(self, ref: str, view: SoundView) -> None:
-        if self._robots.capabilities(ref):
-            self._robots.set_server_metric(ref, SOUND_METRIC, view)
-
-
-def best(offered: tuple[str, ...], listeners: list[frozenset[str]]) -> str | None:
-    """The encoding to request: one that every listener plays, if there is one. None: whatever the robot sends."""
-    known = [name for name in ENCODINGS if name in offered]
-    played = [name for name in known if all(name in can for can in listeners)]
-    return next(iter(played or reversed(known)), None)
-
-
-def rest() -> SoundView:
-    """What is shown of a robot whose sound no page uses."""
-    return SoundView(state="rest", why="", encoding="", listeners=0, talker="")
 
 
 def _encoding(payload: bytes) -> str:

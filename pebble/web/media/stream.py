@@ -10,13 +10,14 @@ from typing import Any, Final, Generic, TypeVar
 
 from starlette.websockets import WebSocket
 
-from pebble.client.media_request.request import TICK_S, MediaRequest
+from pebble.client.broker import Broker
+from pebble.client.media_request.offer import Medium
+from pebble.client.media_request.shared import TICK_S, SharedRequest
 from pebble.client.robot_topics import own_topic
-from pebble.client.viewer import Medium
-from pebble.contract import STATUS, Channel
+from pebble.client.robot_view import RobotView
+from pebble.contract import Channel
 from pebble.contract.identity import Direction
 from pebble.media.rate_meter import RateMeter
-from pebble.web.media.connection import MediaConnection
 from pebble.web.robots import Robots
 
 log = logging.getLogger(__name__)
@@ -62,22 +63,14 @@ class MediaStream(ABC, Generic[ViewerT, ViewT]):
     ``task`` ends once the request is withdrawn; until then viewers may join again.
     """
 
-    def __init__(
-        self,
-        connection: MediaConnection,
-        robots: Robots,
-        ref: str,
-        medium: Medium,
-        show: Callable[[str, ViewT], None],
-        view: ViewT,
-    ) -> None:
-        """``show`` tells pages of the robot's view; ``view`` is that of one at rest, which is shown already."""
+    def __init__(self, broker: Broker, robots: Robots, ref: str, medium: Medium, metric: str, view: ViewT) -> None:
+        """Pages are shown ``metric``; ``view`` is that of a robot at rest, which they are shown already."""
         self.ref = ref
         self.viewers: set[ViewerT] = set()
-        self.view = view  # as shown last
+        self.view = self._at_rest = view  # as shown last
         self._shown_at = float("-inf")
-        self._connection, self._broker, self._robots, self._show = connection, connection.broker, robots, show
-        self._request = MediaRequest(self._broker, ref, medium, self.receive)
+        self._broker, self._robots, self._metric = broker, robots, metric
+        self._request = SharedRequest(broker, ref, medium, self.receive)
         self._arrivals = Arrivals()
         self.task = asyncio.create_task(self._run())
 
@@ -94,6 +87,11 @@ class MediaStream(ABC, Generic[ViewerT, ViewT]):
         self._request.close()
         await self.task
 
+    @property
+    def robot(self) -> RobotView:
+        """It is the robot, as far as it is known."""
+        return self._robots.view(self.ref) or RobotView(self.ref)
+
     # -- of each medium
 
     @abstractmethod
@@ -108,21 +106,19 @@ class MediaStream(ABC, Generic[ViewerT, ViewT]):
     def _make_view(self, state: str, why: str, rate: float, kbits: float) -> ViewT:
         """What pages are shown."""
 
-    @abstractmethod
     def _end(self) -> None:
-        """The request ends; show that it rests."""
+        """Take note that the request has ended."""
 
     # -- the task
 
     async def _run(self) -> None:
         try:
-            async with self._connection.used():
-                await self._request.run(self._step)
+            await self._request.run(self._step)
         finally:
             self._end()
+            self._show(self._at_rest)
 
     async def _step(self) -> None:
-        self._request.take_status(bytes(self._robots.value(self.ref, STATUS.metric) or b""))
         self._report()
         await self._follow()
         self._report()
@@ -145,7 +141,11 @@ class MediaStream(ABC, Generic[ViewerT, ViewT]):
         view = self._make_view(state, why, rate, kbits)
         if view != self.view:
             self.view, self._shown_at = view, now
-            self._show(self.ref, view)
+            self._show(view)
+
+    def _show(self, view: ViewT) -> None:
+        if self._robots.capabilities(self.ref):
+            self._robots.set_server_metric(self.ref, self._metric, view)
 
     def _state(self, now: float) -> tuple[str, str]:
         if self._request.problem:
@@ -173,8 +173,8 @@ StreamT = TypeVar("StreamT", bound=MediaStream[Any, Any])
 class Streams(Generic[StreamT]):
     """The streams of one medium, by robot; one that has ended is forgotten."""
 
-    def __init__(self, channel: Channel, connection: MediaConnection, make: Callable[[str], StreamT]) -> None:
-        self._channel, self._connection, self._make = channel, connection, make
+    def __init__(self, channel: Channel, make: Callable[[str], StreamT]) -> None:
+        self._channel, self._make = channel, make
         self._closed = False
         self._streams: dict[str, StreamT] = {}
 
@@ -182,24 +182,23 @@ class Streams(Generic[StreamT]):
         """The stream of that robot, if pages use it."""
         return self._streams.get(ref)
 
-    async def serve(
+    async def let_view(
         self, websocket: WebSocket, ref: str, viewer: Any, *work: Callable[[StreamT], Coroutine[Any, Any, None]]
     ) -> None:
         """Let the page view that robot until one part of the ``work`` for its socket ends; close the socket."""
         if self._closed or not own_topic(ref, self._channel.topic(ref), Direction.OUTGOING):
             await websocket.close(_BAD_REQUEST, "no such component")
             return
-        async with self._connection.used():
-            stream = self._open(ref)
-            stream.join(viewer)
-            tasks = {asyncio.create_task(one(stream)) for one in work}
-            try:
-                await asyncio.wait({*tasks, stream.task}, return_when=asyncio.FIRST_COMPLETED)
-            finally:
-                stream.leave(viewer)
-                await _end(tasks)
-                with contextlib.suppress(RuntimeError):  # it is closed already
-                    await websocket.close(_GONE)
+        stream = self._open(ref)
+        stream.join(viewer)
+        tasks = {asyncio.create_task(part(stream)) for part in work}
+        try:
+            await asyncio.wait({*tasks, stream.task}, return_when=asyncio.FIRST_COMPLETED)
+        finally:
+            stream.leave(viewer)
+            await _end(tasks)
+            with contextlib.suppress(RuntimeError):  # it is closed already
+                await websocket.close(_GONE)
 
     async def close(self) -> None:
         """Withdraw all requests; for good."""

@@ -38,13 +38,13 @@ class ArchiveProcess:
         """The process that answers, if it runs."""
         return [] if self._pool is None else list(self._pool._processes or ())  # those of a pool are not public
 
-    async def ask(self, question: Callable[..., AnswerT], *arguments: Any, **options: Any) -> AnswerT:
+    async def ask(self, question: Callable[..., AnswerT], *arguments: Any) -> AnswerT:
         """The answer of a function of :mod:`pebble.recordings.seek.questions`. Raises PebbleError."""
         if self._waiting >= MOST_WAITING:
             raise BusyError("too many questions about recordings at once: try again")
         self._waiting += 1
         try:
-            return await asyncio.wrap_future(self._started().submit(_Call(question, options), *arguments))
+            return await asyncio.wrap_future(self._started().submit(question, *arguments))
         except BrokenProcessPool:
             self.close()
             raise PebbleError("the process that reads recordings has ended: try again") from None
@@ -67,16 +67,6 @@ class ArchiveProcess:
                 1, mp_context=_SPAWN, initializer=questions.begin, initargs=(self._folder,)
             )
         return self._pool
-
-
-class _Call:
-    """A function with keywords, as a pool takes it."""
-
-    def __init__(self, function: Callable[..., Any], options: dict[str, Any]) -> None:
-        self._function, self._options = function, options
-
-    def __call__(self, *arguments: Any) -> Any:
-        return self._function(*arguments, **self._options)
 
 
 class Job:

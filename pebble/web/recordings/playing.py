@@ -20,6 +20,7 @@ from typing import Any, Final
 import msgspec
 
 from pebble import contract as c
+from pebble.client.robot_view import RobotView
 from pebble.contract.channels import LOGS
 from pebble.errors import PebbleError
 from pebble.recordings.files.recorded import Recorded
@@ -31,7 +32,7 @@ from pebble.runtime.parent import end_with_parent
 from pebble.transports import Message
 from pebble.web import messages as m
 from pebble.web.log_lines import line_of
-from pebble.web.robots import Component
+from pebble.web.robots import liveness_of
 
 HEAD: Final = struct.Struct(">IB")
 TEXT, BINARY = 0, 1
@@ -44,6 +45,8 @@ _FLUSH_S: Final = 0.05
 _PLAYED_S: Final = 0.25  # between two messages about where it is
 _LIVENESS_S: Final = 0.5
 _PICTURE_S: Final = 1 / 40  # of a recording that is played fast not every picture is shown
+
+_LIVENESS: Final = {channel.metric: channel for channel in (c.ONLINE, c.LINK)}
 
 _ops = msgspec.json.Decoder(m.FromReplay)
 
@@ -192,7 +195,7 @@ class PlayedRobot:
         self._values: dict[str, tuple[Any, float]] = {}
         self._lines: list[msgspec.Raw] = []
         self._line, self._is_new, self._rested = 1, True, False
-        self._component = Component(self._ref)
+        self._robot = RobotView(self._ref)
         self._flushed_at = self._played_at = self._liveness_at = self._pictured_at = float("-inf")
         player = self.player
         self._link.write(m.Played(at=at_ns / 1e6, on=not player.paused, speed=player.speed, begins=True))
@@ -214,9 +217,9 @@ class PlayedRobot:
         if rests != self._rested or (not rests and now - self._played_at >= _PLAYED_S):
             self._rested = rests
             self._show()
-        if not rests and now - self._liveness_at >= _LIVENESS_S and self._component.live:
+        if not rests and now - self._liveness_at >= _LIVENESS_S and self._robot.live:
             self._liveness_at = now
-            self._values["web/liveness"] = self._component.view(position_ms / 1e3), position_ms
+            self._values["web/liveness"] = liveness_of(self._robot, position_ms / 1e3), position_ms
         if self._values or self._is_new:
             self._is_new = False
             values = ((self._ref, metric, raw, position_ms - at) for metric, (raw, at) in self._values.items())
@@ -232,12 +235,9 @@ class PlayedRobot:
         payload, received = message.payload, message.log_ns / 1e9
         if metric == c.CAPABILITIES.metric:
             payload = harmless(payload, self._ref, self._replayed)
-        elif metric == c.ONLINE.metric:
+        elif (channel := _LIVENESS.get(metric)) is not None:
             retained = message.channel.metadata.get("retained") == "1"
-            heartbeat = Message(message.channel.topic, payload, retain=retained)
-            self._component.take_heartbeat(heartbeat, received, received)
-        elif metric == c.LINK.metric:
-            self._component.robot.receive(c.LINK, Message(message.channel.topic, payload), received, received)
+            self._robot.receive(channel, Message(message.channel.topic, payload, retain=retained), received, received)
         try:
             msgspec.json.decode(payload)
         except (ValueError, RecursionError):  # msgspec's are ValueErrors

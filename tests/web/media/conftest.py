@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from pebble.client.media_request import request
+from pebble.client.media_request import shared
 from tests.web.media.robots import MediaRobot, Server, serving
 
 
@@ -18,7 +18,7 @@ def anyio_backend() -> str:
 
 @pytest.fixture(autouse=True)
 def _short_linger(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(request, "LINGER_S", 0.4)
+    monkeypatch.setattr(shared, "LINGER_S", 0.4)
 
 
 @pytest.fixture

@@ -17,7 +17,7 @@ import numpy as np
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from pebble.client.broker import Broker
-from pebble.client.viewer import Medium
+from pebble.client.media_request.offer import Medium
 from pebble.contract.packets import Sound
 from pebble.fleet.roles import Role, Session
 from pebble.media.scene import Scene
@@ -26,7 +26,6 @@ from pebble.media.speech import Speech
 from pebble.media.video import make_encoder
 from pebble.transports import Message, MqttSettings, QoS, Transport
 from pebble.transports.memory import MemoryHub, MemoryTransport
-from pebble.web.media.connection import MediaConnection
 from pebble.web.media.pictures import MediaHub
 from pebble.web.media.sound import SoundHub
 from pebble.web.robots import Robots
@@ -300,7 +299,6 @@ class Server:
 
     def __init__(self, hub: MemoryHub) -> None:
         self.fleet, self.broker = broker_on(hub), broker_on(hub, "media")
-        self.connection = MediaConnection(self.broker)
         self.subscribed: list[str] = []
         subscribe = self.broker.transport.subscribe
 
@@ -311,8 +309,8 @@ class Server:
         self.broker.transport.subscribe = noted  # type: ignore[method-assign]
         self.robots = Robots()
         self.noted: list[tuple[str, str]] = []  # who talked
-        self.media = MediaHub(self.connection, self.robots)
-        self.sound = SoundHub(self.connection, self.robots, lambda ref, who, *_: self.noted.append((ref, who.user)))
+        self.media = MediaHub(self.broker, self.robots)
+        self.sound = SoundHub(self.broker, self.robots, lambda ref, who, *_: self.noted.append((ref, who.user)))
         self.views: list[tuple[float, Any]] = []
         self._tasks: set[asyncio.Task[None]] = set()
         publish = self.robots.set_server_metric
@@ -352,7 +350,7 @@ class Server:
         await self.media.close()
         await self.sound.close()
         await asyncio.gather(*self._tasks)
-        await self.connection.close()
+        await self.broker.close()
         await self.fleet.close()
 
 
@@ -360,6 +358,7 @@ class Server:
 async def serving(robot: MediaRobot) -> AsyncIterator[Server]:
     server = Server(robot.hub)
     await server.fleet.open()
+    await server.broker.open()
     await server.fleet.subscribe(CAPABILITIES, server.robots.receive)
     try:
         await until(lambda: server.robots.capabilities(REF))

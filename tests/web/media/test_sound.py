@@ -14,7 +14,7 @@ from pebble.contract.packets import Codec, Sound
 from pebble.contract.payloads import LinkState
 from pebble.fleet.roles import Role
 from pebble.transports import Message
-from pebble.web.media.sound import MAX_PACKETS, WINDOW, SoundQueue, best
+from pebble.web.media.sound import MAX_PACKETS, WINDOW, SoundQueue
 from pebble.web.media.talk import LATE_S, PIECE_BYTES, PIECES_PER_S, SILENT_S, Talk, Voice
 from tests.web.media.robots import AUDIO, REF, UPLINK, Server, SoundPage, SoundRobot, serving, until
 
@@ -45,17 +45,6 @@ async def test_one_listener_without_opus_is_enough_for_pcm(robot: SoundRobot, se
     assert {Sound.unpack(packet).codec for packet in plain.received} == {Codec.PCM16LE}
     plain.leave()
     await until(lambda: robot.encodings == ["opus", "pcm", "opus"])
-
-
-def test_the_best_encoding_that_all_listeners_play() -> None:
-    both, pcm = frozenset({"opus", "pcm"}), frozenset({"pcm"})
-    assert best(("pcm", "opus"), [both, both]) == "opus"
-    assert best(("pcm", "opus"), [both, pcm]) == "pcm"
-    assert best(("pcm",), [both]) == "pcm"
-    assert best(("opus",), [pcm]) == "opus"  # there is no other
-    assert best(("pcm", "opus"), []) == "opus"  # a page that only talks
-    assert best((), [both]) is None
-    assert best(("flac",), [both]) is None
 
 
 async def test_a_page_that_cannot_play_what_comes_gets_a_reason() -> None:
