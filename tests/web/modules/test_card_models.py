@@ -81,7 +81,6 @@ WHY_NO_FLASH = {
     'values[ref]["web/liveness"].online = false': "goob is silent",
     "values[ref].capabilities.value.lights.controls = false": "goob takes no such commands",
     "values[ref].capabilities.value.lights.flash = false": NO_FLASH,
-    "values[ref].capabilities.value.lights = 7": NO_FLASH,
     "values[ref].capabilities = null": NO_FLASH,
     "delete values[ref]": NO_FLASH,
 }
@@ -153,7 +152,7 @@ LIGHTS: Rows = {
 
 # -- sounds
 
-sounds = Script({"ui/cards/sounds-model.js": "clips, grouped, play, playing, repeatLast"}, _STORED + _PAGE, anew=True)
+sounds = Script({"ui/cards/sounds-model.js": "grouped, play, repeatLast"}, _STORED + _PAGE, anew=True)
 FILES = ["horn.wav", "Bell.wav", "animals/Cat.wav", "animals/dog.wav", "animals/wild/cat.wav"]
 WILD = ["animals/wild/", FILES[4:]]
 #: What is searched, how many are shown at most, and the groups; and how many more there are.
@@ -164,19 +163,6 @@ GROUPS = [
     ("nothing", 60, [], 0),
     ("", 2, [["", FILES[:2]]], 3),
 ]
-CLIPS = {
-    '{ files: ["a.wav", "a.wav", 7, null, "", "  ", ["b.wav"], "c.wav"] }': ["a.wav", "c.wav"],
-    '{ value: { files: ["a.wav"] } }': ["a.wav"],
-    **dict.fromkeys(('{ files: "a.wav" }', '{ files: { 0: "a.wav" } }', "null", "7"), None),
-}
-#: Status, what plays, and the error.
-PLAYING = {
-    '{ playing: true, file: "a.wav", error: null }': ["a.wav", ""],
-    "{ playing: true, file: { x: 1 }, error: 7 }": ["a clip", ""],
-    '{ playing: "yes", file: "a.wav", error: "Sound file not found" }': ["", "Sound file not found"],
-    "[]": ["", ""],
-    "null": ["", ""],
-}
 # fmt: off
 SOUNDS: Rows = {
     "the last sound is repeated as it was played": ("""
@@ -191,10 +177,6 @@ SOUNDS: Rows = {
     **{f"{most} clips with '{words}' are grouped by folder": (
         f"result = grouped({json.dumps(FILES)}, '{words}', {most});", {"folders": folders, "more": more})
         for words, most, folders, more in GROUPS},
-    **{f"only names are clips: {payload}": (f"result = clips({payload});", expected)
-        for payload, expected in CLIPS.items()},
-    **{f"what plays: {payload}": (f"const {{ file, error }} = playing({payload}); result = [file, error];", expected)
-        for payload, expected in PLAYING.items()},
 }
 # fmt: on
 
@@ -436,11 +418,7 @@ def test_the_newest_answers_are_remembered_by_the_number_of_the_command() -> Non
     assert evaluate({"ui/parts/models.js": "Connection"}, steps) == ["refused", "done", 200, True, False]
 
 
-autonomy = Script({"ui/cards/autonomy-model.js": "Since, statusOf, whyNotStarted"}, _PAGE)
-ODD = (
-    *("null", "7", '"x"', "[]", '{ running: "yes", file: 3 }'),
-    "{ running: true, file: [], dependencies: { a: 1 }, config: [1] }",
-)
+autonomy = Script({"ui/cards/autonomy-model.js": "Since, whyNotStarted"}, _PAGE)
 BOB = 'values[ref]["web/driver"] = { by: "bob", you: %s, idle_s: %s }'
 WHY_NOT_STARTED = {
     "": "",
@@ -456,19 +434,9 @@ WHY_NOT_STARTED = {
 }
 # fmt: off
 AUTONOMY: Rows = {
-    **{f"a status may be anything: {payload}": (f"""
-        const {{ running, dependencies, config, error }} = statusOf({payload});
-        result = [running, dependencies, config, error];""", ["true" in payload, [], [], ""]) for payload in ODD},
-    "a status of a robot": ("""
-        const dependencies = [{ file: "wheel-odometry", pid: 8, running: true }, { file: 3, running: 1 }, "x"];
-        result = statusOf({ running: true, file: "follow", pid: 7, overridden: true,
-          error: null, config: { tag_id: 5 }, dependencies });""", {
-        "running": True, "file": "follow", "pid": 7, "waits": True, "error": "",
-        "config": [["tag_id", 5]],
-        "dependencies": [{"file": "wheel-odometry", "running": True}, {"file": "?", "running": False}]}),
     "since when a script runs": ("""
         const since = new Since();
-        const see = (status, at) => { since.update(statusOf(status), at); return [since.at, since.isExact]; };
+        const see = (status, at) => { since.update(status, at); return [since.at, since.isExact]; };
         const follow = { running: true, file: "follow", pid: 7 };
         result = [see(follow, 100), see({ ...follow, overridden: true }, 200), see({ running: false }, 300),
           see(follow, 400), see({ ...follow, pid: 8 }, 500)];""",

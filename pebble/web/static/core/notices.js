@@ -31,7 +31,7 @@ const EVENTS = {
     return { state, text: state && `is wanted: ${state} asks to drive` };
   },
   script(_before, status) {
-    if (!isObject(status)) return null;
+    if (!status) return null;
     const state = status.error ? `script ${short(status.file) || "?"} failed: ${short(status.error)}` : "";
     return { state, text: state };
   },

@@ -1,7 +1,7 @@
 // The scripts of a robot: which one runs, and a form to start one.
 
 import { useAnswer } from "../parts/asking.js";
-import { Since, handDriven, statusOf, whyNotStarted } from "./autonomy-model.js";
+import { Since, handDriven, whyNotStarted } from "./autonomy-model.js";
 import { filled, lastScript, moreWords, remember, remembered, scripts, whyNotSent } from "./form-model.js";
 import { Form } from "./form.js";
 import { html, useMetric, useOnline, useState, useTick, useValue } from "../parts/hooks.js";
@@ -21,8 +21,8 @@ export function Autonomy({ at }) {
   const payload = useValue(at, "autonomy-files");
   const listed = useMemo(() => scripts(payload), [payload]);
   const entry = useMetric(at, "autonomy-status");
-  const status = statusOf(entry?.value);
-  const [chosen, choose] = useState(() => status.file || lastScript(at));
+  const status = entry?.value ?? {};
+  const [chosen, choose] = useState(() => status.file ?? lastScript(at));
   const name = useName(at);
   const find = (file) => listed?.find((one) => one.file === file);
   const script = find(chosen);
@@ -62,8 +62,8 @@ function Row({ script, isOpen, onOpen, ...parts }) {
 }
 
 /** What a script does, as far as is known. */
-function how({ waits }, past) {
-  if (waits) return " waits: a person drives";
+function how({ overridden }, past) {
+  if (overridden) return " waits: a person drives";
   if (past) return " ran when it was last seen";
   return " runs";
 }
@@ -75,10 +75,12 @@ function Running({ at, page, entry, status, script }) {
   const [seen] = useState(() => new Since()); // what runs while the card is closed may be another run
   if (entry) seen.update(status, entry.at);
   const past = !useOnline(at);
+  const { dependencies = [] } = status;
+  const config = Object.entries(status.config ?? {});
   return html`<div class="ask-row ask-now">
       <p role="status" data-test="script-state">
         ${status.running
-          ? html`<b>${past ? "○" : "●"} ${plain(status.file)}</b>
+          ? html`<b>${past ? "○" : "●"} ${plain(status.file ?? "A script")}</b>
               ${how(status, past)},
               ${" "}${since(seen)}`
           : html`<span class="dim">No script runs.</span>`}
@@ -96,19 +98,19 @@ function Running({ at, page, entry, status, script }) {
     </div>
     ${why && (status.running || !entry) && html`<${Why} id="why-end-script">${why}<//>`}
     ${status.error && html`<p class="bad" data-test="script-error">✖ ${plain(status.error)}</p>`}
-    ${status.dependencies.length > 0 &&
+    ${dependencies.length > 0 &&
     html`<ul class="dependencies" aria-label="Scripts that it needs">
-      ${status.dependencies.map(
+      ${dependencies.map(
         ({ file, running }, index) => html`<li key=${index} class=${running ? "" : "bad"}>
           ${running ? "●" : "✖"} ${plain(file)} ${running ? "runs" : "does not run"}
         </li>`,
       )}
     </ul>`}
-    ${status.config.length > 0 &&
+    ${config.length > 0 &&
     html`<details class="effective">
-      <summary data-test="effective">Its settings (${status.config.length})</summary>
+      <summary data-test="effective">Its settings (${config.length})</summary>
       <dl class="values">
-        ${status.config.map(
+        ${config.map(
           ([key, value]) => html`<div key=${key}>
             <dt>${plain(label(key))}</dt>
             <dd>${plain(value)}</dd>
@@ -208,5 +210,5 @@ function startedWords({ op, why }, name) {
 
 function startWords({ running, file }, script) {
   if (!running) return "Start";
-  return file === script.file ? "Start again" : `Start instead of ${file.slice(0, 40)}`;
+  return file === script.file ? "Start again" : `Start instead of ${(file ?? "it").slice(0, 40)}`;
 }

@@ -4,10 +4,8 @@ import { isLevel, useAnswer } from "../parts/asking.js";
 import { html, useEffect, useMetric, useOnline, useState, useTick } from "../parts/hooks.js";
 import { Why } from "../parts/parts.js";
 import { useReasons, whyNotEnd, whyNotMoved } from "../parts/why-not.js";
-import { inner, isObject } from "../parts/words.js";
 
 const MOST = 64;
-const LONG = 64; // characters of a name
 const CONFIRMED_MS = 3000;
 
 export function Outlets({ at, offers }) {
@@ -33,9 +31,7 @@ export function outletsOf(offers) {
   const section = offers.section("outlets");
   /** @type {Map<string, boolean>} */
   const found = new Map();
-  for (const one of Array.isArray(section.outlets) ? section.outlets : []) {
-    if (isObject(one) && typeof one.name === "string" && one.name) found.set(one.name, one.controls !== false);
-  }
+  for (const { name, controls } of section.outlets ?? []) found.set(name, controls !== false);
   for (const metric of offers.metrics) {
     const name = /^outlets\/([^/]+)\/status$/.exec(metric)?.[1];
     if (name && !found.has(name)) found.set(name, section.available !== true);
@@ -60,7 +56,7 @@ export function obstacle(name, controls, report, on) {
 function Outlet({ at, id, name, controls, page }) {
   const payload = useMetric(at, `outlets/${name}/status`)?.value;
   const online = useOnline(at);
-  const report = isObject(inner(payload)) ? inner(payload) : {};
+  const report = payload?.value ?? {};
   const [asked, ask] = useState(/** @type {{on: boolean, at: number, n: number} | null} */ (null));
   const answer = useAnswer(asked?.n);
   const refused = answer.op === "refused";
@@ -104,7 +100,6 @@ function Outlet({ at, id, name, controls, page }) {
 }
 
 function labelOf(payload, name) {
-  const label = isObject(payload) && typeof payload.label === "string" ? payload.label.trim() : "";
-  const text = label && label !== name ? `${label} (${name})` : name;
-  return text.length > LONG ? `${text.slice(0, LONG)}…` : text;
+  const label = payload?.label?.trim();
+  return label && label !== name ? `${label} (${name})` : name;
 }

@@ -7,7 +7,7 @@ import { Panel } from "../panels/panel.js";
 import { HoldButton, Icon, Why, useName } from "../parts/parts.js";
 import { useReasons, whyNot, whyNotEnd } from "../parts/why-not.js";
 import { plain } from "../parts/more-words.js";
-import { clockTime, driverName, isObject } from "../parts/words.js";
+import { clockTime, driverName } from "../parts/words.js";
 
 /** @typedef {"reboot" | "service-restart" | "git-pull"} Action */
 
@@ -153,11 +153,11 @@ const SPELLINGS = {
  * @param {Action} action @param {any} capabilities their value; undefined: unknown @returns {string}
  */
 export function lacks(action, capabilities) {
-  if (!isObject(capabilities)) return "";
-  const system = isObject(capabilities.system) ? capabilities.system : {};
+  if (!capabilities) return "";
+  const { system = {} } = capabilities;
   const entry = SPELLINGS[action].map((name) => system[name] ?? capabilities[name]).find((known) => known !== undefined);
   if (entry === true) return "";
-  if (!isObject(entry) || entry.available === false) return "This robot does not offer it";
+  if (!entry || entry.available === false) return "This robot does not offer it";
   return entry.controls === false ? "Not set up on this robot" : "";
 }
 

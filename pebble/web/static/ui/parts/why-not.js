@@ -2,7 +2,6 @@
 
 import { useModel, usePage, useValue } from "./hooks.js";
 import { nameIn } from "./looks.js";
-import { inner, isObject } from "./words.js";
 
 /** @typedef {{store: import("../../core/store.js").Store, connection: import("./models.js").Connection}} Services */
 
@@ -43,11 +42,8 @@ export function whyNotMoved(page, ref, section = "") {
   return why || (page.connection.you?.drives === false ? "Needs https: this connection is not encrypted" : "");
 }
 
-/** @param {unknown} capabilities payload @param {string} name @returns {Record<string, any>} empty if there is none */
-export function sectionOf(capabilities, name) {
-  const value = inner(capabilities);
-  return isObject(value) && isObject(value[name]) ? value[name] : {};
-}
+/** @param {any} capabilities payload @param {string} name @returns {Record<string, any>} empty if there is none */
+export const sectionOf = (capabilities, name) => capabilities?.value[name] ?? {};
 
 const picked = ({ isOpen, you }) => `${isOpen} ${you?.role}`;
 
