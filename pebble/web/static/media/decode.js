@@ -2,7 +2,7 @@
 
 import * as browser from "../core/browser.js";
 import { PayloadError } from "./errors.js";
-import { MAX_BYTES, joined } from "./jpeg.js";
+import { MAX_BYTES } from "./jpeg.js";
 
 export const MAX_PAYLOAD = (MAX_BYTES * 3) / 2; // base64 takes a third more
 const MAX_TEXT = Math.floor((MAX_BYTES * 4) / 3) + 1024;
@@ -129,7 +129,7 @@ export async function inflate(packed, limit = MAX_BYTES) {
     reader.cancel().catch(() => {});
     throw error instanceof PayloadError ? error : new PayloadError(`zlib: ${error}`);
   }
-  return joined(parts);
+  return new Uint8Array(await new Blob(parts).arrayBuffer());
 }
 
 /** Which payload may follow which, and what was made of each. */
@@ -139,7 +139,6 @@ export class Sequence {
     this.last = null; // null: the next difference builds on nothing
     this.wantsKeyframe = false;
     this.problem = ""; // why the last payload was refused, for display
-    this.counters = { pictures: 0, refused: 0, waiting: 0, gaps: 0 };
   }
 
   /**
@@ -147,12 +146,7 @@ export class Sequence {
    * @param {Payload} payload
    */
   admit(payload) {
-    if (payload.keyframe || this.follows(payload)) {
-      this.countGap(payload);
-      return true;
-    }
-    this.counters.waiting++;
-    this.counters.gaps += this.last === null ? 0 : 1;
+    if (payload.keyframe || this.follows(payload)) return true;
     this.reset();
     return false;
   }
@@ -161,14 +155,12 @@ export class Sequence {
   shown(payload) {
     this.last = { ...payload, body: new Uint8Array(0) };
     this.wantsKeyframe = false;
-    this.counters.pictures++;
   }
 
   /**
    * @param {unknown} error
    */
   refuse(error) {
-    this.counters.refused++;
     this.problem = error instanceof Error ? error.message : String(error);
     this.reset();
   }
@@ -185,14 +177,6 @@ export class Sequence {
     if (last.capturedMs === null || payload.capturedMs === null) return last.capturedMs === payload.capturedMs;
     const step = payload.capturedMs - last.capturedMs;
     return step >= 0 && step <= LONGEST_STEP_MS;
-  }
-
-  /** A key frame needs nothing before it, yet frames before it may be lost. */
-  countGap(/** @type {Payload} */ payload) {
-    const { last } = this;
-    if (last !== null && last.encoding === payload.encoding && last.frame !== null && payload.frame) {
-      this.counters.gaps += payload.frame > last.frame + 1 ? 1 : 0;
-    }
   }
 }
 

@@ -28,17 +28,3 @@ export function checked(jpeg) {
   }
   throw new PayloadError("JPEG: without a size");
 }
-
-/**
- * @param {Uint8Array[]} parts
- * @returns {Uint8Array}
- */
-export function joined(parts) {
-  const whole = new Uint8Array(parts.reduce((length, part) => length + part.length, 0));
-  let at = 0;
-  for (const part of parts) {
-    whole.set(part, at);
-    at += part.length;
-  }
-  return whole;
-}

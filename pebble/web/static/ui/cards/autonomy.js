@@ -2,7 +2,7 @@
 
 import { useAnswer } from "../parts/asking.js";
 import { Since, handDriven, whyNotStarted } from "./autonomy-model.js";
-import { filled, lastScript, moreWords, remember, remembered, scripts, whyNotSent } from "./form-model.js";
+import { filled, lastScript, moreWords, remember, remembered, scripts } from "./form-model.js";
 import { Form } from "./form.js";
 import { html, useMetric, useOnline, useState, useTick, useValue } from "../parts/hooks.js";
 import { Nothing } from "../parts/nothing.js";
@@ -13,6 +13,7 @@ import { clockTime } from "../parts/words.js";
 import { useMemo } from "../../vendor/hooks.mjs";
 
 const ASKED_MS = 10_000; // so long the page says that it has asked
+const LONGEST_CONFIG = 14_000; // characters of JSON: the server reads messages of 16 KB
 
 export function Autonomy({ at }) {
   const page = useReasons(at);
@@ -125,10 +126,12 @@ const since = ({ at, isExact }) => `since ${clockTime(at)}${isExact ? "" : " or 
 /** The form of one script, and its start. */
 function Starter({ at, page, entry, status, script }) {
   const [{ texts, version }, set] = useState(() => ({ texts: remembered(at, script.file), version: 0 }));
-  const [opened, setOpened] = useState(false);
+  const [asked, setAsked] = useState(/** @type {{at: number, of: number | undefined, n: number} | null} */ (null));
+  const answer = useAnswer(asked?.n);
+  const isAsked = asked !== null && Date.now() - asked.at < ASKED_MS && entry?.receivedAt === asked.of;
+  useTick(isAsked ? 1000 : 0);
   const { main, more } = script;
-  const form = filled(script.fields, texts);
-  const why = whyNotStarted(page, at) || whyNotSent(form);
+  const why = whyNotStarted(page, at);
   const { by, waits } = handDriven(page, at);
   const name = useName(at);
   const note = by && waits ? `${by} driving: the script will wait` : meaning(name, waits);
@@ -144,63 +147,50 @@ function Starter({ at, page, entry, status, script }) {
     const others = [...texts].filter(([one]) => one !== key);
     change(new Map(text === null ? others : [...others, [key, text]]));
   };
-  const shared = { texts, mistakes: form.mistakes, onText };
-  const wrong = more.some(({ key }) => form.mistakes.has(key));
-  return html`<${Form} key=${`main ${version}`} id="script-set" fields=${main} ...${shared} />
+  const start = (event) => {
+    event.preventDefault();
+    const wrong = [...event.currentTarget.elements].find(isWrong);
+    if (!wrong) {
+      const config = filled(script.fields, texts);
+      if (JSON.stringify(config).length > LONGEST_CONFIG) return page.connection.show("Not done: the settings are too long together");
+      const n = page.commands.startScript(at, script.file, config);
+      remember(at, script.file, texts); // it is the last one now
+      return setAsked({ at: Date.now(), of: entry?.receivedAt, n });
+    }
+    const folded = wrong.closest("details");
+    if (folded) folded.open = true;
+    return wrong.reportValidity();
+  };
+  return html`<form noValidate onSubmit=${start}>
+    <${Form} key=${`main ${version}`} id="script-set" fields=${main} texts=${texts} onText=${onText} />
     ${more.length > 0 &&
-    html`<details class="script-more" open=${opened || wrong} onToggle=${(event) => setOpened(event.currentTarget.open)}>
+    html`<details class="script-more">
       <summary data-test="more-settings">${moreWords(more, texts)}</summary>
       <div class="script-more-fields" tabindex="0" role="group" aria-label="More settings">
-        <${Form} key=${`more ${version}`} id="script-more" fields=${more} ...${shared} />
-        ${script.omitted > 0 && html`<p class="dim">… ${script.omitted} more settings cannot be shown.</p>`}
+        <${Form} key=${`more ${version}`} id="script-more" fields=${more} texts=${texts} onText=${onText} />
       </div>
     </details>`}
     <div class="script-start">
-      <${StartButton}
-        at=${at}
-        page=${page}
-        entry=${entry}
-        why=${why}
-        config=${form.config}
-        file=${script.file}
-        >${startWords(status, script)}<//
+      <button class=${why ? "" : "primary"} data-test="start-script" disabled=${Boolean(why)} aria-describedby="why-start">
+        <${Icon} name="play" />${startWords(status, script)}
+      </button>
+      <span role="status" class=${answer.op === "refused" ? "bad" : "dim"} data-test="asked"
+        >${isAsked && startedWords(answer, name)}</span
       >
       ${texts.size > 0 &&
       html`<button type="button" data-test="restore-all" onClick=${restore}>
         All defaults
       </button>`}
       <${Why} id="why-start">${why || note}<//>
-    </div>`;
+    </div>
+  </form>`;
 }
+
+/** Whether a browser refuses what is in a field. Its steps are only those of its arrows. */
+const isWrong = ({ validity }) => !validity.valid && (!validity.stepMismatch || validity.rangeUnderflow || validity.rangeOverflow);
 
 /** What a start means. */
 const meaning = (name, waits) => `${name} may move by itself${waits ? ". Drive by hand to interrupt it" : ""}`;
-
-function StartButton({ at, page, entry, why, config, file, children }) {
-  const [asked, setAsked] = useState(/** @type {{at: number, of: number | undefined, n: number} | null} */ (null));
-  const answer = useAnswer(asked?.n);
-  const name = useName(at);
-  const isAsked = asked !== null && Date.now() - asked.at < ASKED_MS && entry?.receivedAt === asked.of;
-  useTick(isAsked ? 1000 : 0);
-  const start = () => {
-    const n = page.commands.startScript(at, file, config);
-    if (n) remember(at, file, remembered(at, file)); // it is the last one now
-    setAsked({ at: Date.now(), of: entry?.receivedAt, n });
-  };
-  return html`<button
-      type="button"
-      class=${why ? "" : "primary"}
-      data-test="start-script"
-      disabled=${Boolean(why)}
-      aria-describedby="why-start"
-      onClick=${start}
-    >
-      <${Icon} name="play" />${children}
-    </button>
-    <span role="status" class=${answer.op === "refused" ? "bad" : "dim"} data-test="asked"
-      >${isAsked && startedWords(answer, name)}</span
-    >`;
-}
 
 /** @param {import("../parts/asking.js").Progress} answer @param {string} name */
 function startedWords({ op, why }, name) {

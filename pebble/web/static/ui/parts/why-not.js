@@ -11,10 +11,14 @@ const ROLES = { drive: "driver", system: "maintainer" }; // the least that have 
  * Why this page may not even end anything: what ends something is asked of every robot, also of one that is silent.
  * @param {Services} page @param {"drive" | "system"} [right] @returns {string} "" it may
  */
-export function whyNotEnd({ store, connection }, right = "drive") {
+export function whyNotEnd(page, right = "drive") {
+  return whyNotReached(page) || (page.connection.may(right) ? "" : `Log in as ${ROLES[right]} to use this`);
+}
+
+/** Why nothing reaches any robot; "" it does. @param {Services} page @returns {string} */
+export function whyNotReached({ store, connection }) {
   if (!connection.isOpen) return "No connection to the server";
-  if (store.get("", "web/broker")?.value.connected === false) return "The server cannot reach the broker";
-  return connection.may(right) ? "" : `Log in as ${ROLES[right]} to use this`;
+  return store.get("", "web/broker")?.value.connected === false ? "The server cannot reach the broker" : "";
 }
 
 /**
