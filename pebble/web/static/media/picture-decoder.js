@@ -2,11 +2,11 @@
 
 import * as browser from "../core/browser.js";
 import { Sequence, inflate, readPayload } from "./decode.js";
-import { addDifference } from "./delta.js";
 import { PayloadError, UnsupportedError } from "./errors.js";
 import { H264Decoder } from "./h264.js";
 import { checked } from "./jpeg.js";
 
+const UNCHANGED = new Uint32Array(new Uint8Array([128, 128, 128, 255]).buffer)[0]; // most pixels of most differences
 // No profile may change a pixel: a difference would not fit any more.
 const AS_IT_IS = /** @type {const} */ ({ colorSpaceConversion: "none", premultiplyAlpha: "none" });
 
@@ -140,4 +140,20 @@ export async function decodeJpeg(bytes) {
 /** @param {import("./decode.js").Payload} payload */
 function labelOf({ encoding, keyframe, frame, capturedMs }) {
   return { encoding, key: keyframe, frame, capturedMs };
+}
+
+/**
+ * reference = clip(reference + difference - 128). The array clips by itself; alpha stays 255.
+ * @param {Uint8ClampedArray} reference RGBA, changed in place
+ * @param {Uint8ClampedArray} difference RGBA, of the same size
+ */
+function addDifference(reference, difference) {
+  const pixels = new Uint32Array(difference.buffer, difference.byteOffset, difference.length >> 2);
+  for (let pixel = 0; pixel < pixels.length; pixel++) {
+    if (pixels[pixel] === UNCHANGED) continue;
+    const i = 4 * pixel;
+    reference[i] = reference[i] + difference[i] - 128;
+    reference[i + 1] = reference[i + 1] + difference[i + 1] - 128;
+    reference[i + 2] = reference[i + 2] + difference[i + 2] - 128;
+  }
 }

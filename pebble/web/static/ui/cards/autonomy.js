@@ -7,6 +7,7 @@ import { Form } from "./form.js";
 import { html, useMetric, useOnline, useState, useTick, useValue } from "../parts/hooks.js";
 import { Nothing } from "../parts/nothing.js";
 import { Icon, Why, useName } from "../parts/parts.js";
+import { refuses } from "../parts/typed.js";
 import { useReasons, whyNotEnd } from "../parts/why-not.js";
 import { plain } from "../parts/more-words.js";
 import { clockTime } from "../parts/words.js";
@@ -149,17 +150,12 @@ function Starter({ at, page, entry, status, script }) {
   };
   const start = (event) => {
     event.preventDefault();
-    const wrong = [...event.currentTarget.elements].find(isWrong);
-    if (!wrong) {
-      const config = filled(script.fields, texts);
-      if (JSON.stringify(config).length > LONGEST_CONFIG) return page.connection.show("Not done: the settings are too long together");
-      const n = page.commands.startScript(at, script.file, config);
-      remember(at, script.file, texts); // it is the last one now
-      return setAsked({ at: Date.now(), of: entry?.receivedAt, n });
-    }
-    const folded = wrong.closest("details");
-    if (folded) folded.open = true;
-    return wrong.reportValidity();
+    if (refuses(event.currentTarget)) return undefined;
+    const config = filled(script.fields, texts);
+    if (JSON.stringify(config).length > LONGEST_CONFIG) return page.connection.show("Not done: the settings are too long together");
+    const n = page.commands.startScript(at, script.file, config);
+    remember(at, script.file, texts); // it is the last one now
+    return setAsked({ at: Date.now(), of: entry?.receivedAt, n });
   };
   return html`<form noValidate onSubmit=${start}>
     <${Form} key=${`main ${version}`} id="script-set" fields=${main} texts=${texts} onText=${onText} />
@@ -185,9 +181,6 @@ function Starter({ at, page, entry, status, script }) {
     </div>
   </form>`;
 }
-
-/** Whether a browser refuses what is in a field. Its steps are only those of its arrows. */
-const isWrong = ({ validity }) => !validity.valid && (!validity.stepMismatch || validity.rangeUnderflow || validity.rangeOverflow);
 
 /** What a start means. */
 const meaning = (name, waits) => `${name} may move by itself${waits ? ". Drive by hand to interrupt it" : ""}`;

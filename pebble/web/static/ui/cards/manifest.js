@@ -1,6 +1,5 @@
 // A self-describing microcontroller: what its commands hold. The server has checked its manifest. Pure.
 
-import { plain } from "../parts/more-words.js";
 import { inner } from "../parts/words.js";
 
 /** @type {Record<string, [number, number]>} */
@@ -12,7 +11,6 @@ const RANGES = {
   u32: [0, 2 ** 32 - 1],
   i32: [-(2 ** 31), 2 ** 31 - 1],
 };
-const LARGEST_F32 = 3.4028234e38;
 
 /** @typedef {{name: string, type?: string, scale?: number, offset?: number, unit?: string}} Field */
 
@@ -46,36 +44,8 @@ export function step({ type, scale = 1, offset = 0 }) {
 }
 
 /**
- * What was entered, as JSON: a boolean, or a number that the field can hold. One that is scaled is rounded by the robot.
- * @param {Field} field @param {string | boolean | undefined} entered
- * @returns {{value: boolean | number} | {problem: string}}
- */
-export function parse(field, entered) {
-  if (field.type === "bool") return { value: entered === true };
-  const written = typeof entered === "string" ? entered.trim() : "";
-  const limits = range(field);
-  const { scale = 1, offset = 0 } = field;
-  const unit = field.unit ? ` ${field.unit}` : "";
-  const wanted = limits ? `${plainNumber(limits[0])} to ${plainNumber(limits[1])}${unit}` : `a number${unit}`;
-  const problem = { problem: `${field.name}: ${wanted}` };
-  const value = Number(written);
-  if (!written || !Number.isFinite(value)) return problem;
-  if (!limits) return Math.abs((value - offset) / scale) > LARGEST_F32 ? problem : { value };
-  if (value < limits[0] || value > limits[1]) return problem;
-  const isPlain = scale === 1 && offset === 0;
-  return isPlain && !Number.isInteger(value) ? { problem: `${field.name}: a whole number, ${wanted}` } : { value };
-}
-
-const plainNumber = (value) => String(Number(value.toPrecision(10)));
-
-/**
- * The value of a command, with exactly the fields that are declared; or what is wrong with it.
+ * The value of a command, with exactly the fields that are declared. What they cannot hold, the browser has refused.
  * @param {Interface} one @param {Map<string, string | boolean>} entered by name of the field
- * @returns {{value: Record<string, boolean | number>, problems: string[]}}
  */
-export function command(one, entered) {
-  const parsed = one.encoding.fields.map((field) => /** @type {const} */ ([field.name, parse(field, entered.get(field.name))]));
-  const problems = parsed.flatMap(([, result]) => ("problem" in result ? [result.problem] : []));
-  const values = parsed.flatMap(([name, result]) => ("value" in result ? [[name, result.value]] : []));
-  return { value: Object.fromEntries(values), problems };
-}
+export const command = ({ encoding: { fields } }, entered) =>
+  Object.fromEntries(fields.map(({ name, type }) => [name, type === "bool" ? entered.get(name) === true : Number(entered.get(name))]));

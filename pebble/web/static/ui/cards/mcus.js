@@ -6,6 +6,7 @@ import { command, fieldOf, range, step, unsendable } from "./manifest.js";
 import { Icon, Why, isGone } from "../parts/parts.js";
 import { Lines } from "./plot.js";
 import { recorderOf } from "../parts/recorder.js";
+import { refuses } from "../parts/typed.js";
 import { useReasons, whyNotMoved } from "../parts/why-not.js";
 import { plain } from "../parts/more-words.js";
 import { clockTime, inner, roughly } from "../parts/words.js";
@@ -123,12 +124,11 @@ function Form({ at, uid, one, id, whyNot }) {
   const answer = useAnswer(asked?.n);
   const names = isLevel(uid) && isLevel(one.name);
   const own = unsendable(one) || (names ? "" : "its name cannot be part of a topic");
-  const { value, problems } = command(one, entered);
-  const why = own || whyNot || problems.join("; ");
+  const why = own || whyNot;
   const send = (event) => {
     event.preventDefault();
-    if (why) return;
-    ask({ at: Date.now(), n: commands.commandMcu(at, uid, one.name, value) });
+    if (why || refuses(event.currentTarget)) return;
+    ask({ at: Date.now(), n: commands.commandMcu(at, uid, one.name, command(one, entered)) });
   };
   const change = (name, what) => enter(new Map(entered).set(name, what));
   return html`<form class="mcu-in" data-test=${`mcu-in-${one.name}`} noValidate onSubmit=${send}>
@@ -174,6 +174,7 @@ function Entry({ field, entered, change }) {
   return html`<label class="mcu-number"
     >${label}<input
       type="number"
+      required
       data-test=${test}
       min=${least}
       max=${most}
