@@ -2,7 +2,7 @@
 
 import * as browser from "../core/browser.js";
 import { Sequence, inflate, readPayload } from "./decode.js";
-import { PayloadError, UnsupportedError } from "./errors.js";
+import { UnsupportedError } from "./errors.js";
 import { H264Decoder } from "./h264.js";
 import { checked } from "./jpeg.js";
 
@@ -54,7 +54,6 @@ export class PictureDecoder {
       this.h264.close();
       this.sequence.refuse(error);
       this.unsupported = error instanceof UnsupportedError;
-      if (!this.unsupported && !(error instanceof PayloadError)) throw error;
       return null;
     }
   }
@@ -109,7 +108,7 @@ export class PictureDecoder {
     const { context } = this;
     const { width, height } = difference;
     if (!context || context.canvas.width !== width || context.canvas.height !== height) {
-      throw new PayloadError("a difference of another size than the picture it builds on");
+      throw new Error("a difference of another size than the picture it builds on");
     }
     const reference = this.reference ?? context.getImageData(0, 0, width, height);
     context.drawImage(difference, 0, 0);
@@ -121,7 +120,7 @@ export class PictureDecoder {
 }
 
 /**
- * A bitmap of a whole JPEG; throws PayloadError for anything else.
+ * A bitmap of a whole JPEG; throws an Error for anything else.
  * @param {Uint8Array} bytes
  * @returns {Promise<ImageBitmap>}
  */
@@ -131,9 +130,9 @@ export async function decodeJpeg(bytes) {
   try {
     bitmap = await browser.find("createImageBitmap")(new Blob([/** @type {any} */ (plain)], { type: "image/jpeg" }), AS_IT_IS);
   } catch (error) {
-    throw new PayloadError(`JPEG: ${error}`);
+    throw new Error(`JPEG: ${error}`);
   }
-  if (bitmap.width !== width || bitmap.height !== height) throw new PayloadError("JPEG: decoded to another size");
+  if (bitmap.width !== width || bitmap.height !== height) throw new Error("JPEG: decoded to another size");
   return bitmap;
 }
 
