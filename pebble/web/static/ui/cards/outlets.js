@@ -1,7 +1,7 @@
 // Switched sockets: what their station reports of each, and what was asked of it.
 
-import { isLevel, useAnswer } from "../parts/asking.js";
-import { html, useEffect, useMetric, useOnline, useState, useTick } from "../parts/hooks.js";
+import { isLevel, useWish } from "../parts/asking.js";
+import { html, useMetric, useOnline } from "../parts/hooks.js";
 import { Why } from "../parts/parts.js";
 import { useReasons, whyNotEnd, whyNotMoved } from "../parts/why-not.js";
 
@@ -57,20 +57,12 @@ function Outlet({ at, id, name, controls, page }) {
   const payload = useMetric(at, `outlets/${name}/status`)?.value;
   const online = useOnline(at);
   const report = payload?.value ?? {};
-  const [asked, ask] = useState(/** @type {{on: boolean, at: number, n: number} | null} */ (null));
-  const answer = useAnswer(asked?.n);
-  const refused = answer.op === "refused";
-  const waits = asked !== null && report.on !== asked.on && !refused;
-  useEffect(() => {
-    if (asked && report.on === asked.on) ask(null);
-  }, [asked, report.on]);
-  useTick(waits ? 500 : 0);
-  const late = waits && performance.now() - asked.at > CONFIRMED_MS;
+  const { wish, waits, late, refused, ask } = useWish(report.on, CONFIRMED_MS);
   const words = report.on === true ? "on" : report.on === false ? "off" : "unknown";
-  const on = !(waits && !late ? asked.on : report.on === true); // what the next press asks
+  const on = !(waits && !late ? wish.on : report.on === true); // what the next press asks
   const own = obstacle(name, controls, report, on);
   const common = on ? whyNotMoved(page, at) : whyNotEnd(page);
-  const press = () => ask({ on, at: performance.now(), n: page.commands.switchOutlet(at, name, on) });
+  const press = () => ask(on, page.commands.switchOutlet(at, name, on));
   const why = [common && "why-outlets", own && `why-outlet-${id}`].filter(Boolean).join(" ");
   return html`<li class="outlet">
     <span class="outlet-name">
@@ -78,9 +70,9 @@ function Outlet({ at, id, name, controls, page }) {
       <span data-test=${`outlet-state-${name}`}>${online ? words : `was ${words}`}</span>
       ${waits &&
       html`<span class=${late ? "bad" : "late"} role="status" data-test=${`outlet-asked-${name}`}
-        >asked: ${asked.on ? "on" : "off"}${late ? ", not confirmed" : ""}</span
+        >asked: ${wish.on ? "on" : "off"}${late ? ", not confirmed" : ""}</span
       >`}
-      ${refused && html`<span class="bad" role="status">not done: ${answer.why}</span>`}
+      ${refused && html`<span class="bad" role="status">not done: ${refused}</span>`}
       ${own && html`<${Why} id=${`why-outlet-${id}`}>${own}<//>`}
     </span>
     <button

@@ -64,7 +64,7 @@ class ReplaySound extends Sound {
   }
 
   /** A seek: what waits at the loudspeaker is not played. */
-  begin() {
+  restart() {
     if (!this.worker || !this.listening) return;
     const { port1, port2 } = new MessageChannel();
     this.speaker.attach(port2);
@@ -267,7 +267,7 @@ export class Replay extends Model {
     this.isOutdated = true;
     this.video.forget();
     this.pictures.begin();
-    this.sound.begin();
+    this.sound.restart();
   }
 
   take(message) {
