@@ -177,8 +177,9 @@ _SECTIONS: dict[str, Any] = dict.fromkeys(_OFFERS, dict[str, Any]) | {"identity"
 def _capabilities(payload: Any) -> Any:
     """Return the sections that can be read."""
     value = _inner(payload)
-    sections = _object(dict[str, Any], value)
-    kept = {name: section for name, section in sections.items() if _readable(_SECTIONS.get(name, Any), [section])}
+    if not isinstance(value, dict):
+        return {}
+    kept = {name: section for name, section in value.items() if _readable(_SECTIONS.get(name, Any), [section])}
     return payload if kept == value and value is not payload else {"value": kept}
 
 

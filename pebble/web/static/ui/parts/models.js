@@ -263,7 +263,7 @@ export class Offers {
   constructor(ref, capabilities, metrics = []) {
     this.metrics = metrics;
     this.isRobot = ref.split("/")[1] === "robots";
-    this.known = Boolean(capabilities);
+    this.known = Boolean(capabilities?.value);
     this.value = capabilities?.value ?? {};
     this.assumed = !this.known && this.isRobot;
   }

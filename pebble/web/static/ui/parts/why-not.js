@@ -47,7 +47,7 @@ export function whyNotMoved(page, ref, section = "") {
 }
 
 /** @param {any} capabilities payload @param {string} name @returns {Record<string, any>} empty if there is none */
-export const sectionOf = (capabilities, name) => capabilities?.value[name] ?? {};
+export const sectionOf = (capabilities, name) => capabilities?.value?.[name] ?? {};
 
 const picked = ({ isOpen, you }) => `${isOpen} ${you?.role}`;
 

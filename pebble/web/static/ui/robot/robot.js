@@ -163,7 +163,7 @@ function Portrait({ at, offers, view, video, source, stage, watches, onPanel }) 
       ${engineers.length > 0 && html`<h2 class="engineers-head">For engineers</h2>`} ${engineers.map(shown)}
       ${tab === "more" &&
       html`<${Missing} at=${at} offers=${offers} view=${view} hasVideo=${Boolean(video)} />
-        <${MoreSettings} onPanel=${onPanel} view=${view} />`}
+        <${MoreSettings} onPanel=${onPanel} />`}
     </div>
     <nav class="tabs" aria-label="Parts of this page">
       ${tabs.map(
@@ -200,7 +200,7 @@ function Immersive({ at, offers, view, video, source, drawer, onPanel }) {
       html`<${Card} id="drive-settings" title="Driving" icon="wheel"><${Speed} /><${Part} part=${DRIVE} open /><//>`}
       ${video && html`<${PictureCard} ...${{ at, source, offers, video }} />`}
       ${cards.map((card) => html`<${CardOf} key=${card.id} card=${card} ...${{ at, offers, view }} />`)}
-      <${MoreSettings} onPanel=${onPanel} view=${view} />
+      <${MoreSettings} onPanel=${onPanel} />
     </aside>`}
   </div>`;
 }
@@ -221,7 +221,7 @@ function Extras({ at, offers }) {
   );
 }
 
-const MoreSettings = ({ onPanel, view }) => html`<button type="button" class="wide" data-test="settings" onClick=${onPanel}>
+const MoreSettings = ({ onPanel }) => html`<button type="button" class="wide" data-test="settings" onClick=${onPanel}>
     <${Icon} name="settings" /><${SettingsWords} />
   </button>
   ${browser.fullScreen.on &&
