@@ -12,7 +12,7 @@ from tests.web.states import described
 
 _MODULES = {
     "ui/cards/manifest.js": "command, range, step, unsendable",
-    "ui/cards/lines.js": "Lines",
+    "ui/cards/lines.js": "linesOf",
     "ui/cards/outlets.js": "outletsOf, obstacle",
     "ui/parts/models.js": "Offers",
 }
@@ -62,7 +62,7 @@ RANGES: list[tuple[dict[str, Any], Any, str]] = [
 
 
 def lines(payload: Any) -> list[list[Any]]:
-    made = run("new Lines(v[0])", payload)
+    made = run("linesOf(v[0])", payload)
     assert made["omitted"] == 0
     return [[line["depth"], line["key"], line["text"]] for line in made["lines"]]
 
@@ -81,7 +81,7 @@ def test_values_of_any_depth_and_length_have_an_end() -> None:
     for _ in range(30):
         deep = {"a": [deep, {"b": deep}]} if _ < 3 else {"a": deep}
     assert max(line[0] for line in lines(deep)) <= 4
-    wide = run("new Lines(v[0])", {"value": {str(n): {"x": n} for n in range(5000)}})
+    wide = run("linesOf(v[0])", {"value": {str(n): {"x": n} for n in range(5000)}})
     assert len(wide["lines"]) <= 101
     assert wide["omitted"] >= 4900
 
