@@ -226,7 +226,7 @@ FORMS: Rows = {
         """, ["1 more, at its default", "2 more, all at their defaults", "1 more, 1 changed"]),
     "forms are remembered by robot and script": ("""
         remember("goob", "a", new Map([["x", "1"]]));
-        remember("goob", "b", new Map([["x", "2"], ["y", ""]]));
+        remember("goob", "b", new Map([["x", "2"]]));
         remember("fred", "a", new Map([["x", "3"]]));
         result = [texts(remembered("goob", "a")), texts(remembered("goob", "b")), texts(remembered("fred", "b")),
           lastScript("goob"), lastScript("fred"), lastScript("lamp")];""",

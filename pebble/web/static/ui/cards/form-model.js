@@ -45,7 +45,7 @@ export const usual = (field) => String(field.default ?? "");
 
 /** What is sent, with the types of JSON: only what was filled in. @param {Field[]} fields @param {Texts} texts */
 export function filled(fields, texts) {
-  return Object.fromEntries(fields.filter(({ key }) => texts.get(key)).map((one) => [one.key, typed(one, texts.get(one.key))]));
+  return Object.fromEntries(fields.filter(({ key }) => texts.has(key)).map((one) => [one.key, typed(one, texts.get(one.key))]));
 }
 
 function typed({ type }, text) {
@@ -89,7 +89,7 @@ export function remembered(ref, file) {
  */
 export function remember(ref, file, texts) {
   const others = forms().filter((one) => one[0] !== ref || one[1] !== file);
-  const newest = [[ref, file, [...texts].filter(([, text]) => text)], ...others].slice(0, MOST_FORMS);
+  const newest = [[ref, file, [...texts]], ...others].slice(0, MOST_FORMS);
   while (newest.length > 1 && JSON.stringify(newest).length > LONGEST_FORMS) newest.pop();
   write("forms", newest);
 }

@@ -16,7 +16,7 @@ export const Form = ({ id, fields, texts, onText }) => html`<div class="ask-form
       id=${`${id}-${index}`}
       field=${field}
       text=${texts.get(field.key)}
-      onText=${(text) => onText(field.key, text === usual(field) ? null : text)}
+      onText=${(text) => onText(field.key, text === usual(field) ? null : text || null)}
     />`,
   )}
 </div>`;
@@ -26,7 +26,7 @@ function FormField({ id, field, text, onText }) {
   const name = plain(field.label);
   const restore = (event) => {
     const input = /** @type {HTMLInputElement} */ (document.getElementById(id));
-    if (field.type === "bool") input.checked = field.default;
+    if (field.type === "bool") input.checked = usual(field) === "true";
     else input.value = usual(field);
     if (event.detail === 0) input.focus(); // by a key: this button is about to go
     onText(null);
@@ -58,9 +58,7 @@ function kindOf({ type, default: usual, options }) {
 /** It keeps what is typed by itself. Once it is left empty, its default is there again. @param {any} props */
 function TextInput({ field, text, onText, ...props }) {
   const leave = ({ currentTarget: input }) => {
-    if (input.value || input.validity.badInput) return;
-    input.value = usual(field);
-    onText(null);
+    if (!input.value && !input.validity.badInput) input.value = usual(field);
   };
   return html`<input
     type="text"
