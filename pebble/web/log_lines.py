@@ -2,7 +2,7 @@
 
 import secrets
 from collections import deque
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import msgspec
 
@@ -13,6 +13,10 @@ MAX_LINES: Final = 500  # of one component; the oldest goes
 MAX_BYTES: Final = 256 * 1024  # of all lines together
 MAX_LINE_BYTES: Final = 16 * 1024  # of one line
 PART_BYTES: Final = 16 * 1024  # of one message to a page: echoes, without which it does not drive, wait behind it
+_TEXT, _WORD = 4000, 64  # characters of a line, and of its level and service
+_LATEST_MS = 8.6e15  # that browsers take for a date
+_TEXTS = {"message", "msg"}
+_SYNONYMS = {"WARN": "WARNING", "ERR": "ERROR", "FATAL": "CRITICAL", "TRACE": "DEBUG", "NOTICE": "INFO"}
 
 
 class Run(NamedTuple):
@@ -85,13 +89,50 @@ class LogReader:
         return run
 
 
+class Line(msgspec.Struct, omit_defaults=True):
+    """A line as pages get it: some robots send text, or other names; ``t`` is in epoch milliseconds."""
+
+    message: str
+    t: float | None = None
+    level: str = ""
+    service: str = ""
+
+
 def line_of(payload: bytes) -> msgspec.Raw | None:
-    """The line as JSON: some robots send plain text. None if it is too long."""
+    """Return the line as JSON; None if it is too long."""
     if len(payload) > MAX_LINE_BYTES:
         return None
     try:
-        codec.plain(LOGS, payload)
-        payload = codec.trim(payload)
+        plain = codec.plain(LOGS, payload)
     except PayloadError:
-        payload = msgspec.json.encode(payload.decode(errors="replace"))
-    return msgspec.Raw(payload) if len(payload) <= MAX_LINE_BYTES else None
+        plain = payload.decode(errors="replace")
+    raw = msgspec.json.encode(_line(plain))
+    return msgspec.Raw(raw) if len(raw) <= MAX_LINE_BYTES else None
+
+
+def _line(plain: Any) -> Line:
+    record = plain if isinstance(plain, dict) else {"message": plain}
+    if not _TEXTS & record.keys() and isinstance(record.get("value"), dict):
+        record = record | record["value"]
+    text = next((record[name] for name in ("message", "msg", "value") if name in record), record)
+    service = _word(record.get("service"))
+    message = _text(text).removeprefix(f"[{service}] " if service else "")  # it is shown beside it
+    level = _word(record.get("level")).upper()
+    return Line(message, _stamp(record), _SYNONYMS.get(level, level), service)
+
+
+def _word(value: object) -> str:
+    return value[:_WORD] if isinstance(value, str) else ""
+
+
+def _text(value: object) -> str:
+    text = value if isinstance(value, str) else "" if value is None else msgspec.json.encode(value).decode()
+    return text if len(text) <= _TEXT else f"{text[:_TEXT]}…"
+
+
+def _stamp(record: dict[str, Any]) -> float | None:
+    for name, per_ms in (("t", 1), ("timestamp", 1000)):
+        stamp = record.get(name)
+        if isinstance(stamp, int | float) and not isinstance(stamp, bool):
+            return stamp * per_ms if 0 < stamp * per_ms < _LATEST_MS else None
+    return None

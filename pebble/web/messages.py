@@ -248,8 +248,8 @@ class Ping(_ToPage, frozen=True, kw_only=True, tag="ping"):
 class State(_ToPage, frozen=True, kw_only=True, tag="state"):
     """The newest value of everything that changed: ``[ref, metric, value, age in ms]``; ``gone``: removed components.
 
-    Metrics are those of the contract, with their payload as JSON, and some of the server's own, below ``web/``.
-    null: the value was removed.
+    Metrics are those of the contract, with their payload as JSON, and some of the server's own, below ``web/``. What
+    cards read of a payload is as the contract has it, or left out. null: the value was removed.
     """
 
     now: float

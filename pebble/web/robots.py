@@ -21,6 +21,7 @@ from pebble.errors import PayloadError
 from pebble.transports import Message
 from pebble.web import messages as m
 from pebble.web.log_lines import LogLines
+from pebble.web.shown import shown
 
 log = logging.getLogger(__name__)
 
@@ -285,18 +286,19 @@ class Robots:
     def _store(self, component: Component, metric: str, channel: c.Channel, message: Message, now: float) -> bool:
         """Check and store the value; False if it is refused."""
         old = component.values.get(metric)
-        size = len(message.payload)
-        grows = size - (0 if old is None else len(bytes(old.raw)))
-        too_large = size > (_MAX_CLIPS_BYTES if channel is c.SOUNDBOARD_FILES else MAX_VALUE_BYTES)
-        if too_large or not self._has_room(component, metric, channel, grows):
+        if len(message.payload) > (_MAX_CLIPS_BYTES if channel is c.SOUNDBOARD_FILES else MAX_VALUE_BYTES):
             self.omitted += 1
             return False
         try:
-            codec.plain(channel, message.payload)
+            raw = shown(channel, message.payload, codec.plain(channel, message.payload))
         except PayloadError:
             return False
+        grows = len(raw) - (0 if old is None else len(bytes(old.raw)))
+        if not self._has_room(component, metric, channel, grows):
+            self.omitted += 1
+            return False
         self._bytes += grows
-        component.values[metric] = _Value(msgspec.Raw(message.payload), now)
+        component.values[metric] = _Value(msgspec.Raw(raw), now)
         if channel is not c.ONLINE:
             self._mark(component.ref, metric)
         return True

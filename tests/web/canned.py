@@ -33,13 +33,16 @@ from starlette.websockets import WebSocket, WebSocketDisconnect, WebSocketState
 
 from pebble.client.drive_reasons import WORDS
 from pebble.client.page import WebSettings
+from pebble.contract import channel_of
 from pebble.contract.packets import Codec, Picture, PictureKind, Sound
 from pebble.fleet.audit import Audit
 from pebble.media.speech import Speech
 from pebble.transports import MqttSettings
 from pebble.web.access.guard import CONTENT_SECURITY_POLICY
+from pebble.web.log_lines import line_of
 from pebble.web.messages import FromPage
 from pebble.web.recordings import routes as recordings
+from pebble.web.shown import shown
 from pebble.web.static_files import StaticFiles
 from tests.support import ROOT, free_port, until
 from tests.web import recorded
@@ -51,6 +54,12 @@ _decoder = msgspec.json.Decoder(FromPage)
 
 #: Component, metric, payload, and its age in ms.
 Value = tuple[str, str, Any, float]
+
+
+def _shown(metric: str, value: Any) -> Any:
+    """Return what the real server lets pages have of it."""
+    raw = json.dumps(value).encode()
+    return None if value is None else json.loads(shown(channel_of(f"outgoing/{metric}"), raw, value))
 
 
 @dataclass(frozen=True)
@@ -205,7 +214,8 @@ class CannedServer:
                 message = json.loads(await websocket.receive_text())
                 self._note(message)
                 if message["op"] == "read-logs" and message["on"]:
-                    lines = state.logs(self.now())
+                    raw = (line_of(json.dumps(line).encode()) for line in state.logs(self.now()))
+                    lines = [json.loads(bytes(line or b"")) for line in raw]
                     logs = {"op": "logs", "ref": message["ref"], "origin": "canned", "first": 213, "lines": lines}
                     await self._send(websocket, logs)
                 if message["op"] != "echo" and "n" in message:
@@ -263,7 +273,8 @@ class CannedServer:
                 await self._send_state(websocket, values)
 
     async def _send_state(self, websocket: WebSocket, values: list[Value]) -> None:
-        await self._send(websocket, {"op": "state", "now": self.now(), "set": values, "gone": []})
+        vouched = [(ref, metric, _shown(metric, value), age) for ref, metric, value, age in values]
+        await self._send(websocket, {"op": "state", "now": self.now(), "set": vouched, "gone": []})
 
     async def _send(self, websocket: WebSocket, message: dict[str, Any]) -> None:
         if websocket.application_state is WebSocketState.CONNECTED:

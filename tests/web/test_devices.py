@@ -107,7 +107,47 @@ def test_a_manifest_of_any_shape_is_read(payload: Any) -> None:
     assert robots.value(BASE, DESCRIBE) is not None
 
 
-@pytest.mark.parametrize("metric", ["status", "online", "capabilities", "charging-level"])
+FIELD = {"name": "x", "type": "u8"}
+INTERFACE = {"name": "a", "dir": "out", "encoding": {"fields": [FIELD]}}
+BARE = {"model": "", "firmware_version": "", "interfaces": []}
+TAG = {"key": "tag", "type": "int", "min": 0}
+FORM = {"key": "tag", "label": "tag", "type": "int", "default": None, "arg": "", "min": 0}
+#: Metrics, what a robot publishes, and what pages get of it.
+SHOWN: list[tuple[str, Any, Any]] = [
+    ("soundboard-files", {"files": ["a.wav"], "more": 1}, {"files": ["a.wav"], "more": 1}),
+    ("soundboard-files", {"value": {"files": ["a.wav"]}}, {"files": ["a.wav"]}),
+    *[("soundboard-files", value, {}) for value in (7, [], {"files": 7}, {"files": ["a", 7]})],
+    ("soundboard-status", {"playing": True, "file": {"x": 1}}, {}),
+    *[("autonomy-status", value, {}) for value in (None, {"running": 1}, {"running": True, "dependencies": ["x"]})],
+    ("autonomy-status", {"running": True, "file": None}, {"running": True, "file": None}),
+    *[("autonomy-files", value, {}) for value in (None, "x", {}, {"files": {}})],
+    ("autonomy-files", {"files": [{"file": "a", "configs": [TAG, 7, {}]}, {"file": 7}, "b"]},
+     {"files": [{"file": "a", "configs": [FORM]}]}),
+    ("autonomy-files", {"files": [{"file": "a", "label": 7}, {"file": ""}]}, {"files": []}),
+    (DESCRIBE, 7, BARE),
+    (DESCRIBE, {"model": {}, "firmware_version": ["x"], "interfaces": [7, INTERFACE, {**INTERFACE, "dir": "up"}]},
+     {**BARE, "interfaces": [INTERFACE]}),
+    ("outlets/o1/status", {"value": {"on": True}, "label": "Lamp"}, {"value": {"on": True}, "label": "Lamp"}),
+    *[("outlets/o1/status", value, {}) for value in (7, {"value": []}, {"value": {"on": "yes"}})],
+    ("media-status", {"t": 1, "value": {"camera": {"running": True}}}, {"camera": {"running": True}}),
+    ("media-status", {"t": 1, "value": {"camera": "x"}}, {}),
+    ("neighbours", {"receives": ["x"]}, {}),
+    *[("capabilities", value, {}) for value in (7, [], {"t": 1, "value": 7})],
+    ("capabilities", {"t": 1, "value": {"drive": {}, "mine": 7}}, {"t": 1, "value": {"drive": {}, "mine": 7}}),
+    ("capabilities", {"value": {"lights": 7, "identity": {"name": 7}, "outlets": {"outlets": [1]}, "reboot": True}},
+     {"value": {"reboot": True}}),
+    ("status", 7, 7),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("metric", "payload", "expected"), SHOWN)
+def test_pages_get_what_their_cards_rely_on(metric: str, payload: Any, expected: Any) -> None:
+    robots = Robots()
+    receive(robots, metric, payload)
+    assert json.loads(bytes(robots.value(BASE, metric) or b"null")) == expected
+
+
+@pytest.mark.parametrize("metric", ["status", "online", "charging-level"])
 def test_pages_get_a_value_without_the_bytes_around_it(metric: str) -> None:
     robots = Robots()
     robots.receive(Message(f"{BASE}/outgoing/{metric}", b'\xef\xbb\xbf{"t":1,"value":{}}\r\n\0'), 1.0)

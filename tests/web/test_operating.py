@@ -70,14 +70,14 @@ def test_a_page_that_reads_logs_receives_those_from_before_and_those_that_come(p
     assert until(lambda: lines(page))
     robot.publish("logs", {"t": 1, "level": "INFO", "service": "a", "message": "second"})
     publish(broker, f"{robot.base}/outgoing/logs", b"plain text")
-    assert until(lambda: lines(page)[-1:] == ["plain text"])
+    assert until(lambda: lines(page)[-1:] == [{"message": "plain text"}])
     first = page.logs[0]
     assert lines(page)[-2]["message"] == "second"
     page.send("read-logs", ref=robot.base, on=False)
     robot.publish("logs", {"message": "unread"})
     robot.publish("charging-level", {"value": 3.5})
     assert until(lambda: page.value(robot.base, "charging-level") is not None)
-    assert lines(page)[-1] == "plain text"
+    assert lines(page)[-1] == {"message": "plain text"}
     seen = len(lines(page))
     page.send("read-logs", ref=robot.base, on=True, origin=first["origin"], after=seen)
     assert until(lambda: lines(page)[-1] == {"message": "unread"})

@@ -22,6 +22,7 @@ import msgspec
 from pebble import contract as c
 from pebble.client.robot_view import RobotView
 from pebble.contract.channels import LOGS
+from pebble.contract.identity import Direction
 from pebble.errors import PebbleError
 from pebble.recordings.files.recorded import Recorded
 from pebble.recordings.replay.player import Player
@@ -33,6 +34,7 @@ from pebble.transports import Message
 from pebble.web import messages as m
 from pebble.web.log_lines import line_of
 from pebble.web.robots import liveness_of
+from pebble.web.shown import shown
 
 HEAD: Final = struct.Struct(">IB")
 TEXT, BINARY = 0, 1
@@ -239,7 +241,7 @@ class PlayedRobot:
             retained = message.channel.metadata.get("retained") == "1"
             self._robot.receive(channel, Message(message.channel.topic, payload, retain=retained), received, received)
         try:
-            msgspec.json.decode(payload)
+            payload = shown(c.channel_of(f"{Direction.OUTGOING}/{metric}"), payload, msgspec.json.decode(payload))
         except (ValueError, RecursionError):  # msgspec's are ValueErrors
             return
         self._values[metric] = msgspec.Raw(payload), received * 1e3

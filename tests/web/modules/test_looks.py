@@ -39,7 +39,7 @@ FACES: Rows = {
     "an outlet is one": ("result = look('r7', { value: { outlets: { available: true } } }).picture;", "outlets"),
     "another is unknown, and has a colour": ("result = brief(look('r7', null));", ["r7", "unknown", "string", 0]),
     "what is no look is not used": (
-        f"result = brief(look('constructor', {stated(name=7, colour='url(x)', picture='__proto__', battery_cells=-1)}));",  # noqa: E501
+        f"result = brief(look('constructor', {stated(colour='url(x)', picture='__proto__', battery_cells=-1)}));",
         ["constructor", "wheeled", "string", 0]),
     "a long name is cut": (f"result = look('r7', {stated(name='x' * 40)}).name;", "x" * 32 + " (r7)"),
     "a name steers nothing": (f"result = look('r7', {stated(name=chr(0x202E) + 'x')}).name;", "\\u202ex (r7)"),

@@ -57,7 +57,7 @@ window.compare = async (payloadsPath, expectedPath) => {
     bitmap.close();
   }
   decoder.h264.close();
-  return { shown, wants, counters: decoder.sequence.counters };
+  return { shown, wants };
 };
 
 /** Decode everything, and post the pictures' pixels, RGBA behind width and height. */

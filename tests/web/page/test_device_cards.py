@@ -109,9 +109,9 @@ def test_a_viewer_may_look(show: Show) -> None:
 
 def test_a_form_sends_exactly_the_declared_fields_in_their_types(cards: Tab, server: CannedServer) -> None:
     form = cards.test("mcu-in-lamp")
-    assert reason(cards, "send-lamp") == "level: 0 to 127.5 %"
     form.locator('[data-test="field-level"]').fill("200")
-    assert cards.test("send-lamp").is_disabled()
+    cards.test("send-lamp").click()
+    assert cards.page.evaluate("document.activeElement.dataset.test") == "field-level"  # it holds 0 to 127.5
     form.locator('[data-test="field-level"]').fill("62.5")
     form.locator('[data-test="field-on"]').check()
     cards.test("send-lamp").click()
@@ -133,13 +133,13 @@ def test_values_have_their_unit_and_a_line_of_the_last_minute(cards: Tab) -> Non
     reading = cards.test("reading-lux")
     reading.click()
     assert reading.get_attribute("aria-expanded") == "true"
-    drawn = """() => { PIXELS const canvas = document.querySelector("[data-test=spark]");
-      return canvas.width > 100 && pixelsOf(canvas).some((byte) => byte > 0); }"""
+    drawn = """() => { PIXELS const canvas = document.querySelector("[data-test=minute] canvas");
+      return canvas?.width > 100 && pixelsOf(canvas).some((byte) => byte > 0); }"""
     assert cards.until(drawn.replace("PIXELS", PIXELS))
-    assert "last minute" in str(cards.test("spark").get_attribute("aria-label"))
+    assert "last minute" in cards.test("minute").inner_text()
     assert cards.until(lambda: "/s" in cards.test("mcu-out-glow").inner_text())
     reading.click()
-    assert cards.test("spark").count() == 0
+    assert cards.test("minute").count() == 0
 
 
 def nested(depth: int) -> Any:
@@ -150,13 +150,8 @@ def nested(depth: int) -> Any:
 
 
 SCRIPT = "<img src=x onerror=alert(1)>"
-#: Manifests that arrive as they are: the server looks only at their size and depth.
+#: Manifests that the server lets pass.
 HOSTILE: dict[str, Any] = {
-    "array": [],
-    "text": SCRIPT,
-    "number": 7,
-    "deep": {"interfaces": [nested(28)], "model": nested(28)},
-    "wrong": {"interfaces": [None, 7, {"name": 1}, {"name": "a", "dir": "out", "encoding": {"fields": [None, 7]}}]},
     "script": {
         "model": SCRIPT,
         "interfaces": [{"name": SCRIPT, "dir": "out", "encoding": {"fields": [{"name": SCRIPT}]}}],
@@ -177,7 +172,6 @@ HOSTILE: dict[str, Any] = {
             for n in range(60)
         ]
     },
-    "many": {"interfaces": [{"name": f"i{n}", "dir": "out"} for n in range(900)]},
 }
 
 
@@ -193,7 +187,6 @@ def test_hostile_manifests_reports_and_capabilities_do_no_harm(show: Show, serve
         opened.test("mcu-hs105-sta").wait_for()
         assert opened.until(lambda: opened.page.locator(".mcu").count() == len(HOSTILE) + 2)
         assert opened.page.locator(".mcu img, .card .failed").count() == 0
-        assert opened.page.locator(".mcu", has_text="836 more").count() == 1
         opened.test("outlet-o2").click()
         assert opened.until(lambda: server.sent("outlet"))
         assert opened.complaints() == []

@@ -155,7 +155,7 @@ def test_the_cards_show_that_time_and_none_of_them_sends(replay: Tab):
     cards = replay.page.locator("[data-card]").evaluate_all("(all) => all.map((one) => one.dataset.card)")
     assert {"telemetry", "map", "plots", "logs", "values"} <= set(cards)
     for card in ("logs", "values"):
-        replay.page.locator(f"[data-card={card}] .card-head button").first.click()  # those for engineers are closed
+        replay.page.locator(f"[data-card={card}] .card-head [aria-expanded]").click()  # those for engineers are closed
     assert not {"lights", "sounds", "autonomy", "outlets", "mcus", "system", "drive"} & set(cards)
     assert replay.until(lambda: "7.91 V" in replay.page.locator("[data-card=telemetry]").inner_text())
     assert replay.until(lambda: "line 10" in replay.test("log-lines").inner_text())

@@ -30,7 +30,7 @@ def test_start_stays_in_view_and_covers_no_field(show: Show, size: Size) -> None
         if size in WAY:
             opened.page.locator(WAY[size]).first.click()
         opened.test("script-follow").click()
-        main = opened.page.locator(".scripts > li > .ask-form input")
+        main = opened.page.locator(".scripts > li > form > .ask-form input")
         assert [one.get_attribute("data-test") for one in main.all()] == ["set-n2", "set-n1", "set-n0"]
         assert [one.input_value() for one in main.all()] == ["0.5"] * 3
         opened.test("more-settings").click()

@@ -203,21 +203,6 @@ def test_the_battery_is_plotted_as_the_broker_carried_it(goob: Console, reports:
     assert goob.tab.until(lambda: newest() in goob.test("plot-battery").inner_text())
 
 
-@pytest.mark.thorough
-def test_what_was_sent_before_a_reload_is_plotted_after_it(goob: Console, reports: Reports) -> None:
-    goob.uncover("plot-acceleration")
-    assert goob.tab.until(lambda: len(rows(goob, "sensors/imu")) >= 15, 20)
-    before = rows(goob, "sensors/imu")
-    shown, carried = ([row["accel_norm_g"] for row in some] for some in (before, reports.values("sensors/imu")))
-    assert set(shown) <= set(carried)
-    goob.page.reload()
-    assert goob.tab.until("!!window.pebble?.connection.you")
-    goob.uncover("plot-acceleration")
-    assert goob.tab.until(lambda: any(row in before for row in rows(goob, "sensors/imu")), 10)
-    times = goob.page.evaluate(_ROWS.replace("rows ?? []", "times"), ["numbers", "sensors/imu"])
-    assert times == sorted(set(times))
-
-
 def test_the_map_follows_goob_while_it_drives(goob: Console, stage: Stage, wire: Wire, reports: Reports) -> None:
     """Its hall sensors are not published: odometry is where its simulated MCU says that it is."""
 

@@ -12,7 +12,7 @@ const TOKEN = "pebble-token"; // restores the driver lease after a reload
 
 /** @typedef {{store: any, version: string, name?: () => string, onOpen?: () => void, onLost?: () => void,
  *   onRefused?: (message: any) => void, onDone?: (message: any) => void, onLogs?: (message: any) => void,
- *   onSeries?: (message: any) => void, onBye?: (message: any) => void, maySend?: (op: string) => boolean,
+ *   onBye?: (message: any) => void, maySend?: (op: string) => boolean,
  *   onChange?: () => void}} Options */
 
 export class ControlSocket {

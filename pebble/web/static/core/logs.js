@@ -1,16 +1,10 @@
-/** Log lines of one component as the page keeps and filters them. Everything in them is of a robot: any JSON. Pure. */
-
-import { isObject } from "./json.js";
+/** Log lines of one component as the page keeps and filters them. Pure. */
 
 export const MOST = 500;
-const LONGEST = 4000; // characters of a line
-const NAME = 64; // characters of a service or logger
 const SERVICES = 60; // in the list to choose from
 
 /** From the least to the most important. */
 export const LEVELS = ["DEBUG", "INFO", "WARNING", "ERROR", "CRITICAL"];
-/** @type {Record<string, string>} */
-const SYNONYMS = { WARN: "WARNING", ERR: "ERROR", FATAL: "CRITICAL", TRACE: "DEBUG", NOTICE: "INFO" };
 
 /**
  * ``number`` grows with each line, ``t`` is epoch ms or null. ``gap``: stands where lines are missing, whatever is
@@ -41,7 +35,7 @@ export class LogBook {
 
   /**
    * Take lines of the server, with the number of the first. What was taken before is not taken again.
-   * @param {{origin: string, first: number, lines: readonly unknown[]}} message
+   * @param {{origin: string, first: number, lines: readonly any[]}} message
    */
   take({ origin, first, lines }) {
     if (!this.origin) this.cut = first > 1;
@@ -85,17 +79,9 @@ const isOf = (service, wanted) => service === wanted || service.startsWith(`${wa
 /** What the launcher says of it: how it ended, and when it is started again. */
 const isAbout = ({ service, text }, wanted) => service === "launcher" && text.startsWith(wanted);
 
-/**
- * @param {unknown} raw a record, a record in a ``value``, or plain text
- * @param {number} number @returns {Line}
- */
-export function lineOf(raw, number) {
-  const record = recordOf(raw);
-  const level = levelOf(record.level);
-  const service = name(record.service);
-  let text = cut(words(record.message ?? record.msg ?? record.value ?? (isObject(raw) ? raw : "")), LONGEST);
-  if (service && text.startsWith(`[${service}] `)) text = text.slice(service.length + 3); // it is shown beside it
-  return { number, t: stampOf(record), level, rank: rankOf(level), service, text, gap: false };
+/** @param {{message: string, t?: number, level?: string, service?: string}} record @param {number} number @returns {Line} */
+function lineOf({ message, t = null, level = "", service = "" }, number) {
+  return { number, t, level, rank: rankOf(level), service, text: message, gap: false };
 }
 
 /** @param {number} number @param {string} text @returns {Line} */
@@ -103,34 +89,5 @@ const gap = (number, text) => ({ number, t: null, level: "", rank: 0, service: "
 
 const dropped = (count) => `… ${count} ${count === 1 ? "line was" : "lines were"} dropped`;
 
-/** @param {unknown} raw @returns {Record<string, any>} */
-function recordOf(raw) {
-  let record = raw;
-  for (let depth = 0; depth < 3 && isObject(record) && !hasText(record) && isObject(record.value); depth++) {
-    record = { ...record, value: undefined, ...record.value };
-  }
-  return isObject(record) ? record : { message: raw };
-}
-
-const hasText = (record) => record.message !== undefined || record.msg !== undefined;
-
-/** @param {unknown} level @returns {string} "" if there is none */
-function levelOf(level) {
-  const text = name(level).toUpperCase().slice(0, 12);
-  return Object.hasOwn(SYNONYMS, text) ? SYNONYMS[text] : text;
-}
-
 /** What is unknown counts as INFO: it must not be lost among details. */
 const rankOf = (level) => (LEVELS.includes(level) ? LEVELS.indexOf(level) : 1);
-
-/** @returns {number | null} epoch ms */
-function stampOf(record) {
-  const t = Number.isFinite(record.t) ? record.t : Number.isFinite(record.timestamp) ? 1000 * record.timestamp : NaN;
-  return t > 0 && t < 8.6e15 ? t : null;
-}
-
-const name = (value) => (typeof value === "string" || typeof value === "number" ? cut(String(value), NAME) : "");
-
-const words = (value) => (typeof value === "string" ? value : (JSON.stringify(value) ?? ""));
-
-const cut = (text, most) => (text.length > most ? `${text.slice(0, most)}…` : text);

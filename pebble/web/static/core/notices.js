@@ -21,17 +21,17 @@ const EVENTS = {
     return online ? { state: true, kind: "online", text: "is online again" } : { state: false, kind: "offline", text: "is offline" };
   },
   stop(_before, view) {
-    if (!isObject(view)) return null;
+    if (!view) return null;
     const state = view.latched === true;
     return { state, text: state ? `was stopped by ${short(view.by) || "an unknown sender"}` : "" };
   },
   /** Who asks this page for control. */
   asks(_before, view) {
-    const state = isObject(view) && view.you === true ? short(view.asks) : "";
+    const state = view?.you ? short(view.asks) : "";
     return { state, text: state && `is wanted: ${state} asks to drive` };
   },
   script(_before, status) {
-    if (!isObject(status)) return null;
+    if (!status) return null;
     const state = status.error ? `script ${short(status.file) || "?"} failed: ${short(status.error)}` : "";
     return { state, text: state };
   },

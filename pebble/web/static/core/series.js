@@ -2,7 +2,6 @@
 
 import { isObject } from "./json.js";
 
-const REPEAT_MS = 1500; // after a new connection the newest value is sent again
 const GAP_MS = 2000; // at least so long without a value is a gap
 const GAP_PERIODS = 3.5;
 const SHOWN_PERIODS = 20; // from which the usual time between two values is taken
@@ -26,8 +25,7 @@ export class Series {
     this.rows = [];
     /** Counts what has changed. */
     this.version = 0;
-    this.until = -Infinity; // nothing of the past is missing before
-    this.since = Infinity; // nor after: the first live value of this connection
+    this.until = -Infinity; // what is older was forgotten
     /** @type {Row | null} */
     this.newest = null; // also if it was not worth remembering
     this.newestAt = -Infinity;
@@ -36,15 +34,8 @@ export class Series {
   /** Forget everything: time has jumped, perhaps back. */
   restart() {
     this.clear(-Infinity);
-    this.since = Infinity;
     this.newest = null;
     this.newestAt = -Infinity;
-  }
-
-  /** A new connection: what was sent between the two is missing. */
-  begin() {
-    this.until = Math.max(this.until, this.newestAt);
-    this.since = Infinity;
   }
 
   /** Forget everything that is older. @param {number} at */
@@ -55,14 +46,10 @@ export class Series {
     this.version++;
   }
 
-  /** A live value. @param {number} at @param {unknown} payload */
+  /** Take a value; a new connection sends the newest one again. @param {number} at @param {unknown} payload */
   push(at, payload) {
     const row = this.pick(payload);
-    const isFirst = this.since === Infinity;
-    if (isFirst) this.since = at;
-    if (!row) return;
-    const repeated = isFirst && this.newest !== null && at - this.newestAt < REPEAT_MS && isSame(row, this.newest);
-    if (at <= this.newestAt || at <= this.until || repeated) return;
+    if (!row || at <= this.newestAt || at <= this.until) return;
     this.newest = row;
     this.newestAt = at;
     this.version++;
@@ -114,12 +101,6 @@ export class Series {
     }
     return [times, ...columns];
   }
-}
-
-/** @param {Row} a @param {Row} b */
-function isSame(a, b) {
-  const keys = Object.keys(a);
-  return keys.length === Object.keys(b).length && keys.every((key) => a[key] === b[key]);
 }
 
 // -- numbers of a payload

@@ -1,28 +1,27 @@
 // Access units of H.264: their NAL units, and the codec string of a key frame. Pure.
 
-import { PayloadError } from "./errors.js";
 import { MAX_BYTES } from "./jpeg.js";
 
 const [IDR, SPS, PPS] = [5, 7, 8];
 
 /**
- * Throws PayloadError unless this is Annex B, and a key frame exactly if `keyframe`.
+ * Throws an Error unless this is Annex B, and a key frame exactly if `keyframe`.
  * @param {Uint8Array} unit
  * @param {boolean} keyframe
  * @returns {string|null} the codec string of a key frame, "avc1.42E01E"
  */
 export function checkUnit(unit, keyframe) {
-  if (unit.length > MAX_BYTES) throw new PayloadError(`h264: ${unit.length} bytes, more than ${MAX_BYTES}`);
+  if (unit.length > MAX_BYTES) throw new Error(`h264: ${unit.length} bytes, more than ${MAX_BYTES}`);
   if (!(unit[0] === 0 && unit[1] === 0 && (unit[2] === 1 || (unit[2] === 0 && unit[3] === 1)))) {
-    throw new PayloadError("h264: no start code");
+    throw new Error("h264: no start code");
   }
   const units = nalUnits(unit);
   const types = new Set(units.map(([type]) => type));
   if (keyframe && ![IDR, SPS, PPS].every((type) => types.has(type))) {
-    throw new PayloadError("h264: a key frame without its parameter sets or its picture");
+    throw new Error("h264: a key frame without its parameter sets or its picture");
   }
   if (!keyframe && (types.has(IDR) || types.has(SPS))) {
-    throw new PayloadError("h264: a key frame that is not marked as one");
+    throw new Error("h264: a key frame that is not marked as one");
   }
   const sps = units.find(([type]) => type === SPS);
   return sps ? codecString(unit, sps[1]) : null;

@@ -2,7 +2,7 @@
 
 import * as browser from "../core/browser.js";
 import { checkUnit } from "./access-unit.js";
-import { PayloadError, UnsupportedError } from "./errors.js";
+import { UnsupportedError } from "./errors.js";
 
 const HELD_MS = 150; // some decoders give a picture out only when the next one comes
 const FAILURES = 2; // key frames in a row that are whole and fail: this browser cannot decode them
@@ -25,7 +25,7 @@ export class H264Decoder {
   }
 
   /**
-   * The newest picture that is ready, with its label; null if the decoder holds it back. Throws PayloadError for what
+   * The newest picture that is ready, with its label; null if the decoder holds it back. Throws an Error for what
    * is damaged, UnsupportedError where this browser has no decoder.
    * @param {Uint8Array} unit with its seal, which decoders skip
    * @param {boolean} keyframe
@@ -43,7 +43,7 @@ export class H264Decoder {
       this.close();
       this.failures += keyframe ? 1 : 0;
       if (this.failures >= FAILURES) throw new UnsupportedError(`h264: ${error}`);
-      throw error instanceof UnsupportedError ? error : new PayloadError(`h264: ${error}`);
+      throw error instanceof UnsupportedError ? error : new Error(`h264: ${error}`);
     }
   }
 
@@ -63,7 +63,7 @@ export class H264Decoder {
   /** @param {Uint8Array} unit @param {string|null} codec of a key frame @param {any} label */
   async submit(unit, codec, label) {
     if (codec !== null && (this.decoder === null || codec !== this.codec)) await this.open(codec);
-    if (this.decoder === null) throw new PayloadError("no key frame yet");
+    if (this.decoder === null) throw new Error("no key frame yet");
     const timestamp = this.units++;
     this.labels.set(timestamp, label);
     this.decoder.decode(new (browser.find("EncodedVideoChunk"))({ type: codec === null ? "delta" : "key", timestamp, data: unit }));

@@ -77,18 +77,7 @@ class Depth {
 export class JitterBuffer {
   /** @param {{limit?: number, concealmentMs?: number, targetMs?: number}} [options] */
   constructor({ limit = 48, concealmentMs = 100, targetMs = 60 } = {}) {
-    this.counters = {
-      packets: 0, // that were played
-      duplicates: 0,
-      late: 0,
-      lost: 0,
-      overflow: 0,
-      skipped: 0, // left out to keep up
-      underruns: 0,
-      jumps: 0,
-      restarts: 0, // of the sender
-      concealedMs: 0,
-    };
+    this.lost = 0; // packets that never came, and those for which there was no room
     this.limit = limit;
     this.budget = concealmentMs / 1000;
     this.depth = new Depth(targetMs / 1000);
@@ -117,16 +106,11 @@ export class JitterBuffer {
   /** @param {Packet} packet @param {number} now */
   put(packet, now) {
     const number = modulo(packet.sequence - 1, NUMBERS) + 1;
-    if (this.isOld(number, packet.capturedMs)) {
-      this.counters.late++;
-    } else if (this.waiting.has(number)) {
-      this.counters.duplicates++;
-    } else {
-      if (!this.playing && !this.waiting.size) this.due = now + this.depth.target;
-      this.waiting.set(number, packet);
-      this.newestMs = Math.max(this.newestMs, packet.capturedMs);
-      this.makeRoom();
-    }
+    if (this.isOld(number, packet.capturedMs) || this.waiting.has(number)) return;
+    if (!this.playing && !this.waiting.size) this.due = now + this.depth.target;
+    this.waiting.set(number, packet);
+    this.newestMs = Math.max(this.newestMs, packet.capturedMs);
+    this.makeRoom();
   }
 
   /**
@@ -140,7 +124,6 @@ export class JitterBuffer {
     }
     this.behind++;
     if (capturedMs <= this.newestMs && this.behind < BEHIND_LIMIT) return true;
-    this.counters.restarts++;
     this.waiting.clear();
     this.expected = null;
     this.newestMs = this.behind = 0;
@@ -152,7 +135,7 @@ export class JitterBuffer {
     const bytes = () => [...this.waiting.values()].reduce((sum, { samples }) => sum + samples.byteLength, 0);
     while (this.waiting.size > 1 && (this.waiting.size > this.limit || bytes() > BYTES_LIMIT)) {
       this.waiting.delete(this.first());
-      this.counters.overflow++;
+      this.lost++;
       if (this.expected !== null) this.expected = this.first(); // left out on purpose: not a gap
     }
   }
@@ -165,11 +148,6 @@ export class JitterBuffer {
   }
 
   // -- out
-
-  /** Seconds until ``take`` may have something; null as long as nothing arrives. @param {number} now */
-  wait(now) {
-    return !this.playing && !this.waiting.size ? null : Math.max(0, this.due - now);
-  }
 
   /** The next chunk if it is due. @param {number} now @returns {Chunk|null} */
   take(now) {
@@ -200,18 +178,14 @@ export class JitterBuffer {
   /** @param {number} now @returns {Chunk|null} */
   next(now) {
     const { last } = this;
-    if (!this.waiting.size) {
-      if (last && !this.concealed) this.counters.underruns++;
-      return this.conceal(this.budget);
-    }
+    if (!this.waiting.size) return this.conceal(this.budget);
     const number = this.first();
     const missing = this.expected === null ? 0 : Math.max(0, ahead(number, this.expected));
     if (missing && last) {
       const concealed = this.conceal((missing * framesOf(last)) / last.rate);
       if (concealed) return concealed;
     }
-    if (missing > GAP_LIMIT) this.counters.jumps++;
-    else if (missing) this.counters.lost += missing;
+    if (missing) this.lost += missing > GAP_LIMIT ? 0 : missing;
     else if (this.concealed && last) this.depth.late(this.concealed / last.rate, now);
     return this.play(number, now);
   }
@@ -233,14 +207,13 @@ export class JitterBuffer {
     const packet = /** @type {Packet} */ (this.waiting.get(number));
     this.waiting.delete(number);
     this.expected = (number % NUMBERS) + 1;
-    this.counters.packets++;
     return packet.samples.length ? packet : null;
   }
 
   /** What to play after leaving out so much; it begins as ``sound`` does. @param {Samples} sound @param {number} excess seconds */
   leaveOut(sound, excess) {
     let newest = sound;
-    for (let left = excess; this.waiting.size && left > secondsOf(newest) - ROUNDING_S; this.counters.skipped++) {
+    for (let left = excess; this.waiting.size && left > secondsOf(newest) - ROUNDING_S; ) {
       left -= secondsOf(newest);
       newest = this.pop(this.first()) ?? newest;
     }
@@ -269,7 +242,6 @@ export class JitterBuffer {
       }
     }
     this.concealed += size;
-    this.counters.concealedMs += round((1000 * size) / rate);
     return { ...last, samples: made, concealed: true };
   }
 }

@@ -2,11 +2,11 @@
 
 import * as browser from "../core/browser.js";
 import { Sequence, inflate, readPayload } from "./decode.js";
-import { addDifference } from "./delta.js";
-import { PayloadError, UnsupportedError } from "./errors.js";
+import { UnsupportedError } from "./errors.js";
 import { H264Decoder } from "./h264.js";
 import { checked } from "./jpeg.js";
 
+const UNCHANGED = new Uint32Array(new Uint8Array([128, 128, 128, 255]).buffer)[0]; // most pixels of most differences
 // No profile may change a pixel: a difference would not fit any more.
 const AS_IT_IS = /** @type {const} */ ({ colorSpaceConversion: "none", premultiplyAlpha: "none" });
 
@@ -54,7 +54,6 @@ export class PictureDecoder {
       this.h264.close();
       this.sequence.refuse(error);
       this.unsupported = error instanceof UnsupportedError;
-      if (!this.unsupported && !(error instanceof PayloadError)) throw error;
       return null;
     }
   }
@@ -109,7 +108,7 @@ export class PictureDecoder {
     const { context } = this;
     const { width, height } = difference;
     if (!context || context.canvas.width !== width || context.canvas.height !== height) {
-      throw new PayloadError("a difference of another size than the picture it builds on");
+      throw new Error("a difference of another size than the picture it builds on");
     }
     const reference = this.reference ?? context.getImageData(0, 0, width, height);
     context.drawImage(difference, 0, 0);
@@ -121,7 +120,7 @@ export class PictureDecoder {
 }
 
 /**
- * A bitmap of a whole JPEG; throws PayloadError for anything else.
+ * A bitmap of a whole JPEG; throws an Error for anything else.
  * @param {Uint8Array} bytes
  * @returns {Promise<ImageBitmap>}
  */
@@ -131,13 +130,29 @@ export async function decodeJpeg(bytes) {
   try {
     bitmap = await browser.find("createImageBitmap")(new Blob([/** @type {any} */ (plain)], { type: "image/jpeg" }), AS_IT_IS);
   } catch (error) {
-    throw new PayloadError(`JPEG: ${error}`);
+    throw new Error(`JPEG: ${error}`);
   }
-  if (bitmap.width !== width || bitmap.height !== height) throw new PayloadError("JPEG: decoded to another size");
+  if (bitmap.width !== width || bitmap.height !== height) throw new Error("JPEG: decoded to another size");
   return bitmap;
 }
 
 /** @param {import("./decode.js").Payload} payload */
 function labelOf({ encoding, keyframe, frame, capturedMs }) {
   return { encoding, key: keyframe, frame, capturedMs };
+}
+
+/**
+ * reference = clip(reference + difference - 128). The array clips by itself; alpha stays 255.
+ * @param {Uint8ClampedArray} reference RGBA, changed in place
+ * @param {Uint8ClampedArray} difference RGBA, of the same size
+ */
+function addDifference(reference, difference) {
+  const pixels = new Uint32Array(difference.buffer, difference.byteOffset, difference.length >> 2);
+  for (let pixel = 0; pixel < pixels.length; pixel++) {
+    if (pixels[pixel] === UNCHANGED) continue;
+    const i = 4 * pixel;
+    reference[i] = reference[i] + difference[i] - 128;
+    reference[i + 1] = reference[i + 1] + difference[i + 1] - 128;
+    reference[i + 2] = reference[i + 2] + difference[i + 2] - 128;
+  }
 }

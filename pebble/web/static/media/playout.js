@@ -52,10 +52,9 @@ export class Playout {
 
   /** @returns {Stats} */
   stats() {
-    const { lost, overflow } = this.buffer.counters;
     const { received, refused, encoding } = this;
     const waiting = this.buffer.waitingS + (this.pushed - this.removed) / this.rate;
-    return { bufferedMs: Math.round(1000 * waiting), lost: lost + overflow, refused, encoding, received };
+    return { bufferedMs: Math.round(1000 * waiting), lost: this.buffer.lost, refused, encoding, received };
   }
 
   /** Seconds of the loudspeaker's clock. */

@@ -1,7 +1,5 @@
 // Packets of sound (PBAT) as pebble.media.sound reads them: the same ones are played, the same ones refused. Pure.
 
-import { PayloadError } from "./errors.js";
-
 const MAGIC = 0x50424154; // "PBAT"
 const HEAD_BYTES = 24;
 const [PCM, OPUS] = [1, 2];
@@ -21,14 +19,14 @@ const BUNDLE_LIMIT = 3; // Opus packets in one of ours
  * @property {Uint8Array} body
  */
 
-/** @param {Uint8Array} payload @returns {Sound} throws PayloadError for what cannot be played */
+/** @param {Uint8Array} payload @returns {Sound} throws an Error for what cannot be played */
 export function unpack(payload) {
-  if (payload.length < HEAD_BYTES) throw new PayloadError("less than a header");
+  if (payload.length < HEAD_BYTES) throw new Error("less than a header");
   const view = new DataView(payload.buffer, payload.byteOffset, payload.byteLength);
-  if (view.getUint32(0) !== MAGIC || view.getUint8(4) !== 1) throw new PayloadError("no packet of sound");
+  if (view.getUint32(0) !== MAGIC || view.getUint8(4) !== 1) throw new Error("no packet of sound");
   const [codec, channels, rate, frames] = [view.getUint8(5), view.getUint8(6), view.getUint16(8), view.getUint16(10)];
   if (!channels || !frames || channels > CHANNELS_LIMIT || rate < LOWEST_RATE || frames > rate) {
-    throw new PayloadError(`${frames} samples on ${channels} channels at ${rate} Hz cannot be played`);
+    throw new Error(`${frames} samples on ${channels} channels at ${rate} Hz cannot be played`);
   }
   const body = payload.subarray(HEAD_BYTES);
   const sequence = view.getUint32(12);
@@ -36,7 +34,7 @@ export function unpack(payload) {
   const sound = { rate, channels, frames, sequence, capturedMs, body };
   if (codec === PCM && body.length >= 2 * frames * channels) return { encoding: "pcm", ...sound };
   if (codec === OPUS && isOpus(sound)) return { encoding: "opus", ...sound };
-  throw new PayloadError(`a packet of codec ${codec} is damaged or unknown`);
+  throw new Error(`a packet of codec ${codec} is damaged or unknown`);
 }
 
 /** @param {Omit<Sound, "encoding">} sound */
@@ -57,10 +55,10 @@ export function split(body) {
   for (let at = 0; at < body.length; ) {
     const size = at + 2 <= body.length ? (body[at] << 8) | body[at + 1] : 0;
     at += 2 + size;
-    if (!size || at > body.length) throw new PayloadError("an Opus packet is empty or cut off");
+    if (!size || at > body.length) throw new Error("an Opus packet is empty or cut off");
     packets.push(body.subarray(at - size, at));
   }
-  if (!packets.length || packets.length > BUNDLE_LIMIT) throw new PayloadError(`${packets.length} Opus packets in one`);
+  if (!packets.length || packets.length > BUNDLE_LIMIT) throw new Error(`${packets.length} Opus packets in one`);
   return packets;
 }
 

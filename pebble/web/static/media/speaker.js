@@ -46,7 +46,9 @@ export class Speaker {
   }
 
   /** Play what comes by this port. @param {MessagePort} port of the worker */
-  attach = (port) => this.node?.port.postMessage({ port }, [port]);
+  attach(port) {
+    this.node?.port.postMessage({ port }, [port]);
+  }
 
   /** @param {boolean} muted */
   mute(muted) {

@@ -18,8 +18,7 @@ const RELOAD_MS = 5000; // where no person is there to press a button
 /** To be called once. @param {any} page */
 export function install(page) {
   const { driver } = page;
-  const doer = new Doer(page);
-  driver.onAction = (id, phase) => doer.act(id, phase);
+  driver.onAction = (id, phase) => act(page, id, phase);
   driver.actions = new Actions(
     (id, phase) => driver.onAction(id, phase),
     () => driver.ref !== "" && document.querySelector("dialog[open]") === null,
@@ -38,47 +37,38 @@ function controlEnd(by, idleMs) {
   return by ? `${by} took over` : `Your control has ended ${why}: take it again`;
 }
 
-/** Does what an action means. What other modules do is fetched with the first press. */
-class Doer {
-  constructor(page) {
-    this.page = page;
+/** Do what an action means. What other modules do is fetched with the first press. @param {any} page @param {string} id @param {"down" | "up"} phase */
+function act(page, id, phase) {
+  const { ref } = page.driver;
+  if (phase === "down" && WATCHES && !WATCHING.includes(id)) return undefined;
+  switch (id) {
+    case "help":
+      return page.panels.toggle("help");
+    case "faster":
+      return changeSpeed(page.driver, STEP);
+    case "slower":
+      return changeSpeed(page.driver, -STEP);
+    case "flash":
+      return say(page, import("./cards/lights-model.js").then((lights) => lights.toggleFlash(page, ref)));
+    case "repeat":
+      return say(page, import("./cards/sounds-model.js").then((sounds) => sounds.repeatLast(page, ref)));
+    case "mute":
+      return page.sound?.toggleMute();
+    case "talk":
+      return page.sound?.talk(phase === "down");
   }
+}
 
-  /** @param {string} id @param {"down" | "up"} phase */
-  act(id, phase) {
-    const { page } = this;
-    const { ref } = page.driver;
-    if (phase === "down" && WATCHES && !WATCHING.includes(id)) return undefined;
-    switch (id) {
-      case "help":
-        return page.panels.toggle("help");
-      case "faster":
-        return this.changeSpeed(STEP);
-      case "slower":
-        return this.changeSpeed(-STEP);
-      case "flash":
-        return this.say(import("./cards/lights-model.js").then((lights) => lights.toggleFlash(page, ref)));
-      case "repeat":
-        return this.say(import("./cards/sounds-model.js").then((sounds) => sounds.repeatLast(page, ref)));
-      case "mute":
-        return page.sound?.toggleMute();
-      case "talk":
-        return page.sound?.talk(phase === "down");
-    }
-  }
+function changeSpeed(driver, step) {
+  const speed = Math.round(100 * (driver.sliders.speed + step)) / 100;
+  driver.sliders.speed = Math.min(1, Math.max(SLOWEST, speed));
+  driver.changed();
+}
 
-  changeSpeed(step) {
-    const { driver } = this.page;
-    const speed = Math.round(100 * (driver.sliders.speed + step)) / 100;
-    driver.sliders.speed = Math.min(1, Math.max(SLOWEST, speed));
-    driver.changed();
-  }
-
-  /** @param {Promise<string>} answer why it was not done; "" it was */
-  async say(answer) {
-    const why = await answer.catch((error) => error.message);
-    if (why) this.page.connection.show(`Not done: ${why}`);
-  }
+/** @param {any} page @param {Promise<string>} answer why it was not done; "" it was */
+async function say(page, answer) {
+  const why = await answer.catch((error) => error.message);
+  if (why) page.connection.show(`Not done: ${why}`);
 }
 
 /** A screen that is not touched for days. */

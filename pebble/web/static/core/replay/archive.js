@@ -4,9 +4,6 @@ import { ROOT } from "../browser.js";
 
 const INDEXING_MS = 500; // between two questions for a day that is being indexed
 
-/** The server has answered, and asking the same again changes nothing: ``message`` is what it says. */
-export class RefusedError extends Error {}
-
 /**
  * @typedef {{since: number, until: number, why?: string}} Stretch
  * @typedef {{from: number, step: number, activity: number[], gaps: Stretch[], outages: Stretch[], sessions: Stretch[]}} Timeline
@@ -82,10 +79,9 @@ const query = (values) => new URLSearchParams(values).toString();
 /** @param {Response} answer */
 async function checked(answer) {
   if (answer.ok) return answer;
-  if (answer.status === 401) throw new RefusedError("log in again: the session has ended");
+  if (answer.status === 401) throw new Error("log in again: the session has ended");
   const line = (await answer.text()).split("\n")[0].slice(0, 300);
-  if (answer.status < 500 && answer.status !== 429) throw new RefusedError(line || `refused (${answer.status})`);
-  throw new Error(line || `the server failed (${answer.status})`);
+  throw new Error(line || `the server ${answer.status < 500 ? "refuses" : "failed"} (${answer.status})`);
 }
 
 /** @param {number} ms @param {AbortSignal} signal */

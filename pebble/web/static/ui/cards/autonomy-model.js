@@ -1,35 +1,7 @@
-// Which script of a robot runs, since when, and why none can be started. Robots may report anything.
+// Since when a script of a robot runs, and why none can be started.
 
 import { nameIn } from "../parts/looks.js";
 import { sectionOf, whyNotMoved } from "../parts/why-not.js";
-import { inner, isObject } from "../parts/words.js";
-
-const MOST_DEPENDENCIES = 16;
-
-/**
- * @typedef {{running: boolean, file: string, waits: boolean, error: string, pid: unknown,
- *   dependencies: {file: string, running: boolean}[], config: [string, unknown][]}} Status
- */
-
-/** @param {unknown} payload of autonomy-status @returns {Status} */
-export function statusOf(payload) {
-  const value = inner(payload);
-  const status = isObject(value) ? value : {};
-  const text = (one) => (typeof one === "string" ? one : "");
-  const parts = Array.isArray(status.dependencies) ? status.dependencies.filter(isObject) : [];
-  const running = status.running === true;
-  return {
-    running,
-    file: text(status.file) || (running ? "A script" : ""),
-    waits: status.overridden === true,
-    error: text(status.error),
-    pid: status.pid,
-    dependencies: parts
-      .slice(0, MOST_DEPENDENCIES)
-      .map((one) => ({ file: text(one.file) || "?", running: one.running === true })),
-    config: isObject(status.config) ? Object.entries(status.config).slice(0, 64) : [],
-  };
-}
 
 /** When the script of one robot was first seen running; robots report only that it runs. */
 export class Since {
@@ -40,7 +12,7 @@ export class Since {
     this.isExact = false;
   }
 
-  /** @param {Status} status @param {number} receivedAt epoch ms @returns {Since} */
+  /** @param {{running?: boolean, file?: string, pid?: number}} status @param {number} receivedAt epoch ms @returns {Since} */
   update({ running, file, pid }, receivedAt) {
     const run = running ? JSON.stringify([file, pid]) : "";
     if (run !== this.run) {

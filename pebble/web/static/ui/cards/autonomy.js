@@ -1,18 +1,20 @@
 // The scripts of a robot: which one runs, and a form to start one.
 
 import { useAnswer } from "../parts/asking.js";
-import { Since, handDriven, statusOf, whyNotStarted } from "./autonomy-model.js";
-import { filled, lastScript, moreWords, remember, remembered, scripts, whyNotSent } from "./form-model.js";
+import { Since, handDriven, whyNotStarted } from "./autonomy-model.js";
+import { filled, lastScript, moreWords, remember, remembered, scripts } from "./form-model.js";
 import { Form } from "./form.js";
 import { html, useMetric, useOnline, useState, useTick, useValue } from "../parts/hooks.js";
 import { Nothing } from "../parts/nothing.js";
 import { Icon, Why, useName } from "../parts/parts.js";
+import { refuses } from "../parts/typed.js";
 import { useReasons, whyNotEnd } from "../parts/why-not.js";
 import { plain } from "../parts/more-words.js";
 import { clockTime } from "../parts/words.js";
 import { useMemo } from "../../vendor/hooks.mjs";
 
 const ASKED_MS = 10_000; // so long the page says that it has asked
+const LONGEST_CONFIG = 14_000; // characters of JSON: the server reads messages of 16 KB
 
 export function Autonomy({ at }) {
   const page = useReasons(at);
@@ -21,8 +23,8 @@ export function Autonomy({ at }) {
   const payload = useValue(at, "autonomy-files");
   const listed = useMemo(() => scripts(payload), [payload]);
   const entry = useMetric(at, "autonomy-status");
-  const status = statusOf(entry?.value);
-  const [chosen, choose] = useState(() => status.file || lastScript(at));
+  const status = entry?.value ?? {};
+  const [chosen, choose] = useState(() => status.file ?? lastScript(at));
   const name = useName(at);
   const find = (file) => listed?.find((one) => one.file === file);
   const script = find(chosen);
@@ -62,8 +64,8 @@ function Row({ script, isOpen, onOpen, ...parts }) {
 }
 
 /** What a script does, as far as is known. */
-function how({ waits }, past) {
-  if (waits) return " waits: a person drives";
+function how({ overridden }, past) {
+  if (overridden) return " waits: a person drives";
   if (past) return " ran when it was last seen";
   return " runs";
 }
@@ -75,10 +77,12 @@ function Running({ at, page, entry, status, script }) {
   const [seen] = useState(() => new Since()); // what runs while the card is closed may be another run
   if (entry) seen.update(status, entry.at);
   const past = !useOnline(at);
+  const { dependencies = [] } = status;
+  const config = Object.entries(status.config ?? {});
   return html`<div class="ask-row ask-now">
       <p role="status" data-test="script-state">
         ${status.running
-          ? html`<b>${past ? "○" : "●"} ${plain(status.file)}</b>
+          ? html`<b>${past ? "○" : "●"} ${plain(status.file ?? "A script")}</b>
               ${how(status, past)},
               ${" "}${since(seen)}`
           : html`<span class="dim">No script runs.</span>`}
@@ -96,19 +100,19 @@ function Running({ at, page, entry, status, script }) {
     </div>
     ${why && (status.running || !entry) && html`<${Why} id="why-end-script">${why}<//>`}
     ${status.error && html`<p class="bad" data-test="script-error">✖ ${plain(status.error)}</p>`}
-    ${status.dependencies.length > 0 &&
+    ${dependencies.length > 0 &&
     html`<ul class="dependencies" aria-label="Scripts that it needs">
-      ${status.dependencies.map(
+      ${dependencies.map(
         ({ file, running }, index) => html`<li key=${index} class=${running ? "" : "bad"}>
           ${running ? "●" : "✖"} ${plain(file)} ${running ? "runs" : "does not run"}
         </li>`,
       )}
     </ul>`}
-    ${status.config.length > 0 &&
+    ${config.length > 0 &&
     html`<details class="effective">
-      <summary data-test="effective">Its settings (${status.config.length})</summary>
+      <summary data-test="effective">Its settings (${config.length})</summary>
       <dl class="values">
-        ${status.config.map(
+        ${config.map(
           ([key, value]) => html`<div key=${key}>
             <dt>${plain(label(key))}</dt>
             <dd>${plain(value)}</dd>
@@ -123,10 +127,12 @@ const since = ({ at, isExact }) => `since ${clockTime(at)}${isExact ? "" : " or 
 /** The form of one script, and its start. */
 function Starter({ at, page, entry, status, script }) {
   const [{ texts, version }, set] = useState(() => ({ texts: remembered(at, script.file), version: 0 }));
-  const [opened, setOpened] = useState(false);
+  const [asked, setAsked] = useState(/** @type {{at: number, of: number | undefined, n: number} | null} */ (null));
+  const answer = useAnswer(asked?.n);
+  const isAsked = asked !== null && Date.now() - asked.at < ASKED_MS && entry?.receivedAt === asked.of;
+  useTick(isAsked ? 1000 : 0);
   const { main, more } = script;
-  const form = filled(script.fields, texts);
-  const why = whyNotStarted(page, at) || whyNotSent(form);
+  const why = whyNotStarted(page, at);
   const { by, waits } = handDriven(page, at);
   const name = useName(at);
   const note = by && waits ? `${by} driving: the script will wait` : meaning(name, waits);
@@ -142,63 +148,42 @@ function Starter({ at, page, entry, status, script }) {
     const others = [...texts].filter(([one]) => one !== key);
     change(new Map(text === null ? others : [...others, [key, text]]));
   };
-  const shared = { texts, mistakes: form.mistakes, onText };
-  const wrong = more.some(({ key }) => form.mistakes.has(key));
-  return html`<${Form} key=${`main ${version}`} id="script-set" fields=${main} ...${shared} />
+  const start = (event) => {
+    event.preventDefault();
+    if (refuses(event.currentTarget)) return undefined;
+    const config = filled(script.fields, texts);
+    if (JSON.stringify(config).length > LONGEST_CONFIG) return page.connection.show("Not done: the settings are too long together");
+    const n = page.commands.startScript(at, script.file, config);
+    remember(at, script.file, texts); // it is the last one now
+    return setAsked({ at: Date.now(), of: entry?.receivedAt, n });
+  };
+  return html`<form noValidate onSubmit=${start}>
+    <${Form} key=${`main ${version}`} id="script-set" fields=${main} texts=${texts} onText=${onText} />
     ${more.length > 0 &&
-    html`<details class="script-more" open=${opened || wrong} onToggle=${(event) => setOpened(event.currentTarget.open)}>
+    html`<details class="script-more">
       <summary data-test="more-settings">${moreWords(more, texts)}</summary>
       <div class="script-more-fields" tabindex="0" role="group" aria-label="More settings">
-        <${Form} key=${`more ${version}`} id="script-more" fields=${more} ...${shared} />
-        ${script.omitted > 0 && html`<p class="dim">… ${script.omitted} more settings cannot be shown.</p>`}
+        <${Form} key=${`more ${version}`} id="script-more" fields=${more} texts=${texts} onText=${onText} />
       </div>
     </details>`}
     <div class="script-start">
-      <${StartButton}
-        at=${at}
-        page=${page}
-        entry=${entry}
-        why=${why}
-        config=${form.config}
-        file=${script.file}
-        >${startWords(status, script)}<//
+      <button class=${why ? "" : "primary"} data-test="start-script" disabled=${Boolean(why)} aria-describedby="why-start">
+        <${Icon} name="play" />${startWords(status, script)}
+      </button>
+      <span role="status" class=${answer.op === "refused" ? "bad" : "dim"} data-test="asked"
+        >${isAsked && startedWords(answer, name)}</span
       >
       ${texts.size > 0 &&
       html`<button type="button" data-test="restore-all" onClick=${restore}>
         All defaults
       </button>`}
       <${Why} id="why-start">${why || note}<//>
-    </div>`;
+    </div>
+  </form>`;
 }
 
 /** What a start means. */
 const meaning = (name, waits) => `${name} may move by itself${waits ? ". Drive by hand to interrupt it" : ""}`;
-
-function StartButton({ at, page, entry, why, config, file, children }) {
-  const [asked, setAsked] = useState(/** @type {{at: number, of: number | undefined, n: number} | null} */ (null));
-  const answer = useAnswer(asked?.n);
-  const name = useName(at);
-  const isAsked = asked !== null && Date.now() - asked.at < ASKED_MS && entry?.receivedAt === asked.of;
-  useTick(isAsked ? 1000 : 0);
-  const start = () => {
-    const n = page.commands.startScript(at, file, config);
-    if (n) remember(at, file, remembered(at, file)); // it is the last one now
-    setAsked({ at: Date.now(), of: entry?.receivedAt, n });
-  };
-  return html`<button
-      type="button"
-      class=${why ? "" : "primary"}
-      data-test="start-script"
-      disabled=${Boolean(why)}
-      aria-describedby="why-start"
-      onClick=${start}
-    >
-      <${Icon} name="play" />${children}
-    </button>
-    <span role="status" class=${answer.op === "refused" ? "bad" : "dim"} data-test="asked"
-      >${isAsked && startedWords(answer, name)}</span
-    >`;
-}
 
 /** @param {import("../parts/asking.js").Progress} answer @param {string} name */
 function startedWords({ op, why }, name) {
@@ -208,5 +193,5 @@ function startedWords({ op, why }, name) {
 
 function startWords({ running, file }, script) {
   if (!running) return "Start";
-  return file === script.file ? "Start again" : `Start instead of ${file.slice(0, 40)}`;
+  return file === script.file ? "Start again" : `Start instead of ${(file ?? "it").slice(0, 40)}`;
 }

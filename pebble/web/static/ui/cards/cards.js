@@ -131,7 +131,7 @@ export const CARDS = [
     icon: "chip",
     tab: "more",
     wants: (offers) => offers.metrics.some((metric) => metric.endsWith("/describe")),
-    part: styled(async (again) => (await import("./mcus.js" + again)).Mcus, "devices.css"),
+    part: styled(async (again) => (await import("./mcus.js" + again)).Mcus, "devices.css", "plots.css", "vendor/uPlot.css"),
   },
   {
     id: "logs",

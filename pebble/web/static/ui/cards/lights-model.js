@@ -12,36 +12,6 @@ const FIRST = { colour: "#ff8800", period: 2, mode: "", steady: "off" };
 
 /** @typedef {"solid" | "flash" | "off"} Mode */
 
-/** Calls the newest of what it is given, at most once in ``stepMs``. */
-export class Pacer {
-  /** @param {number} stepMs @param {() => number} [clock] @param {(fn: () => void, ms: number) => unknown} [later] */
-  constructor(stepMs, clock = () => performance.now(), later = (fn, ms) => setTimeout(fn, ms)) {
-    this.stepMs = stepMs;
-    this.clock = clock;
-    this.later = later;
-    this.calledAt = -Infinity;
-    /** @type {(() => void) | null} */
-    this.waiting = null;
-  }
-
-  /** @param {() => void} fn */
-  call(fn) {
-    const isDue = this.waiting === null;
-    this.waiting = fn;
-    const wait = this.calledAt + this.stepMs - this.clock();
-    if (wait <= 0) this.flush();
-    else if (isDue) this.later(() => this.flush(), wait);
-  }
-
-  flush() {
-    const fn = this.waiting;
-    if (!fn) return;
-    this.waiting = null;
-    this.calledAt = this.clock();
-    fn();
-  }
-}
-
 /** What was asked of one component's lights. ``mode`` "": nothing yet. */
 export class Lights extends Model {
   /** @param {string} ref */
@@ -55,7 +25,8 @@ export class Lights extends Model {
     this.mode = ["solid", "flash", "off"].includes(stored.mode) ? stored.mode : "";
     /** @type {Mode} what a flash returns to */
     this.steady = stored.steady === "solid" ? "solid" : "off";
-    this.pacer = new Pacer(STEP_MS);
+    this.sentAt = -Infinity;
+    this.timer = 0; // of what was asked too soon after that
     this.passed = this.state; // what the server has passed on last
     this.n = 0; // of the newest command
   }
@@ -74,8 +45,19 @@ export class Lights extends Model {
     this.period = period(seconds);
     this.mode = mode ?? (this.mode === "flash" ? "flash" : "solid");
     if (this.mode !== "flash") this.steady = this.mode;
-    this.pacer.call(() => this.send(page));
+    this.soon(page);
     this.changed();
+  }
+
+  soon(page) {
+    const send = () => {
+      this.timer = 0;
+      this.sentAt = performance.now();
+      this.send(page);
+    };
+    const wait = this.sentAt + STEP_MS - performance.now();
+    if (wait > 0) this.timer ||= setTimeout(send, wait);
+    else if (!this.timer) send();
   }
 
   /** What is refused was not asked: it is as it was before. */
@@ -90,7 +72,7 @@ export class Lights extends Model {
         // Of what does not flash, the period is only the next flash's: it may have changed since.
         this.passed = state.mode === "flash" ? state : { ...state, period: this.passed.period };
         this.save();
-      } else if ((answer || !connection.isOpen) && n === this.n && !this.pacer.waiting) {
+      } else if ((answer || !connection.isOpen) && n === this.n && !this.timer) {
         this.restore();
       }
       if (answer || !connection.isOpen) end();

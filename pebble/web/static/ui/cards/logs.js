@@ -5,7 +5,8 @@ import { LEVELS } from "../../core/logs.js";
 import { html, useEffect, useModel, usePage, useRef, useState, useValue } from "../parts/hooks.js";
 import { logViewOf } from "../parts/log-view.js";
 import { Why } from "../parts/parts.js";
-import { clockTime, inner, isObject } from "../parts/words.js";
+import { exactTime } from "../parts/more-words.js";
+import { inner, isObject } from "../parts/words.js";
 
 const SIGNS = { DEBUG: "·", INFO: "○", WARNING: "▲", ERROR: "✖", CRITICAL: "✖" };
 const END_PX = 24; // so near to the end the newest line is in sight
@@ -135,14 +136,12 @@ function draw({ number, t, level, service, text, gap }) {
   if (gap) return html`<li key=${number} class="log-gap">${text}</li>`;
   const known = LEVELS.includes(level); // a robot must not choose a class
   return html`<li key=${number} class=${`log-line ${known ? level.toLowerCase() : ""}`}>
-    <time title=${t === null ? "" : new Date(t).toLocaleString()}>${stamp(t)}</time>
+    <time title=${t === null ? "" : new Date(t).toLocaleString()}>${t === null ? "no time" : exactTime(t)}</time>
     <b class="log-level"><i aria-hidden="true">${SIGNS[level] ?? "○"}</i> ${level}</b>
     <span class="log-service">${service}</span>
     <span class="log-text">${text}</span>
   </li>`;
 }
-
-const stamp = (t) => (t === null ? "no time" : `${clockTime(t)}.${String(Math.floor(t) % 1000).padStart(3, "0")}`);
 
 function Empty({ view }) {
   const { connection } = usePage();

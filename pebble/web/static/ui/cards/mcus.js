@@ -1,13 +1,15 @@
 // A section for each self-describing microcontroller: what it measures, and what it takes as commands.
 
 import { isLevel, useAnswer } from "../parts/asking.js";
-import { html, useMetric, useOnline, usePage, useRef, useState, useTick, useValue } from "../parts/hooks.js";
-import { command, fieldOf, range, readManifest, step, text, unsendable } from "./manifest.js";
+import { html, useMetric, useOnline, usePage, useState, useTick, useValue } from "../parts/hooks.js";
+import { command, fieldOf, range, step, unsendable } from "./manifest.js";
 import { Icon, Why, isGone } from "../parts/parts.js";
-import { Spark, remember } from "./spark.js";
+import { Lines } from "./plot.js";
+import { recorderOf } from "../parts/recorder.js";
+import { refuses } from "../parts/typed.js";
 import { useReasons, whyNotMoved } from "../parts/why-not.js";
 import { plain } from "../parts/more-words.js";
-import { clockTime, roughly } from "../parts/words.js";
+import { clockTime, inner, roughly } from "../parts/words.js";
 
 const MOST = 16;
 
@@ -24,64 +26,71 @@ export function Mcus({ at, offers }) {
 }
 
 function Mcu({ at, uid, id, whyNot }) {
-  const manifest = readManifest(useValue(at, `mcu/${uid}/describe`));
-  const rows = manifest?.interfaces.map((one, index) => {
-    const key = `${one.isOut} ${one.name} ${index}`; // a new manifest must not inherit what was entered
-    if (one.isOut) return html`<${Readings} key=${key} at=${at} uid=${uid} one=${one} />`;
-    return html`<${Form} key=${key} at=${at} uid=${uid} one=${one} id=${`${id}-${index}`} whyNot=${whyNot} />`;
-  });
+  const { model, firmware_version: firmware, interfaces } = useValue(at, `mcu/${uid}/describe`) ?? { interfaces: [] };
   return html`<section class="mcu" aria-labelledby=${id} data-test=${`mcu-${uid}`}>
-    <h3 id=${id}>${text(uid)}</h3>
-    ${!manifest && html`<p class="bad">What it says of itself cannot be read.</p>`}
-    ${manifest &&
-    html`<p class="dim">${manifest.model || "unknown model"} · firmware ${manifest.firmware || "unknown"}</p>
-      ${rows}
-      ${manifest.omitted > 0 && html`<p class="dim">… ${manifest.omitted} more</p>`}`}
+    <h3 id=${id}>${uid}</h3>
+    <p class="dim">${model || "unknown model"} · firmware ${firmware || "unknown"}</p>
+    ${interfaces.map((one, index) => {
+      const key = `${one.dir} ${one.name} ${index}`; // a new manifest must not inherit what was entered
+      if (one.dir === "out") return html`<${Readings} key=${key} at=${at} uid=${uid} one=${one} />`;
+      return html`<${Form} key=${key} at=${at} uid=${uid} one=${one} id=${`${id}-${index}`} whyNot=${whyNot} />`;
+    })}
   </section>`;
 }
 
 /** The newest payload of an interface, under its own topic or under its alias. */
 function useReading(at, uid, one) {
   const own = useMetric(at, `mcu/${uid}/${one.name}`);
-  const alias = useMetric(at, one.channel);
+  const alias = useMetric(at, one.channel ?? "");
   return own ?? alias;
 }
 
+const MINUTE_MS = 60_000;
+const LIMITS = { spanMs: MINUTE_MS, most: 300, differs: (_row, _last, ms) => ms >= 240 };
+
+/** What can be drawn of a payload: numbers, and switches as 0 and 1. @param {any} payload */
+function drawable(payload) {
+  const fields = Object.entries(inner(payload) ?? {}).filter(([, value]) => isDrawable(value));
+  return Object.fromEntries(fields.map(([name, value]) => [name, Number(value)]));
+}
+
+const isDrawable = (value) => typeof value === "number" || typeof value === "boolean";
+
 function Readings({ at, uid, one }) {
+  const page = usePage();
   useTick(1000);
   const entry = useReading(at, uid, one);
   const online = useOnline(at);
-  const history = useRef(/** @type {import("./spark.js").Point[]} */ ([]));
-  if (entry) remember(history.current, entry);
   const { age = 0, period = 0 } = entry ?? {};
-  const repeats = one.kind === "sample" || one.rateHz > 0; // others are sent when they change
+  const repeats = one.kind === "sample" || one.rate_hz > 0; // others are sent when they change
   const gone = Boolean(entry) && isGone({ age, period: repeats ? period : 0 }, online);
   const late = repeats && period > 0 && age > 2 * period + 250;
   const rate = period > 0 && repeats && !gone ? `${plain(Number((1000 / period).toPrecision(2)))}/s` : "";
-  const since = entry ? `${roughly(age)} ago` : one.isPrivate ? "stays on the robot" : "nothing received yet";
+  const since = entry ? `${roughly(age)} ago` : one.local_only ? "stays on the robot" : "nothing received yet";
+  const metric = page.store.get(at, `mcu/${uid}/${one.name}`) ? `mcu/${uid}/${one.name}` : one.channel;
+  const series = entry && recorderOf(page, at).follow("drawable", metric, drawable, LIMITS);
   return html`<div class="mcu-out" data-test=${`mcu-out-${one.name}`}>
     <h4>
-      ${one.label}${" "}
+      ${one.name}${" "}
       <small class=${late ? "late" : ""}>${[one.profile, rate, since].filter(Boolean).join(" · ")}</small>
     </h4>
     <ul>
-      ${one.fields.map((field) => {
+      ${one.encoding.fields.map((field) => {
         const value = entry && fieldOf(entry.value, field.name);
-        return html`<${Reading} key=${field.name} field=${field} value=${value} gone=${gone} history=${history} />`;
+        return html`<${Reading} key=${field.name} field=${field} value=${value} gone=${gone} series=${series} />`;
       })}
     </ul>
-    ${one.omitted > 0 && html`<p class="dim">… ${one.omitted} more</p>`}
   </div>`;
 }
 
 /** One field; pressing it shows its last minute. */
-function Reading({ field, value, gone, history }) {
+function Reading({ field, value, gone, series }) {
   const [open, show] = useState(false);
-  const unit = field.unit && ` ${field.unit}`;
+  const unit = field.unit ? ` ${field.unit}` : "";
   const words = value === undefined ? "–" : gone ? `– (was ${plain(value)}${unit})` : `${plain(value)}${unit}`;
-  const name = html`<span class="dim">${text(field.name)}</span>`;
+  const name = html`<span class="dim">${field.name}</span>`;
   const shown = html`<span class=${gone ? "dim" : ""}>${words}</span>`;
-  if (typeof value !== "number" && typeof value !== "boolean") return html`<li class="reading">${name}${shown}</li>`;
+  if (!isDrawable(value)) return html`<li class="reading">${name}${shown}</li>`;
   return html`<li>
     <button
       type="button"
@@ -92,8 +101,20 @@ function Reading({ field, value, gone, history }) {
     >
       ${name}${shown}<${Icon} name=${open ? "up" : "plot"} />
     </button>
-    ${open && html`<${Spark} field=${field} history=${history} gone=${gone} />`}
+    ${open && html`<${Minute} series=${series} name=${field.name} unit=${unit} />`}
   </li>`;
+}
+
+/** The last minute of a field. */
+function Minute({ series, name, unit }) {
+  const now = usePage().store.clock();
+  const [, column] = series.columns([name], now - MINUTE_MS, now);
+  const values = column.filter((value) => value !== null);
+  const words = values.length ? `${plain(Math.min(...values))} to ${plain(Math.max(...values))}${unit}` : "no values";
+  return html`<div class="plots" data-test="minute">
+    <${Lines} key=${series} series=${series} fields=${[name]} shownMs=${MINUTE_MS} paused=${false} />
+    <small>last minute: ${words}</small>
+  </div>`;
 }
 
 function Form({ at, uid, one, id, whyNot }) {
@@ -103,22 +124,20 @@ function Form({ at, uid, one, id, whyNot }) {
   const answer = useAnswer(asked?.n);
   const names = isLevel(uid) && isLevel(one.name);
   const own = unsendable(one) || (names ? "" : "its name cannot be part of a topic");
-  const { value, problems } = command(one, entered);
-  const why = own || whyNot || problems.join("; ");
+  const why = own || whyNot;
   const send = (event) => {
     event.preventDefault();
-    if (why) return;
-    ask({ at: Date.now(), n: commands.commandMcu(at, uid, one.name, value) });
+    if (why || refuses(event.currentTarget)) return;
+    ask({ at: Date.now(), n: commands.commandMcu(at, uid, one.name, command(one, entered)) });
   };
   const change = (name, what) => enter(new Map(entered).set(name, what));
   return html`<form class="mcu-in" data-test=${`mcu-in-${one.name}`} noValidate onSubmit=${send}>
-    <h4>${one.label} ${one.profile && html`<small>${one.profile}</small>`}</h4>
-    ${one.fields.map((field) => html`<${Entry} key=${field.name} field=${field} entered=${entered} change=${change} />`)}
-    ${one.omitted > 0 && html`<p class="dim">… ${one.omitted} more</p>`}
+    <h4>${one.name} ${one.profile && html`<small>${one.profile}</small>`}</h4>
+    ${one.encoding.fields.map((field) => html`<${Entry} key=${field.name} field=${field} entered=${entered} change=${change} />`)}
     <button
       type="submit"
       data-test=${`send-${one.name}`}
-      aria-label=${`Send ${one.label}`}
+      aria-label=${`Send ${one.name}`}
       aria-describedby=${why ? id : undefined}
       disabled=${Boolean(why)}
     >
@@ -138,7 +157,7 @@ function askedWords({ op, why }, at) {
 
 function Entry({ field, entered, change }) {
   const value = entered.get(field.name);
-  const label = html`<span>${text(field.name)}${field.unit && html` <small>${field.unit}</small>`}</span>`;
+  const label = html`<span>${field.name}${field.unit && html` <small>${field.unit}</small>`}</span>`;
   const test = `field-${field.name}`;
   if (field.type === "bool") {
     return html`<label class="check"
@@ -155,6 +174,7 @@ function Entry({ field, entered, change }) {
   return html`<label class="mcu-number"
     >${label}<input
       type="number"
+      required
       data-test=${test}
       min=${least}
       max=${most}

@@ -1,13 +1,11 @@
 // Switched sockets: what their station reports of each, and what was asked of it.
 
-import { isLevel, useAnswer } from "../parts/asking.js";
-import { html, useEffect, useMetric, useOnline, useState, useTick } from "../parts/hooks.js";
+import { isLevel, useWish } from "../parts/asking.js";
+import { html, useMetric, useOnline } from "../parts/hooks.js";
 import { Why } from "../parts/parts.js";
 import { useReasons, whyNotEnd, whyNotMoved } from "../parts/why-not.js";
-import { inner, isObject } from "../parts/words.js";
 
 const MOST = 64;
-const LONG = 64; // characters of a name
 const CONFIRMED_MS = 3000;
 
 export function Outlets({ at, offers }) {
@@ -33,9 +31,7 @@ export function outletsOf(offers) {
   const section = offers.section("outlets");
   /** @type {Map<string, boolean>} */
   const found = new Map();
-  for (const one of Array.isArray(section.outlets) ? section.outlets : []) {
-    if (isObject(one) && typeof one.name === "string" && one.name) found.set(one.name, one.controls !== false);
-  }
+  for (const { name, controls } of section.outlets ?? []) found.set(name, controls !== false);
   for (const metric of offers.metrics) {
     const name = /^outlets\/([^/]+)\/status$/.exec(metric)?.[1];
     if (name && !found.has(name)) found.set(name, section.available !== true);
@@ -60,21 +56,13 @@ export function obstacle(name, controls, report, on) {
 function Outlet({ at, id, name, controls, page }) {
   const payload = useMetric(at, `outlets/${name}/status`)?.value;
   const online = useOnline(at);
-  const report = isObject(inner(payload)) ? inner(payload) : {};
-  const [asked, ask] = useState(/** @type {{on: boolean, at: number, n: number} | null} */ (null));
-  const answer = useAnswer(asked?.n);
-  const refused = answer.op === "refused";
-  const waits = asked !== null && report.on !== asked.on && !refused;
-  useEffect(() => {
-    if (asked && report.on === asked.on) ask(null);
-  }, [asked, report.on]);
-  useTick(waits ? 500 : 0);
-  const late = waits && performance.now() - asked.at > CONFIRMED_MS;
+  const report = payload?.value ?? {};
+  const { wish, waits, late, refused, ask } = useWish(report.on, CONFIRMED_MS);
   const words = report.on === true ? "on" : report.on === false ? "off" : "unknown";
-  const on = !(waits && !late ? asked.on : report.on === true); // what the next press asks
+  const on = !(waits && !late ? wish.on : report.on === true); // what the next press asks
   const own = obstacle(name, controls, report, on);
   const common = on ? whyNotMoved(page, at) : whyNotEnd(page);
-  const press = () => ask({ on, at: performance.now(), n: page.commands.switchOutlet(at, name, on) });
+  const press = () => ask(on, page.commands.switchOutlet(at, name, on));
   const why = [common && "why-outlets", own && `why-outlet-${id}`].filter(Boolean).join(" ");
   return html`<li class="outlet">
     <span class="outlet-name">
@@ -82,9 +70,9 @@ function Outlet({ at, id, name, controls, page }) {
       <span data-test=${`outlet-state-${name}`}>${online ? words : `was ${words}`}</span>
       ${waits &&
       html`<span class=${late ? "bad" : "late"} role="status" data-test=${`outlet-asked-${name}`}
-        >asked: ${asked.on ? "on" : "off"}${late ? ", not confirmed" : ""}</span
+        >asked: ${wish.on ? "on" : "off"}${late ? ", not confirmed" : ""}</span
       >`}
-      ${refused && html`<span class="bad" role="status">not done: ${answer.why}</span>`}
+      ${refused && html`<span class="bad" role="status">not done: ${refused}</span>`}
       ${own && html`<${Why} id=${`why-outlet-${id}`}>${own}<//>`}
     </span>
     <button
@@ -104,7 +92,6 @@ function Outlet({ at, id, name, controls, page }) {
 }
 
 function labelOf(payload, name) {
-  const label = isObject(payload) && typeof payload.label === "string" ? payload.label.trim() : "";
-  const text = label && label !== name ? `${label} (${name})` : name;
-  return text.length > LONG ? `${text.slice(0, LONG)}…` : text;
+  const label = payload?.label?.trim();
+  return label && label !== name ? `${label} (${name})` : name;
 }

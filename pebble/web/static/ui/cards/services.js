@@ -3,7 +3,7 @@
 import { html, useOnline, usePage, useValue } from "../parts/hooks.js";
 import { logViewOf } from "../parts/log-view.js";
 import { plain } from "../parts/more-words.js";
-import { inner, isObject, mediaOf } from "../parts/words.js";
+import { inner, isObject } from "../parts/words.js";
 
 const MOST = 64;
 const SIGNS = { ready: "●", init: "○", restarting: "▲", failed: "✖", stopped: "■" };
@@ -11,7 +11,7 @@ const SIGNS = { ready: "●", init: "○", restarting: "▲", failed: "✖", sto
 export function Services({ at, view }) {
   const { services, mcu } = inner(useValue(at, "status")) ?? {};
   const online = useOnline(at);
-  const media = mediaOf(useValue(at, "media-status"));
+  const media = Object.entries(useValue(at, "media-status") ?? {});
   if (!isObject(services)) return html`<p class="dim">It reports no services.</p>`;
   const names = Object.keys(services);
   return html`<ul class="services-list">
@@ -33,7 +33,7 @@ export function Services({ at, view }) {
       .map(([name, line]) => html`<${SerialLine} key=${`mcu ${name}`} name=${name} online=${online} line=${line} />`)}
     ${media.map(
       ([name, report]) => html`<li key=${`media ${name}`} class=${online ? "" : "dim"} data-test=${`media-${name}`}>
-        <i aria-hidden="true">${report?.running ? SIGNS.ready : SIGNS.init}</i>
+        <i aria-hidden="true">${report.running ? SIGNS.ready : SIGNS.init}</i>
         <span class="services-name">${name.replaceAll("_", " ")}</span>
         <span class="services-more">${online ? "" : "was: "}${mediaWords(report)}</span>
       </li>`,
@@ -42,7 +42,6 @@ export function Services({ at, view }) {
 }
 
 function mediaWords(report) {
-  if (!isObject(report)) return plain(report);
   if (report.last_error) return plain(report.last_error);
   return report.running ? plain(report.doing ?? "running") : "rests";
 }

@@ -2,10 +2,8 @@
 
 import { Model } from "../parts/models.js";
 import { whyNot } from "../parts/why-not.js";
-import { inner, isObject } from "../parts/words.js";
 
 const LONGEST_NAME = 1000; // characters, of the server
-const MOST = 20_000; // clips; robots list 256 KiB of names
 
 /** What was chosen here for one robot, since the page was loaded. */
 export class Sounds extends Model {
@@ -54,14 +52,6 @@ export function repeatLast(page, ref) {
   return last ? play(page, ref, last.file, last.repeat) : whyNot(page, ref, "soundboard") || "Play one sound first";
 }
 
-/** @param {unknown} payload of soundboard-files @returns {string[] | null} null: none was received */
-export function clips(payload) {
-  const value = inner(payload);
-  const files = isObject(value) ? value.files : value;
-  if (!Array.isArray(files)) return null;
-  return [...new Set(files.slice(0, MOST).filter((file) => typeof file === "string" && file.trim()))];
-}
-
 /**
  * The clips whose names contain every word of ``filter``: the first ``most`` of them by folder, and how many more.
  * @param {string[]} files @param {string} filter @param {number} most
@@ -77,12 +67,4 @@ export function grouped(files, filter, most) {
     folders.set(folder, [...(folders.get(folder) ?? []), file]);
   }
   return { folders: [...folders], more: Math.max(0, found.length - most) };
-}
-
-/** @param {unknown} payload of soundboard-status @returns {{file: string, error: string}} file "": nothing plays */
-export function playing(payload) {
-  const value = inner(payload);
-  const text = (one) => (typeof one === "string" ? one : "");
-  if (!isObject(value)) return { file: "", error: "" };
-  return { file: value.playing === true ? text(value.file) || "a clip" : "", error: text(value.error) };
 }

@@ -2,7 +2,7 @@
 
 import { html, useModel, useOnline, useValue } from "../parts/hooks.js";
 import { Icon, Why, useName } from "../parts/parts.js";
-import { clips, grouped, play, playing, repeatLast, soundsOf } from "./sounds-model.js";
+import { grouped, play, repeatLast, soundsOf } from "./sounds-model.js";
 import { useReasons, whyNot, whyNotEnd } from "../parts/why-not.js";
 import { plain } from "../parts/more-words.js";
 import { useMemo } from "../../vendor/hooks.mjs";
@@ -42,12 +42,12 @@ export function Sounds({ at }) {
 }
 
 function NowPlaying({ at, page }) {
-  const { file, error } = playing(useValue(at, "soundboard-status"));
+  const { playing, file, error } = useValue(at, "soundboard-status") ?? {};
   const why = whyNotEnd(page);
   const was = useOnline(at) ? "plays" : "played when it was last seen";
   return html`<div class="ask-row ask-now">
       <p role="status" data-test="playing">
-        ${file ? html`<b>♪ ${plain(file)}</b> ${was}` : html`<span class="dim">Nothing ${was}.</span>`}
+        ${playing ? html`<b>♪ ${plain(file ?? "a clip")}</b> ${was}` : html`<span class="dim">Nothing ${was}.</span>`}
       </p>
       <button
         type="button"
@@ -64,12 +64,11 @@ function NowPlaying({ at, page }) {
 }
 
 function Clips({ at, page, sounds, why }) {
-  const payload = useValue(at, "soundboard-files");
   const name = useName(at);
-  const files = useMemo(() => clips(payload), [payload]);
+  const { files } = useValue(at, "soundboard-files") ?? {};
   const { filter } = sounds;
   const shown = useMemo(() => grouped(files ?? [], filter, MOST), [files, filter]);
-  const now = playing(useValue(at, "soundboard-status")).file;
+  const { playing, file: now } = useValue(at, "soundboard-status") ?? {};
   if (!files) return html`<p class="dim">No list of clips was received yet: is soundboard_handler enabled in its config?</p>`;
   if (!files.length) return html`<p class="dim">No clips: put sound files into ${name}'s folder of sounds.</p>`;
   return html`<input
@@ -88,7 +87,7 @@ function Clips({ at, page, sounds, why }) {
           <ul>
             ${names.map(
               (file) => html`<li key=${file}>
-                <${Clip} at=${at} page=${page} file=${file} folder=${folder} plays=${file === now} why=${why} />
+                <${Clip} at=${at} page=${page} file=${file} folder=${folder} plays=${playing && file === now} why=${why} />
               </li>`,
             )}
           </ul>

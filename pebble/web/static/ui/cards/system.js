@@ -1,13 +1,13 @@
 // What can be done to the whole robot: restart, reboot, update; and the flags that allow pictures and sound.
 
-import { useAnswer } from "../parts/asking.js";
-import { html, useEffect, usePage, useState, useTick, useValue } from "../parts/hooks.js";
+import { useAnswer, useWish } from "../parts/asking.js";
+import { html, useEffect, usePage, useState, useValue } from "../parts/hooks.js";
 import { logViewOf } from "../parts/log-view.js";
 import { Panel } from "../panels/panel.js";
 import { HoldButton, Icon, Why, useName } from "../parts/parts.js";
 import { useReasons, whyNot, whyNotEnd } from "../parts/why-not.js";
 import { plain } from "../parts/more-words.js";
-import { clockTime, driverName, isObject } from "../parts/words.js";
+import { clockTime, driverName } from "../parts/words.js";
 
 /** @typedef {"reboot" | "service-restart" | "git-pull"} Action */
 
@@ -153,11 +153,11 @@ const SPELLINGS = {
  * @param {Action} action @param {any} capabilities their value; undefined: unknown @returns {string}
  */
 export function lacks(action, capabilities) {
-  if (!isObject(capabilities)) return "";
-  const system = isObject(capabilities.system) ? capabilities.system : {};
+  if (!capabilities) return "";
+  const { system = {} } = capabilities;
   const entry = SPELLINGS[action].map((name) => system[name] ?? capabilities[name]).find((known) => known !== undefined);
   if (entry === true) return "";
-  if (!isObject(entry) || entry.available === false) return "This robot does not offer it";
+  if (!entry || entry.available === false) return "This robot does not offer it";
   return entry.controls === false ? "Not set up on this robot" : "";
 }
 
@@ -186,20 +186,10 @@ function Flags({ at, offers }) {
 
 function Flag({ at, name, title, meaning, value, known }) {
   const page = useReasons(at);
-  const [asked, ask] = useState(/** @type {{on: boolean, at: number, was: any, n: number} | null} */ (null));
-  useEffect(() => {
-    // another operator's change may arrive in place of the echo
-    if (asked && (value === asked.on || value !== asked.was)) ask(null);
-  }, [asked, value]);
-  useTick(asked ? 500 : 0);
-  const answer = useAnswer(asked?.n);
-  const isWaiting = asked && answer.op !== "refused" && performance.now() - asked.at < ECHO_MS;
-  const pending = isWaiting ? asked : null;
+  const { wish, waits, late, refused, ask } = useWish(value, ECHO_MS);
+  const pending = waits && !late ? wish : null;
   const why = whyNotEnd(page, name === "remote-mirror" ? "system" : "drive") || (known ? "" : "Not received yet");
-  const change = (event) => {
-    const on = event.currentTarget.checked;
-    ask({ on, at: performance.now(), was: value, n: page.commands.setFlag(at, name, on) });
-  };
+  const change = ({ currentTarget: { checked } }) => ask(checked, page.commands.setFlag(at, name, checked));
   const id = `flag-${name}`;
   return html`<div class="flag">
     <label class="check"
@@ -213,14 +203,14 @@ function Flag({ at, name, title, meaning, value, known }) {
         onChange=${change}
       /><span>${title}</span></label
     >
-    <span class="flag-state" role="status">${flagWords(asked, pending, value, answer)}</span>
+    <span class="flag-state" role="status">${flagWords(late, pending, value, refused)}</span>
     <${Why} id=${`${id}-why`}>${why || meaning}<//>
   </div>`;
 }
 
-function flagWords(asked, pending, value, answer) {
+function flagWords(late, pending, value, refused) {
   const now = value === true ? "on" : value === false ? "off" : "never set";
   if (pending) return `asked: ${pending.on ? "on" : "off"}…`;
-  if (answer.op === "refused") return `✖ ${now}; not done: ${answer.why}`;
-  return asked && asked.on !== value ? `✖ not confirmed: ${now}` : now;
+  if (refused) return `✖ ${now}; not done: ${refused}`;
+  return late ? `✖ not confirmed: ${now}` : now;
 }

@@ -4,7 +4,7 @@ import { html, useMetric, useOnline, useTick, useValue } from "../parts/hooks.js
 import { Live } from "../parts/parts.js";
 import { poseOf, poseWords } from "../../core/trail.js";
 import { charging, plain } from "../parts/more-words.js";
-import { battery, inner, isObject, mediaOf, number, roughly, span, typeOf } from "../parts/words.js";
+import { battery, inner, isObject, number, roughly, span, typeOf } from "../parts/words.js";
 
 const STREAM_MS = 1000;
 const LEVEL_DEG = 3;
@@ -28,10 +28,10 @@ export function Telemetry({ at }) {
 
 /** For the maker of a robot that does not say what it can do. */
 function Hint({ at }) {
-  const value = inner(useValue(at, "capabilities"));
-  const isKnown = isObject(value) && value.announced !== true;
+  const value = useValue(at, "capabilities")?.value;
+  const isKnown = value && value.announced !== true;
   if (isKnown || typeOf(at) !== "robots") return null;
-  const offered = isObject(value) ? "What is offered here, it lists as its subscriptions" : "So there is nothing to drive";
+  const offered = value ? "What is offered here, it lists as its subscriptions" : "So there is nothing to drive";
   return html`<p class="dim" data-test="hint">
     It publishes no capabilities. ${offered}. docs/your-robot.md tells its maker what to publish.
   </p>`;
@@ -81,8 +81,8 @@ function Heartbeat({ at }) {
 
 /** Which robots of its LAN it receives, and whose script drives it. */
 function Neighbours({ at }) {
-  const { receives, driven_by: driver } = useValue(at, "neighbours") ?? {};
-  const robots = Object.entries(isObject(receives) ? receives : {}).map(([name, is]) => (is ? name : `not ${name}`));
+  const { receives = {}, driven_by: driver } = useValue(at, "neighbours") ?? {};
+  const robots = Object.entries(receives).map(([name, is]) => (is ? name : `not ${name}`));
   return html`${robots.length > 0 && html`<div><dt>Receives</dt><dd>${robots.join(", ")}</dd></div>`}
     ${driver && html`<div><dt>Driven by</dt><dd>a script of ${plain(driver)}</dd></div>`}`;
 }
@@ -112,8 +112,8 @@ function touch(payload) {
 
 /** What fails of camera and sound; how they run is with the services. */
 function Troubles({ at, online }) {
-  return mediaOf(useValue(at, "media-status"))
-    .filter(([, report]) => report?.last_error)
+  return Object.entries(useValue(at, "media-status") ?? {})
+    .filter(([, report]) => report.last_error)
     .map(
       ([name, report]) => html`<div key=${name}>
         <dt>${name.replaceAll("_", " ")}</dt>

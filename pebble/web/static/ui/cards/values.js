@@ -1,7 +1,7 @@
 // Everything that was received of a component, whatever its type: a group of lines for each metric.
 
 import { html, useMetric, useMetrics, useOnline, useState, useTick } from "../parts/hooks.js";
-import { Lines } from "./lines.js";
+import { linesOf } from "./lines.js";
 import { isGone } from "../parts/parts.js";
 import { plain } from "../parts/more-words.js";
 import { roughly } from "../parts/words.js";
@@ -26,7 +26,7 @@ function Metric({ at, metric }) {
   const online = useOnline(at);
   const [open, show] = useState(false);
   if (!entry) return null;
-  const { lines, omitted } = new Lines(entry.value);
+  const { lines, omitted } = linesOf(entry.value);
   const gone = isGone(entry, online);
   const rate = entry.period > 0 && !gone ? `${plain(Number((1000 / entry.period).toPrecision(2)))}/s · ` : "";
   const count = lines.length + omitted;

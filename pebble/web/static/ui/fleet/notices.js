@@ -2,7 +2,7 @@
 
 import { Notices, aloud } from "../../core/notices.js";
 import { DoubtMark } from "./doubt.js";
-import { html, useEffect, useModel, usePage, useRef, useState } from "../parts/hooks.js";
+import { html, useCalm, useEffect, useModel, usePage, useState } from "../parts/hooks.js";
 import { Model } from "../parts/models.js";
 import { Panel } from "../panels/panel.js";
 import { charge, looksOf, nameIn } from "../parts/looks.js";
@@ -13,7 +13,6 @@ import { inner } from "../parts/words.js";
 
 const METRICS = ["web/liveness", "web/estop", "web/driver", "autonomy-status", "status", "charging-level"];
 const SIGNS = { offline: "✖", online: "●", stop: "■", battery: "▲", script: "✖", service: "▲", undriveable: "▲", driveable: "●", asks: "?" };
-const CALM_MS = 1000; // between two texts that are read aloud
 
 /** Follows all components, from when it is made. */
 class NoticeModel extends Model {
@@ -98,7 +97,7 @@ export function Bell({ at, wide, room = wide }) {
     if (!open) panels.show("");
     show(!open);
   };
-  return html`<${Announcement} notices=${notices} list=${notices.list} />
+  return html`<${Announcement} notices=${notices} />
     ${at && html`<${DoubtMark} at=${at} />`}
     ${room && at && html`<${RecordingsLink} at=${at} className="button quiet" />`}
     ${wide &&
@@ -120,25 +119,16 @@ export function Bell({ at, wide, room = wide }) {
 }
 
 /** What came since the last time is read aloud, at most once a second. Of the component that is open the banners are read. */
-function Announcement({ notices, list }) {
+function Announcement({ notices }) {
   const { route, store } = usePage();
-  const [text, say] = useState("");
-  const changedAt = useRef(-Infinity);
   const isBanner = ({ ref, kind }) => ref === route.ref && ["offline", "stop", "undriveable"].includes(kind);
+  const { fresh } = notices;
+  const text = notices.unread ? aloud(fresh.filter((notice) => !isBanner(notice)), (ref) => nameIn(store, ref)) : "";
+  const said = useCalm(text);
   useEffect(() => {
-    if (!notices.unread) say("");
-    if (!notices.fresh.length) return undefined;
-    const timer = setTimeout(
-      () => {
-        changedAt.current = performance.now();
-        say(aloud(notices.fresh.filter((notice) => !isBanner(notice)), (ref) => nameIn(store, ref)));
-        notices.fresh = [];
-      },
-      Math.max(0, changedAt.current + CALM_MS - performance.now()),
-    );
-    return () => clearTimeout(timer);
-  }, [list, route.ref]);
-  return html`<span class="sr" role="status" data-test="announcement">${text}</span>`;
+    if (said === text) notices.fresh = notices.fresh.filter((notice) => !fresh.includes(notice));
+  }, [said, text]);
+  return html`<span class="sr" role="status" data-test="announcement">${said}</span>`;
 }
 
 export function NoticeList({ onGo }) {

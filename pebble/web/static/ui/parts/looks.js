@@ -1,6 +1,5 @@
 // How a robot looks to people: as its capabilities say, and where they say nothing, by its id and by what it offers.
 
-import { isObject } from "../../core/json.js";
 import { battery, inner, nameOf, typeOf, visible } from "./words.js";
 
 const FACES = new URL("../../faces.svg", import.meta.url).href;
@@ -33,18 +32,18 @@ const COLOURS = { goob: "blue", fred: "amber", minilamp: "violet", benjr: "green
  * @returns {{name: string, description: string, colour: string, picture: string, cells: number}} ``cells`` 0: unknown
  */
 export function looksOf(ref, capabilities) {
-  const value = inner(capabilities);
+  const value = capabilities?.value ?? {};
   /** @type {Partial<import("../../messages.js").RobotIdentity>} */
-  const identity = isObject(value) && isObject(value.identity) ? value.identity : {};
+  const identity = value.identity ?? {};
   const id = nameOf(ref);
   const body = Object.hasOwn(BODIES, id) ? BODIES[id] : id;
-  const picture = Object.hasOwn(PICTURES, identity.picture) ? identity.picture : assumed(body, isObject(value) ? value : {});
+  const picture = Object.hasOwn(PICTURES, identity.picture) ? identity.picture : assumed(body, value);
   return {
     name: called(text(identity.name, 32), visible(id)),
     description: text(identity.description, 60) || PICTURES[picture],
     colour: TINTS.includes(identity.colour) ? identity.colour : Object.hasOwn(COLOURS, body) ? COLOURS[body] : TINTS[hash(id) % TINTS.length],
     picture,
-    cells: Number.isInteger(identity.battery_cells) && identity.battery_cells > 0 ? identity.battery_cells : 0,
+    cells: Math.max(0, identity.battery_cells ?? 0),
   };
 }
 
@@ -69,7 +68,7 @@ function assumed(body, value) {
   return value.outlets?.available ? "outlets" : "unknown";
 }
 
-const text = (value, most) => (typeof value === "string" ? visible(value.trim().slice(0, most)) : "");
+const text = (value = "", most) => visible(value.trim().slice(0, most));
 
 function hash(id) {
   let sum = 0;

@@ -2,7 +2,6 @@
 
 import * as browser from "../../core/browser.js";
 import { callAll } from "../../core/store.js";
-import { inner, isObject } from "./words.js";
 
 /** Whether this screen only watches: nothing but stops is sent. It is in the address, so it outlives everything. */
 export const WATCHES = new URLSearchParams(globalThis.location?.search).has("watch");
@@ -264,14 +263,13 @@ export class Offers {
   constructor(ref, capabilities, metrics = []) {
     this.metrics = metrics;
     this.isRobot = ref.split("/")[1] === "robots";
-    const value = inner(capabilities);
-    this.known = isObject(value);
-    this.value = this.known ? value : {};
+    this.known = Boolean(capabilities?.value);
+    this.value = capabilities?.value ?? {};
     this.assumed = !this.known && this.isRobot;
   }
 
   section(name) {
-    return isObject(this.value[name]) ? this.value[name] : {};
+    return this.value[name] ?? {};
   }
 
   /** Whether it has a section that people use; assumed of a robot without capabilities, as the original page does. */
@@ -315,7 +313,6 @@ export class Offers {
   }
 
   get transport() {
-    const kind = this.section("transport").kind;
-    return typeof kind === "string" ? kind : "";
+    return this.section("transport").kind ?? "";
   }
 }

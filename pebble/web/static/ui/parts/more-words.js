@@ -1,11 +1,14 @@
 // How values are written of which the first screen shows none; see words.js.
 
-import { inner, isObject } from "./words.js";
+import { clockTime, inner, isObject } from "./words.js";
 
 const short = new Intl.DateTimeFormat("en-GB", { hour: "2-digit", minute: "2-digit" });
 
 /** @param {number} ms epoch @returns {string} 12:03 */
 export const shortTime = (ms) => short.format(ms);
+
+/** @param {number} ms epoch @returns {string} 10:03:12.345 */
+export const exactTime = (ms) => `${clockTime(ms)}.${String(Math.floor(ms) % 1000).padStart(3, "0")}`;
 
 /** @param {unknown} payload of charging-status @returns {string} "": it is not known */
 export function charging(payload) {

@@ -47,11 +47,8 @@ class Recorder {
   /** @param {Series} series @param {string} metric */
   record(series, metric) {
     const { store, ref } = this;
-    let known = null; // the store makes another one for each connection
     const live = () => {
-      const entry = store.get(ref, metric) ?? null;
-      if (known && entry !== known) series.begin();
-      known = entry;
+      const entry = store.get(ref, metric);
       if (entry) series.push(entry.receivedAt, entry.value);
     };
     live();

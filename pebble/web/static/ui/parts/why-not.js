@@ -2,7 +2,6 @@
 
 import { useModel, usePage, useValue } from "./hooks.js";
 import { nameIn } from "./looks.js";
-import { inner, isObject } from "./words.js";
 
 /** @typedef {{store: import("../../core/store.js").Store, connection: import("./models.js").Connection}} Services */
 
@@ -12,10 +11,14 @@ const ROLES = { drive: "driver", system: "maintainer" }; // the least that have 
  * Why this page may not even end anything: what ends something is asked of every robot, also of one that is silent.
  * @param {Services} page @param {"drive" | "system"} [right] @returns {string} "" it may
  */
-export function whyNotEnd({ store, connection }, right = "drive") {
+export function whyNotEnd(page, right = "drive") {
+  return whyNotReached(page) || (page.connection.may(right) ? "" : `Log in as ${ROLES[right]} to use this`);
+}
+
+/** Why nothing reaches any robot; "" it does. @param {Services} page @returns {string} */
+export function whyNotReached({ store, connection }) {
   if (!connection.isOpen) return "No connection to the server";
-  if (store.get("", "web/broker")?.value.connected === false) return "The server cannot reach the broker";
-  return connection.may(right) ? "" : `Log in as ${ROLES[right]} to use this`;
+  return store.get("", "web/broker")?.value.connected === false ? "The server cannot reach the broker" : "";
 }
 
 /**
@@ -43,11 +46,8 @@ export function whyNotMoved(page, ref, section = "") {
   return why || (page.connection.you?.drives === false ? "Needs https: this connection is not encrypted" : "");
 }
 
-/** @param {unknown} capabilities payload @param {string} name @returns {Record<string, any>} empty if there is none */
-export function sectionOf(capabilities, name) {
-  const value = inner(capabilities);
-  return isObject(value) && isObject(value[name]) ? value[name] : {};
-}
+/** @param {any} capabilities payload @param {string} name @returns {Record<string, any>} empty if there is none */
+export const sectionOf = (capabilities, name) => capabilities?.value?.[name] ?? {};
 
 const picked = ({ isOpen, you }) => `${isOpen} ${you?.role}`;
 

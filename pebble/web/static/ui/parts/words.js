@@ -54,12 +54,6 @@ export function battery(payload, digits = 2) {
   return `${number(value, 1)}${unit ? ` ${unit}` : ""}`;
 }
 
-/** @param {unknown} payload of media-status @returns {[string, any][]} what each of them reports */
-export function mediaOf(payload) {
-  const streams = inner(payload);
-  return isObject(streams) ? Object.entries(streams).slice(0, 8) : [];
-}
-
 /** @param {any} view DriverView @returns {string} "bob (phone)" */
 export function driverName(view) {
   return view.device ? `${view.by} (${view.device})` : view.by;

@@ -12,7 +12,7 @@ import { Model } from "../parts/models.js";
 import { recorderOf } from "../parts/recorder.js";
 import { span } from "../parts/words.js";
 import { Video } from "../robot/video-model.js";
-import { ReplaySound } from "./sound.js";
+import { Sound } from "../robot/sound-model.js";
 
 const ADDRESS_MS = 400; // browsers limit how often it may change
 const LOADING_MS = 400; // a seek that takes longer is shown
@@ -44,6 +44,36 @@ class Recorded extends Model {
 /** The picture of a recording: it is always of the same component. */
 class RecordedVideo extends Video {
   show() {}
+}
+
+/** The sound of a recording: as a live robot's, but the server's player sends it by another socket. */
+class ReplaySound extends Sound {
+  /** @param {any} page the services of the replay @param {string} ref */
+  constructor({ store, connection }, ref) {
+    super({ store, connection, route: { ref, onChange() {} } });
+  }
+
+  /** The worker opens no socket of its own. @param {string} _ref @param {MessagePort | null} port */
+  connect(_ref, port) {
+    super.connect("", port);
+  }
+
+  /** @param {Uint8Array} payload */
+  feed(payload) {
+    if (this.listening) this.worker?.postMessage({ op: "take", payload: payload.slice().buffer });
+  }
+
+  /** A seek: what waits at the loudspeaker is not played. */
+  restart() {
+    if (!this.worker || !this.listening) return;
+    const { port1, port2 } = new MessageChannel();
+    this.speaker.attach(port2);
+    this.connect("", port1);
+  }
+
+  talkReason() {
+    return "This is a recording";
+  }
 }
 
 /** @param {string} ref */
@@ -237,7 +267,7 @@ export class Replay extends Model {
     this.isOutdated = true;
     this.video.forget();
     this.pictures.begin();
-    this.sound.begin();
+    this.sound.restart();
   }
 
   take(message) {

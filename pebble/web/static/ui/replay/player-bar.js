@@ -4,11 +4,10 @@ import { SPEEDS } from "../../core/replay/feed.js";
 import { MARKS, extentOf, holding, stretchesOf, whyOf } from "../../core/replay/timeline.js";
 import { html, useMemo, useModel, useState, useTick } from "../parts/hooks.js";
 import { Icon } from "../parts/parts.js";
-import { shortTime } from "../parts/more-words.js";
+import { exactTime, shortTime } from "../parts/more-words.js";
 import { clockTime } from "../parts/words.js";
 import { Elsewhere, Sessions } from "./choose.js";
 import { Download, long } from "./download.js";
-import { stamp } from "./stage.js";
 
 const PANELS = { days: ["Days", "list"], download: ["Download", "save"] };
 
@@ -50,7 +49,7 @@ export function PlayerBar({ at, replay }) {
       >
         ${SPEEDS.map((one) => html`<option key=${one} value=${one}>×${one}</option>`)}
       </select>
-      <output class="player-time" data-test="time">${feed.seeks ? stamp(feed.position) : "–"} <small>${words}</small></output>
+      <output class="player-time" data-test="time">${feed.seeks ? exactTime(feed.position) : "–"} <small>${words}</small></output>
       ${session &&
       html`<button type="button" data-test="near" aria-pressed=${isNear} onClick=${() => setNear(!isNear)}>
         <${Icon} name="full" />Session

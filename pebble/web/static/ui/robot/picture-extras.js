@@ -101,36 +101,18 @@ function paint(canvas, picture, overlays) {
 export const Tools = ({ source, wanted }) => html`<${Marks} source=${source} />
   <${Stream} source=${source} wanted=${wanted} />`;
 
-/** Snapshots, and whether overlays are drawn. */
-export function StillTools({ source }) {
-  const { connection, store, video } = usePage();
-  useModel(video);
-  const save = () =>
-    snapshot(video, store, source).then(
-      (name) => connection.show(`Saved as ${name}`),
-      (error) => connection.show(`Not saved: ${error.message}`),
-    );
-  return html`${video.info &&
-  !video.stream &&
-  html`<button type="button" data-test="snapshot" onClick=${save}><${Icon} name="save" />Snapshot</button>`}
-    <${Marks} source=${source} />`;
-}
-
 /** Whether what scripts mark is drawn over the picture. */
-function Marks({ source }) {
+export function Marks({ source }) {
   useModel(switches);
-  const drawn = useMetrics(source).includes(OVERLAYS);
-  return (
-    drawn &&
-    html`<label class="check overlay-switch"
+  if (!useMetrics(source).includes(OVERLAYS)) return null;
+  return html`<label class="check overlay-switch"
     ><input
       type="checkbox"
       data-test="overlays"
       checked=${switches.isOn(source)}
       onChange=${(event) => switches.set(source, event.currentTarget.checked)}
     /><span>Marks of scripts</span></label
-    >`
-  );
+  >`;
 }
 
 /** Save what is on the canvas, under the time at which it was taken; returns the file's name. */

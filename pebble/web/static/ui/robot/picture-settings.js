@@ -9,13 +9,9 @@ import { nameIn } from "../parts/looks.js";
 
 /** Its source, which counts for everybody who looks at this component; and how the picture comes. */
 export function PictureSettings({ at, source, offers, video, extras }) {
-  const page = useReasons(at);
   const view = useValue(source, "web/picture");
-  const why = whyNotEnd(page);
-  const more = { disabled: Boolean(why), "aria-describedby": why ? "why-picture" : undefined };
   return html`<div class="picture-settings">
-    <${PictureFrom} at=${at} source=${source} offers=${offers} more=${more} />
-    ${why && html`<${Why} id="why-picture">${why}<//>`}
+    <${PictureFrom} at=${at} source=${source} offers=${offers} />
     <${Extra} of=${extras} part="Tools" what="More of the picture" source=${source} wanted=${video?.wanted ?? true} />
     <${StreamAddress} key=${source} source=${source} />
     <${Facts} source=${source} view=${view} />
@@ -40,35 +36,35 @@ function Facts({ source, view }) {
 
 /** For a component without a camera: another one may look at it, or a stream of any other program. */
 export function NoCamera({ at, offers }) {
-  const page = useReasons(at);
-  const why = whyNotEnd(page);
-  const more = { disabled: Boolean(why), "aria-describedby": why ? "why-picture" : undefined };
   const name = useName(at);
   return html`<section class="no-camera picture-settings" aria-label="Picture">
     <${Face} at=${at} />
     <p>${name} has no camera.</p>
-    <${PictureFrom} at=${at} source=${at} offers=${offers} more=${more} />
-    ${why && html`<${Why} id="why-picture">${why}<//>`}
+    <${PictureFrom} at=${at} source=${at} offers=${offers} />
     <${StreamAddress} source=${at} />
   </section>`;
 }
 
-function PictureFrom({ at, source, offers, more }) {
-  const { commands, store } = usePage();
+function PictureFrom({ at, source, offers }) {
+  const page = useReasons(at);
+  const { commands, store } = page;
+  const why = whyNotEnd(page);
   const cameras = useCameras(at);
-  if (!cameras.length) return null;
+  const whyShown = why && html`<${Why} id="why-picture">${why}<//>`;
+  if (!cameras.length) return whyShown;
   return html`<label class="field"
     ><span>Picture from</span>
     <select
       data-test="picture-from"
       value=${source === at ? "" : source}
-      ...${more}
+      disabled=${Boolean(why)}
+      aria-describedby=${why ? "why-picture" : undefined}
       onChange=${(event) => commands.setPictureFrom(at, event.currentTarget.value)}
     >
       <option value="">${offers.hasVideo ? "its own camera" : "nowhere"}</option>
       ${cameras.map((ref) => html`<option key=${ref} value=${ref}>${nameIn(store, ref)}</option>`)}
     </select></label
-  >`;
+    >${whyShown}`;
 }
 
 /** Enter the address of a stream, for this browser: of a camera that is beside the robot, for example. */

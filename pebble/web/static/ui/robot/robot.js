@@ -158,14 +158,12 @@ function Portrait({ at, offers, view, video, source, stage, watches, onPanel }) 
       ${usual.map(shown)}
       ${tab === "more" &&
       video &&
-      html`<${Card} id="picture" title="Picture" icon="camera"
-        ><${Part} part=${PICTURE} at=${at} source=${source} offers=${offers} video=${video} extras=${EXTRAS}
-      /><//>`}
+      html`<${PictureCard} ...${{ at, source, offers, video }} />`}
       ${tab !== "more" && html`<${Hidden} cards=${hidden(view).filter((card) => tabOf(card) === tab)} view=${view} />`}
       ${engineers.length > 0 && html`<h2 class="engineers-head">For engineers</h2>`} ${engineers.map(shown)}
       ${tab === "more" &&
       html`<${Missing} at=${at} offers=${offers} view=${view} hasVideo=${Boolean(video)} />
-        <${MoreSettings} onPanel=${onPanel} view=${view} />`}
+        <${MoreSettings} onPanel=${onPanel} />`}
     </div>
     <nav class="tabs" aria-label="Parts of this page">
       ${tabs.map(
@@ -200,15 +198,15 @@ function Immersive({ at, offers, view, video, source, drawer, onPanel }) {
     html`<aside class="drawer" aria-label="Everything else">
       ${offers.drives &&
       html`<${Card} id="drive-settings" title="Driving" icon="wheel"><${Speed} /><${Part} part=${DRIVE} open /><//>`}
-      ${video &&
-      html`<${Card} id="picture" title="Picture" icon="camera"
-        ><${Part} part=${PICTURE} at=${at} source=${source} offers=${offers} video=${video} extras=${EXTRAS}
-      /><//>`}
+      ${video && html`<${PictureCard} ...${{ at, source, offers, video }} />`}
       ${cards.map((card) => html`<${CardOf} key=${card.id} card=${card} ...${{ at, offers, view }} />`)}
-      <${MoreSettings} onPanel=${onPanel} view=${view} />
+      <${MoreSettings} onPanel=${onPanel} />
     </aside>`}
   </div>`;
 }
+
+/** Its settings, where no gear opens them. */
+const PictureCard = (props) => html`<${Card} id="picture" title="Picture" icon="camera"><${Part} part=${PICTURE} ...${props} extras=${EXTRAS} /><//>`;
 
 /** What drives, over a picture that is the whole page. */
 const Floating = ({ at }) => html`<div class="float-pad"><${DrivePad} /></div>
@@ -223,7 +221,7 @@ function Extras({ at, offers }) {
   );
 }
 
-const MoreSettings = ({ onPanel, view }) => html`<button type="button" class="wide" data-test="settings" onClick=${onPanel}>
+const MoreSettings = ({ onPanel }) => html`<button type="button" class="wide" data-test="settings" onClick=${onPanel}>
     <${Icon} name="settings" /><${SettingsWords} />
   </button>
   ${browser.fullScreen.on &&

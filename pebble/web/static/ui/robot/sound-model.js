@@ -7,6 +7,7 @@ import { Microphone } from "../../media/microphone.js";
 import { Speaker } from "../../media/speaker.js";
 import { Model, Offers } from "../parts/models.js";
 import { nameIn } from "../parts/looks.js";
+import { whyNotReached } from "../parts/why-not.js";
 
 const WORKER = new URL("../../media/sound-worker.js", import.meta.url).href;
 const STEP_MS = 200; // while a person talks: the page tells the worker that it is alive
@@ -268,9 +269,11 @@ export class Sound extends Model {
 
   /** @returns {string} why nothing can be heard now; "" it can */
   listenReason() {
-    if (!this.connection.isOpen) return "No connection to the server";
-    if (this.store.get("", "web/broker")?.value.connected === false) return "The server cannot reach the broker";
-    if (!this.offers.has("audio")) return `${nameIn(this.store, this.route.ref)} has no sound`;
+    const why = whyNotReached(this);
+    if (why) return why;
+    const { ref } = this.route;
+    const offers = new Offers(ref, this.store.get(ref, "capabilities")?.value);
+    if (!offers.has("audio")) return `${nameIn(this.store, ref)} has no sound`;
     return browser.find("AudioWorkletNode") ? "" : "Needs https";
   }
 
@@ -295,10 +298,5 @@ export class Sound extends Model {
     const talker = this.store.get(this.route.ref, "web/sound")?.value.talker ?? "";
     const own = talker === this.connection.you?.user && performance.now() - this.voice.endedAt < OWN_MS;
     return this.talking || own ? "" : talker;
-  }
-
-  get offers() {
-    const { ref } = this.route;
-    return new Offers(ref, this.store.get(ref, "capabilities")?.value);
   }
 }

@@ -2,7 +2,7 @@
 
 import * as browser from "../../core/browser.js";
 import { html, useCalm, useEffect, useModel, usePage, useValue } from "../parts/hooks.js";
-import { Icon, Why, useName } from "../parts/parts.js";
+import { Icon, useName } from "../parts/parts.js";
 import { Sound } from "./sound-model.js";
 
 /** @param {{at: string, place?: "card" | "bar" | "short" | "over"}} props "short": in a bar with little room */
@@ -18,9 +18,13 @@ export function SoundControls({ at, place = "card" }) {
   useValue("", "web/broker");
   const { listening, muted } = sound;
   const noListening = listening ? "" : sound.listenReason();
+  const noTalking = page.recording || sound.talking ? "" : sound.talkReason();
   const inBar = place !== "card";
-  const short = place === "short";
   const text = words(sound, view, useName(at));
+  const calm = useCalm(text);
+  const isHeard = text === LISTENING; // the numbers of that are for who asks for them
+  const said = isHeard && inBar ? "" : text;
+  const title = isHeard ? numbers(sound) : text || noListening || noTalking;
   return html`<div class=${`sound ${inBar ? "in-bar" : ""}`} role="group" aria-label="Sound">
     <div class="sound-buttons">
       <button
@@ -32,33 +36,27 @@ export function SoundControls({ at, place = "card" }) {
       >
         <${Icon} name=${listening ? "halt" : "sound"} /><span>${listening ? (inBar ? "Silence" : "Stop listening") : "Listen"}</span>
       </button>
-      ${!page.recording && html`<${TalkButton} sound=${sound} noListening=${noListening} short=${short} />`}
+      ${!page.recording &&
+      html`<${TalkButton} sound=${sound} why=${noTalking} isSame=${noTalking === noListening} short=${place === "short"} />`}
       ${listening &&
       (place === "bar" || !inBar) &&
       html`<button type="button" data-test="mute" aria-pressed=${muted} onClick=${() => sound.toggleMute()}>
         <${Icon} name=${muted ? "muted" : "sound"} /><span>${muted ? "Muted" : "Mute"}</span><kbd>M</kbd>
       </button>`}
     </div>
-    ${inBar
-      ? html`<${Note} sound=${sound} noListening=${noListening} text=${text} />`
-      : html`<${Reasons} sound=${sound} noListening=${noListening} /><${State} text=${text} />`}
+    <div class=${inBar ? "bar-note" : "sound-lines"} title=${title}>
+      <span class="sound-state" data-test=${inBar ? "sound-note" : "sound-state"} title=${isHeard ? title : undefined}>${said}</span>
+      ${noListening && html`<span class=${inBar ? hides(said) : "why"} id="why-listen">${noListening}</span>`}
+      ${noTalking &&
+      noTalking !== noListening &&
+      html`<span class=${inBar ? hides(said || noListening) : "why"} id="why-talk">${noTalking}</span>`}
+    </div>
+    <span class="sr" role="status">${calm}</span>
   </div>`;
 }
 
-/** One line in what is left of the bar: why something is off, or is not heard. Numbers are behind the gear. */
-function Note({ sound, noListening, text }) {
-  const noTalking = sound.talking || usePage().recording ? "" : sound.talkReason();
-  const well = text.includes("buffered");
-  const said = useCalm(well ? "Listening" : text);
-  return html`<p class="bar-note" title=${(well ? "" : text) || noListening || noTalking}>
-      <span data-test="sound-note">${well ? "" : text}</span>
-      ${noListening && html`<span id="why-listen" class=${text && !well ? "sr" : ""}>${noListening}</span>`}
-      ${noTalking &&
-      noTalking !== noListening &&
-      html`<span id="why-talk" class=${noListening || (text && !well) ? "sr" : ""}>${noTalking}</span>`}
-    </p>
-    <span class="sr" role="status">${said}</span>`;
-}
+/** A bar has room for one line: others are only read aloud. @param {string} first */
+const hides = (first) => (first ? "sr" : "");
 
 /** For engineers: how the sound comes now. @param {{at: string}} props */
 export function SoundFacts({ at }) {
@@ -67,25 +65,12 @@ export function SoundFacts({ at }) {
   const sound = (page.sound.model ??= new Sound(page));
   useModel(sound);
   const view = useValue(at, "web/sound");
-  return html`<p class="facts" data-test="sound-state">${words(sound, view, useName(at))}</p>`;
+  const text = words(sound, view, useName(at));
+  return html`<p class="facts" data-test="sound-state">${text === LISTENING ? numbers(sound) : text}</p>`;
 }
 
-/** Numbers are for who asks for them. */
-function State({ text }) {
-  const words = text.replace(/^.*buffered.*$/, "Listening");
-  return html`<p class="sound-state" data-test="sound-state" title=${text === words ? "" : text}>${words}</p>
-    <span class="sr" role="status">${useCalm(words)}</span>`;
-}
-
-/** Under the buttons that are off; once, if it is the same for both. */
-function Reasons({ sound, noListening }) {
-  const noTalking = sound.talking || usePage().recording ? "" : sound.talkReason();
-  return html`${noListening && html`<${Why} id="why-listen">${noListening}<//>`}
-  ${noTalking && noTalking !== noListening && html`<${Why} id="why-talk">${noTalking}<//>`}`;
-}
-
-function TalkButton({ sound, noListening, short }) {
-  const why = sound.talking ? "" : sound.talkReason();
+/** ``isSame``: listening is off for the same reason. */
+function TalkButton({ sound, why, isSame, short }) {
   const end = () => sound.talk(false);
   useEffect(() => end, []);
   useEffect(() => {
@@ -98,7 +83,7 @@ function TalkButton({ sound, noListening, short }) {
     data-test="talk"
     disabled=${why !== ""}
     aria-pressed=${Boolean(sound.talking)}
-    aria-describedby=${why ? (why === noListening ? "why-listen" : "why-talk") : undefined}
+    aria-describedby=${why ? (isSame ? "why-listen" : "why-talk") : undefined}
     onPointerDown=${(event) => {
       if (event.button) return;
       browser.capture(event);
@@ -119,16 +104,22 @@ function TalkButton({ sound, noListening, short }) {
   </button>`;
 }
 
+const LISTENING = "Listening";
+
 /** What is heard, or why nothing is. @param {Sound} sound @param {any} view @param {string} name */
 function words(sound, view, name) {
   const { talking, listening, stats } = sound;
   if (talking) return talking.on ? `${name} plays your voice.` : "One moment…";
   if (sound.problem || !listening) return sound.problem;
-  const muted = sound.muted ? "muted · " : "";
   if (!sound.link.isOpen) return "Connecting…";
   if (view?.state === "refused") return `${name} refuses: ${view.why}`;
   if (["silent", "held"].includes(view?.state)) return `Waits for sound: ${view.why || "none comes"}`;
-  if (!stats?.received) return view?.why || "Waits for sound…";
+  return stats?.received ? LISTENING : view?.why || "Waits for sound…";
+}
+
+/** How it is heard. @param {Sound} sound */
+function numbers({ muted, stats }) {
   const lost = stats.lost + stats.refused;
-  return `${muted}${stats.bufferedMs} ms buffered · ${stats.encoding} · ${lost ? `${lost} packets lost` : "nothing lost"}`;
+  const words = [muted && "muted", `${stats.bufferedMs} ms buffered`, stats.encoding, lost ? `${lost} packets lost` : "nothing lost"];
+  return words.filter(Boolean).join(" · ");
 }

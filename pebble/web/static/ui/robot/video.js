@@ -30,10 +30,34 @@ export function useVideo(at, source) {
  * settings are one of them.
  */
 export function Stage({ at, video: control, source, offers, view, layout }) {
-  const page = usePage();
-  const { video } = page;
+  const { video } = usePage();
   useModel(video);
   useTick(200);
+  const cover = useCover(control, source);
+  const info = video.stream ? null : video.info;
+  const name = useName(source);
+  const over = html`${info &&
+    html`<span class=${`tag tag-age ${cover ? "bad" : ""}`} data-test="age"><${Age} video=${video} /></span>`}
+    ${source !== at && html`<span class="tag tag-from">seen from ${name}</span>`}
+    <${Bands} at=${at} />`;
+  return html`<${Frame} label="Live picture" alt=${`What ${name} sees`} part="Layer" source=${source} cover=${cover} face=${!info} over=${over}>
+    ${layout !== "immersive" &&
+    html`<${Bar} ...${{ at, control, source, offers, view }} short=${layout === "portrait"} wide=${layout === "desktop"} />`}
+    ${layout === "immersive" &&
+    html`<div class="float-tools">
+      <${SnapshotButton} source=${source} />
+      ${offers.has("audio") && html`<${Boundary} what="Sound"><${Part} part=${VOICE} lines=${0} at=${at} place="over" /><//>`}
+    </div>`}
+  <//>`;
+}
+
+/**
+ * A picture, live or recorded. ``part``: of EXTRAS, what is drawn over it; ``cover``: why it is none of now; ``over``:
+ * what else lies over it; ``children``: what is below it.
+ * @param {any} props
+ */
+export function Frame({ label, alt, part, source, cover, face = false, over, children }) {
+  const { video } = usePage();
   const place = useRef(null);
   useLayoutEffect(() => {
     const { current } = place;
@@ -42,33 +66,21 @@ export function Stage({ at, video: control, source, offers, view, layout }) {
       if (video.canvas.parentNode === current) video.canvas.remove(); // another layout may have it already
     };
   }, []);
-  const cover = useCover(control, source);
-  const stale = cover !== "";
-  const info = video.stream ? null : video.info;
-  const name = useName(source);
   video.canvas.setAttribute("role", "img");
-  video.canvas.setAttribute("aria-label", `What ${name} sees`);
+  video.canvas.setAttribute("aria-label", alt);
   return html`<section
-    class=${`stage ${stale ? "stale" : ""} ${video.info ? "" : "blank"}`}
-    aria-label="Live picture"
+    class=${`stage ${cover ? "stale" : ""} ${video.info ? "" : "blank"}`}
+    aria-label=${label}
     data-card="picture"
     data-span="main"
   >
     <div class="picture">
       <div class="canvas" ref=${place}></div>
-      <${Extra} of=${EXTRAS} part="Layer" what="What is drawn over it" source=${source} />
-      ${cover && html`<p class="cover" data-test="cover">${!info && html`<${Face} at=${source} />`}${cover}</p>`}
-      ${info && html`<span class=${`tag tag-age ${stale ? "bad" : ""}`} data-test="age"><${Age} video=${video} /></span>`}
-      ${source !== at && html`<span class="tag tag-from">seen from ${name}</span>`}
-      <${Bands} at=${at} />
+      <${Extra} of=${EXTRAS} part=${part} what="What is drawn over it" source=${source} />
+      ${cover && html`<p class="cover" data-test="cover">${face && html`<${Face} at=${source} />`}${cover}</p>`}
+      ${over}
     </div>
-    ${layout !== "immersive" &&
-    html`<${Bar} ...${{ at, control, source, offers, view }} short=${layout === "portrait"} wide=${layout === "desktop"} />`}
-    ${layout === "immersive" &&
-    html`<div class="float-tools">
-      <${SnapshotButton} source=${source} />
-      ${offers.has("audio") && html`<${Boundary} what="Sound"><${Part} part=${VOICE} lines=${0} at=${at} place="over" /><//>`}
-    </div>`}
+    ${children}
   </section>`;
 }
 
@@ -118,7 +130,7 @@ function Bar({ at, control, source, offers, view, short, wide }) {
 }
 
 /** What takes the snapshot is fetched with the first one. */
-function SnapshotButton({ source, short = false }) {
+export function SnapshotButton({ source, short = false }) {
   const { connection, store, video } = usePage();
   const off = !video.info || video.stream !== "";
   const why = off ? "There is no picture that could be saved" : undefined;

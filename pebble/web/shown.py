@@ -1,0 +1,196 @@
+"""What the cards of a page may rely on in payloads of robots: it is checked here, and not again in the page. Pure."""
+
+from collections.abc import Callable
+from contextlib import suppress
+from functools import partial
+from typing import Annotated, Any, Literal
+
+import msgspec
+from msgspec import Meta, Struct, ValidationError, convert
+
+from pebble import contract as c
+from pebble.contract import forms
+
+_Name = Annotated[str, Meta(min_length=1, max_length=255)]
+
+
+class _Clips(Struct):
+    files: list[str] = []
+
+
+class _Clip(Struct):
+    playing: bool = False
+    file: str | None = None
+    error: str | None = None
+
+
+class _Dependency(Struct):
+    file: str
+    running: bool = False
+
+
+class _Running(_Clip):
+    running: bool = False
+    overridden: bool = False
+    dependencies: list[_Dependency] = []
+    config: dict[str, Any] | None = None
+
+
+class _Scripts(Struct):
+    files: list[Any]
+
+
+class _Script(Struct):
+    file: _Name
+    label: str = ""
+    summary: str = ""
+    main: list[str] = []
+    configs: list[Any] = []
+
+
+class _Medium(Struct):
+    running: bool = False
+    doing: str | None = None
+    last_error: str | None = None
+
+
+class _Neighbours(Struct):
+    receives: dict[str, bool] = {}
+    driven_by: str = ""
+
+
+class _Switch(Struct):
+    on: bool | None = None
+    bound: bool | None = None
+    reachable: bool | None = None
+
+
+class _Outlet(Struct):
+    value: _Switch
+    label: str = ""
+
+
+class _Identity(Struct):
+    name: str = ""
+    description: str = ""
+    colour: str = ""
+    picture: str = ""
+    battery_cells: int = 0
+
+
+class _OutletOffer(Struct):
+    name: _Name
+    controls: bool = False
+
+
+class _OutletOffers(Struct):
+    outlets: list[_OutletOffer] = []
+
+
+class _Field(Struct):
+    name: _Name
+    type: str = ""
+    scale: float = 1
+    offset: float = 0
+    unit: str = ""
+
+
+class _Fields(Struct):
+    fields: list[_Field]
+
+
+class _Texts(Struct):
+    model: str = ""
+    firmware_version: str = ""
+
+
+class _Interface(Struct):
+    name: _Name
+    dir: Literal["in", "out"]
+    encoding: _Fields
+    kind: str = ""
+    channel: str = ""
+    profile: str = ""
+    rate_hz: float = 0
+    local_only: bool = False
+
+
+def shown(channel: c.Channel | None, raw: bytes, payload: Any) -> bytes:
+    """Return the JSON that pages get of ``payload``: ``raw``, which it was, unless a card relies on more than that."""
+    show = None if channel is None else _SHOWN.get(channel.metric)
+    relied = payload if show is None else show(payload)
+    return raw if relied is payload else msgspec.json.encode(relied)
+
+
+def _inner(payload: Any) -> Any:
+    return payload["value"] if isinstance(payload, dict) and "value" in payload else payload
+
+
+def _object(kind: Any, payload: Any) -> Any:
+    """Return an object if it is of this kind, and nothing of any other."""
+    return payload if _readable(kind, [payload]) else {}
+
+
+def _inner_object(kind: Any, payload: Any) -> Any:
+    return _object(kind, _inner(payload))
+
+
+def _readable(kind: Any, entries: object) -> list[Any]:
+    """Return the entries of a list that are of this kind, as they are."""
+    readable = []
+    for entry in entries if isinstance(entries, list) else ():
+        with suppress(ValidationError):
+            convert(entry, kind)
+            readable.append(entry)
+    return readable
+
+
+def _scripts(payload: Any) -> Any:
+    """Return the scripts that can be read, with the settings that can be."""
+    listed = _object(_Scripts, _inner(payload))
+    if not listed:
+        return {}
+    files = [{**entry, "configs": _settings(entry.get("configs"))} for entry in _readable(_Script, listed["files"])]
+    return {**listed, "files": files}
+
+
+def _settings(configs: object) -> list[dict[str, Any]]:
+    return [setting.entry() for setting in forms.listed(configs)[: forms.MAX_SETTINGS]]
+
+
+def _manifest(payload: Any) -> Any:
+    """Return the interfaces that can be read."""
+    manifest = _object(dict[str, Any], _inner(payload))
+    texts = _object(_Texts, manifest)
+    return {
+        **manifest,
+        "model": texts.get("model", ""),
+        "firmware_version": texts.get("firmware_version", ""),
+        "interfaces": _readable(_Interface, manifest.get("interfaces")),
+    }
+
+
+_OFFERS = "drive", "video", "audio", "soundboard", "autonomy", "lights", "system", "telemetry", "transport"
+_SECTIONS: dict[str, Any] = dict.fromkeys(_OFFERS, dict[str, Any]) | {"identity": _Identity, "outlets": _OutletOffers}
+
+
+def _capabilities(payload: Any) -> Any:
+    """Return the sections that can be read."""
+    value = _inner(payload)
+    if not isinstance(value, dict):
+        return {}
+    kept = {name: section for name, section in value.items() if _readable(_SECTIONS.get(name, Any), [section])}
+    return payload if kept == value and value is not payload else {"value": kept}
+
+
+_SHOWN: dict[str, Callable[[Any], Any]] = {
+    c.CAPABILITIES.metric: _capabilities,
+    c.SOUNDBOARD_FILES.metric: partial(_inner_object, _Clips),
+    c.SOUNDBOARD_STATUS.metric: partial(_inner_object, _Clip),
+    c.AUTONOMY_FILES.metric: _scripts,
+    c.AUTONOMY_STATUS.metric: partial(_inner_object, _Running),
+    c.MEDIA_STATUS.metric: partial(_inner_object, dict[str, _Medium]),
+    c.NEIGHBOURS.metric: partial(_inner_object, _Neighbours),
+    c.OUTLET_STATUS.metric: partial(_object, _Outlet),
+    c.MCU_DESCRIBE.metric: _manifest,
+}
