@@ -1,7 +1,6 @@
 """Rate, loss and packet size of networks of namespaces."""
 
 import json
-import shutil
 import subprocess
 import sys
 from contextlib import closing
@@ -9,7 +8,6 @@ from pathlib import Path
 
 import pytest
 
-from pebble.bench.impair import network as networks
 from pebble.bench.impair.conditions import Condition, Shape
 from pebble.bench.impair.network import NamespaceNetwork
 from tests.bench.impair.peers import ProbeConnection, largest_packet
@@ -71,18 +69,6 @@ def test_the_namespaces_have_no_other_connection() -> None:
             shown = subprocess.check_output(command(["cat", "/proc/net/dev"]), text=True)
             devices = {line.split(":")[0].strip() for line in shown.splitlines()[2:]}
             assert devices == {"lo", "wire", "timed"}
-
-
-def test_a_missing_program_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    (tmp_path / "nsenter").symlink_to(str(shutil.which("nsenter")))
-    monkeypatch.setattr(networks, "SBIN", "/nowhere")
-    monkeypatch.setenv("PATH", str(tmp_path))
-    assert "failed to execute ip: No such file" in str(networks.why_no_namespaces.__wrapped__())
-
-
-def test_namespaces_that_fail_are_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(networks, "_TABLE", "nonsense")
-    assert str(networks.why_no_namespaces.__wrapped__()).startswith("nft -f -: ")
 
 
 def test_a_user_without_permission_gets_the_reason() -> None:
