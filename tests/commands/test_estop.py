@@ -110,12 +110,6 @@ def test_the_first_stop_is_sent_before_anything_is_known_of_the_robot(run: Run, 
     assert [topic.rpartition("/")[2] for _, topic, _ in robot.received[:2]] == ["estop", "drive-values"]
 
 
-def test_an_owner_that_saves_nothing_is_stopped_with_a_remark(run: Run, robot_on: Make, url: str) -> None:
-    robot = robot_on("mcu", persisted=None)
-    assert run("estop", robot.id, url) == 0
-    assert "NOT SAVED: a restart frees it" in run.out
-
-
 UNPLUGGED = "serial: no /dev/ttyACM0"
 DOUBTS = {
     "no": ({"state": "no", "why": UNPLUGGED}, f"CANNOT BE DRIVEN OR STOPPED: {UNPLUGGED}"),

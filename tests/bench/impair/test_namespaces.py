@@ -34,22 +34,6 @@ def test_loss_drops_the_configured_share_of_packets(delay_ms: int, tmp_path: Pat
         assert traffic.bytes_up - before.bytes_up >= _SENT * _DATAGRAM
 
 
-def test_loss_of_the_downlink_is_on_the_robots_side(tmp_path: Path) -> None:
-    with closing(NamespaceNetwork()) as network, ProbeConnection(network, tmp_path) as talk:
-        network.apply(Condition("down", Shape(), Shape(loss=0.2)))
-        talk.down(100_000)
-        counter = network.on_robot(["nft", "-j", "list", "counter", "ip", "impair", "lost"])
-        assert json.loads(subprocess.check_output(counter))["nftables"][-1]["counter"]["packets"] > 0
-        assert network.traffic().dropped_up == 0
-
-
-def test_a_full_queue_drops(tmp_path: Path) -> None:
-    with closing(NamespaceNetwork()) as network, ProbeConnection(network, tmp_path) as talk:
-        network.apply(Condition("64k", Shape(kbit=64)))
-        talk.send_datagrams(400)
-        assert 50 < network.traffic().dropped_up <= 400
-
-
 @pytest.mark.parametrize("kbit", [None, 4000])
 def test_no_packet_is_larger_than_on_a_wire(kbit: float | None, tmp_path: Path) -> None:
     with (
