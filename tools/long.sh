@@ -32,14 +32,14 @@ looks) debian chromium=chromium ;;
 esac
 
 case "$1" in
-stops) both tests.robot.stop_schedules --log build/stops ;;
+stops) $python -m tests.kit.schedules robot_stops --log build/stops ;;
 soak) both tests.robot.soak --minutes "${MINUTES:-5}" ;;
 floods) both tests.robot.soak.floods ;;
 schedules) # the shortest schedule that violates a rule is printed, or the seed of a sequence that does
     $python -m tests.kit.schedules motion --schedules 10000
     $python -m tests.kit.schedules lockstep --schedules 10000
     $python -m tests.kit.schedules owners --schedules 20000 --jobs 2
-    both tests.robot.script_schedules
+    $python -m tests.kit.schedules robot_scripts
     ;;
 page) $python -m pytest --workers 8 -m page tests/web ;;
 looks) $python -m tests.web.looks ;;
