@@ -55,13 +55,18 @@ _ENDING_S = 5.0  # for processes that are about to end
 
 #: Folders of tests that check no times.
 _COMPUTING = (
-    *("config", "contract", "media", "motion", "perception", "bench/judging", "web/modules"),
+    *("config", "contract", "media", "motion", "perception", "web/modules"),
     *("recordings/exports", "recordings/files", "recordings/seek", "recordings/traffic"),
 )
 #: Modules that take longest begin first: begun last, one of them would delay the end of the run.
 _LONG = (
-    *("conform/test_conform.py", "selftest/test_robot.py", "web/robots/test_controls.py", "conform/test_operators.py"),
-    *("robot/test_closed_loop.py", "robot/test_media.py", "robot/test_driveable.py"),
+    *(
+        "conform/test_conform.py",
+        "web/robots/test_controls.py",
+        "robot/test_closed_loop.py",
+        "robot/test_media.py",
+        "robot/test_driveable.py",
+    ),
     *("commands/test_estop.py", "commands/test_drive.py", "transports/test_mqtt.py", "recordings/recorder"),
     *("web/test_types.py", "firmware/test_deadman_virtual.py", "motion/test_traces.py"),
 )

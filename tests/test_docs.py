@@ -70,11 +70,6 @@ def test_every_page_can_be_found_from_the_index() -> None:
     assert pages - linked - {ROOT / "docs" / "README.md"} == set()
 
 
-def test_a_term_has_one_entry_in_the_glossary() -> None:
-    terms = re.findall(r"^\| (?!term|---)(.+?) \|", (ROOT / "docs" / "glossary.md").read_text(), re.MULTILINE)
-    assert sorted(terms) == sorted(set(terms))
-
-
 def test_the_first_service_and_its_test_run_as_they_stand(tmp_path: Path) -> None:
     text = (ROOT / "docs" / "my-first-service.md").read_text()
     service, test = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
@@ -108,10 +103,6 @@ def test_a_command_line_is_one_that_exists(pebble: Any, line: str, monkeypatch: 
 
 
 ALL_TEXT = "\n".join(path.read_text() for path in DOCUMENTS)
-
-
-def test_a_command_line_stands_in_a_block_of_code() -> None:
-    assert re.findall(r"^\n(?:sudo|pebble|make|pip) .*", ALL_TEXT, re.MULTILINE) == []
 
 
 def test_extras_targets_and_modules_are_ones_that_exist() -> None:

@@ -16,7 +16,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.commands.test_estop import LiveRobot
+from tests.kit.played_robot import RecordingRobot
 from tests.support import ROOT, THOROUGH, Broker, Child, free_port, until
 
 ELSEWHERE = [sys.executable, str(ROOT / "tests" / "fakes" / "other_platform.py")]
@@ -35,10 +35,10 @@ def broker(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Broker]:
 
 
 @pytest.fixture
-def robot(broker: Broker) -> Iterator[LiveRobot]:
-    robot = LiveRobot(broker.port, "serial")
-    yield robot
-    robot.close()
+def robot(broker: Broker) -> Iterator[RecordingRobot]:
+    with RecordingRobot(broker.port, "pebble/robots/goob", heartbeats=False) as robot:
+        robot.publish_states()
+        yield robot
 
 
 def elsewhere(*arguments: str) -> subprocess.CompletedProcess[str]:
@@ -64,7 +64,7 @@ def test_commands_without_a_network() -> None:
     assert done.stdout.count("Usage") == 4
 
 
-def test_messages_are_published_and_received_and_a_robot_is_stopped(broker: Broker, robot: LiveRobot) -> None:
+def test_messages_are_published_and_received_and_a_robot_is_stopped(broker: Broker, robot: RecordingRobot) -> None:
     url = f"--url mqtt://127.0.0.1:{broker.port}"
     done = elsewhere(
         "each",

@@ -13,7 +13,7 @@ list() {
 make long PART=stops      400 random schedules of emergency stops and faults with whole robots, 40 minutes
 make long PART=soak       floods, kills, freezes, full disks and more while an operator drives; MINUTES=30 for each transport
 make long PART=floods     60,000 retained flags, 10,000 actions a second and more, also while a robot starts, four minutes
-make long PART=schedules  random schedules in virtual time, with whole robots and scripts, and at the page, two hours
+make long PART=schedules  random schedules in virtual time, with whole robots and scripts, two hours
 make long PART=page       every state, card, interruption and finger at the operator page in Chromium, 25 minutes
 make long PART=looks      store anew how the page looks, for PART=page to compare; look at the pictures, a minute
 make long PART=fleet      brokers and hubs that are killed, hung and cut off under driven robots and 300 boards, 16 minutes
@@ -32,16 +32,14 @@ looks) debian chromium=chromium ;;
 esac
 
 case "$1" in
-stops) both tests.robot.stop_schedules --log build/stops ;;
+stops) $python -m tests.kit.schedules robot_stops --log build/stops ;;
 soak) both tests.robot.soak --minutes "${MINUTES:-5}" ;;
 floods) both tests.robot.soak.floods ;;
 schedules) # the shortest schedule that violates a rule is printed, or the seed of a sequence that does
-    debian chromium=chromium
     $python -m tests.kit.schedules motion --schedules 10000
     $python -m tests.kit.schedules lockstep --schedules 10000
     $python -m tests.kit.schedules owners --schedules 20000 --jobs 2
-    both tests.robot.script_schedules
-    $python -m tests.web.chromium_schedules
+    $python -m tests.kit.schedules robot_scripts
     ;;
 page) $python -m pytest --workers 8 -m page tests/web ;;
 looks) $python -m tests.web.looks ;;

@@ -1,21 +1,15 @@
 """The bridge comparison without robots: matching of commands and reports, cells, turns."""
 
-import io
 import json
 from collections.abc import Sequence
-from types import SimpleNamespace
-from typing import Any, ClassVar
+from typing import Any
 
 import pytest
-from rich.console import Console
 
-from pebble.bench import bridge
-from pebble.bench.bridge import COMMANDS, CPU, DOWN, LOADED, UNLOADED, UP, Settings, cells_of, run
+from pebble.bench.bridge import COMMANDS, CPU, DOWN, LOADED, UNLOADED, UP, cells_of
 from pebble.bench.bridge_operator import ALL, HOP, SERVICES, Arrived, Turn, arrivals, matched, wheels, wheels_of
-from pebble.bench.results import STAND_IN, Cell, Results
+from pebble.bench.results import Cell, Results
 from pebble.bench.rounds import add_round
-from pebble.rig.processes import Processes
-from pebble.rig.robot import Robot
 from pebble.services.serial_mcu_bridge.text.goob_base import Touch
 from pebble.simulation.trace import Entry
 
@@ -121,61 +115,3 @@ def test_cpu_is_divided_by_what_was_forwarded_in_each_turn() -> None:
     *_, bridge_, serial = joined([all_ + half, none])
     assert (bridge_.measure, bridge_.unit, bridge_.params) == (CPU, "us", {"load": "none", "process": "bridge"})
     assert [*bridge_.rounds, *serial.rounds] == [pytest.approx([100, 200]), [], pytest.approx([200, 400]), []]
-
-
-class FakeRobot:
-    """A stand-in for a robot that remembers when it was driven."""
-
-    started: ClassVar[list[tuple[str, bool, bool]]] = []
-    driven: ClassVar[list[str]] = []
-
-    def __init__(self, kind: str, *, media: bool = False, reports: bool = True) -> None:
-        self.kind = kind
-        self.started.append((kind, media, reports))
-
-    def __enter__(self) -> "FakeRobot":
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        pass
-
-    def wait_until_ready(self) -> None:
-        pass
-
-    def drive(self, seconds: float) -> Turn:
-        self.driven.append(f"{self.kind} {seconds:g}")
-        turn, self.last = turn_of([1.0], [1.0], cpu_s={} if self.kind == HOP else {FORWARDER: 0.1, SERIAL: 0.1})
-        return turn
-
-    drive_with_media = drive
-
-    def arrived(self, _turns: Sequence[Turn]) -> Arrived:
-        return self.last
-
-
-def test_every_load_has_robots_of_its_own_that_take_turns(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(bridge, "driven_robot", FakeRobot)
-    monkeypatch.setattr(bridge, "STARTUP_S", 0.0)
-    settings = Settings(variants=(STAND_IN, "mqtt"), with_media=True, seconds=2.0, rounds=2)
-    cells = run(settings, Console(file=io.StringIO())).results.cells
-    reporting = [(kind, True, True) for kind in (STAND_IN, "mqtt", HOP)]
-    silent = [(STAND_IN, False, False), ("mqtt", False, False)]
-    assert FakeRobot.started == [*reporting, *silent, *silent, *reporting]
-    there, back = ["stand-in 1", "mqtt 1", "one hop 1"], ["one hop 1", "mqtt 1", "stand-in 1"]
-    assert FakeRobot.driven[:11] == [*there, *back, "mqtt 2", *there[:2], *back[1:]]
-    assert FakeRobot.driven[11:] == [*back[1:], *there[:2], *back, *there, "mqtt 2"]
-    assert {len(cell.rounds) for cell in cells} == {2}
-    processes = [(CPU, load, part) for load in (UNLOADED, COMMANDS) for part in (FORWARDER, SERIAL)]
-    wanted = [(DOWN, UNLOADED), (DOWN, COMMANDS), (UP, UNLOADED), *processes]
-    assert {(cell.variant, cell.measure, *cell.params.values()) for cell in cells} == {
-        *((kind, *one) for kind in (STAND_IN, "mqtt") for one in wanted),
-        *(("mqtt", DOWN, LOADED), ("mqtt", UP, LOADED), (HOP, DOWN, UNLOADED)),
-    }
-
-
-def test_the_local_broker_counts_as_part_of_the_robot(monkeypatch: pytest.MonkeyPatch) -> None:
-    with Processes() as processes:
-        robot = Robot(processes, "mqtt", ("127.0.0.1", 1))
-    monkeypatch.setattr(robot, "local_broker", SimpleNamespace(pid=-2))
-    monkeypatch.setattr(robot, "_started", [SimpleNamespace(pid=-3)])
-    assert robot.pids() == [-3, -2]

@@ -1,6 +1,5 @@
 """The control comparison: what a slice counts, order of the slices, and a short real run that leaves nothing."""
 
-import io
 import os
 import signal
 import subprocess
@@ -8,18 +7,14 @@ import sys
 from collections.abc import Callable
 from itertools import product
 from pathlib import Path
-from typing import ClassVar, Self
 
 import pytest
-from rich.console import Console
 
-from pebble.bench import control
-from pebble.bench.control import ONE_WAY, QUICK, ROUND_TRIP, VARIANTS, Participants, Settings, conditions, spec_of
+from pebble.bench.control import ONE_WAY, ROUND_TRIP, VARIANTS, Participants
 from pebble.bench.control_ends import (
     REPLIES,
     Connection,
     EndInbox,
-    Exchange,
     Handler,
     Sender,
     Slice,
@@ -29,7 +24,7 @@ from pebble.bench.control_ends import (
 from pebble.bench.results import load
 from pebble.errors import PebbleError
 from pebble.rig.processes import children
-from tests.support import ROOT, until
+from tests.support import ROOT
 
 
 class Loop:
@@ -73,57 +68,6 @@ def test_what_comes_twice_counts_once_and_what_does_not_come_is_lost() -> None:
     assert (done.sent, len(done.exchanges)) == (50, 25)
 
 
-def test_only_the_first_size_and_rates_are_measured_with_a_load() -> None:
-    assert len(conditions(Settings())) * len(VARIANTS) == 60
-    assert len(conditions(QUICK)) * len(VARIANTS) == 12
-    assert conditions(Settings(sizes=(40,), rates=(20, 200, 1000), loads=("media",))) == [
-        {"size": "40 B", "rate": rate, "load": "media"} for rate in ("20 Hz", "200 Hz")
-    ]
-
-
-@pytest.mark.parametrize(("size", "rate"), [(40, 200.0), (1024, 0.5), (1536, 1000.0)])
-def test_a_condition_is_the_slice_that_it_names(size: int, rate: float) -> None:
-    (condition,) = conditions(Settings(sizes=(size,), rates=(rate,), loads=("none",)))
-    assert spec_of(condition, 0.35) == SliceSpec(size=size, rate=rate, seconds=0.35)
-
-
-class FakeParticipants:
-    """Answers at once; the second start fails."""
-
-    calls: ClassVar[list[tuple[str, str]]] = []
-    started: ClassVar[list[object]] = []
-
-    def __init__(self, variants: object) -> None:
-        self.started.append(variants)
-
-    def __enter__(self) -> Self:
-        if len(self.started) == 2:
-            raise PebbleError("mqtt: echo said nothing")
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        """Nothing was started."""
-
-    def run(self, variant: str, _spec: SliceSpec, load: str) -> tuple[Slice, float]:
-        self.calls.append((variant, load))
-        return Slice(sent=10, late=1, exchanges=[Exchange(0, 100_000, 250_000)] * 9), 0.0
-
-
-def test_every_other_pass_goes_backwards_and_a_round_that_fails_counts_for_no_variant(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setattr(control, "Participants", FakeParticipants)
-    settings = Settings(variants=("mqtt", "zenoh-p2p"), sizes=(40,), rates=(200,), loads=("none", "hog"), rounds=3)
-    results = control.run(settings, Console(file=io.StringIO())).results
-    there = [("mqtt", "none"), ("zenoh-p2p", "none"), ("mqtt", "hog"), ("zenoh-p2p", "hog")]
-    assert FakeParticipants.calls == [*there, *there[::-1]] * 2
-    assert [(cell.variant, cell.params["load"]) for cell in results.cells[::2]] == there
-    assert results.notes == ["1 of 3 rounds failed and were left out; round 2: mqtt: echo said nothing"]
-    for cell in results.cells:
-        assert cell.rounds == [[100.0 if cell.measure == ONE_WAY else 250.0] * 18] * 2
-        assert (cell.lost, cell.total("late")) == (4, 4)
-
-
 def command(*options: str) -> list[str]:
     return [sys.executable, "-m", "pebble.cli", "bench", "control", *options]
 
@@ -148,26 +92,6 @@ def test_variants_alone_and_beside_a_load(
         assert back is not None
         assert all(0 < a < b for a, b in zip(there.samples, back.samples, strict=True))
         assert (there.middle("pictures_hz") > 0) == (load_ == "media")
-    assert list(temporary.iterdir()) == []
-
-
-@pytest.mark.thorough
-def test_ctrl_c_leaves_nothing(temporary: Path, tmp_path: Path) -> None:
-    options = ("--seconds", "60", "--variants", "mqtt,zenoh-p2p", "--loads", "media", "--output", str(tmp_path / "out"))
-    bench = subprocess.Popen(
-        command(*options), env={**os.environ, "TMPDIR": str(temporary)}, cwd=ROOT, stdout=subprocess.DEVNULL,
-        stderr=subprocess.DEVNULL,
-    )  # fmt: skip
-    try:
-        assert until(lambda: len(children(bench.pid)) == 8, 30)  # two are the pictures
-        started = children(bench.pid)
-        assert list(temporary.iterdir())
-        bench.send_signal(signal.SIGINT)
-        assert bench.wait(30) == 130
-    finally:
-        bench.kill()
-        bench.wait()
-    assert until(lambda: not any(Path(f"/proc/{pid}").exists() for pid in started), 10)
     assert list(temporary.iterdir()) == []
 
 

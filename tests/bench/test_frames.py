@@ -8,11 +8,9 @@ import time
 from pathlib import Path
 
 import pytest
-from rich.console import Console
 
 from pebble.bench import frames
 from pebble.bench.results import Cell, load
-from pebble.errors import PebbleError
 from pebble.rig.processes import children
 from tests.support import ROOT, gone, until
 
@@ -103,20 +101,6 @@ def test_workers_end_with_a_killed_bench(temporary: Path, tmp_path: Path) -> Non
         bench.kill()
         bench.wait()
     assert until(lambda: all(map(gone, started)), 10)
-
-
-def test_what_is_not_installed_is_left_out_with_the_command_that_installs_it(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(frames, "SYSTEM_PYTHON", "/nowhere/python3")
-    monkeypatch.setattr(
-        frames, "measure", lambda variant, condition, _s: frames.round_cell(variant, "frame", "us", [1.0], condition)
-    )
-    results = frames.run(frames.QUICK, Console(quiet=True)).results
-    assert "gstreamer-shm" not in {cell.variant for cell in results.cells}
-    (note,) = results.notes
-    assert note.startswith("gstreamer-shm is left out: /nowhere/python3 has no GStreamer")
-    assert frames.INSTALL_GSTREAMER in note
-    with pytest.raises(PebbleError, match="no variant can be measured on this machine: /nowhere"):
-        frames.run(frames.Settings(variants=("gstreamer-shm",)), Console(quiet=True))
 
 
 def test_what_the_systems_python_runs_as_plain_files_imports_nothing_of_pebble() -> None:

@@ -35,11 +35,6 @@ def test_a_file_comes_back_as_it_was_with_all_that_repeats_it(tmp_path: Path) ->
     assert all(loaded.machine[name] for name in ("cpu", "kernel", "eclipse-zenoh"))
 
 
-def test_a_machine_without_a_broker_is_described_too(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("pebble.rig.processes.mosquitto_path", lambda: None)
-    assert machine()["mosquitto"] is None
-
-
 def test_a_folder_in_which_nothing_can_be_written_is_refused(tmp_path: Path) -> None:
     check_folder(tmp_path / "new")
     assert list((tmp_path / "new").iterdir()) == []
@@ -97,11 +92,6 @@ def test_a_percentile_is_a_figure_that_was_measured(figures: list[float], percen
 
 def test_nothing_has_no_percentile() -> None:
     assert math.isnan(percentile([], 50))
-
-
-def test_conditions_are_words() -> None:
-    assert a_cell().conditions() == "40 B, readers: 3"
-    assert a_cell(params={}).conditions() == ""
 
 
 def test_a_cell_is_found_by_what_it_measured() -> None:

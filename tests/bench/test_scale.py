@@ -5,11 +5,13 @@ from __future__ import annotations
 import io
 import os
 import resource
+from pathlib import Path
 
 import pytest
 from rich.console import Console
 
 from pebble.bench.scale import CPU, HUB, LATENCY, MEMORY, PAGE, Settings, allow_files, run
+from pebble.bench.show import finish
 from pebble.errors import PebbleError
 from pebble.rig.processes import children
 
@@ -28,9 +30,9 @@ def test_a_limit_of_this_user_is_one_line(monkeypatch: pytest.MonkeyPatch) -> No
 
 @pytest.mark.alone
 @pytest.mark.thorough
-def test_both_are_measured_with_some_boards() -> None:
+def test_both_are_measured_with_some_boards(tmp_path: Path) -> None:
     shown = run(Settings(boards=(5, 40), seconds=1.0), Console(file=io.StringIO()))
-    assert shown.results.complete
+    assert finish(shown, tmp_path, Console(file=io.StringIO())) == 0
     for variant, others in ((PAGE, ("broker", "boards")), (HUB, ("boards",))):
         for boards in (5, 40):
             latency = shown.results.find(variant, LATENCY, boards=boards)

@@ -1,6 +1,5 @@
 """Resource usage of running and ended processes, from the kernel."""
 
-import mmap
 import os
 import sys
 import time
@@ -11,7 +10,6 @@ import pytest
 from pebble.bench.usage import cpu_s, pss_mb, wall_clock_ahead_ns
 from pebble.errors import PebbleError
 from pebble.rig.processes import Worker, children
-from tests.own_memory import own_mb
 from tests.support import Child
 
 GONE = 1 << 22  # above the largest pid
@@ -39,20 +37,6 @@ def test_a_child_is_found_by_its_parent() -> None:
 def test_memory_of_an_ended_process_is_zero() -> None:
     assert pss_mb(os.getpid()) > 1
     assert pss_mb(GONE) == 0
-
-
-def test_a_process_owns_what_it_allocates_but_not_the_files_that_it_reads(tmp_path: Path) -> None:
-    size = 32 << 20
-    (tmp_path / "program").write_bytes(bytes(size))
-    with (tmp_path / "program").open("rb") as file, mmap.mmap(file.fileno(), 0, prot=mmap.PROT_READ) as program:
-        own, proportional = own_mb(os.getpid()), pss_mb(os.getpid())
-        assert not any(program[at] for at in range(0, size, mmap.PAGESIZE))
-        assert own_mb(os.getpid()) < own + 16
-        assert pss_mb(os.getpid()) > proportional + 16
-    allocated = bytearray(os.urandom(size))
-    assert own_mb(os.getpid()) > own + 16
-    assert len(allocated) == size
-    assert own_mb(GONE) == 0
 
 
 def test_a_worker_that_has_ended_is_reported_when_asked(tmp_path: Path) -> None:

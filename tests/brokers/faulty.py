@@ -9,12 +9,13 @@ from contextlib import suppress
 from types import TracebackType
 from typing import Self
 
+from tests.kit.mqtt_bytes import packet
 from tests.sparing_broker import packet_of
 from tests.support import free_port
 
-CONNECT, CONNACK, PUBLISH, SUBSCRIBE, PINGRESP, DISCONNECT = 0x10, 0x20, 0x30, 0x82, 0xD0, 0xE0
-RETAIN, QOS_1, CLEAN, BRIDGE = 0x01, 0x02, 0x02, 0x80
-_LEVEL, _FLAGS, _ID = 6, 7, 12  # places in the body of a CONNECT
+CONNECT, PUBLISH, PINGRESP, DISCONNECT = 0x10, 0x30, 0xD0, 0xE0
+RETAIN, BRIDGE = 0x01, 0x80
+_LEVEL = 6  # its place in the body of a CONNECT
 _LATE_S = 3.0
 
 
@@ -34,20 +35,8 @@ class Fault:
         return [packet(first, body)]
 
 
-def packet(first: int, body: bytes) -> bytes:
-    size, head = len(body), bytes((first,))
-    while size > 127:
-        head, size = head + bytes((size & 127 | 128,)), size >> 7
-    return head + bytes((size,)) + body
-
-
 def kind(first: int) -> int:
     return first & 0xF0
-
-
-def payload_at(first: int, body: bytes) -> int:
-    """Where the payload of a PUBLISH begins."""
-    return 2 + int.from_bytes(body[:2], "big") + (2 if first & QOS_1 else 0)
 
 
 class DropsWills(Fault):

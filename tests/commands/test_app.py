@@ -135,13 +135,6 @@ def test_what_cannot_be_done_is_one_line_and_exit_code_1(run: Run, arguments: tu
     assert named in run.err
 
 
-def test_version(run: Run) -> None:
-    from pebble.version import __version__
-
-    assert run("--version") == 0
-    assert run.out == f"pebble {__version__}\n"
-
-
 def test_up_loads_nothing_that_a_running_robot_does_not_need(tmp_path: Path) -> None:
     code = (
         "import sys; sys.argv = ['pebble', 'up', sys.argv[1]];"

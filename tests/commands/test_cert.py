@@ -63,15 +63,3 @@ def test_mistakes(run: Run, tmp_path: Path) -> None:
     assert run("cert", "renew", "--folder", tmp_path) == 1
     assert run("cert", "init", "--folder", "/proc/pebble", "lab-pc.local") == 1
     assert run.err == "pebble: /proc/pebble: No such file or directory\n"
-
-
-def test_cert_alone_prints_help(run: Run) -> None:
-    assert run("cert") == 0
-    assert "pebble cert init lab-pc.local 192.168.1.20" in run.out
-
-
-def test_without_the_extra(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("pebble.client.page.find_spec", lambda name: None)
-    assert run("cert", "init", "lab-pc.local") == 1
-    assert run.err.endswith("pip install 'pebble-robot[web]'\n")
-    assert run.err.count("\n") == 1

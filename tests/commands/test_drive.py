@@ -3,13 +3,9 @@
 from __future__ import annotations
 
 import json
-import os
-import pty
-import select
 import signal
 import subprocess
 import sys
-import termios
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -21,6 +17,7 @@ import pytest
 from pebble.simulation.trace import complete_lines, read_trace
 from pebble.transports import Message, MqttSettings, QoS, create
 from tests.commands.command_line import Run
+from tests.kit.terminal import Terminal
 from tests.support import ROOT, Broker, Child, gone, some, until
 
 BASE = "pebble/robots/minilamp"
@@ -91,80 +88,7 @@ class Lamp:
             self.capabilities.set()
 
 
-class Console:
-    """A process in a terminal of its own, whose keys can be held as a terminal repeats them."""
-
-    def __init__(self, *command: str, cwd: Path = ROOT) -> None:
-        self.master, slave = pty.openpty()
-        self.mode = termios.tcgetattr(slave)
-        self._slave = slave  # open: so the mode can be read after the process has ended
-        self.process = subprocess.Popen(
-            ["setsid", "--ctty", *command], cwd=cwd, stdin=slave, stdout=slave, stderr=slave, env=os.environ | SHELL
-        )
-        self._held = b""
-        self._shown = b""
-        self._ending = threading.Event()
-        self._threads = [threading.Thread(target=job, daemon=True) for job in (self._read, self._repeat)]
-        for thread in self._threads:
-            thread.start()
-
-    def close(self) -> None:
-        self._ending.set()
-        for thread in self._threads:
-            thread.join()
-        for descriptor in (self.master, self._slave):
-            if descriptor >= 0:
-                os.close(descriptor)
-        if self.process.poll() is None:
-            self.process.kill()
-        self.process.wait(10)
-
-    def hang_up(self) -> None:
-        """Close the terminal, as its window does."""
-        self._ending.set()
-        for thread in self._threads:
-            thread.join()
-        os.close(self._slave)
-        os.close(self.master)
-        self.master = self._slave = -1
-
-    def type(self, keys: bytes) -> None:
-        os.write(self.master, keys)
-
-    def hold(self, key: bytes) -> None:
-        """Repeat a key, as a terminal does after its first delay; b"" lets go."""
-        self._held = key
-
-    def sees(self, text: str, timeout: float = 15.0) -> bool:
-        return until(lambda: text in self.shown, timeout)
-
-    @property
-    def shown(self) -> str:
-        return self._shown.decode(errors="replace")
-
-    def forget(self) -> None:
-        self._shown = b""
-
-    @property
-    def restored(self) -> bool:
-        return termios.tcgetattr(self._slave) == self.mode
-
-    def _read(self) -> None:
-        while not self._ending.is_set():
-            if select.select([self.master], [], [], 0.05)[0]:
-                try:
-                    self._shown += os.read(self.master, 65536)
-                except OSError:
-                    return
-
-    def _repeat(self) -> None:
-        while not self._ending.wait(0.03):
-            if self._held:
-                os.write(self.master, self._held)
-
-
-SHELL = {"PS1": "$ ", "TERM": "xterm", "COLUMNS": "200", "HISTFILE": "/dev/null"}
-Drive = Callable[..., Console]
+Drive = Callable[..., Terminal]
 
 
 @pytest.fixture(scope="module")
@@ -184,16 +108,16 @@ def lamp(one_lamp: Lamp) -> Lamp:
 
 @pytest.fixture
 def drive(broker: Broker, lamp: Lamp) -> Iterator[Drive]:
-    consoles: list[Console] = []
+    consoles: list[Terminal] = []
 
-    def start(*options: str, shell: bool = False, shows: str = "ready") -> Console:
+    def start(*options: str, shell: bool = False, shows: str = "ready") -> Terminal:
         url = f"mqtt://127.0.0.1:{broker.port}"
         command = [sys.executable, "-m", "pebble", "drive", "minilamp", "--url", url, *options]
         if shell:
-            consoles.append(Console("bash", "--norc", "-i"))
+            consoles.append(Terminal("bash", "--norc", "-i"))
             consoles[-1].type(" ".join(command).encode() + b"\n")
         else:
-            consoles.append(Console(*command))
+            consoles.append(Terminal(*command))
         assert consoles[-1].sees(shows), consoles[-1].shown
         return consoles[-1]
 
@@ -202,7 +126,7 @@ def drive(broker: Broker, lamp: Lamp) -> Iterator[Drive]:
         console.close()
 
 
-def driving(console: Console, lamp: Lamp, key: bytes = b"w") -> None:
+def driving(console: Terminal, lamp: Lamp, key: bytes = b"w") -> None:
     """Press ``key``, and again where a stall of a busy machine has ended the gesture."""
     end = time.monotonic() + 20
     while not (lamp.moving and "driving x" in console.shown):
@@ -402,7 +326,7 @@ def test_without_a_terminal_there_is_one_line(run: Run) -> None:
 
 
 def test_an_unreachable_broker_is_reported_before_the_terminal_is_changed() -> None:
-    console = Console(sys.executable, "-m", "pebble", "drive", "minilamp", "--url", "mqtt://127.0.0.1:1")
+    console = Terminal(sys.executable, "-m", "pebble", "drive", "minilamp", "--url", "mqtt://127.0.0.1:1")
     try:
         assert console.process.wait(20) == 1
         assert console.sees("cannot connect to mqtt://127.0.0.1:1")

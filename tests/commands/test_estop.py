@@ -1,9 +1,8 @@
-"""``pebble estop`` with a real broker and robots whose motor owners are scripted around the real latch."""
+"""``pebble estop`` with a real broker and robots that are played around the real latch."""
 
 from __future__ import annotations
 
 import itertools
-import json
 import os
 import pty
 import signal
@@ -11,16 +10,16 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
+from functools import partial
 from pathlib import Path
 from typing import IO, Any
 
 import pytest
 
 from pebble.commands import estop
-from pebble.transports import Message, MqttSettings, State, create
-from tests.client.estop_robot import Robot, outgoing
 from tests.commands.command_line import Run, config_file, program, running
 from tests.fakes.bad_brokers import BEHAVIOURS, resolving, serving
+from tests.kit.played_robot import RecordingRobot
 from tests.sparing_broker import SparingBroker
 from tests.support import Broker, until
 from tests.tcp_proxy import TcpProxy
@@ -29,92 +28,7 @@ from tests.web.served import Served
 _numbers = itertools.count(1)
 
 
-class LiveRobot:
-    """A robot on a broker: answers stops and resets, and records every command."""
-
-    def __init__(self, port: int, *owners: str, id_: str = "", persisted: bool | None = True, **more: Any) -> None:
-        self.id = id_ or f"robot{next(_numbers)}"
-        self.base = f"pebble/robots/{self.id}"
-        self.robot = Robot(self.base, *owners, persisted=persisted, **more)
-        self.commands: list[Message] = []
-        self.deaf = False
-        self.late_s = 0.0  # by so much what it answers
-        self._late: list[threading.Timer] = []
-        self.on_stop: Callable[[], None] = lambda: None
-        self._lock = threading.Lock()
-        self._transport = create("mqtt", self.id, MqttSettings(host="127.0.0.1", port=port)).open()
-        assert self._transport.state is State.CONNECTED
-        self._transport.subscribe(f"{self.base}/incoming/#", self._take)
-        self.publish(self.robot.capabilities(), *(owner.state() for owner in self.robot.owners))
-
-    def publish(self, *messages: Message) -> None:
-        for message in messages:
-            assert self._transport.publish(message.topic, message.payload, qos=message.qos, retain=True)
-
-    def stop(self, name: str = "0123456789abcdef", by: str = "ann@desk", why: str = "dog") -> None:
-        """Stop it as another operator."""
-        body = json.dumps({"stop": name, "by": by, "why": why}).encode()
-        self._take(Message(f"{self.base}/incoming/estop", body))
-
-    def set_flag(self, flag: str) -> None:
-        """Publishes as an operator."""
-        self._transport.publish(f"{self.base}/incoming/flags/{flag}", b"true", retain=True)
-
-    def publish_heartbeat(self) -> None:
-        heartbeat = json.dumps({"t": int(1000 * time.time()), "online": True}).encode()
-        self._transport.publish(f"{self.base}/outgoing/online", heartbeat)
-
-    def publish_link(self, level: str) -> None:
-        link = {"level": level, "drive_hz": 4, "rtt_ms": 600, "queue_ms": 0, "t": 1}
-        self.publish(Message(f"{self.base}/outgoing/link", json.dumps(link).encode()))
-
-    @property
-    def latched(self) -> bool:
-        return all(owner.latch.latched for owner in self.robot.owners)
-
-    def count(self, metric: str) -> int:
-        return sum(message.topic == f"{self.base}/incoming/{metric}" for message in self.commands)
-
-    def close(self) -> None:
-        """Leave without a trace."""
-        for answer in self._late:
-            answer.join()
-        for owner in self.robot.owners:
-            self.publish(Message(owner.state().topic, b""))
-        self.publish(*(Message(f"{self.base}/outgoing/{metric}", b"") for metric in ("capabilities", "status", "link")))
-        self._transport.close()
-
-    def _take(self, message: Message) -> None:
-        with self._lock:
-            self.commands.append(message)
-            if message.topic.endswith("/estop"):
-                self.on_stop()
-            answers = [] if self.deaf else self.robot.take([message])
-        if not self.late_s:
-            self.publish(*answers)
-            return
-        self._late.append(threading.Timer(self.late_s, self.publish, answers))
-        self._late[-1].start()
-
-
-class Heartbeat:
-    """Publishes the heartbeat of a robot, until it is stopped."""
-
-    def __init__(self, robot: LiveRobot) -> None:
-        self._robot, self._stopping = robot, threading.Event()
-        self._thread = threading.Thread(target=self._run, daemon=True)
-        self._thread.start()
-
-    def stop(self) -> None:
-        self._stopping.set()
-        self._thread.join()
-
-    def _run(self) -> None:
-        while not self._stopping.wait(0.1):
-            self._robot.publish_heartbeat()
-
-
-Make = Callable[..., LiveRobot]
+Make = Callable[..., RecordingRobot]
 
 
 @pytest.fixture
@@ -124,14 +38,26 @@ def url(broker: Broker) -> str:
 
 @pytest.fixture
 def robot_on(broker: Broker) -> Iterator[Make]:
-    robots: list[LiveRobot] = []
+    """Make robots without a heartbeat, which leave nothing at the broker; ``more``: capabilities beyond the usual."""
+    robots: list[RecordingRobot] = []
 
-    def make(*owners: str, **options: Any) -> LiveRobot:
-        robots.append(LiveRobot(broker.port, *owners, **options))
-        return robots[-1]
+    def make(*owners: str, id_: str = "", persisted: bool | None = True, **more: Any) -> RecordingRobot:
+        base = f"pebble/robots/{id_ or f'robot{next(_numbers)}'}"
+        robot = RecordingRobot(broker.port, base, *owners, persisted=persisted, heartbeats=False)
+        robots.append(robot)
+        robot.deaf = not more.get("estop", True)
+        if more:
+            robot.publish_capabilities(robot.motors.value | more)
+        if not robot.deaf:
+            robot.publish_states()
+        return robot
 
     yield make
     for robot in robots:
+        robot.silent()
+        states = [f"estop/{owner.name}" for owner in robot.motors.owners]
+        for metric in ("capabilities", "status", "link", "online", *states):
+            robot.remove(metric)
         robot.close()
 
 
@@ -172,22 +98,16 @@ def test_a_stop_is_confirmed_by_every_owner(run: Run, robot_on: Make, url: str) 
     assert run("estop", robot.id, url, "--why", "dog") == 0
     assert robot.latched
     assert run.out.splitlines()[-1].startswith(f"{robot.id}: stopped and confirmed after 0.")
-    latch = robot.robot.owners[0].latch
+    latch = robot.motors.owners[0].latch
     assert (latch.by, latch.why, latch.count) == (estop.me()[:32], "dog", 1)
-    assert json.loads(robot.commands[1].payload)["valid_ms"] == 0
+    assert robot.received[1][2]["valid_ms"] == 0
 
 
 def test_the_first_stop_is_sent_before_anything_is_known_of_the_robot(run: Run, robot_on: Make, url: str) -> None:
     robot = robot_on("serial")
     assert run("estop", robot.id, url) == 0
-    assert until(lambda: len(robot.commands) >= 2)  # it may still be on its way when the command has ended
-    assert [message.topic.rpartition("/")[2] for message in robot.commands[:2]] == ["estop", "drive-values"]
-
-
-def test_an_owner_that_saves_nothing_is_stopped_with_a_remark(run: Run, robot_on: Make, url: str) -> None:
-    robot = robot_on("mcu", persisted=None)
-    assert run("estop", robot.id, url) == 0
-    assert "NOT SAVED: a restart frees it" in run.out
+    assert until(lambda: len(robot.received) >= 2)  # it may still be on its way when the command has ended
+    assert [topic.rpartition("/")[2] for _, topic, _ in robot.received[:2]] == ["estop", "drive-values"]
 
 
 UNPLUGGED = "serial: no /dev/ttyACM0"
@@ -209,7 +129,7 @@ def test_a_stop_of_a_robot_that_cannot_be_driven_is_reported_with_that(
     run: Run, robot_on: Make, url: str, driveable: object, doubt: str
 ) -> None:
     robot = robot_on("base")
-    robot.publish(outgoing(robot.base, "status", {"value": {"services": {}, "driveable": driveable}}))
+    robot.publish("status", {"value": {"services": {}, "driveable": driveable}}, retain=True)
     assert run("estop", robot.id, url) == 0
     output = run.out
     assert "stopped and confirmed" in output
@@ -286,7 +206,7 @@ def test_no_robot_at_all_is_a_failure(run: Run, tmp_path: Path) -> None:
     assert "NOTHING IS STOPPED" in run.out
 
 
-def at_rest(robot: LiveRobot) -> bool:
+def at_rest(robot: RecordingRobot) -> bool:
     """Whether no stop arrives for longer than the time between two of them."""
     before = robot.count("estop")
     time.sleep(0.8)
@@ -299,16 +219,16 @@ def test_a_hold_stops_robots_that_come_online_later(robot_on: Make, url: str) ->
         assert until(lambda: early.latched, 30)
         late = robot_on("serial")
         assert until(lambda: late.latched, 5)
-        latch = late.robot.owners[0].latch
+        latch = late.motors.owners[0].latch
         assert latch.reset(latch.boot, latch.count, 0, 0)
-        late.publish(late.robot.owners[0].state())
+        late.publish_states()
         last = robot_on("serial")
         assert until(lambda: last.latched, 5)
         assert not late.latched, "reset on purpose"
         assert until(lambda: at_rest(last)), "its confirmation has arrived"
         process.send_signal(signal.SIGINT)
         out, err = process.communicate(timeout=30)
-    names = {robot.robot.owners[0].latch.recent[0] for robot in (early, late, last)}
+    names = {robot.motors.owners[0].latch.recent[0] for robot in (early, late, last)}
     assert (process.returncode, err, len(names)) == (0, "", 1)
     assert f"stop {names.pop()} is held" in out
     assert f"{late.id}: was stopped, and reset since" in out
@@ -316,7 +236,8 @@ def test_a_hold_stops_robots_that_come_online_later(robot_on: Make, url: str) ->
 
 def test_a_lost_broker_is_waited_for(tmp_path: Path) -> None:
     broker = Broker(tmp_path)
-    robot = LiveRobot(broker.port, "serial")
+    robot = RecordingRobot(broker.port, "pebble/robots/lost", heartbeats=False)
+    robot.publish_states()
     robot.deaf = True
     with running("estop", robot.id, f"--url=mqtt://127.0.0.1:{broker.port}") as process:
         assert until(lambda: robot.count("estop") >= 1, 30)
@@ -337,14 +258,13 @@ def test_a_lost_broker_is_waited_for(tmp_path: Path) -> None:
 def test_a_slow_network_does_not_delay_repetitions(robot_on: Make, broker: Broker) -> None:
     robot = robot_on("serial")
     robot.deaf = True
-    times: list[float] = []
-    robot.on_stop = lambda: times.append(time.monotonic())
     with (
         TcpProxy(broker.port, delay_s=0.2) as proxy,
         running("estop", robot.id, f"--url=mqtt://127.0.0.1:{proxy.port}"),
     ):
-        assert until(lambda: len(times) >= 2, 30)
-    assert times[1] - times[0] < 1.7, "two seconds if it waited for its subscriptions"
+        assert until(lambda: robot.count("estop") >= 2, 30)
+    first, second, *_ = robot.times("estop")
+    assert second - first < 1.7, "two seconds if it waited for its subscriptions"
 
 
 #: What a broker keeps, too long to arrive, of a stranger or of the robot itself, and who stops the robot all the same.
@@ -369,12 +289,14 @@ def test_a_stop_waits_for_nothing_that_a_broker_keeps(
     broker: Broker, robot_on: Make, base: str, metric: str, words: tuple[str, ...]
 ) -> None:
     robot = robot_on("serial")
-    kept, heartbeat = f"{base or robot.base}/outgoing/{metric}", Heartbeat(robot)
-    robot.publish(Message(kept, json.dumps({"value": "x" * 5000}).encode()))
+    robot.start()
     sparing = SparingBroker(broker.port, longest=1500)
     program_, *more = (word.format(id=robot.id, base=robot.base) for word in words)
     with ExitStack() as opened:
-        for end in (sparing.close, heartbeat.stop, lambda: robot.publish(Message(kept, b""))):
+        stranger = partial(RecordingRobot, broker.port, base, capabilities={}, heartbeats=False)
+        keeper = opened.enter_context(stranger()) if base else robot
+        keeper.publish(metric, {"value": "x" * 5000}, retain=True)
+        for end in (sparing.close, robot.silent, lambda: keeper.remove(metric)):
             opened.callback(end)
         if more[0] in ("reset", "status"):
             robot.stop()
@@ -474,7 +396,7 @@ def test_a_reset_shows_who_stopped_the_robot_and_frees_it(run: Run, robot_on: Ma
         True
     ] * 2
     assert lines[2] == f"{robot.id}: free; it moves again once drive commands have paused for half a second"
-    assert not any(owner.latch.latched for owner in robot.robot.owners)
+    assert not any(owner.latch.latched for owner in robot.motors.owners)
     assert run("estop", "reset", robot.id, url) == 0
     assert run.out == f"{robot.id}: free\n"
     assert robot.count("estop-reset") == 2
@@ -482,9 +404,10 @@ def test_a_reset_shows_who_stopped_the_robot_and_frees_it(run: Run, robot_on: Ma
 
 def test_over_a_thin_link_an_answer_may_take_longer(run: Run, robot_on: Make, url: str) -> None:
     robot = robot_on("serial")
-    robot.publish_link("thin")
+    link = {"level": "thin", "drive_hz": 4, "rtt_ms": 600, "queue_ms": 0, "t": 1}
+    robot.publish("link", link, retain=True)
     robot.late_s = 2.2
-    heartbeat = threading.Timer(robot.late_s, robot.publish_heartbeat)
+    heartbeat = threading.Timer(robot.late_s, robot.beat)
     heartbeat.start()
     assert (run("estop", "status", robot.id, url), run.out) == (0, f"{robot.id}: free\n")
     heartbeat.join()
@@ -539,11 +462,12 @@ def test_status_of_one_and_of_all(run: Run, robot_on: Make, url: str) -> None:
         robot_on("serial"),
     )
     stopped.stop()
-    silent.publish(Message(silent.robot.owners[0].state().topic, b""))
+    silent.remove("estop/serial")
     assert run("estop", "status", url) == 0
     last = "no heartbeat; its last state: "
     assert {line.split(": ", 1)[1][: len(last)] for line in run.out.splitlines()} == {last}
-    alive = [Heartbeat(robot) for robot in (free, stopped, old, silent)]
+    for robot in (free, stopped, old, silent):
+        robot.start()
     assert run("estop", "status", url) == 0
     lines = dict(line.split(": ", 1) for line in run.out.splitlines())
     assert lines[free.id] == "free"
@@ -554,14 +478,12 @@ def test_status_of_one_and_of_all(run: Run, robot_on: Make, url: str) -> None:
     assert run("estop", "status", stopped.id, url) == 0
     assert list(dict(line.split(": ", 1) for line in run.out.splitlines())) == [stopped.id]
     assert run("estop", "status", "unknown", url) == 1
-    for one in alive:
-        one.stop()
 
 
 def test_no_name_from_the_network_reaches_the_terminal_unchanged(run: Run, robot_on: Make, url: str) -> None:
     robot = robot_on("a\u202eb")
     state = {"latched": True, "boot": "0", "count": 1, "recent": [], "by": "\x1b[31m", "why": "\u202e", "since": 1}
-    robot.publish(outgoing(robot.base, "estop/a\u202eb", state))
+    robot.publish("estop/a\u202eb", state, retain=True)
     assert run("estop", "status", robot.id, url) == 0
     assert "\x1b" not in run.out
     assert "\u202e" not in run.out

@@ -25,8 +25,8 @@ from pebble.fleet.people import People
 from pebble.fleet.roles import Role
 from pebble.rig.processes import mosquitto_path, python
 from pebble.transports.zenoh.access import read_access
-from tests.commands.test_drive import Console
 from tests.fleet.broker_client import BrokerClient, Place
+from tests.kit.terminal import Terminal
 from tests.support import ROOT, Child, free_port, listening, until
 
 PAGE = (ROOT / "docs" / "fleet.md").read_text()
@@ -82,7 +82,7 @@ def test_the_first_page_as_a_newcomer_types_it(level: str, tmp_path: Path) -> No
         place = Place("127.0.0.1", port, tmp_path / "hall" / "ca.pem")
         with BrokerClient(place, "minilamp", passwords["minilamp"]) as robot, typed(simulate, tmp_path):
             robot.subscribe([f"{LAMP}/incoming/#", f"{LAMP}/outgoing/estop/#"])
-            with closing(Console(*python("pebble.cli", *shlex.split(drive)[1:]), cwd=tmp_path)) as console:
+            with closing(Terminal(*python("pebble.cli", *shlex.split(drive)[1:]), cwd=tmp_path)) as console:
                 assert console.sees("ready"), console.shown
                 console.hold(b"w")
                 assert until(lambda: robot.listen(0.05) or any(MOVES.search(one) for _, one in robot.received), 20)

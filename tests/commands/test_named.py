@@ -8,8 +8,8 @@ from collections.abc import Iterator
 import pytest
 
 from tests.commands.command_line import Run
+from tests.kit.played_robot import RecordingRobot
 from tests.support import Broker, until
-from tests.web.served import RecordingRobot
 
 NAMES = itertools.count(1)
 COMMANDS: list[tuple[list[str], list[str], bool]] = [

@@ -40,14 +40,6 @@ def test_its_test_passes_and_fails_for_a_robot_that_turns_away(folder: Path) -> 
 
 
 @pytest.mark.thorough
-def test_it_passes_below_a_folder_with_other_settings_for_pytest(folder: Path) -> None:
-    (folder.parent / "pyproject.toml").write_text(
-        '[tool.pytest.ini_options]\naddopts = "-qq --strict-config"\nunknown = 1\n'
-    )
-    assert "1 passed" in pytest_in(folder.parent, folder.name).stdout
-
-
-@pytest.mark.thorough
 def test_the_tests_of_two_scripts_pass_in_one_run(folder: Path) -> None:
     second = shutil.copytree(folder, folder.with_name("second"))
     (second / "test_follow_me.py").rename(second / "test_second.py")

@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import math
-
 import msgspec
 import pytest
 
 from pebble.client.names import ANY_ROBOT, Names
 from pebble.commands.terminal import show
-from pebble.media.rate_meter import RateMeter
-from pebble.transports import Message, QoS
+from pebble.transports import Message
 
 
 def test_bodies() -> None:
@@ -35,27 +32,9 @@ def test_no_payload_upsets_the_terminal(payload: bytes) -> None:
     assert "\x9b" not in text
 
 
-def test_headlines() -> None:
-    stamped = Message("a/b", b'{"t": 1710969600000}', QoS.DELIVERED, retain=True)
-    assert show.headline(stamped, 1710969603.0) == "a/b  20 B  qos 1  retained  stamped 3.0 s ago"
-    assert show.headline(Message("a", b"x", retain_requested=True), 0.0) == "a  1 B  qos 0  to be retained"
-    assert show.age(-0.5) == "500 ms ahead"
-    assert [show.duration(seconds) for seconds in (0.012, 99, 130, 7200, 200_000)] == [
-        "12 ms", "99.0 s", "2 min", "2 h", "2 d",
-    ]  # fmt: skip
-
-
 def test_a_thin_link_is_listed() -> None:
     listing = show.Listing(Names(ANY_ROBOT))
     link = {"level": "thin", "drive_hz": 4, "rtt_ms": 600, "queue_ms": 45, "t": 1}
     for name, value in (("goob", link), ("fred", link | {"level": "wide"}), ("eve", 7)):
         listing.add(Message(f"pebble/robots/{name}/outgoing/link", msgspec.json.encode(value), retain=True), 0.0)
     assert show.remarks(listing, 0.0) == ["goob has a slow connection: commands take 0.3 s"]
-
-
-def test_rates() -> None:
-    meter = RateMeter(window_s=math.inf, limit=11)
-    assert show.rate_line(meter, 0.0) is None
-    for number in range(50):
-        meter.add(number * 0.25, 100)
-    assert str(show.rate_line(meter, 99.0)).startswith("4.000 Hz  3.2 kbit/s  min 0.2500 s  max 0.2500 s")

@@ -108,21 +108,6 @@ def test_the_printed_commands_make_it_start(
         assert settings.authority == state / "tls/ca.pem"
 
 
-def test_the_same_from_a_config(run: Run, served: list[WebSettings], tmp_path: Path) -> None:
-    config = config_file(tmp_path, web_interface={"host": "0.0.0.0"}, **BROKER)
-    assert run("web", config) == 2
-    assert run.err.splitlines()[0].endswith("so the page needs a certificate and a user:")
-    tls = tmp_path / "tls"
-    assert run("cert", "init", "--folder", tls, "lab.local") == 0
-    assert run("web", config, "--tls", tls) == 2
-    people = People(tmp_path / "people.sqlite")
-    people.add("alice", SECRET, Role.VIEWER)
-    people.close()
-    assert run("web", config, "--tls", tls, "--people", tmp_path / "people.sqlite") == 0, run.err
-    assert served[0].certificate == tls / "server.pem"
-    assert served[0].login
-
-
 @pytest.mark.parametrize("order", ["user first", "certificate first"])
 @pytest.mark.parametrize(
     ("added", "counts"),
@@ -157,15 +142,6 @@ def test_whose_people_may_use_the_page_of_a_config(
     assert [settings.people for settings in served] == ([tmp_path / counts / "people.sqlite"] if counts else [])
 
 
-def test_plain_http_for_others_is_a_matter_of_the_config(run: Run, served: list[WebSettings], tmp_path: Path) -> None:
-    people = People(tmp_path / "people.sqlite")
-    people.add("alice", SECRET, Role.VIEWER)
-    people.close()
-    web = {"host": "0.0.0.0", "plain_http": True, "people": str(tmp_path / "people.sqlite")}
-    assert run("web", config_file(tmp_path, web_interface=web, **BROKER)) == 0, run.err
-    assert (served[0].login, served[0].certificate, served[0].plain_http_drive) == (True, None, False)
-
-
 def test_a_folder_without_a_certificate_and_the_missing_user_are_named_at_once(
     run: Run, served: list[WebSettings], tmp_path: Path, state: Path
 ) -> None:
@@ -178,30 +154,6 @@ def test_a_folder_without_a_certificate_and_the_missing_user_are_named_at_once(
     assert run(*lines[1].split()[1:]) == 0, run.err
     assert run("web", "--url", "mqtt://broker.example", "--tls", tmp_path) == 2
     assert run.err.splitlines()[0].endswith("so the page needs a user:")
-
-
-def test_an_unreadable_certificate_and_the_missing_user_are_named_at_once(
-    run: Run, served: list[WebSettings], tmp_path: Path
-) -> None:
-    web = {"host": "0.0.0.0", "tls": {"certificate": "server.pem", "key": "server.key"}, "people": "people.sqlite"}
-    assert run("web", config_file(tmp_path, web_interface=web, **BROKER)) == 1
-    assert [line.removeprefix("pebble: ").partition(":")[0] for line in run.err.splitlines()] == [
-        "web_interface.tls.certificate", "web_interface.people",
-    ]  # fmt: skip
-
-
-def test_the_help_shows_the_command_line_that_people_use(run: Run) -> None:
-    assert run("web", "--help") == 0
-    assert run.out.split("\n\n")[0].strip().upper() == "USAGE: PEBBLE WEB [OPTIONS] [CONFIG]"
-    assert run("web", "user", "add", "--help") == 0
-    assert "Usage: pebble web user add" in run.out
-
-
-def test_tls_on_this_machine_has_a_login(run: Run, served: list[WebSettings], tmp_path: Path) -> None:
-    run("cert", "init", "--folder", tmp_path / "tls", "localhost")
-    assert run("web", "--url", "mqtt://broker.example", "--tls", tmp_path / "tls") == 2
-    assert run.err.splitlines()[0] == "pebble: a page with --tls has a login, so the page needs a user:"
-    assert served == []
 
 
 @pytest.mark.parametrize(

@@ -180,11 +180,6 @@ def test_a_tool_that_fails_ends_it_and_leaves_no_password(board: NodeBoard, tmp_
     assert not any(Path(path).exists() for path in tools.seen)
 
 
-def test_an_imu_without_usb_names_its_serial_port(board: NodeBoard, reported: list[str]) -> None:
-    execute(FlashOptions(firmware=FIRMWARE["goob_imu"], port=board.port), RecordingTools(), reported.append)
-    assert reported[-1].strip() == "with this MicroPython it sends on D6 and D7, 115200 baud, not on USB: not checked"
-
-
 def test_a_dry_run_shows_every_command_and_runs_none(tmp_path: Path, reported: list[str]) -> None:
     image = tmp_path / "c6.bin"
     private = private_files(
@@ -210,18 +205,6 @@ def test_a_dry_run_shows_every_command_and_runs_none(tmp_path: Path, reported: l
     assert "sesam" not in text
     assert "geheim" not in text
     assert "pebble/robots/lamp/outgoing/online" in text
-
-
-def test_a_samd21_gets_its_micropython_by_a_drive(tmp_path: Path, reported: list[str]) -> None:
-    show_steps(
-        FlashOptions(firmware=FIRMWARE["fred"], port="/dev/ttyX", micropython=tmp_path / "x.uf2"),
-        Tools(QUICK),
-        reported.append,
-    )
-    lines = [line.strip() for line in reported]
-    assert f"cp {tmp_path}/x.uf2 DRIVE/" in lines
-    assert not any("esptool" in line for line in lines)
-    assert lines.index(f"cp {tmp_path}/x.uf2 DRIVE/") < lines.index("$ mpremote connect /dev/ttyX reset")
 
 
 @pytest.mark.thorough

@@ -4,9 +4,6 @@ from __future__ import annotations
 
 from itertools import count
 
-BASE = "pebble/robots/goob"
-DRIVE = f"{BASE}/incoming/drive-values"
-CONNACK, DISCONNECT, PINGREQ = b"\x20\x02\x00\x00", b"\xe0\x00", b"\xc0\x00"
 _names = count()
 
 
@@ -47,27 +44,3 @@ def publish(
     raw = payload.encode() if isinstance(payload, str) else payload
     head = 0x30 | qos << 1 | int(retain) | (8 if dup else 0)
     return packet(head, text(topic) + (number.to_bytes(2, "big") if qos else b"") + raw)
-
-
-def acknowledgement(head: int, number: int) -> bytes:
-    return bytes((head, 2)) + number.to_bytes(2, "big")
-
-
-def puback(number: int) -> bytes:
-    return acknowledgement(0x40, number)
-
-
-def pubrec(number: int) -> bytes:
-    return acknowledgement(0x50, number)
-
-
-def pubrel(number: int) -> bytes:
-    return acknowledgement(0x62, number)
-
-
-def pubcomp(number: int) -> bytes:
-    return acknowledgement(0x70, number)
-
-
-def subscribe(filter_: str, qos: int = 0) -> bytes:
-    return packet(0x82, b"\x00\x09" + text(filter_) + bytes((qos,)))

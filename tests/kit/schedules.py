@@ -32,6 +32,8 @@ ENGINES = {
     "stops": "tests.services.mqtt_bridge.stop_schedules",
     "ages": "tests.forwarding.age_schedules",
     "thin": "tests.robot.thin_schedules",
+    "robot_scripts": "tests.robot.script_schedules.world",
+    "robot_stops": "tests.robot.stop_schedules.performance",
 }
 
 Step = tuple[str, int, int]  # the world's method do_<action> is called with two small numbers
@@ -261,7 +263,7 @@ def _map(jobs: int, work: Callable[..., Any], *arguments: Iterable[Any]) -> Iter
 
 
 def table(results: list[Result]) -> str:
-    """One line for each kind of world, one for all, and one for each tag."""
+    """One line for each kind of world, one for all, and one for each tag; of counts the sums, or of the slowest one."""
     groups: dict[str, list[Result]] = {}
     for name, one in [(one.kind, one) for one in results if one.kind] + [("all", one) for one in results]:
         groups.setdefault(name, []).append(one)
@@ -270,7 +272,8 @@ def table(results: list[Result]) -> str:
     names = list(dict.fromkeys(name for one in results for name in one.counts))
     rows = [("", "schedules", *names, "violations", "slowest")]
     for name, group in groups.items():
-        counts = (f"{sum(one.counts.get(count, 0) for one in group):g}" for count in names)
+        totals = ((max if count.startswith("slowest") else sum, count) for count in names)
+        counts = (f"{total(one.counts.get(count, 0) for one in group):g}" for total, count in totals)
         bad, slowest = sum(len(one.problems) for one in group), max(one.seconds for one in group)
         rows.append((name, str(len(group)), *counts, str(bad), f"{slowest:.2f} s"))
     return "\n".join(f"{row[0]:36}" + "".join(f"{cell:>13}" for cell in row[1:]) for row in rows)

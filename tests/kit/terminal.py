@@ -1,48 +1,106 @@
-"""A program in a terminal of its own, and a person who types when it asks."""
+"""A program in a terminal of its own, and a person who types when it asks, or holds a key."""
 
 from __future__ import annotations
 
 import os
 import pty
 import select
-import time
-from collections.abc import Sequence
-from contextlib import suppress
+import subprocess
+import termios
+import threading
+from pathlib import Path
+
+from tests.support import ROOT, until
+
+SHELL = {"PS1": "$ ", "TERM": "xterm", "COLUMNS": "200", "HISTFILE": "/dev/null"}
 
 
 class Terminal:
-    """``shown`` is all that it has shown."""
+    """``shown`` is all that it has shown, or all since ``forget``."""
 
-    def __init__(self, command: Sequence[str]) -> None:
-        self.shown, self._answered = "", 0
-        self.pid, self._terminal = pty.fork()
-        if self.pid == 0:
-            os.execvp(command[0], [*command])
+    def __init__(self, *command: str, cwd: Path = ROOT) -> None:
+        self.master, slave = pty.openpty()
+        self.mode = termios.tcgetattr(slave)
+        self._slave = slave  # open: so the mode can be read after the process has ended
+        self.process = subprocess.Popen(
+            ["setsid", "--ctty", *command], cwd=cwd, stdin=slave, stdout=slave, stderr=slave, env=os.environ | SHELL
+        )
+        self._held = b""
+        self._shown = b""
+        self._answered = 0  # so much of what is shown is answered
+        self._ending = threading.Event()
+        self._threads = [threading.Thread(target=job, daemon=True) for job in (self._read, self._repeat)]
+        for thread in self._threads:
+            thread.start()
 
-    def shows(self, prompt: str, timeout_s: float = 60.0) -> None:
-        """Wait until it asks so."""
-        self._read_to(prompt, time.monotonic() + timeout_s)
+    def close(self) -> None:
+        self.hang_up()
+        if self.process.poll() is None:
+            self.process.kill()
+        self.process.wait(10)
+
+    def hang_up(self) -> None:
+        """Close the terminal, as its window does."""
+        self._ending.set()
+        for thread in self._threads:
+            thread.join()
+        for descriptor in (self.master, self._slave):
+            if descriptor >= 0:
+                os.close(descriptor)
+        self.master = self._slave = -1
+
+    def ends(self, timeout_s: float = 60.0) -> int:
+        """Wait for the end of the process; return its exit code."""
+        code = self.process.wait(timeout_s)
+        assert until(lambda: not select.select([self.master], [], [], 0)[0]), "what it has shown last is read"
+        self.close()
+        return code
+
+    # -- what is typed
+
+    def type(self, keys: bytes) -> None:
+        os.write(self.master, keys)
+
+    def hold(self, key: bytes) -> None:
+        """Repeat a key, as a terminal does after its first delay; b"" lets go."""
+        self._held = key
 
     def answers(self, prompt: str, text: str) -> None:
         """Type a line once it asks so."""
         self.shows(prompt)
-        self._answered = len(self.shown)
-        os.write(self._terminal, f"{text}\n".encode())
+        self._answered = len(self._shown)
+        self.type(f"{text}\n".encode())
 
-    def ends(self, timeout_s: float = 60.0) -> int:
-        """Wait for its end; its exit code."""
-        self._read_to(None, time.monotonic() + timeout_s)
-        os.close(self._terminal)
-        _, status = os.waitpid(self.pid, 0)
-        return os.waitstatus_to_exitcode(status)
+    # -- what is shown
 
-    def _read_to(self, text: str | None, end: float) -> None:
-        while text is None or text not in self.shown[self._answered :]:
-            assert time.monotonic() < end, self.shown
-            if select.select([self._terminal], [], [], 0.1)[0]:
-                part = b""
-                with suppress(OSError):  # Linux: the program has ended
-                    part = os.read(self._terminal, 4096)
-                if not part:
-                    break
-                self.shown += part.decode(errors="replace")
+    def sees(self, text: str, timeout: float = 15.0) -> bool:
+        return until(lambda: text in self.shown, timeout)
+
+    def shows(self, prompt: str, timeout_s: float = 60.0) -> None:
+        """Wait until it asks so, after the last answer."""
+        assert until(lambda: prompt.encode() in self._shown[self._answered :], timeout_s), self.shown
+
+    @property
+    def shown(self) -> str:
+        return self._shown.decode(errors="replace")
+
+    def forget(self) -> None:
+        self._shown, self._answered = b"", 0
+
+    @property
+    def restored(self) -> bool:
+        """True if the terminal has the mode that it had before the process."""
+        return termios.tcgetattr(self._slave) == self.mode
+
+    def _read(self) -> None:
+        while not self._ending.is_set():
+            if select.select([self.master], [], [], 0.05)[0]:
+                try:
+                    self._shown += os.read(self.master, 65536)
+                except OSError:
+                    return
+
+    def _repeat(self) -> None:
+        while not self._ending.wait(0.03):
+            if self._held:
+                os.write(self.master, self._held)

@@ -86,7 +86,7 @@ class Clock:
 
 def answered(robot: Robot, clock: Clock) -> str:
     """What the terminal of setup has shown, to a person who takes what is offered; the robot's camera is simulated."""
-    terminal = Terminal(robot.machine.command("env", "TERM=xterm-256color", *SETUP))
+    terminal = Terminal(*robot.machine.command("env", "TERM=xterm-256color", *SETUP))
     terminal.shows("Name [", timeout_s=600)
     clock.did("the package has built its slot, and setup asks")
     robot.plug_in()

@@ -16,6 +16,7 @@ from pebble.bench import bridge, cost, startup
 from pebble.bench.bridge import COMMANDS, CPU, DOWN, LOADED, UNLOADED, UP
 from pebble.bench.bridge_operator import HOP, SERVICES
 from pebble.bench.results import STAND_IN, Cell, Results
+from pebble.bench.show import Shown, finish
 from pebble.rig.processes import children
 from pebble.rig.robot import KINDS
 from tests.robot.rig import Rig, descendants
@@ -24,15 +25,20 @@ from tests.support import ROOT, Child, until
 pytestmark = [pytest.mark.alone, pytest.mark.thorough]  # whole robots
 
 
+def written(shown: Shown, folder: Path) -> Results:
+    """Return the results, once their tables were printed and their pictures drawn."""
+    assert finish(shown, folder, Console(file=io.StringIO())) == 0
+    return shown.results
+
+
 def cell_of(results: Results, variant: str, measure: str, **params: str) -> Cell:
     cell = results.find(variant, measure, **params)
     assert cell is not None, (variant, measure, params)
     return cell
 
 
-def test_startup_of_both_kinds() -> None:
-    results = startup.run(startup.Settings(rounds=1, joins=2), Console(file=io.StringIO())).results
-    assert results.complete
+def test_startup_of_both_kinds(tmp_path: Path) -> None:
+    results = written(startup.run(startup.Settings(rounds=1, joins=2), Console(file=io.StringIO())), tmp_path)
     for kind in KINDS:
         for measure in startup.STARTED:
             assert 0 < cell_of(results, kind, measure).samples[0] < 60
@@ -45,9 +51,9 @@ def test_startup_of_both_kinds() -> None:
     assert children(os.getpid()) == []
 
 
-def test_cost_of_both_kinds(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_cost_of_both_kinds(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(cost, "_STARTUP_S", 0.0)
-    results = cost.run(cost.Settings(seconds=0.4, rounds=1), Console(file=io.StringIO())).results
+    results = written(cost.run(cost.Settings(seconds=0.4, rounds=1), Console(file=io.StringIO())), tmp_path)
     for kind, own in (("mqtt", "mosquitto"), ("zenoh", "zenoh_hub")):
         for phase in ("idle", "driving", *cost.STREAMS):
             for process in ("launcher", "announcer", "serial_mcu_bridge", "mqtt_bridge", "av_daemon", own):
@@ -60,11 +66,10 @@ def test_cost_of_both_kinds(monkeypatch: pytest.MonkeyPatch) -> None:
     assert children(os.getpid()) == []
 
 
-def test_all_robots_are_driven_also_with_media(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_all_robots_are_driven_also_with_media(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("pebble.bench.bridge_operator._STARTUP_S", 0.2)
-    results = bridge.run(
-        bridge.Settings(with_media=True, seconds=1.0, rounds=1), Console(file=io.StringIO())
-    ).results  # fmt: skip
+    settings = bridge.Settings(with_media=True, seconds=1.0, rounds=1)
+    results = written(bridge.run(settings, Console(file=io.StringIO())), tmp_path)
     robots = [(kind, load, way) for kind in KINDS for load in (UNLOADED, LOADED) for way in (DOWN, UP)]
     robots += [(STAND_IN, UNLOADED, way) for way in (DOWN, UP)] + [(HOP, UNLOADED, DOWN)]
     robots += [(kind, COMMANDS, DOWN) for kind in (STAND_IN, *KINDS)]

@@ -1,13 +1,9 @@
-"""One short trial of whole robots, and an interrupted one: nothing is left behind."""
+"""One short trial of whole robots, which leaves nothing behind."""
 
 from __future__ import annotations
 
 import io
 import os
-import signal
-import subprocess
-import sys
-import tempfile
 from pathlib import Path
 
 import pytest
@@ -16,9 +12,8 @@ from rich.console import Console
 from pebble.bench.impair import metrics
 from pebble.bench.impair.network import why_no_namespaces
 from pebble.bench.impair.trials import Settings, run
+from pebble.bench.show import finish
 from pebble.rig.processes import children
-from tests.robot.rig import Rig, descendants
-from tests.support import ROOT, until
 
 pytestmark = pytest.mark.alone  # whole robots
 
@@ -34,7 +29,7 @@ def permitted() -> None:
 
 @pytest.mark.thorough
 @pytest.mark.parametrize("subject", ["zenoh h264 opus", "mqtt original"])
-def test_a_robot_is_driven_and_streams_media_over_a_slow_network(subject: str) -> None:
+def test_a_robot_is_driven_and_streams_media_over_a_slow_network(subject: str, tmp_path: Path) -> None:
     shown = run(Settings(trials=("512k",), subjects=(subject,), **SHORT), Console(file=io.StringIO()))
     cells = {cell.measure: cell for cell in shown.results.cells}
     assert {cell.variant for cell in cells.values()} == {subject}
@@ -51,38 +46,5 @@ def test_a_robot_is_driven_and_streams_media_over_a_slow_network(subject: str) -
     assert clip.lost == 0
     assert 0 < clip.samples[0] < 20_000
     assert len(shown.tables) == 5
+    assert finish(shown, tmp_path, Console(file=io.StringIO())) == 0
     assert children(os.getpid()) == []
-
-
-@pytest.mark.thorough
-def test_ctrl_c_leaves_nothing(tmp_path: Path) -> None:
-    with tempfile.TemporaryDirectory(prefix="i-", dir="/tmp") as short:  # as below it are Unix sockets
-        _end_by_ctrl_c(tmp_path, Path(short))
-
-
-def _end_by_ctrl_c(tmp_path: Path, temporary: Path) -> None:
-    command = [
-        sys.executable,
-        "-m",
-        "pebble.cli",
-        "bench",
-        "impair",
-        "--subjects",
-        "mqtt original",
-        "--output",
-        str(tmp_path),
-    ]
-    process = subprocess.Popen(
-        command, cwd=ROOT, env={**os.environ, "TMPDIR": str(temporary)}, stdout=subprocess.DEVNULL
-    )
-    try:
-        assert until(lambda: len(list(temporary.glob("pbl-*/the operator*.log"))) == 1, 60), "the robot does not start"
-        started = descendants(process.pid)
-        process.send_signal(signal.SIGINT)
-        assert process.wait(30) == 130
-    finally:
-        process.kill()
-        process.wait()
-    assert len(started) > 4
-    assert until(lambda: not any(map(Rig.alive, started)))
-    assert not list(temporary.glob("pbl-*"))

@@ -20,9 +20,9 @@ from pebble.config import load
 from pebble.forwarding.retained_window import INITIAL_SYNC_S
 from pebble.runtime.connections import local_transport
 from pebble.transports import Message
-from tests.commands.test_drive import Console
 from tests.fleet.broker_client import BrokerClient, Place
 from tests.fleet.brokers import HOST
+from tests.kit.terminal import Terminal
 from tests.robot.named import CONTROL, DRIVE, Hall, Named
 from tests.robot.operator import Operator, driving
 from tests.robot.rig import BASE, STOP, lines
@@ -95,7 +95,7 @@ def test_a_terminal_takes_control_by_its_account_is_asked_and_is_taken_over(rig:
     password.chmod(0o600)
     url = f"mqtt://otto@127.0.0.1:{rig.hall.plain_port}"
     drive = [sys.executable, "-m", "pebble.cli", "drive", "rover", "--url", url, "--password-file", str(password)]
-    with closing(Console(*drive)) as console:
+    with closing(Terminal(*drive)) as console:
         assert console.sees("ready"), console.shown
         assert (rig.state()["by"].partition("/")[0], rig.state()["named"]) == ("otto", True)
         began = time.monotonic()

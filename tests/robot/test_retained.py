@@ -1,4 +1,4 @@
-"""Messages retained before the robot starts: commands are stale and are not forwarded, flags are reconciled."""
+"""Messages retained before the robot starts: commands are stale and are not forwarded."""
 
 from __future__ import annotations
 
@@ -124,37 +124,3 @@ def test_retained_commands_at_the_local_broker(two_brokers: Rig) -> None:
     two_brokers.start()
     assert_untouched(two_brokers)
     assert not set(retained_messages(two_brokers.remote.port, BASE)) & set(COMMANDS)
-
-
-@pytest.mark.parametrize("two_brokers", ["mqtt", further("mirror")], indirect=True)
-def test_retained_flags_that_differ_end_with_the_remote_value(two_brokers: Rig) -> None:
-    flag = "incoming/flags/mqtt-video"
-    assert two_brokers.local is not None
-    retain_messages(two_brokers.local.port, {flag: {"value": True}})
-    retain_messages(two_brokers.remote.port, {flag: {"value": False}})
-    watchers = [Operator(broker.port, BASE) for broker in (two_brokers.local, two_brokers.remote)]
-    two_brokers.start()
-    assert until(lambda: watchers[0].last(flag).json == {"value": False}, 10)
-    time.sleep(1)  # long enough for hundreds of rounds, if it flapped
-    for watcher in watchers:
-        assert watcher.last(flag).json == {"value": False}
-        assert len(watcher.on(flag)) <= 3
-        watcher.close()
-
-
-@pytest.mark.parametrize("two_brokers", ["mqtt", further("mirror")], indirect=True)
-def test_a_flag_set_locally_during_an_outage_wins(two_brokers: Rig) -> None:
-    flag = "incoming/flags/mqtt-audio"
-    assert two_brokers.local is not None
-    two_brokers.start()
-    two_brokers.operator.send(flag, {"value": False}, retain=True)
-    local = Operator(two_brokers.local.port, BASE)
-    assert until(lambda: (seen := local.last(flag)) is not None and seen.json == {"value": False}, 5)
-    two_brokers.uplink.blackhole()
-    time.sleep(3)  # noticed after 2 s
-    local.send(flag, {"value": True}, retain=True)
-    two_brokers.uplink.resume()
-    assert until(lambda: two_brokers.operator.last(flag).json == {"value": True}, 10)
-    assert until(lambda: retained_messages(two_brokers.remote.port, BASE, 0.2)[flag] == b'{"value": true}', 5)
-    assert local.last(flag).json == {"value": True}
-    local.close()

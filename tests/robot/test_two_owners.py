@@ -1,6 +1,6 @@
-"""Two motor owners are one robot: tables of who drives both, and of what is no silence; random schedules.
+"""Two motor owners are one robot: tables of who drives both, and of what is no silence.
 
-``python -m tests.kit.schedules owners`` runs thousands. The world in virtual time checks its own rules all the time.
+The world in virtual time checks its own rules all the time.
 """
 
 from __future__ import annotations
@@ -14,13 +14,9 @@ import pytest
 
 from pebble.config import Config
 from tests.robot.lockstep.drivers import STRANGER
-from tests.robot.lockstep.two_owners import ENGINE, FIRST, SECOND, TwoOwners, configuration
-from tests.support import cases
+from tests.robot.lockstep.two_owners import FIRST, SECOND, TwoOwners, configuration
 
 pytestmark = pytest.mark.computing
-
-SCHEDULES = cases(50, 150)
-FOREVER = 1e6
 
 
 @pytest.fixture(autouse=True)
@@ -250,8 +246,3 @@ def test_the_second_shows_what_the_first_does_under_its_own_boot(config: Config)
     assert [getattr(second, field) for field in shown] == [getattr(first, field) for field in shown]
     assert (first.by, first.asks, len(first.key)) == ("ann", "eve", 8)
     assert first.boot != second.boot
-
-
-def test_no_schedule_has_two_drivers() -> None:
-    broken = [rule for result in ENGINE.run("", 1, range(SCHEDULES)) for rule in result.problems]
-    assert not broken, "python -m tests.kit.schedules owners prints the shortest schedule"

@@ -14,7 +14,6 @@ from pebble.runtime.places import Places
 from tests.commands.command_line import Run
 from tests.kit.terminal import Terminal
 from tests.setup.rig import ANSWERS, BROKER_PASSWORD, PASSWORD, answers_in, set_up, tree
-from tests.support import ROOT
 
 FAR = ANSWERS | {"broker": "broker.lab:8884", "broker_user": "goob"}
 
@@ -108,7 +107,7 @@ def terminal(root: Path) -> Terminal:
         "from pathlib import Path; from pebble.setup.session import set_up; from tests.setup.rig import machine;"
         f"exit(set_up(machine(Path({str(root)!r})), None, None))"
     )
-    return Terminal(["env", "-C", str(ROOT), "-u", "SUDO_USER", "COLUMNS=60", sys.executable, "-c", script])
+    return Terminal("env", "-u", "SUDO_USER", "COLUMNS=60", sys.executable, "-c", script)
 
 
 def test_six_questions_in_a_terminal(root: Path) -> None:

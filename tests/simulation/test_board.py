@@ -1,13 +1,11 @@
 """The firmware of Goob and Fred on simulated boards, without a real clock or a pty."""
 
-import math
-
 import pytest
 
 from pebble.errors import ConfigError
 from pebble.services.serial_mcu_bridge.text.goob_base import Charging, Level, Touch, parse
 from pebble.simulation.board import SimulatedMcu
-from pebble.simulation.motion import FULL_SPEED_MM_S, TRACK_MM, RobotMotion
+from pebble.simulation.motion import FULL_SPEED_MM_S, RobotMotion
 
 
 def run(mcu: SimulatedMcu, start: float, seconds: float, command: bytes = b"") -> bytes:
@@ -19,11 +17,6 @@ def run(mcu: SimulatedMcu, start: float, seconds: float, command: bytes = b"") -
             output += mcu.receive(command, now)
         output += mcu.tick(now)
     return output
-
-
-def test_a_command_may_arrive_in_pieces() -> None:
-    mcu = SimulatedMcu("goob", 0.0)
-    assert b"".join(mcu.receive(bytes([byte]), 0.0) for byte in b"M 0.5 0.5\nL 0 0 0\n") == b"OK M\r\nOK L\r\n"
 
 
 def test_goob_reports() -> None:
@@ -67,31 +60,12 @@ def test_driving_ahead_moves_both_wheels_and_the_magnets() -> None:
         assert min(wave) < 270
 
 
-def test_more_left_than_right_turns_right() -> None:
-    mcu = SimulatedMcu("goob", 0.0)
-    run(mcu, 0.0, 0.5, b"M 0.2 -0.2\n")
-    state = mcu.state()
-    assert state.pose.heading_rad == pytest.approx(-0.4 * FULL_SPEED_MM_S * 0.44 / TRACK_MM, rel=0.05)
-    assert math.hypot(state.pose.x_mm, state.pose.y_mm) < 1e-6
-    assert state.motors == (0.2, 0.2), "Goob's right motor is mounted the other way round"
-
-
 def test_motion_does_not_depend_on_how_time_is_cut() -> None:
     coarse, fine = RobotMotion(), RobotMotion()
     coarse.advance(0.5, 0.5, 1.0)
     for _ in range(1000):
         fine.advance(0.5, 0.5, 0.001)
     assert coarse.pose.x_mm == pytest.approx(fine.pose.x_mm)
-
-
-def test_a_circle_comes_back() -> None:
-    motion = RobotMotion()
-    motion.left_mm_s, motion.right_mm_s = 0.25 * FULL_SPEED_MM_S, 0.5 * FULL_SPEED_MM_S
-    around_s = math.tau * TRACK_MM / (0.25 * FULL_SPEED_MM_S)
-    for _ in range(1000):
-        motion.advance(0.25, 0.5, around_s / 1000)
-    assert math.hypot(motion.pose.x_mm, motion.pose.y_mm) < 1.0
-    assert abs(motion.pose.heading_rad) < 0.01
 
 
 @pytest.mark.parametrize("failsafe_s", [1.0, 5.0])
@@ -125,14 +99,6 @@ def test_a_command_after_a_long_pause_is_obeyed_at_once() -> None:
     mcu = SimulatedMcu("goob", 0.0)
     assert mcu.receive(b"M 1 1\n", 1000.0).startswith(b"OK M\r\n")
     assert mcu.state().drive == (1.0, 1.0)
-
-
-def test_commands_that_arrive_together_are_obeyed_in_turn() -> None:
-    changes = []
-    mcu = SimulatedMcu("goob", 0.0, on_motors=lambda now, motors: changes.append(motors))
-    assert mcu.receive(b"M 1 1\nM 0 0\nM 0.5 0.5\nM 0", 0.0) == b"OK M\r\n" * 3
-    assert changes == [(1.0, 1.0), (0.0, 0.0), (0.5, 0.5)]
-    assert mcu.state().commands == 3
 
 
 def test_an_error_in_the_firmware_stops_the_motors_and_starts_it_anew(monkeypatch: pytest.MonkeyPatch) -> None:

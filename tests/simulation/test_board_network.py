@@ -19,13 +19,10 @@ from pebble.simulation.micropython.clock import RealClock, VirtualClock
 from pebble.simulation.micropython.modules.sockets import MAX_SOCKETS, HostNetwork
 from pebble.simulation.micropython.modules.streams import POLLERR, POLLIN, POLLOUT
 from pebble.simulation.micropython.servers import LoopbackServers
-from tests.simulation.virtual_broker import VirtualBroker
-from tests.simulation.virtual_network import BROKER, VirtualNetwork
+from tests.simulation.virtual_network import BROKER
 from tests.support import free_port, until
 
 TLS = Path(__file__).parent.parent / "data" / "tls"
-CONNECT = b"\x10\x0d\x00\x04MQTT\x04\x02\x00\x02\x00\x01a"
-SUBSCRIBE = b"\x82\x06\x00\x01\x00\x01t\x01"
 
 
 def joined(network: Any) -> dict[str, Any]:
@@ -279,107 +276,3 @@ class TestServers:
             assert until(lambda: address("localhost") == bytes([127, 0, 0, 1]))
             servers.names = False
             assert address("pool.ntp.org") is None
-
-
-class TestVirtual:
-    def world(self) -> tuple[VirtualClock, VirtualBroker, VirtualNetwork, Any]:
-        clock = VirtualClock()
-        broker = VirtualBroker(clock.now)
-        network = VirtualNetwork(clock, broker)
-        sock = joined(network)["socket"].socket()
-        with pytest.raises(OSError):
-            sock.connect(BROKER)
-        return clock, broker, network, sock
-
-    def subscribed(self) -> tuple[VirtualClock, VirtualBroker, VirtualNetwork, Any]:
-        clock, broker, network, sock = self.world()
-        clock.advance(0.1)
-        assert sock.write(CONNECT + SUBSCRIBE) == len(CONNECT + SUBSCRIBE)
-        network.step()
-        clock.advance(0.1)
-        network.step()
-        clock.advance(0.1)
-        assert sock.read(100) == b"\x20\x02\0\0" + b"\x90\x03\x00\x01\x01"
-        return clock, broker, network, sock
-
-    def test_commands_arrive_after_the_latency(self) -> None:
-        clock, broker, network, sock = self.subscribed()
-        broker.publish("t", b"hello")
-        assert sock.read(100) is None
-        clock.advance(0.011)
-        assert sock.read(100) == b"\x30\x08\x00\x01thello"
-        assert [command.payload for _, command in network.arrivals] == [b"hello"]
-        assert broker.violations == []
-
-    def test_a_hole_delivers_everything_at_once_when_it_ends(self) -> None:
-        clock, broker, network, sock = self.subscribed()
-        network.conditions.hole = True
-        for number in b"123":
-            broker.publish("t", bytes([number]))
-            clock.advance(0.5)
-        assert sock.read(100) is None
-        network.conditions.hole = False
-        assert sock.read(100) == b"\x30\x04\x00\x01t1\x30\x04\x00\x01t2\x30\x04\x00\x01t3"
-
-    def test_at_most_twenty_messages_wait_for_their_acknowledgement(self) -> None:
-        clock, broker, network, sock = self.subscribed()
-        for number in range(25):
-            broker.publish("t", bytes([number]), qos=1)
-        clock.advance(0.1)
-        assert len(sock.read(1000)) == 20 * 8
-        sock.write(b"\x40\x02\x00\x01")
-        clock.advance(0.1)
-        network.step()
-        clock.advance(0.1)
-        assert sock.read(1000) == b"\x32\x06\x00\x01t\x00\x15\x14"
-
-    def test_retained_messages_are_marked(self) -> None:
-        clock, broker, network, sock = self.world()
-        broker.publish("t", b"old", retain=True)
-        clock.advance(0.1)
-        sock.write(CONNECT + SUBSCRIBE)
-        network.step()
-        clock.advance(0.1)
-        network.step()
-        clock.advance(0.1)
-        assert sock.read(100).endswith(b"\x31\x06\x00\x01told")
-        assert [command.retained for _, command in network.arrivals] == [True]
-
-    def test_a_killed_broker_resets_and_then_refuses(self) -> None:
-        clock, broker, network, sock = self.subscribed()
-        broker.kill()
-        with pytest.raises(OSError) as raised:
-            sock.read(1)
-        assert raised.value.errno == errno.ECONNRESET
-        sock.close()
-        again = network.modules()["socket"].socket()
-        network.radio.activate(True)
-        network.radio.connect()
-        with pytest.raises(OSError):
-            again.connect(BROKER)
-        clock.advance(0.1)
-        with pytest.raises(OSError) as raised:
-            again.read(1)
-        assert raised.value.errno == errno.ECONNREFUSED
-
-    def test_a_silent_client_is_given_up_and_its_will_speaks(self) -> None:
-        clock, broker, network, sock = self.world()
-        clock.advance(0.1)
-        will = b"\x10\x15\x00\x04MQTT\x04\x26\x00\x02\x00\x01a\x00\x01w\x00\x03off"
-        sock.write(will)
-        network.step()
-        clock.advance(0.1)
-        network.step()
-        network.conditions.hole = True
-        clock.advance(5.0)
-        network.step()
-        assert broker.retained["w"].payload == b"off"
-
-    def test_what_no_client_may_send_is_remembered(self) -> None:
-        clock, broker, network, sock = self.subscribed()
-        sock.write(CONNECT)
-        clock.advance(0.1)
-        network.step()
-        assert broker.violations
-        clock.advance(0.1)
-        assert sock.read(1) == b""

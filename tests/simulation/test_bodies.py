@@ -119,26 +119,6 @@ def test_the_battery_is_measured_through_its_divider(clock: VirtualClock, kind: 
     assert adc.read_u16() < 65535, "a full battery is within the range"
 
 
-@pytest.mark.parametrize("kind", ["goob", "fred"])
-def test_hall_sensors_follow_the_wheels(clock: VirtualClock, kind: str) -> None:
-    body = body_of(kind, Board(clock))
-    adcs = [body.board.firmware.module("machine").ADC(pin) for pin in body.pins.SENSORS]
-    seen: list[set[int]] = [set(), set(), set()]
-    drive(body, 1.0, 0.0)
-    for _ in range(100):
-        clock.advance(0.01)
-        for values, adc in zip(seen, adcs, strict=True):
-            values.add(adc.read_u16() >> 6)
-    left, right, later = seen
-    assert (min(left) < 270, max(left) > 750, len(right), min(later) < 270, max(later) > 750) == (
-        True,
-        True,
-        1,
-        True,
-        True,
-    )
-
-
 def test_lights(clock: VirtualClock) -> None:
     goob, fred = body_of("goob", Board(clock)), body_of("fred", Board(clock))
     assert goob.state().light == Light(0.0, 0.0, 0.0)
@@ -146,14 +126,6 @@ def test_lights(clock: VirtualClock) -> None:
     assert goob.state().light == Light(0.25, 0.25, 0.25)
     put(fred, fred.pins.LED[2], 1.0)
     assert fred.state().light == Light(0.0, 0.0, 1.0)
-
-
-def test_freds_charger_is_a_pin(clock: VirtualClock) -> None:
-    body = body_of("fred", Board(clock))
-    pin = body.board.firmware.module("machine").Pin(body.pins.CHARGE)
-    values = [pin.value()]
-    body.battery.charging = True
-    assert [*values, pin.value()] == [0, 1]
 
 
 def test_grousers_are_seen_but_no_wheels(clock: VirtualClock) -> None:

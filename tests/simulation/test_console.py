@@ -9,7 +9,6 @@ import pytest
 from pebble.simulation.micropython.board import Board
 from pebble.simulation.micropython.clock import VirtualClock
 from pebble.simulation.micropython.faults import WouldHang
-from pebble.simulation.micropython.ports import SAMD21_OFFICIAL
 from pebble.simulation.micropython.timers import BoardReset
 
 
@@ -101,16 +100,3 @@ def test_a_host_that_does_not_read_costs_half_a_second_per_write(board: Board, c
     assert board.take_output() == bytes(256)
     assert poll.poll(20) == [(sys.stdout, select.POLLOUT)]
     assert clock.now() == pytest.approx(1000.52)
-
-
-def test_the_official_image_of_a_xiao_has_no_select_but_a_uart(clock: VirtualClock) -> None:
-    board = Board(clock, port=SAMD21_OFFICIAL)
-    with pytest.raises(ImportError):
-        board.firmware.module("select")
-    assert not hasattr(board.firmware.module("sys").stdin, "buffer")
-    uart = machine(board).UART(4, 115200, tx=machine(board).Pin("D6"), rx=machine(board).Pin("D7"), timeout=0)
-    buffer = bytearray(2)
-    assert (uart.any(), uart.read(), uart.readinto(buffer)) == (0, None, None)
-    board.type(b"a\x03c")
-    assert (uart.any(), uart.readinto(buffer), uart.read()) == (3, 2, b"c")
-    assert (buffer, uart.write(b"xyz"), board.take_output()) == (b"a\x03", 3, b"xyz")

@@ -76,11 +76,6 @@ def test_a_host_gets_samples_on_a_grid_answers_and_reports_of_a_disturbed_bus(tm
     assert [frame.payload for frame in host.of(Type.LOG)][-2:] == [b"imu_read_failed", b"imu_reinit"]
 
 
-def test_two_boards_differ_by_their_uid() -> None:
-    for uid in (b"one", b"two"):
-        assert SimulatedMcu("goob_imu", 0.0, uid=uid).board.firmware.module("machine").unique_id() == uid
-
-
 def test_a_host_that_was_away_for_a_while_misses_no_sample() -> None:
     """A wait of half a second, which is more than the scheduler of a busy machine takes away."""
     mcu = SimulatedMcu("goob_imu", 0.0)

@@ -49,18 +49,6 @@ def test_two_boards_know_nothing_of_each_other_nor_of_the_host(root: Path) -> No
     assert "toy" not in sys.modules
 
 
-def test_a_module_is_executed_once_per_board(root: Path) -> None:
-    firmware = world(root)
-    assert firmware.module("common.counter") is firmware.module("common.counter")
-    assert firmware.module("toy.robot").counter is firmware.module("common.counter")
-
-
-def test_a_name_that_is_a_folder_is_a_package(root: Path) -> None:
-    firmware = world(root)
-    firmware.module("common.counter")
-    assert firmware.module("common").counter.count == 0
-
-
 @pytest.mark.parametrize(
     "name", ["subprocess", "pebble", "common.nothing", "nothing.robot", "toy.robot.step", "asyncio"]
 )
@@ -80,39 +68,12 @@ def test_what_would_work_on_this_machine_only_does_not(root: Path, text: str, er
         world(root).module("toy.wants")
 
 
-def test_annotations_are_never_evaluated_as_on_a_board(root: Path) -> None:
-    (root / "toy/robot.py").write_text("def step(how: Unknown | None) -> Nowhere:\n    return how\n")
-    assert world(root).module("toy.robot").step(5) == 5
-
-
 def test_an_error_names_the_file_and_the_line(root: Path) -> None:
     (root / "toy/robot.py").write_text("def step():\n    x = 1\n    return x / 0  # here\n")
     with pytest.raises(ZeroDivisionError) as caught:
         world(root).module("toy.robot").step()
     last = traceback.extract_tb(caught.tb)[-1]
     assert (last.filename, last.lineno, last.line) == (str(root / "toy/robot.py"), 3, "return x / 0  # here")
-
-
-def test_a_module_that_failed_may_be_tried_again(root: Path) -> None:
-    (root / "toy/robot.py").write_text("1 / 0\n")
-    firmware = world(root)
-    with pytest.raises(ZeroDivisionError):
-        firmware.module("toy.robot")
-    with pytest.raises(ZeroDivisionError):
-        firmware.module("toy.robot")
-
-
-def test_a_changed_file_is_compiled_anew(root: Path) -> None:
-    file = root / "toy/robot.py"
-    assert world(root).module("toy.robot").step() == (1, "a")
-    file.write_text("def step():\n    return 'new'\n")
-    assert world(root).module("toy.robot").step() == "new"
-
-
-def test_main_is_executed_as_main(root: Path) -> None:
-    (root / "toy/main.py").write_text("from toy.robot import step\nname = __name__\nresult = step()\n")
-    main = world(root).run("toy/main.py")
-    assert (main.name, main.result) == ("__main__", (1, "a"))
 
 
 def test_the_firmware_is_found() -> None:

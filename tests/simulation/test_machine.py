@@ -45,15 +45,6 @@ def test_an_input_reads_its_pull_resistor_until_it_is_driven(board: Board) -> No
     assert board.duty(3) == 0.0, "an input puts out nothing"
 
 
-def test_each_change_of_an_output_is_reported(board: Board) -> None:
-    received: list[float] = []
-    board.pins.before_change = lambda: received.append(board.duty(3))
-    pwm = machine(board).PWM(machine(board).Pin(3), freq=1000, duty_u16=0)
-    for duty in (65535, 65535, 0):
-        pwm.duty_u16(duty)
-    assert received == [0.0, 1.0], "what was until then"
-
-
 def test_pwm(board: Board) -> None:
     pwm = machine(board).PWM(machine(board).Pin(3))
     pwm.duty_u16(32768)
@@ -73,14 +64,6 @@ def test_pwm(board: Board) -> None:
         pwm.freq(0)
 
 
-def test_a_reset_lets_every_output_go(board: Board) -> None:
-    received: list[bool] = []
-    machine(board).PWM(3, freq=1000, duty_u16=65535)
-    board.pins.before_change = lambda: received.append(True)
-    board.boot()
-    assert (board.duty(3), received) == (0.0, [True])
-
-
 @pytest.mark.parametrize(
     ("port", "wrong"), [(ESP32_C6, "D3"), (ESP8266, "D3"), (SAMD21, 3), (SAMD21, "D11"), (SAMD21, "PA30")]
 )
@@ -90,12 +73,6 @@ def test_pins_have_the_names_of_their_port(clock: VirtualClock, port: Any, wrong
         machine(board).Pin(wrong)
     with pytest.raises(ValueError, match="not a Pin"):
         board.duty(wrong)
-
-
-def test_a_xiaos_pin_has_many_names(clock: VirtualClock) -> None:
-    board = Board(clock)
-    machine(board).Pin("A1_D1", machine(board).Pin.OUT, value=1)
-    assert [board.duty(name) for name in ("A1_D1", "D1", "A1", "PA04")] == [1.0] * 4
 
 
 @pytest.mark.parametrize("name", ["D0", "D6", "D7"])
@@ -214,13 +191,6 @@ def test_the_watchdog_counts_and_starves(board: Board, clock: VirtualClock) -> N
         dog.feed()
 
 
-def test_sleeping_too_long_resets_the_board_at_that_moment(board: Board, clock: VirtualClock) -> None:
-    machine(board).WDT(timeout=2000)
-    with pytest.raises(BoardReset):
-        board.firmware.module("time").sleep(60)
-    assert clock.now() == 1002.0
-
-
 @pytest.mark.parametrize(
     ("port", "asked", "real"),
     [(SAMD21, 2000, 1024), (SAMD21, 5, 512), (SAMD21, 99999, 16384), (ESP32_C6, 2000, 2000), (ESP8266, 5000, 5000)],
@@ -229,14 +199,3 @@ def test_the_timeout_is_what_the_port_makes_of_it(clock: VirtualClock, port: Any
     board = Board(clock, port=port)
     machine(board).WDT(timeout=asked)
     assert board.watchdog.timeout_ms == real
-
-
-def test_an_esp8266_takes_no_other_timeout_than_its_own(clock: VirtualClock) -> None:
-    with pytest.raises(ValueError, match="5000"):
-        machine(Board(clock, port=ESP8266)).WDT(timeout=2000)
-
-
-def test_a_reset_cannot_be_caught(board: Board) -> None:
-    assert not issubclass(BoardReset, Exception)
-    with pytest.raises(BoardReset):
-        machine(board).reset()

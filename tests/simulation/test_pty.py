@@ -112,14 +112,6 @@ def test_a_host_that_does_not_read_loses_reports_and_stops_nothing(tmp_path: Pat
         assert until(lambda: mcu.state().drive == (0.1, 0.1))
 
 
-def test_a_closed_mcu_refuses_requests(tmp_path: Path) -> None:
-    mcu = PtyMcu("goob", tmp_path / "port").open()
-    mcu.close()
-    mcu.close()
-    with pytest.raises(DeviceError):
-        mcu.state()
-
-
 def test_a_drive_entry_must_be_well_formed() -> None:
     assert Entry(0, "line", "M 0.1 -0.2").drive == (0.1, -0.2)
     assert [Entry(0, "line", text).drive for text in ("M a b", "M 1", "L 1 1 1", "")] == [None] * 4
@@ -178,13 +170,6 @@ def test_who_takes_over_a_link_keeps_it(tmp_path: Path) -> None:
         first.close()
         with serial.Serial(str(second.symlink), 460800):
             assert until(lambda: second.host)
-
-
-def test_a_port_that_cannot_be_created_is_a_one_line_error(tmp_path: Path) -> None:
-    command = [sys.executable, "-m", "pebble.cli", "sim", "goob", "--link", str(tmp_path / "no" / "port")]
-    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=20)
-    assert done.returncode == 1
-    assert done.stderr == f"pebble: cannot create a serial port at {tmp_path}/no/port: No such file or directory\n"
 
 
 @pytest.mark.parametrize("how", [signal.SIGTERM, signal.SIGINT, signal.SIGHUP])

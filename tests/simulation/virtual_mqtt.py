@@ -5,6 +5,8 @@ from __future__ import annotations
 import struct
 from dataclasses import dataclass
 
+from tests.kit import mqtt_bytes
+
 CONNECT, CONNACK, PUBLISH, PUBACK, SUBSCRIBE, SUBACK, PINGREQ, PINGRESP, DISCONNECT = 1, 2, 3, 4, 8, 9, 12, 13, 14
 
 _CLIENT_FLAGS = {CONNECT: 0, PUBACK: 0, SUBSCRIBE: 2, PINGREQ: 0, DISCONNECT: 0}  # the low half of the first byte
@@ -55,19 +57,11 @@ def split(buffer: bytearray) -> tuple[int, int, bytes] | None:
 
 
 def packet(kind: int, body: bytes = b"", flags: int = 0) -> bytes:
-    size, length = bytearray(), len(body)
-    while True:
-        length, digit = length >> 7, length & 0x7F
-        size.append(digit | (0x80 if length else 0))
-        if not length:
-            return bytes([kind << 4 | flags]) + bytes(size) + body
+    return mqtt_bytes.packet(kind << 4 | flags, body)
 
 
 def publish(message: Publish) -> bytes:
-    topic = message.topic.encode()
-    number = struct.pack("!H", message.packet_id) if message.qos else b""
-    body = struct.pack("!H", len(topic)) + topic + number + message.payload
-    return packet(PUBLISH, body, message.qos << 1 | message.retain)
+    return mqtt_bytes.publish(message.topic, message.payload, message.qos, message.packet_id, retain=message.retain)
 
 
 def read_publish(flags: int, body: bytes) -> Publish:

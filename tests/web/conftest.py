@@ -10,10 +10,11 @@ from functools import partial
 import pytest
 from playwright.sync_api import Browser
 
+from tests.kit.played_robot import RecordingRobot
 from tests.support import Broker
 from tests.web.browser import chromium
 from tests.web.canned import CannedServer, Show, serving, showing
-from tests.web.served import Page, RecordingRobot, Served
+from tests.web.served import Page, Served
 
 _NUMBERS = itertools.count(1)
 

@@ -1,4 +1,4 @@
-"""A server of the operator page in a thread, a page without a browser, and a robot that only records."""
+"""A server of the operator page in a thread, and a page without a browser."""
 
 from __future__ import annotations
 
@@ -9,21 +9,15 @@ import time
 from types import TracebackType
 from typing import Any, Self
 
-import msgspec
 import uvicorn
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import ClientConnection, connect
 
 from pebble.client.page import WebSettings
-from pebble.contract import ESTOP_STATE, ONLINE, codec
-from pebble.contract.names import without_name
-from pebble.contract.payloads import EstopState, Heartbeat
-from pebble.transports import Message, MqttSettings, QoS, create
+from pebble.transports import MqttSettings
 from pebble.web.serve import listen, server_config
-from tests.client.control_robot import KeepingRobot
 from tests.support import until
 
-HEARTBEAT_S = 0.25
 #: The state of a motor owner that is not stopped.
 FREE = {"latched": False, "boot": "b", "count": 0, "recent": [], "by": "", "why": "", "since": 0}
 
@@ -177,150 +171,3 @@ class Page:
 def now_ms() -> float:
     """The page's clock, which has nothing to do with the server's."""
     return 1000 * time.monotonic() % 1e9 + 1e6
-
-
-class RecordingRobot:
-    """Publishes heartbeats and capabilities, and records what arrives; it also takes stops.
-
-    ``keeps``: it keeps control itself, as ``keeping`` does. ``named``: it takes commands with names, as a bridge gives
-    them to a robot, and drive commands of strangers; ``wire`` has the topics as they arrived. ``pace``: of the clock by
-    which it keeps control.
-    """
-
-    def __init__(
-        self,
-        broker_port: int,
-        base: str,
-        *,
-        capabilities: dict[str, Any] | None = None,
-        keeps: bool = False,
-        named: bool = False,
-        pace: float = 1.0,
-        **login: Any,
-    ) -> None:
-        self.base, self.named, self._pace = base, named, pace
-        self.wire: set[str] = set()
-        self.received: list[tuple[float, str, Any]] = []
-        self.latched = False
-        self._count = 0
-        self._recent: list[str] = []
-        self.keeping = KeepingRobot(base, "serial") if keeps else None
-        for owner in self.keeping.owners if self.keeping else ():
-            owner.named = named
-        self._answering = threading.Lock()
-        self._transport = create(
-            "mqtt", f"robot-{base.replace('/', '-')}", MqttSettings(host="127.0.0.1", port=broker_port, **login)
-        )
-        self._transport.open()
-        self._transport.subscribe(f"{base}/incoming/#", self._receive, direct=True)
-        drive = {"available": True, "controls": True, "topic": f"{base}/incoming/drive-values", "arbitrates": True}
-        drive |= {"control": True} if keeps else {}
-        estop = {"available": True, "owners": ["serial"]}
-        value = {"drive": drive, "estop": estop} if capabilities is None else capabilities
-        if value:
-            self.publish_capabilities(value | ({"named": True} if named else {}))
-        self._publish_all(self.keeping.states() if self.keeping else [])
-        self._ending = threading.Event()
-        self._thread = threading.Thread(target=self._heartbeats, daemon=True)
-        self._thread.start()
-
-    def publish_capabilities(self, value: dict[str, Any]) -> None:
-        self.publish("capabilities", {"schema": "pebble-capabilities/v1", "t": 1, "value": value}, retain=True)
-
-    def drives(self, since: float = 0.0) -> list[dict[str, Any]]:
-        """The drive commands that have arrived."""
-        topic = f"{self.base}/incoming/drive-values"
-        return [payload for at, name, payload in list(self.received) if name == topic and at >= since]
-
-    def topics(self) -> set[str]:
-        return {topic for _, topic, _ in list(self.received)}
-
-    def publish(self, metric: str, value: Any, *, retain: bool = False) -> None:
-        topic = f"{self.base}/outgoing/{metric}"
-        self._transport.publish(topic, msgspec.json.encode(value), qos=QoS.DELIVERED, retain=retain)
-
-    def remove(self, metric: str) -> None:
-        """Remove a retained value."""
-        self._transport.publish(f"{self.base}/outgoing/{metric}", b"", qos=QoS.DELIVERED, retain=True)
-
-    def silent(self) -> None:
-        """Stop the heartbeats."""
-        self._ending.set()
-        self._thread.join()
-
-    def close(self) -> None:
-        self._ending.set()
-        self._transport.close()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, tb: TracebackType | None) -> None:
-        self.close()
-
-    def _heartbeats(self) -> None:
-        while True:
-            payload = codec.encode(ONLINE, Heartbeat(t=int(1000 * time.time()), online=True))
-            self._transport.publish(ONLINE.topic(self.base), payload, qos=QoS.DELIVERED, retain=True)
-            self.answer([])
-            if self._ending.wait(HEARTBEAT_S):
-                return
-
-    def answer(self, messages: list[Message]) -> None:
-        """Requests for control reach it, or only time."""
-        with self._answering:
-            self._publish_all(self.keeping.take(messages, self._pace * time.monotonic()) if self.keeping else [])
-
-    def stranger(self, **drive: float) -> None:
-        """A program publishes a drive command without any control, as the original's page does."""
-        self._transport.publish(f"{self.base}/incoming/drive-values", msgspec.json.encode(drive), qos=QoS.DELIVERED)
-
-    def publish_states(self) -> None:
-        """Publish who has control."""
-        self._publish_all(self.keeping.states() if self.keeping else [])
-
-    def _publish_all(self, states: list[Message]) -> None:
-        for state in states:
-            self._transport.publish(state.topic, state.payload, qos=QoS.DELIVERED, retain=True)
-
-    def _receive(self, message: Message) -> None:
-        try:
-            payload = json.loads(message.payload)
-        except ValueError:
-            payload = message.payload
-        self.wire.add(message.topic)
-        if (named := without_name(message.topic)) is not None and self.named:
-            person = payload.get("by") if isinstance(payload, dict) else None
-            by = f"{named.account}/{person}" if person else named.account
-            payload = payload | {"by": by} if isinstance(payload, dict) else payload
-            message = Message(named.topic, msgspec.json.encode(payload), message.qos)
-        elif self.named and not message.topic.endswith(("/drive-values", "/estop")):
-            return
-        self.received.append((time.monotonic(), message.topic, payload))
-        self.answer([message])
-        if message.topic.endswith("/incoming/estop"):
-            self._stop(payload)
-        elif message.topic.endswith("/estop-reset") and payload.get("count") == self._count:
-            self.latched = False
-            self._publish_state("")
-
-    def _stop(self, payload: dict[str, Any]) -> None:
-        if payload["stop"] not in self._recent:
-            self.latched = True
-            self._count += 1
-            self._recent.insert(0, payload["stop"])
-        self._publish_state(payload.get("by", ""))
-
-    def _publish_state(self, by: str) -> None:
-        state = EstopState(
-            latched=self.latched,
-            boot="b",
-            count=self._count,
-            recent=self._recent[:8],
-            by=by,
-            why="",
-            since=1,
-            persisted=True,
-        )
-        topic = ESTOP_STATE.topic(self.base, owner="serial")
-        self._transport.publish(topic, codec.encode(ESTOP_STATE, state), qos=QoS.DELIVERED, retain=True)

@@ -24,12 +24,13 @@ from websockets.exceptions import ConnectionClosed
 from pebble.fleet.roles import Role
 from pebble.web import control, serve
 from pebble.web import messages as m
+from tests.kit.played_robot import RecordingRobot
 from tests.support import Broker, beside, cases, until
 from tests.web.attacker import PASSWORDS, Everything, Hall
-from tests.web.served import Page, RecordingRobot, Served, now_ms
+from tests.web.served import Page, Served, now_ms
 
 GOOB = "pebble/robots/goob"
-OWNER = {"owner": "serial", "boot": "b", "count": 1}
+OWNER = {"owner": "serial", "boot": "00000000", "count": 1}
 PUBLIC = {"/login", "/ca.pem", "/healthz", "/api/login", "/api/logout"}
 HERE = Path(__file__).resolve().parents[2] / "pebble/web"
 

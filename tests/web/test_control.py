@@ -5,8 +5,9 @@ from __future__ import annotations
 import itertools
 import time
 
+from tests.kit.played_robot import RecordingRobot
 from tests.support import until
-from tests.web.served import RecordingRobot, Served
+from tests.web.served import Served
 
 ZERO = {"x": 0.0, "z": 0.0, "y": 0.0}
 FINAL = {**ZERO, "valid_ms": 0}

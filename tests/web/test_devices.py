@@ -10,9 +10,10 @@ import pytest
 
 from pebble.transports import Message
 from pebble.web.robots import MAX_ALIASES, Interest, Robots
+from tests.kit.played_robot import RecordingRobot
 from tests.services.serial_mcu_bridge import mcu_wire as wire
 from tests.support import Broker, until
-from tests.web.served import Page, RecordingRobot, Served
+from tests.web.served import Page, Served
 from tests.web.states import described, outlet, sample
 
 BASE = "pebble/robots/lampy"

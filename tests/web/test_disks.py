@@ -13,10 +13,10 @@ import pytest
 from pebble.fleet.audit import Audit
 from pebble.runtime.rate_limit import RateLimitedLog
 from pebble.web.access import login
+from tests.kit.played_robot import RecordingRobot
 from tests.small_disk import SmallDisk
 from tests.support import Broker, needs_root, some, until
 from tests.web.attacker import PASSWORDS, Hall
-from tests.web.served import RecordingRobot
 
 pytestmark = needs_root
 

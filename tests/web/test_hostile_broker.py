@@ -21,9 +21,10 @@ from websockets.sync.client import connect
 
 from pebble.web.robots import MAX_COMPONENTS
 from tests.commands.command_line import program
+from tests.kit.played_robot import RecordingRobot
 from tests.support import Broker, some, until
 from tests.web.attacker import Everything
-from tests.web.served import FREE, Page, RecordingRobot, Served
+from tests.web.served import FREE, Page, Served
 
 GOOB = "pebble/robots/goob"
 VICTIM = "pebble/robots/victim"
@@ -194,7 +195,7 @@ def test_capabilities_that_name_other_topics(server: ServerProcess, broker: Brok
                 page.drive(EVIL, number + 1, z=0.5)
                 page.send("stop", ref=EVIL)
                 page.send("estop", ref=EVIL, stop=f"{number:016x}")
-                owners = [{"owner": "serial", "boot": "b", "count": number}]
+                owners = [{"owner": "serial", "boot": "00000000", "count": number}]
                 page.send("estop-reset", ref=EVIL, owners=owners)
                 assert until(lambda evil=evil: any(name.endswith("/estop") for name in evil.topics()))
                 page.send("estop-end", stop=f"{number:016x}")

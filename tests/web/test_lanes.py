@@ -20,9 +20,10 @@ from pebble.fleet.roles import Account
 from pebble.media.video import make_encoder
 from pebble.transports import MqttSettings, QoS, create
 from tests.fleet.brokers import FleetBroker
+from tests.kit.played_robot import RecordingRobot
 from tests.support import Broker, free_port, until
 from tests.tcp_proxy import SlowTcpProxy, TcpProxy
-from tests.web.served import FREE, Page, RecordingRobot, Served
+from tests.web.served import FREE, Page, Served
 from tools.same_bytes import Recorder, connect_id
 
 GOOB = "pebble/robots/goob"

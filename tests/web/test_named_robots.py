@@ -10,9 +10,10 @@ import pytest
 
 from pebble.fleet.roles import Role
 from pebble.transports import MqttSettings
+from tests.kit.played_robot import RecordingRobot
 from tests.support import Broker, until
 from tests.web.attacker import Hall
-from tests.web.served import RecordingRobot, Served
+from tests.web.served import Served
 
 NAMES = itertools.count(1)
 DRIVE = {"available": True, "controls": True, "arbitrates": True, "control": True}
@@ -48,7 +49,7 @@ def test_everything_has_the_servers_account_in_its_topic_and_the_person_beside_i
         page.send("flag", ref=ref, name="mqtt-video", on=True, n=3)
         page.send("estop", ref=ref, stop="00c0ffee00c0ffee", why="")
         assert until(lambda: page.value(ref, "web/estop", "latched") is True)
-        owners = [{"owner": "serial", "boot": "b", "count": 1}]
+        owners = [{"owner": "serial", "boot": "00000000", "count": 1}]
         page.send("estop-reset", ref=ref, owners=owners)
         assert until(lambda: page.value(ref, "web/estop", "latched") is False)
         for metric in ("control", "drive-values", "lights-solid", "autonomy-command", "estop-reset"):
@@ -137,7 +138,7 @@ def test_a_robot_that_checks_names_is_reset_only_by_safety_and_admin(broker, rob
                         [one["count"] for one in page.value(ref, "web/estop", "owners")] == [number]
                     )
                 )
-                page.send("estop-reset", ref=ref, owners=[{"owner": "serial", "boot": "b", "count": number}])
+                page.send("estop-reset", ref=ref, owners=[{"owner": "serial", "boot": "00000000", "count": number}])
                 page.send("flag", ref="pebble/robots/nowhere", name="mqtt-video", on=True, n=1)
                 assert until(lambda page=page: page.refused)
                 assert ("reset" in page.welcome["named_rights"]) is (role in (Role.SAFETY, Role.ADMIN))

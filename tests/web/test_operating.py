@@ -19,9 +19,10 @@ from pebble.errors import TransportError
 from pebble.transports import Message, MqttSettings, QoS, create
 from pebble.web.open_components import OpenComponents
 from pebble.web.robots import Interest, Robots
+from tests.kit.played_robot import RecordingRobot
 from tests.support import Broker, until
 from tests.web.attacker import Hall
-from tests.web.served import Page, RecordingRobot, Served
+from tests.web.served import Page, Served
 
 NAMES = itertools.count(1)
 

@@ -13,8 +13,9 @@ from collections.abc import Iterator
 import paho.mqtt.client as mqtt
 import pytest
 
+from tests.kit.played_robot import RecordingRobot
 from tests.support import until
-from tests.web.served import RecordingRobot, Served
+from tests.web.served import Served
 
 BASE = "pebble/robots/shared"
 METRICS = (

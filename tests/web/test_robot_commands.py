@@ -18,9 +18,10 @@ from pebble.transports import Message, MqttSettings, QoS, create
 from pebble.web import messages as m
 from pebble.web import robot_commands
 from pebble.web.robots import Interest, Robots
+from tests.kit.played_robot import RecordingRobot
 from tests.support import Broker, until
 from tests.web.attacker import Hall
-from tests.web.served import Page, RecordingRobot, Served, now_ms
+from tests.web.served import Page, Served, now_ms
 
 BASE = "pebble/robots/goob"
 NUMBERS = itertools.count(1)

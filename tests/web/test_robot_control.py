@@ -11,9 +11,10 @@ import pytest
 
 from pebble.fleet.roles import Role, page_rights
 from pebble.transports import MqttSettings, QoS, create
+from tests.kit.played_robot import RecordingRobot
 from tests.support import until
 from tests.web.attacker import Hall
-from tests.web.served import Page, RecordingRobot, Served
+from tests.web.served import Page, Served
 
 NAMES = itertools.count(1)
 

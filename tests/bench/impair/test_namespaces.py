@@ -1,7 +1,6 @@
 """Rate, loss and packet size of networks of namespaces."""
 
 import json
-import shutil
 import subprocess
 import sys
 from contextlib import closing
@@ -9,7 +8,6 @@ from pathlib import Path
 
 import pytest
 
-from pebble.bench.impair import network as networks
 from pebble.bench.impair.conditions import Condition, Shape
 from pebble.bench.impair.network import NamespaceNetwork
 from tests.bench.impair.peers import ProbeConnection, largest_packet
@@ -36,22 +34,6 @@ def test_loss_drops_the_configured_share_of_packets(delay_ms: int, tmp_path: Pat
         assert traffic.bytes_up - before.bytes_up >= _SENT * _DATAGRAM
 
 
-def test_loss_of_the_downlink_is_on_the_robots_side(tmp_path: Path) -> None:
-    with closing(NamespaceNetwork()) as network, ProbeConnection(network, tmp_path) as talk:
-        network.apply(Condition("down", Shape(), Shape(loss=0.2)))
-        talk.down(100_000)
-        counter = network.on_robot(["nft", "-j", "list", "counter", "ip", "impair", "lost"])
-        assert json.loads(subprocess.check_output(counter))["nftables"][-1]["counter"]["packets"] > 0
-        assert network.traffic().dropped_up == 0
-
-
-def test_a_full_queue_drops(tmp_path: Path) -> None:
-    with closing(NamespaceNetwork()) as network, ProbeConnection(network, tmp_path) as talk:
-        network.apply(Condition("64k", Shape(kbit=64)))
-        talk.send_datagrams(400)
-        assert 50 < network.traffic().dropped_up <= 400
-
-
 @pytest.mark.parametrize("kbit", [None, 4000])
 def test_no_packet_is_larger_than_on_a_wire(kbit: float | None, tmp_path: Path) -> None:
     with (
@@ -71,18 +53,6 @@ def test_the_namespaces_have_no_other_connection() -> None:
             shown = subprocess.check_output(command(["cat", "/proc/net/dev"]), text=True)
             devices = {line.split(":")[0].strip() for line in shown.splitlines()[2:]}
             assert devices == {"lo", "wire", "timed"}
-
-
-def test_a_missing_program_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    (tmp_path / "nsenter").symlink_to(str(shutil.which("nsenter")))
-    monkeypatch.setattr(networks, "SBIN", "/nowhere")
-    monkeypatch.setenv("PATH", str(tmp_path))
-    assert "failed to execute ip: No such file" in str(networks.why_no_namespaces.__wrapped__())
-
-
-def test_namespaces_that_fail_are_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(networks, "_TABLE", "nonsense")
-    assert str(networks.why_no_namespaces.__wrapped__()).startswith("nft -f -: ")
 
 
 def test_a_user_without_permission_gets_the_reason() -> None:

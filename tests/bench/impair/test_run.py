@@ -8,7 +8,7 @@ from contextlib import AbstractContextManager, nullcontext
 from itertools import islice
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any, cast
+from typing import Any
 
 import msgspec
 import pytest
@@ -18,7 +18,7 @@ from pebble.bench.impair import trials as module
 from pebble.bench.impair.conditions import Condition
 from pebble.bench.impair.metrics import DRIVE, OperatorReport, Record, Window
 from pebble.bench.impair.network import Traffic
-from pebble.bench.impair.trials import FULL, QUICK, SUBJECTS, TRIALS, ImpairedRobot, Settings, groups, run
+from pebble.bench.impair.trials import SUBJECTS, ImpairedRobot, Settings, run
 from pebble.bench.results import Results
 from pebble.errors import PebbleError
 
@@ -98,12 +98,6 @@ def test_each_group_runs_each_condition_and_then_a_clean_network(monkeypatch: py
     assert {cell.params["trial"] for cell in results.cells} == {"1024k", "5%"}
 
 
-def test_without_namespaces_it_does_not_begin(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("pebble.bench.impair.network.why_no_namespaces", lambda: "not permitted")
-    with pytest.raises(PebbleError, match="no network namespaces: not permitted"):
-        run(FULL, Console(quiet=True))
-
-
 def test_a_robot_that_fails_ends_the_run_and_costs_no_results(monkeypatch: pytest.MonkeyPatch) -> None:
     _, results = go(monkeypatch, trials=1)
     (note,) = results.notes
@@ -116,13 +110,3 @@ def test_a_robot_that_fails_ends_the_run_and_costs_no_results(monkeypatch: pytes
 def test_robots_that_fail_at_once_are_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(PebbleError, match="mqtt original: the operator said nothing for 30 s"):
         go(monkeypatch, trials=0)
-
-
-def test_a_full_run_groups_transports_and_a_quick_one_all_subjects() -> None:
-    robots = [cast(ImpairedRobot, SimpleNamespace(subject=subject)) for subject in SUBJECTS]
-    assert [[robot.subject for robot in group] for group in groups(FULL, robots)] == [
-        [*SUBJECTS[:2]],
-        [*SUBJECTS[2:]],
-    ]
-    assert [len(group) for group in groups(QUICK, robots)] == [4]
-    assert set(QUICK.trials) < set(TRIALS)

@@ -19,7 +19,7 @@ from pebble.recordings.stamps import stamp_ns
 from pebble.transports import Message, MqttSettings, QoS, create
 from tests.commands.command_line import Run, program
 from tests.commands.conftest import run as run
-from tests.commands.test_drive import Console
+from tests.kit.terminal import Terminal
 from tests.recordings import messages
 from tests.recordings.playing import FRED, GOOB, Line, demo, js, ms, write
 from tests.support import Broker, until
@@ -199,7 +199,7 @@ def test_a_broker_that_restarts_gets_the_rest(tmp_path: Path, run: Run) -> None:
 
 def test_keys_on_a_terminal(tmp_path: Path, operator: Operator, at: tuple[str, str]) -> None:
     command = [*(sys.executable, "-m", "pebble.cli", "replay", str(walk(tmp_path))), *at, "--paused"]
-    console = Console(*command)
+    console = Terminal(*command)
     try:
         assert console.sees("Space pauses")
         assert console.sees("paused · 0 sent")

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Iterator
-from pathlib import Path
 
 import pytest
 
@@ -14,8 +13,6 @@ from pebble.recordings.replay import robots as replayed_robots
 from pebble.recordings.replay.robots import ReplayedRobots
 from pebble.transports import Message, QoS
 from pebble.transports.memory import MemoryHub, MemoryTransport
-from tests.recordings.playing import GOOB, Line, js, ms, write
-from tests.recordings.replayed import Plays
 from tests.support import until
 
 BASE = "replay/robots/goob"
@@ -93,21 +90,3 @@ def test_an_outage_is_named_until_it_ends(network: Network) -> None:
         network.hub.start()
         assert until(lambda: robots.publish(heartbeat()))
         assert robots.problem == ""
-
-
-# -- a recording as the robot of a service under test
-
-
-def test_the_fixture_feeds_a_recording_to_the_clients_of_a_hub(tmp_path: Path, recording: Plays) -> None:
-    hub, received = MemoryHub(), []
-    lines = [
-        Line(0, f"{GOOB}/outgoing/status", js(t=ms(0)), 1, retain=True),
-        *(Line(n / 50, f"{GOOB}/incoming/drive-values", js(x=n / 3000, z=0), 1) for n in range(3000)),
-    ]
-    path = write(tmp_path / "x.mcap", lines)
-    with MemoryTransport("service", hub) as service:
-        service.subscribe(f"{GOOB}/incoming/#", received.append, direct=True)
-        assert recording(path, hub) == 3001
-        assert until(lambda: len(received) == 3000)
-    assert [message.payload for message in received] == [line.payload for line in lines[1:]]
-    assert list(hub.retained) == [f"{GOOB}/outgoing/status"]

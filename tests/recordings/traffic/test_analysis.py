@@ -235,21 +235,18 @@ def sessions(found: Traffic) -> list[tuple[int, int]]:
     return [(one.since_s - start, one.until_s - start) for one in robot(found, GOOB).sessions]
 
 
-def test_a_session_has_margins(of):
-    assert sessions(of(drive(10.0, 11.0, 30.5))) == [(5, 36)]
-
-
-def test_breaks_of_two_minutes_belong_to_a_session(of):
-    assert sessions(of(drive(10.0, 130.0))) == [(5, 136)]
-    assert sessions(of(drive(10.0, 131.0))) == [(5, 16), (126, 137)]
-
-
-def test_a_robot_at_rest_is_not_used(of):
-    assert sessions(of(drive(10.0, moving=False))) == []
-
-
-def test_a_warning_is_no_session(of):
-    assert sessions(of([Sent(START_NS, f"{GOOB}/outgoing/logs", b'{"level":"ERROR"}')])) == []
+@pytest.mark.parametrize(
+    ("messages", "expected"),
+    [
+        (drive(10.0, 11.0, 30.5), [(5, 36)]),  # with margins
+        (drive(10.0, 130.0), [(5, 136)]),  # a break of two minutes belongs to it
+        (drive(10.0, 131.0), [(5, 16), (126, 137)]),
+        (drive(10.0, moving=False), []),
+        ([Sent(START_NS, f"{GOOB}/outgoing/logs", b'{"level":"ERROR"}')], []),
+    ],
+)
+def test_sessions(of, messages, expected):
+    assert sessions(of(messages)) == expected
 
 
 def test_bandwidths_of_sessions_and_of_idle_time_are_apart(minute):

@@ -1,4 +1,7 @@
-"""A robot with scripts of its own and of the original's shape, a person, and what fails."""
+"""A robot with scripts of its own and of the original's shape, a person, and what fails.
+
+``python -m tests.kit.schedules robot_scripts`` runs hundreds.
+"""
 
 from __future__ import annotations
 
@@ -13,11 +16,12 @@ from pathlib import Path
 from typing import Any
 
 from pebble.client.estop import new_name
+from tests.kit.schedules import Engine, Outcome
 from tests.kit.stalls import Stalls
 from tests.robot.rig import Rig
 from tests.robot.script_schedules.alive import Alive
 from tests.robot.script_schedules.rules import by_person, by_script, problems
-from tests.robot.script_schedules.schedules import ACTIVE_S, FILES, Schedule, Step
+from tests.robot.script_schedules.schedules import ACTIVE_S, FILES, Schedule, Step, make
 from tests.robot.stop_schedules.history import History
 from tests.robot.stop_schedules.people import Driver
 from tests.support import ROOT, until
@@ -77,8 +81,11 @@ class World:
         stalls = [*self._stalls.found, *self.rig.mcu.late(began)]
         return problems(self.history, lines, motors, list(self.alive.overlaps), stalls) + left
 
-    def logs(self) -> str:
-        return self.rig.log.read_text()[-4000:]
+    def described(self) -> str:
+        """Return what persons did and what the MCU received, in the order of time, and the end of the log."""
+        events = [(event.at, f"{event.what} {event.details or ''}") for event in self.history.events()]
+        events += [(at, f"    M {wheels}") for at, wheels in self.rig.mcu.drives(self.history.began)]
+        return "\n".join([*(f"{at:.3f} {text}" for at, text in sorted(events)), self.rig.log.read_text()[-4000:]])
 
     # -- what persons do
 
@@ -240,3 +247,14 @@ def _write_scripts(root: Path) -> None:
         (root / name).mkdir()
         (root / name / "run.py").write_text(text)
     shutil.copytree(ROOT / "tests" / "robot" / "scripts" / "cruise", root / "cruise")
+
+
+ENGINE = Engine(
+    draw=lambda kind, seed, number: make(kind, seed + number),
+    world=lambda kind: closing(World(kind)),
+    perform=lambda world, schedule: Outcome(world.perform(schedule), log=world.described),
+    kinds=("zenoh", "mqtt"),
+    schedules=200,
+    per_world=20,
+    repeats=False,
+)

@@ -1,15 +1,18 @@
-"""Performs one schedule in a world, and afterwards shows that everything can be ended."""
+"""Performs one schedule in a world, and afterwards shows that everything can be ended.
+
+``python -m tests.kit.schedules robot_stops`` runs hundreds.
+"""
 
 from __future__ import annotations
 
 import time
 from concurrent.futures import Future
-from dataclasses import dataclass, field
+from contextlib import closing
 
-from tests.robot.stop_schedules.history import History
+from tests.kit.schedules import Engine, Outcome
 from tests.robot.stop_schedules.people import Sender
 from tests.robot.stop_schedules.rules import violations
-from tests.robot.stop_schedules.schedules import BOARD, ROBOTS, ROVER, Schedule, Step
+from tests.robot.stop_schedules.schedules import BOARD, ROBOTS, ROVER, Schedule, Step, make, setups
 from tests.robot.stop_schedules.world import World
 from tests.support import until
 
@@ -25,19 +28,6 @@ _RESETS = 9  # tries of _ANSWER_S: an owner that was killed five times in a minu
 _runs = iter(range(1, 1_000_000_000))
 
 
-@dataclass
-class Result:
-    schedule: Schedule
-    history: History
-    seconds: float = 0.0
-    stops: int = 0
-    confirmed: int = 0
-    unconfirmable: int = 0
-    resets: int = 0
-    slowest: float = 0.0  # confirmation
-    problems: list[str] = field(default_factory=list)
-
-
 class Performance:
     """One schedule in one world."""
 
@@ -48,25 +38,24 @@ class Performance:
         self._faults: list[Future[None]] = []
         self._looked = {robot: world.watch(robot).look(robot) for robot in ROBOTS}
 
-    def run(self) -> Result:
-        result = Result(self.schedule, self.history)
+    def run(self) -> Outcome:
         try:
             self._perform()
             problems = self._rest()
         finally:
             for sender, _ in self._senders:
                 sender.end()
-        result.problems = violations(self.history, self.world, self._resting) + problems
+        problems = violations(self.history, self.world, self._resting) + problems
         confirmed = self.history.events("confirmed")
-        result.seconds = time.monotonic() - self.history.began
-        result.stops = len(self.history.events("stop given"))
-        result.confirmed = len(confirmed)
-        result.unconfirmable = sum(
-            not self.world.confirmable(robot, port) for sender, port in self._senders for robot in sender.robots
-        )
-        result.resets = len(self.history.events("reset"))
-        result.slowest = max((event.details["took"] for event in confirmed), default=0.0)
-        return result
+        deaf = [not self.world.confirmable(robot, port) for sender, port in self._senders for robot in sender.robots]
+        counts = {
+            "stops": len(self.history.events("stop given")),
+            "confirmed": len(confirmed),
+            "deaf": sum(deaf),
+            "resets": len(self.history.events("reset")),
+            "slowest stop": round(max((event.details["took"] for event in confirmed), default=0.0), 3),
+        }
+        return Outcome(problems, counts, self.schedule.faults, self._described)
 
     # -- the active part
 
@@ -176,22 +165,32 @@ class Performance:
                 return [f"{robot}: does not move although its state says that it is free"]
         return [f"{robot}: a stop cannot be ended: {self._looked[robot].refusals()}"]
 
+    # -- for reading
 
-def described(result: Result) -> str:
-    """The whole history, for reading."""
-    lines = [f"{result.schedule.setup} --seed {result.schedule.seed}", *map(str, result.schedule.steps), ""]
-    lines += [
-        f"{event.at - result.history.began:7.3f}  {event.robot:6} {event.what} "
-        + " ".join(f"{name}={value}" for name, value in event.details.items())
-        for event in result.history.events()
-        if event.what != "online"
-    ]
-    return "\n".join([*lines, "", *result.problems])
+    def _described(self) -> str:
+        """Return the steps, the whole history, the wheels, and the end of the logs."""
+        lines = [*map(str, self.schedule.steps), ""]
+        lines += [
+            f"{event.at - self.history.began:7.3f}  {event.robot:6} {event.what} "
+            + " ".join(f"{name}={value}" for name, value in event.details.items())
+            for event in self.history.events()
+            if event.what != "online"
+        ]
+        lines += [
+            f"{change.at - self.history.began:7.3f}  {robot:6} wheels {change.speed:+.2f}"
+            for robot in (ROVER, BOARD)
+            for change in self.world.wheels[robot].read()
+        ]
+        return "\n".join([*lines, "", self.world.logs(), ""])
 
 
-def wheels_described(world: World, history: History) -> str:
-    return "\n".join(
-        f"{change.at - history.began:7.3f}  {robot:6} wheels {change.speed:+.2f}"
-        for robot in (ROVER, BOARD)
-        for change in world.wheels[robot].read()
-    )
+#: Its kinds of world are a transport and a set-up.
+ENGINE = Engine(
+    draw=lambda kind, seed, number: make(*kind.split(" ", 1), seed + number),
+    world=lambda kind: closing(World(*kind.split(" ", 1))),
+    perform=lambda world, schedule: Performance(world, schedule).run(),
+    kinds=tuple(f"{transport} {setup}" for transport in ("zenoh", "mqtt") for setup in setups(transport)),
+    schedules=400,
+    per_world=10,
+    repeats=False,
+)

@@ -71,14 +71,6 @@ def test_the_firmware_drives_the_wheels_and_stops_without_commands() -> None:
     assert goob.motion.left_mm_s == 0.0, "the firmware's own failsafe"
 
 
-def test_the_mcu_sends_its_hall_sensors_fifty_times_a_second() -> None:
-    simulated = LockstepWorld(world())
-    goob = simulated.robots["goob"]
-    goob.read()
-    simulated.run(2.0)
-    assert goob.read().count(b"T a0=") == pytest.approx(100, abs=2)
-
-
 @pytest.mark.parametrize(("x", "z"), [(0.0, 0.5), (0.3, 0.9), (-0.2, -0.31234), (0.1, -0.1)])
 def test_a_drive_command_is_the_line_that_the_service_writes(x: float, z: float) -> None:
     lines: list[bytes] = []

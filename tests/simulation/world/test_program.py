@@ -135,14 +135,6 @@ def refused(monkeypatch: pytest.MonkeyPatch) -> Callable[[Path], str]:
     return refuse
 
 
-def test_mistakes_in_the_file_are_printed_all_at_once(room: Path, refused: Callable[[Path], str]) -> None:
-    room.write_text('{"robots": {"goob": {"x": 0, "y": 0, "kind": "tank"}}, "tag": []}')
-    assert refused(room).splitlines() == [
-        f'{room}: robots.goob.kind: must be "goob" or "fred"',
-        f'{room}: tag: unknown key, did you mean "tags"?',
-    ]
-
-
 def test_a_missing_file_and_a_folder_that_cannot_be_made_are_one_line(
     room: Path, refused: Callable[[Path], str]
 ) -> None:

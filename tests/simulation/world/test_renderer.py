@@ -56,50 +56,37 @@ def test_the_field_of_view_is_the_cameras() -> None:
     assert edges[0] / edges[1] == pytest.approx(math.tan(math.radians(45)) / math.tan(math.radians(27.15)), rel=0.02)
 
 
-def test_a_wall_hides_what_is_behind_it() -> None:
-    assert 13 in tags_in(seen(world_of(tags=[TAG])))
-    assert tags_in(seen(world_of(tags=[TAG], walls=[WALL]))) == {}
+NEAR = {**TAG, "y": 0.5, "size_m": 0.1}
+AWAY = {"x1": 0.5, "y1": 0.15, "x2": 6.0, "y2": -0.5}
+FRED = {"goob": {"x": 0, "y": 0}, "fred": {"x": 1.5, "y": 0, "tag": 2}}
+THREE = {name: {"x": x, "y": 0.0, "tag": tag} for name, x, tag in (("goob", 0.0, 1), ("fred", 1.0, 2), ("ben", 2.0, 3))}
+BEHIND = {"robots": THREE, "tags": [{**TAG, "x": 3.0, "size_m": 0.1, "z": 0.1}]}
+#: Keys of a world, where robots stand, and the tags that goob sees.
+SCENES: list[tuple[dict[str, Any], dict[str, Any], set[int]]] = [
+    ({"tags": [TAG]}, {}, {13}),
+    ({"tags": [TAG], "walls": [WALL]}, {}, set()),
+    ({"tags": [NEAR]}, {}, {13}),
+    ({"tags": [NEAR], "walls": [AWAY]}, {}, set()),  # nearer than the middle of the wall
+    ({"tags": [{**TAG, "z": 0.5}], "walls": [{**WALL, "height_m": 0.2}]}, {}, {13}),
+    *(({"tags": [{**TAG, "x": 1.0, "y": y}], "walls": [WALL]}, {}, {13}) for y in (0.0, 0.3, -0.3)),  # on the wall
+    ({"tags": [{**TAG, "x": 1.0}], "walls": [WALL]}, {"goob": (2.0, 0.0, math.pi)}, set()),  # from behind
+    ({"robots": FRED, "walls": [WALL]}, {"fred": (1.3, 0.0, 0.2)}, set()),
+    ({"robots": FRED, "walls": [WALL]}, {"fred": (0.8, 0.0, 0.2)}, {2}),
+    (BEHIND, {"fred": (0.6, 0, 0), "ben": (1.2, 0, 0)}, {2}),
+    (BEHIND, {"fred": (1.2, 0, 0), "ben": (0.6, 0, 0)}, {3}),
+    (BEHIND, {"fred": (0.8, 0.3, 0), "ben": (1.2, -0.4, 0)}, {2, 3, 13}),
+]
 
 
-def test_a_wall_hides_what_is_nearer_than_its_middle() -> None:
-    tag = {**TAG, "y": 0.5, "size_m": 0.1}
-    away = {"x1": 0.5, "y1": 0.15, "x2": 6.0, "y2": -0.5}
-    assert 13 in tags_in(seen(world_of(tags=[tag])))
-    assert tags_in(seen(world_of(tags=[tag], walls=[away]))) == {}
-
-
-def test_a_low_wall_hides_the_lower_part() -> None:
-    world = world_of(tags=[{**TAG, "z": 0.5}], walls=[{**WALL, "height_m": 0.2}])
-    assert 13 in tags_in(seen(world))
-
-
-@pytest.mark.parametrize("y", [0.0, 0.3, -0.3])
-def test_a_tag_on_a_wall_is_in_front_of_it_and_unseen_from_behind(y: float) -> None:
-    world = world_of(tags=[{**TAG, "x": 1.0, "y": y}], walls=[WALL])
-    assert 13 in tags_in(seen(world))
-    assert tags_in(seen(world, goob=(2.0, 0.0, math.pi))) == {}
+@pytest.mark.parametrize(("keys", "poses", "tags"), SCENES)
+def test_walls_and_robots_hide_what_is_behind_them(keys: dict[str, Any], poses: dict[str, Any], tags: set[int]) -> None:
+    assert set(tags_in(seen(world_of(**keys), **poses))) == tags
 
 
 @pytest.mark.parametrize("heading", [0.0, 0.4, 0.8, 1.2, 2.0, 4.0])
 def test_a_robot_is_seen_by_the_tags_on_its_four_sides(heading: float) -> None:
     robots = {"goob": {"x": 0.0, "y": 0.0}, "fred": {"x": 1.0, "y": 0.0, "tag": 2}}
     assert 2 in tags_in(seen(world_of(robots=robots), fred=(0.8, 0.0, heading)))
-
-
-def test_the_nearer_robot_hides_the_farther_one_and_both_the_tag() -> None:
-    robots = {
-        name: {"x": x, "y": 0.0, "tag": tag} for name, x, tag in (("goob", 0.0, 1), ("fred", 1.0, 2), ("ben", 2.0, 3))
-    }
-    world = world_of(robots=robots, tags=[{**TAG, "x": 3.0, "size_m": 0.1, "z": 0.1}])
-    assert set(tags_in(seen(world, fred=(0.6, 0, 0), ben=(1.2, 0, 0)))) == {2}
-    assert set(tags_in(seen(world, fred=(1.2, 0, 0), ben=(0.6, 0, 0)))) == {3}
-    assert set(tags_in(seen(world, fred=(0.8, 0.3, 0), ben=(1.2, -0.4, 0)))) == {2, 3, 13}
-
-
-def test_a_robot_behind_a_wall_is_hidden_and_one_before_it_is_not() -> None:
-    world = world_of(robots={"goob": {"x": 0, "y": 0}, "fred": {"x": 1.5, "y": 0, "tag": 2}}, walls=[WALL])
-    assert tags_in(seen(world, fred=(1.3, 0.0, 0.2))) == {}
-    assert 2 in tags_in(seen(world, fred=(0.8, 0.0, 0.2)))
 
 
 def test_a_robot_does_not_see_itself() -> None:

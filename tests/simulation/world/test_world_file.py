@@ -10,7 +10,7 @@ import pytest
 
 import pebble.simulation.world
 from pebble.errors import ConfigError, DeviceError
-from pebble.simulation.world.world_file import open_world, parse_world, read_world, split_device
+from pebble.simulation.world.world_file import open_world, parse_world, split_device
 
 ROOM = Path(pebble.simulation.world.__file__).with_name("room.json")
 GOOB = {"x": 0.0, "y": 0.0}
@@ -20,18 +20,6 @@ def problems(**keys: Any) -> list[str]:
     with pytest.raises(ConfigError) as caught:
         parse_world({"robots": {"goob": GOOB}} | keys)
     return caught.value.problems
-
-
-def test_the_room_of_the_package_has_four_tags_and_two_robots() -> None:
-    world = read_world(ROOM)
-    assert {tag.id for tag in world.tags} == {4, 7, 13, 21}
-    assert {name: place.kind for name, place in world.robots.items()} == {"goob": "goob", "fred": "fred"}
-
-
-def test_the_defaults_are_those_of_the_robots() -> None:
-    world = parse_world({"robots": {"goob": GOOB}, "tags": [{"id": 1, "x": 1, "y": 2}]})
-    assert (world.family, world.camera.hfov_deg, world.camera.height_m) == ("APRILTAG_25h9", 54.3, 0.12)
-    assert (world.tags[0].size_m, world.tags[0].z) == (0.25, 0.2)
 
 
 def test_all_mistakes_are_reported_at_once_with_their_places() -> None:

@@ -9,9 +9,10 @@ import pytest
 from playwright.sync_api import Browser
 
 from pebble.transports import MqttSettings
+from tests.kit.played_robot import RecordingRobot
 from tests.support import Broker, until
 from tests.web.browser import Size, Tab, tab
-from tests.web.served import RecordingRobot, Served
+from tests.web.served import Served
 
 GOOB = "pebble/robots/goob"
 SLOT = "document.querySelector('[data-test=why]').textContent"

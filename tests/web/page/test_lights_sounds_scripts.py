@@ -11,9 +11,10 @@ from typing import Any
 import pytest
 from playwright.sync_api import Browser, Locator
 
+from tests.kit.played_robot import RecordingRobot
 from tests.support import Broker
 from tests.web.browser import Tab, tab
-from tests.web.served import RecordingRobot, Served
+from tests.web.served import Served
 from tests.web.states import setting
 
 pytestmark = pytest.mark.page

@@ -17,10 +17,11 @@ from playwright.sync_api import Browser, Page
 from starlette.requests import Request
 from starlette.responses import PlainTextResponse, Response
 
+from tests.kit.played_robot import RecordingRobot
 from tests.support import until
 from tests.web.browser import tab
 from tests.web.canned import CannedServer
-from tests.web.served import RecordingRobot, Served
+from tests.web.served import Served
 from tests.web.states import STATES
 
 #: What happens to a file, how often, and what is sent of it; -1: no answer at all.

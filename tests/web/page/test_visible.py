@@ -10,10 +10,11 @@ import pytest
 from playwright.sync_api import Browser
 
 from pebble.config.visible import shown
+from tests.kit.played_robot import RecordingRobot
 from tests.support import Broker, some, until
 from tests.web.browser import tab
 from tests.web.in_node import evaluate
-from tests.web.served import RecordingRobot, Served
+from tests.web.served import Served
 
 #: Texts, and how they are shown.
 TEXTS = {
