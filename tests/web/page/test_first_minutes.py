@@ -150,8 +150,9 @@ def test_a_visitor_sees_drives_stops_starts_a_script_and_takes_a_film_home(
         visitor.did("the map has its trail")
 
         opened.page.get_by_role("link", name="Recordings").first.click()
-        visitor.sees("window.pebble?.replay?.drawnAt", 60)
+        visitor.sees("window.pebble?.replay?.video.info", 60)
         visitor.did("its recording is open")
+        visitor.presses("open-download")
         visitor.presses("download")
         with opened.page.expect_download(timeout=120_000) as download:
             visitor.presses("download-file", 120)
