@@ -128,6 +128,14 @@ def test_lights(clock: VirtualClock) -> None:
     assert fred.state().light == Light(0.0, 0.0, 1.0)
 
 
+def test_freds_charger_is_a_pin(clock: VirtualClock) -> None:
+    body = body_of("fred", Board(clock))
+    pin = body.board.firmware.module("machine").Pin(body.pins.CHARGE)
+    values = [pin.value()]
+    body.battery.charging = True
+    assert [*values, pin.value()] == [0, 1]
+
+
 def test_grousers_are_seen_but_no_wheels(clock: VirtualClock) -> None:
     body = body_of("minilamp", Board(clock))
     assert isinstance(body, Minilamp)
