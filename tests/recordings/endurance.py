@@ -22,10 +22,11 @@ from pebble.contract import DRIVE, codec
 from pebble.contract.payloads import Drive
 from pebble.errors import PebbleError
 from pebble.recordings.library import files, merged
-from pebble.rig.testbed import ROBOTS, Stage
+from pebble.rig.testbed import ROBOTS
 from pebble.transports import Message, MqttSettings, QoS, Transport, create
 from tests.own_memory import own_mb
 from tests.support import quarters, until
+from tests.web.stage import Stage
 
 ENCODINGS = ("json", "pbvd", "h264")
 _SAMPLE_S, _DRIVE_S, _CHANGE_S = 20.0, 10.0, 60.0
