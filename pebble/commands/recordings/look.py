@@ -1,14 +1,11 @@
 """``pebble recordings`` list, info and search: what there is, and what was recorded."""
 
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
-from rich import box
-from rich.console import Console
-from rich.table import Table
 
 from pebble.client.names import base_of
 from pebble.commands.recordings.options import RecordingsArgument, RobotOption, Since, Topics, Until, period
@@ -29,15 +26,15 @@ Check = Annotated[bool, typer.Option("--check", help="Read all of it; without, o
 
 def list_(places: RecordingsArgument, since: Since = None, until: Until = None, check: Check = False) -> int:
     """List the files, their times, sizes and state."""
-    table = Table(*_columns("begins", "lasts", "what", "messages", "size", "state"), box=box.SIMPLE, pad_edge=False)
-    total = Counter[str]()
+    rows, total = list[tuple[str, ...]](), Counter[str]()
     looked, unread = _looked_at(places, since, until, check=check)
     for one in looked:
         lasts = show.duration((one.last_ns - one.first_ns) / 1e9) if one.messages else ""
         begins = local_time(one.first_ns) if one.messages else ""
-        table.add_row(begins, lasts, _lane(one.path), f"{one.messages:,}", show.size(one.size), _state(one))
+        rows.append((begins, lasts, _lane(one.path), f"{one.messages:,}", show.size(one.size), _state(one)))
         total.update(files=1, messages=one.messages, size=one.size)
-    Console(highlight=False, markup=False).print(table)
+    columns = ("begins", "lasts", "what", "messages", "size", "state")
+    show.print_table(columns, rows, whole=("begins", "lasts"), right=("messages", "size"))
     typer.echo(f"{total['files']} files, {total['messages']:,} messages, {show.size(total['size'])}")
     return report_unread(unread)
 
@@ -103,13 +100,6 @@ def search(
             break
     typer.echo(f"{found:,} messages", err=True)
     return report_unread(problems(damages))
-
-
-def _columns(*names: str) -> Iterator[Any]:
-    from rich.table import Column
-
-    for name in names:
-        yield Column(name, justify="right" if name in ("messages", "size") else "left")
 
 
 def _looked_at(
