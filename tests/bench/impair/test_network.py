@@ -42,27 +42,11 @@ def test_both_ways(network: NamespaceNetwork, tmp_path: Path) -> None:
         assert must * 0.95 < talk.down(30_000) < must * _SLACK
 
 
-def test_delay_and_back_to_none_on_one_connection(network: NamespaceNetwork, tmp_path: Path) -> None:
-    with ProbeConnection(network, tmp_path) as talk:
-        network.apply(Condition("far", Shape(delay_ms=40), Shape(delay_ms=20)))
-        assert 0.06 <= min(talk.round_trips()) < 0.5
-        network.apply(Condition("near"))
-        assert min(talk.round_trips()) < 0.06
-
-
-def test_loss_is_late_to_tcp_but_nothing_is_missing(network: NamespaceNetwork, tmp_path: Path) -> None:
-    with ProbeConnection(network, tmp_path) as talk:
-        network.apply(Condition("lossy", Shape(loss=0.1)))
-        talk.up(200_000)
-        assert network.traffic().dropped_up > 0
-
-
 def test_what_was_carried_is_counted_with_its_headers(network: NamespaceNetwork, tmp_path: Path) -> None:
     with ProbeConnection(network, tmp_path) as talk:
-        before = network.traffic()
+        before = network.bytes_up()
         talk.up(100_000)
-        after = network.traffic()
-    assert 100_000 + 66 * 69 <= after.bytes_up - before.bytes_up < 125_000
+        assert 100_000 + 66 * 69 <= network.bytes_up() - before < 125_000
 
 
 def test_conditions_of_every_kind_can_follow_each_other(network: NamespaceNetwork) -> None:
@@ -78,9 +62,9 @@ def test_networks_are_independent(tmp_path: Path) -> None:
         ProbeConnection(one, tmp_path) as first,
         ProbeConnection(other, tmp_path) as second,
     ):
-        one.apply(Condition("far", Shape(delay_ms=100)))
-        assert min(first.round_trips(3)) >= 0.1
-        assert min(second.round_trips()) < 0.1
+        one.apply(Condition("64k", Shape(kbit=64)))
+        assert first.up(8_000) > 0.5
+        assert second.up(8_000) < 0.5
 
 
 @pytest.mark.usefixtures("namespaces_permitted")
@@ -92,7 +76,7 @@ def test_close_leaves_nothing_and_may_be_repeated() -> None:
     network.close()
     assert gone(process)
     assert not (Path("/sys/class/net") / "wire").exists()
-    with pytest.raises(PebbleError, match="closed"):
+    with pytest.raises(PebbleError, match="No such file"):
         network.apply(Condition("late"))
 
 
