@@ -99,33 +99,28 @@ class Style:
     hollow: bool = False
 
 
-#: The variants of each colour. The first four are for other ones of Zenoh, too, the next four of MQTT, the rest of all.
+#: The variants of each colour, in several comparisons.
 _VARIANTS: dict[str, tuple[str, ...]] = {
     "#0072B2": ("zenoh", "zenoh-p2p", "zenoh-shm", "zenoh h264 opus", "hub"),
-    "#2AA198": ("zenoh-hub", "zenoh-copy"),
-    "#56B4E9": ("zenoh-net", "zenoh original"),
-    "#1B3A6B": (),
+    "#2AA198": ("zenoh-hub",),
+    "#56B4E9": ("zenoh original",),
     "#D55E00": ("mqtt", "mqtt h264 opus"),
     "#E69F00": ("mqtt-nodelay", "mqtt original"),
     "#A4133C": ("mqtt5",),
     "#8C510A": (STAND_IN,),
     "#4D4D4D": ("one hop", "memcpy"),
     "#8A8A8A": ("gstreamer-shm", "page"),
-    **dict.fromkeys(("#117733", "#6DBE8B", "#CC79A7", "#7B4F9E", "#1A1A1A", "#B3B3B3"), ()),
 }
 _STYLES = {
-    colour: Style(colour, ("-", "--", "-.", ":")[at % 4], "os^DvPX"[at % 7]) for at, colour in enumerate(_VARIANTS)
+    name: Style(colour, ("-", "--", "-.", ":")[at % 4], "os^DvPX"[at % 7], hollow="original" in name)
+    for at, (colour, names) in enumerate(_VARIANTS.items())
+    for name in names
 }
 
 
 def styles(variants: Sequence[str]) -> dict[str, Style]:
-    """Return the fixed style of each known variant, and one from its family's colours for every other."""
-    colours = {name: colour for colour, names in _VARIANTS.items() for name in names if name in variants}
-    for name in variants:
-        begin, end = (0, 4) if name.startswith("zenoh") else (4, 8) if name.startswith("mqtt") else (8, None)
-        family = list(_VARIANTS)[begin:end]
-        colours.setdefault(name, next((colour for colour in family if colour not in colours.values()), family[0]))
-    return {name: replace(_STYLES[colours[name]], hollow="original" in name) for name in variants}
+    """Return the style of each variant, which is the same in every picture."""
+    return {name: _STYLES[name] for name in variants}
 
 
 def unique(values: Sequence[str]) -> list[str]:

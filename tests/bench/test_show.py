@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import itertools
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import pytest
@@ -172,11 +172,11 @@ def test_only_figures_of_robots_that_were_analysed_are_drawn() -> None:
         assert titles == [f"Figure 4.{number}" for number in numbers]
 
 
-def test_a_variant_looks_the_same_everywhere_and_like_no_other() -> None:
-    alone, together = plots.styles(["zenoh-p2p"]), plots.styles(["mqtt", STAND_IN, "zenoh-hub", "zenoh-p2p"])
-    assert together["zenoh-p2p"] == alone["zenoh-p2p"]
-    unknown = plots.styles(["mqtt", "mqtt-new", "zenoh", "zenoh-new", "other", "another"])
-    assert len({style.colour for style in unknown.values()}) == len(unknown)
+@pytest.mark.parametrize(
+    "variants", [tuple(control.VARIANTS), frames.VARIANTS, bridge.FULL.variants, scale.VARIANTS, trials.SUBJECTS]
+)
+def test_each_variant_of_a_comparison_has_a_style_like_no_other(variants: Sequence[str]) -> None:
+    assert len(set(plots.styles(variants).values())) == len(variants)
 
 
 def test_numbers_have_three_digits() -> None:
