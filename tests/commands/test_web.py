@@ -210,7 +210,7 @@ def test_tls_on_this_machine_has_a_login(run: Run, served: list[WebSettings], tm
         ([], "which robots is missing: name either a robot's config file or --url mqtt://BROKER"),
         (["x.json", "--url", "mqtt://a"], "which robots is missing"),
         (["--url", "http://a"], "--url must be mqtt://"),
-        (["--url", "zenoh:/tmp"], "the operator page needs MQTT"),
+        (["--url", "zenoh:/tmp"], "--url must be mqtt://"),
         (["--url", f"mqtt://me:{SECRET}@a"], "--url holds a password"),
     ],
 )
