@@ -69,7 +69,8 @@ class NamespaceNetwork(Worker):
 
     def bytes_up(self) -> int:
         """Return what the robot has sent, with all headers; only differences mean something."""
-        return self._robot.sent_bytes()
+        (link,) = json.loads(self._robot.run("ip", "-s", "-j", "link", "show", "dev", _WIRE))
+        return int(link["stats64"]["tx"]["bytes"])
 
     def close(self) -> None:
         """May be called repeatedly."""
@@ -95,7 +96,7 @@ class _Side:
             f"link set {_WIRE} gso_max_segs 1",  # otherwise packets of 64 KB are limited and dropped as one
             f"link set {_WIRE} up",
         )
-        self._run("nft", "-f", "-", stdin=_TABLE)
+        self.run("nft", "-f", "-", stdin=_TABLE)
         self.apply(None, 0.0)
 
     def apply(self, kbit: float | None, loss: float) -> None:
@@ -103,17 +104,13 @@ class _Side:
         self.batch("tc", f"qdisc replace dev {_WIRE} root {_queue(kbit)}")
         rule = f'iifname != "lo" numgen random mod 10000 < {round(loss * 10000)} counter drop'
         add = f"add rule ip impair arriving {rule}\n" if loss else ""
-        self._run("nft", "-f", "-", stdin=f"flush chain ip impair arriving\n{add}")
-
-    def sent_bytes(self) -> int:
-        (link,) = json.loads(self._run("ip", "-s", "-j", "link", "show", "dev", _WIRE))
-        return int(link["stats64"]["tx"]["bytes"])
+        self.run("nft", "-f", "-", stdin=f"flush chain ip impair arriving\n{add}")
 
     def batch(self, program: str, *lines: str) -> None:
         """Runs lines of ``ip`` or ``tc``."""
-        self._run(program, "-batch", "-", stdin="".join(f"{line}\n" for line in lines))
+        self.run(program, "-batch", "-", stdin="".join(f"{line}\n" for line in lines))
 
-    def _run(self, program: str, *arguments: str, stdin: str = "") -> str:
+    def run(self, program: str, *arguments: str, stdin: str = "") -> str:
         command, what = self.inside([program, *arguments]), f"{program} {' '.join(arguments)}"
         env = {**os.environ, "PATH": f"{os.environ.get('PATH', os.defpath)}:{SBIN}"}
         try:
