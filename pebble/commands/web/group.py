@@ -14,7 +14,7 @@ import typer
 from typer.core import TyperCommand, TyperGroup
 
 from pebble.client.page import require_packages
-from pebble.commands.options import CaCert, PasswordFile, broker_of, host_of
+from pebble.commands.options import BrokerUrl, CaCert, PasswordFile, broker_of, host_of
 from pebble.commands.web.people import PEOPLE, TLS, PeopleOption, default_folder, opened, register_people
 from pebble.config import load
 from pebble.config.hosts import name_of_page
@@ -44,9 +44,7 @@ def serve(
             help="A robot's config file: its broker, and web_interface.", metavar="CONFIG", show_default=False
         ),
     ] = None,
-    url: Annotated[
-        str | None, typer.Option(help="mqtt://[USER@]HOST[:PORT] or mqtts://… of the robots' broker.", metavar="URL")
-    ] = None,
+    url: BrokerUrl = None,
     password_file: PasswordFile = None,
     ca_cert: CaCert = None,
     host: Host = None,
