@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Iterator
-from contextlib import contextmanager
-from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 
 from pebble.commands.options import Output
-from pebble.commands.recordings.options import RecordingsArgument, Since, Until
+from pebble.commands.recordings.options import RecordingsArgument, Since, Until, period
+from pebble.commands.recordings.report import errors_of_files
 
 if TYPE_CHECKING:
     from pebble.recordings.traffic.results import RobotTraffic, Traffic
@@ -50,18 +49,17 @@ def analyse(
     from pebble.commands.recordings.progress import progress_of_steps
     from pebble.config.visible import shown
     from pebble.recordings.catalogue import check_name
-    from pebble.recordings.period import parse_period
     from pebble.recordings.traffic.analysis import analyse as analyse_traffic
     from pebble.recordings.traffic.report import write_report
     from pebble.recordings.traffic.sources import sources
 
-    since_ns, until_ns = parse_period(since, until, now=datetime.now())
+    since_ns, until_ns = period(since, until)
     bases = [base_of(name) for name in robot or ()]
-    with _errors_of_files():
+    with errors_of_files():
         output.mkdir(parents=True, exist_ok=True)  # before the work, not after it
     with tempfile.TemporaryDirectory(prefix="pebble-analyse-") as folder, progress_of_steps() as progress:
         scratch = Path(folder)
-        with _errors_of_files():
+        with errors_of_files():
             found = sources(places, scratch, progress)
         for line in found.unread:
             typer.echo(f"pebble: {shown(line)}", err=True)
@@ -71,17 +69,6 @@ def analyse(
         written = write_report(traffic, output, csv=csv, advance=progress)
     _print(traffic, written)
     return 1 if found.unread else 0
-
-
-@contextmanager
-def _errors_of_files() -> Iterator[None]:
-    """Raise PebbleError for OSError."""
-    from pebble.errors import PebbleError
-
-    try:
-        yield
-    except OSError as error:
-        raise PebbleError(f"{error.filename}: {error.strerror}") from None
 
 
 def _print(traffic: Traffic, written: list[Path]) -> None:

@@ -58,18 +58,13 @@ def info(places: RecordingsArgument, since: Since = None, until: Until = None, c
         count = sum(number for topic, number in topics.items() if topic.startswith(f"{robot}/"))
         typer.echo(f"\n{one_line(shown(robot))}: {count:,} messages")
         own = Counter({topic[len(robot) + 1 :]: n for topic, n in topics.items() if topic.startswith(f"{robot}/")})
-        for topic, number in own.most_common(_SHOWN_TOPICS):
-            typer.echo(f"  {number:>10,}  {one_line(shown(topic))}")
-        if len(own) > _SHOWN_TOPICS:
-            typer.echo(f"  … and {len(own) - _SHOWN_TOPICS} topics more")
+        _print_topics(own)
     encodings = {topic: name for one in looked for topic, name in one.encodings.items() if robot_in(topic) is None}
-    others = Counter({topic: topics[topic] for topic in encodings if not topic.startswith("$recorder/")})
+    named = ((topic, name) for topic, name in encodings.items() if not topic.startswith("$recorder/"))
+    others = Counter({f"{topic} {name}": topics[topic] for topic, name in named})
     if others:
         typer.echo(f"\nTopics that are of no robot: {others.total():,} messages")
-    for topic, number in others.most_common(_SHOWN_TOPICS):
-        typer.echo(f"  {number:>10,}  {one_line(shown(f'{topic} {encodings[topic]}'))}")
-    if len(others) > _SHOWN_TOPICS:
-        typer.echo(f"  … and {len(others) - _SHOWN_TOPICS} topics more")
+    _print_topics(others)
     _print_events(one.path for one in looked if one.readable)
     return report_unread(unread)
 
@@ -100,6 +95,13 @@ def search(
             break
     typer.echo(f"{found:,} messages", err=True)
     return report_unread(problems(damages))
+
+
+def _print_topics(counts: Counter[str]) -> None:
+    for topic, number in counts.most_common(_SHOWN_TOPICS):
+        typer.echo(f"  {number:>10,}  {one_line(shown(topic))}")
+    if len(counts) > _SHOWN_TOPICS:
+        typer.echo(f"  … and {len(counts) - _SHOWN_TOPICS} topics more")
 
 
 def _looked_at(

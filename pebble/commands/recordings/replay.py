@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from datetime import datetime
 from functools import partial
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Annotated
 
@@ -131,7 +132,9 @@ def _play(console: _Console, make: Make, rules: Rules, make_player: Callable[...
         sys.stdout.flush()
         if terminal:
             stack.enter_context(console.keys())
-        console.attach(player, robots)
+        console.player, console.robots = player, robots
+        if console.ended:
+            player.stop()
         player.run()
     return player
 
@@ -144,30 +147,20 @@ def _maker(kind: str, settings: object) -> Make:
 
 
 def _has_terminal() -> bool:
-    """Whether keys can be read: not in a pipe, and not on Windows."""
-    if not (sys.stdin.isatty() and sys.stdout.isatty()):
-        return False
-    try:
-        import termios  # noqa: F401
-    except ImportError:
-        return False
-    return True
+    """True if keys can be read: not in a pipe, and not on Windows."""
+    return sys.stdin.isatty() and sys.stdout.isatty() and find_spec("termios") is not None
 
 
 class _Console:
     """Waits for the player; meanwhile keys, signals and the state of the connection are looked at."""
 
+    player: Player  # both are there once it plays
+    robots: ReplayedRobots
+
     def __init__(self) -> None:
         self.ended = ""  # why, if not by the end of the recording
-        self._player: Player | None = None
-        self._robots: ReplayedRobots | None = None
         self._loop: TerminalLoop | None = None
         self._problem = ""
-
-    def attach(self, player: Player, robots: ReplayedRobots) -> None:
-        self._player, self._robots = player, robots
-        if self.ended:
-            player.stop()
 
     @contextmanager
     def keys(self) -> Iterator[None]:
@@ -181,9 +174,7 @@ class _Console:
                 self._loop = None
 
     def wait(self, seconds: float) -> None:
-        player, robots = self._player, self._robots
-        if player is None or robots is None:
-            return
+        player, robots = self.player, self.robots
         if self._loop is None:
             time.sleep(seconds)
             self._report(robots.problem)
