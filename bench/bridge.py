@@ -24,7 +24,7 @@ from pebble.bench import plots
 from pebble.bench.bridge_operator import ALL, HOP, Arrived, DrivenRobot, Turn, driven_robot
 from pebble.bench.results import STAND_IN, Cell, Results, begin, grouped, round_cell
 from pebble.bench.rounds import Progress, in_turn, measure_rounds
-from pebble.bench.show import RATIOS, Shown, compared, percentiles, plain_table, spread
+from pebble.bench.show import RATIOS, Picture, Shown, compared, percentiles, plain_table, spread
 from pebble.rig.robot import KINDS
 
 UNLOADED, COMMANDS, LOADED = "none", "commands", "media"  # unloaded: 20 commands and 50 reports a second
@@ -59,21 +59,10 @@ def shown(results: Results) -> Shown:
     """Return the tables and pictures of results."""
     results.cells.sort(key=lambda cell: MEASURES.index(cell.measure))
     latencies, cpu = ([cell for cell in results.cells if (cell.measure == CPU) == is_cpu] for is_cpu in (False, True))
-    pictures = [
-        *(
-            picture
-            for way in (DOWN, UP)
-            for picture in plots.curves(
-                f"bridge-{way}", f"Operator to wheels and back: {way}",
-                [cell for cell in latencies if cell.measure == way],
-            )
-        ),
-        *plots.ratios("bridge-ratios", "Operator to wheels and back", latencies, STAND_IN),
-        *plots.medians(
-            "bridge-cpu", "CPU for each forwarded message", cpu,
-            panel=lambda cell: f"load: {cell.params['load']}", row=lambda cell: str(cell.params["process"]),
-        ),
-    ]  # fmt: skip
+    pictures = list[Picture]()
+    for way in (DOWN, UP):
+        cells = [cell for cell in latencies if cell.measure == way]
+        pictures += plots.curves(f"bridge-{way}", f"Operator to wheels and back: {way}", cells)
     return Shown(results, [latency_table(results, latencies), cpu_table(results, cpu)], pictures)
 
 

@@ -83,11 +83,7 @@ def run(settings: Settings, console: Console) -> Shown:
 def shown(results: Results) -> Shown:
     """Return the tables and pictures of results."""
     one_way = [cell for cell in results.cells if cell.measure == ONE_WAY]
-    pictures = [
-        *plots.curves("control-one-way", "Service to service, one way", one_way),
-        *plots.ratios("control-ratios", "Service to service", one_way, BASELINE),
-    ]
-    return Shown(results, [table(results)], pictures)
+    return Shown(results, [table(results)], plots.curves("control-one-way", "Service to service, one way", one_way))
 
 
 def conditions(settings: Settings) -> list[Params]:

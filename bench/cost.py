@@ -19,7 +19,6 @@ from typing import Final
 from rich.console import Console
 from rich.table import Table
 
-from pebble.bench import plots
 from pebble.bench.clients import RobotSubscriber, driving, ready_robot
 from pebble.bench.results import Cell, Results, begin, round_cell
 from pebble.bench.rounds import Progress, in_turn, measure_rounds
@@ -69,16 +68,8 @@ def run(settings: Settings, console: Console) -> Shown:
 
 
 def shown(results: Results) -> Shown:
-    """Return the tables and pictures of results."""
-    pictures = []
-    for measure_ in (MEMORY, CPU):
-        cells = [cell for cell in results.cells if cell.measure == measure_]
-        cells.sort(key=lambda cell: cell.params["process"] == ALL)
-        pictures += plots.medians(
-            f"cost-{measure_.lower()}", f"What a robot costs, {measure_}", cells,
-            panel=lambda cell: str(cell.params["phase"]), row=lambda cell: str(cell.params["process"]),
-        )  # fmt: skip
-    return Shown(results, [table(results), whole(results)], pictures)
+    """Return results with their tables."""
+    return Shown(results, [table(results), whole(results)])
 
 
 def measure(variant: str, seconds: float) -> Iterator[Cell]:

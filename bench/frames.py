@@ -4,9 +4,8 @@ One process writes BGR pictures at 30 Hz, one or three others read them. The lat
 a reader has a whole numpy array. Every case starts new processes in every round: starts of a process differ more than
 frames of one process, so many short rounds are better than a few long ones. The first frames do not count.
 
-``zenoh-shm``: created in the shared segment and read as a view. ``zenoh-copy``: one copy in, one out. ``zenoh-net``:
-the same code where memory may not be locked. ``mqtt``: mosquitto and paho, QoS 0. ``gstreamer-shm``: shmsink to shmsrc,
-as in the original, with the system's Python. ``memcpy``: no transport, a copy of as many bytes.
+``zenoh-shm``: created in the shared segment and read as a view. ``mqtt``: mosquitto and paho, QoS 0. ``gstreamer-shm``:
+shmsink to shmsrc, as in the original, with the system's Python. ``memcpy``: no transport, a copy of as many bytes.
 """
 
 from __future__ import annotations
@@ -31,7 +30,7 @@ from pebble.bench.usage import cpu_s, pss_mb
 from pebble.errors import PebbleError
 from pebble.rig.processes import Processes, mosquitto_path, python
 
-VARIANTS: Final = ("zenoh-shm", "zenoh-copy", "zenoh-net", "mqtt", "gstreamer-shm", "memcpy")
+VARIANTS: Final = ("zenoh-shm", "mqtt", "gstreamer-shm", "memcpy")
 SIZES: Final = ("640x480", "1280x720", "1920x1080")
 BASELINE: Final = "mqtt"
 INSTALL_GSTREAMER: Final = (

@@ -26,7 +26,7 @@ import numpy as np
 if __package__:
     from pebble.errors import TransportError
     from pebble.rig import worker_end
-    from pebble.transports.frames import FrameInfo, FrameReader, FrameWriter, shared_memory
+    from pebble.transports.frames import FrameInfo, FrameReader, FrameWriter
 else:  # the system's Python runs plain files
     sys.path.append(str(Path(__file__).parents[1] / "rig"))
     import worker_end  # type: ignore[import-not-found, no-redef]
@@ -37,7 +37,6 @@ _READ_S = 0.2
 _GAP_S = 0.010  # between a frame and the bare copy after it
 _FRAMES_IN_SEGMENT = 8
 _STREAM, _TOPIC = "bench", "pebble/bench/frames"
-_WITHOUT_COPIES = ("zenoh-shm", "memcpy")
 
 Gst: Any = None  # loaded by main(): other Pythons have no gi
 Fill = Callable[[np.ndarray], None]  # writes the pixels of a frame (uint8, 1-D)
@@ -117,21 +116,20 @@ def read(reader: Reader, bare_copy: int) -> None:
 
 
 class ZenohWriter:
-    """Frames are created in the shared segment, or copied there, or sent as bytes."""
+    """Frames are created in the shared segment, as services do."""
 
     fallbacks = 0  # frames that did not go through shared memory
 
-    def __init__(self, variant: str, folder: Path, size: int) -> None:
-        self._in_segment, self._info = variant in _WITHOUT_COPIES, FrameInfo(format="bgr24")
-        self._frame = np.zeros(size, np.uint8)
+    def __init__(self, folder: Path, size: int) -> None:
+        self._info, self._frame = FrameInfo(format="bgr24"), np.zeros(size, np.uint8)
         self._writer = FrameWriter(folder, _STREAM, capacity=size).open()
-        _refuse(self._writer.problem, variant)
+        _refuse(self._writer.problem)
         self.close = self._writer.close
 
     def write(self, fill: Fill) -> bool:
         if not self._writer.wanted:
             return False
-        slot = self._writer.slot(len(self._frame)) if self._in_segment else None
+        slot = self._writer.slot(len(self._frame))
         fill(self._frame if slot is None else slot.array)
         if slot is None:
             self._writer.write(self._frame, self._info)
@@ -142,22 +140,21 @@ class ZenohWriter:
 
 
 class ZenohReader:
-    """Frames are views into the segment, or copies."""
+    """Frames are views into the segment."""
 
-    def __init__(self, variant: str, folder: Path) -> None:
-        self._variant = variant
-        self._reader = FrameReader(folder, _STREAM, views=variant in _WITHOUT_COPIES).open()
+    def __init__(self, folder: Path) -> None:
+        self._reader = FrameReader(folder, _STREAM, views=True).open()
         self.close = self._reader.close
 
     def read(self, timeout: float) -> np.ndarray | None:
         frame = self._reader.read(timeout)
-        _refuse(self._reader.problem, self._variant)
+        _refuse(self._reader.problem)
         return None if frame is None else frame.data
 
 
-def _refuse(problem: str, variant: str) -> None:
+def _refuse(problem: str) -> None:
     """Raises TransportError: results of frames that took another way would be labelled wrongly."""
-    if problem and variant != "zenoh-net":
+    if problem:
         raise TransportError(problem)
 
 
@@ -295,13 +292,13 @@ def writer(variant: str, where: str, size: int, caps: str = "") -> Writer:
     """``size`` in bytes; ``caps``: the format of frames, for GStreamer."""
     if variant == "gstreamer-shm":
         return GstWriter(f"{where}/gst.sock", caps, size)
-    return MqttWriter(int(where), size) if variant == "mqtt" else ZenohWriter(variant, Path(where), size)
+    return MqttWriter(int(where), size) if variant == "mqtt" else ZenohWriter(Path(where), size)
 
 
 def reader(variant: str, where: str, caps: str = "") -> Reader:
     if variant == "gstreamer-shm":
         return GstReader(f"{where}/gst.sock", caps)
-    return MqttReader(int(where)) if variant == "mqtt" else ZenohReader(variant, Path(where))
+    return MqttReader(int(where)) if variant == "mqtt" else ZenohReader(Path(where))
 
 
 def main(arguments: list[str]) -> None:
@@ -312,8 +309,6 @@ def main(arguments: list[str]) -> None:
     variant, role, where, size = arguments
     width, height = map(int, size.split("x"))
     count, caps = 3 * width * height, f"video/x-raw,format=BGR,width={width},height={height},framerate=30/1"
-    if variant == "zenoh-net":  # as on a system where memory may not be locked: frames are sent as bytes
-        shared_memory.lockable = lambda size: False  # noqa: ARG005
     if role == "writer":
         write(writer(variant, where, count, caps), count)
     else:

@@ -1,20 +1,18 @@
-"""Draws the pictures of comparisons: distributions, bars, and lines. matplotlib is imported only to draw."""
+"""Draws the pictures of comparisons: distributions, and lines. matplotlib is imported only to draw."""
 
 from __future__ import annotations
 
 import io
 import math
 import textwrap
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from statistics import median
 from typing import TYPE_CHECKING, Any
 
 from pebble.bench.results import STAND_IN, Cell, grouped, named, percentile
-from pebble.bench.rounds import Interval, ratio
-from pebble.bench.show import Picture, digits, middle
+from pebble.bench.show import Picture, digits
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -61,77 +59,6 @@ def _curves(cells: Sequence[Cell], title: str) -> Figure:
     return figure
 
 
-@dataclass(frozen=True, slots=True)
-class Bar:
-    """A bar in a panel and in a row, in a variant's colour; a line over it, and a text at the end of both."""
-
-    panel: str
-    row: str
-    variant: str
-    end: float
-    line: tuple[float, ...]
-    text: str = ""
-
-
-def medians(
-    name: str, caption: str, cells: Sequence[Cell], *, panel: Callable[[Cell], str], row: Callable[[Cell], str]
-) -> list[Picture]:
-    """Return bars to the medians, with lines between the fastest and the slowest round."""
-    bars = [
-        Bar(panel(cell), row(cell), cell.variant, median(rounds), (min(rounds), max(rounds)), f"  {middle(cell)}")
-        for cell in cells
-        for rounds in [cell.medians()]
-        if rounds
-    ]
-    caption = f"{caption}: medians, with lines from the lowest to the highest round"
-    units = unique([_unit(cell) for cell in cells])
-    return [Picture(name, caption, partial(_bars, bars, caption, "" if len(units) > 1 else units[0]))] if bars else []
-
-
-def ratios(name: str, caption: str, cells: Sequence[Cell], baseline: str) -> list[Picture]:
-    """Return the medians as ratios to the baseline's, with their intervals; a panel for each measure."""
-    base = {(cell.measure, cell.conditions()): cell for cell in cells if cell.variant == baseline}
-    pairs = [(cell, base.get((cell.measure, cell.conditions()))) for cell in cells if cell.variant != baseline]
-    judged = [(cell, ratio(cell, theirs)) for cell, theirs in pairs if theirs is not None]
-    bars = [_ratio_bar(cell, interval) for cell, interval in judged if math.isfinite(interval.ratio)]
-    caption = f"{caption}: median as a ratio to {baseline}'s, from 8 rounds on with its interval of 99 %"
-    return [Picture(name, caption, partial(_bars, bars, caption, "ratio", is_ratio=True))] if bars else []
-
-
-def _ratio_bar(cell: Cell, interval: Interval) -> Bar:
-    line = (interval.ratio,) if interval.few else (interval.low, interval.high)
-    return Bar(cell.measure, cell.conditions(), cell.variant, interval.ratio, line)
-
-
-def _bars(bars: Sequence[Bar], title: str, label: str, *, is_ratio: bool = False) -> Figure:
-    """Draw panels of bars, those of a row below each other; ratios begin at 1."""
-    by_panel, style_of = grouped(bars, lambda bar: bar.panel), styles(unique([bar.variant for bar in bars]))
-    every_row, begin = unique([bar.row for bar in bars]), float(is_ratio)
-    height = 0.9 + 0.17 * max(map(len, by_panel.values())) + 0.15 * len(every_row)
-    figure, every = panels(len(by_panel), 2, (5.6, height), title)
-    for axes, (panel, some) in zip(every, by_panel.items(), strict=True):
-        rows = [row for row in every_row if any(bar.row == row for bar in some)]
-        for place, row in enumerate(rows):
-            here = [bar for bar in some if bar.row == row]
-            for number, bar in enumerate(here):
-                y, thick = place + 0.8 * ((number + 0.5) / len(here) - 0.5), min(0.5, 0.72 / len(here))
-                axes.barh(y, bar.end - begin, left=begin, height=thick, color=style_of[bar.variant].colour, alpha=0.8)
-                axes.plot(bar.line, [y] * len(bar.line), color=_DARK, linewidth=1.1, marker="|", markersize=6)
-                axes.annotate(bar.text, (max((bar.end, *bar.line)), y), fontsize=8, va="center")
-        axes.set_yticks(range(len(rows)), [short(row, 34) for row in rows])
-        axes.set(ylim=(len(rows) - 0.4, -0.6), title=short(panel, 50))
-        axes.grid(visible=False, axis="y")
-        ends = [value for bar in some for value in (bar.end, *bar.line)]
-        if is_ratio:
-            low, high = max(0.005, 0.93 * min(0.95, *ends)), min(50.0, 1.07 * max(1.25, *ends))
-            log_axis(axes, "x", f"{label}; left of 1 is faster", low, high)
-            axes.axvline(1.0, color=_DARK, linewidth=0.9)
-        else:
-            axes.set(xlim=(0, 1.25 * max(ends) or 1.0), xlabel=label)
-    legend(figure, {variant: Style(style.colour, "", "s") for variant, style in style_of.items()})
-    return figure
-
-
 def lines(name: str, caption: str, cells: Sequence[Cell], *, over: str) -> list[Picture]:
     """Return lines through the medians as the parameter ``over`` grows; one panel for each measure."""
     known = [cell for cell in cells if cell.samples]
@@ -172,33 +99,28 @@ class Style:
     hollow: bool = False
 
 
-#: The variants of each colour. The first four are for other ones of Zenoh, too, the next four of MQTT, the rest of all.
+#: The variants of each colour, in several comparisons.
 _VARIANTS: dict[str, tuple[str, ...]] = {
     "#0072B2": ("zenoh", "zenoh-p2p", "zenoh-shm", "zenoh h264 opus", "hub"),
-    "#2AA198": ("zenoh-hub", "zenoh-copy"),
-    "#56B4E9": ("zenoh-net", "zenoh original"),
-    "#1B3A6B": (),
+    "#2AA198": ("zenoh-hub",),
+    "#56B4E9": ("zenoh original",),
     "#D55E00": ("mqtt", "mqtt h264 opus"),
     "#E69F00": ("mqtt-nodelay", "mqtt original"),
     "#A4133C": ("mqtt5",),
     "#8C510A": (STAND_IN,),
     "#4D4D4D": ("one hop", "memcpy"),
     "#8A8A8A": ("gstreamer-shm", "page"),
-    **dict.fromkeys(("#117733", "#6DBE8B", "#CC79A7", "#7B4F9E", "#1A1A1A", "#B3B3B3"), ()),
 }
 _STYLES = {
-    colour: Style(colour, ("-", "--", "-.", ":")[at % 4], "os^DvPX"[at % 7]) for at, colour in enumerate(_VARIANTS)
+    name: Style(colour, ("-", "--", "-.", ":")[at % 4], "os^DvPX"[at % 7], hollow="original" in name)
+    for at, (colour, names) in enumerate(_VARIANTS.items())
+    for name in names
 }
 
 
 def styles(variants: Sequence[str]) -> dict[str, Style]:
-    """Return the fixed style of each known variant, and one from its family's colours for every other."""
-    colours = {name: colour for colour, names in _VARIANTS.items() for name in names if name in variants}
-    for name in variants:
-        begin, end = (0, 4) if name.startswith("zenoh") else (4, 8) if name.startswith("mqtt") else (8, None)
-        family = list(_VARIANTS)[begin:end]
-        colours.setdefault(name, next((colour for colour in family if colour not in colours.values()), family[0]))
-    return {name: replace(_STYLES[colours[name]], hollow="original" in name) for name in variants}
+    """Return the style of each variant, which is the same in every picture."""
+    return {name: _STYLES[name] for name in variants}
 
 
 def unique(values: Sequence[str]) -> list[str]:

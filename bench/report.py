@@ -48,7 +48,7 @@ SECTIONS: Final = (
     Section("bridge", "Operator to wheels, and back", 2100, 22, ("--with-media",)),
     Section("startup", "Start-up", 100, 23),
     Section("cost", "Memory and CPU", 180, 20),
-    Section("frames", "Camera frames inside the robot", 350, 20),
+    Section("frames", "Camera frames inside the robot", 240, 14),
     Section("scale", "Many boards", 240, 40),
     Section("traffic", "Traffic of robots, as in the paper", 140, 19),
     Section("impair", "On an impaired network", 900, 85, needs_root=True),

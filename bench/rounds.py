@@ -103,18 +103,8 @@ class Interval:
     rounds: int = 0
 
     def __str__(self) -> str:
-        interval = "" if self.few else f" ({_digits(self.low)} to {_digits(self.high)})"
+        interval = "" if self.rounds < LEAST_ROUNDS else f" ({_digits(self.low)} to {_digits(self.high)})"
         return "–" if math.isnan(self.ratio) else f"{_digits(self.ratio)}{interval}"
-
-    @property
-    def few(self) -> bool:
-        """True if there are too few rounds to judge."""
-        return self.rounds < LEAST_ROUNDS
-
-    @property
-    def equal(self) -> bool:
-        """True if the rounds show no difference."""
-        return self.low <= 1.0 <= self.high
 
 
 def ratio(ours: Cell, theirs: Cell, percent: float = 50) -> Interval:

@@ -20,7 +20,6 @@ from typing import Any, Final
 from rich.console import Console
 from rich.table import Table
 
-from pebble.bench import plots
 from pebble.bench.clients import UP_S, RobotSubscriber, StockClient, driving, ready_robot
 from pebble.bench.results import Cell, Results, begin, round_cell
 from pebble.bench.rounds import Progress, in_turn, measure_rounds
@@ -78,17 +77,9 @@ def run(settings: Settings, console: Console) -> Shown:
 
 
 def shown(results: Results) -> Shown:
-    """Return the tables and pictures of results."""
+    """Return results with their table."""
     results.cells.sort(key=lambda cell: MEASURES.index(cell.measure))
-    pictures = plots.medians("startup", "Start-up", results.cells, panel=_phase, row=lambda cell: cell.measure)
-    return Shown(results, [table(results)], pictures)
-
-
-def _phase(cell: Cell) -> str:
-    """Return the panel of a measure; a late subscriber takes a hundredth of the others."""
-    if cell.measure in STARTED:
-        return "from the launch, s"
-    return "late subscribers, ms" if cell.measure in LATE else "from the request of a picture, ms"
+    return Shown(results, [table(results)])
 
 
 def table(results: Results) -> Table:

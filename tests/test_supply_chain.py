@@ -19,7 +19,6 @@ from packaging.utils import canonicalize_name
 from tests.support import ROOT
 
 sys.path.insert(0, str(ROOT / "tools"))
-import audit  # type: ignore[import-not-found]
 import lock  # type: ignore[import-not-found]
 import sbom  # type: ignore[import-not-found]
 
@@ -146,29 +145,6 @@ def test_a_file_with_another_hash_ends_the_installation(tmp_path: Path) -> None:
     assert done.returncode == 1
     assert len(installed) == 2
     assert "the package index has other files than requirements.txt, see above" in done.stderr
-
-
-# -- known vulnerabilities
-
-CLEAN = {"name": "Six", "version": "1", "vulns": []}
-FLAW = {"name": "six", "version": "1", "vulns": [{"id": "PYSEC-1", "fix_versions": ["2"]}]}
-SKIPPED = {"name": "six", "skip_reason": "Dependency not found on PyPI and could not be audited: six (1)"}
-
-
-@pytest.mark.parametrize(
-    ("answer", "log", "code", "line"),
-    [
-        ({"dependencies": [CLEAN]}, "", 0, "no known vulnerability in 1 packages; libraries inside wheels"),
-        ({"dependencies": [FLAW]}, "Found 1 known vulnerability", 1, "six: PYSEC-1, mended in 2"),
-        ({"dependencies": [SKIPPED]}, "No known vulnerabilities found", 0, "not checked: no answer about six"),
-        ({}, "…\nConnectionError: api.osv.dev\n", 0, "not checked: ConnectionError: api.osv.dev"),
-        (None, "", 0, "not checked: pip-audit answered nothing"),
-    ],
-)
-def test_an_audit_names_what_was_not_checked(answer: object, log: str, code: int, line: str) -> None:
-    found, lines = audit.judge({"six"}, "" if answer is None else json.dumps(answer), log)
-    assert (found, len(lines)) == (code, 1)
-    assert lines[0].startswith(line)
 
 
 # -- what is in it

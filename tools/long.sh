@@ -70,7 +70,7 @@ life)
     ;;
 packages)
     sh tools/setup.sh tools
-    tool tools/audit.py
+    tool -m pip_audit --requirement requirements.txt --require-hashes --disable-pip --vulnerability-service osv
     tool tools/sbom.py
     ;;
 *)

@@ -11,7 +11,6 @@ class Shape:
 
     kbit: float | None = None  # per second; None: no limit
     loss: float = 0.0  # share of the packets
-    delay_ms: float = 0.0  # one way
 
 
 @dataclass(frozen=True)

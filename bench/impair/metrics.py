@@ -15,14 +15,12 @@ from itertools import groupby, pairwise
 import msgspec
 
 from pebble.bench.bridge_operator import arrivals
-from pebble.bench.impair.network import Traffic
 from pebble.bench.results import Cell, percentile, round_cell
 from pebble.client.robot_view import Liveness
 from pebble.simulation.loudspeaker import Playback
 from pebble.simulation.trace import Entry
 
-SOUND, PICTURES, PICTURE_GAP = "audio latency", "video latency", "picture gap"
-HEARTBEAT_GAP, HEARTBEAT_DELAY = "heartbeat gap", "heartbeat delay"
+SOUND, PICTURES, HEARTBEAT_GAP = "audio latency", "video latency", "heartbeat gap"
 DRIVE, DRIVE_ALONE, DRIVE_VIDEO, DRIVE_AUDIO = "drive", "drive alone", "drive during video", "drive during audio"
 AFTER_VIDEO, AFTER_AUDIO, CLIP = "heartbeat gap after video", "heartbeat gap after audio", "clip"
 
@@ -198,23 +196,22 @@ def rest_s(commands: Sequence[Command], entries: Iterable[Entry]) -> float:
 
 @dataclass(frozen=True, slots=True)
 class Trial:
-    """One subject in one condition. ``traffic``: the network's counters before and after each phase."""
+    """One subject in one condition. ``traffic``: bytes that the robot had sent before and after each phase."""
 
     subject: str
     name: str
     record: Record
     entries: Sequence[Entry]  # of the MCU
-    traffic: dict[str, tuple[Traffic, Traffic]]
+    traffic: dict[str, tuple[int, int]]
     playbacks: Sequence[Playback] = ()  # of the robot's loudspeaker, in any trial
 
     def cell(self, measure: str, unit: str, samples: list[float], **figures: float) -> Cell:
         return round_cell(self.subject, measure, unit, samples, {"trial": self.name}, **figures)
 
     def wire(self, phase: str) -> dict[str, float]:
-        """What the robot sent in a phase, and what the network dropped of it."""
+        """What the robot sent in a phase."""
         (before, after), seconds = self.traffic[phase], self.record.windows[phase].seconds
-        sent, dropped = after.bytes_up - before.bytes_up, after.dropped_up - before.dropped_up
-        return {"window_s": seconds, "bytes_up": sent, "dropped_up": dropped, "kbit_up": 8e-3 * sent / seconds}
+        return {"bytes_up": after - before, "kbit_up": 8e-3 * (after - before) / seconds}
 
 
 def cells_of(trials: Iterable[Trial]) -> Iterator[Cell]:
@@ -245,15 +242,13 @@ def _pictures(trial: Trial) -> Iterator[Cell]:
         PICTURES, "ms", [picture.ms for picture in pictures], fps=len(pictures) / window.seconds,
         frozen_s=sum((gap for gap in gaps if gap > FROZEN_S), 0.0), longest_gap_s=max(gaps), **trial.wire("video"),
     )  # fmt: skip
-    yield trial.cell(PICTURE_GAP, "s", gaps)
 
 
 def _heartbeats(trial: Trial) -> Iterator[Cell]:
     heartbeats, driven = trial.record.heartbeats, trial.record.driven
     gaps, offline = gaps_s([one.arrived_ns for one in heartbeats], driven), offline_s(heartbeats, driven)
     longest = {"longest_gap_s": max(gaps), "longest_offline_s": max(offline, default=0.0)}
-    yield trial.cell(HEARTBEAT_GAP, "s", gaps, window_s=driven.seconds, **longest)
-    yield trial.cell(HEARTBEAT_DELAY, "ms", [one.ms for one in heartbeats if driven.holds(one.arrived_ns)])
+    yield trial.cell(HEARTBEAT_GAP, "s", gaps, **longest)
 
 
 def _drive(trial: Trial) -> Iterator[Cell]:
@@ -263,7 +258,7 @@ def _drive(trial: Trial) -> Iterator[Cell]:
     yield trial.cell(
         DRIVE, "ms", [ms for _, ms in driven],
         sent=len(commands), delivered_percent=100 * own / len(commands) if commands else 0.0,
-        trips=trips(commands, trial.entries), rest_s=rest_s(commands, trial.entries), window_s=record.driven.seconds,
+        trips=trips(commands, trial.entries), rest_s=rest_s(commands, trial.entries),
     )  # fmt: skip
     for measure, phase in ((DRIVE_ALONE, "alone"), (DRIVE_VIDEO, "video"), (DRIVE_AUDIO, "audio")):
         window = record.windows[phase]

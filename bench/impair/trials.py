@@ -25,7 +25,7 @@ from rich.table import Table
 from pebble.bench.impair import metrics
 from pebble.bench.impair.conditions import CONDITIONS, Condition
 from pebble.bench.impair.metrics import OperatorReport, Plan, Trial, cells_of, with_lost
-from pebble.bench.impair.network import REMOTE_HOST, NamespaceNetwork, Traffic, require_namespaces
+from pebble.bench.impair.network import REMOTE_HOST, NamespaceNetwork, require_namespaces
 from pebble.bench.impair.operator import CLIP
 from pebble.bench.impair.pictures import over_trials
 from pebble.bench.results import STAND_IN, Cell, Results, begin, grouped
@@ -127,14 +127,14 @@ class ImpairedRobot:
 
     def trial(self, name: str) -> Trial:
         """Run a trial; the network is impaired already. Raises PebbleError."""
-        began_ns, traffic = time.monotonic_ns(), dict[str, tuple[Traffic, Traffic]]()
-        phase, before = "", Traffic()
+        began_ns, traffic = time.monotonic_ns(), dict[str, tuple[int, int]]()
+        phase, before = "", 0
         self.operator.send("trial")
         while (report := self.next_report()).record is None:
             if report.phase:
-                phase, before = report.phase, self.network.traffic()
+                phase, before = report.phase, self.network.bytes_up()
             else:
-                traffic[phase] = before, self.network.traffic()
+                traffic[phase] = before, self.network.bytes_up()
         entries, played = self.robot.lines(began_ns), playbacks(self.robot.folder)
         return Trial(self.subject, name, report.record, entries, traffic, played)
 
@@ -244,8 +244,6 @@ _COLUMNS: Final[dict[str, tuple[tuple[str, str, _Value], ...]]] = {
     "Details of media": (
         ("video\nkbit/s", metrics.PICTURES, "kbit_up"),
         ("audio\nkbit/s", metrics.SOUND, "kbit_up"),
-        ("video\ndrops", metrics.PICTURES, "dropped_up"),
-        ("audio\ndrops", metrics.SOUND, "dropped_up"),
         ("audio\np50 ms", metrics.SOUND, _P50),
         ("video\ngap s", metrics.PICTURES, "longest_gap_s"),
     ),

@@ -114,13 +114,7 @@ def startup(variants: Variants = None, rounds: Rounds = None, quick: Quick = Fal
 
 
 @app.command()
-def cost(
-    variants: Variants = None,
-    seconds: Annotated[float | None, typer.Option(help="Of each phase.", min=0.4, max=_LONGEST_S)] = None,
-    rounds: Rounds = None,
-    quick: Quick = False,
-    output: Output = FOLDER,
-) -> int:
+def cost(variants: Variants = None, rounds: Rounds = None, quick: Quick = False, output: Output = FOLDER) -> int:
     """What a robot costs: memory, CPU and threads of each of its processes.
 
     Idle, driven 20 times a second, and sending pictures (640x480, 15 per second) and sound to an operator in two
@@ -129,15 +123,14 @@ def cost(
     from pebble.bench import cost as comparison
 
     full = comparison.QUICK if quick else comparison.FULL
-    chosen = _chosen("variants", variants, full.variants)
-    return _run(comparison.run, _settings(full, variants=chosen, seconds=seconds, rounds=rounds), quick, output)
+    settings = _settings(full, variants=_chosen("variants", variants, full.variants), rounds=rounds)
+    return _run(comparison.run, settings, quick, output)
 
 
 @app.command()
 def frames(
     variants: Variants = None,
     size: Annotated[str | None, typer.Option(help="Such as 640x480,1920x1080.", metavar="SIZES")] = None,
-    readers: Annotated[str | None, typer.Option(help="For example 1,3.", metavar="COUNTS")] = None,
     seconds: Seconds = None,
     rounds: Rounds = None,
     quick: Quick = False,
@@ -150,7 +143,6 @@ def frames(
         comparison.QUICK if quick else comparison.FULL,
         variants=_chosen("variants", variants, comparison.VARIANTS),
         size=_chosen("size", size, comparison.SIZES),
-        readers=_numbers("readers", readers, int, least=1, most=16),
         seconds=seconds,
         rounds=rounds,
     )
@@ -160,7 +152,6 @@ def frames(
 @app.command()
 def scale(
     boards: Annotated[str | None, typer.Option(help="For example 10,100,1000.", metavar="NUMBERS")] = None,
-    seconds: Annotated[float | None, typer.Option(help="Of each size.", min=1, max=_LONGEST_S)] = None,
     quick: Quick = False,
     output: Output = FOLDER,
 ) -> int:
@@ -168,7 +159,7 @@ def scale(
     from pebble.bench import scale as comparison
 
     numbers = _numbers("boards", boards, int, least=1, most=comparison.MOST)
-    settings = _settings(comparison.QUICK if quick else comparison.FULL, boards=numbers, seconds=seconds)
+    settings = _settings(comparison.QUICK if quick else comparison.FULL, boards=numbers)
     return _run(comparison.run, settings, quick, output)
 
 
@@ -188,9 +179,6 @@ def impair(
     trials: Annotated[str | None, typer.Option(help="Some of them, separated by commas.", metavar="NAMES")] = None,
     subjects: Annotated[
         str | None, typer.Option(help='Such as "mqtt original,zenoh h264 opus".', metavar="NAMES")
-    ] = None,
-    window: Annotated[
-        float | None, typer.Option(help="Seconds of video, and of audio, per trial.", min=1, max=_LONGEST_S)
     ] = None,
     quick: Quick = False,
     output: Output = FOLDER,
@@ -212,7 +200,6 @@ def impair(
         comparison.QUICK if quick else comparison.FULL,
         trials=_chosen("trials", trials, comparison.TRIALS),
         subjects=_chosen("subjects", subjects, comparison.SUBJECTS),
-        window_s=window,
     )
     return _run(comparison.run, settings, quick, output)
 

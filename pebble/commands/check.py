@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, NamedTuple
 
@@ -141,11 +141,16 @@ def _print(config: Config, path: Path, scripts: Mapping[str, Script]) -> None:
     from rich.text import Text
 
     console = Console(highlight=False)
+
+    def print_grid(name_style: str, rows: Iterable[tuple[str, ...]], above: int = 1) -> None:
+        grid = Table.grid(padding=(0, 2))
+        for name, *more in rows:
+            grid.add_row(Text(name, style=name_style), *map(Text, more))
+        if grid.row_count:
+            console.print(Padding(grid, (above, 0, 0, 2)))
+
     console.print(Text.assemble((config.base, "bold"), f"  {path}"))
-    grid = Table.grid(padding=(0, 2))
-    for name, fact in facts(config):
-        grid.add_row(Text(name, style="dim"), Text(fact))
-    console.print(Padding(grid, (0, 0, 0, 2)))
+    print_grid("dim", facts(config), above=0)
     if config.robot.platform == "linux":
         table = Table(box=None, pad_edge=False, header_style="dim", padding=(0, 1, 0, 0))
         for name in ("process", "", "topic"):
@@ -162,16 +167,8 @@ def _print(config: Config, path: Path, scripts: Mapping[str, Script]) -> None:
                     "yes" if line.retained else "",
                 )
         console.print(Padding(table, (1, 0, 0, 2)))
-    if scripts:
-        grid = Table.grid(padding=(0, 2))
-        for name, script in scripts.items():
-            grid.add_row(Text("script", style="dim"), Text(shown(name)), Text(shown(_fitness(script))))
-        console.print(Padding(grid, (1, 0, 0, 2)))
-    if config.warnings:
-        grid = Table.grid(padding=(0, 2))
-        for warning in config.warnings:
-            grid.add_row(Text("warning", style="yellow"), Text(warning))
-        console.print(Padding(grid, (1, 0, 0, 2)))
+    print_grid("dim", [("script", shown(name), shown(_fitness(script))) for name, script in scripts.items()])
+    print_grid("yellow", [("warning", warning) for warning in config.warnings])
 
 
 class TopicLine(NamedTuple):

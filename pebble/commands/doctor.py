@@ -8,12 +8,10 @@ from typing import Annotated
 
 import typer
 
-from pebble.client.url import FORMS, UrlError, settings_of
 from pebble.commands.checks import Printer, is_clear
 from pebble.commands.estop import me
-from pebble.commands.options import CaCert, PasswordFile, RootOption
+from pebble.commands.options import CaCert, PasswordFile, RootOption, broker_of
 from pebble.config import load
-from pebble.config.text_files import password
 from pebble.config.web import is_loopback
 from pebble.errors import PebbleError
 from pebble.runtime.environment import withhold
@@ -24,7 +22,6 @@ from pebble.transports import MqttSettings
 from pebble.transports.topics import check_topic
 
 _BELOW = "pebble/doctor"
-_FORMS = "mqtt://[USER@]HOST[:PORT] or mqtts://[USER@]HOST[:PORT]"
 
 
 def doctor(
@@ -88,7 +85,7 @@ def doctor(
     if broker is not None:
         if config is not None:
             raise PebbleError("--broker judges a broker alone: leave out the config file")
-        return _broker(_settings_at(broker, password_file, ca_cert), below, restart=restart, as_json=as_json)
+        return _broker(broker_of("--broker", broker, password_file, ca_cert), below, restart=restart, as_json=as_json)
     from pebble.checks.robot import run_checks  # of Linux only
 
     printer = Printer("CONFIG" if config is None else str(config), as_json=as_json)
@@ -154,17 +151,6 @@ def _report(file: Path, config: Path | None, places: Places) -> int:
 
 
 # -- a broker
-
-
-def _settings_at(url: str, password_file: Path | None, ca_cert: Path | None) -> MqttSettings:
-    """Raises UrlError."""
-    try:
-        _, settings = settings_of(url, password=password(password_file), password_file=password_file, ca_cert=ca_cert)
-    except UrlError as error:
-        raise UrlError(str(error).replace("--url", "--broker").replace(FORMS, _FORMS)) from None
-    if not isinstance(settings, MqttSettings):
-        raise UrlError(f"--broker must be {_FORMS}")
-    return settings
 
 
 def _broker(settings: MqttSettings, below: str, *, restart: bool, as_json: bool) -> int:

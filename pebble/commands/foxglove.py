@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from pebble.client.connection import Target, resolve
-from pebble.commands.options import CaCert, PasswordFile, host_of
+from pebble.commands.options import BrokerUrl, CaCert, PasswordFile, host_of
 from pebble.config.web import is_loopback
 from pebble.errors import PebbleError
 from pebble.runtime.connections import REMOTE_RECONNECT_S
@@ -24,9 +24,7 @@ def foxglove(
         Path | None,
         typer.Argument(help="A robot's config file: show this robot.", metavar="CONFIG", show_default=False),
     ] = None,
-    url: Annotated[
-        str | None, typer.Option(help="mqtt://[USER@]HOST[:PORT] or mqtts://… of the robots' broker.", metavar="URL")
-    ] = None,
+    url: BrokerUrl = None,
     robot: Annotated[str | None, typer.Option(help="Only this robot; all, unless given.", metavar="ROBOT")] = None,
     host: Annotated[str, typer.Option(help="Address to listen on.", metavar="HOST")] = "127.0.0.1",
     port: Annotated[int, typer.Option(help="TCP port; 0 is a free one.", metavar="PORT", min=0, max=65535)] = 8765,

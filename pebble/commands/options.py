@@ -1,14 +1,19 @@
 """Arguments and options that several commands share."""
 
+from __future__ import annotations
+
 import functools
 import inspect
 from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from pebble.errors import PebbleError
+
+if TYPE_CHECKING:
+    from pebble.transports import MqttSettings
 
 ConfigArgument = Annotated[Path, typer.Argument(help="A robot's config file.", metavar="CONFIG", show_default=False)]
 ConfigOption = Annotated[
@@ -22,6 +27,9 @@ RobotArgument = Annotated[
 ]
 UrlOption = Annotated[
     str | None, typer.Option(help="mqtt://[USER@]HOST[:PORT], mqtts://… or zenoh:RUN_DIR.", metavar="URL")
+]
+BrokerUrl = Annotated[
+    str | None, typer.Option(help="mqtt://[USER@]HOST[:PORT] or mqtts://… of the robots' broker.", metavar="URL")
 ]
 RemoteOption = Annotated[
     bool, typer.Option("--remote", help="With --config: the operators' remote broker, not the robot's local transport.")
@@ -75,6 +83,22 @@ def with_target(*, program: str = "tool", robot: bool = False) -> Callable[[Call
         return run
 
     return decorate
+
+
+def broker_of(option: str, url: str, password_file: Path | None, ca_cert: Path | None) -> MqttSettings:
+    """Return the settings of the MQTT broker that an option names. Raises PebbleError."""
+    from pebble.client.url import FORMS, UrlError, settings_of  # not all commands that use this module connect
+    from pebble.config.text_files import password
+    from pebble.transports import MqttSettings
+
+    forms = "mqtt://HOST[:PORT] or mqtts://…"
+    try:
+        _, settings = settings_of(url, password=password(password_file), password_file=password_file, ca_cert=ca_cert)
+    except UrlError as error:
+        raise UrlError(str(error).replace("--url", option).replace(FORMS, forms)) from None
+    if not isinstance(settings, MqttSettings):
+        raise UrlError(f"{option} must be {forms}")
+    return settings
 
 
 def host_of(option: str, text: str, parse: Callable[[str], str] | None = None) -> str:

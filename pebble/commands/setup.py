@@ -7,6 +7,7 @@ import typer
 
 from pebble.client.page import require_packages
 from pebble.runtime.places import Places
+from pebble.runtime.whole_file import write_new
 
 _Answers = Annotated[
     Path | None, typer.Option(help="File with the answers, as JSON; nothing is asked.", metavar="FILE")
@@ -32,9 +33,7 @@ def setup(answers: _Answers = None, backup: _Backup = None, from_: _From = None)
         pebble setup --from goob.tar            after the SD card died
     """
     if backup is not None:
-        from pebble.commands.backup import backup as write_backup  # of Linux only
-
-        return write_backup(backup, Places())
+        return back_up(backup, Places())
     require_packages("pebble setup")
     from pebble.setup.answers import AnswersError
     from pebble.setup.session import set_up  # of Linux only
@@ -46,3 +45,19 @@ def setup(answers: _Answers = None, backup: _Backup = None, from_: _From = None)
         for line in str(error).splitlines():
             typer.echo(f"pebble: {line}", err=True)
         return 2
+
+
+def back_up(file: Path, places: Places) -> int:
+    """Write the tar file, and read it again."""
+    from pebble.setup import backup as backups  # of Linux only
+
+    if file.exists():
+        raise typer.BadParameter(f"{file} exists: name another file, or remove it")
+    made = backups.make(places)
+    write_new(file, backups.packed(made))
+    back = backups.read(file)  # as the disk has it
+    typer.echo(f"{file}: {back.about.id}, {len(back.files)} files, {back.bytes / 1e6:.1f} MB")
+    for place, why in made.left_out.items():
+        typer.echo(f"not in it: {place}: {why}")
+    typer.echo(f"pebble: warning: {back.about.note}", err=True)
+    return 0

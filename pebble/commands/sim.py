@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from pebble.commands.options import CaCert, PasswordFile
+from pebble.commands.options import CaCert, PasswordFile, broker_of
 
 if TYPE_CHECKING:
     from pebble.config import Config
@@ -190,26 +190,16 @@ def _wireless(
 
 def _address(broker: str, password_file: Path | None, ca_cert: Path | None) -> tuple[BrokerAddress, Config | None]:
     """The broker that a URL or a config file names, and the config. Raises PebbleError."""
-    from pebble.client.connection import password
-    from pebble.client.url import UrlError, settings_of
     from pebble.config import load
-    from pebble.errors import PebbleError
     from pebble.runtime.connections import LOCAL_RECONNECT_S, mqtt_settings
     from pebble.simulation.wireless import BrokerAddress
-    from pebble.transports import MqttSettings, ZenohSettings
 
-    settings: MqttSettings | ZenohSettings
     config = None
     if "://" not in broker and not broker.startswith("zenoh:"):
         config = load(Path(broker))
         settings = mqtt_settings(config.local_mqtt, reconnect_max_s=LOCAL_RECONNECT_S)
     else:
-        try:
-            _, settings = settings_of(broker, password=password(password_file), ca_cert=ca_cert)
-        except UrlError as error:
-            raise UrlError(str(error).replace("--url", "--broker")) from None
-    if not isinstance(settings, MqttSettings):
-        raise PebbleError("--broker: robots with Wi-Fi use MQTT only: mqtt://HOST[:PORT]")
+        settings = broker_of("--broker", broker, password_file, ca_cert)
     tls = settings.tls
     return (
         BrokerAddress(

@@ -1,13 +1,19 @@
 """``pebble topic contract``: the contract as a table, or as JSON."""
 
+from __future__ import annotations
+
 import json
-from typing import Annotated, Any
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from pebble.client.names import base_of
 from pebble.contract import CHANNELS, INCOMING, OUTGOING, Channel
 from pebble.contract.docs import authority, payload_name, rate, travels
+
+if TYPE_CHECKING:
+    pass
 
 
 def contract(
@@ -56,28 +62,17 @@ def _plain(channel: Channel, prefix: str) -> dict[str, Any]:
 
 
 def _print_table(prefix: str) -> None:
-    from rich.console import Console
-    from rich.table import Table
     from rich.text import Text
 
-    console = Console(highlight=False)
-    table = Table(box=None, pad_edge=False, header_style="dim")
-    table.add_column("topic", no_wrap=True)
-    table.add_column("kind")
-    table.add_column("qos", justify="right")
-    table.add_column("retained")
-    table.add_column("rate", justify="right", no_wrap=True)
-    table.add_column("description", ratio=1)
+    from pebble.commands.terminal.show import print_table
+
+    rows = list[Sequence[str | Text]]()
     for direction in (INCOMING, OUTGOING):
-        table.add_row(Text(f"{prefix}{direction}/" if prefix else direction, style="bold"))
+        rows.append([Text(f"{prefix}{direction}/" if prefix else direction, style="bold")])
         for channel in CHANNELS:
             if channel.direction == direction:
-                table.add_row(
-                    Text(f"  {channel.metric}"),
-                    channel.kind.name.lower(),
-                    str(channel.default_qos),
-                    "yes" if channel.default_retain else "",
-                    rate(channel),
-                    Text(channel.doc),
-                )
-    console.print(table)
+                retained = "yes" if channel.default_retain else ""
+                about = (channel.kind.name.lower(), str(channel.default_qos), retained, rate(channel), channel.doc)
+                rows.append([f"  {channel.metric}", *about])
+    columns = ("topic", "kind", "qos", "retained", "rate", "description")
+    print_table(columns, rows, whole=("topic", "kind", "retained"), right=("qos", "rate"))

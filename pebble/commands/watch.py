@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from pebble.client.connection import Target, connected, put_names
-from pebble.commands.options import CaCert, PasswordFile
+from pebble.commands.options import BrokerUrl, CaCert, PasswordFile
 from pebble.config import load
 from pebble.errors import PebbleError
 from pebble.runtime.signals import interrupted_by_signals
@@ -25,9 +25,6 @@ _TICK_S = 0.1
 RobotArgument = Annotated[
     str, typer.Argument(help="A robot's config file, or with --url its id.", metavar="ROBOT", show_default=False)
 ]
-UrlOption = Annotated[
-    str | None, typer.Option(help="mqtt://[USER@]HOST[:PORT] or mqtts://… of the operators' broker.", metavar="URL")
-]
 EncodingOption = Annotated[
     str | None, typer.Option("--encoding", "-e", help="json, pbvd or h264. [default: the robot's]")
 ]
@@ -36,7 +33,7 @@ EncodingOption = Annotated[
 def watch(
     robot: RobotArgument,
     picture: Annotated[Path, typer.Option(help="The file to write, PNG or JPEG.", metavar="FILE", show_default=False)],
-    url: UrlOption = None,
+    url: BrokerUrl = None,
     encoding: EncodingOption = None,
     password_file: PasswordFile = None,
     ca_cert: CaCert = None,

@@ -62,9 +62,3 @@ def link_of(payload: bytes) -> LinkState | None:
         return codec.decode(LINK, payload) if payload else None
     except PayloadError:
         return None
-
-
-def level_of(payload: bytes) -> LinkLevel:
-    """The level that a message on ``outgoing/link`` reports; what carries everything reports none."""
-    link = link_of(payload)
-    return "wide" if link is None else link.level

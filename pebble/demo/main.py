@@ -3,17 +3,22 @@
 from __future__ import annotations
 
 import math
+import shlex
+import sys
 import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from pathlib import Path
 from types import FrameType
 from typing import Any
 
 from rich.console import Console
 
 from pebble.client.page import DEFAULT_PORT, require_packages
-from pebble.demo import invitation, phone
+from pebble.contract import DRIVE
+from pebble.contract.identity import Identity
+from pebble.demo import phone
 from pebble.demo.brokers import BrokerKind, best_kind
 from pebble.demo.media import MediaViewer
 from pebble.demo.operator import FIRST_ROUND_S, STEPS, TAKE_OVER, Operator
@@ -21,6 +26,7 @@ from pebble.demo.outcome import Outcomes, outcome_of
 from pebble.demo.phone import Phone
 from pebble.demo.view import View, show_media, show_outcomes
 from pebble.errors import PebbleError
+from pebble.rig.processes import HOST
 from pebble.rig.robot import SimulatedRobot
 from pebble.rig.testbed import ROBOTS, PageServer, Testbed
 from pebble.runtime.signals import handled_by
@@ -34,6 +40,7 @@ Goob on Zenoh and Fred on MQTT, with simulated motor MCU, camera and microphone;
 Goob also with inertial sensor, loudspeaker and scripts, in a room with tags.
 MiniLAMP and BenJr are MCUs that use MQTT themselves: their firmware, on
 simulated pins."""
+_GOOB = Identity("pebble", "robots", "goob")
 _RECORDED = ("--keep", "256M", "--rotate", "5min")
 
 
@@ -80,6 +87,7 @@ class Demo:
         testbed.start_brokers(kind.program)
         console.print(_ROBOTS)
         self._start_page(opened)
+        self._broker_url = f"mqtt://{HOST}:{testbed.broker_port}"
         self._invite()
         testbed.start_robots()
         self._operator = Operator(testbed.broker_port)
@@ -89,8 +97,7 @@ class Demo:
     def play(self) -> list[str]:
         """Drive until the end; returns a line for each robot and each process that failed."""
         robots = list(self._testbed.robots.values())
-        broker_url = invitation.broker_url(self._testbed.broker_port)
-        addresses = f"Operator page: {self._page_url}   Broker: {broker_url}"
+        addresses = f"Operator page: {self._page_url}   Broker: {self._broker_url}"
         try:
             with View(self._console, self._operator, self._media, robots, self._ending, addresses) as view:
                 missing = self._wait_until_ready(view)
@@ -130,10 +137,18 @@ class Demo:
             opened.show(self._page_url, console)
 
     def _invite(self) -> None:
-        """Print the broker's address, and what can be pasted into another terminal."""
-        port = self._testbed.broker_port
-        print_line(self._console, f"Or from another terminal, by their broker at {invitation.broker_url(port)}:")
-        for what, line in invitation.lines(port).items():
+        """Print the broker's address, and what can be pasted into another terminal in this folder."""
+        port, pebble, url = self._testbed.broker_port, _pebble(), self._broker_url
+        drive = f'mosquitto_pub -h {HOST} -p {port} -t {DRIVE.topic(_GOOB.base)} -m \'{{"x": 0, "z": 0.3}}\''
+        lines = {
+            "look at its drive commands": f"{pebble} topic echo {DRIVE.metric} --robot {_GOOB.id} --url {url}",
+            "drive Goob, by any MQTT client": drive,
+            "record all robots until Ctrl-C": f"{pebble} record --url {url}",
+            "stop Goob, whoever drives it": f"{pebble} estop {_GOOB.id} --url {url}",
+            "let it go again": f"{pebble} estop reset {_GOOB.id} --url {url}",
+        }
+        print_line(self._console, f"Or from another terminal, by their broker at {url}:")
+        for what, line in lines.items():
             print_line(self._console, f"  # {what}\n  {line}")
 
     def _wait_until_ready(self, view: View) -> list[str]:
@@ -175,6 +190,15 @@ class Demo:
             wrong += [f"{step}: not done" for step in steps if self._outcomes.of(robot.name, step) is None]
         missing = self._media.received[robot.name].missing() if robot.name in self._media.received else []
         return wrong + [f"nothing arrived as {encoding}" for encoding in missing]
+
+
+def _pebble() -> str:
+    """Return the program of the environment that this one runs in, as short as it can be written here."""
+    program = Path(sys.executable).with_name("pebble")
+    if not program.exists():
+        return f"{shlex.quote(sys.executable)} -m pebble"
+    here = Path.cwd()
+    return shlex.quote(str(program.relative_to(here) if program.is_relative_to(here) else program))
 
 
 def print_line(console: Console, line: str) -> None:

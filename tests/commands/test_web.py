@@ -162,7 +162,7 @@ def test_a_folder_without_a_certificate_and_the_missing_user_are_named_at_once(
         ([], "which robots is missing: name either a robot's config file or --url mqtt://BROKER"),
         (["x.json", "--url", "mqtt://a"], "which robots is missing"),
         (["--url", "http://a"], "--url must be mqtt://"),
-        (["--url", "zenoh:/tmp"], "the operator page needs MQTT"),
+        (["--url", "zenoh:/tmp"], "--url must be mqtt://"),
         (["--url", f"mqtt://me:{SECRET}@a"], "--url holds a password"),
     ],
 )

@@ -73,7 +73,7 @@ def test_the_program_shows_the_status_of_its_robots_and_ends_in_order(broker: Br
     [
         (("fleet", "--broker", "http://x"), "--broker must be mqtt://"),
         (("minilamp", "--broker", "mqtt://ann:secret@x"), "holds a password"),
-        (("minilamp", "--broker", "zenoh:/tmp"), "MQTT only"),
+        (("minilamp", "--broker", "zenoh:/tmp"), "--broker must be mqtt://"),
         (("benjr", "--broker", "nowhere.json"), "nowhere.json"),
         (("fleet", "-n", "1001", "--broker", "mqtt://127.0.0.1"), "1000"),
         (("fleet", "--kind", "goob", "--broker", "mqtt://127.0.0.1"), "goob"),

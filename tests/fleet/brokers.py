@@ -79,7 +79,7 @@ class FleetBroker:
         self.stop()
 
     def start(self) -> None:
-        command = [str(mosquitto_path()), "-c", str(self.folder / CONF)]
+        command = [str(mosquitto_path()), "-c", str(self.folder / CONF), "-v"]  # what clients do is in the log
         log = (self.folder / "log").open("ab")
         self._process = Child(command, stdout=log, stderr=log)
         ports = [port for port in (self.port, self.unencrypted) if port is not None]

@@ -136,12 +136,12 @@ def test_others_cannot_read_it_from_its_first_byte_on(places: Places, tmp_path: 
     file, log = tmp_path / "goob.tar", tmp_path / "calls"
     audit = (
         "import sys, os, pathlib\n"
-        "from pebble.commands.backup import backup\n"
+        "from pebble.commands.setup import back_up\n"
         "from pebble.runtime.places import Places\n"
         f"log = open({str(log)!r}, 'w')\n"
         f"sys.addaudithook(lambda name, arguments: name == 'open' and arguments[0] == {str(file)!r}\n"
         "    and print(arguments[2], os.umask(os.umask(0)), os.path.exists(arguments[0]), file=log))\n"
-        f"backup(pathlib.Path({str(file)!r}), Places(pathlib.Path({str(places.root)!r})))\n"
+        f"back_up(pathlib.Path({str(file)!r}), Places(pathlib.Path({str(places.root)!r})))\n"
     )
     subprocess.run([sys.executable, "-c", audit], cwd=ROOT, check=True, capture_output=True)
     assert stat.S_IMODE(file.stat().st_mode) == 0o600

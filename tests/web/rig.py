@@ -21,7 +21,8 @@ from pebble.bench.impair.conditions import Condition
 from pebble.bench.impair.network import CLONE_NEWNET, NamespaceNetwork, require_namespaces
 from pebble.bench.impair.network import ROBOT_HOST as SERVER
 from pebble.errors import PebbleError
-from pebble.rig.testbed import ROBOTS, Stage
+from pebble.rig.testbed import ROBOTS
+from tests.web.stage import Stage
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser, Page

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
-import shutil
 import signal
 import subprocess
 import sys
@@ -23,13 +21,13 @@ from pebble.fleet import applying, certificates, folder, pieces
 from pebble.fleet.broker_files import new_password
 from pebble.fleet.folder import CONF, Fleet, FleetError, Server
 from pebble.fleet.roles import Account, ProgramRole
+from pebble.rig.processes import mosquitto_path
 from pebble.runtime.whole_file import write
 
 HUB_FILE, GATEWAY_FILE, ROBOTS = "hub.json", "gateway.json", "robots"
 _LOCK = ".up"
 GATEWAY = "lan-gateway"  # the account of the boards' gateway
 _SHARED = ("online",)  # what all receive of each other until their configs say more
-_SBIN = "/usr/local/sbin:/usr/sbin:/sbin"  # where Debian puts mosquitto, not in the PATH of users
 _LOOK_S, _END_S = 0.5, 5.0
 
 _Folder = Annotated[Path, typer.Argument(metavar="FOLDER", help="A new folder.", show_default=False)]
@@ -120,7 +118,7 @@ def _commands(place: Path) -> dict[str, list[str]]:
     found = {"hub": [*pebble, "fleet", "hub", str(place / HUB_FILE)]}
     if not (place / GATEWAY_FILE).exists():
         return found
-    mosquitto = shutil.which("mosquitto", path=f"{os.environ.get('PATH', os.defpath)}:{_SBIN}")
+    mosquitto = mosquitto_path()
     if mosquitto is None:
         raise PebbleError("mosquitto is not installed: sudo apt install mosquitto")
     broker = [] if applying.pid_of(place) else [mosquitto, "-c", str(place / CONF)]

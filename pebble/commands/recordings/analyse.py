@@ -3,24 +3,20 @@
 from __future__ import annotations
 
 import tempfile
-import time
 from collections.abc import Iterator
-from contextlib import contextmanager
-from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 
 from pebble.commands.options import Output
-from pebble.commands.recordings.options import RecordingsArgument, Since, Until
+from pebble.commands.recordings.options import RecordingsArgument, Since, Until, period
+from pebble.commands.recordings.report import errors_of_files
 
 if TYPE_CHECKING:
     from pebble.recordings.traffic.results import RobotTraffic, Traffic
-    from pebble.recordings.traffic.sources import Progress
 
 FOLDER: Final = Path("report")
-_QUIET_S: Final = 2.0  # before progress is shown
 
 Robots = Annotated[
     list[str] | None, typer.Option("--robot", "-r", help="Only this one; may be repeated.", metavar="[SYSTEM/TYPE/]ID")
@@ -50,20 +46,20 @@ def analyse(
 
     require_packages("duckdb", "matplotlib")
     from pebble.client.names import base_of
+    from pebble.commands.recordings.progress import progress_of_steps
     from pebble.config.visible import shown
     from pebble.recordings.catalogue import check_name
-    from pebble.recordings.period import parse_period
     from pebble.recordings.traffic.analysis import analyse as analyse_traffic
     from pebble.recordings.traffic.report import write_report
     from pebble.recordings.traffic.sources import sources
 
-    since_ns, until_ns = parse_period(since, until, now=datetime.now())
+    since_ns, until_ns = period(since, until)
     bases = [base_of(name) for name in robot or ()]
-    with _errors_of_files():
+    with errors_of_files():
         output.mkdir(parents=True, exist_ok=True)  # before the work, not after it
-    with tempfile.TemporaryDirectory(prefix="pebble-analyse-") as folder, _progress() as progress:
+    with tempfile.TemporaryDirectory(prefix="pebble-analyse-") as folder, progress_of_steps() as progress:
         scratch = Path(folder)
-        with _errors_of_files():
+        with errors_of_files():
             found = sources(places, scratch, progress)
         for line in found.unread:
             typer.echo(f"pebble: {shown(line)}", err=True)
@@ -75,67 +71,19 @@ def analyse(
     return 1 if found.unread else 0
 
 
-@contextmanager
-def _errors_of_files() -> Iterator[None]:
-    """Raise PebbleError for OSError."""
-    from pebble.errors import PebbleError
-
-    try:
-        yield
-    except OSError as error:
-        raise PebbleError(f"{error.filename}: {error.strerror}") from None
-
-
-@contextmanager
-def _progress() -> Iterator[Progress]:
-    """What is done and how far it is, from two seconds after the start on; on a terminal only."""
-    from rich.console import Console
-    from rich.progress import BarColumn, Progress, TextColumn
-
-    bar = Progress(
-        TextColumn("{task.description}", markup=False), BarColumn(), console=Console(stderr=True), transient=True
-    )
-    task = bar.add_task("", total=1.0)
-    quiet_until, shown = time.monotonic() + _QUIET_S, False
-
-    def show(what: str, share: float) -> None:
-        nonlocal shown
-        bar.update(task, description=what, completed=share)
-        if not shown and time.monotonic() >= quiet_until and bar.console.is_terminal:
-            bar.start()
-            shown = True
-
-    try:
-        yield show
-    finally:
-        if shown:
-            bar.stop()
-
-
 def _print(traffic: Traffic, written: list[Path]) -> None:
-    from rich import box
-    from rich.console import Console
-    from rich.table import Table
-    from rich.text import Text
-
+    from pebble.commands.terminal.show import print_table
     from pebble.config.visible import shown
     from pebble.recordings.traffic.report import remarks
 
-    table = Table(box=box.SIMPLE_HEAD)
-    for heading in ("robot", "messages", "sessions", "outages", "latency", "video", "audio"):
-        is_name = heading == "robot"
-        table.add_column(
-            heading, justify="left" if is_name else "right", no_wrap=True, min_width=8 if is_name else None
-        )
-    for robot in traffic.robots:
-        table.add_row(Text(shown(robot.robot.rpartition("/")[2])), *_cells(robot))
-    console = Console()
-    console.print(table)
-    console.print("Medians: latency of heartbeats in ms, video and audio in kbit/s.", style="dim", soft_wrap=True)
+    columns = ("robot", "messages", "sessions", "outages", "latency", "video", "audio")
+    rows = ((robot.robot.rpartition("/")[2], *_cells(robot)) for robot in traffic.robots)
+    print_table(columns, rows, whole=("robot",), right=columns[1:])
+    typer.secho("Medians: latency of heartbeats in ms, video and audio in kbit/s.", dim=True)
     for remark in remarks(traffic):
-        console.print(shown(remark), markup=False, highlight=False, soft_wrap=True)
+        typer.echo(shown(remark))
     for path in written:
-        console.print(f"Written: {path}", style="dim", markup=False, highlight=False, soft_wrap=True)
+        typer.secho(f"Written: {path}", dim=True)
 
 
 def _cells(robot: RobotTraffic) -> Iterator[str]:

@@ -1,20 +1,19 @@
 """``pebble recordings`` export and import: recordings in the formats of other programs."""
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 from enum import StrEnum
 from functools import partial
 from pathlib import Path
-from typing import Annotated, BinaryIO
+from typing import Annotated
 
 import typer
 
 from pebble.client.names import base_of
 from pebble.commands.recordings.options import RecordingsArgument, RobotOption, Since, Topics, Until, period
 from pebble.commands.recordings.progress import progress_of_time
-from pebble.commands.recordings.report import report_unread
+from pebble.commands.recordings.report import errors_of_files, report_unread
 from pebble.commands.terminal import show
 from pebble.config.visible import shown
 from pebble.errors import PebbleError
@@ -85,7 +84,12 @@ def import_(
     target: Annotated[Path, typer.Argument(help="A new recording.", metavar="OUT.mcap")],
 ) -> int:
     """Import what the original's logger recorded, or an export as lines."""
-    with _opened(source) as file, unfinished(target) as path, path.open("wb", buffering=0) as out:
+    with (
+        errors_of_files(source),
+        source.open("rb") as file,
+        unfinished(target) as path,
+        path.open("wb", buffering=0) as out,
+    ):
         writer = RecordingWriter(out)
         writer.metadata("pebble.recording", {"format": "1", "imported": source.name})
         counted = _import(read_lines(file), Copy(writer))
@@ -144,12 +148,3 @@ def _only_robot(paths: list[Path]) -> str:
         names = ", ".join(sorted(shown(robot) for robot in robots)) or "none"
         raise PebbleError(f"whose pictures and sound is not clear: add --robot ({names})")
     return robots.pop()
-
-
-@contextmanager
-def _opened(path: Path) -> Iterator[BinaryIO]:
-    try:
-        with path.open("rb") as file:
-            yield file
-    except OSError as error:
-        raise PebbleError(f"{path}: {error.strerror or error}") from None

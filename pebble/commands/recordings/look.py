@@ -1,14 +1,11 @@
 """``pebble recordings`` list, info and search: what there is, and what was recorded."""
 
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
-from rich import box
-from rich.console import Console
-from rich.table import Table
 
 from pebble.client.names import base_of
 from pebble.commands.recordings.options import RecordingsArgument, RobotOption, Since, Topics, Until, period
@@ -29,15 +26,15 @@ Check = Annotated[bool, typer.Option("--check", help="Read all of it; without, o
 
 def list_(places: RecordingsArgument, since: Since = None, until: Until = None, check: Check = False) -> int:
     """List the files, their times, sizes and state."""
-    table = Table(*_columns("begins", "lasts", "what", "messages", "size", "state"), box=box.SIMPLE, pad_edge=False)
-    total = Counter[str]()
+    rows, total = list[tuple[str, ...]](), Counter[str]()
     looked, unread = _looked_at(places, since, until, check=check)
     for one in looked:
         lasts = show.duration((one.last_ns - one.first_ns) / 1e9) if one.messages else ""
         begins = local_time(one.first_ns) if one.messages else ""
-        table.add_row(begins, lasts, _lane(one.path), f"{one.messages:,}", show.size(one.size), _state(one))
+        rows.append((begins, lasts, _lane(one.path), f"{one.messages:,}", show.size(one.size), _state(one)))
         total.update(files=1, messages=one.messages, size=one.size)
-    Console(highlight=False, markup=False).print(table)
+    columns = ("begins", "lasts", "what", "messages", "size", "state")
+    show.print_table(columns, rows, whole=("begins", "lasts"), right=("messages", "size"))
     typer.echo(f"{total['files']} files, {total['messages']:,} messages, {show.size(total['size'])}")
     return report_unread(unread)
 
@@ -61,18 +58,13 @@ def info(places: RecordingsArgument, since: Since = None, until: Until = None, c
         count = sum(number for topic, number in topics.items() if topic.startswith(f"{robot}/"))
         typer.echo(f"\n{one_line(shown(robot))}: {count:,} messages")
         own = Counter({topic[len(robot) + 1 :]: n for topic, n in topics.items() if topic.startswith(f"{robot}/")})
-        for topic, number in own.most_common(_SHOWN_TOPICS):
-            typer.echo(f"  {number:>10,}  {one_line(shown(topic))}")
-        if len(own) > _SHOWN_TOPICS:
-            typer.echo(f"  … and {len(own) - _SHOWN_TOPICS} topics more")
+        _print_topics(own)
     encodings = {topic: name for one in looked for topic, name in one.encodings.items() if robot_in(topic) is None}
-    others = Counter({topic: topics[topic] for topic in encodings if not topic.startswith("$recorder/")})
+    named = ((topic, name) for topic, name in encodings.items() if not topic.startswith("$recorder/"))
+    others = Counter({f"{topic} {name}": topics[topic] for topic, name in named})
     if others:
         typer.echo(f"\nTopics that are of no robot: {others.total():,} messages")
-    for topic, number in others.most_common(_SHOWN_TOPICS):
-        typer.echo(f"  {number:>10,}  {one_line(shown(f'{topic} {encodings[topic]}'))}")
-    if len(others) > _SHOWN_TOPICS:
-        typer.echo(f"  … and {len(others) - _SHOWN_TOPICS} topics more")
+    _print_topics(others)
     _print_events(one.path for one in looked if one.readable)
     return report_unread(unread)
 
@@ -105,11 +97,11 @@ def search(
     return report_unread(problems(damages))
 
 
-def _columns(*names: str) -> Iterator[Any]:
-    from rich.table import Column
-
-    for name in names:
-        yield Column(name, justify="right" if name in ("messages", "size") else "left")
+def _print_topics(counts: Counter[str]) -> None:
+    for topic, number in counts.most_common(_SHOWN_TOPICS):
+        typer.echo(f"  {number:>10,}  {one_line(shown(topic))}")
+    if len(counts) > _SHOWN_TOPICS:
+        typer.echo(f"  … and {len(counts) - _SHOWN_TOPICS} topics more")
 
 
 def _looked_at(

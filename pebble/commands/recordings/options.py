@@ -23,4 +23,4 @@ Topics = Annotated[
 
 
 def period(since: str | None, until: str | None) -> tuple[int, int]:
-    return parse_period(since, until, now=datetime.now().astimezone())
+    return parse_period(since, until, now=datetime.now())

@@ -17,25 +17,29 @@ _QUIET_S = 2.0  # before progress is shown
 
 
 @contextmanager
-def progress(what: str, total: int) -> Iterator[Callable[[float], None]]:
-    """Shown on a terminal, and only where it takes longer than two seconds."""
-    began, bar = time.monotonic(), None
-    columns = (TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(), TimeRemainingColumn())
-    shown = Progress(*columns, console=Console(stderr=True), transient=True)
+def progress_of_steps() -> Iterator[Callable[[str, float], None]]:
+    """Yield a function for what is done, and the share of it; shown on a terminal, where it takes over two seconds."""
+    columns = (TextColumn("{task.description}", markup=False), BarColumn(), TaskProgressColumn(), TimeRemainingColumn())
+    bar, quiet_until = Progress(*columns, console=Console(stderr=True), transient=True), time.monotonic() + _QUIET_S
+    task = bar.add_task("", total=1.0)
 
-    def advance(done: float) -> None:
-        nonlocal bar
-        if bar is None and sys.stderr.isatty() and time.monotonic() - began > _QUIET_S:
-            shown.start()
-            bar = shown.add_task(what, total=total)
-        if bar is not None:
-            shown.update(bar, completed=done)
+    def show(what: str, share: float) -> None:
+        bar.update(task, description=what, completed=share)
+        if sys.stderr.isatty() and time.monotonic() > quiet_until:
+            bar.start()
 
     try:
-        yield advance
+        yield show
     finally:
-        if bar is not None:
-            shown.stop()
+        if bar.live.is_started:
+            bar.stop()
+
+
+@contextmanager
+def progress(what: str, total: int) -> Iterator[Callable[[float], None]]:
+    """Yield a function for how much of one step is done."""
+    with progress_of_steps() as show:
+        yield lambda done: show(what, done / max(1, total))
 
 
 @contextmanager
@@ -47,5 +51,5 @@ def progress_of_time(paths: list[Path], since_ns: int, until_ns: int) -> Iterato
             last += [file.last_ns] if file.damage.finished else []
     begin = max(since_ns, min(first, default=0))
     end = min(until_ns, max(last))
-    with progress("exporting", max(1, end - begin)) as advance:
+    with progress("exporting", end - begin) as advance:
         yield lambda log_ns: advance(log_ns - begin)

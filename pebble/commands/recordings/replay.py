@@ -131,7 +131,9 @@ def _play(console: _Console, make: Make, rules: Rules, make_player: Callable[...
         sys.stdout.flush()
         if terminal:
             stack.enter_context(console.keys())
-        console.attach(player, robots)
+        console.player, console.robots = player, robots
+        if console.ended:
+            player.stop()
         player.run()
     return player
 
@@ -146,17 +148,13 @@ def _maker(kind: str, settings: object) -> Make:
 class _Console:
     """Waits for the player; meanwhile keys, signals and the state of the connection are looked at."""
 
+    player: Player  # both are there once it plays
+    robots: ReplayedRobots
+
     def __init__(self) -> None:
         self.ended = ""  # why, if not by the end of the recording
-        self._player: Player | None = None
-        self._robots: ReplayedRobots | None = None
         self._terminal: Terminal | None = None
         self._problem = ""
-
-    def attach(self, player: Player, robots: ReplayedRobots) -> None:
-        self._player, self._robots = player, robots
-        if self.ended:
-            player.stop()
 
     @contextmanager
     def keys(self) -> Iterator[None]:
@@ -168,9 +166,7 @@ class _Console:
                 self._terminal = None
 
     def wait(self, seconds: float) -> None:
-        player, robots = self._player, self._robots
-        if player is None or robots is None:
-            return
+        player, robots = self.player, self.robots
         if self._terminal is None:
             time.sleep(seconds)
             self._report(robots.problem)

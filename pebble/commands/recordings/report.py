@@ -1,10 +1,23 @@
 """Lines that commands for recordings print: times, what could not be read, and what was left as it is."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from datetime import UTC, datetime
+from pathlib import Path
 
 import typer
 
 from pebble.config.visible import shown
+from pebble.errors import PebbleError
+
+
+@contextmanager
+def errors_of_files(path: Path | None = None) -> Iterator[None]:
+    """Raise PebbleError for OSError; ``path`` is named where the error names no file."""
+    try:
+        yield
+    except OSError as error:
+        raise PebbleError(f"{error.filename or path}: {error.strerror or error}") from None
 
 
 def report_unread(lines: list[str]) -> int:

@@ -1,13 +1,17 @@
 """What ``pebble topic`` prints: messages, rates and lists of topics, without characters that control the terminal."""
 
+from __future__ import annotations
+
 import json
 import math
 import os
 import statistics
-from collections.abc import Iterable, Sequence
+from collections.abc import Container, Iterable, Sequence
 from contextlib import suppress
 from itertools import pairwise
-from typing import Any, TextIO
+from typing import TYPE_CHECKING, Any, Literal, TextIO
+
+import typer
 
 from pebble.client.discovery import Discovery
 from pebble.client.estop_states import RobotEstop
@@ -19,6 +23,9 @@ from pebble.contract.payloads import EstopState
 from pebble.media.rate_meter import RateMeter
 from pebble.transports import Message
 
+if TYPE_CHECKING:
+    from rich.text import Text
+
 _TOPIC_LIMIT = 10_000  # topics in one listing
 _WINDOW = 1000
 _DUMPED = 32  # bytes of a binary payload that are shown
@@ -26,17 +33,25 @@ _DUMPED = 32  # bytes of a binary payload that are shown
 RECOGNISERS = {b"PBAT": "PBAT sound", b"PBVD": "PBVD picture", b"\xff\xd8": "JPEG picture"}
 
 
-def print_table(columns: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
-    """Rows of text that may come from anybody; a column called ``time`` is never folded."""
+def print_table(
+    columns: Sequence[str],
+    rows: Iterable[Sequence[str | Text]],
+    *,
+    whole: Container[str] = ("time",),
+    right: Container[str] = (),
+) -> None:
+    """Print rows of text that may come from anybody; columns in ``whole`` and ``right`` are never folded."""
     from rich.console import Console
     from rich.table import Table
     from rich.text import Text
 
     table = Table(box=None, pad_edge=False, header_style="dim")
     for column in columns:
-        table.add_column(column, no_wrap=column == "time", overflow="fold")
+        is_number = column in right
+        justify: Literal["left", "right"] = "right" if is_number else "left"
+        table.add_column(column, justify=justify, no_wrap=is_number or column in whole, overflow="fold")
     for row in rows:
-        table.add_row(*(Text(shown(text).replace("\n", "\\u000a")) for text in row))
+        table.add_row(*(Text(shown(cell).replace("\n", "\\u000a")) if isinstance(cell, str) else cell for cell in row))
     Console(highlight=False).print(table)
 
 
@@ -172,32 +187,24 @@ class Listing:
 
 def print_listing(listing: Listing, now: float, wall: float) -> None:
     """Print the topics, grouped by component: the first three levels are the same for many lines."""
-    from rich.console import Console
-    from rich.table import Table
     from rich.text import Text
 
-    console = Console(highlight=False)
     if not listing.records:
-        console.print("no topics received; a longer --seconds may show slower ones")
+        typer.echo("no topics received; a longer --seconds may show slower ones")
         return
-    table = Table(box=None, pad_edge=False, header_style="dim")
-    table.add_column("topic", overflow="fold")
-    table.add_column("retained")
-    for name in ("rate", "size", "age"):
-        table.add_column(name, justify="right", no_wrap=True)
-    table.add_column("kind", no_wrap=True)
-    base = None
+    base, rows = None, list[Sequence[str | Text]]()
     for topic in sorted(listing.records):
         address = parse_topic(topic)
         if address is not None and address.identity.base != base:
             base = address.identity.base
-            table.add_row(Text(shown(base), style="bold"))
+            rows.append([Text(shown(base), style="bold")])
         name = topic if address is None else f"  {address.direction}/{address.metric}"
         kind, style = _kind(listing.names, topic)
-        table.add_row(Text(shown(name)), *_cells(listing.records[topic], now, wall), Text(kind, style=style))
-    console.print(table)
+        rows.append([name, *_cells(listing.records[topic], now, wall), Text(kind, style=style)])
+    columns = ("topic", "retained", "rate", "size", "age", "kind")
+    print_table(columns, rows, whole=("retained", "kind"), right=("rate", "size", "age"))
     if listing.omitted:
-        console.print(f"omitted: {listing.omitted} messages of further topics")
+        typer.echo(f"omitted: {listing.omitted} messages of further topics")
 
 
 def remarks(listing: Listing, wall: float) -> list[str]:

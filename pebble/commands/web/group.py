@@ -13,10 +13,8 @@ import msgspec
 import typer
 from typer.core import TyperCommand, TyperGroup
 
-from pebble.client.connection import password as broker_password
 from pebble.client.page import require_packages
-from pebble.client.url import settings_of as settings_of_url
-from pebble.commands.options import CaCert, PasswordFile, host_of
+from pebble.commands.options import BrokerUrl, CaCert, PasswordFile, broker_of, host_of
 from pebble.commands.web.people import PEOPLE, TLS, PeopleOption, default_folder, register_people
 from pebble.config import load
 from pebble.config.hosts import name_of_page
@@ -47,9 +45,7 @@ def serve(
             help="A robot's config file: its broker, and web_interface.", metavar="CONFIG", show_default=False
         ),
     ] = None,
-    url: Annotated[
-        str | None, typer.Option(help="mqtt://[USER@]HOST[:PORT] or mqtts://… of the robots' broker.", metavar="URL")
-    ] = None,
+    url: BrokerUrl = None,
     password_file: PasswordFile = None,
     ca_cert: CaCert = None,
     host: Host = None,
@@ -93,7 +89,8 @@ def serve(
         "recordings": recordings,
     }
     if url is not None:
-        settings, plain = _of_url(_broker(url, password_file, ca_cert), options, None if empty else folder), False
+        broker = replace(broker_of("--url", url, password_file, ca_cert), reconnect_max_s=REMOTE_RECONNECT_S)
+        settings, plain = _of_url(broker, options, None if empty else folder), False
     else:
         settings, plain = _of_config(Path(str(config)), options, None if empty else folder)
     if missing := _missing(settings, plain=plain, empty=empty):
@@ -124,14 +121,6 @@ def register(app: typer.Typer) -> None:
 
 
 # -- settings
-
-
-def _broker(url: str, password_file: Path | None, ca_cert: Path | None) -> MqttSettings:
-    password = broker_password(password_file)
-    _, settings = settings_of_url(url, password=password, password_file=password_file, ca_cert=ca_cert)
-    if not isinstance(settings, MqttSettings):
-        raise PebbleError("the operator page needs MQTT: use --url mqtt://HOST[:PORT] or mqtts://…")
-    return replace(settings, reconnect_max_s=REMOTE_RECONNECT_S)
 
 
 def _of_url(broker: MqttSettings, options: dict[str, Any], folder: Path | None) -> WebSettings:

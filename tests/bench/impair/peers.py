@@ -38,9 +38,6 @@ class ProbeConnection:
         """Seconds until so many bytes have arrived from the broker's side."""
         return float(self._ask(f"down {size}"))
 
-    def round_trips(self, n: int = 5) -> list[float]:
-        return [self.up(1) for _ in range(n)]
-
     def send_datagrams(self, n: int) -> None:
         self._ask(f"datagrams {n}")
 

@@ -17,7 +17,6 @@ from rich.console import Console
 from pebble.bench.impair import trials as module
 from pebble.bench.impair.conditions import Condition
 from pebble.bench.impair.metrics import DRIVE, OperatorReport, Record, Window
-from pebble.bench.impair.network import Traffic
 from pebble.bench.impair.trials import SUBJECTS, ImpairedRobot, Settings, run
 from pebble.bench.results import Results
 from pebble.errors import PebbleError
@@ -42,8 +41,8 @@ class QuietNetwork:
     def apply(self, condition: Condition) -> None:
         self._log.append(f"{self._name}: {condition.name}")
 
-    def traffic(self) -> Traffic:
-        return Traffic()
+    def bytes_up(self) -> int:
+        return 0
 
 
 class FakeOperator:

@@ -10,7 +10,8 @@ from pebble.checks.conform.control import CONTROL
 from pebble.checks.conform.motion import MOVING
 from pebble.checks.observer import observed
 from pebble.client.connection import Target
-from pebble.rig.testbed import ROBOTS, Stage
+from pebble.rig.testbed import ROBOTS
+from tests.web.stage import Stage
 
 pytestmark = [pytest.mark.alone, pytest.mark.thorough]
 
