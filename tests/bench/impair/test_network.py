@@ -50,7 +50,7 @@ def test_close_leaves_nothing_and_may_be_repeated() -> None:
     network.close()
     assert gone(process)
     assert not (Path("/sys/class/net") / "wire").exists()
-    with pytest.raises(PebbleError, match="closed"):
+    with pytest.raises(PebbleError, match="No such file"):
         network.apply(Condition("late"))
 
 
