@@ -1181,9 +1181,12 @@ class Hole(TcpProxy):
         """The largest segment of this process's connections to it."""
         sizes = [0]
         for link in list(Path("/proc/self/fd").iterdir()):
-            with suppress(OSError, IndexError), socket.socket(fileno=os.dup(int(link.name))) as copy:
-                if copy.getpeername()[1] == self.port:
-                    sizes.append(copy.getsockopt(socket.IPPROTO_TCP, socket.TCP_MAXSEG))
+            with suppress(OSError, IndexError):
+                if not str(link.readlink()).startswith("socket:"):
+                    continue
+                with socket.socket(fileno=os.dup(int(link.name))) as copy:
+                    if copy.getpeername()[1] == self.port:
+                        sizes.append(copy.getsockopt(socket.IPPROTO_TCP, socket.TCP_MAXSEG))
         return max(sizes)
 
 
