@@ -22,7 +22,7 @@ help:
 	@echo "make release           write build/release: wheel, sdist, Debian package, SBOM, checksums; a minute"
 	@echo "make clean             remove what the other targets created"
 
-# The options are checked before the set-up, which takes a minute; the shortest is that of pebble.demo.main, rounded up.
+# The options are checked before the set-up, which takes a minute; the shortest is that of pebble.extensions.lab.demo.main, rounded up.
 demo:
 	@awk 'BEGIN { exit ARGV[1] + 0 < 26 }' "$(or $(SECONDS),26)" || \
 		{ echo "make demo: one round of driving takes 26 s: give it at least that many, make demo SECONDS=30" >&2; exit 2; }
@@ -35,7 +35,7 @@ demo:
 # processors: one of them may miss its own, so what failed runs a second time.
 QUICKLY := --workers 4 -m "not page and not thorough and not alone" tests/contract tests/forwarding tests/motion \
 	tests/robot/test_lockstep.py tests/transports/test_contract.py
-WHOLE := --workers 8 --durations 10 -m "not page$(if $(THOROUGH),, and not thorough)" --ignore tests/life tests
+WHOLE := --workers 8 --durations 10 -m "not page$(if $(THOROUGH),, and not thorough)" --ignore tests/ext/install/life tests
 test: .venv/.ready-dev
 	@$(DEBIAN) mosquitto=mosquitto mosquitto_pub=mosquitto-clients chromium=chromium g++=g++ openssl=openssl \
 		ip=iproute2 tc=iproute2 nft=nftables systemd-analyze=systemd
@@ -60,7 +60,7 @@ check: .venv/.ready-dev
 docs: .venv/.ready-dev
 	@$(VENV) -m pebble.contract.docs build/docs
 	@$(VENV) -m pebble.config.schema build/docs
-	@$(VENV) -m pebble.web.messages_docs build/docs
+	@$(VENV) -m pebble.extensions.page.messages_docs build/docs
 	@$(VENV) tools/bounds.py build/docs
 
 long: .venv/.ready-dev
@@ -70,7 +70,7 @@ long: .venv/.ready-dev
 report: .venv/.ready-dev
 	@$(DEBIAN) mosquitto=mosquitto
 	@$(DEBIAN) ip=iproute2 tc=iproute2 nft=nftables || echo "pebble: without them pebble bench impair fails"
-	@$(VENV) -c "import sys; from pebble.bench.frames import missing; sys.exit(missing('gstreamer-shm') is not None)" || \
+	@$(VENV) -c "import sys; from pebble.extensions.lab.bench.frames import missing; sys.exit(missing('gstreamer-shm') is not None)" || \
 		$(DEBIAN) =gstreamer1.0-plugins-base =gstreamer1.0-plugins-bad =gir1.2-gst-plugins-base-1.0 \
 		=python3-gst-1.0 =python3-numpy || echo "pebble: continuing without GStreamer"
 	@$(VENV) -m pebble.cli bench report $(if $(QUICK),--quick build/report-quick,build/report)

@@ -4,23 +4,26 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
+from pebble import public_names
 from pebble.version import __version__ as __version__
+
+public_names.install()
 
 if TYPE_CHECKING:
     from pebble.cameras import camera as camera
     from pebble.contract import Channel as Channel
     from pebble.contract import Kind as Kind
-    from pebble.script import Robot as Robot
-    from pebble.script import Stopped as Stopped
-    from pebble.script import run as run
+    from pebble.extensions.scripts.script import Robot as Robot
+    from pebble.extensions.scripts.script import Stopped as Stopped
+    from pebble.extensions.scripts.script import run as run
 
 _FROM = {
     "camera": "pebble.cameras",
     "Channel": "pebble.contract",
     "Kind": "pebble.contract",
-    "Robot": "pebble.script",
-    "Stopped": "pebble.script",
-    "run": "pebble.script",
+    "Robot": "pebble.extensions.scripts.script",
+    "Stopped": "pebble.extensions.scripts.script",
+    "run": "pebble.extensions.scripts.script",
 }
 
 

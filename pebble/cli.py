@@ -60,7 +60,7 @@ def _flushes(stream: TextIO) -> bool:
     try:
         stream.flush()
     except OSError:
-        from pebble.commands.terminal.show import discard_output
+        from pebble.runtime.output import discard_output
 
         discard_output(stream)
         return False

@@ -26,10 +26,10 @@ import pytest
 from hypothesis import settings
 
 from pebble.transports import segments
+from tests.ext.recordings.replayed import recording as recording  # a fixture for all tests
 from tests.kit import rows
 from tests.kit.workers import pytest_addoption as pytest_addoption  # of the initial conftest
 from tests.kit.workers import pytest_configure as pytest_configure
-from tests.recordings.replayed import recording as recording  # a fixture for all tests
 from tests.support import ROOT, Broker, cases
 
 # Started in the background of a shell or by nohup, this process ignores signals, and so would every program it starts.
@@ -55,20 +55,25 @@ _ENDING_S = 5.0  # for processes that are about to end
 
 #: Folders of tests that check no times.
 _COMPUTING = (
-    *("config", "contract", "media", "motion", "perception", "web/modules"),
-    *("recordings/exports", "recordings/files", "recordings/seek", "recordings/traffic"),
+    *("config", "contract", "ext/media", "motion", "ext/scripts/perception", "ext/page/modules"),
+    *("ext/recordings/exports", "ext/recordings/files", "ext/recordings/seek", "ext/recordings/traffic"),
 )
 #: Modules that take longest begin first: begun last, one of them would delay the end of the run.
 _LONG = (
     *(
         "conform/test_conform.py",
-        "web/robots/test_controls.py",
+        "ext/page/robots/test_controls.py",
         "robot/test_closed_loop.py",
         "robot/test_media.py",
         "robot/test_driveable.py",
     ),
-    *("commands/test_estop.py", "commands/test_drive.py", "transports/test_mqtt.py", "recordings/recorder"),
-    *("web/test_types.py", "firmware/test_deadman_virtual.py", "motion/test_traces.py"),
+    *(
+        "ext/operator/commands/test_estop.py",
+        "ext/operator/commands/test_drive.py",
+        "transports/test_mqtt.py",
+        "ext/recordings/recorder",
+    ),
+    *("ext/page/test_types.py", "firmware/test_deadman_virtual.py", "motion/test_traces.py"),
 )
 
 

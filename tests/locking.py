@@ -7,8 +7,8 @@ import resource
 
 import pytest
 
-from pebble.checks.check import State
-from pebble.checks.machine import memory_lock
+from pebble.extensions.checks.check import State
+from pebble.extensions.checks.machine import memory_lock
 
 _found = memory_lock(resource.getrlimit(resource.RLIMIT_MEMLOCK)[0], root=os.geteuid() == 0)
 needs_shared_memory = pytest.mark.skipif(_found.state is not State.OK, reason=f"{_found.text}: {_found.fix}")

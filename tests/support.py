@@ -18,8 +18,8 @@ from typing import Any, TypeVar
 
 import pytest
 
-from pebble.rig.processes import free_port as free_port
-from pebble.rig.processes import mosquitto_command
+from pebble.extensions.lab.rig.processes import free_port as free_port
+from pebble.extensions.lab.rig.processes import mosquitto_command
 from pebble.runtime.parent import tied_to_parent
 
 #: The checkout: tests that start programs of ours start them here.
@@ -249,7 +249,7 @@ class AmqttBroker:
         self.start()
 
     def start(self) -> None:
-        command = [sys.executable, "-m", "pebble.demo.brokers", str(self.port)]
+        command = [sys.executable, "-m", "pebble.extensions.lab.demo.brokers", str(self.port)]
         self._process = Child(command, cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
         assert until(lambda: listening(self.port), 20), "amqtt did not start"
 

@@ -20,9 +20,9 @@ from pathlib import Path
 import pytest
 
 from pebble.contract.encodings import ALL_SOUND, ALL_VIDEO
-from pebble.demo.main import SHORTEST_S
-from pebble.demo.operator import STEPS
-from pebble.rig.testbed import ROBOTS
+from pebble.extensions.lab.demo.main import SHORTEST_S
+from pebble.extensions.lab.demo.operator import STEPS
+from pebble.extensions.lab.rig.testbed import ROBOTS
 from tests.kit.demo import START_S, Demo, demos, page_of, start, temporary
 from tests.support import ROOT, until
 
@@ -161,8 +161,8 @@ def test_nothing_outlives_a_demo_that_is_killed(demos: list[Demo], temporary: Pa
 def test_a_robot_that_does_not_come_up_is_a_failure_with_a_place_to_look(demos: list[Demo], temporary: Path) -> None:
     code = """
 import sys
-import pebble.demo.main as main
-import pebble.rig.testbed as testbed
+import pebble.extensions.lab.demo.main as main
+import pebble.extensions.lab.rig.testbed as testbed
 main._DISCOVERY_S = 1.0
 testbed.LinuxRobot.bring_up = lambda self, ending: None
 sys.exit(main.run(main.SHORTEST_S))

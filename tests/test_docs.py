@@ -15,10 +15,10 @@ from typing import Any
 import pytest
 import typer
 
-from pebble.checks.conform.checks import CHECKS, LAST
-from pebble.checks.conform.control import CONTROL, named
-from pebble.checks.conform.motion import MOVING
 from pebble.commands.app import application
+from pebble.extensions.checks.conform.checks import CHECKS, LAST
+from pebble.extensions.checks.conform.control import CONTROL, named
+from pebble.extensions.checks.conform.motion import MOVING
 from tests.support import ROOT
 from tools.bounds import bounds
 
@@ -33,7 +33,7 @@ LINK = re.compile(r"\]\((?!https?:)([^)#]+)")
 CODE = re.compile(
     r"`((?!(?:incoming|outgoing|flags|sensors|mcu|by|build|pebble/robots|system)/)(?:[\w.-]+/)+[\w.-]*|[\w-]+\.(?:py|md|toml|json))`"
 )
-OURS = ("pebble", "transports", "services", "simulation", "bench", "rig", "firmware")
+OURS = ("pebble", "transports", "services", "firmware")
 
 
 @pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: str(path.relative_to(ROOT)))

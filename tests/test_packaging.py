@@ -15,8 +15,8 @@ from tests.support import ROOT
 
 pytestmark = pytest.mark.computing
 
-LINKED = ("bench", "configs", "firmware", "rig", "services", "simulation", "transports")
-NOT_MODULES = ("pebble/firmware/", "pebble/scripts/")  # imported by boards; started as programs
+LINKED = ("configs", "firmware", "services", "transports")
+NOT_MODULES = ("pebble/firmware/", "pebble/extensions/scripts/shipped/")  # imported by boards; started as programs
 SHARED = ".data/data/share/"  # in the name of what is put below the prefix: completions, a program for GStreamer
 NOT_SOURCES = shutil.ignore_patterns(".*", "__pycache__", "*.egg-info", "build", "dist", "tests", "docs")
 
@@ -75,7 +75,7 @@ def test_every_module_of_the_wheel_imports_without_the_checkout_and_its_firmware
 import importlib, sys
 for name in sys.argv[1:]:
     print(importlib.import_module(name).__file__)
-mcu = sys.modules["pebble.simulation.board"].SimulatedMcu("goob", 0.0)
+mcu = sys.modules["pebble.extensions.lab.simulation.board"].SimulatedMcu("goob", 0.0)
 print(mcu.board.firmware.module("goob.robot").__file__)
 print(mcu.receive(b"M 1 1\\n", 0.0))
 """

@@ -21,9 +21,15 @@ from tests.support import ROOT, THOROUGH, Broker, Child, free_port, until
 
 ELSEWHERE = [sys.executable, str(ROOT / "tests" / "fakes" / "other_platform.py")]
 MODULES = (
-    *(f"pebble.commands.{name}" for name in ("topic", "estop", "watch", "web", "cert", "drive", "check")),
-    *("pebble.web.app", "pebble.web.serve", "pebble.transports.mqtt.transport", "pebble.client.media_receiver"),
-    *("pebble.commands.foxglove", "pebble.foxglove.run"),
+    *(f"pebble.extensions.operator.commands.{name}" for name in ("topic", "estop", "watch", "drive")),
+    *("pebble.extensions.page.commands", "pebble.extensions.page.commands.cert", "pebble.commands.check"),
+    *(
+        "pebble.extensions.page.app",
+        "pebble.extensions.page.serve",
+        "pebble.transports.mqtt.transport",
+        "pebble.extensions.operator.client.media_receiver",
+    ),
+    *("pebble.extensions.foxglove.command", "pebble.extensions.foxglove.run"),
 )
 
 

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from pebble.demo.main import SHORTEST_S
+from pebble.extensions.lab.demo.main import SHORTEST_S
 from tests.kit import rows
 from tests.support import ROOT
 

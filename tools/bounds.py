@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 ROOT = Path(__file__).resolve().parents[1]
 _FOLDERS = ("pebble", "transports", "services", "firmware")
-_OTHERS = ("pebble/demo/", "pebble/perception/")  # nothing of strangers is counted there
+_OTHERS = ("pebble/extensions/lab/", "pebble/extensions/scripts/perception/")  # nothing of strangers is counted there
 _CONSTANT = re.compile(
     r"^((?:\w+, )*(?:_?(?:MAX|MOST)(?:_[A-Z_]+)?|_?(?:[A-Z]+_)*(?:LIMIT|RESERVE|WAITING|REMEMBERED|TOPICS)))"
     r"(?:: Final)? = (\(?[\w ]*\d[^#\n]*)(?:# *(?!noqa)(.*))?$",

@@ -41,13 +41,13 @@ schedules) # the shortest schedule that violates a rule is printed, or the seed 
     $python -m tests.kit.schedules owners --schedules 20000 --jobs 2
     $python -m tests.kit.schedules robot_scripts
     ;;
-page) $python -m pytest --workers 8 -m page tests/web ;;
-looks) $python -m tests.web.looks ;;
-fleet) tests --workers 2 --timeout 900 -s tests/fleet ;;
+page) $python -m pytest --workers 8 -m page tests/ext/page ;;
+looks) $python -m tests.ext.page.looks ;;
+fleet) tests --workers 2 --timeout 900 -s tests/ext/fleet ;;
 brokers)
-    sh tests/brokers/install.sh
-    $python -m pytest -ra tests/transports/test_brokers.py tests/transports/test_client_ids.py tests/brokers
-    $python -m pytest -ra -k "(nats or another) and in_python" tests/checks/conform
+    sh tests/ext/checks/brokers/install.sh
+    $python -m pytest -ra tests/transports/test_brokers.py tests/transports/test_client_ids.py tests/ext/checks/brokers
+    $python -m pytest -ra -k "(nats or another) and in_python" tests/ext/checks/conform
     ;;
 gstreamer)
     debian gst-launch-1.0=gstreamer1.0-tools
@@ -66,7 +66,7 @@ life)
         $python -m pip download --quiet --require-hashes --only-binary :all: --dest .venv/wheels -r .venv/robot.txt
         cp .venv/robot.txt .venv/wheels/robot.txt
     }
-    tests --timeout=900 -ra tests/configs/test_slot.py tests/update tests/life
+    tests --timeout=900 -ra tests/configs/test_slot.py tests/ext/install/update tests/ext/install/life
     ;;
 packages)
     sh tools/setup.sh tools

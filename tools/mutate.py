@@ -5,7 +5,7 @@ copy of the tree, collected once; for each change, a forked process replaces the
 that reach its line: programs that tests start do not have it. A line that runs while tests are imported (a constant, a
 class body, a default) is changed in the copy and tried by all rows in a new process, which takes seconds. Calls that
 log are counted apart. A hang counts as killed. A page module is changed in the copy and tried by all rows; those of
-tests/web/modules, which run in Node, if no others are named. What is inside its strings and templates is not changed.
+tests/ext/page/modules, which run in Node, if no others are named. What is inside its strings and templates is not changed.
 """
 
 import argparse
@@ -133,7 +133,7 @@ def replacements(node: Any) -> Iterator[tuple[str, Any, ast.AST]]:
 def tests_that_import(files: list[str]) -> list[str]:
     """Return the test files whose imports lead to one of these files in the end; those of page modules are a folder."""
     if all(file.endswith(".js") for file in files):
-        return ["tests/web/modules"]
+        return ["tests/ext/page/modules"]
     packages = {"tests", *(path.parent.name for path in ROOT.glob("*/__init__.py"))}
     graph = grimp.build_graph(*packages, exclude_type_checking_imports=True, cache_dir=None)
     places = {name: (ROOT / f"{name.replace('.', '/')}.py").resolve() for name in graph.modules}

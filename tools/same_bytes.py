@@ -154,7 +154,7 @@ def masked(data: bytes) -> str:
 def run(tree: Path) -> Counter[str]:
     """Every packet of a robot of this tree; Python's packages are those of this interpreter."""
     environment = {**os.environ, "PYTHONPATH": str(tree)}
-    from pebble.rig.processes import Processes  # the brokers are no part of what is compared
+    from pebble.extensions.lab.rig.processes import Processes  # the brokers are no part of what is compared
 
     with Processes() as processes:
         brokers = processes.broker("remote"), processes.broker("local")
@@ -170,9 +170,9 @@ def run(tree: Path) -> Counter[str]:
 def robot(direct: int, remote: int, local: int) -> None:
     """This runs in a process of its own, with the modules of the tree that is measured."""
     from pebble import contract
-    from pebble.bench.clients import RobotSubscriber, StockClient
-    from pebble.rig.processes import Processes
-    from pebble.rig.robot import BASE, MEDIA, Robot
+    from pebble.extensions.lab.bench.clients import RobotSubscriber, StockClient
+    from pebble.extensions.lab.rig.processes import Processes
+    from pebble.extensions.lab.rig.robot import BASE, MEDIA, Robot
 
     with Processes() as processes:
         one = Robot(processes, "mqtt", ("127.0.0.1", remote), services=MEDIA, reports=True)

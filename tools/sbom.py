@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 ROOT = Path(__file__).resolve().parent.parent
-VENDOR = ROOT / "pebble" / "web" / "static" / "vendor" / "vendor.json"
+VENDOR = ROOT / "pebble/extensions/page/static/vendor/vendor.json"
 SBOM = ROOT / "build" / "sbom.cdx.json"
 
 

@@ -3,7 +3,7 @@
     python robot.py ID HOST PORT STOP_FILE [USER PASSWORD_FILE CA_FILE]
 
 It needs the modules beside it as well.
-With a user it is at level named, see docs/fleet.md: commands count only under the account of their sender.
+With a user it is at level named, see docs/ext/fleet.md: commands count only under the account of their sender.
 """
 
 import json

@@ -18,43 +18,43 @@ if TYPE_CHECKING:
     from typer._click.core import Command, Context
     from typer._click.formatting import HelpFormatter
 
-#: Each command, by what it is for: the module of this package that has the function of its name, or registers what is
+#: Each command, by what it is for: the module of pebble that has the function of its name, or registers what is
 #: below it, and its line of help. One of two words is imported without the others of its group.
 COMMANDS: Final = {
     "use": {
-        "demo": ("sim", "run four simulated robots; needs nothing else"),
-        "drive": ("drive", "drive a robot with the keys of this terminal"),
-        "estop": ("estop", "stop robots until they are reset"),
-        "watch": ("watch", "write a picture of a robot's camera into a file"),
-        "web": ("web.group", "drive, stop and watch robots in a browser"),
-        "foxglove": ("foxglove", "show robots live in the Foxglove app"),
+        "demo": ("extensions.lab.commands.sim", "run four simulated robots; needs nothing else"),
+        "drive": ("extensions.operator.commands.drive", "drive a robot with the keys of this terminal"),
+        "estop": ("extensions.operator.commands.estop", "stop robots until they are reset"),
+        "watch": ("extensions.operator.commands.watch", "write a picture of a robot's camera into a file"),
+        "web": ("extensions.page.commands.group", "drive, stop and watch robots in a browser"),
+        "foxglove": ("extensions.foxglove.command", "show robots live in the Foxglove app"),
     },
     "own": {
-        "setup": ("setup", "make a robot of this machine, or back it up"),
-        "up": ("up", "run a robot"),
-        "check": ("check", "validate configs and summarise them"),
-        "doctor": ("doctor", "find what is wrong with a machine, robot or broker"),
-        "flash": ("flash", "install a robot's firmware on its board"),
+        "setup": ("extensions.install.commands.setup", "make a robot of this machine, or back it up"),
+        "up": ("commands.up", "run a robot"),
+        "check": ("commands.check", "validate configs and summarise them"),
+        "doctor": ("extensions.checks.commands.doctor", "find what is wrong with a machine, robot or broker"),
+        "flash": ("extensions.install.commands.flash", "install a robot's firmware on its board"),
     },
     "write": {
-        "script": ("script.group", "write, start and stop programs that move a robot"),
-        "topic": ("topic", "list, print, publish and measure messages"),
-        "sim": ("sim", "simulate boards, robots, rooms and fleets"),
-        "conform": ("conform", "judge a robot of your own by the contract"),
+        "script": ("extensions.scripts.commands.group", "write, start and stop programs that move a robot"),
+        "topic": ("extensions.operator.commands.topic", "list, print, publish and measure messages"),
+        "sim": ("extensions.lab.commands.sim", "simulate boards, robots, rooms and fleets"),
+        "conform": ("extensions.checks.commands.conform", "judge a robot of your own by the contract"),
     },
     "share": {
-        "fleet": ("fleet.group", "give robots and people accounts at a broker"),
-        "fleet hub": ("fleet.hub", "Run a Zenoh hub for several robots."),
-        "fleet gateway": ("fleet.gateway", "Carry robots of a hub or a LAN to a broker."),
-        "fleet audit": ("fleet.audit", "Print who did what to a robot."),
-        "cert": ("cert", "make certificates, so that phones may connect"),
+        "fleet": ("extensions.fleet.commands.group", "give robots and people accounts at a broker"),
+        "fleet hub": ("extensions.fleet.commands.hub", "Run a Zenoh hub for several robots."),
+        "fleet gateway": ("extensions.fleet.commands.gateway", "Carry robots of a hub or a LAN to a broker."),
+        "fleet audit": ("extensions.fleet.commands.audit", "Print who did what to a robot."),
+        "cert": ("extensions.page.commands.cert", "make certificates, so that phones may connect"),
     },
     "measure": {
-        "record": ("recordings.record", "record robots"),
-        "recordings": ("recordings.group", "list, search, mend and export recordings"),
-        "replay": ("recordings.replay", "play recordings as if their robots were there"),
-        "analyse": ("recordings.analyse", "report bandwidth, outages and latency of recordings"),
-        "bench": ("bench", "compare MQTT and Zenoh on this machine"),
+        "record": ("extensions.recordings.commands.record", "record robots"),
+        "recordings": ("extensions.recordings.commands.group", "list, search, mend and export recordings"),
+        "replay": ("extensions.recordings.commands.replay", "play recordings as if their robots were there"),
+        "analyse": ("extensions.recordings.commands.analyse", "report bandwidth, outages and latency of recordings"),
+        "bench": ("extensions.lab.commands.bench", "compare MQTT and Zenoh on this machine"),
     },
 }
 
@@ -132,7 +132,7 @@ class _Listed(TyperCommand):
         }
         if arguments and arguments[0] in below:
             return TyperGroup(name=self.name, commands=below, rich_markup_mode=None)
-        module, name = import_module(f"pebble.commands.{_ROWS[self._words][0]}"), str(self.name)
+        module, name = import_module(f"pebble.{_ROWS[self._words][0]}"), str(self.name)
         app = typer.Typer(rich_markup_mode=None)
         if hasattr(module, "register"):
             module.register(app)

@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Annotated, NamedTuple
 import typer
 
 from pebble.config import Config, Mqtt, load, resolved
-from pebble.config.neighbours import Neighbours
 from pebble.config.rules.doors import place_of
 from pebble.config.secret_text import shown_user, without_secrets
 from pebble.config.visible import shown
@@ -21,6 +20,7 @@ from pebble.launcher.programs import programs
 from pebble.runtime.addresses import Addresses
 from pebble.runtime.connections import check_connections, tls_settings
 from pebble.runtime.process import view_of
+from pebble.services.neighbours.config import Neighbours
 
 if TYPE_CHECKING:
     from pebble.services.autonomy_manager.script import Script

@@ -50,7 +50,7 @@ def robots(context: Context) -> list[str]:
 def scripts(context: Context) -> list[str]:
     """Return the scripts of the robot whose config was given, else those of Pebble."""
     file = Path(str(context.params.get("robot")))
-    folders: tuple[Path, ...] = (Path(pebble.__file__).with_name("scripts"),)
+    folders: tuple[Path, ...] = (Path(pebble.__file__).with_name("extensions") / "scripts" / "shipped",)
     if file.is_file():
         from pebble.config import load
         from pebble.errors import PebbleError

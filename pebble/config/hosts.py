@@ -1,7 +1,7 @@
 """Reads hosts as people write them: a name or an address is understood, all else is refused with what to write."""
 
 import re
-from ipaddress import IPv4Address, IPv6Address
+from ipaddress import IPv4Address, IPv6Address, ip_address
 from typing import NamedTuple
 from urllib.parse import unquote, urlsplit
 
@@ -145,3 +145,11 @@ def _name(text: str) -> str:
     if len(name) > 253 or not all(map(_LABEL, labels)):
         raise ValueError(text)
     return name
+
+
+def is_loopback(host: str) -> bool:
+    """Whether ``host`` is an address of this machine that no other one reaches."""
+    try:
+        return ip_address(host).is_loopback
+    except ValueError:
+        return host.lower() == "localhost"

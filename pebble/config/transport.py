@@ -41,7 +41,7 @@ class Mqtt(Section, frozen=True, kw_only=True):
     }
     refused: ClassVar = {
         "hosts": "is no key any more: write host, a name that has the addresses of all or that of a cluster "
-        "(docs/fleet.md, One broker)"
+        "(docs/ext/fleet.md, One broker)"
     }
 
     host: Annotated[BrokerHost, doc("Name or address of the broker.")] = "127.0.0.1"

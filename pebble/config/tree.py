@@ -4,10 +4,7 @@ from typing import Annotated, Any, ClassVar, Literal
 
 from msgspec import Meta, field
 
-from pebble.config.autonomy import AutonomyManager
 from pebble.config.media import AvDaemon, Media, SoundboardHandler, VideoStream
-from pebble.config.neighbours import Neighbours
-from pebble.config.recorder import Recorder
 from pebble.config.security import Security
 from pebble.config.transport import Mqtt, RemoteConnection, RemoteMqtt, TransportSection
 from pebble.config.types import (
@@ -31,10 +28,13 @@ from pebble.config.types import (
     Variables,
     doc,
 )
-from pebble.config.web import WebHandler, WebInterface
 from pebble.contract.looks import Body, Colour
 from pebble.contract.payloads import LinkLevel
 from pebble.contract.serial_protocols import SerialProtocolName
+from pebble.extensions.page.config import WebHandler, WebInterface
+from pebble.extensions.recordings.config import Recorder
+from pebble.extensions.scripts.config import AutonomyManager
+from pebble.services.neighbours.config import Neighbours
 
 
 class Robot(Section, frozen=True, kw_only=True):

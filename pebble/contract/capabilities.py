@@ -162,5 +162,5 @@ class CapabilitiesValue(Payload, frozen=True, kw_only=True):
     lights: LightsOffer | UnsetType = UNSET
     telemetry: TelemetryOffer | UnsetType = UNSET
     outlets: OutletsOffer | UnsetType = UNSET
-    named: bool | UnsetType = UNSET  # it takes commands only with an account's name in the topic (docs/fleet.md)
+    named: bool | UnsetType = UNSET  # it takes commands only with an account's name in the topic (docs/ext/fleet.md)
     announced: bool | UnsetType = UNSET  # only in what readers make of a heartbeat's `subscribes`; robots leave it out

@@ -248,7 +248,7 @@ NAVIGATION_LOCAL_PLAN = _c("navigation/local-plan", Kind.STREAM, p.AnyObject, "N
 NAVIGATION_GLOBAL_PLAN = _c("navigation/global-plan", Kind.STREAM, p.AnyObject, "Whole route of a ROS planner.")
 DIAGNOSTICS = _c("diagnostics", Kind.STATE, p.AnyObject, "Diagnostics of a ROS robot.", rate_hz=1)
 
-# -- between robots of a LAN: docs/neighbours.md
+# -- between robots of a LAN: docs/ext/neighbours.md
 FROM_NEIGHBOUR = _c("from/{robot}/drive-values", Kind.COMMAND, p.Drive,
                     "What a script of another robot drives, at the hub of the LAN; only `neighbours` reads it.",
                     rate_hz=20, newest=True, remote=False)  # fmt: skip

@@ -3,7 +3,7 @@
 from typing import Literal
 
 Colour = Literal["blue", "amber", "violet", "green", "coral", "rose", "teal", "slate"]
-#: Its drawings of robots (pebble/web/static/faces.svg).
+#: Its drawings of robots (pebble/extensions/page/static/faces.svg).
 Body = Literal[
     "goob", "fred", "minilamp", "benjr", "pitcam", "outlets", "wheeled", "walker", "arm", "drone", "boat", "unknown"
 ]  # fmt: skip

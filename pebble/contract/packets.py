@@ -25,7 +25,7 @@ class Codec(IntEnum):
     """What the body of a PBAT packet is."""
 
     PCM16LE = 1  # interleaved samples
-    OPUS = 2  # one or more Opus packets; see pebble.media.opus
+    OPUS = 2  # one or more Opus packets; see pebble.extensions.media.opus
 
 
 class PictureKind(IntEnum):

@@ -14,7 +14,7 @@ from pebble.config.types import ServiceSection
 from pebble.contract import capabilities as offers
 from pebble.contract.encodings import ALL_SOUND, ALL_VIDEO
 from pebble.contract.serial_protocols import SERIAL_PROTOCOLS
-from pebble.media import pyav
+from pebble.runtime import pyav
 from pebble.runtime.addresses import Addresses
 from pebble.runtime.process import view_of
 

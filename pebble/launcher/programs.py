@@ -61,7 +61,7 @@ def programs(config: Config) -> tuple[Program, ...]:
         (services.av_daemon.enabled, _av_daemon(config)),
         (services.autonomy_manager.enabled, _package(config, "autonomy_manager", Stage.CONNECTION, runs_scripts=True)),
         (services.mqtt_bridge.enabled, _package(config, "mqtt_bridge", Stage.CONNECTION, may_request=True)),
-        (mirror is not None, _service(config, "mqtt_mirror", Stage.CONNECTION)),
+        (mirror is not None, _package(config, "mqtt_mirror", Stage.CONNECTION)),
         (services.soundboard_handler.enabled, _package(config, "soundboard_handler", Stage.CONNECTION)),
         (services.web_handler.enabled, _web_handler(config)),
         (services.neighbours.enabled, _service(config, "neighbours", Stage.CONNECTION, preloaded=False)),
@@ -73,7 +73,7 @@ def programs(config: Config) -> tuple[Program, ...]:
 
 def shared_modules(config: Config, table: Iterable[Program]) -> list[str]:
     """The modules to import before the first fork: what the programs run, and what several of them use."""
-    media = ["pebble.transports.frames", "pebble.media.sound"] if config.media_programs() else []
+    media = ["pebble.transports.frames", "pebble.extensions.media.sound"] if config.media_programs() else []
     return [*_transport_modules(config), *media, *(one.entry or one.module for one in table if one.preloaded)]
 
 
@@ -130,13 +130,13 @@ def _av_daemon(config: Config) -> Program:
 def _web_handler(config: Config) -> Program:
     """The operator page; its module is above the launcher, which only starts it, and may miss what it imports."""
     arguments = (str(config.path),)
-    return Program("web_handler", "pebble.web.run", arguments, Stage.CONNECTION, preloaded=False)
+    return Program("web_handler", "pebble.extensions.page.run", arguments, Stage.CONNECTION, preloaded=False)
 
 
 def _on_demand(config: Config, name: str) -> Program:
     """A program that the bridge requests while operators want its video or audio."""
     if name == "video_stream":
-        return _service(config, name, Stage.CONNECTION, on_demand=True)
+        return _package(config, name, Stage.CONNECTION, on_demand=True)
     return _service(config, name, Stage.CONNECTION, on_demand=True, preloaded=False)
 
 

@@ -16,9 +16,9 @@ from pebble.transports.hosts import SMALL_SEGMENT
 from pebble.transports.socket_paths import FRAMES_SOCKET, PEER_SOCKET, fits_socket
 
 if TYPE_CHECKING:
-    from pebble.config.gateway_file import GatewayFile
-    from pebble.config.hub_file import HubFile
-    from pebble.config.neighbours import Lan
+    from pebble.extensions.fleet.gateway.gateway_file import GatewayFile
+    from pebble.extensions.fleet.hub_file import HubFile
+    from pebble.services.neighbours.config import Lan
 
 _ANY = "+/+/+"  # the levels of any robot
 #: Topics of the robot's states, and of all commands, that are published even to a broker that hangs up on them.

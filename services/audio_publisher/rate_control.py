@@ -4,8 +4,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final
 
-from pebble.media.opus import BUNDLE_LIMIT
-from pebble.media.rate import InFlight, Rests
+from pebble.extensions.media.opus import BUNDLE_LIMIT
+from pebble.runtime.rate import InFlight, Rests
 from pebble.transports.base import Outgoing
 
 LEAST_BITRATE: Final = 16_000  # of Opus: below it speech gets hard to follow

@@ -6,8 +6,8 @@ from typing import Any
 from pebble.contract import AUDIO, AUDIO_CONTROL, MEDIA_REPORT
 from pebble.contract.payloads import MediaReport, MediaRequest
 from pebble.errors import DeviceError, PebbleError
-from pebble.media.rate_meter import RateMeter
-from pebble.media.sound import SOUND_ENCODINGS, SoundEncoder, make_sound_encoder, sequence_numbers
+from pebble.extensions.media.rate_meter import RateMeter
+from pebble.extensions.media.sound import SOUND_ENCODINGS, SoundEncoder, make_sound_encoder, sequence_numbers
 from pebble.runtime.connections import remote_transport
 from pebble.runtime.parent import requested_encoding
 from pebble.runtime.service import Service, every, on

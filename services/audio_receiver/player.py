@@ -12,7 +12,7 @@ import time
 from contextlib import suppress
 
 from pebble.config.media import AudioReceiver
-from pebble.media.jitter import Chunk
+from pebble.extensions.media.jitter import Chunk
 from pebble.runtime.child import Child, how_ended
 from pebble.runtime.environment import child_environment
 

@@ -9,8 +9,8 @@ from pebble.contract import AUDIO_STREAM, MEDIA_REPORT
 from pebble.contract.names import with_name
 from pebble.contract.payloads import MediaReport
 from pebble.errors import DeviceError
-from pebble.media.jitter import JitterBuffer
-from pebble.media.rate_meter import RateMeter
+from pebble.extensions.media.jitter import JitterBuffer
+from pebble.extensions.media.rate_meter import RateMeter
 from pebble.runtime.connections import remote_transport
 from pebble.runtime.service import Service, every
 from pebble.services.audio_receiver.player import Player

@@ -15,10 +15,10 @@ from msgspec.structs import asdict, replace
 
 import pebble
 from pebble.config import Config
-from pebble.config.autonomy import Script as ScriptSection
 from pebble.config.home import in_home
 from pebble.contract.forms import MAX_SETTINGS, Setting, form
 from pebble.contract.identity import meant
+from pebble.extensions.scripts.config import Script as ScriptSection
 from pebble.services.autonomy_manager.describe import (
     MANIFEST,
     BrokenScriptError,
@@ -37,7 +37,7 @@ MAX_SCRIPTS = 256  # that are listed
 _LONGEST_NAME = 100
 _LONGEST_FILES = 256 * 1024  # bytes of all forms together
 _RETRY_S = 60.0  # after a failure: it may have been a busy machine's
-_OWN_SCRIPTS = Path(pebble.__file__).parent / "scripts"
+_OWN_SCRIPTS = Path(pebble.__file__).parent / "extensions" / "scripts" / "shipped"
 
 log = logging.getLogger(__name__)
 

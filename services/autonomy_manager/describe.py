@@ -68,7 +68,7 @@ class BrokenScriptError(DescribeError):
 
 
 def is_ours(entry: Path) -> bool:
-    """Whether a Python file imports ``run`` from pebble, or pebble.script. It is read, never run.
+    """Whether a Python file imports ``run`` from pebble, or pebble.extensions.scripts.script. It is read, never run.
 
     Raises BrokenScriptError for what is no Python.
     """

@@ -3,8 +3,8 @@
 from collections.abc import Mapping
 
 from pebble.config import Config
+from pebble.extensions.scripts.runs import CONFIG, RUN
 from pebble.runtime.environment import child_environment
-from pebble.runtime.runs import CONFIG, RUN
 
 
 def environment(*more: Mapping[str, str]) -> dict[str, str]:

@@ -3,8 +3,8 @@
 from collections.abc import Collection, Iterator
 
 from pebble.contract.payloads import LAST_RUN, ControlState, EstopState
+from pebble.extensions.scripts.runs import SUPERSEDED, newest
 from pebble.motion.arbiter import newer
-from pebble.runtime.runs import SUPERSEDED, newest
 
 _MOST = 16  # owners; their names come from other processes
 

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 from pebble.contract.forms import Value
 from pebble.errors import PebbleError
-from pebble.runtime.runs import CONFIG, RUN
+from pebble.extensions.scripts.runs import CONFIG, RUN
 from pebble.services.autonomy_manager.child import Launch, Process, Spawn
 from pebble.services.autonomy_manager.environment import environment
 from pebble.services.autonomy_manager.motor_owners import Baseline

@@ -24,10 +24,10 @@ from pebble.contract.payloads import (
     EstopState,
 )
 from pebble.errors import PebbleError
+from pebble.extensions.scripts.runs import LocalScripts, following, next_run
 from pebble.motion.arbiter import HOLD_MS
 from pebble.runtime.addresses import Addresses
 from pebble.runtime.process import view_of
-from pebble.runtime.runs import LocalScripts, following, next_run
 from pebble.runtime.service import Service, on
 from pebble.services.autonomy_manager.child import Processes, Spawn
 from pebble.services.autonomy_manager.motor_owners import OVERRIDDEN, Baseline, MotorOwners

@@ -3,7 +3,7 @@
 from msgspec.structs import replace
 
 from pebble.contract.payloads import MediaReport
-from pebble.media.rate_meter import RateMeter
+from pebble.extensions.media.rate_meter import RateMeter
 from pebble.transports.frames import FrameInfo
 
 _OPENING_S = 15.0  # a device that takes longer to open hangs

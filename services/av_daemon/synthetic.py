@@ -11,14 +11,14 @@ from typing import TYPE_CHECKING
 
 from pebble.config.media import CameraCapture, Microphone
 from pebble.errors import DeviceError
-from pebble.media.scene import Scene
-from pebble.media.speech import Speech
+from pebble.extensions.media.scene import Scene
+from pebble.extensions.media.speech import Speech
 from pebble.services.av_daemon.alsa import CHUNK_S
 from pebble.services.av_daemon.source import Bytes, Capture
 from pebble.transports.frames import FrameInfo
 
 if TYPE_CHECKING:
-    from pebble.simulation.world.robot_view import RobotView
+    from pebble.extensions.lab.simulation.world.robot_view import RobotView
 
 _BEHIND = 10  # chunks of sound that are made up for after a delay
 
@@ -119,7 +119,7 @@ class WorldCamera(ComputedCamera):
 
     def __init__(self, video: CameraCapture, start: float) -> None:
         super().__init__(video, start)
-        view = import_module("pebble.simulation.world.robot_view")  # only who needs it pays for it
+        view = import_module("pebble.extensions.lab.simulation.world.robot_view")  # only who needs it pays for it
         self._view: RobotView = view.RobotView(video.device, video.width, video.height)
 
     def look(self, _turn: int) -> int:

@@ -6,8 +6,8 @@ from typing import Any
 from pebble.contract import CAMERA, MEDIA_REPORT, VIDEO_CONTROL
 from pebble.contract.payloads import MediaReport, MediaRequest
 from pebble.errors import DeviceError, PebbleError
-from pebble.media.rate_meter import RateMeter
-from pebble.media.video import VIDEO_ENCODINGS, VideoEncoder, make_encoder
+from pebble.extensions.media.rate_meter import RateMeter
+from pebble.extensions.media.video import VIDEO_ENCODINGS, VideoEncoder, make_encoder
 from pebble.runtime.connections import remote_transport
 from pebble.runtime.parent import requested_encoding
 from pebble.runtime.service import Service, every, on

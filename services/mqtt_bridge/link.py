@@ -9,7 +9,7 @@ from msgspec import Struct
 
 from pebble.contract.payloads import LinkLevel
 from pebble.forwarding.sieve import Rank
-from pebble.media.rate import InFlight
+from pebble.runtime.rate import InFlight
 from pebble.transports import Answer
 
 _ORDER: tuple[LinkLevel, ...] = ("wide", "narrow", "thin")

@@ -9,12 +9,12 @@ from typing import Any
 from msgspec.structs import replace
 
 from pebble.config import Config, Mqtt, parse
-from pebble.config.neighbours import Neighbours
 from pebble.contract import ONLINE
 from pebble.contract.levels import silent_after
 from pebble.contract.payloads import Heartbeat
 from pebble.runtime.connections import local_transport
 from pebble.runtime.service import every
+from pebble.services.neighbours.config import Neighbours
 from pebble.services.neighbours.service import HEARTBEAT_S, NeighboursService
 from pebble.transports import Message
 

@@ -20,13 +20,13 @@ from pebble.contract import (
 from pebble.contract.identity import Identity
 from pebble.contract.payloads import Drive, Neighbours
 from pebble.errors import PebbleError
+from pebble.extensions.operator.client.robot_estop import RobotEstop
+from pebble.extensions.scripts.runs import LocalScripts, next_run
+from pebble.extensions.scripts.script.neighbour import PRESENT_S
 from pebble.runtime.addresses import Addresses
 from pebble.runtime.connections import lan_transport
 from pebble.runtime.process import view_of
-from pebble.runtime.robot_estop import RobotEstop
-from pebble.runtime.runs import LocalScripts, next_run
 from pebble.runtime.service import WAIT_LIMIT_S, Service, every, on
-from pebble.script.neighbour import PRESENT_S
 from pebble.services.neighbours.begun import begin
 from pebble.services.neighbours.visit import Visit
 from pebble.transports import Message, QoS, Transport

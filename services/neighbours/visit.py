@@ -7,8 +7,8 @@ script has, ends it by what motor owners publish. A person ends it by any comman
 from collections.abc import Callable, Mapping
 
 from pebble.contract.payloads import Drive, EstopState, NeighbourRefusal
-from pebble.runtime.runs import SUPERSEDED, newest
-from pebble.script.drive_sender import HOLD_S, DriveSender
+from pebble.extensions.scripts.runs import SUPERSEDED, newest
+from pebble.extensions.scripts.script.drive_sender import HOLD_S, DriveSender
 
 VALID_MS = 300  # for which a command of another robot moves this one, at most
 

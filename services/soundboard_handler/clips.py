@@ -10,7 +10,7 @@ from pathlib import Path
 
 from msgspec import Struct
 
-from pebble.media import pyav
+from pebble.runtime import pyav
 
 _WAV = ".wav"
 _NEED_PYAV = (".mp3", ".ogg", ".flac")

@@ -17,7 +17,7 @@ from pebble.runtime.environment import child_environment
 from pebble.services.soundboard_handler.clips import Clip
 
 if TYPE_CHECKING:
-    from pebble.media.sound_file import SoundFile
+    from pebble.extensions.media.sound_file import SoundFile
 
 Post = Callable[[Callable[[], None]], None]
 
@@ -72,7 +72,7 @@ class Playback:
 
     def _start_decoded(self) -> None:
         """Decode on a thread of its own: no more than the pipe to the player holds."""
-        from pebble.media.sound_file import SoundFile  # only where a clip is decoded: it costs memory
+        from pebble.extensions.media.sound_file import SoundFile  # only where a clip is decoded: it costs memory
 
         file = SoundFile(self.clip.path)
         try:

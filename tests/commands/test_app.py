@@ -179,7 +179,7 @@ def test_a_reader_that_goes_away_is_no_error() -> None:
 
 
 def test_demo_hands_over(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
-    from pebble.demo import main
+    from pebble.extensions.lab.demo import main
 
     asked: list[tuple[float | None, bool]] = []
     monkeypatch.setattr(main, "run", lambda seconds, *, for_phones: asked.append((seconds, for_phones)) or 3)

@@ -8,9 +8,9 @@ from typing import Any
 
 import pytest
 
-from pebble.checks.check import State
-from pebble.checks.robot import run_checks
 from pebble.config import load, parse
+from pebble.extensions.checks.check import State
+from pebble.extensions.checks.robot import run_checks
 
 
 def written(folder: Path, mode: int, **keys: Any) -> Path:

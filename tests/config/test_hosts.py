@@ -6,11 +6,11 @@ from pathlib import Path
 
 import pytest
 
-from pebble.client.url import settings_of
 from pebble.config import Config, load, parse
 from pebble.config.hosts import HostError, broker_host, endpoint, name_of_page
 from pebble.errors import ConfigError, PebbleError
-from pebble.fleet.certificates import init
+from pebble.extensions.fleet.certificates import init
+from pebble.extensions.operator.client.url import settings_of
 
 
 @pytest.mark.parametrize(

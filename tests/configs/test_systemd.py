@@ -1,4 +1,4 @@
-"""The units confine a robot; tests/life has it in one."""
+"""The units confine a robot; tests/ext/install/life has it in one."""
 
 from __future__ import annotations
 

@@ -12,10 +12,10 @@ from typing import NamedTuple
 import pytest
 
 from pebble import contract as c
-from pebble.checks.observer import Observer
-from pebble.client.connection import connected
 from pebble.contract.payloads import Drive
-from tests.checks.conform.programs import OPERATORS, Sample, at_open, robot_in_python
+from pebble.extensions.checks.observer import Observer
+from pebble.extensions.operator.client.connection import connected
+from tests.ext.checks.conform.programs import OPERATORS, Sample, at_open, robot_in_python
 from tests.support import Broker, Child, further, until
 
 pytestmark = pytest.mark.alone  # rates and deadlines are checked

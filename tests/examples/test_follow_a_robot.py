@@ -7,8 +7,8 @@ import runpy
 
 import pytest
 
-from pebble.perception.odom_follow import Pose
-from pebble.perception.tags import Place
+from pebble.extensions.scripts.perception.odom_follow import Pose
+from pebble.extensions.scripts.perception.tags import Place
 from tests.support import ROOT
 
 AT_0 = Pose(0.0, 0.0, 0.0)

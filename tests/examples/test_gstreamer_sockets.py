@@ -18,7 +18,7 @@ import pytest
 
 from pebble.transports.frames import FrameInfo
 from pebble.transports.segments import SHM
-from tests.services.media_rig import Device
+from tests.ext.av.media_rig import Device
 from tests.support import ROOT, Child, until
 
 #: `make long PART=gstreamer` installs it.

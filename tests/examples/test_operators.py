@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from tests.checks.conform.programs import OPERATORS, Sample, robot_in_python
+from tests.ext.checks.conform.programs import OPERATORS, Sample, robot_in_python
 from tests.robot.operator import Operator
 from tests.support import Broker, Child, until
 

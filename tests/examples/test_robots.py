@@ -12,7 +12,7 @@ from typing import Any
 
 import pytest
 
-from tests.checks.conform.programs import ROBOT_PY, ROBOTS, Command, Sample, mutant, robot_in_micropython, sketch
+from tests.ext.checks.conform.programs import ROBOT_PY, ROBOTS, Command, Sample, mutant, robot_in_micropython, sketch
 from tests.robot.operator import Operator
 from tests.support import Broker, Child, until
 

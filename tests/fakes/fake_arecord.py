@@ -8,7 +8,7 @@ import sys
 import time
 from itertools import count
 
-from pebble.media.speech import Speech
+from pebble.extensions.media.speech import Speech
 from tests.fakes.installed import signed_in
 
 

@@ -15,7 +15,7 @@ from itertools import count
 import cv2
 import numpy as np
 
-from pebble.media.scene import Scene
+from pebble.extensions.media.scene import Scene
 from tests.fakes.installed import signed_in
 
 

@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from typing import Any
 
+from pebble.extensions.lab.simulation.bodies import body_of
+from pebble.extensions.lab.simulation.micropython.board import Board
+from pebble.extensions.lab.simulation.micropython.clock import VirtualClock
+from pebble.extensions.lab.simulation.micropython.modules.machine import Machine
+from pebble.extensions.lab.simulation.micropython.ports import Port
 from pebble.services.serial_mcu_bridge.pebble_serial_v1.frame import Frame, FrameError, Type, decode, encode
 from pebble.services.serial_mcu_bridge.pebble_serial_v1.manifest import Manifest, parse_describe
-from pebble.simulation.bodies import body_of
-from pebble.simulation.micropython.board import Board
-from pebble.simulation.micropython.clock import VirtualClock
-from pebble.simulation.micropython.modules.machine import Machine
-from pebble.simulation.micropython.ports import Port
 
 ASK = encode(Frame(Type.DESCRIBE_REQ))
 

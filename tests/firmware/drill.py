@@ -22,12 +22,12 @@ from msgspec.structs import replace
 from pebble import contract as c
 from pebble.contract import codec
 from pebble.contract.payloads import Drive
-from pebble.simulation.micropython.board import Board
-from pebble.simulation.micropython.clock import VirtualClock
-from pebble.simulation.micropython.ports import OF_ROBOT
+from pebble.extensions.lab.simulation.micropython.board import Board
+from pebble.extensions.lab.simulation.micropython.clock import VirtualClock
+from pebble.extensions.lab.simulation.micropython.ports import OF_ROBOT
+from tests.ext.lab.simulation.virtual_broker import Command, VirtualBroker
+from tests.ext.lab.simulation.virtual_network import VirtualNetwork
 from tests.firmware.rules import FREE, Rules
-from tests.simulation.virtual_broker import Command, VirtualBroker
-from tests.simulation.virtual_network import VirtualNetwork
 
 START_S: Final = 1000.0  # of the clock, when a drill begins
 BUSY_S: Final = 0.01

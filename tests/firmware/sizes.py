@@ -7,8 +7,8 @@ import tempfile
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
-from pebble.flash.boards import FIRMWARE
-from pebble.flash.sources import modules
+from pebble.extensions.install.flash.boards import FIRMWARE
+from pebble.extensions.install.flash.sources import modules
 from tests.firmware.heap import CASES, LIMITS, Case, Cost, measure, smallest
 from tests.firmware.micropython import compile_module
 from tests.support import ROOT

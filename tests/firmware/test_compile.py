@@ -6,9 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from pebble.flash.boards import FIRMWARE
-from pebble.flash.on_board import MPY_VERSION
-from pebble.flash.sources import firmware_folder, modules
+from pebble.extensions.install.flash.boards import FIRMWARE
+from pebble.extensions.install.flash.on_board import MPY_VERSION
+from pebble.extensions.install.flash.sources import firmware_folder, modules
 from tests.firmware.micropython import compile_module
 
 pytestmark = pytest.mark.computing

@@ -17,7 +17,7 @@ from typing import Any
 import pytest
 from paho.mqtt.client import MQTTMessageInfo
 
-from pebble.simulation.wireless import KINDS
+from pebble.extensions.lab.simulation.wireless import KINDS
 from tests.firmware.wireless_rig import Operator, Robots
 from tests.support import Broker, until
 from tests.tcp_proxy import TcpProxy

@@ -15,7 +15,7 @@ from itertools import pairwise
 
 import pytest
 
-from pebble.simulation.wireless import KINDS
+from pebble.extensions.lab.simulation.wireless import KINDS
 from tests.firmware.drill import LIMIT_S, ONLINE, RESENT_S, START_S, Drill, ViolatedError
 from tests.firmware.schedules import FAULTS, act, perform
 from tests.support import cases, some

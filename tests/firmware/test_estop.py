@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from pebble.contract import ESTOP_STATE, codec
-from pebble.simulation.micropython.faults import failure
+from pebble.extensions.lab.simulation.micropython.faults import failure
 from tests.firmware.drill import BASE, DRIVE, ESTOP, NAME, RESET, START_S, STATE, Drill
 from tests.firmware.test_network_robot import AHEAD, KINDS, online, published
 
@@ -321,7 +321,7 @@ def test_the_refusal_of_the_drive_topic_is_fatal() -> None:
 
 
 def test_the_simulated_robot_keeps_its_files_in_a_folder(tmp_path: Path) -> None:
-    from pebble.simulation.micropython.files import Files
+    from pebble.extensions.lab.simulation.micropython.files import Files
 
     files = Files(tmp_path / "board")
     with files.open("/estop.new", "w") as file:

@@ -12,7 +12,7 @@ import pytest
 
 from pebble import cli
 from pebble.errors import ConfigError
-from pebble.simulation.fleet import MOST, members
+from pebble.extensions.lab.simulation.fleet import MOST, members
 from tests.support import ROOT, Broker, Child, free_port, until
 
 

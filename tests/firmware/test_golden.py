@@ -17,10 +17,10 @@ from typing import Any
 
 import pytest
 
+from pebble.extensions.lab.simulation.bodies import body_of
+from pebble.extensions.lab.simulation.micropython.board import Board
+from pebble.extensions.lab.simulation.micropython.clock import VirtualClock
 from pebble.services.serial_mcu_bridge.text.goob_base import Charging, Level, Touch, parse
-from pebble.simulation.bodies import body_of
-from pebble.simulation.micropython.board import Board
-from pebble.simulation.micropython.clock import VirtualClock
 
 pytestmark = pytest.mark.computing
 

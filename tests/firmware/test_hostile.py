@@ -8,7 +8,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from pebble.simulation.wireless import KINDS
+from pebble.extensions.lab.simulation.wireless import KINDS
 from tests.firmware.schedules import HOSTILE
 from tests.firmware.wireless_rig import Operator, Robots
 from tests.support import Broker, until

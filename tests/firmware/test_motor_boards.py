@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from pebble.simulation.micropython.modules.machine import Machine
+from pebble.extensions.lab.simulation.micropython.modules.machine import Machine
 from tests.firmware.benches import Bench
 from tests.support import some
 

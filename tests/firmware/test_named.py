@@ -11,11 +11,11 @@ import pytest
 
 from pebble.config import Security
 from pebble.contract.names import with_name
-from pebble.fleet.certificates import CA_CERT
-from pebble.fleet.roles import Account
+from pebble.extensions.fleet.certificates import CA_CERT
+from pebble.extensions.fleet.roles import Account
+from tests.ext.fleet.broker_client import BrokerClient
+from tests.ext.fleet.brokers import HOST, FleetBroker
 from tests.firmware.wireless_rig import Robots
-from tests.fleet.broker_client import BrokerClient
-from tests.fleet.brokers import HOST, FleetBroker
 from tests.support import beside, until
 
 KIND = "minilamp"

@@ -11,9 +11,9 @@ from typing import Any
 
 import pytest
 
+from tests.ext.lab.simulation.virtual_broker import Session, VirtualBroker
+from tests.ext.lab.simulation.virtual_network import Answers
 from tests.firmware.drill import BASE, DRIVE, LIMIT_S, ONLINE, STALE_S, START_S, Drill
-from tests.simulation.virtual_broker import Session, VirtualBroker
-from tests.simulation.virtual_network import Answers
 from wifi import sockets
 
 KINDS = ("minilamp", "benjr")

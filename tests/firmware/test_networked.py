@@ -19,10 +19,10 @@ import pytest
 
 from pebble.commands import app
 from pebble.errors import PebbleError
-from pebble.simulation import networked
-from pebble.simulation.mcu import Snapshot
-from pebble.simulation.trace import read_trace
-from pebble.simulation.wireless import KINDS
+from pebble.extensions.lab.simulation import networked
+from pebble.extensions.lab.simulation.mcu import Snapshot
+from pebble.extensions.lab.simulation.trace import read_trace
+from pebble.extensions.lab.simulation.wireless import KINDS
 from tests.firmware.wireless_rig import Operator, Robots
 from tests.support import ROOT, Broker, Child, free_port, until
 

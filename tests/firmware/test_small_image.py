@@ -13,8 +13,8 @@ from pathlib import Path
 
 import pytest
 
-from pebble.flash.boards import FIRMWARE, SAMD21
-from pebble.flash.sources import firmware_folder, modules
+from pebble.extensions.install.flash.boards import FIRMWARE, SAMD21
+from pebble.extensions.install.flash.sources import firmware_folder, modules
 
 HAS = {
     "array",

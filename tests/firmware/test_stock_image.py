@@ -8,10 +8,10 @@ from typing import Any
 
 import pytest
 
+from pebble.extensions.lab.simulation.micropython.modules.machine import Machine
+from pebble.extensions.lab.simulation.micropython.ports import SAMD21_OFFICIAL
+from pebble.extensions.lab.simulation.micropython.timers import BoardReset
 from pebble.services.serial_mcu_bridge.pebble_serial_v1.frame import Type
-from pebble.simulation.micropython.modules.machine import Machine
-from pebble.simulation.micropython.ports import SAMD21_OFFICIAL
-from pebble.simulation.micropython.timers import BoardReset
 from tests.firmware.benches import ASK, Bench, of
 
 

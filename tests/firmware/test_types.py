@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from pebble.flash.boards import FIRMWARE
+from pebble.extensions.install.flash.boards import FIRMWARE
 from tests.firmware.types import check
 
 pytestmark = pytest.mark.computing

@@ -9,8 +9,8 @@ import subprocess
 import sys
 from pathlib import Path
 
-from pebble.flash.boards import FIRMWARE, Firmware
-from pebble.flash.sources import firmware_folder
+from pebble.extensions.install.flash.boards import FIRMWARE, Firmware
+from pebble.extensions.install.flash.sources import firmware_folder
 from tests.support import ROOT
 
 STUBS = ROOT / ".venv" / "stubs"

@@ -15,8 +15,8 @@ from paho.mqtt.enums import CallbackAPIVersion
 
 from pebble.config import Security
 from pebble.contract.identity import Identity
-from pebble.simulation.fleet import Fleet
-from pebble.simulation.wireless import KINDS, BrokerAddress, WirelessRobot
+from pebble.extensions.lab.simulation.fleet import Fleet
+from pebble.extensions.lab.simulation.wireless import KINDS, BrokerAddress, WirelessRobot
 from tests.support import until
 
 START_S = 10.0

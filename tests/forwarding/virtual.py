@@ -15,10 +15,10 @@ import pytest
 from pebble.config import Config, parse
 from pebble.forwarding.service import ForwardingService
 from pebble.forwarding.side import Gate
-from pebble.services import mqtt_mirror as mirror_module
 from pebble.services.mqtt_bridge import service as bridge_module
 from pebble.services.mqtt_bridge.service import MqttBridge
-from pebble.services.mqtt_mirror import MqttMirror
+from pebble.services.mqtt_mirror import service as mirror_module
+from pebble.services.mqtt_mirror.service import MqttMirror
 from pebble.transports import Answer, Message, Outgoing, clock
 from pebble.transports.memory import MemoryHub, MemoryTransport
 from tests.services.mqtt_bridge.bridge_rig import Client, make_config

@@ -18,9 +18,9 @@ from typing import Any, Self
 from pebble.config import Config
 from pebble.runtime.process import view_of
 from pebble.services.serial_mcu_bridge.serial_service import bridge_of
+from tests.ext.boards import mcu_wire as wire
+from tests.ext.boards.mcu_wire import M, Received
 from tests.kit.robot import ROBOT, Listener, LocalNetwork, Running
-from tests.services.serial_mcu_bridge import mcu_wire as wire
-from tests.services.serial_mcu_bridge.mcu_wire import M, Received
 from tests.support import until
 
 _numbers = count()

@@ -14,8 +14,8 @@ from pebble.contract import ONLINE, codec
 from pebble.contract.names import without_name
 from pebble.contract.payloads import Heartbeat
 from pebble.transports import Message, MqttSettings, QoS, create
-from tests.client import estop_robot
-from tests.client.control_robot import KeepingRobot
+from tests.ext.operator.client import estop_robot
+from tests.ext.operator.client.control_robot import KeepingRobot
 
 HEARTBEAT_S = 0.25
 

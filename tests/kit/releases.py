@@ -11,7 +11,7 @@ from typing import Any
 
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
-from pebble.update.release import MANIFEST, SIGNATURE, TEST_ID
+from pebble.extensions.install.update.release import MANIFEST, SIGNATURE, TEST_ID
 
 WHEEL = "pebble_robot-0.3.0-py3-none-any.whl"
 

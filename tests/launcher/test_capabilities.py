@@ -216,7 +216,7 @@ def test_encodings_are_those_of_this_installation(monkeypatch: pytest.MonkeyPatc
     publishers = {"video_publisher": {"encoding": "pbvd"}, "audio_publisher": {"encoding": "opus"}}
     value = of(mqtt_bridge={"media": publishers})
     assert (value["video"]["encoding"], value["audio"]["encoding"]) == ("pbvd", "opus")
-    monkeypatch.setattr("pebble.media.pyav.find_spec", lambda _name: None)
+    monkeypatch.setattr("pebble.runtime.pyav.find_spec", lambda _name: None)
     value = of()
     assert (value["video"]["encodings"], value["audio"]["encodings"]) == (["json", "pbvd"], ["pcm"])
 

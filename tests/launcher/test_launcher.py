@@ -465,7 +465,7 @@ def test_an_mqtt_robot_has_no_hub() -> None:
 DEVICES = {"enabled": True}
 
 
-MEDIA_MODULES = {"pebble.transports.frames", "pebble.media.sound"}
+MEDIA_MODULES = {"pebble.transports.frames", "pebble.extensions.media.sound"}
 #: Of a robot with a camera, a text protocol on its serial line, and the security level `open`.
 NEEDED = [
     "numpy",
@@ -545,7 +545,7 @@ def test_the_launcher_of_a_robot_without_media_carries_nothing_for_them() -> Non
 def test_the_operator_page_is_one_more_connection_and_is_imported_by_its_own_process_only() -> None:
     services = {"web_handler": {"enabled": True}}
     page = programs(_parsed(services=services))[-1]
-    assert (page.name, page.module, page.arguments) == ("web_handler", "pebble.web.run", ("None",))
+    assert (page.name, page.module, page.arguments) == ("web_handler", "pebble.extensions.page.run", ("None",))
     assert (page.stage, page.on_demand) == (Stage.CONNECTION, False)
     assert page.module not in shared_modules(_parsed(services=services), [page])
     assert "web_handler" not in [row[0] for row in _table(services={"web_handler": {"enabled": False}})]

@@ -14,7 +14,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
-from pebble.flash.boards import FIRMWARE
+from pebble.extensions.install.flash.boards import FIRMWARE
 from pebble.motion.latch import is_name, reset_of, stop_of
 from tests.firmware.micropython import SCRIPTS, compile_module, run
 from tests.motion.histories import ENGINE

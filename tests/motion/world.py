@@ -12,8 +12,8 @@ from collections.abc import Callable
 from types import SimpleNamespace
 from typing import Any
 
-from pebble.client.estop import StopSender
-from pebble.simulation.micropython.loader import FirmwareModules
+from pebble.extensions.lab.simulation.micropython.loader import FirmwareModules
+from pebble.extensions.operator.client.estop import StopSender
 from pebble.transports import Message, QoS
 from tests.kit.schedules import Step, check
 from tests.motion.control_rules import Client, ControlRules

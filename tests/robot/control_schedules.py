@@ -18,7 +18,7 @@ from itertools import groupby
 from pathlib import Path
 from typing import Any
 
-from pebble.client.estop import new_name
+from pebble.extensions.operator.client.estop import new_name
 from tests.kit.schedules import Engine, Outcome, RandomSteps, Steps
 from tests.kit.stalls import Stalls, lost_s
 from tests.robot.named import Hall, Named

@@ -9,8 +9,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Literal
 
-from pebble.fleet.roles import Account
-from tests.fleet.brokers import FleetBroker
+from pebble.extensions.fleet.roles import Account
+from tests.ext.fleet.brokers import FleetBroker
 from tests.robot.operator import Operator
 from tests.robot.rig import BASE, Rig, lines
 from tests.support import free_port, until

@@ -16,8 +16,8 @@ from typing import Any, Self
 
 import msgspec
 
-from pebble.rig.processes import children
-from pebble.simulation.trace import Entry, complete_lines
+from pebble.extensions.lab.rig.processes import children
+from pebble.extensions.lab.simulation.trace import Entry, complete_lines
 from tests.kit.stalls import Stall
 from tests.robot.operator import Operator
 from tests.support import ROOT, Broker, gone, process_name, until

@@ -12,13 +12,13 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
-from pebble.bench import bridge, cost, startup
-from pebble.bench.bridge import COMMANDS, CPU, DOWN, LOADED, UNLOADED, UP
-from pebble.bench.bridge_operator import HOP, SERVICES
-from pebble.bench.results import STAND_IN, Cell, Results
-from pebble.bench.show import Shown, finish
-from pebble.rig.processes import children
-from pebble.rig.robot import KINDS
+from pebble.extensions.lab.bench import bridge, cost, startup
+from pebble.extensions.lab.bench.bridge import COMMANDS, CPU, DOWN, LOADED, UNLOADED, UP
+from pebble.extensions.lab.bench.bridge_operator import HOP, SERVICES
+from pebble.extensions.lab.bench.results import STAND_IN, Cell, Results
+from pebble.extensions.lab.bench.show import Shown, finish
+from pebble.extensions.lab.rig.processes import children
+from pebble.extensions.lab.rig.robot import KINDS
 from tests.robot.rig import Rig, descendants
 from tests.support import ROOT, Child, until
 
@@ -67,7 +67,7 @@ def test_cost_of_both_kinds(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
 
 
 def test_all_robots_are_driven_also_with_media(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("pebble.bench.bridge_operator._STARTUP_S", 0.2)
+    monkeypatch.setattr("pebble.extensions.lab.bench.bridge_operator._STARTUP_S", 0.2)
     settings = bridge.Settings(with_media=True, seconds=1.0, rounds=1)
     results = written(bridge.run(settings, Console(file=io.StringIO())), tmp_path)
     robots = [(kind, load, way) for kind in KINDS for load in (UNLOADED, LOADED) for way in (DOWN, UP)]

@@ -9,11 +9,11 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
-from pebble.bench.impair import metrics
-from pebble.bench.impair.network import why_no_namespaces
-from pebble.bench.impair.trials import Settings, run
-from pebble.bench.show import finish
-from pebble.rig.processes import children
+from pebble.extensions.lab.bench.impair import metrics
+from pebble.extensions.lab.bench.impair.network import why_no_namespaces
+from pebble.extensions.lab.bench.impair.trials import Settings, run
+from pebble.extensions.lab.bench.show import finish
+from pebble.extensions.lab.rig.processes import children
 
 pytestmark = pytest.mark.alone  # whole robots
 

@@ -10,10 +10,10 @@ from typing import Any
 
 import pytest
 
-from pebble.media.decode import Decoded, VideoDecoder
-from pebble.media.scene import read_counter
-from pebble.media.sound import SoundDecoder
-from pebble.media.video import VIDEO_ENCODINGS
+from pebble.extensions.media.decode import Decoded, VideoDecoder
+from pebble.extensions.media.scene import read_counter
+from pebble.extensions.media.sound import SoundDecoder
+from pebble.extensions.media.video import VIDEO_ENCODINGS
 from tests.robot.operator import Operator, ReceivedMessage
 from tests.robot.rig import BASE, DEVICES, Rig
 from tests.support import further, until

@@ -20,8 +20,8 @@ from pebble.config import load
 from pebble.forwarding.retained_window import INITIAL_SYNC_S
 from pebble.runtime.connections import local_transport
 from pebble.transports import Message
-from tests.fleet.broker_client import BrokerClient, Place
-from tests.fleet.brokers import HOST
+from tests.ext.fleet.broker_client import BrokerClient, Place
+from tests.ext.fleet.brokers import HOST
 from tests.kit.terminal import Terminal
 from tests.robot.named import CONTROL, DRIVE, Hall, Named
 from tests.robot.operator import Operator, driving
@@ -248,7 +248,7 @@ def test_what_another_account_sends_holds_up_no_stop(flooded: Named) -> None:
     assert rig.sends("boss", "estop-reset", order, lambda: not state_of(rig)["latched"], 30), state_of(rig)
 
 
-# -- from a broker with logins to names, as docs/fleet.md has it
+# -- from a broker with logins to names, as docs/ext/fleet.md has it
 
 
 class Old(Operator):

@@ -9,9 +9,9 @@ from pathlib import Path
 
 import pytest
 
+from tests.ext.page.served import Page, Served
 from tests.robot.rig import STOP, Rig
 from tests.support import ROOT, until
-from tests.web.served import Page, Served
 
 PERIOD_S = 0.05
 HALF, FAST, OLD, SCRIPT = (0.5, 0.5), (0.7, 0.7), (0.9, 0.9), (-0.3, -0.3)

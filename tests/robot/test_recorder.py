@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from pebble.recordings import library
+from pebble.extensions.recordings import library
 from tests.robot.rig import Rig
 from tests.support import further, until
 

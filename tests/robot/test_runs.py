@@ -1,6 +1,6 @@
 """A stranger who signs as a script, on a whole robot: from outside, and where nothing stands between.
 
-tests/runtime/test_runs.py has the rule.
+tests/ext/scripts/runtime/test_runs.py has the rule.
 """
 
 from __future__ import annotations

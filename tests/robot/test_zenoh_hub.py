@@ -14,12 +14,12 @@ from typing import Any
 import pytest
 
 from pebble.config import load
-from pebble.fleet import certificates
-from pebble.fleet.folder import ZENOH
+from pebble.extensions.fleet import certificates
+from pebble.extensions.fleet.folder import ZENOH
 from pebble.runtime.connections import local_transport
 from pebble.transports import Message, QoS, ZenohSettings, create
-from tests.fleet.test_attempts import GOOB
-from tests.fleet.test_zenoh import Hall
+from tests.ext.fleet.test_attempts import GOOB
+from tests.ext.fleet.test_zenoh import Hall
 from tests.robot.operator import ReceivedMessage
 from tests.robot.rig import Rig
 from tests.support import beside, cases, further, until

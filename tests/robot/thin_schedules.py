@@ -22,10 +22,10 @@ from unittest.mock import patch
 
 import msgspec
 
-from pebble.client.estop_states import Reset, RobotEstop
 from pebble.config import Config, load
 from pebble.contract import CONTROL, CONTROL_STATE, CONTROL_TAKE, DRIVE, ESTOP, ESTOP_STATE, LINK, codec
 from pebble.contract.levels import LEVELS
+from pebble.extensions.operator.client.estop_states import Reset, RobotEstop
 from pebble.services.mqtt_bridge import service as bridge_module
 from pebble.services.mqtt_bridge.service import MqttBridge
 from pebble.transports import Answer, Message, Outgoing, QoS

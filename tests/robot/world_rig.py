@@ -11,14 +11,14 @@ import time
 from pathlib import Path
 from typing import Any
 
-from pebble.simulation.loudspeaker import Playback, playbacks
-from pebble.simulation.world.pose_page import PoseReader, page_path
-from pebble.simulation.world.poses import RobotPose
-from pebble.simulation.world.program import port_path, trace_path
+from pebble.extensions.lab.simulation.loudspeaker import Playback, playbacks
+from pebble.extensions.lab.simulation.world.pose_page import PoseReader, page_path
+from pebble.extensions.lab.simulation.world.poses import RobotPose
+from pebble.extensions.lab.simulation.world.program import port_path, trace_path
 from tests.robot.rig import Motors, Rig
 from tests.support import ROOT, Child, until
 
-SCRIPTS, PEBBLES_SCRIPTS = Path(__file__).parent / "scripts", ROOT / "pebble" / "scripts"
+SCRIPTS, PEBBLES_SCRIPTS = Path(__file__).parent / "scripts", ROOT / "pebble/extensions/scripts/shipped"
 TAG, TAG_SIZE_M = 13, 0.25
 #: One robot in a large room with one tag, 2 m ahead of the middle.
 ROOM: dict[str, Any] = {

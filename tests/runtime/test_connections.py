@@ -10,8 +10,9 @@ import msgspec
 import pytest
 
 from pebble.config import parse
-from pebble.config.gateway_file import GatewayFile
 from pebble.contract import ESTOP
+from pebble.extensions.fleet.gateway.gateway import will
+from pebble.extensions.fleet.gateway.gateway_file import GatewayFile
 from pebble.runtime.connections import (
     gateway_transports,
     local_settings,
@@ -19,7 +20,6 @@ from pebble.runtime.connections import (
     remote_transport,
     stops_transport,
 )
-from pebble.services.gateway.gateway import will
 from pebble.transports import MqttSettings, create
 from pebble.transports.hosts import SMALL_SEGMENT
 from pebble.transports.topics import matches

@@ -16,7 +16,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from pebble.checks.broker.login_attempt import attempt
+from pebble.extensions.checks.broker.login_attempt import attempt
 from pebble.transports import MqttSettings
 from tests.support import ROOT, Broker, Child, free_port, until
 

@@ -11,8 +11,8 @@ from typing import Any
 
 import pytest
 
-from pebble.client.connection import Target, connected, subscribed_stop
-from pebble.client.discovery import ALL_OUTGOING, Discovery
+from pebble.extensions.operator.client.connection import Target, connected, subscribed_stop
+from pebble.extensions.operator.client.discovery import ALL_OUTGOING, Discovery
 from pebble.transports import Message, MqttSettings, QoS, State
 from pebble.transports.mqtt.transport import MqttTransport
 from tests.forwarding.links.rig import MqttEnd, Rig, Side

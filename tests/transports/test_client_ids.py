@@ -11,10 +11,10 @@ from typing import Any
 
 import pytest
 
-from pebble.checks.broker.login_attempt import attempt
-from pebble.client.connection import Target, resolve
-from pebble.client.page import settings_of
 from pebble.config import Config, load
+from pebble.extensions.checks.broker.login_attempt import attempt
+from pebble.extensions.operator.client.connection import Target, resolve
+from pebble.extensions.page.setting import settings_of
 from pebble.runtime.connections import local_transport, mirror_transport, remote_transport
 from pebble.transports import MqttSettings, State, create
 from pebble.transports.mqtt.client_ids import unique

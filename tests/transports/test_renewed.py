@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from pebble.fleet import certificates
+from pebble.extensions.fleet import certificates
 from pebble.transports import MqttSettings, State, TlsSettings, create
 from pebble.transports.renewed import Renewed
 from tests.support import Broker, until
@@ -122,7 +122,7 @@ def test_a_robot_is_back_after_its_authority_its_certificate_and_its_password_we
 
 
 def test_the_page_shows_a_renewed_certificate_to_new_connections(tmp_path: Path) -> None:
-    from pebble.web.serve import renew_certificate
+    from pebble.extensions.page.serve import renew_certificate
 
     certificates.init(tmp_path, ["localhost"])
     authority, files = tmp_path / "ca.pem", (tmp_path / "server.pem", tmp_path / "server.key")

@@ -1,6 +1,6 @@
 """Frames: pictures and sound from one writer to many readers on the same machine, through shared memory.
 
-A robot's streams are `camera` and `microphone`. docs/media.md follows one; decision 7 has the reasons.
+A robot's streams are `camera` and `microphone`. docs/ext/media.md follows one; decision 7 has the reasons.
 """
 
 from pebble.transports.frames.frame import Frame as Frame

@@ -10,7 +10,6 @@ from msgspec.structs import replace
 
 from pebble.config.hosts import HostError, check_web_url
 from pebble.config.media import AvDaemon, VideoStream
-from pebble.config.neighbours import Neighbours
 from pebble.config.problems import Path
 from pebble.config.reader import Check, Reader
 from pebble.config.rules.doors import check_doors, check_lan
@@ -21,9 +20,10 @@ from pebble.config.text_files import NotTextError, read_text
 from pebble.config.transport import Mqtt, RemoteMqtt, Tls, TransportSection
 from pebble.config.tree import MqttBridge, Root, SerialBridge, Services
 from pebble.config.types import Secret
-from pebble.config.web import WebInterface, WebTls
 from pebble.contract import DRIVE, OUTGOING, channel_of, is_reserved
 from pebble.contract.identity import GATEWAYS, SERVERS
+from pebble.extensions.page.config import WebInterface, WebTls
+from pebble.services.neighbours.config import Neighbours
 
 MOST_NEIGHBOURS, MOST_METRICS = 16, 32  # of one robot; metrics of one neighbour
 _TLS = ("tls/", "quic/")  # endpoints of Zenoh that are encrypted

@@ -3,12 +3,12 @@
 import re
 from collections.abc import Iterator
 
+from pebble.config.hosts import is_loopback
 from pebble.config.problems import Notes, Path
 from pebble.config.rules.exposure import brokers
 from pebble.config.rules.shared_topics import renamed_commands
 from pebble.config.transport import Mqtt, ZenohClient
 from pebble.config.tree import Root
-from pebble.config.web import is_loopback
 
 _ZENOH_ENCRYPTED = ("tls/", "quic/")
 _ZENOH_LOCAL = ("unixsock-stream/", "unixpipe/", "vsock/")
@@ -32,7 +32,7 @@ def warning_of_open(root: Root) -> str:
     places = [*hosts, *(endpoint for _, endpoint in _endpoints(root))]
     if root.security.level != "open" or not places:
         return ""
-    return f'security.level is "open": whoever may publish by {places[0]} drives this robot (docs/fleet.md)'
+    return f'security.level is "open": whoever may publish by {places[0]} drives this robot (docs/ext/fleet.md)'
 
 
 def _robots_brokers(root: Root) -> Iterator[tuple[Path, Mqtt]]:

@@ -5,10 +5,10 @@ import stat
 from collections.abc import Iterator
 from pathlib import Path as FilePath
 
+from pebble.config.hosts import is_loopback
 from pebble.config.problems import Notes, Path
 from pebble.config.transport import Mqtt
 from pebble.config.tree import Root
-from pebble.config.web import is_loopback
 
 
 def warn_if_readable(notes: Notes, path: Path, file: FilePath, what: str) -> None:

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from pebble.simulation.world.poses import RobotPose
+from pebble.extensions.lab.simulation.world.poses import RobotPose
 from tests.robot.closed_loop.aims import Samples
 from tests.robot.world_rig import TAG_SIZE_M, WorldRig
 from tests.support import gone, until

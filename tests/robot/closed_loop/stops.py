@@ -10,8 +10,8 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from pebble.client.scripted_operator import paced
 from pebble.config import load
+from pebble.extensions.operator.client.scripted_operator import paced
 from pebble.runtime.connections import local_transport
 from pebble.transports import QoS
 from tests.robot.closed_loop.aims import Samples

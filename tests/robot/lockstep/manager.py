@@ -7,7 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from pebble.config import Config
-from pebble.runtime.runs import RUN
+from pebble.extensions.scripts.runs import RUN
 from pebble.services.autonomy_manager.child import Launch
 from pebble.services.autonomy_manager.script import Dependency
 from pebble.services.autonomy_manager.script import Script as Described

@@ -7,10 +7,10 @@ from typing import Any
 
 import msgspec
 
-from pebble.client.estop import StopSender
-from pebble.client.estop_states import Reset, RobotEstop
 from pebble.contract import AUTONOMY_COMMAND, AUTONOMY_STATUS, CAPABILITIES, DRIVE, ESTOP, codec
 from pebble.contract.payloads import AutonomyStatus
+from pebble.extensions.operator.client.estop import StopSender
+from pebble.extensions.operator.client.estop_states import Reset, RobotEstop
 from pebble.transports import Message, QoS
 from tests.robot.lockstep.commands import PERSON, Command, Commands
 from tests.robot.lockstep.network import Connection, Network

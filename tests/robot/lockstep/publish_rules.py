@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pebble.contract.payloads import Drive
-from pebble.runtime.robot_estop import RobotEstop
+from pebble.extensions.operator.client.robot_estop import RobotEstop
 from tests.robot.lockstep.scheduler import Scheduler
 
 

@@ -9,10 +9,10 @@ from itertools import count
 from pebble.contract import DRIVE, ESTOP_STATE, codec
 from pebble.contract.payloads import Drive
 from pebble.errors import PayloadError
-from pebble.runtime.robot_estop import RobotEstop
-from pebble.script.drive_sender import DriveSender
-from pebble.script.guard import END_S
-from pebble.script.robot import EXIT_ENDED
+from pebble.extensions.operator.client.robot_estop import RobotEstop
+from pebble.extensions.scripts.script.drive_sender import DriveSender
+from pebble.extensions.scripts.script.guard import END_S
+from pebble.extensions.scripts.script.robot import EXIT_ENDED
 from pebble.transports import Message, QoS
 from tests.robot.lockstep.commands import Command, Commands
 from tests.robot.lockstep.network import Connection, Network

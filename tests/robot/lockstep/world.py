@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from pebble.config import Config, load
-from pebble.runtime.runs import next_run
+from pebble.extensions.scripts.runs import next_run
 from pebble.transports import Message
 from tests.robot.lockstep.commands import Commands
 from tests.robot.lockstep.manager import Manager

@@ -15,7 +15,7 @@ from contextlib import ExitStack, closing, suppress
 from pathlib import Path
 from typing import Any
 
-from pebble.client.estop import new_name
+from pebble.extensions.operator.client.estop import new_name
 from tests.kit.schedules import Engine, Outcome
 from tests.kit.stalls import Stalls
 from tests.robot.rig import Rig

@@ -10,7 +10,7 @@ from typing import Any
 
 import msgspec
 
-from pebble.simulation.trace import Entry, complete_lines
+from pebble.extensions.lab.simulation.trace import Entry, complete_lines
 
 
 @dataclass(frozen=True, slots=True)

@@ -10,11 +10,11 @@ import time
 from contextlib import suppress
 from typing import Any
 
-from pebble.client.estop import StopSender, new_name
-from pebble.client.estop_states import Reset, RobotEstop
 from pebble.contract import CAPABILITIES, DRIVE, ESTOP, ESTOP_STATE, ONLINE, codec
 from pebble.contract.payloads import EstopState
 from pebble.errors import PayloadError
+from pebble.extensions.operator.client.estop import StopSender, new_name
+from pebble.extensions.operator.client.estop_states import Reset, RobotEstop
 from pebble.transports import Message, MqttSettings, QoS, Transport, create
 from tests.robot.stop_schedules.history import History
 

@@ -15,8 +15,8 @@ from contextlib import ExitStack, closing, contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
-from pebble.client.estop import new_name
 from pebble.contract import DRIVE, ESTOP, ESTOP_STATE
+from pebble.extensions.operator.client.estop import new_name
 from pebble.transports import QoS
 from tests.robot.rig import Rig, descendants
 from tests.robot.stop_schedules.history import History, Wheels

@@ -23,9 +23,9 @@ from collections.abc import Callable
 from types import ModuleType
 from typing import Any
 
-from pebble.client.estop import StopSender
 from pebble.contract import CAPABILITIES, ESTOP, ESTOP_STATE, codec
 from pebble.contract.payloads import Capabilities, EstopCommand, EstopState
+from pebble.extensions.operator.client.estop import StopSender
 from pebble.motion.latch import Latch
 from pebble.services.mqtt_bridge import passed_stops
 from pebble.services.mqtt_bridge.stop_connection import Copies, Way

@@ -14,9 +14,9 @@ import pytest
 from pebble.forwarding.routing import Side
 from pebble.transports import Message, QoS
 from pebble.transports.memory import MemoryTransport
-from tests.recordings.demo_robots import DRIVE as RECORDED_DRIVE
-from tests.recordings.demo_robots import GOOB, messages, recorded
-from tests.recordings.replayed import Plays
+from tests.ext.recordings.demo_robots import DRIVE as RECORDED_DRIVE
+from tests.ext.recordings.demo_robots import GOOB, messages, recorded
+from tests.ext.recordings.replayed import Plays
 from tests.services.mqtt_bridge.bridge_rig import BASE, Client, MemoryRig, Quiet
 from tests.support import until
 

@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import Any
 
 from pebble.config import parse
+from pebble.extensions.lab.simulation.pty import PtyMcu
 from pebble.runtime.process import view_of
 from pebble.services.serial_mcu_bridge.text.motor_bridge import MotorBridge
-from pebble.simulation.pty import PtyMcu
 from pebble.transports import MqttSettings, create
 from pebble.transports.memory import MemoryHub
 from tests.kit.robot import BASE as BASE

@@ -10,13 +10,13 @@ from typing import Any
 
 import pytest
 
-from pebble.client.control import ControlClient, RobotControl
 from pebble.config import Security
 from pebble.contract import CONTROL_STATE, codec
 from pebble.contract.payloads import ControlRequest, ControlState, ControlVouched, Drive
+from pebble.extensions.operator.client.control import ControlClient, RobotControl
+from pebble.extensions.operator.client.robot_estop import RobotEstop
 from pebble.motion.arbiter import PERSON, REFUSED, Arbiter
 from pebble.motion.latch import Latch
-from pebble.runtime.robot_estop import RobotEstop
 from pebble.services.serial_mcu_bridge.motion.control import Control
 from pebble.transports.memory import MemoryHub
 from tests.services.serial_mcu_bridge.motor_rig import BASE, STOPPED, Bench

@@ -14,10 +14,10 @@ from pathlib import Path
 import pytest
 
 from pebble.errors import DeviceError
+from pebble.extensions.lab.simulation.pty import PtyMcu
 from pebble.services.serial_mcu_bridge.line.port import Port
 from pebble.services.serial_mcu_bridge.line.serial_line import LineState, SerialLine
 from pebble.services.serial_mcu_bridge.text.goob_base import STOP, drive_line, lights_line
-from pebble.simulation.pty import PtyMcu
 from tests.support import cases, until
 
 STOPPED = "M 0.000 0.000"

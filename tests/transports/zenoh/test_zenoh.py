@@ -22,8 +22,8 @@ import msgspec
 import pytest
 import zenoh
 
-from pebble.bench.usage import pss_mb
 from pebble.errors import TransportError
+from pebble.extensions.lab.bench.usage import pss_mb
 from pebble.runtime.hub import run_hub
 from pebble.transports import Message, QoS, State, TlsSettings, Transport, ZenohSettings, create
 from pebble.transports.zenoh import publishers, wire

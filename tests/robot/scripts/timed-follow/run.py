@@ -11,7 +11,7 @@ from pebble.cameras import Camera, Picture
 from pebble.transports import Transport
 from pebble.transports.frames import Frame
 
-FOLLOW = Path(pebble.__file__).parent / "scripts" / "apriltag-follow" / "run.py"
+FOLLOW = Path(pebble.__file__).parent / "extensions/scripts/shipped" / "apriltag-follow" / "run.py"
 _picture, _publish = Camera._picture, Transport.publish
 captured_ns = 0
 

@@ -1,0 +1,101 @@
+"""Checks what an account may publish and receive at a broker, and whether that broker holds small messages back."""
+
+from __future__ import annotations
+
+import secrets
+import time
+from collections.abc import Iterator
+from dataclasses import replace
+
+from pebble.config.security import SecurityLevel
+from pebble.contract import BRIDGE_PROBE, ONLINE
+from pebble.contract.identity import SERVERS, Identity
+from pebble.contract.levels import LEVELS
+from pebble.errors import TransportError
+from pebble.extensions.checks.broker.login_attempt import reached
+from pebble.extensions.checks.broker.messages import REFUSED, held_back
+from pebble.extensions.checks.broker.peer import BrokerTrial, Peer
+from pebble.extensions.checks.check import CheckResult, failed, ok, warn
+from pebble.forwarding.probes import new_probe
+from pebble.transports import MqttSettings
+
+_LARGE = 1000  # bytes of a nonce, written as 2 kB: more than a packet carries
+_MATTERS_S = 0.02  # a shorter round trip delays nothing that people notice: our own programs acknowledge at once
+
+
+def robot_account(
+    what: str,
+    settings: MqttSettings,
+    base: str,
+    answer_s: float = LEVELS["wide"].answer_s,
+    level: SecurityLevel = "open",
+    reads: str = "",
+) -> Iterator[CheckResult]:
+    """Publish probes, which no program takes for anything else, below ``base``, and see when they come back.
+
+    After ``answer_s`` one counts as lost. Above the level ``open`` one that poses as another robot has to be.
+    ``reads``: a filter that the broker must grant besides.
+    """
+    try:
+        with reached(settings, "") as trial:
+            trial.patience_s = answer_s
+            peer = trial.peer(protocol=settings.protocol)
+            if reads and (peer.subscribe(reads) or b"\xff")[0] >= REFUSED:
+                text = f"a page with this account does not hear robots: the broker refuses it {reads}"
+                yield failed(text, "pebble fleet check; its role is page", what)
+                return
+            topic = BRIDGE_PROBE.topic(base)
+            peer.subscribe(topic)
+            is_back, refusal = _echo(trial, peer, topic)
+            tells = settings.protocol == "5" and not reads  # what it refuses
+            if refusal or not (is_back or tells):
+                why = refusal or "it does not come back (or may this account not read it?)"
+                fix = f"allow it to write and read {topic.rpartition('/')[0]}/# on the broker"
+                yield failed(f"this account may not publish to {topic}: {why}", fix, what)
+                return
+            yield ok("accepts what this account publishes", what=what)
+            if level != "open":
+                yield _rules(what, trial, peer, topic)
+            if is_back and trial.round_trip_s >= _MATTERS_S:
+                yield replace(held_back(trial, peer, peer, topic), what=f"small messages at {what}")
+            if is_back and not _echo(trial, peer, topic, _LARGE)[0]:
+                text = "a message of 2 kB does not come back, small ones do: the way there seems to lose large packets"
+                yield warn(text, "set a smaller MTU at its network card, or let ICMP pass", what)
+    except TransportError as error:
+        yield warn(f"cannot be published to: {error}", what=what)
+
+
+def page_account(what: str, settings: MqttSettings, level: SecurityLevel = "open") -> Iterator[CheckResult]:
+    """Check that a page server with this account is sent what robots publish, and may publish itself."""
+    base, states = Identity("pebble", SERVERS, "doctor").base, ONLINE.filter("+/+/+")
+    return robot_account(what, settings, base, level=level, reads=states)
+
+
+def _echo(trial: BrokerTrial, peer: Peer, topic: str, nonce_bytes: int = 8) -> tuple[bool, str]:
+    """Publish a probe; True if it comes back, and why the broker does not take it, as far as it tells."""
+    payload, began = new_probe(time.time_ns() // 1_000_000, nonce_bytes), time.monotonic()
+    mid = peer.publish(topic, payload, qos=1)
+
+    def refusal() -> str:
+        if peer.acks.get(mid, 0) >= REFUSED:
+            return f"the broker refuses it (code {peer.acks[mid]})"
+        return "the broker hangs up on it" if peer.closed else ""
+
+    is_back = trial.wait(lambda: payload in peer.payloads() or refusal()) and payload in peer.payloads()
+    trial.round_trip_s = time.monotonic() - began if is_back else 0.0
+    return is_back, refusal()
+
+
+def _rules(what: str, trial: BrokerTrial, peer: Peer, topic: str) -> CheckResult:
+    """Check that the broker has rules: no robot, and no page, may publish what a robot of another name does."""
+    other = BRIDGE_PROBE.topic(f"pebble/robots/doctor-{secrets.token_hex(4)}")
+    peer.subscribe(other)
+    payload = new_probe(time.time_ns() // 1_000_000)
+    peer.publish(other, payload, qos=1)
+    is_back, _ = _echo(trial, peer, topic)  # what was let through has come before it
+    if payload in peer.payloads():
+        fix = "start it with the files of `pebble fleet init`, see docs/ext/fleet.md"
+        return failed("has no rules: with this account one can pose as any robot, and drive it", fix, what)
+    if not is_back and not peer.closed:
+        return warn("does not answer in time: whether it has rules is not known", what=what)
+    return ok("keeps this account from posing as another robot", what=what)

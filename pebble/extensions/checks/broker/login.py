@@ -1,0 +1,102 @@
+"""Checks whom a broker lets in, where it answers, and whether others can read what is sent to it."""
+
+import time
+from collections.abc import Iterable, Iterator
+from dataclasses import replace
+
+from pebble.config.hosts import is_loopback
+from pebble.config.secret_text import shown_user
+from pebble.config.security import SecurityLevel
+from pebble.extensions.checks.broker import MOSQUITTO
+from pebble.extensions.checks.broker.login_attempt import TIMEOUT_S, LoginAttempt, attempt
+from pebble.extensions.checks.check import SOON_DAYS, CheckResult, failed, ok, warn
+from pebble.extensions.checks.machine import printed
+from pebble.transports.settings import MqttSettings
+
+_REFUSED_ID = 2  # a return code of CONNACK (MQTT 3.1.1, table 3.1)
+_HERE_S = 1.0  # within which an address of this machine answers
+
+
+def broker(
+    name: str, settings: MqttSettings, level: SecurityLevel = "open", answer_s: float = TIMEOUT_S
+) -> Iterator[CheckResult]:
+    """Check that it answers, accepts the config's login, refuses anonymous ones, and is encrypted.
+
+    Above the level ``open`` one that lets everybody in is no mere warning.
+    """
+    what, is_here = f"{name} {settings.host}:{settings.port}", is_loopback(settings.host)
+    answer = attempt(settings, login=True, timeout_s=answer_s)
+    if answer.code is None:
+        start = "sudo systemctl start mosquitto" if is_here else f"nc -vz {settings.host} {settings.port}"
+        yield failed(f"cannot be reached: {answer.problem}", start, what)
+        return
+    yield replace(_own_login(settings, answer), what=what)
+    if answer.problem and not is_here:
+        fix = f"correct the addresses of {settings.host} in your DNS, or start the brokers there"
+        yield warn(f"has addresses that do not answer: {answer.problem}", fix, what)
+    without_name = answer if settings.username is None else attempt(settings, login=False, timeout_s=answer_s)
+    yield replace(_anonymous_login(without_name, level, is_here=is_here), what=what)
+    yield replace(_encryption(settings, answer, is_here=is_here), what=what)
+
+
+def _own_login(settings: MqttSettings, answer: LoginAttempt) -> CheckResult:
+    if answer.code == 0:
+        return ok(f"answers, and lets it in within {answer.took_ms:.1f} ms")
+    why = answer.refusal
+    if answer.code == _REFUSED_ID:
+        return failed(why, "let it admit any client id, or set remote_mqtt.client_id to one that it knows")
+    if settings.username is None:
+        return failed(f"refuses the login: {why}", "set username and password_file of this broker")
+    user = shown_user(settings.username)
+    fix = f"on the broker: sudo mosquitto_passwd /etc/mosquitto/passwd {user}"
+    return failed(f"refuses user {user}: {why}", fix)
+
+
+def _anonymous_login(answer: LoginAttempt, level: SecurityLevel, *, is_here: bool) -> CheckResult:
+    if answer.code != 0:
+        return ok("refuses anonymous logins")
+    if is_here:
+        return ok("accepts anonymous logins: every program on this machine can drive the robot")
+    return (warn if level == "open" else failed)(
+        "accepts anonymous logins: every client that reaches it can drive the robot",
+        f"{MOSQUITTO}allow_anonymous false, password_file /etc/mosquitto/passwd",
+    )
+
+
+def _encryption(settings: MqttSettings, answer: LoginAttempt, *, is_here: bool) -> CheckResult:
+    if settings.tls is None:
+        if is_here:
+            return ok("not encrypted, which is fine on this machine")
+        return warn("is not encrypted: commands and passwords can be read on the network", "set tls.enabled to true")
+    days = None if answer.expires is None else (answer.expires - time.time()) / 86400
+    if days is not None and days < SOON_DAYS:
+        return warn(f"its certificate expires in {days:.0f} days", "renew the broker's certificate")
+    if settings.tls.insecure:
+        return warn("encrypted, but the name in its certificate is not checked", "set tls.insecure to false")
+    return ok("encrypted" if days is None else f"encrypted, its certificate for {days:.0f} more days")
+
+
+def beyond_loopback(name: str, settings: MqttSettings, addresses: Iterable[str]) -> Iterator[CheckResult]:
+    """Try the port of a broker that is meant for its machine alone at each of ``addresses``."""
+    tls = None if settings.tls is None else replace(settings.tls, insecure=True)  # its certificate names the loopback
+    codes = {
+        address: attempt(replace(settings, host=address, tls=tls), login=False, timeout_s=_HERE_S).code
+        for address in addresses
+    }
+    what = f"{name} {settings.host}:{settings.port}"
+    answering = [address for address, code in codes.items() if code is not None]
+    if anonymous := [address for address, code in codes.items() if code == 0]:
+        yield warn(
+            f"also answers at {', '.join(anonymous)} and accepts anonymous logins: the network can drive the robot",
+            f"{MOSQUITTO}listener {settings.port} 127.0.0.1, or allow_anonymous false and a password_file",
+            what,
+        )
+    elif answering:
+        yield ok(f"also answers at {', '.join(answering)}, and refuses anonymous logins there", what=what)
+    elif codes:
+        yield ok(f"does not answer at {', '.join(codes)}", what=what)
+
+
+def own_addresses() -> list[str]:
+    """Return the addresses of this machine on its networks; none on systems whose ``hostname`` does not tell them."""
+    return printed("hostname", "-I").split()

@@ -1,0 +1,84 @@
+"""One login at a broker: the broker's answer, how long it took, and its certificate."""
+
+import ssl
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+
+from pebble.errors import TransportError
+from pebble.extensions.checks.broker.peer import BrokerTrial
+from pebble.transports.hosts import Address, addresses_of, described
+from pebble.transports.mqtt import reasons
+from pebble.transports.settings import MqttSettings
+
+TIMEOUT_S = 3.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LoginAttempt:
+    """The result of one login. ``code`` is CONNACK's (0: accepted), None without one; ``problem`` is the reason.
+
+    With a code, ``problem`` names the addresses of the host that were tried before and failed.
+    """
+
+    code: int | None = None
+    took_ms: float = 0.0
+    problem: str = ""
+    expires: float | None = None  # the broker's certificate, in epoch seconds
+    address: Address | None = None  # that accepted the login
+
+    @property
+    def refusal(self) -> str:
+        """Return why there was no login; empty: it was accepted."""
+        return self.problem if self.code is None else reasons.connection_refused(self.code) * bool(self.code)
+
+
+def attempt(settings: MqttSettings, *, login: bool, timeout_s: float = TIMEOUT_S) -> LoginAttempt:
+    """Connect and disconnect, with the settings' user and password or (``login=False``) anonymously.
+
+    Where the host has several addresses, the first one counts that accepts the login, else the last one that answers.
+    """
+    if not login:
+        settings = replace(settings, username=None, password=None, password_file=None)
+    try:
+        addresses = addresses_of(settings.host, settings.port)
+    except UnicodeError:  # a label that is too long as it travels
+        return LoginAttempt(problem=f"{settings.host} is no name of a host")
+    except OSError as error:
+        return LoginAttempt(problem=error.strerror or str(error))
+    answered, failures = LoginAttempt(), {}
+    for address in addresses:
+        began = time.monotonic()
+        try:
+            trial = BrokerTrial(settings, address, "", patience_s=timeout_s)
+            expires = _expiry(trial.peer().sock)
+        except TransportError as error:
+            if (code := getattr(error, "code", None)) is None:
+                failures[f"{address.text}:"] = str(error)
+            else:
+                answered = LoginAttempt(code=code)
+            continue
+        answered = LoginAttempt(code=0, took_ms=1000 * (time.monotonic() - began), expires=expires, address=address)
+        trial.close()
+        break
+    return replace(answered, problem=described(failures) if len(addresses) > 1 else "".join(failures.values()))
+
+
+def _expiry(sock: object) -> float | None:
+    certificate = sock.getpeercert() if isinstance(sock, ssl.SSLSocket) else None
+    until = certificate.get("notAfter") if certificate else None
+    return ssl.cert_time_to_seconds(until) if isinstance(until, str) else None
+
+
+@contextmanager
+def reached(settings: MqttSettings, below: str, restart: Callable[[], bool] | None = None) -> Iterator[BrokerTrial]:
+    """Try the broker at the address that accepts a login; at the end everything is removed. Raises TransportError."""
+    answer = attempt(settings, login=True)
+    if answer.address is None:
+        raise TransportError(f"broker {settings.host}:{settings.port} cannot be used: {answer.refusal}")
+    trial = BrokerTrial(settings, answer.address, below, restart)
+    try:
+        yield trial
+    finally:
+        trial.close()

@@ -1,0 +1,259 @@
+"""Probes of a broker: what an account may do there, and how messages arrive."""
+
+from __future__ import annotations
+
+import secrets
+import time
+from statistics import median
+
+from pebble.extensions.checks.broker import MOSQUITTO, OTHER
+from pebble.extensions.checks.broker.peer import BrokerTrial, Peer, Received, RefusedError
+from pebble.extensions.checks.check import CheckResult, failed, ok, skipped, warn
+from pebble.forwarding.probes import new_probe
+from pebble.transports import Message, QoS
+
+_APART_S = 0.005  # between the two messages of a pair
+_HELD_S = 0.03  # by which Nagle's algorithm delays where the receiver's kernel confirms late
+_HELD = 0.75  # of a round trip: a thin link itself needs some of it for the second message
+_PAIRS = 5
+_PING_TRIES = 3  # an answer that comes too early may by chance come last
+_PING_S = 2.0  # after which a robot gives a connection up
+_WILL_S = 1.0
+REFUSED = 0x80
+
+#: What a name of a robot or of a channel may contain, below a topic of our own.
+_ODD_TOPICS = {
+    "a blank": "a b",
+    "a dot": "a.b",
+    "* and >": "*/>",
+    "letters beyond ASCII": "ä/機",
+    "190 levels": "/".join("l" * 190),
+    "900 bytes": 900 * "n",
+}
+
+
+# -- rights
+
+
+def rights(trial: BrokerTrial) -> CheckResult:
+    """Publish and read; and find out for the other probes whether there is QoS 1, and whether anything is retained."""
+    fix = (
+        "use a robot's account and its topics: --below pebble/robots/ID; "
+        f"or allow these ({MOSQUITTO}an acl_file with topic readwrite {trial.below}/#)"
+    )
+    reader, writer = trial.peer(), trial.peer()
+    granted, began = reader.subscribe("#"), time.monotonic()
+    if not granted or granted[0] >= REFUSED:
+        return failed(f"this account may not subscribe to {trial.base}/#", fix)
+    mid = writer.publish("x", qos=1)
+    trial.wait(lambda: (mid in writer.acks and reader.received) or writer.closed)
+    has_qos_1 = mid in writer.acks and bool(reader.received) and not writer.closed
+    if has_qos_1:
+        trial.round_trip_s = min(1.0, time.monotonic() - began)
+    elif why := _why_unread(trial, reader):
+        return failed(why, fix)
+    trial.qos = int(has_qos_1 and granted == b"\x01")
+    kept = _kept(trial)
+    trial.retains = kept is not None
+    if kept is not None and not kept.retain:
+        return failed("what it retains comes without the retain flag: a command of yesterday looks new", OTHER)
+    lacks = [
+        *([] if trial.qos else ["it has no QoS 1: events and answers may be lost on the way"]),
+        *([] if trial.retains else ["it retains nothing: who connects later sees no state until it changes"]),
+    ]
+    if lacks:
+        return warn("; ".join(lacks), f"{MOSQUITTO}max_qos 2, retain_available true")
+    took = f"a round trip takes {1000 * trial.round_trip_s:.1f} ms"
+    return ok(f"this account publishes and reads below {trial.below}/; {took}")
+
+
+def _why_unread(trial: BrokerTrial, reader: Peer) -> str:
+    """Publish without QoS 1, too; return why even that is not read, or nothing."""
+    writer = trial.peer()
+    writer.publish("x")
+    if not trial.wait(lambda: reader.received or writer.closed):
+        may = "publish" if _is_forbidden(trial) else "read"
+        return f"this account may not {may} {trial.base}/x, and is not told"
+    return f"it hangs up on what this account publishes to {trial.base}/x" if writer.closed else ""
+
+
+def _kept(trial: BrokerTrial) -> Received | None:
+    """Return what a later subscriber gets of a message that was to be retained."""
+    writer, late = trial.peer(), trial.peer()
+    writer.publish("retained", qos=trial.qos, retain=True)
+    writer.ping()
+    late.subscribe("retained", qos=0)
+    if not trial.wait(lambda: late.received):
+        trial.left.clear()
+        return None
+    return late.received[0]
+
+
+def _is_forbidden(trial: BrokerTrial) -> bool | None:
+    """True if a message is not taken; only MQTT 5 tells, so None is possible."""
+    try:
+        writer = trial.peer(protocol="5")
+    except RefusedError:
+        return None
+    mid = writer.publish("x", qos=1)
+    if not trial.wait(lambda: mid in writer.acks or writer.closed) or writer.closed:
+        return None
+    return writer.acks[mid] >= REFUSED
+
+
+def refusals(trial: BrokerTrial) -> CheckResult:
+    """Subscribe where no rule mentions the topic: an account with rules is refused that."""
+    trial.base = f"{secrets.token_hex(8)}/doctor/one"
+    reader, writer = trial.peer(), trial.peer()
+    granted = reader.subscribe("#", qos=0)
+    if granted and granted[0] >= REFUSED:
+        return ok("it tells which it refuses")
+    if not granted:
+        return warn("it answers one that is not allowed by nothing, or hangs up")
+    writer.publish("x")
+    if trial.wait(lambda: reader.received, 1.0):
+        return skipped("this account is refused none")
+    if _is_forbidden(trial) is False:
+        return warn("it grants them, and then delivers nothing")
+    return skipped("it grants them, and nothing comes: this account may not publish there, or may not read")
+
+
+# -- messages
+
+
+def topics(trial: BrokerTrial) -> CheckResult:
+    reader = trial.peer()
+    reader.subscribe("#", qos=0)
+    for name in _ODD_TOPICS.values():
+        trial.peer().publish(name)  # each with a connection of its own: some brokers end it
+    trial.wait(lambda: len(reader.topics()) >= len(_ODD_TOPICS) or reader.closed)
+    lacks = [words for words, name in _ODD_TOPICS.items() if name not in reader.topics()]
+    if lacks:
+        return warn(f"it does not carry those with {', '.join(lacks)}", "give robots names of A-Z, a-z, 0-9, _ and -")
+    return ok(f"also those with {', '.join(_ODD_TOPICS)}")
+
+
+def delay(trial: BrokerTrial) -> CheckResult:
+    reader, writer = trial.peer(), trial.peer()
+    reader.subscribe("#", qos=0)
+    return held_back(trial, reader, writer, "x")
+
+
+def held_back(trial: BrokerTrial, reader: Peer, writer: Peer, topic: str) -> CheckResult:
+    """Judge whether a message waits, by Nagle's algorithm, until the receiver's kernel has confirmed the one before."""
+    pairs = [pair for _ in range(_PAIRS) if (pair := _pair(trial, reader, writer, topic)) is not None]
+    if len(pairs) < _PAIRS:
+        return failed("they are lost on an idle connection", OTHER)
+    round_trip_s, late_s = min(pair[0] for pair in pairs), median(pair[1] for pair in pairs) - _APART_S
+    if late_s < max(_HELD_S, _HELD * round_trip_s):
+        return ok("are passed on at once")
+    text = f"it holds them back: a message that follows another one comes {1000 * late_s:.0f} ms late"
+    return warn(text, f"{MOSQUITTO}set_tcp_nodelay true")
+
+
+def _pair(trial: BrokerTrial, reader: Peer, writer: Peer, topic: str) -> tuple[float, float] | None:
+    """Return the round trip of a message, and how long after it a second one comes; None if one is lost."""
+    reader.acknowledge_late()
+    began, probes = time.monotonic(), [new_probe(number) for number in range(2)]
+    for probe in probes:
+        writer.publish(topic, probe)
+        trial.wait(lambda: False, _APART_S)
+    if not trial.wait(lambda: set(probes) <= set(reader.payloads())):
+        return None
+    trial.wait(lambda: False, 2 * _HELD_S + trial.round_trip_s)  # the pair is acknowledged then
+    first, second = (message.at for message in reader.received if message.payload in probes)
+    return first - began, second - first
+
+
+def pings(trial: BrokerTrial) -> CheckResult:
+    peer = trial.peer()
+    peer.subscribe("#", qos=0)
+    began = time.monotonic()
+    if not peer.ping():
+        return failed("it does not answer a ping", "use another broker: robots would connect anew all the time")
+    seconds = time.monotonic() - began
+    late = max(_late(trial, peer) for _ in range(_PING_TRIES))
+    if seconds > _PING_S:
+        return failed(f"it takes {seconds:.1f} s for one", "use a broker that is nearer, or less busy")
+    if late:
+        return warn(f"it answers before it has passed on what came before ({late} of 20 messages)")
+    return ok(f"after {1000 * seconds:.1f} ms, behind what came before")
+
+
+def _late(trial: BrokerTrial, peer: Peer) -> int:
+    """Return how many of twenty messages come after the answer to a ping that was sent after them."""
+    for place in range(20):
+        peer.publish("x", b"%d" % place)
+    peer.ping()
+    trial.wait_quiet(peer)
+    return len(peer.received) - peer.pongs[-1]
+
+
+def overlaps(trial: BrokerTrial) -> CheckResult:
+    reader, writer = trial.peer(), trial.peer()
+    reader.subscribe("a/b", "a/+", "#", qos=trial.qos)
+    writer.publish("a/b", qos=trial.qos)
+    trial.wait(lambda: reader.received)
+    trial.wait_quiet(reader)
+    copies = len(reader.received)
+    if copies > 1:
+        return warn(f"a client with three of them gets {copies} copies of a message", "subscribe to one filter only")
+    return ok("one copy of each message")
+
+
+def as_published(trial: BrokerTrial) -> CheckResult:
+    lacks = {}
+    for words, protocol, bridge in (("bridge mode of 3.1.1", "3.1.1", True), ("MQTT 5", "5", False)):
+        trial.begin()
+        try:
+            peer = trial.peer(protocol=protocol, bridge=bridge)
+            lacks[words] = _lacks_of_flags(trial, peer, modern=protocol == "5")
+        except RefusedError:
+            continue
+    working = [words for words, lack in lacks.items() if not lack]
+    if working:
+        told = "own messages do not come back, and tell whether they were to be retained"
+        return ok(f"{told}, with {' and '.join(working)}")
+    text = "; ".join(f"{words}: {lack}" for words, lack in lacks.items()) or "it has neither bridge mode nor MQTT 5"
+    return warn(text, "a robot works without; mqtt_mirror needs a broker with it, as mosquitto")
+
+
+def _lacks_of_flags(trial: BrokerTrial, peer: Peer, *, modern: bool) -> str:
+    """Return what it lacks of noLocal and retain-as-published; empty if nothing."""
+    other, granted = trial.peer(), peer.subscribe("#", qos=trial.qos, options=modern)
+    peer.publish("own", qos=trial.qos)
+    other.publish("other", b"1", qos=trial.qos, retain=trial.retains)
+    trial.wait(lambda: peer.payloads("other"))
+    trial.wait_quiet(peer)
+    if not granted or not peer.payloads("other"):
+        return "nothing comes"
+    if peer.payloads("own"):
+        return "own messages come back"
+    return "" if peer.received[-1].retain or not trial.retains else "the retain flag is lost"
+
+
+# -- the end of a connection
+
+
+def last_will(trial: BrokerTrial) -> CheckResult:
+    reader, retain = trial.peer(), trial.retains
+    reader.subscribe("#", qos=trial.qos)
+    try:
+        robot = trial.peer(will=Message("online", b"gone", QoS(trial.qos), retain=retain))
+    except RefusedError as error:
+        return warn(f"it refuses a client with a will: {error}", "allow wills, also retained ones of QoS 1")
+    robot.publish("online", b"here", qos=trial.qos, retain=retain)
+    trial.wait(lambda: reader.received)
+    began = time.monotonic()
+    robot.cut()
+    if not trial.wait(lambda: b"gone" in reader.payloads(), 3 * trial.answer_s):
+        return warn("none is published when a connection is reset", "allow wills (an access list may forbid them)")
+    seconds = time.monotonic() - began
+    if seconds > _WILL_S + trial.round_trip_s:
+        return warn(f"one is published {seconds:.1f} s after the connection is reset")
+    late = trial.peer()
+    late.subscribe("online", qos=trial.qos)
+    trial.wait(lambda: not retain or late.received)
+    if retain and late.payloads()[-1:] != [b"gone"]:
+        return warn("one is published, and not retained", "allow retained wills")
+    return ok(f"once, {seconds:.2f} s after a reset{', and retained' if retain else ''}")

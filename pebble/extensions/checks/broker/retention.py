@@ -1,0 +1,95 @@
+"""Probes of a broker: what it retains, for whom, and in which order that comes."""
+
+from __future__ import annotations
+
+from itertools import count, pairwise
+
+from pebble.extensions.checks.broker import MOSQUITTO, OTHER
+from pebble.extensions.checks.broker.peer import BrokerTrial, RefusedError
+from pebble.extensions.checks.check import CheckResult, failed, ok, skipped, warn
+
+_STATES = 200  # retained ones; a robot has some twenty
+_TURNS = 6  # in which one asks for it after a restart
+_BY_NAME = 8  # filters in one SUBSCRIBE: AWS IoT closes the connection for more
+_PERSISTENT = f"{MOSQUITTO}persistence true, persistence_location /var/lib/mosquitto/, autosave_on_changes true"
+
+
+def retains(trial: BrokerTrial) -> str:
+    return "" if trial.retains else "it retains nothing"
+
+
+def is_restarted(trial: BrokerTrial) -> str:
+    return "" if trial.restart is not None else "it was not restarted: --restart asks for that"
+
+
+def _retain_states(trial: BrokerTrial) -> list[str]:
+    names, writer = [f"s/{place}" for place in range(_STATES)], trial.peer()
+    for name in names:
+        writer.publish(name, qos=0, retain=True)
+    writer.ping()
+    return names
+
+
+def by_wildcard(trial: BrokerTrial) -> CheckResult:
+    names = set(_retain_states(trial))
+    counts = []
+    for filter_ in ("s/+", "#"):
+        reader = trial.peer()
+        reader.subscribe(filter_, qos=0)
+        trial.wait(lambda: len(reader.topics()) == len(names) or reader.closed)  # noqa: B023
+        counts.append(len(reader.topics() & names))
+    trial.wildcards = min(counts) > 0
+    if not min(counts):
+        return warn("nothing comes: only subscriptions of exact names get retained messages")
+    if min(counts) < len(names):
+        return failed(f"{min(counts)} of {len(names)} come", f"{MOSQUITTO}max_queued_messages 1000")
+    return ok(f"all {len(names)}")
+
+
+def before_pong(trial: BrokerTrial) -> CheckResult:
+    names, reader = _retain_states(trial), trial.peer()
+    reader.subscribe(*(["#"] if trial.wildcards else names[:_BY_NAME]), qos=0)
+    reader.ping()
+    expected = len(names) if trial.wildcards else _BY_NAME
+    trial.wait(lambda: len(reader.received) >= expected)
+    late = len(reader.received) - (reader.pongs or [0])[0]
+    return warn(f"{late} of {expected} come later") if late else ok("all of them")
+
+
+def order(trial: BrokerTrial) -> CheckResult:
+    writer, readers, numbers = trial.peer(), [trial.peer() for _ in range(8)], count(1)
+    for reader in readers:
+        for _ in range(10):
+            writer.publish("state", b"%d" % next(numbers), qos=trial.qos, retain=True)
+        reader.subscribe("state", qos=trial.qos)
+    writer.ping()
+    trial.wait_quiet(*readers)
+    received = [[int(payload) if payload.isdigit() else -1 for payload in reader.payloads()] for reader in readers]
+    newest = next(numbers) - 1
+    wrong = [reader for reader, seen in zip(readers, received, strict=True) if seen[-1:] != [newest]]
+    if any(not reader.received or not reader.received[-1].retain for reader in wrong):
+        return failed("the last value that comes to a new subscription is not the newest", OTHER)
+    if wrong:
+        return warn("a retained value comes after a newer live one")
+    if any(after < before for seen in received for before, after in pairwise(seen)):
+        return warn("an older value may come between, to who subscribes while others publish; the newest is last")
+    return ok("no older value comes after a newer one")
+
+
+def restarted(trial: BrokerTrial) -> CheckResult:
+    writer = trial.peer()
+    mid = writer.publish("state", b"1", qos=trial.qos, retain=True)
+    trial.wait(lambda: mid in writer.acks or not trial.qos)
+    if trial.restart is None or not trial.restart():
+        return skipped("it was not restarted")
+    if writer.ping():
+        return skipped("it was not restarted: a connection from before is still open")
+    for turn in range(_TURNS):  # NATS lets clients in some seconds before it has read what it retains
+        try:
+            late = trial.peer()
+        except RefusedError as error:
+            return failed(f"it takes no connection since: {error}", "see why in its log")
+        late.subscribe("state", qos=trial.qos)
+        if trial.wait(lambda: late.received, trial.answer_s / 3):  # noqa: B023
+            return ok("it is there again" + (", some seconds later" if turn else ""))
+    return warn("it is gone", _PERSISTENT)

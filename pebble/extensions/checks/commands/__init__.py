@@ -1,0 +1,1 @@
+"""The commands that check a machine, a robot or a broker."""

@@ -1,0 +1,276 @@
+"""Checks that turn wheels, as far as the robot shows them. A person has agreed, and looks on."""
+
+from __future__ import annotations
+
+import secrets
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from math import inf
+from typing import Any
+
+import msgspec
+
+from pebble import contract as c
+from pebble.extensions.checks.check import Check, CheckResult, State, failed, ok, skipped
+from pebble.extensions.checks.conform.checks import (
+    BY,
+    END_IT,
+    commanded,
+    controls,
+    drives,
+    free,
+    freed,
+    reset,
+    stop,
+    stops,
+)
+from pebble.extensions.checks.conform.control import DRIVES_S, SPEED, STEP_S, UNSEEN, Driver, named
+from pebble.extensions.checks.observer import ANSWER_S, Observer
+
+RESTS_S = 0.75  # after the last command, at the latest
+LATE_S = 0.5  # until a report of it is here
+_SWING = 30  # of a hall sensor's value: less is noise
+_OTHER_KEY, _OTHER_ACCOUNT = "0badf00d", "conform-other"
+_NOT_SHOWN = skipped(
+    "nothing that it publishes shows whether it moves",
+    'publish {"value": {"wheels": [left, right]}} on outgoing/status whenever they change, or touch-sensors',
+)
+
+
+def moves_until(robot: Observer, since: float) -> float | None:
+    """Return when the last motion after ``since`` ended: infinite while it lasts, 0 without any, None if none is shown.
+
+    It is shown by ``wheels`` in the status, which is published on change, or by readings of hall sensors.
+    """
+    reports = _shown(robot)
+    readings = [(record.at, record.value.value) for record in robot.of(c.TOUCH_SENSORS) if record.value]
+    if not reports and not readings:
+        return None
+    ends = [*(at for at, _ in reports[1:]), inf]  # a report holds until the next one
+    turns = [end for (_, wheels), end in zip(reports, ends, strict=False) if any(wheels)]
+    return max((at for at in (*turns, *_swings(readings)) if at > since), default=0.0)
+
+
+def _swings(readings: list[tuple[float, Any]]) -> Iterator[float]:
+    """Return when a hall sensor's value differed from that at the last swing by more than noise."""
+    level: tuple[int, ...] = ()
+    for at, sensors in readings:
+        values = msgspec.structs.astuple(sensors)
+        if any(abs(value - before) > _SWING for value, before in zip(values, level or values, strict=True)):
+            yield at
+            level = values
+        level = level or values
+
+
+def _shown(robot: Observer) -> list[tuple[float, list[float]]]:
+    """Return since when its wheels did what."""
+    reports = [(report.at, report.value.value.get("wheels")) for report in robot.of(c.STATUS) if report.value]
+    return robot.eyes() or [(at, wheels) for at, wheels in reports if _are_wheels(wheels)]
+
+
+def _moves(robot: Observer, since: float) -> list[float] | None:
+    """Return what its wheels do by commands since then; empty: nothing, None: it is not shown."""
+
+    def moving() -> list[float]:
+        return next((wheels for at, wheels in reversed(_shown(robot)) if at >= since and any(wheels)), [])
+
+    robot.wait(moving, ANSWER_S)
+    robot.look(LATE_S)
+    return moving() if _shown(robot) else None
+
+
+def _are_wheels(value: Any) -> bool:
+    return isinstance(value, list) and len(value) > 0 and all(isinstance(speed, int | float) for speed in value)
+
+
+@contextmanager
+def at_the_wheel(robot: Observer, by: str = BY, answer_s: float = ANSWER_S) -> Iterator[Driver]:
+    """Take control if it is free, and let go, so that a wait after a reset is over; at the end, too."""
+    driver = Driver(robot, by)
+    try:
+        if robot.view.controlled:
+            driver.asks(for_ms=10_000)
+            robot.answers(lambda: driver.holds, answer_s)
+        if driver.may_drive:
+            driver.send()
+            robot.wait(lambda: moves_until(robot, time.monotonic()) != inf, ANSWER_S)
+        yield driver
+    finally:
+        if driver.may_drive:
+            driver.send(valid_ms=0)
+        driver.leaves()
+
+
+def _driven(test: Callable[[Observer, Driver], CheckResult]) -> Callable[[Observer], CheckResult]:
+    def run(robot: Observer) -> CheckResult:
+        with at_the_wheel(robot) as driver:
+            return test(robot, driver)
+
+    return run
+
+
+def _rest(robot: Observer, began: float, last: float, limit_s: float, what: str = "the last command") -> CheckResult:
+    robot.look(limit_s + LATE_S)
+    return rested(robot, began, last, limit_s, what)
+
+
+def rested(robot: Observer, began: float, last: float, limit_s: float, what: str = "the last command") -> CheckResult:
+    """Judge what was seen of a robot that was driven from ``began`` to ``last``, and had to rest soon after."""
+    until = moves_until(robot, began)
+    if until is None:
+        return _NOT_SHOWN
+    if until == 0.0:
+        return failed("its commands do not move it", "drive by incoming/drive-values, live ones")
+    if until > last + limit_s + LATE_S / 2:
+        shown = "still moves" if until == inf else f"moved for {until - last:.2f} s"
+        return failed(f"it {shown} after {what}", f"stop {limit_s:g} s after {what}, at the latest")
+    return ok(f"it rests {max(0.0, until - last):.2f} s after {what}")
+
+
+def _moved(robot: Observer, since: float, why: str, fix: str) -> CheckResult:
+    """Return a failure if it has moved."""
+    robot.look(robot.patience_s)
+    until = moves_until(robot, since)
+    if until is None:
+        return _NOT_SHOWN
+    return failed(why, fix) if until > since else ok("it moves nothing")
+
+
+def _dead_man(robot: Observer, driver: Driver) -> CheckResult:
+    return _rest(robot, *driver.drive(), RESTS_S)
+
+
+def _valid_ms(robot: Observer, driver: Driver) -> CheckResult:
+    """Drive by commands with a short time, and with one that is too long."""
+    outcome = _rest(robot, *driver.drive(valid_ms=150), 0.15)
+    if outcome.state is not State.OK:
+        return outcome
+    last = _rest(robot, *driver.drive(0.2, valid_ms=4000), RESTS_S)
+    return outcome if last.state is State.OK else failed(f"valid_ms 4000: {last.text}", last.fix)
+
+
+def _zero(robot: Observer, driver: Driver) -> CheckResult:
+    """Send a zero that is not the driver's: it needs no key."""
+    began, _ = driver.drive()
+    return _rest(robot, began, driver.send(key=_OTHER_KEY), 0.1, "a zero with another key")
+
+
+def _steering(robot: Observer, driver: Driver) -> CheckResult:
+    ways: tuple[tuple[dict[str, Any], tuple[int, int]], ...] = (
+        ({"z": 0, "x": SPEED}, (1, -1)),
+        ({"z": SPEED}, (1, 1)),
+        ({"z": -SPEED, "wrapped": True}, (-1, -1)),
+    )
+    for fields, signs in ways:
+        wheels = _moves(robot, driver.drive(DRIVES_S / 2, **fields)[0])
+        if wheels is None:
+            return _NOT_SHOWN
+        if [speed * sign > 0 for speed, sign in zip(wheels, signs, strict=False)] != [True, True]:
+            sent = f"x {fields.get('x', 0):g}, z {fields['z']:g}" + " within value" * ("wrapped" in fields)
+            return failed(f"at {sent} its wheels do {wheels}", "left is z + x, right is z - x, also within value")
+    return ok("x to the right, z ahead")
+
+
+def _stop_moving(robot: Observer, driver: Driver) -> CheckResult:
+    """Go on with commands, and begin again after the stick was let go; they move nothing."""
+    began, _ = driver.drive()
+    at = time.monotonic()
+    stop(robot, secrets.token_hex(8))
+    driver.drive()
+    driver.send()
+    driver.drive(DRIVES_S / 2)
+    outcome = _rest(robot, began, at, 0.25, "the stop")
+    return outcome if freed(robot) else failed("a reset does not end the stop", END_IT)
+
+
+def _reset_waits(robot: Observer, driver: Driver) -> CheckResult:
+    """Hold the stick down meanwhile. A zero of another ends no wait while one has control."""
+    stop(robot, secrets.token_hex(8))
+    began, _ = driver.drive(2 * STEP_S)  # from before the reset on: a pause would end the wait
+    reset(robot)
+    driver.drive(DRIVES_S / 2)
+    if robot.view.controlled:
+        driver.send(key=_OTHER_KEY)
+    driver.drive()
+    why = "a stick that is held down moves it after a reset"
+    outcome = _moved(robot, began, why, "wait for a zero of who has control, or for 0.5 s without commands")
+    if outcome.state is State.OK:
+        driver.send()
+        outcome = _rest(robot, *driver.drive(), RESTS_S)
+    is_free = robot.wait(lambda: not robot.view.latched, ANSWER_S)
+    return outcome if is_free else failed("a reset does not end the stop", END_IT)
+
+
+def _not_a_number(robot: Observer, _driver: Driver) -> CheckResult:
+    began = time.monotonic()
+    for number in (b"NaN", b"Infinity", b"1e999", b'"nan"', b"null"):
+        robot.send(c.DRIVE, b'{"x": 0, "z": %s}' % number)
+    return _moved(robot, began, "it moves by a command that is no number", "refuse NaN and infinity")
+
+
+def _clamped(robot: Observer, driver: Driver) -> CheckResult:
+    wheels = _moves(robot, driver.drive(DRIVES_S / 2, z=9, x=-9)[0])
+    if wheels is None:
+        return _NOT_SHOWN
+    if not wheels:
+        return failed("x -9, z 9 does not move it", "clamp both axes to -1..1, and obey")
+    largest = max(map(abs, wheels))
+    if largest > 1.0:
+        return failed(f"a wheel got {largest:g}", "clamp both axes to -1..1, and the sum of them for each wheel")
+    return ok(f"{largest:g} at most")
+
+
+def _foreign_key(robot: Observer, driver: Driver) -> CheckResult:
+    """Drive with another's key while one has control, and while none has."""
+    why, fix = "it moves by another's key", "refuse what moves and has another key"
+    outcome = _moved(robot, driver.drive(key=_OTHER_KEY)[0], why, fix)
+    if outcome.state is not State.OK:
+        return outcome
+    driver.leaves()
+    return _moved(robot, driver.drive(DRIVES_S / 2, key=_OTHER_KEY)[0], f"{why} while no one has control", fix)
+
+
+def _control_passes(robot: Observer, driver: Driver) -> CheckResult:
+    began, _ = driver.drive()
+    key, second = driver.key, Driver(robot)
+    at = second.takes()
+    robot.answers(lambda: second.holds)
+    driver.drive(key=key)
+    outcome = _rest(robot, began, at, 0.25, "another took control")
+    second.leaves()
+    return outcome
+
+
+def _keyless(robot: Observer, driver: Driver) -> CheckResult:
+    began, _ = driver.drive(key="")
+    return _moved(robot, began, "it moves by a command without a key", "at level named refuse those")
+
+
+def _foreign_account(robot: Observer, driver: Driver) -> CheckResult:
+    """Send the key of control behind another account, and behind none."""
+    command = msgspec.json.encode({"x": 0, "z": SPEED, "key": driver.key})
+    began = time.monotonic()
+    delivered = [robot.send_as(account, c.DRIVE, command) for account in (_OTHER_ACCOUNT, "")]
+    fix = "a key counts with the account that asked for it"
+    outcome = _moved(robot, began, "it moves by a key that another sends", fix)
+    return outcome if all(delivered) or outcome.state is State.FAILED else skipped(UNSEEN)
+
+
+_MOVES = (drives, free, commanded)
+_BY_TURNS = (*_MOVES, controls)
+
+MOVING: tuple[Check[Observer], ...] = (
+    Check("dead man", _driven(_dead_man), _MOVES, "a driver may vanish at any moment"),
+    Check("validity", _driven(_valid_ms), _MOVES, "a command tells how long it counts, but never long"),
+    Check("zero", _driven(_zero), _MOVES, "who lets go expects it to stop at once, and anyone may halt it"),
+    Check("steering", _driven(_steering), _MOVES, "a person must know where it will go"),
+    Check("no number", _driven(_not_a_number), _MOVES, "a speed that is no number must not be one"),
+    Check("clamps", _driven(_clamped), _MOVES, "motors get no more than everything"),
+    Check("foreign key", _driven(_foreign_key), _BY_TURNS, "who had control before must not drive on"),
+    Check("control passes", _driven(_control_passes), _BY_TURNS, "the next driver must not get a robot that moves"),
+    Check("stop moving", _driven(_stop_moving), (*_MOVES, stops), "a stopped robot does not move, whatever is sent"),
+    Check("reset waits", _driven(_reset_waits), (*_MOVES, stops), "who resets must not be surprised by a stick"),
+    Check("keyless", _driven(_keyless), _BY_TURNS, "where names are checked, who drives is known", binds=named),
+    Check("foreign account", _driven(_foreign_account), _BY_TURNS, "a key can be read by all", binds=named),
+)

@@ -1,0 +1,67 @@
+"""Checks of this machine, which change nothing on it."""
+
+import os
+import subprocess
+import time
+from resource import RLIM_INFINITY, RLIMIT_MEMLOCK, getrlimit
+from typing import Any
+
+from pebble.errors import PebbleError
+from pebble.extensions.checks.check import Check, CheckResult, failed, ok, warn
+
+_ENOUGH_LOCKED = 64 * 1024 * 1024  # a camera's pool of frames at 1080p
+_BUILT = 1735689600  # 2025: a clock before this has not been set
+
+
+def memory_lock(limit: int, *, root: bool) -> CheckResult:
+    """``limit`` in bytes, or RLIM_INFINITY. A reader that cannot lock a shared segment loses every frame silently."""
+    if limit == RLIM_INFINITY or limit >= _ENOUGH_LOCKED or root:
+        return ok("no limit that matters")
+    return warn(
+        f"limited to {limit // 1024} kB: too little for shared camera frames",
+        "LimitMEMLOCK=infinity in the systemd unit, or `ulimit -l unlimited` in a root shell",
+    )
+
+
+def clock(now: float, synchronised: bool | None) -> CheckResult:
+    """``now`` in epoch seconds; ``synchronised`` None if unknown."""
+    fix = "sudo timedatectl set-ntp true"
+    if now < _BUILT:
+        return failed(f"is set to {time.gmtime(now).tm_year}: stamps will be wrong", fix)
+    if synchronised is False:
+        return warn("is not synchronised: latencies will be wrong", fix)
+    return ok("synchronised" if synchronised else "plausible; not known to be synchronised")
+
+
+def synchronised() -> bool | None:
+    """True if the clock is synchronised by NTP, according to systemd; None without systemd."""
+    answer = printed("timedatectl", "show", "--property=NTPSynchronized", "--value")
+    return {"yes": True, "no": False}.get(answer.strip())
+
+
+def output_of(program: str, *arguments: str, seconds: float = 5.0, **user: Any) -> str:
+    """Return what a program of the system prints; ``user`` is as whom it runs. Raises PebbleError."""
+    command: tuple[str, ...] = (program, *arguments)
+    try:
+        done = subprocess.run(command, capture_output=True, timeout=seconds, check=False, cwd="/", **user)
+    except FileNotFoundError:
+        raise PebbleError(f"{program} is not installed") from None
+    except (OSError, subprocess.TimeoutExpired) as error:
+        raise PebbleError(str(error)) from None
+    if done.returncode and not done.stdout:
+        raise PebbleError(f"{program} ended with {done.returncode}: {done.stderr.decode(errors='replace')[-300:]}")
+    return str(done.stdout, errors="replace")
+
+
+def printed(*command: str) -> str:
+    """Return what a program of the system prints; nothing if it is not there, or does not end."""
+    try:
+        return output_of(*command)
+    except PebbleError:
+        return ""
+
+
+MACHINE: tuple[Check[None], ...] = (
+    Check("memory lock", lambda _: memory_lock(getrlimit(RLIMIT_MEMLOCK)[0], root=os.geteuid() == 0)),
+    Check("clock", lambda _: clock(time.time(), synchronised())),
+)

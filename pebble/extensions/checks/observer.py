@@ -1,0 +1,184 @@
+"""One robot as a client sees it: everything that it publishes, and what is sent to it."""
+
+from __future__ import annotations
+
+import time
+from collections import defaultdict, deque
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from typing import Any
+
+from pebble import contract as c
+from pebble.contract import codec
+from pebble.contract.names import with_name
+from pebble.errors import PayloadError
+from pebble.extensions.operator.client.connection import Target, connected, put_names, wait_for
+from pebble.extensions.operator.client.names import Names
+from pebble.extensions.operator.client.robot_topics import section_of
+from pebble.extensions.operator.client.robot_view import RobotView
+from pebble.transports import Message, QoS, Transport
+
+ANSWER_S = 1.0  # within which a robot answers
+_MOST = 50_000  # messages that are kept; a robot at rest sends some ten a second
+_RETAINED_S = 1.0  # some brokers send what is retained a moment after the subscription
+
+
+@dataclass(frozen=True, slots=True)
+class Record:
+    """A message, when it arrived (monotonic), and its value by the contract; ``wrong``: why it has none."""
+
+    at: float
+    metric: str  # below the base: ``outgoing/online``
+    payload: bytes
+    retain: bool
+    channel: c.Channel | None
+    value: Any = None
+    wrong: str = ""
+
+
+class Observer:
+    """The messages of one robot at one connection. :meth:`wait` lets time pass and reads them."""
+
+    def __init__(self, target: Target, transport: Transport, names: Names, filters: Iterable[str] = ()) -> None:
+        """``filters``: instead of all that the robot publishes."""
+        self.base, self.target, self.transport, self.account = names.base, target, transport, names.account
+        self._names, self.view = names, RobotView(self.base)
+        self.records: deque[Record] = deque(maxlen=_MOST)
+        self.listeners: list[Callable[[Message, float], None]] = []  # get each message, and when it arrived (monotonic)
+        #: When its wheels changed (monotonic), and to what, left and right: from where it is seen besides.
+        self.eyes: Callable[[], list[tuple[float, list[float]]]] = list
+        self._of: defaultdict[c.Channel | None, deque[Record]] = defaultdict(lambda: deque(maxlen=_MOST))
+        self._slowest_s = ANSWER_S / 4  # of its answers
+        self._arrived: deque[tuple[Message, float, float]] = deque(maxlen=_MOST)
+        put_names(transport, names, lambda base: base == self.base and self.view.named)
+        for filter_ in filters or (f"{self.base}/{c.OUTGOING}/#",):
+            transport.subscribe(filter_, self._take, qos=QoS.DELIVERED, direct=True)
+
+    def _take(self, message: Message) -> None:
+        self._arrived.append((message, time.monotonic(), time.time()))
+
+    # -- what arrives
+
+    def read(self) -> None:
+        while self._arrived:
+            message, at, wall = self._arrived.popleft()
+            record = self.record_of(message, at)
+            self.records.append(record)
+            self._of[record.channel].append(record)
+            self.view.receive(record.channel, message, at, wall)
+            for listener in self.listeners:
+                listener(message, at)
+
+    def record_of(self, message: Message, at: float) -> Record:
+        channel = self._names.channel(message.topic)
+        value, wrong = None, ""
+        try:
+            if channel is not None and message.payload:
+                value = codec.decode(channel, message.payload)
+        except PayloadError as error:
+            wrong = str(error)
+        metric = message.topic.removeprefix(f"{self.base}/")
+        return Record(at, metric, message.payload, message.retain, channel, value, wrong)
+
+    def of(self, channel: c.Channel, since: float = 0.0, *, retained: bool = False) -> list[Record]:
+        """Return its live messages of a channel, or with ``retained`` all."""
+        return [
+            record
+            for record in self._of[channel]
+            if record.at >= since and record.payload and (retained or not record.retain)
+        ]
+
+    # -- time
+
+    def wait(self, condition: Callable[[], object], seconds: float) -> bool:
+        """Read what arrives until ``condition``; return False if it does not hold within ``seconds``."""
+
+        def holds() -> object:
+            self.read()
+            return condition()
+
+        return wait_for(holds, seconds)
+
+    def look(self, seconds: float) -> float:
+        """Let time pass; return when that began."""
+        began = time.monotonic()
+        self.wait(lambda: False, seconds)
+        return began
+
+    def answers(self, condition: Callable[[], object], seconds: float = ANSWER_S) -> bool:
+        """True if the robot does what was asked, in time."""
+        began = time.monotonic()
+        done = self.wait(condition, seconds)
+        if done:
+            self._slowest_s = max(self._slowest_s, time.monotonic() - began)
+        return done
+
+    @property
+    def patience_s(self) -> float:
+        """Return how long to look on to be sure that something does not happen: it may answer late, here or always."""
+        return 2 * self._slowest_s
+
+    def happens(self, condition: Callable[[], object]) -> bool:
+        """True if the robot does what it must not do."""
+        return self.wait(condition, self.patience_s)
+
+    # -- what is sent
+
+    def send(self, channel: c.Channel, value: object) -> float:
+        """Publish a command, as bytes or as its struct; return when."""
+        payload = value if isinstance(value, bytes) else codec.encode(channel, value)
+        self.transport.publish(channel.topic(self.base), payload, qos=QoS(channel.default_qos), urgent=True)
+        return time.monotonic()
+
+    def sent(self, seconds: float) -> float:
+        """Wait until the broker has all that was sent, so long at most; return when."""
+        self.wait(lambda: self.transport.outgoing.waiting == 0, seconds)
+        return time.monotonic()
+
+    def send_as(self, account: str, channel: c.Channel, value: object) -> bool:
+        """Publish a command with another account in its topic, or "": without one; True if the broker delivers it."""
+        payload = value if isinstance(value, bytes) else codec.encode(channel, value)
+        topic = channel.topic(self.base)
+        with self.beside("conform-other", f"{self.base}/{c.INCOMING}/#") as (beside, messages):
+            beside.publish(with_name(topic, account) if account else topic, payload, qos=QoS.DELIVERED, urgent=True)
+            return self.wait(lambda: any(message.payload == payload for message in list(messages)), _RETAINED_S)
+
+    def retained(self) -> list[Record]:
+        """Return what the broker has retained of it and for it, as one gets it who connects now."""
+        filters = (f"{self.base}/{direction}/#" for direction in (c.OUTGOING, c.INCOMING))
+        with self.beside("conform-retained", *filters) as (_, messages):
+            self.look(_RETAINED_S)
+        return [self.record_of(message, 0.0) for message in list(messages) if message.retain and message.payload]
+
+    @contextmanager
+    def beside(self, program: str, *filters: str) -> Iterator[tuple[Transport, deque[Message]]]:
+        """Connect again, to see what arrives there; each filter is a subscription, as some brokers refuse one."""
+        messages: deque[Message] = deque(maxlen=_MOST)
+        with connected(replace(self.target, program=program)) as (beside, _):
+            for filter_ in filters:
+                beside.subscribe(filter_, messages.append, qos=QoS.DELIVERED, direct=True)
+            yield beside, messages
+
+
+@contextmanager
+def observed(target: Target, seconds: float) -> Iterator[Observer]:
+    """Connect, and look on for so long. Raises PebbleError."""
+    with connected(target) as (transport, names):
+        observer = Observer(target, transport, names)
+        observer.look(seconds)
+        yield observer
+
+
+def why_not_free(view: RobotView) -> str:
+    """Return who has the robot, or has stopped it: a test takes nothing from them. Empty if it is free."""
+    if view.stopped_by is not None:
+        return f"it is stopped by {view.stopped_by.by or 'unknown'}, which only a person ends"
+    if view.autonomy is not None and view.autonomy.running:
+        return f"the script {view.autonomy.file} is running"
+    return f"{view.control.who} drives it" if view.control.who else ""
+
+
+def available(capabilities: dict[str, Any]) -> Iterator[str]:
+    """Return the sections of a robot's capabilities that are available."""
+    return (name for name in capabilities if section_of(capabilities, name).get("available") is True)

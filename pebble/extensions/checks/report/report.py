@@ -1,0 +1,184 @@
+"""What helps to find a fault from elsewhere, in one zip file without a password or key."""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+import platform
+import sys
+import time
+import zipfile
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+from pebble.config import Config, load
+from pebble.config.config import resolved
+from pebble.config.masking import masked
+from pebble.config.problems import Notes
+from pebble.config.raw import decode, plain, read_text
+from pebble.config.secret_text import without_secrets
+from pebble.contract import OUTGOING
+from pebble.errors import PebbleError
+from pebble.extensions.checks.machine import output_of
+from pebble.extensions.checks.report.secrets_here import Secrets, secrets_of
+from pebble.extensions.checks.robot import run_checks
+from pebble.extensions.checks.running.robot import user_of
+from pebble.runtime.places import Places
+from pebble.version import __version__
+
+_JOURNAL_LINES = 2000
+_PROGRAM_S = 20.0
+_LONGEST_PART = 8 << 20  # bytes
+_STATES_S = 1.0  # until all have come
+_UNITS = ("etc/systemd/system", "usr/lib/systemd/system", "lib/systemd/system", "usr/local/lib/systemd/system")
+
+
+@dataclass(frozen=True)
+class Here:
+    """The robot that is reported: that installed below ``places``, or that of another config."""
+
+    places: Places
+    file: Path
+    config: Config | None = None  # None: it has mistakes, or is not there
+    problem: str = ""
+
+
+Part = Callable[[Here], str]
+
+
+@dataclass
+class Report:
+    """``missing``: why a part is not in it; ``unread``: files whose secrets could not be searched for."""
+
+    parts: dict[str, str] = field(default_factory=dict)
+    missing: dict[str, str] = field(default_factory=dict)
+    unread: tuple[str, ...] = ()
+
+    def packed(self) -> bytes:
+        output = io.BytesIO()
+        with zipfile.ZipFile(output, "w", zipfile.ZIP_DEFLATED) as packed:
+            for name, text in self.parts.items():
+                packed.writestr(name, text)
+        return output.getvalue()
+
+
+def make(places: Places, file: Path | None = None) -> Report:
+    """Collect all parts, without a secret of this machine; a part that fails is named in the index."""
+    here = _here(places, file or places.config)
+    known = secrets_of(places, here.config, [here.file])
+    report = Report(unread=known.unread)
+    for name, part in PARTS.items():
+        try:
+            report.parts[name] = known.hidden(without_secrets(part(here)))[:_LONGEST_PART]
+        except Exception as error:  # noqa: BLE001 - what is broken is why there is a report: the rest is in it
+            kind = "" if isinstance(error, PebbleError) else f"{type(error).__name__}: "
+            report.missing[name] = known.hidden(without_secrets(kind + " ".join(str(error).split())))
+    report.parts = {"index.txt": known.hidden(_index(report, known)), **report.parts}
+    return report
+
+
+def _here(places: Places, file: Path) -> Here:
+    env = {"STATE_DIRECTORY": str(places.state)} if file == places.config and places.state.exists() else {}
+    try:
+        return Here(places, file, load(file, {**os.environ, **env}))
+    except PebbleError as error:
+        return Here(places, file, None, str(error))
+
+
+def _index(report: Report, known: Secrets) -> str:
+    lines = [f"Pebble {__version__}, {time.strftime('%Y-%m-%d %H:%M:%S %z')}", ""]
+    lines += [f"{name}: {len(text):,} characters" for name, text in report.parts.items()]
+    lines += [f"{name}: MISSING: {why}" for name, why in report.missing.items()]
+    lines += ["", f"{len(known.known)} passwords and keys of this machine are hidden in it"]
+    lines += [f"too short to be hidden: one in {where}" for where in known.short]
+    lines += [f"could not be read, so what is in it is not hidden: {file}" for file in known.unread]
+    return "\n".join(lines) + "\n"
+
+
+# -- the parts
+
+
+def _config(here: Here) -> str:
+    """Return the config as written and as it is meant, with stars where there are secrets."""
+    written = masked(plain(decode(read_text(here.file), here.file.name), Notes()))
+    whole: dict[str, Any] = {"file": str(here.file), "written": written}
+    whole |= {"problems": here.problem.splitlines()} if here.config is None else {"resolved": resolved(here.config)}
+    return json.dumps(whole, indent=1, ensure_ascii=False)
+
+
+def _doctor(here: Here) -> str:
+    results = run_checks(here.config)
+    lines = [f"{result.state:<7}  {result.what}: {result.text}  {result.fix}\n" for result in results]
+    return "".join(lines) + here.problem
+
+
+def _status(here: Here) -> str:
+    """Return what the robot's own side publishes and retains; asked as its user, as root may not."""
+    if here.config is None:
+        raise PebbleError("the config cannot be read")
+    user, file = user_of(here.config.run_dir()), str(here.file.absolute())
+    who: dict[str, Any] = {} if user is None else {"user": user.pw_uid, "group": user.pw_gid, "extra_groups": []}
+    topics = f"{here.config.base}/{OUTGOING}/#"
+    echo = ("-m", "pebble.cli", "topic", "echo", topics, "--seconds", str(_STATES_S), "--config", file)
+    return output_of(sys.executable, *echo, seconds=_PROGRAM_S, **who)
+
+
+def _journal(here: Here) -> str:
+    root = [] if here.places.root == Path("/") else [f"--root={here.places.root}"]
+    units = [word for name in ("pebble*", "mosquitto*") for word in ("--unit", name)]
+    options = (f"--lines={_JOURNAL_LINES}", "--no-pager", "--output=short-iso")
+    return output_of("journalctl", *root, *units, *options, seconds=_PROGRAM_S)
+
+
+def _versions(here: Here) -> str:
+    lines = [f"pebble {__version__}", f"python {sys.version}", f"{sys.executable}", " ".join(platform.uname())]
+    release = here.places.root / "etc/os-release"
+    lines += release.read_text(encoding="utf-8", errors="replace").splitlines() if release.is_file() else []
+    installed = {package.name: package.version for package in metadata.distributions()}
+    return "\n".join([*lines, *(f"{name} {version}" for name, version in sorted(installed.items()))]) + "\n"
+
+
+def _files(*patterns: str) -> Part:
+    """Return the part with all files that match, below the root."""
+
+    def part(here: Here) -> str:
+        files = sorted({file for pattern in patterns for file in here.places.root.glob(pattern)})
+        if not files:
+            raise PebbleError("there are no such files")
+        return "\n".join(map(_described, files)) + "\n"
+
+    return part
+
+
+def _described(path: Path) -> str:
+    if path.is_symlink():
+        return f"# {path} -> {path.readlink()}"
+    if path.is_file():
+        return f"# {path}\n{path.read_text(encoding='utf-8', errors='replace').strip()}"
+    return f"# {path}/"
+
+
+def _programs(*commands: tuple[str, ...]) -> Part:
+    """Return the part with what these commands print."""
+    return lambda _here: "".join(output_of(*command, seconds=_PROGRAM_S) for command in commands)
+
+
+#: In the order in which a reader wants them.
+PARTS: dict[str, Part] = {
+    "config.json": _config,
+    "doctor.txt": _doctor,
+    "status.txt": _status,
+    "journal.txt": _journal,
+    "units.txt": _files(
+        *(f"{folder}/pebble*{inner}" for folder in _UNITS for inner in ("", "/*")), "etc/polkit-1/rules.d/*pebble*"
+    ),
+    "slots.txt": _files("opt/pebble/*", "opt/pebble/*/.complete", "run/pebble-slot/*", "var/lib/pebble-update/*"),
+    "versions.txt": _versions,
+    "lsusb.txt": _programs(("lsusb",)),
+    "devices.txt": _files("dev/*/by-id/*"),
+    "disk.txt": _programs(("df", "-h", "-x", "tmpfs"), ("free", "-h"), ("uptime",)),
+}

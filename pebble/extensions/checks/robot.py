@@ -1,0 +1,176 @@
+"""Checks of the robot on this machine, by its config. They change nothing; an unreachable broker takes seconds."""
+
+import os
+from collections.abc import Iterator
+from pathlib import Path
+
+from pebble.config import LAUNCHER_LOCK, Config
+from pebble.config.hosts import is_loopback
+from pebble.config.rules import exposure
+from pebble.config.rules.doors import warning_of_open
+from pebble.contract.levels import LEVELS
+from pebble.errors import PebbleError
+from pebble.extensions.checks import devices
+from pebble.extensions.checks.broker.account import page_account, robot_account
+from pebble.extensions.checks.broker.login import beyond_loopback, broker, own_addresses
+from pebble.extensions.checks.broker.login_attempt import TIMEOUT_S
+from pebble.extensions.checks.check import SOON_DAYS, Check, CheckResult, State, failed, ok, run, some_of, warn
+from pebble.extensions.checks.machine import MACHINE
+from pebble.extensions.checks.recorder import recorder
+from pebble.extensions.fleet import certificates
+from pebble.extensions.fleet.folder import FLEET, Fleet, FleetError, load
+from pebble.extensions.fleet.roles import ProgramRole, Right, rights
+from pebble.extensions.operator.client.page_packages import require_packages
+from pebble.extensions.page.setting import settings_of
+from pebble.runtime.connections import REMOTE_RECONNECT_S, mqtt_settings
+from pebble.runtime.parent import launcher_runs
+
+#: By the config section of each broker that the robot uses.
+_BROKERS = {"local_mqtt": "local broker", "mqtt_mirror": "mirror's broker", "remote_mqtt": "remote broker"}
+_WHO = "who can drive"
+_NAMES_SHOWN = 12  # in one line
+_DRIVERS = {
+    "open": "every program that reaches its broker, which here only this machine's do",
+    "login": "every account of its broker with a role that drives; which one sent a command is not checked",
+    "named": "every account of its broker with a role that drives, under its own name",
+}
+
+
+def run_checks(config: Config | None) -> Iterator[CheckResult]:
+    """Check this machine, and ``config``'s robot on it."""
+    yield from (result for _, result in run(MACHINE, None))
+    if config is None:
+        return
+    yield from (warn(warning, what="config") for warning in config.warnings)
+    if config.robot.platform == "linux":
+        yield from (result for _, result in run(ROBOT, config))
+
+
+def who_drives(config: Config) -> Iterator[CheckResult]:
+    """Tell its level, and who may drive it at that."""
+    level = config.security.level
+    if warning := warning_of_open(config):
+        yield warn(warning, "pebble fleet init, then the account of this robot")
+        return
+    yield ok(f"level {level}: it is driven by {_DRIVERS[level]}")
+    for folder in _folders(config) if level != "open" else ():
+        try:
+            yield ok(_accounts(load(folder)), what=_WHO)
+        except FleetError as error:
+            yield warn(str(error), what=_WHO)
+    if level == "named" and config.security.unnamed != "refuse":
+        when = " while nobody has control" if config.security.unnamed == "free" else ""
+        yield warn(
+            f'also senders without a name{when}, because security.strangers is "{config.security.unnamed}"',
+            "leave out security.strangers once all clients have names",
+            _WHO,
+        )
+
+
+def _accounts(fleet: Fleet) -> str:
+    """Return those whose roles let them drive, servers of the page with a word more."""
+    names = [
+        f"{name} (a page server: its people, too)" if ProgramRole.PAGE in account.roles else name
+        for name, account in fleet.accounts.items()
+        if Right.DRIVE in rights(account.roles, fleet.level)
+    ]
+    return f"{some_of(names, _NAMES_SHOWN) or 'no account'}; programs on the robot itself, too"
+
+
+def _folders(config: Config) -> list[Path]:
+    """Return where the files of its fleet are: beside its config, or the authority that it trusts."""
+    ca_cert = config.services.mqtt_bridge.remote_mqtt.tls.ca_cert
+    places = [config.folder, *([] if ca_cert is None else [Path(ca_cert).parent])]
+    return [folder for folder in (place.absolute() for place in places) if (folder / FLEET).is_file()][:1]
+
+
+def state_directory(path: Path) -> CheckResult:
+    """Find a place where an emergency stop cannot be saved: it would end with a power cut."""
+    existing = next(folder for folder in (path, *path.parents) if os.access(folder, os.F_OK))
+    if not existing.is_dir() or not os.access(existing, os.W_OK | os.X_OK):
+        return warn(
+            f"{path} cannot be written: an emergency stop ends with a power cut",
+            f"sudo install -d -m 700 -o $USER {path}, or set transport.state_dir",
+        )
+    return ok(str(path) if existing == path else f"{path} will be created")
+
+
+def config_of_running(config: Config) -> Iterator[CheckResult]:
+    """Find a file that has changed since the robot was started with it."""
+    lock = config.run_dir() / LAUNCHER_LOCK
+    if config.path is None or not launcher_runs(config.run_dir()):
+        return
+    if config.path.stat().st_mtime > lock.stat().st_mtime:
+        yield warn(f"{config.path} has changed since the robot read it", "start the robot again")
+    else:
+        yield ok(f"{config.path}, as the robot runs")
+
+
+def operator_page(config: Config) -> Iterator[CheckResult]:
+    """Check that the page that the robot itself serves can start; if it has users, only its own user can read that."""
+    if not config.services.web_handler.enabled:
+        return
+    try:
+        settings = settings_of(config)
+        require_packages()
+    except PebbleError as error:
+        yield failed(str(error))  # which says what to do
+        return
+    if settings.login and settings.certificate is None:
+        yield warn("is not encrypted: passwords can be read", "pebble cert init")
+    else:
+        yield ok(f"port {settings.port} of {settings.host}")
+    if settings.certificate is None:
+        return
+    try:
+        days = certificates.show(settings.certificate).days_left
+    except certificates.CertificateError as error:
+        yield failed(str(error), "pebble cert init")
+        return
+    text = f"its certificate ends in {days:.0f} days"
+    yield ok(text) if days >= SOON_DAYS else warn(text, "pebble cert renew")
+
+
+def brokers(config: Config) -> Iterator[CheckResult]:
+    """Check each broker that the robot uses: its login, its account, and where else it answers."""
+    level, link = config.security.level, config.services.mqtt_bridge.link
+    sections = {str(path[-1]): mqtt for path, mqtt in exposure.brokers(config)}
+    for section, name in _BROKERS.items():
+        if (mqtt := sections.get(section)) is None:
+            continue
+        is_remote = section == "remote_mqtt"
+        answer_s = LEVELS[link.slowest if is_remote else "wide"].answer_s
+        settings = mqtt_settings(mqtt, reconnect_max_s=REMOTE_RECONNECT_S, program="doctor")
+        results = list(broker(name, settings, level, max(TIMEOUT_S, answer_s)))
+        yield from results
+        if is_remote and results[0].state is State.OK:
+            yield from robot_account(results[0].what, settings, config.base, answer_s, level)
+        if is_loopback(settings.host):
+            yield from beyond_loopback(name, settings, own_addresses())
+
+
+def page_brokers(config: Config) -> Iterator[CheckResult]:
+    """Check that the broker of an operator page that has its own lets it in, and delivers what all robots send."""
+    mqtt, level = config.web_interface.mqtt, config.security.level
+    if not mqtt.host:
+        return
+    settings = mqtt_settings(mqtt, reconnect_max_s=REMOTE_RECONNECT_S)
+    results = list(broker("page's broker", settings, level))
+    yield from results
+    if not any(result.state is State.FAILED for result in results):
+        yield from page_account(results[0].what, settings, level)
+
+
+ROBOT: tuple[Check[Config], ...] = (
+    Check("security", who_drives),
+    Check("config", config_of_running),
+    Check("state directory", lambda config: state_directory(config.state_dir())),
+    Check("serial port", devices.serial_ports),
+    Check("camera", devices.cameras),
+    Check("microphone", devices.microphone),
+    Check("loudspeaker", devices.loudspeaker),
+    Check("operator page", operator_page),
+    Check("page's broker", page_brokers),
+    Check("recorder", recorder),
+    Check("broker", brokers),
+)

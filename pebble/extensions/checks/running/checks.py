@@ -1,0 +1,208 @@
+"""The checks of a robot that runs, as a table: what needs to be reached and free for each, and what makes it."""
+
+from __future__ import annotations
+
+import math
+import shlex
+from itertools import pairwise
+
+from pebble.contract.levels import LEVELS, silent_after
+from pebble.extensions.checks.check import Check, CheckResult, failed, ok, skipped, some_of
+from pebble.extensions.checks.observer import available, why_not_free
+from pebble.extensions.checks.running import machine
+from pebble.extensions.checks.running.operating import received, retained_commands, stop, wheels
+from pebble.extensions.checks.running.robot import RobotSide, RobotUnderTest
+from pebble.extensions.operator.client.names import id_of
+from pebble.extensions.operator.client.robot_topics import section_of
+from pebble.launcher.capabilities import capabilities as expected_capabilities
+from pebble.runtime.addresses import Addresses
+
+_IN_A_ROW = 10  # heartbeats in a row
+_LONGEST_GAP = 2.5  # times the interval that its config has
+_JUDGED_S = 6.0  # motor owners repeat every 5 s what the others must receive of them
+_VOLTS_S = 6.0  # boards report it every five seconds
+_LEAST_CELL_V = 3.4  # of a lithium cell: below, a robot has minutes
+_SHOWN = 5  # names in one line
+_LOG = "journalctl -u pebble -n 50"
+
+# -- what a check needs: empty, or why it is lacking
+
+
+def running(robot: RobotUnderTest) -> str:
+    if robot.own is None:
+        return "its own side is not reached"
+    states = set(_states(robot).values())
+    return "it does not run" if states and states <= {"stopped"} else ""
+
+
+def operators_side(robot: RobotUnderTest) -> str:
+    return "" if robot.operators is not None else f"its operators' side is not reached: {robot.why_operators}"
+
+
+def motors(robot: RobotUnderTest) -> str:
+    return "" if robot.config.motor_lines() else "it has no motors"
+
+
+def account(robot: RobotUnderTest) -> str:
+    nameless = robot.operators is not None and robot.view.named and not robot.operators.account
+    return "at level named it needs an account: services.mqtt_bridge.remote_mqtt.username" if nameless else ""
+
+
+def free(robot: RobotUnderTest) -> str:
+    return why_not_free(robot.view)
+
+
+# -- the sides
+
+
+def processes(robot: RobotUnderTest) -> CheckResult:
+    """Check that its own side answers, and each of its processes is ready."""
+    if why := robot.why_own or running(robot):
+        return failed(why, "sudo systemctl start pebble, or pebble up CONFIG; and test it as the robot's user or root")
+    if not robot.wait(lambda: _unready(robot) == [], robot.patience_s):
+        return failed(", ".join(_unready(robot)), _LOG)
+    return ok(f"{len(_states(robot))} are ready")
+
+
+def _states(robot: RobotUnderTest) -> dict[str, str]:
+    status = robot.own_side.status
+    return {name: str(section_of(status, f"services.{name}").get("state")) for name in section_of(status, "services")}
+
+
+def _unready(robot: RobotUnderTest) -> list[str]:
+    """``held`` ones wait while people drive over a thin link, and ``stopped`` ones until they are requested."""
+    if not robot.own_side.status:
+        return ["its status has not arrived: is it starting?"]
+    states = {name: state for name, state in _states(robot).items() if state not in ("ready", "held")}
+    return [f"{name} is {states[name]}" for name in sorted(states.keys() - {*robot.config.on_demand_programs()})]
+
+
+def heartbeats(robot: RobotUnderTest) -> CheckResult:
+    """Check that operators see it, without gaps."""
+    side, section = robot.operators, robot.config.services.mqtt_bridge.heartbeat
+    if side is None:
+        why = robot.why_operators
+        return failed(why, "pebble doctor CONFIG") if robot.config.services.mqtt_bridge.enabled else skipped(why)
+    if not section.enabled:
+        return skipped("services.mqtt_bridge.heartbeat is off")
+
+    seen = side.view.liveness
+
+    def longest() -> float:
+        interval_s = max(section.interval_seconds, LEVELS[seen.link].heartbeat_s)
+        return max(silent_after(interval_s, seen.link, seen.average_latency_s or 0.0), _LONGEST_GAP * interval_s)
+
+    if not robot.wait(lambda: side.heartbeats, robot.patience_s):
+        return failed("none arrives", "pebble doctor CONFIG")
+    if not robot.wait(lambda: _gap(side) <= longest(), 3 * _IN_A_ROW * longest()):
+        return failed(f"gaps of {_gap(side):.1f} s, where {longest():.1f} s is the longest", "pebble doctor CONFIG")
+    late = seen.average_latency_s
+    shown = "" if late is None else f", {1000 * late:.0f} ms on the way"
+    return ok(f"{_IN_A_ROW} in a row, the longest gap {_gap(side):.2f} s{shown}")
+
+
+def _gap(side: RobotSide) -> float:
+    """Return the longest one between the newest heartbeats; infinite until there are enough."""
+    newest = side.heartbeats[-_IN_A_ROW:]
+    gaps = [after - before for before, after in pairwise(newest)]
+    return max(gaps) if len(newest) == _IN_A_ROW else math.inf
+
+
+def capabilities(robot: RobotUnderTest) -> CheckResult:
+    """Check that it offers, on both sides, what its config has."""
+    wanted = {*available(expected_capabilities(robot.config, Addresses(robot.config)))} - {"outlets"}  # with a device
+    for side in robot.sides:
+        where = "" if side.own else " to operators"
+        if not side.view.estop.has_capabilities:
+            return failed(f"it has not published them{where}", _LOG)
+        if lacking := sorted(wanted - {*available(side.view.capabilities)}):
+            return failed(f"it does not offer {', '.join(lacking)}{where}", _LOG)
+    return ok(", ".join(sorted(wanted)) or "none")
+
+
+# -- what hangs on it
+
+
+def boards(robot: RobotUnderTest) -> CheckResult:
+    """Check that each serial line's board was heard, and commands reach the motors."""
+    lines = {name or "serial": line.serial.port for name, line in robot.config.serial_instances().items()}
+    if not lines:
+        return skipped("it has no serial line")
+
+    def absent() -> list[str]:
+        return [name for name in lines if _mcu(robot, name).get("state") != "ready"]
+
+    robot.wait(lambda: not absent(), robot.patience_s)
+    if names := absent():
+        mcu = _mcu(robot, names[0])
+        why = mcu.get("why") or _MCU_STATES.get(str(mcu.get("state")), "its state is not known")
+        return failed(f"{names[0]} ({lines[names[0]]}): {why}", f"plug it in, then: ls -l /dev/serial/by-id/; {_LOG}")
+    robot.wait(lambda: robot.view.driveable is None or robot.view.driveable.state != "unknown", _JUDGED_S)
+    drives = robot.view.driveable
+    if drives is not None and drives.state == "no":
+        return failed(f"its motors are not reached: {drives.why}", _LOG)
+    unheard = [name for name in lines if not isinstance(age := _mcu(robot, name).get("heard_ms"), int) or age >= 10_000]
+    if unheard:
+        return skipped(f"{', '.join(unheard)} sends nothing at rest, as some boards do")
+    if drives is not None and drives.state == "unknown":
+        return skipped(f"it is not known whether its motors obey: {drives.why}")
+    return ok(f"heard: {', '.join(lines)}" + (", and commands reach the motors" if drives is not None else ""))
+
+
+_MCU_STATES = {"silent": "its board has stopped sending", "absent": "there is no such device", "booting": "it starts"}
+
+
+def _mcu(robot: RobotUnderTest, name: str) -> dict[str, object]:
+    return section_of(section_of(robot.own_side.status, "mcu"), name)
+
+
+def battery(robot: RobotUnderTest) -> CheckResult:
+    """Read its voltage, and judge whether that is too low where its config has the number of cells."""
+    robot.wait(lambda: robot.view.volts is not None, _VOLTS_S)
+    volts, cells = robot.view.volts, robot.config.robot.battery_cells
+    if volts is None:
+        return skipped("it reports no voltage")
+    charging = ", on the charger" if robot.view.charging else ""
+    if cells and volts / cells < _LEAST_CELL_V and not robot.view.charging:
+        return failed(f"{volts:.2f} V, {volts / cells:.2f} V a cell: it is nearly empty", "charge it")
+    return ok(f"{volts:.2f} V{charging}")
+
+
+def leftovers(robot: RobotUnderTest) -> CheckResult:
+    """Find what robots of other ids have left retained on this machine: this one before it was renamed, for example."""
+    here = [side for side in robot.sides if side.is_here(robot.config)]
+    if not here:
+        return skipped("other ids at a broker elsewhere are other robots")
+    others: set[str] = set()
+    for side in here:
+        topics, live = side.others()
+        others |= topics.keys()
+        if gone := sorted(topics.keys() - live):
+            names = some_of([id_of(base) for base in gone], _SHOWN)
+            remote = "" if side.own else " --remote"
+            topic = shlex.quote(min(topics[gone[0]]))  # anybody may have chosen it
+            fix = f"if they are gone: pebble topic pub {topic} '' --retain --force -c CONFIG{remote}, and so on"
+            return failed(f"{len(gone)} that send no heartbeat: {names}", fix)
+    return ok(f"none; {len(others)} other robots are there" if others else "none")
+
+
+_BOTH = (running, operators_side)
+CHECKS: tuple[Check[RobotUnderTest], ...] = (
+    Check("unit", machine.unit),
+    Check("slot", machine.slot),
+    Check("clock", machine.clock),
+    Check("disk", machine.disk),
+    Check("processes", processes),
+    Check("heartbeats", heartbeats),
+    Check("capabilities", capabilities, (running,)),
+    Check("boards", boards, (running,)),
+    Check("battery", battery, (running, motors)),
+    Check("leftovers", leftovers, (running,)),
+    Check("page", machine.page),
+    Check("picture", lambda robot: received(robot, "video", "camera"), (*_BOTH, account)),
+    Check("sound", lambda robot: received(robot, "audio", "microphone"), (*_BOTH, account)),
+    Check("retained commands", retained_commands, (*_BOTH, account, motors, free)),
+    Check("stop", stop, (running, motors, free)),
+)
+#: What turns wheels: only where a person has agreed.
+MOVING: tuple[Check[RobotUnderTest], ...] = (Check("wheels", wheels, (running, account, motors, free)),)

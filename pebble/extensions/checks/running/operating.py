@@ -1,0 +1,171 @@
+"""Checks of what operators do with a robot: they watch and hear it, stop it and drive it. It is free afterwards."""
+
+import time
+from dataclasses import replace
+from functools import partial
+
+from pebble.contract import ESTOP_RESET, ESTOP_STATE, codec
+from pebble.contract.payloads import EstopReset
+from pebble.errors import PebbleError
+from pebble.extensions.checks.check import CheckResult, State, failed, ok, skipped
+from pebble.extensions.checks.conform.control import Driver
+from pebble.extensions.checks.conform.motion import LATE_S, at_the_wheel, rested
+from pebble.extensions.checks.running.robot import RobotUnderTest
+from pebble.extensions.operator.client.estop import StopSender, new_name, send
+from pebble.extensions.operator.client.estop_states import Reset
+from pebble.extensions.operator.client.media_receiver import MediaReceiver
+from pebble.extensions.operator.client.media_request.offer import Medium
+from pebble.transports import QoS
+
+_LOG = "pebble doctor CONFIG; journalctl -u pebble -n 50"
+_PROGRAMS: dict[Medium, str] = {"video": "camera_publisher", "audio": "audio_publisher"}
+_CONFIRMED_S = 5.0  # a stop is repeated every half second
+_WHY = "selftest"
+_NO_BOOT, _NO_COUNT = "selftest", 1_000_000  # of no start of a motor owner, and of no stop
+_SPEED, _DRIVES_S = 0.2, 0.3
+_CONTROL_S = 3.0
+_WHEEL_FIXES = {
+    State.FAILED: f"battery, motors and their wires; {_LOG}",
+    State.SKIPPED: "look whether it moved, or set services.serial_mcu_bridge.telemetry.publish_touch_sensors to true",
+}
+
+
+# -- pictures and sound
+
+
+def received(robot: RobotUnderTest, medium: Medium, device: str) -> CheckResult:
+    """Request pictures or sound as an operator does, and give them back."""
+    if _PROGRAMS[medium] not in robot.config.media_programs():
+        return skipped(f"it has no {device}")
+    receiver = MediaReceiver(robot.commanding_side.transport, robot.config.base)
+
+    def arrived() -> bool:
+        receiver.poll()
+        return receiver.newest is not None if medium == "video" else receiver.sounds.count > 0
+
+    try:
+        receiver.wait_for_capabilities(robot.patience_s)
+        began = time.monotonic()
+        receiver.request(medium)
+        if not robot.wait(arrived, robot.patience_s):
+            return failed(f"none came from the {device} within {robot.patience_s:g} s", _LOG)
+        took_s = time.monotonic() - began
+    except PebbleError as error:
+        return failed(str(error), _LOG)
+    finally:
+        receiver.close()
+    size = "" if receiver.newest is None else "{1}×{0}, ".format(*receiver.newest.picture.shape[:2])
+    return ok(f"{size}{receiver.encoding[medium]}, after {took_s:.1f} s")
+
+
+# -- the emergency stop
+
+
+def stop(robot: RobotUnderTest) -> CheckResult:
+    """Stop it as operators do, and end exactly this stop on its own side."""
+    before = {owner: state.recent for owner, state in robot.view.estop.states.items()}
+    side, name = robot.commanding_side, new_name()
+    sender = StopSender(name, by=robot.by, why=_WHY, now=time.monotonic(), robots=[robot.config.base])
+    stopped = sender.robots[robot.config.base]
+    stopped.estop = side.view.estop  # as it is known already, with its topics
+    side.listeners.append(sender.receive)
+
+    def confirmed() -> bool:
+        send(partial(side.transport.publish, urgent=True), sender.tick(time.monotonic()))
+        return sender.confirmed
+
+    try:
+        robot.wait(confirmed, _CONFIRMED_S)
+        took_s, why = stopped.confirmed_s, stopped.why
+    finally:  # also when this is interrupted: what it has stopped, it ends
+        why_stopped = _end(robot, name, before)
+    if why_stopped:
+        return failed(why_stopped, "pebble estop reset CONFIG")
+    if took_s is None:
+        text = f"NOT CONFIRMED after {_CONFIRMED_S:g} s: {why}"
+        return failed(text, "pebble doctor CONFIG; pebble estop CONFIG")
+    sender_side = "its own side" if side.own else "operators"
+    return ok(f"confirmed {took_s:.2f} s after {sender_side} sent it, and ended by name")
+
+
+def _end(robot: RobotUnderTest, name: str, before: dict[str, list[str]]) -> str:
+    """End this stop; return why the robot stays stopped, or nothing."""
+    view = robot.view
+    robot.wait(lambda: all(name in state.recent for state in view.estop.states.values()), 1.0)
+    if not view.latched:
+        return ""
+    for owner, state in view.estop.latched.items():
+        if state.recent[:1] != [name] or not set(state.recent[1:]) <= set(before.get(owner, [])):
+            return f"it was stopped by another one meanwhile, and stays so ({state.by or 'unknown'}: {state.why})"
+    reset = Reset(view.estop, robot.by)
+    send(partial(robot.own_side.transport.publish, urgent=True), reset.messages())
+    robot.wait(lambda: not reset.waiting, robot.patience_s)
+    refusals = [f"{owner}: {why}" for owner, why in reset.refusals().items()]
+    return f"it stays stopped: {', '.join(refusals)}" if refusals else ""
+
+
+def retained_commands(robot: RobotUnderTest) -> CheckResult:
+    """Leave a command retained at the broker, one that could do no harm, and see that the robot ignores it.
+
+    It is a reset that no motor owner could take: who reads it, publishes why it refuses it. A live one of another kind
+    follows, so that the silence before it means something.
+    """
+    operators = robot.commanding_side
+    if robot.own_side.heartbeats:
+        return skipped("one broker serves both sides: there, what is published to be retained is live at first")
+    owner, state = next(iter(robot.view.estop.states.items()), (None, None))
+    if owner is None or state is None:
+        return skipped("it publishes no emergency stop")
+    if state.reset_refused is not None:
+        return skipped("it refused a reset before, which looks the same", "run it again")
+    topic, metric = ESTOP_RESET.topic(robot.config.base), ESTOP_STATE.suffix.format(owner=owner)
+    began = time.monotonic()
+
+    def refusals() -> set[str | None]:
+        states = [record for record in operators.of(ESTOP_STATE, began) if record.metric == metric]
+        return {record.value.reset_refused for record in states if record.value is not None}
+
+    def leave(payload: bytes) -> None:
+        beside.publish(topic, payload, qos=QoS.DELIVERED, retain=True, remember=False)
+        robot.wait(lambda: beside.outgoing.waiting == 0, robot.patience_s)
+
+    with operators.beside("selftest") as (beside, _):  # it puts no name into the topic: nothing with one is retained
+        try:
+            leave(codec.encode(ESTOP_RESET, EstopReset(boot=_NO_BOOT, count=0, by=_WHY)))
+            operators.send(ESTOP_RESET, EstopReset(boot=state.boot, count=state.count + _NO_COUNT, by=_WHY))
+            robot.wait(lambda: "count" in refusals(), robot.patience_s)
+        finally:
+            leave(b"")
+    if "boot" in refusals():
+        return failed("it read a retained command as if it were sent now", "pebble doctor CONFIG")
+    if "count" not in refusals():
+        return skipped("a live one of this account is not answered either")
+    return ok("it ignores them")
+
+
+# -- driving
+
+
+def wheels(robot: RobotUnderTest) -> CheckResult:
+    """Drive a little way ahead and back, if a person has agreed; between the two, and after it, it stops by itself."""
+    if robot.view.charging:
+        return skipped("it is on its charger")
+    with at_the_wheel(robot.commanding_side, robot.by.partition("@")[0], _CONTROL_S) as driver:
+        if not driver.may_drive:
+            return skipped(f"{robot.commanding_side.view.control.who or 'no one'} has control")
+        ahead = _drive(robot, driver, _SPEED)
+        if ahead.state is State.FAILED:
+            return ahead
+        back = _drive(robot, driver, -_SPEED)
+    return back if ahead.state is State.OK else ahead
+
+
+def _drive(robot: RobotUnderTest, driver: Driver, speed: float) -> CheckResult:
+    began, last = driver.drive(_DRIVES_S, z=speed)
+    robot.wait(lambda: False, robot.rests_s + LATE_S)
+    if robot.view.latched:
+        return failed("it was stopped meanwhile", "pebble estop status CONFIG")
+    if not driver.may_drive:
+        return skipped(f"{robot.commanding_side.view.control.who or 'another one'} took control")
+    result = rested(robot.own_side, began, last, robot.rests_s)
+    return replace(result, text=f"at {speed:+.1f}: {result.text}", fix=_WHEEL_FIXES.get(result.state, ""))

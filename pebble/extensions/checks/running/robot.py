@@ -1,0 +1,170 @@
+"""The robot under test, as its own side and its operators' side show it."""
+
+from __future__ import annotations
+
+import os
+import pwd
+from collections import defaultdict
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+from pebble import contract as c
+from pebble.config import Config
+from pebble.config.hosts import is_loopback
+from pebble.config.rules.exposure import is_near
+from pebble.contract.identity import parse_topic
+from pebble.errors import PebbleError
+from pebble.extensions.checks.conform.motion import RESTS_S
+from pebble.extensions.checks.observer import Observer
+from pebble.extensions.operator.client.connection import Target, connected, wait_for
+from pebble.extensions.operator.client.names import Names
+from pebble.extensions.operator.client.robot_view import RobotView
+from pebble.runtime.addresses import Addresses
+from pebble.runtime.places import Places
+from pebble.transports import Transport
+
+PATIENCE_S = 3.0
+_HEARTBEATS_S = 2.5  # within which a robot at a broker of this machine sends one
+_STATES = (c.ONLINE, c.CAPABILITIES, c.STATUS, c.ESTOP_STATE)
+_WATCHED = (*_STATES, c.CONTROL_STATE, c.LINK, c.CHARGING_LEVEL, c.CHARGING_STATUS, c.AUTONOMY_STATUS)
+_ANY = "+/+/+"
+
+
+class RobotSide(Observer):
+    """A side of the robot: where its processes meet, or where its operators do."""
+
+    def __init__(self, config: Config, target: Target, transport: Transport, names: Names, *, own: bool) -> None:
+        """``own``: the robot's own side."""
+        self.own = own
+        self._addresses = Addresses(config)
+        watched = (*_WATCHED, c.TOUCH_SENSORS) if own else _WATCHED
+        super().__init__(target, transport, names, [self._addresses[channel].topic for channel in watched])
+
+    def is_here(self, config: Config) -> bool:
+        """True if it ends on this machine: what other robots have left there can only be left over."""
+        if self.own:
+            return config.transport.kind != "mqtt" or is_loopback(config.local_mqtt.host)
+        return is_near(config.services.mqtt_bridge.remote_mqtt)
+
+    def ask(self, patience_s: float) -> None:
+        """Ask for what is retained by its name, which some brokers need; capabilities name some of it."""
+        estop = self.view.estop
+        self.transport.ask([self._addresses[channel].topic for channel in _WATCHED if not channel.is_pattern])
+        self.wait(lambda: estop.has_capabilities, patience_s)
+        self.transport.ask([*estop.missing, *estop.missing_control])
+
+    def others(self) -> tuple[dict[str, list[str]], set[str]]:
+        """Return the retained topics of each other robot, by its base, and which of these robots send heartbeats."""
+        topics: defaultdict[str, list[str]] = defaultdict(list)
+        live: set[str] = set()
+        with self.beside("selftest-others", *(channel.filter(_ANY) for channel in _STATES)) as (_, messages):
+            self.look(_HEARTBEATS_S)
+        for message in list(messages):
+            address = parse_topic(message.topic)
+            if address is None or address.identity.is_server or address.identity.base == self.base:
+                continue
+            if message.retain and message.payload:
+                topics[address.identity.base].append(message.topic)
+            elif address.metric == c.ONLINE.metric:
+                live.add(address.identity.base)
+        return topics, live
+
+    @property
+    def status(self) -> dict[str, object]:
+        """Return the value of the newest status; empty before the first."""
+        values = [record.value.value for record in self.of(c.STATUS, retained=True) if record.value is not None]
+        return values[-1] if values else {}
+
+    @property
+    def heartbeats(self) -> list[float]:
+        """Return when live ones arrived (monotonic)."""
+        return [record.at for record in self.of(c.ONLINE) if record.value is not None]
+
+
+@dataclass(kw_only=True)
+class RobotUnderTest:
+    """A robot, and its sides as far as they are reached; ``why_own`` and ``why_operators`` are why they are not."""
+
+    config: Config
+    places: Places
+    by: str  # who tests it, for stops and control: ann@goob
+    patience_s: float  # for a picture, a sound, and other answers
+    rests_s: float  # so long after the last command wheels may turn
+    own: RobotSide | None = None
+    operators: RobotSide | None = None
+    why_own: str = ""
+    why_operators: str = ""
+
+    @property
+    def sides(self) -> list[RobotSide]:
+        return [side for side in (self.own, self.operators) if side is not None]
+
+    @property
+    def commanding_side(self) -> RobotSide:
+        """Return the side from which it is commanded: that of its operators, if it is reached."""
+        return self.operators or self.own_side
+
+    @property
+    def own_side(self) -> RobotSide:
+        """Return its own side, which the check needs."""
+        assert self.own is not None  # noqa: S101
+        return self.own
+
+    @property
+    def view(self) -> RobotView:
+        return self.own_side.view
+
+    def read(self) -> None:
+        for side in self.sides:
+            side.read()
+
+    def wait(self, condition: Callable[[], object], seconds: float) -> bool:
+        """Read what arrives on both sides until ``condition``; return False if it does not hold within ``seconds``."""
+
+        def holds() -> object:
+            self.read()
+            return condition()
+
+        return wait_for(holds, seconds)
+
+
+def user_of(folder: Path) -> pwd.struct_passwd | None:
+    """Return as whom root reaches the robot of this folder, so that it leaves no files of its own; None: as itself."""
+    owner = folder.stat().st_uid if folder.is_dir() else 0
+    return pwd.getpwuid(owner) if owner and os.geteuid() == 0 else None
+
+
+def become_user_of(folder: Path) -> None:
+    """Go on as :func:`user_of`."""
+    user = user_of(folder)
+    if user is not None:
+        os.initgroups(user.pw_name, user.pw_gid)
+        os.setgid(user.pw_gid)
+        os.setuid(user.pw_uid)
+
+
+@contextmanager
+def reached(
+    config: Config, places: Places, by: str, *, patience_s: float = PATIENCE_S, rests_s: float = RESTS_S
+) -> Iterator[RobotUnderTest]:
+    """Connect to both sides of a robot, as far as that is possible, until the block ends."""
+    robot = RobotUnderTest(config=config, places=places, by=by, patience_s=patience_s, rests_s=rests_s)
+    with ExitStack() as stack:
+
+        def connect(*, own: bool) -> tuple[RobotSide | None, str]:
+            target = Target(config=config.path, remote=not own, program="selftest")
+            try:
+                transport, names = stack.enter_context(connected(target))
+                return RobotSide(config, target, transport, names, own=own), ""
+            except PebbleError as error:
+                return None, str(error)
+
+        robot.own, robot.why_own = connect(own=True)
+        robot.why_operators = "its config has no mqtt_bridge"
+        if config.services.mqtt_bridge.enabled:
+            robot.operators, robot.why_operators = connect(own=False)
+        for side in robot.sides:
+            side.ask(robot.patience_s)
+        yield robot

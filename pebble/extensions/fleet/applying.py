@@ -1,0 +1,166 @@
+"""Changes of a fleet: its table becomes the files of its brokers and hubs, and mosquitto reads them again."""
+
+import getpass
+import os
+import signal
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
+from pathlib import Path
+
+from pebble.extensions.fleet import broker_files, certificates
+from pebble.extensions.fleet.folder import ACL, CONF, PASSWORDS, PID, ZENOH, Fleet, FleetError, Server, save
+from pebble.runtime.whole_file import write
+
+_LOOPBACK = "127.0.0.1"
+_PLUGIN = "dynamic_security"  # in the name of its library
+_STARTING_S = 3.0  # a small board loads many accounts
+
+
+def make(folder: Path, fleet: Fleet, passwords: Mapping[str, str] | None = None, others: Sequence[str] = ()) -> None:
+    """Write all files of a new fleet. Raises PebbleError.
+
+    ``passwords``: of the accounts that it begins with. ``others``: machines of the fleet that the broker's certificate
+    names, too, and that its authority may sign for. A broker that is ``included`` has its configuration elsewhere.
+    """
+    if (folder / CONF).exists():
+        raise FleetError(f"{folder / CONF} exists already: name another folder")
+    server = fleet.brokers[0]
+    certificates.init(folder, [*names_of(server), *others])
+    folder.chmod(0o700)
+    write_rules(folder, fleet, {name: broker_files.hashed(password) for name, password in (passwords or {}).items()})
+    if not server.included:
+        write_conf(folder, fleet)
+    save(folder, fleet)
+
+
+def names_of(server: Server) -> list[str]:
+    """Return the names in the broker's certificate; by the last ones programs of this machine reach it."""
+    return list(dict.fromkeys((server.host, "localhost", _LOOPBACK)))
+
+
+def write_conf(folder: Path, fleet: Fleet) -> None:
+    text = broker_files.conf_text(fleet, folder, getpass.getuser())
+    write(folder / CONF, text.encode(), 0o644, FleetError)
+
+
+def conf_differences(folder: Path, fleet: Fleet) -> Iterator[str]:
+    """Yield the lines of `mosquitto.conf` that are not what :func:`write_conf` wrote: another listener is another door.
+
+    They may be there for a reason, so no command takes them back.
+    """
+    file = folder / CONF
+    try:
+        lines = file.read_text(encoding="utf-8").splitlines()
+    except OSError as error:
+        raise FleetError(f"{file}: {error.strerror}") from None
+    user = next((line.split()[1] for line in lines if line.startswith("user ")), "")
+    wanted = broker_files.conf_text(fleet, folder, user).splitlines()
+    too_many = (line for line in lines if line.strip() and line not in wanted)
+    yield from (f"{file}: has a line of its own: {line}: remove it there, then restart mosquitto" for line in too_many)
+    lacking = (line for line in wanted if line not in lines)
+    yield from (f"{file}: is without the line: {line}: add it there, then restart mosquitto" for line in lacking)
+
+
+def apply(folder: Path, fleet: Fleet, passwords: Mapping[str, str] | None = None) -> str:
+    """Make broker and hubs know this fleet, then write `fleet.json`. Returns how, in words. ``passwords``: new ones.
+
+    Raises FleetError if the broker does not know it then; `fleet.json` stays as it is.
+    """
+    if obeys_plugin(folder):
+        why = "mosquitto still obeys its dynamic-security plugin: `pebble fleet apply` prints the lines to change"
+        raise FleetError(f"{folder / CONF}: {why}")
+    if fleet.hubs != "none":
+        write_zenoh(folder, fleet)
+    new = {name: broker_files.hashed(password) for name, password in (passwords or {}).items()}
+    write_rules(folder, fleet, passwords_of(folder) | new)
+    how = _reload(folder)
+    save(folder, fleet)
+    return how
+
+
+def copies(folder: Path, fleet: Fleet) -> Iterator[str]:
+    """Yield where copies of the folder's rules count: there nothing changes until they are copied again."""
+    again = f"its copies of {folder / ACL} and {PASSWORDS}: copy them again, and send it SIGHUP"
+    yield from (f"broker {server.host}:{server.port} obeys {again}" for server in fleet.brokers[1:])
+    if fleet.hubs == "elsewhere":
+        yield f"Zenoh hubs obey their copies of {folder / ZENOH}: copy it again, they have read it within two seconds"
+
+
+def write_zenoh(folder: Path, fleet: Fleet) -> None:
+    """Write the rules for Zenoh hubs; one that reads them here obeys within a second or two. Raises FleetError."""
+    from pebble.extensions.fleet.zenoh_rules import zenoh_text  # Zenoh, which few fleets need
+
+    write(folder / ZENOH, zenoh_text(fleet), 0o644, FleetError)
+
+
+def zenoh_differences(folder: Path, fleet: Fleet) -> Iterator[str]:
+    """Yield a line if the rules for Zenoh hubs are not those of the table."""
+    from pebble.extensions.fleet.zenoh_rules import zenoh_text
+
+    file = folder / ZENOH
+    if fleet.hubs != "none" and not (file.is_file() and file.read_bytes() == zenoh_text(fleet)):
+        yield f"{file} does not hold the rules of the table"
+
+
+def pid_of(folder: Path) -> int | None:
+    """Return the process of this folder's mosquitto on this machine; None: it does not run."""
+    try:
+        pid = int((folder / PID).read_text(encoding="utf-8"))
+        name = Path(f"/proc/{pid}/cmdline").read_bytes()
+    except (OSError, ValueError):
+        return None
+    return pid if b"mosquitto" in name else None
+
+
+def obeys_plugin(folder: Path) -> bool:
+    """Return True if mosquitto has the dynamic-security plugin: by its configuration, or in the process that runs."""
+    found = ""
+    with suppress(FileNotFoundError):
+        lines = (folder / CONF).read_text(encoding="utf-8").splitlines()
+        found = "\n".join(line for line in lines if line.startswith("plugin "))
+    with suppress(OSError):  # it does not run, or as somebody else, whom SIGHUP by this process does not reach either
+        found += Path(f"/proc/{pid_of(folder)}/maps").read_text(encoding="utf-8")
+    return _PLUGIN in found
+
+
+def passwords_of(folder: Path) -> dict[str, broker_files.Hashed]:
+    """Return the passwords that the broker's file has, by account. Raises FleetError."""
+    file = folder / PASSWORDS
+    try:
+        return broker_files.passwords_in(file.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise FleetError(f"{file}: {error.strerror}") from None
+    except ValueError:
+        raise FleetError(f"{file} cannot be read: restore it from a copy, or make a new fleet") from None
+
+
+def write_rules(folder: Path, fleet: Fleet, passwords: Mapping[str, broker_files.Hashed]) -> None:
+    """Write the two files that mosquitto reads. Raises FleetError. Accounts without a password cannot log in."""
+    known = {name: passwords[name] for name in fleet.accounts if name in passwords}
+    for name, text in ((PASSWORDS, broker_files.passwords_text(known)), (ACL, broker_files.acl_text(fleet))):
+        write(folder / name, text.encode(), 0o600, FleetError)
+
+
+def _reload(folder: Path) -> str:
+    """Make mosquitto read its files again, and end the connections of those who may not be there. Returns how."""
+    pid = pid_of(folder)
+    if pid is None:
+        return f"in {folder / ACL}: mosquitto does not run"
+    try:
+        _await_handler(pid)
+        os.kill(pid, signal.SIGHUP)
+    except OSError as error:
+        raise FleetError(f"mosquitto (process {pid}): {error.strerror}; send it SIGHUP: sudo kill -HUP {pid}") from None
+    return "at once"
+
+
+def _await_handler(pid: int) -> None:
+    """Wait while mosquitto starts: it listens before it handles SIGHUP, which would end it (2.0.11, measured)."""
+    deadline = time.monotonic() + _STARTING_S
+    while time.monotonic() < deadline:
+        status = Path(f"/proc/{pid}/status").read_text(encoding="ascii")
+        caught = next((line.split()[1] for line in status.splitlines() if line.startswith("SigCgt:")), "0")
+        if int(caught, 16) >> (signal.SIGHUP - 1) & 1:
+            return
+        time.sleep(0.01)

@@ -1,0 +1,121 @@
+"""The audit of a page server: who did what to which robot, one table."""
+
+import sqlite3
+import threading
+import time
+from pathlib import Path
+from typing import Final
+
+from msgspec import Struct
+
+from pebble.extensions.fleet.database import Database
+from pebble.extensions.fleet.tries import network_of
+from pebble.runtime.row_writer import DIFFERENT, OF_STRANGERS, Row, RowWriter
+
+#: What anybody can cause, without a right and without a login.
+REFUSED: Final = ("login-refused", "login-limited")
+OTHERS = "(others)"
+MAX_ROWS, MAX_REFUSED = 100_000, 10_000  # of all, and of REFUSED; beyond, the oldest go
+_TRIM_PERIOD = 1000  # rows between two deletions of old ones
+_MAX_TEXT = 200  # characters of one value
+_FIELDS = ("ref", "user", "device", "address", "detail")
+_COLUMNS = ", ".join(("at", "what", *_FIELDS, "count"))
+_TABLES = (
+    "CREATE TABLE IF NOT EXISTS audit ("
+    "number INTEGER PRIMARY KEY AUTOINCREMENT, at REAL NOT NULL, what TEXT NOT NULL, ref TEXT NOT NULL, "
+    "user TEXT NOT NULL, device TEXT NOT NULL, address TEXT NOT NULL, detail TEXT NOT NULL, "
+    "count INTEGER NOT NULL DEFAULT 1);"
+)
+_TRIM = """
+DELETE FROM audit WHERE number IN (
+    SELECT number FROM audit WHERE what IN (?, ?) ORDER BY number DESC LIMIT -1 OFFSET ?
+) OR number IN (SELECT number FROM audit ORDER BY number DESC LIMIT -1 OFFSET ?)
+"""
+
+
+class Entry(Struct, frozen=True):
+    """A row of the audit; ``at`` is in epoch seconds. With a ``count``: so many more of the minute before."""
+
+    at: float
+    what: str
+    ref: str
+    user: str
+    device: str
+    address: str
+    detail: str
+    count: int
+
+
+class Audit:
+    """Thread-safe; :meth:`write` never blocks."""
+
+    def __init__(self, path: Path | None) -> None:
+        self._database = Database(path, _TABLES, _take_over)
+        self._lock = threading.Lock()
+        self._written = 0
+        self._writer = RowWriter(self._store)
+        self._writer.start()
+
+    def write(
+        self, what: str, *, ref: str = "", user: str = "", device: str = "", address: str = "", detail: str = ""
+    ) -> None:
+        texts = dict(zip(_FIELDS, map(_storable, (ref, user, device, address, detail)), strict=True))
+        refused = what in REFUSED
+        like = (what, network_of(address)) if refused else None
+        self._writer.add({"t": time.time(), "what": what, **texts}, like, OF_STRANGERS if refused else DIFFERENT)
+
+    def read(self, limit: int, ref: str = "") -> list[Entry]:
+        """Return the newest rows, the newest last; of one robot, and of all robots, if ``ref`` names it.
+
+        Raises DatabaseError.
+        """
+        with self._lock:
+            rows = self._database.rows(
+                f"SELECT {_COLUMNS} FROM audit WHERE ? IN ('', ref) OR ref = 'all' "  # noqa: S608
+                "ORDER BY at DESC, number DESC LIMIT ?",
+                (ref, limit),
+            )
+        return [Entry(*row) for row in reversed(rows)]
+
+    def close(self) -> None:
+        """Write what waits, for at most a few seconds."""
+        self._writer.close()
+        with self._lock:
+            self._database.close()
+
+    def _store(self, rows: list[Row]) -> None:
+        """Store all rows. Raises DatabaseError or OSError, and then none is stored."""
+        with self._lock:
+            if removed := self._database.removed:
+                raise OSError(removed)
+            self._written += len(rows)
+            with self._database.transaction() as connection:
+                connection.executemany(
+                    f"INSERT INTO audit ({_COLUMNS}) VALUES (?, ?, ?, ?, ?, ?, ?, ?)",  # noqa: S608
+                    [_values(row) for row in rows],
+                )
+                if self._written >= _TRIM_PERIOD:
+                    self._written = 0
+                    connection.execute(_TRIM, (*REFUSED, MAX_REFUSED, MAX_ROWS))
+
+
+def _values(row: Row) -> tuple[float | str | int, ...]:
+    """A row as it is stored; without texts it stands for those that differ too much."""
+    texts = (row.get(field, OTHERS if field == "user" else "") for field in _FIELDS)
+    return (row["t"], row["what"], *texts, row.get("count", 1))
+
+
+def _take_over(database: sqlite3.Connection) -> None:
+    """Bring what an older version stored in several tables into one."""
+    database.execute("BEGIN IMMEDIATE")  # another process may do the same
+    if "count" not in {row[1] for row in database.execute("PRAGMA table_info(audit)")}:
+        database.execute("ALTER TABLE audit ADD COLUMN count INTEGER NOT NULL DEFAULT 1")
+    if list(database.execute("PRAGMA table_info(refused)")):
+        database.execute(f"INSERT INTO audit ({_COLUMNS}) SELECT {_COLUMNS} FROM refused")  # noqa: S608
+        database.execute("DROP TABLE refused")
+    database.execute("DROP TABLE IF EXISTS marks")
+    database.execute("COMMIT")
+
+
+def _storable(text: str) -> str:
+    return text[:_MAX_TEXT].encode(errors="replace").decode()

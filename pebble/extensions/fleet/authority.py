@@ -1,0 +1,147 @@
+"""A small certificate authority, with the package cryptography: it signs for machines of its own network only."""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime, timedelta
+from ipaddress import ip_address, ip_network
+from pathlib import Path
+from typing import Any
+
+from cryptography import x509
+from cryptography.hazmat.primitives.asymmetric import ec
+from cryptography.hazmat.primitives.hashes import SHA256
+from cryptography.hazmat.primitives.serialization import Encoding, NoEncryption, PrivateFormat, load_pem_private_key
+
+from pebble.extensions.fleet.certificates import CertificateError
+from pebble.runtime.whole_file import write
+
+SERVER_DAYS = 397  # the longest that browsers accept
+_AUTHORITY_DAYS = 3650
+_CLOCKS_DIFFER = timedelta(hours=1)
+#: What an authority may sign for, besides the names it is made for. Whatever happens to its key, a phone that trusts it
+#: accepts no certificate of it for a bank.
+_DOMAINS = ("local", "localhost", "lan", "internal", "home.arpa")
+_IPV4 = ("127.0.0.0/8", "10.0.0.0/8", "172.16.0.0/12", "192.168.0.0/16", "169.254.0.0/16", "100.64.0.0/10")
+_IPV6 = ("::1/128", "fc00::/7", "fe80::/10")
+
+
+@dataclass(frozen=True)
+class Authority:
+    """A certificate that others trust, and its key."""
+
+    certificate: x509.Certificate
+    key: ec.EllipticCurvePrivateKey
+    file: Path
+
+    def sign(self, name: str, hosts: Sequence[str], file: Path, key_file: Path, *, is_client: bool) -> None:
+        """Write a certificate and a new key, for who listens at ``hosts``, logs in with it, or both.
+
+        ``name`` is no host: OpenSSL applies the constraints for names to one that is an address. Raises
+        CertificateError for hosts that it may not sign for.
+        """
+        _check_permitted(self, hosts)
+        usages = [x509.oid.ExtendedKeyUsageOID.SERVER_AUTH] if hosts else []
+        usages += [x509.oid.ExtendedKeyUsageOID.CLIENT_AUTH] if is_client else []
+        identifier = x509.AuthorityKeyIdentifier.from_issuer_public_key(self.key.public_key())
+        extensions: list[x509.ExtensionType] = [x509.ExtendedKeyUsage(usages), identifier]
+        extensions += [x509.SubjectAlternativeName(_general_names(hosts))] if hosts else []
+        _write(file, key_file, name, extensions, issuer=self)
+
+
+def make(file: Path, key_file: Path, hosts: Sequence[str]) -> None:
+    """Write a new authority, which may sign for ``hosts`` and names of local networks. Raises CertificateError."""
+    try:
+        file.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise CertificateError(f"{file.parent}: {error.strerror}") from None
+    permitted = dict.fromkeys(_general_names((*_DOMAINS, *_IPV4, *_IPV6, *hosts), networks=True))
+    constraints = x509.NameConstraints(list(permitted), None)
+    _write(file, key_file, f"Pebble authority of {hosts[0]}"[:64], [constraints])
+
+
+def read(file: Path, key_file: Path) -> Authority:
+    """Return the authority of two files. Raises CertificateError."""
+    certificate = certificate_in(file)
+    try:
+        key: Any = load_pem_private_key(key_file.read_bytes(), None)
+    except (OSError, ValueError, TypeError) as error:
+        raise CertificateError(f"{key_file}: {getattr(error, 'strerror', error)}") from None
+    if key.public_key() != certificate.public_key():
+        raise CertificateError(f"{key_file} is not the key of {file}")
+    return Authority(certificate, key, file)
+
+
+def certificate_in(file: Path) -> x509.Certificate:
+    """Return the certificate of a file. Raises CertificateError."""
+    try:
+        return x509.load_pem_x509_certificate(file.read_bytes())
+    except OSError as error:
+        raise CertificateError(f"{file}: {error.strerror}; `pebble cert init` makes certificates") from None
+    except ValueError:
+        raise CertificateError(f"{file} holds no certificate") from None
+
+
+def names_of(certificate: x509.Certificate) -> tuple[str, ...]:
+    """Return the hosts that a certificate is for."""
+    found = [one.value for one in certificate.extensions if isinstance(one.value, x509.SubjectAlternativeName)]
+    return tuple(str(name.value) for names in found for name in names)
+
+
+def fingerprint(certificate: x509.Certificate) -> str:
+    """Return its SHA-256 as browsers show it."""
+    return certificate.fingerprint(SHA256()).hex(":").upper()
+
+
+def _general_names(hosts: Iterable[str], *, networks: bool = False) -> list[x509.GeneralName]:
+    read_ip = ip_network if networks else ip_address
+    return [x509.IPAddress(read_ip(host)) if _is_address(host) else x509.DNSName(host) for host in hosts]
+
+
+def _is_address(host: str) -> bool:
+    return ":" in host or host.rpartition(".")[2][:1].isdecimal()  # no name ends in a number
+
+
+def _check_permitted(authority: Authority, hosts: Sequence[str]) -> None:
+    constraints = authority.certificate.extensions.get_extension_for_class(x509.NameConstraints).value
+    permitted = constraints.permitted_subtrees or ()
+    domains = [f".{name.value}" for name in permitted if isinstance(name, x509.DNSName)]
+    networks: list[Any] = [name.value for name in permitted if isinstance(name, x509.IPAddress)]
+    for host in hosts:
+        is_in = any(ip_address(host) in net for net in networks) if _is_address(host) else False
+        if not (is_in or f".{host}".endswith(tuple(domains))):
+            raise CertificateError(
+                f"the authority in {authority.file.parent} may not sign for {host}, only for addresses of local "
+                f"networks, names that end in {', '.join(_DOMAINS)}, and those it was made for: use one, or make "
+                "another authority"
+            )
+
+
+def _write(
+    file: Path, key_file: Path, name: str, extensions: Iterable[x509.ExtensionType], issuer: Authority | None = None
+) -> None:
+    """Write a new key and its certificate; without an ``issuer`` it is an authority, which signs itself."""
+    key, now = ec.generate_private_key(ec.SECP256R1()), datetime.now(UTC)
+    subject = x509.Name([x509.NameAttribute(x509.NameOID.COMMON_NAME, name)])
+    until = now + timedelta(days=SERVER_DAYS if issuer else _AUTHORITY_DAYS) - _CLOCKS_DIFFER
+    never = ("content_commitment", "key_encipherment", "data_encipherment", "key_agreement")
+    not_used = dict.fromkeys((*never, "encipher_only", "decipher_only"), False)
+    signs = issuer is None
+    usage = x509.KeyUsage(digital_signature=not signs, key_cert_sign=signs, crl_sign=signs, **not_used)
+    builder = (
+        x509.CertificateBuilder()
+        .subject_name(subject)
+        .issuer_name(issuer.certificate.subject if issuer else subject)
+        .public_key(key.public_key())
+        .serial_number(x509.random_serial_number())
+        .not_valid_before(now - _CLOCKS_DIFFER)
+        .not_valid_after(min(until, issuer.certificate.not_valid_after_utc) if issuer else until)
+        .add_extension(x509.BasicConstraints(ca=signs, path_length=0 if signs else None), critical=True)
+        .add_extension(usage, critical=True)
+        .add_extension(x509.SubjectKeyIdentifier.from_public_key(key.public_key()), critical=False)
+    )
+    for extension in extensions:
+        builder = builder.add_extension(extension, critical=isinstance(extension, x509.NameConstraints))
+    certificate = builder.sign(issuer.key if issuer else key, SHA256())
+    private = key.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, NoEncryption())
+    write(key_file, private, 0o600, CertificateError)
+    write(file, certificate.public_bytes(Encoding.PEM), 0o644, CertificateError)

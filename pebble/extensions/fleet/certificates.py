@@ -1,0 +1,107 @@
+"""Certificates of one's own, so that browsers and phones in a lab can use https: their files, names and dates."""
+
+import socket
+from collections.abc import Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
+from pebble.config.hosts import HostError
+from pebble.config.hosts import host as host_of
+from pebble.errors import PebbleError
+
+CA_CERT, CA_KEY, SERVER_CERT, SERVER_KEY = "ca.pem", "ca.key", "server.pem", "server.key"
+ACCOUNTS = "accounts"  # folder of the certificates with names of accounts
+
+
+class CertificateError(PebbleError):
+    """Certificates cannot be made or read. Example: ``tls/ca.pem exists: …``."""
+
+
+@dataclass(frozen=True, slots=True)
+class Shown:
+    """The content of one certificate file."""
+
+    file: Path
+    names: tuple[str, ...]  # empty for an authority
+    until: datetime
+    sha256: str  # of the certificate, as browsers show it
+
+    @property
+    def days_left(self) -> float:
+        return (self.until - datetime.now(UTC)) / timedelta(days=1)
+
+
+def init(folder: Path, names: Sequence[str]) -> None:
+    """Write a new authority and a server certificate for ``names``. Raises CertificateError; overwrites nothing."""
+    from pebble.extensions.fleet import authority  # needs the package cryptography, which a robot may lack
+
+    hosts = _hosts(names)
+    for name in (CA_CERT, CA_KEY, SERVER_CERT, SERVER_KEY):
+        if (folder / name).exists():
+            raise CertificateError(
+                f"{folder / name} exists: `pebble cert renew --folder {folder}` makes a new server certificate, "
+                "and another --folder a new authority"
+            )
+    authority.make(folder / CA_CERT, folder / CA_KEY, hosts)
+    renew(folder, hosts)
+
+
+def renew(folder: Path, names: Sequence[str] = ()) -> None:
+    """Write a server certificate and key by the folder's authority, for ``names`` or those of before.
+
+    Raises CertificateError.
+    """
+    from pebble.extensions.fleet import authority
+
+    signer = authority.read(folder / CA_CERT, folder / CA_KEY)
+    hosts = _hosts(names or show(folder / SERVER_CERT).names)
+    signer.sign("Pebble operator page", hosts, folder / SERVER_CERT, folder / SERVER_KEY, is_client=False)
+
+
+def of_account(folder: Path, account: str, hosts: Sequence[str] = ()) -> tuple[Path, Path]:
+    """Write a certificate with the name of an account, and its key. Raises CertificateError.
+
+    ``hosts``: where it listens itself, as the hub of a robot does.
+    """
+    from pebble.extensions.fleet import authority
+
+    files = folder / ACCOUNTS / f"{account}.pem", folder / ACCOUNTS / f"{account}.key"
+    signer = authority.read(folder / CA_CERT, folder / CA_KEY)
+    files[0].parent.mkdir(mode=0o700, exist_ok=True)
+    signer.sign(account, _hosts(hosts) if hosts else [], *files, is_client=True)
+    return files
+
+
+def show(file: Path) -> Shown:
+    """Return what a file holds. Raises CertificateError."""
+    from pebble.extensions.fleet import authority
+
+    certificate = authority.certificate_in(file)
+    names, until = authority.names_of(certificate), certificate.not_valid_after_utc
+    return Shown(file, names, until, authority.fingerprint(certificate))
+
+
+def own_names() -> list[str]:
+    """Return names by which other machines probably reach this one."""
+    names = [f"{socket.gethostname().partition('.')[0].lower()}.local"]
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        try:
+            probe.connect(("192.0.2.1", 9))  # sends nothing; the kernel chooses the address of the way out
+            names.append(probe.getsockname()[0])
+        except OSError:
+            pass
+    return names
+
+
+def _hosts(names: Sequence[str]) -> list[str]:
+    """Return host names and addresses, each once and in its one spelling. Raises CertificateError."""
+    try:
+        hosts = list(dict.fromkeys(host_of(name).lower() for name in names))
+    except HostError as error:
+        raise CertificateError(f"a certificate's name {error}") from None
+    if not hosts:
+        raise CertificateError("name the addresses by which browsers reach the server: robot-lab.local 192.168.1.20")
+    if odd := next((host for host in hosts if "%" in host or "_" in host), ""):
+        raise CertificateError(f"{odd}: a certificate names no network card and no _, leave out what has one")
+    return hosts

@@ -1,0 +1,49 @@
+"""Compares the files of a fleet with its table, and names certificates that end soon; one line each."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+from pebble.extensions.fleet import certificates
+from pebble.extensions.fleet.applying import conf_differences, passwords_of, zenoh_differences
+from pebble.extensions.fleet.broker_files import acl_text, rules_in
+from pebble.extensions.fleet.folder import ACL, Fleet, FleetError
+
+_SOON_DAYS = 30
+
+
+def by_hand(folder: Path, fleet: Fleet) -> list[str]:
+    """Return what no command mends; each line names what does. Raises FleetError."""
+    return [*conf_differences(folder, fleet), *_certificates(folder, fleet)]
+
+
+def of_rules(folder: Path, fleet: Fleet) -> list[str]:
+    """Return the differences of accounts and rules, which `pebble fleet apply` takes back. Raises FleetError."""
+    return [*zenoh_differences(folder, fleet), *_of_acl(folder, fleet), *_of_passwords(folder, fleet)]
+
+
+def _certificates(folder: Path, fleet: Fleet) -> Iterator[str]:
+    renewed = {folder / certificates.SERVER_CERT: f"`pebble cert renew --folder {folder}`, then restart mosquitto"}
+    for name in fleet.accounts:
+        file = folder / certificates.ACCOUNTS / f"{name}.pem"
+        if file.exists():
+            renewed[file] = f"`pebble fleet certificate {name}`, with its hosts, and move it to its machine"
+    for file, how in renewed.items():
+        days = certificates.show(file).days_left
+        if days < _SOON_DAYS:
+            yield f"{file} ends in {days:.0f} days: {how}"
+
+
+def _of_acl(folder: Path, fleet: Fleet) -> Iterator[str]:
+    try:
+        there = dict.fromkeys(rules_in((folder / ACL).read_text(encoding="utf-8")))
+    except OSError as error:
+        raise FleetError(f"{error.filename}: {error.strerror}") from None
+    wanted = dict.fromkeys(rules_in(acl_text(fleet)))
+    yield from (f"one rule too many: {rule}" for rule in there if rule not in wanted)
+    yield from (f"one rule too few: {rule}" for rule in wanted if rule not in there)
+
+
+def _of_passwords(folder: Path, fleet: Fleet) -> Iterator[str]:
+    stored = passwords_of(folder)
+    yield from (f"{name}: an account too many: the broker lets it in" for name in stored.keys() - fleet.accounts)
+    yield from (f"{name}: has no password: `pebble fleet password {name}`" for name in fleet.accounts - stored.keys())

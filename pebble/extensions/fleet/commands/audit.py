@@ -1,0 +1,51 @@
+"""``pebble fleet audit``: who did what to this robot, as its bridge has logged it."""
+
+import json
+import time
+from typing import Annotated, Any
+
+import typer
+
+from pebble.commands.options import ConfigArgument
+from pebble.config import load
+from pebble.errors import PebbleError
+from pebble.extensions.operator.commands.terminal.show import print_table
+from pebble.services.mqtt_bridge.audit import files
+
+_COLUMNS = ("t", "what", "who", "from", "count")
+
+
+def audit(
+    config: ConfigArgument,
+    limit: Annotated[int, typer.Option("--limit", "-n", help="Rows to print.", min=1, max=100_000)] = 50,
+) -> int:
+    """Print who did what to a robot, on its own computer, the newest last. Names with ? are claims.
+
+    A row with a number stands for so many more of its minute. The log is a file of JSON lines, for jq and grep.
+
+    \b
+        pebble fleet audit goob.json
+    """
+    newer, older = files(load(config))
+    try:
+        lines = [line for file in (older, newer) if file.exists() for line in file.read_bytes().splitlines() if line]
+    except OSError as error:
+        raise PebbleError(f"{error.filename}: {error.strerror}; run it as the robot's user") from None
+    rows = [row for line in lines[-limit:] if (row := _row(line))]
+    print_table(("time", "what", "who", "from", ""), rows)
+    typer.echo(f"{newer}: {len(lines):,} rows" if lines else "nothing yet: the bridge of this robot writes it")
+    if unread := min(limit, len(lines)) - len(rows):
+        typer.echo(f"{unread:,} lines cannot be read: a power cut leaves such, or somebody has changed them")
+    return 0
+
+
+def _row(line: bytes) -> tuple[str, ...]:
+    """The columns of a line; none if it cannot be read."""
+    try:
+        row: dict[str, Any] = json.loads(line)
+        at = time.strftime("%Y-%m-%d %H:%M:%S", time.localtime(row["t"]))
+    except (ValueError, LookupError, TypeError, ArithmeticError, OSError, RecursionError):
+        return ()
+    what, who, place, count = (str(row.get(column, "")) for column in _COLUMNS[1:])
+    more = ", ".join(f"{key} {value}" for key, value in row.items() if key not in _COLUMNS and value != "")
+    return at, f"{what} × {count}" if count else what, who, place, more

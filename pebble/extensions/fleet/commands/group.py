@@ -1,0 +1,433 @@
+"""``pebble fleet``: the accounts of a broker, and what each of them may do."""
+
+import json
+import os
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import typer
+from msgspec.structs import replace
+
+from pebble.commands.options import host_of, split_names
+from pebble.errors import PebbleError
+from pebble.extensions.fleet import applying, certificates, check, folder, pieces, plugin
+from pebble.extensions.fleet.broker_files import new_password
+from pebble.extensions.fleet.commands import lan
+from pebble.extensions.fleet.folder import CONF, ZENOH, Fleet, FleetError, Server
+from pebble.extensions.fleet.people import People
+from pebble.extensions.fleet.roles import Account, ProgramRole, Role
+from pebble.extensions.operator.client.page_packages import require_packages
+
+_HELP = """The accounts of a broker: robots, people and page servers, and what each may do.
+
+\b
+    pebble fleet init hall --host broker.lab       all files of a broker
+    mosquitto -c hall/mosquitto.conf               the broker
+    pebble fleet add ann --role driver             prints a password once
+    pebble fleet add goob --role robot             prints a piece of config
+    pebble fleet role ann maintainer
+    pebble fleet remove ann
+    pebble fleet check
+"""
+_Folder = Annotated[
+    Path | None, typer.Option("--folder", help="Folder of the fleet; else the only one here.", metavar="FOLDER")
+]
+_Name = Annotated[str, typer.Argument(help="1 to 32 of a-z, 0-9, _ and -.", metavar="NAME", show_default=False)]
+_Roles = Annotated[
+    str,
+    typer.Option(
+        "--role",
+        help="viewer, driver, maintainer, safety, admin, or several: driver,safety; else page, robot, neighbour, "
+        "gateway, boards, hub.",
+        metavar="ROLE[,ROLE]",
+    ),
+]
+_LEVELS: dict[str, Literal["login", "named"]] = {"login": "login", "named": "named"}
+
+
+def init(
+    folder_: Annotated[Path, typer.Argument(metavar="FOLDER", help="A new folder.", show_default=False)],
+    host: Annotated[
+        str | None,
+        typer.Option(
+            help="Name or address by which robots and people reach the broker; then those of spare ones and hubs.",
+            metavar="HOST[,HOST]",
+        ),
+    ] = None,
+    level: Annotated[str | None, typer.Option(help="login, or named: names in topics, too.", metavar="LEVEL")] = None,
+    port: Annotated[int, typer.Option(help="Port of the broker, which is encrypted.", min=1, max=65535)] = folder.PORT,
+    unencrypted: Annotated[
+        int | None,
+        typer.Option("--board-port", help="Also a port without TLS, for boards that have none.", min=1, max=65535),
+    ] = None,
+    plain: Annotated[
+        bool | None, typer.Option("--plain/--no-plain", help="At level named: topics without names are allowed, too.")
+    ] = None,
+) -> int:
+    """Write all files of a broker: authority, certificate, mosquitto.conf, accounts and rules.
+
+    In a folder that is a fleet already it changes the level, and gives every account its rules again.
+
+    \b
+        pebble fleet init hall --host broker.lab
+        pebble fleet init hall --host broker.lab,spare.lab,hub1.lab
+        pebble fleet init hall --level named --plain
+    """
+    require_packages("pebble fleet")
+    place = folder_.absolute()
+    if level is not None and level not in _LEVELS:
+        raise PebbleError(f'--level must be "login" or "named", not "{level}"')
+    if (place / folder.FLEET).exists():
+        return _init_again(place, host, level, plain)
+    if host is None:
+        raise PebbleError("--host is missing: the name or address by which robots and people reach the broker")
+    first, *others = (host_of("--host", one) for one in split_names(host))
+    server = Server(host=first, port=port, unencrypted=unencrypted)
+    fleet = Fleet(level=_LEVELS[level or "login"], brokers=(server,), plain=bool(plain))
+    applying.make(place, fleet, others=others)
+    typer.echo(f"{_shown(place)} has all files of a broker at {server.host}:{server.port}, level {fleet.level}.")
+    typer.echo(f"Start it:\n    mosquitto -c {_shown(place / CONF)}")
+    if os.geteuid() == 0:
+        typer.echo("It will run as root, as whom these files were made: a user of its own would do.")
+    typer.echo(f"Keep {_shown(place)} secret, and a copy of it: its keys are in it.")
+    return 0
+
+
+def add(
+    name: _Name,
+    roles: _Roles,
+    base: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="Of a robot, unless pebble/robots/NAME; of a neighbour; of a gateway, each that it carries.",
+            metavar="BASE",
+        ),
+    ] = None,
+    plain: Annotated[
+        bool, typer.Option("--plain", help="A robot that does not know names: its topics stay without them.")
+    ] = False,
+    board: Annotated[bool, typer.Option("--board", help="A robot that is a board: print local_mqtt.")] = False,
+    people: Annotated[
+        Path | None,
+        typer.Option(help="Of a page on this machine: its database of people; remove acts there, too.", metavar="FILE"),
+    ] = None,
+    folder_: _Folder = None,
+) -> int:
+    """Add an account, and print its password: this once, and nowhere else.
+
+    \b
+        pebble fleet add ann --role driver,safety
+        pebble fleet add goob --role robot
+        pebble fleet add lamp --role robot --base a/b/lamp --plain --board
+        pebble fleet add page-1 --role page
+        pebble fleet add goob-lan --role neighbour --base pebble/robots/goob
+    """
+    given = tuple(dict.fromkeys(split_names(roles)))
+    bases = tuple(base or ((f"pebble/robots/{name}",) if given == (ProgramRole.ROBOT,) else ()))
+    database = "" if people is None else str(people.absolute())
+    account = Account(roles=given, bases=bases, plain=plain, people=database)
+    with _changing(folder_) as (place, fleet):
+        if why := folder.refused(fleet, name, account):
+            raise FleetError(why)
+        if len(fleet.accounts) >= folder.MAX_ACCOUNTS:
+            raise FleetError(f"{place} has {folder.MAX_ACCOUNTS} accounts already: remove one, or make another fleet")
+        after = fleet.with_account(name, account)
+        secret = new_password()
+        is_neighbour = given == (ProgramRole.NEIGHBOUR,)  # which is at a hub, and nowhere else
+        if is_neighbour:
+            require_packages("pebble fleet")
+            after = replace(after, hubs="here" if fleet.hubs == "none" else fleet.hubs)
+        how = applying.apply(place, after, {name: secret})
+        files = certificates.of_account(place, name, ()) if is_neighbour else None
+    _print_account(place, after, name, secret, how, board=board)
+    if files is not None:
+        _print_certificate(place, after, name, files)
+    return 0
+
+
+def role_(
+    name: _Name,
+    roles: Annotated[str, typer.Argument(metavar="ROLE[,ROLE]", help="What it may do.", show_default=False)],
+    folder_: _Folder = None,
+) -> int:
+    """Change what an account may do; it stays connected."""
+    with _changing(folder_) as (place, fleet):
+        account = _account(place, fleet, name)
+        changed = replace(account, roles=tuple(dict.fromkeys(split_names(roles))))
+        if why := folder.refused(fleet.without(name), name, changed):
+            raise FleetError(why)
+        after = replace(fleet, accounts={**fleet.accounts, name: changed})
+        how = applying.apply(place, after)
+    typer.echo(f"{name} is {', '.join(changed.roles)} now ({how})")
+    return _left(applying.copies(Path(_shown(place)), after))
+
+
+def password(name: _Name, folder_: _Folder = None) -> int:
+    """Give an account a new password, print it this once, and end its connections."""
+    with _changing(folder_) as (place, fleet):
+        _account(place, fleet, name)
+        secret = new_password()
+        how = applying.apply(place, fleet, {name: secret})
+    _print_account(place, fleet, name, secret, how)
+    return _left(applying.copies(Path(_shown(place)), replace(fleet, hubs="none")))  # which know no passwords
+
+
+def remove(name: _Name, folder_: _Folder = None) -> int:
+    """Remove an account everywhere, and end its connections; say where it may still get in."""
+    with _changing(folder_) as (place, fleet):
+        account = _account(place, fleet, name)
+        after = fleet.without(name)
+        left = list(_remove_from_pages(fleet, name)) if not set(account.roles) & set(ProgramRole) else []
+        left += applying.copies(Path(_shown(place)), after)
+        try:
+            how = applying.apply(place, after)
+            typer.echo(f"{name} is removed and disconnected ({how})")
+        except FleetError as error:
+            left += [*str(error).splitlines(), f"{name} may still get in there: give this command again"]
+    return _left(left)
+
+
+def zenoh(
+    only_here: Annotated[
+        bool, typer.Option("--only-here", help="All hubs run on this machine and read the file in the folder.")
+    ] = False,
+    folder_: _Folder = None,
+) -> int:
+    """Write the same rules for Zenoh hubs, and write them again at each later change.
+
+    \b
+        pebble fleet zenoh --only-here
+    """
+    require_packages("pebble fleet")
+    with _changing(folder_) as (place, fleet):
+        after = replace(fleet, hubs="here" if only_here else "elsewhere")
+        applying.write_zenoh(place, after)
+        folder.save(place, after)
+    file = place / ZENOH
+    typer.echo(f"{_shown(file)} has the rules of {len(after.accounts)} accounts. For a robot's hub, in its config:")
+    typer.echo(f'    "transport": {{"access": "{file}", …}}')
+    typer.echo("For a hub of its own, in the settings that it is started with:")
+    typer.echo(f'    "access": "{file}"')
+    if not only_here:
+        typer.echo("On other machines: a copy of it, after each change (hubs read it again when it changes).")
+    return 0
+
+
+def certificate(
+    name: _Name,
+    hosts: Annotated[
+        list[str] | None,
+        typer.Argument(metavar="HOST…", help="Where it listens itself, as a robot's hub does.", show_default=False),
+    ] = None,
+    folder_: _Folder = None,
+) -> int:
+    """Write a certificate with the name of an account, for Zenoh, and print what belongs into its config.
+
+    \b
+        pebble fleet certificate goob
+        pebble fleet certificate goob goob.local 192.168.1.7
+    """
+    require_packages("pebble fleet")
+    with _changing(folder_) as (place, fleet):
+        account = _account(place, fleet, name)
+        is_hub = ProgramRole.HUB in account.roles
+        if is_hub and not hosts:
+            raise FleetError(f"{name} is a hub: name where others reach it, `pebble fleet certificate {name} HOST`")
+        files = certificates.of_account(place, name, hosts or ())
+    _print_certificate(place, fleet, name, files)
+    return 0
+
+
+def list_(folder_: _Folder = None) -> int:
+    """Print the accounts and what each is."""
+    place = _place(folder_)
+    fleet = folder.load(place)
+    typer.echo(
+        f"{_shown(place)}: level {fleet.level}, broker " + ", ".join(f"{s.host}:{s.port}" for s in fleet.brokers)
+    )
+    for name, account in fleet.accounts.items():
+        what = [", ".join(account.roles), *account.bases, *(["plain"] if account.plain or fleet.plain else [])]
+        typer.echo(f"{name:<32}  {'  '.join(what)}")
+    return 0
+
+
+def apply_(folder_: _Folder = None) -> int:
+    """Write all rules again from the table, and let the broker read them.
+
+    A fleet that an earlier version made for mosquitto's plugin becomes one of
+    files; the lines of mosquitto.conf to change are printed.
+
+    \b
+        pebble fleet apply
+    """
+    with _changing(folder_, any_rules=True) as (place, fleet):
+        left = list[str]()
+        if fleet.rules == "plugin":
+            fleet, left = plugin.convert(place, fleet)
+        if applying.obeys_plugin(place):
+            left += applying.conf_differences(place, fleet)
+        else:
+            typer.echo(f"{_shown(place)} knows {len(fleet.accounts)} accounts ({applying.apply(place, fleet)})")
+        left += applying.copies(Path(_shown(place)), fleet)
+    return _left(left)
+
+
+def check_(folder_: _Folder = None) -> int:
+    """Compare the broker's files with the table, and name each rule too many or too few.
+
+    \b
+        pebble fleet check
+    """
+    require_packages("pebble fleet")
+    with _changing(folder_) as (place, fleet):
+        by_hand, rules = check.by_hand(place, fleet), check.of_rules(place, fleet)
+    code = _left(by_hand + rules)
+    if rules:
+        typer.echo(f"pebble: `pebble fleet apply --folder {_shown(place)}` writes the rules again", err=True)
+    if not code:
+        typer.echo(f"The files of {_shown(place)} have its {len(fleet.accounts)} accounts, and their rules.")
+    return code
+
+
+def register(app: typer.Typer) -> None:
+    group = typer.Typer(help=_HELP, rich_markup_mode=None)
+    commands: dict[str, Any] = {"init": init, "add": add, "role": role_, "password": password, "remove": remove}
+    commands |= {
+        "list": list_,
+        "apply": apply_,
+        "check": check_,
+        "zenoh": zenoh,
+        "certificate": certificate,
+        "lan": lan.lan,
+        "up": lan.up,
+    }
+    for name, command in commands.items():
+        group.command(name)(command)
+    app.add_typer(group, name="fleet")
+
+
+# -- inside
+
+
+def _init_again(place: Path, host: str | None, level: str | None, plain: bool | None) -> int:
+    if host is not None:
+        raise PebbleError(f"{_shown(place)} is a fleet already, so leave out --host; another host needs another folder")
+    with _changing(place) as (_, fleet):
+        after = replace(
+            fleet,
+            level=fleet.level if level is None else _LEVELS[level],
+            plain=fleet.plain if plain is None else plain,
+        )
+        how = applying.apply(place, after)
+    typer.echo(f"{_shown(place)} has level {after.level}{' and plain topics' if after.plain else ''} ({how})")
+    return _left(applying.copies(Path(_shown(place)), after))
+
+
+@contextmanager
+def _changing(folder_: Path | None, *, any_rules: bool = False) -> Iterator[tuple[Path, Fleet]]:
+    """Lock a fleet; one that is still for the plugin only with ``any_rules``. Raises PebbleError."""
+    place = _place(folder_)
+    with folder.locked(place):
+        fleet = folder.load(place)
+        if fleet.rules == "plugin" and not any_rules:
+            shown = _shown(place)
+            raise FleetError(f"{shown} is for mosquitto's plugin: `pebble fleet apply --folder {shown}` makes it files")
+        yield place, fleet
+
+
+def _place(folder_: Path | None) -> Path:
+    """The folder that is named, else the only fleet in this one. Raises PebbleError."""
+    if folder_ is not None:
+        return folder_.absolute()
+    found = [Path(), *sorted(path for path in Path().iterdir() if path.is_dir() and not path.name.startswith("."))]
+    fleets = [path.absolute() for path in found if (path / folder.FLEET).is_file()]
+    if len(fleets) != 1:
+        names = ", ".join(map(_shown, fleets))
+        why = f"there are several fleets here, {names}" if fleets else "there is no fleet here"
+        raise PebbleError(f"{why}: name one with --folder FOLDER")
+    return fleets[0]
+
+
+def _shown(path: Path) -> str:
+    """Show a path below this folder without the folder."""
+    return str(path.relative_to(Path.cwd())) if path.is_relative_to(Path.cwd()) else str(path)
+
+
+def _account(place: Path, fleet: Fleet, name: str) -> Account:
+    if name not in fleet.accounts:
+        raise FleetError(f"{_shown(place / folder.FLEET)} has no account {name!r}: `pebble fleet list` lists them")
+    return fleet.accounts[name]
+
+
+def _print_account(place: Path, fleet: Fleet, name: str, secret: str, how: str, *, board: bool = False) -> None:
+    account = fleet.accounts[name]
+    if ProgramRole.NEIGHBOUR in account.roles:  # it logs in nowhere: its certificate admits it to the hub
+        typer.echo(f"{name} is {account.bases[0]} at the hub of a LAN ({how}).")
+        return
+    typer.echo(f"{name} may log in as {', '.join(account.roles)} ({how})")
+    typer.echo(f"    password: {secret}")
+    typer.echo("It is shown this once.")
+    ca = _shown(place / certificates.CA_CERT)
+    if ProgramRole.ROBOT in account.roles:
+        typer.echo(f"For its config, which no other user may read, with a copy of {ca} beside it:")
+        typer.echo(json.dumps(pieces.of_broker(fleet, name, secret, board=board), indent=2))
+        return
+    url = f"mqtts://{name}@{pieces.host_and_port(fleet.brokers[0])}"
+    if ProgramRole.PAGE in account.roles:
+        typer.echo(f"    pebble web --url {url} --ca-cert {ca} --password-file FILE")
+    elif ProgramRole.HUB in account.roles:
+        typer.echo("A hub needs none, but a certificate:")
+        typer.echo(f"    pebble fleet certificate {name} HOST")
+    elif ProgramRole.BOARDS in account.roles:
+        typer.echo(
+            f"The file of that gateway, with its password in {name}-password, and what each board grants to add:"
+        )
+        typer.echo(json.dumps(pieces.boards_file(fleet, name, f"{_shown(place)}/"), indent=2))
+    elif ProgramRole.GATEWAY not in account.roles:
+        does = "watch" if account.roles == (Role.VIEWER,) else "drive"
+        typer.echo(f"    pebble {does} ROBOT --url {url} --ca-cert {ca} --password-file FILE")
+
+
+def _print_certificate(place: Path, fleet: Fleet, name: str, files: tuple[Path, Path]) -> None:
+    """Where the certificate of an account and its key are, and what belongs into its config."""
+    roles, until = fleet.accounts[name].roles, certificates.show(files[0]).until
+    typer.echo(f"{' and '.join(map(_shown, files))} are for {name}, until {until:%Y-%m-%d}.")
+    copies = " and ".join(map(_shown, (files[0], place / certificates.CA_CERT)))
+    typer.echo(
+        f"Move the key to its machine, with copies of {copies} beside it. `pebble fleet check` watches the date."
+    )
+    if ProgramRole.HUB in roles:
+        typer.echo(f"And a copy of {_shown(place / ZENOH)}. The file of that hub:")
+    if piece := pieces.of_certificate(fleet, name):
+        typer.echo(json.dumps(piece, indent=2))
+
+
+def _left(lines: Iterable[str]) -> int:
+    """Print where a change does not count yet; the command's exit code."""
+    code = 0
+    for line in lines:
+        typer.echo(f"pebble: {line}", err=True)
+        code = 1
+    return code
+
+
+def _remove_from_pages(fleet: Fleet, name: str) -> Iterator[str]:
+    """Remove the person from the pages' own lists on this machine; yields where that cannot be done."""
+    for page, account in fleet.accounts.items():
+        if ProgramRole.PAGE not in account.roles:
+            continue
+        if not account.people:
+            yield f"{page} has people of its own: if {name} is one, `pebble web user remove {name}` on its machine"
+            continue
+        if not Path(account.people).is_file():
+            yield f"{page}: {account.people} is not there: who is in it may still get in by that page"
+            continue
+        people = People(Path(account.people))
+        try:
+            if any(user.name == name for user in people.list()):
+                people.remove(name)
+                typer.echo(f"{name} is removed from the people of {page} and logged out there")
+        finally:
+            people.close()

@@ -1,0 +1,199 @@
+"""``pebble fleet lan`` and ``pebble fleet up``: where the robots of a LAN meet, from its files to its programs."""
+
+from __future__ import annotations
+
+import json
+import signal
+import subprocess
+import sys
+from collections import Counter
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from pebble.commands.options import host_of
+from pebble.errors import PebbleError
+from pebble.extensions.fleet import applying, certificates, folder, pieces
+from pebble.extensions.fleet.broker_files import new_password
+from pebble.extensions.fleet.folder import CONF, Fleet, FleetError, Server
+from pebble.extensions.fleet.roles import Account, ProgramRole
+from pebble.extensions.lab.rig.processes import mosquitto_path
+from pebble.extensions.operator.client.page_packages import require_packages
+from pebble.runtime.whole_file import write
+
+HUB_FILE, GATEWAY_FILE, ROBOTS = "hub.json", "gateway.json", "robots"
+_LOCK = ".up"
+GATEWAY = "lan-gateway"  # the account of the boards' gateway
+_SHARED = ("online",)  # what all receive of each other until their configs say more
+_LOOK_S, _END_S = 0.5, 5.0
+
+_Folder = Annotated[Path, typer.Argument(metavar="FOLDER", help="A new folder.", show_default=False)]
+
+
+def lan(
+    folder_: _Folder,
+    robots: Annotated[list[str], typer.Argument(metavar="ROBOT…", help="Ids of the robots.", show_default=False)],
+    host: Annotated[str, typer.Option(help="Name or address of this machine in the LAN.", metavar="HOST")],
+    boards: Annotated[
+        list[str] | None,
+        typer.Option("--board", help="Id of an ESP32 on Wi-Fi; may be given several times.", metavar="ID"),
+    ] = None,
+    port: Annotated[int, typer.Option(help="Of the broker for boards.", min=1, max=65535)] = folder.PORT,
+) -> int:
+    """Write all files of a LAN whose robots receive each other: of its hub, and for boards of a broker and a gateway.
+
+    For each robot there is a folder with its certificate and what its config needs.
+    Until their configs say more, robots receive that the others are there, and no
+    script drives another robot.
+
+    \b
+        pebble fleet lan hall goob fred --board minilamp --host hub.lab
+        pebble fleet up hall
+        pebble up hall/robots/goob/goob.json     # on the robot
+    """
+    require_packages("pebble fleet")
+    place, shown, boards = folder_.absolute(), str(folder_), boards or []
+    if (place / folder.FLEET).exists():
+        raise FleetError(f"{shown} is a fleet already: add to it with `pebble fleet add`, or name another folder")
+    server = Server(host=host_of("--host", host), port=port)
+    fleet = _accounts(Fleet(level="login", brokers=(server,), hubs="here"), robots, boards)
+    passwords = {name: new_password() for name in fleet.accounts}
+    applying.make(place, fleet, passwords)
+    applying.write_zenoh(place, folder.load(place))
+    for name in (*robots, *boards):
+        certificates.of_account(place, _neighbour(name), ())
+    _write(place / HUB_FILE, pieces.hub_file(certificates.SERVER_CERT.removesuffix(".pem")))
+    for name in robots:
+        _write_robot(place, fleet, name, [other for other in (*robots, *boards) if other != name])
+    if boards:
+        _write_boards(place, fleet, boards, passwords)
+    typer.echo(f"{shown} has all files of a LAN with {', '.join((*robots, *boards))}. On this machine, {server.host}:")
+    typer.echo(f"    pebble fleet up {shown}")
+    typer.echo(f"On each robot, with a copy of its folder in {shown}/{ROBOTS}; what it has of its own, add there:")
+    for name in robots:
+        typer.echo(f"    pebble up {name}.json")
+    for name in boards:
+        typer.echo(f"    pebble flash {name}.json     # or, simulated: pebble sim minilamp --broker {name}.json")
+    typer.echo(f"Keep {shown} secret: its keys and passwords are in it.")
+    return 0
+
+
+def up(folder_: Annotated[Path, typer.Argument(metavar="FOLDER", help="Of the fleet.", show_default=False)]) -> int:
+    """Run on this machine what the folder of a LAN is for, until Ctrl-C: its hub, broker and gateway.
+
+    Where they shall run after a restart of the machine, use the units in configs/systemd.
+
+    \b
+        pebble fleet up hall
+    """
+    from pebble.runtime.signals import EndSignal
+    from pebble.transports.peers import FileLock
+
+    place = folder_.absolute()
+    if not (place / HUB_FILE).is_file():
+        raise FleetError(f"{folder_ / HUB_FILE} is missing: name a folder that `pebble fleet lan` has made")
+    commands = {name: command for name, command in _commands(place).items() if command}
+    if (lock := FileLock.take(place / _LOCK)) is None:
+        raise FleetError(f"{folder_} runs already: another `pebble fleet up` holds {folder_ / _LOCK}")
+    ends = EndSignal()
+    with ExitStack() as stack:
+        stack.callback(lock.release)
+        running = {name: stack.enter_context(_running(command)) for name, command in commands.items()}
+        typer.echo(f"{', '.join(running)} of {folder_}; Ctrl-C ends them", err=True)
+        while not ends.wait(_LOOK_S):
+            for name, process in running.items():
+                if (code := process.poll()) is not None:
+                    raise PebbleError(
+                        f"{name} has ended with code {code}, so all others end, too: read what it said, and start again"
+                    )
+    return 0
+
+
+def _commands(place: Path) -> dict[str, list[str]]:
+    """What runs here, by its name; nothing for what this LAN does not have. Raises PebbleError."""
+    pebble = [sys.executable, "-m", "pebble"]
+    found = {"hub": [*pebble, "fleet", "hub", str(place / HUB_FILE)]}
+    if not (place / GATEWAY_FILE).exists():
+        return found
+    mosquitto = mosquitto_path()
+    if mosquitto is None:
+        raise PebbleError("mosquitto is not installed: sudo apt install mosquitto")
+    broker = [] if applying.pid_of(place) else [mosquitto, "-c", str(place / CONF)]
+    return {"broker": broker, **found, "gateway": [*pebble, "fleet", "gateway", str(place / GATEWAY_FILE)]}
+
+
+@contextmanager
+def _running(command: list[str]) -> Iterator[subprocess.Popen[bytes]]:
+    from pebble.runtime.parent import tied_to_parent
+
+    process = subprocess.Popen(tied_to_parent(command, signal.SIGTERM), start_new_session=True)
+    try:
+        yield process
+    finally:
+        process.terminate()
+        try:
+            process.wait(_END_S)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            process.wait()
+
+
+def _accounts(fleet: Fleet, robots: list[str], boards: list[str]) -> Fleet:
+    """Each is a neighbour of the others; boards are at the broker as well, with a gateway. Raises FleetError."""
+    bases = {name: f"pebble/robots/{name}" for name in (*robots, *boards)}
+    for name, times in Counter((*robots, *boards)).items():
+        if times > 1:
+            raise FleetError(f"{name} is named {times} times")
+    wanted = [(_neighbour(name), ProgramRole.NEIGHBOUR, [base]) for name, base in bases.items()]
+    wanted += [(name, ProgramRole.ROBOT, [bases[name]]) for name in boards]
+    wanted += [(GATEWAY, ProgramRole.BOARDS, [bases[name] for name in boards])] if boards else []
+    for name, role, of_it in wanted:
+        account = Account(roles=(role,), bases=tuple(of_it))
+        if why := folder.refused(fleet, name, account):
+            raise FleetError(why)
+        fleet = fleet.with_account(name, account)
+    return fleet
+
+
+def _write_boards(place: Path, fleet: Fleet, boards: list[str], passwords: dict[str, str]) -> None:
+    for name in boards:
+        piece = pieces.of_broker(fleet, name, passwords[name], board=True)
+        piece["robot"]["platform"] = "esp32"
+        _write(_folder_of(place, name) / f"{name}.json", piece)
+    gateway = pieces.boards_file(fleet, GATEWAY, "")
+    for neighbour in gateway["neighbours"].values():
+        neighbour["shares"] = list(_SHARED)
+    _write(place / GATEWAY_FILE, gateway)
+    write(place / f"{GATEWAY}-password", f"{passwords[GATEWAY]}\n".encode(), 0o600, FleetError)
+
+
+def _write_robot(place: Path, fleet: Fleet, name: str, others: list[str]) -> None:
+    piece = pieces.of_certificate(fleet, _neighbour(name))
+    section = piece["services"]["neighbours"]
+    section |= {"shares": list(_SHARED), "listens": {other: list(_SHARED) for other in others}}
+    its = _folder_of(place, name)
+    _write(
+        its / f"{name}.json", {"robot": piece["robot"], "transport": {"kind": "zenoh"}, "services": piece["services"]}
+    )
+    for suffix, mode in ((".pem", 0o644), (".key", 0o600)):
+        file = place / certificates.ACCOUNTS / f"{_neighbour(name)}{suffix}"
+        write(its / file.name, file.read_bytes(), mode, FleetError)
+
+
+def _folder_of(place: Path, name: str) -> Path:
+    """The folder that is copied to a robot."""
+    its = place / ROBOTS / name
+    its.mkdir(parents=True, exist_ok=True)
+    write(its / certificates.CA_CERT, (place / certificates.CA_CERT).read_bytes(), 0o644, FleetError)
+    return its
+
+
+def _neighbour(name: str) -> str:
+    return f"{name}-lan"
+
+
+def _write(file: Path, content: dict[str, Any]) -> None:
+    write(file, json.dumps(content, indent=2).encode() + b"\n", 0o600, FleetError)

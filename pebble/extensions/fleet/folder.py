@@ -1,0 +1,157 @@
+"""The folder of one broker, and `fleet.json` in it: who has an account, as what. There is no secret in that file."""
+
+import os
+import re
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Annotated, Literal
+
+import msgspec
+from msgspec import Meta, Struct
+from msgspec.structs import replace
+
+from pebble.contract.identity import SERVERS, Identity
+from pebble.contract.names import NAME
+from pebble.errors import ConfigError, PebbleError
+from pebble.extensions.fleet.roles import GATEWAYS, Account, Extra, ProgramRole, Rule, add_up, rules
+from pebble.runtime.whole_file import write
+
+FLEET, CONF, PID, ACL, PASSWORDS = "fleet.json", "mosquitto.conf", "mosquitto.pid", "acl", "passwords"
+ZENOH = "zenoh.json"
+PORT, PLAIN_PORT = 8883, 1883  # of MQTT over TLS, and without
+MAX_ACCOUNTS = 10_000  # of one fleet
+_LOCK = ".lock"
+_NO_LINK = getattr(os, "O_NOFOLLOW", 0)  # which Windows lacks
+_METRIC = re.compile(r"[^/#$+\x00-\x20\x7f]+|\+")  # one level
+
+
+class FleetError(PebbleError):
+    """An account, a folder or a broker that cannot be used. Example: ``hall/fleet.json has no account 'ann'``."""
+
+
+class Server(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, omit_defaults=True):
+    """Where a broker of the fleet listens. ``unencrypted``: a port for boards that have no TLS.
+
+    ``included``: it is the mosquitto of its machine, which reads `mosquitto.conf` as a part of its own, and which
+    programs of that machine reach at ``PLAIN_PORT`` of loopback: there TLS would keep out a robot whose clock is unset.
+    """
+
+    host: str
+    port: Annotated[int, Meta(ge=1, le=65535)] = PORT
+    unencrypted: Annotated[int, Meta(ge=1, le=65535)] | None = None
+    included: bool = False
+
+
+class Fleet(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """The content of `fleet.json`. The first broker is the one whose files are in this folder.
+
+    ``rules``: `plugin` if an earlier version made it for mosquitto's dynamic-security plugin: `pebble fleet apply`
+    turns it into files. ``plain``: all robots keep their topics without names beside those with names. ``hubs``: where
+    Zenoh hubs run that read the rules for them, on this machine in this folder or elsewhere from copies.
+    """
+
+    level: Literal["login", "named"]
+    brokers: Annotated[tuple[Server, ...], Meta(min_length=1)]
+    rules: Literal["plugin", "files"] = "files"
+    plain: bool = False
+    hubs: Literal["none", "here", "elsewhere"] = "none"
+    accounts: dict[str, Account] = msgspec.field(default_factory=dict)
+    extra: Extra = Extra()
+
+    def rules_of(self, name: str, *, at_hub: bool = False) -> tuple[Rule, ...]:
+        account = self.accounts[name]
+        return rules(name, account, self.level, plain=self._plain_bases(), extra=self.extra, at_hub=at_hub)
+
+    def with_account(self, name: str, account: Account) -> "Fleet":
+        return replace(self, accounts={**self.accounts, name: account})
+
+    def without(self, name: str) -> "Fleet":
+        return replace(self, accounts={one: account for one, account in self.accounts.items() if one != name})
+
+    def _plain_bases(self) -> Sequence[str]:
+        if self.plain:
+            return ("+/+/+",)
+        return tuple(base for account in self.accounts.values() if account.plain for base in account.bases)
+
+
+def load(folder: Path) -> Fleet:
+    """Raises FleetError with the mistake in it."""
+    file = folder / FLEET
+    try:
+        fleet = msgspec.json.decode(file.read_bytes(), type=Fleet)
+    except FileNotFoundError:
+        raise FleetError(f"there is no {file}: `pebble fleet init {folder} --host NAME` makes a fleet") from None
+    except OSError as error:
+        raise FleetError(f"{file}: {error.strerror}") from None
+    except msgspec.MsgspecError as error:
+        raise FleetError(f"{file}: {error}") from None
+    if len(fleet.accounts) > MAX_ACCOUNTS:
+        raise FleetError(f"{file}: {len(fleet.accounts)} accounts; a broker's files have {MAX_ACCOUNTS} at most")
+    for name, account in fleet.accounts.items():
+        if why := refused(fleet.without(name), name, account):
+            raise FleetError(f"{file}: accounts.{name}: {why}")
+    for metric in (*fleet.extra.look, *fleet.extra.drive, *fleet.extra.system):
+        if not all(map(_METRIC.fullmatch, metric.split("/"))) or metric.startswith(("by/", "estop")):
+            raise FleetError(f"{file}: extra: {metric!r} is no metric: write what follows incoming/, such as arm/+")
+    return fleet
+
+
+def save(folder: Path, fleet: Fleet) -> None:
+    """Replace `fleet.json` at once. Raises FleetError."""
+    text = msgspec.json.format(msgspec.json.encode(fleet), indent=2) + b"\n"
+    write(folder / FLEET, text, 0o644, FleetError)
+
+
+def refused(fleet: Fleet, name: str, account: Account) -> str:
+    """Empty if this account may be added, else why not."""
+    if not NAME.fullmatch(name):
+        return f"{name!r} is no name: use 1 to 32 of a-z, 0-9, _ and -"
+    if name in fleet.accounts:
+        return f"{name} exists already, as {', '.join(fleet.accounts[name].roles)}"
+    if why := add_up(account.roles):
+        return why
+    gateway = any(role in account.roles for role in (ProgramRole.GATEWAY, ProgramRole.BOARDS))
+    robot = any(role in account.roles for role in (ProgramRole.ROBOT, ProgramRole.NEIGHBOUR))
+    if robot != (len(account.bases) == 1) and not gateway:
+        return "a robot, or a neighbour, has one base (--base pebble/robots/goob), and no other account has any"
+    if account.plain and not robot:
+        return "only a robot can be plain"
+    if account.people and ProgramRole.PAGE not in account.roles:
+        return "only a page has people of its own"
+    for base in account.bases:
+        if why := _refused_base(base, several=gateway):
+            return why
+        same = (one for one, other in fleet.accounts.items() if base in other.bases and other.roles == account.roles)
+        if robot and (owner := next(same, None)) is not None:
+            return f"{base} belongs to {owner}"
+    return ""
+
+
+def _refused_base(base: str, *, several: bool) -> str:
+    levels = base.split("/")
+    try:
+        Identity(*(one if one != "+" or not several else "any" for one in levels))
+    except (ConfigError, TypeError):
+        return f"{base!r} is no base: write SYSTEM/TYPE/ID, such as pebble/robots/goob"
+    if any(character.isspace() for character in base):
+        return f"{base!r} has a blank, which the rules of a broker cannot have"
+    if levels[1] in (SERVERS, GATEWAYS):
+        return f"{base!r} is no robot's base: {levels[1]} are no robots"
+    return ""
+
+
+@contextmanager
+def locked(folder: Path) -> Iterator[None]:
+    """One command at a time changes the folder. Raises FleetError if there is none."""
+    try:
+        descriptor = os.open(folder / _LOCK, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | _NO_LINK, 0o600)
+    except OSError as error:
+        raise FleetError(f"{folder}: {error.strerror}") from None
+    try:
+        import fcntl  # the command explains itself where there is none
+
+        fcntl.flock(descriptor, fcntl.LOCK_EX)
+        yield
+    finally:
+        os.close(descriptor)

@@ -1,0 +1,215 @@
+"""A robot that the gateway carries: a forwarder and the subscriptions of one time, made anew when it begins again.
+
+So what hub and broker retain then counts, as at the start of a bridge.
+"""
+
+from collections.abc import Callable, Iterable, Sequence
+from functools import partial
+from itertools import islice
+
+from pebble.contract import (
+    AUDIO,
+    AUDIO_CONTROL,
+    CAMERA,
+    INCOMING,
+    MQTT_AUDIO,
+    MQTT_VIDEO,
+    OUTGOING,
+    VIDEO_CONTROL,
+    Channel,
+    Kind,
+    codec,
+)
+from pebble.contract.names import BY, stop_topic, without_name
+from pebble.errors import PayloadError
+from pebble.extensions.fleet.gateway.pace import LARGEST, MOST_EACH, MOST_TOGETHER, Pace
+from pebble.forwarding.cycles import PROBE_PERIOD_S
+from pebble.forwarding.forwarder import Forwarder
+from pebble.forwarding.retained_window import INITIAL_SYNC_S
+from pebble.forwarding.routing import GATEWAY, Side
+from pebble.forwarding.subjects import Subject, Subjects
+from pebble.transports import Handler, Message, Subscription, Transport, clock
+
+#: What the robot sends of each medium, by what allows and what requests it.
+_MEDIA = ((CAMERA, MQTT_VIDEO, VIDEO_CONTROL), (AUDIO, MQTT_AUDIO, AUDIO_CONTROL))
+
+
+class NamedSubjects(Subjects):
+    """Subjects of a robot that renames nothing, also behind the name of a sender, which passes as it is."""
+
+    def _find(self, topic: str) -> Subject | None:
+        if not topic.startswith(f"{self._base}/{INCOMING}/{BY}/"):
+            return super()._find(topic)
+        named = without_name(topic)
+        plain = named.topic if named is not None else stop_topic(topic)
+        subject = None if plain is None else super()._find(plain)
+        if subject is None or subject.kind is not Kind.FLAG:
+            return subject
+        return self._subject(Kind.COMMAND, subject.channel, subject.qos)  # nothing is retained behind a name
+
+
+class Beginning:
+    """Tells since when commands may have waited behind what the broker retains for a robot that begins.
+
+    They share a connection with it, on which something of ours is nearly always on its way, so pings do not tell.
+    """
+
+    LONG_S, REST_S = 0.5, 0.25  # what moves may wait so long; so long after it what had waited is still being read
+
+    def __init__(self) -> None:
+        self._began: float | None = None  # None: none begins
+        self._slow, self._until = 0.0, float("-inf")  # the newest one that took long: since, until
+
+    def __enter__(self) -> None:
+        self._began = clock.since_boot()
+
+    def __exit__(self, *_: object) -> None:
+        now, began = clock.since_boot(), self._began
+        if began is not None and now - began > self.LONG_S:
+            self._slow, self._until = began, now + self.REST_S
+        self._began = None
+
+    def aged(self, message: Message) -> Message:
+        """Return ``message`` with the time since when it may have waited. Hot."""
+        began = self._began
+        if began is None and self._until == float("-inf"):
+            return message
+        now, since = clock.since_boot(), None
+        if began is not None and now - began > self.LONG_S:
+            since = began
+        elif now <= self._until:
+            since = self._slow
+        if since is None:
+            return message
+        return Message(message.topic, message.payload, message.qos, message.retain, message.retain_requested, since)
+
+
+def begin(robots: Sequence["CarriedRobot"], hub: Transport, broker: Transport) -> None:
+    """Forward for ``robots`` from now on; first what the hub retains.
+
+    Waits, bounded, for both sides: once for all robots, as a round trip takes longer than all else that one needs.
+    """
+    _subscribe(robots, Side.LOCAL, hub, f"{OUTGOING}/#", f"{INCOMING}/flags/#")
+    for robot in robots:
+        robot.forwarder.open()
+    _subscribe(robots, Side.REMOTE, broker, f"{INCOMING}/#")
+
+
+def _subscribe(robots: Sequence["CarriedRobot"], side: Side, transport: Transport, *below: str) -> None:
+    handlers: dict[str, Handler] = {}
+    for robot in robots:
+        handlers |= robot.subscribing(side, *below)
+    subscriptions = iter(transport.subscribe_all(handlers, echo=False, direct=True))
+    if side is Side.REMOTE:
+        transport.ask([flag for robot in robots for flag in robot.subjects.flags])
+    for robot in robots:
+        robot.subscribed(side, islice(subscriptions, len(below)))
+
+
+class CarriedRobot:
+    """A robot of the hub.
+
+    ``stops_pass`` is asked for each stop: whether another way carries it. ``flooded`` is called with the topic of each
+    message that is too much at this moment.
+    """
+
+    def __init__(
+        self,
+        base: str,
+        hub: Transport,
+        broker: Transport,
+        stops_pass: Callable[[], bool],
+        flooded: Callable[[str], None],
+        clock: Callable[[], float],
+        beginning: Beginning,
+    ) -> None:
+        self.base = base
+        self._stops_pass, self._flooded, self._clock, self._beginning = stops_pass, flooded, clock, beginning
+        self._paces = {side: Pace(clock, MOST_EACH, MOST_TOGETHER) for side in Side}
+        self._subscriptions: list[Subscription] = []
+        #: By the channel of each medium: what allows it, and whether it was requested at the broker; None: not known.
+        self._allowed: dict[Channel, bool] = {}
+        self._requested: dict[Channel, bool | None] = {medium: None for medium, _, _ in _MEDIA}
+        self._synchronize_at = self._probe_at = float("-inf")
+        self.subjects = NamedSubjects(base)
+        self.forwarder = Forwarder(
+            self.subjects,
+            GATEWAY,
+            {Side.LOCAL: hub, Side.REMOTE: broker},
+            winner=Side.REMOTE,
+            on_value=self._on_value,
+            clock=clock,
+        )
+
+    def subscribing(self, side: Side, *below: str) -> dict[str, Handler]:
+        """Return what to subscribe to on ``side``; its retained messages arrive from now on."""
+        self.forwarder.sides[side].subscribing()
+        return {f"{self.base}/{metrics}": partial(self.receive, side) for metrics in below}
+
+    def subscribed(self, side: Side, subscriptions: Iterable[Subscription]) -> None:
+        """Note that these are active, and that what is retained there has arrived."""
+        self._subscriptions += subscriptions
+        self.forwarder.subscribed(side)
+        self._synchronize_at = self._clock() + INITIAL_SYNC_S
+
+    def end(self) -> None:
+        self.forwarder.shut()
+        for subscription in self._subscriptions:
+            subscription.close()
+
+    def tick(self, now: float) -> None:
+        """Do what is due: what was too much in the second before; what both sides retain; a look for cycles."""
+        for side, pace in self._paces.items():
+            for message in pace.due():
+                self._pass(side, message)
+        if now >= self._synchronize_at:
+            self._synchronize_at = float("inf")
+            for side in Side:
+                self.forwarder.retained.synchronize(side)
+        if now >= self._probe_at:
+            self._probe_at = now + PROBE_PERIOD_S
+            self.forwarder.publisher.probe_again((Side.REMOTE,), self.forwarder.retained.value)
+
+    # -- the transports' threads
+
+    def receive(self, side: Side, message: Message) -> None:
+        is_old = self.forwarder.sides[side].window.may_be_old(message)  # all that is retained comes at once
+        if len(message.payload) <= LARGEST and (is_old or self._paces[side].takes(message, message.topic)):
+            self._pass(side, message)
+        else:
+            self._flooded(message.topic)
+
+    def _pass(self, side: Side, message: Message) -> None:
+        subject = self.subjects[message.topic]
+        if subject is None:
+            return
+        if side is Side.LOCAL:
+            if self._is_wanted(subject.channel):
+                self.forwarder.receive(side, message)
+        elif not (subject.is_stop and self._stops_pass()):
+            self._note_request(subject.channel, message)
+            self.forwarder.receive(side, self._beginning.aged(message))
+
+    # -- media
+
+    def _is_wanted(self, channel: Channel | None) -> bool:
+        """True if it is no medium, or one that is allowed and that no operator at the broker has ended."""
+        if channel not in self._requested:
+            return True
+        return self._allowed.get(channel, False) and self._requested[channel] is not False
+
+    def _on_value(self, subject: Subject, payload: bytes) -> None:
+        for medium, flag, _ in _MEDIA:
+            if subject.channel is flag:
+                try:
+                    self._allowed[medium] = bool(payload) and codec.decode(flag, payload)
+                except PayloadError:
+                    self._allowed[medium] = False
+
+    def _note_request(self, channel: Channel | None, message: Message) -> None:
+        for medium, _, request in _MEDIA:
+            if channel is request and not message.retain:
+                try:
+                    self._requested[medium] = codec.decode(request, message.payload).enabled
+                except PayloadError:
+                    return

@@ -1,0 +1,292 @@
+"""The gateway as a program: it carries the robots that it hears at a hub to an MQTT broker, and their commands back.
+
+Where boards are, the broker of a LAN takes the place of the hub. There is one gateway for a LAN; a second one does not
+start. A live emergency stop has a connection of its own, which is subscribed to nothing else, and passes for every
+robot, heard or not. Only while that connection is away, or flooded, the robot's forwarder passes it as well.
+"""
+
+import logging
+import secrets
+import threading
+import time
+from collections.abc import Callable, Iterable, Sequence
+
+import msgspec
+
+from pebble.contract import ESTOP, ONLINE, Kind
+from pebble.contract.identity import GATEWAYS, Identity, parse_topic
+from pebble.contract.names import with_name
+from pebble.contract.payloads import GatewayHeartbeat
+from pebble.errors import PebbleError
+from pebble.extensions.fleet.gateway.carried_robot import Beginning, CarriedRobot, begin
+from pebble.extensions.fleet.gateway.others import FRESH_S, HEARTBEAT_S, OtherGateways
+from pebble.extensions.fleet.gateway.pace import MOST_STOPS, Pace, Senders
+from pebble.forwarding.cycles import Cycles, Finding
+from pebble.forwarding.routing import Side
+from pebble.forwarding.subjects import Subject
+from pebble.runtime.rate_limit import RateLimitedLog
+from pebble.transports import Message, QoS, State, Transport
+from pebble.transports.counters import Counters
+
+log = logging.getLogger(__name__)
+
+TICK_S = 0.1
+FLOOD_S = 2.0  # so long after a flood of stops others may wait behind it
+MAX_ROBOTS = 1000  # that one gateway carries; further ones with a warning
+SILENT_S = 30.0  # without a heartbeat a robot is carried so long: three of the slowest pace
+#: Robots that begin in one turn: they wait together for hub and broker. What moves is taken for old while a turn lasts
+#: longer than Beginning.LONG_S.
+TOGETHER = 8
+_STOP = Subject(Kind.COMMAND, ESTOP)
+_STOP_END = f"/{ESTOP.metric}"
+
+_decode, _encode = msgspec.json.Decoder(GatewayHeartbeat).decode, msgspec.json.encode
+
+
+class SecondGatewayError(PebbleError):
+    """Another gateway carries the robots already."""
+
+
+def will(name: str) -> Message:
+    """Return what tells the others that this gateway has gone."""
+    return Message(ONLINE.topic(Identity("pebble", GATEWAYS, name).base), b"", QoS.DELIVERED, True)
+
+
+def is_stop(topic: str) -> bool:
+    """True if it is a stop, with the name of a sender or without."""
+    return f"/{ESTOP.direction}/" in topic and topic.endswith(_STOP_END)
+
+
+class Gateway:
+    """The carrier of the robots whose bases match ``robots``. The transports are not yet open.
+
+    ``broker`` is for what is forwarded, as published; ``presence``, with the :func:`will`, and ``stops`` are further
+    connections to the same broker.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        robots: Sequence[str],
+        hub: Transport,
+        broker: Transport,
+        presence: Transport,
+        stops: Transport,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self.counters = Counters()
+        self._name, self._filters, self._clock = name, tuple(robots), clock
+        self._hub, self._broker, self._presence, self._stops = hub, broker, presence, stops
+        self._others = OtherGateways(secrets.token_hex(4))
+        self._listens_since = float("inf")  # for other gateways
+        self._told_at = float("-inf")  # the newest heartbeat
+        self._heard: dict[str, float] = {}  # robots, and when
+        self._first: dict[str, bytes] = {}  # heartbeat of a robot that may be retained
+        self._carried: dict[str, CarriedRobot] = {}
+        self._has_begun = False
+        self._beginning = Beginning()
+        self._stop_pace, self._stop_cycles = Pace(clock, MOST_STOPS), Cycles(clock)
+        self._stop_senders = Senders(self._heard, clock)
+        self._flooded_at = float("-inf")  # the connection of stops
+        self._quiet_log = RateLimitedLog(log, period_s=60.0)
+        self._lost, self._wake = threading.Event(), threading.Event()
+        self._running = True
+
+    @property
+    def carries(self) -> frozenset[str]:
+        return frozenset(self._carried)
+
+    # -- the life of the program
+
+    def run(self, ready: Callable[[], None] = lambda: None) -> None:
+        """Run until :meth:`quit`. Raises SecondGatewayError if another one carries its robots at the start."""
+        try:
+            self.open()
+            ready()
+            while self._running:
+                self._wake.wait(TICK_S)
+                self._wake.clear()
+                self.tick()
+        finally:
+            self.close()
+
+    def quit(self) -> None:
+        """End :meth:`run` soon. Safe from any thread."""
+        self._running = False
+        self._wake.set()
+
+    def open(self) -> None:
+        for transport in (self._hub, self._stops, self._presence, self._broker):
+            transport.policy.is_stop = is_stop
+            transport.on_state(self._on_state)
+        self._presence.on_state(self._on_presence)
+        self._hub.policy.is_invented = self._is_invented
+        self._broker.policy.skips_retained, self._broker.policy.delivers_late = self._skips_retained, True
+        for transport in (self._hub, self._stops, self._presence, self._broker):
+            transport.open(timeout=0.0)
+        for base in self._filters:
+            stop = ESTOP.topic(base)
+            for topic in (stop, with_name(stop, "+")):
+                self._stops.subscribe(topic, self._on_stop, direct=True)
+            self._hub.subscribe(ONLINE.topic(base), self._on_robot, echo=False, direct=True)
+        self._presence.subscribe(ONLINE.filter(f"+/{GATEWAYS}/+"), self._on_gateway, direct=True)
+
+    def close(self) -> None:
+        """Stop forwarding, and only then tell the others."""
+        self._end(self.carries)
+        for transport in (self._broker, self._presence, self._stops, self._hub):
+            transport.close()
+
+    def tick(self) -> None:
+        """Take a turn: end what is over, begin what is heard, and tell other gateways."""
+        for stop in self._stop_pace.due():
+            self._pass_stop(stop)
+        if self._lost.is_set():
+            self._lost.clear()
+            self._end(self.carries)
+        now = self._clock()
+        for base in [base for base, at in list(self._heard.items()) if now - at > SILENT_S]:
+            self._heard.pop(base, None)
+        self._end(self.carries - self._heard.keys())
+        if self._is_connected and now - self._listens_since >= FRESH_S:
+            self._leave_to_others(now)
+            self._begin(now)
+        for robot in self._carried.values():
+            robot.tick(now)
+        if now - self._told_at >= HEARTBEAT_S and self._presence.state is State.CONNECTED:
+            self._told_at = now
+            heartbeat = GatewayHeartbeat(
+                t=int(time.time() * 1000), run=self._others.run, robots=tuple(sorted(self._carried))
+            )
+            self._presence.publish(
+                will(self._name).topic, _encode(heartbeat), qos=QoS.DELIVERED, retain=True, remember=False
+            )
+
+    @property
+    def _is_connected(self) -> bool:
+        """True if robots can be carried, as far as this depends on connections."""
+        return all(one.state is State.CONNECTED for one in (self._hub, self._broker, self._presence))
+
+    def _leave_to_others(self, now: float) -> None:
+        for base in list(self._heard):
+            other = self._others.carrier(base, now, carried=base in self._carried)
+            if not other:
+                continue
+            if not self._has_begun:
+                raise SecondGatewayError(
+                    f"gateway {self._name} does not start: {other} carries {base} already. One gateway carries the "
+                    "robots of a LAN"
+                )
+            self._quiet_log.warning(base, "gateway %s carries %s: this one leaves it", other, base)
+            self._end(self.carries & {base})
+
+    def _begin(self, now: float) -> None:
+        waiting = [
+            base
+            for base in list(self._heard)
+            if base not in self._carried and not self._others.carrier(base, now, carried=False)
+        ]
+        if not waiting:
+            return
+        hub, broker = self._hub, self._broker
+        robots = [
+            CarriedRobot(base, hub, broker, self._stops_pass, self._report_flood, self._clock, self._beginning)
+            for base in waiting[:TOGETHER]
+        ]
+        for transport in (hub, broker):
+            transport.policy.is_stop = is_stop  # of all robots, not of the newest one
+        self._has_begun = True
+        self._carried |= {robot.base: robot for robot in robots}
+        with self._beginning:
+            begin(robots, hub, broker)
+        log.info("carries %s", ", ".join(robot.base for robot in robots))
+        if len(waiting) > TOGETHER:
+            self._wake.set()
+
+    def _end(self, bases: Iterable[str]) -> None:
+        for base in bases:
+            self._carried.pop(base).end()
+            log.info("carries %s no more", base)
+
+    # -- the transports' threads
+
+    def _on_state(self, state: State) -> None:
+        if state is not State.CONNECTED:
+            self._lost.set()
+        self._wake.set()
+
+    def _on_presence(self, state: State) -> None:
+        self._others.forget()
+        self._listens_since = self._clock() if state is State.CONNECTED else float("inf")
+
+    def _on_robot(self, message: Message) -> None:
+        address, payload = parse_topic(message.topic), message.payload
+        if not payload or address is None or address.identity.is_server:
+            return
+        base = address.identity.base
+        if message.retain and not (self._hub.as_published and self._differs(base, payload)):
+            return  # it may be an old one
+        if base in self._heard or len(self._heard) < MAX_ROBOTS:
+            self._heard[base] = self._clock()
+        else:
+            self._quiet_log.warning("many", "the hub has more than %d robots: give it accounts", MAX_ROBOTS)
+
+    def _differs(self, base: str, heartbeat: bytes) -> bool:
+        """True if an earlier heartbeat of that robot was another one, where live ones look like retained ones."""
+        if base not in self._first and len(self._first) >= MAX_ROBOTS:
+            self._first.clear()
+        return self._first.setdefault(base, heartbeat) != heartbeat
+
+    def _on_gateway(self, message: Message) -> None:
+        address = parse_topic(message.topic)
+        if address is None:
+            return
+        name = address.identity.id
+        if not message.payload:
+            self._others.left(name)
+        elif not message.retain:
+            try:
+                heartbeat = _decode(message.payload)
+            except msgspec.MsgspecError:
+                self._quiet_log.warning(name[:40], "%s is no heartbeat of a gateway", message.topic[:200])
+                return
+            self._others.heard(name, heartbeat.run, heartbeat.robots[:MAX_ROBOTS], self._clock())
+
+    def _on_stop(self, message: Message) -> None:
+        if message.retain:
+            return
+        if self._stop_pace.takes(message, self._stop_senders.key(message)):
+            self._pass_stop(message)
+        else:
+            self._flooded_at = self._clock()
+            self._report_flood(message.topic)
+
+    def _pass_stop(self, stop: Message) -> None:
+        if self._stop_cycles.examine(Side.REMOTE, _STOP, stop) is Finding.PASS:
+            self.counters.add("stops")
+            self._hub.publish(stop.topic, stop.payload, qos=QoS.DELIVERED, urgent=True)
+
+    def _report_flood(self, topic: str) -> None:
+        self.counters.add("too_often")
+        self._quiet_log.warning("flood", "more comes on %s than a gateway passes in a second", topic[:200])
+
+    def _stops_pass(self) -> bool:
+        """True if stops come, and soon, by their own connection."""
+        is_flooded = self._clock() - self._flooded_at < FLOOD_S
+        return self._stops.state is State.CONNECTED and not self._stops.not_received and not is_flooded
+
+    def _of(self, topic: str) -> CarriedRobot | None:
+        address = parse_topic(topic)
+        return None if address is None else self._carried.get(address.identity.base)
+
+    def _is_invented(self, topic: str) -> bool:
+        robot = self._of(topic)
+        return robot is None or robot.subjects.invented(topic.encode()) is not None
+
+    def _skips_retained(self, topic: bytes) -> bool:
+        robot = self._of(topic.decode(errors="replace"))
+        return (
+            robot is not None
+            and not topic.endswith(_STOP_END.encode())
+            and robot.forwarder.skips_retained(Side.REMOTE, topic)
+        )

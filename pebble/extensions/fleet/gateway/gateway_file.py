@@ -1,0 +1,109 @@
+"""The file of ``pebble fleet gateway``: where robots are, the MQTT broker of their operators, and which robots."""
+
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated
+
+from pebble.config.config import default_run_folder
+from pebble.config.problems import Notes
+from pebble.config.raw import decode, plain, read_text
+from pebble.config.reader import Reader
+from pebble.config.rules.between_keys import CHECKS
+from pebble.config.rules.doors import place_of
+from pebble.config.transport import Mqtt, ZenohSection
+from pebble.config.types import EMPTY, Account, Level, Section, doc
+from pebble.contract.identity import GATEWAYS, SERVERS, Identity
+from pebble.errors import ConfigError
+from pebble.services.neighbours.config import Neighbours
+
+MOST_BOARDS = 16  # of one file that have neighbours: each has two connections and a thread
+
+
+class GatewayHub(ZenohSection, frozen=True, kw_only=True):
+    """The hub."""
+
+    account: Annotated[Account, doc("Its account at a hub with `access`: the name (CN) in tls.client_cert.")] = ""
+
+
+class GatewayFile(Section, frozen=True, kw_only=True):
+    """A gateway between a hub, or the broker of a LAN, and the broker of the operators."""
+
+    id: Annotated[Level, doc("What it is called among gateways; unset: mqtt.username, the name of its account.")] = ""
+    hub: Annotated[GatewayHub, doc("Where the robots are.")] = GatewayHub()
+    boards: Annotated[
+        Mqtt | None, doc("Instead of hub: the broker of a LAN at which boards are, and robots that speak MQTT.")
+    ] = None
+    mqtt: Annotated[
+        Mqtt | None,
+        doc("The broker of their operators; unset: 127.0.0.1, and beside `neighbours` none: no robot is carried."),
+    ] = None
+    robots: Annotated[tuple[str, ...], doc("Bases of the robots that it carries; + stands for any level.")] = (
+        "pebble/robots/+",
+    )
+    neighbours: Annotated[
+        dict[str, Neighbours],
+        doc("By the base of a robot at `boards`, which runs no program: what services.neighbours is to others."),
+    ] = EMPTY
+
+    @property
+    def operators(self) -> Mqtt | None:
+        """Their broker; None: it carries no robot."""
+        return self.mqtt or (None if self.neighbours else Mqtt())
+
+
+def load_gateway(path: Path, env: Mapping[str, str] = os.environ) -> tuple[GatewayFile, str, Path]:
+    """Read such a file; returns it, the gateway's name, and its run directory. Raises ConfigError with all problems."""
+    path = path.absolute()
+    reader = Reader(path.parent, env, CHECKS)
+    problem = reader.notes.problem
+    gateway = reader.section(GatewayFile, plain(decode(read_text(path), path.name), reader.notes))
+    operators = gateway.operators
+    name = gateway.id or (operators.username if operators is not None else "") or ""
+    if not name:
+        problem(("id",), "is missing: write what this gateway is called, such as gate-1")
+    if not gateway.robots:
+        problem(("robots",), 'is empty: write such as ["pebble/robots/+"]')
+    for at, base in enumerate(gateway.robots):
+        if not _is_base(base):
+            problem(("robots", str(at)), f"{base!r} is no base: write SYSTEM/TYPE/ID, such as pebble/robots/+")
+    _check_sides(reader.notes, gateway, operators)
+    _check_neighbours(reader.notes, gateway)
+    if reader.notes.problems:
+        raise ConfigError(list(dict.fromkeys(f"{path.name}: {one}" for one in reader.notes.problems)))
+    return gateway, name, default_run_folder(f"gateway {path}", env)
+
+
+def _check_sides(notes: Notes, gateway: GatewayFile, operators: Mqtt | None) -> None:
+    boards = gateway.boards
+    if boards is None and not gateway.hub.connect:
+        notes.problem(("hub", "connect"), 'is missing: write where the hub listens, such as ["tls/hub1.lab:7447"]')
+    if boards is not None and gateway.hub.connect:
+        notes.problem(("boards",), "must be left out beside hub: write a second file for it, with an id of its own")
+    if gateway.hub.listen:
+        notes.problem(("hub", "listen"), "must be left out: a gateway is a client of hubs")
+    if boards is not None and operators is not None and place_of(boards) == place_of(operators):
+        notes.problem(("mqtt",), "is also boards: operators reach these robots there without a gateway")
+
+
+def _check_neighbours(notes: Notes, gateway: GatewayFile) -> None:
+    if gateway.neighbours and gateway.boards is None:
+        notes.problem(("neighbours",), "must be left out without boards: a robot at a hub has its own")
+    if len(gateway.neighbours) > MOST_BOARDS:
+        notes.problem(("neighbours",), f"has {len(gateway.neighbours)} robots: {MOST_BOARDS} are the most")
+    for base, one in gateway.neighbours.items():
+        path = ("neighbours", base)
+        if "+" in base or not _is_base(base):
+            notes.problem(path, f"{base!r} is no base: write SYSTEM/TYPE/ID, such as pebble/robots/minilamp")
+        if not one.lan.connect:
+            notes.problem((*path, "lan", "connect"), 'is missing: write where the hub listens: ["tls/hub.lab:7447"]')
+        if one.listens:
+            notes.problem((*path, "listens"), "must be left out: no script of this robot runs here")
+
+
+def _is_base(base: str) -> bool:
+    try:
+        Identity(*("any" if level == "+" else level for level in base.split("/")))
+    except (ConfigError, TypeError):
+        return False
+    return base.split("/")[1] not in (SERVERS, GATEWAYS)

@@ -1,0 +1,290 @@
+"""People who may use the operator page, their sessions, and settings of the server: one SQLite file."""
+
+import hashlib
+import hmac
+import logging
+import secrets
+import sqlite3
+import threading
+import time
+from collections.abc import Callable, Sequence
+from contextlib import closing
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any
+from unicodedata import normalize
+
+from pebble.contract.names import NAME
+from pebble.errors import PebbleError
+from pebble.extensions.fleet.database import Database, DatabaseError
+from pebble.extensions.fleet.roles import Role, Session
+from pebble.extensions.fleet.tries import Tries, network_of
+from pebble.runtime.rate_limit import RateLimitedLog
+from pebble.transports.bounds import BoundedTable
+
+log = logging.getLogger(__name__)
+
+SESSION_S = 7 * 24 * 3600.0  # a session ends after this long, whether it is used or not
+MIN_PASSWORD = 8
+MAX_PASSWORD = 256  # longer ones are refused unread: hashing them costs time
+_SESSIONS = 1000  # that are remembered for when the file cannot be read
+_SESSIONS_EACH = 20  # of one person; the oldest ends when there are more
+_TABLES = """
+CREATE TABLE IF NOT EXISTS people (name TEXT PRIMARY KEY, role TEXT NOT NULL, salt BLOB NOT NULL, hash BLOB NOT NULL);
+CREATE TABLE IF NOT EXISTS sessions (
+    digest BLOB PRIMARY KEY, id TEXT NOT NULL, name TEXT NOT NULL REFERENCES people(name) ON DELETE CASCADE,
+    address TEXT NOT NULL, started REAL NOT NULL, expires REAL NOT NULL);
+CREATE INDEX IF NOT EXISTS sessions_of ON sessions (name, address);
+CREATE TABLE IF NOT EXISTS settings (key TEXT PRIMARY KEY, value TEXT NOT NULL);
+"""
+
+
+class PeopleError(PebbleError):
+    """A name, password or role that cannot be used. Example: ``alice exists already``."""
+
+
+class TooManyTriesError(PebbleError):
+    """Too many passwords were tried from one address or for one name; ``wait_s`` is when the next one is read."""
+
+    def __init__(self, wait_s: float) -> None:
+        self.wait_s = wait_s
+        super().__init__(f"too many tries: wait {max(1, round(wait_s))} s")
+
+
+@dataclass(frozen=True, slots=True)
+class User:
+    """A person."""
+
+    name: str
+    role: Role
+
+
+class People:
+    """Thread-safe. Each call reads the file, so that changes by another process count at once.
+
+    ``path`` None: in memory. Passwords are stored as scrypt hashes, session tokens as their SHA-256.
+    """
+
+    def __init__(
+        self,
+        path: Path | None,
+        *,
+        clock: Callable[[], float] = time.time,
+        monotonic: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self._lock = threading.Lock()
+        self._database = Database(path, _TABLES)
+        self._removed = ""
+        self._log = RateLimitedLog(log, period_s=60.0)
+        #: What the file said of each session when it could be read last, and when that session ends.
+        self._seen = BoundedTable[tuple[Session, float]](_SESSIONS, _SESSIONS << 10, lambda _: 1)
+        self._clock = clock
+        self._addresses, self._names = Tries(monotonic), Tries(monotonic)
+        self._no_hash = _no_hash()  # compared where the name is unknown: the same time
+
+    def close(self) -> None:
+        with self._lock:
+            self._database.close()
+
+    # -- people
+
+    def add(self, name: str, password: str, role: Role) -> None:
+        """Raises PeopleError."""
+        self.check_name(name)
+        salt = secrets.token_bytes(16)
+        values = (name, role.value, salt, _hash(usable(password), salt))
+        try:
+            self._change("INSERT INTO people (name, role, salt, hash) VALUES (?, ?, ?, ?)", *values)
+        except sqlite3.IntegrityError:
+            raise _exists(name) from None
+
+    def check_name(self, name: str) -> None:
+        """Raise PeopleError for a name that cannot be added."""
+        if not NAME.fullmatch(name):
+            raise PeopleError(f"{name!r} is no name: use 1 to 32 of a-z, 0-9, _ and -")
+        if self._rows("SELECT 1 FROM people WHERE name = ?", name):
+            raise _exists(name)
+
+    def remove(self, name: str) -> None:
+        """Ends the person's sessions, too. Raises PeopleError."""
+        self._change_one(name, "DELETE FROM people WHERE name = ?", name)
+
+    def set_password(self, name: str, password: str) -> None:
+        """Ends the person's sessions, too. Raises PeopleError."""
+        salt = secrets.token_bytes(16)
+        hashed = _hash(usable(password), salt)
+        self._change_one(name, "UPDATE people SET salt = ?, hash = ? WHERE name = ?", salt, hashed, name)
+        self._change("DELETE FROM sessions WHERE name = ?", name)
+
+    def set_role(self, name: str, role: Role) -> None:
+        """Counts for running sessions, too. Raises PeopleError."""
+        self._change_one(name, "UPDATE people SET role = ? WHERE name = ?", role.value, name)
+
+    def list(self) -> list[User]:
+        return [User(name, Role(role)) for name, role in self._rows("SELECT name, role FROM people ORDER BY name")]
+
+    def version(self) -> tuple[int, int]:
+        """Another one after each change of people and sessions, by whatever process. Raises DatabaseError."""
+        with self._lock:
+            return self._database.version()
+
+    # -- sessions
+
+    def check(self, name: str, password: str, address: str) -> User | None:
+        """The person with this password. Blocks for some 20 ms, with accents 60, the same for unknown names.
+
+        Raises TooManyTriesError. A name whose tries are used up still logs in from an address where it has a session:
+        others cannot keep a person out.
+        """
+        self._count_try(name, address)
+        known = name if NAME.fullmatch(name) else ""
+        rows = self._rows("SELECT name, role, salt, hash FROM people WHERE name = ?", known)
+        found, role, salt, expected = rows[0] if rows else ("", "", b"no such person..", self._no_hash)
+        typed = password[: 2 * MAX_PASSWORD]  # so long may one be whose accents are letters of their own
+        given = [_hash(spelling, salt) for spelling in _spellings(typed)]
+        is_right = any(hmac.compare_digest(one, expected) for one in given)
+        if not is_right or not found or len(normalize("NFC", typed)) > MAX_PASSWORD:
+            return None
+        self._addresses.give_back(network_of(address))
+        self._names.give_back(name)
+        return User(found, Role(role))
+
+    def start_session(self, user: User, address: str = "") -> str:
+        """A new session's token; the only copy of it."""
+        token = secrets.token_urlsafe(32)
+        now = self._clock()
+        self._change("DELETE FROM sessions WHERE expires <= ?", now)
+        self._change(
+            "DELETE FROM sessions WHERE name = ? AND digest NOT IN "
+            "(SELECT digest FROM sessions WHERE name = ? ORDER BY started DESC LIMIT ?)",
+            user.name,
+            user.name,
+            _SESSIONS_EACH - 1,
+        )
+        self._change(
+            "INSERT INTO sessions (digest, id, name, address, started, expires) VALUES (?, ?, ?, ?, ?, ?)",
+            _digest(token),
+            secrets.token_hex(4),
+            user.name,
+            address,
+            now,
+            now + SESSION_S,
+        )
+        return token
+
+    def session(self, token: str) -> Session | None:
+        """The running session of this token, with the person's role of now.
+
+        While the file cannot be read it is what it was: who drives can go on, and stop robots.
+        """
+        digest, now = _digest(token), self._clock()
+        try:
+            rows = self._rows(
+                "SELECT sessions.id, people.name, people.role, expires FROM sessions JOIN people USING (name) "
+                "WHERE digest = ? AND expires > ?",
+                digest,
+                now,
+            )
+        except DatabaseError as error:
+            self._log.log("unreadable", logging.ERROR, "%s: who is logged in stays so until it can be read", error)
+            session, expires = self._seen.get(digest.hex(), (None, now))
+            return session if expires > now else None
+        if not rows:
+            self._seen.pop(digest.hex(), None)
+            return None
+        id_, name, role, expires = rows[0]
+        session = Session(id_, name, Role(role))
+        self._seen[digest.hex()] = session, expires
+        return session
+
+    def end_session(self, token: str) -> None:
+        self._change("DELETE FROM sessions WHERE digest = ?", _digest(token))
+
+    # -- settings of the server
+
+    def get(self, key: str) -> str:
+        """Return a setting; "" if it was never set."""
+        rows = self._rows("SELECT value FROM settings WHERE key = ?", key)
+        return str(rows[0][0]) if rows else ""
+
+    def set(self, key: str, value: str) -> None:
+        self._change("INSERT OR REPLACE INTO settings (key, value) VALUES (?, ?)", key, value)
+
+    # -- inside
+
+    def _count_try(self, name: str, address: str) -> None:
+        wait_s = self._addresses.take(network_of(address))
+        if wait_s:
+            raise TooManyTriesError(wait_s)
+        wait_s = self._names.take(name)
+        if wait_s and not self._rows("SELECT 1 FROM sessions WHERE name = ? AND address = ?", name, address):
+            raise TooManyTriesError(wait_s)
+
+    def _rows(self, statement: str, *values: Any) -> Sequence[Any]:
+        """Raises DatabaseError, as all methods do."""
+        with self._lock:
+            self._note_place()
+            return self._database.rows(statement, values)
+
+    def _change(self, statement: str, *values: Any) -> int:
+        with self._lock:
+            self._note_place()
+            return self._database.execute(statement, values).rowcount
+
+    def _note_place(self) -> None:
+        removed = self._database.removed
+        if removed and not self._removed:
+            log.error("%s; until then who logs in, and who did what, is not stored", removed)
+        elif self._removed and not removed:
+            log.info("people, sessions and the audit log are stored again")
+        self._removed = removed
+
+    def _change_one(self, name: str, statement: str, *values: Any) -> None:
+        if self._change(statement, *values) == 0:
+            raise PeopleError(f"there is no {name!r}: `pebble web user list` lists the names")
+
+
+def _exists(name: str) -> PeopleError:
+    return PeopleError(f"{name} exists already: change the password or the role, or remove {name}")
+
+
+def has_user(path: Path | None, name: str = "") -> bool:
+    """Return True if the database knows this person, or without a name anybody. Raises DatabaseError."""
+    if path is None or not path.exists():
+        return False
+    # Writes nothing. What is in a write-ahead log is read, too, which needs a file of SQLite's that only then is there
+    unchanged = "" if path.with_name(f"{path.name}-wal").exists() else "&immutable=1"
+    try:
+        with closing(sqlite3.connect(f"{path.absolute().as_uri()}?mode=ro{unchanged}", uri=True)) as connection:
+            if not connection.execute("SELECT 1 FROM sqlite_master WHERE name = 'people'").fetchall():
+                return False  # the program that made it was killed
+            return bool(connection.execute("SELECT 1 FROM people WHERE ? IN (name, '')", (name,)).fetchall())
+    except sqlite3.Error as error:
+        raise DatabaseError(path, error) from None
+
+
+def usable(password: str) -> str:
+    """Return the password as it is stored, with accents as most keyboards write them (NFC). Raises PeopleError."""
+    password = normalize("NFC", password)
+    if not MIN_PASSWORD <= len(password) <= MAX_PASSWORD:
+        raise PeopleError(f"a password has {MIN_PASSWORD} to {MAX_PASSWORD} characters")
+    return password
+
+
+def _spellings(password: str) -> set[str]:
+    """Return how it is stored, and how earlier versions stored it: as typed, on macOS with accents of their own."""
+    return {normalize("NFC", password), password, normalize("NFD", password)}
+
+
+@cache
+def _no_hash() -> bytes:
+    return _hash("", b"no such person..")
+
+
+def _hash(password: str, salt: bytes) -> bytes:
+    return hashlib.scrypt(password.encode(errors="surrogatepass"), salt=salt, n=2**14, r=8, p=1)
+
+
+def _digest(token: str) -> bytes:
+    return hashlib.sha256(token.encode(errors="surrogatepass")).digest()

@@ -1,0 +1,75 @@
+"""What belongs into the configs and files of a fleet's accounts: where they connect, and as whom."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from pebble.extensions.fleet import certificates
+from pebble.extensions.fleet.folder import ZENOH, Fleet, Server
+from pebble.extensions.fleet.roles import ProgramRole
+
+HUB_PORT = 7447
+
+
+def of_broker(fleet: Fleet, name: str, secret: str, *, board: bool) -> dict[str, Any]:
+    """Return what a robot needs in its config to be at the fleet's broker."""
+    server = fleet.brokers[0]
+    login = {"host": server.host, "port": server.port, "username": name, "password": secret}
+    link = login | {"tls": {"enabled": True, "ca_cert": certificates.CA_CERT}}
+    found = {"local_mqtt": link} if board else {"services": {"mqtt_bridge": {"enabled": True, "remote_mqtt": link}}}
+    return {**_who(fleet, name), **found}
+
+
+def of_certificate(fleet: Fleet, name: str) -> dict[str, Any]:
+    """What who has a certificate needs in its config, or as a file of its own; keys and authority lie beside it."""
+    roles = fleet.accounts[name].roles
+    at_hub = _at_hub(fleet, name, certificates.CA_CERT, name)
+    if ProgramRole.HUB in roles:
+        return hub_file(name) | {"journal": f"{name}.journal"}
+    if ProgramRole.ROBOT in roles:
+        remote = {"kind": "zenoh", **at_hub}
+        return {**_who(fleet, name), "services": {"mqtt_bridge": {"enabled": True, "remote": remote}}}
+    if ProgramRole.NEIGHBOUR in roles:
+        return {"robot": _who(fleet, name)["robot"], "services": {"neighbours": {"enabled": True, "lan": at_hub}}}
+    return {}
+
+
+def hub_file(keys: str) -> dict[str, Any]:
+    """The file of a hub that obeys the rules beside it; ``keys``: its certificate and key without their suffix."""
+    return {"listen": [f"tls/0.0.0.0:{HUB_PORT}"], "tls": _tls(certificates.CA_CERT, keys), "access": ZENOH}
+
+
+def boards_file(fleet: Fleet, name: str, below: str) -> dict[str, Any]:
+    """The file of a gateway of boards: those that have an account as a neighbour are in it.
+
+    ``below``: how that file names what is in the fleet's folder.
+    """
+    server, ca = fleet.brokers[0], below + certificates.CA_CERT
+    login = {"username": name, "password_file": f"{name}-password", "tls": {"enabled": True, "ca_cert": ca}}
+    neighbours = {
+        account.bases[0]: {"lan": _at_hub(fleet, other, ca, f"{below}{certificates.ACCOUNTS}/{other}")}
+        for other, account in fleet.accounts.items()
+        if ProgramRole.NEIGHBOUR in account.roles and account.bases[0] in fleet.accounts[name].bases
+    }
+    return {"id": name, "boards": {"host": server.host, "port": server.port, **login}, "neighbours": neighbours}
+
+
+def host_and_port(server: Server) -> str:
+    return f"[{server.host}]:{server.port}" if ":" in server.host else f"{server.host}:{server.port}"
+
+
+def _at_hub(fleet: Fleet, name: str, ca: str, keys: str) -> dict[str, Any]:
+    """How this account connects to the fleet's hub."""
+    return {"account": name, "connect": [f"tls/{fleet.brokers[0].host}:{HUB_PORT}"], "tls": _tls(ca, keys)}
+
+
+def _tls(ca: str, keys: str) -> dict[str, Any]:
+    return {"enabled": True, "ca_cert": ca, "client_cert": f"{keys}.pem", "client_key": f"{keys}.key"}
+
+
+def _who(fleet: Fleet, name: str) -> dict[str, Any]:
+    """The id with the account, which may do nothing below another base: its messages would be dropped in silence."""
+    account = fleet.accounts[name]
+    parts = dict(zip(("system", "type", "id"), account.bases[0].split("/"), strict=True))
+    robot = {key: part for key, part in parts.items() if key == "id" or part != {"system": "pebble"}.get(key, "robots")}
+    return {"robot": robot, "security": {"level": "login" if account.plain else fleet.level}}

@@ -1,0 +1,202 @@
+"""The one table of who may do what: roles, and the rights of each (pebble/contract/rights.py has their channels).
+
+Rules for brokers, the rights of people on the operator page, and the tables of docs/ext/fleet.md are made from it.
+"""
+
+import re
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import NamedTuple
+
+from msgspec import Struct
+
+from pebble.config.security import SecurityLevel
+from pebble.contract import INCOMING, OUTGOING, Channel, Kind
+from pebble.contract import channels as c
+from pebble.contract.identity import GATEWAYS as GATEWAYS
+from pebble.contract.identity import SERVERS
+from pebble.contract.names import BY
+from pebble.contract.rights import WRITES as WRITES
+from pebble.contract.rights import Right as Right
+
+_ANY = "+/+/+"  # any component
+
+
+class Role(StrEnum):
+    """One role of a person."""
+
+    VIEWER = "viewer"
+    DRIVER = "driver"
+    MAINTAINER = "maintainer"
+    SAFETY = "safety"
+    ADMIN = "admin"
+
+
+class ProgramRole(StrEnum):
+    """The role of a program that has an account of its own."""
+
+    PAGE = "page"  # a server of the operator page, which asks the rights of its own people
+    ROBOT = "robot"
+    NEIGHBOUR = "neighbour"  # what a robot is to the other robots at the hub of a LAN
+    GATEWAY = "gateway"
+    BOARDS = "boards"  # a gateway at the broker of a LAN, where the robots are that it carries
+    HUB = "hub"  # a Zenoh hub or router, which carries what all accounts send
+
+
+_EVERYBODY = frozenset({Right.LOOK, Right.STOP})
+_DRIVING = _EVERYBODY | {Right.DRIVE}
+_RIGHTS: Mapping[str, frozenset[Right]] = {
+    Role.VIEWER: _EVERYBODY,
+    Role.DRIVER: _DRIVING,
+    Role.MAINTAINER: _DRIVING | {Right.TAKE, Right.SYSTEM},
+    Role.SAFETY: _DRIVING | {Right.RESET, Right.TAKE},
+    Role.ADMIN: frozenset(Right),
+    ProgramRole.PAGE: frozenset(Right) - {Right.PEOPLE},
+    ProgramRole.NEIGHBOUR: frozenset(),
+    ProgramRole.ROBOT: frozenset(),  # robots and gateways have the topics of their own bases
+    ProgramRole.GATEWAY: frozenset(),
+    ProgramRole.BOARDS: frozenset(),
+    ProgramRole.HUB: frozenset(),  # at a broker; at a hub everything
+}
+ROLES = tuple(_RIGHTS)
+#: Roles that go with no other one.
+_ALONE = frozenset(ProgramRole)
+
+
+class Rule(NamedTuple):
+    """One thing that a broker lets an account do. ``access``: ``read`` or ``write``."""
+
+    access: str
+    filter: str
+
+
+class Account(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, omit_defaults=True):
+    """What `fleet.json` has of one account. ``bases``: of a robot its own, of a gateway those that it carries.
+
+    ``plain``: a robot that does not know names, so its topics stay as they are without them. ``people``: the database
+    of a page server's own people, if that is on this machine.
+    """
+
+    roles: tuple[str, ...]
+    bases: tuple[str, ...] = ()
+    plain: bool = False
+    people: str = ""
+
+
+class Extra(Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
+    """Metrics beyond the contract, by the right that may write them: ``{"drive": ["arm/+"]}``."""
+
+    look: tuple[str, ...] = ()
+    drive: tuple[str, ...] = ()
+    system: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Session:
+    """One login. ``id`` names it in the audit log; it cannot be used to log in."""
+
+    id: str
+    user: str
+    role: Role
+
+
+#: What a browser on the same machine gets where there is no login.
+LOCAL = Session("local", "local", Role.ADMIN)
+
+
+def rights(roles: Iterable[str], level: SecurityLevel) -> frozenset[Right]:
+    """What a person with these roles may do, which add up. Below ``named`` those who drive also reset."""
+    found = frozenset[Right]().union(*(_RIGHTS[role] for role in roles))
+    return found | {Right.RESET} if level != "named" and Right.DRIVE in found else found
+
+
+def page_rights(role: Role, level: SecurityLevel = "open") -> frozenset[str]:
+    """What a person may do on the operator page beyond what everybody may there."""
+    return frozenset(right.value for right in rights((role,), level) - _EVERYBODY)
+
+
+def right_of(channel: Channel) -> str:
+    """The right that may write this channel."""
+    return next(right.value for right, channels in WRITES.items() if channel in channels)
+
+
+def add_up(roles: Sequence[str]) -> str:
+    """Empty if one account may have these roles, else why not."""
+    unknown = [role for role in roles if role not in _RIGHTS]
+    if unknown or not roles:
+        return f"{unknown[0] if unknown else ''!r} is no role: use {', '.join(ROLES)}"
+    alone = [role for role in roles if role in _ALONE]
+    return f"{alone[0]} goes with no other role" if alone and len(set(roles)) > 1 else ""
+
+
+def rules(
+    name: str,
+    account: Account,
+    level: SecurityLevel,
+    *,
+    plain: Sequence[str] = (),
+    extra: Extra | None = None,
+    at_hub: bool = False,
+) -> tuple[Rule, ...]:
+    """All that a broker lets this account do. ``plain``: bases of robots that do not know names, or ``+/+/+``.
+
+    ``at_hub``: what a Zenoh hub lets it do. That differs for a gateway, whose robots are at the hub, and their
+    operators at the broker.
+    """
+    found = [
+        *_of_bases(name, account, at_hub=at_hub),
+        *_of_rights(name, rights(account.roles, level), level, plain, extra or Extra()),
+    ]
+    return tuple(dict.fromkeys(found))
+
+
+def metrics(right: Right, extra: Extra | None = None) -> tuple[str, ...]:
+    """What the right may write below ``incoming/``, as parts of filters."""
+    own = (one if isinstance(one, str) else one.metric for one in WRITES.get(right, ()))
+    return (*(re.sub(r"{[^}]*}", "+", one) for one in own), *getattr(extra, right, ()))
+
+
+def _of_bases(name: str, account: Account, *, at_hub: bool) -> Iterator[Rule]:
+    for base in account.bases:
+        if ProgramRole.NEIGHBOUR in account.roles:
+            yield from _of_neighbour(base) if at_hub else ()
+        elif ProgramRole.BOARDS in account.roles and at_hub:
+            return
+        elif ProgramRole.ROBOT in account.roles or ProgramRole.BOARDS in account.roles:
+            yield from (Rule(access, f"{base}/#") for access in ("read", "write"))
+        else:
+            yield from (Rule("read", f"{base}/{direction}/#") for direction in (INCOMING, OUTGOING))
+            yield Rule("write", f"{base}/{INCOMING if at_hub else OUTGOING}/#")
+            yield from (Rule("write", one.filter(base)) for one in c.CHANNELS if one.kind is Kind.FLAG)
+    if ProgramRole.GATEWAY in account.roles and not at_hub:
+        yield Rule("read", c.ONLINE.filter(f"+/{GATEWAYS}/+"))
+        yield Rule("write", c.ONLINE.filter(f"+/{GATEWAYS}/{name}"))
+
+
+def _of_neighbour(base: str) -> Iterator[Rule]:
+    """Its id in the topics of its commands is that of its base, so no other one can claim it."""
+    kind, _, name = base.rpartition("/")
+    yield Rule("read", f"{kind}/+/{OUTGOING}/#")
+    yield Rule("write", f"{base}/{OUTGOING}/#")
+    yield Rule("read", c.FROM_NEIGHBOUR.filter(base))
+    yield Rule("write", c.FROM_NEIGHBOUR.topic(f"{kind}/+", robot=name))
+
+
+def _of_rights(
+    name: str, held: frozenset[Right], level: SecurityLevel, plain: Sequence[str], extra: Extra
+) -> Iterator[Rule]:
+    if Right.LOOK in held:
+        yield Rule("read", f"{_ANY}/{OUTGOING}/#")
+        yield Rule("read", f"{_ANY}/{INCOMING}/flags/#")
+    if Right.STOP in held:
+        yield Rule("write", c.ESTOP.filter(_ANY))  # a stop needs no name, at any level
+    for right in Right:
+        if right in held:
+            for metric in metrics(right, extra):
+                if level == "named":
+                    yield Rule("write", f"{_ANY}/{INCOMING}/{BY}/{name}/{metric}")
+                for base in plain if level == "named" else (_ANY,):
+                    yield Rule("write", f"{base}/{INCOMING}/{metric}")
+    if Right.DRIVE in held:
+        yield Rule("write", c.BRIDGE_PROBE.filter(f"+/{SERVERS}/+"))

@@ -1,0 +1,76 @@
+"""Rules for a Zenoh hub, of the same table as a broker's: what each account, named in its certificate, may do there."""
+
+from collections.abc import Iterable, Iterator, Sequence
+
+from pebble.contract import CHANNELS, ESTOP, INCOMING, OUTGOING, Kind
+from pebble.contract.names import with_name
+from pebble.extensions.fleet.folder import Fleet
+from pebble.extensions.fleet.roles import Account, ProgramRole, Rule
+from pebble.transports.zenoh import wire
+from pebble.transports.zenoh.access import (
+    EVERYTHING,
+    IN,
+    OUT,
+    Access,
+    Grant,
+    HubAccount,
+    access_control,
+    first,
+    written,
+)
+from pebble.transports.zenoh.keymap import filter_to_key
+
+_ANY = "+/+/+"  # the levels of any robot
+_STOP = ESTOP.topic(_ANY)
+_FLAGS = tuple(f"/{one.suffix}" for one in CHANNELS if one.kind is Kind.FLAG)
+
+
+def zenoh_text(fleet: Fleet) -> bytes:
+    """The file that a hub reads as ``transport.access``."""
+    rules = {name: fleet.rules_of(name, at_hub=True) for name in fleet.accounts}
+    accounts = {name: _hub_account(fleet.accounts[name], held) for name, held in rules.items()}
+    rows = (
+        ([name], _grants(name, rules[name], accounts[name].retains, is_hub=ProgramRole.HUB in account.roles))
+        for name, account in fleet.accounts.items()
+    )
+    stops = _keys((_STOP, with_name(_STOP, "+")))
+    return written(Access(access_control(rows), accounts, first(_keys([f"{_ANY}/{INCOMING}/#"]), stops)))
+
+
+def _hub_account(account: Account, held: Iterable[Rule]) -> HubAccount:
+    """A robot retains what it publishes and leaves its will there; others retain flags without a name."""
+    writes = [rule.filter for rule in held if rule.access == "write"]
+    robot = ProgramRole.ROBOT in account.roles
+    wills = [f"{base}/{OUTGOING}/#" for base in account.bases if robot]
+    whole = [one for one in writes if robot and one.endswith("/#")]
+    flags = [one for one in writes if one.endswith(_FLAGS)]
+    return HubAccount(tuple(wills), tuple(dict.fromkeys((*wills, *whole, *flags))))
+
+
+def _grants(name: str, held: Sequence[Rule], retains: Iterable[str], *, is_hub: bool) -> Iterator[Grant]:
+    """Only what its client needs; so it cannot pose as a hub, nor answer queries of others."""
+    if is_hub:
+        yield from EVERYTHING
+        return
+    reads, writes = (_keys(rule.filter for rule in held if rule.access == one) for one in ("read", "write"))
+    asks = tuple(wire.asked(one, name) for one in (wire.HELLO, wire.BYE))
+    retained, hubs, counts = _retained(reads), (f"{wire.UP}*",), (f"{wire.SYNC}*",)
+    yield Grant(OUT, ("put",), reads)
+    yield Grant(IN, ("declare_subscriber",), reads)
+    yield Grant(IN, ("put",), (*writes, *_retained(_keys(retains))))
+    # Zenoh lets a declaration through only if the rule covers all that it asks for, here what local programs do.
+    yield Grant(OUT, ("declare_subscriber",), ("**", f"{wire.RETAINED}**"))
+    for keys in (retained, asks, counts):
+        yield Grant(IN, ("query",), keys)
+        yield Grant(OUT, ("reply", "declare_queryable"), keys)
+    yield Grant(IN, ("liveliness_token",), (f"{wire.LIVE}{name}{wire.OF}$*",))
+    yield Grant(IN, ("liveliness_query", "declare_liveliness_subscriber"), hubs)
+    yield Grant(OUT, ("liveliness_token",), hubs)
+
+
+def _retained(keys: Iterable[str]) -> tuple[str, ...]:
+    return tuple(wire.RETAINED + key for key in keys)
+
+
+def _keys(filters: Iterable[str]) -> tuple[str, ...]:
+    return tuple(map(filter_to_key, filters))

@@ -1,0 +1,55 @@
+"""The JSON channels of robots as Foxglove understands them: JSON Schema in the part that its parser reads."""
+
+from functools import cache
+from typing import Any, Final
+
+import msgspec
+
+from pebble.contract import Channel
+from pebble.contract.payloads import AnyObject
+from pebble.contract.schemas import schemas
+from pebble.extensions.foxglove.server import ChannelSpec
+
+_PLAIN: Final = frozenset({"boolean", "string", "number", "integer"})
+_ANY: Final = "pebble.Any"
+_DEEPEST: Final = 8
+
+
+def json_spec(topic: str, channel: Channel | None) -> ChannelSpec:
+    """The channel for this topic.
+
+    Foxglove plots only fields that a schema names, so one that cannot name all of them is left out: then the channel
+    holds any JSON.
+    """
+    name, schema = (_ANY, b"") if channel is None else _schema_of(channel.suffix, channel.payload)
+    return ChannelSpec(topic, "json", name, "jsonschema", schema)
+
+
+@cache
+def _schema_of(suffix: str, payload: type) -> tuple[str, bytes]:
+    document = schemas()
+    fitted = _value(document["topics"][suffix], document["$defs"], 0)
+    if payload is AnyObject or fitted is None or fitted["type"] != "object":
+        return _ANY, b""
+    return f"pebble.{payload.__name__}", msgspec.json.encode({"title": f"pebble.{payload.__name__}", **fitted})
+
+
+def _value(schema: dict[str, Any], definitions: dict[str, Any], depth: int) -> dict[str, Any] | None:
+    """The same in what Foxglove reads: plain types, objects with known fields, arrays of these. None: it cannot."""
+    if depth > _DEEPEST:
+        return None
+    if "$ref" in schema:
+        return _value(definitions[schema["$ref"].rpartition("/")[2]], definitions, depth + 1)
+    if "anyOf" in schema:
+        some = [one for one in schema["anyOf"] if one.get("type") != "null"]
+        return _value(some[0], definitions, depth + 1) if len(some) == 1 else None
+    kind = schema.get("type")
+    if kind in _PLAIN:
+        return {"type": kind}
+    if kind == "object" and schema.get("properties"):
+        fields = {name: _value(one, definitions, depth + 1) for name, one in schema["properties"].items()}
+        return None if None in fields.values() else {"type": "object", "properties": fields}
+    if kind == "array" and isinstance(schema.get("items"), dict):
+        item = _value(schema["items"], definitions, depth + 1)
+        return None if item is None or item["type"] == "array" else {"type": "array", "items": item}
+    return None

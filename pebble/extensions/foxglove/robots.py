@@ -1,0 +1,130 @@
+"""Robots of a broker for Foxglove: their channels as they appear, and their telemetry."""
+
+import asyncio
+import logging
+import time
+from typing import Final
+
+from pebble.contract import CAPABILITIES, STATUS, Channel
+from pebble.contract.channels import channel_of
+from pebble.contract.identity import parse_topic
+from pebble.extensions.foxglove.json_channels import json_spec
+from pebble.extensions.foxglove.media_feed import MediaFeed
+from pebble.extensions.foxglove.server import Server, protobuf_spec
+from pebble.extensions.operator.client.broker import Broker
+from pebble.extensions.operator.client.media_request.offer import Medium
+from pebble.extensions.operator.client.robot_topics import FLEET, SYNONYMS, WATCHED
+from pebble.extensions.operator.client.robot_view import RobotView
+from pebble.extensions.recordings.exports.foxglove_messages import Schemas, Telemetry, as_object, stamped, time_of
+from pebble.transports import Message
+from pebble.transports.topics import matches
+
+log = logging.getLogger(__name__)
+
+MOST_ROBOTS: Final = 500  # that are shown; further ones are counted
+_MEDIA: Final[tuple[Medium, ...]] = ("video", "audio")
+
+
+def filters(base: str) -> list[str]:
+    """What to subscribe to: the telemetry of these robots, without pictures and sound."""
+    every = list(dict.fromkeys(channel.filter(base) for channel in (*FLEET, *WATCHED, *SYNONYMS)))
+    return [one for one in every if not any(other != one and matches(other, one) for other in every)]
+
+
+class Robots:
+    """Only the event loop calls it."""
+
+    def __init__(self, broker: Broker, server: Server, schemas: Schemas) -> None:
+        self.robots: dict[str, RobotView] = {}
+        self._refused = 0  # messages that are no JSON, and those of a robot too many
+        self._broker, self._server, self._schemas = broker, server, schemas
+        self._telemetry = Telemetry(schemas)
+        self._feeds: dict[tuple[str, Medium], MediaFeed] = {}
+        self._by_channel: dict[str, MediaFeed] = {}
+        self._tasks: set[asyncio.Task[None]] = set()
+        broker.is_named = lambda base: base in self.robots and self.robots[base].named
+
+    @property
+    def dropped(self) -> int:
+        """Pictures and packets of sound that were too many at once."""
+        return sum(feed.dropped for feed in self._feeds.values())
+
+    @property
+    def refused(self) -> int:
+        """What is none of these: no JSON, damaged, or a picture without those that it builds on."""
+        return self._refused + sum(feed.refused for feed in self._feeds.values())
+
+    def receive(self, message: Message, at: float) -> None:
+        """A message that arrived at ``at`` (monotonic)."""
+        address = parse_topic(message.topic)
+        if address is None or address.identity.is_server or not message.payload:
+            return
+        robot = self._robot(address.identity.base)
+        if robot is None:
+            self._refused += 1
+            return
+        channel = channel_of(f"{address.direction}/{address.metric}")
+        if channel in (CAPABILITIES, STATUS):
+            robot.receive(channel, message, at, time.time())
+        if channel is CAPABILITIES:
+            for medium in _MEDIA:
+                feed = self._feed(robot, medium)
+                self._by_channel.update(dict.fromkeys(feed.update(), feed))
+        self._publish(channel, message, time.time_ns() - round((time.monotonic() - at) * 1e9))
+
+    def wake(self, topic: str, *, subscribed: bool) -> None:
+        """A client has subscribed to this channel, or unsubscribed."""
+        feed = self._by_channel.get(topic)
+        if feed is not None:
+            feed.wake(topic.rpartition("/")[2], subscribed=subscribed)
+
+    async def close(self, timeout: float) -> None:
+        """Withdraw all requests."""
+        for task in self._tasks:
+            task.cancel()
+        if self._tasks:
+            await asyncio.wait(self._tasks, timeout=timeout)
+
+    def _robot(self, base: str) -> RobotView | None:
+        """Return that robot; None: there are too many."""
+        if base not in self.robots and len(self.robots) < MOST_ROBOTS:
+            self.robots[base] = RobotView(base)
+        return self.robots.get(base)
+
+    # -- telemetry
+
+    def _publish(self, channel: Channel | None, message: Message, at_ns: int) -> None:
+        """What Foxglove has a schema for, by that; other JSON as it is. The last value of a state is remembered."""
+        topic, payload = message.topic, message.payload
+        remember = message.retain or (channel is not None and channel.default_retain)
+        converted = self._telemetry.convert(topic, payload)
+        if converted is not None:
+            made, below = converted.message, f"{topic}/{converted.ending}"
+            if not self._server.declared(below):
+                self._server.declare(protobuf_spec(below, made, self._schemas))
+            self._server.publish(below, stamped(made, time_of(payload, at_ns)), at_ns, remember=remember)
+        if converted is not None and not converted.beside:
+            return
+        data = as_object(payload)
+        if data is None:
+            self._refused += 1
+            return
+        if not self._server.declared(topic):
+            self._server.declare(json_spec(topic, channel))
+        self._server.publish(topic, data, at_ns, remember=remember)
+
+    # -- pictures and sound
+
+    def _feed(self, robot: RobotView, medium: Medium) -> MediaFeed:
+        if (feed := self._feeds.get((robot.base, medium))) is not None:
+            return feed
+        feed = self._feeds[robot.base, medium] = MediaFeed(self._broker, self._server, self._schemas, robot, medium)
+        task = asyncio.create_task(feed.run(), name=f"the {medium} of {robot.base}")
+        self._tasks.add(task)
+        task.add_done_callback(_log_error)
+        return feed
+
+
+def _log_error(task: asyncio.Task[None]) -> None:
+    if not task.cancelled() and task.exception() is not None:
+        log.error("%s has ended", task.get_name(), exc_info=task.exception())

@@ -1,0 +1,70 @@
+"""Verifies a flashed robot: waits for its first heartbeat at the broker, or its first report on the serial line."""
+
+import json
+import queue
+import time
+from contextlib import closing, suppress
+
+import serial
+
+from pebble.config import Config
+from pebble.contract import ONLINE
+from pebble.errors import DeviceError
+from pebble.extensions.install.flash.boards import Firmware
+from pebble.runtime.connections import LOCAL_RECONNECT_S, mqtt_settings
+from pebble.transports import Message, QoS, State, create
+
+BROKER_S = 5.0
+HEARTBEAT_S = 60.0  # boot, Wi-Fi, DHCP, DNS
+REPORT_S = 20.0
+_CHUNK = 4096
+
+
+def at_broker(config: Config, timeout_s: float = HEARTBEAT_S) -> str:
+    """Wait for a live heartbeat; a retained one is from before the reset. Raises DeviceError with what to check."""
+    broker = config.local_mqtt
+    received: queue.Queue[Message] = queue.Queue()
+    settings = mqtt_settings(broker, reconnect_max_s=LOCAL_RECONNECT_S)
+    transport = create("mqtt", f"{config.base}/flash", settings)
+    with closing(transport.open(BROKER_S)):
+        if transport.state is not State.CONNECTED:
+            why = transport.problem or f"no answer within {BROKER_S:g} s"
+            raise DeviceError(f"local_mqtt: this machine cannot connect to {broker.host}:{broker.port}: {why}")
+        transport.subscribe(ONLINE.topic(config.base), received.put, qos=QoS.LATEST)
+        end = time.monotonic() + timeout_s
+        while (left := end - time.monotonic()) > 0:
+            with suppress(queue.Empty):
+                message = received.get(timeout=left)
+                if not message.retain and _alive(message.payload):
+                    return "the robot is online"
+    raise DeviceError(
+        f"no heartbeat from {config.base} within {timeout_s:g} s: check that the Wi-Fi's name and password are right, "
+        f"that it is a 2.4 GHz network, and that {broker.host} can be reached from it"
+    )
+
+
+def _alive(payload: bytes) -> bool:
+    try:
+        body = json.loads(payload)
+    except ValueError:
+        return False
+    return isinstance(body, dict) and body.get("online") is not False
+
+
+def on_serial_port(port: str, firmware: Firmware, timeout_s: float = REPORT_S) -> str:
+    """Wait for the firmware's report on its serial line. Raises DeviceError with what was received instead."""
+    is_report = firmware.is_report
+    assert is_report is not None  # noqa: S101 - robots with a broker are verified there
+    end = time.monotonic() + timeout_s
+    received = b""
+    while time.monotonic() < end:
+        # the port disappears while the board resets
+        with suppress(OSError, serial.SerialException), serial.Serial(port, firmware.baud, timeout=0.1) as line:
+            while time.monotonic() < end:
+                received = (received + line.read(line.in_waiting or 1))[-_CHUNK:]
+                if is_report(received):
+                    return "the robot sends reports"
+        time.sleep(0.1)
+    raise DeviceError(
+        f"--port {port}: no report from {firmware.name} within {timeout_s:g} s; received {received[-200:]!r}"
+    )

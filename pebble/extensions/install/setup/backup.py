@@ -1,0 +1,253 @@
+"""Packs what a new machine needs to be this robot into one tar file, and reads it again.
+
+The first member is ``backup.json``, an :class:`About`; the others are files at their paths below the root, without the
+leading slash. Recordings are not in it.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import os
+import re
+import sqlite3
+import tarfile
+import time
+from collections.abc import Iterable, Iterator
+from contextlib import closing
+from dataclasses import dataclass, field
+from pathlib import Path, PurePosixPath
+
+import msgspec
+
+from pebble.config import Config, load
+from pebble.config.masking import values_of
+from pebble.errors import PebbleError
+from pebble.extensions.fleet.folder import FLEET
+from pebble.extensions.page.setting import people_of
+from pebble.runtime.places import Places
+from pebble.version import __version__
+
+FORMAT = 1
+ABOUT = "backup.json"
+NOTE = "It holds passwords and private keys: who has this file can act as this robot, its broker and its page."
+_SQLITE = b"SQLite format 3\0"
+#: Ends of names: what SQLite has beside a database, recordings, halves of files, and what a broker makes again.
+_NOT = ("-wal", "-shm", ".mcap", ".new", ".pid", ".pyc", "/mosquitto.db")
+_SHA256 = "PEBBLE.sha256"  # of the content, in the header of each file but the first
+_LARGEST = 64 << 20  # bytes of one file
+_MOST = 1 << 30  # bytes of a backup
+_END = 2 * tarfile.BLOCKSIZE  # bytes of zeros, at least
+#: Keys of mosquitto's configuration that name a file of accounts, rules or keys.
+_BROKER_FILES = re.compile(
+    r"^\s*(?:password_file|acl_file|psk_file|cafile|certfile|keyfile|crlfile|plugin_opt_config_file)\s+(/.*\S)",
+    re.MULTILINE,
+)
+
+
+class BackupError(PebbleError):
+    """A backup cannot be made or read. Example: ``goob.tar: is no backup of Pebble``."""
+
+
+class About(msgspec.Struct, frozen=True, kw_only=True):
+    """The content of ``backup.json``. ``id``: of the robot; ``version``: of the Pebble that made it."""
+
+    format: int
+    version: str
+    id: str
+    note: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Saved:
+    """One file, and its permissions."""
+
+    content: bytes
+    mode: int
+
+
+@dataclass(slots=True)
+class Backup:
+    """``files`` by their paths below the root; ``left_out``: why a file that belongs to the robot is not in it."""
+
+    about: About
+    files: dict[str, Saved] = field(default_factory=dict)
+    left_out: dict[str, str] = field(default_factory=dict)
+
+    @property
+    def bytes(self) -> int:
+        return sum(len(saved.content) for saved in self.files.values())
+
+
+# -- making one
+
+
+def make(places: Places) -> Backup:
+    """Read everything of the robot that is installed there. Raises BackupError; its database may be in use."""
+    if not places.config.is_file():
+        raise BackupError(f"there is no {places.config}: no robot is installed there, so there is nothing to back up")
+    config = load(places.config, {**os.environ, "STATE_DIRECTORY": str(places.state)})
+    backup = Backup(About(format=FORMAT, version=__version__, id=config.robot.id, note=NOTE))
+    files = dict.fromkeys(_files(places, config))
+    plain = {file.resolve() for file in files if not file.is_symlink()}
+    for file in files:
+        if not (file.is_symlink() and file.resolve() in plain):  # setup makes such a link again
+            _add(backup, places.root, file)
+    for what, folder in _left_out(config):
+        if (place := _here(places, folder)).exists():
+            backup.left_out[str(place)] = what
+    if backup.bytes > _MOST:
+        raise BackupError(f"it would have {backup.bytes / 1e9:.1f} GB: is there something below {places.state}?")
+    return backup
+
+
+def _files(places: Places, config: Config) -> Iterator[Path]:
+    """Yield what the robot cannot be made from again. A file that another one names may be anywhere."""
+    without = [_here(places, folder) for _, folder in _left_out(config)]
+    for folder in (places.etc, places.state, _here(places, config.state_dir())):
+        yield from _below(folder, without)
+    named = [places.broker, people_of(config), *values_of(config, Path)]
+    if places.broker.is_file():
+        named += map(Path, _BROKER_FILES.findall(places.broker.read_text(encoding="utf-8", errors="replace")))
+    for path in named:
+        file = _here(places, path)
+        if (file.parent / FLEET).is_file():  # the accounts of a broker are one folder, with the authority's key
+            yield from _below(file.parent, without)
+        if file.is_file():
+            yield file
+
+
+def _here(places: Places, path: Path) -> Path:
+    """Return where a path of the robot is below the root."""
+    path = Path(os.path.normpath(path.absolute()))  # a config may name it by ../..
+    return path if path.is_relative_to(places.root) else places.root / path.relative_to("/")
+
+
+def _left_out(config: Config) -> Iterator[tuple[str, Path]]:
+    yield "recordings", config.services.recorder.place
+    scripts = config.folder / config.services.autonomy_manager.autonomy_root
+    if not scripts.is_relative_to(config.folder):
+        yield "scripts of your own", scripts
+    if (sounds := config.services.soundboard_handler.playback.directory) is not None:
+        yield "sounds", sounds
+
+
+def _below(place: Path, without: Iterable[Path]) -> Iterator[Path]:
+    for path in sorted(place.rglob("*")):
+        if path.is_file() and not any(path.is_relative_to(folder) for folder in without):
+            yield path
+
+
+def _add(backup: Backup, root: Path, file: Path) -> None:
+    """Add one file, as it is at one moment."""
+    name = str(file.relative_to(root))
+    if name.endswith(_NOT):
+        return
+    try:
+        if (size := file.stat().st_size) > _LARGEST:
+            backup.left_out[str(file)] = f"{size / 1e6:.0f} MB are too large"
+            return
+        content = file.read_bytes()
+        if content.startswith(_SQLITE):
+            content = _database(file)
+        backup.files[name] = Saved(content, file.stat().st_mode & 0o777)
+    except FileNotFoundError:  # removed meanwhile
+        return
+    except OSError as error:
+        raise BackupError(f"{file}: cannot be read: {error.strerror}; run it as root") from None
+
+
+def _database(file: Path) -> bytes:
+    """Return a database as it is between two changes, by SQLite's own backup. Raises BackupError for a damaged one."""
+    try:
+        with (
+            closing(sqlite3.connect(f"file:{file}?mode=ro", uri=True)) as there,
+            closing(sqlite3.connect(":memory:")) as here,
+        ):
+            there.backup(here)
+            ((result,),) = here.execute("PRAGMA quick_check(1)").fetchall()
+            if result != "ok":
+                raise BackupError(f"{file}: is damaged: {result}")
+            return here.serialize()
+    except sqlite3.Error as error:
+        raise BackupError(f"{file}: is no whole database: {error}") from None
+
+
+def packed(backup: Backup) -> bytes:
+    """Return the tar file."""
+    output = io.BytesIO()
+    about = Saved(msgspec.json.format(msgspec.json.encode(backup.about)) + b"\n", 0o600)
+    with tarfile.open(None, "w", output, format=tarfile.PAX_FORMAT) as tar:
+        for name, saved in {ABOUT: about, **dict(sorted(backup.files.items()))}.items():
+            member = tarfile.TarInfo(name)
+            member.size, member.mode, member.mtime = len(saved.content), saved.mode, int(time.time())
+            member.pax_headers = {} if name == ABOUT else {_SHA256: hashlib.sha256(saved.content).hexdigest()}
+            tar.addfile(member, io.BytesIO(saved.content))
+    return output.getvalue()
+
+
+# -- reading one
+
+
+def read(file: Path) -> Backup:
+    """Read a whole backup, and check that it is one. Raises BackupError with one line."""
+    try:
+        size = file.stat().st_size
+        if size > _MOST + _LARGEST:
+            raise BackupError(f"{file}: is too large for a backup of Pebble")
+        return unpacked(file.read_bytes(), str(file))
+    except OSError as error:
+        raise BackupError(f"{file}: {error.strerror}") from None
+
+
+def unpacked(raw: bytes, name: str) -> Backup:
+    """Read the same from the content of the file called ``name``."""
+    try:
+        with tarfile.open(fileobj=io.BytesIO(raw), mode="r:") as tar:
+            members = iter(tar)
+            backup = Backup(_about(tar, next(members, None), name))
+            for member in members:
+                path = _path(member, backup, name)
+                backup.files[path] = Saved(_content(tar, member), member.mode & 0o777)
+            rest = raw[tar.offset :]
+            if len(rest) < _END or rest.strip(b"\0"):  # tarfile takes a damaged header for the end
+                raise EOFError("its end is missing")
+    except (tarfile.TarError, EOFError, ValueError) as error:
+        if not raw.startswith(ABOUT.encode()):
+            raise BackupError(f"{name}: is no backup of Pebble") from None
+        raise BackupError(f"{name}: is cut off or damaged: {error}; make another backup, or use an older one") from None
+    return backup
+
+
+def _about(tar: tarfile.TarFile, member: tarfile.TarInfo | None, name: str) -> About:
+    if member is None or member.name != ABOUT or not member.isfile():
+        raise BackupError(f"{name}: is no backup of Pebble: it does not begin with {ABOUT}")
+    try:
+        about = msgspec.json.decode(_content(tar, member), type=About)
+    except msgspec.MsgspecError as error:
+        raise BackupError(f"{name}: its {ABOUT} is not of a backup: {error}") from None
+    if about.format != FORMAT:
+        raise BackupError(f"{name}: has format {about.format}, of Pebble {about.version}: update Pebble here first")
+    return about
+
+
+def _path(member: tarfile.TarInfo, backup: Backup, name: str) -> str:
+    """Return the path of a member, by which nothing outside the root can be written."""
+    path = PurePosixPath(member.name)
+    if not member.isfile() or path.is_absolute() or ".." in path.parts or str(path) != member.name:
+        raise BackupError(f"{name}: {member.name!r} is not what a backup has: it was changed, or is of another program")
+    if member.name in backup.files:
+        raise BackupError(f"{name}: {member.name!r} is in it twice: it was changed")
+    return member.name
+
+
+def _content(tar: tarfile.TarFile, member: tarfile.TarInfo) -> bytes:
+    """Return what is in a file. Raises EOFError where it is cut off, or is not what it was."""
+    opened = tar.extractfile(member)
+    content = b"" if opened is None else opened.read()
+    if len(content) != member.size or member.pax_headers.get(_SHA256) not in (
+        None,
+        hashlib.sha256(content).hexdigest(),
+    ):
+        raise EOFError(f"{member.name} is not what it was")
+    return content

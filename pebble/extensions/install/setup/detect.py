@@ -1,0 +1,180 @@
+"""What is at this machine: boards, which are listened to and never written to, cameras, and what a robot lacks."""
+
+import re
+import shutil
+import socket
+import subprocess
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import serial
+
+from pebble.extensions.checks.check import State
+from pebble.extensions.checks.machine import clock, synchronised
+from pebble.extensions.fleet.folder import PLAIN_PORT, PORT
+from pebble.runtime.places import Places
+from pebble.services.serial_mcu_bridge.pebble_serial_v1.frame import FrameError, decode
+
+DEVICES, SERIAL_PORTS = Path("/dev"), Path("/dev/serial/by-id")
+BAUDS = (460800, 115200)
+LISTEN_S = 1.2
+_MOST = 65536  # bytes that are looked at
+_ENOUGH = 0.8  # of the lines must be readable; the first one is cut off
+_KINDS = {b"T": "goob_base_v1", b"C": "goob_base_v1", b"I": "imu_mpu6050_v1", b"S": "imu_mpu6050_v1"}
+_LIBCAMERA = ("rpicam-hello", "libcamera-hello")
+_CAMERA_S = 10.0
+#: What only one file of mosquitto's configuration may set.
+_GLOBAL = re.compile(
+    r"^\s*(listener|port|password_file|acl_file|allow_anonymous|per_listener_settings|plugin|auth_plugin)\b.*", re.M
+)
+_POLKIT = ("usr/lib/polkit-1/polkitd", "usr/libexec/polkitd", "usr/lib/policykit-1/polkitd")
+_RENEW = "sudo pebble cert renew --folder /etc/pebble/tls"
+NO_POLKIT = "polkit is not installed, so the page cannot restart or reboot the robot: sudo apt install polkitd"
+NO_MOSQUITTO = "mosquitto is not installed: sudo apt install mosquitto, then sudo pebble setup"
+OFFLINE = (
+    "This machine has no network, so no phone reaches it: join one, such as by sudo nmtui,"
+    f" then {_RENEW} NAME.local ADDRESS"
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Board:
+    """A serial port, and what was received there. ``baud`` None: it was silent, or could not be opened."""
+
+    port: str
+    baud: int | None
+    text: str
+    protocol: str | None = None  # None: it does not show
+
+
+def boards(folder: Path, bauds: Sequence[int] = BAUDS, seconds: float = LISTEN_S) -> Iterator[Board]:
+    """Listen to each serial port that has a name that stays."""
+    for path in sorted(folder.glob("*")):
+        yield listen(str(path), bauds, seconds)
+
+
+def listen(port: str, bauds: Sequence[int] = BAUDS, seconds: float = LISTEN_S) -> Board:
+    """Return what a port sends by itself. Nothing is written to it, and its reset lines stay as they are."""
+    try:
+        for baud in bauds:
+            received = _received(port, baud, seconds)
+            if (understood := _understood(received)) is not None:
+                protocol, what = understood
+                return Board(port, baud, f"{baud} baud, answers, {what}", protocol)
+    except (OSError, ValueError) as error:  # SerialException is an OSError
+        return Board(port, None, f"cannot be opened: {getattr(error, 'strerror', None) or error}")
+    return Board(port, None, "silent")
+
+
+def _received(port: str, baud: int, seconds: float) -> bytes:
+    line = serial.Serial(None, baud, timeout=0.05, exclusive=True)
+    line.port, line.dtr, line.rts = port, False, False  # some boards start anew at each of them
+    received, end = b"", time.monotonic() + seconds
+    with line:
+        while time.monotonic() < end and len(received) < _MOST:
+            received += line.read(4096)
+    return received
+
+
+def _understood(received: bytes) -> tuple[str | None, str] | None:
+    """Return the protocol and what was received, in words; None: nothing that makes sense at this speed."""
+    if b"\0" in received:
+        return ("pebble_serial_v1", "frames") if any(map(_is_frame, received.split(b"\0"))) else None
+    lines = [line.strip() for line in received.split(b"\n") if line.strip()]
+    readable = [line for line in lines if line.isascii() and line.decode().isprintable()]
+    if not readable or len(readable) < _ENOUGH * len(lines):
+        return None
+    kinds = {line.split()[0] for line in readable}
+    known = sorted(kind for kind in kinds if kind in _KINDS)
+    if not known:
+        return None, f"{len(readable)} lines"
+    return _KINDS[known[0]], f"`{'`, `'.join(kind.decode() for kind in known)}` lines"
+
+
+def _is_frame(stuffed: bytes) -> bool:
+    try:
+        decode(stuffed)
+    except FrameError:
+        return False
+    return True
+
+
+def cameras(devices: Path) -> Iterator[str]:
+    """Yield device files that capture pictures, by names that stay; `libcamera` for one at the board's own connector.
+
+    udev gives a camera's other files, of its metadata, the names ``…-video-index1`` and so on.
+    """
+    yield from map(str, sorted((devices / "v4l/by-id").glob("*-video-index0")))
+    program = next((name for name in _LIBCAMERA if shutil.which(name)), None)
+    if program is not None:
+        try:
+            done = subprocess.run(
+                [program, "--list-cameras"], capture_output=True, text=True, check=False, timeout=_CAMERA_S
+            )
+        except (OSError, subprocess.TimeoutExpired):
+            return
+        if re.search(r"^\s*\d+ : ", done.stdout + done.stderr, re.M):
+            yield "libcamera"
+
+
+def lacks(places: Places) -> Iterator[str]:
+    """Yield what the robot has to do without, and what to type for it."""
+    if not any((places.root / path).exists() for path in _POLKIT):
+        yield NO_POLKIT
+    found = clock(time.time(), synchronised())
+    if found.state is State.FAILED:
+        yield f"The clock {found.text.partition(':')[0]}, so certificates would be refused: {found.fix}, then {_RENEW}"
+    if not _has_network():
+        yield OFFLINE
+
+
+def no_broker(places: Places) -> str:
+    """Return why the robot's own broker cannot be made here; empty: it can."""
+    if not any((places.root / path).exists() for path in ("usr/sbin/mosquitto", "usr/bin/mosquitto")):
+        return NO_MOSQUITTO
+    for file in (places.broker.parent.parent / "mosquitto.conf", *sorted(places.broker.parent.glob("*.conf"))):
+        if file == places.broker:
+            continue
+        try:
+            found = _GLOBAL.search(file.read_text(encoding="utf-8", errors="replace"))
+        except OSError:
+            continue
+        if found is not None:
+            line = found[0].strip().split()[0]
+            return f"{places.named(file)} has its own `{line}`: remove it, or answer with the name of that broker"
+    if places.root != Path("/") or places.broker.exists() or _runs("mosquitto"):
+        return ""
+    taken = [port for port in (PLAIN_PORT, PORT) if _is_taken(port)]
+    return f"port {taken[0]} is taken by another program: sudo ss -ltnp 'sport = :{taken[0]}' names it" if taken else ""
+
+
+def _runs(program: str) -> bool:
+    for path in Path("/proc").glob("[0-9]*/comm"):
+        try:
+            if path.read_text(encoding="utf-8").strip() == program:
+                return True
+        except OSError:
+            continue
+    return False
+
+
+def _is_taken(port: int) -> bool:
+    with socket.socket() as probe:
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            probe.bind(("", port))
+        except OSError:
+            return True
+    return False
+
+
+def _has_network() -> bool:
+    """Return True if there is a way to other machines; sends nothing."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        try:
+            probe.connect(("192.0.2.1", 9))
+        except OSError:
+            return False
+    return True

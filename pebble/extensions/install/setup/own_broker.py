@@ -1,0 +1,58 @@
+"""The robot's own broker: the machine's mosquitto, with a folder that the commands of `pebble fleet` change later."""
+
+from pathlib import Path
+
+from pebble.extensions.fleet import applying, broker_files, certificates, folder
+from pebble.extensions.fleet.folder import CONF, PID, Fleet, Server
+from pebble.extensions.fleet.roles import Account, ProgramRole
+from pebble.extensions.install.setup.answers import PAGE
+from pebble.runtime.places import Places
+
+_LINKS = {CONF: "../conf.d/pebble.conf", PID: "../../../run/mosquitto/mosquitto.pid"}
+
+
+def fleet_of(account: str, base: str, people: Path) -> Fleet:
+    """Return accounts for the robot and its page, at a broker that other machines reach with a login and TLS only."""
+    accounts = {
+        account: Account(roles=(ProgramRole.ROBOT,), bases=(base,)),
+        PAGE: Account(roles=(ProgramRole.PAGE,), people=str(people)),
+    }
+    host = certificates.own_names()[0]
+    return Fleet(level="login", brokers=(Server(host=host, included=True),), accounts=accounts)
+
+
+def conf_text(places: Places, fleet: Fleet) -> bytes:
+    """Return what mosquitto includes; its paths are those of the machine whose root this is."""
+    return broker_files.conf_text(fleet, Path(places.named(places.broker_folder)), "").encode()
+
+
+def make(new: Path, fleet: Fleet, passwords: dict[str, str]) -> None:
+    """Fill a new folder."""
+    applying.make(new, fleet, passwords)
+    with folder.locked(new):
+        pass  # its file belongs to the folder
+    link(new)
+
+
+def link(place: Path) -> None:
+    """Make links to what mosquitto has elsewhere, relative so that they mean the same below another root."""
+    for name, target in _LINKS.items():
+        if not (place / name).is_symlink():
+            (place / name).symlink_to(target)
+
+
+def knows(place: Path, wanted: Fleet, passwords: dict[str, str]) -> bool:
+    """Return True if these accounts are there as they should be, with these passwords."""
+    fleet = folder.load(place)
+    stored = applying.passwords_of(place)
+    known = all(fleet.accounts.get(name) == account for name, account in wanted.accounts.items())
+    return known and all(name in stored and stored[name].is_of(password) for name, password in passwords.items())
+
+
+def change(place: Path, wanted: Fleet, passwords: dict[str, str]) -> None:
+    """Let the broker know these accounts, at once where it runs."""
+    with folder.locked(place):
+        fleet = folder.load(place)
+        for name, account in wanted.accounts.items():
+            fleet = fleet.without(name).with_account(name, account)
+        applying.apply(place, fleet, passwords)

@@ -1,0 +1,1 @@
+"""Simulated robots, the demo, comparisons, and the rig that starts them."""

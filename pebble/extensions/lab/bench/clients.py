@@ -1,0 +1,176 @@
+"""Stock paho clients, of which operators are made: some drive robots, one watches a robot start and stream."""
+
+from __future__ import annotations
+
+import json
+import socket
+import threading
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import closing, contextmanager, suppress
+from itertools import zip_longest
+from typing import Any, Final, Self
+
+from paho.mqtt.client import Client, MQTTMessage, MQTTMessageInfo
+from paho.mqtt.enums import CallbackAPIVersion
+
+from pebble import contract
+from pebble.contract.packets import Codec, Picture, PictureKind, Sound
+from pebble.contract.payloads import Drive
+from pebble.errors import PayloadError, PebbleError
+from pebble.extensions.lab.rig.robot import BASE, MEDIA, Robot, one_robot
+from pebble.extensions.operator.client.robot_view import RobotView
+from pebble.extensions.operator.client.scripted_operator import ScriptedOperator
+from pebble.transports import Message
+
+_AHEAD: Final = 0.5
+_ANSWER_S = 10.0
+UP_S: Final = 20.0  # for a robot to start
+#: Flag and request, of pictures and of sound.
+_MEDIA_CHANNELS = (contract.MQTT_VIDEO, contract.VIDEO_CONTROL), (contract.MQTT_AUDIO, contract.AUDIO_CONTROL)
+
+
+def drive_of(left: float, right: float) -> Drive:
+    """Return the drive command for these wheel speeds."""
+    return Drive(x=(left - right) / 2, z=(left + right) / 2)
+
+
+class StockClient:
+    """One paho client on loopback with its own network thread, on which ``receive`` runs.
+
+    ``subscriptions`` are topics with a QoS or with options. ``at_once`` sets TCP_NODELAY, as Pebble's own clients do.
+    Without it, a client that receives as much as it sends delays a command in a hundred by 40 ms, until the broker's
+    delayed ACK.
+    """
+
+    def __init__(
+        self,
+        receive: Callable[[MQTTMessage], None] = lambda _: None,
+        subscriptions: Sequence[tuple[str, Any]] = (),
+        *,
+        at_once: bool = True,
+    ) -> None:
+        self._ready, self._subscriptions = threading.Event(), list(subscriptions)
+        self.paho = Client(CallbackAPIVersion.VERSION2)
+        self.paho.on_connect = self._on_connect
+        self.paho.on_subscribe = lambda *_: self._ready.set()
+        self.paho.on_message = lambda _client, _data, message: receive(message)
+        if at_once:
+            self.paho.on_socket_open = _send_at_once
+
+    def open(self, port: int) -> Self:
+        """Connects and starts the network thread; returns before anything was subscribed."""
+        self.paho.connect("127.0.0.1", port)
+        self.paho.loop_start()
+        return self
+
+    def wait(self) -> None:
+        """Wait for the broker to acknowledge the subscriptions, or the connection without any. Raises PebbleError."""
+        if not self._ready.wait(_ANSWER_S):
+            raise PebbleError(f"the broker acknowledged nothing within {_ANSWER_S:.0f} s")
+
+    def subscribe(self, filter_: str, qos: int) -> None:
+        """Add a subscription, acknowledged by the broker when this returns. Raises PebbleError."""
+        self._ready.clear()
+        self.paho.subscribe(filter_, qos)
+        self.wait()
+
+    def close(self) -> None:
+        self.paho.disconnect()
+        self.paho.loop_stop()
+
+    def send(self, channel: contract.Channel, base: str, body: Any) -> MQTTMessageInfo:
+        """Publishes ``body`` as JSON, with the QoS and the retain flag of the channel."""
+        return self.paho.publish(channel.topic(base), json.dumps(body), channel.default_qos, channel.default_retain)
+
+    def publish(self, message: Message) -> None:
+        self.paho.publish(message.topic, message.payload, message.qos, message.retain)
+
+    def driver(self, base: str, wait: Callable[[float], object] = time.sleep) -> ScriptedOperator:
+        """Return an operator of a robot of which it knows nothing, as the original page: without control."""
+        return ScriptedOperator(RobotView(base), self.publish, by="bench", wait=wait)
+
+    def request_media(self, base: str, enabled: bool = True, *encodings: str) -> None:
+        """Allows and requests a robot's pictures and sound, by default as it is configured; or ends both."""
+        for (flag, request), encoding in zip_longest(_MEDIA_CHANNELS, encodings):
+            self.send(flag, base, enabled)
+            self.send(request, base, {"enabled": enabled} | ({"encoding": encoding} if encoding else {}))
+
+    def _on_connect(self, *_: Any) -> None:
+        if self._subscriptions:
+            self.paho.subscribe(self._subscriptions)
+        else:
+            self._ready.set()
+
+
+def _send_at_once(_client: Client, _data: Any, sock: Any) -> None:
+    sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+
+
+@contextmanager
+def driving(port: int, *bases: str) -> Iterator[None]:
+    """Drive these robots during the ``with`` block, whether or not they receive it."""
+    ended = threading.Event()
+    with closing(StockClient().open(port)) as client:
+        drivers = [client.driver(base, ended.wait) for base in bases]
+        threads = [threading.Thread(target=driver.drive, args=(0.0, _AHEAD), daemon=True) for driver in drivers]
+        for driver, thread in zip(drivers, threads, strict=True):
+            driver.command(Drive())
+            thread.start()
+        try:
+            yield
+        finally:
+            ended.set()
+            for thread in threads:
+                thread.join()
+
+
+class RobotSubscriber(StockClient):
+    """Records when and how much one robot publishes: CLOCK_MONOTONIC, in ns; None: not yet."""
+
+    def __init__(self, port: int, base: str) -> None:
+        self._base = base
+        self.first_heartbeat_ns: int | None = None
+        self.ready_ns: int | None = None  # every service is ready
+        self.arrived: Counter[str] = Counter()  # pictures and sound packets, by encoding: "json", "h264", "pcm", "opus"
+        super().__init__(self._on_message, [(f"{base}/#", 1)])
+        self.open(port)
+
+    def _on_message(self, message: MQTTMessage) -> None:
+        now, topic = time.monotonic_ns(), message.topic.removeprefix(f"{self._base}/")
+        if topic in (contract.CAMERA.suffix, contract.AUDIO.suffix):
+            self.arrived[encoding_of(bytes(message.payload))] += 1
+        elif topic == contract.ONLINE.suffix and self.first_heartbeat_ns is None:
+            self.first_heartbeat_ns = now if json.loads(message.payload).get("online", True) else None
+        elif (
+            topic == contract.STATUS.suffix
+            and self.ready_ns is None
+            and all_ready(json.loads(message.payload)["value"])
+        ):
+            self.ready_ns = now
+
+
+@contextmanager
+def ready_robot(kind: str) -> Iterator[tuple[Robot, RobotSubscriber]]:
+    """Start a robot with a camera and a microphone, whose services are ready. Raises PebbleError with its log."""
+    with one_robot(kind, services=MEDIA) as robot, closing(RobotSubscriber(robot.remote_port, BASE)) as subscriber:
+        subscriber.wait()
+        robot.launch()
+        robot.expect(lambda: subscriber.ready_ns is not None, "not every service is ready", UP_S)
+        yield robot, subscriber
+
+
+def encoding_of(raw: bytes) -> str:
+    """Return the encoding of a picture or a sound packet; ``json`` if it has no binary header."""
+    with suppress(PayloadError):
+        return "h264" if Picture.unpack(raw).kind == PictureKind.H264 else "pbvd"
+    with suppress(PayloadError):
+        return "opus" if Sound.unpack(raw).codec == Codec.OPUS else "pcm"
+    return "json"
+
+
+def all_ready(status: Mapping[str, Any]) -> bool:
+    """True if all services are ready; those on demand are ``stopped`` until requested, as all are before."""
+    states = {service["state"] for service in status.get("services", {}).values()}
+    return "ready" in states and states <= {"ready", "stopped"}

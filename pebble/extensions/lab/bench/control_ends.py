@@ -1,0 +1,228 @@
+"""The two ends of the control comparison, which use a transport as services do.
+
+A service handles a drive command on the transport's thread that brings it, if it is idle; else its inbox keeps the
+command for its own thread (decision 24). The ends do the same. Stock paho calls its handler on its network thread.
+
+``python -m pebble.extensions.lab.bench.control_ends echo|sender stand-in|mqtt|zenoh SETTINGS`` (JSON, of the transport). A sender
+receives slices as JSON and answers each.
+"""
+
+from __future__ import annotations
+
+import math
+import struct
+import sys
+import time
+from collections.abc import Callable
+from contextlib import closing
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import msgspec
+
+from pebble.contract import DRIVE
+from pebble.errors import PebbleError
+from pebble.extensions.lab.bench.results import STAND_IN
+from pebble.extensions.lab.rig.worker_end import answer, serve, serve_on_thread
+from pebble.runtime.inbox import Inbox
+from pebble.runtime.work_lock import WorkLock
+from pebble.transports import Message, MqttSettings, QoS, State, Transport, ZenohSettings, create
+
+REQUESTS, REPLIES = "pebble/bench/echo", "pebble/bench/echoed"
+_QOS = QoS(DRIVE.default_qos)
+_LEAD_S = 0.1  # messages at the start of a slice do not count: caches are cold after a pause
+_LAST_S = 1.0  # how long to wait for the last replies of a slice
+_POLL_S = 0.01
+_CONNECT_S = 10.0
+_WARM_UP, _WARM_UP_S = 20, 15.0  # messages
+
+_FORM = struct.Struct(
+    "<Qqq"
+)  # of a message: its number, when it was sent (ns), and when it was echoed; padding follows
+_ECHOED, _ECHOED_AT = struct.Struct("<q"), 16
+SMALLEST = _FORM.size
+
+Handler = Callable[[bytes], None]
+
+
+class SliceSpec(msgspec.Struct, frozen=True):
+    """A slice of a round: messages of this size at this rate."""
+
+    size: int
+    rate: float
+    seconds: float
+
+
+class Exchange(NamedTuple):
+    """The times at which a message was sent, echoed, and received again: CLOCK_MONOTONIC, ns."""
+
+    sent_ns: int
+    echoed_ns: int
+    received_ns: int
+
+
+class Slice(msgspec.Struct, frozen=True, kw_only=True):
+    """The results of a slice."""
+
+    sent: int  # counted messages
+    late: int  # of these, by more than half of the period
+    exchanges: list[Exchange]
+
+
+# -- connections, and the two ends
+
+
+class Connection(NamedTuple):
+    """A connection, as its end uses it: three functions."""
+
+    subscribe: Callable[[str, Handler], object]  # to a topic
+    publish: Callable[[str, bytes], object]
+    close: Callable[[], object]
+
+
+class EndInbox:
+    """The inbox of one end, and the lock under which it works."""
+
+    def __init__(self) -> None:
+        self.inbox, self.lock = Inbox(), WorkLock()
+
+    def bring(self, job: Callable[[], None]) -> None:
+        """Do the job at once, as Service.run_if_idle; post it if the end is busy."""
+        if self.lock.try_enter():
+            try:
+                if not self.inbox:
+                    return job()
+            finally:
+                self.lock.leave()
+        return self.inbox.post(job)
+
+    def turn(self, timeout: float | None = None) -> None:
+        """Do the next job that waits, waiting up to ``timeout`` seconds for one."""
+        self.inbox.wait(timeout)
+        with self.lock:
+            job = self.inbox.take()
+            if job is not None:
+                job()
+
+
+def opened(transport: Transport, inbox: EndInbox) -> Connection:
+    """Open any of Pebble's transports, used through the same calls as in pebble.service.Service. Raises PebbleError."""
+    transport.open(_CONNECT_S)
+    if transport.state is not State.CONNECTED:
+        problem = transport.problem
+        transport.close()
+        raise PebbleError(f"no connection: {problem or 'no answer'}")
+
+    def subscribe(topic: str, handler: Handler) -> None:
+        def on_message(message: Message) -> None:
+            inbox.bring(lambda: handler(message.payload))
+
+        transport.subscribe(topic, on_message, qos=_QOS, direct=True)
+
+    return Connection(subscribe, partial(transport.publish, qos=_QOS), transport.close)
+
+
+def stock(port: int) -> Connection:
+    """Open stock paho with its own network thread and no socket options, as in the original program."""
+    from pebble.extensions.lab.bench.clients import StockClient  # only these ends import paho
+
+    client = StockClient(at_once=False).open(port)
+    client.wait()
+
+    def subscribe(topic: str, handler: Handler) -> None:
+        client.paho.on_message = lambda _client, _data, message: handler(bytes(message.payload))
+        client.subscribe(topic, _QOS)
+
+    return Connection(subscribe, partial(client.paho.publish, qos=_QOS), client.close)
+
+
+def echo(connection: Connection) -> None:
+    """Return every message from now on at once, with its time."""
+
+    def on_message(payload: bytes) -> None:
+        reply = bytearray(payload)
+        _ECHOED.pack_into(reply, _ECHOED_AT, time.monotonic_ns())
+        connection.publish(REPLIES, bytes(reply))
+
+    connection.subscribe(REQUESTS, on_message)
+
+
+class Sender:
+    """Sends slices and collects the replies; what collects on another thread fills entries that the slice has made."""
+
+    def __init__(self, connection: Connection, inbox: EndInbox) -> None:
+        self._connection, self._inbox = connection, inbox
+        self._first = 0  # the number of the first message
+        self._received: list[Exchange | None] = []
+        connection.subscribe(REPLIES, self._on_message)
+
+    def warm_up(self, count: int, timeout: float) -> bool:
+        """Exchange ``count`` messages, so that both ends are connected and their code has run; False if that fails."""
+        end, returned = time.monotonic() + timeout, 0
+        while returned < count and time.monotonic() < end:
+            self._expect(1)
+            with self._inbox.lock:
+                self._send(self._first, SMALLEST)
+            self._collect(0.1)
+            returned += None not in self._received
+        return returned >= count
+
+    def run(self, spec: SliceSpec) -> Slice:
+        lead, period = max(1, math.ceil(_LEAD_S * spec.rate)), 1 / spec.rate
+        counting = max(1, round(spec.seconds * spec.rate))
+        self._expect(lead + counting)
+        sent = late = 0
+        due = time.monotonic() + period
+        while sent < lead + counting:
+            self._inbox.turn(max(0.0, due - time.monotonic()))
+            behind = time.monotonic() - due
+            if behind >= 0:
+                late += sent >= lead and behind > period / 2
+                with self._inbox.lock:
+                    self._send(self._first + sent, spec.size)
+                sent, due = sent + 1, due + period
+        self._collect(_LAST_S)
+        exchanges = [exchange for exchange in self._received[lead:] if exchange is not None]
+        return Slice(sent=counting, late=late, exchanges=exchanges)
+
+    def _expect(self, count: int) -> None:
+        self._first += len(self._received)
+        self._received = [None] * count
+
+    def _send(self, number: int, size: int) -> None:
+        self._connection.publish(REQUESTS, _FORM.pack(number, time.monotonic_ns(), 0).ljust(size, b"\0"))
+
+    def _collect(self, timeout: float) -> None:
+        end = time.monotonic() + timeout
+        while None in self._received and time.monotonic() < end:
+            self._inbox.turn(_POLL_S)
+
+    def _on_message(self, payload: bytes) -> None:
+        received = time.monotonic_ns()
+        number, sent, echoed = _FORM.unpack_from(payload)
+        index = number - self._first
+        if 0 <= index < len(self._received) and self._received[index] is None:  # QoS 1 may deliver twice
+            self._received[index] = Exchange(sent, echoed, received)
+
+
+def run_end(role: str, kind: str, settings: str) -> None:
+    inbox, form = EndInbox(), ZenohSettings if kind == "zenoh" else MqttSettings
+    where: Any = msgspec.json.decode(settings, type=form, dec_hook=lambda _kind, text: Path(text))
+    with closing(stock(where.port) if kind == STAND_IN else opened(create(kind, role, where), inbox)) as connection:
+        if role == "echo":
+            echo(connection)
+            ended = serve_on_thread(lambda _line: None, inbox.inbox.wake)
+            answer({"ready": True})
+            while not ended.is_set():
+                inbox.turn()
+        else:
+            sender = Sender(connection, inbox)
+            if not sender.warm_up(_WARM_UP, _WARM_UP_S):
+                raise PebbleError("the echo does not answer")
+            answer({"ready": True})
+            serve(lambda line: msgspec.json.encode(sender.run(msgspec.json.decode(line, type=SliceSpec))))
+
+
+if __name__ == "__main__":
+    run_end(*sys.argv[1:])

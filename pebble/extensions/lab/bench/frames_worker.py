@@ -1,0 +1,319 @@
+"""One end of a transfer of time-stamped frames, 30 a second, as a process that measures during a given window.
+
+``python -m pebble.extensions.lab.bench.frames_worker VARIANT ROLE WHERE SIZE``: ``WHERE`` is a folder for sockets, or a broker's
+port; ``SIZE`` is ``640x480``. One end of GStreamer's is this file in the system's Python, where gi and Gst are
+installed; without arguments it fails if it could not be. So a plain file imports only the standard library, numpy, and
+the other end of a worker.
+
+A frame begins with the time it was complete (CLOCK_MONOTONIC, ns) and its number, and ends with its number again. The
+time is written last. A process writes ``{"ready": true}``, receives ``FROM UNTIL`` (CLOCK_MONOTONIC, ns), and answers
+an empty line with what it measured in that window.
+"""
+
+from __future__ import annotations
+
+import struct
+import sys
+import time
+from collections import deque
+from collections.abc import Callable
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+if __package__:
+    from pebble.errors import TransportError
+    from pebble.extensions.lab.rig import worker_end
+    from pebble.transports.frames import FrameInfo, FrameReader, FrameWriter
+else:  # the system's Python runs plain files
+    sys.path.append(str(Path(__file__).parents[1] / "rig"))
+    import worker_end  # type: ignore[import-not-found, no-redef]
+
+RATE_HZ = 30.0
+_WARM_UP = 8  # frames: the first ones create pools and fill caches
+_READ_S = 0.2
+_GAP_S = 0.010  # between a frame and the bare copy after it
+_FRAMES_IN_SEGMENT = 8
+_STREAM, _TOPIC = "bench", "pebble/bench/frames"
+
+Gst: Any = None  # loaded by main(): other Pythons have no gi
+Fill = Callable[[np.ndarray], None]  # writes the pixels of a frame (uint8, 1-D)
+
+
+class Window:
+    """The time in which is measured (``ns``), and the end of standard input, which names it."""
+
+    def __init__(self, results: Callable[[], dict[str, Any]]) -> None:
+        self.ns, self._results = range(0), results
+        self.ended = worker_end.serve_on_thread(self._handle)
+
+    def _handle(self, line: str) -> dict[str, Any] | None:
+        if not line:
+            return self._results()
+        self.ns = range(*map(int, line.split()))
+        return None
+
+
+def write(writer: Writer, size: int) -> None:
+    """Write a frame of ``size`` bytes 30 times a second until standard input closes; answer how many of the window."""
+    picture = np.random.default_rng(1).integers(0, 256, size, dtype=np.uint8)
+    stamps: list[int] = []  # of the frames, also of those that could not be sent
+
+    def fill(frame: np.ndarray) -> None:
+        """Pixels are written first, then the time, as a camera does."""
+        np.copyto(frame, picture)
+        for place in (8, len(frame) - 8):
+            struct.pack_into("<q", frame.data, place, len(stamps))
+        stamps.append(time.monotonic_ns())
+        struct.pack_into("<q", frame.data, 0, stamps[-1])
+
+    window = Window(lambda: {"sent": sum(one in window.ns for one in stamps), "fallbacks": writer.fallbacks})
+    worker_end.answer({"ready": True})
+    due = time.monotonic()
+    while not window.ended.is_set():
+        due += 1 / RATE_HZ
+        window.ended.wait(max(0.0, due - time.monotonic()))
+        if not writer.write(fill):
+            stamps.append(time.monotonic_ns())
+    writer.close()
+
+
+def read(reader: Reader, bare_copy: int) -> None:
+    """Reads until standard input closes; answers with every latency of the window in µs.
+
+    With ``bare_copy``, measures instead the time of a copy of that many bytes between two frames, when the caches hold
+    other data.
+    """
+    source = np.random.default_rng(2).integers(0, 256, bare_copy, dtype=np.uint8)
+    target = np.zeros(bare_copy, np.uint8)
+    latencies_us: list[float] = []
+    frames = torn = 0
+    window = Window(lambda: {"latencies_us": latencies_us, "torn": torn})
+    while not window.ended.is_set():
+        frame = reader.read(_READ_S)
+        if frame is None:
+            continue
+        now, frames = time.monotonic_ns(), frames + 1
+        stamp, number = struct.unpack_from("<qq", frame.data)
+        torn += struct.unpack_from("<q", frame.data, len(frame) - 8) != (number,)
+        del frame
+        if stamp in window.ns:
+            if bare_copy:
+                window.ended.wait(_GAP_S)
+                stamp = time.monotonic_ns()
+                np.copyto(target, source)
+                now = time.monotonic_ns()
+            latencies_us.append((now - stamp) / 1000)
+        if frames == _WARM_UP:
+            worker_end.answer({"ready": True})
+    reader.close()
+
+
+# -- Pebble's frame transport. ``write`` sends the frame that ``fill`` writes; false: none can be sent now. ``read``
+#    returns the next frame, or None after a timeout; a view is released as soon as it is deleted.
+
+
+class ZenohWriter:
+    """Frames are created in the shared segment, as services do."""
+
+    fallbacks = 0  # frames that did not go through shared memory
+
+    def __init__(self, folder: Path, size: int) -> None:
+        self._info, self._frame = FrameInfo(format="bgr24"), np.zeros(size, np.uint8)
+        self._writer = FrameWriter(folder, _STREAM, capacity=size).open()
+        _refuse(self._writer.problem)
+        self.close = self._writer.close
+
+    def write(self, fill: Fill) -> bool:
+        if not self._writer.wanted:
+            return False
+        slot = self._writer.slot(len(self._frame))
+        fill(self._frame if slot is None else slot.array)
+        if slot is None:
+            self._writer.write(self._frame, self._info)
+        else:
+            slot.send(self._info)
+        self.fallbacks = self._writer.counters["fallbacks"]
+        return True
+
+
+class ZenohReader:
+    """Frames are views into the segment."""
+
+    def __init__(self, folder: Path) -> None:
+        self._reader = FrameReader(folder, _STREAM, views=True).open()
+        self.close = self._reader.close
+
+    def read(self, timeout: float) -> np.ndarray | None:
+        frame = self._reader.read(timeout)
+        _refuse(self._reader.problem)
+        return None if frame is None else frame.data
+
+
+def _refuse(problem: str) -> None:
+    """Raises TransportError: results of frames that took another way would be labelled wrongly."""
+    if problem:
+        raise TransportError(problem)
+
+
+# -- MQTT, QoS 0
+
+
+class MqttWriter:
+    """The next frame is not begun before the last one is sent."""
+
+    fallbacks = 0
+
+    def __init__(self, port: int, size: int) -> None:
+        self._client, self._frame, self._leaving = _mqtt(port), bytearray(size), None
+        self._client.loop_start()
+        self.close = self._client.disconnect
+
+    def write(self, fill: Fill) -> bool:
+        if self._leaving is not None and not self._leaving.is_published():
+            return False
+        fill(np.frombuffer(self._frame, np.uint8))
+        self._leaving = self._client.publish(_TOPIC, self._frame, qos=0)
+        return True
+
+
+class MqttReader:
+    """Runs paho's network loop in the reading thread, which avoids a handover between threads."""
+
+    def __init__(self, port: int) -> None:
+        self._arrived: deque[bytes] = deque(maxlen=1)
+        self._client = _mqtt(port)
+        self._client.on_message = lambda _client, _data, message: self._arrived.append(message.payload)
+        self._client.subscribe(_TOPIC, qos=0)
+        self.close = self._client.disconnect
+
+    def read(self, timeout: float) -> np.ndarray | None:
+        end = time.monotonic() + timeout
+        while not self._arrived:
+            left = end - time.monotonic()
+            if left <= 0:
+                return None
+            self._client.loop(left)
+        return np.frombuffer(self._arrived.popleft(), np.uint8)
+
+
+def _mqtt(port: int) -> Any:
+    from paho.mqtt.client import Client
+    from paho.mqtt.enums import CallbackAPIVersion
+
+    client = Client(CallbackAPIVersion.VERSION2)
+    client.connect("127.0.0.1", port)
+    while not client.is_connected():
+        client.loop(0.05)
+    return client
+
+
+# -- GStreamer's shmsink and shmsrc, in the system's Python
+
+
+class GstWriter:
+    """appsrc into shmsink. As in the original Pebble, pictures are created in the shared segment: no copy is made."""
+
+    fallbacks = 0
+
+    def __init__(self, socket: str, caps: str, size: int) -> None:
+        self._size = size
+        self._pipeline = Gst.parse_launch(
+            f"appsrc name=source is-live=true format=time do-timestamp=true max-buffers=2 leaky-type=downstream"
+            f" caps={caps} ! shmsink name=sink"
+            f" socket-path={socket} shm-size={_FRAMES_IN_SEGMENT * size} wait-for-connection=false sync=false"
+        )
+        self._source, sink = (self._pipeline.get_by_name(name) for name in ("source", "sink"))
+        self._pipeline.set_state(Gst.State.PLAYING)
+        # The allocator that shmsink offers upstream exists once the pipeline has started.
+        query = Gst.Query.new_allocation(Gst.Caps.from_string(caps), True)
+        if not sink.get_static_pad("sink").query(query) or not query.get_n_allocation_params():
+            raise RuntimeError("shmsink offers no allocator")
+        self._allocator = query.parse_nth_allocation_param(0)[0]
+
+    def write(self, fill: Fill) -> bool:
+        buffer = Gst.Buffer.new_allocate(self._allocator, self._size, None)
+        if buffer is None:
+            return False
+        with buffer.map(Gst.MapFlags.WRITE) as mapped:
+            fill(np.frombuffer(mapped.data, np.uint8))
+        self._source.push_buffer(buffer)
+        return True
+
+    def close(self) -> None:
+        """shmsink removes its socket and its segment."""
+        self._pipeline.set_state(Gst.State.NULL)
+
+
+class GstReader:
+    """shmsrc into appsink, which holds only the newest buffer; the reader maps it and copies it once."""
+
+    def __init__(self, socket: str, caps: str) -> None:
+        self._pipeline = Gst.parse_launch(
+            f"shmsrc socket-path={socket} is-live=true do-timestamp=true ! {caps}"
+            " ! appsink name=sink sync=false max-buffers=1 drop=true"
+        )
+        self._sink = self._pipeline.get_by_name("sink")
+        self._pipeline.set_state(Gst.State.PLAYING)
+
+    def read(self, timeout: float) -> np.ndarray | None:
+        sample = self._sink.try_pull_sample(int(timeout * 1e9))
+        if sample is None:
+            return None
+        with sample.get_buffer().map(Gst.MapFlags.READ) as mapped:
+            return np.frombuffer(mapped.data, np.uint8).copy()
+
+    def close(self) -> None:
+        self._pipeline.set_state(Gst.State.NULL)
+
+
+def _load_gstreamer() -> None:
+    global Gst
+    import gi  # type: ignore[import-not-found]
+
+    gi.require_version("Gst", "1.0")
+    gi.require_version("GstApp", "1.0")
+    Gst = import_module("gi.repository.Gst")
+    import_module("gi.repository.GstApp")  # gives appsrc and appsink their methods
+    Gst.init(None)
+    if not all(map(Gst.ElementFactory.find, ("shmsink", "shmsrc", "appsrc", "appsink"))):
+        raise RuntimeError("GStreamer has no shmsink, shmsrc, appsrc or appsink")
+
+
+# -- the process
+
+Writer = ZenohWriter | MqttWriter | GstWriter
+Reader = ZenohReader | MqttReader | GstReader
+
+
+def writer(variant: str, where: str, size: int, caps: str = "") -> Writer:
+    """``size`` in bytes; ``caps``: the format of frames, for GStreamer."""
+    if variant == "gstreamer-shm":
+        return GstWriter(f"{where}/gst.sock", caps, size)
+    return MqttWriter(int(where), size) if variant == "mqtt" else ZenohWriter(Path(where), size)
+
+
+def reader(variant: str, where: str, caps: str = "") -> Reader:
+    if variant == "gstreamer-shm":
+        return GstReader(f"{where}/gst.sock", caps)
+    return MqttReader(int(where)) if variant == "mqtt" else ZenohReader(Path(where))
+
+
+def main(arguments: list[str]) -> None:
+    if not __package__:
+        _load_gstreamer()
+    if not arguments:  # only asked whether it could
+        return
+    variant, role, where, size = arguments
+    width, height = map(int, size.split("x"))
+    count, caps = 3 * width * height, f"video/x-raw,format=BGR,width={width},height={height},framerate=30/1"
+    if role == "writer":
+        write(writer(variant, where, count, caps), count)
+    else:
+        read(reader(variant, where, caps), count if variant == "memcpy" else 0)
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

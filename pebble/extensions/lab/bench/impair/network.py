@@ -1,0 +1,177 @@
+"""Networks between a robot and its broker that can be impaired and restored while both use them.
+
+Two network namespaces with a veth pair between them: rate by TBF and loss by nftables, all of it in the kernel.
+``python -m pebble.extensions.lab.bench.impair.network`` is a process that holds them. When it ends, the devices disappear, and so do
+the namespaces once they are empty.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import json
+import os
+import signal
+import subprocess
+import sys
+import weakref
+from collections.abc import Sequence
+from contextlib import closing
+from functools import cache
+from pathlib import Path
+
+from pebble.errors import PebbleError
+from pebble.extensions.lab.bench.impair.conditions import Condition, Shape
+from pebble.extensions.lab.rig.processes import SBIN, Worker, end_all, python
+from pebble.extensions.lab.rig.worker_end import answer
+
+ROBOT_HOST, REMOTE_HOST = "10.77.0.1", "10.77.0.2"
+_WIRE = "wire"  # the device of each namespace
+_MTU, _ETHERNET = 1500, 14  # bytes; the second is the header
+_BURST = 1600  # bytes: one packet, so that the rate also holds over short times
+_QUEUE_S = 0.3  # the queue of a home router's modem, with tail drop
+_QUEUE_PACKETS = 4  # at least; at 64 kbit/s 0.3 s hold fewer than two
+_COMMAND_S = _ANSWER_S = 10.0
+
+CLONE_NEWNET = 0x40000000
+_TABLE = "table ip impair { chain arriving { type filter hook prerouting priority raw; }; }"
+
+
+class NamespaceNetwork(Worker):
+    """One robot's network: the process that holds its namespaces, whose end cuts all connections.
+
+    ``on_robot`` and ``on_remote`` wrap a command so that it runs on the robot's or the broker's side. Several networks
+    may be open at the same time, independent; ``name`` is for messages. Raises PebbleError.
+    """
+
+    def __init__(self, name: str = "") -> None:
+        file = os.memfd_create("link")  # unnamed: nothing is left behind if we are killed
+        weakref.finalize(self, os.close, file)
+        command, log = python("pebble.extensions.lab.bench.impair.network"), Path(f"/proc/self/fd/{file}")
+        super().__init__(f"network {name}".strip(), command, log)
+        try:
+            spaces = self.answer(_ANSWER_S)
+            if "unavailable" in spaces:
+                raise PebbleError(spaces["unavailable"])
+            robot, remote = (f"/proc/{self.pid}/fd/{spaces[side]}" for side in ("robot", "remote"))
+            self._robot, self._remote = _Side(robot, ROBOT_HOST), _Side(remote, REMOTE_HOST)
+            self.on_robot, self.on_remote = self._robot.inside, self._remote.inside
+            self._robot.batch("ip", f"link add {_WIRE} type veth peer name {_WIRE} netns {remote}")
+            self._robot.set_up()
+            self._remote.set_up()
+        except BaseException:
+            self.close()
+            raise
+
+    def apply(self, condition: Condition) -> None:
+        """Apply a condition. Connections stay."""
+        self._robot.apply(condition.up.kbit, condition.down.loss)
+        self._remote.apply(condition.down.kbit, condition.up.loss)
+
+    def bytes_up(self) -> int:
+        """Return what the robot has sent, with all headers; only differences mean something."""
+        (link,) = json.loads(self._robot.run("ip", "-s", "-j", "link", "show", "dev", _WIRE))
+        return int(link["stats64"]["tx"]["bytes"])
+
+    def close(self) -> None:
+        """May be called repeatedly."""
+        end_all([self])
+
+
+class _Side:
+    """One of the namespaces, configured with the system's tools."""
+
+    def __init__(self, path: str, address: str) -> None:
+        self._path, self._address = path, address
+
+    def inside(self, command: Sequence[str]) -> list[str]:
+        """The command on this side. The process is replaced: pid and signals stay."""
+        return ["nsenter", f"--net={self._path}", "--", *command]
+
+    def set_up(self) -> None:
+        self.batch(
+            "ip",
+            "link set lo up",
+            f"address add {self._address}/30 dev {_WIRE}",
+            f"link set {_WIRE} mtu {_MTU} addrgenmode none",  # no IPv6 traffic of its own
+            f"link set {_WIRE} gso_max_segs 1",  # otherwise packets of 64 KB are limited and dropped as one
+            f"link set {_WIRE} up",
+        )
+        self.run("nft", "-f", "-", stdin=_TABLE)
+        self.apply(None, 0.0)
+
+    def apply(self, kbit: float | None, loss: float) -> None:
+        """Limit the rate of outgoing packets, and drop a share of incoming ones."""
+        self.batch("tc", f"qdisc replace dev {_WIRE} root {_queue(kbit)}")
+        rule = f'iifname != "lo" numgen random mod 10000 < {round(loss * 10000)} counter drop'
+        add = f"add rule ip impair arriving {rule}\n" if loss else ""
+        self.run("nft", "-f", "-", stdin=f"flush chain ip impair arriving\n{add}")
+
+    def batch(self, program: str, *lines: str) -> None:
+        """Runs lines of ``ip`` or ``tc``."""
+        self.run(program, "-batch", "-", stdin="".join(f"{line}\n" for line in lines))
+
+    def run(self, program: str, *arguments: str, stdin: str = "") -> str:
+        command, what = self.inside([program, *arguments]), f"{program} {' '.join(arguments)}"
+        env = {**os.environ, "PATH": f"{os.environ.get('PATH', os.defpath)}:{SBIN}"}
+        try:
+            done = subprocess.run(command, input=stdin, capture_output=True, text=True, timeout=_COMMAND_S, env=env)
+        except (OSError, subprocess.TimeoutExpired) as error:
+            raise PebbleError(f"{what}: {error}") from None
+        if done.returncode:
+            raise PebbleError(f"{what}: {(done.stderr.strip() or f'code {done.returncode}').splitlines()[0]}")
+        return done.stdout
+
+
+def _queue(kbit: float | None) -> str:
+    """The queueing discipline in tc's syntax; without a limit the device's default."""
+    if kbit is None:
+        return "noqueue"
+    rate = kbit * 1000 / 8
+    limit = max(rate * _QUEUE_S, _QUEUE_PACKETS * (_MTU + _ETHERNET))
+    return f"tbf rate {round(kbit * 1000)}bit burst {round(max(_BURST, rate * 0.005))} limit {round(limit)}"
+
+
+@cache
+def why_no_namespaces() -> str | None:
+    """What prevents such networks; None: nothing. Tested with every feature a condition may use."""
+    everything = Shape(kbit=1000, loss=0.01)
+    try:
+        with closing(NamespaceNetwork("on trial")) as network:
+            network.apply(Condition("trial", everything, everything))
+            network.bytes_up()
+    except PebbleError as error:
+        return str(error)
+    return None
+
+
+def require_namespaces() -> None:
+    """Raises PebbleError if there are none."""
+    if why := why_no_namespaces():
+        raise PebbleError(f"no network namespaces: {why}")
+
+
+# -- its process
+
+
+def main() -> int:
+    try:
+        spaces = {"robot": _namespace(), "remote": _namespace()}
+    except OSError as error:
+        answer({"unavailable": f"new namespaces: {error.strerror}: run it as root, or in `unshare --map-root-user`"})
+        return 1
+    answer(spaces)
+    sys.stdin.read()  # until it closes
+    return 0
+
+
+def _namespace() -> int:
+    """Enter a new network namespace; return its descriptor. Raises OSError."""
+    libc = ctypes.CDLL(None, use_errno=True)
+    if libc.unshare(CLONE_NEWNET):
+        raise OSError(ctypes.get_errno(), os.strerror(ctypes.get_errno()))
+    return os.open("/proc/thread-self/ns/net", os.O_RDONLY)
+
+
+if __name__ == "__main__":
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    sys.exit(main())

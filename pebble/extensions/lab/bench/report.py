@@ -1,0 +1,235 @@
+"""Runs the comparisons of a report, each as its own command line, and writes the report: README.md and its pictures."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field
+from importlib import import_module
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Final
+
+from rich.console import Console
+
+from pebble.errors import PebbleError
+from pebble.extensions.lab.bench.results import STAND_IN, Results, Value, check_folder, load, named
+from pebble.extensions.lab.bench.show import RATIOS, compared, digits, middle
+from pebble.extensions.lab.rig.processes import Program, end_all, python
+from pebble.runtime.signals import interrupted_by_signals
+
+NAME: Final = "README.md"
+_HEADING = "# Results"  # the first line of every report
+#: Before a command: its tables are plain text of this width.
+_PLAIN = ("env", "-u", "FORCE_COLOR", "-u", "TTY_COMPATIBLE", "COLUMNS=120", "NO_COLOR=1", "PYTHONUNBUFFERED=1")
+_POLL_S = 0.2
+_TIMEOUT_FACTOR, _TIMEOUT_EXTRA_S = 4, 60.0  # of the expected time: a comparison that takes longer is ended
+_END_S = 20.0  # for a comparison to end its processes
+_NOT_THE_TABLE = ("Written:", "No plots:")  # what a command prints about its files
+
+
+@dataclass(frozen=True, slots=True)
+class Section:
+    """A comparison of the report, and the seconds that it takes, in full and quickly."""
+
+    name: str
+    title: str
+    full_s: int
+    quick_s: int
+    options: Sequence[str] = ()  # of the full run
+    needs_root: bool = False
+
+
+_MODULES: Final = {"impair": "impair.trials"}  # that are not in the module of their name
+SECTIONS: Final = (
+    Section("control", "Service to service", 700, 40),
+    Section("bridge", "Operator to wheels, and back", 2100, 22, ("--with-media",)),
+    Section("startup", "Start-up", 100, 23),
+    Section("cost", "Memory and CPU", 180, 20),
+    Section("frames", "Camera frames inside the robot", 240, 14),
+    Section("scale", "Many boards", 240, 40),
+    Section("traffic", "Traffic of robots, as in the paper", 140, 19),
+    Section("impair", "On an impaired network", 900, 85, needs_root=True),
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Headline:
+    """A row of the first table: a measure of a comparison, and the variants of its columns."""
+
+    what: str
+    bench: str
+    measure: str
+    params: Mapping[str, Value] = field(default_factory=dict)
+    variants: Sequence[str] = (STAND_IN, "mqtt", "zenoh")
+    figure: str = ""  # that is shown instead of the median
+
+
+_SLICE: Final = {"size": "40 B", "rate": "200 Hz"}
+_P2P: Final = (STAND_IN, "mqtt", "zenoh-p2p")
+_WORST: Final = {"trial": "64k+5%"}
+HEADLINES: Final = (
+    Headline("message between two services", "control", "one-way", {**_SLICE, "load": "none"}, _P2P),
+    Headline("the same, beside pictures", "control", "one-way", {**_SLICE, "load": "media"}, _P2P),
+    Headline("command to the wheels, commands only", "bridge", "down", {"load": "commands"}),
+    Headline("the same, with reports", "bridge", "down", {"load": "none"}),
+    Headline("report to the operator", "bridge", "up", {"load": "none"}),
+    Headline("CPU of the bridge per message", "bridge", "CPU per message", {"load": "none", "process": "bridge"}),
+    Headline("launch to ready", "startup", "all ready"),
+    Headline("launch to the first drive command obeyed", "startup", "first drive obeyed"),
+    Headline("memory of a robot at rest", "cost", "PSS", {"phase": "idle", "process": "all"}),
+    Headline("CPU of a driven robot", "cost", "CPU", {"phase": "driving", "process": "all"}),
+    Headline("frame of 640x480 to one reader; the original's GStreamer", "frames", "frame",
+             {"size": "640x480", "readers": 1}, ("gstreamer-shm", "mqtt", "zenoh-shm")),
+    Headline("frame of 1920x1080 to one reader; the original's GStreamer", "frames", "frame",
+             {"size": "1920x1080", "readers": 1}, ("gstreamer-shm", "mqtt", "zenoh-shm")),
+    Headline("sound within 1 s at 64 kbit/s and 5 % loss, %; the original's encodings", "impair", "audio latency",
+             _WORST, ("mqtt original", "mqtt h264 opus", "zenoh h264 opus"), "on_time_percent"),
+)  # fmt: skip
+
+
+def run(names: Sequence[str], folder: Path, *, quick: bool, console: Console) -> int:
+    """Measure and write; returns 0 if every comparison succeeded. A failed one does not stop the others.
+
+    Without names all that this user may run. Raises PebbleError if the folder cannot be written.
+    """
+    path, sections, failed = _checked(folder), _chosen(names), 0
+    console.print(f"{len(sections)} comparisons: about {_span(sum(_expected_s(one, quick) for one in sections))}")
+    try:
+        with interrupted_by_signals():
+            for section in sections:
+                began = time.monotonic()
+                with console.status(f"{section.name}, about {_expected_s(section, quick)} s"):
+                    problem = run_one(section, folder, quick)
+                line = f"{section.name} {problem}: see {folder / section.name}.txt" if problem else section.name
+                console.print(f"{line}, {_span(time.monotonic() - began)}", soft_wrap=True)
+                failed += bool(problem)
+    finally:  # also after Ctrl-C
+        with named(path):
+            path.write_text(text(folder))
+        console.print(f"Written: {path}", soft_wrap=True)
+    return 1 if failed else 0
+
+
+def _checked(folder: Path) -> Path:
+    """Return the page's path. Raises PebbleError, before an hour of measuring, if it cannot or must not be written."""
+    if find_spec("matplotlib") is None:
+        raise PebbleError("a report needs matplotlib, which is not installed: pip install 'pebble-robot[bench]'")
+    check_folder(folder)
+    path = folder / NAME
+    if path.exists() and not path.read_text(errors="replace").startswith(_HEADING):
+        raise PebbleError(f"{path} is not a report of pebble bench and would be overwritten: name another folder")
+    return path
+
+
+def _chosen(names: Sequence[str]) -> list[Section]:
+    """Return the sections of these names; without names all that this user may run."""
+    return [one for one in SECTIONS if one.name in names or (not names and not (one.needs_root and os.geteuid()))]
+
+
+def run_one(section: Section, folder: Path, quick: bool) -> str:
+    """Run a comparison's command line; returns why it failed. The process ends with this one."""
+    results, output = (folder / f"{section.name}.{ending}" for ending in ("json", "txt"))
+    for path in (results, output, *folder.glob(f"{section.name}*.png")):  # of an earlier run: they would hide a failure
+        path.unlink(missing_ok=True)
+    words = python("pebble.cli", *_command(section, quick), "--output", folder)
+    until = time.monotonic() + _TIMEOUT_FACTOR * _expected_s(section, quick) + _TIMEOUT_EXTRA_S
+    program = Program(section.name, [*_PLAIN, *words], output)
+    try:
+        while (code := program.code) is None and time.monotonic() < until:
+            time.sleep(_POLL_S)
+    finally:
+        end_all([program], _END_S)
+    if code is None:
+        return "hung and was ended"
+    return f"ended with code {code}" if code else "" if results.exists() else "measured nothing"
+
+
+def _command(section: Section, quick: bool) -> list[str]:
+    return ["bench", section.name, *(["--quick"] if quick else section.options)]
+
+
+def _expected_s(section: Section, quick: bool) -> int:
+    return section.quick_s if quick else section.full_s
+
+
+def _span(seconds: float) -> str:
+    return f"{seconds / 60:.0f} min" if seconds >= 600 else f"{seconds:.0f} s"
+
+
+# -- the page
+
+
+def text(folder: Path) -> str:
+    """Return the whole report as Markdown, of what is in the folder."""
+    measured = dict[str, Results]()
+    for section in SECTIONS:
+        with suppress(PebbleError):  # it failed, or was not measured
+            measured[section.name] = load(folder / f"{section.name}.json")
+    quick = any(results.quick for results in measured.values())
+    parts = [f"{_HEADING} of a quick run" if quick else _HEADING, *_headlines(measured)]
+    for results in list(measured.values())[:1]:
+        machine = {**results.machine, "pebble": results.pebble}
+        parts.append(_table(("the machine", ""), [(name, str(value or "–")) for name, value in machine.items()]))
+    for section in SECTIONS:
+        parts += _section(section, folder, measured.get(section.name))
+    return "\n\n".join([*parts, "## What these numbers do not show", "\n".join(f"* {line}" for line in _LIMITS)]) + "\n"
+
+
+def _headlines(measured: Mapping[str, Results]) -> Iterator[str]:
+    """Yield MQTT against Zenoh, with the stand-in of the original beside it."""
+    rows = []
+    for headline in HEADLINES:
+        results = measured.get(headline.bench)
+        if results is None:
+            continue
+        cells = [results.find(variant, headline.measure, **headline.params) for variant in headline.variants]
+        if not any(cells):
+            continue
+        shown = [
+            middle(one) if not headline.figure or one is None else digits(one.middle(headline.figure)) for one in cells
+        ]
+        _, mqtt, zenoh = cells
+        unit = "%" if headline.figure else next((one.unit for one in cells if one), "")
+        rows.append((headline.what, unit.replace("us", "µs"), *shown, "" if headline.figure else compared(zenoh, mqtt)))
+    if rows:
+        yield _table(("median", "unit", STAND_IN, "mqtt", "zenoh", "zenoh / mqtt"), rows)
+        yield f"The {STAND_IN} is plain paho in place of the original, or as the row says. {RATIOS}"
+
+
+def _section(section: Section, folder: Path, results: Results | None) -> Iterator[str]:
+    output = folder / f"{section.name}.txt"
+    if not output.exists():
+        return
+    lines = output.read_text(errors="replace").rstrip().splitlines()
+    yield f"## {section.title}"
+    yield (
+        import_module(f"pebble.extensions.lab.bench.{_MODULES.get(section.name, section.name)}").__doc__ or ""
+    ).strip()
+    if results is None:
+        yield "**It failed, and left no results.**"
+    else:
+        yield f"    pebble {' '.join(_command(section, results.quick))}"
+        incomplete = "" if results.complete else " **Something could not be measured.**"
+        yield f"Started {results.began[:10]} {results.began[11:16]} UTC, {_span(results.took_s)}.{incomplete}"
+    yield from (f"![{path.stem}]({path.name})" for path in sorted(folder.glob(f"{section.name}*.png")))
+    shown = [line.rstrip() for line in lines if not line.startswith(_NOT_THE_TABLE)]
+    yield "\n".join(["```text", *shown, "```"])
+
+
+def _table(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    lines = (" | ".join(line) for line in (heads, ["---"] * len(heads), *rows))
+    return "\n".join(f"| {line} |" for line in lines)
+
+
+_LIMITS: Final = (
+    "One machine. Intervals are over the rounds of one run; another run, kernel or load changes medians by more.",
+    "No radio: all went over loopback and veth pairs.",
+    "No second machine: brokers, operators and the measuring programs compete with the robot for the same cores.",
+    "No Raspberry Pi: its cores are slower, and throttle when hot. Ratios between variants transfer better than times.",
+    "No camera, microphone and hardware encoder: real pictures and sounds are noisier than ours, which costs bytes.",
+    "No MCU: its serial line is a pty without a baud rate; at 115,200 baud a command takes another 1.3 ms.",
+    "No other language than Python, no TLS, no large network, and no long run.",
+)

@@ -1,0 +1,145 @@
+"""Variants take turns in rounds, and rounds are the observations: the ratio of two variants has an interval over them.
+
+Samples of one round are not independent: they share processes, a memory layout and a moment of the machine. So each
+round counts as one observation, and the variation is estimated by resampling the rounds (decision 0010).
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from statistics import NormalDist, fmean
+from typing import Final, TypeVar
+
+import msgspec
+from rich.console import Console
+from rich.markup import escape
+
+from pebble.errors import PebbleError
+from pebble.extensions.lab.bench.results import Cell, Results, grouped, percentile
+
+LEVEL: Final = 0.99
+LEAST_ROUNDS: Final = 8  # fewer do not support an interval of this level: it is computed, but means little
+RESAMPLES = 20_000
+_GIVEN_UP = 2  # rounds that fail before any has succeeded: then the run ends
+_INFINITE = 1e15  # stands for infinity where resampling computes differences
+_LARGEST = 1e6  # ratio that is written as a number
+
+Samples = Sequence[Sequence[float]]  # of each round
+Progress = Callable[[str], None]  # shows what is being done
+T = TypeVar("T")
+
+
+# -- turns
+
+
+def in_turn(things: Sequence[T], number: int) -> Sequence[T]:
+    """Return the things in the order of this round: every other one goes backwards."""
+    return things[::-1] if number % 2 else things
+
+
+def measure_rounds(
+    results: Results, rounds: int, measure: Callable[[int, Progress], Iterable[Cell]], console: Console
+) -> None:
+    """Measure all rounds and join their cells; a round that fails is left out for all variants, and noted.
+
+    Raises PebbleError if the first ones fail, since all would.
+    """
+    began, failed = time.monotonic(), list[str]()
+    with console.status("", refresh_per_second=4) as status:
+        for number in range(rounds):
+
+            def progress(what: str, before: str = f"round {number + 1} of {rounds}: ") -> None:
+                status.update(escape(before + what))
+
+            try:
+                add_round(results, measure(number, progress))
+            except (PebbleError, OSError) as error:
+                failed.append(f"round {number + 1}: {error}")
+                if len(failed) == number + 1 == min(_GIVEN_UP, rounds):
+                    raise
+                console.print(failed[-1], style="red", highlight=False, markup=False)
+    results.took_s = round(time.monotonic() - began, 1)
+    if failed:
+        results.notes.append(f"{len(failed)} of {rounds} rounds failed and were left out; {failed[0].splitlines()[0]}")
+    enough = rounds < LEAST_ROUNDS or rounds - len(failed) >= LEAST_ROUNDS
+    results.complete = enough and all(cell.samples for cell in results.cells)
+
+
+def add_round(results: Results, measured: Iterable[Cell]) -> None:
+    """Join the cells of a round to those of earlier ones; several of the same case are one.
+
+    Their figures that are whole numbers are counts, which add up; others are averaged.
+    """
+    known = {_key(cell): cell for cell in results.cells}
+    for key, parts in grouped(list(measured), _key).items():
+        cell = known.get(key)
+        if cell is None:
+            cell = msgspec.structs.replace(parts[0], rounds=[], figures={})
+            results.cells.append(cell)
+        cell.rounds.append([sample for part in parts for sample in part.samples])
+        for name in parts[0].figures:
+            values = [value for part in parts for value in part.figures[name]]
+            whole = all(isinstance(value, int) for value in values)
+            cell.figures.setdefault(name, []).append(sum(values) if whole else fmean(values))
+
+
+def _key(cell: Cell) -> tuple[str, str, frozenset[object]]:
+    return cell.variant, cell.measure, frozenset(cell.params.items())
+
+
+# -- ratios
+
+
+@dataclass(frozen=True, slots=True)
+class Interval:
+    """A ratio and its interval of 99 %, which few rounds do not support; NaN: nothing was measured."""
+
+    ratio: float = math.nan
+    low: float = math.nan
+    high: float = math.nan
+    rounds: int = 0
+
+    def __str__(self) -> str:
+        interval = "" if self.rounds < LEAST_ROUNDS else f" ({_digits(self.low)} to {_digits(self.high)})"
+        return "–" if math.isnan(self.ratio) else f"{_digits(self.ratio)}{interval}"
+
+
+def ratio(ours: Cell, theirs: Cell, percent: float = 50) -> Interval:
+    """Return the ratio of the percentiles of two cells that took turns; lost messages are infinitely late."""
+    return paired(ours.with_lost(), theirs.with_lost(), percent)
+
+
+def paired(ours: Samples, theirs: Samples, percent: float = 50) -> Interval:
+    """Return the median, over rounds, of the ratio of their percentiles; rounds where both are infinite do not count.
+
+    The ends of the interval are those of the medians of many samples of as many rounds, drawn with replacement, and
+    wider by Student's t.
+    """
+    pairs = [(percentile(a, percent), percentile(b, percent)) for a, b in zip(ours, theirs, strict=False) if a and b]
+    ratios = [min(a, _INFINITE) / min(b, _INFINITE) for a, b in pairs if b > 0 and min(a, b) < math.inf]
+    if not ratios:
+        return Interval()
+    import numpy as np  # importing it earlier than it is needed would change the memory of measured processes
+
+    logs = [math.log(one) if one else -math.inf for one in ratios]
+    middle = float(np.median(logs))
+    random = np.random.default_rng(1)  # the same samples give the same interval
+    drawn = np.median(random.choice(logs, (RESAMPLES, len(logs))), axis=1)
+    tail, wider = (1 - LEVEL) / 2, _student(len(logs)) / _student(math.inf)
+    low, high = (middle + wider * (end - middle) for end in np.quantile(drawn, [tail, 1 - tail]))
+    return Interval(math.exp(middle), math.exp(low), math.exp(high), len(logs))
+
+
+def _student(rounds: float) -> float:
+    """Return half of an interval's width in standard errors: Student's t, approximated."""
+    z, freedom = NormalDist().inv_cdf((1 + LEVEL) / 2), max(1, rounds - 1)
+    return z * (1 + (z**2 + 1) / (4 * freedom) + (5 * z**4 + 16 * z**2 + 3) / (96 * freedom**2))
+
+
+def _digits(value: float) -> str:
+    if value >= _LARGEST:
+        return "∞"
+    return f"{value:.2f}" if value >= 0.1 else f"{value:.2g}" if value > 1 / _LARGEST else "0"

@@ -1,0 +1,220 @@
+"""``pebble sim`` and ``pebble demo``: simulated robots and devices; MCUs run the real firmware on simulated pins."""
+
+from __future__ import annotations
+
+import tempfile
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import typer
+
+from pebble.commands.options import CaCert, PasswordFile, broker_of
+
+if TYPE_CHECKING:
+    from pebble.config import Config
+    from pebble.extensions.lab.simulation.wireless import BrokerAddress
+
+_SERIAL = ("goob", "fred", "goob_imu")
+_WIFI = ("minilamp", "benjr")
+_NAMED = (*_WIFI, "world")
+#: The kinds that each option is for.
+_OF = {
+    "link": _SERIAL,
+    "charging": ("goob", "fred"),
+    "broker": (*_WIFI, "fleet"),
+    "password_file": (*_WIFI, "fleet"),
+    "ca_cert": (*_WIFI, "fleet"),
+    "called": _WIFI,
+    "files": _WIFI,
+    "robots": ("fleet",),
+    "kinds": ("fleet",),
+    "seconds": ("fleet",),
+    "folder": ("world",),
+    "trace": (*_SERIAL, *_WIFI, "world"),
+    "trace_output": _SERIAL,
+    "report": (*_SERIAL, *_WIFI, "world"),
+    "control": (*_SERIAL, "world"),
+}
+
+Kind = Literal["goob", "fred", "goob_imu", "minilamp", "benjr", "fleet", "world", "loudspeaker"]
+
+
+def sim(
+    context: typer.Context,
+    kind: Annotated[Kind, typer.Argument(help="What to simulate.", metavar="KIND", show_default=False)],
+    name: Annotated[
+        str | None,
+        typer.Argument(help="A MiniLAMP's or BenJr's id, or a world's file.", metavar="[ID|FILE]", show_default=False),
+    ] = None,
+    link: Annotated[
+        Path | None, typer.Option(help="Path of the serial port. [default: /tmp/pebble-KIND]", metavar="PATH")
+    ] = None,
+    charging: Annotated[bool, typer.Option("--charging", help="Start with the charger connected.")] = False,
+    broker: Annotated[
+        str | None,
+        typer.Option(
+            "--broker", "-b", help="mqtt://[USER@]HOST[:PORT], mqtts://… or the robot's config.", metavar="URL"
+        ),
+    ] = None,
+    called: Annotated[str, typer.Option("--name", help="What people call the robot.", metavar="TEXT")] = "",
+    files: Annotated[
+        Path | None, typer.Option(help="Folder for the files of the board, which survive it.", metavar="FOLDER")
+    ] = None,
+    robots: Annotated[int, typer.Option("--robots", "-n", min=1, help="How many robots a fleet has.")] = 10,
+    kinds: Annotated[
+        list[str] | None,
+        typer.Option("--kind", help="Of the robots of a fleet; repeatable. [default: minilamp, benjr]"),
+    ] = None,
+    seconds: Annotated[float | None, typer.Option("--seconds", "-s", min=1, help="End a fleet after this.")] = None,
+    folder: Annotated[
+        Path | None, typer.Option(help="For a world's serial ports. [default: /tmp/pebble-world-…]", metavar="FOLDER")
+    ] = None,
+    trace: Annotated[
+        Path | None,
+        typer.Option(help="File for what boards receive and motors do; of a world the folder.", metavar="PATH"),
+    ] = None,
+    trace_output: Annotated[bool, typer.Option("--trace-said", help="Also trace what the board sends.")] = False,
+    report: Annotated[bool, typer.Option("--report", help="Print the state as JSON, ten times a second.")] = False,
+    control: Annotated[bool, typer.Option("--control", help="Read commands, such as unplug, from stdin.")] = False,
+    password_file: PasswordFile = None,
+    ca_cert: CaCert = None,
+) -> int:
+    """Simulate a board, a robot, many robots or a room, until Ctrl-C. Boards run the firmware of the real ones.
+
+    goob, fred and goob_imu are boards on a pseudo terminal: set serial.port in a robot's config to its link.
+    minilamp and benjr are whole robots on a real broker; fleet is many of them, minilamp-001, benjr-001 and so on, and
+    exits 0 only if all were online at the end. world is a room with walls and AprilTags, which robots' cameras see; it
+    prints what belongs in their configs. loudspeaker takes aplay's arguments, and with --record FOLDER records what is
+    played.
+
+    \b
+        pebble sim goob --link /tmp/goob
+        pebble sim benjr benjr-2 --broker mqtt://127.0.0.1
+        pebble sim minilamp --broker minilamp.json
+        pebble sim fleet --robots 200 --broker mqtt://127.0.0.1
+        pebble sim world world.json
+        pebble sim loudspeaker --record /tmp/played clip.wav
+    """
+    _check_options(context, kind)
+    if kind == "loudspeaker":
+        from pebble.extensions.lab.simulation.loudspeaker import main
+
+        return main([word for word in (name, *context.args) if word is not None])
+    _check_words(kind, [word for word in (name, *context.args) if word is not None])
+    if kind == "world":
+        from pebble.extensions.lab.simulation.world.program import ROOM
+        from pebble.extensions.lab.simulation.world.program import run as run_world
+
+        return run_world(Path(name or ROOM), folder, trace=trace, report=report, control=control)
+    if kind in _SERIAL:
+        from pebble.extensions.lab.simulation.mcu import run as run_mcu
+
+        path = link or Path(tempfile.gettempdir(), f"pebble-{kind}")
+        if not report:
+            typer.echo(f"{kind} is at {path}; Ctrl-C ends it")
+        return run_mcu(
+            kind, path, trace=trace, trace_output=trace_output, charging=charging, report=report, control=control
+        )
+    if broker is None:
+        raise typer.BadParameter(f"{kind} needs --broker URL")
+    address, config = _address(broker, password_file, ca_cert)
+    if kind == "fleet":
+        from pebble.extensions.lab.simulation.fleet_program import run as run_fleet
+
+        return run_fleet(address, robots, kinds, seconds=seconds)
+    return _wireless(kind, name, address, config, called, trace=trace, report=report, files=files)
+
+
+def demo(
+    seconds: Annotated[
+        float | None, typer.Option("--seconds", "-s", min=1, help="End after this long of driving.", show_default=False)
+    ] = None,
+    phone: Annotated[
+        bool, typer.Option("--phone", help="Open the page to the network: https, a login and a QR code.")
+    ] = False,
+) -> int:
+    """Four simulated robots, driven by a scripted operator through one broker, until Ctrl-C.
+
+    Goob on Zenoh, Fred on MQTT, MiniLAMP and BenJr on MCUs with their own firmware; needs no hardware.
+    With --seconds it exits 0 only if every robot moved and stopped as commanded.
+
+    \b
+        pebble demo
+        pebble demo --seconds 30
+        pebble demo --phone
+    """
+    from pebble.extensions.lab.demo.main import run
+
+    return run(seconds, for_phones=phone)
+
+
+def _check_options(context: typer.Context, kind: str) -> None:
+    """Raises BadParameter for an option of another kind."""
+    for parameter in context.command.params:
+        source = context.get_parameter_source(str(parameter.name))
+        if source is not None and source.name == "COMMANDLINE" and kind not in _OF.get(str(parameter.name), (kind,)):
+            raise typer.BadParameter(f"{kind} takes no {parameter.opts[0]}")
+
+
+def _check_words(kind: str, words: list[str]) -> None:
+    """Raises BadParameter for an option that there is not, and for more words than this kind takes."""
+    for word in words:
+        if word.startswith("-"):
+            raise typer.BadParameter(f"there is no option {word}")
+    if len(words) > (kind in _NAMED):
+        raise typer.BadParameter(f"{kind} takes no {words[-1]}")
+
+
+def _wireless(
+    kind: str,
+    id_: str | None,
+    broker: BrokerAddress,
+    config: Config | None,
+    called: str,
+    *,
+    trace: Path | None,
+    report: bool,
+    files: Path | None,
+) -> int:
+    from pebble.contract.identity import Identity
+    from pebble.extensions.lab.simulation.networked import run
+
+    identity, security = Identity("pebble", "robots", id_ or kind), None
+    if config is not None:
+        identity, security = Identity(config.robot.system, config.robot.type, id_ or config.robot.id), config.security
+        called = called or config.robot.name or ""
+    if not report:
+        typer.echo(f"{identity} connects to the broker at {broker}; Ctrl-C ends it")
+    return run(kind, identity, broker, name=called, security=security, trace=trace, report=report, files=files)
+
+
+def _address(broker: str, password_file: Path | None, ca_cert: Path | None) -> tuple[BrokerAddress, Config | None]:
+    """The broker that a URL or a config file names, and the config. Raises PebbleError."""
+    from pebble.config import load
+    from pebble.extensions.lab.simulation.wireless import BrokerAddress
+    from pebble.runtime.connections import LOCAL_RECONNECT_S, mqtt_settings
+
+    config = None
+    if "://" not in broker and not broker.startswith("zenoh:"):
+        config = load(Path(broker))
+        settings = mqtt_settings(config.local_mqtt, reconnect_max_s=LOCAL_RECONNECT_S)
+    else:
+        settings = broker_of("--broker", broker, password_file, ca_cert)
+    tls = settings.tls
+    return (
+        BrokerAddress(
+            host=settings.host,
+            port=settings.port,
+            username=settings.username,
+            password=settings.password,
+            tls=tls is not None,
+            ca=None if tls is None else tls.ca_cert,
+        ),
+        config,
+    )
+
+
+def register(app: typer.Typer) -> None:
+    others = {"ignore_unknown_options": True, "allow_extra_args": True}  # those of a loudspeaker
+    app.command("sim", context_settings=others)(sim)
+    app.command("demo")(demo)

@@ -1,0 +1,61 @@
+"""The demo's brokers: mosquitto where it is installed, else amqtt from the extra ``demo``.
+
+``python -m pebble.extensions.lab.demo.brokers PORT`` runs amqtt on loopback.
+"""
+
+import asyncio
+import sys
+from collections.abc import Iterator
+from enum import StrEnum
+from importlib.util import find_spec
+from typing import Any
+
+from pebble.errors import PebbleError
+from pebble.extensions.lab.rig.processes import HOST, mosquitto_path
+
+
+class BrokerKind(StrEnum):
+    MOSQUITTO = "mosquitto"
+    EMBEDDED = "embedded"
+
+    @property
+    def program(self) -> str | None:
+        """The module that is one; None: it is mosquitto."""
+        return "pebble.extensions.lab.demo.brokers" if self is BrokerKind.EMBEDDED else None
+
+
+def best_kind() -> BrokerKind:
+    """Return the best kind installed on this machine. Raises PebbleError with both remedies if there is none."""
+    if mosquitto_path() is not None:
+        return BrokerKind.MOSQUITTO
+    if find_spec("amqtt") is not None:
+        return BrokerKind.EMBEDDED
+    raise PebbleError(
+        "no broker: install mosquitto (apt install mosquitto) or amqtt (pip install 'pebble-robot[demo]')"
+    )
+
+
+class _Subscriptions(dict[str, Any]):
+    """Subscriptions that may grow while amqtt 0.12.1 iterates over them: else that ends the service of a client."""
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(list(self.keys()))
+
+    def items(self) -> Any:
+        return list(super().items())
+
+
+async def serve_amqtt(port: int) -> None:
+    """Run amqtt on loopback until the task is cancelled."""
+    from amqtt.broker import Broker as AmqttBroker  # optional
+
+    listeners = {"default": {"type": "tcp", "bind": f"{HOST}:{port}"}}
+    plugins = {"amqtt.plugins.authentication.AnonymousAuthPlugin": {"allow_anonymous": True}}
+    broker = AmqttBroker({"listeners": listeners, "plugins": plugins})
+    broker._subscriptions = _Subscriptions()
+    await broker.start()
+    await asyncio.Event().wait()
+
+
+if __name__ == "__main__":
+    asyncio.run(serve_amqtt(int(sys.argv[1])))

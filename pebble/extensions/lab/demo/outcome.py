@@ -1,0 +1,83 @@
+"""Whether a robot moved when it was driven and stood when it was let go, by the trace of its motors. Pure."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+from pebble.extensions.lab.simulation.trace import Entry
+
+STOPS_S = 1.2  # the second of the contract, and what a simulated board may lose on a busy machine
+
+Wheels = tuple[float, float]  # left and right, -1..1
+
+
+class Driven(NamedTuple):
+    """A robot that was driven, and then let go or stopped. Times are seconds of time.monotonic()."""
+
+    robot: str  # its id
+    step: str
+    wheels: Wheels  # as commanded
+    began: float
+    released: float  # the last command that moves it, or the stop
+    ended: float  # until then it has to stand
+
+
+class Outcome(NamedTuple):
+    """What a robot did in one step; ``wrong`` is empty if that is what it was commanded to do."""
+
+    robot: str
+    step: str
+    off_s: float  # from the release until its motors were off; infinite if they never were
+    wrong: str
+
+
+def outcome_of(driven: Driven, entries: Sequence[Entry]) -> Outcome:
+    """Judge a step by the changes of the motors in ``entries``, which are in the order of time."""
+    motors = [(entry.ns / 1e9, entry.motors) for entry in entries if entry.motors is not None]
+    motors = [(at, wheels) for at, wheels in motors if at < driven.ended]
+    moved = any(driven.began <= at < driven.released and _same_way(wheels, driven.wheels) for at, wheels in motors)
+    off_s = max(0.0, _off_at(motors) - driven.released)
+    wrong = ""
+    if not moved:
+        wrong = "it did not move as commanded"
+    elif math.isinf(off_s):
+        wrong = "its motors did not stop"
+    elif off_s > STOPS_S:
+        wrong = f"its motors ran for {off_s:.2f} s after it was let go"
+    return Outcome(driven.robot, driven.step, off_s, wrong)
+
+
+def _same_way(wheels: Wheels, commanded: Wheels) -> bool:
+    return all(speed * wanted > 0 for speed, wanted in zip(wheels, commanded, strict=True))
+
+
+def _off_at(motors: Sequence[tuple[float, Wheels]]) -> float:
+    """Return when they were switched off for the last time; infinite if they run at the end."""
+    running = [index for index, (_, wheels) in enumerate(motors) if any(wheels)]
+    if not running:
+        return -math.inf
+    after = motors[running[-1] + 1 :]
+    return after[0][0] if after else math.inf
+
+
+class Outcomes:
+    """The worst outcome of each robot and step, however long the demo runs."""
+
+    def __init__(self) -> None:
+        self._worst: dict[tuple[str, str], Outcome] = {}
+
+    def add(self, outcome: Outcome) -> None:
+        key = outcome.robot, outcome.step
+        self._worst[key] = max(outcome, self._worst.get(key, outcome), key=lambda one: (bool(one.wrong), one.off_s))
+
+    def of(self, robot: str, step: str) -> Outcome | None:
+        return self._worst.get((robot, step))
+
+    def steps(self) -> list[str]:
+        return list(dict.fromkeys(step for _, step in self._worst))
+
+    def problems(self, robot: str) -> list[str]:
+        """Return what went wrong with a robot, step by step."""
+        return [f"{one.step}: {one.wrong}" for one in self._worst.values() if one.robot == robot and one.wrong]

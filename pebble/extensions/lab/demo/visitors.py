@@ -1,0 +1,69 @@
+"""Which robots people have taken from the demo's operator: driven by any program, or stopped. Pure."""
+
+import math
+from collections import defaultdict, deque
+from functools import partial
+
+from pebble.contract.identity import parse_topic
+from pebble.extensions.operator.client.robot_view import RobotView
+from pebble.transports import Message
+
+DRIVES_S = 3.0  # so long after the last command of a person a robot is still the person's
+_SENT = 1000  # drive commands of the operator that are on their way back: 50 s of a held stick, on a busy machine
+
+
+class Visitors:
+    """A table of what people do; a robot that a person had is free again in the step after.
+
+    Times are seconds of one monotonic clock.
+    """
+
+    def __init__(self, name: str) -> None:
+        """``name``: that of the operator, whose own stops are none of a person."""
+        self.left_alone: set[str] = set()  # names of robots that were found to be taken
+        self.own_ids: set[str] = set()  # under which the operator itself has control
+        self._name = name
+        self._driven: dict[str, tuple[float, str]] = {}  # by base topic: when a person had it, and who
+        self._moved: dict[str, float] = {}  # by base topic: when a person's command came
+        self._sent: defaultdict[str, deque[bytes]] = defaultdict(partial(deque, maxlen=_SENT))  # by topic
+        self._step_began = 0.0
+
+    def note_sent(self, topic: str, payload: bytes) -> None:
+        """The operator drives a robot by this, which the broker sends back to it."""
+        self._sent[topic].append(payload)
+
+    def receive_drive(self, message: Message, now: float) -> None:
+        """Take any drive command of any robot: the operator's own, or one that was pasted into a terminal."""
+        address, sent = parse_topic(message.topic), self._sent.get(message.topic)
+        if sent and message.payload in sent:
+            sent.remove(message.payload)
+        elif address is not None and not message.retain:
+            self._driven[address.identity.base] = now, "another program"
+            self._moved[address.identity.base] = now
+
+    def begin_step(self, now: float) -> None:
+        """Forget what people had before."""
+        self._step_began = now
+
+    def taken(self, robot: RobotView, now: float) -> str:
+        """Return why a person has the robot now; empty: it is free."""
+        state = robot.control.state if robot.controlled else None
+        if state is not None and state.id and state.id not in self.own_ids:
+            self._driven[robot.base] = now, robot.control.who
+        stop = robot.stopped_by
+        if stop is not None and stop.by != self._name:
+            return f"is stopped by {stop.by or 'unknown'}"
+        at, who = self._driven.get(robot.base, (-math.inf, ""))
+        return f"is driven by {who}" if now - at < DRIVES_S else ""
+
+    def rests(self, robot: RobotView, now: float) -> bool:
+        """True if no person has moved it for a moment, also if one has the control."""
+        return now - self._moved.get(robot.base, -math.inf) >= DRIVES_S
+
+    def free(self, robot: RobotView, now: float) -> bool:
+        """True if it may be driven in the present step, in which no person has had it so far."""
+        taken = self.taken(robot, now)
+        if self._driven.get(robot.base, (-math.inf, ""))[0] < self._step_began and not taken:
+            return True
+        self.left_alone.add(robot.name)
+        return False

@@ -1,0 +1,213 @@
+"""Brokers, the simulated robots that come with Pebble, their room, and the operator page."""
+
+from __future__ import annotations
+
+import json
+import struct
+import threading
+import time
+from collections.abc import Sequence
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from pebble.config.raw import deep_merge
+from pebble.errors import PebbleError
+from pebble.extensions.lab.rig.processes import HOST, OPERATORS, Processes, Program, python
+from pebble.extensions.lab.rig.robot import MEDIA, START_S, Config, Robot, SimulatedRobot
+from pebble.extensions.lab.simulation.mcu import Snapshot
+from pebble.extensions.lab.simulation.world.program import Snapshot as WorldSnapshot
+from pebble.extensions.lab.simulation.world.program import port_path, trace_path
+from pebble.extensions.media.sound_file import write_wav
+from pebble.extensions.operator.client.discovery import ALL_OUTGOING, Discovery
+from pebble.extensions.operator.client.page_packages import require_packages
+from pebble.extensions.page.run import Ready
+from pebble.transports import MqttSettings, create
+
+ROBOTS = ("goob", "fred", "minilamp", "benjr")
+CLIP = "horn.wav"  # that Goob plays
+TAG_ID = 21  # of the tag that Goob follows, as in the world file
+_BOARDS = {"minilamp": "ESP32-C6", "benjr": "ESP8266"}
+_RESTART = ["sh", "-c", "kill $PPID"]  # the bridge alone, which runs it: the demo would take more for a failure
+_RATE = 16_000
+_POLL_S = 0.02
+HORN = struct.pack("<40h", *[8000] * 20, *[-8000] * 20) * 400  # the clip: 1 s of 400 Hz
+#: After the first round of driving Goob looks at the tag, and has space for further rounds wherever it is then.
+_START = {"goob": {"kind": "goob", "x": -0.3, "y": 0.2, "heading_deg": 0.0}}
+
+
+class LinuxRobot(Robot):
+    """Goob or Fred: the real launcher and services; camera, microphone, MCUs and loudspeaker are simulated.
+
+    ``instances`` are the configs of its self-describing MCUs, to which others may be added before it is brought up.
+    """
+
+    runs_on = "Linux, SAMD21"
+    has_media = True
+
+    def __init__(self, running: Testbed, name: str) -> None:
+        own = _config(name)
+        remote, folder = (HOST, running.broker_port), running.folder / name
+        super().__init__(running, own["transport"]["kind"], remote, name=name, folder=folder)
+        self.has_imu, self.local_port = name == "goob", running.local_broker.port
+        self.voice = folder / "voice"  # where its loudspeaker records what it plays of operators' voices
+        self._imu = folder / "imu"  # a serial port
+        self.instances: dict[str, Config] = {}
+        if self.has_imu:
+            self.instances["imu"] = {"protocol": "pebble_serial_v1", "serial": {"port": str(self._imu)}}
+        self._own = own | {"services": own["services"] | {"av_daemon": {}}}
+        raw = ["-t", "raw", "-f", "S16_LE", "-c", "{channels}", "-r", "{rate}", "-"]
+        self._services = {
+            "mqtt_bridge": {
+                "service_restart_control": {"command": _RESTART},
+                "media": {"audio_receiver": {"command": [*_loudspeaker(self.voice), *raw]}},
+            },
+            "serial_mcu_bridge": {
+                "instances": self.instances,
+                "telemetry": {"publish_touch_sensors": self.has_scripts},
+            },
+            "av_daemon": MEDIA["av_daemon"],
+        }
+
+    def bring_up(self, ending: threading.Event) -> None:
+        """Start the MCUs first, so that their ports exist, then the robot."""
+        if self.has_imu:
+            mcu = self._start_board("goob_imu", self._imu, self.folder / "imu.jsonl", name="imu")
+            mcu.wait_until(self._imu.exists, START_S, ending)
+        self.prepare(ending)
+        self.start(self.name, python("pebble.cli", "up", self.config))
+
+    def _start_motors(self) -> Program:
+        return self._start_board(self.name, self.port, self._trace, "--report", each=self._collect)
+
+
+class RoomRobot(LinuxRobot):
+    """Goob in the room that comes with Pebble, alone, with a tag on each wall: its MCU is part of the room.
+
+    Its camera sees the ``room``, and a simulated loudspeaker records what it ``played``.
+    """
+
+    has_scripts = True
+
+    def __init__(self, running: Testbed, name: str) -> None:
+        super().__init__(running, name)
+        self.room, self.played = self.folder / "room.json", self.folder / "played"
+        self.port, self._trace = port_path(self.folder, name), trace_path(self.folder, name)
+        room = json.loads((files("pebble.extensions.lab.simulation.world") / "room.json").read_text())
+        self.room.write_text(json.dumps(room | {"robots": _START}, indent=1))
+        sounds = self.folder / "sounds"
+        (sounds / "signals").mkdir(parents=True)
+        for clip, seconds in {CLIP: 1.0, "signals/beep.wav": 0.15, "signals/long.wav": 0.6}.items():
+            write_wav(sounds / clip, HORN[: 2 * round(seconds * _RATE)], _RATE)
+        playback = {"directory": str(sounds), "player_command": _loudspeaker(self.played)}
+        self._services |= {
+            "av_daemon": deep_merge(MEDIA["av_daemon"], {"video": {"device": f"{self.room}#{name}"}}),
+            "soundboard_handler": {"playback": playback},
+        }
+
+    def _start_motors(self) -> Program:
+        options = (self.room, "--folder", self.folder, "--trace", self.folder, "--report")
+        return self._start_mcu("world", *options, each=self._collect)
+
+    def _collect(self, line: bytes) -> None:
+        seen = msgspec.json.decode(line, type=WorldSnapshot)
+        self.mcu_reports.append(Snapshot(seen.ns, True, True, seen.robots[self.name]))
+
+
+def _config(name: str) -> Any:
+    return json.loads((files("pebble") / "configs" / f"{name}.json").read_text())
+
+
+def _loudspeaker(record: Path) -> list[str]:
+    return python("pebble.extensions.lab.simulation.loudspeaker", "--record", record)
+
+
+class McuRobot(SimulatedRobot):
+    """MiniLAMP or BenJr: the firmware's own files against simulated pins, with its own connection to the broker."""
+
+    def __init__(self, running: Testbed, name: str) -> None:
+        super().__init__(running, name, running.folder / name)
+        self.runs_on, self._broker = _BOARDS[name], f"mqtt://{HOST}:{running.broker_port}"
+        self._called = _config(name)["robot"]["name"]
+
+    def bring_up(self, ending: threading.Event) -> None:
+        options = ("--name", self._called, "--broker", self._broker, "--trace", self._trace)
+        mcu = self._start_mcu(self.name, *options, "--report", each=self._collect)
+        mcu.wait_until(lambda: bool(self.mcu_reports), START_S, ending)
+
+
+class PageServer(Program):
+    """A server of the operator page for one broker; ``settings`` are further fields of WebSettings."""
+
+    def __init__(self, folder: Path, broker_port: int, **settings: Any) -> None:
+        """Raises PebbleError without the packages that it needs."""
+        require_packages()
+        self.url = ""  # with a slash at the end; empty until it can be opened
+        fields = {"broker": {"host": HOST, "port": broker_port}, "host": HOST, "server": "demo", **settings}
+        command = python("pebble.extensions.page.run", msgspec.json.encode(fields, enc_hook=str).decode())
+        super().__init__("the operator page", command, folder / "page.log", self._take)
+
+    def wait(self, ending: threading.Event | None = None) -> None:
+        """Wait until the page can be opened at ``url``, or ``ending``. Raises PebbleError if it cannot."""
+        self.wait_until(lambda: bool(self.url), START_S, ending)
+
+    def _take(self, line: bytes) -> None:
+        self.url = msgspec.json.decode(line, type=Ready).url
+
+
+class Testbed(Processes):
+    """Two brokers, two Linux robots with an MCU each, and two robots that are an MCU; or only those of ``names``.
+
+    ``keep``: the folder with the logs stays after the demo. ``room``: Goob is in a simulated room, and sees it.
+    ``broker_port`` is that of the operators' broker, on loopback.
+    """
+
+    ends_s = (1.0, 2.5, 1.0, 1.0)  # with the operator's disconnect: every process ends within five seconds
+    keep = True
+    server: PageServer  # the newest
+
+    def __init__(self, ending: threading.Event, names: Sequence[str] = ROBOTS, *, room: bool = True) -> None:
+        super().__init__("pebble-demo-")
+        self.robots: dict[str, LinuxRobot | McuRobot] = {}
+        self._ending, self._names, self._room = ending, names, room
+
+    def start_brokers(self, program: str | None = None) -> None:
+        """Start the operators' remote broker and Fred's local one, see Broker. Raises PebbleError if one fails."""
+        names = "remote-broker", "freds-broker"
+        self.remote_broker, self.local_broker = (self.broker(name, program=program) for name in names)
+        for broker in (self.remote_broker, self.local_broker):
+            broker.wait(self._ending)
+        self.broker_port = self.remote_broker.port
+        for name in self._names:
+            linux = RoomRobot if name == "goob" and self._room else LinuxRobot
+            self.robots[name] = McuRobot(self, name) if name in _BOARDS else linux(self, name)
+
+    def start_page(self, port: int = 0, **settings: Any) -> PageServer:
+        """The operator page's server, which is starting, instead of an earlier one; ``port`` 0 is a free one."""
+        for earlier in [program for program in self._kinds if isinstance(program, PageServer)]:
+            self.end(earlier)
+        self.server = self.add(PageServer(self.folder, self.broker_port, port=port, **settings), OPERATORS)
+        return self.server
+
+    def start_recorder(self, into: Path, *options: object) -> Program:
+        """``pebble record`` of everything at the operators' broker, which is starting; ``options`` are further ones."""
+        url = f"mqtt://{HOST}:{self.broker_port}"
+        command = python("pebble.cli", "record", "--url", url, "--into", into, *options)
+        return self.add(Program("pebble record", command, self.folder / "record.log"), OPERATORS)
+
+    def start_robots(self) -> None:
+        """Raises PebbleError if a simulated MCU fails; the operator detects any other failure."""
+        for robot in self.robots.values():
+            robot.bring_up(self._ending)
+
+    def wait_until_ready(self, timeout: float = 30.0) -> None:
+        """Wait until all robots can be driven. Raises PebbleError after that time, or if a process ends."""
+        discovery, end = Discovery(), time.monotonic() + timeout
+        with create("mqtt", "testbed", MqttSettings(host=HOST, port=self.broker_port)) as transport:
+            transport.subscribe(ALL_OUTGOING, lambda one: discovery.receive(one, time.monotonic(), time.time()))
+            while sum(robot.ready(time.monotonic()) for robot in discovery.all_robots()) < len(self.robots):
+                if (problems := self.unexpected_exits()) or time.monotonic() > end:
+                    raise PebbleError("; ".join(problems) or "the robots did not become ready to drive")
+                time.sleep(_POLL_S)

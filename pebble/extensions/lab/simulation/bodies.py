@@ -1,0 +1,264 @@
+"""The robots around simulated boards: motors, wheels, battery, sensors, lights and I2C devices."""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, Final
+
+from pebble.errors import ConfigError
+from pebble.extensions.lab.simulation.i2c_devices import MotorShield, Mpu6050
+from pebble.extensions.lab.simulation.micropython.board import Board
+from pebble.extensions.lab.simulation.micropython.pins import PinName
+from pebble.extensions.lab.simulation.motion import Battery, Pose, RobotMotion, hall
+
+_SLICE_S = 0.02  # step of the integration of motion
+_MOST_SLICES = 1_000
+_ONE_TURN_S = 0.001  # changes of outputs within this time count as one
+
+Pair = tuple[float, float]
+
+
+@dataclass(frozen=True, slots=True)
+class Light:
+    """The present colour of a light; parts 0..1."""
+
+    blue: float
+    green: float
+    red: float
+
+
+DARK = Light(0.0, 0.0, 0.0)
+
+
+@dataclass(frozen=True, slots=True)
+class BoardState:
+    """State of a robot: wheel speeds in mm/s, and how far the wheels have turned in mm.
+
+    ``drive`` is −1..1 as commanded, ``motors`` as the pins drive them.
+    """
+
+    kind: str
+    pose: Pose
+    left_mm_s: float
+    right_mm_s: float
+    left_mm: float
+    right_mm: float
+    drive: tuple[float, float]
+    motors: tuple[float, float]
+    light: Light
+    volts: float
+    charging: bool
+    commands: int
+    last_command: str
+
+
+class Body:
+    """A robot around its board, from pins to pose. Make it before loading the firmware, which needs its devices.
+
+    ``end_turn`` must be called after every turn of the firmware's loop. It calls ``on_motors(now, (left, right))``
+    when the motors have changed: −1..1, + = forward of the robot, however the motors are mounted.
+    """
+
+    kind: str
+    cells = 2
+
+    def __init__(self, board: Board, motion: RobotMotion | None = None) -> None:
+        self.board = board
+        board.configure_for(self.kind)
+        self.pins: Any = board.firmware.module(f"{self.kind}.pins")
+        self.motion = motion or RobotMotion()
+        self.battery = Battery(self.cells)
+        self.on_motors: Callable[[float, Pair], None] = lambda _now, _motors: None
+        self._rolled = self._changed_at = board.clock.now()
+        self._motors = self._reported = (0.0, 0.0)
+        self._stale = False
+        board.pins.before_change = self.before_output_change
+
+    def before_output_change(self) -> None:
+        """Called just before an output of the board changes; several may change in one turn."""
+        now = self.board.clock.now()
+        if self._stale and now == self._changed_at:
+            return
+        if now - self._changed_at > _ONE_TURN_S:
+            self.end_turn()
+        self.advance()
+        self._stale, self._changed_at = True, now
+
+    def end_turn(self) -> None:
+        """End a turn of the firmware: call ``on_motors`` if the motors have changed."""
+        self._read_outputs()
+        if self._motors != self._reported:
+            self._reported = self._motors
+            self.on_motors(self._changed_at, self._motors)
+
+    def advance(self) -> None:
+        """Advance motion and battery to the present time."""
+        now = self.board.clock.now()
+        seconds, self._rolled = now - self._rolled, max(now, self._rolled)
+        if seconds <= 0.0:
+            return
+        self._read_outputs()
+        at_rest = self._motors == (0.0, 0.0) == (self.motion.left_mm_s, self.motion.right_mm_s)
+        slices = 1 if at_rest else min(_MOST_SLICES, math.ceil(seconds / _SLICE_S))
+        for _ in range(slices):
+            self.motion.advance(*self._motors, seconds / slices)
+            self.battery.advance(self.motion, seconds / slices)
+
+    def _read_outputs(self) -> None:
+        """Update the motors if outputs have changed."""
+        if self._stale:
+            self._stale = False
+            self._motors = self.forward(*self.outputs())
+
+    def state(self, drive: Pair | None = None, commands: int = 0, last_command: str = "") -> BoardState:
+        """Return the present state; without ``drive``, the motors' speeds count as commanded."""
+        self.advance()
+        self._read_outputs()
+        return BoardState(
+            kind=self.kind,
+            pose=self.motion.pose,
+            left_mm_s=self.motion.left_mm_s,
+            right_mm_s=self.motion.right_mm_s,
+            left_mm=self.motion.left_mm,
+            right_mm=self.motion.right_mm,
+            drive=self._motors if drive is None else drive,
+            motors=self.outputs(),
+            light=self.light(),
+            volts=self.battery.volts,
+            charging=self.battery.charging,
+            commands=commands,
+            last_command=last_command,
+        )
+
+    def outputs(self) -> Pair:
+        """Inputs of the left and right motor driver, −1..1; + is the driver's own forward."""
+        return 0.0, 0.0
+
+    def forward(self, left: float, right: float) -> Pair:
+        """Convert ``outputs`` to speeds of the robot: + = forward."""
+        return left, right
+
+    def light(self) -> Light:
+        return DARK
+
+    def half_bridge(self, pins: tuple[PinName, PinName]) -> float:
+        """Speed of a motor on half a DRV8833: the first pin high turns it forward."""
+        forward, back = pins
+        level = self.board.duty
+        return round(level(forward) - level(back), 4) + 0.0  # 16-bit duties; + 0.0: no −0.0
+
+    def measure_battery(self) -> None:
+        """Connect the battery to its pin, through the divider that the firmware assumes."""
+        self.board.set_volts(self.pins.BATTERY, self._divided)
+
+    def measure_wheels(self) -> None:
+        """Connect the hall sensors to their pins, scaled to the range of the ADC."""
+        for index, pin in enumerate(self.pins.SENSORS):
+            self.board.set_volts(pin, partial(self._hall, index))
+
+    def _divided(self) -> float:
+        self.advance()
+        return self.battery.volts / float(self.pins.BATTERY_FULL_V) * self.board.port.adc_v
+
+    def _hall(self, index: int) -> float:
+        self.advance()
+        return hall(self.motion)[index] * self.board.port.adc_v
+
+
+class TwoWheeled(Body):
+    """Two wheels on a DRV8833."""
+
+    def outputs(self) -> Pair:
+        return self.half_bridge(self.pins.LEFT), self.half_bridge(self.pins.RIGHT)
+
+
+class Goob(TwoWheeled):
+    """Two wheels with hall sensors, headlights, and a measured battery."""
+
+    kind = "goob"
+
+    def __init__(self, board: Board, motion: RobotMotion | None = None) -> None:
+        super().__init__(board, motion)
+        self.measure_wheels()
+        self.measure_battery()
+
+    def forward(self, left: float, right: float) -> Pair:
+        return left, 0.0 - right  # the right motor is mounted in reverse
+
+    def light(self) -> Light:
+        level = round(self.board.duty(self.pins.LED), 3)
+        return Light(level, level, level)
+
+
+class Fred(TwoWheeled):
+    """Two wheels with hall sensors, an RGB light, and a pin that is high on the charger."""
+
+    kind = "fred"
+
+    def __init__(self, board: Board, motion: RobotMotion | None = None) -> None:
+        super().__init__(board, motion)
+        self.measure_wheels()
+        board.set_pin(self.pins.CHARGE, lambda: self.battery.charging)
+
+    def light(self) -> Light:
+        return Light(*(round(self.board.duty(pin), 3) for pin in self.pins.LED))
+
+
+class Minilamp(TwoWheeled):
+    """Two wheels and a pair of grousers, one cell."""
+
+    kind = "minilamp"
+    cells = 1
+
+    def __init__(self, board: Board, motion: RobotMotion | None = None) -> None:
+        super().__init__(board, motion)
+        self.measure_battery()
+
+    @property
+    def grousers(self) -> float:
+        return self.half_bridge(self.pins.GROUSERS)
+
+
+class Benjr(Body):
+    """Two reversed motors on an I2C shield; one cell behind a battery shield."""
+
+    kind = "benjr"
+    cells = 1
+
+    def __init__(self, board: Board, motion: RobotMotion | None = None) -> None:
+        super().__init__(board, motion)
+        self.shield = MotorShield()
+        self.shield.before_change = self.before_output_change
+        board.attach_i2c(self.pins.MOTOR_SHIELD, self.shield)
+        self.measure_battery()
+
+    def outputs(self) -> Pair:
+        return self.shield.speeds
+
+    def forward(self, left: float, right: float) -> Pair:
+        return 0.0 - left, 0.0 - right
+
+
+class GoobImu(Body):
+    """The second board of a Goob: an MPU-6050 that lies flat and follows ``motion``."""
+
+    kind = "goob_imu"
+
+    def __init__(self, board: Board, motion: RobotMotion | None = None) -> None:
+        super().__init__(board)
+        self.imu = Mpu6050(board.clock.now, motion)
+        board.attach_i2c(self.pins.IMU, self.imu)
+
+
+BODIES: Final[dict[str, type[Body]]] = {kind.kind: kind for kind in (Goob, Fred, Minilamp, Benjr, GoobImu)}
+
+
+def body_of(kind: str, board: Board, motion: RobotMotion | None = None) -> Body:
+    """Make the body of a robot around ``board``, before its firmware is loaded; ConfigError for an unknown kind.
+
+    ``motion``: where it stands, and on what; otherwise at the origin of an empty floor.
+    """
+    if kind not in BODIES:
+        raise ConfigError(f"unknown simulated robot {kind!r}; known: {', '.join(BODIES)}")
+    return BODIES[kind](board, motion)

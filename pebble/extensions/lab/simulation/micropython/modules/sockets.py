@@ -1,0 +1,219 @@
+"""The network of a simulated board: real, non-blocking TCP and UDP of this machine behind a simulated Wi-Fi."""
+
+from __future__ import annotations
+
+import errno
+import select
+import socket
+from collections.abc import Mapping
+from types import SimpleNamespace
+from typing import Any
+
+from pebble.extensions.lab.simulation.micropython.clock import Clock
+from pebble.extensions.lab.simulation.micropython.faults import WouldHang, failure
+from pebble.extensions.lab.simulation.micropython.modules.streams import POLLERR, POLLHUP, POLLIN, POLLOUT, Stream
+from pebble.extensions.lab.simulation.micropython.modules.tls import ssl_module
+from pebble.extensions.lab.simulation.micropython.modules.wlan import Platform, Radio, network_module
+
+Address = tuple[str, int]
+
+MAX_SOCKETS = 5  # TCP connections of the ESP8266's lwIP; the ESP32 has a few more
+RESOLVE_S = 5.0  # how long getaddrinfo blocks a board for a name
+
+_CONSTANTS = {
+    name: int(getattr(socket, name))
+    for name in ("AF_INET", "SOCK_STREAM", "SOCK_DGRAM", "SOL_SOCKET", "SO_REUSEADDR", "IPPROTO_TCP", "TCP_NODELAY")
+}
+
+
+class HostNetwork:
+    """The network of one board. Packets to an address in ``routes`` go to the address there instead.
+
+    The scheduler reads ``new_sockets``, which it then watches, and ``unread``, whether more can be read at once.
+    """
+
+    def __init__(
+        self,
+        clock: Clock,
+        *,
+        platform: Platform = "esp32",
+        routes: Mapping[Address, Address] | None = None,
+        uid: bytes = b"",
+    ) -> None:
+        self.clock = clock
+        self.radio = Radio(clock.now, platform)
+        self.new_sockets: list[socket.socket] = []
+        self.unread = False
+        self.problem = ""  # of the last connection, as text
+        self.open: list[HostTcp | HostUdp] = []
+        self._uid = uid
+        self._to = dict(routes or {})
+        self._from = {there: here for here, there in self._to.items()}
+
+    def modules(self) -> dict[str, Any]:
+        """Return the modules for a board that has just booted."""
+        self.power_off()
+        return {
+            "network": network_module(self.radio, self._uid),
+            "socket": socket_module(self.clock, self._socket),
+            "ssl": ssl_module(),
+        }
+
+    def power_off(self) -> None:
+        """Close all sockets and turn the radio off."""
+        for sock in list(self.open):
+            sock.close()
+        self.radio.activate(False)
+
+    def route(self, address: Address) -> Address:
+        return self._to.get(address, address)
+
+    def board_address(self, address: Address) -> Address:
+        """Return the address under which the board knows this one."""
+        return self._from.get(address, address)
+
+    def _socket(self, kind: int) -> HostTcp | HostUdp:
+        if len(self.open) >= MAX_SOCKETS:
+            raise OSError(errno.ENFILE, "too many sockets: one is not closed")
+        made = HostTcp(self) if kind == socket.SOCK_STREAM else HostUdp(self)
+        self.open.append(made)
+        return made
+
+
+def socket_module(clock: Clock, make: Any) -> SimpleNamespace:
+    """Make the module ``socket`` of one board; ``make`` opens a socket of the given type."""
+
+    def open_socket(_family: int = socket.AF_INET, kind: int = socket.SOCK_STREAM, _protocol: int = 0) -> Any:
+        return make(kind)
+
+    def getaddrinfo(host: str, port: int, *_more: Any) -> list[tuple[int, int, int, str, Address]]:
+        """Return a numeric address at once; block the whole board for a name, as real ones do."""
+        if not _is_numeric(host):
+            clock.sleep(RESOLVE_S)
+            raise OSError(-2, "EAI_NONAME")
+        return [(socket.AF_INET, socket.SOCK_STREAM, 0, host, (host, port))]
+
+    return SimpleNamespace(socket=open_socket, getaddrinfo=getaddrinfo, **_CONSTANTS)
+
+
+def numeric(address: Address) -> Address:
+    """Return ``address`` if it is numeric. Raises OSError for a name, which would need a resolver."""
+    if not _is_numeric(address[0]):
+        raise OSError(-2, f"{address[0]} is not an address")
+    return address
+
+
+def _is_numeric(host: str) -> bool:
+    try:
+        socket.inet_pton(socket.AF_INET, host)
+    except OSError:
+        return False
+    return True
+
+
+class _HostSocket:
+    """Common part of both kinds of socket: they never block, and receive nothing without Wi-Fi."""
+
+    def __init__(self, network: HostNetwork, kind: socket.SocketKind) -> None:
+        self._network = network
+        self._sock = socket.socket(socket.AF_INET, kind)
+        self._sock.setblocking(False)
+        self._poll = select.poll()
+        self._poll.register(self._sock, 0)
+        network.new_sockets.append(self._sock)
+
+    def setblocking(self, blocking: bool) -> None:
+        if blocking:
+            raise WouldHang("a socket that waits: setblocking(False)")
+
+    def setsockopt(self, level: int, option: int, value: Any) -> None:
+        self._sock.setsockopt(level, option, value)
+
+    def fileno(self) -> int:
+        return self._sock.fileno()
+
+    def close(self) -> None:
+        if self in self._network.open:
+            self._network.open.remove(self)
+        self._sock.close()
+
+    def ready(self, mask: int) -> int:
+        """Return the events for poll() of the board."""
+        if self._sock.fileno() < 0:
+            return 32  # POLLNVAL
+        if not self._network.radio.connected:
+            return 0
+        self._poll.modify(self._sock, mask & (POLLIN | POLLOUT))
+        events = self._poll.poll(0)
+        return events[0][1] & (mask | POLLERR | POLLHUP) if events else 0
+
+    def _need_wifi(self) -> None:
+        if not self._network.radio.connected:
+            raise failure(errno.EHOSTUNREACH)
+
+
+class HostTcp(_HostSocket, Stream):
+    """A TCP connection of the board."""
+
+    def __init__(self, network: HostNetwork) -> None:
+        super().__init__(network, socket.SOCK_STREAM)
+        self._established = False
+
+    def connect(self, address: Address) -> None:
+        """Start to connect. Always raises OSError: EINPROGRESS on success."""
+        self._need_wifi()
+        code = self._sock.connect_ex(self._network.route(numeric(address)))
+        raise failure(code or errno.EINPROGRESS)
+
+    def _receive(self, size: int) -> bytes | None:
+        if not self._network.radio.connected:
+            return None
+        try:
+            got = self._sock.recv(size)
+            self._network.problem = "" if got else "the broker closed the connection"
+        except BlockingIOError:
+            got = None
+        except OSError as error:
+            self._network.problem = error.strerror or str(error)
+            raise
+        self._network.unread = got is not None and len(got) == size
+        return got
+
+    def _send(self, data: bytes) -> int | None:
+        if not self._network.radio.connected:
+            return None
+        if not self._established and not self.ready(POLLOUT):
+            if self._network.radio.platform == "esp32":  # the ESP8266's lwIP takes early bytes, this one refuses them
+                raise failure(errno.EINPROGRESS)
+            return None
+        self._established = True
+        try:
+            return self._sock.send(data)
+        except BlockingIOError:
+            return None
+
+
+class HostUdp(_HostSocket):
+    """A UDP socket of the board."""
+
+    def __init__(self, network: HostNetwork) -> None:
+        super().__init__(network, socket.SOCK_DGRAM)
+
+    def bind(self, _place: Address) -> None:
+        """Ignored: answers return to the port of the request."""
+
+    def connect(self, address: Address) -> None:
+        self._sock.connect(self._network.route(numeric(address)))
+
+    def sendto(self, data: bytes, address: Address) -> int:
+        self._need_wifi()
+        return self._sock.sendto(data, self._network.route(numeric(address)))
+
+    def recvfrom(self, size: int) -> tuple[bytes, Address]:
+        if not self._network.radio.connected:
+            raise failure(errno.EAGAIN)
+        try:
+            data, address = self._sock.recvfrom(size)
+        except BlockingIOError:
+            raise failure(errno.EAGAIN) from None
+        return data, self._network.board_address(address)

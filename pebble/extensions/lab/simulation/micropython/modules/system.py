@@ -1,0 +1,112 @@
+"""The small built-in modules of a simulated board: ``sys``, ``os``, ``gc``, ``micropython``, ``random``, ``json``."""
+
+from __future__ import annotations
+
+import json
+from types import SimpleNamespace
+from typing import TYPE_CHECKING, Any, Final
+
+from pebble.extensions.lab.simulation.micropython.console import Input, Output
+
+if TYPE_CHECKING:
+    from pebble.extensions.lab.simulation.micropython.hardware import Hardware
+
+_VERSION: Final = (1, 29, 0)
+
+
+def sys_module(board: Hardware) -> SimpleNamespace:
+    version = ".".join(map(str, _VERSION))
+    console, stdio_bytes = board.console, board.port.stdio_bytes
+    return SimpleNamespace(
+        stdin=Input(console, buffer=stdio_bytes),
+        stdout=Output(console, buffer=stdio_bytes),
+        stderr=Output(console, buffer=stdio_bytes),
+        platform=board.port.platform,
+        implementation=SimpleNamespace(name="micropython", version=_VERSION, _machine=board.port.board),
+        version=f"3.4.0; MicroPython v{version}",
+        version_info=(3, 4, 0),
+        byteorder="little",
+        maxsize=(1 << 31) - 1,
+        path=["", "/lib"],
+        print_exception=lambda error, _file=None: board.print(repr(error)),
+    )
+
+
+def os_module(board: Hardware) -> SimpleNamespace:
+    files = board.files
+    return SimpleNamespace(
+        urandom=board.random.randbytes,
+        stat=files.stat,
+        listdir=files.listdir,
+        rename=files.rename,
+        remove=files.remove,
+        uname=lambda: SimpleNamespace(sysname=board.port.platform, machine=board.port.board, release="1.29.0"),
+    )
+
+
+def _nothing(*_arguments: Any) -> int:
+    return 0
+
+
+#: Without effect: memory is measured on MicroPython itself
+GC: Final = SimpleNamespace(
+    collect=_nothing, enable=_nothing, disable=_nothing, threshold=_nothing, mem_free=_nothing, mem_alloc=_nothing
+)
+
+
+def micropython_module(board: Hardware) -> SimpleNamespace:
+    def kbd_intr(character: int) -> None:
+        board.console.interrupt = character
+
+    return SimpleNamespace(
+        const=lambda value: value,
+        kbd_intr=kbd_intr,
+        mem_info=_nothing,
+        alloc_emergency_exception_buf=_nothing,
+        heap_lock=_nothing,
+        heap_unlock=_nothing,
+        opt_level=_nothing,
+    )
+
+
+def random_module(board: Hardware) -> SimpleNamespace:
+    """CPython's generator, one per board, so that runs are repeatable."""
+    own = board.random
+    return SimpleNamespace(
+        seed=own.seed,
+        random=own.random,
+        uniform=own.uniform,
+        getrandbits=own.getrandbits,
+        randint=own.randint,
+        randrange=own.randrange,
+        choice=own.choice,
+    )
+
+
+def _refuse(name: str) -> Any:
+    raise ValueError(f"syntax error in JSON: {name}")
+
+
+def _loads(text: str | bytes | bytearray) -> Any:
+    """Parse JSON. Raises ValueError for anything else, including NaN, infinity and too deep nesting."""
+    try:
+        decoded = text if isinstance(text, str) else str(text, "utf-8")
+        return json.loads(decoded, parse_constant=_refuse)
+    except RecursionError:
+        raise ValueError("syntax error in JSON: too deep") from None
+
+
+def _load(stream: Any) -> Any:
+    return _loads(stream.read())
+
+
+def _dumps(value: Any, separators: tuple[str, str] | None = None) -> str:
+    return json.dumps(value, separators=separators, allow_nan=False, ensure_ascii=False)
+
+
+def _dump(value: Any, stream: Any, separators: tuple[str, str] | None = None) -> None:
+    stream.write(_dumps(value, separators))
+
+
+#: ``json``: CPython's, without what MicroPython refuses
+JSON: Final = SimpleNamespace(loads=_loads, load=_load, dumps=_dumps, dump=_dump)

@@ -1,0 +1,96 @@
+"""The watchdog and the software timers of a simulated board."""
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+from pebble.extensions.lab.simulation.micropython.clock import Clock
+
+
+class BoardReset(BaseException):
+    """The board resets. A BaseException, so that no firmware catches it; the runner reboots the board."""
+
+
+class Watchdog:
+    """Resets the board unless it is fed in time, once armed. ``on_feed`` is called at each feed: once per turn."""
+
+    def __init__(self, clock: Clock) -> None:
+        self.feeds = 0
+        self.on_feed: Callable[[], None] = lambda: None
+        self.timeout_ms: int | None = None
+        self._clock = clock
+        self._fed_at = 0.0
+
+    def arm(self, timeout_ms: int) -> None:
+        self.timeout_ms, self._fed_at = timeout_ms, self._clock.now()
+
+    def disarm(self) -> None:
+        """Stop the watchdog, as only a reset does."""
+        self.timeout_ms = None
+
+    def feed(self) -> None:
+        self.check()
+        self.feeds += 1
+        self._fed_at = self._clock.now()
+        self.on_feed()
+
+    def left(self) -> float:
+        """Seconds until it resets the board."""
+        if self.timeout_ms is None:
+            return math.inf
+        return max(0.0, self._fed_at + self.timeout_ms / 1000 - self._clock.now())
+
+    def starved(self, now: float) -> bool:
+        """Whether it would have reset the board by ``now``."""
+        return self.timeout_ms is not None and now >= self._fed_at + self.timeout_ms / 1000
+
+    def check(self) -> None:
+        """Reset the board if it was not fed in time."""
+        if self.starved(self._clock.now()):
+            raise BoardReset("the watchdog was not fed in time")
+
+
+class SoftTimers:
+    """Timers that run while the program waits. ``on_wait`` is called after each part of a wait, for tests."""
+
+    def __init__(self, clock: Clock) -> None:
+        self.on_wait: Callable[[], None] = lambda: None
+        self._clock = clock
+        self._due: dict[Any, float] = {}
+        self._busy = False
+
+    @property
+    def running(self) -> bool:
+        return bool(self._due) and not self._busy
+
+    def start(self, timer: Any) -> None:
+        self._due[timer] = self._clock.now() + timer.period_s
+
+    def stop(self, timer: Any) -> None:
+        self._due.pop(timer, None)
+
+    def clear(self) -> None:
+        self._due.clear()
+        self._busy = False
+
+    def wait(self, longest_s: float) -> None:
+        """Wait until the next timer has run, at most ``longest_s``."""
+        now = self._clock.now()
+        left = min(self._due.values()) - now
+        self._clock.sleep(max(0.0, min(left, longest_s)))
+        if left <= longest_s:
+            self._call()
+        self.on_wait()
+
+    def _call(self) -> None:
+        self._busy = True
+        try:
+            now = self._clock.now()
+            for timer in [timer for timer, due in self._due.items() if due <= now]:
+                if timer.repeats:
+                    self._due[timer] += timer.period_s
+                else:
+                    self.stop(timer)
+                timer.callback(timer)
+        finally:
+            self._busy = False

@@ -1,0 +1,275 @@
+"""A simulated MCU behind a real pseudo terminal, which the host uses as a serial port."""
+
+import errno
+import os
+import queue
+import select
+import threading
+import time
+import tty
+from collections.abc import Callable
+from concurrent.futures import Future
+from contextlib import suppress
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self, TypeVar
+
+from pebble.errors import DeviceError
+from pebble.extensions.lab.simulation.board import BoardState, SimulatedMcu
+from pebble.extensions.lab.simulation.bodies import Pair
+from pebble.extensions.lab.simulation.micropython.board import UID
+from pebble.extensions.lab.simulation.motion import Pose, RobotMotion
+from pebble.extensions.lab.simulation.trace import Entry, Event, Trace, motors_entry
+from pebble.runtime.lines import LineSplitter
+from pebble.transports.wakeup import WakeupPipe
+
+_NO_HOST_S = 0.005  # a master whose slave is closed is always "ready", so it is polled with this period
+_LATE_S = 0.03  # that a turn of the MCU may come after its time
+_ANSWER_S = 5.0
+_CHUNK = 65_536
+_TRACED_LINE = 4096  # bytes; far longer than any line that the MCU accepts
+
+T = TypeVar("T")
+
+
+class _Recorder:
+    """Adds to a trace what passes the port, in lines."""
+
+    def __init__(self, trace: Trace, *, is_text: bool, output: bool) -> None:
+        self._trace = trace
+        self._received = LineSplitter(_TRACED_LINE) if is_text else None
+        self._sent = LineSplitter(_TRACED_LINE) if is_text and output else None
+
+    def event(self, event: Event) -> None:
+        self._trace.add(Entry(time.monotonic_ns(), event))
+
+    def received(self, ns: int, data: bytes) -> None:
+        if self._received is not None:
+            self._add(ns, "line", self._received.feed(data))
+
+    def sent(self, ns: int, data: bytes, *, whole: bool) -> None:
+        """``whole``: nothing was lost after it."""
+        if self._sent is not None:
+            self._add(ns, "said", self._sent.feed(data))
+            if not whole:
+                self._sent.reset()  # the host never gets the rest of this line
+
+    def _add(self, ns: int, event: Event, lines: list[bytes]) -> None:
+        for line in lines:
+            if text := line.strip().decode("utf-8", "backslashreplace"):  # blank lines are not recorded
+                self._trace.add(Entry(ns, event, text))
+
+
+class PtyMcu:
+    """A SimulatedMcu, its pty, the thread that runs them, and ``symlink``, the stable path of the port.
+
+    The symlink's folder must exist; only a symlink is replaced. Unplugging closes the pty but leaves the MCU powered:
+    its motors stop by failsafe, as on a robot whose MCU is powered by the battery. Each replug makes a new pty behind
+    the same symlink. ``motion`` is where the robot stands, used by that thread alone. The file ``trace`` also has when
+    the MCU was late, and with ``trace_output`` the trace has the MCU's own lines that the host received.
+    """
+
+    def __init__(
+        self,
+        kind: str,
+        symlink: Path,
+        *,
+        trace: Path | None = None,
+        trace_output: bool = False,
+        failsafe_s: float | None = None,
+        charging: bool = False,
+        uid: bytes = UID,
+        motion: RobotMotion | None = None,
+    ) -> None:
+        self.symlink = symlink
+        self.trace = Trace(trace)
+        self.dropped = 0  # bytes of the MCU that no host received
+        self._traces_late = trace is not None
+        self._mcu = SimulatedMcu(
+            kind,
+            time.monotonic(),
+            failsafe_s=failsafe_s,
+            charging=charging,
+            uid=uid,
+            motion=motion,
+            on_motors=self._moved,
+        )
+        self._tick_s = self._mcu.profile.tick_s
+        self._recorder = _Recorder(self.trace, is_text=self._mcu.profile.is_text, output=trace_output)
+        self._master: int | None = None
+        self._tty = ""
+        self._host = False
+        self._stopping = False
+        self._requests: queue.SimpleQueue[tuple[Future[Any], Callable[[], Any]]] = queue.SimpleQueue()
+        self._wakeup = WakeupPipe()
+        self._thread = threading.Thread(target=self._run, name=f"pebble-sim {kind}", daemon=True)
+
+    def open(self) -> Self:
+        """Power on and plug in; the port exists when this returns. Raises DeviceError if it cannot be created."""
+        self._thread.start()
+        try:
+            self.replug()
+        except OSError as error:
+            self.close()
+            raise DeviceError(f"cannot create a serial port at {self.symlink}: {error.strerror}") from None
+        return self
+
+    def close(self) -> None:
+        """Unplug, remove the symlink and end the thread. The trace stays readable."""
+        if self._stopping:
+            return
+        self.unplug()
+        self._call(self._stop)
+        self._thread.join(_ANSWER_S)
+        self.trace.close()
+        self._wakeup.close()
+
+    def __enter__(self) -> Self:
+        return self.open()
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, tb: TracebackType | None) -> None:
+        self.close()
+
+    def unplug(self) -> None:
+        """Close the pty and remove the symlink, as pulling the USB plug does."""
+        self._call(self._unplug)
+
+    def replug(self) -> None:
+        self._call(self._replug)
+
+    def reset(self) -> None:
+        """Reboot the MCU, as its reset button does."""
+        self._call(lambda: self._mcu.boot(time.monotonic()))
+
+    def charge(self, on: bool) -> None:
+        """Put the robot on its charger, or take it off."""
+        self._call(lambda: setattr(self._mcu.battery, "charging", on))
+
+    def disturb(self, on: bool) -> None:
+        """Make the devices on the board's I2C bus fail, or work again."""
+        self._call(lambda: self._mcu.disturb(on))
+
+    def place(self, pose: Pose) -> None:
+        """Lift the robot and put it down at ``pose``."""
+        self._call(lambda: self._mcu.motion.place(pose))
+
+    def state(self) -> BoardState:
+        return self._call(self._mcu.state)
+
+    @property
+    def plugged(self) -> bool:
+        return self._master is not None
+
+    @property
+    def host(self) -> bool:
+        """Whether a program has the port open."""
+        return self._host
+
+    def _call(self, job: Callable[[], T]) -> T:
+        """Run ``job`` on the MCU's thread, the only one that uses the pty, and return its result."""
+        if not self._thread.is_alive():
+            raise DeviceError(f"the simulated MCU at {self.symlink} is not running")
+        answer: Future[T] = Future()
+        self._requests.put((answer, job))
+        self._wakeup.set()
+        return answer.result(_ANSWER_S)
+
+    # -- the MCU's thread
+
+    def _run(self) -> None:
+        looked = time.monotonic()
+        while not self._stopping:
+            self._wait()
+            before, looked = looked, time.monotonic()
+            if self._traces_late and looked - before > self._tick_s + _LATE_S:
+                self.trace.add(Entry(round(looked * 1e9), "late", f"{looked - before:.3f}"))
+            if self._master is not None:
+                self._poll_host(self._master)
+            self._transmit(self._mcu.tick(time.monotonic()))
+            self._run_requests()
+
+    def _wait(self) -> None:
+        """Wait for data from the host, for a request, or for the next tick."""
+        watched = [self._wakeup.fileno()]
+        if self._host and self._master is not None:
+            watched.append(self._master)
+        unasked = self._master is not None and not self._host
+        ready, _, _ = select.select(watched, [], [], min(self._tick_s, _NO_HOST_S) if unasked else self._tick_s)
+        if self._wakeup.fileno() in ready:
+            self._wakeup.clear()
+
+    def _poll_host(self, master: int) -> None:
+        poller = select.poll()
+        poller.register(master, select.POLLIN)
+        events = poller.poll(0)
+        has_data = bool(events and events[0][1] & select.POLLIN)
+        hung_up = bool(events and events[0][1] & select.POLLHUP)
+        if (has_data or not hung_up) and not self._host:
+            self._host = True
+            self._recorder.event("opened")
+        if has_data:
+            self._receive(master)
+        elif hung_up and self._host:
+            self._host = False
+            self._recorder.event("closed")
+
+    def _receive(self, master: int) -> None:
+        try:
+            data = os.read(master, _CHUNK)
+        except OSError:  # the host has just closed the port
+            return
+        arrived = time.monotonic_ns()
+        self._recorder.received(arrived, data)
+        self._transmit(self._mcu.receive(data, arrived / 1e9))
+
+    def _transmit(self, data: bytes) -> None:
+        """Write to the host; as with a USB device, data that no host receives is lost."""
+        if not data:
+            return
+        sent, began = 0, time.monotonic_ns()
+        if self._host and self._master is not None:
+            with suppress(OSError):  # the host's buffer is full, or it has just closed
+                sent = os.write(self._master, data)
+        self.dropped += len(data) - sent
+        self._recorder.sent(began, data[:sent], whole=sent == len(data))
+
+    def _run_requests(self) -> None:
+        with suppress(queue.Empty):
+            while True:
+                answer, job = self._requests.get_nowait()
+                try:
+                    answer.set_result(job())
+                except OSError as error:
+                    answer.set_exception(error)
+
+    def _replug(self) -> None:
+        if self._master is not None:
+            return
+        if self.symlink.exists() and not self.symlink.is_symlink():
+            raise FileExistsError(errno.EEXIST, "the path exists and is not a symlink")
+        new = self.symlink.with_name(self.symlink.name + ".new")
+        new.unlink(missing_ok=True)
+        master, slave = os.openpty()
+        tty.setraw(slave)  # at once: the terminal's echo would send the MCU its own reports as commands
+        os.set_blocking(master, False)
+        self._master, self._tty = master, os.ttyname(slave)
+        os.close(slave)
+        new.symlink_to(self._tty)
+        self._recorder.event("plugged")
+        new.replace(self.symlink)
+
+    def _unplug(self) -> None:
+        if self._master is None:
+            return
+        # another simulation may have replaced it
+        if self.symlink.is_symlink() and self.symlink.readlink() == Path(self._tty):
+            self.symlink.unlink()
+        os.close(self._master)
+        self._master, self._host = None, False
+        self._recorder.event("unplugged")
+
+    def _stop(self) -> None:
+        self._stopping = True
+
+    def _moved(self, now: float, motors: Pair) -> None:
+        self.trace.add(motors_entry(round(now * 1e9), motors))

@@ -1,0 +1,155 @@
+"""A simulated MiniLAMP or BenJr: its board, its body, and a real connection to a broker."""
+
+import hashlib
+import secrets
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+from pebble.config.security import Security
+from pebble.contract.identity import Identity
+from pebble.errors import ConfigError
+from pebble.extensions.lab.simulation.bodies import BoardState, body_of
+from pebble.extensions.lab.simulation.micropython.board import Board
+from pebble.extensions.lab.simulation.micropython.clock import RealClock
+from pebble.extensions.lab.simulation.micropython.files import Files
+from pebble.extensions.lab.simulation.micropython.modules.sockets import HostNetwork
+from pebble.extensions.lab.simulation.micropython.ports import OF_ROBOT
+from pebble.extensions.lab.simulation.micropython.runner import Runner
+from pebble.extensions.lab.simulation.micropython.servers import LoopbackServers
+
+KINDS: Final = ("minilamp", "benjr")
+
+_MOVING_S, _RESTING_S = 0.01, 0.05  # period of turns while sockets are idle
+_CA_FILE = "/ca.der"
+_OPEN = Security()
+
+Motors = tuple[float, float]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class BrokerAddress:
+    """Address and login of a robot's broker; ``ca`` (DER) or ``tls`` enables TLS."""
+
+    host: str
+    port: int
+    username: str | None = None
+    password: str | None = None
+    tls: bool = False
+    ca: Path | None = None
+
+    def __str__(self) -> str:
+        return f"{self.host}:{self.port}"
+
+    def settings(self) -> dict[str, Any]:
+        """Return the section ``mqtt`` of a private_config.json."""
+        login = {"username": self.username, "password": self.password}
+        tls: Any = {"ca": _CA_FILE} if self.ca is not None else self.tls
+        return {"host": self.host, "port": self.port, "tls": tls, **{k: v for k, v in login.items() if v is not None}}
+
+
+class WirelessRobot:
+    """One robot; ``step`` is a turn of its loop. ``on_motors(seconds, (left, right))`` is called when motors change.
+
+    ``pause_s`` is the longest time until its next turn while its sockets are idle. ``files`` is the folder of its
+    board's files, which survive the program; None: they are in memory. ``name``: what people call it; empty: nothing
+    else than its id. ``security``: of its config.
+    """
+
+    def __init__(
+        self,
+        kind: str,
+        identity: Identity,
+        broker: BrokerAddress,
+        servers: LoopbackServers,
+        *,
+        name: str = "",
+        security: Security = _OPEN,
+        on_motors: Callable[[float, Motors], None] | None = None,
+        moving_s: float = _MOVING_S,
+        files: Path | None = None,
+    ) -> None:
+        if kind not in KINDS:
+            raise ConfigError(f"unknown simulated robot with Wi-Fi {kind!r}; known: {', '.join(KINDS)}")
+        self.kind, self.identity, self.broker, self.name = kind, identity, broker, name
+        self._security = security.on_board()
+        clock = RealClock()
+        uid = hashlib.sha256(identity.base.encode()).digest()[:6]
+        self.network = HostNetwork(clock, platform=OF_ROBOT[kind].platform, routes=servers.routes, uid=uid)
+        self.board = Board(clock, self.network, uid, seed=secrets.randbits(64))  # another one at each start
+        self.board.files = Files(files)
+        self.body = body_of(kind, self.board)
+        self.body.on_motors = self._moved
+        self._on_motors, self._moving_s = on_motors, moving_s
+        self._motors: Motors = (0.0, 0.0)
+        self._power_is_cut = False
+        if broker.ca is not None:
+            self.board.files[_CA_FILE] = _read(broker.ca)
+        try:
+            self._runner = Runner(self.board, kind, self._settings())
+        except ValueError as error:  # settings that this firmware does not support
+            raise ConfigError(f"{kind}: {error}") from None
+
+    @property
+    def pause_s(self) -> float:
+        return self._moving_s if self.moving else _RESTING_S
+
+    @property
+    def firmware(self) -> Any:
+        """The robot object that the firmware has built."""
+        return self._runner.robot
+
+    @property
+    def moving(self) -> bool:
+        return any(self._motors)
+
+    @property
+    def online(self) -> bool:
+        """Whether the firmware is connected to the broker and subscribed."""
+        return str(self.firmware.session.connection.state) == "online"
+
+    @property
+    def problem(self) -> str:
+        """Why the robot is not online; "" if unknown."""
+        reason = str(self.firmware.session.connection.reason)
+        return reason if "refused by the broker" in reason else self.network.problem or reason
+
+    def step(self) -> None:
+        """Run one turn of the loop."""
+        if self._power_is_cut:
+            self._power_is_cut = False
+            self._runner.boot()
+        self._runner.step()
+        self.body.end_turn()
+
+    def cut_power(self) -> None:
+        """Switch the board off, and on again at its next turn: only its files survive. May be called in any thread."""
+        self._power_is_cut = True
+
+    def stop(self) -> None:
+        """Stop the motors and power off."""
+        self.firmware.stop()
+        self.network.power_off()
+        self.body.end_turn()
+
+    def state(self) -> BoardState:
+        return self.body.state()
+
+    def _settings(self) -> dict[str, Any]:
+        robot = {"system": self.identity.system, "type": self.identity.type, "id": self.identity.id, "name": self.name}
+        wifi = {"ssid": "simulated", "password": "simulated"}
+        security = {"security": self._security} if self._security else {}
+        return {"robot": robot, "wifi": wifi, "mqtt": self.broker.settings(), **security}
+
+    def _moved(self, now: float, motors: Motors) -> None:
+        self._motors = motors
+        if self._on_motors is not None:
+            self._on_motors(now, motors)
+
+
+def _read(file: Path) -> bytes:
+    try:
+        return file.read_bytes()
+    except OSError as error:
+        raise ConfigError(f"{file}: {error.strerror}") from None

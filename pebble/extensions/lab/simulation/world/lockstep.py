@@ -1,0 +1,153 @@
+"""A simulated world on one virtual clock that the caller advances: real firmware, motion, contacts and cameras.
+
+The same calls give the same bytes and pixels, on every run and however busy the machine is.
+"""
+
+from collections import deque
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from pebble.extensions.lab.simulation.board import SimulatedMcu
+from pebble.extensions.lab.simulation.motion import Pose, RobotMotion
+from pebble.extensions.lab.simulation.world.pose_page import PERIOD_S
+from pebble.extensions.lab.simulation.world.poses import RobotPose, Sample, Track
+from pebble.extensions.lab.simulation.world.renderer import Renderer
+from pebble.extensions.lab.simulation.world.surfaces import Image
+from pebble.extensions.lab.simulation.world.walls import Floor, start_pose
+from pebble.extensions.lab.simulation.world.world_file import LONGEST_EXPOSURE_MS, LONGEST_LATENCY_MS, World
+
+STEP_S: Final = 0.005  # one turn of the firmware's loop
+_STEPS_PER_SAMPLE = round(PERIOD_S / STEP_S)
+_SAMPLES = round((LONGEST_LATENCY_MS + LONGEST_EXPOSURE_MS) / 1000 / PERIOD_S) + 2
+
+
+class CameraMode(NamedTuple):
+    """The size of pictures in pixels, and how many there are per second."""
+
+    width: int = 640
+    height: int = 480
+    fps: float = 15.0
+
+
+class Picture(NamedTuple):
+    """A picture, BGR, (height, width, 3), and what time it shows."""
+
+    pixels: Image
+    at: float
+
+
+class LockstepWorld:
+    """A world and its robots. ``now`` is the clock, in seconds since the start; pass it to what is tested.
+
+    Example::
+
+        world = LockstepWorld(read_world(path))
+        goob = world.robots["goob"]
+        while world.now() < 20:
+            world.step()
+            if (picture := goob.picture()) is not None:
+                goob.drive(x=0.0, z=0.3)
+    """
+
+    def __init__(self, world: World, camera: CameraMode | None = None) -> None:
+        self._steps = 0
+        self.floor = Floor(world)
+        mode = camera or CameraMode()
+        self.robots = {name: LockstepRobot(world, name, self.floor, mode) for name in world.robots}
+        self._sample()
+
+    def now(self) -> float:
+        return self._steps * STEP_S
+
+    def step(self) -> None:
+        """Advance everything by ``STEP_S``."""
+        self._steps += 1
+        now = self.now()
+        for robot in self.robots.values():
+            robot.tick(now)
+        if self._steps % _STEPS_PER_SAMPLE == 0:
+            self._sample()
+
+    def run(self, seconds: float) -> None:
+        end = self.now() + seconds - STEP_S / 1000
+        while self.now() < end:
+            self.step()
+
+    def _sample(self) -> None:
+        for robot in self.robots.values():
+            robot.sample()
+        tracks = {name: robot.track for name, robot in self.robots.items()}
+        for robot in self.robots.values():
+            robot.tracks = tracks
+
+
+class LockstepRobot:
+    """A robot of a LockstepWorld, which calls ``tick`` and ``sample``: its serial line, its camera, and the truth."""
+
+    def __init__(self, world: World, name: str, floor: Floor, camera: CameraMode) -> None:
+        self.name = name
+        self.motion = RobotMotion(start_pose(world, name), floor.mover(name))
+        self.mcu = SimulatedMcu(world.robots[name].kind, 0.0, motion=self.motion)
+        self.tracks: dict[str, Track] = {}
+        self._world, self._camera = world, camera
+        self._renderer: Renderer | None = None  # made for the first picture: not every test has OpenCV to load
+        self._now = 0.0
+        self._output = b""
+        self._samples: deque[Sample] = deque(maxlen=_SAMPLES)
+        self._pictures = 0  # due until the last one that was taken
+
+    @property
+    def pose(self) -> RobotPose:
+        self.mcu.body.advance()
+        pose = self.motion.pose
+        return RobotPose(pose.x_mm / 1000, pose.y_mm / 1000, pose.heading_rad)
+
+    def place(self, x: float, y: float, heading: float) -> None:
+        """Put the robot down elsewhere: metres and radians."""
+        self.mcu.body.advance()
+        self.motion.place(Pose(x * 1000, y * 1000, heading))
+
+    # -- the serial line
+
+    def write(self, data: bytes) -> None:
+        """Send to the MCU, as the host does."""
+        self._output += self.mcu.receive(data, self._now)
+
+    def read(self) -> bytes:
+        """What the MCU has sent since the last call."""
+        output, self._output = self._output, b""
+        return output
+
+    def drive(self, x: float, z: float) -> None:
+        """Send what ``serial_mcu_bridge`` makes of a drive command: throttle ``z``, steering ``x``, + turns right."""
+        left, right = (min(1.0, max(-1.0, speed)) for speed in (z + x, z - x))
+        self.write(b"M %.3f %.3f\n" % (round(left, 3) + 0.0, round(right, 3) + 0.0))  # + 0.0: no "-0.000"
+
+    # -- the camera
+
+    def picture(self) -> Picture | None:
+        """The newest picture, unless it has been taken already. It is rendered only then."""
+        due = int(self._now * self._camera.fps + 1e-6)
+        if due == self._pictures:
+            return None
+        self._pictures = due
+        at = due / self._camera.fps - self._world.camera.latency_ms / 1000
+        pixels = np.empty((self._camera.height, self._camera.width, 3), np.uint8)
+        if self._renderer is None:
+            self._renderer = Renderer(self._world, self.name, self._camera.width, self._camera.height)
+        self._renderer.render(self.tracks, round(at * 1e9), pixels)
+        return Picture(pixels, at)
+
+    # -- for the world
+
+    def tick(self, now: float) -> None:
+        self._now = now
+        self._output += self.mcu.tick(now)
+
+    def sample(self) -> None:
+        self._samples.append(Sample(round(self._now * 1e9), self.pose))
+
+    @property
+    def track(self) -> Track:
+        return Track(list(self._samples))

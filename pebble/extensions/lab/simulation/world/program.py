@@ -1,0 +1,192 @@
+"""A simulated world as a program: the MCUs of its robots behind pseudo terminals, and their poses for their cameras."""
+
+import math
+import os
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Mapping
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any, Final
+
+import msgspec
+
+from pebble.errors import ConfigError, DeviceError
+from pebble.extensions.lab.simulation.board import BoardState
+from pebble.extensions.lab.simulation.mcu import actions
+from pebble.extensions.lab.simulation.motion import Pose, RobotMotion
+from pebble.extensions.lab.simulation.pty import PtyMcu
+from pebble.extensions.lab.simulation.world.pose_page import PERIOD_S, PosePage, page_path
+from pebble.extensions.lab.simulation.world.poses import RobotPose
+from pebble.extensions.lab.simulation.world.walls import Floor, start_pose
+from pebble.extensions.lab.simulation.world.world_file import World, read_world
+from pebble.runtime.signals import EndSignal
+
+_SAMPLES_PER_REPORT = round(0.1 / PERIOD_S)
+
+ROOM: Final = Path(__file__).with_name("room.json")  # 4 m wide, four tags, Goob and Fred
+
+Mcus = dict[str, PtyMcu]
+
+
+class Snapshot(msgspec.Struct, frozen=True):
+    """A line of a report: one JSON object, ten times a second. ``ns`` is time.monotonic_ns()."""
+
+    ns: int
+    robots: dict[str, BoardState]
+
+
+def run(
+    file: Path, folder: Path | None = None, *, trace: Path | None = None, report: bool = False, control: bool = False
+) -> int:
+    """Run until a signal, or with ``control`` until standard input ends. Raises PebbleError.
+
+    ``folder`` is for serial ports, ``trace`` for what MCUs receive, ROBOT.trace.jsonl. ``report``: write a
+    :class:`Snapshot` to standard output ten times a second.
+    """
+    end, path = EndSignal(), file.absolute()
+    world = _read(path)
+    folder = folder or Path(tempfile.gettempdir(), f"pebble-world-{path.stem}")
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise DeviceError(f"{error.filename}: {error.strerror}") from None
+    with ExitStack() as stack:
+        page = _page(path, world)
+        stack.callback(page.close)
+        floor = Floor(world)
+        motions = {name: RobotMotion(start_pose(world, name), floor.mover(name)) for name in world.robots}
+        mcus = {name: stack.enter_context(mcu) for name, mcu in _mcus(world, motions, folder, trace).items()}
+        imus = {name: stack.enter_context(imu) for name, imu in _imus(world, motions, folder).items()}
+        if not report:
+            _write(_introduction(path, mcus, imus))
+        if control:
+            threading.Thread(target=_run_commands, args=(mcus, end), name="pebble-world control", daemon=True).start()
+        _publish_poses(page, mcus, end, report=report)
+    return 0
+
+
+def port_path(folder: Path, robot: str) -> Path:
+    """The serial port of a robot's motor MCU."""
+    return folder / f"{robot}.port"
+
+
+def imu_port_path(folder: Path, robot: str) -> Path:
+    """The serial port of its inertial sensor's MCU, if it has one."""
+    return folder / f"{robot}.imu-port"
+
+
+def trace_path(folder: Path, robot: str) -> Path:
+    """The file for what a robot's MCU receives."""
+    return folder / f"{robot}.trace.jsonl"
+
+
+def _read(path: Path) -> World:
+    """Every line of an error names the file."""
+    try:
+        return read_world(path)
+    except ConfigError as error:
+        raise ConfigError(
+            [line if line.startswith(str(path)) else f"{path}: {line}" for line in error.problems]
+        ) from None
+
+
+def _page(path: Path, world: World) -> PosePage:
+    try:
+        return PosePage(page_path(path), world.robots)
+    except DeviceError as error:
+        raise DeviceError(f"{path}: {error}") from None
+
+
+def _mcus(world: World, motions: Mapping[str, RobotMotion], folder: Path, trace: Path | None) -> Mcus:
+    return {
+        name: PtyMcu(
+            place.kind,
+            port_path(folder, name),
+            trace=trace_path(trace, name) if trace else None,
+            motion=motions[name],
+        )
+        for name, place in world.robots.items()
+    }
+
+
+def _imus(world: World, motions: Mapping[str, RobotMotion], folder: Path) -> Mcus:
+    """They only read the motion, which the thread of the motor MCU advances."""
+    return {
+        name: PtyMcu("goob_imu", imu_port_path(folder, name), motion=motions[name])
+        for name, place in world.robots.items()
+        if place.imu
+    }
+
+
+def _publish_poses(page: PosePage, mcus: Mcus, end: EndSignal, *, report: bool) -> None:
+    """Write samples to the page until the end is requested."""
+    due, count = time.monotonic(), 0
+    while not end.wait(max(0.0, due - time.monotonic())):
+        due = max(due + PERIOD_S, time.monotonic())
+        states = {name: mcu.state() for name, mcu in mcus.items()}
+        ns = time.monotonic_ns()
+        poses = (state.pose for state in states.values())
+        page.write(ns, [RobotPose(pose.x_mm / 1000, pose.y_mm / 1000, pose.heading_rad) for pose in poses])
+        count += 1
+        if (
+            report
+            and count % _SAMPLES_PER_REPORT == 0
+            and not _write(msgspec.json.encode(Snapshot(ns, states)) + b"\n")
+        ):
+            return
+
+
+def _introduction(path: Path, mcus: Mcus, imus: Mcus) -> bytes:
+    """Where the robots are, and what belongs in their configs."""
+    lines = [f"the world of {path} runs; Ctrl-C ends it"]
+    for name, mcu in mcus.items():
+        video = msgspec.json.encode({"backend": "synthetic", "device": f"{path}#{name}"}).decode()
+        serial = _serial(mcu)
+        if name in imus:
+            serial |= {"instances": {"imu": {"protocol": "pebble_serial_v1", **_serial(imus[name])}}}
+        bridge = msgspec.json.encode(serial).decode()
+        lines += [f"{name}, in the services of its config:", f'    "serial_mcu_bridge": {bridge}']
+        lines += [f'    "av_daemon": {{"video": {video}}}']
+    return "\n".join(lines).encode() + b"\n"
+
+
+def _serial(mcu: PtyMcu) -> dict[str, Any]:
+    return {"serial": {"port": str(mcu.symlink)}}
+
+
+def _write(text: bytes) -> bool:
+    """False if the reader of standard output has closed it."""
+    try:
+        os.write(sys.stdout.fileno(), text)
+    except BrokenPipeError:
+        return False
+    return True
+
+
+def _run_commands(mcus: Mcus, end: EndSignal) -> None:
+    for line in sys.stdin:
+        if problem := _command(mcus, line.split()):
+            sys.stderr.write(f"{line.strip()!r}: {problem}\n")
+    end.set()
+
+
+def _command(mcus: Mcus, words: list[str]) -> str:
+    """Execute one line of standard input; returns what is wrong with it."""
+    if len(words) < 2 or words[0] not in mcus:
+        return f"begin with a robot ({', '.join(mcus)}) and a command"
+    mcu, command, arguments = mcus[words[0]], words[1], words[2:]
+    known = actions(mcu)
+    if command in known and not arguments:
+        known[command]()
+        return ""
+    if command != "place":
+        return f"known commands: {', '.join(known)}, place X Y DEGREES"
+    try:
+        x, y, degrees = map(float, arguments)
+        mcu.place(Pose(x * 1000, y * 1000, math.remainder(math.radians(degrees), math.tau)))
+    except ValueError:
+        return "place needs three numbers: metres, metres, degrees"
+    return ""

@@ -1,0 +1,251 @@
+"""Draws what the camera of a robot in a simulated world sees.
+
+All surfaces are upright and the camera is level, so what hides what is decided in the plan, seen from above.
+"""
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any, Final, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pebble.extensions.lab.simulation.world.poses import RobotPose, Track, poses_at
+from pebble.extensions.lab.simulation.world.surfaces import Image, Surface, Surfaces
+from pebble.extensions.lab.simulation.world.world_file import World
+from pebble.extensions.media.scene import noise
+
+_NEAR_M: Final = 0.05  # nothing nearer is drawn
+_BESIDE_PX = 64.0  # beyond the picture's edges surfaces are cut off
+_TOUCHING_M = 1e-4  # surfaces as near to each other lie in one plane
+_EXPOSURES = 4  # pictures whose mean shows motion blur
+_SKY, _GROUND = (214, 208, 200), (112, 118, 122)
+_FLOOR_PX, _TILE_M = 512, 0.25
+_NOISES = 61  # how far the noise is shifted between pictures, at most; in both directions
+_SHIFT = 4  # fractional bits of a corner
+
+_Floats: TypeAlias = NDArray[np.float64]
+
+
+class Renderer:
+    """Pictures of ``width`` x ``height``, BGR, of the robot ``me``; the same calls give the same pixels."""
+
+    def __init__(self, world: World, me: str, width: int, height: int) -> None:
+        import cv2  # 16 MB, only where pictures are made
+
+        cv2.setNumThreads(1)
+        self._cv2: Any = cv2
+        self._lens, self._me = world.camera, me
+        self._surfaces = Surfaces(world)
+        self._width, self._height = width, height
+        self._focal = width / 2 / math.tan(math.radians(world.camera.hfov_deg / 2))
+        self._middle = ((width - 1) / 2, (height - 1) / 2)
+        self._horizon = math.floor(self._middle[1]) + 1
+        self._floor, self._floor_to_world = _floor(world)
+        self._background = np.full((height, width, 3), _SKY, np.uint8)
+        self._background[self._horizon :] = _GROUND
+        self._noise = _noise(width, height, world.camera.noise) if world.camera.noise else None
+        self._count = 0
+
+    def render(self, tracks: Mapping[str, Track], ns: int, out: Image) -> None:
+        """Draw what the camera sees at ``ns`` into ``out``, of shape (height, width, 3), with all of its faults."""
+        cv2, lens = self._cv2, self._lens
+        self._expose(tracks, ns, out)
+        if lens.blur:
+            size = 2 * math.ceil(2 * lens.blur) + 1
+            cv2.GaussianBlur(out, (size, size), lens.blur, dst=out)
+        if self._noise is not None:
+            down, right = self._count * 17 % _NOISES, self._count * 29 % _NOISES
+            lighter, darker = self._noise[:, down : down + self._height, right : right + self._width]
+            cv2.add(out, lighter, dst=out)
+            cv2.subtract(out, darker, dst=out)
+        if lens.jpeg_quality is not None:
+            _, data = cv2.imencode(".jpg", out, (cv2.IMWRITE_JPEG_QUALITY, lens.jpeg_quality))
+            out[:] = cv2.imdecode(data, cv2.IMREAD_COLOR)
+        self._count += 1
+
+    def _expose(self, tracks: Mapping[str, Track], ns: int, out: Image) -> None:
+        """The mean of what is seen during the exposure, which ends at ``ns``."""
+        exposure_ns = self._lens.motion_blur_ms * 1e6
+        times = [ns - round(exposure_ns * part / (_EXPOSURES - 1)) for part in range(_EXPOSURES)]
+        views = [poses_at(tracks, moment) for moment in (times if exposure_ns else [ns])]
+        if all(view == views[0] for view in views):
+            self.draw(views[0], out)
+            return
+        total = np.zeros(out.shape, np.uint16)
+        for view in views:
+            self.draw(view, out)
+            total += out
+        out[:] = total // len(views)
+
+    def draw(self, poses: Mapping[str, RobotPose], out: Image) -> None:
+        """Draw one moment into ``out``, sharp and without noise."""
+        me = poses[self._me]
+        np.copyto(out, self._background)
+        self._draw_floor(me, out)
+        surfaces = self._surfaces.surfaces(poses, self._me)
+        if not surfaces:
+            return
+        plan, parts = self._seen(surfaces, me)
+        for index in _back_to_front(plan, [surfaces[number].layer for number in parts], self._columns(plan)):
+            surface = surfaces[parts[index]]
+            if surface.textures:
+                self._draw_texture(surface, me, plan[index], out)
+            else:
+                self._fill(surface, plan[index], out)
+
+    # -- plan: (n, 2, 2) left and right edge of each surface, as distance ahead of the camera and to its right
+
+    def _seen(self, surfaces: Sequence[Surface], me: RobotPose) -> tuple[_Floats, list[int]]:
+        """The parts of surfaces that are in front of the camera, and which surfaces they are of."""
+        edges = np.array([(surface.left, surface.right) for surface in surfaces])
+        plan = self._to_camera(edges, me)
+        (ahead1, right1), (ahead2, right2) = plan[:, 0].T, plan[:, 1].T
+        shows_front = right2 * ahead1 - right1 * ahead2 > 0
+        slope = (self._width / 2 + _BESIDE_PX) / self._focal
+        from_, to = np.zeros(len(plan)), np.ones(len(plan))
+        for inside1, inside2 in (
+            (ahead1 - _NEAR_M, ahead2 - _NEAR_M),
+            (slope * ahead1 - right1, slope * ahead2 - right2),
+            (slope * ahead1 + right1, slope * ahead2 + right2),
+        ):
+            crossing = inside1 / np.where(inside1 == inside2, np.inf, inside1 - inside2)
+            from_ = np.where(inside1 < 0, np.maximum(from_, np.where(inside2 > 0, crossing, 1.0)), from_)
+            to = np.where(inside2 < 0, np.minimum(to, np.where(inside1 > 0, crossing, 0.0)), to)
+        shown = np.flatnonzero(shows_front & (from_ < to))
+        start, along = plan[shown, 0], plan[shown, 1] - plan[shown, 0]
+        cut = np.stack((start + along * from_[shown, None], start + along * to[shown, None]), axis=1)
+        return cut, shown.tolist()
+
+    def _to_camera(self, points: _Floats, me: RobotPose) -> _Floats:
+        sine, cosine = math.sin(me.heading), math.cos(me.heading)
+        return np.asarray((points - (me.x, me.y)) @ np.array([[cosine, sine], [sine, -cosine]]))
+
+    def _columns(self, plan: _Floats) -> _Floats:
+        """Where in the picture the edges are."""
+        return np.asarray(self._middle[0] + self._focal * plan[..., 1] / plan[..., 0])
+
+    def _rows(self, surface: Surface, plan: _Floats) -> _Floats:
+        """Top and bottom at both edges."""
+        heights = self._lens.height_m - np.array((surface.top, surface.bottom))
+        return np.asarray(self._middle[1] + self._focal * heights[None] / plan[:, :1])
+
+    # -- drawing
+
+    def _fill(self, surface: Surface, plan: _Floats, out: Image) -> None:
+        (left, right), ((top1, bottom1), (top2, bottom2)) = self._columns(plan), self._rows(surface, plan)
+        corners = np.array([(left, top1), (right, top2), (right, bottom2), (left, bottom1)])
+        points = np.round(corners * (1 << _SHIFT)).astype(np.int32)
+        self._cv2.fillConvexPoly(out, points, surface.colour, self._cv2.LINE_AA, _SHIFT)
+
+    def _draw_texture(self, surface: Surface, me: RobotPose, plan: _Floats, out: Image) -> None:
+        columns, rows = self._columns(plan), self._rows(surface, plan)
+        x0, x1 = max(0, math.floor(columns[0])), min(self._width, math.ceil(columns[1]) + 1)
+        y0, y1 = max(0, math.floor(rows.min())), min(self._height, math.ceil(rows.max()) + 1)
+        if x0 >= x1 or y0 >= y1:
+            return
+        area = (columns[1] - columns[0]) * (rows[:, 1] - rows[:, 0]).mean()
+        area *= self._share(surface, plan)
+        fine = [texture for texture in surface.textures if texture.shape[0] * texture.shape[1] >= area]
+        texture = fine[-1] if fine else surface.textures[0]  # the smallest that is not enlarged
+        size = len(texture)
+        whole = self._to_camera(np.array((surface.left, surface.right)), me)
+        (ahead, beside), (ahead2, beside2) = whole
+        down = (surface.bottom - surface.top) / size
+        to_space = np.array(  # from pixels of the texture to (right, down, ahead) of the camera
+            [
+                [(beside2 - beside) / size, 0.0, beside],
+                [0.0, -down, self._lens.height_m - surface.top],
+                [(ahead2 - ahead) / size, 0.0, ahead],
+            ]
+        )
+        self._warp(texture, to_space, (x0, y0, x1, y1), out)
+
+    @staticmethod
+    def _share(surface: Surface, plan: _Floats) -> float:
+        """How much larger the surface is than the part in the plan."""
+        whole = math.dist(surface.left, surface.right)
+        return whole / max(1e-9, math.dist(plan[0], plan[1]))
+
+    def _warp(self, texture: Image, to_space: _Floats, box: tuple[int, int, int, int], out: Image) -> None:
+        """Draw a texture, whose pixels have the middle at .5, into the ``box`` of a picture."""
+        x0, y0, x1, y1 = box
+        lens = np.array(
+            [[self._focal, 0.0, self._middle[0] - x0], [0.0, self._focal, self._middle[1] - y0], [0.0, 0.0, 1.0]]
+        )
+        to_picture = lens @ to_space @ np.array([[1.0, 0.0, 0.5], [0.0, 1.0, 0.5], [0.0, 0.0, 1.0]])
+        self._cv2.warpPerspective(
+            texture,
+            to_picture,
+            (x1 - x0, y1 - y0),
+            dst=out[y0:y1, x0:x1],
+            flags=self._cv2.INTER_LINEAR,
+            borderMode=self._cv2.BORDER_TRANSPARENT,
+        )
+
+    def _draw_floor(self, me: RobotPose, out: Image) -> None:
+        sine, cosine, height = math.sin(me.heading), math.cos(me.heading), self._lens.height_m
+        to_camera = np.array(
+            [
+                [sine, -cosine, -sine * me.x + cosine * me.y],
+                [0.0, 0.0, height],
+                [cosine, sine, -cosine * me.x - sine * me.y],
+            ]
+        )
+        box = (0, self._horizon, self._width, self._height)
+        self._warp(self._floor, to_camera @ self._floor_to_world, box, out)
+
+
+def _back_to_front(plan: _Floats, layers: Sequence[int], columns: _Floats) -> list[int]:
+    """The order in which surfaces are drawn. Of crossing ones, the farther one is first."""
+    covers = _covers(plan, np.array(layers), columns)
+    distance = (plan.mean(axis=1) ** 2).sum(axis=1)
+    left, order = set(range(len(plan))), []
+    while left:
+        rest = sorted(left, key=lambda index: -distance[index])
+        free = [index for index in rest if not covers[index, rest].any()]
+        order += (chosen := free or rest[:1])
+        left.difference_update(chosen)
+    return order
+
+
+def _covers(plan: _Floats, layers: NDArray[np.int_], columns: _Floats) -> NDArray[np.bool_]:
+    """``[i, j]``: surface i hides a part of j. The camera is at 0, 0."""
+    start, along = plan[:, 0], plan[:, 1] - plan[:, 0]
+    normal = np.stack((along[:, 1], -along[:, 0]), axis=1) / np.linalg.norm(along, axis=1, keepdims=True)
+    normal *= np.where((start * normal).sum(axis=1, keepdims=True) > 0, -1.0, 1.0)  # towards the camera
+    # how far the edges of i are in front of j: [i, edge, j]
+    before = np.einsum("iek,jk->iej", plan, normal) - (start * normal).sum(axis=1)
+    nearest, farthest = before.max(axis=1), before.min(axis=1)
+    in_front = (farthest > -_TOUCHING_M) & (nearest > _TOUCHING_M)
+    behind = (nearest < _TOUCHING_M) & (farthest < -_TOUCHING_M)
+    one_plane = (np.abs(before) <= _TOUCHING_M).all(axis=1)
+    sure = in_front | behind.T
+    covers = (sure & ~sure.T) | (one_plane & one_plane.T & (layers[:, None] > layers))
+    overlap = (columns[:, None, 0] < columns[:, 1]) & (columns[:, 0] < columns[:, None, 1])
+    return np.asarray(covers & overlap & ~np.eye(len(plan), dtype=bool))
+
+
+def _floor(world: World) -> tuple[Image, _Floats]:
+    """A texture of tiles, and the matrix from its pixels to the floor; of the room, or of 20 m around the origin."""
+    import cv2
+
+    room = world.room
+    x, y, wide = (
+        (room.x_min, room.y_min, max(room.x_max - room.x_min, room.y_max - room.y_min)) if room else (-10, -10, 20)
+    )
+    tiles = max(2, min(64, round(wide / _TILE_M)))
+    shades = (
+        120 + 26 * (np.indices((tiles, tiles)).sum(axis=0) % 2) + 20 * noise(7, tiles * tiles).reshape(tiles, tiles)
+    )
+    picture = cv2.resize(shades.astype(np.uint8), (_FLOOR_PX, _FLOOR_PX), interpolation=cv2.INTER_NEAREST)
+    scale = wide / _FLOOR_PX
+    to_world = np.array([[scale, 0.0, x], [0.0, scale, y], [0.0, 0.0, 1.0]])
+    return np.asarray(cv2.cvtColor(picture, cv2.COLOR_GRAY2BGR), np.uint8), to_world
+
+
+def _noise(width: int, height: int, sigma: float) -> Image:
+    """Gaussian noise, what it adds and what it takes away; larger than a picture, each gets another part of it."""
+    shape = (height + _NOISES, width + _NOISES, 3)
+    grain = np.round(np.random.default_rng(2).standard_normal(shape, np.float32) * np.float32(sigma))
+    return np.stack((grain.clip(0, 255), (-grain).clip(0, 255))).astype(np.uint8)

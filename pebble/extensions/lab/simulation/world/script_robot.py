@@ -1,0 +1,190 @@
+"""The robot of a script in a lockstep world: ``main(robot, options)`` runs in it as it is, on a virtual clock."""
+
+import importlib.util
+import logging
+import math
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+from pebble.config import parse
+from pebble.contract import DRIVE, Channel
+from pebble.contract.payloads import Drive
+from pebble.errors import PebbleError
+from pebble.extensions.lab.simulation.world.lockstep import STEP_S, LockstepRobot, LockstepWorld
+from pebble.extensions.lab.simulation.world.world_file import read_world
+from pebble.extensions.scripts.script import Robot, Stopped
+from pebble.extensions.scripts.script.drive_sender import DriveSender
+from pebble.extensions.scripts.script.robot import check_publish
+from pebble.runtime.addresses import Addresses
+
+_WATCHDOG_S = 0.75  # of serial_mcu_bridge
+_PATIENCE = 10_000  # calls during which no time passes
+
+Image = Any
+Handler = Callable[..., None]
+
+
+def load_script(file: Path) -> ModuleType:
+    """The module of a script's ``run.py``, whose name many scripts share, so an import would find only the first.
+
+    Raises OSError, and what the module raises.
+    """
+    name = str(file.absolute())
+    spec = importlib.util.spec_from_file_location(name, file)
+    if spec is None or spec.loader is None:
+        raise PebbleError(f"{file} is no Python file")
+    module = sys.modules[name] = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+class SimulatedRobot(Robot):
+    """A robot of the world in ``file``, for tests of a script.
+
+    Time passes only in ``camera()``, ``picture()`` and ``sleep()``, so the same test always has the same result. What
+    a script would receive from other programs, a test passes to :meth:`receive`; what it publishes is in ``published``.
+
+    Example::
+
+        robot = SimulatedRobot("room.json", "goob")
+        robot.run(main, Options(), seconds=20)
+        assert robot.distance_to(tag=13) < 0.7
+    """
+
+    def __init__(self, file: Path | str, name: str = "goob") -> None:
+        """Raises ConfigError for a file that is wrong, PebbleError if the robot is not in it."""
+        model = read_world(Path(file))
+        if name not in model.robots:
+            raise PebbleError(f"{file}: there is no robot {name!r}, only {', '.join(model.robots) or 'an empty world'}")
+        self.world = LockstepWorld(model)
+        self.config = parse({"robot": {"id": name}}, folder=Path(file).absolute().parent, env={})
+        self.log = logging.getLogger(f"pebble.script.{name}")
+        self.published: list[tuple[Channel, Any]] = []
+        self._addresses = Addresses(self.config)
+        self._last_values: dict[Channel, Callable[[], Any]] = {}
+        self._model, self._body = model, self.world.robots[name]
+        self._sender = DriveSender(1, self._drive)
+        self._driven_at = float("-inf")
+        self._end_at = float("inf")
+        self._messages: dict[Channel, tuple[Any, float]] = {}
+        self._handlers: list[tuple[Channel, Handler]] = []
+        self._picture: tuple[Image, float] | None = None
+        self._calls = 0  # since time has passed
+
+    # -- for tests
+
+    def run(self, main: Callable[..., None], *options: Any, seconds: float) -> None:
+        """Run a script for so long, or until it returns. The wheels are stopped in the end."""
+        self._end_at = self.world.now() + seconds
+        try:
+            main(self, *options)
+        except Stopped:
+            self.log.debug("its time is over")
+        self._sender.end("its time is over", self.world.now())
+        self.published += [(channel, value()) for channel, value in self._last_values.items()]
+
+    def distance_to(self, *, tag: int) -> float:
+        """How far the robot's middle is from a tag's, along the floor, in m. Raises PebbleError if there is none."""
+        for one in self._model.tags:
+            if one.id == tag:
+                return math.hypot(one.x - self._body.pose.x, one.y - self._body.pose.y)
+        raise PebbleError(f"there is no tag {tag} in this world")
+
+    @property
+    def body(self) -> LockstepRobot:
+        """Where it really is, and its motor board."""
+        return self._body
+
+    def receive(self, channel: Channel, value: Any) -> None:
+        """A message of another program arrives now; a drive command without a source is a person's."""
+        self._messages[channel] = (value, self.world.now())
+        if channel == DRIVE:
+            self._sender.receive(value, self.world.now())
+            self._drive(value)
+        for wanted, handler in self._handlers:
+            if wanted == channel:
+                handler(value)
+
+    # -- for scripts
+
+    def camera(self, *, width: int | None = None, views: bool = False, timeout: float | None = None) -> Iterator[Image]:
+        """Each picture once; time passes until there is one."""
+        del width, views, timeout
+        while True:
+            self._pass_step()
+            picture = self._body.picture()
+            if picture is not None:
+                yield picture.pixels
+
+    def picture(self, max_age: float = 0.5) -> Image | None:
+        self._pass_step()
+        picture = self._body.picture()
+        if picture is not None:
+            self._picture = (picture.pixels, picture.at)
+        newest = self._picture
+        return None if newest is None or self.world.now() - newest[1] > max_age else newest[0]
+
+    def latest(self, channel: Channel, max_age: float = 1.0) -> Any:
+        self._check()
+        value, at = self._messages.get(channel, (None, float("-inf")))
+        return value if self.world.now() - at <= max_age else None
+
+    def on(self, channel: Channel, handler: Handler) -> None:
+        self._handlers.append((channel, handler))
+
+    def drive(self, x: float = 0.0, z: float = 0.0, y: float = 0.0) -> bool:
+        self._check()
+        return self._sender.drive(Drive(x=x, z=z, y=y), self.world.now())
+
+    @property
+    def overridden(self) -> bool:
+        return self._sender.overridden(self.world.now())
+
+    @property
+    def why_refused(self) -> str:
+        return self._sender.refusal(self.world.now())
+
+    def publish(self, channel: Channel, value: Any, **names: str) -> bool:
+        self._check()
+        check_publish(channel.topic(self.config.base, **names), self._addresses)
+        self.published.append((channel, value))
+        return True
+
+    def sleep(self, seconds: float) -> None:
+        for _ in range(max(1, round(seconds / STEP_S))):
+            self._pass_step()
+
+    def end(self, why: str, exit_code: int = 0) -> None:
+        del exit_code
+        self._sender.end(why, self.world.now())
+        self._end_at = self.world.now()
+
+    def close(self) -> None:
+        self.end("closed")
+
+    # -- time
+
+    def _check(self) -> None:
+        self._calls += 1
+        if self._calls > _PATIENCE:
+            raise PebbleError("time stands still: wait with robot.sleep(), not with time.sleep()")
+        if self.world.now() >= self._end_at:
+            raise Stopped(0)
+
+    def _pass_step(self) -> None:
+        self._check()
+        self._calls = 0
+        self.world.step()
+        now = self.world.now()
+        self._sender.tick(now)
+        if now - self._driven_at > _WATCHDOG_S:
+            self._driven_at = float("inf")
+            self._body.drive(0.0, 0.0)
+
+    def _drive(self, command: Drive) -> bool:
+        self._driven_at = self.world.now()
+        self._body.drive(command.x, command.z)
+        return True

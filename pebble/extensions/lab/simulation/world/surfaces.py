@@ -1,0 +1,122 @@
+"""The upright surfaces of a world: walls, tags and robots, as the renderer draws them."""
+
+import math
+from collections.abc import Mapping
+from typing import Any, Final, NamedTuple, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pebble.extensions.lab.simulation.world.poses import RobotPose
+from pebble.extensions.lab.simulation.world.world_file import Wall, World
+
+MODULE_PX: Final = 32  # of a tag's texture; halves to 1 without a rest
+_SIDE, _TAG_SIDE = 1.6, 1.2  # of a robot's box and of the tag on it, in radii: the box is about as wide as the circle
+_ABOVE_LENS_M = 0.04  # a robot's box ends so far above its camera
+
+Image: TypeAlias = NDArray[np.uint8]
+Colour: TypeAlias = tuple[int, int, int]  # blue, green, red
+_WALL_COLOURS: Final[tuple[Colour, ...]] = ((196, 204, 208), (186, 192, 200), (176, 186, 196), (190, 196, 198))
+_BODY_COLOURS: Final[tuple[Colour, ...]] = ((60, 150, 60), (60, 60, 180), (170, 110, 50), (40, 150, 190))
+
+
+class Surface(NamedTuple):
+    """An upright rectangle from ``left`` to ``right`` as seen from its front; where it covers another exactly, the
+    higher ``layer`` is in front. It has a colour, or a texture in several sizes, the largest first."""
+
+    left: tuple[float, float]
+    right: tuple[float, float]
+    bottom: float
+    top: float
+    layer: int
+    colour: Colour = (0, 0, 0)
+    textures: tuple[Image, ...] = ()
+
+
+class Surfaces:
+    """The surfaces that a robot's camera may see."""
+
+    def __init__(self, world: World) -> None:
+        self._world = world
+        self._margin = _modules(world) + 2  # modules with the white around them
+        self._textures: dict[int, tuple[Image, ...]] = {}
+        self._fixed = [
+            *(
+                surface
+                for index, wall in enumerate(world.room.walls if world.room else ())
+                for surface in [_left_side(wall, index)]
+            ),
+            *(surface for index, wall in enumerate(world.walls) for surface in _both_sides(wall, index)),
+            *(self._tag(tag.id, tag.size_m, tag.x, tag.y, tag.z, math.radians(tag.yaw_deg)) for tag in world.tags),
+        ]
+
+    def surfaces(self, poses: Mapping[str, RobotPose], me: str) -> list[Surface]:
+        """All of them, of the robots at these poses; without the robot ``me``, which does not see itself."""
+        robots = [
+            surface
+            for index, name in enumerate(self._world.robots)
+            if name != me and name in poses
+            for surface in self._robot(name, poses[name], _BODY_COLOURS[index % len(_BODY_COLOURS)])
+        ]
+        return self._fixed + robots
+
+    def _robot(self, name: str, pose: RobotPose, colour: Colour) -> list[Surface]:
+        place = self._world.robots[name]
+        half, top = place.radius_m * _SIDE / 2, self._world.camera.height_m + _ABOVE_LENS_M
+        surfaces = []
+        for quarter, light in enumerate((1.0, 0.8, 0.65, 0.8)):
+            yaw = pose.heading + quarter * math.pi / 2
+            x, y = pose.x + half * math.cos(yaw), pose.y + half * math.sin(yaw)
+            shade = (round(colour[0] * light), round(colour[1] * light), round(colour[2] * light))
+            surfaces.append(Surface(*_edges(x, y, half, yaw), 0.0, top, 0, shade))
+            if place.tag is not None:
+                size = min(place.radius_m * _TAG_SIDE, 0.75 * top)
+                surfaces.append(self._tag(place.tag, size, x, y, top / 2, yaw))
+        return surfaces
+
+    def _tag(self, number: int, size: float, x: float, y: float, z: float, yaw: float) -> Surface:
+        if number not in self._textures:
+            self._textures[number] = _tag_textures(self._world.family, number)
+        half = size / 2 * self._margin / (self._margin - 2)
+        return Surface(*_edges(x, y, half, yaw), z - half, z + half, 1, textures=self._textures[number])
+
+
+def _edges(x: float, y: float, half: float, yaw: float) -> tuple[tuple[float, float], tuple[float, float]]:
+    """The left and right edge of a surface whose middle is at x, y and whose front looks to ``yaw``."""
+    right_x, right_y = -math.sin(yaw) * half, math.cos(yaw) * half
+    return (x - right_x, y - right_y), (x + right_x, y + right_y)
+
+
+def _left_side(wall: Wall, index: int) -> Surface:
+    colour = _WALL_COLOURS[index % len(_WALL_COLOURS)]
+    return Surface((wall.x2, wall.y2), (wall.x1, wall.y1), 0.0, wall.height_m, 0, colour)
+
+
+def _both_sides(wall: Wall, index: int) -> tuple[Surface, Surface]:
+    one = _left_side(wall, index)
+    return one, one._replace(left=one.right, right=one.left)
+
+
+def _modules(world: World) -> int:
+    return int(_dictionary(world.family).markerSize) + 2
+
+
+def _tag_textures(family: str, number: int) -> tuple[Image, ...]:
+    """The tag with a white border of one module, and halves of it down to one pixel per module."""
+    import cv2
+
+    dictionary = _dictionary(family)
+    modules = dictionary.markerSize + 2
+    grey = cv2.aruco.generateImageMarker(dictionary, number, modules * MODULE_PX)
+    white = np.pad(np.asarray(grey, np.uint8), MODULE_PX, constant_values=255)
+    textures: list[Any] = [cv2.cvtColor(white, cv2.COLOR_GRAY2BGR)]
+    while len(textures[-1]) > modules + 2:
+        smaller = len(textures[-1]) // 2
+        textures.append(cv2.resize(textures[-1], (smaller, smaller), interpolation=cv2.INTER_AREA))
+    return tuple(textures)
+
+
+def _dictionary(family: str) -> Any:
+    import cv2
+
+    return cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, f"DICT_{family}"))

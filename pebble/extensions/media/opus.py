@@ -1,0 +1,133 @@
+"""Opus for PBAT codec 2, by PyAV's libopus, and how several Opus packets share one PBAT body.
+
+The body is one or more Opus packets, each behind its length in bytes as u16, big-endian as the header is. All of them
+belong together in time; ``samples`` of the header counts what all of them decode to, at the header's rate, which is one
+of RATES. Three short packets instead of one long one, because a decoder conceals each by itself.
+
+Facts: RFC 6716 (3.1: the first byte tells a packet's length in time; a frame of no more than its first byte asks the
+decoder to conceal one). FFmpeg's decoder always yields 48 kHz and offers no other way to conceal; what in-band FEC adds
+to the next packet only decoders with an own libopus make use of.
+"""
+
+import struct
+from collections.abc import Iterator
+from typing import Any, Final
+
+import numpy as np
+
+from pebble.errors import PayloadError, PebbleError
+from pebble.extensions.media.pcm import Resampler, Samples
+from pebble.runtime import pyav
+
+RATES: Final = (8000, 12000, 16000, 24000, 48000)
+FRAMES_MS: Final = (20, 40, 60)
+BUNDLE_LIMIT: Final = 3  # Opus packets in one of ours
+_DECODED_RATE = 48_000
+_EXPECTED_LOSS = 10  # per cent; how much of the bitrate FEC may have
+_LENGTH = struct.Struct(">H")
+
+
+def _layout(channels: int) -> str:
+    return "mono" if channels == 1 else "stereo"
+
+
+def join(packets: list[bytes]) -> bytes:
+    """Opus packets as one PBAT body."""
+    return b"".join(_LENGTH.pack(len(packet)) + packet for packet in packets)
+
+
+def split(body: bytes) -> list[bytes]:
+    """The Opus packets of a PBAT body. Raises PayloadError unless it is made of whole ones, from 1 to BUNDLE_LIMIT."""
+    packets = list(_pieces(body))
+    if not 1 <= len(packets) <= BUNDLE_LIMIT:
+        raise PayloadError(f"PBAT: {len(packets)} Opus packets in one body")
+    return packets
+
+
+def _pieces(body: bytes) -> Iterator[bytes]:
+    at = 0
+    while at < len(body):
+        start = at + _LENGTH.size
+        size = _LENGTH.unpack_from(body, at)[0] if start <= len(body) else 0
+        at = start + size
+        if not size or at > len(body):
+            raise PayloadError("PBAT: an Opus packet is empty or cut off")
+        yield body[start:at]
+
+
+def milliseconds(packet: bytes) -> float:
+    """The duration of an Opus packet, by its first byte or two (RFC 6716, 3.1 and 3.2)."""
+    mode, code = packet[0] >> 3, packet[0] & 3
+    if mode < 12:  # SILK
+        frame_ms: float = (10, 20, 40, 60)[mode % 4]
+    elif mode < 16:  # both
+        frame_ms = (10, 20)[mode % 2]
+    else:  # CELT
+        frame_ms = (2.5, 5, 10, 20)[mode % 4]
+    count = (1, 2, 2, packet[1] & 0x3F if len(packet) > 1 else 0)[code]
+    return frame_ms * count
+
+
+def _codec(av: Any, mode: str) -> Any:
+    try:
+        return av.CodecContext.create("libopus", mode)
+    except ValueError as error:  # PyAV's UnknownCodecError is one
+        raise PebbleError(f"this PyAV has no libopus: {error}") from None
+
+
+class OpusEncoder:
+    """Frames of ``frame_ms`` (one of FRAMES_MS) at one of RATES, mono or stereo, to one Opus packet each."""
+
+    def __init__(self, rate: int, channels: int, *, frame_ms: int, bitrate: int) -> None:
+        self._av = pyav.load("opus")
+        self.samples = rate * frame_ms // 1000
+        self._rate, self._layout = rate, _layout(channels)
+        codec = _codec(self._av, "w")
+        codec.sample_rate, codec.layout, codec.format, codec.bit_rate = rate, self._layout, "s16", bitrate
+        codec.options = {
+            "application": "voip",
+            "frame_duration": str(frame_ms),
+            "fec": "1",
+            "packet_loss": str(_EXPECTED_LOSS),
+        }
+        codec.open()
+        self._codec = codec
+
+    def encode(self, frame: Samples) -> list[bytes]:
+        """One packet; ``frame`` is (self.samples, channels)."""
+        interleaved = np.ascontiguousarray(frame).reshape(1, -1)
+        handed = self._av.AudioFrame.from_ndarray(interleaved, format="s16", layout=self._layout)
+        handed.sample_rate = self._rate
+        return [bytes(packet) for packet in self._codec.encode(handed)]
+
+
+class OpusDecoder:
+    """Opus packets to samples at ``rate`` (one of RATES), mono or stereo whatever they were made of."""
+
+    def __init__(self, rate: int, channels: int) -> None:
+        self._av = pyav.load("opus")
+        self._codec = _codec(self._av, "r")
+        self._codec.sample_rate, self._codec.layout = _DECODED_RATE, _layout(channels)
+        self._channels = channels
+        self._resampler = Resampler(_DECODED_RATE, rate, channels)
+        self._mode: bytes | None = None  # first byte of the last packet: what a concealed one is like
+
+    def decode(self, packet: bytes) -> Samples:
+        """(samples, channels). Raises PayloadError for what is no Opus packet."""
+        samples = self._decode(packet)
+        self._mode = bytes([packet[0] & 0xFC])  # 0xFC: one frame, not several
+        return samples
+
+    def conceal(self) -> Samples:
+        """An estimate of one more frame, which fades when called again and again. Empty before the first packet."""
+        if self._mode is None:
+            return np.zeros((0, self._channels), np.int16)
+        return self._decode(self._mode)
+
+    def _decode(self, packet: bytes) -> Samples:
+        try:
+            frames = self._codec.decode(self._av.Packet(packet))
+        except (self._av.FFmpegError, ValueError) as error:
+            raise PayloadError(f"PBAT: no Opus packet: {error}") from None
+        decoded = [frame.to_ndarray().reshape(-1, self._channels) for frame in frames]
+        return self._resampler.feed(np.concatenate(decoded) if decoded else np.zeros((0, self._channels), np.int16))

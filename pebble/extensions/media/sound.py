@@ -1,0 +1,219 @@
+"""Sound to PBAT packets and back. Order and timing of playback are the jitter buffer's."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from pebble.contract.encodings import ALL_SOUND
+from pebble.contract.packets import SEQUENCE_LIMIT, Codec, Sound
+from pebble.errors import PayloadError, PebbleError
+from pebble.extensions.media import opus
+from pebble.extensions.media.opus import OpusDecoder, OpusEncoder
+from pebble.extensions.media.pcm import Resampler, Samples, remix, to_bytes, to_samples
+from pebble.runtime import pyav
+from pebble.transports.counters import Counters
+
+#: Those this installation can make.
+SOUND_ENCODINGS: Final = pyav.available(ALL_SOUND)
+
+CHANNELS_LIMIT: Final = 8  # channels of one stream of sound
+LOWEST_RATE: Final = 4000  # Hz; a player would fail with less
+_HIGHEST_PCM_RATE = 65_535  # what the header can express
+_LONGEST_S = 1.0  # of one packet: the most the original can be configured to send
+_GAP_MS = 60  # a capture time further than this from where the last chunk ended: sound is missing between them
+
+
+def sequence_numbers() -> Iterator[int]:
+    """1, 2, 3 … 0xFFFFFFFF, 1 …: one for each packet of a process, whatever its encoding."""
+    while True:
+        yield from range(1, SEQUENCE_LIMIT)
+
+
+class _Intake:
+    """Converts sound to the rate and channels on the wire and cuts it into equal frames."""
+
+    def __init__(self, rate: int, channels: int, rate_out: int, channels_out: int) -> None:
+        self.rate, self.channels = rate_out, channels_out
+        self._fed_rate, self._fed_channels = rate, channels
+        self._resampler = Resampler(rate, rate_out, channels_out)
+        self._left = np.zeros((0, channels_out), np.int16)
+        self._next_ms: float | None = None  # when the first sample of the next chunk should have been captured
+
+    def has_gap(self, captured_ms: int) -> bool:
+        """Is sound missing before ``captured_ms``? Then the samples left over are dropped."""
+        if self._next_ms is None or abs(captured_ms - self._next_ms) <= _GAP_MS:
+            return False
+        self._left = self._left[:0]
+        return True
+
+    def frames(self, pcm: bytes, captured_ms: int, size: int) -> Iterator[tuple[Samples, int]]:
+        """Frames of ``size`` samples, each with the epoch milliseconds of its first one."""
+        fed = to_samples(pcm, self._fed_channels)
+        start_ms = captured_ms - 1000 * len(self._left) / self.rate
+        held = np.concatenate((self._left, self._resampler.feed(remix(fed, self.channels))))
+        whole = len(held) // size * size
+        for at in range(0, whole, size):
+            yield held[at : at + size], round(start_ms + 1000 * at / self.rate)
+        self._left = held[whole:]
+        self._next_ms = captured_ms + 1000 * len(fed) / self._fed_rate
+
+
+class SoundEncoder:
+    """Takes any amount of s16le and returns whole packets; the rest waits for more samples.
+
+    ``bundle`` Opus packets are in one of ours; without ``codec`` it holds the samples as they are.
+    """
+
+    def __init__(
+        self, intake: _Intake, numbers: Iterator[int], frame_ms: int, codec: OpusEncoder | None = None, bundle: int = 1
+    ) -> None:
+        self.name = "pcm" if codec is None else "opus"
+        self.rate, self.channels = intake.rate, intake.channels  # of what is sent
+        self._intake, self._numbers, self._codec, self._bundle = intake, numbers, codec, bundle
+        self._samples = min(max(1, self.rate * frame_ms // 1000), _HIGHEST_PCM_RATE)
+        self._ready: list[bytes] = []
+        self._ready_ms = 0  # when the first of them was captured
+
+    @property
+    def part_way(self) -> bool:
+        """True if an unfinished packet already holds encoded sound."""
+        return bool(self._ready)
+
+    def encode(self, pcm: bytes, captured_ms: int) -> list[bytes]:
+        """Return no, one or several PBAT packets; ``captured_ms`` is epoch time of the first sample."""
+        packets = []
+        if self._intake.has_gap(captured_ms):
+            self._ready = []
+        for frame, first_ms in self._intake.frames(pcm, captured_ms, self._samples):
+            if not self._ready:
+                self._ready_ms = first_ms
+            self._ready += [to_bytes(frame)] if self._codec is None else self._codec.encode(frame)
+            if len(self._ready) >= self._bundle:
+                packets.append(self._packet())
+        return packets
+
+    def _packet(self) -> bytes:
+        ready, self._ready = self._ready, []
+        samples, first_ms = len(ready) * self._samples, max(0, self._ready_ms)
+        codec, body = (Codec.PCM16LE, ready[0]) if self._codec is None else (Codec.OPUS, opus.join(ready))
+        return Sound(codec, self.channels, self.rate, samples, next(self._numbers), first_ms, body).pack()
+
+
+def make_sound_encoder(
+    name: str,
+    *,
+    rate: int,
+    channels: int,
+    chunk_ms: int = 20,
+    bitrate: int = 24_000,
+    bundle: int = 1,
+    sent_rate: int | None = None,
+    sent_channels: int | None = None,
+    numbers: Iterator[int] | None = None,
+) -> SoundEncoder:
+    """Make an encoder of what has ``rate`` and ``channels``, to ``sent_…`` as far as the encoding has them.
+
+    Opus packets last ``chunk_ms`` rounded up to 20, 40 or 60, and ``bundle`` of them (at most 3) share a PBAT packet.
+    Raises PebbleError for an unknown name and for one this installation cannot make.
+    """
+    numbers = sequence_numbers() if numbers is None else numbers
+    rate_out, channels_out = sent_rate or rate, sent_channels or channels
+    if name == "pcm":
+        rate_out = rate_out if rate_out <= _HIGHEST_PCM_RATE else opus.RATES[-1]
+        return SoundEncoder(_Intake(rate, channels, rate_out, channels_out), numbers, chunk_ms)
+    if name == "opus":
+        rate_out = next((known for known in opus.RATES if known >= rate_out), opus.RATES[-1])
+        intake = _Intake(rate, channels, rate_out, channels_out if channels_out <= 2 else 1)
+        frame_ms = next((known for known in opus.FRAMES_MS if known >= chunk_ms), opus.FRAMES_MS[-1])
+        codec = OpusEncoder(rate_out, intake.channels, frame_ms=frame_ms, bitrate=bitrate)
+        return SoundEncoder(intake, numbers, frame_ms, codec, min(max(bundle, 1), opus.BUNDLE_LIMIT))
+    raise PebbleError(f'there is no sound encoding "{name}": use {" or ".join(SOUND_ENCODINGS)}')
+
+
+@dataclass(frozen=True, slots=True)
+class ReceivedSound:
+    """A packet that was decoded: samples are (samples, channels)."""
+
+    samples: Samples
+    rate: int
+    channels: int
+    captured_ms: int
+    sequence: int
+    encoding: str
+
+    @property
+    def pcm(self) -> bytes:
+        """Interleaved s16le."""
+        return to_bytes(self.samples)
+
+
+def unpack(payload: bytes) -> Sound:
+    """The packet in ``payload``, if it may be played. Raises PayloadError for anything else."""
+    sound = Sound.unpack(payload)
+    if sound.channels > CHANNELS_LIMIT or sound.rate < LOWEST_RATE:
+        raise PayloadError(f"PBAT: {sound.channels} channels at {sound.rate} Hz cannot be played")
+    if sound.samples > _LONGEST_S * sound.rate:
+        raise PayloadError(f"PBAT: one packet of {sound.samples / sound.rate:.1f} s")
+    if sound.codec == Codec.PCM16LE:
+        if len(sound.body) < 2 * sound.samples * sound.channels:
+            raise PayloadError("PBAT: fewer samples than in its header")
+    elif sound.codec == Codec.OPUS and "opus" in SOUND_ENCODINGS:
+        _check_opus(sound)
+    else:
+        raise PayloadError(f"PBAT: codec {sound.codec} is unknown")
+    return sound
+
+
+def _check_opus(sound: Sound) -> None:
+    if sound.rate not in opus.RATES or sound.channels > 2:
+        raise PayloadError(f"PBAT: no Opus has {sound.channels} channels at {sound.rate} Hz")
+    if sound.samples * 1000 != sum(map(opus.milliseconds, opus.split(sound.body))) * sound.rate:
+        raise PayloadError("PBAT: not as many samples as its Opus packets hold")
+
+
+class SoundDecoder:
+    """Packets to samples, in the order they are fed; any may differ from the one before in codec, rate and channels.
+
+    ``counters``: packets, refused.
+    """
+
+    def __init__(self) -> None:
+        self.counters = Counters()
+        self._format = (0, 0, 0)
+        self._opus: OpusDecoder | None = None
+
+    def feed(self, payload: bytes) -> ReceivedSound | None:
+        """The sound of one MQTT payload; None if it cannot be played."""
+        try:
+            return self.decode(unpack(payload))
+        except PayloadError:
+            self.counters.add("refused")
+            return None
+
+    def decode(self, sound: Sound) -> ReceivedSound:
+        """The sound of a packet from :func:`unpack`. Raises PayloadError if it cannot be decoded.
+
+        Raises PebbleError for Opus where PyAV is missing.
+        """
+        format_ = (sound.codec, sound.rate, sound.channels)
+        if format_ != self._format:
+            self._opus = OpusDecoder(sound.rate, sound.channels) if sound.codec == Codec.OPUS else None
+            self._format = format_
+        samples = self._samples(sound)
+        self.counters.add("packets")
+        encoding = "pcm" if self._opus is None else "opus"
+        return ReceivedSound(samples, sound.rate, sound.channels, sound.captured_ms, sound.sequence, encoding)
+
+    def conceal(self) -> Samples | None:
+        """An estimate of one more frame by the codec itself; None if it cannot conceal."""
+        if self._opus is None:
+            return None
+        made = self._opus.conceal()
+        return made if len(made) else None
+
+    def _samples(self, sound: Sound) -> Samples:
+        if self._opus is None:
+            return to_samples(sound.body[: 2 * sound.samples * sound.channels], sound.channels)
+        return np.concatenate([self._opus.decode(packet) for packet in opus.split(sound.body)])

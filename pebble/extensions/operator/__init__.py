@@ -1,0 +1,1 @@
+"""Operators' programs: the client library and the commands that use it."""

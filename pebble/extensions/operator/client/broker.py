@@ -1,0 +1,184 @@
+"""A server's connection to the broker, for code on an event loop."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import secrets
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+from typing import Final
+
+from pebble.errors import TransportError
+from pebble.extensions.operator.client.named_topics import NamedTopics
+from pebble.transports import Message, MqttSettings, QoS, State, Subscription, Transport, create
+
+log = logging.getLogger(__name__)
+
+Handler = Callable[[Message, float], None]  # the message, and the monotonic time at which it arrived
+
+MAX_MESSAGES: Final = 10_000  # on their way to the event loop
+MAX_BYTES: Final = 64 << 20  # of their payloads
+ANSWER_S: Final = 0.25  # a broker that acknowledges nothing for longer would deliver commands late, all at once
+_DELIVER_S: Final = 0.01  # for them at a time: whatever else is due must not wait for a flood
+
+
+def problem_of(transport: Transport) -> str:
+    """Return why nothing should be sent now, in one line; empty if all is well."""
+    if transport.state is not State.CONNECTED:
+        return transport.problem or "not connected yet"
+    return "it does not answer" if transport.outgoing.stalled_s > ANSWER_S else ""
+
+
+class Arrived:
+    """Messages on their way to the event loop, which alone gets them. Any thread puts, and never waits for room."""
+
+    def __init__(self) -> None:
+        self.dropped = 0
+        self._waiting: deque[tuple[Handler, Message, float]] = deque()
+        self._bytes = 0
+        self._lock = threading.Lock()  # guards these
+
+    def put(self, handler: Handler, message: Message, at: float) -> None:
+        """Queue a message; one for which there is no room is dropped."""
+        size = len(message.payload)
+        with self._lock:
+            if len(self._waiting) < MAX_MESSAGES and self._bytes + size <= MAX_BYTES:
+                self._bytes += size
+                self._waiting.append((handler, message, at))
+                return
+            self.dropped += 1
+        if self.dropped & (self.dropped - 1) == 0:  # the 1st, 2nd, 4th, 8th …
+            log.warning("%d messages dropped, the last on %s: too many at once", self.dropped, message.topic)
+
+    def get(self) -> tuple[Handler, Message, float] | None:
+        """Return the oldest; None if there is none."""
+        with self._lock:
+            if not self._waiting:
+                return None
+            arrived = self._waiting.popleft()
+            self._bytes -= len(arrived[1].payload)
+            return arrived
+
+
+class Broker:
+    """Handlers and watchers run on the event loop; subscribing waits for the broker, so it does not happen there."""
+
+    def __init__(self, settings: MqttSettings, name: str = "pebble-web") -> None:
+        """``name``: what the broker's log calls it."""
+        self.transport: Transport = create("mqtt", f"{name}-{secrets.token_hex(4)}", settings)
+        self.transport.on_state(lambda _state: self._call(self._notify))
+        self._loop: asyncio.AbstractEventLoop | None = None
+        self._watchers: list[Callable[[], None]] = []
+        self._arrived = Arrived()
+        self._woken = False  # deliver is about to be called
+        #: Whether a robot, by its base, takes commands only with a name.
+        self.is_named: Callable[[str], bool] = lambda _base: False
+        self.names = NamedTopics(settings.username or "", lambda base: self.is_named(base))
+        self.transport.policy.forms = self.names.forms
+
+    @property
+    def loop(self) -> asyncio.AbstractEventLoop:
+        assert self._loop is not None, "the connection is not open"  # noqa: S101
+        return self._loop
+
+    @property
+    def connected(self) -> bool:
+        return self.transport.state is State.CONNECTED
+
+    @property
+    def dropped(self) -> int:
+        """Messages for which there was no room, because too many came at once."""
+        return self._arrived.dropped
+
+    @property
+    def problem(self) -> str:
+        """Why nothing should be sent to it now, in one line; empty if all is well."""
+        return problem_of(self.transport)
+
+    @property
+    def not_received(self) -> str:
+        """Return what is not heard although there is a connection, and why, in one line."""
+        return self.transport.not_received if self.connected else ""
+
+    async def open(self) -> None:
+        """Start connecting, and wait a moment for success. Raises TransportError for settings that can never work."""
+        self._loop = asyncio.get_running_loop()
+        await asyncio.to_thread(self.transport.open, 2.0)
+
+    async def close(self) -> None:
+        await asyncio.to_thread(self.transport.close)
+
+    def on_state(self, watcher: Callable[[], None]) -> None:
+        """Call ``watcher`` when the connection is made or lost."""
+        self._watchers.append(watcher)
+
+    def publish(
+        self,
+        topic: str,
+        payload: bytes,
+        *,
+        retain: bool = False,
+        remember: bool = True,
+        qos: QoS = QoS.DELIVERED,
+        by: str = "",
+    ) -> bool:
+        """Publish now, ahead of streams; False if there is no connection, or no topic may be called so.
+
+        ``remember`` False: what is retained belongs to whoever publishes it next; a broker that has lost it, has.
+        ``by``: the person who wants it. Robots that take commands only with a name learn of it.
+        """
+        try:
+            signed = self.names.signed(topic, payload, by)
+            return self.transport.publish(topic, signed, qos=qos, retain=retain, urgent=True, remember=remember)
+        except TransportError as error:  # parts of topics come from robots and pages: what else is due must go on
+            log.warning("not published: %s", error)
+            return False
+
+    async def subscribe(self, filter_: str, handler: Handler, *, deferred: bool = False) -> Subscription:
+        """Deliver what matches ``filter_`` until it is unsubscribed.
+
+        ``deferred``: with the next call of ``deliver``, or before the next message that is not. To wake the event loop
+        for each heartbeat of a hundred robots costs more than the heartbeats.
+        """
+
+        def take(message: Message) -> None:
+            self._arrived.put(handler, message, time.monotonic())
+            if not deferred:
+                self._wake()
+
+        return await asyncio.to_thread(self.transport.subscribe, filter_, take, qos=QoS.DELIVERED, direct=True)
+
+    def deliver(self) -> None:
+        """Hand over what has arrived, in its order; the rest after whatever else is due, if that takes long."""
+        self._woken = False
+        end = time.monotonic() + _DELIVER_S
+        while (one := self._arrived.get()) is not None:
+            handler, message, at = one
+            try:
+                handler(message, at)
+            except Exception:  # one message must not hold back the others
+                log.exception("a message on %s", message.topic)
+            if time.monotonic() > end:
+                self._wake()
+                return
+
+    def _wake(self) -> None:
+        if not self._woken:
+            self._woken = True
+            self._call(self.deliver)
+
+    async def unsubscribe(self, subscription: Subscription) -> None:
+        """Stop delivery; a message that has arrived before may still be handled."""
+        await asyncio.to_thread(subscription.close)
+
+    def _notify(self) -> None:
+        for watcher in self._watchers:
+            watcher()
+
+    def _call(self, function: Callable[..., None], *arguments: object) -> None:
+        """On a thread of the transport. The loop may have ended meanwhile."""
+        if self._loop is not None and not self._loop.is_closed():
+            self._loop.call_soon_threadsafe(function, *arguments)

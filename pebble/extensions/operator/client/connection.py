@@ -1,0 +1,193 @@
+"""A command's own short-lived connection to a robot's local transport or to a broker."""
+
+import logging
+import os
+import queue
+import time
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import closing, contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from pebble.config import Config, load
+from pebble.config.text_files import password as password
+from pebble.errors import ConfigError, PebbleError, TransportError
+from pebble.extensions.operator.client.named_topics import NamedTopics
+from pebble.extensions.operator.client.names import ANY_ROBOT, Names, base_of
+from pebble.extensions.operator.client.robot_estop import RobotEstop
+from pebble.extensions.operator.client.url import settings_of
+from pebble.runtime.addresses import Addresses
+from pebble.runtime.connections import REMOTE_RECONNECT_S, local_settings, mqtt_settings, zenoh_settings
+from pebble.transports import Message, MqttSettings, QoS, State, Transport, create
+from pebble.transports.hosts import SMALL_SEGMENT
+
+log = logging.getLogger(__name__)
+
+_STEP_S = 0.005  # between two looks at a condition
+_LATE_S = 0.25  # some brokers send what is retained so long after they have acknowledged a subscription
+OPEN_TIMEOUT_S = 3.0
+_WAITING = 10_000  # messages that wait to be printed before new ones are dropped
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Target:
+    """The options of a ``pebble topic`` command that select where to connect."""
+
+    config: Path | None = None
+    url: str | None = None
+    robot: str | None = None
+    remote: bool = False
+    password_file: Path | None = None
+    ca_cert: Path | None = None
+    program: str = "tool"  # the end of its client id, where the config sets one: two with one id end each other
+
+
+def target_of(robot: str | None, options: Target) -> Target:
+    """Where to connect: with --url or --config ``robot`` is an id, else a config file. Raises PebbleError."""
+    if options.config is None and options.url is None:
+        if robot is None:
+            raise PebbleError("where to connect is missing: use either --config CONFIG or --url URL")
+        if not Path(robot).is_file():
+            raise PebbleError(f"{robot} is not a config file: name one, or add --url or --config for the robot {robot}")
+        return replace(options, config=Path(robot))
+    if robot is not None and robot.endswith(".json") and Path(robot).is_file():
+        raise PebbleError(f"{robot} is a config file: leave out --url and --config, or give the robot's id instead")
+    return replace(options, robot=robot)
+
+
+@contextmanager
+def connected(target: Target) -> Iterator[tuple[Transport, Names]]:
+    """Connect, and disconnect at the end. Raises PebbleError with a remedy if the connection fails."""
+    kind, settings, names, where = resolve(target)
+    transport = create(kind, f"pebble-tool-{os.getpid()}", in_small_segments(settings))
+    with closing(transport.open(OPEN_TIMEOUT_S)):
+        if transport.state is not State.CONNECTED:
+            why = transport.problem or f"no answer within {OPEN_TIMEOUT_S:g} s"
+            raise TransportError(f"cannot connect to {where}: {why}")
+        not_received = _report_missing(transport)
+        yield transport, names
+        _report_missing(transport, not_received)  # what was subscribed to meanwhile may be refused
+
+
+@contextmanager
+def listening(target: Target, sender: Transport) -> Iterator[Transport]:
+    """A second connection to where ``sender`` is, not waited for: what it receives holds up nothing that is sent.
+
+    It is ``sender`` itself where each client needs an id of its own, and within a robot's Zenoh network.
+    """
+    kind, settings, _, _ = resolve(target)
+    if not isinstance(settings, MqttSettings) or settings.client_id is not None:
+        yield sender
+        return
+    transport = create(kind, f"pebble-tool-{os.getpid()}-listening", in_small_segments(settings))
+    with closing(transport.open(0.0)):
+        yield transport
+        _report_missing(transport)
+
+
+def in_small_segments(settings: Any) -> Any:
+    """The same settings for a way that may lose large packets."""
+    return replace(settings, max_segment=SMALL_SEGMENT) if isinstance(settings, MqttSettings) else settings
+
+
+def _report_missing(transport: Transport, before: str = "") -> str:
+    not_received = transport.not_received if transport.state is State.CONNECTED else ""
+    if not_received not in ("", before):
+        log.error("%s", not_received)
+    return not_received
+
+
+def resolve(target: Target) -> tuple[str, Any, Names, str]:
+    """The kind of transport and its settings, the names of topics there, and the place in words. Raises PebbleError."""
+    if (target.config is None) == (target.url is None):
+        raise PebbleError("where to connect is missing: use either --config CONFIG or --url URL")
+    if target.config is not None:
+        return _of_config(load(target.config), target)
+    url = str(target.url)
+    if target.remote:
+        raise PebbleError("--remote needs --config; with --url name the remote broker itself")
+    file = target.password_file
+    kind, settings = settings_of(url, password=password(file), password_file=file, ca_cert=target.ca_cert)
+    base = ANY_ROBOT if target.robot is None else base_of(target.robot)
+    return kind, settings, Names(base, account=_account(settings)), url
+
+
+def _account(settings: Any) -> str | None:
+    return settings.username or "" if isinstance(settings, MqttSettings) else None
+
+
+def put_names(transport: Transport, names: Names, is_named: Callable[[str], bool]) -> None:
+    """From now on commands have this client's name in their topics, to robots that take them only so."""
+    if names.account is not None:
+        transport.policy.forms = NamedTopics(names.account, is_named).forms
+
+
+def _of_config(config: Config, target: Target) -> tuple[str, Any, Names, str]:
+    base = config.base if target.robot is None else base_of(target.robot)
+    addresses = Addresses(config) if base == config.base else None
+    if target.remote:
+        kind, settings = _remote(config, target.program)
+        return kind, settings, Names(base, addresses, _account(settings)), f"the remote side of {config.base}"
+    names = Names(base, addresses)
+    if config.transport.kind == "zenoh":
+        where = f"the hub of {config.base} in {config.run_dir()} (is the robot up?)"
+        return "zenoh", zenoh_settings(config, client=True), names, where
+    where = f"{config.base} by {config.transport.kind}"
+    if config.transport.kind == "mqtt":
+        where = f"the broker of {config.base} at {config.local_mqtt.host}:{config.local_mqtt.port}"
+    return config.transport.kind, local_settings(config), names, where
+
+
+def _remote(config: Config, program: str) -> tuple[str, Any]:
+    bridge = config.services.mqtt_bridge
+    if bridge.remote is not None and bridge.remote.kind != "mqtt":
+        raise ConfigError("services.mqtt_bridge.remote: --remote uses MQTT only, and this robot's uplink does not")
+    if not bridge.remote_mqtt.host:
+        raise ConfigError("services.mqtt_bridge.remote_mqtt.host: is not set, so there is no remote side")
+    return "mqtt", mqtt_settings(bridge.remote_mqtt, reconnect_max_s=REMOTE_RECONNECT_S, program=program)
+
+
+class Listener:
+    """Queues messages from the transport's threads for the thread that prints them."""
+
+    def __init__(self, transport: Transport, filters: Iterable[str]) -> None:
+        self._waiting: queue.Queue[Message] = queue.Queue(_WAITING)
+        self.dropped = 0  # messages that arrived faster than they were printed
+        self.subscribe(transport, filters)
+
+    def subscribe(self, transport: Transport, filters: Iterable[str]) -> None:
+        """Queue further messages; on a slow network this takes seconds."""
+        for filter_ in filters:
+            transport.subscribe(filter_, self._take, qos=QoS.DELIVERED)
+
+    def next(self, timeout: float) -> Message | None:
+        """The next message, waiting up to ``timeout`` seconds for one."""
+        try:
+            return self._waiting.get(timeout=max(timeout, 0.0))
+        except queue.Empty:
+            return None
+
+    def _take(self, message: Message) -> None:
+        try:
+            self._waiting.put_nowait(message)
+        except queue.Full:
+            self.dropped += 1
+
+
+def subscribed_stop(transport: Transport, base: str) -> RobotEstop:
+    """The emergency stop of a robot, with what is retained of it, also from a broker that sends it a moment later."""
+    robot = RobotEstop(base)
+    robot.subscribe(transport)
+    wait_for(lambda: robot.has_capabilities, _LATE_S)
+    transport.ask(robot.missing)
+    wait_for(lambda: not robot.missing, _LATE_S)
+    return robot
+
+
+def wait_for(condition: Callable[[], object], seconds: float) -> bool:
+    """Wait until ``condition`` is true; return False if it is not within ``seconds``."""
+    end = time.monotonic() + seconds
+    while not (is_met := bool(condition())) and time.monotonic() < end:
+        time.sleep(_STEP_S)
+    return is_met

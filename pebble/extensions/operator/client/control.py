@@ -1,0 +1,206 @@
+"""Control of a robot: who has it, as its motor owners publish it, and a client that asks for it. Pure.
+
+The robot is the memory: a client repeats what it wants every second, over a thin link more rarely, and the state is
+the answer. Of several motor owners the first one by name decides, so that two clients never share a robot; who has
+control of another one only gives it back.
+"""
+
+import secrets
+from collections.abc import Callable
+from contextlib import suppress
+from typing import Literal
+
+import msgspec
+from msgspec import UNSET, UnsetType
+
+from pebble.contract import CONTROL, CONTROL_STATE, CONTROL_TAKE, codec
+from pebble.contract.channels import Channel
+from pebble.contract.payloads import ControlRequest, ControlState
+from pebble.errors import PayloadError
+from pebble.extensions.operator.client.pace_of_link import WIDE, Pace, ms
+from pebble.extensions.operator.client.robot_estop import MAX_OWNERS, RobotEstop
+from pebble.motion import lease
+from pebble.transports import Message, QoS
+
+UNANSWERED = "does not answer"
+ASKS_S = 30.0  # so long a driver is asked
+APART = 1.5  # times what lies between two requests: until then the other client has the rest of the robot
+IDLE_S = 60.0  # without a gesture control is given back
+
+_STATE_BYTES = 1024  # the contract allows 300
+_ID = 8  # characters of an id, and of a key
+_KEYS = 8  # in one command: motor owners read no more
+_NAME, _DEVICE = 40, 20  # characters, as robots cut them
+
+
+class RobotControl:
+    """Who has control of one robot, by the states of its motor owners; ``estop`` knows which of them it lists."""
+
+    def __init__(self, estop: RobotEstop) -> None:
+        self.base = estop.base
+        self._estop = estop
+        self._states: dict[str, ControlState] = {}
+        self._prefix = CONTROL_STATE.topic(estop.base).removesuffix("{owner}")
+
+    @property
+    def states(self) -> list[ControlState]:
+        """They are in the order of the owners' names; with capabilities only those that these list."""
+        names = self._estop.owners if self._estop.has_capabilities else self._states
+        return [self._states[name] for name in sorted(names) if name in self._states]
+
+    @property
+    def state(self) -> ControlState | None:
+        """The one that decides; None: nothing is known."""
+        return next(iter(self.states), None)
+
+    @property
+    def who(self) -> str:
+        """Who has control, for people; "" nobody has."""
+        state = self.state
+        return "" if state is None or not state.id else state.by or "somebody"
+
+    def receive(self, message: Message) -> bool:
+        """Update from one message of this robot; False if it is about something else, or malformed."""
+        owner = message.topic.removeprefix(self._prefix)
+        if owner == message.topic or len(message.payload) > _STATE_BYTES:
+            return False
+        if not message.payload:
+            return self._states.pop(owner, None) is not None
+        if owner not in self._states and len(self._states) >= MAX_OWNERS:
+            unlisted = next((other for other in self._states if other not in self._estop.owners), None)
+            if unlisted is None:
+                return False
+            del self._states[unlisted]
+        with suppress(PayloadError):
+            state: ControlState = codec.decode(CONTROL_STATE, message.payload)
+            if max(map(len, (state.id, state.key, state.asks_id))) <= _ID:
+                self._states[owner] = _clean(state)
+                return True
+        return False
+
+
+class ControlClient:
+    """What one tab, or one process, wants of one robot. Call :meth:`update` after each state, and :meth:`tick` often.
+
+    ``held``: the robot has answered that it has control. ``failed``: why it no longer asks for it, for people.
+    """
+
+    def __init__(
+        self, robot: RobotControl, *, by: str, device: str, pace_of: Callable[[], Pace] = lambda: WIDE
+    ) -> None:
+        self.robot = robot
+        self.id = secrets.token_hex(4)
+        self.wanted = self.held = False
+        self.decided = ""  # the key of the owner that decides: a new one needs a new gesture
+        self.failed = ""
+        self.passed_over = ""  # the id of who was not let drive
+        self._by, self._device, self._pace_of = by, device, pace_of
+        self._take = False
+        self._asked_at = self._answered_at = self._due_at = 0.0
+        self._out: list[Message] = []
+
+    # -- what is wanted
+
+    def ask(self, now: float, *, over: bool = False) -> None:
+        """Want control from now on. Who drives is asked for it; ``over``: it is taken from them."""
+        if not self.wanted:
+            self.failed, self._out = "", []  # a release that was not sent yet is none
+        self.wanted, self._take = True, over
+        self._asked_at = self._answered_at = self._due_at = now
+        self.update(now)
+
+    def release(self) -> None:
+        """Give it back, or do not ask any more; the next :meth:`tick` says so."""
+        if self.wanted:
+            self._out.append(self._message(CONTROL, want="release"))
+        self.wanted = self.held = False
+        self.decided = ""
+
+    def keep(self) -> None:
+        """Do not let drive who asks now."""
+        state = self.robot.state
+        self.passed_over = state.asks_id if state is not None else ""
+
+    # -- what follows
+
+    def update(self, now: float) -> None:
+        """Take note of the robot's states."""
+        state = self.robot.state
+        if not self.wanted or state is None:
+            return
+        mine = state.id == self.id
+        if self.held and not mine and state.id:  # it was taken over, or ended while this client was not heard
+            self._give_up(f"{self.robot.who} has control now")
+            return
+        if self.held and not mine:  # free: it has ended, or the motor owner was started again
+            self._asked_at = self._answered_at = self._due_at = now
+        self.held, self.decided = mine, state.key if mine else ""
+        if mine:
+            self._take = False
+        elif state.asks_id:  # of this client, or of another: then it waits for its turn
+            self._answered_at = now
+        if not mine and state.id and self._has_any():
+            self._out = [self._message(CONTROL, want="release")]
+            self._due_at = max(self._due_at, now + APART * self._pace_of().control_s)
+
+    def tick(self, now: float) -> list[Message]:
+        """What to publish now."""
+        self.update(now)
+        if self.wanted and not self.held and (why := self._hopeless(now)):
+            self._give_up(why)
+        if self.wanted and now >= self._due_at:
+            pace = self._pace_of()
+            self._due_at = now + pace.control_s
+            channel, at = CONTROL_TAKE if self._take else CONTROL, ms(now) if pace.stamped else UNSET
+            self._out.append(self._message(channel, for_ms=pace.control_for_ms, t=at))
+            self._take = False
+        out, self._out = self._out, []
+        return out
+
+    @property
+    def done(self) -> bool:
+        """Whether it neither wants anything nor has anything to publish."""
+        return not self.wanted and not self._out
+
+    @property
+    def key(self) -> str:
+        """What a drive command needs: the keys of all motor owners that this client has control of."""
+        keys = [one.key for one in self.robot.states if one.id == self.id]
+        return " ".join(keys[:_KEYS]) if self.held else ""
+
+    @property
+    def asked_by(self) -> str:
+        """Who asks for it, and was not refused; "" nobody does, or it is not held."""
+        state = self.robot.state
+        if not self.held or state is None or state.asks_id in ("", self.id, self.passed_over):
+            return ""
+        return state.asks or "somebody"
+
+    def _give_up(self, why: str) -> None:
+        self.release()
+        self.failed = why
+
+    def _has_any(self) -> bool:
+        return any(one.id == self.id for one in self.robot.states)
+
+    def _hopeless(self, now: float) -> str:
+        """Why it is given up; empty: it is not."""
+        if now - self._answered_at > self._pace_of().answer_s:
+            return f"{self.robot.base.rpartition('/')[2]} {UNANSWERED}"
+        return f"{self.robot.who} drives on" if now - self._asked_at > ASKS_S else ""
+
+    def _message(
+        self,
+        channel: Channel,
+        want: Literal["hold", "release"] = "hold",
+        for_ms: float = WIDE.control_for_ms,
+        t: int | UnsetType = UNSET,
+    ) -> Message:
+        request = ControlRequest(id=self.id, want=want, for_ms=for_ms, by=self._by, device=self._device, t=t)
+        return Message(channel.topic(self.robot.base), codec.encode(channel, request), QoS(channel.default_qos))
+
+
+def _clean(state: ControlState) -> ControlState:
+    """The state with short, printable names."""
+    by, asks = (lease.shown(text, _NAME) for text in (state.by, state.asks))
+    return msgspec.structs.replace(state, by=by, asks=asks, device=lease.shown(state.device, _DEVICE))

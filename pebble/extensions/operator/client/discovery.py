@@ -1,0 +1,40 @@
+"""Discovers robots by their outgoing topics."""
+
+from pebble.contract import OUTGOING, channel_of
+from pebble.contract.identity import parse_topic
+from pebble.contract.levels import silent_after
+from pebble.extensions.media.rate_meter import RateMeter
+from pebble.extensions.operator.client.robot_view import RobotView
+from pebble.transports import Message
+
+ALL_OUTGOING = f"+/+/+/{OUTGOING}/#"
+
+
+class Discovery:
+    """All robots that have published anything, by base topic. One thread calls ``receive``; others only read."""
+
+    def __init__(self) -> None:
+        self.robots: dict[str, RobotView] = {}
+        self.traffic: dict[str, RateMeter] = {}  # messages of each
+
+    def all_robots(self) -> list[RobotView]:
+        return list(self.robots.values())  # a copy: robots may be added meanwhile
+
+    def awaits_heartbeat(self, waited_s: float) -> bool:
+        """Whether one of them, or the first of all, may be there although nothing was heard of it for so long."""
+        robots = [one.liveness for one in self.all_robots()]
+        awaited = [silent_after(link=one.link) for one in robots if one.received_at is None]
+        return waited_s < max(awaited, default=0.0 if robots else silent_after())
+
+    def receive(self, message: Message, now: float, wall: float) -> None:
+        """Update from one message that arrived at ``now`` (monotonic) and ``wall`` (epoch seconds)."""
+        address = parse_topic(message.topic)
+        if address is None or address.identity.is_server:
+            return
+        base = address.identity.base
+        robot = self.robots.get(base)
+        if robot is None:
+            self.traffic[base] = RateMeter()  # first: other threads look for it once the robot is there
+            robot = self.robots[base] = RobotView(base)
+        self.traffic[base].add(now, len(message.payload))
+        robot.receive(channel_of(f"{address.direction}/{address.metric}"), message, now, wall)

@@ -1,0 +1,323 @@
+"""Sends an emergency stop until it is confirmed and saved. Pure: the caller publishes, receives and waits.
+
+*Confirmed* means that each motor owner has published that it is stopped by this stop, *saved* that the owner would be
+so after a power cut. The sender repeats the stop until both hold, or an owner says that it cannot save.
+"""
+
+import secrets
+from collections.abc import Callable, Collection, Iterable
+from enum import Enum
+from typing import NamedTuple
+
+from pebble.contract import AUTONOMY_COMMAND, DRIVE, ESTOP, STATUS, Channel, codec
+from pebble.contract.identity import Direction, parse_topic
+from pebble.contract.levels import silent_after
+from pebble.contract.payloads import AutonomyCommand, Drive, EstopCommand
+from pebble.extensions.operator.client.driveable import Driveable, driveable_of
+from pebble.extensions.operator.client.estop_states import RobotEstop
+from pebble.motion.latch import is_name, stop_of
+from pebble.transports import Message, QoS
+
+REPEAT_S = 0.5
+COLLECT_S = silent_after(link="thin")  # so long a stop of all is sent to further robots, which may be at any level
+GIVE_UP_S = 60.0
+MAX_ROBOTS = 2000  # to which a stop of all is repeated; one beyond gets it whenever anything arrives from it
+
+_ZERO = codec.encode(DRIVE, Drive(valid_ms=0))
+_ZEROS = "it has motors that no stop can hold: they get zeros"
+_END_SCRIPT = codec.encode(AUTONOMY_COMMAND, AutonomyCommand(action="stop"))
+
+
+def new_name() -> str:
+    return secrets.token_hex(8)
+
+
+class Progress(Enum):
+    """The progress of the stop of one robot, as pages are told."""
+
+    WAITING = "sent"
+    CONFIRMED = "confirmed"
+    OLD = "old"  # it has no emergency stop: zeros are sent while the stop lasts, and it cannot be latched
+    SPARED = "spared"  # among all robots: it says that it does not drive; it gets the stop once, and is not waited for
+    NOT_CONFIRMED = "not confirmed"  # it is no longer sent to
+
+
+class Order(NamedTuple):
+    """What is the same for every robot that one stop is sent to."""
+
+    name: str
+    payload: bytes
+    named: bool  # robots, by who presses; False: all that publish anything
+    hold: bool  # it lasts until it is ended
+    own_only: bool  # topics that a robot's capabilities name are used only if they are incoming ones of its own
+
+
+class RobotStop:
+    """The stop of one robot: what is sent to it when, and whether it is confirmed."""
+
+    def __init__(self, base: str, order: Order, now: float) -> None:
+        self.estop = RobotEstop(base)
+        self.live = False  # anything but retained messages has arrived from it
+        self.driveable: Driveable | None = None  # as its status says
+        self.confirmed_s: float | None = None  # how long it took; None: it is not confirmed
+        self.next: float = now  # when to send again, unless it is confirmed or spared
+        self._order, self._began = order, now
+        self._sent_at = float("-inf")
+        self._script_ended = False
+        self._given_up = False
+        self._names_due = False  # it was sent before it was known that the robot reads topics with a name
+        self._status_topic = STATUS.topic(base)
+        self._boots: dict[str, str] = {}  # by owner, the newest one in which it has listed this stop
+        self._settled = False  # each owner that had listed it has saved it, cannot save anything, or was reset
+
+    @property
+    def progress(self) -> Progress:
+        """How far its stop is."""
+        if self.confirmed_s is not None:
+            return Progress.CONFIRMED
+        if self.estop.has_capabilities and not (self.estop.available or self.estop.drives or self._order.named):
+            return Progress.SPARED
+        if self.estop.old:
+            return Progress.OLD
+        return Progress.NOT_CONFIRMED if self._given_up else Progress.WAITING
+
+    @property
+    def saved(self) -> bool:
+        """True if every owner has saved its newest state, so that it survives a power cut."""
+        states = self.estop.states
+        return bool(self.estop.owners) and all(
+            owner in states and states[owner].persisted is True for owner in self.estop.owners
+        )
+
+    @property
+    def unconfirmed(self) -> dict[str, str]:
+        """Why, by owner; owners that are confirmed are not in it."""
+        return {owner: why for owner in self.estop.owners if (why := self._lacks(owner))}
+
+    @property
+    def why(self) -> str:
+        """Why it is not confirmed, in words; empty if it is. Names of owners in it come from the robot."""
+        if self.progress in (Progress.CONFIRMED, Progress.SPARED):
+            return ""
+        if self.estop.old:
+            return "it has no emergency stop"
+        if not self.estop.has_capabilities:
+            return "it has not published its capabilities" if self.live else "nothing was received: it may be off"
+        if not self.estop.available:
+            if self.estop.zeros:
+                return _ZEROS
+            return "its broker refuses emergency stops, so it gets zeros" if self.estop.drives else "it does not drive"
+        if not self.estop.owners:
+            return "its capabilities list no valid motor owners"
+        why = ", ".join(
+            [f"{owner} {why}" for owner, why in self.unconfirmed.items()] + [_ZEROS] * bool(self.estop.zeros)
+        )
+        return why if self.live else f"{why}: it may be off"
+
+    @property
+    def sending(self) -> bool:
+        """Whether the stop is repeated."""
+        unsettled = self.progress is Progress.CONFIRMED and not self._settled
+        unsent = self._names_due or self._sent_at == float("-inf")
+        is_due = unsent or unsettled or self.progress in (Progress.WAITING, Progress.OLD)
+        return not self._given_up and is_due
+
+    def receive(self, message: Message, now: float) -> None:
+        self.live = self.live or not message.retain
+        if message.topic == self._status_topic:
+            self.driveable = driveable_of(message.payload)
+            return
+        known = self.estop.has_capabilities
+        if not self.estop.receive(message):
+            return
+        if self.estop.has_capabilities and not known:
+            self.next, self._names_due = now, self.estop.named  # its topics may be others
+        self._boots.update(
+            {owner: self.estop.states[owner].boot for owner in self.estop.owners if self._lists_it(owner)}
+        )
+        if self.confirmed_s is None:
+            if self.estop.owners and self.estop.available and not (self.unconfirmed or self.estop.zeros):
+                self.confirmed_s = now - self._began
+        elif (self._order.hold or not self._settled) and self.unconfirmed:
+            self.confirmed_s, self._settled = None, False  # it has restarted, and saved nothing
+            self._began = now if self._order.hold else self._began
+            self.next = max(now, self._sent_at + REPEAT_S)
+        if self.confirmed_s is not None and not self._settled:
+            self._settled = all(map(self._survives, self.estop.owners))
+
+    def tick(self, now: float, *, again: bool = True) -> list[Message]:
+        if now < self.next or not self.sending or not (again or self._sent_at == float("-inf")):
+            return []
+        self._sent_at, self.next, self._names_due = now, now + REPEAT_S, False
+        messages = []
+        if not self.estop.old:
+            messages.append(_message(ESTOP, ESTOP.topic(self.estop.base), self._order.payload))
+        if (self.estop.old or self.estop.zeros) and not self._script_ended:
+            self._script_ended = True
+            messages.append(_message(AUTONOMY_COMMAND, self.estop.script_topic, _END_SCRIPT))
+        topics = dict.fromkeys((self.estop.drive_topic, *self.estop.zeros))
+        messages += [_message(DRIVE, topic, _ZERO) for topic in topics]
+        return [one for one in messages if not self._order.own_only or _is_incoming(one.topic, self.estop.base)]
+
+    def give_up(self) -> None:
+        """Send no more."""
+        self._given_up = True
+
+    def _lacks(self, owner: str) -> str:
+        return "" if self._has_taken_it(owner) else "has not confirmed"
+
+    def _survives(self, owner: str) -> bool:
+        state = self.estop.states.get(owner)
+        return state is not None and (state.persisted is not False or not state.latched)
+
+    def _lists_it(self, owner: str) -> bool:
+        state = self.estop.states.get(owner)
+        return state is not None and self._order.name in state.recent
+
+    def _has_taken_it(self, owner: str) -> bool:
+        """Whether it has listed this stop since its start: later stops of others may have taken its place."""
+        state = self.estop.states.get(owner)
+        return state is not None and self._boots.get(owner) == state.boot
+
+
+class StopSender:
+    """One emergency stop, of named robots or of all, until it is confirmed, ended, or 60 s old.
+
+    Publish what ``tick`` returns, pass every message of the robots' ``outgoing/#`` to ``receive``, and call ``tick``
+    again after it and at ``due``. Times are seconds of one monotonic clock. A ``hold`` lasts until ``end``.
+
+    A stop of all goes to every robot as soon as anything arrives from it. ``robots`` has those to which it is also
+    repeated without that, and which confirm it; where there are too many, the others count as ``omitted``.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        *,
+        by: str,
+        why: str,
+        now: float,
+        robots: Collection[str] | None,
+        known: Collection[str] = (),
+        hold: bool = False,
+        own_only: bool = False,
+    ) -> None:
+        """``name`` is that of :func:`new_name`; ``robots`` are base topics, None: all robots that publish anything.
+
+        ``known``: with all robots, those that get it without having published anything. ``own_only``: topics that a
+        robot's capabilities name are used only if they are its own. Neither list is cut.
+        """
+        if not is_name(name):
+            raise ValueError(f"{name!r} is not 16 hex digits")
+        _, by, why = stop_of({"by": by, "why": why})
+        payload = codec.encode(ESTOP, EstopCommand(stop=name, by=by, why=why))
+        self.order = Order(name, payload, named=robots is not None, hold=hold, own_only=own_only)
+        self.robots = {base: RobotStop(base, self.order, now) for base in (known if robots is None else robots)}
+        self.omitted = 0  # messages of robots for which ``robots`` had no room
+        self._began = self._now = now
+        self._ended = False
+        self._passed: set[str] = set()  # robots that are not in ``robots`` and got the stop
+        self._passed_at = float("-inf")  # since then
+        self._passing: list[Message] = []  # such stops, to be sent now
+
+    @property
+    def collecting(self) -> bool:
+        """Whether further robots are stopped when they publish anything."""
+        return (
+            not self.order.named and not self._ended and (self.order.hold or self._now < self._began + self._collect_s)
+        )
+
+    @property
+    def finished(self) -> bool:
+        """Whether nothing more will be sent."""
+        return self._ended or not (
+            self.order.hold or self.collecting or any(robot.sending for robot in self.robots.values())
+        )
+
+    @property
+    def confirmed(self) -> bool:
+        """Whether at least one robot is stopped, and every other one, except components that do not drive."""
+        found = {robot.progress for robot in self.robots.values()}
+        return Progress.CONFIRMED in found and found <= {Progress.CONFIRMED, Progress.SPARED} and not self.omitted
+
+    @property
+    def due(self) -> float | None:
+        """When to call ``tick`` next; None: not before a message."""
+        if self.finished:
+            return None
+        times = [robot.next for robot in self.robots.values() if robot.sending]
+        if not self.order.hold:
+            times.append(self._began + (self._collect_s if self.collecting else GIVE_UP_S))
+        return self._now if self._passing else min(times, default=None)
+
+    def receive(self, message: Message, now: float) -> None:
+        """Update from any message of a robot, retained or not."""
+        self._now = now
+        address = parse_topic(message.topic)
+        if address is None or address.direction is not Direction.OUTGOING:
+            return
+        base = address.identity.base
+        if (robot := self.robots.get(base)) is not None:
+            robot.receive(message, now)
+        # An empty message removes what was retained: it is no sign of a robot.
+        elif self.collecting and message.payload and not address.identity.is_server:
+            self._receive_first(base, message, now)
+
+    def tick(self, now: float, *, again: bool = True) -> list[Message]:
+        """Return what to publish now; some of it again in 0.5 s.
+
+        ``again`` False: only to robots that it was not sent to yet, because what was sent still waits.
+        """
+        self._now = now
+        if not self.order.hold and now >= self._began + GIVE_UP_S:
+            self.end()
+        passing, self._passing = self._passing, []
+        return [message for robot in self.robots.values() for message in robot.tick(now, again=again)] + passing
+
+    def tick_robot(self, base: str, now: float, *, again: bool = True) -> list[Message]:
+        """What ``tick`` would return of this robot, from which a message was just received."""
+        passing, self._passing = self._passing, []
+        robot = self.robots.get(base)
+        return passing if robot is None else robot.tick(now, again=again) + passing
+
+    def end(self) -> None:
+        """Send no more. Robots that are stopped stay so."""
+        self._ended = True
+        self._passing.clear()
+        for robot in self.robots.values():
+            robot.give_up()
+
+    @property
+    def _collect_s(self) -> float:
+        """A robot that is not in ``robots`` gets the stop again only when anything arrives from it: for a minute."""
+        return GIVE_UP_S if self.omitted else COLLECT_S
+
+    def _receive_first(self, base: str, message: Message, now: float) -> None:
+        """Take a message of a robot that is not in ``robots``."""
+        robot = RobotStop(base, self.order, now)
+        robot.receive(message, now)
+        if len(self.robots) < MAX_ROBOTS:
+            self.robots[base] = robot
+            return
+        self.omitted += 1
+        if now >= self._passed_at + REPEAT_S:
+            self._passed, self._passed_at = set(), now
+        if base not in self._passed:
+            self._passed.add(base)
+            self._passing += robot.tick(now)
+
+
+def send(publish: Callable[..., bool], messages: Iterable[Message]) -> None:
+    """Publish messages of a stop; those that are refused because too many are not acknowledged, as LATEST ones."""
+    for message in messages:
+        if not publish(message.topic, message.payload, qos=message.qos):
+            publish(message.topic, message.payload, qos=QoS.LATEST)
+
+
+def _is_incoming(topic: str, base: str) -> bool:
+    """Also one that the contract calls otherwise: a stop does no harm there, and it may be what drives this robot."""
+    return topic.startswith(f"{base}/{Direction.INCOMING}/") and not topic.endswith("/")
+
+
+def _message(channel: Channel, topic: str, payload: bytes) -> Message:
+    return Message(topic, payload, QoS(channel.default_qos))

@@ -1,0 +1,57 @@
+"""The emergency stop of a robot as the robot publishes it, and resets of what was read there. Pure."""
+
+from pebble.contract import ESTOP_RESET, codec
+from pebble.contract.payloads import EstopReset
+from pebble.extensions.operator.client.robot_estop import MAX_OWNERS as MAX_OWNERS
+from pebble.extensions.operator.client.robot_estop import RobotEstop as RobotEstop
+from pebble.motion.latch import stop_of
+from pebble.transports import Message, QoS
+
+
+class Reset:
+    """Ends exactly the stops that a person was shown: a later stop is never ended by it."""
+
+    def __init__(self, robot: RobotEstop, by: str) -> None:
+        """``robot`` goes on receiving messages; what is reset is what it has published until now."""
+        self.robot = robot
+        self.shown = robot.latched
+        self._by = stop_of({"by": by})[1]
+
+    def messages(self) -> list[Message]:
+        """What to publish, once: one message for each stopped owner."""
+        commands = [EstopReset(boot=state.boot, count=state.count, by=self._by) for state in self.shown.values()]
+        topic, qos = ESTOP_RESET.topic(self.robot.base), QoS(ESTOP_RESET.default_qos)
+        return [Message(topic, codec.encode(ESTOP_RESET, command), qos) for command in commands]
+
+    @property
+    def waiting(self) -> list[str]:
+        """The owners whose answer is missing."""
+        return [owner for owner in self.shown if self._free(owner) is None]
+
+    @property
+    def free(self) -> bool:
+        """Whether every owner has confirmed that it is no longer stopped."""
+        return all(self._free(owner) for owner in self.shown)
+
+    def refusals(self) -> dict[str, str]:
+        """Why owners are still stopped, in words; to be called when none is waiting, or after a timeout."""
+        return {owner: self._refusal(owner) for owner in self.shown if not self._free(owner)}
+
+    def _free(self, owner: str) -> bool | None:
+        """None until the owner's state shows an effect. ``reset_refused`` does not decide: others reset as well."""
+        before, now = self.shown[owner], self.robot.states.get(owner)
+        if now is None or (now.latched and (now.boot, now.count) == (before.boot, before.count)):
+            return None
+        return not now.latched
+
+    def _refusal(self, owner: str) -> str:
+        before, now = self.shown[owner], self.robot.states.get(owner)
+        if now is None:
+            return "its state was removed"
+        if now.boot != before.boot:
+            return "it has restarted since"
+        if now.count != before.count:
+            return f"stopped again meanwhile by {now.by or 'unknown'}"
+        return (
+            "the reset reached it too late" if now.reset_refused == "old" else "no answer (may this account reset it?)"
+        )

@@ -1,0 +1,51 @@
+"""Hears of every robot that is there, whatever its broker keeps, and however the way from it loses large packets."""
+
+import os
+import threading
+from collections import deque
+from dataclasses import replace
+
+from pebble.contract import ONLINE
+from pebble.extensions.operator.client.connection import OPEN_TIMEOUT_S, wait_for
+from pebble.extensions.operator.client.robot_topics import SYNONYMS
+from pebble.transports import Message, MqttSettings, State, Transport, create
+
+_FILTERS = [channel.filter("+/+/+") for channel in (ONLINE, *SYNONYMS)]
+_WAITING = 10_000  # heartbeats, of which the oldest goes: it comes again
+
+
+class Heartbeats:
+    """A connection that is subscribed to heartbeats alone: with MQTT 5 to those of now, else also to retained ones.
+
+    It is made on a thread, which nothing waits for.
+    """
+
+    def __init__(self, settings: MqttSettings) -> None:
+        self._settings = replace(settings, max_qos=0)
+        self._heard: deque[Message] = deque(maxlen=_WAITING)
+        self._transport: Transport | None = None
+        self._closed = threading.Event()
+        threading.Thread(target=self._open, name="pebble-heartbeats", daemon=True).start()
+
+    def take(self) -> list[Message]:
+        """The heartbeats since the last call."""
+        return [self._heard.popleft() for _ in range(len(self._heard))]
+
+    def close(self) -> None:
+        """Close the connection; it may take a second."""
+        self._closed.set()
+        if self._transport is not None:
+            self._transport.close()
+
+    def _open(self) -> None:
+        for settings in (replace(self._settings, protocol="5", sends_retained=False), self._settings):
+            transport = self._transport = create("mqtt", f"pebble-heartbeats-{os.getpid()}", settings)
+            transport.open(0.0)
+            wait_for(lambda: transport.state is not State.CONNECTING or transport.problem, OPEN_TIMEOUT_S)  # noqa: B023
+            if self._closed.is_set():
+                transport.close()
+                return
+            if transport.state is State.CONNECTED or settings is self._settings:
+                transport.subscribe_all(dict.fromkeys(_FILTERS, self._heard.append), direct=True)
+                return
+            transport.close()

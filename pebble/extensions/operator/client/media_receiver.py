@@ -1,0 +1,121 @@
+"""Receives one robot's pictures and sound, and measures their rate and age."""
+
+import threading
+import time
+
+from pebble.contract import CAPABILITIES
+from pebble.errors import PebbleError
+from pebble.extensions.media.decode import Decoded, VideoDecoder
+from pebble.extensions.media.picture_header import read_header
+from pebble.extensions.media.rate_meter import RateMeter
+from pebble.extensions.media.sound import ReceivedSound, SoundDecoder
+from pebble.extensions.operator.client.media_request.offer import Medium
+from pebble.extensions.operator.client.media_request.request import ViewerRequest, send
+from pebble.extensions.operator.client.robot_view import RobotView
+from pebble.transports import Message, QoS, Subscription, Transport
+
+_STEP_S = 0.02  # until a request is sent
+
+
+class MediaReceiver:
+    """One robot's pictures and sound. The caller opens and closes ``transport``.
+
+    The transport's threads decode; others may read ``newest``.
+    """
+
+    def __init__(self, transport: Transport, base: str) -> None:
+        self.robot = RobotView(base)  # by its capabilities
+        self.newest: Decoded | None = None
+        self.pictures, self.sounds = RateMeter(), RateMeter()
+        self.encoding: dict[Medium, str] = {}  # of the last payload
+        self._video, self._audio = VideoDecoder(), SoundDecoder()
+        self.requests: dict[Medium, ViewerRequest] = {}
+        self._transport = transport
+        self._subscriptions: list[Subscription] = []
+        self._is_known = threading.Event()
+        self._subscriptions.append(transport.subscribe(CAPABILITIES.topic(base), self._on_capabilities))
+
+    def wait_for_capabilities(self, timeout: float) -> None:
+        """Wait for the robot's capabilities; raises PebbleError on timeout."""
+        if not self._is_known.wait(timeout):
+            raise PebbleError(f"{self.robot.base} publishes no capabilities: is the robot up, and is this its broker?")
+
+    def request(self, medium: Medium, encoding: str | None = None) -> None:
+        """Request a medium in ``encoding``, or as configured. Raises PebbleError if the robot does not offer it."""
+        request = self.requests.get(medium) or ViewerRequest(self.robot.base, medium, self.robot.capabilities)
+        request.want(encoding, time.monotonic())
+        if medium not in self.requests:
+            self.requests[medium] = request
+            self._subscribe(medium, request)
+            request.want(encoding, time.monotonic())  # from now on a retained flag, and what flows already, arrives
+        while not request.settled:
+            send(self._transport, request.tick(time.monotonic()))
+            time.sleep(_STEP_S)
+
+    def poll(self) -> None:
+        """Call this a few times a second: repeats unanswered requests, and requests a key frame if one is missing."""
+        now = time.monotonic()
+        for request in list(self.requests.values()):
+            if request.settled:
+                send(self._transport, request.tick(now))
+        if self._video.wants_keyframe and "video" in self.requests:
+            send(self._transport, self.requests["video"].keyframe(self.encoding.get("video"), now))
+
+    def summary(self, medium: Medium, now: float) -> str:
+        """A line for display: ``h264 10/s 212 kbit/s, 45 ms``; empty while nothing arrives."""
+        meter = self.pictures if medium == "video" else self.sounds
+        rate, age_s = meter.rate(now), meter.age_s(now)
+        if not rate or medium not in self.encoding:
+            return ""
+        age = "" if age_s is None else f", {1000 * age_s:.0f} ms"
+        return f"{self.encoding[medium]} {rate:.0f}/s {meter.bitrate(now) / 1000:.0f} kbit/s{age}"
+
+    def close(self) -> None:
+        """Withdraw what was requested."""
+        for request in list(self.requests.values()):
+            send(self._transport, request.end())
+        for subscription in self._subscriptions:
+            subscription.close()
+
+    def on_picture(self, picture: Decoded) -> None:
+        """Override to get every picture, not only the newest; runs on a thread of the transport."""
+
+    def on_sound(self, received: ReceivedSound) -> None:
+        """Override to get every packet of sound; runs on a thread of the transport."""
+
+    # -- the transport's threads
+
+    def _on_capabilities(self, message: Message) -> None:
+        self.robot.receive(CAPABILITIES, message, 0.0, 0.0)
+        if self.robot.estop.has_capabilities:
+            self._is_known.set()
+
+    def _subscribe(self, medium: Medium, request: ViewerRequest) -> None:
+        def on_media(message: Message) -> None:
+            request.receive(message, time.monotonic())
+            (self._on_video if medium == "video" else self._on_audio)(message.payload)
+
+        def on_flag(message: Message) -> None:
+            request.receive(message, time.monotonic())
+
+        subscribe = self._transport.subscribe
+        self._subscriptions.append(subscribe(request.flag_topic, on_flag, echo=False, direct=True))
+        self._subscriptions.append(subscribe(request.media_topic, on_media, qos=QoS.LATEST))
+
+    def _on_video(self, payload: bytes) -> None:
+        picture = self._video.feed(payload)
+        age_s = None if picture is None or picture.captured_ms is None else time.time() - picture.captured_ms / 1000
+        self.pictures.add(time.monotonic(), len(payload), age_s)
+        if (header := read_header(payload)) is not None:
+            self.encoding["video"] = header.encoding
+        if picture is not None:
+            self.newest = picture
+            self.on_picture(picture)
+
+    def _on_audio(self, payload: bytes) -> None:
+        received = self._audio.feed(payload)
+        if received is None:
+            return
+        self.sounds.add(time.monotonic(), len(payload), time.time() - received.captured_ms / 1000)
+        self.encoding["audio"] = received.encoding
+        self.on_sound(received)

@@ -1,0 +1,64 @@
+"""What of a robot's pictures and sound may be requested, by its capabilities. Pure."""
+
+from collections.abc import Collection, Sequence
+from typing import Any, Final, Literal, NamedTuple
+
+from pebble.contract import AUDIO, AUDIO_CONTROL, CAMERA, MQTT_AUDIO, MQTT_VIDEO, VIDEO_CONTROL, Channel
+from pebble.extensions.operator.client.robot_topics import PLACES, names
+
+Medium = Literal["video", "audio"]
+
+#: The channels of a medium, for which capabilities may name topics.
+CHANNELS: Final[dict[Medium, tuple[Channel, ...]]] = {
+    "video": (CAMERA, VIDEO_CONTROL, MQTT_VIDEO),
+    "audio": (AUDIO, AUDIO_CONTROL, MQTT_AUDIO),
+}
+
+
+BEST_FIRST: Final[dict[Medium, tuple[str, ...]]] = {"video": ("h264", "pbvd", "json"), "audio": ("opus", "pcm")}
+
+
+class Words(NamedTuple):
+    """How people are told of a medium."""
+
+    lacking: str
+    fixed: str
+    name: str
+
+
+WORDS: Final[dict[Medium, Words]] = {
+    "video": Words("it has no camera", "its camera cannot be switched on from here", "pictures"),
+    "audio": Words("it has no sound", "its sound cannot be switched on from here", "sound"),
+}
+
+
+def offered(capabilities: dict[str, Any], medium: Medium) -> tuple[str, ...]:
+    """The encodings that may be requested; empty for robots that do not list any, whose requests name none."""
+    section = capabilities.get(medium)
+    listed = section.get("encodings") if isinstance(section, dict) else None
+    return tuple(name for name in listed if isinstance(name, str)) if isinstance(listed, list) else ()
+
+
+def refusal(ref: str, capabilities: dict[str, Any], medium: Medium) -> str:
+    """Why this robot's pictures, or its sound, are not requested; empty if they may be.
+
+    Capabilities come from the network: one that names topics of another component, or channel, is not believed at all.
+    """
+    if not capabilities:
+        return "it has published no capabilities yet"
+    section, words = capabilities.get(medium), WORDS[medium]
+    if not isinstance(section, dict) or section.get("available") is not True:
+        return words.lacking
+    if section.get("controls") is not True:
+        return words.fixed
+    for channel in CHANNELS[medium]:
+        key = PLACES[channel][1]
+        if section.get(key) is not None and not names(ref, section[key], channel):
+            return f"its capabilities name a topic for {words.name} that is not its own ({key})"
+    return ""
+
+
+def best(medium: Medium, encodings: Collection[str], viewers: Sequence[frozenset[str]]) -> str | None:
+    """Return the best of what most viewers can show or play; None: whatever the robot sends, as it lists none."""
+    known = [encoding for encoding in BEST_FIRST[medium] if encoding in encodings]
+    return max(known, key=lambda encoding: sum(encoding in can for can in viewers), default=None)

@@ -1,0 +1,119 @@
+"""The request for a robot's pictures or sound: what it is sent for them, and what is taken back afterwards. Pure."""
+
+from collections import deque
+from typing import Any, Final
+
+from pebble.contract import codec
+from pebble.contract.payloads import MediaRequest
+from pebble.errors import PayloadError, PebbleError
+from pebble.extensions.operator.client.media_request.offer import CHANNELS, Medium, offered
+from pebble.extensions.operator.client.robot_topics import topic_of
+from pebble.transports import Message, QoS, Transport
+
+_REPEAT_S: Final = 2.0  # without a payload before a request is repeated
+_FLAG_S: Final = 0.2  # a retained flag arrives within this time of subscribing
+_JOIN_S: Final = 0.4  # a stream that is already running delivers a payload within this time
+_KEYFRAME_S: Final = 1.0
+_SENT: Final = 20
+
+
+class ViewerRequest:
+    """One medium of one robot. Times are seconds of a monotonic clock.
+
+    Subscribe to ``flag_topic`` and ``media_topic``, pass what arrives to :meth:`receive`, and publish what the other
+    methods return by :func:`send`. What was running before stays, and a flag that another operator lowers stays
+    lowered.
+    """
+
+    def __init__(self, base: str, medium: Medium, capabilities: dict[str, Any]) -> None:
+        self.sent: deque[bytes] = deque(maxlen=_SENT)  # own requests: what else arrives on their topic is from others
+        self.settled = False  # it was sent, or nothing has to be: else call :meth:`tick` often
+        topics = (topic_of(base, capabilities, channel) for channel in CHANNELS[medium])
+        self.media_topic, self.control_topic, self.flag_topic = topics
+        self.section: dict[str, Any] = capabilities.get(medium) or {}  # of the newest capabilities
+        self._base, self._medium = base, medium
+        _, self._control, self._flag = CHANNELS[medium]
+        self._encoding: str | None = None
+        self._is_up: bool | None = None  # the flag; None: not known
+        self._raised = self._requested = False
+        self._began_at = self._sent_at = self._received_at = self._keyframe_at = float("-inf")
+
+    def want(self, encoding: str | None, now: float) -> None:
+        """Want the medium in ``encoding``, or as configured. Raises PebbleError if the robot does not offer it."""
+        if not (self.section.get("available") and self.section.get("controls")):
+            raise PebbleError(f"{self._base} offers no {self._medium}")
+        listed = self._encodings()
+        if encoding is not None and listed and encoding not in listed:
+            raise PebbleError(f"{self._base} cannot send {self._medium} as {encoding}, only as {', '.join(listed)}")
+        self._encoding, self._began_at, self.settled = encoding, now, False
+
+    def receive(self, message: Message, now: float) -> bool:
+        """Take a message of one of its topics; True if it is a payload of the medium."""
+        if message.topic != self.flag_topic:
+            self._received_at = now
+            return True
+        try:
+            self._is_up = bool(message.payload) and bool(codec.decode(self._flag, message.payload))
+        except PayloadError:  # a malformed flag counts as lowered
+            self._is_up = False
+        self._raised = self._raised and self._is_up  # one that was lowered is another operator's to raise
+        return False
+
+    def tick(self, now: float) -> list[Message]:
+        """Return what to send now; without a payload the request is repeated."""
+        if self.settled:
+            is_quiet = now - max(self._sent_at, self._received_at) > _REPEAT_S
+            return [self._ask(now)] if is_quiet else []
+        if self._encoding is None and self._received_at > float("-inf"):
+            self.settled, self._sent_at = True, now  # another operator has requested it: change nothing
+            return []
+        waits_s = 0.0 if self._is_up is not None else _FLAG_S
+        if now < self._began_at + (_JOIN_S if self._encoding is None else waits_s):
+            return []
+        self.settled, asked = True, [self._ask(now)]
+        if not self._is_up:
+            self._is_up = self._raised = True
+            asked.insert(0, self._flag_message(up=True))
+        return asked
+
+    def keyframe(self, encoding: str | None, now: float) -> list[Message]:
+        """Request a full picture in the encoding that arrives, at most once a second."""
+        if now - self._keyframe_at < _KEYFRAME_S:
+            return []
+        self._keyframe_at = now
+        known = encoding if encoding in self._encodings() else None
+        return [self._message(MediaRequest(enabled=True, encoding=known, keyframe=True))]
+
+    def leave(self) -> None:
+        """Leave the medium to another operator, who has requested it, too."""
+        self._requested = self._raised = False
+
+    def end(self) -> list[Message]:
+        """Withdraw the request, and lower the flag that was down before."""
+        messages = [self._message(MediaRequest(enabled=False))] if self._requested else []
+        messages += [self._flag_message(up=False)] if self._raised else []
+        self.leave()
+        return messages
+
+    def _encodings(self) -> tuple[str, ...]:
+        return offered({self._medium: self.section}, self._medium)
+
+    def _ask(self, now: float) -> Message:
+        self._sent_at, self._requested = now, True
+        return self._message(MediaRequest(enabled=True, encoding=self._encoding))
+
+    def _message(self, request: MediaRequest) -> Message:
+        payload = codec.encode(self._control, request)
+        self.sent.append(payload)
+        return Message(self.control_topic, payload, QoS.DELIVERED)
+
+    def _flag_message(self, *, up: bool) -> Message:
+        return Message(self.flag_topic, codec.encode(self._flag, up), QoS.DELIVERED, retain=True)
+
+
+def send(transport: Transport, messages: list[Message]) -> None:
+    """Publish what a request returns. Raises TransportError."""
+    for message in messages:
+        transport.publish(
+            message.topic, message.payload, qos=message.qos, retain=message.retain, shared=message.retain, urgent=True
+        )

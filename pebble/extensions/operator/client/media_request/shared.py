@@ -1,0 +1,152 @@
+"""One robot's pictures or sound, requested while they are wanted and a while longer, however many want them."""
+
+import asyncio
+import contextlib
+import logging
+import time
+from collections.abc import Awaitable, Callable
+from typing import Any, Final
+
+from pebble.errors import PebbleError
+from pebble.extensions.operator.client.broker import Broker
+from pebble.extensions.operator.client.media_request.offer import CHANNELS, WORDS, Medium, refusal
+from pebble.extensions.operator.client.media_request.request import ViewerRequest, send
+from pebble.extensions.operator.client.robot_topics import named_topic
+from pebble.extensions.operator.client.robot_view import RobotView
+from pebble.transports import Message, Subscription
+
+log = logging.getLogger(__name__)
+
+LINGER_S: Final = 5.0  # unwanted, before the request is withdrawn: a page that reloads is back by then
+TICK_S: Final = 0.5
+_STEP_S: Final = 0.02  # until a request is sent
+_PROGRAMS: Final[dict[Medium, str]] = {"video": "camera_publisher", "audio": "audio_publisher"}
+_WAITS: Final[dict[Medium, str]] = {"video": "Pictures wait for driving", "audio": "it waits for driving"}
+
+
+class SharedRequest:
+    """The request for one medium of one robot. Only the event loop calls it, its coroutines only in :meth:`run`."""
+
+    def __init__(self, broker: Broker, ref: str, medium: Medium, receive: Callable[[bytes], None]) -> None:
+        """``receive`` gets each payload."""
+        self.ref, self.medium = ref, medium
+        self.problem = ""  # why it is not requested
+        self.encoding: str | None = None  # as requested; None: as configured, or nothing is requested
+        self.waits = ""  # why the robot, which knows of it, sends nothing for now: nothing is repeated
+        self.requested_at = float("-inf")
+        self._broker, self._receive = broker, receive
+        self._request: ViewerRequest | None = None
+        self._topics: list[str | None] = []  # that the capabilities named at the request
+        self._subscriptions: list[Subscription] = []
+        self._wanted = self._closing = False
+        self._wanted_at = float("-inf")  # the last time
+        self._wakeup = asyncio.Event()
+
+    def want(self, wanted: bool) -> None:
+        """Say whether anything shows or plays it now."""
+        if wanted or self._wanted:
+            self._wanted_at = time.monotonic()
+        self._wanted = wanted
+        self.wake()
+
+    def wake(self) -> None:
+        """Take the next step soon."""
+        self._wakeup.set()
+
+    def close(self) -> None:
+        """Let :meth:`run` end now."""
+        self._closing = True
+        self.wake()
+
+    async def wait_until_wanted(self) -> None:
+        while not self._wanted:
+            self._wakeup.clear()
+            await self._wakeup.wait()
+
+    async def run(self, step: Callable[[], Awaitable[None]]) -> None:
+        """Await ``step`` twice a second, and soon if it is woken, until nothing has wanted the request for a while.
+
+        At the end, also if it is cancelled, the request is withdrawn.
+        """
+        try:
+            while not self._closing:
+                if not self._is_over():
+                    began = time.monotonic()
+                    await step()
+                    await self._pause(began)
+                    continue
+                await self._withdraw()
+                if self._is_over():  # else something has come to want it meanwhile
+                    return
+        finally:
+            await self._withdraw()
+
+    async def follow(self, robot: RobotView, encoding: str | None) -> None:
+        """Request it if it is wanted, as the robot allows it; call it with each step."""
+        capabilities = robot.capabilities
+        self.waits = _WAITS[self.medium] if robot.holds(_PROGRAMS[self.medium]) else ""
+        self.problem = refusal(self.ref, capabilities, self.medium)
+        if self.problem:
+            await self._withdraw()
+            return
+        if not self._wanted or self.waits:
+            return
+        try:
+            await self._follow(capabilities, encoding)
+        except PebbleError as error:
+            self.problem = str(error)
+
+    async def request_keyframe(self, encoding: str) -> None:
+        """Request a key frame in the encoding that arrives, at most once a second."""
+        if self._request is not None and not self.waits:
+            send(self._broker.transport, self._request.keyframe(encoding, time.monotonic()))
+
+    async def _follow(self, capabilities: dict[str, Any], encoding: str | None) -> None:
+        topics = [named_topic(self.ref, capabilities, channel) for channel in CHANNELS[self.medium]]
+        request = self._request
+        try:
+            if request is None or topics != self._topics:
+                await self._withdraw()
+                request, self._topics = ViewerRequest(self.ref, self.medium, capabilities), topics
+                self._request = request
+                for topic in (request.flag_topic, request.media_topic):
+                    self._subscriptions.append(await self._broker.subscribe(topic, self._take))
+            request.section = capabilities[self.medium]
+            if encoding != self.encoding or self.requested_at == float("-inf"):
+                self.encoding, self.requested_at = encoding, time.monotonic()
+                request.want(encoding, self.requested_at)
+            send(self._broker.transport, request.tick(time.monotonic()))
+            while not request.settled:
+                await asyncio.sleep(_STEP_S)
+                send(self._broker.transport, request.tick(time.monotonic()))
+        except PebbleError:
+            await self._withdraw()
+            raise
+
+    def _take(self, message: Message, at: float) -> None:
+        if self._request is not None and self._request.receive(message, at):
+            self._receive(message.payload)
+
+    async def _withdraw(self) -> None:
+        request, self._request = self._request, None
+        subscriptions, self._subscriptions = self._subscriptions, []
+        self.encoding, self.requested_at = None, float("-inf")
+        try:
+            send(self._broker.transport, [] if request is None else request.end())
+        except PebbleError as error:
+            log.warning("the %s of %s: %s", WORDS[self.medium].name, self.ref, error)
+        for subscription in subscriptions:
+            await self._broker.unsubscribe(subscription)
+
+    def _is_over(self) -> bool:
+        """A request is not withdrawn while there is no broker: the robot would go on sending afterwards."""
+        idle = not self._wanted and time.monotonic() - self._wanted_at >= LINGER_S
+        return idle and (self._broker.connected or self._request is None)
+
+    async def _pause(self, began: float) -> None:
+        """A step that is needed earlier comes a tenth of a second after the last one."""
+        await asyncio.sleep(max(0.0, began + TICK_S / 5 - time.monotonic()))
+        with contextlib.suppress(TimeoutError):  # wait_for of Python 3.11 loses a cancellation that meets a wakeup
+            async with asyncio.timeout(max(0.001, began + TICK_S - time.monotonic())):
+                await self._wakeup.wait()
+        self._wakeup.clear()

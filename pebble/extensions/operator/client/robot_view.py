@@ -1,0 +1,259 @@
+"""The robot as an operator's program sees it: whether it is there, what it can do, and what holds it. Pure."""
+
+from collections import deque
+from contextlib import suppress
+from typing import Any
+
+from pebble import contract as c
+from pebble.contract import codec
+from pebble.contract.levels import link_of, silent_after
+from pebble.contract.payloads import AutonomyStatus, EstopState, LinkLevel, LinkState, Orientation
+from pebble.errors import PayloadError
+from pebble.extensions.operator.client.announced import announced
+from pebble.extensions.operator.client.control import RobotControl
+from pebble.extensions.operator.client.drive_reasons import SILENT_S, Situation
+from pebble.extensions.operator.client.driveable import Driveable, driveable_of, is_held
+from pebble.extensions.operator.client.pace_of_link import Pace, pace_of, way_s
+from pebble.extensions.operator.client.robot_estop import RobotEstop
+from pebble.extensions.operator.client.robot_topics import SYNONYMS, named_topic, section_of
+from pebble.transports import Message
+
+MAX_REMEMBERED = 64  # topics of one robot
+_HISTORY = 10
+_STAMPS = 5  # heartbeats by which a clock of whole seconds is recognised
+
+
+class Liveness:
+    """Is a component online? As on the paper's operator page, the timeout follows the heartbeat's own interval."""
+
+    def __init__(self) -> None:
+        self.received_at: float | None = None  # monotonic
+        self.reported_offline = False
+        self.link: LinkLevel = "wide"  # as its bridge measures it
+        self._intervals: deque[float] = deque(maxlen=_HISTORY)
+        self._latencies: deque[float] = deque(maxlen=_HISTORY)
+        self._stamps: deque[int] = deque(maxlen=_STAMPS)
+        self.latency_s: float | None = None  # of the newest heartbeat; None if its clock is wrong
+
+    def heartbeat(self, now: float, latency_s: float, *, online: bool = True, t: int = 1) -> None:
+        """Take note of a heartbeat with the time ``t``, in milliseconds of its own clock."""
+        self._stamps.append(t)
+        if self.received_at is not None and 0.05 <= now - self.received_at <= 10.0:
+            self._intervals.append(now - self.received_at)
+        self.latency_s = max(0.0, latency_s) if -1.0 <= latency_s <= 10.0 else None
+        if self.latency_s is not None:
+            self._latencies.append(self.latency_s)
+        self.received_at, self.reported_offline = now, not online
+
+    @property
+    def average_latency_s(self) -> float | None:
+        """It is the mean of the last ten heartbeats that tell it; correct only if both clocks are synchronised."""
+        return _mean(self._latencies)
+
+    @property
+    def interval_s(self) -> float | None:
+        """It is the mean time between the last ten heartbeats."""
+        return _mean(self._intervals)
+
+    @property
+    def whole_seconds(self) -> bool:
+        """True if its clock counts whole seconds: latency says nothing."""
+        return len(self._stamps) == _STAMPS and all(stamp % 1000 == 0 for stamp in self._stamps)
+
+    def age_s(self, now: float) -> float | None:
+        return None if self.received_at is None else now - self.received_at
+
+    def online(self, now: float, at_least_s: float = 0.0) -> bool | None:
+        """None while there are too few heartbeats to decide; a silence of less than ``at_least_s`` is none."""
+        if self.reported_offline:
+            return False
+        interval = self.interval_s
+        if self.received_at is None or len(self._intervals) < 2 or interval is None:
+            return None
+        age = now - self.received_at
+        return age <= silent_after(interval, self.link, self.average_latency_s or 0.0) or age < at_least_s
+
+
+def _mean(values: deque[float]) -> float | None:
+    return sum(values) / len(values) if values else None
+
+
+class RobotView:
+    """One robot, by the messages it publishes."""
+
+    def __init__(self, base: str) -> None:
+        self.base = base
+        self.liveness = Liveness()
+        self.estop = RobotEstop(base)
+        self.control = RobotControl(self.estop)
+        self.reset_at = float("-inf")  # when its emergency stop ended, as far as it was seen
+        self.remembered: dict[str, Message] = {}  # by topic: what an emergency stop that begins later needs to know
+        self.capabilities: dict[str, Any] = {}
+        self._status = b""  # the newest
+        self.link: LinkState | None = None  # what the way to its broker carries; None: everything
+        self.autonomy: AutonomyStatus | None = None
+        self.volts: float | None = None
+        self.charging: bool | None = None
+        self.attitude: Orientation | None = None  # of the newest sample of its inertial sensor
+
+    @property
+    def name(self) -> str:
+        """The last level of its base topic."""
+        return self.base.rpartition("/")[2]
+
+    # -- what arrives
+
+    def receive(self, channel: c.Channel | None, message: Message, now: float, wall: float) -> None:
+        """Take a message of it that arrived at ``now`` (monotonic) and ``wall`` (epoch seconds).
+
+        What it says is known from ``channel``. A malformed one changes nothing: the last valid state stays. An empty
+        one removes what was retained.
+        """
+        if channel in _FOR_STOPS:
+            self._remember(message)
+        if channel in (c.CAPABILITIES, c.ESTOP_STATE):
+            self._receive_stop(channel, message, now)
+        elif channel is c.CONTROL_STATE:
+            self.control.receive(message)
+        elif channel is c.LINK:
+            self.link = link_of(message.payload)  # absent or unreadable it is wide
+            self.liveness.link = "wide" if self.link is None else self.link.level
+        elif channel is c.STATUS:
+            self._status = message.payload
+            self._announce(message.payload)
+        elif channel in _DECODED:
+            with suppress(PayloadError):
+                self._receive_decoded(channel, message, codec.decode(channel, message.payload), now, wall)
+
+    def _receive_decoded(self, channel: c.Channel, message: Message, payload: Any, now: float, wall: float) -> None:
+        if channel is c.CHARGING_LEVEL:
+            self.volts = payload.value
+        elif channel is c.CHARGING_STATUS:
+            self.charging = payload.value
+        elif channel is c.IMU:
+            self.attitude = payload.value.orientation_deg
+        elif channel is c.AUTONOMY_STATUS:
+            self.autonomy = payload
+        else:
+            self._announce(message.payload)
+            if not message.retain:  # a heartbeat that is retained is no sign of life
+                self.liveness.heartbeat(now, wall - payload.t / 1000, online=payload.online is not False, t=payload.t)
+
+    def _announce(self, payload: bytes) -> None:
+        """Take what a heartbeat or status lists, unless it publishes capabilities."""
+        if not self.capabilities or "announced" in self.capabilities:
+            found = announced(self.base, payload)
+            self.capabilities = self.capabilities if found == self.capabilities else found or self.capabilities
+
+    def _receive_stop(self, channel: c.Channel, message: Message, now: float) -> None:
+        """Take capabilities, or the state of a motor owner. Empty capabilities take nothing away."""
+        latched = self.latched
+        self.estop.receive(message)
+        if latched and not self.latched:
+            self.reset_at = now
+        if channel is c.CAPABILITIES:
+            with suppress(PayloadError):
+                self.capabilities = codec.decode(c.CAPABILITIES, message.payload).value or self.capabilities
+
+    def _remember(self, message: Message) -> None:
+        """Keep it for an emergency stop that begins later; invented owners keep no capabilities out."""
+        known = (*self.remembered, c.CAPABILITIES.topic(self.base))
+        if not message.payload:
+            self.remembered.pop(message.topic, None)
+        elif len(self.remembered) < MAX_REMEMBERED or message.topic in known:
+            self.remembered[message.topic] = message
+
+    # -- what is known
+
+    @property
+    def live(self) -> bool:
+        """True if anything but retained messages has arrived from it."""
+        return self.liveness.received_at is not None
+
+    @property
+    def transport(self) -> str:
+        return str(section_of(self.capabilities, "transport").get("kind", "?"))
+
+    @property
+    def latched(self) -> bool:
+        """Whether any of its motor owners is stopped by an emergency stop: it must not be driven."""
+        return bool(self.estop.latched)
+
+    @property
+    def stopped_by(self) -> EstopState | None:
+        """The state that holds the newest stop, if it is stopped."""
+        return self.estop.stopped_by
+
+    @property
+    def drives(self) -> bool:
+        """Whether it offers driving; without capabilities nothing is assumed (paper A.8.6)."""
+        drive = section_of(self.capabilities, "drive")
+        return drive.get("available") is True and drive.get("controls") is not False
+
+    @property
+    def arbitrates(self) -> bool:
+        """Whether it decides itself between a script and a person."""
+        return section_of(self.capabilities, "drive").get("arbitrates") is True
+
+    @property
+    def controlled(self) -> bool:
+        """Whether it decides itself which person drives it."""
+        return section_of(self.capabilities, "drive").get("control") is True
+
+    @property
+    def driveable(self) -> Driveable | None:
+        """It is what its status says of its motors."""
+        return driveable_of(self._status)
+
+    def holds(self, program: str) -> bool:
+        """True if that program is requested, and waits while people drive over a thin link."""
+        return is_held(self._status, program)
+
+    @property
+    def named(self) -> bool:
+        """Whether it takes commands only with the name of their sender in the topic."""
+        return self.estop.named
+
+    @property
+    def slow_s(self) -> float | None:
+        """How long commands take over its thin link; None: it has reported none, or is gone."""
+        link = self.link
+        return None if link is None or link.level == "wide" or self.liveness.reported_offline else way_s(link)
+
+    @property
+    def pace(self) -> Pace:
+        """At what rate, and how, commands go to it; also while it is gone, for when it is back over the same link."""
+        return pace_of(self.link)
+
+    def topic(self, channel: c.Channel) -> str | None:
+        """Return the topic that its capabilities name for ``channel``; None: none, or none of its own."""
+        return named_topic(self.base, self.capabilities, channel)
+
+    def offers(self, section: str) -> bool:
+        """Whether that section of its capabilities, for example ``video``, can be requested."""
+        return section_of(self.capabilities, section).get("controls") is True
+
+    def ready(self, now: float) -> bool:
+        """Whether it is online, with a known drive topic."""
+        return self.topic(c.DRIVE) is not None and self.liveness.online(now) is True
+
+    def online(self, now: float) -> bool | None:
+        """Whether people are told that it is there: as its heartbeats say, but not silent after less than 1.5 s."""
+        return self.liveness.online(now, SILENT_S)
+
+    def situation(self, now: float) -> Situation:
+        """What speaks for and against driving it, as far as it says so itself."""
+        script = self.autonomy
+        return Situation(
+            online=self.online(now),
+            latched=self.latched,
+            free_s=now - self.reset_at,
+            published=bool(self.capabilities) or self.estop.has_capabilities,
+            drives=self.drives,
+            arbitrates=self.arbitrates,
+            script=script is not None and script.running,
+        )
+
+
+_FOR_STOPS = (c.ONLINE, c.CAPABILITIES, c.ESTOP_STATE)
+_DECODED = (c.ONLINE, *SYNONYMS, c.CHARGING_LEVEL, c.CHARGING_STATUS, c.IMU, c.AUTONOMY_STATUS)

@@ -1,0 +1,112 @@
+"""The scripts of a robot as its autonomy_manager publishes them, and commands that start and stop them."""
+
+from collections.abc import Sequence
+from contextlib import suppress
+from typing import Any
+
+from pebble.contract import AUTONOMY_COMMAND, AUTONOMY_FILES, AUTONOMY_STATUS, CAPABILITIES, LINK, codec, forms
+from pebble.contract.payloads import AutonomyCommand, AutonomyStatus
+from pebble.errors import PayloadError, PebbleError
+from pebble.extensions.operator.client.names import Names
+from pebble.extensions.operator.client.robot_view import RobotView
+from pebble.transports import Message, QoS, Transport
+
+_BYTES = 512 * 1024  # of a list of scripts
+_RECEIVED = (CAPABILITIES, LINK, AUTONOMY_FILES, AUTONOMY_STATUS)
+_STARTS_S = 5.0  # that a script may take until its status shows it
+
+Entry = dict[str, Any]
+
+
+class RobotScripts:
+    """Which scripts one robot offers, and what runs. Other threads may read while it receives."""
+
+    def __init__(self, names: Names) -> None:
+        self.robot = RobotView(names.base)
+        self.files: dict[str, Entry] | None = None  # by name; None: the robot has not published any list
+        self.answers = 0  # statuses that arrived live
+        self._channels = {names.topic(channel.metric): channel for channel in _RECEIVED}
+        self._command_topic = names.topic(AUTONOMY_COMMAND.metric)
+
+    @property
+    def status(self) -> AutonomyStatus | None:
+        """It is what runs; None: the robot has not published it."""
+        return self.robot.autonomy
+
+    @property
+    def answer_s(self) -> float:
+        """A robot whose status has not changed so long after a command does not follow it."""
+        return max(_STARTS_S, self.robot.pace.answer_s)
+
+    def subscribe(self, transport: Transport) -> None:
+        """Receive from ``transport``; when this returns, what is retained has arrived."""
+        for topic in self._channels:
+            transport.subscribe(topic, self.receive, direct=True)
+
+    def receive(self, message: Message) -> None:
+        """Update from a message of this robot; what is malformed is ignored."""
+        channel, before = self._channels.get(message.topic), self.status
+        if channel is not AUTONOMY_FILES:
+            self.robot.receive(channel, message, 0.0, 0.0)
+            self.answers += self.status is not before and not message.retain
+        elif len(message.payload) <= _BYTES:
+            with suppress(PayloadError):
+                listed = codec.decode(AUTONOMY_FILES, message.payload).files
+                self.files = {entry["file"]: entry for entry in listed if isinstance(entry.get("file"), str)}
+
+    def start(self, transport: Transport, file: str, words: Sequence[str]) -> bool:
+        """Command a start with the options in ``words``; False: it was not sent. Raises PebbleError."""
+        if self.files is None:
+            raise PebbleError(
+                "the robot has published no scripts: is services.autonomy_manager.enabled true, is it up?"
+            )
+        if file not in self.files:
+            known = ", ".join(self.files) or "none"
+            raise PebbleError(f"there is no script {file}, only: {known}; just after the robot's start, try again")
+        chosen = settings(self.files[file], words)
+        return self._publish(transport, AutonomyCommand(action="start", file=file, config=chosen))
+
+    def stop(self, transport: Transport) -> bool:
+        return self._publish(transport, AutonomyCommand(action="stop"))
+
+    def _publish(self, transport: Transport, command: AutonomyCommand) -> bool:
+        raw = codec.encode(AUTONOMY_COMMAND, command)
+        return transport.publish(self._command_topic, raw, qos=QoS(AUTONOMY_COMMAND.default_qos), urgent=True)
+
+
+def settings(entry: Entry, words: Sequence[str]) -> dict[str, Any]:
+    """The settings that words such as ``--tag-id 5 --no-search`` select in a script's form. Raises PebbleError."""
+    form = forms.listed(entry.get("configs"))
+    options = {option: (setting, value) for setting in form for option, value in options_of(setting)}
+    chosen: dict[str, Any] = {}
+    rest = iter(words)
+    for word in rest:
+        option, given, text = word.partition("=")
+        if option not in options:
+            known = ", ".join(options) or "it has none"
+            raise PebbleError(f"{option} is no option of {entry['file']}: {known}")
+        setting, value = options[option]
+        if value is None and not given:
+            following = next(rest, None)
+            if following is None:
+                raise PebbleError(f"{option} needs a value")
+            text = following
+        try:
+            chosen[setting.key] = forms.accepted(setting, text) if value is None else value
+        except forms.SettingError as error:
+            raise PebbleError(f"{option} of {entry['file']}: {error}") from None
+    return chosen
+
+
+def options_of(setting: forms.Setting) -> list[tuple[str, bool | None]]:
+    """The options of a setting: first the script's own, then those made of its key; for flags with their value."""
+    key = setting.key.replace("_", "-")
+    on = _distinct(setting.arg, f"--{key}")
+    if setting.type != "bool":
+        return [(option, None) for option in on]
+    off = _distinct(setting.arg_false, f"--no-{key}")
+    return [*((option, True) for option in on), *((option, False) for option in off)]
+
+
+def _distinct(own: str | None, made: str) -> list[str]:
+    return list(dict.fromkeys((own, made))) if own and own.startswith("--") else [made]

@@ -1,0 +1,127 @@
+"""A terminal that passes on each key at once, and notices when it is lost. Linux and macOS only."""
+
+import os
+import select
+import shutil
+import signal
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from types import FrameType
+from typing import Any
+
+from pebble.config.visible import shown
+from pebble.extensions.operator.client.terminal.key_decoder import END, KeyDecoder
+from pebble.runtime.signals import handled_by
+
+_READ = 4096
+_SHOW_PERIOD_S = 0.1
+_HIDE_CURSOR, _SHOW_CURSOR, _ERASE_REST = "\x1b[?25l", "\x1b[?25h", "\x1b[K"
+
+
+class Terminal:
+    """Standard input as keys, and one status line below the shell's lines; see :func:`opened`."""
+
+    def __init__(self) -> None:
+        import termios
+
+        self.ended = ""  # why it is over: a signal, Ctrl-D, or a terminal that is gone
+        self._suspended = self._continued = False  # by Ctrl-Z, and after it
+        self._termios, self._fd = termios, sys.stdin.fileno()
+        self._before: list[Any] = termios.tcgetattr(self._fd)
+        self._decoder = KeyDecoder()
+        self._line, self._shown_at = "", float("-inf")
+
+    def start(self) -> None:
+        """Turn off echo and lines; Ctrl-C and Ctrl-Z stay signals, and Ctrl-S holds nothing back."""
+        import tty
+
+        tty.setcbreak(self._fd, self._termios.TCSAFLUSH)
+        mode = self._termios.tcgetattr(self._fd)
+        mode[0] &= ~self._termios.IXON
+        self._termios.tcsetattr(self._fd, self._termios.TCSANOW, mode)
+        _write(_HIDE_CURSOR)
+
+    def restore(self) -> None:
+        """Restores the terminal; keys that were not read are forgotten, so that no shell gets them."""
+        _write("\r\n" + _SHOW_CURSOR)
+        with suppress(self._termios.error, OSError):
+            self._termios.tcsetattr(self._fd, self._termios.TCSAFLUSH, self._before)
+
+    def keys(self, seconds: float) -> list[str]:
+        """Wait up to ``seconds`` for keys."""
+        if self._continued:  # a shell may have changed the mode of the terminal meanwhile
+            self._continued = False
+            self.start()
+        data, is_gone, due = b"", False, self._decoder.due
+        wait_s = seconds if due is None else min(seconds, due - time.monotonic())
+        try:
+            is_ready = bool(select.select([self._fd], [], [], max(0.0, wait_s))[0])
+            if is_ready and not (self.ended or self._suspended):
+                data = os.read(self._fd, _READ)
+                is_gone = not data
+        except OSError:  # EIO: its other end was closed, or this process is in the background for good
+            is_gone = True
+        if is_gone:
+            self.ended = self.ended or "the terminal is gone"
+        keys = self._decoder.feed(data, time.monotonic())
+        self.ended = END if END in keys else self.ended
+        return keys
+
+    def show(self, status: Callable[[], str], *, at_once: bool) -> None:
+        """Show the status if it has changed, a few times a second unless ``at_once``."""
+        now = time.monotonic()
+        if at_once or now - self._shown_at >= _SHOW_PERIOD_S:
+            self._shown_at = now
+            if (line := shown(status())) != self._line:
+                self._line = line
+                _write(f"\r{line[: max(10, shutil.get_terminal_size().columns) - 1]}{_ERASE_REST}")
+
+    def suspend(self, prepare: Callable[[], object]) -> None:
+        """Stand still after Ctrl-Z, once that is prepared, until this process goes on. Main thread only."""
+        if not self._suspended:
+            return
+        prepare()
+        self.restore()
+        signal.signal(signal.SIGTSTP, signal.SIG_DFL)
+        signal.pthread_kill(threading.get_ident(), signal.SIGTSTP)  # to this thread: it acts before the next line
+        signal.signal(signal.SIGTSTP, self.on_signal)
+        self._suspended, self._continued = False, True
+        self._line = ""  # a shell has written over it
+
+    def on_signal(self, number: int, _frame: FrameType | None) -> None:
+        """Note a signal."""
+        if number == signal.SIGTSTP:
+            self._suspended = True
+        elif number == signal.SIGCONT:
+            self._continued = True
+        else:
+            self.ended = self.ended or signal.Signals(number).name
+
+
+def _write(text: str) -> None:
+    with suppress(OSError):
+        os.write(sys.stdout.fileno(), text.encode(errors="replace"))
+
+
+def has_terminal() -> bool:
+    """True if keys can be read: not in a pipe, and not on Windows."""
+    try:
+        import termios  # noqa: F401
+    except ImportError:
+        return False
+    return sys.stdin.isatty() and sys.stdout.isatty()
+
+
+@contextmanager
+def opened() -> Iterator[Terminal]:
+    """The terminal of this process, restored at the end."""
+    terminal = Terminal()
+    with handled_by(terminal.on_signal, signal.SIGQUIT, signal.SIGTSTP, signal.SIGCONT):
+        try:
+            terminal.start()
+            yield terminal
+        finally:
+            terminal.restore()

@@ -1,0 +1,385 @@
+"""``pebble estop``: stops robots until each has confirmed it, ends stops, and shows them."""
+
+from __future__ import annotations
+
+import difflib
+import getpass
+import socket
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import closing, contextmanager, suppress
+from typing import Annotated
+
+import typer
+
+from pebble.config.visible import shown
+from pebble.contract import CAPABILITIES, ESTOP_STATE, LINK, ONLINE, STATUS
+from pebble.contract.levels import LEVELS
+from pebble.errors import PebbleError, TransportError
+from pebble.extensions.operator.client.connection import (
+    Listener,
+    Target,
+    connected,
+    in_small_segments,
+    listening,
+    put_names,
+    resolve,
+    target_of,
+    wait_for,
+)
+from pebble.extensions.operator.client.discovery import Discovery
+from pebble.extensions.operator.client.driveable import Driveable
+from pebble.extensions.operator.client.estop import Progress, RobotStop, StopSender, new_name, send
+from pebble.extensions.operator.client.estop_states import Reset, RobotEstop
+from pebble.extensions.operator.client.heartbeats import Heartbeats
+from pebble.extensions.operator.client.names import id_of
+from pebble.extensions.operator.client.robot_topics import SYNONYMS
+from pebble.extensions.operator.client.robot_view import RobotView
+from pebble.extensions.operator.commands.target import with_target
+from pebble.extensions.operator.commands.terminal import show
+from pebble.runtime.signals import interrupted_by_signals
+from pebble.transports import Message, MqttSettings, QoS, State, Transport
+
+_VERBS = ("reset", "status")
+_TICK_S = 0.25
+_HEARD_S = 0.02  # between two looks at heartbeats
+_ON_ITS_WAY_S = 0.05  # between the thread that has received a message and this one
+_REPORT_PERIOD_S = 0.05
+_QUICK_S = 1.0  # an answer within this time needs no line before it
+_ANSWER_S = LEVELS["wide"].answer_s  # longest wait for what the broker has of a robot
+_BATCH = 1000  # messages that are handled before the next stop is due
+
+
+@with_target(program="estop")
+def estop(
+    words: Annotated[
+        list[str] | None,
+        typer.Argument(
+            help="A robot's config file, or with --url or --config its id.",
+            metavar="[reset|status] ROBOT",
+            show_default=False,
+        ),
+    ] = None,
+    all_: Annotated[bool, typer.Option("--all", help="Stop all robots there.")] = False,
+    hold: Annotated[
+        bool, typer.Option("--hold", help="Until Ctrl-C: also stop robots that come online meanwhile.")
+    ] = False,
+    why: Annotated[str, typer.Option(help="Shown to others; at most 40 characters.", metavar="TEXT")] = "",
+    *,
+    target: Target,
+) -> int:
+    """Stop robots until they are reset.
+
+    This is software over a network, not a safety-rated stop: where people can be hurt, cut the power of the motors.
+
+    A stopped robot moves nothing, also after a restart, until `pebble estop reset`. The stop is repeated until every
+    motor owner of the robot has confirmed it, for at most a minute. Exit code 0: confirmed; 1: not confirmed.
+
+    \b
+        pebble estop goob.json
+        pebble estop goob.json --remote
+        pebble estop goob --url mqtt://127.0.0.1 --why "dog on the lane"
+        pebble estop --all --url mqtt://127.0.0.1
+        pebble estop --all --hold --url mqtt://127.0.0.1
+        pebble estop status --url mqtt://127.0.0.1
+        pebble estop reset goob.json
+    """
+    verb, robot = _parse(words or [])
+    if verb and (all_ or hold or why):
+        raise typer.BadParameter(f"--all, --hold and --why are not for {verb}")
+    if all_ and robot is not None:
+        raise typer.BadParameter(f"give either --all or {robot}")
+    if robot is None and not all_ and verb != "status":
+        raise typer.BadParameter("name the robot" if verb else "nothing was stopped: name the robot, or add --all")
+    target = target_of(robot, target)
+    if verb == "reset":
+        return _reset(target)
+    if verb == "status":
+        return _status(target, every=robot is None)
+    return _stop(target, why, every=all_, hold=hold)
+
+
+def _parse(words: list[str]) -> tuple[str, str | None]:
+    """``("reset", "goob.json")``; the verb is empty for a stop. A robot called reset is given as system/type/id."""
+    verb = words[0] if words and words[0] in _VERBS else ""
+    robots = words[1:] if verb else words
+    near = difflib.get_close_matches(words[0], _VERBS, n=1) if len(words) > 1 and not verb else []
+    if near:
+        raise typer.BadParameter(f'did you mean "pebble estop {near[0]} {words[1]}"?')
+    if len(robots) > 1:
+        raise typer.BadParameter(f"one robot at a time{'' if verb else ', or --all'}: not {' '.join(robots)}")
+    if robots and robots[0] in _VERBS:
+        raise typer.BadParameter(f"a robot called {robots[0]} is given as system/type/id")
+    return verb, robots[0] if robots else None
+
+
+def me(account: str | None = None) -> str:
+    """Who gives this command, at the broker or else on this machine, and from which machine: ``ann@desk``."""
+    try:
+        user = account or getpass.getuser()
+    except (ImportError, KeyError, OSError):  # no name for this user id, or no such ids
+        user = "unknown"
+    return f"{user}@{socket.gethostname()}"
+
+
+# -- stop
+
+
+def _stop(target: Target, why: str, *, every: bool, hold: bool) -> int:
+    """Send stops over a connection of their own, on which nothing arrives."""
+    with interrupted_by_signals(), connected(target) as (transport, names):
+        robots = None if every else [names.base]
+        sender = StopSender(new_name(), by=me(names.account), why=why, now=time.monotonic(), robots=robots, hold=hold)
+        put_names(transport, names, lambda base: base in sender.robots and sender.robots[base].estop.named)
+        outbox = _Outbox(transport, sender)
+        outbox.publish()
+        report = _Report(sender, outbox)
+        try:
+            with _heartbeats(target, every=every) as heartbeats, listening(target, transport) as second:
+                listener, subscribing = _listen(second, _filters(names.base))
+                while not sender.finished:
+                    for message in heartbeats.take() if heartbeats else ():
+                        sender.receive(message, time.monotonic())
+                    outbox.publish()
+                    _receive(listener, sender, _until_due(sender, hears=heartbeats is not None))
+                    outbox.publish()
+                    report.connection(
+                        "" if transport.state is State.CONNECTED else transport.problem or "no connection"
+                    )
+                    report.update(time.monotonic())
+                subscribing.join(_ANSWER_S)  # a status tells whether the motors obey, and may come after it
+                wait_for(lambda: second.state is State.CONNECTED, _ANSWER_S)
+                _receive(listener, sender, _ON_ITS_WAY_S)
+        except KeyboardInterrupt:
+            sender.end()
+        report.end()
+    return 0 if sender.confirmed else 1
+
+
+@contextmanager
+def _heartbeats(target: Target, *, every: bool) -> Iterator[Heartbeats | None]:
+    """Of all robots, whom a stop of all goes to; within a robot there are none."""
+    _, settings, _, _ = resolve(target)
+    if not every or not isinstance(settings, MqttSettings) or settings.client_id is not None:
+        yield None
+        return
+    with closing(Heartbeats(in_small_segments(settings))) as heartbeats:
+        yield heartbeats
+
+
+def _listen(transport: Transport, filters: list[str]) -> tuple[Listener, threading.Thread]:
+    """Subscribe on a thread, which is returned, too: what the network takes for it must not delay a stop."""
+    listener = Listener(transport, ())
+
+    def subscribe() -> None:
+        with suppress(TransportError):  # closed meanwhile
+            listener.subscribe(transport, filters)
+
+    subscribing = threading.Thread(target=subscribe, name="pebble-estop-subscribe", daemon=True)
+    subscribing.start()
+    return listener, subscribing
+
+
+def _filters(base: str) -> list[str]:
+    return [channel.filter(base) for channel in (ESTOP_STATE, CAPABILITIES, STATUS, ONLINE, *SYNONYMS)]
+
+
+def _until_due(sender: StopSender, *, hears: bool) -> float:
+    due, most = sender.due, _HEARD_S if hears and sender.collecting else _TICK_S
+    return most if due is None else min(most, due - time.monotonic())
+
+
+def _receive(listener: Listener, sender: StopSender, left: float) -> None:
+    """Handle what has arrived; wait for something if nothing has, for ``left`` seconds."""
+    for _ in range(_BATCH):
+        message = listener.next(left)
+        if message is None:
+            return
+        sender.receive(message, time.monotonic())
+        left = 0.0
+
+
+class _Outbox:
+    """Publishes a stop, and knows to which robots it has left."""
+
+    def __init__(self, transport: Transport, sender: StopSender) -> None:
+        self._transport, self._sender = transport, sender
+        self._waiting: set[str] = set()
+        self._left: set[str] = set()
+
+    def publish(self) -> None:
+        send(self._accepts, self._sender.tick(time.monotonic()))  # waits for no acknowledgement
+
+    def has_sent(self, base: str) -> bool:
+        """True once a stop of this robot has arrived at the other end of the connection."""
+        if self._transport.state is State.CONNECTED and not self._transport.outgoing.waiting:
+            self._left |= self._waiting
+            self._waiting.clear()
+        return base in self._left
+
+    def _accepts(self, topic: str, payload: bytes, *, qos: QoS) -> bool:
+        accepted = self._transport.publish(topic, payload, qos=qos, urgent=True)
+        if accepted and topic.count("/") > 2:
+            self._waiting.add("/".join(topic.split("/", 3)[:3]))
+        return accepted
+
+
+class _Report:
+    """Prints a line whenever the stop of a robot has got further."""
+
+    def __init__(self, sender: StopSender, outbox: _Outbox) -> None:
+        self._sender, self._outbox = sender, outbox
+        self._lines: dict[str, str] = {}  # the last one of each robot
+        self._problem = ""
+        self._began = self._updated = time.monotonic()
+        if sender.order.hold:
+            _echo(f"stop {sender.order.name} is held until Ctrl-C; robots stay stopped after it")
+
+    def connection(self, problem: str) -> None:
+        """Warn once of each outage."""
+        if problem and not self._problem:
+            _echo(f"pebble: warning: nothing is sent until there is a connection again: {problem}", err=True)
+        self._problem = problem
+
+    def update(self, now: float) -> None:
+        if now - self._updated >= _REPORT_PERIOD_S:
+            self._updated = now
+            self._print(patient=now - self._began < _QUICK_S)
+
+    def end(self) -> None:
+        sender = self._sender
+        self._print(patient=False)
+        if not sender.robots:
+            _echo("no robot was found: NOTHING IS STOPPED")
+        if sender.omitted:
+            _echo(f"there are more than {len(sender.robots)} robots: the others got the stop, NOT CONFIRMED")
+
+    def _print(self, *, patient: bool) -> None:
+        for base, robot in list(self._sender.robots.items()):
+            line = _line(robot, patient=patient, sent=self._outbox.has_sent(base))
+            if line and robot.driveable is not None and robot.driveable.doubt:
+                line += f"; its status says: {robot.driveable.doubt}"
+            if self._lines.get(base, "") != line:
+                self._lines[base] = line
+                _echo(shown(f"{id_of(base)}: {line}"))
+
+
+def _echo(line: str, *, err: bool = False) -> None:
+    """Print ``line``; a stop is sent on if that fails, because the reader has ended or a disk is full."""
+    try:
+        typer.echo(line, err=err)
+    except OSError:
+        show.discard_output(sys.stderr if err else sys.stdout)
+
+
+def _line(robot: RobotStop, *, patient: bool, sent: bool) -> str:
+    match robot.progress:
+        case Progress.CONFIRMED if not robot.estop.latched:
+            return "was stopped, and reset since"
+        case Progress.CONFIRMED:
+            took = f"after {robot.confirmed_s:.2f} s"
+            if robot.saved:
+                return f"stopped and confirmed {took}"
+            return f"stopped {took}, {'not saved yet' if robot.sending else 'NOT SAVED: a restart frees it'}"
+        case Progress.OLD if robot.sending:
+            return "old firmware: zeros are sent, it cannot be latched"
+        case Progress.OLD:
+            return "old firmware: NOT LATCHED, zeros are no longer sent"
+        case Progress.SPARED:
+            return "does not drive"
+        case Progress.NOT_CONFIRMED:
+            return f"NOT CONFIRMED, no longer sent: {robot.why}"
+    if not sent:
+        return "" if patient else "STOP NOT SENT YET: it waits for the network"
+    return "stop sent" if patient else f"stop sent, not confirmed yet: {robot.why}"
+
+
+# -- reset and status
+
+
+def _reset(target: Target) -> int:
+    with connected(target) as (transport, names), listening(target, transport) as second:
+        view, name = RobotView(names.base), shown(id_of(names.base))
+        robot = view.estop
+        put_names(transport, names, lambda base: base == robot.base and robot.named)
+        robot.subscribe(second)
+        second.subscribe(LINK.topic(robot.base), lambda one: view.receive(LINK, one, 0.0, 0.0), direct=True)
+        wait_for(lambda: robot.has_capabilities, _ANSWER_S)
+        second.ask(robot.missing)  # the capabilities may have come after the subscription
+        wait_for(lambda: not robot.missing, _ANSWER_S)
+        if not robot.states:
+            raise PebbleError(f"{name} publishes no emergency stop: {_absent(robot)}")
+        reset = Reset(robot, me(names.account))
+        _print_states(robot)
+        if not reset.shown:
+            return 0
+        if sys.stdin.isatty() and not typer.confirm(f"Let {name} move again?"):
+            return 1
+        for message in reset.messages():
+            if not transport.publish(message.topic, message.payload, qos=message.qos, urgent=True):
+                raise TransportError(f"the reset was not sent: {transport.problem or 'the connection was lost'}")
+        wait_for(lambda: not reset.waiting, view.pace.answer_s)
+        for owner, why in reset.refusals().items():
+            raise PebbleError(shown(f"{name} is still stopped: {owner}: {why}; look again, then repeat"))
+    typer.echo(f"{name}: free; it moves again once drive commands have paused for half a second")
+    return 0
+
+
+def _status(target: Target, *, every: bool) -> int:
+    with connected(target) as (transport, names):
+        discovery = Discovery()
+
+        def take(message: Message) -> None:
+            discovery.receive(message, time.monotonic(), time.time())
+
+        is_remote = target.remote or str(target.url).startswith("mqtt")  # within a robot there is no heartbeat
+        for channel in (ESTOP_STATE, STATUS, CAPABILITIES, *((ONLINE, LINK) if is_remote else ())):
+            transport.subscribe(channel.filter(names.base), take, direct=True)
+        if not every:
+            wait_for(
+                lambda: names.base in discovery.robots and discovery.robots[names.base].estop.has_capabilities,
+                _ANSWER_S,
+            )
+            transport.ask([topic for robot in discovery.all_robots() for topic in robot.estop.missing])
+        if is_remote:
+            found, began = discovery.all_robots, time.monotonic()
+            wait_for(lambda: not discovery.awaits_heartbeat(time.monotonic() - began), float("inf"))
+            wait_for(lambda: not any(one.liveness.received_at and one.estop.lacks for one in found()), _ANSWER_S)
+        robots = sorted(discovery.all_robots(), key=lambda robot: robot.base)
+    for robot in robots:
+        _print_states(robot.estop, robot.driveable, silent=is_remote and robot.liveness.received_at is None)
+    if not robots:
+        typer.echo("no robot has published an emergency stop or capabilities")
+    return 0 if robots else 1
+
+
+def _print_states(robot: RobotEstop, driveable: Driveable | None = None, *, silent: bool = False) -> None:
+    """One line for a robot that is free or has no emergency stop, else one for each stopped owner.
+
+    ``silent``: it sends no heartbeat now.
+    """
+    name, now = f"{id_of(robot.base)}{': no heartbeat; its last state' if silent else ''}", time.time()
+    lines = [
+        f"{name}: {show.stopped(state, now)} ({owner}{'' if state.persisted else ', NOT SAVED'})"
+        for owner, state in robot.latched.items()
+    ]
+    missing = [owner for owner in robot.owners if owner not in robot.states]
+    if robot.has_capabilities and not robot.available:
+        lines.append(f"{name}: {_absent(robot)}")
+    elif missing or not robot.states:
+        lines.append(f"{name}: unknown, no state of {', '.join(missing) or 'any motor owner'}")
+    lines = lines or [f"{name}: free"]
+    if driveable is not None and driveable.doubt:
+        lines.append(f"{name}: {driveable.doubt}")
+    for line in lines:
+        typer.echo(shown(line))
+
+
+def _absent(robot: RobotEstop) -> str:
+    if robot.old:
+        return "its firmware has none"
+    if robot.has_capabilities and not robot.available:
+        return "its broker refuses it" if robot.drives else "it does not drive"
+    return "is it on, and is this its broker?"

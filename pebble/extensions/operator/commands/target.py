@@ -1,0 +1,67 @@
+"""The options that select where a command connects."""
+
+import functools
+import inspect
+from collections.abc import Callable
+from typing import Any
+
+from pebble.commands.options import CaCert, ConfigOption, PasswordFile, RemoteOption, RobotOption, UrlOption
+
+
+def _option(name: str, option: Any, default: object = None) -> inspect.Parameter:
+    return inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=option)
+
+
+_CONNECTION = (_option("config", ConfigOption), _option("url", UrlOption))
+_ROBOT = (_option("robot", RobotOption),)
+_REMOTE = (_option("remote", RemoteOption, default=False),)
+_CREDENTIALS = (_option("password_file", PasswordFile), _option("ca_cert", CaCert))
+
+
+def with_target(*, program: str = "tool", robot: bool = False) -> Callable[[Callable[..., int]], Callable[..., int]]:
+    """Give a command the options that select where to connect, and pass them to it as its keyword ``target``.
+
+    They take the place of this parameter; the password and the certificate authority come last. ``robot``: there is an
+    option --robot, too, where no argument of the command names a robot.
+    """
+    options = (*_CONNECTION, *(_ROBOT if robot else ()), *_REMOTE)
+
+    def decorate(command: Callable[..., int]) -> Callable[..., int]:
+        @functools.wraps(command)
+        def run(**given: Any) -> int:
+            from pebble.extensions.operator.client.connection import (
+                Target,  # not all commands that use this module connect
+            )
+
+            target = {one.name: given.pop(one.name) for one in (*options, *_CREDENTIALS)}
+            return command(**given, target=Target(**target, program=program))
+
+        signature = inspect.signature(command, eval_str=True)
+        own = list(signature.parameters.values())
+        at = list(signature.parameters).index("target")
+        parameters = [*own[:at], *options, *own[at + 1 :], *_CREDENTIALS]
+        run.__signature__ = signature.replace(parameters=parameters)  # type: ignore[attr-defined]
+        run.__annotations__ = {one.name: one.annotation for one in parameters}
+        return run
+
+    return decorate
+
+
+def broker_of(option: str, url: str, password_file: Path | None, ca_cert: Path | None) -> MqttSettings:
+    """Return the settings of the MQTT broker that an option names. Raises PebbleError."""
+    from pebble.config.text_files import password
+    from pebble.extensions.operator.client.url import (  # not all commands that use this module connect
+        FORMS,
+        UrlError,
+        settings_of,
+    )
+    from pebble.transports import MqttSettings
+
+    forms = "mqtt://HOST[:PORT] or mqtts://…"
+    try:
+        _, settings = settings_of(url, password=password(password_file), password_file=password_file, ca_cert=ca_cert)
+    except UrlError as error:
+        raise UrlError(str(error).replace("--url", option).replace(FORMS, forms)) from None
+    if not isinstance(settings, MqttSettings):
+        raise UrlError(f"{option} must be {forms}")
+    return settings

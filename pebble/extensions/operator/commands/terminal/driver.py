@@ -1,0 +1,160 @@
+"""Drives one robot with the keys of a terminal: what is sent, and what is shown. Pure.
+
+A person at a terminal drives by the rules of a page, `DrivenRobot`: a key that is held is a gesture. A terminal repeats
+it and does not report its release: it counts as held for HELD_S after its last repetition.
+"""
+
+from collections.abc import Sequence
+
+from pebble import contract as c
+from pebble.contract import channel_of, codec
+from pebble.extensions.operator.client.drive_reasons import first_reason, words
+from pebble.extensions.operator.client.estop import StopSender, new_name
+from pebble.extensions.operator.client.names import id_of
+from pebble.extensions.operator.client.robot_view import RobotView
+from pebble.extensions.operator.client.terminal.key_decoder import DOWN, ESCAPE, LEFT, RIGHT, SPACE, UP
+from pebble.extensions.page.drive.driven_robot import SILENCE_S, Command, DrivenRobot, State, Tab
+from pebble.extensions.page.messages import DriveOp
+from pebble.transports import Message
+
+HELD_S, PERIOD_S = 0.4, 0.05  # a key after its last repetition; between two commands
+_BURST = 8  # as many keys at once were held back on the way, and are old
+_TWICE_S = 0.6  # between two presses of Escape
+_AXES = {
+    "w": ("z", 1), UP: ("z", 1), "s": ("z", -1), DOWN: ("z", -1),
+    "d": ("x", 1), RIGHT: ("x", 1), "a": ("x", -1), LEFT: ("x", -1),
+    "q": ("y", 1), "e": ("y", -1),
+}  # fmt: skip
+
+
+class TerminalDriver:
+    """One person at one terminal. Pass messages to :meth:`receive`, keys to :meth:`press`; publish what is returned.
+
+    ``heartbeat``: whether the robot sends one on this connection. Times are seconds of one monotonic clock that goes
+    on while the machine is suspended.
+    """
+
+    def __init__(self, base: str, *, by: str, device: str, speed: float, turn: float, heartbeat: bool) -> None:
+        self.robot, self.name = RobotView(base), id_of(base)
+        self.stop: StopSender | None = None
+        self._driven, self._tab = DrivenRobot(base, lambda: self.robot, set()), Tab("", by.partition("@")[0], device)
+        self._by, self._speed, self._turn, self._heartbeat = by, speed, turn, heartbeat
+        self._willing = True  # to have control as soon as it is free
+        self._held: dict[str, tuple[int, float]] = {}  # by axis: the direction, and when its key last arrived
+        self._gesture, self._pressed, self._reason, self._note = 0, False, "", ""
+        self._key_at = self._ticked_at = self._escape_at = float("-inf")
+        self._out, self._failures = list[Command](), list[str]()  # the latter of the newest request for control
+
+    @property
+    def filters(self) -> list[str]:
+        """The topics that :meth:`receive` needs; within the robot there is no link."""
+        channels = (c.ESTOP_STATE, c.CONTROL_STATE, c.CAPABILITIES, c.ONLINE, c.CHARGING_LEVEL, c.AUTONOMY_STATUS)
+        return [channel.filter(self.robot.base) for channel in (*channels, *([c.LINK] if self._heartbeat else []))]
+
+    def receive(self, message: Message, now: float, wall: float) -> None:
+        self.robot.receive(channel_of(message.topic.removeprefix(f"{self.robot.base}/")), message, now, wall)
+        if self.stop is not None:
+            self.stop.receive(message, now)
+
+    def press(self, keys: Sequence[str], now: float) -> None:
+        """Take the keys that were read; the newest one of an axis counts."""
+        for key in keys:
+            if key == "!" or (key == ESCAPE and now - self._escape_at <= _TWICE_S):
+                self._begin_stop(now)
+            elif key in (SPACE, "l"):
+                self.end(now, leave=key == "l")
+                self._out += self._driven.stop(now)
+            elif key in ("t", "o"):
+                self._take(now, over=key == "o")
+            elif key in _AXES:
+                axis, direction = _AXES[key]
+                self._held[axis], self._key_at, self._willing = (direction, now), now, True
+            elif not key.isascii():
+                self._note = f"this keyboard types {key}: W A S D need a Latin layout; the arrows drive, too"
+            self._escape_at = now if key == ESCAPE else self._escape_at
+        if len(keys) >= _BURST:
+            self.end(now)
+
+    def tick(self, now: float, problem: str = "") -> list[Message]:
+        """Return what to publish now; to be called every PERIOD_S. ``problem``: why there is no connection."""
+        if now - self._ticked_at > SILENCE_S:  # this process stood still
+            self.end(now)
+        self._ticked_at = now
+        self._tab.clock.echo(self._tab.clock.ping(now), 1000 * now, now)  # no network is between keys and driver
+        view = self._driven.shown(self._tab, now)
+        known = self._driven.published is not None if view.keeps else self.robot.situation(now).published
+        if self._willing and known and not view.by and not view.asking:
+            self._take(now, over=False)
+        self._out += self._driven.update(now)
+        self._reason = f"no connection: {problem}" if problem else self._why_not(now)
+        self._drive(now)
+        zeros, requests = self._driven.tick(now)
+        topic, commands, self._out = self.robot.estop.drive_topic, [*self._out, *zeros], []
+        drives = [Message(topic, codec.encode(c.DRIVE, command.drive), command.qos) for command in commands]
+        return [*(self.stop.tick(now) if self.stop else []), *drives, *([] if problem else requests)]
+
+    def end(self, now: float, *, leave: bool = False) -> None:
+        """End the gesture for good, and with ``leave`` control; the pause before the next one begins now."""
+        self._out += self._tab.interrupt(self._gesture, now)
+        self._pressed, self._key_at = True, now
+        if leave:
+            self._willing = False
+            self._out += self._driven.release(self._tab, now)
+
+    @property
+    def unconfirmed(self) -> str:
+        """It is why an emergency stop from here is not confirmed; empty if none is pending."""
+        return "" if self.stop is None or self.stop.confirmed else self.stop.robots[self.robot.base].why
+
+    def status(self) -> str:
+        """Return one line: what is sent, or why nothing is, and what is known. Parts of it come from others."""
+        view, robot = self._driven.shown(self._tab, self._ticked_at), self.robot
+        x, z, _ = self._wanted(self._ticked_at)
+        idle = self._reason or ("let go first" if self._pressed else "ready")
+        parts = (
+            self.name,
+            f"driving x {x:+.2f} z {z:+.2f}" if self._driven.state is State.MOVING else idle,
+            self.unconfirmed and f"EMERGENCY STOP NOT CONFIRMED: {self.unconfirmed}",
+            f"{view.asks} asks for control: l lets {view.asks} drive" if view.you and view.asks else "",
+            *([] if view.you else self._failures),
+            "" if robot.volts is None else f"{robot.volts:.1f} V",
+            "" if not robot.slow_s else f"slow connection: commands take {robot.slow_s:.1f} s",
+            self._note,
+        )
+        return " · ".join(filter(None, parts))
+
+    def _take(self, now: float, *, over: bool) -> None:
+        self._willing, self._failures = False, []
+        self._out += self._driven.take(self._tab, now, lambda: None, self._failures.append, over=over)
+
+    def _drive(self, now: float) -> None:
+        """Send a command of the gesture, or a zero at its end."""
+        x, z, y = self._wanted(now)
+        moves = bool(x or z or y)
+        self._gesture += moves and not self._pressed
+        self._pressed = moves or (self._pressed and now - self._key_at < HELD_S)
+        if moves or self._driven.state is State.MOVING:
+            op = DriveOp(ref=self.robot.base, g=self._gesture, t=1000 * now, x=x, z=z, y=y)
+            self._out += self._driven.drive(self._tab, op, now, self._reason)[0]
+
+    def _why_not(self, now: float) -> str:
+        """Return the reason against driving; empty if there is none."""
+        view, sends = self._driven.shown(self._tab, now), self.stop is not None and not self.stop.finished
+        situation = self.robot.situation(now)._replace(driven=view.by != "" and not view.you, listening=not view.you)
+        situation = situation._replace(stopping=sends, online=situation.online if self._heartbeat else True)
+        who = f"{view.by} ({view.device}{', ' * bool(view.device)}name {'' if view.checked else 'not '}checked)"
+        return words(first_reason(situation), self.name, stopped=self.robot.stopped_by, driven=who)
+
+    def _wanted(self, now: float) -> tuple[float, float, float]:
+        """Return x, z and y by the keys that are held."""
+        held = {axis: direction for axis, (direction, at) in self._held.items() if now - at < HELD_S}
+        turn, speed, up = self._turn * held.get("x", 0), self._speed * held.get("z", 0), self._speed * held.get("y", 0)
+        most = max(1.0, abs(speed + turn), abs(speed - turn))  # no wheel is faster than 1
+        return round(turn / most, 3) + 0.0, round(speed / most, 3) + 0.0, round(up, 3) + 0.0
+
+    def _begin_stop(self, now: float) -> None:
+        self.end(now)
+        if self.stop is None or self.stop.finished:
+            self.stop = StopSender(new_name(), by=self._by, why="", now=now, robots=[self.robot.base])
+            for message in self.robot.remembered.values():
+                self.stop.receive(message, now)

@@ -1,0 +1,244 @@
+"""``pebble topic``: list, print, publish and measure messages, on either transport."""
+
+from __future__ import annotations
+
+import math
+import shutil
+import sys
+import time
+from functools import cache
+from typing import Annotated
+
+import typer
+
+from pebble.config.visible import shown
+from pebble.contract import DRIVE, codec
+from pebble.contract.identity import parse_topic
+from pebble.errors import PayloadError, PebbleError, TransportError
+from pebble.extensions.media.rate_meter import RateMeter
+from pebble.extensions.operator.client.connection import Listener, Target, connected, put_names, subscribed_stop
+from pebble.extensions.operator.client.estop_states import RobotEstop
+from pebble.extensions.operator.client.names import Names, id_of
+from pebble.extensions.operator.commands.draft import Draft, draft
+from pebble.extensions.operator.commands.target import with_target
+from pebble.extensions.operator.commands.terminal import show
+from pebble.extensions.operator.commands.topic_contract import contract
+from pebble.transports import QoS, Transport
+from pebble.transports.topics import is_pattern
+
+_TICK_S = 0.2
+_REPORT_PERIOD_S = 1.0
+
+Name = Annotated[
+    str,
+    typer.Argument(
+        help="A metric (drive-values, outgoing/online) or a whole topic; + and # except with pub.",
+        metavar="TOPIC",
+        show_default=False,
+    ),
+]
+SecondsOption = Annotated[float | None, typer.Option("--seconds", "-s", min=0.1, help="Stop after this long.")]
+WindowOption = Annotated[int, typer.Option("--window", "-w", min=2, help="Number of newest messages to measure.")]
+
+_GROUP_HELP = """List, print, publish and measure messages, on either transport.
+
+\b
+    pebble topic list -c goob.json
+    pebble topic echo online -c goob.json --remote
+    pebble topic pub drive-values '{"z": 0.3}' -c goob.json --rate 10 -n 20
+    pebble topic hz touch-sensors --url mqtt://127.0.0.1 -r fred
+    pebble topic contract
+"""
+
+
+def register(app: typer.Typer) -> None:
+    group = typer.Typer(help=_GROUP_HELP, rich_markup_mode=None)
+    for command in (list_, echo, pub, hz, contract):
+        group.command(command.__name__.rstrip("_"))(command)
+    app.add_typer(group, name="topic")
+
+
+@with_target(robot=True)
+def list_(
+    filter_: Annotated[str | None, typer.Argument(help="Only topics that match.", metavar="FILTER")] = None,
+    seconds: Annotated[float, typer.Option("--seconds", "-s", min=0.1, help="How long to receive.")] = 2.0,
+    *,
+    target: Target,
+) -> int:
+    """List topics: whether retained, rate, size and age.
+
+    \b
+        pebble topic list -c goob.json
+        pebble topic list 'pebble/+/+/outgoing/#' --url mqtt://127.0.0.1 -s 5
+    """
+    with connected(target) as (transport, names):
+        listing = show.Listing(names)
+        listener = Listener(transport, [filter_ or ("#" if target.robot is None else f"{names.base}/#")])
+        end = time.monotonic() + seconds
+        while (left := end - time.monotonic()) > 0:
+            message = listener.next(left)
+            if message is not None:
+                listing.add(message, time.monotonic())
+        show.print_listing(listing, time.monotonic(), time.time())
+        for line in show.remarks(listing, time.time()):
+            typer.echo(line)
+    return 0 if listing.records else 1
+
+
+@with_target(robot=True)
+def echo(
+    topic: Name,
+    count: Annotated[int | None, typer.Option("--count", "-n", min=1, help="Stop after this many.")] = None,
+    seconds: SecondsOption = None,
+    raw: Annotated[bool, typer.Option("--raw", help="Only unchanged payloads, one per line.")] = False,
+    *,
+    target: Target,
+) -> int:
+    """Print messages as they arrive.
+
+    JSON is formatted; of a binary payload the first bytes are printed as a hex dump. If the robot is stopped by an
+    emergency stop, the first line shows it.
+
+    \b
+        pebble topic echo drive-values -c goob.json
+        pebble topic echo '+/+/+/outgoing/online' --url mqtt://127.0.0.1 -n 4
+        pebble topic echo capabilities -c goob.json --raw -n 1 | jq .value.drive
+    """
+    printed = 0
+    with connected(target) as (transport, names):
+        robot = _estop(transport, names, topic)
+        if robot is not None and robot.stopped_by is not None:
+            typer.echo(f"pebble: {show.stopped_line(robot, time.time())}", err=True)
+        listener = Listener(transport, names.filters(topic))
+        end = _end(seconds)
+        while time.monotonic() < end and printed != count:
+            message = listener.next(min(_TICK_S, end - time.monotonic()))
+            if message is None:
+                continue
+            printed += 1
+            if raw:
+                sys.stdout.buffer.write(message.payload + b"\n")
+                sys.stdout.buffer.flush()
+            else:
+                typer.secho(show.headline(message, time.time()), dim=True)
+                typer.echo(show.body(message.payload, shutil.get_terminal_size().columns))
+        _warn_of_dropped(listener)
+    return 0 if printed else 1
+
+
+@with_target(robot=True)
+def pub(
+    topic: Name,
+    payload: Annotated[str, typer.Argument(help="JSON, any text, or @FILE.", metavar="PAYLOAD", show_default=False)],
+    retain: Annotated[
+        bool | None,
+        typer.Option("--retain/--no-retain", help="Retain it for later subscribers. [default: the contract's rule]"),
+    ] = None,
+    qos: Annotated[int | None, typer.Option(min=0, max=1, help="[default: the contract's rule]")] = None,
+    force: Annotated[
+        bool, typer.Option("--force", help="Publish even a retained command, and to a stopped robot.")
+    ] = False,
+    rate: Annotated[float | None, typer.Option("--rate", min=0.01, help="Repeat this many times a second.")] = None,
+    count: Annotated[
+        int | None, typer.Option("--count", "-n", min=1, help="Stop after this many, with --rate.")
+    ] = None,
+    *,
+    target: Target,
+) -> int:
+    """Publish a message once, or repeatedly.
+
+    A robot stops 0.75 s after the last drive command: repeat it with --rate. A robot that is stopped by an emergency
+    stop is not driven. An empty payload with --retain removes the retained message.
+
+    \b
+        pebble topic pub drive-values '{"z": 0.5}' -c goob.json --rate 10 -n 20
+        pebble topic pub flags/mqtt-video true -c fred.json
+        pebble topic pub lights-flash @party.json --url mqtt://127.0.0.1 -r goob
+    """
+    with connected(target) as (transport, names):
+        message = draft(names, topic, payload, retain=retain, qos=qos, force=force)
+        for warning in message.warnings:
+            typer.echo(f"pebble: warning: {warning}", err=True)
+        robot = cache(lambda: _estop(transport, names, message.topic))
+        estop = robot() if not force and _moves(names, message) else None
+        if not force:
+            put_names(transport, names, lambda _base: (one := robot()) is not None and one.named)
+        for number in range(1 if rate is None else count or sys.maxsize):
+            if number:
+                time.sleep(1 / (rate or 1))
+            _refuse_stopped(estop)
+            if not transport.publish(
+                message.topic, message.payload, qos=QoS(message.qos), retain=message.retain, shared=True
+            ):
+                raise TransportError(
+                    f"{message.topic} was not published: {transport.problem or 'the connection was lost'}"
+                )
+    return 0
+
+
+@with_target(robot=True)
+def hz(topic: Name, window: WindowOption = 100, seconds: SecondsOption = None, *, target: Target) -> int:
+    """Print once a second how often messages arrive, and how many payload bytes. Retained messages do not count.
+
+    \b
+        pebble topic hz online -c goob.json --remote
+        pebble topic hz front-camera --url mqtt://127.0.0.1 -r goob
+    """
+    meter = RateMeter(window_s=math.inf, limit=window + 1)
+    with connected(target) as (transport, names):
+        listener = Listener(transport, names.filters(topic))
+        end, report_at, reported = _end(seconds), time.monotonic() + _REPORT_PERIOD_S, 0
+        while time.monotonic() < end:
+            message = listener.next(min(end, report_at) - time.monotonic())
+            if message is not None and not message.retain:
+                meter.add(time.monotonic(), len(message.payload))
+            if time.monotonic() >= min(end, report_at):
+                report_at += _REPORT_PERIOD_S
+                _print_rate(meter, silent=meter.count == reported)
+                reported = meter.count
+        _warn_of_dropped(listener)
+    return 0 if meter.count else 1
+
+
+def _print_rate(meter: RateMeter, *, silent: bool) -> None:
+    line = show.rate_line(meter, time.monotonic())
+    if silent or line is None:
+        line = "no new messages" if meter.count != 1 else "one message so far"
+    typer.echo(line)
+    sys.stdout.flush()
+
+
+def _moves(names: Names, message: Draft) -> bool:
+    """Whether it would move a robot."""
+    if names.channel(message.topic) is not DRIVE:
+        return False
+    try:
+        return bool(codec.decode(DRIVE, message.payload).moves)
+    except PayloadError:  # robots refuse it, or have other rules: treat it as a command that moves
+        return True
+
+
+def _refuse_stopped(robot: RobotEstop | None) -> None:
+    if robot is not None and robot.stopped_by is not None:
+        raise PebbleError(
+            f"{show.stopped_line(robot, time.time())}; it is not driven (--force publishes anyway). "
+            f"To end the stop: pebble estop reset {shown(id_of(robot.base))}, with the same --url or --config"
+        )
+
+
+def _estop(transport: Transport, names: Names, topic: str) -> RobotEstop | None:
+    """The emergency stop of the one robot that ``topic`` belongs to, as retained; None for several robots."""
+    address = parse_topic(topic)
+    base = names.base if address is None else address.identity.base
+    if is_pattern(base):
+        return None
+    return subscribed_stop(transport, base)
+
+
+def _warn_of_dropped(listener: Listener) -> None:
+    if listener.dropped:
+        typer.echo(f"pebble: warning: {listener.dropped} messages arrived faster than they were printed", err=True)
+
+
+def _end(seconds: float | None) -> float:
+    return float("inf") if seconds is None else time.monotonic() + seconds

@@ -1,0 +1,213 @@
+"""``pebble web``: serves the operator page."""
+
+from __future__ import annotations
+
+import getpass
+import signal
+import sys
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import msgspec
+import typer
+from typer.core import TyperCommand, TyperGroup
+
+from pebble.commands.options import BrokerUrl, CaCert, PasswordFile, broker_of, host_of
+from pebble.config import load
+from pebble.config.hosts import is_loopback, name_of_page
+from pebble.contract.names import NAME
+from pebble.errors import PebbleError
+from pebble.extensions.fleet.certificates import CA_CERT, SERVER_CERT, SERVER_KEY, own_names
+from pebble.extensions.fleet.people import has_user
+from pebble.extensions.operator.client.page_packages import require_packages
+from pebble.extensions.page.commands.people import PEOPLE, TLS, PeopleOption, default_folder, register_people
+from pebble.extensions.page.config import WebTls
+from pebble.runtime.connections import REMOTE_RECONNECT_S
+from pebble.transports import MqttSettings
+
+if TYPE_CHECKING:
+    from pebble.extensions.page.setting import WebSettings
+
+Host = Annotated[
+    str | None,
+    typer.Option(help="Address to listen on; 0.0.0.0 is all of this machine. [default: 127.0.0.1]", metavar="HOST"),
+]
+Port = Annotated[
+    int | None, typer.Option(help="TCP port; 0 is a free one. [default: 8080]", metavar="PORT", min=0, max=65535)
+]
+
+
+def serve(
+    config: Annotated[
+        Path | None,
+        typer.Argument(
+            help="A robot's config file: its broker, and web_interface.", metavar="CONFIG", show_default=False
+        ),
+    ] = None,
+    url: BrokerUrl = None,
+    password_file: PasswordFile = None,
+    ca_cert: CaCert = None,
+    host: Host = None,
+    port: Port = None,
+    tls: Annotated[
+        Path | None, typer.Option(help="Folder with the certificates of `pebble cert init`.", metavar="FOLDER")
+    ] = None,
+    name: Annotated[
+        list[str] | None,
+        typer.Option(help="A further host name by which browsers may address the page; repeatable.", metavar="NAME"),
+    ] = None,
+    people: PeopleOption = None,
+    recordings: Annotated[
+        Path | None, typer.Option(help="Folder of `pebble record`, to look at on the page.", metavar="DIR")
+    ] = None,
+) -> int:
+    """Serve the operator page: drive, stop and watch robots in a browser, also on a phone.
+
+    On this machine it needs no login. For others it needs a certificate and a user; without them it does not start,
+    and prints the commands that make them.
+
+    \b
+        pebble web goob.json
+        pebble web --url mqtt://127.0.0.1
+        pebble web goob.json --host 0.0.0.0
+        pebble web user --help       who may use it
+        pebble web audit             who did what
+    """
+    if (config is None) == (url is None):
+        raise PebbleError("which robots is missing: name either a robot's config file or --url mqtt://BROKER")
+    require_packages()
+    folder = None if tls is None else tls.absolute()
+    empty = folder is not None and not all((folder / file).is_file() for file in (SERVER_CERT, SERVER_KEY))
+    if recordings is not None and not recordings.is_dir():
+        raise PebbleError(f"--recordings {recordings}: there is no such folder")
+    options = {
+        "host": None if host is None else host_of("--host", host),
+        "port": port,
+        "names": tuple(host_of("--name", one, name_of_page) for one in name or ()),
+        "people": people,
+        "recordings": recordings,
+    }
+    if url is not None:
+        broker = replace(broker_of("--url", url, password_file, ca_cert), reconnect_max_s=REMOTE_RECONNECT_S)
+        settings, plain = _of_url(broker, options, None if empty else folder), False
+    else:
+        settings, plain = _of_config(Path(str(config)), options, None if empty else folder)
+    if missing := _missing(settings, plain=plain, empty=empty):
+        _print_missing(settings, missing, folder or default_folder() / TLS)
+        return 2
+    return _run(settings)
+
+
+class _Group(TyperGroup):
+    """``pebble web CONFIG`` is ``pebble web serve CONFIG``."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        return super().parse_args(ctx, args if args and args[0] in self.commands else ["serve", *args])
+
+
+class _Serve(TyperCommand):
+    """Its help shows the command line without ``serve``."""
+
+    def format_usage(self, ctx: Any, formatter: Any) -> None:
+        formatter.write_usage(ctx.parent.command_path, " ".join(self.collect_usage_pieces(ctx)))
+
+
+def register(app: typer.Typer) -> None:
+    group = typer.Typer(cls=_Group, help="Serve the operator page.", rich_markup_mode=None)
+    group.command("serve", cls=_Serve)(serve)
+    register_people(group)
+    app.add_typer(group, name="web")
+
+
+# -- settings
+
+
+def _of_url(broker: MqttSettings, options: dict[str, Any], folder: Path | None) -> WebSettings:
+    from pebble.extensions.page.setting import WebSettings
+
+    given = {key: value for key, value in options.items() if value is not None}
+    settings = WebSettings(**{"broker": broker, "people": default_folder() / PEOPLE, **given})
+    folder = folder or _default_tls_folder(settings.host)
+    if folder is not None:
+        settings = replace(
+            settings, certificate=folder / SERVER_CERT, key=folder / SERVER_KEY, authority=folder / CA_CERT
+        )
+    return replace(settings, login=settings.certificate is not None or not is_loopback(settings.host))
+
+
+def _of_config(file: Path, options: dict[str, Any], folder: Path | None) -> tuple[WebSettings, bool]:
+    """The settings, and whether the config allows plain http."""
+    from pebble.extensions.page.run import settings_or_all_problems
+
+    config = load(file)
+    web = config.web_interface
+    given = {key: value for key, value in options.items() if value is not None}
+    given["names"] = (*web.names, *options["names"])
+    web = msgspec.structs.replace(web, **given)
+    if folder is None and web.tls.certificate is None and not web.plain_http:
+        folder = _default_tls_folder(web.host)
+    if folder is not None:
+        tls = WebTls(certificate=folder / SERVER_CERT, key=folder / SERVER_KEY, ca=folder / CA_CERT)
+        web = msgspec.structs.replace(web, tls=tls)
+    allowed = msgspec.structs.replace(web, plain_http=True)  # what is missing is reported with the commands for it
+    settings = settings_or_all_problems(msgspec.structs.replace(config, web_interface=allowed))
+    # `pebble web user add ann` does not know the config: its people count until the robot's own page has some.
+    shared = default_folder() / PEOPLE
+    if settings.login and web.people is None and not has_user(settings.people) and has_user(shared):
+        settings = replace(settings, people=shared)
+    return settings, web.plain_http
+
+
+def _default_tls_folder(host: str) -> Path | None:
+    folder = default_folder() / TLS
+    return folder if not is_loopback(host) and (folder / SERVER_CERT).is_file() else None
+
+
+def _missing(settings: WebSettings, *, plain: bool, empty: bool) -> list[str]:
+    """Those of "certificate" and "user" that are needed and not there. ``empty``: --tls names a folder without one."""
+    if not settings.login and not empty:
+        return []
+    missing = [] if (settings.certificate is not None or plain) and not empty else ["certificate"]
+    return missing if has_user(settings.people) else [*missing, "user"]
+
+
+def _print_missing(settings: WebSettings, missing: list[str], folder: Path) -> None:
+    others = (
+        f"other machines reach {settings.host}" if not is_loopback(settings.host) else "a page with --tls has a login"
+    )
+    lines = [f"pebble: {others}, so the page needs a {' and a '.join(missing)}:"]
+    if "certificate" in missing:
+        lines.append(f"    pebble cert init --folder {folder} {' '.join(own_names())}")
+    if "user" in missing:
+        lines.append(f"    pebble web user add {_me()} --role admin --people {settings.people}")
+    repeated = " ".join(sys.argv[1:])
+    tls = "" if "--tls" in repeated or "certificate" not in missing else f" --tls {folder}"
+    typer.echo("\n".join([*lines, f"    pebble {repeated}{tls}"]), err=True)
+
+
+def _me() -> str:
+    try:
+        user = getpass.getuser().lower()
+    except (KeyError, OSError):
+        user = ""
+    return user if NAME.fullmatch(user) else "alice"
+
+
+def _run(settings: WebSettings) -> int:
+    from pebble.extensions.page.serve import run
+
+    if hasattr(signal, "SIGHUP"):  # the terminal was closed: end as with Ctrl-C, which stops what pages move
+        signal.signal(signal.SIGHUP, lambda *_: signal.raise_signal(signal.SIGINT))
+    return run(settings, on_ready=lambda url: _print_ready(settings, url))
+
+
+def _print_ready(settings: WebSettings, url: str) -> None:
+    typer.echo(f"The operator page is at {url} (Ctrl-C ends it)")
+    if settings.login:
+        typer.echo(f"Who may log in is in {settings.people}")
+    if settings.authority is not None and settings.authority.is_file():
+        show = f"pebble cert show --folder {settings.authority.parent}"
+        typer.echo(f"Browsers must trust {url}ca.pem once; `{show}` explains how")
+    elif settings.login and settings.certificate is None:
+        typer.echo("pebble: it is not encrypted: everybody on the network can read passwords and pictures", err=True)

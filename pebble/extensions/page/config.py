@@ -1,0 +1,69 @@
+"""The config sections of the operator page: where it listens, who may use it, and the robot's service that runs it."""
+
+from typing import Annotated, ClassVar
+
+from pebble.config.hosts import is_loopback
+from pebble.config.transport import RemoteMqtt
+from pebble.config.types import (
+    UNIT,
+    File,
+    Host,
+    Level,
+    NameOfPage,
+    Port,
+    Section,
+    ServiceSection,
+    doc,
+)
+
+
+class WebHandler(ServiceSection, frozen=True, kw_only=True):
+    """Runs the operator page on the robot; `web_interface` sets it up. It needs `pip install 'pebble-robot[web]'`."""
+
+    retired: ClassVar = {"env": UNIT}
+
+
+class WebTls(Section, frozen=True, kw_only=True):
+    """The certificate that the page shows to browsers; `pebble cert init` makes one."""
+
+    certificate: Annotated[File | None, doc("Certificate of the server; with it the page is https.")] = None
+    key: Annotated[File | None, doc("Private key of certificate.")] = None
+    ca: Annotated[File | None, doc("Authority of certificate, offered at `/ca.pem` so that phones can trust it.")] = (
+        None
+    )
+
+
+class WebInterface(Section, frozen=True, kw_only=True):
+    """The operator page, of `pebble web CONFIG` and of `services.web_handler`."""
+
+    retired: ClassVar = {
+        **dict.fromkeys(("robots", "robot_discovery"), "robots are found by their messages, and named by `robot.name`"),
+        "mqtt_history": "`services.recorder` records into files",
+        "log_level": "the one of the file is for all services",
+    }
+
+    host: Annotated[
+        Host, doc("Address to listen on; one that other machines reach needs tls and a user (`pebble web user add`).")
+    ] = "127.0.0.1"
+    port: Annotated[Port, doc("TCP port to listen on.")] = 8080
+    names: Annotated[tuple[NameOfPage, ...], doc("Further host names and addresses that browsers may use for it.")] = ()
+    server: Annotated[Level | None, doc("What it is called on pages and for other servers; unset: this machine.")] = (
+        None
+    )
+    tls: Annotated[WebTls, doc("The page's certificate.")] = WebTls()
+    people: Annotated[File | None, doc("Database of users and sessions; unset: in the robot's state directory.")] = None
+    plain_http: Annotated[
+        bool, doc("Serve other machines without encryption: everybody on the network can read passwords and pictures.")
+    ] = False
+    plain_http_drive: Annotated[bool, doc("Allow driving from there, too.")] = False
+    mqtt: Annotated[
+        RemoteMqtt, doc("The broker that robots connect to; without host: services.mqtt_bridge.remote_mqtt.")
+    ] = RemoteMqtt()
+    recordings: Annotated[
+        File | None, doc("Folder of recordings to look at on the page; unset: that of services.recorder, if it runs.")
+    ] = None
+
+    @property
+    def local(self) -> bool:
+        """Whether only this machine can reach it."""
+        return is_loopback(self.host)

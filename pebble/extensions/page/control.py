@@ -1,0 +1,383 @@
+"""The control socket of one page: what it asks for, and the state that it is sent."""
+
+import asyncio
+import secrets
+import time
+from collections import deque
+from collections.abc import Callable
+from contextlib import suppress
+from typing import Any
+
+import msgspec
+from starlette.websockets import WebSocket, WebSocketDisconnect, WebSocketState
+
+from pebble.extensions.fleet.database import DatabaseError
+from pebble.extensions.fleet.roles import Session, page_rights
+from pebble.extensions.operator.client.drive_reasons import WORDS
+from pebble.extensions.operator.client.estop_states import Reset
+from pebble.extensions.page import messages as m
+from pebble.extensions.page import robot_commands
+from pebble.extensions.page.access.login import named, printable
+from pebble.extensions.page.drive.driven_robot import Tab
+from pebble.extensions.page.log_lines import LogReader
+from pebble.extensions.page.pace import STOP_WAITS_S, Pace
+from pebble.extensions.page.page_clock import PING_S, ClockJumpError
+from pebble.extensions.page.robots import Interest
+from pebble.extensions.page.server import Server, encode
+from pebble.transports.clock import since_boot as clock
+
+FLUSH_S = 0.05  # between two states
+HELLO_S = 5.0  # to begin with
+CHECK_S = 5.0  # between two looks at whether the session still exists, while no person and no session changes
+_WATCH_COST = 20  # it subscribes to so many topics
+_WAITING = 64  # messages that wait to be sent, besides the state
+_NOT_NOTED = ("op", "ref", "n", "config")  # settings of a script may be secret
+
+_decoder = msgspec.json.Decoder(m.FromPage)
+
+
+class Leave(Exception):  # noqa: N818 - not an error
+    """The server ends this connection; the page may connect anew."""
+
+
+class Control:
+    """One connection, accepted and with a session; ``serve`` returns when it has ended."""
+
+    def __init__(
+        self, server: Server, websocket: WebSocket, session: Session, check: Callable[[], Session | None]
+    ) -> None:
+        """``check`` returns the session as it is now; None: it was revoked."""
+        self._server, self._websocket, self._session, self._check = server, websocket, session, check
+        self._tab = Tab(secrets.token_urlsafe(12), session.user, "")
+        self._interest = Interest(lambda: self._wake.set())
+        self._wake = asyncio.Event()
+        self._pace = Pace(time.monotonic())
+        self._waiting: deque[m.ToPage] = deque(maxlen=_WAITING)
+        self._why_not = ""  # why this page may not drive at all
+        self._logs = LogReader()
+        self._large_due = False  # whether the page has received the last large value
+        self._moved: set[str] = set()  # robots that this lease has moved, for the audit
+
+    async def serve(self) -> None:
+        """Until the page or the server ends it. What the page moved has been stopped then."""
+        sender: asyncio.Task[None] | None = None
+        try:
+            self._begin(await asyncio.wait_for(self._receive(), HELLO_S))
+            sender = asyncio.ensure_future(self._send_all())
+            while not sender.done():
+                op = await self._receive()
+                wait_s = self._pace.take(_WATCH_COST if isinstance(op, m.Watch) else 1, time.monotonic())
+                if wait_s:
+                    await asyncio.sleep(min(wait_s, STOP_WAITS_S) if isinstance(op, m.EstopOp | m.StopOp) else wait_s)
+                try:
+                    self._handle(op)
+                except DatabaseError as error:
+                    self._refuse(op, f"The server cannot store this: {error.why}")
+        except Leave as reason:
+            await self._leave(reason)
+        except TimeoutError:
+            await self._leave(Leave("no hello"))
+        except ClockJumpError as error:
+            await self._leave(Leave(str(error)))
+        except (WebSocketDisconnect, RuntimeError):
+            pass  # the page has gone
+        finally:
+            try:
+                self._end()
+            finally:
+                if sender is not None:
+                    sender.cancel()
+                    await asyncio.gather(sender, return_exceptions=True)
+
+    # -- begin and end
+
+    def _begin(self, hello: Any) -> None:
+        if not isinstance(hello, m.Hello):
+            raise Leave("the first message must be hello")
+        server, settings = self._server, self._server.settings
+        self._tab.device = printable(hello.device)
+        if not settings.login:
+            self._session = named(self._session, hello.name)
+            self._tab.user = self._session.user
+        drives = settings.plain_http_drive or self._is_secure()
+        version = self._websocket.app.state.version
+        if not drives:
+            self._why_not = WORDS["plain"]
+        elif hello.version != version:
+            self._why_not = WORDS["reload"]
+        self._post(
+            m.Welcome(
+                server=settings.name,
+                version=version,
+                user=self._session.user,
+                role=self._session.role,
+                rights=tuple(sorted(self._rights())),
+                named_rights=tuple(sorted(page_rights(self._session.role, "named"))),
+                login=settings.login,
+                token=self._tab.token,
+                now=1000 * time.time(),
+                drives=drives,
+                words=WORDS,
+                recordings=settings.recordings is not None,
+            )
+        )
+        if "drive" in self._rights():
+            server.drivers.restore(hello.token, self._tab)
+        server.robots.join(self._interest)
+        self._interest.dirty |= {(ref, "web/driver") for ref in server.robots.components}
+        self._post(self._ping())
+
+    def _end(self) -> None:
+        self._server.robots.leave(self._interest)
+        try:
+            self._server.drivers.closed(self._tab)
+        finally:
+            if self._interest.watched:
+                self._server.unwatch(self._interest.watched)
+
+    async def _leave(self, reason: Leave) -> None:
+        self._end_leases()
+        try:
+            await self._websocket.send_text(encode(m.Bye(why=str(reason), again=True)))
+            await self._websocket.close(4000)
+        except (WebSocketDisconnect, RuntimeError):
+            pass  # it has gone already
+
+    def _end_leases(self) -> None:
+        self._server.drivers.closed(self._tab, for_good=True)
+
+    def _is_secure(self) -> bool:
+        client = self._websocket.client
+        return self._websocket.url.scheme == "wss" or (client is not None and client.host in ("127.0.0.1", "::1"))
+
+    # -- from the page
+
+    async def _receive(self) -> Any:
+        text = await self._receive_text()
+        try:
+            return _decoder.decode(text)
+        except (msgspec.MsgspecError, RecursionError) as error:
+            raise Leave(f"not understood: {error}"[:200]) from None
+
+    async def _receive_text(self) -> str:
+        message = await self._websocket.receive()
+        if message["type"] != "websocket.receive":
+            raise WebSocketDisconnect
+        text = message.get("text")
+        if text is None:
+            raise Leave("messages on this connection are text")
+        if len(text) > m.MAX_OP_BYTES:
+            raise Leave(f"a message is longer than {m.MAX_OP_BYTES} characters")
+        return str(text)
+
+    def _handle(self, op: Any) -> None:
+        match op:
+            case m.Echo():
+                self._tab.clock.echo(op.n, op.t, clock())
+                self._logs.echoed()
+                self._large_due = True
+            case m.DriveOp():
+                self._drive(op)
+            case m.StopOp():
+                self._server.drivers.stop(op.ref, self._session.user)
+            case m.EstopOp():
+                self._server.stop(op.ref, op.stop, self._session, self._tab.device, op.why, self._address())
+            case m.EstopEndOp():
+                self._end_stop(op)
+            case m.EstopResetOp():
+                self._reset(op)
+            case m.Watch():
+                self._watch(op.ref)
+            case m.ReadLogs():
+                if op.ref == self._interest.watched:
+                    self._logs.begin(op.origin, op.after, on=op.on)
+            case m.Lease():
+                self._lease(op)
+            case m.PictureFromOp():
+                if self._may("drive", op):
+                    self._server.sources.choose(op.ref, op.source)
+            case m.Hello():
+                raise Leave("hello comes only once")
+            case _:
+                self._command(op)
+        self._wake.set()
+
+    def _command(self, op: m.RobotOp) -> None:
+        """Publish what is asked of a robot, once: nothing repeats it, and the robot's states tell what came of it."""
+        if not self._may(robot_commands.right(op), op):
+            return
+        if why := (self._why_not if robot_commands.moves(op) else "") or self._server.drivers.refusals.of_op(op):
+            self._refuse(op, why)
+            return
+        message = robot_commands.publication(op, self._server.robots.capabilities(op.ref))
+        if not self._server.broker.publish(
+            message.topic,
+            message.payload,
+            retain=message.retain,
+            remember=False,
+            qos=message.qos,
+            by=self._session.user,
+        ):
+            self._refuse(op, "The server cannot reach the broker")
+            return
+        self._post(m.Done(cmd=_tag(op), ref=op.ref, n=op.n))
+        if not isinstance(op, m.LightsOp | m.SoundboardOp):
+            self._audit(_tag(op), op.ref, detail=_detail(op))
+
+    def _drive(self, op: m.DriveOp) -> None:
+        if not self._may("drive", op):
+            return
+        server = self._server
+        if op.ref not in server.robots.components:
+            self._refuse(op, "unknown component")
+            return
+        moves, why = server.drivers.drive(self._tab, op, self._why_not)
+        if why:
+            self._refuse(op, why)
+        elif moves and op.ref not in self._moved:
+            self._moved.add(op.ref)
+            self._audit("drive", op.ref)
+
+    def _end_stop(self, op: m.EstopEndOp) -> None:
+        """One's own, or with the right to reset: a viewer must not end the stop of another person."""
+        user = self._server.stops.user(op.stop)
+        if user is not None and (user == self._session.user or self._may("reset", op)):
+            self._server.stops.end(op.stop)
+
+    def _reset(self, op: m.EstopResetOp) -> None:
+        robot = self._server.robots.view(op.ref)
+        if not self._may("reset", op) or robot is None:
+            return
+        reset = Reset(robot.estop, self._session.user)
+        shown = {one.owner: (one.boot, one.count) for one in op.owners}
+        reset.shown = {
+            owner: msgspec.structs.replace(state, boot=shown[owner][0], count=shown[owner][1])
+            for owner, state in reset.shown.items()
+            if owner in shown
+        }
+        for message in reset.messages():
+            self._server.broker.publish(message.topic, message.payload, qos=message.qos)
+        self._audit("reset", op.ref)
+
+    def _watch(self, ref: str) -> None:
+        before = self._interest.watched
+        if ref == before:
+            return
+        self._server.robots.watch(self._interest, ref)
+        self._logs.end()
+        if ref:
+            self._server.watch(ref)
+        if before:
+            self._server.unwatch(before)
+
+    def _lease(self, op: m.Lease) -> None:
+        server = self._server
+        self._moved.discard(op.ref)
+        if not op.take:
+            if server.drivers.release(self._tab, op.ref):
+                self._audit("release", op.ref)
+            return
+        robot = server.robots.view(op.ref)
+        right = "take" if op.over and server.drivers.robot(op.ref).keeps else "drive"
+        if not self._may(right, op):
+            return
+        if self._why_not or robot is None:
+            self._refuse(op, self._why_not or "unknown component")
+            return
+
+        def granted() -> None:
+            self._audit("take over" if op.over else "take", op.ref)
+
+        if not op.over and (state := server.drivers.robot(op.ref).published) is not None and state.id:
+            self._audit("ask", op.ref)
+        server.drivers.take(self._tab, robot, granted, lambda why: self._refuse(op, why), over=op.over)
+
+    def _rights(self, ref: str = "") -> frozenset[str]:
+        return page_rights(self._session.role, self._server.level(ref))
+
+    def _may(self, right: str, op: m.FromPage) -> bool:
+        if right in self._rights(getattr(op, "ref", "")):
+            return True
+        self._refuse(op, f"The role {self._session.role} may not do this")
+        return False
+
+    def _refuse(self, op: m.FromPage, why: str) -> None:
+        g = op.g if isinstance(op, m.DriveOp) else -1  # lights have a g, too
+        self._post(m.Refused(cmd=_tag(op), ref=getattr(op, "ref", ""), why=why, g=g, n=getattr(op, "n", 0)))
+
+    def _audit(self, what: str, ref: str, detail: str = "") -> None:
+        session, device, address = self._session, self._tab.device, self._address()
+        self._server.audit.write(what, ref=ref, user=session.user, device=device, address=address, detail=detail)
+
+    def _address(self) -> str:
+        return "" if self._websocket.client is None else self._websocket.client.host
+
+    # -- to the page
+
+    def _post(self, message: m.ToPage) -> None:
+        self._waiting.append(message)
+        self._wake.set()
+
+    async def _send_all(self) -> None:
+        """States at most every 50 ms, pings twice a second."""
+        ping_at, check_at = time.monotonic() + PING_S, time.monotonic() + CHECK_S
+        people = self._server.people_version
+        while self._websocket.application_state is WebSocketState.CONNECTED:
+            with suppress(TimeoutError):
+                await asyncio.wait_for(self._wake.wait(), max(0.0, min(ping_at, check_at) - time.monotonic()))
+            self._wake.clear()
+            now = time.monotonic()
+            if now >= ping_at:
+                ping_at = now + PING_S
+                self._waiting.append(self._ping())
+            if now >= check_at or people != self._server.people_version:
+                check_at, people = now + CHECK_S, self._server.people_version
+                await self._check_session()
+            await self._flush(now)
+            await asyncio.sleep(FLUSH_S if not self._waiting else 0)
+
+    async def _flush(self, now: float) -> None:
+        while self._waiting:
+            await self._websocket.send_text(encode(self._waiting.popleft()))
+        drivers = {one for one in self._interest.dirty if one[1] == "web/driver"}
+        self._interest.dirty -= drivers
+        found, large = self._server.robots.take(self._interest, now, large=self._large_due)
+        self._large_due = self._large_due and not large
+        if self._interest.more:
+            self._wake.set()
+        seen, driven = clock(), self._server.drivers
+        values = found + tuple((ref, "web/driver", driven.robot(ref).shown(self._tab, seen), 0.0) for ref, _ in drivers)
+        gone, self._interest.gone = tuple(self._interest.gone), set()
+        if values or gone:
+            await self._websocket.send_text(encode(m.State(now=1000 * time.time(), set=values, gone=gone)))
+        await self._send_logs()
+
+    async def _send_logs(self) -> None:
+        """Send one part at each echo: on a slow connection pings never wait behind more than that."""
+        ref = self._interest.watched
+        lines = self._server.robots.logs.get(ref)
+        if lines is not None and (run := self._logs.take(lines)) is not None:
+            await self._websocket.send_text(
+                encode(m.Logs(ref=ref, origin=lines.origin, first=run.first, lines=run.lines))
+            )
+
+    async def _check_session(self) -> None:
+        session = await asyncio.to_thread(self._check)
+        if session is None or session.role != self._session.role:
+            self._end_leases()
+            await self._websocket.send_text(encode(m.Bye(why="logged out", again=False)))
+            await self._websocket.close(4001)
+
+    def _ping(self) -> m.Ping:
+        round_trip = self._tab.clock.round_trip_s
+        number = self._tab.clock.ping(clock())
+        return m.Ping(n=number, now=1000 * time.time(), round_trip_ms=-1 if round_trip is None else 1000 * round_trip)
+
+
+def _tag(op: m.FromPage) -> str:
+    return str(op.__struct_config__.tag)
+
+
+def _detail(op: m.RobotOp) -> str:
+    fields = msgspec.to_builtins(op)
+    return ", ".join(f"{key} {value}" for key, value in fields.items() if key not in _NOT_NOTED)[:200]

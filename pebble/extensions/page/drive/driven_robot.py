@@ -1,0 +1,384 @@
+"""Which page of this server drives one robot, and which commands of pages reach it. Pure: times are passed in.
+
+Motion belongs to a numbered gesture: from the moment the inputs leave neutral until they are released. What interrupts
+a gesture ends it for good, so a key that is held down never moves anything again before it was released.
+"""
+
+import secrets
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from enum import Enum
+from typing import NamedTuple
+
+from msgspec.structs import replace
+
+from pebble.contract.payloads import ControlState, Drive
+from pebble.extensions.operator.client.control import IDLE_S, ControlClient
+from pebble.extensions.operator.client.drive_reasons import WORDS, Code, words
+from pebble.extensions.operator.client.pace_of_link import WIDE, Pace
+from pebble.extensions.operator.client.robot_view import RobotView
+from pebble.extensions.page.messages import DriveOp, DriverView
+from pebble.extensions.page.page_clock import PageClock
+from pebble.transports import Message, QoS
+
+SILENCE_S = 0.25  # without a command of a gesture it is over
+REPEATS_S = (0.1, 0.2)  # after a zero of the server's own
+TAKEN_FROM_IDLE_S = 5.0  # a driver who has not moved for so long is not asked
+AWAITED_S = 5.0  # a page that connects again
+
+LET_GO = WORDS["release"]
+ZERO, FINAL_ZERO = Drive(), Drive(valid_ms=0)
+
+
+class State(Enum):
+    """What one robot is to this server."""
+
+    FREE = "no page of this server has control"
+    HELD = "a page has control, and its inputs rest"
+    MOVING = "a gesture of the page that has control lasts"
+
+
+class Event(Enum):
+    """What happens to one robot."""
+
+    GIVEN = "a page gets control: from the robot, or from this server if the robot keeps none"
+    ENDED = "its page gives control back, has gone, or has rested for a minute"
+    LOST = "the robot has taken control away"
+    MOVES = "a command of its page may move it"
+    LETS_GO = "the gesture's own zero has come"
+    INTERRUPTED = "a stop, silence, a command that is refused, or another robot ends the gesture"
+
+
+class Step(NamedTuple):
+    """What follows from an event."""
+
+    state: State
+    halts: bool = False  # by a final zero, which is repeated
+    gives_back: bool = False  # who has had control tells the robot
+
+
+#: What is not listed changes nothing. Zeros pass in every state.
+TABLE = {
+    (State.FREE, Event.GIVEN): Step(State.HELD),
+    (State.HELD, Event.GIVEN): Step(State.HELD, gives_back=True),
+    (State.MOVING, Event.GIVEN): Step(State.HELD, halts=True, gives_back=True),
+    (State.HELD, Event.ENDED): Step(State.FREE, gives_back=True),
+    (State.MOVING, Event.ENDED): Step(State.FREE, halts=True, gives_back=True),
+    (State.HELD, Event.LOST): Step(State.FREE),
+    (State.MOVING, Event.LOST): Step(State.FREE, halts=True),
+    (State.HELD, Event.MOVES): Step(State.MOVING),
+    (State.MOVING, Event.LETS_GO): Step(State.HELD),
+    (State.MOVING, Event.INTERRUPTED): Step(State.HELD, halts=True),
+}
+
+
+class Command(NamedTuple):
+    """A drive command to be published."""
+
+    ref: str
+    drive: Drive
+    qos: QoS = WIDE.qos
+
+
+@dataclass(slots=True, eq=False)
+class Tab:
+    """One control connection of a page. It moves one robot at a time."""
+
+    token: str
+    user: str
+    device: str
+    clock: PageClock = field(default_factory=PageClock)
+    moves: "DrivenRobot | None" = None
+    gesture: int = -1  # by which it moves that
+    over: int = -1  # this gesture and all before it have ended
+
+    def interrupt(self, gesture: int, now: float) -> list[Command]:
+        """End this gesture, and all before it, for good."""
+        self.over = max(self.over, gesture)
+        return [] if self.moves is None or self.gesture > gesture else self.moves.interrupt(now)
+
+
+@dataclass(slots=True, eq=False)
+class Wish:
+    """What one page wants of a robot that keeps control. ``granted`` or ``failed`` is called when that has answered."""
+
+    client: ControlClient
+    granted: Callable[[], None]
+    failed: Callable[[str], None]
+    ended_at: float = float("inf")
+
+
+class DrivenRobot:
+    """One robot. ``changed`` collects those of which pages see something else than before."""
+
+    def __init__(self, ref: str, view: Callable[[], RobotView | None], changed: set[str]) -> None:
+        self.ref = ref
+        self.state = State.FREE
+        self.tab: Tab | None = None  # that has control
+        self.client: ControlClient | None = None  # by which the robot has given it
+        self._view, self._changed = view, changed
+        self._decided = ""  # the key with which it was given
+        self._wishes: dict[Tab, Wish] = {}
+        self._idle_from = self._sent_at = self._received_at = float("-inf")
+        self._repeats: list[float] = []  # when to send a zero again
+        self._awaited = ("", float("-inf"))  # a page, by its token, that had control; and until when
+        self.renew_key()
+
+    def renew_key(self) -> None:
+        """Take another key: robots without control compare ages per key, and what was on its way must not count."""
+        self._key = secrets.token_hex(4)
+
+    # -- what is known
+
+    @property
+    def keeps(self) -> bool:
+        """True if the robot decides itself who drives it; else this server does, for its own pages."""
+        robot = self._view()
+        return robot is not None and robot.controlled
+
+    @property
+    def published(self) -> ControlState | None:
+        """It is what the robot says of control; None if it keeps none."""
+        robot = self._view()
+        return robot.control.state if robot is not None and robot.controlled else None
+
+    @property
+    def pace(self) -> Pace:
+        """It is how often the robot is sent commands."""
+        robot = self._view()
+        return WIDE if robot is None else robot.pace
+
+    @property
+    def moved_by(self) -> str:
+        """It is who moves the robot now: while a gesture lasts, or as the robot says. Empty: no page does."""
+        if other := self._elsewhere():
+            return other.by
+        return self.tab.user if self.tab is not None and self.state is State.MOVING else ""
+
+    def wanted_by(self, tab: Tab) -> bool:
+        """True if that page has control, or asks for it."""
+        return self.tab is tab or tab in self._wishes
+
+    def awaits(self, token: str, now: float) -> bool:
+        """True, once, if a page with this token has just had control, and still nobody else has it."""
+        awaited, until = self._awaited
+        if awaited != token:
+            return False
+        self._awaited = ("", float("-inf"))
+        return now <= until and self.state is State.FREE and self._elsewhere() is None
+
+    def at_rest(self, now: float) -> bool:
+        """True if nothing has to be remembered of it."""
+        return self.state is State.FREE and not self._wishes and not self._repeats and now > self._awaited[1]
+
+    def shown(self, tab: Tab, now: float) -> DriverView:
+        """Return what this page is shown of who drives."""
+        wish, state = self._wishes.get(tab), self.published
+        view = DriverView(keeps=self.keeps, asking=wish is not None and wish.client.wanted and not wish.client.held)
+        if state is not None:
+            asks = (state.asks or "somebody") if state.asks_id else ""
+            view = replace(view, asks=asks, checked=state.named, others=state.others)
+        if (other := self._elsewhere()) is not None:
+            return replace(view, by=other.by, device=other.device)
+        if self.tab is None:
+            return view
+        idle_s = None if self.state is State.MOVING else now - self._idle_from
+        return replace(view, by=self.tab.user, device=self.tab.device, you=self.tab is tab, idle_s=idle_s)
+
+    # -- control
+
+    def take(
+        self, tab: Tab, now: float, granted: Callable[[], None], failed: Callable[[str], None], *, over: bool
+    ) -> list[Command]:
+        """Want control for this page; ``over``: also from who drives."""
+        robot = self._view()
+        if robot is not None and robot.controlled:
+            wish = self._wishes.get(tab)
+            client = ControlClient(robot.control, by=tab.user, device=tab.device, pace_of=lambda: robot.pace)
+            wish = self._wishes[tab] = Wish(client if wish is None else wish.client, granted, failed)
+            wish.client.ask(now, over=over)
+            self._changed.add(self.ref)
+            return []
+        if self.tab is not tab and not over and (who := self._active(now)):
+            failed(words(Code.LEASE, driven=who))
+            return []
+        commands = [] if self.tab is tab else self._give(tab, None, now)
+        granted()
+        return commands
+
+    def release(self, tab: Tab, now: float) -> list[Command]:
+        """Give control back, or do not ask for it any more."""
+        if self.tab is tab:
+            return self._on(Event.ENDED, now)
+        if (wish := self._wishes.get(tab)) is not None:
+            wish.client.release()
+            self._changed.add(self.ref)
+        return []
+
+    def closed(self, tab: Tab, now: float, *, for_good: bool) -> list[Command]:
+        """Take note that the connection has ended; ``for_good``: the user may no longer drive, so nothing is kept."""
+        if self.tab is tab and not for_good:
+            self._awaited = (tab.token, now + AWAITED_S)
+        return self.release(tab, now)
+
+    def update(self, now: float) -> list[Command]:
+        """Take note that the robot has answered, or is another one than before."""
+        commands: list[Command] = []
+        for tab, wish in list(self._wishes.items()):
+            commands += self._answered(tab, wish, now)
+        if self.client is None and self.keeps:  # it was this server's to give, and is no more
+            commands += self._on(Event.LOST, now)
+        self._changed.add(self.ref)
+        return commands
+
+    # -- commands
+
+    def drive(self, tab: Tab, op: DriveOp, now: float, blocked: str) -> tuple[list[Command], str]:
+        """Judge a command of a gesture: what is to be published, and why it was refused, if it was.
+
+        ``blocked``: why this robot may not be moved. Raises ClockJumpError.
+        """
+        if not (op.x or op.z or op.y):
+            return self._zero(tab, op, now), ""
+        if op.g <= tab.over:
+            return [], LET_GO
+        if why := self._why_not(tab, op, now) or blocked:
+            return tab.interrupt(op.g, now), why
+        if tab.moves is None:
+            tab.moves, tab.gesture = self, op.g
+            self._sent_at, self._repeats = float("-inf"), []  # repeated zeros would interrupt it
+            self._on(Event.MOVES, now)
+        self._received_at = now
+        pace = self.pace
+        if now - self._sent_at < pace.step_s:
+            return [], ""
+        self._sent_at = now
+        drive = self._signed(Drive(x=op.x, z=op.z, y=op.y, valid_ms=WIDE.valid_ms))
+        return [Command(self.ref, pace.dated(drive, now, self._key), pace.qos)], ""
+
+    def stop(self, now: float) -> list[Command]:
+        """Halt it for anybody; the gesture that moves it is over."""
+        self.interrupt(now)
+        return self._final_zero(now)
+
+    def interrupt(self, now: float) -> list[Command]:
+        """End the gesture that moves it."""
+        return self._on(Event.INTERRUPTED, now)
+
+    def tick(self, now: float) -> tuple[list[Command], list[Message]]:
+        """End what is silent or idle; what is to be published, in this order. To be called every 50 ms."""
+        commands: list[Command] = []
+        if self.state is State.MOVING and now - self._received_at > SILENCE_S:
+            commands += self.interrupt(now)
+        elif self.state is State.HELD and now - self._idle_from > IDLE_S:
+            commands += self._on(Event.ENDED, now)
+        if self._repeats and (late_s := now - self._repeats[0]) >= 0:
+            self._repeats = [at for at in self._repeats if at > now]
+            if late_s <= SILENCE_S:  # else this process stood still: a newer gesture may have begun elsewhere
+                commands.append(Command(self.ref, FINAL_ZERO))
+        messages: list[Message] = []
+        for tab, wish in list(self._wishes.items()):
+            messages += wish.client.tick(now)
+            commands += self._answered(tab, wish, now)
+            if self._is_over(wish, now):
+                del self._wishes[tab]
+        return commands, messages
+
+    # -- inside
+
+    def _on(self, event: Event, now: float) -> list[Command]:
+        """Go one step of the table."""
+        step = TABLE.get((self.state, event))
+        if step is None:
+            return []
+        if self.state is State.MOVING and self.tab is not None:  # each step from there ends the gesture
+            self.tab.over = max(self.tab.over, self.tab.gesture)
+            self.tab.moves, self._idle_from = None, now
+        commands = self._final_zero(now) if step.halts else []
+        if step.gives_back and self.client is not None:
+            self.client.release()
+        if step.state is State.FREE:
+            self.tab = self.client = None
+        self.state = step.state
+        self._changed.add(self.ref)
+        return commands
+
+    def _give(self, tab: Tab, client: ControlClient | None, now: float) -> list[Command]:
+        commands = self._on(Event.GIVEN, now) + tab.interrupt(tab.gesture, now)  # what is held now moves no robot
+        self.tab, self.client, self._decided = tab, client, "" if client is None else client.decided
+        self._idle_from = now
+        return commands
+
+    def _answered(self, tab: Tab, wish: Wish, now: float) -> list[Command]:
+        client, robot = wish.client, self._view()
+        if robot is None or not robot.controlled or robot.control is not client.robot:
+            client.release()  # it is gone, or was forgotten meanwhile
+        client.update(now)
+        had = self.client is client
+        commands: list[Command] = []
+        if had and client.decided != self._decided:
+            commands = self._on(Event.LOST, now)
+        if client.held and self.client is not client:
+            commands += self._give(tab, client, now)
+            wish.granted()
+        if client.failed:
+            if not had:  # who has had it sees who has it now
+                wish.failed(client.failed)
+            client.failed = ""
+            self._changed.add(self.ref)
+        return commands
+
+    def _is_over(self, wish: Wish, now: float) -> bool:
+        """Not before the robot has taken note: until then it is this server that has control, and no other."""
+        if not wish.client.done:
+            wish.ended_at = float("inf")
+            return False
+        wish.ended_at = min(wish.ended_at, now)
+        state = self.published
+        return state is None or state.id != wish.client.id or now - wish.ended_at > self.pace.answer_s
+
+    def _elsewhere(self) -> ControlState | None:
+        """Return what the robot says if it has given control, but not to this server."""
+        state = self.published
+        if state is None or not state.id or any(wish.client.id == state.id for wish in self._wishes.values()):
+            return None
+        return replace(state, by=state.by or "somebody")
+
+    def _active(self, now: float) -> str:
+        """Return who drives it now and has to be asked; empty: it can be taken."""
+        if other := self._elsewhere():
+            return other.by
+        if self.tab is None or (self.state is State.HELD and now - self._idle_from >= TAKEN_FROM_IDLE_S):
+            return ""
+        return self.tab.user
+
+    def _why_not(self, tab: Tab, op: DriveOp, now: float) -> str:
+        if self.tab is not tab:
+            other = self._active(now)
+            return words(Code.LEASE if other else Code.LISTENING, driven=other)
+        if tab.moves is not None and (tab.gesture != op.g or tab.moves is not self):
+            return LET_GO  # the end of the one before was lost
+        if tab.moves is not None and now - self._received_at > SILENCE_S:
+            return LET_GO  # the page stood still, or this process
+        if problem := tab.clock.problem(now):
+            return problem[0].upper() + problem[1:]
+        return words(Code.LATE) if tab.clock.late(op.t, now) else ""
+
+    def _zero(self, tab: Tab, op: DriveOp, now: float) -> list[Command]:
+        """Forward it always. At the end of a gesture it is the release."""
+        tab.over = max(tab.over, op.g)
+        if tab.moves is self and op.g >= tab.gesture:
+            self._on(Event.LETS_GO, now)
+        commands = tab.interrupt(op.g, now)  # what it moves elsewhere
+        if self.tab is not tab or op.final:
+            return [Command(self.ref, FINAL_ZERO), *commands]
+        return [Command(self.ref, self._signed(ZERO)), *commands]  # with the key it is a letting go
+
+    def _signed(self, drive: Drive) -> Drive:
+        """Return the command with the key of control."""
+        key = "" if self.client is None else self.client.key
+        return replace(drive, key=key) if key else drive
+
+    def _final_zero(self, now: float) -> list[Command]:
+        self._repeats = [now + after for after in REPEATS_S]
+        return [Command(self.ref, FINAL_ZERO)]

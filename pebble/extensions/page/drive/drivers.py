@@ -1,0 +1,142 @@
+"""What pages and robots want of driving, and what is published for it."""
+
+from collections.abc import Callable
+from functools import partial
+
+from pebble.contract import DRIVE, codec
+from pebble.extensions.operator.client.broker import Broker
+from pebble.extensions.operator.client.estop import send
+from pebble.extensions.operator.client.robot_view import RobotView
+from pebble.extensions.page import messages as m
+from pebble.extensions.page.drive.driven_robot import Command, DrivenRobot, Tab
+from pebble.extensions.page.drive.refusals import Refusals
+from pebble.extensions.page.robots import Robots
+from pebble.transports.clock import since_boot as clock
+
+MOST_WISHES = 16  # of one tab: robots of which it has control, or asks for it
+
+
+class Drivers:
+    """It belongs to one server. What a method decides is published at once."""
+
+    def __init__(self, broker: Broker, robots: Robots) -> None:
+        self._broker, self._robots = broker, robots
+        self._driven: dict[str, DrivenRobot] = {}
+        self._changed: set[str] = set()
+        self.refusals = Refusals(broker, lambda ref: self.robot(ref).moved_by, robots.view)
+
+    def robot(self, ref: str) -> DrivenRobot:
+        """Return who drives that robot; of one that rests nothing is remembered."""
+        robot = self._driven.get(ref)
+        if robot is None:
+            robot = self._driven[ref] = DrivenRobot(ref, partial(self._robots.view, ref), self._changed)
+        return robot
+
+    # -- of pages
+
+    def take(
+        self, tab: Tab, view: RobotView, granted: Callable[[], None], failed: Callable[[str], None], *, over: bool
+    ) -> None:
+        """A page wants control; ``granted``, or ``failed`` with the reason, is called as soon as that is known."""
+        now, robot = clock(), self.robot(view.base)
+        wanted = sum(one.wanted_by(tab) for one in self._driven.values())
+        if why := self.refusals.nameless(view):
+            failed(why)
+        elif wanted >= MOST_WISHES and not robot.wanted_by(tab):
+            failed(f"This page has control of {MOST_WISHES} robots: release one")
+        else:
+            self._publish(robot.take(tab, now, granted, failed, over=over))
+            self._turn(robot, now)
+
+    def release(self, tab: Tab, ref: str) -> bool:
+        """A page gives control back, or does not ask for it any more; whether it had it."""
+        now, robot = clock(), self.robot(ref)
+        had = robot.tab is tab
+        self._publish(robot.release(tab, now))
+        self._turn(robot, now)
+        return had
+
+    def drives(self, ref: str) -> bool:
+        """True if a page has control of that robot."""
+        return ref in self._driven and self._driven[ref].tab is not None
+
+    def restore(self, token: str, tab: Tab) -> None:
+        """A page has connected again: it asks for what it had, but no gesture goes on.
+
+        Its old connection may still be open, if nothing comes from it any more.
+        """
+        now = clock()
+        old = {robot.tab for robot in self._driven.values() if robot.tab is not None and robot.tab.token == token}
+        for stalled in [one for one in old if one.clock.problem(now)]:
+            self.closed(stalled)
+        for robot in [one for one in self._driven.values() if one.awaits(token, now)]:
+            if (view := self._robots.view(robot.ref)) is not None:
+                self.take(tab, view, lambda: None, lambda _why: None, over=False)
+
+    def closed(self, tab: Tab, *, for_good: bool = False) -> None:
+        """The connection of a page has ended; ``for_good``: its user may no longer drive."""
+        now, wanted = clock(), [robot for robot in self._driven.values() if robot.wanted_by(tab)]
+        try:
+            self._publish([zero for robot in wanted for zero in robot.closed(tab, now, for_good=for_good)])
+        finally:
+            for robot in wanted:
+                self._turn(robot, now)
+
+    def closed_all(self) -> None:
+        for tab in [robot.tab for robot in self._driven.values() if robot.tab is not None]:
+            self.closed(tab)
+
+    def drive(self, tab: Tab, op: m.DriveOp, blocked: str) -> tuple[bool, str]:
+        """Judge a command of a gesture, and publish what follows: whether wheels move now, and why it was refused."""
+        now, robot = clock(), self.robot(op.ref)
+        commands, refused = robot.drive(tab, op, now, blocked or self.refusals.of_driving(op.ref))
+        accepted = self._publish(commands, tab.user)
+        if refused:
+            return False, refused
+        if not accepted:
+            self._publish(robot.stop(now))
+            return False, "The server cannot reach the broker"
+        return bool(commands) and commands[0].drive.moves, ""
+
+    def stop(self, ref: str, by: str) -> None:
+        """A zero from anybody, who need not drive."""
+        if self._robots.view(ref) is not None:
+            self._publish(self.robot(ref).stop(clock()), by)
+
+    # -- of robots
+
+    def updated(self, ref: str) -> None:
+        """A robot has published what it can do, or who has control."""
+        self._publish(self.robot(ref).update(clock()))
+
+    def renew_keys(self) -> None:
+        """The connection to the broker is another one."""
+        for robot in self._driven.values():
+            robot.renew_key()
+
+    # -- what is due
+
+    def tick(self, now: float) -> None:
+        for ref, robot in list(self._driven.items()):
+            self._turn(robot, now)
+            if robot.at_rest(now):
+                del self._driven[ref]
+
+    # -- inside
+
+    def _turn(self, robot: DrivenRobot, now: float) -> None:
+        """Publish what is due; requests of control come after the zeros of who has had it."""
+        commands, messages = robot.tick(now)
+        self._publish(commands)
+        send(self._broker.publish, messages)
+
+    def _publish(self, commands: list[Command], by: str = "") -> bool:
+        """Publish drive commands of a person, each to the robot's own topic; False if one was not accepted."""
+        accepted = True
+        for ref, drive, qos in commands:
+            topic = self._robots.topic(ref, DRIVE)
+            accepted = self._broker.publish(topic, codec.encode(DRIVE, drive), qos=qos, by=by) and accepted
+        if self._changed:
+            self._robots.mark_drivers(set(self._changed))
+            self._changed.clear()
+        return accepted

@@ -1,0 +1,61 @@
+"""Why a page may not ask a robot for something now, in words for people. Each returns "" where it may."""
+
+import time
+from collections.abc import Callable
+
+from pebble.extensions.operator.client.broker import Broker
+from pebble.extensions.operator.client.drive_reasons import (
+    SCRIPT_ORDER,
+    SERVER_ORDER,
+    Code,
+    Situation,
+    first_reason,
+    words,
+)
+from pebble.extensions.operator.client.named_topics import why_not
+from pebble.extensions.operator.client.robot_view import RobotView
+from pebble.extensions.page import messages as m
+from pebble.extensions.page import robot_commands
+
+
+class Refusals:
+    """It belongs to one server; ``moved_by`` tells who moves a component, ``robot_of`` finds it."""
+
+    def __init__(
+        self, broker: Broker, moved_by: Callable[[str], str], robot_of: Callable[[str], RobotView | None]
+    ) -> None:
+        self._broker, self._moved_by, self._robot_of = broker, moved_by, robot_of
+
+    def of_driving(self, ref: str) -> str:
+        """Why this component may not be moved by any page."""
+        robot = self._robot_of(ref) or RobotView(ref)
+        return self._words(robot, first_reason(self._situation(robot), SERVER_ORDER)) or self.nameless(robot)
+
+    def nameless(self, robot: RobotView) -> str:
+        """Why it takes no commands of this server, which has no name."""
+        return why_not(robot.name, self._broker.names.account) if robot.named else ""
+
+    def of_op(self, op: m.RobotOp) -> str:
+        """Why this is not asked of a robot now. What ends something is always asked."""
+        robot = self._robot_of(op.ref)
+        if robot is None:
+            return "unknown component"
+        if robot_commands.ends(op):
+            return "" if self._broker.connected else "The server cannot reach the broker"
+        order = (Code.BROKER,) if isinstance(op, m.FlagOp) else (Code.BROKER, Code.SILENT)  # a broker remembers flags
+        why = self._words(robot, first_reason(self._situation(robot), order))
+        why = why or self.nameless(robot) or robot_commands.refusal(op, robot.capabilities)
+        return self._of_script(robot) if isinstance(op, m.AutonomyOp) and not why else why
+
+    def _of_script(self, robot: RobotView) -> str:
+        """Why no script may begin now."""
+        by = self._moved_by(robot.base)
+        situation = self._situation(robot)._replace(driven=bool(by) and not robot.arbitrates)
+        code = first_reason(situation, SCRIPT_ORDER)
+        return "Stopped: reset it first" if code is Code.STOPPED else words(code, robot.name, driven=by)
+
+    def _situation(self, robot: RobotView) -> Situation:
+        return robot.situation(time.monotonic())._replace(problem=self._broker.problem)
+
+    def _words(self, robot: RobotView, code: Code | None) -> str:
+        return words(code, robot.name, stopped=robot.stopped_by, problem=self._broker.problem)

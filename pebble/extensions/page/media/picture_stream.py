@@ -1,0 +1,180 @@
+"""One robot's pictures on their way to the pages that show them."""
+
+import asyncio
+import struct
+import time
+from typing import Final
+
+from pebble.extensions.media.picture_header import PictureHeader, PictureSequence
+from pebble.extensions.operator.client.broker import Broker
+from pebble.extensions.operator.client.media_request.offer import BEST_FIRST, best, offered
+from pebble.extensions.operator.client.media_request.queue import NO_FRAME, Frame, ViewerQueue, assess
+from pebble.extensions.page.media import rescue
+from pebble.extensions.page.media.rescue import RescuedPicture, RescueStream
+from pebble.extensions.page.media.stream import MediaStream
+from pebble.extensions.page.messages import PictureView
+from pebble.extensions.page.robots import Robots
+
+_CHANGE_S: Final = 1.0  # a new encoding begins with a key frame within this time: viewers need no help meanwhile
+_MAX_CHAIN: Final = 240  # pictures since a key frame
+_MAX_CHAIN_BYTES: Final = 8 << 20  # of these pictures
+_HEAD: Final = struct.Struct(">IB")
+_RESCUE_HEAD: Final = struct.Struct(">IBQ")
+_SNAPSHOT_S: Final = 0.5  # a snapshot this recent is used again
+_AT_REST: Final = PictureView(state="rest", why="", encoding="", per_second=0, kbits=0, viewers=0)
+
+
+class PageViewer:
+    """One page's queue, and how its sender is woken."""
+
+    def __init__(self, can: frozenset[str]) -> None:
+        self.queue = ViewerQueue(can, time.monotonic())
+        self.wakeup = asyncio.Event()
+
+
+class PictureStream(MediaStream[PageViewer, PictureView]):
+    """Gives the pictures of one robot to each viewer's queue."""
+
+    def __init__(self, broker: Broker, robots: Robots, ref: str) -> None:
+        super().__init__(broker, robots, ref, "video", "web/picture", _AT_REST)
+        self._rescue = RescueStream(self._on_rescued)
+        self._sequence = PictureSequence()
+        self._chain: list[bytes] = []  # the newest key frame and all pictures since; empty: it would be too long
+        self._chain_bytes = 0
+        self._seq = 0
+        self._taking = asyncio.Lock()  # guards the snapshot
+        self._snapshot: bytes | None = None
+        self._snapshot_at = float("-inf")
+
+    # -- pages
+
+    def acknowledge(self, viewer: PageViewer, seq: int, what: int) -> None:
+        """Take a page's answer: 0 drawn, 1 a key frame is wanted, 2 this encoding cannot be decoded there."""
+        now = time.monotonic()
+        frame = viewer.queue.acknowledge(seq, now)
+        if what == 1 and (frame is not None or seq == NO_FRAME):
+            viewer.queue.refuse(now)
+        elif what == 2 and (frame is not None or seq == NO_FRAME):
+            viewer.queue.cannot_decode(self._arrivals.encoding if frame is None else frame.encoding)
+        viewer.wakeup.set()
+        if what:
+            self._request.wake()
+
+    async def snapshot(self) -> bytes | None:
+        """Return the newest picture as a JPEG, if pictures are flowing."""
+        async with self._taking:
+            if not self._chain or not self._arrivals.flowing(time.monotonic()):
+                return None
+            if time.monotonic() - self._snapshot_at > _SNAPSHOT_S:
+                self._snapshot = await asyncio.to_thread(rescue.newest_jpeg, list(self._chain))
+                self._snapshot_at = time.monotonic()
+            return self._snapshot
+
+    # -- pictures
+
+    def receive(self, payload: bytes) -> None:
+        now = time.monotonic()
+        header, fits = self._sequence.take(payload), self._sequence.complete
+        if header is None:
+            return
+        self._note(header.encoding, len(payload), now)
+        self._extend_chain(payload, header, fits=fits)
+        self._rescue.feed(payload, keyframe=header.keyframe)
+        if fits:
+            self._offer(payload, header, now)
+        else:
+            self._skip(now)
+
+    def _extend_chain(self, payload: bytes, header: PictureHeader, *, fits: bool) -> None:
+        grown = self._chain_bytes + len(payload)
+        if header.keyframe:
+            self._chain, self._chain_bytes = [payload], len(payload)
+        elif fits and self._chain and len(self._chain) < _MAX_CHAIN and grown <= _MAX_CHAIN_BYTES:
+            self._chain.append(payload)
+            self._chain_bytes = grown
+        else:
+            self._chain, self._chain_bytes = [], 0
+
+    def _offer(self, payload: bytes, header: PictureHeader, now: float) -> None:
+        seq = self._next_seq()
+        frame = Frame(seq, _HEAD.pack(seq, 0) + payload, header.encoding, header.keyframe)
+        urgent = False
+        for viewer in self.viewers:
+            queue = viewer.queue
+            if queue.rescued or queue.decodes(header.encoding):
+                queue.offer_direct(frame, now)
+                viewer.wakeup.set()
+            urgent = urgent or (queue.waiting and not queue.rescued)
+        if urgent and header.encoding == "h264":
+            self._request.wake()
+
+    def _skip(self, now: float) -> None:
+        """A picture is missing before this one: it and what follows wait for a key frame."""
+        for viewer in self.viewers:
+            viewer.queue.lost(now)
+        self._request.wake()
+
+    def _on_rescued(self, picture: RescuedPicture) -> None:
+        seq = self._next_seq()
+        data = _RESCUE_HEAD.pack(seq, 1, picture.captured_ms) + picture.jpeg
+        frame = Frame(seq, data, "jpeg", keyframe=True)
+        for viewer in self.viewers:
+            viewer.queue.offer_rescue(frame)
+            viewer.wakeup.set()
+
+    def _next_seq(self) -> int:
+        self._seq = (self._seq + 1) % NO_FRAME  # NO_FRAME itself is no number
+        return self._seq
+
+    # -- requests, and key frames
+
+    async def _follow(self) -> None:
+        robot = self.robot
+        await self._request.follow(robot, best("video", offered(robot.capabilities, "video"), self._can()))
+        if not self._request.problem:
+            await self._help_viewers()
+
+    def _can(self) -> list[frozenset[str]]:
+        """What each viewer decodes. For one that decodes nothing, what this server converts counts."""
+        known = frozenset(BEST_FIRST["video"])
+        converted = frozenset(name for name in known if not rescue.unavailable(name))
+        return [viewer.queue.can & known or converted for viewer in self.viewers]
+
+    async def _help_viewers(self) -> None:
+        """Request a key frame, or begin the rescue stream, if viewers need it."""
+        now = time.monotonic()
+        if not self._arrivals.encoding:
+            return
+        changing = now - self._request.requested_at < _CHANGE_S
+        can_rescue = not changing and not rescue.unavailable(self._arrivals.encoding)
+        queues = [viewer.queue for viewer in self.viewers]
+        wanted = assess(queues, self._arrivals.encoding, now, can_rescue=can_rescue)
+        if can_rescue and any(queue.rescued for queue in queues):
+            self._rescue.start(self._chain)
+            wanted = wanted or not self._chain  # it begins at a key frame, too
+        else:
+            self._rescue.stop()
+        if wanted and not changing:
+            for queue in queues:
+                queue.new = False
+            await self._request.request_keyframe(self._arrivals.encoding)
+
+    # -- what pages are shown
+
+    def _make_view(self, state: str, why: str, rate: float, kbits: float) -> PictureView:
+        return PictureView(
+            state=state,
+            why=why,
+            encoding=self._arrivals.encoding,
+            per_second=rate,
+            kbits=kbits,
+            viewers=len(self.viewers),
+        )
+
+    def _end(self) -> None:
+        self._rescue.stop()
+
+    def _problem(self) -> str:
+        lacking = sum(not viewer.queue.decodes(self._arrivals.encoding) for viewer in self.viewers)
+        problem = rescue.unavailable(self._arrivals.encoding)
+        return f"{lacking} of {len(self.viewers)} browsers cannot show it: {problem}" if problem and lacking else ""

@@ -1,0 +1,226 @@
+"""One medium of each robot on its way to pages: the request while pages use it, and what is shown about it."""
+
+import asyncio
+import contextlib
+import logging
+import time
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Coroutine
+from typing import Any, Final, Generic, TypeVar
+
+from starlette.websockets import WebSocket
+
+from pebble.contract import Channel
+from pebble.contract.identity import Direction
+from pebble.extensions.media.rate_meter import RateMeter
+from pebble.extensions.operator.client.broker import Broker
+from pebble.extensions.operator.client.media_request.offer import Medium
+from pebble.extensions.operator.client.media_request.shared import TICK_S, SharedRequest
+from pebble.extensions.operator.client.robot_topics import own_topic
+from pebble.extensions.operator.client.robot_view import RobotView
+from pebble.extensions.page.robots import Robots
+
+log = logging.getLogger(__name__)
+
+_WHAT: Final[dict[Medium, str]] = {"video": "picture", "audio": "sound"}
+_SILENT_S: Final = 2.0
+_SILENT_PERIODS: Final = 3.0
+_GONE, _BAD_REQUEST = 1001, 4400  # codes of a closed socket
+
+ViewerT = TypeVar("ViewerT")
+ViewT = TypeVar("ViewT")
+
+
+class Arrivals:
+    """What arrives of one medium: in which encoding, how much, and whether it still does. Pure: times are passed in."""
+
+    def __init__(self) -> None:
+        self.encoding = ""  # of the newest payload
+        self.meter = RateMeter()
+        self._newest_at: float | None = None
+
+    def add(self, encoding: str, size: int, now: float) -> bool:
+        """Note a payload; return whether an encoding begins with it."""
+        begins = self._newest_at is None or encoding != self.encoding
+        self.meter.add(now, size)
+        self._newest_at, self.encoding = now, encoding
+        return begins
+
+    def quiet_s(self, now: float) -> float | None:
+        """How long nothing has come; None: nothing ever has."""
+        return None if self._newest_at is None else now - self._newest_at
+
+    def flowing(self, now: float) -> bool:
+        if self._newest_at is None:
+            return False
+        rate = self.meter.rate(self._newest_at)
+        return now - self._newest_at <= max(_SILENT_S, _SILENT_PERIODS / rate if rate else 0.0)
+
+
+class MediaStream(ABC, Generic[ViewerT, ViewT]):
+    """Requests one medium of one robot while it has viewers.
+
+    ``task`` ends once the request is withdrawn; until then viewers may join again.
+    """
+
+    def __init__(self, broker: Broker, robots: Robots, ref: str, medium: Medium, metric: str, view: ViewT) -> None:
+        """Pages are shown ``metric``; ``view`` is that of a robot at rest, which they are shown already."""
+        self.ref = ref
+        self.viewers: set[ViewerT] = set()
+        self.view = self._at_rest = view  # as shown last
+        self._shown_at = float("-inf")
+        self._broker, self._robots, self._metric = broker, robots, metric
+        self._request = SharedRequest(broker, ref, medium, self.receive)
+        self._arrivals = Arrivals()
+        self.task = asyncio.create_task(self._run())
+
+    def join(self, viewer: ViewerT) -> None:
+        self.viewers.add(viewer)
+        self._request.want(True)
+
+    def leave(self, viewer: ViewerT) -> None:
+        self.viewers.discard(viewer)
+        self._request.want(bool(self.viewers))
+
+    async def close(self) -> None:
+        """Withdraw the request now."""
+        self._request.close()
+        await self.task
+
+    @property
+    def robot(self) -> RobotView:
+        """It is the robot, as far as it is known."""
+        return self._robots.view(self.ref) or RobotView(self.ref)
+
+    # -- of each medium
+
+    @abstractmethod
+    def receive(self, payload: bytes) -> None:
+        """Give a payload of the robot to all viewers. On the event loop."""
+
+    @abstractmethod
+    async def _follow(self) -> None:
+        """Request what the viewers need; called a few times a second."""
+
+    @abstractmethod
+    def _make_view(self, state: str, why: str, rate: float, kbits: float) -> ViewT:
+        """What pages are shown."""
+
+    def _end(self) -> None:
+        """Take note that the request has ended."""
+
+    # -- the task
+
+    async def _run(self) -> None:
+        try:
+            await self._request.run(self._step)
+        finally:
+            self._end()
+            self._show(self._at_rest)
+
+    async def _step(self) -> None:
+        self._report()
+        await self._follow()
+        self._report()
+
+    def _note(self, encoding: str, size: int, now: float) -> None:
+        if self._arrivals.add(encoding, size, now):
+            self._request.wake()
+
+    # -- what pages are shown
+
+    def _report(self) -> None:
+        """Show what has changed, at most twice a second."""
+        now = time.monotonic()
+        if now - self._shown_at < TICK_S:
+            return
+        state, why = self._state(now)
+        flowing = state == "flowing"
+        rate = round(self._arrivals.meter.rate(now), 1) if flowing else 0.0
+        kbits = float(round(self._arrivals.meter.bitrate(now) / 1000)) if flowing else 0.0
+        view = self._make_view(state, why, rate, kbits)
+        if view != self.view:
+            self.view, self._shown_at = view, now
+            self._show(view)
+
+    def _show(self, view: ViewT) -> None:
+        if self._robots.capabilities(self.ref):
+            self._robots.set_server_metric(self.ref, self._metric, view)
+
+    def _state(self, now: float) -> tuple[str, str]:
+        if self._request.problem:
+            return "refused", self._request.problem
+        if self._arrivals.flowing(now):
+            return "flowing", self._problem()
+        if self._request.waits:
+            return "held", self._request.waits
+        if not self._broker.connected:
+            what = _WHAT[self._request.medium]
+            return "silent", f"no connection to the broker for the {what}: {self._broker.problem}"
+        quiet_s = self._arrivals.quiet_s(now)
+        if quiet_s is None:
+            return "starting", ""
+        return "silent", f"no {_WHAT[self._request.medium]} for {int(quiet_s)} s"
+
+    def _problem(self) -> str:
+        """What is wrong although it flows."""
+        return ""
+
+
+StreamT = TypeVar("StreamT", bound=MediaStream[Any, Any])
+
+
+class Streams(Generic[StreamT]):
+    """The streams of one medium, by robot; one that has ended is forgotten."""
+
+    def __init__(self, channel: Channel, make: Callable[[str], StreamT]) -> None:
+        self._channel, self._make = channel, make
+        self._closed = False
+        self._streams: dict[str, StreamT] = {}
+
+    def get(self, ref: str) -> StreamT | None:
+        """The stream of that robot, if pages use it."""
+        return self._streams.get(ref)
+
+    async def let_view(
+        self, websocket: WebSocket, ref: str, viewer: Any, *work: Callable[[StreamT], Coroutine[Any, Any, None]]
+    ) -> None:
+        """Let the page view that robot until one part of the ``work`` for its socket ends; close the socket."""
+        if self._closed or not own_topic(ref, self._channel.topic(ref), Direction.OUTGOING):
+            await websocket.close(_BAD_REQUEST, "no such component")
+            return
+        stream = self._open(ref)
+        stream.join(viewer)
+        tasks = {asyncio.create_task(part(stream)) for part in work}
+        try:
+            await asyncio.wait({*tasks, stream.task}, return_when=asyncio.FIRST_COMPLETED)
+        finally:
+            stream.leave(viewer)
+            await _end(tasks)
+            with contextlib.suppress(RuntimeError):  # it is closed already
+                await websocket.close(_GONE)
+
+    async def close(self) -> None:
+        """Withdraw all requests; for good."""
+        self._closed = True
+        await asyncio.gather(*(stream.close() for stream in self._streams.values()), return_exceptions=True)
+
+    def _open(self, ref: str) -> StreamT:
+        stream = self._streams.get(ref)
+        if stream is None:
+            stream = self._streams[ref] = self._make(ref)
+            stream.task.add_done_callback(lambda task: self._forget(ref, task))
+        return stream
+
+    def _forget(self, ref: str, task: asyncio.Task[None]) -> None:
+        self._streams.pop(ref, None)
+        if not task.cancelled() and task.exception() is not None:
+            log.error("the pictures or the sound of %s have ended", ref, exc_info=task.exception())
+
+
+async def _end(tasks: set[asyncio.Task[None]]) -> None:
+    for task in tasks:
+        task.cancel()
+    for result in await asyncio.gather(*tasks, return_exceptions=True):
+        if isinstance(result, Exception):
+            log.warning("a page's pictures or sound have ended: %s", result)

@@ -1,0 +1,181 @@
+"""What is received of the components that pages have open, besides what is received of all."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections import Counter
+from collections.abc import Callable, Coroutine
+from typing import Any
+
+from msgspec.structs import replace
+
+from pebble import contract as c
+from pebble.contract import codec
+from pebble.contract.identity import Direction
+from pebble.contract.payloads import AnyObject
+from pebble.errors import PayloadError, PebbleError
+from pebble.extensions.operator.client.broker import Broker
+from pebble.extensions.operator.client.robot_topics import FLAGS, PLACES, WATCHED
+from pebble.extensions.page.log_lines import LogLines
+from pebble.extensions.page.messages import FlagsView
+from pebble.extensions.page.robots import Robots
+from pebble.transports import Message, Subscription
+
+log = logging.getLogger(__name__)
+
+KEEP_S = 5.0  # so long they are still received after the last page has closed the component
+_FLAGS_METRIC = "web/flags"
+STEP_S = 1.0  # between two changes of what is received of one component: capabilities may change without end
+
+#: The component and channel of what a topic carries, where its own name does not tell them.
+_Carried = tuple[str, c.Channel] | None
+
+#: Channels for which capabilities may name a topic that is subscribed to, besides overlays and flags.
+_NAMED = [
+    channel
+    for channel in PLACES
+    if channel.direction == Direction.OUTGOING and channel.payload is not bytes and channel is not c.VIDEO_OVERLAYS
+]
+#: Fields of FlagsView.
+_FLAG_FIELDS = {flag: flag.metric.removeprefix("flags/").replace("-", "_") for flag in FLAGS.values()}
+
+
+class OpenComponents:
+    """Subscribes while at least one page has a component open. Only the event loop calls it."""
+
+    def __init__(
+        self,
+        broker: Broker,
+        robots: Robots,
+        spawn: Callable[[Coroutine[Any, Any, None]], None],
+        *,
+        keep_s: float = KEEP_S,
+        step_s: float = STEP_S,
+    ) -> None:
+        """``spawn`` runs a coroutine in the background."""
+        self._broker, self._robots, self._spawn = broker, robots, spawn
+        self._keep_s, self._step_s = keep_s, step_s
+        self._pages: Counter[str] = Counter()
+        self._subscriptions: dict[str, dict[str, Subscription]] = {}  # by component and filter
+        self._following: set[str] = set()  # components whose task runs
+        self._wanted: dict[str, dict[str, _Carried]] = {}  # by component and filter
+        self._flags: dict[str, FlagsView] = {}
+
+    @property
+    def known(self) -> set[str]:
+        """The components of which anything is received or remembered here."""
+        return {*self._pages, *self._subscriptions, *self._wanted, *self._flags}
+
+    def __contains__(self, ref: object) -> bool:
+        return ref in self._pages
+
+    def open(self, ref: str) -> None:
+        self._pages[ref] += 1
+        self._robots.logs.setdefault(ref, LogLines())
+        self.update(ref)
+
+    def close(self, ref: str) -> None:
+        self._broker.loop.call_later(self._keep_s, self._closed, ref)
+
+    def _closed(self, ref: str) -> None:
+        """Some time later: a page that is loaded anew finds everything."""
+        self._pages[ref] -= 1
+        if not self._pages[ref]:
+            del self._pages[ref]
+            self.update(ref)
+
+    def update(self, ref: str) -> None:
+        """Its capabilities, or the pages that have it open, may have changed."""
+        wanted = set(self._filters(ref)) if ref in self._pages else None
+        received = set(self._subscriptions[ref]) if ref in self._subscriptions else None
+        if ref not in self._following and wanted != received:
+            self._following.add(ref)
+            self._spawn(self._follow(ref))
+
+    async def _follow(self, ref: str) -> None:
+        """Subscribe and unsubscribe until what is received is what is wanted."""
+        failed: set[str] = set()  # they are tried again, but logged once
+        try:
+            done = self._subscriptions.setdefault(ref, {})
+            while True:
+                wanted = self._wanted[ref] = self._filters(ref) if ref in self._pages else {}
+                for filter_ in [filter_ for filter_ in done if filter_ not in wanted]:
+                    await self._broker.unsubscribe(done.pop(filter_))
+                for filter_ in [filter_ for filter_ in wanted if filter_ not in done]:
+                    try:
+                        done[filter_] = await self._broker.subscribe(filter_, self._receiver(ref, filter_))
+                    except PebbleError as error:
+                        if filter_ not in failed:
+                            failed.add(filter_)
+                            log.warning("%s is not received: %s", filter_, error)
+                if wanted and self._broker.connected:
+                    self._show_flags(ref, self._flags.get(ref, FlagsView()))  # those that are not set do not arrive
+                if not wanted:
+                    if ref in self._pages:  # opened again meanwhile
+                        continue
+                    self._forget(ref)
+                    return
+                await asyncio.sleep(self._step_s)
+                if ref in self._pages and set(self._filters(ref)) == set(done):
+                    return
+        finally:
+            self._following.discard(ref)
+
+    def _forget(self, ref: str) -> None:
+        """Nothing is received of it any more. Pages may open what is no component at all."""
+        self._subscriptions.pop(ref, None)
+        self._wanted.pop(ref, None)
+        self._flags.pop(ref, None)
+        self._robots.logs.pop(ref, None)
+        self._robots.remove_server_metric(ref, _FLAGS_METRIC)
+        if ref not in self._robots.components:
+            self._robots.forget(ref)
+
+    def _receiver(self, ref: str, filter_: str) -> Callable[[Message, float], None]:
+        def take(message: Message, now: float) -> None:
+            carried = self._wanted.get(ref, {}).get(filter_)
+            before = self._robots.aliases(ref)
+            if carried is None:
+                self._robots.receive(message, now)
+            elif carried[1].kind is c.Kind.FLAG:
+                self._receive_flag(ref, carried[1], message)
+            else:
+                self._robots.receive_as(carried[0], carried[1].metric, message, now, carried[1])
+            if self._robots.aliases(ref) != before:
+                self.update(ref)
+
+        return take
+
+    def _receive_flag(self, ref: str, channel: c.Channel, message: Message) -> None:
+        """Its newest value; an empty message removes what was retained."""
+        try:
+            value = codec.decode(channel, message.payload) if message.payload else None
+        except PayloadError:
+            return
+        view = replace(self._flags.get(ref, FlagsView()), **{_FLAG_FIELDS[channel]: value})
+        self._show_flags(ref, view)
+
+    def _show_flags(self, ref: str, view: FlagsView) -> None:
+        self._flags[ref] = view
+        self._robots.set_server_metric(ref, _FLAGS_METRIC, view)
+
+    def _filters(self, ref: str) -> dict[str, _Carried]:
+        """Every channel's own topic, flags, what capabilities and manifests name, and overlays of its picture."""
+        filters: dict[str, _Carried] = {channel.filter(ref): None for channel in WATCHED}
+        for channel in _NAMED:
+            self._add(filters, ref, channel)
+        for metric in self._robots.aliases(ref):
+            alias = c.Channel(metric=metric, kind=c.Kind.STREAM, payload=AnyObject)
+            filters.setdefault(f"{ref}/{Direction.OUTGOING}/{metric}", (ref, alias))
+        for flag in FLAGS.values():
+            filters[self._robots.topic(ref, flag)] = (ref, flag)
+        source = self._robots.sources.get(ref, ref)
+        filters.setdefault(c.VIDEO_OVERLAYS.filter(source), None)
+        self._add(filters, source, c.VIDEO_OVERLAYS)
+        return filters
+
+    def _add(self, filters: dict[str, _Carried], ref: str, channel: c.Channel) -> None:
+        topic = self._robots.topic(ref, channel)
+        if topic != channel.topic(ref):
+            filters.setdefault(topic, (ref, channel))

@@ -1,0 +1,300 @@
+"""The routes of recordings: days, timelines, films. Nothing is sent."""
+
+from __future__ import annotations
+
+import math
+import secrets
+import tempfile
+from collections.abc import Awaitable, Callable
+from dataclasses import dataclass
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import Annotated, Any, Final, Literal
+
+import msgspec
+from msgspec import Meta, Struct
+from starlette.requests import HTTPConnection, Request
+from starlette.responses import FileResponse, JSONResponse, PlainTextResponse, Response
+from starlette.routing import Route
+
+from pebble.contract.identity import Identity
+from pebble.errors import PebbleError
+from pebble.extensions.page.access import login
+from pebble.extensions.page.recordings.archive_process import ArchiveProcess, BusyError, Job
+from pebble.extensions.page.recordings.viewers import Viewers
+from pebble.extensions.recordings.seek import questions
+from pebble.transports.clock import since_boot as clock
+
+_NONE: Final = "this server has no recordings: start it with --recordings DIR"
+_LONGEST_EXPORT_MS: Final = 3_600_000.0
+_ACTIVE_S: Final = 30.0  # a timeline of files that are being written is made anew after this time
+_TIMELINES: Final = 16  # that are remembered
+_LATEST_MS: Final = 9.0e12  # in the year 2255
+
+_Ref = Annotated[str, Meta(max_length=200)]
+
+
+class ExportRequest(Struct, frozen=True, rename={"form": "as"}):
+    """The body of POST /archive/exports; times in epoch milliseconds."""
+
+    robot: _Ref
+    since: float
+    until: float
+    form: Literal["mkv", "mp4", "mcap"]
+
+
+_export_decoder = msgspec.json.Decoder(ExportRequest)
+
+
+@dataclass(slots=True)
+class _Timeline:
+    """One that is being made, or was made; ``made``: JSON, while a newer one is made that of before."""
+
+    paths: list[str]
+    active: bool
+    target: Path
+    job: Job
+    began_at: float  # seconds since the machine was started
+    made: bytes | None = None
+
+    def take(self) -> bytes | None:
+        if self.job.ready and self.target.exists():
+            self.made = self.target.read_bytes()
+            self.target.unlink()
+        return self.made
+
+
+@dataclass(slots=True)
+class _Export:
+    """The one export that there is."""
+
+    id: str
+    name: str
+    target: Path
+    job: Job
+
+
+class BadQuestionError(PebbleError):
+    """A parameter that is missing or no such value. Example: ``at: a number of milliseconds is needed``."""
+
+
+class Recordings:
+    """What one server offers of a folder of recordings. Everything runs on the event loop."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.process = ArchiveProcess(folder)
+        self.viewers = Viewers(folder)
+        self._scratch = tempfile.TemporaryDirectory(prefix="pebble-replay-")
+        self._timelines: dict[tuple[str, str], _Timeline] = {}
+        self._export: _Export | None = None
+
+    @property
+    def scratch(self) -> Path:
+        """Where jobs write."""
+        return Path(self._scratch.name)
+
+    async def close(self) -> None:
+        self.process.close()
+        for one in self._timelines.values():
+            await one.job.end()
+        if self._export is not None:
+            await self._export.job.end()
+        self._scratch.cleanup()
+
+    async def timeline(self, day: str, robot: str, *, again: bool = False) -> bytes | float:
+        """JSON, or the share of the work that is done. Raises PebbleError.
+
+        What has failed is done anew only ``again``, or for other recordings.
+        """
+        key, period = (day, robot), _period_of(day)
+        paths, active = await self.process.ask(questions.files, robot, *period)
+        known = self._timelines.pop(key, None)
+        if known is None or self._is_old(known, paths, active=active, again=again):
+            before = None if known is None else known.take()
+            known = self._begin(robot, period, paths, active=active, before=before)
+        self._timelines[key] = known  # the last one used is the last one forgotten
+        await self._forget()
+        if known.job.why:
+            raise PebbleError(known.job.why)
+        made = known.take()
+        return known.job.done if made is None else made
+
+    async def export(self, wanted: ExportRequest) -> str:
+        """Begin an export; returns its id. Raises PebbleError, BusyError while one runs."""
+        if self._export is not None and self._export.job.running:
+            raise BusyError("another export runs: wait for it, or end it")
+        if not 0 <= wanted.since < wanted.until <= wanted.since + _LONGEST_EXPORT_MS:
+            raise BadQuestionError("an export is of at most one hour, and ends after it begins")
+        period = round(wanted.since * 1e6), round(wanted.until * 1e6)
+        paths, _ = await self.process.ask(questions.files, wanted.robot, *period)
+        if not paths:
+            raise PebbleError(f"nothing is recorded of {wanted.robot} in this time")
+        await self.end_export()
+        number = secrets.token_hex(8)
+        target = self._target(f"{number}.{wanted.form}")
+        job = Job(questions.export_job, paths, target, wanted.robot, period, wanted.form)
+        began = datetime.fromtimestamp(wanted.since / 1000, UTC).strftime("%Y%m%dT%H%M%SZ")
+        name = f"{wanted.robot.rpartition('/')[2]}-{began}.{wanted.form}"
+        self._export = _Export(number, name, target, job)
+        return number
+
+    def export_of(self, number: str) -> _Export | None:
+        return self._export if self._export is not None and self._export.id == number else None
+
+    async def end_export(self) -> None:
+        one, self._export = self._export, None
+        if one is not None:
+            await one.job.end()
+            one.target.unlink(missing_ok=True)
+
+    def _begin(
+        self, robot: str, period: tuple[int, int], paths: list[str], *, active: bool, before: bytes | None
+    ) -> _Timeline:
+        target = self._target(f"{secrets.token_hex(8)}.json")
+        job = Job(questions.make_timeline_job, paths, target, robot, period)
+        return _Timeline(paths, active, target, job, clock(), before)
+
+    def _target(self, name: str) -> Path:
+        """Where a job writes; systems may have cleaned the folder away."""
+        try:
+            self.scratch.mkdir(mode=0o700, exist_ok=True)
+        except OSError as error:
+            raise PebbleError(questions.reason(error)) from None
+        return self.scratch / name
+
+    def _is_old(self, known: _Timeline, paths: list[str], *, active: bool, again: bool) -> bool:
+        if known.job.running:
+            return False
+        if known.job.why:
+            return again or paths != known.paths
+        changed = paths != known.paths or known.active or active
+        return changed and clock() - known.began_at > _ACTIVE_S
+
+    async def _forget(self) -> None:
+        while len(self._timelines) > _TIMELINES:
+            old = self._timelines.pop(next(iter(self._timelines)))
+            await old.job.end()
+            old.target.unlink(missing_ok=True)
+
+
+def _period_of(day: str) -> tuple[int, int]:
+    try:
+        begin = datetime.strptime(day, "%Y-%m-%d").replace(tzinfo=UTC)
+        end = begin + timedelta(days=1)
+    except (ValueError, OverflowError):
+        raise BadQuestionError(f'day: "{day[:20]}" is none: write 2026-11-20') from None
+    return int(begin.timestamp()) * 10**9, int(end.timestamp()) * 10**9
+
+
+# -- routes
+
+_Answers = Callable[[Request, Recordings], Awaitable[Response]]
+
+
+def routes() -> list[Route]:
+    return [
+        Route("/archive/days", _answered(_days)),
+        Route("/archive/timeline", _answered(_timeline)),
+        Route("/archive/exports", _answered(_begin_export), methods=["POST"]),
+        Route("/archive/exports/{id}", _answered(_export)),
+        Route("/archive/exports/{id}/file", _answered(_file)),
+        Route("/archive/exports/{id}/end", _answered(_end_export), methods=["POST"]),
+    ]
+
+
+def _answered(answers: _Answers) -> Callable[[Request], Awaitable[Response]]:
+    """Only with a session, and one line for everything that is wrong."""
+
+    async def endpoint(request: Request) -> Response:
+        if login.session_of(request) is None:
+            return PlainTextResponse("log in first", 401)
+        recordings: Recordings | None = request.app.state.recordings
+        if recordings is None:
+            return PlainTextResponse(_NONE, 404)
+        try:
+            return await answers(request, recordings)
+        except BadQuestionError as error:
+            return PlainTextResponse(str(error), 400)
+        except BusyError as error:
+            return PlainTextResponse(str(error), 409)
+        except PebbleError as error:
+            return PlainTextResponse(str(error), 422)
+
+    return endpoint
+
+
+async def _days(_: Request, recordings: Recordings) -> Response:
+    return _json(await recordings.process.ask(questions.days))
+
+
+async def _timeline(request: Request, recordings: Recordings) -> Response:
+    asked = request.query_params
+    made = await recordings.timeline(asked.get("day", ""), _robot(request), again=asked.get("again") == "1")
+    return JSONResponse({"indexing": made}, 202) if isinstance(made, float) else _json(made)
+
+
+async def _begin_export(request: Request, recordings: Recordings) -> Response:
+    try:
+        wanted = _export_decoder.decode(await request.body())
+    except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
+        raise BadQuestionError(str(error)) from None
+    number = await recordings.export(wanted)
+    session = login.session_of(request)
+    user, address = "" if session is None else session.user, "" if request.client is None else request.client.host
+    detail = f"{wanted.form}, {round((wanted.until - wanted.since) / 1000)} s from {round(wanted.since / 1000)}"
+    request.app.state.audit.write("export", ref=wanted.robot, user=user, address=address, detail=detail)
+    return JSONResponse({"id": number}, 202)
+
+
+async def _export(request: Request, recordings: Recordings) -> Response:
+    one = recordings.export_of(request.path_params["id"])
+    if one is None:
+        return PlainTextResponse("there is no such export", 404)
+    state = "running" if one.job.running else "ready" if one.job.ready else "failed"
+    size = one.target.stat().st_size if state == "ready" else 0
+    why = one.job.why or one.job.unread
+    return JSONResponse({"state": state, "done": one.job.done, "why": why, "name": one.name, "bytes": size})
+
+
+async def _file(request: Request, recordings: Recordings) -> Response:
+    one = recordings.export_of(request.path_params["id"])
+    if one is None or one.job.running or not one.job.ready:
+        return PlainTextResponse("there is no such export, or it is not ready", 404)
+    return FileResponse(one.target, filename=one.name, media_type="application/octet-stream")
+
+
+async def _end_export(request: Request, recordings: Recordings) -> Response:
+    if recordings.export_of(request.path_params["id"]) is None:
+        return PlainTextResponse("there is no such export", 404)
+    await recordings.end_export()
+    return JSONResponse({})
+
+
+def _json(data: bytes) -> Response:
+    return Response(data, media_type="application/json")
+
+
+def robot_and_time(connection: HTTPConnection) -> tuple[str, float]:
+    """Return whose recording a page wants to look at, and from when on. Raises BadQuestionError."""
+    return _robot(connection), _number(connection, "at", _LATEST_MS)
+
+
+def _robot(request: HTTPConnection) -> str:
+    text = request.query_params.get("robot", "")
+    levels = text.split("/")
+    try:
+        return Identity(*levels).base
+    except (TypeError, ValueError, PebbleError):
+        raise BadQuestionError(f'robot: "{text[:100]}" is none: write system/type/id') from None
+
+
+def _number(request: HTTPConnection, name: str, most: float) -> float:
+    text: Any = request.query_params.get(name)
+    try:
+        value = float(text)
+    except (TypeError, ValueError):
+        value = math.nan
+    if not 0 <= value <= most:
+        raise BadQuestionError(f"{name}: a number from 0 to {most:g} is needed")
+    return value

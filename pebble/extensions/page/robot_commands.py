@@ -1,0 +1,112 @@
+"""What a page asks of a robot, besides driving: which right it needs, and what is then published. Pure."""
+
+from typing import Any, NamedTuple
+
+import msgspec
+
+from pebble import contract as c
+from pebble.contract import Channel, codec
+from pebble.contract import payloads as p
+from pebble.extensions.fleet.roles import right_of
+from pebble.extensions.operator.client.robot_topics import FLAGS, PLACES, names, section_of, topic_of
+from pebble.extensions.page import messages as m
+from pebble.transports import Message, QoS
+
+
+class _Command(NamedTuple):
+    channel: Channel
+    value: Any
+    names: dict[str, str] = {}  # of the channel's topic  # noqa: RUF012 - never changed
+
+
+_ACTIONS = {"reboot": c.REBOOT, "service-restart": c.SERVICE_RESTART, "git-pull": c.GIT_PULL}
+_DESCRIBE = c.MCU_DESCRIBE.metric.rpartition("/")[2]  # on this topic bridges ask each other whose device it is
+_FLAGS = {flag.metric.removeprefix("flags/"): flag for flag in FLAGS.values()}
+
+
+def right(op: m.RobotOp) -> str:
+    """That a person needs to ask this."""
+    return right_of(_command(op).channel)
+
+
+def ends(op: m.RobotOp) -> bool:
+    """Whether it ends something: then it is passed on whatever the component is and reports."""
+    match op:
+        case m.SoundboardOp(file="") | m.AutonomyOp(file="") | m.FlagOp(on=False) | m.OutletOp(on=False):
+            return True
+        case m.LightsOp(r=0, g=0, b=0):
+            return True
+    return False
+
+
+def moves(op: m.RobotOp) -> bool:
+    """Whether something may move, or be switched on, because of it: not over a connection that may not drive."""
+    return isinstance(op, m.AutonomyOp | m.McuOp | m.OutletOp) and not ends(op)
+
+
+def refusal(op: m.RobotOp, capabilities: dict[str, Any]) -> str:
+    """Why a component with these capabilities is not asked this; empty if it is, also where they do not mention it."""
+    if isinstance(op, m.McuOp) and op.name == _DESCRIBE:
+        return f"{op.name} is no command of a microcontroller"
+    command = _command(op)
+    section, key = PLACES.get(command.channel, ("", ""))
+    offered = section_of(capabilities, section)
+    kind = key.removesuffix("_topic")  # lights that do not flash: {"solid": true, "flash": false}
+    if isinstance(op, m.ActionOp):
+        offered = next(filter(None, (section_of(capabilities, section) for section in _sections(op))), {})
+    if isinstance(op, m.OutletOp):
+        outlets = section_of(capabilities, "outlets").get("outlets")
+        named = [one for one in outlets if isinstance(one, dict)] if isinstance(outlets, list) else []
+        offered = next((one for one in named if one.get("name") == op.outlet), {})
+    refused = any(offered.get(name) is False for name in ("available", "controls", kind))
+    name, metric = op.ref.rpartition("/")[2], command.channel.metric.format(**command.names)
+    return f"{name} takes no {metric} commands" if refused else ""
+
+
+def publication(op: m.RobotOp, capabilities: dict[str, Any]) -> Message:
+    command = _command(op)
+    channel = command.channel
+    if isinstance(op, m.ActionOp):
+        topic = _action_topic(op, channel, capabilities)
+    elif channel in PLACES:
+        topic = topic_of(op.ref, capabilities, channel)
+    else:
+        topic = channel.topic(op.ref, **command.names)
+    qos = QoS(channel.default_qos)
+    return Message(topic, codec.encode(channel, command.value), qos=qos, retain=channel.default_retain)
+
+
+def _action_topic(op: m.ActionOp, channel: Channel, capabilities: dict[str, Any]) -> str:
+    """The first that the capabilities name."""
+    sections = (section_of(capabilities, section) for section in _sections(op))
+    topics = (section.get(key) for section in sections for key in ("flag_topic", "topic"))
+    return next((str(topic) for topic in topics if names(op.ref, topic, channel)), channel.topic(op.ref))
+
+
+def _sections(op: m.ActionOp) -> list[str]:
+    """The commands in the capabilities, in all spellings that the original page understands."""
+    names = (op.name.replace("-", "_"), op.name)
+    return [f"system.{name}" for name in names] + list(names)
+
+
+def _command(op: m.RobotOp) -> _Command:
+    match op:
+        case m.LightsOp(r=r, g=g, b=b, period=None):
+            return _Command(c.LIGHTS_SOLID, p.LightsSolid(r=r, g=g, b=b))
+        case m.LightsOp(r=r, g=g, b=b, period=period):
+            return _Command(c.LIGHTS_FLASH, p.LightsFlash(r=r, g=g, b=b, period=period or 0))
+        case m.SoundboardOp(file=file, repeat=repeat):
+            play = p.SoundboardCommand(action="play", enabled=True, file=file, repeat=repeat or msgspec.UNSET)
+            stop = p.SoundboardCommand(action="stop", enabled=False)
+            return _Command(c.SOUNDBOARD_COMMAND, play if file else stop)
+        case m.AutonomyOp(file=file, config=config):
+            start = p.AutonomyCommand(action="start", file=file, config=config)
+            return _Command(c.AUTONOMY_COMMAND, start if file else p.AutonomyCommand(action="stop"))
+        case m.OutletOp(outlet=outlet, on=on):
+            return _Command(c.OUTLET_COMMAND, p.OutletCommand(on=on), names={"outlet": outlet})
+        case m.McuOp(uid=uid, name=name, value=value):
+            return _Command(c.MCU_COMMAND, value, names={"uid": uid, "name": name})
+        case m.ActionOp(name=name):
+            return _Command(_ACTIONS[name], True)
+        case m.FlagOp(name=name, on=on):
+            return _Command(_FLAGS[name], on)

@@ -1,0 +1,377 @@
+"""The newest value of every component and metric, and what of it each page has not received yet.
+
+No queue forms: a slow page receives the newest value less often. A page that connects again receives everything.
+"""
+
+import logging
+import re
+import time
+from collections.abc import Callable, Collection, Iterator
+from itertools import chain
+from typing import Any, NamedTuple
+
+import msgspec
+
+from pebble import contract as c
+from pebble.contract import channel_of, codec, is_reserved
+from pebble.contract.identity import LEVEL, Direction, parse_topic
+from pebble.errors import PayloadError
+from pebble.extensions.operator.client.robot_topics import FLEET, topic_of
+from pebble.extensions.operator.client.robot_view import RobotView
+from pebble.extensions.page import messages as m
+from pebble.extensions.page.log_lines import LogLines
+from pebble.extensions.page.shown import shown
+from pebble.transports import Message
+
+log = logging.getLogger(__name__)
+
+MAX_COMPONENTS, MAX_METRICS, MAX_VALUE_BYTES = 2000, 200, 64 * 1024  # components; metrics of one; bytes of a value
+_MAX_CLIPS_BYTES = 400 * 1024  # of the list of clips, which has up to 256 KiB of names
+LARGE_BYTES = 16 * 1024  # a value beyond holds up a slow connection: one is sent, then the page has to answer
+MAX_STATE_BYTES = 128 * 1024  # of values in one message: pings, by which pages drive, do not wait for thousands
+MAX_BYTES = 64 * 1024 * 1024  # of all values together, but for those of components that are open, driven or stopped
+MAX_ALIASES = 64  # of one component: topics that its microcontrollers declare besides the contract's
+_REFRESH_S = 1.0  # values that change with every heartbeat are sent this often,
+_REFRESHES_PER_S = 100  # but of so many components at most, and of those that are open
+_LONGEST_ALIAS = 200  # characters
+
+_is_level = re.compile(LEVEL).search
+
+
+class _Value(NamedTuple):
+    raw: msgspec.Raw
+    at: float  # monotonic
+
+
+class Component:
+    """One component, by the messages it publishes."""
+
+    def __init__(self, ref: str) -> None:
+        self.ref = ref
+        self.robot = RobotView(ref)
+        self.values: dict[str, _Value] = {}
+        self.aliases: dict[str, tuple[str, ...]] = {}  # by metric of the manifest that declares them
+        self.sent_online: bool | None = None
+        self.refreshed_at = float("-inf")
+
+    def lists(self, metric: str) -> bool:
+        """Whether this is the state of a motor owner that its capabilities list."""
+        states, owners = (c.ESTOP_STATE, c.CONTROL_STATE), self.robot.estop.owners
+        return metric in [state.metric.format(owner=owner) for state in states for owner in owners]
+
+
+def liveness_of(robot: RobotView, now: float) -> m.Liveness:
+    """Return whether it is there, as pages are shown it."""
+    liveness = robot.liveness
+    return m.Liveness(
+        online=robot.online(now),
+        silent_s=liveness.age_s(now),
+        latency_ms=_ms(liveness.latency_s),
+        average_latency_ms=_ms(liveness.average_latency_s),
+        interval_ms=_ms(liveness.interval_s),
+        whole_seconds=liveness.whole_seconds,
+    )
+
+
+def _ms(seconds: float | None) -> float | None:
+    return None if seconds is None else 1000 * seconds
+
+
+class Interest:
+    """What one page has not received yet, and which component it has open."""
+
+    def __init__(self, changed: Callable[[], None]) -> None:
+        self.watched = ""
+        self.dirty: set[tuple[str, str]] = set()
+        self.more = False  # what is dirty did not fit into the last message
+        self.gone: set[str] = set()
+        self.notify = changed
+
+
+class Robots:
+    """All components. Only the event loop calls it."""
+
+    def __init__(self) -> None:
+        self.components: dict[str, Component] = {}
+        #: Robots that get a place in any case, and those that lose it to none: they are open, driven or stopped.
+        self.is_wanted: Callable[[str], bool] = lambda _ref: False
+        self.is_kept: Callable[[str], bool] = lambda _ref: False
+        self.omitted = 0  # messages of components, metrics and values beyond the limits
+        self.interests: set[Interest] = set()
+        self.on_forget: Callable[[str], object] = lambda _: None
+        self.logs: dict[str, LogLines] = {}  # of watched components
+        self.sources: dict[str, str] = {}  # the components whose pictures are shown on the pages of others
+        self._server: dict[tuple[str, str], _Value] = {}
+        self._bytes = 0
+
+    # -- reading
+
+    def view(self, ref: str) -> RobotView | None:
+        component = self.components.get(ref)
+        return None if component is None else component.robot
+
+    def capabilities(self, ref: str) -> dict[str, Any]:
+        """Empty until they are known."""
+        component = self.components.get(ref)
+        return {} if component is None else component.robot.capabilities
+
+    def topic(self, ref: str, channel: c.Channel) -> str:
+        """Return the topic that the component's capabilities name for ``channel``, else the channel's own."""
+        return topic_of(ref, self.capabilities(ref), channel)
+
+    def aliases(self, ref: str) -> list[str]:
+        """The metrics, none of the contract's, under which its microcontrollers say that they publish."""
+        component = self.components.get(ref)
+        declared = () if component is None else component.aliases.values()
+        return list(dict.fromkeys(chain.from_iterable(declared)))[:MAX_ALIASES]
+
+    def value(self, ref: str, metric: str) -> msgspec.Raw | None:
+        """The newest value; that of a server's metric as well."""
+        found = self._find(ref, metric)
+        return None if found is None else found.raw
+
+    def take(
+        self, interest: Interest, now: float, *, large: bool
+    ) -> tuple[tuple[tuple[str, str, Any, float], ...], bool]:
+        """What this page has not received yet, None for what was removed; it counts as received from now on.
+
+        With it, whether there is a large value among them: one if it may be ``large``, the others wait. What is open is
+        taken first; what does not fit into a message waits for the next one.
+        """
+        dirty, interest.dirty = interest.dirty, set()
+        taken, has_large, left = [], False, MAX_STATE_BYTES
+        for ref, metric in sorted(dirty, key=lambda one: one[0] != interest.watched):
+            one = self._find(ref, metric)
+            size = 0 if one is None else len(bytes(one.raw))
+            if left <= 0 or (size > LARGE_BYTES and (has_large or not large)):
+                interest.dirty.add((ref, metric))
+                continue
+            has_large = has_large or size > LARGE_BYTES
+            left -= size
+            taken.append((ref, metric, None, 0.0) if one is None else (ref, metric, one.raw, 1000 * (now - one.at)))
+        interest.more = left <= 0
+        return tuple(taken), has_large
+
+    def _find(self, ref: str, metric: str) -> _Value | None:
+        if metric.startswith("web/"):
+            return self._server.get((ref, metric))
+        component = self.components.get(ref)
+        return None if component is None else component.values.get(metric)
+
+    # -- pages
+
+    def join(self, interest: Interest) -> None:
+        """Send everything to this page."""
+        self.interests.add(interest)
+        interest.dirty |= set(self._all(FLEET)) | set(self._server)
+
+    def watch(self, interest: Interest, ref: str) -> None:
+        """Send further metrics of ``ref`` to this page."""
+        interest.watched = ref
+        component = self.components.get(ref)
+        if component is not None:
+            interest.dirty |= {(ref, metric) for metric in component.values}
+
+    def leave(self, interest: Interest) -> None:
+        self.interests.discard(interest)
+
+    def _all(self, channels: Collection[c.Channel | None]) -> Iterator[tuple[str, str]]:
+        for ref, component in self.components.items():
+            for metric in component.values:
+                if _channel(metric) in channels:
+                    yield ref, metric
+
+    # -- changes
+
+    def set_server_metric(self, ref: str, metric: str, value: Any) -> None:
+        """Set one of the server's own metrics for all pages; unchanged values are not sent again."""
+        raw = msgspec.Raw(msgspec.json.encode(value))
+        old = self._server.get((ref, metric))
+        if old is None or bytes(old.raw) != bytes(raw):
+            self._server[ref, metric] = _Value(raw, time.monotonic())
+            self._mark(ref, metric, everybody=True)
+
+    def remove_server_metric(self, ref: str, metric: str) -> None:
+        """Pages have its last value until they receive another one."""
+        self._server.pop((ref, metric), None)
+
+    def receive(self, message: Message, now: float) -> None:
+        """Take a message of any component."""
+        address = parse_topic(message.topic)
+        if address is None or address.direction is not Direction.OUTGOING or address.identity.is_server:
+            return
+        self.receive_as(address.identity.base, address.metric, message, now)
+
+    def receive_as(self, ref: str, metric: str, message: Message, now: float, channel: c.Channel | None = None) -> None:
+        """Take a message as the metric that it carries, whatever its topic is called.
+
+        ``channel``: how it is read, if the contract does not have it.
+        """
+        component = self.components.get(ref) or self._add(ref)
+        channel = channel or _channel(metric)
+        if component is None or channel is None:
+            return
+        if channel is c.LOGS:
+            self._log(component, message)
+            return
+        if not message.payload:
+            self._remove_value(component, metric)
+        elif (raw := codec.trim(message.payload)) != message.payload:  # pages get it as it is
+            message = msgspec.structs.replace(message, payload=raw)
+        if not message.payload or self._store(component, metric, channel, message, now):
+            self._interpret(component, metric, channel, message, now)
+
+    def forget(self, ref: str) -> None:
+        """Remove a component, also one that was never there; it comes back with its next message."""
+        component = self.components.pop(ref, None)
+        if component is not None:
+            self._bytes -= sum(len(bytes(value.raw)) for value in component.values.values())
+        self.on_forget(ref)
+        for key in [key for key in self._server if key[0] == ref]:
+            del self._server[key]
+        for interest in self.interests:
+            interest.gone.add(ref)
+            interest.notify()
+
+    def refresh(self, now: float) -> None:
+        """Send what changes with time; to be called every 0.25 s.
+
+        Whether a component is there is sent at once. What is merely older than before is sent of what is open, and of a
+        third of the others, or fewer: no page has to draw all of them at once, and a thousand robots are no flood.
+        """
+        older: list[Component] = []
+        opened = {interest.watched for interest in self.interests}
+        every_s = max(_REFRESH_S, len(self.components) / _REFRESHES_PER_S)
+        for component in self.components.values():
+            age_s = now - component.refreshed_at
+            if component.robot.online(now) is not component.sent_online or age_s == float("inf"):
+                self._refresh(component, now)
+            elif age_s >= _REFRESH_S and (component.robot.live or component.sent_online is not None):
+                if component.ref in opened:
+                    self._refresh(component, now)
+                elif age_s >= every_s:
+                    older.append(component)
+        older.sort(key=lambda one: one.refreshed_at)
+        for component in older[: 1 + min(len(self.components), _REFRESHES_PER_S) // 3]:
+            self._refresh(component, now)
+
+    def _refresh(self, component: Component, now: float) -> None:
+        component.sent_online, component.refreshed_at = component.robot.online(now), now
+        self.set_server_metric(component.ref, "web/liveness", liveness_of(component.robot, now))
+        if c.ONLINE.metric in component.values:
+            self._mark(component.ref, c.ONLINE.metric)
+
+    def _add(self, ref: str) -> Component | None:
+        if len(self.components) >= MAX_COMPONENTS:
+            if not self.omitted:
+                log.warning("more than %d components at this broker: give it accounts", MAX_COMPONENTS)
+            self.omitted += 1
+            if not self.is_wanted(ref):
+                return None
+            newest = next((other for other in reversed(self.components) if not self.is_kept(other)), None)
+            if newest is not None:
+                self.forget(newest)
+            self.on_forget(ref)  # what it published before found no place: it is asked for
+        component = self.components[ref] = Component(ref)
+        return component
+
+    def _has_room(self, component: Component, metric: str, channel: c.Channel, grows: int) -> bool:
+        if component.lists(metric):
+            return True
+        is_new = metric not in component.values
+        if is_new and len(component.values) >= MAX_METRICS and channel.is_pattern:
+            return False
+        return self._bytes + grows <= MAX_BYTES or self.is_kept(component.ref)
+
+    def _store(self, component: Component, metric: str, channel: c.Channel, message: Message, now: float) -> bool:
+        """Check and store the value; False if it is refused."""
+        old = component.values.get(metric)
+        if len(message.payload) > (_MAX_CLIPS_BYTES if channel is c.SOUNDBOARD_FILES else MAX_VALUE_BYTES):
+            self.omitted += 1
+            return False
+        try:
+            raw = shown(channel, message.payload, codec.plain(channel, message.payload))
+        except PayloadError:
+            return False
+        grows = len(raw) - (0 if old is None else len(bytes(old.raw)))
+        if not self._has_room(component, metric, channel, grows):
+            self.omitted += 1
+            return False
+        self._bytes += grows
+        component.values[metric] = _Value(msgspec.Raw(raw), now)
+        if channel is not c.ONLINE:
+            self._mark(component.ref, metric)
+        return True
+
+    def _remove_value(self, component: Component, metric: str) -> None:
+        """An empty message removes what was retained."""
+        old = component.values.pop(metric, None)
+        if old is not None:
+            self._bytes -= len(bytes(old.raw))
+            self._mark(component.ref, metric)
+        component.aliases.pop(metric, None)
+
+    def _interpret(self, component: Component, metric: str, channel: c.Channel, message: Message, now: float) -> None:
+        robot, before = component.robot, component.robot.capabilities
+        robot.receive(channel, message, now, time.time() - (time.monotonic() - now))
+        if channel is c.MCU_DESCRIBE and message.payload:
+            component.aliases[metric] = _aliases(message.payload)
+        if robot.capabilities is not before and "announced" in robot.capabilities:
+            # Pages get what it announces as its capabilities, until it publishes them.
+            payload = msgspec.json.encode({"t": int(1000 * time.time()), "value": robot.capabilities})
+            announced = Message(c.CAPABILITIES.topic(component.ref), payload)
+            self._store(component, c.CAPABILITIES.metric, c.CAPABILITIES, announced, now)
+        if robot.liveness.reported_offline and component.sent_online is not False:
+            self._refresh(component, now)  # it may be back before the next round
+
+    def _log(self, component: Component, message: Message) -> None:
+        lines = self.logs.get(component.ref)
+        if lines is None or message.retain or not message.payload:
+            return
+        lines.add(message.payload)
+        for interest in self.interests:
+            if interest.watched == component.ref:
+                interest.notify()
+
+    def mark_drivers(self, refs: Collection[str]) -> None:
+        """Let all pages see who drives these."""
+        for interest in self.interests if refs else ():
+            interest.dirty |= {(ref, "web/driver") for ref in refs}
+            interest.notify()
+
+    def _mark(self, ref: str, metric: str, *, everybody: bool = False) -> None:
+        channel = _channel(metric)
+        everybody = everybody or channel in FLEET
+        for interest in self.interests:
+            drawn = channel is c.VIDEO_OVERLAYS and self.sources.get(interest.watched) == ref
+            if everybody or drawn or interest.watched == ref:
+                interest.dirty.add((ref, metric))
+                interest.notify()
+
+
+def _channel(metric: str) -> c.Channel | None:
+    return channel_of(f"{Direction.OUTGOING}/{metric}")
+
+
+def _aliases(payload: bytes) -> tuple[str, ...]:
+    """What a manifest declares besides the contract's metrics, however strange the rest of it is."""
+    manifest = codec.plain(c.MCU_DESCRIBE, payload)
+    interfaces = manifest.get("interfaces") if isinstance(manifest, dict) else None
+    outgoing = [
+        str(one.get("channel"))
+        for one in (interfaces if isinstance(interfaces, list) else ())
+        if isinstance(one, dict) and one.get("dir") == "out" and isinstance(one.get("channel"), str)
+    ]
+    return tuple(filter(_may_be_alias, outgoing[:MAX_ALIASES]))
+
+
+def _may_be_alias(metric: str) -> bool:
+    """Whether this is a metric that nothing else defines: neither the contract nor the server itself."""
+    family = metric.partition("/")[0]
+    return (
+        _channel(metric) is None
+        and not is_reserved(metric)
+        and family not in ("web", "mcu")
+        and len(metric) <= _LONGEST_ALIAS
+        and all(map(_is_level, metric.split("/")))
+    )

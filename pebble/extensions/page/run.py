@@ -1,0 +1,134 @@
+"""The operator page as a process: ``python -m pebble.extensions.page.run CONFIG`` of a robot.
+
+Instead of CONFIG it takes fields of WebSettings as JSON, and prints ``{"url": …}`` once the page can be opened.
+"""
+
+import asyncio
+import logging
+import signal
+import sys
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from pebble.config import Config, config_of_process
+from pebble.errors import ConfigError, PebbleError
+from pebble.extensions.fleet.people import has_user
+from pebble.extensions.operator.client.page_packages import require_packages
+from pebble.extensions.page.setting import WebSettings, has_login, people_of, settings_of
+from pebble.runtime.parent import ALIVE_PERIOD_S, Notifier, set_log_level, set_up_logging
+from pebble.runtime.process import exit_at_the_latest
+
+log = logging.getLogger(__name__)
+
+
+class Ready(msgspec.Struct):
+    """The output of the process once the page of settings in JSON can be opened."""
+
+    url: str
+
+
+def main(arguments: list[str]) -> int:
+    set_up_logging("INFO")
+    if len(arguments) != 1:
+        sys.stderr.write("usage: python -m pebble.extensions.page.run CONFIG\n")
+        return 2
+    try:
+        is_json = arguments[0].startswith("{")
+        settings = _decoded(arguments[0]) if is_json else _settings_of_process(arguments[0])
+        require_packages()
+        return _Page(settings, prints_url=is_json).run()
+    except PebbleError as error:
+        for line in str(error).splitlines():
+            log.error("%s", line)
+        return 1
+    except Exception:  # the process boundary: log why, exit non-zero, be restarted
+        log.exception("web_handler ended unexpectedly")
+        return 1
+
+
+def settings_or_all_problems(config: Config) -> WebSettings:
+    """The settings of the page; the error also says whether a user is missing: it is not found only after the rest."""
+    try:
+        return settings_of(config)
+    except ConfigError as error:
+        try:
+            more = _without_user(config)
+        except PebbleError as other:
+            more = [str(other)]
+        raise ConfigError([*error.problems, *more]) from None
+
+
+def _settings_of_process(path: str) -> WebSettings:
+    """The settings of a page that people can use. Raises ConfigError with everything that is missing."""
+    config = config_of_process(path)
+    set_log_level(config.log_level)
+    settings = settings_or_all_problems(config)
+    if problems := _without_user(config):
+        raise ConfigError(problems)
+    return settings
+
+
+def _decoded(fields: str) -> WebSettings:
+    def path(kind: type[Any], value: Any) -> Any:
+        return Path(value) if issubclass(kind, Path) else value
+
+    try:
+        return msgspec.json.decode(fields, type=WebSettings, dec_hook=path)
+    except msgspec.MsgspecError as error:
+        raise PebbleError(f"fields of WebSettings: {error}") from None
+
+
+def _without_user(config: Config) -> list[str]:
+    """The problem that a login is needed and there is no user; empty if all is well."""
+    file = people_of(config)
+    if not has_login(config.web_interface) or has_user(file):
+        return []
+    return [
+        f"web_interface.people: {file} has no user: run `pebble web user add NAME --people {file}` as the user who "
+        "runs the robot"
+    ]
+
+
+class _Page:
+    """Serves the page until SIGTERM, and notifies the launcher while its event loop is alive."""
+
+    def __init__(self, settings: WebSettings, *, prints_url: bool) -> None:
+        self._settings, self._prints_url = settings, prints_url
+        self._notify = Notifier()
+        self._ended = self._served = False
+        self._alive: asyncio.Task[None] | None = None
+
+    def run(self) -> int:
+        from pebble.extensions.page.serve import run  # of packages that may be missing
+
+        for number in (signal.SIGTERM, signal.SIGINT):
+            signal.signal(number, self._end)
+        code = run(self._settings, on_ready=self._ready)
+        return code if self._served else 1
+
+    def _end(self, _signal: int, _frame: object) -> None:
+        """Called before the server has its own handlers, and by the server when it has ended."""
+        self._ended = True
+        exit_at_the_latest()
+
+    def _ready(self, url: str) -> None:
+        self._served = True
+        log.info("the operator page is at %s", url)
+        if self._prints_url:
+            sys.stdout.write(msgspec.json.encode(Ready(url)).decode() + "\n")
+            sys.stdout.flush()
+        self._notify.ready()
+        self._alive = asyncio.get_running_loop().create_task(self._report())
+        if self._ended:
+            signal.raise_signal(signal.SIGTERM)
+
+    async def _report(self) -> None:
+        while True:
+            self._notify.alive()
+            await asyncio.sleep(ALIVE_PERIOD_S)
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

@@ -1,0 +1,255 @@
+"""Ties the parts of the server together: what arrives from the broker, what pages ask for, and what is due."""
+
+import asyncio
+import logging
+import secrets
+import time
+from collections.abc import Coroutine
+from contextlib import suppress
+from typing import Any
+
+import msgspec
+
+from pebble.config.security import SecurityLevel
+from pebble.contract import CAPABILITIES, CONTROL_STATE, ONLINE, channel_of
+from pebble.contract.identity import SERVERS, Identity, parse_topic
+from pebble.errors import ConfigError
+from pebble.extensions.fleet.audit import Audit
+from pebble.extensions.fleet.database import DatabaseError
+from pebble.extensions.fleet.people import People
+from pebble.extensions.fleet.roles import Session
+from pebble.extensions.operator.client.broker import Broker
+from pebble.extensions.operator.client.connection import in_small_segments
+from pebble.extensions.operator.client.estop import send
+from pebble.extensions.operator.client.heartbeats import Heartbeats
+from pebble.extensions.operator.client.robot_topics import FLEET, SYNONYMS
+from pebble.extensions.page import messages as m
+from pebble.extensions.page.drive.drivers import Drivers
+from pebble.extensions.page.media.chosen_sources import ChosenSources
+from pebble.extensions.page.media.pictures import MediaHub
+from pebble.extensions.page.media.sound import SoundHub
+from pebble.extensions.page.open_components import OpenComponents
+from pebble.extensions.page.robots import Robots
+from pebble.extensions.page.setting import WebSettings
+from pebble.extensions.page.stops import Stops
+from pebble.transports import Message, QoS, Subscription
+from pebble.transports.clock import since_boot as clock
+
+log = logging.getLogger(__name__)
+
+TICK_S = 0.05
+PEOPLE_S = 0.5  # between two looks at whether people or sessions were changed
+_REFRESH_S = 0.25
+_MANY_WAIT = 16 * 1024  # bytes that the broker has not confirmed
+_ESTOP_METRIC = "web/estop"
+
+
+class Server:
+    """All state of one server. Everything runs on one event loop."""
+
+    def __init__(self, settings: WebSettings, people: People, audit: Audit) -> None:
+        self.settings, self.people, self.audit = settings, people, audit
+        self._base = Identity("pebble", SERVERS, f"{settings.name}-{secrets.token_hex(2)}").base
+        self.broker, self.stop_broker = (
+            Broker(in_small_segments(settings.broker), name) for name in ("pebble-web", "pebble-web-stops")
+        )
+        self.robots, self.stops = Robots(), Stops(self._has_sent)
+        self.drivers = Drivers(self.broker, self.robots)
+        self.media = Broker(settings.broker, "pebble-web-media")  # what it carries holds up no command
+        self.pictures = MediaHub(self.media, self.robots)
+        self.sound = SoundHub(self.media, self.robots, self._note_talk)
+        for broker in (self.broker, self.stop_broker, self.media):
+            broker.is_named = self._is_named
+        self._heartbeats: Heartbeats | None = None  # while a stop of all goes to further robots
+        self.open_components = OpenComponents(self.broker, self.robots, self.spawn)
+        # What is drawn over the picture comes from there.
+        self.sources = ChosenSources(people, self.robots, self.open_components.update)
+        self.robots.is_wanted = self._is_wanted
+        self.robots.is_kept = lambda ref: self._is_wanted(ref) or self.stops.sends_to(ref)
+        self.robots.on_forget = self._ask_anew
+        self._of_all: list[Subscription] = []
+        self.people_version = (0, 0)
+        self._tasks: set[asyncio.Task[None]] = set()
+
+    async def open(self) -> None:
+        """Connect to the broker and subscribe. Raises TransportError for settings that can never work."""
+        await asyncio.gather(self.broker.open(), self.stop_broker.open(), self.media.open())
+        self.broker.on_state(self._show_broker)
+        self.broker.on_state(self.drivers.renew_keys)
+        self._show_broker()
+        for channel in (*FLEET, *SYNONYMS):
+            deferred = channel is ONLINE or channel in SYNONYMS
+            self._of_all.append(await self.broker.subscribe(channel.filter("+/+/+"), self.receive, deferred=deferred))
+        self.spawn(self._tick())
+        if self.settings.login:
+            self.spawn(self._watch_people())
+
+    async def close(self) -> None:
+        """Stop what pages move, then disconnect."""
+        try:
+            self.drivers.closed_all()
+            for task in list(self._tasks):
+                task.cancel()
+            await asyncio.gather(*self._tasks, return_exceptions=True)
+        finally:
+            await asyncio.gather(self.pictures.close(), self.sound.close())
+            if self._heartbeats is not None:
+                await asyncio.to_thread(self._heartbeats.close)
+            await asyncio.gather(self.media.close(), self.stop_broker.close(), self.broker.close())
+
+    def spawn(self, work: Coroutine[Any, Any, None]) -> None:
+        """Run it until it ends or the server does."""
+        task = asyncio.ensure_future(work)
+        self._tasks.add(task)
+        task.add_done_callback(self._tasks.discard)
+
+    # -- from the broker
+
+    def receive(self, message: Message, now: float) -> None:
+        address = parse_topic(message.topic)
+        if address is None:
+            return
+        ref = address.identity.base
+        self.robots.receive(message, now)
+        self._send(self.stops.receive(message, clock()))
+        if ref not in self.robots.components:
+            return
+        if address.metric != ONLINE.metric or self.robots.value(ref, _ESTOP_METRIC) is None:
+            self.stops.changed.add(ref)
+        if channel_of(f"outgoing/{address.metric}") in (CAPABILITIES, CONTROL_STATE):
+            self.drivers.updated(ref)
+        if address.metric == CAPABILITIES.metric:
+            for one in (ref, *(page for page, source in self.robots.sources.items() if source == ref)):
+                self.open_components.update(one)
+
+    def _ask_anew(self, _ref: str) -> None:
+        """Ask again for what this robot has published, although it has been delivered."""
+        for subscription in self._of_all:
+            subscription.renew()
+
+    def _show_broker(self) -> None:
+        view = m.BrokerView(
+            connected=self.broker.connected,
+            problem=self.broker.problem,
+            not_received=self.broker.not_received,
+            robots_omitted=self.robots.omitted,
+            stops_omitted=self.stops.omitted(clock()),
+        )
+        self.robots.set_server_metric("", "web/broker", view)
+
+    # -- to the broker
+
+    def _send(self, messages: list[Message]) -> None:
+        """Publish messages of stops: on a connection on which nothing arrives, for which they would wait."""
+        send(self._publish_stop, messages)
+
+    def _publish_stop(self, topic: str, payload: bytes, *, qos: QoS) -> bool:
+        return any(broker.publish(topic, payload, qos=qos) for broker in (self.stop_broker, self.broker))
+
+    def _hear(self, now: float) -> None:
+        """Stop further robots while a stop of all goes to them, by heartbeats that wait for nothing else."""
+        if self._heartbeats is None:
+            if self.stops.collecting:
+                self._heartbeats = Heartbeats(in_small_segments(self.settings.broker))
+            return
+        for message in self._heartbeats.take():
+            self._send(self.stops.receive(message, now))
+        if not self.stops.collecting:
+            heartbeats, self._heartbeats = self._heartbeats, None
+            self.spawn(asyncio.to_thread(heartbeats.close))
+
+    def _has_sent(self) -> bool:
+        """Whether little waits to be sent. To repeat the stop of a thousand robots before would only delay its end."""
+        return self.stop_broker.transport.outgoing.waiting < _MANY_WAIT
+
+    def stop(self, ref: str, name: str, session: Session, device: str, why: str, address: str = "") -> None:
+        """An emergency stop of one component, or of all (""): sent at once, and repeated until it is confirmed."""
+        by = f"{session.user} on {device}" if device else session.user
+        if ref and not _is_base(ref):
+            return
+        known = [component.robot for component in self.robots.components.values()]
+        self._send(self.stops.press(ref, name, by=by, why=why, now=clock(), known=known, user=session.user))
+        self.show_stops()
+        self.audit.write("stop", ref=ref or "all", user=session.user, device=device, address=address, detail=why)
+
+    def _is_wanted(self, ref: str) -> bool:
+        """True if a page has it open, drives it or has stopped it."""
+        return ref in self.open_components or self.drivers.drives(ref) or self.stops.names(ref)
+
+    # -- names
+
+    def level(self, ref: str) -> SecurityLevel:
+        """How strictly that robot checks names, as far as it tells; of others it is as in the server's config."""
+        robot = self.robots.view(ref)
+        if robot is None or not robot.estop.has_capabilities:
+            return self.settings.level
+        return "named" if robot.named else "open"
+
+    def _is_named(self, ref: str) -> bool:
+        robot = self.robots.view(ref)
+        return robot is not None and robot.named
+
+    def _note_talk(self, ref: str, session: Session, device: str, address: str) -> None:
+        self.audit.write("talk", ref=ref, user=session.user, device=device, address=address)
+
+    # -- what is open
+
+    def watch(self, ref: str) -> None:
+        """A page has opened this component."""
+        if _is_base(ref):
+            self.open_components.open(ref)
+            self.sources.show(ref)
+
+    def unwatch(self, ref: str) -> None:
+        if _is_base(ref):
+            self.open_components.close(ref)
+
+    # -- what is due
+
+    async def _tick(self) -> None:
+        refresh_at = 0.0
+        while True:
+            await asyncio.sleep(TICK_S)
+            try:
+                self.broker.deliver()
+                now = clock()
+                self.drivers.tick(now)
+                self._hear(now)
+                self._send(self.stops.tick(now))
+                self.show_stops()
+                if now >= refresh_at:
+                    refresh_at = now + _REFRESH_S
+                    self.robots.refresh(time.monotonic())
+                    self._show_broker()
+            except (
+                Exception
+            ):  # one faulty round must not end all later ones, on which the end of silent gestures depends
+                log.exception("a round of the server failed")
+
+    async def _watch_people(self) -> None:
+        """A person who is removed is out soon, though each page looks after its session rarely."""
+        while True:
+            with suppress(DatabaseError):  # which the looks at sessions report
+                self.people_version = await asyncio.to_thread(self.people.version)
+            await asyncio.sleep(PEOPLE_S)
+
+    def show_stops(self) -> None:
+        """Let pages see what has changed of emergency stops."""
+        changed, self.stops.changed = self.stops.changed, set()
+        for ref in changed:
+            if (robot := self.robots.view(ref)) is not None:
+                self.robots.set_server_metric(ref, _ESTOP_METRIC, self.stops.view(robot.estop))
+
+
+def _is_base(ref: str) -> bool:
+    levels = ref.split("/")
+    if len(levels) != 3:
+        return False
+    with suppress(ConfigError):
+        return Identity(*levels).base == ref
+    return False
+
+
+def encode(message: m.ToPage) -> str:
+    """The text that a page receives."""
+    return msgspec.json.encode(message).decode()

@@ -1,0 +1,150 @@
+/** Why a control is off, in one line for people; the first reason counts. Pure. */
+
+export const PING_TIMEOUT_MS = 1500;
+export const PICTURE_OLD_MS = 2000;
+const IDLE_MS = 5500; // the server lets a driver be replaced after 5 s without a gesture
+export const SLOW_MS = 300; // from this round trip on, the speed is limited
+const LATE_MS = 600;
+export const SLOW_SPEED = 0.4;
+const RESET_MS = 600; // after a reset robots refuse a driver who has not paused for 0.5 s
+
+/** @typedef {{code: string, text: string, action?: Action, also?: Action}} Reason */
+/** @typedef {{label: string, kind: "take"|"ask"|"give-up"|"take-over"|"see"|"login"|"reload"|"stop-script"}} Action */
+
+/**
+ * @typedef {object} Situation
+ * @property {string} name of the component
+ * @property {Record<string, string>} words of the server, by code
+ * @property {boolean} open whether the control socket is
+ * @property {boolean} [connecting] for the first time
+ * @property {string} broker why the server cannot reach the broker; "" it can
+ * @property {boolean} reload the page is older than the server
+ * @property {boolean} drives false: not over this connection
+ * @property {readonly string[]} rights
+ * @property {boolean} loading what shows the picture and these reasons is not here yet
+ * @property {boolean} hidden
+ * @property {boolean} focus
+ * @property {boolean} dialog whether one is open, or a panel
+ * @property {boolean} fromKeys whether a key or the gamepad is used
+ * @property {{online: boolean|null, silent_s: number|null}|undefined} liveness
+ * @property {{latched: boolean, by: string}|undefined} estop
+ * @property {number} freeForMs since it was seen stopped
+ * @property {Record<string, any>} capabilities
+ * @property {import("../messages.js").DriverView|undefined} driver
+ * @property {number} driverIdleMs since the driver's last gesture; -1: it lasts, or is not known
+ * @property {{running?: boolean, file?: string}|undefined} script
+ * @property {number|null} pictureAgeMs null: no picture is wanted here; NaN: its age is not known; -1: none comes while it is driven
+ * @property {boolean} inSight the driver sees the robot itself
+ * @property {number} roundTripMs
+ * @property {string} failed a part of this page that does not work; ""
+ * @property {boolean} padFrozen
+ * @property {boolean} mustRelease
+ * @property {string} refusal why the server has ended the last gesture; "" it has not
+ */
+
+/** Why nothing may be commanded at all. @param {Situation} s @returns {Reason|null} */
+export function offReason(s) {
+  if (!s.open) return s.connecting ? reason("connecting", "Connecting to the server…") : reason("server", "No connection to the server");
+  if (s.broker) return say(s, "broker", { problem: s.broker });
+  return null;
+}
+
+/** Why this component cannot be driven now. @param {Situation} s @returns {Reason|null} */
+export function driveReason(s) {
+  return offReason(s) ?? pageReason(s) ?? robotReason(s) ?? leaseReason(s) ?? momentReason(s);
+}
+
+function pageReason(s) {
+  if (s.failed) return { ...say(s, "failed", { part: s.failed }), action: RELOAD };
+  if (s.reload) return { ...say(s, "reload"), action: RELOAD };
+  if (!s.drives) return say(s, "plain");
+  if (!s.rights.includes("drive")) return { ...say(s, "role"), action: { label: "Log in", kind: "login" } };
+  if (s.hidden) return say(s, "hidden");
+  return null;
+}
+
+function robotReason(s) {
+  if (!s.liveness || s.liveness.online === false) return say(s, "silent", { name: s.name, since: silence(s) });
+  if (s.estop?.latched) return say(s, "stopped", { by: s.estop.by || "unknown" });
+  if (s.freeForMs < RESET_MS) return say(s, "reset");
+  const drive = s.capabilities.drive;
+  if (drive?.available !== true || drive.controls === false) return say(s, "no-drive", { name: s.name });
+  return null;
+}
+
+function silence(s) {
+  const since = s.liveness?.silent_s;
+  return since === null || since === undefined ? "" : ` for ${Math.round(since)} s`;
+}
+
+function leaseReason(s) {
+  if (s.driver?.you) return null;
+  if (!s.driver?.by) {
+    const runs = s.script?.running ? `${scriptName(s) || "A script"} runs. ` : "";
+    const { code, text } = say(s, "free");
+    return { code, text: runs + text, action: TAKE };
+  }
+  const who = s.driver.device ? `${s.driver.by} (${s.driver.device})` : s.driver.by;
+  if (s.driver.keeps) return askReason(s, who);
+  if (s.driverIdleMs >= IDLE_MS) {
+    return { ...say(s, "idle", { who }), action: TAKE };
+  }
+  return { ...say(s, "lease", { who }), action: OVER };
+}
+
+const RELOAD = /** @type {const} */ ({ label: "Reload", kind: "reload" });
+const TAKE = /** @type {const} */ ({ label: "Take control", kind: "take" });
+const OVER = /** @type {const} */ ({ label: "Hold to take over", kind: "take-over" });
+
+/** The robot itself decides: who drives it is asked, and who rests does not keep it. */
+function askReason(s, who) {
+  const also = s.rights.includes("take") ? OVER : undefined;
+  if (s.driver.asking) return { ...say(s, "asked", { who }), action: { label: "Do not ask", kind: "give-up" }, also };
+  return { ...say(s, "kept", { who }), code: "lease", action: { label: "Ask for it", kind: "ask" }, also };
+}
+
+function momentReason(s) {
+  if (s.loading) return say(s, "loading");
+  if (s.dialog) return say(s, "dialog");
+  if (s.script?.running && s.capabilities.drive?.arbitrates !== true) return scriptReason(s, scriptName(s));
+  if (s.pictureAgeMs !== null && !(s.pictureAgeMs >= 0 && s.pictureAgeMs <= PICTURE_OLD_MS) && !s.inSight) return { ...oldPicture(s), code: "picture", action: SEE };
+  if (s.roundTripMs >= LATE_MS) return say(s, "late", { by_ms: ` (${Math.round(s.roundTripMs)} ms)` });
+  if (s.padFrozen) return say(s, "pad");
+  if (s.fromKeys && !s.focus) return say(s, "focus");
+  if (s.mustRelease) return released(s);
+  return null;
+}
+
+function scriptName(s) {
+  const { file } = s.script;
+  return typeof file === "string" ? file.slice(0, 40) : "";
+}
+
+function scriptReason(s, name) {
+  const action = { label: `Stop ${name || "the script"}`, kind: "stop-script" };
+  return { ...say(s, "script", { script: name || "A script" }), action };
+}
+
+/** The server gives the same reason while a gesture that it has ended lasts. */
+function released(s) {
+  const { code, text } = say(s, "release");
+  return { code, text: s.refusal && s.refusal !== text ? `${text}. It was: ${s.refusal}` : text };
+}
+
+const SEE = { label: "I can see the robot", kind: "see" };
+
+function oldPicture(s) {
+  if (s.pictureAgeMs < 0) return say(s, "picture-waits");
+  if (Number.isNaN(s.pictureAgeMs)) return say(s, "picture-unknown");
+  if (!Number.isFinite(s.pictureAgeMs)) return say(s, "picture-none");
+  return say(s, "picture", { age: (s.pictureAgeMs / 1000).toFixed(1) });
+}
+
+/** A state in the server's words, of which WORDS in pebble/extensions/operator/client/drive_reasons.py has the table. @returns {Reason} */
+function say(s, code, values = {}) {
+  return { code, text: (s.words[code] ?? code).replace(/{(\w+)}/g, (_, name) => values[name] ?? "") };
+}
+
+export function reason(code, text) {
+  return { code, text };
+}

@@ -1,0 +1,152 @@
+"""The files of the page, read once: what is not among them cannot be requested."""
+
+import base64
+import gzip
+import hashlib
+import posixpath
+import re
+from collections.abc import Iterator
+from importlib.resources.abc import Traversable
+
+from starlette.requests import Request
+from starlette.responses import PlainTextResponse, Response
+
+from pebble.extensions.page.access.guard import CONTENT_SECURITY_POLICY
+
+NO_STORE = {"cache-control": "no-store"}
+FOREVER = {"cache-control": "public, max-age=31536000, immutable"}
+
+_TYPES = {
+    "css": "text/css; charset=utf-8",
+    "html": "text/html; charset=utf-8",
+    "js": "text/javascript; charset=utf-8",
+    "mjs": "text/javascript; charset=utf-8",
+    "png": "image/png",
+    "svg": "image/svg+xml",
+    "webmanifest": "application/manifest+json",
+    "woff2": "font/woff2",
+}
+_PACKED = {"png", "woff2"}  # compressed already
+_VERSION = b"{version}"  # in the pages, replaced by that of the files
+_ROOT = b"{root}"  # replaced by root_of(): a proxy may show the server below a path that only browsers know
+_START = b"{start}"  # replaced by start.js, which needs no request of its own
+_MODULES = b"{modules}"  # replaced by links to all that is imported: browsers need not discover them one by one
+#: index.html, with what that screen needs
+_SCREENS = {"fleet.html": "ui/fleet/fleet.js", "robot.html": "ui/robot/robot.js"}
+_SHEETS = {"fleet.html": "fleet.css"}  # that the screen needs beside app.css
+_IMPORT = re.compile(rb'^(?:import|export|\}).*?"(\.\.?/[^"]+)";?$', re.MULTILINE)
+_AGAIN = re.compile(r"\.\d{1,4}")  # after the version: the same files once more, for a page that has lost one
+_COMMENTS = re.compile(r"^[ \t]*(?:/\*.*?\*/|//[^\n]*)[ \t]*$", re.MULTILINE | re.DOTALL)
+_CASTS = re.compile(r"/\*\* @[^\n]*?\*/ ")  # types within a line
+_LINE_ENDS = re.compile(r"(?<=\S)[ \t]+//[ ][^\"'`\n]*$", re.MULTILINE)  # one with quotes may be the end of a string
+_LOOSE = re.compile(r" (?=\{$)|(^[\w-]+:) |;\n(?=})|(?<=[{};,])\n|(?<=,) ", re.MULTILINE)  # in style sheets
+_INDENTATION = re.compile(r"^\s+", re.MULTILINE)
+
+
+class StaticFiles:
+    """All files below one folder. ``version`` is another one after any change; it is part of their addresses."""
+
+    def __init__(self, root: Traversable) -> None:
+        self.files = dict(sorted(_read(root, "")))
+        digest = hashlib.sha256()
+        for name, content in self.files.items():
+            digest.update(f"{name}\0{len(content)}\0".encode() + content)
+        self.version = digest.hexdigest()[:12]
+        start = self.files.pop("start.js").strip()
+        hashed = f"'sha256-{base64.b64encode(hashlib.sha256(start).digest()).decode()}'"
+        self._policy = CONTENT_SECURITY_POLICY.replace("script-src", f"script-src {hashed}")
+        index = self.files.pop("index.html").replace(_START, start)
+        for name, screen in _SCREENS.items():
+            links = [_link(one) for one in (screen, *self._imported("main.js", screen))]
+            if name in _SHEETS:
+                sheet = _SHEETS[name].encode()
+                links.insert(0, b'<link rel="preload" as="style" href="{root}static/{version}/%s">' % sheet)
+            self.files[name] = index.replace(_MODULES, b"\n".join(links))
+        for name in self.files:
+            if name.endswith(".html"):
+                self.files[name] = self.files[name].replace(_VERSION, self.version.encode())
+        self._first = {"main.js", *self._imported("main.js")}
+        self._packed = {name: _packed(name, content) for name, content in self.files.items()}
+
+    def _imported(self, *names: str) -> list[str]:
+        """What these modules import before they run, and what that imports."""
+        found = dict.fromkeys(names)
+        for name in (waiting := list(names)):
+            for path in _IMPORT.findall(self.files.get(name, b"")):
+                other = posixpath.normpath(posixpath.join(posixpath.dirname(name), path.decode()))
+                if other not in found:
+                    found[other] = None
+                    waiting.append(other)
+        return [name for name in found if name not in names]
+
+    def page(self, request: Request) -> Response:
+        """The operator page; which screen it shows is up to its address."""
+        # with no-referrer, browsers do not say where a form comes from
+        headers = {**NO_STORE, "content-security-policy": self._policy, "referrer-policy": "same-origin"}
+        name = "robot.html" if request.url.path.startswith("/r/") else "fleet.html"
+        content = self.files[name].replace(_ROOT, root_of(request).encode())
+        return _response(request, name, content, _packed(name, content), headers)
+
+    def is_current(self, version: str) -> bool:
+        """True if this version, of an address, is that of the files."""
+        return _AGAIN.sub("", version) == self.version
+
+    def answer(self, request: Request, name: str, headers: dict[str, str]) -> Response:
+        """The file ``name``, compressed if the browser takes that; 404 if there is none.
+
+        With a number as query it is a module that is fetched again because one that it imports was lost: those have the
+        query, too, but for the ones that run since the start.
+        """
+        if name not in self.files:
+            return PlainTextResponse("not found", 404)
+        if (query := request.scope.get("query_string", b"")).isdigit():
+            content = _IMPORT.sub(lambda found: self._renewed(name, found, query[:4]), self.files[name])
+            return _response(request, name, content, _packed(name, content), headers)
+        return _response(request, name, self.files[name], self._packed[name], headers)
+
+    def _renewed(self, name: str, found: re.Match[bytes], query: bytes) -> bytes:
+        path = found[1]
+        whole = posixpath.normpath(posixpath.join(posixpath.dirname(name), path.decode()))
+        return found[0] if whole in self._first else found[0].replace(path, path + b"?" + query)
+
+
+def root_of(request: Request) -> str:
+    """The way from the address of ``request`` to where the server begins: ``./``, ``../../``."""
+    path: bytes = request.scope["raw_path"]
+    return "../" * (path.count(b"/") - 1) or "./"
+
+
+def _packed(name: str, content: bytes) -> bytes | None:
+    return None if name.rpartition(".")[2] in _PACKED else gzip.compress(content, 9, mtime=0)
+
+
+def _response(request: Request, name: str, content: bytes, packed: bytes | None, headers: dict[str, str]) -> Response:
+    headers = {**headers, "vary": "accept-encoding"}
+    if packed is not None and "gzip" in request.headers.get("accept-encoding", ""):
+        content, headers["content-encoding"] = packed, "gzip"
+    return Response(content, media_type=_TYPES[name.rpartition(".")[2]], headers=headers)
+
+
+def _link(module: str) -> bytes:
+    return b'<link rel="modulepreload" href="{root}static/{version}/%s">' % module.encode()
+
+
+def _read(folder: Traversable, path: str) -> Iterator[tuple[str, bytes]]:
+    for entry in folder.iterdir():
+        suffix = entry.name.rpartition(".")[2]
+        if entry.is_dir():
+            yield from _read(entry, f"{path}{entry.name}/")
+        elif suffix in _TYPES:
+            content = entry.read_bytes()
+            yield path + entry.name, content if suffix in _PACKED else stripped(content, suffix)
+
+
+def stripped(source: bytes, suffix: str) -> bytes:
+    """Without indentation, comments and empty lines: a sixth less to send."""
+    text = source.decode()
+    if suffix in ("css", "js", "mjs"):
+        text = _COMMENTS.sub("", text)
+    if suffix in ("js", "mjs"):
+        text = _LINE_ENDS.sub("", _CASTS.sub("", text))
+    text = _INDENTATION.sub("", text)
+    return (_LOOSE.sub(r"\1", text) if suffix == "css" else text).encode()

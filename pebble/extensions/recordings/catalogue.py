@@ -1,0 +1,156 @@
+"""What recordings hold, without reading all of them where their summaries say it."""
+
+import json
+from collections import Counter
+from collections.abc import Collection, Iterable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Final
+
+from pebble.config.visible import shown
+from pebble.extensions.recordings.files.reader import DAMAGE, RecordingFile, missing_before
+from pebble.extensions.recordings.files.recorded import Channel, Recorded, RecordingError
+from pebble.extensions.recordings.library import ACTIVE, merged, robot_of
+from pebble.extensions.recordings.recorder.intake import EVENTS
+from pebble.transports.topics import matches
+
+_SHOWN_EVENTS: Final = frozenset({"gap", "clock", "dropped", "pruned", "recovered", "damaged", "removed"})
+_LISTED: Final = 20  # names that a message lists
+
+
+@dataclass(slots=True)
+class FileInfo:
+    """One file."""
+
+    path: Path
+    size: int
+    messages: int = 0
+    first_ns: int = 0
+    last_ns: int = 0
+    missing: int = 0
+    finished: bool = True
+    damaged: bool = False
+    readable: bool = True
+    problem: str = ""  # what could not be read of it now
+    topics: Counter[str] = field(default_factory=Counter)  # messages by topic
+    encodings: dict[str, str] = field(default_factory=dict)  # by topic
+    robots: set[str] = field(default_factory=set)
+
+    @property
+    def is_active(self) -> bool:
+        return self.path.name.endswith(ACTIVE)
+
+
+def look_at(path: Path, *, whole: bool = False) -> FileInfo:
+    """What a file holds, by its summary; one without, or ``whole``, is read completely. Raises RecordingError."""
+    try:
+        size = path.stat().st_size
+    except OSError as error:
+        raise RecordingError(f"{path}: {error.strerror}") from None
+    info = FileInfo(path, size)
+    with RecordingFile(path) as file:
+        if file.statistics is None or whole:
+            _read_all(info, file)
+        else:
+            _take_over(info, file)
+        metadata = file.metadata()
+        info.missing = file.damage.missing + missing_before(metadata)
+        info.finished = file.damage.finished
+        info.damaged = bool(file.damage.parts) or DAMAGE in metadata
+        info.problem = file.problem
+    return info
+
+
+def _take_over(info: FileInfo, file: RecordingFile) -> None:
+    counted = file.statistics
+    if counted is not None:
+        info.messages, info.first_ns, info.last_ns = (
+            counted.message_count,
+            counted.message_start_time,
+            counted.message_end_time,
+        )
+        for number, count in counted.channel_message_counts.items():
+            _count(info, file.channels[number], count)
+
+
+def _read_all(info: FileInfo, file: RecordingFile) -> None:
+    for message in file.read():
+        info.first_ns = message.log_ns if not info.messages else info.first_ns
+        info.last_ns = message.log_ns
+        info.messages += 1
+        _count(info, message.channel, 1)
+
+
+def _count(info: FileInfo, channel: Channel, count: int) -> None:
+    info.topics[channel.topic] += count
+    info.encodings[channel.topic] = channel.encoding
+    robot = robot_of(channel)
+    if robot is not None:
+        info.robots.add(robot)
+
+
+def events(paths: Iterable[Path]) -> Iterator[dict[str, Any]]:
+    """What happened to the recording itself, in the order of time."""
+    for message in merged(paths, chooses=lambda channel: channel.topic == EVENTS):
+        try:
+            event = json.loads(message.payload)
+        except (ValueError, RecursionError):
+            continue
+        if isinstance(event, dict) and event.get("event") in _SHOWN_EVENTS:
+            yield {**event, "t": message.log_ns // 10**6}
+
+
+@dataclass(frozen=True, slots=True)
+class Query:
+    """Which messages are wanted; without any condition all of robots, brokers and the recorder."""
+
+    robot: str | None = None  # system/type/id
+    topics: tuple[str, ...] = ()  # filters; one without the robot's identity begins at any robot's
+    text: str | None = None  # somewhere in the payload
+
+    def chooses(self, channel: Channel) -> bool:
+        if self.robot is not None and robot_of(channel) != self.robot:
+            return False
+        return not self.topics or any(_matches(filter_, channel.topic) for filter_ in self.topics)
+
+    def accepts(self, message: Recorded) -> bool:
+        return self.text is None or self.text.encode() in message.payload
+
+
+def check_names(query: Query, paths: Iterable[Path], places: Iterable[Path]) -> None:
+    """Raises RecordingError if the recordings of ``places`` have no such robot or topic, which may be a mistake.
+
+    Where a file cannot be read completely, names are not known: it is the file's problem that is to be said.
+    """
+    if query.robot is None and not query.topics:
+        return
+    found: list[Channel] = []
+    for path in paths:
+        try:
+            with RecordingFile(path) as file:
+                for _ in file.read(chooses=lambda _channel: False) if file.statistics is None else ():
+                    pass
+                found += file.channels.values()
+                if file.problem:
+                    return
+        except RecordingError:
+            return
+    check_name("robot", query.robot, {robot for one in found if (robot := robot_of(one))}, places)
+    topics = {one.topic for one in found if query.robot in (None, robot_of(one))}
+    for filter_ in query.topics:
+        if not any(_matches(filter_, topic) for topic in topics):
+            check_name("topic", filter_, {topic for topic in topics if not topic.startswith("$")}, places)
+
+
+def check_name(kind: str, name: str | None, known: Collection[str], places: Iterable[Path]) -> None:
+    """Raises RecordingError, which says what there is, if ``name`` is none of the ``known`` ones."""
+    if name is not None and name not in known:
+        listed = [shown(one) for one in sorted(known)[:_LISTED]] or ["none"]
+        more = f" and {len(known) - _LISTED} more" if len(known) > _LISTED else ""
+        where = ", ".join(map(str, places))
+        raise RecordingError(f"no {kind} {shown(name)} in {where}; there are: {', '.join(listed)}{more}")
+
+
+def _matches(filter_: str, topic: str) -> bool:
+    below = filter_.split("/", 1)[0] in ("incoming", "outgoing")
+    return matches(f"+/+/+/{filter_}" if below else filter_, topic)

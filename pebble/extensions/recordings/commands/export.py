@@ -1,0 +1,150 @@
+"""``pebble recordings`` export and import: recordings in the formats of other programs."""
+
+from collections import Counter
+from collections.abc import Callable, Iterable
+from dataclasses import replace
+from enum import StrEnum
+from functools import partial
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from pebble.config.visible import shown
+from pebble.errors import PebbleError
+from pebble.extensions.operator.client.names import base_of
+from pebble.extensions.operator.commands.terminal import show
+from pebble.extensions.recordings import catalogue
+from pebble.extensions.recordings.catalogue import Query
+from pebble.extensions.recordings.commands.options import RecordingsArgument, RobotOption, Since, Topics, Until, period
+from pebble.extensions.recordings.commands.progress import progress_of_time
+from pebble.extensions.recordings.commands.report import errors_of_files, report_unread
+from pebble.extensions.recordings.exports.film import write_film, write_wav
+from pebble.extensions.recordings.exports.foxglove import write_foxglove
+from pebble.extensions.recordings.exports.lines import TRUNCATED, BadLine, read_lines, write_lines
+from pebble.extensions.recordings.exports.unfinished import unfinished
+from pebble.extensions.recordings.files.recorded import Recorded
+from pebble.extensions.recordings.files.rewrite import Copy, write_copy
+from pebble.extensions.recordings.files.writer import RecordingWriter
+from pebble.extensions.recordings.library import Damages, files, merged, problems
+
+
+class Form(StrEnum):
+    """What recordings can be exported to."""
+
+    LINES = "lines"
+    FOXGLOVE = "foxglove"
+    MKV = "mkv"
+    MP4 = "mp4"
+    WAV = "wav"
+    MCAP = "mcap"
+
+
+_BY_SUFFIX = {
+    ".jsonl": Form.LINES,
+    ".mkv": Form.MKV,
+    ".mp4": Form.MP4,
+    ".wav": Form.WAV,
+    ".mcap": Form.MCAP,
+}
+
+
+def export(
+    places: RecordingsArgument,
+    target: Annotated[Path, typer.Argument(help="A new file.", metavar="OUT")],
+    form: Annotated[Form | None, typer.Option("--as", help="What to write. [default: by the name of OUT]")] = None,
+    robot: RobotOption = None,
+    since: Since = None,
+    until: Until = None,
+    topic: Topics = None,
+) -> int:
+    """Export to JSON lines, Foxglove, a film, sound, MCAP."""
+    form = form or _BY_SUFFIX.get(target.suffix)
+    if form is None:
+        raise PebbleError(f"{target}: what to write is not clear from this name: add --as lines, foxglove, mkv …")
+    since_ns, until_ns = period(since, until)
+    paths = files(places)
+    query = Query(None if robot is None else base_of(robot), tuple(topic or ()))
+    catalogue.check_names(query, paths, places)
+    if query.robot is None and form in (Form.MKV, Form.MP4, Form.WAV):
+        query = replace(query, robot=_only_robot(paths))
+    damages = Damages()
+    beside = damages if query == Query() else ()  # those that were read
+    try:
+        with progress_of_time(paths, since_ns, until_ns) as on_time:
+            read = partial(merged, paths, since_ns=since_ns, until_ns=until_ns, chooses=query.chooses, damages=damages)
+            typer.echo(_export(form, read, target, query.robot or "", on_time, beside))
+    finally:
+        code = report_unread(problems(damages))
+    return code
+
+
+def import_(
+    source: Annotated[Path, typer.Argument(help="JSON lines.", metavar="FILE")],
+    target: Annotated[Path, typer.Argument(help="A new recording.", metavar="OUT.mcap")],
+) -> int:
+    """Import what the original's logger recorded, or an export as lines."""
+    with (
+        errors_of_files(source),
+        source.open("rb") as file,
+        unfinished(target) as path,
+        path.open("wb", buffering=0) as out,
+    ):
+        writer = RecordingWriter(out)
+        writer.metadata("pebble.recording", {"format": "1", "imported": source.name})
+        counted = _import(read_lines(file), Copy(writer))
+        writer.finish()
+    typer.echo(f"{target}: {counted['messages']:,} messages")
+    if counted["bad"]:
+        typer.echo(f"pebble: {counted['bad']:,} lines hold no message and were left out", err=True)
+    if counted["truncated"]:
+        typer.echo(f"pebble: {counted['truncated']:,} payloads had been cut before", err=True)
+    return 0 if counted["messages"] else 1
+
+
+def _export(
+    form: Form,
+    read: Callable[[], Iterable[Recorded]],
+    target: Path,
+    robot: str,
+    on_time: Callable[[int], None],
+    beside: Iterable[Path],
+) -> str:
+    if form is Form.FOXGLOVE:
+        counts = write_foxglove(read(), target, on_time=on_time)
+        return f"{target}: " + ", ".join(f"{count:,} {name}" for name, count in counts.items())
+    if form in (Form.MKV, Form.MP4):
+        film = write_film(read, target, robot, on_time=on_time)
+        sound = "no sound" if film.sound is None else f"{show.duration(film.sound.seconds)} of sound"
+        lost = f", {film.left_out:,} pictures that cannot be decoded left out" if film.left_out else ""
+        return f"{target}: {show.duration(film.seconds)}, {film.pictures:,} pictures, {sound}{lost}"
+    if form is Form.WAV:
+        return f"{target}: {show.duration(write_wav(read(), target, robot, on_time=on_time).seconds)} of sound"
+    with unfinished(target) as path, path.open("wb") as out:
+        if form is Form.LINES:
+            count = write_lines(read(), out, on_time=on_time)
+        else:
+            count = write_copy(read(), out, on_time=on_time, beside=beside)
+    return f"{target}: {count:,} messages"
+
+
+def _import(found: Iterable[Recorded | BadLine], copy: Copy) -> Counter[str]:
+    counted = Counter[str]()
+    for one in found:
+        if isinstance(one, BadLine):
+            counted["bad"] += 1
+            if counted["bad"] <= 3:
+                typer.echo(f"pebble: line {one.number}: {shown(one.problem)}", err=True)
+            continue
+        copy.add(one)
+        counted["messages"] += 1
+        counted["truncated"] += TRUNCATED in one.channel.metadata
+    return counted
+
+
+def _only_robot(paths: list[Path]) -> str:
+    robots = set[str]().union(*(catalogue.look_at(path).robots for path in paths))
+    if len(robots) != 1:
+        names = ", ".join(sorted(shown(robot) for robot in robots)) or "none"
+        raise PebbleError(f"whose pictures and sound is not clear: add --robot ({names})")
+    return robots.pop()

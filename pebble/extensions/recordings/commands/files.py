@@ -1,0 +1,173 @@
+"""``pebble recordings`` mend and rm: what is done to the files themselves."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from pebble.config.visible import shown
+from pebble.errors import PebbleError
+from pebble.extensions.operator.client.names import base_of
+from pebble.extensions.recordings.catalogue import Query, check_names
+from pebble.extensions.recordings.commands.options import RobotOption, Since, Until, period
+from pebble.extensions.recordings.commands.progress import progress
+from pebble.extensions.recordings.commands.report import report_left, report_unread
+from pebble.extensions.recordings.files.reader import RecordingFile
+from pebble.extensions.recordings.files.recorded import Recorded, RecordingError
+from pebble.extensions.recordings.files.rewrite import Keeps, rewrite
+from pebble.extensions.recordings.library import ACTIVE, SUFFIX, files, robot_of
+from pebble.extensions.recordings.recorder.finisher import mend as mend_leftover
+from pebble.extensions.recordings.recorder.folder import DAMAGED, Folder, finished_path
+from pebble.extensions.recordings.traffic.index import index_path
+
+_DATE = re.compile(r"\d{2}|\d{4}", re.ASCII)
+
+
+def mend(
+    source: Annotated[Path, typer.Argument(help="Folder of a recorder; or one file.", metavar="DIR|FILE")],
+    target: Annotated[Path | None, typer.Argument(help="For a file: a new one.", metavar="OUT")] = None,
+) -> int:
+    """Copy what can be read of damaged or unfinished recordings.
+
+    In a folder that is what a killed recorder left, as the next recorder there does: a file of which not all could be
+    read stays beside its copy, as ….mcap.damaged. FILE stays as it is.
+    """
+    if not source.is_dir():
+        return _mend_file(source, target)
+    owner = Folder(source)
+    with owner.taken():
+        return _mend_all(owner)
+
+
+def rm(
+    folder: Annotated[
+        Path, typer.Argument(help="Folder of a recorder; or one file, which goes as a whole.", metavar="DIR|FILE")
+    ],
+    robot: RobotOption = None,
+    since: Since = None,
+    until: Until = None,
+    yes: Annotated[bool, typer.Option("--yes", help="Do not ask.")] = False,
+) -> int:
+    """Delete what was recorded of a robot, or in a period. Files that hold more are written again without it.
+
+    A file that cannot be read completely stays as it is. One that is named is deleted, whatever is in it.
+    """
+    if not folder.is_dir() and robot is None and since is None and until is None:
+        return _delete_whole(folder, yes=yes)
+    if robot is None and since is None and until is None:
+        raise PebbleError("what to delete is missing: name --robot, --since or --until")
+    since_ns, until_ns = period(since, until)
+    base = None if robot is None else base_of(robot)
+
+    def keeps(message: Recorded) -> bool:
+        inside = since_ns <= message.log_ns < until_ns
+        return not inside or (base is not None and robot_of(message.channel) != base)
+
+    owner = Folder(_existing(folder))
+    with owner.taken():  # a recorder would write retained values again
+        return _rm(owner, base, (since_ns, until_ns), keeps, yes=yes)
+
+
+def _rm(owner: Folder, base: str | None, period_ns: tuple[int, int], keeps: Keeps, *, yes: bool) -> int:
+    entries, folder = owner.entries(), owner.root
+    left = sum(report_left(f"{entry.path}: is not finished, or damaged") for entry in entries if not entry.is_finished)
+    finished = [entry.path for entry in entries if entry.is_finished]
+    if not left:
+        check_names(Query(base), finished, [folder])
+    due = [path for path in finished if _reaches_into(path, *period_ns)]
+    what = f"{shown(base)} " if base else "everything "
+    if not yes and not typer.confirm(f"Delete {what}from {len(due)} files in {folder}?"):
+        return 1
+    deleted = 0
+    with progress("deleting", len(due)) as advance:
+        for number, path in enumerate(due, 1):
+            try:
+                names = path.stat().st_nlink
+                made = rewrite(path, path, keeps=keeps)
+            except (PebbleError, OSError) as error:
+                left += report_left(error)
+                continue
+            if made.left_out:
+                deleted += made.left_out
+                if names > 1:
+                    left += 1
+                    typer.echo(f"pebble: {path}: has other names (hard links), which keep all of it", err=True)
+                index_path(path).unlink(missing_ok=True)
+                if made.is_empty:
+                    path.unlink()
+            advance(number)
+    typer.echo(f"{deleted:,} messages deleted")
+    if left:
+        typer.echo(
+            f"pebble: {left} files may hold more of it: pebble recordings rm FILE deletes one as a whole", err=True
+        )
+    return 1 if left else 0
+
+
+def _reaches_into(path: Path, since_ns: int, until_ns: int) -> bool:
+    """Whether a file may hold messages of a period: one that cannot be read may."""
+    try:
+        with RecordingFile(path) as file:
+            return not file.chunks or file.reaches_into(since_ns, until_ns)
+    except RecordingError:
+        return True
+
+
+def _delete_whole(path: Path, *, yes: bool) -> int:
+    """Raises PebbleError for what is no file of a recorder, or is being written."""
+    if path.is_symlink():
+        raise PebbleError(f"{path} is a link: name the file itself")
+    if not path.is_file() or not path.name.endswith((SUFFIX, ACTIVE, DAMAGED)):
+        raise PebbleError(f"{path}: there is no such folder or recording")
+    if path.name.endswith(ACTIVE) and Folder.is_in_use(_archive_of(path)):
+        raise PebbleError(f"{path}: is being written: stop the recorder first")
+    if not yes and not typer.confirm(f"Delete {path}?"):
+        return 1
+    path.unlink()
+    index_path(path).unlink(missing_ok=True)
+    typer.echo(f"{path.name}: deleted")
+    return 0
+
+
+def _mend_file(source: Path, target: Path | None) -> int:
+    files([source])
+    if target is None:
+        raise PebbleError(f"{source}: name a new file for what can be read: pebble recordings mend {source} OUT")
+    if target.exists():
+        raise PebbleError(f"{target} exists already")
+    made = rewrite(source, target)
+    typer.echo(f"{target}: {made.messages:,} messages, {made.missing:,} missing")
+    report_unread([f"{source}: {made.unread}"] if made.unread else [])
+    return 0 if made.messages else 1
+
+
+def _mend_all(folder: Folder) -> int:
+    left, failed = [entry.path for entry in folder.entries() if entry.is_active], False
+    for path in left:
+        try:
+            made = mend_leftover(path)
+        except (PebbleError, OSError) as error:
+            failed |= bool(report_left(f"{path.name}: {error}"))
+            continue
+        failed |= not made.is_whole
+        typer.echo(f"{finished_path(path).name}: {made.messages:,} messages, {made.missing:,} missing")
+    if not left:
+        typer.echo("nothing to mend")
+    return 1 if failed else 0
+
+
+def _archive_of(path: Path) -> Path:
+    """The folder of a recorder, which has one for each year, month and day."""
+    folder = path.resolve().parent
+    while _DATE.fullmatch(folder.name):
+        folder = folder.parent
+    return folder
+
+
+def _existing(folder: Path) -> Path:
+    if not folder.is_dir():
+        raise PebbleError(f"{folder}: there is no such folder")
+    return folder

@@ -1,0 +1,165 @@
+"""``pebble recordings`` list, info and search: what there is, and what was recorded."""
+
+from collections import Counter
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from pebble.config.visible import shown
+from pebble.extensions.operator.client.names import base_of
+from pebble.extensions.operator.commands.terminal import show
+from pebble.extensions.recordings import catalogue
+from pebble.extensions.recordings.catalogue import FileInfo, Query
+from pebble.extensions.recordings.commands.options import RecordingsArgument, RobotOption, Since, Topics, Until, period
+from pebble.extensions.recordings.commands.progress import progress
+from pebble.extensions.recordings.commands.report import local_time, one_line, report_unread
+from pebble.extensions.recordings.files.recorded import RecordingError
+from pebble.extensions.recordings.library import Damages, files, merged, problems, robot_in
+
+_SHOWN_TOPICS = 30  # of one recording; the rest is counted
+_ONE_LINE = 1 << 20  # columns
+_CHECKED = 256 << 20  # bytes of files that are read as a whole without being asked to
+Check = Annotated[bool, typer.Option("--check", help="Read all of it; without, of much only the summaries.")]
+
+
+def list_(places: RecordingsArgument, since: Since = None, until: Until = None, check: Check = False) -> int:
+    """List the files, their times, sizes and state."""
+    rows, total = list[tuple[str, ...]](), Counter[str]()
+    looked, unread = _looked_at(places, since, until, check=check)
+    for one in looked:
+        lasts = show.duration((one.last_ns - one.first_ns) / 1e9) if one.messages else ""
+        begins = local_time(one.first_ns) if one.messages else ""
+        rows.append((begins, lasts, _lane(one.path), f"{one.messages:,}", show.size(one.size), _state(one)))
+        total.update(files=1, messages=one.messages, size=one.size)
+    columns = ("begins", "lasts", "what", "messages", "size", "state")
+    show.print_table(columns, rows, whole=("begins", "lasts"), right=("messages", "size"))
+    typer.echo(f"{total['files']} files, {total['messages']:,} messages, {show.size(total['size'])}")
+    return report_unread(unread)
+
+
+def info(places: RecordingsArgument, since: Since = None, until: Until = None, check: Check = False) -> int:
+    """Show robots, topics, and what happened to the recording."""
+    looked, unread = _looked_at(places, since, until, check=check)
+    topics, sizes = Counter[str](), sum(one.size for one in looked)
+    for one in looked:
+        topics.update(one.topics)
+    messages = sum(one.messages for one in looked)
+    times = [one for one in looked if one.messages]
+    if times:
+        begin, end = min(one.first_ns for one in times), max(one.last_ns for one in times)
+        typer.echo(f"{local_time(begin)} to {local_time(end)} ({show.duration((end - begin) / 1e9)})")
+    typer.echo(f"{messages:,} messages, {show.size(sizes)} in {len(looked)} files")
+    missing = sum(one.missing for one in looked)
+    if missing:
+        typer.echo(f"{missing:,} messages are missing: files were damaged")
+    for robot in sorted(set().union(*(one.robots for one in looked))):
+        count = sum(number for topic, number in topics.items() if topic.startswith(f"{robot}/"))
+        typer.echo(f"\n{one_line(shown(robot))}: {count:,} messages")
+        own = Counter({topic[len(robot) + 1 :]: n for topic, n in topics.items() if topic.startswith(f"{robot}/")})
+        _print_topics(own)
+    encodings = {topic: name for one in looked for topic, name in one.encodings.items() if robot_in(topic) is None}
+    named = ((topic, name) for topic, name in encodings.items() if not topic.startswith("$recorder/"))
+    others = Counter({f"{topic} {name}": topics[topic] for topic, name in named})
+    if others:
+        typer.echo(f"\nTopics that are of no robot: {others.total():,} messages")
+    _print_topics(others)
+    _print_events(one.path for one in looked if one.readable)
+    return report_unread(unread)
+
+
+def search(
+    places: RecordingsArgument,
+    robot: RobotOption = None,
+    since: Since = None,
+    until: Until = None,
+    topic: Topics = None,
+    text: Annotated[str | None, typer.Option(help="Somewhere in the payload.", metavar="TEXT")] = None,
+    count: Annotated[int, typer.Option("--count", "-n", min=0, help="Stop after so many; 0: never.")] = 0,
+) -> int:
+    """Print the messages that match, in the order of time."""
+    since_ns, until_ns = period(since, until)
+    query = Query(None if robot is None else base_of(robot), tuple(topic or ()), text)
+    paths, found, damages = files(places), 0, Damages()
+    catalogue.check_names(query, paths, places)
+    for message in merged(paths, since_ns=since_ns, until_ns=until_ns, chooses=query.chooses, damages=damages):
+        if not query.accepts(message):
+            continue
+        flag = " (retained)" if message.channel.metadata.get("retained") else ""
+        line = one_line(show.body(message.payload, _ONE_LINE))
+        topic_ = one_line(shown(message.channel.topic))
+        typer.echo(f"{local_time(message.log_ns, fraction=True)}  {topic_}{flag}  {line}")
+        found += 1
+        if found == count:
+            break
+    typer.echo(f"{found:,} messages", err=True)
+    return report_unread(problems(damages))
+
+
+def _print_topics(counts: Counter[str]) -> None:
+    for topic, number in counts.most_common(_SHOWN_TOPICS):
+        typer.echo(f"  {number:>10,}  {one_line(shown(topic))}")
+    if len(counts) > _SHOWN_TOPICS:
+        typer.echo(f"  … and {len(counts) - _SHOWN_TOPICS} topics more")
+
+
+def _looked_at(
+    places: list[Path], since: str | None, until: str | None, *, check: bool
+) -> tuple[list[FileInfo], list[str]]:
+    """The files of a period by their times, and a line for each that cannot be read completely.
+
+    They are read as a whole with ``check``, or if that takes no more than seconds; else their summaries count.
+    """
+    since_ns, until_ns = period(since, until)
+    paths = files(places)
+    looked, unread = [], []
+    size = sum(path.stat().st_size for path in paths if path.exists())
+    with progress("reading", len(paths)) as advance:
+        for number, path in enumerate(paths, 1):
+            try:
+                one = catalogue.look_at(path, whole=check or size <= _CHECKED)
+            except RecordingError as error:
+                if not path.exists():  # finished, renamed or deleted meanwhile
+                    continue
+                one = FileInfo(path, path.stat().st_size, readable=False)
+                unread.append(str(error))
+            if one.problem:
+                unread.append(f"{path}: {one.problem}")
+            if one.first_ns < until_ns and (one.last_ns >= since_ns or not one.messages):
+                looked.append(one)
+            advance(number)
+    if size > _CHECKED and not check:
+        typer.echo(f"pebble: {show.size(size)} were not read but for their summaries: add --check", err=True)
+    return sorted(looked, key=lambda one: (one.first_ns, one.path.name)), unread
+
+
+def _lane(path: Path) -> str:
+    """``state`` or ``media of goob``, from the name of a recorder's file; else that name."""
+    parts = path.name.removesuffix(".active").removesuffix(".mcap").split(".", 1)
+    if len(parts) == 1:
+        return shown(path.name)
+    return shown(f"media of {parts[1].rpartition('.')[2]}" if parts[1].startswith("media.") else parts[1])
+
+
+def _state(one: FileInfo) -> str:
+    if one.is_active:
+        return "being written"
+    if one.missing:
+        return f"{one.missing:,} missing"
+    if not one.readable:
+        return "cannot be read"
+    return "damaged" if one.damaged or one.problem else "" if one.finished else "unfinished"
+
+
+def _print_events(paths: Iterable[Path]) -> None:
+    found = list(catalogue.events(path for path in paths if ".media." not in path.name))
+    if found:
+        typer.echo("\nWhat happened to the recording:")
+    for event in found:
+        name, at = event.pop("event"), event.pop("t", 0)
+        since, until = event.pop("since", None), event.pop("until", None)
+        if isinstance(since, int) and isinstance(until, int):
+            event["lasted"] = show.duration(max(0.0, (until - since) / 1e3))
+        details = one_line(", ".join(f"{key} {value}" for key, value in event.items()))
+        typer.echo(f"  {local_time(at * 10**6)}  {shown(f'{name}: {details}')}")

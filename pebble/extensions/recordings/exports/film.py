@@ -1,0 +1,175 @@
+"""One robot's pictures and sound as a film, or its sound alone: each at the time at which it was received."""
+
+import heapq
+import tempfile
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from fractions import Fraction
+from pathlib import Path
+from typing import Any, Final
+
+from pebble.contract import OUTGOING
+from pebble.contract.packets import PBAT
+from pebble.extensions.recordings.exports.film_sound import RATE, SoundResult, SoundTrack
+from pebble.extensions.recordings.exports.lines import Progress
+from pebble.extensions.recordings.exports.unfinished import unfinished
+from pebble.extensions.recordings.files.recorded import Recorded, RecordingError
+from pebble.extensions.recordings.stamps import is_picture
+from pebble.runtime import pyav
+
+#: By the ending of the film: FFmpeg's names of the container and of the encoder of its sound.
+_FORMATS: Final = {".mkv": ("matroska", "libopus"), ".mp4": ("mp4", "aac")}
+_LAST_PICTURE_MS: Final = 66  # how long the last picture of a film is shown
+_MILLISECOND: Final = Fraction(1, 1000)
+_KEYFRAME_INTERVAL: Final = 60  # pictures: how far a player jumps
+_NOMINAL_FPS: Final = 15  # for the encoder; each picture has its own time
+_OPTIONS: Final = {"crf": "23", "preset": "veryfast"}
+_BITRATE: Final = 64_000  # bits per second of each channel
+
+
+@dataclass(frozen=True, slots=True)
+class FilmResult:
+    """What a film is made of."""
+
+    seconds: float
+    pictures: int
+    left_out: int  # pictures: damaged, or without those that they build on
+    sound: SoundResult | None  # None: none was received
+
+
+def write_film(
+    read: Callable[[], Iterable[Recorded]],
+    target: Path,
+    robot: str,
+    *,
+    on_time: Progress = lambda _log_ns: None,
+) -> FilmResult:
+    """Write the pictures and the sound of ``robot`` (its base) to ``target``, which ends in .mkv or .mp4.
+
+    The messages are read twice: for the sound, then for the pictures, which take long. If several of its topics carry
+    pictures, or sound, the first one counts. The film has the size of its first picture. Raises
+    RecordingError if there are no pictures or ``target`` cannot be written; PebbleError without PyAV.
+    """
+    if target.suffix not in _FORMATS:
+        raise RecordingError(f"{target}: a film ends in {' or '.join(_FORMATS)}")
+    av = pyav.load("film")
+    container, codec = _FORMATS[target.suffix]
+    with unfinished(target) as path, _file_beside(target) as wav:
+        try:
+            with SoundTrack(wav) as sound:
+                for at_ms, payload in _media(read(), robot, lambda _log_ns: on_time(0)):
+                    if not is_picture(payload):
+                        sound.add(payload, at_ms)
+            with av.open(str(path), "w", format=container) as out:
+                pictures = _Pictures(av, out)
+                media = _media(read(), robot, on_time)
+                tracks = [pictures.packets((at_ms, payload) for at_ms, payload in media if is_picture(payload))]
+                if sound.result.packets:
+                    tracks.append(_sound_packets(av, wav, out, codec))
+                for packet in heapq.merge(*tracks, key=lambda packet: packet.dts * packet.time_base):
+                    if pictures.count:
+                        out.mux(packet)
+        except av.error.FFmpegError as error:
+            raise RecordingError(f"{target}: {error}") from None
+        if not pictures.count:
+            raise RecordingError(f"{robot}: no pictures; its sound alone can be exported as wav")
+    seconds = max((pictures.last_ms + _LAST_PICTURE_MS) / 1000, sound.result.seconds)
+    return FilmResult(seconds, pictures.count, pictures.left_out, sound.result if sound.result.packets else None)
+
+
+def write_wav(
+    messages: Iterable[Recorded],
+    target: Path,
+    robot: str,
+    *,
+    on_time: Progress = lambda _log_ns: None,
+) -> SoundResult:
+    """Write the sound of ``robot`` (its base) to ``target``, from its first sample on. Raises RecordingError."""
+    with unfinished(target) as path, SoundTrack(path) as track:
+        first_ms = None
+        for at_ms, payload in _media(messages, robot, on_time):
+            if not is_picture(payload):
+                first_ms = at_ms if first_ms is None else first_ms
+                track.add(payload, at_ms - first_ms)
+        if not track.result.packets:
+            raise RecordingError(f"{robot}: no sound" + ("" if pyav.installed() else f"; Opus {pyav.INSTALL}"))
+    return track.result
+
+
+@contextmanager
+def _file_beside(target: Path) -> Iterator[Path]:
+    """A file that may become as large as the film: the folder for temporary files is often in memory."""
+    with tempfile.TemporaryDirectory(dir=target.parent, prefix=f".{target.name}.") as name:
+        yield Path(name, "sound.wav")
+
+
+def _media(messages: Iterable[Recorded], robot: str, on_time: Progress) -> Iterator[tuple[int, bytes]]:
+    """The pictures and the sound of one robot, of one topic each, with milliseconds since the first one."""
+    below, topics, first_ms = f"{robot}/{OUTGOING}/", dict[bool, str](), None
+    for message in messages:
+        on_time(message.log_ns)
+        topic, payload = message.channel.topic, message.payload
+        if topic.startswith(below) and message.channel.metadata.get("retained") != "1":
+            picture = is_picture(payload)
+            if (picture or payload.startswith(PBAT)) and topics.setdefault(picture, topic) == topic:
+                log_ms = message.log_ns // 10**6
+                first_ms = log_ms if first_ms is None else first_ms
+                yield log_ms - first_ms, payload
+
+
+def _sound_packets(av: Any, path: Path, out: Any, codec: str) -> Iterator[Any]:
+    """Made while they are read, so that no more than a part of the sound is in memory."""
+    with av.open(str(path), format="wav") as source:
+        wav = source.streams.audio[0]
+        layout = "mono" if wav.channels == 1 else "stereo"  # wav has no names for them
+        stream = out.add_stream(codec, rate=RATE, layout=layout, bit_rate=_BITRATE * wav.channels)
+        for frame in source.decode(wav):
+            yield from stream.encode(frame)
+        yield from stream.encode(None)
+
+
+class _Pictures:
+    """Pictures of any size and encoding as H.264 of one size, that of the first: the encoder scales the others."""
+
+    def __init__(self, av: Any, out: Any) -> None:
+        from pebble.extensions.media.decode import VideoDecoder
+
+        self.count = self.left_out = 0
+        self.last_ms = -1
+        self._av, self._out, self._decoder = av, out, VideoDecoder()
+
+    def packets(self, pictures: Iterable[tuple[int, bytes]]) -> Iterator[Any]:
+        """Yield packets of a stream of ``out``: each picture is shown at its time (ms), but after the one before it."""
+        stream: Any = None
+        for at_ms, payload in pictures:
+            decoded = self._decoder.feed(payload)
+            if decoded is None:  # damaged, or without those that it builds on
+                self.left_out += 1
+                continue
+            if stream is None:
+                stream = self._opened(*decoded.picture.shape[:2])
+            frame = self._av.VideoFrame.from_ndarray(decoded.picture, format="bgr24")
+            self.last_ms = frame.pts = max(at_ms, self.last_ms + 1)
+            frame.time_base = _MILLISECOND
+            self.count += 1
+            yield from _lasting(stream.encode(frame))
+        if stream is not None:
+            yield from _lasting(stream.encode(None))
+
+    def _opened(self, height: int, width: int) -> Any:
+        """Colour is stored for two by two pixels."""
+        stream = self._out.add_stream("libx264", rate=_NOMINAL_FPS, options=_OPTIONS)
+        stream.width, stream.height = width & ~1, height & ~1
+        stream.pix_fmt = "yuv420p"
+        stream.codec_context.time_base = _MILLISECOND
+        stream.codec_context.gop_size = _KEYFRAME_INTERVAL
+        stream.codec_context.max_b_frames = 0
+        return stream
+
+
+def _lasting(packets: list[Any]) -> list[Any]:
+    """Give each a length, which counts for the last one: the others are shown until the next."""
+    for packet in packets:
+        packet.duration = _LAST_PICTURE_MS
+    return packets

@@ -1,0 +1,97 @@
+"""Recordings for Foxglove: MCAP with its Protobuf schemas, which its panels show without further settings.
+
+``foxglove_messages`` says what becomes of which topic; other JSON stays on its topic as it is.
+"""
+
+from collections import Counter
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Final
+
+from pebble.contract.packets import PBAT
+from pebble.extensions.recordings.exports.foxglove_messages import (
+    Converted,
+    Media,
+    Schemas,
+    Telemetry,
+    as_object,
+    stamped,
+    time_of,
+)
+from pebble.extensions.recordings.exports.lines import Progress
+from pebble.extensions.recordings.exports.unfinished import unfinished
+from pebble.extensions.recordings.files.recorded import Channel, Recorded, Schema
+from pebble.extensions.recordings.files.rewrite import Copy
+from pebble.extensions.recordings.files.writer import RecordingWriter
+from pebble.extensions.recordings.stamps import is_picture
+
+JSON: Final = "json"
+LEFT_OUT: Final = "left out"
+
+
+def write_foxglove(
+    messages: Iterable[Recorded],
+    target: Path,
+    *,
+    on_time: Progress = lambda _log_ns: None,
+) -> dict[str, int]:
+    """Write ``messages`` to the MCAP file ``target``; returns how many there are by schema, ``json`` and ``left out``.
+
+    Left out are bytes that are no media of a known kind, pictures without those that they build on, and removals of
+    retained messages. Raises RecordingError if ``target`` cannot be written, PebbleError without Foxglove's schemas.
+    """
+    schemas = Schemas()
+    with unfinished(target) as path, path.open("wb", buffering=0) as file:
+        writer = RecordingWriter(file)
+        export = _Export(Copy(writer), schemas)
+        for message in messages:
+            export.add(message)
+            on_time(message.log_ns)
+        writer.finish()
+    return dict(export.counts)
+
+
+class _Export:
+    """One file in the making."""
+
+    def __init__(self, copy: Copy, schemas: Schemas) -> None:
+        self.counts: Counter[str] = Counter()
+        self._copy, self._schemas = copy, schemas
+        self._media = Media(schemas)
+        self._telemetry = Telemetry(schemas)
+        self._channels: dict[str, Channel] = {}
+
+    def add(self, message: Recorded) -> None:
+        topic, payload = message.channel.topic, message.payload
+        if is_picture(payload) or payload.startswith(PBAT):
+            converted = self._media.convert(topic, payload)
+            if converted is None:
+                self.counts[LEFT_OUT] += 1
+                return
+        else:
+            converted = self._telemetry.convert(topic, payload)
+        if converted is not None:
+            self._add(message, converted)
+        if converted is None or converted.beside:
+            self._add_json(message)
+
+    def _add(self, message: Recorded, converted: Converted) -> None:
+        made, topic = converted.message, f"{message.channel.topic}/{converted.ending}"
+        if topic not in self._channels:
+            schema = Schema(made.DESCRIPTOR.full_name, "protobuf", self._schemas.descriptors(made))
+            self._channels[topic] = Channel(0, topic, "protobuf", {}, schema)
+        stamp = _time_of(message)
+        self._copy.add(Recorded(self._channels[topic], 0, message.log_ns, stamp, stamped(made, stamp)))
+        self.counts[made.DESCRIPTOR.name] += 1
+
+    def _add_json(self, message: Recorded) -> None:
+        payload, topic = as_object(message.payload), message.channel.topic
+        if payload is None:
+            self.counts[LEFT_OUT] += 1
+            return
+        self._copy.add(Recorded(Channel(0, topic, JSON), 0, message.log_ns, _time_of(message), payload))
+        self.counts[JSON] += 1
+
+
+def _time_of(message: Recorded) -> int:
+    return time_of(message.payload, message.log_ns, message.publish_ns)

@@ -1,0 +1,298 @@
+"""Messages of robots as Foxglove's own, for its files and for its live connection.
+
+Each topic that is converted gets an ending, because Foxglove expects one schema for a topic: ``…/front-camera/video``.
+Sources: https://docs.foxglove.dev/docs/sdk/schemas, and for the payloads ``pebble.contract.payloads``.
+"""
+
+from __future__ import annotations
+
+import importlib
+import math
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
+
+import msgspec
+
+from pebble import contract as c
+from pebble.contract import codec
+from pebble.contract.channels import channel_of
+from pebble.contract.packets import PBAT, PBVD, Picture, PictureKind
+from pebble.contract.payloads import Corners, LogRecord, TagData, TagLocations, VideoOverlays
+from pebble.errors import PayloadError, PebbleError
+from pebble.extensions.recordings.stamps import CLOCK_FROM_NS, stamp_ns
+
+if TYPE_CHECKING:
+    from pebble.extensions.media.decode import VideoDecoder
+    from pebble.extensions.media.sound import SoundDecoder
+
+QUALITY: Final = 85  # of the JPEGs that are made of pictures, 1 to 100
+MOST_CHANNELS: Final = 8192  # of one export; further ones are left out and counted
+#: What media become, and the endings of their topics.
+VIDEO, IMAGE, SOUND = ("CompressedVideo", "video"), ("CompressedImage", "image"), ("RawAudio", "sound")
+
+_LEVELS: Final = {"DEBUG": 1, "INFO": 2, "WARNING": 3, "ERROR": 4, "CRITICAL": 5}  # Foxglove's numbers; 0: unknown
+_LINE_LOOP, _LINE_STRIP = 2, 3  # types of PointsAnnotation
+_YELLOW: Final = {"r": 1.0, "g": 0.85, "b": 0.0, "a": 1.0}
+_THICKNESS, _FONT_SIZE = 2.0, 14.0  # pixels
+_MILLIMETRES: Final = 1000.0
+_TAG_EDGE_M, _TAG_DEPTH_M = 0.15, 0.01  # of the box that stands for a tag, whose true size is not published
+_TAG_SHOWN_S: Final = 1  # a tag is published ten times a second
+
+
+class Converted(NamedTuple):
+    """A Protobuf message of Foxglove's, and the ending of its topic."""
+
+    message: Any
+    ending: str
+    beside: bool = False  # the JSON that it was made of says more, and goes out as well
+
+
+class Schemas:
+    """The classes of Foxglove's schemas, by name."""
+
+    def __init__(self) -> None:
+        """Raises PebbleError."""
+        try:
+            self._descriptors = importlib.import_module("google.protobuf.descriptor_pb2")
+            importlib.import_module("foxglove_schemas_protobuf.RawAudio_pb2")
+        except ImportError as error:
+            raise PebbleError(
+                f'Foxglove\'s format needs its schemas: pip install "pebble-robot[foxglove]" ({error})'
+            ) from None
+
+    def make(self, schema: str, /, **fields: Any) -> Any:
+        return getattr(importlib.import_module(f"foxglove_schemas_protobuf.{schema}_pb2"), schema)(**fields)
+
+    def descriptors(self, message: Any) -> bytes:
+        """The file descriptors of a message's schema, each after those that it imports: what MCAP calls its schema."""
+        found: dict[str, Any] = {}
+
+        def add(file: Any) -> None:
+            for needed in file.dependencies:
+                if needed.name not in found:
+                    add(needed)
+            found[file.name] = file
+
+        add(message.DESCRIPTOR.file)
+        together = self._descriptors.FileDescriptorSet()
+        for file in found.values():
+            file.CopyToProto(together.file.add())
+        return bytes(together.SerializeToString())
+
+
+class Media:
+    """Pictures and sound: H.264 as it was sent, other pictures as whole JPEGs, all sound as samples."""
+
+    def __init__(self, schemas: Schemas) -> None:
+        self._make = schemas.make
+        self._pictures: dict[str, VideoDecoder] = {}  # by topic
+        self._sounds: dict[str, SoundDecoder] = {}
+
+    def convert(self, topic: str, payload: bytes) -> Converted | None:
+        """None for bytes that are no media of a known kind, and for pictures without those that they build on."""
+        if payload.startswith(PBAT):
+            return self.sound(topic, payload)
+        return self.video(topic, payload) if is_h264(payload) else self.image(topic, payload)
+
+    def video(self, topic: str, payload: bytes) -> Converted | None:
+        """H.264 as it was sent: one picture in Annex B, parameter sets in key frames, no B-frames, as Foxglove asks.
+
+        None for another encoding, and for what is damaged.
+        """
+        from pebble.extensions.media.h264 import unseal
+
+        if not is_h264(payload):
+            return None
+        try:
+            unit = unseal(Picture.unpack(payload).body)
+        except PayloadError:
+            return None
+        schema, ending = VIDEO
+        return Converted(self._make(schema, frame_id=_id(topic), data=unit, format="h264"), ending)
+
+    def image(self, topic: str, payload: bytes) -> Converted | None:
+        """A whole JPEG of a picture in any encoding; None as of :meth:`convert`."""
+        import cv2
+
+        decoded = self.decoder(topic).feed(payload)
+        if decoded is None:
+            return None
+        jpeg = cv2.imencode(".jpg", decoded.picture, [cv2.IMWRITE_JPEG_QUALITY, QUALITY])[1].tobytes()
+        schema, ending = IMAGE
+        return Converted(self._make(schema, frame_id=_id(topic), data=jpeg, format="jpeg"), ending)
+
+    def sound(self, topic: str, payload: bytes) -> Converted | None:
+        """Samples: Foxglove knows no Opus. None for what is no sound, and for Opus without PyAV."""
+        from pebble.extensions.media.sound import SoundDecoder
+
+        decoder = self._sounds.get(topic) or self._sounds.setdefault(topic, SoundDecoder())
+        sound = decoder.feed(payload)
+        if sound is None:
+            return None
+        schema, ending = SOUND
+        made = self._make(
+            schema, data=sound.pcm, format="pcm-s16", sample_rate=sound.rate, number_of_channels=sound.channels
+        )
+        return Converted(made, ending)
+
+    def decoder(self, topic: str) -> VideoDecoder:
+        """What decodes the pictures of this topic: it knows why one was refused, and whether it wants a key frame."""
+        from pebble.extensions.media.decode import VideoDecoder
+
+        return self._pictures.get(topic) or self._pictures.setdefault(topic, VideoDecoder())
+
+
+class Telemetry:
+    """Payloads of the contract for which Foxglove has a schema."""
+
+    def __init__(self, schemas: Schemas) -> None:
+        self._make = schemas.make
+        self._converters: dict[c.Channel, Callable[[str, bytes], Converted | None]] = {
+            c.LOGS: self._log,
+            c.WHEEL_ODOMETRY: self._odometry,
+            c.LOCALIZATION_POSE: self._localization,
+            c.APRILTAG_LOCATIONS: self._tags,
+            c.APRILTAG_DATA: self._followed,
+            c.VIDEO_OVERLAYS: self._overlays,
+        }
+
+    def convert(self, topic: str, payload: bytes) -> Converted | None:
+        """None for a payload that is to stay as it is, also if it is not what its channel has."""
+        levels = topic.split("/", 3)
+        channel = channel_of(levels[3]) if len(levels) == 4 and levels[3].startswith((c.INCOMING, c.OUTGOING)) else None
+        convert = None if channel is None else self._converters.get(channel)
+        if convert is None:
+            return None
+        try:
+            return convert(topic, payload)
+        except (PayloadError, OverflowError):  # whole numbers of any length are JSON
+            return None
+
+    def _log(self, _topic: str, payload: bytes) -> Converted:
+        record: LogRecord = codec.decode(c.LOGS, payload)
+        level = _LEVELS.get(record.level.upper(), 0)
+        return Converted(self._make("Log", level=level, message=record.message, name=record.service), "log")
+
+    def _odometry(self, topic: str, payload: bytes) -> Converted | None:
+        """Some robots have metres, and other names (paper A.8.12)."""
+        odometry = codec.decode(c.WHEEL_ODOMETRY, payload)
+        value, per_metre = odometry.value, 1.0 if odometry.unit == "m" else _MILLIMETRES
+        x, y = (_number(value, f"{axis}_mm", axis) for axis in "xy")
+        if x is None or y is None:
+            return None
+        per_metre = _MILLIMETRES if "x_mm" in value else per_metre
+        heading = _number(value, "heading_rad", "theta_rad", "heading") or 0.0
+        return Converted(self._pose(f"{_id(topic)}/odom", x / per_metre, y / per_metre, 0.0, heading), "pose")
+
+    def _localization(self, _topic: str, payload: bytes) -> Converted | None:
+        """The pose of a ROS robot: metres and radians in the frame that it names."""
+        pose = codec.plain(c.LOCALIZATION_POSE, payload)
+        value = pose.get("value", pose) if isinstance(pose, dict) else None
+        if not isinstance(value, dict):
+            return None
+        x, y = _number(value, "x_m"), _number(value, "y_m")
+        if x is None or y is None:
+            return None
+        frame = str(value.get("frame_id") or "map")
+        made = self._pose(frame, x, y, _number(value, "z_m") or 0.0, _number(value, "yaw_rad") or 0.0)
+        return Converted(made, "pose")
+
+    def _pose(self, frame: str, x: float, y: float, z: float, heading_rad: float) -> Any:
+        pose = self._make("PoseInFrame", frame_id=frame)
+        pose.pose.position.x, pose.pose.position.y, pose.pose.position.z = x, y, z
+        pose.pose.orientation.z, pose.pose.orientation.w = math.sin(heading_rad / 2), math.cos(heading_rad / 2)
+        return pose
+
+    def _tags(self, _topic: str, payload: bytes) -> Converted:
+        tags: TagLocations = codec.decode(c.APRILTAG_LOCATIONS, payload)
+        drawn = _Drawing(self._make("ImageAnnotations"), tags.frame_width, tags.frame_height)
+        for tag in tags.detections:
+            drawn.outline(tag.corners_norm, _LINE_LOOP)
+            drawn.label(str(tag.marker_id), tag.center_norm)
+        return Converted(drawn.annotations, "annotations")
+
+    def _followed(self, topic: str, payload: bytes) -> Converted:
+        """The tag that is followed, as a box around the robot: x ahead, y to the left. Empty while it is not seen."""
+        tag: TagData = codec.decode(c.APRILTAG_DATA, payload)
+        scene = self._make("SceneUpdate")
+        if tag.detected and tag.distance_m is not None and tag.angle_rad is not None:
+            x, y = tag.distance_m * math.cos(tag.angle_rad), -tag.distance_m * math.sin(tag.angle_rad)
+            entity = scene.entities.add(frame_id=_id(topic), id="tag")
+            entity.lifetime.FromSeconds(_TAG_SHOWN_S)
+            box = entity.cubes.add(color=_YELLOW, size={"x": _TAG_DEPTH_M, "y": _TAG_EDGE_M, "z": _TAG_EDGE_M})
+            box.pose.position.x, box.pose.position.y, box.pose.orientation.w = x, y, 1.0
+            label = entity.texts.add(text=str(tag.marker_id), color=_YELLOW, font_size=_TAG_EDGE_M, billboard=True)
+            label.pose.position.x, label.pose.position.y, label.pose.position.z = x, y, _TAG_EDGE_M
+            label.pose.orientation.w = 1.0
+        else:
+            scene.deletions.add(id="tag")
+        return Converted(scene, "scene", beside=True)
+
+    def _overlays(self, _topic: str, payload: bytes) -> Converted:
+        overlays: VideoOverlays = codec.decode(c.VIDEO_OVERLAYS, payload)
+        drawn = _Drawing(self._make("ImageAnnotations"), overlays.frame_width, overlays.frame_height)
+        for shape in overlays.shapes:
+            drawn.outline(shape, _LINE_STRIP)
+        for label in overlays.labels:
+            drawn.label(str(label.marker_id), label.center_norm)
+        return Converted(drawn.annotations, "annotations")
+
+
+class _Drawing:
+    """Lines and texts on a picture, from parts of its size to pixels."""
+
+    def __init__(self, annotations: Any, width: int, height: int) -> None:
+        self.annotations, self._width, self._height = annotations, width, height
+
+    def outline(self, corners: Corners, line: int) -> None:
+        drawn = self.annotations.points.add(type=line, thickness=_THICKNESS, outline_color=_YELLOW)
+        for x, y in corners:
+            drawn.points.add(x=x * self._width, y=y * self._height)
+
+    def label(self, text: str, at: tuple[float, float]) -> None:
+        position = {"x": at[0] * self._width, "y": at[1] * self._height}
+        self.annotations.texts.add(text=text, position=position, font_size=_FONT_SIZE, text_color=_YELLOW)
+
+
+def is_h264(payload: bytes) -> bool:
+    """Whether it is a picture in H.264, by its header."""
+    return payload.startswith(PBVD) and payload[5:6] == bytes([PictureKind.H264])
+
+
+def stamped(message: Any, ns: int) -> bytes:
+    """The message with this time, as bytes. A scene has none itself, its parts have."""
+    parts = [message] if "timestamp" in message.DESCRIPTOR.fields_by_name else [*message.entities, *message.deletions]
+    for part in parts:
+        part.timestamp.FromNanoseconds(ns)
+    return bytes(message.SerializeToString())
+
+
+def time_of(payload: bytes, received_ns: int, publish_ns: int = 0) -> int:
+    """The payload's own time, or when it was received."""
+    stamp = publish_ns or stamp_ns(payload)
+    return stamp if stamp >= CLOCK_FROM_NS else received_ns
+
+
+def as_object(payload: bytes) -> bytes | None:
+    """The JSON object in ``payload``. Another JSON value is wrapped as the contract does (paper A.4.5).
+
+    None for what is no JSON, and for an empty payload.
+    """
+    payload = codec.trim(payload)
+    try:
+        payload.decode()
+        value = msgspec.json.decode(payload)
+    except (UnicodeDecodeError, msgspec.DecodeError, RecursionError):
+        return None
+    return payload if isinstance(value, dict) else msgspec.json.encode({"value": value})
+
+
+def _id(topic: str) -> str:
+    """The id of the robot, which its frame is named after."""
+    return "/".join(topic.split("/")[2:3])
+
+
+def _number(value: dict[str, Any], *names: str) -> float | None:
+    """The first of the named fields that is a number; None if none is."""
+    found = (value.get(name) for name in names)
+    return next((float(one) for one in found if isinstance(one, int | float) and not isinstance(one, bool)), None)

@@ -1,0 +1,159 @@
+"""Recordings as JSON lines, in the form of the original's broker logger, and back: one line at a time.
+
+A line is ``{"timestamp", "topic", "qos", "retain", "payload_size_bytes", "payload_truncated", "payload_b64"}``, and
+``payload_text`` and ``payload_json`` where the payload is text or JSON. The logger stamps with seconds since 1970 and
+cuts payloads at 8192 bytes unless asked otherwise. We add ``retained``: the logger's subscriptions set ``retain`` for
+messages that are from before them only, ours as they were published.
+"""
+
+from collections.abc import Callable, Iterable, Iterator
+from datetime import UTC, datetime, timedelta
+from decimal import Decimal
+from functools import partial
+from typing import Annotated, Any, BinaryIO, Final
+
+import msgspec
+from msgspec import UNSET, Meta, Raw, Struct, UnsetType
+
+from pebble.errors import TransportError
+from pebble.extensions.recordings.files.recorded import Channel, Recorded, RecordingError
+from pebble.extensions.recordings.stamps import stamp_ns
+from pebble.transports.topics import check_topic
+
+TRUNCATED: Final = "truncated"  # of a channel: its payloads were cut before they were recorded here
+
+LONGEST_LINE: Final = 96 << 20  # bytes; the largest message of a recording takes less
+_TEXT_MOST: Final = 1 << 16  # bytes of a payload that is written as text, too
+_MILLISECONDS_FROM: Final = 10**11  # a number as large as this counts milliseconds (paper A.4.2)
+_LATEST_NS: Final = (1 << 63) - 1
+_EPOCH: Final = datetime(1970, 1, 1, tzinfo=UTC)
+_MICROSECOND: Final = timedelta(microseconds=1)
+
+Progress = Callable[[int], None]  # called with the log time of each message
+
+
+class BadLine(Struct, frozen=True):
+    """A line that holds no message."""
+
+    number: int  # from 1
+    problem: str
+
+
+class _Line(Struct):
+    timestamp: Raw
+    topic: str
+    qos: Annotated[int, Meta(ge=0, le=2)] = 0
+    retain: bool = False
+    retained: bool | None = None  # it was from before the subscription; None: the logger's "retain" says so
+    payload_truncated: bool = False
+    payload_b64: bytes = b""
+
+
+class _Written(Struct):
+    timestamp: Raw
+    topic: str
+    qos: int
+    retain: bool
+    retained: bool
+    payload_size_bytes: int
+    payload_truncated: bool
+    payload_b64: bytes
+    payload_text: str | UnsetType = UNSET
+    payload_json: Any = UNSET
+
+
+_encoder = msgspec.json.Encoder()
+_decoder = msgspec.json.Decoder(_Line)
+
+
+def write_lines(messages: Iterable[Recorded], out: BinaryIO, *, on_time: Progress = lambda _log_ns: None) -> int:
+    """Write a line for each message; returns how many.
+
+    Stamps have nine decimals, so that reading the lines again gives the same nanoseconds. Payloads of up to 64 KiB are
+    readable, too, where they are text or JSON.
+    """
+    count = 0
+    for message in messages:
+        out.write(_encoder.encode(_line(message)) + b"\n")
+        count += 1
+        on_time(message.log_ns)
+    return count
+
+
+def read_lines(file: BinaryIO) -> Iterator[Recorded | BadLine]:
+    """Yield the messages of a logger's file, in its order. Lines that are none are yielded as such; empty ones are not.
+
+    Raises RecordingError at a line that is too long to be held in memory.
+    """
+    for number, line in enumerate(iter(partial(file.readline, LONGEST_LINE + 1), b""), 1):
+        if len(line) > LONGEST_LINE:
+            raise RecordingError(f"{file.name}: line {number} is longer than {LONGEST_LINE:,} bytes")
+        if not line.isspace():
+            yield _message(number, line)
+
+
+def _line(message: Recorded) -> _Written:
+    metadata, payload = message.channel.metadata, message.payload
+    seconds, fraction = divmod(message.log_ns, 10**9)
+    line = _Written(
+        timestamp=Raw(b"%d.%09d" % (seconds, fraction)),
+        topic=message.channel.topic,
+        qos=int(metadata.get("qos", "0")),
+        retain=metadata.get("retain") == "1",
+        retained=metadata.get("retained") == "1",
+        payload_size_bytes=len(payload),
+        payload_truncated=metadata.get(TRUNCATED) == "1",
+        payload_b64=payload,
+    )
+    if len(payload) <= _TEXT_MOST:
+        _add_text(line, payload)
+    return line
+
+
+def _add_text(line: _Written, payload: bytes) -> None:
+    try:
+        line.payload_text = payload.decode()
+        line.payload_json = msgspec.json.decode(payload)
+    except (UnicodeDecodeError, msgspec.DecodeError, RecursionError):
+        pass
+
+
+def _message(number: int, line: bytes) -> Recorded | BadLine:
+    try:
+        found = _decoder.decode(line)
+        check_topic(found.topic.removeprefix("$"))  # our own events have one
+        log_ns = _stamp_ns(bytes(found.timestamp))
+        if not 0 <= log_ns <= _LATEST_NS:
+            raise ValueError("the stamp is no time between 1970 and 2262")
+    except (ValueError, OverflowError, RecursionError, TransportError) as error:  # msgspec's are ValueErrors
+        return BadLine(number, str(error))
+    payload = found.payload_b64
+    encoding = "json" if payload[:1] in (b"{", b"[") else "application/octet-stream"
+    channel = Channel(0, found.topic, encoding, _metadata(found))
+    return Recorded(channel, 0, log_ns, stamp_ns(payload), payload)
+
+
+def _metadata(line: _Line) -> dict[str, str]:
+    """The form is that of a recording's channel."""
+    flags = {"retained": line.retain if line.retained is None else line.retained, TRUNCATED: line.payload_truncated}
+    known = {"qos": str(line.qos), "retain": str(int(line.retain))}
+    return known | {name: "1" for name, is_set in flags.items() if is_set}
+
+
+def _stamp_ns(stamp: bytes) -> int:
+    """The time of a number, or of a text in ISO 8601, which is UTC unless it names another zone. Raises ValueError."""
+    if not stamp.startswith(b'"'):
+        try:
+            return _epoch_ns(Decimal(stamp.decode()))
+        except ArithmeticError:
+            raise ValueError("the stamp is no number") from None
+    moment = datetime.fromisoformat(msgspec.json.decode(stamp, type=str))
+    moment = moment if moment.tzinfo is not None else moment.replace(tzinfo=UTC)
+    return (moment - _EPOCH) // _MICROSECOND * 1000
+
+
+def _epoch_ns(stamp: Decimal) -> int:
+    """Nanoseconds since 1970 of a stamp in seconds or milliseconds. Raises ValueError."""
+    if not 0 <= stamp < _LATEST_NS // 1_000_000:  # false for NaN, too
+        raise ValueError("the stamp is no time")
+    return int(stamp * (10**6 if stamp >= _MILLISECONDS_FROM else 10**9))

@@ -1,0 +1,135 @@
+"""Writes an MCAP file so that a process that is killed loses what it has not flushed, and nothing else."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from io import BufferedIOBase
+from typing import TYPE_CHECKING, Final, Protocol
+
+from pebble.extensions.recordings.files.recorded import require_package
+from pebble.version import __version__
+
+if TYPE_CHECKING:
+    from mcap.records import Channel
+
+LIBRARY: Final = f"pebble {__version__}"
+MOST_CHANNELS: Final = (1 << 16) - 1  # of one file: their numbers have 16 bits
+_NAMES_AGAIN_NS: Final = 60 * 10**9
+_CHUNK: Final = b"\x06"
+
+
+class File(Protocol):
+    """Where the bytes go: an unbuffered file. ``write`` may take a part of them."""
+
+    def write(self, data: memoryview, /) -> int | None: ...
+
+
+class RecordingWriter:
+    """One file. :meth:`flush` it at least once a second, and :meth:`finish` it."""
+
+    def __init__(self, file: File, library: str = LIBRARY) -> None:
+        """Raises RecordingError without the package ``mcap``; OSError, as all others."""
+        require_package()
+        from mcap.writer import Writer
+
+        self.messages = 0  # that were added
+        self.channels = self.indexed = 0  # channels; channels of each chunk, which the package keeps in memory
+        self._output = _Output(self, file)
+        self._writer = Writer(self._output)  # type: ignore[arg-type]
+        self._named: list[Channel] = []
+        self._new: list[Channel] = []  # since the last flush
+        self._used: set[int] = set()  # channels
+        self._log_ns = self._names_again_ns = 0
+        self._writer.start(library=library)
+
+    @property
+    def size(self) -> int:
+        """The bytes that the file has taken."""
+        return self._output.size
+
+    @property
+    def flushed(self) -> int:
+        """The messages that the file has taken."""
+        return self._output.messages
+
+    def metadata(self, name: str, items: Mapping[str, str]) -> None:
+        """Add named texts about the file."""
+        self._writer.add_metadata(name, dict(items))
+
+    def attach(self, name: str, media_type: str, data: bytes, *, log_ns: int, create_ns: int) -> None:
+        """Add bytes that are no message."""
+        self._writer.add_attachment(create_ns, log_ns, name, media_type, data)
+
+    def schema(self, name: str, encoding: str, data: bytes) -> int:
+        """Declare what messages look like; returns its number for :meth:`channel`."""
+        number: int = self._writer.register_schema(name, encoding, data)
+        return number
+
+    def channel(self, topic: str, encoding: str, metadata: Mapping[str, str], schema: int = 0) -> int:
+        """Declare a channel, one of MOST_CHANNELS; returns its number for :meth:`add`."""
+        from mcap.records import Channel
+
+        number = self._writer.register_channel(topic, encoding, schema, dict(metadata))
+        self._new.append(Channel(number, topic, encoding, dict(metadata), schema))
+        self.channels += 1
+        return number
+
+    def add(self, channel: int, log_ns: int, payload: bytes, publish_ns: int = 0) -> None:
+        """Add a message that was received at ``log_ns``. Hot."""
+        number, self.messages = self.messages, self.messages + 1
+        self._log_ns = log_ns
+        self._used.add(channel)
+        self._writer.add_message(channel, log_ns, payload, publish_ns, number & 0xFFFFFFFF)
+
+    def flush(self) -> None:
+        """Give all that was added to the file.
+
+        The package names a channel once, in a chunk, which damage may take: so each is named before that chunk, too,
+        and all are named again once a minute.
+        """
+        self._named += self._new
+        named, self._new = self._new, []
+        if self._log_ns >= self._names_again_ns:
+            named, self._names_again_ns = self._named, self._log_ns + _NAMES_AGAIN_NS
+        if named and self.messages:
+            self._output.write(_packed(named))
+        self._writer.flush()
+        self.indexed += len(self._used)
+        self._used.clear()
+
+    def finish(self) -> None:
+        """Write the summary: the file is complete."""
+        self._writer.finish()
+
+
+class _Output(BufferedIOBase):
+    """A file as the package writes to it: each of its calls is written whole."""
+
+    def __init__(self, writer: RecordingWriter, file: File) -> None:
+        self.size = self.messages = 0
+        self._writer, self._file = writer, file
+
+    def write(self, data: bytes) -> int:  # type: ignore[override]
+        rest = memoryview(data)
+        while rest:
+            rest = rest[self._file.write(rest) :]
+        self.size += len(data)
+        if data[:1] == _CHUNK:  # the package writes a chunk in one call, and holds back no message
+            self.messages = self._writer.messages
+        return len(data)
+
+    def seek(self, _offset: int, _whence: int = 0) -> int:
+        """Return the only position, which is the end: so its position is asked for."""
+        return self.size
+
+
+def _packed(channels: list[Channel]) -> bytes:
+    """Return the records of channels. One with a schema is not repeated: its schema had to be, too."""
+    from mcap.data_stream import RecordBuilder
+
+    builder = RecordBuilder()
+    for channel in channels:
+        if not channel.schema_id:
+            channel.write(builder)
+    packed: bytes = builder.end()
+    return packed

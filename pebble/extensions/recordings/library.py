@@ -1,0 +1,104 @@
+"""Recordings as one stream of messages in the order of time, however many files they are in."""
+
+from collections.abc import Iterable, Iterator
+from functools import partial
+from pathlib import Path
+
+from pebble.extensions.recordings.files.reader import Chooses, RecordingFile, in_time_order
+from pebble.extensions.recordings.files.recorded import ACTIVE as ACTIVE
+from pebble.extensions.recordings.files.recorded import FOREVER_NS as FOREVER_NS
+from pebble.extensions.recordings.files.recorded import SUFFIX as SUFFIX
+from pebble.extensions.recordings.files.recorded import Channel, Damage, Recorded, RecordingError
+from pebble.extensions.recordings.files.records import MAGIC
+
+#: What is wrong with each file that was read.
+Damages = dict[Path, Damage]
+
+
+def files(places: Iterable[Path]) -> list[Path]:
+    """The recordings among ``places`` and in folders there, finished or not. Raises RecordingError if there is none."""
+    found: list[Path] = []
+    for place in places:
+        if place.is_dir():
+            found += sorted(recordings_in(place))
+        elif _begins_as_mcap(place) or place.name.endswith((SUFFIX, ACTIVE)):
+            found.append(place)
+        else:
+            raise RecordingError(f"{place}: is not a recording (MCAP)")
+    if not found:
+        raise RecordingError(f"{', '.join(map(str, places))}: there is no recording")
+    return found
+
+
+def recordings_in(folder: Path) -> Iterator[Path]:
+    """Yield them by their names; a link that leads nowhere is one that cannot be read."""
+    for path in folder.rglob(f"*{SUFFIX}*"):
+        if path.name.endswith((SUFFIX, ACTIVE)) and (path.is_file() or path.is_symlink()):
+            yield path
+
+
+def reaches_into(path: Path, since_ns: int, until_ns: int) -> bool:
+    """True if a file may hold messages of a period. Raises RecordingError."""
+    with RecordingFile(path) as file:
+        return file.reaches_into(since_ns, until_ns)
+
+
+def merged(
+    paths: Iterable[Path],
+    *,
+    since_ns: int = 0,
+    until_ns: int = FOREVER_NS,
+    chooses: Chooses = lambda _channel: True,
+    damages: Damages | None = None,
+) -> Iterator[Recorded]:
+    """The messages of all files from ``since_ns`` to before ``until_ns``, by the time at which they were received.
+
+    A file is open only while its time has come: its chunks outside the period are not unpacked. What is wrong with
+    those that were read is in ``damages``. Raises RecordingError.
+    """
+    damages = {} if damages is None else damages
+    due = []
+    for path in paths:
+        with RecordingFile(path) as file:
+            if not file.chunks:
+                damages[path] = file.damage
+            elif file.reaches_into(since_ns, until_ns):
+                reading = partial(_messages, path, since_ns, until_ns, chooses, damages)
+                due.append((max(file.first_ns, since_ns), reading))
+    yield from in_time_order(due)
+
+
+def problems(damages: Damages) -> list[str]:
+    """A line for each file that could not be read completely."""
+    found = ((path, damage.report(active=path.name.endswith(ACTIVE))) for path, damage in damages.items())
+    return [f"{path}: {text}" for path, text in found if text]
+
+
+def _messages(path: Path, since_ns: int, until_ns: int, chooses: Chooses, damages: Damages) -> Iterator[Recorded]:
+    if not path.exists() and path.name.endswith(ACTIVE):  # finished meanwhile
+        path = path.with_name(path.name.removesuffix(ACTIVE) + SUFFIX)
+    if not path.exists():  # deleted meanwhile, to make room
+        return
+    with RecordingFile(path) as file:
+        damages[path] = file.damage
+        for message in file.read(chooses=chooses, since_ns=since_ns, until_ns=until_ns):
+            if since_ns <= message.log_ns < until_ns:
+                yield message
+
+
+def _begins_as_mcap(path: Path) -> bool:
+    try:
+        with path.open("rb") as file:
+            return file.read(len(MAGIC)) == MAGIC
+    except OSError as error:
+        raise RecordingError(f"{path}: {error.strerror or error}") from None
+
+
+def robot_of(channel: Channel) -> str | None:
+    """``system/type/id`` of a channel's topic; None if it has none."""
+    return robot_in(channel.topic)
+
+
+def robot_in(topic: str) -> str | None:
+    levels = topic.split("/", 4)
+    return "/".join(levels[:3]) if len(levels) == 5 and levels[3] in ("incoming", "outgoing") else None

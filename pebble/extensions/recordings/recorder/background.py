@@ -1,0 +1,69 @@
+"""What a recorder does beside writing: makes files durable, and finishes them."""
+
+import logging
+import os
+import threading
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from typing import Final
+
+from pebble.extensions.recordings.recorder.lane import OpenFile
+from pebble.extensions.recordings.recorder.memory import return_free_pages
+
+log = logging.getLogger(__name__)
+
+SYNC_S: Final = 5.0  # a power cut loses as much
+
+
+class Background:
+    """One thread makes files durable every few seconds, and returns free memory; another one does what takes long."""
+
+    def __init__(self) -> None:
+        self._jobs = ThreadPoolExecutor(1, "pebble-recorder-finish")
+        self._files: list[OpenFile] = []
+        self._stopping = threading.Event()
+        self._thread = threading.Thread(target=self._sync_all, name="pebble-recorder-sync", daemon=True)
+
+    @property
+    def alive(self) -> bool:
+        return self._thread.is_alive()
+
+    def start(self) -> None:
+        self._thread.start()
+
+    def stop(self) -> None:
+        """Wait until all jobs are done."""
+        self._jobs.shutdown()
+        self._stopping.set()
+        self._thread.join()
+
+    def do(self, job: Callable[[], None]) -> None:
+        self._jobs.submit(_logged, job)
+
+    def watch(self, files: list[OpenFile]) -> None:
+        self._files = files
+
+    def _sync_all(self) -> None:
+        while not self._stopping.wait(SYNC_S):
+            for file in self._files:
+                self._sync(file)
+            return_free_pages()
+
+    def _sync(self, file: OpenFile) -> None:
+        try:
+            descriptor = os.dup(file.file.fileno())
+        except (OSError, ValueError):  # closed meanwhile
+            return
+        try:
+            os.fdatasync(descriptor)
+        except OSError as error:
+            log.error("%s cannot be made durable: %s", file.path.name, error.strerror)
+        finally:
+            os.close(descriptor)
+
+
+def _logged(job: Callable[[], None]) -> None:
+    try:
+        job()
+    except Exception:  # one file must not keep the others from being finished
+        log.exception("a recording could not be finished")

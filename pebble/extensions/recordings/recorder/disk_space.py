@@ -1,0 +1,52 @@
+"""Which recordings make room for new ones. Pure."""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+from pebble.extensions.recordings.recorder.folder import Entry
+from pebble.extensions.recordings.recorder.settings import Options
+
+_DAY_S = 86_400.0
+
+
+@dataclass(frozen=True, slots=True)
+class Disk:
+    """The file system of the folder."""
+
+    free_bytes: int
+    has_inodes: bool = True
+
+
+def surplus(entries: Iterable[Entry], options: Options, disk: Disk) -> list[Entry]:
+    """What to delete now to keep the limits of space: the oldest first, pictures and sound before state.
+
+    Files that are being written are never among them, nor those that are damaged: these may hold what was
+    not read, and do not count. The newest file of each kind stays.
+    """
+    listed = [entry for entry in entries if entry.is_active or entry.is_finished]
+    used, free = sum(entry.size for entry in listed), disk.free_bytes
+    deleted = []
+    for entry in _deletable(listed):
+        too_much = options.keep_bytes and used > options.keep_bytes
+        if not too_much and free >= options.free_bytes and disk.has_inodes:
+            break
+        deleted.append(entry)
+        used -= entry.size
+        free += entry.size
+        disk = Disk(free)
+    return deleted
+
+
+def outdated(entries: Iterable[Entry], options: Options, now: float) -> Entry | None:
+    """A file of pictures and sound that is too old; one at a time, because the clock may have been set wrong."""
+    age_s = options.keep_media_days * _DAY_S
+    old = (entry for entry in _deletable(list(entries)) if entry.is_media and now - entry.ended > age_s)
+    return next(old, None) if age_s else None
+
+
+def _deletable(entries: list[Entry]) -> list[Entry]:
+    """The files in the order in which they go."""
+    finished = sorted((entry for entry in entries if entry.is_finished), key=lambda entry: entry.number)
+    media = [entry for entry in finished if entry.is_media]
+    state = [entry for entry in finished if not entry.is_media]
+    return media[:-1] + state[:-1]

@@ -1,0 +1,106 @@
+"""Finishes files beside the writer: complete ones, and what a killed recorder or a full disk has left."""
+
+import logging
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+
+from pebble.extensions.recordings.files.recorded import RecordingError
+from pebble.extensions.recordings.files.rewrite import Rewritten, rewrite
+from pebble.extensions.recordings.library import SUFFIX
+from pebble.extensions.recordings.recorder.background import Background
+from pebble.extensions.recordings.recorder.folder import DAMAGED, finished_path, rename
+from pebble.extensions.recordings.recorder.lane import OpenFile
+from pebble.runtime.whole_file import sync_folder
+
+log = logging.getLogger(__name__)
+
+
+def mend(path: Path) -> Rewritten:
+    """Make a finished file of one that a killed recorder has left.
+
+    That one is deleted if nothing but the begin of a record is lost, else kept as ``….mcap.damaged``. Raises
+    RecordingError, OSError.
+    """
+    target = finished_path(path)
+    made = rewrite(path, target)
+    if made.is_empty:
+        target.unlink()
+    sync_folder(path.parent)
+    if made.is_whole:
+        path.unlink()
+    else:
+        rename(path, _damaged_path(path))
+    return made
+
+
+def _damaged_path(path: Path) -> Path:
+    return finished_path(path).with_suffix(SUFFIX + DAMAGED)
+
+
+class Finisher:
+    """Queues its work for ``background``. ``event`` writes down what became of a file that was left."""
+
+    def __init__(self, background: Background, event: Callable[..., None], on_finished: Callable[[], None]) -> None:
+        self._background, self._event, self._on_finished = background, event, on_finished
+        self._unfinished: set[Path] = set()
+
+    def finish(self, file: OpenFile) -> None:
+        self._background.do(partial(self._finish, file))
+
+    def mend(self, path: Path) -> None:
+        """Finish a file as it was left."""
+        self._background.do(partial(self._mend, path))
+
+    def postpone(self, path: Path) -> None:
+        """Finish a file when there is room again."""
+        self._unfinished.add(path)
+
+    def retry(self) -> None:
+        """Try again what could not be finished."""
+        for path in list(self._unfinished):
+            self.mend(path)
+
+    # -- the background thread
+
+    def _finish(self, file: OpenFile) -> None:
+        try:
+            file.finish()
+        except OSError as error:
+            self._later(file.path, error)
+            return
+        self._on_finished()
+
+    def _mend(self, path: Path) -> None:
+        if not path.exists():
+            self._unfinished.discard(path)
+            return
+        try:
+            made = mend(path)
+        except RecordingError as error:
+            self._set_aside(path, str(error))
+            return
+        except OSError as error:
+            self._later(path, error)
+            return
+        self._unfinished.discard(path)
+        if not made.is_whole:
+            self._event("damaged", file=path.name, why=made.unread)
+        if not made.is_empty:
+            self._event("recovered", file=path.name, messages=made.messages, missing=made.missing)
+            self._on_finished()
+
+    def _set_aside(self, path: Path, why: str) -> None:
+        try:
+            rename(path, _damaged_path(path))
+        except OSError as error:
+            self._later(path, error)
+            return
+        self._unfinished.discard(path)
+        self._event("damaged", file=path.name, why=why)
+
+    def _later(self, path: Path, error: OSError) -> None:
+        """Leave it as it is, so that it can be read, until there is room; said once."""
+        if path not in self._unfinished:
+            log.warning("%s is not finished yet: %s", path.name, error.strerror or error)
+        self._unfinished.add(path)

@@ -1,0 +1,165 @@
+"""The folder of recordings: names and numbers of its files, its lock, and what may be deleted. One recorder uses it."""
+
+import errno
+import os
+import re
+import stat
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import BinaryIO, Final
+
+from pebble.extensions.recordings.files.recorded import RecordingError
+from pebble.extensions.recordings.files.rewrite import PART
+from pebble.extensions.recordings.library import ACTIVE, SUFFIX
+from pebble.runtime.whole_file import sync_folder
+from pebble.transports.own_file import OwnFile
+
+STATE: Final = "state"
+MEDIA: Final = "media."
+DAMAGED: Final = ".damaged"
+LOCK: Final = "recorder.lock"
+_NAME: Final = re.compile(
+    r"(?P<stamp>\d{8}T\d{6}Z)-(?P<number>\d{6,})\.(?P<lane>state|media\.[A-Za-z0-9_.-]{1,120})\.mcap(?P<state>|\.active|\.damaged)"
+)
+_COPY: Final = re.compile(rf"\.{_NAME.pattern}\.\d+{re.escape(PART)}")
+_DAY: Final = "%Y/%m/%d"
+
+
+@dataclass(frozen=True, slots=True)
+class Entry:
+    """One file of a recorder."""
+
+    path: Path
+    number: int  # they grow: names alone do not say which is older, because clocks are set
+    lane: str
+    size: int
+    ended: float  # when it was written last, seconds since 1970
+
+    @property
+    def is_media(self) -> bool:
+        return self.lane != STATE
+
+    @property
+    def is_active(self) -> bool:
+        return self.path.name.endswith(ACTIVE)
+
+    @property
+    def is_finished(self) -> bool:
+        return self.path.name.endswith(SUFFIX)
+
+
+class Folder:
+    """``root`` holds ``2026/11/20/20261120T232921Z-000017.state.mcap`` and the like."""
+
+    def __init__(self, root: Path) -> None:
+        self.root = root
+        self._number = 0
+        self._lock = ExitStack()
+        self._own = OwnFile(root / LOCK)
+
+    def take(self) -> None:
+        """Make the folder, and lock it against a second recorder. Raises RecordingError."""
+        try:
+            self.root.mkdir(mode=0o750, parents=True, exist_ok=True)
+        except OSError as error:
+            raise RecordingError(f"{self.root}: {error.strerror}: name another folder") from None
+        used = f"{self.root}: a recorder writes here: stop it first, or name another folder"
+        self._lock.enter_context(_locked(self.root / LOCK, used))
+        self._own = OwnFile(self.root / LOCK)
+        for path in self._files():
+            if _COPY.fullmatch(path.name):  # was being written when its process was killed
+                path.unlink(missing_ok=True)
+        self._number = max((self._number, *(entry.number for entry in self.entries())))
+
+    @property
+    def in_place(self) -> bool:
+        """Whether it is the folder that was taken: it may be removed, or its disk taken away or brought back."""
+        return self._own.in_place
+
+    def release(self) -> None:
+        self._lock.close()
+
+    @contextmanager
+    def taken(self) -> Iterator[None]:
+        """Keep recorders away meanwhile. Raises RecordingError."""
+        self.take()
+        try:
+            yield
+        finally:
+            self.release()
+
+    @classmethod
+    def is_in_use(cls, root: Path) -> bool:
+        """Whether a recorder writes there."""
+        if not (root / LOCK).exists():
+            return False
+        try:
+            with _locked(root / LOCK, ""):
+                return False
+        except RecordingError:
+            return True
+
+    def create(self, lane: str, now_ns: int) -> tuple[BinaryIO, Path]:
+        """A new file that is being written. Raises OSError."""
+        self._number += 1
+        moment = time.gmtime(max(0, now_ns) // 10**9)
+        day = self.root / time.strftime(_DAY, moment)
+        for folder in (day.parent.parent, day.parent, day):
+            folder.mkdir(mode=0o750, exist_ok=True)
+        path = day / f"{time.strftime('%Y%m%dT%H%M%SZ', moment)}-{self._number:06d}.{lane}{ACTIVE}"
+        descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o640)
+        return os.fdopen(descriptor, "r+b", buffering=0), path
+
+    def entries(self) -> list[Entry]:
+        """The recorder's own files, the oldest first; links and what others have put there are left alone."""
+        found = []
+        for path in self._files():
+            match = _NAME.fullmatch(path.name)
+            try:
+                about = path.lstat()
+            except OSError:
+                continue
+            if match is not None and stat.S_ISREG(about.st_mode):
+                found.append(Entry(path, int(match["number"]), match["lane"], about.st_size, about.st_mtime))
+        return sorted(found, key=lambda entry: entry.number)
+
+    def _files(self) -> Iterator[Path]:
+        for folder, _, names in os.walk(self.root):
+            for name in names:
+                if SUFFIX in name:
+                    yield Path(folder, name)
+
+
+@contextmanager
+def _locked(path: Path, used: str) -> Iterator[None]:
+    """Raises RecordingError(used) if another process holds it."""
+    try:
+        import fcntl
+    except ImportError:  # Windows
+        raise RecordingError("recording needs a system with file locks, such as Linux or macOS") from None
+    try:
+        file = path.open("a+b")
+    except OSError as error:
+        raise RecordingError(f"{path}: {error.strerror}: name another folder") from None
+    with file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            raise RecordingError(used) from None
+        yield
+
+
+def finished_path(path: Path) -> Path:
+    """The name of a file that was ``.mcap.active``, once it is finished."""
+    return path.with_name(path.name.removesuffix(ACTIVE) + SUFFIX)
+
+
+def rename(path: Path, target: Path) -> None:
+    """Durably; never over another file. Raises OSError."""
+    if target.exists():
+        raise FileExistsError(errno.EEXIST, "there is another file of this name", str(target))
+    path.rename(target)
+    sync_folder(path.parent)

@@ -1,0 +1,93 @@
+"""The files that a recorder writes at present: one for each lane."""
+
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from typing import Final
+
+from pebble.extensions.recordings.recorder.folder import STATE, Folder
+from pebble.extensions.recordings.recorder.lane import CARRIED, OTHER_MEDIA, Item, OpenFile, lane_of
+from pebble.extensions.recordings.stamps import is_media
+from pebble.transports.bounds import BoundedTable
+
+_MOST_MEDIA: Final = 32  # lanes
+_TOPICS, _BYTES = 10_000, 16 << 20
+
+
+class RetainedValues:
+    """The retained values at this moment, by connection and topic: a new file begins with them."""
+
+    def __init__(self) -> None:
+        self._values = BoundedTable[Item](_TOPICS, _BYTES, lambda item: len(item.payload))
+
+    def note(self, item: Item) -> None:
+        """A message. Where the broker hides how it was published, a topic that is known to be retained stays so."""
+        key = f"{item.source} {item.topic}"
+        known = self._values.get(key)
+        if item.retained and known is not None and not known.retained:
+            return  # fetched by another connection, while a newer one had come
+        if not item.retain and not (item.retain is None and known is not None):
+            return
+        if item.payload:
+            self._values[key] = item._replace(retain=True)
+        else:
+            self._values.pop(key, None)
+
+    def forget(self, source: str) -> None:
+        """They are fetched anew."""
+        for key in [key for key in self._values if key.startswith(f"{source} ")]:
+            del self._values[key]
+
+    def carried(self) -> Iterator[Item]:
+        """What a new file begins with."""
+        for item in list(self._values.values()):
+            yield item._replace(retained=CARRIED)
+
+
+class OpenFiles:
+    """By lane; a file of the state begins with the retained values. Not thread-safe.
+
+    ``about`` is written into each file, and ``watch`` gets all of them whenever that changes.
+    """
+
+    def __init__(self, folder: Folder, about: Mapping[str, str], watch: Callable[[list[OpenFile]], None]) -> None:
+        self.retained = RetainedValues()
+        self._folder, self._about, self._watch = folder, about, watch
+        self._files: dict[str, OpenFile] = {}
+
+    @property
+    def by_lane(self) -> dict[str, OpenFile]:
+        """A copy, so that files may be opened and taken meanwhile."""
+        return dict(self._files)
+
+    @property
+    def paths(self) -> set[Path]:
+        return {file.path for file in self._files.values()}
+
+    def lane(self, item: Item) -> str:
+        """The lane of a message; media beyond those of so many robots share one."""
+        lane = lane_of(item.topic, is_media=is_media(item.payload))
+        media = len(self._files) - (STATE in self._files)
+        return lane if lane == STATE or lane in self._files or media < _MOST_MEDIA else OTHER_MEDIA
+
+    def get(self, lane: str, *, now_ns: int, at_ns: int) -> OpenFile:
+        """The file of a lane, or a new one, begun now, with the values retained at ``at_ns``. Raises OSError."""
+        file = self._files.get(lane)
+        if file is not None:
+            return file
+        file = OpenFile(self._folder, lane, now_ns, self._about)
+        if lane == STATE:
+            try:
+                for value in self.retained.carried():
+                    file.add(value, at_ns)
+            except OSError:
+                file.discard()
+                raise
+        self._files[lane] = file
+        self._watch(list(self._files.values()))
+        return file
+
+    def take(self, lane: str) -> OpenFile:
+        """The file, which is not written any more."""
+        file = self._files.pop(lane)
+        self._watch(list(self._files.values()))
+        return file

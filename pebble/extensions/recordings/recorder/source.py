@@ -1,0 +1,181 @@
+"""Where a recorder's messages come from: a broker, or a robot's local transport."""
+
+import time
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import replace
+from functools import partial
+from typing import Any, Final
+
+from pebble.extensions.recordings.recorder.recorder import Recorder
+from pebble.transports import Message, MqttSettings, QoS, State, Transport, create
+from pebble.transports.topics import matches
+
+#: Topics of a replay: recorded only where a filter names them.
+REPLAYED: Final = "replay/"
+#: How long a connection for retained messages waits for the next one before it ends.
+_QUIET_S: Final = 1.0
+_LONGEST_S: Final = 60.0
+#: The reason of a broker that knows only MQTT 3.1.1, which does not show how a live message was published.
+_OLD_BROKER: Final = "unsupported protocol version"
+_LOSSES: Final = ("too_long", "malformed")  # messages that a transport has dropped
+
+
+class Source:
+    """One connection. What happens to it is written down as events.
+
+    A broker sends at most some 1,000 retained messages to a subscription of QoS 1, and none of them is marked on a
+    connection that shows how live messages were published. So each connection to a broker has a second one beside it,
+    which fetches the retained messages with QoS 0 and ends.
+    """
+
+    def __init__(self, recorder: Recorder, kind: str, settings: Any, filters: Iterable[str], name: str = "") -> None:
+        self._recorder, self._kind, self._name = recorder, kind, name
+        self._filters = list(dict.fromkeys(filters))
+        self._ignored = () if any(one.startswith(REPLAYED) for one in self._filters) else (REPLAYED,)
+        self._settings, self._is_modern = settings, True
+        self._lost_at = 0  # nanoseconds since 1970; 0: connected, or never was
+        self._losses: dict[str, int] = {}
+        self._copies: _Copies | None = None
+        self._wants_copies = self._was_connected = False
+        self._transport = self._make()
+
+    @property
+    def connected(self) -> bool:
+        return self._transport.state is State.CONNECTED
+
+    @property
+    def problem(self) -> str:
+        return self._transport.problem
+
+    def start(self, timeout: float = 3.0) -> None:
+        """Connect, and go on trying. Raises TransportError for settings that can never work."""
+        self._open(timeout)
+        self.check()
+
+    def check(self) -> None:
+        """Once a second: write down what the transport had to drop; begin and end the fetching of retained messages."""
+        counted = self._transport.counters.snapshot()
+        for name in _LOSSES:
+            new = counted.get(name, 0) - self._losses.get(name, 0)
+            if new > 0:
+                self._losses[name] = counted[name]
+                self._recorder.note("dropped", messages=new, why=name, **self._about)
+        if self._kind == "mqtt" and self._is_modern and _OLD_BROKER in self.problem:
+            self._transport.close()
+            self._is_modern = False
+            self._transport = self._make()
+            self._open(0.0)
+        copies = self._copies
+        if copies is not None and (copies.is_done or self._wants_copies):
+            copies.close()
+            self._copies = None
+            if copies.failed:
+                self._recorder.note("dropped", why="the retained messages cannot be fetched", **self._about)
+        if self._wants_copies:
+            self._wants_copies = False
+            self._copies = _Copies(self._settings, self._filters, self._record_retained)
+
+    def close(self) -> None:
+        self._transport.close()
+        if self._copies is not None:
+            self._copies.close()
+
+    def _open(self, timeout: float) -> None:
+        self._transport.on_state(self._watch)
+        self._transport.open(timeout)
+        for filter_, receive in _once(self._filters, self._receive):
+            self._transport.subscribe(filter_, receive, qos=QoS.DELIVERED, echo=False, direct=True)
+
+    @property
+    def _about(self) -> dict[str, str]:
+        return {"source": self._name} if self._name else {}
+
+    def _make(self) -> Transport:
+        if self._kind == "mqtt":
+            modern = self._is_modern
+            protocol = "5" if modern else "3.1.1"
+            settings = replace(self._settings, protocol=protocol, as_published=modern, sends_retained=not modern)
+            return create("mqtt", "pebble-recorder", settings)
+        return create(self._kind, "pebble-recorder", self._settings)
+
+    # -- the transport's threads
+
+    def _watch(self, state: State) -> None:
+        now_ns = self._recorder.clock.now()
+        if state is State.CONNECTED:
+            if self._lost_at:
+                self._recorder.note_gap(self._lost_at, "no connection", **self._about)
+            self._lost_at = 0
+            self._recorder.note("connected", **self._about)
+            self._wants_copies = self._kind == "mqtt"
+            self._recorder.forget_retained(self._name)
+            self._was_connected = True
+        elif state is State.CONNECTING and self._was_connected and not self._lost_at:
+            self._lost_at = now_ns
+            self._recorder.note("lost", why=self.problem, **self._about)
+
+    def _receive(self, message: Message) -> None:
+        if message.topic.startswith(self._ignored):
+            return
+        is_live = self._transport.as_published or not message.retain
+        if is_live:
+            self._recorder.receive(
+                message.topic, message.payload, int(message.qos), message.retain_requested, source=self._name
+            )
+        elif self._kind != "mqtt":  # of a broker the other connection fetches them
+            self._record_retained(message)
+
+    def _record_retained(self, message: Message) -> None:
+        if message.topic.startswith(self._ignored):
+            return
+        self._recorder.receive(message.topic, message.payload, None, True, retained=True, source=self._name)
+
+
+class _Copies:
+    """A connection that fetches the retained messages of a broker."""
+
+    def __init__(self, settings: MqttSettings, filters: list[str], record: Callable[[Message], None]) -> None:
+        self._record = record
+        self._quiet_since = float("inf")  # not connected yet
+        self._ends_at = time.monotonic() + _LONGEST_S
+        id_ = settings.client_id and f"{settings.client_id}-retained"
+        plain = replace(settings, as_published=False, sends_retained=True, max_qos=0, client_id=id_)
+        self._transport = create("mqtt", "pebble-recorder-retained", plain)
+        self._transport.on_state(self._watch)
+        self._transport.open(0.0)
+        for filter_, receive in _once(filters, self._receive):
+            self._transport.subscribe(filter_, receive, direct=True)
+
+    @property
+    def is_done(self) -> bool:
+        now = time.monotonic()
+        return now - self._quiet_since > _QUIET_S or now > self._ends_at
+
+    @property
+    def failed(self) -> bool:
+        """Whether it has never been connected for long enough."""
+        now = time.monotonic()
+        return now > self._ends_at and now - self._quiet_since <= _QUIET_S
+
+    def close(self) -> None:
+        self._transport.close()
+
+    def _watch(self, state: State) -> None:
+        if state is State.CONNECTED:
+            self._quiet_since = time.monotonic()
+
+    def _receive(self, message: Message) -> None:
+        if message.retain:
+            self._quiet_since = time.monotonic()
+            self._record(message)
+
+
+def _once(filters: list[str], receive: Callable[[Message], None]) -> Iterator[tuple[str, Callable[[Message], None]]]:
+    """Each filter with its handler, so that a message that several of them match is received once."""
+    for number, filter_ in enumerate(filters):
+        yield filter_, partial(_receive_unless, filters[:number], receive) if number else receive
+
+
+def _receive_unless(earlier: list[str], receive: Callable[[Message], None], message: Message) -> None:
+    if not any(matches(filter_, message.topic) for filter_ in earlier):
+        receive(message)

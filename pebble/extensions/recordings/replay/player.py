@@ -1,0 +1,267 @@
+"""Publishes a recording again, in its order and at its pace. Pure: clocks, waiting and publishing are passed in."""
+
+from collections.abc import Callable, Iterator
+from typing import Final, Protocol
+
+from pebble.extensions.recordings.files.reader import Chooses
+from pebble.extensions.recordings.files.recorded import Recorded
+from pebble.extensions.recordings.library import FOREVER_NS
+from pebble.extensions.recordings.replay.pace import SLOWEST, Pace
+from pebble.extensions.recordings.replay.rules import Rules, zero
+from pebble.transports import Message
+
+_TICK_S: Final = 0.05  # at least so often the caller can act
+_NOW_S: Final = 1e-6  # less is not worth waiting for
+_RETRY_S: Final = 0.01  # after a message that was refused
+_TRIES: Final = 50  # for the last zero
+#: Later than this is made up by no burst of old messages: the recording goes on from where it is.
+_LATE_S: Final = 0.5
+
+
+class Source(Protocol):
+    """What a player reads."""
+
+    def messages(self, since_ns: int, until_ns: int) -> Iterator[Recorded]:
+        """Yield those of a period by the time at which they were received."""
+        ...
+
+    def state_before(self, at_ns: int, publishes: Chooses) -> list[Recorded]:
+        """Return what a subscriber would know at a time, the pictures that the next one builds on last."""
+        ...
+
+
+class Output(Protocol):
+    """Where a player sends messages."""
+
+    sent: int
+    skipped: int
+
+    @property
+    def moves(self) -> bool:
+        """True if something may be moving because of what was sent."""
+        ...
+
+    def send(self, message: Recorded, position_ns: int) -> bool:
+        """Return whether it is done; else it is tried again."""
+        ...
+
+    def halt(self) -> None:
+        """Stop what moves."""
+        ...
+
+
+class BusOutput:
+    """Publishes recorded messages again, and a zero after those that move something.
+
+    ``publish`` returns False for what it cannot take now; ``wall_ns`` is the time since 1970.
+    """
+
+    def __init__(self, rules: Rules, publish: Callable[[Message], bool], wall_ns: Callable[[], int]) -> None:
+        self.sent = self.skipped = 0
+        self._rules, self._publish, self._wall_ns = rules, publish, wall_ns
+        self._moved: dict[str, None] = {}  # topics of drive commands without a zero after them
+
+    @property
+    def moves(self) -> bool:
+        """Whether something may be moving because of what was published."""
+        return bool(self._moved)
+
+    def send(self, message: Recorded, position_ns: int) -> bool:
+        """Whether it is done; a stamp was ``position_ns`` - stamp old then, and is as old now."""
+        found = self._rules.outgoing(message, self._wall_ns() - position_ns)
+        if found is None:
+            self.skipped += 1
+            return True
+        if not self._publish(found.message):
+            return False
+        self.sent += 1
+        if found.moves is not None:
+            self._moved.pop(found.message.topic, None)
+            if found.moves:
+                self._moved[found.message.topic] = None
+        return True
+
+    def halt(self) -> None:
+        """A zero after each drive command that moves. Without a connection the robot's own deadline has to do."""
+        self._moved = {topic: None for topic in self._moved if not self._publish(zero(topic))}
+
+
+class Reading:
+    """Where a replay is in its recording, in what is published; ``skipped`` counts the messages between."""
+
+    def __init__(self, source: Source, publishes: Chooses, until_ns: int) -> None:
+        self.next: Recorded | None = None
+        self.state: list[Recorded] = []  # to be sent before the next message, the last one first
+        self.skipped = 0
+        self._source, self._publishes, self._until_ns = source, publishes, until_ns
+        self._messages: Iterator[Recorded] = iter(())
+
+    def open(self, since_ns: int) -> None:
+        """Go on from another time, with the state and the pictures that a decoder needs by then."""
+        self._messages = self._source.messages(since_ns, self._until_ns)
+        self.state = self._source.state_before(since_ns, self._publishes)[::-1] if since_ns else []
+        self.advance()
+
+    def advance(self) -> None:
+        """Find the next message that is published; those between take no time."""
+        for message in self._messages:
+            if self._publishes(message.channel):
+                self.next = message
+                return
+            self.skipped += 1
+        self.next = None
+
+
+class Player:
+    """Plays until the end; between its calls of ``wait`` it may be paused, moved and stopped."""
+
+    def __init__(
+        self,
+        source: Source,
+        publishes: Chooses,
+        output: Output,
+        *,
+        now: Callable[[], float],
+        wait: Callable[[float], None],
+        since_ns: int = 0,
+        until_ns: int = FOREVER_NS,
+        speed: float = 1.0,
+        slowest: float = SLOWEST,
+        loop: bool = False,
+        paused: bool = False,
+        stays: bool = False,
+        longest_gap_ns: int = FOREVER_NS,
+    ) -> None:
+        """``wait`` waits for up to so many seconds; ``now`` never goes back, in seconds.
+
+        With ``stays`` it is paused at the end, and each time is a position, also one before the first message. Of a
+        time without messages at most ``longest_gap_ns`` is played.
+        """
+        self.paused, self.ended = paused, False
+        self.at_end = False  # it is paused there
+        self._reading = Reading(source, publishes, until_ns)
+        self._output = output
+        self._pace = Pace(now, speed=speed, slowest=slowest)
+        self._now, self._wait = now, wait
+        self._since_ns, self._loop, self._stays, self._longest_gap_ns = since_ns, loop, stays, longest_gap_ns
+        self._begins_ns = 0  # the first message
+        self._waited = 0.0
+
+    @property
+    def sent(self) -> int:
+        return self._output.sent
+
+    @property
+    def skipped(self) -> int:
+        return self._reading.skipped + self._output.skipped
+
+    @property
+    def restores(self) -> bool:
+        """True while the state before the newest seek is being sent."""
+        return bool(self._reading.state)
+
+    @property
+    def position_ns(self) -> int:
+        """The time in the recording, since 1970."""
+        from_ns, next_ = self._pace.from_ns, self._reading.next
+        if self.paused or self.ended:
+            return from_ns
+        reached_ns = self._pace.reached_ns
+        return reached_ns if next_ is None else min(reached_ns, max(next_.log_ns, from_ns))
+
+    @property
+    def speed(self) -> float:
+        return self._pace.speed
+
+    @speed.setter
+    def speed(self, speed: float) -> None:
+        self._pace.change(speed, self.position_ns)
+
+    def run(self) -> None:
+        """Play to the end, or until :meth:`stop`; whatever moves is stopped then, also after an error."""
+        try:
+            self._open(self._since_ns, self._since_ns if self._stays else 0)
+            if self._reading.next is not None and not self._stays:
+                self._begins_ns = self._reading.next.log_ns
+            while not self.ended:
+                self._step()
+        finally:
+            self._output.halt()
+            for _ in range(_TRIES if self._output.moves else 0):
+                self._wait(_RETRY_S)
+                self._output.halt()
+
+    def pause(self) -> None:
+        self._pace.from_ns = self.position_ns
+        self.paused = True
+        self._output.halt()
+
+    def resume(self) -> None:
+        if self.at_end:
+            self.seek(self.position_ns)  # more may have been recorded meanwhile
+        self.paused = False
+        self._pace.go_on_from(self._pace.from_ns)
+
+    def seek(self, to_ns: int) -> None:
+        """Go on from another time, with the state and the pictures that a decoder needs by then."""
+        self._output.halt()
+        self._open(max(to_ns, self._begins_ns), to_ns)
+
+    def stop(self) -> None:
+        self._pace.from_ns = self.position_ns
+        self.ended = True
+
+    def _open(self, since_ns: int, position_ns: int = 0) -> None:
+        self.at_end = False
+        self._reading.open(since_ns)
+        first_ns = position_ns if self._reading.next is None else self._reading.next.log_ns
+        self._pace.go_on_from(max(since_ns, position_ns) if position_ns else first_ns)
+
+    def _step(self) -> None:
+        now, reading = self._now(), self._reading
+        if now - self._waited > _TICK_S:
+            self._pass(0.0)
+        elif reading.state:
+            if self._send(reading.state[-1], self._pace.from_ns):
+                reading.state.pop()
+        elif self.paused:
+            self._output.halt()
+            self._pass(_TICK_S)
+        elif reading.next is None:
+            self._end()
+        else:
+            self._play(reading.next, now)
+
+    def _play(self, message: Recorded, now: float) -> None:
+        due_s = self._pace.due_s(message.log_ns, now)
+        if message.log_ns - self._pace.reached_ns > self._longest_gap_ns:
+            self._pace.go_on_from(message.log_ns)
+        elif due_s > _NOW_S:
+            self._pass(min(due_s, _TICK_S))
+            return
+        if due_s < -_LATE_S:
+            self._pace.go_on_from(message.log_ns)
+        if self._send(message, message.log_ns):
+            self._reading.advance()
+
+    def _send(self, message: Recorded, position_ns: int) -> bool:
+        """Whether it is done; else it is tried again."""
+        done = self._output.send(message, position_ns)
+        if not done:
+            self._pass(_RETRY_S)
+        return done
+
+    def _pass(self, seconds: float) -> None:
+        self._wait(seconds)
+        self._waited = self._now()
+
+    def _end(self) -> None:
+        self._output.halt()
+        if self._loop and self._begins_ns:
+            self._pass(_TICK_S)  # a recording may be one message
+            self._open(self._begins_ns)
+        elif self._stays:
+            self.pause()
+            self.at_end = True
+        else:
+            self.stop()

@@ -1,0 +1,215 @@
+"""What of a recording may be published again, and how: harmless unless asked for more. Pure.
+
+The rules in their order: nothing of a broker's own; another base; nothing that is an order to a robot, but mild ones
+if asked for; nothing retained. Names of topics decide by the contract, so an unknown name counts as the worst of its
+direction.
+"""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any, Final, NamedTuple
+
+import msgspec
+
+from pebble import contract as c
+from pebble.contract import Channel as Declared
+from pebble.contract import channel_of, codec
+from pebble.contract.channels import is_reserved
+from pebble.contract.identity import Identity, ParsedTopic, parse_topic
+from pebble.contract.payloads import Drive
+from pebble.errors import PayloadError, PebbleError, TransportError
+from pebble.extensions.recordings.files.recorded import Channel, Recorded
+from pebble.extensions.recordings.stamps import shifted
+from pebble.transports import Message, QoS
+from pebble.transports.topics import check_filter, check_topic, matches
+
+SYSTEM: Final = "replay"  # the first level of replayed topics, unless another one is named
+
+#: Commands whose effect ends by itself, or is visible at once. All others, and all that the contract does not know,
+#: are never sent: they switch on cameras, mains and scripts, or move what no zero stops.
+_MILD: Final = frozenset({c.DRIVE, c.LIGHTS_SOLID, c.LIGHTS_FLASH, c.AUDIO_STREAM, c.SOUNDBOARD_COMMAND})
+_HEARTBEATS: Final = frozenset({c.ONLINE, c.HEARTBEAT})
+_PROBE: Final = 24  # bytes of white space at the end of a payload by which bridges look for cycles
+_WATCHED: Final = frozenset({"video", "audio"})  # sections of capabilities that a viewer has to request
+_ZERO: Final = codec.encode(c.DRIVE, Drive(valid_ms=0))  # final: no script resumes after it
+
+
+class ReplayError(PebbleError):
+    """A replay that cannot be. Example: ``--base pebble is the base of pebble/robots/goob itself: …``."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Options:
+    """What the user has asked for."""
+
+    system: str = SYSTEM
+    incoming: bool = False  # commands that end by themselves
+    only: tuple[str, ...] = ()  # filters of recorded topics; none: all
+
+
+class Outgoing(NamedTuple):
+    """A message to publish."""
+
+    message: Message
+    moves: bool | None  # of a drive command, whether it moves anything; None: it is none
+
+
+class _Address(NamedTuple):
+    """Where the messages of one recorded channel go."""
+
+    recorded: Identity
+    base: str
+    topic: str
+    declared: Declared | None
+    qos: QoS
+
+
+class Rules:
+    """Decides about each message of a recording."""
+
+    def __init__(self, options: Options, channels: Iterable[Channel]) -> None:
+        """``channels``: those of the recording. Raises ReplayError, ConfigError or TransportError."""
+        self._options = options
+        Identity(options.system, "robots", "any")
+        for filter_ in options.only:
+            check_filter(filter_)
+        self._found = lru_cache(maxsize=65_536)(self._find)
+        #: The robots that are replayed: recorded base by new base.
+        self.robots: dict[str, str] = {}
+        for channel in channels:
+            self._add(channel)
+
+    def publishes(self, channel: Channel) -> bool:
+        return self._listed(channel) is not None
+
+    def outgoing(self, recorded: Recorded, by_ns: int) -> Outgoing | None:
+        """The message to publish instead of a recorded one, with stamps moved by ``by_ns``; None: none."""
+        address = self._listed(recorded.channel)
+        if address is None or _is_probe(recorded.payload):
+            return None
+        payload, moves = recorded.payload, None
+        if address.declared is c.DRIVE:
+            moves = self._moves(payload)
+            if moves is None:
+                return None
+        if address.declared is c.CAPABILITIES and payload:
+            payload = harmless(payload, address.recorded.base, address.base)
+            if not payload:
+                return None
+        return Outgoing(Message(address.topic, shifted(payload, by_ns), address.qos), moves)
+
+    def _listed(self, channel: Channel) -> _Address | None:
+        """None for robots that the files did not name at the start: they may be live."""
+        address = self._address(channel)
+        return address if address is not None and address.base in self.robots else None
+
+    def _address(self, channel: Channel) -> _Address | None:
+        metadata = channel.metadata
+        return self._found(channel.topic, metadata.get("qos", "0"), metadata.get("retained") == "1")
+
+    def _find(self, topic: str, qos: str, retained: bool) -> _Address | None:
+        """``retained``: the recorder received it as an old message."""
+        parsed = None if topic.startswith("$") else parse_topic(topic)
+        if parsed is None or parsed.identity.is_server or not self._wanted(topic):
+            return None
+        declared = channel_of(f"{parsed.direction}/{parsed.metric}")
+        if not self._allowed(parsed, declared, retained):
+            return None
+        identity = Identity(self._options.system, parsed.identity.type, parsed.identity.id)
+        new = ParsedTopic(identity, parsed.direction, parsed.metric).topic
+        try:
+            check_topic(new)
+        except TransportError:  # no transport of ours can have recorded it
+            return None
+        quality = QoS.LATEST if qos == "0" else QoS.DELIVERED
+        return _Address(parsed.identity, identity.base, new, declared, quality)
+
+    def _wanted(self, topic: str) -> bool:
+        only = self._options.only
+        return not only or any(matches(filter_, topic) for filter_ in only)
+
+    def _allowed(self, parsed: ParsedTopic, declared: Declared | None, retained: bool) -> bool:
+        if parsed.direction != c.INCOMING:
+            return declared is not c.BRIDGE_PROBE and not (retained and declared in _HEARTBEATS)
+        if retained or is_reserved(parsed.metric):  # stale; or who stops, resets and drives the robot, or did
+            return False
+        return self._options.incoming and declared in _MILD
+
+    def _moves(self, payload: bytes) -> bool | None:
+        """None for a command that is not to be sent: one that cannot be read, or a script's."""
+        try:
+            command: Drive = codec.decode(c.DRIVE, payload)
+        except PayloadError:
+            return None
+        # A script's number would bar the runs of the robot's own scripts.
+        return None if command.signed else command.moves
+
+    def _add(self, channel: Channel) -> None:
+        address = self._address(channel)
+        if address is None:
+            return
+        base = address.recorded.base
+        if self._options.system == address.recorded.system:
+            raise ReplayError(f"--base {self._options.system} is the base of {base} itself: choose another one")
+        if self.robots.setdefault(address.base, base) != base:
+            raise ReplayError(
+                f"{self.robots[address.base]} and {base} would both be {address.base}: choose one by --only '{base}/#'"
+            )
+
+
+def harmless(payload: bytes, recorded: str, base: str) -> bytes:
+    """Return capabilities with their topics below ``base``, and no offers of what is not there; b"" if unreadable.
+
+    Pages publish to the topics that they find here: unchanged, they would drive the real robot.
+    """
+    try:
+        plain = codec.plain(c.CAPABILITIES, payload)
+    except PayloadError:
+        return b""
+    if not isinstance(plain, dict) or not isinstance(plain.get("value"), dict):
+        return b""
+    value = {name: _section(name, section, recorded, base) for name, section in plain["value"].items()}
+    return msgspec.json.encode({**plain, "value": value})
+
+
+def _section(name: str, section: Any, recorded: str, base: str) -> Any:
+    section = _rebased(section, f"{recorded}/", f"{base}/")
+    return section if name in _WATCHED else _without_controls(section, drives=name == "drive")
+
+
+def zero(topic: str) -> Message:
+    """What stops a robot that a drive command on ``topic`` may have set in motion."""
+    return Message(topic, _ZERO, QoS.DELIVERED)
+
+
+def _is_probe(payload: bytes) -> bool:
+    """Whether a bridge looks for cycles by it; also white space alone."""
+    return bool(payload) and payload[-_PROBE:].isspace()
+
+
+def _rebased(plain: Any, old: str, new: str) -> Any:
+    """``plain`` with all topics below ``old`` moved below ``new``; names of topics elsewhere are left out."""
+    if isinstance(plain, dict):
+        return {key: _rebased(value, old, new) for key, value in plain.items() if not _is_elsewhere(key, value, old)}
+    if isinstance(plain, list):
+        return [_rebased(value, old, new) for value in plain if not _is_elsewhere("", value, old)]
+    return new + plain.removeprefix(old) if isinstance(plain, str) and plain.startswith(old) else plain
+
+
+def _is_elsewhere(key: str, value: Any, old: str) -> bool:
+    """Whether it names a topic outside the robot's base, which a config may do."""
+    if not isinstance(value, str):
+        return False
+    return not value.startswith(old) and (key.endswith("topic") or parse_topic(value) is not None)
+
+
+def _without_controls(section: Any, *, drives: bool) -> Any:
+    """No part of a recording obeys a command."""
+    if isinstance(section, list):
+        return [_without_controls(value, drives=drives) for value in section]
+    if not isinstance(section, dict):
+        return section
+    plain = {key: _without_controls(value, drives=drives) for key, value in section.items()}
+    refused = {"controls", "available"} if drives else {"controls"}
+    return {key: False if key in refused else value for key, value in plain.items()}

@@ -1,0 +1,235 @@
+"""A folder of recordings, asked about one robot at one time: what was, what came, which picture was seen."""
+
+import re
+import time
+from collections.abc import Iterator
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Final, NamedTuple
+
+from pebble.contract.channels import LOGS
+from pebble.contract.identity import Direction, parse_topic
+from pebble.errors import PebbleError
+from pebble.extensions.recordings.files.reader import Chunk
+from pebble.extensions.recordings.files.recorded import Channel, Recorded
+from pebble.extensions.recordings.library import recordings_in
+from pebble.extensions.recordings.recorder.folder import MEDIA
+from pebble.extensions.recordings.recorder.lane import OTHER_MEDIA, lane_of
+from pebble.extensions.recordings.seek.file import SeekableFile, is_carried
+from pebble.extensions.recordings.stamps import is_keyframe, is_media, is_picture
+
+LOG_LINES: Final = 50  # of the state at a time
+_LOG_NS: Final = 600 * 10**9
+#: A key frame is looked for so far back: robots send one at least every ten seconds.
+_CHAIN_NS, _CHAIN_BYTES = 15 * 10**9, 8 << 20
+LIST_S: Final = 1.0  # between two looks at the folder
+_LONGEST_FILE_NS: Final = 25 * 3600 * 10**9
+_MOST_OPEN: Final = 64  # files that are open at once
+_NAME: Final = re.compile(r"(?P<stamp>\d{8}T\d{6}Z)-\d{6,}\.(?P<lane>.+?)\.mcap(?:\.active)?")
+
+
+class _Named(NamedTuple):
+    """What a file's name says about it; of other programs' files nothing."""
+
+    path: Path
+    lane: str  # "": any
+    begins_ns: int  # 0: not known
+
+
+class Archive:
+    """The recordings below ``folder``. Not thread-safe."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self._named: list[_Named] = []
+        self._listed_at = float("-inf")
+        self._open: dict[Path, SeekableFile] = {}
+        self._failed: dict[Path, str] = {}  # those that cannot be opened, and why
+
+    def close(self) -> None:
+        while self._open:
+            self._open.popitem()[1].close()
+
+    def messages(self, robot: str, since_ns: int, until_ns: int) -> list[Recorded]:
+        """What a robot published, and what was sent to it, from ``since_ns`` to before ``until_ns``."""
+        found: list[Recorded] = []
+        for file in self.files(robot, since_ns, until_ns):
+            for chunk in _within(file, file.channels_of(robot), since_ns, until_ns):
+                found += (
+                    one
+                    for one in file.messages_of(chunk)
+                    if since_ns <= one.log_ns < until_ns and _is_of(one.channel, robot) and not is_carried(one.channel)
+                )
+        found.sort(key=lambda one: one.log_ns)
+        return found
+
+    def state(self, robot: str, at_ns: int) -> list[Recorded]:
+        """The newest message of each topic of a robot before ``at_ns``, without media, the oldest first."""
+        files = self.files(robot, at_ns - _LONGEST_FILE_NS, at_ns, media=False)
+        files = [file for file in files if file.first_ns < at_ns]
+        if not files:
+            return []
+        file = max(files, key=lambda one: one.first_ns)
+        wanted = {one.topic for one in file.channels.values() if _is_of(one, robot)}
+        found: dict[str, Recorded] = {}
+        for chunk in reversed(_within(file, file.channels_of(robot), 0, at_ns)):
+            missing = wanted - found.keys()
+            if not missing:
+                break
+            if chunk.channels and not any(
+                file.channels[number].topic in missing for number in chunk.channels if number in file.channels
+            ):
+                continue
+            for one in reversed(file.messages_of(chunk)):
+                topic = one.channel.topic
+                if one.log_ns < at_ns and topic not in found and _is_of(one.channel, robot):
+                    found[topic] = one
+        return sorted((one for one in found.values() if not is_media(one.payload)), key=lambda one: one.log_ns)
+
+    def log_lines(self, robot: str, at_ns: int) -> list[Recorded]:
+        """The last lines of its log before ``at_ns``, the oldest first."""
+        topic = LOGS.topic(robot)
+        found: list[Recorded] = []
+        for file in reversed(self.files(robot, at_ns - _LOG_NS, at_ns, media=False)):
+            numbers = frozenset(number for number, one in file.channels.items() if one.topic == topic)
+            for chunk in reversed(_within(file, numbers, at_ns - _LOG_NS, at_ns)):
+                lines = [one for one in file.messages_of(chunk) if one.channel.topic == topic and one.log_ns < at_ns]
+                found += reversed(lines)
+                if len(found) >= LOG_LINES:
+                    break
+        return sorted(found[:LOG_LINES], key=lambda one: one.log_ns)
+
+    def pictures(self, robot: str, at_ns: int) -> list[Recorded]:
+        """The last picture before ``at_ns``, and before it all from its key frame on; empty if there is none."""
+        chain: list[Recorded] = []
+        size = 0
+        for one in self._pictures_before(robot, at_ns):
+            if chain and one.channel.topic != chain[-1].channel.topic:
+                continue
+            chain.append(one)
+            size += len(one.payload)
+            if is_keyframe(one.payload):
+                chain.reverse()
+                return chain
+            if size > _CHAIN_BYTES:
+                break
+        return []
+
+    def next_ns(self, robot: str, at_ns: int) -> int | None:
+        """When the robot's next message from ``at_ns`` on was received; None if there is none."""
+        found: int | None = None
+        for file in sorted(self.files(robot, at_ns, 1 << 63), key=lambda one: one.first_ns):
+            if found is not None and file.first_ns >= found:
+                break
+            one = _first(file, robot, at_ns)
+            if one is not None:
+                found = one if found is None else min(found, one)
+        return found
+
+    def files(self, robot: str, since_ns: int, until_ns: int, *, media: bool = True) -> list[SeekableFile]:
+        """Those that may hold messages of a robot in a period, opened, in the order of time."""
+        lane = lane_of(f"{robot}/", is_media=True)
+        found = []
+        for named in self._list():
+            if named.lane.startswith(MEDIA) and (not media or named.lane not in (lane, OTHER_MEDIA)):
+                continue
+            if named.begins_ns and not since_ns - _LONGEST_FILE_NS <= named.begins_ns < until_ns:
+                continue
+            file = self._opened(named.path)
+            if file is None or not file.chunks or file.first_ns >= until_ns or file.last_ns < since_ns:
+                continue
+            found.append(file)
+        return sorted(found, key=lambda one: one.first_ns)
+
+    def all_files(self) -> Iterator[SeekableFile]:
+        """All, opened one after the other."""
+        files = (self._opened(named.path) for named in self._list())
+        yield from (file for file in files if file is not None)
+
+    def unread(self) -> dict[Path, str]:
+        """What could not be read of each file, as far as that is known."""
+        return self._failed | {path: file.problem for path, file in self._open.items() if file.problem}
+
+    # -- files
+
+    def _list(self) -> list[_Named]:
+        now = time.monotonic()
+        if now - self._listed_at >= LIST_S:
+            self._named = sorted(_named(path) for path in recordings_in(self.folder) if path.is_file())
+            self._listed_at = now
+            there = {named.path for named in self._named}
+            for path in [path for path in self._open if path not in there]:
+                self._open.pop(path).close()
+            self._failed = {path: why for path, why in self._failed.items() if path in there}
+        return self._named
+
+    def _opened(self, path: Path) -> SeekableFile | None:
+        """None for one that has gone meanwhile, or is no recording."""
+        file = self._open.pop(path, None)
+        try:
+            if file is not None and file.is_replaced():
+                file.close()
+                file = None
+            if file is None:
+                file = SeekableFile(path)
+            file.refresh()
+        except (PebbleError, OSError) as error:
+            self._failed[path] = str(error).removeprefix(f"{path}: ")
+            return None
+        self._failed.pop(path, None)
+        self._open[path] = file  # the last one used is the last one closed
+        while len(self._open) > _MOST_OPEN:
+            self._open.pop(next(iter(self._open))).close()
+        return file
+
+    def _pictures_before(self, robot: str, at_ns: int) -> Iterator[Recorded]:
+        """The newest first."""
+        since_ns = at_ns - _CHAIN_NS
+        for file in reversed(self.files(robot, since_ns, at_ns)):
+            for chunk in reversed(_within(file, file.channels_of(robot), since_ns, at_ns)):
+                for one in reversed(file.messages_of(chunk)):
+                    outgoing = one.channel.topic.startswith(f"{robot}/outgoing/")
+                    if one.log_ns < at_ns and outgoing and is_picture(one.payload):
+                        yield one
+
+
+def metric_of(topic: str) -> tuple[str, bool]:
+    """What follows ``incoming/`` or ``outgoing/``, and whether it was sent to the robot."""
+    parsed = parse_topic(topic)
+    if parsed is None:
+        return topic, False
+    return parsed.metric, parsed.direction is Direction.INCOMING
+
+
+def _first(file: SeekableFile, robot: str, at_ns: int) -> int | None:
+    for chunk in _within(file, file.channels_of(robot), at_ns, 1 << 63):
+        for one in file.messages_of(chunk):
+            if one.log_ns >= at_ns and _is_of(one.channel, robot) and not is_carried(one.channel):
+                return one.log_ns
+    return None
+
+
+def _within(file: SeekableFile, channels: frozenset[int], since_ns: int, until_ns: int) -> list[Chunk]:
+    """The chunks of a period that hold messages of these channels."""
+    return [
+        chunk
+        for chunk in file.chunks
+        if chunk.end_ns >= since_ns
+        and chunk.start_ns < until_ns
+        and (not chunk.channels or not chunk.channels.isdisjoint(channels))
+    ]
+
+
+def _is_of(channel: Channel, robot: str) -> bool:
+    return channel.topic.startswith((f"{robot}/outgoing/", f"{robot}/incoming/"))
+
+
+def _named(path: Path) -> _Named:
+    match = _NAME.fullmatch(path.name)
+    if match is None:
+        return _Named(path, "", 0)
+    try:
+        begins = datetime.strptime(match["stamp"], "%Y%m%dT%H%M%SZ").replace(tzinfo=UTC)
+    except ValueError:
+        return _Named(path, "", 0)
+    return _Named(path, match["lane"], int(begins.timestamp()) * 10**9)

@@ -1,0 +1,135 @@
+"""The days of an archive, and what each holds, by the summaries of its files."""
+
+import json
+from collections.abc import Iterator
+from contextlib import suppress
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Final
+
+from msgspec import Struct, field
+
+from pebble.contract import DRIVE
+from pebble.extensions.recordings.files.reader import Chunk
+from pebble.extensions.recordings.library import robot_of
+from pebble.extensions.recordings.recorder.intake import EVENTS
+from pebble.extensions.recordings.seek.archive import Archive
+from pebble.extensions.recordings.seek.file import SeekableFile
+
+DAY_NS: Final = 86_400 * 10**9
+_MOST_DAYS: Final = 31  # of one chunk
+
+
+class Day(Struct):
+    """One day of UTC; ``first`` and ``last`` in epoch milliseconds, ``gaps``: of the recording itself.
+
+    ``driven``: about how many seconds each robot was sent commands to drive, in steps of the recording's chunks.
+    ``unread``: a line for each file that cannot be read completely, on the day when it was written last.
+    """
+
+    day: str
+    robots: list[str] = field(default_factory=list)
+    bytes: int = 0
+    first: float = 0.0
+    last: float = 0.0
+    gaps: int = 0
+    driven: dict[str, float] = field(default_factory=dict)
+    unread: list[str] = field(default_factory=list)
+
+
+class Days:
+    """Remembers what was found of each file that does not change any more."""
+
+    def __init__(self, archive: Archive) -> None:
+        self._archive = archive
+        self._known: dict[Path, list[Day]] = {}
+
+    def all(self) -> list[Day]:
+        """The newest first. A file counts to each day that its messages reach into; its bytes to the first."""
+        found: dict[str, Day] = {}
+        for file in self._archive.all_files():
+            days = self._known.get(file.path)
+            if days is None:
+                days = _days(file)
+                if file.damage.finished:
+                    self._known[file.path] = days
+            for day in days:
+                _merge(found.setdefault(day.day, Day(day.day, first=day.first)), day)
+        for path, why in self._archive.unread().items():
+            with suppress(OSError):  # it is deleted by now
+                about = path.stat()
+                name, ms = _day_of(int(about.st_mtime)), about.st_mtime * 1e3
+                day = found.setdefault(name, Day(name, bytes=about.st_size, first=ms, last=ms))
+                day.unread.append(f"{path.name}: {why}")
+        return sorted(found.values(), key=lambda day: day.day, reverse=True)
+
+
+def _days(file: SeekableFile) -> list[Day]:
+    if not file.chunks:
+        return []
+    gaps = _gaps(file)
+    days: list[Day] = []
+    for number in sorted({number for chunk in file.chunks for number in _day_numbers(chunk)}):
+        begin, end = number * DAY_NS, (number + 1) * DAY_NS
+        first, last = max(file.first_ns, begin), min(file.last_ns, end - 1)
+        size = 0 if days else file.size
+        within = sum(begin <= ns < end for ns in gaps)
+        driven = _driven(file, begin, end)
+        days.append(Day(_day_of(number * 86_400), sorted(file.robots()), size, first / 1e6, last / 1e6, within, driven))
+    return days
+
+
+def _driven(file: SeekableFile, begin: int, end: int) -> dict[str, float]:
+    """Seconds within a day, by robot."""
+    drives = {number: robot_of(channel) for number, channel in file.channels.items() if _drives(channel.topic)}
+    robots = {number: robot for number, robot in drives.items() if robot is not None}
+    found: dict[str, float] = {}
+    for chunk in file.chunks if robots else []:
+        within = max(0, min(chunk.end_ns, end) - max(chunk.start_ns, begin)) / 1e9
+        for robot in {robots[number] for number in chunk.channels if number in robots} if within else ():
+            found[robot] = found.get(robot, 0.0) + within
+    return found
+
+
+def _drives(topic: str) -> bool:
+    return topic.rpartition("/")[2] == DRIVE.metric
+
+
+def _day_of(seconds: int) -> str:
+    return datetime.fromtimestamp(seconds, UTC).strftime("%Y-%m-%d")
+
+
+def _day_numbers(chunk: Chunk) -> Iterator[int]:
+    """The days that a chunk reaches into: of a clock that was set only the first ones, and the last."""
+    first, last = chunk.start_ns // DAY_NS, chunk.end_ns // DAY_NS
+    yield from range(first, min(last, first + _MOST_DAYS))
+    yield last
+
+
+def _merge(day: Day, other: Day) -> None:
+    day.robots = sorted({*day.robots, *other.robots})
+    day.bytes += other.bytes
+    day.first, day.last = min(day.first, other.first), max(day.last, other.last)
+    day.gaps += other.gaps
+    for robot, seconds in other.driven.items():
+        day.driven[robot] = day.driven.get(robot, 0.0) + seconds
+
+
+def _gaps(file: SeekableFile) -> list[int]:
+    """When the recorder wrote down gaps."""
+    numbers = {number for number, channel in file.channels.items() if channel.topic == EVENTS}
+    found = []
+    for chunk in file.chunks if numbers else []:
+        if not chunk.channels.isdisjoint(numbers):
+            found += [
+                one.log_ns for one in file.messages_of(chunk) if one.channel.id in numbers and _is_gap(one.payload)
+            ]
+    return found
+
+
+def _is_gap(payload: bytes) -> bool:
+    try:
+        event = json.loads(payload)
+    except (ValueError, RecursionError):
+        return False
+    return isinstance(event, dict) and event.get("event") == "gap"

@@ -1,0 +1,53 @@
+"""One recording that is read in any place; the chunks that were read last stay unpacked."""
+
+import os
+from collections import OrderedDict
+from pathlib import Path
+from typing import Final
+
+from pebble.extensions.recordings.files.reader import OLD_OTHER, Chunk, RecordingFile
+from pebble.extensions.recordings.files.recorded import Channel, Recorded
+from pebble.extensions.recordings.library import ACTIVE, robot_of
+from pebble.extensions.recordings.recorder.lane import CARRIED
+
+_CACHED: Final = 4  # chunks: the next question is mostly about the same time
+
+
+class SeekableFile(RecordingFile):
+    """One file, finished or being written."""
+
+    def __init__(self, path: Path) -> None:
+        self._unpacked_chunks: OrderedDict[int, list[Recorded]] = OrderedDict()
+        super().__init__(path)
+        self._about = os.fstat(self._file.fileno())
+
+    def robots(self) -> set[str]:
+        """All that a channel belongs to."""
+        return {robot for channel in self.channels.values() if (robot := robot_of(channel)) is not None}
+
+    def channels_of(self, robot: str) -> frozenset[int]:
+        """Those of a robot, and of topics that have no channel of their own in a file of the last version."""
+        return frozenset(
+            number for number, one in self.channels.items() if robot_of(one) == robot or one.topic == OLD_OTHER
+        )
+
+    def is_replaced(self) -> bool:
+        """Whether its name leads to another file now. Raises OSError."""
+        now, then = self.path.stat(), self._about
+        grown = not self.path.name.endswith(ACTIVE) and now.st_size != then.st_size
+        return grown or not os.path.samestat(now, then)
+
+    def messages_of(self, chunk: Chunk) -> list[Recorded]:
+        """Those of a chunk in the order of time; empty if it is damaged."""
+        known = self._unpacked_chunks.get(chunk.at)
+        if known is None:
+            known = self._unpacked_chunks[chunk.at] = self.messages(chunk)
+            if len(self._unpacked_chunks) > _CACHED:
+                self._unpacked_chunks.popitem(last=False)
+        self._unpacked_chunks.move_to_end(chunk.at)
+        return known
+
+
+def is_carried(channel: Channel) -> bool:
+    """Whether its messages were written again at the begin of the file, and are not of that time."""
+    return channel.metadata.get("retained") == CARRIED

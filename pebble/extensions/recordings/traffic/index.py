@@ -1,0 +1,210 @@
+"""The index of a recording: one row per message, without payloads, in ``NAME.parquet`` beside ``NAME.mcap``.
+
+It may be deleted: it is made again when it is needed. :data:`COLUMNS` are its columns; its rows are in the order of
+robots and times. Its metadata (``parquet_kv_metadata``) name the state of the recording from which it was made.
+"""
+# ruff: noqa: S608  (what is put into queries are names of files and texts, in quotes)
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+from msgspec import Struct
+
+from pebble.contract.channels import HEARTBEAT, ONLINE
+from pebble.contract.identity import parse_topic
+from pebble.contract.packets import PBAT
+from pebble.extensions.recordings.files.reader import RecordingFile
+from pebble.extensions.recordings.files.recorded import SUFFIX, Channel, Recorded
+from pebble.extensions.recordings.recorder.intake import EVENTS
+from pebble.extensions.recordings.stamps import is_picture
+from pebble.extensions.recordings.traffic.activity import Activity, activity_of
+from pebble.extensions.recordings.traffic.duck import connected, quoted
+
+if TYPE_CHECKING:
+    from duckdb import DuckDBPyConnection
+
+INDEX: Final = ".parquet"
+#: With the types of DuckDB. Times are UTC.
+COLUMNS: Final = {
+    "ts": "TIMESTAMP_NS",  # received
+    "stamp": "TIMESTAMP_NS",  # its own stamp
+    "robot": "VARCHAR",  # system/type/id; empty: it belongs to none, and its whole topic is in metric
+    "direction": "VARCHAR",  # incoming, outgoing
+    "metric": "VARCHAR",
+    "size": "UINTEGER",  # bytes of the payload
+    "qos": "UTINYINT",
+    "retain": "BOOLEAN",  # as published
+    "retained": "BOOLEAN",  # an old message, which came after subscribing or was repeated in a new file
+    "medium": "UTINYINT",  # PICTURE, SOUND; NULL: neither
+    "activity": "UTINYINT",  # activity.Activity
+    "online": "BOOLEAN",  # of heartbeats: false in the last one
+    "event": "VARCHAR",  # JSON: what the recorder noted about itself
+}
+PICTURE, SOUND = 1, 2
+Advance = Callable[[float], None]
+
+_BATCH: Final = 50_000  # rows
+_MEMORY_MB: Final = 128
+_LATEST_NS: Final = (1 << 63) - 1
+_OFFLINE: Final = re.compile(rb'"online"\s*:\s*false')
+#: A row while it is collected; -1, and 0 for stamp and medium: none.
+_ROW: Final = [
+    ("channel", "u2"), ("ts", "i8"), ("stamp", "i8"), ("size", "u4"), ("medium", "u1"), ("activity", "u1"),
+    ("online", "i1"),
+]  # fmt: skip
+_TABLES: Final = """
+    CREATE TABLE channels (channel USMALLINT, robot VARCHAR, direction VARCHAR, metric VARCHAR, qos UTINYINT,
+                           retain BOOLEAN, retained BOOLEAN);
+    CREATE TABLE rows (channel USMALLINT, ts BIGINT, stamp BIGINT, size UINTEGER, medium UTINYINT, activity UTINYINT,
+                       online TINYINT);
+    CREATE TABLE events (ts BIGINT, event VARCHAR);
+"""
+_COPY: Final = """
+    COPY (
+        SELECT make_timestamp_ns(ts) AS ts, make_timestamp_ns(nullif(stamp, 0)) AS stamp, robot, direction, metric,
+               size, qos, retain, retained, nullif(medium, 0) AS medium, activity,
+               nullif(online, -1)::BOOLEAN AS online, NULL::VARCHAR AS event
+        FROM rows JOIN channels USING (channel)
+        UNION ALL BY NAME
+        SELECT make_timestamp_ns(ts) AS ts, '' AS robot, event FROM events
+        ORDER BY robot, ts
+    ) TO {path} (FORMAT parquet, COMPRESSION zstd, KV_METADATA {about})
+"""
+
+
+class About(Struct):
+    """What an index says of its recording."""
+
+    recording: str  # its name
+    size: int  # of the file, when it was indexed
+    changed_ns: int
+    missing: int  # messages that damage has taken
+    unread: str  # what could not be read, in words; "" if all was
+
+
+def index_path(recording: Path) -> Path:
+    return recording.with_name(recording.name.removesuffix(".active").removesuffix(SUFFIX) + INDEX)
+
+
+def about(index: Path, connection: DuckDBPyConnection) -> About | None:
+    """None for a file that is no index. Raises RecordingError if it cannot be read."""
+    found = dict(connection.execute(f"SELECT key, value FROM parquet_kv_metadata({quoted(index)})").fetchall())
+    try:
+        texts = {key.decode(): value.decode() for key, value in found.items()}
+        numbers = [int(texts[name]) for name in ("size", "changed_ns", "missing")]
+        size, changed_ns, missing = numbers
+        return About(texts["recording"], size, changed_ns, missing, texts["unread"])
+    except (KeyError, ValueError):
+        return None
+
+
+def is_of(index: Path, recording: Path, connection: DuckDBPyConnection) -> bool:
+    """Whether it was made from the recording as it is now."""
+    if not index.is_file():
+        return False
+    made, now = about(index, connection), recording.stat()
+    return made is not None and (made.size, made.changed_ns) == (now.st_size, now.st_mtime_ns)
+
+
+def write_index(recording: Path, index: Path, scratch: Path, advance: Advance = lambda _share: None) -> None:
+    """Index a recording, in whatever state it is.
+
+    ``advance`` is called with the share of the file that is done. Raises RecordingError, OSError.
+    """
+    state = recording.stat()
+    part = index.with_name(f".{index.name}.{os.getpid()}")
+    with connected(scratch, memory_mb=_MEMORY_MB) as connection:
+        rows = _Rows(connection)
+        missing, unread = rows.read(recording, advance)
+        made = About(recording.name, state.st_size, state.st_mtime_ns, missing, unread)
+        pairs = ", ".join(f"{name}: {quoted(getattr(made, name))}" for name in About.__struct_fields__)
+        try:
+            connection.execute(_COPY.format(path=quoted(part), about=f"{{{pairs}}}"))
+            part.replace(index)
+        finally:
+            part.unlink(missing_ok=True)
+
+
+class _Rows:
+    """Collects the rows of one recording in tables of DuckDB."""
+
+    def __init__(self, connection: DuckDBPyConnection) -> None:
+        connection.execute(_TABLES)
+        self._connection = connection
+        self._count = 0
+        self._batch: list[tuple[int, ...]] = []
+        self._activities: dict[int, Callable[[bytes], Activity]] = {}  # by channel
+        self._heartbeats: set[int] = set()
+
+    def read(self, recording: Path, advance: Advance) -> tuple[int, str]:
+        """Returns how many messages are missing, and what could not be read. Raises RecordingError."""
+        with RecordingFile(recording) as file:
+            damage, expected = file.damage, 0 if file.statistics is None else file.statistics.message_count
+            for message in file.read():
+                if message.log_ns > _LATEST_NS:
+                    damage.missing += 1
+                    damage.why = "times after 2262"
+                elif message.channel.topic == EVENTS:
+                    self._add_event(message)
+                else:
+                    self._add(message)
+                if len(self._batch) >= _BATCH:
+                    self._flush()
+                    advance(min(1.0, self._count / expected) if expected else 0.5)
+            unread = file.problem
+        self._flush()
+        advance(1.0)
+        return damage.missing, unread
+
+    def _add(self, message: Recorded) -> None:
+        channel, payload = message.channel.id, message.payload
+        activity = self._activities.get(channel)
+        if activity is None:
+            activity = self._declare(message.channel)
+        stamp = message.publish_ns if message.publish_ns <= _LATEST_NS else 0
+        medium = SOUND if payload.startswith(PBAT) else PICTURE if is_picture(payload) else 0
+        used = Activity.MEDIA if medium else activity(payload)
+        online = -1 if channel not in self._heartbeats else int(_OFFLINE.search(payload) is None)
+        self._batch.append((channel, message.log_ns, stamp, len(payload), medium, used, online))
+
+    def _declare(self, channel: Channel) -> Callable[[bytes], Activity]:
+        topic = parse_topic(channel.topic)
+        robot, direction, metric = "", "", channel.topic
+        if topic is not None:
+            robot, direction, metric = topic.identity.base, str(topic.direction), topic.metric
+        suffix = f"{direction}/{metric}"
+        self._activities[channel.id] = activity_of(suffix)
+        if suffix in (ONLINE.suffix, HEARTBEAT.suffix):
+            self._heartbeats.add(channel.id)
+        metadata = channel.metadata
+        qos = {"1": 1, "2": 2}.get(metadata.get("qos", ""), 0)
+        flags = [metadata.get(name, "0") not in ("", "0") for name in ("retain", "retained")]
+        self._connection.execute(
+            "INSERT INTO channels VALUES (?, ?, ?, ?, ?, ?, ?)", [channel.id, robot, direction, metric, qos, *flags]
+        )
+        return self._activities[channel.id]
+
+    def _add_event(self, message: Recorded) -> None:
+        try:
+            text = message.payload.decode()
+        except UnicodeDecodeError:
+            return
+        self._connection.execute("INSERT INTO events VALUES (?, ?)", [message.log_ns, text])
+
+    def _flush(self) -> None:
+        import numpy as np
+
+        if not self._batch:
+            return
+        batch = np.array(self._batch, dtype=_ROW)
+        columns: dict[str, Any] = {name: np.ascontiguousarray(batch[name]) for name, _ in _ROW}
+        self._connection.register("batch", columns)
+        self._connection.execute("INSERT INTO rows SELECT * FROM batch")
+        self._connection.unregister("batch")
+        self._count += len(self._batch)
+        self._batch.clear()

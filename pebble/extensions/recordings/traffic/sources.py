@@ -1,0 +1,104 @@
+"""Finds the indexes of recordings for an analysis, and makes those that are missing."""
+# ruff: noqa: S608  (what is put into queries are names of files in quotes)
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterable, Iterator
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+from msgspec import Struct, field
+
+from pebble.extensions.recordings.files.recorded import SUFFIX, RecordingError
+from pebble.extensions.recordings.library import ACTIVE, files
+from pebble.extensions.recordings.recorder.folder import finished_path
+from pebble.extensions.recordings.traffic.duck import connected, parquet
+from pebble.extensions.recordings.traffic.index import INDEX, about, index_path, is_of, write_index
+
+if TYPE_CHECKING:
+    from duckdb import DuckDBPyConnection
+
+#: Called with what is done now, and the share of all that is done.
+Progress = Callable[[str, float], None]
+
+_MEMORY_MB: Final = 128
+_OLD: Final = "index"  # the folder in which the last version had its index
+
+
+class Sources(Struct):
+    """The indexes of recordings, and what they hold."""
+
+    indexes: list[Path] = field(default_factory=list)
+    robots: list[str] = field(default_factory=list)
+    missing: int = 0  # messages that damage has taken
+    unread: list[str] = field(default_factory=list)  # a line for each file that could not be read completely
+
+
+def sources(places: Iterable[Path], scratch: Path, progress: Progress = lambda _what, _share: None) -> Sources:
+    """Return the indexes of all recordings in ``places``, files or folders.
+
+    What is not indexed yet is indexed now: beside the recording if its folder can be written, else, as for files that
+    are still being written, below ``scratch``. In a folder, recordings count that were deleted after they had been
+    indexed. Raises RecordingError.
+    """
+    found = Sources()
+    scratch.mkdir(parents=True, exist_ok=True)
+    with connected(scratch, memory_mb=_MEMORY_MB) as connection:
+        for path in _indexes([place.resolve() for place in places], scratch, connection, progress):
+            made = about(path, connection)
+            if made is not None:
+                found.indexes.append(path)
+                found.missing += made.missing
+                found.unread += [f"{made.recording}: {made.unread}"] if made.unread else []
+        if found.indexes:
+            names = f"SELECT DISTINCT robot FROM {parquet(found.indexes)} WHERE robot <> '' ORDER BY robot"
+            found.robots = [robot for (robot,) in connection.execute(names).fetchall()]
+    return found
+
+
+def _indexes(places: list[Path], scratch: Path, connection: DuckDBPyConnection, progress: Progress) -> Iterator[Path]:
+    deleted = [path for place in places if place.is_dir() for path in _of_deleted(place)]
+    try:
+        paths = list(dict.fromkeys(path.resolve() for path in files(places)))
+    except RecordingError:
+        if not deleted:
+            raise
+        paths = []
+    yield from dict.fromkeys(deleted)
+    sizes = [path.stat().st_size if path.exists() else 0 for path in paths]
+    done, total = 0, max(1, sum(sizes))
+    for number, (path, size) in enumerate(zip(paths, sizes, strict=True)):
+        advance = partial(_report, progress, path.name, done / total, size / total)
+        index = _index(path, scratch / f"{number}{INDEX}", connection, advance)
+        done += size
+        if index is not None:
+            yield index
+
+
+def _of_deleted(place: Path) -> Iterator[Path]:
+    """The indexes of recordings that are not there any more."""
+    for index in sorted(place.rglob(f"*{INDEX}")):
+        is_ours = _OLD not in index.relative_to(place).parts and not index.name.startswith(".")
+        if is_ours and not index.with_suffix(SUFFIX).exists():
+            yield index
+
+
+def _report(progress: Progress, name: str, before: float, own: float, share: float) -> None:
+    progress(f"index {name}", before + share * own)
+
+
+def _index(path: Path, spare: Path, connection: DuckDBPyConnection, advance: Callable[[float], None]) -> Path | None:
+    """The index of a recording, ``spare`` if it has none beside it; None if it was deleted meanwhile."""
+    if path.name.endswith(ACTIVE) and not path.exists():
+        path = finished_path(path)  # its recorder finished it a moment ago
+    if not path.exists():
+        return None
+    is_active = path.name.endswith(ACTIVE)
+    index = index_path(path)
+    if not is_active and is_of(index, path, connection):
+        return index
+    index = spare if is_active or not os.access(path.parent, os.W_OK) else index
+    write_index(path, index, spare.parent, advance)
+    return index

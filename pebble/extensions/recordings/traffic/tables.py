@@ -1,0 +1,98 @@
+"""The tables of an analysis, for its report and as CSV files. Times are UTC."""
+
+import csv
+from collections.abc import Sequence
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from msgspec import Struct
+
+from pebble.extensions.recordings.traffic.results import AUDIO, VIDEO, Traffic
+
+
+class Table(Struct, frozen=True):
+    """``columns``: the name of each in CSV, and its heading."""
+
+    name: str
+    title: str
+    columns: Sequence[tuple[str, str]]
+    rows: Sequence[Sequence[Any]]
+
+
+def tables(traffic: Traffic) -> list[Table]:
+    """Return Table 4.1 of the paper, and what its figures show; each may have no rows."""
+    return [make(traffic) for make in (media_bandwidth, _bandwidth, _outages, _latency)]
+
+
+def media_bandwidth(traffic: Traffic) -> Table:
+    """Table 4.1 of the paper."""
+    columns = [
+        ("robot", "robot"), ("video_median_kbps", "video, median kbit/s"), ("video_p95_kbps", "video, p95"),
+        ("audio_median_kbps", "audio, median kbit/s"), ("audio_p95_kbps", "audio, p95"),
+    ]  # fmt: skip
+    rows = []
+    for robot in traffic.robots:
+        both = robot.of(VIDEO), robot.of(AUDIO)
+        if any(both):
+            cells = [(None, None) if one is None else (one.median_kbps, one.p95_kbps) for one in both]
+            rows.append([robot.robot, *cells[0], *cells[1]])
+    return Table("table-4-1-media-bandwidth", "Table 4.1: bandwidth of media, of active seconds", columns, rows)
+
+
+def _bandwidth(traffic: Traffic) -> Table:
+    columns = [
+        ("robot", "robot"), ("machine", "machine"), ("family", "kind of message"), ("time", "time"),
+        ("active_seconds", "active seconds"), ("median_kbps", "median kbit/s"), ("p95_kbps", "p95 kbit/s"),
+        ("messages", "messages"), ("bytes", "bytes"),
+    ]  # fmt: skip
+    rows = [
+        [
+            robot.robot, robot.machine, one.family, one.time, one.seconds, one.median_kbps, one.p95_kbps, one.messages,
+            one.bytes,
+        ]
+        for robot in traffic.robots
+        for one in robot.bandwidth
+    ]  # fmt: skip
+    return Table("bandwidth", "Figure 4.3: bandwidth in sessions and while idle", columns, rows)
+
+
+def _latency(traffic: Traffic) -> Table:
+    columns = [
+        ("robot", "robot"), ("heartbeats", "heartbeats"), ("median_ms", "median ms"), ("p95_ms", "p95 ms"),
+    ]  # fmt: skip
+    rows = [
+        [robot.robot, one.count, one.median_ms, one.p95_ms]
+        for robot in traffic.robots
+        if (one := robot.latency) is not None
+    ]
+    return Table("latency", "Figures 4.2, 4.5 and 4.6: latency of heartbeats", columns, rows)
+
+
+def _outages(traffic: Traffic) -> Table:
+    columns = [("robot", "robot"), ("since", "from"), ("length_ms", "length ms")]
+    rows = [
+        [robot.robot, moment(one.since_ns / 1e9), one.length_ms] for robot in traffic.robots for one in robot.outages
+    ]
+    return Table("outages", "Figures 4.1 and 4.4: outages of heartbeats", columns, rows)
+
+
+def moment(seconds: float) -> str:
+    """``2026-11-20T10:00:00Z``; with milliseconds if it is no whole second."""
+    spec = "seconds" if seconds == int(seconds) else "milliseconds"
+    return datetime.fromtimestamp(seconds, UTC).replace(tzinfo=None).isoformat(timespec=spec) + "Z"
+
+
+def write_csv(table: Table, folder: Path) -> Path:
+    """Raises OSError."""
+    path = folder / f"{table.name}.csv"
+    with path.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file)
+        writer.writerow([name for name, _ in table.columns])
+        writer.writerows([_cell(value) for value in row] for row in table.rows)
+    return path
+
+
+def _cell(value: Any) -> Any:
+    """Spreadsheets take text for a formula that begins like one; anyone may choose the names in topics."""
+    return f"'{value}" if isinstance(value, str) and value.startswith(("=", "+", "-", "@", "\t", "\r")) else value

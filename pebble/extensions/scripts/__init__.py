@@ -1,0 +1,1 @@
+"""Programs that move a robot: their base, the shipped ones, and perception."""

@@ -1,0 +1,185 @@
+"""``pebble script``: writes a new script, and lists, starts and stops those of a robot."""
+
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from pebble.commands.options import RobotArgument
+from pebble.config.visible import shown
+from pebble.contract import forms
+from pebble.contract.payloads import AutonomyStatus
+from pebble.errors import PebbleError, TransportError
+from pebble.extensions.operator.client.connection import Target, connected, put_names, target_of, wait_for
+from pebble.extensions.operator.client.names import id_of
+from pebble.extensions.operator.client.scripts import RobotScripts, options_of
+from pebble.extensions.operator.commands.target import with_target
+from pebble.transports import Transport
+
+_HELP = """Programs that move a robot by themselves; docs/ext/scripts.md explains them.
+
+\b
+    pebble script new follow            write a first script and its test
+    pebble script list goob.json        what the robot offers, and what runs
+    pebble script start goob.json follow --tag-id 7
+    pebble script stop goob.json
+"""
+_FIRST_SECOND_S = 1.0  # most mistakes in a script end it within that
+_SAME_ERROR_S = 1.0  # an error that was there before the command is the answer to it, too, if it stays
+
+
+def new(
+    name: Annotated[str, typer.Argument(help="Of the script and its folder.", metavar="NAME", show_default=False)],
+    folder: Annotated[Path, typer.Option("--folder", help="Where its folder is made.", metavar="DIR")] = Path(),
+) -> None:
+    """Write a script that follows a tag, a test that runs it in a simulated room, and a robot for that room.
+
+    \b
+        pebble script new follow
+        cd follow
+        python -m pytest
+    """
+    from pebble.extensions.scripts.commands.new import write
+
+    for path in write(name, folder):
+        typer.echo(path)
+
+
+@with_target()
+def list_(robot: RobotArgument, *, target: Target) -> int:
+    """List the scripts that a robot offers, their options, what runs with which settings, and the last error."""
+    with _scripts(robot, target) as (_, scripts, name):
+        if scripts.files is None:
+            raise PebbleError(f"{name} has published no scripts: is it up, and services.autonomy_manager.enabled true?")
+        for file, entry in scripts.files.items():
+            label = str(entry.get("label") or file)
+            _print(file if label == file else f"{file}: {label}")
+            for setting in forms.listed(entry.get("configs")):
+                _print(f"    {_option(setting)}")
+        if scripts.status is not None:
+            _print_status(scripts.status)
+    return 0
+
+
+@with_target()
+def start(
+    context: typer.Context,
+    robot: RobotArgument,
+    file: Annotated[
+        str, typer.Argument(help="The script; its own options follow.", metavar="SCRIPT", show_default=False)
+    ] = "",
+    *,
+    target: Target,
+) -> int:
+    """Start a script on its robot, and wait until it has run for a second. A script that runs already is stopped first.
+
+    \b
+        pebble script start goob.json follow --tag-id 7 --distance-m 0.5
+    """
+    if not file or file.startswith("-"):
+        raise PebbleError(f'which script? see "pebble script list {robot}"')
+    with _scripts(robot, target) as (transport, scripts, _):
+        before, answers, began = scripts.status, scripts.answers, time.monotonic()
+        _sent(transport, scripts.start(transport, file, context.args))
+        wait_for(
+            lambda: scripts.answers > answers and _answered(before, scripts.status, file, time.monotonic() - began),
+            scripts.answer_s,
+        )
+        status = scripts.status
+        if scripts.answers == answers or status is None:
+            raise PebbleError(f"no answer within {scripts.answer_s:g} s: is the robot up?")
+        if not _runs(before, status, file):
+            raise PebbleError(shown(status.error or f"{file} does not run"))
+        _print_status(status)
+        wait_for(lambda: _ended(scripts.status), _FIRST_SECOND_S)
+        if scripts.status is not None and _ended(scripts.status) and scripts.status.error:
+            raise PebbleError(shown(scripts.status.error))
+    return 0
+
+
+@with_target()
+def stop(robot: RobotArgument, *, target: Target) -> int:
+    """Stop the script that runs. In an emergency: pebble estop."""
+    with _scripts(robot, target) as (transport, scripts, _):
+        _sent(transport, scripts.stop(transport))
+        wait_for(lambda: scripts.status is not None and not scripts.status.running, scripts.answer_s)
+        if scripts.status is None or scripts.status.running:
+            raise PebbleError(
+                f"it is not known to have stopped within {scripts.answer_s:g} s: pebble estop stops the robot"
+            )
+        _print_status(scripts.status)
+    return 0
+
+
+def register(app: typer.Typer) -> None:
+    group = typer.Typer(help=_HELP, rich_markup_mode=None)
+    group.command("new", context_settings={"ignore_unknown_options": True})(new)  # else -x is not seen as a name
+    group.command("list")(list_)
+    group.command("start", context_settings={"allow_extra_args": True, "ignore_unknown_options": True})(start)
+    group.command("stop")(stop)
+    app.add_typer(group, name="script")
+
+
+@contextmanager
+def _scripts(robot: str, target: Target) -> Iterator[tuple[Transport, RobotScripts, str]]:
+    """The connection, what the robot has published about its scripts, and its name."""
+    with connected(target_of(robot, target)) as (transport, names):
+        scripts = RobotScripts(names)
+        put_names(transport, names, lambda base: base == names.base and scripts.robot.named)
+        scripts.subscribe(transport)
+        wait_for(lambda: scripts.files is not None and scripts.status is not None, 1.0)
+        yield transport, scripts, shown(id_of(names.base))
+
+
+def _answered(before: AutonomyStatus | None, now: AutonomyStatus | None, file: str, elapsed: float) -> bool:
+    if now is None or _runs(before, now, file):
+        return now is not None
+    return bool(now.error) and (before is None or now.error != before.error or elapsed > _SAME_ERROR_S)
+
+
+def _runs(before: AutonomyStatus | None, now: AutonomyStatus, file: str) -> bool:
+    """Whether the script runs, as another process than before."""
+    as_before = before is not None and before.running and now.pid == before.pid
+    return now.running and now.file == file and not as_before
+
+
+def _ended(now: AutonomyStatus | None) -> bool:
+    return now is not None and not now.running
+
+
+def _sent(transport: Transport, accepted: bool) -> None:
+    if not accepted:
+        raise TransportError(f"nothing was sent: {transport.problem or 'the connection was lost'}")
+
+
+def _print_status(status: AutonomyStatus) -> None:
+    if status.running:
+        waits = ", but a person drives: it waits" if status.overridden is True else ""
+        _print(f"{status.file} runs (process {status.pid}){waits}")
+        for key, value in (status.config or {}).items():
+            _print(f"    {key}: {value}")
+        for other in status.dependencies:
+            _print(f"    with {other.file}" + (f" (process {other.pid})" if other.running else ", which does not run"))
+    else:
+        _print("no script runs")
+    if status.error:
+        _print(f"error: {status.error}")
+
+
+def _option(setting: forms.Setting) -> str:
+    """``--tag-id INT  Tag ID (default: 13)``."""
+    first = {value: option for option, value in reversed(options_of(setting))}
+    flag = setting.type == "bool"
+    shown = f"[{first[True]} | {first[False]}]" if flag else f"{first[None]} {setting.type.upper()}"
+    notes = [", ".join(map(str, setting.options))] if setting.options else []
+    notes += [f"min {setting.min}"] if setting.min is not None else []
+    notes += [f"max {setting.max}"] if setting.max is not None else []
+    notes.append("required" if setting.required else f"default: {setting.default}")
+    return f"{shown:32}  {setting.label or setting.key} ({'; '.join(notes)})"
+
+
+def _print(line: str) -> None:
+    typer.echo(shown(line))

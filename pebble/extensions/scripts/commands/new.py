@@ -1,0 +1,56 @@
+"""Writes a first script: one that follows a tag, its test, and a robot in a simulated room."""
+
+import re
+import tempfile
+from collections.abc import Iterator
+from importlib.resources import files
+from pathlib import Path
+
+from pebble.errors import PebbleError
+
+_name = re.compile(r"[A-Za-z][A-Za-z0-9_-]{0,62}").fullmatch
+
+
+def write(name: str, folder: Path) -> Iterator[Path]:
+    """Make ``folder/name`` with its files, and yield their paths. Raises PebbleError, also if it exists already."""
+    if not _name(name):
+        raise PebbleError(f"{name!r}: a script's name is letters, digits, - and _, beginning with a letter")
+    target = folder / name
+    try:
+        if (alike := _alike(target)) is not None:
+            raise PebbleError(f"{alike} exists already: choose another name, or another --folder")
+        target.mkdir(parents=True)
+    except OSError as error:
+        raise PebbleError(f"{target}: {error.strerror}") from None
+    test = f"test_{name.replace('-', '_')}.py"
+    texts = {
+        "run.py": _text("run.py.txt"),
+        test: _text("test_run.py.txt"),
+        "room.json": _room(),
+        "goob.json": _robot(target),
+        "pytest.ini": _text("pytest.ini"),
+    }
+    for file, text in texts.items():
+        (target / file).write_text(text, encoding="utf-8")
+        yield target / file
+
+
+def _alike(target: Path) -> Path | None:
+    """What exists with this name, whatever its case: many file systems make no difference."""
+    if not target.parent.is_dir():
+        return None
+    return next((one for one in target.parent.iterdir() if one.name.lower() == target.name.lower()), None)
+
+
+def _text(file: str) -> str:
+    return files("pebble.extensions.scripts.commands").joinpath("starter", file).read_text(encoding="utf-8")
+
+
+def _room() -> str:
+    return files("pebble.extensions.lab.simulation.world").joinpath("room.json").read_text(encoding="utf-8")
+
+
+def _robot(target: Path) -> str:
+    """The config names absolute paths, so that `pebble up` finds them from everywhere."""
+    world = Path(tempfile.gettempdir(), "pebble-world-room")
+    return _text("goob.json").replace("{folder}", str(target.absolute())).replace("{world}", str(world))

@@ -1,0 +1,100 @@
+"""Follows a tag, and drives on without seeing it: to where it was, by the wheels' odometry, for a bounded time."""
+
+import math
+from typing import Any, NamedTuple
+
+from msgspec.structs import replace
+
+from pebble.contract.payloads import WheelOdometry
+from pebble.extensions.scripts.perception.follow import Command, Follower, FollowSettings
+from pebble.extensions.scripts.perception.tags import Place
+
+_BLIND_S = 6.0  # at most, since the tag was seen
+_SLOW_RAD = math.radians(40.0)  # off the goal; the more beyond, the slower
+_LEAST_SHARE = 0.2
+_TURN_POWER = 0.6
+
+
+class Pose(NamedTuple):
+    """Metres and radians in the odometry's frame; counter-clockwise is positive."""
+
+    x_m: float
+    y_m: float
+    heading_rad: float
+
+
+def pose_of(odometry: WheelOdometry | None) -> Pose | None:
+    """The pose in a payload of any producer, in metres or millimetres; None if there is none in it."""
+    if odometry is None:
+        return None
+    value = odometry.value
+    parts = [
+        _number(value, *names) for names in (("x_mm", "x"), ("y_mm", "y"), ("heading_rad", "theta_rad", "heading"))
+    ]
+    if parts[2] is None and (degrees := _number(value, "heading_deg", "theta_deg")) is not None:
+        parts[2] = math.radians(degrees)
+    x, y, heading = parts
+    if x is None or y is None or heading is None:
+        return None
+    metres = 1.0 if odometry.unit.lower() in ("m", "meter", "meters") else 0.001
+    return Pose(x * metres, y * metres, math.remainder(heading, math.tau))
+
+
+def _number(value: dict[str, Any], *names: str) -> float | None:
+    found = next((value[name] for name in names if value.get(name) is not None), None)
+    usable = isinstance(found, int | float) and math.isfinite(found)
+    return float(found) if usable else None  # type: ignore[arg-type]
+
+
+class OdomFollower:
+    """Call ``see`` for every picture, and ``step`` at a steady rate of about 10 Hz."""
+
+    def __init__(self, settings: FollowSettings) -> None:
+        self.settings = settings
+        self._vision = Follower(replace(settings, tag_timeout_s=0.0))  # how old a place may be is decided here
+        self._place: Place | None = None
+        self._goal: tuple[float, float] | None = None
+        self._seen_at = self._planned_at = self._reached_at = float("-inf")
+
+    def see(self, now: float, place: Place | None, pose: Pose | None) -> None:
+        """Where the tag is, or None if it is not in the picture, and the pose at that time, if known."""
+        self._place, self._seen_at = place, now
+        if place is not None:
+            self._goal = None if pose is None else self._plan(place, pose)
+            self._planned_at = now
+
+    def step(self, now: float, pose: Pose | None) -> Command:
+        place = self._place if now - self._seen_at <= self.settings.tag_timeout_s else None
+        vision = self._vision.step(now, place)
+        if place is not None:
+            return vision
+        blind = None if self._goal is None or pose is None else self._to_goal(now, self._goal, pose)
+        if blind is not None:
+            return blind
+        return Command(reason="goal reached") if now - self._reached_at < self.settings.goal_hold_s else vision
+
+    def _plan(self, place: Place, pose: Pose) -> tuple[float, float] | None:
+        """The point at the wanted distance from the tag, on the way to it; None: it is near."""
+        settings = self.settings
+        advance = place.distance_m - settings.target_distance_m
+        if advance <= max(settings.distance_threshold_m, settings.min_goal_advance_m):
+            return None
+        bearing = pose.heading_rad - place.angle_rad
+        return pose.x_m + advance * math.cos(bearing), pose.y_m + advance * math.sin(bearing)
+
+    def _to_goal(self, now: float, goal: tuple[float, float], pose: Pose) -> Command | None:
+        """None: it has been reached, or the time is over."""
+        settings = self.settings
+        dx, dy = goal[0] - pose.x_m, goal[1] - pose.y_m
+        distance = math.hypot(dx, dy)
+        if distance <= settings.odom_goal_tolerance_m or now - self._planned_at > _BLIND_S:
+            self._goal, self._reached_at = None, now
+            return None
+        off = math.remainder(math.atan2(dy, dx) - pose.heading_rad, math.tau)  # > 0: to the left
+        share = max(-1.0, min(1.0, settings.odom_heading_kp * off / (math.pi / 2)))
+        floor = settings.odom_min_drive_power if distance >= settings.odom_brake_distance_m else 0.0
+        power = min(settings.odom_max_drive_power, max(floor, settings.odom_distance_kp * distance))
+        if abs(off) > _SLOW_RAD:
+            power *= max(_LEAST_SHARE, 1.0 - (abs(off) - _SLOW_RAD) / (math.pi - _SLOW_RAD))
+        x = -share * _TURN_POWER
+        return Command(x, min(power, 1.0 - abs(x)), "odometry")

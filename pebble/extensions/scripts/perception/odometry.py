@@ -1,0 +1,211 @@
+"""Where a robot is, by its wheels' hall sensors and the power of its motors: dead reckoning from the pose (0, 0, 0).
+
+Commands and samples are processed in the order of their arrival, because samples carry no time. Distances are good to
+millimetres as long as no wheel slips; heading is good to the difference of both wheels' calibration, and better with
+an inertial sensor.
+"""
+
+import math
+from dataclasses import dataclass
+from typing import Annotated, Any, Literal, NamedTuple
+
+from msgspec import Meta, Struct
+
+from pebble.contract.payloads import ImuFast, MotorPower, TouchValues
+from pebble.extensions.scripts.perception.gyro import GyroHeading
+from pebble.extensions.scripts.perception.hall import HallSample, HallWheel
+
+_MOVING_S = 0.45  # a robot counts as moving so long after its last motion
+_STALL_S = 0.32
+_NOISE_MM = 1.0  # less is no motion
+_UNCHANGED_S = 0.3  # without motion and power the robot is at rest
+_HOLD_S = 0.35  # wheels coast so long
+_LEAST_POWER = 0.02
+
+
+Pin = Literal["a0", "a1", "a2"]
+
+
+class OdometrySettings(Struct, frozen=True, kw_only=True):
+    """Wheels, magnets of alternating poles, and the ADC channels of their sensors."""
+
+    use_tune_state: Annotated[bool, Meta(title="Use Tune State")] = False
+    wheel_diameter_mm: Annotated[float, Meta(ge=1, le=1000, title="Wheel Diameter (mm)")] = 61.0
+    track_width_mm: Annotated[float, Meta(ge=1, le=5000, title="Track Width (mm)")] = 130.5
+    magnets: Annotated[int, Meta(ge=1, le=200, title="Magnets per Wheel")] = 10
+    left_channel: Annotated[Pin, Meta(title="Left Sensor")] = "a0"
+    right_channel: Annotated[Pin, Meta(title="Right Sensor")] = "a1"
+    second_channel: Annotated[
+        Literal["a0", "a1", "a2", "none"], Meta(title="Second Left Sensor, a quarter wave away")
+    ] = "a2"
+    left_mm_per_event: Annotated[float, Meta(ge=0, le=1000, title="Left Step (mm), 0: by geometry")] = 0.0
+    right_mm_per_event: Annotated[float, Meta(ge=0, le=1000, title="Right Step (mm), 0: by geometry")] = 0.0
+    publish_rate_hz: Annotated[float, Meta(ge=1, le=50, title="Rate While Moving (Hz)")] = 20.0
+    idle_publish_rate_hz: Annotated[float, Meta(ge=0.2, le=50, title="Rate at Rest (Hz)")] = 2.0
+
+    @property
+    def step_mm(self) -> tuple[float, float]:
+        """A step of the left and of the right wheel, one for each magnet."""
+        step = math.pi * self.wheel_diameter_mm / self.magnets
+        return self.left_mm_per_event or step, self.right_mm_per_event or step
+
+
+class WheelPose(NamedTuple):
+    """The pose in the frame of the start: x ahead, y to the left, heading −π..π, counter-clockwise positive."""
+
+    x_mm: float = 0.0
+    y_mm: float = 0.0
+    heading_rad: float = 0.0
+
+
+@dataclass(slots=True)
+class _Part:
+    """A part of the way, as an arc: one sample, or all of the time in which distances are corrected."""
+
+    ahead_mm: float = 0.0
+    turn_rad: float = 0.0
+
+    def end(self, start: WheelPose) -> WheelPose:
+        half = self.turn_rad / 2
+        chord = self.ahead_mm * (math.sin(half) / half if half else 1.0)
+        middle = start.heading_rad + half
+        return WheelPose(
+            start.x_mm + chord * math.cos(middle),
+            start.y_mm + chord * math.sin(middle),
+            math.remainder(start.heading_rad + self.turn_rad, math.tau),
+        )
+
+
+class _Wheel:
+    """A wheel, when it turned last, and how often it did not although it was commanded to."""
+
+    def __init__(self, mm_per_step: float) -> None:
+        self.hall = HallWheel(mm_per_step)
+        self.turned_at = float("-inf")
+        self.stalls = 0
+        self._turned_mm = 0.0  # where it was then
+        self._idle_since: float | None = None  # with power; None: without, or it turns
+
+    def update(self, sample: HallSample, now: float) -> float:
+        """Return the distance since the last sample, in mm."""
+        distance = self.hall.update(sample)
+        if turned := abs(self.hall.mm - self._turned_mm) > _NOISE_MM:
+            self._turned_mm, self.turned_at = self.hall.mm, now
+        if turned or not sample.power:
+            self._idle_since = None
+        elif self._idle_since is None:
+            self._idle_since = now
+        elif now - self._idle_since > _STALL_S:
+            self.stalls += 1
+            self._idle_since = math.inf
+        return distance
+
+
+class Directions:
+    """The power of both motors, and the direction in which each wheel may turn: a single sensor does not show it."""
+
+    def __init__(self, now: float) -> None:
+        self._power = (0.0, 0.0)  # left, right
+        self._signs = [0, 0]
+        self._signs_until = [now, now]
+
+    def command(self, power: MotorPower, now: float) -> None:
+        self._note_signs(now)
+        self._power = (power.left, power.right)
+
+    def at(self, now: float) -> tuple[tuple[float, int], tuple[float, int]]:
+        """Power and possible direction of the left and the right wheel; a direction remains while wheels coast."""
+        self._note_signs(now)
+        left, right = (s if now <= until else 0 for s, until in zip(self._signs, self._signs_until, strict=True))
+        return (self._power[0], left), (self._power[1], right)
+
+    def _note_signs(self, now: float) -> None:
+        for wheel, power in enumerate(self._power):
+            if abs(power) >= _LEAST_POWER:
+                self._signs[wheel] = 1 if power > 0.0 else -1
+                self._signs_until[wheel] = now + _HOLD_S
+
+
+class Odometry:
+    """Feed it every power that the wheels are commanded, and every sample."""
+
+    def __init__(self, settings: OdometrySettings, now: float) -> None:
+        self.pose = self._base = WheelPose()
+        self.distance_mm = 0.0
+        self._part = _Part()
+        self._was_ready = True
+        self._settings = settings
+        self._power = Directions(now)
+        self._left, self._right = map(_Wheel, settings.step_mm)
+        self._gyro = GyroHeading()
+        self._heading_source = "wheels"
+        self._samples = self._published = 0
+        self._powered = False
+
+    def moving(self, now: float) -> bool:
+        return now - max(self._left.turned_at, self._right.turned_at) < _MOVING_S
+
+    def power(self, power: MotorPower, now: float) -> None:
+        self._power.command(power, now)
+
+    def imu(self, imu: ImuFast, now: float) -> None:
+        """A sample of the inertial sensor."""
+        still_s = now - max(self._left.turned_at, self._right.turned_at)
+        at_rest = still_s > _UNCHANGED_S and not self._powered
+        self._gyro.sample(imu.value.gyro_dps.z, imu.mcu_ms, now, at_rest=at_rest)
+
+    def touch(self, values: TouchValues, now: float) -> None:
+        """A sample of the hall sensors."""
+        self._samples += 1
+        settings, (left_power, right_power) = self._settings, self._power.at(now)
+        second = None if settings.second_channel == "none" else getattr(values, settings.second_channel)
+        left = self._left.update(HallSample(getattr(values, settings.left_channel), second, *left_power), now)
+        right = self._right.update(HallSample(getattr(values, settings.right_channel), None, *right_power), now)
+        self._powered = left_power[0] != 0.0 or right_power[0] != 0.0
+        self._move(left, right, now)
+
+    def _move(self, left: float, right: float, now: float) -> None:
+        turn = (right - left) / self._settings.track_width_mm
+        measured = self._gyro.take(turn, now)
+        self._heading_source = "wheels" if measured is None else "gyro"
+        part = self._part
+        part.ahead_mm += (left + right) / 2
+        part.turn_rad += turn if measured is None else measured
+        self.pose = part.end(self._base)
+        ready = self._left.hall.ready and self._right.hall.ready
+        if ready:
+            self.distance_mm += abs(part.ahead_mm) if self.moving(now) or not self._was_ready else 0.0
+            self._base, self._part = self.pose, _Part()
+        self._was_ready = ready
+
+    def value(self) -> dict[str, Any]:
+        """The ``value`` of the payload (paper A.8.12), each time with the next ``publish_seq``."""
+        self._published += 1
+        left, right = self._left.hall, self._right.hall
+        value: dict[str, Any] = {
+            "x_mm": round(self.pose.x_mm, 3),
+            "y_mm": round(self.pose.y_mm, 3),
+            "heading_rad": round(self.pose.heading_rad, 6),
+            "heading_deg": round(math.degrees(self.pose.heading_rad), 3),
+            "left_mm": round(left.mm, 3),
+            "right_mm": round(right.mm, 3),
+            "distance_mm": round(self.distance_mm, 3),
+            "left_crossings": int(left.steps),
+            "right_crossings": int(right.steps),
+            "unknown_direction_events": left.unknown + right.unknown,
+            "left_step_total": round(left.steps, 6),
+            "right_step_total": round(right.steps, 6),
+            "left_mm_per_step": round(left.mm_per_step, 6),
+            "right_mm_per_step": round(right.mm_per_step, 6),
+            "left_extrema_events": left.extrema,
+            "right_extrema_events": right.extrema,
+            "left_rejected_sign_flips": left.rejected,
+            "right_rejected_sign_flips": right.rejected,
+            "left_stall_events": self._left.stalls,
+            "right_stall_events": self._right.stalls,
+            "sample_seq": self._samples,
+            "publish_seq": self._published,
+        }
+        if self._heading_source == "gyro":
+            value["heading_source"] = "gyro"
+        return value

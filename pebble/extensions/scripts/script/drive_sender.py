@@ -1,0 +1,168 @@
+"""Decides which drive commands of a script are published, and when. Pure: the caller receives, waits and has a clock.
+
+The wheels belong to the motor owner, whose arbiter decides. This only knows what the owners and other senders have
+published, so that a script learns that its commands have no effect, and that others are not disturbed.
+"""
+
+from collections.abc import Callable, Mapping
+
+from msgspec.structs import replace
+
+from pebble.contract.payloads import SCRIPT, Drive, EstopState
+from pebble.extensions.scripts.runs import SUPERSEDED
+from pebble.motion.arbiter import HOLD_MS, newer
+
+MAX_PER_S = 50  # drive commands of a script; the newest takes its turn, a zero goes at once
+HOLD_S = HOLD_MS / 1000  # so long after a person's last command scripts are refused
+_SLOT_S = 0.021  # between commands: with an early zero and the final one, at most MAX_PER_S in any second
+_MAX_OWNERS = 64  # whose last state is remembered
+_GRACE_S = 0.1  # for the first command of a newer run to arrive: it bars this run as a person does
+
+ENDED = "this run was ended"  # by others: why, is known a moment later
+
+_ZERO = Drive()
+
+
+class DriveSender:
+    """The drive commands of one run of a script.
+
+    ``publish`` sends one command and returns whether it was accepted. Times are seconds of one monotonic clock. Call
+    :meth:`tick` at :attr:`due`. One thread at a time.
+
+    At most MAX_PER_S commands a second are published. Of several that wait for their turn, the newest is. A zero is
+    published at once, in place of all that wait; only repetitions of a published zero take their turn.
+    """
+
+    def __init__(self, run: int, publish: Callable[[Drive], bool]) -> None:
+        self.run = run
+        self._publish = publish
+        self._tried = False  # the script has commanded anything: scripts that never do are not ended
+        self._pending: Drive | None = None
+        self._turn = float("-inf")  # when the next command may be published
+        self._zero_is_last = False  # the newest accepted command is a zero
+        self._person_at = float("-inf")
+        self._latched: EstopState | None = None
+        self._owners: dict[str, EstopState] = {}
+        self._barred_at: float | None = None
+        self._superseded = False  # by a newer run
+        self._end = ""  # why this run can never drive again
+        self._final = False  # the final zero was published
+
+    # -- what the script wants
+
+    def drive(self, wanted: Drive, now: float) -> bool:
+        """Publish a command now or at its turn. False: it has no effect, as far as is known."""
+        self._tried = True
+        if self._end:
+            return False
+        signed = replace(wanted, source=SCRIPT, run=self.run)
+        obeyed = not self.refusal(now)
+        self._pending = None
+        if not signed.moves and not self._zero_is_last:
+            return self._send(signed, now) and obeyed
+        if signed.moves and not obeyed:
+            return False
+        if now >= self._turn:
+            return self._send(signed, now) and obeyed
+        self._pending = signed
+        return obeyed
+
+    def drive_another(self, now: float) -> str:
+        """A command for another robot: what ends this run ends that, too. Returns :meth:`refusal`."""
+        self._tried = True
+        return self.refusal(now)
+
+    def end(self, why: str, now: float) -> None:
+        """Publish the final zero, if the script has ever commanded anything; nothing is published after it."""
+        if self._final:
+            return
+        self._end, self._final = self._end or why, True
+        self._pending = None
+        if self._tried:
+            self._send(replace(_ZERO, source=SCRIPT, run=self.run), now)
+
+    def tick(self, now: float) -> None:
+        """Publish what waits for its turn, unless it is refused by now."""
+        if self._pending is None or now < self._turn:
+            return
+        pending, self._pending = self._pending, None
+        if not (pending.moves and self.refusal(now)):
+            self._send(pending, now)
+
+    # -- what others have published
+
+    def receive(self, drive: Drive, now: float) -> None:
+        """A drive command of another sender, that arrives now."""
+        if not drive.signed:
+            self._person_at = now
+        elif isinstance(drive.run, int) and newer(drive.run, self.run):
+            self._superseded = True
+
+    def owners(self, states: Mapping[str, EstopState], now: float) -> None:
+        """The newest states of all motor owners."""
+        if self._tried:
+            for owner, state in states.items():
+                self._compare(owner, self._owners.get(owner), state)
+        before = self._owners if len(self._owners) < _MAX_OWNERS else {}
+        self._owners = {**before, **states}  # one that is gone for a while may come back restarted
+        self._latched = max((s for s in states.values() if s.latched), key=lambda state: state.since, default=None)
+        barring = [state.last_barred for state in states.values() if not newer(self.run, state.last_barred)]
+        if any(run != self.run for run in barring):
+            self._superseded = True
+        elif barring and self._barred_at is None:
+            self._barred_at = now
+
+    # -- what follows
+
+    def overridden(self, now: float) -> bool:
+        """Whether a person has commanded within the last 2 s."""
+        return now - self._person_at < HOLD_S
+
+    def refusal(self, now: float) -> str:
+        """Why a command has no effect now, as far as is known; empty: it has."""
+        if self._end:
+            return self._end
+        if self._latched is not None:
+            return f"the robot is stopped {_described(self._latched)}"
+        if self._superseded or self._barred_at is not None:
+            return ENDED
+        return "a person drives" if self.overridden(now) else ""
+
+    def ended(self, now: float) -> str:
+        """Why this run can never drive again; empty: it may, or it never wanted to."""
+        if not self._end and self._tried:
+            if self._superseded:
+                self._end = SUPERSEDED
+            elif self._barred_at is not None and now >= self._barred_at + _GRACE_S:
+                self._end = "stopped by an operator"
+        return self._end
+
+    @property
+    def due(self) -> float | None:
+        """When to call :meth:`tick`, and to look at :meth:`ended`; None: not before something happens."""
+        times = [] if self._pending is None else [self._turn]
+        if self._barred_at is not None and not self._end:
+            times.append(self._barred_at + _GRACE_S)
+        return min(times, default=None)
+
+    def _compare(self, owner: str, before: EstopState | None, now: EstopState) -> None:
+        """A run never outlives an emergency stop, nor a motor owner that has forgotten what it barred."""
+        if self._end or before is None:
+            return
+        if before.boot != now.boot:
+            self._end = f"{owner}, which moves the wheels, has restarted"
+        elif before.count != now.count or (now.latched and not before.latched):
+            self._end = f"emergency stop {_described(now)}"
+        elif before.latched and not now.latched:
+            self._end = "the emergency stop was reset: start the script again"
+
+    def _send(self, command: Drive, now: float) -> bool:
+        self._turn = max(self._turn, now) + _SLOT_S
+        accepted = self._publish(command)
+        self._zero_is_last = accepted and not command.moves
+        return accepted
+
+
+def _described(state: EstopState) -> str:
+    by = f"by {state.by}" if state.by else "by an unknown person"
+    return f"{by} ({state.why})" if state.why else by

@@ -1,0 +1,111 @@
+"""Another robot of the LAN, as a script of this one sees it."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+from pebble.contract import DRIVE, NEIGHBOURS, TO_NEIGHBOUR, Channel, codec
+from pebble.contract.identity import Identity
+from pebble.contract.payloads import SCRIPT, Drive, Neighbours
+from pebble.errors import PebbleError
+from pebble.extensions.scripts.script.wheels import Wheels
+from pebble.transports import QoS, Transport
+
+PRESENT_S = 1.0  # so long a robot is there after it was received last; it comes four times a second
+_SLOT_S = 0.019  # between commands: at most 50 in a second
+
+
+class NotGrantedError(PebbleError):
+    """The other robot's config does not let this one do that."""
+
+
+class Way(NamedTuple):
+    """What a neighbour needs of its robot. ``check`` raises once the script is to end."""
+
+    transport: Transport
+    wheels: Wheels
+    latest: Callable[[Channel, float], Any]  # payload of the neighbour
+    check: Callable[[], None]
+    clock: Callable[[], float]
+
+
+class Neighbour:
+    """Robot ``name``; ``me`` is this one. :meth:`pebble.extensions.scripts.script.Robot.neighbour` makes it. Any thread may use it."""
+
+    def __init__(self, name: str, me: Identity, way: Way) -> None:
+        self.name = name
+        self._me, self._way = me.id, way
+        self._topic = TO_NEIGHBOUR.topic(me.base, robot=name)
+        self._sent_at = float("-inf")
+        self._moves = False  # the newest command does
+        self._over = False
+        self._lock = threading.Lock()  # else the last command might come after the final zero
+        way.latest(NEIGHBOURS, PRESENT_S)  # subscribes
+
+    @property
+    def online(self) -> bool:
+        """Whether it was heard within the last second."""
+        return self._state is not None
+
+    def latest(self, channel: Channel, max_age: float = 1.0) -> Any:
+        """The newest payload of ``channel`` that arrived within the last ``max_age`` seconds, or None. Does not wait.
+
+        The first call subscribes, and mostly returns None. The other robot's config has to list it in ``shares``, and
+        this one's in ``listens``.
+        """
+        self._way.check()
+        return self._way.latest(channel, max_age)
+
+    def drive(self, x: float = 0.0, z: float = 0.0, y: float = 0.0) -> bool:
+        """Drive it, as :meth:`Robot.drive` does this one, for 0.3 s at most. False: that has no effect, as far as is
+        known. Raises NotGrantedError if it does not let this robot drive it.
+        """
+        self._way.check()
+        command = Drive(x=float(x), z=float(z), y=float(y), source=SCRIPT, run=self._way.wheels.run)
+        state, now = self._state, self._way.clock()
+        if state is not None and DRIVE.metric not in state.commanded.get(self._me, ()):
+            raise NotGrantedError(
+                f"{self.name} does not let {self._me} drive it: its config needs "
+                f'services.neighbours.commanded: {{"{self._me}": ["{DRIVE.metric}"]}}'
+            )
+        refusal = self._way.wheels.drive_another() or self.why_refused
+        if command.moves and refusal:
+            return False
+        if command.moves is self._moves and now - self._sent_at < _SLOT_S:
+            return not refusal
+        self._sent_at = now
+        return self._send(command) and not refusal
+
+    def stop(self) -> bool:
+        """Stop its wheels: the same as ``drive()``."""
+        return self.drive()
+
+    @property
+    def why_refused(self) -> str:
+        """Why :meth:`drive` would have no effect now, in words; empty: it would, as far as is known."""
+        state = self._state
+        if state is None:
+            return f"{self.name} is not heard"
+        refusal = state.refused.get(self._me)
+        return refusal.why if refusal is not None and refusal.run == self._way.wheels.run else ""
+
+    def end(self) -> None:
+        """Stop what this script moves there."""
+        self._over = True
+        if self._moves:
+            self._send(Drive(source=SCRIPT, run=self._way.wheels.run))
+
+    @property
+    def _state(self) -> Neighbours | None:
+        state: Neighbours | None = self._way.latest(NEIGHBOURS, PRESENT_S)
+        return state
+
+    def _send(self, command: Drive) -> bool:
+        raw = codec.encode(TO_NEIGHBOUR, command)
+        with self._lock:
+            if command.moves and self._over:
+                return False
+            self._moves = command.moves
+            return self._way.transport.publish(self._topic, raw, qos=QoS.DELIVERED, urgent=True)

@@ -1,0 +1,92 @@
+"""Publishes where the robot is, from its wheels' hall sensors and what its motors are commanded."""
+
+import json
+import math
+import queue
+import time
+from collections.abc import Callable
+from typing import Any
+
+from msgspec import convert
+from msgspec.structs import replace
+
+from pebble import Robot, run
+from pebble.contract import IMU_FAST, MOTOR_POWER, TOUCH_SENSORS, WHEEL_ODOMETRY
+from pebble.contract.payloads import WheelOdometry
+from pebble.extensions.scripts.perception.odometry import Odometry, OdometrySettings
+from pebble.extensions.scripts.perception.rate import Rate
+from pebble.runtime.rate_limit import RateLimitedLog
+
+TUNE_STATE = "auto_tune_state.json"  # in the config's folder
+WAITING = 500  # inputs: 3 s of samples
+SILENCE_S = 3.0  # without a sample: none is published
+NO_SAMPLES = "no hall sensors: set services.serial_mcu_bridge.telemetry.publish_touch_sensors to true"
+
+
+def main(robot: Robot, options: OdometrySettings) -> None:
+    odometry = Odometry(tuned(robot, options), time.monotonic())
+    inputs: queue.Queue[tuple[Callable[..., None], Any, float]] = queue.Queue(WAITING)
+
+    log = RateLimitedLog(robot.log)
+
+    def take(method: Callable[..., None]) -> Callable[..., None]:
+        """Commands and samples wait in one queue: a sample gets its direction from the commands before it."""
+
+        def receive(value: Any, **_: str) -> None:
+            try:
+                inputs.put_nowait((method, value, time.monotonic()))
+            except queue.Full:
+                log.warning("busy", "too busy: samples are lost, and the position with them")
+
+        return receive
+
+    def touched(touch: Any, now: float) -> None:
+        odometry.touch(touch.value, now)
+
+    robot.on(MOTOR_POWER, take(odometry.power))
+    robot.on(TOUCH_SENSORS, take(touched))
+    robot.on(IMU_FAST, take(odometry.imu))
+    rate = Rate(options.publish_rate_hz)
+    silent_at: float | None = time.monotonic() + SILENCE_S  # None: a sample has arrived, or the warning is logged
+    while True:
+        try:
+            method, value, now = inputs.get(timeout=0.05)
+            method(value, now)
+            silent_at = None if method is touched else silent_at
+        except queue.Empty:
+            robot.sleep(0)  # ends when it should
+            now = time.monotonic()
+        if silent_at is not None and now >= silent_at:
+            silent_at = None
+            robot.log.warning(NO_SAMPLES)
+        rate.hz = options.publish_rate_hz if odometry.moving(now) else options.idle_publish_rate_hz
+        if rate.due(now):
+            payload = WheelOdometry(source=WHEEL_ODOMETRY.metric, value=odometry.value(), timestamp=time.time())
+            robot.publish(WHEEL_ODOMETRY, payload)
+
+
+def tuned(robot: Robot, options: OdometrySettings) -> OdometrySettings:
+    """With use_tune_state, the values of the original's tuning program win over the geometry."""
+    state = tune_state(robot) if options.use_tune_state else {}
+    steps = {key: getattr(options, key) or state.get(key, 0.0) for key in ("left_mm_per_event", "right_mm_per_event")}
+    return replace(options, track_width_mm=state.get("track_width_mm", options.track_width_mm), **steps)
+
+
+def tune_state(robot: Robot) -> dict[str, float]:
+    try:
+        values = convert(
+            json.loads((robot.config.folder / TUNE_STATE).read_text(encoding="utf-8"))["current_values"], dict[str, Any]
+        )
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        robot.log.warning("%s: %s; the geometry counts", TUNE_STATE, error)
+        return {}
+    return {key: float(v) for key, v in values.items() if isinstance(v, int | float) and math.isfinite(v) and v > 0}
+
+
+if __name__ == "__main__":
+    run(
+        main,
+        label="Wheel odometry",
+        summary="Works out where the robot is from its turning wheels, and draws it on the map.",
+        main_options=("wheel_diameter_mm", "track_width_mm", "magnets"),
+    )

@@ -1,0 +1,79 @@
+"""Public names of modules that lie in an extension: ``import pebble.perception.tags`` means the same module as before.
+
+One module under two names, not two: a class is the same class. Names that no document promises are not here.
+"""
+
+from __future__ import annotations
+
+import sys
+from importlib import import_module
+from importlib.machinery import ModuleSpec
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from types import CodeType, ModuleType
+
+PUBLIC = {
+    "pebble.script": "pebble.extensions.scripts.script",
+    "pebble.scripts": "pebble.extensions.scripts.shipped",
+    "pebble.perception": "pebble.extensions.scripts.perception",
+    "pebble.simulation": "pebble.extensions.lab.simulation",
+    "pebble.recordings": "pebble.extensions.recordings",
+    "pebble.media": "pebble.extensions.media",
+    "pebble.update": "pebble.extensions.install.update",  # pebble-slot and the release that it starts may differ in age
+}
+
+
+class PublicNames:
+    """Finds a module by its public name.
+
+    It stands before Python's own finders, which would find a part of such a package a second time, by its path.
+    """
+
+    @staticmethod
+    def find_spec(fullname: str, *_: object) -> ModuleSpec | None:
+        public = ".".join(fullname.split(".", 2)[:2])
+        place = _spec(PUBLIC[public] + fullname[len(public) :]) if public in PUBLIC else None
+        if place is None:
+            return None
+        loader: Any = _SameModule(place)
+        return ModuleSpec(fullname, loader, is_package=place.submodule_search_locations is not None)
+
+
+class _SameModule:
+    """Loads a module under a second name."""
+
+    def __init__(self, place: ModuleSpec) -> None:
+        self._place = place
+        self._spec: ModuleSpec | None = None
+
+    def create_module(self, _: ModuleSpec) -> ModuleType:
+        module = import_module(self._place.name)
+        self._spec = module.__spec__  # importing sets that of the second name
+        return module
+
+    def exec_module(self, module: ModuleType) -> None:
+        module.__spec__ = self._spec
+
+    def get_code(self, _: str) -> CodeType | None:
+        """Return what ``python -m`` runs."""
+        loader: Any = self._place.loader
+        code: CodeType | None = loader.get_code(self._place.name)
+        return code
+
+    def get_source(self, _: str) -> str | None:
+        loader: Any = self._place.loader
+        source: str | None = loader.get_source(self._place.name)
+        return source
+
+
+def _spec(name: str) -> ModuleSpec | None:
+    from importlib.util import find_spec  # of use to public names only
+
+    return find_spec(name)
+
+
+def install() -> None:
+    """Make the public names importable."""
+    if PublicNames not in sys.meta_path:
+        sys.meta_path.insert(0, PublicNames)

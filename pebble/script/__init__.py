@@ -1,8 +1,0 @@
-"""Programs that move a robot by themselves: `from pebble import Robot, run`. See docs/scripts.md."""
-
-from pebble.contract import Channel, Kind
-from pebble.script.neighbour import NotGrantedError
-from pebble.script.program import run
-from pebble.script.robot import EXIT_ENDED, Robot, Stopped
-
-__all__ = ["EXIT_ENDED", "Channel", "Kind", "NotGrantedError", "Robot", "Stopped", "run"]

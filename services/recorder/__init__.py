@@ -1,0 +1,1 @@
+"""Records the robot on the robot."""

@@ -1,0 +1,1 @@
+"""Runs a foreign streaming program while video is requested."""

@@ -1,0 +1,156 @@
+"""The audio publisher as its own process: a real stream of sound, real brokers, and an operator who decodes."""
+
+from __future__ import annotations
+
+import signal
+from collections.abc import Iterator
+from itertools import pairwise
+from statistics import median
+
+import numpy as np
+import pytest
+
+from pebble.contract.payloads import MediaReport
+from pebble.extensions.media.sound import ReceivedSound
+from pebble.extensions.media.speech import PERIOD_S, Speech
+from tests.ext.av.audio_rig import Ear, Mouth, Program
+from tests.kit.sound import best_match, envelope
+from tests.support import Broker, until
+from tests.tcp_proxy import SlowTcpProxy
+
+NAME = "audio_publisher"
+
+
+@pytest.fixture
+def ear(remote: Broker) -> Iterator[Ear]:
+    ear = Ear(remote.port)
+    yield ear
+    ear.close()
+
+
+def joined(received: list[ReceivedSound]) -> np.ndarray:
+    return np.concatenate([one.samples for one in received])[:, 0].astype(float)
+
+
+def recorded(rate: int) -> np.ndarray:
+    """Two periods: whatever was heard is somewhere in it."""
+    return Speech(rate).samples(0, 2 * PERIOD_S * rate)[:, 0].astype(float)
+
+
+def pcm_likeness(received: list[ReceivedSound]) -> float:
+    """May be low for a while: a machine that is too busy loses chunks of the microphone, and counts them."""
+    return best_match(joined(received), recorded(16000))
+
+
+def opus_likeness(received: list[ReceivedSound]) -> float:
+    return best_match(envelope(joined(received), 16000), envelope(recorded(16000), 16000))
+
+
+def is_whole(received: list[ReceivedSound]) -> bool:
+    return all(later.sequence == earlier.sequence + 1 for earlier, later in pairwise(received))
+
+
+def test_every_encoding_in_turn_carries_the_recorded_speech(local: Broker, remote: Broker, ear: Ear) -> None:
+    with Program(NAME, "mqtt", local.port, remote.port) as robot, Mouth(robot.run_dir):
+        pcm = ear.wait(60)
+        assert {(one.encoding, one.rate, one.channels, len(one.samples)) for one in pcm} == {("pcm", 16000, 1, 320)}
+        assert until(lambda: pcm_likeness(ear.received[-60:]) > 0.999, 20, step=0.1)
+        ages = [at - one.captured_ms / 1000 for at, one in zip(ear.arrived, pcm, strict=False)]
+        assert 0.015 < median(ages) < 0.5  # of the first sample, so at least a whole chunk
+        assert median(b.captured_ms - a.captured_ms for a, b in pairwise(pcm)) == pytest.approx(20, abs=2)
+        robot.ask(encoding="opus")
+        ear.wait_for("opus")
+        assert robot.reported(encoding="opus", running=True, last_error=None, reduced=None)
+        opus = ear.wait(40)
+        assert {(one.encoding, one.rate, len(one.samples)) for one in opus} == {("opus", 16000, 640)}
+        assert until(lambda: opus_likeness(ear.received[-40:]) > 0.9, 20, step=0.1)
+        robot.ask(encoding="smoke signals")
+        ear.wait_for("pcm")
+        assert is_whole(ear.received)
+        assert ear.decoder.counters["refused"] == 0
+        assert until(lambda: (robot.newest.doing or "").startswith("pcm 16 kHz mono, "))
+
+
+def test_a_robot_with_zenoh_inside_and_another_rate(local: Broker, remote: Broker, ear: Ear) -> None:
+    options = {"encoding": "opus", "rate": 16000, "channels": 1, "bundle": 3}
+    with Program(NAME, "zenoh", local.port, remote.port, **options) as robot, Mouth(robot.run_dir, 48000, 2):
+        received = ear.wait(15)
+        assert {(one.encoding, one.rate, one.channels, len(one.samples)) for one in received} == {
+            ("opus", 16000, 1, 960)
+        }
+        assert robot.reported(encoding="opus", running=True, last_error=None)
+        robot.ask(encoding="pcm")
+        ear.wait_for("pcm")
+
+
+def test_the_microphone_comes_later_and_comes_back(local: Broker, remote: Broker, ear: Ear) -> None:
+    with Program(NAME, "mqtt", local.port, remote.port) as robot:
+        assert robot.reported(doing="waits for the microphone")
+        with Mouth(robot.run_dir):
+            ear.wait(10)
+            assert robot.reported(running=True, last_error=None)
+        assert until(lambda: "no sound" in (robot.newest.last_error or ""))
+        with Mouth(robot.run_dir, 48000, 2):
+            assert until(lambda: ear.received[-1].rate == 48000)
+        assert is_whole(ear.received)
+
+
+def test_the_remote_broker_goes_and_comes_back(local: Broker, remote: Broker, ear: Ear) -> None:
+    with Program(NAME, "mqtt", local.port, remote.port) as robot, Mouth(robot.run_dir):
+        ear.wait(20)
+        remote.kill()
+        assert robot.reported(doing="rests: the remote side is away")
+        assert until(lambda: (robot.newest.dropped or 0) > 20)
+        assert robot.newest.last_error
+        remote.start()
+        ear.wait(20)
+        young = [at - one.captured_ms / 1000 for at, one in zip(ear.arrived, ear.received, strict=True)][-10:]
+        assert median(young) < 0.5  # nothing from before
+        assert robot.reported(last_error=None)
+
+
+@pytest.mark.thorough
+def test_a_slow_link_makes_opus_thrifty_and_nothing_waits(local: Broker, remote: Broker, ear: Ear) -> None:
+    with (
+        SlowTcpProxy(remote.port, kbits=100) as link,
+        Program(NAME, "mqtt", local.port, link.port, encoding="opus", bundle=1, bitrate=32_000) as robot,
+        Mouth(robot.run_dir),
+    ):
+        ear.wait(20)
+        assert robot.reported(reduced=None)
+        link.kbits = 22
+        assert until(lambda: robot.newest.reduced == "3 parts a packet, 16 kbit/s", 20)
+        assert until(lambda: _steady(robot.reports), 20)
+
+
+def _steady(reports: list[MediaReport]) -> bool:
+    """Packets are no longer dropped."""
+    return len(reports) > 3 and reports[-1].dropped == reports[-3].dropped
+
+
+def test_a_link_too_slow_for_pcm_loses_packets_but_no_time(local: Broker, remote: Broker, ear: Ear) -> None:
+    with (
+        SlowTcpProxy(remote.port, kbits=1000) as link,
+        Program(NAME, "mqtt", local.port, link.port) as robot,
+        Mouth(robot.run_dir),
+    ):
+        ear.wait(20)
+        link.kbits = 150
+        assert until(lambda: (robot.newest.dropped or 0) > 20, 20)
+        ear.wait(30)
+        ages = [at - one.captured_ms / 1000 for at, one in zip(ear.arrived, ear.received, strict=False)][-20:]
+        assert median(ages) < 1.0  # 0.2 s of PCM wait with us, the rest is what the link's own buffers hold
+
+
+def test_it_ends_on_sigterm_and_leaves_nothing(local: Broker, remote: Broker, ear: Ear) -> None:
+    with Program(NAME, "mqtt", local.port, remote.port) as robot, Mouth(robot.run_dir) as mouth:
+        ear.wait(5)
+        robot.process.send_signal(signal.SIGTERM)
+        assert robot.process.wait(5) == 0
+        assert until(lambda: mouth.writer.readers == 0)
+        robot.start()
+        ear.wait(5)
+        robot.process.kill()
+        robot.process.wait(5)
+        robot.start()
+        ear.wait(5)

@@ -1,0 +1,241 @@
+"""The audio receiver as its own process, a recorder instead of aplay, and an operator who speaks."""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from functools import cache
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+import numpy as np
+import pytest
+
+from pebble.config import parse
+from pebble.contract.packets import Codec, Sound
+from pebble.extensions.media.pcm import to_bytes
+from pebble.extensions.media.sound import make_sound_encoder, sequence_numbers
+from pebble.extensions.media.speech import Speech
+from pebble.services.audio_receiver import service as service_module
+from pebble.services.audio_receiver.service import AudioReceiver
+from pebble.transports import QoS, Subscription
+from pebble.transports.memory import MemoryHub, MemoryTransport
+from tests.ext.av.audio_rig import RECORDER, Program
+from tests.ext.av.media_rig import BASE, client
+from tests.kit.robot import Running
+from tests.kit.sound import best_match, envelope
+from tests.support import Broker, until
+
+
+class Recorder:
+    """The command that stands in for aplay, and what it was given to play."""
+
+    def __init__(self, folder: Path) -> None:
+        script = folder / "recorder.py"
+        script.write_text(RECORDER)
+        self.folder = folder
+        self.command = [sys.executable, str(script), str(folder), "{rate}", "{channels}", "{device}"]
+
+    @property
+    def calls(self) -> list[str]:
+        """Rate, channels and device, oldest first."""
+        return [file.stem.partition("-")[2].rpartition("-")[0] for file in self._files()]
+
+    @property
+    def pids(self) -> list[int]:
+        return [int(file.stem.rpartition("-")[2]) for file in self._files()]
+
+    def samples(self, call: int = 0) -> np.ndarray:
+        files = self._files()
+        data = files[call].read_bytes() if len(files) > call else b""
+        return np.frombuffer(data[: len(data) // 2 * 2], "<i2").astype(float)
+
+    def _files(self) -> list[Path]:
+        return sorted(self.folder.glob("*.raw"))  # their names begin with when they began
+
+
+@pytest.fixture
+def recorder(tmp_path: Path) -> Recorder:
+    folder = tmp_path / "played"
+    folder.mkdir()
+    return Recorder(folder)
+
+
+speech_of = cache(Speech)
+
+
+class Operator:
+    """Speaks in real time."""
+
+    def __init__(self, port: int) -> None:
+        self.transport = client("operator", port)
+        self.numbers = sequence_numbers()
+
+    def speak(
+        self, name: str = "pcm", seconds: float = 1.0, rate: int = 16000, channels: int = 1, **options: Any
+    ) -> None:
+        encoder = make_sound_encoder(name, rate=rate, channels=channels, numbers=self.numbers, **options)
+        speech, count, began = speech_of(rate, channels), rate // 50, time.monotonic()
+        for number in range(round(seconds * 50)):
+            time.sleep(max(0.0, began + 0.02 * number - time.monotonic()))  # as a microphone does
+            for packet in encoder.encode(to_bytes(speech.samples(number * count, count)), time.time_ns() // 1_000_000):
+                self.send(packet)
+
+    def send(self, payload: bytes, *, retain: bool = False) -> None:
+        assert self.transport.publish(f"{BASE}/incoming/audio-stream", payload, qos=QoS.LATEST, retain=retain)
+
+
+@pytest.fixture
+def operator(remote: Broker) -> Iterator[Operator]:
+    operator = Operator(remote.port)
+    yield operator
+    operator.transport.close()
+
+
+Receive = Callable[..., Program]
+
+
+@pytest.fixture
+def receive(local: Broker, remote: Broker, recorder: Recorder) -> Iterator[Receive]:
+    """Starts the receiver of a robot with this kind inside, and returns once it reports."""
+    with ExitStack() as ends:
+
+        def started(kind: str = "mqtt", problem: str | None = None, **options: Any) -> Program:
+            options = {"command": recorder.command, **options}
+            robot = ends.enter_context(Program("audio_receiver", kind, local.port, remote.port, **options))
+            assert robot.reported(running=True, last_error=problem, doing="is silent")
+            return robot
+
+        yield started
+
+
+@pytest.mark.alone  # what comes too late is not played
+def test_received_speech_is_played(receive: Receive, operator: Operator, recorder: Recorder) -> None:
+    robot = receive(device="plug:x", latency_ms=300)
+    operator.speak(seconds=2)
+    speech = Speech(16000).samples(0, 32000)[:, 0].astype(float)
+    assert until(lambda: len(recorder.samples()) >= 32000 * 0.98)
+    assert recorder.calls == ["16000-1-plug:x"]
+    assert best_match(recorder.samples()[:28000], np.pad(speech, (8000, 8000))) > 0.95
+    assert robot.reported(encoding="pcm", last_error=None, doing="plays 16 kHz, 1 channel")
+    assert until(lambda: (robot.newest.bitrate or 0) > 0)
+
+
+@pytest.mark.alone
+def test_opus_on_a_robot_with_zenoh_inside(receive: Receive, operator: Operator, recorder: Recorder) -> None:
+    robot = receive("zenoh", latency_ms=1000)  # the most there is: what a busy machine delivers later is not played
+    operator.speak("opus", 2, bundle=2)
+    speech = np.pad(Speech(16000).samples(0, 32000)[:, 0].astype(float), (8000, 8000))
+    assert until(lambda: len(recorder.samples()) >= 32000 * 0.95)
+    played, loud = recorder.samples()[:28000], envelope(speech, 16000)
+    assert max(best_match(envelope(played[shift:], 16000), loud) for shift in range(0, 320, 40)) > 0.9
+    assert robot.reported(encoding="opus", last_error=None)
+
+
+def test_a_change_of_format_begins_another_player(receive: Receive, operator: Operator, recorder: Recorder) -> None:
+    robot = receive()
+    operator.speak(seconds=0.5)
+    operator.speak(seconds=0.5, rate=48000, channels=2)
+    operator.speak("opus", seconds=0.5)
+    assert until(lambda: len(recorder.calls) == 3 and len(recorder.samples(2)) > 5000)
+    assert recorder.calls == ["16000-1-default", "48000-2-default", "16000-1-default"]
+    assert robot.newest.restarts == 0
+
+
+def test_a_restarted_sender_is_played(receive: Receive, operator: Operator, recorder: Recorder) -> None:
+    receive()
+    operator.speak(seconds=0.6)
+    operator.numbers = sequence_numbers()
+    operator.speak(seconds=0.6)
+    assert until(lambda: len(recorder.samples()) >= 18000)
+
+
+def test_a_player_that_dies_is_started_again(receive: Receive, operator: Operator, recorder: Recorder) -> None:
+    robot = receive()
+    operator.speak(seconds=0.3)
+    assert until(lambda: len(recorder.pids) == 1)
+    os.kill(recorder.pids[0], signal.SIGKILL)
+    operator.speak(seconds=1.2)
+    assert until(lambda: len(recorder.pids) == 2 and len(recorder.samples(1)) > 3000)
+    assert robot.reported(restarts=1)
+
+
+def test_a_player_that_hangs_is_replaced_and_blocks_nothing_else(
+    receive: Receive, operator: Operator, recorder: Recorder
+) -> None:
+    robot = receive()
+    operator.speak(seconds=0.3)
+    assert until(lambda: len(recorder.pids) == 1)
+    os.kill(recorder.pids[0], signal.SIGSTOP)
+    seen = len(robot.reports)
+    operator.speak(seconds=3.5)
+    assert len(robot.reports) >= seen + 2
+    assert until(lambda: len(recorder.pids) == 2 and len(recorder.samples(1)) > 3000)
+    robot.process.send_signal(signal.SIGTERM)
+    assert robot.process.wait(5) == 0
+
+
+def test_a_player_that_is_not_installed_is_named_once(receive: Receive, operator: Operator) -> None:
+    robot = receive(command=["no-such-player", "-"], problem="no-such-player is not installed")
+    operator.speak(seconds=0.5)
+    assert until(lambda: (robot.newest.dropped or 0) > 10)
+    assert robot.newest.last_error == "no-such-player is not installed"
+    assert robot.process.printed.count("no sound: no-such-player is not installed") == 1
+
+
+def test_garbage_and_retained_packets_play_nothing(receive: Receive, operator: Operator, recorder: Recorder) -> None:
+    packet = make_sound_encoder("pcm", rate=16000, channels=1).encode(bytes(640), 1000)[0]
+    operator.send(packet, retain=True)
+    robot = receive()
+    for size in range(200):
+        operator.send(bytes(range(256))[:size])
+        operator.send(packet[:size])
+    assert until(lambda: (robot.newest.rate or 0) > 0)
+    assert recorder.calls == []
+    operator.speak(seconds=0.3)
+    assert until(lambda: recorder.calls == ["16000-1-default"])
+
+
+def test_delay_from_the_operator_to_the_player(receive: Receive, operator: Operator, recorder: Recorder) -> None:
+    """Every sample of a packet is its number, so what was recorded last tells which one was played last."""
+    receive()
+    behind, began = [], time.monotonic()
+    for number in range(1, 101):
+        time.sleep(max(0.0, began + 0.02 * number - time.monotonic()))  # as a microphone does
+        body = np.full(320, number, "<i2").tobytes()
+        operator.send(Sound(Codec.PCM16LE, 1, 16000, 320, number, 1000 + 20 * number, body).pack())
+        played = recorder.samples()
+        behind.append(number - (played[-1] if len(played) else 0))
+    assert median(behind[50:]) < 45  # 0.9 s, on a busy machine; the usual is 5
+
+
+@pytest.mark.parametrize(
+    ("security", "topics"),
+    [
+        ({}, ["audio-stream"]),
+        ({"level": "named"}, ["by/+/audio-stream"]),
+        ({"level": "named", "strangers": "free"}, ["by/+/audio-stream", "audio-stream"]),
+    ],
+)
+def test_whose_voice_it_receives(monkeypatch: pytest.MonkeyPatch, security: dict[str, str], topics: list[str]) -> None:
+    filters: list[str] = []
+
+    class Remote(MemoryTransport):
+        def subscribe(self, filter_: str, *arguments: Any, **options: Any) -> Subscription:
+            filters.append(filter_)
+            return super().subscribe(filter_, *arguments, **options)
+
+    monkeypatch.setattr(service_module, "remote_transport", lambda _config, name: Remote(name, MemoryHub()))
+    bridge = {"enabled": True, "remote_mqtt": {"host": "127.0.0.1", "port": 1884}}
+    raw = {"robot": {"id": "rover"}, "security": security, "services": {"mqtt_bridge": bridge}}
+    config = parse(raw, folder=Path.cwd(), env={})
+    running = Running(AudioReceiver(config, MemoryTransport("local", MemoryHub())))
+    try:
+        assert until(lambda: filters == [f"{config.base}/incoming/{topic}" for topic in topics])
+    finally:
+        running.stop()

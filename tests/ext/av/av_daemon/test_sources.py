@@ -1,0 +1,377 @@
+"""Every kind of camera and microphone, with programs that stand in for hardware that is not there."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from pebble.errors import DeviceError
+from pebble.extensions.media.scene import Scene, read_counter
+from pebble.extensions.media.speech import Speech
+from pebble.services.av_daemon import alsa, capture_program, sources
+from pebble.services.av_daemon.alsa import AlsaMicrophone
+from pebble.services.av_daemon.capture_program import CaptureProgram
+from pebble.services.av_daemon.jpeg_splitter import JpegSplitter
+from pebble.services.av_daemon.libcamera import LibcameraCamera
+from pebble.services.av_daemon.source import Capture, Source
+from pebble.services.av_daemon.sources import Rotated
+from pebble.services.av_daemon.synthetic import Pacer, SyntheticCamera, SyntheticMicrophone
+from pebble.services.av_daemon.v4l2 import V4l2Camera
+from pebble.transports.frames import FrameInfo
+from pebble.transports.frames.frame import picture
+from tests.ext.av.av_daemon.av_rig import grabbed, is_speech, options
+from tests.fakes.installed import Installed
+from tests.support import until
+
+SMALL = {"width": 320, "height": 240, "fps": 30}
+
+
+Open = Callable[..., Source]
+
+
+@pytest.fixture
+def rpicam(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Installed:
+    return Installed(monkeypatch, tmp_path, "rpicam-vid", "tests.fakes.fake_rpicam")
+
+
+@pytest.fixture
+def opened() -> Iterator[list[Source]]:
+    """Sources put in here are closed in the end."""
+    sources: list[Source] = []
+    yield sources
+    for source in sources:
+        source.close()
+
+
+@pytest.fixture
+def libcamera(monkeypatch: pytest.MonkeyPatch, rpicam: Installed, opened: list[Source]) -> Open:
+    """Opens one, with a program that behaves as ``fake`` says."""
+
+    def open_(fake: str = "", **video: Any) -> Source:
+        monkeypatch.setenv("FAKE", fake)
+        opened.append(LibcameraCamera(options(video={**SMALL, **video})))
+        return opened[-1]
+
+    return open_
+
+
+@pytest.fixture
+def alsa_microphone(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, opened: list[Source]) -> Open:
+    Installed(monkeypatch, tmp_path, "arecord", "tests.fakes.fake_arecord")
+
+    def open_(fake: str = "", **audio: Any) -> Source:
+        monkeypatch.setenv("FAKE", fake)
+        opened.append(AlsaMicrophone(options(audio=audio)))
+        return opened[-1]
+
+    return open_
+
+
+class TestLibcamera:
+    @pytest.mark.parametrize("form", ["auto", "mjpeg", "raw"])
+    def test_pictures_come_and_their_counter_advances(self, libcamera: Open, form: str) -> None:
+        camera = libcamera(capture_format=form)
+        frames = [grabbed(camera) for _ in range(8)]
+        numbers = [read_counter(picture(data, info)) for info, data in frames]
+        assert None not in numbers
+        assert numbers == sorted(set(numbers))
+        info, data = frames[0]
+        assert (info.width, info.height) == (320, 240)
+        assert (data[:2].tobytes(), data[-2:].tobytes()) == (b"\xff\xd8", b"\xff\xd9")
+        assert (info.format, info.stride) == ("mjpeg", 0), "its own JPEG is passed on as it is"
+
+    @pytest.mark.parametrize("name", ["libcamera", "arducam", "picamera2"])
+    def test_all_its_names_mean_it(self, rpicam: Installed, name: str) -> None:
+        sources.camera(options(video={**SMALL, "backend": name}), 0.0)().close()
+        assert len(rpicam.pids) <= 1
+
+    def test_the_older_program_does_as_well(
+        self, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, opened: list[Source]
+    ) -> None:
+        older = Installed(monkeypatch, tmp_path, "libcamera-vid", "tests.fakes.fake_rpicam")
+        opened.append(LibcameraCamera(options(video=SMALL)))
+        grabbed(opened[0])
+        assert len(older.pids) == 1
+
+    def test_its_complaint_is_the_error(self, libcamera: Open) -> None:
+        with pytest.raises(DeviceError, match=r"rpicam-vid ended: exit code 1 \(ERROR: .* no cameras available"):
+            libcamera("refuses").grab()
+
+    def test_a_wait_can_be_interrupted_and_leaves_no_thread(self, libcamera: Open, rpicam: Installed) -> None:
+        camera = libcamera("quiet")
+        assert until(lambda: rpicam.pids)
+        threading.Timer(0.1, camera.interrupt).start()
+        with pytest.raises(DeviceError, match="signal 9"):
+            camera.grab()
+        camera.close()
+        assert rpicam.gone(rpicam.pids[0])
+
+
+@pytest.mark.parametrize(("opener", "fix"), [(LibcameraCamera, "rpicam-apps"), (AlsaMicrophone, "alsa-utils")])
+def test_a_missing_program_is_named(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, opener: Callable[[Any], Source], fix: str
+) -> None:
+    monkeypatch.setenv("PATH", str(tmp_path))
+    with pytest.raises(DeviceError, match=fix):
+        opener(options(video=SMALL))
+
+
+@pytest.mark.parametrize(
+    ("source", "frames", "hung"), [("libcamera", 5, "rpicam-vid"), ("alsa_microphone", 50, "arecord")]
+)
+def test_silence_is_an_error(
+    request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch, source: str, frames: int, hung: str
+) -> None:
+    monkeypatch.setattr(capture_program, "SILENCE_S", 1.0)
+    device = request.getfixturevalue(source)("hangs")
+    for _ in range(frames):
+        device.grab()
+    with pytest.raises(DeviceError, match=f"{hung} hangs: nothing came for 1 s"):
+        device.grab()
+
+
+class TestCaptureProgram:
+    def test_one_that_does_not_want_to_end_is_killed(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setattr(capture_program, "_STOP_S", 0.2)
+        program = CaptureProgram(["sh", "-c", "trap '' TERM; echo up; while :; do sleep 0.05; done"])
+        assert program.read() == b"up\n"
+        begin = time.monotonic()
+        program.close()
+        assert time.monotonic() - begin < 3
+
+    def test_one_that_cannot_be_started_is_a_link_error(self, tmp_path: Path) -> None:
+        with pytest.raises(DeviceError, match="cannot start nothing"):
+            CaptureProgram([str(tmp_path / "nothing")])
+
+    def test_errors_fill_no_pipe(self) -> None:
+        program = CaptureProgram(["sh", "-c", "yes 'a line of errors' | head -n 100000 >&2; echo done"])
+        assert program.read() == b"done\n"
+        with pytest.raises(DeviceError, match=r"exit code 0 \(a line of errors\)"):
+            program.read()
+        program.close()
+
+
+class TestAlsa:
+    @pytest.mark.parametrize(("rate", "channels"), [(16_000, 1), (44_100, 2)])
+    def test_every_sample_arrives_in_order(
+        self, alsa_microphone: Open, monkeypatch: pytest.MonkeyPatch, rate: int, channels: int
+    ) -> None:
+        monkeypatch.setattr(alsa, "_BEHIND", 1000)  # however busy this machine is
+        microphone = alsa_microphone(rate=rate, channels=channels)
+        frames = [grabbed(microphone) for _ in range(15)]
+        received = np.concatenate([data for _, data in frames]).view(np.int16).reshape(-1, channels)
+        assert np.array_equal(received, Speech(rate, channels).samples(0, len(received)))
+        info, size = frames[0][0], frames[0][1].size
+        assert (info.format, info.rate, info.channels) == ("s16le", rate, channels)
+        assert (
+            size
+            == sources.chunk_bytes(options(audio={"rate": rate, "channels": channels}))
+            == rate // 50 * 2 * channels
+        )
+
+    def test_after_a_delay_it_continues_with_the_present(
+        self, alsa_microphone: Open, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        sound = Speech(16_000).samples(0, 320 * 15)[:, 0].tobytes()
+        program = SimpleNamespace(read=lambda: sound, close=lambda: None)
+        monkeypatch.setattr(alsa, "CaptureProgram", lambda *_, **__: program)
+        capture = alsa_microphone().grab()
+        assert (capture.data, capture.skipped) == (sound[-640:], 14)
+
+
+@pytest.fixture(scope="session")
+def film(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Ten frames of the scene, 320x240."""
+    file = tmp_path_factory.mktemp("film") / "scene.avi"
+    writer = cv2.VideoWriter(str(file), cv2.CAP_OPENCV_MJPEG, cv2.VideoWriter.fourcc(*"MJPG"), 15, (320, 240))
+    scene, out = Scene(320, 240), np.empty((240, 320, 3), np.uint8)
+    for number in range(10):
+        scene.render(number, out)
+        writer.write(out)
+    writer.release()
+    return file
+
+
+class TestOpenCv:
+    def test_a_file_plays_a_camera_and_ends(self, film: Path, opened: list[Source]) -> None:
+        opened.append(V4l2Camera(options(video={"device": str(film)}).video))
+        frames = [grabbed(opened[0]) for _ in range(9)]  # the first was looked at when it was opened
+        assert [read_counter(picture(data, info)) for info, data in frames] == list(range(1, 10))
+        assert frames[0][0].format == "bgr24"
+        assert (frames[0][0].width, frames[0][0].height, frames[0][0].stride) == (320, 240, 960)
+        with pytest.raises(DeviceError, match="gives no picture"):
+            opened[0].grab()
+
+    @pytest.mark.parametrize(
+        "device", ["/dev/video_none", "/nowhere/film.avi", "99", "rtsp://someone:s3cret@127.0.0.1:1/door?key=s3cret"]
+    )
+    def test_what_is_not_there_is_an_error_without_a_password(self, device: str) -> None:
+        with pytest.raises(DeviceError, match="cannot open") as raised:
+            V4l2Camera(options(video={"device": device}).video)
+        assert ("rtsp://127.0.0.1:1/door" in str(raised.value)) is device.startswith("rtsp")
+        assert "s3cret" not in str(raised.value)
+
+    def test_controls_it_does_not_know_are_only_a_warning(
+        self, film: Path, opened: list[Source], caplog: pytest.LogCaptureFixture
+    ) -> None:
+        video = options(video={"device": str(film), "camera_controls": {"wheels": 4, "fourcc": "x"}}).video
+        opened.append(V4l2Camera(video))
+        assert [record.args[1] for record in caplog.records if record.args] == ["wheels", "fourcc"]
+
+
+class Still:
+    """A camera that always sees the same."""
+
+    def __init__(self, info: FrameInfo, data: bytes, *, broken: int = 0) -> None:
+        self._info, self._data, self._broken = info, data, broken
+        self.closed = False
+
+    def grab(self) -> Capture:
+        self._broken -= 1
+        data = b"no picture" if self._broken >= 0 else self._data
+        return Capture(self._info, len(data), data, at_ns=7)
+
+    def close(self) -> None:
+        self.closed = True
+
+    def interrupt(self) -> None: ...
+
+
+class TestRotation:
+    PICTURE = np.arange(4 * 6 * 3, dtype=np.uint8).reshape(4, 6, 3)
+
+    @pytest.mark.parametrize(("degrees", "quarters"), [(90, 1), (180, 2), (270, 3)])
+    def test_it_turns_clockwise(self, degrees: int, quarters: int) -> None:
+        info = FrameInfo(format="bgr24", width=6, height=4, stride=18)
+        info, data = grabbed(Rotated(Still(info, self.PICTURE.tobytes()), degrees))
+        assert np.array_equal(picture(data, info), np.rot90(self.PICTURE, -quarters))
+
+    @pytest.mark.parametrize("degrees", [0, 90, 180, 270])
+    def test_of_the_configured_camera(self, degrees: int) -> None:
+        """Turned back, its counter can be read."""
+        chosen = options(video={**SMALL, "backend": "synthetic", "fps": 500, "rotate_degrees": degrees})
+        info, data = grabbed(sources.camera(chosen, time.monotonic())())
+        assert (info.width, info.height) == ((320, 240) if degrees % 180 == 0 else (240, 320))
+        assert data.size == sources.picture_bytes(chosen)
+        assert read_counter(np.rot90(picture(data, info), degrees // 90)) is not None
+
+    def test_compressed_pictures_become_bgr(self) -> None:
+        scene = np.empty((240, 320, 3), np.uint8)
+        Scene(320, 240).render(77, scene)
+        coded = cv2.imencode(".jpg", scene)[1].tobytes()
+        camera = Rotated(Still(FrameInfo(format="mjpeg", width=320, height=240), coded, broken=3), 180)
+        capture = camera.grab()
+        data = capture.pixels(np.empty(capture.size, np.uint8))
+        assert (capture.info.format, capture.info.stride, capture.skipped) == ("bgr24", 960, 3)
+        assert read_counter(np.rot90(picture(data, capture.info), 2)) == 77
+
+    def test_nothing_but_broken_pictures_is_an_error(self) -> None:
+        camera = Rotated(Still(FrameInfo(format="mjpeg", width=320, height=240), b"", broken=1000), 90)
+        with pytest.raises(DeviceError, match="cannot be decoded"):
+            camera.grab()
+
+
+class TestSynthetic:
+    def test_the_counter_is_the_time_since_the_start(self) -> None:
+        start = time.monotonic() - 100
+        camera = SyntheticCamera(options(video={**SMALL, "fps": 50}).video, start)
+        info, data = grabbed(camera)
+        number = read_counter(picture(data, info))
+        assert number is not None
+        assert 5000 <= number <= (time.monotonic() - start) * 50
+
+    def test_every_chunk_is_the_speech_of_its_time(self) -> None:
+        start = time.monotonic() - 100
+        microphone = SyntheticMicrophone(options().audio, start)
+        captures = [microphone.grab() for _ in range(12)]
+        first = round((captures[0].at_ns / 1e9 - start) * 16_000) - 320  # the sample heard at that time
+        assert is_speech([(capture.at_ns, np.asarray(capture.data).ravel()) for capture in captures], first)
+
+    @pytest.mark.parametrize("source", [SyntheticCamera(options(video={"fps": 0.01}).video, time.monotonic()),
+                                        SyntheticMicrophone(options().audio, time.monotonic())])  # fmt: skip
+    def test_nothing_comes_after_an_interruption(self, source: Source) -> None:
+        threading.Timer(0.05, source.interrupt).start()
+        with pytest.raises(DeviceError):
+            list(iter(source.grab, None))
+
+
+class TestPacer:
+    def paced(self, rate: float, *, behind: int = 0) -> tuple[Pacer, list[float]]:
+        now = [1000.0]
+        return Pacer(rate, behind=behind, start=1000.0, clock=lambda: now[0]), now
+
+    def test_it_does_not_drift(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setattr(threading.Event, "wait", lambda _event, _seconds: False)
+        pacer, now = self.paced(15)
+        for turn in range(1, 15 * 3600):
+            assert pacer.next() == turn
+            now[0] = pacer.due(turn) + 0.01  # the work takes a while
+        assert now[0] == pytest.approx(1000.0 + (15 * 3600 - 1) / 15 + 0.01)
+
+    def test_who_stood_still_goes_on_with_the_present_turn(self) -> None:
+        pacer, now = self.paced(15)
+        pacer.next()
+        now[0] += 10
+        assert (pacer.next(), pacer.skipped) == (150, 148)
+        assert (pacer.next(), pacer.skipped) == (151, 0)
+
+    def test_what_may_be_made_up_for_is(self) -> None:
+        pacer, now = self.paced(50, behind=10)
+        pacer.next()
+        now[0] += 0.2
+        assert [pacer.next() for _ in range(3)] == [2, 3, 4]
+        now[0] += 10
+        assert pacer.next() == 510
+
+    def test_it_keeps_the_rate_by_the_monotonic_clock(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        wall = iter(range(0, 10**9, 3600))
+        monkeypatch.setattr(time, "time", lambda: float(next(wall)))
+        monkeypatch.setattr(time, "time_ns", lambda: next(wall) * 10**9)
+        begin = time.monotonic()
+        pacer = Pacer(100, start=begin)
+        assert [pacer.next() for _ in range(20)][-1] >= 20
+        assert 0.19 <= time.monotonic() - begin < 5
+
+
+class TestJpegSplitter:
+    PICTURES = tuple(
+        cv2.imencode(".jpg", np.full((16, 16, 3), shade, np.uint8))[1].tobytes() for shade in (0, 100, 200)
+    )
+
+    @pytest.mark.parametrize("size", [1, 2, 3, 7, 100, 100_000])
+    def test_pictures_come_out_as_they_went_in(self, size: int) -> None:
+        stream, splitter = b"".join(self.PICTURES), JpegSplitter()
+        got = [found for at in range(0, len(stream), size) for found in splitter.feed(stream[at : at + size])]
+        assert got == list(self.PICTURES)
+
+    def test_a_preview_inside_does_not_end_a_picture(self) -> None:
+        preview = b"\xff\xe1" + (len(self.PICTURES[0]) + 2).to_bytes(2) + self.PICTURES[0]
+        whole = self.PICTURES[1][:2] + preview + self.PICTURES[1][2:]
+        assert JpegSplitter().feed(whole + self.PICTURES[2]) == [whole, self.PICTURES[2]]
+
+    def test_garbage_between_pictures_is_skipped(self) -> None:
+        splitter = JpegSplitter()
+        stream = b"garbage" + self.PICTURES[0] + b"\xff\xd8 no picture \xff" + self.PICTURES[1]
+        assert splitter.feed(stream) == [self.PICTURES[0], self.PICTURES[1]]
+
+    def test_a_picture_without_end_is_given_up(self) -> None:
+        splitter = JpegSplitter(limit=10_000)
+        endless = self.PICTURES[0][:-2]
+        assert splitter.feed(endless + bytes(20_000)) == []
+        assert splitter.feed(self.PICTURES[1]) == [self.PICTURES[1]]
+
+    def test_noise_never_breaks_it(self) -> None:
+        random = np.random.default_rng(3)
+        splitter = JpegSplitter(limit=5000)
+        for _ in range(3000):
+            splitter.feed(random.choice([0xFF, 0xD8, 0xD9, 0xDA, 0xE0, 0, 1], 50).astype(np.uint8).tobytes())
+        splitter.feed(bytes(6000))
+        assert splitter.feed(self.PICTURES[0])[-1:] in ([self.PICTURES[0]], [])

@@ -1,0 +1,123 @@
+"""The camera of a robot in a simulated world, which may not run."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pebble.config.media import CameraCapture
+from pebble.errors import DeviceError, NotRunningError
+from pebble.extensions.lab.simulation.world.pose_page import PosePage, page_path
+from pebble.extensions.lab.simulation.world.poses import RobotPose
+from pebble.extensions.lab.simulation.world.world_file import read_world
+from pebble.services.av_daemon import sources
+from pebble.services.av_daemon.health import Health
+from pebble.services.av_daemon.synthetic import WorldCamera
+from pebble.transports.frames.frame import picture
+from tests.ext.av.av_daemon.av_rig import grabbed, options
+from tests.ext.lab.simulation.world.worlds import CLEAR, projected, tags_in
+
+TAG = {"id": 13, "x": 2.0, "y": 0.0, "yaw_deg": 180}
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    return write(tmp_path / "world.json")
+
+
+def write(path: Path, tag: int = 13, **camera: float) -> Path:
+    world = {"tags": [{**TAG, "id": tag}], "robots": {"goob": {"x": 0, "y": 0}}, "camera": camera}
+    path.write_text(json.dumps(world))
+    return path
+
+
+@pytest.fixture
+def page(path: Path) -> Iterator[PosePage]:
+    running = PosePage(page_path(path), ["goob"])
+    yield running
+    running.close()
+
+
+def stand(page: PosePage, x: float = 0.0, *, ago_s: float = 0.0) -> int:
+    ns = time.monotonic_ns() - round(ago_s * 1e9)
+    page.write(ns, [RobotPose(x, 0.0, 0.0)])
+    return ns
+
+
+def camera_of(path: Path) -> WorldCamera:
+    return WorldCamera(CameraCapture(backend="synthetic", device=f"{path}#goob", fps=200), 0.0)
+
+
+def shows(camera: WorldCamera, path: Path, x: float, ns: int) -> bool:
+    """Whether the tag is where the robot sees it from ``x``, and the picture's time is that of the pose."""
+    info, data = grabbed(camera)
+    off = np.abs(tags_in(picture(data, info))[13] - projected(read_world(path), 13, (x, 0.0, 0.0))).max()
+    return bool(off < 1.0 and camera.grab().at_ns == ns)
+
+
+def test_the_picture_shows_the_tag_and_its_time_is_that_of_the_pose(path: Path, page: PosePage) -> None:
+    stand(page, 0.1)
+    ns = stand(page, 0.5)
+    camera = camera_of(path)
+    assert shows(camera, path, 0.5, ns)
+
+
+def test_latency_shows_an_earlier_pose_with_its_time(path: Path, page: PosePage) -> None:
+    write(path, latency_ms=100.0, **CLEAR)
+    ns = stand(page, 0.5)
+    page.write(ns + 100_000_000, [RobotPose(1.5, 0.0, 0.0)])
+    camera = camera_of(path)
+    assert shows(camera, path, 0.5, ns)
+
+
+def test_a_device_with_a_number_sign_is_a_robot_in_a_world(path: Path, page: PosePage) -> None:
+    stand(page)
+    config = options(video={"backend": "synthetic", "device": f"{path}#goob", "width": 320, "height": 240})
+    info, _ = grabbed(sources.camera(config, 0.0)())
+    assert (info.width, info.height, info.format) == (320, 240, "bgr24")
+
+
+def test_the_error_without_a_world_names_the_command_that_starts_it(path: Path) -> None:
+    with pytest.raises(NotRunningError, match=rf"^the world does not run, start it: pebble sim world {path}$"):
+        camera_of(path)
+
+
+def test_a_world_that_is_silent_is_not_running(path: Path, page: PosePage) -> None:
+    stand(page, ago_s=1.5)
+    with pytest.raises(NotRunningError):
+        camera_of(path)
+
+
+def test_a_world_that_ends_is_not_running(path: Path) -> None:
+    page = PosePage(page_path(path), ["goob"])
+    stand(page)
+    camera = camera_of(path)
+    page.close()
+    with pytest.raises(NotRunningError):
+        camera.grab()
+
+
+@pytest.mark.parametrize(
+    ("device", "problem"),
+    [
+        ("{folder}/none.json#goob", "{folder}/none.json: there is no such file"),
+        ("{folder}/world.json#gob", "{folder}/world.json: there is no robot 'gob', did you mean \"goob\"?"),
+        ("{folder}/world.json#", "'{folder}/world.json#' is no robot of a world, write for example"),
+    ],
+)
+def test_a_wrong_device_is_one_line(path: Path, device: str, problem: str) -> None:
+    wrong = CameraCapture(backend="synthetic", device=device.format(folder=path.parent))
+    with pytest.raises(DeviceError) as caught:
+        WorldCamera(wrong, 0.0)
+    assert str(caught.value).startswith(problem.format(folder=path.parent))
+    assert "\n" not in str(caught.value)
+
+
+def test_a_world_that_is_expected_is_looked_for_without_growing_delays() -> None:
+    health = Health(2.0)
+    assert [health.failed("absent", expected=True) for _ in range(4)] == [2.0, 2.0, 2.0, 2.0]

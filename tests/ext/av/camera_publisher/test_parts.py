@@ -1,0 +1,264 @@
+"""The publisher's small parts: full pictures on request, shapes, rates, and frames that turn bad while looked at."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from fractions import Fraction
+from itertools import product
+from pathlib import Path
+from queue import Empty, Queue
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from pebble.config import parse
+from pebble.errors import PayloadError, PebbleError
+from pebble.extensions.media.decode import VideoDecoder
+from pebble.extensions.media.video import make_encoder
+from pebble.services.camera_publisher import service as module
+from pebble.services.camera_publisher.frame_selector import KeyframeRequests
+from pebble.services.camera_publisher.rate_control import RateController, wire_size
+from pebble.services.camera_publisher.service import CameraPublisher
+from pebble.services.camera_publisher.shape import Shape
+from pebble.transports import Message, QoS
+from pebble.transports.base import Outgoing
+from pebble.transports.counters import Counters
+from pebble.transports.frames import Frame, FrameInfo
+from pebble.transports.memory import MemoryHub, MemoryTransport
+from tests.kit.robot import BASE, ROBOT, Listener, Running
+from tests.support import until
+
+
+class TestKeyframes:
+    def test_requests_are_answered_once_a_second(self) -> None:
+        keyframes, answers = KeyframeRequests(), []
+        for tick in range(300):
+            keyframes.request()
+            if keyframes.due(tick / 100):
+                keyframes.sent(tick / 100)
+                answers.append(tick)
+        assert answers == [0, 100, 200]
+
+    def test_one_full_picture_serves_everybody(self) -> None:
+        keyframes = KeyframeRequests()
+        keyframes.request()
+        keyframes.sent(5.0)  # the encoder made one of its own accord
+        assert not keyframes.due(7.0)
+
+    def test_what_the_sender_needs_is_not_rationed(self) -> None:
+        keyframes = KeyframeRequests()
+        keyframes.sent(1.0)
+        keyframes.require()
+        assert keyframes.due(1.1)
+
+
+def frame(width: int = 64, height: int = 48, form: str = "bgr24") -> Frame:
+    """Red in its upper left quarter, black elsewhere."""
+    picture = np.zeros((height, width, 3), np.uint8)
+    picture[: height // 2, : width // 2] = (0, 0, 255)
+    packed = {"bgr24": np.ravel, "mjpeg": lambda made: cv2.imencode(".jpg", made)[1].reshape(-1), "nv12": _nv12}
+    info = FrameInfo(captured_ns=1, captured_ms=1, format=form, width=width, height=height)
+    return Frame(info, packed[form](picture), shared=False)
+
+
+def _nv12(picture: Any) -> Any:
+    height, width = picture.shape[:2]
+    i420 = cv2.cvtColor(picture, cv2.COLOR_BGR2YUV_I420).reshape(-1)
+    luma, quarter = width * height, width * height // 4
+    chroma = np.stack([i420[luma : luma + quarter], i420[luma + quarter :]], axis=1)
+    return np.concatenate([i420[:luma], chroma.reshape(-1)])
+
+
+def red_corner(picture: Any) -> tuple[bool, bool]:
+    """Where the red quarter is: (in the lower half, in the right half)."""
+    height, width = picture.shape[:2]
+    rows, columns = np.nonzero(picture[:, :, 2] > 128)
+    return bool(rows.mean() > height / 2), bool(columns.mean() > width / 2)
+
+
+@pytest.mark.parametrize("form", ["bgr24", "mjpeg", "nv12"])
+@pytest.mark.parametrize(
+    ("turn", "corner"), [(0, (False, False)), (90, (False, True)), (180, (True, True)), (270, (True, False))]
+)
+def test_pictures_are_turned_clockwise(form: str, turn: int, corner: tuple[bool, bool]) -> None:
+    picture = Shape(None, None, turn).picture(frame(form=form))
+    assert picture.shape == ((48, 64, 3) if turn in (0, 180) else (64, 48, 3))
+    assert red_corner(picture) == corner
+
+
+@pytest.mark.parametrize(
+    ("width", "height", "turn", "part", "size"),
+    [
+        (None, None, 0, "1", (64, 48)),
+        (32, None, 0, "1", (32, 24)),
+        (None, 24, 0, "1", (32, 24)),
+        (40, 40, 0, "1", (40, 40)),
+        (128, None, 0, "1", (128, 96)),
+        (None, None, 0, "1/2", (32, 24)),
+        (32, 24, 0, "3/4", (24, 18)),
+        (24, None, 90, "1", (24, 32)),
+        (None, 32, 270, "1/2", (12, 16)),
+        (1, 1, 0, "1/4", (1, 1)),
+    ],
+)
+@pytest.mark.parametrize("form", ["bgr24", "mjpeg"])
+def test_what_is_sent_has_the_wanted_size(
+    form: str, width: int | None, height: int | None, turn: int, part: str, size: tuple[int, int]
+) -> None:
+    picture = Shape(width, height, turn).picture(frame(form=form), Fraction(part))
+    assert (picture.shape[1], picture.shape[0]) == size
+
+
+FORMS = ("bgr24", "mjpeg", "nv12", "yuyv", "s16le", "", "hdr")
+SIZES = ((64, 48), (0, 0), (-4, 8), (1 << 40, 2))
+
+
+def test_what_is_no_picture_is_refused() -> None:
+    for form, (width, height), size in product(FORMS, SIZES, (0, 1, 1000)):
+        info = FrameInfo(format=form, width=width, height=height)
+        with pytest.raises(PayloadError):
+            Shape(None, None, 0).picture(Frame(info, np.zeros(size, np.uint8), shared=False))
+
+
+class Doubtful(Frame):
+    """A view whose memory was given to another frame while it was looked at."""
+
+    def valid(self) -> bool:
+        return False
+
+
+class Feed(Queue[Frame]):
+    """Stands in for the reader of the camera's frames: it has those that a test puts into it."""
+
+    def __enter__(self) -> Feed:
+        return self
+
+    def __exit__(self, *_: object) -> None: ...
+
+    def read(self, timeout: float) -> Frame | None:
+        try:
+            return self.get(timeout=timeout)
+        except Empty:
+            return None
+
+
+ENDS = ("sent", "overwritten", "failed", "refused")
+
+
+class Bench:
+    """The service in this process, between two networks in memory."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, folder: Path) -> None:
+        self.local, self.remote, self.feed = MemoryHub(), MemoryHub(), Feed()
+        monkeypatch.setattr(module, "remote_transport", lambda _config, name: MemoryTransport(name, self.remote))
+        monkeypatch.setattr(module, "FrameReader", lambda *_, **__: self.feed)
+        config = parse({"robot": {"id": ROBOT}}, folder=folder, env={})
+        self.operator = Listener(MemoryTransport("operator", self.remote))
+        self.robot = Listener(MemoryTransport("client", self.local))
+        self.service = CameraPublisher(config, MemoryTransport("robot", self.local))
+        self._running = Running(self.service)
+        self._captured = 0
+
+    @property
+    def pictures(self) -> list[bytes]:
+        return [message.payload for message in self.operator.on("front-camera")]
+
+    def show(self, kind: type[Frame] = Frame, form: str = "bgr24", data: Any = None) -> None:
+        """A frame, long after the one before it; returns once it has been dealt with."""
+        self._captured += 1
+        times = {"captured_ns": self._captured * 1_000_000_000, "captured_ms": self._captured}
+        before = self._dealt_with()
+        self.feed.put(
+            kind(
+                FrameInfo(format=form, width=64, height=48, **times),
+                frame().data if data is None else data,
+                shared=False,
+            )
+        )
+        assert until(lambda: self._dealt_with() > before)
+
+    def _dealt_with(self) -> int:
+        return sum(self.service.counters[what] for what in ENDS)
+
+    def close(self) -> None:
+        self._running.stop()
+        self.operator.transport.close()
+        self.robot.transport.close()
+
+
+@pytest.fixture
+def bench(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[Bench]:
+    bench = Bench(monkeypatch, tmp_path)
+    yield bench
+    bench.close()
+
+
+@pytest.mark.parametrize(
+    ("kind", "form", "data", "counter"),
+    [(Doubtful, "bgr24", None, "overwritten"), (Frame, "mjpeg", np.zeros(100, np.uint8), "failed")],
+)
+def test_after_a_bad_frame_comes_a_full_picture(
+    bench: Bench, kind: type[Frame], form: str, data: Any, counter: str
+) -> None:
+    decoder = VideoDecoder()
+    for _ in range(2):
+        bench.show()
+    bench.show(kind, form, data)
+    assert bench.service.counters[counter] == 1
+    for _ in range(2):
+        bench.show()
+    assert until(lambda: len(bench.pictures) == 4)
+    pictures = [decoder.feed(payload) for payload in bench.pictures]
+    assert [picture is not None and picture.captured_ms for picture in pictures] == [1, 2, 4, 5]
+    assert [picture is not None and picture.keyframe for picture in pictures][2]
+
+
+def test_without_h264_there_is_a_problem_and_json_is_sent(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    def without_av(name: str, **options: Any) -> Any:
+        if name == "h264":
+            raise PebbleError("h264 needs PyAV")
+        return make_encoder(name, **options)
+
+    monkeypatch.setattr(module, "make_encoder", without_av)
+    bench.show()  # it runs
+    bench.robot.command("front-camera", {"enabled": True, "encoding": "h264"})
+    assert bench.robot.became("media-report/camera_publisher", last_error="h264 needs PyAV", encoding="json")
+    bench.show()
+    assert until(lambda: len(bench.pictures) == 2)
+    assert bench.pictures[-1].startswith(b"{")
+
+
+class Far(MemoryTransport):
+    """Its other end is 0.3 s away, there and back, and takes everything at once."""
+
+    clock = 0.0
+
+    def __init__(self) -> None:
+        super().__init__("publisher", MemoryHub())
+        self._under_way: list[tuple[float, int]] = []
+
+    def _send(self, message: Message, urgent: bool) -> bool:
+        self._under_way.append((self.clock, len(message.payload) + len(message.topic) + 5))  # as MQTT writes it
+        return True
+
+    @property
+    def outgoing(self) -> Outgoing:
+        return Outgoing(sum(size for at, size in self._under_way if self.clock - at < 0.3), 0.3)
+
+
+def test_headers_count_as_bytes_under_way() -> None:
+    """Else a long way would seem slow: of several frames under way the oldest would be taken for unconfirmed."""
+    with Far() as transport:
+        rate, topic = RateController(15, 0.0, lambda: transport.outgoing, Counters()), f"{BASE}/outgoing/front-camera"
+        payload, sent = bytes(5000), 0
+        for turn in range(20 * 50):  # every 20 ms, as the service does
+            transport.clock = now = turn / 50
+            rate.poll(now)
+            if turn * 15 // 50 > (turn - 1) * 15 // 50 and rate.may_encode(now, now):
+                assert transport.publish(topic, payload, qos=QoS.LATEST)
+                rate.sent(wire_size(topic, payload), now)
+                sent += 1
+        assert not str(rate.step)
+        assert sent > 0.95 * 20 * 15

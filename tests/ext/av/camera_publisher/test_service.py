@@ -1,0 +1,167 @@
+"""The camera publisher as its own process: a real writer of frames, real brokers, and an operator who decodes."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack
+from itertools import pairwise
+from types import TracebackType
+from typing import Self
+
+import pytest
+
+from pebble.transports import Message, QoS
+from tests.ext.av.camera_publisher.camera_rig import Camera, Publisher, Seen, Viewer
+from tests.ext.av.media_rig import client
+from tests.support import Broker, until
+from tests.tcp_proxy import SlowTcpProxy
+
+
+@pytest.fixture
+def viewer(remote: Broker) -> Iterator[Viewer]:
+    viewer = Viewer(remote.port)
+    yield viewer
+    viewer.close()
+
+
+def rate_of(pictures: list[Seen]) -> float:
+    """Pictures per second, by when they were captured."""
+    return 1000 * (len(pictures) - 1) / (pictures[-1].captured_ms - pictures[0].captured_ms)
+
+
+def are_what_was_captured(pictures: list[Seen], camera: Camera) -> bool:
+    """Those of full size: a machine that has too much to do reduces them until their number cannot be read."""
+    whole = [picture for picture in pictures if picture.shape == (240, 320, 3)]
+    return bool(whole) and all(picture.number == camera.numbers[picture.captured_ms] for picture in whole)
+
+
+def test_every_form_in_turn_at_the_wanted_rate(local: Broker, remote: Broker, viewer: Viewer) -> None:
+    with Publisher("mqtt", local.port, remote.port, publish_fps=10) as robot, Camera(robot.run_dir, 15) as camera:
+        first = viewer.wait(1)[0]
+        assert (first.encoding, first.keyframe, first.shape) == ("json", True, (240, 320, 3))
+        viewer.wait(61)  # and more of them while the machine has too much to do to keep a camera's beat
+        assert until(lambda: rate_of(viewer.received[-61:]) == pytest.approx(10, rel=0.02), 60), rate_of(
+            viewer.received[-61:]
+        )
+        for encoding in ("pbvd", "h264"):
+            robot.ask(encoding=encoding)
+            viewer.wait_for(encoding)
+            assert {picture.encoding for picture in viewer.wait(10)} == {encoding}
+            assert robot.reported(encoding=encoding, width=320, height=240, running=True)
+        robot.ask(encoding="smoke signals")
+        viewer.wait_for("json")
+        assert until(lambda: robot.reports[-1].rate == pytest.approx(10, abs=0.7), 60)
+        assert are_what_was_captured(viewer.received, camera)
+        assert viewer.decoder.problem == ""
+
+
+def test_a_robot_with_zenoh_inside(local: Broker, remote: Broker, viewer: Viewer) -> None:
+    video = {"encoding": "pbvd", "publish_width": 240, "rotate_degrees": 90}
+    with Publisher("zenoh", local.port, remote.port, **video) as robot, Camera(robot.run_dir, 15) as camera:
+        viewer.wait_for("pbvd")
+        assert viewer.wait(20)[-1].shape == (320, 240, 3)
+        assert robot.reported(encoding="pbvd", running=True, last_error=None)
+        robot.ask(encoding="json")
+        viewer.wait_for("json")
+        assert camera.writer.readers == 1
+
+
+def test_keyframes_on_request_once_a_second(local: Broker, remote: Broker, viewer: Viewer) -> None:
+    with Publisher("mqtt", local.port, remote.port, encoding="h264") as robot, Camera(robot.run_dir, 15):
+        viewer.wait(5)
+
+        def keyframes() -> list[int]:
+            return [picture.captured_ms for picture in viewer.received if picture.keyframe]
+
+        while len(keyframes()) < 4:  # many operators, all of them impatient
+            robot.ask(encoding="h264", keyframe=True)
+            time.sleep(0.05)
+        # by the publisher's clock it is a second; a busy machine captures one late and the next one early
+        assert all(after - before >= 700 for before, after in pairwise(keyframes()[1:]))
+
+
+def test_nothing_is_encoded_while_the_remote_side_is_away(local: Broker, remote: Broker, viewer: Viewer) -> None:
+    with Publisher("mqtt", local.port, remote.port) as robot, Camera(robot.run_dir, 15) as camera:
+        viewer.wait(10)
+        assert camera.writer.wanted
+        remote.kill()
+        assert robot.reported(running=False, doing="rests: the remote side is away")
+        assert until(lambda: robot.reports[-1].last_error)
+        assert until(lambda: not camera.writer.wanted)
+        before = len(viewer.received)
+        remote.start()
+        assert until(lambda: len(viewer.received) > before + 5, 20)
+        assert viewer.received[before].keyframe
+        assert robot.reported(running=True, last_error=None)
+
+
+def test_a_camera_that_gives_nothing_is_reported(local: Broker, remote: Broker, viewer: Viewer) -> None:
+    def complains() -> bool:
+        return bool(robot.reports) and "no frame from the camera" in (robot.reports[-1].last_error or "")
+
+    with Publisher("mqtt", local.port, remote.port) as robot:
+        assert until(complains, 15)
+        assert robot.reports[-1].doing == "waits for the camera"
+        for _ in range(2):  # the second after a restart of the camera's program
+            with Camera(robot.run_dir, 15):
+                viewer.wait(5)
+        assert until(complains, 15)
+
+
+def worst_age_ms(pictures: list[Seen]) -> int:
+    return max(picture.arrived_ms - picture.captured_ms for picture in pictures)
+
+
+@pytest.mark.thorough
+def test_a_slow_connection_gets_recent_pictures_and_delays_nothing_else(
+    local: Broker, remote: Broker, viewer: Viewer
+) -> None:
+    with ExitStack() as ends:
+        link = ends.enter_context(SlowTcpProxy(remote.port, kbits=256))
+        delays = ends.enter_context(Control(link.port, remote.port))
+        robot = ends.enter_context(Publisher("mqtt", local.port, link.port, publish_fps=10))
+        camera = ends.enter_context(Camera(robot.run_dir, 15, (640, 480)))
+        assert until(lambda: robot.reports and robot.reports[-1].reduced is not None, 15)
+        pictures = viewer.wait(80)
+        assert worst_age_ms(viewer.received) < 1500
+        assert worst_age_ms(pictures[-60:]) < 800
+        assert until(lambda: rate_of(viewer.received[-60:]) > 8, 60)
+        assert delays.worst_s() < 0.5
+        assert link.passed * 8 / 256_000 > 2  # it was in use
+        link.kbits = 20_000
+        assert robot.reported(reduced=None, timeout=60)
+        assert camera.writer.readers == 1
+
+
+class Control:
+    """Another sender, which shares the link: small messages, and how long each takes."""
+
+    def __init__(self, link_port: int, broker_port: int) -> None:
+        self._far, self._near = client("control-far", broker_port), client("control-near", link_port)
+        self._delays: list[float] = []
+        self._stopping = threading.Event()
+        self._far.subscribe("control", self._on_message, qos=QoS.LATEST)
+        self._thread = threading.Thread(target=self._run, daemon=True)
+
+    def __enter__(self) -> Self:
+        self._thread.start()
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, tb: TracebackType | None) -> None:
+        self._stopping.set()
+        self._thread.join(5)
+        self._near.close()
+        self._far.close()
+
+    def worst_s(self) -> float:
+        assert len(self._delays) > 50
+        return max(self._delays)
+
+    def _on_message(self, message: Message) -> None:
+        self._delays.append(time.monotonic() - float(message.payload))
+
+    def _run(self) -> None:
+        while not self._stopping.wait(0.05):
+            self._near.publish("control", str(time.monotonic()).encode())

@@ -1,0 +1,426 @@
+"""The bridge of a self-describing MCU, on every transport and a real pty: topics, commands, plugging in and out."""
+
+from __future__ import annotations
+
+import logging
+import os
+import random
+import time
+from contextlib import suppress
+
+import pytest
+
+from pebble.runtime import notes
+from pebble.runtime.parent import NOTIFY_FD
+from pebble.services.serial_mcu_bridge.devices import imu, peers
+from pebble.services.serial_mcu_bridge.pebble_serial_v1 import host
+from pebble.services.serial_mcu_bridge.pebble_serial_v1.host import SILENCE_S
+from pebble.transports import QoS
+from tests.ext.boards import mcu_wire as wire
+from tests.ext.boards.mcu_wire import IMU, LAMP, STATION, F, I, M
+from tests.ext.boards.test_pebble_serial_hostile import ATTACKS
+from tests.kit.board import SerialRig, motion, summary
+from tests.support import cases, until
+
+
+def test_the_launcher_is_notified_of_outlets_while_they_are_in_use(
+    memory_rig: SerialRig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pipe, end = os.pipe()
+    monkeypatch.setenv(NOTIFY_FD, str(end))
+    os.set_blocking(pipe, False)
+    mcu, written = memory_rig.mcu(STATION), bytearray()
+    memory_rig.bridge()
+    features = sorted(f"outlets/o{number}/{what}" for number in range(1, 5) for what in ("status", "power"))
+
+    def notified(has: bool) -> bool:
+        with suppress(BlockingIOError):
+            written.extend(os.read(pipe, 10_000))
+        received = [note for note in map(notes.decode, written.splitlines()) if not isinstance(note, notes.Mcu)]
+        return received == [notes.Feature(feature, has) for feature in features]
+
+    assert until(lambda: notified(True))
+    written.clear()
+    mcu.unplug()
+    assert until(lambda: notified(False))
+    memory_rig.close()
+    os.close(pipe)
+    os.close(end)
+
+
+@pytest.mark.alone
+def test_it_is_found_within_two_seconds_and_publishes_its_manifest(rig: SerialRig) -> None:
+    mcu = rig.mcu(IMU, plugged=False, sends_hello=False)
+    rig.bridge()
+    time.sleep(0.5)  # the port is absent at first
+    mcu.stream(100, motion())
+    mcu.plug()
+    rig.described("goob-imu-nano")
+    assert rig.got("sensors/imu-fast")
+    assert rig.world.first("mcu/goob-imu-nano/describe") - mcu.plugged_at < 2
+    assert rig.world.first("mcu/goob-imu-nano/imu_fast") - mcu.plugged_at < 2
+    assert rig.world.first("sensors/imu-fast") - mcu.plugged_at < 2
+    (described,) = rig.world.payloads("mcu/goob-imu-nano/describe")
+    assert described["schema_hash"] == "goob-imu-v2"
+    assert rig.world.received[0].topic == f"{rig.base}/outgoing/mcu/goob-imu-nano/local-only"
+    late = rig.listener("late")
+    assert until(lambda: late.on("mcu/goob-imu-nano/describe"))
+    assert late.on("mcu/goob-imu-nano/describe")[0].retain
+
+
+@pytest.mark.alone
+def test_a_hundred_samples_a_second_without_loss(rig: SerialRig) -> None:
+    mcu, _ = rig.up(IMU)
+    mcu.stream(100, motion())
+    seconds = cases(2, 5)
+    time.sleep(seconds)
+    mcu.silent = True
+    assert until(lambda: len(rig.world.on("sensors/imu-fast")) == mcu.samples_sent)
+    assert mcu.samples_sent >= 90 * seconds
+    for metric in ("mcu/goob-imu-nano/imu_fast", "sensors/imu-fast"):
+        assert [body["seq"] for body in rig.world.payloads(metric)] == list(range(1, mcu.samples_sent + 1))
+
+
+def test_the_bodies_of_an_inertial_sensor(memory_rig: SerialRig) -> None:
+    mcu, _ = memory_rig.up(IMU)
+    began = time.time_ns() // 1_000_000
+    mcu.send(wire.frame(wire.STATE, summary(), 2, 7, 700))  # a summary before the first motion is not published
+    mcu.send(wire.frame(wire.SAMPLE, motion(), 1, 8, 800), wire.frame(wire.STATE, summary(), 2, 9, 900))
+    assert memory_rig.got("sensors/imu")
+    (fast,), (slow,) = memory_rig.world.payloads("sensors/imu-fast"), memory_rig.world.payloads("sensors/imu")
+    assert list(fast) == ["t", "seq", "mcu_ms", "value"]
+    assert (fast["seq"], fast["mcu_ms"]) == (8, 800)
+    assert 0 <= fast["t"] - began < 5000
+    fast_value = {
+        "accel_mps2": {"x": 9.807, "y": -0.02, "z": 0.003},
+        "gyro_dps": {"x": 1.0, "y": -1.0, "z": 0.01},
+        "temp_c": 25.12,
+        "orientation_deg": {"roll": 0.33, "pitch": -0.07},
+    }
+    assert fast["value"] == fast_value
+    assert slow["value"] == {
+        **fast_value,
+        "accel_norm_g": 1.001,
+        "gyro_bias_dps": {"x": 0.05, "y": -0.06, "z": 0.07},
+        "health": {
+            "device": str(memory_rig.folder / "one"),
+            "protocol": "pebble_serial_v1",
+            "instance": "one",
+            "samples_ok": 1000,
+            "samples_error": 2,
+            "calibration_samples": 200,
+        },
+    }
+    first, second = memory_rig.world.payloads("mcu/goob-imu-nano/imu")
+    assert (first["seq"], second["seq"]) == (7, 9)
+    generic = memory_rig.world.payloads("mcu/goob-imu-nano/imu_fast")[0]
+    assert list(generic) == ["t", "seq", "mcu_ms", "device_uid", "interface", "profile", "value"]
+    assert (generic["device_uid"], generic["interface"], generic["profile"]) == (
+        "goob-imu-nano", "imu_fast", "imu.motion.v1",
+    )  # fmt: skip
+    assert generic["value"]["ax"] == 9.807
+    out = f"{memory_rig.base}/outgoing/"
+    qos = {m.topic.removeprefix(out): (int(m.qos), m.retain_requested) for m in memory_rig.world.received}
+    assert qos["mcu/goob-imu-nano/imu_fast"] == qos["sensors/imu-fast"] == (0, False)
+    assert qos["mcu/goob-imu-nano/imu"] == qos["sensors/imu"] == (1, False)
+    assert qos["mcu/goob-imu-nano/describe"] == (1, True)
+
+
+def test_qos_and_retain_follow_the_interface(rig: SerialRig) -> None:
+    mcu, _ = rig.up(LAMP)
+    mcu.send(wire.frame(wire.STATE, b"\x0b", 2), wire.frame(wire.STATE, b"\1", 3), wire.frame(wire.SAMPLE, bytes(4), 4))
+    assert rig.got("mcu/lamp-1/glow")
+    assert rig.values("lights/lamp") == [{"level": 5.5}]
+    late = rig.listener("late")
+    assert until(lambda: len(late.received) >= 4)
+    time.sleep(0.2)
+    assert sorted(m.topic.removeprefix(f"{rig.base}/outgoing/") for m in late.received) == [
+        "lights/lamp", "mcu/lamp-1/describe", "mcu/lamp-1/lamp", "mcu/lamp-1/local-only",
+    ]  # fmt: skip
+    assert {int(m.qos) for m in rig.world.on("mcu/lamp-1/button") + rig.world.on("lights/lamp")} == {1}
+    assert {int(m.qos) for m in rig.world.on("mcu/lamp-1/glow")} == {0}
+
+
+def test_a_state_that_is_sent_only_once_is_not_lost(rig: SerialRig) -> None:
+    """A state right after the manifest arrives before the uid and the alias are known to be free."""
+    mcu = rig.mcu(LAMP, plugged=False)
+    mcu.after_describing = wire.frame(wire.STATE, b"\x0a", 2) + wire.frame(wire.STATE, b"\x0b", 2)
+    rig.bridge()
+    mcu.plug()
+    assert rig.got("lights/lamp")
+    for metric in ("mcu/lamp-1/lamp", "lights/lamp"):
+        assert rig.values(metric) == [{"level": 5.5}]
+
+
+# -- commands
+
+
+def test_a_command_reaches_the_mcu(rig: SerialRig) -> None:
+    mcu, _ = rig.up(LAMP)
+    rig.world.command("mcu/lamp-1/lamp", {"level": 40, "on": True})
+    rig.world.command("lights/lamp", {"value": {"level": 40, "on": True}})
+    assert until(lambda: len(mcu.commands()) == 2)
+    for command in mcu.commands():
+        assert (command.interface, command.payload) == (1, b"\x50\x01")
+        assert command.ms == pytest.approx(time.time() * 1000 % 2**32, abs=5000)
+
+
+def test_what_does_not_fit_never_reaches_the_mcu(memory_rig: SerialRig, caplog: pytest.LogCaptureFixture) -> None:
+    mcu, running = memory_rig.up(LAMP)
+    caplog.set_level(logging.WARNING)
+    bad = [{"level": 10}, {"level": 200, "on": True}, {"level": 1, "on": "false"}, {"level": 1, "on": 1},
+           {"level": "5", "on": True}, [], 5, None, True, b"\xff", b"{", b"[" * 40_000]  # fmt: skip
+    for body in bad:
+        memory_rig.world.command("mcu/lamp-1/lamp", body)
+    memory_rig.world.command("mcu/lamp-1/lamp", {"level": 0, "on": False})
+    assert mcu.obeyed() == [(1, b"\0\0")]
+    assert running.service.counters["refused"] == len(bad)
+    assert "lamp: on is missing" in caplog.text
+
+
+def test_a_retained_command_is_refused(rig: SerialRig) -> None:
+    mcu = rig.mcu(LAMP)
+    rig.world.command("mcu/lamp-1/lamp", {"level": 40, "on": True}, retain=True)
+    rig.world.command("lights/lamp", {"level": 40, "on": True}, retain=True)
+    running = rig.bridge()
+    rig.described("lamp-1")
+    assert until(lambda: running.service.counters["stale"] == 2)
+    rig.world.command("lights/lamp", {"level": 1, "on": False})
+    assert mcu.obeyed() == [(1, b"\2\0")]
+
+
+def test_answers_are_logged(memory_rig: SerialRig, caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level(logging.DEBUG)
+    mcu, _ = memory_rig.up(STATION)
+    memory_rig.world.command("mcu/hs105-sta/o1_set", {"on": True})
+    assert until(lambda: "o1_set: command 2 accepted" in caplog.text)
+    mcu.answers = lambda received: wire.frame(wire.NACK, b"slot_unconfigured", received.interface, received.sequence)
+    memory_rig.world.command("mcu/hs105-sta/o4_set", {"on": True})
+    assert until(lambda: "o4_set: the MCU refuses command 3: slot_unconfigured" in caplog.text)
+    (warning,) = [record for record in caplog.records if "refuses" in record.getMessage()]
+    assert warning.levelno == logging.WARNING
+
+
+def test_many_commands_at_once_all_arrive_unless_they_are_far_too_many(memory_rig: SerialRig) -> None:
+    mcu, _ = memory_rig.up(STATION)
+    for number in range(4):
+        memory_rig.world.command(f"mcu/hs105-sta/o{number + 1}_set", {"on": True})
+        memory_rig.world.command(f"mcu/hs105-sta/o{number + 1}_set", {"on": False})
+    assert mcu.obeyed(8) == [(interface, payload) for interface in (1, 3, 5, 7) for payload in (b"\1", b"\0")]
+
+
+# -- plugging in and out, restarts and new firmware
+
+
+@pytest.mark.alone
+def test_an_unplugged_device_is_cleared_and_a_replugged_one_is_requested_again(rig: SerialRig) -> None:
+    mcu = rig.mcu(LAMP, sends_hello=False)
+    running = rig.bridge()
+    rig.described("lamp-1")
+    assert rig.claimed()
+    mcu.send(wire.frame(wire.STATE, b"\x0b", 2))
+    assert rig.got("lights/lamp")
+    mcu.unplug()
+    assert rig.cleared("mcu/lamp-1/describe", "mcu/lamp-1/lamp", "lights/lamp")
+    late = rig.listener("late")
+    time.sleep(0.3)
+    assert late.received == []
+    rig.world.command("mcu/lamp-1/lamp", {"level": 40, "on": True})
+    assert until(lambda: running.service.counters["no_device"] == 1)
+    asked = mcu.asked()
+    mcu.plug()
+    rig.described("lamp-1")
+    assert rig.world.at[-1] - mcu.plugged_at < 2
+    assert mcu.asked() > asked
+    assert rig.claimed()
+    rig.world.command("lights/lamp", {"level": 40, "on": True})
+    assert len(mcu.obeyed()) == 1, "the command sent while it was unplugged was dropped"
+
+
+def test_a_known_device_is_usable_after_its_hello(memory_rig: SerialRig, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(host, "ASK_AFTER_OPENING_S", 60.0)  # until then only a HELLO causes a request
+    mcu, _ = memory_rig.up(LAMP)
+    asked = mcu.asked()
+    mcu.unplug()
+    assert memory_rig.cleared("mcu/lamp-1/describe")
+    mcu.plug()
+    memory_rig.described("lamp-1")
+    assert mcu.asked() == asked
+
+
+def test_a_partial_frame_of_an_earlier_host_does_not_damage_the_first_command(
+    memory_rig: SerialRig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    mcu, running = memory_rig.up(LAMP)
+    mcu.unplug()
+    assert memory_rig.cleared("mcu/lamp-1/describe")
+    monkeypatch.setattr(host, "ASK_AFTER_OPENING_S", 60.0)  # the command is the first frame after opening
+    mcu.half = wire.frame(wire.CMD, b"\x50\x01", 1, 7)[:9]
+    mcu.plug()
+    memory_rig.described("lamp-1")
+    asked = mcu.asked()
+    memory_rig.world.command("mcu/lamp-1/lamp", {"level": 40, "on": True})
+    assert mcu.obeyed()
+    assert mcu.asked() == asked
+    assert running.service.counters["unanswered"] == 0
+
+
+def test_another_device_at_the_same_line(memory_rig: SerialRig) -> None:
+    mcu, _ = memory_rig.up(LAMP)
+    mcu.unplug()
+    mcu.manifest = LAMP.but(uid="lamp-2", hash="other")
+    mcu.plug()
+    memory_rig.described("lamp-2")
+    assert until(lambda: memory_rig.world.newest_raw("mcu/lamp-1/describe") == [])
+    memory_rig.world.command("mcu/lamp-1/lamp", {"level": 40, "on": True})
+    memory_rig.world.command("mcu/lamp-2/lamp", {"level": 1, "on": True})
+    assert mcu.obeyed() == [(1, b"\2\1")]
+
+
+def test_new_firmware_while_it_runs(rig: SerialRig) -> None:
+    mcu, _ = rig.up(LAMP)
+    mcu.send(wire.frame(wire.STATE, b"\x0b", 2))
+    assert rig.got("lights/lamp")
+    renumbered = tuple(I(**{**vars(one), "id": one.id + 10, "channel": ""}) for one in LAMP.interfaces)
+    mcu.manifest = LAMP.but(interfaces=renumbered, hash="h2")
+    mcu.send(wire.frame(wire.HELLO, mcu.manifest.hello()))
+    assert until(lambda: [body["schema_hash"] for body in rig.world.payloads("mcu/lamp-1/describe")] == ["h1", "h2"], 3)
+    assert rig.cleared("lights/lamp")
+    assert rig.claimed()
+    rig.world.command("lights/lamp", {"level": 40, "on": True})
+    rig.world.command("mcu/lamp-1/lamp", {"level": 1, "on": True})
+    assert [interface for interface, _ in mcu.obeyed()] == [11]
+    mcu.send(wire.frame(wire.STATE, b"\x0c", 2), wire.frame(wire.STATE, b"\x0d", 12))
+    assert until(lambda: len(rig.world.payloads("mcu/lamp-1/lamp")) == 2)
+    assert rig.world.payloads("mcu/lamp-1/lamp")[-1]["value"] == {"level": 6.5}
+
+
+def test_a_stopping_bridge_clears_its_retained_messages(rig: SerialRig) -> None:
+    mcu, running = rig.up(LAMP)
+    mcu.send(wire.frame(wire.STATE, b"\x0b", 2))
+    assert rig.got("mcu/lamp-1/lamp")
+    running.stop()
+    assert rig.cleared("mcu/lamp-1/describe", "mcu/lamp-1/lamp")
+
+
+def test_a_stale_manifest_of_a_killed_bridge_is_cleared_by_the_next(
+    rig: SerialRig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The device was removed while no bridge was running."""
+    monkeypatch.setattr(peers, "CONFIRM_S", 1.5)
+    left = rig.network.client("killed").open(10)
+    manifest = b'{"protocol":"pebble_serial_v1","schema_version":1,"interface_count":0,"schema_hash":"h",' \
+               b'"device_uid":"ghost","firmware_version":"1","model":"m","interfaces":[]}'  # fmt: skip
+    left.publish(f"{rig.base}/outgoing/mcu/ghost/describe", manifest, qos=1, retain=True)  # type: ignore[arg-type]
+    rig.described("ghost")
+    left.close()
+    rig.mcu(LAMP)
+    rig.bridge()
+    rig.described("lamp-1")
+    assert rig.world.newest_raw("mcu/ghost/describe")
+    assert rig.cleared("mcu/ghost/describe")
+    assert rig.world.newest_raw("mcu/lamp-1/describe")
+
+
+def test_invalid_messages_about_other_devices_do_not_stop_the_bridge(rig: SerialRig) -> None:
+    stranger = rig.network.client("stranger").open(10)
+    odd = b'{"protocol":"pebble_serial_v1","schema_version":1,"interface_count":1,"schema_hash":"h",' \
+          b'"device_uid":"odd","firmware_version":"1","model":"m","interfaces":[{"name":"a","channel":"sensors/imu",' \
+          b'"profile":"imu.summary.v1","encoding":{"fields":5}}]}'  # fmt: skip
+    stranger.publish(f"{rig.base}/outgoing/mcu/odd/describe", odd, qos=QoS.DELIVERED, retain=True)
+    stranger.publish(f"{rig.base}/outgoing/mcu//describe", odd, qos=QoS.DELIVERED, retain=True)
+    rig.described("odd")
+    rig.mcu(LAMP)
+    running = rig.bridge()
+    rig.described("lamp-1")
+    stranger.publish(f"{rig.base}/incoming/mcu//describe", b'{"from": "x"}', qos=QoS.DELIVERED)
+    stranger.publish(f"{rig.base}/incoming/mcu/lamp-1/describe", b'{"from": {"x": [1]}, "has": 3}', qos=QoS.DELIVERED)
+    rig.world.command("mcu/lamp-1/lamp", {"level": 40, "on": True})
+    assert until(rig.mcus["one"].commands)
+    assert running.alive
+    assert running.service.counters["refused"] == 2
+    assert running.service.transport.counters["handler_errors"] == running.service.counters["handler_errors"] == 0
+    stranger.close()
+
+
+def test_garbage_on_the_line_does_not_stop_the_bridge(memory_rig: SerialRig) -> None:
+    mcu, running = memory_rig.up(LAMP)
+    mcu.send(b"Arduino says hello\r\n" * 50, b"\0", wire.frame(wire.HELLO, M(b"\xff").hello()))
+    mcu.send(wire.frame(wire.DESCRIBE, b"\xff" * 40), wire.frame(wire.STATE, b"\x0b", 2)[:-3], b"\0")
+    mcu.send(wire.frame(wire.STATE, b"\x0b", 2))
+    assert memory_rig.got("mcu/lamp-1/lamp")
+    counters = running.service.counters
+    assert (counters["hello"], counters["describe"]) == (1, 1)
+    assert counters["stuffing"] + counters["crc"] >= 1
+
+
+def test_thousands_of_hostile_frames_do_not_stop_the_bridge(memory_rig: SerialRig) -> None:
+    mcu, running = memory_rig.up(STATION)
+    chance = random.Random(8)
+    for _ in range(cases(40, 200)):
+        mcu.pour(b"".join(chance.choice(ATTACKS)(chance) for _ in range(100)))
+    before = len(memory_rig.world.on("mcu/hs105-sta/o1_state"))
+
+    def understood() -> bool:
+        mcu.pour(b"\0" + wire.frame(wire.DESCRIBE, STATION.describe()) + wire.frame(wire.STATE, b"\1\0\1", 2))
+        return len(memory_rig.world.on("mcu/hs105-sta/o1_state")) > before
+
+    assert until(understood, 10, step=0.1)
+    assert running.alive
+    assert running.service.counters["crc"] > 100
+
+
+# -- health
+
+
+@pytest.mark.alone
+def test_a_silent_inertial_sensor_ends_the_process(memory_rig: SerialRig, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(imu, "TIMEOUT_S", 1.0)
+    mcu = memory_rig.mcu(IMU)
+    running = memory_rig.bridge(log_level="INFO")
+    mcu.stream(100, motion())
+    assert memory_rig.got("sensors/imu-fast")
+    time.sleep(1.2)
+    assert running.alive
+    mcu.silent = True
+    stopped = time.monotonic()
+    assert until(lambda: not running.alive, 5)
+    assert 0.9 < time.monotonic() - stopped < 2.5
+    assert str(running.error) == "no sample for 1 s"
+    assert memory_rig.world.newest_raw("mcu/goob-imu-nano/describe") == []
+
+
+@pytest.mark.parametrize(("manifest", "timeout_s"), [(STATION, 0), (IMU, 5)])
+def test_only_an_inertial_sensor_must_not_be_silent(memory_rig: SerialRig, manifest: M, timeout_s: float) -> None:
+    _, running = memory_rig.up(manifest)
+    assert running.service.watchdog.timeout_s == timeout_s < SILENCE_S  # type: ignore[attr-defined]
+
+
+def test_an_absent_sensor_is_waited_for(memory_rig: SerialRig, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(imu, "TIMEOUT_S", 0.5)
+    mcu = memory_rig.mcu(IMU)
+    running = memory_rig.bridge()
+    mcu.stream(100, motion())
+    assert memory_rig.got("sensors/imu-fast")
+    mcu.unplug()
+    time.sleep(1.0)
+    assert running.alive
+    mcu.plug()
+    memory_rig.described("goob-imu-nano")
+
+
+def test_a_refused_alias_is_logged_and_its_interface_still_works(
+    memory_rig: SerialRig, caplog: pytest.LogCaptureFixture
+) -> None:
+    rogue = M("rogue", (
+        I(1, "drive", wire.IN, wire.KIND_COMMAND, (F("x", wire.I8),), "drive-values"),
+        I(2, "reboot", wire.OUT, wire.KIND_STATE, (F("v", wire.U8),), "online", "", wire.RETAIN),
+    ))  # fmt: skip
+    mcu, _ = memory_rig.up(rogue)
+    mcu.send(wire.frame(wire.STATE, b"\1", 2))
+    assert memory_rig.got("mcu/rogue/reboot")
+    memory_rig.world.command("drive-values", {"x": 1, "z": 0})
+    memory_rig.world.command("mcu/rogue/drive", {"x": 5})
+    assert mcu.obeyed() == [(1, b"\5")]
+    assert memory_rig.world.on("online") == []
+    assert "rogue: no alias for drive: incoming/drive-values: the channel is the robot's own" in caplog.text

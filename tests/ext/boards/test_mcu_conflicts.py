@@ -1,0 +1,193 @@
+"""Two devices with one channel: neither gets it. Two with one uid: the first gets it. On every transport."""
+
+from __future__ import annotations
+
+import logging
+import time
+from contextlib import closing
+from pathlib import Path
+
+import msgspec
+import pytest
+
+from pebble.services.serial_mcu_bridge.pebble_serial_v1.manifest import parse_describe
+from pebble.transports import QoS, State
+from tests.ext.boards import mcu_wire as wire
+from tests.ext.boards.mcu_wire import IMU, LAMP, M, Received
+from tests.kit.board import SerialRig, motion
+from tests.support import until
+
+
+def imu(uid: str) -> M:
+    return IMU.but(uid=uid)
+
+
+def test_a_channel_that_two_claim_is_unused_until_one_leaves(rig: SerialRig, caplog: pytest.LogCaptureFixture) -> None:
+    one, two = rig.mcu(imu("imu-1"), "one"), rig.mcu(imu("imu-2"), "two", plugged=False)
+    rig.bridge("one")
+    rig.bridge("two")
+    one.stream(50, motion(1000))
+    two.stream(50, motion(2000))
+    assert rig.got("sensors/imu-fast")
+    caplog.set_level(logging.INFO)
+    two.plug()
+    assert rig.got("mcu/imu-2/imu_fast")
+    time.sleep(0.1)
+    before = len(rig.world.on("sensors/imu-fast"))
+    generic = len(rig.world.on("mcu/imu-1/imu_fast")), len(rig.world.on("mcu/imu-2/imu_fast"))
+    time.sleep(0.5)
+    assert len(rig.world.on("sensors/imu-fast")) == before
+    assert {body["value"]["accel_mps2"]["x"] for body in rig.world.payloads("sensors/imu-fast")} == {1.0}
+    assert len(rig.world.on("mcu/imu-1/imu_fast")) > generic[0] + 15
+    assert len(rig.world.on("mcu/imu-2/imu_fast")) > generic[1] + 15
+    warnings = [record.getMessage() for record in caplog.records if "both claim" in record.getMessage()]
+    for claim in ("outgoing/sensors/imu-fast", "outgoing/sensors/imu"):
+        warned = sorted(text for text in warnings if f"claim {claim}:" in text)
+        assert [text.partition(" both")[0] for text in warned] == ["imu-1 and imu-2", "imu-2 and imu-1"]
+    one.unplug()
+    assert until(
+        lambda: 2.0 in {body["value"]["accel_mps2"]["x"] for body in rig.world.payloads("sensors/imu-fast")}, 3
+    )
+    assert "imu-2: outgoing/sensors/imu-fast is in use again" in caplog.text
+
+
+def test_of_two_that_start_together_neither_publishes_under_the_alias(rig: SerialRig) -> None:
+    one, two = rig.mcu(imu("imu-1"), "one"), rig.mcu(imu("imu-2"), "two")
+    rig.bridge("one")
+    rig.bridge("two")
+    one.stream(50, motion(1000))
+    two.stream(50, motion(2000))
+    assert rig.got("mcu/imu-1/imu_fast")
+    assert rig.got("mcu/imu-2/imu_fast")
+    time.sleep(0.6)  # longer than the asking and the claiming take
+    assert rig.world.on("sensors/imu-fast") == []
+
+
+def test_of_two_that_claim_one_channel_that_of_the_config_has_it(
+    memory_rig: SerialRig, caplog: pytest.LogCaptureFixture
+) -> None:
+    one, two = memory_rig.mcu(imu("imu-1"), "one"), memory_rig.mcu(imu("imu-2"), "two", plugged=False)
+    caplog.set_level(logging.INFO)
+    for name in ("one", "two"):
+        memory_rig.bridge(name, aliases={"sensors/imu-fast": "imu-2"})
+    one.stream(50, motion(1000))
+    two.stream(50, motion(2000))
+    assert memory_rig.got("mcu/imu-1/imu_fast")
+    assert until(lambda: "imu-1: outgoing/sensors/imu-fast is imu-2's by the config" in caplog.text)
+    time.sleep(0.5)
+    assert memory_rig.world.on("sensors/imu-fast") == [], "nor before it is plugged in"
+    two.plug()
+    assert memory_rig.got("sensors/imu-fast")
+    assert {body["value"]["accel_mps2"]["x"] for body in memory_rig.world.payloads("sensors/imu-fast")} == {2.0}
+    assert not [text for text in caplog.messages if "claim outgoing/sensors/imu-fast" in text]
+
+
+def test_a_contested_state_is_not_retained_and_a_contested_command_moves_nothing(rig: SerialRig) -> None:
+    one, two = rig.mcu(LAMP, "one"), rig.mcu(LAMP.but(uid="lamp-2"), "two", plugged=False)
+    rig.bridge("one")
+    second = rig.bridge("two")
+    rig.described("lamp-1")
+    assert rig.claimed()
+    one.send(wire.frame(wire.STATE, b"\x0b", 2))
+    assert rig.got("lights/lamp")
+    two.plug()
+    assert rig.cleared("lights/lamp")
+    assert rig.world.newest_raw("mcu/lamp-1/lamp")
+    rig.world.command("lights/lamp", {"level": 40, "on": True})
+    rig.world.command("mcu/lamp-2/lamp", {"level": 1, "on": True})
+    assert until(two.commands)
+    assert (one.commands(), [command.payload for command in two.commands()]) == ([], [b"\2\1"])
+    second.stop()
+
+    def obeys() -> list[Received]:
+        """That the alias is in use again is not announced."""
+        rig.world.command("lights/lamp", {"level": 40, "on": True})
+        return one.commands()
+
+    assert until(obeys, step=0.1)
+
+
+def test_the_first_of_two_devices_with_one_uid_gets_it(rig: SerialRig, caplog: pytest.LogCaptureFixture) -> None:
+    one, two = rig.mcu(IMU, "one"), rig.mcu(IMU, "two")
+    one.stream(50, motion(1000))
+    two.stream(50, motion(2000))
+    rig.bridge("one")
+    rig.bridge("two")
+    assert rig.got("sensors/imu-fast")
+    time.sleep(0.6)
+    received = {body["value"]["accel_mps2"]["x"] for body in rig.world.payloads("sensors/imu-fast")}
+    generic = {body["value"]["ax"] for body in rig.world.payloads("mcu/goob-imu-nano/imu_fast")}
+    assert len(received) == len(generic) == 1
+    assert "goob-imu-nano: another device has this uid already" in caplog.text
+    (one if received == {1.0} else two).unplug()
+    other = {1.0, 2.0} - received
+    assert until(
+        lambda: other <= {body["value"]["accel_mps2"]["x"] for body in rig.world.payloads("sensors/imu-fast")}, 3
+    )
+
+
+def test_one_uid_twice_while_the_broker_is_down(tmp_path: Path) -> None:
+    """Without a broker both acquire the uid. Afterwards one releases it, and the other's messages are retained."""
+    with closing(SerialRig("mqtt", tmp_path)) as rig:
+        lines = {}
+        for name, level in (("one", b"\x0a"), ("two", b"\x14")):
+            rig.mcu(LAMP, name, plugged=False).after_describing = wire.frame(wire.STATE, level, 2)
+            lines[level[0] / 2] = rig.bridge(name).service
+
+        def holders() -> list[float]:
+            return [level for level, service in lines.items() if service.device is not None]  # type: ignore[attr-defined]
+
+        def retained(metric: str) -> list[float]:
+            return [msgspec.json.decode(raw)["value"]["level"] for raw in rig.world.newest_raw(metric)]
+
+        assert until(lambda: all(service.transport.state is State.CONNECTED for service in lines.values()))
+        with rig.network.outage():
+            for name in ("one", "two"):
+                rig.mcus[name].plug()
+            assert until(lambda: len(holders()) == 2)
+        assert until(lambda: len(holders()) == 1, 15)
+        assert until(lambda: rig.world.newest_raw("mcu/lamp-1/describe"), 10)
+        assert until(lambda: retained("mcu/lamp-1/lamp") == retained("lights/lamp") == holders(), 10)
+
+
+def test_a_manifest_cleared_by_another_is_published_again(rig: SerialRig) -> None:
+    rig.mcu(LAMP)
+    rig.bridge()
+    rig.described("lamp-1")
+    other = rig.listener("other").transport
+    other.publish(f"{rig.base}/outgoing/mcu/lamp-1/describe", b"", qos=QoS.DELIVERED, retain=True)
+    assert until(lambda: len(rig.world.payloads("mcu/lamp-1/describe")) >= 2)
+    rig.listener("late").described("lamp-1")
+
+
+def test_checking_a_retained_manifest_does_not_request_its_uid(memory_rig: SerialRig) -> None:
+    """A check must not delay a device with this uid that is being plugged in."""
+    asked: list[bytes] = []
+    questions = f"{memory_rig.base}/incoming/mcu/+/describe"
+    memory_rig.world.transport.subscribe(questions, lambda message: asked.append(message.payload))
+    ghost = parse_describe(LAMP.but(uid="ghost").describe()).payload()
+    body = msgspec.json.encode(ghost)
+    memory_rig.world.transport.publish(
+        f"{memory_rig.base}/outgoing/mcu/ghost/describe", body, qos=QoS.DELIVERED, retain=True
+    )
+    memory_rig.mcu(LAMP, plugged=False)
+    memory_rig.bridge()
+    assert until(lambda: asked)
+    assert [msgspec.json.decode(question)["from"] for question in asked] == [""]
+
+
+def test_a_line_that_renames_its_channels_leaves_them_to_the_other(memory_rig: SerialRig) -> None:
+    out = f"{memory_rig.base}/outgoing/sensors"
+    rear = {"high_rate": f"{out}/rear-fast", "low_rate": f"{out}/rear"}
+    one, two = memory_rig.mcu(imu("imu-1"), "one"), memory_rig.mcu(imu("imu-2"), "two")
+    memory_rig.bridge("one")
+    memory_rig.bridge("two", topics=rear)
+    one.stream(50, motion(1000))
+    two.stream(50, motion(2000))
+    assert memory_rig.got("sensors/imu-fast")
+    assert memory_rig.got("sensors/rear-fast")
+    time.sleep(0.5)
+    for metric, expected in (("sensors/imu-fast", 1.0), ("sensors/rear-fast", 2.0)):
+        assert {body["value"]["accel_mps2"]["x"] for body in memory_rig.world.payloads(metric)} == {expected}
+    interfaces = memory_rig.world.payloads("mcu/imu-2/describe")[-1]["interfaces"]
+    assert [interface["channel"] for interface in interfaces] == ["sensors/rear-fast", "sensors/rear"]

@@ -1,0 +1,48 @@
+"""docs/ext/boards.md: its example is a valid manifest, and its numbers agree with the code."""
+
+from __future__ import annotations
+
+import re
+from typing import Any
+
+from pebble.services.serial_mcu_bridge.devices import described_bridge, peers
+from pebble.services.serial_mcu_bridge.devices.aliases import claims
+from pebble.services.serial_mcu_bridge.pebble_serial_v1 import frame, host, manifest, uid_claim
+from tests.support import ROOT
+
+DOCUMENT = (ROOT / "docs/ext/boards.md").read_text()
+
+
+def test_the_example_is_a_valid_manifest() -> None:
+    (code,) = re.findall(r"```python\n(.*?)```", DOCUMENT, re.DOTALL)
+    names: dict[str, Any] = {}
+    exec(code, names)
+    assert manifest.parse_hello(names["HELLO"]).device_uid == "lamp-1"
+    described = manifest.parse_describe(names["DESCRIBE"])
+    assert set(claims(described.payload()).granted) == {"incoming/lights/lamp", "outgoing/lights/lamp"}
+
+
+def test_the_example_frames_are_valid() -> None:
+    request, command = (bytes.fromhex(found) for found in re.findall(r"`((?:[0-9a-f]{2} ){9,}00)`", DOCUMENT))
+    assert frame.decode(request[:-1]).type is frame.Type.DESCRIBE_REQ
+    assert frame.decode(command[:-1]) == frame.Frame(frame.Type.CMD, b"\x01", 3, 1)
+
+
+def test_the_numbers_agree_with_the_code() -> None:
+    sentences = " ".join(DOCUMENT.split())
+    for number, sentence in (
+        (frame.FRAME_LIMIT, "{} bytes between two zeros"),
+        (host.PING_S, "After {:g} s of silence the host sends a PING"),
+        (host.SILENCE_S, "after {:g} s the device counts as gone"),
+        (host.ASK_AFTER_OPENING_S, "{:g} s after opening the port"),
+        (host.ASK_AFTER_HELLO_S, "{:g} s after a HELLO"),
+        (host.ANSWER_S, "no answer within {:g} s"),
+        (host.WAITING, "Up to {} commands per interface"),
+        (peers.CONFIRM_S, "counts as a claim for {:g} s"),
+        (described_bridge.CLAIM_S, "only {:g} s after it has published"),
+        (manifest.MOST_INTERFACES, "fields of an interface; levels of a channel | {}; 64; 8"),
+    ):
+        assert sentence.format(number) in sentences, sentence
+    assert uid_claim.ASK_S + described_bridge.CLAIM_S + described_bridge.DescribedBridge.retry_s < 1, (
+        "the topics exist within two seconds"
+    )

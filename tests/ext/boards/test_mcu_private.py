@@ -1,0 +1,259 @@
+"""Interfaces that are local_only never leave the robot: the rule alone, and with real bridges."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from pebble.forwarding.side import Gate
+from pebble.services.mqtt_bridge.private_topics import PrivateTopics
+from pebble.services.mqtt_bridge.service import MqttBridge
+from pebble.transports import Message, MqttSettings, create
+from tests.ext.boards import mcu_wire as wire
+from tests.ext.boards.mcu_wire import F, I, M
+from tests.kit.board import SerialRig, motion
+from tests.kit.robot import BASE, Listener, Running
+from tests.services.mqtt_bridge.bridge_rig import gate_of
+from tests.support import Broker, cases, until
+
+OUT = f"{BASE}/outgoing"
+#: One interface of each kind, private and public, and an inertial sensor with channels outside the contract.
+SPY = M("spy-1", (
+    I(1, "fast", wire.OUT, wire.KIND_SAMPLE, (F("v", wire.U8),), "lab/fast", "", wire.LOCAL_ONLY),
+    I(2, "slow", wire.OUT, wire.KIND_STATE, (F("v", wire.U8),), "lab/slow", "", wire.RETAIN),
+    I(3, "secret", wire.OUT, wire.KIND_STATE, (F("v", wire.U8),), "lab/secret", "", wire.RETAIN | wire.LOCAL_ONLY),
+    I(4, "set", wire.IN, wire.KIND_COMMAND, (F("v", wire.U8),), "lab/set"),
+    I(5, "tune", wire.IN, wire.KIND_COMMAND, (F("v", wire.U8),), "lab/tune", "", wire.LOCAL_ONLY),
+    *wire.imu_interfaces(6, channels=("lab/imu-fast", "lab/imu")),
+))  # fmt: skip
+PRIVATE = ("mcu/spy-1/fast", "lab/fast", "mcu/spy-1/secret", "lab/secret", "mcu/spy-1/imu_fast", "lab/imu-fast")
+
+
+DESCRIBE, LIST = "mcu/spy-1/describe", "mcu/spy-1/local-only"
+LISTED = tuple(f"outgoing/{metric}" for metric in PRIVATE)
+COMMANDS = ("incoming/mcu/spy-1/tune", "incoming/lab/tune")
+
+
+def local_only(*topics: str, uid: str = "spy-1") -> Message:
+    payload = json.dumps({"topics": topics}).encode()
+    return Message(f"{OUT}/mcu/{uid}/local-only", payload, retain_requested=True)
+
+
+def sample(interface: str, uid: str = "spy-1") -> bytes:
+    body = {"t": 1, "seq": 1, "mcu_ms": 1, "device_uid": uid, "interface": interface, "profile": "", "value": {"v": 1}}
+    return json.dumps(body).encode()
+
+
+def value(metric: str, interface: str = "", **more: Any) -> Message:
+    """A value of the interface that the topic ends with, unless another is named."""
+    return Message(f"{OUT}/{metric}", sample(interface or metric.rpartition("/")[2]), **more)
+
+
+def cleared(metric: str) -> Message:
+    return Message(f"{OUT}/{metric}", b"", retain_requested=True)
+
+
+FAST, SLOW = ("mcu/spy-1/fast", "lab/fast"), ("mcu/spy-1/slow", "lab/slow")
+SECRET = value("mcu/spy-1/secret", retain_requested=True)
+KNOWN = local_only(*LISTED)
+NONSENSE = (b"", b"{", b'{"device_uid": 5}', b'["device_uid"]', b"\xff\xfe", sample("slow"))
+#: What is offered one after the other, and what passes then: the message, nothing, or the topics that are named.
+HISTORIES: dict[str, list[tuple[Message, bool | list[str]]]] = {
+    "what is listed stays, and what is not passes": [
+        (KNOWN, False),
+        *((value(metric), False) for metric in PRIVATE),
+        *((value(metric), True) for metric in SLOW),
+    ],
+    "before the list nothing of the MCU passes but its manifest": [
+        *((value(metric), False) for metric in (*FAST, *SLOW)),
+        (value("anywhere/else", "fast"), False),
+        (Message(f"{OUT}/{DESCRIBE}", b"{}", retain_requested=True), True),
+        (KNOWN, False),
+        *((value(metric), False) for metric in FAST),
+        *((value(metric), True) for metric in SLOW),
+    ],
+    # Retained messages arrive in any order, and later subscribers need the state of a socket.
+    **{
+        f"a value with {flag} waits for the list": [
+            *((value(metric, **{flag: True}), False) for metric in (*SLOW, "lab/secret")),
+            (KNOWN, [*SLOW]),
+            (KNOWN, False),
+        ]
+        for flag in ("retain", "retain_requested")
+    },
+    "a retained value that was cleared is not forwarded later": [
+        *(step for one in SLOW for step in ((value(one, retain=True), False), (cleared(one), True))),
+        (KNOWN, False),
+    ],
+    "a board that restarts: nothing passes until it is described again, and its states are cleared": [
+        (KNOWN, False),
+        (cleared(LIST), False),
+        (cleared("mcu/spy-1/slow"), True),
+        (cleared("mcu/spy-1/secret"), False),
+        *((value(metric), False) for metric in (*FAST, *SLOW)),
+        (KNOWN, False),
+        *((value(metric), True) for metric in SLOW),
+    ],
+    "a manifest that changes makes public what was private": [
+        (KNOWN, False),
+        (SECRET, False),
+        (local_only(), False),
+        (SECRET, True),
+    ],
+    "a manifest that changes makes private what was public": [
+        *((local_only(), False), (value("lab/slow"), True)),
+        *((local_only("outgoing/lab/slow"), False), (value("lab/slow"), False)),
+    ],
+    "two boards with one alias: the list of each counts, and neither speaks for the other": [
+        (local_only(), False),
+        (value("lab/slow", retain=True), True),
+        (Message(f"{OUT}/lab/slow", sample("slow", "spy-2"), retain=True), False),
+        (local_only("outgoing/lab/slow", uid="spy-2"), False),
+        (value("lab/slow"), False),
+        (value("mcu/spy-1/slow"), True),
+    ],
+    "a list that cannot be read lets nothing pass, of this MCU": [
+        *((KNOWN, False), (local_only(uid="spy-2"), False)),
+        (Message(f"{OUT}/{LIST}", b'{"topics": 5}', retain_requested=True), False),
+        *((value("lab/slow"), False), (value("mcu/spy-2/slow"), True)),
+    ],
+    "a list keeps no stop and no control of the robot back": [
+        (local_only("outgoing/estop-state/goob", "outgoing/control/goob"), False),
+        *((Message(f"{OUT}/{metric}", b"{}"), True) for metric in ("estop-state/goob", "control/goob")),
+    ],
+    "nonsense is neither an error nor held back": [
+        (KNOWN, False),
+        *((Message(f"{OUT}/strange", payload), True) for payload in NONSENSE),
+        (value("lab/slow"), True),
+    ],
+}
+
+
+@pytest.mark.parametrize("history", HISTORIES.values(), ids=HISTORIES)
+def test_what_passes(history: list[tuple[Message, bool | list[str]]]) -> None:
+    topics = PrivateTopics(BASE)
+    for message, passes in history:
+        expected = [message.topic.removeprefix(f"{OUT}/")] if passes is True else passes or []
+        assert [admitted.topic.removeprefix(f"{OUT}/") for admitted in topics.admit(message)] == expected, message
+
+
+def test_which_commands_stay() -> None:
+    """Requests for a manifest do not leave the robot, nor commands to an MCU without a list."""
+    topics = PrivateTopics(BASE)
+    incoming = [f"{BASE}/incoming/{metric}" for metric in ("mcu/spy-1/describe", "mcu/spy-1/tune", "mcu/spy-1/set")]
+    aliases = [f"{BASE}/incoming/{metric}" for metric in ("lab/tune", "lab/set", "estop", "drive-values")]
+    assert [topics.stays(topic) for topic in (*incoming, *aliases)] == [True] * 3 + [False] * 4
+    topics.admit(local_only(*COMMANDS, "incoming/estop"))
+    assert [topics.stays(topic) for topic in (*incoming, *aliases)] == [True, True, False, True, False, False, False]
+
+
+def test_memory_is_bounded() -> None:
+    topics = PrivateTopics(BASE)
+    for number in range(300):
+        assert topics.admit(value(f"lab/slow-{number}", "slow", retain=True)) == []
+    assert len(topics.admit(KNOWN)) == 256, "waiting values"
+    for number in range(300):
+        topics.admit(local_only(uid=f"spy-{number}"))
+    slow = [Message(f"{OUT}/mcu/spy-{number}/slow", b"{}") for number in range(300)]
+    assert sum(len(topics.admit(message)) for message in slow) == 256, "MCUs"
+
+
+# -- with real bridges
+
+
+@pytest.fixture(params=["mqtt", "zenoh"])
+def rig(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[SerialRig]:
+    rig = SerialRig(request.param, tmp_path)
+    yield rig
+    rig.close()
+
+
+class World:
+    """A remote broker, an operator that subscribes to everything there, and a bridge that can be restarted."""
+
+    def __init__(self, rig: SerialRig) -> None:
+        self.rig = rig
+        self.broker = Broker(rig.folder)
+        self.operator = Listener(create("mqtt", "operator", MqttSettings(host="127.0.0.1", port=self.broker.port)))
+        self.bridge: Running | None = None
+
+    def start(self) -> None:
+        section = {"enabled": True, "remote_mqtt": {"host": "127.0.0.1", "port": self.broker.port}}
+        config = self.rig.network.config(self.rig.folder, {}, mqtt_bridge=section)
+        service = MqttBridge(config, self.rig.network.robots_transport(config, "local-bridge", as_published=True))
+        self.bridge = Running(service)
+        assert until(lambda: gate_of(service) is Gate.OPEN)
+
+    def stop(self) -> None:
+        if self.bridge is not None:
+            self.bridge.stop()
+            self.bridge = None
+
+    def close(self) -> None:
+        self.stop()
+        self.operator.transport.close()
+        self.broker.stop()
+
+
+@pytest.fixture
+def world(rig: SerialRig) -> Iterator[World]:
+    world = World(rig)
+    yield world
+    world.close()
+
+
+def test_nothing_private_leaves_the_robot_in_any_start_order(rig: SerialRig, world: World) -> None:
+    world.start()  # the first time before the MCU is known
+    mcu = rig.mcu(SPY)
+    line = rig.bridge()
+    rig.described("spy-1")
+    mcu.stream(300, b"\1")
+    assert rig.got("lab/fast")
+    for round_ in range(cases(2, 4)):  # then while the MCU sends values
+        world.stop()
+        mcu.send(wire.frame(wire.STATE, bytes([round_]), 2), wire.frame(wire.STATE, bytes([round_]), 3))
+        mcu.send(wire.frame(wire.SAMPLE, motion(), 6), wire.frame(wire.STATE, b"\0" * 18, 7))
+        world.start()
+        assert until(lambda r=round_: {"v": r} in world.operator.values("lab/slow"), 5), "retained, and from before"
+        mcu.send(wire.frame(wire.STATE, bytes([round_ + 100]), 2), wire.frame(wire.SAMPLE, motion(), 6))
+        assert until(lambda r=round_: {"v": r + 100} in world.operator.values("lab/slow"), 5)
+    mcu.unplug()
+    assert world.operator.cleared("mcu/spy-1/describe")
+    mcu.plug()
+    world.operator.described("spy-1")
+    time.sleep(0.5)
+    line.stop()
+    assert world.operator.cleared("lab/slow")
+    received = {message.topic.removeprefix(f"{OUT}/") for message in world.operator.received}
+    assert {metric for metric in PRIVATE if rig.world.on(metric)} == set(PRIVATE), "they were published locally"
+    assert received & set(PRIVATE) == set()
+    assert {"mcu/spy-1/slow", "lab/slow", "mcu/spy-1/describe"} <= received
+
+
+def test_private_commands_are_for_the_robot_only(rig: SerialRig, world: World) -> None:
+    mcu = rig.mcu(SPY)
+    rig.bridge()
+    world.start()
+    assert world.operator.got("mcu/spy-1/describe")
+    assert rig.claimed()
+
+    def received(value: int) -> list[int]:
+        return [command.interface for command in mcu.commands() if command.payload == bytes([value])]
+
+    def samples_under_alias() -> list[int]:
+        """Send a command to the alias: its start is not announced, so the test tries until one arrives."""
+        world.operator.command("lab/set", {"v": 3})
+        return received(3)
+
+    assert until(samples_under_alias, step=0.2)
+    for metric in ("mcu/spy-1/tune", "lab/tune", "mcu/spy-1/set", "lab/set"):
+        world.operator.command(metric, {"v": 1})
+    assert until(lambda: len(received(1)) == 2)
+    rig.world.command("lab/tune", {"v": 2})
+    assert until(lambda: received(2))
+    assert (received(1), received(2)) == ([4, 4], [5])

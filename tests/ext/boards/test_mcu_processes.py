@@ -1,0 +1,46 @@
+"""The serial service as a process: which class is used for which protocol, and how the process ends."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from pebble.config import parse
+from pebble.runtime.process import view_of
+from pebble.services.serial_mcu_bridge.devices.described_bridge import DescribedBridge
+from pebble.services.serial_mcu_bridge.serial_service import bridge_of
+from pebble.services.serial_mcu_bridge.text.imu_bridge import ImuBridge
+from pebble.services.serial_mcu_bridge.text.motor_bridge import MotorBridge
+from tests.ext.boards import mcu_wire as wire
+from tests.ext.boards.mcu_wire import STATION
+from tests.kit.board import ScriptedMcu
+from tests.kit.robot import ProgramRobot
+from tests.support import Broker, until
+
+
+@pytest.mark.parametrize(
+    ("protocol", "service"),
+    [("goob_base_v1", MotorBridge), ("pebble_serial_v1", DescribedBridge), ("imu_mpu6050_v1", ImuBridge)],
+)
+def test_a_protocol_has_its_service(protocol: str, service: type) -> None:
+    line = {"enabled": True, "protocol": protocol, "serial": {"port": "/dev/x"}}
+    section: dict[str, Any] = {"instances": {"one": line}}
+    raw = {"robot": {"id": "rover"}, "services": {"serial_mcu_bridge": section}}
+    config = parse(raw, folder=Path("/"), env={})
+    assert bridge_of(view_of(config, "one")) is service
+
+
+def test_a_terminated_process_withdraws_its_device(local: Broker, tmp_path: Path) -> None:
+    mcu = ScriptedMcu(tmp_path / "port", STATION, sends_hello=True)
+    line = {"enabled": True, "protocol": "pebble_serial_v1", "serial": {"port": str(mcu.link)}}
+    with mcu, ProgramRobot("mqtt", local.port, {"serial_mcu_bridge": {"instances": {"sockets": line}}}) as robot:
+        process = robot.run("pebble.services.serial_mcu_bridge", "sockets")
+        robot.world.described("hs105-sta")
+        mcu.send(wire.frame(wire.STATE, b"\1\1\0", 2))
+        assert robot.world.got("outlets/o1/status")
+        robot.world.command("outlets/o1/power", {"on": True})
+        assert until(mcu.commands)
+        assert process.end() == 0
+        assert robot.world.cleared("mcu/hs105-sta/describe", "outlets/o1/status", "mcu/hs105-sta/o1_state")

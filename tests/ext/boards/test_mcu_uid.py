@@ -1,0 +1,292 @@
+"""Two devices with one uid, and their claims of channels: without a serial line and without a clock."""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass, field
+from typing import Any
+
+import msgspec
+import pytest
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
+
+from pebble.config import SerialBridge
+from pebble.contract import DRIVE, MCU_DESCRIBE, codec
+from pebble.contract.payloads import McuManifest
+from pebble.services.mqtt_bridge.private_topics import PrivateTopics
+from pebble.services.serial_mcu_bridge.devices.aliases import claims
+from pebble.services.serial_mcu_bridge.devices.imu import ImuWatchdog
+from pebble.services.serial_mcu_bridge.devices.peers import CONFIRM_S, PeerDevices
+from pebble.services.serial_mcu_bridge.pebble_serial_v1.manifest import parse_describe
+from pebble.services.serial_mcu_bridge.pebble_serial_v1.uid_claim import AGAIN_S, ASK_S, Move, UidClaim
+from pebble.transports import Message
+from tests.ext.boards import mcu_wire as wire
+from tests.ext.boards.mcu_wire import IMU, STATION, F, I, M
+from tests.support import cases
+
+# -- uids
+
+
+#: What a claim with this token is told and asked, one after the other, and what it does.
+CLAIMS: dict[str, tuple[str, list[tuple[Move, str, Any]]]] = {
+    "a uid without an objection is acquired": ("a", [
+        *((Move.ASK, "request", ("u", 0.0)), (Move.NOTHING, "tick", (ASK_S - 0.01,)), (Move.HOLD, "tick", (ASK_S,))),
+        *((Move.ANSWER, "on_question", ("u", "b", 1.0)), (Move.NOTHING, "on_question", ("other", "b", 1.0))),
+        (Move.NOTHING, "on_question", ("u", "a", 1.0)),  # its own question, echoed
+        (Move.INSIST, "on_manifest", ("u", 1.0)),  # its own manifest, echoed, or that of another holder
+    ]),
+    "a requester that is answered waits and asks again": ("z", [
+        *((Move.ASK, "request", ("u", 0.0)), (Move.NOTHING, "on_manifest", ("other", 0.1))),
+        *((Move.YIELD, "on_manifest", ("u", 0.1)), (Move.NOTHING, "on_question", ("u", "b", 1.0))),
+        *((Move.NOTHING, "tick", (0.09 + AGAIN_S,)), (Move.ASK, "tick", (0.1 + AGAIN_S,))),
+        *((Move.YIELD, "on_manifest", ("u", 6.0)), (Move.ASK, "on_withdrawal", ("u", 7.0))),
+        (Move.HOLD, "tick", (7.0 + ASK_S,)),
+    ]),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("token", "history"), CLAIMS.values(), ids=CLAIMS)
+def test_how_a_uid_is_claimed(token: str, history: list[tuple[Move, str, Any]]) -> None:
+    claim = UidClaim(token)
+    for move, event, arguments in history:
+        assert getattr(claim, event)(*arguments) is move, (event, arguments)
+
+
+def holder(token: str) -> UidClaim:
+    claim = UidClaim(token)
+    claim.request("u", 0.0)
+    assert claim.tick(ASK_S) is Move.HOLD
+    assert claim.due is None
+    return claim
+
+
+def test_of_two_holders_the_one_with_the_smaller_token_yields_and_a_requester_always() -> None:
+    weak, strong, requester = holder("a"), holder("b"), UidClaim("z")
+    assert strong.on_question("u", "a", 1.0, has=True) is Move.INSIST
+    assert weak.on_question("u", "b", 1.0, has=True) is Move.YIELD
+    assert weak.due == 1.0 + AGAIN_S
+    requester.request("u", 0.0)
+    assert requester.on_question("u", "a", 0.1, has=True) is Move.YIELD
+
+
+def test_a_released_uid_is_not_answered_for() -> None:
+    claim = holder("a")
+    claim.release()
+    assert (claim.tick(10.0), claim.on_question("u", "b", 10.0)) == (Move.NOTHING, Move.NOTHING)
+
+
+@dataclass
+class LocalNetwork:
+    """Claims that receive each other's messages, and their own, after ``delay`` s."""
+
+    delay: float
+    claims: dict[str, UidClaim] = field(default_factory=dict)
+    on_its_way: list[tuple[float, str, str]] = field(default_factory=list)
+    holders: set[str] = field(default_factory=set)
+
+    def act(self, token: str, move: Move, now: float) -> None:
+        if move in (Move.ASK, Move.ANSWER):
+            self.on_its_way.append((now + self.delay, move.name, token))
+        elif move is Move.HOLD:
+            self.holders.add(token)
+            self.on_its_way.append((now + self.delay, "ANSWER", token))
+
+    def run(self, begin: dict[str, float], until: float) -> None:
+        for step in range(int(until * 1000)):
+            now = step / 1000
+            due = [one for one in self.on_its_way if one[0] <= now]
+            self.on_its_way = [one for one in self.on_its_way if one[0] > now]
+            for token, at in begin.items():
+                if step == round(at * 1000):
+                    self.claims[token] = UidClaim(token)
+                    self.act(token, self.claims[token].request("u", now), now)
+            for _, what, sender in due:
+                for token, claim in self.claims.items():
+                    answer = claim.on_question("u", sender, now) if what == "ASK" else claim.on_manifest("u", now)
+                    self.act(token, answer, now)
+            for token, claim in self.claims.items():
+                self.act(token, claim.tick(now), now)
+
+
+@pytest.mark.parametrize("tokens", ["ab", "ba"])
+def test_of_two_exactly_one_has_it(tokens: str) -> None:
+    for delay, later in itertools.product((0.001, 0.02, 0.09), (0.0, 0.001, 0.05, 0.15, 0.3, 3.0)):
+        network = LocalNetwork(delay)
+        network.run({tokens[0]: 0.0, tokens[1]: later}, 12.0)
+        assert len(network.holders) == 1, (delay, later)
+
+
+def test_of_five_at_once_exactly_one_has_it() -> None:
+    network = LocalNetwork(0.01)
+    network.run(dict.fromkeys("cadbe", 0.0), 12.0)
+    assert network.holders == {"e"}
+
+
+# -- claims
+
+
+def published(manifest: M) -> McuManifest:
+    return parse_describe(manifest.describe()).payload()
+
+
+def state(name: str, channel: str, number: int = 1, **more: object) -> I:
+    fields = {"id": number, "name": name, "dir": wire.OUT, "kind": wire.KIND_STATE, "fields": (F("v", wire.U8),)}
+    return I(**{**fields, "channel": channel, **more})  # type: ignore[arg-type]
+
+
+def command(name: str, channel: str, number: int = 1) -> I:
+    return I(number, name, wire.IN, wire.KIND_COMMAND, (F("v", wire.U8),), channel)
+
+
+def granted(*interfaces: I) -> dict[str, str]:
+    return dict(claims(published(M("u", interfaces))).granted)
+
+
+def refused(interface: I) -> str:
+    return claims(published(M("u", (interface,)))).refused["a"]
+
+
+def test_which_channels_a_device_gets() -> None:
+    assert granted(*IMU.interfaces) == {"outgoing/sensors/imu-fast": "imu_fast", "outgoing/sensors/imu": "imu"}
+    station = claims(published(STATION))
+    assert not station.refused
+    assert station.granted["incoming/outlets/o3/power"] == "o3_set"
+    assert station.granted["outgoing/outlets/o3/status"] == "o3_state"
+    both = granted(state("a", "lamp/one"), command("b", "lamp/one", 2))
+    assert both == {"outgoing/lamp/one": "a", "incoming/lamp/one": "b"}, "outside the contract it is free"
+    twice = claims(published(M("u", (state("a", "lamp"), state("b", "lamp", 2)))))
+    assert (twice.granted, twice.refused) == ({"outgoing/lamp": "a"}, {"b": "outgoing/lamp: a has it already"})
+
+
+COMMANDS = [
+    "drive-values", "lights-solid", "front-camera", "audio", "audio-stream", "soundboard-command", "autonomy-command",
+    "flags/reboot", "flags/mqtt-video", "flags/anything", "flags", "mip-raw", "mcu/other/led", "mcu",
+    "estop", "estop-reset", "estop/mcu", "estop-anything", "by", "by/anna/drive-values", "control",
+]  # fmt: skip
+PUBLISHED = [
+    "online", "heartbeat", "capabilities", "status", "logs", "charging-status", "charging-level", "touch-sensors",
+    "front-camera", "audio", "wheel-odometry", "flags/mqtt-video", "mcu/other/describe", "bridge-probe",
+    "estop", "estop/mcu", "estop/mcu/more", "estop-reset", "by/anna", "control", "control/lease",
+]  # fmt: skip
+
+
+def test_which_channels_are_refused_with_which_reason() -> None:
+    reasons = [refused(command("a", one)) for one in COMMANDS] + [refused(state("a", one)) for one in PUBLISHED]
+    assert [reason for reason in reasons if "robot's own" not in reason] == []
+    for channel in ("sensors/imu", "sensors/imu-fast"):
+        for profile in ("", "imu.motion.v1", "imu.summary.v1"):
+            assert "it needs the profile imu." in refused(state("a", channel, profile=profile))
+
+
+def test_a_local_only_interface_gets_no_public_channel_without_a_device_uid() -> None:
+    """The bridge identifies local_only values by `device_uid`, which the body of sensors/imu does not have."""
+    hidden = IMU.but(interfaces=tuple(I(**{**vars(one), "flags": wire.LOCAL_ONLY}) for one in IMU.interfaces))
+    found = claims(published(hidden))
+    assert found.granted == {"outgoing/sensors/imu-fast": "imu_fast"}
+    assert "it may leave the robot" in found.refused["imu"]
+
+
+def test_a_channel_that_the_config_renames_is_the_robots_own_too() -> None:
+    taken = claims(published(M("u", (command("a", "elsewhere"),))), {"incoming/elsewhere": DRIVE}.get)
+    assert "robot's own" in taken.refused["a"]
+
+
+def test_malformed_manifests_of_other_devices_raise_nothing() -> None:
+    odd = McuManifest(protocol="x", schema_version=1, interface_count=1, schema_hash="", device_uid="u",
+                      firmware_version="", model="", interfaces=[
+                          {}, {"channel": 5}, {"channel": "a", "encoding": 7}, {"channel": "sensors/imu",
+                           "profile": "imu.summary.v1", "encoding": {"fields": [1, {}, None]}}])  # fmt: skip
+    assert claims(odd).granted == {"outgoing/a": "None"}
+
+
+_ANYTHING = st.recursive(
+    st.none() | st.booleans() | st.integers(-9, 9) | st.floats(allow_nan=False) | st.text(max_size=4),
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=4), inner, max_size=3),
+    max_leaves=5,
+)
+_ODD_FIELDS = _ANYTHING | st.lists(st.fixed_dictionaries({"name": _ANYTHING}) | _ANYTHING, max_size=3)
+_ODD_INTERFACE = st.fixed_dictionaries({}, optional={
+    "name": _ANYTHING | st.just("a"),
+    "dir": _ANYTHING | st.sampled_from(["in", "out"]),
+    "channel": _ANYTHING | st.sampled_from(["sensors/imu", "sensors/imu-fast", "outlets/o1/status", "a//", "flags"]),
+    "profile": _ANYTHING | st.sampled_from(["imu.motion.v1", "imu.summary.v1"]),
+    "local_only": _ANYTHING,
+    "encoding": _ANYTHING | st.fixed_dictionaries({"fields": _ODD_FIELDS}),
+})  # fmt: skip
+
+
+@settings(max_examples=cases(100, 1000))
+@given(st.lists(_ODD_INTERFACE, max_size=4))
+@example([{"channel": "sensors/imu", "profile": "imu.summary.v1", "encoding": {"fields": 5}}])
+def test_no_manifest_of_another_device_raises_anything(interfaces: list[dict[str, object]]) -> None:
+    body = {"protocol": "pebble_serial_v1", "schema_version": 1, "interface_count": 1, "schema_hash": "",
+            "device_uid": "u", "firmware_version": "", "model": "", "interfaces": interfaces}  # fmt: skip
+    raw = msgspec.json.encode(body)
+    claims(codec.decode(MCU_DESCRIBE, raw))
+    topics = PrivateTopics("pebble/robots/rover")
+    topics.admit(Message(MCU_DESCRIBE.topic("pebble/robots/rover", uid="u"), raw, retain_requested=True))
+    topics.admit(Message("pebble/robots/rover/outgoing/sensors/imu", b'{"device_uid": "u"}'))
+
+
+# -- peer devices
+
+
+def test_a_peer_device_claims_until_it_is_withdrawn() -> None:
+    peers = PeerDevices()
+    peers.add("b", frozenset({"outgoing/x", "outgoing/y"}), 0.0, retained=False)
+    peers.add("a", frozenset({"outgoing/x"}), 0.0, retained=False)
+    assert peers.claimants("outgoing/x") == ["a", "b"]
+    assert peers.claimants("outgoing/y") == ["b"]
+    assert peers.due is None
+    peers.forget("b")
+    assert peers.claimants("outgoing/y") == []
+
+
+def test_a_retained_manifest_counts_until_its_confirmation_times_out() -> None:
+    peers = PeerDevices()
+    peers.add("ghost", frozenset({"outgoing/x"}), 10.0, retained=True)
+    peers.add("alive", frozenset({"outgoing/x"}), 10.0, retained=True)
+    assert peers.due == 10.0 + CONFIRM_S
+    peers.add("alive", frozenset({"outgoing/x"}), 10.1, retained=False)
+    assert peers.left_over(10.0 + CONFIRM_S - 0.01) == []
+    assert peers.claimants("outgoing/x") == ["alive", "ghost"]
+    assert peers.left_over(10.0 + CONFIRM_S) == ["ghost"]
+    assert peers.claimants("outgoing/x") == ["alive"]
+    assert peers.due is None
+
+
+def test_the_number_of_peer_devices_is_bounded() -> None:
+    peers = PeerDevices()
+    for number in range(1000):
+        peers.add(f"u{number}", frozenset({"outgoing/x"}), 0.0, retained=False)
+    assert len(peers.claimants("outgoing/x")) == 256
+
+
+# -- the watchdog of inertial sensors
+
+
+@pytest.mark.parametrize(
+    ("section", "instance", "expected"),
+    [
+        ({"protocol": "imu_mpu6050_v1"}, "", 5.0),
+        ({"protocol": "pebble_serial_v1"}, "imu", 5.0),
+        ({"protocol": "pebble_serial_v1"}, "outlets", 0.0),
+    ],
+)
+def test_which_lines_have_a_timeout(section: dict[str, object], instance: str, expected: float) -> None:
+    watchdog = ImuWatchdog(SerialBridge(**section), instance)  # type: ignore[arg-type]
+    assert watchdog.timeout_s == expected
+    watchdog.begin(100.0)
+    assert watchdog.expired(108.0) == (expected > 0)
+    watchdog.sample(108.0)
+    assert not watchdog.expired(108.0 + expected)
+    watchdog.end()
+    assert not watchdog.expired(1000.0)
+
+
+def test_the_first_sample_may_take_longer() -> None:
+    watchdog = ImuWatchdog(SerialBridge(protocol="imu_mpu6050_v1"), "")
+    watchdog.begin(0.0)
+    assert not watchdog.expired(6.9)
+    assert watchdog.expired(7.1)

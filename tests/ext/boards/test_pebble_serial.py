@@ -1,0 +1,347 @@
+"""The host's side of pebble_serial_v1, without a serial line and without a clock."""
+
+from __future__ import annotations
+
+import logging
+import struct
+from typing import Any
+
+import pytest
+
+from pebble.errors import PayloadError
+from pebble.services.serial_mcu_bridge.pebble_serial_v1.host import (
+    ANSWER_S,
+    SILENCE_S,
+    Answer,
+    Described,
+    Event,
+    Gone,
+    Reading,
+    RefusedInput,
+    Send,
+    Session,
+)
+from pebble.services.serial_mcu_bridge.text.device_log import DeviceLogLine
+from tests.ext.boards import mcu_wire as wire
+from tests.ext.boards.mcu_wire import IMU, STATION, M, Received
+
+OPENED = 100.0
+WALL_MS = 1_700_000_000_123
+STATE_PAYLOAD = b"\1\0\1"
+
+
+class Host:
+    """A session, the current time, its events and the frames that it sent."""
+
+    def __init__(self) -> None:
+        self.session = Session()
+        self.now = OPENED
+        self.events: list[Event] = []
+        self.sent: list[tuple[float, Received]] = []
+        self.session.opened(OPENED)
+
+    def feed(self, *frames: bytes) -> list[Event]:
+        return self._take(self.session.feed(b"".join(frames), self.now))
+
+    def until(self, when: float) -> None:
+        """Advance the time to ``when``, with a tick each time the session is due."""
+        while (due := self.session.due) is not None and due <= when:
+            assert due > self.now - 1e-9
+            self.now = max(self.now, due)
+            self._take(self.session.tick(self.now, WALL_MS))
+        self.now = when
+
+    def describe(self, manifest: M = STATION) -> None:
+        self.feed(wire.frame(wire.DESCRIBE, manifest.describe()))
+
+    def of(self, kind: type) -> list[Any]:
+        return [event for event in self.events if isinstance(event, kind)]
+
+    def asked(self) -> list[float]:
+        return [round(at - OPENED, 3) for at, frame in self.sent if frame.kind == wire.DESCRIBE_REQ]
+
+    def command(self, name: str, values: dict[str, Any]) -> Received:
+        manifest = self.session.manifest
+        assert manifest is not None
+        interface = next(one for one in manifest.interfaces if one.name == name)
+        send = self.session.command(interface, values, self.now, WALL_MS)
+        self._take([send])
+        return self.sent[-1][1]
+
+    def _take(self, events: list[Event]) -> list[Event]:
+        self.events += events
+        for event in events:
+            if isinstance(event, Send):
+                assert event.data.endswith(b"\0")
+                (stuffed,) = filter(None, event.data.split(b"\0"))
+                self.sent.append((self.now, wire.received(stuffed)))
+        return events
+
+    def refused(self, *frames: bytes) -> str:
+        """Feed what yields nothing but one refusal; return its subject."""
+        (refused,) = self.feed(*frames)
+        assert isinstance(refused, RefusedInput)
+        return refused.subject
+
+
+@pytest.fixture
+def host() -> Host:
+    return Host()
+
+
+def state(interface: int = 2, payload: bytes = STATE_PAYLOAD, sequence: int = 9, ms: int = 77) -> bytes:
+    return wire.frame(wire.STATE, payload, interface, sequence, ms)
+
+
+# -- discovery
+
+
+HELLO = wire.frame(wire.HELLO, STATION.hello())
+
+
+def test_when_it_requests_the_manifest(host: Host) -> None:
+    """A second after opening and then every two; soon after a hello it does not know, however often that comes."""
+    host.until(OPENED + 8)
+    assert host.asked() == [1.0, 3.0, 5.0, 7.0]
+    host.describe()
+    host.until(OPENED + 12)
+    assert host.asked() == [1.0, 3.0, 5.0, 7.0]
+    greeted, repeated = Host(), Host()
+    greeted.until(OPENED + 0.3)
+    greeted.feed(HELLO)
+    greeted.until(OPENED + 2)
+    assert greeted.asked() == [0.55]
+    for tenth in range(30):
+        repeated.until(OPENED + tenth / 10)
+        repeated.feed(HELLO)
+    assert len(repeated.asked()) >= 2
+    assert repeated.asked()[0] == 0.25
+
+
+def test_the_first_request_begins_with_a_frame_end(host: Host) -> None:
+    """An earlier host may have been killed in the middle of a frame."""
+    host.until(OPENED + 1)
+    assert host.of(Send)[0].data.startswith(b"\0")
+
+
+def test_a_described_device_is_understood(host: Host) -> None:
+    host.describe(IMU)
+    (described,) = host.of(Described)
+    assert described.manifest.uid == "goob-imu-nano"
+    assert not described.remembered
+    payload = struct.pack("<9h", 9807, 0, -1, 100, -100, 1, 2512, 33, -7)
+    (reading,) = host.feed(wire.frame(wire.SAMPLE, payload, 1, 5, 1234))
+    assert isinstance(reading, Reading)
+    assert (reading.interface.name, reading.sequence, reading.mcu_ms) == ("imu_fast", 5, 1234)
+    assert reading.values["ax"] == 9.807
+    assert reading.values["temp_c"] == 25.12
+
+
+def test_a_known_hello_makes_a_device_usable_at_once(host: Host) -> None:
+    host.describe()
+    assert host.feed(HELLO) == [], "that of a reboot changes nothing"
+    assert host.session.closed() == [Gone("the line is gone")]
+    host.session.opened(host.now)
+    (described,) = host.feed(HELLO)
+    assert described == Described(host.of(Described)[0].manifest, remembered=True)
+    assert [type(event) for event in host.feed(state())] == [Reading]
+    host.until(host.now + 4)
+    assert host.asked() == []
+
+
+@pytest.mark.parametrize(
+    "change", [{"hash": "h2"}, {"uid": "other"}, {"firmware": "1.1"}, {"interfaces": wire.outlets(1)}]
+)
+def test_any_difference_in_a_hello_asks_again(host: Host, change: dict[str, Any]) -> None:
+    host.describe()
+    events = host.feed(wire.frame(wire.HELLO, STATION.but(**change).hello()))
+    assert [type(event) for event in events] == [Gone]
+    assert host.refused(state()) == "early"
+    host.until(host.now + 0.3)
+    assert host.asked() == [0.25]
+
+
+def test_after_a_replug_it_asks_again_and_drops_the_old_manifest(host: Host) -> None:
+    host.describe()
+    host.session.closed()
+    host.until(OPENED + 50)
+    assert host.asked() == []
+    host.session.opened(host.now)
+    assert host.refused(state()) == "early"
+    host.until(host.now + 1.5)
+    assert host.asked() == [51.0]
+    host.describe()
+    assert len(host.of(Described)) == 2
+
+
+def test_half_a_frame_from_before_the_replug_is_not_continued(host: Host) -> None:
+    host.feed(state()[:6])
+    host.session.closed()
+    host.session.opened(host.now)
+    assert not [event for event in host.feed(state()[6:]) if not isinstance(event, RefusedInput)]
+
+
+def test_describing_itself_differently_replaces_everything(host: Host) -> None:
+    host.describe()
+    other = STATION.but(interfaces=(wire.I(7, "lamp", wire.OUT, wire.KIND_STATE, (wire.F("on", wire.BOOL),)),))
+    events = host.feed(wire.frame(wire.DESCRIBE, other.describe()))
+    assert [type(event) for event in events] == [Gone, Described]
+    assert isinstance(host.feed(state())[0], RefusedInput)
+    (reading,) = host.feed(state(7, b"\1"))
+    assert isinstance(reading, Reading)
+    assert reading.values == {"on": True}
+    assert host.feed(wire.frame(wire.DESCRIBE, other.describe())) == [], "the same manifest again has no effect"
+
+
+def test_readings_that_do_not_fit_make_it_ask_but_not_every_time(host: Host) -> None:
+    host.describe()
+    for tenth in range(50):
+        host.until(OPENED + tenth / 10)
+        host.feed(state(interface=99))
+        host.until(OPENED + tenth / 10 + 0.05)
+        host.describe()
+    assert host.asked() == [0.0], "one request within ten seconds"
+
+
+def test_a_manifest_that_cannot_be_used_is_refused_and_asked_for_again(host: Host) -> None:
+    """The original Pebble's reader thread ends by bad text in a hello."""
+    host.until(OPENED + 1)
+    assert host.refused(wire.frame(wire.DESCRIBE, STATION.describe()[:-1])) == "describe"
+    assert "DESCRIBE refused" in host.events[-1].reason  # type: ignore[union-attr]
+    host.until(OPENED + 3.5)
+    assert host.asked() == [1.0, 3.0]
+    host.refused(wire.frame(wire.HELLO, M(b"\xff\xff").hello()))
+    assert "not UTF-8" in host.events[-1].reason  # type: ignore[union-attr]
+    host.describe()
+    assert host.of(Described)
+
+
+# -- readings
+
+
+@pytest.mark.parametrize(
+    ("frame", "subject"),
+    [
+        (state(interface=1), "state"),  # a command, which sends no values
+        (state(interface=0), "state"),
+        (state(interface=99), "state"),
+        (state(payload=b""), "state"),
+        (state(payload=b"\1\2\3\4"), "state"),
+        (wire.frame(wire.CMD, b"\1", 1, 1), "cmd"),
+        (wire.frame(wire.DESCRIBE_REQ), "describe_req"),
+        (wire.frame(wire.PING), "ping"),
+        (wire.frame(wire.ACK, b"", 1, 12345), "ack"),
+        (wire.frame(wire.NACK, b"why", 1, 12345), "nack"),
+    ],
+)
+def test_frames_that_make_no_sense_are_refused_and_counted_by_name(host: Host, frame: bytes, subject: str) -> None:
+    host.describe()
+    assert host.refused(frame) == subject
+    assert isinstance(host.feed(state())[0], Reading)
+
+
+def test_chunks_may_be_cut_anywhere(host: Host) -> None:
+    stream = wire.frame(wire.DESCRIBE, STATION.describe()) + state() + b"\0\0" + state(4)
+    for byte in stream:
+        host.feed(bytes([byte]))
+    assert len(host.of(Described)) == 1
+    assert [reading.interface.name for reading in host.of(Reading)] == ["o1_state", "o2_state"]
+    assert host.of(RefusedInput) == []
+
+
+def test_its_log_lines_are_reported_and_made_printable(host: Host) -> None:
+    (line,) = host.feed(wire.frame(wire.LOG, b"imu_ready \x1b[31m \xff"))
+    assert line == DeviceLogLine(logging.INFO, "imu_ready \N{REPLACEMENT CHARACTER}[31m \\xff")
+
+
+def test_a_frame_without_end_is_counted_and_discarded(host: Host) -> None:
+    host.describe()
+    events = host.feed(*(b"\x55" * 1000 for _ in range(20)))
+    assert [event.subject for event in events if isinstance(event, RefusedInput)] == ["too long"]
+    assert [type(event) for event in host.feed(b"\0", state())] == [Reading]
+
+
+# -- commands
+
+
+def test_a_command_becomes_a_frame(host: Host) -> None:
+    host.describe()
+    first = host.command("o2_set", {"on": True})
+    assert (first.kind, first.interface, first.payload) == (wire.CMD, 3, b"\1")
+    assert first.ms == WALL_MS % 2**32
+    assert host.command("o2_set", {"on": False}).sequence == first.sequence + 1
+    bad: list[tuple[dict[str, Any], str]] = [
+        ({}, "o1_set: on is missing"),
+        ({"on": "false"}, "o1_set: on is a boolean"),
+    ]
+    for values, reason in bad:
+        with pytest.raises(PayloadError, match=reason):
+            host.command("o1_set", values)
+
+
+def test_answers_find_their_command(host: Host) -> None:
+    host.describe()
+    first, second = host.command("o1_set", {"on": True}), host.command("o2_set", {"on": True})
+    assert host.feed(wire.frame(wire.NACK, b"slot_unconfigured", 3, second.sequence)) == [
+        Answer("o2_set", second.sequence, False, "slot_unconfigured")
+    ]
+    assert host.feed(wire.frame(wire.ACK, b"", 1, first.sequence)) == [Answer("o1_set", first.sequence, True)]
+    assert host.refused(wire.frame(wire.ACK, b"", 1, first.sequence)) == "ack", "a command is answered once"
+
+
+def test_a_command_without_an_answer_is_reported(host: Host) -> None:
+    host.describe()
+    command = host.command("o1_set", {"on": True})
+    host.until(host.now + ANSWER_S - 0.01)
+    assert host.of(Answer) == []
+    host.until(host.now + 0.1)
+    assert host.of(Answer) == [Answer("o1_set", command.sequence, None)]
+
+
+def test_a_thousand_commands_without_an_answer_are_not_remembered_for_ever(host: Host) -> None:
+    host.describe()
+    for _ in range(1000):
+        host.command("o1_set", {"on": True})
+    host.until(host.now + ANSWER_S)
+    assert len(host.of(Answer)) == 64
+    assert len({event.kind for event in host.of(Send)}) <= 9, "at most 8 commands wait to be sent"
+
+
+def test_eight_commands_of_each_interface_may_wait_independently_of_others(host: Host) -> None:
+    host.describe()
+    for _ in range(8):
+        for name in ("o1_set", "o2_set", "o3_set", "o4_set"):
+            host.command(name, {"on": True})
+    kinds = [event.kind for event in host.of(Send) if event.kind.startswith("command 1/")]
+    assert len(set(kinds)) == len(kinds) == 8
+
+
+# -- silence
+
+
+def test_a_silent_device_is_pinged_and_then_counts_as_gone(host: Host) -> None:
+    host.describe()
+    began = host.now
+    host.until(began + 14.9)
+    pings = [at - began for at, frame in host.sent if frame.kind == wire.PING]
+    assert pings == pytest.approx([5.0, 10.0])
+    assert host.of(Gone) == []
+    host.until(began + SILENCE_S)
+    assert [gone.why for gone in host.of(Gone)] == ["has been silent for 15 s"]
+    host.until(began + 20)
+    assert host.asked() == [15.0, 17.0, 19.0]
+    host.describe()
+    assert len(host.of(Described)) == 2
+
+
+@pytest.mark.parametrize("sends", [True, False])
+def test_a_device_that_sends_is_not_pinged_and_one_that_answers_stays(host: Host, sends: bool) -> None:
+    host.describe()
+    for second in range(1, 60):
+        host.until(OPENED + second)
+        if sends:
+            host.feed(state())
+        elif host.sent and host.sent[-1][0] > host.now - 1:
+            host.feed(wire.frame(wire.PONG))
+    assert host.of(Gone) == []
+    assert (len(host.sent) == 0) if sends else (len(host.sent) >= 8)

@@ -1,0 +1,86 @@
+"""What the doctor finds out about a robot's own recorder."""
+
+from __future__ import annotations
+
+import json
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from pebble.config import parse
+from pebble.extensions.checks.check import CheckResult, State
+from pebble.extensions.checks.recorder import recorder
+from pebble.extensions.recordings.recorder.folder import Folder
+from tests.ext.recordings.playing import GOOB, Line, js, ms, write
+
+HOUR = "2023/11/14/20231114T221320Z-000001.state.mcap"
+
+
+def findings(folder: Path, *, enabled: bool = True) -> list[CheckResult]:
+    robot = {"system": "pebble", "type": "robots", "id": "goob"}
+    config = {"robot": robot, "services": {"recorder": {"enabled": enabled, "folder": str(folder)}}}
+    return list(recorder(parse(config, folder=folder, env={})))
+
+
+def recorded(folder: Path) -> Path:
+    """A finished file."""
+    path = folder / HOUR
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write(path, [Line(at, f"{GOOB}/outgoing/online", js(t=ms(at))) for at in (0.0, 900.0)])
+    return path
+
+
+def test_a_robot_without_a_recorder_is_not_asked(tmp_path: Path) -> None:
+    assert findings(tmp_path, enabled=False) == []
+
+
+def test_one_that_has_not_recorded_and_one_that_does_not_run(tmp_path: Path) -> None:
+    (finding,) = findings(tmp_path / "none")
+    assert (finding.state, "has not recorded anything" in finding.text) == (State.OK, True)
+    recorded(tmp_path)
+    assert findings(tmp_path)[0].text == "does not run now"
+
+
+@pytest.mark.parametrize(
+    ("status", "state", "text"),
+    [
+        ({}, State.OK, "runs, 7 messages into "),
+        ({"at": 1_700_000_000.0}, State.WARN, "has stood still for "),
+        ({"blocked": "no room"}, State.FAILED, "writes nothing: no room"),
+        ({"dropped": 12}, State.WARN, "has dropped 12 messages"),
+    ],
+)
+def test_one_that_runs(tmp_path: Path, status: dict[str, Any], state: State, text: str) -> None:
+    with Folder(tmp_path).taken():
+        (tmp_path / "recorder.json").write_text(json.dumps({"at": time.time(), "messages": 7, **status}))
+        finding = findings(tmp_path)[0]
+    assert (finding.state, text in finding.text) == (state, True)
+
+
+def test_files_that_were_left(tmp_path: Path) -> None:
+    path = recorded(tmp_path)
+    path.rename(path.with_name(f"{path.name}.active"))
+    finding = findings(tmp_path)[0]
+    assert (finding.state, finding.fix) == (State.WARN, f"pebble recordings mend {tmp_path}")
+
+
+def test_without_the_package_it_fails(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("pebble.extensions.checks.recorder.find_spec", lambda _: None)
+    (finding,) = findings(tmp_path)
+    assert (finding.state, finding.fix) == (State.FAILED, 'pip install "pebble-robot[record]"')
+
+
+def test_damaged_files_are_named(tmp_path: Path) -> None:
+    path = recorded(tmp_path)
+    path.rename(path.with_name(f"{path.name}.damaged"))
+    *_, finding = findings(tmp_path)
+    assert (finding.state, f"{path}.damaged" in finding.text) == (State.WARN, True)
+
+
+def test_links_are_left_alone(tmp_path: Path) -> None:
+    path = recorded(tmp_path)
+    path.unlink()
+    path.symlink_to(tmp_path / "nowhere")
+    assert all(finding.state is State.OK for finding in findings(tmp_path))

@@ -1,0 +1,333 @@
+"""Accounts that change: at a mosquitto that runs, in the files of one that does not, and what a check finds."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import subprocess
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack
+from getpass import getuser
+from pathlib import Path
+from typing import Any
+
+import pytest
+from msgspec.structs import replace
+
+from pebble.extensions.fleet import broker_files, check
+from pebble.extensions.fleet.folder import ACL, CONF, FLEET, PASSWORDS, Extra, FleetError, load, locked, refused
+from pebble.extensions.fleet.roles import Account
+from pebble.extensions.lab.rig.processes import Processes, python
+from pebble.extensions.lab.rig.robot import Robot
+from tests.ext.fleet.broker_client import BrokerClient, RefusedError
+from tests.ext.fleet.brokers import HOST, FleetBroker
+from tests.support import ROOT, until
+
+DRIVER, VIEWER = Account(roles=("driver",)), Account(roles=("viewer",))
+GOOB = Account(roles=("robot",), bases=("pebble/robots/goob",))
+DATA = ROOT / "tests" / "data" / "plugin_fleet"
+PLUGIN = next(Path("/usr/lib").glob("*/mosquitto_dynamic_security.so"), None)
+DRIVE, STOP = "pebble/robots/goob/incoming/drive-values", "pebble/robots/goob/incoming/estop"
+
+
+@pytest.fixture
+def broker(tmp_path: Path) -> Iterator[FleetBroker]:
+    with FleetBroker(tmp_path / "hall", {"otto": DRIVER, "goob": GOOB}) as broker:
+        yield broker
+
+
+def passes(broker: FleetBroker, client: BrokerClient, topic: str) -> bool:
+    """Whether the robot gets what this client sends."""
+    with broker.login("goob") as robot:
+        robot.subscribe(["pebble/robots/goob/#"])
+        client.publish(topic, b"tried")
+        client.flush()
+        robot.publish("pebble/robots/goob/outgoing/end", b"end")
+        robot.wait(lambda: any(payload == b"end" for _, payload in robot.received), "deliver")
+        return (topic, b"tried") in robot.received
+
+
+def test_a_change_counts_at_once_and_costs_no_other_connection(broker: FleetBroker) -> None:
+    with broker.login("goob") as robot, broker.login("otto") as otto:
+        took = {}
+        for what, change in (
+            ("add", lambda: broker.add("zoe", DRIVER)),
+            ("role", lambda: broker.change(broker.fleet.with_account("zoe", VIEWER))),
+            ("remove", lambda: broker.remove("zoe")),
+        ):
+            began = time.monotonic()
+            assert change() == "at once"
+            took[what] = time.monotonic() - began
+        for one in (robot, otto):
+            one.listen(0.05)
+            one.publish("pebble/robots/goob/outgoing/end", b"")
+            one.flush()
+            assert not one.closed
+    assert max(took.values()) < 0.5, took
+
+
+def test_a_role_counts_for_connections_that_are_there(broker: FleetBroker) -> None:
+    broker.add("zoe", DRIVER)
+    assert until(lambda: _gets_in(broker, "zoe"))
+    with broker.login("zoe") as zoe:
+        assert passes(broker, zoe, DRIVE)
+        broker.change(broker.fleet.with_account("zoe", VIEWER))
+        assert until(lambda: not passes(broker, zoe, DRIVE), 3)
+        assert passes(broker, zoe, STOP)
+        broker.change(broker.fleet.with_account("zoe", DRIVER))
+        assert until(lambda: passes(broker, zoe, DRIVE), 3)
+
+
+@pytest.mark.parametrize("how", ["remove", "password"])
+def test_who_is_removed_or_gets_another_password_is_disconnected(broker: FleetBroker, how: str) -> None:
+    change = {"remove": lambda broker: broker.remove("otto"), "password": lambda broker: broker.renew("otto")}
+    with broker.login("otto") as otto:
+        old = broker.passwords["otto"]
+        change[how](broker)
+        assert until(lambda: otto.listen(0.05) or otto.closed, 3)
+    with pytest.raises(RefusedError):
+        BrokerClient(broker.place, "otto", old)
+    assert _gets_in(broker, "otto") == (how == "password")
+
+
+def _gets_in(broker: FleetBroker, name: str) -> bool:
+    try:
+        broker.login(name).__exit__()
+    except RefusedError:
+        return False
+    return True
+
+
+def test_who_takes_all_connections_is_removed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(broker_files, "MAX_CONNECTIONS", 10)
+    with FleetBroker(tmp_path / "hall", {"otto": DRIVER, "zoe": DRIVER}) as broker, ExitStack() as all_of_them:
+        clients = [all_of_them.enter_context(broker.login("otto")) for _ in range(10)]
+        assert broker.remove("otto") == "at once"
+        assert until(lambda: all(client.listen(0.01) or client.closed for client in clients), 3)
+        assert _gets_in(broker, "zoe")
+
+
+def test_a_change_while_mosquitto_is_down_counts_when_it_runs(broker: FleetBroker) -> None:
+    broker.stop()
+    assert "mosquitto does not run" in broker.add("zoe", DRIVER)
+    broker.remove("otto")
+    broker.start()
+    assert check.of_rules(broker.folder, broker.fleet) == []
+    assert [_gets_in(broker, name) for name in ("zoe", "otto", "goob")] == [True, False, True]
+
+
+def test_a_password_survives_a_change_of_level(broker: FleetBroker) -> None:
+    broker.change(replace(broker.fleet, level="named"))
+    with broker.login("otto") as otto:
+        named = until(lambda: passes(broker, otto, "pebble/robots/goob/incoming/by/otto/drive-values"), 3)
+        assert (named, passes(broker, otto, DRIVE), passes(broker, otto, STOP)) == (True, False, True)
+    broker.change(replace(broker.fleet, plain=True))
+    with broker.login("otto") as otto:
+        assert until(lambda: passes(broker, otto, DRIVE), 3)
+
+
+def test_metrics_beyond_the_contract(broker: FleetBroker) -> None:
+    broker.change(replace(broker.fleet, extra=Extra(drive=("arm/+",))))
+    with broker.login("otto") as otto:
+        assert until(lambda: passes(broker, otto, "pebble/robots/goob/incoming/arm/left"), 3)
+        assert not passes(broker, otto, "pebble/robots/goob/incoming/arm")
+
+
+# -- what a check finds
+
+
+def test_it_finds_one_rule_too_many_and_one_too_few(tmp_path: Path) -> None:
+    broker = FleetBroker(tmp_path / "hall", {"otto": DRIVER, "goob": GOOB})
+    fleet = broker.fleet
+    assert check.of_rules(broker.folder, fleet) == []
+    found = check.of_rules(broker.folder, replace(fleet, accounts=fleet.accounts | {"otto": VIEWER, "new": VIEWER}))
+    assert "one rule too many: otto: write +/+/+/incoming/drive-values" in found
+    assert "new: has no password: `pebble fleet password new`" in found
+    found = check.of_rules(broker.folder, replace(fleet, extra=Extra(look=("arm/+",))).without("goob"))
+    assert "one rule too few: otto: write +/+/+/incoming/arm/+" in found
+    assert "goob: an account too many: the broker lets it in" in found
+
+
+@pytest.mark.parametrize(
+    ("file", "old", "new", "found"),
+    [
+        (CONF, "allow_anonymous false", "allow_anonymous true", "has a line of its own: allow_anonymous true"),
+        (CONF, "max_connections", "listener 1883\nmax_connections", "has a line of its own: listener 1883"),
+        (ACL, "user otto\n", "topic readwrite #\nuser otto\n", "one rule too many: everybody: readwrite #"),
+        (ACL, "topic write +/+/+/incoming/audio\n", "", "one rule too few: otto: write +/+/+/incoming/audio"),
+        (PASSWORDS, "goob:", "bob:", "goob: has no password"),
+    ],
+)
+def test_it_finds_changes_of_files(tmp_path: Path, file: str, old: str, new: str, found: str) -> None:
+    broker = FleetBroker(tmp_path / "hall", {"otto": DRIVER, "goob": GOOB})
+    changed = (broker.folder / file).read_text().replace(old, new)
+    (broker.folder / file).write_text(changed)
+    by_hand, rules = check.by_hand(broker.folder, broker.fleet), check.of_rules(broker.folder, broker.fleet)
+    assert any(found in line for line in (*by_hand, *rules))
+    assert bool(by_hand) == (file == CONF), "`pebble fleet apply` is advised for what it mends"
+    assert all(line.endswith("then restart mosquitto") for line in by_hand)
+
+
+# -- a fleet of the last version
+
+
+def test_a_fleet_of_the_plugin_becomes_one_of_files(tmp_path: Path) -> None:
+    """As the last version made it, and the plugin has it: vera is disabled, mia without rights, ghost in no table."""
+    broker = FleetBroker(tmp_path / "hall", {})
+    with_plugin = (
+        (DATA / CONF).read_text().format(folder=broker.folder, port=broker.port, user=getuser(), plugin=PLUGIN)
+    )
+    (broker.folder / CONF).write_text(with_plugin)
+    for name in (FLEET, "dynamic-security.json"):
+        (broker.folder / name).write_text((DATA / name).read_text().replace("18883", str(broker.port)))
+    (broker.folder / ACL).unlink()
+    (broker.folder / PASSWORDS).unlink()
+    broker.passwords = {"otto": "ne64-pksd-a7vu-j2p8", "goob": "bbe2-qvse-j4bs-2ch3", "ghost": "boo"}
+    broker.passwords |= {"vera": "4cvf-pjhv-bg6v-tjyb", "mia": "4kds-nsmp-zbbu-wha4", "admin": "3aht-huvw-xgnj-exxp"}
+    with broker:
+        before = [name for name in broker.passwords if _gets_in(broker, name)]
+        refused = _pebble(broker, "remove", "otto")
+        assert (refused.returncode, "`pebble fleet apply --folder hall` makes it files" in refused.stderr) == (1, True)
+        applied = _pebble(broker, "apply")
+        assert applied.returncode == 1  # until the lines are changed
+        lines = re.findall(r"(?:has a line of its own|is without the line): (.*): (remove|add) it", applied.stderr)
+        assert "mosquitto still obeys its dynamic-security plugin" in _pebble(broker, "remove", "otto").stderr
+    gone = [line for line, what in lines if what == "remove"]
+    wanted = [line for line in with_plugin.splitlines() if line not in gone]
+    (broker.folder / CONF).write_text("\n".join(wanted + [line for line, what in lines if what == "add"]))
+    with broker:
+        after = [name for name in broker.passwords if _gets_in(broker, name)]
+        with broker.login("otto") as otto:
+            by_otto = "pebble/robots/goob/incoming/by/otto/drive-values"
+            assert [passes(broker, otto, topic) for topic in (by_otto, DRIVE, STOP)] == [True, False, True]
+            assert _pebble(broker, "apply").returncode == 0
+            assert _pebble(broker, "check").stderr.count("pebble: ") == 3  # vera and mia have no password
+            assert _pebble(broker, "remove", "otto").returncode == 0
+            assert until(lambda: otto.listen(0.05) or otto.closed, 3)
+    assert before == ["otto", "goob", "ghost", "mia", "admin"]
+    assert after == ["otto", "goob", "admin"]
+    assert [name for name in ("ghost", "vera", "mia") if f"pebble: {name}: " in applied.stderr] == [
+        "ghost",
+        "vera",
+        "mia",
+    ]
+
+
+def _pebble(broker: FleetBroker, *words: str) -> subprocess.CompletedProcess[str]:
+    """Run a command of `pebble fleet` beside the folder."""
+    command = python("pebble.cli", "fleet", *words, "--folder", "hall")
+    return subprocess.run(command, cwd=broker.folder.parent, capture_output=True, text=True, check=False, timeout=60)
+
+
+# -- a person who drives
+
+
+@pytest.mark.alone
+def test_the_wheels_stop_within_a_second_when_the_driver_is_removed(tmp_path: Path) -> None:
+    with FleetBroker(tmp_path / "hall", {"otto": DRIVER, "goob": GOOB}) as broker, Processes() as running:
+        login = {"username": "goob", "password": broker.passwords["goob"]}
+        tls = {"enabled": True, "ca_cert": str(broker.folder / "ca.pem")}
+        bridge = {"mqtt_bridge": {"remote_mqtt": login | {"tls": tls}}, "serial_mcu_bridge": {}}
+        robot = Robot(running, "zenoh", (HOST, broker.port), name="goob", services=bridge)
+        robot._own |= {"security": {"level": "login"}}
+        robot.prepare()
+        robot.launch()
+        with broker.login("otto") as otto:
+
+            def driven() -> bool:
+                if not otto.closed:
+                    otto.publish(DRIVE, b'{"x": 0, "z": 0.5}')
+                    otto.listen(0.05)
+                return any(entry.motors not in (None, (0.0, 0.0)) for entry in robot.entries()[-3:])
+
+            assert until(driven, 20), robot.log()
+            removed = time.monotonic()
+            broker.remove("otto")
+            assert until(lambda: otto.listen(0.02) or otto.closed, 2)
+            stopped = until(lambda: [e.motors for e in robot.entries() if e.motors is not None][-1] == (0.0, 0.0), 3)
+            last = [entry.ns / 1e9 for entry in robot.entries() if entry.motors is not None][-1]
+        assert stopped
+        assert last - removed < 1.0
+
+
+# -- names, folders
+
+
+@pytest.mark.parametrize(
+    ("name", "account", "why"),
+    [
+        ("Ann", DRIVER, "is no name"),
+        ("a/b", DRIVER, "is no name"),
+        ("", DRIVER, "is no name"),
+        ("a" * 33, DRIVER, "is no name"),
+        ("otto", DRIVER, "exists already, as driver"),
+        ("x", Account(roles=()), "is no role"),
+        ("x", Account(roles=("boss",)), "'boss' is no role: use viewer"),
+        ("x", Account(roles=("robot", "driver"), bases=("a/b/c",)), "robot goes with no other role"),
+        ("x", Account(roles=("page", "driver")), "page goes with no other role"),
+        ("x", Account(roles=("robot",)), "has one base"),
+        ("x", Account(roles=("driver",), bases=("a/b/c",)), "no other account has any"),
+        ("x", Account(roles=("driver",), plain=True), "only a robot can be plain"),
+        ("x", Account(roles=("robot",), bases=("pebble/robots/goob",)), "belongs to goob"),
+        ("x", Account(roles=("robot",), bases=("pebble/+/goob",)), "is no base"),
+        ("x", Account(roles=("robot",), bases=("goob",)), "is no base"),
+        ("x", Account(roles=("robot",), bases=("pebble/servers/x",)), "servers are no robots"),
+        ("x", Account(roles=("gateway",), bases=("pebble/robots",)), "is no base"),
+        ("x", Account(roles=("driver", "safety")), ""),
+        ("x", Account(roles=("gateway",), bases=("pebble/robots/+",)), ""),
+        ("x", Account(roles=("boards",), bases=("pebble/robots/minilamp", "pebble/robots/benjr")), ""),
+        ("x_-1", Account(roles=("robot",), bases=("pebble/lamps/x",), plain=True), ""),
+    ],
+    ids=str,
+)
+def test_who_may_be_added(tmp_path: Path, name: str, account: Account, why: str) -> None:
+    broker = FleetBroker(tmp_path / "hall", {"otto": DRIVER, "goob": GOOB})
+    assert why in refused(broker.fleet, name, account)
+    assert bool(why) == bool(refused(broker.fleet, name, account))
+
+
+@pytest.mark.parametrize(
+    ("change", "why"),
+    [
+        ({"level": "open"}, "Invalid enum value 'open'"),
+        ({"brokers": []}, "brokers"),
+        ({"accounts": {"Ann": {"roles": ["driver"]}}}, "accounts.Ann: 'Ann' is no name"),
+        ({"accounts": {"ann": {"roles": ["boss"]}}}, "'boss' is no role"),
+        ({"extra": {"drive": ["#"]}}, "'#' is no metric"),
+        ({"extra": {"drive": ["by/otto/x"]}}, "is no metric"),
+        ({"secret": 1}, "unknown field `secret`"),
+    ],
+    ids=str,
+)
+def test_a_mistake_in_the_file_is_named(tmp_path: Path, change: dict[str, Any], why: str) -> None:
+    broker = FleetBroker(tmp_path / "hall", {})
+    file = broker.folder / FLEET
+    file.write_text(json.dumps(json.loads(file.read_text()) | change))
+    with pytest.raises(FleetError, match=r"fleet\.json") as error:
+        load(broker.folder)
+    assert why in str(error.value)
+
+
+def test_no_secret_is_in_the_fleet_and_no_other_user_reads_one(tmp_path: Path) -> None:
+    broker = FleetBroker(tmp_path / "hall", {"otto": DRIVER})
+    text = (broker.folder / FLEET).read_text()
+    assert not any(password in text for password in broker.passwords.values())
+    assert broker.folder.stat().st_mode & 0o077 == 0
+
+
+def test_commands_change_a_folder_one_after_the_other(tmp_path: Path) -> None:
+    broker = FleetBroker(tmp_path / "hall", {})
+    child = os.fork()
+    if child == 0:  # pragma: no cover
+        for number in range(10):
+            with locked(broker.folder):
+                broker.add(f"a{number}", DRIVER)
+        os._exit(0)
+    for number in range(10):
+        with locked(broker.folder):
+            broker.add(f"b{number}", DRIVER)
+    assert os.waitpid(child, 0)[1] == 0
+    assert len(broker.fleet.accounts) == 20
+    assert check.of_rules(broker.folder, broker.fleet) == []

@@ -1,0 +1,418 @@
+"""Two whole robots at a hub that knows accounts: goob's script drives fred, and what must never move fred."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import random
+import secrets
+import statistics
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from pebble.contract import DRIVE, codec
+from pebble.contract.payloads import SCRIPT, Drive
+from pebble.extensions.fleet import applying, certificates
+from pebble.extensions.fleet.folder import ZENOH, Fleet, Server, refused
+from pebble.extensions.fleet.roles import Account, rules
+from pebble.transports import Message, QoS, TlsSettings, Transport, ZenohSettings, create
+from pebble.transports.topics import matches
+from tests.robot.rig import STOP, Rig
+from tests.support import ROOT, Child, beside, cases, free_port, until
+from tests.tcp_proxy import TcpProxy
+from tests.transports.zenoh_net import HubProcess
+
+FRED, GOOB = "pebble/robots/fred", "pebble/robots/goob"
+LEAD = """
+from pebble import Robot, run
+
+def main(robot: Robot) -> None:
+    fred = robot.neighbour("fred")
+    while True:
+        fred.drive(z=0.4)
+        robot.sleep(0.05)
+
+run(main)
+"""
+BY_GOOB, BY_STRANGER = (0.4, 0.4), (0.25, 0.25)
+_RUNS = itertools.count(int(time.time()) - 1_735_689_600 + 10_000, 1000)
+HOLD_S = 2.1  # after a person's command
+OLD_S = 1.0  # what was sent before a stop has arrived or is too old
+
+
+def neighbour(name: str) -> Account:
+    return Account(roles=("neighbour",), bases=(f"pebble/robots/{name}",))
+
+
+#: Topics at the hub, and whether goob's account writes them and reads them.
+TOPICS = {
+    f"{FRED}/incoming/from/goob/drive-values": (True, False),
+    f"{FRED}/incoming/from/goob/lights-solid": (False, False),
+    f"{FRED}/incoming/from/carl/drive-values": (False, False),
+    f"{FRED}/incoming/drive-values": (False, False),
+    f"{FRED}/outgoing/wheel-odometry": (False, True),
+    f"{GOOB}/outgoing/wheel-odometry": (True, True),
+    f"{GOOB}/incoming/from/carl/drive-values": (False, True),
+    f"{GOOB}/incoming/drive-values": (False, False),
+    "pebble/lamps/lamp/outgoing/online": (False, False),
+}
+
+
+@pytest.mark.parametrize("level", ["login", "named"])
+def test_an_account_of_a_neighbour_speaks_for_its_own_base(level: Any) -> None:
+    held = rules("goob-lan", neighbour("goob"), level, at_hub=True)
+    found = {
+        topic: tuple(
+            any(matches(rule.filter, topic) for rule in held if rule.access == one) for one in ("write", "read")
+        )
+        for topic in TOPICS
+    }
+    assert found == TOPICS
+    assert rules("goob-lan", neighbour("goob"), level) == (), "at a broker it is nothing"
+
+
+def test_one_neighbour_has_a_base(tmp_path: Path) -> None:
+    accounts = {"goob": Account(roles=("robot",), bases=(GOOB,)), "goob-lan": neighbour("goob")}
+    fleet = Fleet(level="login", brokers=(Server(host="127.0.0.1"),), accounts=accounts)
+    assert refused(fleet, "two", neighbour("goob")) == f"{GOOB} belongs to goob-lan"
+    assert refused(fleet, "two", neighbour("fred")) == ""
+
+
+class Hall:
+    """The hub, fred and goob; ``incoming``: what is received below fred's ``incoming/`` on fred's own transport."""
+
+    def __init__(self, folder: Path, stack: ExitStack) -> None:
+        certificates.init(folder, ["127.0.0.1", "localhost"])
+        accounts = {f"{name}-lan": neighbour(name) for name in ("fred", "goob", "carl")}
+        for name in accounts:
+            certificates.of_account(folder, name)
+        fleet = Fleet(level="login", brokers=(Server(host="127.0.0.1"),), hubs="here", accounts=accounts)
+        applying.write_zenoh(folder, fleet)
+        self.folder, self.endpoint, self._stack = folder, f"tls/127.0.0.1:{free_port()}", stack
+        own = self._tls(folder / certificates.SERVER_CERT, folder / certificates.SERVER_KEY)
+        hub = HubProcess(folder / "run")
+        hub.settings = replace(hub.settings, listen=(self.endpoint,), tls=own, access=folder / ZENOH, lease_ms=2000)
+        self.hub = hub.start()
+        stack.callback(hub.end)
+        self.proxy = TcpProxy(int(self.endpoint.rpartition(":")[2]))
+        stack.callback(self.proxy.stop)
+        self.fred = self._robot(
+            "fred", f"tls/127.0.0.1:{self.proxy.port}", shares=["wheel-odometry"], commanded={"goob": ["drive-values"]}
+        )
+        self.goob = self._robot("goob", self.endpoint, listens={"fred": ["wheel-odometry"]})
+        local = ZenohSettings(run_dir=self.fred.folder / "run", client=True)
+        self.local = stack.enter_context(create("zenoh", "eye", local))
+        self.incoming: list[tuple[float, Message]] = []
+        self.local.subscribe(f"{FRED}/incoming/#", self._on_incoming, direct=True)
+
+    def _on_incoming(self, message: Message) -> None:
+        self.incoming.append((time.monotonic(), message))
+
+    def _tls(self, certificate: Path, key: Path) -> TlsSettings:
+        return TlsSettings(ca_cert=self.folder / certificates.CA_CERT, client_cert=certificate, client_key=key)
+
+    def _robot(self, name: str, endpoint: str, **section: Any) -> Rig:
+        place, account = self.folder / certificates.ACCOUNTS, f"{name}-lan"
+        files = {"client_cert": str(place / f"{account}.pem"), "client_key": str(place / f"{account}.key")}
+        tls = {"enabled": True, "ca_cert": str(self.folder / certificates.CA_CERT), **files}
+        lan = {"connect": [endpoint], "account": account, "tls": tls}
+        rig = Rig("zenoh", name=name, direct=True, neighbours={"enabled": True, "lan": lan, **section})
+        self._stack.callback(rig.close)
+        return rig
+
+    def client(self, account: str, stack: ExitStack) -> Transport:
+        """A program that has the certificate of this account, and sends what it likes."""
+        place = self.folder / certificates.ACCOUNTS
+        tls = self._tls(place / f"{account}.pem", place / f"{account}.key")
+        run_dir = self.folder / f"run-{account}"
+        settings = ZenohSettings(run_dir=run_dir, connect=(self.endpoint,), tls=tls, client=True, account=account)
+        return stack.enter_context(create("zenoh", f"{account}-x", settings))
+
+    def script(self, stack: ExitStack) -> None:
+        """goob's script drives fred."""
+        path = self.folder / "lead.py"
+        path.write_text(LEAD)
+        began = time.monotonic()
+        self.start(self.goob, path, stack)
+        assert until(lambda: self.by_goob(began), 20), self.fred.log.read_text()[-3000:]
+
+    def start(self, robot: Rig, path: Path, stack: ExitStack) -> None:
+        script = Child([sys.executable, str(path), "--config", str(robot.config)])
+        stack.callback(script.wait, 10)
+        stack.callback(script.terminate)
+
+    def by_goob(self, since: float) -> list[float]:
+        return [at for at, wheels in self.fred.mcu.drives(since) if wheels == BY_GOOB]
+
+    def stop(self) -> float:
+        """Stop fred, by its operator; seconds until its wheels have stopped."""
+        began = time.monotonic()
+        self.fred.operator.send("incoming/estop", {"stop": secrets.token_hex(8), "by": "ann"})
+        assert until(self._latched, 10)
+        assert until(lambda: not self.fred.mcu.turning(), 10)
+        return max([at for at, drive in self.fred.mcu.motors(began) if drive == STOP], default=began) - began
+
+    def reset(self) -> None:
+        if self._latched():
+            state = self.fred.operator.last("outgoing/estop/serial")
+            assert state is not None
+            self.fred.operator.send("incoming/estop-reset", {one: state.json[one] for one in ("boot", "count")})
+            assert until(lambda: not self._latched(), 10)
+
+    def _latched(self) -> bool:
+        state = self.fred.operator.last("outgoing/estop/serial")
+        return state is not None and state.json["latched"]
+
+    def rests(self, timeout: float = 5.0) -> None:
+        """Wait until fred's wheels rest, it is not stopped, and no person drives it."""
+        self.reset()
+        assert until(lambda: not self.fred.mcu.turning(), timeout)
+        time.sleep(HOLD_S)
+
+
+@pytest.fixture(scope="module")
+def hall() -> Iterator[Hall]:
+    with tempfile.TemporaryDirectory(prefix="pbl") as folder, ExitStack() as stack:
+        yield Hall(Path(folder), stack)
+
+
+@pytest.fixture
+def stack() -> Iterator[ExitStack]:
+    with ExitStack() as ends:
+        yield ends
+
+
+def send(client: Transport, name: str, number: int, z: float = 0.4, metric: str = "drive-values") -> None:
+    raw = codec.encode(DRIVE, Drive(z=z, source=SCRIPT, run=number))
+    client.publish(f"{FRED}/incoming/from/{name}/{metric}", raw, qos=QoS.DELIVERED)
+
+
+def sends(client: Transport, name: str, number: int, seconds: float, **options: Any) -> None:
+    end = time.monotonic() + seconds
+    while time.monotonic() < end:
+        send(client, name, number, **options)
+        time.sleep(0.05)
+
+
+def newer() -> int:
+    """The number of a run that is newer than those of goob's scripts, and of this test before."""
+    return next(_RUNS)
+
+
+@pytest.mark.thorough
+@pytest.mark.alone
+def test_a_script_drives_another_robot_until_a_person_does(hall: Hall, stack: ExitStack) -> None:
+    hall.script(stack)
+    began = time.monotonic()
+    hall.fred.operator.send("incoming/drive-values", {"x": 0, "z": -0.3})
+    assert until(lambda: (-0.3, -0.3) in [wheels for _, wheels in hall.fred.mcu.drives(began)])
+    taken = next(at for at, wheels in hall.fred.mcu.drives(began) if wheels == (-0.3, -0.3)) - began
+    time.sleep(OLD_S)
+    after = hall.by_goob(began + OLD_S / 2)
+    sys.stdout.write(f"\na person takes over after {1000 * taken:.0f} ms\n")
+    assert (after, taken < 1.0) == ([], True)
+
+
+@pytest.mark.thorough
+@pytest.mark.alone
+def test_after_a_persons_zero_who_still_sends_moves_nothing(hall: Hall, stack: ExitStack) -> None:
+    hall.rests()
+    goob, number = hall.client("goob-lan", stack), newer()
+    began = time.monotonic()
+    sends(goob, "goob", number, 1.0)
+    assert hall.by_goob(began)
+    hall.fred.operator.send("incoming/drive-values", {"x": 0, "z": 0})
+    began = time.monotonic()
+    assert until(lambda: not hall.fred.mcu.moving(), 1)
+    sends(goob, "goob", number, OLD_S)
+    seconds = cases(5, 60)
+    since = time.monotonic()
+    sends(goob, "goob", number, seconds)
+    hall.fred.kill("neighbours")
+    sends(goob, "goob", number, 5.0)
+    assert hall.by_goob(since) == []
+    hall.fred.wait_until_up(since)
+    sends(goob, "goob", number + 1, 1.0)
+    assert hall.by_goob(since), "a new start of its script drives"
+    sys.stdout.write(f"\nafter a zero: 0 commands in {seconds} s and over a restart of neighbours\n")
+
+
+@pytest.mark.thorough
+@pytest.mark.alone
+def test_who_may_not_moves_nothing(hall: Hall, stack: ExitStack) -> None:
+    """A spoofed name, a certificate without a grant, a metric without one, and the robot's own topic: 0 messages."""
+    hall.rests()
+    clients = {name: hall.client(f"{name}-lan", stack) for name in ("carl", "goob", "fred")}
+    number = newer()
+    hall.incoming.clear()
+    since = time.monotonic()
+    spoofed = codec.encode(DRIVE, Drive(z=0.25))
+    for step in range(20):
+        send(clients["carl"], "goob", number + step, 0.25)
+        send(clients["carl"], "carl", number + step, 0.25)
+        send(clients["goob"], "fred", number + step, 0.25)
+        send(clients["goob"], "goob", number + step, 0.25, "lights-solid")
+        for client in clients.values():
+            client.publish(f"{FRED}/incoming/drive-values", spoofed, qos=QoS.DELIVERED)
+        clients["carl"].publish(f"{GOOB}/outgoing/neighbours", b'{"commanded": {"x": []}}', qos=QoS.DELIVERED)
+        time.sleep(0.02)
+    sends(clients["goob"], "goob", number + 100, 0.5)
+    assert hall.by_goob(since), "it is heard at all"
+    assert BY_STRANGER not in [wheels for _, wheels in hall.fred.mcu.drives(since)]
+    drives = [json.loads(message.payload) for _, message in hall.incoming if message.topic == DRIVE.topic(FRED)]
+    assert {one["z"] for one in drives} <= {0.4, 0.0}
+    assert {message.topic for _, message in hall.incoming} == {DRIVE.topic(FRED)}
+    seen = [one.topic for one in hall.fred.operator.seen if "/from/" in one.topic or "/to/" in one.topic]
+    assert seen == []
+
+
+@pytest.mark.thorough
+@pytest.mark.alone
+def test_a_stop_ends_it_and_it_is_fast(hall: Hall, stack: ExitStack) -> None:
+    goob, number = hall.client("goob-lan", stack), newer()
+    hall.rests()
+    sent: dict[float, float] = {}
+    began = time.monotonic()
+    for step in range(cases(60, 400)):
+        z = round(0.2 + step / 10_000, 4)
+        sent[z] = time.monotonic()
+        send(goob, "goob", number, z)
+        time.sleep(0.05)
+    took = [
+        1000 * (at - sent[found])
+        for at, message in list(hall.incoming)
+        if at > began and (found := json.loads(message.payload)["z"]) in sent
+    ]
+    stopped = time.monotonic()
+    stop = hall.stop()
+    sends(goob, "goob", number, 1.0)
+    moved = [drive for at, drive in hall.fred.mcu.motors(stopped + stop) if drive != STOP]
+    figures = {"p50 ms": round(statistics.median(took), 2), "commands": len(took), "stop s": round(stop, 3)}
+    sys.stdout.write(f"\nneighbours: {json.dumps(figures)}\n")
+    assert (moved, stop <= 1.0) == ([], True)
+    assert len(took) > 0.9 * len(sent)
+
+
+class Stream:
+    """Numbered commands of one run of goob's, 40 a second, by a client that may be replaced."""
+
+    def __init__(self, hall: Hall, client: Transport) -> None:
+        self.client, self.ending, self.sent = client, threading.Event(), dict[float, float]()
+        self._hall, self._run = hall, newer()
+        hall.incoming.clear()
+
+    def run(self) -> None:
+        for number in itertools.count():
+            if self.ending.wait(0.025):
+                return
+            z = round(0.2 + number / 100_000, 5)
+            self.sent[z] = time.monotonic()
+            send(self.client, "goob", self._run, z)
+
+    @property
+    def arrived(self) -> list[tuple[float, float]]:
+        """When each came to fred's motors' topic, and which one it is."""
+        drives = [(at, one) for at, one in list(self._hall.incoming) if one.topic == DRIVE.topic(FRED)]
+        found = [(at, json.loads(one.payload)["z"]) for at, one in drives]
+        return [(at, z) for at, z in found if z in self.sent]
+
+    def arrives(self, since: float) -> bool:
+        arrived = self.arrived
+        return bool(arrived) and self.sent[arrived[-1][1]] > since
+
+    def wrong(self) -> dict[str, int]:
+        order = [z for _, z in self.arrived]
+        return {
+            "twice": len(order) - len(set(order)),
+            "out of order": sum(b < a for a, b in itertools.pairwise(order)),
+            "older than 0.5 s": sum(at - self.sent[z] > 0.5 for at, z in self.arrived),
+        }
+
+
+def _away(hall: Hall, stream: Stream, stack: ExitStack) -> Callable[[], None]:
+    stream.client.close()
+
+    def back() -> None:
+        stream.client = hall.client("goob-lan", stack)
+
+    return back
+
+
+def _hub_killed(hall: Hall, _stream: Stream, _stack: ExitStack) -> Callable[[], object]:
+    hall.hub.kill()
+    return hall.hub.start
+
+
+def _still(hall: Hall, _stream: Stream, _stack: ExitStack) -> Callable[[], None]:
+    hall.proxy.blackhole()
+    return hall.proxy.resume
+
+
+def _cut(hall: Hall, _stream: Stream, _stack: ExitStack) -> Callable[[], None]:
+    hall.proxy.cut()
+    return hall.proxy.mend
+
+
+#: What happens to the LAN, which returns its end, and for how long.
+FAULTS: dict[str, tuple[Callable[[Hall, Stream, ExitStack], Callable[[], object]], list[float]]] = {
+    "still": (_still, [0.3 + 2.7 * random.Random(3).random() for _ in range(cases(3, 20))]),
+    "cut": (_cut, [2.0, *([10.0] * cases(0, 1))]),
+    "hub killed": (_hub_killed, [1.0]),
+    "goob away": (_away, [1.0]),
+}
+
+
+@pytest.mark.thorough
+@pytest.mark.alone
+@pytest.mark.parametrize("fault", FAULTS)
+def test_after_a_fault_nothing_comes_twice_late_or_out_of_order(hall: Hall, stack: ExitStack, fault: str) -> None:
+    begin, lasting = FAULTS[fault]
+    hall.rests()
+    stream, gaps = Stream(hall, hall.client("goob-lan", stack)), list[float]()
+    with beside(stream.run, stream.ending):
+        assert until(lambda: stream.arrives(0), 10)
+        for seconds in lasting:
+            end = begin(hall, stream, stack)
+            time.sleep(seconds)
+            end()
+            ended = time.monotonic()
+            assert until(lambda ended=ended: stream.arrives(ended), 20)
+            gaps.append(stream.arrived[-1][0] - ended)
+        end = begin(hall, stream, stack)
+        stop = hall.stop()
+        end()
+        time.sleep(1.0)
+    figures = {"faults": len(lasting), "longest until it drives again s": round(max(gaps), 2), "stop s": round(stop, 3)}
+    sys.stdout.write(f"\nLAN, {fault}: {json.dumps({**figures, **stream.wrong()})}\n")
+    assert stream.wrong() == dict.fromkeys(stream.wrong(), 0)
+    assert stop <= 1.0
+
+
+@pytest.mark.thorough
+@pytest.mark.alone
+def test_goob_follows_fred_while_their_brokers_are_down(hall: Hall, stack: ExitStack) -> None:
+    hall.rests()
+    odometry = ROOT / "pebble/extensions/scripts/shipped/wheel-odometry/run.py"
+    follow = ROOT / "examples" / "follow-a-robot" / "run.py"
+    for robot, script in ((hall.fred, odometry), (hall.goob, odometry), (hall.goob, follow)):
+        hall.start(robot, script, stack)
+    for robot in (hall.fred, hall.goob):
+        robot.remote.kill()
+        stack.callback(robot.remote.start)
+    began = time.monotonic()
+
+    def fred_drives_and_goob_follows() -> bool:
+        hall.local.publish(DRIVE.topic(FRED), codec.encode(DRIVE, Drive(z=0.4)), qos=QoS.DELIVERED)
+        return any(min(wheels) > 0 for _, wheels in hall.goob.mcu.motors(began))
+
+    assert until(fred_drives_and_goob_follows, 20), hall.goob.log.read_text()[-3000:]
+    assert until(lambda: not hall.goob.mcu.turning(), 20), "fred stands, and goob has caught up"

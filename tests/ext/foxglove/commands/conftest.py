@@ -1,0 +1,3 @@
+"""One broker for each module."""
+
+from tests.commands.conftest import broker as broker

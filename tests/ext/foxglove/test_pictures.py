@@ -1,0 +1,255 @@
+"""Pictures and sound: requested while a client subscribes, as Foxglove expects them, and withdrawn afterwards."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import re
+import signal
+import socket
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import av
+import cv2
+import numpy as np
+import pytest
+from websockets.sync.client import ClientConnection, connect
+
+from pebble.extensions.foxglove.server import BACKLOG
+from pebble.extensions.media.scene import read_counter
+from tests.ext.foxglove.live import Live, client, live
+from tests.ext.foxglove.watcher import SUBPROTOCOL, Watcher, parser
+from tests.ext.page.media.robots import (
+    AUDIO,
+    CAMERA,
+    CAPABILITIES,
+    SOUND,
+    VIDEO,
+    PictureRobot,
+    SoundRobot,
+    capabilities,
+)
+from tests.support import Broker, some, until
+
+H264, JPEG, SAMPLES = f"{CAMERA}/video", f"{CAMERA}/image", f"{SOUND}/sound"
+REQUESTED, WITHDRAWN = {"enabled": True, "encoding": "h264"}, {"enabled": False}
+_nal_types = re.compile(rb"\x00\x00\x01(.)", re.DOTALL).findall
+
+
+@contextmanager
+def filming(
+    broker: Broker, *, fps: float = 15, size: tuple[int, int] = (160, 120), **video: Any
+) -> Iterator[PictureRobot]:
+    robot = PictureRobot({**VIDEO, **video}, fps=fps, size=size, transport=client(broker))
+    try:
+        yield robot
+    finally:
+        robot.close()
+
+
+def nal_types(unit: bytes) -> list[int]:
+    return [byte[0] & 31 for byte in _nal_types(unit)]
+
+
+def decoded(image: Any) -> Any:
+    return cv2.imdecode(np.frombuffer(image.data, np.uint8), cv2.IMREAD_COLOR)
+
+
+def not_reading(address: str) -> ClientConnection:
+    """A connection whose receive buffer is small, so that soon no more fits."""
+    plain = socket.socket()
+    plain.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+    host, _, port = address.removeprefix("ws://").rpartition(":")
+    plain.connect((host, int(port)))
+    return connect(address, sock=plain, subprotocols=[SUBPROTOCOL], max_queue=1, max_size=None, compression=None)  # type: ignore[list-item]
+
+
+def pictures_of(connection: ClientConnection, kind: Any) -> list[Any]:
+    """What waited for it: until half a second passes without a message."""
+    found = []
+    with contextlib.suppress(TimeoutError):
+        while True:
+            message = connection.recv(timeout=0.5)
+            found += [kind.FromString(message[13:])] if isinstance(message, bytes) else []
+    return found
+
+
+def counters(pictures: list[Any]) -> list[int | None]:
+    return [read_counter(np.asarray(picture, np.uint8)) for picture in pictures]
+
+
+def follow_each_other(numbers: list[int | None]) -> bool:
+    known = [number for number in numbers if number is not None]
+    return len(known) == len(numbers) and known == list(range(known[0], known[0] + len(known)))
+
+
+def test_h264_is_requested_while_a_client_subscribes_and_passed_on_as_foxglove_expects_it(broker: Broker) -> None:
+    with filming(broker, fps=30) as robot, live(broker) as server:
+        watcher = Watcher(server.address)
+        assert until(lambda: {H264, JPEG} <= set(watcher.channels))
+        assert robot.requests == []
+        watcher.subscribe(H264)
+        assert until(lambda: watcher.count(H264) >= 40, 30)
+        assert robot.requests[0] == REQUESTED
+        watcher.unsubscribe(H264)
+        assert until(lambda: robot.requests[-1] == WITHDRAWN and robot.flags == [True, False], 20)
+        assert watcher.statuses == []
+    videos = watcher.of(H264)
+    assert {(video.format, video.frame_id) for video in videos} == {("h264", "goob")}
+    units = [video.data for video in videos]
+    assert all(unit.startswith(b"\x00\x00\x00\x01") for unit in units)
+    assert [5 in nal_types(unit) for unit in units] == [{5, 7, 8} <= set(nal_types(unit)) for unit in units]
+    assert 31 not in {kind for unit in units for kind in nal_types(unit)}  # the seal is ours
+    decoder = av.CodecContext.create("h264", "r")
+    decoder.options = {"flags": "+low_delay"}
+    shown = [decoder.decode(av.Packet(unit)) for unit in units]
+    assert {len(frames) for frames in shown} == {1}  # a picture in each message, which waits for no later one
+    assert {int(frame.pict_type) for (frame,) in shown} <= {1, 2}  # I and P: 3 is B
+    assert follow_each_other(counters([frame.to_ndarray(format="bgr24") for (frame,) in shown]))
+    stamps = [video.timestamp.ToMilliseconds() for video in videos]
+    assert stamps == sorted(stamps)
+    assert all(
+        0 <= message.at_ns / 1e6 - stamp < 10_000 for message, stamp in zip(watcher.messages, stamps, strict=True)
+    )
+
+
+def test_a_client_that_comes_later_begins_with_a_key_frame(broker: Broker) -> None:
+    with filming(broker) as robot, live(broker) as server:
+        first, second = Watcher(server.address), Watcher(server.address)
+        first.subscribe(H264)
+        assert until(lambda: first.count(H264) >= 5, 30)
+        second.subscribe(H264)
+        assert until(lambda: any(5 in nal_types(video.data) for video in second.of(H264)), 20)
+        assert {**REQUESTED, "keyframe": True} in robot.requests
+        second.close()
+        first.close()
+        assert until(lambda: robot.requests[-1] == WITHDRAWN, 20)
+
+
+@pytest.mark.parametrize("encoding", ["json", "pbvd", "h264"])
+def test_pictures_of_every_encoding_become_jpegs(broker: Broker, encoding: str) -> None:
+    with filming(broker, encoding=encoding) as robot, live(broker) as server:
+        watcher = Watcher(server.address)
+        watcher.subscribe(JPEG)
+        assert until(lambda: watcher.count(JPEG) >= 12, 30)
+        assert robot.requests[0] == {"enabled": True}  # as configured: what others see of it does not change
+    images = watcher.of(JPEG)
+    assert {(image.format, image.frame_id) for image in images} == {("jpeg", "goob")}
+    assert follow_each_other(counters(list(map(decoded, images))))
+
+
+def test_both_at_once_are_made_of_one_stream(broker: Broker) -> None:
+    with filming(broker, encoding="json") as robot, live(broker) as server:
+        watcher = Watcher(server.address)
+        watcher.subscribe(JPEG)
+        assert until(lambda: watcher.count(JPEG), 30)
+        watcher.subscribe(H264)
+        assert until(lambda: watcher.count(H264), 30)
+        seen = watcher.count(JPEG)
+        assert until(lambda: watcher.count(JPEG) > seen + 5, 30)
+        assert [request.get("encoding") for request in robot.requests][:2] == [None, "h264"]
+
+
+def test_a_robot_without_h264_has_no_channel_for_it(broker: Broker) -> None:
+    with filming(broker, encodings=["json"]), live(broker) as server:
+        watcher = Watcher(server.address)
+        watcher.subscribe(JPEG)
+        assert until(lambda: watcher.count(JPEG), 30)
+        assert H264 not in watcher.channels
+
+
+@pytest.mark.parametrize("by", some([signal.SIGTERM, signal.SIGINT, signal.SIGHUP], 3))
+def test_a_signal_withdraws_the_requests(broker: Broker, by: signal.Signals) -> None:
+    with filming(broker) as robot:
+        server = Live(broker)
+        watcher = Watcher(server.address)
+        watcher.subscribe(H264)
+        assert until(lambda: watcher.count(H264), 30)
+        code, errors, seconds = server.end(by)
+        assert (code, errors.splitlines()[1:]) == (0, [])
+        assert errors.startswith("Showed 1 robots in ")
+        assert seconds < 5
+        assert until(lambda: robot.requests[-1] == WITHDRAWN and robot.flags == [True, False])
+        assert until(lambda: watcher.closed)
+
+
+def test_it_ends_beside_a_frozen_broker_too(broker: Broker) -> None:
+    with filming(broker), live(broker) as server:
+        watcher = Watcher(server.address)
+        watcher.subscribe(H264)
+        assert until(lambda: watcher.count(H264), 30)
+        broker.freeze()
+        try:
+            assert server.end() < 8
+        finally:
+            broker.thaw()
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"command_topic": "pebble/robots/fred/incoming/front-camera"},
+        {"topic": "pebble/robots/fred/outgoing/front-camera"},
+        {"flag_topic": "pebble/robots/goob/incoming/estop"},
+    ],
+)
+def test_capabilities_that_name_topics_of_others_get_no_channel_and_no_request(
+    broker: Broker, wrong: dict[str, str]
+) -> None:
+    with filming(broker, **wrong) as robot, live(broker) as server:
+        watcher = Watcher(server.address)
+        watcher.subscribe(CAPABILITIES)
+        assert until(lambda: watcher.count(CAPABILITIES))
+        assert set(watcher.channels) == {CAPABILITIES}
+        assert robot.requests == []
+
+
+def test_why_there_are_no_pictures_is_shown_in_foxglove(broker: Broker) -> None:
+    with filming(broker) as robot, live(broker) as server:
+        watcher = Watcher(server.address)
+        watcher.subscribe(H264)
+        assert until(lambda: watcher.count(H264), 30)
+        robot.transport.publish(CAPABILITIES, capabilities({**VIDEO, "available": False}), retain=True)
+        assert until(lambda: watcher.statuses, 20)
+        assert watcher.statuses[0]["message"] == f"{CAMERA}: it has no camera"
+        assert until(lambda: robot.requests[-1] == WITHDRAWN, 20)
+
+
+@pytest.mark.thorough
+def test_a_client_that_does_not_read_delays_no_other_and_loses_the_oldest(broker: Broker) -> None:
+    with filming(broker, fps=60, size=(640, 480), encoding="pbvd") as robot, live(broker) as server:
+        watcher = Watcher(server.address)
+        watcher.subscribe(JPEG)
+        stopped = not_reading(server.address)
+        channel = watcher.channels[JPEG]["id"]
+        stopped.send(json.dumps({"op": "subscribe", "subscriptions": [{"id": 1, "channelId": channel}]}))
+        assert until(lambda: watcher.count(JPEG) >= 400, 90)
+        images = watcher.of(JPEG)
+        assert follow_each_other(counters(list(map(decoded, images))))
+        robot.mute = True
+        waited = counters(list(map(decoded, pictures_of(stopped, parser(watcher.channels[JPEG])))))
+        assert waited[-1] == len(robot.sent) - 1
+        assert BACKLOG <= len(waited) < len(images) - 50
+        stopped.close()
+
+
+@pytest.mark.parametrize("encoding", ["pcm", "opus"])
+def test_sound_becomes_samples(broker: Broker, encoding: str) -> None:
+    robot = SoundRobot({**AUDIO, "encoding": encoding}, transport=client(broker))
+    try:
+        with live(broker) as server:
+            watcher = Watcher(server.address)
+            watcher.subscribe(SAMPLES)
+            assert until(lambda: watcher.count(SAMPLES) >= 50, 30)
+            watcher.unsubscribe(SAMPLES)
+            assert until(lambda: robot.requests[-1] == WITHDRAWN, 20)
+            assert robot.requests[0] == {"enabled": True}
+        blocks = watcher.of(SAMPLES)
+        assert {(one.format, one.number_of_channels) for one in blocks} == {("pcm-s16", 1)}
+        samples = np.frombuffer(b"".join(one.data for one in blocks), np.int16)
+        assert len(samples) == pytest.approx(len(blocks) * blocks[0].sample_rate / 50, rel=0.1)
+        assert np.abs(samples).max() > 1000
+    finally:
+        robot.close()

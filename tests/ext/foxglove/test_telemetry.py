@@ -1,0 +1,192 @@
+"""What robots publish besides pictures and sound, of one robot and of many, and of those that come and go."""
+
+from __future__ import annotations
+
+import json
+import math
+import time
+from collections.abc import Iterator
+
+import pytest
+
+from pebble.contract import APRILTAG_DATA, APRILTAG_LOCATIONS, CHARGING_LEVEL, LOGS, WHEEL_ODOMETRY
+from pebble.contract.payloads import ChargingLevel, LogRecord, TagData, TagDetection, TagLocations, WheelOdometry
+from pebble.transports import Message, QoS, Transport
+from tests.ext.foxglove.live import FRED, GOOB, client, live, online, publish
+from tests.ext.foxglove.watcher import Watcher
+from tests.support import Broker, until
+
+ONLINE, LEVEL = f"{GOOB}/outgoing/online", f"{GOOB}/outgoing/charging-level"
+CORNERS = [(0.1, 0.2), (0.3, 0.2), (0.3, 0.4), (0.1, 0.4)]
+
+
+@pytest.fixture
+def robot(broker: Broker) -> Iterator[Transport]:
+    robot = client(broker)
+    yield robot
+    robot.close()
+
+
+def now_ms() -> int:
+    return int(time.time() * 1000)
+
+
+def test_each_payload_gets_the_schema_that_foxglove_has_for_it(broker: Broker, robot: Transport) -> None:
+    t = now_ms()
+    detection = TagDetection(marker_id=7, corners_norm=CORNERS, center_norm=(0.2, 0.3))
+    tags = TagLocations(source="x", detections=[detection], frame_width=640, frame_height=480, timestamp=t / 1e3)
+    odometry = WheelOdometry(value={"x_mm": 1500.0, "y_mm": 0.0, "heading_rad": 0.0}, timestamp=t / 1e3, unit="mm")
+    followed = TagData(detected=True, timestamp=t / 1e3, marker_id=7, distance_m=2.0, angle_rad=math.pi / 2)
+    record = LogRecord(t=t, level="WARNING", service="bridge", message="careful")
+    sent = {LOGS: record, WHEEL_ODOMETRY: odometry, APRILTAG_LOCATIONS: tags, APRILTAG_DATA: followed}
+    names = ["logs/log", "wheel-odometry/pose", "apriltag-locations/annotations", "apriltag-data/scene"]
+    topics = [f"{GOOB}/outgoing/{name}" for name in (*names, "apriltag-data")]
+    with live(broker) as server:
+        watcher = Watcher(server.address)
+
+        def publish_all() -> bool:
+            for channel, value in sent.items():
+                publish(robot, GOOB, channel, value)
+            return all(watcher.of(topic) for topic in topics)
+
+        publish_all()
+        for topic in topics:
+            watcher.subscribe(topic)
+        assert until(publish_all, 20, step=0.05)
+    log, pose, drawn, scene, data = (watcher.of(topic)[0] for topic in topics)
+    assert (log.level, log.name, log.message, log.timestamp.ToMilliseconds()) == (3, "bridge", "careful", t)
+    assert (pose.frame_id, pose.pose.position.x) == ("goob/odom", 1.5)
+    assert [(point.x, point.y) for point in drawn.points[0].points] == [(64, 96), (192, 96), (192, 192), (64, 192)]
+    (entity,) = scene.entities
+    place = entity.cubes[0].pose.position
+    assert (entity.frame_id, place.x, place.y) == ("goob", pytest.approx(0, abs=1e-9), pytest.approx(-2))
+    assert entity.timestamp.ToMilliseconds() == t
+    assert data["distance_m"] == 2.0
+
+
+def test_json_has_the_schema_of_the_contract_and_its_last_value_for_who_subscribes_later(
+    broker: Broker, robot: Transport
+) -> None:
+    publish(robot, GOOB, CHARGING_LEVEL, ChargingLevel(value=7.4))
+    robot.publish(f"{GOOB}/outgoing/diagnostics", b"[1, 2]", retain=True)
+    with live(broker) as server:
+        first, second = Watcher(server.address), Watcher(server.address)
+        first.subscribe(LEVEL)
+        assert until(lambda: first.of(LEVEL)), "although it was published before"
+        second.subscribe(LEVEL)
+        assert until(lambda: second.of(LEVEL))
+        first.subscribe(f"{GOOB}/outgoing/diagnostics")
+        assert until(lambda: first.of(f"{GOOB}/outgoing/diagnostics") == [{"value": [1, 2]}])
+    channel = first.channels[LEVEL]
+    assert (channel["encoding"], channel["schemaName"]) == ("json", "pebble.ChargingLevel")
+    assert json.loads(channel["schema"])["properties"]["value"] == {"type": "number"}
+    assert second.of(LEVEL)[0]["value"] == 7.4
+
+
+def test_a_value_that_the_broker_retains_is_remembered_whatever_its_channel(broker: Broker, robot: Transport) -> None:
+    outlet = f"{GOOB}/outgoing/mcu/strip/o1"
+    robot.publish(outlet, b'{"t": 1}', qos=QoS.DELIVERED, retain=True)
+    with live(broker) as server:
+        first, second = Watcher(server.address), Watcher(server.address)
+        first.subscribe(outlet)
+        assert until(lambda: first.of(outlet) == [{"t": 1}])
+        robot.publish(outlet, b'{"t": 2}', qos=QoS.DELIVERED, retain=True)
+        assert until(lambda: first.of(outlet) == [{"t": 1}, {"t": 2}])
+        second.subscribe(outlet)
+        assert until(lambda: second.of(outlet))
+        assert second.of(outlet) == [{"t": 2}]
+
+
+def test_a_robot_that_comes_later_gets_its_channels_then_and_one_that_goes_keeps_them(
+    broker: Broker, robot: Transport
+) -> None:
+    online(robot, GOOB)
+    with live(broker) as server:
+        watcher = Watcher(server.address)
+        watcher.subscribe(ONLINE)
+        online(robot, FRED)
+        watcher.subscribe(f"{FRED}/outgoing/online")
+        assert until(lambda: watcher.of(f"{FRED}/outgoing/online"))
+        robot.publish(ONLINE, b"", qos=QoS.DELIVERED, retain=True)  # it is removed from the broker
+        online(robot, FRED, 2)
+        assert until(lambda: {"t": 2} in watcher.of(f"{FRED}/outgoing/online"))
+        later = Watcher(server.address)
+        later.subscribe(ONLINE)
+        assert until(lambda: later.of(ONLINE) == [{"t": 1}])
+        online(robot, GOOB, 3)
+        assert until(lambda: {"t": 3} in watcher.of(ONLINE))
+
+
+def test_only_the_robot_that_was_asked_for(broker: Broker, robot: Transport) -> None:
+    with live(broker, FRED) as server:
+        watcher = Watcher(server.address)
+        for base in (GOOB, FRED):
+            online(robot, base)
+        watcher.subscribe(f"{FRED}/outgoing/online")
+        assert list(watcher.channels) == [f"{FRED}/outgoing/online"]
+
+
+def test_clients_only_look(broker: Broker, robot: Transport) -> None:
+    received: list[Message] = []
+    robot.subscribe(f"{GOOB}/incoming/#", received.append, direct=True)
+    online(robot, GOOB)
+    drive = {"id": 1, "topic": f"{GOOB}/incoming/drive-values", "encoding": "json", "schemaName": "x"}
+    with live(broker) as server:
+        watcher = Watcher(server.address)
+        assert until(lambda: watcher.info)
+        assert watcher.info["capabilities"] == []
+        watcher.send({"op": "advertise", "channels": [drive]})
+        watcher.send(b"\x01\x01\x00\x00\x00" + b'{"x": 0, "z": 1}')
+        assert until(lambda: watcher.statuses)
+        assert "clientPublish" in watcher.statuses[0]["message"]
+        watcher.subscribe(ONLINE)
+        assert until(lambda: watcher.of(ONLINE))
+    assert received == []
+
+
+def test_many_robots_at_once_do_not_lose_a_client(broker: Broker, robot: Transport) -> None:
+    metrics = ("online", "status", "charging-level", "charging-status")
+    topics = {f"pebble/robots/r{number}/outgoing/{metric}" for number in range(300) for metric in metrics}
+    with live(broker) as server:
+        watcher = Watcher(server.address)
+        assert until(lambda: watcher.info)
+
+        def shown() -> bool:
+            """A broker queues no more than 1,000 messages for a slow reader: what is missing comes again."""
+            for topic in topics - set(watcher.channels):
+                robot.publish(topic, b'{"t": 1}', qos=QoS.DELIVERED)
+            return topics <= set(watcher.channels)
+
+        assert until(shown, 30, step=0.5)
+        assert not watcher.closed
+
+
+def test_what_is_no_json_and_no_robot_is_left_out(broker: Broker, robot: Transport) -> None:
+    with live(broker) as server:
+        watcher = Watcher(server.address)
+        robot.publish(f"{GOOB}/outgoing/status", b"\xff\xfe")
+        robot.publish("pebble/servers/lab/outgoing/status", b'{"t": 1}')
+        robot.publish(f"{GOOB}/incoming/drive-values", b'{"x": 0, "z": 0}')
+        online(robot, GOOB)
+        watcher.subscribe(ONLINE)
+        assert list(watcher.channels) == [ONLINE]
+
+
+def test_a_broker_that_goes_is_a_problem_in_foxglove_and_one_that_is_back_goes_on(
+    broker: Broker, robot: Transport
+) -> None:
+    with live(broker) as server:
+        watcher = Watcher(server.address)
+        online(robot, GOOB)
+        watcher.subscribe(ONLINE)
+        assert until(lambda: watcher.of(ONLINE))
+        broker.stop()
+        assert until(lambda: watcher.statuses, 20)
+        assert f"mqtt://127.0.0.1:{broker.port}" in watcher.statuses[0]["message"]
+        broker.start()
+
+        def published() -> bool:
+            online(robot, GOOB, 2)
+            return {"t": 2} in watcher.of(ONLINE)
+
+        assert until(published, 30, step=0.1)

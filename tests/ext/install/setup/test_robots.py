@@ -1,0 +1,246 @@
+"""What setup makes works: its broker lets in whom it should, and backups become robots again."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import threading
+from collections.abc import Iterator
+from contextlib import closing, contextmanager
+from pathlib import Path
+
+import pytest
+
+from pebble.config import load
+from pebble.contract.identity import Identity
+from pebble.extensions.checks.broker.login_attempt import attempt
+from pebble.extensions.fleet import certificates
+from pebble.extensions.fleet.certificates import CA_CERT
+from pebble.extensions.fleet.people import People
+from pebble.extensions.fleet.roles import Account, Role
+from pebble.extensions.install.setup.backup import make
+from pebble.extensions.lab.rig.processes import mosquitto_path
+from pebble.extensions.page.commands import people as web_people
+from pebble.runtime.connections import mqtt_settings
+from pebble.runtime.places import Places
+from pebble.transports import MqttSettings
+from pebble.transports.settings import TlsSettings
+from tests.commands.command_line import Run
+from tests.ext.fleet.brokers import HOST, FleetBroker
+from tests.ext.install.setup.conftest import at
+from tests.ext.install.setup.rig import BROKER_PASSWORD, PASSWORD, answers_in, machine_root, set_up, tar_of, tree
+from tests.support import Child, free_port, listening, needs_root, until
+
+HEAD = ("backup.json", b'{"format": 1, "version": "0", "id": "a"}')
+GOOB, FRED = Identity("pebble", "robots", "goob"), Identity("pebble", "robots", "fred")
+
+
+def settings_of(root: Path) -> MqttSettings:
+    return mqtt_settings(load(Places(root).config).services.mqtt_bridge.remote_mqtt, reconnect_max_s=1)
+
+
+# -- the robot's own broker
+
+
+@contextmanager
+def mosquitto(root: Path) -> Iterator[tuple[int, int]]:
+    """A real one with the configuration that setup wrote, at other ports; yields those."""
+    plain, encrypted = free_port(), free_port()
+    text = Places(root).broker.read_text().replace("/etc/", f"{root}/etc/")
+    text = text.replace("listener 1883 ", f"listener {plain} ").replace("listener 8883", f"listener {encrypted} {HOST}")
+    (root / "mosquitto-of-test.conf").write_text(f"{text}user root\n")
+    with Child([str(mosquitto_path()), "-c", str(root / "mosquitto-of-test.conf")]) as process:
+        assert until(lambda: listening(plain) and listening(encrypted))
+        yield plain, encrypted
+        process.terminate()
+
+
+def test_its_own_broker_lets_in_the_robot_and_its_page_and_no_stranger(root: Path) -> None:
+    set_up(root)
+    places = Places(root)
+    logins = {
+        name: (places.etc / f"{file}.password").read_text().strip()
+        for name, file in (("goob", "broker"), ("page", "page"))
+    }
+    tls = TlsSettings(ca_cert=places.broker_folder / CA_CERT)
+
+    def code(port: int, tls: TlsSettings | None, user: str | None = None, password: str | None = None) -> int | None:
+        settings = MqttSettings(host=HOST, port=port, username=user, password=password, tls=tls)
+        return attempt(settings, login=user is not None).code
+
+    with mosquitto(root) as (plain, encrypted):
+        found = [
+            code(port, with_tls, name, one)
+            for name, one in logins.items()
+            for port, with_tls in ((plain, None), (encrypted, tls))
+        ]
+        assert found == [0] * 4
+        assert [code(plain, None), code(encrypted, tls), code(plain, None, "goob", "wrong")] == [5, 5, 5]
+        assert code(encrypted, None, "goob", logins["goob"]) is None, "beyond this machine it is encrypted"
+
+
+def test_a_name_that_was_changed_in_the_config_keeps_its_account(root: Path) -> None:
+    set_up(root)
+    config = Places(root).config
+    config.write_text(config.read_text().replace('"id": "goob"', '"id": "fred"'))
+    assert set_up(root) == ["accounts, rules and certificate of the robot's own broker"]
+    accounts = json.loads((Places(root).broker_folder / "fleet.json").read_text())["accounts"]
+    assert {name: account["bases"] for name, account in accounts.items() if "bases" in account} == {"goob": [FRED.base]}
+    assert set_up(root) == []
+
+
+# -- a broker elsewhere
+
+
+@pytest.mark.parametrize(
+    ("user", "password", "shown"),
+    [
+        ("goob", None, []),
+        ("goob", "wrong-password", ["not authorized (bad user name or password?)"]),
+        ("eve", None, ["not authorized (bad user name or password?)"]),
+    ],
+    ids=("right", "wrong password", "no account"),
+)
+def test_a_broker_elsewhere_is_asked_whether_it_lets_the_robot_in(
+    user: str, password: str | None, shown: list[str], root: Path, tmp_path: Path, run: Run
+) -> None:
+    robot = {"goob": Account(roles=("robot",), bases=(GOOB.base,))}
+    with FleetBroker(tmp_path / "hall", robot, unencrypted=free_port()) as broker:
+        file, place = tmp_path / "password", f"{HOST}:{broker.unencrypted}"
+        file.write_text(password or broker.passwords["goob"])
+        answers = answers_in(tmp_path, broker=place, broker_user=user, page=False, broker_password_file=str(file))
+        run("setup", "--answers", answers)
+        refused = re.findall(
+            r"Failed: the broker (.*) does not let the robot in: (.*); the robot", run.out.replace("\n  ", " ")
+        )
+        assert refused == [(place, why) for why in shown]
+        assert file.read_text() not in run.out + run.err
+        assert settings_of(root).password == file.read_text()
+
+
+def test_a_broker_on_another_machine_is_reached_encrypted_and_with_a_login(
+    root: Path, tmp_path: Path, run: Run
+) -> None:
+    certificates.init(tmp_path / "hall", ["broker.invalid"])
+    file, ca = tmp_path / "password", tmp_path / "hall" / CA_CERT
+    file.write_text(BROKER_PASSWORD)
+    far = {"broker": "broker.invalid", "broker_user": "goob", "broker_ca": str(ca), "broker_password_file": str(file)}
+    run("setup", "--answers", answers_in(tmp_path, **far))
+    assert "Failed: the broker broker.invalid does not let the robot in" in run.out
+    config = load(Places(root).config)
+    remote = config.services.mqtt_bridge.remote_mqtt
+    assert config.security.level == "login"
+    assert (remote.port, remote.username, remote.password, remote.tls.enabled) == (8883, "goob", BROKER_PASSWORD, True)
+    assert (Places(root).etc / "broker-ca.pem").read_bytes() == ca.read_bytes()
+    ca.unlink()
+    assert set_up(root, camera="none") == ["config /etc/pebble/robot.json"], "the file that was named may be gone"
+
+
+# -- backups
+
+
+def test_a_backup_on_a_blank_machine_is_the_same_robot(
+    root: Path, tmp_path: Path, run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    set_up(root)
+    places = Places(root)
+    places.config.write_text(places.config.read_text().replace("synthetic", "libcamera"))
+    (places.state / "estop-serial-pebble+robots+goob.json").write_text('{"stopped": true}')
+    wanted = tree(root)
+    places.manifest.write_text("{}")  # of an earlier setup: it is not needed
+    backup = tmp_path / "goob.tar"
+    assert run("setup", "--backup", backup) == 0
+    other = machine_root(tmp_path / "other")
+    at(other, monkeypatch)
+    assert run("setup", "--from", backup) == 1, "systemd does not run there"
+    assert "The files of goob are in their places." in run.out
+    assert tree(other) == wanted
+    assert settings_of(other).password == settings_of(root).password
+    with closing(People(Places(other).people)) as people:
+        assert people.check("ann", PASSWORD, "")
+    before = tree(other)
+    run("setup", "--from", backup)
+    assert "All is so already." in run.out
+    assert tree(other) == before
+
+
+@pytest.mark.parametrize("name", ["etc/pebble/robot.json", "var/lib/pebble/estop-serial-pebble+robots+goob.json"])
+def test_a_machine_with_other_files_takes_no_backup(
+    name: str, root: Path, tmp_path: Path, run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    set_up(root)
+    (Places(root).state / "estop-serial-pebble+robots+goob.json").write_text('{"stopped": true}')
+    assert run("setup", "--backup", tmp_path / "goob.tar") == 0
+    other = machine_root(tmp_path / "other")
+    at(other, monkeypatch)
+    (other / name).write_text("{}")
+    before = tree(other)
+    assert run("setup", "--from", tmp_path / "goob.tar") == 1
+    assert (
+        run.err
+        == f"pebble: {other / name} is there already, with other content: only a blank machine becomes this robot\n"
+    )
+    assert tree(other) == before
+
+
+@needs_root
+def test_a_backup_by_root_of_a_database_that_is_written_to_is_whole_and_leaves_it_to_its_owner(root: Path) -> None:
+    """SQLite makes files beside a database, and gives them to the owner of that, where it may."""
+    set_up(root)
+    file, owner = Places(root).people, 65534
+    os.chown(file, owner, owner)
+    ending = threading.Event()
+
+    def write() -> None:
+        with closing(People(file)) as people:
+            (ann,) = people.list()
+            while not ending.is_set():
+                people.start_session(ann)
+
+    page = threading.Thread(target=write)
+    page.start()
+    try:
+        saved = [make(Places(root)).files["var/lib/pebble/people.sqlite"].content for _ in range(10)]
+    finally:
+        ending.set()
+        page.join()
+    assert len(set(saved)) > 1, "it was written to meanwhile"
+    make(Places(root))
+    assert {path.stat().st_uid for path in file.parent.glob("people.sqlite*")} == {owner}
+    (root / "saved.sqlite").write_bytes(saved[-1])
+    with closing(People(root / "saved.sqlite")) as people:
+        assert people.check("ann", PASSWORD, "")
+
+
+@pytest.mark.parametrize(
+    ("members", "why"),
+    [
+        ([("etc/pebble/robot.json", b"")], "is no backup of Pebble"),
+        ([("backup.json", b"{}")], "Object missing required field"),
+        ([("backup.json", b'{"format": 2, "version": "9", "id": "a"}')], "has format 2"),
+        ([HEAD, ("etc/pebble/robot.json", b""), ("etc/shadow", b"")], "is no file of a robot"),
+        ([HEAD, ("etc/pebble/../shadow", b"")], "is not what a backup has"),
+        ([HEAD, ("/etc/pebble/a", b"")], "is not what a backup has"),
+        ([HEAD], "has no etc/pebble/robot.json"),
+    ],
+)
+def test_what_is_no_backup_is_refused(
+    members: list[tuple[str, bytes]], why: str, root: Path, tmp_path: Path, run: Run
+) -> None:
+    before = tree(root)
+    assert run("setup", "--from", tar_of(tmp_path / "a.tar", members)) == 1
+    assert why in run.err
+    assert tree(root) == before
+
+
+# -- people
+
+
+def test_a_user_without_a_config_is_added_where_the_robots_page_reads(
+    root: Path, run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    set_up(root)
+    monkeypatch.setattr(web_people, "PLACES", Places(root))
+    assert run("web", "user", "list") == 0
+    assert run.out.split() == ["ann", Role.ADMIN]

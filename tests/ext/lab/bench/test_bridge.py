@@ -1,0 +1,127 @@
+"""The bridge comparison without robots: matching of commands and reports, cells, turns."""
+
+import json
+from collections.abc import Sequence
+from typing import Any
+
+import pytest
+
+from pebble.extensions.lab.bench.bridge import COMMANDS, CPU, DOWN, LOADED, UNLOADED, UP, cells_of
+from pebble.extensions.lab.bench.bridge_operator import (
+    ALL,
+    HOP,
+    SERVICES,
+    Arrived,
+    Turn,
+    arrivals,
+    matched,
+    wheels,
+    wheels_of,
+)
+from pebble.extensions.lab.bench.results import Cell, Results
+from pebble.extensions.lab.bench.rounds import add_round
+from pebble.extensions.lab.simulation.trace import Entry
+from pebble.services.serial_mcu_bridge.text.goob_base import Touch
+
+MS = 1_000_000
+FORWARDER, SERIAL = PARTS = tuple(SERVICES)
+
+
+def test_no_two_commands_are_alike_within_hours() -> None:
+    assert len({wheels(number) for number in range(100_000)}) == 100_000
+
+
+def test_every_command_makes_both_wheels_turn_and_is_identified_by_its_speeds() -> None:
+    for number in range(0, 640_000, 997):
+        left, right = wheels(number)
+        assert 0.1 <= left < 0.9
+        assert 0.1 <= right < 0.9
+        assert wheels_of(json.dumps({"x": (left - right) / 2, "z": (left + right) / 2}).encode()) == (left, right)
+
+
+def test_a_command_counts_once_and_when_it_came_first() -> None:
+    turn = Turn(0, 200 * MS, {(0.1, 0.1): 10 * MS, (0.2, 0.1): 60 * MS, (0.3, 0.1): 110 * MS}, {FORWARDER: 0.002})
+    trace = [
+        Entry(11 * MS, "line", "M 0.100 0.100"),
+        Entry(13 * MS, "line", "M 0.100 0.100"),
+        Entry(62 * MS, "line", "M 0.200 0.100"),
+        Entry(63 * MS, "motors", "0.200 0.100"),
+        Entry(900 * MS, "line", "M 0.000 0.000"),
+    ]
+    down, forwarded = cells_of("mqtt", COMMANDS, turn, Arrived(arrivals(trace), [], []))
+    assert (down.samples, down.lost) == ([1.0, 2.0], 1)
+    assert forwarded.samples == [1000.0]  # us for each of two
+
+
+def test_a_report_is_identified_by_values_that_occur_once() -> None:
+    turn = Turn(100 * MS, 200 * MS, {}, {FORWARDER: 0.003})
+    trace = [
+        Entry(90 * MS, "said", "T a0=1 a1=1 a2=1"),
+        Entry(110 * MS, "said", "T a0=2 a1=2 a2=2"),
+        Entry(115 * MS, "said", "OK M"),
+        Entry(120 * MS, "line", "T a0=7 a1=7 a2=7"),
+        Entry(130 * MS, "said", "T a0=3 a1=3 a2=3"),
+        Entry(150 * MS, "said", "T a0=4 a1=4 a2=4"),
+        Entry(170 * MS, "said", "T a0=3 a1=3 a2=3"),
+        Entry(190 * MS, "said", "T a0=5 a1=5 a2=5"),
+        Entry(210 * MS, "said", "T a0=6 a1=6 a2=6"),
+    ]
+    received = [
+        (ns * MS, Touch(value, value, value)) for ns, value in ((91, 1), (112, 2), (131, 3), (193, 5), (211, 6))
+    ]
+    _, up, forwarded = cells_of("mqtt", UNLOADED, turn, Arrived({}, matched(trace, received), received))
+    assert (up.samples, up.total("sent")) == ([2.0, 3.0], 3)
+    assert forwarded.samples == [1000.0]  # us for each of the three that were received meanwhile
+
+
+def test_a_report_received_before_it_was_sent_is_another_one() -> None:
+    trace = [Entry(10 * MS, "said", "T a0=1 a1=2 a2=3")]
+    received = [(9 * MS, Touch(1, 2, 3)), (12 * MS, Touch(1, 2, 3)), (14 * MS, Touch(1, 2, 3))]
+    assert matched(trace, received) == [(10 * MS, 12 * MS)]
+
+
+# -- cells
+
+
+def joined(rounds: Sequence[Sequence[Cell]]) -> list[Cell]:
+    results = Results(bench="bridge")
+    for cells in rounds:
+        add_round(results, cells)
+    return results.cells
+
+
+def turn_of(down: Sequence[float] = (), up: Sequence[float] = (), sent: int = 1, **known: Any) -> tuple[Turn, Arrived]:
+    """A result with latencies in ms."""
+    turn = Turn(
+        **{"began": 0, "ended": MS, "sent": {wheels(number): 0 for number in range(sent)}, "cpu_s": {}, **known}
+    )
+    commands = {wheels(number): round(ms * MS) for number, ms in enumerate(down)}
+    reports: list[tuple[int, int | None]] = [(0, None)] if not up else [(0, round(ms * MS)) for ms in up]
+    return turn, Arrived(commands, reports, [])
+
+
+def test_cells_have_a_list_of_samples_for_each_round() -> None:
+    took: dict[str, Any] = {"ended": 500 * MS, "cpu_s": {ALL: 0.1}}
+    turns = [turn_of([1.0], [2.0], **took), turn_of([1.5], **took), turn_of([3.0], [2.5], 2, **took)]
+    first, again, second = ([*cells_of("zenoh", LOADED, *turn)] for turn in turns)
+    down, up = joined([first + again, second])
+    assert (down.variant, down.measure, down.params, down.unit) == ("zenoh", DOWN, {"load": "media"}, "ms")
+    assert (down.rounds, down.lost) == ([[1.0, 1.5], [3.0]], 1)
+    assert (up.measure, up.rounds, up.lost) == (UP, [[2.0], [2.5]], 1)
+    assert down.figures == {"sent": [2, 2], "cpu_percent": [20.0, 20.0]}
+
+
+def test_without_reports_there_is_one_cell() -> None:
+    for variant, load in ((HOP, UNLOADED), ("mqtt", COMMANDS)):
+        (cell,) = cells_of(variant, load, *turn_of([0.2]))
+        assert (cell.measure, cell.rounds, cell.figures) == (DOWN, [[0.2]], {"sent": [1]})
+
+
+def test_cpu_is_divided_by_what_was_forwarded_in_each_turn() -> None:
+    parts = {FORWARDER: 0.007, SERIAL: 0.014}
+    all_, half, none = (
+        [*cells_of("mqtt", UNLOADED, *turn_of(count * [1.0], sent=count, cpu_s=parts))] for count in (70, 35, 0)
+    )
+    *_, bridge_, serial = joined([all_ + half, none])
+    assert (bridge_.measure, bridge_.unit, bridge_.params) == (CPU, "us", {"load": "none", "process": "bridge"})
+    assert [*bridge_.rounds, *serial.rounds] == [pytest.approx([100, 200]), [], pytest.approx([200, 400]), []]

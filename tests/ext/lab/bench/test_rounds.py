@@ -1,0 +1,145 @@
+"""Rounds are the observations: what is planted is found, what is not is not, and failed rounds count for nobody."""
+
+from __future__ import annotations
+
+import io
+import math
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+from pebble.errors import PebbleError
+from pebble.extensions.lab.bench import rounds
+from pebble.extensions.lab.bench.results import Cell, Results, round_cell
+from pebble.extensions.lab.bench.rounds import LEAST_ROUNDS, Progress, add_round, in_turn, measure_rounds, paired, ratio
+
+Rounds = list[list[float]]
+RUNS = 300
+
+
+@pytest.fixture
+def _fewer_resamples(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A number of resamplings for hundreds of intervals within a second or two."""
+    monkeypatch.setattr(rounds, "RESAMPLES", 1000)
+
+
+def make(random: np.random.Generator, count: int, *, factor: float = 1.0, mood: float = 0.05) -> Rounds:
+    """The samples look as measured ones do: each round has an offset of its own, and a long tail."""
+    moods = factor * np.exp(random.normal(0, mood, count))
+    return [(100 * one * np.exp(random.normal(0, 0.1, 25))).tolist() for one in moods]
+
+
+@pytest.mark.usefixtures("_fewer_resamples")
+@pytest.mark.parametrize("count", [LEAST_ROUNDS, 12])
+def test_no_difference_is_not_called_one(count: int) -> None:
+    random = np.random.default_rng(count)
+    intervals = [paired(make(random, count), make(random, count)) for _ in range(RUNS)]
+    equal = sum(interval.low <= 1 <= interval.high for interval in intervals)
+    assert equal >= 0.975 * RUNS  # the level is 99 %; 300 runs cannot distinguish it from 98 %
+
+
+@pytest.mark.usefixtures("_fewer_resamples")
+def test_a_planted_fifth_is_found() -> None:
+    random = np.random.default_rng(7)
+    seen = sum(paired(make(random, 12, factor=1.2, mood=0.04), make(random, 12, mood=0.04)).low > 1 for _ in range(100))
+    assert seen >= 95
+
+
+def test_variation_that_both_share_cancels_out_in_turns() -> None:
+    theirs = make(np.random.default_rng(3), 10, mood=0.5)
+    ours = [[1.2 * sample for sample in samples] for samples in theirs]
+    assert paired(ours, theirs).low == pytest.approx(1.2)
+
+
+def test_few_rounds_give_wider_intervals_which_are_not_shown() -> None:
+    ours, theirs = [[90.0], [110.0]], [[100.0], [100.0]]
+    few, more = paired(ours, theirs), paired(4 * ours, 4 * theirs)
+    assert few.low < more.low < 1 < more.high < few.high
+    assert str(few) == "0.99"
+    assert str(more).startswith("0.99 (0.")
+
+
+def test_the_percentile_is_that_of_each_round() -> None:
+    many = [[1.0] * 98 + [50.0, 50.0]] * 3
+    assert paired(many, [[1.0]] * 3, 99).ratio == pytest.approx(50)
+    assert paired(many, [[1.0]] * 3, 50).ratio == pytest.approx(1)
+
+
+def test_what_never_arrived_is_infinitely_late() -> None:
+    mostly, never = [[1.0, 1.0, math.inf]] * 10, [[1.0, math.inf, math.inf]] * 10
+    assert paired(mostly, [[2.0]] * 10).ratio == pytest.approx(0.5)
+    assert str(paired(never, [[2.0]] * 10)) == "∞ (∞ to ∞)"
+    assert str(paired([[2.0]] * 10, never)) == "0 (0 to 0)"
+    assert math.isnan(paired(never, never).ratio)
+    assert paired([*never[:1], *mostly[:9]], [*never[:2], *mostly[:8]]).rounds == 9
+
+
+def test_lost_messages_count_in_ratios() -> None:
+    lossy, whole = (
+        Cell(variant=name, measure="way", unit="ms", rounds=[[1.0]] * 8, figures={"sent": [sent] * 8})
+        for name, sent in (("a", 3), ("b", 1))
+    )
+    assert str(ratio(lossy, whole)).startswith("∞")
+
+
+@pytest.mark.parametrize(("ours", "theirs"), [([], []), ([[]], [[1.0]]), ([[1.0]], [[]]), ([[1.0]], [[0.0]])])
+def test_nothing_measured_is_nothing_claimed(ours: Rounds, theirs: Rounds) -> None:
+    assert str(paired(ours, theirs)) == "–"
+
+
+# -- turns
+
+
+def test_every_other_round_goes_backwards() -> None:
+    assert [in_turn("abc", number) for number in range(3)] == ["abc", "cba", "abc"]
+
+
+def measured(outcomes: str, printed: io.StringIO | None = None) -> Results:
+    """One round for each letter; ``x`` fails after its first variant."""
+    results = Results(bench="wake-up")
+
+    def measure(number: int, _progress: Progress) -> Iterator[Cell]:
+        yield round_cell("pipe", "way", "us", [float(number)])
+        if outcomes[number] == "x":
+            raise PebbleError("the robot is not up\nits last [words]")
+        yield round_cell("socket", "way", "us", [] if outcomes[number] == "-" else [1.0])
+
+    measure_rounds(results, len(outcomes), measure, Console(file=printed or io.StringIO(), width=80))
+    return results
+
+
+@pytest.mark.parametrize(
+    ("outcomes", "complete"),
+    [(10 * ".", True), ("..x......x", True), (".x", True), ("x.", True), ("........x", True),
+     (".x.x.x....", False), ("x.......", False), ("--", False)],
+)  # fmt: skip
+def test_a_round_that_fails_counts_for_no_variant(outcomes: str, complete: bool) -> None:
+    results = measured(outcomes)
+    assert [len(cell.rounds) for cell in results.cells] == [outcomes.count(".") + outcomes.count("-")] * 2
+    assert results.complete is complete
+
+
+def test_a_failed_round_is_noted_and_shown_at_once() -> None:
+    printed = io.StringIO()
+    noted = ["2 of 3 rounds failed and were left out; round 2: the robot is not up"]
+    assert measured(".xx", printed).notes == noted
+    assert "round 3: the robot is not up\nits last [words]" in printed.getvalue()
+    assert measured("..").notes == []
+
+
+@pytest.mark.parametrize("outcomes", ["x", "xx."])
+def test_two_failures_at_the_start_end_the_run(outcomes: str) -> None:
+    with pytest.raises(PebbleError, match="the robot is not up"):
+        measured(outcomes)
+
+
+def test_turns_of_a_round_are_one_and_counts_add_up() -> None:
+    results = Results(bench="x")
+    for cpu in (2.0, 4.0):
+        add_round(results, [round_cell("a", "way", "us", [cpu], {"n": 1}, sent=2, cpu=cpu + turn) for turn in (0, 1)])
+    (cell,) = results.cells
+    assert cell.rounds == [[2.0, 2.0], [4.0, 4.0]]
+    assert cell.figures == {"sent": [4, 4], "cpu": [2.5, 4.5]}
+    assert (cell.lost, cell.middle("cpu"), cell.total("sent")) == (4, 3.5, 8)

@@ -1,0 +1,99 @@
+"""Processes end in order and leave nothing behind; a worker's other end answers line by line."""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+import pytest
+
+from pebble.errors import PebbleError
+from pebble.extensions.lab.rig.processes import BROKERS, MCUS, OPERATORS, ROBOTS, Processes, Program, children
+from tests.support import until
+
+WORKER = """
+from pebble.extensions.lab.rig.worker_end import answer, serve
+answer({"ready": True})
+serve(lambda line: None if line == "quiet" else {"line": line})
+"""
+ON_THREAD = """
+from pebble.extensions.lab.rig.worker_end import answer, serve_on_thread
+from threading import Event
+answered = Event()
+def end():
+    answer({"ended": True})
+    answered.set()
+ended = serve_on_thread(lambda line: b'[1]', end)
+answered.wait()
+assert ended.is_set()
+"""
+
+
+def write_when_ended(name: str, into: Path) -> list[str]:
+    """A program that appends its name to a file when it gets SIGTERM."""
+    return ["sh", "-c", f"trap 'echo {name} >> {into}; exit' TERM; touch {into}.{name}; while :; do sleep 0.01; done"]
+
+
+def python(code: str) -> Sequence[str]:
+    return [sys.executable, "-c", code]
+
+
+def test_operators_end_first_and_brokers_last(tmp_path: Path) -> None:
+    order = tmp_path / "order"
+    with Processes() as processes:
+        for name, kind in (("broker", BROKERS), ("mcu", MCUS), ("robot", ROBOTS), ("operator", OPERATORS)):
+            processes.add(Program(name, write_when_ended(name, order), tmp_path / f"{name}.log"), kind)
+            assert until(Path(f"{order}.{name}").exists)
+        assert processes.unexpected_exits() == []
+    assert order.read_text().split() == ["operator", "robot", "mcu", "broker"]
+    assert not processes.folder.exists()
+
+
+def test_each_line_that_a_program_writes_is_read(tmp_path: Path) -> None:
+    lines: list[bytes] = []
+    with Processes() as processes:
+        command = ["sh", "-c", "echo one; echo two; exec sleep 60"]
+        program = Program("lines", command, tmp_path / "log", each=lines.append)
+        processes.add(program, OPERATORS)
+        assert until(lambda: lines == [b"one\n", b"two\n"])
+
+
+def test_one_that_ended_by_itself_is_named_and_one_that_was_ended_is_not(tmp_path: Path) -> None:
+    with Processes() as processes:
+        ended = processes.add(Program("the hub", ["true"], tmp_path / "hub.log"), BROKERS)
+        assert until(lambda: ended.ended)
+        assert processes.unexpected_exits() == [f"the hub ended unexpectedly: see {ended.log}"]
+        processes.end(ended)
+        assert processes.unexpected_exits() == []
+
+
+def test_what_cannot_be_started_leaves_no_process_and_no_folder() -> None:
+    class Broken(Processes):
+        def start(self) -> None:
+            self.worker("worker", "pebble.extensions.lab.rig.no_such_module")
+            self.broker()
+            raise PebbleError("no robot")
+
+    broken, before = Broken(), children(os.getpid())
+    with pytest.raises(PebbleError, match="no robot"), broken:
+        pass
+    assert not broken.folder.exists()
+    assert set(children(os.getpid())) <= set(before)
+
+
+def test_a_worker_answers_each_line_that_has_an_answer() -> None:
+    with Processes() as processes:
+        worker = processes.command("worker", python(WORKER))
+        assert worker.answer(20) == {"ready": True}
+        worker.send("quiet")
+        assert [worker.ask(line, 20) for line in ("one", "two")] == [{"line": "one"}, {"line": "two"}]
+
+
+def test_a_worker_on_a_thread_learns_that_its_input_has_closed() -> None:
+    with Processes() as processes:
+        worker = processes.command("worker", python(ON_THREAD))
+        assert worker.ask("", 20) == [1]
+        worker.ask_to_end()
+        assert worker.answer(20) == {"ended": True}

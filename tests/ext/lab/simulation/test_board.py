@@ -1,0 +1,161 @@
+"""The firmware of Goob and Fred on simulated boards, without a real clock or a pty."""
+
+import math
+
+import pytest
+
+from pebble.errors import ConfigError
+from pebble.extensions.lab.simulation.board import SimulatedMcu
+from pebble.extensions.lab.simulation.motion import FULL_SPEED_MM_S, TRACK_MM, RobotMotion
+from pebble.services.serial_mcu_bridge.text.goob_base import Charging, Level, Touch, parse
+
+
+def run(mcu: SimulatedMcu, start: float, seconds: float, command: bytes = b"") -> bytes:
+    """Tick for ``seconds``, sending ``command`` at 10 Hz. Returns the MCU's output."""
+    output = b""
+    for step in range(round(seconds / 0.01)):
+        now = start + 0.01 * (step + 1)
+        if command and step % 10 == 0:
+            output += mcu.receive(command, now)
+        output += mcu.tick(now)
+    return output
+
+
+def test_goob_reports() -> None:
+    mcu = SimulatedMcu("goob", 0.0)
+    lines = run(mcu, 0.0, 10.0).splitlines()
+    assert lines[:2] == [b"Starting setup...", b"Done!"]
+    reports = [report for line in lines[2:] for report in parse(line)]
+    assert sum(isinstance(report, Touch) for report in reports) == 500
+    assert [report for report in reports if isinstance(report, Charging)] == [Charging(None)] * 3
+    volts = [report.volts for report in reports if isinstance(report, Level)]
+    assert volts == sorted(volts, reverse=True)
+    assert 6.0 < volts[-1] < 8.4
+
+
+def test_fred_reports() -> None:
+    mcu = SimulatedMcu("fred", 0.0, charging=True)
+    lines = run(mcu, 0.0, 10.0).splitlines()
+    assert sum(line.startswith(b"T t0=") and line.endswith(b" chg=1") for line in lines) == 20
+    mcu.battery.charging = False
+    assert parse(run(mcu, 10.0, 0.5).strip())[1:] == [Charging(False)]
+    assert not any(line.startswith(b"C") for line in lines)
+
+
+def test_after_a_pause_there_is_one_report_and_not_all_that_were_missed() -> None:
+    mcu = SimulatedMcu("goob", 0.0)
+    mcu.tick(0.0)
+    assert mcu.tick(3.0).count(b"T a0=") == 1
+    assert mcu.tick(3.001) == b""
+
+
+def test_driving_ahead_moves_both_wheels_and_the_magnets() -> None:
+    mcu = SimulatedMcu("goob", 0.0)
+    output = run(mcu, 0.0, 2.0, b"M 1 1\n")
+    state = mcu.state()
+    assert state.left_mm_s == state.right_mm_s == pytest.approx(FULL_SPEED_MM_S)
+    assert state.pose.x_mm == pytest.approx(FULL_SPEED_MM_S * (2.0 - 0.07), rel=0.02)
+    assert abs(state.pose.y_mm) < 1e-6
+    touches = [report for line in output.splitlines() for report in parse(line) if isinstance(report, Touch)]
+    for wave in zip(*((touch.a0, touch.a1, touch.a2) for touch in touches), strict=True):
+        assert max(wave) > 750
+        assert min(wave) < 270
+
+
+def test_more_left_than_right_turns_right() -> None:
+    mcu = SimulatedMcu("goob", 0.0)
+    run(mcu, 0.0, 0.5, b"M 0.2 -0.2\n")
+    state = mcu.state()
+    assert state.pose.heading_rad == pytest.approx(-0.4 * FULL_SPEED_MM_S * 0.44 / TRACK_MM, rel=0.05)
+    assert math.hypot(state.pose.x_mm, state.pose.y_mm) < 1e-6
+    assert state.motors == (0.2, 0.2), "Goob's right motor is mounted the other way round"
+
+
+def test_motion_does_not_depend_on_how_time_is_cut() -> None:
+    coarse, fine = RobotMotion(), RobotMotion()
+    coarse.advance(0.5, 0.5, 1.0)
+    for _ in range(1000):
+        fine.advance(0.5, 0.5, 0.001)
+    assert coarse.pose.x_mm == pytest.approx(fine.pose.x_mm)
+
+
+@pytest.mark.parametrize("failsafe_s", [1.0, 5.0])
+def test_the_failsafe_stops_the_wheels(failsafe_s: float) -> None:
+    mcu = SimulatedMcu("goob", 0.0, failsafe_s=failsafe_s)
+    mcu.receive(b"M 1 1\n", 0.0)
+    run(mcu, 0.0, failsafe_s - 0.05)
+    assert mcu.state().drive == (1.0, 1.0)
+    run(mcu, failsafe_s - 0.05, 1.0)
+    assert mcu.state().drive == (0.0, 0.0)
+    assert mcu.state().left_mm_s == 0.0
+
+
+def test_the_failsafe_stops_at_its_time_even_without_ticks() -> None:
+    mcu = SimulatedMcu("goob", 0.0)
+    mcu.receive(b"M 1 1\n", 0.0)
+    mcu.tick(100.0)
+    assert mcu.state().pose.x_mm < 1.1 * FULL_SPEED_MM_S
+
+
+def test_each_change_of_the_motors_is_reported_with_its_time() -> None:
+    changes = []
+    mcu = SimulatedMcu("goob", 0.0, on_motors=lambda now, motors: changes.append((now, motors)))
+    mcu.receive(b"M 0.5 -0.25\n", 0.1)
+    mcu.receive(b"M 0.5 -0.25\n", 0.2)
+    mcu.tick(5.0)
+    assert changes == [(0.1, (0.5, -0.25)), (pytest.approx(1.2, abs=0.005), (0.0, 0.0))], "+ is ahead on both sides"
+
+
+def test_a_command_after_a_long_pause_is_obeyed_at_once() -> None:
+    mcu = SimulatedMcu("goob", 0.0)
+    assert mcu.receive(b"M 1 1\n", 1000.0).startswith(b"OK M\r\n")
+    assert mcu.state().drive == (1.0, 1.0)
+
+
+def test_an_error_in_the_firmware_stops_the_motors_and_starts_it_anew(monkeypatch: pytest.MonkeyPatch) -> None:
+    mcu = SimulatedMcu("goob", 0.0)
+    mcu.receive(b"M 1 1\n", 0.0)
+    monkeypatch.setattr(mcu.robot.port, "read", lambda: 1 / 0)
+    assert mcu.tick(0.1).startswith(b"Starting setup...")
+    assert mcu.state().motors == (0.0, 0.0)
+    assert mcu.resets == 1
+    assert (mcu.state().commands, mcu.state().drive) == (0, (0.0, 0.0))
+    assert b"OK M\r\n" in mcu.receive(b"M 1 1\n", 0.3)
+    assert mcu.state().motors == (1.0, -1.0)
+
+
+def test_firmware_that_fails_at_every_turn_keeps_starting(monkeypatch: pytest.MonkeyPatch) -> None:
+    mcu = SimulatedMcu("goob", 0.0)
+    monkeypatch.setattr(type(mcu.robot), "step", lambda _robot: 1 / 0)
+    for turn in range(5):
+        mcu.tick(turn * 0.001)
+        monkeypatch.setattr(type(mcu.robot), "step", lambda _robot: 1 / 0)  # each boot has classes of its own
+    assert mcu.resets == 5
+    assert mcu.state().motors == (0.0, 0.0)
+
+
+def test_the_battery_drains_with_driving_and_fills_on_the_charger() -> None:
+    idle, driving, charging = (SimulatedMcu("goob", 0.0) for _ in range(3))
+    charging.battery.charging = True
+    run(idle, 0.0, 20.0)
+    run(driving, 0.0, 20.0, b"M 1 1\n")
+    run(charging, 0.0, 20.0)
+    assert driving.state().volts < idle.state().volts < charging.state().volts
+    run(driving, 20.0, 2.0)
+    charging.tick(1e6)
+    assert charging.state().volts == pytest.approx(8.4)
+
+
+def test_a_reboot_stops_the_motors_and_reports_the_start() -> None:
+    mcu = SimulatedMcu("goob", 0.0)
+    run(mcu, 0.0, 1.0, b"M 1 1\n")
+    way = mcu.state().pose
+    mcu.boot(1.0)
+    assert mcu.tick(1.0).startswith(b"Starting setup...\r\nDone!\r\nC chg=-1 v=")
+    assert mcu.state().drive == (0.0, 0.0)
+    assert mcu.state().pose == way
+
+
+def test_an_unknown_kind_is_refused() -> None:
+    with pytest.raises(ConfigError, match="goob, fred"):
+        SimulatedMcu("pitcam", 0.0)

@@ -1,0 +1,171 @@
+"""Simulated bodies, from pins to wheels, batteries, lights and I2C devices."""
+
+from __future__ import annotations
+
+import math
+from itertools import pairwise
+
+import pytest
+
+from pebble.errors import ConfigError
+from pebble.extensions.lab.simulation.bodies import Benjr, Body, Light, Minilamp, body_of
+from pebble.extensions.lab.simulation.micropython.board import Board
+from pebble.extensions.lab.simulation.micropython.clock import VirtualClock
+from pebble.extensions.lab.simulation.motion import FULL_SPEED_MM_S, WHEEL_DIAMETER_MM, RobotMotion, hall
+
+SERIAL = ("goob", "fred", "goob_imu")  # those with a radio start in test_board_network.py
+
+
+@pytest.fixture
+def clock() -> VirtualClock:
+    return VirtualClock(50.0)
+
+
+def put(body: Body, pin: str | int, level: float) -> None:
+    """Put out a PWM level as firmware does."""
+    machine = body.board.firmware.module("machine")
+    machine.PWM(machine.Pin(pin), freq=1000, duty_u16=round(level * 65535))
+
+
+def drive(body: Body, left: float, right: float) -> None:
+    """Half bridges: one input driven, the other low."""
+    for (ahead, back), speed in zip((body.pins.LEFT, body.pins.RIGHT), (left, right), strict=True):
+        put(body, back if speed < 0 else ahead, abs(speed))
+
+
+@pytest.mark.parametrize(("kind", "forward"), [("minilamp", (1.0, 0.5)), ("fred", (1.0, 0.5)), ("goob", (1.0, -0.5))])
+def test_half_bridges_turn_the_wheels(clock: VirtualClock, kind: str, forward: tuple[float, float]) -> None:
+    body = body_of(kind, Board(clock))
+    drive(body, *forward)
+    clock.advance(1.0)
+    state = body.state()
+    assert state.motors == pytest.approx(forward, abs=1e-3)
+    assert state.drive == pytest.approx((1.0, 0.5), abs=1e-3)
+    assert (state.left_mm_s, state.right_mm_s) == pytest.approx((FULL_SPEED_MM_S, FULL_SPEED_MM_S / 2), rel=0.01)
+    assert state.pose.x_mm > 100
+
+
+def test_both_inputs_of_a_bridge_high_brake(clock: VirtualClock) -> None:
+    body = body_of("minilamp", Board(clock))
+    for pin in body.pins.LEFT:
+        put(body, pin, 1.0)
+    assert body.outputs() == (0.0, 0.0)
+
+
+def test_motors_are_reported_once_per_turn_with_the_time_of_the_change(clock: VirtualClock) -> None:
+    body = body_of("minilamp", Board(clock))
+    changes: list[tuple[float, tuple[float, float]]] = []
+    body.on_motors = lambda now, motors: changes.append((now, motors))
+    drive(body, 1.0, 1.0)
+    assert changes == [], "the turn is not over"
+    clock.advance(0.3)
+    body.end_turn()
+    body.end_turn()
+    assert changes == [(50.0, (1.0, 1.0))]
+
+
+def test_a_long_turn_reports_each_change_within_it(clock: VirtualClock) -> None:
+    body = body_of("minilamp", Board(clock))
+    changes: list[tuple[float, tuple[float, float]]] = []
+    body.on_motors = lambda now, motors: changes.append((now, motors))
+    drive(body, 1.0, 1.0)
+    clock.advance(2.0)
+    body.board.pins.float_all()
+    clock.advance(3.0)
+    body.end_turn()
+    assert changes == [(50.0, (1.0, 1.0)), (52.0, (0.0, 0.0))]
+    assert body.state().pose.x_mm == pytest.approx(2.0 * FULL_SPEED_MM_S, rel=0.01), "it rolled two seconds, not five"
+
+
+def test_a_reset_of_the_board_stops_bridges_but_not_a_shield(clock: VirtualClock) -> None:
+    lamp, walker = body_of("minilamp", Board(clock)), body_of("benjr", Board(clock))
+    assert isinstance(walker, Benjr)
+    drive(lamp, 1.0, 1.0)
+    walker.shield.write(b"\x10\x01\x27\x10")
+    walker.shield.write(b"\x00\x00\x03\xe8")
+    for body in (lamp, walker):
+        body.board.boot()
+    assert lamp.state().drive == (0.0, 0.0)
+    assert walker.state().drive == (1.0, 0.0)
+
+
+def test_benjrs_shield(clock: VirtualClock) -> None:
+    body = body_of("benjr", Board(clock))
+    assert isinstance(body, Benjr)
+    i2c = body.board.firmware.module("machine").SoftI2C(scl=body.pins.SCL, sda=body.pins.SDA)
+    i2c.writeto(body.pins.MOTOR_SHIELD, b"\x10\x02\x13\x88")
+    assert body.outputs() == (0.0, 0.0), "nothing turns before the frequency is set"
+    i2c.writeto(body.pins.MOTOR_SHIELD, b"\x00\x00\x03\xe8")
+    assert body.outputs() == (0.5, 0.0), "clockwise"
+    i2c.writeto(body.pins.MOTOR_SHIELD, b"\x11\x01\xff\xff")
+    assert body.outputs() == (0.5, -1.0), "counter-clockwise, and not more than full"
+    assert body.state().drive == (-0.5, 1.0), "both motors are mounted backwards"
+    for direction in (b"\x00", b"\x03", b"\x04"):
+        i2c.writeto(body.pins.MOTOR_SHIELD, b"\x10" + direction + b"\x27\x10")
+        assert body.outputs() == (0.0, -1.0)
+    i2c.writeto(body.pins.MOTOR_SHIELD, b"\x10\x02\x27")
+    assert body.outputs() == (0.0, -1.0), "three bytes are no message"
+
+
+@pytest.mark.parametrize("kind", ["goob", "minilamp", "benjr"])
+def test_the_battery_is_measured_through_its_divider(clock: VirtualClock, kind: str) -> None:
+    body = body_of(kind, Board(clock))
+    machine = body.board.firmware.module("machine")
+    adc = machine.ADC(body.pins.BATTERY)
+    assert adc.read_u16() / 65535 * body.pins.BATTERY_FULL_V == pytest.approx(body.battery.volts, abs=0.001)
+    body.battery.charging = True
+    clock.advance(1e6)
+    assert adc.read_u16() / 65535 * body.pins.BATTERY_FULL_V == pytest.approx(4.2 * body.cells, abs=0.001)
+    assert adc.read_u16() < 65535, "a full battery is within the range"
+
+
+def test_lights(clock: VirtualClock) -> None:
+    goob, fred = body_of("goob", Board(clock)), body_of("fred", Board(clock))
+    assert goob.state().light == Light(0.0, 0.0, 0.0)
+    put(goob, goob.pins.LED, 0.25)
+    assert goob.state().light == Light(0.25, 0.25, 0.25)
+    put(fred, fred.pins.LED[2], 1.0)
+    assert fred.state().light == Light(0.0, 0.0, 1.0)
+
+
+def test_freds_charger_is_a_pin(clock: VirtualClock) -> None:
+    body = body_of("fred", Board(clock))
+    pin = body.board.firmware.module("machine").Pin(body.pins.CHARGE)
+    values = [pin.value()]
+    body.battery.charging = True
+    assert [*values, pin.value()] == [0, 1]
+
+
+def test_grousers_are_seen_but_no_wheels(clock: VirtualClock) -> None:
+    body = body_of("minilamp", Board(clock))
+    assert isinstance(body, Minilamp)
+    put(body, body.pins.GROUSERS[1], 1.0)
+    assert (body.grousers, body.outputs()) == (-1.0, (0.0, 0.0))
+
+
+@pytest.mark.parametrize("kind", SERIAL)
+def test_every_firmware_starts_in_its_body_with_its_motors_off(clock: VirtualClock, kind: str) -> None:
+    board = Board(clock)
+    body = body_of(kind, board)
+    robot = board.load(kind)
+    for _ in range(10):
+        robot.step()
+        clock.advance(0.01)
+    assert (body.state().motors, body.state().left_mm_s) == ((0.0, 0.0), 0.0)
+    robot.stop()
+
+
+def test_an_unknown_robot_is_refused(clock: VirtualClock) -> None:
+    with pytest.raises(ConfigError, match="'pitcam'; known: goob, fred, minilamp, benjr, goob_imu"):
+        body_of("pitcam", Board(clock))
+
+
+def test_the_hall_sensors_see_five_waves_in_a_turn_of_a_wheel() -> None:
+    """Ten magnets, whose poles alternate: 10 extremes, 19.16 mm apart."""
+    motion = RobotMotion()
+    levels = []
+    for step in range(2001):
+        motion.left_mm = math.pi * WHEEL_DIAMETER_MM * step / 2000
+        levels.append(hall(motion)[0])
+    falling = [before >= 0.5 > after for before, after in pairwise(levels[:-1])]
+    assert sum(falling) == 5

@@ -1,0 +1,81 @@
+"""Firmware files in an import world of their own."""
+
+from __future__ import annotations
+
+import sys
+import traceback
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+
+from pebble.extensions.lab.simulation.micropython.loader import FirmwareModules, firmware_root
+from tests.support import ROOT
+
+ROBOT = """
+from common.counter import up
+from common import counter
+import common.counter as same
+import common.counter
+import machine
+
+def step():
+    assert counter is same is common.counter
+    return up(), machine.name
+"""
+
+
+@pytest.fixture
+def root(tmp_path: Path) -> Path:
+    """A board's files; ``write`` more with Path.write_text."""
+    for folder in ("common", "toy"):
+        (tmp_path / folder).mkdir()
+    (tmp_path / "common/counter.py").write_text(
+        "count = 0\n\ndef up():\n    global count\n    count += 1\n    return count\n"
+    )
+    (tmp_path / "toy/robot.py").write_text(ROBOT)
+    return tmp_path
+
+
+def world(root: Path, name: str = "a") -> FirmwareModules:
+    return FirmwareModules({"machine": SimpleNamespace(name=name)}, root=root)
+
+
+def test_two_boards_know_nothing_of_each_other_nor_of_the_host(root: Path) -> None:
+    before = set(sys.modules), list(sys.path)
+    one, other = world(root, "one").module("toy.robot"), world(root, "other").module("toy.robot")
+    assert [one.step(), one.step(), other.step()] == [(1, "one"), (2, "one"), (1, "other")]
+    assert (set(sys.modules), list(sys.path)) == before
+    assert "toy" not in sys.modules
+
+
+@pytest.mark.parametrize(
+    "name", ["subprocess", "pebble", "common.nothing", "nothing.robot", "toy.robot.step", "asyncio"]
+)
+def test_what_the_board_lacks_cannot_be_imported(root: Path, name: str) -> None:
+    (root / "toy/wants.py").write_text(f"import {name}\n")
+    with pytest.raises(ImportError, match="no module named"):
+        world(root).module("toy.wants")
+
+
+@pytest.mark.parametrize(
+    ("text", "error"),
+    [("from . import robot\n", ImportError), ("from machine import Nothing\n", ImportError), ("input()\n", NameError)],
+)
+def test_what_would_work_on_this_machine_only_does_not(root: Path, text: str, error: type[Exception]) -> None:
+    (root / "toy/wants.py").write_text(text)
+    with pytest.raises(error):
+        world(root).module("toy.wants")
+
+
+def test_an_error_names_the_file_and_the_line(root: Path) -> None:
+    (root / "toy/robot.py").write_text("def step():\n    x = 1\n    return x / 0  # here\n")
+    with pytest.raises(ZeroDivisionError) as caught:
+        world(root).module("toy.robot").step()
+    last = traceback.extract_tb(caught.tb)[-1]
+    assert (last.filename, last.lineno, last.line) == (str(root / "toy/robot.py"), 3, "return x / 0  # here")
+
+
+def test_the_firmware_is_found() -> None:
+    assert (firmware_root() / "common/run.py").is_file()
+    assert firmware_root() == ROOT / "firmware", "errors name the file that people edit"

@@ -1,0 +1,182 @@
+"""The simulated MCU as a serial port, opened by a plain pyserial program."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+import serial
+
+from pebble.errors import DeviceError
+from pebble.extensions.lab.simulation.pty import PtyMcu
+from pebble.extensions.lab.simulation.trace import Entry, motors_entry, read_trace
+from tests.support import until
+
+
+def test_a_host_talks_to_it_and_everything_is_traced_in_time(tmp_path: Path) -> None:
+    with PtyMcu("goob", tmp_path / "port", trace=tmp_path / "trace") as mcu:
+        before = time.monotonic_ns()
+        with serial.Serial(str(mcu.symlink), 460800, timeout=5) as port:
+            port.write(b"M 0.5 0.25\nL 1 ")
+            assert until(lambda: "M 0.5 0.25" in mcu.trace.lines())
+            port.write(b"0 0\r\n")
+            assert until(lambda: "L 1 0 0" in mcu.trace.lines())
+            assert b"OK M\r\n" in {port.readline() for _ in range(20)}
+        assert until(lambda: not mcu.host)
+        after = time.monotonic_ns()
+        entries = mcu.trace.entries()
+    assert all(before <= entry.ns <= after for entry in entries[1:])
+    moved = [entry for entry in entries if entry.event == "motors"]
+    assert moved[0].motors == (0.5, 0.25)
+    others = [entry for entry in entries if entry.event not in ("motors", "late")]
+    assert [entry.event for entry in others] == ["plugged", "opened", "line", "line", "closed"]
+    assert others[2].drive == (0.5, 0.25)
+    assert others[2].motors is None
+    assert others[3].drive is None
+    assert read_trace(tmp_path / "trace") == [*entries, mcu.trace.entries()[-1]]
+
+
+def test_on_request_the_trace_has_the_mcus_output_with_its_time(tmp_path: Path) -> None:
+    with PtyMcu("goob", tmp_path / "port", trace_output=True) as mcu:
+        with serial.Serial(str(mcu.symlink), 460800, timeout=5) as port:
+            port.write(b"M 0.5 0.25\n")
+            assert port.read_until(b"OK M\r\n").endswith(b"OK M\r\n")
+            received = time.monotonic_ns()
+            assert until(lambda: any(entry.line == "OK M" for entry in mcu.trace.entries()))
+        (answer,) = [entry for entry in mcu.trace.entries() if entry.line == "OK M"]
+        (asked,) = [entry for entry in mcu.trace.entries() if entry.event == "line"]
+    assert answer.event == "said"
+    assert asked.ns <= answer.ns <= received
+
+
+def test_the_line_is_raw_before_the_host_configures_it(tmp_path: Path) -> None:
+    """A terminal's echo would feed the MCU its own reports; its line editing would keep and alter bytes."""
+    with PtyMcu("goob", tmp_path / "port") as mcu:
+        host = os.open(mcu.symlink, os.O_RDWR | os.O_NOCTTY)
+        assert until(lambda: mcu.host)
+        os.write(host, b"\x03\x04\x7fM 1 1\r\n")
+        assert until(lambda: mcu.trace.lines() == ["\x03\x04\x7fM 1 1"])
+        read = b""
+        while read.count(b"\n") < 5:
+            read += os.read(host, 1000)
+        assert b"M 1 1" not in read
+        assert b"ERR unknown command\r\n" in read
+        os.close(host)
+        assert mcu.trace.lines() == ["\x03\x04\x7fM 1 1"]
+
+
+def test_bytes_written_just_before_the_host_closes_are_not_lost(tmp_path: Path) -> None:
+    with PtyMcu("fred", tmp_path / "port") as mcu:
+        for number in range(50):
+            host = os.open(mcu.symlink, os.O_RDWR | os.O_NOCTTY)
+            os.write(host, b"M 0 0.%03d\n" % number)
+            os.close(host)
+            assert until(lambda n=number: mcu.trace.lines()[-1:] == [f"M 0 0.{n:03d}"])  # type: ignore[misc]
+        assert len(mcu.trace.lines()) == 50
+
+
+def test_unplug_and_replug(tmp_path: Path) -> None:
+    symlink = tmp_path / "port"
+    with PtyMcu("goob", symlink) as mcu, serial.Serial(str(symlink), 460800, timeout=5) as port:
+        port.write(b"M 1 1\n")
+        assert until(lambda: mcu.state().drive == (1.0, 1.0))
+        mcu.unplug()
+        mcu.unplug()
+        assert not symlink.is_symlink()
+        with pytest.raises(serial.SerialException):
+            port.read(100_000)
+        assert until(lambda: mcu.state().drive == (0.0, 0.0)), "the failsafe works without a host"
+        mcu.replug()
+        mcu.replug()
+        with serial.Serial(str(symlink), 460800, timeout=5) as again:
+            again.write(b"M 0.5 0.5\n")
+            assert until(lambda: mcu.state().drive == (0.5, 0.5))
+        assert until(lambda: not mcu.host)
+    events = [entry.event for entry in mcu.trace.entries() if entry.event not in ("line", "motors")]
+    assert events == ["plugged", "opened", "unplugged", "plugged", "opened", "closed", "unplugged"]
+    assert not symlink.is_symlink()
+
+
+def test_a_host_that_does_not_read_loses_reports_and_stops_nothing(tmp_path: Path) -> None:
+    with PtyMcu("goob", tmp_path / "port") as mcu, serial.Serial(str(mcu.symlink), 460800) as port:
+        assert until(lambda: mcu.host)
+        dropped = mcu.dropped
+        while mcu.dropped == dropped:
+            port.write(b"X\n" * 50)
+            time.sleep(0.001)
+        port.write(b"M 0.1 0.1\n")
+        assert until(lambda: mcu.state().drive == (0.1, 0.1))
+
+
+def test_a_drive_entry_must_be_well_formed() -> None:
+    assert Entry(0, "line", "M 0.1 -0.2").drive == (0.1, -0.2)
+    assert [Entry(0, "line", text).drive for text in ("M a b", "M 1", "L 1 1 1", "")] == [None] * 4
+
+
+def test_a_motors_entry_has_three_decimals_and_no_minus_zero() -> None:
+    entry = motors_entry(5, (-0.0001, 0.12345))
+    assert entry == Entry(5, "motors", "0.000 0.123")
+    assert entry.motors == (0.0, 0.123)
+    assert entry.drive is None
+    assert Entry(5, "line", "0.5 0.5").motors is None
+
+
+def test_the_program(tmp_path: Path) -> None:
+    symlink, trace = tmp_path / "port", tmp_path / "trace"
+    command = [sys.executable, "-m", "pebble.cli", "sim", "fred", "--link", str(symlink)]
+    command += ["--trace", str(trace), "--report", "--control", "--charging"]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, bufsize=1) as program:
+        assert program.stdin is not None
+        assert program.stdout is not None
+        snapshots = (json.loads(line) for line in program.stdout)
+        first = next(snapshots)
+        assert (first["plugged"], first["host"], first["board"]["kind"]) == (True, False, "fred")
+        with serial.Serial(str(symlink), 115200) as port:
+            port.write(b"M 1 1\n")
+            moving = next(snapshot for snapshot in snapshots if snapshot["board"]["left_mm_s"] > 0)
+            assert moving["board"]["last_command"] == "M 1 1"
+            assert moving["board"]["charging"] is True
+            program.stdin.write("discharge\nnonsense\nunplug\n")
+            assert not next(snapshot for snapshot in snapshots if not snapshot["plugged"])["board"]["charging"]
+        program.stdin.write("replug\n")
+        assert next(snapshot for snapshot in snapshots if snapshot["plugged"])
+        program.stdin.close()
+        assert program.wait(10) == 0
+    assert [entry.line for entry in read_trace(trace) if entry.event == "line"] == ["M 1 1"]
+    assert not symlink.is_symlink()
+
+
+def test_how_long_it_did_not_look_at_its_port_is_in_the_file(tmp_path: Path) -> None:
+    with PtyMcu("goob", tmp_path / "port", trace=tmp_path / "trace") as mcu:
+        mcu._call(lambda: time.sleep(0.2))
+        assert until(lambda: max(entry.late_s for entry in read_trace(tmp_path / "trace")) >= 0.2)
+
+
+def test_it_never_takes_a_file_away(tmp_path: Path) -> None:
+    notes = tmp_path / "notes.txt"
+    notes.write_text("precious")
+    with pytest.raises(DeviceError, match=r"notes\.txt: the path exists and is not a symlink"):
+        PtyMcu("goob", notes).open()
+    assert notes.read_text() == "precious"
+
+
+def test_who_takes_over_a_link_keeps_it(tmp_path: Path) -> None:
+    first = PtyMcu("goob", tmp_path / "port").open()
+    with PtyMcu("goob", tmp_path / "port") as second:
+        first.close()
+        with serial.Serial(str(second.symlink), 460800):
+            assert until(lambda: second.host)
+
+
+@pytest.mark.parametrize("how", [signal.SIGTERM, signal.SIGINT, signal.SIGHUP])
+def test_the_program_ends_on_a_signal_and_takes_its_link_along(tmp_path: Path, how: signal.Signals) -> None:
+    symlink = tmp_path / "port"
+    with subprocess.Popen([sys.executable, "-m", "pebble.cli", "sim", "goob", "--link", symlink]) as program:
+        assert until(symlink.is_symlink)
+        program.send_signal(how)
+        assert program.wait(10) == 0
+    assert not symlink.is_symlink()

@@ -1,0 +1,250 @@
+"""A network in memory and virtual time for one simulated board: name server, time server and broker, and all faults."""
+
+from __future__ import annotations
+
+import errno
+import socket
+from collections import deque
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Final, Literal
+
+from pebble.extensions.lab.simulation.micropython.answers import name_answer, time_answer
+from pebble.extensions.lab.simulation.micropython.clock import Clock
+from pebble.extensions.lab.simulation.micropython.faults import WouldHang, failure
+from pebble.extensions.lab.simulation.micropython.modules.sockets import MAX_SOCKETS, Address, numeric, socket_module
+from pebble.extensions.lab.simulation.micropython.modules.streams import POLLERR, POLLHUP, POLLIN, POLLOUT, Stream
+from pebble.extensions.lab.simulation.micropython.modules.tls import ssl_module
+from pebble.extensions.lab.simulation.micropython.modules.wlan import ADDRESS, Platform, Radio, network_module
+from tests.ext.lab.simulation.virtual_broker import Command, VirtualBroker
+from tests.ext.lab.simulation.virtual_wire import State, Wire
+
+NAME_SERVERS: Final = ((ADDRESS[3], 53), ("224.0.0.251", 5353))
+TIME_PORT = 123
+HOSTS: Final[Mapping[str, str]] = {"broker.test": "10.0.0.2", "broker.local": "10.0.0.2", "pool.ntp.org": "10.0.0.3"}
+BROKER: Final = ("10.0.0.2", 1883)
+EPOCH_S = 1_800_000_000.0  # the time server's time at virtual time 0
+
+_WRITES_8266 = 8  # lwIP's send queue there; one more waits, non-blocking or not (micropython issue 19704)
+_STUCK_S = 10.0
+
+Answers = Literal["answers", "silent", "nonsense"]
+
+
+@dataclass(slots=True)
+class Conditions:
+    """The present condition of the network; ``latency_s`` is one way, ``cut`` splits packets."""
+
+    hole: bool = False  # packets vanish, connections stay; TCP delivers later what it still holds
+    mute: bool = False  # so do only the board's
+    dns: Answers | Literal["no such name"] = "answers"
+    ntp: Answers = "answers"
+    latency_s: Callable[[], float] = field(default=lambda: 0.01)
+    cut: Callable[[int], int] = field(default=lambda size: size)
+
+
+class VirtualNetwork:
+    """``modules()`` is for the board. ``step`` delivers what is due, and is called at every use of a socket.
+
+    ``arrivals`` are the operator's commands that reached the board, with the time their last byte did; ``reads`` are
+    those that its firmware has read.
+    """
+
+    def __init__(
+        self,
+        clock: Clock,
+        broker: VirtualBroker,
+        *,
+        platform: Platform = "esp32",
+        hosts: Mapping[str, str | Sequence[str]] = HOSTS,
+        uid: bytes = b"",
+    ) -> None:
+        self.clock, self.broker = clock, broker
+        self.radio = Radio(clock.now, platform)
+        self.conditions = Conditions()
+        self.arrivals: list[tuple[float, Command]] = []
+        self.reads: list[Command] = []
+        self.open: list[VirtualTcp | VirtualUdp] = []
+        self.hosts: Mapping[str, str | Sequence[str]] = hosts
+        self._uid = uid
+        self._wires: list[Wire] = []
+
+    def modules(self) -> dict[str, Any]:
+        """What a board has after power on or a reset: no socket, a radio that is off."""
+        self.power_off()
+        return {
+            "network": network_module(self.radio, self._uid),
+            "socket": socket_module(self.clock, self._socket),
+            "ssl": ssl_module(),
+        }
+
+    def power_off(self) -> None:
+        for sock in list(self.open):
+            sock.close()
+        self.radio.activate(False)
+
+    def passable(self) -> bool:
+        return self.radio.connected and not self.conditions.hole
+
+    @property
+    def unread(self) -> bool:
+        """Whether bytes have reached the board that its firmware has not taken yet."""
+        return any(wire.inbox for wire in self._wires)
+
+    def step(self) -> None:
+        self.broker.step()
+        for wire in self._wires:
+            wire.flow()
+
+    def wire(self, place: Address) -> Wire:
+        """A new connection of the board; unanswered where there is no broker."""
+        self._wires = [wire for wire in self._wires if not wire.over]
+        broker = self.broker if place == BROKER else None
+        conditions = self.conditions
+        wire = Wire(
+            self.clock.now,
+            self.passable,
+            lambda: conditions.mute,
+            conditions.latency_s,
+            conditions.cut,
+            broker,
+            self._arrived,
+            self.reads.append,
+        )
+        self._wires.append(wire)
+        return wire
+
+    def ask(self, place: Address, data: bytes) -> bytes | None:
+        """What a server at ``place`` answers to a datagram."""
+        if place in NAME_SERVERS:
+            return self._spoilt(self.conditions.dns, self._names(data))
+        if place[1] == TIME_PORT:
+            return self._spoilt(self.conditions.ntp, time_answer(data, EPOCH_S + self.clock.now()))
+        return None
+
+    def _names(self, query: bytes) -> bytes | None:
+        known = {} if self.conditions.dns == "no such name" else self.hosts
+        return name_answer(query, known.get)
+
+    @staticmethod
+    def _spoilt(how: str, answer: bytes | None) -> bytes | None:
+        if how == "silent" or answer is None:
+            return None
+        return bytes(byte ^ 0xA5 for byte in answer) if how == "nonsense" else answer
+
+    def _arrived(self, command: Command) -> None:
+        self.arrivals.append((self.clock.now(), command))
+
+    def _socket(self, kind: int) -> VirtualTcp | VirtualUdp:
+        if len(self.open) >= MAX_SOCKETS:
+            raise OSError(errno.ENFILE, "too many sockets: one is not closed")
+        made = VirtualTcp(self) if kind == socket.SOCK_STREAM else VirtualUdp(self)
+        self.open.append(made)
+        return made
+
+
+class _Virtual:
+    def __init__(self, network: VirtualNetwork) -> None:
+        self._network = network
+
+    def setblocking(self, blocking: bool) -> None:
+        if blocking:
+            raise WouldHang("a socket that waits: setblocking(False)")
+
+    def setsockopt(self, _level: int, _option: int, _value: Any) -> None:
+        """Nothing here depends on one."""
+
+    def close(self) -> None:
+        if self in self._network.open:
+            self._network.open.remove(self)
+
+    def _need_wifi(self) -> None:
+        if not self._network.radio.connected:
+            raise failure(errno.EHOSTUNREACH)
+
+
+class VirtualTcp(_Virtual, Stream):
+    """A TCP connection of the board."""
+
+    def __init__(self, network: VirtualNetwork) -> None:
+        super().__init__(network)
+        self._wire: Wire | None = None
+
+    def connect(self, place: Address) -> None:
+        """Always raises: EINPROGRESS if it goes well."""
+        self._need_wifi()
+        self._wire = self._network.wire(numeric(place))
+        raise failure(errno.EINPROGRESS)
+
+    def close(self) -> None:
+        super().close()
+        if self._wire is not None and self._wire.state is not State.CLOSED:
+            self._wire.close()
+
+    def ready(self, mask: int) -> int:
+        """What poll() of the board reports."""
+        wire = self._current()
+        if wire.state in (State.RESET, State.REFUSED):
+            return POLLERR | POLLHUP | (mask & (POLLIN | POLLOUT))
+        readable = POLLIN if wire.inbox or wire.state is State.FINISHED else 0
+        return (readable | (POLLOUT if wire.state is State.OPEN else 0)) & mask
+
+    def _receive(self, size: int) -> bytes | None:
+        wire = self._current()
+        if wire.inbox:
+            return wire.take(size)
+        self._check(wire)
+        return b"" if wire.state is State.FINISHED else None
+
+    def _send(self, data: bytes) -> int | None:
+        wire = self._current()
+        self._check(wire)
+        if wire.state is State.CONNECTING and self._network.radio.platform == "esp32":
+            raise failure(errno.EINPROGRESS)  # the ESP8266's lwIP takes early bytes
+        if self._network.radio.platform == "esp8266" and wire.unacknowledged >= _WRITES_8266:
+            self._network.clock.sleep(_STUCK_S)
+            return None
+        return wire.put(data) or None
+
+    def _current(self) -> Wire:
+        self._network.step()
+        if self._wire is None or self._wire.state is State.CLOSED:
+            raise failure(errno.ENOTCONN if self._wire is None else errno.EBADF)
+        return self._wire
+
+    @staticmethod
+    def _check(wire: Wire) -> None:
+        if wire.state in (State.RESET, State.REFUSED):
+            raise failure(errno.ECONNREFUSED if wire.state is State.REFUSED else errno.ECONNRESET)
+
+
+class VirtualUdp(_Virtual):
+    """A UDP socket of the board."""
+
+    def __init__(self, network: VirtualNetwork) -> None:
+        super().__init__(network)
+        self._answers: deque[tuple[float, bytes, Address]] = deque()
+        self._peer: Address | None = None
+
+    def bind(self, _place: Address) -> None:
+        """Nothing to do: answers come back to the port that asked."""
+
+    def sendto(self, data: bytes, place: Address) -> int:
+        self._need_wifi()
+        network = self._network
+        received = network.passable() and not network.conditions.mute
+        answer = network.ask(numeric(place), bytes(data)) if received else None
+        if answer is not None:
+            self._answers.append((network.clock.now() + 2 * network.conditions.latency_s(), answer, place))
+        return len(data)
+
+    def recvfrom(self, size: int) -> tuple[bytes, Address]:
+        if not self.ready(POLLIN):
+            raise failure(errno.EAGAIN)
+        _, data, place = self._answers.popleft()
+        return data[:size], place
+
+    def ready(self, mask: int) -> int:
+        """What poll() of the board reports."""
+        there = self._network.passable() and self._answers and self._answers[0][0] <= self._network.clock.now()
+        return ((POLLIN if there else 0) | POLLOUT) & mask

@@ -1,0 +1,120 @@
+"""A world whose time the test advances: repeatable to the last bit, faster than the real one."""
+
+from __future__ import annotations
+
+import hashlib
+import math
+import time
+
+import numpy as np
+import pytest
+
+from pebble.extensions.lab.simulation.motion import FULL_SPEED_MM_S
+from pebble.extensions.lab.simulation.world.lockstep import CameraMode, LockstepRobot, LockstepWorld
+from pebble.extensions.lab.simulation.world.world_file import World, parse_world
+from pebble.services.serial_mcu_bridge.text.goob_base import drive_line, mix
+from tests.ext.lab.simulation.world.worlds import CLEAR, projected, tags_in
+
+pytestmark = pytest.mark.computing
+
+TAG = {"id": 13, "x": 3.0, "y": 0.0, "yaw_deg": 180.0}
+
+
+def world(**camera: float) -> World:
+    robots = {"goob": {"x": 0.0, "y": 0.0, "tag": 1}, "fred": {"kind": "fred", "x": 1.0, "y": 0.6, "tag": 2}}
+    return parse_world({"tags": [TAG], "robots": robots, "camera": camera})
+
+
+def follow(goob: LockstepRobot) -> bytes | np.ndarray:
+    """Turn towards the tag and go to it; the picture that showed it, if there was one."""
+    picture = goob.picture()
+    if picture is None:
+        return b""
+    corners = tags_in(picture.pixels).get(13, np.full((1, 2), 500.0))
+    goob.drive(x=(corners[:, 0].mean() - 319.5) / 1000, z=0.4)
+    return picture.pixels
+
+
+def history(seconds: float) -> str:
+    simulated, digest = LockstepWorld(world(latency_ms=70.0, motion_blur_ms=20.0)), hashlib.sha256()
+    goob, fred = simulated.robots.values()
+    fred.write(b"M 0.5 0.1\n")
+    while simulated.now() < seconds:
+        simulated.step()
+        digest.update(follow(goob))
+        digest.update(goob.read() + fred.read() + repr((goob.pose, fred.pose)).encode())
+    return digest.hexdigest()
+
+
+def test_two_runs_are_the_same_to_the_last_bit() -> None:
+    assert history(1.5) == history(1.5)
+
+
+def test_time_runs_much_faster_than_real_time() -> None:
+    simulated = LockstepWorld(world())
+    goob = simulated.robots["goob"]
+    began, pictures = time.process_time(), 0
+    while simulated.now() < 4.0:
+        simulated.step()
+        pictures += goob.picture() is not None
+    assert pictures == 60
+    assert time.process_time() - began < 1.0, "0.13 s on an idle machine"
+
+
+def test_the_firmware_drives_the_wheels_and_stops_without_commands() -> None:
+    simulated = LockstepWorld(world())
+    goob = simulated.robots["goob"]
+    goob.drive(x=0.0, z=0.5)
+    simulated.run(0.5)
+    assert goob.motion.left_mm_s == pytest.approx(0.5 * FULL_SPEED_MM_S, rel=0.01)
+    simulated.run(1.5)
+    assert goob.motion.left_mm_s == 0.0, "the firmware's own failsafe"
+
+
+@pytest.mark.parametrize(("x", "z"), [(0.0, 0.5), (0.3, 0.9), (-0.2, -0.31234), (0.1, -0.1)])
+def test_a_drive_command_is_the_line_that_the_service_writes(x: float, z: float) -> None:
+    lines: list[bytes] = []
+    goob = LockstepWorld(world()).robots["goob"]
+    goob.write = lines.append  # type: ignore[method-assign]
+    goob.drive(x=x, z=z)
+    assert lines == [drive_line(*mix(x, z))]
+
+
+def test_pictures_come_at_the_rate_of_the_camera_each_once() -> None:
+    simulated = LockstepWorld(world(), CameraMode(64, 48, 10.0))
+    goob = simulated.robots["goob"]
+    times = []
+    while simulated.now() < 1.0:
+        simulated.step()
+        times += [(simulated.now(), picture.at) for picture in (goob.picture(),) if picture is not None]
+    assert [at for _, at in times] == pytest.approx([(n + 1) / 10 for n in range(10)])
+    assert [now for now, _ in times] == pytest.approx([(n + 1) / 10 for n in range(10)], abs=0.006)
+
+
+def test_a_camera_with_latency_shows_what_was() -> None:
+    model = world(latency_ms=200.0, **CLEAR)
+    simulated = LockstepWorld(model)
+    goob = simulated.robots["goob"]
+    poses = {}
+    while simulated.now() < 1.0:
+        goob.drive(x=0.05, z=1.0)
+        simulated.step()
+        poses[round(simulated.now(), 3)] = goob.pose
+    picture = goob.picture()
+    assert picture is not None
+    assert picture.at == pytest.approx(0.8)
+    then = tuple(poses[0.8])
+    assert np.abs(tags_in(picture.pixels)[13] - projected(model, 13, then)).max() < 1.0  # type: ignore[arg-type]
+    now = tuple(poses[1.0])
+    assert np.abs(tags_in(picture.pixels)[13] - projected(model, 13, now)).max() > 2.0  # type: ignore[arg-type]
+
+
+def test_a_robot_is_put_down_elsewhere() -> None:
+    simulated = LockstepWorld(world(**CLEAR))
+    goob = simulated.robots["goob"]
+    goob.place(1.5, -0.2, math.radians(10))
+    simulated.run(0.2)
+    picture = goob.picture()
+    assert picture is not None
+    expected = projected(world(), 13, (1.5, -0.2, math.radians(10)))
+    assert np.abs(tags_in(picture.pixels)[13] - expected).max() < 1.0

@@ -1,0 +1,113 @@
+"""Robots have bodies: walls and other robots stop them, their wheels slip, and they can always leave."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import pytest
+
+from pebble.extensions.lab.simulation.motion import FULL_SPEED_MM_S, Pose
+from pebble.extensions.lab.simulation.world.lockstep import LockstepWorld
+from pebble.extensions.lab.simulation.world.walls import Floor
+from pebble.extensions.lab.simulation.world.world_file import parse_world
+from tests.ext.lab.simulation.world.worlds import world_of
+
+WALL = {"x1": 1.0, "y1": 1.0, "x2": 1.0, "y2": -1.0}
+TOUCH_M = 0.9  # x of a robot of radius 0.1 at the wall
+
+
+def driven(seconds: float, left: float, right: float, world: LockstepWorld | None = None, **keys: Any) -> LockstepWorld:
+    """Drive goob's wheels."""
+    world = world or LockstepWorld(world_of(**keys))
+    end = world.now() + seconds
+    while world.now() < end:
+        world.robots["goob"].write(b"M %.3f %.3f\n" % (left, right))
+        world.run(0.1)
+    return world
+
+
+def at_wall(heading_deg: float = 0.0) -> LockstepWorld:
+    return driven(4.0, 1, 1, walls=[WALL], robots={"goob": {"x": 0.0, "y": 0.0, "heading_deg": heading_deg}})
+
+
+@pytest.mark.parametrize("heading_deg", [0.0, 30.0, -40.0])
+def test_a_wall_stops_a_robot_where_its_body_touches(heading_deg: float) -> None:
+    goob = at_wall(heading_deg).robots["goob"]
+    assert goob.pose.x == pytest.approx(TOUCH_M, abs=1e-4)
+    assert goob.pose.y == pytest.approx(TOUCH_M * math.tan(math.radians(heading_deg)), abs=1e-3), "it does not slide"
+    assert goob.pose.heading == pytest.approx(math.radians(heading_deg))
+
+
+def test_the_wheels_slip_and_count_on() -> None:
+    world = at_wall()
+    goob = world.robots["goob"]
+    before = goob.motion.left_mm
+    driven(1.0, 1, 1, world)
+    assert goob.motion.left_mm - before == pytest.approx(FULL_SPEED_MM_S, rel=0.05)
+    assert goob.pose.x == pytest.approx(TOUCH_M, abs=1e-4)
+    assert world.floor.touches("goob")
+
+
+def test_a_robot_turns_at_a_wall_and_drives_away() -> None:
+    world = driven(1.0, -0.4, 0.4, at_wall())
+    goob = world.robots["goob"]
+    assert goob.pose.heading > 1.0
+    assert goob.pose.x == pytest.approx(TOUCH_M, abs=1e-4)
+    world = driven(1.0, -1, -1, at_wall())
+    assert world.robots["goob"].pose.x < TOUCH_M - 0.3
+    assert not world.floor.touches("goob")
+
+
+def test_a_robot_drives_along_a_wall() -> None:
+    floor = Floor(world_of(walls=[WALL]))
+    start = Pose(900.0, 0.0, math.pi / 2)
+    floor.place("goob", start)
+    end = Pose(900.0, 100.0, math.pi / 2)
+    assert floor.move("goob", start, end) == end
+
+
+def test_a_robot_stops_at_the_end_of_a_wall_and_passes_beside_it() -> None:
+    beside = {"x1": 1.0, "y1": 1.0, "x2": 1.0, "y2": 0.101}
+    assert driven(4.0, 1, 1, walls=[beside]).robots["goob"].pose.x > 1.3
+    in_the_way = {**beside, "y2": 0.06}
+    goob = driven(4.0, 1, 1, walls=[in_the_way]).robots["goob"]
+    assert goob.pose.x == pytest.approx(1.0 - math.sqrt(0.1**2 - 0.06**2), abs=1e-4)
+
+
+@pytest.mark.parametrize("heading_deg", [0.0, 90.0, 180.0, 270.0, 45.0])
+def test_no_robot_leaves_a_room(heading_deg: float) -> None:
+    room = {"x_min": -0.5, "x_max": 0.5, "y_min": -0.5, "y_max": 0.5}
+    goob = driven(4.0, 1, 1, room=room, robots={"goob": {"x": 0, "y": 0, "heading_deg": heading_deg}}).robots["goob"]
+    assert max(abs(goob.pose.x), abs(goob.pose.y)) == pytest.approx(0.4, abs=1e-4)
+
+
+def test_robots_stop_each_other_and_neither_is_pushed() -> None:
+    world = LockstepWorld(parse_world({"robots": {"goob": {"x": 0.0, "y": 0.0}, "fred": {"x": 1.0, "y": 0.0}}}))
+    fred = world.robots["fred"].pose
+    driven(4.0, 1, 1, world)
+    assert world.robots["fred"].pose == fred
+    assert world.robots["goob"].pose.x == pytest.approx(0.8, abs=1e-4)
+    assert world.floor.touches("fred")
+
+
+def test_two_robots_that_meet_head_on_stop_and_can_part() -> None:
+    robots = {"goob": {"x": 0.0, "y": 0.0}, "fred": {"x": 1.0, "y": 0.0, "heading_deg": 180}}
+    world = LockstepWorld(parse_world({"robots": robots}))
+    while world.now() < 3.0:
+        for robot in world.robots.values():
+            robot.write(b"M 1 1\n")
+        world.run(0.1)
+    goob, fred = (robot.pose.x for robot in world.robots.values())
+    assert fred - goob == pytest.approx(0.2, abs=1e-4)
+    driven(1.0, -1, -1, world)
+    assert world.robots["goob"].pose.x < goob - 0.3
+
+
+def test_a_robot_that_was_put_into_a_wall_can_leave_it_but_not_go_deeper() -> None:
+    floor = Floor(world_of(walls=[WALL]))
+    inside = Pose(950.0, 0.0, 0.0)
+    floor.place("goob", inside)
+    assert floor.move("goob", inside, Pose(960.0, 0.0, 0.0)).x_mm == pytest.approx(950.0, abs=0.01)
+    floor.place("goob", inside)
+    assert floor.move("goob", inside, Pose(940.0, 0.0, 0.0)).x_mm == 940.0

@@ -1,0 +1,274 @@
+"""The decoder: silent rather than wrong, and it says when a key frame would help."""
+
+from __future__ import annotations
+
+import hashlib
+import itertools
+import struct
+import zlib
+
+import cv2
+import numpy as np
+import pytest
+
+from pebble.contract.packets import Picture, PictureKind
+from pebble.errors import PayloadError
+from pebble.extensions.media import json_video
+from pebble.extensions.media.decode import MAX_PAYLOAD, Decoded, VideoDecoder
+from pebble.extensions.media.jpeg import decode_jpeg, jpeg_size
+from pebble.extensions.media.json_video import inflate
+from pebble.extensions.media.scene import read_counter
+from pebble.extensions.media.video import make_encoder
+from tests.ext.recordings.demo_robots import FRED, MEDIA, recorded
+
+T0 = 1_710_969_600_000
+FORMS = ("json", "pbvd", "h264")
+
+
+def picture(number: int, width: int = 64, height: int = 48) -> np.ndarray:
+    made = np.full((height, width, 3), (90, 120, 70), np.uint8)
+    cv2.circle(made, (number * 5 % width, height // 2), 9, (40, 60, 220), -1)
+    return made
+
+
+def stream(name: str, count: int = 12, interval: int = 6, start_ms: int = T0, first: int = 0) -> list[bytes]:
+    encoder = make_encoder(name, fps=15, keyframe_interval=interval)
+    return [encoder.encode(picture(first + n), start_ms + n * 66) for n in range(count)]
+
+
+def frames(decoder: VideoDecoder, packets: list[bytes]) -> list[int | None]:
+    """The numbers of what was shown, None where nothing was."""
+    return [shown.frame if shown else None for shown in map(decoder.feed, packets)]
+
+
+@pytest.mark.parametrize("name", FORMS)
+def test_after_a_lost_frame_nothing_until_the_next_key_frame(name: str) -> None:
+    packets, decoder = stream(name), VideoDecoder()
+    assert frames(decoder, packets[:3] + packets[4:6]) == [0, 1, 2, None, None]
+    assert decoder.wants_keyframe
+    assert frames(decoder, packets[6:9]) == [6, 7, 8]
+    assert not decoder.wants_keyframe
+
+
+@pytest.mark.parametrize("name", FORMS)
+def test_a_frame_lost_before_a_key_frame_is_harmless(name: str) -> None:
+    packets = stream(name)
+    assert frames(VideoDecoder(), packets[:5] + packets[6:8]) == [0, 1, 2, 3, 4, 6, 7]
+
+
+@pytest.mark.parametrize("name", FORMS)
+def test_joined_between_key_frames(name: str) -> None:
+    decoder = VideoDecoder()
+    assert not decoder.wants_keyframe
+    assert frames(decoder, stream(name)[3:8]) == [None, None, None, 6, 7]
+
+
+@pytest.mark.parametrize("name", FORMS)
+def test_a_sender_that_began_again(name: str) -> None:
+    old, new = stream(name), stream(name, start_ms=T0 + 3000, first=3)
+    decoder = VideoDecoder()
+    assert frames(decoder, [*old[:5], new[1], *new[6:8]]) == [0, 1, 2, 3, 4, None, 6, 7]
+    assert frames(decoder, new[:2]) == [0, 1]
+
+
+@pytest.mark.parametrize("name", FORMS)
+def test_a_new_sender_whose_number_fits_by_chance_is_detected_by_its_time(name: str) -> None:
+    old, new = stream(name), stream(name, start_ms=T0 + 8000, first=3)
+    assert frames(VideoDecoder(), [*old[:3], *new[3:8]]) == [0, 1, 2, None, None, None, 6, 7]
+    late = stream(name, start_ms=T0 - 1000, first=3)
+    assert frames(VideoDecoder(), [*old[:3], *late[3:5]]) == [0, 1, 2, None, None]
+
+
+@pytest.mark.parametrize("name", FORMS)
+@pytest.mark.parametrize("bad", [b"", b"\x00", b"{", b"PBVD", b"\xff\xd8", b"PBVD\x01\x09" + bytes(40), b"[]", b"null"])
+def test_anything_refused_breaks_the_chain(name: str, bad: bytes) -> None:
+    packets, decoder = stream(name), VideoDecoder()
+    assert frames(decoder, [*packets[:2], bad, *packets[2:7]]) == [0, 1, None, None, None, None, None, 6]
+    assert decoder.problem
+
+
+@pytest.mark.parametrize("name", FORMS)
+@pytest.mark.parametrize("number", [0, 1])
+def test_cut_short_anywhere_it_is_not_shown(name: str, number: int) -> None:
+    packets = stream(name)
+    for length in range(len(packets[number])):
+        decoder = VideoDecoder()
+        assert frames(decoder, [*packets[:number], packets[number][:length]])[-1] is None
+        assert decoder.wants_keyframe
+
+
+@pytest.mark.parametrize("name", ["json", "h264"])
+def test_any_flipped_bit_of_the_body_is_found(name: str) -> None:
+    packets = stream(name, count=2)
+    whole = [VideoDecoder().feed(packets[0])] * 2
+    body = 19 if name != "json" else packets[0].index(b'"data":"') + 8
+    for at in range(body, min(len(packets[0]), body + 700)):
+        damaged = bytearray(packets[0])
+        damaged[at] ^= 1 << at % 8
+        shown = VideoDecoder().feed(bytes(damaged))
+        assert same(shown, whole[0])
+
+
+def same(shown: Decoded | None, expected: Decoded | None) -> bool:
+    """Not shown at all, or as it was sent (a bit of base64's padding or of JSON's white space means nothing)."""
+    return shown is None or (expected is not None and np.array_equal(shown.picture, expected.picture))
+
+
+def test_a_change_of_form_is_seen_at_once() -> None:
+    decoder = VideoDecoder()
+    for name in (*FORMS, *FORMS):
+        assert frames(decoder, stream(name, count=3)) == [0, 1, 2]
+        other = next(form for form in FORMS if form != name)
+        assert frames(decoder, [stream(other)[3]]) == [None]
+
+
+def test_a_recorded_camera_counts_its_pictures_in_every_form() -> None:
+    """The number that the simulated camera draws into its pictures grows by one with each, whatever the form."""
+    packets, decoder = recorded(MEDIA, f"{FRED}/outgoing/front-camera"), VideoDecoder()
+    shown = [decoder.feed(packet) for packet in packets]
+    seen = [one for one in shown if one is not None]
+    assert len(seen) == len(packets) > 80
+    forms = ["json", "pbvd", "pbvz", "h264"]
+    assert list(dict.fromkeys(one.encoding for one in seen)) == forms
+    for name in forms:
+        counts = [read_counter(one.picture) for one in seen if one.encoding == name]
+        assert None not in counts
+        assert all(0 < after - before <= 2 for before, after in itertools.pairwise(counts)), name
+
+
+def test_a_recorded_camera_is_decoded_to_the_same_pictures_every_time() -> None:
+    packets = recorded(MEDIA, f"{FRED}/outgoing/front-camera")
+    assert len({digest(packets) for _ in range(3)}) == 1
+    assert digest(packets) != digest(packets[:-1])
+
+
+def digest(packets: list[bytes]) -> str:
+    decoder, found = VideoDecoder(), hashlib.sha256()
+    for packet in packets:
+        shown = decoder.feed(packet)
+        assert shown is not None, decoder.problem
+        found.update(shown.picture.tobytes())
+    return found.hexdigest()
+
+
+def test_raw_jpeg_is_a_key_frame_without_number_and_time() -> None:
+    jpeg = cv2.imencode(".jpg", picture(1))[1].tobytes()
+    decoder = VideoDecoder()
+    shown = decoder.feed(jpeg)
+    assert shown is not None
+    assert (shown.frame, shown.captured_ms, shown.keyframe, shown.encoding) == (None, None, True, "jpeg")
+    assert frames(decoder, [stream("pbvd")[1]]) == [None]
+    assert decoder.feed(jpeg + b"\0\0") is not None  # some cameras fill their buffers up
+
+
+def test_the_picture_belongs_to_the_caller() -> None:
+    spoilt, untouched = VideoDecoder(), VideoDecoder()
+    for packet in stream("pbvd"):
+        one, other = spoilt.feed(packet), untouched.feed(packet)
+        assert one is not None
+        assert other is not None
+        assert np.array_equal(one.picture, other.picture)
+        one.picture[:] = 0
+
+
+def test_numbers_wrap_after_32_bits() -> None:
+    jpeg = cv2.imencode(".jpg", picture(0))[1].tobytes()
+    flat = cv2.imencode(".jpg", np.full((48, 64, 3), 128, np.uint8))[1].tobytes()
+    decoder = VideoDecoder()
+    packets = [
+        Picture(PictureKind.JPEG, (1 << 32) - 1, T0, jpeg).pack(),
+        Picture(PictureKind.DELTA_JPEG, 0, T0 + 5, flat).pack(),
+    ]
+    assert frames(decoder, packets) == [(1 << 32) - 1, 0]
+
+
+def test_a_difference_of_another_size() -> None:
+    small = cv2.imencode(".jpg", picture(0, 32, 24))[1].tobytes()
+    decoder = VideoDecoder()
+    assert frames(decoder, [stream("pbvd")[0], Picture(PictureKind.DELTA_JPEG, 1, T0, small).pack()]) == [0, None]
+    assert "size" in decoder.problem
+
+
+@pytest.mark.parametrize(
+    ("stamp", "captured_ms"),
+    [
+        ("1710969600.123", 1710969600123),
+        ("1710969600123", 1710969600123),
+        ("null", None),
+        ("-1", None),
+        ("0", None),
+        ("1e300", None),
+        ("-1e308", None),
+    ],
+)
+def test_stamps(stamp: str, captured_ms: int | None) -> None:
+    packet = json_video.pack(0, True, None, cv2.imencode(".jpg", picture(0))[1].tobytes())
+    shown = VideoDecoder().feed(packet.replace(b'"timestamp":null', b'"timestamp":' + stamp.encode()))
+    assert shown is not None
+    assert shown.captured_ms == captured_ms
+
+
+@pytest.mark.parametrize(
+    ("was", "now"),
+    [
+        (b'"id":0', b'"id":' + b"9" * 400),
+        (b'"id":0', b'"id":-1'),
+        (b'"id":0', b'"id":0.5'),
+        (b'"id":0', b'"id":true'),
+        (b'"id":0', b'"id":"0"'),
+        (b'"id":0', b'"id":0,"more":' + b"[" * 100_000),
+        (b'"keyframe":true', b'"keyframe":1'),
+        (b'"keyframe":true', b'"keyframe":null'),
+        (b'"timestamp":1710969600.0', b'"timestamp":NaN'),
+        (b'"timestamp":1710969600.0', b'"timestamp":Infinity'),
+        (b'"data":"', b'"data":"!'),
+        (b'"data":"', b'"data":"A'),
+        (b'"data":"', b'"data":null,"date":"'),
+    ],
+)
+def test_json_that_is_none_of_ours(was: bytes, now: bytes) -> None:
+    packet = stream("json")[0]
+    assert was in packet
+    decoder = VideoDecoder()
+    assert decoder.feed(packet.replace(was, now)) is None
+    assert decoder.wants_keyframe
+
+
+def test_what_is_too_large_is_refused_before_it_is_decoded() -> None:
+    bomb = zlib.compress(bytes(64 << 20), 9)
+    decoder = VideoDecoder()
+    assert frames(decoder, [Picture(PictureKind.ZLIB_JPEG, 0, T0, bomb).pack(), bytes(MAX_PAYLOAD + 1)]) == [None, None]
+    with pytest.raises(PayloadError, match="more than 1000"):
+        inflate(zlib.compress(bytes(1001)), 1000)
+    assert inflate(zlib.compress(bytes(1000)), 1000) == bytes(1000)
+    jpeg = cv2.imencode(".jpg", picture(0))[1].tobytes()
+    at = jpeg.index(b"\xff\xc0") + 5
+    for height, width in ((4097, 16), (16, 4097), (65535, 65535), (0, 64), (48, 0)):
+        with pytest.raises(PayloadError):
+            jpeg_size(jpeg[:at] + struct.pack(">HH", height, width) + jpeg[at + 4 :])
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        [cv2.IMWRITE_JPEG_PROGRESSIVE, 1],
+        [cv2.IMWRITE_JPEG_OPTIMIZE, 1],
+        [cv2.IMWRITE_JPEG_RST_INTERVAL, 2],
+        [cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_411],
+        [cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444],
+    ],
+)
+def test_every_jpeg_a_camera_may_send(options: list[int]) -> None:
+    jpeg = cv2.imencode(".jpg", picture(0, 161, 121), options)[1].tobytes()
+    assert jpeg_size(jpeg) == (161, 121)
+    assert decode_jpeg(jpeg).shape == (121, 161, 3)
+    grey = cv2.imencode(".jpg", picture(0)[:, :, 0], options[:2])[1].tobytes()
+    assert decode_jpeg(grey).shape == (48, 64, 3)
+
+
+def test_a_turn_asked_for_in_the_picture_is_ignored() -> None:
+    jpeg = cv2.imencode(".jpg", picture(0))[1].tobytes()
+    tiff = b"II*\0" + struct.pack("<IHHHII", 8, 1, 0x0112, 3, 1, 6) + bytes(4)
+    exif = b"Exif\0\0" + tiff
+    turned = jpeg[:2] + b"\xff\xe1" + struct.pack(">H", len(exif) + 2) + exif + jpeg[2:]
+    assert np.array_equal(decode_jpeg(turned), decode_jpeg(jpeg))

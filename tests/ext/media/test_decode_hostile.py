@@ -1,0 +1,191 @@
+"""Generated hostile packets among good ones: never a crash, never a wrong picture shown as right.
+
+A packet that is well-formed and lies (another id, another picture, a damaged bare JPEG) cannot be told from an honest
+one: what is shown from there to the next honest key frame is not judged. Everything else is.
+
+``make test THOROUGH=1`` tries 100,000; PEBBLE_HOSTILE_SEED makes them others.
+"""
+
+from __future__ import annotations
+
+import os
+import random
+import zlib
+from collections import Counter
+from collections.abc import Callable
+
+import cv2
+import numpy as np
+
+from pebble.contract.packets import Picture, PictureKind
+from pebble.extensions.media import h264
+from pebble.extensions.media.decode import Decoded, VideoDecoder
+from pebble.extensions.media.jpeg import MAX_EDGE, Pixels
+from pebble.extensions.media.video import make_encoder
+from tests.support import cases
+
+PACKETS = cases(4000, 100_000)
+SEED = int(os.environ.get("PEBBLE_HOSTILE_SEED", "1"))
+T0 = 1_710_969_600_000
+HEADER = 19
+LENGTH, INTERVAL = 40, 6
+BOMB = Picture(PictureKind.ZLIB_JPEG, 0, T0, zlib.compress(bytes(30 << 20), 9)).pack()
+Stream = list[bytes]
+
+
+def camera(sender: int, number: int) -> Pixels:
+    made = np.full((48, 64, 3), (60 + 50 * sender, 120, 200 - 50 * sender), np.uint8)
+    made[:: 5 + sender] = 30
+    cv2.circle(made, (number * 5 % 64, 12 + 10 * sender), 9, (40, 60, 220), -1)
+    return made
+
+
+def streams() -> dict[str, list[Stream]]:
+    """Each form has three senders, each with its own pictures, minutes apart."""
+    made: dict[str, list[Stream]] = {}
+    for form in ("json", "pbvd", "h264"):
+        made[form] = []
+        for sender in range(3):
+            encoder = make_encoder(form, fps=15, keyframe_interval=INTERVAL, quality=20)
+            start = T0 + sender * 100_000
+            made[form].append([encoder.encode(camera(sender, n), start + n * 66) for n in range(LENGTH)])
+    made["jpeg"] = [[cv2.imencode(".jpg", camera(sender, n))[1].tobytes() for n in range(9)] for sender in range(3)]
+    return made
+
+
+class Attack:
+    """Feeds one decoder, and knows what each honest packet has to become."""
+
+    def __init__(self, seed: int) -> None:
+        self.random = random.Random(seed)
+        self.streams = streams()
+        self.truth: dict[bytes, Pixels] = {}
+        for form in self.streams.values():
+            for stream in form:
+                honest = VideoDecoder()
+                for packet in stream:
+                    shown = honest.feed(packet)
+                    assert shown is not None, honest.problem
+                    self.truth[packet] = shown.picture
+        self.decoder = VideoDecoder()
+        self.fed = 0
+        self.lied = False  # something unverifiable was shown, and no honest key frame since
+        self.seen: Counter[str] = Counter()
+        self.form = "json"
+        self.sender = self.at = 0
+
+    @property
+    def stream(self) -> Stream:
+        return self.streams[self.form][self.sender]
+
+    def step(self) -> None:
+        what = self.random.choices([self.honest, self.lose, self.jump, self.repeat, self.attack], [10, 1, 1, 1, 6])[0]
+        what()
+        self.at %= len(self.stream)
+
+    def honest(self) -> None:
+        self.feed(self.stream[self.at], self.stream[self.at])
+        self.at += 1
+
+    def lose(self) -> None:
+        self.at += self.random.randint(1, 8)
+
+    def jump(self) -> None:
+        """Another sender: a restart, a change of form, or two on one topic."""
+        self.form = self.random.choice(list(self.streams))
+        self.sender = self.random.randrange(3)
+        self.at = self.random.randrange(len(self.stream))
+
+    def repeat(self) -> None:
+        old = self.random.choice(self.stream[max(0, self.at - 4) : self.at + 1])
+        self.feed(old, old)
+
+    def attack(self) -> None:
+        packet = self.stream[self.at]
+        checked = self.form in ("json", "h264")
+        kind: Callable[[bytes], bytes] = self.random.choice(
+            [self.cut, self.longer, self.flip, self.garbage, self.lie, self.splice, self.repack, self.resize, self.bomb]
+        )
+        made = kind(packet)
+        strict = kind in (self.cut, self.longer, self.garbage, self.bomb) or (kind == self.flip and checked)
+        self.feed(made, packet if strict else None, kind.__name__)
+        self.at += self.random.random() < 0.5  # instead of the honest one, or before it
+
+    def feed(self, packet: bytes, right: bytes | None, kind: str = "honest") -> None:
+        """``right``: the honest packet whose picture this may show; None: that is unknown."""
+        shown = self.decoder.feed(packet)
+        self.fed += 1
+        self.seen[f"{kind}: {'shown' if shown else 'hidden'}"] += 1
+        right = packet if packet in self.truth else right
+        if shown is not None:
+            self._judge(shown, right)
+        assert self.decoder.wants_keyframe is (shown is None)
+
+    def _judge(self, shown: Decoded, right: bytes | None) -> None:
+        assert shown.picture.dtype == np.uint8
+        assert max(shown.picture.shape) <= MAX_EDGE
+        if right is None:
+            self.lied = True
+        elif shown.keyframe or not self.lied:
+            self.lied = False
+            assert np.array_equal(shown.picture, self.truth[right]), (shown.encoding, shown.frame)
+
+    # -- what is done to an honest packet
+
+    def cut(self, packet: bytes) -> bytes:
+        return packet[: self.random.choice([self.random.randrange(len(packet)), len(packet) - 1, len(packet) - 2])]
+
+    def longer(self, packet: bytes) -> bytes:
+        return packet + self.random.randbytes(self.random.randint(1, 30))
+
+    def flip(self, packet: bytes) -> bytes:
+        made = bytearray(packet)
+        first = HEADER if packet.startswith(b"PBVD") else 0
+        for _ in range(self.random.randint(1, 8)):
+            made[self.random.randrange(first, len(made))] ^= 1 << self.random.randrange(8)
+        return bytes(made)
+
+    def garbage(self, packet: bytes) -> bytes:
+        begin = self.random.choice([b"", b"{", b'{"id":', b"PBVD\x01\x01\x00", b"PBVD\x01\x05\x01", b"\xff\xd8\xff"])
+        return begin + self.random.randbytes(self.random.randint(0, 300))
+
+    def lie(self, packet: bytes) -> bytes:
+        """Any byte of the header, or of the first fields of the JSON, is any other."""
+        made = bytearray(packet)
+        made[self.random.randrange(min(HEADER, len(made)))] = self.random.randrange(256)
+        return bytes(made).replace(b'"id":', self.random.choice([b'"id":', b'"id":1e9', b'"id":-', b'"id":9'])[:8])
+
+    def splice(self, packet: bytes) -> bytes:
+        other = self.random.choice(self.stream)
+        at = self.random.randrange(min(len(packet), len(other)))
+        return packet[:at] + other[at:]
+
+    def repack(self, packet: bytes) -> bytes:
+        """Damaged below the checksum."""
+        if not packet.startswith(b"PBVD"):
+            return self.flip(packet)
+        head, body = packet[:HEADER], packet[HEADER:]
+        if self.form == "h264":
+            return head + h264.seal(self.flip(bytes(HEADER) + h264.unseal(body))[HEADER:])
+        return head + self.flip(body)
+
+    def resize(self, packet: bytes) -> bytes:
+        """Another size in the JPEG's header."""
+        at = packet.find(b"\xff\xc0")
+        size = b"".join(self.random.choice([1, 16, 47, 64, 100, 4096, 65535]).to_bytes(2, "big") for _ in "hw")
+        return packet[: at + 5] + size + packet[at + 9 :] if at >= 0 else self.flip(self.repack(packet))
+
+    def bomb(self, packet: bytes) -> bytes:
+        return self.random.choice([BOMB, b"[" * 100_000, b'{"a":' * 50_000, b"PBVD\x01\x01\x00" + bytes(70_000)])
+
+
+def test_hostile_packets() -> None:
+    attack = Attack(SEED)
+    while attack.fed < PACKETS:
+        attack.step()
+    attack.form, attack.sender, attack.at = "pbvd", 0, 0
+    for _ in range(LENGTH):  # and afterwards it works as if nothing had been
+        attack.honest()
+    assert attack.decoder.feed(attack.stream[0]) is not None
+    assert attack.seen["honest: shown"] > PACKETS / 5
+    print(dict(sorted(attack.seen.items())))  # noqa: T201

@@ -1,0 +1,428 @@
+"""The jitter buffer on a clock of its own: what an ear gets to hear when packets come as they like."""
+
+from __future__ import annotations
+
+import hashlib
+import itertools
+import random
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pytest
+
+from pebble.contract.packets import Codec, Sound
+from pebble.extensions.media.jitter import Chunk, JitterBuffer, ahead
+from pebble.extensions.media.pcm import to_bytes
+from pebble.extensions.media.sound import make_sound_encoder, sequence_numbers
+from pebble.extensions.media.speech import Speech
+from tests.ext.recordings.demo_robots import FRED, MEDIA, messages
+
+RATE = 16000
+CHUNK = 320  # 20 ms
+LAST = 0xFFFFFFFF
+EPOCH_MS = 1_700_000_000_000
+
+
+@dataclass
+class Played:
+    """What came out of the buffer, and when."""
+
+    chunks: list[tuple[float, Chunk]]
+
+    @property
+    def real(self) -> list[int]:
+        """Which packets were heard: each carries its index as its samples."""
+        return [int(chunk.samples[len(chunk.samples) // 2, 0]) for _, chunk in self.chunks if not chunk.concealed]
+
+    @property
+    def concealed_s(self) -> float:
+        return sum(chunk.seconds for _, chunk in self.chunks if chunk.concealed)
+
+    @property
+    def stutters(self) -> int:
+        """How often the next chunk came later than the one before it ended."""
+        return sum(
+            later - earlier > chunk.seconds + 1e-6
+            for (earlier, chunk), (later, _) in zip(self.chunks, self.chunks[1:], strict=False)
+        )
+
+
+def packet(
+    index: int, *, sequence: int | None = None, ms: int | None = None, rate: int = RATE, channels: int = 1
+) -> bytes:
+    """20 ms in which every sample is ``index``."""
+    samples = rate // 50
+    body = np.full(samples * channels, index, "<i2").tobytes()
+    number = index + 1 if sequence is None else sequence
+    return Sound(
+        Codec.PCM16LE, channels, rate, samples, number, EPOCH_MS + 20 * index if ms is None else ms, body
+    ).pack()
+
+
+def play(buffer: JitterBuffer, arrivals: Iterable[tuple[float, bytes]]) -> Played:
+    """Everything that happens until nothing more is due."""
+    chunks = []
+    coming = sorted(arrivals, key=lambda arrival: arrival[0])
+    now = 0.0
+    while True:
+        wait = buffer.wait(now)
+        if wait is None and not coming:
+            return Played(chunks)
+        due = now + wait if wait is not None else float("inf")
+        if coming and coming[0][0] <= due:
+            now, payload = coming.pop(0)
+            buffer.put(payload, now)
+            continue
+        now = due
+        chunk = buffer.take(now)
+        if chunk is not None:
+            chunks.append((now, chunk))
+
+
+def on_time(count: int, *, first: int = 0, **more: Any) -> list[tuple[float, bytes]]:
+    return [(0.02 * index, packet(index, **more)) for index in range(first, first + count)]
+
+
+# -- all is well
+
+
+def test_what_comes_evenly_is_played_evenly_and_whole() -> None:
+    played = play(JitterBuffer(concealment_ms=0), on_time(100))
+    assert played.real == list(range(100))
+    assert played.stutters == 0
+    assert played.chunks[0][0] == pytest.approx(0.06)
+
+
+def test_a_single_packet_is_played() -> None:
+    played = play(JitterBuffer(), on_time(1))
+    assert played.real == [0]
+    assert played.concealed_s == pytest.approx(0.1)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_jitter_below_the_target_is_inaudible(seed: int) -> None:
+    randoms = random.Random(seed)
+    arrivals = [(at + randoms.uniform(0, 0.039), raw) for at, raw in on_time(500)]
+    played = play(JitterBuffer(concealment_ms=0), arrivals)
+    assert played.real == list(range(500))
+    assert played.stutters == 0
+
+
+def recorded_sound() -> list[tuple[float, bytes]]:
+    """A robot's packets in PCM, with the times at which they really arrived."""
+    packets = [one for one in messages(MEDIA) if one.channel.topic == f"{FRED}/outgoing/audio"]
+    return [((one.log_ns - packets[0].log_ns) / 1e9, one.payload) for one in packets if one.payload[5] == Codec.PCM16LE]
+
+
+def test_recorded_sound_is_played_evenly_at_its_recorded_jitter() -> None:
+    arrivals = recorded_sound()
+    longest_s = max(later - earlier for (earlier, _), (later, _) in itertools.pairwise(arrivals))
+    assert longest_s > 0.08, "more than the buffer waits at first"
+    played = play(JitterBuffer(), arrivals)
+    sent = b"".join(payload[24:] for _, payload in arrivals)
+    first = b"".join(chunk.pcm for _, chunk in played.chunks[:10])
+    assert first == sent[: len(first)]
+    assert sum(not chunk.concealed for _, chunk in played.chunks) >= len(arrivals) - 2, "what waited too long"
+    assert played.stutters == 0
+    assert played.concealed_s < longest_s + 0.1, "the end of the sound is concealed for 0.1 s"
+
+
+def test_recorded_sound_is_the_same_every_time() -> None:
+    digests = set()
+    for _ in range(3):
+        played = play(JitterBuffer(), recorded_sound())
+        digests.add(hashlib.sha256(b"".join(chunk.pcm for _, chunk in played.chunks)).hexdigest())
+    assert len(digests) == 1
+
+
+def test_jitter_above_the_target_is_learnt() -> None:
+    randoms = random.Random(3)
+    arrivals = [(at + randoms.choice([0, 0.01, 0.13]), raw) for at, raw in on_time(2000)]
+    buffer = JitterBuffer()
+    played = play(buffer, arrivals)
+    late = [at for at, chunk in played.chunks if chunk.concealed and at < 39.9]
+    assert sum(at > 20 for at in late) <= sum(at < 20 for at in late)
+    assert len(set(played.real)) > 1900
+    assert buffer.counters["overflow"] == 0
+
+
+def test_reordered_and_repeated_packets() -> None:
+    arrivals = on_time(100)
+    shuffled = [(at, arrivals[index ^ 1][1]) for index, (at, _) in enumerate(arrivals)]
+    buffer = JitterBuffer()
+    played = play(buffer, [*shuffled, *((at + 0.005, raw) for at, raw in shuffled)])
+    assert played.real == list(range(100))
+    assert buffer.counters["duplicates"] + buffer.counters["late"] == 100
+
+
+# -- gaps
+
+
+@pytest.mark.parametrize("lost", [1, 2, 3, 4, 5])
+def test_a_short_gap_is_filled_and_costs_no_time(lost: int) -> None:
+    buffer = JitterBuffer()
+    arrivals = [arrival for index, arrival in enumerate(on_time(60)) if not 20 <= index < 20 + lost]
+    played = play(buffer, arrivals)
+    assert played.real == [*range(20), *range(20 + lost, 60)]
+    first_after = next(at for at, chunk in played.chunks if chunk.samples[-1, 0] == 20 + lost)
+    assert first_after == pytest.approx(0.06 + 0.02 * (20 + lost))
+    assert played.stutters == 0
+    assert buffer.counters["lost"] == lost
+
+
+def test_a_long_gap_is_filled_for_100_ms_and_the_rest_is_silence() -> None:
+    arrivals = [arrival for index, arrival in enumerate(on_time(120)) if not 20 <= index < 70]
+    played = play(JitterBuffer(), arrivals)
+    assert played.real == [*range(20), *range(70, 120)]
+    assert played.concealed_s == pytest.approx(0.2)  # and once more at the end
+
+
+@pytest.mark.parametrize("concealment_ms", [0, 1, 50, 100, 130])
+def test_when_the_sender_stops_there_is_an_end(concealment_ms: int) -> None:
+    buffer = JitterBuffer(concealment_ms=concealment_ms)
+    played = play(buffer, on_time(20))
+    assert played.concealed_s == pytest.approx(concealment_ms / 1000, abs=1e-4)
+    assert buffer.wait(1000.0) is None
+    assert buffer.take(1000.0) is None
+
+
+def test_what_is_made_up_begins_where_the_sound_ended_and_fades_to_nothing() -> None:
+    recorded = Speech(RATE).samples(0, 30 * CHUNK)
+    encoder = make_sound_encoder("pcm", rate=RATE, channels=1)
+    raw = encoder.encode(to_bytes(recorded), EPOCH_MS)
+    played = play(JitterBuffer(), [(0.02 * index, one) for index, one in enumerate(raw)])
+    made = np.concatenate([chunk.samples for _, chunk in played.chunks if chunk.concealed])[:, 0].astype(int)
+    assert made[0] == pytest.approx(recorded[-1, 0], abs=1)
+    assert len(made) == RATE // 10
+    assert np.abs(made[-32:]).max() < np.abs(made[:320]).max() / 20 + 1
+
+
+def test_opus_conceals_with_its_own_means_and_no_longer_than_allowed() -> None:
+    encoder = make_sound_encoder("opus", rate=RATE, channels=1, bundle=3)
+    recorded = Speech(RATE).samples(0, 2 * RATE)
+    raw = encoder.encode(to_bytes(recorded), EPOCH_MS)
+    buffer = JitterBuffer()
+    played = play(buffer, [(0.06 * index, one) for index, one in enumerate(raw) if index not in (10, 20, 21, 22)])
+    assert played.concealed_s == pytest.approx(0.06 + 0.1 + 0.1)
+    assert buffer.counters["lost"] == 4
+    whole = np.concatenate([chunk.samples for _, chunk in played.chunks])
+    assert np.abs(np.diff(whole[:, 0].astype(int))).max() < 12_000
+
+
+# -- the sender
+
+
+@pytest.mark.parametrize("before", [3, 7, 50, 500])
+def test_a_restarted_sender_is_played_at_once(before: int) -> None:
+    again = [
+        (0.02 * before + 0.5 + at, packet(index + before, sequence=index + 1))
+        for index, (at, _) in enumerate(on_time(30))
+    ]
+    buffer = JitterBuffer()
+    played = play(buffer, [*on_time(before), *again])
+    assert played.real == list(range(before + 30))
+    assert buffer.counters["restarts"] == 1
+
+
+def test_a_restarted_sender_with_another_clock_is_played_soon() -> None:
+    again = [(1.5 + 0.02 * index, packet(50 + index, sequence=index + 1, ms=1000 + index)) for index in range(30)]
+    played = play(JitterBuffer(), [*on_time(50), *again])
+    assert played.real == [*range(50), *range(54, 80)]
+
+
+def test_a_sender_without_a_clock() -> None:
+    first = [(0.02 * index, packet(index, ms=0)) for index in range(50)]
+    again = [(1.5 + 0.02 * index, packet(50 + index, sequence=index + 1, ms=0)) for index in range(30)]
+    played = play(JitterBuffer(), [*first, *again])
+    assert played.real == [*range(50), *range(54, 80)]
+
+
+def test_numbers_wrap_to_1() -> None:
+    numbers = [LAST - 2, LAST - 1, LAST, 1, 2, 3]
+    arrivals = [(0.02 * index, packet(index, sequence=number)) for index, number in enumerate(numbers)]
+    buffer = JitterBuffer()
+    assert play(buffer, arrivals).real == [0, 1, 2, 3, 4, 5]
+    assert buffer.counters["lost"] == buffer.counters["restarts"] == 0
+
+
+@pytest.mark.parametrize(
+    ("sequence", "of", "expected"), [(2, 1, 1), (1, 2, -1), (1, LAST, 1), (LAST, 1, -1), (5, 5, 0), (1, LAST - 1, 2)]
+)
+def test_ahead(sequence: int, of: int, expected: int) -> None:
+    assert ahead(sequence, of) == expected
+
+
+def test_a_change_of_format_keeps_its_place() -> None:
+    first, second = on_time(20), on_time(20, first=20, rate=48000, channels=2)
+    played = play(JitterBuffer(), [*first, *second])
+    assert played.real == list(range(40))
+    assert [(chunk.rate, chunk.channels) for _, chunk in played.chunks[19:21]] == [(16000, 1), (48000, 2)]
+    assert played.stutters == 0
+
+
+def test_a_change_of_encoding_in_midstream() -> None:
+    numbers = sequence_numbers()
+    raw: list[bytes] = []
+    for name in ("pcm", "opus", "pcm"):
+        encoder = make_sound_encoder(name, rate=RATE, channels=1, numbers=numbers)
+        raw += encoder.encode(to_bytes(Speech(RATE).samples(len(raw) * CHUNK, 20 * CHUNK)), EPOCH_MS + 20 * len(raw))
+    buffer = JitterBuffer(concealment_ms=0)
+    played = play(buffer, [(0.02 * index, one) for index, one in enumerate(raw)])
+    assert len(played.chunks) == 60
+    assert played.stutters == 0
+
+
+# -- too much
+
+
+def test_more_than_the_limit_never_waits_and_the_oldest_goes() -> None:
+    buffer = JitterBuffer(limit=10, concealment_ms=0)
+    for index in range(100):
+        buffer.put(packet(index), 0.0)
+    assert len(buffer) == 10
+    assert buffer.counters["overflow"] == 90
+    played = play(buffer, [])
+    assert played.real == list(range(90, 100))
+
+
+def test_the_limit_counts_while_playing_too() -> None:
+    buffer = JitterBuffer(limit=10, concealment_ms=0)
+    burst = [(0.5, packet(index)) for index in range(20, 100)]
+    played = play(buffer, [*on_time(20), *burst])
+    assert played.real == [*range(20), *range(90, 100)]
+
+
+def test_large_packets_are_limited_by_their_bytes() -> None:
+    buffer = JitterBuffer()
+    for number in range(1, 100):
+        buffer.put(Sound(Codec.PCM16LE, 8, 48000, 48000, number, EPOCH_MS + number, bytes(768_000)).pack(), 0.0)
+    assert len(buffer) == 5
+
+
+def test_after_a_stall_latency_comes_down_again() -> None:
+    """Half a second nothing arrives, then all of it at once."""
+    arrivals = [(max(at, 1.5) if at > 1 else at, raw) for at, raw in on_time(500)]
+    buffer = JitterBuffer()
+    played = play(buffer, arrivals)
+    latency = {index: at - 0.02 * index for (at, chunk), index in _with_index(played)}
+    assert latency[480] < 0.16
+    assert buffer.counters["skipped"] > 10
+
+
+def _with_index(played: Played) -> list[tuple[tuple[float, Chunk], int]]:
+    return [((at, chunk), int(chunk.samples[-1, 0])) for at, chunk in played.chunks if not chunk.concealed]
+
+
+@pytest.mark.parametrize("drift", [0.001, 0.0002])
+def test_a_sender_whose_clock_is_fast_adds_no_latency(drift: float) -> None:
+    count = 15_000  # five minutes
+    arrivals = [(at / (1 + drift), raw) for at, raw in on_time(count)]
+    buffer = JitterBuffer()
+    played = play(buffer, arrivals)
+    latency = [at - 0.02 * index / (1 + drift) for (at, _), index in _with_index(played)]
+    assert max(latency) < 0.12
+    assert 0 < buffer.counters["skipped"] <= drift * count + 2
+    assert buffer.counters["overflow"] == 0
+
+
+def test_a_sender_whose_clock_is_slow_is_stretched() -> None:
+    count = 15_000
+    arrivals = [(at * 1.001, raw) for at, raw in on_time(count)]
+    buffer = JitterBuffer()
+    played = play(buffer, arrivals)
+    assert played.real == list(range(count))
+    assert played.stutters == 0
+    assert played.concealed_s == pytest.approx(0.001 * 0.02 * count, abs=0.2)
+
+
+def test_a_player_that_takes_late_is_not_flooded() -> None:
+    buffer = JitterBuffer(concealment_ms=0)
+    for index in range(40):
+        buffer.put(packet(index), 0.0)
+    assert buffer.take(0.0) is None
+    assert buffer.take(0.06) is not None
+    assert buffer.take(5.0) is not None  # it hung for five seconds
+    assert buffer.take(5.0) is None
+    assert buffer.take(5.02) is not None
+
+
+# -- rubbish
+
+
+def test_a_far_number_does_not_silence_the_sender() -> None:
+    arrivals = [*on_time(100), (0.5, packet(999, sequence=2_000_000_000, ms=2**62))]
+    played = play(JitterBuffer(), arrivals)
+    received = [index for index in played.real if index != 999]
+    assert len(received) > 90
+    assert received[-1] == 99
+
+
+def hostile(randoms: random.Random, good: list[bytes]) -> bytes:
+    choice = randoms.random()
+    if choice < 0.2:
+        return randoms.randbytes(randoms.randrange(80))
+    if choice < 0.4:
+        return Sound(
+            randoms.choice([1, 1, 2, 7]),
+            randoms.randrange(10),
+            randoms.choice([0, 1, 4000, 8000, 16000, 48000, 65535]),
+            randoms.choice([0, 1, 160, 320, 65535]),
+            randoms.choice([0, 1, 2, LAST, randoms.randrange(LAST)]),
+            randoms.choice([0, EPOCH_MS, 2**64 - 1]),
+            randoms.randbytes(randoms.randrange(700)),
+        ).pack()
+    raw = bytearray(randoms.choice(good))
+    for _ in range(randoms.randrange(4)):
+        raw[randoms.randrange(len(raw))] = randoms.randrange(256)
+    return bytes(raw[: randoms.randrange(len(raw) + 1)] if choice > 0.9 else raw)
+
+
+def storm(seed: int, count: int) -> JitterBuffer:
+    """``count`` hostile packets into a buffer that is being played; afterwards an honest sender must be heard."""
+    randoms = random.Random(seed)
+    recorded = to_bytes(Speech(RATE).samples(0, RATE))
+    good = make_sound_encoder("pcm", rate=RATE, channels=1).encode(recorded, EPOCH_MS)
+    good += make_sound_encoder("opus", rate=RATE, channels=1, bundle=2).encode(recorded, EPOCH_MS)
+    buffer = JitterBuffer(limit=20)
+    now = 0.0
+    for _ in range(count):
+        now += randoms.choice([0, 0.001, 0.02, 0.3])
+        buffer.put(hostile(randoms, good), now)
+        assert len(buffer) <= 20
+        chunk = buffer.take(now)
+        assert chunk is None or (chunk.samples.dtype == np.int16 and chunk.samples.shape[1] == chunk.channels)
+        assert chunk is None or 0 < chunk.seconds <= 1
+    honest = [(now + 0.02 * index, packet(index, ms=2**63)) for index in range(200)]
+    played = _continue(buffer, honest)
+    assert played.real[-150:] == list(range(50, 200))
+    return buffer
+
+
+def _continue(buffer: JitterBuffer, arrivals: list[tuple[float, bytes]]) -> Played:
+    chunks = []
+    for at, raw in arrivals:
+        buffer.put(raw, at)
+        for step in range(4):
+            chunk = buffer.take(at + step * 0.005)
+            if chunk is not None:
+                chunks.append((at, chunk))
+    for step in range(200):
+        chunk = buffer.take(arrivals[-1][0] + 0.02 * step)
+        if chunk is not None:
+            chunks.append((0.0, chunk))
+    return Played(chunks)
+
+
+def test_hostile_packets() -> None:
+    counted = storm(1, 3000).counters.snapshot()
+    assert counted["refused"] > 300
+    assert counted["packets"] > 300
+
+
+def test_exactly_one_packet_too_many_is_left_out() -> None:
+    buffer = JitterBuffer(target_ms=40)
+    played = play(buffer, [(max(0.0, 0.02 * (index - 1) - 0.005), packet(index)) for index in range(100)])
+    assert buffer.counters["skipped"] == 1
+    assert len(played.real) == 99

@@ -1,0 +1,105 @@
+"""The synthetic scene: always the same, always moving, and its counter survives what pictures go through."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+from pebble.extensions.media.scene import COUNTER_LIMIT, TAG_ID, Scene, read_counter
+from tests.support import cases, some
+
+NUMBERS = some((0, 1, 2, 255, 0xABCDEF, 256, 65_535, COUNTER_LIMIT - 1), 4)
+
+
+def picture(number: int, width: int = 640, height: int = 480) -> np.ndarray:
+    out = np.empty((height, width, 3), np.uint8)
+    Scene(width, height).render(number, out)
+    return out
+
+
+def jpeg(image: np.ndarray, quality: int = 10) -> np.ndarray:
+    return cv2.imdecode(cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, quality])[1], cv2.IMREAD_COLOR)
+
+
+def test_the_same_number_gives_the_same_pixels_whatever_was_drawn_before() -> None:
+    scene, out = Scene(640, 480), np.zeros((480, 640, 3), np.uint8)
+    for number in (5, 99, 5):
+        scene.render(number, out)
+    assert np.array_equal(out, picture(5))
+
+
+def test_it_never_stands_still() -> None:
+    scene, before, after = Scene(640, 480), *np.empty((2, 480, 640, 3), np.uint8)
+    for number in range(0, 900, cases(37, 7)):
+        scene.render(number, before)
+        scene.render(number + 1, after)
+        assert np.mean(before[:400] != after[:400]) > 0.2, number
+
+
+@pytest.mark.parametrize("size", [(640, 480), (1920, 1080), (320, 240), (1280, 720), (97, 331)])
+@pytest.mark.parametrize("number", NUMBERS)
+def test_the_counter_can_be_read_at_any_size(size: tuple[int, int], number: int) -> None:
+    assert read_counter(picture(number, *size)) == number
+
+
+def test_the_counter_starts_again() -> None:
+    assert read_counter(picture(COUNTER_LIMIT + 7)) == 7
+
+
+@pytest.mark.parametrize("size", [(640, 480), (1920, 1080), (1280, 720), (352, 288)])
+@pytest.mark.parametrize("number", NUMBERS)
+def test_the_counter_survives_coarse_coding_and_shrinking(size: tuple[int, int], number: int) -> None:
+    small = cv2.resize(jpeg(picture(number, *size)), (320, 240), interpolation=cv2.INTER_AREA)
+    assert read_counter(jpeg(small)) == number
+    assert read_counter(cv2.cvtColor(small, cv2.COLOR_BGR2GRAY)) == number
+
+
+def test_the_counter_survives_being_sent_as_differences() -> None:
+    """Codes as the paper's encoder does (8.8): differences are clipped at 128 and coded at quality 10."""
+    scene, now = Scene(320, 240), np.empty((240, 320, 3), np.uint8)
+    scene.render(1000, now)
+    shown = jpeg(now)
+    for number in range(1001, cases(1020, 1060)):
+        scene.render(number, now)
+        difference = jpeg(np.clip(now.astype(np.int16) - shown + 128, 0, 255).astype(np.uint8))
+        shown = np.clip(shown.astype(np.int16) + difference.astype(np.int16) - 128, 0, 255).astype(np.uint8)
+        assert read_counter(shown) == number
+
+
+def test_a_torn_counter_is_read_as_none() -> None:
+    """The upper half of one picture above the lower half of another, as a lost slice leaves them."""
+    scene, mixed, other = Scene(640, 480), *np.empty((2, 480, 640, 3), np.uint8)
+    for number in range(100, cases(160, 400)):
+        scene.render(number, mixed)
+        scene.render(1000 * number, other)
+        mixed[456:] = other[456:]
+        assert read_counter(mixed) is None
+
+
+@pytest.mark.parametrize("shape", [(1, 1, 3), (480, 640, 3), (240, 320), (39, 640, 3), (480, 39, 3)])
+@pytest.mark.parametrize("value", [0, 128, 255])
+def test_other_pictures_have_no_counter(shape: tuple[int, ...], value: int) -> None:
+    assert read_counter(np.full(shape, value, np.uint8)) is None
+
+
+def test_noise_has_no_counter() -> None:
+    random = np.random.default_rng(1)
+    assert all(read_counter(random.integers(0, 256, (240, 320, 3), np.uint8)) is None for _ in range(200))
+
+
+@pytest.mark.parametrize("size", [(1, 1), (1, 40), (40, 1), (2, 5), (16, 16), (40, 9)])
+def test_tiny_pictures_are_drawn_too(size: tuple[int, int]) -> None:
+    for number in range(0, 900, 29):
+        picture(number, *size)
+
+
+def test_the_tag_is_found_where_it_is() -> None:
+    detector = cv2.aruco.ArucoDetector(cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_APRILTAG_36h11))
+    scene, out = Scene(640, 480), np.empty((480, 640, 3), np.uint8)
+    for number in range(0, 450, cases(45, 15)):
+        scene.render(number, out)
+        corners, ids, _ = detector.detectMarkers(out)
+        found = {int(tag): corner for tag, corner in zip(np.ravel(ids), corners, strict=True)}
+        assert TAG_ID in found, number
+        assert np.abs(found[TAG_ID][0].mean(axis=0) - scene.tag_centre(number)).max() < 1.5

@@ -1,0 +1,310 @@
+"""Sound to packets and back: what was said is what is heard, and rubbish is nothing."""
+
+from __future__ import annotations
+
+import json
+import random
+import sys
+from itertools import islice, pairwise
+from typing import Any
+
+import numpy as np
+import pytest
+
+from pebble.contract.packets import Codec, Sound
+from pebble.errors import PayloadError, PebbleError
+from pebble.extensions.media import opus, sound
+from pebble.extensions.media.opus import milliseconds
+from pebble.extensions.media.pcm import Resampler, Samples, remix, to_bytes, to_samples
+from pebble.extensions.media.sound import (
+    SOUND_ENCODINGS,
+    ReceivedSound,
+    SoundDecoder,
+    make_sound_encoder,
+    sequence_numbers,
+    unpack,
+)
+from pebble.extensions.media.speech import Speech
+from tests.support import some
+from tests.vectors import make_pbat
+
+VECTORS: list[dict[str, Any]] = json.loads(make_pbat.FILE.read_text())
+SECONDS = 4
+
+
+def speech(rate: int, channels: int = 1) -> Samples:
+    return Speech(rate, channels).samples(0, SECONDS * rate)
+
+
+def packets(name: str, samples: Samples, rate: int, *, feed: int = 320, **options: Any) -> list[bytes]:
+    """Encoded in pieces of ``feed`` samples, captured from epoch millisecond 1000 on."""
+    encoder = make_sound_encoder(name, rate=rate, channels=samples.shape[1], **options)
+    made = []
+    for at in range(0, len(samples), feed):
+        made += encoder.encode(to_bytes(samples[at : at + feed]), 1000 + round(1000 * at / rate))
+    return made
+
+
+def received(raw: list[bytes]) -> list[ReceivedSound]:
+    decoder = SoundDecoder()
+    return [one for one in map(decoder.feed, raw) if one is not None]
+
+
+def joined(sounds: list[ReceivedSound]) -> Samples:
+    return np.concatenate([one.samples for one in sounds])
+
+
+def envelope(samples: Samples, rate: int) -> Any:
+    step = rate // 50
+    return np.sqrt((samples[: len(samples) // step * step, 0].astype(float).reshape(-1, step) ** 2).mean(axis=1))
+
+
+def likeness(first: Any, second: Any) -> float:
+    count = min(len(first), len(second))
+    return float(np.corrcoef(first[:count], second[:count])[0, 1])
+
+
+@pytest.mark.parametrize("vector", VECTORS, ids=lambda vector: vector["name"])
+def test_vectors(vector: dict[str, Any]) -> None:
+    one = SoundDecoder().feed(bytes.fromhex(vector["hex"]))
+    found = None if one is None else (one.rate, one.channels, one.samples.reshape(-1).tolist())
+    expected = None if vector["samples"] is None else (vector["rate"], vector["channels"], vector["samples"])
+    assert found == expected
+
+
+def test_the_vectors_are_up_to_date() -> None:
+    assert make_pbat.vectors() == VECTORS, "run: python -m tests.vectors.make_pbat"
+
+
+# -- PCM
+
+
+@pytest.mark.parametrize("feed", [1, 100, 320, 321, 5000])
+@pytest.mark.parametrize("channels", [1, 2])
+def test_pcm_is_exact_whatever_the_pieces(feed: int, channels: int) -> None:
+    recorded = speech(16000, channels)[:8000]
+    sounds = received(packets("pcm", recorded, 16000, feed=feed))
+    assert [len(one.samples) for one in sounds] == [320] * 25
+    assert np.array_equal(joined(sounds), recorded)
+    assert [one.sequence for one in sounds] == list(range(1, 26))
+    assert all(abs(one.captured_ms - (1000 + 20 * number)) <= 1 for number, one in enumerate(sounds))
+
+
+def test_a_pcm_packet_is_the_original_s() -> None:
+    (raw,) = packets("pcm", to_samples(bytes(640), 1), 16000)
+    assert len(raw) == 664
+    assert Sound.unpack(raw) == Sound(Codec.PCM16LE, 1, 16000, 320, 1, 1000, bytes(640))
+
+
+def test_what_the_header_cannot_express_is_resampled() -> None:
+    encoder = make_sound_encoder("pcm", rate=96000, channels=2)
+    assert encoder.rate == 48000
+    (raw,) = encoder.encode(bytes(96000 // 50 * 4), 1000)
+    assert (Sound.unpack(raw).rate, Sound.unpack(raw).samples) == (48000, 960)
+
+
+def test_other_rate_and_channels_than_captured() -> None:
+    recorded = speech(48000, 2)
+    sounds = received(packets("pcm", recorded, 48000, feed=960, sent_rate=16000, sent_channels=1))
+    assert {(one.rate, one.channels, len(one.samples)) for one in sounds} == {(16000, 1, 320)}
+    assert likeness(envelope(joined(sounds), 16000), envelope(recorded, 48000)) > 0.98
+
+
+def test_a_hole_in_what_is_captured_is_no_part_of_a_packet() -> None:
+    encoder = make_sound_encoder("pcm", rate=16000, channels=1)
+    assert encoder.encode(bytes(200), 1000) == []
+    (raw,) = encoder.encode(b"\1" * 640, 5000)
+    assert (Sound.unpack(raw).captured_ms, Sound.unpack(raw).body) == (5000, b"\1" * 640)
+
+
+def test_a_hole_ends_a_bundle() -> None:
+    encoder = make_sound_encoder("opus", rate=16000, channels=1, bundle=3)
+    assert encoder.encode(bytes(1280), 1000) == []
+    (raw,) = encoder.encode(bytes(1920), 5000)
+    assert (Sound.unpack(raw).captured_ms, Sound.unpack(raw).samples) == (5000, 960)
+
+
+def test_numbers_begin_at_1_and_go_on_at_1(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sound, "SEQUENCE_LIMIT", 4)
+    assert list(islice(sequence_numbers(), 7)) == [1, 2, 3, 1, 2, 3, 1]
+
+
+def test_numbers_go_on_over_a_change_of_encoding() -> None:
+    numbers = sequence_numbers()
+    made = packets("pcm", speech(16000)[:960], 16000, numbers=numbers)
+    made += packets("opus", speech(16000)[:960], 16000, numbers=numbers)
+    assert [one.sequence for one in received(made)] == [1, 2, 3, 4, 5, 6]
+
+
+# -- Opus
+
+
+@pytest.mark.parametrize("rate", some([16000, 8000, 12000, 48000, 24000], 3))
+@pytest.mark.parametrize("channels", [1, 2])
+def test_opus_sounds_the_same(rate: int, channels: int) -> None:
+    recorded = speech(rate, channels)
+    sounds = received(packets("opus", recorded, rate))
+    assert {(one.rate, one.channels, len(one.samples), one.encoding) for one in sounds} == {
+        (rate, channels, rate // 50, "opus")
+    }
+    assert likeness(envelope(joined(sounds), rate), envelope(recorded, rate)) > 0.9
+
+
+@pytest.mark.parametrize(("captured", "sent"), [(44100, 48000), (22050, 24000), (11025, 12000), (32000, 48000)])
+def test_opus_of_other_rates(captured: int, sent: int) -> None:
+    recorded = speech(captured)
+    sounds = received(packets("opus", recorded, captured, feed=captured // 50))
+    assert {one.rate for one in sounds} == {sent}
+    assert likeness(envelope(joined(sounds), sent), envelope(recorded, captured)) > 0.9
+
+
+@pytest.mark.parametrize("chunk_ms", [1, 20, 30, 60, 1000])
+@pytest.mark.parametrize("bundle", some([3, 1, 2], 3))
+def test_bundles(chunk_ms: int, bundle: int) -> None:
+    part_ms = {1: 20, 20: 20, 30: 40, 60: 60, 1000: 60}[chunk_ms]
+    raw = packets("opus", speech(16000), 16000, chunk_ms=chunk_ms, bundle=bundle)
+    unpacked = list(map(unpack, raw))
+    assert {one.samples for one in unpacked} == {16 * part_ms * bundle}
+    assert {len(opus.split(one.body)) for one in unpacked} == {bundle}
+    sounds = received(raw)
+    assert len(joined(sounds)) == sum(one.samples for one in unpacked)
+    assert all(abs(b.captured_ms - a.captured_ms - part_ms * bundle) <= 1 for a, b in pairwise(sounds))
+
+
+def test_opus_makes_one_of_many_channels() -> None:
+    assert make_sound_encoder("opus", rate=16000, channels=6).channels == 1
+
+
+def test_bitrate_is_as_configured() -> None:
+    sizes = {
+        bitrate: sum(map(len, packets("opus", speech(16000), 16000, bitrate=bitrate, bundle=3)))
+        for bitrate in (16000, 32000)
+    }
+    assert sizes[16000] * 8 / SECONDS < 18_000
+    assert sizes[16000] < sizes[32000] * 8 / 8 < 36_000 / 8 * SECONDS
+
+
+def test_opus_conceals_by_itself_and_fades() -> None:
+    decoder = SoundDecoder()
+    assert decoder.conceal() is None
+    for raw in packets("opus", speech(16000)[:8000], 16000):
+        decoder.feed(raw)
+    loud = [
+        float(np.abs(made.astype(float)).mean()) for made in (decoder.conceal() for _ in range(10)) if made is not None
+    ]
+    assert len(loud) == 10
+    assert loud[0] > 100
+    assert loud[-1] < loud[0] / 10
+
+
+def test_pcm_has_nothing_to_conceal_with() -> None:
+    decoder = SoundDecoder()
+    decoder.feed(packets("pcm", speech(16000)[:320], 16000)[0])
+    assert decoder.conceal() is None
+
+
+def test_any_change_in_midstream() -> None:
+    numbers = sequence_numbers()
+    made = []
+    for name, rate, channels in (("pcm", 16000, 1), ("opus", 16000, 1), ("opus", 48000, 2), ("pcm", 44100, 2)):
+        made += packets(name, speech(rate, channels)[: rate // 5], rate, feed=rate // 50, numbers=numbers)
+    sounds = received(made)
+    assert [one.sequence for one in sounds] == list(range(1, 41))
+    assert [(one.encoding, one.rate, one.channels) for one in sounds[::10]] == [
+        ("pcm", 16000, 1),
+        ("opus", 16000, 1),
+        ("opus", 48000, 2),
+        ("pcm", 44100, 2),
+    ]
+
+
+@pytest.mark.parametrize(
+    ("first", "rest", "expected"),
+    [(0x00, b"\0", 10), (0x48, b"\0", 20), (0x5B, b"\3", 180), (0x6A, b"\0", 40), (0x80, b"", 2.5), (0xFB, b"", 0)],
+)
+def test_how_long_an_opus_packet_is(first: int, rest: bytes, expected: float) -> None:
+    assert milliseconds(bytes([first]) + rest) == expected
+
+
+# -- without PyAV, and other mistakes
+
+
+def test_without_pyav_opus_is_refused_and_pcm_works(monkeypatch: pytest.MonkeyPatch) -> None:
+    raw = packets("opus", speech(16000)[:320], 16000)
+    monkeypatch.setitem(sys.modules, "av", None)
+    monkeypatch.setattr(sound, "SOUND_ENCODINGS", ("pcm",))
+    with pytest.raises(PebbleError, match="pip install"):
+        make_sound_encoder("opus", rate=16000, channels=1)
+    decoder = SoundDecoder()
+    assert decoder.feed(raw[0]) is None
+    assert decoder.feed(packets("pcm", speech(16000)[:320], 16000)[0]) is not None
+
+
+def test_an_unknown_encoding_is_named() -> None:
+    assert SOUND_ENCODINGS == ("pcm", "opus")
+    with pytest.raises(PebbleError, match='"mp3": use pcm or opus'):
+        make_sound_encoder("mp3", rate=16000, channels=1)
+
+
+def test_hostile_packets() -> None:
+    """Bits turned, ends cut, headers made up: refused or heard, nothing else."""
+    randoms = random.Random(5)
+    good = packets("pcm", speech(16000)[:1600], 16000) + packets("opus", speech(16000)[:6400], 16000, bundle=2)
+    decoder = SoundDecoder()
+    for _ in range(4000):
+        raw = bytearray(randoms.choice(good))
+        for _ in range(randoms.randrange(1, 6)):
+            raw[randoms.randrange(len(raw))] = randoms.randrange(256)
+        decoder.feed(bytes(raw[: randoms.randrange(len(raw) + 1)] if randoms.random() < 0.3 else raw))
+    counted = decoder.counters.snapshot()
+    assert counted["packets"] + counted["refused"] == 4000
+    assert min(counted.values()) > 100
+    after = [decoder.feed(raw) for raw in good[:5]]
+    assert all(one is not None for one in after)
+
+
+def test_hostile_bodies_of_opus() -> None:
+    randoms = random.Random(6)
+    for _ in range(4000):
+        body = randoms.randbytes(randoms.randrange(40))
+        try:
+            parts = opus.split(body)
+        except PayloadError:
+            continue
+        assert opus.join(parts) == body
+
+
+# -- samples
+
+
+@pytest.mark.parametrize(
+    ("rate", "wanted"), [(48000, 16000), (16000, 48000), (44100, 48000), (48000, 48000), (44099, 16000)]
+)
+def test_resampling_keeps_a_tone(rate: int, wanted: int) -> None:
+    def tone(of: int) -> Any:
+        return 10_000 * np.sin(2 * np.pi * 440 * np.arange(of) / of)
+
+    resampler = Resampler(rate, wanted, 1)
+    pieces = np.array_split(np.rint(tone(rate)).astype(np.int16)[:, None], 37)
+    made = np.concatenate([resampler.feed(piece) for piece in pieces])[:, 0].astype(float)
+    assert abs(len(made) - wanted) <= 1
+    spectrum = np.abs(np.fft.rfft(made * np.hanning(len(made))))
+    peak = int(spectrum.argmax())
+    assert abs(peak * wanted / len(made) - 440) < 1
+    assert spectrum[peak] ** 2 > 1e4 * (np.sum(spectrum**2) - np.sum(spectrum[peak - 3 : peak + 4] ** 2))
+
+
+def test_resampling_down_leaves_no_alias() -> None:
+    tone = np.rint(10_000 * np.sin(2 * np.pi * 11_000 * np.arange(48000) / 48000)).astype(np.int16)
+    made = Resampler(48000, 16000, 1).feed(tone[:, None])
+    assert np.abs(made[200:].astype(float)).max() < 40
+
+
+def test_remixing() -> None:
+    stereo = np.array([[100, 300], [-32768, -32768]], np.int16)
+    assert remix(stereo, 1).tolist() == [[200], [-32768]]
+    assert remix(stereo[:, :1], 2).tolist() == [[100, 100], [-32768, -32768]]
+
+
+def test_an_unfinished_sample_is_left_out() -> None:
+    assert to_samples(b"\1\0\2\0\3\0\4", 2).tolist() == [[1, 2]]

@@ -1,0 +1,347 @@
+"""Who has control of a robot: clients in virtual time, and motor owners that answer them."""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Callable
+
+import pytest
+from msgspec import UNSET
+
+from pebble.contract import CAPABILITIES, CONTROL, CONTROL_STATE, codec
+from pebble.contract.payloads import ControlRequest, ControlState, LinkState
+from pebble.extensions.operator.client.control import ASKS_S, ControlClient, RobotControl
+from pebble.extensions.operator.client.pace_of_link import WIDE, pace_of
+from pebble.extensions.operator.client.robot_view import RobotView
+from pebble.transports import Message
+from tests.ext.operator.client.control_robot import KeepingRobot
+from tests.ext.operator.client.estop_robot import capabilities
+from tests.support import cases
+
+GOOB = "pebble/robots/goob"
+STEP_S = 0.05
+
+
+class World:
+    """One robot, and clients that hear it at once; each has a view of its own."""
+
+    def __init__(self, *owners: str) -> None:
+        self.robot = KeepingRobot(GOOB, *owners)
+        self.now = 100.0
+        self.sent: list[Message] = []
+        self.clients: list[ControlClient] = []
+        self.pace = WIDE
+        self.lost: Callable[[ControlClient], bool] = lambda _client: False  # whether its messages get lost
+
+    def client(self, by: str = "ann") -> ControlClient:
+        view = RobotView(GOOB)
+        owners = [one.name for one in self.robot.owners]
+        listed = capabilities(GOOB, {"estop": {"available": True, "owners": owners}})
+        view.receive(CAPABILITIES, listed, self.now, self.now)
+        client = ControlClient(view.control, by=by, device="desk", pace_of=lambda: self.pace)
+        self.clients.append(client)
+        self.receive(self.robot.states())
+        return client
+
+    def holder(self, by: str = "ann") -> ControlClient:
+        client = self.client(by)
+        client.ask(self.now)
+        self.wait(STEP_S)
+        assert client.held
+        return client
+
+    def receive(self, states: list[Message]) -> None:
+        for client in self.clients:
+            for state in states:
+                client.robot.receive(state)
+                client.update(self.now)
+
+    def wait(self, seconds: float) -> None:
+        for _ in range(round(seconds / STEP_S)):
+            self.step()
+            self.now = round(self.now + STEP_S, 6)
+
+    def step(self) -> None:
+        for client in list(self.clients):
+            out = client.tick(self.now)
+            self.sent += out
+            self.receive(self.robot.take([] if self.lost(client) else out, self.now))
+
+    def drive(self, client: ControlClient) -> list[bool]:
+        """Which motor owners move by a command of this client; without a key it sends none."""
+        return [client.key != "" and owner.drive(client.key, self.now) for owner in self.robot.owners]
+
+    @property
+    def held(self) -> list[bool]:
+        return [client.held for client in self.clients]
+
+
+def requests(messages: list[Message]) -> list[tuple[str, str]]:
+    """The metric and what is wanted."""
+    return [(one.topic.rpartition("/incoming/")[2], codec.decode(CONTROL, one.payload).want) for one in messages]
+
+
+def test_free_control_is_given_at_once_and_repeated_every_second() -> None:
+    world = World()
+    ann = world.holder()
+    assert world.drive(ann) == [True]
+    world.wait(3.0)
+    assert requests(world.sent) == [("control", "hold")] * 4
+    assert len({one.payload for one in world.sent}) == 1
+    request: ControlRequest = codec.decode(CONTROL, world.sent[0].payload)
+    assert (request.id, request.by, request.device, request.for_ms) == (ann.id, "ann", "desk", 3000)
+
+
+def test_over_a_thin_link_it_is_asked_for_more_rarely_and_longer() -> None:
+    world = World()
+    world.pace = pace_of(LinkState(level="thin", drive_hz=4, rtt_ms=600, queue_ms=0, t=1))
+    ann = world.holder()
+    world.wait(9.5)
+    ann.release()
+    world.wait(STEP_S)
+    asked: list[ControlRequest] = [codec.decode(CONTROL, one.payload) for one in world.sent]
+    assert [(one.want, one.for_ms, one.t) for one in asked] == [
+        *(("hold", 10_000, 1000 * seconds) for seconds in (100, 105)),
+        ("release", 3000, UNSET),
+    ]
+    world.lost = lambda _client: True
+    ann.ask(world.now)
+    world.wait(9.9)
+    assert ann.wanted
+    world.wait(0.2)
+    assert (ann.wanted, ann.failed) == (False, "goob does not answer")
+
+
+def test_what_is_given_back_is_free() -> None:
+    world = World()
+    ann = world.holder()
+    ann.release()
+    assert (ann.held, ann.key) == (False, "")
+    world.wait(2.0)
+    assert requests(world.sent) == [("control", "hold"), ("control", "release")]
+    assert world.client("bob").robot.who == ""
+
+
+def test_who_drives_is_asked_and_may_let_the_other_drive() -> None:
+    world = World()
+    ann, bob = world.holder(), world.client("bob")
+    world.drive(ann)
+    bob.ask(world.now)
+    world.wait(STEP_S)
+    assert (world.held, ann.asked_by, bob.robot.who) == ([True, False], "bob", "ann")
+    before = ann.key
+    ann.release()
+    world.wait(STEP_S)
+    assert world.held == [False, True]
+    assert bob.key not in ("", before)
+    assert world.drive(ann) == [False]
+
+
+def test_who_is_not_let_drive_asks_no_more_after_a_while() -> None:
+    world = World()
+    ann, bob = world.holder(), world.client("bob")
+    bob.ask(world.now)
+    for _ in range(round((ASKS_S + 1) / STEP_S)):
+        world.drive(ann)
+        world.wait(STEP_S)
+        ann.keep()
+        assert ann.asked_by == ""
+    assert (world.held, bob.wanted, bob.failed) == ([True, False], False, "ann drives on")
+    world.wait(3.0)
+    assert ann.robot.state is not None
+    assert ann.robot.state.asks_id == ""
+
+
+def test_who_asks_anew_is_shown_again() -> None:
+    world = World()
+    ann, bob, eve = world.holder(), world.client("bob"), world.client("eve")
+    world.drive(ann)
+    bob.ask(world.now)
+    world.wait(STEP_S)
+    ann.keep()
+    bob.release()
+    eve.ask(world.now)
+    world.wait(STEP_S)
+    assert ann.asked_by == "eve"
+
+
+def test_who_rests_is_not_asked() -> None:
+    world = World()
+    ann, bob = world.holder(), world.client("bob")
+    world.wait(4.0)
+    bob.ask(world.now)
+    world.wait(STEP_S)
+    assert world.held == [True, False]
+    world.wait(2.0)
+    assert (world.held, ann.wanted, ann.failed) == ([False, True], False, "bob has control now")
+
+
+def test_control_can_be_taken_and_who_has_lost_it_does_not_take_it_back() -> None:
+    world = World()
+    ann, bob = world.holder(), world.client("bob")
+    world.drive(ann)
+    bob.ask(world.now, over=True)
+    world.wait(STEP_S)
+    assert world.held == [False, True]
+    world.wait(20.0)
+    assert world.held == [False, True]
+    assert requests(world.sent).count(("control/take", "hold")) == 1
+
+
+def test_a_motor_owner_that_is_started_again_gives_control_anew() -> None:
+    world = World()
+    ann = world.holder()
+    before = ann.decided
+    world.robot.owners[0].start(world.now)
+    world.receive(world.robot.states())
+    assert (ann.held, ann.key) == (False, "")
+    world.wait(STEP_S)
+    assert ann.held
+    assert ann.decided != before
+
+
+def test_who_was_silent_for_too_long_has_it_again_only_if_it_is_free() -> None:
+    world = World()
+    ann = world.holder()
+    world.lost = lambda client: client is ann
+    world.wait(3.5)
+    assert ann.held is False
+    world.lost = lambda _client: False
+    world.wait(1.0)
+    assert ann.held
+    world.lost = lambda client: client is ann
+    bob = world.client("bob")
+    bob.ask(world.now)
+    world.wait(6.0)
+    world.lost = lambda _client: False
+    world.wait(2.0)
+    assert world.held == [False, True]
+
+
+def test_a_robot_that_does_not_answer_is_not_asked_for_ever() -> None:
+    world = World()
+    ann = world.client()
+    world.robot.owners[0].receives = False
+    ann.ask(world.now)
+    world.wait(WIDE.answer_s + 1.1)
+    assert (ann.wanted, ann.failed) == (False, "goob does not answer")
+
+
+def test_who_waits_behind_another_keeps_waiting() -> None:
+    world = World()
+    ann, bob, eve = world.holder(), world.client("bob"), world.client("eve")
+    world.drive(ann)
+    bob.ask(world.now)
+    world.wait(0.5)
+    eve.ask(world.now)
+    for _ in range(round(8 / STEP_S)):
+        world.drive(ann)
+        world.wait(STEP_S)
+    bob.release()
+    world.wait(2.0)
+    assert (ann.asked_by, eve.wanted) == ("eve", True)
+
+
+# -- several motor owners
+
+
+def test_one_client_has_all_motor_owners_and_its_commands_move_all() -> None:
+    world = World("arm", "wheels")
+    ann = world.holder()
+    assert world.drive(ann) == [True, True]
+
+
+def test_the_first_motor_owner_by_name_decides_and_who_has_only_another_gives_it_back() -> None:
+    world = World("arm", "wheels")
+    ann, bob = world.holder(), world.client("bob")
+    world.drive(ann)
+    world.robot.owners[1].start(world.now)
+    bob.ask(world.now)
+    out = bob.tick(world.now)  # it is heard before the holder is
+    world.receive(world.robot.take(out, world.now))
+    assert world.held == [True, False]
+    assert world.drive(bob) == [False, False]
+    for _ in range(round(2.5 / STEP_S)):
+        world.drive(ann)
+        world.wait(STEP_S)
+    assert world.held == [True, False]
+    assert world.drive(ann) == [True, True]
+
+
+def test_random_schedules_never_have_two_holders_and_end_with_one() -> None:
+    for seed in range(cases(40, 400)):
+        chance = random.Random(seed)
+        world = World(*("arm", "wheels")[: chance.randrange(1, 3)])
+        clients = [world.client(name) for name in ("ann", "bob", "eve")]
+        silent: set[ControlClient] = set()
+        world.lost = silent.__contains__
+        for _ in range(40):
+            one = chance.choice(clients)
+            match chance.randrange(8):
+                case 0 | 1:
+                    one.ask(world.now, over=chance.random() < 0.3)
+                case 2:
+                    one.release()
+                case 3:
+                    one.keep()
+                case 4:
+                    silent.symmetric_difference_update({one})
+                case 5:
+                    chance.choice(world.robot.owners).start(world.now)
+                    world.receive(world.robot.states())
+                case _:
+                    world.drive(one)
+            world.wait(chance.choice((0.05, 0.3, 1.0, 4.0)))
+            assert sum(world.held) <= 1, seed
+            assert {client.key == "" for client in clients if not client.held} <= {True}, seed
+        silent.clear()
+        for client in clients:
+            client.release()
+        world.wait(4.0)
+        clients[0].ask(world.now)
+        world.wait(2.0)
+        assert (world.held, world.drive(clients[0])) == ([True, False, False], [True] * len(world.robot.owners)), seed
+
+
+# -- what is received
+
+
+def state(**fields: object) -> bytes:
+    return codec.encode(CONTROL_STATE, {"by": "ann", "id": "3f2a91c0", "key": "0badf00d", **fields})
+
+
+@pytest.mark.parametrize(
+    ("owner", "payload"),
+    [
+        ("serial", b"{"),
+        ("serial", b'{"by": "ann"}'),
+        ("serial", state(id="3f2a91c0" * 2)),
+        ("serial", state(key="x" * 400)),
+        ("serial", b" " * 2000),
+    ],
+)
+def test_what_is_no_state_changes_nothing(owner: str, payload: bytes) -> None:
+    control = RobotView(GOOB).control
+    assert not control.receive(Message(f"{GOOB}/outgoing/control/{owner}", payload))
+    assert control.state is None
+
+
+def test_names_are_short_and_printable() -> None:
+    control = RobotView(GOOB).control
+    assert control.receive(Message(f"{GOOB}/outgoing/control/serial", state(by="Ann\x1b[2J" + 90 * "x")))
+    assert control.who == "ann__2j" + 33 * "x"
+
+
+def test_invented_owners_decide_nothing_and_are_bounded() -> None:
+    world = World("wheels")
+    ann = world.holder()
+    for number in range(40):
+        ann.robot.receive(Message(f"{GOOB}/outgoing/control/a{number}", state()))
+    ann.update(world.now)
+    assert ann.held
+    assert len(ann.robot._states) <= 16
+    view = RobotView(GOOB)
+    assert isinstance(view.control, RobotControl)
+    empty = ControlState(by="", id="", key="")
+    view.control.receive(Message(f"{GOOB}/outgoing/control/serial", codec.encode(CONTROL_STATE, empty)))
+    assert view.control.who == ""

@@ -1,0 +1,79 @@
+"""At what rate, and how, commands go over a link of each kind."""
+
+from __future__ import annotations
+
+import msgspec
+import pytest
+from msgspec import UNSET
+
+from pebble.contract import LINK, ONLINE
+from pebble.contract.levels import link_of
+from pebble.contract.payloads import Drive, LinkLevel, LinkState
+from pebble.extensions.operator.client.pace_of_link import WIDE, Pace, pace_of
+from pebble.extensions.operator.client.robot_view import RobotView
+from pebble.transports import QoS
+from tests.ext.operator.client.estop_robot import outgoing
+
+GOOB = "pebble/robots/goob"
+MOVE = Drive(z=0.5, valid_ms=400)
+
+
+def link(level: LinkLevel, hz: float, queue_ms: int = 40) -> LinkState:
+    return LinkState(level=level, drive_hz=hz, rtt_ms=310, queue_ms=queue_ms, t=1)
+
+
+@pytest.mark.parametrize(
+    ("state", "step_s", "qos", "valid_ms"),
+    [
+        (None, 0.015, QoS.DELIVERED, 400),
+        (link("wide", 20), 0.015, QoS.DELIVERED, 400),
+        (link("narrow", 10), 0.075, QoS.LATEST, 400),
+        (link("narrow", 8), 0.1, QoS.LATEST, 400),
+        (link("thin", 4), 0.225, QoS.LATEST, 750),
+        # What a robot reports neither halts it between two commands, nor fills its link.
+        (link("narrow", 0), 0.175, QoS.LATEST, 400),
+        (link("thin", -7), 0.35, QoS.LATEST, 750),
+        (link("thin", 1e9), 0.025, QoS.LATEST, 750),
+        # Behind a queue that stays nothing comes in time.
+        (link("thin", 2.5, 500), 0.35, QoS.LATEST, 750),
+        (link("thin", 2.67, 1700), 1.7, QoS.LATEST, 750),
+        (link("thin", 2.67, 60_000), 2.0, QoS.LATEST, 750),
+        (link("thin", 4, 1700), 0.225, QoS.LATEST, 750),  # it may have been a loss
+    ],
+)
+def test_a_robot_asks_for_a_pace(state: LinkState | None, step_s: float, qos: QoS, valid_ms: int) -> None:
+    pace = pace_of(state)
+    assert pace._replace(step_s=round(pace.step_s, 6))[:3] == (step_s, qos, valid_ms)
+    assert pace.stamped is (qos is QoS.LATEST)
+
+
+@pytest.mark.parametrize(
+    "payload", [b"", b"{", b'{"level": "slow", "drive_hz": 1, "rtt_ms": 1, "queue_ms": 1, "t": 1}']
+)
+def test_a_link_that_cannot_be_read_carries_everything(payload: bytes) -> None:
+    assert pace_of(link_of(payload)) is WIDE
+
+
+@pytest.mark.parametrize(
+    ("pace", "drive", "expected"),
+    [
+        (WIDE, MOVE, {}),
+        (Pace(stamped=True), MOVE, {"t": 12_346, "key": "0badf00d"}),
+        (Pace(stamped=True), msgspec.structs.replace(MOVE, key="aa bb"), {"t": 12_346, "key": "aa bb"}),
+    ],
+)
+def test_a_stamped_command_has_a_time_and_a_key(pace: Pace, drive: Drive, expected: dict[str, object]) -> None:
+    dated = pace.dated(drive, 12.3456, "0badf00d")
+    assert {"t": dated.t, "key": dated.key} == {"t": UNSET, "key": UNSET, **expected}
+
+
+def test_who_drives_keeps_to_the_pace_of_a_link_that_is_lost_for_a_while() -> None:
+    """More would wait at the broker for the robot's return."""
+    robot = RobotView(GOOB)
+    robot.receive(LINK, outgoing(GOOB, "link", msgspec.to_builtins(link("thin", 4)), retain=True), 1.0, 1.0)
+    assert robot.pace.valid_ms == 750
+    for online in (False, True):
+        robot.receive(ONLINE, outgoing(GOOB, "online", {"t": 1, "online": online}), 2.0, 2.0)
+        assert robot.pace.valid_ms == 750
+    robot.receive(LINK, outgoing(GOOB, "link", 7), 3.0, 3.0)
+    assert robot.pace is WIDE

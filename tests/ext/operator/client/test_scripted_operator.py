@@ -1,0 +1,161 @@
+"""An operator that is a program: rate, deadline and last zero of what it sends, and people before it."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from typing import Any
+
+import pytest
+
+from pebble.contract import channel_of
+from pebble.contract.payloads import Drive
+from pebble.extensions.operator.client.robot_view import RobotView
+from pebble.extensions.operator.client.scripted_operator import RATE_HZ, VALID_MS, ScriptedOperator, paced
+from pebble.transports import Message, QoS
+from tests.ext.operator.client.control_robot import KeepingRobot
+from tests.ext.operator.client.estop_robot import Robot, capabilities
+
+BASE = "pebble/robots/mine"
+DRIVE = f"{BASE}/incoming/drive-values"
+CONTROL = {"drive": {"available": True, "control": True}, "estop": {"available": True, "owners": ["serial"]}}
+ANN = {"id": "0badcafe", "by": "ann", "want": "hold", "for_ms": 3000}
+
+
+class Given:
+    """A robot with its real leases and latches, and its operator, whose waits take no time."""
+
+    def __init__(self, value: dict[str, Any] | None = None) -> None:
+        self.view = RobotView(BASE)
+        self.keeping, self.latches = KeepingRobot(BASE), Robot(BASE, "serial")
+        self.sent: list[Message] = []
+        self.waited: list[float] = []
+        self.operator = ScriptedOperator(self.view, self.publish, by="program", wait=self.wait)
+        if value is not None:
+            self.receive(capabilities(BASE, value), *self.keeping.states())
+
+    def publish(self, message: Message) -> None:
+        self.sent.append(message)
+        self.receive(*self.keeping.take([message], time.monotonic()), *self.latches.take([message]))
+
+    def person(self, metric: str, body: dict[str, Any]) -> None:
+        message = Message(f"{BASE}/incoming/{metric}", json.dumps(body).encode(), QoS.DELIVERED)
+        self.receive(*self.keeping.take([message], time.monotonic()), *self.latches.take([message]))
+
+    def receive(self, *messages: Message) -> None:
+        for message in messages:
+            channel = channel_of(message.topic.removeprefix(f"{BASE}/"))
+            self.view.receive(channel, message, time.monotonic(), time.time())
+            self.operator.receive(message)
+
+    def wait(self, seconds: float) -> bool:
+        self.waited.append(seconds)
+        return False
+
+    @property
+    def drives(self) -> list[dict[str, Any]]:
+        return [json.loads(message.payload) for message in self.sent if message.topic == DRIVE]
+
+
+def has_control(given: Given) -> bool:
+    given.operator.ask_control()
+    given.operator.tick()
+    given.operator.tick()
+    return given.operator.control.held
+
+
+def test_it_drives_at_a_steady_rate_with_a_deadline_in_each_command_and_a_zero_at_the_end() -> None:
+    given = Given()
+    given.operator.drive(0.1, 0.5, 2.0)
+    assert given.drives[:-1] == [{"x": 0.1, "z": 0.5, "y": 0, "valid_ms": VALID_MS}] * 40
+    assert given.drives[-1] == {"x": 0, "z": 0, "y": 0, "valid_ms": VALID_MS}
+    assert {message.qos for message in given.sent} == {QoS.DELIVERED}
+    assert given.waited == sorted(given.waited)  # time does not pass: what is due moves on
+    assert given.waited[-1] == pytest.approx(2.0, abs=0.5)
+
+
+def test_what_is_late_does_not_delay_the_rest(monkeypatch: pytest.MonkeyPatch) -> None:
+    now, late = [100.0], iter([0.12])
+    monkeypatch.setattr(time, "monotonic", lambda: now[0])
+
+    def wait(seconds: float) -> None:
+        now[0] += seconds + next(late, 0.0)
+
+    times = [now[0] - 100 for _ in paced(0.3, wait=wait)]
+    assert times == pytest.approx([0, 0.17, 0.17, 0.17, 0.2, 0.25])
+    assert now[0] == pytest.approx(100 + 6 / RATE_HZ)
+
+
+def interrupt() -> bool:
+    raise KeyboardInterrupt
+
+
+@pytest.mark.parametrize("end", [lambda: True, interrupt])
+def test_whatever_ends_it_it_lets_go(end: Callable[[], bool]) -> None:
+    given = Given()
+    operator = ScriptedOperator(
+        given.view, given.publish, by="program", wait=lambda _: len(given.drives) == 3 and end()
+    )
+    with suppress(KeyboardInterrupt):
+        operator.drive(z=0.5)
+    assert [drive["z"] for drive in given.drives] == [0.5, 0.5, 0.5, 0]
+
+
+def test_it_drives_with_the_key_of_control_and_gives_it_back() -> None:
+    given = Given(CONTROL)
+    assert has_control(given)
+    given.operator.command(Drive(z=0.5))
+    state = given.view.control.state
+    assert state is not None
+    assert given.drives[-1]["key"] == state.key != ""
+    given.operator.release()
+    given.operator.command(Drive())
+    assert "key" not in given.drives[-1]
+    assert given.view.control.who == ""
+
+
+def test_while_a_person_has_control_nothing_is_sent() -> None:
+    given = Given(CONTROL)
+    given.person("control", ANN)
+    assert not has_control(given)
+    assert not given.operator.has_control
+    assert given.operator.command(Drive(z=0.5)) == float("inf")
+    given.operator.drive(z=0.5, seconds=0.1)
+    assert given.drives == []
+    assert given.keeping.owners[0].by == "ann"
+
+
+def test_a_person_who_asks_gets_control() -> None:
+    given = Given(CONTROL)
+    assert has_control(given)
+    given.person("control", ANN)
+    given.operator.command(Drive(z=0.5))
+    given.person("control", ANN)
+    assert given.keeping.owners[0].by == "ann"
+    sent = len(given.drives)
+    given.operator.command(Drive(z=0.5))
+    assert len(given.drives) == sent
+
+
+def test_a_stop_is_repeated_until_it_is_confirmed_and_reset_by_who_pressed_it() -> None:
+    given = Given()
+    given.operator.stop("a test")
+    given.operator.tick()
+    assert not given.operator.stopped  # nobody has told what it is
+    given.receive(given.latches.capabilities(), *[owner.state() for owner in given.latches.owners])
+    given.operator.tick()
+    assert given.operator.stopped
+    assert given.view.latched
+    given.operator.reset()
+    assert not given.view.latched
+
+
+def test_a_stop_of_a_person_is_left_to_the_person() -> None:
+    given = Given()
+    given.receive(given.latches.capabilities())
+    given.person("estop", {"stop": "00c0ffee00c0ffee", "by": "ann"})
+    given.operator.reset()
+    assert given.sent == []
+    assert given.view.latched

@@ -1,0 +1,336 @@
+"""``pebble drive`` in a real terminal, with a real broker and MiniLAMP's firmware on simulated motors."""
+
+from __future__ import annotations
+
+import json
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from pebble.extensions.lab.simulation.trace import complete_lines, read_trace
+from pebble.transports import Message, MqttSettings, QoS, create
+from tests.commands.command_line import Run
+from tests.kit.terminal import Terminal
+from tests.support import ROOT, Broker, Child, gone, some, until
+
+BASE = "pebble/robots/minilamp"
+VALID_S = 0.4  # of a command
+BUSY_S = 0.35  # what a busy machine may add
+ZERO, FINAL = {"x": 0, "z": 0, "y": 0}, {"x": 0, "z": 0, "y": 0, "valid_ms": 0}
+
+
+class Lamp:
+    """A simulated MiniLAMP: its own firmware, and what its motors really do."""
+
+    def __init__(self, folder: Path, broker: Broker) -> None:
+        self.commands: list[tuple[float, Any]] = []  # when they reached the broker
+        self.control: dict[str, Any] = {}  # who has it
+        self.stops = 0
+        self._trace, self._begin = folder / "trace", 0
+        self._transport = create("mqtt", "observer", MqttSettings(host="127.0.0.1", port=broker.port)).open()
+        self.capabilities = threading.Event()
+        self._transport.subscribe(f"{BASE}/#", self._take)
+        command = [sys.executable, "-m", "pebble.cli", "sim", "minilamp"]
+        address = [*("--broker", f"mqtt://127.0.0.1:{broker.port}"), *("--trace", str(self._trace))]
+        self._process = Child([*command, *address], cwd=ROOT, stderr=subprocess.DEVNULL)
+        assert self.capabilities.wait(20)
+
+    def close(self) -> None:
+        self._process.terminate()
+        self._process.wait(10)
+        self._transport.close()
+
+    def forget(self) -> None:
+        """Forget what was recorded, while the motors rest."""
+        self.commands.clear()
+        self.stops = 0
+        self._begin = complete_lines(self._trace, self._begin)[1]
+
+    def publish(self, topic: str, body: object) -> None:
+        assert self._transport.publish(topic, json.dumps(body).encode(), qos=QoS.DELIVERED)
+
+    @property
+    def motors(self) -> list[tuple[float, tuple[float, float]]]:
+        """When the motors changed, by the monotonic clock, and to what."""
+        return [(one.ns / 1e9, one.motors) for one in read_trace(self._trace, self._begin) if one.motors is not None]
+
+    @property
+    def moving(self) -> bool:
+        changes = self.motors
+        return bool(changes) and changes[-1][1] != (0.0, 0.0)
+
+    def halted_after(self, moment: float) -> float:
+        """How long the motors went on after ``moment``."""
+        assert until(lambda: not self.moving, 5), (moment, self.commands[-10:], self.motors[-5:])
+        return self.motors[-1][0] - moment
+
+    def moved_since(self, moment: float) -> bool:
+        return any(at > moment and speeds != (0.0, 0.0) for at, speeds in self.motors)
+
+    def _take(self, message: Message) -> None:
+        metric = message.topic.rpartition("/")[2]
+        if metric == "drive-values":
+            command = json.loads(message.payload)
+            assert command.pop("key", "") or not (command["x"] or command["z"] or command["y"])
+            self.commands.append((time.monotonic(), command))
+        elif "/outgoing/control/" in message.topic:
+            self.control = json.loads(message.payload)
+        elif message.topic.endswith("incoming/estop"):
+            self.stops += 1
+        elif metric == "capabilities":
+            self.capabilities.set()
+
+
+Drive = Callable[..., Terminal]
+
+
+@pytest.fixture(scope="module")
+def one_lamp(tmp_path_factory: pytest.TempPathFactory, broker: Broker) -> Iterator[Lamp]:
+    lamp = Lamp(tmp_path_factory.mktemp("lamp"), broker)
+    yield lamp
+    lamp.close()
+
+
+@pytest.fixture
+def lamp(one_lamp: Lamp) -> Lamp:
+    """It rests, and has recorded nothing yet."""
+    assert until(lambda: not one_lamp.moving, 5)
+    one_lamp.forget()
+    return one_lamp
+
+
+@pytest.fixture
+def drive(broker: Broker, lamp: Lamp) -> Iterator[Drive]:
+    consoles: list[Terminal] = []
+
+    def start(*options: str, shell: bool = False, shows: str = "ready") -> Terminal:
+        url = f"mqtt://127.0.0.1:{broker.port}"
+        command = [sys.executable, "-m", "pebble", "drive", "minilamp", "--url", url, *options]
+        if shell:
+            consoles.append(Terminal("bash", "--norc", "-i"))
+            consoles[-1].type(" ".join(command).encode() + b"\n")
+        else:
+            consoles.append(Terminal(*command))
+        assert consoles[-1].sees(shows), consoles[-1].shown
+        return consoles[-1]
+
+    yield start
+    for console in consoles:
+        console.close()
+
+
+def driving(console: Terminal, lamp: Lamp, key: bytes = b"w") -> None:
+    """Press ``key``, and again where a stall of a busy machine has ended the gesture."""
+    end = time.monotonic() + 20
+    while not (lamp.moving and "driving x" in console.shown):
+        assert time.monotonic() < end, console.shown
+        console.hold(b"")
+        time.sleep(0.5)
+        console.forget()
+        console.hold(key)
+        until(lambda: lamp.moving and "driving x" in console.shown, 2)
+
+
+def test_a_held_key_drives_and_its_release_stops(drive: Drive, lamp: Lamp) -> None:
+    console = drive("--speed", "0.5")
+    before = time.monotonic()
+    driving(console, lamp)
+    time.sleep(1.0)
+    console.hold(b"")
+    assert lamp.halted_after(time.monotonic()) < 0.4 + BUSY_S
+    assert console.sees("ready")
+    sent = [command for at, command in lamp.commands if at > before]
+    assert sent[0] == {"x": 0, "z": 0.5, "y": 0, "valid_ms": 400}
+    assert until(lambda: lamp.commands[-1][1] == ZERO)
+    assert 15 <= len([command for command in sent if command["z"]]) <= 45
+    assert lamp.control["device"].startswith("terminal_on_")
+    console.type(b"\x03")
+    assert console.process.wait(5) == 0
+    assert console.restored
+    assert until(lambda: lamp.control["key"] == "")
+
+
+def test_an_arrow_and_ctrl_d(drive: Drive, lamp: Lamp) -> None:
+    console = drive()
+    driving(console, lamp, b"\x1b[D")
+    assert lamp.motors[-1][1][0] < lamp.motors[-1][1][1]
+    console.hold(b"")
+    pressed = time.monotonic()
+    console.type(b"\x04")
+    assert lamp.halted_after(pressed) < BUSY_S
+    assert (console.process.wait(5), console.restored) == (0, True)
+
+
+@pytest.mark.parametrize("number", some([signal.SIGTERM, signal.SIGHUP, signal.SIGINT, signal.SIGQUIT], 2))
+def test_a_signal_stops_the_robot_at_once(drive: Drive, lamp: Lamp, number: signal.Signals) -> None:
+    console = drive()
+    driving(console, lamp)
+    console.process.send_signal(number)
+    assert lamp.halted_after(time.monotonic()) < BUSY_S
+    assert console.process.wait(5) == (0 if number == signal.SIGINT else 1)
+    assert console.restored
+    assert until(lambda: [command for _, command in lamp.commands[-3:]] == [FINAL] * 3), lamp.commands[-8:]
+
+
+def test_a_terminal_that_is_closed_stops_the_robot_at_once(drive: Drive, lamp: Lamp) -> None:
+    console = drive()
+    driving(console, lamp)
+    console.hang_up()
+    assert lamp.halted_after(time.monotonic()) < BUSY_S
+    assert console.process.wait(5) == 1
+
+
+def test_a_killed_process_leaves_a_robot_that_stops_by_itself(drive: Drive, lamp: Lamp) -> None:
+    console = drive()
+    driving(console, lamp)
+    console.process.kill()
+    assert lamp.halted_after(time.monotonic()) < VALID_S + BUSY_S
+
+
+@pytest.mark.parametrize("stall", some([2.0, 0.6], 2))
+def test_after_a_stall_a_key_that_is_still_held_moves_nothing(drive: Drive, lamp: Lamp, stall: float) -> None:
+    console = drive()
+    driving(console, lamp)
+    console.process.send_signal(signal.SIGSTOP)
+    stopped = time.monotonic()
+    assert lamp.halted_after(stopped) < VALID_S + BUSY_S
+    time.sleep(max(0.0, stopped + stall - time.monotonic()))
+    console.forget()
+    resumed = time.monotonic()
+    console.process.send_signal(signal.SIGCONT)
+    assert console.sees("let go first")
+    time.sleep(1.0)
+    assert not lamp.moved_since(resumed)
+    console.hold(b"")
+    assert console.sees("ready")
+    driving(console, lamp)
+
+
+def test_ctrl_z_stops_the_robot_and_what_follows_needs_a_new_key(drive: Drive, lamp: Lamp) -> None:
+    console = drive(shell=True)
+    driving(console, lamp)
+    console.hold(b"")
+    console.type(b"w\x1a")
+    pressed = time.monotonic()
+    assert lamp.halted_after(pressed) < BUSY_S
+    assert console.sees("Stopped")
+    assert [command for _, command in lamp.commands[-3:]] == [FINAL] * 3
+    console.forget()
+    resumed = time.monotonic()
+    console.type(b"fg\n")
+    assert console.sees("ready"), console.shown
+    assert not lamp.moved_since(resumed)
+    driving(console, lamp)
+    console.hold(b"")
+    console.forget()
+    console.type(b"\x03")
+    assert console.sees("$ ")
+    console.type(b"stty -a\n")
+    assert console.sees(" icanon"), "the shell has its own mode again"
+
+
+def test_space_stops_at_once(drive: Drive, lamp: Lamp) -> None:
+    console = drive()
+    driving(console, lamp)
+    console.hold(b"")
+    console.type(b" ")
+    assert lamp.halted_after(time.monotonic()) < BUSY_S
+    assert until(lambda: [command for _, command in lamp.commands[-3:]] == [FINAL] * 3), lamp.commands[-8:]
+
+
+@pytest.mark.parametrize("keys", some([b"\x1b\x1b", b"!"], 2))
+def test_an_emergency_stop_latches(drive: Drive, lamp: Lamp, run: Run, broker: Broker, keys: bytes) -> None:
+    console = drive()
+    driving(console, lamp)
+    console.type(keys)
+    pressed = time.monotonic()
+    assert lamp.halted_after(pressed) < BUSY_S
+    assert console.sees("Stopped by ")
+    time.sleep(1.0)
+    assert (lamp.moved_since(pressed + BUSY_S), console.process.poll()) == (False, None)
+    console.hold(b"")
+    url = f"--url=mqtt://127.0.0.1:{broker.port}"
+    assert run("estop", "reset", "minilamp", url) == 0
+    console.forget()
+    assert console.sees("ready"), console.shown
+    driving(console, lamp)
+
+
+def test_an_emergency_stop_is_sent_on_after_the_terminal_has_ended(
+    drive: Drive, lamp: Lamp, run: Run, broker: Broker
+) -> None:
+    console = drive()
+    console.type(b"!\x04")
+    assert console.process.wait(10) == 0
+    assert lamp.stops >= 1
+    assert "NOT CONFIRMED" not in console.shown.rpartition("\n")[2]
+    assert run("estop", "reset", "minilamp", f"--url=mqtt://127.0.0.1:{broker.port}") == 0, run.err
+
+
+def test_a_driver_elsewhere_is_respected_until_it_is_taken_over(drive: Drive, lamp: Lamp) -> None:
+    bob = {"id": "b0b0b0b0", "by": "bob", "device": "phone"}
+    control, ending = f"{BASE}/incoming/control", threading.Event()
+
+    def repeat() -> None:
+        while not ending.wait(0.5):
+            lamp.publish(control, bob)
+
+    thread = threading.Thread(target=repeat, daemon=True)
+    thread.start()
+    try:
+        lamp.publish(f"{control}/take", bob)
+        assert until(lambda: lamp.control.get("by") == "bob")
+        console = drive(shows="is driving")
+        console.type(b"o")
+        assert console.sees("ready")
+        driving(console, lamp)
+        console.hold(b"")
+        console.forget()
+        lamp.publish(f"{control}/take", bob)
+        assert console.sees("bob (phone, name not checked) is driving")
+        resumed = time.monotonic()
+        time.sleep(0.6)
+        console.hold(b"w")
+        time.sleep(0.6)
+        assert not lamp.moved_since(resumed + VALID_S)
+    finally:
+        ending.set()
+        thread.join()
+
+
+def test_a_broker_that_is_gone_and_comes_back(drive: Drive, lamp: Lamp, broker: Broker) -> None:
+    console = drive()
+    driving(console, lamp)
+    console.forget()
+    broker.stop()
+    assert console.sees("no connection: ")
+    assert lamp.halted_after(time.monotonic()) < VALID_S + 1.0
+    console.hold(b"")
+    broker.start()
+    console.forget()
+    assert console.sees("ready", 30)
+    driving(console, lamp)
+
+
+def test_without_a_terminal_there_is_one_line(run: Run) -> None:
+    assert run("drive", "minilamp", "--url", "mqtt://127.0.0.1") == 1
+    assert run.err.startswith("pebble: driving by keys needs a terminal of Linux or macOS: use `pebble web`, ")
+    assert run.err.count("\n") == 1
+
+
+def test_an_unreachable_broker_is_reported_before_the_terminal_is_changed() -> None:
+    console = Terminal(sys.executable, "-m", "pebble", "drive", "minilamp", "--url", "mqtt://127.0.0.1:1")
+    try:
+        assert console.process.wait(20) == 1
+        assert console.sees("cannot connect to mqtt://127.0.0.1:1")
+        assert console.restored
+    finally:
+        console.close()
+    assert gone(console.process.pid)

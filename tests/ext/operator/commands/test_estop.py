@@ -1,0 +1,531 @@
+"""``pebble estop`` with a real broker and robots that are played around the real latch."""
+
+from __future__ import annotations
+
+import itertools
+import os
+import pty
+import signal
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from functools import partial
+from pathlib import Path
+from typing import IO, Any
+
+import pytest
+
+from pebble.extensions.operator.commands import estop
+from tests.commands.command_line import Run, config_file, program, running
+from tests.ext.page.served import Served
+from tests.fakes.bad_brokers import BEHAVIOURS, resolving, serving
+from tests.kit.played_robot import RecordingRobot
+from tests.sparing_broker import SparingBroker
+from tests.support import Broker, until
+from tests.tcp_proxy import TcpProxy
+
+_numbers = itertools.count(1)
+
+
+Make = Callable[..., RecordingRobot]
+
+
+@pytest.fixture
+def url(broker: Broker) -> str:
+    return f"--url=mqtt://127.0.0.1:{broker.port}"
+
+
+@pytest.fixture
+def robot_on(broker: Broker) -> Iterator[Make]:
+    """Make robots without a heartbeat, which leave nothing at the broker; ``more``: capabilities beyond the usual."""
+    robots: list[RecordingRobot] = []
+
+    def make(*owners: str, id_: str = "", persisted: bool | None = True, **more: Any) -> RecordingRobot:
+        base = f"pebble/robots/{id_ or f'robot{next(_numbers)}'}"
+        robot = RecordingRobot(broker.port, base, *owners, persisted=persisted, heartbeats=False)
+        robots.append(robot)
+        robot.deaf = not more.get("estop", True)
+        if more:
+            robot.publish_capabilities(robot.motors.value | more)
+        if not robot.deaf:
+            robot.publish_states()
+        return robot
+
+    yield make
+    for robot in robots:
+        robot.silent()
+        states = [f"estop/{owner.name}" for owner in robot.motors.owners]
+        for metric in ("capabilities", "status", "link", "online", *states):
+            robot.remove(metric)
+        robot.close()
+
+
+@pytest.fixture
+def unread() -> Iterator[IO[str]]:
+    """The writing end of a pipe that is closed at its other end."""
+    reading, writing = os.pipe()
+    os.close(reading)
+    with os.fdopen(writing, "w") as output:
+        yield output
+
+
+# -- stop
+
+
+def test_a_stop_reaches_a_living_address_behind_dead_ones(robot_on: Make, broker: Broker) -> None:
+    robot, dead = robot_on("mcu"), [f"127.0.0.{last}" for last in (2, 3, 4, 5)]
+    with ExitStack() as opened:
+        for address, how in zip(dead, ("mute", "closing", "server unavailable", "mute"), strict=True):
+            opened.enter_context(serving(address, broker.port, BEHAVIOURS[how]))
+        names = resolving({"fleet.test": [*dead, "127.0.0.1"], "dead.test": dead})
+        stop = program("estop", robot.id, f"--url=mqtt://fleet.test:{broker.port}", env=names)
+        out, err = stop.communicate(timeout=40)
+        assert (stop.returncode, robot.latched) == (0, True), out + err
+        stop = program("estop", robot.id, f"--url=mqtt://dead.test:{broker.port}", env=names)
+        _, err = stop.communicate(timeout=40)
+    mute = "accepts connections but does not speak MQTT in time"
+    assert (stop.returncode, err) == (
+        1,
+        f"pebble: cannot connect to mqtt://dead.test:{broker.port}: broker dead.test:{broker.port}: "
+        f"127.0.0.2 {mute}; 127.0.0.3 hung up on our CONNECT; 127.0.0.4 refused us: server unavailable; "
+        f"127.0.0.5 {mute}\n",
+    )
+
+
+def test_a_stop_is_confirmed_by_every_owner(run: Run, robot_on: Make, url: str) -> None:
+    robot = robot_on("left", "right")
+    assert run("estop", robot.id, url, "--why", "dog") == 0
+    assert robot.latched
+    assert run.out.splitlines()[-1].startswith(f"{robot.id}: stopped and confirmed after 0.")
+    latch = robot.motors.owners[0].latch
+    assert (latch.by, latch.why, latch.count) == (estop.me()[:32], "dog", 1)
+    assert robot.received[1][2]["valid_ms"] == 0
+
+
+def test_the_first_stop_is_sent_before_anything_is_known_of_the_robot(run: Run, robot_on: Make, url: str) -> None:
+    robot = robot_on("serial")
+    assert run("estop", robot.id, url) == 0
+    assert until(lambda: len(robot.received) >= 2)  # it may still be on its way when the command has ended
+    assert [topic.rpartition("/")[2] for _, topic, _ in robot.received[:2]] == ["estop", "drive-values"]
+
+
+UNPLUGGED = "serial: no /dev/ttyACM0"
+DOUBTS = {
+    "no": ({"state": "no", "why": UNPLUGGED}, f"CANNOT BE DRIVEN OR STOPPED: {UNPLUGGED}"),
+    "unknown": ({"state": "unknown", "why": UNPLUGGED}, f"not known whether its motors obey: {UNPLUGGED}"),
+    "no reason": ({"state": "no"}, "CANNOT BE DRIVEN OR STOPPED: it does not say why"),
+    "escapes": ({"state": "no", "why": "\x1b[2J"}, "CANNOT BE DRIVEN OR STOPPED: \\u001b[2J"),
+    "long": ({"state": "no", "why": "x" * 9000}, f"CANNOT BE DRIVEN OR STOPPED: {'x' * 300}\n"),
+    "it can": ({"state": "yes"}, ""),
+    "an older robot": (None, ""),
+    "no object": ("no", ""),
+    "another state": ({"state": ["no"]}, ""),
+}
+
+
+@pytest.mark.parametrize(("driveable", "doubt"), DOUBTS.values(), ids=DOUBTS)
+def test_a_stop_of_a_robot_that_cannot_be_driven_is_reported_with_that(
+    run: Run, robot_on: Make, url: str, driveable: object, doubt: str
+) -> None:
+    robot = robot_on("base")
+    robot.publish("status", {"value": {"services": {}, "driveable": driveable}}, retain=True)
+    assert run("estop", robot.id, url) == 0
+    output = run.out
+    assert "stopped and confirmed" in output
+    assert run("estop", "status", robot.id, url) == 0
+    for text in (output, run.out):
+        assert (doubt in text) if doubt else ("status says" not in text and "DRIVEN" not in text)
+
+
+def test_a_robot_that_does_not_answer_is_reported_and_ctrl_c_ends_it(robot_on: Make, url: str) -> None:
+    robot = robot_on("serial")
+    robot.deaf = True
+    with running("estop", robot.id, url) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline() == f"{robot.id}: stop sent\n"
+        assert "not confirmed yet: serial has not confirmed" in process.stdout.readline()
+        process.send_signal(signal.SIGINT)
+        out, err = process.communicate(timeout=30)
+    assert out.startswith(f"{robot.id}: NOT CONFIRMED, no longer sent: serial has not confirmed")
+    assert (process.returncode, err) == (1, "")
+    assert robot.count("estop") == robot.count("drive-values") >= 2
+
+
+def test_a_stop_is_repeated_until_it_is_confirmed_although_nothing_can_be_printed(
+    robot_on: Make, url: str, unread: IO[str]
+) -> None:
+    robot = robot_on("serial")
+    robot.deaf = True
+    with running("estop", robot.id, url, stdout=unread) as process:
+        assert until(lambda: robot.count("estop") >= 4, 30)
+        robot.deaf = False
+        _, err = process.communicate(timeout=30)
+    assert (process.returncode, err) == (0, "")
+    assert robot.latched
+
+
+def test_a_hold_goes_on_although_nothing_can_be_printed(robot_on: Make, url: str, unread: IO[str]) -> None:
+    robot = robot_on("serial")
+    robot.deaf = True
+    with running("estop", "--all", "--hold", url, stdout=unread, stderr=unread):
+        assert until(lambda: robot.count("estop") >= 4, 30)
+
+
+def test_an_old_robot_gets_zeros(robot_on: Make, url: str) -> None:
+    robot = robot_on(estop={})
+    with running("estop", robot.id, url) as process:
+        assert until(lambda: robot.count("drive-values") >= 3, 30)
+        process.send_signal(signal.SIGTERM)
+        out, _ = process.communicate(timeout=30)
+    assert out.endswith(
+        f"{robot.id}: old firmware: zeros are sent, it cannot be latched\n"
+        f"{robot.id}: old firmware: NOT LATCHED, zeros are no longer sent\n"
+    )
+    assert (process.returncode, robot.count("autonomy-command")) == (1, 1)
+    assert robot.count("estop") <= 2, "only before its capabilities had arrived"
+
+
+def test_all_robots_are_stopped_and_others_spared(run: Run, robot_on: Make, url: str) -> None:
+    robots = [robot_on("serial"), robot_on("mcu", "arm")]
+    outlet = robot_on(estop=None, drive={"available": False})
+    began = time.monotonic()
+    assert run("estop", "--all", url) == 0
+    assert 3.0 <= time.monotonic() - began < 10.0
+    assert all(robot.latched for robot in robots)
+    assert run.out.count("stopped and confirmed") == 2
+    assert f"{outlet.id}: does not drive" in run.out
+
+
+def test_no_robot_at_all_is_a_failure(run: Run, tmp_path: Path) -> None:
+    empty = Broker(tmp_path)
+    try:
+        assert run("estop", "--all", f"--url=mqtt://127.0.0.1:{empty.port}") == 1
+    finally:
+        empty.stop()
+    assert "NOTHING IS STOPPED" in run.out
+
+
+def at_rest(robot: RecordingRobot) -> bool:
+    """Whether no stop arrives for longer than the time between two of them."""
+    before = robot.count("estop")
+    time.sleep(0.8)
+    return robot.count("estop") == before
+
+
+def test_a_hold_stops_robots_that_come_online_later(robot_on: Make, url: str) -> None:
+    early = robot_on("serial")
+    with running("estop", "--all", "--hold", url) as process:
+        assert until(lambda: early.latched, 30)
+        late = robot_on("serial")
+        assert until(lambda: late.latched, 5)
+        latch = late.motors.owners[0].latch
+        assert latch.reset(latch.boot, latch.count, 0, 0)
+        late.publish_states()
+        last = robot_on("serial")
+        assert until(lambda: last.latched, 5)
+        assert not late.latched, "reset on purpose"
+        assert until(lambda: at_rest(last)), "its confirmation has arrived"
+        process.send_signal(signal.SIGINT)
+        out, err = process.communicate(timeout=30)
+    names = {robot.motors.owners[0].latch.recent[0] for robot in (early, late, last)}
+    assert (process.returncode, err, len(names)) == (0, "", 1)
+    assert f"stop {names.pop()} is held" in out
+    assert f"{late.id}: was stopped, and reset since" in out
+
+
+def test_a_lost_broker_is_waited_for(tmp_path: Path) -> None:
+    broker = Broker(tmp_path)
+    robot = RecordingRobot(broker.port, "pebble/robots/lost", heartbeats=False)
+    robot.publish_states()
+    robot.deaf = True
+    with running("estop", robot.id, f"--url=mqtt://127.0.0.1:{broker.port}") as process:
+        assert until(lambda: robot.count("estop") >= 1, 30)
+        broker.kill()
+        assert process.stderr is not None
+        assert process.stderr.readline().startswith(
+            "pebble: warning: nothing is sent until there is a connection again"
+        )
+        robot.deaf = False
+        broker.start()
+        out, _ = process.communicate(timeout=50)
+    robot.close()
+    broker.stop()
+    assert process.returncode == 0, out
+    assert robot.latched
+
+
+def test_a_slow_network_does_not_delay_repetitions(robot_on: Make, broker: Broker) -> None:
+    robot = robot_on("serial")
+    robot.deaf = True
+    with (
+        TcpProxy(broker.port, delay_s=0.2) as proxy,
+        running("estop", robot.id, f"--url=mqtt://127.0.0.1:{proxy.port}"),
+    ):
+        assert until(lambda: robot.count("estop") >= 2, 30)
+    first, second, *_ = robot.times("estop")
+    assert second - first < 1.7, "two seconds if it waited for its subscriptions"
+
+
+#: What a broker keeps, too long to arrive, of a stranger or of the robot itself, and who stops the robot all the same.
+KEPT = {
+    "capabilities of a stranger": ("pebble/robots/attic", "capabilities", ("estop", "--all")),
+    "its own capabilities": ("", "capabilities", ("estop", "--all")),
+    "its own status": ("", "status", ("estop", "--all")),
+    "a heartbeat of a stranger": ("pebble/robots/attic", "online", ("estop", "--all")),
+    "a state of a stranger": ("pebble/robots/attic", "estop/x", ("estop", "--all", "--hold")),
+    "its own capabilities, by name": ("", "capabilities", ("estop", "{id}")),
+    "a state that a stranger invents of it": ("", "estop/invented", ("estop", "{id}")),
+    "capabilities of a stranger, on a page": ("pebble/robots/attic", "capabilities", ("page", "")),
+    "a heartbeat of a stranger, on a page": ("pebble/robots/attic", "online", ("page", "")),
+    "its own capabilities, on its page": ("", "capabilities", ("page", "{base}")),
+    "capabilities of a stranger, in its status": ("pebble/robots/attic", "capabilities", ("estop", "status", "{id}")),
+    "capabilities of a stranger, at its reset": ("pebble/robots/attic", "capabilities", ("estop", "reset", "{id}")),
+}
+
+
+@pytest.mark.parametrize(("base", "metric", "words"), KEPT.values(), ids=KEPT)
+def test_a_stop_waits_for_nothing_that_a_broker_keeps(
+    broker: Broker, robot_on: Make, base: str, metric: str, words: tuple[str, ...]
+) -> None:
+    robot = robot_on("serial")
+    robot.start()
+    sparing = SparingBroker(broker.port, longest=1500)
+    program_, *more = (word.format(id=robot.id, base=robot.base) for word in words)
+    with ExitStack() as opened:
+        stranger = partial(RecordingRobot, broker.port, base, capabilities={}, heartbeats=False)
+        keeper = opened.enter_context(stranger()) if base else robot
+        keeper.publish(metric, {"value": "x" * 5000}, retain=True)
+        for end in (sparing.close, robot.silent, lambda: keeper.remove(metric)):
+            opened.callback(end)
+        if more[0] in ("reset", "status"):
+            robot.stop()
+            out, err = program(program_, *more, f"--url=mqtt://127.0.0.1:{sparing.port}").communicate(timeout=40)
+            assert (": free" if more[0] == "reset" else "stopped by ann@desk") in out, err
+            return
+        robot.deaf = True
+        if program_ == "page":
+            page = opened.enter_context(opened.enter_context(Served(sparing.port)).page())
+            page.send("estop", ref=more[0], stop="a" * 16)
+        else:
+            opened.enter_context(running(program_, *more, f"--url=mqtt://127.0.0.1:{sparing.port}"))
+        assert until(lambda: robot.count("estop") > 3, 10), "it is repeated"
+        assert sparing.stalled or metric == "online"
+
+
+def test_a_stop_counts_as_sent_once_it_has_left(robot_on: Make, broker: Broker) -> None:
+    robot = robot_on("serial")
+    robot.deaf = True
+    with (
+        TcpProxy(broker.port) as proxy,
+        running("estop", robot.id, f"--url=mqtt://127.0.0.1:{proxy.port}") as process,
+    ):
+        assert until(lambda: robot.count("estop") >= 1, 30)
+        assert process.stdout is not None
+        assert process.stdout.readline() == f"{robot.id}: stop sent\n"
+
+
+def test_a_config_file_leads_to_the_robots_own_side_and_to_the_remote_one(
+    run: Run, robot_on: Make, broker: Broker, tmp_path: Path
+) -> None:
+    robot = robot_on("serial")
+    nowhere = {"host": "127.0.0.1", "port": 1}
+    there = {"host": "127.0.0.1", "port": broker.port}
+    local = config_file(tmp_path, robot={"id": robot.id}, local_mqtt=there)
+    assert run("estop", local) == 0
+    assert run("estop", robot.id, "--config", local) == 0
+    assert run("estop", "reset", local) == 0
+    bridge = {"enabled": True, "remote_mqtt": there}
+    remote = config_file(tmp_path, robot={"id": robot.id}, local_mqtt=nowhere, services={"mqtt_bridge": bridge})
+    assert run("estop", remote, "--remote") == 0
+    assert robot.latched
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "named"),
+    [
+        (("goob",), 1, "goob is not a config file"),
+        (("--all",), 1, "--config CONFIG or --url URL"),
+        (("--hold", "--url", "mqtt://127.0.0.1:1"), 2, "--all"),
+        (("goob", "--all", "--url", "mqtt://127.0.0.1:1"), 2, "either --all or goob"),
+        (("goob", "fred", "--url", "mqtt://127.0.0.1:1"), 2, "one robot at a time"),
+        (("reset", "--url", "mqtt://127.0.0.1:1"), 2, "name the robot"),
+        ((), 2, "nothing was stopped: name the robot, or add --all"),
+        (("stauts", "goob", "--url", "mqtt://127.0.0.1:1"), 2, 'did you mean "pebble estop status goob"?'),
+        (("reset", "--all", "--url", "mqtt://127.0.0.1:1"), 2, "not for reset"),
+        (("reset", "reset", "--url", "mqtt://127.0.0.1:1"), 2, "system/type/id"),
+        (("status",), 1, "--config CONFIG or --url URL"),
+        (("goob", "--url", "mqtt://127.0.0.1:1"), 1, "cannot connect"),
+        (("goob", "--url", "mqtt://ann:geheim@127.0.0.1:1"), 1, "--password-file"),
+    ],
+)
+def test_wrong_command_lines(run: Run, arguments: tuple[str, ...], code: int, named: str) -> None:
+    assert run("estop", *arguments) == code
+    assert run.err.count("\n") == 1
+    assert named in run.err
+    assert "geheim" not in run.err
+
+
+def test_a_robot_called_reset_can_be_stopped(run: Run, robot_on: Make, url: str) -> None:
+    robot = robot_on("serial", id_="reset")
+    assert run("estop", robot.base, url) == 0
+    assert robot.latched
+    assert run("estop", "reset", robot.base, url) == 0
+    assert not robot.latched
+
+
+# -- reset and status
+
+
+@contextmanager
+def terminal() -> Iterator[tuple[int, int]]:
+    """Both ends of one."""
+    ends = pty.openpty()
+    yield ends
+    for end in ends:
+        os.close(end)
+
+
+def test_a_reset_shows_who_stopped_the_robot_and_frees_it(run: Run, robot_on: Make, url: str) -> None:
+    robot = robot_on("left", "right")
+    robot.stop(by="ann@desk", why="dog")
+    assert run("estop", "reset", robot.id, url) == 0
+    lines = run.out.splitlines()
+    assert lines[0].startswith(f"{robot.id}: stopped by ann@desk, ")
+    assert [line.endswith(f": dog ({owner})") for line, owner in zip(lines, ("left", "right"), strict=False)] == [
+        True
+    ] * 2
+    assert lines[2] == f"{robot.id}: free; it moves again once drive commands have paused for half a second"
+    assert not any(owner.latch.latched for owner in robot.motors.owners)
+    assert run("estop", "reset", robot.id, url) == 0
+    assert run.out == f"{robot.id}: free\n"
+    assert robot.count("estop-reset") == 2
+
+
+def test_over_a_thin_link_an_answer_may_take_longer(run: Run, robot_on: Make, url: str) -> None:
+    robot = robot_on("serial")
+    link = {"level": "thin", "drive_hz": 4, "rtt_ms": 600, "queue_ms": 0, "t": 1}
+    robot.publish("link", link, retain=True)
+    robot.late_s = 2.2
+    heartbeat = threading.Timer(robot.late_s, robot.beat)
+    heartbeat.start()
+    assert (run("estop", "status", robot.id, url), run.out) == (0, f"{robot.id}: free\n")
+    heartbeat.join()
+    assert run("estop", robot.id, url) == 0
+    *sent, confirmed = run.out.splitlines()
+    assert f"{robot.id}: stop sent, not confirmed yet: serial has not confirmed" in {
+        one.partition(": it")[0] for one in sent
+    }
+    assert confirmed.startswith(f"{robot.id}: stopped and confirmed after ")
+    assert run("estop", "reset", robot.id, url) == 0
+    assert not robot.latched
+
+
+def test_a_stop_that_was_not_shown_is_not_reset(robot_on: Make, url: str) -> None:
+    robot = robot_on("serial")
+    robot.stop()
+    with terminal() as (master, slave), running("estop", "reset", robot.id, url, stdin=slave) as process:
+        assert process.stdout is not None
+        assert "stopped by ann@desk" in process.stdout.readline()
+        robot.stop("fedcba9876543210", by="bob@door")
+        os.write(master, b"y\n")
+        _, err = process.communicate(timeout=30)
+    why = "serial: stopped again meanwhile by bob@door"
+    assert err == f"pebble: {robot.id} is still stopped: {why}; look again, then repeat\n"
+    assert (process.returncode, robot.latched, robot.count("estop-reset")) == (1, True, 1)
+
+
+def test_a_declined_reset_resets_nothing(robot_on: Make, url: str) -> None:
+    robot = robot_on("serial")
+    robot.stop()
+    with terminal() as (master, slave), running("estop", "reset", robot.id, url, stdin=slave) as process:
+        os.write(master, b"n\n")
+        assert process.wait(30) == 1
+    assert (robot.latched, robot.count("estop-reset")) == (True, 0)
+
+
+def test_a_reset_without_an_answer_is_a_failure(run: Run, robot_on: Make, url: str) -> None:
+    robot = robot_on("serial")
+    robot.stop()
+    robot.deaf = True
+    assert run("estop", "reset", robot.id, url) == 1
+    assert "still stopped: serial: no answer" in run.err
+    assert run("estop", "reset", "unknown", url) == 1
+    assert run.err == "pebble: unknown publishes no emergency stop: is it on, and is this its broker?\n"
+
+
+def test_status_of_one_and_of_all(run: Run, robot_on: Make, url: str) -> None:
+    free, stopped, old, silent = (
+        robot_on("serial"),
+        robot_on("mcu", persisted=None),
+        robot_on(estop=None),
+        robot_on("serial"),
+    )
+    stopped.stop()
+    silent.remove("estop/serial")
+    assert run("estop", "status", url) == 0
+    last = "no heartbeat; its last state: "
+    assert {line.split(": ", 1)[1][: len(last)] for line in run.out.splitlines()} == {last}
+    for robot in (free, stopped, old, silent):
+        robot.start()
+    assert run("estop", "status", url) == 0
+    lines = dict(line.split(": ", 1) for line in run.out.splitlines())
+    assert lines[free.id] == "free"
+    assert lines[stopped.id].startswith("stopped by ann@desk, ")
+    assert lines[stopped.id].endswith(": dog (mcu, NOT SAVED)")
+    assert lines[old.id] == "its firmware has none"
+    assert lines[silent.id] == "unknown, no state of serial"
+    assert run("estop", "status", stopped.id, url) == 0
+    assert list(dict(line.split(": ", 1) for line in run.out.splitlines())) == [stopped.id]
+    assert run("estop", "status", "unknown", url) == 1
+
+
+def test_no_name_from_the_network_reaches_the_terminal_unchanged(run: Run, robot_on: Make, url: str) -> None:
+    robot = robot_on("a\u202eb")
+    state = {"latched": True, "boot": "0", "count": 1, "recent": [], "by": "\x1b[31m", "why": "\u202e", "since": 1}
+    robot.publish("estop/a\u202eb", state, retain=True)
+    assert run("estop", "status", robot.id, url) == 0
+    assert "\x1b" not in run.out
+    assert "\u202e" not in run.out
+    assert "stopped by ?[31m" in run.out
+
+
+# -- other commands
+
+
+def test_a_stopped_robot_is_not_driven_unless_forced(run: Run, robot_on: Make, url: str) -> None:
+    robot = robot_on("left", "right")
+    drive = ("topic", "pub", "drive-values", '{"z": 0.3}', url, f"--robot={robot.id}")
+    assert run(*drive) == 0
+    robot.stop()
+    assert run(*drive) == 1
+    assert run.err.count("\n") == 1
+    assert run.err.startswith(f"pebble: {robot.id} is stopped by ann@desk, ")
+    assert f"pebble estop reset {robot.id}" in run.err
+    assert run("topic", "pub", f"{robot.base}/incoming/drive-values", "{}", url) == 0, "a zero moves nothing"
+    assert run("topic", "pub", "lights-solid", "{}", url, f"--robot={robot.id}") == 0
+    assert robot.count("drive-values") == 2
+    assert run(*drive, "--force") == 0
+    assert until(lambda: robot.count("drive-values") == 3)
+
+
+def test_driving_ends_when_the_robot_is_stopped(robot_on: Make, url: str) -> None:
+    robot = robot_on("serial")
+    with running("topic", "pub", "drive-values", '{"z": 0.3}', "--rate=50", url, f"--robot={robot.id}") as process:
+        assert until(lambda: robot.count("drive-values") >= 3, 30)
+        robot.stop()
+        _, err = process.communicate(timeout=30)
+    assert process.returncode == 1
+    assert f"{robot.id} is stopped by ann@desk" in err
+
+
+def test_topic_list_and_topic_echo_show_a_stopped_robot(run: Run, robot_on: Make, url: str) -> None:
+    robot = robot_on("serial")
+    options = (url, f"--robot={robot.id}", "--seconds=0.3")
+    assert run("topic", "list", *options) == 0
+    assert "stopped" not in run.out
+    robot.stop()
+    assert run("topic", "list", *options) == 0
+    assert run.out.splitlines()[-1].startswith(f"{robot.id} is stopped by ann@desk, ")
+    assert run("topic", "echo", "capabilities", *options) == 0
+    assert run.err.startswith(f"pebble: {robot.id} is stopped by ann@desk, ")

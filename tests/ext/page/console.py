@@ -1,0 +1,287 @@
+"""A tab of the page before one robot of a stage: tests use the page's controls, and look at the robot's motors."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field
+from typing import Any
+
+import msgspec
+from playwright.sync_api import Browser, Error, Locator
+
+from pebble.transports import Message, MqttSettings, QoS, create
+from tests.ext.page.browser import Size, Tab, Theme, tab
+from tests.ext.page.stage import Stage
+
+Wheels = tuple[int, int]
+
+FORWARD, BACK, LEFT, RIGHT, REST = (1, 1), (-1, -1), (-1, 1), (1, -1), (0, 0)
+#: Key, and what the wheels do: their signs, left and right.
+KEYS: dict[str, Wheels] = {
+    "KeyW": FORWARD,
+    "KeyS": BACK,
+    "KeyA": LEFT,
+    "KeyD": RIGHT,
+    "ArrowUp": FORWARD,
+    "ArrowDown": BACK,
+    "ArrowLeft": LEFT,
+    "ArrowRight": RIGHT,
+}
+REST_S = 1.0  # to come to rest after a release, on a busy machine; 20 ms on an idle one
+QUIET_S = 0.4  # so long nothing may turn where nothing may turn: eight commands of a gesture
+_READY_S = 20.0  # for picture, echoes and lease, on a busy machine
+_PRESSES = 6
+_MOVES_S = 0.7
+_PADS = "window.__pads = []; navigator.getGamepads = () => window.__pads;"
+
+
+@dataclass
+class Console:
+    """``name`` is the robot's. ``since_ns`` is when the last call of ``rests`` began."""
+
+    tab: Tab
+    stage: Stage
+    name: str
+    held: list[str] = field(default_factory=list)
+
+    # -- the page
+
+    @property
+    def page(self) -> Any:
+        return self.tab.page
+
+    @property
+    def ref(self) -> str:
+        return self.stage.ref(self.name)
+
+    def test(self, name: str) -> Locator:
+        return self.tab.page.locator(f'[data-test="{name}"]:visible')
+
+    def place(self, name: str) -> tuple[float, float, float]:
+        """The middle of a control and its width, in pixels of the window."""
+        box = self.test(name).bounding_box()
+        assert box is not None
+        return box["x"] + box["width"] / 2, box["y"] + box["height"] / 2, box["width"]
+
+    def uncover(self, name: str) -> Locator:
+        return self.tab.uncover(name)
+
+    @property
+    def reason(self) -> str:
+        """The code of why it cannot be driven; "" it can."""
+        return str(self.page.evaluate("window.pebble?.driver.reason()?.code ?? (window.pebble ? '' : 'loading')"))
+
+    def state(self, metric: str, ref: str | None = None) -> Any:
+        """The newest value of a metric that the page has."""
+        return self.page.evaluate(
+            "([ref, metric]) => window.pebble?.store.get(ref, metric)?.value",
+            [self.ref if ref is None else ref, metric],
+        )
+
+    def because(self, *codes: str, within: float = _READY_S) -> bool:
+        """Wait until driving is off for one of these reasons; "" is that it is on."""
+        return self.tab.until(lambda: self.reason in codes, within)
+
+    def reset(self, name: str = "") -> None:
+        """Without the page's controls: end the stop of this robot, or of another one."""
+        ref = self.stage.ref(name or self.name)
+        owners = self.state("web/estop", ref)["owners"]
+        self.page.evaluate("([ref, owners]) => window.pebble.commands.reset(ref, owners)", [ref, owners])
+
+    def take(self) -> None:
+        """Take control; there may be a stop to be reset, or a picture to wait for. Ends with nothing held."""
+        self.let_go()
+        end = time.monotonic() + 2 * _READY_S
+        while not self.because("", within=0.2):
+            assert time.monotonic() < end, self.reason
+            with suppress(Error):  # the reason has changed meanwhile, and with it the button
+                self._improve(self.reason)
+
+    def _improve(self, reason: str) -> None:
+        """Do what the page offers against this reason."""
+        match reason:
+            case "stopped":
+                self.reset()
+            case "free" | "idle":
+                self.test("take").click(timeout=500)
+            case "lease":
+                self.test("take-over").hover(timeout=500)
+                self.page.mouse.down()
+                self.because("", "free", "idle", within=1.5)
+                self.page.mouse.up()
+
+    def hold_button(self, name: str, seconds: float = 1.15) -> None:
+        """Press it with the mouse for so long."""
+        self.test(name).hover()
+        self.page.mouse.down()
+        self.page.wait_for_timeout(1000 * seconds)
+        self.page.mouse.up()
+
+    # -- keys
+
+    def down(self, *codes: str) -> None:
+        for code in codes:
+            self.page.keyboard.down(code)
+            self.held.append(code)
+
+    def let_go(self) -> None:
+        """Release all keys."""
+        while self.held:
+            self.page.keyboard.up(self.held.pop())
+
+    def drive(self, *codes: str, wheels: Wheels = FORWARD) -> bool:
+        """Press and hold keys until the wheels turn so."""
+        return self.persists(lambda: self.down(*(codes or ("KeyW",))), lambda: self.wheels == wheels, self.let_go)
+
+    def persists(self, begin: Callable[[], None], reached: Callable[[], bool], end: Callable[[], None]) -> bool:
+        """Begin a gesture until it has its effect; again, if a busy machine has ended it, as it should."""
+        for _ in range(_PRESSES):
+            begin()
+            if self.tab.until(reached, _MOVES_S):
+                return True
+            end()
+            self.page.wait_for_timeout(60)
+        return False
+
+    def press_anew(self) -> bool:
+        """Whether releasing and pressing a key drives again; the robot is at rest after it."""
+        self.let_go()
+        self.page.wait_for_timeout(80)
+        turned = self.drive()
+        self.let_go()
+        return turned and self.rests()
+
+    # -- wheels
+
+    @property
+    def wheels(self) -> Wheels:
+        motors = self.stage.motors(self.name)
+        left, right = motors[-1][1] if motors else (0.0, 0.0)
+        return _sign(left), _sign(right)
+
+    @property
+    def speeds(self) -> tuple[float, float]:
+        return self.stage.motors(self.name)[-1][1]
+
+    def turns(self, wheels: Wheels, within: float = 2.0) -> bool:
+        return self.tab.until(lambda: self.wheels == wheels, within)
+
+    def rests(self, within: float = REST_S) -> bool:
+        return self.tab.until(lambda: self.wheels == REST, within)
+
+    def stays_at_rest(self, seconds: float = QUIET_S) -> bool:
+        """Whether no motor runs, from now on for so long."""
+        began = time.monotonic_ns()
+        self.page.wait_for_timeout(1000 * seconds)
+        return not self.stage.wheels_turning(self.name, since_ns=began)
+
+    # -- gamepads
+
+    def pads(self, *pads: dict[str, Any] | None) -> None:
+        """What the browser shows of gamepads from now on."""
+        self.page.evaluate("(pads) => { window.__pads = pads }", list(pads))
+
+
+def pad(x: float = 0.0, z: float = 0.0, *buttons: int, stamp: float = 0.0, name: str = "Gamepad") -> dict[str, Any]:
+    """A gamepad as a browser shows it; ``buttons`` are pressed. ``stamp`` 0: newer than all before."""
+    return {
+        "id": name,
+        "axes": [x, -z],
+        "buttons": [{"pressed": index in buttons} for index in range(12)],
+        "timestamp": stamp or time.monotonic_ns() / 1e6,
+        "connected": True,
+    }
+
+
+@contextmanager
+def console(
+    browser: Browser,
+    stage: Stage,
+    name: str,
+    size: Size = "desktop",
+    theme: Theme = "light",
+    *,
+    url: str = "",
+    script: str = "",
+    engineers: bool = True,
+) -> Iterator[Console]:
+    """Open the page of a robot. ``url`` with a slash at the end: by another way than the server's own address.
+
+    Without ``engineers`` none of its cards for them is open: drawing plots takes most of what a page needs.
+    """
+    address = f"{url or stage.url}r/{stage.ref(name)}"
+    with tab(browser, address, size, theme, script=_PADS + script, engineers=engineers) as opened:
+        yield Console(opened, stage, name)
+
+
+@contextmanager
+def used(opened: Console, *, complaints: bool = True) -> Iterator[Console]:
+    """A console for one test: it has control, and at the end nothing moves and the page has not complained.
+
+    ``complaints`` False: the browser may report that connections have failed, and nothing else.
+    """
+    opened.page.evaluate("document.activeElement.blur()")  # keys in a list choose from it
+    opened.take()
+    before = len(opened.tab.complaints())
+    yield opened
+    opened.let_go()
+    opened.pads()
+    opened.page.mouse.up()
+    assert opened.rests(), opened.speeds
+    found = opened.tab.complaints()[before:]
+    assert [one for one in found if complaints or not _of_connection(one)] == []
+
+
+class Wire:
+    """What passes the operators' broker, except sound and pictures."""
+
+    def __init__(self, stage: Stage) -> None:
+        self._last: dict[str, Any] = {}
+        self.received: list[tuple[str, Any]] = []
+        self._transport = create("mqtt", "wire", MqttSettings(host="127.0.0.1", port=stage.broker_port))
+        self._transport.open()
+        for metric in ("estop/+", "media-status", "online"):
+            self._transport.subscribe(f"pebble/+/+/outgoing/{metric}", self._receive)
+        for metric in ("drive-values", "front-camera", "flags/+", "estop"):
+            self._transport.subscribe(f"pebble/+/+/incoming/{metric}", self._receive)
+
+    def last(self, topic: str) -> Any:
+        """The newest payload below ``pebble/robots``."""
+        return self._last.get(f"pebble/robots/{topic}")
+
+    def all(self, topic: str) -> list[Any]:
+        return [payload for one, payload in list(self.received) if one == f"pebble/robots/{topic}"]
+
+    def publish(self, topic: str, value: object, *, retain: bool = False) -> None:
+        payload = b"" if value is None else msgspec.json.encode(value)
+        self._transport.publish(f"pebble/robots/{topic}", payload, qos=QoS.DELIVERED, retain=retain)
+
+    def latched(self, name: str) -> bool:
+        """Whether all motor owners of a robot say that they are stopped."""
+        prefix = f"pebble/robots/{name}/outgoing/estop/"
+        states = [payload for topic, payload in list(self._last.items()) if topic.startswith(prefix)]
+        return bool(states) and all(state["latched"] for state in states)
+
+    def camera(self, name: str) -> bool:
+        """Whether the robot's own program for pictures is running."""
+        report = (self.last(f"{name}/outgoing/media-status") or {}).get("value", {})
+        return any(one.get("running") for program, one in report.items() if "video" in program or "camera" in program)
+
+    def close(self) -> None:
+        self._transport.close()
+
+    def _receive(self, message: Message) -> None:
+        payload = json.loads(message.payload) if message.payload else None
+        self._last[message.topic] = payload
+        self.received.append((message.topic, payload))
+
+
+def _of_connection(complaint: str) -> bool:
+    return any(words in complaint for words in ("WebSocket", "ERR_CONNECTION", "Failed to load resource"))
+
+
+def _sign(value: float) -> int:
+    return (value > 0) - (value < 0)

@@ -1,0 +1,214 @@
+"""How the page looks in a few states, pixel by pixel, and stored pictures of it: ``make long PART=looks``.
+
+Time stands still on the page and at its server, nothing moves, and the camera shows flat colours; so a picture differs
+only where the page does, and by how the browser smooths edges. Pictures are stored at half size: that is readable, and
+all of them together are small.
+"""
+
+from __future__ import annotations
+
+import io
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+from PIL import Image
+from playwright.sync_api import Browser, Page
+
+from tests.ext.page.browser import Tab, Theme, chromium
+from tests.ext.page.canned import CannedServer, State, serving, showing
+from tests.ext.page.states import DRIVING, STATES
+from tests.support import ROOT
+
+STORED = ROOT / "tests/ext/page/page/looks"
+FAILED = ROOT / "build" / "looks"
+MOST_BYTES = 600_000  # of all stored pictures
+LEVELS, SHARE = 12, 0.0003  # a pixel differs by more than so many of 255 levels; this share of them may
+AT = 1_795_341_630_000  # 22 November 2026, 10:00:30 UTC
+SIZES = {"desktop": (1440, 900), "tall": (1440, 1960), "phone": (390, 844), "landscape": (844, 390)}
+
+#: Both clocks of the page stand still; timers run.
+_FROZEN = f"""{{
+  const Then = Date;
+  window.Date = class extends Then {{
+    constructor(...parts) {{ parts.length ? super(...parts) : super({AT}); }}
+    static now() {{ return {AT}; }}
+  }};
+  performance.now = () => 5000;
+}}"""
+#: The server never answers.
+UNANSWERED = """window.WebSocket = class extends EventTarget {
+  readyState = 0;
+  send() {}
+  close() {}
+};"""
+#: What is fetched without a server, too.
+_PARTS = "!document.querySelector('.loading') && Boolean(document.querySelector('.key-place'))"
+#: A style sheet of its own: the page's policy allows no style element.
+_STYLED = """(rules) => {
+  const sheet = new CSSStyleSheet();
+  sheet.replaceSync(rules);
+  document.adoptedStyleSheets = [sheet];
+}"""
+_HERE = """!document.querySelector('.loading') && document.fonts.status === 'loaded' &&
+  [...document.images].every((one) => one.complete || one.hidden) &&
+  (!pebble.video.ref || Boolean(pebble.video.info))"""
+#: The first picture of a recording is drawn, and its timeline.
+_REPLAYED = "Boolean(pebble.replay?.video.info && pebble.replay.day.timeline)"
+
+Pixels = npt.NDArray[np.uint8]
+
+
+def _nothing(_page: Page) -> None:
+    pass
+
+
+def _press(*names: str) -> Callable[[Page], None]:
+    def act(page: Page) -> None:
+        for name in names:
+            page.locator(f"[data-test={name}]").first.click()
+
+    return act
+
+
+@dataclass(frozen=True)
+class Look:
+    """One picture: a state of the server, a size and a theme, and what a person does then."""
+
+    state: State
+    size: str = "desktop"
+    theme: Theme = "light"
+    act: Callable[[Page], None] = _nothing
+    here: str = _HERE
+    script: str = ""
+
+
+LOOKS: dict[str, Look] = {
+    "fleet": Look(STATES["fleet"]),
+    "fleet-stopped": Look(STATES["fleet-stopped"], theme="dark"),
+    "fleet-stops": Look(STATES["fleet-stopped"], size="phone", act=_press("stopped")),
+    "fleet-phone": Look(STATES["fleet"], size="phone", theme="dark"),
+    "fleet-empty": Look(STATES["fleet-empty"]),
+    "connecting": Look(
+        DRIVING,
+        here=_PARTS,
+        script=UNANSWERED,
+    ),
+    "robot": Look(STATES["full"], size="tall"),
+    "free": Look(STATES["free"], theme="dark"),
+    "hint": Look(STATES["free"], act=lambda page: page.locator("[data-test=stick]").click(force=True)),
+    "gear": Look(STATES["driving"], act=_press("gear")),
+    "script": Look(STATES["asked"], act=_press("script-apriltag-follow"), size="tall", theme="dark"),
+    "stopped": Look(STATES["stopped"], theme="dark"),
+    "reset": Look(STATES["stopped"], size="phone", act=_press("reset")),
+    "taken": Look(STATES["taken"], size="phone", theme="dark"),
+    "no-broker": Look(STATES["no-broker"]),
+    "no-camera": Look(STATES["no-camera"], theme="dark"),
+    "phone": Look(STATES["driving"], size="phone"),
+    "landscape": Look(STATES["odometry"], size="landscape", theme="dark"),
+    "settings": Look(STATES["driving"], act=_press("settings"), theme="dark"),
+    "recordings": Look(STATES["recordings"], size="phone"),
+    "replay": Look(STATES["replay"], here=_REPLAYED),
+}
+
+
+class Difference(NamedTuple):
+    """``share`` of the pixels that differ; ``marks``: a picture of where, or of both sizes that are not the same."""
+
+    share: float
+    marks: Pixels
+
+
+def taken(server: CannedServer, browser: Browser, look: Look, style: str = "") -> Pixels:
+    """The page as it looks, at half size; ``style``: with these rules besides its own."""
+    state = replace(look.state, at=AT, still=True, repeated={})
+    width, height = SIZES[look.size]
+    options = {"reduced_motion": "reduce", "timezone_id": "UTC", "locale": "en-GB", "engineers": False}
+    with showing(
+        server,
+        browser,
+        state,
+        "desktop" if width == SIZES["desktop"][0] else "phone",
+        viewport={"width": width, "height": height},
+        theme=look.theme,
+        script=_FROZEN + look.script,
+        **options,
+    ) as opened:
+        assert opened.until(look.here, 60), f"{state.path} is not shown"
+        look.act(opened.page)
+        opened.page.evaluate(_STYLED, style)
+        return _at_rest(opened)
+
+
+def _at_rest(opened: Tab) -> Pixels:
+    """A picture, once three in a row are the same: what is fetched later has come, and cards have their places."""
+    seen: list[Pixels] = []
+
+    def same() -> bool:
+        picture = Image.open(io.BytesIO(opened.page.screenshot(animations="disabled"))).convert("RGB")
+        half = picture.resize((picture.width // 2, picture.height // 2), Image.Resampling.BOX)
+        seen.append(np.asarray(half))
+        opened.page.wait_for_timeout(500)
+        return len(seen) > 3 and all(difference(one, seen[-1]).share == 0 for one in seen[-3:])
+
+    assert opened.until(same, 90), "the page does not come to rest"
+    return seen[-1]
+
+
+def stored(name: str) -> Pixels:
+    return np.asarray(Image.open(STORED / f"{name}.webp").convert("RGB"))
+
+
+def difference(one: Pixels, other: Pixels) -> Difference:
+    if one.shape != other.shape:
+        size = tuple(max(a, b) for a, b in zip(one.shape, other.shape, strict=True))
+        marks = np.zeros(size, np.uint8)
+        for picture in (one, other):
+            marks[: picture.shape[0], : picture.shape[1]] += picture // 2
+        return Difference(1.0, marks)
+    differs = (np.abs(one.astype(np.int16) - other.astype(np.int16)) > LEVELS).any(axis=2)
+    marks = one // 4
+    marks[differs] = (255, 0, 90)
+    return Difference(float(differs.mean()), marks)
+
+
+def check(name: str, found: Pixels) -> None:
+    """An AssertionError names the pictures that show what is not as it is stored."""
+    share, marks = difference(found, stored(name))
+    if share <= SHARE:
+        return
+    FAILED.mkdir(parents=True, exist_ok=True)
+    paths = [FAILED / f"{name}.{what}.png" for what in ("actual", "difference")]
+    for path, picture in zip(paths, (found, marks), strict=True):
+        Image.fromarray(picture).save(path)
+    shown = " and ".join(str(path.relative_to(ROOT)) for path in paths)
+    raise AssertionError(
+        f"{name} looks different in {share:.2%} of its pixels: see {shown}. If it is meant to, "
+        f"`make long PART=looks` renews {STORED.relative_to(ROOT)}"
+    )
+
+
+def _store(name: str, picture: Pixels) -> int:
+    target = STORED / f"{name}.webp"
+    Image.fromarray(picture).save(target, lossless=True, quality=100, method=6)
+    return target.stat().st_size
+
+
+def main(names: list[str]) -> None:
+    STORED.mkdir(exist_ok=True)
+    with serving() as server, chromium() as browser:
+        for name in names or LOOKS:
+            size = _store(name, taken(server, browser, LOOKS[name]))
+            sys.stdout.write(f"{STORED.relative_to(ROOT)}/{name}.webp: {size} bytes\n")
+            sys.stdout.flush()
+    total = sum(path.stat().st_size for path in STORED.iterdir())
+    sys.stdout.write(f"{total} bytes in all; look at them before you commit them\n")
+    if total > MOST_BYTES:
+        sys.exit(f"more than {MOST_BYTES} bytes")
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

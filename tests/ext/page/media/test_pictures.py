@@ -1,0 +1,267 @@
+"""The server between one robot's camera and the pages that show it."""
+
+from __future__ import annotations
+
+import asyncio
+import itertools
+import time
+
+import cv2
+import numpy as np
+import pytest
+
+from pebble.extensions.media.decode import VideoDecoder
+from pebble.extensions.media.picture_header import follows, read_header
+from pebble.extensions.media.scene import read_counter
+from pebble.extensions.media.video import make_encoder
+from pebble.extensions.operator.client.media_request.queue import NO_FRAME
+from pebble.extensions.page.media import rescue
+from pebble.transports import QoS
+from tests.ext.page.media.robots import (
+    CAMERA,
+    EVERYTHING,
+    REF,
+    VIDEO,
+    PicturePage,
+    PictureRobot,
+    Server,
+    serving,
+    until,
+)
+
+pytestmark = pytest.mark.anyio
+PLAIN = EVERYTHING - {"h264"}
+
+
+@pytest.fixture
+def robot() -> PictureRobot:
+    return PictureRobot()
+
+
+def jpeg(number: int = 0) -> bytes:
+    return cv2.imencode(".jpg", np.full((48, 64, 3), 40 + number % 150, np.uint8))[1].tobytes()
+
+
+def encoding_of(payload: bytes) -> str | None:
+    header = read_header(payload)
+    return header and header.encoding
+
+
+# -- the encoding
+
+
+async def test_the_encoding_is_one_that_all_pages_decode(robot: PictureRobot, server: Server) -> None:
+    first = server.open(PicturePage())
+    await until(lambda: len(first.frames) > 3)
+    second = server.open(PicturePage(), PLAIN)
+    await until(lambda: len(second.direct()) > 3)
+    assert {encoding_of(body) for body in second.direct()} == {"pbvd"}
+    assert encoding_of(first.direct()[-1]) == "pbvd"
+    assert robot.encodings == ["h264", "pbvd"]
+
+
+async def test_another_operators_encoding_is_forwarded_as_it_is(robot: PictureRobot, server: Server) -> None:
+    page = server.open(PicturePage())
+    await until(lambda: len(page.frames) > 3)
+    other = robot.hub
+    with type(robot.transport)("other", other) as operator:
+        operator.publish(VIDEO["command_topic"], b'{"enabled":true,"encoding":"pbvd"}', qos=QoS.DELIVERED)
+        await until(lambda: encoding_of(page.direct()[-1]) == "pbvd")
+        await asyncio.sleep(1.5)
+    assert encoding_of(page.direct()[-1]) == "pbvd"
+    assert [request.get("encoding") for request in robot.requests if "keyframe" not in request].count("h264") == 1
+
+
+async def test_raw_jpegs_flow() -> None:
+    robot = PictureRobot({**{name: VIDEO[name] for name in ("available", "controls", "topic")}, "encoding": "jpeg"})
+    robot.mute = True
+    async with serving(robot) as server:
+        page = server.open(PicturePage(), frozenset({"jpeg"}))
+        await until(lambda: robot.requests)
+        for number in range(5):
+            robot.send(jpeg(number))
+            await until(lambda number=number: page.direct() == [jpeg(one) for one in range(number + 1)])
+        await until(lambda: server.view.state == "flowing" and server.view.encoding == "jpeg")
+
+
+# -- forwarding
+
+
+def decoded(bodies: list[bytes]) -> list[int | None]:
+    decoder = VideoDecoder()
+    shown = [decoder.feed(body) for body in bodies]
+    return [None if one is None else read_counter(one.picture) for one in shown]
+
+
+@pytest.mark.parametrize("can", [EVERYTHING, PLAIN, frozenset({"json"}), frozenset({"pbvd"})])
+async def test_payloads_arrive_unchanged_and_decodable(
+    robot: PictureRobot, server: Server, can: frozenset[str]
+) -> None:
+    page = server.open(PicturePage(), can)
+    await until(lambda: len(page.frames) > 20)
+    bodies = page.direct()
+    assert set(bodies) <= set(robot.sent)
+    assert None not in decoded(bodies)
+    assert [seq for seq, _, _ in page.frames] == sorted({seq for seq, _, _ in page.frames})
+
+
+async def test_what_follows_a_lost_picture_is_not_sent() -> None:
+    robot = PictureRobot()
+    robot.mute = True
+    encoder = make_encoder("pbvd", fps=15, keyframe_interval=5)
+    packets = [encoder.encode(np.full((48, 64, 3), n, np.uint8), 1_710_969_600_000 + 66 * n) for n in range(12)]
+    async with serving(robot) as server:
+        page = server.open(PicturePage())
+        await until(lambda: robot.requests)
+        arrives = [*packets[:3], *packets[5:7], packets[10]]
+        for packet in [
+            *(packets[3], *packets[:3], packets[4], b"garbage", bytes(5 << 20)),
+            *(*packets[5:7], packets[6], packets[7], packets[10]),
+        ]:
+            count = len(page.frames) + (packet in arrives and packet not in page.direct())
+            robot.send(packet)
+            await until(lambda count=count: len(page.frames) == count)
+            await asyncio.sleep(0.02)
+        assert page.direct() == arrives
+
+
+def test_headers_are_read_as_the_decoder_reads_them() -> None:
+    for name in ("json", "pbvd", "h264"):
+        encoder, last, decoder = make_encoder(name, fps=15, keyframe_interval=4), None, VideoDecoder()
+        for number in range(9):
+            payload = encoder.encode(np.full((48, 64, 3), 20 * number, np.uint8), 1_710_969_600_000 + 66 * number)
+            header, shown = read_header(payload), decoder.feed(payload)
+            assert header is not None
+            assert shown is not None
+            assert header == (shown.encoding, shown.keyframe, shown.frame, shown.captured_ms)
+            assert follows(last, header)
+            last = header
+    assert [read_header(raw) for raw in (b"", b"x", b"PBVD", b"{", b"[]", b" 7", b"PBVD\1\x09" + bytes(20))] == [
+        None
+    ] * 7
+
+
+async def test_a_slow_page_gets_key_frames_and_a_fast_one_everything(robot: PictureRobot, server: Server) -> None:
+    fast, slow = server.open(PicturePage(), PLAIN), server.open(PicturePage(answer=None), PLAIN)
+    end = time.monotonic() + 3
+    acknowledged = 0
+    while time.monotonic() < end:
+        await asyncio.sleep(0.3)
+        for seq, _, _ in slow.frames[acknowledged : acknowledged + 1]:
+            slow.acknowledge(seq, 0)
+            acknowledged += 1
+    assert len(slow.frames) - acknowledged <= 8
+    assert None not in decoded(fast.direct())
+    assert None not in decoded(slow.direct())
+    assert acknowledged <= len(slow.frames) < len(fast.frames)
+
+
+async def test_a_page_that_wants_a_key_frame_gets_one(robot: PictureRobot, server: Server) -> None:
+    page = server.open(PicturePage())
+    await until(lambda: len(page.frames) > 5)
+    await asyncio.sleep(1.0)
+    count, began = len(page.frames), time.monotonic() - 2
+    page.acknowledge(NO_FRAME, 1)
+    await until(lambda: any(request.get("keyframe") for request in robot.requests))
+    await until(lambda: len(page.frames) > count + 3)
+    for _ in range(20):
+        page.acknowledge(NO_FRAME, 1)
+        await asyncio.sleep(0.05)
+    elapsed = time.monotonic() - began
+    assert sum(request.get("keyframe", False) for request in robot.requests) <= 2 + elapsed
+
+
+async def test_the_view_changes_at_most_twice_a_second(robot: PictureRobot, server: Server) -> None:
+    page = server.open(PicturePage())
+    await until(lambda: len(page.frames) > 45)
+    times = [at for at, _ in server.views]
+    assert len(times) > 3
+    assert min(b - a for a, b in itertools.pairwise(times)) > 0.45
+    assert server.view.per_second == pytest.approx(15, rel=0.5)
+    assert server.view.kbits > 0
+
+
+# -- rescue
+
+
+@pytest.mark.parametrize("encoding", ["h264", "pbvd", "json"])
+async def test_a_page_that_decodes_nothing_gets_jpegs(encoding: str) -> None:
+    robot = PictureRobot({**VIDEO, "encodings": [encoding], "encoding": encoding}, fps=20)
+    async with serving(robot) as server:
+        page, start = server.open(PicturePage(), frozenset()), 0.0
+        await until(lambda: page.rescued())
+        start, count = time.monotonic(), len(page.frames)
+        await asyncio.sleep(2)
+        rate = (len(page.frames) - count) / (time.monotonic() - start)
+        assert 0.5 < rate <= 5.5
+        assert page.direct() == []
+        pictures = [cv2.imdecode(np.frombuffer(body, np.uint8), cv2.IMREAD_COLOR) for body in page.rescued()]
+        numbers = [read_counter(picture) for picture in pictures]
+        assert numbers == sorted(number for number in numbers if number is not None)
+        assert numbers[-1] >= len(robot.sent) - 40
+        captured = int.from_bytes(page.frames[-1][2][:8], "big")
+        assert 0 <= time.time() * 1000 - captured < 5000
+
+
+async def test_a_slow_page_among_fast_ones_is_rescued() -> None:
+    robot = PictureRobot(fps=20)
+    async with serving(robot) as server:
+        fast = [server.open(PicturePage()) for _ in range(3)]
+        slow = server.open(PicturePage(answer=None))
+        await until(lambda: len(slow.frames) >= 2)
+        await asyncio.sleep(2.0)
+        for seq, _, _ in list(slow.frames):
+            slow.acknowledge(seq, 0)
+        slow.answer = 0
+        await until(lambda: len(slow.rescued()) > 3)
+        assert all(None not in decoded(page.direct()) for page in fast)
+
+
+async def test_a_page_that_fails_to_decode_is_rescued(robot: PictureRobot, server: Server) -> None:
+    page, other = server.open(PicturePage(answer=2)), server.open(PicturePage())
+    await until(lambda: len(page.rescued()) > 2)
+    await until(lambda: len(other.direct()) > 10)
+    assert len(page.direct()) <= 8
+
+
+async def test_without_pyav_there_is_a_reason(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(rescue.pyav, "installed", lambda: False)
+    robot = PictureRobot({**VIDEO, "encodings": ["h264"]})
+    async with serving(robot) as server:
+        page = server.open(PicturePage(), PLAIN)
+        await until(lambda: server.view and server.view.state == "flowing" and "needs PyAV" in server.view.why)
+        assert "1 of 1 browsers cannot show it" in server.view.why
+        assert page.frames == []
+
+
+async def test_a_snapshot_is_the_newest_picture_and_starts_no_camera(robot: PictureRobot, server: Server) -> None:
+    assert await server.media.snapshot(REF) is None
+    assert await server.media.snapshot("#") is None
+    assert robot.published == []
+    page = server.open(PicturePage())
+    await until(lambda: len(page.frames) > 30)
+    taken = await asyncio.gather(*(server.media.snapshot(REF) for _ in range(10)))
+    assert len(set(taken)) == 1
+    picture = cv2.imdecode(np.frombuffer(taken[0] or b"", np.uint8), cv2.IMREAD_COLOR)
+    assert len(robot.sent) - 20 <= (read_counter(picture) or 0) <= len(robot.sent)
+    robot.mute = True
+    await until(lambda: server.view.state == "silent")
+    assert await server.media.snapshot(REF) is None
+
+
+@pytest.mark.alone
+async def test_thirty_viewers_get_everything_and_the_robot_sends_no_more() -> None:
+    robot = PictureRobot(fps=15)
+    async with serving(robot) as server:
+        alone = server.open(PicturePage())
+        await until(lambda: len(alone.frames) > 5)
+        pages = [server.open(PicturePage()) for _ in range(29)]
+        await until(lambda: all(len(page.frames) > 3 for page in pages))
+        await asyncio.sleep(1.0)
+        before, frames, requests = [len(page.frames) for page in pages], len(robot.sent), len(robot.requests)
+        await asyncio.sleep(3.0)
+        sent = len(robot.sent) - frames
+        assert sent >= 40
+        assert all(len(page.frames) - count >= 0.95 * sent - 1 for page, count in zip(pages, before, strict=True))
+        assert len(robot.requests) == requests
+        assert CAMERA not in {message.topic for message in robot.published}

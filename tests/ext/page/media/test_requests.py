@@ -1,0 +1,253 @@
+"""The request for pictures or sound of one robot: made for the first page, withdrawn after the last one."""
+
+from __future__ import annotations
+
+import asyncio
+import operator
+import time
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import msgspec
+import pytest
+
+from pebble.transports import Message
+from tests.ext.page.media.robots import (
+    EVERYTHING,
+    REF,
+    MediaRobot,
+    Page,
+    PicturePage,
+    PictureRobot,
+    Server,
+    SoundPage,
+    SoundRobot,
+    serving,
+    until,
+)
+
+pytestmark = pytest.mark.anyio
+
+
+class Kind(NamedTuple):
+    """One medium: its robot, its page, how many pages a view counts, and its words."""
+
+    robot: type[MediaRobot]
+    page: Callable[[], Page]
+    count: Callable[[Any], int]
+    nonsense: tuple[bytes, ...]
+    lacking: str
+    fixed: str
+    silent: str
+
+
+PICTURE = Kind(
+    PictureRobot,
+    PicturePage,
+    operator.attrgetter("viewers"),
+    (b"", b"123", bytes(1000)),
+    "it has no camera",
+    "its camera cannot be switched on from here",
+    "no picture for",
+)
+VOICE = Kind(
+    SoundRobot,
+    SoundPage,
+    operator.attrgetter("listeners"),
+    (b"", b"\0", b"\x07\0\0\0\1", b"\1" * 50, bytes(2000)),
+    "it has no sound",
+    "its sound cannot be switched on from here",
+    "no sound for",
+)
+OTHER = "pebble/robots/victim"
+#: Topics that capabilities may not name, by their key; the first three also for a request that runs already.
+HOSTILE: list[tuple[str, object]] = [
+    ("topic", f"{OTHER}/outgoing/front-camera"),
+    ("command_topic", f"{OTHER}/incoming/drive-values"),
+    ("flag_topic", f"{OTHER}/incoming/flags/reboot"),
+    ("topic", "#"),
+    ("topic", "+/+/+/outgoing/#"),
+    ("topic", f"{REF}/outgoing/#"),
+    ("topic", f"{REF}/incoming/drive-values"),
+    ("topic", f"{REF}x/outgoing/front-camera"),
+    ("topic", 7),
+    ("command_topic", f"{OTHER}/incoming/front-camera"),
+    ("command_topic", f"{REF}/outgoing/online"),
+    ("command_topic", f"{REF}/incoming/flags/reboot"),
+    ("flag_topic", "$SYS/broker"),
+    ("flag_topic", f"{REF}/incoming/+"),
+    ("flag_topic", f"{REF}/incoming/estop"),
+]
+
+
+@pytest.fixture(params=[PICTURE, VOICE], ids=["picture", "sound"])
+def kind(request: pytest.FixtureRequest) -> Kind:
+    found: Kind = request.param
+    return found
+
+
+@pytest.fixture
+def robot(kind: Kind) -> MediaRobot:
+    return kind.robot()
+
+
+async def opened(server: Server, kind: Kind, count: int = 1) -> Page:
+    """A page that has received this many payloads."""
+    page: Page = server.open(kind.page())
+    await until(lambda: len(page.received) >= count)
+    return page
+
+
+async def test_the_first_page_requests_and_the_last_one_withdraws(kind: Kind, robot: Any, server: Server) -> None:
+    await asyncio.sleep(0.1)
+    assert robot.published == []
+    first, second = server.open(kind.page()), server.open(kind.page())
+    await until(lambda: len(first.received) > 5 and len(second.received) > 5)
+    assert robot.encodings == [robot.best]
+    assert robot.flags == [True]
+    await until(lambda: server.shows("flowing") and kind.count(server.view) == 2)
+    assert server.view.encoding == robot.best
+    first.leave()
+    await until(lambda: kind.count(server.view) == 1)
+    assert robot.encodings == [robot.best]
+    second.leave()
+    await until(lambda: server.shows("rest"))
+    await until(lambda: robot.encodings == [robot.best, None])
+    await until(lambda: robot.flags == [True, False])
+
+
+async def test_a_page_that_reloads_does_not_restart_the_request(kind: Kind, robot: Any, server: Server) -> None:
+    for _ in range(3):
+        page = await opened(server, kind, 4)
+        page.leave()
+        await asyncio.sleep(0.1)
+    assert robot.encodings == [robot.best]
+
+
+async def test_a_flag_that_was_up_stays_up(kind: Kind, robot: Any) -> None:
+    robot.raise_flag()
+    async with serving(robot) as server:
+        page = await opened(server, kind)
+        page.leave()
+        await until(lambda: server.shows("rest"))
+    assert robot.flags == []
+
+
+async def test_it_is_requested_again_while_nothing_comes(kind: Kind, robot: Any, server: Server) -> None:
+    await opened(server, kind)
+    robot.mute = True
+    count = len(robot.requests)
+    await until(lambda: server.shows("silent") and server.view.why.startswith(kind.silent))
+    await until(lambda: len(robot.requests) > count)
+    robot.mute = False
+    await until(lambda: server.shows("flowing"))
+
+
+async def _is_asked_for_nothing(kind: Kind, change: dict[str, Any] | None, why: str) -> None:
+    robot: Any = kind.robot({} if change is None else {**kind.robot.section, **change})
+    async with serving(robot) as server:
+        page = server.open(kind.page())
+        await until(lambda: server.shows("refused"))
+        assert why in server.view.why
+        page.send(b"\1" + bytes(8 + 640))  # of sound: a piece of a voice; of pictures: nonsense
+        await asyncio.sleep(0.6)
+        assert robot.published == []
+        assert server.subscribed == []
+
+
+async def test_a_robot_that_offers_nothing_or_topics_of_others_is_asked_for_nothing(kind: Kind) -> None:
+    """Nor is anything subscribed to that would bring the pictures, the sound or the commands of others."""
+    rows: list[tuple[dict[str, Any] | None, str]] = [
+        ({"available": False, "controls": False}, kind.lacking),
+        (None, kind.lacking),
+        ({"available": "yes"}, kind.lacking),
+        ({"controls": False}, kind.fixed),
+        *(({key: topic}, f"not its own ({key})") for key, topic in HOSTILE),
+    ]
+    await asyncio.gather(*(_is_asked_for_nothing(kind, change, why) for change, why in rows))
+
+
+@pytest.mark.parametrize("change", [{"controls": False}, *({key: topic} for key, topic in HOSTILE[:3])])
+async def test_capabilities_that_change_later_end_the_request(
+    kind: Kind, robot: Any, server: Server, change: dict[str, Any]
+) -> None:
+    await opened(server, kind)
+    robot.announce({**robot.section, **change})
+    await until(lambda: server.shows("refused"))
+    await until(lambda: robot.encodings == [robot.best, None] and robot.flags == [True, False])
+    assert {message.topic for message in robot.published} == {robot.request, robot.flag}
+
+
+@pytest.mark.parametrize("topic", ["incoming/elsewhere", "incoming/a/../../../victim"])  # ".." means nothing
+async def test_the_request_moves_to_another_topic_of_the_robots_own(
+    kind: Kind, robot: Any, server: Server, topic: str
+) -> None:
+    await opened(server, kind)
+    robot.announce({**robot.section, "command_topic": f"{REF}/{topic}"})
+    await until(lambda: f"{REF}/{topic}" in {message.topic for message in list(robot.published)})
+    assert robot.encodings == [robot.best, None]
+
+
+async def test_a_page_cannot_name_a_filter(kind: Kind, robot: Any, server: Server) -> None:
+    refs = ("+/+/+", "#", "", "pebble/robots/#", "a/b", "a/b/c/d", "$x/y/z")
+    pages = [server.open(kind.page(), ref=ref) for ref in refs]
+    await until(lambda: all(page.closed for page in pages))
+    assert robot.published == []
+
+
+async def test_a_robot_that_lists_no_encodings_sends_what_it_sends(kind: Kind) -> None:
+    robot: Any = kind.robot({key: value for key, value in kind.robot.section.items() if key != "encodings"})
+    async with serving(robot) as server:
+        await opened(server, kind, 4)
+        assert robot.encodings == [""]
+
+
+async def test_one_page_that_decodes_less_is_enough_for_another_encoding(
+    kind: Kind, robot: Any, server: Server
+) -> None:
+    await opened(server, kind)
+    plain = server.open(kind.page(), EVERYTHING - {robot.best})
+    await until(lambda: len(plain.received) > 3)
+    plain.leave()
+    await until(lambda: len(robot.encodings) == 3)
+    assert robot.encodings[0] == robot.encodings[2] == robot.best
+
+
+async def test_a_page_that_sends_what_is_not_understood_is_closed(kind: Kind, server: Server) -> None:
+    pages = [await opened(server, kind) for _ in kind.nonsense]
+    other = await opened(server, kind)
+    for page, message in zip(pages, kind.nonsense, strict=True):
+        page.send(message)
+    await until(lambda: all(page.closed is not None for page in pages))
+    assert other.closed is None
+
+
+async def test_closing_withdraws_and_closes_the_sockets(kind: Kind, robot: Any, server: Server) -> None:
+    page = await opened(server, kind)
+    await server.media.close()
+    await server.sound.close()
+    await until(lambda: page.closed is not None)
+    await until(lambda: robot.encodings[-1] is None)
+    late = server.open(kind.page())
+    await until(lambda: late.closed is not None)
+
+
+async def test_nothing_is_withdrawn_while_there_is_no_broker(kind: Kind, robot: Any, server: Server) -> None:
+    page = await opened(server, kind)
+    robot.hub.stop()
+    await until(lambda: not server.broker.connected)
+    page.leave()
+    await asyncio.sleep(1.2)
+    robot.hub.start()
+    await until(lambda: robot.encodings[-1] is None and robot.flags[-1] is False)
+
+
+async def test_pages_are_shown_that_pictures_and_sound_wait(kind: Kind, robot: Any, server: Server) -> None:
+    program = {"video": "camera_publisher", "audio": "audio_publisher"}[robot.medium]
+    robot.mute = True
+    server.open(kind.page())
+    await until(lambda: server.shows("starting"))
+    for state, shown in (("held", "held"), ("ready", "starting"), (7, "starting")):
+        status = {"t": 1, "value": {"services": {program: {"state": state}}}}
+        server.robots.receive(Message(f"{REF}/outgoing/status", msgspec.json.encode(status)), time.monotonic())
+        await until(lambda shown=shown: server.shows(shown))  # type: ignore[misc]

@@ -1,0 +1,271 @@
+"""The server between one robot's microphone and loudspeaker, and the pages that listen and talk."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from functools import partial
+from itertools import pairwise
+
+import pytest
+
+from pebble.contract import LINK, codec
+from pebble.contract.packets import Codec, Sound
+from pebble.contract.payloads import LinkState
+from pebble.extensions.fleet.roles import Role
+from pebble.extensions.page.media.sound import MAX_PACKETS, WINDOW, SoundQueue
+from pebble.extensions.page.media.talk import LATE_S, PIECE_BYTES, PIECES_PER_S, SILENT_S, Talk, Voice
+from pebble.transports import Message
+from tests.ext.page.media.robots import AUDIO, REF, UPLINK, Server, SoundPage, SoundRobot, serving, until
+
+pytestmark = pytest.mark.anyio
+PLAIN, NOTHING = frozenset({"pcm"}), frozenset[str]()
+
+
+@pytest.fixture
+def robot() -> SoundRobot:
+    return SoundRobot()
+
+
+@pytest.fixture
+def patient(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nothing that this machine delays is too late; that has tests of its own."""
+    monkeypatch.setattr("pebble.extensions.page.media.talk.LATE_S", 60.0)
+    monkeypatch.setattr("pebble.extensions.page.media.talk.SILENT_S", 60.0)
+
+
+# -- listening
+
+
+async def test_one_listener_without_opus_is_enough_for_pcm(robot: SoundRobot, server: Server) -> None:
+    page = server.open(SoundPage())
+    await until(lambda: page.received)
+    plain = server.open(SoundPage(), PLAIN)
+    await until(lambda: len(plain.received) > 3)
+    assert {Sound.unpack(packet).codec for packet in plain.received} == {Codec.PCM16LE}
+    plain.leave()
+    await until(lambda: robot.encodings == ["opus", "pcm", "opus"])
+
+
+async def test_a_page_that_cannot_play_what_comes_gets_a_reason() -> None:
+    robot = SoundRobot({**AUDIO, "encodings": ["opus"], "encoding": "opus"})
+    async with serving(robot) as server:
+        page = server.open(SoundPage(), PLAIN)
+        await until(lambda: server.view and server.view.why == "1 of 1 browsers cannot play opus")
+        assert page.received == []
+
+
+def test_the_queue_of_a_slow_page_is_bounded_and_its_oldest_is_dropped() -> None:
+    queue = SoundQueue()
+    packets = [bytes([number]) * 100 for number in range(200)]
+    for packet in packets:
+        queue.offer(packet)
+    assert [queue.take() for _ in range(MAX_PACKETS)] == packets[-MAX_PACKETS:]
+    assert queue.take() is None
+    sent = 0
+    for packet in packets:
+        queue.offer(packet)
+        sent += queue.take() is not None
+    assert sent == WINDOW - MAX_PACKETS
+    queue.acknowledge(5)
+    assert [queue.take() is not None for _ in range(6)] == [True] * 5 + [False]
+    queue.acknowledge(1 << 31)  # more than was sent
+    assert queue.take() is not None
+    queue.offer(bytes(300_000))
+    assert queue.take() is None, "larger than everything that may wait"
+
+
+async def test_a_page_that_acknowledges_nothing_gets_a_window_and_delays_no_other(
+    robot: SoundRobot, server: Server
+) -> None:
+    slow, fast = server.open(SoundPage(None)), server.open(SoundPage())
+    await until(lambda: len(fast.received) > WINDOW + 30)
+    assert len(slow.received) == WINDOW
+    slow.acknowledge(WINDOW)
+    await until(lambda: len(slow.received) > WINDOW)
+    newest = [Sound.unpack(page.received[-1]).sequence for page in (slow, fast)]
+    assert newest[1] - newest[0] <= MAX_PACKETS + 2
+
+
+async def test_what_is_no_sound_is_not_passed_on(robot: SoundRobot, server: Server) -> None:
+    page = server.open(SoundPage())
+    await until(lambda: page.received)
+    bad = [b"", b"PBAT", b"{}", Sound(9, 1, 16000, 1, 1, 1, b"xx").pack(), bytes(300_000)]
+    big = Sound(1, 1, 16000, 320, 1, 1, bytes(300_000)).pack()
+    for payload in (*bad, big):
+        robot.send(payload)
+    count = len(page.received)
+    await until(lambda: len(page.received) > count + 5)
+    assert not set(page.received) & {*bad, big}
+
+
+# -- talking
+
+
+async def test_a_talk_to_a_robot_without_sound_is_refused() -> None:
+    async with serving(SoundRobot({})) as server:
+        page = server.open(SoundPage())
+        await page.speak(1, 3)
+        await until(lambda: page.talks)
+        assert page.talks == [{"talk": 1, "on": False, "why": "it has no sound"}]
+
+
+async def test_no_voice_takes_the_room_of_commands_on_a_thin_link(robot: SoundRobot, server: Server) -> None:
+    link = codec.encode(LINK, LinkState(level="thin", drive_hz=4, rtt_ms=600, queue_ms=0, t=1))
+    server.robots.receive(Message(LINK.topic(REF), link), time.monotonic())
+    page = server.open(SoundPage(), NOTHING)
+    await page.speak(1, 3)
+    await until(lambda: page.talks)
+    assert page.talks == [{"talk": 1, "on": False, "why": "The connection of goob is too slow for a voice"}]
+    assert robot.voice == []
+
+
+@pytest.mark.usefixtures("patient")
+async def test_a_voice_reaches_the_robot_which_is_asked_to_play_it(robot: SoundRobot, server: Server) -> None:
+    page = server.open(SoundPage(), NOTHING)
+    sent = await page.speak(1, 50)
+    await until(lambda: len(robot.voice) == 50)
+    assert b"".join(packet.body for packet in robot.voice) == sent
+    assert {(one.codec, one.channels, one.rate, one.samples) for one in robot.voice} == {(1, 1, 16000, 320)}
+    assert all(b.sequence == a.sequence + 1 for a, b in pairwise(robot.voice))
+    assert all(abs(one.captured_ms - 1000 * time.time()) < 10_000 for one in robot.voice)
+    assert robot.flags == [True]
+    assert robot.encodings == ["opus"]
+    assert page.received == []  # it only talks
+    assert page.talks == [{"talk": 1, "on": True, "why": ""}]
+    assert server.view.talker == "alice"
+    assert server.view.listeners == 0
+    assert server.noted == [(REF, "alice")]
+    page.end(1)
+    await until(lambda: server.view.talker == "")
+    page.leave()
+    await until(lambda: robot.flags == [True, False])
+
+
+@pytest.mark.usefixtures("patient")
+async def test_a_second_talker_is_refused_until_the_first_one_is_done(robot: SoundRobot, server: Server) -> None:
+    bob, eve = server.open(SoundPage(), user="bob"), server.open(SoundPage(), user="eve")
+    talking = asyncio.create_task(bob.speak(1, 40))
+    await until(lambda: server.view and server.view.talker == "bob")
+    await eve.speak(1, 5)
+    await until(lambda: eve.talks)
+    assert eve.talks == [{"talk": 1, "on": False, "why": "bob is talking"}]
+    sent = await talking
+    bob.end(1)
+    eve.send_piece(1, 6, bytes(PIECE_BYTES))  # the refused one does not begin now
+    await until(lambda: server.view.talker == "")
+    await until(lambda: len(robot.voice) == 40)
+    assert b"".join(packet.body for packet in robot.voice) == sent
+    await eve.speak(2, 5)
+    await until(lambda: server.view.talker == "eve")
+    numbers = [packet.sequence for packet in robot.voice]
+    assert all(b > a for a, b in pairwise(numbers))
+    assert server.noted == [(REF, "bob"), (REF, "eve")]
+
+
+async def test_a_viewer_listens_and_does_not_talk(robot: SoundRobot, server: Server) -> None:
+    page = server.open(SoundPage(), role=Role.VIEWER)
+    await until(lambda: page.received)
+    await page.speak(1, 3)
+    await until(lambda: page.talks)
+    assert page.talks == [{"talk": 1, "on": False, "why": "The role viewer may not do this"}]
+    assert robot.voice == []
+    assert UPLINK not in {message.topic for message in robot.published}
+
+
+async def test_a_talk_ends_with_its_socket_and_after_a_second_without_sound(
+    robot: SoundRobot, server: Server, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bob, eve = server.open(SoundPage(), user="bob"), server.open(SoundPage(), user="eve")
+    await bob.speak(1, 3)
+    await until(lambda: bob.talks[-1:] == [{"talk": 1, "on": False, "why": "No sound came in time for 1 s"}])
+    await until(lambda: server.view.talker == "")
+    monkeypatch.setattr("pebble.extensions.page.media.talk.SILENT_S", 60.0)
+    bob.send_piece(1, 3, bytes(PIECE_BYTES))
+    await bob.speak(2, 3)
+    await until(lambda: server.view.talker == "bob")
+    assert [one["on"] for one in bob.talks] == [True, False, True]
+    bob.leave()
+    await until(lambda: server.view.talker == "")
+    await eve.speak(1, 3)
+    await until(lambda: eve.talks)
+    assert eve.talks == [{"talk": 1, "on": True, "why": ""}]
+
+
+@pytest.mark.usefixtures("patient")
+async def test_a_talk_ends_when_the_robots_sound_is_refused(robot: SoundRobot, server: Server) -> None:
+    page = server.open(SoundPage(), NOTHING)
+    talking = asyncio.create_task(page.speak(1, 250))
+    await until(lambda: server.view and server.view.talker == "alice")
+    robot.announce({**AUDIO, "controls": False})
+    await talking
+    await until(lambda: len(page.talks) > 1)
+    assert page.talks[1:] == [{"talk": 1, "on": False, "why": "its sound cannot be switched on from here"}]
+    await until(lambda: server.view.talker == "")
+
+
+async def test_a_talk_ends_when_the_broker_takes_nothing(robot: SoundRobot, server: Server) -> None:
+    server.broker.publish = lambda *_, **__: False  # type: ignore[method-assign]
+    page = server.open(SoundPage(), NOTHING)
+    await page.speak(1, 50)
+    await until(lambda: len(page.talks) > 1)
+    assert page.talks[1:] == [{"talk": 1, "on": False, "why": "The server cannot reach the broker"}]
+
+
+async def test_the_voice_goes_to_the_robots_own_topic_only() -> None:
+    for named, topic in [
+        (f"{REF}/incoming/voice", f"{REF}/incoming/voice"),
+        ("pebble/robots/victim/incoming/audio-stream", UPLINK),
+        (f"{REF}/incoming/drive-values", UPLINK),
+    ]:
+        robot = SoundRobot({**AUDIO, "uplink_topic": named})
+        async with serving(robot) as server:
+            await server.open(SoundPage(), NOTHING).speak(1, 3)
+            await until(partial(_was_published, robot, topic))
+            assert all(one.topic.startswith(f"{REF}/incoming/") for one in robot.published)
+
+
+def _was_published(robot: SoundRobot, topic: str) -> bool:
+    return topic in {one.topic for one in list(robot.published)}
+
+
+def test_what_a_stalled_connection_held_back_is_not_played() -> None:
+    talk = Talk(1, 0.0)
+    assert all(talk.takes(number, 10 + number / PIECES_PER_S) for number in range(100))
+    stalled = 10 + 100 / PIECES_PER_S + 1.0
+    taken = [talk.takes(number, stalled) for number in range(100, 150)]
+    assert taken.index(True) == pytest.approx(50 * (1 - LATE_S), abs=2)
+    assert all(talk.takes(number, 10 + number / PIECES_PER_S + 0.02) for number in range(150, 200))
+    assert not talk.is_over(10 + 200 / PIECES_PER_S)
+    assert talk.is_over(10 + 200 / PIECES_PER_S + SILENT_S + 0.1)
+
+
+def test_a_talk_of_which_everything_is_late_is_over() -> None:
+    talk = Talk(1, 0.0)
+    assert talk.takes(0, 10.0)
+    lost = 10.0 + LATE_S + 0.1  # the page's microphone has skipped so much
+    assert not any(talk.takes(number, lost + number / PIECES_PER_S) for number in range(1, 60))
+    assert talk.is_over(lost + 60 / PIECES_PER_S)
+
+
+def test_a_microphone_whose_clock_is_slow_works_for_an_hour() -> None:
+    talk = Talk(1, 0.0)
+    assert all(talk.takes(number, number / PIECES_PER_S * 1.0005) for number in range(3600 * PIECES_PER_S))
+
+
+def test_the_numbers_of_packets_only_grow_also_of_another_server() -> None:
+    piece, numbers = bytes(PIECE_BYTES), []
+    for server in range(3):
+        voice = Voice()
+        for talk in range(3):
+            now = 1.7e9 + 100 * server + 10 * talk
+            voice.begin(now)
+            numbers += [Sound.unpack(voice.packet(piece, now)).sequence for _ in range(400)]
+    assert all(a < b for a, b in pairwise(numbers))
+
+
+def test_after_the_last_number_comes_1() -> None:
+    voice = Voice()
+    voice.begin((0xFFFF_FFFE + 0.5) / PIECES_PER_S)
+    numbers = [Sound.unpack(voice.packet(bytes(PIECE_BYTES), 1.0)).sequence for _ in range(3)]
+    assert numbers == [0xFFFF_FFFF, 1, 2]

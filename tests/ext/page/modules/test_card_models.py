@@ -1,0 +1,331 @@
+"""What is behind the cards Lights, Sounds and Autonomy, without a browser: in Node.js."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from typing import Any
+
+from pebble.contract.forms import Setting
+from tests.ext.page.in_node import Rows, Script, evaluate, rows
+
+_STORED = """
+const stored = new Map();
+const getItem = (key) => stored.get(key) ?? null;
+globalThis.localStorage = { getItem, setItem: (key, value) => stored.set(key, value) };
+const texts = (map) => Object.fromEntries(map);
+"""
+
+#: The services of a page before one robot; ``sent`` is what it asks for.
+_PAGE = """
+const ref = "pebble/robots/goob";
+const values = {
+  "": { "web/broker": { problem: "" } },
+  [ref]: {
+    "web/liveness": { online: true },
+    capabilities: { value: {
+      lights: { solid: true, flash: true }, soundboard: { available: true, controls: true },
+      autonomy: { available: true, controls: true }, drive: { available: true, arbitrates: true },
+    } },
+  },
+};
+const sent = [];
+const followers = new Set();
+const onChange = (fn) => { followers.add(fn); return () => followers.delete(fn); };
+const page = {
+  connection: { isOpen: true, may: (right) => right === "drive", answers: new Map(), onChange },
+  store: { get: (at, metric) => (metric in (values[at] ?? {}) ? { value: values[at][metric] } : undefined) },
+  commands: {
+    setLights: (_ref, colour) => sent.push(colour),
+    playSound: (_ref, file, repeat) => sent.push([file, repeat]),
+  },
+};
+"""
+
+BLACK = {"r": 0, "g": 0, "b": 0}
+ORANGE = {"r": 1, "g": 0.533, "b": 0}
+lights = Script({"ui/cards/lights-model.js": "Lights, lightsOf, supported, toggleFlash"}, _STORED + _PAGE, anew=True)
+_ANSWER = """
+const answer = (n, op) => { page.connection.answers.set(n, { op, n }); [...followers].forEach((fn) => fn()); };
+const one = lightsOf(ref);
+const lit = () => [one.mode, one.colour];
+"""
+#: What is asked of lights, and what is sent.
+ASKED = {
+    '{ mode: "solid" }': ORANGE,
+    '{ colour: "#0000ff" }': {"r": 0, "g": 0, "b": 1},
+    '{ mode: "flash", period: 0.5 }': ORANGE | {"period": 0.5},
+    '{ mode: "flash", period: 99 }': ORANGE | {"period": 10},
+    '{ mode: "flash", period: NaN }': ORANGE | {"period": 2},
+    '{ mode: "off" }': BLACK,
+    '{ colour: "red" }': ORANGE,
+}
+NO_FLASH = "goob has no lights that flash"
+WHY_NO_FLASH = {
+    "page.connection.isOpen = false": "No connection to the server",
+    'values[""]["web/broker"].problem = "refused"': "The server cannot reach the broker",
+    "page.connection.may = () => false": "Log in as driver to use this",
+    'values[ref]["web/liveness"].online = false': "goob is silent",
+    "values[ref].capabilities.value.lights.controls = false": "goob takes no such commands",
+    "values[ref].capabilities.value.lights.flash = false": NO_FLASH,
+    "values[ref].capabilities = null": NO_FLASH,
+    "delete values[ref]": NO_FLASH,
+}
+#: Sections of capabilities, and whether such lights stay on, and flash.
+ABLE = {
+    "{ solid: true, flash: true }": [True, True],
+    "{ solid: true, flash: false }": [True, False],
+    "{ available: true }": [True, True],
+    "{ available: true, flash: false }": [True, False],
+    '{ solid: "yes", available: 1 }': [False, False],
+    "{}": [False, False],
+}
+REMEMBERED = "null", "7", '"x"', "[]", '{"colour":"url(x)","period":"2","mode":"boom","steady":[]}'
+# fmt: off
+LIGHTS: Rows = {
+    "a dragged colour is sent now and at last": ("""
+        const one = lightsOf(ref);
+        for (let blue = 10; blue < 30; blue++) one.ask(page, { colour: `#0000${blue}` });
+        await new Promise((resolve) => setTimeout(resolve, 300));
+        result = sent.map(({ b }) => b);""", [0.063, 0.161]),
+    **{f"what is asked of lights: {change}": (f"lightsOf(ref).ask(page, {change}); result = sent;", [expected])
+        for change, expected in ASKED.items()},
+    **{f"a flash ends in what was before: {before}": (f"""
+        const one = lightsOf(ref);
+        one.ask(page, {{ mode: "{before}" }});
+        result = [toggleFlash(page, ref), one.mode, toggleFlash(page, ref), one.mode];""", ["", "flash", "", before])
+        for before in ("solid", "off")},
+    "lights that were refused are as before": (f"""{_ANSWER}
+        one.ask(page, {{ mode: "solid", colour: "#0000ff" }});
+        answer(1, "done");
+        one.sentAt = -Infinity;
+        result = [toggleFlash(page, ref), lit()];
+        answer(2, "refused");
+        result.push(lit(), followers.size);
+        one.sentAt = -Infinity;
+        page.commands.setLights = () => 0;
+        one.ask(page, {{ mode: "off" }});
+        result.push(lit());""", ["", ["flash", "#0000ff"], ["solid", "#0000ff"], 0, ["solid", "#0000ff"]]),
+    "a refusal does not undo what was asked after it": (f"""{_ANSWER}
+        one.ask(page, {{ mode: "solid" }});
+        one.sentAt = -Infinity;
+        one.ask(page, {{ mode: "off" }});
+        answer(1, "refused");
+        result = [lit()[0]];
+        answer(2, "done");
+        result.push(lit()[0], followers.size);""", ["off", "off", 0]),
+    "lights that only flash are off in black": ("""
+        values[ref].capabilities.value.lights = { solid: false, flash: true };
+        lightsOf(ref).ask(page, { mode: "off" }); result = sent;""", [BLACK | {"period": 2}]),
+    "a flash of a silent robot can be switched off": ("""
+        const one = lightsOf(ref);
+        one.ask(page, { mode: "flash" });
+        values[ref]["web/liveness"].online = false;
+        result = [toggleFlash(page, ref), one.mode, toggleFlash(page, ref)];""", ["", "off", "goob is silent"]),
+    **{f"why lights do not flash: {change}": (f"{change}; result = [toggleFlash(page, ref), sent];", [why, []])
+        for change, why in WHY_NO_FLASH.items()},
+    **{f"what lights can do: {section}": (f"""
+        const {{ solid, flash }} = supported({{ value: {{ lights: {section} }} }});
+        result = [solid, flash];""", expected) for section, expected in ABLE.items()},
+    **{f"lights ignore what they cannot have remembered: {found}": (f"""
+        globalThis.localStorage = {{ getItem: () => {json.dumps(found)}, setItem() {{}} }};
+        const {{ colour, period, mode, steady }} = new Lights("other");
+        result = [colour, period, mode, steady];""", ["#ff8800", 2, "", "off"]) for found in REMEMBERED},
+}
+# fmt: on
+
+# -- sounds
+
+sounds = Script({"ui/cards/sounds-model.js": "grouped, play, repeatLast"}, _STORED + _PAGE, anew=True)
+FILES = ["horn.wav", "Bell.wav", "animals/Cat.wav", "animals/dog.wav", "animals/wild/cat.wav"]
+WILD = ["animals/wild/", FILES[4:]]
+#: What is searched, how many are shown at most, and the groups; and how many more there are.
+GROUPS = [
+    ("", 60, [["", FILES[:2]], ["animals/", FILES[2:4]], WILD], 0),
+    ("CAT", 60, [["animals/", FILES[2:3]], WILD], 0),
+    ("  wild   cat ", 60, [WILD], 0),
+    ("nothing", 60, [], 0),
+    ("", 2, [["", FILES[:2]]], 3),
+]
+# fmt: off
+SOUNDS: Rows = {
+    "the last sound is repeated as it was played": ("""
+        result = [repeatLast(page, ref), play(page, ref, "a/horn.wav", true), repeatLast(page, ref),
+          repeatLast(page, "pebble/robots/fred"), sent];""",
+        ["Play one sound first", "", "", "Play one sound first", [["a/horn.wav", True]] * 2]),
+    "what cannot be played is not repeated": ("""
+        result = [play(page, ref, "x".repeat(1001), false), repeatLast(page, ref)];
+        values[ref].capabilities.value.soundboard.controls = false;
+        result.push(play(page, ref, "horn.wav", false), repeatLast(page, ref), sent);""",
+        ["Its name is too long", "Play one sound first", *["goob takes no such commands"] * 2, []]),
+    **{f"{most} clips with '{words}' are grouped by folder": (
+        f"result = grouped({json.dumps(FILES)}, '{words}', {most});", {"folders": folders, "more": more})
+        for words, most, folders, more in GROUPS},
+}
+# fmt: on
+
+# -- forms of scripts
+
+forms = Script(
+    {"ui/cards/form-model.js": "filled, hint, lastScript, moreWords, remember, remembered, scripts"},
+    _STORED,
+)
+
+
+def entry(key: str, kind: Any = "string", **more: Any) -> dict[str, Any]:
+    return Setting(key=key, type=kind, **more).entry()
+
+
+ALL = [
+    entry("name", default="goob"),
+    entry("laps", "int", default=3, min=1, max=9, step=1),
+    entry("power", "float", default=0.5, min=0.1, max=1.0),
+    entry("search", "bool", default=True),
+    entry("family", "enum", default="A", options=["A", "B"]),
+    entry("tag", "int", required=True),
+]
+GIVEN = {"name": "naïve café", "laps": "4", "power": "0.25", "search": "false", "family": "B", "tag": "0", "other": "x"}
+SENT = {"name": "naïve café", "laps": 4, "power": 0.25, "search": False, "family": "B", "tag": 0}
+HINTS = [
+    (entry("a", "int", min=1, max=9, default=3), "A whole number from 1 to 9"),
+    (entry("a", "float", min=0.5), "A number, at least 0.5"),
+    (entry("a", "float", max=2, default=1.5), "A number, at most 2"),
+    (entry("a", "int"), "A whole number"),
+    (entry("a", "bool", default=False), ""),
+    (entry("a"), ""),
+]
+LISTED = {"files": [{"file": "x", "configs": [one | {"key": f"k{n}"} for n, (one, _) in enumerate(HINTS)]}]}
+SAME = ["Follow (a)", "Follow (b)", "Go"]
+#: Payloads, and the labels of the scripts that they list.
+LABELS = {
+    **dict.fromkeys(("undefined", "{}"), None),
+    '{ files: [{ file: "a", label: "Follow", configs: [] }, { file: "b", label: "Follow", configs: [] }, '
+    '{ file: "c", label: "Go", configs: [] }] }': SAME,
+}
+NOT_STORED = "{", "7", '{"a":1}', '[[1,2,3],["goob","a",{"x":1}],["goob","a",[["x",1]]],null]'
+# fmt: off
+FORMS: Rows = {
+    "what was filled in is sent in the types of JSON": (f"""
+        result = [{{ tag: "7" }}, {json.dumps(GIVEN)}].map(
+          (texts) => filled({json.dumps(ALL)}, new Map(Object.entries(texts))));""", [{"tag": 7}, SENT]),
+    "hints": (
+        f"result = scripts({json.dumps(LISTED)})[0].fields.map(hint);", [expected for _, expected in HINTS]),
+    **{f"the scripts of {payload}": (f"result = scripts({payload})?.map((one) => one.label);", labels)
+        for payload, labels in LABELS.items()},
+    "three settings come first, those that a script names, and what must be filled in": ("""
+        const configs = ["a", "b", "c", "d"].map((key) => ({ key }));
+        configs.push({ key: "e", required: true, default: null });
+        result = [undefined, ["c", "b"], ["gone"], ["e", "d", "c", "b"]].map((main) => {
+          const [one] = scripts({ files: [{ file: "x", configs, main }] });
+          return [one.main, one.more].map((fields) => fields.map(({ key }) => key).join("")).join(" ");
+        });""", ["abce d", "cbe ad", "abce d", "edc ab"]),
+    "what else there is": ("""
+        const [{ more }] = scripts({ files: [{ file: "x", configs: ["a", "b", "c", "d"].map((key) => ({ key })) }] });
+        const words = (fields, texts) => moreWords(fields, new Map(texts));
+        result = [words(more, []), words([...more, ...more], []), words(more, [["d", "1"]])];
+        """, ["1 more, at its default", "2 more, all at their defaults", "1 more, 1 changed"]),
+    "forms are remembered by robot and script": ("""
+        remember("goob", "a", new Map([["x", "1"]]));
+        remember("goob", "b", new Map([["x", "2"]]));
+        remember("fred", "a", new Map([["x", "3"]]));
+        result = [texts(remembered("goob", "a")), texts(remembered("goob", "b")), texts(remembered("fred", "b")),
+          lastScript("goob"), lastScript("fred"), lastScript("lamp")];""",
+        [{"x": "1"}, {"x": "2"}, {}, "b", "a", ""]),
+    "the memory of forms is bounded": ("""
+        for (let n = 0; n < 40; n++) remember("goob", `script ${n}`, new Map([["x", "y".repeat(200)]]));
+        const many = JSON.parse(stored.get("pebble forms")).length;
+        for (let n = 0; n < 40; n++) remember("goob", `script ${n}`, new Map([["x", "y".repeat(20000)]]));
+        result = [many, stored.get("pebble forms").length < 60000, texts(remembered("goob", "script 39")).x.length];""",
+        [32, True, 20000]),
+    **{f"a memory of something else is none: {found}": (f"""
+        stored.set("pebble forms", {json.dumps(found)});
+        result = [texts(remembered("goob", "a")), lastScript("goob")];""", [{}, ""]) for found in NOT_STORED},
+}
+# fmt: on
+
+# -- what may be asked, and scripts that run
+
+SERVER, BROKER, DRIVER, MAINTAINER = (
+    "No connection to the server",
+    "The server cannot reach the broker",
+    "Log in as driver to use this",
+    "Log in as maintainer to use this",
+)
+may = Script({"ui/parts/why-not.js": "whyNot, whyNotEnd", "ui/parts/parts.js": "isGone"}, _PAGE)
+#: What ends something may be asked of a silent robot: why it, what a driver and what a maintainer does may not.
+WHYS = {
+    "": ["", "", MAINTAINER],
+    "page.connection.may = () => true": ["", "", ""],
+    "page.connection.may = () => false": [DRIVER, DRIVER, MAINTAINER],
+    'values[ref]["web/liveness"].online = false': ["", "goob is silent", MAINTAINER],
+    'values[""]["web/broker"].problem = "x"': ["", BROKER, MAINTAINER],
+    'values[""]["web/broker"].connected = false': [BROKER] * 3,
+    "page.connection.isOpen = false": [SERVER] * 3,
+}
+#: The age of a value and its usual period in seconds, and whether its robot is online and the value gone.
+GONE = [
+    (9, 1, True, False),
+    (11, 1, True, True),
+    (11, 5, True, False),
+    (16, 5, True, True),
+    (99, 0, True, False),
+    (0, 1, False, True),
+]
+# fmt: off
+MAY: Rows = {
+    **{f"what may be asked: {change}": (
+        f'{change}; result = [whyNotEnd(page), whyNot(page, ref), whyNot(page, ref, "", "system")];', whys)
+        for change, whys in WHYS.items()},
+    **{f"after {age} s of {period} s a value is gone: {gone}": (
+        f"result = isGone({{ age: {1000 * age}, period: {1000 * period} }}, {json.dumps(online)});", gone)
+        for age, period, online, gone in GONE},
+}
+# fmt: on
+
+
+def test_the_newest_answers_are_remembered_by_the_number_of_the_command() -> None:
+    steps = """
+    const connection = new Connection("v");
+    const answer = (n, op) => connection.answered({ op, cmd: "outlet", ref: "a", n, why: "no" });
+    answer(1, "refused");
+    answer(2, "done");
+    result = [connection.answers.get(1).op, connection.answers.get(2).op];
+    for (let n = 3; n <= 500; n++) answer(n, "done");
+    answer(0, "refused");
+    result.push(connection.answers.size, connection.answers.has(500), connection.answers.has(300));"""
+    assert evaluate({"ui/parts/models.js": "Connection"}, steps) == ["refused", "done", 200, True, False]
+
+
+autonomy = Script({"ui/cards/autonomy-model.js": "Since, whyNotStarted"}, _PAGE)
+BOB = 'values[ref]["web/driver"] = { by: "bob", you: %s, idle_s: %s }'
+WHY_NOT_STARTED = {
+    "": "",
+    "page.connection.may = () => false": DRIVER,
+    'values[ref]["web/liveness"].online = false': "goob is silent",
+    'values[ref]["web/liveness"].online = null': "goob has not been seen yet",
+    'values[ref]["web/estop"] = { latched: true, by: "eve" }': "Stopped by eve",
+    "values[ref].capabilities.value.autonomy.controls = false": "goob takes no such commands",
+    BOB % ("false", "null"): "",
+    BOB % ("false", "null") + "; drive.arbitrates = false": "bob is driving",
+    BOB % ("true", "null") + '; drive.arbitrates = "yes"': "You are driving",
+    BOB % ("false", "0.1") + "; drive.arbitrates = false": "",
+}
+# fmt: off
+AUTONOMY: Rows = {
+    "since when a script runs": ("""
+        const since = new Since();
+        const see = (status, at) => { since.update(status, at); return [since.at, since.isExact]; };
+        const follow = { running: true, file: "follow", pid: 7 };
+        result = [see(follow, 100), see({ ...follow, overridden: true }, 200), see({ running: false }, 300),
+          see(follow, 400), see({ ...follow, pid: 8 }, 500)];""",
+        [[100, False], [100, False], [300, True], [400, True], [500, True]]),
+    **{f"why no script can be started: {change}": (f"""
+        const {{ drive }} = values[ref].capabilities.value; {change}; result = whyNotStarted(page, ref);""", why)
+        for change, why in WHY_NOT_STARTED.items()},
+}
+# fmt: on
+
+
+@rows((lights, LIGHTS), (sounds, SOUNDS), (forms, FORMS), (may, MAY), (autonomy, AUTONOMY))
+def test_each(found: Callable[[], Any], expected: Any) -> None:
+    assert found() == expected

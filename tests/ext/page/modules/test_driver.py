@@ -1,0 +1,152 @@
+"""The page's driver with events, gamepads and a socket that are made up, and the end of a session; in Node.js."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+
+from tests.ext.page.in_node import Rows, Script, evaluate, rows
+
+_DRIVER = """
+let pads = [];
+let dialog = null;
+const define = (name, value) => Object.defineProperty(globalThis, name, { value, configurable: true });
+define("document", { hidden: false, hasFocus: () => true, querySelector: () => dialog, activeElement: null });
+define("navigator", { getGamepads: () => pads });
+const done = [];
+const REF = "pebble/robots/goob";
+const store = new Store(undefined, (flush) => flush());
+const facts = {
+  "web/liveness": { online: true }, "web/driver": { you: true, by: "anna" },
+  capabilities: { value: { drive: { available: true } } },
+};
+for (const [metric, value] of Object.entries(facts)) store.set(REF, metric, value);
+const you = { drives: true, rights: ["drive"], words: {} };
+const socket = { state: "open", you, roundTripMs: 5, restart() {}, send: (op) => done.push(op.op) };
+const estop = { press: (_, why) => done.push(`estop: ${why}`) };
+const driver = new Driver({ socket, store, estop });
+driver.select(REF);
+driver.pads = new Pads(driver);
+driver.onInterrupt = () => done.push("ended");
+driver.actions = new Actions((id, phase) => done.push(`${id} ${phase}`));
+const pad = (z, ...pressed) => ({
+  id: "pad", index: 0, connected: true, axes: [0, -z], timestamp: stamp++,
+  buttons: Array.from({ length: 16 }, (_, i) => ({ pressed: pressed.includes(i) })),
+});
+let stamp = 0;
+const seen = (...samples) => samples.forEach((one) => { pads = [one]; driver.tick(); });
+const key = (code, more = {}) =>
+  driver.keyDown({ code, key: code, target: {}, timeStamp: performance.now(), preventDefault() {}, ...more });
+driver.tick();
+await null;
+done.length = 0;
+"""
+
+
+_MODULES = {
+    "core/driver.js": "Driver",
+    "core/store.js": "Store",
+    "core/actions.js": "Actions",
+    "core/pads.js": "Pads",
+}
+_ALL = "await null;\nresult ??= done;"
+#: What was done: ops that were sent, emergency stops, actions, and what ends a talk.
+driver = Script(_MODULES, _DRIVER, _ALL)
+
+
+# -- what else ends with a gesture, and gamepads
+
+ENDS = [
+    "driver.latch('button')",
+    "driver.space()",
+    "driver.leave()",
+    "driver.take()",
+    "driver.release()",
+    "driver.select('')",
+    "driver.lost()",
+    "driver.clock.lookedAt -= 300; driver.tick()",
+    "driver.clock.base -= 1000; driver.tick()",
+    "key('MetaLeft', { key: 'Meta' })",
+    "driver.refused({ cmd: 'drive', ref: REF, g: 1, why: 'Commands are late' })",
+    "dialog = {}; driver.tick()",
+    "socket.roundTripMs = 9999; driver.tick()",
+]
+# fmt: off
+DRIVER: Rows = {
+    **{f"what ends a gesture lets go of what else is held: {end}": (f"""
+        key('KeyW'); key('KeyT'); await null; result = [done.at(-1)]; done.length = 0; {end};
+        await null; result.push(['talk up', 'ended'].every((one) => done.includes(one)));""", ["talk down", True])
+        for end in ENDS},
+    "the end of a gesture and a refusal of another one end nothing else": ("""
+        key("KeyW"); key("KeyT");
+        driver.refused({ cmd: "drive", ref: REF, g: 7, why: "" });
+        driver.keyUp({ code: "KeyW", key: "w" }); driver.tick(); await null;
+        result = [driver.gestureActive, done.filter((one) => one === "talk up" || one === "ended")];""", [False, []]),
+    "what ends a talk cannot keep a stop from being sent": ("""
+        process.on("uncaughtException", () => {});
+        driver.onInterrupt = () => { throw new Error("no"); };
+        driver.latch("button"); result = done;""", ["estop: button"]),
+    "a list that closes without a choice was closed by Escape": ("""
+        const list = { value: "a", matches: () => false, closest() { return this.open ? this : null; } };
+        document.activeElement = list;
+        const close = (value) => {
+          list.open = true; driver.tick(); Object.assign(list, { open: false, value }); driver.tick(); };
+        close("b"); key("Escape"); const chosen = done.length;
+        driver.escapes.pressedAt = -Infinity; close("b"); key("Escape"); result = [chosen, ...done];""",
+        [0, "estop: Escape twice"]),
+    "a space bar that is held stops again and again": (
+        "key('Space'); key('Space', { repeat: true }); await null;", ["stop", "stop", "ended", "ended"]),
+    "a space bar that is held on a button stops once": ("""
+        const target = { matches: (one) => one.includes("button") };
+        key("Space", { target }); key("Space", { target, repeat: true }); await null;""", ["stop", "ended"]),
+    "a space bar switches what has the focus as well": ("""
+        let prevented = 0;
+        const on = (selector) => key("Space", {
+          target: { matches: (all) => all.split(", ").includes(selector) }, preventDefault: () => prevented++ });
+        on("input[type=checkbox]"); on("button"); const pressed = prevented; on("div");
+        await null; result = [pressed, prevented, done.filter((one) => one === "stop").length];""", [0, 1, 3]),
+    "another gamepad has to be seen in neutral though the one before was": ("""
+        const other = (z) => ({ ...pad(z), id: "other" });
+        seen(pad(0), other(1)); result = [driver.inputs.pad.z];
+        seen(other(0), other(1)); result.push(driver.inputs.pad.z);""", [0, 1]),
+    "the emergency stop of a gamepad comes before all that may fail": ("""
+        driver.pads.read = () => { throw new Error("no"); };
+        console.error = () => {}; seen(pad(0, 8, 9));
+        result = [...done];""", ["estop: gamepad"]),
+    "the buttons of a gamepad stop once each time": ("""
+        seen(pad(0), pad(1, 8, 9), pad(1, 8, 9), pad(1, 0), pad(0), pad(1, 0, 8, 9), pad(1, 0));
+        seen(pad(0), pad(1, 0)); result = done.filter((one) => /stop/.test(one));""",
+        ["estop: gamepad", "stop", "estop: gamepad", "stop"]),
+    "until their mappings are here gamepads only stop": ("""
+        driver.actions = driver.pads = null; seen(pad(0), pad(1), pad(1, 0));
+        result = [done[0], driver.gestureActive, driver.inputs.pad];""", ["stop", False, {"x": 0, "z": 0, "y": 0}]),
+    "an axis that never rests in the middle blocks no keys": ("""
+        const lever = pad(1); seen(lever); driver.inputs.padMovedAt -= 10_000; seen(lever);
+        key("KeyW"); result = [driver.inputs.padFrozen, driver.reason(), driver.gestureActive];""",
+        [False, None, True]),
+}
+# fmt: on
+
+
+# -- a session that has ended
+
+
+@pytest.mark.parametrize(("answer", "reloads"), [("opaqueredirect", 1), ("basic", 0)])
+def test_a_session_that_has_ended_leads_to_the_login_which_leads_back(answer: str, reloads: int) -> None:
+    """The server redirects each screen to the login, which then opens that screen."""
+    steps = """let reloads = 0;
+    const define = (name, value) => Object.defineProperty(globalThis, name, { value, configurable: true });
+    define("location", { reload: () => (reloads += 1) });
+    define("fetch", async () => ({ type: given }));
+    const socket = new ControlSocket({ store: {}, version: "1" });
+    socket.lost(4401);
+    await new Promise((resolve) => setImmediate(resolve));
+    result = reloads;"""
+    assert evaluate({"core/control-socket.js": "ControlSocket"}, steps, answer) == reloads
+
+
+@rows((driver, DRIVER))
+def test_each(found: Callable[[], Any], expected: Any) -> None:
+    assert found() == expected

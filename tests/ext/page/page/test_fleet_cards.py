@@ -1,0 +1,114 @@
+"""The cards of the fleet: what a press opens, many robots in groups, and the first steps of a newcomer."""
+
+import pytest
+from playwright.sync_api import Locator
+
+from tests.ext.page.canned import CannedServer, Show, State
+from tests.ext.page.states import GOOB, STATES, estop, robot
+
+pytestmark = pytest.mark.page
+
+#: Where the card is pressed, as parts of its width and height.
+PLACES = {"top left": (0.02, 0.02), "centre": (0.5, 0.5), "bottom left": (0.02, 0.98)}
+
+
+@pytest.mark.parametrize("place", PLACES.values(), ids=PLACES)
+def test_the_whole_card_opens_its_robot(show: Show, place: tuple[float, float]) -> None:
+    with show(STATES["fleet"]) as opened:
+        card = opened.test("card-goob")
+        box = card.bounding_box()
+        assert box is not None
+        card.click(position={"x": place[0] * box["width"], "y": place[1] * box["height"]})
+        assert opened.until(f"window.pebble.driver.ref === '{GOOB}'", 3)
+
+
+def test_a_stop_of_a_card_opens_nothing(show: Show, server: CannedServer) -> None:
+    with show(STATES["fleet"]) as opened:
+        opened.test("stop-goob").click()
+        assert opened.until(lambda: server.sent("estop"))
+        assert opened.page.evaluate("location.pathname") == "/"
+
+
+def test_many_robots_are_shown_by_what_they_need(show: Show) -> None:
+    names = [f"pebble/robots/r{number:02}" for number in range(14)]
+
+    def many(now: int) -> list[tuple[str, str, object, int]]:
+        stopped = (names[3], "web/estop", {**estop(now), "latched": True}, 0)
+        return [one for name in names for one in robot(now, name, "mqtt", 7.9)] + [stopped]
+
+    with show(State("/", many)) as opened:
+        group = opened.page.locator("section[aria-label='Need a look'] .fleet-card")
+        assert opened.until(lambda: group.locator("h2").all_inner_texts() == ["r03"])
+        assert opened.page.locator(".fleet-card").count() == 14
+        assert opened.test("stopped").inner_text() == "1 stopped"
+
+
+def test_the_first_steps_are_ticked_and_can_be_hidden(show: Show) -> None:
+    with show(STATES["fleet"]) as opened:
+        steps = opened.test("first-time")
+        steps.get_by_text("Drive").click()
+        assert opened.until("location.pathname !== '/'", 3)
+        opened.page.go_back()
+        assert opened.until(lambda: steps.locator(".step.done").count() == 1)
+        opened.test("hide-first-time").click()
+        assert steps.count() == 0
+        opened.page.reload()
+        opened.test("card-goob").wait_for()
+        assert steps.count() == 0
+
+
+def test_robots_without_a_camera_show_their_face(show: Show) -> None:
+    with show(STATES["fleet"]) as opened:
+        assert opened.test("card-minilamp").locator(".thumbnail use").get_attribute("href", timeout=3000)
+        assert "no camera" in opened.test("card-minilamp").inner_text()
+        assert opened.test("card-goob").get_by_text("live").is_visible()
+
+
+def shown(cards: Locator) -> list[str]:
+    return cards.locator("h2").all_inner_texts()
+
+
+def test_of_a_thousand_only_those_on_the_screen_are_drawn(show: Show) -> None:
+    with show(STATES["fleet-thousand"]) as opened:
+        page, cards = opened.page, opened.page.locator(".fleet-card")
+        assert opened.until(lambda: 10 < cards.count() < 120)
+        assert page.evaluate("document.querySelectorAll('*').length") < 4000
+        page.evaluate("scrollTo(0, document.body.scrollHeight / 2)")
+        assert opened.until(lambda: "robot-05" in shown(cards)[40])
+        assert cards.count() < 120
+        stop, card = opened.page.locator(".fleet-card .stop-small").nth(40), cards.nth(40)
+        inner, outer = stop.bounding_box(), card.bounding_box()
+        assert inner is not None
+        assert outer is not None
+        assert inner["y"] + inner["height"] < outer["y"] + outer["height"]
+        page.keyboard.press("End")
+        assert opened.until(lambda: "robot-0984" in page.locator(".away").inner_text())
+
+
+def test_one_of_a_thousand_is_found_by_name_driver_and_state(show: Show) -> None:
+    with show(STATES["fleet-thousand"]) as opened:
+        cards = opened.page.locator(".fleet-card")
+        opened.test("filter").fill("0053 BOB")
+        assert opened.until(lambda: shown(cards) == ["robot-0053"])
+        opened.test("card-robot-0053").get_by_role("link").click()
+        assert opened.until("location.pathname !== '/'", 3)
+        opened.page.go_back()
+        assert opened.until(lambda: shown(cards) == ["robot-0053"])  # what was looked for is kept
+        opened.test("filter").fill("stopped")
+        assert opened.until(lambda: len(shown(cards)) == 10)
+        opened.test("filter").fill("offline")
+        assert opened.until(lambda: cards.count() == 0 and opened.page.locator(".away-row").count() > 5)
+
+
+def test_a_stop_of_all_shows_how_many_have_confirmed_it(show: Show) -> None:
+    with show(STATES["fleet-thousand"]) as opened:
+        opened.page.locator(".fleet-card").first.wait_for()
+        opened.test("stop-all").click()
+        confirm = """(number) => pebble.store.refs().forEach((ref, at) => pebble.store.set(ref, "web/estop", {
+          ...pebble.store.get(ref, "web/estop").value, latched: true, stop: pebble.estop.pressed.stop,
+          sending: at < number - 3 ? "confirmed" : "sent" }))"""
+        opened.page.evaluate(confirm, 1000)
+        assert opened.until(lambda: opened.test("tally").inner_text() == "STOP ALL: 997 of 1000 confirmed.")
+        opened.page.evaluate(confirm.replace("number - 3", "number"), 1000)
+        assert opened.until(lambda: opened.test("tally").inner_text() == "STOP ALL: all 1000 confirmed.")
+        assert opened.page.locator(".stops .banner").count() <= 50

@@ -1,0 +1,326 @@
+"""The page decodes exactly what pebble.extensions.media.decode does: the same pictures, and every pixel of them."""
+
+from __future__ import annotations
+
+import base64
+import json
+import random
+import struct
+import threading
+import zlib
+from collections.abc import Iterator, Sequence
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from playwright.sync_api import Browser
+
+from pebble.contract.packets import Picture, PictureKind
+from pebble.extensions.media.decode import VideoDecoder
+from pebble.extensions.media.picture_header import read_header
+from pebble.extensions.media.scene import Scene, noise, read_counter
+from pebble.extensions.media.video import make_encoder
+from tests.ext.page.browser import tab
+from tests.support import ROOT, cases
+
+STATIC = ROOT / "pebble/extensions/page/static"
+PAGE = Path(__file__).with_name("pixels.js")
+
+
+class MediaPages:
+    """Serves the page's modules, the test's pages, and byte strings; takes byte strings that a page posts."""
+
+    def __init__(self) -> None:
+        self.posted: dict[str, bytes] = {}
+        self._data = {"/": b'<!doctype html><script type="module" src="/pixels.js"></script>'}
+        pages = self
+
+        class Handler(BaseHTTPRequestHandler):
+            def do_GET(self) -> None:
+                pages.answer(self)
+
+            def do_POST(self) -> None:
+                pages.posted[self.path] = self.rfile.read(int(self.headers["content-length"]))
+                self.send_response(204)
+                self.end_headers()
+
+            def log_message(self, *_args: object) -> None:
+                """Log nothing."""
+
+        self._server = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
+        self.url = f"http://127.0.0.1:{self._server.server_address[1]}"
+        threading.Thread(target=self._server.serve_forever, daemon=True).start()
+
+    def offer(self, parts: Sequence[bytes]) -> str:
+        """Serve byte strings, each behind its length; returns their path."""
+        name = f"/data/{len(self._data)}"
+        self._data[name] = b"".join(struct.pack(">I", len(part)) + part for part in parts)
+        return name
+
+    def close(self) -> None:
+        self._server.shutdown()
+        self._server.server_close()
+
+    def answer(self, request: BaseHTTPRequestHandler) -> None:
+        path = request.path
+        file = PAGE if path == "/pixels.js" else STATIC / path.lstrip("/")
+        data = self._data.get(path) or (file.read_bytes() if file.is_file() else b"")
+        request.send_response(200)
+        request.send_header("content-type", "text/html" if path == "/" else "text/javascript")
+        request.send_header("content-length", str(len(data)))
+        request.end_headers()
+        request.wfile.write(data)
+
+
+EXACT = ("json", "pbvd")
+T0 = 1_710_969_600_000
+
+
+@pytest.fixture(scope="module")
+def pages() -> Iterator[MediaPages]:
+    pages = MediaPages()
+    yield pages
+    pages.close()
+
+
+@pytest.fixture(scope="module")
+def page(pages: MediaPages, browser: Browser) -> Iterator[Any]:
+    with tab(browser, f"{pages.url}/") as one:
+        assert one.until("window.ready === true")
+        yield one.page
+
+
+@pytest.fixture
+def check(page: Any, pages: MediaPages) -> Any:
+    """Feed payloads to both decoders; returns what was shown, which must be the same."""
+
+    def compare(payloads: Sequence[bytes]) -> list[Any]:
+        decoder = VideoDecoder()
+        expected, wants, pictures = [], [], []
+        for payload in payloads:
+            shown = decoder.feed(payload)
+            wants.append(decoder.wants_keyframe)
+            pictures.append(b"" if shown is None else cv2.cvtColor(shown.picture, cv2.COLOR_BGR2RGB).tobytes())
+            expected.append(
+                shown
+                and {
+                    "encoding": shown.encoding,
+                    "key": shown.keyframe,
+                    "frame": shown.frame,
+                    "capturedMs": shown.captured_ms,
+                    "width": shown.picture.shape[1],
+                    "height": shown.picture.shape[0],
+                    "difference": 0,
+                }
+            )
+        passed = [payload if read_header(payload) else b"" for payload in payloads]  # the server sends no other one
+        paths = [pages.offer(passed), pages.offer(pictures)]
+        result = page.evaluate("paths => window.compare(...paths)", paths)
+        assert result["shown"] == expected
+        assert result["wants"] == wants
+        return expected
+
+    return compare
+
+
+def stream(
+    name: str, count: int, *, size: tuple[int, int] = (96, 64), start_ms: int = T0, **options: Any
+) -> list[bytes]:
+    """A moving scene with noise, as a camera has it."""
+    width, height = size
+    encoder = make_encoder(name, fps=15, keyframe_interval=options.pop("interval", 5), **options)
+    scene, picture = Scene(width, height), np.empty((height, width, 3), np.uint8)
+    made = []
+    for number in range(count):
+        scene.render(number, picture)
+        grain = noise(number, picture.size).reshape(picture.shape) * 24 - 12
+        noisy = np.clip(picture + grain, 0, 255).astype(np.uint8)
+        made.append(encoder.encode(noisy, start_ms + number * 66))
+    return made
+
+
+@pytest.mark.parametrize(
+    ("quality", "size"),
+    [
+        (60, (112, 80)),
+        *(pytest.param(quality, (112, 80), marks=pytest.mark.thorough) for quality in (10, 95)),
+        *(pytest.param(quality, (640, 480), marks=pytest.mark.thorough) for quality in (10, 60, 95)),
+    ],
+    ids=str,
+)
+@pytest.mark.parametrize("name", EXACT)
+def test_every_pixel_is_the_same(check: Any, name: str, quality: int, size: tuple[int, int]) -> None:
+    shown = check(stream(name, 12, size=size, quality=quality))
+    assert [one["frame"] for one in shown] == list(range(12))
+
+
+@pytest.mark.parametrize("size", [(64, 48), pytest.param((320, 180), marks=pytest.mark.thorough)], ids=str)
+@pytest.mark.parametrize("name", EXACT)
+def test_a_long_row_of_differences_does_not_drift(check: Any, name: str, size: tuple[int, int]) -> None:
+    count = cases(30, 90)
+    assert None not in check(stream(name, count, size=size, interval=count))
+
+
+@pytest.mark.parametrize("name", EXACT)
+def test_after_loss_duplication_and_a_restart(check: Any, name: str) -> None:
+    old, new = stream(name, 12), stream(name, 12, start_ms=T0 + 3000)
+    lost = check([*old[:3], *old[4:7]])
+    assert [one and one["frame"] for one in lost] == [0, 1, 2, None, 5, 6]
+    twice = check([*old[:3], old[2], *old[3:7]])
+    assert [one and one["frame"] for one in twice] == [0, 1, 2, None, None, None, 5, 6]
+    restarted = check([*old[:4], new[1], *new[5:8], *new[:2]])
+    assert [one and one["frame"] for one in restarted] == [0, 1, 2, 3, None, 5, 6, 7, 0, 1]
+    by_chance = check([*old[:3], *stream(name, 8, start_ms=T0 + 9000)[3:8]])
+    assert [one and one["frame"] for one in by_chance] == [0, 1, 2, None, None, 5, 6, 7]
+    check([*old[:3], *stream(name, 5, start_ms=T0 - 1000)[3:5]])
+
+
+SIZES = [((96, 64), (64, 64)), ((96, 64), (96, 48)), ((64, 48), (96, 80)), ((63, 49), (17, 9))]
+NO_PICTURES = (b"", b"\0", b"{", b"PBVD", b"\xff\xd8", b"PBVD\x01\x09" + bytes(40), b"[]", b"null", b" 1", b" null")
+
+
+@pytest.mark.parametrize("name", EXACT)
+def test_a_change_of_size(check: Any, name: str) -> None:
+    for first, second in ([stream(name, 5, size=size) for size in pair] for pair in SIZES):
+        assert None not in check([*first, *second, *first])
+        # A difference of another size, whose number fits, is refused.
+        assert check([*first[:2], second[2], *second[3:], *first])[2:5] == [None] * 3
+
+
+@pytest.mark.parametrize("name", EXACT)
+def test_what_is_no_picture_breaks_the_row(check: Any, name: str) -> None:
+    packets = stream(name, 7)
+    for bad in NO_PICTURES:
+        assert check([*packets[:2], bad, *packets[2:]])[2:5] == [None] * 3
+
+
+@pytest.mark.parametrize("name", EXACT)
+def test_cut_short_anywhere(check: Any, name: str) -> None:
+    packets = stream(name, 2, size=(32, 32))
+    key, difference = packets
+    every = [key[:length] for length in range(0, len(key), 7)]
+    every += [part for length in range(0, len(difference), 7) for part in (key, difference[:length])]
+    check([*every, key[:-1], key, difference[:-1]])
+
+
+@pytest.mark.parametrize("seed", range(cases(1, 3)))
+@pytest.mark.parametrize("name", EXACT)
+def test_random_faults(check: Any, name: str, seed: int) -> None:
+    """Loss, duplication, exchange, damage, other encodings and jumps of time, at random."""
+    chance = random.Random(seed)
+    sent: list[bytes] = []
+    for start in range(12):
+        some = stream(
+            chance.choice([name, name, name, *EXACT]),
+            10,
+            size=chance.choice([(32, 24), (32, 32)]),
+            start_ms=T0 + start * 660,
+        )
+        for packet in some:
+            sent += [packet] * chance.choice([0, 1, 1, 1, 1, 1, 1, 1, 1, 2])
+            if chance.random() < 0.05 and len(sent) > 2:
+                sent[-1], sent[-2] = sent[-2], sent[-1]
+            if chance.random() < 0.05 and sent:
+                sent[-1] = damaged(sent[-1], chance)
+    shown = check(sent)
+    assert 20 < sum(one is not None for one in shown) < len(shown)
+
+
+def damaged(packet: bytes, chance: random.Random) -> bytes:
+    """Bits flip where a checksum finds them: bits of a bare JPEG's coefficients change the picture unnoticed."""
+    changed = bytearray(packet)
+    at = chance.randrange(len(packet)) if packet[4:6] not in (b"\x01\x01", b"\x01\x02") else chance.randrange(19)
+    changed[at] ^= 1 << chance.randrange(8)
+    return bytes(changed) if chance.random() < 0.5 else packet[: chance.randrange(len(packet))]
+
+
+def vectors() -> dict[str, list[bytes]]:
+    steps = json.loads((Path(ROOT) / "tests" / "vectors" / "video.json").read_text())
+    return {name: [base64.b64decode(step["packet"]) for step in one] for name, one in steps.items()}
+
+
+@pytest.mark.parametrize("name", list(vectors()))
+def test_streams_of_the_reference_implementation(check: Any, name: str) -> None:
+    check(vectors()[name])
+
+
+def jpeg(picture: np.ndarray, *options: int) -> bytes:
+    return cv2.imencode(".jpg", picture, list(options))[1].tobytes()
+
+
+def key(body: bytes, kind: PictureKind = PictureKind.JPEG) -> bytes:
+    return Picture(kind, 7, T0, body).pack()
+
+
+def with_segment(body: bytes, marker: int, content: bytes) -> bytes:
+    return body[:2] + struct.pack(">BBH", 0xFF, marker, len(content) + 2) + content + body[2:]
+
+
+def test_unusual_jpegs(check: Any) -> None:
+    picture = cv2.resize(np.random.default_rng(1).integers(0, 255, (6, 9, 3), np.uint8), (99, 66))
+    plain = jpeg(picture)
+    turned = with_segment(plain, 0xE1, b"Exif\0\0MM\0*\0\0\0\x08\0\x01\x01\x12\0\x03\0\0\0\x01\0\x06\0\0\0\0\0\0")
+    profile = with_segment(plain, 0xE2, b"ICC_PROFILE\0\x01\x01" + bytes(128))
+    grey = jpeg(cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY))
+    progressive = jpeg(picture, cv2.IMWRITE_JPEG_PROGRESSIVE, 1)
+    sampled = [jpeg(picture, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, factor) for factor in (0x411111, 0x221111, 0x111111)]
+    restarts = jpeg(picture, cv2.IMWRITE_JPEG_RST_INTERVAL, 2)
+    odd = [plain, turned, profile, grey, progressive, *sampled, restarts, jpeg(picture[:1, :1]), jpeg(picture[:3, :50])]
+    assert None not in check([key(body) for body in odd])
+    assert None not in check(odd)  # raw JPEG
+    difference = Picture(PictureKind.DELTA_JPEG, 8, T0 + 66, jpeg(np.full_like(picture, 140))).pack()
+    assert None not in check([key(turned), difference])
+    assert None not in check([key(grey), difference])
+
+
+def test_extreme_differences_clip(check: Any) -> None:
+    dark, light = np.zeros((40, 40, 3), np.uint8), np.full((40, 40, 3), 255, np.uint8)
+    for first in (dark, light):
+        for second in (dark, light):
+            difference = Picture(PictureKind.DELTA_JPEG, 8, T0, jpeg(second)).pack()
+            assert None not in check([key(jpeg(first)), difference])
+
+
+def test_limits_of_zlib(check: Any) -> None:
+    body = jpeg(np.full((32, 32, 3), 99, np.uint8))
+    packed = zlib.compress(body)
+    bomb = zlib.compress(bytes(64 << 20), 9)
+    bodies = [packed, packed[:-1], packed + b"x", packed + packed, bomb, b"", zlib.compress(b""), packed[:-4] + b"abcd"]
+    shown = check([key(one, PictureKind.ZLIB_JPEG) for one in bodies])
+    assert [one is not None for one in shown] == [True, *[False] * 7]
+
+
+def counters(posted: bytes) -> list[int | None]:
+    """The numbers in the pictures that a page has posted."""
+    found, at = [], 0
+    while at < len(posted):
+        width, height = struct.unpack_from("<II", posted, at)
+        size = width * height * 4
+        pixels = np.frombuffer(posted, np.uint8, size, at + 8).reshape(height, width, 4)
+        found.append(read_counter(np.ascontiguousarray(pixels[..., :3])))
+        at += 8 + size
+    return found
+
+
+def h264_counters(page: Any, pages: MediaPages, payloads: Sequence[bytes]) -> list[int | None]:
+    problem = page.evaluate("paths => window.post(...paths)", [pages.offer(payloads), "/posted"])
+    assert problem == "" or len(payloads) > 0
+    return counters(pages.posted["/posted"])
+
+
+def test_h264_shows_every_picture_in_order(page: Any, pages: MediaPages) -> None:
+    packets = stream("h264", 30, size=(320, 240), interval=15, quality=40)
+    assert h264_counters(page, pages, packets) == list(range(30))
+
+
+def test_h264_after_faults(page: Any, pages: MediaPages) -> None:
+    packets = stream("h264", 30, size=(320, 240), interval=10, quality=40)
+    assert h264_counters(page, pages, [*packets[:4], *packets[5:12]]) == [0, 1, 2, 3, 10, 11]
+    assert h264_counters(page, pages, [*packets[:3], packets[2], *packets[3:12]]) == [0, 1, 2, 10, 11]
+    smaller = stream("h264", 4, size=(320, 180), interval=4, quality=40)
+    assert h264_counters(page, pages, [*packets[:3], *smaller, *packets[10:12]]) == [0, 1, 2, 0, 1, 2, 3, 10, 11]
+    mixed = [*packets[:2], *stream("pbvd", 2, size=(320, 240), quality=60), *packets[2:4], *packets[10:12]]
+    assert h264_counters(page, pages, mixed) == [0, 1, 0, 1, 10, 11]

@@ -1,0 +1,401 @@
+"""Recordings on the page, in Chromium, before the real routes of recordings: /replay never sends a robot anything."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from playwright.sync_api import Browser, Route
+
+from tests.ext.page import recorded
+from tests.ext.page.browser import PIXELS, Tab
+from tests.ext.page.canned import CannedServer, Show
+from tests.ext.page.recorded import DAY, END, GAP, ROBOT, START
+from tests.ext.page.states import STATES
+
+pytest.importorskip("duckdb")  # it makes timelines
+pytestmark = [pytest.mark.page, pytest.mark.timeout(180)]
+
+TIMELINE = re.compile("/archive/timeline")
+AT = START + 30_000
+#: What every page sends of itself, on any screen.
+USUAL = {"hello", "echo", "watch"}
+_DRAWN = """(at) => { const { feed, video } = window.pebble?.replay ?? {};
+  return Boolean(feed) && !feed.seeking && video.info?.receivedMs === at; }"""
+
+
+@pytest.fixture
+def replay(show: Show, server: CannedServer) -> Iterator[Tab]:
+    """Half a minute after the begin, paused; whatever a test does there, no robot is sent anything."""
+    with show(STATES["replay"]) as opened:
+        assert shown(opened, AT)
+        assert opened.until("!!window.pebble?.replay?.day.timeline", 30)
+        yield opened
+        assert {message["op"] for message in server.received} <= USUAL
+        assert [message["ref"] for message in server.sent("watch")] == [""] * len(server.sent("watch"))
+        assert opened.complaints() == []
+
+
+def shown(opened: Tab, at: int, within: float = 15.0) -> bool:
+    """Whether the picture that was received at this time is drawn, after the newest seek."""
+    return opened.until(lambda: opened.page.evaluate(_DRAWN, at), within)
+
+
+def position(opened: Tab) -> float:
+    return float(opened.page.evaluate("pebble.replay.feed.position"))
+
+
+def seek(opened: Tab, at: float) -> None:
+    opened.page.evaluate("(at) => pebble.replay.seek(at)", at)
+
+
+def stored(opened: Tab, metric: str) -> Any:
+    return opened.page.evaluate("([ref, m]) => pebble.replay.store.get(ref, m)?.value", [ROBOT, metric])
+
+
+def test_the_way_to_a_day_and_a_robot(show: Show) -> None:
+    with show(replace(STATES["recordings"], path="/")) as opened:
+        opened.page.get_by_role("link", name="Recordings", exact=True).click()
+        assert opened.until("window.pebble?.replay?.video.info", 30)  # a picture is there at once
+        assert GAP[1] <= position(opened) <= GAP[1] + 20_000  # the first one of the newest session
+        opened.test("open-days").click()
+        opened.page.get_by_role("link", name="All days").click()
+        day = opened.test(f"day-{DAY}")
+        day.wait_for()
+        assert "10:00 to 10:06" in day.inner_text()
+        assert "1 gap" in day.inner_text()
+        day.get_by_role("link", name="goob").click()
+        assert opened.until("window.pebble?.replay?.feed.seeks > 0", 30)
+        assert START <= position(opened) <= START + 10_000  # the first picture of its first session
+        opened.test("badge").get_by_role("link").click()
+        assert opened.until(lambda: opened.page.url.endswith(f"/r/{ROBOT}"))
+        opened.page.get_by_role("link", name="Recordings", exact=True).click()
+        assert opened.until("window.pebble?.replay?.feed.seeks > 0", 30)
+        opened.page.go_back()
+        assert opened.until("pebble.route.ref !== '' && pebble.replay === null")
+        # Who leaves the robot's page so soon closes its line for pictures before that is there.
+        assert [one for one in opened.complaints() if "closed before the connection is established" not in one] == []
+
+
+def test_no_way_leads_there_without_recordings(show: Show) -> None:
+    with show(STATES["fleet"]) as opened:
+        opened.test("phone").wait_for()
+        assert opened.page.locator("a[href^='/replay']").count() == 0
+
+
+def test_a_time_in_the_address_is_shown_and_follows_seeks(replay: Tab):
+    assert "Recording of 22 Nov, 10:00:30" in replay.test("badge").inner_text()
+    assert replay.test("time").inner_text().startswith("10:00:30.000")
+    assert "10:00:29.960" in replay.test("picture-time").inner_text()  # when it was taken
+    seek(replay, AT + 12_345)
+    assert shown(replay, AT + 12_300)
+    assert replay.until(lambda: replay.page.url.endswith(f"/replay/{ROBOT}?at={AT + 12_345}"))
+
+
+def test_playing_and_its_keys(replay: Tab):
+    keys = replay.page.keyboard
+    keys.press("Space")
+    assert replay.until("pebble.replay.feed.played.on")
+    assert replay.until(lambda: position(replay) > AT + 1500)
+    assert replay.until("pebble.replay.video.info.receivedMs > pebble.replay.feed.position - 400")
+    keys.press("Space")
+    assert replay.until("!pebble.replay.feed.played.on")
+    for key, step in (("ArrowRight", 10_000), ("Shift+ArrowLeft", -60_000), ("ArrowLeft", -10_000)):
+        before = position(replay)
+        keys.press(key)
+        assert position(replay) == pytest.approx(before + step, abs=1), key
+    for key, speed in (("+", 2), ("+", 4), ("-", 2)):
+        keys.press(key)
+        assert replay.until(f"pebble.replay.feed.played.speed === {speed}"), key
+    keys.press("End")
+    assert replay.until(lambda: END - 10_000 <= position(replay) <= END + 10_000)
+    keys.press("Home")
+    assert replay.until(lambda: START <= position(replay) <= START + 10_000)
+
+
+def test_another_day_is_opened(replay: Tab):
+    replay.test("open-days").click()
+    replay.page.locator("[data-test=replay-day] option").nth(1).wait_for(state="attached")
+    replay.test("replay-day").select_option("2026-11-21")
+    assert replay.until("pebble.replay.day.name === '2026-11-21' && !pebble.replay.feed.seeking", 30)
+
+
+@pytest.mark.parametrize("size", ["desktop", "phone"])
+def test_the_bar_shows_what_was_recorded_and_leads_there(show: Show, size) -> None:
+    with show(STATES["replay"], size) as opened:
+        assert shown(opened, AT)
+        assert opened.until("!!window.pebble?.replay?.day.timeline", 30)
+        bar = opened.test("bar")
+        for _ in ("the day", "this session only"):
+            box = bar.bounding_box()
+            since, until = (float(bar.get_attribute(name) or 0) for name in ("min", "max"))
+            assert box is not None
+            opened.page.mouse.click(box["x"] + 8 + (box["width"] - 16) / 5, box["y"] + box["height"] / 2)
+            assert opened.until(lambda: abs(position(opened) - (since + (until - since) / 5)) < (until - since) / 50)  # noqa: B023
+            opened.test("near").click()
+        assert START - 10_000 <= since < until <= GAP[0] + 10_000
+        assert opened.page.locator(".player-marks > .gap").count() <= 1
+        assert opened.page.locator(".player-marks > .drive").count() == 1
+        assert opened.complaints() == []
+
+
+def test_a_key_in_a_list_is_not_the_replays(replay: Tab):
+    replay.test("speed").focus()
+    replay.page.keyboard.press("ArrowRight")
+    assert position(replay) == AT
+
+
+def test_the_cards_show_that_time_and_none_of_them_sends(replay: Tab):
+    assert stored(replay, "sensors/imu")["t"] == AT
+    assert stored(replay, "web/liveness")["latency_ms"] == pytest.approx(42, abs=0.01)
+    cards = replay.page.locator("[data-card]").evaluate_all("(all) => all.map((one) => one.dataset.card)")
+    assert {"telemetry", "map", "plots", "logs", "values"} <= set(cards)
+    for card in ("logs", "values"):
+        replay.page.locator(f"[data-card={card}] .card-head [aria-expanded]").click()  # those for engineers are closed
+    assert not {"lights", "sounds", "autonomy", "outlets", "mcus", "system", "drive"} & set(cards)
+    assert replay.until(lambda: "7.91 V" in replay.page.locator("[data-card=telemetry]").inner_text())
+    assert replay.until(lambda: "line 10" in replay.test("log-lines").inner_text())
+    assert "line 11" not in replay.test("log-lines").inner_text()
+    assert "x -0.46 m" in replay.test("map-pose").inner_text()
+    seek(replay, AT - 20_000)
+    assert replay.until(lambda: stored(replay, "sensors/imu")["t"] == AT - 20_000)
+    assert replay.until(lambda: "line 3" in replay.test("log-lines").inner_text())
+    assert "line 10" not in replay.test("log-lines").inner_text()
+    assert replay.page.evaluate("pebble.store.get('pebble/robots/goob', 'touch-sensors').value.value.a0") == 512  # live
+
+
+def test_plots_and_the_trail_grow_while_it_plays_and_begin_anew_with_a_seek(replay: Tab):
+    replay.page.evaluate("pebble.replay.feed.setSpeed(8)")
+    replay.test("play").click()
+    trail = """async () => {
+      const { recorderOf } = await import(`/static/${pebble.connection.version}/ui/parts/recorder.js`);
+      return recorderOf(pebble.replay.page, 'pebble/robots/goob').all.get('poses wheel-odometry')?.times ?? []; }"""
+    assert replay.until(lambda: len(replay.page.evaluate(trail)) > 8)
+    replay.test("play").click()
+    seek(replay, START + 5000)
+    assert replay.until(lambda: replay.page.evaluate(trail) in ([START + 5000], [START + 4800]))
+
+
+def test_overlays_are_those_of_that_time(replay: Tab):
+    inked = (
+        f"""(canvas) => {{ {PIXELS} return pixelsOf(canvas).filter((value, i) => i % 4 === 3 && value > 0).length; }}"""
+    )
+    overlays = replay.test("overlays-canvas")
+    assert replay.until(lambda: overlays.evaluate(inked) > 500)
+    replay.test("overlays").uncheck()
+    assert replay.until(lambda: overlays.count() == 0)
+
+
+def test_a_gap_is_left_out_and_explained(replay: Tab):
+    seek(replay, GAP[0] - 1200)
+    replay.test("play").click()
+    replay.test("skipped").wait_for()
+    assert replay.test("skipped").inner_text() == "Skipped 3 min 20 s: no connection to the broker"
+    assert position(replay) >= GAP[1]
+    assert replay.until(f"pebble.replay.video.info.receivedMs >= {GAP[1]}")
+
+
+def test_the_end_of_the_recording_is_shown(replay: Tab):
+    seek(replay, END - 700)
+    replay.test("play").click()
+    assert replay.until(lambda: "end of the recording" in replay.test("time").inner_text())
+    assert replay.test("play").inner_text() == "Play"
+
+
+def test_a_time_at_which_nothing_was_recorded(show: Show) -> None:
+    with show(STATES["replay-gap"]) as opened:
+        assert opened.until(lambda: "No picture was recorded here" in opened.test("cover").inner_text(), 15)
+
+
+def test_a_day_that_is_being_indexed(show: Show) -> None:
+    answers = iter(range(1, 3))
+
+    def indexing(route: Route) -> None:
+        number = next(answers, 0)
+        if number:
+            route.fulfill(status=202, json={"indexing": number / 4})
+        else:
+            route.continue_()
+
+    with show(STATES["replay"], routes={TIMELINE: indexing}) as opened:
+        opened.page.get_by_text("This day is being indexed: 25 %").wait_for()
+        assert opened.until("!!window.pebble?.replay?.day.timeline", 30)
+        opened.page.get_by_text("not recorded (1)").first.wait_for()
+
+
+@pytest.mark.parametrize("size", ["desktop", "phone"])
+def test_a_day_that_cannot_be_indexed_is_tried_again_by_people_only(
+    show: Show, server: CannedServer, browser: Browser, size
+) -> None:
+    asked: list[str] = []
+
+    def failing(route: Route) -> None:
+        asked.append(route.request.url)
+        if "again=1" in route.request.url:
+            route.continue_()
+        else:
+            route.fulfill(status=422, body='this needs DuckDB: pip install "pebble-robot[archive]"')
+
+    with show(STATES["replay"], size, routes={TIMELINE: failing}) as opened:
+        opened.page.get_by_text("this needs DuckDB: pip install").wait_for()
+        opened.page.wait_for_timeout(1500)  # three questions of a page that would go on
+        before = len(asked)
+        assert before <= 2
+        opened.test("try-again").click()
+        assert opened.until("!!window.pebble?.replay?.day.timeline", 30)
+        assert len(asked) == before + 1
+
+
+def test_sessions_lead_to_their_beginning(replay: Tab):
+    replay.test("open-days").click()
+    replay.test("session").last.click()
+    assert replay.until(lambda: GAP[1] - 10_000 <= position(replay) <= GAP[1])
+
+
+def test_a_stretch_is_downloaded_and_a_download_is_cancelled(replay: Tab):
+    replay.test("open-download").click()
+    replay.test("mark-in").click()
+    seek(replay, AT + 4000)
+    replay.test("mark-out").click()
+    assert replay.test("stretch").inner_text() == "10:00:30 – 10:00:34"
+    replay.test("download-as").select_option("mcap")
+    replay.test("download").click()
+    replay.test("download-file").wait_for(timeout=60_000)
+    with replay.page.expect_download() as download:
+        replay.test("download-file").click()
+    assert download.value.suggested_filename.endswith(".mcap")
+    assert download.value.path().read_bytes()[:5] == b"\x89MCAP"
+    replay.test("download-end").click()
+    assert replay.until(lambda: replay.test("download-file").count() == 0)
+    replay.test("mark-clear").click()
+    replay.test("download-as").select_option("mp4")
+    replay.test("download").click()
+    replay.test("download-end").click()
+    assert replay.until(lambda: replay.test("download").is_enabled())
+
+
+def test_stop_all_works_here_as_everywhere(show: Show, server: CannedServer) -> None:
+    with show(STATES["replay"]) as opened:
+        assert shown(opened, AT)
+        opened.test("stop-all").click()
+        assert opened.until(lambda: server.sent("estop"))
+        (stop,) = server.sent("estop")
+        assert stop["ref"] == ""
+        opened.page.keyboard.press("Escape")
+        opened.page.keyboard.press("Escape")
+        assert opened.until(lambda: len(server.sent("estop")) == 2)
+
+
+def test_space_stops_robots_again_once_the_page_is_left(show: Show, server: CannedServer) -> None:
+    with show(STATES["replay"]) as opened:
+        assert shown(opened, AT)
+        opened.test("badge").get_by_role("link").click()
+        assert opened.until(f"pebble.driver.ref === '{ROBOT}' && pebble.replay === null")
+        opened.page.keyboard.press("Space")
+        assert opened.until(lambda: server.sent("stop") == [{"op": "stop", "ref": ROBOT}])
+
+
+def test_sound_is_played_at_its_own_speed_only_and_after_a_click(replay: Tab):
+    assert replay.page.evaluate("pebble.replay.sound.context") is None
+    replay.test("play").click()
+    replay.test("listen").click()
+    assert replay.until("pebble.replay.sound.stats?.received > 20 && pebble.replay.sound.stats.bufferedMs > 0")
+    assert replay.page.evaluate("pebble.replay.sound.stats.refused") == 0
+    assert replay.test("talk").count() == 0
+    replay.test("speed").select_option("2")
+    replay.page.get_by_text("Sound is played at speed ×1 only").wait_for()
+    replay.test("speed").select_option("1")
+    seek(replay, AT)
+    assert replay.until("!pebble.replay.feed.seeking && pebble.replay.sound.stats?.received > 20")
+    replay.test("listen").click()
+    assert replay.until("pebble.replay.sound.worker === null")
+
+
+#: Records what is played, and when pictures are drawn: of each block its time, and of each picture when it was
+#: received.
+_LISTEN = """async () => { const { sound } = pebble.replay; const { context } = sound;
+  Object.assign(window, { blocks: [], drawn: [] });
+  const { node } = await sound.speaker;
+  node.port.onmessage = ({ data }) => {
+    const { contextTime, performanceTime } = context.getOutputTimestamp();
+    blocks.push([performanceTime + 1000 * (data.at - contextTime), [...data.left]]);
+  };
+  node.port.postMessage({ taps: true });
+  const draw = pebble.replay.pictures.canvasDraw;
+  pebble.replay.pictures.canvasDraw = (bitmap, info) => { draw(bitmap, info);
+    drawn.push([performance.now(), info.capturedMs]); };
+}"""
+
+
+def test_sound_and_pictures_are_together(replay: Tab):
+    """What was captured at one time is heard and seen within 150 ms; on a busy machine not always."""
+    replay.test("play").click()
+    replay.test("listen").click()
+    assert replay.until("pebble.replay.sound.stats?.received > 20")
+    replay.page.evaluate(_LISTEN)
+    assert any(abs(_apart(replay)) < 150 for _ in range(4))
+
+
+def _apart(opened: Tab) -> float:
+    """By how many ms sound is heard later than its picture is drawn."""
+    opened.page.evaluate("() => { blocks.length = drawn.length = 0; }")
+    assert opened.until("blocks.length * 128 > 2.5 * pebble.replay.sound.context.sampleRate", 60)
+    blocks, drawn, rate = opened.page.evaluate("[blocks, drawn, pebble.replay.sound.context.sampleRate]")
+    samples = np.concatenate([samples for _, samples in blocks])
+    first = float(np.median(np.array([at for at, _ in blocks]) - 128_000 / rate * np.arange(len(blocks))))
+    seconds = 2
+    piece = np.interp(
+        np.arange(16_000 * seconds) / 16_000, np.arange(rate * seconds) / rate, samples[-rate * seconds :]
+    )
+    original = recorded.speech().astype(float)
+    spectrum = np.fft.rfft(original) * np.conj(np.fft.rfft(piece, len(original)))
+    captured = START + int(np.argmax(np.fft.irfft(spectrum, len(original)))) / 16 - recorded.SOUND_LATE_MS
+    played_at = first + 1000 * (len(samples) / rate - seconds)
+    loop_ms = len(original) / 16
+    seen = float(np.median([at - captured_ms for at, captured_ms in drawn]))
+    return (played_at - captured - seen + loop_ms / 2) % loop_ms - loop_ms / 2
+
+
+def test_a_snapshot_is_named_after_the_time_at_which_it_was_taken(replay: Tab):
+    with replay.page.expect_download() as download:
+        replay.test("snapshot").click()
+    assert download.value.suggested_filename == "goob-2026-11-22T10-00-29.png"
+
+
+def test_two_hundred_seeks_leave_nothing_behind(show: Show, server: CannedServer) -> None:
+    """Bitmaps are closed, and there is one worker and one socket."""
+    counting = """const made = window.made = { open: 0, workers: 0, sockets: 0 };
+      const close = ImageBitmap.prototype.close; const drawn = CanvasRenderingContext2D.prototype.drawImage;
+      const known = new WeakSet();
+      CanvasRenderingContext2D.prototype.drawImage = function (image, ...more) {
+        if (image instanceof ImageBitmap && !known.has(image)) { known.add(image); made.open++; }
+        return drawn.call(this, image, ...more);
+      };
+      ImageBitmap.prototype.close = function () { if (known.delete(this)) made.open--; return close.call(this); };
+      const { Worker: Old, WebSocket: OldSocket } = window;
+      window.Worker = class extends Old { constructor(...all) { super(...all); made.workers++; } };
+      window.WebSocket = class extends OldSocket {
+        constructor(url) { super(url); made.sockets += /replay/.test(url); } };"""
+    seeks = """async (times) => { const { replay } = pebble;
+    const later = (ms) => new Promise((go) => setTimeout(go, ms));
+      for (const at of times) { replay.seek(at); const end = performance.now() + 4000;
+        while (performance.now() < end && (replay.feed.seeking || !replay.video.info)) await later(2); }
+      return [replay.feed.seeks, replay.video.info?.receivedMs]; }"""
+    with show(STATES["replay"], script=counting) as opened:
+        assert shown(opened, AT)
+        times = [START + (7919 * number) % 85_000 + 1000 for number in range(240)]
+        cdp = opened.cdp()
+        opened.page.evaluate(seeks, times[:40])
+        cdp.send("HeapProfiler.collectGarbage")
+        before = opened.page.evaluate("performance.memory.usedJSHeapSize")
+        arrived, drawn = opened.page.evaluate(seeks, times[40:])
+        assert (arrived, drawn) == (241, times[-1] // 100 * 100)
+        cdp.send("HeapProfiler.collectGarbage")
+        grown = opened.page.evaluate("performance.memory.usedJSHeapSize") - before
+        assert opened.page.evaluate("made") == {"open": 0, "workers": 1, "sockets": 1}
+        assert grown < 8_000_000
+        assert opened.complaints() == []

@@ -1,0 +1,496 @@
+"""Plots, the map of the odometry, what is drawn over pictures, snapshots, and a robot's own stream; in Chromium."""
+
+from __future__ import annotations
+
+import io
+import re
+import time
+from collections.abc import Iterator
+from dataclasses import replace
+from functools import partial
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+from playwright.sync_api import Browser
+
+from tests.ext.page.browser import PIXELS, Tab
+from tests.ext.page.canned import CannedServer, Show, showing
+from tests.ext.page.states import (
+    GOOB,
+    MINE,
+    SENSORS,
+    STATES,
+    STREAM,
+    TOWER,
+    asked,
+    at,
+    changed,
+    fleet,
+    liveness,
+    with_stream,
+)
+
+pytestmark = pytest.mark.page
+
+#: Counts how often each canvas is drawn: before anything is drawn, it is cleared.
+COUNT = """
+window.drawn = { plots: 0, map: 0 };
+const clear = CanvasRenderingContext2D.prototype.clearRect;
+CanvasRenderingContext2D.prototype.clearRect = function (...area) {
+  if (this.canvas.closest(".plot-lines")) window.drawn.plots++;
+  return clear.apply(this, area);
+};
+const write = CanvasRenderingContext2D.prototype.fillText;
+CanvasRenderingContext2D.prototype.fillText = function (...text) {
+  if (this.canvas.closest(".map")) window.drawn.map++;
+  return write.apply(this, text);
+};
+"""
+
+
+@pytest.fixture(scope="module")
+def show(server: CannedServer, browser: Browser) -> Show:
+    return partial(showing, server, browser, when="!!window.pebble?.connection.you")
+
+
+@pytest.fixture(scope="module")
+def _sensors(show: Show) -> Iterator[Tab]:
+    with show(SENSORS, script=COUNT) as opened:
+        yield opened
+
+
+@pytest.fixture
+def sensors(_sensors: Tab) -> Iterator[Tab]:
+    """One page for several tests."""
+    yield _sensors
+    assert _sensors.complaints() == []
+
+
+def see(opened: Tab, name: str) -> None:
+    opened.test(name).first.scroll_into_view_if_needed()
+
+
+def drawings(opened: Tab, what: str, ms: int) -> int:
+    """How many there are within so many milliseconds."""
+    before = opened.page.evaluate(f"window.drawn.{what}")
+    opened.page.wait_for_timeout(ms)
+    return int(opened.page.evaluate(f"window.drawn.{what}") - before)
+
+
+# -- plots
+
+#: Columns of a plot with its first line's colour, as shares of the width.
+_LINE = """(name) => { PIXELS
+  const figure = document.querySelector(`[data-test="${name}"]`);
+  const canvas = figure?.querySelector("canvas");
+  if (!canvas) return [];
+  const wanted = getComputedStyle(figure).getPropertyValue("--line-0").trim();
+  const [r, g, b] = [1, 3, 5].map((at) => parseInt(wanted.slice(at, at + 2), 16));
+  const [data, width] = [pixelsOf(canvas), canvas.width];
+  const columns = new Set();
+  for (let i = 0; i < data.length; i += 4) {
+    const near = Math.abs(data[i] - r) + Math.abs(data[i + 1] - g) + Math.abs(data[i + 2] - b) < 90;
+    if (near && data[i + 3] > 128) columns.add(((i / 4) % width) / width);
+  }
+  return [...columns].sort((a, b) => a - b);
+}""".replace("PIXELS", PIXELS)
+
+
+def line(opened: Tab, name: str, begin: float = 0.2, end: float = 1.0) -> int:
+    return sum(begin <= column < end for column in opened.page.evaluate(_LINE, name))
+
+
+@pytest.mark.parametrize("name", [f"plot-{one}" for one in ("battery", "attitude", "rates", "acceleration", "touch")])
+def test_a_plot_is_drawn_up_to_now(sensors: Tab, name: str) -> None:
+    see(sensors, name)
+    assert sensors.until(lambda: line(sensors, name, 0.8, 1) > 5)
+
+
+def test_the_newest_values_are_text(sensors: Tab) -> None:
+    texts = sensors.test("plot-battery").locator("li").all_inner_texts()
+    assert [" ".join(text.split()) for text in texts] == ["battery 7.92 V"]
+    names = [text.split()[0] for text in sensors.test("plot-touch").locator("li").all_inner_texts()]
+    assert names == ["a0", "a1", "a2"]
+    swatches = sensors.test("plot-touch").locator("svg")
+    dashes = swatches.evaluate_all("(all) => all.map((one) => getComputedStyle(one).strokeDasharray)")
+    assert len(set(dashes)) == 3
+
+
+def test_the_last_values_of_a_silent_robot_are_old_ones(show: Show) -> None:
+    silent = at(GOOB, "web/liveness", liveness(online=False, silent_s=9.0, latency_ms=None))
+    with show(replace(SENSORS, values=changed(SENSORS.values, silent), repeated={})) as opened:
+        see(opened, "plot-battery")
+        text = opened.test("plot-battery").locator("li")
+        assert opened.until(lambda: re.fullmatch(r"battery\s+– \(\d+ s ago: 7\.92 V\)", text.inner_text()))
+        assert re.fullmatch(r"– \(\d+ s ago: x .*°\)", opened.test("map-pose").inner_text())
+
+
+def test_only_what_is_seen_is_drawn_and_not_often(sensors: Tab) -> None:
+    sensors.page.evaluate("scrollTo(0, 0)")
+    sensors.page.wait_for_timeout(300)
+    assert drawings(sensors, "plots", 700) == 0
+    see(sensors, "plot-touch")
+    assert sensors.until("window.drawn.plots > 0")
+    seen = sensors.page.locator("figure.plot").count()
+    assert 0 < drawings(sensors, "plots", 1000) <= 11 * seen
+    sensors.hide()
+    sensors.page.wait_for_timeout(150)
+    assert drawings(sensors, "plots", 700) == 0
+    sensors.hide(hidden=False)
+    assert sensors.until(lambda: drawings(sensors, "plots", 100) > 0)
+
+
+def test_a_pause_and_a_closed_card_draw_nothing(sensors: Tab) -> None:
+    see(sensors, "plot-touch")
+    sensors.test("plots-pause").click()
+    sensors.page.wait_for_timeout(150)
+    assert drawings(sensors, "plots", 700) == 0
+    sensors.test("plots-pause").click()
+    sensors.page.get_by_label("Close Plots").click()
+    assert sensors.until("!document.querySelector('.plot-lines')")
+    assert drawings(sensors, "plots", 400) == 0
+    sensors.page.get_by_label("Open Plots").click()
+    assert sensors.until(lambda: line(sensors, "plot-touch", 0.8, 1) > 0)
+
+
+FETCHED = "performance.getEntriesByType('resource').some(({ name }) => /uPlot/.test(name))"
+
+
+def test_all_numbers_of_a_metric_are_plotted_and_remembered(show: Show) -> None:
+    with show(replace(SENSORS, path="/")) as opened:
+        opened.page.locator("[data-test^=card-]").first.wait_for()
+        assert not opened.page.evaluate(FETCHED)  # it comes with the plots only
+        opened.page.goto(opened.page.url + SENSORS.path.lstrip("/"))
+        see(opened, "plots-of")
+        opened.test("plots-of").select_option("sensors/imu")
+        figure = opened.test("plot-sensors/imu accel_mps2")
+        assert opened.until(lambda: figure.locator("li").count() == 3)
+        opened.page.reload()
+        figure.wait_for()
+        opened.test("plots-of").select_option("")
+        assert opened.until(lambda: figure.count() == 0)
+        assert opened.complaints() == []
+
+
+SET = "([metric, value]) => pebble.store.set(pebble.route.ref, metric, value)"
+NASTY: list[Any] = [
+    None,
+    7,
+    "x" * 5000,
+    [],
+    {"value": {"a" * 5000: 1}},
+    {"value": {"x_mm": "1", "y_mm": []}},
+    {"value": {str(number): number for number in range(500)}},
+    {"shapes": 7, "labels": {}},
+    {"shapes": [[[1e300, None]] * 900] * 900},
+    {"value": {"orientation_deg": {"roll": "<img src=x>", "pitch": None}}},
+]
+
+
+def test_no_payload_breaks_a_card(show: Show) -> None:
+    with show(SENSORS) as opened:
+        opened.test("plot-battery").wait_for()
+        for metric in ("sensors/imu", "wheel-odometry", "video-overlays", "status", "charging-level"):
+            for payload in NASTY:
+                opened.page.evaluate(SET, [metric, payload])
+                opened.page.wait_for_timeout(120)
+            see(opened, "map")
+            assert opened.page.locator(".failed").count() == 0, metric
+            assert opened.page.evaluate("document.documentElement.scrollWidth <= innerWidth"), metric
+        assert opened.errors == []
+
+
+# -- map
+
+#: Where the component's arrow and its trail are drawn: counts of the accent colour in the middle, and everywhere.
+_TRAIL = """() => { PIXELS
+  const canvas = document.querySelector("[data-test=map]");
+  const wanted = getComputedStyle(canvas).getPropertyValue("--accent").trim();
+  const [r, g, b] = [1, 3, 5].map((at) => parseInt(wanted.slice(at, at + 2), 16));
+  const { width, height } = canvas;
+  const data = pixelsOf(canvas);
+  const found = { middle: 0, all: 0 };
+  for (let i = 0; i < data.length; i += 4) {
+    if (Math.abs(data[i] - r) + Math.abs(data[i + 1] - g) + Math.abs(data[i + 2] - b) > 60) continue;
+    found.all++;
+    const [x, y] = [((i / 4) % width) - width / 2, Math.floor(i / 4 / width) - height / 2];
+    if (Math.hypot(x, y) < 14) found.middle++;
+  }
+  return found;
+}""".replace("PIXELS", PIXELS)
+
+
+def trail(opened: Tab) -> dict[str, int]:
+    found: dict[str, int] = opened.page.evaluate(_TRAIL)
+    return found
+
+
+@pytest.mark.parametrize("samples", [True, False])
+def test_a_position_that_cannot_change_is_explained(show: Show, samples: bool) -> None:
+    odometry = asked(telemetry={"touch_sensors": samples})
+    with show(replace(SENSORS, values=changed(SENSORS.values, odometry))) as opened:
+        see(opened, "map")
+        assert opened.until(lambda: opened.test("map-pose").inner_text().startswith("x "))
+        lacks = opened.test("map-lacks")
+        assert lacks.count() == (not samples)
+        assert samples or "publish_touch_sensors" in lacks.inner_text()
+
+
+def test_the_map_has_the_trail_and_the_component_in_its_middle(sensors: Tab) -> None:
+    see(sensors, "map")
+    assert sensors.until(lambda: trail(sensors)["middle"] > 30)
+    assert sensors.until(lambda: trail(sensors)["all"] > 300)
+    words = sensors.test("map-pose").inner_text()
+    assert re.fullmatch(r"x -?\d\.\d\d m · y -?\d\.\d\d m · heading -?\d+°", words)
+    assert drawings(sensors, "map", 1000) <= 11
+    sensors.test("map-clear").click()
+    assert sensors.until(lambda: trail(sensors)["all"] < 250)
+    assert trail(sensors)["middle"] > 30
+
+
+def test_the_map_is_moved_zoomed_and_centred(sensors: Tab) -> None:
+    see(sensors, "map")
+    box = sensors.test("map").bounding_box()
+    assert box is not None
+    x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
+    mouse = sensors.page.mouse
+    mouse.move(x, y)
+    mouse.down()
+    mouse.move(x + 100, y + 40, steps=4)
+    mouse.up()
+    assert sensors.until(lambda: trail(sensors)["middle"] < 30)
+    sensors.test("map-centre").click()
+    assert sensors.until(lambda: trail(sensors)["middle"] > 30)
+    for button in ("map-out", "map-in"):
+        sensors.test(button).click()
+    assert sensors.until(lambda: trail(sensors)["middle"] > 30)
+
+
+def test_one_finger_scrolls_the_page_and_two_zoom_the_map(show: Show) -> None:
+    with show(SENSORS, "phone") as opened:
+        opened.test("tab-sensors").click()
+        opened.test("map").wait_for()
+        assert opened.until(lambda: opened.page.locator(".loading").count() == 0)  # a card above it would move it
+        see(opened, "map")
+        box = opened.test("map").bounding_box()
+        assert box is not None
+        x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
+        cdp = opened.cdp()
+
+        def fingers(kind: str, *points: tuple[float, float]) -> None:
+            cdp.send("Input.dispatchTouchEvent", {
+                "type": kind, "touchPoints": [{"x": x, "y": y, "id": number} for number, (x, y) in enumerate(points)],
+            })  # fmt: skip
+
+        scale = lambda: float(opened.page.evaluate("document.querySelector('.map canvas').dataset.scale ?? NaN"))
+        assert opened.until(lambda: scale() > 0)
+        before = scale()
+        fingers("touchStart", (x - 30, y), (x + 30, y))
+        for apart in (40, 50, 60):
+            fingers("touchMove", (x - apart, y), (x + apart, y))
+        fingers("touchEnd")
+        assert opened.until(lambda: scale() == pytest.approx(2 * before, rel=0.01))
+        assert opened.page.evaluate("visualViewport.scale") == 1
+        top = opened.page.evaluate("scrollY")
+        cdp.send("Input.synthesizeScrollGesture", {"x": x, "y": y, "yDistance": 150 if top > 150 else -150})
+        assert opened.until(lambda: abs(opened.page.evaluate("scrollY") - top) > 60)
+
+
+# -- over the picture
+
+#: Instead of pictures: one colour, so that a test sees where the picture is.
+_PLAIN = """() => {
+  pebble.video.draw = function (bitmap, info) {
+    const { canvas, context } = this;
+    if (canvas.width !== 640) Object.assign(canvas, { width: 640, height: 360 });
+    context.fillStyle = "#ff00ff";
+    context.fillRect(0, 0, canvas.width, canvas.height);
+    const first = !this.info;
+    this.info = { ...info, capturedMs: Date.now() };
+    this.drawnAt = performance.now();
+    if (first) this.changed();
+  };
+}"""
+
+
+def seen(opened: Tab) -> Any:
+    return np.asarray(Image.open(io.BytesIO(opened.page.screenshot())).convert("RGB")).astype(int)
+
+
+def area(pixels: Any, colour: tuple[int, int, int], tolerance: int = 60) -> tuple[int, int, int, int] | None:
+    """Left, top, right and bottom of what has this colour; None if nothing has."""
+    rows, columns = np.where(np.abs(pixels - np.array(colour)).sum(axis=2) < tolerance)
+    if not len(rows):
+        return None
+    return int(columns.min()), int(rows.min()), int(columns.max()) + 1, int(rows.max()) + 1
+
+
+PICTURE, INK = (255, 0, 255), (77, 243, 255)
+
+
+def assert_a_square_in_the_middle(opened: Tab, pixel: float = 1.0) -> None:
+    """Its corners are a quarter and three quarters of what is seen of the picture; ``pixel``: of the line."""
+    areas: list[Any] = []
+
+    def are_both_seen() -> bool:
+        pixels = seen(opened)
+        areas[:] = area(pixels, PICTURE), area(pixels, INK)
+        return None not in areas
+
+    assert opened.until(are_both_seen)
+    (left, top, right, bottom), square = areas
+    assert (right - left) / (bottom - top) == pytest.approx(640 / 360, rel=0.01)
+    width, height = right - left, bottom - top
+    expected = (left + width / 4, top + height / 4, right - width / 4, bottom - height / 4)
+    assert square == pytest.approx(expected, abs=1.6 * pixel)
+
+
+OVERLAYS = STATES["overlays"]
+
+
+@pytest.mark.parametrize(
+    ("size", "options"),
+    [
+        ("desktop", {"viewport": {"width": 1280, "height": 800}}),
+        ("desktop", {"viewport": {"width": 1100, "height": 560}}),  # bars on both sides of the picture
+        ("desktop", {"viewport": {"width": 1281, "height": 701}, "device_scale_factor": 2}),
+        ("phone", {}),
+        ("landscape", {}),
+    ],
+)
+def test_what_is_drawn_over_a_picture_is_where_it_belongs(show: Show, size: Any, options: dict[str, Any]) -> None:
+    with show(OVERLAYS, size, **options) as opened:
+        opened.page.evaluate(_PLAIN)
+        assert_a_square_in_the_middle(opened, options.get("device_scale_factor", 1))
+        assert opened.complaints() == []
+
+
+def test_overlays_in_full_screen_where_stop_and_the_reason_remain_and_overlays_that_are_off(
+    show: Show, server: CannedServer
+) -> None:
+    with show(OVERLAYS) as opened:
+        opened.page.evaluate(_PLAIN)
+        opened.test("full-screen").click()
+        assert opened.until("!!document.fullscreenElement && !!document.querySelector('.immersive')")
+        assert opened.test("stop-one").is_visible()
+        assert opened.test("why").is_visible()
+        assert_a_square_in_the_middle(opened)
+        opened.test("stop-one").click()
+        assert opened.until(lambda: server.sent("estop"))
+        opened.page.get_by_label("Leave full screen").click()
+        opened.gear()
+        opened.test("overlays").click()
+        assert opened.until("!document.querySelector('[data-test=overlays-canvas]')")
+        opened.page.reload()
+        opened.gear()
+        opened.test("overlays").wait_for()  # they stay so
+        assert not opened.test("overlays").is_checked()
+        assert opened.page.evaluate("!document.querySelector('[data-test=overlays-canvas]')")
+
+
+def test_overlays_vanish_half_a_second_after_the_last(show: Show) -> None:
+    with show(replace(OVERLAYS, repeated={"web/liveness": 1.0})) as opened:
+        assert opened.until("!!document.querySelector('[data-test=overlays-canvas]')")
+        opened.page.evaluate(SET, ["video-overlays", {"shapes": [[[0.2, 0.2], [0.8, 0.8]]]}])
+        canvas = 'document.querySelector("[data-test=overlays-canvas]")'
+        inked = f"() => {{ {PIXELS} return pixelsOf({canvas}).some((value) => value > 0); }}"
+        assert opened.until(inked, 1)
+        began = time.monotonic()
+        assert opened.until(lambda: not opened.page.evaluate(inked), 3)
+        assert time.monotonic() - began < 1.5
+
+
+def test_a_snapshot_is_what_is_on_the_canvas_under_its_time(show: Show) -> None:
+    with show(STATES["driving"]) as opened:
+        with opened.page.expect_download() as saved:
+            opened.test("snapshot").click()
+        name = saved.value.suggested_filename
+        picture = Image.open(saved.value.path())
+        assert (picture.format, picture.size) == ("PNG", (640, 360))
+        assert np.asarray(picture.convert("RGB")).std() > 10
+        taken = time.mktime(time.strptime(name, "goob-%Y-%m-%dT%H-%M-%S.png"))
+        assert abs(time.time() - taken) < 10
+        assert opened.complaints() == []
+
+
+# -- the robot's own stream
+
+OWN = STATES["own-stream"]
+
+
+def test_a_robots_own_stream_is_shown_in_a_frame_and_never_called_live(show: Show, server: CannedServer) -> None:
+    reason = "pebble.driver.reason()?.code ?? ''"
+    with show(OWN) as opened:
+        assert opened.until(f"{reason} === ''")
+        opened.gear()
+        opened.test("open-stream").click()
+        frame = opened.test("stream")
+        assert frame.get_attribute("sandbox") == "allow-scripts allow-same-origin"
+        text = opened.page.frame_locator("[data-test=stream]").locator("body")
+        assert "own stream" in text.inner_text(timeout=5000)
+        assert opened.until(f"{reason} === 'picture'")
+        assert "not known" in opened.test("why").inner_text()
+        opened.page.keyboard.down("KeyW")
+        opened.page.wait_for_timeout(300)
+        opened.page.keyboard.up("KeyW")
+        assert not [one for one in server.sent("drive") if one["x"] or one["z"]]
+        opened.test("see").click()
+        assert opened.until(f"{reason} === ''")
+        opened.page.keyboard.down("KeyW")
+        assert opened.until(lambda: any(one["z"] for one in server.sent("drive")))
+        text.click()
+        assert opened.until("!pebble.driver.gestureActive"), "keys go to the frame"
+        opened.page.keyboard.up("KeyW")
+        opened.test("close-stream").click()
+        assert frame.count() == 0
+        assert opened.complaints() == []
+
+
+OWN_HOST = "http://127.0.0.1:{port}/stream"
+NOT_SHOWN = ["javascript:parent.ran = 1", "data:text/html,x", "http://user:secret@localhost/", OWN_HOST]
+
+
+@pytest.mark.parametrize("address", NOT_SHOWN)
+def test_what_may_not_be_shown_is_not(show: Show, address: str) -> None:
+    with show(replace(OWN, values=changed(fleet, MINE, with_stream(address)))) as opened:
+        opened.gear()
+        assert opened.test("open-stream").is_disabled()
+        assert opened.page.locator("#why-stream").inner_text()
+        assert opened.page.evaluate("document.querySelectorAll('iframe').length") == 0
+
+
+TOWER_SHOWN = (
+    at(GOOB, "web/picture-from", {"source": TOWER}),
+    at(TOWER, "status", {"value": {"url": f"{STREAM}/stream"}}),
+)
+
+
+def test_the_stream_of_another_component_is_shown_instead(show: Show) -> None:
+    with show(replace(OWN, values=changed(fleet, MINE, *TOWER_SHOWN))) as opened:
+        opened.gear()
+        opened.test("open-stream").click()
+        assert opened.test("stream").get_attribute("title") == "The own stream of tower-1"
+        assert "own stream" in opened.page.frame_locator("[data-test=stream]").locator("body").inner_text(timeout=5000)
+
+
+def test_an_address_is_entered_and_taken_back(show: Show, server: CannedServer) -> None:
+    with show(replace(OWN, values=changed(fleet, MINE))) as opened:
+        opened.gear()
+        opened.test("stream-address").click()
+        use, address = opened.test("set-stream"), opened.test("stream-url")
+        assert use.is_disabled()
+        address.fill("javascript:alert(1)")
+        assert "only http://" in opened.page.locator("#why-stream-address").inner_text()
+        assert use.is_disabled()
+        address.fill(f" http://localhost:{server.port}/stream ")
+        use.click()
+        opened.page.reload()
+        opened.gear()
+        opened.test("open-stream").click()
+        assert "own stream" in opened.page.frame_locator("[data-test=stream]").locator("body").inner_text(timeout=5000)
+        opened.test("stream-address").click()
+        opened.test("unset-stream").click()
+        assert opened.until(lambda: opened.test("unset-stream").count() == 0)
+        assert opened.complaints() == []

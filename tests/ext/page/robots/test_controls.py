@@ -1,0 +1,325 @@
+"""Every control of the fleet and of a robot's page, used in a browser; what it does is asserted at the robot.
+
+The robots are microcontrollers; those with pictures are in test_pictures_of_robots.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+
+import pytest
+from playwright.sync_api import Browser, Locator
+
+from pebble.contract.payloads import Heartbeat
+from tests.ext.page.browser import tab
+from tests.ext.page.console import BACK, FORWARD, KEYS, LEFT, REST, RIGHT, Console, Wheels, Wire, console, used
+from tests.ext.page.stage import Stage
+from tests.support import further
+
+pytestmark = pytest.mark.alone  # deadlines are checked
+
+
+@pytest.fixture(scope="module")
+def _benjr_page(browser: Browser, stage: Stage) -> Iterator[Console]:
+    with console(browser, stage, "benjr", theme="dark", engineers=False) as opened:
+        yield opened
+
+
+@pytest.fixture
+def at_benjr(_benjr_page: Console) -> Iterator[Console]:
+    """Benjr's page, in the dark: its motors have more speeds than on and off."""
+    with used(_benjr_page) as ready:
+        yield ready
+
+
+# -- keys
+
+
+@pytest.mark.parametrize("page", ["at_lamp", further("at_benjr")])
+def test_each_key_turns_the_wheels_while_it_is_held(request: pytest.FixtureRequest, page: str) -> None:
+    robot: Console = request.getfixturevalue(page)
+    for key, wheels in KEYS.items():
+        assert robot.drive(key, wheels=wheels), (key, robot.wheels, robot.reason)
+        robot.let_go()
+        assert robot.rests(), key
+
+
+def test_two_keys_are_mixed_and_opposite_ones_rest(at_benjr: Console) -> None:
+    assert at_benjr.drive("KeyW", "KeyD", wheels=(1, 0))
+    at_benjr.let_go()
+    assert at_benjr.rests()
+    assert at_benjr.drive()
+    at_benjr.down("KeyS")
+    assert at_benjr.rests()
+    assert at_benjr.press_anew()
+
+
+@pytest.mark.parametrize(("key", "button", "y"), [("KeyQ", "aux+", 0.6), ("KeyE", "aux-", -0.6)])
+def test_the_extra_axis_has_keys_and_buttons(at_lamp: Console, wire: Wire, key: str, button: str, y: float) -> None:
+    def newest() -> float:
+        return float((wire.last("minilamp/incoming/drive-values") or {}).get("y", 0.0))
+
+    assert at_lamp.persists(lambda: at_lamp.down(key), lambda: newest() == y, at_lamp.let_go)
+    at_lamp.let_go()
+    assert at_lamp.tab.until(lambda: newest() == 0, 2)
+    at_lamp.uncover(button).hover()
+    mouse = at_lamp.page.mouse
+    assert at_lamp.persists(mouse.down, lambda: newest() == y, mouse.up)
+    mouse.up()
+    assert at_lamp.tab.until(lambda: newest() == 0, 2)
+
+
+# -- sliders and stick
+
+SLIDERS = {"speed": "60", "turn": "60", "balance": "0"}
+
+
+@pytest.mark.parametrize(
+    ("slider", "value", "key", "speeds"),
+    [
+        ("speed", "30", "KeyW", (0.3, 0.3)),
+        ("speed", "100", "KeyS", (-1.0, -1.0)),
+        ("turn", "25", "KeyD", (0.25, -0.25)),
+        ("balance", "50", "KeyW", (0.6, 0.3)),
+        ("balance", "-50", "KeyW", (0.3, 0.6)),
+    ],
+)
+def test_a_slider_scales_what_the_wheels_do(
+    at_benjr: Console, slider: str, value: str, key: str, speeds: tuple[float, float]
+) -> None:
+    at_benjr.uncover(slider).fill(value)
+    assert at_benjr.drive(key, wheels=KEYS[key])
+    assert at_benjr.tab.until(lambda: at_benjr.speeds == pytest.approx(speeds, abs=0.01), 1), at_benjr.speeds
+    at_benjr.let_go()
+    at_benjr.test(slider).fill(SLIDERS[slider])
+
+
+def test_arrow_keys_on_a_slider_move_the_slider_only(at_benjr: Console) -> None:
+    at_benjr.test("speed").focus()
+    at_benjr.down("ArrowRight")
+    assert at_benjr.stays_at_rest(0.2)
+    assert at_benjr.test("speed").input_value() == "65"
+    at_benjr.test("speed").fill("60")
+
+
+@pytest.mark.parametrize(("x", "y", "wheels"), [(0, -1, FORWARD), (0, 1, BACK), (-1, 0, LEFT), (1, 0, RIGHT)])
+def test_the_stick_follows_the_mouse(at_benjr: Console, x: int, y: int, wheels: Wheels) -> None:
+    left, top, size = at_benjr.place("stick")
+    mouse = at_benjr.page.mouse
+
+    def drag() -> None:
+        mouse.move(left, top)
+        mouse.down()
+        mouse.move(left + 0.4 * x * size, top + 0.4 * y * size, steps=3)
+
+    assert at_benjr.persists(drag, lambda: at_benjr.wheels == wheels, mouse.up)
+    mouse.move(left + 3 * x * size, top + 3 * y * size)
+    assert at_benjr.wheels == wheels
+    mouse.up()
+    assert at_benjr.rests()
+    mouse.move(left, top)
+    mouse.down()
+    assert at_benjr.stays_at_rest(0.1)
+
+
+def test_what_appears_above_the_stick_does_not_turn_the_robot(at_benjr: Console) -> None:
+    left, top, size = at_benjr.place("stick")
+    mouse = at_benjr.page.mouse
+
+    def drag() -> None:
+        mouse.move(left, top)
+        mouse.down()
+        mouse.move(left + 0.4 * size, top, steps=3)
+
+    assert at_benjr.persists(drag, lambda: at_benjr.wheels == RIGHT, mouse.up)
+    at_benjr.page.evaluate("document.querySelector('main').style.paddingTop = '150px'")
+    mouse.move(left + 0.4 * size + 1, top)
+    assert not at_benjr.tab.until(lambda: at_benjr.wheels != RIGHT, 0.3)
+    mouse.up()
+    assert at_benjr.rests()
+    at_benjr.page.evaluate("document.querySelector('main').style.paddingTop = ''")
+
+
+# -- stops
+
+
+def test_the_space_bar_ends_the_gesture_and_latches_nothing(at_lamp: Console, wire: Wire) -> None:
+    assert at_lamp.drive()
+    at_lamp.page.keyboard.press("Space")
+    assert at_lamp.rests()
+    assert at_lamp.stays_at_rest()
+    assert not wire.latched("minilamp")
+    assert at_lamp.press_anew()
+
+
+def _escape_twice(element: Locator) -> None:
+    element.press("Escape")
+    element.press("Escape")
+
+
+def _touch(element: Locator) -> None:
+    element.hover()
+    element.page.mouse.down()
+
+
+STOPS: dict[str, Callable[[Console], None]] = {
+    "Ctrl+Space": lambda robot: robot.page.keyboard.press("Control+Space"),
+    "Escape twice": lambda robot: _escape_twice(robot.page.locator("body")),
+    "Escape twice, in a list": lambda robot: _escape_twice(robot.test("picker")),
+    "STOP": lambda robot: robot.test("stop-one").click(),
+    "STOP, by key": lambda robot: robot.test("stop-one").press("Enter"),
+    "STOP, as soon as it is touched": lambda robot: _touch(robot.test("stop-one")),
+}
+
+
+@pytest.mark.parametrize("how", STOPS)
+def test_a_stop_latches_the_robot_which_stays_at_rest(at_lamp: Console, wire: Wire, how: str) -> None:
+    assert at_lamp.drive()
+    STOPS[how](at_lamp)
+    assert at_lamp.tab.until(lambda: wire.latched("minilamp"), 2)
+    assert at_lamp.rests()
+    assert at_lamp.because("stopped", within=2)
+    at_lamp.let_go()
+    at_lamp.down("KeyW")
+    assert at_lamp.stays_at_rest()
+
+
+def test_stop_all_latches_every_robot_and_each_is_reset_by_itself(stage: Stage, at_lamp: Console, wire: Wire) -> None:
+    assert at_lamp.drive()
+    at_lamp.test("stop-all").click()
+    assert at_lamp.tab.until(lambda: all(wire.latched(name) for name in stage.robots), 3)
+    assert at_lamp.rests()
+    at_lamp.let_go()
+    at_lamp.test("reset").click()
+    at_lamp.test("leave-stopped").click()
+    at_lamp.test("reset").click()
+    at_lamp.test("reset-hold").click()
+    at_lamp.hold_button("reset-hold", 0.5)
+    assert wire.latched("minilamp")
+    at_lamp.hold_button("reset-hold")
+    assert at_lamp.tab.until(lambda: not wire.latched("minilamp"), 3)
+    assert wire.latched("benjr")
+    assert at_lamp.press_anew()
+    at_lamp.reset("benjr")
+    assert at_lamp.tab.until(lambda: not wire.latched("benjr"), 3)
+
+
+# -- control
+
+
+def test_a_release_stops_the_wheels(at_lamp: Console) -> None:
+    assert at_lamp.drive()
+    at_lamp.test("release").click()
+    assert at_lamp.rests()
+    assert at_lamp.because("free", within=2)
+    at_lamp.let_go()
+    at_lamp.down("KeyW")
+    assert at_lamp.stays_at_rest()
+
+
+def test_a_second_tab_stops_by_the_space_bar_and_takes_over_by_a_hold(
+    browser: Browser, stage: Stage, at_lamp: Console
+) -> None:
+    with console(browser, stage, "minilamp", engineers=False) as second:
+        assert second.because("lease")
+        second.down("KeyW")
+        assert second.stays_at_rest(0.2)
+        second.let_go()
+        assert at_lamp.drive()
+        second.page.keyboard.press("Space")
+        assert at_lamp.rests()
+        assert at_lamp.stays_at_rest()
+        at_lamp.let_go()
+        assert at_lamp.drive()
+        second.test("take-over").click()
+        assert not second.because("", within=0.3)
+        second.hold_button("take-over")
+        assert at_lamp.rests()
+        assert second.because("", within=3)
+        assert second.press_anew()
+        second.test("release").click()
+        assert at_lamp.because("free", within=3)
+        assert at_lamp.stays_at_rest()  # its key is still held
+        at_lamp.test("take").click()
+        assert at_lamp.because("", "release", within=3)
+        assert at_lamp.stays_at_rest()
+        assert at_lamp.press_anew()
+        assert second.tab.complaints() == []
+
+
+# -- the fleet
+
+
+def test_the_fleet_stops_robots(browser: Browser, stage: Stage, wire: Wire) -> None:
+    with tab(browser, stage.url) as fleet:
+        assert fleet.until(lambda: fleet.page.locator(".fleet-card").count() == 2)
+        fleet.test("stop-benjr").click()
+        assert fleet.until(lambda: wire.latched("benjr"), 2)
+        assert not wire.latched("minilamp")
+        names = "[...document.querySelectorAll('.fleet-card h2')].map((one) => one.textContent).join()"
+        assert fleet.page.evaluate(names) == "BenJr,MiniLAMP"
+        fleet.test("fleet-more").click()
+        fleet.test("sort").select_option("battery")
+        assert fleet.until(f"{names} === 'MiniLAMP,BenJr'", 2)
+        fleet.test("filter").fill("LAMP")
+        assert fleet.until(f"{names} === 'MiniLAMP'", 2)
+        fleet.test("card-minilamp").click(position={"x": 4, "y": 4})  # the whole card is the link, but for its Stop
+        assert fleet.until("window.pebble.driver.ref === 'pebble/robots/minilamp'", 2)
+        assert fleet.complaints() == []
+
+
+@pytest.mark.page
+def test_an_offline_robot_can_be_forgotten_until_it_is_back(browser: Browser, stage: Stage, wire: Wire) -> None:
+    wire.publish("old/outgoing/online", Heartbeat(t=1_700_000_000_000, online=False), retain=True)
+    with tab(browser, stage.url) as fleet:
+        assert fleet.until(lambda: fleet.test("forget").count() == 1)
+        fleet.test("forget").click()
+        assert fleet.until(lambda: fleet.test("forget").count() == 0, 2)
+        wire.publish("old/outgoing/online", Heartbeat(t=int(1000 * time.time()), online=True))
+        assert fleet.until(lambda: fleet.test("card-old").count() == 1, 3)
+        assert fleet.complaints() == []
+    wire.publish("old/outgoing/online", None, retain=True)
+
+
+@pytest.mark.page
+def test_the_settings_change_the_colours_and_end_a_gesture(at_lamp: Console) -> None:
+    colour = "getComputedStyle(document.body).backgroundColor"
+    light = at_lamp.page.evaluate(colour)
+    assert at_lamp.drive()
+    at_lamp.test("settings").click()
+    assert at_lamp.rests()
+    at_lamp.test("theme-dark").check()
+    assert at_lamp.page.evaluate(colour) != light
+    at_lamp.test("in-sight").check()
+    assert at_lamp.page.evaluate("window.pebble.driver.inSight")
+    at_lamp.test("in-sight").uncheck()
+    at_lamp.test("theme-light").check()
+    assert at_lamp.page.evaluate(colour) == light
+    at_lamp.page.keyboard.press("Escape")
+    assert at_lamp.tab.until("document.querySelector('dialog[open]') === null", 2)
+    assert at_lamp.press_anew()
+
+
+# -- without a mouse
+
+
+@pytest.mark.page
+def test_the_tab_key_reaches_every_control_and_space_on_a_button_also_stops(at_lamp: Console) -> None:
+    at_lamp.page.evaluate("document.activeElement.blur()")
+    focusable = "a[href], button:enabled, input:enabled, select:enabled, summary, [tabindex='0']"
+    count = at_lamp.page.evaluate(
+        "(all) => [...document.querySelectorAll(all)].filter((one) => one.checkVisibility()).length", focusable
+    )
+    at_lamp.page.evaluate("window.reached = new Set()")
+    for _ in range(count + 2):
+        at_lamp.page.keyboard.press("Tab")
+        at_lamp.page.evaluate("window.reached.add(document.activeElement)")
+    assert at_lamp.page.evaluate("window.reached.delete(document.body) || true")
+    assert at_lamp.page.evaluate("window.reached.size") == count
+    at_lamp.test("release").focus()
+    assert at_lamp.drive()
+    at_lamp.page.keyboard.press("Space")
+    assert at_lamp.rests()
+    assert at_lamp.because("free", within=2)
+    assert at_lamp.wheels == REST

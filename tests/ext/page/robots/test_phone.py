@@ -1,0 +1,213 @@
+"""The page on phones, used with fingers; what they do is asserted at the robot's motors."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+import pytest
+from playwright.sync_api import Browser
+
+from tests.ext.page.browser import Size, Theme
+from tests.ext.page.console import BACK, FORWARD, LEFT, REST, RIGHT, Console, Wheels, Wire, console, used
+from tests.ext.page.fingers import Fingers
+from tests.ext.page.stage import Stage
+
+pytestmark = pytest.mark.page  # deadlines are checked
+
+
+class Phone(Console):
+    """A console that is touched."""
+
+    fingers: Fingers
+
+    def opens_drive(self) -> bool:
+        """Tap its tab; a tap that a busy machine stretches is none."""
+        self.test("tab-drive").tap()
+        return self.test("stick").is_visible()
+
+    def stick(self, x: float = 0.0, y: float = -1.0, finger: int = 1) -> None:
+        """Put a finger on the middle of the stick and drag it: to the right and down, of the stick's reach."""
+        left, top, size = self.place("stick")
+        self.fingers.down(finger, left, top)
+        self.fingers.move(finger, left + 0.2 * x * size, top + 0.2 * y * size)
+        self.fingers.move(finger, left + 0.4 * x * size, top + 0.4 * y * size)
+
+    def drive_by_stick(self, x: float = 0.0, y: float = -1.0, wheels: Wheels = FORWARD) -> bool:
+        return self.persists(lambda: self.stick(x, y), lambda: self.wheels == wheels, self.fingers.lift)
+
+    def touch(self, name: str, finger: int = 2) -> None:
+        left, top, _ = self.place(name)
+        self.fingers.down(finger, left, top)
+
+
+@contextmanager
+def phone(browser: Browser, stage: Stage, size: Size = "phone", theme: Theme = "light") -> Iterator[Phone]:
+    with console(browser, stage, "minilamp", size, theme) as opened, used(opened):
+        held = Phone(opened.tab, stage, opened.name)
+        held.fingers = Fingers(opened.tab)
+        yield held
+        held.fingers.lift()
+
+
+@pytest.fixture
+def at_lamp(browser: Browser, stage: Stage) -> Iterator[Phone]:
+    with phone(browser, stage) as opened:
+        yield opened
+
+
+@pytest.mark.parametrize(("size", "theme"), [("phone", "light"), ("landscape", "dark"), ("small", "dark")])
+def test_the_stick_follows_a_finger_until_it_is_lifted(
+    browser: Browser, stage: Stage, size: Size, theme: Theme
+) -> None:
+    with phone(browser, stage, size, theme) as robot:
+        for x, y, wheels in [(0, -1, FORWARD), (0, 1, BACK), (-1, 0, LEFT), (1, 0, RIGHT)]:
+            assert robot.drive_by_stick(x, y, wheels)
+            robot.fingers.up(1)
+            assert robot.rests()
+        assert robot.drive_by_stick()
+        robot.fingers.move(1, robot.place("stick")[0], 1)  # far above the stick
+        assert robot.turns(FORWARD)
+        robot.fingers.up(1)
+        assert robot.rests()
+
+
+# -- a second finger
+
+
+def test_a_second_finger_on_stop_latches(at_lamp: Phone, wire: Wire) -> None:
+    assert at_lamp.drive_by_stick()
+    at_lamp.touch("stop-one")
+    assert at_lamp.tab.until(lambda: wire.latched("minilamp"), 2)
+    assert at_lamp.rests()
+    at_lamp.fingers.up(2)
+    assert at_lamp.because("stopped", within=3)
+    at_lamp.reset()
+    assert at_lamp.tab.until(lambda: not wire.latched("minilamp"), 3)
+    left, top, size = at_lamp.place("stick")
+    at_lamp.fingers.move(1, left, top - 0.3 * size)
+    assert at_lamp.stays_at_rest()
+    at_lamp.fingers.up(1)
+    assert at_lamp.drive_by_stick()
+
+
+def test_a_second_finger_elsewhere_neither_holds_the_stick_nor_lets_it_go(at_lamp: Phone) -> None:
+    assert at_lamp.drive_by_stick()
+    at_lamp.touch("why")
+    at_lamp.fingers.up(2)
+    assert at_lamp.turns(FORWARD)
+    at_lamp.touch("why")
+    at_lamp.fingers.up(1)
+    assert at_lamp.rests()
+    assert at_lamp.stays_at_rest()
+    at_lamp.fingers.up(2)
+    assert at_lamp.drive_by_stick()
+
+
+def test_a_second_finger_on_the_stick_ends_the_gesture(at_lamp: Phone) -> None:
+    assert at_lamp.drive_by_stick()
+    at_lamp.touch("stick")
+    assert at_lamp.rests()
+    at_lamp.fingers.up(2)
+    assert at_lamp.stays_at_rest()
+    at_lamp.fingers.up(1)
+    assert at_lamp.drive_by_stick()
+
+
+def test_a_part_of_the_page_that_is_opened_takes_the_stick_away(at_lamp: Phone) -> None:
+    assert at_lamp.drive_by_stick()
+    at_lamp.test("tab-more").dispatch_event("click")
+    assert at_lamp.rests()
+    assert at_lamp.test("stop-one").is_visible()
+    at_lamp.fingers.lift()
+    at_lamp.page.wait_for_timeout(300)  # no finger taps anew at once
+    assert at_lamp.tab.until(at_lamp.opens_drive, 10)
+    assert at_lamp.drive_by_stick()
+
+
+# -- what takes the finger away
+
+
+def _rotate(robot: Phone, width: int, height: int, kind: str, angle: int) -> None:
+    robot.tab.cdp().send(
+        "Emulation.setDeviceMetricsOverride",
+        {
+            "width": width,
+            "height": height,
+            "deviceScaleFactor": 1,
+            "mobile": True,
+            "screenOrientation": {"type": kind, "angle": angle},
+        },
+    )
+
+
+LOSSES: dict[str, Callable[[Phone], None]] = {
+    "the system takes the finger": lambda robot: robot.fingers.cancel(),
+    "rotation": lambda robot: _rotate(robot, 844, 390, "landscapePrimary", 90),
+    "the screen is switched off": lambda robot: robot.tab.hide(),
+    "another application": lambda robot: robot.tab.blur(),
+}
+
+
+@pytest.mark.parametrize("what", LOSSES)
+def test_what_takes_the_finger_away_stops(at_lamp: Phone, what: str) -> None:
+    assert at_lamp.drive_by_stick()
+    LOSSES[what](at_lamp)
+    assert at_lamp.rests()
+    assert at_lamp.stays_at_rest()
+    at_lamp.tab.hide(hidden=False)
+    assert at_lamp.stays_at_rest()
+    at_lamp.fingers.lift()
+    assert at_lamp.test("stop-one").is_visible()
+    assert at_lamp.drive_by_stick()
+
+
+# -- buttons
+
+
+def test_control_and_reset_by_finger(browser: Browser, stage: Stage, wire: Wire) -> None:
+    with phone(browser, stage, theme="dark") as robot:
+        robot.test("release").tap()
+        assert robot.because("free", within=3)
+        robot.stick()
+        assert robot.stays_at_rest()
+        robot.fingers.lift()
+        robot.test("take").tap()
+        assert robot.because("", within=3)
+        robot.touch("stop-one")
+        assert robot.tab.until(lambda: wire.latched("minilamp"), 2)
+        robot.fingers.up(2)
+        robot.test("reset").tap()
+        robot.test("reset-hold").tap()
+        robot.touch("reset-hold")
+        robot.page.wait_for_timeout(400)
+        assert wire.latched("minilamp")
+        robot.page.wait_for_timeout(900)
+        robot.fingers.up(2)
+        assert robot.tab.until(lambda: not wire.latched("minilamp"), 3)
+        assert robot.because("", within=3)
+        assert robot.drive_by_stick()
+
+
+def test_the_extra_axis_is_held_by_a_finger(at_lamp: Phone, wire: Wire) -> None:
+    axis: Callable[[], float] = lambda: (wire.last("minilamp/incoming/drive-values") or {}).get("y", 0.0)
+    assert at_lamp.test("aux+").is_visible()  # the robot has no picture, so there is room
+    assert at_lamp.persists(lambda: at_lamp.touch("aux+"), lambda: axis() > 0, at_lamp.fingers.lift)
+    at_lamp.fingers.up(2)
+    assert at_lamp.tab.until(lambda: axis() == 0, 2)
+    assert at_lamp.persists(lambda: at_lamp.touch("aux-"), lambda: axis() < 0, at_lamp.fingers.lift)
+    at_lamp.fingers.cancel()
+    assert at_lamp.tab.until(lambda: axis() == 0, 2)
+    assert at_lamp.wheels == REST
+
+
+def test_the_fleet_is_stopped_and_a_robot_opened_by_finger(browser: Browser, stage: Stage, wire: Wire) -> None:
+    with phone(browser, stage) as robot:
+        robot.page.get_by_label("All robots").tap()
+        assert robot.tab.until("window.pebble.driver.ref === ''", 2)
+        robot.test("stop-all").tap()
+        assert robot.tab.until(lambda: wire.latched("minilamp"), 2)
+        robot.test("card-minilamp").get_by_role("link").first.tap()
+        assert robot.because("stopped")
+        robot.take()
+        assert robot.drive_by_stick()

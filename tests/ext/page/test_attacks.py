@@ -1,0 +1,704 @@
+"""What an attacker with a browser, or with a socket, tries against the real server; each attempt is refused."""
+
+from __future__ import annotations
+
+import json
+import socket
+import sqlite3
+import struct
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import replace
+from itertools import product
+from pathlib import Path
+from typing import Any, get_args
+from urllib.parse import quote
+
+import httpx
+import pytest
+from starlette.routing import Route, WebSocketRoute
+from websockets.exceptions import ConnectionClosed
+
+from pebble.extensions.fleet.roles import Role
+from pebble.extensions.page import control, serve
+from pebble.extensions.page import messages as m
+from tests.ext.page.attacker import PASSWORDS, Everything, Hall
+from tests.ext.page.served import Page, Served, now_ms
+from tests.kit.played_robot import RecordingRobot
+from tests.support import Broker, beside, cases, until
+
+GOOB = "pebble/robots/goob"
+OWNER = {"owner": "serial", "boot": "00000000", "count": 1}
+PUBLIC = {"/login", "/ca.pem", "/healthz", "/api/login", "/api/logout"}
+HERE = Path(__file__).resolve().parents[3] / "pebble/extensions/page"
+
+
+@pytest.fixture(scope="module")
+def hall(broker: Broker, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Hall]:
+    with Hall(broker.port, tmp_path_factory.mktemp("hall")) as hall:
+        yield hall
+
+
+@pytest.fixture(scope="module")
+def everything(broker: Broker) -> Iterator[Everything]:
+    recorder = Everything(broker.port)
+    yield recorder
+    recorder.close()
+
+
+@pytest.fixture(scope="module")
+def goob(broker: Broker) -> Iterator[RecordingRobot]:
+    with RecordingRobot(broker.port, GOOB) as robot:
+        yield robot
+
+
+@pytest.fixture(scope="module")
+def driver(hall: Hall, goob: RecordingRobot) -> Iterator[Page]:
+    """An honest page beside the attacks."""
+    with hall.page("driver") as page:
+        assert page.knows(GOOB)
+        assert page.ready()
+        yield page
+
+
+# -- other sites
+
+
+def foreign(hall: Hall) -> list[str | None]:
+    port = hall.served.port
+    return [
+        None,
+        "null",
+        "http://evil.test",
+        f"http://127.0.0.1:{port + 1}",
+        "http://127.0.0.1",
+        f"https://127.0.0.1:{port}",
+        f"http://localhost:{port}",
+        f"http://127.0.0.1:{port}.evil.test",
+        f"http://evil.test/http://127.0.0.1:{port}",
+    ]
+
+
+def test_a_page_of_another_site_opens_no_socket(hall: Hall, driver: Page) -> None:
+    cookie = hall.cookie("admin")
+    of_robots = [path for path in hall.routes(WebSocketRoute) if path != "/ws/replay"]  # here are no recordings
+    paths = [f"{path}?ref={GOOB}&can=json" for path in of_robots]
+    assert len(paths) >= 2
+    for path in paths:
+        assert hall.refusal(path, cookie=cookie) == 101, path
+        for origin in foreign(hall):
+            assert hall.refusal(path, cookie=cookie, origin=origin) == 403, (path, origin)
+
+
+def test_it_posts_nothing(hall: Hall, driver: Page, everything: Everything) -> None:
+    paths = list(hall.routes(Route, "POST"))
+    assert {"/api/estop", "/api/login", "/api/logout"} <= set(paths)
+    body = {"ref": GOOB, "stop": "0123456789abcdef", "op": "estop", "user": "admin", "password": PASSWORDS["admin"]}
+    with hall.client("admin") as client:
+        for path in paths:
+            for origin in foreign(hall):
+                headers = {} if origin is None else {"origin": origin}
+                for answer in (
+                    client.post(path, json=body, headers=headers),
+                    client.post(path, data=body, headers=headers),
+                ):
+                    assert (answer.status_code, answer.text) == (403, "this request comes from another site\n"), path
+                    assert "set-cookie" not in answer.headers
+            form = {"origin": hall.served.origin}
+            assert client.post(path, files={"a": b"b"}, headers=form).status_code == 415
+        for path in {*paths} - {"/api/estop"}:
+            assert client.post(path, data=body, headers=form).status_code == 415
+        assert client.get("/").status_code == 200, "the session has ended"
+    assert not {topic for topic in everything.incoming() if topic.endswith("/estop")}
+
+
+def test_it_reads_nothing(hall: Hall, driver: Page) -> None:
+    with hall.client("admin") as client:
+        for path in hall.routes(Route, "GET"):
+            answer = client.get(path, headers={"origin": "http://evil.test"})
+            assert not [name for name in answer.headers if name.startswith("access-control")], path
+            assert answer.headers["cross-origin-resource-policy"] == "same-origin"
+            assert client.options(path, headers={"origin": "http://evil.test"}).status_code == 405
+
+
+@pytest.mark.parametrize("host", ["evil.test", "evil.test:{port}", "a@127.0.0.1", "127.0.0.1.evil.test:{port}", ""])
+def test_a_name_that_was_bent_to_this_machine_is_refused(hall: Hall, driver: Page, host: str) -> None:
+    name = host.format(port=hall.served.port)
+    cookie = hall.cookie("admin")
+    for path in ("/", "/login", "/healthz", "/ca.pem", f"/static/{hall.served.version}/main.js"):
+        request = f"GET {path} HTTP/1.1\r\nHost: {name}\r\nCookie: {cookie}\r\nConnection: close\r\n\r\n"
+        assert hall.raw(request.encode()).startswith(b"HTTP/1.1 421 ")
+    upgrade = (
+        f"GET /ws/control HTTP/1.1\r\nHost: {name}\r\nOrigin: http://{name}\r\nCookie: {cookie}\r\n"
+        "Connection: Upgrade\r\nUpgrade: websocket\r\nSec-WebSocket-Version: 13\r\n"
+        "Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\n\r\n"
+    )
+    assert hall.raw(upgrade.encode()).startswith(b"HTTP/1.1 403 ")
+
+
+# -- without a session
+
+
+def expired(hall: Hall) -> str:
+    cookie = hall.cookie("admin")
+    database = sqlite3.connect(str(hall.served.settings.people))
+    with database:
+        database.execute("UPDATE sessions SET expires = ? WHERE started = (SELECT MAX(started) FROM sessions)", (1.0,))
+    database.close()
+    return cookie
+
+
+def revoked(hall: Hall) -> str:
+    cookie = hall.cookie("admin")
+    hall.people.end_session(cookie.partition("=")[2])
+    return cookie
+
+
+def test_without_a_session_there_is_nothing(hall: Hall, driver: Page, everything: Everything) -> None:
+    cookies = {"none": "", "odd": "pebble=x", "expired": expired(hall), "revoked": revoked(hall)}
+    cookies["of https"] = "__Host-" + hall.cookie("admin")
+    body = {"op": "estop", "ref": GOOB, "stop": "0123456789abcdef"}
+    for kind, cookie in cookies.items():
+        for path in hall.routes(WebSocketRoute):
+            assert hall.refusal(f"{path}?ref={GOOB}&can=json", cookie=cookie) == 403, (kind, path)
+        with httpx.Client(base_url=hall.served.origin, headers={"cookie": cookie}) as client:
+            for path in hall.routes(Route, "GET"):
+                if path not in PUBLIC and not path.startswith("/static/"):
+                    assert client.get(path).status_code in (303, 401), (kind, path)
+            for path in hall.routes(Route, "POST"):
+                if path not in PUBLIC:
+                    answer = client.post(path, json=body, headers={"origin": hall.served.origin})
+                    assert answer.status_code == 401, (kind, path)
+            form = client.post("/api/estop", data=body, headers={"origin": hall.served.origin})
+            assert (form.status_code, "log in first" in form.text) == (401, True), kind
+    assert not {topic for topic in everything.incoming() if topic.endswith("/estop")}
+
+
+def moving(page: Page, robot: RecordingRobot) -> bool:
+    """Take the lease and move; each call is a new gesture."""
+    gesture = int(now_ms())
+    page.send("lease", ref=robot.base, take=True)
+    end = time.monotonic() + 2
+    since = time.monotonic()
+    while time.monotonic() < end and not page.closed:
+        page.drive(robot.base, gesture, z=0.5)
+        if any(one["z"] for one in robot.drives(since)):
+            return True
+        time.sleep(0.05)
+    return False
+
+
+@pytest.mark.parametrize("how", ["removed", "password", "role", "logout"])
+def test_a_session_that_is_revoked_while_driving_ends(
+    hall: Hall, broker: Broker, how: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    base = f"pebble/robots/revoked-{how}"
+    hall.people.add("mallory", "sentinel of mallory", Role.DRIVER)
+    cookie = hall.cookie("mallory")
+    with RecordingRobot(broker.port, base) as robot, Page(hall.served, cookie=cookie) as page:
+        assert page.knows(base)
+        assert page.ready()
+        pictures = hall.socket(f"/ws/media?ref={base}&can=json", cookie=cookie)
+        assert moving(page, robot)
+        match how:
+            case "removed":
+                hall.people.remove("mallory")
+            case "password":
+                hall.people.set_password("mallory", "another sentinel")
+            case "role":
+                hall.people.set_role("mallory", Role.VIEWER)
+            case "logout":
+                headers = {"cookie": cookie, "origin": hall.served.origin}
+                assert httpx.post(f"{hall.served.origin}/api/logout", json={}, headers=headers).status_code == 200
+        end = time.monotonic() + 3
+        while time.monotonic() < end and not page.closed:
+            try:
+                page.drive(base, int(now_ms()), z=0.5)
+            except ConnectionClosed:
+                break
+            time.sleep(0.05)
+        assert until(lambda: page.closed, 1)
+        assert page.bye["why"]
+        assert until(lambda: robot.drives()[-1]["z"] == 0, 1), "the wheels stop"
+        if how != "role":
+            with pytest.raises(ConnectionClosed):
+                pictures.recv(timeout=3)
+            assert hall.refusal("/ws/control", cookie=cookie) == 403
+        pictures.close()
+    if how != "removed":
+        hall.people.remove("mallory")
+
+
+# -- roles
+
+
+def ops(ref: str) -> dict[str, dict[str, Any]]:
+    """One message of each kind that a page can send."""
+    return {
+        "hello": {"version": "x"},
+        "echo": {"n": 0, "t": 0},
+        "watch": {"ref": ref},
+        "read-logs": {"ref": ref, "on": True},
+        "lease": {"ref": ref, "take": True, "over": True},
+        "drive": {"ref": ref, "g": 1, "t": now_ms(), "z": 0.5},
+        "stop": {"ref": ref},
+        "estop": {"ref": ref, "stop": "0123456789abcdef"},
+        "estop-end": {"stop": "0123456789abcdef"},
+        "estop-reset": {"ref": ref, "owners": [OWNER]},
+        "picture-from": {"ref": ref, "source": GOOB},
+        "lights": {"ref": ref, "r": 1},
+        "soundboard": {"ref": ref, "file": "horn.wav"},
+        "autonomy": {"ref": ref, "file": "follow"},
+        "outlet": {"ref": ref, "outlet": "o1", "on": True},
+        "mcu": {"ref": ref, "uid": "imu", "name": "led", "value": {}},
+        "action": {"ref": ref, "name": "reboot"},
+        "flag": {"ref": ref, "name": "mqtt-video", "on": False},
+    }
+
+
+#: What a viewer may send: it moves nothing and changes nothing for others, but a stop.
+FOR_VIEWERS = {"hello", "echo", "watch", "read-logs", "stop", "estop", "estop-end"}
+
+
+def test_every_op_is_attacked() -> None:
+    assert set(ops(GOOB)) == {kind.__struct_config__.tag for kind in get_args(m.FromPage)}
+
+
+def test_a_viewer_may_not(hall: Hall, broker: Broker, driver: Page, everything: Everything) -> None:
+    base, asked = "pebble/robots/viewed", sorted(set(ops(GOOB)) - FOR_VIEWERS)
+    with RecordingRobot(broker.port, base) as robot, hall.page("viewer") as page:
+        assert page.knows(base)
+        assert page.ready()
+        before = dict(driver.state)
+        for op in asked:
+            page.send(op, **ops(base)[op])
+        assert until(lambda: len(page.refused) >= len(asked)), page.refused
+        why = "The role viewer may not do this"
+        assert [(one["cmd"], one["why"]) for one in page.refused] == [(op, why) for op in asked]
+        assert not page.closed
+        time.sleep(0.2)
+        assert robot.received == []
+        assert everything.incoming(base) == set()
+        assert driver.value(base, "web/driver") == before.get((base, "web/driver"))
+
+
+def test_a_viewer_may_stop_and_is_offered_nothing_else(hall: Hall, broker: Broker) -> None:
+    base = "pebble/robots/stopped-by-viewer"
+    with RecordingRobot(broker.port, base) as robot, hall.page("viewer", device="phone") as page:
+        assert (page.welcome["user"], page.welcome["role"], page.welcome["rights"]) == ("viewer", "viewer", [])
+        assert page.knows(base)
+        page.send("estop", ref=base, stop="00000000000000aa")
+        assert until(lambda: robot.latched)
+        assert until(lambda: page.value(base, "web/estop", "latched"))
+        page.send("estop-reset", **ops(base)["estop-reset"])
+        assert until(lambda: page.refused)
+        assert robot.latched
+
+
+# -- paths
+
+
+TRAVERSALS = [
+    "../server.py",
+    "..%2fserver.py",
+    "%2e%2e/server.py",
+    "%2e%2e%2fserver.py",
+    "..%252fserver.py",
+    "%252e%252e%252fserver.py",
+    "..\\server.py",
+    "..%5cserver.py",
+    "....//server.py",
+    "core/../../server.py",
+    "/etc/passwd",
+    "%2fetc%2fpasswd",
+    "//etc/passwd",
+    "..%00/server.py",
+    "main.js%00.py",
+    "..;/server.py",
+    "..%c0%afserver.py",
+    "..%ef%bc%8fserver.py",
+    "core",
+    "core/",
+    "",
+    ".",
+    "vendor/..",
+    "file:///etc/passwd",
+    "C:%5cWindows%5cwin.ini",
+]
+
+
+@pytest.mark.parametrize("path", TRAVERSALS)
+def test_nothing_but_the_pages_files_is_served(hall: Hall, path: str) -> None:
+    secret = (HERE / "server.py").read_bytes()[:60]
+    versions = (hall.served.version, "..", "%2e%2e", "x")
+    for place in [f"/static/{version}/{path}" for version in versions] + [f"/static/{path}", f"/r/{path}", f"/{path}"]:
+        request = f"GET {place} HTTP/1.1\r\nHost: 127.0.0.1:{hall.served.port}\r\nConnection: close\r\n\r\n"
+        answer = hall.raw(request.encode("latin-1", "replace"))
+        assert answer.split(b" ", 2)[1] in (b"303", b"307", b"400", b"404"), (place, answer[:100])
+        assert secret not in answer
+        assert b"root:" not in answer
+        assert b"Traceback" not in answer
+
+
+# -- the control socket
+
+
+def bad_messages() -> dict[str, str | bytes]:
+    drive = '{"op":"drive","ref":"%s","g":1,"t":%s,"x":0,"z":%s}'
+    odd: dict[str, str | bytes] = {
+        f"z={value}": drive % (GOOB, int(now_ms()), value)
+        for value in (
+            "NaN",
+            "Infinity",
+            "-Infinity",
+            "1e999",
+            "1.001",
+            "-1.001",
+            "1e308",
+            '"0.5"',
+            "null",
+            "[0.5]",
+            "{}",
+        )
+    }
+    odd |= {f"t={value}": drive % (GOOB, value, "0.5") for value in ("NaN", "Infinity", "-1", "1e300", '"1"', "null")}
+    return odd | {
+        "g is huge": drive.replace('"g":1', '"g":1e100') % (GOOB, 1, 0.5),
+        "g is negative": drive.replace('"g":1', '"g":-1') % (GOOB, 1, 0.5),
+        "g is a fraction": drive.replace('"g":1', '"g":1.5') % (GOOB, 1, 0.5),
+        "17 KB": json.dumps({"op": "watch", "ref": GOOB, "more": "x" * 17 * 1024}),
+        "ref of 201": json.dumps({"op": "watch", "ref": "x" * 201}),
+        "deep list": "[" * 16_000,
+        "deep object": '{"op":' * 2500,
+        "deep unknown field": '{"op":"watch","ref":"","more":' + "[" * 8000 + "]" * 8000 + "}",
+        "drive without anything": '{"op":"drive"}',
+        "unknown op": '{"op":"reboot","ref":"x"}',
+        "no op": '{"ref":"x"}',
+        "op is a number": '{"op":1}',
+        "not JSON": "drive!",
+        "empty": "",
+        "not an object": "[]",
+        "half a surrogate": '{"op":"watch","ref":"\\ud800"}',
+        "hello again": '{"op":"hello","version":"x"}',
+        "binary": b'{"op":"stop","ref":"x"}',
+        "binary zero": b"\x00" * 100,
+        "stop without a name": '{"op":"estop","ref":"","stop":"x"}',
+        "stop with another line": '{"op":"estop","ref":"","stop":"0123456789abcdef\\n"}',
+        "many owners": json.dumps(
+            {"op": "estop-reset", "ref": GOOB, "owners": [{"owner": "a", "boot": "b", "count": 1}] * 17}
+        ),
+    }
+
+
+@pytest.mark.parametrize("kind", sorted(bad_messages()))
+def test_what_is_not_understood_ends_the_connection_and_moves_nothing(
+    hall: Hall, goob: RecordingRobot, driver: Page, kind: str
+) -> None:
+    with hall.page("admin") as page:
+        assert page.knows(GOOB)
+        assert page.ready()
+        assert page.take(GOOB)
+        since = time.monotonic()
+        page.send_raw(bad_messages()[kind])
+        assert until(lambda: page.closed, 3)
+        assert page.bye["why"]
+        assert "Traceback" not in page.bye["why"]
+        assert not [one for one in goob.drives(since) if one["x"] or one["z"]]
+    assert hall.works()
+    assert not driver.closed
+
+
+FRAMES = {
+    "100 MB": b"\x81\xff" + (100 * 1024 * 1024).to_bytes(8, "big") + bytes(4),
+    "2^63 bytes": b"\x81\xff" + b"\x7f" + b"\xff" * 7 + bytes(4),
+    "compressed": b"\xc1\x85" + bytes(4) + b"hello",
+    "not masked": b"\x81\x05hello",
+    "unknown kind": b"\x83\x85" + bytes(4) + b"hello",
+    "not UTF-8": b"\x81\x82" + bytes(4) + b"\xff\xff",
+    "long ping": b"\x89\xfe\x00\xff" + bytes(4) + b"x" * 255,
+    "many parts": b"\x01\xfe\xea\x60" + bytes(4) + b"x" * 60000 + (b"\x00\xfe\xea\x60" + bytes(4) + b"x" * 60000) * 4,
+}
+
+
+@pytest.mark.parametrize("kind", sorted(FRAMES))
+def test_odd_frames_end_the_connection(hall: Hall, kind: str) -> None:
+    with socket.create_connection(("127.0.0.1", hall.served.port), 5) as client:
+        client.sendall(
+            f"GET /ws/control HTTP/1.1\r\nHost: 127.0.0.1:{hall.served.port}\r\nOrigin: {hall.served.origin}\r\n"
+            f"Cookie: {hall.cookie('admin')}\r\nConnection: Upgrade\r\nUpgrade: websocket\r\n"
+            "Sec-WebSocket-Version: 13\r\nSec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\n\r\n".encode()
+        )
+        assert b" 101 " in client.recv(4096)
+        client.sendall(FRAMES[kind])
+        start = time.monotonic()
+        with suppress(ConnectionError):
+            while client.recv(65536):
+                pass
+        assert time.monotonic() - start < 2
+    assert hall.works()
+
+
+HOSTILE_REFS = [
+    "#",
+    "+/+/+",
+    "pebble/robots/#",
+    "pebble/robots/+",
+    "pebble/robots/goob/incoming/drive-values",
+    "pebble/robots",
+    "$SYS/broker/uptime",
+    "pebble//goob",
+    "/pebble/robots/goob",
+    "pebble/robots/goob/",
+    "pebble/robots/\u0000",
+    "pebble/robots/../../x",
+    "constructor",
+    "__proto__",
+]
+UNKNOWN_REFS = ["pebble/servers/hall", "pebble/robots/unknown"]  # a robot that is off is stopped when it comes
+
+
+def test_names_of_robots_are_no_topics(hall: Hall, goob: RecordingRobot, everything: Everything) -> None:
+    cookie = hall.cookie("admin")
+    with hall.page("admin") as page, hall.client("admin") as client:
+        assert page.knows(GOOB)
+        assert page.ready()
+        for ref in HOSTILE_REFS + UNKNOWN_REFS:
+            published = len(everything.messages)
+            for op, fields in ops(ref).items():
+                if op not in {"hello", "echo"}:
+                    page.send(op, **fields)
+            page.send("watch", ref="")
+            assert client.get("/api/snapshot.jpg", params={"ref": ref}).status_code == 404, ref
+            time.sleep(0.3)
+            assert not page.closed, (ref, page.bye)
+            sent = {one.topic for one in everything.messages[published:] if "/incoming/" in one.topic}
+            named = UNKNOWN_REFS if ref in UNKNOWN_REFS else []  # stops are repeated until they arrive
+            assert sent <= {f"{one}/incoming/{metric}" for one in named for metric in ("estop", "drive-values")}, ref
+            page.send("estop-end", stop="0123456789abcdef")
+            assert hall.refusal(f"/ws/media?ref={quote(ref)}", cookie=cookie) == 403, ref
+    assert hall.works()
+
+
+#: Of each socket of media: what a page offers, messages that are nonsense, and some that may come at any time.
+NONSENSE: dict[str, tuple[str, list[str | bytes], list[bytes]]] = {
+    "media": (
+        "json",
+        ["text", "", b"", *(b"\x00" * size for size in (4, 6, 60_000, 1_000_000))],
+        [struct.pack(">IB", *one) for one in product((0, 1, 0xFFFFFFFF), (0, 1, 2, 3, 255))],
+    ),
+    "sound": (
+        "opus",
+        ["text", "", b"", *(b"\x00" * size for size in (4, 60_000)), *(b"\x01" * size for size in (648, 650)),
+         b"\x02" * 6, b"\x03" * 5],
+        [struct.pack(">BI", *one) for one in product((0, 2), (0, 1, 0xFFFFFFFF))],
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("kind", NONSENSE)
+def test_a_socket_of_media_takes_no_nonsense(hall: Hall, driver: Page, kind: str) -> None:
+    cookie, (can, wrong, allowed) = hall.cookie("viewer"), NONSENSE[kind]
+    for query in ("", "?ref=", "?ref=%23", "?ref=pebble/robots/nobody", f"?ref={GOOB}/incoming"):
+        assert hall.refusal(f"/ws/{kind}{query}", cookie=cookie) == 403
+    path = f"/ws/{kind}?ref={GOOB}&can={f'{can},' * 500}%00'\"<script>"
+    for data in wrong:
+        assert hall.closed_after(path, cookie, data)
+    with hall.socket(path, cookie=cookie) as opened:
+        for data in allowed:
+            opened.send(data)
+    assert hall.works()
+
+
+def test_a_viewer_does_not_talk(hall: Hall, driver: Page) -> None:
+    with hall.socket(f"/ws/sound?ref={GOOB}&can=opus", cookie=hall.cookie("viewer")) as talker:
+        talker.send(b"\x01" + bytes(648))
+        assert json.loads(talker.recv(timeout=5)) == {"talk": 0, "on": False, "why": "The role viewer may not do this"}
+
+
+@pytest.mark.parametrize(
+    "body", [b"", b"\xff", b"{", b"[" * 16_000, b"null", b'{"op":"estop","ref":"\xff"}', b"x" * 17_000]
+)
+def test_odd_bodies_stop_nothing(hall: Hall, everything: Everything, body: bytes) -> None:
+    headers = {"origin": hall.served.origin, "content-type": "application/json"}
+    before = len(everything.incoming())
+    with hall.client("admin") as client:
+        for path in hall.routes(Route, "POST"):
+            if path != "/api/logout":
+                expected = (400, 413, 429, *(404,) * ("{" in path))
+                assert client.post(path, content=body, headers=headers).status_code in expected, path
+    assert len(everything.incoming()) == before
+
+
+def test_the_login_leads_back_to_the_page_that_was_asked_for(hall: Hall) -> None:
+    with hall.client() as client:
+        assert client.get(f"/r/{GOOB}").headers["location"] == f"../../../login?next=/r/{GOOB}"
+        assert client.get("/").headers["location"] == "./login"
+        assert client.get("/r/%0d%0aset-cookie:%20x=y").status_code == 404
+        odd = client.get("/r/%22%3E//evil.test?x=y&next=//evil.test")
+        assert odd.headers["location"] == "../../../login?next=/r/%22%3E//evil.test"
+
+
+# -- slow and many
+
+
+def test_a_socket_without_hello_is_closed(hall: Hall, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(control, "HELLO_S", 0.3)
+    assert hall.closed_after("/ws/control", hall.cookie("admin"))
+
+
+def test_slow_requests_do_not_keep_others_out(hall: Hall, driver: Page, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(serve, "REQUEST_S", 1.0)
+    before, slow = len(hall.served.open), []
+    for number in range(300):
+        client = socket.create_connection(("127.0.0.1", hall.served.port), 5)
+        client.sendall(b"GET /ws/control HTTP/1.1\r\nX: y\r\n" if number % 2 else b"G")
+        slow.append(client)
+    assert hall.works()
+    assert until(lambda: len(hall.served.open) <= before + 1, 5)
+    assert not driver.closed
+    for client in slow:
+        client.close()
+
+
+def test_a_flood_of_stops_ends_no_other_persons_stop(hall: Hall, everything: Everything) -> None:
+    def count() -> int:
+        return len([one for one in everything.messages if one.topic == "pebble/robots/off/incoming/estop"])
+
+    with hall.page("driver") as page, hall.page("viewer") as mallory:
+        page.send("estop", ref="pebble/robots/off", stop="00000000000000ff")
+        assert until(count)
+        with suppress(ConnectionClosed):
+            for number in range(300):
+                mallory.send("estop", ref=f"pebble/robots/w{number}", stop=f"{number:016x}")
+            mallory.send("estop-end", stop="00000000000000ff")
+        time.sleep(1)
+        before = count()
+        assert until(lambda: count() >= before + 2, 3), "it is no longer sent"
+        assert until(lambda: [one["why"] for one in mallory.refused] == ["The role viewer may not do this"])
+        page.send("estop-end", stop="00000000000000ff")
+        time.sleep(0.7)
+        before = count()
+        time.sleep(0.7)
+        assert count() == before
+    assert hall.works()
+
+
+# -- guessing
+
+
+def test_passwords_cannot_be_guessed(broker: Broker, tmp_path: Path) -> None:
+    with Hall(broker.port, tmp_path) as hall, hall.client() as client:
+        headers = {"origin": hall.served.origin}
+
+        def log_in(user: str, password: str) -> httpx.Response:
+            return client.post("/api/login", json={"user": user, "password": password}, headers=headers)
+
+        answers = [log_in("admin" if number % 2 else f"x{number}", f"guess {number}") for number in range(12)]
+        assert [answer.status_code for answer in answers] == [401] * 5 + [429] * 7
+        assert len({answer.content for answer in answers[:5]}) == 1
+        assert log_in("admin", PASSWORDS["admin"]).status_code == 429, "also for the right one"
+        for forwarded in ("x-forwarded-for", "forwarded", "x-real-ip", "x-client-ip"):
+            answer = client.post(
+                "/api/login",
+                json={"user": "driver", "password": PASSWORDS["driver"]},
+                headers={**headers, forwarded: "192.0.2.1"},
+            )
+            assert answer.status_code == 429, f"{forwarded} is not believed"
+        audit = hall.served.app.state.audit
+        assert until(lambda: {one.what for one in audit.read(9)} == {"login-refused", "login-limited"})
+
+
+# -- secrets
+
+
+def test_no_secret_leaves_the_server(
+    broker: Broker, tmp_path: Path, goob: RecordingRobot, caplog: pytest.LogCaptureFixture
+) -> None:
+    hall = Hall(broker.port, tmp_path)
+    settings = hall.served.settings
+    secret = replace(settings.broker, username="sentinel-user", password="sentinel-broker-password")
+    hall.served = Served(broker.port, login=True, people=settings.people, broker=secret)
+    seen: list[bytes] = []
+    with hall, hall.client("admin") as client:
+        token = client.headers["cookie"].partition("=")[2]
+        paths = {*hall.routes(Route, "GET"), *(f"/static/{hall.served.version}/{name}" for name in static(hall))}
+        for path in paths:
+            answer = client.get(path)
+            seen += [answer.content, str(answer.headers).encode()]
+        for user, password in (("admin", PASSWORDS["admin"]), ("admin", "sentinel-guess"), ("", "")):
+            body = {"user": user, "password": password}
+            answer = client.post("/api/login", json=body, headers={"origin": hall.served.origin})
+            seen.append(answer.content)
+        with hall.socket("/ws/control", cookie=hall.cookie("admin")) as control_socket:
+            control_socket.send(json.dumps({"op": "hello", "version": hall.served.version}))
+            control_socket.send(json.dumps({"op": "watch", "ref": GOOB}))
+            end = time.monotonic() + 1.5
+            while time.monotonic() < end:
+                with suppress(TimeoutError):
+                    seen.append(str(control_socket.recv(timeout=0.3)).encode())
+        assert any(b'"welcome"' in one for one in seen)
+        assert any(GOOB.encode() in one for one in seen)
+        audit = repr(hall.served.app.state.audit.read(1000)).encode()
+        everything = b"\n".join([*seen, audit, repr(hall.served.settings).encode(), caplog.text.encode()])
+        assert everything.count(b"sentinel-broker-password") == 0
+        assert token.encode() not in everything
+        for password in (*PASSWORDS.values(), "sentinel-guess"):
+            assert password.encode() not in everything
+        assert str(tmp_path).encode() not in b"\n".join(seen)
+
+
+def static(hall: Hall) -> list[str]:
+    names = list(hall.served.app.state.static.files)
+    assert {"fleet.html", "robot.html", "login.html", "main.js"} <= set(names)
+    return names
+
+
+# -- connections that are opened and held
+
+
+@contextmanager
+def held_connections(port: int, number: int = cases(400, 1200)) -> Iterator[None]:
+    """So many at once from this machine, all silent, each opened again when it is closed."""
+    ending = threading.Event()
+
+    def refill(clients: list[socket.socket | None]) -> None:
+        while not ending.is_set():
+            for place, client in enumerate(clients):
+                with suppress(OSError):
+                    if client is not None and client.recv(1) != b"":
+                        continue
+                with suppress(OSError):
+                    clients[place] = socket.create_connection(("127.0.0.1", port), 1)
+                    clients[place].setblocking(False)  # type: ignore[union-attr]
+            ending.wait(0.2)
+        for client in clients:
+            if client is not None:
+                client.close()
+
+    with beside(lambda: refill([None] * number), ending):
+        yield
+
+
+def test_held_connections_keep_out_neither_a_person_nor_a_stop(
+    broker: Broker, tmp_path: Path, goob: RecordingRobot
+) -> None:
+    with Hall(broker.port, tmp_path) as hall, hall.page("driver") as page:
+        assert page.knows(GOOB)
+        assert page.ready()
+        with held_connections(hall.served.port):
+            time.sleep(1)  # all are open
+            answers = []
+            for number in range(10):
+                name = f"{number:016x}"
+                with suppress(httpx.TransportError), hall.client("viewer") as client:
+                    body = {"op": "estop", "ref": GOOB, "stop": name, "why": ""}
+                    headers = {"origin": hall.served.origin}
+                    answers.append(client.get("/healthz").status_code)
+                    answers.append(client.post("/api/estop", json=body, headers=headers).status_code)
+                time.sleep(0.2)
+            assert answers.count(202) >= 9, answers
+            page.send("estop", ref=GOOB, stop="00000000000000ff", why="x")
+            assert until(lambda: any("00000000000000ff" in str(one) for _, _, one in list(goob.received)), 5)
+            assert not page.closed

@@ -1,0 +1,93 @@
+"""The page below a path of a reverse proxy: all that browsers ask for lies below it, and works as it does without."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from urllib.parse import urlsplit
+
+import pytest
+from playwright.sync_api import Browser
+
+from tests.ext.page.attacker import PASSWORDS, Hall
+from tests.ext.page.browser import tab
+from tests.ext.page.console import REST, Console, console
+from tests.ext.page.stage import Stage
+from tests.support import Broker
+from tests.tcp_proxy import PrefixProxy
+
+pytestmark = pytest.mark.page
+
+#: Among them some that are paths of the page itself.
+PREFIXES = ["/robots/", "/a/b/c/", "/r/", "/replay/", "/static/", "/p%C3%A4th%20/", "/"]
+
+#: Shown once the process that reads recordings has been started, which takes long on a busy machine.
+EMPTY = "document.body.innerText.includes('Nothing is recorded yet')"
+#: Where the page begins once it is installed.
+STARTS = """async () => {
+  const { href } = document.querySelector("link[rel=manifest]");
+  return new URL((await (await fetch(href)).json()).start_url, href).href;
+}"""
+
+
+@pytest.fixture(params=PREFIXES)
+def proxy(request: pytest.FixtureRequest) -> Iterator[PrefixProxy]:
+    with PrefixProxy(1, request.param) as running:
+        yield running
+
+
+def url_of(proxy: PrefixProxy) -> str:
+    return f"http://127.0.0.1:{proxy.port}{proxy.prefix.decode()}"
+
+
+def test_a_login_leads_to_the_screen_that_was_asked_for_and_each_screen_leads_on(
+    broker: Broker, browser: Browser, tmp_path: Path, proxy: PrefixProxy
+) -> None:
+    url = url_of(proxy)
+    with ExitStack() as opened:
+        hall = opened.enter_context(Hall(broker.port, tmp_path, names=(f"127.0.0.1:{proxy.port}",)))
+        proxy.lead_to(hall.served.port)
+        one = opened.enter_context(tab(browser, f"{url}r/pebble/robots/goob"))
+        assert one.page.url == f"{url}login?next=/r/pebble/robots/goob"
+        one.page.get_by_label("User").fill("driver")
+        one.page.get_by_label("Password").fill(PASSWORDS["driver"])
+        one.page.get_by_role("button", name="Log in").click()
+        assert one.until(lambda: one.page.url == f"{url}r/pebble/robots/goob")
+        assert one.until("window.pebble?.route.ref === 'pebble/robots/goob'")
+        one.page.goto(url)
+        assert one.until("window.pebble?.connection.isOpen")
+        one.page.get_by_role("link", name="Recordings").first.click()
+        assert one.until(lambda: one.page.url == f"{url}replay")
+        assert one.until(EMPTY, 60)
+        one.page.reload()
+        assert one.until(EMPTY, 60)
+        assert one.page.evaluate(STARTS) == url
+        one.page.evaluate("() => { pebble.commands.logOut() }")
+        assert one.until(lambda: one.page.url == f"{url}login")
+        assert proxy.outside == []
+
+
+@contextmanager
+def console_behind(proxy: PrefixProxy, browser: Browser, stage: Stage) -> Iterator[Console]:
+    proxy.lead_to(urlsplit(stage.url).port or 0)
+    with console(browser, stage, "minilamp", url=url_of(proxy)) as one:
+        yield one
+
+
+def test_a_robot_is_driven_and_stopped(browser: Browser) -> None:
+    """The page shows its picture, and all that it fetches later."""
+    with PrefixProxy(1, "/robots/") as proxy:
+        names = ["127.0.0.1", f"127.0.0.1:{proxy.port}"]
+        with Stage("minilamp", names=names) as stage, console_behind(proxy, browser, stage) as one:
+            one.take()
+            assert one.drive()
+            one.let_go()
+            assert one.rests()
+            one.page.evaluate("(ref) => { pebble.connection.socket.restart(); pebble.estop.press(ref) }", one.ref)
+            assert one.because("stopped")
+            assert one.tab.until("pebble.video.canvas.width > 1")
+            assert one.tab.until("performance.getEntriesByType('resource').some((one) => one.name.includes('help.js'))")
+            assert one.wheels == REST
+            assert proxy.outside == []
+            assert one.tab.violations == []

@@ -1,0 +1,282 @@
+"""Pages at a real server and a real broker: what reaches the robot, and what does not."""
+
+from __future__ import annotations
+
+import itertools
+import time
+
+from tests.ext.page.served import Served
+from tests.kit.played_robot import RecordingRobot
+from tests.support import until
+
+ZERO = {"x": 0.0, "z": 0.0, "y": 0.0}
+FINAL = {**ZERO, "valid_ms": 0}
+NAMES = itertools.count(1)
+
+
+def last(robot: RecordingRobot):
+    drives = robot.drives()
+    return drives[-1] if drives else None
+
+
+def test_with_the_lease_a_gesture_moves_the_robot_and_its_release_stops_it(served, page, robot):
+    page.drive(robot.base, 1, z=0.5)
+    assert until(lambda: page.refused)
+    assert page.refused[0] == {
+        "op": "refused", "cmd": "drive", "ref": robot.base, "why": "Take control to drive", "g": 1, "n": 0,
+    }  # fmt: skip
+    assert page.take(robot.base)
+    page.drive(robot.base, 2, z=0.5)
+    assert until(lambda: last(robot) == {"x": 0.0, "z": 0.5, "y": 0.0, "valid_ms": 400})
+    page.drive(robot.base, 2)
+    assert until(lambda: last(robot) == ZERO)
+    assert [one["z"] for one in robot.drives()] == [0.5, 0.0], "nothing of the first gesture"
+    page.send("estop", ref=robot.base, stop="00000000000000ff", why="button")
+
+    def noted():
+        return [one.what for one in served.app.state.audit.read(100) if one.ref == robot.base]
+
+    assert until(lambda: noted() == ["take", "drive", "stop"], 3), noted()
+
+
+def test_a_silent_page_is_stopped_and_its_gesture_is_over(page, robot):
+    assert page.take(robot.base)
+    page.drive(robot.base, 1, z=0.5)
+    assert until(lambda: last(robot) == FINAL, 1)
+    page.drive(robot.base, 1, z=0.5)
+    assert until(lambda: any(one["why"] == "Let go first" for one in page.refused))
+    time.sleep(0.35)  # repetitions of the zero
+    page.drive(robot.base, 2, z=0.5)
+    assert until(lambda: last(robot)["z"] == 0.5)
+
+
+def test_a_lost_page_is_stopped(served, robot):
+    page = served.page()
+    assert page.knows(robot.base)
+    assert page.ready()
+    assert page.take(robot.base)
+    page.drive(robot.base, 1, z=0.5)
+    assert until(lambda: robot.drives())
+    page.abort()
+    assert until(lambda: last(robot) == FINAL, 1)
+
+
+def test_old_commands_move_nothing_and_a_clock_that_jumps_ends_the_connection(page, robot):
+    assert page.take(robot.base)
+    page.drive(robot.base, 1, z=0.5, age_ms=900)
+    assert until(lambda: page.refused)
+    assert page.refused[0]["why"] == "Commands are late"
+    assert robot.drives() == []
+    page.drive(robot.base, 2, z=0.5, age_ms=-5000)
+    assert until(lambda: page.closed)
+    assert "jumped" in page.bye["why"]
+    assert until(lambda: not robot.drives() or last(robot) == FINAL)
+
+
+def test_a_page_that_does_not_answer_does_not_drive(page, robot):
+    assert page.take(robot.base)
+    page.answers = False
+    time.sleep(1.3)
+    page.drive(robot.base, 1, z=0.5)
+    assert until(lambda: page.refused)
+    assert "late" in page.refused[0]["why"] or "stalled" in page.refused[0]["why"]
+    assert robot.drives() == []
+
+
+def test_a_broker_that_does_not_answer_ends_the_gesture(broker, page, robot):
+    assert page.take(robot.base)
+    page.drive(robot.base, 1, z=0.5)
+    assert until(lambda: robot.drives())
+    broker.freeze()
+
+    def refused() -> bool:
+        page.drive(robot.base, 1, z=0.5)
+        time.sleep(0.05)
+        return bool(page.refused)
+
+    assert until(refused, 3)
+    assert page.refused[0]["why"] == "The server cannot reach the broker: it does not answer"
+    page.drive(robot.base, 2, z=0.7)
+    assert until(lambda: any(one["g"] == 2 for one in page.refused))
+    broker.thaw()
+    assert until(lambda: last(robot) == FINAL)
+    assert until(lambda: page.value("", "web/broker", "connected") is True)
+    assert all(one["z"] != 0.7 for one in robot.drives())
+    assert last(robot) == FINAL
+    page.drive(robot.base, 3, z=0.5)
+    assert until(lambda: last(robot)["z"] == 0.5)
+
+
+def test_one_robot_has_one_driver(served, page, robot):
+    with served.page(device="phone") as other:
+        assert other.knows(robot.base)
+        assert other.ready()
+        assert page.take(robot.base)
+        page.drive(robot.base, 1, z=0.5)
+        assert until(lambda: robot.drives())
+        other.send("lease", ref=robot.base, take=True)
+        assert until(lambda: other.refused)
+        assert other.refused[0]["why"] == "local is driving"
+        other.refused.clear()
+        assert other.take(robot.base, over=True)
+        assert until(lambda: last(robot) == FINAL)
+        page.drive(robot.base, 1, z=0.5)
+        assert until(lambda: page.refused)
+        assert until(lambda: page.value(robot.base, "web/driver", "device") == "phone")
+        assert page.value(robot.base, "web/driver", "you") is False
+        time.sleep(0.35)
+        assert last(robot) == FINAL
+
+
+def test_a_page_that_connects_again_has_its_lease_but_no_gesture(served, robot):
+    first = served.page()
+    assert first.knows(robot.base)
+    assert first.ready()
+    assert first.take(robot.base)
+    first.close()
+    with served.page(token=first.welcome["token"]) as again:
+        assert until(lambda: again.value(robot.base, "web/driver", "you") is True)
+        with served.page(token=first.welcome["token"]) as copy:
+            time.sleep(0.3)
+            assert copy.value(robot.base, "web/driver", "you") is False
+
+
+def test_a_page_that_connects_again_need_not_wait_for_the_end_of_its_stalled_connection(served, robot):
+    with served.page() as first:
+        assert first.knows(robot.base)
+        assert first.ready()
+        assert first.take(robot.base)
+        first.answers = False
+        time.sleep(1.6)  # so long a page waits before it connects anew
+        with served.page(token=first.welcome["token"]) as again:
+            assert until(lambda: again.value(robot.base, "web/driver", "you") is True)
+            first.close()
+            time.sleep(0.2)
+            assert again.value(robot.base, "web/driver", "you") is True
+
+
+def test_space_stops_for_everybody_and_ends_the_gesture(served, page, robot):
+    assert page.take(robot.base)
+    page.drive(robot.base, 1, z=0.5)
+    with served.page() as other:
+        assert other.knows(robot.base)
+        other.send("stop", ref=robot.base)
+        assert until(lambda: last(robot) == FINAL)
+        page.drive(robot.base, 1, z=0.5)
+        assert until(lambda: page.refused)
+        assert last(robot) == FINAL
+
+
+def test_an_emergency_stop_is_repeated_until_the_robot_confirms_and_a_reset_names_what_was_shown(page, robot):
+    page.send("estop", ref=robot.base, stop="00000000000000aa", why="button")
+    assert until(lambda: page.value(robot.base, "web/estop", "sending") == "confirmed")
+    view = page.value(robot.base, "web/estop")
+    assert (view["latched"], view["by"], view["stop"]) == (True, "local on test", "00000000000000aa")
+    assert page.take(robot.base)
+    page.drive(robot.base, 1, z=0.5)
+    assert until(lambda: page.refused)
+    assert page.refused[0]["why"] == "Stopped by local on test"
+    (owner,) = view["owners"]
+    shown = {key: owner[key] for key in ("owner", "boot", "count")}
+    page.send("estop-reset", ref=robot.base, owners=[{**shown, "count": 99}])
+    time.sleep(0.3)
+    assert robot.latched
+    page.send("estop-reset", ref=robot.base, owners=[shown])
+    assert until(lambda: page.value(robot.base, "web/estop", "latched") is False)
+
+
+def test_all_are_stopped(broker, page, robot):
+    with RecordingRobot(broker.port, f"pebble/robots/rover{next(NAMES)}") as second:
+        assert page.knows(second.base)
+        page.send("estop", ref="", stop="00000000000000cc")
+        assert until(lambda: robot.latched and second.latched, 3)
+        page.send("estop-end", stop="00000000000000cc")  # else it collects further robots for three seconds
+        assert until(lambda: page.value(second.base, "web/estop", "sending") == "confirmed")
+
+
+def test_an_old_robot_is_sent_zeros_and_shown_as_old(broker, served):
+    base = f"pebble/robots/old{next(NAMES)}"
+    drive = {"available": True, "controls": True}
+    with RecordingRobot(broker.port, base, capabilities={"drive": drive}) as old, served.page() as page:
+        assert page.knows(base)
+        page.send("estop", ref=base, stop="00000000000000dd")
+        assert until(lambda: len([one for one in old.drives() if one == FINAL]) >= 2, 3)
+        assert page.value(base, "web/estop", "sending") == "old"
+        page.send("estop-end", stop="00000000000000dd")
+        until(lambda: False, 0.3)  # one that is on its way
+        count = len(old.drives())
+        until(lambda: False, 1.0)
+        assert len(old.drives()) == count
+
+
+def test_a_robot_without_drive_is_not_driven(broker, served):
+    base = f"pebble/towers/tower{next(NAMES)}"
+    with RecordingRobot(broker.port, base, capabilities={"identity": {}}) as tower, served.page() as page:
+        assert page.knows(base)
+        assert page.ready()
+        assert page.take(base)
+        page.drive(base, 1, z=0.5)
+        assert until(lambda: page.refused)
+        assert page.refused[0]["why"] == f"{base.rpartition('/')[2]} does not drive"
+        assert tower.drives() == []
+
+
+def test_a_silent_robot_is_shown_as_silent_and_not_driven(page, robot):
+    assert page.take(robot.base)
+    robot.silent()
+    assert until(lambda: page.value(robot.base, "web/liveness", "online") is False, 4)
+    page.drive(robot.base, 1, z=0.5)
+    assert until(lambda: page.refused)
+    assert page.refused[0]["why"].endswith("is silent")
+
+
+def test_a_page_of_another_version_does_not_drive(served, robot):
+    with served.page(version="old") as page:
+        assert page.knows(robot.base)
+        page.send("lease", ref=robot.base, take=True)
+        assert until(lambda: page.refused)
+        assert "load it again" in page.refused[0]["why"]
+
+
+def test_servers_share_a_robot_that_keeps_no_control(broker, page, robot):
+    """Each lets one of its own pages drive; the last command counts, as with programs of the original."""
+    with Served(broker.port, server="attic") as other, other.page() as there:
+        assert there.knows(robot.base)
+        assert there.ready()
+        assert page.take(robot.base)
+        assert there.take(robot.base)
+        page.drive(robot.base, 1, z=0.5)
+        there.drive(robot.base, 1, z=0.25)
+        assert until(lambda: {0.5, 0.25} <= {one["z"] for one in robot.drives()})
+        assert (page.refused, page.value(robot.base, "web/driver", "by")) == ([], "local")
+        assert not any("/servers/" in topic for topic in robot.topics())
+
+
+def test_a_picture_of_another_component_is_remembered(served, page, robot):
+    page.send("watch", ref=robot.base)
+    assert until(lambda: page.value(robot.base, "web/picture-from", "source") == "")
+    other = next(ref for ref, metric in page.state if metric == "web/liveness" and ref != robot.base)
+    page.send("picture-from", ref=robot.base, source=other)
+    assert until(lambda: page.value(robot.base, "web/picture-from", "source") == other)
+
+
+def test_what_is_drawn_over_a_picture_comes_with_it(served, broker, page, robot):
+    with RecordingRobot(broker.port, f"{robot.base}-eye") as eye:
+        assert page.knows(eye.base)
+        page.send("picture-from", ref=robot.base, source=eye.base)
+        page.send("watch", ref=robot.base)
+
+        def drawn():
+            eye.publish("video-overlays", {"shapes": [[[0, 0], [1, 1]]]})
+            eye.publish("sensors/imu", {"value": 1})
+            return page.value(eye.base, "video-overlays")
+
+        assert until(drawn)
+        assert page.value(eye.base, "sensors/imu") is None
+        page.send("picture-from", ref=robot.base, source="")
+        assert until(lambda: page.value(robot.base, "web/picture-from", "source") == "")
+        page.state.pop((eye.base, "video-overlays"))
+        eye.publish("video-overlays", {"shapes": [[[0, 0], [1, 0]]]})
+        eye.publish("charging-level", {"value": 7.0})
+        assert until(lambda: page.value(eye.base, "charging-level"))
+        assert page.value(eye.base, "video-overlays") is None

@@ -1,0 +1,111 @@
+"""A page whose database cannot be written or read for a while: a login says so, and driving and stops go on."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager
+from pathlib import Path
+
+import httpx
+import pytest
+
+from pebble.extensions.fleet.audit import Audit
+from pebble.extensions.page.access import login
+from pebble.runtime.rate_limit import RateLimitedLog
+from tests.ext.page.attacker import PASSWORDS, Hall
+from tests.kit.played_robot import RecordingRobot
+from tests.small_disk import SmallDisk
+from tests.support import Broker, needs_root, some, until
+
+pytestmark = needs_root
+
+Fault = Callable[[SmallDisk], AbstractContextManager[None]]
+
+
+@contextmanager
+def _hidden(disk: SmallDisk) -> Iterator[None]:
+    disk.mount()
+    yield
+    disk.unmount()
+
+
+@contextmanager
+def _moved(disk: SmallDisk) -> Iterator[None]:
+    away = disk.root / "away"
+    away.mkdir()
+    files = list(disk.root.glob("people*"))
+    for file in files:
+        file.rename(away / file.name)
+    yield
+    for file in files:
+        (away / file.name).rename(file)
+
+
+#: What happens to the disk, how a login is answered meanwhile, and what the log says.
+FAULTS: dict[str, tuple[Fault, int, str]] = {
+    "full": (SmallDisk.full, 503, "people.sqlite: database or disk is full: nobody can log in"),
+    "unmounted": (_hidden, 200, "people.sqlite was removed or replaced: put it back"),
+    "removed": (_moved, 200, "people.sqlite was removed or replaced: put it back"),
+}
+
+
+@pytest.fixture
+def disk(tmp_path: Path) -> Iterator[SmallDisk]:
+    disk = SmallDisk(tmp_path / "state")
+    disk.mount()
+    yield disk
+    disk.close()
+
+
+@pytest.mark.parametrize("name", some(FAULTS, 2))
+def test_a_login_names_what_is_wrong_and_what_is_driven_stays_so(
+    broker: Broker, disk: SmallDisk, name: str, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(login, "_log", RateLimitedLog(logging.getLogger("login")))  # it has logged nothing yet
+    fault, status, line = FAULTS[name]
+    ref = f"pebble/robots/goob-{list(FAULTS).index(name)}"
+    with (
+        Hall(broker.port, disk.root, recordings=None) as hall,
+        RecordingRobot(broker.port, ref) as robot,
+        hall.page("driver") as page,
+        hall.client("driver") as client,
+    ):
+        headers = {"origin": hall.served.origin}
+
+        def log_in() -> httpx.Response:
+            body = {"user": "admin", "password": PASSWORDS["admin"]}
+            with hall.client() as new:
+                return new.post("/api/login", json=body, headers=headers)
+
+        assert page.knows(ref)
+        assert page.ready()
+        assert page.take(ref)
+        assert client.get("/").status_code == 200
+        with fault(disk):
+            assert until(lambda: log_in().status_code == status)
+            page.send("picture-from", ref=ref, source=ref)
+            page.drive(ref, 1, x=0.5)
+            assert until(lambda: any(one.get("x") for one in robot.drives())), page.refused
+            stop = {"op": "estop", "ref": ref, "stop": "0123456789abcdef"}
+            assert client.post("/api/estop", json=stop, headers=headers).status_code == 202
+            assert until(lambda: robot.latched)
+            assert not page.closed
+            assert client.get("/").status_code == 200
+        assert until(lambda: log_in().status_code == 200)
+        assert until(lambda: "stop" in {entry.what for entry in hall.served.app.state.audit.read(100)})
+    assert line in caplog.text
+    assert [record for record in caplog.records if record.exc_info] == []
+
+
+def test_rows_of_the_audit_wait_while_the_disk_is_full(disk: SmallDisk, caplog: pytest.LogCaptureFixture) -> None:
+    log = Audit(disk.root / "people.sqlite")
+    with disk.full():
+        for number in range(3000):
+            log.write(f"what {number % 3}", ref=f"{number}")
+        assert until(lambda: "audit: rows wait to be written: " in caplog.text)
+    log.write("at last")
+    log.close()
+    rows = Audit(disk.root / "people.sqlite").read(10_000)
+    assert sum(row.count for row in rows) == 3001
+    assert "audit: rows are written again, 0 are lost" in caplog.text

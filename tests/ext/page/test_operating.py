@@ -1,0 +1,411 @@
+"""What a page needs to operate whole robots, at a real server and broker: logs, flags, actions, and its own name."""
+
+from __future__ import annotations
+
+import asyncio
+import itertools
+import json
+import struct
+from collections.abc import Callable, Coroutine, Iterator
+from pathlib import Path
+from typing import Any, cast
+
+import httpx
+import pytest
+from websockets.sync.client import connect
+
+from pebble.errors import TransportError
+from pebble.extensions.operator.client.broker import Broker as BrokerOfPages
+from pebble.extensions.page.open_components import OpenComponents
+from pebble.extensions.page.robots import Interest, Robots
+from pebble.transports import Message, MqttSettings, QoS, create
+from tests.ext.page.attacker import Hall
+from tests.ext.page.served import Page, Served
+from tests.kit.played_robot import RecordingRobot
+from tests.support import Broker, until
+
+NAMES = itertools.count(1)
+
+
+def lines(page: Page) -> list[Any]:
+    """The log lines that a page has received."""
+    return [line for message in list(page.logs) for line in message["lines"]]
+
+
+@pytest.fixture
+def page(served: Served, robot: RecordingRobot) -> Iterator[Page]:
+    with Page(served) as one:
+        assert one.knows(robot.base)
+        one.send("watch", ref=robot.base)
+        assert until(lambda: one.value(robot.base, "web/flags") is not None)
+        yield one
+
+
+def publish(broker: Broker, topic: str, payload: bytes, *, retain: bool = False) -> None:
+    transport = create("mqtt", "somewhere", MqttSettings(host="127.0.0.1", port=broker.port))
+    transport.open()
+    transport.publish(topic, payload, qos=QoS.DELIVERED, retain=retain)
+    assert until(lambda: transport.outgoing.waiting == 0)
+    transport.close()
+
+
+def retained(broker: Broker, topic: str) -> bytes:
+    """What a new subscriber receives."""
+    received: list[Message] = []
+    transport = create("mqtt", "reader", MqttSettings(host="127.0.0.1", port=broker.port))
+    transport.open()
+    transport.subscribe(topic, received.append, direct=True)
+    assert until(lambda: received)
+    transport.close()
+    assert received[0].retain
+    return received[0].payload
+
+
+# -- logs
+
+
+def test_a_page_that_reads_logs_receives_those_from_before_and_those_that_come(page, robot, broker) -> None:
+    assert until(lambda: _logged(robot, page, "first"))
+    assert page.logs == []  # it has not asked
+    page.send("read-logs", ref=robot.base, on=True)
+    assert until(lambda: lines(page))
+    robot.publish("logs", {"t": 1, "level": "INFO", "service": "a", "message": "second"})
+    publish(broker, f"{robot.base}/outgoing/logs", b"plain text")
+    assert until(lambda: lines(page)[-1:] == [{"message": "plain text"}])
+    first = page.logs[0]
+    assert lines(page)[-2]["message"] == "second"
+    page.send("read-logs", ref=robot.base, on=False)
+    robot.publish("logs", {"message": "unread"})
+    robot.publish("charging-level", {"value": 3.5})
+    assert until(lambda: page.value(robot.base, "charging-level") is not None)
+    assert lines(page)[-1] == {"message": "plain text"}
+    seen = len(lines(page))
+    page.send("read-logs", ref=robot.base, on=True, origin=first["origin"], after=seen)
+    assert until(lambda: lines(page)[-1] == {"message": "unread"})
+    assert len(lines(page)) == seen + 1
+
+
+def _logged(robot: RecordingRobot, page: Page, text: str) -> bool:
+    """Publish until the server receives it: it subscribes a moment after the page has opened the robot."""
+    robot.publish("logs", {"message": text})
+    robot.publish("status", {"value": {"text": text}})
+    return page.value(robot.base, "status", "value") == {"text": text}
+
+
+def test_lines_that_the_server_drops_leave_a_gap(page, robot, broker) -> None:
+    page.send("read-logs", ref=robot.base, on=True)
+    assert until(lambda: _logged(robot, page, "ready"))
+    publish(broker, f"{robot.base}/outgoing/logs", b"x" * 20_000)
+    robot.publish("logs", {"message": "last"})
+    assert until(lambda: lines(page)[-1:] == [{"message": "last"}])
+    last = page.logs[-1]
+    before = page.logs[-2]
+    assert last["first"] == before["first"] + len(before["lines"]) + 1
+
+
+def test_a_part_of_the_logs_waits_for_an_echo(page, robot) -> None:
+    assert until(lambda: _logged(robot, page, "ready"))
+    for _ in range(60):
+        robot.publish("logs", {"message": "x" * 1000})
+    robot.publish("charging-level", {"value": 3.5})
+    assert until(lambda: page.value(robot.base, "charging-level") is not None)
+    page.answers = False
+    page.send("read-logs", ref=robot.base, on=True)
+    assert until(lambda: page.logs)
+    assert not until(lambda: len(page.logs) > 2, 0.5)  # an answer may have been under way
+    page.answers = True
+    assert until(lambda: len(page.logs) > 3, 4)
+
+
+def test_logs_of_another_component_are_not_sent(page, robot, served, broker) -> None:
+    with RecordingRobot(broker.port, f"{robot.base}b") as other:
+        page.send("read-logs", ref=other.base, on=True)
+        page.send("read-logs", ref=robot.base, on=True)
+        assert until(lambda: _logged(robot, page, "mine"))
+        other.publish("logs", {"message": "theirs"})
+        robot.publish("logs", {"message": "end"})
+        assert until(lambda: {"message": "end"} in lines(page))
+        assert {"message": "theirs"} not in lines(page)
+
+
+# -- flags
+
+
+def test_flags_are_those_of_the_broker(page, robot, broker) -> None:
+    flags = lambda: page.value(robot.base, "web/flags")
+    assert flags() == {"remote_mirror": None, "mqtt_audio": None, "mqtt_video": None}
+    page.send("flag", ref=robot.base, name="mqtt-video", on=True)
+    assert until(lambda: flags()["mqtt_video"] is True)
+    assert retained(broker, f"{robot.base}/incoming/flags/mqtt-video") == b'{"value":true}'
+    publish(broker, f"{robot.base}/incoming/flags/mqtt-audio", b'{"enabled": false}', retain=True)
+    assert until(lambda: flags()["mqtt_audio"] is False)
+    publish(broker, f"{robot.base}/incoming/flags/mqtt-video", b'"odd"')
+    publish(broker, f"{robot.base}/incoming/flags/mqtt-audio", b"", retain=True)
+    assert until(lambda: flags()["mqtt_audio"] is None)
+    assert flags()["mqtt_video"] is True
+
+
+def test_a_flag_is_read_where_the_capabilities_name_it_but_only_of_the_robot_itself(served, broker) -> None:
+    base = f"pebble/robots/rig{next(NAMES)}"
+    named = {
+        "video": {"available": True, "flag_topic": f"{base}/incoming/flags/eye"},
+        "audio": {"available": True, "flag_topic": "pebble/robots/other/incoming/flags/mqtt-audio"},
+    }
+    publish(broker, f"{base}/incoming/flags/eye", b"true", retain=True)
+    publish(broker, f"{base}/incoming/flags/mqtt-audio", b"true", retain=True)
+    publish(broker, "pebble/robots/other/incoming/flags/mqtt-audio", b"false", retain=True)
+    with RecordingRobot(broker.port, base, capabilities=named) as robot, Page(served) as page:
+        assert page.knows(base)
+        page.send("watch", ref=base)
+        wanted = {"remote_mirror": None, "mqtt_audio": True, "mqtt_video": True}
+        assert until(lambda: page.value(base, "web/flags") == wanted), page.value(base, "web/flags")
+        page.send("flag", ref=base, name="mqtt-video", on=False)
+        assert until(lambda: f"{base}/incoming/flags/eye" in robot.topics())
+
+
+# -- actions
+
+
+@pytest.mark.parametrize(
+    ("flag", "topic"),
+    [("again", "again"), ("pebble/robots/other/incoming/flags/reboot", "service-restart")],
+    ids=["that the capabilities name", "but never another robot's"],
+)
+def test_an_action_goes_to_the_topic(served, broker, flag: str, topic: str) -> None:
+    base = f"pebble/robots/rig{next(NAMES)}"
+    named = flag if "/" in flag else f"{base}/incoming/flags/{flag}"
+    capabilities = {"system": {"service_restart": {"flag_topic": named}}}
+    with RecordingRobot(broker.port, base, capabilities=capabilities) as robot, Page(served) as page:
+        assert page.knows(base)
+        page.send("action", ref=base, name="service-restart")
+        page.send("action", ref=base, name="reboot")
+        wanted = [(f"{base}/incoming/flags/{name}", {"value": True}) for name in (topic, "reboot")]
+        assert until(lambda: [(topic, value) for _, topic, value in robot.received] == wanted), robot.received
+        assert until(lambda: [one["cmd"] for one in page.done] == ["action", "action"])
+    assert until(lambda: [one.detail for one in _audit(served, base)] == ["name service-restart", "name reboot"])
+
+
+@pytest.mark.parametrize(
+    ("role", "may"),
+    [
+        pytest.param("viewer", set(), marks=pytest.mark.thorough),
+        ("driver", {"mqtt-video"}),
+        pytest.param("maintainer", {"mqtt-video", "reboot"}, marks=pytest.mark.thorough),
+    ],
+)
+def test_what_each_role_may_ask(broker, tmp_path: Path, role: str, may: set[str]) -> None:
+    base = f"pebble/robots/rig{next(NAMES)}"
+    with Hall(broker.port, tmp_path) as hall, RecordingRobot(broker.port, base) as robot, hall.page(role) as page:
+        assert page.knows(base)
+        page.send("flag", ref=base, name="mqtt-video", on=True)
+        page.send("action", ref=base, name="reboot")
+        assert until(lambda: len(page.refused) == 2 - len(may))
+        assert until(lambda: robot.topics() == {f"{base}/incoming/flags/{name}" for name in may})
+
+
+def test_only_who_looks_after_robots_reads_what_was_done(broker, tmp_path: Path) -> None:
+    with Hall(broker.port, tmp_path) as hall:
+        audit = hall.served.app.state.audit
+        for number, ref in enumerate(("pebble/robots/goob", "pebble/robots/fred", "all")):
+            audit.write("stop", ref=ref, user="ann", detail=f"{number}")
+        assert until(lambda: len(audit.read(9, "pebble/robots/goob")) == 2)
+        for name, code in (("viewer", 403), ("driver", 403), ("", 401), ("maintainer", 200), ("admin", 200)):
+            with hall.client(name) as client:
+                answer = client.get("/api/audit", params={"ref": "pebble/robots/goob"})
+            assert answer.status_code == code, name
+        rows = answer.json()
+        assert [(row["what"], row["ref"], row["user"], row["detail"], row["count"]) for row in rows] == [
+            ("stop", "pebble/robots/goob", "ann", "0", 1),
+            ("stop", "all", "ann", "2", 1),
+        ]
+
+
+def test_an_answer_has_the_number_of_what_was_asked(page, robot) -> None:
+    page.send("outlet", ref=robot.base, outlet="o1", on=True, n=5)
+    page.send("lights", ref="pebble/robots/nobody", g=0.5, n=6)
+    assert until(lambda: page.done and page.refused)
+    assert page.done == [{"op": "done", "cmd": "outlet", "ref": robot.base, "n": 5}]
+    why = "unknown component"
+    assert page.refused == [
+        {"op": "refused", "cmd": "lights", "ref": "pebble/robots/nobody", "why": why, "g": -1, "n": 6}
+    ]
+
+
+def _audit(served: Served, ref: str) -> list[Any]:
+    return [entry for entry in served.app.state.audit.read(100) if entry.ref == ref and entry.what == "action"]
+
+
+# -- opened and closed
+
+
+class SlowBroker:
+    """Subscribes and unsubscribes as slowly as the test lets it."""
+
+    connected = True
+
+    def __init__(self) -> None:
+        self.filters: set[str] = set()
+        self.refuses = ""  # a filter
+        self.may_unsubscribe = asyncio.Event()
+
+    @property
+    def loop(self) -> asyncio.AbstractEventLoop:
+        return asyncio.get_running_loop()
+
+    def on_state(self, watcher: Callable[[], None]) -> None:
+        pass
+
+    async def subscribe(self, filter_: str, _handler: object, **_options: object) -> str:
+        if filter_ == self.refuses:
+            raise TransportError("no")
+        self.filters.add(filter_)
+        return filter_
+
+    async def unsubscribe(self, filter_: str) -> None:
+        await self.may_unsubscribe.wait()
+        self.filters.discard(filter_)
+
+
+class Opened:
+    """What is received of one robot while pages open and close it; its broker is as slow as the test lets it."""
+
+    base = "pebble/robots/rig"
+
+    def __init__(self) -> None:
+        self.broker, self.robots = SlowBroker(), Robots()
+        self.tasks: list[asyncio.Future[None]] = []
+        self.components = OpenComponents(
+            cast(BrokerOfPages, self.broker),
+            self.robots,
+            lambda work: self.tasks.append(asyncio.ensure_future(work)),
+            keep_s=0,
+            step_s=0,
+        )
+
+    async def open(self) -> None:
+        self.components.open(self.base)
+        await asyncio.gather(*self.tasks)
+
+    async def close(self) -> None:
+        """Returns when it has begun to receive nothing more: the broker is about to end the first subscription."""
+        self.components.close(self.base)
+        while len(self.tasks) == 1:
+            await asyncio.sleep(0)
+        await asyncio.sleep(0)
+
+
+async def opened_while_it_is_being_closed() -> None:
+    rig = Opened()
+    await rig.open()
+    everything = set(rig.broker.filters)
+    await rig.close()
+    rig.components.open(rig.base)
+    rig.broker.may_unsubscribe.set()
+    await asyncio.gather(*rig.tasks)
+    assert rig.broker.filters == everything
+    assert rig.base in rig.robots.logs
+
+
+async def no_component_leaves_nothing() -> None:
+    rig, other = Opened(), Interest(lambda: None)
+    rig.broker.may_unsubscribe.set()
+    rig.robots.join(other)
+    rig.components.open(rig.base)
+    rig.robots.set_server_metric(rig.base, "web/picture-from", {"source": ""})
+    await asyncio.gather(*rig.tasks)
+    assert rig.robots.value(rig.base, "web/flags") is not None
+    await rig.close()
+    await asyncio.gather(*rig.tasks)
+    assert (rig.broker.filters, rig.robots.logs, rig.components.known, other.gone) == (set(), {}, set(), {rig.base})
+    assert [rig.robots.value(rig.base, f"web/{metric}") for metric in ("flags", "picture-from")] == [None, None]
+
+
+async def capabilities_pass_no_channel_off_as_another() -> None:
+    rig = Opened()
+    telemetry = {"imu_topic": f"{rig.base}/outgoing/front-camera", "touch_topic": f"{rig.base}/outgoing/renamed"}
+    value = {"telemetry": telemetry, "video": {"flag_topic": f"{rig.base}/incoming/estop"}}
+    payload = json.dumps({"schema": "pebble-capabilities/v1", "t": 1, "value": value}).encode()
+    rig.robots.receive(Message(f"{rig.base}/outgoing/capabilities", payload), 0.0)
+    await rig.open()
+    assert {f"{rig.base}/outgoing/renamed", f"{rig.base}/incoming/flags/mqtt-video"} <= rig.broker.filters
+    assert not {f"{rig.base}/outgoing/front-camera", f"{rig.base}/incoming/estop"} & rig.broker.filters
+
+
+@pytest.mark.parametrize(
+    "story",
+    [opened_while_it_is_being_closed, no_component_leaves_nothing, capabilities_pass_no_channel_off_as_another],
+)
+def test_components_that_are_opened_and_closed(story: Callable[[], Coroutine[Any, Any, None]]) -> None:
+    asyncio.run(story())
+
+
+def test_one_topic_that_cannot_be_received_holds_back_no_other(caplog: pytest.LogCaptureFixture) -> None:
+    async def work() -> None:
+        rig = Opened()
+        rig.broker.refuses = f"{rig.base}/outgoing/sensors/imu"
+        rig.components.open(rig.base)
+        for _ in range(100):
+            await asyncio.sleep(0)
+        assert {f"{rig.base}/outgoing/logs", f"{rig.base}/incoming/flags/mqtt-video"} <= rig.broker.filters
+        assert [record.getMessage() for record in caplog.records] == [f"{rig.broker.refuses} is not received: no"]
+        rig.broker.refuses = ""
+        await asyncio.gather(*rig.tasks)
+        assert f"{rig.base}/outgoing/sensors/imu" in rig.broker.filters
+
+    asyncio.run(work())
+
+
+# -- names
+
+
+def test_the_name_of_a_page_without_a_login_counts_for_its_voice_and_for_a_stop_by_request(served, broker) -> None:
+    base = f"pebble/robots/rig{next(NAMES)}"
+    audio = {"available": True, "controls": True, "topic": f"{base}/outgoing/audio"}
+    url = f"ws://127.0.0.1:{served.port}/ws/sound?ref={base}&name=Alice&device=phone"
+    with RecordingRobot(broker.port, base, capabilities={"audio": audio}), Page(served) as page:
+        assert page.knows(base)
+        with connect(url, origin=served.origin) as sound:
+            sound.send(struct.pack(">BII", 1, 1, 0) + bytes(640))
+            assert json.loads(sound.recv(timeout=3)) == {"talk": 1, "on": True, "why": ""}
+            assert until(lambda: page.value(base, "web/sound", "talker") == "Alice")
+        stop = {"op": "estop", "ref": base, "stop": "00112233445566aa"}
+        with httpx.Client(headers={"origin": served.origin}) as client:
+            assert client.post(f"{served.origin}/api/estop?name=Alice", json=stop).status_code == 202
+    audit = served.app.state.audit
+
+    def noted() -> set[tuple[str, str, str, str]]:
+        return {(one.what, one.user, one.device, one.address) for one in audit.read(20) if one.ref == base}
+
+    assert until(lambda: {("talk", "Alice", "phone", "127.0.0.1"), ("stop", "Alice", "", "127.0.0.1")} <= noted())
+
+
+def test_a_plain_form_stops_and_says_who_has_confirmed_it(served, robot):
+    url, headers = f"{served.origin}/api/estop", {"origin": served.origin}
+    with Page(served) as page, httpx.Client(headers=headers) as client:
+        assert page.knows(robot.base)
+        answer = client.post(url, data={"ref": robot.base, "why": "no page"})
+        assert until(lambda: robot.latched)
+        assert (answer.status_code, answer.headers["content-type"]) == (202, "text/html; charset=utf-8")
+        assert "Confirmed by 1 of 1." in answer.text
+        assert client.post(url, data={"stop": "<b>"}).status_code == 400
+
+
+def test_without_a_login_a_page_gives_its_own_name(served, robot) -> None:
+    with Page(served, name="Alice \u202e", device="phone") as alice, Page(served) as other:
+        assert alice.welcome["user"] == "Alice ?"
+        assert other.welcome["user"] == "local"
+        assert other.knows(robot.base)
+        assert alice.knows(robot.base)
+        assert alice.take(robot.base)
+        assert until(lambda: other.value(robot.base, "web/driver", "by") == "Alice ?")
+        assert other.value(robot.base, "web/driver", "device") == "phone"
+        alice.send("estop", ref=robot.base, stop="00112233445566ff", why="test")
+        assert until(lambda: other.value(robot.base, "web/estop", "latched") is True)
+        assert "Alice" in other.value(robot.base, "web/estop", "by")
+    audit = served.app.state.audit
+    assert until(lambda: ("Alice ?", "stop") in [(entry.user, entry.what) for entry in audit.read(9)])
+
+
+def test_with_a_login_the_name_of_the_user_counts(broker, tmp_path: Path) -> None:
+    with Hall(broker.port, tmp_path) as hall, Page(hall.served, cookie=hall.cookie("driver"), name="Alice") as page:
+        assert page.welcome["user"] == "driver"

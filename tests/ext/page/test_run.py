@@ -1,0 +1,108 @@
+"""The operator page as a process of the robot: what it refuses, and how the launcher shows it."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import urllib.request
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from pebble.extensions.page import run
+from pebble.extensions.page import setting as settings_module
+from tests.support import ROOT, Broker, Child, free_port, until
+
+
+def written(folder: Path, web: dict[str, Any], **services: Any) -> Path:
+    path = folder / "goob.json"
+    raw = {
+        "robot": {"id": "goob"},
+        "transport": {"kind": "mqtt", "run_dir": str(folder / "run"), "state_dir": str(folder / "state")},
+        "services": {"web_handler": {"enabled": True}, **services},
+        "web_interface": web,
+    }
+    path.write_text(json.dumps(raw))
+    return path
+
+
+def test_a_page_that_cannot_start_ends_with_one_line(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    assert run.main([str(written(tmp_path, {}))]) == 1
+    assert [record.message.partition(":")[0] for record in caplog.records] == ["web_interface.mqtt.host"]
+
+
+def test_a_login_needs_a_user(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    config = written(tmp_path, {"host": "0.0.0.0", "plain_http": True, "mqtt": {"host": "127.0.0.1"}})
+    assert run.main([str(config)]) == 1
+    (line,) = [record.message for record in caplog.records]
+    assert line.startswith(
+        f"web_interface.people: {tmp_path}/state/people.sqlite has no user: run `pebble web user add"
+    )
+
+
+def test_everything_that_is_missing_is_named_at_once(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    assert run.main([str(written(tmp_path, {"host": "0.0.0.0", "mqtt": {"host": "127.0.0.1"}}))]) == 1
+    keys = [record.message.partition(":")[0] for record in caplog.records]
+    assert keys == ["web_interface.host", "web_interface.people"]
+
+
+def test_missing_packages_are_named_with_the_command_that_installs_them(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(settings_module, "find_spec", lambda name: None if name == "uvicorn" else object())
+    assert run.main([str(written(tmp_path, {"mqtt": {"host": "127.0.0.1"}}))]) == 1
+    assert "(uvicorn): pip install 'pebble-robot[web]'" in caplog.text
+
+
+def test_the_command_line_is_one_config(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run.main([]) == 2
+    assert "usage" in capsys.readouterr().err
+
+
+def test_it_reports_that_it_is_ready_and_alive_and_ends_by_a_signal(tmp_path: Path, broker: Broker) -> None:
+    port = free_port()
+    config = written(tmp_path, {"port": port, "mqtt": {"host": "127.0.0.1", "port": broker.port}})
+    reader, writer = os.pipe()
+    page = Child(
+        [sys.executable, "-m", "pebble.extensions.page.run", str(config)],
+        cwd=ROOT,
+        env=os.environ | {"PEBBLE_NOTIFY_FD": str(writer)},
+        pass_fds=[writer],
+    )
+    os.close(writer)
+    with os.fdopen(reader) as notes:
+        assert [json.loads(notes.readline())["note"] for _ in range(3)] == ["ready", "alive", "alive"]
+        with urllib.request.urlopen(f"http://127.0.0.1:{port}/healthz", timeout=5) as answer:
+            assert answer.status == 200
+        page.terminate()
+        assert page.wait(5) == 0
+
+
+def test_the_status_of_the_robot_shows_a_page_that_crashes_again_and_again(tmp_path: Path, broker: Broker) -> None:
+    """Nothing else of the robot is affected."""
+    bridge = {"enabled": True, "remote_mqtt": {"host": "127.0.0.1", "port": broker.port}}
+    own = {"launcher": {"restart_delay_seconds": 0.1}, "mqtt_bridge": bridge}
+    config = written(tmp_path, {"host": "0.0.0.0"}, **own)
+    raw = json.loads(config.read_text()) | {"local_mqtt": {"port": broker.port}}
+    config.write_text(json.dumps(raw))
+    errors = tmp_path / "errors"
+    with errors.open("wb") as out:
+        robot = Child([sys.executable, "-m", "pebble", "up", str(config)], cwd=ROOT, stderr=out)
+    try:
+        assert until(lambda: len(re.findall(r"web_interface\.host: other machines reach", errors.read_text())) >= 3, 20)
+        with subprocess.Popen(
+            [sys.executable, "-m", "pebble", "topic", "echo", "status", "-c", str(config), "--raw", "-n", "1"],
+            cwd=ROOT, stdout=subprocess.PIPE, text=True,
+        ) as echo:  # fmt: skip
+            services = json.loads(echo.communicate(timeout=20)[0])["value"]["services"]
+        assert services["web_handler"]["state"] in ("restarting", "failed")
+        assert services["web_handler"]["last_exit"] == "exit code 1"
+        assert services["mqtt_bridge"] == {"state": "ready", "restarts": 0, "last_exit": None}
+    finally:
+        robot.send_signal(signal.SIGTERM)
+        assert robot.wait(15) == 0

@@ -1,0 +1,210 @@
+"""Lines of a broker logger become messages, and messages lines; the same bytes come back."""
+
+from __future__ import annotations
+
+import base64
+import io
+import json
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from pebble.extensions.media import json_video
+from pebble.extensions.recordings.exports import lines
+from pebble.extensions.recordings.exports.lines import BadLine, read_lines, write_lines
+from pebble.extensions.recordings.files.recorded import Channel, Recorded, RecordingError
+
+T_NS = 1_732_300_000_123_456_789
+TOPIC = "pebble/robots/goob/outgoing/online"
+LINE = {
+    "timestamp": 1732300000.25,
+    "topic": TOPIC,
+    "qos": 1,
+    "retain": False,
+    "payload_size_bytes": 3,
+    "payload_truncated": False,
+    "payload_b64": "AAH/",
+}
+
+BYTES = Channel(0, TOPIC, "application/octet-stream", {"qos": "1", "retain": "0"})
+MESSAGE = Recorded(BYTES, 0, 1_732_300_000_250_000_000, 0, b"\0\1\xff")
+
+
+def recorded(payload: bytes, topic: str = TOPIC, log_ns: int = T_NS, **metadata: str) -> Recorded:
+    return Recorded(Channel(1, topic, "json", {"qos": "0", "retain": "0"} | metadata), 0, log_ns, 0, payload)
+
+
+def written(messages: list[Recorded]) -> bytes:
+    out = io.BytesIO()
+    assert write_lines(messages, out) == len(messages)
+    return out.getvalue()
+
+
+def read(raw: bytes) -> list[Recorded | BadLine]:
+    return list(read_lines(io.BytesIO(raw)))
+
+
+def metadata(raw: bytes) -> list[Mapping[str, str]]:
+    return [message.channel.metadata for message in read_lines(io.BytesIO(raw)) if isinstance(message, Recorded)]
+
+
+def test_a_line_of_the_loggers() -> None:
+    raw = json.dumps(LINE).encode() + b"\n"
+    assert read(raw) == [MESSAGE]
+
+
+def test_a_line_of_ours() -> None:
+    line = json.loads(written([recorded(b'{"t": 1, "online": true}', qos="1", retain="1")]))
+    assert line.pop("timestamp") == pytest.approx(T_NS / 1e9)
+    assert base64.b64decode(line.pop("payload_b64")) == b'{"t": 1, "online": true}'
+    assert line == {
+        "topic": TOPIC,
+        "qos": 1,
+        "retain": True,
+        "retained": False,
+        "payload_size_bytes": 24,
+        "payload_truncated": False,
+        "payload_text": '{"t": 1, "online": true}',
+        "payload_json": {"t": 1, "online": True},
+    }
+
+
+@pytest.mark.parametrize(
+    ("payload", "readable"),
+    [
+        (b"true", {"payload_text", "payload_json"}),
+        (b"on", {"payload_text"}),
+        (b"", {"payload_text"}),
+        (b"[NaN]", {"payload_text"}),
+        (b'{"a":\n1}', {"payload_text", "payload_json"}),
+        (b"[" * 100_000, set()),
+        (b"[" * 60_000, {"payload_text"}),
+        (b"9" * 400, {"payload_text", "payload_json"}),
+        (b"\xff\xd8\xff", set()),
+        (json_video.pack(1, True, 1, bytes(range(256)) * 999), {"payload_text", "payload_json"}),
+    ],
+)
+def test_payloads_are_readable_where_they_are_text_or_json(payload: bytes, readable: set[str]) -> None:
+    raw = written([recorded(payload)])
+    assert raw.count(b"\n") == 1
+    assert {name for name in json.loads(raw) if name in ("payload_text", "payload_json")} == readable
+    assert [message.payload for message in read(raw) if isinstance(message, Recorded)] == [payload]
+
+
+def shown(message: Recorded) -> tuple[object, ...]:
+    return message.log_ns, message.channel.topic, message.payload, message.channel.metadata
+
+
+@given(
+    st.lists(
+        st.builds(
+            recorded,
+            st.binary(max_size=200) | st.text().map(str.encode) | st.sampled_from([b"{}", b"null", b"\n"]),
+            topic=st.sampled_from([TOPIC, "pebble/infrastructure", "$recorder/events", "a/ü/ö", 'a"b\\c']),
+            log_ns=st.integers(0, 4 * 10**18),
+            qos=st.sampled_from("012"),
+            retain=st.sampled_from("01"),
+        ),
+        max_size=5,
+    )
+)
+def test_there_and_back(messages: list[Recorded]) -> None:
+    back = [message for message in read(written(messages)) if isinstance(message, Recorded)]
+    assert list(map(shown, back)) == list(map(shown, messages))
+
+
+def test_flags_there_and_back() -> None:
+    flags = [
+        {"qos": "1", "retain": "1"},
+        {"qos": "0", "retain": "1", "retained": "1"},
+        {"qos": "2", "retain": "0", "truncated": "1"},
+    ]
+    assert metadata(written([recorded(b"x", **one) for one in flags])) == flags
+
+
+def test_the_loggers_retain_is_a_message_from_before_its_subscription() -> None:
+    assert metadata(json.dumps(LINE | {"retain": True}).encode()) == [{"qos": "1", "retain": "1", "retained": "1"}]
+
+
+def test_a_payload_that_the_logger_cut_is_marked() -> None:
+    (flags,) = metadata(json.dumps(LINE | {"payload_truncated": True, "payload_size_bytes": 9000}).encode())
+    assert flags["truncated"] == "1"
+
+
+def test_a_line_without_an_end_is_refused_by_file_and_number(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(lines, "LONGEST_LINE", 1000)
+    path = tmp_path / "day.jsonl"
+    path.write_bytes(json.dumps(LINE).encode() + b"\n" + b" " * 999 + b"\n" + b"x" * 1001)
+    with path.open("rb") as file:
+        messages = read_lines(file)
+        next(messages)
+        with pytest.raises(RecordingError, match=r"day\.jsonl: line 3 is longer than 1,000 bytes"):
+            next(messages)
+
+
+@pytest.mark.parametrize(
+    ("stamp", "expected_ns"),
+    [
+        ("1732300000", 1_732_300_000 * 10**9),
+        ("1732300000.123456789", 1_732_300_000_123_456_789),
+        ("1.7323e9", 1_732_300_000 * 10**9),
+        ("1732300000123", 1_732_300_000_123 * 10**6),
+        ("0", 0),
+        ('"2024-11-22T18:26:40Z"', 1_732_300_000 * 10**9),
+        ('"2024-11-22T18:26:40.250000+00:00"', 1_732_300_000_250_000_000),
+        ('"2024-11-22T19:26:40.000001+01:00"', 1_732_300_000_000_001_000),
+        ('"2024-11-22 18:26:40"', 1_732_300_000 * 10**9),
+    ],
+)
+def test_stamps(stamp: str, expected_ns: int) -> None:
+    raw = json.dumps(LINE | {"timestamp": "STAMP"}).replace('"STAMP"', stamp).encode()
+    assert [one.log_ns for one in read(raw) if isinstance(one, Recorded)] == [expected_ns]
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        b"hello",
+        b"{}",
+        b"[1, 2]",
+        b"\xff\xfe",
+        b"[" * 200_000,
+        json.dumps(LINE).encode()[:-9],
+        json.dumps(LINE | {"topic": "a/#"}).encode(),
+        json.dumps(LINE | {"topic": ""}).encode(),
+        json.dumps(LINE | {"topic": "$"}).encode(),
+        json.dumps(LINE | {"topic": 5}).encode(),
+        json.dumps(LINE | {"qos": 3}).encode(),
+        json.dumps(LINE | {"payload_b64": "%%"}).encode(),
+        json.dumps(LINE | {"timestamp": None}).encode(),
+        json.dumps(LINE | {"timestamp": "yesterday"}).encode(),
+        json.dumps(LINE | {"timestamp": "0001-01-01T00:00:00"}).encode(),
+        json.dumps(LINE | {"timestamp": -1}).encode(),
+        json.dumps(LINE | {"timestamp": 1e300}).encode(),
+        json.dumps(LINE).replace("1732300000.25", "1e999999999").encode(),
+        json.dumps(LINE).replace("1732300000.25", "NaN").encode(),
+    ],
+)
+def test_bad_lines_are_reported_and_the_others_read(line: bytes) -> None:
+    good = json.dumps(LINE).encode()
+    first, bad, last = read(good + b"\n" + line + b"\r\n\n" + good)
+    assert isinstance(bad, BadLine)
+    assert bad.number == 2
+    assert bad.problem
+    assert first == last == MESSAGE
+
+
+def test_messages_are_written_as_they_come() -> None:
+    out, sizes, times = io.BytesIO(), [], []
+
+    def coming() -> Iterator[Recorded]:
+        for number in range(3):
+            sizes.append(len(out.getvalue()))
+            yield recorded(b"x" * 100, log_ns=T_NS + number)
+
+    write_lines(coming(), out, on_time=times.append)
+    assert sizes[0] == 0 < sizes[1] < sizes[2]
+    assert times == [T_NS, T_NS + 1, T_NS + 2]

@@ -1,0 +1,222 @@
+"""MCAP files: as other readers want them, and in any state of damage."""
+
+from __future__ import annotations
+
+import os
+import random
+from collections.abc import Callable
+from itertools import product
+from pathlib import Path
+
+import pytest
+from mcap.stream_reader import StreamReader
+
+from pebble.extensions.recordings.files.reader import RecordingFile
+from pebble.extensions.recordings.files.recorded import UNNAMED
+from pebble.extensions.recordings.files.rewrite import rewrite
+from pebble.extensions.recordings.files.writer import RecordingWriter
+from tests.ext.recordings.demo_robots import DRIVE, MEDIA
+from tests.ext.recordings.files.other_readers import Counted, by_mcap, by_mcap_core
+from tests.ext.recordings.messages import START_NS, STEP_NS, contents, is_part_of, read, write
+from tests.support import cases
+
+MESSAGES = 2000
+#: How many times as many files are damaged as usual.
+TIMES = int(os.environ.get("PEBBLE_DAMAGES", cases(1, 6)))
+
+
+class TestWhole:
+    def test_other_readers_read_it(self, tmp_path: Path) -> None:
+        path = tmp_path / "a.mcap"
+        written = write(path)
+        assert [by_mcap(path), *by_mcap_core([path])] == [Counted(MESSAGES, MESSAGES, MESSAGES)] * 2
+        found, damage = read(path)
+        assert (found, damage.report()) == (written, "")
+
+    def test_an_empty_one(self, tmp_path: Path) -> None:
+        path = tmp_path / "a.mcap"
+        write(path, 0)
+        assert [by_mcap(path), *by_mcap_core([path])] == [Counted(0, 0, 0)] * 2
+        assert contents(path) == []
+
+    @pytest.mark.parametrize("finish", [True, False])
+    def test_only_the_chunks_of_a_period_are_read(self, tmp_path: Path, finish: bool) -> None:
+        path = tmp_path / "a.mcap"
+        written = write(path, finish=finish)
+        since, until = START_NS + 500 * STEP_NS, START_NS + 700 * STEP_NS
+        assert contents(path, since_ns=since, until_ns=until) == written[500:700]
+
+    def test_only_the_chosen_channels_are_read(self, tmp_path: Path) -> None:
+        path = tmp_path / "a.mcap"
+        topic = "pebble/robots/r3/outgoing/t3"
+        expected = [one for one in write(path) if one[0] == topic]
+        assert contents(path, chooses=lambda channel: channel.topic == topic) == expected
+
+    def test_one_that_is_written_is_read_so_far_as_it_is(self, tmp_path: Path) -> None:
+        """Byte by byte: the last chunk, and the indexes behind it, are often there only in part."""
+        source, path = tmp_path / "a.mcap", tmp_path / "growing.mcap.active"
+        written = write(source, 300, each=50, finish=False)
+        data, lengths = source.read_bytes(), list[int]()
+        path.write_bytes(data[:40])
+        with RecordingFile(path) as file:
+            for end in range(40, len(data) + 1, 37):
+                path.write_bytes(data[:end])
+                file.refresh()
+                lengths.append(sum(len(file.messages(chunk)) for chunk in file.chunks))
+            path.write_bytes(data)
+            file.refresh()
+            assert [(one.channel.topic, one.payload) for one in file.read()] == written
+            assert all(chunk.channels for chunk in file.chunks[:-1])
+            assert file.damage.parts == set()
+        assert sorted(set(lengths)) == [0, 50, 100, 150, 200, 250, 300]
+        assert lengths == sorted(lengths)
+
+
+class TestLastVersion:
+    """Two files that it wrote."""
+
+    @pytest.mark.parametrize(("path", "messages", "channels"), [(DRIVE, 1047, 67), (MEDIA, 197, 4)])
+    def test_they_are_read_as_the_package_reads_them(self, path: Path, messages: int, channels: int) -> None:
+        with RecordingFile(path) as file, path.open("rb") as data:
+            found = list(file.read())
+            records = list(StreamReader(data, validate_crcs=True).records)
+            assert (file.damage.report(), len(file.channels)) == ("", channels)
+        wanted = [record for record in records if type(record).__name__ == "Message"]
+        topics = {record.id: record.topic for record in records if type(record).__name__ == "Channel"}
+        assert len(found) == messages
+        assert [(one.channel.topic, one.log_ns, one.publish_ns, one.payload) for one in found] == [
+            (topics[one.channel_id], one.log_time, one.publish_time, one.data) for one in wanted
+        ]
+
+    @pytest.mark.parametrize("path", [DRIVE, MEDIA])
+    def test_without_its_end(self, tmp_path: Path, path: Path) -> None:
+        """So a recorder of the last version left it when it was killed."""
+        with RecordingFile(path) as file:
+            end = file.chunks[-1].at + file.chunks[-1].length
+        cut = tmp_path / "cut.mcap.active"
+        cut.write_bytes(path.read_bytes()[:end])
+        assert contents(cut) == contents(path)
+
+    def test_topics_without_a_channel_of_their_own(self, tmp_path: Path) -> None:
+        """They had one for all beyond 512 of a robot, in which each message begins with its topic."""
+        path, topic = tmp_path / "a.mcap", b"pebble/robots/goob/outgoing/x"
+        begin = len(topic).to_bytes(4, "little") + topic + b"\x0b\0\0\0\x03\0\0\0qos\0\0\0\0"
+        with path.open("wb", buffering=0) as file:
+            writer = RecordingWriter(file, "pebble 0.9 0123456789abcdef")
+            other = writer.channel("$recorder/other", "application/octet-stream", {})
+            writer.add(other, START_NS, begin + b"payload")
+            writer.finish()
+        assert contents(path) == [(topic.decode(), b"payload")]
+        assert contents(path, chooses=lambda channel: channel.topic.startswith("pebble/robots/fred/")) == []
+
+
+def cut(raw: bytearray, rng: random.Random) -> None:
+    del raw[rng.randrange(len(raw)) :]
+
+
+def flip(raw: bytearray, rng: random.Random, bits: int = 8) -> None:
+    for _ in range(bits):
+        raw[rng.randrange(len(raw))] ^= 1 << rng.randrange(8)
+
+
+def zero_a_page(raw: bytearray, rng: random.Random) -> None:
+    begin = rng.randrange(len(raw))
+    raw[begin : begin + 4096] = bytes(len(raw[begin : begin + 4096]))
+
+
+def end_in_garbage(raw: bytearray, rng: random.Random) -> None:
+    cut(raw, rng)
+    raw += rng.randbytes(rng.randrange(5000))
+
+
+def end_in_zeros(raw: bytearray, rng: random.Random) -> None:
+    cut(raw, rng)
+    raw += bytes(rng.randrange(20_000))
+
+
+def lose_a_part(raw: bytearray, rng: random.Random) -> None:
+    begin = rng.randrange(len(raw))
+    del raw[begin : begin + rng.randrange(60_000)]
+
+
+DAMAGES = [cut, flip, zero_a_page, end_in_garbage, end_in_zeros, lose_a_part]
+
+
+class TestDamaged:
+    @pytest.mark.parametrize(("damage", "finished"), list(product(DAMAGES, [False, True])))
+    def test_all_that_is_left_is_read_mended_and_what_is_missing_is_known(
+        self, tmp_path: Path, damage: Callable[[bytearray, random.Random], None], finished: bool
+    ) -> None:
+        rng, path = random.Random(f"{damage.__name__}{finished}"), tmp_path / "a.mcap"
+        mended: dict[Path, Counted] = {}
+        written = write(path, finish=finished)
+        whole = path.read_bytes()
+        for number in range(2 * TIMES):
+            raw, path = bytearray(whole), tmp_path / f"{number}.mcap"
+            damage(raw, rng)
+            path.write_bytes(raw)
+            found, report = read(path)
+            assert is_part_of([one for one in found if not one[0].startswith(UNNAMED)], written)
+            if damage in (flip, zero_a_page) and not report.torn:  # a torn end may have held more
+                assert report.missing == len(written) - len(found)
+            copy = tmp_path / f"{number}-mended.mcap"
+            made = rewrite(path, copy)
+            assert path.read_bytes() == raw
+            assert (made.messages, made.missing, contents(copy)) == (len(found), report.missing, found)
+            mended[copy] = by_mcap(copy)
+            assert mended[copy] == Counted(len(found), len(found), len(found))
+        assert by_mcap_core(list(mended)) == list(mended.values())
+
+    @pytest.mark.parametrize("finish", [True, False])
+    def test_one_bit_costs_a_chunk_at_most(self, tmp_path: Path, finish: bool) -> None:
+        rng, path = random.Random(finish), tmp_path / "a.mcap"
+        written = write(path, finish=finish)
+        whole = path.read_bytes()
+        for _ in range(50 * TIMES):
+            raw = bytearray(whole)
+            flip(raw, rng, 1)
+            path.write_bytes(raw)
+            found, damage = read(path)
+            assert is_part_of(found, written)
+            assert len(written) - len(found) == damage.missing in (0, 100)
+
+    def test_bits_of_what_has_no_checksum(self, tmp_path: Path) -> None:
+        """A bit of opcodes and lengths of each record: a wrong one must not hide the others."""
+        rng, path, step = random.Random(3), tmp_path / "a.mcap", cases(9, 1)
+        written = write(path, 600, finish=False)
+        whole = path.read_bytes()
+        for begin in _records(whole):
+            for at in range(begin + rng.randrange(step), begin + 9, step):
+                raw = bytearray(whole)
+                raw[at] ^= 1 << rng.randrange(8)
+                path.write_bytes(raw)
+                found = contents(path)
+                assert is_part_of(found, written), at
+                assert len(found) >= len(written) - 100, at
+
+    def test_the_name_of_a_channel_survives_its_chunk(self, tmp_path: Path) -> None:
+        path = tmp_path / "a.mcap"
+        written = write(path, finish=False)
+        with RecordingFile(path) as file:
+            first = file.chunks[0]
+        raw = bytearray(path.read_bytes())
+        raw[first.at + first.length // 2] ^= 1
+        path.write_bytes(raw)
+        found, damage = read(path)
+        assert (found, damage.missing, damage.unnamed) == (written[100:], 100, 0)
+
+    @pytest.mark.parametrize("garbage", [b"", bytes(5000), random.Random(1).randbytes(5000), b"\x89MCAP0\r\n"])
+    def test_nothing_but_garbage(self, tmp_path: Path, garbage: bytes) -> None:
+        path = tmp_path / "a.mcap"
+        path.write_bytes(garbage)
+        found, damage = read(path)
+        assert (found, damage.finished) == ([], False)
+        assert damage.report()
+
+
+def _records(raw: bytes) -> list[int]:
+    found, at = [], 8
+    while at < len(raw):
+        found.append(at)
+        at += 9 + int.from_bytes(raw[at + 1 : at + 9], "little")
+    return found[1:]

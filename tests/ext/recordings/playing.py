@@ -1,0 +1,161 @@
+"""Makes recordings, and plays them in virtual time."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from pebble.contract.packets import KEY_FRAME, Codec, Picture, PictureKind, Sound
+from pebble.extensions.recordings.files.recorded import Channel
+from pebble.extensions.recordings.files.writer import RecordingWriter
+from pebble.extensions.recordings.replay.player import BusOutput, Player
+from pebble.extensions.recordings.replay.rules import Options, Rules
+from pebble.extensions.recordings.replay.source import ReplaySource
+from pebble.extensions.recordings.stamps import stamp_ns
+from pebble.transports import Message
+
+GOOB, FRED = "pebble/robots/goob", "pebble/robots/fred"
+THEN_NS = 1_700_000_000 * 10**9  # when recordings of tests begin
+NOW_NS = 1_800_000_000 * 10**9  # when they are replayed
+
+
+class Line(NamedTuple):
+    """One message of a recording, at a time in seconds from its begin."""
+
+    at: float
+    topic: str
+    payload: bytes
+    qos: int = 0
+    retain: bool = False  # published so
+    retained: bool = False  # an old one that came after subscribing
+
+    @property
+    def log_ns(self) -> int:
+        return THEN_NS + round(self.at * 1e9)
+
+    @property
+    def metadata(self) -> dict[str, str]:
+        flags = {"qos": str(self.qos), "retain": str(int(self.retain))}
+        return flags | ({"retained": "1"} if self.retained else {})
+
+
+def js(**fields: Any) -> bytes:
+    return json.dumps(fields).encode()
+
+
+def ms(at: float) -> int:
+    """Epoch milliseconds of a time in seconds from the begin of a recording."""
+    return THEN_NS // 10**6 + round(at * 1000)
+
+
+def write(path: Path, lines: Iterable[Line], *, finished: bool = True) -> Path:
+    with path.open("wb", buffering=0) as file:
+        writer = RecordingWriter(file, library="pebble test")
+        numbers: dict[tuple[str, str], int] = {}
+        for line in lines:
+            key = line.topic, str(line.metadata)
+            if key not in numbers:
+                numbers[key] = writer.channel(line.topic, "json", line.metadata)
+            writer.add(numbers[key], line.log_ns, line.payload, stamp_ns(line.payload))
+        writer.flush()
+        if finished:
+            writer.finish()
+    return path
+
+
+class VirtualTime:
+    """A clock that only waiting moves on."""
+
+    def __init__(self) -> None:
+        self.seconds = 0.0
+
+    def now(self) -> float:
+        return self.seconds
+
+    def wall_ns(self) -> int:
+        return NOW_NS + round(self.seconds * 1e9)
+
+    def wait(self, seconds: float) -> None:
+        self.seconds += seconds
+
+
+class Sent(NamedTuple):
+    at: float
+    message: Message
+
+
+class Stage:
+    """A player in virtual time, and all that it publishes."""
+
+    def __init__(self, path: Path | Sequence[Path], options: Options | None = None, **playing: Any) -> None:
+        self.time = VirtualTime()
+        self.sent: list[Sent] = []
+        self.refuses = 0  # so many of the next messages
+        self.takes_s = 0.0  # for each message
+        self.waits = 0
+        self.actions: list[tuple[float, Any]] = []  # what to do at a time, in order
+        source = ReplaySource([path] if isinstance(path, Path) else path)
+        self.rules = Rules(options or Options(), source.channels)
+        output = BusOutput(self.rules, self._publish, self.time.wall_ns)
+        clocks = {"now": self.time.now, "wait": self._wait}
+        self.player = Player(source, self.rules.publishes, output, **clocks, **playing)
+
+    def run(self) -> Stage:
+        self.player.run()
+        return self
+
+    def at(self, seconds: float, action: Any) -> Stage:
+        self.actions.append((seconds, action))
+        return self
+
+    @property
+    def topics(self) -> list[str]:
+        return [sent.message.topic for sent in self.sent]
+
+    def payloads(self, topic: str) -> list[bytes]:
+        return [sent.message.payload for sent in self.sent if sent.message.topic == topic]
+
+    def _publish(self, message: Message) -> bool:
+        if self.refuses:
+            self.refuses -= 1
+            return False
+        self.time.wait(self.takes_s)
+        self.sent.append(Sent(self.time.now(), message))
+        return True
+
+    def _wait(self, seconds: float) -> None:
+        self.waits += 1
+        self.time.wait(seconds)
+        while self.actions and self.time.now() >= self.actions[0][0]:
+            self.actions.pop(0)[1]()
+
+
+def rules_of(options: Options, *lines: Line) -> Rules:
+    return Rules(options, [Channel(number, line.topic, "json", line.metadata) for number, line in enumerate(lines)])
+
+
+def picture(kind: PictureKind, frame: int, at: float, flags: int = 0, body: bytes = b"picture") -> bytes:
+    return Picture(kind, frame, ms(at), body, flags).pack()
+
+
+def demo(seconds: float, robots: Sequence[str] = (GOOB, FRED)) -> list[Line]:
+    """What robots publish while they are driven and watched."""
+    lines = []
+    for number in range(int(seconds * 50)):
+        at = number / 50
+        for base in robots:
+            sound = Sound(Codec.PCM16LE, 1, 16000, 320, number + 1, ms(at), b"\1\2" * 320)
+            lines.append(Line(at, f"{base}/outgoing/audio", sound.pack()))
+            if number % 3 == 0:
+                key = number % 60 == 0
+                packet = picture(PictureKind.H264, number // 3, at, KEY_FRAME * key, b"x" * 900)
+                lines.append(Line(at + 0.001, f"{base}/outgoing/front-camera", packet))
+            if number % 12 == 0:
+                lines.append(Line(at + 0.002, f"{base}/outgoing/online", js(t=ms(at)), 1, retain=True))
+            if number % 5 == 0:
+                drive = js(x=0.0, z=0.5 * (number % 100 < 50))
+                lines.append(Line(at + 0.003, f"{base}/incoming/drive-values", drive, 1))
+                lines.append(Line(at + 0.004, f"{base}/outgoing/sensors/imu", js(t=ms(at), n=number), 1))
+    return lines

@@ -1,0 +1,224 @@
+"""``pebble record`` beside a real broker: every message with its flags, and a word about those that are missing."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from pebble.extensions.recordings import library
+from pebble.extensions.recordings.files.recorded import Recorded
+from pebble.extensions.recordings.recorder.intake import EVENTS
+from pebble.transports import Message, MqttSettings, QoS, Transport, create
+from tests.commands.command_line import Run
+from tests.support import AmqttBroker, Broker, until
+
+GOOB = "pebble/robots/goob"
+ONLINE, AUDIO, STATUS = f"{GOOB}/outgoing/online", f"{GOOB}/outgoing/audio", f"{GOOB}/outgoing/status"
+FLAG, DRIVE = f"{GOOB}/incoming/flags/mqtt-video", f"{GOOB}/incoming/drive-values"
+
+
+def pebble(*arguments: object, **options: Any) -> subprocess.Popen[str]:
+    command = [sys.executable, "-m", "pebble", *map(str, arguments)]
+    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, **options)
+
+
+@contextmanager
+def recording(root: Path, port: int, *options: object) -> Iterator[subprocess.Popen[str]]:
+    """A recorder that is connected, and ends in order at the end."""
+    with started(root, port, *options) as process:
+        assert process.stdout is not None
+        assert "Recording" in process.stdout.readline()
+        yield process
+
+
+@contextmanager
+def started(root: Path, port: int, *options: object) -> Iterator[subprocess.Popen[str]]:
+    """A recorder that ends in order at the end."""
+    with pebble("record", "--url", f"mqtt://127.0.0.1:{port}", "--into", root, *options) as process:
+        try:
+            yield process
+        finally:
+            process.send_signal(signal.SIGINT)
+            process.wait(20)
+
+
+def client(port: int, name: str = "robot") -> Transport:
+    return create("mqtt", name, MqttSettings(host="127.0.0.1", port=port)).open()
+
+
+def recorded(root: Path) -> list[Recorded]:
+    """What is in the files so far; a recorder that runs has none before its first write."""
+    return list(library.merged(library.files([root]))) if any(root.rglob("*.mcap*")) else []
+
+
+def of(messages: list[Recorded], topic: str) -> list[bytes]:
+    return [message.payload for message in messages if message.channel.topic == topic]
+
+
+def old_topics(root: Path) -> set[str]:
+    """Those of the many values that were retained before."""
+    old = (one.channel.topic for one in recorded(root) if one.channel.metadata.get("retained") == "1")
+    return {topic for topic in old if "/many/" in topic}
+
+
+def events(messages: list[Recorded], name: str) -> list[dict[str, Any]]:
+    return [event for event in map(json.loads, of(messages, EVENTS)) if event["event"] == name]
+
+
+class Reference:
+    """A subscriber beside the recorder."""
+
+    def __init__(self, port: int) -> None:
+        self.received: list[Message] = []
+        self.transport = client(port, "reference")
+        self.transport.subscribe("#", self.received.append, qos=QoS.DELIVERED, direct=True)
+
+    def of(self, topic: str) -> list[bytes]:
+        return [message.payload for message in self.received if message.topic == topic]
+
+
+def publish_all(robot: Transport, reference: Reference, number: int = 300) -> None:
+    """State, sound and commands, faster than robots are; waits until the reference has them."""
+    for count in range(number):
+        robot.publish(ONLINE, b'{"t":%d}' % count, qos=QoS.DELIVERED, retain=True)
+        robot.publish(AUDIO, b"PBAT\x01\x01\x01\x00" + bytes(12) + count.to_bytes(4, "big"), qos=QoS.LATEST)
+        robot.publish(DRIVE, b'{"x":0.1,"z":%d}' % count, qos=QoS.DELIVERED)
+        time.sleep(0.002)
+    assert until(lambda: len(reference.of(DRIVE)) == number, 10)
+
+
+@pytest.mark.parametrize("filters", [(), ("--filter", "#", "--filter", "pebble/#")])
+def test_what_a_subscriber_sees_is_recorded_byte_for_byte_with_its_flags(
+    tmp_path: Path, filters: tuple[str, ...]
+) -> None:
+    broker = Broker(tmp_path)
+    robot = client(broker.port)
+    for count in range(1500):
+        robot.publish(f"{GOOB}/outgoing/many/{count}", b"%d" % count, retain=True)
+    robot.publish(FLAG, b"true", qos=QoS.DELIVERED, retain=True)
+    reference = Reference(broker.port)
+    with recording(tmp_path / "rec", broker.port, *filters):
+        publish_all(robot, reference)
+        robot.publish(STATUS, b"{}", qos=QoS.DELIVERED, retain=True)
+        robot.publish("replay/robots/goob/outgoing/online", b"{}", retain=True)
+        robot.publish("pebble/infrastructure", b"1")
+        assert until(lambda: of(recorded(tmp_path / "rec"), "pebble/infrastructure"), step=0.2)
+        assert until(lambda: len(old_topics(tmp_path / "rec")) == 1500, step=0.2)  # they are fetched beside
+    found = recorded(tmp_path / "rec")
+    for topic in (AUDIO, DRIVE):
+        assert of(found, topic) == reference.of(topic)
+    assert not of(found, "replay/robots/goob/outgoing/online")
+    live = [message for message in found if not message.channel.metadata.get("retained")]
+    assert of(live, ONLINE) == reference.of(ONLINE)
+    flags = {message.channel.topic: dict(message.channel.metadata) for message in live}
+    assert flags[STATUS] == {"qos": "1", "retain": "1"}
+    assert flags[AUDIO] == {"qos": "0", "retain": "0"}
+    assert flags["pebble/infrastructure"]["qos"] == "0"
+    old = [message for message in found if message.channel.metadata.get("retained") == "1"]
+    assert of(old, FLAG) == [b"true"]
+    assert len(old_topics(tmp_path / "rec")) == 1500
+    robot.close()
+    reference.transport.close()
+    broker.stop()
+
+
+def test_a_broker_that_knows_only_mqtt_3(tmp_path: Path) -> None:
+    broker = AmqttBroker()
+    try:
+        robot = client(broker.port)
+        reference = Reference(broker.port)
+        with started(tmp_path / "rec", broker.port):
+            assert until(lambda: events(recorded(tmp_path / "rec"), "connected"), step=0.2)
+            publish_all(robot, reference, 50)
+            assert until(lambda: len(of(recorded(tmp_path / "rec"), DRIVE)) == 50, step=0.2)
+        found = recorded(tmp_path / "rec")
+        assert of(found, DRIVE) == reference.of(DRIVE)
+        assert next(one.channel.metadata for one in found if one.channel.topic == DRIVE) == {"qos": "1"}
+        robot.close()
+        reference.transport.close()
+    finally:
+        broker.stop()
+
+
+def test_a_killed_recorder_is_continued_by_the_next(tmp_path: Path) -> None:
+    broker, root = Broker(tmp_path), tmp_path / "rec"
+    robot, reference = client(broker.port), Reference(broker.port)
+    with recording(root, broker.port) as process:
+        publish_all(robot, reference, 200)
+        assert until(lambda: len(of(recorded(root), DRIVE)) == 200, step=0.2)
+        process.kill()
+    active = [path for path in library.files([root]) if path.name.endswith(".active")]
+    assert len(active) == 2
+    assert of(recorded(root), DRIVE) == reference.of(DRIVE)
+    with recording(root, broker.port):
+        assert until(lambda: not any(path.exists() for path in active), 10)
+        publish_all(robot, Reference(broker.port), 20)
+        assert until(lambda: len(of(recorded(root), DRIVE)) == 220, step=0.2)
+    found = recorded(root)
+    assert len(of(found, DRIVE)) == 220
+    assert [event["missing"] for event in events(found, "recovered")] == [0, 0]
+    robot.close()
+    broker.stop()
+
+
+@pytest.mark.parametrize("how", ["killed", "stopped"])
+def test_an_outage_is_a_gap(tmp_path: Path, how: str) -> None:
+    broker, root = Broker(tmp_path), tmp_path / "rec"
+    with recording(root, broker.port):
+        time.sleep(1.0)
+        began = time.time()
+        if how == "killed":
+            broker.kill()
+            time.sleep(1.0)
+            broker.start()
+        else:
+            os.kill(broker.pid, signal.SIGSTOP)
+            time.sleep(3.0)
+            os.kill(broker.pid, signal.SIGCONT)
+        ended = time.time()
+        assert until(lambda: events(recorded(root), "gap"), 10, step=0.2)
+    (gap,) = events(recorded(root), "gap")
+    assert gap["why"] == "no connection"
+    assert gap["since"] / 1e3 == pytest.approx(began, abs=3.0)  # a silence is noticed after two seconds
+    assert ended - 0.5 <= gap["until"] / 1e3 <= ended + 4.0
+    broker.stop()
+
+
+class TestErrors:
+    def test_there_is_no_broker_yet(self, tmp_path: Path) -> None:
+        with pebble("record", "--url", "mqtt://127.0.0.1:1", "--into", tmp_path / "rec", "--for", "1s") as process:
+            assert process.stdout is not None
+            assert "cannot connect to mqtt://127.0.0.1:1 yet" in process.stdout.readline()
+            assert process.wait(20) == 0
+
+    @pytest.mark.parametrize(
+        ("arguments", "problem"),
+        [
+            (("--url", "http://x"), "--url must be mqtt://"),
+            ((), "where to connect is missing"),
+            (("--url", "mqtt://127.0.0.1", "--rotate", "soon"), '"soon" is not a duration: 30s, 10min, 1h or 7d'),
+            (("--url", "mqtt://127.0.0.1", "--keep", "much"), '"much" is not a size: 64M, 2G or 1T'),
+            (("--url", "mqtt://127.0.0.1", "-f", "a/#/b"), "a/#/b"),
+            (
+                ("--url", "mqtt://127.0.0.1", "--into", "/proc/x"),
+                "/proc/x: No such file or directory: name another folder",
+            ),
+        ],
+    )
+    def test_one_line(
+        self, tmp_path: Path, run: Run, monkeypatch: pytest.MonkeyPatch, arguments: tuple[str, ...], problem: str
+    ) -> None:
+        monkeypatch.chdir(tmp_path)
+        assert run("record", *arguments) != 0
+        assert problem in run.err
+        assert len(run.err.strip().splitlines()) == 1

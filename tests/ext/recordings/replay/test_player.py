@@ -1,0 +1,276 @@
+"""The player in virtual time: order, pace, pause, seek, loop, and what it does when it cannot publish."""
+
+from __future__ import annotations
+
+import json
+from itertools import pairwise
+from pathlib import Path
+
+import pytest
+
+from pebble.contract.packets import KEY_FRAME, Picture, PictureKind
+from pebble.extensions.recordings.replay.rules import Options, zero
+from pebble.extensions.recordings.replay.source import ReplaySource
+from pebble.extensions.recordings.stamps import stamp_ns
+from tests.ext.recordings.playing import FRED, GOOB, NOW_NS, THEN_NS, Line, Stage, demo, js, ms, picture, write
+
+LOGS = f"{GOOB}/outgoing/logs"
+DRIVE = f"{GOOB}/incoming/drive-values"
+REPLAYED_LOGS, REPLAYED_DRIVE = (topic.replace("pebble/", "replay/", 1) for topic in (LOGS, DRIVE))
+ALL = Options(incoming=True)
+ZERO = zero(REPLAYED_DRIVE).payload
+
+
+def numbers(stage: Stage) -> list[int]:
+    """Those of the lines of the log that were sent."""
+    return [json.loads(payload)["n"] for payload in stage.payloads(REPLAYED_LOGS)]
+
+
+@pytest.fixture
+def walk(tmp_path: Path) -> Path:
+    """A line of the log each second for 60 s."""
+    return write(tmp_path / "walk.mcap", [Line(n, LOGS, js(n=n, t=ms(n))) for n in range(60)])
+
+
+@pytest.mark.parametrize("speed", [0.1, 1.0, 7.0, 100.0])
+def test_messages_come_in_order_and_at_their_pace(walk: Path, speed: float) -> None:
+    stage = Stage(walk, ALL, speed=speed).run()
+    assert numbers(stage) == list(range(60))
+    assert [round(sent.at * speed, 3) for sent in stage.sent] == list(range(60))
+    assert (stage.player.sent, stage.player.skipped, stage.player.ended) == (60, 0, True)
+
+
+def test_speed_has_limits(walk: Path) -> None:
+    stage = Stage(walk, ALL, speed=1000)
+    assert stage.player.speed == 100
+    stage.player.speed = 0.01
+    assert stage.player.speed == 0.1
+    assert Stage(walk, ALL, speed=0.5, slowest=1.0).player.speed == 1.0
+
+
+def test_speed_may_change_meanwhile(walk: Path) -> None:
+    stage = Stage(walk, ALL)
+    stage.at(10.5, lambda: setattr(stage.player, "speed", 10.0)).run()
+    assert stage.sent[10].at == pytest.approx(10)
+    assert stage.sent[11].at == pytest.approx(10.55, abs=0.01)
+    assert stage.sent[-1].at == pytest.approx(10.5 + 4.85, abs=0.01)
+
+
+def test_stamps_are_as_old_as_they_were(walk: Path) -> None:
+    stage = Stage(walk, Options(), speed=2.0).run()
+    for sent in stage.sent:
+        assert stamp_ns(sent.message.payload) == pytest.approx(NOW_NS + sent.at * 1e9, abs=2e6)
+
+
+def test_a_pause_takes_no_time_of_the_recording(walk: Path) -> None:
+    stage = Stage(walk, ALL)
+    stage.at(10.5, stage.player.pause).at(100, stage.player.resume).run()
+    assert stage.sent[10].at == pytest.approx(10)
+    assert stage.sent[11].at == pytest.approx(100.5, abs=0.06)
+    assert len(stage.sent) == 60
+
+
+def test_the_position_is_that_in_the_recording(walk: Path) -> None:
+    stage, seen = Stage(walk, ALL, speed=2.0), []
+    for moment in (5.0, 10.0):
+        stage.at(moment, lambda: seen.append((stage.player.position_ns - THEN_NS) / 1e9))
+    stage.at(10.0, stage.player.pause)
+    stage.at(20.0, lambda: seen.append((stage.player.position_ns - THEN_NS) / 1e9)).at(20.0, stage.player.resume)
+    stage.run()
+    assert seen == pytest.approx([10, 20, 20], abs=0.2)
+
+
+def test_it_may_begin_paused(walk: Path) -> None:
+    stage = Stage(walk, ALL, paused=True)
+    stage.at(30, stage.player.resume).run()
+    assert stage.sent[0].at == pytest.approx(30, abs=0.06)
+    assert len(stage.sent) == 60
+
+
+@pytest.mark.parametrize(("to", "begins"), [(40.2, 41), (5.0, 5), (-20, 0)])
+def test_seek_goes_on_from_there(walk: Path, to: float, begins: int) -> None:
+    stage = Stage(walk, ALL)
+    stage.at(10.5, lambda: stage.player.seek(THEN_NS + int(to * 1e9))).run()
+    assert numbers(stage) == [*range(11), *range(begins, 60)]
+
+
+def test_a_seek_behind_the_end_ends(walk: Path) -> None:
+    stage = Stage(walk, ALL)
+    stage.at(10.5, lambda: stage.player.seek(THEN_NS + 10**12)).run()
+    assert len(stage.sent) == 11
+
+
+def test_it_begins_and_ends_where_asked(walk: Path) -> None:
+    stage = Stage(walk, ALL, since_ns=THEN_NS + 20 * 10**9, until_ns=THEN_NS + 30 * 10**9).run()
+    assert numbers(stage) == list(range(20, 30))
+    assert stage.sent[0].at == 0
+
+
+def test_a_loop_begins_again(walk: Path) -> None:
+    stage = Stage(walk, ALL, loop=True)
+    stage.at(150.5, stage.player.stop).run()
+    assert len(stage.sent) == pytest.approx(150, abs=3)
+    assert numbers(stage)[60] == numbers(stage)[0] == 0
+
+
+def test_a_loop_of_one_message_is_no_flood(tmp_path: Path) -> None:
+    stage = Stage(write(tmp_path / "one.mcap", [Line(0, LOGS, b"{}")]), ALL, loop=True)
+    stage.at(10, stage.player.stop).run()
+    assert 10 < len(stage.sent) <= 210
+
+
+def test_several_files_are_one_recording(tmp_path: Path) -> None:
+    paths = [
+        write(tmp_path / f"{name}.mcap", [Line(n, f"{GOOB}/outgoing/{name}", b"{}") for n in range(begin, 30, 2)])
+        for begin, name in enumerate(("logs", "audio"))
+    ]
+    stage = Stage(paths, ALL).run()
+    assert [topic.rpartition("/")[2] for topic in stage.topics] == ["logs", "audio"] * 15
+
+
+@pytest.mark.parametrize("finished", [True, False])
+def test_a_file_of_a_killed_recorder_is_played(tmp_path: Path, finished: bool) -> None:
+    path = write(tmp_path / "x.mcap.active", demo(2), finished=finished)
+    stage = Stage(path, ALL).run()
+    assert stage.player.sent == len(demo(2))
+    assert set(stage.rules.robots.values()) == {GOOB, FRED}
+
+
+def test_an_empty_recording_ends(tmp_path: Path) -> None:
+    assert Stage(write(tmp_path / "x.mcap", []), loop=True).run().sent == []
+
+
+def test_what_is_refused_is_sent_again_and_nothing_is_lost(walk: Path) -> None:
+    stage = Stage(walk, ALL)
+    stage.at(9.9, lambda: setattr(stage, "refuses", 20)).run()
+    assert len(stage.sent) == 60
+    assert stage.sent[10].at == pytest.approx(10.2, abs=0.06)
+    assert stage.sent[11].at == pytest.approx(11, abs=0.06)
+
+
+def test_after_a_long_refusal_there_is_no_burst(walk: Path) -> None:
+    stage = Stage(walk, ALL)
+    stage.at(9.9, lambda: setattr(stage, "refuses", 2000)).run()
+    times = [sent.at for sent in stage.sent]
+    assert times[10] == pytest.approx(30, abs=1)
+    assert all(after - before > 0.45 for before, after in pairwise(times[10:]))
+
+
+def test_a_process_that_stood_still_sends_no_burst(walk: Path) -> None:
+    stage = Stage(walk, ALL)
+    stage.at(10.5, lambda: stage.time.wait(3600)).run()
+    assert stage.sent[12].at - stage.sent[11].at == pytest.approx(1, abs=0.06)
+
+
+def test_the_caller_acts_also_when_all_is_late(walk: Path) -> None:
+    stage = Stage(write(walk, [Line(n / 1e6, LOGS, b"{}") for n in range(5000)]), ALL)
+    stage.takes_s = 0.001
+    stage.run()
+    assert stage.waits > 50
+
+
+def driving(*seconds: float, stops: float | None = None) -> list[Line]:
+    lines = [Line(at, DRIVE, js(x=0, z=0.5), 1) for at in seconds]
+    return lines + ([Line(stops, DRIVE, js(x=0, z=0), 1)] if stops is not None else []) + [Line(50, LOGS, b"{}")]
+
+
+def test_rule_7_a_drive_command_is_followed_by_a_stop_at_the_end(tmp_path: Path) -> None:
+    stage = Stage(write(tmp_path / "x.mcap", driving(1, 2)[:-1]), ALL).run()
+    assert stage.payloads(REPLAYED_DRIVE) == [js(x=0, z=0.5)] * 2 + [ZERO]
+
+
+def test_rule_7_not_after_a_recorded_one(tmp_path: Path) -> None:
+    stage = Stage(write(tmp_path / "x.mcap", driving(1, 2, stops=3)[:-1]), ALL).run()
+    assert ZERO not in stage.payloads(REPLAYED_DRIVE)
+
+
+@pytest.mark.parametrize("what", ["pause", "seek", "stop"])
+def test_rule_7_at_each_interruption(tmp_path: Path, what: str) -> None:
+    stage = Stage(write(tmp_path / "x.mcap", driving(0, 1, 2)), ALL)
+    actions = {"pause": stage.player.pause, "seek": lambda: stage.player.seek(THEN_NS + 40 * 10**9)}
+    actions["stop"] = stage.player.stop
+    stage.at(2.5, actions[what]).at(10, stage.player.stop).run()
+    at = next(sent.at for sent in stage.sent if sent.message.payload == ZERO)
+    assert at == pytest.approx(2.5, abs=0.06)
+    assert stage.payloads(REPLAYED_DRIVE).count(ZERO) == 1
+
+
+def test_rule_7_at_each_turn_of_a_loop(tmp_path: Path) -> None:
+    stage = Stage(write(tmp_path / "x.mcap", driving(0, 1)[:-1]), ALL, loop=True)
+    stage.at(3.5, stage.player.stop).run()
+    assert stage.payloads(REPLAYED_DRIVE)[2] == ZERO
+    assert stage.payloads(REPLAYED_DRIVE)[-1] == ZERO
+
+
+def test_rule_7_after_an_error_and_though_it_is_refused_at_first(tmp_path: Path) -> None:
+    stage = Stage(write(tmp_path / "x.mcap", driving(0, 1, 2)), ALL)
+
+    def fail() -> None:
+        stage.refuses = 10
+        raise RuntimeError
+
+    with pytest.raises(RuntimeError):
+        stage.at(1.5, fail).run()
+    assert stage.payloads(REPLAYED_DRIVE)[-1] == ZERO
+
+
+STATE = f"{GOOB}/outgoing/charging-status"
+CAMERA = f"{GOOB}/outgoing/front-camera"
+
+
+def test_a_seek_begins_with_the_newest_state(tmp_path: Path) -> None:
+    lines = [
+        Line(0, f"{GOOB}/outgoing/soundboard-files", js(files=[]), 1, retain=True),
+        Line(0.1, f"{GOOB}/outgoing/custom", b"1", 1, retained=True),
+        Line(0.2, f"{GOOB}/outgoing/gone", b"1", 1, retain=True),
+        Line(0.3, f"{GOOB}/outgoing/gone", b"", 1, retain=True),
+        *(Line(n, STATE, js(value=n), 1, retain=True) for n in range(1, 60)),
+        *(Line(n + 0.5, LOGS, js(n=n)) for n in range(59)),
+        *(Line(n + 0.6, f"{GOOB}/outgoing/online", js(t=ms(n)), 1, retain=True) for n in range(30)),
+        *(Line(n + 0.7, f"{GOOB}/incoming/flags/mqtt-video", b"true", 1, retain=True) for n in range(30)),
+    ]
+    path = write(tmp_path / "x.mcap", sorted(lines, key=lambda line: line.at))
+    stage = Stage(path, ALL, since_ns=THEN_NS + int(40.2 * 1e9)).run()
+    assert [(sent.message.topic.rpartition("/")[2], sent.message.payload) for sent in stage.sent[:4]] == [
+        ("soundboard-files", js(files=[])),
+        ("custom", b"1"),
+        ("charging-status", js(value=40)),
+        ("logs", js(n=40)),
+    ]
+    assert stage.sent[3].at == 0
+
+
+def test_state_before_has_stamps_of_its_age(tmp_path: Path) -> None:
+    lines = [Line(n, f"{GOOB}/outgoing/status", js(t=ms(n), value={}), 1, retain=True) for n in (5, 60)]
+    stage = Stage(write(tmp_path / "x.mcap", lines), since_ns=THEN_NS + 30 * 10**9).run()
+    assert stamp_ns(stage.sent[0].message.payload) == NOW_NS - 55 * 10**9  # the recording goes on at 60 s
+    assert stamp_ns(stage.sent[1].message.payload) == NOW_NS
+
+
+@pytest.mark.parametrize("kinds", [(PictureKind.JPEG, PictureKind.DELTA_JPEG), (PictureKind.H264, PictureKind.H264)])
+def test_a_seek_begins_at_a_key_frame(tmp_path: Path, kinds: tuple[PictureKind, PictureKind]) -> None:
+    whole, delta = kinds
+    lines = [
+        Line(n / 10, CAMERA, picture(*((whole, n, n / 10, KEY_FRAME) if n % 40 == 0 else (delta, n, n / 10))))
+        for n in range(600)
+    ]
+    stage = Stage(write(tmp_path / "x.mcap", lines), ALL)
+    stage.at(2.05, lambda: stage.player.seek(THEN_NS + int(33.05 * 1e9))).run()
+    frames = [Picture.unpack(sent.message.payload).frame for sent in stage.sent]
+    assert frames == [*range(21), *range(320, 331), *range(331, 600)]
+    assert stage.sent[31].at == pytest.approx(2.05, abs=0.06)  # the last of those before
+    assert stage.sent[32].at == pytest.approx(2.10, abs=0.06)
+
+
+def test_a_key_frame_of_long_ago_is_of_no_use(tmp_path: Path) -> None:
+    lines = [Line(0, CAMERA, picture(PictureKind.JPEG, 0, 0)), Line(100, CAMERA, picture(PictureKind.JPEG, 1, 100))]
+    stage = Stage(write(tmp_path / "x.mcap", lines), ALL, since_ns=THEN_NS + 90 * 10**9).run()
+    assert len(stage.sent) == 1
+
+
+def test_a_state_does_not_unpack_media(tmp_path: Path) -> None:
+    state = write(tmp_path / "state.mcap", [Line(0, STATE, js(value=True), 1, retain=True)])
+    media = write(tmp_path / "media.mcap", [Line(n, f"{GOOB}/outgoing/audio", b"PBAT") for n in range(3)])
+    source = ReplaySource([state, media])
+    media.write_bytes(b"unreadable")
+    assert [message.channel.topic for message in source.state_before(THEN_NS + 10**10)] == [STATE]

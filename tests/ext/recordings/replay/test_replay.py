@@ -1,0 +1,263 @@
+"""``pebble replay`` as a process, with a real mosquitto and a real terminal."""
+
+from __future__ import annotations
+
+import json
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+
+from pebble.extensions.recordings.files.rewrite import rewrite
+from pebble.extensions.recordings.stamps import stamp_ns
+from pebble.transports import Message, MqttSettings, QoS, create
+from tests.commands.command_line import Run, program
+from tests.commands.conftest import run as run
+from tests.ext.recordings import messages
+from tests.ext.recordings.playing import FRED, GOOB, Line, demo, js, ms, write
+from tests.kit.terminal import Terminal
+from tests.support import Broker, until
+
+REPLAYED = "replay/robots/goob"
+ONLINE, STATUS, LOGS = (f"{REPLAYED}/outgoing/{metric}" for metric in ("online", "status", "logs"))
+
+
+@pytest.fixture(scope="module")
+def broker(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Broker]:
+    broker = Broker(tmp_path_factory.mktemp("broker"), "max_queued_messages 0")
+    yield broker
+    broker.stop()
+
+
+class Operator:
+    """Receives everything."""
+
+    def __init__(self, broker: Broker) -> None:
+        self._settings = MqttSettings(host="127.0.0.1", port=broker.port)
+        self.transport = create("mqtt", "operator", self._settings).open()
+        self.received: list[tuple[float, Message]] = []
+        self.transport.subscribe("#", self._take, direct=True)
+
+    def _take(self, message: Message) -> None:
+        self.received.append((time.monotonic(), message))
+
+    def payloads(self, topic: str) -> list[bytes]:
+        return [message.payload for _, message in list(self.received) if message.topic == topic]
+
+    def states(self, topic: str = ONLINE) -> list[object]:
+        return [json.loads(payload).get("online", True) for payload in self.payloads(topic)]
+
+    def retained(self) -> dict[str, bytes]:
+        """What a new subscriber is sent."""
+        found: dict[str, bytes] = {}
+        with create("mqtt", "late", self._settings) as late:
+            late.subscribe("#", lambda message: _note(message, found), direct=True)
+        return found
+
+
+def _note(message: Message, found: dict[str, bytes]) -> None:
+    if message.retain:
+        found[message.topic] = message.payload
+
+
+@pytest.fixture
+def operator(broker: Broker) -> Iterator[Operator]:
+    operator = Operator(broker)
+    yield operator
+    for topic in operator.retained():
+        operator.transport.publish(topic, b"", qos=QoS.DELIVERED, retain=True)
+    operator.transport.close()
+
+
+@pytest.fixture
+def at(broker: Broker) -> tuple[str, str]:
+    return "--url", f"mqtt://127.0.0.1:{broker.port}"
+
+
+def walk(folder: Path, seconds: int = 60) -> Path:
+    """Heartbeats, a retained state, a log and drive commands."""
+    lines = [Line(0, f"{GOOB}/outgoing/status", js(t=ms(0), value={}), 1, retained=True)]
+    for number in range(seconds * 4):
+        at = number / 4
+        lines.append(Line(at, f"{GOOB}/outgoing/online", js(t=ms(at)), 1, retain=True))
+        lines.append(Line(at + 0.01, f"{GOOB}/outgoing/logs", js(t=ms(at), n=number)))
+        lines.append(Line(at + 0.02, f"{GOOB}/incoming/drive-values", js(x=0, z=0.5), 1))
+    return write(folder / "walk.mcap", lines)
+
+
+@contextmanager
+def meanwhile(job: Callable[[], object]) -> Iterator[None]:
+    """``job`` on a thread of its own."""
+    thread = threading.Thread(target=job)
+    thread.start()
+    yield
+    thread.join(20)
+
+
+def ends(process: subprocess.Popen[str], timeout: float = 20) -> tuple[int, str, str]:
+    try:
+        out, err = process.communicate(timeout=timeout)
+    finally:
+        process.kill()
+    return process.returncode, out, err
+
+
+def test_replayed_at_ten_times_its_speed_it_is_the_same(
+    tmp_path: Path, operator: Operator, at: tuple[str, str], run: Run
+) -> None:
+    lines = demo(20)
+    path = write(tmp_path / "demo.mcap", lines)
+    began = time.monotonic()
+    assert (run("replay", path, *at, "--incoming", "--speed", "10"), run.err) == (0, "")
+    assert time.monotonic() - began > 2
+    robots = [base.replace("pebble", "replay") for base in (GOOB, FRED)]
+    assert run.out.splitlines() == [", ".join(robots), f"{len(lines)} sent, 0 skipped"]
+    assert until(lambda: operator.states(f"{robots[1]}/outgoing/online")[-1] is False)
+    for topic in {line.topic for line in lines}:
+        sent = [_without_stamp(line.payload) for line in lines if line.topic == topic]
+        received = [_without_stamp(payload) for payload in operator.payloads(topic.replace("pebble", "replay"))]
+        assert received[: len(sent)] == sent, topic
+        assert len(received) - len(sent) == topic.endswith("online")
+    qualities = {line.topic.replace("pebble", "replay"): line.qos for line in lines}
+    assert all(message.qos == qualities[message.topic] for _, message in operator.received)
+    assert operator.retained() == {}
+
+
+def _without_stamp(payload: bytes) -> object:
+    """A payload, which a replay changes in its stamp only."""
+    stamp = stamp_ns(payload) // 10**6
+    if stamp and payload.startswith(b"{"):
+        return {name: value for name, value in json.loads(payload).items() if name not in ("t", "timestamp")}
+    return payload.replace(stamp.to_bytes(8, "big"), b"") if stamp else payload
+
+
+def test_by_default_it_is_harmless_and_current(
+    tmp_path: Path, operator: Operator, at: tuple[str, str], run: Run
+) -> None:
+    period = ("--since", "2023-11-14T22:13:30Z", "--until", "+5s")  # from 10 s after its begin
+    assert (run("replay", walk(tmp_path), *at, *period, "--speed", "10"), run.err) == (0, "")
+    assert until(lambda: operator.states() == [*[True] * 20, False])
+    assert {message.topic for _, message in operator.received} == {ONLINE, STATUS, LOGS}
+    assert [json.loads(payload)["n"] for payload in operator.payloads(LOGS)] == list(range(40, 60))
+    late = [time.time() * 1000 - json.loads(payload)["t"] for payload in operator.payloads(ONLINE)]
+    assert all(-1000 < each < 20_000 for each in late)
+    assert len(operator.payloads(STATUS)) == 1
+    assert operator.retained() == {}
+
+
+def test_ctrl_c_leaves_nothing_that_moves(tmp_path: Path, operator: Operator, at: tuple[str, str]) -> None:
+    process = program("replay", walk(tmp_path), *at, "--incoming")
+    assert until(lambda: len(operator.payloads(LOGS)) > 2)
+    process.send_signal(signal.SIGINT)
+    code, _, err = ends(process)
+    assert (code, err) == (0, "")
+    assert operator.retained() == {}
+    assert until(lambda: operator.states()[-1] is False, 3)
+    assert json.loads(operator.payloads(f"{REPLAYED}/incoming/drive-values")[-1])["valid_ms"] == 0
+
+
+def test_when_it_is_killed_the_broker_publishes_that_its_robot_is_offline(
+    tmp_path: Path, operator: Operator, at: tuple[str, str]
+) -> None:
+    process = program("replay", walk(tmp_path), *at)
+    assert until(lambda: len(operator.payloads(LOGS)) > 2)
+    process.kill()
+    process.communicate()
+    assert until(lambda: operator.states()[-1] is False, 5)
+    assert operator.retained() == {}
+
+
+def test_a_broker_that_restarts_gets_the_rest(tmp_path: Path, run: Run) -> None:
+    broker = Broker(tmp_path)
+    operator = Operator(broker)
+
+    def restart() -> None:
+        assert until(lambda: len(operator.payloads(LOGS)) > 2)
+        broker.kill()
+        time.sleep(0.2)
+        broker.start()  # it ends with this thread
+        assert until(lambda: operator.states()[-1] is False, 20)
+
+    with meanwhile(restart):
+        assert run("replay", walk(tmp_path, 3), "--url", f"mqtt://127.0.0.1:{broker.port}") == 0
+    numbers = [json.loads(payload)["n"] for payload in operator.payloads(LOGS)]
+    assert numbers == sorted(numbers)
+    assert numbers[-1] == 11
+    assert len(numbers) >= 10
+    assert "no connection" in run.err
+    assert run.err.splitlines()[-1] == "pebble: it goes on"
+    assert operator.retained() == {}
+    operator.transport.close()
+    broker.stop()
+
+
+def test_keys_on_a_terminal(tmp_path: Path, operator: Operator, at: tuple[str, str]) -> None:
+    command = [*(sys.executable, "-m", "pebble.cli", "replay", str(walk(tmp_path))), *at, "--paused"]
+    console = Terminal(*command)
+    try:
+        assert console.sees("Space pauses")
+        assert console.sees("paused · 0 sent")
+        console.type(b" ")
+        assert until(lambda: len(operator.payloads(LOGS)) > 2)
+        console.type(b" ")
+        assert console.sees("paused · ")
+        count = len(operator.payloads(LOGS))
+        console.type(b"\x1b[C\x1b[C+ ")  # 20 s on, twice as fast
+        assert until(lambda: len(operator.payloads(LOGS)) > count + 2)
+        assert json.loads(operator.payloads(LOGS)[-1])["n"] > 80
+        assert console.sees("× 2 · ")
+        console.type(b"\x03")
+        assert console.process.wait(10) == 0
+        assert console.sees(" skipped")
+    finally:
+        console.close()
+    assert until(lambda: operator.states()[-1] is False, 3)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "problem"),
+    [
+        (("--incoming", "--speed", "0.5"), "--speed 0.5 would drive a robot for longer"),
+        (("--paused",), "--paused needs a terminal"),
+        (("--base", "pebble"), "--base pebble is the base of pebble/robots/goob itself"),
+        (("--base", "a/b"), "robot.system: must be a topic level"),
+        (("--only", "other/#"), "no topic other/# in "),
+        (("--only", "+/+/+/incoming/#"), "there is nothing to publish"),
+        (("--only", "a/#/b"), "# must stand alone"),
+        (("--since", "yesterday-ish"), "yesterday-ish"),
+    ],
+)
+def test_errors_are_one_line(tmp_path: Path, run: Run, arguments: tuple[str, ...], problem: str) -> None:
+    assert run("replay", walk(tmp_path, 1), "--url", "mqtt://127.0.0.1:9", *arguments) == 1
+    assert problem in run.err
+    assert len(run.err.splitlines()) == 1
+
+
+def test_other_places_are_errors_too(tmp_path: Path, run: Run) -> None:
+    assert run("replay", tmp_path / "none.mcap", "--url", "mqtt://127.0.0.1:9") == 1
+    assert "none.mcap: No such file or directory" in run.err
+    assert run("replay", walk(tmp_path, 1), "--url", "mqtt://127.0.0.1:9") == 1
+    assert "cannot connect" in run.err
+    assert run("replay", walk(tmp_path, 1)) == 2
+
+
+def test_what_damage_has_taken_is_counted(tmp_path: Path, at: tuple[str, str], run: Run) -> None:
+    path, mended = tmp_path / "x.mcap", tmp_path / "mended.mcap"
+    messages.write(path, 400, channels=3)
+    data = bytearray(path.read_bytes())
+    middle = len(data) // 2
+    data[middle : middle + 20] = bytes(20)
+    path.write_bytes(data)
+    assert rewrite(path, mended).missing == 100
+    assert run("replay", mended, *at, "--speed", "100") == 0
+    assert run.err == "pebble: 100 messages are missing in this recording: files were damaged\n"
+    assert run.out.splitlines()[-1] == "300 sent, 0 skipped"
+    assert run("replay", path, *at, "--speed", "100") == 1
+    assert "1 damaged parts, 100 messages missing" in run.err
+    assert run.out.splitlines()[-1] == "300 sent, 0 skipped"

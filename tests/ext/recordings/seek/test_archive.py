@@ -1,0 +1,173 @@
+"""What was at any moment of a recording, against a naive reading of all of it."""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from pebble.extensions.media.decode import VideoDecoder
+from pebble.extensions.media.scene import read_counter
+from pebble.extensions.recordings.files.recorded import Recorded
+from pebble.extensions.recordings.library import files, merged
+from pebble.extensions.recordings.recorder.folder import Folder, finished_path
+from pebble.extensions.recordings.recorder.lane import CARRIED, Item, OpenFile
+from pebble.extensions.recordings.seek.archive import Archive
+from pebble.extensions.recordings.seek.days import Days
+from pebble.extensions.recordings.seek.file import SeekableFile
+from tests.ext.recordings.playing import FRED, GOOB, THEN_NS, Line, js, ms, write
+from tests.ext.recordings.seek.filming import CAMERA, FPS, SCENES, film
+
+SECONDS = 30
+ENCODINGS = ("json", "pbvd", "h264")
+
+
+@pytest.fixture(scope="module", params=["finished", "being written"])
+def folder(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return film(tmp_path_factory.mktemp("film"), "pbvd", SECONDS, finished=request.param == "finished")
+
+
+@pytest.fixture
+def archive(folder: Path) -> Iterator[Archive]:
+    made = Archive(folder)
+    yield made
+    made.close()
+
+
+@pytest.fixture(scope="module")
+def everything(folder: Path) -> list[Recorded]:
+    return list(merged(files([folder])))
+
+
+def moments(count: int = 25) -> list[int]:
+    """Nanoseconds, at random and at messages."""
+    chance = random.Random(7)
+    return [THEN_NS + round(1e9 * chance.uniform(0.5, SECONDS)) for _ in range(count)] + [THEN_NS + 12 * 10**9]
+
+
+def at_ns(seconds: float) -> int:
+    return THEN_NS + round(seconds * 1e9)
+
+
+def texts(messages: list[Recorded]) -> list[tuple[int, str, bytes]]:
+    return [(one.log_ns, one.channel.topic, one.payload) for one in messages]
+
+
+def test_a_period_holds_exactly_its_messages(archive: Archive, everything: list[Recorded]) -> None:
+    for begin in moments():
+        end = begin + 2 * 10**9
+        wanted = [one for one in everything if begin <= one.log_ns < end]
+        assert sorted(texts(archive.messages(GOOB, begin, end))) == sorted(texts(wanted))
+        assert not archive.messages(FRED, begin, end)
+
+
+def test_the_state_is_the_newest_value_of_each_topic(archive: Archive, everything: list[Recorded]) -> None:
+    for at in moments():
+        newest = {
+            one.channel.topic: one
+            for one in everything
+            if one.log_ns < at and one.channel.topic not in (CAMERA, f"{GOOB}/outgoing/audio")
+        }
+        assert sorted(texts(archive.state(GOOB, at))) == sorted(texts(list(newest.values())))
+
+
+def test_what_was_carried_into_a_file_is_state_and_no_message(tmp_path: Path) -> None:
+    folder = Folder(tmp_path / "own")
+    folder.take()
+    lane = OpenFile(folder, "state", THEN_NS, {})
+    lane.add(Item(0, f"{GOOB}/outgoing/status", b'{"n": 1}', 1, True, CARRIED), THEN_NS)
+    lane.add(Item(0, f"{GOOB}/outgoing/online", b'{"t": 1}', 1, True, ""), THEN_NS + 10**9)
+    lane.finish()
+    folder.release()
+    archive = Archive(tmp_path / "own")
+    assert [one.channel.topic for one in archive.messages(GOOB, 0, 1 << 62)] == [f"{GOOB}/outgoing/online"]
+    assert [one.payload for one in archive.state(GOOB, THEN_NS + 10**9)] == [b'{"n": 1}']
+    assert archive.next_ns(GOOB, 0) == THEN_NS + 10**9
+    archive.close()
+
+
+def test_log_lines_before_a_time_are_there(archive: Archive) -> None:
+    lines = archive.log_lines(GOOB, THEN_NS + 26 * 10**9)
+    assert [one.payload.split(b'"')[-2] for one in lines] == [b"line 250", b"line 750", b"line 1250"]
+
+
+@pytest.mark.parametrize("encoding", ENCODINGS)
+def test_the_picture_at_a_time_is_the_one_that_was_there(tmp_path: Path, encoding: str) -> None:
+    archive = Archive(film(tmp_path, encoding, 10))
+    chance = random.Random(3)
+    for _ in range(8):
+        number = chance.randrange(10 * FPS)
+        decoder = VideoDecoder()
+        *_, made = (decoder.feed(one.payload) for one in archive.pictures(GOOB, at_ns(number / FPS + 0.02)))
+        assert made is not None
+        assert read_counter(made.picture) == number % SCENES
+        assert abs((made.captured_ms or 0) - ms(number / FPS)) <= 1
+    assert archive.pictures(GOOB, at_ns(-1)) == []
+    assert archive.pictures(GOOB, at_ns(30)) == [], "an old picture is shown as one of this time"
+    archive.close()
+
+
+def test_a_day_names_its_robots_and_gaps(tmp_path: Path) -> None:
+    gap = Line(5.0, "$recorder/events", js(t=ms(5), event="gap", since=ms(4), until=ms(5), why="lost"))
+    path = write(tmp_path / "a.mcap", [Line(0.0, f"{GOOB}/outgoing/online", js(t=ms(0))), gap])
+    (day,) = Days(Archive(tmp_path)).all()
+    assert (day.day, day.robots, day.bytes, day.gaps) == ("2023-11-14", [GOOB], path.stat().st_size, 1)
+    assert (day.first, day.last) == (ms(0), ms(5))
+
+
+def test_what_is_written_meanwhile_is_found(tmp_path: Path) -> None:
+    """Also the rest of a chunk that was there only in part."""
+    whole = film(tmp_path / "whole", "pbvd", 6, finished=False)
+    source = next(whole.rglob("*.state.mcap.active"))
+    growing = tmp_path / "growing" / source.name
+    growing.parent.mkdir()
+    data = source.read_bytes()
+    growing.write_bytes(data[: len(data) // 2])
+    file = SeekableFile(growing)
+    before = len(file.chunks)
+    for end in range(len(data) // 2, len(data), 997):
+        growing.write_bytes(data[:end])
+        file.refresh()
+    growing.write_bytes(data)
+    file.refresh()
+    assert 0 < before < len(file.chunks)
+    found = [one for chunk in file.chunks for one in file.messages_of(chunk)]
+    assert texts(found) == texts([one for one in merged([source]) if not one.channel.topic.startswith("$")])
+    file.close()
+
+
+def test_a_file_that_is_finished_meanwhile_is_read_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    archive = Archive(film(tmp_path, "pbvd", 6, finished=False))
+    before = texts(archive.messages(GOOB, 0, 1 << 62))
+    for path in tmp_path.rglob("*.active"):
+        path.rename(finished_path(path))
+    monkeypatch.setattr("pebble.extensions.recordings.seek.archive.LIST_S", 0.0)
+    assert before
+    assert texts(archive.messages(GOOB, 0, 1 << 62)) == before
+    archive.close()
+
+
+def test_damage_costs_its_chunk_only(tmp_path: Path) -> None:
+    archive = Archive(film(tmp_path, "pbvd", 10))
+    before = len(archive.messages(GOOB, 0, 1 << 62))
+    file = next(one for one in archive.all_files() if "media" in one.path.name)
+    lost = len(file.messages_of(file.chunks[3]))
+    archive.close()
+    with file.path.open("r+b") as out:
+        out.seek(file.chunks[3].at + 200)
+        out.write(b"\xff" * 40)
+    again = Archive(tmp_path)
+    assert len(again.messages(GOOB, 0, 1 << 62)) == before - lost
+    again.close()
+
+
+def test_what_is_no_recording_is_left_out(tmp_path: Path) -> None:
+    (tmp_path / "x.mcap").write_bytes(b"no recording")
+    (tmp_path / "empty.mcap.active").write_bytes(b"")
+    archive = Archive(tmp_path)
+    assert archive.messages(GOOB, 0, 1 << 62) == []
+    (day,) = Days(archive).all()
+    assert (day.robots, len(day.unread), "x.mcap" in day.unread[0]) == ([], 1, True)
+    archive.close()

@@ -1,0 +1,128 @@
+"""Periods as users type them."""
+
+from datetime import UTC, datetime
+from zoneinfo import ZoneInfo
+
+import pytest
+
+from pebble.errors import PebbleError
+from pebble.extensions.recordings.library import FOREVER_NS
+from pebble.extensions.recordings.period import parse_period
+
+BERLIN = ZoneInfo("Europe/Berlin")
+NOW = datetime(2026, 11, 20, 12, 30, tzinfo=UTC)
+
+
+def ns(text: str) -> int:
+    return int(datetime.fromisoformat(text).timestamp()) * 10**9
+
+
+@pytest.mark.parametrize(
+    ("since", "expected"),
+    [
+        ("10:00", "2026-11-20T10:00Z"),
+        ("9:05", "2026-11-20T09:05Z"),
+        ("12:30", "2026-11-20T12:30Z"),
+        ("12:30:01", "2026-11-19T12:30:01Z"),  # the latest one is yesterday's
+        ("2026-11-18", "2026-11-18T00:00Z"),
+        ("2026-11-18T10:00", "2026-11-18T10:00Z"),
+        ("2026-11-18 10:00:30", "2026-11-18T10:00:30Z"),
+        ("2026-11-18T10:00+02:00", "2026-11-18T08:00Z"),
+        ("2027-01-01", "2027-01-01T00:00Z"),
+        ("-90s", "2026-11-20T12:28:30Z"),
+        ("-2h", "2026-11-20T10:30Z"),
+        ("-3d", "2026-11-17T12:30Z"),
+        (" 10:00 ", "2026-11-20T10:00Z"),
+    ],
+)
+def test_since(since, expected):
+    assert parse_period(since, None, now=NOW) == (ns(expected), FOREVER_NS)
+
+
+@pytest.mark.parametrize(
+    ("since", "until", "expected"),
+    [
+        ("10:00", "11:00", "2026-11-20T11:00Z"),
+        ("10:00", "13:00", "2026-11-20T13:00Z"),  # may be later than now
+        ("22:00", "06:00", "2026-11-20T06:00Z"),  # from yesterday
+        ("10:00", "10:00", "2026-11-21T10:00Z"),
+        ("10:00", "+5m", "2026-11-20T10:05Z"),
+        ("2026-11-18T23:00", "+90m", "2026-11-19T00:30Z"),
+        ("2026-11-18", "2026-11-18", "2026-11-19T00:00Z"),  # the whole day
+        ("2026-11-18", "2026-11-18T10:00", "2026-11-18T10:00Z"),
+        ("-2h", "-1h", "2026-11-20T11:30Z"),
+        (None, "11:00", "2026-11-20T11:00Z"),
+        (None, "13:00", "2026-11-19T13:00Z"),
+        (None, "-1h", "2026-11-20T11:30Z"),
+    ],
+)
+def test_until(since, until, expected):
+    assert parse_period(since, until, now=NOW)[1] == ns(expected)
+
+
+def test_without_either_it_is_all_time():
+    assert parse_period(None, None, now=NOW) == (0, FOREVER_NS)
+
+
+def test_fractions_are_exact():
+    assert parse_period("10:00:00.123456", None, now=NOW)[0] == ns("2026-11-20T10:00Z") + 123_456_000
+
+
+def test_times_are_in_the_zone_of_now():
+    now = datetime(2026, 11, 20, 0, 30, tzinfo=BERLIN)
+    assert parse_period("10:00", "+1h", now=now) == (ns("2026-11-19T10:00+01:00"), ns("2026-11-19T11:00+01:00"))
+
+
+def test_a_date_in_summer_has_summer_time():
+    now = datetime(2026, 11, 20, 12, 30, tzinfo=BERLIN)
+    assert parse_period("2026-07-01", "2026-07-01", now=now) == (
+        ns("2026-07-01T00:00+02:00"),
+        ns("2026-07-02T00:00+02:00"),
+    )
+
+
+def test_a_day_is_23_hours_long_when_clocks_go_forward():
+    now = datetime(2026, 11, 20, 12, 30, tzinfo=BERLIN)
+    since, until = parse_period("2026-03-29", "2026-03-29", now=now)
+    assert until - since == 23 * 3600 * 10**9
+
+
+def test_without_a_zone_it_is_that_of_the_machine():
+    since, _ = parse_period("2026-07-01T10:00", None, now=datetime(2026, 11, 20, 12, 30))
+    assert since == int(datetime(2026, 7, 1, 10).timestamp()) * 10**9
+
+
+@pytest.mark.parametrize(
+    ("since", "until", "message"),
+    [
+        ("25:00", None, '--since "25:00" is no time: write 10:00,'),
+        ("yesterday", None, '--since "yesterday" is no time'),
+        ("2026-02-30", None, "2026-02-30"),
+        ("", None, "is no time"),
+        ("\u0661\u0660:\u0660\u0660", None, "is no time"),
+        ("10", None, "is no time"),
+        ("+5m", None, "is in the future: write -5m"),
+        (None, "+5m", "counts from --since"),
+        (None, "soon", '--until "soon" is no time'),
+        (None, "24:61", "+5m or -1h"),
+        ("2026-11-20", "2026-11-19", "--until 2026-11-19 is not after --since 2026-11-20"),
+        ("-1h", "-2h", "is not after"),
+        ("10:00", "+0s", "is not after"),
+        (None, "1960-01-01", "is before 1970"),
+    ],
+)
+def test_what_is_wrong_is_explained_in_a_line(since, until, message):
+    with pytest.raises(PebbleError) as error:
+        parse_period(since, until, now=NOW)
+    assert message in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("since", ["0001-01-01", "0001-01-01T00:00+14:00", "-999999999d", "1969-12-31"])
+def test_before_1970_is_1970(since):
+    assert parse_period(since, None, now=NOW)[0] == 0
+
+
+@pytest.mark.parametrize("until", ["9999-12-31", "9999-12-31T23:59-12:00", "+999999999d", "2600-01-01"])
+def test_what_is_too_late_for_a_recording_is_the_end_of_time(until):
+    assert parse_period("10:00", until, now=NOW)[1] == FOREVER_NS

@@ -1,0 +1,157 @@
+"""``pebble recordings``: what it prints, and what it does to files."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+
+import pytest
+
+from pebble.extensions.recordings import library
+from pebble.extensions.recordings.files.writer import RecordingWriter
+from pebble.extensions.recordings.recorder.recorder import Recorder
+from pebble.extensions.recordings.recorder.settings import Options
+from tests.commands.command_line import Run
+from tests.ext.recordings.messages import START_NS
+
+GOOB, FRED = "pebble/robots/goob", "pebble/robots/fred"
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """What a recorder has recorded of two robots."""
+    recorder = Recorder(tmp_path / "rec", Options(free_bytes=0))
+    recorder.start()
+    for number in range(100):
+        for robot in (GOOB, FRED):
+            recorder.receive(f"{robot}/outgoing/online", b'{"t":%d}' % number, 1, retain=False)
+    recorder.receive(
+        f"{GOOB}/outgoing/logs", json.dumps({"level": "WARNING", "message": "low \n battery"}).encode(), 1, retain=False
+    )
+    recorder.note("gap", since=1000, until=61_000, why="no connection")
+    recorder.stop()
+    return tmp_path / "rec"
+
+
+def messages(folder: Path) -> int:
+    return sum(1 for one in library.merged(library.files([folder])) if not one.channel.topic.startswith("$"))
+
+
+def test_list_and_info(folder: Path, run: Run) -> None:
+    assert run("recordings", "list", folder) == 0
+    assert re.search(r"state +204 ", run.out)
+    assert run("recordings", "info", folder) == 0
+    assert "pebble/robots/goob: 101 messages" in run.out
+    assert "100  outgoing/online" in run.out
+    assert "gap: why no connection, lasted 60.0 s" in run.out
+
+
+def test_search(folder: Path, run: Run) -> None:
+    run("recordings", "search", folder, "--robot", "goob", "--topic", "outgoing/logs", "--text", "battery")
+    (line,) = run.out.splitlines()
+    assert line.endswith('{"level": "WARNING", "message": "low \\n battery"}')
+    assert run.err == "1 messages\n"
+    run("recordings", "search", folder, "-t", f"{FRED}/#", "-n", "3")
+    assert len(run.out.splitlines()) == 3
+
+
+def test_lines_there_and_back(folder: Path, tmp_path: Path, run: Run) -> None:
+    lines, again = tmp_path / "a.jsonl", tmp_path / "again.mcap"
+    assert run("recordings", "export", folder, lines) == 0
+    assert run("recordings", "import", lines, again) == 0
+    assert messages(again) == messages(folder) == 201
+    assert run("recordings", "export", folder, lines) == 1
+    assert run.err == f"pebble: {lines} exists already\n"
+
+
+def test_an_import_in_another_order_is_read_in_that_of_time(tmp_path: Path, run: Run) -> None:
+    lines, made = tmp_path / "a.jsonl", tmp_path / "a.mcap"
+    numbers = [3, 1, 2, *range(40_000, 10, -1)]
+    line = '{"timestamp": %d, "topic": "pebble/robots/goob/outgoing/online", "payload_b64": ""}'
+    lines.write_text("\n".join(line % number for number in numbers))
+    assert run("recordings", "import", lines, made) == 0
+    read = [one.log_ns for one in library.merged([made])]
+    assert read == sorted(number * 10**9 for number in numbers)
+
+
+def test_one_robot_is_deleted(folder: Path, run: Run) -> None:
+    assert run("recordings", "rm", folder, "--robot", "fred", "--yes") == 0
+    assert run.out == "100 messages deleted\n"
+    assert messages(folder) == 101
+    assert run("recordings", "info", folder) == 0
+    assert "fred" not in run.out
+
+
+def test_what_a_recorder_uses_is_left_alone(folder: Path, run: Run) -> None:
+    recorder = Recorder(folder, Options(free_bytes=0))
+    recorder.start()
+    try:
+        for command in (("rm", folder, "--robot", "fred", "--yes"), ("mend", folder)):
+            assert (run("recordings", *command), len(run.err.splitlines())) == (1, 1)
+            assert "a recorder writes here" in run.err
+    finally:
+        recorder.stop()
+    assert messages(folder) == 201
+
+
+READING = [
+    ("search", "{rec}"), *(("export", "{rec}", f"{{tmp}}/a.{end}") for end in ("jsonl", "mcap", "mkv", "wav")),
+]  # fmt: skip
+NO_ROBOT = f"no robot pebble/robots/nosuch in {{rec}}; there are: {FRED}, {GOOB}\n"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "problem"),
+    [
+        (("list", "nowhere"), "nowhere: No such file or directory"),
+        (("info", "{tmp}"), "there is no recording"),
+        (("list", "{tmp}/text"), "is not a recording (MCAP)"),
+        (("export", "{rec}", "{tmp}/a.xyz"), "add --as"),
+        (("export", "{rec}", "{tmp}/a.mkv"), "add --robot (pebble/robots/fred, pebble/robots/goob)"),
+        *(((*command, "-r", "nosuch"), NO_ROBOT) for command in READING),
+        (("rm", "{rec}", "--yes", "-r", "nosuch", "--since", "2000-01-01"), NO_ROBOT),
+        *(((*command, "-t", "outgoing/none"), "no topic outgoing/none in {rec}; there are: ") for command in READING),
+        (("search", "{rec}", "-r", "fred", "-t", "outgoing/logs"), f"; there are: {FRED}/outgoing/online\n"),
+        (("rm", "{rec}"), "what to delete is missing"),
+        (("search", "{rec}", "--since", "soon"), "--since"),
+        (("mend", "{tmp}/none"), "none: No such file or directory"),
+    ],
+)
+def test_mistakes_are_one_line(
+    folder: Path, tmp_path: Path, run: Run, arguments: tuple[str, ...], problem: str
+) -> None:
+    (tmp_path / "text").write_text("text")
+    empty = tmp_path / "empty"
+    empty.mkdir()
+
+    def filled(text: str) -> str:
+        return text.replace("{tmp}/", f"{tmp_path}/").replace("{tmp}", str(empty)).replace("{rec}", str(folder))
+
+    before = sorted(tmp_path.rglob("*"))
+    assert run("recordings", *map(filled, arguments)) != 0
+    assert filled(problem) in run.err
+    assert sorted(tmp_path.rglob("*")) == before
+    assert len(run.err.strip().splitlines()) == 1
+
+
+def test_a_foreign_file_cannot_forge_lines(tmp_path: Path, run: Run) -> None:
+    path = tmp_path / "[red]evil.mcap"
+    with path.open("wb", buffering=0) as file:
+        writer = RecordingWriter(file, library="evil")
+        channel = writer.channel("a/b/c/outgoing/x\n2026 forged\x1b[31m", "json", {"qos": "?"})
+        writer.metadata("pebble.damage", {"missing_messages": "many"})
+        events = writer.channel("$recorder/events", "json", {})
+        for payload in (
+            b'{"event":"gap","t":"x","since":"a","until":1e400}',
+            b"[" * 9000,
+            b'{"event":"gap","since":1,"until":-9}',
+        ):
+            writer.add(events, START_NS, payload)
+        writer.add(channel, START_NS, b"\x1b[2J\n")
+        writer.finish()
+    for command in ("info", "list", "search"):
+        assert (run("recordings", command, path), run.err.count("\n") <= 1) == (0, True)
+        assert "\x1b" not in run.out
+        assert not any(line.startswith("2026 forged") for line in run.out.splitlines())
+        assert command != "list" or "[red]evil" in run.out

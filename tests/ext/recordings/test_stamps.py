@@ -1,0 +1,191 @@
+"""Stamps are found and moved."""
+
+import time
+
+import msgspec
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from pebble.contract.packets import KEY_FRAME, Codec, Picture, PictureKind, Sound
+from pebble.extensions.media import json_video
+from pebble.extensions.media.picture_header import read_header
+from pebble.extensions.recordings.stamps import is_keyframe, is_media, is_picture, shifted, stamp_ns
+
+T_MS = 1_732_300_000_123
+T_NS = T_MS * 10**6
+LONG = "x" * 2000
+
+SOUND = Sound(Codec.PCM16LE, 1, 16000, 320, 7, T_MS, b"\0" * 640)
+PICTURE = Picture(PictureKind.JPEG, 3, T_MS, b"\xff\xd8picture")
+
+
+def json_picture(keyframe: bool = True) -> bytes:
+    return json_video.pack(3, keyframe, T_MS, b"\xff\xd8picture" * 300)
+
+
+@pytest.mark.parametrize(
+    "payload",
+    [
+        b'{"online":true,"t":1732300000123}',
+        b'{"t": 1732300000123, "online": true}',
+        b'{ "t" : 1732300000123 }',
+        b'{"t":1732300000.123,"mcu":5}',
+        b'{"t":1732300000123,"message":"a brace } in it"}',
+        b'{"t":1732300000123,"message":"a brace { in it"}',
+        b'{"value":{"t":5},"t":1732300000123}',
+        b'{"t":1732300000123,"value":{"t":5,"timestamp":7}}',
+        b'{"say \\"t":5,"t":1732300000123}',
+        b'{"timestamp":1732300000.123}',
+        b'{"t":1732300000123.0}',
+        b'{"timestamp":1732300000123}',
+        b'{"t":1.732300000123e+12}',
+        b'{"t":1732300000123,"value":"' + LONG.encode() + b'"}',
+        b'{"value":"' + LONG.encode() + b'","t":1732300000123}',
+        SOUND.pack(),
+        PICTURE.pack(),
+    ],
+)
+def test_the_own_stamp_is_found(payload):
+    assert abs(stamp_ns(payload) - T_NS) < 1000
+
+
+def test_a_json_picture_is_found_by_its_end():
+    assert stamp_ns(json_picture()) == T_NS
+
+
+@pytest.mark.parametrize(
+    "payload",
+    [
+        b"",
+        b"{",
+        b"P",
+        b"true",
+        b"12",
+        b'{"x":0.5}',
+        b'{"t":NaN}',
+        b'{"t":-5}',
+        b'{"t":-1732300000123}',
+        b'{"t":1e300}',
+        b'{"t":1e999}',
+        b'{"t":99999999999999999999}',
+        b'{"t":10000000000}',
+        b'{"t":"1732300000123"}',
+        b'{"t":0}',
+        b'{"t":null}',
+        b'{"value":{"t":1732300000123}}',
+        b'{"value":{"t":1732300000123},"x":1}',
+        b'{"rate":1732300000123,"at":1732300000123}',
+        b'["t",1732300000123]',
+        SOUND.pack()[:23],
+        PICTURE.pack()[:18],
+        b"PBAT" + b"\xff" * 40,
+        b"PBVD" + bytes(40),
+        b"\xff\xd8\xff",
+    ],
+)
+def test_what_is_no_stamp_is_0(payload):
+    assert stamp_ns(payload) == 0
+
+
+def test_a_stamp_of_a_board_counts_from_its_start():
+    assert stamp_ns(b'{"t":1}') == 10**9
+
+
+@pytest.mark.parametrize(
+    ("before", "after"),
+    [
+        (b'{"online":true,"t":1732300000123}', b'{"online":true,"t":1732300002623}'),
+        (b'{"timestamp": 1732300000.1234567 }', b'{"timestamp":1732300002.6234567}'),
+        (b'{"timestamp":1732300000}', b'{"timestamp":1732300002}'),
+        (b'{"t":1732300000123.25}', b'{"t":1732300002623.25}'),
+        (b'{"t":1732300000123,"value":{"t":1732300000123}}', b'{"t":1732300002623,"value":{"t":1732300000123}}'),
+        (
+            b'{"t":1732300000123,"x":1,"timestamp":1732300000.5}',
+            b'{"t":1732300002623,"x":1,"timestamp":1732300003.0}',
+        ),
+        (b'{"t":1.732300000123e12}', b'{"t":1732300002623.0}'),
+        (b'{"t":1732300000123', b'{"t":1732300000123'),
+        (b'{"t":1234}', b'{"t":1234}'),
+        (b'{"t":0}', b'{"t":0}'),
+        (b'{"x":0.25}', b'{"x":0.25}'),
+        (b"", b""),
+        (b"PBAT", b"PBAT"),
+    ],
+)
+def test_stamps_are_moved_and_nothing_else(before, after):
+    assert shifted(before, 2_500_000_000) == after
+
+
+def test_headers_are_moved():
+    assert Sound.unpack(shifted(SOUND.pack(), 2 * 10**9)).captured_ms == T_MS + 2000
+    assert Picture.unpack(shifted(PICTURE.pack(), -2 * 10**9)).captured_ms == T_MS - 2000
+    assert shifted(PICTURE.pack(), 10**6)[19:] == PICTURE.body
+    header = read_header(shifted(json_picture(), 10**9))
+    assert header is not None
+    assert header.captured_ms == T_MS + 1000
+
+
+def test_an_unknown_stamp_stays_unknown():
+    unknown = Picture(PictureKind.JPEG, 3, 0, b"").pack()
+    assert shifted(unknown, 10**18) == unknown
+    assert shifted(PICTURE.pack(), -2 * 10**18) == PICTURE.pack()
+
+
+@given(st.binary(max_size=600), st.integers(-(10**19), 10**19))
+def test_any_bytes_are_taken(payload, by_ns):
+    for one in (payload, b"{" + payload, b"PBAT" + payload, b"PBVD" + payload, b'{"id":' + payload):
+        assert 0 <= stamp_ns(one) < 1 << 63
+        shifted(one, by_ns)
+        assert isinstance(is_media(one), bool)
+        assert isinstance(is_keyframe(one), bool)
+
+
+@given(st.integers(2 * 10**12, 9 * 10**12), st.integers(-(10**9), 10**9), st.booleans())
+def test_moved_there_and_back_is_the_same(stamp_ms, by_ms, at_end):
+    stamp = {"t": stamp_ms}
+    payload = msgspec.json.encode({"v": 1} | stamp if at_end else stamp | {"v": 1})
+    moved = shifted(payload, by_ms * 10**6)
+    assert stamp_ns(moved) == (stamp_ms + by_ms) * 10**6
+    assert shifted(moved, -by_ms * 10**6) == payload
+
+
+def test_media_are_known_by_their_first_bytes():
+    assert is_media(SOUND.pack())
+    assert not is_picture(SOUND.pack())
+    for picture in (PICTURE.pack(), json_picture(), b"\xff\xd8\xff\xe0"):
+        assert is_media(picture)
+        assert is_picture(picture)
+    for other in (b"", b"{}", b'{"id":5,"name":"outlet"}', b'{"t":1732300000123}', b"\xff", b"PBA"):
+        assert not is_media(other)
+
+
+@pytest.mark.parametrize(
+    ("payload", "whole"),
+    [
+        (PICTURE.pack(), True),
+        (Picture(PictureKind.DELTA_JPEG, 4, T_MS, b"").pack(), False),
+        (Picture(PictureKind.ZLIB_JPEG, 4, T_MS, b"").pack(), True),
+        (Picture(PictureKind.ZLIB_DELTA_JPEG, 4, T_MS, b"").pack(), False),
+        (Picture(PictureKind.H264, 4, T_MS, b"", KEY_FRAME).pack(), True),
+        (Picture(PictureKind.H264, 4, T_MS, b"").pack(), False),
+        (json_picture(), True),
+        (json_picture(False), False),
+        (b"\xff\xd8\xff", True),
+        (b"PBVD", False),
+        (SOUND.pack(), False),
+        (b'{"keyframe":true}', False),
+    ],
+)
+def test_key_frames_are_known(payload, whole):
+    assert is_keyframe(payload) is whole
+
+
+def test_it_is_fast():
+    payload, times = b'{"online":true,"t":1732300000123}', []
+    for _ in range(20):
+        began = time.perf_counter()
+        for _ in range(1000):
+            stamp_ns(payload)
+        times.append(time.perf_counter() - began)
+    assert min(times) < 0.015  # 15 us for each; measured 0.5

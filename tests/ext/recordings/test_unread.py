@@ -1,0 +1,390 @@
+"""What other programs wrote is read completely, or named; and no file is replaced by a part of it."""
+
+from __future__ import annotations
+
+import errno
+import os
+import random
+import signal
+import subprocess
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+from mcap.reader import make_reader
+
+from pebble.extensions.recordings.files import rewrite as rewriting
+from pebble.extensions.recordings.files.reader import RecordingFile
+from pebble.extensions.recordings.files.recorded import RecordingError
+from pebble.extensions.recordings.files.rewrite import rewrite
+from pebble.extensions.recordings.library import problems
+from pebble.extensions.recordings.recorder.disk_space import Disk, outdated, surplus
+from pebble.extensions.recordings.recorder.folder import Folder
+from pebble.extensions.recordings.recorder.settings import Options
+from pebble.extensions.recordings.replay.source import ReplaySource
+from pebble.extensions.recordings.seek.archive import Archive
+from pebble.extensions.recordings.seek.days import Days
+from pebble.extensions.recordings.traffic.sources import sources
+from tests.commands.command_line import Run
+from tests.ext.recordings.messages import contents, read, write
+from tests.ext.recordings.others import (
+    COUNT,
+    DAMAGED,
+    FRED,
+    GOOB,
+    MESSAGES,
+    OTHERS,
+    REFUSED,
+    SCHEMA,
+    VALID,
+    by_package,
+    channel,
+    chunk,
+    flipped,
+    payload,
+    whole,
+)
+from tests.support import cases
+
+EXPECTED = [(FRED if number % 4 == 3 else GOOB, payload(number)) for number in range(COUNT)]
+OF_GOOB = [one for one in EXPECTED if one[0] == GOOB]
+pytest.importorskip("duckdb")
+pytest.importorskip("matplotlib")
+NAME = "20261122T100030Z-000001.state.mcap"
+
+
+def stored(folder: Path, data: bytes, name: str = NAME) -> Path:
+    path = folder / "rec" / "2026" / "11" / "22" / name
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_bytes(data)
+    return path
+
+
+@pytest.mark.parametrize("name", VALID)
+def test_a_file_of_another_program_is_read_in_the_order_of_time(tmp_path: Path, run: Run, name: str) -> None:
+    path, copy = stored(tmp_path, VALID[name]), tmp_path / "copy.mcap"
+    messages, damage = read(path)
+    assert (messages, damage.report()) == (EXPECTED, "")
+    for check in ([], ["--check"]):
+        assert (run("recordings", "list", tmp_path / "rec", *check, columns=200), run.err) == (0, "")
+        assert f" {COUNT} " in run.out
+    assert run("recordings", "search", path) == 0
+    assert [line.split("  ")[-1] for line in run.out.splitlines()] == [one.decode() for _, one in EXPECTED]
+    assert run("recordings", "export", path, copy) == 0
+    assert exported(copy) == [(*SCHEMA, *one) for one in EXPECTED]
+    archive = Archive(tmp_path / "rec")
+    shown = archive.messages("pebble/robots/goob", 0, 1 << 63)
+    assert [(one.channel.topic, one.payload) for one in shown] == OF_GOOB
+    assert archive.unread() == {}
+    archive.close()
+    replayed = ReplaySource([path])
+    assert [(one.channel.topic, one.payload) for one in replayed.messages()] == EXPECTED
+    assert problems(replayed.damages) == []
+    found = sources([path], tmp_path)
+    assert (found.robots, found.unread) == (["pebble/robots/fred", "pebble/robots/goob"], [])
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_one_without_chunks_is_refused_with_one_line(tmp_path: Path, run: Run, name: str) -> None:
+    path = stored(tmp_path, REFUSED[name])
+    assert run("recordings", "search", path) == 1
+    assert run.err == f"pebble: {path}: its messages are not in chunks: `mcap compress` puts them there\n"
+
+
+def test_a_deletion_leaves_it_as_it_is(tmp_path: Path, run: Run) -> None:
+    """It may hold what only that program knows."""
+    path = stored(tmp_path, VALID["metadata and attachments"])
+    assert run("recordings", "rm", tmp_path / "rec", "--robot", "fred", "--yes") == 1
+    assert "another program wrote it" in run.err
+    assert path.read_bytes() == VALID["metadata and attachments"]
+
+
+def exported(path: Path) -> list[tuple[Any, ...]]:
+    """The records as the package reads them: name, encoding and data of the schema, topic, payload."""
+    with path.open("rb") as file:
+        found = make_reader(file, validate_crcs=True).iter_messages()
+        return [
+            (*((schema.name, schema.encoding, schema.data) if schema else ()), channel.topic, message.data)
+            for schema, channel, message in found
+        ]
+
+
+@pytest.mark.parametrize("name", OTHERS)
+def test_other_topics_times_and_encodings(tmp_path: Path, run: Run, name: str) -> None:
+    data, count = OTHERS[name]
+    path, copy = stored(tmp_path, data), tmp_path / "copy.mcap"
+    for command in (["list"], ["info"], ["search"]):
+        assert run("recordings", *command, tmp_path / "rec", columns=200) == 0
+        assert f"{count} messages" in run.out + run.err
+    assert run("recordings", "export", path, copy) == 0
+    assert (len(exported(copy)), len(contents(path))) == (count, count)
+
+
+def test_metadata_and_attachments_go_with_an_export_and_a_mended_copy(tmp_path: Path, run: Run) -> None:
+    path, copies = stored(tmp_path, by_package(beside=True)), [tmp_path / "copy.mcap", tmp_path / "mended.mcap"]
+    assert run("recordings", "export", path, copies[0]) == 0
+    assert run("recordings", "mend", path, copies[1]) == 0
+    for one in copies:
+        with one.open("rb") as file:
+            reader = make_reader(file, validate_crcs=True)
+            assert [each.data for each in reader.iter_attachments()] == [b"walls"]
+            places = [each.metadata["place"] for each in reader.iter_metadata() if each.name == "about"]
+            assert places == ["hall", "yard"]
+
+
+def test_topics_of_no_robot_are_named_with_their_encodings(tmp_path: Path, run: Run) -> None:
+    path = stored(tmp_path, whole(channel(1, "/imu", encoding="cdr"), channel(2, FRED), chunk(*MESSAGES)))
+    assert run("recordings", "info", path) == 0
+    assert "Topics that are of no robot: 30 messages\n          30  /imu cdr\n" in run.out
+
+
+READERS = [
+    ["list"], ["info"], ["search"], ["export", "{out}.jsonl"], ["export", "{out}.mcap"],
+    ["export", "{out}.wav", "-r", "goob"], ["analyse", "--output", "{out}"],
+]  # fmt: skip
+WRITERS = [["rm", "--robot", "fred", "--yes"], ["rm", "--since", "2000-01-01", "--yes"]]
+
+
+def on(folder: Path, command: list[str], out: Path) -> list[str | Path]:
+    group = [] if command[0] == "analyse" else ["recordings"]
+    return [*group, command[0], folder, *(one.replace("{out}", str(out)) for one in command[1:])]
+
+
+@pytest.fixture
+def _no_figures(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Reports without them, which take longest."""
+    monkeypatch.setattr("pebble.extensions.recordings.traffic.report.figures", lambda _: [])
+
+
+@pytest.mark.usefixtures("_no_figures")
+@pytest.mark.parametrize("name", DAMAGED)
+def test_what_cannot_be_read_is_named_and_not_touched(tmp_path: Path, run: Run, name: str) -> None:
+    data, wanted = DAMAGED[name]
+    path = stored(tmp_path, data)
+    each = cases(3, 1)  # of the commands, for a damage others than for the next one
+    for number, command in enumerate([*READERS, *WRITERS][[*DAMAGED].index(name) % each :: each]):
+        code = run(*on(tmp_path / "rec", command, tmp_path / str(number)))
+        assert (code, NAME in run.err, wanted in run.err) == (1, True, True), (command, run.out, run.err)
+        assert path.read_bytes() == data
+    assert run("recordings", "rm", path, "--yes") == 0
+    assert not path.exists()
+
+
+#: What is found out by reading messages only: a summary says nothing of it.
+IN_CHUNKS = {"a chunk", "the length of a chunk", "the kind of a chunk", "a channel that is none"}
+
+
+@pytest.mark.parametrize("name", sorted(DAMAGED.keys() - IN_CHUNKS))
+def test_the_days_of_the_page_name_what_is_known_at_once(tmp_path: Path, name: str) -> None:
+    data, wanted = DAMAGED[name]
+    stored(tmp_path, data)
+    days = Days(Archive(tmp_path / "rec")).all()
+    assert any(wanted in line for day in days for line in day.unread), days
+
+
+def test_a_flipped_bit_anywhere_costs_no_message_at_a_deletion(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    write(path, 60, channels=2, each=20)
+    data, chance = path.read_bytes(), random.Random(1)
+    expected = [one for one in contents(path) if "/r0/" not in one[0]]
+    refused = 0
+    for at in range(chance.randrange(7), len(data), cases(17, 7)):
+        raw = flipped(data, at, chance.randrange(8))
+        path.write_bytes(raw)
+        try:
+            rewrite(path, path, keeps=lambda one: "/r0/" not in one.channel.topic)
+        except RecordingError:
+            assert path.read_bytes() == raw
+            refused += 1
+        else:
+            assert contents(path) == expected, at
+    assert refused > 20
+
+
+@pytest.mark.parametrize("command", [*READERS, *WRITERS])
+def test_without_the_package_the_extra_is_named(
+    tmp_path: Path, run: Run, monkeypatch: pytest.MonkeyPatch, command: list[str]
+) -> None:
+    path = stored(tmp_path, by_package())
+    monkeypatch.setattr("pebble.extensions.recordings.files.recorded.find_spec", lambda _: None)
+    assert run(*on(tmp_path / "rec", command, tmp_path / "out")) == 1
+    assert 'recordings need the package mcap: pip install "pebble-robot[record]"' in run.err
+    assert path.read_bytes() == by_package()
+    assert not [one for one in tmp_path.glob("out*") if one.is_file()]
+
+
+class TestInterrupted:
+    """A deletion that does not come to its end leaves the file as it was, and nothing beside it."""
+
+    @pytest.fixture
+    def path(self, tmp_path: Path) -> Path:
+        path = stored(tmp_path, b"")
+        write(path, 100, channels=2)
+        return path
+
+    def test_a_full_disk(self, path: Path, run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+        def full(_descriptor: int) -> None:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+        before = path.read_bytes()
+        monkeypatch.setattr(rewriting.os, "fsync", full)
+        assert run("recordings", "rm", path.parents[3], "--robot", "r0", "--yes") == 1
+        assert "No space left on device" in run.err
+        assert path.read_bytes() == before
+        assert list(path.parent.iterdir()) == [path]
+
+    @pytest.mark.parametrize("how", ["replaced", "grown"])
+    def test_another_program_writes_meanwhile(
+        self, path: Path, run: Run, monkeypatch: pytest.MonkeyPatch, how: str
+    ) -> None:
+        other, before = path.with_name("other"), path.read_bytes()
+
+        def meanwhile(part: Path, made: Any) -> None:
+            other.write_bytes(before + (b"more" if how == "grown" else b""))
+            other.replace(path) if how == "replaced" else path.write_bytes(other.read_bytes())
+
+        monkeypatch.setattr(rewriting, "_check", meanwhile)
+        assert run("recordings", "rm", path.parents[3], "--robot", "r0", "--yes") == 1
+        assert "was changed meanwhile" in run.err
+        assert path.read_bytes().startswith(before)
+
+    def test_a_kill_before_the_copy_takes_its_place(self, path: Path, run: Run) -> None:
+        kill, before = "rewriting._check = lambda *_: os.kill(os.getpid(), signal.SIGKILL)", path.read_bytes()
+        rest = [one for one in contents(path) if "/r0/" not in one[0]]
+        code = (
+            f"import os, signal, sys; from pebble.recordings.files import rewrite as rewriting; {kill};"
+            "from pebble.cli import main; sys.argv = ['pebble', *sys.argv[1:]]; main()"
+        )
+        arguments = ["recordings", "rm", str(path.parents[3]), "--robot", "r0", "--yes"]
+        killed = subprocess.run([sys.executable, "-c", code, *arguments], check=False, timeout=60)
+        assert killed.returncode == -signal.SIGKILL
+        assert path.read_bytes() == before
+        assert len(list(path.parent.iterdir())) == 2
+        assert run(*arguments) == 0
+        assert list(path.parent.iterdir()) == [path]
+        assert contents(path) == rest
+
+    def test_a_copy_that_cannot_be_read_again(self, path: Path, run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+        before = path.read_bytes()
+        monkeypatch.setattr("pebble.extensions.recordings.files.writer.RecordingWriter.finish", lambda _: None)
+        assert run("recordings", "rm", path.parents[3], "--robot", "r0", "--yes") == 1
+        assert "cannot be read again" in run.err
+        assert path.read_bytes() == before
+
+
+class TestNames:
+    """Links, files that are not finished, and names that are taken."""
+
+    def test_what_a_deletion_does_not_look_into_is_named(self, tmp_path: Path, run: Run) -> None:
+        whole_ = stored(tmp_path, b"")
+        write(whole_, 100, channels=2)
+        left = [
+            stored(tmp_path, VALID["zstd"], f"{NAME.replace('001', '002')}{end}") for end in (".active", ".damaged")
+        ]
+        assert run("recordings", "rm", tmp_path / "rec", "--robot", "r0", "--yes") == 1
+        assert not [topic for topic, _ in contents(whole_) if "/r0/" in topic]
+        wanted = run.err
+        for path in left:
+            assert path.name in wanted
+            assert path.read_bytes() == VALID["zstd"]
+            assert run("recordings", "rm", path, "--yes") == 0
+            assert not path.exists()
+
+    @pytest.mark.parametrize("make", [Path.symlink_to, Path.hardlink_to])
+    def test_a_link(self, tmp_path: Path, run: Run, make: Any) -> None:
+        target, path = tmp_path / "rest.mcap", stored(tmp_path, b"")
+        written, before = write(target, 100, channels=2), target.read_bytes()
+        path.unlink()
+        make(path, target)
+        run("recordings", "rm", tmp_path / "rec", "--robot", "r0", "--yes")
+        assert target.read_bytes() == before
+        assert (contents(path) == written) == path.is_symlink()
+        assert run("recordings", "rm", path, "--yes") == path.is_symlink()
+
+    @pytest.mark.parametrize("name", ["notes.txt", "none.mcap"])
+    def test_only_a_recording_is_deleted_by_its_name(self, tmp_path: Path, run: Run, name: str) -> None:
+        (tmp_path / "notes.txt").write_text("notes")
+        assert run("recordings", "rm", tmp_path / name, "--yes") == 1
+        assert run("recordings", "rm", tmp_path / "notes.txt", "--yes") == 1
+        assert (tmp_path / "notes.txt").exists()
+
+    @pytest.mark.parametrize("ending", ["mcap", "jsonl"])
+    def test_an_export_replaces_no_file(self, tmp_path: Path, run: Run, ending: str) -> None:
+        path = stored(tmp_path, VALID["zstd"])
+        taken = path if ending == "mcap" else tmp_path / "a.jsonl"
+        before = VALID["zstd"] if ending == "mcap" else b"rest"
+        taken.write_bytes(before)
+        assert run("recordings", "export", path, taken) == 1
+        assert run("recordings", "mend", path, taken) == 1
+        assert taken.read_bytes() == before
+
+    def test_mending_takes_no_name_that_is_taken(self, tmp_path: Path, run: Run) -> None:
+        whole_ = stored(tmp_path, VALID["zstd"])
+        active = whole_.with_name(f"{NAME}.active")
+        write(active, 100, finish=False)
+        before = active.read_bytes()
+        assert run("recordings", "mend", tmp_path / "rec") == 1
+        assert "exists already" in run.err
+        assert whole_.read_bytes() == VALID["zstd"]
+        assert active.read_bytes() == before
+
+
+def test_what_was_not_read_makes_no_room(tmp_path: Path) -> None:
+    """Damaged files are neither deleted for their size and age nor is another one for theirs."""
+    for number, end in enumerate(["", ".damaged", "", ".damaged"], 1):
+        stored(tmp_path, bytes(1000), f"{NAME.replace('001', f'{number:03}')}{end}")
+    entries = Folder(tmp_path / "rec").entries()
+    assert [one.number for one in surplus(entries, Options(keep_bytes=1500), Disk(1 << 40))] == [1]
+    assert surplus(entries, Options(keep_bytes=2000), Disk(1 << 40)) == []
+    old = outdated(entries[1:], Options(keep_media_days=1.0), entries[0].ended + 1e6)
+    assert old is None
+
+
+class TestMending:
+    """What becomes of a file that a recorder has left."""
+
+    def test_what_is_missing_is_counted_and_the_damaged_file_stays(self, tmp_path: Path, run: Run) -> None:
+        path = stored(tmp_path, b"", f"{NAME}.active")
+        written = write(path, 100, finish=False, each=20, channels=1)
+        with RecordingFile(path) as file:
+            second = file.chunks[1]
+        damaged = flipped(path.read_bytes(), second.at + second.length // 2)
+        path.write_bytes(damaged)
+        assert run("recordings", "mend", tmp_path / "rec") == 1
+        assert run.out == f"{NAME}: 80 messages, 20 missing\n"
+        assert contents(path.with_name(NAME)) == written[:20] + written[40:]
+        assert path.with_name(f"{NAME}.damaged").read_bytes() == damaged
+        assert not path.exists()
+        assert run("recordings", "list", tmp_path / "rec", columns=200) == 0
+        assert "20 missing" in run.out
+
+    def test_the_begin_of_a_record_is_all_that_may_be_lost_with_it(self, tmp_path: Path, run: Run) -> None:
+        path = stored(tmp_path, b"", f"{NAME}.active")
+        written = write(path, 100, finish=False, each=20)
+        data = path.read_bytes()
+        with RecordingFile(path) as file:
+            last = file.chunks[-1]
+        for end in range(last.at, len(data), 97):
+            path.write_bytes(data[:end])
+            assert run("recordings", "mend", tmp_path / "rec") == 0
+            rest = contents(path.with_name(NAME))
+            assert rest == written[:80] or (end >= last.at + last.length and rest == written)
+            assert [one.name for one in path.parent.iterdir()] == [NAME]
+            path.with_name(NAME).unlink()
+
+    @pytest.mark.parametrize("data", [b"", whole(library="pebble 1.0")[:-60]])
+    def test_a_file_without_messages_goes(self, tmp_path: Path, run: Run, data: bytes) -> None:
+        path = stored(tmp_path, data, f"{NAME}.active")
+        assert run("recordings", "mend", tmp_path / "rec") == 0
+        assert list(path.parent.iterdir()) == []
+
+    def test_a_copy_needs_room(self, tmp_path: Path, run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+        path = stored(tmp_path, b"", f"{NAME}.active")
+        write(path, 100, finish=False)
+        before = path.read_bytes()
+        monkeypatch.setattr(rewriting.shutil, "disk_usage", lambda _: SimpleNamespace(free=1000))
+        assert run("recordings", "mend", tmp_path / "rec") == 1
+        assert f"there is no room for a copy of {path.name}" in run.err
+        assert path.read_bytes() == before

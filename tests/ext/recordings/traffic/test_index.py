@@ -1,0 +1,155 @@
+"""The index has a row for each message, is made again when needed, and is never seen half made."""
+
+import errno
+import os
+from pathlib import Path
+
+import pytest
+
+from pebble.contract.packets import Codec, Sound
+from pebble.extensions.recordings.traffic.activity import Activity
+from pebble.extensions.recordings.traffic.index import COLUMNS, PICTURE, SOUND, index_path, write_index
+from pebble.extensions.recordings.traffic.sources import sources
+from tests.ext.recordings.synthetic import FLEET, START_NS, Sent, event, traffic, write_recording
+
+duckdb = pytest.importorskip("duckdb")
+
+GOOB = FLEET[0].base
+NAME = "2025/11/20/20251120T010000Z-000001.state.mcap"
+
+
+def query(sql: str, *parameters: object) -> list[tuple]:
+    with duckdb.connect() as connection:
+        return connection.execute(sql, parameters).fetchall()
+
+
+def rows(archive: Path, columns: str, where: str = "true") -> list[tuple]:
+    """Read as other programs would: by a pattern."""
+    return query(f"SELECT {columns} FROM '{archive}/**/*.parquet' WHERE {where} ORDER BY ts, metric")
+
+
+def indexed(archive: Path, messages: list[Sent], name: str = NAME) -> Path:
+    """The index of a recording that holds these messages."""
+    path = write_recording(archive / name, messages)
+    write_index(path, index_path(path), archive / "scratch")
+    return index_path(path)
+
+
+def in_turn(*parts: tuple[str, bytes]) -> list[Sent]:
+    """Messages by topic, a millisecond apart."""
+    return [Sent(START_NS + number * 10**6, topic, payload) for number, (topic, payload) in enumerate(parts)]
+
+
+def test_each_message_is_a_row(tmp_path):
+    messages = traffic()
+    assert indexed(tmp_path, messages) == tmp_path / NAME.replace(".mcap", ".parquet")
+    found = rows(tmp_path, "epoch_ns(ts), robot || '/' || direction || '/' || metric, size, retained")
+    expected = [(sent.ns, sent.topic, len(sent.payload), sent.retained) for sent in messages]
+    assert sorted(found) == sorted(expected)
+
+
+def test_the_columns_have_the_promised_types(tmp_path):
+    path = indexed(tmp_path, traffic(seconds=2.0))
+    assert dict(query("SELECT column_name, column_type FROM (DESCRIBE FROM read_parquet(?))", str(path))) == COLUMNS
+
+
+USES = [
+    ("incoming/drive-values", b'{"x":0.1,"z":0}', Activity.DRIVE),
+    ("incoming/drive-values", b'{"value":{"x":0,"z":-0.5}}', Activity.DRIVE),
+    ("incoming/drive-values", b'{"x":0.01,"z":-0.02}', Activity.NONE),
+    ("incoming/drive-values", b'{"x":NaN}', Activity.NONE),
+    ("incoming/drive-values", b"\xff not JSON", Activity.NONE),
+    ("incoming/lights-flash", b"{}", Activity.LIGHTS),
+    ("incoming/front-camera", b'{"enabled":true}', Activity.MEDIA_REQUEST),
+    ("incoming/flags/mqtt-audio", b"true", Activity.MEDIA_REQUEST),
+    ("incoming/soundboard-command", b"{}", Activity.SOUND),
+    ("incoming/autonomy-command", b"{}", Activity.AUTONOMY),
+    ("incoming/audio-stream", Sound(Codec.PCM16LE, 1, 16000, 2, 1, 1, bytes(4)).pack(), Activity.MEDIA),
+    ("outgoing/front-camera", b'{"id": 1, "keyframe": true}', Activity.MEDIA),
+    ("outgoing/logs", b'{"level": "WARNING", "message": "hot"}', Activity.WARNING),
+    ("outgoing/logs", b'{"level": "INFO", "message": "WARNING"}', Activity.NONE),
+    ("outgoing/status", b"{}", Activity.NONE),
+]
+
+
+def test_the_use_of_a_robot_shows(tmp_path):
+    indexed(tmp_path, in_turn(*((f"{GOOB}/{suffix}", payload) for suffix, payload, _ in USES)))
+    assert rows(tmp_path, "activity") == [(activity,) for _, _, activity in USES]
+    assert rows(tmp_path, "medium", "medium IS NOT NULL") == [(SOUND,), (PICTURE,)]
+
+
+def test_a_heartbeat_may_be_the_last(tmp_path):
+    heartbeats = [
+        ("outgoing/online", b'{"t":1,"online":true}', True),
+        ("outgoing/online", b'{"t":1}', True),
+        ("outgoing/heartbeat", b'{"t":1, "online": false}', False),
+        ("outgoing/status", b'{"online": false}', None),
+    ]
+    indexed(tmp_path, in_turn(*((f"{GOOB}/{suffix}", payload) for suffix, payload, _ in heartbeats)))
+    assert rows(tmp_path, "online") == [(online,) for _, _, online in heartbeats]
+
+
+def test_what_belongs_to_no_robot_keeps_its_topic(tmp_path):
+    topics = ["pebble/infrastructure", "$SYS/uptime", "a/b/c/sideways/x"]
+    indexed(tmp_path, in_turn(*((topic, b"{}") for topic in topics)))
+    assert rows(tmp_path, "robot, direction, metric") == [("", "", topic) for topic in topics]
+
+
+def test_a_robot_may_have_any_name(tmp_path):
+    robots = [f"pebble/robots/{name}" for name in ("a.b", "x=y", "50% off", "..", "día", "it's", "a\\b")]
+    indexed(tmp_path, in_turn(*((f"{robot}/outgoing/status", b"{}") for robot in robots)), "it's.mcap")
+    assert rows(tmp_path, "robot") == [(robot,) for robot in robots]
+    assert sources([tmp_path], tmp_path / "scratch").robots == sorted(robots)
+
+
+def test_events_of_the_recorder_are_rows(tmp_path):
+    noted = event(START_NS, "gap", since=1, until=2, why="lost")
+    indexed(tmp_path, [noted, Sent(START_NS + 1, "$recorder/events", b"\xff")])
+    assert rows(tmp_path, "robot, event") == [("", noted.payload.decode())]
+
+
+def test_times_beyond_what_a_timestamp_holds_are_left_out(tmp_path):
+    indexed(tmp_path, [Sent(START_NS, f"{GOOB}/outgoing/status", b"{}"), Sent(1 << 63, f"{GOOB}/outgoing/status", b"")])
+    assert rows(tmp_path, "epoch_ns(ts)") == [(START_NS,)]
+    assert sources([tmp_path], tmp_path / "scratch").missing == 1
+
+
+def state(folder: Path) -> list[tuple[Path, int]]:
+    return [(path, path.stat().st_mtime_ns) for path in sorted(folder.rglob("*.parquet"))]
+
+
+def test_a_recording_is_indexed_once_and_again_when_it_has_changed(tmp_path):
+    messages = traffic(seconds=3.0)
+    path = write_recording(tmp_path / NAME, messages)
+    assert sources([tmp_path], tmp_path / "scratch").robots == sorted(robot.base for robot in FLEET)
+    before = state(tmp_path)
+    sources([tmp_path], tmp_path / "scratch")
+    assert state(tmp_path) == before
+    write_recording(path, [sent for sent in messages if sent.topic.startswith(GOOB)])
+    assert sources([tmp_path], tmp_path / "scratch").robots == [GOOB]
+
+
+def test_a_failure_leaves_the_former_index_and_nothing_temporary(tmp_path, monkeypatch):
+    path = write_recording(tmp_path / NAME, traffic(seconds=2.0))
+    sources([tmp_path], tmp_path / "scratch")
+    before = state(tmp_path)
+    os.utime(path)
+
+    def fails(*_: object) -> Path:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(Path, "replace", fails)
+    with pytest.raises(OSError):
+        sources([tmp_path], tmp_path / "scratch")
+    assert state(tmp_path) == before
+    assert {one.suffix for one in path.parent.iterdir()} == {".mcap", ".parquet"}
+
+
+def test_a_torn_recording_is_indexed_as_far_as_it_goes_and_not_beside_it(tmp_path):
+    messages = traffic(seconds=5.0)
+    path = write_recording(tmp_path / "x.mcap.active", messages, finished=False)
+    whole = path.read_bytes()
+    path.write_bytes(whole + whole[-1000:-500])
+    (index,) = sources([tmp_path], tmp_path / "scratch").indexes
+    assert query("SELECT count(*) FROM read_parquet(?)", str(index)) == [(len(messages),)]
+    assert list(tmp_path.glob("*.parquet")) == []

@@ -1,0 +1,125 @@
+"""What the motor owners' states mean for a script that is to start, or runs."""
+
+from __future__ import annotations
+
+import operator
+from typing import Any
+
+import pytest
+
+from pebble.contract.payloads import ControlState, EstopState
+from pebble.extensions.scripts.runs import SUPERSEDED, following
+from pebble.motion.arbiter import Arbiter
+from pebble.motion.latch import Latch
+from pebble.motion.lease import Lease
+from pebble.services.autonomy_manager.motor_owners import OVERRIDDEN, MotorOwners
+
+
+def state(**fields: Any) -> EstopState:
+    return EstopState(
+        **{"latched": False, "boot": "aa", "count": 0, "recent": [], "by": "", "why": "", "since": 0} | fields
+    )
+
+
+@pytest.fixture
+def owners() -> MotorOwners:
+    owners = MotorOwners(["serial"])
+    owners.receive("serial", state(barred=7))
+    return owners
+
+
+def test_only_a_latched_robot_refuses_and_names_who(owners: MotorOwners) -> None:
+    assert (owners.refusal, owners.barred) == ("", 7)
+    assert owners.ending(8, owners.baseline()) == ""
+    owners.receive("serial", state(latched=True, by="ann\x07"))
+    assert owners.refusal == "emergency stop by ann? of motor owner serial: reset it first"
+
+
+@pytest.mark.parametrize(
+    ("fields", "why"),
+    [
+        ({"latched": True, "count": 1, "barred": 8}, "emergency stop of motor owner serial: reset it first"),
+        ({"count": 1, "barred": 8, "by": "bob"}, "emergency stop by bob of motor owner serial: it was reset since"),
+        ({"barred": 8}, OVERRIDDEN),
+        ({"barred": 9, "boot": "bb"}, SUPERSEDED),
+        ({"boot": "bb"}, "motor owner serial was restarted: start the script again"),
+        ({"barred": 7}, ""),
+    ],
+)
+def test_a_run_ends_with_the_reason(owners: MotorOwners, fields: dict[str, Any], why: str) -> None:
+    baseline = owners.baseline()
+    owners.receive("serial", state(**fields))
+    assert owners.ending(8, baseline) == why
+
+
+@pytest.mark.parametrize(("newest_run", "why"), [(8, OVERRIDDEN), (9, SUPERSEDED)])
+def test_a_newer_run_is_no_operator(owners: MotorOwners, newest_run: int, why: str) -> None:
+    owners.note_run(newest_run)
+    baseline = owners.baseline()
+    owners.receive("serial", state(barred=8))
+    assert owners.ending(8, baseline) == why
+
+
+def test_an_owner_that_appears_during_a_run_must_not_change_from_then_on() -> None:
+    owners = MotorOwners([])
+    baseline = owners.baseline()
+    owners.receive("esp", state())
+    assert owners.ending(1, baseline) == ""
+    owners.receive("esp", state(boot="cc"))
+    assert owners.ending(1, baseline) == "motor owner esp was restarted: start the script again"
+
+
+def test_states_of_others_count_only_where_no_owner_is_known() -> None:
+    owners = MotorOwners(["serial"])
+    owners.receive("old", state(latched=True))
+    assert owners.refusal == ""
+    unknown = MotorOwners([])
+    for number in range(100):
+        unknown.receive(f"o{number}", state(barred=number))
+    assert unknown.barred == 15
+
+
+HALF, LAST = 1 << 29, (1 << 30) - 1
+
+
+@pytest.mark.parametrize(
+    "barred",
+    [[7, HALF + 9], [HALF + 9, 7], [7, HALF + 6], [7, LAST], [1, LAST], [0, HALF], [5, LAST // 3, LAST // 3 * 2]],
+)
+def test_every_owner_comes_to_obey_a_run_also_one_that_was_away_while_a_stranger_sent_numbers(
+    barred: list[int],
+) -> None:
+    table, arbiters = MotorOwners([]), []
+    for owner, number in enumerate(barred):
+        table.receive(f"o{owner}", state(barred=number))
+        arbiters.append(Arbiter(Latch("aa", 8, operator.sub), Lease(0, operator.sub, str, 0), 0, operator.sub, 750))
+        arbiters[-1].bar(number)
+    run, baseline = following(table.barred), table.baseline()
+    zeros = list(table.steps_to(run))
+    for arbiter in arbiters:
+        for number in zeros:
+            arbiter.judge(False, number, -1, 3000)
+        assert arbiter.judge(True, run, -1, 3000) == 750
+    assert table.ending(run, baseline) == "", "what was barred before the start ends nothing"
+
+
+@pytest.mark.parametrize(
+    ("states", "by", "holder"),
+    [
+        ({}, "ann", ""),
+        ({"serial": ("", "")}, "ann", ""),
+        ({"serial": ("ann", "0badf00d")}, "ann", ""),
+        ({"serial": ("ann", "0badf00d")}, "otto", "ann"),
+        ({"serial": ("ann", "0badf00d")}, "-", "ann"),
+        ({"serial": ("", "0badf00d")}, "ann", "a program of the robot"),
+        ({"serial": ("page-1/ann", "0badf00d")}, "page-1/bob", ""),  # the page asks its own people
+        ({"serial": ("page-1/ann", "0badf00d")}, "ann", "page-1/ann"),
+        ({"left": ("otto", "0badf00d"), "arm": ("ann", "1badf00d")}, "ann", ""),  # the first owner by name decides
+    ],
+)
+def test_who_has_control_beside_the_one_who_asks(states: dict[str, tuple[str, str]], by: str, holder: str) -> None:
+    owners = MotorOwners(list(states))
+    for owner, (name, key) in states.items():
+        owners.receive_control(owner, ControlState(by=name, id="aaaaaaaa", key=key))
+        owners.receive_control(f"forged-{owner}", ControlState(by="mia", id="bbbbbbbb", key="2badf00d"))
+    assert owners.holder_beside(by) == holder

@@ -1,0 +1,408 @@
+"""What the manager does with commands, ends of processes, motor owners and people."""
+
+from __future__ import annotations
+
+import signal
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from pebble.contract.forms import Setting
+from pebble.extensions.scripts.runs import SUPERSEDED
+from pebble.services.autonomy_manager.motor_owners import OVERRIDDEN
+from pebble.services.autonomy_manager.script import Dependency, Script
+from tests.ext.scripts.autonomy_manager.fake_children import Bench, FakeChild
+from tests.support import until
+
+SPEED = Setting(key="speed", type="float", default=0.5, arg="--speed", max=1)
+TERM, KILL = signal.SIGTERM, signal.SIGKILL
+
+
+def script(file: str, *dependencies: str, **more: Any) -> Script:
+    needs = tuple(map(Dependency, dependencies))
+    fields = {"settings": (SPEED,), "ours": True, **more}
+    return Script(file=file, label=file, command=(file,), folder=Path(), dependencies=needs, **fields)
+
+
+SCRIPTS = {
+    entry.file: entry
+    for entry in (
+        *(script("walk"), script("sing"), script("eyes"), script("wheel"), script("follow", "eyes", "wheel")),
+        script("old", ours=False),
+    )
+}
+IDLE = {
+    "running": False,
+    "file": None,
+    "pid": None,
+    "dependencies": [],
+    "error": None,
+    "config": None,
+    "controls": True,
+}
+
+
+@pytest.fixture
+def bench(tmp_path: Path) -> Iterator[Bench]:
+    bench = Bench(tmp_path, SCRIPTS)
+    yield bench
+    bench.close()
+
+
+def run_of(child: FakeChild) -> int:
+    return int(child.launch.environment["PEBBLE_RUN"])
+
+
+def test_it_begins_idle_and_stops_what_a_predecessor_may_have_left(bench: Bench) -> None:
+    assert bench.status == IDLE
+    (halt,) = bench.drives
+    assert (halt["source"], halt["x"], halt["z"]) == ("autonomy", 0, 0)
+    walk = bench.start("walk", speed="0.25", unknown=[1])
+    assert run_of(walk) > halt["run"]
+    assert walk.launch.command[0:2] == ("walk", "--config")
+    assert walk.launch.command[3:] == ("--speed", "0.25")
+    assert walk.launch.environment["PEBBLE_CONFIG"] == walk.launch.command[2]
+    assert walk.launch.tie is TERM
+    assert bench.status == {**IDLE, "running": True, "file": "walk", "pid": walk.pid, "config": {"speed": 0.25}}
+    zero = {"x": 0.0, "z": 0.0, "y": 0.0, "source": "autonomy", "run": run_of(walk)}
+    assert until(lambda: bench.drives[-1] == zero), "else a person who stops it before it drives would not end it"
+
+
+def test_a_script_of_others_gets_no_run_and_is_killed_with_the_manager(bench: Bench) -> None:
+    old = bench.start("old")
+    assert "PEBBLE_RUN" not in old.launch.environment
+    assert old.launch.tie is KILL
+
+
+@pytest.mark.parametrize(
+    "body",
+    [
+        {"action": "RUN ", "file": " walk "},
+        {"enabled": True, "file": "walk"},
+        {"value": {"enabled": True, "file": "walk"}},
+        {"value": {"action": "on"}, "file": "walk", "config": {"speed": 0.5}},
+        {"value": True, "file": "walk"},
+        {"action": "?", "enabled": True, "file": "walk"},
+    ],
+)
+def test_a_start_has_many_forms_and_so_has_a_stop(bench: Bench, body: dict[str, Any]) -> None:
+    bench.command(body)
+    assert bench.becomes(running=True, config={"speed": 0.5})
+    (walk,) = bench.children.all
+    bench.command({"action": "disable"})
+    assert until(lambda: walk.signals == [TERM])
+    walk.end(-TERM)
+    assert bench.becomes(**IDLE)
+
+
+@pytest.mark.parametrize(
+    ("body", "error"),
+    [
+        (True, "Start command missing file"),
+        ({"action": "start", "file": "sing", "config": {"speed": 2}}, "Invalid config for sing: speed above maximum 1"),
+    ],
+)
+def test_a_refused_start_leaves_the_running_script_alone(bench: Bench, body: Any, error: str) -> None:
+    walk = bench.start("walk")
+    bench.command(body)
+    assert bench.becomes(running=True, file="walk", pid=walk.pid, error=error)
+    assert walk.signals == []
+    bench.command({"action": "stop"})
+    walk.end(0)
+    assert bench.becomes(**IDLE)
+
+
+def test_nonsense_does_nothing(bench: Bench) -> None:
+    walk = bench.start("walk")
+    for body in ({"file": "sing"}, {"action": "dance"}, b"\xff", b"[" * 5000, 7, {"action": "stop", "config": 3}):
+        bench.command(body)
+    bench.quiet()
+    assert (walk.signals, bench.children.files) == ([], ["walk"])
+
+
+def test_stop_halts_the_wheels_and_the_run_that_has_ended_is_barred(bench: Bench) -> None:
+    """Else a process that left the script's process group could drive on."""
+    walk = bench.start("walk")
+    bench.stop(walk)
+    assert until(lambda: bench.zeros(run_of(walk)) == 1), "first"
+    assert bench.status["running"] is True  # until it has ended
+    walk.end(0)
+    assert bench.becomes(**IDLE)
+    bench.quiet()
+    assert (bench.drives[-1]["run"], bench.drives[-1]["x"], bench.drives[-1]["z"]) == (run_of(walk) + 1, 0, 0)
+    bench.advance(0.11)
+    bench.advance(0.2)
+    assert until(lambda: bench.zeros(run_of(walk)) == 4), "and again when the process has ended"
+    assert run_of(bench.start("sing")) > run_of(walk) + 1, "a person may have barred that number meanwhile"
+
+
+def test_what_does_not_end_is_killed(bench: Bench) -> None:
+    walk = bench.start("walk")
+    bench.stop(walk)
+    bench.advance(7.9)
+    assert walk.signals == [TERM]
+    bench.advance(0.2)
+    assert walk.signals == [TERM, KILL]
+    walk.end(-KILL)
+    assert bench.becomes(**IDLE)
+
+
+def test_only_the_newest_request_counts_while_another_script_ends(bench: Bench) -> None:
+    walk = bench.start("walk")
+    for file in ("sing", "follow", "sing", "eyes"):
+        bench.command({"action": "start", "file": file})
+    bench.quiet()
+    assert (walk.signals, bench.children.files) == ([TERM], ["walk"])
+    walk.end(0)
+    assert bench.becomes(running=True, file="eyes")
+    assert bench.children.files == ["eyes"]
+    bench.command({"action": "start", "file": "sing"})
+    bench.command({"action": "stop"})
+    bench.quiet()
+    bench.children.all[-1].end(0)
+    assert bench.becomes(**IDLE)
+    assert bench.children.files == [], "a stop forgets what was to start next"
+
+
+@pytest.mark.parametrize(
+    ("code", "error"), [(0, None), (3, "walk exited with code 3"), (-9, "walk was ended by signal 9")]
+)
+def test_an_end_stops_the_wheels_and_nothing_is_started_again(bench: Bench, code: int, error: str | None) -> None:
+    walk = bench.start("walk")
+    walk.end(code)
+    assert bench.becomes(**{**IDLE, "error": error})
+    bench.advance(0.11)
+    bench.advance(0.2)
+    bench.advance(60)
+    assert until(lambda: bench.zeros(run_of(walk)) == 3)
+    assert bench.children.files == []
+
+
+def test_dependencies_come_first_with_the_same_run_and_go_last(bench: Bench) -> None:
+    follow = bench.start("follow")
+    eyes, wheel, _ = bench.children.all
+    assert bench.children.files == ["eyes", "wheel", "follow"]
+    assert {run_of(child) for child in bench.children.all} == {run_of(follow)}
+    assert bench.status["dependencies"] == [
+        {"file": "eyes", "pid": eyes.pid, "running": True},
+        {"file": "wheel", "pid": wheel.pid, "running": True},
+    ]
+    bench.command({"action": "start", "file": "walk"})
+    assert until(lambda: follow.signals == [TERM])
+    assert (eyes.signals, wheel.signals) == ([], [])
+    follow.end(0)
+    assert until(lambda: eyes.signals == [TERM] == wheel.signals)
+    assert bench.becomes(running=False)
+    eyes.end(0)
+    bench.quiet()
+    assert bench.children.files == ["wheel"]
+    wheel.end(-TERM)
+    assert bench.becomes(running=True, file="walk", error=None, dependencies=[])
+
+
+@pytest.mark.parametrize(("code", "how"), [(0, "exited with code 0"), (-11, "was ended by signal 11")])
+def test_a_dependencys_end_stops_the_script(bench: Bench, code: int, how: str) -> None:
+    follow = bench.start("follow")
+    eyes, wheel, _ = bench.children.all
+    eyes.end(code)
+    assert until(lambda: follow.signals == [TERM])
+    assert until(lambda: bench.zeros(run_of(follow)) == 1)
+    follow.end(1)
+    assert until(lambda: wheel.signals == [TERM])
+    wheel.end(0)
+    assert bench.becomes(**{**IDLE, "error": f"dependency eyes {how}"})
+
+
+def test_what_cannot_be_started_ends_what_was_started_for_it(bench: Bench) -> None:
+    bench.children.failing = "wheel"
+    bench.command({"action": "start", "file": "follow"})
+    assert until(lambda: bench.children.all and bench.children.all[0].signals == [TERM])
+    bench.children.all[0].end(0)
+    assert bench.becomes(**{**IDLE, "error": "Failed to start follow: [Errno 2] No such file or directory: 'wheel'"})
+    bench.children.failing = ""
+    bench.start("walk")
+
+
+# -- motor owners
+
+
+def test_a_run_is_above_what_motor_owners_have_barred(bench: Bench) -> None:
+    bench.owner(barred=500_000_000)
+    assert run_of(bench.start("walk")) > 500_000_000
+
+
+def test_an_emergency_stop_ends_the_script_and_refuses_others_until_the_reset(bench: Bench) -> None:
+    bench.owner()
+    walk = bench.start("walk")
+    bench.owner(latched=True, count=1, by="ann")
+    error = "emergency stop by ann of motor owner serial: reset it first"
+    assert bench.becomes(error=error)
+    assert walk.signals == [TERM]
+    walk.end(0)
+    assert bench.becomes(**{**IDLE, "error": error})
+    bench.command({"action": "start", "file": "sing"})
+    assert bench.becomes(error=f"Failed to start sing: {error}")
+    bench.owner(count=1, by="ann")
+    bench.start("sing")
+
+
+@pytest.mark.parametrize(
+    ("fields", "error"),
+    [
+        ({"count": 1}, "emergency stop of motor owner serial: it was reset since"),
+        ({"boot": "bb"}, "motor owner serial was restarted: start the script again"),
+        ({"barred": 500_000_000}, SUPERSEDED),
+    ],
+)
+def test_what_ended_a_run_at_the_motors_ends_its_script(bench: Bench, fields: dict[str, Any], error: str) -> None:
+    bench.owner()
+    walk = bench.start("walk")
+    bench.owner(**fields)
+    assert bench.becomes(error=error)
+    assert walk.signals == [TERM]
+
+
+def test_a_stop_while_another_script_ends_cancels_the_next_one(bench: Bench) -> None:
+    bench.owner()
+    walk = bench.start("walk")
+    bench.command({"action": "start", "file": "sing"})
+    bench.owner(latched=True, count=1)
+    walk.end(0)
+    assert bench.becomes(**{**IDLE, "error": "emergency stop of motor owner serial: reset it first"})
+    bench.owner(count=1)
+    assert bench.children.files == []
+
+
+# -- people
+
+
+def test_the_status_shows_that_a_person_drives(bench: Bench) -> None:
+    bench.start("walk")
+    assert "overridden" not in bench.status
+    bench.drive(z=0.5, source="autonomy", run=7)
+    bench.quiet()
+    assert "overridden" not in bench.status
+    bench.drive(z=0.5)
+    assert bench.becomes(running=True, overridden=True)
+    bench.advance(1.5)
+    bench.drive(z=0.0)
+    bench.quiet()
+    bench.advance(1.5)
+    assert bench.status["overridden"] is True
+    bench.advance(0.6)
+    assert "overridden" not in bench.status
+    assert bench.status["running"] is True
+
+
+KEY = {"key": "0badf00d"}
+
+
+@pytest.mark.parametrize(
+    ("drives", "status"),
+    [
+        ([{"z": 0.5}, {"z": 0.0, "valid_ms": 0}], {"running": True}),
+        ([{"z": 0.5, **KEY}], {"running": True, "overridden": True}),
+        ([{"z": 0.5, **KEY}, {"z": 0.0, **KEY}, {"z": 0.4}], {"running": True, "overridden": True}),
+        ([{"z": 0.0, "valid_ms": 0, **KEY}], {"error": OVERRIDDEN, "overridden": True}),
+    ],
+    ids=["its own commands", "a person with control", "who lets go", "who stops"],
+)
+def test_who_has_control_is_told_from_a_script_that_does_not_sign(
+    bench: Bench, drives: list[dict[str, Any]], status: dict[str, Any]
+) -> None:
+    old = bench.start("old")
+    for drive in drives:
+        bench.drive(**drive)
+    bench.quiet()
+    bench.owner(barred=bench.drives[0]["run"] + 9)  # as its own zeros may bar it
+    assert bench.becomes(**status)
+    assert ("overridden" in bench.status) == ("overridden" in status)
+    assert old.signals == ([TERM] if "error" in status else [])
+
+
+def test_a_script_that_does_not_sign_ends_when_the_connection_of_who_drives_is_lost(bench: Bench) -> None:
+    old = bench.start("old")
+    bench.drive(z=0.5, **KEY)
+    assert bench.becomes(overridden=True)
+    bench.advance(2.1)
+    assert bench.becomes(error=OVERRIDDEN)
+    assert old.signals == [TERM]
+
+
+@pytest.mark.parametrize(("holder", "zeros"), [("", 1), ("page-1/ann", 0)])
+def test_the_wheels_of_a_script_that_does_not_sign_stop_with_it(bench: Bench, holder: str, zeros: int) -> None:
+    """A signed zero is refused for 2 s after what looks like a person's command; who has control is not stopped."""
+    bench.holder(holder)
+    old = bench.start("old")
+    bench.drive(z=0.5)
+    bench.quiet()
+    bench.stop(old)
+    old.end(-TERM)
+    assert bench.becomes(**IDLE)
+    zero = {"x": 0.0, "z": 0.0, "y": 0.0, "source": "autonomy_manager"}
+    assert until(lambda: bench.drives[-1].get("run", 0) > bench.drives[1]["run"])
+    assert bench.drives.count(zero) == zeros
+
+
+def test_a_run_by_hand_ends_the_script_with_that_reason(bench: Bench) -> None:
+    """The owner bars the run before the newer one, as if a person had stopped it."""
+    walk = bench.start("walk")
+    bench.drive(z=0.5, source="autonomy", run=run_of(walk) + 1)
+    bench.owner(barred=run_of(walk))
+    assert bench.becomes(error=SUPERSEDED)
+
+
+def test_a_person_may_end_the_script_where_the_config_wants_it(tmp_path: Path) -> None:
+    bench = Bench(tmp_path, SCRIPTS, on_override="stop")
+    walk = bench.start("walk")
+    bench.drive(x=0.1)
+    assert bench.becomes(error=OVERRIDDEN)
+    assert walk.signals == [TERM]
+    bench.close()
+
+
+def test_a_start_right_after_a_persons_final_zero_is_refused_instead_of_ended_two_seconds_later(bench: Bench) -> None:
+    bench.drive(z=0.0, valid_ms=0)
+    bench.quiet()
+    bench.command({"action": "start", "file": "walk"})
+    assert bench.becomes(error=f"Failed to start walk: {OVERRIDDEN} just now: start it again in 2 s", running=False)
+    bench.advance(2.01)
+    bench.drive(z=0.0)  # a release
+    bench.quiet()
+    bench.start("walk")
+
+
+def test_where_names_are_checked_only_who_has_control_starts_a_script(tmp_path: Path) -> None:
+    """Anybody ends one, and a program of the robot, which has no name, starts one."""
+    bench = Bench(tmp_path, SCRIPTS, named=True)
+    try:
+        bench.holder("page-1/ann")
+        for by in ("otto", "-"):
+            bench.command({"action": "start", "file": "walk", "by": by})
+            assert bench.becomes(error="page-1/ann has control, and starts scripts")
+            bench.command({"action": "start", "file": "none", "by": "page-1"})
+            assert bench.becomes(error="Unknown autonomy file: none")
+        bench.command({"action": "start", "file": "walk", "by": "page-1/bob"})
+        assert bench.becomes(running=True, file="walk")
+        bench.command({"action": "stop", "by": "otto"})
+        assert until(lambda: bench.children.all[-1].signals == [TERM])
+        bench.children.all[-1].end(0)
+        bench.start("sing")
+        bench.holder("")
+        bench.quiet()
+        bench.command({"action": "start", "file": "eyes", "by": "otto"})
+        assert until(lambda: bench.children.all[-1].signals == [TERM])
+    finally:
+        bench.close()
+
+
+# -- its own end
+
+
+def test_its_end_ends_everything_and_is_published(bench: Bench) -> None:
+    bench.start("follow")
+    bench.running.stop()
+    assert {tuple(child.signals) for child in bench.children.all} == {(TERM, KILL)}
+    assert bench.becomes(**IDLE)

@@ -1,0 +1,158 @@
+"""``pebble script`` with a real broker and a robot whose manager is scripted."""
+
+from __future__ import annotations
+
+import json
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from pebble.contract import AUTONOMY_COMMAND, AUTONOMY_FILES, AUTONOMY_STATUS, codec
+from pebble.contract.payloads import AutonomyFiles, AutonomyStatus
+from pebble.errors import PebbleError
+from pebble.extensions.operator.client.scripts import settings
+from pebble.transports import Message, MqttSettings, QoS, create
+from tests.commands.command_line import GOOB, Run, config_file
+from tests.support import Broker, until
+
+FORM: list[dict[str, Any]] = [
+    {"key": "tag_id", "label": "Tag ID", "type": "int", "default": 13, "arg": "--tag-id", "min": 0, "max": 34},
+    {"key": "speed", "label": "Speed", "type": "enum", "default": "slow", "arg": "-s", "options": ["slow", "fast"]},
+    {"key": "search", "label": "Search", "type": "bool", "default": True, "arg": "--search", "mode": "flag"},
+    {"key": "size_m", "label": "Size", "type": "float", "default": None, "arg": "--size-m", "required": True},
+]
+ENTRY = {"file": "follow", "label": "Follow a tag", "configs": FORM}
+
+
+class Manager:
+    """Publishes one script; answers each command with the next of its statuses, and a moment later with ``then``."""
+
+    def __init__(self, port: int) -> None:
+        self.commands: list[dict[str, Any]] = []
+        self.answers: list[AutonomyStatus] = []
+        self._transport = create("mqtt", "manager", MqttSettings(host="127.0.0.1", port=port)).open()
+        self._transport.subscribe(AUTONOMY_COMMAND.topic(GOOB), self._receive)
+        self.then: list[AutonomyStatus] = []
+        self._publish(AUTONOMY_FILES, AutonomyFiles(files=[ENTRY], timestamp=1.0))
+        self.publish(AutonomyStatus(running=False, timestamp=1.0))
+
+    def publish(self, status: AutonomyStatus) -> None:
+        self._publish(AUTONOMY_STATUS, status)
+
+    def close(self) -> None:
+        self._transport.close()
+
+    def _publish(self, channel: Any, value: Any) -> None:
+        self._transport.publish(channel.topic(GOOB), codec.encode(channel, value), qos=QoS.DELIVERED, retain=True)
+
+    def _receive(self, message: Message) -> None:
+        self.commands.append(json.loads(message.payload))
+        self.publish(self.answers.pop(0))
+        for status in self.then:
+            threading.Timer(0.2, self.publish, [status]).start()
+
+
+@pytest.fixture
+def config(broker: Broker, tmp_path: Path) -> Path:
+    return config_file(tmp_path, local_mqtt={"host": "127.0.0.1", "port": broker.port})
+
+
+@pytest.fixture
+def manager(broker: Broker) -> Iterator[Manager]:
+    manager = Manager(broker.port)
+    yield manager
+    manager.close()
+
+
+def test_it_lists_scripts_and_their_options(run: Run, config: Path, manager: Manager) -> None:
+    assert run("script", "list", config) == 0, run.err
+    assert [line.strip().split("  ")[0] for line in run.out.splitlines()] == [
+        "follow: Follow a tag", "--tag-id INT", "--speed ENUM", "[--search | --no-search]", "--size-m FLOAT",
+        "no script runs",
+    ]  # fmt: skip
+    assert "(min 0; max 34; default: 13)" in run.out
+    assert "(slow, fast; default: slow)" in run.out
+
+
+def test_it_starts_a_script_with_options(run: Run, config: Path, manager: Manager) -> None:
+    effective = {"tag_id": 7, "search": False}
+    manager.answers = [AutonomyStatus(running=True, timestamp=2.0, file="follow", pid=42, config=effective)]
+    assert run("script", "start", config, "follow", "--tag-id", "7", "--no-search", "--size-m=0.2") == 0, run.err
+    chosen = {"tag_id": 7, "search": False, "size_m": 0.2}
+    assert manager.commands == [{"action": "start", "file": "follow", "config": chosen}]
+    assert run.out.splitlines() == ["follow runs (process 42)", "    tag_id: 7", "    search: False"]
+
+
+def test_a_script_that_dies_at_once_is_an_error(run: Run, config: Path, manager: Manager) -> None:
+    manager.answers = [AutonomyStatus(running=True, timestamp=2.0, file="follow", pid=42)]
+    manager.then = [AutonomyStatus(running=False, timestamp=3.0, error="follow exited with code 1")]
+    assert run("script", "start", config, "follow") == 1
+    assert run.err == "pebble: follow exited with code 1\n"
+
+
+@pytest.mark.parametrize("words", [[], ["--tag-id", "7"]])
+def test_a_start_without_a_script_names_the_command_that_lists_them(words: list[str], run: Run, config: Path) -> None:
+    assert run("script", "start", config, *words) == 1
+    assert run.err == f'pebble: which script? see "pebble script list {config}"\n'
+
+
+def test_by_url_it_needs_the_robots_id(run: Run, broker: Broker, manager: Manager) -> None:
+    manager.answers = [AutonomyStatus(running=False, timestamp=2.0)]
+    assert run("script", "stop", "goob", "--url", f"mqtt://127.0.0.1:{broker.port}") == 0, run.err
+    assert until(lambda: manager.commands == [{"action": "stop"}])
+    assert run.out == "no script runs\n"
+
+
+def test_a_refused_start_is_an_error_even_if_the_script_runs_already(run: Run, config: Path, manager: Manager) -> None:
+    running = {"running": True, "file": "follow", "pid": 42}
+    manager.publish(AutonomyStatus(timestamp=2.0, **running))
+    error = "Invalid config for follow: missing size_m"
+    manager.answers = [AutonomyStatus(timestamp=3.0, error=error, **running)]
+    assert run("script", "start", config, "follow", "--tag-id", "1") == 1
+    assert run.err == f"pebble: {error}\n"
+
+
+def test_the_list_ends_with_what_runs(run: Run, config: Path, manager: Manager) -> None:
+    manager.publish(AutonomyStatus(running=False, timestamp=2.0, error="follow exited with code 3"))
+    assert run("script", "list", config) == 0
+    assert run.out.splitlines()[-2:] == ["no script runs", "error: follow exited with code 3"]
+    manager.publish(AutonomyStatus(running=True, timestamp=2.0, file="follow", pid=4, overridden=True))
+    assert run("script", "list", config) == 0
+    assert run.out.splitlines()[-1] == "follow runs (process 4), but a person drives: it waits"
+
+
+def test_an_unknown_script_is_named(run: Run, config: Path, manager: Manager) -> None:
+    assert run("script", "start", config, "folow") == 1
+    assert run.err == "pebble: there is no script folow, only: follow; just after the robot's start, try again\n"
+
+
+@pytest.mark.parametrize(
+    ("words", "problem"),
+    [
+        (["--tagid", "3"], "--tagid is no option of follow: --tag-id, --speed, --search, --no-search, --size-m"),
+        (["--tag-id"], "--tag-id needs a value"),
+        (["--tag-id", "x"], "--tag-id of follow: tag_id must be a whole number"),
+        (["--size-m", "nan"], "--size-m of follow: size_m must be a number"),
+        (["--tag-id", "-1"], "--tag-id of follow: tag_id below minimum 0"),
+        (["--tag-id=35"], "--tag-id of follow: tag_id above maximum 34"),
+        (["--speed", "warp"], "--speed of follow: Invalid option 'warp' for speed"),
+    ],
+)
+def test_wrong_options_are_named(words: list[str], problem: str) -> None:
+    with pytest.raises(PebbleError) as error:
+        settings(ENTRY, words)
+    assert str(error.value) == problem
+
+
+@pytest.mark.parametrize(
+    "words", [["--marker-id=7", "--preview"], ["--tag-id", "7", "--preview"]], ids=["own", "by key"]
+)
+def test_an_option_is_the_scripts_own_or_made_of_its_key(words: list[str]) -> None:
+    form = [
+        {"key": "tag_id", "type": "int", "arg": "--marker-id"},
+        {"key": "preview", "type": "bool", "arg": "--preview"},
+    ]
+    assert settings({"file": "follow", "configs": form}, words) == {"tag_id": 7, "preview": True}

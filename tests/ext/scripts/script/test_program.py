@@ -1,0 +1,222 @@
+"""Scripts as real processes: however they end, a final stop leaves at once, and they say why in one line."""
+
+from __future__ import annotations
+
+import re
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from pebble.config import LAUNCHER_LOCK
+from pebble.contract.payloads import Drive
+from pebble.extensions.scripts.script import EXIT_ENDED
+from tests.commands.command_line import config_file
+from tests.ext.scripts.script.conftest import BOTH
+from tests.ext.scripts.script.station import Station
+from tests.support import Child, gone, until
+
+AT_ONCE_S = 0.25  # a few milliseconds, but not on a busy machine
+
+
+DRIVES = re.compile(r"\d\d:\d\d:\d\d \[INFO\] run \d+ drives goob\n").fullmatch
+
+
+def ended(script: subprocess.Popen[str], timeout: float = 10.0) -> tuple[int, str]:
+    """Its exit code, and what it has printed but that it drives."""
+    lines = script.communicate(timeout=timeout)[0].splitlines(keepends=True)
+    return script.returncode, "".join(line for line in lines if not DRIVES(line))
+
+
+def ended_by_signal(script: subprocess.Popen[str]) -> str:
+    """What it has printed."""
+    script.terminate()
+    code, output = ended(script)
+    assert code == 128 + signal.SIGTERM, output
+    return output
+
+
+@BOTH
+@pytest.mark.parametrize(
+    ("body", "code"),
+    [
+        ("robot.drive(z=0.5)", 0),
+        ("robot.drive(z=0.5)\nsys.exit(7)", 7),
+        ("robot.drive(z=0.5)\nraise ValueError('no such tag')", 1),
+        ("robot.drive(z=0.5)\nif os.fork():\n    os.wait()", 0),
+        ("robot.drive(z=0.5)\nrobot.drive(z=0.6)", 0),
+    ],
+    ids=["returns", "sys.exit", "raises", "forks", "commands that wait"],
+)
+def test_a_script_that_ends_stops_the_wheels(station: Station, body: str, code: int) -> None:
+    found, output = ended(station.start(body))
+    assert found == code, output
+    assert until(station.rests)
+    stop = station.received[-1].drive
+    assert (stop.source, stop.run) == ("autonomy", station.received[0].drive.run)
+    assert [received.drive.moves for received in station.received].count(False) == 1
+
+
+@BOTH
+@pytest.mark.alone
+@pytest.mark.parametrize(
+    "body",
+    ["time.sleep(60)", "while True: pass", "import ctypes\nctypes.CDLL(None).poll(None, 0, 60_000)", "robot.sleep(60)"],
+    ids=["asleep", "busy", "blocked in C", "waiting for the robot"],
+)
+def test_a_signal_stops_the_wheels_whatever_the_script_does(station: Station, body: str) -> None:
+    script = station.driven(f"robot.drive(z=0.5)\n{body}")
+    began = time.monotonic()
+    script.terminate()
+    assert until(station.rests)
+    assert station.received[-1].at - began < AT_ONCE_S
+
+
+@pytest.mark.alone
+def test_a_script_that_does_not_look_ends_2_s_after_the_signal(station: Station) -> None:
+    script = station.driven("robot.drive(z=0.5)\nwhile True:\n    try: robot.drive(z=0.5)\n    except SystemExit: pass")
+    script.terminate()
+    began = time.monotonic()
+    assert ended(script)[0] == 128 + signal.SIGTERM
+    assert 1.0 < time.monotonic() - began < 8.0
+    assert until(station.rests)
+
+
+def test_ctrl_c_ends_it_without_a_word(station: Station) -> None:
+    script = station.driven("robot.drive(z=0.5)\nrobot.sleep(60)")
+    script.send_signal(signal.SIGINT)
+    assert ended(script) == (130, "")
+    assert until(station.rests)
+
+
+def test_a_fork_is_no_script(station: Station) -> None:
+    """A signal to it does not end the script, and it cannot drive."""
+    body = """
+child = os.fork()
+if not child:
+    try: robot.drive(z=0.9)
+    except Exception as error: print(error)
+    sys.stdout.flush()
+    time.sleep(60)
+time.sleep(0.2)
+os.kill(child, 15)
+print(os.wait()[1], robot.drive(z=0.5))
+robot.sleep(60)"""
+    script = station.driven(f"robot.drive(z=0.1){body}")
+    assert until(lambda: station.received[-1].drive.z == 0.5)
+    assert ended_by_signal(script).splitlines() == [
+        "a fork of a script has no robot: use a thread, or start a program with subprocess", "15 True"
+    ]  # fmt: skip
+    assert 0.9 not in [received.drive.z for received in station.received]
+
+
+@pytest.mark.parametrize(
+    ("change", "why"),
+    [
+        ({"barred": 17}, "stopped by an operator"),
+        ({"latched": True, "count": 1, "by": "anna"}, "emergency stop by anna"),
+    ],
+)
+def test_a_run_that_is_ended_at_the_motors(station: Station, change: dict[str, Any], why: str) -> None:
+    script = station.driven("while robot.drive(z=0.5): time.sleep(0.02)\ntime.sleep(0.3)\nrobot.sleep(60)", run=17)
+    station.publish_state(**change)
+    code, output = ended(script)
+    assert code == EXIT_ENDED
+    assert output.endswith(f"[WARNING] {why}\n"), output
+
+
+@BOTH
+def test_of_two_runs_the_newer_one_drives(station: Station) -> None:
+    loop = "while True:\n    print(robot.drive(z=0.5), robot.why_refused)\n    robot.sleep(0.05)"
+    older = station.driven(loop)
+    newer = station.driven(loop)
+    code, output = ended(older)
+    assert code == EXIT_ENDED
+    assert output.endswith("[WARNING] superseded: a newer run drives the robot\n")
+    before = len(station.received)
+    assert until(lambda: len(station.received) > before + 3)
+    assert set(ended_by_signal(newer).splitlines()) == {"True "}
+
+
+def test_a_run_by_hand_is_above_what_is_barred(station: Station) -> None:
+    station.publish_state(barred=500_000_000)
+    script = station.driven("robot.drive(z=0.5)\nrobot.sleep(60)")
+    run = station.received[-1].drive.run
+    assert isinstance(run, int)
+    assert run > 500_000_000
+    ended_by_signal(script)
+
+
+def test_a_person_goes_first(station: Station) -> None:
+    script = station.driven("while True:\n    print(robot.drive(z=0.5), robot.overridden)\n    robot.sleep(0.05)")
+    station.publish_drive(Drive(x=0.1))
+    assert script.stdout is not None
+    lines = [next(script.stdout) for _ in range(17)]  # it goes on trying
+    assert DRIVES(lines[0]) or DRIVES(lines[1])
+    assert sum("[WARNING] goob does not obey this script: a person drives" in line for line in lines) == 1
+    assert "False True\n" in lines
+    before = len(station.received)
+    station.publish_drive(Drive())
+    assert any(re.search(r"\[INFO\] run \d+ drives goob again", next(script.stdout)) for _ in range(200))
+    ended_by_signal(script)
+    assert until(station.rests)
+    assert len(station.received) > before + 1
+
+
+def test_a_script_that_does_not_drive_publishes_no_stop(station: Station) -> None:
+    ended(station.start("robot.sleep(0.1)"))
+    assert station.received == []
+
+
+def test_a_robot_that_is_not_up_is_named_in_one_line(tmp_path: Path) -> None:
+    config = config_file(tmp_path, transport={"kind": "mqtt"}, local_mqtt={"host": "127.0.0.1", "port": 1})
+    (script := tmp_path / "away.py").write_text("from pebble import run\nrun(lambda robot: None)\n")
+    command = [sys.executable, str(script), "--config", str(config)]
+    code, output = ended(Child(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True))
+    assert code == 1
+    last = output.splitlines()[-1]
+    assert "[ERROR] goob is not up" in last
+    assert last.endswith(f"start it with `pebble up {config}`")
+
+
+def test_a_robot_that_is_not_up_beside_a_broker_that_is(station: Station) -> None:
+    lock = station.folder / "run" / LAUNCHER_LOCK
+    held = lock.read_text()
+    lock.write_text("no process\n")
+    try:
+        output = ended(station.start("robot.drive()"))[1]
+    finally:
+        lock.write_text(held)
+    assert f"[WARNING] goob is not up, so it does not move: start it with `pebble up {station.config_path}`" in output
+
+
+def test_describe_with_anything_else_starts_nothing(tmp_path: Path) -> None:
+    config = config_file(tmp_path, transport={"kind": "mqtt"})
+    (script := tmp_path / "walk.py").write_text("from pebble import run\nrun(lambda robot: print('runs'))\n")
+    command = [sys.executable, str(script), "--describe", "--config", str(config)]
+    found = ended(Child(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True))
+    assert found == (2, "walk.py: --describe goes alone: it prints the form and starts nothing (see --help)\n")
+
+
+def test_a_wrong_run_number_is_named(station: Station) -> None:
+    code, output = ended(station.start("robot.drive()", run=0))
+    assert code == 1
+    assert output.endswith("[ERROR] PEBBLE_RUN: '0' is not a number from 1 to 1073741823\n")
+
+
+def test_without_a_connection_nothing_has_an_effect() -> None:
+    station = Station("mqtt")
+    assert station.broker is not None
+    try:
+        script = station.driven("while robot.drive(z=0.5): robot.sleep(0.02)\nprint('refused')\nrobot.sleep(60)")
+        station.broker.stop()
+        assert script.stdout is not None
+        assert any(line == "refused\n" for line in script.stdout)
+        script.terminate()
+        assert until(lambda: gone(script.pid))
+    finally:
+        station.close()

@@ -1,0 +1,77 @@
+"""The forms of the scripts that come with Pebble: the original's keys, options, defaults and limits."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from functools import cache
+from typing import Any
+
+import pytest
+
+from tests.support import ROOT
+
+SCRIPTS = ROOT / "pebble/extensions/scripts/shipped"
+NAMES = ("apriltag-follow", "apriltag-locations", "apriltag-odom-follow", "wheel-odometry")
+#: Those for sizes that the camera decides, for other topics, and for nothing.
+GONE = {
+    "width",
+    "height",
+    "fps",
+    "min_wheel_pwm",
+    "locations_topic",
+    "overlays_topic",
+    "tags_topic",
+    "odom_topic",
+    "topic",
+}
+#: Without a path that an operator chooses, a window on the robot's screen, and a topic that the original does not use.
+ORIGINALS = json.loads((ROOT / "tests" / "data" / "original-forms.json").read_text())
+
+
+@cache
+def described(name: str) -> dict[str, Any]:
+    command = [sys.executable, str(SCRIPTS / name / "run.py"), "--describe"]
+    found: dict[str, Any] = json.loads(subprocess.run(command, capture_output=True, check=True).stdout)
+    return found
+
+
+def test_these_are_all() -> None:
+    assert sorted(path.name for path in SCRIPTS.iterdir() if path.name != "__pycache__") == sorted(NAMES)
+
+
+@pytest.mark.parametrize("name", ORIGINALS)
+def test_the_originals_settings_are_all_there(name: str) -> None:
+    wanted = [entry for entry in ORIGINALS[name] if entry["key"] not in GONE]
+    keys = {entry["key"] for entry in wanted}
+    got = [entry for entry in described(name)["configs"] if entry["key"] in keys]
+    essential = ("key", "label", "type", "default", "arg", "min", "max", "required", "mode", "arg_false")
+    assert [[entry.get(key) or None for key in essential] for entry in got] == [
+        [entry.get(key) or None for key in essential] for entry in wanted
+    ]
+
+
+def test_following_by_odometry_has_27_settings_and_needs_two_scripts() -> None:
+    found = described("apriltag-odom-follow")
+    assert len(found["configs"]) == 27
+    needs = {need["file"]: need["config"] for need in found["dependencies"]}
+    assert needs == {"apriltag-locations": {}, "wheel-odometry": {"use_tune_state": False}}
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_each_has_a_sentence_and_main_settings(name: str) -> None:
+    found = described(name)
+    assert 10 < len(found["summary"]) <= 160
+    assert 1 < len(found["main"]) <= 3
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_no_setting_is_a_path(name: str) -> None:
+    words = {word for entry in described(name)["configs"] for word in entry["key"].split("_")}
+    assert words.isdisjoint({"file", "path", "dir", "folder", "calibration"})
+
+
+def test_the_tags_size_must_be_given_or_confirmed() -> None:
+    (entry,) = (entry for entry in described("apriltag-follow")["configs"] if entry["key"] == "tag_size_m")
+    assert (entry["arg"], entry["required"], entry["default"], entry["min"]) == ("--marker-size", True, 0.25, 0.01)

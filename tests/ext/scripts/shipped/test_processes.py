@@ -1,0 +1,102 @@
+"""The scripts as real processes on both transports, with pictures in shared memory and samples of hall sensors."""
+
+from __future__ import annotations
+
+import math
+import signal
+from itertools import pairwise
+from typing import Any
+
+import pytest
+
+from tests.ext.scripts.shipped.stand_in import Sensors
+from tests.support import until
+
+
+def end(script: Any) -> str:
+    """What it has printed."""
+    script.send_signal(signal.SIGTERM)
+    output: str = script.communicate(timeout=20)[0]
+    return output
+
+
+def test_locations_are_published_at_their_rate_and_emptied_at_the_end(sensors: Sensors) -> None:
+    sensors.subscribe("apriltag-locations", "video-overlays")
+    script = sensors.start("apriltag-locations")
+    found, drawn = sensors.messages["apriltag-locations"], sensors.messages["video-overlays"]
+    assert until(lambda: len(found) > 24, 30)
+    end(script)
+    (detection,) = found[5]["detections"]
+    assert (detection["marker_id"], found[5]["frame_width"], found[5]["source"]) == (13, 640, "apriltag-locations")
+    assert drawn[5]["shapes"] == [[pytest.approx(corner) for corner in detection["corners_norm"]]]
+    rate = 20 / (found[23]["timestamp"] - found[3]["timestamp"])
+    assert rate <= 13, "12 a second"
+    assert until(lambda: (found[-1]["detections"], drawn[-1]["shapes"]) == ([], []))
+
+
+def test_a_follower_drives_towards_the_tag_and_stops(sensors: Sensors) -> None:
+    sensors.subscribe("apriltag-data", "video-overlays")
+    station = sensors.station
+    station.received.clear()
+    script = sensors.start("apriltag-follow", "--marker-size", "0.25")
+    data = sensors.messages["apriltag-data"]
+    assert until(lambda: sum(one["detected"] for one in data) > 20, 30)
+    assert data[-1]["distance_m"] == pytest.approx(math.hypot(2.0, 0.3), rel=0.02)
+    assert data[-1]["angle_rad"] == pytest.approx(math.atan2(0.3, 2.0), abs=0.01)
+    driven = [one for one in station.received if one.drive.moves]
+    assert all(one.drive.z > 0.8 and one.drive.x > 0 for one in driven[5:]), "forward, and to the right"
+    gaps = sorted(after.at - before.at for before, after in pairwise(driven[5:20]))
+    assert 0.05 < gaps[len(gaps) // 2] < 0.4, "10 a second, or fewer on a busy machine"
+    sensors.visible = False
+    assert until(lambda: not data[-1]["detected"], 10)
+    assert (data[-1]["corners_norm"], data[-1]["distance_m"]) == ([], None)
+    sensors.visible = True
+    end(script)
+    assert until(station.rests)
+    assert until(lambda: not data[-1]["detected"] and sensors.messages["video-overlays"][-1]["shapes"] == [])
+
+
+def test_odometry_measures_the_way_and_rests_at_a_lower_rate(sensors: Sensors) -> None:
+    sensors.subscribe("wheel-odometry")
+    script = sensors.start("wheel-odometry")
+    published = sensors.messages["wheel-odometry"]
+    assert until(lambda: len(published) > 2, 30)
+    mm = sensors.roll(2.5, 0.6)
+    assert until(lambda: published[-1]["value"]["x_mm"] == pytest.approx(mm, abs=20), 10)
+    assert abs(published[-1]["value"]["heading_deg"]) < 5
+    assert (published[-1]["unit"], published[-1]["source"]) == ("mm", "wheel-odometry")
+    moving = [one["timestamp"] for one in published if 100 < one["value"]["x_mm"] < 500]
+    assert 6 < len(moving) / (moving[-1] - moving[0]) < 26, "20 a second, not the 2 at rest"
+    end(script)
+
+
+def test_following_by_odometry_uses_what_two_other_scripts_publish(sensors: Sensors) -> None:
+    sensors.subscribe("apriltag-data")
+    station = sensors.station
+    station.received.clear()
+    locations, odometry = sensors.start("apriltag-locations"), sensors.start("wheel-odometry")
+    follower = sensors.start("apriltag-odom-follow")
+    data = sensors.messages["apriltag-data"]
+    assert until(lambda: sum(one["detected"] for one in data) > 10, 40)
+    assert data[-1]["distance_m"] == pytest.approx(math.hypot(2.0, 0.3), rel=0.02)
+    assert until(lambda: station.moves())
+    sensors.visible = False
+    assert until(lambda: not data[-1]["detected"], 10)
+    before = len(station.received)
+    assert until(lambda: len(station.received) > before + 8, 10)
+    assert station.received[-1].drive.z > 0.3, "it drives on to where the tag was"
+    sensors.visible = True
+    for script in (follower, locations, odometry):
+        end(script)
+    assert until(station.rests)
+
+
+def test_of_two_tags_with_one_id_a_follower_uses_the_larger(sensors: Sensors) -> None:
+    sensors.subscribe("apriltag-data")
+    sensors.start("apriltag-follow", "--marker-size", "0.25")
+    data = sensors.messages["apriltag-data"]
+    assert until(lambda: sum(one["detected"] for one in data) > 5, 40)
+    assert all("of" not in one for one in data)
+    sensors.two = True
+    assert until(lambda: sum(one.get("of") == 2 for one in data) > 10, 20)
+    assert {round(one["distance_m"], 1) for one in data if one.get("of") == 2} == {1.5}, "the nearer one"
