@@ -22,7 +22,7 @@ help:
 	@echo "make release           write build/release: wheel, sdist, Debian package, SBOM, checksums; a minute"
 	@echo "make clean             remove what the other targets created"
 
-# The options are checked before the set-up, which takes a minute; the shortest is that of pebble.extensions.lab.demo.main, rounded up.
+# The options are checked before the set-up, which takes a minute; the shortest is that of the demo, rounded up.
 demo:
 	@awk 'BEGIN { exit ARGV[1] + 0 < 26 }' "$(or $(SECONDS),26)" || \
 		{ echo "make demo: one round of driving takes 26 s: give it at least that many, make demo SECONDS=30" >&2; exit 2; }

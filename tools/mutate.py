@@ -5,7 +5,8 @@ copy of the tree, collected once; for each change, a forked process replaces the
 that reach its line: programs that tests start do not have it. A line that runs while tests are imported (a constant, a
 class body, a default) is changed in the copy and tried by all rows in a new process, which takes seconds. Calls that
 log are counted apart. A hang counts as killed. A page module is changed in the copy and tried by all rows; those of
-tests/ext/page/modules, which run in Node, if no others are named. What is inside its strings and templates is not changed.
+tests/ext/page/modules, which run in Node, if no others are named. What is inside its strings and templates is not
+changed.
 """
 
 import argparse

@@ -21,6 +21,7 @@ import time
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import suppress
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -170,11 +171,14 @@ def run(tree: Path) -> Counter[str]:
 def robot(direct: int, remote: int, local: int) -> None:
     """This runs in a process of its own, with the modules of the tree that is measured."""
     from pebble import contract
-    from pebble.extensions.lab.bench.clients import RobotSubscriber, StockClient
-    from pebble.extensions.lab.rig.processes import Processes
-    from pebble.extensions.lab.rig.robot import BASE, MEDIA, Robot
 
-    with Processes() as processes:
+    lab = "pebble.extensions.lab" if Path("pebble", "extensions", "lab").is_dir() else "pebble"  # of older trees
+    clients = import_module(f"{lab}.bench.clients")
+    RobotSubscriber, StockClient = clients.RobotSubscriber, clients.StockClient  # noqa: N806
+    robots = import_module(f"{lab}.rig.robot")
+    BASE, MEDIA, Robot = robots.BASE, robots.MEDIA, robots.Robot  # noqa: N806
+
+    with import_module(f"{lab}.rig.processes").Processes() as processes:
         one = Robot(processes, "mqtt", ("127.0.0.1", remote), services=MEDIA, reports=True)
         one.local_port = local
         one.prepare()

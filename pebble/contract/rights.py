@@ -1,6 +1,7 @@
 """What may be done to a robot, by kinds: the rights, and what each of them writes.
 
-pebble/extensions/fleet/roles.py says who has them. A robot asks only what they write, where it takes commands without a name.
+pebble/extensions/fleet/roles.py says who has them. A robot asks only what they write, where it takes commands
+without a name.
 """
 
 from collections.abc import Mapping

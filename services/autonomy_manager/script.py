@@ -38,7 +38,7 @@ class Script(Struct, frozen=True, kw_only=True):
     main: tuple[str, ...] = ()  # the settings that operators see first
     dependencies: tuple[Dependency, ...] = ()
     environment: dict[str, str] = {}
-    ours: bool = False  # it uses pebble.extensions.scripts.script, which signs its drive commands and stops the wheels at its end
+    ours: bool = False  # it uses pebble.script, which signs its drive commands and stops the wheels at its end
     broken: str = ""  # why it cannot be started
 
 

@@ -1,4 +1,4 @@
-"""Offers a Zenoh robot's topics on a broker on the robot: ``python -m pebble.services.mqtt_mirror CONFIG``.
+"""Offers a Zenoh robot's topics on a broker on the robot.
 
 docs/bridge.md explains when it forwards, and when it refuses to.
 """

@@ -1,4 +1,4 @@
-"""Records the robot on the robot: ``python -m pebble.services.recorder CONFIG``."""
+"""Records the robot on the robot."""
 
 import os
 from collections.abc import Iterator

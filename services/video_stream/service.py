@@ -1,4 +1,4 @@
-"""Runs a foreign streaming program while video is requested: ``python -m pebble.services.video_stream CONFIG``."""
+"""Runs a foreign streaming program while video is requested."""
 
 import signal
 from typing import Any

@@ -86,7 +86,8 @@ def demos(temporary: Path) -> Iterator[list[Demo]]:
 
 
 def start(demos: list[Demo], folder: Path, arguments: str, terminal: int | None = None) -> Demo:
-    imports = "import sys; from pebble.extensions.lab.demo.brokers import BrokerKind; from pebble.extensions.lab.demo.main import run"
+    lab = "pebble.extensions.lab.demo"
+    imports = f"import sys; from {lab}.brokers import BrokerKind; from {lab}.main import run"
     demos.append(Demo(folder, f"{imports}; sys.exit(run({arguments}))", terminal))
     return demos[-1]
 

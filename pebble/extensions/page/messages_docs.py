@@ -1,7 +1,7 @@
 """Generates messages.d.ts from messages.py, and the table of the words for people.
 
-Program: ``python -m pebble.extensions.page.messages_docs`` writes messages.d.ts; a test checks that it is current. With a folder it
-writes the table there.
+Program: ``python -m pebble.extensions.page.messages_docs`` writes messages.d.ts; a test checks that it is current.
+With a folder it writes the table there.
 """
 
 import json

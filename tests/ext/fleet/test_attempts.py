@@ -216,7 +216,7 @@ def test_every_role_and_every_command_of_the_contract_is_tried() -> None:
     assert tried == given
 
 
-#: The rows of docs/ext/fleet.md: what is sent, below this robot or the system; ``{by}`` names the sender at level `named`.
+#: The rows of docs/ext/fleet.md: what is sent, below the robot or the system; ``{by}`` is the sender at level `named`.
 ROWS = {
     "emergency stop": ["incoming/{by}estop"],
     "emergency stop, without a name": ["incoming/estop"],

@@ -169,7 +169,8 @@ def test_without_pyav_the_error_names_what_to_install(monkeypatch: pytest.Monkey
 
 def test_pyav_is_loaded_by_those_who_use_it() -> None:
     program = (
-        "import sys, numpy; from pebble.media.video import make_encoder; from pebble.media.decode import VideoDecoder;"
+        "import sys, numpy; from pebble.media.video import make_encoder;"
+        "from pebble.media.decode import VideoDecoder;"
         "VideoDecoder().feed(make_encoder('json', fps=9).encode(numpy.zeros((48, 64, 3), numpy.uint8), 1));"
         "sys.exit('av' in sys.modules)"
     )

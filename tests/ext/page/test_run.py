@@ -14,8 +14,8 @@ from typing import Any
 
 import pytest
 
+from pebble.extensions.operator.client import page_packages
 from pebble.extensions.page import run
-from pebble.extensions.page import setting as settings_module
 from tests.support import ROOT, Broker, Child, free_port, until
 
 
@@ -54,7 +54,7 @@ def test_everything_that_is_missing_is_named_at_once(tmp_path: Path, caplog: pyt
 def test_missing_packages_are_named_with_the_command_that_installs_them(
     tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(settings_module, "find_spec", lambda name: None if name == "uvicorn" else object())
+    monkeypatch.setattr(page_packages, "find_spec", lambda name: None if name == "uvicorn" else object())
     assert run.main([str(written(tmp_path, {"mqtt": {"host": "127.0.0.1"}}))]) == 1
     assert "(uvicorn): pip install 'pebble-robot[web]'" in caplog.text
 

@@ -1,8 +1,8 @@
 """An operator who drives at a steady rate over MQTT, what is driven, and which commands and reports of its MCU arrived.
 
-As processes beside the robot: ``python -m pebble.extensions.lab.bench.bridge_operator WHAT …``. ``frames RUN_DIR`` reads a robot's
-frames and ``media PORT BASE`` receives its video and sound; both answer every line with the counts so far. ``hop PORT
-BASE TRACE`` is a stock client one hop from the operator, which writes a trace as a simulated MCU does.
+As processes beside the robot: ``python -m pebble.extensions.lab.bench.bridge_operator WHAT …``. ``frames RUN_DIR``
+reads a robot's frames and ``media PORT BASE`` receives its video and sound; both answer every line with the counts so
+far. ``hop PORT BASE TRACE`` is a stock client one hop from the operator, which writes a trace as a simulated MCU does.
 """
 
 from __future__ import annotations

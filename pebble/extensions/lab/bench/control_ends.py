@@ -3,8 +3,8 @@
 A service handles a drive command on the transport's thread that brings it, if it is idle; else its inbox keeps the
 command for its own thread (decision 24). The ends do the same. Stock paho calls its handler on its network thread.
 
-``python -m pebble.extensions.lab.bench.control_ends echo|sender stand-in|mqtt|zenoh SETTINGS`` (JSON, of the transport). A sender
-receives slices as JSON and answers each.
+``python -m pebble.extensions.lab.bench.control_ends echo|sender stand-in|mqtt|zenoh SETTINGS`` (JSON, of the
+transport). A sender receives slices as JSON and answers each.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """One end of a transfer of time-stamped frames, 30 a second, as a process that measures during a given window.
 
-``python -m pebble.extensions.lab.bench.frames_worker VARIANT ROLE WHERE SIZE``: ``WHERE`` is a folder for sockets, or a broker's
-port; ``SIZE`` is ``640x480``. One end of GStreamer's is this file in the system's Python, where gi and Gst are
+``python -m pebble.extensions.lab.bench.frames_worker VARIANT ROLE WHERE SIZE``: ``WHERE`` is a folder for sockets, or a
+broker's port; ``SIZE`` is ``640x480``. One end of GStreamer's is this file in the system's Python, where gi and Gst are
 installed; without arguments it fails if it could not be. So a plain file imports only the standard library, numpy, and
 the other end of a worker.
 

@@ -6,7 +6,8 @@ cheap, all on one thread: a connection and a will each, retained capabilities, f
 that obeys. The latency is that of a voltage, from the publish call of one more board until the viewer, or the
 subscriber, has it; one that the page has replaced by a newer one is lost.
 
-``python -m pebble.extensions.lab.bench.scale mqtt|zenoh WHERE COUNT`` are the boards; ``WHERE`` is a broker's port or a hub's folder.
+``python -m pebble.extensions.lab.bench.scale mqtt|zenoh WHERE COUNT`` are the boards; ``WHERE`` is a broker's port or a
+hub's folder.
 """
 
 from __future__ import annotations

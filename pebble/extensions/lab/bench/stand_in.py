@@ -1,4 +1,6 @@
-"""A robot as an engineer would build it with paho alone: ``python -m pebble.extensions.lab.bench.stand_in bridge|serial …``.
+"""A robot as an engineer would build it with paho alone.
+
+Program: ``python -m pebble.extensions.lab.bench.stand_in bridge|serial …``.
 
 What a user would have without us, after the description of the original in the paper; not the original's code, which is
 not here. One process forwards between two brokers: a client on each side, whose ``on_message`` publishes on the other.

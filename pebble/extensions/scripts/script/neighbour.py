@@ -32,7 +32,7 @@ class Way(NamedTuple):
 
 
 class Neighbour:
-    """Robot ``name``; ``me`` is this one. :meth:`pebble.extensions.scripts.script.Robot.neighbour` makes it. Any thread may use it."""
+    """Robot ``name``; ``me`` is this one. :meth:`pebble.script.Robot.neighbour` makes it. Any thread may use it."""
 
     def __init__(self, name: str, me: Identity, way: Way) -> None:
         self.name = name

@@ -1,4 +1,7 @@
-"""Judges each broker that can run here, and prints what docs/brokers.md has a table of: ``tests.ext.checks.brokers.document``."""
+"""Judges each broker that can run here, and prints what docs/brokers.md has a table of.
+
+Program: ``python -m tests.ext.checks.brokers.document``.
+"""
 
 from __future__ import annotations
 

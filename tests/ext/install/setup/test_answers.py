@@ -104,7 +104,8 @@ def test_without_mosquitto_there_is_no_broker_here(root: Path, tmp_path: Path, r
 def terminal(root: Path) -> Terminal:
     """The command in a terminal of 60 columns."""
     script = (
-        "from pathlib import Path; from pebble.extensions.install.setup.session import set_up; from tests.ext.install.setup.rig import machine;"
+        "from pathlib import Path; from pebble.extensions.install.setup.session import set_up;"
+        "from tests.ext.install.setup.rig import machine;"
         f"exit(set_up(machine(Path({str(root)!r})), None, None))"
     )
     return Terminal("env", "-u", "SUDO_USER", "COLUMNS=60", sys.executable, "-c", script)

@@ -50,5 +50,6 @@ def test_encodings_are_distinguished() -> None:
 def test_the_measuring_process_does_not_import_large_libraries() -> None:
     """Otherwise part of a robot's memory would be counted as the measuring process's."""
     large = "{'numpy', 'cv2', 'av', 'zenoh', 'matplotlib'}"
-    code = f"import sys, pebble.extensions.lab.bench.cost, pebble.extensions.lab.commands.bench, pebble.extensions.lab.bench.report; print({large} & set(sys.modules))"
+    lab = "pebble.extensions.lab"
+    code = f"import sys, {lab}.bench.cost, {lab}.commands.bench, {lab}.bench.report; print({large} & set(sys.modules))"
     assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout == "set()\n"

@@ -1,4 +1,4 @@
-"""The page looks as it did: pictures of a few states are those in tests/ext/page/page/looks (``make long PART=looks``)."""
+"""The page looks as it did: pictures of a few states are those in the folder looks (``make long PART=looks``)."""
 
 from __future__ import annotations
 

@@ -1,8 +1,8 @@
 """Networks between a robot and its broker that can be impaired and restored while both use them.
 
 Two network namespaces with a veth pair between them: rate by TBF and loss by nftables, all of it in the kernel.
-``python -m pebble.extensions.lab.bench.impair.network`` is a process that holds them. When it ends, the devices disappear, and so do
-the namespaces once they are empty.
+``python -m pebble.extensions.lab.bench.impair.network`` is a process that holds them. When it ends, the devices
+disappear, and so do the namespaces once they are empty.
 """
 
 from __future__ import annotations

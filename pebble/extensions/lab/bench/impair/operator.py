@@ -1,7 +1,8 @@
 """The operator of one robot, on the broker's side of the network: drives, receives video, then audio, and plays a clip.
 
-As a process: ``python -m pebble.extensions.lab.bench.impair.operator HOST PORT BASE PLAN``, the plan as JSON. It reports when the
-robot is ready, then serves each line, ``trial`` or ``recover``, and ends when its standard input closes.
+As a process: ``python -m pebble.extensions.lab.bench.impair.operator HOST PORT BASE PLAN``, the plan as JSON. It
+reports when the robot is ready, then serves each line, ``trial`` or ``recover``, and ends when its standard input
+closes.
 """
 
 from __future__ import annotations
