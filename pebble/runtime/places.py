@@ -1,8 +1,11 @@
-"""The places of an installed robot's files, below ``/`` or below another root."""
+"""The places of an installed robot's files, below ``/`` or below another root, and of a machine's mosquitto."""
 
+import shutil
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+
+SBIN = "/usr/local/sbin:/usr/sbin:/sbin"  # where Debian puts brokers and network tools, not in the PATH of users
 
 
 @dataclass(frozen=True)
@@ -73,3 +76,8 @@ class Places:
     def named(self, path: Path) -> str:
         """Return the path as it is on the machine whose root this is."""
         return f"/{path.relative_to(self.root)}"
+
+
+def mosquitto_path() -> str | None:
+    """Return where mosquitto is; None if it is not installed."""
+    return shutil.which("mosquitto") or shutil.which("mosquitto", path=SBIN)

@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from pebble.commands.options import CaCert, PasswordFile, broker_of
+from pebble.commands.options import CaCert, PasswordFile
+from pebble.extensions.operator.commands.target import broker_of
 
 if TYPE_CHECKING:
     from pebble.config import Config

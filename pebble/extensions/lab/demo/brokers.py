@@ -11,7 +11,8 @@ from importlib.util import find_spec
 from typing import Any
 
 from pebble.errors import PebbleError
-from pebble.extensions.lab.rig.processes import HOST, mosquitto_path
+from pebble.extensions.lab.rig.processes import HOST
+from pebble.runtime.places import mosquitto_path
 
 
 class BrokerKind(StrEnum):

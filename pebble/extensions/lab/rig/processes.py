@@ -19,12 +19,12 @@ from typing import Any, ClassVar, Self, TypeVar
 
 from pebble.errors import PebbleError
 from pebble.runtime.parent import tied_to_parent
+from pebble.runtime.places import mosquitto_path
 
 #: In this order they end: robots while the brokers to which they report it still run, MCUs after what they move.
 OPERATORS, ROBOTS, MCUS, BROKERS = range(4)
 
 HOST = "127.0.0.1"  # of brokers
-SBIN = "/usr/local/sbin:/usr/sbin:/sbin"  # where Debian puts brokers and network tools, not in the PATH of users
 _PORTS = 10_100, 32_768  # below those of outgoing connections, on Linux and elsewhere; no browser opens 10080
 _LONGEST_FOLDER = 40  # characters: Unix sockets live below, and their paths end at 108 bytes
 
@@ -145,11 +145,6 @@ class Worker(Program):
     def _read(self, each: Each) -> None:
         super()._read(each)
         self._answers.put(None)
-
-
-def mosquitto_path() -> str | None:
-    """None if it is not installed."""
-    return shutil.which("mosquitto") or shutil.which("mosquitto", path=SBIN)
 
 
 def mosquitto_command(port: int, stem: Path, extra: Sequence[str] = (), host: str = HOST) -> list[str]:

@@ -1,11 +1,17 @@
 """The options that select where a command connects."""
 
+from __future__ import annotations
+
 import functools
 import inspect
 from collections.abc import Callable
-from typing import Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from pebble.commands.options import CaCert, ConfigOption, PasswordFile, RemoteOption, RobotOption, UrlOption
+
+if TYPE_CHECKING:
+    from pebble.transports import MqttSettings
 
 
 def _option(name: str, option: Any, default: object = None) -> inspect.Parameter:
