@@ -18,10 +18,17 @@ DRIVE = "incoming/drive-values"
 
 
 def stop_and_wait(station: Station) -> None:
-    """Send a stop and wait until it reaches the wheels: a serial line that was just opened takes half a second."""
+    """Send a stop until it reaches the wheels: a serial line and a mirror open late."""
     began = time.monotonic()
-    station.operator.send(DRIVE, {"x": 0, "z": 0})
-    assert until(lambda: station.rig.mcu.drives(began) and not station.rig.mcu.moving(), 3)
+
+    def stands() -> bool:
+        return station.rig.mcu.drives(began) and not station.rig.mcu.moving()
+
+    for _ in range(4):
+        station.operator.send(DRIVE, {"x": 0, "z": 0})
+        if until(stands, 1):
+            return
+    assert stands()
 
 
 def first_motion(station: Station, since: float) -> tuple[float, tuple[float, float]]:
