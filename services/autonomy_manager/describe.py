@@ -68,11 +68,11 @@ class BrokenScriptError(DescribeError):
 
 
 def is_ours(entry: Path) -> bool:
-    """Whether a Python file imports ``run`` from pebble, or pebble.extensions.scripts.script. It is read, never run.
+    """True if a Python file imports ``run`` from pebble, or pebble.script. It is read, never run.
 
-    Raises BrokenScriptError for what is no Python.
+    A pipe or a device is not opened: that would wait, or never end. Raises BrokenScriptError for what is no Python.
     """
-    if entry.suffix != ".py":
+    if entry.suffix != ".py" or not entry.is_file():
         return False
     try:
         if entry.stat().st_size > _LONGEST_SOURCE:

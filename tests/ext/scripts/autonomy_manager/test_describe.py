@@ -58,6 +58,13 @@ def test_what_is_no_python_is_named_with_its_line_and_no_other_file_is_ours(entr
     assert not is_ours(entry.with_name("missing.py"))
 
 
+def test_what_is_no_file_is_not_opened(entry: Path) -> None:
+    os.mkfifo(pipe := entry.with_name("pipe.py"))  # to open it would wait for a writer
+    (device := entry.with_name("device.py")).symlink_to("/dev/zero")  # it has no end
+    assert not is_ours(pipe)
+    assert not is_ours(device)
+
+
 def asked(entry: Path, text: str) -> Description:
     entry.write_text(text)
     return ask([sys.executable, str(entry)], entry.parent, os.environ)
