@@ -1,4 +1,4 @@
-"""One robot's config. `pebble check --keys` lists every key; configs/schema.json tells editors."""
+"""The config of one robot. `pebble check --keys` lists every key; configs/schema.json tells editors."""
 
 from pebble.config.config import LAUNCHER_LOCK as LAUNCHER_LOCK
 from pebble.config.config import RUN_DIR_OF_UNIT as RUN_DIR_OF_UNIT

@@ -148,7 +148,7 @@ def _name(text: str) -> str:
 
 
 def is_loopback(host: str) -> bool:
-    """Whether ``host`` is an address of this machine that no other one reaches."""
+    """True if ``host`` is an address of this machine that no other one reaches."""
     try:
         return ip_address(host).is_loopback
     except ValueError:

@@ -9,7 +9,7 @@ Strangers = Literal["drive", "free", "refuse"]
 
 
 class Security(Section, frozen=True, kw_only=True):
-    """Who may do what to this robot; docs/ext/fleet.md explains the levels."""
+    """Rules of who may do what to this robot; docs/ext/fleet.md explains the levels."""
 
     level: Annotated[
         SecurityLevel,

@@ -1,4 +1,4 @@
-"""One medium of one robot for Foxglove: requested while a client subscribes to its channels, converted, published."""
+"""A medium of a robot for Foxglove: requested while a client subscribes to its channels, converted, published."""
 
 import asyncio
 import logging
@@ -119,7 +119,7 @@ class MediaFeed:
         return next((name for name in _WITHOUT_PYAV[self._medium] if name in known), _AS_CONFIGURED)
 
     def _take_picture(self, payload: bytes) -> bool:
-        """Whether it is a picture. One that is missing before it is noticed, and a key frame wanted."""
+        """True if it is a picture. One that is missing before it is noticed, and a key frame wanted."""
         header = self._sequence.take(payload)
         if header is None:
             return False

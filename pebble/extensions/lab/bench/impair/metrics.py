@@ -196,7 +196,7 @@ def rest_s(commands: Sequence[Command], entries: Iterable[Entry]) -> float:
 
 @dataclass(frozen=True, slots=True)
 class Trial:
-    """One subject in one condition. ``traffic``: bytes that the robot had sent before and after each phase."""
+    """A subject in one condition. ``traffic``: bytes that the robot had sent before and after each phase."""
 
     subject: str
     name: str
