@@ -19,6 +19,7 @@ from pathlib import Path
 import numpy as np
 
 from pebble.config import load
+from pebble.services.av_daemon.config import AvDaemon
 from pebble.transports.frames import Frame, FrameReader
 from pebble.transports.segments import SHM
 
@@ -58,7 +59,7 @@ def offer(path: Path, parser: str, reader: FrameReader, data: Callable[[Frame], 
 
 def main(config_path: str) -> None:
     config = load(Path(config_path))
-    video, audio = config.services.av_daemon.video, config.services.av_daemon.audio
+    video, audio = config.section(AvDaemon).video, config.section(AvDaemon).audio
     size = (video.width, video.height)[:: -1 if video.rotate_degrees in (90, 270) else 1]
     bgr = "rawvideoparse format=bgr width={} height={} framerate={}/1".format(*size, round(video.fps))
     pcm = f"rawaudioparse pcm-format=s16le sample-rate={audio.rate} num-channels={audio.channels}"
@@ -68,7 +69,7 @@ def main(config_path: str) -> None:
     with ThreadPoolExecutor() as pool, ExitStack() as readers:
         signal.signal(signal.SIGTERM, lambda *_: readers.close())
         running = []
-        for name, path in config.services.av_daemon.sockets().items():
+        for name, path in config.section(AvDaemon).sockets().items():
             parser, reader, data = kinds[name]
             running.append(pool.submit(offer, path, parser, readers.enter_context(reader), data))
         for ended in as_completed(running):

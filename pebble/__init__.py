@@ -21,9 +21,9 @@ _FROM = {
     "camera": "pebble.cameras",
     "Channel": "pebble.contract",
     "Kind": "pebble.contract",
-    "Robot": "pebble.extensions.scripts.script",
-    "Stopped": "pebble.extensions.scripts.script",
-    "run": "pebble.extensions.scripts.script",
+    "Robot": "pebble.script",
+    "Stopped": "pebble.script",
+    "run": "pebble.script",
 }
 
 

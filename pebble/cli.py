@@ -95,7 +95,7 @@ def _run(arguments: list[str]) -> int:
         from pebble.config import load  # without typer: this process becomes the launcher, which stays in memory
         from pebble.launcher.launcher import Launcher
 
-        return Launcher(load(Path(arguments[1]))).run()
+        return Launcher(load(Path(arguments[1]), lenient=True)).run()
     from pebble.commands import app
 
     return app.run(arguments)

@@ -7,7 +7,7 @@ import resource
 
 import pytest
 
-from pebble.extensions.checks.check import State
+from pebble.check_result import State
 from pebble.extensions.checks.machine import memory_lock
 
 _found = memory_lock(resource.getrlimit(resource.RLIMIT_MEMLOCK)[0], root=os.geteuid() == 0)

@@ -5,8 +5,8 @@ from pathlib import Path
 
 from pebble.errors import TransportError
 
-#: The longest names of sockets in a run directory: of frames, and of the peers.
-FRAMES_SOCKET, PEER_SOCKET = "frames-microphone.sock", "01234567.sock"
+#: The longest name of a socket in a run directory, of the frames of a microphone; those of peers are shorter.
+LONGEST_SOCKET = "frames-microphone.sock"
 
 _LIMIT = 108  # bytes, sizeof(sun_path): a longer path cannot be bound
 

@@ -4,81 +4,46 @@ from __future__ import annotations
 
 import logging
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from importlib import import_module
 from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import typer
 from typer.core import TyperCommand, TyperGroup
 
+from pebble.extension import Command as Offered
+from pebble.extension import ours, packages, part, refuse_claims
 from pebble.version import __version__
 
 if TYPE_CHECKING:
     from typer._click.core import Command, Context
     from typer._click.formatting import HelpFormatter
 
-#: Each command, by what it is for: the module of pebble that has the function of its name, or registers what is
-#: below it, and its line of help. One of two words is imported without the others of its group.
-COMMANDS: Final = {
-    "use": {
-        "demo": ("extensions.lab.commands.sim", "run four simulated robots; needs nothing else"),
-        "drive": ("extensions.operator.commands.drive", "drive a robot with the keys of this terminal"),
-        "estop": ("extensions.operator.commands.estop", "stop robots until they are reset"),
-        "watch": ("extensions.operator.commands.watch", "write a picture of a robot's camera into a file"),
-        "web": ("extensions.page.commands.group", "drive, stop and watch robots in a browser"),
-        "foxglove": ("extensions.foxglove.command", "show robots live in the Foxglove app"),
-    },
-    "own": {
-        "setup": ("extensions.install.commands.setup", "make a robot of this machine, or back it up"),
-        "up": ("commands.up", "run a robot"),
-        "check": ("commands.check", "validate configs and summarise them"),
-        "doctor": ("extensions.checks.commands.doctor", "find what is wrong with a machine, robot or broker"),
-        "flash": ("extensions.install.commands.flash", "install a robot's firmware on its board"),
-    },
-    "write": {
-        "script": ("extensions.scripts.commands.group", "write, start and stop programs that move a robot"),
-        "topic": ("extensions.operator.commands.topic", "list, print, publish and measure messages"),
-        "sim": ("extensions.lab.commands.sim", "simulate boards, robots, rooms and fleets"),
-        "conform": ("extensions.checks.commands.conform", "judge a robot of your own by the contract"),
-    },
-    "share": {
-        "fleet": ("extensions.fleet.commands.group", "give robots and people accounts at a broker"),
-        "fleet hub": ("extensions.fleet.commands.hub", "Run a Zenoh hub for several robots."),
-        "fleet gateway": ("extensions.fleet.commands.gateway", "Carry robots of a hub or a LAN to a broker."),
-        "fleet audit": ("extensions.fleet.commands.audit", "Print who did what to a robot."),
-        "cert": ("extensions.page.commands.cert", "make certificates, so that phones may connect"),
-    },
-    "measure": {
-        "record": ("extensions.recordings.commands.record", "record robots"),
-        "recordings": ("extensions.recordings.commands.group", "list, search, mend and export recordings"),
-        "replay": ("extensions.recordings.commands.replay", "play recordings as if their robots were there"),
-        "analyse": ("extensions.recordings.commands.analyse", "report bandwidth, outages and latency of recordings"),
-        "bench": ("extensions.lab.commands.bench", "compare MQTT and Zenoh on this machine"),
-    },
+#: Ours that are of no extension.
+_CORE: Final = {
+    "up": Offered("pebble.commands.up:up", "run a robot", "own", 20),
+    "check": Offered("pebble.commands.check:check", "validate configs and summarise them", "own", 30),
 }
+#: The headings of the help, in their order; other packages' commands stand last.
+_GROUPS: Final = ("use", "own", "write", "share", "measure", "more")
 
-#: Commands of the last release, and how they are called now.
-FORMER: Final = {
-    "topics": "topic contract",
-    "topic bw": "topic hz",
-    "snapshot": "watch --picture FILE",
-    "script status": "script list",
-    "selftest": "doctor --running",
-    "report": "doctor --report FILE.zip",
-    "backup": "setup --backup FILE",
-    "hub": "fleet hub",
-    "gateway": "fleet gateway",
-    "audit": "fleet audit",
-    "impair": "bench impair",
-}
 
-_ROWS: Final = {words: row for rows in COMMANDS.values() for words, row in rows.items()}
+def commands(words: Sequence[str] = ()) -> dict[str, Offered]:
+    """Return each command by its words, in the order of the help.
+
+    Those of other packages are looked for only if the first of ``words`` is none of ours.
+    """
+    offered = {**_CORE, **{name: row for one in ours() for name, row in one.commands.items()}}
+    if not words or words[0] not in offered:
+        foreign = list(packages())
+        refuse_claims([*ours(), *foreign])
+        offered |= {name: row for one in foreign for name, row in one.commands.items()}
+    return dict(sorted(offered.items(), key=lambda item: (_GROUPS.index(item[1].group), item[1].rank)))
 
 
 def run(arguments: list[str]) -> int:
     """Run one command line; returns the exit code, 2 for a wrong command line. Raises PebbleError."""
-    for former, now in FORMER.items():
+    for former, now in ((former, now) for one in ours() for former, now in one.former.items()):
         if arguments[: len(former.split())] == former.split():
             command = now.partition(" --")[0]
             sys.stderr.write(f'pebble: "{former}" is now "{now}": pebble {command} --help\n')
@@ -87,36 +52,43 @@ def run(arguments: list[str]) -> int:
         return _run(arguments)
 
 
-def application() -> Command:
-    """Build the command line; what is below a command is imported when it is needed."""
+def application(words: Sequence[str] = ()) -> Command:
+    """Build the command line for such words; what is below a command is imported when it is needed."""
     app = typer.Typer(cls=_Pebble, rich_markup_mode=None)
     app.callback()(_options)
-    return typer.main.get_command(app)
+    command = typer.main.get_command(app)
+    assert isinstance(command, _Pebble)  # noqa: S101 - cls
+    command.offer(commands(words))
+    return command
 
 
 class _Pebble(TyperGroup):
     """The command ``pebble``. Its help has one line for each command, and fits on a terminal of 80 x 24."""
 
-    def __init__(self, **attributes: Any) -> None:
-        commands = {words: _Listed(words) for words in _ROWS if " " not in words}
-        super().__init__(**attributes | {"commands": commands})
+    _offered: Mapping[str, Offered] = {}
+
+    def offer(self, offered: Mapping[str, Offered]) -> None:
+        """Have these commands."""
+        self._offered = offered
+        self.commands = {words: _Listed(words, offered) for words in offered if " " not in words}
 
     def format_help(self, ctx: Context, formatter: HelpFormatter) -> None:
         formatter.write(
             f"Usage: {ctx.command_path} COMMAND …  (also: --version, COMMAND --help, --install-completion)\n"
         )
-        for group, rows in COMMANDS.items():
-            names = [name for name in rows if " " not in name]
-            for name in names:
-                formatter.write(f"{group if name == names[0] else '':<9}{name:<12}{rows[name][1]}\n")
+        before = ""
+        for name, row in self._offered.items():
+            if " " not in name:
+                formatter.write(f"{'' if row.group == before else row.group:<9}{name:<12}{row.help}\n")
+                before = row.group
 
 
 class _Listed(TyperCommand):
     """A command of the table. It is imported when it runs, explains itself or completes what is typed."""
 
-    def __init__(self, words: str) -> None:
-        super().__init__(words.split()[-1], help=_ROWS[words][1])
-        self._words = words
+    def __init__(self, words: str, offered: Mapping[str, Offered]) -> None:
+        super().__init__(words.split()[-1], help=offered[words].help)
+        self._words, self._offered = words, offered
 
     def make_context(self, info_name: str | None, args: list[str], parent: Context | None = None, **extra: Any) -> Any:
         command = self._command(args)
@@ -128,16 +100,18 @@ class _Listed(TyperCommand):
 
     def _command(self, arguments: list[str]) -> Command:
         below: dict[str, Command] = {
-            words.split()[1]: _Listed(words) for words in _ROWS if words.startswith(f"{self._words} ")
+            words.split()[1]: _Listed(words, self._offered)
+            for words in self._offered
+            if words.startswith(f"{self._words} ")
         }
         if arguments and arguments[0] in below:
             return TyperGroup(name=self.name, commands=below, rich_markup_mode=None)
-        module, name = import_module(f"pebble.{_ROWS[self._words][0]}"), str(self.name)
+        loaded, name = part(self._offered[self._words].place), str(self.name)
         app = typer.Typer(rich_markup_mode=None)
-        if hasattr(module, "register"):
-            module.register(app)
+        if hasattr(loaded, "register"):
+            loaded.register(app)
         else:
-            app.command(name)(getattr(module, name))
+            app.command(name)(loaded)
         command = typer.main.get_group(app).commands[name]
         if isinstance(command, TyperGroup):
             command.commands.update(below)
@@ -146,7 +120,7 @@ class _Listed(TyperCommand):
 
 def _run(arguments: list[str]) -> int:
     try:
-        code = application().main(arguments, prog_name="pebble", standalone_mode=False)
+        code = application(arguments).main(arguments, prog_name="pebble", standalone_mode=False)
     except typer.TyperException as error:
         context, message = getattr(error, "ctx", None), error.format_message().rstrip(".")
         if context is not None and message == "Missing command":

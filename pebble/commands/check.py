@@ -3,27 +3,25 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, NamedTuple
+from typing import Annotated, NamedTuple
 
 import typer
 
 from pebble.config import Config, Mqtt, load, resolved
 from pebble.config.rules.doors import place_of
+from pebble.config.rules.exposure import connections
 from pebble.config.secret_text import shown_user, without_secrets
 from pebble.config.visible import shown
 from pebble.contract import CHANNELS, MEDIA_STATUS, STATUS, TOUCH_SENSORS, Channel
 from pebble.contract.serial_protocols import SERIAL_PROTOCOLS
 from pebble.errors import ConfigError, TransportError
+from pebble.extension import Facts, lacking_packages, part, programs_of
 from pebble.launcher.programs import programs
 from pebble.runtime.addresses import Addresses
 from pebble.runtime.connections import check_connections, tls_settings
 from pebble.runtime.process import view_of
-from pebble.services.neighbours.config import Neighbours
-
-if TYPE_CHECKING:
-    from pebble.services.autonomy_manager.script import Script
 
 SCHEMA = "schema.json"  # in the folder of configs, so `configs/*.json` includes it
 _LAUNCHER = "launcher"
@@ -80,32 +78,8 @@ def _check(path: Path, *, as_json: bool, first: bool) -> bool:
         return True
     if not first:
         typer.echo()
-    _print(config, path, _found_scripts(config))
+    _print(config, path, [part(one.facts)(config) for one in config.installed if one.facts])
     return True
-
-
-def _found_scripts(config: Config) -> dict[str, Script]:
-    """The scripts that ``autonomy_manager`` would offer, by name."""
-    if config.robot.platform != "linux" or not config.services.autonomy_manager.enabled:
-        return {}
-    try:
-        from pebble.services.autonomy_manager.catalogue import Catalogue  # few checks need it
-    except ModuleNotFoundError:  # a system without fcntl runs no robots
-        return {}
-    found: list[dict[str, Script]] = []
-    Catalogue(config, asks=False).scan(found.append)
-    return found[-1]
-
-
-def _fitness(script: Script) -> str:
-    """Whether it can run here, in a few words."""
-    if script.broken or script.ours:
-        return f"does not run: {script.broken}" if script.broken else "runs, Pebble's own"
-    from pebble.services.autonomy_manager.environment import environment
-    from pebble.services.autonomy_manager.interpreter import lacking
-
-    missing = lacking(script.command, script.folder, environment(script.environment))
-    return f"runs with {script.command[0]}" + (f", which lacks {', '.join(missing)}" if missing else "")
 
 
 def _check_certificates(config: Config) -> None:
@@ -117,7 +91,7 @@ def _check_certificates(config: Config) -> None:
         "transport.mqtt_mirror": None if transport.mqtt_mirror is None else transport.mqtt_mirror.tls,
         "services.mqtt_bridge.remote_mqtt": bridge.remote_mqtt.tls,
         "services.mqtt_bridge.remote": None if bridge.remote is None else bridge.remote.tls,
-        "web_interface.mqtt": config.web_interface.mqtt.tls,
+        **{".".join(map(str, path)): section.tls for path, section in connections(config) if hasattr(section, "tls")},
     }
     problems = []
     for place, section in sections.items():
@@ -134,7 +108,7 @@ def _check_certificates(config: Config) -> None:
         raise ConfigError(problems)
 
 
-def _print(config: Config, path: Path, scripts: Mapping[str, Script]) -> None:
+def _print(config: Config, path: Path, added: list[Facts]) -> None:
     from rich.console import Console
     from rich.padding import Padding
     from rich.table import Table
@@ -150,7 +124,7 @@ def _print(config: Config, path: Path, scripts: Mapping[str, Script]) -> None:
             console.print(Padding(grid, (above, 0, 0, 2)))
 
     console.print(Text.assemble((config.base, "bold"), f"  {path}"))
-    print_grid("dim", facts(config), above=0)
+    print_grid("dim", facts(config, added), above=0)
     if config.robot.platform == "linux":
         table = Table(box=None, pad_edge=False, header_style="dim", padding=(0, 1, 0, 0))
         for name in ("process", "", "topic"):
@@ -167,8 +141,16 @@ def _print(config: Config, path: Path, scripts: Mapping[str, Script]) -> None:
                     "yes" if line.retained else "",
                 )
         console.print(Padding(table, (1, 0, 0, 2)))
-    print_grid("dim", [("script", shown(name), shown(_fitness(script))) for name, script in scripts.items()])
-    print_grid("yellow", [("warning", warning) for warning in config.warnings])
+    print_grid("dim", [tuple(map(shown, line)) for one in added for line in one.table])
+    print_grid("yellow", [("warning", warning) for warning in (*config.warnings, *_packages(config))])
+
+
+def _packages(config: Config) -> Iterator[str]:
+    """What the programs of this robot cannot do without, and this Python lacks."""
+    for extension in config.installed:
+        if missing := lacking_packages(extension) if programs_of([extension], config) else []:
+            install = f'pip install "{extension.package}[{extension.extra}]"'
+            yield f"{extension.name} does not run without {' and '.join(missing)}: {install}"
 
 
 class TopicLine(NamedTuple):
@@ -181,7 +163,7 @@ class TopicLine(NamedTuple):
     renamed: bool
 
 
-def facts(config: Config) -> list[tuple[str, str]]:
+def facts(config: Config, added: Iterable[Facts]) -> list[tuple[str, str]]:
     """The transport, the connections and the processes, line by line, without secrets."""
     if config.robot.platform != "linux":
         firmware = f"runs on its own MCU ({config.robot.platform}), not with `pebble up`"
@@ -191,8 +173,7 @@ def facts(config: Config) -> list[tuple[str, str]]:
         found.append(("mirror", _mqtt(config.transport.mqtt_mirror)))
     if config.services.mqtt_bridge.enabled:
         found.append(("uplink", _uplink(config)))
-    if config.services.neighbours.enabled:
-        found.append(("lan", _lan(config.services.neighbours)))
+    found += [line for one in added for line in one.lines]
     found += _scripts(config)
     found += [("serial", line) for line in _serial_lines(config)]
     found += [("for the original's scripts", text) for text in _local_media(config)]
@@ -268,13 +249,6 @@ def _uplink(config: Config) -> str:
     return f"mqtt, {_mqtt(bridge.remote_mqtt)}"
 
 
-def _lan(section: Neighbours) -> str:
-    ways = [f"connects to {one}" for one in section.lan.connect]
-    drivers = [name for name, granted in section.commanded.items() if granted]
-    names = {"receives": section.listens, "driven by scripts of": drivers, "shares": section.shares}
-    return ", ".join([*ways, *(f"{what} {' and '.join(found)}" for what, found in names.items() if found)])
-
-
 def _scripts(config: Config) -> list[tuple[str, str]]:
     """What a script's signature is worth at a broker that others share: no bridge stands between it and the motors."""
     bridge, shared = config.services.mqtt_bridge, config.transport.mqtt_mirror
@@ -297,10 +271,6 @@ def _mqtt(mqtt: Mqtt) -> str:
 
 def _local_media(config: Config) -> Iterator[str]:
     """What programs of the original find on the robot besides MQTT."""
-    devices = config.services.av_daemon
-    forms = {"video": "pictures", "audio": "sound"}
-    for section, path in devices.sockets().items():
-        yield f"{forms[section]} at {path}, by examples/gstreamer_sockets.py"
     for line in config.motor_lines().values():
         if (memory := config.hall_memory(line)) is not None:
             yield f"hall samples in the shared memory {memory}"

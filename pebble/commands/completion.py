@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterator
-from contextlib import suppress
 from functools import partial
 from itertools import islice
 from pathlib import Path
@@ -13,7 +12,7 @@ from typing import TYPE_CHECKING, Final
 from typer._click.shell_completion import CompletionItem
 from typer.core import TyperGroup
 
-import pebble
+from pebble.extension import ours, part
 
 if TYPE_CHECKING:
     from typer._click.core import Command, Context
@@ -26,7 +25,9 @@ _LONGEST = 1_000_000  # bytes of a config
 def complete_values(command: Command) -> None:
     """Let a command, and those below it, complete the values of arguments and options that ``VALUES`` has."""
     for parameter in command.params:
-        if values := VALUES.get(parameter.metavar or ""):
+        name = parameter.metavar or ""
+        added = next((one.completions[name] for one in ours() if name in one.completions), "")
+        if values := part(added) if added else VALUES.get(name):
             parameter.shell_complete = partial(_items, values)  # type: ignore[method-assign]
     for below in command.commands.values() if isinstance(command, TyperGroup) else ():
         complete_values(below)
@@ -47,20 +48,6 @@ def robots(context: Context) -> list[str]:
     return [*configs(context), *sorted(set(_ids()))]
 
 
-def scripts(context: Context) -> list[str]:
-    """Return the scripts of the robot whose config was given, else those of Pebble."""
-    file = Path(str(context.params.get("robot")))
-    folders: tuple[Path, ...] = (Path(pebble.__file__).with_name("extensions") / "scripts" / "shipped",)
-    if file.is_file():
-        from pebble.config import load
-        from pebble.errors import PebbleError
-        from pebble.services.autonomy_manager.catalogue import roots
-
-        with suppress(PebbleError):
-            folders = roots(load(file))
-    return sorted({path.parent.name for folder in folders for path in folder.glob("*/run.py")})
-
-
 def _ids() -> Iterator[str]:
     for file in islice((file for place in _PLACES for file in place.glob("*.json")), _FILES):
         try:
@@ -70,12 +57,11 @@ def _ids() -> Iterator[str]:
             continue
 
 
-#: Functions for the values of arguments and options, by how the help calls them.
+#: Functions for the values of arguments and options, by how the help calls them. Extensions add theirs.
 VALUES: Final = {
     "CONFIG": configs,
     "CONFIG…": configs,
     "ROBOT": robots,
     "[SYSTEM/TYPE/]ID": robots,
     "[reset|status] ROBOT": lambda context: ["reset", "status", *robots(context)],
-    "SCRIPT": scripts,
 }

@@ -1,9 +1,18 @@
 """``pebble up`` with options, and its help; ``pebble.cli`` runs a plain ``pebble up CONFIG`` without this module."""
 
+from typing import Annotated
+
+import typer
+
 from pebble.commands.options import ConfigArgument
 
 
-def up(config: ConfigArgument) -> int:
+def up(
+    config: ConfigArgument,
+    core_only: Annotated[
+        bool, typer.Option("--core-only", help="Without extensions: no page, camera, sounds or scripts.")
+    ] = False,
+) -> int:
     """Run the robot that CONFIG describes, until Ctrl-C or SIGTERM.
 
     Starts every enabled service (on Zenoh robots the hub first), and restarts processes that end unexpectedly.
@@ -14,4 +23,4 @@ def up(config: ConfigArgument) -> int:
     from pebble.config import load
     from pebble.launcher.launcher import Launcher
 
-    return Launcher(load(config)).run()
+    return Launcher(load(config, lenient=True, core_only=core_only)).run()

@@ -4,29 +4,36 @@ import hashlib
 import os
 import zlib
 from collections.abc import Mapping
+from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import msgspec
-from msgspec.structs import asdict, replace
+from msgspec import defstruct
+from msgspec.structs import asdict, fields, replace
 
+from pebble import extension
 from pebble.config.home import in_home
 from pebble.config.masking import holds_secret, masked
-from pebble.config.raw import Pairs, decode, plain, read_text, with_instances
-from pebble.config.reader import Reader
+from pebble.config.problems import Notes
+from pebble.config.raw import Pairs, decode, plain, read_text, with_instances, without
+from pebble.config.reader import Reader, Rule
 from pebble.config.rules.between_keys import CHECKS
 from pebble.config.rules.exposure import warn_if_readable
-from pebble.config.tree import Root, SerialBridge
-from pebble.config.types import Topic
+from pebble.config.tree import Root, SerialBridge, tree_of
+from pebble.config.types import Section, Topic
 from pebble.contract import DRIVE
 from pebble.contract.identity import Identity
 from pebble.contract.serial_protocols import SERIAL_PROTOCOLS
 from pebble.errors import ConfigError
+from pebble.extension import Extension, Missing
 
 #: In the run directory: the process id of the robot's newest launcher, and on a second line the robot's base topic.
 LAUNCHER_LOCK = "launcher.lock"
 RUN_DIR_OF_UNIT = Path("/run/pebble")  # of our unit; a tool that is started from a shell does not see its environment
 _LONGEST_NAME = 150  # bytes; file systems allow 255
+
+S = TypeVar("S", bound=Section)
 
 
 class Config(Root, frozen=True, kw_only=True):
@@ -39,12 +46,22 @@ class Config(Root, frozen=True, kw_only=True):
     run_folder: Path
     state_folder: Path
     password_variables: tuple[str, ...]  # of the environment: those that passwords were read from
+    installed: tuple[Extension, ...]  # that it was read with
+    missing: tuple[Missing, ...]  # that it names and this machine lacks
     motor_owners: tuple[str, ...] = ()  # of the whole robot, also in the view of one serial line
 
     @property
     def base(self) -> str:
         """What all topics of this robot begin with, without a final slash."""
         return self.identity.base
+
+    def section(self, kind: type[S]) -> S:
+        """Return the section of an extension by its class; its defaults where the extension is not installed."""
+        for holder in (self.services, self):
+            for name in holder.__struct_fields__:
+                if isinstance(section := getattr(holder, name), kind):
+                    return section
+        return kind()
 
     def run_dir(self) -> Path:
         """The folder of this robot's sockets and locks, absolute; not created here."""
@@ -92,28 +109,23 @@ class Config(Root, frozen=True, kw_only=True):
         except msgspec.ValidationError:  # it names none, or one that no message may have
             return (DRIVE.topic(self.base),)
 
-    def media_programs(self) -> tuple[str, ...]:
-        """The on-demand programs for pictures and sound, by the services' names."""
-        devices = self.services.av_daemon
-        if not (self.services.mqtt_bridge.enabled and devices.enabled):
-            return ()
-        video = ("camera_publisher",) if devices.video.enabled else ()
-        return (*video, *(("audio_publisher", "audio_receiver") if devices.audio.enabled else ()))
-
     def on_demand_programs(self) -> tuple[str, ...]:
-        """All programs that the bridge may request: the media programs, and a third party's streaming program."""
-        own = self.services.video_stream
-        stream = ("video_stream",) if own.enabled and own.command and self.services.mqtt_bridge.enabled else ()
-        return (*self.media_programs(), *stream)
+        """Return the programs that the bridge may request: they run while operators want their pictures or sound."""
+        return tuple(program.name for program in extension.programs_of(self.installed, self) if program.on_demand)
 
 
-def load(path: Path | str, env: Mapping[str, str] = os.environ) -> Config:
-    """Read a config file. Raises ConfigError with every problem in it."""
+def load(
+    path: Path | str, env: Mapping[str, str] = os.environ, *, lenient: bool = False, core_only: bool = False
+) -> Config:
+    """Read a config file. Raises ConfigError with every problem in it.
+
+    ``lenient``: an extension that this machine lacks is a warning, unless it owns motors. ``core_only``: without any.
+    """
     path = Path(path).absolute()
     raw = decode(read_text(path), path.name)
     if isinstance(raw, Pairs) and (keys := dict(raw).keys()) & {"robots", "tags"} and "robot" not in keys:
         raise ConfigError(f"{path.name}: this is a world file, for pebble sim world; name the config file of a robot")
-    return _config(raw, path, path.parent, env)
+    return _config(raw, path, path.parent, env, lenient=lenient, core_only=core_only)
 
 
 _handed_over: Config | None = None
@@ -137,28 +149,75 @@ def parse(raw: dict[str, Any], *, folder: Path, env: Mapping[str, str]) -> Confi
     return _config(raw, None, folder.absolute(), env)
 
 
-def _config(raw: Any, path: Path | None, folder: Path, env: Mapping[str, str]) -> Config:
-    reader = Reader(folder, env, CHECKS)
-    own = plain(raw, reader.notes)
+def _config(
+    raw: Any,
+    path: Path | None,
+    folder: Path,
+    env: Mapping[str, str],
+    *,
+    lenient: bool = False,
+    core_only: bool = False,
+) -> Config:
+    notes = Notes()
+    own = plain(raw, notes)
+    installed, missing = ((), ()) if core_only else _extensions(own, folder)
+    for one in missing:
+        note = notes.warning if lenient and not one.drives else notes.problem
+        note(tuple(one.key.split(".", 1)), one.reason)
+    tree, kind, rules = _tree(installed)
+    reader = Reader(folder, env, rules)
+    reader.notes = notes
     merged = with_instances(own)
-    root = reader.section(Root, merged)
-    reader.notes.forget_inherited(own, merged)
+    unread = extension.keys_of_missing(installed)
+    root = reader.section(tree, without(merged, unread))
+    notes.forget_inherited(own, merged)
     if path is not None and holds_secret(own):
-        warn_if_readable(reader.notes, (), path, "it, and there is a password in it")
-    if reader.notes.problems:
-        raise ConfigError(list(dict.fromkeys(map(str, reader.notes.problems))))
+        warn_if_readable(notes, (), path, "it, and there is a password in it")
+    if notes.problems:
+        raise ConfigError(list(dict.fromkeys(map(str, notes.problems))))
     identity = Identity(root.robot.system, root.robot.type, root.robot.id)
-    config = Config(
+    config: Config = kind(
         **asdict(root),
+        installed=installed,
+        missing=missing,
         identity=identity,
         path=path,
         folder=folder,
-        warnings=reader.notes.warning_lines(),
+        warnings=notes.warning_lines(),
         run_folder=root.transport.run_dir or default_run_folder(identity.base, env),
         state_folder=root.transport.state_dir or default_state_folder(identity.base, env),
         password_variables=tuple(reader.password_variables),
     )
     return replace(config, motor_owners=tuple(map(config.motor_owner, config.motor_lines())))
+
+
+def _extensions(own: Any, folder: Path) -> tuple[tuple[Extension, ...], tuple[Missing, ...]]:
+    """Return ours and those that the file lists, and those of both that this machine lacks."""
+    listed = own.get("extensions") if isinstance(own, dict) else None
+    entries = listed if isinstance(listed, dict) else {}
+    drives = {name: isinstance(entry, dict) and entry.get("drives") is True for name, entry in entries.items()}
+    found, missing = extension.named(drives, folder)
+    installed = (*extension.ours(), *found)
+    extension.refuse_claims(installed)
+    return installed, (*missing, *extension.lacking(own))
+
+
+@cache
+def _tree(installed: tuple[Extension, ...]) -> tuple[type[Root], Any, tuple[Rule, ...]]:
+    """Return the class of a file with the sections of these extensions, that of such a config, and the rules."""
+    tree = tree_of({key: extension.part(place) for one in installed for key, place in one.sections.items()})
+    added = [
+        (field.name, field.type, field.default) for field in fields(tree) if field.name not in Root.__struct_fields__
+    ]
+    names = {"__doc__": Config.__doc__, "__module__": __name__}
+    kind = defstruct("Config", added, bases=(Config,), namespace=names, frozen=True, kw_only=True)
+    rules = [rule for one in installed if one.rules for rule in extension.part(one.rules)]
+    return tree, kind, (*CHECKS, *rules)
+
+
+def full_tree() -> type[Root]:
+    """Return the class of a whole file that lists no other extensions, for the schema and the table of keys."""
+    return _tree(extension.ours())[0]
 
 
 def default_run_folder(base: str, env: Mapping[str, str]) -> Path:
@@ -208,10 +267,9 @@ def resolved(config: Config) -> dict[str, Any]:
     JSON can write all of it. Keys that are not set and have no default are left out; secrets and the values of
     variables read ``***``.
     """
-    own = {
-        name: masked(getattr(config, name), name)
-        for name in ("log_level", "robot", "local_mqtt", "transport", "security", "services", "web_interface")
-    }
+    derived = {*Config.__struct_fields__} - {*Root.__struct_fields__}
+    names = [name for name in config.__struct_fields__ if name not in derived and name != "schema_"]
+    own = {name: masked(getattr(config, name), name) for name in names}
     return own | {
         "derived": {
             "base": config.base,

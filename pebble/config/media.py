@@ -1,26 +1,20 @@
-"""The config sections of camera, microphone and video, on the robot and towards operators."""
+"""The config sections of pictures and sound towards operators, which the bridge asks for."""
 
-from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, ClassVar
 
-from msgspec import Meta, field
+from msgspec import Meta
 
 from pebble.config.types import (
     BY_CONTRACT,
-    COMMAND,
     ONE_VALUE,
-    UNIT,
     AudioChannels,
     Command,
     Count,
-    File,
     FramesPerSecond,
-    HandlerTopics,
     Pixels,
     Rotation,
     SampleRate,
     Section,
-    ServiceSection,
     Topic,
     doc,
 )
@@ -28,85 +22,7 @@ from pebble.contract.encodings import SoundEncoding, VideoEncoding
 
 _FRAMES = "pictures and sound use the robot's own shared memory, found by transport.run_dir"
 _SOURCE = "every frame has its own size and format"
-_SOCKET = "examples/gstreamer_sockets.py chooses them"
-_SHMSINK = {"shm_size": _SOCKET, "wait_for_connection": _SOCKET}
 _INPUT = {"input_shm": _FRAMES, "input_retry_seconds": _FRAMES}
-
-
-class CameraCapture(Section, frozen=True, kw_only=True):
-    """The camera."""
-
-    retired: ClassVar = {**_SHMSINK, "io_mode": "OpenCV chooses by itself"}
-
-    enabled: Annotated[bool, doc("Open the camera.")] = True
-    backend: Annotated[
-        Literal["v4l2", "libcamera", "arducam", "picamera2", "synthetic"],
-        doc("How the camera is reached; `synthetic` needs none."),
-    ] = "v4l2"
-    device: Annotated[
-        str, doc("Device of a v4l2 camera, or a file or URL; of a synthetic one, `world.json#goob`: a simulated robot.")
-    ] = "/dev/video0"
-    capture_format: Annotated[str, doc("Of v4l2: `auto`, `raw`, `mjpeg`, or a pixel format such as `yuyv`.")] = "auto"
-    camera_name: Annotated[str | None, doc("Which libcamera camera; unset: the first.")] = None
-    camera_controls: Annotated[dict[str, Any], doc("Settings passed to the camera unchanged.")] = field(
-        default_factory=dict
-    )
-    width: Annotated[Pixels, doc("Pixels.")] = 640
-    height: Annotated[Pixels, doc("Pixels.")] = 480
-    fps: Annotated[FramesPerSecond, doc("Frames per second.")] = 15
-    rotate_degrees: Annotated[Rotation, doc("Clockwise.")] = 0
-    socket_path: Annotated[
-        File | None, doc("Where programs of the original read raw BGR; examples/gstreamer_sockets.py offers it there.")
-    ] = None
-
-
-class Microphone(Section, frozen=True, kw_only=True):
-    """The microphone."""
-
-    retired: ClassVar = _SHMSINK
-
-    enabled: Annotated[bool, doc("Open the microphone.")] = True
-    source: Annotated[
-        Literal["alsa", "auto", "synthetic"], doc("How the microphone is reached; `synthetic` needs none.")
-    ] = "alsa"
-    device: Annotated[str | None, doc("ALSA device; unset: the default.")] = None
-    rate: Annotated[SampleRate, doc("Samples per second.")] = 16000
-    channels: Annotated[AudioChannels, doc("1 is mono, 2 stereo.")] = 1
-    socket_path: Annotated[
-        File | None, doc("Where programs of the original read S16LE; examples/gstreamer_sockets.py offers it there.")
-    ] = None
-
-
-class AvDaemon(ServiceSection, frozen=True, kw_only=True):
-    """Owns the camera and the microphone."""
-
-    retired: ClassVar = {
-        **dict.fromkeys(("restart_delay_seconds", "stop_timeout_seconds", "cwd"), ONE_VALUE),
-        "env": UNIT,
-    }
-
-    video: Annotated[CameraCapture, doc("Camera.")] = CameraCapture()
-    audio: Annotated[Microphone, doc("Microphone.")] = Microphone()
-
-    def sockets(self) -> dict[str, Path]:
-        """Return the GStreamer sockets for programs of the original, by the section that names them."""
-        if not self.enabled:
-            return {}
-        sections: dict[str, CameraCapture | Microphone] = {"video": self.video, "audio": self.audio}
-        return {
-            name: section.socket_path
-            for name, section in sections.items()
-            if section.enabled and section.socket_path is not None
-        }
-
-
-class VideoStream(ServiceSection, frozen=True, kw_only=True):
-    """Runs a third party's streaming program while operators request video."""
-
-    retired: ClassVar = dict.fromkeys(("cwd", "env"), COMMAND)
-
-    command: Annotated[Command, doc("The program and its arguments, without a shell; required where enabled.")] = ()
-    webrtc_url: Annotated[str | None, doc("Where its pictures are shown; operator pages find it in the status.")] = None
 
 
 class VideoPublisher(Section, frozen=True, kw_only=True):
@@ -185,25 +101,3 @@ class Media(Section, frozen=True, kw_only=True):
     video_publisher: Annotated[VideoPublisher, doc("Pictures out.")] = VideoPublisher()
     audio_publisher: Annotated[AudioPublisher, doc("Sound out.")] = AudioPublisher()
     audio_receiver: Annotated[AudioReceiver, doc("Sound in.")] = AudioReceiver()
-
-
-class Playback(Section, frozen=True, kw_only=True):
-    """Where sounds are and what plays them; decoded ones are played by the audio receiver's command."""
-
-    retired: ClassVar = {
-        **dict.fromkeys(("stop_timeout", "scan_interval"), ONE_VALUE),
-        **dict.fromkeys(("cwd", "env"), COMMAND),
-        "volume": "clips are played as recorded: set the loudspeaker's volume, or the player's",
-    }
-
-    directory: Annotated[File | None, doc("Folder of the sounds; unset: `~/sounds`.")] = None
-    player_command: Annotated[Command, doc("Plays wav files; `{file}` stands for the sound, else it comes last.")] = (
-        "aplay",
-    )
-
-
-class SoundboardHandler(ServiceSection, frozen=True, kw_only=True):
-    """Plays sounds on the robot."""
-
-    topics: Annotated[HandlerTopics, doc("Other names for topics.")] = HandlerTopics()
-    playback: Annotated[Playback, doc("Sounds and player.")] = Playback()

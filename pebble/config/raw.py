@@ -2,6 +2,7 @@
 
 import json
 import math
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -102,6 +103,18 @@ def with_instances(raw: Any) -> Any:
     shared = {key: value for key, value in serial.items() if key != "instances"}
     merged = {name: deep_merge(shared, own) for name, own in instances.items()}
     return raw | {"services": raw["services"] | {"serial_mcu_bridge": shared | {"instances": merged}}}
+
+
+def without(raw: Any, keys: Iterable[str]) -> Any:
+    """Return ``raw`` without what is at these dotted keys."""
+    for key in keys:
+        first, _, rest = key.partition(".")
+        inner = raw.get(first) if isinstance(raw, dict) else None
+        if rest and isinstance(inner, dict):
+            raw = raw | {first: without(inner, [rest])}
+        elif not rest and inner is not None:
+            raw = {name: value for name, value in raw.items() if name != first}
+    return raw
 
 
 def _at(raw: Any, *keys: str) -> Any:

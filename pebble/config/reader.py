@@ -2,7 +2,7 @@
 
 import re
 import types
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import cache
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin
@@ -18,6 +18,8 @@ from pebble.errors import PebbleError
 S = TypeVar("S", bound=Section)
 #: Checks a finished section of its class; returns it, completed if necessary.
 Check = Callable[["Reader", Any, problems.Path], Any]
+#: The class of the sections that a check is for, subclasses included.
+Rule = tuple[type[Section], Check]
 
 _NUMBER = re.compile(r"[+-]?[0-9.]{1,10}|true|false", re.ASCII).fullmatch
 _WRONG = object()  # in place of a refused value: the key gets its default
@@ -31,10 +33,10 @@ def _known(kind: type[Section]) -> dict[str, FieldInfo]:
 class Reader:
     """Reads one file. Relative paths start at ``folder``; ``env`` is the environment for secrets."""
 
-    def __init__(self, folder: Path, env: Mapping[str, str], checks: Mapping[type[Section], Check]) -> None:
+    def __init__(self, folder: Path, env: Mapping[str, str], rules: Sequence[Rule]) -> None:
         self.folder, self.env, self.notes = folder, env, problems.Notes()
         self.password_variables: dict[str, None] = {}  # those that were read, in order
-        self._checks = checks
+        self._rules = rules
 
     def section(self, kind: type[S], raw: Any, path: problems.Path = ()) -> S:
         """A section of ``kind``. Refused values are noted and replaced by their defaults (missing ones by None)."""
@@ -55,7 +57,7 @@ class Reader:
         return self._checked(kind(**values), path)
 
     def _checked(self, section: S, path: problems.Path) -> S:
-        for kind, check in self._checks.items():
+        for kind, check in self._rules:
             if isinstance(section, kind):
                 section = check(self, section, path)
         return section
@@ -88,11 +90,14 @@ class Reader:
             return self._map(name, item, raw, path)
         if kind is Path:
             return self._path(raw, metas, path) if isinstance(raw, str) else self._refuse(kind, metas, raw, path)
-        if get_origin(kind) is Literal and isinstance(raw, str):
-            raw = next((choice for choice in get_args(kind) if str(choice).lower() == raw.lower()), raw)
+        choices = _choices(kind, metas)
+        if choices and isinstance(raw, str):
+            raw = next((choice for choice in choices if str(choice).lower() == raw.lower()), raw)
         try:
             value = msgspec.convert(raw, annotation)
         except msgspec.ValidationError:
+            return self._refuse(kind, metas, raw, path)
+        if choices and value not in choices:
             return self._refuse(kind, metas, raw, path)
         return Secret(value) if _extra(metas, "secret") else self._parsed(metas, value, path)
 
@@ -164,8 +169,8 @@ def expected(kind: Any, metas: list[Meta]) -> str:
     """A correct value in words, to follow "must be"."""
     if text := _extra(metas, "expected"):
         return str(text)
-    if get_origin(kind) is Literal:
-        *most, last = (msgspec.json.encode(choice).decode() for choice in get_args(kind))
+    if choices := _choices(kind, metas):
+        *most, last = (msgspec.json.encode(choice).decode() for choice in choices)
         return f"{', '.join(most)} or {last}" if most else last
     if get_origin(kind) in (Union, types.UnionType):
         return " or ".join(expected(member, []) for member in get_args(kind))
@@ -185,6 +190,11 @@ def _limits(metas: list[Meta]) -> Iterator[str]:
             yield f"and at most {bound['le']}"
     elif "ge" in bound:
         yield f"of at least {bound['ge']}"
+
+
+def _choices(kind: Any, metas: list[Meta]) -> tuple[Any, ...]:
+    """The values that a key may have, where they are listed; an extension may add to those of ``choices``."""
+    return get_args(kind) if get_origin(kind) is Literal else tuple(_extra(metas, "choices") or ())
 
 
 def _extra(metas: list[Meta], name: str) -> Any:

@@ -14,6 +14,7 @@ import msgspec
 from msgspec import NODEFAULT
 from msgspec.structs import FieldInfo, fields
 
+from pebble.config.config import full_tree
 from pebble.config.reader import expected, unwrap
 from pebble.config.tree import Root
 from pebble.config.types import Section
@@ -25,7 +26,7 @@ KEYS_FILE = "configuration.md"
 def schema_text() -> str:
     """The JSON Schema of a config file. Unlike the reader, it refuses an empty string for "not set"."""
     _, definitions = msgspec.json.schema_components(
-        [Root], schema_hook=lambda _kind: {"type": "string"}, ref_template="#/$defs/{name}"
+        [full_tree()], schema_hook=lambda _kind: {"type": "string"}, ref_template="#/$defs/{name}"
     )
     for kind in _subclasses(Section):
         if kind.__name__ in definitions:
@@ -42,6 +43,10 @@ def schema_text() -> str:
 def _complete(definition: dict[str, Any], kind: type[Section]) -> None:
     """Allow comments and retired keys; a section's default consists of the defaults of its keys."""
     properties = definition["properties"]
+    for field in fields(kind):
+        choices = [choice for meta in unwrap(field.type)[1] for choice in (meta.extra or {}).get("choices", ())]
+        if choices:
+            properties[field.encode_name]["enum"] = choices
     for value in properties.values():
         if "$ref" in value or value.get("default", 0) is None:
             value.pop("default", None)
@@ -62,7 +67,7 @@ def _subclasses(kind: type[Section]) -> Iterator[type[Section]]:
 
 def keys_text() -> str:
     """Return a table of the keys of each section, with their whole names, defaults and meanings."""
-    return "".join(["# Keys of a config\n\n", *_chapters(Root, "", {})]).rstrip("\n") + "\n"
+    return "".join(["# Keys of a config\n\n", *_chapters(full_tree(), "", {})]).rstrip("\n") + "\n"
 
 
 def _chapters(kind: type[Section], path: str, places: dict[type[Section], str]) -> Iterator[str]:

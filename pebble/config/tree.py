@@ -1,10 +1,11 @@
 """The sections of a robot's config file: every key with its default, its limits and its meaning."""
 
+from collections.abc import Mapping
 from typing import Annotated, Any, ClassVar, Literal
 
-from msgspec import Meta, field
+from msgspec import Meta, defstruct, field
 
-from pebble.config.media import AvDaemon, Media, SoundboardHandler, VideoStream
+from pebble.config.media import Media
 from pebble.config.security import Security
 from pebble.config.transport import Mqtt, RemoteConnection, RemoteMqtt, TransportSection
 from pebble.config.types import (
@@ -30,11 +31,7 @@ from pebble.config.types import (
 )
 from pebble.contract.looks import Body, Colour
 from pebble.contract.payloads import LinkLevel
-from pebble.contract.serial_protocols import SerialProtocolName
-from pebble.extensions.page.config import WebHandler, WebInterface
-from pebble.extensions.recordings.config import Recorder
-from pebble.extensions.scripts.config import AutonomyManager
-from pebble.services.neighbours.config import Neighbours
+from pebble.contract.serial_protocols import SERIAL_PROTOCOLS
 
 
 class Robot(Section, frozen=True, kw_only=True):
@@ -236,7 +233,9 @@ class SerialBridge(ServiceSection, frozen=True, kw_only=True):
         "publish": "the contract fixes QoS and retain flag",
     }
 
-    protocol: Annotated[SerialProtocolName, doc("The serial protocol of the MCU.")] = "goob_base_v1"
+    protocol: Annotated[str, Meta(extra={"choices": SERIAL_PROTOCOLS}), doc("The serial protocol of the MCU.")] = (
+        "goob_base_v1"
+    )
     serial: Annotated[SerialPort, doc("The line.")] = SerialPort()
     telemetry: Annotated[SerialTelemetry, doc("What is published.")] = SerialTelemetry()
     odometry_shm: Annotated[
@@ -254,24 +253,23 @@ class SerialBridge(ServiceSection, frozen=True, kw_only=True):
 
 
 class Services(Section, frozen=True, kw_only=True):
-    """One section per service."""
+    """One section per service; extensions add theirs."""
 
     defaults: Annotated[Defaults, doc("Values for several services.")] = Defaults()
     launcher: Annotated[Launcher, doc("Starts the others.")] = Launcher()
-    av_daemon: Annotated[AvDaemon, doc("Camera and microphone.")] = AvDaemon()
     mqtt_bridge: Annotated[MqttBridge, doc("Connection to operators.")] = MqttBridge()
     ros1_bridge: Annotated[dict[str, Any], doc("The original's connection to ROS 1: read, and not used.")] = EMPTY
     serial_mcu_bridge: Annotated[SerialBridge, doc("Serial line to the motor MCU.")] = SerialBridge()
-    video_stream: Annotated[VideoStream, doc("A streaming program of a third party.")] = VideoStream()
-    soundboard_handler: Annotated[SoundboardHandler, doc("Plays sounds.")] = SoundboardHandler()
-    autonomy_manager: Annotated[AutonomyManager, doc("Runs autonomy scripts.")] = AutonomyManager()
-    web_handler: Annotated[WebHandler, doc("Runs the operator page.")] = WebHandler()
-    recorder: Annotated[Recorder, doc("Records the robot.")] = Recorder()
-    neighbours: Annotated[Neighbours, doc("Hears and drives other robots of the LAN.")] = Neighbours()
+
+
+class ExtensionEntry(Section, frozen=True, kw_only=True):
+    """An extension of another package, or a file of yours."""
+
+    drives: Annotated[bool, doc("It owns motors: without it the robot does not start.")] = False
 
 
 class Root(Section, frozen=True, kw_only=True):
-    """The top of the file."""
+    """The top of the file; extensions add their sections."""
 
     schema_: Annotated[str | None, doc("Where editors find the JSON Schema; not used otherwise.")] = field(
         name="$schema", default=None
@@ -284,4 +282,23 @@ class Root(Section, frozen=True, kw_only=True):
     )
     security: Annotated[Security, doc("Who may do what.")] = Security()
     services: Annotated[Services, doc("One section per service.")] = Services()
-    web_interface: Annotated[WebInterface, doc("The operator page.")] = WebInterface()
+    extensions: Annotated[
+        dict[str, ExtensionEntry], doc("Extensions of other packages by name, and files such as `lamp.py`.")
+    ] = EMPTY
+
+
+def tree_of(sections: Mapping[str, type[Section]]) -> type[Root]:
+    """Return the class of a whole file with the sections of extensions, by key: ``services.lamp`` or ``lamp``."""
+    inner = {key.removeprefix("services."): kind for key, kind in sections.items() if key.startswith("services.")}
+    outer = {key: kind for key, kind in sections.items() if "." not in key}
+    services = _with(Services, inner)
+    tree: type[Root] = _with(
+        Root, outer, ("services", Annotated[services, doc("One section per service.")], services())
+    )
+    return tree
+
+
+def _with(kind: type[Section], sections: Mapping[str, type[Section]], *fields: Any) -> Any:
+    added = [(name, Annotated[section, doc(section.meaning())], section()) for name, section in sections.items()]
+    names = {"__doc__": kind.__doc__, "__module__": kind.__module__}
+    return defstruct(kind.__name__, [*fields, *added], bases=(kind,), namespace=names, frozen=True, kw_only=True)

@@ -1,6 +1,6 @@
 """The kinds of value a config key may have, and what every section of a config has in common."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
 
@@ -118,6 +118,15 @@ class Section(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     retired: ClassVar[Mapping[str, str]] = {}
     #: Keys of earlier versions that are errors, and what to write.
     refused: ClassVar[Mapping[str, str]] = {}
+
+    def connections(self) -> Iterator[tuple[tuple[str, ...], "Section"]]:
+        """Yield its connections in use, to brokers and Zenoh hubs, by their keys: the security level judges them."""
+        yield from ()
+
+    @classmethod
+    def meaning(cls) -> str:
+        """Return what it is for: the first line of its docstring."""
+        return (cls.__doc__ or "").partition("\n")[0]
 
     @classmethod
     def all_retired(cls) -> dict[str, str]:

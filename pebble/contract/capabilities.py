@@ -4,9 +4,10 @@ Nothing here is required: a reader takes a section that is absent, or is none of
 Topics are whole ones and the component's own; readers use no others. What is absent has the topic of the contract.
 """
 
-from typing import Literal
+from typing import Any, Literal
 
 from msgspec import UNSET, UnsetType
+from msgspec.structs import replace
 
 from pebble.contract.looks import Body, Colour
 from pebble.contract.payloads import Payload
@@ -164,3 +165,8 @@ class CapabilitiesValue(Payload, frozen=True, kw_only=True):
     outlets: OutletsOffer | UnsetType = UNSET
     named: bool | UnsetType = UNSET  # it takes commands only with an account's name in the topic (docs/ext/fleet.md)
     announced: bool | UnsetType = UNSET  # only in what readers make of a heartbeat's `subscribes`; robots leave it out
+
+
+def offered(offer: Any, enabled: bool) -> Any:
+    """Return an offer of something that exists and obeys if it is enabled."""
+    return replace(offer, available=enabled, controls=enabled)

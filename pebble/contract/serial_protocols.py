@@ -1,12 +1,12 @@
 """The protocols of serial lines to MCUs, one row each: all that other programs know of them.
 
-A new protocol is a row here and the service that the row names. The row is kept apart from that service, because every
-process reads the config, and must not import the serial port's library for the names that it may contain.
+A new protocol is a row that an extension declares, and the service that the row names. The row is kept apart from that
+service, because every process reads the config, and must not import the serial port's library for the names in it.
 """
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Final, Literal, TypeAlias
+from typing import Final
 
 from msgspec import Struct
 
@@ -32,13 +32,8 @@ class SerialProtocol(Struct, frozen=True):
 
 _BRIDGE = "pebble.services.serial_mcu_bridge"
 
-#: By the config's ``protocol``.
-SERIAL_PROTOCOLS: Final = {
+#: By the config's ``protocol``; extensions add theirs.
+SERIAL_PROTOCOLS: Final[dict[str, SerialProtocol]] = {
     "goob_base_v1": SerialProtocol(f"{_BRIDGE}.text.motor_bridge:MotorBridge", drives=True),
     "imu_mpu6050_v1": SerialProtocol(f"{_BRIDGE}.text.imu_bridge:ImuBridge", is_imu=True),
-    "pebble_serial_v1": SerialProtocol(f"{_BRIDGE}.devices.described_bridge:DescribedBridge", describes_itself=True),
 }
-if TYPE_CHECKING:
-    SerialProtocolName: TypeAlias = str
-else:
-    SerialProtocolName = Literal[tuple(SERIAL_PROTOCOLS)]

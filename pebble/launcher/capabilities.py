@@ -10,10 +10,10 @@ from msgspec import UNSET
 
 from pebble import contract as c
 from pebble.config import Config, SystemControl
-from pebble.config.types import ServiceSection
 from pebble.contract import capabilities as offers
 from pebble.contract.encodings import ALL_SOUND, ALL_VIDEO
 from pebble.contract.serial_protocols import SERIAL_PROTOCOLS
+from pebble.extension import part
 from pebble.runtime import pyav
 from pebble.runtime.addresses import Addresses
 from pebble.runtime.process import view_of
@@ -22,19 +22,20 @@ from pebble.runtime.process import view_of
 def capabilities(
     config: Config, addresses: Addresses, lacking: Collection[str] = (), found: Collection[str] = ()
 ) -> dict[str, Any]:
-    """The ``value`` of a capabilities message: ``available`` is what exists, ``controls`` what takes commands.
+    """Return the ``value`` of a capabilities message: ``available`` is what exists, ``controls`` what takes commands.
+
+    Without extensions there are no pictures, sound, sounds and scripts: they complete the value.
 
     ``lacking`` and ``found`` are what its processes report at present (pebble.launcher.features).
     """
     drive, estop, lights, telemetry = _motor(config, addresses, lacking)
-    soundboard, autonomy = config.services.soundboard_handler, config.services.autonomy_manager
     value = offers.CapabilitiesValue(
         identity=_identity(config),
         transport=offers.TransportOffer(kind=config.transport.kind),
         video=_video(config, addresses),
         audio=_audio(config, addresses),
-        soundboard=_files(soundboard, addresses, c.SOUNDBOARD_COMMAND, c.SOUNDBOARD_FILES, c.SOUNDBOARD_STATUS),
-        autonomy=_files(autonomy, addresses, c.AUTONOMY_COMMAND, c.AUTONOMY_FILES, c.AUTONOMY_STATUS),
+        soundboard=_files(addresses, c.SOUNDBOARD_COMMAND, c.SOUNDBOARD_FILES, c.SOUNDBOARD_STATUS),
+        autonomy=_files(addresses, c.AUTONOMY_COMMAND, c.AUTONOMY_FILES, c.AUTONOMY_STATUS),
         system=_system(config, addresses),
         drive=drive,
         estop=estop,
@@ -43,6 +44,9 @@ def capabilities(
         outlets=_outlets(config, found),
         named=config.security.named or UNSET,
     )
+    for extension in config.installed:
+        if extension.offers:
+            value = part(extension.offers)(config, value)
     built: dict[str, Any] = msgspec.to_builtins(value)
     return built
 
@@ -55,54 +59,42 @@ def _identity(config: Config) -> offers.RobotIdentity:
 
 
 def _video(config: Config, addresses: Addresses) -> offers.VideoOffer:
-    sent, captured = config.services.mqtt_bridge.media.video_publisher, config.services.av_daemon.video
-    available, controls = _offered(config, captured.enabled)
-    if "video_stream" in config.on_demand_programs():
-        available = controls = True
+    sent = config.services.mqtt_bridge.media.video_publisher
     return offers.VideoOffer(
-        available=available,
-        controls=controls,
+        available=False,
+        controls=False,
         topic=addresses[c.CAMERA].topic,
         command_topic=addresses[c.VIDEO_CONTROL].topic,
         flag_topic=addresses[c.MQTT_VIDEO].topic,
         overlays_topic=addresses[c.VIDEO_OVERLAYS].topic,
-        width=_first(sent.publish_width, sent.width, captured.width),
-        height=_first(sent.publish_height, sent.height, captured.height),
-        fps=_first(sent.publish_fps, sent.target_fps, sent.fps, captured.fps),
+        width=_first(sent.publish_width, sent.width),
+        height=_first(sent.publish_height, sent.height),
+        fps=_first(sent.publish_fps, sent.target_fps, sent.fps),
         encoding=sent.encoding,
         encodings=list(pyav.available(ALL_VIDEO)),
     )
 
 
 def _audio(config: Config, addresses: Addresses) -> offers.AudioOffer:
-    sent, captured = config.services.mqtt_bridge.media.audio_publisher, config.services.av_daemon.audio
-    available, controls = _offered(config, captured.enabled)
+    sent = config.services.mqtt_bridge.media.audio_publisher
     return offers.AudioOffer(
-        available=available,
-        controls=controls,
+        available=False,
+        controls=False,
         topic=addresses[c.AUDIO].topic,
         uplink_topic=addresses[c.AUDIO_STREAM].topic,
         command_topic=addresses[c.AUDIO_CONTROL].topic,
         flag_topic=addresses[c.MQTT_AUDIO].topic,
-        rate=_first(sent.rate, captured.rate),
-        channels=_first(sent.channels, captured.channels),
+        rate=sent.rate,
+        channels=sent.channels,
         encoding=sent.encoding,
         encodings=list(pyav.available(ALL_SOUND)),
     )
 
 
-def _offered(config: Config, captured: bool) -> tuple[bool, bool]:
-    """Whether it exists, and obeys: the bridge requests the programs that send it; without it there are no requests."""
-    available = config.services.av_daemon.enabled and captured
-    return available, available and config.services.mqtt_bridge.enabled
-
-
-def _files(
-    section: ServiceSection, addresses: Addresses, command: c.Channel, files: c.Channel, status: c.Channel
-) -> offers.FilesOffer:
+def _files(addresses: Addresses, command: c.Channel, files: c.Channel, status: c.Channel) -> offers.FilesOffer:
     return offers.FilesOffer(
-        available=section.enabled,
-        controls=section.enabled,
+        available=False,
+        controls=False,
         command_topic=addresses[command].topic,
         files_topic=addresses[files].topic,
         status_topic=addresses[status].topic,
@@ -154,7 +146,7 @@ def _motor(
         touch_topic=addresses[c.TOUCH_SENSORS].topic,
         charging_topic=addresses[c.CHARGING_STATUS].topic,
         charging_level_topic=addresses[c.CHARGING_LEVEL].topic,
-        wheel_odometry=touch and config.services.autonomy_manager.enabled,
+        wheel_odometry=False,
         wheel_odometry_topic=addresses[c.WHEEL_ODOMETRY].topic,
         imu=imu,
         imu_topic=imu_topic,

@@ -7,8 +7,8 @@ from contextlib import suppress
 from typing import NoReturn
 
 from pebble.config import Config
+from pebble.extension import Program
 from pebble.launcher.forked import become
-from pebble.launcher.programs import Program
 from pebble.runtime.exits import exit_descriptor
 
 _READ_BYTES = 65_536

@@ -16,7 +16,7 @@ from contextlib import suppress
 from typing import NoReturn
 
 from pebble.config import Config, hand_over
-from pebble.launcher.programs import Program
+from pebble.extension import Program
 from pebble.runtime.parent import NOTIFY_FD, die_with_launcher
 
 _NOTES = 3  # the descriptor of notes, next after stdin, stdout and stderr

@@ -10,13 +10,14 @@ from typing import Any
 from pebble.config import Config
 from pebble.config.rules.doors import warning_of_open
 from pebble.errors import ConfigError, PebbleError
+from pebble.extension import Program, Stage
 from pebble.launcher.child import Child
 from pebble.launcher.driveable import Driveable
 from pebble.launcher.features import Features
 from pebble.launcher.log_forwarding import LogForwarder, OwnRecords
 from pebble.launcher.on_demand import OnDemand
 from pebble.launcher.process_supervisor import ProcessSupervisor
-from pebble.launcher.programs import Program, Stage, preload, program_of, programs, shared_modules
+from pebble.launcher.programs import preload, program_of, programs, shared_modules
 from pebble.launcher.reactor import Reactor, StopSignals
 from pebble.launcher.restart_policy import RestartPolicy
 from pebble.launcher.run_lock import RunLock

@@ -4,8 +4,8 @@ import logging
 from collections.abc import Iterable
 
 from pebble.config.visible import shown
+from pebble.extension import Program
 from pebble.launcher.process_supervisor import ProcessSupervisor
-from pebble.launcher.programs import Program
 from pebble.launcher.reactor import Reactor
 from pebble.runtime.notes import Held, Wanted
 from pebble.runtime.parent import ENCODING, WANTED

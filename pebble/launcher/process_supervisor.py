@@ -7,10 +7,10 @@ from functools import partial
 
 import msgspec
 
+from pebble.extension import Program
 from pebble.launcher.child import Child
 from pebble.launcher.log_forwarding import text_of
 from pebble.launcher.pipes import Pipes
-from pebble.launcher.programs import Program
 from pebble.launcher.reactor import Reactor
 from pebble.launcher.restart_policy import LOOP_EXITS, LOOP_WINDOW_S, RestartPolicy
 from pebble.runtime import notes

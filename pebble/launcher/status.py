@@ -103,9 +103,9 @@ class StatusPublisher:
         shown = [supervisor for supervisor in self._supervisors if supervisor.shown]
         relevant = {s.program.name: self._state(s) for s in shown if not _rests(s)}
         self._systemd.status(_summary(relevant))
-        states = {supervisor.program.name: self._state(supervisor) for supervisor in shown}
-        stream = self._config.services.video_stream
-        url = stream.webrtc_url if stream.enabled else None
+        states = {one.name: ServiceState(state="failed", last_exit="not installed") for one in self._config.missing}
+        states |= {supervisor.program.name: self._state(supervisor) for supervisor in shown}
+        url = next((one.program.webrtc_url for one in self._supervisors if one.program.webrtc_url), None)
         self._publish_state(STATUS, self._status(states, self._driveable.mcus, url))
 
     def _status(

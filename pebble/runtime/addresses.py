@@ -1,6 +1,5 @@
 """The topic that one robot uses for each channel, after its config (paper Table A.6)."""
 
-from functools import reduce
 from typing import Any, NamedTuple
 
 from pebble.config import Config
@@ -55,6 +54,8 @@ def _default(channel: Channel, base: str) -> Address:
 
 def _at(config: Config, path: str) -> str | None:
     """The topic at a dotted path of the config tree; None where the key was not set."""
-    section: Any = config
-    topic: str | None = reduce(getattr, path.split("."), section)
+    value: Any = config
+    for name in path.split("."):
+        value = getattr(value, name, None)  # an extension's section is missing with it
+    topic: str | None = value
     return topic

@@ -3,22 +3,19 @@
 from collections.abc import Iterator
 from dataclasses import replace as replace_settings
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from msgspec.structs import replace
 
 from pebble import contract as c
 from pebble.config import Config, Mqtt, RemoteConnection, RemoteMqtt, Tls
+from pebble.config.transport import ZenohClient
 from pebble.errors import ConfigError, TransportError
+from pebble.extension import programs_of
 from pebble.runtime.addresses import Addresses
 from pebble.transports import Message, MqttSettings, TlsSettings, Transport, ZenohSettings, check_kind, create
 from pebble.transports.hosts import SMALL_SEGMENT
-from pebble.transports.socket_paths import FRAMES_SOCKET, PEER_SOCKET, fits_socket
-
-if TYPE_CHECKING:
-    from pebble.extensions.fleet.gateway.gateway_file import GatewayFile
-    from pebble.extensions.fleet.hub_file import HubFile
-    from pebble.services.neighbours.config import Lan
+from pebble.transports.socket_paths import LONGEST_SOCKET, fits_socket
 
 _ANY = "+/+/+"  # the levels of any robot
 #: Topics of the robot's states, and of all commands, that are published even to a broker that hangs up on them.
@@ -30,6 +27,7 @@ ALL_VITAL = (*_VITAL_STATES, f"{_ANY}/{c.INCOMING}/#")
 
 LOCAL_RECONNECT_S, REMOTE_RECONNECT_S = 0.5, 2.0
 _BRIDGE, _STOPS = "remote-bridge", "remote-stops"
+_FRAMES = "pebble.transports.frames"  # makes sockets for pictures and sound
 #: RFC 4594: what must not wait, and what may be dropped last of what can. Where a link may be thin.
 _EXPEDITED, _ASSURED = 46, 10
 
@@ -52,25 +50,14 @@ def check_connections(config: Config) -> None:
             check_kind(kind)
         except TransportError as error:
             problems.append(f"{place}: {error}")
-    socket = _longest_socket(config)
-    if socket is not None and not fits_socket(config.run_dir() / socket):
+    added = programs_of(config.installed, config)
+    has_sockets = config.transport.kind == "zenoh" or any(_FRAMES in program.shares for program in added)
+    if has_sockets and not fits_socket(config.run_dir() / LONGEST_SOCKET):
         problems.append(
             f"transport.run_dir: {config.run_dir()} is too long for the sockets in it, set it to a shorter path"
         )
-    for name, path in config.services.av_daemon.sockets().items():
-        if not fits_socket(path):
-            problems.append(
-                f"services.av_daemon.{name}.socket_path: {path} is too long for a socket, write a shorter one"
-            )
     if problems:
         raise ConfigError(problems)
-
-
-def _longest_socket(config: Config) -> str | None:
-    """The longest name of a socket in the run directory; None: this robot has none."""
-    if config.services.av_daemon.enabled:
-        return FRAMES_SOCKET
-    return PEER_SOCKET if config.transport.kind == "zenoh" else None
 
 
 def local_settings(config: Config, as_published: bool = False) -> Any:
@@ -109,14 +96,14 @@ def stops_transport(config: Config) -> Transport | None:
     if config.security.level == "open" and (bridge.remote is not None or bridge.link.profile == "wide"):
         return None
     if bridge.remote is None:
-        settings = _live_only(mqtt_settings(bridge.remote_mqtt, reconnect_max_s=REMOTE_RECONNECT_S, program=_STOPS))
+        settings = live_only(mqtt_settings(bridge.remote_mqtt, reconnect_max_s=REMOTE_RECONNECT_S, program=_STOPS))
         return create("mqtt", _name(config, "mqtt", _STOPS), settings)
     if bridge.remote.kind != "zenoh":  # what another transport makes of a second connection is not known
         return None
     return create("zenoh", _name(config, "zenoh", _STOPS), _remote_settings(config, bridge.remote))
 
 
-def _live_only(settings: MqttSettings) -> MqttSettings:
+def live_only(settings: MqttSettings) -> MqttSettings:
     """Return the settings of a connection that no retained message holds up: MQTT 5 lets it ask for none."""
     return replace_settings(settings, max_segment=SMALL_SEGMENT, sends_retained=False)
 
@@ -136,17 +123,18 @@ def _remote_settings(config: Config, remote: RemoteConnection) -> Any:
     """A Zenoh uplink is a client of a hub elsewhere, separate from the robot's local transport."""
     if remote.kind != "zenoh":
         return remote.settings
-    return _client_of_hub(config, "remote", remote)
+    return client_of_hub(config.run_dir() / "remote", remote, remote.lease_ms, remote.account)
 
 
-def _client_of_hub(config: Config, folder: str, hub: "RemoteConnection | Lan") -> ZenohSettings:
+def client_of_hub(run_dir: Path, hub: ZenohClient, lease_ms: int, account: str) -> ZenohSettings:
+    """Return the settings of a client of a hub elsewhere."""
     return ZenohSettings(
-        run_dir=config.run_dir() / folder,
+        run_dir=run_dir,
         connect=tuple(hub.connect),
         tls=tls_settings(hub.tls),
-        lease_ms=hub.lease_ms,
+        lease_ms=lease_ms,
         client=True,
-        account=hub.account,
+        account=account,
     )
 
 
@@ -170,60 +158,6 @@ def hub_settings(config: Config) -> ZenohSettings:
         of_robot=True,
         wills=tuple(dict.fromkeys(_renamed_wills(config))),
     )
-
-
-def fleet_hub_settings(hub: "HubFile", run_dir: Path) -> ZenohSettings:
-    """A hub of its own, for several robots."""
-    return ZenohSettings(
-        run_dir=run_dir,
-        listen=hub.listen,
-        connect=hub.connect,
-        tls=tls_settings(hub.tls),
-        allowed_names=hub.allowed_names,
-        access=hub.access,
-        lease_ms=hub.lease_ms,
-        journal=hub.journal,
-        max_wills=hub.max_wills,
-    )
-
-
-def lan_transport(config: Config) -> Transport:
-    """The connection of ``neighbours`` to the hub of the LAN, not yet opened."""
-    settings = _client_of_hub(config, "lan", config.services.neighbours.lan)
-    return create("zenoh", _name(config, "zenoh", "lan"), settings)
-
-
-def gateway_transports(
-    gateway: "GatewayFile", operators: Mqtt, run_dir: Path, will: Message
-) -> tuple[Transport, Transport, Transport, Transport]:
-    """The connections of a gateway: to where the robots are, and three to the operators' broker, one of them for its
-    heartbeats, with its will, and one for stops.
-    """
-    base = will.topic.removesuffix(f"/{c.ONLINE.suffix}")
-    forwards = mqtt_settings(operators, as_published=True, reconnect_max_s=REMOTE_RECONNECT_S)
-    apart = mqtt_settings(operators, reconnect_max_s=REMOTE_RECONNECT_S)
-    return (
-        _robots_transport(gateway, base, run_dir),
-        create("mqtt", f"{base}/forwards", forwards),
-        create("mqtt", f"{base}/presence", apart, will=will),
-        create("mqtt", f"{base}/stops", _live_only(apart)),
-    )
-
-
-def _robots_transport(gateway: "GatewayFile", base: str, run_dir: Path) -> Transport:
-    if gateway.boards is not None:
-        settings = mqtt_settings(gateway.boards, as_published=True, reconnect_max_s=LOCAL_RECONNECT_S)
-        return create("mqtt", f"{base}/boards", settings)
-    hub = gateway.hub
-    zenoh = ZenohSettings(
-        run_dir=run_dir,
-        connect=hub.connect,
-        tls=tls_settings(hub.tls),
-        lease_ms=hub.lease_ms,
-        client=True,
-        account=hub.account,
-    )
-    return create("zenoh", f"{base}-hub", zenoh)
 
 
 def _renamed_wills(config: Config) -> Iterator[tuple[str, bool]]:

@@ -1,1 +1,10 @@
 """Plays an operator's voice: a jitter buffer, and a program that writes to the loudspeaker."""
+
+from pebble.extension import Extension
+
+EXTENSION = Extension(
+    name="audio_receiver",
+    needs=("av_daemon",),
+    programs="pebble.services.av_daemon.offers:loudspeaker_programs",
+    page="docs/ext/media.md",
+)

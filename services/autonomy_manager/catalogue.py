@@ -18,6 +18,7 @@ from pebble.config import Config
 from pebble.config.home import in_home
 from pebble.contract.forms import MAX_SETTINGS, Setting, form
 from pebble.contract.identity import meant
+from pebble.extensions.scripts.config import AutonomyManager
 from pebble.extensions.scripts.config import Script as ScriptSection
 from pebble.services.autonomy_manager.describe import (
     MANIFEST,
@@ -48,7 +49,7 @@ def roots(config: Config, own: Path = _OWN_SCRIPTS) -> tuple[Path, ...]:
     An absolute path is the only folder; a relative one is searched beside the config, and then Pebble's own.
     The original starts relative paths at its repository, two folders above its configs.
     """
-    given = in_home(config.services.autonomy_manager.autonomy_root)
+    given = in_home(config.section(AutonomyManager).autonomy_root)
     if given.is_absolute():
         return (given,)
     beside = [config.folder / given]
@@ -71,7 +72,7 @@ class Catalogue:
 
     def __init__(self, config: Config, *, asks: bool = True, clock: Callable[[], float] = time.monotonic) -> None:
         """``asks`` is False for a list of scripts without the settings of ours."""
-        self._config, self._section, self._asks = config, config.services.autonomy_manager, asks
+        self._config, self._section, self._asks = config, config.section(AutonomyManager), asks
         self._roots, self._login = roots(config), local_login(config)
         self._clock = clock
         #: By name: the version of its files, what they say, and until when that counts.

@@ -24,6 +24,7 @@ from pebble.contract.payloads import (
     EstopState,
 )
 from pebble.errors import PebbleError
+from pebble.extensions.scripts.config import AutonomyManager as AutonomyManagerSection
 from pebble.extensions.scripts.runs import LocalScripts, following, next_run
 from pebble.motion.arbiter import HOLD_MS
 from pebble.runtime.addresses import Addresses
@@ -52,7 +53,7 @@ class AutonomyManager(Service):
         self, *arguments: Any, spawn: Spawn | None = None, scripts: Mapping[str, Script] | None = None, **options: Any
     ) -> None:
         super().__init__(*arguments, **options)
-        self._section = self.config.services.autonomy_manager
+        self._section = self.config.section(AutonomyManagerSection)
         motors = self.config.motor_lines()
         self.addresses = Addresses(view_of(self.config, next(iter(motors), "")))
         self._local = LocalScripts(self.config)

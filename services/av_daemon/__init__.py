@@ -1,1 +1,21 @@
 """Captures camera and microphone while there are readers, for any number of them."""
+
+from pebble.extension import Extension, Program, Stage
+
+EXTENSION = Extension(
+    name="av_daemon",
+    needs=("media",),
+    extra="av",
+    sections={"services.av_daemon": "pebble.services.av_daemon.config:AvDaemon"},
+    rules="pebble.services.av_daemon.config:RULES",
+    program=Program(
+        "av_daemon",
+        "pebble.services.av_daemon",
+        stage=Stage.DEVICE,
+        preloaded=False,
+        shares=("pebble.transports.frames",),
+    ),
+    offers="pebble.services.av_daemon.offers:offers",
+    facts="pebble.services.av_daemon.offers:facts",
+    page="docs/ext/media.md",
+)

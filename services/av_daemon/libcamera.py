@@ -4,9 +4,9 @@ import logging
 import shutil
 import time
 
-from pebble.config.media import AvDaemon
 from pebble.errors import DeviceError
 from pebble.services.av_daemon.capture_program import CaptureProgram
+from pebble.services.av_daemon.config import AvDaemon
 from pebble.services.av_daemon.jpeg_splitter import JpegSplitter
 from pebble.services.av_daemon.source import Capture
 from pebble.transports.frames import FrameInfo

@@ -11,6 +11,7 @@ from pebble.contract.payloads import MediaReport, MediaStatus
 from pebble.errors import DeviceError
 from pebble.runtime.service import Service, every, on
 from pebble.services.av_daemon import sources
+from pebble.services.av_daemon.config import AvDaemon as AvDaemonSection
 from pebble.services.av_daemon.stream import Stream
 from pebble.transports.frames import FrameWriter
 
@@ -52,7 +53,7 @@ class AvDaemon(Service):
         self._writers: list[FrameWriter] = []
 
     def start(self) -> None:
-        options, now = self.config.services.av_daemon, self.clock()
+        options, now = self.config.section(AvDaemonSection), self.clock()
         if options.video.enabled:
             self._open(CAMERA, sources.picture_bytes(options), sources.camera(options, now))
         if options.audio.enabled:

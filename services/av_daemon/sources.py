@@ -8,9 +8,9 @@ from typing import Any, Final, TypeAlias
 import numpy as np
 from msgspec.structs import replace
 
-from pebble.config.media import AvDaemon
 from pebble.errors import DeviceError, PayloadError
 from pebble.services.av_daemon.alsa import CHUNK_S, AlsaMicrophone
+from pebble.services.av_daemon.config import AvDaemon
 from pebble.services.av_daemon.libcamera import LibcameraCamera
 from pebble.services.av_daemon.source import Bytes, Capture, Source, opencv
 from pebble.services.av_daemon.synthetic import SyntheticCamera, SyntheticMicrophone, WorldCamera

@@ -9,11 +9,11 @@ from collections.abc import Callable
 from importlib import import_module
 from typing import TYPE_CHECKING
 
-from pebble.config.media import CameraCapture, Microphone
 from pebble.errors import DeviceError
 from pebble.extensions.media.scene import Scene
 from pebble.extensions.media.speech import Speech
 from pebble.services.av_daemon.alsa import CHUNK_S
+from pebble.services.av_daemon.config import CameraCapture, Microphone
 from pebble.services.av_daemon.source import Bytes, Capture
 from pebble.transports.frames import FrameInfo
 

@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pebble.config.media import CameraCapture
 from pebble.errors import DeviceError
 from pebble.services.av_daemon.capture_program import SILENCE_S
+from pebble.services.av_daemon.config import CameraCapture
 from pebble.services.av_daemon.source import Bytes, Capture, opencv
 from pebble.transports.frames import FrameInfo
 

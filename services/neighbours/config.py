@@ -1,9 +1,20 @@
 """The config section of robots that hear and drive each other on a LAN."""
 
+from collections.abc import Iterator
 from typing import Annotated, ClassVar
 
+from pebble.config import Config
+from pebble.config.problems import Path
+from pebble.config.reader import Reader, Rule
+from pebble.config.rules.doors import place_of_endpoint, zenoh_endpoints
 from pebble.config.transport import ZenohClient
-from pebble.config.types import EMPTY, ONE_VALUE, Account, Level, ServiceSection, Topic, doc
+from pebble.config.tree import Root
+from pebble.config.types import EMPTY, ONE_VALUE, Account, Level, Section, ServiceSection, Topic, doc
+from pebble.contract import DRIVE, OUTGOING, channel_of, is_reserved
+from pebble.extension import Facts
+
+MOST_NEIGHBOURS, MOST_METRICS = 16, 32  # of one robot; metrics of one neighbour
+_LAN: Path = ("services", "neighbours", "lan")
 
 
 class Lan(ZenohClient, frozen=True, kw_only=True):
@@ -35,3 +46,57 @@ class Neighbours(ServiceSection, frozen=True, kw_only=True):
         dict[Level, tuple[Topic, ...]],
         doc('By the id of another robot, what this one\'s scripts hear of it: {"fred": ["wheel-odometry"]}.'),
     ] = EMPTY
+
+    def connections(self) -> Iterator[tuple[tuple[str, ...], Section]]:
+        if self.enabled:
+            yield ("lan",), self.lan
+
+
+def _check(reader: Reader, section: Neighbours, path: Path) -> Neighbours:
+    problem, lan = reader.notes.problem, section.lan
+    if section.enabled and not lan.connect:
+        reader.notes.doubt((*path, "lan", "connect"), 'is missing, write where the hub listens: ["tls/hub.lab:7447"]')
+    if lan.account and (not lan.tls.enabled or lan.tls.client_cert is None):
+        problem((*path, "lan", "account"), "needs tls.client_cert, in which it is the name")
+    for key, names in (("commanded", section.commanded), ("listens", section.listens)):
+        if len(names) > MOST_NEIGHBOURS:
+            problem((*path, key), f"has {len(names)} robots: {MOST_NEIGHBOURS} are the most")
+    for name, granted in section.commanded.items():
+        if any(metric != DRIVE.metric for metric in granted):
+            problem((*path, "commanded", name), f'must be ["{DRIVE.metric}"]: nothing else can be granted')
+    named = [(("shares",), section.shares), *((("listens", name), found) for name, found in section.listens.items())]
+    for place, metrics in named:
+        if len(metrics) > MOST_METRICS:
+            problem((*path, *place), f"has {len(metrics)} metrics: {MOST_METRICS} are the most")
+        for metric in metrics:
+            channel = channel_of(f"{OUTGOING}/{metric}")
+            if is_reserved(metric) or (channel is not None and not (channel.remote and channel.bridged)):
+                problem((*path, *place), f"{metric} cannot be shared: no pictures or sound, nor who stops and drives")
+    return section
+
+
+def _check_hub(reader: Reader, root: Root, _: Path) -> Root:
+    """Note where the hub of the LAN is also that of the operators, or of the robot itself."""
+    endpoints = list(zenoh_endpoints(root))
+    meets = {place_of_endpoint(endpoint): endpoint for path, endpoint in endpoints if path[:3] == _LAN}
+    for path, endpoint in endpoints:
+        mine = meets.get(place_of_endpoint(endpoint))
+        if mine is not None and path[:3] != _LAN:
+            why = f"is also {'.'.join(map(str, path))}: what is shared would come twice, or without end"
+            reader.notes.problem((*_LAN, "connect"), f"{mine} {why}; take another hub")
+    return root
+
+
+RULES: tuple[Rule, ...] = ((Neighbours, _check), (Root, _check_hub))
+
+
+def facts(config: Config) -> Facts:
+    """Return a line about the LAN."""
+    section = config.section(Neighbours)
+    if not section.enabled:
+        return Facts()
+    ways = [f"connects to {endpoint}" for endpoint in section.lan.connect]
+    drivers = [name for name, granted in section.commanded.items() if granted]
+    names = {"receives": section.listens, "driven by scripts of": drivers, "shares": section.shares}
+    named = (f"{what} {' and '.join(robots)}" for what, robots in names.items() if robots)
+    return Facts((("lan", ", ".join([*ways, *named])),))

@@ -5,6 +5,7 @@ from __future__ import annotations
 from functools import partial
 from typing import Any
 
+from pebble.config import Config
 from pebble.contract import (
     CAPABILITIES,
     DRIVE,
@@ -24,12 +25,13 @@ from pebble.extensions.operator.client.robot_estop import RobotEstop
 from pebble.extensions.scripts.runs import LocalScripts, next_run
 from pebble.extensions.scripts.script.neighbour import PRESENT_S
 from pebble.runtime.addresses import Addresses
-from pebble.runtime.connections import lan_transport
+from pebble.runtime.connections import client_of_hub
 from pebble.runtime.process import view_of
 from pebble.runtime.service import WAIT_LIMIT_S, Service, every, on
 from pebble.services.neighbours.begun import begin
+from pebble.services.neighbours.config import Neighbours as NeighboursSection
 from pebble.services.neighbours.visit import Visit
-from pebble.transports import Message, QoS, Transport
+from pebble.transports import Message, QoS, Transport, create
 
 HEARTBEAT_S = 0.25
 MOST_BYTES = 16 * 1024  # of a message of another robot
@@ -43,10 +45,10 @@ class NeighboursService(Service):
 
     def __init__(self, *arguments: Any, lan: Transport | None = None, **options: Any) -> None:
         super().__init__(*arguments, **options)
-        self._section = self.config.services.neighbours
+        self._section = self.config.section(NeighboursSection)
         self._me = me = self.config.identity
         self.addresses = Addresses(view_of(self.config, next(iter(self.config.motor_lines()), "")))
-        self._lan = lan or lan_transport(self.config)
+        self._lan = lan or _lan_transport(self.config)
         self._others = {name: Identity(me.system, me.type, name) for name in self._section.listens}
         self._local = LocalScripts(self.config)
         self._estop = RobotEstop(self.config.base)
@@ -179,3 +181,10 @@ class NeighboursService(Service):
 
     def _is_present(self, name: str, now: float) -> bool:
         return now - self._received_at.get(name, float("-inf")) <= PRESENT_S
+
+
+def _lan_transport(config: Config) -> Transport:
+    """The connection to the hub of the LAN, not yet opened."""
+    lan = config.section(NeighboursSection).lan
+    settings = client_of_hub(config.run_dir() / "lan", lan, lan.lease_ms, lan.account)
+    return create("zenoh", f"{config.base}-lan", settings)

@@ -5,6 +5,7 @@ from collections.abc import Iterator
 from typing import Any, Final
 
 from pebble.errors import ConfigError
+from pebble.extensions.recordings.config import Recorder as RecorderSection
 from pebble.extensions.recordings.recorder import metrics
 from pebble.extensions.recordings.recorder.recorder import Recorder
 from pebble.extensions.recordings.recorder.settings import Options
@@ -22,7 +23,7 @@ class RobotRecorder(Service):
     name = "recorder"
 
     def start(self) -> None:
-        section = self.config.services.recorder
+        section = self.config.section(RecorderSection)
         options = Options(keep_bytes=section.keep_bytes, keep_media_days=section.keep_media_days, media=section.media)
         folder = section.place
         os.nice(_NICE)
@@ -55,7 +56,7 @@ class RobotRecorder(Service):
 
     def _connections(self) -> Iterator[tuple[str, str, Any]]:
         """Name, kind and settings of each."""
-        section, bridge = self.config.services.recorder, self.config.services.mqtt_bridge
+        section, bridge = self.config.section(RecorderSection), self.config.services.mqtt_bridge
         yield "", self.config.transport.kind, local_settings(self.config)
         if not section.remote:
             return

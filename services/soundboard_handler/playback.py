@@ -15,6 +15,7 @@ from pebble.errors import PebbleError
 from pebble.runtime.child import Child
 from pebble.runtime.environment import child_environment
 from pebble.services.soundboard_handler.clips import Clip
+from pebble.services.soundboard_handler.config import SoundboardHandler
 
 if TYPE_CHECKING:
     from pebble.extensions.media.sound_file import SoundFile
@@ -34,7 +35,7 @@ class Playback:
         self.ended = self.stopped = False
         self.problem = self._decoding_problem = ""
         self.exit_code = 0
-        self._config, self._post = config.services, post
+        self._config, self._post = config, post
         self._on_change = partial(on_change, self)
 
     def start(self) -> None:
@@ -66,7 +67,7 @@ class Playback:
     @property
     def _words(self) -> list[str]:
         """Return the player of a wav file: ``{file}`` stands for its path, which is the last word otherwise."""
-        command, path = list(self._config.soundboard_handler.playback.player_command), str(self.clip.path)
+        command, path = list(self._config.section(SoundboardHandler).playback.player_command), str(self.clip.path)
         words = [word.replace("{file}", path) for word in command]
         return words if words != command else [*words, path]
 
@@ -76,7 +77,7 @@ class Playback:
 
         file = SoundFile(self.clip.path)
         try:
-            words = self._config.mqtt_bridge.media.audio_receiver.words(file.rate, file.channels)
+            words = self._config.services.mqtt_bridge.media.audio_receiver.words(file.rate, file.channels)
             player = self._start_player(words, subprocess.PIPE)
         except (OSError, ValueError):
             file.close()

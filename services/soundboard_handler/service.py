@@ -12,6 +12,7 @@ from pebble.contract.identity import meant
 from pebble.contract.payloads import STOP_WORDS, MediaReport, SoundboardCommand, SoundboardFiles, SoundboardStatus
 from pebble.runtime.service import Service, on
 from pebble.services.soundboard_handler.clips import Clip, Clips
+from pebble.services.soundboard_handler.config import SoundboardHandler as SoundboardHandlerSection
 from pebble.services.soundboard_handler.playback import Playback
 
 _PLAY = ("play", "start", "on", "enable", "enabled")
@@ -40,7 +41,7 @@ class SoundboardHandler(Service):
 
     def __init__(self, *arguments: Any, **options: Any) -> None:
         super().__init__(*arguments, **options)
-        self._section = self.config.services.soundboard_handler
+        self._section = self.config.section(SoundboardHandlerSection)
         self._clips = Clips(self._section.playback.directory or in_home("~/sounds"))
         self._listed: list[str] | None = None
         self._scan_problem = ""

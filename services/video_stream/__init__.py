@@ -1,1 +1,12 @@
 """Runs a foreign streaming program while video is requested."""
+
+from pebble.extension import Extension
+
+EXTENSION = Extension(
+    name="video_stream",
+    sections={"services.video_stream": "pebble.services.video_stream.config:VideoStream"},
+    rules="pebble.services.video_stream.config:RULES",
+    programs="pebble.services.video_stream.offers:programs",
+    offers="pebble.services.video_stream.offers:offers",
+    page="docs/ext/media.md",
+)

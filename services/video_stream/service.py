@@ -7,6 +7,7 @@ from pebble.errors import ConfigError, DeviceError
 from pebble.runtime.child import Child, how_ended
 from pebble.runtime.environment import child_environment
 from pebble.runtime.service import Service, every
+from pebble.services.video_stream.config import VideoStream as VideoStreamSection
 
 _STOP_S = 2.0  # between SIGTERM and SIGKILL; the launcher kills a service after three
 
@@ -21,7 +22,7 @@ class VideoStream(Service):
         self._program: Child | None = None
 
     def start(self) -> None:
-        options = self.config.services.video_stream
+        options = self.config.section(VideoStreamSection)
         if not options.command:
             raise ConfigError("services.video_stream.command: is missing, write the program that streams the video")
         try:
@@ -39,4 +40,4 @@ class VideoStream(Service):
         """Fail when the program has ended: the launcher restarts this process, with longer and longer delays."""
         code = None if self._program is None else self._program.wait(0.0)
         if code is not None:
-            raise DeviceError(f"{self.config.services.video_stream.command[0]} ended: {how_ended(code)}")
+            raise DeviceError(f"{self.config.section(VideoStreamSection).command[0]} ended: {how_ended(code)}")

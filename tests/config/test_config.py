@@ -17,7 +17,10 @@ from msgspec.structs import replace
 from pebble.config import LAUNCHER_LOCK, Config, load, parse, resolved
 from pebble.contract import channel_of
 from pebble.errors import ConfigError
+from pebble.extensions.page.config import WebHandler, WebInterface
+from pebble.extensions.recordings.config import Recorder
 from pebble.runtime.connections import hub_settings
+from pebble.services.video_stream.config import VideoStream
 from pebble.transports.topics import check_topic
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -90,14 +93,14 @@ class TestMeaning:
         assert (fred.transport.kind, fred.services.serial_mcu_bridge.serial.baud) == ("mqtt", 115200)
         assert (minilamp.robot.platform, benjr.robot.platform) == ("esp32", "esp8266")
         assert pitcam.services.mqtt_bridge.heartbeat.enabled
-        assert (pitcam.media_programs(), pitcam.on_demand_programs()) == ((), ("video_stream",))
+        assert pitcam.on_demand_programs() == ("video_stream",)
         assert pitcam.serial_instances() == {}
 
     def test_zero_and_false_are_values(self) -> None:
         services = {"mqtt_bridge": {"heartbeat": {"enabled": False}}, "recorder": {"keep_bytes": 0}}
         config = read(at("services", services))
         assert not config.services.mqtt_bridge.heartbeat.enabled
-        assert config.services.recorder.keep_bytes == 0
+        assert config.section(Recorder).keep_bytes == 0
 
     @pytest.mark.parametrize("nothing", ["", None])
     def test_an_empty_string_and_null_mean_not_set(self, nothing: str | None) -> None:
@@ -193,7 +196,7 @@ class TestOriginal:
         (warning,) = [line for line in config.warnings if line.startswith("web_interface")]
         assert warning.startswith("web_interface.host: other machines reach 0.0.0.0, so the page starts only with a ")
         assert "`pebble cert init`" in warning
-        assert (config.services.web_handler.enabled, config.web_interface.mqtt.host) == (True, "127.0.0.1")
+        assert (config.section(WebHandler).enabled, config.section(WebInterface).mqtt.host) == (True, "127.0.0.1")
 
     def test_a_soundboard_needs_a_player(self) -> None:
         """Else the sound itself would be run."""
@@ -712,7 +715,7 @@ class TestPasswords:
 
     def test_a_login_in_the_address_of_a_stream_is_left_out_because_it_is_published(self) -> None:
         config = read(at("services.video_stream.webrtc_url", "https://me:p@ss@pit.example:8889/cam@2"))
-        assert config.services.video_stream.webrtc_url == "https://pit.example:8889/cam@2"
+        assert config.section(VideoStream).webrtc_url == "https://pit.example:8889/cam@2"
         assert config.warnings == (
             "services.video_stream.webrtc_url: its login is left out, because the address is published",
         )
@@ -727,12 +730,12 @@ class TestWebInterface:
     @pytest.mark.parametrize("host", ["127.0.0.1", "127.1.2.3", "::1", "localhost"])
     def test_addresses_of_this_machine(self, host: str) -> None:
         config = read(at("web_interface.host", host))
-        assert (config.web_interface.local, config.warnings) == (True, ())
+        assert (config.section(WebInterface).local, config.warnings) == (True, ())
 
     @pytest.mark.parametrize("host", ["0.0.0.0", "::", "192.168.1.7", "goob.local"])
     def test_addresses_that_other_machines_reach(self, host: str) -> None:
         config = read(at("web_interface.host", host))
-        assert not config.web_interface.local
+        assert not config.section(WebInterface).local
         (warning,) = config.warnings
         assert warning.startswith(f"web_interface.host: other machines reach {host}, ")
         assert read(at("web_interface", {"host": host, "plain_http": True})).warnings == ()
@@ -745,8 +748,8 @@ class TestWebInterface:
         raw = at("web_interface", {"host": "0.0.0.0", "tls": tls, "people": "people.sqlite"})
         config = load(written(tmp_path, json.dumps(raw)), env={})
         assert config.warnings == ()
-        assert config.web_interface.tls.certificate == tmp_path / "server.pem"
-        assert config.web_interface.people == tmp_path / "people.sqlite"
+        assert config.section(WebInterface).tls.certificate == tmp_path / "server.pem"
+        assert config.section(WebInterface).people == tmp_path / "people.sqlite"
 
     def test_a_certificate_that_does_not_exist_yet_stops_the_page_and_not_the_robot(self) -> None:
         config = read(at("web_interface.tls", {"certificate": "server.pem", "key": "server.key"}))

@@ -8,8 +8,8 @@ from typing import Any
 
 import pytest
 
+from pebble.check_result import State
 from pebble.config import load, parse
-from pebble.extensions.checks.check import State
 from pebble.extensions.checks.robot import run_checks
 
 

@@ -11,6 +11,7 @@ from pebble.config.hosts import HostError, broker_host, endpoint, name_of_page
 from pebble.errors import ConfigError, PebbleError
 from pebble.extensions.fleet.certificates import init
 from pebble.extensions.operator.client.url import settings_of
+from pebble.services.video_stream.config import VideoStream
 
 
 @pytest.mark.parametrize(
@@ -102,7 +103,7 @@ def test_endpoints_and_names_of_the_page() -> None:
 )
 def test_the_address_of_a_stream(url: str, public: str, warned: str) -> None:
     config = parse({"robot": {"id": "r"}, "services": {"video_stream": {"webrtc_url": url}}}, folder=Path("/"), env={})
-    assert config.services.video_stream.webrtc_url == public
+    assert config.section(VideoStream).webrtc_url == public
     assert warned in "".join(config.warnings)
     assert bool(warned) == bool(config.warnings)
 

@@ -17,9 +17,9 @@ sys.path.insert(0, root)
 
 from pebble.config import load  # noqa: E402
 from pebble.errors import PebbleError  # noqa: E402
+from pebble.extension import Program, Stage  # noqa: E402
 from pebble.launcher import launcher, on_demand, restart_policy  # noqa: E402
 from pebble.launcher.child import Child  # noqa: E402
-from pebble.launcher.programs import Program, Stage  # noqa: E402
 from tests.fakes.seccomp import deny  # noqa: E402
 
 

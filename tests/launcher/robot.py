@@ -12,7 +12,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from pebble.launcher.programs import Stage
+from pebble.extension import Stage
 from tests.support import ROOT, gone, process_name, until
 
 BASE = "pebble/robots/rover"

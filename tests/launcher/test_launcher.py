@@ -17,8 +17,9 @@ import pytest
 
 from pebble.config import Config, load, parse
 from pebble.errors import ConfigError
+from pebble.extension import Program, Stage
 from pebble.launcher.launcher import Launcher
-from pebble.launcher.programs import Program, Stage, programs, shared_modules
+from pebble.launcher.programs import programs, shared_modules
 from pebble.launcher.run_lock import RunLock
 from pebble.runtime.parent import NOTIFY_FD
 from tests.fakes.seccomp import CALLS

@@ -14,10 +14,10 @@ from typing import Any, cast
 import msgspec
 import pytest
 
+from pebble.extension import Program, Stage
 from pebble.launcher import on_demand
 from pebble.launcher.on_demand import OnDemand
 from pebble.launcher.process_supervisor import ProcessSupervisor
-from pebble.launcher.programs import Program, Stage
 from pebble.launcher.reactor import Reactor
 from pebble.runtime import notes
 from pebble.runtime.notes import Held, Wanted

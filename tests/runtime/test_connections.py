@@ -11,10 +11,10 @@ import pytest
 
 from pebble.config import parse
 from pebble.contract import ESTOP
+from pebble.extensions.fleet.gateway.connections import gateway_transports
 from pebble.extensions.fleet.gateway.gateway import will
 from pebble.extensions.fleet.gateway.gateway_file import GatewayFile
 from pebble.runtime.connections import (
-    gateway_transports,
     local_settings,
     mqtt_settings,
     remote_transport,

@@ -2,30 +2,21 @@
 
 import os
 import re
-from collections.abc import Callable, Mapping
 from pathlib import Path as FilePath
-from typing import Any
 
 from msgspec.structs import replace
 
-from pebble.config.hosts import HostError, check_web_url
-from pebble.config.media import AvDaemon, VideoStream
 from pebble.config.problems import Path
-from pebble.config.reader import Check, Reader
-from pebble.config.rules.doors import check_doors, check_lan
+from pebble.config.reader import Reader, Rule
+from pebble.config.rules.doors import check_doors
 from pebble.config.rules.exposure import warn_if_readable, warn_of_known_id, warn_of_logins_in_clear
 from pebble.config.rules.shared_topics import shared_topics
-from pebble.config.secret_text import without_login
 from pebble.config.text_files import NotTextError, read_text
-from pebble.config.transport import Mqtt, RemoteMqtt, Tls, TransportSection
+from pebble.config.transport import Mqtt, Tls, TransportSection
 from pebble.config.tree import MqttBridge, Root, SerialBridge, Services
 from pebble.config.types import Secret
-from pebble.contract import DRIVE, OUTGOING, channel_of, is_reserved
 from pebble.contract.identity import GATEWAYS, SERVERS
-from pebble.extensions.page.config import WebInterface, WebTls
-from pebble.services.neighbours.config import Neighbours
 
-MOST_NEIGHBOURS, MOST_METRICS = 16, 32  # of one robot; metrics of one neighbour
 _TLS = ("tls/", "quic/")  # endpoints of Zenoh that are encrypted
 _LONGEST_TEXT = 65535  # bytes of a user name or password (MQTT 3.1.1, section 1.5.3)
 _VARIABLE = re.compile("[A-Z_][A-Z0-9_]*").fullmatch  # as they are usually written; else it may be a password
@@ -48,7 +39,6 @@ def _root(reader: Reader, root: Root, _path: Path) -> Root:
         warn_of_logins_in_clear(reader.notes, root)
         warn_of_known_id(reader.notes, root)
     check_doors(reader.notes, root)
-    check_lan(reader.notes, root)
     return root
 
 
@@ -80,60 +70,7 @@ def _services(reader: Reader, services: Services, path: Path) -> Services:
             (*path, "ros1_bridge"),
             "is enabled, but arrives in a later release; skipped, and a stop sends zeros to one that runs",
         )
-    if services.video_stream.enabled and not services.video_stream.command:
-        reader.notes.doubt((*path, "video_stream", "command"), "is missing, write the program that streams the video")
-    if services.soundboard_handler.enabled and not services.soundboard_handler.playback.player_command:
-        reader.notes.doubt((*path, "soundboard_handler", "playback", "player_command"), "is missing, write aplay")
     return services
-
-
-def _av_daemon(reader: Reader, devices: AvDaemon, path: Path) -> AvDaemon:
-    """The sockets for programs of the original. Without a folder for them the robot runs, and they wait."""
-    sockets = devices.sockets()
-    for section, file in sockets.items():
-        if not file.parent.is_dir():
-            text = f"there is no folder {file.parent}: until there is, no program finds this socket"
-            reader.notes.warning((*path, section, "socket_path"), text)
-    if len(sockets) > len(set(sockets.values())):
-        reader.notes.problem((*path, "audio", "socket_path"), "is also that of video, write another")
-    return devices
-
-
-def _video_stream(reader: Reader, stream: VideoStream, path: Path) -> VideoStream:
-    """Every operator receives the address: a login in it would be no secret."""
-    if stream.webrtc_url is None:
-        return stream
-    public = without_login(stream.webrtc_url)
-    if public != stream.webrtc_url:
-        reader.notes.warning((*path, "webrtc_url"), "its login is left out, because the address is published")
-    try:
-        check_web_url(public)
-    except HostError as error:
-        reader.notes.warning((*path, "webrtc_url"), f"no page can show it: {error}")
-    return replace(stream, webrtc_url=public)
-
-
-def _neighbours(reader: Reader, section: Neighbours, path: Path) -> Neighbours:
-    problem, lan = reader.notes.problem, section.lan
-    if section.enabled and not lan.connect:
-        reader.notes.doubt((*path, "lan", "connect"), 'is missing, write where the hub listens: ["tls/hub.lab:7447"]')
-    if lan.account and (not lan.tls.enabled or lan.tls.client_cert is None):
-        problem((*path, "lan", "account"), "needs tls.client_cert, in which it is the name")
-    for key, names in (("commanded", section.commanded), ("listens", section.listens)):
-        if len(names) > MOST_NEIGHBOURS:
-            problem((*path, key), f"has {len(names)} robots: {MOST_NEIGHBOURS} are the most")
-    for name, granted in section.commanded.items():
-        if any(metric != DRIVE.metric for metric in granted):
-            problem((*path, "commanded", name), f'must be ["{DRIVE.metric}"]: nothing else can be granted')
-    named = [(("shares",), section.shares), *((("listens", name), found) for name, found in section.listens.items())]
-    for place, metrics in named:
-        if len(metrics) > MOST_METRICS:
-            problem((*path, *place), f"has {len(metrics)} metrics: {MOST_METRICS} are the most")
-        for metric in metrics:
-            channel = channel_of(f"{OUTGOING}/{metric}")
-            if is_reserved(metric) or (channel is not None and not (channel.remote and channel.bridged)):
-                problem((*path, *place), f"{metric} cannot be shared: no pictures or sound, nor who stops and drives")
-    return section
 
 
 def _bridge(reader: Reader, bridge: MqttBridge, path: Path) -> MqttBridge:
@@ -211,34 +148,6 @@ def _tls(reader: Reader, tls: Tls, path: Path) -> Tls:
     return tls
 
 
-def _web(reader: Reader, web: WebInterface, path: Path) -> WebInterface:
-    """A mistake here must not keep the robot from starting: without a page it still drives."""
-    if not web.local and web.tls.certificate is None and not web.plain_http:
-        reader.notes.warning(
-            (*path, "host"),
-            f"other machines reach {web.host}, so the page starts only with a certificate and a user: run "
-            f"`pebble cert init` and `pebble web user add`, write web_interface.tls; or leave out host",
-        )
-    if not web.mqtt.host and web.mqtt != RemoteMqtt():
-        reader.notes.warning((*path, "mqtt"), "not used: it has no host, so the page connects to the robot's broker")
-    if web.plain_http and web.tls.certificate is not None:
-        reader.notes.warning((*path, "plain_http"), "has no effect: there is a certificate, so the page is https")
-    return web
-
-
-def _web_tls(reader: Reader, tls: WebTls, path: Path) -> WebTls:
-    for key, other in (("certificate", "key"), ("key", "certificate")):
-        if getattr(tls, key) is not None and getattr(tls, other) is None:
-            reader.notes.doubt((*path, other), f"is missing, it belongs to {key}")
-    for key in ("certificate", "key", "ca"):
-        file = getattr(tls, key)
-        if file is not None and not file.is_file():
-            reader.notes.warning((*path, key), f"there is no file {file}; run `pebble cert init`")
-    if tls.key is not None:
-        warn_if_readable(reader.notes, (*path, "key"), tls.key, "this key")
-    return tls
-
-
 def _mqtt(reader: Reader, mqtt: Mqtt, path: Path) -> Mqtt:
     given = [key for key in ("password", "password_file", "password_env") if getattr(mqtt, key) is not None]
     if len(given) > 1:
@@ -285,22 +194,13 @@ def _contents(reader: Reader, file: FilePath, path: Path) -> str | None:
     return None
 
 
-def _table(*rows: tuple[type[Any], Callable[[Reader, Any, Path], Any]]) -> Mapping[type[Any], Check]:
-    return dict(rows)
-
-
-#: By the class of a section, subclasses included.
-CHECKS = _table(
+#: By the class of a section, subclasses included. Extensions add those of theirs.
+CHECKS: tuple[Rule, ...] = (
     (Root, _root),
     (TransportSection, _transport),
     (Services, _services),
-    (AvDaemon, _av_daemon),
-    (VideoStream, _video_stream),
     (MqttBridge, _bridge),
-    (Neighbours, _neighbours),
     (SerialBridge, _serial),
     (Tls, _tls),
     (Mqtt, _mqtt),
-    (WebTls, _web_tls),
-    (WebInterface, _web),
 )

@@ -1,11 +1,11 @@
-"""What the security level of a config refuses: ways to the robot without a login; and one hub for two uses."""
+"""What the security level of a config refuses: ways to the robot without a login."""
 
 import re
 from collections.abc import Iterator
 
 from pebble.config.hosts import is_loopback
 from pebble.config.problems import Notes, Path
-from pebble.config.rules.exposure import brokers
+from pebble.config.rules.exposure import brokers, connections, core_connections
 from pebble.config.rules.shared_topics import renamed_commands
 from pebble.config.transport import Mqtt, ZenohClient
 from pebble.config.tree import Root
@@ -13,7 +13,6 @@ from pebble.config.tree import Root
 _ZENOH_ENCRYPTED = ("tls/", "quic/")
 _ZENOH_LOCAL = ("unixsock-stream/", "unixpipe/", "vsock/")
 _EVERYWHERE = ("0.0.0.0", "::")  # noqa: S104 -- compared only
-_LAN: Path = ("services", "neighbours", "lan")
 _BARE_HOST = re.compile(r"^[a-z0-9-]+/\[?([^\]/]*?)\]?(?::\d+)?(?:[?#].*)?$")
 
 
@@ -36,7 +35,7 @@ def warning_of_open(root: Root) -> str:
 
 
 def _robots_brokers(root: Root) -> Iterator[tuple[Path, Mqtt]]:
-    return (one for one in brokers(root) if one[0][0] != "web_interface")
+    return ((path, section) for path, section in core_connections(root) if isinstance(section, Mqtt))
 
 
 def _check_links(notes: Notes, root: Root) -> None:
@@ -58,52 +57,30 @@ def _check_links(notes: Notes, root: Root) -> None:
     for path, endpoint in _endpoints(root):
         if not endpoint.startswith(_ZENOH_ENCRYPTED):
             notes.problem(path, f'{endpoint} is not encrypted: write tls/… at security.level "{level}"')
-    remote, lan = root.services.mqtt_bridge.remote, root.services.neighbours.lan
-    links = {("mqtt_bridge", "remote"): "" if remote is None else remote.account, ("neighbours", "lan"): lan.account}
-    for link, account in links.items():
-        if not account and any(path[1:3] == link for path, _ in _endpoints(root)):
+    for path, section in connections(root):
+        ways = [endpoint for place, endpoint in _endpoints(root) if place[:-1] == path]
+        if ways and getattr(section, "account", None) == "":
             notes.problem(
-                ("services", *link, "account"),
+                (*path, "account"),
                 f'is missing at security.level "{level}": `pebble fleet certificate NAME` prints what belongs there',
             )
 
 
-def check_lan(notes: Notes, root: Root) -> None:
-    """Note where the hub of the LAN is also that of the operators, or of the robot itself."""
-    sections = _zenoh_sections(root)
-    lan = sections.pop(_LAN, None)
-    meets = {_place(endpoint): endpoint for endpoint in (() if lan is None else lan.connect)}
-    for path, key, endpoint in _each(sections):
-        if (mine := meets.get(_place(endpoint))) is not None:
-            other = ".".join(map(str, (*path, key)))
-            why = f"is also {other}: what is shared would come twice, or without end; take another hub"
-            notes.problem((*_LAN, "connect"), f"{mine} {why}")
-
-
 def _endpoints(root: Root) -> Iterator[tuple[Path, str]]:
     """Those of Zenoh that lead beyond this machine."""
-    for path, key, endpoint in _each(_zenoh_sections(root)):
-        if not _is_near(endpoint):
-            yield (*path, key), endpoint
+    return (row for row in zenoh_endpoints(root) if not _is_near(row[1]))
 
 
-def _zenoh_sections(root: Root) -> dict[Path, ZenohClient]:
-    transport, bridge = root.transport, root.services.mqtt_bridge
-    found: dict[Path, ZenohClient] = {("transport",): transport} if transport.kind == "zenoh" else {}
-    if bridge.enabled and bridge.remote is not None and bridge.remote.kind == "zenoh":
-        found["services", "mqtt_bridge", "remote"] = bridge.remote
-    if root.services.neighbours.enabled:
-        found[_LAN] = root.services.neighbours.lan
-    return found
+def zenoh_endpoints(root: Root) -> Iterator[tuple[Path, str]]:
+    """Yield the endpoints of all connections by Zenoh, with their places in the config."""
+    for path, section in connections(root):
+        if isinstance(section, ZenohClient):
+            for key in ("listen", "connect"):
+                yield from (((*path, key), endpoint) for endpoint in getattr(section, key, ()))
 
 
-def _each(sections: dict[Path, ZenohClient]) -> Iterator[tuple[Path, str, str]]:
-    for path, section in sections.items():
-        yield from ((path, key, one) for key in ("listen", "connect") for one in getattr(section, key, ()))
-
-
-def _place(endpoint: str) -> tuple[str, str]:
-    """Host and port; all names of this machine are one."""
+def place_of_endpoint(endpoint: str) -> tuple[str, str]:
+    """Return host and port; all names of this machine are one."""
     host, _, port = re.sub(r"[?#].*", "", endpoint.partition("/")[2]).rpartition(":")
     host = host.strip("[]")
     return ("" if host in _EVERYWHERE or is_loopback(host) else host), port

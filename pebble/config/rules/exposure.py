@@ -9,6 +9,7 @@ from pebble.config.hosts import is_loopback
 from pebble.config.problems import Notes, Path
 from pebble.config.transport import Mqtt
 from pebble.config.tree import Root
+from pebble.config.types import Section
 
 
 def warn_if_readable(notes: Notes, path: Path, file: FilePath, what: str) -> None:
@@ -48,12 +49,30 @@ def warn_of_known_id(notes: Notes, root: Root) -> None:
 
 
 def brokers(root: Root) -> Iterator[tuple[Path, Mqtt]]:
-    bridge, mirror = root.services.mqtt_bridge, root.transport.mqtt_mirror
-    if root.transport.kind == "mqtt":
+    """Yield the brokers that the robot's programs connect to, with their places in the config."""
+    return ((path, section) for path, section in connections(root) if isinstance(section, Mqtt))
+
+
+def connections(root: Root) -> Iterator[tuple[Path, Section]]:
+    """Yield all sections of connections in use, those of extensions included, with their places in the config."""
+    yield from core_connections(root)
+    for place, holder in (("services",), root.services), ((), root):
+        for name in holder.__struct_fields__:
+            section = getattr(holder, name)
+            for path, connection in section.connections() if isinstance(section, Section) else ():
+                yield (*place, name, *path), connection
+
+
+def core_connections(root: Root) -> Iterator[tuple[Path, Section]]:
+    """Yield those of the core: inside the robot, and to operators."""
+    bridge, transport = root.services.mqtt_bridge, root.transport
+    if transport.kind == "mqtt":
         yield ("local_mqtt",), root.local_mqtt
-    if mirror is not None:
-        yield ("transport", "mqtt_mirror"), mirror
+    if transport.mqtt_mirror is not None:
+        yield ("transport", "mqtt_mirror"), transport.mqtt_mirror
+    if transport.kind == "zenoh":
+        yield ("transport",), transport
     if bridge.enabled and (bridge.remote is None or bridge.remote.kind == "mqtt"):
         yield ("services", "mqtt_bridge", "remote_mqtt"), bridge.remote_mqtt
-    if root.web_interface.mqtt.host:
-        yield ("web_interface", "mqtt"), root.web_interface.mqtt
+    if bridge.enabled and bridge.remote is not None and bridge.remote.kind == "zenoh":
+        yield ("services", "mqtt_bridge", "remote"), bridge.remote

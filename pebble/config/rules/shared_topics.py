@@ -1,7 +1,6 @@
 """Finds the keys of a config that give a channel another topic, or that of another one."""
 
 from collections.abc import Iterator
-from functools import reduce
 from typing import Any
 
 from pebble.config.problems import Path
@@ -56,5 +55,7 @@ def _keys(channel: Channel, root: Root) -> Iterator[tuple[Path, str | None]]:
 
 
 def _at(section: Any, keys: tuple[str, ...]) -> str | None:
-    topic: str | None = reduce(getattr, keys, section)
+    for key in keys:
+        section = getattr(section, key, None)  # an extension's section is missing with it
+    topic: str | None = section
     return topic

@@ -1,43 +1,18 @@
-"""The engine of all checks: what a check is, what its result is, and how a table of checks is run."""
+"""The engine of all checks: what a check is, and how a table of checks is run."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable, Iterator
 from dataclasses import dataclass, replace
-from enum import StrEnum
-from functools import partial
 from itertools import islice
 from typing import Final, Generic, TypeVar
 
+from pebble.check_result import CheckResult, failed, skipped
 from pebble.errors import PebbleError
 
 SOON_DAYS: Final = 14  # before its end, a certificate is warned of
 
 Subject = TypeVar("Subject")
-
-
-class State(StrEnum):
-    OK = "ok"
-    WARN = "warn"
-    FAILED = "failed"
-    SKIPPED = "skipped"
-
-
-@dataclass(frozen=True, slots=True)
-class CheckResult:
-    """The result of one check.
-
-    ``fix`` is the command or config change that ends a failure; ``what`` is the subject, where a check has several.
-    The text of a check that was skipped completes "skipped because", and its fix is what would let it be made.
-    """
-
-    state: State
-    text: str
-    fix: str = ""
-    what: str = ""
-
-
-ok, warn, failed, skipped = (partial(CheckResult, state) for state in State)
 
 
 def some_of(names: Collection[str], most: int = 3) -> str:

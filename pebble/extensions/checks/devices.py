@@ -6,8 +6,10 @@ import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
+from pebble.check_result import CheckResult, failed, ok, warn
 from pebble.config import Config
-from pebble.extensions.checks.check import CheckResult, failed, ok, warn
+from pebble.services.av_daemon.config import AvDaemon
+from pebble.services.soundboard_handler.config import SoundboardHandler
 
 _NUMBERED = re.compile(r"(ttyACM|ttyUSB|video)[0-9]+")  # the number depends on the order of plugging in
 _METADATA = re.compile(r"-video-index(?!0$)")  # another device file of the same camera
@@ -50,7 +52,7 @@ def serial_port(path: Path, key: str, names: Path = _SERIAL_NAMES) -> CheckResul
 
 def cameras(config: Config, folder: Path = Path("/dev")) -> Iterator[CheckResult]:
     """Check the camera, if it has one. ``folder``: of device files."""
-    daemon = config.services.av_daemon
+    daemon = config.section(AvDaemon)
     if daemon.enabled and daemon.video.enabled:
         yield camera(daemon.video.backend, daemon.video.device, folder)
 
@@ -67,7 +69,7 @@ def camera(backend: str, name: str, folder: Path) -> CheckResult:
 
 
 def microphone(config: Config) -> Iterator[CheckResult]:
-    daemon = config.services.av_daemon
+    daemon = config.section(AvDaemon)
     if daemon.enabled and daemon.audio.enabled and daemon.audio.source != "synthetic":
         yield _program(("arecord",), "sudo apt install alsa-utils")
 
@@ -80,10 +82,10 @@ def _program(names: tuple[str, ...], fix: str) -> CheckResult:
 
 def loudspeaker(config: Config) -> Iterator[CheckResult]:
     """Look for the players of sounds and of an operator's voice, if it plays them."""
-    services = config.services
-    talk_back = services.av_daemon.enabled and services.av_daemon.audio.enabled
-    wav, raw = services.soundboard_handler.playback.player_command, services.mqtt_bridge.media.audio_receiver.command
-    commands = [wav] * services.soundboard_handler.enabled + [raw] * talk_back
+    devices, sounds = config.section(AvDaemon), config.section(SoundboardHandler)
+    talk_back = devices.enabled and devices.audio.enabled
+    wav, raw = sounds.playback.player_command, config.services.mqtt_bridge.media.audio_receiver.command
+    commands = [wav] * sounds.enabled + [raw] * talk_back
     for name in dict.fromkeys(command[0] for command in commands):
         if shutil.which(name) is not None:
             yield ok(f"uses {name}")

@@ -6,8 +6,9 @@ import time
 from resource import RLIM_INFINITY, RLIMIT_MEMLOCK, getrlimit
 from typing import Any
 
+from pebble.check_result import CheckResult, failed, ok, warn
 from pebble.errors import PebbleError
-from pebble.extensions.checks.check import Check, CheckResult, failed, ok, warn
+from pebble.extensions.checks.check import Check
 
 _ENOUGH_LOCKED = 64 * 1024 * 1024  # a camera's pool of frames at 1080p
 _BUILT = 1735689600  # 2025: a clock before this has not been set

@@ -2,25 +2,28 @@
 
 import os
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
+from pebble.check_result import CheckResult, State, failed, ok, warn
 from pebble.config import LAUNCHER_LOCK, Config
 from pebble.config.hosts import is_loopback
 from pebble.config.rules import exposure
 from pebble.config.rules.doors import warning_of_open
 from pebble.contract.levels import LEVELS
 from pebble.errors import PebbleError
+from pebble.extension import part
 from pebble.extensions.checks import devices
 from pebble.extensions.checks.broker.account import page_account, robot_account
 from pebble.extensions.checks.broker.login import beyond_loopback, broker, own_addresses
 from pebble.extensions.checks.broker.login_attempt import TIMEOUT_S
-from pebble.extensions.checks.check import SOON_DAYS, Check, CheckResult, State, failed, ok, run, some_of, warn
+from pebble.extensions.checks.check import SOON_DAYS, Check, run, some_of
 from pebble.extensions.checks.machine import MACHINE
-from pebble.extensions.checks.recorder import recorder
 from pebble.extensions.fleet import certificates
 from pebble.extensions.fleet.folder import FLEET, Fleet, FleetError, load
 from pebble.extensions.fleet.roles import ProgramRole, Right, rights
 from pebble.extensions.operator.client.page_packages import require_packages
+from pebble.extensions.page.config import WebHandler, WebInterface
 from pebble.extensions.page.setting import settings_of
 from pebble.runtime.connections import REMOTE_RECONNECT_S, mqtt_settings
 from pebble.runtime.parent import launcher_runs
@@ -108,7 +111,7 @@ def config_of_running(config: Config) -> Iterator[CheckResult]:
 
 def operator_page(config: Config) -> Iterator[CheckResult]:
     """Check that the page that the robot itself serves can start; if it has users, only its own user can read that."""
-    if not config.services.web_handler.enabled:
+    if not config.section(WebHandler).enabled:
         return
     try:
         settings = settings_of(config)
@@ -151,7 +154,7 @@ def brokers(config: Config) -> Iterator[CheckResult]:
 
 def page_brokers(config: Config) -> Iterator[CheckResult]:
     """Check that the broker of an operator page that has its own lets it in, and delivers what all robots send."""
-    mqtt, level = config.web_interface.mqtt, config.security.level
+    mqtt, level = config.section(WebInterface).mqtt, config.security.level
     if not mqtt.host:
         return
     settings = mqtt_settings(mqtt, reconnect_max_s=REMOTE_RECONNECT_S)
@@ -159,6 +162,13 @@ def page_brokers(config: Config) -> Iterator[CheckResult]:
     yield from results
     if not any(result.state is State.FAILED for result in results):
         yield from page_account(results[0].what, settings, level)
+
+
+def extensions(config: Config) -> Iterator[CheckResult]:
+    """Run the checks that extensions add for a robot, each under the extension's name."""
+    for extension in config.installed:
+        for result in part(extension.checks)(config) if extension.checks else ():
+            yield replace(result, what=result.what or extension.name)
 
 
 ROBOT: tuple[Check[Config], ...] = (
@@ -171,6 +181,6 @@ ROBOT: tuple[Check[Config], ...] = (
     Check("loudspeaker", devices.loudspeaker),
     Check("operator page", operator_page),
     Check("page's broker", page_brokers),
-    Check("recorder", recorder),
+    Check("extensions", extensions),
     Check("broker", brokers),
 )

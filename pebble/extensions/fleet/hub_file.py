@@ -14,6 +14,8 @@ from pebble.config.rules.between_keys import CHECKS
 from pebble.config.transport import ZenohSection
 from pebble.config.types import CommonName, File, doc
 from pebble.errors import ConfigError
+from pebble.runtime.connections import tls_settings
+from pebble.transports import ZenohSettings
 
 
 class HubFile(ZenohSection, frozen=True, kw_only=True):
@@ -43,3 +45,18 @@ def load_hub(path: Path, env: Mapping[str, str] = os.environ) -> tuple[HubFile, 
     if reader.notes.problems:
         raise ConfigError(list(dict.fromkeys(f"{path.name}: {one}" for one in reader.notes.problems)))
     return hub, hub.run_dir or default_run_folder(f"hub {path}", env)
+
+
+def settings_of(hub: HubFile, run_dir: Path) -> ZenohSettings:
+    """Return the settings of a hub of its own, for several robots."""
+    return ZenohSettings(
+        run_dir=run_dir,
+        listen=hub.listen,
+        connect=hub.connect,
+        tls=tls_settings(hub.tls),
+        allowed_names=hub.allowed_names,
+        access=hub.access,
+        lease_ms=hub.lease_ms,
+        journal=hub.journal,
+        max_wills=hub.max_wills,
+    )

@@ -1,1 +1,5 @@
 """Pictures and sound on the wire: encoders, decoders, a jitter buffer, and computed test material."""
+
+from pebble.extension import Extension
+
+EXTENSION = Extension(name="media", extra="av", page="docs/ext/media.md")

@@ -1,1 +1,24 @@
 """Operators' programs: the client library and the commands that use it."""
+
+from pebble.extension import Command, Extension
+
+EXTENSION = Extension(
+    name="operator",
+    needs=("media",),
+    commands={
+        "estop": Command(
+            "pebble.extensions.operator.commands.estop:estop", "stop robots until they are reset", "use", 30
+        ),
+        "watch": Command(
+            "pebble.extensions.operator.commands.watch:watch",
+            "write a picture of a robot's camera into a file",
+            "use",
+            40,
+        ),
+        "topic": Command(
+            "pebble.extensions.operator.commands.topic", "list, print, publish and measure messages", "write", 20
+        ),
+    },
+    former={"topics": "topic contract", "topic bw": "topic hz", "snapshot": "watch --picture FILE"},
+    page="docs/topics.md",
+)

@@ -1,8 +1,12 @@
 """The config sections of the operator page: where it listens, who may use it, and the robot's service that runs it."""
 
+from collections.abc import Iterator
 from typing import Annotated, ClassVar
 
 from pebble.config.hosts import is_loopback
+from pebble.config.problems import Path
+from pebble.config.reader import Reader, Rule
+from pebble.config.rules.exposure import warn_if_readable
 from pebble.config.transport import RemoteMqtt
 from pebble.config.types import (
     UNIT,
@@ -67,3 +71,38 @@ class WebInterface(Section, frozen=True, kw_only=True):
     def local(self) -> bool:
         """Whether only this machine can reach it."""
         return is_loopback(self.host)
+
+    def connections(self) -> Iterator[tuple[tuple[str, ...], Section]]:
+        if self.mqtt.host:
+            yield ("mqtt",), self.mqtt
+
+
+def _check(reader: Reader, web: WebInterface, path: Path) -> WebInterface:
+    """A mistake here must not keep the robot from starting: without a page it still drives."""
+    if not web.local and web.tls.certificate is None and not web.plain_http:
+        reader.notes.warning(
+            (*path, "host"),
+            f"other machines reach {web.host}, so the page starts only with a certificate and a user: run "
+            f"`pebble cert init` and `pebble web user add`, write web_interface.tls; or leave out host",
+        )
+    if not web.mqtt.host and web.mqtt != RemoteMqtt():
+        reader.notes.warning((*path, "mqtt"), "not used: it has no host, so the page connects to the robot's broker")
+    if web.plain_http and web.tls.certificate is not None:
+        reader.notes.warning((*path, "plain_http"), "has no effect: there is a certificate, so the page is https")
+    return web
+
+
+def _check_tls(reader: Reader, tls: WebTls, path: Path) -> WebTls:
+    for key, other in (("certificate", "key"), ("key", "certificate")):
+        if getattr(tls, key) is not None and getattr(tls, other) is None:
+            reader.notes.doubt((*path, other), f"is missing, it belongs to {key}")
+    for key in ("certificate", "key", "ca"):
+        file = getattr(tls, key)
+        if file is not None and not file.is_file():
+            reader.notes.warning((*path, key), f"there is no file {file}; run `pebble cert init`")
+    if tls.key is not None:
+        warn_if_readable(reader.notes, (*path, "key"), tls.key, "this key")
+    return tls
+
+
+RULES: tuple[Rule, ...] = ((WebTls, _check_tls), (WebInterface, _check))

@@ -16,6 +16,7 @@ from pebble.config import Config, config_of_process
 from pebble.errors import ConfigError, PebbleError
 from pebble.extensions.fleet.people import has_user
 from pebble.extensions.operator.client.page_packages import require_packages
+from pebble.extensions.page.config import WebInterface
 from pebble.extensions.page.setting import WebSettings, has_login, people_of, settings_of
 from pebble.runtime.parent import ALIVE_PERIOD_S, Notifier, set_log_level, set_up_logging
 from pebble.runtime.process import exit_at_the_latest
@@ -83,7 +84,7 @@ def _decoded(fields: str) -> WebSettings:
 def _without_user(config: Config) -> list[str]:
     """The problem that a login is needed and there is no user; empty if all is well."""
     file = people_of(config)
-    if not has_login(config.web_interface) or has_user(file):
+    if not has_login(config.section(WebInterface)) or has_user(file):
         return []
     return [
         f"web_interface.people: {file} has no user: run `pebble web user add NAME --people {file}` as the user who "

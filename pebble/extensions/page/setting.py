@@ -10,6 +10,7 @@ from pebble.config import Config, Mqtt
 from pebble.config.security import SecurityLevel
 from pebble.errors import ConfigError
 from pebble.extensions.page.config import WebInterface
+from pebble.extensions.recordings.config import Recorder
 from pebble.runtime.connections import REMOTE_RECONNECT_S, mqtt_settings
 from pebble.transports import MqttSettings
 
@@ -46,7 +47,7 @@ def settings_of(config: Config) -> WebSettings:
 
     Whether there is a user, where ``login`` is true, is seen only in a database: ``pebble.extensions.page.run``.
     """
-    web = config.web_interface
+    web = config.section(WebInterface)
     if not web.local and web.tls.certificate is None and not web.plain_http:
         raise ConfigError(
             f"web_interface.host: other machines reach {web.host}, which needs a certificate and a user: run "
@@ -76,21 +77,21 @@ def has_login(web: WebInterface) -> bool:
 
 
 def people_of(config: Config) -> Path:
-    return config.web_interface.people or config.state_dir() / PEOPLE
+    return config.section(WebInterface).people or config.state_dir() / PEOPLE
 
 
 def _recordings(config: Config) -> Path | None:
-    recorder = config.services.recorder
-    if config.web_interface.recordings is not None:
-        return config.web_interface.recordings
+    recorder = config.section(Recorder)
+    if config.section(WebInterface).recordings is not None:
+        return config.section(WebInterface).recordings
     return recorder.place if recorder.enabled else None
 
 
 def _broker(config: Config) -> Mqtt:
     """The broker of ``web_interface.mqtt``, else the one that the robot's bridge connects to."""
     bridge = config.services.mqtt_bridge
-    if config.web_interface.mqtt.host:
-        return config.web_interface.mqtt
+    if config.section(WebInterface).mqtt.host:
+        return config.section(WebInterface).mqtt
     if bridge.remote is not None and bridge.remote.kind != "mqtt":
         raise ConfigError(
             f'web_interface.mqtt.host: is missing, and the robot\'s own connection is "{bridge.remote.kind}"; '

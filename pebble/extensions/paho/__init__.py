@@ -1,1 +1,5 @@
 """MQTT by the package paho-mqtt, as a transport that is found by its entry point."""
+
+from pebble.extension import Extension
+
+EXTENSION = Extension(name="paho", extra="paho", packages=("paho",), page="docs/transports.md")

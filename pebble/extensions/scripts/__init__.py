@@ -1,1 +1,15 @@
 """Programs that move a robot: their base, the shipped ones, and perception."""
+
+from pebble.extension import Command, Extension
+
+EXTENSION = Extension(
+    name="scripts",
+    needs=("operator",),
+    commands={
+        "script": Command(
+            "pebble.extensions.scripts.commands.group", "write, start and stop programs that move a robot", "write", 10
+        ),
+    },
+    former={"script status": "script list"},
+    page="docs/ext/scripts.md",
+)

@@ -8,7 +8,7 @@ from pebble.contract import IMU, IMU_FAST
 from pebble.errors import DeviceError
 from pebble.runtime.lines import LineSplitter
 from pebble.runtime.service import every
-from pebble.services.serial_mcu_bridge.devices.imu import ImuReports, ImuWatchdog
+from pebble.services.serial_mcu_bridge.imu import ImuReports, ImuWatchdog
 from pebble.services.serial_mcu_bridge.line.serial_line import LineState
 from pebble.services.serial_mcu_bridge.serial_service import SerialService
 from pebble.services.serial_mcu_bridge.text.device_log import DeviceLogLine, is_known

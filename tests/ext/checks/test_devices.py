@@ -9,8 +9,8 @@ from typing import Any
 
 import pytest
 
+from pebble.check_result import State
 from pebble.config import parse
-from pebble.extensions.checks.check import State
 from pebble.extensions.checks.devices import camera, cameras, device, loudspeaker, microphone, serial_port
 
 KEY = "a.b"

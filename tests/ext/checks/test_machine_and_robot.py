@@ -13,12 +13,12 @@ from pathlib import Path
 
 import pytest
 
+from pebble.check_result import CheckResult, State
 from pebble.config import load, parse
 from pebble.extensions.checks import machine, robot
 from pebble.extensions.checks.broker import login
 from pebble.extensions.checks.broker.account import robot_account
 from pebble.extensions.checks.broker.login_attempt import LoginAttempt, attempt
-from pebble.extensions.checks.check import CheckResult, State
 from pebble.transports.settings import MqttSettings, TlsSettings
 from tests.ext.fleet.brokers import FleetBroker, accounts
 from tests.support import Broker, free_port

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import pytest
 
+from pebble.check_result import State
 from pebble.config import parse
 from pebble.extensions.checks.broker.login import beyond_loopback, own_addresses
-from pebble.extensions.checks.check import State
 from pebble.extensions.checks.robot import run_checks
 from pebble.transports.settings import MqttSettings
 from tests.support import Broker, free_port, listening, until

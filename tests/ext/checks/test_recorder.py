@@ -9,10 +9,10 @@ from typing import Any
 
 import pytest
 
+from pebble.check_result import CheckResult, State
 from pebble.config import parse
-from pebble.extensions.checks.check import CheckResult, State
-from pebble.extensions.checks.recorder import recorder
 from pebble.extensions.recordings.recorder.folder import Folder
+from pebble.services.recorder.checks import checks as recorder
 from tests.ext.recordings.playing import GOOB, Line, js, ms, write
 
 HOUR = "2023/11/14/20231114T221320Z-000001.state.mcap"
@@ -67,7 +67,7 @@ def test_files_that_were_left(tmp_path: Path) -> None:
 
 
 def test_without_the_package_it_fails(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("pebble.extensions.checks.recorder.find_spec", lambda _: None)
+    monkeypatch.setattr("pebble.services.recorder.checks.find_spec", lambda _: None)
     (finding,) = findings(tmp_path)
     assert (finding.state, finding.fix) == (State.FAILED, 'pip install "pebble-robot[record]"')
 

@@ -13,8 +13,8 @@ from typing import Any
 
 import pytest
 
+from pebble.check_result import CheckResult
 from pebble.config import parse
-from pebble.extensions.checks.check import CheckResult
 from pebble.extensions.checks.running import machine
 from pebble.extensions.checks.running.robot import RobotUnderTest
 from pebble.extensions.fleet import authority, certificates

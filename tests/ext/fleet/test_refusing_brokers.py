@@ -11,9 +11,9 @@ from pathlib import Path
 
 import pytest
 
+from pebble.check_result import State
 from pebble.config import load
 from pebble.extensions.checks.broker.account import robot_account
-from pebble.extensions.checks.check import State
 from pebble.extensions.checks.robot import page_brokers
 from pebble.extensions.fleet.broker_files import passwords_in
 from pebble.extensions.fleet.certificates import CA_CERT

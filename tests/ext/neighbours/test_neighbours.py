@@ -9,8 +9,8 @@ import pytest
 
 from pebble.config import parse
 from pebble.config.raw import deep_merge
-from pebble.config.rules.between_keys import MOST_METRICS, MOST_NEIGHBOURS
 from pebble.errors import ConfigError
+from pebble.services.neighbours.config import MOST_METRICS, MOST_NEIGHBOURS
 
 LAN = {"connect": ["tls/hub.lab:7447"]}
 WRONG: list[tuple[dict[str, Any], str]] = [

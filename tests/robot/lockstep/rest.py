@@ -5,6 +5,7 @@ from __future__ import annotations
 import signal
 from collections.abc import Callable
 
+from pebble.extensions.scripts.config import AutonomyManager
 from tests.robot.lockstep.commands import PERSON
 from tests.robot.lockstep.scripts import Script
 from tests.robot.lockstep.world import STOP_TIMEOUT_S, World
@@ -87,7 +88,7 @@ def _ends(world: World, script: Script, error: str | None) -> None:
     status = world.people[0].status
     world.scheduler.check(status is not None and not status.running, "the status shows a script that has ended")
     assert status is not None
-    known = error is None or world.config.services.autonomy_manager.on_override == "stop"
+    known = error is None or world.config.section(AutonomyManager).on_override == "stop"
     world.scheduler.check(known or error in (status.error or ""), "the status does not say why the script has ended")
 
 
@@ -134,7 +135,7 @@ def _release(world: World, script: Script) -> None:
     world.scheduler.check(command is not None and command.run == PERSON, "a person does not drive")
     world.scheduler.run(0.3 + _AT_REST_S)
     world.scheduler.check(not _turning(world), "the wheels turn after a person has let go")
-    if world.config.services.autonomy_manager.on_override == "stop":
+    if world.config.section(AutonomyManager).on_override == "stop":
         _ends(world, script, "stopped by an operator")
         return
     world.scheduler.run(2.2)

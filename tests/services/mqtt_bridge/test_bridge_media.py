@@ -19,7 +19,7 @@ import pytest
 from pebble.config.media import AudioPublisher, VideoPublisher
 from pebble.contract import AUDIO_CONTROL, MQTT_AUDIO, MQTT_VIDEO, VIDEO_CONTROL
 from pebble.contract.payloads import MediaRequest
-from pebble.launcher.programs import Stage
+from pebble.extension import Stage
 from pebble.runtime import notes
 from pebble.runtime.notes import Held, Wanted
 from pebble.runtime.parent import NOTIFY_FD, WANTED, ProgramRequest

@@ -7,6 +7,7 @@ import time
 from collections.abc import Iterator
 from dataclasses import replace
 
+from pebble.check_result import CheckResult, failed, ok, warn
 from pebble.config.security import SecurityLevel
 from pebble.contract import BRIDGE_PROBE, ONLINE
 from pebble.contract.identity import SERVERS, Identity
@@ -15,7 +16,6 @@ from pebble.errors import TransportError
 from pebble.extensions.checks.broker.login_attempt import reached
 from pebble.extensions.checks.broker.messages import REFUSED, held_back
 from pebble.extensions.checks.broker.peer import BrokerTrial, Peer
-from pebble.extensions.checks.check import CheckResult, failed, ok, warn
 from pebble.forwarding.probes import new_probe
 from pebble.transports import MqttSettings
 

@@ -4,12 +4,13 @@ import time
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
 
+from pebble.check_result import CheckResult, failed, ok, warn
 from pebble.config.hosts import is_loopback
 from pebble.config.secret_text import shown_user
 from pebble.config.security import SecurityLevel
 from pebble.extensions.checks.broker import MOSQUITTO
 from pebble.extensions.checks.broker.login_attempt import TIMEOUT_S, LoginAttempt, attempt
-from pebble.extensions.checks.check import SOON_DAYS, CheckResult, failed, ok, warn
+from pebble.extensions.checks.check import SOON_DAYS
 from pebble.extensions.checks.machine import printed
 from pebble.transports.settings import MqttSettings
 

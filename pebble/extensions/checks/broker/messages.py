@@ -6,9 +6,9 @@ import secrets
 import time
 from statistics import median
 
+from pebble.check_result import CheckResult, failed, ok, skipped, warn
 from pebble.extensions.checks.broker import MOSQUITTO, OTHER
 from pebble.extensions.checks.broker.peer import BrokerTrial, Peer, Received, RefusedError
-from pebble.extensions.checks.check import CheckResult, failed, ok, skipped, warn
 from pebble.forwarding.probes import new_probe
 from pebble.transports import Message, QoS
 

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 
+from pebble.check_result import CheckResult, State, failed
 from pebble.extensions.checks.broker import messages, retention
 from pebble.extensions.checks.broker.peer import BrokerTrial, RefusedError
-from pebble.extensions.checks.check import Check, CheckResult, State, failed, run
+from pebble.extensions.checks.check import Check, run
 
 Probe = Check[BrokerTrial]
 _RIGHTS, _WILDCARDS, _BRIDGE_MODE = "rights", "retained, to + and #", "bridge mode"

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from itertools import count, pairwise
 
+from pebble.check_result import CheckResult, failed, ok, skipped, warn
 from pebble.extensions.checks.broker import MOSQUITTO, OTHER
 from pebble.extensions.checks.broker.peer import BrokerTrial, RefusedError
-from pebble.extensions.checks.check import CheckResult, failed, ok, skipped, warn
 
 _STATES = 200  # retained ones; a robot has some twenty
 _TURNS = 6  # in which one asks for it after a restart

@@ -15,7 +15,7 @@ from pebble.config.secret_text import without_secrets
 from pebble.config.visible import shown
 
 if TYPE_CHECKING:
-    from pebble.extensions.checks.check import CheckResult
+    from pebble.check_result import CheckResult
 
 _COLOURS = {
     "ok": typer.colors.GREEN,

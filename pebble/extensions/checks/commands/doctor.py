@@ -156,10 +156,10 @@ def _report(file: Path, config: Path | None, places: Places) -> int:
 
 def _broker(settings: MqttSettings, below: str, *, restart: bool, as_json: bool) -> int:
     """Print what is wrong with a broker, and what to type. Returns 0, 1 with limits, 2 if robots cannot use it."""
+    from pebble.check_result import State
     from pebble.extensions.checks.broker.login import beyond_loopback, broker, own_addresses
     from pebble.extensions.checks.broker.login_attempt import reached
     from pebble.extensions.checks.broker.probes import assessment, judge
-    from pebble.extensions.checks.check import State
 
     check_topic(below)
     printer = Printer(as_json=as_json)

@@ -10,11 +10,12 @@ from itertools import pairwise
 import msgspec
 
 from pebble import contract as c
+from pebble.check_result import CheckResult, State, failed, ok, skipped
 from pebble.contract.capabilities import CapabilitiesValue
 from pebble.contract.identity import parse_topic
 from pebble.contract.levels import silent_after
 from pebble.contract.payloads import ControlRequest, EstopCommand, EstopReset
-from pebble.extensions.checks.check import Check, CheckResult, State, failed, ok, skipped, some_of
+from pebble.extensions.checks.check import Check, some_of
 from pebble.extensions.checks.observer import ANSWER_S, Observer, available, why_not_free
 from pebble.extensions.operator.client.robot_topics import section_of
 from pebble.extensions.operator.client.robot_view import RobotView

@@ -10,8 +10,9 @@ from typing import Any, Literal
 import msgspec
 
 from pebble import contract as c
+from pebble.check_result import CheckResult, failed, ok, skipped
 from pebble.contract.payloads import ControlRequest, ControlState, EstopReset
-from pebble.extensions.checks.check import Check, CheckResult, failed, ok, skipped
+from pebble.extensions.checks.check import Check
 from pebble.extensions.checks.conform.checks import BY, commanded, controls, drives, free, stops, while_stopped
 from pebble.extensions.checks.observer import ANSWER_S, Observer
 from pebble.extensions.operator.client.pace_of_link import ms

@@ -12,7 +12,8 @@ from typing import Any
 import msgspec
 
 from pebble import contract as c
-from pebble.extensions.checks.check import Check, CheckResult, State, failed, ok, skipped
+from pebble.check_result import CheckResult, State, failed, ok, skipped
+from pebble.extensions.checks.check import Check
 from pebble.extensions.checks.conform.checks import (
     BY,
     END_IT,

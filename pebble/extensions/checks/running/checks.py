@@ -6,8 +6,9 @@ import math
 import shlex
 from itertools import pairwise
 
+from pebble.check_result import CheckResult, failed, ok, skipped
 from pebble.contract.levels import LEVELS, silent_after
-from pebble.extensions.checks.check import Check, CheckResult, failed, ok, skipped, some_of
+from pebble.extensions.checks.check import Check, some_of
 from pebble.extensions.checks.observer import available, why_not_free
 from pebble.extensions.checks.running import machine
 from pebble.extensions.checks.running.operating import received, retained_commands, stop, wheels

@@ -10,11 +10,13 @@ from http import HTTPStatus
 from http.client import HTTPConnection, HTTPException, HTTPSConnection
 from pathlib import Path
 
+from pebble.check_result import CheckResult, State, failed, ok, skipped
 from pebble.errors import PebbleError
 from pebble.extensions.checks import machine as this_machine
-from pebble.extensions.checks.check import SOON_DAYS, CheckResult, State, failed, ok, skipped
+from pebble.extensions.checks.check import SOON_DAYS
 from pebble.extensions.checks.running.robot import RobotUnderTest
 from pebble.extensions.fleet import certificates
+from pebble.extensions.page.config import WebHandler
 from pebble.extensions.page.setting import settings_of
 
 UNIT = "pebble.service"
@@ -103,7 +105,7 @@ def disk(robot: RobotUnderTest) -> CheckResult:
 
 def page(robot: RobotUnderTest) -> CheckResult:
     """Check that the robot's own page answers, with the certificate of its config, and for how long that is valid."""
-    if not robot.config.services.web_handler.enabled:
+    if not robot.config.section(WebHandler).enabled:
         return skipped("the robot serves no page: services.web_handler is off")
     try:
         settings = settings_of(robot.config)

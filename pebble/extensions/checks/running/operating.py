@@ -4,10 +4,10 @@ import time
 from dataclasses import replace
 from functools import partial
 
+from pebble.check_result import CheckResult, State, failed, ok, skipped
 from pebble.contract import ESTOP_RESET, ESTOP_STATE, codec
 from pebble.contract.payloads import EstopReset
 from pebble.errors import PebbleError
-from pebble.extensions.checks.check import CheckResult, State, failed, ok, skipped
 from pebble.extensions.checks.conform.control import Driver
 from pebble.extensions.checks.conform.motion import LATE_S, at_the_wheel, rested
 from pebble.extensions.checks.running.robot import RobotUnderTest
@@ -35,7 +35,7 @@ _WHEEL_FIXES = {
 
 def received(robot: RobotUnderTest, medium: Medium, device: str) -> CheckResult:
     """Request pictures or sound as an operator does, and give them back."""
-    if _PROGRAMS[medium] not in robot.config.media_programs():
+    if _PROGRAMS[medium] not in robot.config.on_demand_programs():
         return skipped(f"it has no {device}")
     receiver = MediaReceiver(robot.commanding_side.transport, robot.config.base)
 

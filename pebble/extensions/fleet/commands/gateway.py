@@ -41,9 +41,9 @@ def gateway(file: FileArgument) -> int:
     "hub" it carries them, and "neighbours" lets robots of the LAN's hub receive
     and drive them.
     """
+    from pebble.extensions.fleet.gateway.connections import gateway_transports
     from pebble.extensions.fleet.gateway.gateway import Gateway, will
     from pebble.extensions.fleet.gateway.gateway_file import load_gateway
-    from pebble.runtime.connections import gateway_transports
     from pebble.runtime.parent import Notifier, set_up_logging
     from pebble.services.neighbours.board import of_board
 

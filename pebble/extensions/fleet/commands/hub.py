@@ -22,13 +22,12 @@ def hub(file: FileArgument) -> int:
     \b
         pebble fleet hub hub1.json
     """
-    from pebble.extensions.fleet.hub_file import load_hub
-    from pebble.runtime.connections import fleet_hub_settings
+    from pebble.extensions.fleet.hub_file import load_hub, settings_of
     from pebble.runtime.hub import run_hub  # of Linux only
     from pebble.runtime.parent import set_up_logging
     from pebble.runtime.signals import EndSignal
 
-    settings = fleet_hub_settings(*load_hub(file))
+    settings = settings_of(*load_hub(file))
     set_up_logging("INFO")
     stop = EndSignal()
     here = f"on this machine --url zenoh:{settings.run_dir}"

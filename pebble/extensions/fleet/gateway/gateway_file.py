@@ -15,7 +15,7 @@ from pebble.config.transport import Mqtt, ZenohSection
 from pebble.config.types import EMPTY, Account, Level, Section, doc
 from pebble.contract.identity import GATEWAYS, SERVERS, Identity
 from pebble.errors import ConfigError
-from pebble.services.neighbours.config import Neighbours
+from pebble.services.neighbours.config import RULES, Neighbours
 
 MOST_BOARDS = 16  # of one file that have neighbours: each has two connections and a thread
 
@@ -55,7 +55,7 @@ class GatewayFile(Section, frozen=True, kw_only=True):
 def load_gateway(path: Path, env: Mapping[str, str] = os.environ) -> tuple[GatewayFile, str, Path]:
     """Read such a file; returns it, the gateway's name, and its run directory. Raises ConfigError with all problems."""
     path = path.absolute()
-    reader = Reader(path.parent, env, CHECKS)
+    reader = Reader(path.parent, env, (*CHECKS, *RULES))
     problem = reader.notes.problem
     gateway = reader.section(GatewayFile, plain(decode(read_text(path), path.name), reader.notes))
     operators = gateway.operators

@@ -25,7 +25,10 @@ from pebble.config.masking import values_of
 from pebble.errors import PebbleError
 from pebble.extensions.fleet.folder import FLEET
 from pebble.extensions.page.setting import people_of
+from pebble.extensions.recordings.config import Recorder
+from pebble.extensions.scripts.config import AutonomyManager
 from pebble.runtime.places import Places
+from pebble.services.soundboard_handler.config import SoundboardHandler
 from pebble.version import __version__
 
 FORMAT = 1
@@ -124,11 +127,11 @@ def _here(places: Places, path: Path) -> Path:
 
 
 def _left_out(config: Config) -> Iterator[tuple[str, Path]]:
-    yield "recordings", config.services.recorder.place
-    scripts = config.folder / config.services.autonomy_manager.autonomy_root
+    yield "recordings", config.section(Recorder).place
+    scripts = config.folder / config.section(AutonomyManager).autonomy_root
     if not scripts.is_relative_to(config.folder):
         yield "scripts of your own", scripts
-    if (sounds := config.services.soundboard_handler.playback.directory) is not None:
+    if (sounds := config.section(SoundboardHandler).playback.directory) is not None:
         yield "sounds", sounds
 
 

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import serial
 
-from pebble.extensions.checks.check import State
+from pebble.check_result import State
 from pebble.extensions.checks.machine import clock, synchronised
 from pebble.extensions.fleet.folder import PLAIN_PORT, PORT
 from pebble.runtime.places import Places

@@ -9,7 +9,9 @@ from pebble.config.hosts import is_loopback
 from pebble.extensions.fleet import certificates
 from pebble.extensions.fleet.folder import PLAIN_PORT, PORT
 from pebble.extensions.install.setup.answers import HERE, NONE, PAGE, Answers, needs_login
+from pebble.extensions.page.config import WebHandler
 from pebble.runtime.places import Places
+from pebble.services.av_daemon.config import AvDaemon
 
 UNIT = "pebble.service"
 PAGE_PORT = 8080
@@ -19,10 +21,10 @@ _SYSTEMCTL = ["systemctl", "--no-ask-password"]
 
 def answers_of(config: Config, places: Places) -> Answers:
     """Return the answers with which setup would write what this config says of them."""
-    services = config.services
-    line, video, remote = services.serial_mcu_bridge, services.av_daemon.video, services.mqtt_bridge.remote_mqtt
+    services, devices = config.services, config.section(AvDaemon)
+    line, video, remote = services.serial_mcu_bridge, devices.video, services.mqtt_bridge.remote_mqtt
     has_board = line.enabled and line.serial.port is not None
-    has_camera = services.av_daemon.enabled and video.enabled
+    has_camera = devices.enabled and video.enabled
     has_broker = services.mqtt_bridge.enabled
     if is_loopback(remote.host) and places.broker.exists():
         broker = HERE
@@ -39,7 +41,7 @@ def answers_of(config: Config, places: Places) -> Answers:
         broker=broker if has_broker else NONE,
         broker_user=remote.username if has_broker else None,
         broker_ca=str(remote.tls.ca_cert) if has_broker and remote.tls.ca_cert is not None else None,
-        page=services.web_handler.enabled,
+        page=config.section(WebHandler).enabled,
     )
 
 

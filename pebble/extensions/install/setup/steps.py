@@ -39,6 +39,7 @@ from pebble.extensions.install.setup.robot_config import (
     config_of,
 )
 from pebble.extensions.install.setup.system import MOSQUITTO, ROBOTS, SetupError, System
+from pebble.extensions.page.config import WebHandler, WebInterface
 from pebble.extensions.page.setting import people_of
 from pebble.runtime.connections import check_connections
 from pebble.runtime.places import Places
@@ -87,7 +88,7 @@ class Job:
     @property
     def page(self) -> Config | None:
         """The config, if the robot serves its page already."""
-        return self.config if self.config is not None and self.config.services.web_handler.enabled else None
+        return self.config if self.config is not None and self.config.section(WebHandler).enabled else None
 
     @property
     def people(self) -> Path:
@@ -186,7 +187,7 @@ class Job:
 
     def _certificate(self) -> Iterator[Step]:
         tls = self.places.tls
-        if self.page is not None and self.page.web_interface.tls.certificate != tls / certificates.SERVER_CERT:
+        if self.page is not None and self.page.section(WebInterface).tls.certificate != tls / certificates.SERVER_CERT:
             return  # it has another one
 
         def fill(new: Path) -> None:

@@ -37,8 +37,8 @@ from pebble.extensions.operator.client.heartbeats import Heartbeats
 from pebble.extensions.operator.client.names import id_of
 from pebble.extensions.operator.client.robot_topics import SYNONYMS
 from pebble.extensions.operator.client.robot_view import RobotView
+from pebble.extensions.operator.commands import show
 from pebble.extensions.operator.commands.target import with_target
-from pebble.extensions.operator.commands.terminal import show
 from pebble.runtime.signals import interrupted_by_signals
 from pebble.transports import Message, MqttSettings, QoS, State, Transport
 

@@ -19,9 +19,9 @@ from pebble.extensions.media.rate_meter import RateMeter
 from pebble.extensions.operator.client.connection import Listener, Target, connected, put_names, subscribed_stop
 from pebble.extensions.operator.client.estop_states import RobotEstop
 from pebble.extensions.operator.client.names import Names, id_of
+from pebble.extensions.operator.commands import show
 from pebble.extensions.operator.commands.draft import Draft, draft
 from pebble.extensions.operator.commands.target import with_target
-from pebble.extensions.operator.commands.terminal import show
 from pebble.extensions.operator.commands.topic_contract import contract
 from pebble.transports import QoS, Transport
 from pebble.transports.topics import is_pattern

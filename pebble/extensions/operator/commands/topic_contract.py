@@ -64,7 +64,7 @@ def _plain(channel: Channel, prefix: str) -> dict[str, Any]:
 def _print_table(prefix: str) -> None:
     from rich.text import Text
 
-    from pebble.extensions.operator.commands.terminal.show import print_table
+    from pebble.extensions.operator.commands.show import print_table
 
     rows = list[Sequence[str | Text]]()
     for direction in (INCOMING, OUTGOING):

@@ -23,7 +23,7 @@ from pebble.extensions.fleet.people import has_user
 from pebble.extensions.operator.client.page_packages import require_packages
 from pebble.extensions.operator.commands.target import broker_of
 from pebble.extensions.page.commands.people import PEOPLE, TLS, PeopleOption, default_folder, register_people
-from pebble.extensions.page.config import WebTls
+from pebble.extensions.page.config import WebInterface, WebTls
 from pebble.runtime.connections import REMOTE_RECONNECT_S
 from pebble.transports import MqttSettings
 
@@ -142,7 +142,7 @@ def _of_config(file: Path, options: dict[str, Any], folder: Path | None) -> tupl
     from pebble.extensions.page.run import settings_or_all_problems
 
     config = load(file)
-    web = config.web_interface
+    web = config.section(WebInterface)
     given = {key: value for key, value in options.items() if value is not None}
     given["names"] = (*web.names, *options["names"])
     web = msgspec.structs.replace(web, **given)

@@ -16,7 +16,8 @@ from pebble.errors import PebbleError
 from pebble.extensions.fleet.audit import Audit, Entry
 from pebble.extensions.fleet.people import People
 from pebble.extensions.fleet.roles import Role
-from pebble.extensions.operator.commands.terminal.show import print_table
+from pebble.extensions.operator.commands.show import print_table
+from pebble.extensions.page.config import WebHandler, WebInterface
 from pebble.runtime.places import Places
 
 PEOPLE = "people.sqlite"
@@ -143,7 +144,7 @@ def _file(config: Path | None, people: Path | None) -> Path:
     if people is not None or config is None:
         return (people or default_folder() / PEOPLE).absolute()
     loaded = load(config)
-    return loaded.web_interface.people or loaded.state_dir() / PEOPLE
+    return loaded.section(WebInterface).people or loaded.state_dir() / PEOPLE
 
 
 def _of_machine() -> Path | None:
@@ -157,7 +158,7 @@ def _of_machine() -> Path | None:
         raise PebbleError(
             f"{file}: this user may not read it: use sudo, or name another database, --people FILE"
         ) from None
-    return file if load(file).services.web_handler.enabled else None
+    return file if load(file).section(WebHandler).enabled else None
 
 
 @contextmanager

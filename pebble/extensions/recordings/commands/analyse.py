@@ -73,7 +73,7 @@ def analyse(
 
 def _print(traffic: Traffic, written: list[Path]) -> None:
     from pebble.config.visible import shown
-    from pebble.extensions.operator.commands.terminal.show import print_table
+    from pebble.extensions.operator.commands.show import print_table
     from pebble.extensions.recordings.traffic.report import remarks
 
     columns = ("robot", "messages", "sessions", "outages", "latency", "video", "audio")

@@ -13,7 +13,7 @@ import typer
 from pebble.config.visible import shown
 from pebble.errors import PebbleError
 from pebble.extensions.operator.client.names import base_of
-from pebble.extensions.operator.commands.terminal import show
+from pebble.extensions.operator.commands import show
 from pebble.extensions.recordings import catalogue
 from pebble.extensions.recordings.catalogue import Query
 from pebble.extensions.recordings.commands.options import RecordingsArgument, RobotOption, Since, Topics, Until, period

@@ -9,7 +9,7 @@ import typer
 
 from pebble.config.visible import shown
 from pebble.extensions.operator.client.names import base_of
-from pebble.extensions.operator.commands.terminal import show
+from pebble.extensions.operator.commands import show
 from pebble.extensions.recordings import catalogue
 from pebble.extensions.recordings.catalogue import FileInfo, Query
 from pebble.extensions.recordings.commands.options import RecordingsArgument, RobotOption, Since, Topics, Until, period

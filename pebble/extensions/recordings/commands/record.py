@@ -13,8 +13,8 @@ import typer
 
 from pebble.errors import PebbleError
 from pebble.extensions.operator.client.connection import Target, resolve
+from pebble.extensions.operator.commands import show
 from pebble.extensions.operator.commands.target import with_target
-from pebble.extensions.operator.commands.terminal import show
 from pebble.extensions.recordings.recorder import metrics
 from pebble.extensions.recordings.recorder.recorder import Recorder
 from pebble.extensions.recordings.recorder.settings import EVERYTHING, Options

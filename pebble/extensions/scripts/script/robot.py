@@ -191,8 +191,8 @@ class Robot:
         self._check()
         found = self._neighbours.get(name)
         if found is None:
-            section = self.config.services.neighbours
-            if not section.enabled or name not in section.listens:
+            section = getattr(self.config.services, "neighbours", None)  # with its extension
+            if section is None or not section.enabled or name not in section.listens:
                 raise PebbleError(f'robot.neighbour: {name!r} is not in services.neighbours.listens: add "{name}": []')
             latest = _Latest(partial(self._subscribe_to, name), self._clock)
             way = Way(self._transport, self._wheels, latest.of, self._check, self._clock)

@@ -10,8 +10,8 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from pebble.config.media import AvDaemon
 from pebble.extensions.media.speech import Speech
+from pebble.services.av_daemon.config import AvDaemon
 from pebble.services.av_daemon.source import Source
 from pebble.transports.counters import Counters
 from pebble.transports.frames import FrameInfo

@@ -10,12 +10,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pebble.config.media import CameraCapture
 from pebble.errors import DeviceError, NotRunningError
 from pebble.extensions.lab.simulation.world.pose_page import PosePage, page_path
 from pebble.extensions.lab.simulation.world.poses import RobotPose
 from pebble.extensions.lab.simulation.world.world_file import read_world
 from pebble.services.av_daemon import sources
+from pebble.services.av_daemon.config import CameraCapture
 from pebble.services.av_daemon.health import Health
 from pebble.services.av_daemon.synthetic import WorldCamera
 from pebble.transports.frames.frame import picture

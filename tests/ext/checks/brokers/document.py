@@ -11,9 +11,9 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
+from pebble.check_result import CheckResult, State
 from pebble.extensions.checks.broker.login_attempt import reached
 from pebble.extensions.checks.broker.probes import judge
-from pebble.extensions.checks.check import CheckResult, State
 from pebble.transports import MqttSettings
 from tests.support import ROOT, Broker
 from tests.transports.brokers import MAKERS

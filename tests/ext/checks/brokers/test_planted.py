@@ -7,9 +7,10 @@ from pathlib import Path
 
 import pytest
 
+from pebble.check_result import CheckResult, State
 from pebble.extensions.checks.broker.login_attempt import reached
 from pebble.extensions.checks.broker.probes import PROBES, Probe
-from pebble.extensions.checks.check import CheckResult, State, run
+from pebble.extensions.checks.check import run
 from pebble.transports import MqttSettings
 from tests.ext.checks.brokers import faulty
 from tests.ext.checks.brokers.faulty import Fault, FaultyBroker

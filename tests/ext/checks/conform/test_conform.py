@@ -13,8 +13,9 @@ from pathlib import Path
 
 import pytest
 
+from pebble.check_result import State
 from pebble.contract import ONLINE
-from pebble.extensions.checks.check import Check, State
+from pebble.extensions.checks.check import Check
 from pebble.extensions.checks.check import run as run_checks
 from pebble.extensions.checks.conform.checks import CHECKS, LAST
 from pebble.extensions.checks.conform.control import CONTROL, UNSEEN

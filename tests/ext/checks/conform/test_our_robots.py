@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from pebble.extensions.checks.check import State, run
+from pebble.check_result import State
+from pebble.extensions.checks.check import run
 from pebble.extensions.checks.conform.checks import CHECKS, LAST
 from pebble.extensions.checks.conform.control import CONTROL
 from pebble.extensions.checks.conform.motion import MOVING

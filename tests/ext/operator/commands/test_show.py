@@ -6,7 +6,7 @@ import msgspec
 import pytest
 
 from pebble.extensions.operator.client.names import ANY_ROBOT, Names
-from pebble.extensions.operator.commands.terminal import show
+from pebble.extensions.operator.commands import show
 from pebble.transports import Message
 
 

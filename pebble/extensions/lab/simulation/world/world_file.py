@@ -139,7 +139,7 @@ def read_world(path: Path) -> World:
 
 def parse_world(raw: Any) -> World:
     """The same from plain data."""
-    reader = Reader(Path(), {}, {})
+    reader = Reader(Path(), {}, ())
     world = reader.section(World, plain(raw, reader.notes))
     if not reader.notes.problems:
         _check(world, reader.notes)

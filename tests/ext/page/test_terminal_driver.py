@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from pebble.extensions.operator.commands.terminal.driver import TerminalDriver
+from pebble.extensions.page.commands.terminal_driver import TerminalDriver
 from pebble.transports import Message
 from tests.ext.operator.client.estop_robot import Robot, outgoing
 

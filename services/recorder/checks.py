@@ -7,18 +7,19 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Final
 
+from pebble.check_result import CheckResult, failed, ok, warn
 from pebble.config import Config
 from pebble.errors import PebbleError
-from pebble.extensions.checks.check import CheckResult, failed, ok, warn
+from pebble.extensions.recordings.config import Recorder
 from pebble.extensions.recordings.recorder.folder import Entry, Folder
 from pebble.extensions.recordings.recorder.metrics import STATUS
 
 _SILENT_S: Final = 30.0  # it writes its numbers every ten seconds
 
 
-def recorder(config: Config) -> Iterator[CheckResult]:
+def checks(config: Config) -> Iterator[CheckResult]:
     """Check the recorder of a robot that has one."""
-    section = config.services.recorder
+    section = config.section(Recorder)
     if not section.enabled:
         return
     folder = section.place

@@ -15,7 +15,7 @@ from pebble.extensions.operator.client.terminal.key_decoder import END
 from pebble.extensions.operator.client.terminal.keys import Terminal, has_terminal, opened
 from pebble.extensions.operator.commands.estop import me
 from pebble.extensions.operator.commands.target import with_target
-from pebble.extensions.operator.commands.terminal.driver import PERIOD_S, TerminalDriver
+from pebble.extensions.page.commands.terminal_driver import PERIOD_S, TerminalDriver
 from pebble.transports import Message, QoS, Transport
 from pebble.transports.clock import since_boot as clock
 

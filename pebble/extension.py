@@ -1,0 +1,332 @@
+"""Extensions: what a robot need not have. Ours, packages of others and a file of the owner, all in the same way.
+
+An extension is one object, ``EXTENSION``, that a package or a file declares. It names its parts as ``module:name``, and
+these are imported where they are used: a robot that records nothing imports nothing of the recorder.
+docs/my-first-extension.md shows one.
+"""
+
+from __future__ import annotations
+
+import logging
+import sys
+from collections.abc import Iterable, Iterator, Mapping
+from enum import IntEnum
+from functools import cache, reduce
+from importlib import import_module
+from importlib.util import find_spec, module_from_spec, spec_from_file_location
+from pathlib import Path
+from typing import Any, Final
+
+from msgspec import Struct
+from msgspec.structs import replace
+
+from pebble.contract.serial_protocols import SERIAL_PROTOCOLS, SerialProtocol
+from pebble.errors import ConfigError, PebbleError
+
+log = logging.getLogger(__name__)
+
+#: The group of entry points by which a package offers an extension.
+ENTRY_POINTS: Final = "pebble.extensions"
+#: Ours, those first that others use, with the keys of a config that belong to each. It is the order of their sections.
+OURS: Final[Mapping[str, tuple[str, ...]]] = {
+    "pebble.extensions.media": (),
+    "pebble.extensions.paho": (),
+    "pebble.extensions.operator": (),
+    "pebble.extensions.scripts": (),
+    "pebble.extensions.recordings": (),
+    "pebble.services.av_daemon": ("services.av_daemon",),
+    "pebble.services.camera_publisher": (),
+    "pebble.services.audio_publisher": (),
+    "pebble.services.audio_receiver": (),
+    "pebble.services.video_stream": ("services.video_stream",),
+    "pebble.services.soundboard_handler": ("services.soundboard_handler",),
+    "pebble.services.autonomy_manager": ("services.autonomy_manager",),
+    "pebble.services.recorder": ("services.recorder",),
+    "pebble.services.neighbours": ("services.neighbours",),
+    "pebble.extensions.fleet": (),
+    "pebble.extensions.page": ("services.web_handler", "web_interface"),
+    "pebble.services.serial_mcu_bridge.pebble_serial_v1": (),
+    "pebble.services.serial_mcu_bridge.devices": (),
+    "pebble.extensions.foxglove": (),
+    "pebble.extensions.lab": (),
+    "pebble.extensions.checks": (),
+    "pebble.extensions.install": (),
+}
+
+
+class Stage(IntEnum):
+    """Programs of one stage stop together; the highest stage stops first."""
+
+    LOCAL_TRANSPORT = 0  # what the others publish through
+    ANNOUNCER = 1  # publishes how the others ended
+    DEVICE = 2  # owns hardware
+    CONNECTION = 3  # is connected to other machines
+
+
+class Program(Struct, frozen=True):
+    """One process: its name in logs and status, and the module that it runs with ``arguments``, as ``python -m`` would.
+
+    The launcher imports the module, or ``entry``, before it forks: importing must do nothing. What that module imports
+    later, because only some robots need it, is in the memory of those robots only.
+    """
+
+    name: str
+    module: str
+    arguments: tuple[str, ...] = ()  # of an extension's program: the path of the config, unless it has others
+    stage: Stage = Stage.CONNECTION
+    reads_announcer_pipe: bool = False  # on its stdin; the others' stdin is empty
+    runs_scripts: bool = False  # lines of its output may be a script's
+    may_request: bool = False  # may request on-demand programs
+    on_demand: bool = False  # runs only while it is requested
+    preloaded: bool = True  # False: its imports are needed by few, and would cost every process their memory
+    entry: str = ""  # what the package that is run begins with; "": the module is no package
+    shares: tuple[str, ...] = ()  # modules that several programs use, imported before the first fork
+    stop_timeout_s: float = 10.0  # after this an on-demand program that was released is killed
+    webrtc_url: str | None = None  # where pages show its pictures
+
+
+class Command(Struct, frozen=True):
+    """A command of ``pebble``: ``module:function``, or a module with ``register(app)``, and its line of help."""
+
+    place: str
+    help: str
+    group: str = "more"  # the heading in `pebble --help`: use, own, write, share, measure
+    rank: int = 100  # its place there
+
+
+class Facts(Struct, frozen=True):
+    """What an extension adds to the summary of ``pebble check``: lines of a name and a text."""
+
+    lines: tuple[tuple[str, str], ...] = ()  # beside those of the connections
+    table: tuple[tuple[str, ...], ...] = ()  # below the table of topics
+
+
+class Extension(Struct, frozen=True, kw_only=True, eq=False):
+    """What an extension adds. Parts are written ``module:name``; an empty one adds nothing."""
+
+    name: str
+    package: str = "pebble-robot"  # who is named where two add the same
+    extra: str = ""  # of the package: what `pip install "PACKAGE[EXTRA]"` adds
+    packages: tuple[str, ...] = ()  # modules of other packages that its programs cannot do without
+    needs: tuple[str, ...] = ()  # extensions without which it counts as not installed
+    sections: dict[str, str] = {}  # by the key of the config, "services.lamp" or "lamp": its Section
+    rules: str = ""  # a function: pairs of a Section and check(reader, section, path)
+    program: Program | None = None  # runs while the section is enabled, or always where there is none
+    programs: str = ""  # a function of the config: its other Programs
+    offers: str = ""  # a function of config, addresses and CapabilitiesValue, which it returns completed
+    facts: str = ""  # a function of the config: Facts
+    checks: str = ""  # a function of the config, for `pebble doctor`: CheckResults
+    commands: dict[str, Command] = {}  # by their words: "lamp", "fleet hub"
+    former: dict[str, str] = {}  # commands of earlier releases, and how they are called now
+    completions: dict[str, str] = {}  # by the name of an argument in help: a function of the context, the values
+    protocols: dict[str, SerialProtocol] = {}  # of serial lines, by the config's `protocol`
+    drives: bool = False  # it owns motors: a robot whose config names it does not start without it
+    page: str = ""  # where its documentation is
+
+
+class Missing(Struct, frozen=True):
+    """An extension that a config names and this machine lacks, and why."""
+
+    name: str
+    key: str  # of the config
+    reason: str
+    drives: bool = False
+
+
+def part(place: str) -> Any:
+    """Return what ``module:name`` names, or the module of a place without a name."""
+    module, _, name = place.partition(":")
+    loaded = import_module(module)
+    return getattr(loaded, name) if name else loaded
+
+
+@cache
+def ours() -> tuple[Extension, ...]:
+    """Return those of ours that are installed with all that they need, in the order of ``OURS``."""
+    found: dict[str, Extension] = {}
+    for module in OURS:
+        extension = _declared(module)
+        if extension is not None and all(need in found for need in extension.needs):
+            found[extension.name] = extension
+            SERIAL_PROTOCOLS.update(extension.protocols)
+    return tuple(found.values())
+
+
+def _declared(module: str) -> Extension | None:
+    try:
+        extension: Extension = import_module(module).EXTENSION
+    except ModuleNotFoundError as error:
+        if error.name is None or not f"{module}.".startswith(f"{error.name}."):
+            raise
+        return None
+    return extension
+
+
+def named(entries: Mapping[str, bool], folder: Path) -> tuple[tuple[Extension, ...], tuple[Missing, ...]]:
+    """Return the extensions that a config lists, and what could not be loaded.
+
+    ``entries``: the names of entry points, or files such as ``lamp.py``, seen from ``folder``; True: it owns motors.
+    Raises ConfigError where one that owns motors is listed as one that does not.
+    """
+    found, missing = [], []
+    for name, drives in entries.items():
+        try:
+            extension = _of_file(folder / name) if name.endswith(".py") else _of_package(name)
+            for place in (*extension.sections.values(), extension.rules, extension.programs):
+                part(place) if place else None
+        except Exception as error:  # noqa: BLE001 - whatever a stranger's module raises when it is imported
+            reason = str(error) if isinstance(error, PebbleError) else f"{type(error).__name__}: {error}"
+            missing.append(Missing(name, f"extensions.{name}", reason, drives))
+            continue
+        if extension.drives and not drives:
+            raise ConfigError(f'extensions.{name}: it owns motors, write {{"drives": true}}')
+        SERIAL_PROTOCOLS.update(extension.protocols)
+        found.append(extension)
+    return tuple(found), tuple(missing)
+
+
+def lacking(raw: Any) -> Iterator[Missing]:
+    """Yield those of ours that are not installed, and that a config has sections of which are not disabled."""
+    here = {key for extension in ours() for key in extension.sections}
+    for module, keys in OURS.items():
+        for key in keys:
+            section = _at(raw, key.split("."))
+            if key not in here and section is not None and _at(section, ["enabled"]) is not False:
+                name = module.rpartition(".")[2]
+                yield Missing(name, key, f"is of the extension {name}, which is not installed: {_how(module)}")
+
+
+def keys_of_missing(installed: Iterable[Extension]) -> list[str]:
+    """Return the keys of a config that are ours, and of extensions that are not among ``installed``."""
+    here = {key for extension in installed for key in extension.sections}
+    return [key for keys in OURS.values() for key in keys if key not in here]
+
+
+def _how(module: str) -> str:
+    return f'pip install "pebble-robot[all]" ({module.replace(".", "/")} is not there, or what it needs)'
+
+
+def _at(raw: Any, path: Iterable[str]) -> Any:
+    for key in path:
+        raw = raw.get(key) if isinstance(raw, dict) else None
+    return raw
+
+
+def lacking_packages(extension: Extension) -> list[str]:
+    """Return the modules of other packages that an extension needs and this Python lacks."""
+    return [name for name in extension.packages if find_spec(name) is None]
+
+
+def refuse_claims(extensions: Iterable[Extension]) -> None:
+    """Raise ConfigError where two extensions add the same section, command, protocol or name; it names both."""
+    owners: dict[tuple[str, str], Extension] = {}
+    for extension in extensions:
+        claims: dict[str, Iterable[str]] = {
+            "section": extension.sections,
+            "command": extension.commands,
+            "protocol": extension.protocols,
+            "extension": (extension.name,),
+        }
+        for kind, names in claims.items():
+            for name in names:
+                other = owners.setdefault((kind, name), extension)
+                if other is not extension:
+                    pair = f"{other.package} ({other.name}) and {extension.package} ({extension.name})"
+                    raise ConfigError(f'extensions: {kind} "{name}" is added by two, {pair}: remove one of them')
+
+
+def packages() -> Iterator[Extension]:
+    """Yield those of installed packages, for the command line; what cannot be loaded adds no command, and is logged."""
+    for name in _offered():
+        try:
+            yield _of_package(name)
+        except Exception as error:  # noqa: BLE001 - as in named()
+            log.error("the extension %s cannot be loaded: %s", name, error)
+
+
+def programs_of(extensions: Iterable[Extension], config: Any, core: Iterable[str] = ()) -> list[Program]:
+    """Return the processes that extensions add to a robot; ``core``: names that are taken.
+
+    Raises ConfigError for a name that is taken, or that two of them have.
+    """
+    owners = dict.fromkeys(core, "the core")
+    found = []
+    for extension in extensions:
+        for program in _programs(extension, config):
+            other = owners.setdefault(program.name, extension.package)
+            if other != extension.package:
+                raise ConfigError(f'extensions: program "{program.name}" is of two, {other} and {extension.package}')
+            found.append(program if program.arguments else replace(program, arguments=(str(config.path),)))
+    return found
+
+
+def _programs(extension: Extension, config: Any) -> Iterator[Program]:
+    sections = (_at_section(config, key) for key in extension.sections)
+    if extension.program is not None and all(getattr(section, "enabled", True) for section in sections):
+        yield extension.program
+    if extension.programs:
+        yield from part(extension.programs)(config)
+
+
+def _at_section(config: Any, key: str) -> Any:
+    return reduce(getattr, key.split("."), config)
+
+
+def _of_package(name: str) -> Extension:
+    offered = _offered()
+    if name not in offered:
+        raise PebbleError(f"no installed package offers it; known are {', '.join(sorted(offered)) or 'none'}")
+    return _checked(part(offered[name]))
+
+
+@cache
+def _offered() -> Mapping[str, str]:
+    """Return the entry points of our group by name, as the packages' files have them.
+
+    ``importlib.metadata`` would take several megabytes of every process's memory for this.
+    """
+    found: dict[str, str] = {}
+    for folder in map(Path, dict.fromkeys(sys.path)):
+        for file in sorted(folder.glob("*.dist-info/entry_points.txt")) if folder.is_dir() else ():
+            inside = False
+            for line in file.read_text(encoding="utf-8", errors="replace").splitlines():
+                if line.startswith("["):
+                    inside = line.strip() == f"[{ENTRY_POINTS}]"
+                elif inside and "=" in line:
+                    name, _, place = line.partition("=")
+                    found.setdefault(name.strip(), place.strip())
+    return found
+
+
+def _of_file(path: Path) -> Extension:
+    """Return that of an owner's file; its module is called as the file, so that its parts are found: ``lamp:Lamp``.
+
+    A file that declares none is one program: it is run with the path of the config.
+    """
+    if not path.is_file():
+        raise PebbleError(f"there is no file {path}")
+    name = path.stem
+    loaded = sys.modules.get(name)
+    if loaded is not None and getattr(loaded, "__file__", None) != str(path):
+        raise PebbleError(f"a module is called {name} already: rename the file")
+    if loaded is None:
+        spec = spec_from_file_location(name, path)
+        if spec is None or spec.loader is None:
+            raise PebbleError(f"{path} cannot be imported")
+        if str(path.parent) not in sys.path:
+            sys.path.append(str(path.parent))  # its process runs it by name; last, so that it hides nothing
+        loaded = sys.modules[name] = module_from_spec(spec)
+        try:
+            spec.loader.exec_module(loaded)
+        except BaseException:
+            del sys.modules[name]
+            raise
+    declared = getattr(loaded, "EXTENSION", None)
+    own_program = Extension(name=name, package=path.name, program=Program(name, name))
+    return own_program if declared is None else _checked(declared)
+
+
+def _checked(extension: Any) -> Extension:
+    if not isinstance(extension, Extension):
+        raise PebbleError("its EXTENSION is no pebble.extension.Extension")
+    return extension

@@ -1,0 +1,57 @@
+"""What a robot with a camera and a microphone offers operators."""
+
+from collections.abc import Iterator
+from typing import Any
+
+from msgspec.structs import replace
+
+from pebble.config import Config
+from pebble.contract.capabilities import CapabilitiesValue
+from pebble.extension import Facts, Program
+from pebble.services.av_daemon.config import AvDaemon
+
+
+def offers(config: Config, value: CapabilitiesValue) -> CapabilitiesValue:
+    """Return ``value`` with its pictures and sound: the bridge requests what sends them, so without it none obeys."""
+    devices, obeys = config.section(AvDaemon), config.services.mqtt_bridge.enabled
+    video, audio = devices.enabled and devices.video.enabled, devices.enabled and devices.audio.enabled
+    return replace(
+        value,
+        video=_completed(value.video, devices.video, ("width", "height", "fps"), video, obeys),
+        audio=_completed(value.audio, devices.audio, ("rate", "channels"), audio, obeys),
+    )
+
+
+def _completed(offer: Any, captured: Any, keys: tuple[str, ...], available: bool, obeys: bool) -> Any:
+    """An offer with what is captured, where operators are not sent something else."""
+    missing = {key: getattr(captured, key) for key in keys if getattr(offer, key) is None}
+    return replace(offer, available=available, controls=available and obeys, **missing)
+
+
+def facts(config: Config) -> Facts:
+    """Return where programs of the original find pictures and sound on the robot."""
+    forms = {"video": "pictures", "audio": "sound"}
+    sockets = config.section(AvDaemon).sockets().items()
+    texts = (f"{forms[name]} at {path}, by examples/gstreamer_sockets.py" for name, path in sockets)
+    return Facts(tuple(("for the original's scripts", text) for text in texts))
+
+
+def camera_programs(config: Config) -> Iterator[Program]:
+    """Yield the process that sends pictures to operators while the bridge requests them."""
+    return _programs(config, "camera_publisher", config.section(AvDaemon).video.enabled)
+
+
+def microphone_programs(config: Config) -> Iterator[Program]:
+    """Yield the process that sends sound to operators while the bridge requests it."""
+    return _programs(config, "audio_publisher", config.section(AvDaemon).audio.enabled)
+
+
+def loudspeaker_programs(config: Config) -> Iterator[Program]:
+    """Yield the process that plays operators' voices while the bridge requests it."""
+    return _programs(config, "audio_receiver", config.section(AvDaemon).audio.enabled)
+
+
+def _programs(config: Config, name: str, has_device: bool) -> Iterator[Program]:
+    if has_device and config.section(AvDaemon).enabled and config.services.mqtt_bridge.enabled:
+        shares = ("pebble.transports.frames", "pebble.extensions.media.sound")
+        yield Program(name, f"pebble.services.{name}", on_demand=True, preloaded=False, shares=shares)

@@ -1,0 +1,47 @@
+"""The config section of sounds."""
+
+from typing import Annotated, ClassVar
+
+from msgspec.structs import replace
+
+from pebble.config import Config
+from pebble.config.problems import Path
+from pebble.config.reader import Reader, Rule
+from pebble.config.types import COMMAND, ONE_VALUE, Command, File, HandlerTopics, Section, ServiceSection, doc
+from pebble.contract.capabilities import CapabilitiesValue, offered
+
+
+class Playback(Section, frozen=True, kw_only=True):
+    """Where sounds are and what plays them; decoded ones are played by the audio receiver's command."""
+
+    retired: ClassVar = {
+        **dict.fromkeys(("stop_timeout", "scan_interval"), ONE_VALUE),
+        **dict.fromkeys(("cwd", "env"), COMMAND),
+        "volume": "clips are played as recorded: set the loudspeaker's volume, or the player's",
+    }
+
+    directory: Annotated[File | None, doc("Folder of the sounds; unset: `~/sounds`.")] = None
+    player_command: Annotated[Command, doc("Plays wav files; `{file}` stands for the sound, else it comes last.")] = (
+        "aplay",
+    )
+
+
+class SoundboardHandler(ServiceSection, frozen=True, kw_only=True):
+    """Plays sounds on the robot."""
+
+    topics: Annotated[HandlerTopics, doc("Other names for topics.")] = HandlerTopics()
+    playback: Annotated[Playback, doc("Sounds and player.")] = Playback()
+
+
+def _check(reader: Reader, section: SoundboardHandler, path: Path) -> SoundboardHandler:
+    if section.enabled and not section.playback.player_command:
+        reader.notes.doubt((*path, "playback", "player_command"), "is missing, write aplay")
+    return section
+
+
+RULES: tuple[Rule, ...] = ((SoundboardHandler, _check),)
+
+
+def offers(config: Config, value: CapabilitiesValue) -> CapabilitiesValue:
+    """Return ``value`` with the robot's sounds."""
+    return replace(value, soundboard=offered(value.soundboard, config.section(SoundboardHandler).enabled))

@@ -1,0 +1,39 @@
+"""The config section of a third party's streaming program."""
+
+from typing import Annotated, ClassVar
+
+from msgspec.structs import replace
+
+from pebble.config.hosts import HostError, check_web_url
+from pebble.config.problems import Path
+from pebble.config.reader import Reader, Rule
+from pebble.config.secret_text import without_login
+from pebble.config.types import COMMAND, Command, ServiceSection, doc
+
+
+class VideoStream(ServiceSection, frozen=True, kw_only=True):
+    """Runs a third party's streaming program while operators request video."""
+
+    retired: ClassVar = dict.fromkeys(("cwd", "env"), COMMAND)
+
+    command: Annotated[Command, doc("The program and its arguments, without a shell; required where enabled.")] = ()
+    webrtc_url: Annotated[str | None, doc("Where its pictures are shown; operator pages find it in the status.")] = None
+
+
+def _check(reader: Reader, stream: VideoStream, path: Path) -> VideoStream:
+    """Every operator receives the address: a login in it would be no secret."""
+    if stream.enabled and not stream.command:
+        reader.notes.doubt((*path, "command"), "is missing, write the program that streams the video")
+    if stream.webrtc_url is None:
+        return stream
+    public = without_login(stream.webrtc_url)
+    if public != stream.webrtc_url:
+        reader.notes.warning((*path, "webrtc_url"), "its login is left out, because the address is published")
+    try:
+        check_web_url(public)
+    except HostError as error:
+        reader.notes.warning((*path, "webrtc_url"), f"no page can show it: {error}")
+    return replace(stream, webrtc_url=public)
+
+
+RULES: tuple[Rule, ...] = ((VideoStream, _check),)

@@ -1,0 +1,232 @@
+"""Extensions: ours, a package of others, an owner's file; missing ones, broken ones, two that want the same."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from pebble.config import load, parse
+from pebble.config.types import Section
+from pebble.extension import OURS, Extension, lacking_packages, ours, part, programs_of
+from tests.support import ROOT
+
+PLACES = dict(zip([extension.name for extension in ours()], OURS, strict=True))
+#: What a section needs besides being enabled.
+NEEDED: dict[str, dict[str, Any]] = {
+    "services.video_stream": {"command": ["cat"]},
+    "services.neighbours": {"lan": {"connect": ["tcp/hub.lab:7447"]}},
+}
+#: Tests of an extension that do not lie in tests/ext/NAME.
+TESTS = {
+    "camera_publisher": "av",
+    "audio_publisher": "av",
+    "audio_receiver": "av",
+    "av_daemon": "av",
+    "video_stream": "../robot",
+    "soundboard_handler": "soundboard",
+    "autonomy_manager": "scripts",
+    "recorder": "recordings",
+    "paho": "../transports",
+    "pebble_serial_v1": "boards",
+    "devices": "boards",
+}
+
+
+@pytest.mark.parametrize("extension", ours(), ids=lambda extension: extension.name)
+class TestOurs:
+    def test_it_has_a_page_and_tests(self, extension: Extension) -> None:
+        assert (ROOT / extension.page).is_file()
+        assert (ROOT / "tests" / "ext" / TESTS.get(extension.name, extension.name)).is_dir()
+
+    def test_its_keys_are_those_of_its_row(self, extension: Extension) -> None:
+        assert tuple(extension.sections) == OURS[PLACES[extension.name]]
+
+    def test_its_parts_are_there(self, extension: Extension) -> None:
+        hooks = (extension.rules, extension.programs, extension.offers, extension.facts, extension.checks)
+        commands = [command.place for command in extension.commands.values()]
+        for place in filter(None, (*hooks, *extension.sections.values(), *extension.completions.values(), *commands)):
+            assert part(place) is not None
+        assert all(issubclass(part(place), Section) for place in extension.sections.values())
+        assert lacking_packages(extension) == []
+
+    def test_a_config_that_enables_it_is_accepted(self, extension: Extension, tmp_path: Path) -> None:
+        raw: dict[str, Any] = {"robot": {"id": "goob"}, "services": {}}
+        for key in extension.sections:
+            name = key.removeprefix("services.")
+            target = raw["services"] if name != key else raw
+            target[name] = NEEDED.get(key, {}) | ({"enabled": True} if name != key else {})
+        config = parse(raw, folder=tmp_path, env={})
+        names = [program.name for program in programs_of([extension], config)]
+        assert names == ([extension.program.name] if extension.program else [])
+
+
+LAMP = '''
+from pebble.config.types import ServiceSection, doc
+from pebble.extension import Command, Extension, Facts, Program
+from typing import Annotated
+
+
+class Lamp(ServiceSection, frozen=True, kw_only=True):
+    """Blinks."""
+
+    hz: Annotated[float, doc("How often a second.")] = 1.0
+
+
+def facts(config):
+    return Facts((("lamp", f"blinks {config.section(Lamp).hz:g} times a second"),))
+
+
+def lamp() -> None:
+    """Print that it is there."""
+    print("lamp is there")
+
+
+EXTENSION = Extension(
+    name="%(name)s",
+    package="%(name)s.py",
+    sections={"services.lamp": "%(name)s:Lamp"},
+    program=Program("lamp", "%(name)s", preloaded=False),
+    facts="%(name)s:facts",
+    commands={"lamp": Command("%(name)s:lamp", "blink")},
+    drives=%(drives)s,
+)
+'''
+
+
+def pebble(*words: str, path: str = "") -> subprocess.CompletedProcess[str]:
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(ROOT), *filter(None, [path])])}
+    command = [sys.executable, "-m", "pebble.cli", *words]
+    return subprocess.run(command, env=environment, capture_output=True, text=True, timeout=60, check=False)
+
+
+def write(folder: Path, extensions: dict[str, Any], lamp: dict[str, Any] | None = None) -> Path:
+    path = folder / "robot.json"
+    services = {} if lamp is None else {"lamp": lamp}
+    raw = {"robot": {"id": "goob"}, "extensions": extensions, "services": services}
+    path.write_text(json.dumps(raw))
+    return path
+
+
+def lamp_file(folder: Path, name: str, drives: bool = False) -> None:
+    (folder / f"{name}.py").write_text(LAMP % {"name": name, "drives": drives})
+
+
+def package(folder: Path, name: str) -> str:
+    """Write an installed package with the entry point ``lamp``; returns its place on the path."""
+    site = folder / "site"
+    (site / f"{name}-1.dist-info").mkdir(parents=True)
+    (site / f"{name}-1.dist-info" / "entry_points.txt").write_text(f"[pebble.extensions]\nlamp = {name}:EXTENSION\n")
+    lamp_file(site, name)
+    return str(site)
+
+
+def test_an_owners_file_has_a_section_a_program_and_a_line_of_check(tmp_path: Path) -> None:
+    lamp_file(tmp_path, "lamp")
+    done = pebble("check", str(write(tmp_path, {"lamp.py": {}}, {"enabled": True, "hz": 4})))
+    assert (done.returncode, done.stderr) == (0, "")
+    assert "blinks 4 times a second" in done.stdout
+    assert "processes" in done.stdout
+    assert ", lamp" in done.stdout
+    done = pebble("check", str(write(tmp_path, {"lamp.py": {}}, {"hzz": 4})))
+    assert (done.returncode, done.stderr) == (
+        1,
+        'pebble: robot.json: services.lamp.hzz: unknown key, did you mean "hz"?\n',
+    )
+
+
+def test_a_file_that_declares_nothing_is_one_program(tmp_path: Path) -> None:
+    (tmp_path / "siren.py").write_text("")
+    config = load(write(tmp_path, {"siren.py": {}}))
+    (program,) = programs_of(config.installed, config)
+    assert (program.name, program.module, program.arguments) == ("siren", "siren", (str(config.path),))
+
+
+def test_a_package_runs_code_where_a_config_names_it(tmp_path: Path) -> None:
+    site = package(tmp_path, "pebble_lamp")
+    named = pebble("check", str(write(tmp_path, {"lamp": {}}, {"hz": 2})), path=site)
+    assert (named.returncode, "blinks 2 times a second" in named.stdout) == (0, True)
+    done = pebble("check", str(write(tmp_path, {}, {"hz": 2})), path=site)
+    assert (done.returncode, "services.lamp: unknown key" in done.stderr) == (1, True)
+    done = pebble("lamp", path=site)
+    assert (done.returncode, done.stdout) == (0, "lamp is there\n")
+    assert "lamp        blink" in pebble("--help", path=site).stdout
+
+
+@pytest.mark.parametrize(
+    ("source", "reason"),
+    [
+        (None, "there is no file "),
+        ("1 / 0", "ZeroDivisionError: division by zero"),
+        ("EXTENSION = 1", "its EXTENSION is no pebble.extension.Extension"),
+        (LAMP % {"name": "absent", "drives": False}, "ModuleNotFoundError: No module named 'absent'"),
+    ],
+)
+@pytest.mark.parametrize("drives", [False, True])
+def test_a_broken_one_is_an_error_and_keeps_a_robot_from_starting_only_if_it_drives(
+    source: str | None, reason: str, drives: bool, tmp_path: Path
+) -> None:
+    if source is not None:
+        (tmp_path / "lamp.py").write_text(source)
+    path = write(tmp_path, {"lamp.py": {"drives": drives}})
+    done = pebble("check", str(path))
+    assert (done.returncode, done.stderr.startswith(f"pebble: robot.json: extensions.lamp.py: {reason}")) == (1, True)
+    code = f"from pebble.config import load; print(load({str(path)!r}, lenient=True).warnings)"
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=False)
+    assert (done.returncode == 0, reason in done.stdout) == (not drives, not drives)
+
+
+def test_what_owns_motors_is_listed_as_such(tmp_path: Path) -> None:
+    lamp_file(tmp_path, "legs", drives=True)
+    done = pebble("check", str(write(tmp_path, {"legs.py": {}})))
+    assert (done.returncode, 'it owns motors, write {"drives": true}' in done.stderr) == (1, True)
+
+
+def test_two_that_want_the_same_are_refused_with_both_names(tmp_path: Path) -> None:
+    lamp_file(tmp_path, "lamp")
+    lamp_file(tmp_path, "lamp2")
+    done = pebble("check", str(write(tmp_path, {"lamp.py": {}, "lamp2.py": {}})))
+    text = 'section "services.lamp" is added by two, lamp.py (lamp) and lamp2.py (lamp2): remove one of them'
+    assert (done.returncode, text in done.stderr) == (1, True)
+
+
+WITHOUT = """
+import sys
+from pathlib import Path
+sys.modules[{module!r}] = None
+from pebble.errors import ConfigError
+from pebble.config import parse
+from pebble.extension import OURS, ours
+from pebble.launcher.launcher import Launcher
+print(*(extension.name for extension in ours()))
+for key in OURS[{module!r}]:
+    name = key.removeprefix("services.")
+    section = {{"enabled": True}} if name != key else {{}}
+    raw = {{"robot": {{"id": "goob"}}, **({{"services": {{name: section}}}} if name != key else {{name: section}})}}
+    try:
+        parse(raw, folder=Path("/"), env={{}})
+    except ConfigError as error:
+        print(error)
+    if name != key:
+        raw["services"] = {{name: {{"enabled": False, "unknown": 1}}}}
+        parse(raw, folder=Path("/"), env={{}})
+"""
+
+
+@pytest.mark.parametrize("name", PLACES)
+def test_without_one_the_core_and_all_others_start_but_those_that_need_it(name: str) -> None:
+    lost = {name}
+    for extension in ours():
+        if lost & {*extension.needs}:
+            lost.add(extension.name)
+    code = WITHOUT.format(module=PLACES[name])
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=False)
+    installed, *problems = done.stdout.splitlines()
+    assert (done.stderr, {*PLACES} - {*installed.split()}) == ("", lost)
+    assert [line.partition(": ")[0] for line in problems] == [*OURS[PLACES[name]]]
+    assert all("is not installed: pip install" in line for line in problems)
