@@ -281,21 +281,10 @@ def _of_package(name: str) -> Extension:
 
 @cache
 def _offered() -> Mapping[str, str]:
-    """Return the entry points of our group by name, as the packages' files have them.
+    """Return the places of the extensions that installed packages offer, by name."""
+    from importlib.metadata import entry_points  # several MB, only for robots with an extension of others
 
-    ``importlib.metadata`` would take several megabytes of every process's memory for this.
-    """
-    found: dict[str, str] = {}
-    for folder in map(Path, dict.fromkeys(sys.path)):
-        for file in sorted(folder.glob("*.dist-info/entry_points.txt")) if folder.is_dir() else ():
-            inside = False
-            for line in file.read_text(encoding="utf-8", errors="replace").splitlines():
-                if line.startswith("["):
-                    inside = line.strip() == f"[{ENTRY_POINTS}]"
-                elif inside and "=" in line:
-                    name, _, place = line.partition("=")
-                    found.setdefault(name.strip(), place.strip())
-    return found
+    return {point.name: point.value for point in entry_points(group=ENTRY_POINTS)}
 
 
 def _of_file(path: Path) -> Extension:
