@@ -102,7 +102,10 @@ class Facts(Struct, frozen=True):
 
 
 class Extension(Struct, frozen=True, kw_only=True, eq=False):
-    """What an extension adds. Parts are written ``module:name``; an empty one adds nothing."""
+    """What an extension adds. Parts are written ``module:name``; an empty one adds nothing.
+
+    A robot whose config lists one with ``motors`` does not start without it.
+    """
 
     name: str
     package: str = "pebble-robot"  # who is named where two add the same
@@ -120,7 +123,7 @@ class Extension(Struct, frozen=True, kw_only=True, eq=False):
     former: dict[str, str] = {}  # commands of earlier releases, and how they are called now
     completions: dict[str, str] = {}  # by the name of an argument in help: a function of the context, the values
     protocols: dict[str, SerialProtocol] = {}  # of serial lines, by the config's `protocol`
-    drives: bool = False  # it owns motors: a robot whose config names it does not start without it
+    motors: dict[str, str] = {}  # its motor owners (pebble.motors.motor_owner) by name: the program
     page: str = ""  # where its documentation is
 
 
@@ -178,7 +181,7 @@ def named(entries: Mapping[str, bool], folder: Path) -> tuple[tuple[Extension, .
             reason = str(error) if isinstance(error, PebbleError) else f"{type(error).__name__}: {error}"
             missing.append(Missing(name, f"extensions.{name}", reason, drives))
             continue
-        if extension.drives and not drives:
+        if extension.motors and not drives:
             raise ConfigError(f'extensions.{name}: it owns motors, write {{"drives": true}}')
         SERIAL_PROTOCOLS.update(extension.protocols)
         found.append(extension)
@@ -242,6 +245,13 @@ def packages() -> Iterator[Extension]:
             yield _of_package(name)
         except Exception as error:  # noqa: BLE001 - as in named()
             log.error("the extension %s cannot be loaded: %s", name, error)
+
+
+def motors_of(extensions: Iterable[Extension], config: Any) -> dict[str, str]:
+    """Return the motor owners that extensions add to a robot, by name: their programs."""
+    running = {program.name for program in programs_of(extensions, config)}
+    found = {owner: program for extension in extensions for owner, program in extension.motors.items()}
+    return {owner: program for owner, program in found.items() if program in running}
 
 
 def programs_of(extensions: Iterable[Extension], config: Any, core: Iterable[str] = ()) -> list[Program]:

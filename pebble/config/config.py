@@ -188,7 +188,10 @@ def _config(
         state_folder=root.transport.state_dir or default_state_folder(identity.base, env),
         password_variables=tuple(reader.password_variables),
     )
-    return replace(config, motor_owners=tuple(map(config.motor_owner, config.motor_lines())))
+    owners = (*map(config.motor_owner, config.motor_lines()), *extension.motors_of(installed, config))
+    if len(owners) > len(set(owners)):
+        raise ConfigError("extensions: two motor owners have one name; serial lines are called as their instances")
+    return replace(config, motor_owners=owners)
 
 
 def _extensions(own: Any, folder: Path) -> tuple[tuple[Extension, ...], tuple[Missing, ...]]:

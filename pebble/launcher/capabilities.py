@@ -119,18 +119,18 @@ def _motor(
     config: Config, addresses: Addresses, lacking: Collection[str]
 ) -> tuple[offers.DriveOffer, offers.EstopOffer, offers.LightsOffer, offers.TelemetryOffer]:
     """Drive, stop, lights and telemetry of the serial line to the motor MCU, with *its* effective topics."""
-    lines = config.motor_lines()
-    present, moves = bool(lines), bool(lines or config.zeros)
+    lines, owned = config.motor_lines(), bool(config.motor_owners)
+    present, moves = bool(lines), owned or bool(config.zeros)
     name, line = next(iter(lines.items())) if lines else ("", config.services.serial_mcu_bridge)
     if name:
         addresses = Addresses(view_of(config, name))
     drive = offers.DriveOffer(
         available=moves,
         controls=moves,
-        topic=addresses[c.DRIVE].topic if present or not config.zeros else config.zeros[0],
-        arbitrates=present or UNSET,
-        axes=["x", "z"] if present else UNSET,  # a line has speeds of two wheels
-        control=(present and "control" not in lacking) or UNSET,
+        topic=addresses[c.DRIVE].topic if owned or not config.zeros else config.zeros[0],
+        arbitrates=owned or UNSET,
+        axes=["x", "z"] if owned else UNSET,  # a line has speeds of two wheels
+        control=(owned and "control" not in lacking) or UNSET,
     )
     lights = offers.LightsOffer(
         solid=present,
@@ -151,12 +151,11 @@ def _motor(
         imu=imu,
         imu_topic=imu_topic,
     )
-    return drive, _estop(config, [] if "estop" in lacking else list(lines)), lights, telemetry
+    return drive, _estop(config, [] if "estop" in lacking else [*config.motor_owners]), lights, telemetry
 
 
-def _estop(config: Config, instances: list[str]) -> offers.EstopOffer:
+def _estop(config: Config, owners: list[str]) -> offers.EstopOffer:
     """Where to stop the robot, and who then reports it as stopped. If one owner lacks the stop, the robot does."""
-    owners = [config.motor_owner(instance) for instance in instances]
     return offers.EstopOffer(
         available=bool(owners),
         topic=c.ESTOP.topic(config.base),

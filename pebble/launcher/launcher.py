@@ -10,7 +10,7 @@ from typing import Any
 from pebble.config import Config
 from pebble.config.rules.doors import warning_of_open
 from pebble.errors import ConfigError, PebbleError
-from pebble.extension import Program, Stage
+from pebble.extension import Program, Stage, motors_of
 from pebble.launcher.child import Child
 from pebble.launcher.driveable import Driveable
 from pebble.launcher.features import Features
@@ -118,9 +118,11 @@ class Launcher:
 
     def _driveable_by(self, running: Collection[str]) -> Driveable:
         lines = {program_of(name): self._config.motor_owner(name) for name in self._config.serial_instances()}
+        added = {program: name for name, program in motors_of(self._config.installed, self._config).items()}
+        owners = [*map(program_of, self._config.motor_lines()), *added]
         return Driveable(
-            {program: name for program, name in lines.items() if program in running},
-            [program for name in self._config.motor_lines() if (program := program_of(name)) in running],
+            {program: name for program, name in (lines | added).items() if program in running},
+            [program for program in owners if program in running],
             [name for name in ("mqtt_bridge",) if name in running],
             lambda: self._status.changed(),
         )

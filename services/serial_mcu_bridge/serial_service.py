@@ -40,8 +40,7 @@ class SerialService(Service, ABC):
         self._silence = Silence()
         self._misread = False
         self._understood = (0, 0)  # which opening of the line, and how often its board was heard since
-        self.notifier = Notifier()
-        self._reported = Reported(self.notifier.mcu)
+        self._reported = Reported(Notifier().mcu)
         self.line = SerialLine(
             section.serial.port,
             section.serial.baud,

@@ -94,7 +94,7 @@ EXTENSION = Extension(
     program=Program("lamp", "%(name)s", preloaded=False),
     facts="%(name)s:facts",
     commands={"lamp": Command("%(name)s:lamp", "blink")},
-    drives=%(drives)s,
+    motors={"lamp": "lamp"} if %(drives)s else {},
 )
 '''
 

@@ -9,42 +9,24 @@ from pebble import contract as c
 from pebble.contract.payloads import (
     ChargingLevel,
     ChargingStatus,
-    ControlRequest,
-    ControlState,
-    ControlTurn,
-    ControlVouched,
     Drive,
-    EstopCommand,
-    EstopReset,
-    EstopState,
     LightsFlash,
     LightsSolid,
     MotorPower,
     TouchSensors,
     TouchValues,
 )
-from pebble.errors import TransportError
+from pebble.motors.motor_owner import MotorOwner
 from pebble.runtime.lines import LineSplitter
-from pebble.runtime.parent import Reported
-from pebble.runtime.service import WAIT_LIMIT_S, every, on
-from pebble.runtime.timers import Timer
+from pebble.runtime.service import on
 from pebble.services.serial_mcu_bridge.line.serial_line import LineState
-from pebble.services.serial_mcu_bridge.motion.control import Control
-from pebble.services.serial_mcu_bridge.motion.motion_inbox import MotionInbox, ReceivedDrive, ReceivedRequest
-from pebble.services.serial_mcu_bridge.motion.motor_guard import MotorGuard
-from pebble.services.serial_mcu_bridge.motion.state_file import StateFile
 from pebble.services.serial_mcu_bridge.serial_service import SerialService
 from pebble.services.serial_mcu_bridge.text import goob_base
 from pebble.services.serial_mcu_bridge.text.device_log import DeviceLogLine, is_known
 from pebble.services.serial_mcu_bridge.text.goob_base import Charging, Level, Report, Touch
 from pebble.services.serial_mcu_bridge.text.hall_memory import HallMemory
-from pebble.transports import Message, QoS
 
 _LIGHTS = "lights"  # a steady colour and a fade replace one another
-_SAVE_AGAIN_S = 1.0
-_REPEAT_S = 5.0  # as often as boards repeat their reports
-_CHECK_S = 1.0  # an answer to a subscription may come later than the connection
-_FINAL_ZERO = Drive(x=0.0, z=0.0, valid_ms=0)
 
 
 class MotorProtocol(Protocol):
@@ -57,8 +39,8 @@ class MotorProtocol(Protocol):
     def flash_line(self, blue: float, green: float, red: float, period_s: float) -> bytes: ...
 
 
-class MotorBridge(SerialService):
-    """Drives the motors as its guard permits, and stops them when the last drive command is no longer valid.
+class MotorBridge(MotorOwner, SerialService):
+    """Drives the motors over a serial line.
 
     SerialLine sends the stop at the start, and at the end from its close(), which runs by :meth:`on_stop`.
 
@@ -66,7 +48,7 @@ class MotorBridge(SerialService):
     """
 
     publishes = (
-        *(c.ESTOP_STATE, c.CONTROL_STATE, c.CONTROL_TURN),
+        *MotorOwner.publishes,
         *(c.MOTOR_POWER, c.TOUCH_SENSORS, c.CHARGING_STATUS, c.CHARGING_LEVEL),
     )
     protocol: ClassVar[MotorProtocol] = goob_base
@@ -75,171 +57,36 @@ class MotorBridge(SerialService):
     def __init__(self, *arguments: Any, **options: Any) -> None:
         super().__init__(*arguments, **options)
         self._publishes_touch = self.options.telemetry.publish_touch_sensors
-        self._owner = self.config.motor_owner(self.instance)
-        self._control = Control(
-            self.config.security,
-            self._publish_control,
-            self.clock(),
-            self._owner,
-            self.config.motor_owners,
-            self._show_turn,
-            bridged=self.config.services.mqtt_bridge.enabled,
-        )
-        self._waiting = MotionInbox(self._control)
-        self.state_file = StateFile(self.config.state_file(f"estop-{self._owner}"), self._on_saved)
-        self._barred_file = StateFile(self.config.run_dir() / f"barred-{self._owner}.json")
-        self._guard = MotorGuard(
-            self.state_file,
-            self._barred_file,
-            self._publish_state,
-            self.counters,
-            self._control,
-            watchdog_s=self.options.safety.drive_timeout_seconds,
-            now=self.clock(),
-        )
         self._power = (0.0, 0.0)  # of the left and the right wheel, as published
-        self._deadline: Timer | None = None  # stops the motors unless a command arrives; None: they are stopped
-        self._guard_timer: Timer | None = None
-        self.announced = True  # that it latches, to operators
-        self._estop_note = Reported(self.notifier.feature, "estop", True)
-        self._control_note = Reported(self.notifier.feature, "control", True)
         self._charging: ChargingStatus | None = None
         self._hall = self._make_hall_memory()
         self._splitter = LineSplitter()
+
+    @property
+    def owner(self) -> str:
+        return self.config.motor_owner(self.instance)
+
+    @property
+    def drive_timeout_s(self) -> float:
+        return self.options.safety.drive_timeout_seconds
 
     def _make_hall_memory(self) -> HallMemory | None:
         name = self.config.hall_memory(self.options)
         return None if name is None else HallMemory(name)
 
     def start(self) -> None:
-        self.on_stop(self.state_file.close)
-        self.on_stop(self._barred_file.close)
         if self._hall is not None:
             self.on_stop(self._hall.close)
-        self._guard.begin(self.clock())
-        self._control.note(self.clock())
         super().start()
 
-    # -- on the transport's threads; the stop is subscribed to before the drive commands
+    # -- motors
 
-    @on(c.ESTOP, direct=True)
-    def receive_stop(self, stop: EstopCommand, _arrived: float) -> None:
-        if stop.owner not in self._control.peers:  # the bridge repeats it for one that has not confirmed it
-            self._judge_soon(self._waiting.put_stop(stop))
-
-    @on(c.ESTOP_RESET, direct=True)
-    def receive_reset(self, reset: EstopReset, arrived: float) -> None:
-        self._judge_soon(self._waiting.put_reset(reset, arrived))
-
-    @on(c.CONTROL, direct=True)
-    def receive_request(self, request: ControlRequest, arrived: float) -> None:
-        self._judge_soon(self._waiting.put_request(request, False, arrived))
-
-    @on(c.CONTROL_TAKE, direct=True)
-    def receive_take(self, request: ControlRequest, arrived: float) -> None:
-        self._judge_soon(self._waiting.put_request(request, True, arrived))
-
-    def set_up(self) -> None:
-        """Receive the turns of other motor owners as well, where there are any."""
-        self.transport.on_state(self._waiting.note_state)
-        super().set_up()
-        receive = self.refusals.reader(c.CONTROL_TURN, self._receive_turn)
-        for owner in self._control.peers:
-            topic = c.CONTROL_TURN.topic(self.config.base, owner=owner)
-            self.transport.subscribe(topic, receive, qos=QoS(c.CONTROL_TURN.default_qos), direct=True)
-
-    def _receive_turn(self, message: Message, turn: ControlTurn, names: dict[str, str]) -> None:
-        if not message.retain:
-            self._judge_soon(self._waiting.put_turn(names["owner"], turn))
-
-    @on(c.DRIVE, direct=True)
-    def receive_drive(self, drive: Drive, arrived: float) -> None:
-        self._judge_soon(self._waiting.put_drive(drive, arrived))
-
-    @on(c.CONTROL_VOUCHED, direct=True)
-    def receive_vouched(self, vouched: ControlVouched, _arrived: float) -> None:
-        self._judge_soon(self._waiting.put_vouched(vouched))
-
-    def _judge_soon(self, was_empty: bool) -> None:
-        if was_empty and not self.run_if_idle(self.judge):
-            self.post_first(self.judge)
-
-    # -- commands
-
-    def judge(self) -> None:
-        """Stops first: they void every drive command that waits with them."""
-        batch = self._waiting.take()
-        latches = not batch.stops or self._latches  # without a stop nothing here depends on it
-        for stop in batch.stops:
-            self._halt()
-            if latches:
-                self._guard.stop(stop, self.clock())
-            else:
-                self.log_limited.warning("unlatched", "a stop only halts: it could not be reset")
-                self._guard.judge(_FINAL_ZERO, self.clock())
-        for waiting in batch.resets:
-            self._guard.reset(waiting.reset, self.clock() - waiting.at, self.clock())
-        for request in batch.requests:
-            self._answer(request)
-        for owner, turn in batch.turns:
-            self._control.receive_turn(owner, turn, self.clock())
-            self._guard.bar(turn.barred, self.clock())
-            self._note_control()
-        if batch.lost:
-            self._control.doubt(self.clock())
-        for received in batch.drives:
-            if latches or not (batch.stops and received.drive.moves):
-                self._drive(received)
-        if batch.vouched is not None:  # the drive commands of before it must count first, or be missed
-            self._control.vouch(batch.vouched, self.clock())
-        self._arm_guard()
-        if self._waiting.dropped:
-            self._count_dropped()
-
-    def _count_dropped(self) -> None:
-        dropped = self._waiting.dropped - self.counters["motion_dropped"]
-        if dropped:
-            self.counters.add("motion_dropped", dropped)
-            text = "dropped commands of many senders or stops that waited"
-            self.log_limited.warning("motion_dropped", text, times=dropped)
-
-    def _drive(self, received: ReceivedDrive) -> None:
-        now, drive = self.clock(), received.drive
-        if drive.moves and now - received.at > WAIT_LIMIT_S:
-            self.count_late(c.DRIVE)
-            self._control.doubt(now)
-            return
-        valid_s = self._guard.judge(drive, now)
-        self._note_control()
-        if valid_s is None:
-            return
-        if self._deadline is not None and now >= self._deadline.due:
-            self._halt()  # the dead-man's switch is late: the last drive command ends before this one begins
-        valid_s -= now - received.at
-        if valid_s <= 0:
-            self._halt()
-            return
+    def move(self, drive: Drive, valid_s: float) -> None:
         power = self.protocol.mix(drive.x, drive.z)
         self.line.drive(self.protocol.drive_line(*power), valid_s)
-        self._set_deadline(now + valid_s)
         self._show_power(*power)
 
-    def _answer(self, received: ReceivedRequest) -> None:
-        now = self.clock()
-        if now - received.at > c.CONTROL.waits_s and not received.request.ends():
-            self.count_late(c.CONTROL)
-            self._control.doubt(now)
-            return
-        self._control.request(received.request, received.over, now)
-        self._note_control()
-
-    def _note_control(self) -> None:
-        if self._control.note(self.clock()):
-            self._halt()
-        self._control.show_turn(self.clock())
-
-    def _halt(self) -> None:
-        self._set_deadline(None)
+    def halt(self) -> None:
         self.line.halt()
         self._show_power(0.0, 0.0)
 
@@ -247,107 +94,7 @@ class MotorBridge(SerialService):
         """Publish what the wheels are commanded, if it has changed and what their sensors say is published."""
         if self._publishes_touch and (left, right) != self._power:
             self._power = left, right
-            self.publish(c.MOTOR_POWER, MotorPower(left=left, right=right), owner=self._owner)
-
-    def _set_deadline(self, due: float | None) -> None:
-        if self._deadline is not None:
-            self._deadline.cancel()
-        self._deadline = None if due is None else self.call_at(due, self._halt)
-
-    # -- what the other end refuses to deliver
-
-    @property
-    def _latches(self) -> bool:
-        """Whether a stop latches. Without the resets it would have no end, and without the stops it is no promise."""
-        return not (self.refused(c.ESTOP) or self.refused(c.ESTOP_RESET))
-
-    def on_connected(self) -> None:
-        self.check_subscriptions()
-
-    @every(_CHECK_S)
-    def check_subscriptions(self) -> None:
-        """Withdraw the emergency stop while its topics are refused. Raises TransportError if the drive topic is."""
-        if self.refused(c.DRIVE):
-            raise TransportError(
-                f"the broker refuses the subscription to {self.addresses[c.DRIVE].topic}: nothing can drive this robot."
-                " Permit the user in local_mqtt to subscribe to it"
-            )
-        if self._latches is not self.announced:
-            self.announced = self._latches
-            self._announce()
-        self._control_note.report("control", not self.refused(c.CONTROL))
-        self._estop_note.report("estop", self.announced)
-
-    def _announce(self) -> None:
-        if self.announced:
-            self.log.warning("the subscriptions to the emergency stop are granted again: a stop latches")
-            self.repeat_state()
-            return
-        topics = [self.addresses[channel].topic for channel in (c.ESTOP, c.ESTOP_RESET) if self.refused(channel)]
-        self.log.error(
-            "the broker refuses the subscription to %s: this robot has no emergency stop, a stop only halts it%s."
-            " Permit the user in local_mqtt to subscribe to both %s and %s",
-            " and ".join(topics),
-            ", and it stays stopped now" if self._guard.latched else "",
-            self.addresses[c.ESTOP].topic,
-            self.addresses[c.ESTOP_RESET].topic,
-        )
-        self.retract(c.ESTOP_STATE, owner=self._owner)
-
-    # -- the guard
-
-    def _arm_guard(self) -> None:
-        due = min((at for at in (self._guard.due, self._control.due) if at is not None), default=None)
-        if due is None or (self._guard_timer is not None and self._guard_timer.due <= due):
-            return
-        if self._guard_timer is not None:
-            self._guard_timer.cancel()
-        self._guard_timer = self.call_at(due, self._tick_guard)
-
-    def _tick_guard(self) -> None:
-        self._guard_timer = None
-        self._guard.tick(self.clock())
-        self._control.tick(self.clock())
-        self._note_control()
-        self._arm_guard()
-
-    @every(_SAVE_AGAIN_S)
-    def save_again(self) -> None:
-        stop = self._guard.appeared_stop() if self._latches else None
-        if stop is not None:
-            self.receive_stop(stop, self.clock())
-        else:
-            self._guard.save_again()
-
-    @every(_REPEAT_S)
-    def repeat_state(self) -> None:
-        self._guard.repeat_state(self.clock())
-        self._control.repeat_state(self.clock())
-        self._arm_guard()
-
-    def _publish_state(self, state: EstopState) -> None:
-        """While a stop does not latch, remove it instead, again and again: a bridge may have missed the first time."""
-        if self._latches:
-            self.publish(c.ESTOP_STATE, state, owner=self._owner)
-        else:
-            self.clear(c.ESTOP_STATE, owner=self._owner)
-
-    def _publish_control(self, state: ControlState) -> None:
-        self.publish(c.CONTROL_STATE, state, owner=self._owner)
-
-    def _show_turn(self) -> None:
-        turn = self._control.turn(self._guard.barred, self.clock())
-        if turn is not None:
-            self.publish(c.CONTROL_TURN, turn, owner=self._owner)
-
-    def _on_saved(self, number: int, succeeded: bool) -> None:
-        """On the file's thread."""
-
-        def note() -> None:
-            self._guard.on_saved(number, succeeded, self.clock())
-            self._arm_guard()
-
-        self.post(note, newest_of="saved")
+            self.publish(c.MOTOR_POWER, MotorPower(left=left, right=right), owner=self.owner)
 
     # -- lights
 

@@ -11,9 +11,9 @@ from unittest.mock import patch
 import msgspec
 
 from pebble.config import Config
+from pebble.motors import control, motor_guard
 from pebble.services.serial_mcu_bridge.line.outbox import Outbox
 from pebble.services.serial_mcu_bridge.line.serial_line import LineState
-from pebble.services.serial_mcu_bridge.motion import control, motor_guard
 from pebble.services.serial_mcu_bridge.text import motor_bridge
 from pebble.services.serial_mcu_bridge.text.motor_bridge import MotorBridge
 from tests.robot.lockstep.network import Connection, Network

@@ -17,7 +17,7 @@ from pebble.extensions.operator.client.control import ControlClient, RobotContro
 from pebble.extensions.operator.client.robot_estop import RobotEstop
 from pebble.motion.arbiter import PERSON, REFUSED, Arbiter
 from pebble.motion.latch import Latch
-from pebble.services.serial_mcu_bridge.motion.control import Control
+from pebble.motors.control import Control
 from pebble.transports.memory import MemoryHub
 from tests.services.serial_mcu_bridge.motor_rig import BASE, STOPPED, Bench
 from tests.support import until

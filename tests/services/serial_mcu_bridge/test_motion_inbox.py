@@ -6,8 +6,8 @@ import pytest
 
 from pebble.config import Security
 from pebble.contract.payloads import ControlRequest, ControlTurn, ControlVouched, Drive, EstopCommand, EstopReset
-from pebble.services.serial_mcu_bridge.motion.control import Control
-from pebble.services.serial_mcu_bridge.motion.motion_inbox import MotionInbox
+from pebble.motors.control import Control
+from pebble.motors.motion_inbox import MotionInbox
 from pebble.transports import State
 
 NAMES = [f"{number:016x}" for number in range(20)]

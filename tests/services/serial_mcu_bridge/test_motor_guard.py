@@ -15,9 +15,9 @@ from msgspec import structs
 
 from pebble.config import Security
 from pebble.contract.payloads import ControlTurn, Drive, EstopCommand, EstopReset, EstopState
-from pebble.services.serial_mcu_bridge.motion.control import Control
-from pebble.services.serial_mcu_bridge.motion.motor_guard import MotorGuard
-from pebble.services.serial_mcu_bridge.motion.state_file import StateFile
+from pebble.motors.control import Control
+from pebble.motors.motor_guard import MotorGuard
+from pebble.motors.state_file import StateFile
 from pebble.transports.counters import Counters
 from tests.support import until
 

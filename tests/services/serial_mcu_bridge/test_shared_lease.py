@@ -9,7 +9,7 @@ from msgspec import structs
 
 from pebble.config import Security
 from pebble.contract.payloads import ControlRequest, ControlState, ControlTurn, Drive
-from pebble.services.serial_mcu_bridge.motion.control import Control
+from pebble.motors.control import Control
 
 OWNERS = ("serial", "arm", "tail")  # the first by name is the second here
 START_S = 100.0

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from pebble.services.serial_mcu_bridge.motion.state_file import StateFile, Unreadable
+from pebble.motors.state_file import StateFile, Unreadable
 from tests.support import until
 
 

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from pebble.services.serial_mcu_bridge.motion.vouched_lease import VouchedLease
+from pebble.motors.vouched_lease import VouchedLease
 
 ANN, EVE = ("", "aaaaaaaa", "ann", ""), ("", "eeeeeeee", "eve", "")
 

@@ -41,7 +41,7 @@ def operators_side(robot: RobotUnderTest) -> str:
 
 
 def motors(robot: RobotUnderTest) -> str:
-    return "" if robot.config.motor_lines() else "it has no motors"
+    return "" if robot.config.motor_owners else "it has no motors"
 
 
 def account(robot: RobotUnderTest) -> str:

@@ -22,8 +22,8 @@ from pebble.extensions.install.commands import setup as command
 from pebble.extensions.install.setup.backup import ABOUT, BackupError, make, packed, read, unpacked
 from pebble.extensions.scripts.perception.camera_model import CameraModel
 from pebble.motion.latch import Latch
+from pebble.motors.state_file import StateFile
 from pebble.runtime.places import Places
-from pebble.services.serial_mcu_bridge.motion.state_file import StateFile
 from tests.commands.command_line import Run
 from tests.ext.checks.installed import BROKER, MQTT, PAGE, PEOPLE, ROBOT, config_of, installed
 from tests.support import ROOT

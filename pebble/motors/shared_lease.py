@@ -8,7 +8,7 @@ from abc import abstractmethod
 from typing import Any
 
 from pebble.contract.payloads import ControlTurn
-from pebble.services.serial_mcu_bridge.motion.vouched_lease import VouchedLease
+from pebble.motors.vouched_lease import VouchedLease
 
 FOLLOWS_MS = 1500  # so long after it was sent a turn is followed; it is repeated every 500
 SETTLES_MS = FOLLOWS_MS + 100

@@ -12,11 +12,11 @@ from msgspec import UNSET
 from pebble.contract.payloads import LAST_RUN, Drive, EstopCommand, EstopReset, EstopState
 from pebble.motion.arbiter import HOLD_MS, PERSON, REFUSED, Arbiter, newer
 from pebble.motion.latch import Latch, stop_of
+from pebble.motors.control import Control
+from pebble.motors.motion_inbox import run_of
+from pebble.motors.paced import Paced
+from pebble.motors.state_file import StateFile
 from pebble.runtime.rate_limit import RateLimitedLog
-from pebble.services.serial_mcu_bridge.motion.control import Control
-from pebble.services.serial_mcu_bridge.motion.motion_inbox import run_of
-from pebble.services.serial_mcu_bridge.motion.paced import Paced
-from pebble.services.serial_mcu_bridge.motion.state_file import StateFile
 from pebble.transports.counters import Counters
 
 log = logging.getLogger(__name__)

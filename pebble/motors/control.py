@@ -8,9 +8,9 @@ from collections.abc import Callable
 
 from pebble.config import Security
 from pebble.contract.payloads import ControlRequest, ControlState, ControlTurn, ControlVouched, Drive
+from pebble.motors.paced import Paced
+from pebble.motors.shared_lease import SharedLease, lease_of
 from pebble.runtime.rate_limit import RateLimitedLog
-from pebble.services.serial_mcu_bridge.motion.paced import Paced
-from pebble.services.serial_mcu_bridge.motion.shared_lease import SharedLease, lease_of
 
 log = logging.getLogger(__name__)
 

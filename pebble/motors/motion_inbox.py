@@ -15,7 +15,7 @@ from pebble.contract.payloads import (
     EstopReset,
 )
 from pebble.motion.arbiter import PERSON, UNKNOWN_RUN
-from pebble.services.serial_mcu_bridge.motion.control import Control
+from pebble.motors.control import Control
 from pebble.transports import State
 
 _STOPS = 8  # as many names as a latch remembers

@@ -1,0 +1,121 @@
+"""An extension that owns motors: what the guard of every motor owner promises holds for it, over a real robot."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from pebble.transports import MqttSettings, QoS, create
+from tests.support import ROOT, Broker, Child, until
+
+BASE = "pebble/robots/spider"
+LEGS = """
+import sys
+from pathlib import Path
+
+from pebble.extension import Extension, Program, Stage
+from pebble.motors.motor_owner import MotorOwner
+from pebble.runtime.process import run
+
+MOVES = Path(__file__).with_name("moves")
+
+
+class Legs(MotorOwner):
+    name = owner = "legs"
+
+    def start(self) -> None:
+        self.halt()
+        self.on_stop(self.halt)
+        super().start()
+        self.report(True)
+
+    def move(self, drive, valid_s):
+        self.write(f"{drive.x:g} {drive.z:g} {0 < valid_s <= 0.75}")
+
+    def halt(self):
+        self.write("halt")
+
+    def write(self, line):
+        with MOVES.open("a") as file:
+            file.write(line + "\\n")
+
+
+EXTENSION = Extension(
+    name="legs",
+    package="legs.py",
+    program=Program("legs", "legs", stage=Stage.DEVICE, preloaded=False),
+    motors={"legs": "legs"},
+)
+
+if __name__ == "__main__":
+    sys.exit(run(Legs))
+"""
+
+
+@pytest.mark.parametrize("kind", ["mqtt", "zenoh"])
+def test_legs_of_an_owner_are_driven_stopped_and_reset(kind: str, tmp_path: Path) -> None:
+    (tmp_path / "legs.py").write_text(LEGS)
+    moves, broker = tmp_path / "moves", Broker(tmp_path)
+    path = tmp_path / "robot.json"
+    path.write_text(
+        json.dumps(
+            {
+                "robot": {"id": "spider"},
+                "transport": {"kind": kind, "run_dir": "run", "state_dir": "state"},
+                "local_mqtt": {"port": broker.port},
+                "services": {
+                    "mqtt_bridge": {"enabled": True, "remote_mqtt": {"host": "127.0.0.1", "port": broker.port}}
+                },
+                "extensions": {"legs.py": {"drives": True}},
+            }
+        )
+    )
+    states: dict[str, Any] = {}
+    operator = create("mqtt", "operator", MqttSettings(host="127.0.0.1", port=broker.port))
+    operator.open()
+    operator.subscribe(f"{BASE}/outgoing/#", lambda message: states.update({message.topic: message.payload}))
+
+    def send(metric: str, value: dict[str, Any]) -> None:
+        operator.publish(f"{BASE}/incoming/{metric}", json.dumps(value).encode(), qos=QoS(1))
+
+    def state(metric: str) -> Any:
+        return json.loads(states.get(f"{BASE}/outgoing/{metric}", b"{}"))
+
+    def moved() -> bool:
+        begun = len(moves.read_text())
+        send("drive-values", {"x": 0.25, "z": 0.5})
+        return until(lambda: "0.25 0.5 True" in moves.read_text()[begun:], 1)
+
+    command = [sys.executable, "-m", "pebble.cli", "up", str(path)]
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    process = Child(command, cwd=tmp_path, env=environment, stderr=subprocess.DEVNULL)
+    try:
+        assert until(lambda: state("status").get("value", {}).get("driveable", {}).get("state") == "yes", 20), states
+        offer = state("capabilities")["value"]
+        assert (offer["drive"]["available"], offer["estop"]["owners"]) == (True, ["legs"])
+        assert moved()
+        assert until(lambda: moves.read_text().endswith("halt\n"), 3)  # no further command has come
+        assert moved()
+        send("estop", {"by": "ann"})
+        assert until(lambda: state("estop/legs")["latched"], 5)
+        assert moves.read_text().endswith("halt\n")
+        assert not moved()
+        stopped = state("estop/legs")
+        send("estop-reset", {"boot": stopped["boot"], "count": stopped["count"]})
+        assert until(lambda: not state("estop/legs")["latched"], 5)
+        assert until(moved, 5)
+        time.sleep(0.1)
+    finally:
+        process.send_signal(signal.SIGTERM)
+        code = process.wait(20)
+        operator.close()
+        broker.stop()
+    assert (code, moves.read_text().endswith("halt\n")) == (0, True)
