@@ -1,10 +1,8 @@
 """Offers a robot's pictures and sound at the GStreamer sockets where programs of the original Pebble read them.
 
-    python gstreamer_sockets.py /etc/pebble/robot.json
-
-The config names them: services.av_daemon.video.socket_path, audio.socket_path. GStreamer serves them: apt install
-gstreamer1.0-tools gstreamer1.0-plugins-base gstreamer1.0-plugins-bad. It ends when GStreamer ends, or frames are not
-what the config says; configs/systemd/pebble-gstreamer.service starts it again.
+The config names them, services.av_daemon.video.socket_path and audio.socket_path, and this program, which `pebble up`
+starts: "extensions": {"gstreamer_sockets.py": {}}. GStreamer serves them: apt install gstreamer1.0-tools
+gstreamer1.0-plugins-base gstreamer1.0-plugins-bad. It ends when GStreamer ends, or frames are not what the config says.
 """
 
 import signal

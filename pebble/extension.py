@@ -78,6 +78,7 @@ class Program(Struct, frozen=True):
     runs_scripts: bool = False  # lines of its output may be a script's
     may_request: bool = False  # may request on-demand programs
     on_demand: bool = False  # runs only while it is requested
+    plain: bool = False  # it reports nothing to the launcher, so it is ready once it runs
     preloaded: bool = True  # False: its imports are needed by few, and would cost every process their memory
     entry: str = ""  # what the package that is run begins with; "": the module is no package
     shares: tuple[str, ...] = ()  # modules that several programs use, imported before the first fork
@@ -300,11 +301,17 @@ def _offered() -> Mapping[str, str]:
 def _of_file(path: Path) -> Extension:
     """Return that of an owner's file; its module is called as the file, so that its parts are found: ``lamp:Lamp``.
 
-    A file that declares none is one program: it is run with the path of the config.
+    A file without the word EXTENSION is one program, run with the path of the config, and not imported here.
     """
     if not path.is_file():
         raise PebbleError(f"there is no file {path}")
     name = path.stem
+    if str(path.parent) not in sys.path:
+        sys.path.append(str(path.parent))  # its process runs it by name; last, so that it hides nothing
+    if "EXTENSION" not in path.read_text(encoding="utf-8", errors="replace"):
+        if getattr(find_spec(name), "origin", None) != str(path):
+            raise PebbleError(f"a module is called {name} already: rename the file")
+        return Extension(name=name, package=path.name, program=Program(name, name, plain=True, preloaded=False))
     loaded = sys.modules.get(name)
     if loaded is not None and getattr(loaded, "__file__", None) != str(path):
         raise PebbleError(f"a module is called {name} already: rename the file")
@@ -312,17 +319,13 @@ def _of_file(path: Path) -> Extension:
         spec = spec_from_file_location(name, path)
         if spec is None or spec.loader is None:
             raise PebbleError(f"{path} cannot be imported")
-        if str(path.parent) not in sys.path:
-            sys.path.append(str(path.parent))  # its process runs it by name; last, so that it hides nothing
         loaded = sys.modules[name] = module_from_spec(spec)
         try:
             spec.loader.exec_module(loaded)
         except BaseException:
             del sys.modules[name]
             raise
-    declared = getattr(loaded, "EXTENSION", None)
-    own_program = Extension(name=name, package=path.name, program=Program(name, name))
-    return own_program if declared is None else _checked(declared)
+    return _checked(getattr(loaded, "EXTENSION", None))
 
 
 def _checked(extension: Any) -> Extension:

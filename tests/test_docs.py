@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import re
 import shlex
@@ -70,16 +71,31 @@ def test_every_page_can_be_found_from_the_index() -> None:
     assert pages - linked - {ROOT / "docs" / "README.md"} == set()
 
 
-def test_the_first_service_and_its_test_run_as_they_stand(tmp_path: Path) -> None:
-    text = (ROOT / "docs" / "my-first-service.md").read_text()
-    service, test = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
-    (tmp_path / "battery_alarm.py").write_text(service)
-    (tmp_path / "test_battery_alarm.py").write_text(test)
-    command = [sys.executable, "-m", "pytest", "--quiet", "test_battery_alarm.py"]
-    done = subprocess.run(
-        command, cwd=tmp_path, env={**os.environ, "PYTHONPATH": str(ROOT)}, capture_output=True, check=False
-    )
-    assert b"1 passed" in done.stdout, done.stdout.decode()
+def test_the_first_extension_and_its_test_run_as_they_stand(tmp_path: Path) -> None:
+    text = (ROOT / "docs" / "my-first-extension.md").read_text()
+    service, test, package = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
+    (config,) = re.findall(r"```json\n(.*?)```", text, re.DOTALL)
+    (metadata,) = re.findall(r"```toml\n(.*?)```", text, re.DOTALL)
+    for name, content in {"battery_alarm": service, "test_battery_alarm": test, "pebble_alarm": package}.items():
+        (tmp_path / f"{name}.py").write_text(content)
+    environment = {**os.environ, "PYTHONPATH": f"{ROOT}{os.pathsep}{tmp_path}"}
+
+    def run(*command: str) -> str:
+        line = [sys.executable, "-m", *command]
+        return subprocess.run(line, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False).stdout
+
+    assert "1 passed" in run("pytest", "--quiet", "test_battery_alarm.py")
+    (tmp_path / "robot.json").write_text(config)
+    assert "announcer, battery_alarm" in run("pebble.cli", "check", "robot.json")
+    points = tomllib.loads(metadata)["project"]["entry-points"]["pebble.extensions"]
+    (tmp_path / "pebble_alarm-1.dist-info").mkdir()
+    lines = [f"{name} = {place}" for name, place in points.items()]
+    (tmp_path / "pebble_alarm-1.dist-info" / "entry_points.txt").write_text("\n".join(["[pebble.extensions]", *lines]))
+    named = {"extensions": {"alarm": {}}, "services": {"alarm": {"enabled": True, "volts": 5}}}
+    (tmp_path / "robot.json").write_text(json.dumps(json.loads(config) | named))
+    assert "below 5 V" in run("pebble.cli", "check", "robot.json")
+    assert "its battery is empty before it warns" in run("pebble.cli", "doctor", "robot.json")
+    assert run("pebble.cli", "alarm") == "warns of a low battery\n"
 
 
 #: A command line in a block of code.

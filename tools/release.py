@@ -33,8 +33,6 @@ PACKAGE = (
     ("configs/slot/pebble-slot", "usr/lib/pebble/pebble-slot", 0o755),
     ("configs/systemd/pebble.service", f"{UNITS}/pebble.service", 0o644),
     ("configs/debian/slot.conf", f"{UNITS}/pebble.service.d/slot.conf", 0o644),
-    ("configs/systemd/pebble-gstreamer.service", f"{UNITS}/pebble-gstreamer.service", 0o644),
-    ("configs/debian/gstreamer-slot.conf", f"{UNITS}/pebble-gstreamer.service.d/slot.conf", 0o644),
     ("configs/debian/pebble-slot.service", f"{UNITS}/pebble-slot.service", 0o644),
     ("configs/debian/sysusers.conf", "usr/lib/sysusers.d/pebble.conf", 0o644),
     ("configs/debian/tmpfiles.conf", "usr/lib/tmpfiles.d/pebble.conf", 0o644),

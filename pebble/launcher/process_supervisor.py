@@ -123,7 +123,7 @@ class ProcessSupervisor:
         if self._is_stopping():
             self.stop()
             return
-        self.policy.started(self._reactor.now())
+        self.policy.started(self._reactor.now(), plain=self.program.plain)
         try:
             self._child = child = self._spawn(self.program)
         except OSError as error:
@@ -132,7 +132,8 @@ class ProcessSupervisor:
         self.state = ProgramState.RUNNING
         self._pipes = Pipes(child, self._reactor, partial(self._printed, child.pid), self._noted)
         self._watch_exit(child)
-        self._check_at(self.policy.stuck_at)
+        if not self.program.plain:
+            self._check_at(self.policy.stuck_at)
         self._on_change()
 
     def stop(self) -> None:

@@ -42,13 +42,16 @@ class RestartPolicy:
         """Seconds to wait before an on-demand program that was released is started on a new request."""
         return max(0.0, self._started + START_INTERVAL_S - now)
 
-    def started(self, now: float) -> None:
+    def started(self, now: float, *, plain: bool = False) -> None:
+        """Record a start; a ``plain`` program is ready at once, and not watched until it gives a sign of life."""
         if self.state == "stopped":  # it ended because it was asked to: no restart
             self.state = "init"
         elif self.last_exit is not None:
             self.restarts += 1
         self._started = now
-        self.stuck_at = now + START_LIMIT_S
+        if plain:
+            self.ready(now)
+        self.stuck_at = float("inf") if plain else now + START_LIMIT_S
 
     def ready(self, now: float) -> None:
         self.state = "ready"

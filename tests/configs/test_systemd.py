@@ -16,7 +16,7 @@ from tests.kit import npm
 from tests.support import ROOT
 
 UNITS = ROOT / "configs" / "systemd"
-NAMES = ("pebble", "pebble-update", "pebble-web", "pebble-record", "pebble-hub", "pebble-gateway", "pebble-gstreamer")
+NAMES = ("pebble", "pebble-update", "pebble-web", "pebble-record", "pebble-hub", "pebble-gateway")
 ROBOT, UPDATE, *OTHERS = (UNITS / f"{name}.service" for name in NAMES)
 MOST_EXPOSED = 20  # tenths, of systemd-analyze
 #: What every unit says, whatever systemd-analyze makes of the rest.

@@ -162,7 +162,7 @@ def test_a_package_runs_code_where_a_config_names_it(tmp_path: Path) -> None:
     ("source", "reason"),
     [
         (None, "there is no file "),
-        ("1 / 0", "ZeroDivisionError: division by zero"),
+        ("1 / 0  # EXTENSION", "ZeroDivisionError: division by zero"),
         ("EXTENSION = 1", "its EXTENSION is no pebble.extension.Extension"),
         (LAMP % {"name": "absent", "drives": False}, "ModuleNotFoundError: No module named 'absent'"),
     ],

@@ -14,7 +14,7 @@ from tests.ext.install.life.robots import CONFIG, Robot
 from tests.kit.machine import Machine
 from tests.support import until
 
-UNITS = ("pebble.service", "pebble-slot.service", "pebble-gstreamer.service")
+UNITS = ("pebble.service", "pebble-slot.service")
 
 
 def test_twice_built_is_equal_byte_for_byte(packages: Packages, tmp_path: Path) -> None:
@@ -38,16 +38,16 @@ def test_units_are_clean_and_confined(machine: Machine) -> None:
 
 
 @pytest.mark.skipif(shutil.which("gst-launch-1.0") is None, reason="GStreamer is not installed")
-def test_the_sockets_of_gstreamer_are_there_with_the_robot_once_their_unit_is_enabled(machine: Machine) -> None:
-    robot, path, unit = Robot(machine), "/run/pebble/video.sock", "pebble-gstreamer.service"
+def test_the_sockets_of_gstreamer_are_there_with_the_robot_that_names_the_example(machine: Machine) -> None:
+    robot, path = Robot(machine), "/run/pebble/video.sock"
+    example = "/run/pebble-slot/current/share/pebble/examples/gstreamer_sockets.py"
     devices = CONFIG["services"]["av_daemon"]
     sockets = {**devices, "video": {**devices["video"], "socket_path": path}}
-    robot.configure({**CONFIG, "services": {**CONFIG["services"], "av_daemon": sockets}})
+    services = {**CONFIG["services"], "av_daemon": sockets}
+    robot.configure({**CONFIG, "services": services, "extensions": {example: {}}})
     robot.plug_in()
-    assert machine.run("systemctl", "is-enabled", unit, check=False) == "disabled\n"
-    machine.run("systemctl", "enable", unit)
     robot.start()
-    assert until(lambda: machine.succeeds("test", "-S", path), 60, step=1), machine.journal(unit)
+    assert until(lambda: machine.succeeds("test", "-S", path), 60, step=1), machine.journal("pebble.service")
 
 
 def test_a_newer_package_is_built_beside_and_the_older_one_is_one_command_away(
