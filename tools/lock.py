@@ -19,7 +19,7 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parent.parent
 LOCK = ROOT / "requirements.txt"
 #: The extras of each kind of installation. What builds the wheel is in all of them but the tools.
-KINDS: dict[str, tuple[str, ...]] = {"robot": ("media", "record", "web"), "demo": ("demo",), "dev": ("dev",)}
+KINDS: dict[str, tuple[str, ...]] = {"robot": ("all",), "demo": ("demo",), "dev": ("dev",)}
 TOOLS = "tools"  # a dependency group: uv itself, and what audits and lists packages
 EVERYTHING = ("--all-extras", "--group", TOOLS)
 HEADER = "# Written by make lock from pyproject.toml. What is installed of it: tools/locked.sh\n"

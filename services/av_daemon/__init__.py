@@ -5,7 +5,7 @@ from pebble.extension import Extension, Program, Stage
 EXTENSION = Extension(
     name="av_daemon",
     needs=("media",),
-    extra="av",
+    extra="media",
     sections={"services.av_daemon": "pebble.services.av_daemon.config:AvDaemon"},
     rules="pebble.services.av_daemon.config:RULES",
     program=Program(

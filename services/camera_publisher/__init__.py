@@ -5,6 +5,8 @@ from pebble.extension import Extension
 EXTENSION = Extension(
     name="camera_publisher",
     needs=("av_daemon",),
+    extra="media",
+    packages=("cv2",),
     programs="pebble.services.av_daemon.offers:camera_programs",
     page="docs/ext/media.md",
 )

@@ -74,7 +74,7 @@ def test_legs_of_an_owner_are_driven_stopped_and_reset(kind: str, tmp_path: Path
                 "services": {
                     "mqtt_bridge": {"enabled": True, "remote_mqtt": {"host": "127.0.0.1", "port": broker.port}}
                 },
-                "extensions": {"legs.py": {"drives": True}},
+                "extensions": {"legs.py": {"drives": True}, "absent": {}},
             }
         )
     )
@@ -99,6 +99,8 @@ def test_legs_of_an_owner_are_driven_stopped_and_reset(kind: str, tmp_path: Path
     process = Child(command, cwd=tmp_path, env=environment, stderr=subprocess.DEVNULL)
     try:
         assert until(lambda: state("status").get("value", {}).get("driveable", {}).get("state") == "yes", 20), states
+        absent = state("status")["value"]["services"]["absent"]
+        assert (absent["state"], absent["last_exit"]) == ("failed", "not installed")
         offer = state("capabilities")["value"]
         assert (offer["drive"]["available"], offer["estop"]["owners"]) == (True, ["legs"])
         assert moved()

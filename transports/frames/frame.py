@@ -1,5 +1,6 @@
 """One frame: its bytes, the metadata beside them, and the picture decoded from them."""
 
+from importlib import import_module
 from typing import Any
 
 import msgspec
@@ -93,8 +94,7 @@ def picture(data: Bytes, info: FrameInfo, width: int | None = None) -> Bytes:
 def _raw(data: Bytes, info: FrameInfo) -> Bytes:
     if info.format == "bgr24":
         return _rows(data, info, info.height, 3 * info.width).reshape(info.height, info.width, 3)
-    import cv2  # tens of MB, only for readers of cameras with such formats
-
+    cv2 = _opencv(f"a frame of format {info.format}")
     if info.width % 2 or info.height % 2:
         raise PayloadError(f"{info.format} of {info.width}x{info.height}: sides must be even")
     if info.format == "nv12":
@@ -103,6 +103,14 @@ def _raw(data: Bytes, info: FrameInfo) -> Bytes:
     rows = _rows(data, info, info.height, 2 * info.width)
     pixels = np.ascontiguousarray(rows).reshape(info.height, info.width, 2)
     return np.asarray(cv2.cvtColor(pixels, cv2.COLOR_YUV2BGR_YUYV))
+
+
+def _opencv(what: str) -> Any:
+    """Return the module cv2: tens of MB, only for readers that need it. Raises PayloadError where it is missing."""
+    try:
+        return import_module("cv2")
+    except ModuleNotFoundError:
+        raise PayloadError(f'{what} needs OpenCV: pip install "pebble-robot[media]"') from None
 
 
 def _rows(data: Bytes, info: FrameInfo, rows: int, row_bytes: int) -> Bytes:
@@ -119,8 +127,7 @@ def _rows(data: Bytes, info: FrameInfo, rows: int, row_bytes: int) -> Bytes:
 
 def _jpeg(data: Bytes, info: FrameInfo, width: int | None) -> Bytes:
     """Decode at 1/2, 1/4 or 1/8 size if that is enough for ``width``: a fraction of the work."""
-    import cv2
-
+    cv2 = _opencv(f"a frame of format {info.format}")
     scale = _scale(info.width, width)
     flags = {1: cv2.IMREAD_COLOR, 2: cv2.IMREAD_REDUCED_COLOR_2, 4: cv2.IMREAD_REDUCED_COLOR_4}
     try:
@@ -139,8 +146,7 @@ def _scale(has: int, wanted: int | None) -> int:
 
 
 def _resized(found: Bytes, width: int) -> Bytes:
-    import cv2
-
+    cv2 = _opencv("a picture of another size")
     height = max(1, round(found.shape[0] * width / found.shape[1]))
     how = cv2.INTER_AREA if width < found.shape[1] else cv2.INTER_LINEAR
     return np.asarray(cv2.resize(found, (width, height), interpolation=how))

@@ -2,4 +2,4 @@
 
 from pebble.extension import Extension
 
-EXTENSION = Extension(name="media", extra="av", page="docs/ext/media.md")
+EXTENSION = Extension(name="media", extra="media", page="docs/ext/media.md")

@@ -5,6 +5,7 @@ from pebble.extension import Command, Extension
 EXTENSION = Extension(
     name="scripts",
     needs=("operator",),
+    extra="scripts",
     commands={
         "script": Command(
             "pebble.extensions.scripts.commands.group", "write, start and stop programs that move a robot", "write", 10
