@@ -8,6 +8,7 @@ docs/my-first-extension.md shows one.
 from __future__ import annotations
 
 import logging
+import os
 import sys
 from collections.abc import Iterable, Iterator, Mapping
 from enum import IntEnum
@@ -114,10 +115,10 @@ class Extension(Struct, frozen=True, kw_only=True, eq=False):
     packages: tuple[str, ...] = ()  # modules of other packages that its programs cannot do without
     needs: tuple[str, ...] = ()  # extensions without which it counts as not installed
     sections: dict[str, str] = {}  # by the key of the config, "services.lamp" or "lamp": its Section
-    rules: str = ""  # a function: pairs of a Section and check(reader, section, path)
+    rules: str = ""  # pairs of a Section and check(reader, section, path), which returns the section
     program: Program | None = None  # runs while the section is enabled, or always where there is none
     programs: str = ""  # a function of the config: its other Programs
-    offers: str = ""  # a function of config, addresses and CapabilitiesValue, which it returns completed
+    offers: str = ""  # a function of config and CapabilitiesValue, which it returns completed
     facts: str = ""  # a function of the config: Facts
     checks: str = ""  # a function of the config, for `pebble doctor`: CheckResults
     commands: dict[str, Command] = {}  # by their words: "lamp", "fleet hub"
@@ -176,8 +177,7 @@ def named(entries: Mapping[str, bool], folder: Path) -> tuple[tuple[Extension, .
     for name, drives in entries.items():
         try:
             extension = _of_file(folder / name) if name.endswith(".py") else _of_package(name)
-            for place in (*extension.sections.values(), extension.rules, extension.programs):
-                part(place) if place else None
+            _check_parts(extension)
         except Exception as error:  # noqa: BLE001 - whatever a stranger's module raises when it is imported
             reason = str(error) if isinstance(error, PebbleError) else f"{type(error).__name__}: {error}"
             missing.append(Missing(name, f"extensions.{name}", reason, drives))
@@ -187,6 +187,14 @@ def named(entries: Mapping[str, bool], folder: Path) -> tuple[tuple[Extension, .
         SERIAL_PROTOCOLS.update(extension.protocols)
         found.append(extension)
     return tuple(found), tuple(missing)
+
+
+def _check_parts(extension: Extension) -> None:
+    lacks = {*extension.needs} - {other.name for other in ours()}
+    if lacks:
+        raise PebbleError(f"it needs {' and '.join(sorted(lacks))}")
+    for place in filter(None, (*extension.sections.values(), extension.rules, extension.programs)):
+        part(place)
 
 
 def lacking(raw: Any) -> Iterator[Missing]:
@@ -221,10 +229,13 @@ def lacking_packages(extension: Extension) -> list[str]:
     return [name for name in extension.packages if find_spec(name) is None]
 
 
-def refuse_claims(extensions: Iterable[Extension]) -> None:
-    """Raise ConfigError where two extensions add the same section, command, protocol or name; it names both."""
+def refuse_claims(core: Extension, extensions: Iterable[Extension]) -> None:
+    """Raise ConfigError where two add the same section, command, protocol or name; it names both.
+
+    ``core``: what the core has of these.
+    """
     owners: dict[tuple[str, str], Extension] = {}
-    for extension in extensions:
+    for extension in (core, *extensions):
         claims: dict[str, Iterable[str]] = {
             "section": extension.sections,
             "command": extension.commands,
@@ -305,6 +316,8 @@ def _of_file(path: Path) -> Extension:
     """
     if not path.is_file():
         raise PebbleError(f"there is no file {path}")
+    if hasattr(os, "getuid") and os.getuid() == 0 != path.stat().st_uid:
+        raise PebbleError(f"{path} belongs to {path.owner()}, and root runs no code of other users: chown root it")
     name = path.stem
     if str(path.parent) not in sys.path:
         sys.path.append(str(path.parent))  # its process runs it by name; last, so that it hides nothing

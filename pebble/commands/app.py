@@ -12,7 +12,7 @@ import typer
 from typer.core import TyperCommand, TyperGroup
 
 from pebble.extension import Command as Offered
-from pebble.extension import ours, packages, part, refuse_claims
+from pebble.extension import Extension, ours, packages, part, refuse_claims
 from pebble.version import __version__
 
 if TYPE_CHECKING:
@@ -36,7 +36,7 @@ def commands(words: Sequence[str] = ()) -> dict[str, Offered]:
     offered = {**_CORE, **{name: row for one in ours() for name, row in one.commands.items()}}
     if not words or words[0] not in offered:
         foreign = list(packages())
-        refuse_claims([*ours(), *foreign])
+        refuse_claims(Extension(name="core", package="Pebble", commands=_CORE), [*ours(), *foreign])
         offered |= {name: row for one in foreign for name, row in one.commands.items()}
     return dict(sorted(offered.items(), key=lambda item: (_GROUPS.index(item[1].group), item[1].rank)))
 

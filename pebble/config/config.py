@@ -20,7 +20,7 @@ from pebble.config.raw import Pairs, decode, plain, read_text, with_instances, w
 from pebble.config.reader import Reader, Rule
 from pebble.config.rules.between_keys import CHECKS
 from pebble.config.rules.exposure import warn_if_readable
-from pebble.config.tree import Root, SerialBridge, tree_of
+from pebble.config.tree import Root, SerialBridge, Services, tree_of
 from pebble.config.types import Section, Topic
 from pebble.contract import DRIVE
 from pebble.contract.identity import Identity
@@ -201,7 +201,9 @@ def _extensions(own: Any, folder: Path) -> tuple[tuple[Extension, ...], tuple[Mi
     drives = {name: isinstance(entry, dict) and entry.get("drives") is True for name, entry in entries.items()}
     found, missing = extension.named(drives, folder)
     installed = (*extension.ours(), *found)
-    extension.refuse_claims(installed)
+    sections = [f"services.{name}" for name in Services.__struct_fields__]
+    core = Extension(name="core", package="Pebble", sections=dict.fromkeys([*sections, *Root.__struct_fields__], ""))
+    extension.refuse_claims(core, installed)
     return installed, (*missing, *extension.lacking(own))
 
 

@@ -195,6 +195,21 @@ def test_two_that_want_the_same_are_refused_with_both_names(tmp_path: Path) -> N
     assert (done.returncode, text in done.stderr) == (1, True)
 
 
+def test_what_is_of_the_core_is_no_extensions(tmp_path: Path) -> None:
+    (tmp_path / "lamp.py").write_text((LAMP % {"name": "lamp", "drives": False}).replace(".lamp", ".mqtt_bridge"))
+    done = pebble("check", str(write(tmp_path, {"lamp.py": {}})))
+    text = 'section "services.mqtt_bridge" is added by two, Pebble (core) and lamp.py (lamp): remove one of them'
+    assert (done.returncode, text in done.stderr) == (1, True)
+
+
+@pytest.mark.skipif(os.getuid() != 0, reason="not root")
+def test_root_runs_no_code_of_other_users(tmp_path: Path) -> None:
+    lamp_file(tmp_path, "lamp")
+    os.chown(tmp_path / "lamp.py", 65534, 65534)
+    done = pebble("check", str(write(tmp_path, {"lamp.py": {}})))
+    assert (done.returncode, "root runs no code of other users" in done.stderr) == (1, True)
+
+
 WITHOUT = """
 import sys
 from pathlib import Path

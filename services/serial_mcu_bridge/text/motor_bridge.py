@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from functools import cached_property
 from typing import Any, ClassVar, Protocol
 
 from pebble import contract as c
@@ -62,7 +63,7 @@ class MotorBridge(MotorOwner, SerialService):
         self._hall = self._make_hall_memory()
         self._splitter = LineSplitter()
 
-    @property
+    @cached_property
     def owner(self) -> str:
         return self.config.motor_owner(self.instance)
 
