@@ -84,7 +84,12 @@ class Config(Root, frozen=True, kw_only=True):
         """The enabled serial lines, one process each, by instance name; the service's own entry is ``""``."""
         own = self.services.serial_mcu_bridge
         lines: dict[str, SerialBridge] = {"": own, **own.instances}
-        return {name: line for name, line in lines.items() if line.enabled and line.serial.port is not None}
+        left_out = {key for one in extension.ours() if one not in self.installed for key in one.protocols}
+        return {
+            name: line
+            for name, line in lines.items()
+            if line.enabled and line.serial.port is not None and line.protocol not in left_out
+        }
 
     def hall_memory(self, line: SerialBridge) -> str | None:
         """The name of the shared memory that gets this line's hall samples; None: there is none."""
@@ -160,7 +165,9 @@ def _config(
 ) -> Config:
     notes = Notes()
     own = plain(raw, notes)
-    installed, missing = ((), ()) if core_only else _extensions(own, folder)
+    found, missing = _extensions(own, folder)
+    installed = () if core_only else found
+    missing = () if core_only else missing
     for one in missing:
         note = notes.warning if lenient and not one.drives else notes.problem
         note(tuple(one.key.split(".", 1)), one.reason)
@@ -168,7 +175,7 @@ def _config(
     reader = Reader(folder, env, rules)
     reader.notes = notes
     merged = with_instances(own)
-    unread = extension.keys_of_missing(installed)
+    unread = [*extension.keys_of_missing(installed), *(key for one in found if core_only for key in one.sections)]
     root = reader.section(tree, without(merged, unread))
     notes.forget_inherited(own, merged)
     if path is not None and holds_secret(own):

@@ -14,6 +14,7 @@ import pytest
 from pebble.config import load, parse
 from pebble.config.types import Section
 from pebble.extension import OURS, Extension, lacking_packages, ours, part, programs_of
+from pebble.launcher.programs import programs
 from tests.support import ROOT
 
 PLACES = dict(zip([extension.name for extension in ours()], OURS, strict=True))
@@ -64,6 +65,13 @@ class TestOurs:
         config = parse(raw, folder=tmp_path, env={})
         names = [program.name for program in programs_of([extension], config)]
         assert names == ([extension.program.name] if extension.program else [])
+
+
+def test_to_declare_costs_a_robot_nothing() -> None:
+    code = "import sys; from pebble.extension import OURS, ours; known = {*sys.modules}; ours();"
+    code += "print(*{*sys.modules} - known - {*OURS} - {'pebble.extensions', 'pebble.services'})"
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
+    assert done.stdout == "pebble.services.serial_mcu_bridge\n", "declarations import none of their parts"
 
 
 LAMP = '''
@@ -179,6 +187,12 @@ def test_a_broken_one_is_an_error_and_keeps_a_robot_from_starting_only_if_it_dri
     code = f"from pebble.config import load; print(load({str(path)!r}, lenient=True).warnings)"
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=False)
     assert (done.returncode == 0, reason in done.stdout) == (not drives, not drives)
+
+
+def test_the_core_alone_reads_a_config_with_sections_of_extensions() -> None:
+    config = load(ROOT / "configs" / "goob.json", core_only=True)
+    names = [program.name for program in programs(config)]
+    assert names == ["zenoh_hub", "announcer", "serial_mcu_bridge", "mqtt_bridge"]
 
 
 def test_what_owns_motors_is_listed_as_such(tmp_path: Path) -> None:
