@@ -52,6 +52,7 @@ class Incoming:
         self.silence_s = settings.silence_s
         self.as_published = as_published
         self.accepted: Accepted | None = None  # what the broker said when it accepted us
+        self._accepted_at = 0.0
         self.where, self._settings = where, settings
         self._refusal: Refused | None = None
         self.reason = ""  # that of its DISCONNECT
@@ -117,6 +118,11 @@ class Incoming:
             waiting.empty(age.received_at)
 
     @property
+    def answered_s(self) -> float | None:
+        """For how long the broker has answered since it accepted us; None: it has not accepted us."""
+        return None if self.accepted is None else self.answered_at - self._accepted_at
+
+    @property
     def lost(self) -> Lost:
         """Why the other side has closed the connection."""
         why, id_ = self.reason or f"{self.where} closed the connection", self._settings.client_id
@@ -142,7 +148,7 @@ class Incoming:
     def on_accepted(self, accepted: Accepted) -> None:
         self._note_connack()
         self.pings.begin(self.answered_at)
-        self.accepted = accepted
+        self.accepted, self._accepted_at = accepted, self.answered_at
 
     def on_refused(self, code: int) -> None:
         self._note_connack()
