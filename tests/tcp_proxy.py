@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import os
 import select
 import socket
 import struct
 import threading
 import time
 from contextlib import suppress
+from pathlib import Path
 from types import TracebackType
 from typing import Self
 
@@ -208,6 +210,30 @@ class ForbiddingProxy(TcpProxy):
             return True  # a SUBSCRIBE
         self.hung_up += 1
         return False
+
+
+class Hole(TcpProxy):
+    """A way that loses what is larger than a packet, unless the client's segments are small."""
+
+    judges_answers, limit = True, 1400
+
+    def passes(self, data: bytes) -> bool:
+        if len(data) < self.limit or self.segments() < 1300:
+            return True
+        time.sleep(0.6)
+        return False
+
+    def segments(self) -> int:
+        """The largest segment of this process's connections to it."""
+        sizes = [0]
+        for link in list(Path("/proc/self/fd").iterdir()):
+            with suppress(OSError, IndexError):
+                if not str(link.readlink()).startswith("socket:"):
+                    continue
+                with socket.socket(fileno=os.dup(int(link.name))) as copy:
+                    if copy.getpeername()[1] == self.port:
+                        sizes.append(copy.getsockopt(socket.IPPROTO_TCP, socket.TCP_MAXSEG))
+        return max(sizes)
 
 
 def _packets(data: bytes) -> list[int]:

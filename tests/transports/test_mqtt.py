@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import logging
-import os
 import re
 import socket
 import subprocess
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from functools import partial
 from itertools import product
 from pathlib import Path
@@ -31,7 +30,7 @@ from pebble.transports.mqtt.packets import MAX_PACKET, Reader
 from pebble.transports.topics import MAX_BYTES
 from tests.kit.mqtt_bytes import connect, publish
 from tests.support import ROOT, AmqttBroker, Broker, RefusingBroker, cases, free_port, some, until
-from tests.tcp_proxy import BridgelessProxy, ForbiddingProxy, TcpProxy
+from tests.tcp_proxy import BridgelessProxy, ForbiddingProxy, Hole, TcpProxy
 from tests.transports.received import Received
 
 DELIVERED = QoS.DELIVERED
@@ -1167,30 +1166,6 @@ def test_tls_mistakes_are_one_clear_error(clients: Clients, wrong: dict[str, Any
         client.open(1)
     assert client.state is State.CLOSED
     client.close()
-
-
-class Hole(TcpProxy):
-    """A way that loses what is larger than a packet, unless the client's segments are small."""
-
-    judges_answers, limit = True, 1400
-
-    def passes(self, data: bytes) -> bool:
-        if len(data) < self.limit or self.segments() < 1300:
-            return True
-        time.sleep(0.6)
-        return False
-
-    def segments(self) -> int:
-        """The largest segment of this process's connections to it."""
-        sizes = [0]
-        for link in list(Path("/proc/self/fd").iterdir()):
-            with suppress(OSError, IndexError):
-                if not str(link.readlink()).startswith("socket:"):
-                    continue
-                with socket.socket(fileno=os.dup(int(link.name))) as copy:
-                    if copy.getpeername()[1] == self.port:
-                        sizes.append(copy.getsockopt(socket.IPPROTO_TCP, socket.TCP_MAXSEG))
-        return max(sizes)
 
 
 #: Who sends what is large, whether it is retained, whether by TLS, and the bytes of a packet that gets through.
