@@ -61,6 +61,7 @@ class Incoming:
         self.messages: list[Message] = []  # read, and not delivered yet
         self.answers: dict[str, bool] = {}  # filters answered since that was last looked at: refused?
         self.more = False  # a batch ended before the socket was empty
+        self._left = 0  # bytes of whole packets that were received, and are not read yet
         self.age = ReadAge(self.answered_at)
         self.pings = Pings(settings, in_flight, self.age)
         self._packets = 0  # received so far
@@ -101,10 +102,10 @@ class Incoming:
 
         `more` tells whether there may be others. Raises Lost.
         """
-        unread = client.unread or self._receive(client, now)
+        unread = self._left or self._receive(client, now)
         self.age.update(now, client.socket)
         try:
-            left = client.read(most)
+            self._left = left = client.read(most)
         except MalformedError as error:
             raise Lost(f"{self.where} does not speak MQTT: {error}") from None
         if self._refusal is not None:

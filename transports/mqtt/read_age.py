@@ -121,7 +121,9 @@ class BrokerDelay:
 
         The longest counts, less what the way itself takes.
         """
-        since, sent_at = self._oldest_unanswered(now)
+        since = sent_at = now
+        if self._asked:  # the oldest that says something
+            since, sent_at = next(((since, sent_at) for since, sent_at, clear in self._asked if clear), (now, now))
         if self._came_at <= sent_at and now - sent_at > self._shortest + _NOTICED_S:  # nothing came: it stood still
             self._stall, self._until = now - sent_at, now + _BACKLOG_S
         self._came_at = now
@@ -129,13 +131,6 @@ class BrokerDelay:
         if waited <= self._shortest + _NOTICED_S:
             return 0.0
         return waited - max(self._shortest, min(round_trip_s(), self._shortest + _UPLINK_S))
-
-    def _oldest_unanswered(self, now: float) -> tuple[float, float]:
-        """Since when what comes before the answer to the oldest ping that counts may have waited, and when it was sent.
-
-        Both are ``now`` if there is none.
-        """
-        return next(((since, sent_at) for since, sent_at, clear in self._asked if clear), (now, now))
 
 
 class ReadAge:
