@@ -127,11 +127,13 @@ class Dialler:
         return not self._asks_for_bridge_mode or self._bridge_mode.next_attempt is Attempt.BRIDGE
 
     def _note_result(self, result: Result) -> None:
+        """Note how a CONNECT has ended: what the broker lacks matters once it is known whether it has bridge mode."""
         self._bridge_mode.note(result)
         if self._will is not None and (self._is_last_attempt or result is not Result.HUNG_UP):
             self.limits.note_connect(result, time.monotonic())
 
     def _note_probe(self, result: Result) -> None:
+        """Note how a CONNECT without bridge mode and will has ended: it tells something to whichever asked for it."""
         if self._bridge_mode.next_attempt is Attempt.PROBE:
             self._bridge_mode.note(result)
         if self._will is not None:  # without one nothing was left out
@@ -154,14 +156,20 @@ class Dialler:
         answered_s = attempt.incoming.answered_s
         return attempt.lost_bytes > _LARGE or (answered_s is not None and answered_s < _SOON_S)
 
-    def is_gone(self, lost: Lost, *, connected: bool, was_ended: bool) -> bool:
-        """Whether the other end is gone: nothing listens, or it hangs up as one that is just ending does."""
-        now, silent = time.monotonic(), isinstance(lost, Silent)  # then it may be we who stood still
+    def note_end(self, lost: Lost) -> bool:
+        """Note how a connection, or an attempt at one, has ended; return True if segments are small from now on."""
+        silent, late = isinstance(lost, Silent), isinstance(lost, TlsLate)
         self.stalled |= silent
-        if isinstance(lost, TlsLate):
+        if late:
             self.addresses.was_slow()
-        if not self.loses_large and (silent or isinstance(lost, TlsLate)):
-            self._large_lost = self._large_lost + 1 if self._may_have_lost_large(lost) else 0
+        if self.loses_large or not (silent or late):
+            return False
+        self._large_lost = self._large_lost + 1 if self._may_have_lost_large(lost) else 0
+        return self.loses_large
+
+    def is_gone(self, lost: Lost, *, connected: bool, was_ended: bool) -> bool:
+        """Return whether the other end is gone: nothing listens, or it hangs up as one that is just ending does."""
+        now, silent = time.monotonic(), isinstance(lost, Silent)  # then it may be we who stood still
         if connected:
             self._gone_at = now
             return not silent

@@ -199,9 +199,8 @@ class MqttTransport(Transport):
                 self._run_connection(run)
             except Lost as lost:
                 connected = self._state is State.CONNECTED
-                before = self._dialler.loses_large
                 self.was_ended = self._dialler.is_gone(lost, connected=connected, was_ended=self.was_ended)
-                if self._dialler.loses_large and not before:
+                if self._dialler.note_end(lost):
                     text = "the way there seems to lose large packets (a wrong MTU?): from now on they are small"
                     log.warning("%s: %s: %s", self.client_id, self._dialler.where, text)
                 problem = str(lost)
