@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import os
 import select
 import socket
 import struct
 import threading
 import time
 from contextlib import suppress
+from pathlib import Path
 from types import TracebackType
 from typing import Self
 
@@ -41,6 +43,8 @@ class TcpProxy:
         self._listener: socket.socket | None = None
         self._thread: threading.Thread | None = None
         self.mend()
+
+    judges_answers = False  # `passes` is asked for what the target sends, too
 
     @property
     def in_use(self) -> bool:
@@ -208,6 +212,30 @@ class ForbiddingProxy(TcpProxy):
         return False
 
 
+class Hole(TcpProxy):
+    """A way that loses what is larger than a packet, unless the client's segments are small."""
+
+    judges_answers, limit = True, 1400
+
+    def passes(self, data: bytes) -> bool:
+        if len(data) < self.limit or self.segments() < 1300:
+            return True
+        time.sleep(0.6)
+        return False
+
+    def segments(self) -> int:
+        """The largest segment of this process's connections to it."""
+        sizes = [0]
+        for link in list(Path("/proc/self/fd").iterdir()):
+            with suppress(OSError, IndexError):
+                if not str(link.readlink()).startswith("socket:"):
+                    continue
+                with socket.socket(fileno=os.dup(int(link.name))) as copy:
+                    if copy.getpeername()[1] == self.port:
+                        sizes.append(copy.getsockopt(socket.IPPROTO_TCP, socket.TCP_MAXSEG))
+        return max(sizes)
+
+
 def _packets(data: bytes) -> list[int]:
     """Where each packet in ``data`` begins, whole ones that are shorter than 16 KB."""
     found, at = [], 0
@@ -256,7 +284,8 @@ class _Pair:
                 if not self._proxy.wait_until_passing() or not select.select([source], [], [], _STEP_S)[0]:
                     continue
                 data = source.recv(self._proxy.piece)
-                if not data or (source is self._ends[0] and not self._proxy.passes(data)):
+                judged = source is self._ends[0] or self._proxy.judges_answers
+                if not data or (judged and not self._proxy.passes(data)):
                     break
                 time.sleep(self._proxy.delay_s)
                 self._send(sink, data)

@@ -65,7 +65,7 @@ def decode(channel: Channel, raw: bytes, remark: Remark | None = None) -> Any:
     decoded = plain(channel, raw)
     if channel.payload is bool:
         return _boolean(channel, decoded)
-    if channel.direction == INCOMING:
+    if channel.kind.direction == INCOMING:
         decoded = _unwrap(channel, decoded, remark or _ignore)
     try:
         return msgspec.convert(decoded, channel.payload)
@@ -77,7 +77,7 @@ def decode(channel: Channel, raw: bytes, remark: Remark | None = None) -> Any:
 
 def plain(channel: Channel, raw: bytes) -> Any:
     """The JSON value in ``raw``, of any shape. Raises PayloadError if it is invalid or beyond the limits."""
-    if channel.direction == INCOMING and len(raw) > MAX_COMMAND_BYTES:
+    if channel.kind.direction == INCOMING and len(raw) > MAX_COMMAND_BYTES:
         raise PayloadError(f"{channel.metric}: {len(raw)} bytes, more than {MAX_COMMAND_BYTES}")
     text = trim(raw)
     try:

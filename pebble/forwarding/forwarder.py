@@ -219,7 +219,7 @@ class Forwarder:
     def _admit(
         self, here: SideState, subject: Subject | None, message: Message, topic: str, named: bool
     ) -> Forward | Drop:
-        """How to forward it, or why not. Hot: what nearly no message needs is asked for here, and done elsewhere.
+        """Return how to forward it, or why not: no subject, no route, or the first of `_ADMISSION` that holds. Hot.
 
         ``topic`` is the one on which it passes, and would be retained.
         """
@@ -230,36 +230,45 @@ class Forwarder:
             message = Message(message.topic, message.payload, message.qos)  # live: passes, and is retained nowhere
         if subject is None:
             return Drop.FOREIGN
-        side, mirroring = here.side, self.mirroring.on and self.mirroring.is_possible()
+        forward = self._route(here.side, subject, message)
+        if isinstance(forward, Drop):
+            return forward
+        for reason in self._ADMISSION:
+            if (drop := reason(self, here, subject, message, forward, topic, named)) is not None:
+                return drop
+        return forward
+
+    def _route(self, side: Side, subject: Subject, message: Message) -> Forward | Drop:
+        """Return what :func:`route` does, which is asked once for each kind of message."""
+        mirroring = self.mirroring.on and self.mirroring.is_possible()
         key = side, subject, message.qos, message.retain, message.retain_requested, mirroring
         forward = self._routes.get(key)
         if forward is None:
             forward = self._routes[key] = route(self._rules, side, subject, message, mirroring=mirroring)
-        if isinstance(forward, Drop):
-            return forward
-        refused = self._admission.refuse(side, subject, message, topic, named=named)
-        if refused is not None:
-            if refused in _WARNED:
-                self._warn(refused, message.topic[:_LOGGED])
-            return refused
-        for check in self._ADMISSION:
-            if (drop := check(self, here, subject, message, forward)) is not None:
-                return drop
         return forward
 
-    def _echo(self, here: SideState, subject: Subject, message: Message, _forward: Forward) -> Drop | None:
+    def _beyond_bound(
+        self, here: SideState, subject: Subject, message: Message, _forward: Forward, topic: str, named: bool
+    ) -> Drop | None:
+        drop = self._admission.refuse(here.side, subject, message, topic, named=named)
+        if drop in _WARNED:
+            self._warn(drop, message.topic[:_LOGGED])
+        return drop
+
+    def _echo(self, here: SideState, subject: Subject, message: Message, *_: object) -> Drop | None:
         if not self.cycles.closed_ways and here.transport.exact_echo:
             return None
         return Drop.ECHO if self.publisher.is_echo(here, subject, message) else None
 
-    def _cycle(self, here: SideState, subject: Subject, message: Message, forward: Forward) -> Drop | None:
+    def _cycle(self, here: SideState, subject: Subject, message: Message, forward: Forward, *_: object) -> Drop | None:
         if self.sides.gate is not Gate.OPEN:
             return None
         finding = self.cycles.examine(here.side, subject, message)
         return None if finding is Finding.PASS else self._act_on(finding, here.side, subject, message, forward)
 
-    #: Why a message that a route and a bound admit does not pass, in this order: an echo is no cycle.
-    _ADMISSION = (_echo, _cycle)
+    #: Why a message that has a route does not pass, in this order: nothing beyond a bound is compared with what we have
+    #: sent or looked at for cycles, and an echo is no cycle.
+    _ADMISSION = (_beyond_bound, _echo, _cycle)
 
     def _pass(
         self, here: SideState, subject: Subject, message: Message, forward: Forward, account: str = ""

@@ -77,13 +77,15 @@ class Audit:
     def passed(self, channel: Channel, by: str | None, payload: bytes) -> None:
         """Note a command or a changed flag. ``by`` is the sender that the broker has checked, ROBOT, or None."""
         says = _COMMANDS.get(channel.suffix)
+        if says is None and channel.kind not in (Kind.FLAG, Kind.ACTION):
+            return
         with suppress(PayloadError):
             if says is not None:
                 command = codec.decode(channel, payload)
                 row, who = says(command), _sender(by, command)
                 if row and not self._is_repeated(row.get("stop", ""), who):
                     self.note(who=who, **_place(by), **row)
-            elif channel.kind in (Kind.FLAG, Kind.ACTION):
+            else:
                 on = bool(payload) and bool(codec.decode(channel, payload))
                 if on or channel.kind is Kind.FLAG:
                     name = channel.metric.removeprefix("flags/")

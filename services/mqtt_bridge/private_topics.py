@@ -36,7 +36,7 @@ class PrivateTopics:
             uid = topic.removeprefix(self._commands).partition("/")[0]
             if uid not in self._listed or topic.endswith(_QUESTION):
                 return True
-        return any(topic in topics for topics in list(self._private.values()))
+        return bool(self._private) and any(topic in topics for topics in list(self._private.values()))
 
     def admit(self, message: Message) -> list[Message]:
         """Return what may pass now: ``message`` or nothing; with a list, the retained values that waited for it."""

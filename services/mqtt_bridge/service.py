@@ -159,6 +159,8 @@ class MqttBridge(ForwardingService):
             self.timers.add(self.clock(), self._publish_heartbeat, period=interval)
         if self._uplink is not None:
             self.timers.add(self.clock(), self._follow_link, period=POLL_S)
+        if self._same_broker.announces:
+            self.timers.add(self.clock(), self._same_broker.report_arrival, period=_ARRIVAL_S)
         self._look_later()
 
     # -- the service's thread
@@ -304,10 +306,6 @@ class MqttBridge(ForwardingService):
         dropped = counters[f"{Side.REMOTE.value}: {Drop.LATE.value}"], self.transport.counters["dropped"]
         losses = gate, self.epoch, self._local_changes, counters[f"{Side.LOCAL.value}: refused"], *dropped
         self.publish(CONTROL_VOUCHED, self._vouching.check(passes, losses, self.clock()))
-
-    @every(_ARRIVAL_S)
-    def _report_arrival(self) -> None:
-        self._same_broker.report_arrival()
 
     @every(CHECK_S)
     def _check_owners(self) -> None:

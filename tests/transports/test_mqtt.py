@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import logging
-import os
 import re
 import socket
 import subprocess
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
+from functools import partial
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -30,7 +30,7 @@ from pebble.transports.mqtt.packets import MAX_PACKET, Reader
 from pebble.transports.topics import MAX_BYTES
 from tests.kit.mqtt_bytes import connect, publish
 from tests.support import ROOT, AmqttBroker, Broker, RefusingBroker, cases, free_port, some, until
-from tests.tcp_proxy import BridgelessProxy, ForbiddingProxy, TcpProxy
+from tests.tcp_proxy import BridgelessProxy, ForbiddingProxy, Hole, TcpProxy
 from tests.transports.received import Received
 
 DELIVERED = QoS.DELIVERED
@@ -1168,37 +1168,39 @@ def test_tls_mistakes_are_one_clear_error(clients: Clients, wrong: dict[str, Any
     client.close()
 
 
-class Hole(TcpProxy):
-    """A way that loses what is larger than a packet, unless the sender's segments are small."""
-
-    def passes(self, data: bytes) -> bool:
-        if len(data) < 1400 or self.segments() < 1300:
-            return True
-        time.sleep(0.6)
-        return False
-
-    def segments(self) -> int:
-        """The largest segment of this process's connections to it."""
-        sizes = [0]
-        for link in list(Path("/proc/self/fd").iterdir()):
-            with suppress(OSError, IndexError):
-                if not str(link.readlink()).startswith("socket:"):
-                    continue
-                with socket.socket(fileno=os.dup(int(link.name))) as copy:
-                    if copy.getpeername()[1] == self.port:
-                        sizes.append(copy.getsockopt(socket.IPPROTO_TCP, socket.TCP_MAXSEG))
-        return max(sizes)
+#: Who sends what is large, whether it is retained, whether by TLS, and the bytes of a packet that gets through.
+LARGE = {
+    "a state": ("robot", True, False, 1400),
+    "a picture": ("robot", False, False, 1400),
+    "a state, by TLS": ("robot", True, True, 1400),
+    "what the broker retains": ("operator", True, False, 1400),
+    "a certificate": ("robot", True, True, 600),
+}
 
 
-@pytest.mark.parametrize("what", ["state", "picture"])
+@pytest.mark.parametrize(("sender", "retain", "by_tls", "limit"), LARGE.values(), ids=LARGE)
 def test_where_large_packets_are_lost_segments_become_small(
-    broker: Broker, clients: Clients, topic: str, caplog: pytest.LogCaptureFixture, what: str
+    broker: Broker,
+    tls_broker: Broker,
+    clients: Clients,
+    topic: str,
+    caplog: pytest.LogCaptureFixture,
+    monkeypatch: pytest.MonkeyPatch,
+    sender: str,
+    retain: bool,
+    by_tls: bool,
+    limit: int,
 ) -> None:
-    with Hole(broker.port) as hole:
-        robot, late, received = clients(hole.port, "robot", silence_s=0.2), clients(broker.port), Received()
-        late.subscribe(topic, received)
-        if what == "state":
-            robot.publish(topic, bytes(3000), qos=DELIVERED, retain=True)
-        sends = (lambda: robot.publish(topic, bytes(3000))) if what == "picture" else (lambda: True)
-        assert until(lambda: sends() and bytes(3000) in received.payloads, 20)
+    for timeout in ("CONNECT_TIMEOUT_S", "HANDSHAKE_S"):
+        monkeypatch.setattr(f"pebble.transports.hosts.{timeout}", 0.4)
+    to, way = (tls_broker.port, {"host": "localhost", "tls": tls()}) if by_tls else (broker.port, {})
+    with Hole(to) as hole:
+        hole.limit, received = limit, Received()
+        robot = clients(hole.port, "robot", silence_s=0.2, opened=False, **way).open(0)
+        operator = clients(to, **way)
+        sends, hears = (robot, operator) if sender == "robot" else (operator, robot)
+        hears.subscribe(topic, received)
+        large = partial(sends.publish, topic, bytes(3000), qos=QoS(retain), retain=retain)
+        large()
+        assert until(lambda: (retain or large()) and bytes(3000) in received.payloads, 20)
         assert len([line for line in caplog.messages if "lose large packets" in line]) == 1

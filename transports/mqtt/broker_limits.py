@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from enum import Enum
 from typing import Final
 
 from pebble.transports.base import Message, QoS
@@ -52,6 +53,14 @@ _STEPS: Final = (EVERYTHING, Limits(qos=0), Limits(retain=False), Limits(retain=
 _LESS: Final = _STEPS[:-1]  # for messages
 
 
+class Asking(Enum):
+    """What the broker is asked at once, in another way than before."""
+
+    NOTHING = "the next CONNECT has its usual turn"
+    WITHOUT_WILL = "a CONNECT without a will"
+    AGAIN = "a CONNECT with a will, as the limits have it: it takes one without, or has said what it lacks"
+
+
 class BrokerLimits:
     """What the broker at one address is used with next, by how its CONNECTs ended.
 
@@ -62,39 +71,52 @@ class BrokerLimits:
 
     def __init__(self) -> None:
         self.limits = EVERYTHING  # of the next connection
-        self.wants_probe = False  # whether a CONNECT without a will is to be tried first
-        self._answers = False  # that was accepted, or the broker has said what it lacks: it is asked again at once
+        self._asking = Asking.NOTHING
         self._since = float("-inf")  # when the limits were last reduced
         self._losses = 0  # in a row
         self._is_decided = False  # such messages were confirmed, or less did not help: losses have another reason
 
     @property
+    def wants_probe(self) -> bool:
+        """Whether a CONNECT without a will is to be tried first."""
+        return self._asking is Asking.WITHOUT_WILL
+
+    @property
     def asks_again(self) -> bool:
         """Whether the same broker is to be asked once more, in another way."""
-        return self.wants_probe or self._answers
+        return self._asking is not Asking.NOTHING
 
     def begin(self, now: float) -> None:
         """A connection is about to be made."""
-        if not self._answers and now - self._since > _VALID_S:
+        if self._asking is not Asking.AGAIN and now - self._since > _VALID_S:
             self.limits = EVERYTHING
 
     def note_probe(self, result: Result) -> None:
         """A CONNECT without a will has ended."""
-        self.wants_probe, self._answers = False, result is Result.ACCEPTED
+        self._asking = Asking.AGAIN if result is Result.ACCEPTED else Asking.NOTHING
 
     def note_connect(self, result: Result, now: float) -> None:
-        """A CONNECT with a will, as `limits` have it, has ended."""
-        answered, self._answers = self._answers, False
+        """Note how a CONNECT with a will, as `limits` have it, has ended. The first line that fits counts.
+
+        | result                               | it was asked | then                                           |
+        |--------------------------------------|--------------|------------------------------------------------|
+        | retained messages or QoS 1 refused   | any          | again, without                                 |
+        | hung up                              | not again    | without a will                                 |
+        | hung up                              | again        | again with less, as long as there is less      |
+        | accepted                             | any          | so it is used                                  |
+        | any other                            | again        | with everything: the will was not the reason   |
+        """
+        again, self._asking = self._asking is Asking.AGAIN, Asking.NOTHING
         if result is Result.RETAIN_REFUSED and self.limits.retain:
             self._reduce(replace(self.limits, retain=False), now)
         elif result is Result.QOS_REFUSED and self.limits.qos:
             self._reduce(replace(self.limits, qos=0), now)
-        elif result is Result.HUNG_UP and not answered:
-            self.wants_probe = True
+        elif result is Result.HUNG_UP and not again:
+            self._asking = Asking.WITHOUT_WILL
         elif result is Result.HUNG_UP and self.limits in _STEPS[:-1]:
             self._reduce(_STEPS[_STEPS.index(self.limits) + 1], now)
-        elif answered and result is not Result.ACCEPTED:
-            self.limits = EVERYTHING  # the will was not the reason
+        elif again and result is not Result.ACCEPTED:
+            self.limits = EVERYTHING
 
     def note_loss(self, *, unconfirmed: bool, confirmed: bool, held: bool, now: float) -> bool:
         """Note that the broker has closed a connection; return True if that may be for what it lacks.
@@ -114,4 +136,4 @@ class BrokerLimits:
         return True
 
     def _reduce(self, limits: Limits, now: float) -> None:
-        self.limits, self._since, self._answers = limits, now, True
+        self.limits, self._since, self._asking = limits, now, Asking.AGAIN

@@ -187,11 +187,6 @@ class Client:
 
     # -- reading
 
-    @property
-    def unread(self) -> int:
-        """Bytes that were taken out of the socket, and not read yet."""
-        return self._reader.unread
-
     def receive(self) -> int:
         """Take what has come out of the socket, if all that came before is read; returns how many bytes.
 
@@ -215,7 +210,7 @@ class Client:
         return len(data)
 
     def read(self, most: int) -> int:
-        """Hand up to ``most`` packets to the listener; returns how many bytes are `unread`. Raises MalformedError."""
+        """Hand up to ``most`` packets to the listener; returns how many bytes are left. Raises MalformedError."""
         reader = self._reader
         reader.read(most)
         return reader.unread

@@ -30,7 +30,7 @@ from pebble.transports.mqtt.outgoing import (
     unconfirmed_bytes,
 )
 from pebble.transports.mqtt.packets import Filter
-from pebble.transports.mqtt.poll import SocketPoll
+from pebble.transports.mqtt.poll import NOTHING, SocketPoll
 
 T = TypeVar("T")
 FILTERS = 8  # in one packet: AWS IoT closes the connection for more
@@ -199,28 +199,32 @@ class Connection:
             self._in_flight.complete()
 
     def _wait(self, timeout: float) -> tuple[bool, float]:
-        """Whether there is something to read, and when that was known: what follows goes by that one time."""
-        poll, client, incoming = self._poll, self._client, self.incoming
-        if not poll.registered:
+        """Return whether there is something to read, and when that was known: what follows goes by that one time.
+
+        What is in the socket already has come at an unknown time, unless the socket was empty just before.
+        """
+        if not self._poll.registered:
             self._register()
-        if client.socket is None:
+        if self._client.socket is None:
             raise self.incoming.lost
-        blocked, waiting = bool(client.waiting), incoming.age.waiting
+        blocked, waiting = bool(self._client.waiting), self.incoming.age.waiting
         began = now = clock.since_boot()
         wait = min(timeout, self.pings.due_at - began)
-        readable = writable = woken = False
-        is_fresh = not incoming.more and began - waiting.checked_at <= _FRESH_S
+        ready = NOTHING
+        is_fresh = not self.incoming.more and began - waiting.checked_at <= _FRESH_S
         if not is_fresh:
-            readable, writable, woken = poll.wait(0.0, write=blocked)
+            ready = self._poll.wait(0.0, write=blocked)
             now = clock.since_boot()
-        if not (readable or writable or woken or incoming.more):
+        if ready == NOTHING and not self.incoming.more:
             if not is_fresh:
                 waiting.empty(began)
-            readable, writable, _ = poll.wait(max(wait, 0.0), write=blocked)
-            if (now := clock.since_boot()) - began <= wait + OVERSLEPT_S:
+            ready = self._poll.wait(max(wait, 0.0), write=blocked)
+            now = clock.since_boot()
+            if now - began <= wait + OVERSLEPT_S:
                 waiting.empty(now)  # until just now
+        readable, writable, _woken = ready
         if writable:
-            incoming.answered_at = now  # the other side's TCP accepted some: slow, but alive
+            self.incoming.answered_at = now  # the other side's TCP accepted some: slow, but alive
         return readable, now
 
     def _register(self) -> None:

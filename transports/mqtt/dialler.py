@@ -18,7 +18,8 @@ from pebble.transports.settings import MqttSettings
 
 _ENDING_S = 1.0  # so long a broker that ends may still accept connections, and hang up on them
 _LARGE = 1000  # bytes from which a message fills a packet, which some ways lose without a word
-_LARGE_LOST = 3  # such losses in a row, and connections have small segments
+_LARGE_LOST = 3  # connections in a row that seem to have lost large packets, and the next ones have small segments
+_SOON_S = 3.0  # what a broker retains, and what we do, is sent so soon
 _HESITATION_S = 0.5  # a CONNACK that takes longer comes over a very slow connection, or from a suspended broker
 
 
@@ -126,11 +127,13 @@ class Dialler:
         return not self._asks_for_bridge_mode or self._bridge_mode.next_attempt is Attempt.BRIDGE
 
     def _note_result(self, result: Result) -> None:
+        """Note how a CONNECT has ended: what the broker lacks matters once it is known whether it has bridge mode."""
         self._bridge_mode.note(result)
         if self._will is not None and (self._is_last_attempt or result is not Result.HUNG_UP):
             self.limits.note_connect(result, time.monotonic())
 
     def _note_probe(self, result: Result) -> None:
+        """Note how a CONNECT without bridge mode and will has ended: it tells something to whichever asked for it."""
         if self._bridge_mode.next_attempt is Attempt.PROBE:
             self._bridge_mode.note(result)
         if self._will is not None:  # without one nothing was left out
@@ -141,15 +144,32 @@ class Dialler:
         """True if the way to the broker seems to lose large packets: connections have small segments from then on."""
         return self._large_lost >= _LARGE_LOST and not self._settings.max_segment
 
-    def is_gone(self, lost: Lost, *, connected: bool, was_ended: bool) -> bool:
-        """Whether the other end is gone: nothing listens, or it hangs up as one that is just ending does."""
-        now, silent = time.monotonic(), isinstance(lost, Silent)  # then it may be we who stood still
+    def _may_have_lost_large(self, lost: Lost) -> bool:
+        """True if the connection ended as one does whose large packets are lost on the way, in whatever direction.
+
+        TLS that is late: a certificate is large. Silence after a large message of ours; or soon after the broker has
+        let us in, as what it retains may be large.
+        """
+        attempt = self.attempt
+        if attempt is None or not isinstance(lost, Silent):
+            return isinstance(lost, TlsLate)
+        answered_s = attempt.incoming.answered_s
+        return attempt.lost_bytes > _LARGE or (answered_s is not None and answered_s < _SOON_S)
+
+    def note_end(self, lost: Lost) -> bool:
+        """Note how a connection, or an attempt at one, has ended; return True if segments are small from now on."""
+        silent, late = isinstance(lost, Silent), isinstance(lost, TlsLate)
         self.stalled |= silent
-        if isinstance(lost, TlsLate):
+        if late:
             self.addresses.was_slow()
-        large = silent and self.attempt is not None and self.attempt.lost_bytes > _LARGE
-        if not self.loses_large and (silent or isinstance(lost, TlsLate)):  # a certificate is large, too
-            self._large_lost = self._large_lost + 1 if large or not silent else 0
+        if self.loses_large or not (silent or late):
+            return False
+        self._large_lost = self._large_lost + 1 if self._may_have_lost_large(lost) else 0
+        return self.loses_large
+
+    def is_gone(self, lost: Lost, *, connected: bool, was_ended: bool) -> bool:
+        """Return whether the other end is gone: nothing listens, or it hangs up as one that is just ending does."""
+        now, silent = time.monotonic(), isinstance(lost, Silent)  # then it may be we who stood still
         if connected:
             self._gone_at = now
             return not silent

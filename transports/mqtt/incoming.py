@@ -52,6 +52,7 @@ class Incoming:
         self.silence_s = settings.silence_s
         self.as_published = as_published
         self.accepted: Accepted | None = None  # what the broker said when it accepted us
+        self._accepted_at = 0.0
         self.where, self._settings = where, settings
         self._refusal: Refused | None = None
         self.reason = ""  # that of its DISCONNECT
@@ -60,6 +61,7 @@ class Incoming:
         self.messages: list[Message] = []  # read, and not delivered yet
         self.answers: dict[str, bool] = {}  # filters answered since that was last looked at: refused?
         self.more = False  # a batch ended before the socket was empty
+        self._left = 0  # bytes of whole packets that were received, and are not read yet
         self.age = ReadAge(self.answered_at)
         self.pings = Pings(settings, in_flight, self.age)
         self._packets = 0  # received so far
@@ -77,44 +79,58 @@ class Incoming:
             raise Silent(f"{self.where} has not answered for {limit:.1f} s")
 
     def read(self, client: Client, now: float) -> None:
-        """Read up to a batch: several times, where more than fits at once has come, or a piece of what TLS unpacks.
+        """Read up to a batch, in pieces: more than fits into one may have come, and TLS unpacks one after the other.
 
         ``now``: a time before anything is read. Raises Lost.
         """
-        age, waiting, first, size = self.age, self.age.waiting, self._packets, 0
-        unread = client.unread if self.more else 0
-        self.more = True
-        while self.more and self._packets - first < _BATCH:
+        age, first, size = self.age, self._packets, 0
+        while self._packets - first < _BATCH:
             before = self._packets
-            if not unread:
-                age.received_at = now
-                if now - waiting.checked_at > OVERSLEPT_S and self.accepted is not None:
-                    self.pings.send_after_stall(client, now)
-                unread = client.receive()
-                waiting.found(unread if client.drained else unread + readable_bytes(client.socket), now)
-            age.update(now, client.socket)
-            try:
-                left = client.read(_BATCH - (before - first))
-            except MalformedError as error:
-                raise Lost(f"{self.where} does not speak MQTT: {error}") from None
-            if self._refusal is not None:
-                raise self._refusal
-            if self.reason:
-                client.close()
-            size += unread - left
-            self.more = left > 0 or not client.drained
-            if not self.more:
+            size += self._read_piece(client, now, first + _BATCH - before)
+            if not self.more or self._packets == before:
                 break
-            waiting.read(unread - left)
-            if self._packets == before:
-                break
-            unread, now = left, clock.since_boot()
+            now = clock.since_boot()
         if size and self.pings.is_thin:  # any sign of life: answers wait behind what others have published
             self.answered_at = clock.since_boot()
         if age.has_retained or (size and self._packets == first):  # the latter is a piece of a long message
             age.note_arriving()
         if not self.more:
-            waiting.empty(age.received_at)
+            age.waiting.empty(age.received_at)
+
+    def _read_piece(self, client: Client, now: float, most: int) -> int:
+        """Read up to ``most`` packets of what was received before, else of what is received now; return their bytes.
+
+        `more` tells whether there may be others. Raises Lost.
+        """
+        unread = self._left or self._receive(client, now)
+        self.age.update(now, client.socket)
+        try:
+            self._left = left = client.read(most)
+        except MalformedError as error:
+            raise Lost(f"{self.where} does not speak MQTT: {error}") from None
+        if self._refusal is not None:
+            raise self._refusal
+        if self.reason:
+            client.close()
+        self.more = left > 0 or not client.drained
+        if self.more:
+            self.age.waiting.read(unread - left)
+        return unread - left
+
+    def _receive(self, client: Client, now: float) -> int:
+        """Take a piece out of the socket, and note how much is there; return the bytes of the piece."""
+        age, waiting = self.age, self.age.waiting
+        age.received_at = now
+        if now - waiting.checked_at > OVERSLEPT_S and self.accepted is not None:
+            self.pings.send_after_stall(client, now)
+        size = client.receive()
+        waiting.found(size if client.drained else size + readable_bytes(client.socket), now)
+        return size
+
+    @property
+    def answered_s(self) -> float | None:
+        """For how long the broker has answered since it accepted us; None: it has not accepted us."""
+        return None if self.accepted is None else self.answered_at - self._accepted_at
 
     @property
     def lost(self) -> Lost:
@@ -142,7 +158,7 @@ class Incoming:
     def on_accepted(self, accepted: Accepted) -> None:
         self._note_connack()
         self.pings.begin(self.answered_at)
-        self.accepted = accepted
+        self.accepted, self._accepted_at = accepted, self.answered_at
 
     def on_refused(self, code: int) -> None:
         self._note_connack()

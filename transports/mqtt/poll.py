@@ -6,6 +6,8 @@ from math import ceil
 
 from pebble.transports.wakeup import WakeupPipe
 
+NOTHING = (False, False, False)  # is readable, writable, or was woken
+
 
 class SocketPoll:
     """Waits until a socket is readable or has an error, or (with ``write``) writable, or `wake` was called."""
@@ -23,7 +25,7 @@ class SocketPoll:
             self._poll.register(self._wake, select.POLLIN)
 
     def wait(self, seconds: float, *, write: bool) -> tuple[bool, bool, bool]:
-        """Which of the three: readable, writable, woken."""
+        """Return which of the three holds: readable, writable, woken."""
         if self._poll is None:
             readable, writable, woken = self._select(seconds, write=write)
         else:

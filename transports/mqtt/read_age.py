@@ -110,16 +110,24 @@ class BrokerDelay:
         return now - sent_at, max(took, waits) - self._shortest
 
     def seconds(self, now: float, round_trip_s: Callable[[], float]) -> float:
-        """What is received at ``now`` waited so long; ``round_trip_s`` asks for TCP's present one, if that matters."""
-        waited = self._newest
-        if self._asked:
-            oldest, sent_at = next(((since, sent_at) for since, sent_at, clear in self._asked if clear), (now, now))
-            waited = max(waited, now - oldest)
-            if self._came_at <= sent_at and now - sent_at > self._shortest + _NOTICED_S:
-                self._stall, self._until = now - sent_at, now + _BACKLOG_S
+        """Return how long what is received at ``now`` has waited; ``round_trip_s`` asks for TCP's present round trip.
+
+        | case                                      | it has waited                                         |
+        |-------------------------------------------|-------------------------------------------------------|
+        | the newest ping was answered late         | as long as the answer took                            |
+        | a ping is unanswered                      | since it was sent, or since nothing was read before it |
+        | the broker stood still until a moment ago | as long as it stood still                             |
+        | none of these is longer than usual        | not at all                                            |
+
+        The longest counts, less what the way itself takes.
+        """
+        since = sent_at = now
+        if self._asked:  # the oldest that says something
+            since, sent_at = next(((since, sent_at) for since, sent_at, clear in self._asked if clear), (now, now))
+        if self._came_at <= sent_at and now - sent_at > self._shortest + _NOTICED_S:  # nothing came: it stood still
+            self._stall, self._until = now - sent_at, now + _BACKLOG_S
         self._came_at = now
-        if now < self._until:
-            waited = max(waited, self._stall)
+        waited = max(self._newest, now - since, self._stall if now < self._until else 0.0)
         if waited <= self._shortest + _NOTICED_S:
             return 0.0
         return waited - max(self._shortest, min(round_trip_s(), self._shortest + _UPLINK_S))

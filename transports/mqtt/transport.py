@@ -199,9 +199,8 @@ class MqttTransport(Transport):
                 self._run_connection(run)
             except Lost as lost:
                 connected = self._state is State.CONNECTED
-                before = self._dialler.loses_large
                 self.was_ended = self._dialler.is_gone(lost, connected=connected, was_ended=self.was_ended)
-                if self._dialler.loses_large and not before:
+                if self._dialler.note_end(lost):
                     text = "the way there seems to lose large packets (a wrong MTU?): from now on they are small"
                     log.warning("%s: %s: %s", self.client_id, self._dialler.where, text)
                 problem = str(lost)
@@ -262,23 +261,27 @@ class MqttTransport(Transport):
                     self._sync_retained(self._own.keys())
                 if self._refused.withheld:
                     self._try_withheld(connection)
-        except Silent:
+        except Lost as lost:
+            self._note_loss(connection, lost, held=time.monotonic() > tried_at)
+            raise
+
+    def _note_loss(self, connection: Connection, lost: Lost, *, held: bool) -> None:
+        """Note what the broker may have closed the connection for: what it lacks, or a message on a topic.
+
+        First what it lacks that all such messages need: else each of their topics would seem to be at fault. ``held``:
+        it has lasted for a while.
+        """
+        now = time.monotonic()
+        written = None if isinstance(lost, Silent) else connection.written_before_loss()
+        lacks = written is not None and self._dialler.limits.note_loss(
+            unconfirmed=connection.unacked > 0 or bool(connection.unconfirmed_retained()),
+            confirmed=connection.has_confirmed,
+            held=held,
+            now=now,
+        )
+        if not lacks or max((written or {}).values(), default=0) >= LARGE:
             with self._publishing:
-                self._refused.note_loss(connection.where, None, time.monotonic())
-            raise
-        except Lost:
-            # First whether it lacks what all such messages need: else each of their topics would seem to be at fault.
-            written, now = connection.written_before_loss(), time.monotonic()
-            lacks = written is not None and self._dialler.limits.note_loss(
-                unconfirmed=connection.unacked > 0 or bool(connection.unconfirmed_retained()),
-                confirmed=connection.has_confirmed,
-                held=now > tried_at,
-                now=now,
-            )
-            if not lacks or max((written or {}).values(), default=0) >= LARGE:
-                with self._publishing:
-                    self._refused.note_loss(connection.where, written, now)
-            raise
+                self._refused.note_loss(connection.where, written, now)
 
     def _try_withheld(self, connection: Connection) -> None:
         """Send what is retained on a topic that is tried again."""

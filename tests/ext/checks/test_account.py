@@ -8,9 +8,11 @@ import pytest
 
 from pebble.extensions.checks.broker import account
 from pebble.extensions.checks.broker.account import robot_account
-from pebble.transports.settings import MqttSettings
+from pebble.extensions.checks.broker.login import broker as login
+from pebble.transports.settings import MqttSettings, TlsSettings
 from tests.sparing_broker import SparingBroker
-from tests.support import Broker
+from tests.support import ROOT, Broker
+from tests.tcp_proxy import Hole
 
 ACCEPTED = ("b", "accepts what this account publishes")
 
@@ -39,3 +41,15 @@ def test_a_way_that_loses_large_packets_is_named(tmp_path: Path, loses_large: bo
     broker.stop()
     assert accepts == ACCEPTED[1]
     assert ["seems to lose large packets" in text for text in more] == [True] * loses_large
+
+
+def test_a_way_that_loses_a_certificate_is_named(tmp_path: Path) -> None:
+    files = ROOT / "tests" / "data" / "tls"
+    options = (f"cafile {files}/ca.crt", f"certfile {files}/server.crt", f"keyfile {files}/server.key")
+    broker = Broker(tmp_path, *options)
+    with Hole(broker.port) as way:
+        way.limit = 500
+        settings = MqttSettings(host="localhost", port=way.port, tls=TlsSettings(ca_cert=files / "ca.crt"))
+        (result,) = login("b", settings, answer_s=0.4)
+    broker.stop()
+    assert "seems to lose large packets" in result.text

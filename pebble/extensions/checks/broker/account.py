@@ -13,6 +13,7 @@ from pebble.contract import BRIDGE_PROBE, ONLINE
 from pebble.contract.identity import SERVERS, Identity
 from pebble.contract.levels import LEVELS
 from pebble.errors import TransportError
+from pebble.extensions.checks.broker.login import SMALLER_PACKETS
 from pebble.extensions.checks.broker.login_attempt import reached
 from pebble.extensions.checks.broker.messages import REFUSED, held_back
 from pebble.extensions.checks.broker.peer import BrokerTrial, Peer
@@ -60,7 +61,7 @@ def robot_account(
                 yield replace(held_back(trial, peer, peer, topic), what=f"small messages at {what}")
             if is_back and not _echo(trial, peer, topic, _LARGE)[0]:
                 text = "a message of 2 kB does not come back, small ones do: the way there seems to lose large packets"
-                yield warn(text, "set a smaller MTU at its network card, or let ICMP pass", what)
+                yield warn(text, SMALLER_PACKETS, what)
     except TransportError as error:
         yield warn(f"cannot be published to: {error}", what=what)
 

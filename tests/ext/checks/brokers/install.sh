@@ -2,7 +2,7 @@
 # Installs brokers of other makers for tests: NATS and aedes into .venv, and RabbitMQ as a Debian package, which neither
 # starts now nor at the next boot. What cannot be installed is left out; its tests are skipped.
 set -u
-cd "$(dirname "$0")/../.."
+cd "$(dirname "$0")/../../../.."
 nats=2.15.1 aedes=1.2.0
 policy=/usr/sbin/policy-rc.d
 
