@@ -69,7 +69,7 @@ _LONG = (
     ),
     *(
         "ext/operator/commands/test_estop.py",
-        "ext/operator/commands/test_drive.py",
+        "ext/page/test_drive_command.py",
         "transports/test_mqtt.py",
         "ext/recordings/recorder",
     ),

@@ -21,8 +21,9 @@ from tests.support import ROOT, THOROUGH, Broker, Child, free_port, until
 
 ELSEWHERE = [sys.executable, str(ROOT / "tests" / "fakes" / "other_platform.py")]
 MODULES = (
-    *(f"pebble.extensions.operator.commands.{name}" for name in ("topic", "estop", "watch", "drive")),
-    *("pebble.extensions.page.commands", "pebble.extensions.page.commands.cert", "pebble.commands.check"),
+    *(f"pebble.extensions.operator.commands.{name}" for name in ("topic", "estop", "watch")),
+    *(f"pebble.extensions.page.commands{name}" for name in ("", ".cert", ".drive")),
+    "pebble.commands.check",
     *(
         "pebble.extensions.page.app",
         "pebble.extensions.page.serve",

@@ -11,10 +11,10 @@ from unittest.mock import patch
 import msgspec
 
 from pebble.config import Config
-from pebble.motors import control, motor_guard
+from pebble.motors import control, motor_guard, motor_owner
 from pebble.services.serial_mcu_bridge.line.outbox import Outbox
 from pebble.services.serial_mcu_bridge.line.serial_line import LineState
-from pebble.services.serial_mcu_bridge.text import motor_bridge
+from pebble.services.serial_mcu_bridge.text import goob_base
 from pebble.services.serial_mcu_bridge.text.motor_bridge import MotorBridge
 from tests.robot.lockstep.network import Connection, Network
 from tests.robot.lockstep.processes import Process, ServiceProcess
@@ -23,7 +23,7 @@ from tests.robot.lockstep.scheduler import Scheduler
 DEADMAN_S = 1.0  # of the MCU
 _BOOT_S = 0.5
 _SAVED_S = 0.003
-_STOP = motor_bridge.goob_base.STOP
+_STOP = goob_base.STOP
 
 Disk = dict[Path, bytes]
 
@@ -169,7 +169,7 @@ class Owner(ServiceProcess):
 
         random = SimpleNamespace(token_hex=self._token_hex)
         with (
-            patch.object(motor_bridge, "StateFile", file),
+            patch.object(motor_owner, "StateFile", file),
             patch.object(motor_guard, "secrets", random),
             patch.object(control, "secrets", random),
         ):
