@@ -1,7 +1,6 @@
 """What the cards of a page may rely on in payloads of robots: it is checked here, and not again in the page. Pure."""
 
 from collections.abc import Callable
-from contextlib import suppress
 from functools import partial
 from typing import Annotated, Any, Literal
 
@@ -126,9 +125,18 @@ def _inner(payload: Any) -> Any:
     return payload["value"] if isinstance(payload, dict) and "value" in payload else payload
 
 
+def _is(kind: Any, payload: object) -> bool:
+    """True if it is of this kind."""
+    try:
+        convert(payload, kind)
+    except ValidationError:
+        return False
+    return True
+
+
 def _object(kind: Any, payload: Any) -> Any:
     """Return an object if it is of this kind, and nothing of any other."""
-    return payload if _readable(kind, [payload]) else {}
+    return payload if _is(kind, payload) else {}
 
 
 def _inner_object(kind: Any, payload: Any) -> Any:
@@ -137,12 +145,13 @@ def _inner_object(kind: Any, payload: Any) -> Any:
 
 def _readable(kind: Any, entries: object) -> list[Any]:
     """Return the entries of a list that are of this kind, as they are."""
-    readable = []
-    for entry in entries if isinstance(entries, list) else ():
-        with suppress(ValidationError):
-            convert(entry, kind)
-            readable.append(entry)
-    return readable
+    return [entry for entry in entries if _is(kind, entry)] if isinstance(entries, list) else []
+
+
+def _media(payload: Any) -> Any:
+    """Return the reports if all can be read. Each by itself: msgspec learns a dict's type anew with each call."""
+    reports = _inner(payload)
+    return reports if isinstance(reports, dict) and all(_is(_Medium, report) for report in reports.values()) else {}
 
 
 def _scripts(payload: Any) -> Any:
@@ -179,7 +188,7 @@ def _capabilities(payload: Any) -> Any:
     value = _inner(payload)
     if not isinstance(value, dict):
         return {}
-    kept = {name: section for name, section in value.items() if _readable(_SECTIONS.get(name, Any), [section])}
+    kept = {name: section for name, section in value.items() if _is(_SECTIONS.get(name, Any), section)}
     return payload if kept == value and value is not payload else {"value": kept}
 
 
@@ -189,7 +198,7 @@ _SHOWN: dict[str, Callable[[Any], Any]] = {
     c.SOUNDBOARD_STATUS.metric: partial(_inner_object, _Clip),
     c.AUTONOMY_FILES.metric: _scripts,
     c.AUTONOMY_STATUS.metric: partial(_inner_object, _Running),
-    c.MEDIA_STATUS.metric: partial(_inner_object, dict[str, _Medium]),
+    c.MEDIA_STATUS.metric: _media,
     c.NEIGHBOURS.metric: partial(_inner_object, _Neighbours),
     c.OUTLET_STATUS.metric: partial(_object, _Outlet),
     c.MCU_DESCRIBE.metric: _manifest,

@@ -86,8 +86,9 @@ def _do(script: str, *selectors: str) -> Act:
 
 
 def _timeline(page: Page) -> None:
-    """The day is here."""
-    page.wait_for_function("pebble.replay?.day.timeline", timeout=30_000)
+    """The day is here. Playwright's own waiting for it is stopped by the page's policy."""
+    while not page.evaluate("Boolean(pebble.replay?.day.timeline)"):
+        page.wait_for_timeout(50)
 
 
 def _recordings_link(page: Page) -> None:

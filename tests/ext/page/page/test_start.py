@@ -195,10 +195,7 @@ def test_a_page_that_loses_a_file_stops_robots(browser: Browser, losing: LosingS
 
 @pytest.mark.page
 @pytest.mark.timeout(1800)
-@pytest.mark.parametrize(
-    ("state", "pattern"),
-    [("recordings", "replay"), ("fleet", "fleet|many"), ("full", "^(?!.*(replay|fleet|many|login))")],
-)
+@pytest.mark.parametrize(("state", "pattern"), WHERE)
 def test_a_page_that_loses_any_file_stops_robots(
     browser: Browser, losing: LosingServer, state: str, pattern: str
 ) -> None:

@@ -21,12 +21,12 @@ SCENES = 60  # after which pictures repeat: drawing takes longer than all else
 CAMERA = f"{GOOB}/outgoing/front-camera"
 
 
-def pictures(encoding: str, seconds: float, size: tuple[int, int], interval: int | None) -> Iterator[Line]:
-    """The number in a picture is its own modulo SCENES; ``interval``: of key frames, None as robots have it."""
-    encoder = make_encoder(encoding, fps=FPS, quality=60, keyframe_interval=interval)
-    scene, made = Scene(*size), list[np.ndarray]()
+def pictures(encoding: str, seconds: float) -> Iterator[Line]:
+    """The number in a picture is its own modulo SCENES."""
+    encoder = make_encoder(encoding, fps=FPS, quality=60, keyframe_interval=2 * FPS)
+    scene, made = Scene(*SIZE), list[np.ndarray]()
     for number in range(SCENES):
-        made.append(np.empty((size[1], size[0], 3), np.uint8))
+        made.append(np.empty((SIZE[1], SIZE[0], 3), np.uint8))
         scene.render(number, made[-1])
     for number in range(int(seconds * FPS)):
         at = number / FPS
@@ -52,26 +52,11 @@ def rest(seconds: float) -> Iterator[Line]:
             yield Line(at, f"{GOOB}/outgoing/logs", js(t=ms(at), level="INFO", message=f"line {number}"), 1)
 
 
-def film(
-    root: Path,
-    encoding: str,
-    seconds: float,
-    size: tuple[int, int] = SIZE,
-    *,
-    finished: bool = True,
-    times: int = 1,
-    interval: int | None = 2 * FPS,
-) -> Path:
-    """A folder as a recorder leaves it: one file of state, one of media, a chunk each second.
-
-    ``times``: so often the pictures are repeated, because encoding an hour takes long. ``interval``: of key frames, in
-    pictures; None: as robots have it.
-    """
+def film(root: Path, encoding: str, seconds: float, *, finished: bool = True) -> Path:
+    """A folder as a recorder leaves it: one file of state, one of media, a chunk each second."""
     day = root / "2023/11/14"
     day.mkdir(parents=True)
-    once = list(pictures(encoding, seconds / times, size, interval))
-    shown = [line._replace(at=line.at + seconds / times * turn) for turn in range(times) for line in once]
-    lines = sorted([*rest(seconds), *shown], key=lambda line: line.at)
+    lines = sorted([*rest(seconds), *pictures(encoding, seconds)], key=lambda line: line.at)
     media = [line for line in lines if line.topic in (CAMERA, f"{GOOB}/outgoing/audio")]
     state = [line for line in lines if line.topic not in (CAMERA, f"{GOOB}/outgoing/audio")]
     suffix = ".mcap" if finished else ".mcap.active"
