@@ -471,7 +471,7 @@ MEDIA_MODULES = {"pebble.transports.frames", "pebble.extensions.media.sound"}
 NEEDED = [
     "numpy",
     "pebble.runtime.process",
-    "pebble.services.mqtt_bridge.audit",
+    "pebble.extensions.fleet.robot_audit",
     "pebble.services.serial_mcu_bridge.text.motor_bridge",
 ]
 NOT_NEEDED = [

@@ -24,10 +24,10 @@ from starlette.routing import Route
 from pebble.extensions.fleet.audit import MAX_REFUSED, OTHERS, REFUSED, Audit
 from pebble.extensions.fleet.people import SESSION_S, People
 from pebble.extensions.fleet.roles import Role
+from pebble.extensions.fleet.row_writer import OF_STRANGERS, WINDOW_S
 from pebble.extensions.page.access import login
 from pebble.extensions.page.access.guard import Guard
 from pebble.extensions.page.setting import WebSettings
-from pebble.runtime.row_writer import OF_STRANGERS, WINDOW_S
 from pebble.transports import MqttSettings
 from tests.ext.fleet.conftest import cheap_hashes as cheap_hashes
 from tests.support import cases, until

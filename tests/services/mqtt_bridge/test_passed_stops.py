@@ -13,7 +13,7 @@ from msgspec import UNSET
 
 from pebble.contract import ESTOP, ESTOP_STATE, codec
 from pebble.contract.payloads import EstopCommand, EstopState
-from pebble.services.mqtt_bridge.audit import Audit
+from pebble.extensions.fleet.robot_audit import Audit
 from pebble.services.mqtt_bridge.passed_stops import NAMES, PassedStops, is_named, named
 from tests.forwarding.virtual import World
 from tests.services.mqtt_bridge.stop_schedules import ENGINE, FAULTS
