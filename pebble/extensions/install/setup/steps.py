@@ -39,10 +39,10 @@ from pebble.extensions.install.setup.robot_config import (
     config_of,
 )
 from pebble.extensions.install.setup.system import MOSQUITTO, ROBOTS, SetupError, System
+from pebble.extensions.operator.places import Places
 from pebble.extensions.page.config import WebHandler, WebInterface
 from pebble.extensions.page.setting import people_of
 from pebble.runtime.connections import check_connections
-from pebble.runtime.places import Places
 
 ROBOT_SERVICE, BROKER_SERVICE = UNIT, "mosquitto.service"
 

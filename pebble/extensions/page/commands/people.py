@@ -17,8 +17,8 @@ from pebble.extensions.fleet.audit import Audit, Entry
 from pebble.extensions.fleet.people import People
 from pebble.extensions.fleet.roles import Role
 from pebble.extensions.operator.commands.show import print_table
+from pebble.extensions.operator.places import Places
 from pebble.extensions.page.config import WebHandler, WebInterface
-from pebble.runtime.places import Places
 
 PEOPLE = "people.sqlite"
 PLACES = Places()

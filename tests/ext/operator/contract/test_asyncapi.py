@@ -11,7 +11,7 @@ import jsonschema
 import yaml
 
 from pebble.contract import CHANNELS
-from pebble.contract.asyncapi import document
+from pebble.extensions.operator.contract.asyncapi import document
 from tests.kit.npm import package
 
 
