@@ -235,6 +235,9 @@ def certificate(
         is_hub = ProgramRole.HUB in account.roles
         if is_hub and not hosts:
             raise FleetError(f"{name} is a hub: name where others reach it, `pebble fleet certificate {name} HOST`")
+        others = {*fleet.accounts, *(() if is_hub else (broker.host for broker in fleet.brokers))} - {name}
+        if taken := others & {*(hosts or ())}:
+            raise FleetError(f"{name} cannot be {min(taken)}: that is a broker of this fleet, or another account")
         files = certificates.of_account(place, name, hosts or ())
     _print_certificate(place, fleet, name, files)
     return 0
