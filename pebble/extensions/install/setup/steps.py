@@ -14,6 +14,7 @@ from pebble.config.config import parse
 from pebble.contract.identity import Identity
 from pebble.errors import PebbleError
 from pebble.extensions.fleet import certificates
+from pebble.extensions.fleet.as_owner import as_owner
 from pebble.extensions.fleet.broker_files import new_password
 from pebble.extensions.fleet.people import People, has_user
 from pebble.extensions.fleet.roles import Role
@@ -202,7 +203,7 @@ class Job:
             return
 
         def add() -> None:
-            with closing(People(file)) as people:
+            with as_owner(file.parent), closing(People(file)) as people:
                 people.add(str(name), self.secrets.password or "", Role.ADMIN)
 
         yield Step(f"{name} may log in at the page, as admin", lambda: has_user(file, str(name)), add, ())
