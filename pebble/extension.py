@@ -197,6 +197,8 @@ def _check_parts(extension: Extension) -> None:
         raise PebbleError(f"it needs {' and '.join(sorted(lacks))}")
     for place in filter(None, (*extension.sections.values(), extension.rules, extension.programs)):
         part(place)
+    if extension.program is not None and find_spec(extension.program.module) is None:
+        raise PebbleError(f"the module of its program, {extension.program.module}, is not installed")
 
 
 def lacking(raw: Any) -> Iterator[Missing]:
@@ -299,7 +301,8 @@ def _at_section(config: Any, key: str) -> Any:
 def _of_package(name: str) -> Extension:
     offered = _offered()
     if name not in offered:
-        raise PebbleError(f"no installed package offers it; known are {', '.join(sorted(offered)) or 'none'}")
+        known = ", ".join(sorted(offered)) or "none"
+        raise PebbleError(f'no installed package offers it (a file is written with ".py"); known are {known}')
     return _checked(part(offered[name]))
 
 

@@ -15,7 +15,7 @@ from msgspec.structs import asdict, fields, replace
 from pebble import extension
 from pebble.config.home import in_home
 from pebble.config.masking import holds_secret, masked
-from pebble.config.problems import Notes
+from pebble.config.problems import Note, Notes
 from pebble.config.raw import Pairs, decode, plain, read_text, with_instances, without
 from pebble.config.reader import Reader, Rule
 from pebble.config.rules.between_keys import CHECKS
@@ -181,7 +181,8 @@ def _config(
     if path is not None and holds_secret(own):
         warn_if_readable(notes, (), path, "it, and there is a password in it")
     if notes.problems:
-        raise ConfigError(list(dict.fromkeys(map(str, notes.problems))))
+        lacking = [Note(tuple(one.key.split(".", 1)), one.reason) for one in missing]  # unknown sections may be theirs
+        raise ConfigError(list(dict.fromkeys(map(str, (*lacking, *notes.problems)))))
     identity = Identity(root.robot.system, root.robot.type, root.robot.id)
     config: Config = kind(
         **asdict(root),

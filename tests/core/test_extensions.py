@@ -13,6 +13,7 @@ import pytest
 
 from pebble.config import load, parse
 from pebble.config.types import Section
+from pebble.errors import ConfigError
 from pebble.extension import OURS, Extension, lacking_packages, ours, part, programs_of
 from pebble.launcher.programs import programs
 from tests.support import ROOT
@@ -173,6 +174,10 @@ def test_a_package_runs_code_where_a_config_names_it(tmp_path: Path) -> None:
         ("1 / 0  # EXTENSION", "ZeroDivisionError: division by zero"),
         ("EXTENSION = 1", "its EXTENSION is no pebble.extension.Extension"),
         (LAMP % {"name": "absent", "drives": False}, "ModuleNotFoundError: No module named 'absent'"),
+        (
+            (LAMP % {"name": "lamp", "drives": False}).replace('("lamp", "lamp"', '("lamp", "absent"'),
+            "the module of its program, absent, is not installed",
+        ),
     ],
 )
 @pytest.mark.parametrize("drives", [False, True])
@@ -187,6 +192,12 @@ def test_a_broken_one_is_an_error_and_keeps_a_robot_from_starting_only_if_it_dri
     code = f"from pebble.config import load; print(load({str(path)!r}, lenient=True).warnings)"
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=False)
     assert (done.returncode == 0, reason in done.stdout) == (not drives, not drives)
+
+
+def test_of_a_refused_config_it_says_what_is_missing(tmp_path: Path) -> None:
+    path = write(tmp_path, {"lamp": {}}, {"hz": 2})
+    with pytest.raises(ConfigError, match=r"(?s)extensions.lamp: no installed package.*services.lamp: unknown key"):
+        load(path, lenient=True)
 
 
 def test_the_core_alone_reads_a_config_with_sections_of_extensions() -> None:
