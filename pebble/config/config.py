@@ -3,7 +3,7 @@
 import hashlib
 import os
 import zlib
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from functools import cache
 from pathlib import Path
 from typing import Any, TypeVar
@@ -176,6 +176,8 @@ def _config(
     reader.notes = notes
     merged = with_instances(own)
     unread = [*extension.keys_of_missing(installed), *(key for one in found if core_only for key in one.sections)]
+    if lenient and missing:
+        unread += _unknown(merged, tree)  # they may be sections of what is missing
     root = reader.section(tree, without(merged, unread))
     notes.forget_inherited(own, merged)
     if path is not None and holds_secret(own):
@@ -200,6 +202,14 @@ def _config(
     if len(owners) > len(set(owners)):
         raise ConfigError("extensions: two motor owners have one name; serial lines are called as their instances")
     return replace(config, motor_owners=owners)
+
+
+def _unknown(raw: Any, tree: type[Root]) -> Iterator[str]:
+    known = {field.encode_name: field for field in fields(tree)}
+    services = {field.encode_name for field in fields(type(known["services"].default))}
+    yield from (key for key in raw if key not in known)
+    written = raw.get("services")
+    yield from (f"services.{key}" for key in (written if isinstance(written, dict) else ()) if key not in services)
 
 
 def _extensions(own: Any, folder: Path) -> tuple[tuple[Extension, ...], tuple[Missing, ...]]:

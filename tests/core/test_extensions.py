@@ -197,13 +197,18 @@ def test_a_broken_one_is_an_error_and_keeps_a_robot_from_starting_only_if_it_dri
 def test_of_a_refused_config_it_says_what_is_missing(tmp_path: Path) -> None:
     path = write(tmp_path, {"lamp": {}}, {"hz": 2})
     with pytest.raises(ConfigError, match=r"(?s)extensions.lamp: no installed package.*services.lamp: unknown key"):
-        load(path, lenient=True)
+        load(path)
 
 
 def test_the_core_alone_reads_a_config_with_sections_of_extensions() -> None:
     config = load(ROOT / "configs" / "goob.json", core_only=True)
     names = [program.name for program in programs(config)]
     assert names == ["zenoh_hub", "announcer", "serial_mcu_bridge", "mqtt_bridge"]
+
+
+def test_a_robot_starts_though_a_section_of_what_is_missing_is_there(tmp_path: Path) -> None:
+    path = write(tmp_path, {"lamp": {}}, {"enabled": True})
+    assert load(path, lenient=True).warnings[0].startswith("extensions.lamp: no installed package offers it")
 
 
 def test_what_owns_motors_is_listed_as_such(tmp_path: Path) -> None:
