@@ -2,8 +2,9 @@
 
 A golden file is a transcript: milliseconds since the firmware was loaded, a sign, and what happened.
 ``=`` volts at a pin, or high or low; ``>`` a line from the host; ``<`` a line from the board; ``!`` what the motors do
-from then on, left and right, + = forward; ``.`` the end. What the world did is played again, and all of it must come
-out as it stands there. ``python -m tests.firmware.test_golden`` writes the files anew.
+from then on, left and right, + = forward; ``*`` how often the line before comes again, each 20 ms later; ``.`` the end.
+What the world did is played again, and all of it must come out as it stands there. ``python -m
+tests.firmware.test_golden`` writes the files anew.
 """
 
 from __future__ import annotations
@@ -11,7 +12,8 @@ from __future__ import annotations
 import sys
 from collections import defaultdict
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +29,7 @@ pytestmark = pytest.mark.computing
 GOLDEN = Path(__file__).parent / "golden"
 ROBOTS = ("goob", "fred")
 _ADC_V = 1.65  # at 65535
+_REPORT_MS = 20  # between two of Goob's reports
 _BATTERY_V = 9.9  # where its pin has 1.65 V: goob/pins.py
 
 
@@ -41,8 +44,12 @@ class Entry:
 
 
 def entries(robot: str) -> list[Entry]:
-    lines = (GOLDEN / f"{robot}.txt").read_text().splitlines()
-    return [Entry(int(line[:5]), line[6], line[8:]) for line in lines]
+    found: list[Entry] = []
+    for line in (GOLDEN / f"{robot}.txt").read_text().splitlines():
+        entry = Entry(int(line[:5]), line[6], line[8:])
+        more = range(found[-1].ms + _REPORT_MS, entry.ms + 1, _REPORT_MS) if entry.sign == "*" else ()
+        found += [replace(found[-1], ms=ms) for ms in more] or [entry]
+    return found
 
 
 def play(robot: str, script: list[Entry]) -> list[Entry]:
@@ -88,7 +95,13 @@ def wire(board: Board, what: str) -> None:
 
 
 def text(transcript: list[Entry]) -> str:
-    return "".join(f"{entry}\n" for entry in transcript)
+    lines: list[Entry] = []
+    for before, entry in pairwise([Entry(0, "", ""), *transcript]):
+        if entry == replace(before, ms=before.ms + _REPORT_MS):
+            times = int(lines.pop().what) if lines[-1].sign == "*" else 0
+            entry = Entry(entry.ms, "*", str(times + 1))
+        lines.append(entry)
+    return "".join(f"{entry}\n" for entry in lines)
 
 
 @pytest.mark.parametrize("robot", ROBOTS)

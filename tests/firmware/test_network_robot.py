@@ -28,11 +28,10 @@ def online(
     *,
     time: Answers = "answers",
     refused: Iterable[str] = (),
-    named: bool = False,
     **settings: Any,
 ) -> Drill:
     """A robot that is connected; ``refused`` topics cannot be subscribed to, ``settings`` change those of its board."""
-    drill = Drill(kind, seed, named=named)
+    drill = Drill(kind, seed)
     drill.network.conditions.ntp = time
     drill.broker.refused = set(refused)
     if settings:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import threading
 import time
 from collections.abc import Iterator
@@ -11,8 +10,6 @@ from typing import Any
 
 import pytest
 
-from pebble.extensions.operator.client.connection import Target, connected, subscribed_stop
-from pebble.extensions.operator.client.discovery import ALL_OUTGOING, Discovery
 from pebble.transports import Message, MqttSettings, QoS, State
 from pebble.transports.mqtt.transport import MqttTransport
 from tests.forwarding.links.rig import MqttEnd, Rig, Side
@@ -20,16 +17,13 @@ from tests.robot.operator import Operator
 from tests.robot.rig import BASE, STOP
 from tests.robot.rig import Rig as RobotRig
 from tests.services.mqtt_bridge.bridge_rig import Quiet
-from tests.sparing_broker import SparingBroker
 from tests.support import Broker, beside, until
 from tests.transports.brokers import MAKERS, ROBOT, Maker, sparing_aedes
-from tests.transports.net import ProcessPeer
 from tests.transports.received import Received
 
 pytestmark = [pytest.mark.alone, pytest.mark.thorough]  # deadlines are checked; make long PART=brokers runs it
 
 FLAG = "incoming/flags/mqtt-audio"
-STOPPED = {"latched": True, "boot": "b", "count": 1, "recent": [], "by": "ann", "why": "", "since": 1}
 TRUE, FALSE = b'{"value": true}', b'{"value": false}'
 
 
@@ -65,47 +59,6 @@ def settings(broker: Broker, **more: Any) -> MqttSettings:
 @pytest.fixture
 def base(request: pytest.FixtureRequest) -> str:
     return f"pebble/robots/{request.node.originalname.rpartition('_')[2]}"
-
-
-def test_every_retained_message_comes_by_its_exact_name_and_wildcard_where_the_broker_has_that(
-    maker: Maker, broker: Broker, base: str
-) -> None:
-    names = [f"{base}/outgoing/state-{number}" for number in range(30)]
-    with MqttTransport("writer", settings(broker, as_published=True)) as writer:
-        assert writer.as_published is maker.bridge_mode
-        for name in names:
-            writer.publish(name, b"1", qos=QoS.DELIVERED, retain=True)
-        assert until(lambda: not writer.outgoing.waiting)
-        with MqttTransport("late", settings(broker)) as late:
-            seen = Received()
-            late.subscribe(f"{base}/#", seen)
-            assert until(lambda: maker.by_name or len(seen.messages) == len(names))
-            assert len(seen.messages) == (0 if maker.by_name else len(names))
-            late.ask(names)
-            assert until(lambda: {one.topic for one in seen.messages if one.retain} == {*names})
-        for name in names:
-            writer.publish(name, b"", qos=QoS.DELIVERED, retain=True)
-    with MqttTransport("later", settings(broker)) as later:
-        left = Received()
-        later.subscribe(f"{base}/#", left)
-        later.ask(names)
-        time.sleep(0.2)
-        assert left.messages == []
-
-
-def test_a_will_is_published_at_once_and_retained(broker: Broker, base: str) -> None:
-    topic, seen, late = f"{base}/outgoing/online", Received(), Received()
-    will = Message(topic, b"gone", QoS.DELIVERED, retain=True)
-    with MqttTransport("operator", settings(broker)) as operator:
-        operator.subscribe(topic, seen)
-        robot = ProcessPeer("mqtt", "robot", settings(broker, as_published=True), will)
-        robot.publish(topic, b"here", retain=True)
-        assert until(lambda: seen.payloads == [b"here"])
-        robot.kill()
-        assert until(lambda: seen.payloads == [b"here", b"gone"])
-        with MqttTransport("late", settings(broker)) as transport:
-            transport.subscribe(topic, late)
-            assert late.until(b"gone")
 
 
 def test_what_an_account_may_not_publish_costs_it_that_and_is_reported(
@@ -159,30 +112,6 @@ def test_an_operators_flag_is_not_overwritten_by_a_robot_that_starts(broker: Bro
     finally:
         rig.close()
         own.close()
-
-
-def test_an_operators_tool_finds_the_states_of_an_idle_robot(broker: Broker, base: str) -> None:
-    """By wildcards, and those of one robot also where a broker sends retained messages for exact names only."""
-    front = SparingBroker(broker.port, by_name=True)
-    drives = {"drive": {"topic": f"{base}/incoming/drive-values"}}
-    estop = {"available": True, "owners": ["serial"], "status_topics": [f"{base}/outgoing/estop/serial"]}
-    states: dict[str, Any] = {"capabilities": {"t": 1, "value": {**drives, "estop": estop}}}
-    states["charging-level"] = {"value": 12.5}
-    states["estop/serial"] = STOPPED
-    with MqttTransport("robot", settings(broker)) as robot:
-        for name, value in states.items():
-            robot.publish(f"{base}/outgoing/{name}", json.dumps(value).encode(), qos=QoS.DELIVERED, retain=True)
-
-        discovery = Discovery()
-        with connected(Target(url=f"mqtt://127.0.0.1:{broker.port}")) as (tool, _):
-            tool.subscribe(ALL_OUTGOING, lambda message: discovery.receive(message, 0.0, 0.0), direct=True)
-            assert until(lambda: base in discovery.robots and discovery.robots[base].volts)
-            assert until(lambda: discovery.robots[base].latched)
-        for port in (broker.port, front.port):
-            with connected(Target(url=f"mqtt://127.0.0.1:{port}", robot=base)) as (tool, _):
-                one = subscribed_stop(tool, base)
-                assert until(lambda: [state.by for state in one.latched.values()] == ["ann"])  # noqa: B023
-    front.close()
 
 
 def test_a_whole_robot_is_driven_and_stopped_although_it_may_not_publish_a_stream(maker: Maker, broker: Broker) -> None:

@@ -7,9 +7,6 @@ import socket
 import subprocess
 import time
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack
-from dataclasses import replace
-from itertools import permutations
 from pathlib import Path
 from threading import Event
 from typing import Any
@@ -20,7 +17,7 @@ from pebble.transports import MqttSettings, QoS, State, Transport, create
 from pebble.transports.hosts import HANDSHAKE_S, STEADY_S, Address, AddressRound, HostPort
 from pebble.transports.settings import TlsSettings
 from tests.fakes.bad_brokers import BEHAVIOURS, mute, serving, showing
-from tests.support import ROOT, Broker, free_port, some, until
+from tests.support import ROOT, Broker, free_port, some
 
 NAME = "fleet.test"
 GOOD, BAD, WORSE = "127.0.0.1", "127.0.0.2", "127.0.0.3"
@@ -72,31 +69,8 @@ def names(monkeypatch: pytest.MonkeyPatch) -> Names:
     return give
 
 
-@pytest.fixture(params=["3.1.1", "5"])
-def made(request: pytest.FixtureRequest) -> Iterator[Callable[[MqttSettings], Transport]]:
-    with ExitStack() as closing:
-
-        def make(settings: MqttSettings) -> Transport:
-            transport = create("mqtt", "tool", replace(settings, protocol=request.param))
-            closing.callback(transport.close)
-            return transport
-
-        yield make
-
-
 def works(transport: Transport) -> bool:
     return transport.publish("addresses/works", b"1", qos=QoS.DELIVERED)
-
-
-@pytest.mark.parametrize("order", some(permutations((GOOD, BAD, WORSE)), 4), ids=" ".join)
-def test_a_living_address_is_found_among_dead_ones_in_any_order(
-    broker: Broker, names: Names, made: Callable[[MqttSettings], Transport], order: tuple[str, ...]
-) -> None:
-    names(*order)
-    with serving(BAD, broker.port, mute), serving(WORSE, broker.port, BEHAVIOURS["closing"]):
-        transport = made(MqttSettings(host=NAME, port=broker.port, reconnect_max_s=20)).open(0.01)
-    assert transport.state is State.CONNECTED, transport.problem
-    assert works(transport)
 
 
 #: Each way to fail, for plain connections and those of a bridge in turns; then the other one.
@@ -161,17 +135,6 @@ def test_which_addresses_failed_is_logged_once_another_works(
         assert transport.problem == ""
     why = f"connected to broker {NAME}:{broker.port} at {GOOD}; before it {BAD} cannot be reached"
     assert [record.getMessage()[: len(why) + 6] for record in caplog.records] == [f"tool: {why}"]
-
-
-def test_a_connection_that_is_lost_is_made_at_another_address(tmp_path: Path, broker: Broker, names: Names) -> None:
-    first = Broker(tmp_path, port=broker.port, host=BAD)
-    names(BAD, GOOD)
-    with create("mqtt", "tool", MqttSettings(host=NAME, port=broker.port, silence_s=0.5)) as transport:
-        first.freeze()
-        assert until(lambda: transport.counters["connected"] == 2)
-        assert works(transport)
-        first.thaw()
-    first.stop()
 
 
 def test_close_does_not_wait_for_a_resolver(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -128,8 +128,9 @@ def test_a_topic_that_is_allowed_again_is_used_again(caplog: pytest.LogCaptureFi
 
 
 @pytest.mark.parametrize("topic", ["r/online", "r/estop/wheels", "r/capabilities"])
-def test_a_vital_topic_is_never_withheld_and_an_error_names_it(topic: str) -> None:
+def test_a_vital_topic_is_never_withheld_and_an_error_names_it(topic: str, caplog: pytest.LogCaptureFixture) -> None:
     world = World(lambda name, _size, now: name == topic and now < 100).run(99)
+    assert any("this account cannot run a robot" in line and topic in line for line in caplog.messages)
     assert topic in world.topics.not_taken
     assert topic not in world.topics.withheld
     world.run(90)

@@ -65,23 +65,6 @@ def test_a_change_is_taken_up_and_what_cannot_be_used_is_not(
     assert value.get() == 3
 
 
-def test_a_file_that_may_be_read_again_is_read(tmp_path: Path) -> None:
-    file, allowed = tmp_path / "number", [True]
-    file.write_text("1")
-
-    def read() -> int:
-        if not allowed[0]:
-            raise PermissionError("not now")
-        return _number(file)
-
-    value = Renewed([file], read)
-    file.write_text("2")
-    allowed[0] = False
-    assert value.get() == 1
-    allowed[0] = True
-    assert value.get() == 2
-
-
 def test_a_robot_is_back_after_its_authority_its_certificate_and_its_password_were_renewed(tmp_path: Path) -> None:
     used, password, accounts = tmp_path / "used", tmp_path / "password", tmp_path / "accounts"
 
