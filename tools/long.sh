@@ -46,7 +46,7 @@ looks) $python -m tests.ext.page.looks ;;
 fleet) tests --workers 2 --timeout 900 -s tests/ext/fleet ;;
 brokers)
     sh tests/ext/checks/brokers/install.sh
-    $python -m pytest -ra tests/transports/test_brokers.py tests/transports/test_client_ids.py tests/ext/checks/brokers
+    $python -m pytest -ra tests/transports/test_brokers.py tests/ext/checks/brokers
     $python -m pytest -ra -k "(nats or another) and in_python" tests/ext/checks/conform
     ;;
 gstreamer)

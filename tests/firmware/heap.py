@@ -22,7 +22,7 @@ ROM, PLAIN = "image with ROMFS", "plain image"
 NAMED = "image with ROMFS, named"
 #: Modules that are never loaded there.
 _UNUSED = {STOCK: ("usb",), FULL: ("console", "uart"), ROM: ("names",), PLAIN: ("names",), "": ("names",)}
-_SCRIPTS = ("board", "net", "workload_serial", "workload_described", "workload_network", "heap")
+_SCRIPTS = ("board", "net", "workload_serial", "workload_network", "heap")
 _DESCRIBED = ("goob_imu",)  # by pebble_serial_v1
 _ENOUGH_S = 300.0  # a minute of its own time takes 5 s, and whatever `make test` leaves it of the processors
 _HEAP = 64 * 1024  # to start with: the smaller, the quicker it is searched for garbage
@@ -80,14 +80,14 @@ class Cost:
     turns: int
 
 
-def measure(case: Case, folder: Path, *, heap: int = _HEAP, capped: bool = False) -> Cost:
+def measure(case: Case, folder: Path) -> Cost:
     """Run the robot for a minute. AssertionError if it fails."""
     folder = folder / re.sub(r"\W+", "-", str(case))
     root, code = folder / "root", folder / ("rom" if case.in_place else "root")
     files = modules(case.firmware)
     if not folder.exists():
         _fill(root, code, case, files)
-    done = run(root, root / "start.py", heap=heap, capped=capped, timeout_s=20.0 if capped else _ENOUGH_S)
+    done = run(root, root / "start.py", heap=_HEAP, timeout_s=_ENOUGH_S)
     assert done.returncode == 0, done.stdout + done.stderr
     figures = json.loads(done.stdout.splitlines()[-1])
     loaded = [(code / file).with_suffix(".mpy") for file in _loaded(case, files)]
@@ -105,19 +105,6 @@ def _names_here(printed: str, *, in_place: bool) -> int:
     return after - before - (text_after - text_before if in_place else 0)
 
 
-def smallest(case: Case, folder: Path) -> int:
-    """The least heap in which it lives its minute, in bytes; boards need less, for they collect in the midst of it."""
-    below, enough, baseline = 0, 2 * _HEAP, 0
-    while enough - below > 512:
-        middle = (below + enough) // 2
-        try:
-            baseline = measure(case, folder, heap=middle, capped=True).baseline
-            enough = middle
-        except (AssertionError, subprocess.TimeoutExpired):  # without memory the interpreter may stand still
-            below = middle
-    return enough - baseline
-
-
 def _loaded(case: Case, files: list[Path]) -> list[Path]:
     return [file for file in files if file.stem not in _UNUSED.get(case.image, ())]
 
@@ -133,13 +120,7 @@ def _fill(root: Path, code: Path, case: Case, files: list[Path]) -> None:
         compile_file(SCRIPTS / f"{name}.py", root / f"{name}.mpy")
     # with a ROM file system, that is the working folder
     (root / "start.py").write_text("import sys\nsys.path.append('/')\nfrom heap import turn\n")
-    workload = (
-        "workload_described"
-        if case.robot in _DESCRIBED
-        else "workload_serial"
-        if case.firmware.is_report
-        else "workload_network"
-    )
+    workload = "workload_serial" if case.firmware.is_report else "workload_network"
     settings = {} if case.firmware.is_report else {**_SETTINGS, "robot": {"id": case.robot}}
     if case.image == NAMED:
         settings["security"] = {"level": "named", "strangers": "free"}
@@ -150,6 +131,7 @@ def _fill(root: Path, code: Path, case: Case, files: list[Path]) -> None:
         "robot": case.robot,
         "workload": workload,
         "stock": case.image == STOCK,
+        "described": case.robot in _DESCRIBED,
         "settings": settings,
         "by": "by/page-1/" if case.image == NAMED else "",
     }

@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-import sys
 import tempfile
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
-from pebble.extensions.install.flash.boards import FIRMWARE
-from pebble.extensions.install.flash.sources import modules
-from tests.firmware.heap import CASES, LIMITS, Case, Cost, measure, smallest
-from tests.firmware.micropython import compile_module
+from tests.firmware.heap import CASES, LIMITS, Case, Cost, measure
 from tests.support import ROOT
 
 DOCS = ROOT / "docs" / "firmware.md"
@@ -19,16 +15,10 @@ _HEAD = "| robot | files | names | code loaded | starting | robot made | in use,
 
 def main() -> None:
     with tempfile.TemporaryDirectory() as folder, ThreadPoolExecutor(2) as pool:
-        print(*module_sizes(Path(folder, "modules")), sep="\n")
-        print()
         costs = pool.map(lambda case: measure(case, Path(folder)), CASES)
         table = heap_table(dict(zip(CASES, costs, strict=True)))
         print(*table, sep="\n")
         _write(table)
-        if "--smallest" in sys.argv:
-            print()
-            sizes = pool.map(lambda case: smallest(case, Path(folder)), CASES)
-            print(*(f"{case}: lives in {size} bytes" for case, size in zip(CASES, sizes, strict=True)), sep="\n")
 
 
 def documented() -> dict[str, list[str]]:
@@ -45,26 +35,6 @@ def _write(table: list[str]) -> None:
 def _table(text: str) -> str:
     start = text.index(_HEAD)
     return text[start : text.index("\n\n", start)]
-
-
-def module_sizes(folder: Path) -> list[str]:
-    """Bytes of each compiled module, per robot."""
-    names = list(FIRMWARE)
-    sizes: dict[str, dict[str, int]] = {}
-    for robot, firmware in FIRMWARE.items():
-        for module in modules(firmware):
-            compiled = compile_module(firmware, module, folder / robot)
-            sizes.setdefault(module.with_suffix("").as_posix(), {})[robot] = compiled.stat().st_size
-    rows = [
-        f"| {module} | {' | '.join(str(of.get(name, '')) for name in names)} |" for module, of in sorted(sizes.items())
-    ]
-    totals = [sum(of.get(name, 0) for of in sizes.values()) for name in names]
-    return [
-        f"| .mpy, bytes | {' | '.join(names)} |",
-        f"|---|{'--:|' * len(names)}",
-        *rows,
-        f"| all | {' | '.join(map(str, totals))} |",
-    ]
 
 
 def heap_table(costs: dict[Case, Cost]) -> list[str]:

@@ -145,19 +145,8 @@ ATTEMPTS = [  # strangers, topic, key, a script's run, whether it moves
     ("drive", "drive-values", "", 0, True),
     ("drive", "drive-values", HOLDERS, 0, False),
     ("drive", "drive-values", "", 1, False),
-    *(
-        ("drive", f"by/{name}drive-values", HOLDERS, 0, False)
-        for name in (
-            "page-1/by/page-1/",
-            "otto/by/page-1/",
-            "Page-1/",
-            "page-1//",
-            "-/",
-            "",
-            f"{'a' * 33}/",
-            "page-1/x/",
-        )
-    ),
+    ("drive", "by/otto/by/page-1/drive-values", HOLDERS, 0, False),
+    ("drive", "by/Page-1/drive-values", HOLDERS, 0, False),
 ]
 
 
@@ -180,13 +169,7 @@ def test_where_names_are_checked_a_key_counts_for_its_account_only(strangers: st
 def test_of_what_has_no_name_or_is_retained_only_stops_and_zeros_count(kind: str) -> None:
     drill = at_named(kind)
     key = drill.control()["key"]
-    for metric in (
-        "control",
-        "control/take",
-        "by/otto/control/x",
-        "by/by/otto/control/take",
-        "by/otto/by/otto/control",
-    ):
+    for metric in ("control", "control/take", "by/otto/by/otto/control"):
         send(drill, metric, id="bbbbbbbb", by="otto")
     send(drill, "by/otto/control/take", id="bbbbbbbb", retain=True)  # live: it counts, and again as a retained one not
     run(drill, 0.5)

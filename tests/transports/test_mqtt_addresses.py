@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import os
 import socket
-import subprocess
 import time
 from collections.abc import Callable, Iterator
-from pathlib import Path
 from threading import Event
 from typing import Any
 
@@ -15,27 +13,14 @@ import pytest
 
 from pebble.transports import MqttSettings, QoS, State, Transport, create
 from pebble.transports.hosts import HANDSHAKE_S, STEADY_S, Address, AddressRound, HostPort
-from pebble.transports.settings import TlsSettings
-from tests.fakes.bad_brokers import BEHAVIOURS, mute, serving, showing
-from tests.support import ROOT, Broker, free_port, some
+from tests.fakes.bad_brokers import BEHAVIOURS, mute, serving
+from tests.support import Broker, free_port, some
 
 NAME = "fleet.test"
 GOOD, BAD, WORSE = "127.0.0.1", "127.0.0.2", "127.0.0.3"
 #: Fails without a server: no route, no such address of this machine, no such family.
 UNREACHABLE = {"no route": "2001:db8::1", "nobody's": "240.0.0.1", "a network": "0.0.0.0"}
-CERTS = ROOT / "tests" / "data" / "tls"
 Names = Callable[..., None]
-
-
-def certificate_of(host: str, folder: Path) -> Path:
-    """A folder with ``server.pem`` and ``server.key`` of this host."""
-    folder = folder / host
-    folder.mkdir()
-    command = ["openssl", "req", "-x509", "-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:prime256v1", "-nodes"]
-    names = ["-subj", f"/CN={host}", "-addext", f"subjectAltName=DNS:{host}"]
-    files = ["-keyout", folder / "server.key", "-out", folder / "server.pem"]
-    subprocess.run([*command, *names, *files], check=True, capture_output=True)
-    return folder
 
 
 @pytest.fixture(scope="module")
@@ -87,27 +72,6 @@ def test_whatever_way_the_first_one_fails(
         assert transport.state is State.CONNECTED, transport.problem
         assert transport.as_published is as_published
         assert works(transport)
-
-
-@pytest.mark.parametrize("failing", ["stalled handshake", "wrong name", "closing", "no TLS"])
-def test_tls_checks_the_name_at_every_address(
-    tmp_path: Path, names: Names, monkeypatch: pytest.MonkeyPatch, failing: str
-) -> None:
-    """The broker's certificate names localhost, whose addresses are these."""
-    wrong = certificate_of("elsewhere", tmp_path)
-    behaviour = {"stalled handshake": mute, "wrong name": showing(wrong), "no TLS": BEHAVIOURS["no MQTT"]}
-    files = [f"cafile {CERTS}/ca.crt", f"certfile {CERTS}/server.crt", f"keyfile {CERTS}/server.key"]
-    secured = Broker(tmp_path, *files)
-    names(BAD, GOOD, name="localhost")
-    monkeypatch.setattr("pebble.transports.hosts.CONNECT_TIMEOUT_S", 1.0)
-    trusted = tmp_path / "both.crt"
-    trusted.write_text((CERTS / "ca.crt").read_text() + (wrong / "server.pem").read_text())
-    settings = MqttSettings(host="localhost", port=secured.port, tls=TlsSettings(ca_cert=trusted))
-    failing_server = serving(BAD, secured.port, behaviour.get(failing, BEHAVIOURS["closing"]))
-    with failing_server, create("mqtt", "tool", settings) as transport:
-        assert transport.state is State.CONNECTED, transport.problem
-        assert works(transport)
-    secured.stop()
 
 
 def test_when_all_fail_one_line_names_each_address_and_its_reason(

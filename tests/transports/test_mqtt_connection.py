@@ -20,16 +20,15 @@ from pebble.transports.mqtt.connection import Connection
 from pebble.transports.mqtt.ending import Lost, Silent
 from pebble.transports.mqtt.packets import Filter
 from pebble.transports.mqtt.transport import MqttTransport
+from tests.kit.mqtt_bytes import packet, publish
 from tests.support import until
-from tests.transports.test_mqtt_packets import packet
 
 PONG = packet(0xD0, b"")
 
 
-def sent(payload: bytes, *, topic: bytes = b"a", retain: bool = False, mid: int = 0) -> bytes:
-    """A PUBLISH; of QoS 1 with an id."""
-    head = bytes((0, len(topic))) + topic + (bytes((0, mid)) if mid else b"")
-    return packet(0x30 | (2 if mid else 0) | int(retain), head + payload)
+def sent(payload: bytes, *, topic: str = "a", retain: bool = False, mid: int = 0) -> bytes:
+    """Return a PUBLISH; of QoS 1 with an id."""
+    return publish(topic, payload, int(mid > 0), mid, retain=retain)
 
 
 class Link:
@@ -119,7 +118,7 @@ def test_a_message_is_acknowledged_when_it_was_handled_even_if_that_failed(link:
 
 def test_a_retained_message_is_not_skipped_while_an_older_one_of_its_batch_may_change_that(link: Link) -> None:
     link.owner.policy.skips_retained = lambda topic: topic == b"b"
-    link.sends(sent(b"1", topic=b"b", retain=True), sent(b"2"), sent(b"3", topic=b"b", retain=True))
+    link.sends(sent(b"1", topic="b", retain=True), sent(b"2"), sent(b"3", topic="b", retain=True))
     link.pump(until_read=2)
     assert [message.payload for message in link.messages] == [b"2", b"3"]
 
