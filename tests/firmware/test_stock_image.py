@@ -91,15 +91,6 @@ def test_a_host_that_does_not_read_does_not_keep_the_motors_running() -> None:
     assert bench.motors[-1][0] - 3.1 <= 1.6, "one wait of half a second may come in between"
 
 
-def test_it_speaks_again_when_the_host_reads_again() -> None:
-    bench = Endless()
-    console = bench.board.console
-    bench.plan = [(at, lambda on=on: setattr(console, "reading", on)) for at, on in ((2.0, False), (4.0, True))]  # type: ignore[misc]
-    bench.run(6.6)
-    assert len([when for when in bench.lines(rb"T a0=.*") if when > 5.6]) >= 49
-    assert not any(b"\r\r" in data for _, data in bench.output)
-
-
 def test_a_flood_does_not_keep_the_motors_running() -> None:
     bench = Endless()
     bench.type({1.5: b"M 1 1\n" + b"x" * 100_000})

@@ -23,6 +23,7 @@ from pebble.errors import TransportError
 from pebble.transports import Message, MqttSettings, QoS, State, TlsSettings, Transport, clock, create
 from pebble.transports.mqtt import refused_topics
 from pebble.transports.mqtt import transport as transport_module
+from pebble.transports.mqtt.client import Client
 from pebble.transports.mqtt.connection import UNACKED_LIMIT, UNACKED_RESERVE
 from pebble.transports.mqtt.packets import MAX_PACKET
 from pebble.transports.topics import MAX_BYTES
@@ -166,24 +167,6 @@ def test_as_published_drops_own_retained_messages_but_not_those_of_others(
 
 
 @both_protocols
-def test_as_published_delivers_retained_messages_once_per_subscription(
-    broker: Broker, clients: Clients, topic: str, protocol: str
-) -> None:
-    bridge, other = clients(broker.port, "bridge", as_published=True, protocol=protocol), clients(broker.port)
-    first, second = Received(), Received()
-    other.publish(f"{topic}/a", b"A", qos=DELIVERED, retain=True)
-    bridge.subscribe(f"{topic}/#", first, echo=False)
-    assert first.until(b"A")
-    bridge.subscribe(f"{topic}/a", second, echo=False)
-    assert second.until(b"A")
-    for _ in range(2):  # equal, but not repeats
-        other.publish(f"{topic}/a", b"A", qos=DELIVERED, retain=True)
-    other.publish(f"{topic}/a", b"B", qos=DELIVERED, retain=True)
-    assert first.until(b"A", b"A", b"A", b"B")
-    assert second.until(b"A", b"A", b"A", b"B")
-
-
-@both_protocols
 def test_subscribe_returns_after_the_retained_messages_however_long_after_the_suback(
     broker: Broker, clients: Clients, protocol: str
 ) -> None:
@@ -234,12 +217,6 @@ def test_a_broker_that_hangs_up_on_bridge_mode_gets_a_plain_connection_until_it_
         assert wills.until(b"gone", b"last")  # of the one that was dropped: a probe has none
 
 
-def test_a_broker_without_mqtt_5_is_a_problem_in_words(amqtt: AmqttBroker, clients: Clients) -> None:
-    client = clients(amqtt.port, protocol="5", opened=False)
-    client.open(0.2)
-    assert until(lambda: f"broker 127.0.0.1:{amqtt.port} refused us: unsupported protocol version" in client.problem)
-
-
 def test_mixed_echo_on_mqtt_5_is_reported_as_inexact(broker: Broker, clients: Clients, topic: str) -> None:
     client, quiet, loud = clients(broker.port, protocol="5"), Received(), Received()
     assert client.exact_echo
@@ -254,29 +231,22 @@ def test_mixed_echo_on_mqtt_5_is_reported_as_inexact(broker: Broker, clients: Cl
     assert not client.exact_echo
 
 
-def test_urgent_messages_expire_on_mqtt_5(broker: Broker, clients: Clients, topic: str) -> None:
+def test_urgent_messages_expire_on_mqtt_5(
+    broker: Broker, clients: Clients, topic: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """A command that waits in the broker for a slow robot is stale after a while; a retained flag never is."""
-    expiries = []
-    listener = paho.Client(CallbackAPIVersion.VERSION2, protocol=paho.MQTTv5)
-    listener.on_connect = lambda client, *_: client.subscribe(f"{topic}/#", 1)
-    listener.on_message = lambda _client, _data, raw: expiries.append(
-        getattr(raw.properties, "MessageExpiryInterval", None)
-    )
-    subscribed = threading.Event()
-    listener.on_subscribe = lambda *_: subscribed.set()
-    listener.connect("127.0.0.1", broker.port)
-    listener.loop_start()
-    try:
-        assert subscribed.wait(10)
-        client = clients(broker.port, protocol="5", silence_s=2.5)
-        client.publish(topic, b"command", qos=DELIVERED, urgent=True)
-        client.publish(f"{topic}/flag", b"true", qos=DELIVERED, retain=True, urgent=True)
-        client.publish(topic, b"event", qos=DELIVERED)
-        assert until(lambda: len(expiries) == 3)
-        assert expiries == [3, None, None]
-    finally:
-        listener.disconnect()
-        listener.loop_stop()
+    expiries, publish = list[int | None](), Client.publish
+
+    def note(client: Client, *arguments: Any, expires_s: int | None, **options: Any) -> int:
+        expiries.append(expires_s)
+        return publish(client, *arguments, expires_s=expires_s, **options)
+
+    monkeypatch.setattr(Client, "publish", note)
+    client = clients(broker.port, protocol="5", silence_s=2.5)
+    client.publish(topic, b"command", qos=DELIVERED, urgent=True)
+    client.publish(f"{topic}/flag", b"true", qos=DELIVERED, retain=True, urgent=True)
+    client.publish(topic, b"event", qos=DELIVERED)
+    assert until(lambda: expiries == [3, None, None])
 
 
 def test_a_protocol_that_does_not_exist_is_refused(broker: Broker, clients: Clients) -> None:
@@ -379,31 +349,6 @@ def test_retained_messages_may_take_longer_than_an_answer(
         assert received.until(*[bytes(size)] * count)
         assert robot.counters["connected"] == 1
         assert robot.counters["silences"] == 0
-
-
-def test_the_time_in_which_retained_messages_are_handled_is_no_silence_but_what_came_meanwhile_is_as_old(
-    broker: Broker, clients: Clients, topic: str
-) -> None:
-    planter, began, ages = clients(broker.port, "planter"), threading.Event(), list[tuple[float, float]]()
-    for number in range(3):
-        assert planter.publish(f"{topic}/{number}", b"x", qos=DELIVERED, retain=True)
-    robot = clients(broker.port, "robot", silence_s=0.3)
-
-    def receive(message: Message) -> None:
-        if message.retain:
-            began.set()
-            time.sleep(0.5)
-        else:
-            ages.append((clock.since_boot() - float(message.payload), message.waited_s))
-
-    subscribing = threading.Thread(target=robot.subscribe, args=(f"{topic}/#", receive), kwargs={"direct": True})
-    subscribing.start()
-    assert began.wait(10)
-    assert planter.publish(topic, b"%f" % clock.since_boot(), qos=DELIVERED)
-    assert until(lambda: ages)
-    assert ages[0][1] >= ages[0][0] - 0.05 > 0.9
-    assert (robot.counters["silences"], robot.counters["connected"]) == (0, 1)
-    subscribing.join()
 
 
 @any_protocol
@@ -792,26 +737,6 @@ def test_a_merged_filter_is_refused_for_all_it_covers(refusing: RefusingBroker, 
     assert (one.refused, other.refused, apart.refused) == (True, True, False)
 
 
-def test_a_refused_query_of_own_retained_topics_refuses_no_subscription(
-    refusing: RefusingBroker, clients: Clients, topic: str
-) -> None:
-    client, received = clients(refusing.port), Received()
-    client.publish(f"{topic}/own", b"1", qos=DELIVERED, retain=True)
-    subscription = client.subscribe(f"{topic}/+", received)
-    answers: list[tuple[list[str], bool]] = []
-    note = client.note_answers  # type: ignore[attr-defined]
-
-    def note_answers(refused: dict[str, bool]) -> None:
-        note(refused)
-        answers.append((list(refused), subscription.refused))
-
-    client.note_answers = note_answers  # type: ignore[attr-defined]
-    refusing.refuse(f"{topic}/own")
-    assert reconnected(client)
-    assert client.counters["subscriptions_refused"] == 1
-    assert answers == [([f"{topic}/own"], False), ([f"{topic}/+"], False)]
-
-
 # -- logins and TLS
 
 
@@ -847,6 +772,7 @@ def test_tls_with_client_certificates(tls_broker: Broker, clients: Clients, topi
     client.publish(topic, b"small", qos=DELIVERED)
     client.publish(topic, payload, qos=DELIVERED)
     assert received.until(b"small", payload)
+    clients(tls_broker.port, "careless", tls=tls(insecure=True))
 
 
 @pytest.mark.parametrize(
@@ -864,7 +790,6 @@ def test_tls_checks_host_name_and_authority_and_shows_a_certificate(
     client.open(0.3)
     assert until(lambda: client.problem and problem in client.problem)
     assert client.state is State.CONNECTING
-    clients(tls_broker.port, "careless", tls=tls(insecure=True))
 
 
 @pytest.mark.parametrize(

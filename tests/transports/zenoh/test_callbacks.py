@@ -16,18 +16,6 @@ from tests.support import until
 from tests.transports.zenoh_net import HubProcess
 
 SESSIONS, MESSAGES = 4, 50
-FORKED = """
-import os, sys
-from pathlib import Path
-from pebble.transports import ZenohSettings, create
-environment = {name: value for name, value in os.environ.items() if name != "ZENOH_RUNTIME"}
-import pebble.transports.zenoh.transport
-os.environ.clear()
-os.environ.update(environment)
-settings = ZenohSettings(run_dir=Path(sys.argv[1]))
-with create("zenoh", "one", settings), create("zenoh", "other", settings):
-    print(*{(task / "comm").read_text().split("-")[0].strip() for task in Path("/proc/self/task").iterdir()})
-"""
 
 #: Answers with more than the sockets hold: from its handler, or from a thread for which its handler waits meanwhile.
 ANSWERING = """
@@ -202,12 +190,3 @@ def test_there_are_few_states_however_many_messages_and_sessions(
     finally:
         hub.end()
     assert min(most, 1) <= len(made) <= most
-
-
-def test_a_service_with_an_environment_of_its_own_reads_on_one_runtime(hub: HubProcess) -> None:
-    """The launcher imports the transport, forks, and sets the service's environment. Else `acc` and `net` wake `rx`."""
-    command = [sys.executable, "-c", FORKED, str(hub.settings.run_dir)]
-    done = subprocess.run(command, check=True, capture_output=True, text=True, timeout=30)
-    runtimes = set(done.stdout.split())
-    assert "rx" in runtimes
-    assert runtimes.isdisjoint({"acc", "net"})

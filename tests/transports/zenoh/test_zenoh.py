@@ -24,7 +24,6 @@ import zenoh
 
 from pebble.errors import TransportError
 from pebble.extensions.lab.bench.usage import pss_mb
-from pebble.runtime.hub import run_hub
 from pebble.transports import Message, QoS, State, TlsSettings, Transport, ZenohSettings, create
 from pebble.transports.zenoh import publishers, wire
 from pebble.transports.zenoh import session as zenoh_session
@@ -626,17 +625,6 @@ def test_the_hub_explains_its_arguments() -> None:
         hub = Forked("pebble.runtime.hub", arguments)
         assert hub.wait(20) == 1
         assert "Traceback" not in hub.printed
-
-
-def test_the_hub_runs_as_a_function(tmp_path: Path) -> None:
-    settings, stop = ZenohSettings(run_dir=tmp_path / "run"), threading.Event()
-    thread = threading.Thread(target=run_hub, args=(settings, stop))
-    thread.start()
-    with create("zenoh", "client", settings) as client:
-        assert client.state is State.CONNECTED
-    stop.set()
-    thread.join(10)
-    assert (thread.is_alive(), list(settings.run_dir.iterdir())) == (False, [])
 
 
 def test_a_tool_waits_for_a_hub(robot: Robot) -> None:
