@@ -314,12 +314,6 @@ def test_only_who_was_asked_may_answer(
     assert sockets.Query(asked, 53, b"question", 0).step(0) == received
 
 
-def test_the_end_of_a_connection_has_a_readable_reason(monkeypatch: pytest.MonkeyPatch) -> None:
-    FakeSocket(monkeypatch, reads=0)
-    with pytest.raises(OSError, match="closed by the broker"):
-        sockets.Stream("10.0.0.2", 1883, None).read(memoryview(bytearray(1)))
-
-
 def test_what_tls_could_not_send_comes_again_as_it_was(monkeypatch: pytest.MonkeyPatch) -> None:
     socket = FakeSocket(monkeypatch)
     stream, data = sockets.Stream("10.0.0.2", 1883, None), memoryview(b"heartbeat and more")

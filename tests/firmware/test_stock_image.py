@@ -74,14 +74,6 @@ def test_it_obeys_answers_and_stops_in_silence(kind: str) -> None:
     assert bench.board.resets == 0
 
 
-@pytest.mark.parametrize(("kind", "rate_hz"), [("goob", 50), ("fred", 2)])
-def test_it_reports_on_time(kind: str, rate_hz: int) -> None:
-    bench = Endless(kind)
-    bench.run(11.0, main=True)
-    reports = bench.lines(rb"T [at]0=.*")
-    assert len([when for when in reports if when > 1.0]) == pytest.approx(rate_hz * 10, abs=2)
-
-
 def test_a_host_that_does_not_read_does_not_keep_the_motors_running() -> None:
     bench = Endless()
     bench.board.console.reading = False

@@ -217,20 +217,6 @@ def test_a_broker_that_hangs_up_on_bridge_mode_gets_a_plain_connection_until_it_
         assert wills.until(b"gone", b"last")  # of the one that was dropped: a probe has none
 
 
-def test_mixed_echo_on_mqtt_5_is_reported_as_inexact(broker: Broker, clients: Clients, topic: str) -> None:
-    client, quiet, loud = clients(broker.port, protocol="5"), Received(), Received()
-    assert client.exact_echo
-    client.subscribe(f"{topic}/a", quiet, echo=False)
-    client.subscribe(f"{topic}/b", loud)
-    client.publish(f"{topic}/a", b"a", qos=DELIVERED)
-    client.publish(f"{topic}/b", b"b", qos=DELIVERED)
-    assert loud.until(b"b")
-    assert quiet.payloads == []
-    assert client.exact_echo
-    client.subscribe(f"{topic}/#", loud)
-    assert not client.exact_echo
-
-
 def test_urgent_messages_expire_on_mqtt_5(
     broker: Broker, clients: Clients, topic: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -666,28 +652,6 @@ def test_an_older_value_at_a_broker_is_replaced_unless_others_may_have_chosen_it
     assert until(
         lambda: sorted((one.topic[-3:], one.payload) for one in late.messages) == [("own", b"new"), ("red", b"old")]
     )
-
-
-# -- what is on its way
-
-
-@any_protocol
-def test_a_refused_connection_is_explained_in_full(broker: Broker, clients: Clients, topic: str, protocol: str) -> None:
-    client = clients(broker.port, protocol=protocol, silence_s=30)
-    assert until(lambda: client.outgoing.waiting == 0)
-    broker.freeze()
-    try:
-        sent = 0
-        while client.counters["dropped"] == 0:  # through the kernels' buffers, the client's, and the backlog
-            assert client.publish(topic, bytes(50_000))
-            sent += 50_000
-            waiting = client.outgoing.waiting
-            assert waiting <= sent + 10_000
-        assert waiting > 256 * 1024  # more than a full backlog: the kernel's part is included
-    finally:
-        broker.thaw()
-    assert until(lambda: client.outgoing.waiting == 0)
-    assert 0 < client.outgoing.round_trip_s < 5
 
 
 # -- refused subscriptions (T21)

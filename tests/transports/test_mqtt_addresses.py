@@ -90,17 +90,6 @@ def test_when_all_fail_one_line_names_each_address_and_its_reason(
     assert [record.getMessage() for record in caplog.records] == [f"tool: {transport.problem}"]
 
 
-def test_which_addresses_failed_is_logged_once_another_works(
-    broker: Broker, names: Names, caplog: pytest.LogCaptureFixture
-) -> None:
-    names(BAD, GOOD)
-    caplog.set_level("INFO")
-    with create("mqtt", "tool", MqttSettings(host=NAME, port=broker.port)) as transport:
-        assert transport.problem == ""
-    why = f"connected to broker {NAME}:{broker.port} at {GOOD}; before it {BAD} cannot be reached"
-    assert [record.getMessage()[: len(why) + 6] for record in caplog.records] == [f"tool: {why}"]
-
-
 def test_close_does_not_wait_for_a_resolver(monkeypatch: pytest.MonkeyPatch) -> None:
     asked, go_on = Event(), Event()
 

@@ -15,8 +15,6 @@ from pebble.transports.zenoh import callbacks
 from tests.support import until
 from tests.transports.zenoh_net import HubProcess
 
-SESSIONS, MESSAGES = 4, 50
-
 #: Answers with more than the sockets hold: from its handler, or from a thread for which its handler waits meanwhile.
 ANSWERING = """
 import sys, threading
@@ -127,24 +125,6 @@ def test_threads_of_python_are_not_watched(hub: HubProcess, monkeypatch: pytest.
     assert guard.watched <= 2  # of Zenoh's, for the hub's answers
 
 
-def test_without_a_thread_for_the_guard_messages_are_handled(
-    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
-    guard = callbacks.Guard()
-    with monkeypatch.context() as patched:
-        patched.setattr(threading.Thread, "start", _refuse)
-        guard.wake()
-        guard.wake()
-    assert guard.rests
-    assert caplog.text.count("no guard for handlers that wait") == 1  # not once for each message
-    guard.wake()
-    assert not guard.rests
-
-
-def _refuse(_thread: threading.Thread) -> None:
-    raise RuntimeError("can't start new thread")
-
-
 def test_a_closed_session_is_forgotten(hub: HubProcess) -> None:
     with create("zenoh", "one", hub.settings):
         sessions = callbacks.guard.sessions
@@ -163,30 +143,3 @@ def test_the_guard_rests_without_callbacks(monkeypatch: pytest.MonkeyPatch) -> N
         calls.ended += 1
         assert until(lambda: guard.rests, 5)
         guard.helped = 0
-
-
-@pytest.mark.parametrize("most", [0, 1, callbacks.MOST])
-def test_there_are_few_states_however_many_messages_and_sessions(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, most: int
-) -> None:
-    """Beyond them everything works as well."""
-    made, received, ensure = list[None](), list[Message](), callbacks.ensure_state
-    monkeypatch.setattr(callbacks, "ensure_state", lambda: (made.append(None), ensure()))
-    monkeypatch.setattr(callbacks, "guard", callbacks.Guard())
-    monkeypatch.setattr(callbacks, "_own", threading.local())
-    monkeypatch.setattr(callbacks, "MOST", most)
-    hub = HubProcess(tmp_path).start()
-    try:
-        with create("zenoh", "sender", hub.settings) as sender:
-            for session in range(1, SESSIONS + 1):
-                with create("zenoh", "receiver", hub.settings) as receiver:
-                    receiver.subscribe("a/b", received.append, direct=True)
-                    assert until(
-                        lambda enough=session * MESSAGES: (  # type: ignore[misc]
-                            sender.publish("a/b", b"1", qos=QoS.DELIVERED) and len(received) >= enough
-                        ),
-                        10,
-                    )
-    finally:
-        hub.end()
-    assert min(most, 1) <= len(made) <= most

@@ -18,7 +18,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import msgspec
 import pytest
 import zenoh
 
@@ -671,24 +670,6 @@ def test_a_message_that_waited_in_a_socket_too_long_is_dropped(robot: Robot, mon
     sender.publish("drive", b"fresh", qos=DELIVERED)
     assert until(lambda: [m.payload for m in received] == [b"old", b"fresh"])
     assert client.counters["late"] == 1
-
-
-def test_a_hub_that_talks_nonsense_does_not_deafen_a_client(robot: Robot, monkeypatch: pytest.MonkeyPatch) -> None:
-    """One of another version, say: its client tries again, and is connected when it makes sense."""
-    client = robot.client("client")
-    robot.hub.kill()
-    assert until(lambda: client.state is State.CONNECTING)
-    understood, left = wire.decode_keys, iter(range(3))
-
-    def hardly_understood(answer: bytes) -> list[str]:
-        if next(left, None) is not None:
-            raise msgspec.DecodeError(str(answer))
-        return understood(answer)
-
-    monkeypatch.setattr(wire, "decode_keys", hardly_understood)
-    robot.hub.start()
-    assert until(lambda: client.state is State.CONNECTED)
-    assert next(left, None) is None
 
 
 @pytest.mark.parametrize("endpoint", ["tcp/127.0.0.1:{}", "tcp/localhost:{}", "tcp/127.0.0.1:{}#iface=lo"])
