@@ -198,20 +198,6 @@ def test_of_a_burst_only_the_newest_acts(kind: str) -> None:
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_a_command_right_behind_the_subscription_acts_at_once_or_never(kind: str) -> None:
-    drill = online(kind)
-    drill.drop_robot()
-    while drill.robot.session.connection.state != "connecting":
-        drill.turn(0.01)
-    start = drill.seconds
-    while drill.robot.session.connection.state != "online":
-        drill.command(0.0, 0.5)
-        drill.turn(0.005)
-    drill.run(start + 5)  # the rule is checked at every turn
-    assert not any(drill.outputs())
-
-
-@pytest.mark.parametrize("kind", KINDS)
 def test_who_loses_the_broker_stops_at_once(kind: str) -> None:
     drill = online(kind)
     drill.command(0.0, 0.5)

@@ -12,19 +12,14 @@ import pytest
 
 from pebble.transports import Message, MqttSettings, QoS, State
 from pebble.transports.mqtt.transport import MqttTransport
-from tests.forwarding.links.rig import MqttEnd, Rig, Side
 from tests.robot.operator import Operator
 from tests.robot.rig import BASE, STOP
 from tests.robot.rig import Rig as RobotRig
-from tests.services.mqtt_bridge.bridge_rig import Quiet
 from tests.support import Broker, beside, until
 from tests.transports.brokers import MAKERS, ROBOT, Maker, sparing_aedes
 from tests.transports.received import Received
 
 pytestmark = [pytest.mark.alone, pytest.mark.thorough]  # deadlines are checked; make long PART=brokers runs it
-
-FLAG = "incoming/flags/mqtt-audio"
-TRUE, FALSE = b'{"value": true}', b'{"value": false}'
 
 
 def needed(name: str) -> Maker:
@@ -93,25 +88,6 @@ def test_what_an_account_may_not_publish_costs_it_that_and_is_reported(
             assert until(lambda: {message.topic for message in seen.messages[before:]} == topics, 20)
             assert robot.counters["connected"] == held
         assert {one.topic for one in seen.messages} == {f"{base}/outgoing/imu", f"{base}/outgoing/online"}
-
-
-def test_an_operators_flag_is_not_overwritten_by_a_robot_that_starts(broker: Broker, tmp_path: Path) -> None:
-    own = MqttEnd(tmp_path)
-    rig = Rig("bridge", own, MqttEnd(tmp_path, broker=broker))
-    try:
-        rig.local.publish(FLAG, TRUE, retain=True)
-        rig.remote.publish(FLAG, FALSE, retain=True)
-        for client in (rig.local, rig.remote):
-            client.transport.close()
-        rig.start()
-        Quiet(rig.client(Side.LOCAL)).wait(0.5)
-        assert rig.retained(Side.LOCAL)[FLAG] == FALSE
-        operator = rig.client(Side.REMOTE)
-        operator.transport.ask([f"{rig.base}/{FLAG}"])
-        assert until(lambda: {*operator.payloads(FLAG)} == {FALSE}), operator.payloads(FLAG)
-    finally:
-        rig.close()
-        own.close()
 
 
 def test_a_whole_robot_is_driven_and_stopped_although_it_may_not_publish_a_stream(maker: Maker, broker: Broker) -> None:

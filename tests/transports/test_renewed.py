@@ -14,6 +14,7 @@ from pebble.extensions.fleet import certificates
 from pebble.transports import MqttSettings, State, TlsSettings, create
 from pebble.transports.renewed import Renewed
 from tests.support import Broker, until
+from tests.transports.test_tls import shake_hands
 
 
 def _number(file: Path) -> int:
@@ -120,13 +121,6 @@ def test_the_page_shows_a_renewed_certificate_to_new_connections(tmp_path: Path)
 
 
 def _shown(listening: ssl.SSLContext, authority: Path) -> bytes | None:
-    """The certificate that a new connection gets; in memory."""
-    there, back = ssl.MemoryBIO(), ssl.MemoryBIO()
-    client = ssl.create_default_context(cafile=str(authority)).wrap_bio(back, there, server_hostname="localhost")
-    server = listening.wrap_bio(there, back, server_side=True)
-    for end in (client, server, client, server) * 2:
-        try:
-            end.do_handshake()
-        except ssl.SSLWantReadError:
-            continue
+    """Return the certificate that a new connection gets."""
+    client = shake_hands(ssl.create_default_context(cafile=str(authority)), listening)
     return client.getpeercert(binary_form=True)

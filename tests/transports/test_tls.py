@@ -7,7 +7,6 @@ import ssl
 import threading
 import time
 from contextlib import closing, nullcontext, suppress
-from itertools import cycle, islice
 from unittest import mock
 
 import pytest
@@ -23,22 +22,24 @@ CERTS = ROOT / "tests" / "data" / "tls"
 EVERY_CIPHER = "ALL:@SECLEVEL=0"
 
 
-def agreed(version: ssl.TLSVersion) -> str | None:
-    """What a connection agrees on with a server that speaks only ``version``; in memory."""
-    with_server = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
-    with_server.load_cert_chain(CERTS / "server.crt", CERTS / "server.key")
-    with_server.set_ciphers(EVERY_CIPHER)
-    with_server.minimum_version = with_server.maximum_version = version
-    with_client = make_context(TlsSettings(ca_cert=CERTS / "ca.crt"))
+def shake_hands(ours: ssl.SSLContext, theirs: ssl.SSLContext) -> ssl.SSLObject:
+    """Return our end of a connection to localhost; in memory."""
     there, back = ssl.MemoryBIO(), ssl.MemoryBIO()
-    client = with_client.wrap_bio(back, there, server_hostname="localhost")
-    server = with_server.wrap_bio(there, back, server_side=True)
-    for end in islice(cycle((client, server)), 8):
-        try:
+    client = ours.wrap_bio(back, there, server_hostname="localhost")
+    server = theirs.wrap_bio(there, back, server_side=True)
+    for end in (client, server) * 4:
+        with suppress(ssl.SSLWantReadError):
             end.do_handshake()
-        except ssl.SSLWantReadError:
-            continue
-    return client.version()
+    return client
+
+
+def agreed(version: ssl.TLSVersion) -> str | None:
+    """Return what a connection agrees on with a server that speaks only ``version``."""
+    theirs = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+    theirs.load_cert_chain(CERTS / "server.crt", CERTS / "server.key")
+    theirs.set_ciphers(EVERY_CIPHER)
+    theirs.minimum_version = theirs.maximum_version = version
+    return shake_hands(make_context(TlsSettings(ca_cert=CERTS / "ca.crt")), theirs).version()
 
 
 @pytest.mark.parametrize("version", [ssl.TLSVersion.TLSv1, ssl.TLSVersion.TLSv1_1])
