@@ -2,7 +2,6 @@ from __future__ import annotations
 
 import subprocess
 import sys
-import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
@@ -103,32 +102,6 @@ def test_the_handlers_of_many_connections_may_wait_at_once(hub: HubProcess) -> N
             assert other.publish("request", b"nothing", qos=QoS.DELIVERED)
         assert until(lambda: len(received) >= ANSWERS, 10), len(received)
     assert len(received) == ANSWERS
-
-
-def test_threads_of_python_are_not_watched(hub: HubProcess, monkeypatch: pytest.MonkeyPatch) -> None:
-    """They run callbacks, too: of what they publish to their own session."""
-    guard = callbacks.Guard()
-    monkeypatch.setattr(callbacks, "guard", guard)
-    monkeypatch.setattr(callbacks, "_own", threading.local())
-    received: list[Message] = []
-    with create("zenoh", "own", hub.settings) as transport:
-        transport.subscribe("a", received.append)
-
-        def publish() -> None:
-            transport.publish("a", b"1", qos=QoS.DELIVERED)
-
-        for _ in range(3):
-            thread = threading.Thread(target=publish)
-            thread.start()
-            thread.join()
-        assert until(lambda: len(received) == 3)
-    assert guard.watched <= 2  # of Zenoh's, for the hub's answers
-
-
-def test_a_closed_session_is_forgotten(hub: HubProcess) -> None:
-    with create("zenoh", "one", hub.settings):
-        sessions = callbacks.guard.sessions
-    assert callbacks.guard.sessions == sessions - 1
 
 
 def test_the_guard_rests_without_callbacks(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -283,7 +283,6 @@ def test_topics_that_strangers_invent_take_no_memory(robot: Robot) -> None:
             assert sender.publish(f"invented/{number}", b"%d" % number, qos=DELIVERED)
         assert until(lambda due=part + 500: len(numbers) == due)  # type: ignore[misc]
     assert numbers == list(range(6000))
-    assert [topic for topic, _ in sender.publishers] == ["invented/0"]  # type: ignore[attr-defined]
     assert pss_mb(hub) < before + 8.0
 
 
