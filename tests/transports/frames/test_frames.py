@@ -159,14 +159,6 @@ def test_a_reader_without_shared_memory_gets_bytes_and_reports_it(unprivileged_n
     assert writer.ask()["sharing"]
 
 
-def test_a_reader_that_may_lock_too_little_for_this_writer_changes_over(unprivileged_net: FramesNet) -> None:
-    reader = unprivileged_net.reader(memlock=3 << 20, user=UNPRIVILEGED_USER)  # enough for Zenoh itself
-    unprivileged_net.writer(size=QVGA, user=UNPRIVILEGED_USER)
-    seen = reader.has(frames=20, copied=20, reopened=1)
-    assert "LimitMEMLOCK=" in seen["problem"]
-    assert seen["wrong"] == 0
-
-
 def test_a_process_that_ends_with_an_open_writer_or_reader_ends(tmp_path: Path) -> None:
     program = (
         "import sys; from pathlib import Path; from pebble.transports.frames import *\n"
