@@ -338,39 +338,6 @@ def test_retained_messages_may_take_longer_than_an_answer(
 
 
 @any_protocol
-@pytest.mark.parametrize(("size", "count"), some([(70_000, 5), (70_000, 1), (900_000, 2), (700, 900), (200, 900)], 3))
-def test_what_fits_into_no_socket_while_nothing_is_read_grows_old_all_the_same(
-    broker: Broker, clients: Clients, topic: str, protocol: str, size: int, count: int
-) -> None:
-    """It waits at the broker; and what is sent after that is fresh."""
-    robot, operator = clients(broker.port, protocol=protocol), clients(broker.port)
-    ages: list[tuple[float, float]] = []
-    stalled = threading.Event()
-
-    def receive(message: Message) -> None:
-        if message.topic.endswith("/stall"):
-            stalled.set()
-            time.sleep(0.7)
-        elif message.topic.endswith("/drive"):
-            ages.append((clock.since_boot() - float(message.payload), message.waited_s))
-
-    robot.subscribe(f"{topic}/#", receive, direct=True)
-    operator.publish(f"{topic}/stall", b"")
-    assert stalled.wait(10)
-    for _ in range(count):
-        operator.publish(f"{topic}/bulk", bytes(size))
-        time.sleep(0.0001)
-    operator.publish(f"{topic}/drive", b"%.6f" % clock.since_boot())
-    assert until(lambda: len(ages) == 1)
-    time.sleep(0.1)  # for the answer to a ping
-    operator.publish(f"{topic}/drive", b"%.6f" % clock.since_boot())
-    assert until(lambda: len(ages) == 2)
-    (age, waited), (_, fresh) = ages
-    assert waited >= age - 0.05
-    assert fresh < 0.3
-
-
-@any_protocol
 @pytest.mark.parametrize("qos", [QoS.LATEST, DELIVERED])
 def test_retained_messages_that_are_not_wanted_are_skipped(
     broker: Broker, clients: Clients, topic: str, protocol: str, qos: QoS
