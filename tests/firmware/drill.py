@@ -87,7 +87,6 @@ class Seen:
 
     longest_run: float = 0.0  # motors on, after the last command that arrived
     oldest: float = 0.0  # on its way, from the broker to the motors that it moved
-    back: float = 0.0  # from the end of all faults to two heartbeats
     moves: int = 0
 
 

@@ -99,7 +99,6 @@ def _come_back(drill: Drill) -> None:
             raise ViolatedError(
                 f"not online {BACK_S:.0f} s after the last fault: {drill.robot.session.connection.reason}"
             )
-    drill.seen.back = drill.seconds - since
 
 
 def _obey_again(drill: Drill) -> None:
