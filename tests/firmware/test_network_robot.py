@@ -12,7 +12,6 @@ from typing import Any
 import pytest
 
 from tests.ext.lab.simulation.virtual_broker import Session, VirtualBroker
-from tests.ext.lab.simulation.virtual_network import Answers
 from tests.firmware.drill import BASE, DRIVE, LIMIT_S, ONLINE, STALE_S, START_S, Drill
 from wifi import sockets
 
@@ -26,13 +25,11 @@ def online(
     kind: str,
     seed: int = 1,
     *,
-    time: Answers = "answers",
     refused: Iterable[str] = (),
     **settings: Any,
 ) -> Drill:
     """A robot that is connected; ``refused`` topics cannot be subscribed to, ``settings`` change those of its board."""
     drill = Drill(kind, seed)
-    drill.network.conditions.ntp = time
     drill.broker.refused = set(refused)
     if settings:
         base = {"robot": {"id": "rover"}, "wifi": {"ssid": "home"}, "mqtt": {"host": "10.0.0.2"}}
@@ -110,18 +107,6 @@ def test_the_heartbeat_is_stamped_in_real_milliseconds(kind: str) -> None:
     assert 38 <= len(heartbeats) <= 42
     for at, t in heartbeats:
         assert abs(EPOCH_MS + at * 1000 - t) < 150  # the way of the message and half of the time server's
-
-
-def test_without_a_time_server_it_counts_from_its_start() -> None:
-    drill = online("benjr", time="silent")
-    assert all(heartbeat["t"] < 60_000 for heartbeat in published(drill, "online"))
-
-
-def test_a_time_server_that_cannot_be_asked_disturbs_nothing() -> None:
-    drill = online("benjr", ntp="no..name")
-    drill.run(10)
-    assert drill.robot.session.connection.state == "online"
-    assert drill.robot.session.connection.losses == 0
 
 
 @pytest.mark.parametrize("kind", KINDS)

@@ -186,14 +186,6 @@ def test_a_ping_follows_at_once_when_nothing_was_read_for_a_while(link: Link) ->
     assert link.answer_pings() == 1
 
 
-def test_a_ping_without_an_answer_makes_what_comes_before_that_as_old(link: Link) -> None:
-    link.idle(1.0)
-    assert link.written().startswith(packets.PINGREQ)
-    link.sends(sent(b"old"))
-    link.pump()
-    assert 0.3 < link.messages[0].waited_s < 1.2
-
-
 def test_a_broker_that_answers_no_ping_is_silent(link: Link) -> None:
     for _ in range(80):
         link.idle(0.05)
@@ -233,14 +225,6 @@ def test_what_came_in_a_silence_is_not_read(link: Link) -> None:
     with pytest.raises(Silent):
         link.pump()
     assert link.messages == []
-
-
-def test_pings_are_sent_while_other_answers_come(link: Link) -> None:
-    for number in range(1, 41):
-        link.idle(0.05)
-        link.connection.publish(Message("a", b"", QoS.DELIVERED))
-        link.sends(packet(0x40, bytes((0, number))))
-    assert 3 <= link.written().count(packets.PINGREQ) <= 6
 
 
 def test_retained_messages_and_pieces_of_long_ones_are_signs_of_life(link: Link) -> None:
