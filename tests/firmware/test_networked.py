@@ -16,7 +16,7 @@ import msgspec
 import pytest
 
 from pebble.commands import app
-from pebble.errors import PebbleError
+from pebble.errors import ConfigError, PebbleError
 from pebble.extensions.lab.simulation.fleet import members
 from pebble.extensions.lab.simulation.mcu import Snapshot
 from pebble.extensions.lab.simulation.trace import read_trace
@@ -141,6 +141,8 @@ def test_kinds_of_a_fleet_take_turns_and_are_counted() -> None:
         ("minilamp", "pebble/robots/minilamp-002"),
     ]
     assert [identity.id for _, identity in members(2, ["benjr"])] == ["benjr-001", "benjr-002"]
+    with pytest.raises(ConfigError, match="0"):
+        list(members(0))
 
 
 def test_a_fleet_shows_its_status_and_ends_in_order(start: Any, broker: Broker) -> None:
@@ -174,7 +176,6 @@ def test_a_config_names_a_broker_that_is_waited_for(start: Any, tmp_path: Path) 
         (("minilamp", "zenoh:/tmp"), "--broker must be mqtt://"),
         (("benjr", "nowhere.json"), "nowhere.json"),
         (("fleet", "mqtt://127.0.0.1", "-n", "1001"), "1000"),
-        (("fleet", "mqtt://127.0.0.1", "-n", "0"), "0"),
         (("fleet", "mqtt://127.0.0.1", "--kind", "goob"), "goob"),
         (("minilamp", "mqtt://127.0.0.1:port"), "--broker"),
         (("minilamp", "mqtt://127.0.0.1", "a/b"), "robot.id"),
