@@ -117,22 +117,6 @@ class TestCommands:
 
 
 class TestOthers:
-    @pytest.mark.parametrize("suffix", ["incoming/dance", "incoming/lights-solid", "incoming/flags/reboot"])
-    def test_what_is_not_probed_at_the_start(self, world: World, suffix: str) -> None:
-        Way(world.local, world.remote, "both", suffix)
-        world.bridge(probe=False)
-        world.send(world.operator, suffix, b"true", b"2")
-        assert world.rests(200)
-
-    def test_what_is_not_probed_at_the_start_while_another_circulates(self, world: World) -> None:
-        Way(world.local, world.remote, "out", "incoming/#")
-        world.bridge()
-        assert world.rests()
-        world.send(world.operator, "incoming/dance", b"1")
-        assert world.rests()
-        assert world.robot.payloads("incoming/dance") == [b"1"]
-        assert world.operator.payloads("incoming/dance") == [b"1"]
-
     @pytest.mark.parametrize("carried", ["", "incoming/#"], ids=["one topic", "all topics"])
     @pytest.mark.parametrize("begins", ["before", "at rest", "after one"])
     @pytest.mark.parametrize(
@@ -226,32 +210,6 @@ class TestSeveralBridges:
         other.shut()
         world.wait(5)
         assert world.arrives(world.robot, DRIVE, b"again")
-
-    @pytest.mark.parametrize("direction", ["in", "out"])
-    def test_two_other_ways(self, world: World, direction: str) -> None:
-        """Each copy becomes two."""
-        for _ in range(2):
-            Way(world.local, world.remote, direction, "incoming/#")
-            Way(world.local, world.remote, "in", "outgoing/#")
-        world.bridge(mirroring=True)
-        world.send(world.operator, DRIVE, MOVE, ZERO)
-        world.send(world.robot, DRIVE, MOVE, ZERO)
-        world.send(world.operator, FLAG, b"true", b"false", retain=True)
-        world.send(world.robot, "outgoing/status", b"1", b"2", retain=True)
-        assert world.rests(5_000)
-
-    def test_commands_are_probed_again_once_something_circulates(self, world: World) -> None:
-        """The other way is younger than the connection, at whose begin they were probed."""
-        world.bridge()
-        assert world.rests()
-        Way(world.local, world.remote, "both", "incoming/#")
-        for _ in range(10):
-            world.send(world.operator, FLAG, b"true", retain=True)
-            assert world.rests()
-        world.wait(1)
-        world.send(world.operator, DRIVE, MOVE)
-        assert world.rests()
-        assert world.robot.payloads(DRIVE) == [MOVE]  # by the other way only
 
     def test_a_mirror_and_a_way_from_its_broker(self, world: World, caplog: pytest.LogCaptureFixture) -> None:
         mirrored = Node(world.network)

