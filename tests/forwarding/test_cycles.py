@@ -99,22 +99,6 @@ class TestCommands:
         assert world.arrives(world.robot, DRIVE, b"again")
         assert sum("everything is forwarded again" in info for info in infos(caplog)) == circulate
 
-    def test_a_way_that_comes_while_a_key_is_held(
-        self, world: World, caplog: pytest.LogCaptureFixture, direction: str, carried: str, mirroring: bool
-    ) -> None:
-        world.bridge(mirroring=mirroring)
-        for _ in range(40):
-            world.send(world.operator, DRIVE, MOVE)
-            world.network.now += 0.05
-            assert world.rests()
-        assert world.robot.payloads(DRIVE) == [MOVE] * 40
-        Way(world.local, world.remote, direction, carried)
-        began = world.network.now
-        world.send(world.operator, DRIVE, MOVE)
-        assert world.rests()
-        assert world.network.now - began < 0.5
-        assert len(errors(caplog)) == (mirroring or direction != "in")
-
 
 class TestOthers:
     @pytest.mark.parametrize("carried", ["", "incoming/#"], ids=["one topic", "all topics"])
@@ -142,20 +126,6 @@ class TestOthers:
             world.network.now += 3
         assert max(runs) <= at_most, runs
         assert runs[2:] == [1, 1]
-
-    @pytest.mark.parametrize("direction", ["in", "out", "both"])
-    @pytest.mark.parametrize("probe", [True, False])
-    def test_flags(self, world: World, direction: str, probe: bool) -> None:
-        Way(world.local, world.remote, direction, "incoming/#")
-        world.bridge(probe=probe)
-        for suffix in (FLAG, "incoming/flags/party"):
-            world.send(world.operator, suffix, b"true", b"false", b"true", retain=True)
-            assert world.rests(300)
-        before = len(world.robot.payloads(FLAG))
-        world.network.now += 3
-        world.send(world.operator, FLAG, b"false", retain=True)
-        assert world.rests()
-        assert set(world.robot.payloads(FLAG)[before:]) == {b"false"}
 
     @pytest.mark.parametrize("suffix", ["outgoing/status", "outgoing/weather", "outgoing/touch-sensors"])
     def test_outgoing(self, world: World, caplog: pytest.LogCaptureFixture, suffix: str) -> None:

@@ -6,8 +6,7 @@ import json
 
 import pytest
 
-from pebble.contract import AUTONOMY_COMMAND, CHANNELS, CONTROL, DRIVE, ESTOP, INCOMING, Channel, codec
-from pebble.contract.payloads import AutonomyCommand
+from pebble.contract import CHANNELS, CONTROL, DRIVE, ESTOP, INCOMING, Channel, codec
 from pebble.contract.rights import WRITES, Right
 from pebble.forwarding.names import Names, Signed
 from pebble.forwarding.routing import TABLE_A1, Drop, Side
@@ -94,12 +93,6 @@ class TestSign:
     @pytest.mark.parametrize("flag", ["retain", "retain_requested"])
     def test_nothing_is_retained_below_a_name(self, suffix: str, flag: str) -> None:
         assert sign(f"by/ann/{suffix}", b'{"z":0}', **{flag: True}) is Drop.STALE
-
-    def test_a_script_that_an_account_starts_is_its_own(self) -> None:
-        found = sign("by/ann/autonomy-command", b'{"file":"a","value":{"action":"start","by":"otto"},"by":"ada"}')
-        assert isinstance(found, Signed)
-        command: AutonomyCommand = codec.decode(AUTONOMY_COMMAND, found.message.payload)
-        assert (command.file, command.by) == ("a", "ann/otto")
 
 
 class TestWithoutName:

@@ -138,14 +138,6 @@ class TestFlags:
         do(world, f"start {history} {forgetful}-forgets")
         assert world.retained(FLAG) == (b"1", b"1")
 
-    def test_are_retained_although_their_publisher_did_not_ask_for_it(self, world: World) -> None:
-        do(world, "start")
-        for client, other in sides(world):
-            client.publish(FLAG, TRUE)
-            world.run()
-            assert other.payloads(FLAG)[-1] == TRUE
-        assert world.retained(FLAG) == (TRUE, TRUE)
-
 
 class TestOneShots:
     @pytest.mark.parametrize("when", ["before", "live"])

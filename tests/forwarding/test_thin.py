@@ -10,7 +10,7 @@ import pytest
 from pebble.contract import LINK, codec
 from pebble.contract.payloads import LinkState
 from pebble.services.mqtt_bridge.uplink import RENEW_S
-from pebble.transports import Message, Outgoing, QoS
+from pebble.transports import Outgoing, QoS
 from tests.forwarding.virtual import World
 from tests.services.mqtt_bridge.bridge_rig import BASE
 
@@ -270,31 +270,3 @@ def flood(world: World, history: str) -> None:
             for payload in COMMANDS[word]:
                 world.remote.publish("incoming/drive-values", payload)
             world.run(0.05)
-
-
-def sent(world: World) -> list[tuple[str, bytes, int, bool]]:
-    """What the bridge has published on the remote side, without what differs at each run."""
-    own = (ONLINE, "outgoing/bridge-probe")
-    return [
-        (one.topic, one.payload, int(one.qos), bool(one.retain_requested))
-        for one in world.remote.seen
-        if not one.topic.endswith(own)
-    ]
-
-
-def test_on_a_wide_link_the_bridge_sends_what_it_receives(start: Start) -> None:
-    """All of it, in order, at once, with the same bytes; and no state of the link."""
-    world = start("wide")
-    world.uplink.way = FULL
-    expected: list[Message] = []
-    for number in range(200):
-        for suffix, qos, retain in ((IMU, 1, False), (LOGS, 0, False), (STATUS, 1, True), (EVENT, 1, False)):
-            message = Message(f"{BASE}/{suffix}", b"%d" % number, QoS(qos), retain)
-            expected.append(message)
-            world.local.publish(suffix, message.payload, qos=qos, retain=retain)
-        world.run(0.01)
-    assert sent(world) == [(one.topic, one.payload, int(one.qos), one.retain) for one in expected]
-    assert not world.remote.on(LINK_STATE)
-    arrived = len(world.remote.on(ONLINE))
-    world.run(10)
-    assert len(world.remote.on(ONLINE)) - arrived == 40

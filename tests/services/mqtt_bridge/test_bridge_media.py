@@ -187,15 +187,6 @@ class TestBridge:
             assert bridge.wanted(CAMERA) == wanted
         assert bridge.service.counters["refused"] == 2
 
-    def test_a_robot_without_camera_and_microphone_asks_for_nothing(self, bridge: AskingBridge) -> None:
-        bridge.start()
-        bridge.run()
-        for flag, request in ((VIDEO_FLAG, VIDEO), (AUDIO_FLAG, AUDIO)):
-            bridge.remote.publish(flag, TRUE, retain=True)
-            bridge.remote.publish(request, ON)
-        assert [bridge.wanted(program) for program in ALL] == [""] * 3
-        assert bridge.local.on(AUDIO)
-
     def test_what_a_bridge_before_it_wanted_runs_on(
         self, either: AskingBridge, monkeypatch: pytest.MonkeyPatch
     ) -> None:

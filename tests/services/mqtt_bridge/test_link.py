@@ -126,13 +126,6 @@ def test_losses_alone_lower_nothing() -> None:
     assert Walk().take((0.05 + chance.random() * 3 * one for one in late), tcp_queue_s=0.04).levels == "wide"
 
 
-def test_a_wide_link_stays_wide() -> None:
-    """Half a day with jitter below the limit, and single late answers."""
-    chance = random.Random(1)
-    trips = (0.01 + 0.14 * chance.random() + (2.0 if number % 7 == 0 else 0.0) for number in range(100_000))
-    assert Walk().take(trips).levels == "wide"
-
-
 def test_a_link_that_fails_each_time_changes_ever_more_rarely() -> None:
     walk = Walk().read("20x5")
     while walk.now < 1000.0 + 4 * 3600:
@@ -150,13 +143,6 @@ class TestRoom:
         assert [room.takes(Rank.STREAM, 200, 0.0) for _ in range(4)] == [True, True, True, False]
         assert [room.takes(Rank.STATE, 200, 0.0) for _ in range(4)] == [True, True, True, False]
         assert room.takes(Rank.HEARTBEAT, 200, 0.0)
-
-    def test_has_some_for_a_large_message_as_soon_as_little_is_on_its_way(self) -> None:
-        room = Room(kbit=9.6)
-        assert room.takes(Rank.HEARTBEAT, 80, 0.0)
-        assert not room.takes(Rank.STREAM, 5000, 0.0)
-        assert room.takes(Rank.STATE, 5000, 0.0)
-        assert not room.takes(Rank.HEARTBEAT, 80, 0.0)
 
     def test_is_learned(self) -> None:
         """It grows while what is sent is confirmed without delay, and shrinks when it is not."""
