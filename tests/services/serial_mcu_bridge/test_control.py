@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -22,7 +23,10 @@ LONGEST = "z" * 50
 # -- on a clock that the test moves
 
 
-def test_states_are_published_when_they_change_and_not_more_than_four_times_a_second() -> None:
+def test_states_are_published_when_they_change_and_not_more_than_four_times_a_second(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    caplog.set_level(logging.INFO)
     states: list[ControlState] = []
     control = Control(Security(), states.append, 100.0)
     control.note(100.0)
@@ -39,6 +43,7 @@ def test_states_are_published_when_they_change_and_not_more_than_four_times_a_se
     assert len(states) == 6  # the newest as soon as it may be, and that control is free again
     assert states[4].by == "mia999"
     assert (states[5].key, now) == ("", pytest.approx(103.0, abs=0.3))
+    assert caplog.messages == [f"mia{number} has control" for number in range(5)]
 
 
 def test_a_state_is_short() -> None:
