@@ -12,7 +12,7 @@ import time
 from pathlib import Path
 
 from pebble.config import config_of_process
-from pebble.runtime.parent import NOTIFY_FD, Notifier, ProgramRequest, earlier_requests, requested_encoding
+from pebble.runtime.parent import NOTIFY_FD, Notifier, ProgramRequest, earlier_requests
 
 WORDS = """12:00:00 [WARNING] mind the gap
 just a print
@@ -110,8 +110,6 @@ def main() -> None:
         os._exit(1)
     if behaviour == "asker":
         ask(Notifier())
-    if behaviour == "curious about itself":
-        note(f"env:{os.environ.get('MARK', '')}:{Path.cwd().name.replace(' ', '-')}:{requested_encoding()}")
     if behaviour == "environment":
         note("systemd:" + str("NOTIFY_SOCKET" in os.environ))
     if behaviour == "configured":

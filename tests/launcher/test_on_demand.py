@@ -19,7 +19,7 @@ from pebble.launcher.programs import Program, Stage
 from pebble.launcher.reactor import Reactor
 from pebble.runtime import notes
 from pebble.runtime.notes import Held, Wanted
-from tests.launcher.robot import CONNECTION, DEVICE, Launch, Robot, Row, lines_of
+from tests.launcher.robot import CONNECTION, DEVICE, Launch, Robot, Row
 from tests.support import gone, until
 
 ASKER: Row = ("bridge", "asker", CONNECTION, {"may_request": True})
@@ -156,30 +156,6 @@ def test_rapidly_changing_requests_start_few_processes(launch: Launch) -> None:
     assert len(robot.events("media", "start")) <= 2 + time.monotonic() - began
 
 
-def test_each_start_gets_the_encoding_that_was_requested_last(launch: Launch) -> None:
-    robot = launch(ASKER, media("curious about itself"))
-    assert robot.ready("bridge")
-    robot.order("bridge", "media 1 h264")
-    assert robot.ready("media")
-    robot.order("bridge", "media 1 pbvd")
-    os.kill(robot.events("bridge", "start")[0], signal.SIGKILL)
-    assert until(lambda: robot.events("bridge", "before:media=pbvd") or robot.events("bridge", "before:media=h264"))
-    robot.order("bridge", "media 1 pbvd", "other 1")
-    assert until(lambda: "may not request" in robot.stderr()), "it has been received"
-    os.kill(robot.events("media", "start")[0], signal.SIGKILL)
-    assert until(lambda: len(environment_notes(robot)) == 2)
-    robot.order("bridge", "media 1", "media 0")
-    assert until(lambda: robot.events("media", "stop"))
-    robot.order("bridge", "media 1")
-    assert until(lambda: len(environment_notes(robot)) == 3)
-    assert [note.rpartition(":")[2] for note in environment_notes(robot)] == ["h264", "pbvd", "None"]
-
-
-def environment_notes(robot: Robot) -> list[str]:
-    output = (line.split() for line in lines_of(robot.journal))
-    return [word for name, word, _ in output if name == "media" and word.startswith("env:")]
-
-
 def test_only_the_bridge_may_request_and_only_existing_programs(launch: Launch) -> None:
     robot = launch(ASKER, ("other", "asker", CONNECTION), media("good"))
     assert robot.ready("bridge", "other")
@@ -191,18 +167,6 @@ def test_only_the_bridge_may_request_and_only_existing_programs(launch: Launch) 
     assert until(lambda: robot.states() == {"bridge": "ready", "other": "ready", "announcer": "ready"})
     assert robot.stderr().count("may not request") == 2, "one line each"
     assert not robot.events("media", "start")
-
-
-def test_the_robot_stops_with_all_it_has(launch: Launch) -> None:
-    robot = launch(ASKER, media("good"), media("stubborn", "deaf"), media("good", "idle"), shutdown_timeout_seconds=1.5)
-    assert robot.ready("bridge")
-    robot.order("bridge", "media 1", "deaf 1")
-    assert robot.ready("media", "deaf")
-    pids = [robot.events(name, "start")[0] for name in ("media", "deaf", "bridge")]
-    assert robot.stop() == 0
-    assert all(gone(pid) for pid in pids)
-    assert "idle" not in robot.services()
-    assert robot.services()["media"]["state"] == "stopped"
 
 
 class TestBridgeThatDies:
