@@ -246,38 +246,33 @@ class TestReconciliation:
             given.append(resolution)
         assert given == [Resolution[name.upper()] for name in resolutions]
 
-    def test_held_copies_fill_what_the_winner_does_not_know(self) -> None:
-        reconciliation = Reconciliation(REMOTE)
-        reconciliation.receive(LOCAL, "known", b"local", retained=True)
-        reconciliation.receive(LOCAL, "unknown", b"local", retained=True)
-        reconciliation.receive(REMOTE, "known", b"remote", retained=True)
-        reconciliation.note_published(LOCAL, "known", b"remote")
-        assert reconciliation.synchronize(REMOTE) == [(REMOTE, "unknown", b"local")]
-        assert reconciliation.value("unknown") == b"local"
-        assert reconciliation.synchronize(LOCAL) == []
-
-    def test_a_side_that_lost_a_value_receives_it(self) -> None:
-        reconciliation = Reconciliation(REMOTE)
-        reconciliation.receive(REMOTE, "t", b"new", retained=False)
-        reconciliation.begin(REMOTE)
-        assert reconciliation.synchronize(REMOTE) == [(REMOTE, "t", b"new")]
-        reconciliation.begin(REMOTE)
-        reconciliation.receive(REMOTE, "t", b"new", retained=True)
-        assert reconciliation.synchronize(REMOTE) == []
-
-    def test_a_side_that_missed_a_removal_receives_it(self) -> None:
-        reconciliation = Reconciliation(LOCAL)
-        reconciliation.receive(LOCAL, "t", b"a", retained=False)
-        reconciliation.note_published(REMOTE, "t", b"a")
-        reconciliation.receive(LOCAL, "t", b"", retained=False)
-        assert reconciliation.synchronize(REMOTE) == [(REMOTE, "t", b"")]
-
-    def test_a_removed_topic_is_not_brought_back(self) -> None:
-        reconciliation = Reconciliation(REMOTE)
-        reconciliation.receive(LOCAL, "t", b"a", retained=False)
-        reconciliation.receive(LOCAL, "t", b"", retained=False)
-        reconciliation.begin(REMOTE)
-        assert reconciliation.synchronize(REMOTE) == []
+    @pytest.mark.parametrize(
+        ("winner", "history", "side", "sent"),
+        [
+            (REMOTE, "L:a", REMOTE, ["a"]),  # a held copy fills what the winner does not know
+            (REMOTE, "L:a R:b to-L:b", REMOTE, []),
+            (REMOTE, "L:a R:b to-L:b", LOCAL, []),
+            (REMOTE, "r:new begin", REMOTE, ["new"]),  # a side that lost a value receives it
+            (REMOTE, "r:new begin R:new", REMOTE, []),
+            (LOCAL, "l:a to-R:a l:", REMOTE, [""]),  # and so does one that missed a removal
+            (REMOTE, "l:a l: begin", REMOTE, []),  # what was removed is not brought back
+        ],
+    )
+    def test_what_a_side_receives_when_it_is_there_again(
+        self, winner: Side, history: str, side: Side, sent: list[str]
+    ) -> None:
+        """to-L, to-R: what was published there. begin: the remote connection begins anew."""
+        reconciliation = Reconciliation(winner)
+        for word in history.split():
+            who, _, payload = word.partition(":")
+            place = REMOTE if who[-1] in "Rr" else LOCAL
+            if who == "begin":
+                reconciliation.begin(REMOTE)
+            elif who.startswith("to-"):
+                reconciliation.note_published(place, "t", payload.encode())
+            else:
+                reconciliation.receive(place, "t", payload.encode(), retained=who.isupper())
+        assert reconciliation.synchronize(side) == [(side, "t", payload.encode()) for payload in sent]
 
     def test_its_memory_is_bounded(self) -> None:
         reconciliation = Reconciliation(REMOTE)

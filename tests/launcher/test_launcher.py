@@ -19,8 +19,6 @@ from pebble.config import Config, load, parse
 from pebble.errors import ConfigError
 from pebble.launcher.launcher import Launcher
 from pebble.launcher.programs import Stage, programs, shared_modules
-from pebble.launcher.run_lock import RunLock
-from pebble.runtime.parent import NOTIFY_FD
 from tests.fakes.seccomp import CALLS
 from tests.launcher.robot import BASE, CONNECTION, DEVICE, LOCAL_TRANSPORT, Launch, lines_of
 from tests.support import ROOT, gone, until
@@ -69,17 +67,6 @@ def test_a_stop_signal_while_starting_starts_no_further_child(launch: Launch) ->
     robot = launch(("hub", "good", LOCAL_TRANSPORT), ("serial", "good", DEVICE), options=("signal",))
     assert robot.process.wait(20) == 0
     assert robot.stderr().count("spawned a child") == 1
-
-
-def test_a_second_launcher_for_the_same_robot_is_refused(launch: Launch) -> None:
-    robot = launch(("bridge", "good", CONNECTION))
-    assert robot.ready("bridge")
-    second = robot.second()
-    assert second.returncode == 1
-    expected = f"refused: {BASE} already runs: process {robot.process.pid} holds {robot.run_dir}/launcher.lock"
-    assert second.stderr.strip() == f"{expected}; end it there with Ctrl-C"
-    assert robot.run_dir.stat().st_mode & 0o777 == 0o700
-    assert len(robot.events("bridge", "start")) == 1
 
 
 def test_microcontroller_robots_are_refused(tmp_path: Path) -> None:
@@ -272,20 +259,6 @@ def test_threads_are_waited_for_before_the_exit_functions_run(launch: Launch) ->
     robot = launch(("serial", "done", DEVICE), restart_delay_seconds=600)
     assert until(lambda: robot.events("serial", "atexit"), 20)
     assert [line.split()[1] for line in lines_of(robot.journal)][:3] == ["start", "thread", "atexit"]
-
-
-def test_the_lock_of_a_killed_launcher_is_free_at_once(launch: Launch) -> None:
-    robot = launch(("bridge", "stubborn", CONNECTION))
-    assert robot.ready("bridge")
-    pid = robot.events("bridge", "start")[0]
-    robot.process.kill()
-    robot.process.wait(10)
-    try:
-        assert not gone(pid)
-        with RunLock(robot.run_dir, BASE, robot.run_dir / "state.lock"):
-            pass
-    finally:
-        os.kill(pid, signal.SIGKILL)
 
 
 def test_restarts_leave_no_descriptors_behind(launch: Launch) -> None:
@@ -550,20 +523,3 @@ print([name for name in {(*NEEDED, *NOT_NEEDED)} if name in sys.modules], len(os
 """
     ran = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, timeout=60)
     assert ran.stdout.strip() == f"{NEEDED} 1", ran.stderr
-
-
-def test_the_hub_process_notifies_that_it_is_ready_and_stops_when_asked(tmp_path: Path) -> None:
-    settings = json.dumps({"run_dir": str(tmp_path / "run")})
-    read_end, notes = os.pipe()
-    environment = {**os.environ, NOTIFY_FD: str(notes)}
-    command = [sys.executable, "-m", "pebble.runtime.hub", settings]
-    with subprocess.Popen(command, cwd=ROOT, env=environment, pass_fds=(notes,)) as hub, os.fdopen(read_end) as signs:
-        try:
-            os.close(notes)
-            assert json.loads(signs.readline()) == {"note": "ready"}
-            assert (tmp_path / "run" / "hub.sock").exists()
-            assert json.loads(signs.readline()) == {"note": "alive"}
-            hub.terminate()
-            assert hub.wait(10) == 0
-        finally:
-            hub.kill()
