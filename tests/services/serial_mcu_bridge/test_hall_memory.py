@@ -137,12 +137,6 @@ def test_what_is_not_its_own_stays_as_it_is(
     assert [record.message.partition(f"{path} ")[2][: len(text)] for record in caplog.records] == [text], "once"
 
 
-def test_a_ring_of_another_form_begins_anew(path: Path, memory: HallMemory) -> None:
-    path.write_bytes(b"X" * (24 + 32 * SLOTS))
-    fill(memory, 2)
-    assert HallReader(path.name).newest == 2
-
-
 def is_whole(path: Path) -> bool:
     """Programs of the original try again, too, while it is being made."""
     try:

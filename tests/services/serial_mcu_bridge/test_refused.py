@@ -14,7 +14,7 @@ from pebble.transports import Message, MqttSettings, QoS, State, create
 from tests.services.serial_mcu_bridge.motor_rig import BASE, STOP, STOPPED, Bench
 from tests.support import RefusingBroker, until
 
-ESTOP, ESTOP_RESET, DRIVE = (f"{BASE}/incoming/{metric}" for metric in ("estop", "estop-reset", "drive-values"))
+ESTOP, ESTOP_RESET = (f"{BASE}/incoming/{metric}" for metric in ("estop", "estop-reset"))
 
 
 @pytest.fixture

@@ -69,14 +69,6 @@ def test_every_field_of_a_line_is_published(bench: Bench) -> None:
 # -- emergency stops and scripts
 
 
-def test_a_command_with_nan_or_infinity_is_refused_whole(bench: Bench) -> None:
-    for metric, first in (("drive-values", '"x":0.5,"z"'), ("lights-solid", '"g":1,"r"')):
-        for number in ('"NaN"', '"-inf"', "NaN", "1e999"):
-            bench.operator.publish(f"{BASE}/incoming/{metric}", f"{{{first}:{number}}}".encode())
-    assert until(lambda: bench.service.counters["refused"] == 8, 5)
-    assert bench.lines == [STOPPED] * 2
-
-
 def test_a_drive_command_without_an_axis_is_logged_once_for_each_sender(
     bench: Bench, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -91,26 +83,6 @@ def test_a_drive_command_without_an_axis_is_logged_once_for_each_sender(
     assert sum("'X'" in line for line in lines) == 1
     assert len(lines) == 17  # 16 senders, and all others together
     assert "'linear', 'source'" in lines[0]
-
-
-def test_after_a_stop_nothing_moves_until_the_reset_also_after_a_restart(bench: Bench) -> None:
-    assert bench.moves(0.5)
-    bench.send("estop", STOP)
-    assert bench.stopped()
-    lines = bench.lines
-    assert lines[-1] == STOPPED
-    for _ in range(3):
-        bench.drive(0.25)
-    assert bench.shines(r=1)  # only motors are stopped
-    bench.restart()
-    assert (bench.state["latched"], bench.state["count"]) == (True, 0)
-    assert bench.state["recent"] == [STOP["stop"]]
-    bench.drive(0.25)
-    assert bench.shines(g=1)
-    assert set(bench.lines) & {"M 0.250 0.250"} == set()
-    assert bench.reset()
-    bench.send("drive-values", {})
-    assert bench.moves(0.125)
 
 
 def test_a_retained_stop_and_a_retained_reset_do_nothing(bench: Bench) -> None:

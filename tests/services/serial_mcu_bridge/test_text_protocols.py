@@ -161,7 +161,7 @@ WORDS = st.sampled_from([*PIECES, *FAST.split(), *SLOW.split()]) | st.binary(max
 GARBAGE = st.binary(max_size=300) | st.text(max_size=100).map(str.encode)
 
 
-@settings(max_examples=cases(500, 5_000))
+@settings(max_examples=cases(300, 5_000))
 @given(
     st.sampled_from([goob_base, imu_mpu6050]),
     st.sampled_from([b"", b" "]).flatmap(lambda gap: st.lists(WORDS, max_size=16).map(gap.join)) | GARBAGE,
