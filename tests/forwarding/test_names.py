@@ -252,6 +252,13 @@ class TestStops:
         start(world)
         assert world.local.payloads("incoming/estop") == []
 
+    def test_many_of_many_accounts_all_arrive(self, world: World) -> None:
+        start(world)
+        for number in range(200):
+            world.remote.publish(f"incoming/by/a{number}/estop", b"{}")
+        world.run(1)
+        assert len(world.local.payloads("incoming/estop")) == 200
+
 
 class TestFlags:
     """A flag by name is changed as if it had been changed on the robot: on both sides, where the robot's own counts."""

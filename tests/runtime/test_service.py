@@ -351,37 +351,6 @@ def test_work_of_another_thread_goes_before_nothing_that_waits(idle: Robot) -> N
     assert order == ["first", "posted", "second"]
 
 
-def test_one_thread_works_at_a_time_and_the_services_own_has_its_turns(idle: Robot) -> None:
-    inside, most, own, ends = [0], [0], [0], threading.Event()
-
-    def work() -> None:
-        inside[0] += 1
-        most[0] = max(most[0], inside[0])
-        time.sleep(0.0001)
-        inside[0] -= 1
-
-    def own_work() -> None:
-        own[0] += 1
-        work()
-
-    def visit() -> None:
-        while not ends.is_set():
-            idle.service.run_if_idle(work)
-
-    visitors = [threading.Thread(target=visit) for _ in range(3)]
-    for visitor in visitors:
-        visitor.start()
-    try:
-        for expected in range(1, 51):
-            idle.service.post(own_work)
-            assert until(lambda expected=expected: own[0] == expected, 5)  # type: ignore[misc]
-    finally:
-        ends.set()
-        for visitor in visitors:
-            visitor.join(5)
-    assert most == [1]
-
-
 def test_a_timer_that_another_thread_sets_wakes_the_services_own(idle: Robot) -> None:
     called: list[int] = []
     due = time.monotonic() + 0.05
