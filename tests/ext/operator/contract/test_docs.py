@@ -47,16 +47,6 @@ def test_running_the_module_writes_the_files(tmp_path: Path) -> None:
     assert {path.name: path.read_text() for path in tmp_path.iterdir()} == topic_docs.documents()
 
 
-@pytest.mark.parametrize("channel", CHANNELS, ids=lambda channel: channel.suffix)
-def test_every_channel_has_its_lines(channel: Channel) -> None:
-    lines = [line for line in topics_document().splitlines() if line.startswith(f"| `{channel.suffix}` |")]
-    meaning, route = lines
-    assert channel.kind.name in meaning
-    assert channel.doc in meaning
-    paths = [] if channel.override is None else [channel.override]
-    assert [path for path in paths if f"`{path}`" not in route] == []
-
-
 def test_every_link_leads_to_a_payload() -> None:
     text = topics_document()
     headings = {heading.lower() for heading in re.findall(r"^### (\w+)$", text, re.MULTILINE)}
