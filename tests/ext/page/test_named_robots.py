@@ -62,32 +62,6 @@ def test_everything_has_the_servers_account_in_its_topic_and_the_person_beside_i
         assert {one for one in robot.wire if not one.startswith(by_name)} == {f"{ref}/incoming/estop"}
 
 
-def test_two_servers_never_share_a_robot_and_each_shows_who_drives_under_a_checked_name(broker, robot):
-    ref = robot.base
-    with (
-        server(broker, "page-1") as hall,
-        server(broker, "page-2") as attic,
-        hall.page(name="ann") as ann,
-        attic.page(name="otto") as otto,
-    ):
-        for page in (ann, otto):
-            assert page.knows(ref)
-            assert page.ready()
-        assert ann.take(ref)
-        assert until(lambda: otto.value(ref, "web/driver", "by") == "page-1/ann")
-        ann.drive(ref, 1, z=0.5)
-        otto.send("lease", ref=ref, take=True)
-        assert until(lambda: ann.value(ref, "web/driver", "asks") == "page-2/otto")
-        ann.send("lease", ref=ref, take=False)
-        assert until(lambda: otto.value(ref, "web/driver", "you") is True)
-        assert until(lambda: ann.value(ref, "web/driver", "by") == "page-2/otto")
-        assert otto.value(ref, "web/driver", "checked") is True
-        ann.drive(ref, 2, z=0.5)
-        assert until(lambda: "page-2/otto is driving" in [one["why"] for one in ann.refused])
-        assert ann.take(ref, over=True)
-        assert until(lambda: otto.value(ref, "web/driver", "by") == "page-1/ann")
-
-
 def test_a_server_without_an_account_stops_and_else_shows_why_it_may_do_nothing(broker, robot):
     ref = robot.base
     with server(broker, None) as hall, hall.page() as page:
