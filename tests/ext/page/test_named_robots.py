@@ -16,8 +16,6 @@ from tests.kit.played_robot import RecordingRobot
 from tests.support import Broker, until
 
 NAMES = itertools.count(1)
-DRIVE = {"available": True, "controls": True, "arbitrates": True, "control": True}
-ESTOP = {"available": True, "owners": ["serial"]}
 
 
 def server(broker: Broker, account: str | None) -> Served:
@@ -75,29 +73,6 @@ def test_a_server_without_an_account_stops_and_else_shows_why_it_may_do_nothing(
         page.send("estop", ref=ref, stop="00c0ffee00c0ffee", why="")
         assert until(lambda: page.value(ref, "web/estop", "sending") == "confirmed")
         assert robot.wire == {f"{ref}/incoming/drive-values", f"{ref}/incoming/estop"}
-
-
-def test_the_level_of_a_robot_may_change_while_it_is_driven(broker, robot):
-    ref = robot.base
-    with server(broker, "page-1") as hall, hall.page(name="ann") as page:
-        assert page.knows(ref)
-        assert page.ready()
-        assert page.take(ref)
-        drive = DRIVE | {"topic": f"{ref}/incoming/drive-values"}
-        page.send("lights", ref=ref, r=1.0, n=1)
-        assert until(lambda: f"{ref}/incoming/by/page-1/lights-solid" in robot.wire)
-        robot.named = False
-        robot.publish_capabilities({"drive": drive, "estop": ESTOP})
-        assert until(lambda: page.value(ref, "capabilities")["value"].get("named") is None)
-        page.send("lights", ref=ref, r=1.0, n=2)
-        assert until(lambda: f"{ref}/incoming/lights-solid" in robot.wire)
-        robot.named = True
-        robot.publish_capabilities({"drive": drive, "estop": ESTOP, "named": True})
-        assert until(lambda: page.value(ref, "capabilities")["value"].get("named") is True)
-        robot.wire.clear()
-        page.drive(ref, 1, z=0.5)
-        assert until(lambda: f"{ref}/incoming/by/page-1/drive-values" in robot.wire)
-        assert f"{ref}/incoming/drive-values" not in robot.wire
 
 
 def test_a_robot_that_checks_names_is_reset_only_by_safety_and_admin(broker, robot, tmp_path):

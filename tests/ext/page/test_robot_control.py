@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import itertools
-import json
 from collections.abc import Iterator
 from typing import Any
 
 import pytest
 
 from pebble.extensions.fleet.roles import Role, page_rights
-from pebble.transports import MqttSettings, QoS, create
 from tests.ext.page.attacker import Hall
 from tests.ext.page.served import Page, Served
 from tests.kit.played_robot import RecordingRobot
@@ -94,19 +92,6 @@ def test_who_drives_at_another_server_is_asked_and_lets_drive(served, attic, rob
         assert all(one["z"] != 0.9 for one in moving(robot))
         assert until(lambda: acts(served, robot) == ["take", "drive", "release"], 5)
         assert until(lambda: acts(attic, robot)[:2] == ["ask", "take"], 5)
-
-
-def test_what_old_servers_announce_does_not_count_and_strangers_are_shown(served, broker, robot):
-    transport = create("mqtt", "old-server", MqttSettings(host="127.0.0.1", port=broker.port))
-    with ready(served, robot) as page, transport:
-        assert page.take(robot.base)
-        robots = {robot.base: {"by": "eve", "device": "", "since": 9_000_000_000_000}}
-        transport.publish(
-            "pebble/servers/old/outgoing/driving", json.dumps({"t": 1, "robots": robots}).encode(), qos=QoS.DELIVERED
-        )
-        robot.stranger(z=0.3)
-        assert until(lambda: view(page, robot)["others"] is True)
-        assert view(page, robot)["you"] is True
 
 
 def test_only_who_has_the_right_takes_over(broker, robot, tmp_path):

@@ -12,7 +12,6 @@ import pytest
 from pebble.extensions.media.decode import VideoDecoder
 from pebble.extensions.media.picture_header import read_header
 from pebble.extensions.media.scene import read_counter
-from pebble.extensions.media.video import make_encoder
 from pebble.extensions.operator.client.media_request.queue import NO_FRAME
 from pebble.extensions.page.media import rescue
 from pebble.transports import QoS
@@ -103,41 +102,6 @@ async def test_payloads_arrive_unchanged_and_decodable(
     assert [seq for seq, _, _ in page.frames] == sorted({seq for seq, _, _ in page.frames})
 
 
-async def test_what_follows_a_lost_picture_is_not_sent() -> None:
-    robot = PictureRobot()
-    robot.mute = True
-    encoder = make_encoder("pbvd", fps=15, keyframe_interval=5)
-    packets = [encoder.encode(np.full((48, 64, 3), n, np.uint8), 1_710_969_600_000 + 66 * n) for n in range(12)]
-    async with serving(robot) as server:
-        page = server.open(PicturePage())
-        await until(lambda: robot.requests)
-        arrives = [*packets[:3], *packets[5:7], packets[10]]
-        for packet in [
-            *(packets[3], *packets[:3], packets[4], b"garbage", bytes(5 << 20)),
-            *(*packets[5:7], packets[6], packets[7], packets[10]),
-        ]:
-            count = len(page.frames) + (packet in arrives and packet not in page.direct())
-            robot.send(packet)
-            await until(lambda count=count: len(page.frames) == count)
-            await asyncio.sleep(0.02)
-        assert page.direct() == arrives
-
-
-async def test_a_slow_page_gets_key_frames_and_a_fast_one_everything(robot: PictureRobot, server: Server) -> None:
-    fast, slow = server.open(PicturePage(), PLAIN), server.open(PicturePage(answer=None), PLAIN)
-    end = time.monotonic() + 3
-    acknowledged = 0
-    while time.monotonic() < end:
-        await asyncio.sleep(0.3)
-        for seq, _, _ in slow.frames[acknowledged : acknowledged + 1]:
-            slow.acknowledge(seq, 0)
-            acknowledged += 1
-    assert len(slow.frames) - acknowledged <= 8
-    assert None not in decoded(fast.direct())
-    assert None not in decoded(slow.direct())
-    assert acknowledged <= len(slow.frames) < len(fast.frames)
-
-
 async def test_a_page_that_wants_a_key_frame_gets_one(robot: PictureRobot, server: Server) -> None:
     page = server.open(PicturePage())
     await until(lambda: len(page.frames) > 5)
@@ -173,20 +137,6 @@ async def test_a_page_that_decodes_nothing_gets_jpegs(encoding: str) -> None:
         assert numbers[-1] >= len(robot.sent) - 40
         captured = int.from_bytes(page.frames[-1][2][:8], "big")
         assert 0 <= time.time() * 1000 - captured < 5000
-
-
-async def test_a_slow_page_among_fast_ones_is_rescued() -> None:
-    robot = PictureRobot(fps=20)
-    async with serving(robot) as server:
-        fast = [server.open(PicturePage()) for _ in range(3)]
-        slow = server.open(PicturePage(answer=None))
-        await until(lambda: len(slow.frames) >= 2)
-        await asyncio.sleep(2.0)
-        for seq, _, _ in list(slow.frames):
-            slow.acknowledge(seq, 0)
-        slow.answer = 0
-        await until(lambda: len(slow.rescued()) > 3)
-        assert all(None not in decoded(page.direct()) for page in fast)
 
 
 async def test_a_page_that_fails_to_decode_is_rescued(robot: PictureRobot, server: Server) -> None:
