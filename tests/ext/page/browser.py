@@ -69,12 +69,13 @@ _FLAGS = (
 
 
 @contextmanager
-def chromium(*flags: str, beside: Browser | None = None) -> Iterator[Browser]:
-    """A headless browser with further ``flags``, perhaps ``beside`` one that runs: a thread has one Playwright.
+def chromium(*flags: str, program: str | None = None, beside: Browser | None = None) -> Iterator[Browser]:
+    """A headless browser with further ``flags``; another ``program`` may start it.
 
-    Skips the test without one, except where CI says it must be there.
+    It may run ``beside`` another one: a thread has one Playwright. Skips the test without a Chromium, except where CI
+    says it must be there.
     """
-    program = shutil.which("chromium")
+    program = program or shutil.which("chromium")
     if program is None:
         reason = "no Chromium: apt install chromium, or `sh tools/debian-packages.sh chromium=chromium`"
         (pytest.fail if os.environ.get("CI") == "true" else pytest.skip)(reason)
