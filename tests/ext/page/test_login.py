@@ -22,7 +22,6 @@ from starlette.routing import Route
 from pebble.extensions.fleet.audit import Audit
 from pebble.extensions.fleet.people import SESSION_S, People
 from pebble.extensions.fleet.roles import Role
-from pebble.extensions.fleet.row_writer import OF_STRANGERS, WINDOW_S
 from pebble.extensions.page.access import login
 from pebble.extensions.page.access.guard import Guard
 from pebble.extensions.page.setting import WebSettings
