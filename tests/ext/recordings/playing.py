@@ -50,11 +50,16 @@ def ms(at: float) -> int:
     return THEN_NS // 10**6 + round(at * 1000)
 
 
-def write(path: Path, lines: Iterable[Line], *, finished: bool = True) -> Path:
+def write(path: Path, lines: Iterable[Any], *, finished: bool = True, chunk_ns: int = 1 << 63) -> Path:
+    """A recording of these lines, in chunks of this length."""
     with path.open("wb", buffering=0) as file:
         writer = RecordingWriter(file, library="pebble test")
         numbers: dict[tuple[str, str], int] = {}
+        ends_ns = 0
         for line in lines:
+            if ends_ns <= line.log_ns:
+                writer.flush()
+                ends_ns = line.log_ns // chunk_ns * chunk_ns + chunk_ns
             key = line.topic, str(line.metadata)
             if key not in numbers:
                 numbers[key] = writer.channel(line.topic, "json", line.metadata)

@@ -68,14 +68,10 @@ def test_a_password_that_the_board_sends_in_clear_is_warned_of(
     assert f"warning: local_mqtt.username: its password crosses the network unencrypted: {fix}" in err
 
 
-def test_robots_on_a_serial_line_need_only_a_name(flash: Flash) -> None:
-    code, out, _ = flash("goob_imu", *NOWHERE, "--dry-run")
-    assert (code, "private_config" in out, "goob_imu/robot.mpy" in out) == (0, False, True)
-
-
 @pytest.mark.parametrize(
     ("arguments", "code", "named"),
     [
+        (("goob_imu", *NOWHERE, "--dry-run"), 0, ""),  # on a serial line it needs only a name
         (("goob",), 1, "--port"),
         (("goob", *NOWHERE), 1, "/dev/ttyNOWHERE: does not exist"),
         (("minilamp", *NOWHERE), 1, "--wifi"),

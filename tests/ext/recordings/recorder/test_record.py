@@ -150,27 +150,6 @@ def test_a_broker_that_knows_only_mqtt_3(tmp_path: Path) -> None:
         broker.stop()
 
 
-def test_a_killed_recorder_is_continued_by_the_next(tmp_path: Path) -> None:
-    broker, root = Broker(tmp_path), tmp_path / "rec"
-    robot, reference = client(broker.port), Reference(broker.port)
-    with recording(root, broker.port) as process:
-        publish_all(robot, reference, 200)
-        assert until(lambda: len(of(recorded(root), DRIVE)) == 200, step=0.2)
-        process.kill()
-    active = [path for path in library.files([root]) if path.name.endswith(".active")]
-    assert len(active) == 2
-    assert of(recorded(root), DRIVE) == reference.of(DRIVE)
-    with recording(root, broker.port):
-        assert until(lambda: not any(path.exists() for path in active), 10)
-        publish_all(robot, Reference(broker.port), 20)
-        assert until(lambda: len(of(recorded(root), DRIVE)) == 220, step=0.2)
-    found = recorded(root)
-    assert len(of(found, DRIVE)) == 220
-    assert [event["missing"] for event in events(found, "recovered")] == [0, 0]
-    robot.close()
-    broker.stop()
-
-
 @pytest.mark.parametrize("how", ["killed", "stopped"])
 def test_an_outage_is_a_gap(tmp_path: Path, how: str) -> None:
     broker, root = Broker(tmp_path), tmp_path / "rec"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -11,9 +10,7 @@ import numpy as np
 from pebble.contract.packets import Codec, Sound
 from pebble.extensions.media.scene import Scene
 from pebble.extensions.media.video import make_encoder
-from pebble.extensions.recordings.files.writer import RecordingWriter
-from pebble.extensions.recordings.stamps import stamp_ns
-from tests.ext.recordings.playing import GOOB, THEN_NS, Line, js, ms
+from tests.ext.recordings.playing import GOOB, Line, js, ms, write
 
 FPS = 15
 SIZE = (320, 240)
@@ -75,24 +72,7 @@ def film(
     media = [line for line in lines if line.topic in (CAMERA, f"{GOOB}/outgoing/audio")]
     state = [line for line in lines if line.topic not in (CAMERA, f"{GOOB}/outgoing/audio")]
     suffix = ".mcap" if finished else ".mcap.active"
-    _write(day / f"20231114T221320Z-000001.state{suffix}", state, finished=finished)
-    _write(day / f"20231114T221320Z-000002.media.{GOOB.replace('/', '.')}{suffix}", media, finished=finished)
+    write(day / f"20231114T221320Z-000001.state{suffix}", state, finished=finished, chunk_ns=10**9)
+    name = f"20231114T221320Z-000002.media.{GOOB.replace('/', '.')}{suffix}"
+    write(day / name, media, finished=finished, chunk_ns=10**9)
     return root
-
-
-def _write(path: Path, lines: list[Line], *, finished: bool) -> None:
-    with path.open("wb", buffering=0) as file:
-        writer = RecordingWriter(file, library="pebble test")
-        numbers: dict[tuple[str, str], int] = {}
-        second = 0
-        for line in lines:
-            if int(line.at) > second:
-                second = int(line.at)
-                writer.flush()
-            key = line.topic, json.dumps(line.metadata)
-            if key not in numbers:
-                numbers[key] = writer.channel(line.topic, "json", line.metadata)
-            writer.add(numbers[key], THEN_NS + round(line.at * 1e9), line.payload, stamp_ns(line.payload))
-        writer.flush()
-        if finished:
-            writer.finish()

@@ -16,7 +16,6 @@ from pebble.extensions.recordings.recorder.folder import Folder, finished_path
 from pebble.extensions.recordings.recorder.lane import CARRIED, Item, OpenFile
 from pebble.extensions.recordings.seek.archive import Archive
 from pebble.extensions.recordings.seek.days import Days
-from pebble.extensions.recordings.seek.file import SeekableFile
 from tests.ext.recordings.playing import FRED, GOOB, THEN_NS, Line, js, ms, write
 from tests.ext.recordings.seek.filming import CAMERA, FPS, SCENES, film
 
@@ -115,27 +114,6 @@ def test_a_day_names_its_robots_and_gaps(tmp_path: Path) -> None:
     (day,) = Days(Archive(tmp_path)).all()
     assert (day.day, day.robots, day.bytes, day.gaps) == ("2023-11-14", [GOOB], path.stat().st_size, 1)
     assert (day.first, day.last) == (ms(0), ms(5))
-
-
-def test_what_is_written_meanwhile_is_found(tmp_path: Path) -> None:
-    """Also the rest of a chunk that was there only in part."""
-    whole = film(tmp_path / "whole", "pbvd", 6, finished=False)
-    source = next(whole.rglob("*.state.mcap.active"))
-    growing = tmp_path / "growing" / source.name
-    growing.parent.mkdir()
-    data = source.read_bytes()
-    growing.write_bytes(data[: len(data) // 2])
-    file = SeekableFile(growing)
-    before = len(file.chunks)
-    for end in range(len(data) // 2, len(data), 997):
-        growing.write_bytes(data[:end])
-        file.refresh()
-    growing.write_bytes(data)
-    file.refresh()
-    assert 0 < before < len(file.chunks)
-    found = [one for chunk in file.chunks for one in file.messages_of(chunk)]
-    assert texts(found) == texts([one for one in merged([source]) if not one.channel.topic.startswith("$")])
-    file.close()
 
 
 def test_a_file_that_is_finished_meanwhile_is_read_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -11,7 +11,6 @@ from typing import Any
 
 _DATAGRAM = b"x" * 100
 _SO_RCVBUFFORCE = 33  # Python has no name for it
-_EVERY_PROTOCOL = 3
 
 
 def _serve(host: str) -> None:
@@ -59,16 +58,6 @@ def _talk(host: str, port: int, datagrams: int) -> None:
             _write_line({"result": time.monotonic() - began})
 
 
-def _capture() -> None:
-    raw = socket.socket(socket.AF_PACKET, socket.SOCK_RAW, socket.htons(_EVERY_PROTOCOL))
-    raw.bind(("wire", 0))
-    sizes = [0]
-    _thread(lambda: sizes.extend(iter(lambda: raw.recv_into(bytearray(70000)), -1)))
-    _write_line({"ready": True})
-    for _ in sys.stdin:
-        _write_line({"largest": max(sizes)})
-
-
 def _thread(what: Callable[..., object], *arguments: object) -> None:
     threading.Thread(target=what, args=arguments, daemon=True).start()
 
@@ -82,7 +71,5 @@ if __name__ == "__main__":
     role, *rest = sys.argv[1:]
     if role == "serve":
         _serve(*rest)
-    elif role == "talk":
-        _talk(rest[0], int(rest[1]), int(rest[2]))
     else:
-        _capture()
+        _talk(rest[0], int(rest[1]), int(rest[2]))

@@ -1,8 +1,6 @@
 """Two programs that communicate over an impaired network, for tests."""
 
 import sys
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -57,19 +55,3 @@ class ProbeConnection:
     def _ask(self, line: str) -> Any:
         self._client.send(line)
         return self._client.answer(_ANSWER_S)["result"]
-
-
-@contextmanager
-def largest_packet(network: NamespaceNetwork, logs: Path) -> Iterator[Callable[[], int]]:
-    """Bytes of the largest packet, with its Ethernet header, that arrives at the broker's side meanwhile."""
-    listener = Worker("capture", network.on_remote([*_PEER, "capture"]), logs / "log")
-    try:
-        listener.answer(_ANSWER_S)
-
-        def largest() -> int:
-            listener.send("largest")
-            return int(listener.answer(_ANSWER_S)["largest"])
-
-        yield largest
-    finally:
-        end_all([listener])
