@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import os
 import stat
 import subprocess
@@ -21,6 +20,7 @@ from pebble.extensions.install.setup.backup import ABOUT, BackupError, make, pac
 from pebble.runtime.places import Places
 from tests.commands.command_line import Run
 from tests.ext.checks.installed import MQTT, PAGE, PEOPLE, ROBOT, installed
+from tests.ext.install.setup.rig import tar_of
 from tests.support import ROOT
 
 
@@ -112,32 +112,20 @@ def test_nothing_is_left_of_one_that_cannot_be_made(tmp_path: Path, run: Backup)
     assert not file.exists()
 
 
-def _tar(*members: tuple[str, bytes], kind: bytes = tarfile.REGTYPE) -> bytes:
-    output = io.BytesIO()
-    with tarfile.open(fileobj=output, mode="w") as tar:
-        for name, content in members:
-            one = tarfile.TarInfo(name)
-            one.size, one.type, one.linkname = (len(content) if kind == tarfile.REGTYPE else 0), kind, "/etc/passwd"
-            one.type = tarfile.REGTYPE if name == ABOUT else kind
-            one.size = len(content)
-            tar.addfile(one, io.BytesIO(content))
-    return output.getvalue()
-
-
 ABOUT_IT = (ABOUT, b'{"format": 1, "version": "0.1", "id": "goob"}')
 FOREIGN: dict[str, tuple[bytes, str]] = {
     "empty": (b"", "is no backup of Pebble"),
     "a picture": (b"\xff\xd8\xff" * 5000, "is no backup of Pebble"),
     "zeros": (bytes(20_000), "is no backup of Pebble"),
-    "another tar": (_tar(("etc/passwd", b"x")), "does not begin with backup.json"),
-    "not JSON": (_tar((ABOUT, b"{")), "is not of a backup"),
-    "no id": (_tar((ABOUT, b'{"format": 1, "version": "0.1"}')), "is not of a backup"),
-    "a later format": (_tar((ABOUT, b'{"format": 2, "version": "0.9", "id": "x"}')), "of Pebble 0.9: update Pebble"),
-    "absolute": (_tar(ABOUT_IT, ("/etc/shadow", b"x")), "'/etc/shadow' is not what a backup has"),
-    "beyond the root": (_tar(ABOUT_IT, ("etc/../../x", b"x")), "is not what a backup has"),
-    "a link": (_tar(ABOUT_IT, ("etc/x", b""), kind=tarfile.SYMTYPE), "is not what a backup has"),
-    "a device": (_tar(ABOUT_IT, ("etc/x", b""), kind=tarfile.CHRTYPE), "is not what a backup has"),
-    "twice": (_tar(ABOUT_IT, ("etc/x", b"1"), ("etc/x", b"2")), "is in it twice"),
+    "another tar": (tar_of(("etc/passwd", b"x")), "does not begin with backup.json"),
+    "not JSON": (tar_of((ABOUT, b"{")), "is not of a backup"),
+    "no id": (tar_of((ABOUT, b'{"format": 1, "version": "0.1"}')), "is not of a backup"),
+    "a later format": (tar_of((ABOUT, b'{"format": 2, "version": "0.9", "id": "x"}')), "of Pebble 0.9: update Pebble"),
+    "absolute": (tar_of(ABOUT_IT, ("/etc/shadow", b"x")), "'/etc/shadow' is not what a backup has"),
+    "beyond the root": (tar_of(ABOUT_IT, ("etc/../../x", b"x")), "is not what a backup has"),
+    "a link": (tar_of(ABOUT_IT, ("etc/x", b""), kind=tarfile.SYMTYPE), "is not what a backup has"),
+    "a device": (tar_of(ABOUT_IT, ("etc/x", b""), kind=tarfile.CHRTYPE), "is not what a backup has"),
+    "twice": (tar_of(ABOUT_IT, ("etc/x", b"1"), ("etc/x", b"2")), "is in it twice"),
 }
 
 

@@ -224,7 +224,9 @@ def test_what_is_no_backup_is_refused(
     members: list[tuple[str, bytes]], why: str, root: Path, tmp_path: Path, run: Run
 ) -> None:
     before = tree(root)
-    assert run("setup", "--from", tar_of(tmp_path / "a.tar", members)) == 1
+    backup = tmp_path / "a.tar"
+    backup.write_bytes(tar_of(*members))
+    assert run("setup", "--from", backup) == 1
     assert why in run.err
     assert tree(root) == before
 

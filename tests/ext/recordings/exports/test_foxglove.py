@@ -31,16 +31,14 @@ from pebble.contract.payloads import (
 from pebble.errors import PebbleError
 from pebble.extensions.media.h264 import unseal
 from pebble.extensions.media.pcm import to_bytes
-from pebble.extensions.media.scene import Scene, read_counter
+from pebble.extensions.media.scene import read_counter
 from pebble.extensions.media.sound import make_sound_encoder
-from pebble.extensions.media.video import make_encoder
 from pebble.extensions.recordings.exports.foxglove import write_foxglove
 from pebble.extensions.recordings.files.recorded import Channel, Recorded
+from tests.ext.recordings.exports.test_film import DELAY_MS, ROBOT, T0_MS, pictures
 
-ROBOT = "pebble/robots/goob"
-T0_MS = 1_732_300_000_000
 T0_NS = T0_MS * 10**6
-DELAY_NS = 40_000_000
+DELAY_NS = DELAY_MS * 10**6
 CORNERS = [(0.1, 0.2), (0.3, 0.2), (0.3, 0.4), (0.1, 0.4)]
 
 
@@ -51,16 +49,6 @@ def recorded(metric: str, payload: bytes, at_ms: int = T0_MS, publish_ns: int = 
 
 def of(channel: ContractChannel, value: Any) -> Recorded:
     return recorded(channel.suffix, codec.encode(channel, value))
-
-
-def pictures(name: str, count: int) -> list[Recorded]:
-    encoder, scene, made = make_encoder(name, fps=15, quality=40), Scene(160, 120), np.empty((120, 160, 3), np.uint8)
-    messages = []
-    for number in range(count):
-        scene.render(number, made)
-        at_ms = T0_MS + number * 66
-        messages.append(recorded("outgoing/front-camera", encoder.encode(made, at_ms), at_ms))
-    return messages
 
 
 class File:
@@ -112,7 +100,7 @@ def converted(tmp_path: Path, messages: list[Recorded]) -> tuple[File, dict[str,
 
 @pytest.mark.parametrize("name", ["json", "pbvd"])
 def test_pictures_become_jpegs(tmp_path: Path, name: str) -> None:
-    file, counts = converted(tmp_path, pictures(name, 8))
+    file, counts = converted(tmp_path, pictures(name, range(8)))
     assert counts == {"CompressedImage": 8}
     assert file.names() == {f"{ROBOT}/outgoing/front-camera/image": "foxglove.CompressedImage"}
     images = file.of("/image")
@@ -125,7 +113,7 @@ def test_pictures_become_jpegs(tmp_path: Path, name: str) -> None:
 
 
 def test_h264_is_passed_on_without_its_seal(tmp_path: Path) -> None:
-    sent = pictures("h264", 8)
+    sent = pictures("h264", range(8))
     damaged = recorded("outgoing/front-camera", sent[5].payload[:-20], T0_MS + 5 * 66)
     file, counts = converted(tmp_path, [*sent[:5], damaged, *sent[6:]])
     assert counts == {"CompressedVideo": 7, "left out": 1}
@@ -267,7 +255,7 @@ def test_what_is_left_out(tmp_path: Path, payload: bytes) -> None:
 def test_several_channels_of_a_topic_become_one(tmp_path: Path) -> None:
     online = recorded("outgoing/online", b'{"t": 1}')
     retained = Recorded(Channel(5, online.channel.topic, "json", {"retained": "1"}), 0, T0_NS, 0, b'{"t": 2}')
-    file, counts = converted(tmp_path, [*pictures("json", 3), *pictures("h264", 3), retained, online])
+    file, counts = converted(tmp_path, [*pictures("json", range(3)), *pictures("h264", range(3)), retained, online])
     assert counts == {"CompressedImage": 3, "CompressedVideo": 3, "json": 2}
     assert file.names() == {
         f"{ROBOT}/outgoing/front-camera/image": "foxglove.CompressedImage",

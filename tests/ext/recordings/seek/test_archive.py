@@ -125,27 +125,3 @@ def test_a_file_that_is_finished_meanwhile_is_read_on(tmp_path: Path, monkeypatc
     assert before
     assert texts(archive.messages(GOOB, 0, 1 << 62)) == before
     archive.close()
-
-
-def test_damage_costs_its_chunk_only(tmp_path: Path) -> None:
-    archive = Archive(film(tmp_path, "pbvd", 10))
-    before = len(archive.messages(GOOB, 0, 1 << 62))
-    file = next(one for one in archive.all_files() if "media" in one.path.name)
-    lost = len(file.messages_of(file.chunks[3]))
-    archive.close()
-    with file.path.open("r+b") as out:
-        out.seek(file.chunks[3].at + 200)
-        out.write(b"\xff" * 40)
-    again = Archive(tmp_path)
-    assert len(again.messages(GOOB, 0, 1 << 62)) == before - lost
-    again.close()
-
-
-def test_what_is_no_recording_is_left_out(tmp_path: Path) -> None:
-    (tmp_path / "x.mcap").write_bytes(b"no recording")
-    (tmp_path / "empty.mcap.active").write_bytes(b"")
-    archive = Archive(tmp_path)
-    assert archive.messages(GOOB, 0, 1 << 62) == []
-    (day,) = Days(archive).all()
-    assert (day.robots, len(day.unread), "x.mcap" in day.unread[0]) == ([], 1, True)
-    archive.close()

@@ -5,17 +5,16 @@ import os
 import re
 import subprocess
 import sys
-from collections.abc import Iterator
-from contextlib import closing
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import closing, contextmanager
 from pathlib import Path
 
 import pytest
 
 from pebble.errors import PebbleError
 from pebble.extensions.lab.bench.impair.conditions import Condition, Shape
-from pebble.extensions.lab.bench.impair.network import NamespaceNetwork, why_no_namespaces
+from pebble.extensions.lab.bench.impair.network import REMOTE_HOST, ROBOT_HOST, NamespaceNetwork, why_no_namespaces
 from pebble.extensions.lab.rig.processes import children
-from tests.ext.lab.bench.impair.peers import ProbeConnection
 from tests.support import ROOT, Child, gone, until
 
 _OWNER = """
@@ -25,10 +24,16 @@ network = NamespaceNetwork()
 print("ready", flush=True)
 time.sleep(60)
 """
-_SLACK = 20.0  # a transfer may take so many times longer on a busy machine
-_SENT = 2000
+_FETCH = """
+import sys, time, urllib.request
+began = time.monotonic()
+urllib.request.urlopen(sys.argv[1]).read()
+print(time.monotonic() - began)
+"""
+_SEND = "import socket; s = socket.socket(2, 2); [s.sendto(b'x' * 100, ('{}', 9)) for _ in range(2000)]"
 _DATAGRAM = 142  # bytes, with the headers of Ethernet, IP and UDP
 _BAND = range(50, 151)  # lost of 100 on average; five standard deviations
+_RATE = Condition("1024k", Shape(kbit=1024))
 
 
 @pytest.fixture
@@ -45,44 +50,62 @@ def network(_permitted: None) -> Iterator[NamespaceNetwork]:
         yield made
 
 
-def test_a_rate_limits_the_uplink_only_and_the_connection_stays(network: NamespaceNetwork, tmp_path: Path) -> None:
-    with ProbeConnection(network, tmp_path) as talk:
-        network.apply(Condition("1024k", Shape(kbit=1024)))
-        must = 30_000 * 8 / 1_024_000
-        assert must * 0.95 < talk.up(30_000) < must * _SLACK
-        assert talk.down(1_000_000) < 1_000_000 * 8 / 1_024_000 / 2
+@contextmanager
+def served(network: NamespaceNetwork, folder: Path) -> Iterator[None]:
+    """Files of 30,000 and 1,000,000 bytes on both sides."""
+    for size in (30_000, 1_000_000):
+        (folder / str(size)).write_bytes(bytes(size))
+    serve = [sys.executable, "-m", "http.server", "--directory", str(folder), "8000"]
+    with Child(network.on_robot(serve), stderr=-3) as robot, Child(network.on_remote(serve), stderr=-3) as remote:
+        try:
+            assert until(
+                lambda: all("1F40" in Path(f"/proc/{side.pid}/net/tcp").read_text() for side in (robot, remote))
+            )
+            yield
+        finally:
+            robot.kill()
+            remote.kill()
+
+
+def fetching(side: Callable[[Sequence[str]], list[str]], host: str, size: int) -> Child:
+    return Child(side([sys.executable, "-c", _FETCH, f"http://{host}:8000/{size}"]), stdout=-1, text=True)
+
+
+def seconds(fetch: Child) -> float:
+    return float(fetch.communicate(timeout=60)[0])
+
+
+def test_a_rate_limits_the_uplink_only_and_a_connection_stays_when_it_ends(
+    network: NamespaceNetwork, tmp_path: Path
+) -> None:
+    full_s = 1_000_000 * 8 / 1_024_000
+    with served(network, tmp_path):
+        network.apply(_RATE)
+        assert seconds(fetching(network.on_remote, ROBOT_HOST, 30_000)) > 30_000 * 8 / 1_024_000 * 0.95
+        assert seconds(fetching(network.on_robot, REMOTE_HOST, 1_000_000)) < full_s / 2
+        before, fetch = network.bytes_up(), fetching(network.on_remote, ROBOT_HOST, 1_000_000)
+        assert until(lambda: network.bytes_up() > before + 50_000)
         network.apply(Condition("base-end"))
-        assert talk.up(1_000_000) < 1_000_000 * 8 / 1_024_000 / 2
+        assert seconds(fetch) < full_s / 2
 
 
 def test_packets_are_those_of_a_wire_and_counted_with_their_headers(network: NamespaceNetwork, tmp_path: Path) -> None:
-    with ProbeConnection(network, tmp_path) as talk:
+    with served(network, tmp_path):
         before = network.bytes_up()
-        talk.up(100_000)
-        assert 100_000 + 66 * 69 <= network.bytes_up() - before < 125_000
+        seconds(fetching(network.on_remote, ROBOT_HOST, 1_000_000))
+        assert 1_000_000 + 66 * 690 <= network.bytes_up() - before < 1_200_000
 
 
-def test_loss_drops_the_configured_share_of_packets(network: NamespaceNetwork, tmp_path: Path) -> None:
-    def lost() -> int:
-        counters = network.on_remote(["nft", "list", "chain", "ip", "impair", "arriving"])
-        return sum(map(int, re.findall(r"packets (\d+)", subprocess.check_output(counters, text=True))))
-
-    with ProbeConnection(network, tmp_path) as talk:
-        before = network.bytes_up()
-        network.apply(Condition("5%", Shape(loss=0.05)))
-        talk.send_datagrams(_SENT)
-        assert lost() in _BAND
-        assert until(lambda: talk.received_datagrams() + lost() == _SENT, 30)
-        assert network.bytes_up() - before >= _SENT * _DATAGRAM
+def test_loss_drops_the_configured_share_of_packets(network: NamespaceNetwork) -> None:
+    before = network.bytes_up()
+    network.apply(Condition("5%", Shape(loss=0.05)))
+    subprocess.run(network.on_robot([sys.executable, "-c", _SEND.format(REMOTE_HOST)]), check=True)
+    counters = network.on_remote(["nft", "list", "chain", "ip", "impair", "arriving"])
+    printed = subprocess.check_output(counters, text=True)
+    assert sum(map(int, re.findall(r"packets (\d+)", printed))) in _BAND
+    assert network.bytes_up() - before >= 2000 * _DATAGRAM
 
 
-def test_the_namespaces_have_no_other_connection(network: NamespaceNetwork) -> None:
-    for command in (network.on_robot, network.on_remote):
-        shown = subprocess.check_output(command(["cat", "/proc/net/dev"]), text=True)
-        assert {line.split(":")[0].strip() for line in shown.splitlines()[2:]} == {"lo", "wire"}
-
-
-@pytest.mark.usefixtures("_permitted")
 def test_close_leaves_nothing_and_may_be_repeated() -> None:
     before = set(children(os.getpid()))
     network = NamespaceNetwork()
