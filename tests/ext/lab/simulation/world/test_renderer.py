@@ -87,6 +87,15 @@ def blurred(picture: Image) -> float:
     return float(np.abs(np.diff(picture[200:280].astype(np.int16), axis=1)).max())
 
 
+@pytest.mark.parametrize(
+    ("fault", "least", "most"),
+    [({"noise": 8.0}, 6, 7), ({"blur": 3.0}, 2, 4), ({"jpeg_quality": 10}, 3, 5), ({}, -1, 0)],
+)
+def test_a_fault_of_the_camera_changes_each_pixel_by_so_much(fault: dict[str, float], least: int, most: int) -> None:
+    clear, faulty = (seen(world_of(tags=[TAG], camera={**CLEAR, **keys})) for keys in ({}, fault))
+    assert least < np.abs(faulty.astype(np.int16) - clear).mean() <= most
+
+
 def turning(radians_per_s: float) -> dict[str, Track]:
     return {
         "goob": Track([Sample(ms * 1_000_000, RobotPose(0, 0, radians_per_s * ms / 1e3)) for ms in range(-200, 1, 20)])
