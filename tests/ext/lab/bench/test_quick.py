@@ -4,7 +4,9 @@ import os
 import signal
 import subprocess
 import sys
+import tempfile
 import time
+from collections.abc import Iterator
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -19,6 +21,13 @@ from tests.support import ROOT, gone, until
 
 def command(name: str, *options: str) -> list[str]:
     return [sys.executable, "-m", "pebble.cli", "bench", name, "--quick", *options]
+
+
+@pytest.fixture
+def temporary() -> Iterator[Path]:
+    """The folder for temporary files of the bench; short, because of Unix sockets: it would take another one."""
+    with tempfile.TemporaryDirectory(prefix="b") as folder:
+        yield Path(folder)
 
 
 @pytest.fixture

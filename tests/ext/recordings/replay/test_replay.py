@@ -17,7 +17,6 @@ import pytest
 from pebble.extensions.recordings.files.rewrite import rewrite
 from pebble.extensions.recordings.stamps import stamp_ns
 from tests.commands.command_line import Run, program
-from tests.commands.conftest import run as run
 from tests.ext.recordings import messages
 from tests.ext.recordings.playing import FRED, GOOB, Line, demo, js, ms, write
 from tests.ext.recordings.recorder.test_record import Reference

@@ -6,7 +6,6 @@ from pathlib import Path
 
 import pytest
 
-from tests.commands.command_line import Run
 from tests.ext.recordings.demo_robots import BENJR, DRIVE, messages
 from tests.ext.recordings.synthetic import demo_folder
 
@@ -15,14 +14,9 @@ pytest.importorskip("matplotlib")
 
 
 @pytest.fixture
-def run(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> Run:
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.setenv("TZ", "UTC")
     monkeypatch.chdir(tmp_path)
-    return Run(monkeypatch, capsys)
-
-
-@pytest.fixture
-def folder(tmp_path: Path) -> Path:
     return demo_folder(tmp_path / "recordings")
 
 
