@@ -15,26 +15,13 @@ from typing import Any
 import pytest
 
 from pebble.extensions.fleet.people import People
-from pebble.extensions.install.commands import setup as command
 from pebble.extensions.install.setup.backup import ABOUT, BackupError, make, packed, read, unpacked
 from pebble.runtime.places import Places
 from tests.commands.command_line import Run
 from tests.ext.checks.installed import MQTT, PAGE, PEOPLE, ROBOT, installed
+from tests.ext.install.setup.conftest import at
 from tests.ext.install.setup.rig import tar_of
 from tests.support import ROOT
-
-
-class Backup(Run):
-    """``pebble setup --backup FILE`` on the machine below a root."""
-
-    def of(self, root: Path, file: Path) -> int:
-        self._monkeypatch.setattr(command, "Places", lambda: Places(root))
-        return self("setup", "--backup", file)
-
-
-@pytest.fixture
-def run(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Backup:
-    return Backup(monkeypatch, capsys)
 
 
 @pytest.fixture(scope="module")
@@ -59,11 +46,12 @@ def test_all_files_but_recordings_are_in_it_as_they_are(places: Places, tmp_path
         assert (saved.content, saved.mode) == (there[name].read_bytes(), stat.S_IMODE(there[name].stat().st_mode)), name
 
 
-def test_the_command(places: Places, tmp_path: Path, run: Backup) -> None:
+def test_the_command(places: Places, tmp_path: Path, run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    at(places.root, monkeypatch)
     file = tmp_path / "goob.tar"
     before = os.umask(0)
     try:
-        assert run.of(places.root, file) == 0
+        assert run("setup", "--backup", file) == 0
     finally:
         os.umask(before)
     assert stat.S_IMODE(file.stat().st_mode) == 0o600
@@ -73,7 +61,7 @@ def test_the_command(places: Places, tmp_path: Path, run: Backup) -> None:
     about = read(file).about
     assert (about.format, about.id) == (1, "goob")
     first = file.read_bytes()
-    assert run.of(places.root, file) == 2
+    assert run("setup", "--backup", file) == 2
     assert "exists: name another file" in run.err
     assert file.read_bytes() == first
     listed = subprocess.run(["tar", "tf", file], capture_output=True, text=True, check=True).stdout.splitlines()
@@ -98,17 +86,19 @@ def test_others_cannot_read_it_from_its_first_byte_on(places: Places, tmp_path: 
     assert (int(flags) & os.O_EXCL != 0, existed) == (True, "False")
 
 
-def test_nothing_is_left_of_one_that_cannot_be_made(tmp_path: Path, run: Backup) -> None:
+def test_nothing_is_left_of_one_that_cannot_be_made(tmp_path: Path, run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     file = tmp_path / "goob.tar"
-    with installed(tmp_path / "root") as broken:
+    with installed(tmp_path / "other") as broken:
         pass  # its database is closed
     (broken.root / PEOPLE).write_bytes(b"SQLite format 3\0" + bytes(4000))
-    assert run.of(broken.root, file) == 1
+    at(broken.root, monkeypatch)
+    assert run("setup", "--backup", file) == 1
     assert "people.sqlite: is" in run.err
     assert len(run.err.splitlines()) == 1
-    assert run.of(tmp_path / "elsewhere", file) == 1
+    at(tmp_path / "elsewhere", monkeypatch)
+    assert run("setup", "--backup", file) == 1
     assert "no robot is installed there" in run.err
-    assert run.of(tmp_path / "elsewhere", tmp_path / "no" / "folder") == 1
+    assert run("setup", "--backup", tmp_path / "no" / "folder") == 1
     assert not file.exists()
 
 
