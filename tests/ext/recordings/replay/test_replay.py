@@ -90,7 +90,7 @@ def ends(process: subprocess.Popen[str], timeout: float = 20) -> tuple[int, str,
 def test_replayed_at_ten_times_its_speed_it_is_the_same(
     tmp_path: Path, operator: Reference, at: tuple[str, str], run: Run
 ) -> None:
-    lines = demo(20)
+    lines = list(demo(20))
     path = write(tmp_path / "demo.mcap", lines)
     began = time.monotonic()
     assert (run("replay", path, *at, "--incoming", "--speed", "10"), run.err) == (0, "")
