@@ -95,17 +95,17 @@ def test_every_other_round_goes_backwards() -> None:
     assert [in_turn("abc", number) for number in range(3)] == ["abc", "cba", "abc"]
 
 
-def measured(outcomes: str) -> Results:
+def measured(outcomes: str, printed: io.StringIO | None = None) -> Results:
     """One round for each letter; ``x`` fails after its first variant."""
     results = Results(bench="wake-up")
 
     def measure(number: int, _progress: Progress) -> Iterator[Cell]:
         yield round_cell("pipe", "way", "us", [float(number)])
         if outcomes[number] == "x":
-            raise PebbleError("the robot is not up\nits last words")
+            raise PebbleError("the robot is not up\nits last [words]")
         yield round_cell("socket", "way", "us", [] if outcomes[number] == "-" else [1.0])
 
-    measure_rounds(results, len(outcomes), measure, Console(file=io.StringIO()))
+    measure_rounds(results, len(outcomes), measure, Console(file=printed or io.StringIO(), width=80))
     return results
 
 
@@ -120,8 +120,11 @@ def test_a_round_that_fails_counts_for_no_variant(outcomes: str, complete: bool)
     assert results.complete is complete
 
 
-def test_a_failed_round_is_noted() -> None:
-    assert measured(".xx").notes == ["2 of 3 rounds failed and were left out; round 2: the robot is not up"]
+def test_a_failed_round_is_noted_and_shown_at_once() -> None:
+    printed = io.StringIO()
+    noted = ["2 of 3 rounds failed and were left out; round 2: the robot is not up"]
+    assert measured(".xx", printed).notes == noted
+    assert "round 3: the robot is not up\nits last [words]" in printed.getvalue()
     assert measured("..").notes == []
 
 
