@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from itertools import product
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from pebble.contract.packets import KEY_FRAME, Codec, Picture, PictureKind, Sound
+from pebble.contract.packets import Codec, Picture, PictureKind, Sound
 from pebble.extensions.recordings.files.recorded import Channel
 from pebble.extensions.recordings.files.writer import RecordingWriter
 from pebble.extensions.recordings.replay.player import BusOutput, Player
@@ -50,11 +51,16 @@ def ms(at: float) -> int:
     return THEN_NS // 10**6 + round(at * 1000)
 
 
-def write(path: Path, lines: Iterable[Line], *, finished: bool = True) -> Path:
+def write(path: Path, lines: Iterable[Any], *, finished: bool = True, chunk_ns: int = 1 << 63) -> Path:
+    """A recording of these lines, in chunks of this length."""
     with path.open("wb", buffering=0) as file:
         writer = RecordingWriter(file, library="pebble test")
         numbers: dict[tuple[str, str], int] = {}
+        ends_ns = 0
         for line in lines:
+            if ends_ns <= line.log_ns:
+                writer.flush()
+                ends_ns = line.log_ns // chunk_ns * chunk_ns + chunk_ns
             key = line.topic, str(line.metadata)
             if key not in numbers:
                 numbers[key] = writer.channel(line.topic, "json", line.metadata)
@@ -140,22 +146,17 @@ def picture(kind: PictureKind, frame: int, at: float, flags: int = 0, body: byte
     return Picture(kind, frame, ms(at), body, flags).pack()
 
 
-def demo(seconds: float, robots: Sequence[str] = (GOOB, FRED)) -> list[Line]:
-    """What robots publish while they are driven and watched."""
-    lines = []
-    for number in range(int(seconds * 50)):
+def demo(seconds: float, robots: Sequence[str] = (GOOB, FRED)) -> Iterator[Line]:
+    """Heartbeats, sound, telemetry, commands, one retained value that changes, and lines of the log."""
+    for number, base in product(range(int(seconds * 50)), robots):
         at = number / 50
-        for base in robots:
-            sound = Sound(Codec.PCM16LE, 1, 16000, 320, number + 1, ms(at), b"\1\2" * 320)
-            lines.append(Line(at, f"{base}/outgoing/audio", sound.pack()))
-            if number % 3 == 0:
-                key = number % 60 == 0
-                packet = picture(PictureKind.H264, number // 3, at, KEY_FRAME * key, b"x" * 900)
-                lines.append(Line(at + 0.001, f"{base}/outgoing/front-camera", packet))
-            if number % 12 == 0:
-                lines.append(Line(at + 0.002, f"{base}/outgoing/online", js(t=ms(at)), 1, retain=True))
-            if number % 5 == 0:
-                drive = js(x=0.0, z=0.5 * (number % 100 < 50))
-                lines.append(Line(at + 0.003, f"{base}/incoming/drive-values", drive, 1))
-                lines.append(Line(at + 0.004, f"{base}/outgoing/sensors/imu", js(t=ms(at), n=number), 1))
-    return lines
+        sound = Sound(Codec.PCM16LE, 1, 16000, 320, number + 1, ms(at), b"\1\2" * 320)
+        yield Line(at, f"{base}/outgoing/audio", sound.pack())
+        if number % 12 == 0:
+            yield Line(at, f"{base}/outgoing/online", js(t=ms(at)), 1, retain=True)
+        if number % 5 == 0:
+            yield Line(at, f"{base}/outgoing/sensors/imu", js(t=ms(at), n=number), 1)
+            yield Line(at, f"{base}/incoming/drive-values", js(x=0.0, z=0.5 * (number % 500 < 250)), 1)
+        if number % 500 == 250:
+            yield Line(at, f"{base}/outgoing/charging-level", js(t=ms(at), value=100 - number // 500), 1, retain=True)
+            yield Line(at, f"{base}/outgoing/logs", js(t=ms(at), level="INFO", message=f"line {number}"), 1)

@@ -19,10 +19,8 @@ from pebble.extensions.recordings.files import rewrite as rewriting
 from pebble.extensions.recordings.files.reader import RecordingFile
 from pebble.extensions.recordings.files.recorded import RecordingError
 from pebble.extensions.recordings.files.rewrite import rewrite
+from pebble.extensions.recordings.files.writer import RecordingWriter
 from pebble.extensions.recordings.library import problems
-from pebble.extensions.recordings.recorder.disk_space import Disk, outdated, surplus
-from pebble.extensions.recordings.recorder.folder import Folder
-from pebble.extensions.recordings.recorder.settings import Options
 from pebble.extensions.recordings.replay.source import ReplaySource
 from pebble.extensions.recordings.seek.archive import Archive
 from pebble.extensions.recordings.seek.days import Days
@@ -203,7 +201,7 @@ def test_a_flipped_bit_anywhere_costs_no_message_at_a_deletion(tmp_path: Path) -
     assert refused > 20
 
 
-@pytest.mark.parametrize("command", [*READERS, *WRITERS])
+@pytest.mark.parametrize("command", [READERS[2], WRITERS[0]], ids=["search", "rm"])
 def test_without_the_package_the_extra_is_named(
     tmp_path: Path, run: Run, monkeypatch: pytest.MonkeyPatch, command: list[str]
 ) -> None:
@@ -215,6 +213,10 @@ def test_without_the_package_the_extra_is_named(
     assert not [one for one in tmp_path.glob("out*") if one.is_file()]
 
 
+def _full(_descriptor: int) -> None:
+    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+
 class TestInterrupted:
     """A deletion that does not come to its end leaves the file as it was, and nothing beside it."""
 
@@ -224,14 +226,21 @@ class TestInterrupted:
         write(path, 100, channels=2)
         return path
 
-    def test_a_full_disk(self, path: Path, run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
-        def full(_descriptor: int) -> None:
-            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-
+    @pytest.mark.parametrize(
+        ("fails", "problem"),
+        [
+            ((rewriting.os, "fsync", _full), "No space left on device"),
+            ((RecordingWriter, "finish", lambda _writer: None), "cannot be read again"),
+            ((rewriting.shutil, "disk_usage", lambda _folder: SimpleNamespace(free=1000)), "there is no room"),
+        ],
+    )
+    def test_a_copy_that_cannot_be_made(
+        self, path: Path, run: Run, monkeypatch: pytest.MonkeyPatch, fails: tuple[Any, str, Any], problem: str
+    ) -> None:
         before = path.read_bytes()
-        monkeypatch.setattr(rewriting.os, "fsync", full)
+        monkeypatch.setattr(*fails)
         assert run("recordings", "rm", path.parents[3], "--robot", "r0", "--yes") == 1
-        assert "No space left on device" in run.err
+        assert problem in run.err
         assert path.read_bytes() == before
         assert list(path.parent.iterdir()) == [path]
 
@@ -265,13 +274,6 @@ class TestInterrupted:
         assert run(*arguments) == 0
         assert list(path.parent.iterdir()) == [path]
         assert contents(path) == rest
-
-    def test_a_copy_that_cannot_be_read_again(self, path: Path, run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
-        before = path.read_bytes()
-        monkeypatch.setattr("pebble.extensions.recordings.files.writer.RecordingWriter.finish", lambda _: None)
-        assert run("recordings", "rm", path.parents[3], "--robot", "r0", "--yes") == 1
-        assert "cannot be read again" in run.err
-        assert path.read_bytes() == before
 
 
 class TestNames:
@@ -310,15 +312,11 @@ class TestNames:
         assert run("recordings", "rm", tmp_path / "notes.txt", "--yes") == 1
         assert (tmp_path / "notes.txt").exists()
 
-    @pytest.mark.parametrize("ending", ["mcap", "jsonl"])
-    def test_an_export_replaces_no_file(self, tmp_path: Path, run: Run, ending: str) -> None:
+    def test_an_export_and_a_mended_copy_replace_no_file(self, tmp_path: Path, run: Run) -> None:
         path = stored(tmp_path, VALID["zstd"])
-        taken = path if ending == "mcap" else tmp_path / "a.jsonl"
-        before = VALID["zstd"] if ending == "mcap" else b"rest"
-        taken.write_bytes(before)
-        assert run("recordings", "export", path, taken) == 1
-        assert run("recordings", "mend", path, taken) == 1
-        assert taken.read_bytes() == before
+        assert run("recordings", "export", path, path) == 1
+        assert run("recordings", "mend", path, path) == 1
+        assert path.read_bytes() == VALID["zstd"]
 
     def test_mending_takes_no_name_that_is_taken(self, tmp_path: Path, run: Run) -> None:
         whole_ = stored(tmp_path, VALID["zstd"])
@@ -329,17 +327,6 @@ class TestNames:
         assert "exists already" in run.err
         assert whole_.read_bytes() == VALID["zstd"]
         assert active.read_bytes() == before
-
-
-def test_what_was_not_read_makes_no_room(tmp_path: Path) -> None:
-    """Damaged files are neither deleted for their size and age nor is another one for theirs."""
-    for number, end in enumerate(["", ".damaged", "", ".damaged"], 1):
-        stored(tmp_path, bytes(1000), f"{NAME.replace('001', f'{number:03}')}{end}")
-    entries = Folder(tmp_path / "rec").entries()
-    assert [one.number for one in surplus(entries, Options(keep_bytes=1500), Disk(1 << 40))] == [1]
-    assert surplus(entries, Options(keep_bytes=2000), Disk(1 << 40)) == []
-    old = outdated(entries[1:], Options(keep_media_days=1.0), entries[0].ended + 1e6)
-    assert old is None
 
 
 class TestMending:
@@ -379,12 +366,3 @@ class TestMending:
         path = stored(tmp_path, data, f"{NAME}.active")
         assert run("recordings", "mend", tmp_path / "rec") == 0
         assert list(path.parent.iterdir()) == []
-
-    def test_a_copy_needs_room(self, tmp_path: Path, run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
-        path = stored(tmp_path, b"", f"{NAME}.active")
-        write(path, 100, finish=False)
-        before = path.read_bytes()
-        monkeypatch.setattr(rewriting.shutil, "disk_usage", lambda _: SimpleNamespace(free=1000))
-        assert run("recordings", "mend", tmp_path / "rec") == 1
-        assert f"there is no room for a copy of {path.name}" in run.err
-        assert path.read_bytes() == before

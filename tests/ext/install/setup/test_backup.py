@@ -2,44 +2,30 @@
 
 from __future__ import annotations
 
-import io
 import os
 import stat
 import subprocess
 import sys
 import tarfile
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from pebble.extensions.fleet import applying, certificates
-from pebble.extensions.fleet.folder import load as load_fleet
 from pebble.extensions.fleet.people import People
-from pebble.extensions.install.commands import setup as command
 from pebble.extensions.install.setup.backup import ABOUT, BackupError, make, packed, read, unpacked
 from pebble.extensions.operator.places import Places
 from pebble.extensions.scripts.perception.camera_model import CameraModel
 from pebble.motion.latch import Latch
 from pebble.motors.state_file import StateFile
+from pebble.extensions.operator.places import Places
 from tests.commands.command_line import Run
-from tests.ext.checks.installed import BROKER, MQTT, PAGE, PEOPLE, ROBOT, config_of, installed
+from tests.ext.checks.installed import MQTT, PAGE, PEOPLE, ROBOT, installed
+from tests.ext.install.setup.conftest import at
+from tests.ext.install.setup.rig import tar_of
 from tests.support import ROOT
-
-
-class Backup(Run):
-    """``pebble setup --backup FILE`` on the machine below a root."""
-
-    def of(self, root: Path, file: Path) -> int:
-        self._monkeypatch.setattr(command, "Places", lambda: Places(root))
-        return self("setup", "--backup", file)
-
-
-@pytest.fixture
-def run(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Backup:
-    return Backup(monkeypatch, capsys)
 
 
 @pytest.fixture(scope="module")
@@ -48,73 +34,28 @@ def places(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Places]:
         yield one
 
 
-@pytest.fixture(scope="module")
-def restored(places: Places, tmp_path_factory: pytest.TempPathFactory) -> Places:
-    """Another root, with what is in the backup and nothing else."""
-    new = Places(tmp_path_factory.mktemp("new"))
-    for name, saved in unpacked(packed(make(places)), "goob.tar").files.items():
-        file = new.root / name
-        file.parent.mkdir(parents=True, exist_ok=True)
-        file.write_bytes(saved.content)
-        file.chmod(saved.mode)
-    return new
-
-
-def _logs_in(places: Places) -> object:
-    with closing(People(places.root / PEOPLE)) as people:
-        return people.check("ann", PAGE, "10.0.0.1")
-
-
-def _stop(places: Places) -> object:
-    latch = Latch("new", 8, int.__sub__)
-    latch.restore(StateFile(config_of(places).state_file("estop-serial")).load())
-    return latch.latched, latch.saved()
-
-
-def _accounts(places: Places) -> object:
-    folder = places.root / BROKER
-    return load_fleet(folder), applying.passwords_of(folder)
-
-
-def _camera(places: Places) -> object:
-    return CameraModel.find([places.etc]).matrix(640, 480).tolist()
-
-
-NEEDED: dict[str, Callable[[Places], object]] = {
-    "its config, with its password": lambda places: config_of(places).services.mqtt_bridge.remote_mqtt,
-    "the page's own login": lambda places: str(config_of(places).web_interface.mqtt.password),
-    "people log in": _logs_in,
-    "the stop": _stop,
-    "the page's certificate": lambda places: certificates.show(places.etc / "tls/server.pem").sha256,
-    "the page's key": lambda places: (places.etc / "tls/server.key").read_bytes(),
-    "the key of its authority": lambda places: (places.etc / "tls/ca.key").read_bytes(),
-    "accounts at its broker": _accounts,
-    "the broker's certificate": lambda places: certificates.show(places.root / BROKER / "server.pem").sha256,
-    "the broker's configuration": lambda places: places.broker.read_text(),
-    "the camera's calibration": _camera,
-    "the wheels' calibration": lambda places: (places.etc / "auto_tune_state.json").read_text(),
-}
-
-
-@pytest.mark.parametrize("what", NEEDED)
-def test_a_restored_robot_has(what: str, places: Places, restored: Places) -> None:
-    before, after = NEEDED[what](places), NEEDED[what](restored)
-    assert before
-    assert repr(after).replace(str(restored.root), str(places.root)) == repr(before)
-
-
-def test_what_is_not_in_it(places: Places) -> None:
+def test_all_files_but_recordings_are_in_it_as_they_are(places: Places, tmp_path: Path) -> None:
+    """Config, passwords, keys, certificates, accounts at the broker, people, the stop, calibrations."""
     made = make(places)
-    assert not [name for name in made.files if name.endswith((".mcap", "-wal", "-shm"))]
+    files = unpacked(packed(made), "goob.tar").files
+    there = {str(path.relative_to(places.root)): path for path in places.root.rglob("*") if path.is_file()}
+    left_out = {name for name in there if name.endswith((".mcap", "-wal", "-shm"))}
     assert made.left_out == {str(places.state / "recordings"): "recordings"}
-    assert all(not name.startswith(("/", "..")) for name in made.files)
+    assert files.keys() == there.keys() - left_out
+    database = tmp_path / "people.sqlite"
+    database.write_bytes(files.pop(str(PEOPLE)).content)
+    with closing(People(database)) as people:
+        assert people.check("ann", PAGE, "10.0.0.1"), "though it is open, with changes in its journal"
+    for name, saved in files.items():
+        assert (saved.content, saved.mode) == (there[name].read_bytes(), stat.S_IMODE(there[name].stat().st_mode)), name
 
 
-def test_the_command(places: Places, tmp_path: Path, run: Backup) -> None:
+def test_the_command(places: Places, tmp_path: Path, run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    at(places.root, monkeypatch)
     file = tmp_path / "goob.tar"
     before = os.umask(0)
     try:
-        assert run.of(places.root, file) == 0
+        assert run("setup", "--backup", file) == 0
     finally:
         os.umask(before)
     assert stat.S_IMODE(file.stat().st_mode) == 0o600
@@ -124,7 +65,7 @@ def test_the_command(places: Places, tmp_path: Path, run: Backup) -> None:
     about = read(file).about
     assert (about.format, about.id) == (1, "goob")
     first = file.read_bytes()
-    assert run.of(places.root, file) == 2
+    assert run("setup", "--backup", file) == 2
     assert "exists: name another file" in run.err
     assert file.read_bytes() == first
     listed = subprocess.run(["tar", "tf", file], capture_output=True, text=True, check=True).stdout.splitlines()
@@ -149,30 +90,20 @@ def test_others_cannot_read_it_from_its_first_byte_on(places: Places, tmp_path: 
     assert (int(flags) & os.O_EXCL != 0, existed) == (True, "False")
 
 
-def test_nothing_is_left_of_one_that_cannot_be_made(tmp_path: Path, run: Backup) -> None:
+def test_nothing_is_left_of_one_that_cannot_be_made(tmp_path: Path, run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     file = tmp_path / "goob.tar"
-    with installed(tmp_path / "root") as broken:
+    with installed(tmp_path / "other") as broken:
         pass  # its database is closed
     (broken.root / PEOPLE).write_bytes(b"SQLite format 3\0" + bytes(4000))
-    assert run.of(broken.root, file) == 1
+    at(broken.root, monkeypatch)
+    assert run("setup", "--backup", file) == 1
     assert "people.sqlite: is" in run.err
     assert len(run.err.splitlines()) == 1
-    assert run.of(tmp_path / "elsewhere", file) == 1
+    at(tmp_path / "elsewhere", monkeypatch)
+    assert run("setup", "--backup", file) == 1
     assert "no robot is installed there" in run.err
-    assert run.of(tmp_path / "elsewhere", tmp_path / "no" / "folder") == 1
+    assert run("setup", "--backup", tmp_path / "no" / "folder") == 1
     assert not file.exists()
-
-
-def _tar(*members: tuple[str, bytes], kind: bytes = tarfile.REGTYPE) -> bytes:
-    output = io.BytesIO()
-    with tarfile.open(fileobj=output, mode="w") as tar:
-        for name, content in members:
-            one = tarfile.TarInfo(name)
-            one.size, one.type, one.linkname = (len(content) if kind == tarfile.REGTYPE else 0), kind, "/etc/passwd"
-            one.type = tarfile.REGTYPE if name == ABOUT else kind
-            one.size = len(content)
-            tar.addfile(one, io.BytesIO(content))
-    return output.getvalue()
 
 
 ABOUT_IT = (ABOUT, b'{"format": 1, "version": "0.1", "id": "goob"}')
@@ -180,15 +111,15 @@ FOREIGN: dict[str, tuple[bytes, str]] = {
     "empty": (b"", "is no backup of Pebble"),
     "a picture": (b"\xff\xd8\xff" * 5000, "is no backup of Pebble"),
     "zeros": (bytes(20_000), "is no backup of Pebble"),
-    "another tar": (_tar(("etc/passwd", b"x")), "does not begin with backup.json"),
-    "not JSON": (_tar((ABOUT, b"{")), "is not of a backup"),
-    "no id": (_tar((ABOUT, b'{"format": 1, "version": "0.1"}')), "is not of a backup"),
-    "a later format": (_tar((ABOUT, b'{"format": 2, "version": "0.9", "id": "x"}')), "of Pebble 0.9: update Pebble"),
-    "absolute": (_tar(ABOUT_IT, ("/etc/shadow", b"x")), "'/etc/shadow' is not what a backup has"),
-    "beyond the root": (_tar(ABOUT_IT, ("etc/../../x", b"x")), "is not what a backup has"),
-    "a link": (_tar(ABOUT_IT, ("etc/x", b""), kind=tarfile.SYMTYPE), "is not what a backup has"),
-    "a device": (_tar(ABOUT_IT, ("etc/x", b""), kind=tarfile.CHRTYPE), "is not what a backup has"),
-    "twice": (_tar(ABOUT_IT, ("etc/x", b"1"), ("etc/x", b"2")), "is in it twice"),
+    "another tar": (tar_of(("etc/passwd", b"x")), "does not begin with backup.json"),
+    "not JSON": (tar_of((ABOUT, b"{")), "is not of a backup"),
+    "no id": (tar_of((ABOUT, b'{"format": 1, "version": "0.1"}')), "is not of a backup"),
+    "a later format": (tar_of((ABOUT, b'{"format": 2, "version": "0.9", "id": "x"}')), "of Pebble 0.9: update Pebble"),
+    "absolute": (tar_of(ABOUT_IT, ("/etc/shadow", b"x")), "'/etc/shadow' is not what a backup has"),
+    "beyond the root": (tar_of(ABOUT_IT, ("etc/../../x", b"x")), "is not what a backup has"),
+    "a link": (tar_of(ABOUT_IT, ("etc/x", b""), kind=tarfile.SYMTYPE), "is not what a backup has"),
+    "a device": (tar_of(ABOUT_IT, ("etc/x", b""), kind=tarfile.CHRTYPE), "is not what a backup has"),
+    "twice": (tar_of(ABOUT_IT, ("etc/x", b"1"), ("etc/x", b"2")), "is in it twice"),
 }
 
 

@@ -1,17 +1,7 @@
-"""The control comparison: what a slice counts, order of the slices, and a short real run that leaves nothing."""
+"""The control comparison: what a slice counts."""
 
-import os
-import signal
-import subprocess
-import sys
 from collections.abc import Callable
-from itertools import product
-from pathlib import Path
 
-import pytest
-
-from pebble.errors import PebbleError
-from pebble.extensions.lab.bench.control import ONE_WAY, ROUND_TRIP, VARIANTS, Participants
 from pebble.extensions.lab.bench.control_ends import (
     REPLIES,
     Connection,
@@ -22,9 +12,6 @@ from pebble.extensions.lab.bench.control_ends import (
     SliceSpec,
     echo,
 )
-from pebble.extensions.lab.bench.results import load
-from pebble.extensions.lab.rig.processes import children
-from tests.support import ROOT
 
 
 class Loop:
@@ -66,43 +53,3 @@ def test_what_comes_twice_counts_once_and_what_does_not_come_is_lost() -> None:
 
     done = exchanged(Loop(spoil), SliceSpec(size=40, rate=1000, seconds=0.05))
     assert (done.sent, len(done.exchanges)) == (50, 25)
-
-
-def command(*options: str) -> list[str]:
-    return [sys.executable, "-m", "pebble.cli", "bench", "control", *options]
-
-
-@pytest.mark.thorough
-@pytest.mark.parametrize(("variants", "loads"), [([*VARIANTS], ["none", "hog"]), (["mqtt", "zenoh-p2p"], ["media"])])
-def test_variants_alone_and_beside_a_load(
-    variants: list[str], loads: list[str], temporary: Path, tmp_path: Path
-) -> None:
-    options = ("--sizes", "40", "--rates", "200", "--seconds", "0.1", "--rounds", "1", "--output", str(tmp_path / "o"))
-    ended = subprocess.run(
-        command(*options, "--variants", ",".join(variants), "--loads", ",".join(loads)),
-        env={**os.environ, "TMPDIR": str(temporary)}, cwd=ROOT, capture_output=True, text=True, timeout=100,
-        check=False,
-    )  # fmt: skip
-    assert ended.returncode == 0, ended.stdout + ended.stderr
-    results = load(tmp_path / "o" / "control.json")
-    for variant, load_ in product(variants, loads):
-        assert variant in ended.stdout
-        there, back = (results.find(variant, measure, load=load_) for measure in (ONE_WAY, ROUND_TRIP))
-        assert there is not None
-        assert back is not None
-        assert all(0 < a < b for a, b in zip(there.samples, back.samples, strict=True))
-        assert (there.middle("pictures_hz") > 0) == (load_ == "media")
-    assert list(temporary.iterdir()) == []
-
-
-def test_a_process_that_dies_is_named() -> None:
-    with Participants(["mqtt"]) as participants:
-        lines = {pid: Path(f"/proc/{pid}/cmdline").read_text() for pid in children(os.getpid())}
-        os.kill(next(pid for pid, line in lines.items() if "\0sender\0" in line), signal.SIGKILL)
-        with pytest.raises(PebbleError, match="mqtt: sender ended with code -9"):
-            participants.run("mqtt", SliceSpec(size=40, rate=100.0, seconds=0.1), "none")
-
-
-def test_the_broker_gets_the_lines_of_its_variant() -> None:
-    with Participants(["mqtt-nodelay"]) as participants:
-        assert "set_tcp_nodelay true" in next(participants.folder.glob("*/broker.conf")).read_text().splitlines()

@@ -65,9 +65,3 @@ def test_a_robot_that_a_person_watches_is_left_as_it_is(media: CountedMedia, per
     media.close()  # withdraws nothing that the person still watches
     assert not until(lambda: len(requests) > 2, 0.1)
     assert media.missing() == [], "people chose its encodings"
-
-
-def test_it_is_the_demos_again_when_the_person_has_seen_enough(media: CountedMedia, person: Transport) -> None:
-    for enabled in (True, False):
-        person.publish(VIDEO_CONTROL.topic(GOOB), codec.encode(VIDEO_CONTROL, MediaRequest(enabled=enabled)))
-        assert until(lambda: media.watched == ({"video"} if enabled else set()))  # noqa: B023 - at once

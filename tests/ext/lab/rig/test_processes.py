@@ -13,11 +13,6 @@ from pebble.errors import PebbleError
 from pebble.extensions.lab.rig.processes import BROKERS, MCUS, OPERATORS, ROBOTS, Processes, Program, children
 from tests.support import until
 
-WORKER = """
-from pebble.extensions.lab.rig.worker_end import answer, serve
-answer({"ready": True})
-serve(lambda line: None if line == "quiet" else {"line": line})
-"""
 ON_THREAD = """
 from pebble.extensions.lab.rig.worker_end import answer, serve_on_thread
 from threading import Event
@@ -51,15 +46,6 @@ def test_operators_end_first_and_brokers_last(tmp_path: Path) -> None:
     assert not processes.folder.exists()
 
 
-def test_each_line_that_a_program_writes_is_read(tmp_path: Path) -> None:
-    lines: list[bytes] = []
-    with Processes() as processes:
-        command = ["sh", "-c", "echo one; echo two; exec sleep 60"]
-        program = Program("lines", command, tmp_path / "log", each=lines.append)
-        processes.add(program, OPERATORS)
-        assert until(lambda: lines == [b"one\n", b"two\n"])
-
-
 def test_one_that_ended_by_itself_is_named_and_one_that_was_ended_is_not(tmp_path: Path) -> None:
     with Processes() as processes:
         ended = processes.add(Program("the hub", ["true"], tmp_path / "hub.log"), BROKERS)
@@ -81,14 +67,6 @@ def test_what_cannot_be_started_leaves_no_process_and_no_folder() -> None:
         pass
     assert not broken.folder.exists()
     assert set(children(os.getpid())) <= set(before)
-
-
-def test_a_worker_answers_each_line_that_has_an_answer() -> None:
-    with Processes() as processes:
-        worker = processes.command("worker", python(WORKER))
-        assert worker.answer(20) == {"ready": True}
-        worker.send("quiet")
-        assert [worker.ask(line, 20) for line in ("one", "two")] == [{"line": "one"}, {"line": "two"}]
 
 
 def test_a_worker_on_a_thread_learns_that_its_input_has_closed() -> None:

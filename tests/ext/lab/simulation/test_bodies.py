@@ -7,13 +7,10 @@ from itertools import pairwise
 
 import pytest
 
-from pebble.errors import ConfigError
-from pebble.extensions.lab.simulation.bodies import Benjr, Body, Light, Minilamp, body_of
+from pebble.extensions.lab.simulation.bodies import Benjr, Body, body_of
 from pebble.extensions.lab.simulation.micropython.board import Board
 from pebble.extensions.lab.simulation.micropython.clock import VirtualClock
 from pebble.extensions.lab.simulation.motion import FULL_SPEED_MM_S, WHEEL_DIAMETER_MM, RobotMotion, hall
-
-SERIAL = ("goob", "fred", "goob_imu")  # those with a radio start in test_board_network.py
 
 
 @pytest.fixture
@@ -43,25 +40,6 @@ def test_half_bridges_turn_the_wheels(clock: VirtualClock, kind: str, forward: t
     assert state.drive == pytest.approx((1.0, 0.5), abs=1e-3)
     assert (state.left_mm_s, state.right_mm_s) == pytest.approx((FULL_SPEED_MM_S, FULL_SPEED_MM_S / 2), rel=0.01)
     assert state.pose.x_mm > 100
-
-
-def test_both_inputs_of_a_bridge_high_brake(clock: VirtualClock) -> None:
-    body = body_of("minilamp", Board(clock))
-    for pin in body.pins.LEFT:
-        put(body, pin, 1.0)
-    assert body.outputs() == (0.0, 0.0)
-
-
-def test_motors_are_reported_once_per_turn_with_the_time_of_the_change(clock: VirtualClock) -> None:
-    body = body_of("minilamp", Board(clock))
-    changes: list[tuple[float, tuple[float, float]]] = []
-    body.on_motors = lambda now, motors: changes.append((now, motors))
-    drive(body, 1.0, 1.0)
-    assert changes == [], "the turn is not over"
-    clock.advance(0.3)
-    body.end_turn()
-    body.end_turn()
-    assert changes == [(50.0, (1.0, 1.0))]
 
 
 def test_a_long_turn_reports_each_change_within_it(clock: VirtualClock) -> None:
@@ -105,59 +83,6 @@ def test_benjrs_shield(clock: VirtualClock) -> None:
         assert body.outputs() == (0.0, -1.0)
     i2c.writeto(body.pins.MOTOR_SHIELD, b"\x10\x02\x27")
     assert body.outputs() == (0.0, -1.0), "three bytes are no message"
-
-
-@pytest.mark.parametrize("kind", ["goob", "minilamp", "benjr"])
-def test_the_battery_is_measured_through_its_divider(clock: VirtualClock, kind: str) -> None:
-    body = body_of(kind, Board(clock))
-    machine = body.board.firmware.module("machine")
-    adc = machine.ADC(body.pins.BATTERY)
-    assert adc.read_u16() / 65535 * body.pins.BATTERY_FULL_V == pytest.approx(body.battery.volts, abs=0.001)
-    body.battery.charging = True
-    clock.advance(1e6)
-    assert adc.read_u16() / 65535 * body.pins.BATTERY_FULL_V == pytest.approx(4.2 * body.cells, abs=0.001)
-    assert adc.read_u16() < 65535, "a full battery is within the range"
-
-
-def test_lights(clock: VirtualClock) -> None:
-    goob, fred = body_of("goob", Board(clock)), body_of("fred", Board(clock))
-    assert goob.state().light == Light(0.0, 0.0, 0.0)
-    put(goob, goob.pins.LED, 0.25)
-    assert goob.state().light == Light(0.25, 0.25, 0.25)
-    put(fred, fred.pins.LED[2], 1.0)
-    assert fred.state().light == Light(0.0, 0.0, 1.0)
-
-
-def test_freds_charger_is_a_pin(clock: VirtualClock) -> None:
-    body = body_of("fred", Board(clock))
-    pin = body.board.firmware.module("machine").Pin(body.pins.CHARGE)
-    values = [pin.value()]
-    body.battery.charging = True
-    assert [*values, pin.value()] == [0, 1]
-
-
-def test_grousers_are_seen_but_no_wheels(clock: VirtualClock) -> None:
-    body = body_of("minilamp", Board(clock))
-    assert isinstance(body, Minilamp)
-    put(body, body.pins.GROUSERS[1], 1.0)
-    assert (body.grousers, body.outputs()) == (-1.0, (0.0, 0.0))
-
-
-@pytest.mark.parametrize("kind", SERIAL)
-def test_every_firmware_starts_in_its_body_with_its_motors_off(clock: VirtualClock, kind: str) -> None:
-    board = Board(clock)
-    body = body_of(kind, board)
-    robot = board.load(kind)
-    for _ in range(10):
-        robot.step()
-        clock.advance(0.01)
-    assert (body.state().motors, body.state().left_mm_s) == ((0.0, 0.0), 0.0)
-    robot.stop()
-
-
-def test_an_unknown_robot_is_refused(clock: VirtualClock) -> None:
-    with pytest.raises(ConfigError, match="'pitcam'; known: goob, fred, minilamp, benjr, goob_imu"):
-        body_of("pitcam", Board(clock))
 
 
 def test_the_hall_sensors_see_five_waves_in_a_turn_of_a_wheel() -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import signal
 import subprocess
 import sys
 import wave
@@ -12,11 +11,10 @@ from typing import Any
 import pytest
 
 from pebble.extensions.lab.simulation.loudspeaker import playbacks
-from tests.support import Child, until
+from tests.support import Child
 
 RATE = 8000
 COMMAND = [sys.executable, "-m", "pebble.simulation.loudspeaker"]
-RAW = ["-q", "-t", "raw", "-f", "S16_LE", "-c", "2", "-r", str(RATE), "-D", "default", "-"]
 
 
 def samples(seconds: float, channels: int = 1) -> bytes:
@@ -47,47 +45,6 @@ def test_a_file_is_played_in_real_time_and_recorded(tmp_path: Path) -> None:
     assert played.frames() == samples(0.3)
     assert played.ended_ns is not None
     assert played.ended_ns - played.began_ns >= 0.15e9, "a busy machine may make up for 0.1 s"
-
-
-def test_raw_sound_comes_from_standard_input(tmp_path: Path) -> None:
-    player = loudspeaker(tmp_path, *RAW, stdin=subprocess.PIPE)
-    player.communicate(samples(0.1, 2) + b"\x01", 20)
-    assert player.returncode == 0
-    (played,) = playbacks(tmp_path)
-    assert (played.file, played.rate, played.channels, played.seconds) == ("-", RATE, 2, 0.1)
-    assert played.frames() == samples(0.1, 2), "half a sample at the end is left out"
-
-
-def test_a_signal_stops_it_as_it_stops_aplay(tmp_path: Path) -> None:
-    player = loudspeaker(tmp_path / "played", str(clip(tmp_path, 30)))
-    assert until(lambda: playbacks(tmp_path / "played"), 20)
-    player.send_signal(signal.SIGTERM)
-    assert player.wait(20) == 1
-    (played,) = playbacks(tmp_path / "played")
-    assert played.stopped
-    assert played.frames() == samples(30)[: len(played.frames())]
-
-
-def test_a_killed_one_leaves_what_it_played(tmp_path: Path) -> None:
-    player = loudspeaker(tmp_path / "played", str(clip(tmp_path, 30)))
-    assert until(lambda: playbacks(tmp_path / "played") and playbacks(tmp_path / "played")[0].frames(), 20)
-    player.kill()
-    player.wait(20)
-    (played,) = playbacks(tmp_path / "played")
-    assert played.ended_ns is None
-    assert played.frames() == samples(30)[: len(played.frames())]
-
-
-def test_an_exclusive_one_is_busy_while_it_plays(tmp_path: Path) -> None:
-    path, folder = str(clip(tmp_path, 30)), tmp_path / "played"
-    first = loudspeaker(folder, "--exclusive", path)
-    assert until(lambda: playbacks(folder), 20)
-    second = loudspeaker(folder, "--exclusive", path, stderr=subprocess.PIPE)
-    _, errors = second.communicate(timeout=20)
-    first.kill()
-    first.wait(20)
-    assert (second.returncode, errors) == (1, b"loudspeaker: audio open error: Device or resource busy\n")
-    assert len(playbacks(folder)) == 1
 
 
 @pytest.mark.parametrize("content", [b"", b"no sound at all", b"RIFF\x00\x00\x00\x00WAVE"])

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 from typing import Any
 
 import pytest
@@ -19,30 +18,6 @@ def machine(board: Board) -> Any:
 
 
 # -- pins
-
-
-def test_an_output(board: Board) -> None:
-    pin = machine(board).Pin(3, machine(board).Pin.OUT, value=1)
-    assert board.duty(3) == 1.0
-    pin.off()
-    assert (board.duty(3), pin.value(), pin()) == (0.0, 0, 0)
-    pin(1)
-    assert (board.duty(3), pin.value()) == (1.0, 1)
-
-
-def test_an_input_reads_its_pull_resistor_until_it_is_driven(board: Board) -> None:
-    kind = machine(board).Pin
-    assert kind(3, kind.IN).value() == 0
-    pin = kind(3, kind.IN, kind.PULL_UP)
-    assert pin.value() == 1
-    board.set_pin(3, False)
-    assert pin.value() == 0
-    board.set_pin(3, lambda: True)
-    assert pin.value() == 1
-    board.set_pin(3, None)
-    assert pin.value() == 1
-    pin.on()
-    assert board.duty(3) == 0.0, "an input puts out nothing"
 
 
 def test_pwm(board: Board) -> None:
@@ -105,74 +80,7 @@ def test_the_order_of_the_signals_decides_which_timer_a_pin_gets(clock: VirtualC
         machine(other).PWM("D2", freq=1000)
 
 
-@pytest.mark.parametrize(
-    ("port", "pin", "full_v", "steps"), [(ESP32_C6, 0, 3.3, 4095), (ESP8266, 0, 1.0, 1023), (SAMD21, "A0", 1.65, 4095)]
-)
-def test_adc(clock: VirtualClock, port: Any, pin: Any, full_v: float, steps: int) -> None:
-    board = Board(clock, port=port)
-    adc = machine(board).ADC(pin)
-    assert adc.read_u16() == 0
-    board.set_volts(pin, full_v / 2)
-    assert adc.read_u16() == pytest.approx(32768, abs=1)
-    assert adc.read_uv() == pytest.approx(full_v / 2 * 1e6, rel=1e-4)
-    board.set_volts(pin, lambda: 5.0)
-    assert (adc.read_u16(), adc.read()) == (65535, steps)
-
-
 # -- I2C
-
-
-class Memory:
-    """A device with 16 registers."""
-
-    def __init__(self) -> None:
-        self.registers, self.at = bytearray(16), 0
-
-    def write(self, data: bytes) -> None:
-        self.at = data[0]
-        self.registers[self.at : self.at + len(data) - 1] = data[1:]
-
-    def read(self, count: int) -> bytes:
-        return bytes(self.registers[self.at : self.at + count])
-
-
-@pytest.mark.parametrize("kind", ["I2C", "SoftI2C"])
-def test_i2c(board: Board, kind: str) -> None:
-    board.attach_i2c(0x68, Memory())
-    i2c = getattr(machine(board), kind)(scl=machine(board).Pin(1), sda=machine(board).Pin(2), freq=400_000)
-    i2c.writeto_mem(0x68, 3, b"\x01\x02")
-    assert i2c.writeto(0x68, b"\x05\x07") == 2
-    buffer = bytearray(3)
-    i2c.readfrom_mem_into(0x68, 3, buffer)
-    assert (buffer, i2c.readfrom_mem(0x68, 4, 2)) == (b"\x01\x02\x07", b"\x02\x07")
-    i2c.writeto(0x68, b"\x03")
-    assert i2c.readfrom(0x68, 1) == b"\x01"
-    assert i2c.scan() == [0x68]
-
-
-def test_a_device_may_be_absent_or_fail(board: Board) -> None:
-    i2c = machine(board).SoftI2C(scl=1, sda=2)
-    board.attach_i2c(0x68, Memory())
-
-    def code() -> int | None:
-        try:
-            i2c.writeto(0x68, b"\x00")
-        except OSError as error:
-            return error.errno
-        return None
-
-    assert code() is None
-    board.bus.fail(0x68)
-    assert (code(), i2c.scan()) == (errno.EIO, [])
-    board.bus.fail(0x68, errno.ETIMEDOUT)
-    assert code() == errno.ETIMEDOUT
-    board.bus.restore(0x68)
-    assert code() is None
-    board.bus.disturbed = True
-    assert (code(), i2c.scan()) == (errno.EIO, [])
-    board.bus.disturbed = False
-    board.bus.detach(0x68)
-    assert code() == errno.ENODEV
 
 
 # -- watchdog and reset
@@ -189,13 +97,3 @@ def test_the_watchdog_counts_and_starves(board: Board, clock: VirtualClock) -> N
     clock.advance(2.5)
     with pytest.raises(BoardReset):
         dog.feed()
-
-
-@pytest.mark.parametrize(
-    ("port", "asked", "real"),
-    [(SAMD21, 2000, 1024), (SAMD21, 5, 512), (SAMD21, 99999, 16384), (ESP32_C6, 2000, 2000), (ESP8266, 5000, 5000)],
-)
-def test_the_timeout_is_what_the_port_makes_of_it(clock: VirtualClock, port: Any, asked: int, real: int) -> None:
-    board = Board(clock, port=port)
-    machine(board).WDT(timeout=asked)
-    assert board.watchdog.timeout_ms == real

@@ -53,15 +53,6 @@ def run(scheduler: Scheduler, seconds: float) -> None:
     scheduler.run(lambda: time.monotonic() < end)
 
 
-def test_each_board_has_its_own_pace(scheduler: Scheduler) -> None:
-    fast, slow = Board(0.01), Board(0.1)
-    scheduler.add(fast)
-    scheduler.add(slow)
-    run(scheduler, 0.5)
-    assert 15 <= len(fast.turns) <= 53
-    assert 3 <= len(slow.turns) <= 8
-
-
 def test_data_on_a_socket_causes_a_turn_of_that_board_only(scheduler: Scheduler) -> None:
     boards = [Board(60.0) for _ in range(3)]
     for board in boards:
@@ -74,15 +65,6 @@ def test_data_on_a_socket_causes_a_turn_of_that_board_only(scheduler: Scheduler)
     assert boards[1].read == b"hello"
     assert boards[1].turns[-1] - sent < 0.09
     assert [len(board.turns) - count for board, count in zip(boards, before, strict=True)] == [0, 1, 0]
-
-
-def test_what_is_left_unread_means_another_turn_at_once(scheduler: Scheduler) -> None:
-    board = Board(60.0, piece=10)
-    scheduler.add(board)
-    run(scheduler, 0.02)
-    board.far.send(bytes(95))
-    run(scheduler, 0.1)
-    assert len(board.read) == 95
 
 
 def test_a_board_that_does_not_read_does_not_keep_the_others_waiting(scheduler: Scheduler) -> None:

@@ -28,11 +28,8 @@ class Publish:
 @dataclass(frozen=True, slots=True)
 class Connect:
     client_id: str
-    clean: bool
     keepalive_s: int
     will: Publish | None
-    username: str | None
-    password: bytes | None
 
 
 def split(buffer: bytearray) -> tuple[int, int, bytes] | None:
@@ -87,14 +84,12 @@ def read_connect(body: bytes) -> Connect:
         topic, at = _text(body, at)
         payload, at = _bytes(body, at)
         will = Publish(topic, payload, flags >> 3 & 3, bool(flags & 0x20))
-    user = password = None
-    if flags & 0x80:
-        user, at = _text(body, at)
-    if flags & 0x40:
-        password, at = _bytes(body, at)
+    for flag in (0x80, 0x40):  # a user name, a password
+        if flags & flag:
+            _, at = _bytes(body, at)
     if at != len(body):
         raise MqttError("a CONNECT with something behind it")
-    return Connect(client_id, bool(flags & 2), keepalive, will, user, password)
+    return Connect(client_id, keepalive, will)
 
 
 def read_subscribe(body: bytes) -> tuple[int, list[tuple[str, int]]]:

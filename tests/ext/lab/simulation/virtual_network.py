@@ -99,18 +99,7 @@ class VirtualNetwork:
     def wire(self, place: Address) -> Wire:
         """A new connection of the board; unanswered where there is no broker."""
         self._wires = [wire for wire in self._wires if not wire.over]
-        broker = self.broker if place == BROKER else None
-        conditions = self.conditions
-        wire = Wire(
-            self.clock.now,
-            self.passable,
-            lambda: conditions.mute,
-            conditions.latency_s,
-            conditions.cut,
-            broker,
-            self._arrived,
-            self.reads.append,
-        )
+        wire = Wire(self, self.broker if place == BROKER else None)
         self._wires.append(wire)
         return wire
 
@@ -131,9 +120,6 @@ class VirtualNetwork:
         if how == "silent" or answer is None:
             return None
         return bytes(byte ^ 0xA5 for byte in answer) if how == "nonsense" else answer
-
-    def _arrived(self, command: Command) -> None:
-        self.arrivals.append((self.clock.now(), command))
 
     def _socket(self, kind: int) -> VirtualTcp | VirtualUdp:
         if len(self.open) >= MAX_SOCKETS:

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable
 from enum import Enum
+from typing import TYPE_CHECKING
 
 from tests.ext.lab.simulation.virtual_broker import Command, Session, VirtualBroker
+
+if TYPE_CHECKING:
+    from tests.ext.lab.simulation.virtual_network import VirtualNetwork
 
 WINDOW = 5760  # bytes the board takes before its firmware reads: 4 segments, as lwIP has on both ports
 
@@ -25,27 +28,14 @@ class State(Enum):
 class Wire:
     """``flow`` delivers what is due. Bytes that an outage held back arrive all at once when it ends, as with TCP.
 
-    ``passable``: whether packets are delivered now; ``mute``: whether those of the board are lost; ``cut`` returns
-    where a packet of a given size is split; ``arrived`` is called for each command whose last byte reached the board,
-    and ``read`` when the firmware took that byte.
+    The network tells its condition, and is told of each command whose last byte reached the board, and was read there.
     """
 
-    def __init__(
-        self,
-        now: Callable[[], float],
-        passable: Callable[[], bool],
-        mute: Callable[[], bool],
-        latency_s: Callable[[], float],
-        cut: Callable[[int], int],
-        broker: VirtualBroker | None,
-        arrived: Callable[[Command], None],
-        read: Callable[[Command], None],
-    ) -> None:
+    def __init__(self, network: VirtualNetwork, broker: VirtualBroker | None) -> None:
         self.state = State.CONNECTING
         self.inbox = bytearray()
-        self._now, self._passable, self._mute, self._latency_s, self._cut = now, passable, mute, latency_s, cut
-        self._broker = broker
-        self._arrived, self._read = arrived, read
+        self._network, self._broker = network, broker
+        self._now, self._conditions = network.clock.now, network.conditions
         self._marks: deque[tuple[int, Command]] = deque()  # of the bytes that the board received
         self._in = self._out = 0  # bytes of the inbox so far
         self._session: Session | None = None
@@ -53,13 +43,13 @@ class Wire:
         self._down: deque[tuple[float, bytes, Command | None]] = deque()
         self._ends_as: State | None = None  # once the broker hung up
         self._retry_s = _FIRST_RETRY_S
-        self._syn_due = now() + 2 * latency_s()
+        self._syn_due = self._now() + 2 * self._conditions.latency_s()
 
     def flow(self) -> None:
         if self.state is State.CONNECTING:
             self._knock()
-        elif self.state in (State.OPEN, State.CLOSED) and self._passable():
-            if not self._mute():
+        elif self.state in (State.OPEN, State.CLOSED) and self._network.passable():
+            if not self._conditions.mute:
                 self._carry_up()
             self._carry_down()
 
@@ -81,7 +71,7 @@ class Wire:
         del self.inbox[:size]
         self._out += len(data)
         while self._marks and self._marks[0][0] <= self._out:
-            self._read(self._marks.popleft()[1])
+            self._network.reads.append(self._marks.popleft()[1])
         return data
 
     def put(self, data: bytes) -> int:
@@ -101,7 +91,7 @@ class Wire:
     # -- the broker's end
 
     def send(self, data: bytes, command: Command | None = None) -> None:
-        cut = self._cut(len(data))
+        cut = self._conditions.cut(len(data))
         for piece, mark in ((data[:cut], None), (data[cut:], command)) if cut < len(data) else ((data, command),):
             self._down.append((self._due(self._down[-1][0] if self._down else 0.0), piece, mark))
 
@@ -112,12 +102,12 @@ class Wire:
 
     def _due(self, behind: float) -> float:
         """When what is sent now arrives: nothing overtakes in TCP."""
-        return max(behind, self._now() + self._latency_s())
+        return max(behind, self._now() + self._conditions.latency_s())
 
     def _knock(self) -> None:
         if self._now() < self._syn_due:
             return
-        if self._broker is None or self._mute() or not self._passable():
+        if self._broker is None or self._conditions.mute or not self._network.passable():
             self._syn_due += self._retry_s
             self._retry_s *= 2
         elif self._broker.running:
@@ -147,6 +137,6 @@ class Wire:
             self._in += len(data)
             if command is not None:
                 self._marks.append((self._in, command))
-                self._arrived(command)
+                self._network.arrivals.append((self._now(), command))
         if self.state is State.OPEN and self._ends_as is not None and not self._down:
             self.state = self._ends_as

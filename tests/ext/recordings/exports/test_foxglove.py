@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import math
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -32,16 +31,14 @@ from pebble.contract.payloads import (
 from pebble.errors import PebbleError
 from pebble.extensions.media.h264 import unseal
 from pebble.extensions.media.pcm import to_bytes
-from pebble.extensions.media.scene import Scene, read_counter
+from pebble.extensions.media.scene import read_counter
 from pebble.extensions.media.sound import make_sound_encoder
-from pebble.extensions.media.video import make_encoder
 from pebble.extensions.recordings.exports.foxglove import write_foxglove
-from pebble.extensions.recordings.files.recorded import Channel, Recorded, RecordingError
+from pebble.extensions.recordings.files.recorded import Channel, Recorded
+from tests.ext.recordings.exports.test_film import DELAY_MS, ROBOT, T0_MS, pictures
 
-ROBOT = "pebble/robots/goob"
-T0_MS = 1_732_300_000_000
 T0_NS = T0_MS * 10**6
-DELAY_NS = 40_000_000
+DELAY_NS = DELAY_MS * 10**6
 CORNERS = [(0.1, 0.2), (0.3, 0.2), (0.3, 0.4), (0.1, 0.4)]
 
 
@@ -52,16 +49,6 @@ def recorded(metric: str, payload: bytes, at_ms: int = T0_MS, publish_ns: int = 
 
 def of(channel: ContractChannel, value: Any) -> Recorded:
     return recorded(channel.suffix, codec.encode(channel, value))
-
-
-def pictures(name: str, count: int) -> list[Recorded]:
-    encoder, scene, made = make_encoder(name, fps=15, quality=40), Scene(160, 120), np.empty((120, 160, 3), np.uint8)
-    messages = []
-    for number in range(count):
-        scene.render(number, made)
-        at_ms = T0_MS + number * 66
-        messages.append(recorded("outgoing/front-camera", encoder.encode(made, at_ms), at_ms))
-    return messages
 
 
 class File:
@@ -113,17 +100,20 @@ def converted(tmp_path: Path, messages: list[Recorded]) -> tuple[File, dict[str,
 
 @pytest.mark.parametrize("name", ["json", "pbvd"])
 def test_pictures_become_jpegs(tmp_path: Path, name: str) -> None:
-    file, counts = converted(tmp_path, pictures(name, 8))
+    file, counts = converted(tmp_path, pictures(name, range(8)))
     assert counts == {"CompressedImage": 8}
     assert file.names() == {f"{ROBOT}/outgoing/front-camera/image": "foxglove.CompressedImage"}
     images = file.of("/image")
     assert [(image.format, image.frame_id) for image in images] == [("jpeg", "goob")] * 8
+    captured = [T0_NS + number * 66_000_000 for number in range(8)]
+    assert [(publish, log) for _, _, log, publish, _ in file.messages] == [(at, at + DELAY_NS) for at in captured]
+    assert [image.timestamp.ToNanoseconds() for image in images] == captured
     decoded = [cv2.imdecode(np.frombuffer(image.data, np.uint8), cv2.IMREAD_COLOR) for image in images]
     assert [read_counter(np.asarray(one, np.uint8)) for one in decoded] == list(range(8))
 
 
 def test_h264_is_passed_on_without_its_seal(tmp_path: Path) -> None:
-    sent = pictures("h264", 8)
+    sent = pictures("h264", range(8))
     damaged = recorded("outgoing/front-camera", sent[5].payload[:-20], T0_MS + 5 * 66)
     file, counts = converted(tmp_path, [*sent[:5], damaged, *sent[6:]])
     assert counts == {"CompressedVideo": 7, "left out": 1}
@@ -133,14 +123,6 @@ def test_h264_is_passed_on_without_its_seal(tmp_path: Path) -> None:
     decoder = av.CodecContext.create("h264", "r")
     shown = [frame for video in videos[:5] for frame in decoder.decode(av.Packet(video.data))] + decoder.decode(None)
     assert [read_counter(frame.to_ndarray(format="bgr24")) for frame in shown] == list(range(5))
-
-
-def test_messages_are_stamped_by_capture_and_ordered_by_receipt(tmp_path: Path) -> None:
-    file, _ = converted(tmp_path, pictures("pbvd", 3))
-    expected = [T0_NS + number * 66_000_000 for number in range(3)]
-    assert [publish for _, _, _, publish, _ in file.messages] == expected
-    assert [log for _, _, log, _, _ in file.messages] == [stamp + DELAY_NS for stamp in expected]
-    assert [image.timestamp.ToNanoseconds() for image in file.of("/image")] == expected
 
 
 @pytest.mark.parametrize(("name", "rate", "channels"), [("pcm", 16_000, 1), ("opus", 48_000, 2)])
@@ -255,8 +237,9 @@ def test_the_tag_that_is_followed_is_a_scene_beside_its_json(tmp_path: Path) -> 
     ],
 )
 def test_other_json_stays_as_it_is(tmp_path: Path, metric: str, payload: bytes, expected: Any) -> None:
-    file, counts = converted(tmp_path, [recorded(metric, payload)])
+    file, counts = converted(tmp_path, [recorded(metric, payload, publish_ns=1_200_000_000)])
     assert counts == {"json": 1}
+    assert [publish for *_, publish, _ in file.messages] == [T0_NS + DELAY_NS], "a board's time since its start is none"
     assert file.topics[f"{ROBOT}/{metric}"].message_encoding == "json"
     assert file.of(metric) == [json.loads(payload) if expected is None else expected]
 
@@ -269,47 +252,20 @@ def test_what_is_left_out(tmp_path: Path, payload: bytes) -> None:
     assert (file.messages, counts) == ([], {"left out": 1})
 
 
-def test_a_stamp_from_the_start_of_a_board_is_no_time(tmp_path: Path) -> None:
-    file, _ = converted(tmp_path, [recorded("outgoing/sensors/imu", b'{"t": 1200}', publish_ns=1_200_000_000)])
-    assert [publish for _, _, _, publish, _ in file.messages] == [T0_NS + DELAY_NS]
-
-
-def test_everything_together(tmp_path: Path) -> None:
-    """Each topic has one schema, and several channels of a recording become one."""
-    heartbeats = [recorded("outgoing/online", b'{"t": 1}', T0_MS + number) for number in range(3)]
-    other = Recorded(Channel(5, heartbeats[0].channel.topic, "json", {"retained": "1"}), 0, T0_NS, 0, b'{"t": 2}')
-    messages = [*pictures("json", 3), *pictures("h264", 3), other, *heartbeats]
-    times: list[int] = []
-    target = tmp_path / "all.mcap"
-    counts = write_foxglove(messages, target, on_time=times.append)
-    assert counts == {"CompressedImage": 3, "CompressedVideo": 3, "json": 4}
-    assert times == [message.log_ns for message in messages]
-    assert File(target).names() == {
+def test_several_channels_of_a_topic_become_one(tmp_path: Path) -> None:
+    online = recorded("outgoing/online", b'{"t": 1}')
+    retained = Recorded(Channel(5, online.channel.topic, "json", {"retained": "1"}), 0, T0_NS, 0, b'{"t": 2}')
+    file, counts = converted(tmp_path, [*pictures("json", range(3)), *pictures("h264", range(3)), retained, online])
+    assert counts == {"CompressedImage": 3, "CompressedVideo": 3, "json": 2}
+    assert file.names() == {
         f"{ROBOT}/outgoing/front-camera/image": "foxglove.CompressedImage",
         f"{ROBOT}/outgoing/front-camera/video": "foxglove.CompressedVideo",
         f"{ROBOT}/outgoing/online": "",
     }
 
 
-def test_an_existing_file_and_an_error_on_the_way(tmp_path: Path) -> None:
-    target = tmp_path / "walk.mcap"
-    target.write_bytes(b"precious")
-    with pytest.raises(RecordingError, match="exists already"):
-        write_foxglove([], target)
-
-    def broken() -> Iterator[Recorded]:
-        yield recorded("outgoing/online", b"{}")
-        raise RecordingError("the disk is gone")
-
-    with pytest.raises(RecordingError, match="gone"):
-        write_foxglove(broken(), tmp_path / "other.mcap")
-    assert target.read_bytes() == b"precious"
-    assert list(tmp_path.iterdir()) == [target]
-
-
-@pytest.mark.parametrize("module", ["foxglove_schemas_protobuf.RawAudio_pb2", "google.protobuf.descriptor_pb2"])
-def test_without_the_schemas_one_line_names_them(tmp_path: Path, module: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, module, None)
+def test_without_the_schemas_one_line_names_them(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "foxglove_schemas_protobuf.RawAudio_pb2", None)
     with pytest.raises(PebbleError, match=r'pip install "pebble-robot\[foxglove\]"'):
         write_foxglove([], tmp_path / "walk.mcap")
     assert list(tmp_path.iterdir()) == []

@@ -5,7 +5,6 @@ from __future__ import annotations
 import base64
 import io
 import json
-from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 import pytest
@@ -45,15 +44,6 @@ def written(messages: list[Recorded]) -> bytes:
 
 def read(raw: bytes) -> list[Recorded | BadLine]:
     return list(read_lines(io.BytesIO(raw)))
-
-
-def metadata(raw: bytes) -> list[Mapping[str, str]]:
-    return [message.channel.metadata for message in read_lines(io.BytesIO(raw)) if isinstance(message, Recorded)]
-
-
-def test_a_line_of_the_loggers() -> None:
-    raw = json.dumps(LINE).encode() + b"\n"
-    assert read(raw) == [MESSAGE]
 
 
 def test_a_line_of_ours() -> None:
@@ -107,7 +97,9 @@ def shown(message: Recorded) -> tuple[object, ...]:
             log_ns=st.integers(0, 4 * 10**18),
             qos=st.sampled_from("012"),
             retain=st.sampled_from("01"),
-        ),
+        )
+        | st.builds(recorded, st.binary(), retain=st.just("1"), retained=st.just("1"))
+        | st.builds(recorded, st.binary(), qos=st.just("2"), truncated=st.just("1")),
         max_size=5,
     )
 )
@@ -116,22 +108,18 @@ def test_there_and_back(messages: list[Recorded]) -> None:
     assert list(map(shown, back)) == list(map(shown, messages))
 
 
-def test_flags_there_and_back() -> None:
-    flags = [
-        {"qos": "1", "retain": "1"},
-        {"qos": "0", "retain": "1", "retained": "1"},
-        {"qos": "2", "retain": "0", "truncated": "1"},
-    ]
-    assert metadata(written([recorded(b"x", **one) for one in flags])) == flags
-
-
-def test_the_loggers_retain_is_a_message_from_before_its_subscription() -> None:
-    assert metadata(json.dumps(LINE | {"retain": True}).encode()) == [{"qos": "1", "retain": "1", "retained": "1"}]
-
-
-def test_a_payload_that_the_logger_cut_is_marked() -> None:
-    (flags,) = metadata(json.dumps(LINE | {"payload_truncated": True, "payload_size_bytes": 9000}).encode())
-    assert flags["truncated"] == "1"
+@pytest.mark.parametrize(
+    ("changes", "flags"),
+    [
+        ({}, {"qos": "1", "retain": "0"}),
+        ({"retain": True}, {"qos": "1", "retain": "1", "retained": "1"}),  # from before its subscription
+        ({"payload_truncated": True, "payload_size_bytes": 9000}, {"qos": "1", "retain": "0", "truncated": "1"}),
+    ],
+)
+def test_a_line_of_the_loggers(changes: dict[str, object], flags: dict[str, str]) -> None:
+    (message,) = read(json.dumps(LINE | changes).encode() + b"\n")
+    assert isinstance(message, Recorded)
+    assert shown(message) == (MESSAGE.log_ns, TOPIC, MESSAGE.payload, flags)
 
 
 def test_a_line_without_an_end_is_refused_by_file_and_number(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -195,16 +183,3 @@ def test_bad_lines_are_reported_and_the_others_read(line: bytes) -> None:
     assert bad.number == 2
     assert bad.problem
     assert first == last == MESSAGE
-
-
-def test_messages_are_written_as_they_come() -> None:
-    out, sizes, times = io.BytesIO(), [], []
-
-    def coming() -> Iterator[Recorded]:
-        for number in range(3):
-            sizes.append(len(out.getvalue()))
-            yield recorded(b"x" * 100, log_ns=T_NS + number)
-
-    write_lines(coming(), out, on_time=times.append)
-    assert sizes[0] == 0 < sizes[1] < sizes[2]
-    assert times == [T_NS, T_NS + 1, T_NS + 2]

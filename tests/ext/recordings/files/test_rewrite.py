@@ -46,18 +46,6 @@ def test_what_is_missing_stays_known(tmp_path: Path) -> None:
         path = copy
 
 
-def test_a_damaged_one_is_not_replaced(tmp_path: Path) -> None:
-    path = tmp_path / "a.mcap"
-    write(path)
-    raw = bytearray(path.read_bytes())
-    zero_a_page(raw, random.Random(1))
-    path.write_bytes(raw)
-    with pytest.raises(RecordingError, match="damaged"):
-        rewrite(path, path, keeps=lambda _message: False)
-    assert path.read_bytes() == bytes(raw)
-    assert not list(tmp_path.glob(".*"))
-
-
 def test_one_that_the_last_version_mended_is_not_replaced(tmp_path: Path) -> None:
     """It has left damaged bytes in it, of which something may be read yet."""
     path = tmp_path / "a.mcap"

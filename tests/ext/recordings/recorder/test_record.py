@@ -6,7 +6,6 @@ import json
 import os
 import signal
 import subprocess
-import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -19,7 +18,7 @@ from pebble.extensions.recordings import library
 from pebble.extensions.recordings.files.recorded import Recorded
 from pebble.extensions.recordings.recorder.intake import EVENTS
 from pebble.transports import Message, MqttSettings, QoS, Transport, create
-from tests.commands.command_line import Run
+from tests.commands.command_line import Run, program
 from tests.support import AmqttBroker, Broker, until
 
 GOOB = "pebble/robots/goob"
@@ -27,25 +26,12 @@ ONLINE, AUDIO, STATUS = f"{GOOB}/outgoing/online", f"{GOOB}/outgoing/audio", f"{
 FLAG, DRIVE = f"{GOOB}/incoming/flags/mqtt-video", f"{GOOB}/incoming/drive-values"
 
 
-def pebble(*arguments: object, **options: Any) -> subprocess.Popen[str]:
-    command = [sys.executable, "-m", "pebble", *map(str, arguments)]
-    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, **options)
-
-
 @contextmanager
-def recording(root: Path, port: int, *options: object) -> Iterator[subprocess.Popen[str]]:
+def recording(root: Path, port: int, *options: str) -> Iterator[subprocess.Popen[str]]:
     """A recorder that is connected, and ends in order at the end."""
-    with started(root, port, *options) as process:
-        assert process.stdout is not None
-        assert "Recording" in process.stdout.readline()
-        yield process
-
-
-@contextmanager
-def started(root: Path, port: int, *options: object) -> Iterator[subprocess.Popen[str]]:
-    """A recorder that ends in order at the end."""
-    with pebble("record", "--url", f"mqtt://127.0.0.1:{port}", "--into", root, *options) as process:
+    with program("record", "--url", f"mqtt://127.0.0.1:{port}", "--into", root, *options) as process:
         try:
+            assert until(lambda: events(recorded(root), "connected"), step=0.2)
             yield process
         finally:
             process.send_signal(signal.SIGINT)
@@ -137,8 +123,7 @@ def test_a_broker_that_knows_only_mqtt_3(tmp_path: Path) -> None:
     try:
         robot = client(broker.port)
         reference = Reference(broker.port)
-        with started(tmp_path / "rec", broker.port):
-            assert until(lambda: events(recorded(tmp_path / "rec"), "connected"), step=0.2)
+        with recording(tmp_path / "rec", broker.port):
             publish_all(robot, reference, 50)
             assert until(lambda: len(of(recorded(tmp_path / "rec"), DRIVE)) == 50, step=0.2)
         found = recorded(tmp_path / "rec")
@@ -148,27 +133,6 @@ def test_a_broker_that_knows_only_mqtt_3(tmp_path: Path) -> None:
         reference.transport.close()
     finally:
         broker.stop()
-
-
-def test_a_killed_recorder_is_continued_by_the_next(tmp_path: Path) -> None:
-    broker, root = Broker(tmp_path), tmp_path / "rec"
-    robot, reference = client(broker.port), Reference(broker.port)
-    with recording(root, broker.port) as process:
-        publish_all(robot, reference, 200)
-        assert until(lambda: len(of(recorded(root), DRIVE)) == 200, step=0.2)
-        process.kill()
-    active = [path for path in library.files([root]) if path.name.endswith(".active")]
-    assert len(active) == 2
-    assert of(recorded(root), DRIVE) == reference.of(DRIVE)
-    with recording(root, broker.port):
-        assert until(lambda: not any(path.exists() for path in active), 10)
-        publish_all(robot, Reference(broker.port), 20)
-        assert until(lambda: len(of(recorded(root), DRIVE)) == 220, step=0.2)
-    found = recorded(root)
-    assert len(of(found, DRIVE)) == 220
-    assert [event["missing"] for event in events(found, "recovered")] == [0, 0]
-    robot.close()
-    broker.stop()
 
 
 @pytest.mark.parametrize("how", ["killed", "stopped"])
@@ -196,9 +160,9 @@ def test_an_outage_is_a_gap(tmp_path: Path, how: str) -> None:
 
 class TestErrors:
     def test_there_is_no_broker_yet(self, tmp_path: Path) -> None:
-        with pebble("record", "--url", "mqtt://127.0.0.1:1", "--into", tmp_path / "rec", "--for", "1s") as process:
-            assert process.stdout is not None
-            assert "cannot connect to mqtt://127.0.0.1:1 yet" in process.stdout.readline()
+        with program("record", "--url", "mqtt://127.0.0.1:1", "--into", tmp_path / "rec", "--for", "1s") as process:
+            assert process.stderr is not None
+            assert "cannot connect to mqtt://127.0.0.1:1 yet" in process.stderr.readline()
             assert process.wait(20) == 0
 
     @pytest.mark.parametrize(

@@ -99,20 +99,6 @@ class TestOneFile:
         file.finish()
         assert [message.log_ns for message in recorded(tmp_path)] == [30, 30, 40]
 
-    def test_a_full_disk_lacks_only_what_it_has_not_taken(
-        self, file: OpenFile, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
-        sent = [b"%d" % number + bytes(100_000) for number in range(30)]
-        for payload in sent:
-            file.add(item(payload), 1)
-        monkeypatch.setattr(RawFile, "write", fails)
-        with pytest.raises(OSError, match="No space"):
-            file.flush()
-        taken = file.writer.flushed
-        assert 0 < taken < len(sent)
-        assert [one.payload for one in file.take_lacking()] == sent[taken:]
-        file.file.close()
-
 
 def item(payload: bytes) -> Item:
     return Item(1, ONLINE, payload, 1, False, "")
@@ -387,16 +373,6 @@ class TestDisk:
         running.stop()
         assert gone[-1] == 2
         assert all(two - one <= 1 for one, two in pairwise(gone))
-
-    def test_a_folder_that_is_removed_is_made_again(self, running: Running) -> None:
-        running.send(5)
-        assert running.written(5)
-        shutil.rmtree(running.root / "20" if (running.root / "20").exists() else next(running.root.glob("2*")))
-        running.send()
-        assert until(lambda: running.recorder.counters["event_removed"] == 1, 10)
-        running.send(5)
-        running.stop()
-        assert len(payloads(running.root)) >= 5
 
     @needs_root
     @pytest.mark.parametrize("fault", FAULTS)

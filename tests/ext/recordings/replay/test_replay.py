@@ -16,11 +16,10 @@ import pytest
 
 from pebble.extensions.recordings.files.rewrite import rewrite
 from pebble.extensions.recordings.stamps import stamp_ns
-from pebble.transports import Message, MqttSettings, QoS, create
 from tests.commands.command_line import Run, program
-from tests.commands.conftest import run as run
 from tests.ext.recordings import messages
 from tests.ext.recordings.playing import FRED, GOOB, Line, demo, js, ms, write
+from tests.ext.recordings.recorder.test_record import Reference
 from tests.kit.terminal import Terminal
 from tests.support import Broker, until
 
@@ -35,44 +34,24 @@ def broker(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Broker]:
     broker.stop()
 
 
-class Operator:
-    """Receives everything."""
-
-    def __init__(self, broker: Broker) -> None:
-        self._settings = MqttSettings(host="127.0.0.1", port=broker.port)
-        self.transport = create("mqtt", "operator", self._settings).open()
-        self.received: list[tuple[float, Message]] = []
-        self.transport.subscribe("#", self._take, direct=True)
-
-    def _take(self, message: Message) -> None:
-        self.received.append((time.monotonic(), message))
-
-    def payloads(self, topic: str) -> list[bytes]:
-        return [message.payload for _, message in list(self.received) if message.topic == topic]
-
-    def states(self, topic: str = ONLINE) -> list[object]:
-        return [json.loads(payload).get("online", True) for payload in self.payloads(topic)]
-
-    def retained(self) -> dict[str, bytes]:
-        """What a new subscriber is sent."""
-        found: dict[str, bytes] = {}
-        with create("mqtt", "late", self._settings) as late:
-            late.subscribe("#", lambda message: _note(message, found), direct=True)
-        return found
+def states(operator: Reference, topic: str = ONLINE) -> list[object]:
+    return [json.loads(payload).get("online", True) for payload in operator.of(topic)]
 
 
-def _note(message: Message, found: dict[str, bytes]) -> None:
-    if message.retain:
-        found[message.topic] = message.payload
+def retained(port: int) -> dict[str, bytes]:
+    """What a new subscriber is sent."""
+    late = Reference(port)
+    late.transport.close()
+    return {message.topic: message.payload for message in late.received if message.retain}
 
 
 @pytest.fixture
-def operator(broker: Broker) -> Iterator[Operator]:
-    operator = Operator(broker)
+def operator(broker: Broker) -> Iterator[Reference]:
+    operator = Reference(broker.port)
     yield operator
-    for topic in operator.retained():
-        operator.transport.publish(topic, b"", qos=QoS.DELIVERED, retain=True)
+    left = retained(broker.port)
     operator.transport.close()
+    assert left == {}
 
 
 @pytest.fixture
@@ -109,24 +88,23 @@ def ends(process: subprocess.Popen[str], timeout: float = 20) -> tuple[int, str,
 
 
 def test_replayed_at_ten_times_its_speed_it_is_the_same(
-    tmp_path: Path, operator: Operator, at: tuple[str, str], run: Run
+    tmp_path: Path, operator: Reference, at: tuple[str, str], run: Run
 ) -> None:
-    lines = demo(20)
+    lines = list(demo(20))
     path = write(tmp_path / "demo.mcap", lines)
     began = time.monotonic()
     assert (run("replay", path, *at, "--incoming", "--speed", "10"), run.err) == (0, "")
     assert time.monotonic() - began > 2
     robots = [base.replace("pebble", "replay") for base in (GOOB, FRED)]
     assert run.out.splitlines() == [", ".join(robots), f"{len(lines)} sent, 0 skipped"]
-    assert until(lambda: operator.states(f"{robots[1]}/outgoing/online")[-1] is False)
+    assert until(lambda: states(operator, f"{robots[1]}/outgoing/online")[-1] is False)
     for topic in {line.topic for line in lines}:
         sent = [_without_stamp(line.payload) for line in lines if line.topic == topic]
-        received = [_without_stamp(payload) for payload in operator.payloads(topic.replace("pebble", "replay"))]
+        received = [_without_stamp(payload) for payload in operator.of(topic.replace("pebble", "replay"))]
         assert received[: len(sent)] == sent, topic
         assert len(received) - len(sent) == topic.endswith("online")
     qualities = {line.topic.replace("pebble", "replay"): line.qos for line in lines}
-    assert all(message.qos == qualities[message.topic] for _, message in operator.received)
-    assert operator.retained() == {}
+    assert all(message.qos == qualities[message.topic] for message in operator.received)
 
 
 def _without_stamp(payload: bytes) -> object:
@@ -138,86 +116,84 @@ def _without_stamp(payload: bytes) -> object:
 
 
 def test_by_default_it_is_harmless_and_current(
-    tmp_path: Path, operator: Operator, at: tuple[str, str], run: Run
+    tmp_path: Path, operator: Reference, at: tuple[str, str], run: Run
 ) -> None:
     period = ("--since", "2023-11-14T22:13:30Z", "--until", "+5s")  # from 10 s after its begin
     assert (run("replay", walk(tmp_path), *at, *period, "--speed", "10"), run.err) == (0, "")
-    assert until(lambda: operator.states() == [*[True] * 20, False])
-    assert {message.topic for _, message in operator.received} == {ONLINE, STATUS, LOGS}
-    assert [json.loads(payload)["n"] for payload in operator.payloads(LOGS)] == list(range(40, 60))
-    late = [time.time() * 1000 - json.loads(payload)["t"] for payload in operator.payloads(ONLINE)]
+    assert until(lambda: states(operator) == [*[True] * 20, False])
+    assert {message.topic for message in operator.received} == {ONLINE, STATUS, LOGS}
+    assert [json.loads(payload)["n"] for payload in operator.of(LOGS)] == list(range(40, 60))
+    late = [time.time() * 1000 - json.loads(payload)["t"] for payload in operator.of(ONLINE)]
     assert all(-1000 < each < 20_000 for each in late)
-    assert len(operator.payloads(STATUS)) == 1
-    assert operator.retained() == {}
+    assert len(operator.of(STATUS)) == 1
 
 
-def test_ctrl_c_leaves_nothing_that_moves(tmp_path: Path, operator: Operator, at: tuple[str, str]) -> None:
+def test_ctrl_c_leaves_nothing_that_moves(tmp_path: Path, operator: Reference, at: tuple[str, str]) -> None:
     process = program("replay", walk(tmp_path), *at, "--incoming")
-    assert until(lambda: len(operator.payloads(LOGS)) > 2)
+    assert until(lambda: len(operator.of(LOGS)) > 2)
     process.send_signal(signal.SIGINT)
     code, _, err = ends(process)
     assert (code, err) == (0, "")
-    assert operator.retained() == {}
-    assert until(lambda: operator.states()[-1] is False, 3)
-    assert json.loads(operator.payloads(f"{REPLAYED}/incoming/drive-values")[-1])["valid_ms"] == 0
+    assert until(lambda: states(operator)[-1] is False, 3)
+    assert json.loads(operator.of(f"{REPLAYED}/incoming/drive-values")[-1])["valid_ms"] == 0
 
 
-def test_when_it_is_killed_the_broker_publishes_that_its_robot_is_offline(
-    tmp_path: Path, operator: Operator, at: tuple[str, str]
+def test_when_it_is_killed_the_broker_publishes_that_its_robots_are_offline(
+    tmp_path: Path, operator: Reference, at: tuple[str, str]
 ) -> None:
-    process = program("replay", walk(tmp_path), *at)
-    assert until(lambda: len(operator.payloads(LOGS)) > 2)
+    heartbeats = [f"replay/robots/{robot}/outgoing/online" for robot in ("goob", "fred")]
+    process = program("replay", write(tmp_path / "demo.mcap", demo(20)), *at)
+    assert until(lambda: all(len(operator.of(topic)) > 2 for topic in heartbeats))
     process.kill()
     process.communicate()
-    assert until(lambda: operator.states()[-1] is False, 5)
-    assert operator.retained() == {}
+    assert until(lambda: all(states(operator, topic)[-1] is False for topic in heartbeats), 5)
 
 
 def test_a_broker_that_restarts_gets_the_rest(tmp_path: Path, run: Run) -> None:
     broker = Broker(tmp_path)
-    operator = Operator(broker)
+    operator = Reference(broker.port)
 
     def restart() -> None:
-        assert until(lambda: len(operator.payloads(LOGS)) > 2)
+        assert until(lambda: len(operator.of(LOGS)) > 2)
         broker.kill()
         time.sleep(0.2)
         broker.start()  # it ends with this thread
-        assert until(lambda: operator.states()[-1] is False, 20)
+        assert until(lambda: states(operator)[-1] is False, 20)
 
     with meanwhile(restart):
         assert run("replay", walk(tmp_path, 3), "--url", f"mqtt://127.0.0.1:{broker.port}") == 0
-    numbers = [json.loads(payload)["n"] for payload in operator.payloads(LOGS)]
+    numbers = [json.loads(payload)["n"] for payload in operator.of(LOGS)]
     assert numbers == sorted(numbers)
     assert numbers[-1] == 11
     assert len(numbers) >= 10
     assert "no connection" in run.err
     assert run.err.splitlines()[-1] == "pebble: it goes on"
-    assert operator.retained() == {}
+    assert retained(broker.port) == {}
     operator.transport.close()
     broker.stop()
 
 
-def test_keys_on_a_terminal(tmp_path: Path, operator: Operator, at: tuple[str, str]) -> None:
+def test_keys_on_a_terminal(tmp_path: Path, operator: Reference, at: tuple[str, str]) -> None:
     command = [*(sys.executable, "-m", "pebble.cli", "replay", str(walk(tmp_path))), *at, "--paused"]
     console = Terminal(*command)
     try:
         assert console.sees("Space pauses")
         assert console.sees("paused · 0 sent")
         console.type(b" ")
-        assert until(lambda: len(operator.payloads(LOGS)) > 2)
+        assert until(lambda: len(operator.of(LOGS)) > 2)
         console.type(b" ")
         assert console.sees("paused · ")
-        count = len(operator.payloads(LOGS))
+        count = len(operator.of(LOGS))
         console.type(b"\x1b[C\x1b[C+ ")  # 20 s on, twice as fast
-        assert until(lambda: len(operator.payloads(LOGS)) > count + 2)
-        assert json.loads(operator.payloads(LOGS)[-1])["n"] > 80
+        assert until(lambda: len(operator.of(LOGS)) > count + 2)
+        assert json.loads(operator.of(LOGS)[-1])["n"] > 80
         assert console.sees("× 2 · ")
         console.type(b"\x03")
         assert console.process.wait(10) == 0
         assert console.sees(" skipped")
     finally:
         console.close()
-    assert until(lambda: operator.states()[-1] is False, 3)
+    assert until(lambda: states(operator)[-1] is False, 3)
 
 
 @pytest.mark.parametrize(
@@ -231,20 +207,13 @@ def test_keys_on_a_terminal(tmp_path: Path, operator: Operator, at: tuple[str, s
         (("--only", "+/+/+/incoming/#"), "there is nothing to publish"),
         (("--only", "a/#/b"), "# must stand alone"),
         (("--since", "yesterday-ish"), "yesterday-ish"),
+        ((), "cannot connect"),
     ],
 )
 def test_errors_are_one_line(tmp_path: Path, run: Run, arguments: tuple[str, ...], problem: str) -> None:
     assert run("replay", walk(tmp_path, 1), "--url", "mqtt://127.0.0.1:9", *arguments) == 1
     assert problem in run.err
     assert len(run.err.splitlines()) == 1
-
-
-def test_other_places_are_errors_too(tmp_path: Path, run: Run) -> None:
-    assert run("replay", tmp_path / "none.mcap", "--url", "mqtt://127.0.0.1:9") == 1
-    assert "none.mcap: No such file or directory" in run.err
-    assert run("replay", walk(tmp_path, 1), "--url", "mqtt://127.0.0.1:9") == 1
-    assert "cannot connect" in run.err
-    assert run("replay", walk(tmp_path, 1)) == 2
 
 
 def test_what_damage_has_taken_is_counted(tmp_path: Path, at: tuple[str, str], run: Run) -> None:

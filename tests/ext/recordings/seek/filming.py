@@ -2,18 +2,14 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 
-from pebble.contract.packets import Codec, Sound
 from pebble.extensions.media.scene import Scene
 from pebble.extensions.media.video import make_encoder
-from pebble.extensions.recordings.files.writer import RecordingWriter
-from pebble.extensions.recordings.stamps import stamp_ns
-from tests.ext.recordings.playing import GOOB, THEN_NS, Line, js, ms
+from tests.ext.recordings.playing import GOOB, Line, demo, js, ms, write
 
 FPS = 15
 SIZE = (320, 240)
@@ -35,6 +31,7 @@ def pictures(encoding: str, seconds: float) -> Iterator[Line]:
             yield Line(at, CAMERA, payload)
 
 
+<<<<<<< HEAD
 def rest(seconds: float) -> Iterator[Line]:
     """Heartbeats, sound, telemetry, commands, one retained value that changes, and lines of the log."""
     yield Line(0.0, f"{GOOB}/outgoing/capabilities", js(t=ms(0), value={"video": {"available": True}}), 1, retain=True)
@@ -57,27 +54,34 @@ def film(root: Path, encoding: str, seconds: float, *, finished: bool = True) ->
     day = root / "2023/11/14"
     day.mkdir(parents=True)
     lines = sorted([*rest(seconds), *pictures(encoding, seconds)], key=lambda line: line.at)
+=======
+def film(
+    root: Path,
+    encoding: str,
+    seconds: float,
+    size: tuple[int, int] = SIZE,
+    *,
+    finished: bool = True,
+    times: int = 1,
+    interval: int | None = 2 * FPS,
+) -> Path:
+    """A folder as a recorder leaves it: one file of state, one of media, a chunk each second.
+
+    ``times``: so often the pictures are repeated, because encoding an hour takes long. ``interval``: of key frames, in
+    pictures; None: as robots have it.
+    """
+    day = root / "2023/11/14"
+    day.mkdir(parents=True)
+    once = list(pictures(encoding, seconds / times, size, interval))
+    shown = [line._replace(at=line.at + seconds / times * turn) for turn in range(times) for line in once]
+    capabilities = js(t=ms(0), value={"video": {"available": True}})
+    offered = Line(0.0, f"{GOOB}/outgoing/capabilities", capabilities, 1, retain=True)
+    lines = sorted([offered, *demo(seconds, [GOOB]), *shown], key=lambda line: line.at)
+>>>>>>> wt-t5
     media = [line for line in lines if line.topic in (CAMERA, f"{GOOB}/outgoing/audio")]
     state = [line for line in lines if line.topic not in (CAMERA, f"{GOOB}/outgoing/audio")]
     suffix = ".mcap" if finished else ".mcap.active"
-    _write(day / f"20231114T221320Z-000001.state{suffix}", state, finished=finished)
-    _write(day / f"20231114T221320Z-000002.media.{GOOB.replace('/', '.')}{suffix}", media, finished=finished)
+    write(day / f"20231114T221320Z-000001.state{suffix}", state, finished=finished, chunk_ns=10**9)
+    name = f"20231114T221320Z-000002.media.{GOOB.replace('/', '.')}{suffix}"
+    write(day / name, media, finished=finished, chunk_ns=10**9)
     return root
-
-
-def _write(path: Path, lines: list[Line], *, finished: bool) -> None:
-    with path.open("wb", buffering=0) as file:
-        writer = RecordingWriter(file, library="pebble test")
-        numbers: dict[tuple[str, str], int] = {}
-        second = 0
-        for line in lines:
-            if int(line.at) > second:
-                second = int(line.at)
-                writer.flush()
-            key = line.topic, json.dumps(line.metadata)
-            if key not in numbers:
-                numbers[key] = writer.channel(line.topic, "json", line.metadata)
-            writer.add(numbers[key], THEN_NS + round(line.at * 1e9), line.payload, stamp_ns(line.payload))
-        writer.flush()
-        if finished:
-            writer.finish()

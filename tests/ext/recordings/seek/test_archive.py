@@ -16,7 +16,6 @@ from pebble.extensions.recordings.recorder.folder import Folder, finished_path
 from pebble.extensions.recordings.recorder.lane import CARRIED, Item, OpenFile
 from pebble.extensions.recordings.seek.archive import Archive
 from pebble.extensions.recordings.seek.days import Days
-from pebble.extensions.recordings.seek.file import SeekableFile
 from tests.ext.recordings.playing import FRED, GOOB, THEN_NS, Line, js, ms, write
 from tests.ext.recordings.seek.filming import CAMERA, FPS, SCENES, film
 
@@ -117,27 +116,6 @@ def test_a_day_names_its_robots_and_gaps(tmp_path: Path) -> None:
     assert (day.first, day.last) == (ms(0), ms(5))
 
 
-def test_what_is_written_meanwhile_is_found(tmp_path: Path) -> None:
-    """Also the rest of a chunk that was there only in part."""
-    whole = film(tmp_path / "whole", "pbvd", 6, finished=False)
-    source = next(whole.rglob("*.state.mcap.active"))
-    growing = tmp_path / "growing" / source.name
-    growing.parent.mkdir()
-    data = source.read_bytes()
-    growing.write_bytes(data[: len(data) // 2])
-    file = SeekableFile(growing)
-    before = len(file.chunks)
-    for end in range(len(data) // 2, len(data), 997):
-        growing.write_bytes(data[:end])
-        file.refresh()
-    growing.write_bytes(data)
-    file.refresh()
-    assert 0 < before < len(file.chunks)
-    found = [one for chunk in file.chunks for one in file.messages_of(chunk)]
-    assert texts(found) == texts([one for one in merged([source]) if not one.channel.topic.startswith("$")])
-    file.close()
-
-
 def test_a_file_that_is_finished_meanwhile_is_read_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     archive = Archive(film(tmp_path, "pbvd", 6, finished=False))
     before = texts(archive.messages(GOOB, 0, 1 << 62))
@@ -146,28 +124,4 @@ def test_a_file_that_is_finished_meanwhile_is_read_on(tmp_path: Path, monkeypatc
     monkeypatch.setattr("pebble.extensions.recordings.seek.archive.LIST_S", 0.0)
     assert before
     assert texts(archive.messages(GOOB, 0, 1 << 62)) == before
-    archive.close()
-
-
-def test_damage_costs_its_chunk_only(tmp_path: Path) -> None:
-    archive = Archive(film(tmp_path, "pbvd", 10))
-    before = len(archive.messages(GOOB, 0, 1 << 62))
-    file = next(one for one in archive.all_files() if "media" in one.path.name)
-    lost = len(file.messages_of(file.chunks[3]))
-    archive.close()
-    with file.path.open("r+b") as out:
-        out.seek(file.chunks[3].at + 200)
-        out.write(b"\xff" * 40)
-    again = Archive(tmp_path)
-    assert len(again.messages(GOOB, 0, 1 << 62)) == before - lost
-    again.close()
-
-
-def test_what_is_no_recording_is_left_out(tmp_path: Path) -> None:
-    (tmp_path / "x.mcap").write_bytes(b"no recording")
-    (tmp_path / "empty.mcap.active").write_bytes(b"")
-    archive = Archive(tmp_path)
-    assert archive.messages(GOOB, 0, 1 << 62) == []
-    (day,) = Days(archive).all()
-    assert (day.robots, len(day.unread), "x.mcap" in day.unread[0]) == ([], 1, True)
     archive.close()

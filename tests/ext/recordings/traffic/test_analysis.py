@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import math
+import statistics
 from collections import defaultdict
 from collections.abc import Iterable, Sequence
 from itertools import pairwise
@@ -31,12 +31,12 @@ from pebble.extensions.recordings.traffic.results import (
     Traffic,
 )
 from pebble.extensions.recordings.traffic.sources import sources
-from tests.ext.recordings.synthetic import FLEET, START_NS, Sent, event, traffic, write_recording
+from tests.ext.recordings.demo_robots import BENJR, DRIVE, FRED, GOOB, MEDIA, MINILAMP, ROBOTS
+from tests.ext.recordings.synthetic import START_NS, Sent, demo_folder, event, write_recording
 
 pytest.importorskip("duckdb")
 
 SECOND, MS = 10**9, 10**6
-GOOB, FRED, MINILAMP, BENJR = (robot.base for robot in FLEET)
 
 
 def analysed(folder: Path, messages: Iterable[Sent], scratch: Path, **options: object) -> Traffic:
@@ -51,9 +51,10 @@ def of(tmp_path):
 
 
 @pytest.fixture(scope="module")
-def minute(tmp_path_factory) -> tuple[Path, Traffic]:
-    folder = tmp_path_factory.mktemp("minute")
-    return folder / "recordings" / "x.mcap", analysed(folder / "recordings", traffic(), folder / "scratch")
+def recorded(tmp_path_factory) -> Traffic:
+    """The demo's robots."""
+    folder = tmp_path_factory.mktemp("demo")
+    return analyse(sources([demo_folder(folder / "recordings")], folder / "scratch"), folder / "scratch")
 
 
 def robot(found: Traffic, base: str) -> RobotTraffic:
@@ -63,18 +64,15 @@ def robot(found: Traffic, base: str) -> RobotTraffic:
 # -- the same from the messages, without a database
 
 
-def percentile(values: Sequence[float], share: float) -> float:
-    ordered = sorted(values)
-    place = share * (len(ordered) - 1)
-    low = math.floor(place)
-    high = min(low + 1, len(ordered) - 1)
-    return ordered[low] + (ordered[high] - ordered[low]) * (place - low)
+def percentiles(values: Sequence[float]) -> list[float]:
+    """The median, and the 95th percentile."""
+    return [statistics.quantiles(values, n=100, method="inclusive")[percent - 1] for percent in (50, 95)]
 
 
-def messages_of(path: Path, base: str, suffix: str) -> list[Recorded]:
+def messages_of(base: str, suffix: str) -> list[Recorded]:
     return [
         message
-        for message in merged([path])
+        for message in merged([DRIVE, MEDIA])
         if message.channel.topic == f"{base}/{suffix}" and "retained" not in message.channel.metadata
     ]
 
@@ -86,59 +84,53 @@ def kbps_by_second(messages: Iterable[Recorded]) -> list[float]:
     return [size * 8 / 1000 for size in seconds.values()]
 
 
-@pytest.mark.parametrize("base", [GOOB, FRED])
 @pytest.mark.parametrize(
-    ("family", "suffix"), [(VIDEO, "outgoing/front-camera"), (AUDIO, "outgoing/audio"), (HEARTBEATS, "outgoing/online")]
+    ("base", "family", "suffix"),
+    [
+        (FRED, VIDEO, "outgoing/front-camera"),
+        (FRED, AUDIO, "outgoing/audio"),
+        (FRED, HEARTBEATS, "outgoing/online"),
+        (BENJR, HEARTBEATS, "outgoing/online"),
+    ],
 )
-def test_bandwidth_is_that_of_active_seconds(minute, base, family, suffix):
-    path, found = minute
-    expected = kbps_by_second(messages_of(path, base, suffix))
-    one = robot(found, base).of(family)
-    assert one.seconds == len(expected)
-    assert one.median_kbps == pytest.approx(percentile(expected, 0.5))
-    assert one.p95_kbps == pytest.approx(percentile(expected, 0.95))
-    assert one.messages == len(messages_of(path, base, suffix))
+def test_bandwidth_is_that_of_active_seconds(recorded, base, family, suffix):
+    messages = messages_of(base, suffix)
+    expected = kbps_by_second(messages)
+    one = robot(recorded, base).of(family)
+    assert (one.seconds, one.messages) == (len(expected), len(messages))
+    assert [one.median_kbps, one.p95_kbps] == pytest.approx(percentiles(expected))
 
 
-def test_one_channel_of_pcm_takes_what_the_paper_measured(minute):
-    assert robot(minute[1], FRED).of(AUDIO).median_kbps == 265.6
-
-
-def test_stereo_takes_what_the_paper_measured(of):
-    packet = Sound(Codec.PCM16LE, 2, 16000, 320, 1, START_NS // MS, bytes(1280)).pack()
+@pytest.mark.parametrize(("channels", "kbps"), [(1, 265.6), (2, 521.6)])
+def test_pcm_takes_what_the_paper_measured(of, channels, kbps):
+    packet = Sound(Codec.PCM16LE, channels, 16000, 320, 1, START_NS // MS, bytes(640 * channels)).pack()
     found = of(Sent(START_NS + number * 20 * MS, f"{GOOB}/outgoing/audio", packet) for number in range(500))
-    assert robot(found, GOOB).of(AUDIO).median_kbps == 521.6
+    assert robot(found, GOOB).of(AUDIO).median_kbps == kbps
 
 
-@pytest.mark.parametrize("base", [one.base for one in FLEET])
-def test_intervals_and_outages(minute, base):
-    path, found = minute
-    times = [message.log_ns for message in messages_of(path, base, "outgoing/online")]
+@pytest.mark.parametrize("base", ROBOTS)
+def test_intervals_outages_and_latency(recorded, base):
+    heartbeats = messages_of(base, "outgoing/online")
+    times = [message.log_ns for message in heartbeats]
     intervals = [(after - before) / MS for before, after in pairwise(times)]
-    usual = percentile(intervals, 0.5)
+    usual = statistics.median(intervals)
     outages = [
         (before, interval - usual) for before, interval in zip(times, intervals, strict=False) if interval > 1.5 * usual
     ]
-    one = robot(found, base)
+    one = robot(recorded, base)
     assert one.interval_ms == pytest.approx(usual)
     assert [outage.since_ns for outage in one.outages] == [since for since, _ in outages]
     assert [outage.length_ms for outage in one.outages] == pytest.approx([length for _, length in outages])
-
-
-@pytest.mark.parametrize("base", [one.base for one in FLEET])
-def test_latency(minute, base):
-    path, found = minute
-    latencies = [(message.log_ns - message.publish_ns) / MS for message in messages_of(path, base, "outgoing/online")]
-    one = robot(found, base).latency
-    assert one.count == len(latencies) == sum(one.histogram.counts)
-    assert [one.median_ms, one.p95_ms] == pytest.approx([percentile(latencies, share) for share in (0.5, 0.95)])
+    latencies = [(message.log_ns - message.publish_ns) / MS for message in heartbeats]
+    assert one.latency.count == len(latencies) == sum(one.latency.histogram.counts)
+    assert [one.latency.median_ms, one.latency.p95_ms] == pytest.approx(percentiles(latencies))
 
 
 # -- what robots are like
 
 
-def test_kinds_of_robots(minute):
-    kinds = {one.robot: one.machine for one in minute[1].robots}
+def test_kinds_of_robots(recorded):
+    kinds = {one.robot: one.machine for one in recorded.robots}
     assert kinds == {GOOB: LINUX, FRED: LINUX, MINILAMP: MCU, BENJR: MCU}
 
 
@@ -174,36 +166,29 @@ def steady(base: str, *missing: tuple[float, float], seconds: float = 60.0, rate
 
 
 def ordered(*parts: Iterable[Sent]) -> list[Sent]:
-    return sorted((sent for part in parts for sent in part), key=lambda sent: sent.ns)
+    return sorted((sent for part in parts for sent in part), key=lambda sent: sent.log_ns)
 
 
-def test_the_length_of_an_outage_is_beyond_the_usual(of):
-    found = robot(of(steady(GOOB, (20.0, 22.0))), GOOB)
-    assert [outage.length_ms for outage in found.outages] == [1750.0]
-    assert found.outages[0].since_ns == START_NS + 20 * SECOND
+GAP = event(START_NS + 22 * SECOND, "gap", since=START_NS // MS + 20_100, until=START_NS // MS + 21_900, why="lost")
+LATE = [number * 0.25 for number in range(20)] + [4.75 + 0.375 + number * 0.25 for number in range(20)]
 
 
-def test_an_interval_of_up_to_one_and_a_half_is_none(of):
-    times = [number * 0.25 for number in range(20)] + [4.75 + 0.375 + number * 0.25 for number in range(20)]
-    assert robot(of(heartbeats(GOOB, times)), GOOB).outages == []
-
-
-def test_above_a_minute_a_robot_was_offline(of):
-    found = robot(of(steady(GOOB, (20.0, 90.0), seconds=120.0)), GOOB)
-    assert found.outages == []
-
-
-def test_what_was_not_recorded_is_no_outage(of):
-    gap = event(START_NS + 22 * SECOND, "gap", since=START_NS // MS + 20_100, until=START_NS // MS + 21_900, why="lost")
-    found = of(ordered(steady(GOOB, (20.0, 22.0), (40.0, 41.0)), [gap]))
-    assert [outage.length_ms for outage in robot(found, GOOB).outages] == [750.0]
-    assert [(one.until_ns - one.since_ns, one.why) for one in found.gaps] == [(1800 * MS, "lost")]
-
-
-@pytest.mark.parametrize("name", ["start", "clock"])
-def test_nothing_is_measured_across_a_start_of_the_recorder(of, name):
-    noted = event(START_NS + 21 * SECOND, name)
-    assert robot(of(ordered(steady(GOOB, (20.0, 22.0)), [noted])), GOOB).outages == []
+@pytest.mark.parametrize(
+    ("messages", "lengths_ms"),
+    [
+        (steady(GOOB, (20.0, 22.0)), [1750.0]),  # beyond the usual interval
+        (heartbeats(GOOB, LATE), []),  # of up to one and a half
+        (steady(GOOB, (20.0, 90.0), seconds=120.0), []),  # above a minute it was offline
+        (ordered(steady(GOOB, (20.0, 22.0), (40.0, 41.0)), [GAP]), [750.0]),  # what was not recorded is none
+        (ordered(steady(GOOB, (20.0, 22.0)), [event(START_NS + 21 * SECOND, "start")]), []),
+        (ordered(steady(GOOB, (20.0, 22.0)), [event(START_NS + 21 * SECOND, "clock")]), []),
+    ],
+    ids=["missing", "late", "offline", "not recorded", "the recorder starts", "its clock jumps"],
+)
+def test_outages(of, messages, lengths_ms):
+    found = of(messages)
+    assert [outage.length_ms for outage in robot(found, GOOB).outages] == lengths_ms
+    assert [(gap.until_ns - gap.since_ns, gap.why) for gap in found.gaps] == [(1800 * MS, "lost")] * (GAP in messages)
 
 
 def test_messages_that_were_dropped_are_counted(of):
@@ -218,7 +203,7 @@ def test_the_last_heartbeat_of_a_connection_does_not_count(of):
 
 
 def test_both_names_of_the_heartbeat_count_once(of):
-    both = [Sent(sent.ns + MS, sent.topic.replace("online", "heartbeat"), sent.payload) for sent in steady(GOOB)]
+    both = [Sent(sent.log_ns + MS, sent.topic.replace("online", "heartbeat"), sent.payload) for sent in steady(GOOB)]
     assert robot(of(ordered(steady(GOOB), both)), GOOB).interval_ms == 250.0
 
 
@@ -249,37 +234,29 @@ def test_sessions(of, messages, expected):
     assert sessions(of(messages)) == expected
 
 
-def test_bandwidths_of_sessions_and_of_idle_time_are_apart(minute):
-    goob = robot(minute[1], GOOB)
-    assert [session.until_s - session.since_s for session in goob.sessions] == [41]
-    assert goob.of(VIDEO, IDLE) is None
-    assert goob.of(TOTAL, IDLE).median_kbps < 3 < 300 < goob.of(TOTAL, SESSION).median_kbps
-    both = goob.of(TOTAL, SESSION), goob.of(TOTAL, IDLE)
-    assert sum(one.bytes for one in both) == goob.of(TOTAL, ALL).bytes == goob.bytes
+def test_bandwidths_of_sessions_and_of_idle_time_are_apart(of):
+    goob = robot(of(ordered(steady(GOOB), drive(10.0, 11.0))), GOOB)
+    assert [goob.of(TOTAL, when).messages for when in (SESSION, IDLE)] == [48 + 2, 240 - 48]
+    assert sum(goob.of(TOTAL, when).bytes for when in (SESSION, IDLE)) == goob.of(TOTAL, ALL).bytes == goob.bytes
 
 
-def test_sound_sent_to_a_robot_is_not_its_audio(of):
-    packet = Sound(Codec.OPUS, 1, 48000, 960, 1, START_NS // MS, b"opus").pack()
-    found = robot(of([Sent(START_NS, f"{GOOB}/incoming/audio-stream", packet)]), GOOB)
-    assert found.of(VOICE).messages == 1
-    assert found.of(AUDIO) is None
+@pytest.mark.parametrize(
+    ("metric", "payload", "family"),
+    [
+        ("incoming/audio-stream", Sound(Codec.OPUS, 1, 48000, 960, 1, START_NS // MS, b"opus").pack(), VOICE),
+        ("outgoing/rear-camera", Picture(PictureKind.JPEG, 1, START_NS // MS, b"\xff\xd8").pack(), VIDEO),
+        ("incoming/front-camera", b'{"enabled":true}', None),  # a request for pictures
+    ],
+)
+def test_media_are_counted_by_what_they_are(of, metric, payload, family):
+    found = robot(of([Sent(START_NS, f"{GOOB}/{metric}", payload)]), GOOB)
+    assert [kind for kind in (VIDEO, AUDIO, VOICE) if found.of(kind)] == [kind for kind in (family,) if kind]
 
 
-def test_a_request_for_pictures_is_no_video(of):
-    found = robot(of([Sent(START_NS, f"{GOOB}/incoming/front-camera", b'{"enabled":true}')]), GOOB)
-    assert found.of(VIDEO) is None
-
-
-def test_video_under_another_topic_is_video(of):
-    picture = Picture(PictureKind.JPEG, 1, START_NS // MS, b"\xff\xd8").pack()
-    found = robot(of([Sent(START_NS, f"{GOOB}/outgoing/rear-camera", picture)]), GOOB)
-    assert found.of(VIDEO).messages == 1
-
-
-def test_retained_messages_are_not_traffic(minute):
-    path, found = minute
-    total = sum("retained" not in message.channel.metadata for message in merged([path]))
-    assert sum(one.messages for one in found.robots) == total
+def test_retained_messages_are_not_traffic(of):
+    old = Sent(START_NS, f"{GOOB}/outgoing/online", b'{"t":1}', {"qos": "1", "retain": "1", "retained": "1"})
+    found = robot(of([old, *steady(GOOB)]), GOOB)
+    assert (found.messages, found.latency.count) == (240, 240)
 
 
 # -- periods, places, options
@@ -303,16 +280,6 @@ def test_a_file_that_is_being_written_is_read_and_not_indexed(tmp_path):
     assert robots == {GOOB: 8, FRED: 12}
 
 
-def test_a_file_that_is_finished_meanwhile_is_found(tmp_path, monkeypatch):
-    finished = write_recording(tmp_path / "a.mcap", steady(GOOB, seconds=2.0))
-    gone = tmp_path / "a.mcap.active"
-    monkeypatch.setattr(
-        "pebble.extensions.recordings.traffic.sources.files", lambda _places: [gone, tmp_path / "deleted.mcap"]
-    )
-    assert len(sources([tmp_path], tmp_path / "scratch").indexes) == 1
-    assert finished.exists()
-
-
 def test_a_recording_that_was_deleted_still_counts(tmp_path):
     path = write_recording(tmp_path / "a.mcap", steady(GOOB, seconds=2.0))
     sources([tmp_path], tmp_path / "scratch")
@@ -329,15 +296,10 @@ def test_the_index_of_the_last_version_is_left_alone(tmp_path):
     assert sources([tmp_path], tmp_path / "scratch").robots == [GOOB]
 
 
-def test_a_file_that_is_named_again_counts_once(tmp_path):
-    path = write_recording(tmp_path / "a.mcap", steady(GOOB, seconds=2.0))
-    assert len(sources([path, tmp_path, path], tmp_path / "scratch").indexes) == 1
-
-
 def test_names_of_folders_are_no_patterns(tmp_path):
     folder, scratch = tmp_path / "it's [1] *?", tmp_path / "scratch"
-    write_recording(folder / "a.mcap", steady(GOOB, seconds=2.0))
-    assert analyse(sources([folder], scratch), scratch).robots[0].messages == 8
+    path = write_recording(folder / "a.mcap", steady(GOOB, seconds=2.0))
+    assert analyse(sources([path, folder], scratch), scratch).robots[0].messages == 8, "it is named twice"
 
 
 def test_a_damaged_index_is_named(tmp_path):

@@ -10,11 +10,11 @@ from pebble.contract.packets import Codec, Sound
 from pebble.extensions.recordings.traffic.activity import Activity
 from pebble.extensions.recordings.traffic.index import COLUMNS, PICTURE, SOUND, index_path, write_index
 from pebble.extensions.recordings.traffic.sources import sources
-from tests.ext.recordings.synthetic import FLEET, START_NS, Sent, event, traffic, write_recording
+from tests.ext.recordings.demo_robots import DRIVE, FRED, GOOB, MEDIA, messages
+from tests.ext.recordings.synthetic import START_NS, Sent, event, write_recording
 
 duckdb = pytest.importorskip("duckdb")
 
-GOOB = FLEET[0].base
 NAME = "2025/11/20/20251120T010000Z-000001.state.mcap"
 
 
@@ -40,17 +40,19 @@ def in_turn(*parts: tuple[str, bytes]) -> list[Sent]:
     return [Sent(START_NS + number * 10**6, topic, payload) for number, (topic, payload) in enumerate(parts)]
 
 
-def test_each_message_is_a_row(tmp_path):
-    messages = traffic()
-    assert indexed(tmp_path, messages) == tmp_path / NAME.replace(".mcap", ".parquet")
-    found = rows(tmp_path, "epoch_ns(ts), robot || '/' || direction || '/' || metric, size, retained")
-    expected = [(sent.ns, sent.topic, len(sent.payload), sent.retained) for sent in messages]
+@pytest.mark.parametrize("recording", [DRIVE, MEDIA], ids=["drive", "media"])
+def test_each_message_is_a_row(tmp_path, recording):
+    index = index_path(tmp_path / "a.mcap")
+    write_index(recording, index, tmp_path / "scratch")
+    found = rows(tmp_path, "epoch_ns(ts), robot || '/' || direction || '/' || metric, size, retained", "robot != ''")
+    expected = [
+        (one.log_ns, one.channel.topic, len(one.payload), "retained" in one.channel.metadata)
+        for one in messages(recording)
+        if not one.channel.topic.startswith("$")
+    ]
     assert sorted(found) == sorted(expected)
-
-
-def test_the_columns_have_the_promised_types(tmp_path):
-    path = indexed(tmp_path, traffic(seconds=2.0))
-    assert dict(query("SELECT column_name, column_type FROM (DESCRIBE FROM read_parquet(?))", str(path))) == COLUMNS
+    described = "SELECT column_name, column_type FROM (DESCRIBE FROM read_parquet(?))"
+    assert dict(query(described, str(index))) == COLUMNS
 
 
 USES = [
@@ -68,7 +70,10 @@ USES = [
     ("outgoing/front-camera", b'{"id": 1, "keyframe": true}', Activity.MEDIA),
     ("outgoing/logs", b'{"level": "WARNING", "message": "hot"}', Activity.WARNING),
     ("outgoing/logs", b'{"level": "INFO", "message": "WARNING"}', Activity.NONE),
-    ("outgoing/status", b"{}", Activity.NONE),
+    ("outgoing/status", b'{"online": false}', Activity.NONE),
+    ("outgoing/online", b'{"t":1,"online":true}', Activity.NONE),
+    ("outgoing/online", b'{"t":1}', Activity.NONE),
+    ("outgoing/heartbeat", b'{"t":1, "online": false}', Activity.NONE),
 ]
 
 
@@ -76,29 +81,16 @@ def test_the_use_of_a_robot_shows(tmp_path):
     indexed(tmp_path, in_turn(*((f"{GOOB}/{suffix}", payload) for suffix, payload, _ in USES)))
     assert rows(tmp_path, "activity") == [(activity,) for _, _, activity in USES]
     assert rows(tmp_path, "medium", "medium IS NOT NULL") == [(SOUND,), (PICTURE,)]
+    assert rows(tmp_path, "online", "online IS NOT NULL") == [(True,), (True,), (False,)]
 
 
-def test_a_heartbeat_may_be_the_last(tmp_path):
-    heartbeats = [
-        ("outgoing/online", b'{"t":1,"online":true}', True),
-        ("outgoing/online", b'{"t":1}', True),
-        ("outgoing/heartbeat", b'{"t":1, "online": false}', False),
-        ("outgoing/status", b'{"online": false}', None),
-    ]
-    indexed(tmp_path, in_turn(*((f"{GOOB}/{suffix}", payload) for suffix, payload, _ in heartbeats)))
-    assert rows(tmp_path, "online") == [(online,) for _, _, online in heartbeats]
-
-
-def test_what_belongs_to_no_robot_keeps_its_topic(tmp_path):
-    topics = ["pebble/infrastructure", "$SYS/uptime", "a/b/c/sideways/x"]
-    indexed(tmp_path, in_turn(*((topic, b"{}") for topic in topics)))
-    assert rows(tmp_path, "robot, direction, metric") == [("", "", topic) for topic in topics]
-
-
-def test_a_robot_may_have_any_name(tmp_path):
+def test_a_robot_may_have_any_name_and_what_belongs_to_none_keeps_its_topic(tmp_path):
     robots = [f"pebble/robots/{name}" for name in ("a.b", "x=y", "50% off", "..", "día", "it's", "a\\b")]
+    topics = ["pebble/infrastructure", "$SYS/uptime", "a/b/c/sideways/x"]
     indexed(tmp_path, in_turn(*((f"{robot}/outgoing/status", b"{}") for robot in robots)), "it's.mcap")
-    assert rows(tmp_path, "robot") == [(robot,) for robot in robots]
+    indexed(tmp_path, in_turn(*((topic, b"{}") for topic in topics)), "none.mcap")
+    assert sorted(rows(tmp_path, "robot", "robot != ''")) == [(robot,) for robot in sorted(robots)]
+    assert rows(tmp_path, "direction, metric", "robot = ''") == [("", topic) for topic in topics]
     assert sources([tmp_path], tmp_path / "scratch").robots == sorted(robots)
 
 
@@ -118,19 +110,21 @@ def state(folder: Path) -> list[tuple[Path, int]]:
     return [(path, path.stat().st_mtime_ns) for path in sorted(folder.rglob("*.parquet"))]
 
 
+HEARTBEATS = in_turn(*((f"{base}/outgoing/online", b"{}") for base in (FRED, GOOB) * 50))
+
+
 def test_a_recording_is_indexed_once_and_again_when_it_has_changed(tmp_path):
-    messages = traffic(seconds=3.0)
-    path = write_recording(tmp_path / NAME, messages)
-    assert sources([tmp_path], tmp_path / "scratch").robots == sorted(robot.base for robot in FLEET)
+    path = write_recording(tmp_path / NAME, HEARTBEATS)
+    assert sources([tmp_path], tmp_path / "scratch").robots == [FRED, GOOB]
     before = state(tmp_path)
     sources([tmp_path], tmp_path / "scratch")
     assert state(tmp_path) == before
-    write_recording(path, [sent for sent in messages if sent.topic.startswith(GOOB)])
+    write_recording(path, HEARTBEATS[1::2])
     assert sources([tmp_path], tmp_path / "scratch").robots == [GOOB]
 
 
 def test_a_failure_leaves_the_former_index_and_nothing_temporary(tmp_path, monkeypatch):
-    path = write_recording(tmp_path / NAME, traffic(seconds=2.0))
+    path = write_recording(tmp_path / NAME, HEARTBEATS)
     sources([tmp_path], tmp_path / "scratch")
     before = state(tmp_path)
     os.utime(path)
@@ -146,10 +140,9 @@ def test_a_failure_leaves_the_former_index_and_nothing_temporary(tmp_path, monke
 
 
 def test_a_torn_recording_is_indexed_as_far_as_it_goes_and_not_beside_it(tmp_path):
-    messages = traffic(seconds=5.0)
-    path = write_recording(tmp_path / "x.mcap.active", messages, finished=False)
+    path = write_recording(tmp_path / "x.mcap.active", HEARTBEATS, finished=False)
     whole = path.read_bytes()
     path.write_bytes(whole + whole[-1000:-500])
     (index,) = sources([tmp_path], tmp_path / "scratch").indexes
-    assert query("SELECT count(*) FROM read_parquet(?)", str(index)) == [(len(messages),)]
+    assert query("SELECT count(*) FROM read_parquet(?)", str(index)) == [(len(HEARTBEATS),)]
     assert list(tmp_path.glob("*.parquet")) == []

@@ -40,70 +40,46 @@ def line(ns: int, left: float, right: float) -> Entry:
     return Entry(ns, "line", f"M {left:.3f} {right:.3f}")
 
 
-# -- sound
+LATE = [packet(number, late_ms=1500 if number % 2 else 50) for number in range(250)]
 
 
-def test_all_sound_of_the_window_is_a_hundred_per_cent() -> None:
-    assert metrics.sound_percent(map(packet, range(-5, 300)), WINDOW) == pytest.approx(100)
+@pytest.mark.parametrize(
+    ("sounds", "within", "percent"),
+    [
+        ([packet(number) for number in range(-5, 300)], (), 100),
+        (LATE, (), 100),
+        (LATE, (1.0,), 50),
+        ([packet(number) for number in range(0, 250, 4)], (), 25.2),
+        ([], (), 0),
+        ([packet(1), packet(1), packet(2)], (), 0.8),  # one came twice
+        ([packet(1, at_ms=-30), packet(2, at_ms=9990)], (), 0.2),  # at the edges, a part of each counts
+        ([packet(3, at_ms=-40), packet(4, at_ms=10_000)], (), 0),
+    ],
+)
+def test_sound_of_the_window(sounds: list[Sound], within: tuple[float, ...], percent: float) -> None:
+    assert metrics.sound_percent(sounds, WINDOW, *within) == pytest.approx(percent)
 
 
-def test_late_sound_is_delivered_and_not_on_time() -> None:
-    sounds = [packet(number, late_ms=1500 if number % 2 else 50) for number in range(250)]
-    assert metrics.sound_percent(sounds, WINDOW) == pytest.approx(100)
-    assert metrics.sound_percent(sounds, WINDOW, 1.0) == pytest.approx(50)
+@pytest.mark.parametrize(("pictures", "gaps"), [([9 * S, 12 * S, 13 * S, 21 * S], [2, 1, 7]), ([], [10])])
+def test_gaps_of_pictures_reach_from_edge_to_edge(pictures: list[int], gaps: list[float]) -> None:
+    assert metrics.gaps_s(pictures, WINDOW) == gaps
 
 
-def test_lost_sound_is_not_delivered() -> None:
-    assert metrics.sound_percent(map(packet, range(0, 250, 4)), WINDOW) == pytest.approx(25, abs=0.5)
-    assert metrics.sound_percent([], WINDOW) == 0
+UNTIL_12 = [heartbeat(8 + number / 4) for number in range(17)]
 
 
-def test_a_packet_that_comes_twice_counts_once() -> None:
-    assert metrics.sound_percent([packet(1), packet(1), packet(2)], WINDOW) == pytest.approx(0.8)
-
-
-def test_packets_at_the_edges_count_for_their_part_in_the_window() -> None:
-    edges = [packet(1, at_ms=-30), packet(2, at_ms=9990)]
-    assert [metrics.overlap_s(sound, WINDOW) for sound in edges] == [pytest.approx(0.01), pytest.approx(0.01)]
-    assert metrics.received([packet(3, at_ms=-40), packet(4, at_ms=10_000)], WINDOW) == []
-
-
-# -- pictures
-
-
-def test_gaps_reach_from_edge_to_edge() -> None:
-    assert metrics.gaps_s([9 * S, 12 * S, 13 * S, 21 * S], WINDOW) == [2, 1, 7]
-
-
-def test_without_any_picture_the_window_is_one_gap() -> None:
-    assert metrics.gaps_s([], WINDOW) == [10]
-
-
-# -- heartbeats
-
-
-def test_a_steady_heartbeat_is_never_offline() -> None:
-    assert metrics.offline_s([heartbeat(8 + number / 4) for number in range(48)], WINDOW) == []
-
-
-def test_silence_is_offline_after_the_operators_timeout() -> None:
-    heartbeats = [heartbeat(8 + number / 4) for number in range(17)] + [
-        heartbeat(15 + number / 4) for number in range(20)
-    ]
-    (spell,) = metrics.offline_s(heartbeats, WINDOW)  # from 12 to 15, less two intervals
-    assert spell == pytest.approx(2.5, abs=0.02)
-
-
-def test_silence_until_the_end_counts_until_the_end() -> None:
-    (spell,) = metrics.offline_s([heartbeat(8 + number / 4) for number in range(17)], WINDOW)
-    assert spell == pytest.approx(7.5, abs=0.02)
-
-
-def test_an_offline_message_is_offline_at_once() -> None:
-    heartbeats = [heartbeat(8 + number / 4) for number in range(17)]
-    goodbye, back = heartbeat(12.1, online=False), [heartbeat(12.6 + number / 4) for number in range(30)]
-    (spell,) = metrics.offline_s([*heartbeats, goodbye, *back], WINDOW)
-    assert spell == pytest.approx(0.5, abs=0.02)
+@pytest.mark.parametrize(
+    ("heartbeats", "offline"),
+    [
+        ([heartbeat(8 + number / 4) for number in range(48)], []),
+        (UNTIL_12 + [heartbeat(15 + number / 4) for number in range(20)], [2.5]),  # less two intervals
+        (UNTIL_12, [7.5]),
+        ([*UNTIL_12, heartbeat(12.1, online=False), *(heartbeat(12.6 + n / 4) for n in range(30))], [0.5]),
+    ],
+    ids=["steady", "silent for a while", "silent to the end", "an offline message"],
+)
+def test_when_a_robot_is_offline(heartbeats: list[Heartbeat], offline: list[float]) -> None:
+    assert metrics.offline_s(heartbeats, WINDOW) == pytest.approx(offline, abs=0.02)
 
 
 # -- driving
@@ -111,26 +87,27 @@ def test_an_offline_message_is_offline_at_once() -> None:
 COMMANDS = [Command(0.2 + number / 1000, 0.3, (10 + number) * S) for number in range(5)]
 
 
-def test_latency_is_to_the_first_line_that_sets_the_wheels() -> None:
-    entries = [line(10 * S + 5 * MS, 0.2, 0.3), line(11 * S + 9 * MS, 0.2, 0.3)]
-    assert metrics.driven_ms(COMMANDS, entries) == [(COMMANDS[0], 5)]
+@pytest.mark.parametrize(
+    ("entries", "took_ms"),
+    [
+        ([line(10 * S + 5 * MS, 0.2, 0.3), line(11 * S + 9 * MS, 0.2, 0.3)], [5]),  # to the first one
+        ([line(10 * S + 5 * MS, 0.2, 0.3), line(13 * S + 7 * MS, 0.203, 0.3)], [5, 2007, 1007, 7]),  # overtaken
+    ],
+)
+def test_latency_is_to_the_line_that_sets_the_wheels_or_overtakes(entries: list[Entry], took_ms: list[float]) -> None:
+    assert metrics.driven_ms(COMMANDS, entries) == list(zip(COMMANDS, took_ms, strict=False))
 
 
-def test_an_overtaken_command_has_waited_for_the_one_that_overtook_it() -> None:
-    entries = [line(10 * S + 5 * MS, 0.2, 0.3), line(13 * S + 7 * MS, 0.203, 0.3)]
-    took = [(COMMANDS[0], 5), (COMMANDS[1], 2007), (COMMANDS[2], 1007), (COMMANDS[3], 7)]
-    assert metrics.driven_ms(COMMANDS, entries) == took
-
-
-def test_a_repeated_stop_between_commands_counts_once() -> None:
-    entries = [line(10 * S, 0.2, 0.3), line(11 * S, 0, 0), line(11 * S + 1, 0, 0), line(12 * S, 0.202, 0.3)]
-    assert metrics.trips(COMMANDS, entries) == 1
-
-
-def test_the_stops_before_the_first_and_after_the_last_command_are_no_trips() -> None:
-    entries = [line(9 * S, 0, 0), line(10 * S, 0.2, 0.3), line(15 * S, 0, 0)]
-    assert metrics.trips(COMMANDS, entries) == 0
-    assert metrics.trips([], entries) == 0
+@pytest.mark.parametrize(
+    ("commands", "entries", "trips"),
+    [
+        (COMMANDS, [line(10 * S, 0.2, 0.3), line(11 * S, 0, 0), line(11 * S + 1, 0, 0), line(12 * S, 0.202, 0.3)], 1),
+        (COMMANDS, [line(9 * S, 0, 0), line(10 * S, 0.2, 0.3), line(15 * S, 0, 0)], 0),
+        ([], [line(9 * S, 0, 0), line(10 * S, 0.2, 0.3), line(15 * S, 0, 0)], 0),
+    ],
+)
+def test_stops_between_commands_are_trips(commands: list[Command], entries: list[Entry], trips: int) -> None:
+    assert metrics.trips(commands, entries) == trips
 
 
 def test_wheels_are_at_rest_before_the_first_command_comes_and_after_each_stop() -> None:

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import math
-import time
 
 import numpy as np
 import pytest
@@ -12,7 +10,6 @@ import pytest
 from pebble.extensions.lab.simulation.motion import FULL_SPEED_MM_S
 from pebble.extensions.lab.simulation.world.lockstep import CameraMode, LockstepRobot, LockstepWorld
 from pebble.extensions.lab.simulation.world.world_file import World, parse_world
-from pebble.services.serial_mcu_bridge.text.goob_base import drive_line, mix
 from tests.ext.lab.simulation.world.worlds import CLEAR, projected, tags_in
 
 pytestmark = pytest.mark.computing
@@ -50,17 +47,6 @@ def test_two_runs_are_the_same_to_the_last_bit() -> None:
     assert history(1.5) == history(1.5)
 
 
-def test_time_runs_much_faster_than_real_time() -> None:
-    simulated = LockstepWorld(world())
-    goob = simulated.robots["goob"]
-    began, pictures = time.process_time(), 0
-    while simulated.now() < 4.0:
-        simulated.step()
-        pictures += goob.picture() is not None
-    assert pictures == 60
-    assert time.process_time() - began < 1.0, "0.13 s on an idle machine"
-
-
 def test_the_firmware_drives_the_wheels_and_stops_without_commands() -> None:
     simulated = LockstepWorld(world())
     goob = simulated.robots["goob"]
@@ -69,15 +55,6 @@ def test_the_firmware_drives_the_wheels_and_stops_without_commands() -> None:
     assert goob.motion.left_mm_s == pytest.approx(0.5 * FULL_SPEED_MM_S, rel=0.01)
     simulated.run(1.5)
     assert goob.motion.left_mm_s == 0.0, "the firmware's own failsafe"
-
-
-@pytest.mark.parametrize(("x", "z"), [(0.0, 0.5), (0.3, 0.9), (-0.2, -0.31234), (0.1, -0.1)])
-def test_a_drive_command_is_the_line_that_the_service_writes(x: float, z: float) -> None:
-    lines: list[bytes] = []
-    goob = LockstepWorld(world()).robots["goob"]
-    goob.write = lines.append  # type: ignore[method-assign]
-    goob.drive(x=x, z=z)
-    assert lines == [drive_line(*mix(x, z))]
 
 
 def test_pictures_come_at_the_rate_of_the_camera_each_once() -> None:
@@ -107,14 +84,3 @@ def test_a_camera_with_latency_shows_what_was() -> None:
     assert np.abs(tags_in(picture.pixels)[13] - projected(model, 13, then)).max() < 1.0  # type: ignore[arg-type]
     now = tuple(poses[1.0])
     assert np.abs(tags_in(picture.pixels)[13] - projected(model, 13, now)).max() > 2.0  # type: ignore[arg-type]
-
-
-def test_a_robot_is_put_down_elsewhere() -> None:
-    simulated = LockstepWorld(world(**CLEAR))
-    goob = simulated.robots["goob"]
-    goob.place(1.5, -0.2, math.radians(10))
-    simulated.run(0.2)
-    picture = goob.picture()
-    assert picture is not None
-    expected = projected(world(), 13, (1.5, -0.2, math.radians(10)))
-    assert np.abs(tags_in(picture.pixels)[13] - expected).max() < 1.0

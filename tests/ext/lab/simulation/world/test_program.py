@@ -114,14 +114,6 @@ def test_a_world_that_was_killed_starts_again_reports_the_truth_and_is_alone(
         assert world.wait(30) == 0
 
 
-def test_it_ends_at_once_where_standard_input_has_ended_already(room: Path) -> None:
-    ended = subprocess.run(
-        command(room, "--control"), stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, timeout=60, check=False
-    )
-    assert ended.returncode == 0
-    assert not page_path(room).exists()
-
-
 @pytest.fixture
 def refused(monkeypatch: pytest.MonkeyPatch) -> Callable[[Path], str]:
     """What is wrong with a room that is not run, in this process, whose signals stay as they are."""
@@ -133,12 +125,3 @@ def refused(monkeypatch: pytest.MonkeyPatch) -> Callable[[Path], str]:
         return str(error.value)
 
     return refuse
-
-
-def test_a_missing_file_and_a_folder_that_cannot_be_made_are_one_line(
-    room: Path, refused: Callable[[Path], str]
-) -> None:
-    assert refused(room.with_name("none.json")) == f"{room.with_name('none.json')}: there is no such file"
-    (room.parent / "f").touch()
-    assert refused(room) == f"{room.parent / 'f'}: File exists"
-    assert not page_path(room).exists()

@@ -12,7 +12,7 @@ import pytest
 from pebble.extensions.lab.simulation.world.poses import RobotPose, Sample, Track
 from pebble.extensions.lab.simulation.world.renderer import Renderer
 from pebble.extensions.lab.simulation.world.surfaces import Image
-from tests.ext.lab.simulation.world.worlds import CLEAR, at_rest, projected, seen, tags_in, world_of
+from tests.ext.lab.simulation.world.worlds import CLEAR, projected, seen, tags_in, world_of
 
 WALL = {"x1": 1.0, "y1": 1.0, "x2": 1.0, "y2": -1.0}
 TAG = {"id": 13, "x": 2.0, "y": 0.0, "yaw_deg": 180.0}
@@ -39,21 +39,6 @@ def test_a_tag_is_where_the_pinhole_model_puts_it(camera: tuple[float, float, fl
     assert len(found) == 1
     for number, corners in found.items():
         assert np.abs(corners - projected(world, number, camera, size)).max() < 1.0
-
-
-@pytest.mark.parametrize("family", ["APRILTAG_16h5", "APRILTAG_25h9", "APRILTAG_36h10", "APRILTAG_36h11"])
-def test_tags_of_every_family_are_recognised(family: str) -> None:
-    world = world_of(family=family, tags=[{**TAG, "id": number, "y": 0.8 - 0.4 * number} for number in range(5)])
-    found = tags_in(seen(world), family)
-    assert set(found) == {0, 1, 2, 3, 4}
-    for number, corners in found.items():
-        assert np.abs(corners - projected(world, number, (0.0, 0.0, 0.0))).max() < 1.0
-
-
-def test_the_field_of_view_is_the_cameras() -> None:
-    narrow, wide = (world_of(tags=[TAG], camera={"hfov_deg": degrees}) for degrees in (54.3, 90.0))
-    edges = [math.dist(*tags_in(seen(world))[13][:2]) for world in (narrow, wide)]
-    assert edges[0] / edges[1] == pytest.approx(math.tan(math.radians(45)) / math.tan(math.radians(27.15)), rel=0.02)
 
 
 NEAR = {**TAG, "y": 0.5, "size_m": 0.1}
@@ -83,12 +68,6 @@ def test_walls_and_robots_hide_what_is_behind_them(keys: dict[str, Any], poses: 
     assert set(tags_in(seen(world_of(**keys), **poses))) == tags
 
 
-@pytest.mark.parametrize("heading", [0.0, 0.4, 0.8, 1.2, 2.0, 4.0])
-def test_a_robot_is_seen_by_the_tags_on_its_four_sides(heading: float) -> None:
-    robots = {"goob": {"x": 0.0, "y": 0.0}, "fred": {"x": 1.0, "y": 0.0, "tag": 2}}
-    assert 2 in tags_in(seen(world_of(robots=robots), fred=(0.8, 0.0, heading)))
-
-
 def test_a_robot_does_not_see_itself() -> None:
     own = world_of(robots={"goob": {"x": 0.0, "y": 0.0, "tag": 2}}, camera=CLEAR)
     assert (seen(own) == seen(world_of(camera=CLEAR))).all()
@@ -103,36 +82,18 @@ def test_a_room_has_walls_all_around(heading: float) -> None:
     assert row.max() <= 208, "the sky is lighter"
 
 
-def test_the_walls_of_a_room_are_seen_from_inside_only() -> None:
-    world = world_of(room={"x_min": -1.0, "x_max": 3.0, "y_min": -1.0, "y_max": 1.0}, camera=CLEAR)
-    assert seen(world, goob=(-1.5, 0.0, 0.0))[350, 320].max() < 170, "the floor behind the nearest wall"
-
-
 def blurred(picture: Image) -> float:
     """The steepest edge of a picture."""
     return float(np.abs(np.diff(picture[200:280].astype(np.int16), axis=1)).max())
 
 
-def test_noise_has_its_strength_and_differs_between_pictures() -> None:
-    world, clear = world_of(camera={"noise": 8.0, "blur": 0.0}), seen(world_of(camera=CLEAR)).astype(np.int16)
-    renderer, tracks = Renderer(world, "goob", 640, 480), at_rest(goob=(0.0, 0.0, 0.0))
-    one, two = np.empty((480, 640, 3), np.uint8), np.empty((480, 640, 3), np.uint8)
-    renderer.render(tracks, 0, one)
-    renderer.render(tracks, 0, two)
-    assert np.std(one - clear) == pytest.approx(8.0, rel=0.1)
-    assert np.std(one.astype(np.int16) - two) == pytest.approx(8.0 * math.sqrt(2), rel=0.1)
-
-
-def test_blur_softens_edges() -> None:
-    sharp, soft = (blurred(seen(world_of(tags=[TAG], camera={"noise": 0.0, "blur": blur}))) for blur in (0.0, 3.0))
-    assert soft < sharp / 3
-
-
-def test_jpeg_loses_detail_and_the_tag_is_still_found() -> None:
-    world = world_of(tags=[TAG], camera={**CLEAR, "jpeg_quality": 10})
-    lossy, clear = seen(world), seen(world_of(tags=[TAG], camera=CLEAR))
-    assert 2 < np.abs(lossy.astype(np.int16) - clear).mean() < 20
-    assert np.abs(tags_in(lossy)[13] - projected(world, 13, (0.0, 0.0, 0.0))).max() < 2.0
+@pytest.mark.parametrize(
+    ("fault", "least", "most"),
+    [({"noise": 8.0}, 6, 7), ({"blur": 3.0}, 2, 4), ({"jpeg_quality": 10}, 3, 5), ({}, -1, 0)],
+)
+def test_a_fault_of_the_camera_changes_each_pixel_by_so_much(fault: dict[str, float], least: int, most: int) -> None:
+    clear, faulty = (seen(world_of(tags=[TAG], camera={**CLEAR, **keys})) for keys in ({}, fault))
+    assert least < np.abs(faulty.astype(np.int16) - clear).mean() <= most
 
 
 def turning(radians_per_s: float) -> dict[str, Track]:

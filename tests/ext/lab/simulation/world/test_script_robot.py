@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 
 from pebble import Robot
-from pebble.contract import APRILTAG_DATA, DRIVE, WHEEL_ODOMETRY
-from pebble.contract.payloads import Drive, TagData, WheelOdometry
+from pebble.contract import DRIVE
+from pebble.contract.payloads import Drive
 from pebble.errors import PebbleError
 from pebble.extensions.lab.simulation.world.script_robot import SimulatedRobot
 
@@ -35,15 +35,6 @@ def test_a_script_moves_its_robot_and_leaves_it_at_rest(robot: SimulatedRobot) -
     assert robot.body.pose.x == pytest.approx(before.x, abs=0.03)
 
 
-def test_the_wheels_stop_without_commands(robot: SimulatedRobot) -> None:
-    def once(robot: Robot) -> None:
-        robot.drive(z=0.5)
-        robot.sleep(5.0)
-
-    robot.run(once, seconds=10.0)
-    assert 0.75 * 0.19 - 0.03 < robot.body.pose.x < 0.19
-
-
 def test_a_person_goes_first(robot: SimulatedRobot) -> None:
     obeyed: list[bool] = []
 
@@ -56,52 +47,6 @@ def test_a_person_goes_first(robot: SimulatedRobot) -> None:
     robot.run(main, seconds=4.0)
     assert obeyed.index(True) == 20
     assert all(obeyed[20:])
-
-
-def test_messages_are_received_and_published(robot: SimulatedRobot) -> None:
-    odometry = WheelOdometry(value={"x_mm": 1.0}, timestamp=1.0)
-    handled: list[WheelOdometry] = []
-
-    def main(robot: Robot) -> None:
-        robot.on(WHEEL_ODOMETRY, handled.append)
-        assert robot.latest(WHEEL_ODOMETRY) is odometry
-        robot.sleep(1.1)
-        assert robot.latest(WHEEL_ODOMETRY) is None
-        robot.publish(APRILTAG_DATA, TagData(detected=False, timestamp=2.0))
-
-    robot.receive(WHEEL_ODOMETRY, odometry)
-    robot.run(main, seconds=2.0)
-    robot.receive(WHEEL_ODOMETRY, odometry)
-    assert handled == [odometry]
-    assert [channel for channel, _ in robot.published] == [APRILTAG_DATA]
-
-
-def test_the_last_value_is_published_when_the_script_ends(robot: SimulatedRobot) -> None:
-    def main(robot: Robot) -> None:
-        robot.publish_at_end(APRILTAG_DATA, lambda: TagData(detected=False, timestamp=5.0))
-        robot.sleep(60)
-
-    robot.run(main, seconds=0.1)
-    assert robot.published == [(APRILTAG_DATA, TagData(detected=False, timestamp=5.0))]
-
-
-def test_what_a_robot_refuses_to_publish_is_refused_here_too(robot: SimulatedRobot) -> None:
-    with pytest.raises(PebbleError, match="use robot"):
-        robot.publish(DRIVE, Drive(z=1.0))
-
-
-def test_a_picture_is_new_or_young_enough(robot: SimulatedRobot) -> None:
-    shapes: list[tuple[int, ...]] = []
-
-    def main(robot: Robot) -> None:
-        while True:
-            if (picture := robot.picture(max_age=0.1)) is not None:
-                shapes.append(picture.shape)
-            robot.sleep(0.05)
-
-    robot.run(main, seconds=0.5)
-    assert set(shapes) == {(480, 640, 3)}
-    assert len(shapes) >= 8
 
 
 def test_a_script_for_which_time_stands_still_is_named(robot: SimulatedRobot) -> None:

@@ -1,0 +1,115 @@
+"""A quick run of each comparison: real processes, real brokers, and nothing of them afterwards."""
+
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from importlib.util import find_spec
+from pathlib import Path
+
+import pytest
+
+from pebble.extensions.lab.bench.impair.network import why_no_namespaces
+from pebble.extensions.lab.bench.report import SECTIONS, Section
+from pebble.extensions.lab.bench.results import load
+from pebble.extensions.lab.rig.processes import children
+from tests.support import ROOT, gone, until
+
+
+def command(name: str, *options: str) -> list[str]:
+    return [sys.executable, "-m", "pebble.cli", "bench", name, "--quick", *options]
+
+
+@pytest.fixture
+def temporary() -> Iterator[Path]:
+    """The folder for temporary files of the bench; short, because of Unix sockets: it would take another one."""
+    with tempfile.TemporaryDirectory(prefix="b") as folder:
+        yield Path(folder)
+
+
+@pytest.fixture
+def _possible(section: Section) -> None:
+    """Skips what this machine cannot measure; asked for only when a test needs it."""
+    if section.needs_root and (obstacle := why_no_namespaces()):
+        pytest.skip(f"no namespaces: {obstacle}")
+    if section.name == "traffic" and find_spec("duckdb") is None:
+        pytest.skip("needs DuckDB")
+
+
+@pytest.mark.alone
+@pytest.mark.thorough
+@pytest.mark.timeout(400)
+@pytest.mark.usefixtures("_possible")
+@pytest.mark.parametrize("section", SECTIONS, ids=lambda section: section.name)
+def test_a_quick_run_leaves_results_and_nothing_else(section: Section, temporary: Path, tmp_path: Path) -> None:
+    ended = subprocess.run(
+        command(section.name, "--output", str(tmp_path)),
+        env={**os.environ, "TMPDIR": str(temporary)}, cwd=ROOT, capture_output=True, text=True, check=False,
+        timeout=300,
+    )  # fmt: skip
+    assert ended.returncode == 0, ended.stdout + ended.stderr
+    results = load(tmp_path / f"{section.name}.json")
+    assert results.complete
+    assert results.quick
+    assert results.cells
+    assert all(sample >= 0 for cell in results.cells for sample in cell.samples)
+    assert list(temporary.iterdir()) == []
+
+
+def segments(pid: int) -> set[Path]:
+    """The shared memory it uses."""
+    lines = Path(f"/proc/{pid}/maps").read_text().splitlines()
+    return {Path(line.split()[5]) for line in lines if line.endswith(".zenoh")}
+
+
+def ended_in_the_middle(temporary: Path, how: signal.Signals) -> tuple[int, list[int], set[Path]]:
+    """The exit code of a comparison that got a signal, its processes, and their shared memory."""
+    bench = subprocess.Popen(
+        command("frames", "--output", str(temporary / "results"), "--seconds", "30", "--variants", "zenoh-shm"),
+        env={**os.environ, "TMPDIR": str(temporary)}, cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
+    )  # fmt: skip
+    try:
+        assert until(lambda: len(children(bench.pid)) == 2, 20)
+        started = children(bench.pid)
+        assert until(lambda: all(map(segments, started)), 20)
+        shared = set().union(*map(segments, started))
+        time.sleep(1)  # files younger than a second are not swept
+        bench.send_signal(how)
+        return bench.wait(20), started, shared
+    finally:
+        bench.kill()
+        bench.wait()
+
+
+def test_ctrl_c_leaves_nothing(temporary: Path) -> None:
+    code, started, shared = ended_in_the_middle(temporary, signal.SIGINT)
+    assert code == 130
+    assert until(lambda: all(map(gone, started)), 5)
+    assert not any(segment.exists() for segment in shared)
+    assert list(temporary.iterdir()) == [temporary / "results"]
+
+
+def test_workers_end_with_a_killed_bench(temporary: Path) -> None:
+    code, started, _ = ended_in_the_middle(temporary, signal.SIGKILL)
+    assert code == -signal.SIGKILL
+    assert until(lambda: all(map(gone, started)), 10)
+
+
+LARGE = "{'numpy', 'cv2', 'av', 'zenoh', 'matplotlib'}"  # part of a robot's memory would be counted as the bench's
+
+
+@pytest.mark.parametrize(
+    ("modules", "never", "options"),
+    [
+        ("pebble.extensions.lab.bench.cost, pebble.extensions.lab.commands.bench", LARGE, ()),
+        ("frames_worker", "{'pebble'}", ("-I",)),  # the system's Python runs it as a plain file
+    ],
+)
+def test_measuring_processes_import_little(modules: str, never: str, options: tuple[str, ...]) -> None:
+    folder = ROOT / "pebble/extensions/lab/bench"
+    code = f"import sys; sys.path.append({str(folder)!r}); import {modules}; print({never} & set(sys.modules))"
+    ended = subprocess.run([sys.executable, *options, "-c", code], capture_output=True, text=True, check=True)
+    assert ended.stdout == "set()\n"
