@@ -15,7 +15,6 @@ from pebble.config import load
 from pebble.extensions.checks.broker.account import robot_account
 from pebble.extensions.checks.check import State
 from pebble.extensions.checks.robot import page_brokers
-from pebble.extensions.fleet.broker_files import passwords_in
 from pebble.extensions.fleet.certificates import CA_CERT
 from pebble.extensions.fleet.folder import ACL, CONF, PASSWORDS
 from pebble.extensions.fleet.roles import Account
@@ -51,30 +50,12 @@ def _change(broker: FleetBroker, file: str, pattern: str) -> None:
     os.kill(broker.pid, signal.SIGHUP)
 
 
-def _refuse_subscriptions(broker: FleetBroker, name: str) -> None:
-    """Our own brokers grant all, and deliver what is allowed; one with this plugin refuses."""
-    stored = passwords_in((broker.folder / PASSWORDS).read_text())
-    clients = [
-        {"username": one, "password": word.hash, "salt": word.salt, "iterations": word.iterations}
-        for one, word in stored.items()
-    ]
-    access = {"publishClientSend": False, "publishClientReceive": False, "subscribe": False, "unsubscribe": True}
-    file, conf = broker.folder / "plugin.json", broker.folder / CONF
-    file.write_text(json.dumps({"defaultACLAccess": access, "clients": clients, "groups": [], "roles": []}))
-    text = re.sub(r"^(acl|password)_file .*\n", "", conf.read_text(), flags=re.MULTILINE)
-    plugin = next(Path("/usr/lib").glob("*/mosquitto_dynamic_security.so"))
-    conf.write_text(f"plugin {plugin}\nplugin_opt_config_file {file}\n{text}")
-    broker.stop()
-    broker.start()
-
-
 def _let(_broker: FleetBroker, _name: str) -> None:
     """The broker lets it in, and delivers."""
 
 
 REFUSALS: dict[str, Callable[[FleetBroker, str], None]] = {
     "account": _remove,
-    "subscriptions": _refuse_subscriptions,
     "rights": _take_rights,
 }
 

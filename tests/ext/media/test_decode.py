@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import itertools
 import struct
 import zlib
@@ -14,7 +13,7 @@ import pytest
 from pebble.contract.packets import Picture, PictureKind
 from pebble.errors import PayloadError
 from pebble.extensions.media import json_video
-from pebble.extensions.media.decode import MAX_PAYLOAD, Decoded, VideoDecoder
+from pebble.extensions.media.decode import MAX_PAYLOAD, VideoDecoder
 from pebble.extensions.media.jpeg import decode_jpeg, jpeg_size
 from pebble.extensions.media.json_video import inflate
 from pebble.extensions.media.scene import read_counter
@@ -97,23 +96,6 @@ def test_cut_short_anywhere_it_is_not_shown(name: str, number: int) -> None:
         assert decoder.wants_keyframe
 
 
-@pytest.mark.parametrize("name", ["json", "h264"])
-def test_any_flipped_bit_of_the_body_is_found(name: str) -> None:
-    packets = stream(name, count=2)
-    whole = [VideoDecoder().feed(packets[0])] * 2
-    body = 19 if name != "json" else packets[0].index(b'"data":"') + 8
-    for at in range(body, min(len(packets[0]), body + 700)):
-        damaged = bytearray(packets[0])
-        damaged[at] ^= 1 << at % 8
-        shown = VideoDecoder().feed(bytes(damaged))
-        assert same(shown, whole[0])
-
-
-def same(shown: Decoded | None, expected: Decoded | None) -> bool:
-    """Not shown at all, or as it was sent (a bit of base64's padding or of JSON's white space means nothing)."""
-    return shown is None or (expected is not None and np.array_equal(shown.picture, expected.picture))
-
-
 def test_a_change_of_form_is_seen_at_once() -> None:
     decoder = VideoDecoder()
     for name in (*FORMS, *FORMS):
@@ -134,21 +116,6 @@ def test_a_recorded_camera_counts_its_pictures_in_every_form() -> None:
         counts = [read_counter(one.picture) for one in seen if one.encoding == name]
         assert None not in counts
         assert all(0 < after - before <= 2 for before, after in itertools.pairwise(counts)), name
-
-
-def test_a_recorded_camera_is_decoded_to_the_same_pictures_every_time() -> None:
-    packets = recorded(MEDIA, f"{FRED}/outgoing/front-camera")
-    assert len({digest(packets) for _ in range(3)}) == 1
-    assert digest(packets) != digest(packets[:-1])
-
-
-def digest(packets: list[bytes]) -> str:
-    decoder, found = VideoDecoder(), hashlib.sha256()
-    for packet in packets:
-        shown = decoder.feed(packet)
-        assert shown is not None, decoder.problem
-        found.update(shown.picture.tobytes())
-    return found.hexdigest()
 
 
 def test_raw_jpeg_is_a_key_frame_without_number_and_time() -> None:
