@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import struct
 import zlib
+from collections.abc import Callable
 
 import cv2
 import numpy as np
@@ -40,42 +41,31 @@ def frames(decoder: VideoDecoder, packets: list[bytes]) -> list[int | None]:
     return [shown.frame if shown else None for shown in map(decoder.feed, packets)]
 
 
-@pytest.mark.parametrize("name", FORMS)
-def test_after_a_lost_frame_nothing_until_the_next_key_frame(name: str) -> None:
-    packets, decoder = stream(name), VideoDecoder()
-    assert frames(decoder, packets[:3] + packets[4:6]) == [0, 1, 2, None, None]
-    assert decoder.wants_keyframe
-    assert frames(decoder, packets[6:9]) == [6, 7, 8]
-    assert not decoder.wants_keyframe
+Sent = Callable[[list[bytes], list[bytes]], list[bytes]]
+SHOWN: dict[str, tuple[Sent, list[int | None]]] = {
+    "a lost frame": (lambda old, _: old[:3] + old[4:6], [0, 1, 2, None, None]),
+    "a lost frame, and a key frame after it": (lambda old, _: old[:3] + old[4:8], [0, 1, 2, None, None, 6, 7]),
+    "a frame lost before a key frame": (lambda old, _: old[:5] + old[6:8], [0, 1, 2, 3, 4, 6, 7]),
+    "joined between key frames": (lambda old, _: old[3:8], [None, None, None, 6, 7]),
+    "a sender that began again": (
+        lambda old, new: [*old[:5], new[1], *new[6:8], *new[:2]],
+        [0, 1, 2, 3, 4, None, 6, 7, 0, 1],
+    ),
+    "a new sender whose number fits, by its time": (
+        lambda old, new: [*old[:3], *new[3:8]],
+        [0, 1, 2, None, None, None, 6, 7],
+    ),
+}
 
 
 @pytest.mark.parametrize("name", FORMS)
-def test_a_frame_lost_before_a_key_frame_is_harmless(name: str) -> None:
-    packets = stream(name)
-    assert frames(VideoDecoder(), packets[:5] + packets[6:8]) == [0, 1, 2, 3, 4, 6, 7]
-
-
-@pytest.mark.parametrize("name", FORMS)
-def test_joined_between_key_frames(name: str) -> None:
+@pytest.mark.parametrize(("sent", "shown"), SHOWN.values(), ids=SHOWN)
+@pytest.mark.parametrize("later_ms", [8000, -1000])
+def test_what_is_shown(name: str, sent: Sent, shown: list[int | None], later_ms: int) -> None:
     decoder = VideoDecoder()
     assert not decoder.wants_keyframe
-    assert frames(decoder, stream(name)[3:8]) == [None, None, None, 6, 7]
-
-
-@pytest.mark.parametrize("name", FORMS)
-def test_a_sender_that_began_again(name: str) -> None:
-    old, new = stream(name), stream(name, start_ms=T0 + 3000, first=3)
-    decoder = VideoDecoder()
-    assert frames(decoder, [*old[:5], new[1], *new[6:8]]) == [0, 1, 2, 3, 4, None, 6, 7]
-    assert frames(decoder, new[:2]) == [0, 1]
-
-
-@pytest.mark.parametrize("name", FORMS)
-def test_a_new_sender_whose_number_fits_by_chance_is_detected_by_its_time(name: str) -> None:
-    old, new = stream(name), stream(name, start_ms=T0 + 8000, first=3)
-    assert frames(VideoDecoder(), [*old[:3], *new[3:8]]) == [0, 1, 2, None, None, None, 6, 7]
-    late = stream(name, start_ms=T0 - 1000, first=3)
-    assert frames(VideoDecoder(), [*old[:3], *late[3:5]]) == [0, 1, 2, None, None]
+    assert frames(decoder, sent(stream(name), stream(name, start_ms=T0 + later_ms, first=3))) == shown
+    assert decoder.wants_keyframe is (shown[-1] is None)
 
 
 @pytest.mark.parametrize("name", FORMS)

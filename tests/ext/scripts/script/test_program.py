@@ -11,7 +11,6 @@ from pathlib import Path
 
 import pytest
 
-from pebble.config import LAUNCHER_LOCK
 from pebble.contract.payloads import Drive
 from pebble.extensions.scripts.script import EXIT_ENDED
 from tests.commands.command_line import config_file
@@ -150,11 +149,6 @@ def test_a_person_goes_first(station: Station) -> None:
     assert len(station.received) > before + 1
 
 
-def test_a_script_that_does_not_drive_publishes_no_stop(station: Station) -> None:
-    ended(station.start("robot.sleep(0.1)"))
-    assert station.received == []
-
-
 def test_a_robot_that_is_not_up_is_named_in_one_line(tmp_path: Path) -> None:
     config = config_file(tmp_path, transport={"kind": "mqtt"}, local_mqtt={"host": "127.0.0.1", "port": 1})
     (script := tmp_path / "away.py").write_text("from pebble import run\nrun(lambda robot: None)\n")
@@ -164,17 +158,6 @@ def test_a_robot_that_is_not_up_is_named_in_one_line(tmp_path: Path) -> None:
     last = output.splitlines()[-1]
     assert "[ERROR] goob is not up" in last
     assert last.endswith(f"start it with `pebble up {config}`")
-
-
-def test_a_robot_that_is_not_up_beside_a_broker_that_is(station: Station) -> None:
-    lock = station.folder / "run" / LAUNCHER_LOCK
-    held = lock.read_text()
-    lock.write_text("no process\n")
-    try:
-        output = ended(station.start("robot.drive()"))[1]
-    finally:
-        lock.write_text(held)
-    assert f"[WARNING] goob is not up, so it does not move: start it with `pebble up {station.config_path}`" in output
 
 
 def test_describe_with_anything_else_starts_nothing(tmp_path: Path) -> None:
