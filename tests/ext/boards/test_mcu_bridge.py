@@ -15,7 +15,6 @@ from pebble.runtime.parent import NOTIFY_FD
 from pebble.services.serial_mcu_bridge import imu
 from pebble.services.serial_mcu_bridge.devices import peers
 from pebble.services.serial_mcu_bridge.pebble_serial_v1 import host
-from pebble.services.serial_mcu_bridge.pebble_serial_v1.host import SILENCE_S
 from pebble.transports import QoS
 from tests.ext.boards import mcu_wire as wire
 from tests.ext.boards.mcu_wire import IMU, LAMP, STATION, F, I, M
@@ -202,14 +201,6 @@ def test_answers_are_logged(memory_rig: SerialRig, caplog: pytest.LogCaptureFixt
     assert warning.levelno == logging.WARNING
 
 
-def test_many_commands_at_once_all_arrive_unless_they_are_far_too_many(memory_rig: SerialRig) -> None:
-    mcu, _ = memory_rig.up(STATION)
-    for number in range(4):
-        memory_rig.world.command(f"mcu/hs105-sta/o{number + 1}_set", {"on": True})
-        memory_rig.world.command(f"mcu/hs105-sta/o{number + 1}_set", {"on": False})
-    assert mcu.obeyed(8) == [(interface, payload) for interface in (1, 3, 5, 7) for payload in (b"\1", b"\0")]
-
-
 # -- plugging in and out, restarts and new firmware
 
 
@@ -236,17 +227,6 @@ def test_an_unplugged_device_is_cleared_and_a_replugged_one_is_requested_again(r
     assert rig.claimed()
     rig.world.command("lights/lamp", {"level": 40, "on": True})
     assert len(mcu.obeyed()) == 1, "the command sent while it was unplugged was dropped"
-
-
-def test_a_known_device_is_usable_after_its_hello(memory_rig: SerialRig, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(host, "ASK_AFTER_OPENING_S", 60.0)  # until then only a HELLO causes a request
-    mcu, _ = memory_rig.up(LAMP)
-    asked = mcu.asked()
-    mcu.unplug()
-    assert memory_rig.cleared("mcu/lamp-1/describe")
-    mcu.plug()
-    memory_rig.described("lamp-1")
-    assert mcu.asked() == asked
 
 
 def test_a_partial_frame_of_an_earlier_host_does_not_damage_the_first_command(
@@ -344,17 +324,6 @@ def test_invalid_messages_about_other_devices_do_not_stop_the_bridge(rig: Serial
     stranger.close()
 
 
-def test_garbage_on_the_line_does_not_stop_the_bridge(memory_rig: SerialRig) -> None:
-    mcu, running = memory_rig.up(LAMP)
-    mcu.send(b"Arduino says hello\r\n" * 50, b"\0", wire.frame(wire.HELLO, M(b"\xff").hello()))
-    mcu.send(wire.frame(wire.DESCRIBE, b"\xff" * 40), wire.frame(wire.STATE, b"\x0b", 2)[:-3], b"\0")
-    mcu.send(wire.frame(wire.STATE, b"\x0b", 2))
-    assert memory_rig.got("mcu/lamp-1/lamp")
-    counters = running.service.counters
-    assert (counters["hello"], counters["describe"]) == (1, 1)
-    assert counters["stuffing"] + counters["crc"] >= 1
-
-
 def test_thousands_of_hostile_frames_do_not_stop_the_bridge(memory_rig: SerialRig) -> None:
     mcu, running = memory_rig.up(STATION)
     chance = random.Random(8)
@@ -389,12 +358,6 @@ def test_a_silent_inertial_sensor_ends_the_process(memory_rig: SerialRig, monkey
     assert 0.9 < time.monotonic() - stopped < 2.5
     assert str(running.error) == "no sample for 1 s"
     assert memory_rig.world.newest_raw("mcu/goob-imu-nano/describe") == []
-
-
-@pytest.mark.parametrize(("manifest", "timeout_s"), [(STATION, 0), (IMU, 5)])
-def test_only_an_inertial_sensor_must_not_be_silent(memory_rig: SerialRig, manifest: M, timeout_s: float) -> None:
-    _, running = memory_rig.up(manifest)
-    assert running.service.watchdog.timeout_s == timeout_s < SILENCE_S  # type: ignore[attr-defined]
 
 
 def test_an_absent_sensor_is_waited_for(memory_rig: SerialRig, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -51,18 +51,6 @@ def test_a_channel_that_two_claim_is_unused_until_one_leaves(rig: SerialRig, cap
     assert "imu-2: outgoing/sensors/imu-fast is in use again" in caplog.text
 
 
-def test_of_two_that_start_together_neither_publishes_under_the_alias(rig: SerialRig) -> None:
-    one, two = rig.mcu(imu("imu-1"), "one"), rig.mcu(imu("imu-2"), "two")
-    rig.bridge("one")
-    rig.bridge("two")
-    one.stream(50, motion(1000))
-    two.stream(50, motion(2000))
-    assert rig.got("mcu/imu-1/imu_fast")
-    assert rig.got("mcu/imu-2/imu_fast")
-    time.sleep(0.6)  # longer than the asking and the claiming take
-    assert rig.world.on("sensors/imu-fast") == []
-
-
 def test_of_two_that_claim_one_channel_that_of_the_config_has_it(
     memory_rig: SerialRig, caplog: pytest.LogCaptureFixture
 ) -> None:

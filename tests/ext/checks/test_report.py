@@ -116,20 +116,6 @@ def test_every_form_of_a_secret_is_hidden(written: str, places: Places) -> None:
     assert known.hidden(f"x{written}y, and nothing") == "x***y, and nothing"
 
 
-PROGRAMS = {"journal.txt": "journalctl", "lsusb.txt": "lsusb", "disk.txt": "df"}
-
-
-def test_without_any_program_of_the_system_missing_parts_are_named(
-    places: Places, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("PATH", str(tmp_path / "empty"))
-    monkeypatch.setattr(report, "PARTS", {name: report.PARTS[name] for name in (*PROGRAMS, "config.json")})
-    made = make(places)
-    assert made.missing == {part: f"{program} is not installed" for part, program in PROGRAMS.items()}
-    assert "journal.txt: MISSING: journalctl is not installed" in made.parts["index.txt"]
-    assert "config.json" in made.parts
-
-
 @pytest.mark.parametrize("text", [None, "{", '{"robot": {"id": "goob", "idd": 1}}'])
 def test_a_config_with_mistakes_or_none_is_reported_as_such(text: str | None, tmp_path: Path) -> None:
     places = Places(tmp_path)

@@ -2,21 +2,15 @@
 
 from __future__ import annotations
 
-import copy
-import os
-import shutil
-import signal
 import subprocess
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Literal
 
-from msgspec.structs import replace
-
 from pebble.extensions.fleet import applying
 from pebble.extensions.fleet.broker_files import new_password
 from pebble.extensions.fleet.certificates import CA_CERT
-from pebble.extensions.fleet.folder import ACL, CONF, PASSWORDS, Fleet, Server, load, save
+from pebble.extensions.fleet.folder import CONF, Fleet, Server, load
 from pebble.extensions.fleet.roles import Account
 from pebble.extensions.operator.places import mosquitto_path
 from tests.ext.fleet.broker_client import BrokerClient, Place
@@ -46,17 +40,6 @@ class FleetBroker:
         fleet = Fleet(level=level, brokers=(server,), accounts=dict(accounts))
         applying.make(folder, fleet, self.passwords)
         self._process: subprocess.Popen[bytes] | None = None
-
-    def spare(self, folder: Path) -> FleetBroker:
-        """A second broker of this fleet, made as docs/ext/fleet.md has it, before one of the two runs."""
-        other = copy.copy(self)
-        other.folder, other.port = folder, free_port()
-        server = Server(host=HOST, port=other.port)
-        save(self.folder, replace(self.fleet, brokers=(*self.fleet.brokers, server)))
-        shutil.copytree(self.folder, folder)
-        text = (folder / CONF).read_text().replace(str(self.folder), str(folder))
-        (folder / CONF).write_text(text.replace(f"listener {self.port}", f"listener {other.port}"))
-        return other
 
     @property
     def fleet(self) -> Fleet:
@@ -101,12 +84,6 @@ class FleetBroker:
     def renew(self, name: str) -> str:
         self.passwords[name] = new_password()
         return self.change(self.fleet, {name: self.passwords[name]})
-
-    def copy_rules(self, other: FleetBroker) -> None:
-        """As docs/ext/fleet.md has it for a second broker after a change, which ``other`` has made."""
-        for name in (ACL, PASSWORDS):
-            shutil.copy(other.folder / name, self.folder / name)
-        os.kill(self.pid, signal.SIGHUP)
 
     def remove(self, name: str) -> str:
         return self.change(self.fleet.without(name))

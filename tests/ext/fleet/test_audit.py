@@ -5,7 +5,6 @@ from __future__ import annotations
 import sqlite3
 import subprocess
 import sys
-import threading
 import time
 from contextlib import closing
 from pathlib import Path
@@ -35,17 +34,6 @@ def test_entries_are_read_with_the_newest_last(tmp_path: Path) -> None:
         "x",
     )
     assert before <= entry.at <= time.time()
-    log.close()
-
-
-def test_entries_survive_and_are_written_at_the_end(tmp_path: Path) -> None:
-    for number in range(2):
-        log = Audit(tmp_path / "people.sqlite")
-        for entry in range(100):
-            log.write(f"run {number}", user=f"{entry}")
-        log.close()
-    log = Audit(tmp_path / "people.sqlite")
-    assert len(log.read(1000)) == 200
     log.close()
 
 
@@ -88,19 +76,6 @@ def test_who_reads_the_rows_in_another_process_takes_none_away(tmp_path: Path) -
         assert int(seen.stdout) == number + 1
     log.close()
     people.close()
-
-
-def test_many_threads_write(tmp_path: Path) -> None:
-    log = Audit(tmp_path / "people.sqlite")
-    threads = [threading.Thread(target=lambda: [log.write("x") for _ in range(500)]) for _ in range(8)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    log.close()
-    log = Audit(tmp_path / "people.sqlite")
-    assert [entry.count for entry in log.read(1000)] == [1, 3999]
-    log.close()
 
 
 def test_the_rows_of_one_robot_and_of_all(tmp_path: Path) -> None:

@@ -96,11 +96,6 @@ def test_what_is_shown(folder: Path) -> None:
     assert authority.sha256.replace(":", "").lower() == content.fingerprint(SHA256()).hex()
 
 
-def test_a_server_certificate_is_valid_for_at_most_397_days(folder: Path) -> None:
-    certificate = x509.load_pem_x509_certificate((folder / "server.pem").read_bytes())
-    assert certificate.not_valid_after_utc - certificate.not_valid_before_utc <= datetime.timedelta(days=397)
-
-
 def test_renewal_has_a_new_key_the_same_names_and_the_same_authority(folder: Path) -> None:
     before = {path.name: path.read_bytes() for path in folder.iterdir()}
     renew(folder)

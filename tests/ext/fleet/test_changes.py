@@ -19,10 +19,9 @@ from msgspec.structs import replace
 from pebble.extensions.fleet import broker_files, check
 from pebble.extensions.fleet.folder import ACL, CONF, FLEET, PASSWORDS, Extra, FleetError, load, locked, refused
 from pebble.extensions.fleet.roles import Account
-from pebble.extensions.lab.rig.processes import Processes, python
-from pebble.extensions.lab.rig.robot import Robot
+from pebble.extensions.lab.rig.processes import python
 from tests.ext.fleet.broker_client import BrokerClient, RefusedError
-from tests.ext.fleet.brokers import HOST, FleetBroker
+from tests.ext.fleet.brokers import FleetBroker
 from tests.support import ROOT, until
 
 DRIVER, VIEWER = Account(roles=("driver",)), Account(roles=("viewer",))
@@ -128,13 +127,6 @@ def test_a_password_survives_a_change_of_level(broker: FleetBroker) -> None:
         assert until(lambda: passes(broker, otto, DRIVE), 3)
 
 
-def test_metrics_beyond_the_contract(broker: FleetBroker) -> None:
-    broker.change(replace(broker.fleet, extra=Extra(drive=("arm/+",))))
-    with broker.login("otto") as otto:
-        assert until(lambda: passes(broker, otto, "pebble/robots/goob/incoming/arm/left"), 3)
-        assert not passes(broker, otto, "pebble/robots/goob/incoming/arm")
-
-
 # -- what a check finds
 
 
@@ -219,37 +211,6 @@ def _pebble(broker: FleetBroker, *words: str) -> subprocess.CompletedProcess[str
     """Run a command of `pebble fleet` beside the folder."""
     command = python("pebble.cli", "fleet", *words, "--folder", "hall")
     return subprocess.run(command, cwd=broker.folder.parent, capture_output=True, text=True, check=False, timeout=60)
-
-
-# -- a person who drives
-
-
-@pytest.mark.alone
-def test_the_wheels_stop_within_a_second_when_the_driver_is_removed(tmp_path: Path) -> None:
-    with FleetBroker(tmp_path / "hall", {"otto": DRIVER, "goob": GOOB}) as broker, Processes() as running:
-        login = {"username": "goob", "password": broker.passwords["goob"]}
-        tls = {"enabled": True, "ca_cert": str(broker.folder / "ca.pem")}
-        bridge = {"mqtt_bridge": {"remote_mqtt": login | {"tls": tls}}, "serial_mcu_bridge": {}}
-        robot = Robot(running, "zenoh", (HOST, broker.port), name="goob", services=bridge)
-        robot._own |= {"security": {"level": "login"}}
-        robot.prepare()
-        robot.launch()
-        with broker.login("otto") as otto:
-
-            def driven() -> bool:
-                if not otto.closed:
-                    otto.publish(DRIVE, b'{"x": 0, "z": 0.5}')
-                    otto.listen(0.05)
-                return any(entry.motors not in (None, (0.0, 0.0)) for entry in robot.entries()[-3:])
-
-            assert until(driven, 20), robot.log()
-            removed = time.monotonic()
-            broker.remove("otto")
-            assert until(lambda: otto.listen(0.02) or otto.closed, 2)
-            stopped = until(lambda: [e.motors for e in robot.entries() if e.motors is not None][-1] == (0.0, 0.0), 3)
-            last = [entry.ns / 1e9 for entry in robot.entries() if entry.motors is not None][-1]
-        assert stopped
-        assert last - removed < 1.0
 
 
 # -- names, folders

@@ -16,7 +16,7 @@ from pebble.errors import PebbleError
 from pebble.extensions.fleet.broker_files import new_password
 from pebble.extensions.fleet.database import DatabaseError
 from pebble.extensions.fleet.people import SESSION_S, People, PeopleError, TooManyTriesError, User, has_user
-from pebble.extensions.fleet.roles import LOCAL, Role, page_rights
+from pebble.extensions.fleet.roles import Role, page_rights
 from pebble.extensions.fleet.tries import TRIES, WINDOW_S, network_of
 
 PASSWORD = "correct horse"
@@ -56,14 +56,6 @@ def test_rights_of_each_role() -> None:
 
 def test_where_names_are_checked_only_safety_and_admin_reset() -> None:
     assert [role.value for role in Role if "reset" in page_rights(role, "named")] == ["safety", "admin"]
-
-
-def test_the_local_session_is_admin() -> None:
-    assert page_rights(LOCAL.role) == page_rights(Role.ADMIN)
-
-
-def test_the_right_password_is_accepted(people: People) -> None:
-    assert people.check("alice", PASSWORD, HERE) == User("alice", Role.DRIVER)
 
 
 UMLAUT = {"one letter": "Schl\u00fcssel", "two letters, as on macOS": "Schlu\u0308ssel"}

@@ -83,7 +83,9 @@ def test_a_gateway_in_six_commands(tmp_path: Path) -> None:
 
 def test_two_robots_of_a_lan_receive_each_other_in_six_commands(tmp_path: Path) -> None:
     hub = free_port()
-    section = Section("neighbours.md", "goob drives fred", {"0.0.0.0:7447": f"127.0.0.1:{hub}", "hub.lab": "127.0.0.1"})
+    section = Section(
+        "ext/neighbours.md", "goob drives fred", {"0.0.0.0:7447": f"127.0.0.1:{hub}", "hub.lab": "127.0.0.1"}
+    )
     init, *accounts, start_hub, up_goob, up_fred = section.lines
     run(init, tmp_path)
     for line, name in zip(accounts, ("goob.json", "fred.json"), strict=True):

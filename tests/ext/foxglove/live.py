@@ -55,25 +55,22 @@ class Live:
 
 
 class Inside:
-    """The same in a thread of this process; ``base``: the robot that is shown."""
+    """The same in a thread of this process."""
 
-    def __init__(self, broker: Broker, base: str) -> None:
+    def __init__(self, broker: Broker) -> None:
         where = MqttSettings(host="127.0.0.1", port=broker.port)
-        self._settings = Settings(where, f"mqtt://127.0.0.1:{broker.port}", base, "127.0.0.1", 0)
+        self._settings = Settings(where, f"mqtt://127.0.0.1:{broker.port}", "+/+/+", "127.0.0.1", 0)
         self._ready: Future[str] = Future()
         self._loop, self._ending = asyncio.new_event_loop(), asyncio.Event()
         self._thread = threading.Thread(target=self._run)
         self._thread.start()
         self.address = self._ready.result(30)
 
-    def end(self) -> float:
-        """How many seconds that took."""
-        began = time.monotonic()
+    def end(self) -> None:
         with suppress(RuntimeError):  # it has ended already
             self._loop.call_soon_threadsafe(self._ending.set)
         self._thread.join(20)
         assert not self._thread.is_alive()
-        return time.monotonic() - began
 
     def _run(self) -> None:
         with asyncio.Runner(loop_factory=lambda: self._loop) as runner:
@@ -81,8 +78,8 @@ class Inside:
 
 
 @contextmanager
-def live(broker: Broker, base: str = "+/+/+") -> Iterator[Inside]:
-    one = Inside(broker, base)
+def live(broker: Broker) -> Iterator[Inside]:
+    one = Inside(broker)
     try:
         yield one
     finally:

@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import contextlib
-import json
 import re
 import signal
-import socket
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -15,12 +12,10 @@ import av
 import cv2
 import numpy as np
 import pytest
-from websockets.sync.client import ClientConnection, connect
 
-from pebble.extensions.foxglove.server import BACKLOG
 from pebble.extensions.media.scene import read_counter
 from tests.ext.foxglove.live import Live, client, live
-from tests.ext.foxglove.watcher import SUBPROTOCOL, Watcher, parser
+from tests.ext.foxglove.watcher import Watcher
 from tests.ext.page.media.robots import (
     AUDIO,
     CAMERA,
@@ -55,25 +50,6 @@ def nal_types(unit: bytes) -> list[int]:
 
 def decoded(image: Any) -> Any:
     return cv2.imdecode(np.frombuffer(image.data, np.uint8), cv2.IMREAD_COLOR)
-
-
-def not_reading(address: str) -> ClientConnection:
-    """A connection whose receive buffer is small, so that soon no more fits."""
-    plain = socket.socket()
-    plain.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
-    host, _, port = address.removeprefix("ws://").rpartition(":")
-    plain.connect((host, int(port)))
-    return connect(address, sock=plain, subprotocols=[SUBPROTOCOL], max_queue=1, max_size=None, compression=None)  # type: ignore[list-item]
-
-
-def pictures_of(connection: ClientConnection, kind: Any) -> list[Any]:
-    """What waited for it: until half a second passes without a message."""
-    found = []
-    with contextlib.suppress(TimeoutError):
-        while True:
-            message = connection.recv(timeout=0.5)
-            found += [kind.FromString(message[13:])] if isinstance(message, bytes) else []
-    return found
 
 
 def counters(pictures: list[Any]) -> list[int | None]:
@@ -140,26 +116,6 @@ def test_pictures_of_every_encoding_become_jpegs(broker: Broker, encoding: str) 
     assert follow_each_other(counters(list(map(decoded, images))))
 
 
-def test_both_at_once_are_made_of_one_stream(broker: Broker) -> None:
-    with filming(broker, encoding="json") as robot, live(broker) as server:
-        watcher = Watcher(server.address)
-        watcher.subscribe(JPEG)
-        assert until(lambda: watcher.count(JPEG), 30)
-        watcher.subscribe(H264)
-        assert until(lambda: watcher.count(H264), 30)
-        seen = watcher.count(JPEG)
-        assert until(lambda: watcher.count(JPEG) > seen + 5, 30)
-        assert [request.get("encoding") for request in robot.requests][:2] == [None, "h264"]
-
-
-def test_a_robot_without_h264_has_no_channel_for_it(broker: Broker) -> None:
-    with filming(broker, encodings=["json"]), live(broker) as server:
-        watcher = Watcher(server.address)
-        watcher.subscribe(JPEG)
-        assert until(lambda: watcher.count(JPEG), 30)
-        assert H264 not in watcher.channels
-
-
 @pytest.mark.parametrize("by", some([signal.SIGTERM, signal.SIGINT, signal.SIGHUP], 3))
 def test_a_signal_withdraws_the_requests(broker: Broker, by: signal.Signals) -> None:
     with filming(broker) as robot:
@@ -173,18 +129,6 @@ def test_a_signal_withdraws_the_requests(broker: Broker, by: signal.Signals) -> 
         assert seconds < 5
         assert until(lambda: robot.requests[-1] == WITHDRAWN and robot.flags == [True, False])
         assert until(lambda: watcher.closed)
-
-
-def test_it_ends_beside_a_frozen_broker_too(broker: Broker) -> None:
-    with filming(broker), live(broker) as server:
-        watcher = Watcher(server.address)
-        watcher.subscribe(H264)
-        assert until(lambda: watcher.count(H264), 30)
-        broker.freeze()
-        try:
-            assert server.end() < 8
-        finally:
-            broker.thaw()
 
 
 @pytest.mark.parametrize(
@@ -215,24 +159,6 @@ def test_why_there_are_no_pictures_is_shown_in_foxglove(broker: Broker) -> None:
         assert until(lambda: watcher.statuses, 20)
         assert watcher.statuses[0]["message"] == f"{CAMERA}: it has no camera"
         assert until(lambda: robot.requests[-1] == WITHDRAWN, 20)
-
-
-@pytest.mark.thorough
-def test_a_client_that_does_not_read_delays_no_other_and_loses_the_oldest(broker: Broker) -> None:
-    with filming(broker, fps=60, size=(640, 480), encoding="pbvd") as robot, live(broker) as server:
-        watcher = Watcher(server.address)
-        watcher.subscribe(JPEG)
-        stopped = not_reading(server.address)
-        channel = watcher.channels[JPEG]["id"]
-        stopped.send(json.dumps({"op": "subscribe", "subscriptions": [{"id": 1, "channelId": channel}]}))
-        assert until(lambda: watcher.count(JPEG) >= 400, 90)
-        images = watcher.of(JPEG)
-        assert follow_each_other(counters(list(map(decoded, images))))
-        robot.mute = True
-        waited = counters(list(map(decoded, pictures_of(stopped, parser(watcher.channels[JPEG])))))
-        assert waited[-1] == len(robot.sent) - 1
-        assert BACKLOG <= len(waited) < len(images) - 50
-        stopped.close()
 
 
 @pytest.mark.parametrize("encoding", ["pcm", "opus"])

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import threading
 
 import pytest
 
@@ -56,21 +55,3 @@ def test_a_cleared_meter_begins_again() -> None:
     meter.add(1.0)
     meter.add(1.5)
     assert meter.rate(1.5) == pytest.approx(2)
-
-
-def test_one_thread_may_add_while_another_reads() -> None:
-    meter, ending = RateMeter(), threading.Event()
-
-    def add() -> None:
-        while not ending.is_set():
-            meter.add(1.0, 1000, 0.01)
-
-    thread = threading.Thread(target=add)
-    thread.start()
-    try:
-        for _ in range(2000):
-            meter.rate(1.0)
-            meter.age_s(1.0)
-    finally:
-        ending.set()
-        thread.join()

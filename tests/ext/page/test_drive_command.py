@@ -157,25 +157,38 @@ def test_a_held_key_drives_and_its_release_stops(drive: Drive, lamp: Lamp) -> No
     assert until(lambda: lamp.control["key"] == "")
 
 
-def test_an_arrow_and_ctrl_d(drive: Drive, lamp: Lamp) -> None:
-    console = drive()
+def signalled(number: signal.Signals) -> Callable[[Terminal], None]:
+    return lambda console: console.process.send_signal(number)
+
+
+def typed(key: bytes) -> Callable[[Terminal], None]:
+    def let_go_and_type(console: Terminal) -> None:
+        console.hold(b"")
+        console.type(key)
+
+    return let_go_and_type
+
+
+#: What ends a drive, and the exit status; None: the program goes on.
+ENDS = {
+    "SIGTERM": (signalled(signal.SIGTERM), 1),
+    "SIGHUP": (signalled(signal.SIGHUP), 1),
+    "Ctrl-D": (typed(b"\x04"), 0),
+    "SIGQUIT": (signalled(signal.SIGQUIT), 1),
+    "space": (typed(b" "), None),
+    "SIGINT": (signalled(signal.SIGINT), 0),
+}
+
+
+@pytest.mark.parametrize("end", some(ENDS, 2))
+def test_what_ends_a_drive_stops_the_robot_at_once(drive: Drive, lamp: Lamp, end: str) -> None:
+    console, (happens, code) = drive(), ENDS[end]
     driving(console, lamp, b"\x1b[D")
-    assert lamp.motors[-1][1][0] < lamp.motors[-1][1][1]
-    console.hold(b"")
-    pressed = time.monotonic()
-    console.type(b"\x04")
-    assert lamp.halted_after(pressed) < BUSY_S
-    assert (console.process.wait(5), console.restored) == (0, True)
-
-
-@pytest.mark.parametrize("number", some([signal.SIGTERM, signal.SIGHUP, signal.SIGINT, signal.SIGQUIT], 2))
-def test_a_signal_stops_the_robot_at_once(drive: Drive, lamp: Lamp, number: signal.Signals) -> None:
-    console = drive()
-    driving(console, lamp)
-    console.process.send_signal(number)
+    assert lamp.motors[-1][1][0] < lamp.motors[-1][1][1], "an arrow turns"
+    happens(console)
     assert lamp.halted_after(time.monotonic()) < BUSY_S
-    assert console.process.wait(5) == (0 if number == signal.SIGINT else 1)
-    assert console.restored
+    assert until(lambda: console.process.poll() == code, 5)
+    assert console.restored is (code is not None)
     assert until(lambda: [command for _, command in lamp.commands[-3:]] == [FINAL] * 3), lamp.commands[-8:]
 
 
@@ -185,13 +198,6 @@ def test_a_terminal_that_is_closed_stops_the_robot_at_once(drive: Drive, lamp: L
     console.hang_up()
     assert lamp.halted_after(time.monotonic()) < BUSY_S
     assert console.process.wait(5) == 1
-
-
-def test_a_killed_process_leaves_a_robot_that_stops_by_itself(drive: Drive, lamp: Lamp) -> None:
-    console = drive()
-    driving(console, lamp)
-    console.process.kill()
-    assert lamp.halted_after(time.monotonic()) < VALID_S + BUSY_S
 
 
 @pytest.mark.parametrize("stall", some([2.0, 0.6], 2))
@@ -234,15 +240,6 @@ def test_ctrl_z_stops_the_robot_and_what_follows_needs_a_new_key(drive: Drive, l
     assert console.sees("$ ")
     console.type(b"stty -a\n")
     assert console.sees(" icanon"), "the shell has its own mode again"
-
-
-def test_space_stops_at_once(drive: Drive, lamp: Lamp) -> None:
-    console = drive()
-    driving(console, lamp)
-    console.hold(b"")
-    console.type(b" ")
-    assert lamp.halted_after(time.monotonic()) < BUSY_S
-    assert until(lambda: [command for _, command in lamp.commands[-3:]] == [FINAL] * 3), lamp.commands[-8:]
 
 
 @pytest.mark.parametrize("keys", some([b"\x1b\x1b", b"!"], 2))

@@ -53,16 +53,6 @@ def test_the_folder_may_be_a_link(tmp_path: Path) -> None:
     assert clips.find(str(tmp_path / "link" / "a.wav")) is not None
 
 
-def test_thousands_of_files(tmp_path: Path) -> None:
-    for number in range(10):
-        (tmp_path / f"{number}").mkdir()
-    for number in range(2_000):
-        os.close(os.open(f"{tmp_path}/{number % 10}/{number:05}.wav", os.O_CREAT | os.O_WRONLY))
-    clips = Clips(tmp_path)
-    assert len(clips.scan()) == 2_000
-    assert clips.problem == ""
-
-
 def test_the_list_is_bounded_and_what_is_not_listed_can_be_played(tmp_path: Path) -> None:
     for number in range(1_400):
         os.close(os.open(f"{tmp_path}/{number:04}{'s' * 192}.wav", os.O_CREAT | os.O_WRONLY))

@@ -29,20 +29,6 @@ def test_other_formats_are_decoded_and_played(board: Soundboard) -> None:
         assert loudness == pytest.approx([9000 / 2**0.5] * 2, rel=0.1)
 
 
-def test_a_decoded_clip_is_stopped_replaced_and_repeated(board: Soundboard) -> None:
-    encode(board.sounds / "long.flac", tone(60, 2), 16_000)
-    encode(board.sounds / "short.flac", tone(0.1, 2), 16_000)
-    board.start()
-    board.play("long.flac")
-    assert until(lambda: len(board.played) == 1)
-    assert board.plays("short.flac", repeat=2)
-    assert [one.stopped for one in board.played] == [True, False, False]
-    board.play("long.flac")
-    board.send(False)
-    assert board.became(playing=False, file=None, error=None)
-    assert until(lambda: board.players() == [])
-
-
 @pytest.mark.parametrize(
     ("name", "error"),
     [

@@ -10,13 +10,11 @@ from statistics import median
 import numpy as np
 import pytest
 
-from pebble.contract.payloads import MediaReport
 from pebble.extensions.media.sound import ReceivedSound
 from pebble.extensions.media.speech import PERIOD_S, Speech
 from tests.ext.av.audio_rig import Ear, Mouth, Program
 from tests.kit.sound import best_match, envelope
 from tests.support import Broker, until
-from tests.tcp_proxy import SlowTcpProxy
 
 NAME = "audio_publisher"
 
@@ -107,39 +105,6 @@ def test_the_remote_broker_goes_and_comes_back(local: Broker, remote: Broker, ea
         young = [at - one.captured_ms / 1000 for at, one in zip(ear.arrived, ear.received, strict=True)][-10:]
         assert median(young) < 0.5  # nothing from before
         assert robot.reported(last_error=None)
-
-
-@pytest.mark.thorough
-def test_a_slow_link_makes_opus_thrifty_and_nothing_waits(local: Broker, remote: Broker, ear: Ear) -> None:
-    with (
-        SlowTcpProxy(remote.port, kbits=100) as link,
-        Program(NAME, "mqtt", local.port, link.port, encoding="opus", bundle=1, bitrate=32_000) as robot,
-        Mouth(robot.run_dir),
-    ):
-        ear.wait(20)
-        assert robot.reported(reduced=None)
-        link.kbits = 22
-        assert until(lambda: robot.newest.reduced == "3 parts a packet, 16 kbit/s", 20)
-        assert until(lambda: _steady(robot.reports), 20)
-
-
-def _steady(reports: list[MediaReport]) -> bool:
-    """Packets are no longer dropped."""
-    return len(reports) > 3 and reports[-1].dropped == reports[-3].dropped
-
-
-def test_a_link_too_slow_for_pcm_loses_packets_but_no_time(local: Broker, remote: Broker, ear: Ear) -> None:
-    with (
-        SlowTcpProxy(remote.port, kbits=1000) as link,
-        Program(NAME, "mqtt", local.port, link.port) as robot,
-        Mouth(robot.run_dir),
-    ):
-        ear.wait(20)
-        link.kbits = 150
-        assert until(lambda: (robot.newest.dropped or 0) > 20, 20)
-        ear.wait(30)
-        ages = [at - one.captured_ms / 1000 for at, one in zip(ear.arrived, ear.received, strict=False)][-20:]
-        assert median(ages) < 1.0  # 0.2 s of PCM wait with us, the rest is what the link's own buffers hold
 
 
 def test_it_ends_on_sigterm_and_leaves_nothing(local: Broker, remote: Broker, ear: Ear) -> None:

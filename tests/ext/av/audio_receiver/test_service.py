@@ -10,14 +10,12 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from functools import cache
 from pathlib import Path
-from statistics import median
 from typing import Any
 
 import numpy as np
 import pytest
 
 from pebble.config import parse
-from pebble.contract.packets import Codec, Sound
 from pebble.extensions.media.pcm import to_bytes
 from pebble.extensions.media.sound import make_sound_encoder, sequence_numbers
 from pebble.extensions.media.speech import Speech
@@ -147,14 +145,6 @@ def test_a_change_of_format_begins_another_player(receive: Receive, operator: Op
     assert robot.newest.restarts == 0
 
 
-def test_a_restarted_sender_is_played(receive: Receive, operator: Operator, recorder: Recorder) -> None:
-    receive()
-    operator.speak(seconds=0.6)
-    operator.numbers = sequence_numbers()
-    operator.speak(seconds=0.6)
-    assert until(lambda: len(recorder.samples()) >= 18000)
-
-
 def test_a_player_that_dies_is_started_again(receive: Receive, operator: Operator, recorder: Recorder) -> None:
     robot = receive()
     operator.speak(seconds=0.3)
@@ -199,19 +189,6 @@ def test_garbage_and_retained_packets_play_nothing(receive: Receive, operator: O
     assert recorder.calls == []
     operator.speak(seconds=0.3)
     assert until(lambda: recorder.calls == ["16000-1-default"])
-
-
-def test_delay_from_the_operator_to_the_player(receive: Receive, operator: Operator, recorder: Recorder) -> None:
-    """Every sample of a packet is its number, so what was recorded last tells which one was played last."""
-    receive()
-    behind, began = [], time.monotonic()
-    for number in range(1, 101):
-        time.sleep(max(0.0, began + 0.02 * number - time.monotonic()))  # as a microphone does
-        body = np.full(320, number, "<i2").tobytes()
-        operator.send(Sound(Codec.PCM16LE, 1, 16000, 320, number, 1000 + 20 * number, body).pack())
-        played = recorder.samples()
-        behind.append(number - (played[-1] if len(played) else 0))
-    assert median(behind[50:]) < 45  # 0.9 s, on a busy machine; the usual is 5
 
 
 @pytest.mark.parametrize(

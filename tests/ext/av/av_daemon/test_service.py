@@ -16,12 +16,11 @@ import pytest
 from pebble.contract import MEDIA_REPORT
 from pebble.contract.payloads import MediaReport
 from pebble.extensions.media.scene import read_counter
-from pebble.runtime.connections import local_transport
 from pebble.transports import QoS
 from pebble.transports.frames import FrameReader
 from tests.ext.av.av_daemon.av_rig import is_speech
 from tests.fakes.installed import Installed
-from tests.kit.robot import Listener, ProgramRobot
+from tests.kit.robot import ProgramRobot
 from tests.support import Broker, until
 
 SYNTHETIC = {"video": {"backend": "synthetic", "fps": 30}, "audio": {"source": "synthetic"}}
@@ -114,13 +113,6 @@ def test_a_report_of_no_program_ends_nothing(running: Robot) -> None:
     assert running.daemon.poll() is None
     assert "" not in running.status
     running.report("", b"", retain=True)
-
-
-def test_a_late_subscriber_receives_the_status(running: Robot) -> None:
-    assert until(lambda: running.status)
-    late = Listener(local_transport(running.config, "late"), running.config.base)
-    assert until(lambda: late.newest_raw("media-status"))
-    late.transport.close()
 
 
 def test_numbers_alone_are_published_rarely_and_everything_else_soon(robot: Robot) -> None:

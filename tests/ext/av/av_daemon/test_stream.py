@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import os
-import signal
 import threading
 import time
 from collections.abc import Callable, Iterator
-from pathlib import Path
 
 import pytest
 
@@ -22,7 +19,6 @@ from pebble.services.av_daemon.stream import Stream
 from pebble.transports.frames import FrameInfo
 from pebble.transports.frames.frame import picture
 from tests.ext.av.av_daemon.av_rig import Remembering, options
-from tests.fakes.installed import Installed
 from tests.support import until
 
 SMALL = {"width": 320, "height": 240, "fps": 30}
@@ -63,11 +59,6 @@ def streams() -> Iterator[Streams]:
     streams = Streams()
     yield streams
     streams.close()
-
-
-@pytest.fixture
-def rpicam(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Installed:
-    return Installed(monkeypatch, tmp_path, "rpicam-vid", "tests.fakes.fake_rpicam")
 
 
 class Device:
@@ -204,21 +195,6 @@ def test_a_device_that_fails_is_opened_again(streams: Streams, error: Exception)
     assert device.closings >= 2
     assert str(error) in (report(stream).last_error or "")
     assert len(writer.frames) >= 6
-
-
-def test_a_killed_program_is_started_again_and_ends_without_readers(streams: Streams, rpicam: Installed) -> None:
-    writer = Remembering()
-    stream = streams(writer, sources.camera(options(video={**SMALL, "backend": "libcamera"}), 0.0))
-    assert until(lambda: len(writer.frames) >= 3)
-    os.kill(rpicam.pids[-1], signal.SIGKILL)
-    assert until(lambda: len(rpicam.pids) == 2)
-    before = len(writer.frames)
-    assert until(lambda: len(writer.frames) > before)
-    assert rpicam.gone(rpicam.pids[0])
-    assert report(stream).restarts == 1
-    assert "signal 9" in (report(stream).last_error or "")
-    writer.wanted = False
-    assert rpicam.gone(rpicam.pids[1]), "it ends without readers"
 
 
 # -- when it hangs

@@ -2,21 +2,12 @@
 
 from __future__ import annotations
 
-import threading
-import time
 from collections.abc import Iterator
-from contextlib import ExitStack
-from itertools import pairwise
-from types import TracebackType
-from typing import Self
 
 import pytest
 
-from pebble.transports import Message, QoS
 from tests.ext.av.camera_publisher.camera_rig import Camera, Publisher, Seen, Viewer
-from tests.ext.av.media_rig import client
 from tests.support import Broker, until
-from tests.tcp_proxy import SlowTcpProxy
 
 
 @pytest.fixture
@@ -68,20 +59,6 @@ def test_a_robot_with_zenoh_inside(local: Broker, remote: Broker, viewer: Viewer
         assert camera.writer.readers == 1
 
 
-def test_keyframes_on_request_once_a_second(local: Broker, remote: Broker, viewer: Viewer) -> None:
-    with Publisher("mqtt", local.port, remote.port, encoding="h264") as robot, Camera(robot.run_dir, 15):
-        viewer.wait(5)
-
-        def keyframes() -> list[int]:
-            return [picture.captured_ms for picture in viewer.received if picture.keyframe]
-
-        while len(keyframes()) < 4:  # many operators, all of them impatient
-            robot.ask(encoding="h264", keyframe=True)
-            time.sleep(0.05)
-        # by the publisher's clock it is a second; a busy machine captures one late and the next one early
-        assert all(after - before >= 700 for before, after in pairwise(keyframes()[1:]))
-
-
 def test_nothing_is_encoded_while_the_remote_side_is_away(local: Broker, remote: Broker, viewer: Viewer) -> None:
     with Publisher("mqtt", local.port, remote.port) as robot, Camera(robot.run_dir, 15) as camera:
         viewer.wait(10)
@@ -108,60 +85,3 @@ def test_a_camera_that_gives_nothing_is_reported(local: Broker, remote: Broker, 
             with Camera(robot.run_dir, 15):
                 viewer.wait(5)
         assert until(complains, 15)
-
-
-def worst_age_ms(pictures: list[Seen]) -> int:
-    return max(picture.arrived_ms - picture.captured_ms for picture in pictures)
-
-
-@pytest.mark.thorough
-def test_a_slow_connection_gets_recent_pictures_and_delays_nothing_else(
-    local: Broker, remote: Broker, viewer: Viewer
-) -> None:
-    with ExitStack() as ends:
-        link = ends.enter_context(SlowTcpProxy(remote.port, kbits=256))
-        delays = ends.enter_context(Control(link.port, remote.port))
-        robot = ends.enter_context(Publisher("mqtt", local.port, link.port, publish_fps=10))
-        camera = ends.enter_context(Camera(robot.run_dir, 15, (640, 480)))
-        assert until(lambda: robot.reports and robot.reports[-1].reduced is not None, 15)
-        pictures = viewer.wait(80)
-        assert worst_age_ms(viewer.received) < 1500
-        assert worst_age_ms(pictures[-60:]) < 800
-        assert until(lambda: rate_of(viewer.received[-60:]) > 8, 60)
-        assert delays.worst_s() < 0.5
-        assert link.passed * 8 / 256_000 > 2  # it was in use
-        link.kbits = 20_000
-        assert robot.reported(reduced=None, timeout=60)
-        assert camera.writer.readers == 1
-
-
-class Control:
-    """Another sender, which shares the link: small messages, and how long each takes."""
-
-    def __init__(self, link_port: int, broker_port: int) -> None:
-        self._far, self._near = client("control-far", broker_port), client("control-near", link_port)
-        self._delays: list[float] = []
-        self._stopping = threading.Event()
-        self._far.subscribe("control", self._on_message, qos=QoS.LATEST)
-        self._thread = threading.Thread(target=self._run, daemon=True)
-
-    def __enter__(self) -> Self:
-        self._thread.start()
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, tb: TracebackType | None) -> None:
-        self._stopping.set()
-        self._thread.join(5)
-        self._near.close()
-        self._far.close()
-
-    def worst_s(self) -> float:
-        assert len(self._delays) > 50
-        return max(self._delays)
-
-    def _on_message(self, message: Message) -> None:
-        self._delays.append(time.monotonic() - float(message.payload))
-
-    def _run(self) -> None:
-        while not self._stopping.wait(0.05):
-            self._near.publish("control", str(time.monotonic()).encode())

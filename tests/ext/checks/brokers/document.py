@@ -1,11 +1,7 @@
-"""Judges each broker that can run here, and prints what docs/brokers.md has a table of.
-
-Program: ``python -m tests.ext.checks.brokers.document``.
-"""
+"""Judges each broker that can run here, of which docs/brokers.md has a table."""
 
 from __future__ import annotations
 
-import sys
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
@@ -67,18 +63,3 @@ def columns(text: str) -> dict[str, dict[str, str]]:
     rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines]
     names = [title.rpartition(" ")[0] for title in rows[0][1:]]
     return {name: {row[0]: row[place] for row in rows[2:]} for place, name in enumerate(names, 1)}
-
-
-def main(names: list[str]) -> None:
-    """Judge these brokers, or all, and print their columns of the table, and what they lack."""
-    for name in names or BROKERS:
-        if BROKERS[name].missing():
-            sys.exit(f"{name} cannot run here: make long PART=brokers installs it")
-        findings = judged(BROKERS[name])
-        sys.stdout.write(f"{name}\n")
-        for probe, finding in findings.items():
-            sys.stdout.write(f"  {MARKS[finding.state]:8}{probe}: {finding.text}\n")
-
-
-if __name__ == "__main__":
-    main(sys.argv[1:])

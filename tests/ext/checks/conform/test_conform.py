@@ -289,13 +289,6 @@ def test_a_library_that_acknowledges_no_long_message_is_found(broker: Broker, tm
         assert [*lacking(judged(robot, ALL["junk"], ALL["long messages"]))] == ["long messages"]
 
 
-@pytest.mark.thorough
-def test_a_robot_whose_disk_is_slow_passes(broker: Broker, tmp_path: Path) -> None:
-    program = changed(tmp_path, "os.fsync(file.fileno())", "time.sleep(0.7)")
-    with switched_on(program, at_open(broker), tmp_path) as robot:
-        assert lacking(judged(robot, ALL["stop"], ALL["stop moving"], ALL["reset waits"])) == {}
-
-
 def test_what_was_not_judged_is_no_pass(
     broker: Broker, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

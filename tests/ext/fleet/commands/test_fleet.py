@@ -181,29 +181,6 @@ def test_without_a_fleet_or_with_several_one_must_be_named(hall: Path) -> None:
     assert pebble("pebble fleet list --folder second", hall).returncode == 0
 
 
-@pytest.mark.thorough
-def test_accounts_come_and_go_in_the_files_of_a_broker_that_is_down(hall: Path) -> None:
-    for line in (
-        "pebble fleet add dora --role driver,safety",
-        "pebble fleet add lamp --role robot --base pebble/lamps/lamp --plain",
-        "pebble fleet add gate --role gateway --base pebble/robots/+",
-        "pebble fleet role dora viewer",
-        "pebble fleet password dora",
-    ):
-        done = pebble(line, hall)
-        assert (done.returncode, done.stderr) == (0, ""), done
-    listed = pebble("pebble fleet list", hall).stdout.splitlines()
-    assert [line.split() for line in listed[1:]] == [
-        ["dora", "viewer"],
-        ["lamp", "robot", "pebble/lamps/lamp", "plain"],
-        ["gate", "gateway", "pebble/robots/+"],
-    ]
-    assert "mosquitto does not run" in pebble("pebble fleet remove dora", hall).stdout
-    done = pebble("pebble fleet check", hall)
-    assert (done.returncode, done.stdout) == (0, "The files of hall have its 2 accounts, and their rules.\n")
-    assert (hall / "hall" / CONF).read_text().count("listener") == 3  # per_listener_settings, and two of them
-
-
 def test_removing_a_person_acts_on_pages_here_and_names_those_elsewhere(hall: Path) -> None:
     people = People(hall / "people.sqlite")
     people.add("ann", "a long password", Role.DRIVER)

@@ -58,12 +58,6 @@ def test_other_machines_are_let_in_only_with_two_options(run: Run, broker: Broke
     assert "everybody on the network can watch and listen, without a login and unencrypted" in errors
 
 
-def test_on_this_machine_no_warning_is_needed(broker: Broker) -> None:
-    server = Live(broker, "--host", "::1")
-    assert server.address.startswith("ws://[::1]:")
-    assert server.end()[1].count("\n") == 1
-
-
 def test_a_config_shows_its_robot_at_its_remote_broker(tmp_path: Path, broker: Broker) -> None:
     remote = {"mqtt_bridge": {"remote_mqtt": {"host": "127.0.0.1", "port": broker.port}}}
     config = config_file(tmp_path, services=remote)

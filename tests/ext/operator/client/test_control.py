@@ -112,16 +112,6 @@ def test_over_a_thin_link_it_is_asked_for_more_rarely_and_longer() -> None:
     assert (ann.wanted, ann.failed) == (False, "goob does not answer")
 
 
-def test_what_is_given_back_is_free() -> None:
-    world = World()
-    ann = world.holder()
-    ann.release()
-    assert (ann.held, ann.key) == (False, "")
-    world.wait(2.0)
-    assert requests(world.sent) == [("control", "hold"), ("control", "release")]
-    assert world.client("bob").robot.who == ""
-
-
 def test_who_drives_is_asked_and_may_let_the_other_drive() -> None:
     world = World()
     ann, bob = world.holder(), world.client("bob")
@@ -152,30 +142,6 @@ def test_who_is_not_let_drive_asks_no_more_after_a_while() -> None:
     assert ann.robot.state.asks_id == ""
 
 
-def test_who_asks_anew_is_shown_again() -> None:
-    world = World()
-    ann, bob, eve = world.holder(), world.client("bob"), world.client("eve")
-    world.drive(ann)
-    bob.ask(world.now)
-    world.wait(STEP_S)
-    ann.keep()
-    bob.release()
-    eve.ask(world.now)
-    world.wait(STEP_S)
-    assert ann.asked_by == "eve"
-
-
-def test_who_rests_is_not_asked() -> None:
-    world = World()
-    ann, bob = world.holder(), world.client("bob")
-    world.wait(4.0)
-    bob.ask(world.now)
-    world.wait(STEP_S)
-    assert world.held == [True, False]
-    world.wait(2.0)
-    assert (world.held, ann.wanted, ann.failed) == ([False, True], False, "bob has control now")
-
-
 def test_control_can_be_taken_and_who_has_lost_it_does_not_take_it_back() -> None:
     world = World()
     ann, bob = world.holder(), world.client("bob")
@@ -200,55 +166,7 @@ def test_a_motor_owner_that_is_started_again_gives_control_anew() -> None:
     assert ann.decided != before
 
 
-def test_who_was_silent_for_too_long_has_it_again_only_if_it_is_free() -> None:
-    world = World()
-    ann = world.holder()
-    world.lost = lambda client: client is ann
-    world.wait(3.5)
-    assert ann.held is False
-    world.lost = lambda _client: False
-    world.wait(1.0)
-    assert ann.held
-    world.lost = lambda client: client is ann
-    bob = world.client("bob")
-    bob.ask(world.now)
-    world.wait(6.0)
-    world.lost = lambda _client: False
-    world.wait(2.0)
-    assert world.held == [False, True]
-
-
-def test_a_robot_that_does_not_answer_is_not_asked_for_ever() -> None:
-    world = World()
-    ann = world.client()
-    world.robot.owners[0].receives = False
-    ann.ask(world.now)
-    world.wait(WIDE.answer_s + 1.1)
-    assert (ann.wanted, ann.failed) == (False, "goob does not answer")
-
-
-def test_who_waits_behind_another_keeps_waiting() -> None:
-    world = World()
-    ann, bob, eve = world.holder(), world.client("bob"), world.client("eve")
-    world.drive(ann)
-    bob.ask(world.now)
-    world.wait(0.5)
-    eve.ask(world.now)
-    for _ in range(round(8 / STEP_S)):
-        world.drive(ann)
-        world.wait(STEP_S)
-    bob.release()
-    world.wait(2.0)
-    assert (ann.asked_by, eve.wanted) == ("eve", True)
-
-
 # -- several motor owners
-
-
-def test_one_client_has_all_motor_owners_and_its_commands_move_all() -> None:
-    world = World("arm", "wheels")
-    ann = world.holder()
-    assert world.drive(ann) == [True, True]
 
 
 def test_the_first_motor_owner_by_name_decides_and_who_has_only_another_gives_it_back() -> None:

@@ -13,7 +13,6 @@ from pebble.contract import CAPABILITIES, ESTOP_STATE, LINK
 from pebble.extensions.operator.client.discovery import Discovery
 from pebble.extensions.operator.client.robot_view import MAX_REMEMBERED, RobotView
 from pebble.transports import Message
-from tests.ext.recordings.demo_robots import DRIVE, GOOB, MINILAMP, ROBOTS, messages, received, values
 from tests.support import ROOT
 
 BASE = "pebble/robots/goob"
@@ -36,30 +35,6 @@ def publish_heartbeats(discovery: Discovery, *times: float) -> RobotView:
     for now in times:
         publish(discovery, "online", {"t": int((WALL + now - 0.01) * 1000)}, now=now)
     return discovery.robots[BASE]
-
-
-def discovered(until_s: float = 60.0) -> Discovery:
-    """After the first seconds of the recording of four robots, as it was received."""
-    discovery, wall = Discovery(), messages(DRIVE)[0].log_ns / 1e9
-    for at, message in received(DRIVE):
-        if at <= until_s:
-            discovery.receive(message, at, wall + at)
-    return discovery
-
-
-def test_heartbeats_make_a_robot_online_and_silence_offline() -> None:
-    seen = publish_heartbeats(Discovery(), 0.0, 0.25)
-    assert seen.liveness.online(0.3) is None, "two heartbeats are too few to know their interval"
-    seen = publish_heartbeats(Discovery(), 0.0, 0.25, 0.5)
-    assert seen.liveness.online(0.9) is True
-    assert seen.liveness.online(1.01) is False
-
-
-def test_a_will_means_offline_at_once() -> None:
-    discovery = Discovery()
-    seen = publish_heartbeats(discovery, 0.0, 0.25, 0.5)
-    publish(discovery, "online", {"t": int(WALL * 1000), "online": False}, now=0.6)
-    assert seen.liveness.online(0.6) is False
 
 
 def test_a_retained_heartbeat_is_no_sign_of_life() -> None:
@@ -100,29 +75,6 @@ def test_strangers_fill_no_memory_and_keep_no_capabilities_out() -> None:
     assert (seen.remembered[known.topic], seen.remembered[capabilities.topic]) == (newer, capabilities)
 
 
-def test_recorded_robots_are_ready_once_they_published_how_to_drive_them() -> None:
-    end = received(DRIVE)[-1][0]
-    ready = {base: seen.ready(end) for base, seen in discovered(end).robots.items()}
-    assert ready == dict.fromkeys(ROBOTS, True)
-    first, at = messages(DRIVE)[0].log_ns, {}
-    for message in reversed(messages(DRIVE)):
-        at[message.channel.topic] = (message.log_ns - first) / 1e9
-    for base in ROBOTS:
-        before = discovered(at[f"{base}/outgoing/capabilities"] - 0.01)
-        assert not any(seen.topic(c.DRIVE) for name, seen in before.robots.items() if name == base)
-    seen = discovered().robots[GOOB]
-    assert (seen.transport, seen.topic(c.DRIVE)) == ("zenoh", f"{GOOB}/incoming/drive-values")
-
-
-def test_recorded_robots_are_online_until_their_recording_ends() -> None:
-    for base, seen in discovered().robots.items():
-        stamps = [one["t"] for one in values(DRIVE, f"{base}/outgoing/online")]
-        last_s = max(stamps) / 1000 - messages(DRIVE)[0].log_ns / 1e9
-        assert seen.liveness.online(last_s + 0.3), base
-        assert seen.liveness.online(last_s + 1.5) is False, base
-        assert seen.liveness.interval_s == pytest.approx(0.25, abs=0.05)
-
-
 def test_topics_of_another_robot_in_capabilities_are_not_used() -> None:
     discovery = Discovery()
     seen = publish_heartbeats(discovery, 0.0, 0.25, 0.5)
@@ -147,24 +99,20 @@ def test_topics_of_another_robot_in_capabilities_are_not_used() -> None:
 )
 def test_only_what_a_robot_offers_is_assumed_of_it(drive: dict[str, object], drives: bool, arbitrates: bool) -> None:
     discovery = Discovery()
-    value = {"schema": "pebble-capabilities/v1", "t": 1, "value": {"drive": drive}}
-    publish(discovery, "capabilities", value, retain=True)
+    value = {"drive": drive, "transport": {"kind": "zenoh"}}
+    publish(discovery, "capabilities", {"schema": "pebble-capabilities/v1", "t": 1, "value": value}, retain=True)
     publish(discovery, "autonomy-status", {"timestamp": 1, "running": True})
+    publish(discovery, "charging-level", {"value": 7.4})
     publish(discovery, "capabilities", "nonsense")
     publish(discovery, "autonomy-status", "nonsense")
     seen = publish_heartbeats(discovery, 0.0, 0.25, 0.5).situation(1.9)
     assert (seen.drives, seen.arbitrates, seen.script, seen.online) == (drives, arbitrates, True, True)
-    assert discovery.robots[BASE].online(2.1) is False, "people are told after 1.5 s"
-
-
-def test_battery_and_message_count() -> None:
-    discovery = discovered()
-    robots = discovery.robots
-    for base in robots:
-        assert discovery.traffic[base].count == sum(one.channel.topic.startswith(f"{base}/") for one in messages(DRIVE))
-    assert robots[GOOB].volts == values(DRIVE, f"{GOOB}/outgoing/charging-level")[-1]["value"]
-    assert robots[MINILAMP].volts == values(DRIVE, f"{MINILAMP}/outgoing/charging-level")[-1]["value"]
-    assert robots[GOOB].volts != robots[MINILAMP].volts
+    robot = discovery.robots[BASE]
+    assert (robot.transport, robot.volts, discovery.traffic[BASE].count) == ("zenoh", 7.4, 8)
+    assert (robot.liveness.online(0.9), robot.liveness.online(1.01)) == (True, False)
+    assert robot.online(2.1) is False, "people are told after 1.5 s"
+    publish(discovery, "online", {"t": int(WALL * 1000), "online": False}, now=0.6)
+    assert robot.liveness.online(0.6) is False, "a will"
 
 
 def test_nonsense_is_passed_over() -> None:
@@ -174,18 +122,3 @@ def test_nonsense_is_passed_over() -> None:
     discovery.receive(Message("other/topic", b""), 0.0, WALL)
     assert list(discovery.robots) == [BASE]
     assert discovery.robots[BASE].liveness.received_at is None
-
-
-@pytest.mark.parametrize(("base", "device"), [*((one, "serial") for one in ROBOTS[:2]), (MINILAMP, "mcu")])
-def test_a_robot_is_stopped_whenever_it_published_so(base: str, device: str) -> None:
-    discovery, known = Discovery(), []
-    topic = f"{base}/outgoing/estop/{device}"
-    for at, message in received(DRIVE):
-        discovery.receive(message, at, WALL)
-        if message.topic == topic:
-            seen = discovery.robots[base]
-            known.append((seen.latched, seen.stopped_by.by if seen.stopped_by else ""))
-    published = [(one["latched"], one["by"] if one["latched"] else "") for one in values(DRIVE, topic)]
-    assert known == published
-    assert (True, "the demo's operator") in known
-    assert not discovery.robots[base].latched

@@ -50,13 +50,6 @@ def offered(viewer: ViewerQueue, seq: int, at: float, encoding: str = "pbvd") ->
     return viewer.rescued
 
 
-def test_it_begins_at_a_key_frame() -> None:
-    queue = ViewerQueue(ALL, 0.0)
-    for one in (frame(1), frame(2), frame(3, keyframe=True), frame(4)):
-        queue.offer(one)
-    assert drained(queue) == [3, 4]
-
-
 def test_two_are_under_way_and_one_when_acknowledgements_are_late() -> None:
     queue = ViewerQueue(ALL, 0.0)
     for seq in range(4):
@@ -83,19 +76,6 @@ def test_more_are_under_way_if_they_are_small(size: int, most: int) -> None:
     queue.offer(frame(20, keyframe=True, size=4000))
     assert queue.window == 1
     assert queue.take(1.0) is None
-
-
-def test_an_overflow_skips_everything_up_to_the_next_key_frame() -> None:
-    queue = ViewerQueue(ALL, 0.0)
-    for seq in range(MAX_FRAMES + 3):
-        queue.offer(frame(seq, keyframe=seq == 0))
-    assert queue.waiting
-    assert queue.overflowed
-    assert queue.take(0.0) is None
-    queue.offer(frame(20, keyframe=True))
-    assert not queue.waiting
-    assert not queue.overflowed
-    assert drained(queue) == [20]
 
 
 def test_bytes_are_bounded_as_well() -> None:
@@ -209,14 +189,6 @@ def test_a_slow_viewer_among_fast_ones_gets_the_rescue_stream() -> None:
     assert not assess(viewers(3, waiting=1), "h264", 0.1, can_rescue=False)
 
 
-def test_it_returns_at_a_key_frame_after_a_minute() -> None:
-    slow = viewers(1, waiting=1)[0]
-    slow.rescue(0.0)
-    for seq, at, keyframe, rescued in ((1, 59.0, True, True), (2, 61.0, False, True), (3, 61.0, True, False)):
-        slow.offer_direct(frame(seq, keyframe=keyframe), at)
-        assert slow.rescued is rescued
-
-
 def test_a_new_viewer_among_others_gets_one_key_frame_and_then_the_rescue_stream() -> None:
     some = viewers(4)
     new = ViewerQueue(ALL, 1.0)
@@ -266,14 +238,6 @@ def test_over_a_thin_connection_small_pictures_come_from_the_rescue_stream(encod
     assert not offered(viewer, 3, now + 61, encoding)
 
 
-def test_one_late_acknowledgement_is_no_thin_connection() -> None:
-    viewer = ViewerQueue(ALL, 0.0)
-    for seq, late_s in enumerate((2.0, 0.1, 2.0, 0.1)):
-        show(viewer, seq, 0.0, late_s)
-        assert not assess([viewer], "pbvd", late_s, can_rescue=True)
-    assert not viewer.rescued
-
-
 def test_small_pictures_that_are_late_as_well_do_not_put_off_the_return() -> None:
     viewer = ViewerQueue(ALL, 0.0)
     for seq in range(18):
@@ -281,17 +245,6 @@ def test_small_pictures_that_are_late_as_well_do_not_put_off_the_return() -> Non
         assess([viewer], "pbvd", seq / 2 + 0.5, can_rescue=True)
         assert viewer.rescued == (seq > 0)
     assert not offered(viewer, 18, 61.0)
-
-
-def test_frames_that_were_under_way_together_are_late_once() -> None:
-    viewer = ViewerQueue(ALL, 0.0)
-    for seq in range(2):
-        viewer.offer_direct(frame(seq, keyframe=seq == 0), 0.0)
-        assert viewer.take(0.0)
-    for seq in range(2):
-        viewer.acknowledge(seq, 2.0 + seq / 10)
-    assert not assess([viewer], "pbvd", 2.2, can_rescue=True)
-    assert not viewer.rescued
 
 
 # -- the encoding

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
 
 import pytest
 
@@ -14,7 +13,6 @@ from pebble.extensions.operator.client.discovery import Discovery
 from pebble.extensions.operator.client.estop import COLLECT_S, StopSender, new_name
 from pebble.extensions.operator.client.names import Names
 from pebble.extensions.operator.client.pace_of_link import pace_of
-from pebble.extensions.operator.client.robot_view import RobotView
 from pebble.extensions.operator.client.scripts import RobotScripts
 from pebble.transports import Message
 
@@ -31,33 +29,12 @@ def heartbeat(base: str = BASE) -> Message:
     return Message(ONLINE.topic(base), b'{"t": 1}')
 
 
-def shown_by_a_page_or_terminal(level: LinkLevel, after_s: float) -> bool:
-    robot = RobotView(BASE)
-    robot.receive(LINK, link(level), 0.0, 0.0)
-    for at in (-2.0, -1.0, 0.0):
-        robot.liveness.heartbeat(at, 0.3)
-    return robot.online(after_s) is False
-
-
-def printed_by_estop_status(level: LinkLevel, after_s: float) -> bool:
+@pytest.mark.parametrize(("level", "limit_s"), {"wide": 2, "narrow": 3, "thin": 5}.items())
+def test_a_robot_whose_link_is_known_is_awaited_for(level: LinkLevel, limit_s: float) -> None:
     discovery = Discovery()
     discovery.receive(link(level), 0.0, 0.0)
-    return not discovery.awaits_heartbeat(after_s)
-
-
-MEMBERS: dict[str, tuple[Callable[[LinkLevel, float], bool], dict[LinkLevel, float]]] = {
-    "a page, or a terminal": (shown_by_a_page_or_terminal, {"wide": 2, "narrow": 3, "thin": 5}),
-    "pebble estop status": (printed_by_estop_status, {"wide": 2, "narrow": 3, "thin": 5}),
-}
-
-
-@pytest.mark.parametrize("level", LEVELS)
-@pytest.mark.parametrize(("silent", "limits"), MEMBERS.values(), ids=MEMBERS)
-def test_a_robot_counts_as_silent_after(
-    silent: Callable[[LinkLevel, float], bool], limits: dict[LinkLevel, float], level: LinkLevel
-) -> None:
-    assert [silent(level, limits[level] - NEAR_S), silent(level, limits[level] + NEAR_S)] == [False, True]
-    assert limits[level] == silent_after(link=level)
+    assert [discovery.awaits_heartbeat(limit_s + more_s) for more_s in (-NEAR_S, NEAR_S)] == [True, False]
+    assert limit_s == silent_after(link=level)
 
 
 @pytest.mark.parametrize(("level", "scripts_s", "others_s"), [("wide", 5, 2), ("narrow", 10, 10), ("thin", 10, 10)])

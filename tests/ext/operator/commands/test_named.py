@@ -53,10 +53,3 @@ def test_a_stop_goes_both_ways_and_a_reset_by_name(broker: Broker, robot: Record
     assert "takes commands only with a name" in run.err
     assert run("estop", "reset", name, "--url", url) == 0, run.err
     assert {one for one in incoming(robot) if one.endswith("reset")} == {"by/ann/estop-reset"}
-
-
-def test_a_nameless_script_command_fails_with_what_to_type(broker: Broker, robot: RecordingRobot, run: Run) -> None:
-    name = robot.base.rpartition("/")[2]
-    assert run("script", "stop", name, "--url", f"mqtt://127.0.0.1:{broker.port}") == 1
-    assert run.err.startswith(f"pebble: {name} takes commands only with a name")
-    assert run.err.count("\n") == 1

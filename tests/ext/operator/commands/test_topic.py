@@ -61,16 +61,6 @@ def test_retained_topics_are_listed_with_their_synonym_and_echoed_raw(at: tuple[
     assert run.out == '{"t": 1710969600123}\n'
 
 
-def test_ctrl_c_ends_an_echo_quietly(at: tuple[str, str, str], run: Run) -> None:
-    assert run("topic", "pub", "flags/mqtt-audio", "true", *at) == 0
-    with running("topic", "echo", "flags/mqtt-audio", *at) as process:
-        assert process.stdout is not None
-        assert "retained" in process.stdout.readline()
-        process.send_signal(signal.SIGINT)
-        _, err = process.communicate(timeout=30)
-    assert (process.returncode, err) == (130, "")
-
-
 def test_a_config_leads_to_its_own_side_and_to_the_remote_one(
     tmp_path: Path, run: Run, local_transports: dict[str, str]
 ) -> None:

@@ -14,7 +14,6 @@ import pytest
 
 from pebble.config import Config, parse
 from pebble.contract.forms import Setting, form
-from pebble.services.autonomy_manager import catalogue as catalogue_module
 from pebble.services.autonomy_manager import interpreter as interpreter_module
 from pebble.services.autonomy_manager.catalogue import MAX_SCRIPTS, Catalogue, files, roots
 from pebble.services.autonomy_manager.interpreter import interpreter, lacking
@@ -210,18 +209,6 @@ def test_a_summary_and_main_settings_are_listed_where_a_script_has_them(tmp_path
     listed = {entry["file"]: entry for entry in files(scripts(tmp_path).values())}
     assert listed["plain"].keys() == {"file", "label", "configs"}
     assert (listed["first"]["summary"], listed["first"]["main"]) == ("Walks.", ["laps"])
-
-
-def test_a_file_is_parsed_again_only_when_it_has_changed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    parsed: list[Path] = []
-    monkeypatch.setattr(catalogue_module, "is_ours", lambda entry: bool(parsed.append(entry)))
-    catalogue = Catalogue(config(tmp_path))
-    entry = write(tmp_path, "walk", "pass")
-    scanned(catalogue)
-    scanned(catalogue)
-    entry.write_text("pass  # changed")
-    scanned(catalogue)
-    assert parsed == [entry, entry]
 
 
 def test_a_failure_is_logged_once_and_tried_again_after_a_minute(

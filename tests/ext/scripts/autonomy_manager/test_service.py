@@ -248,22 +248,6 @@ def test_an_emergency_stop_ends_the_script_and_refuses_others_until_the_reset(be
     bench.start("sing")
 
 
-@pytest.mark.parametrize(
-    ("fields", "error"),
-    [
-        ({"count": 1}, "emergency stop of motor owner serial: it was reset since"),
-        ({"boot": "bb"}, "motor owner serial was restarted: start the script again"),
-        ({"barred": 500_000_000}, SUPERSEDED),
-    ],
-)
-def test_what_ended_a_run_at_the_motors_ends_its_script(bench: Bench, fields: dict[str, Any], error: str) -> None:
-    bench.owner()
-    walk = bench.start("walk")
-    bench.owner(**fields)
-    assert bench.becomes(error=error)
-    assert walk.signals == [TERM]
-
-
 def test_a_stop_while_another_script_ends_cancels_the_next_one(bench: Bench) -> None:
     bench.owner()
     walk = bench.start("walk")

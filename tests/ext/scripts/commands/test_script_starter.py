@@ -4,15 +4,12 @@ from __future__ import annotations
 
 import json
 import os
-import shutil
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 
-from pebble.config import load
-from pebble.services.autonomy_manager.catalogue import roots
 from tests.commands.command_line import Run
 
 
@@ -39,17 +36,6 @@ def test_its_test_passes_and_fails_for_a_robot_that_turns_away(folder: Path) -> 
     assert "1 failed" in pytest_in(folder).stdout
 
 
-@pytest.mark.thorough
-def test_the_tests_of_two_scripts_pass_in_one_run(folder: Path) -> None:
-    second = shutil.copytree(folder, folder.with_name("second"))
-    (second / "test_follow_me.py").rename(second / "test_second.py")
-    (second / "run.py").write_text((second / "run.py").read_text().replace("= 0.6", "= 0.9"))
-    (folder / "run.py").write_text("")
-    done = pytest_in(folder.parent, folder.name, second.name)
-    assert "1 failed, 1 passed" in done.stdout
-    assert "has no attribute 'Options'" in done.stdout
-
-
 def test_it_is_a_script_of_less_than_30_lines(folder: Path) -> None:
     script = folder / "run.py"
     assert script.read_text().count("\n") < 30
@@ -64,21 +50,9 @@ def test_its_robot_is_one(folder: Path, run: Run) -> None:
     assert "autonomy_manager" in run.out
 
 
-def test_its_robot_offers_it_and_the_scripts_of_pebble(folder: Path) -> None:
-    beside, own = roots(load(folder / "goob.json"))
-    assert beside.resolve() == folder.parent
-    assert (own / "wheel-odometry" / "run.py").is_file()
-
-
 def test_an_existing_folder_is_left_alone(folder: Path, run: Run) -> None:
     assert run("script", "new", "follow-me", "--folder", folder.parent) == 1
     assert run.err == f"pebble: {folder} exists already: choose another name, or another --folder\n"
-
-
-def test_a_file_of_the_same_name_in_another_case_is_left_alone(run: Run, tmp_path: Path) -> None:
-    (tmp_path / "README").write_text("")
-    assert run("script", "new", "readme", "--folder", tmp_path) == 1
-    assert run.err == f"pebble: {tmp_path}/README exists already: choose another name, or another --folder\n"
 
 
 @pytest.mark.parametrize("name", ["../out", "a b", "1st", "", "-x", "x" * 80])

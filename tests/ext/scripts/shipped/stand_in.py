@@ -21,18 +21,13 @@ FPS = 15
 
 
 class Sensors:
-    """Pictures of a tag 13 that is 2 m ahead, while ``visible``, and all messages of the channels of ``subscribe``.
-
-    While there are ``two``, a nearer one with the same id is on its left.
-    """
+    """Pictures of a tag 13 that is 2 m ahead, while ``visible``, and all messages of the channels of ``subscribe``."""
 
     def __init__(self, station: Station) -> None:
         self.station = station
-        self.visible, self.two = True, False
+        self.visible = True
         self.messages: dict[str, list[dict[str, Any]]] = defaultdict(list)
         self._seen, _ = picture(13, ahead_m=2.0, right_m=0.3)
-        self._both, _ = picture(13, ahead_m=1.4, right_m=-0.5)
-        self._both[:, SIZE[0] // 2 :] = self._seen[:, SIZE[0] // 2 :]
         self._empty, _ = picture(13, ahead_m=2.0, right_m=50.0)
         self._writer = FrameWriter(station.config.run_dir(), "camera", capacity=self._seen.size).open()
         self._ended = threading.Event()
@@ -85,5 +80,4 @@ class Sensors:
     def _write(self) -> None:
         while not self._ended.wait(1 / FPS):
             info = FrameInfo(format="bgr24", width=SIZE[0], height=SIZE[1], captured_ns=time.monotonic_ns())
-            shown = self._both if self.two else self._seen
-            self._writer.write((shown if self.visible else self._empty).ravel(), info)
+            self._writer.write((self._seen if self.visible else self._empty).ravel(), info)

@@ -89,14 +89,3 @@ def test_following_by_odometry_uses_what_two_other_scripts_publish(sensors: Sens
     for script in (follower, locations, odometry):
         end(script)
     assert until(station.rests)
-
-
-def test_of_two_tags_with_one_id_a_follower_uses_the_larger(sensors: Sensors) -> None:
-    sensors.subscribe("apriltag-data")
-    sensors.start("apriltag-follow", "--marker-size", "0.25")
-    data = sensors.messages["apriltag-data"]
-    assert until(lambda: sum(one["detected"] for one in data) > 5, 40)
-    assert all("of" not in one for one in data)
-    sensors.two = True
-    assert until(lambda: sum(one.get("of") == 2 for one in data) > 10, 20)
-    assert {round(one["distance_m"], 1) for one in data if one.get("of") == 2} == {1.5}, "the nearer one"
