@@ -17,10 +17,6 @@ import pytest
 from pebble.extensions.fleet.people import People
 from pebble.extensions.install.setup.backup import ABOUT, BackupError, make, packed, read, unpacked
 from pebble.extensions.operator.places import Places
-from pebble.extensions.scripts.perception.camera_model import CameraModel
-from pebble.motion.latch import Latch
-from pebble.motors.state_file import StateFile
-from pebble.extensions.operator.places import Places
 from tests.commands.command_line import Run
 from tests.ext.checks.installed import MQTT, PAGE, PEOPLE, ROBOT, installed
 from tests.ext.install.setup.conftest import at

@@ -31,53 +31,14 @@ def pictures(encoding: str, seconds: float) -> Iterator[Line]:
             yield Line(at, CAMERA, payload)
 
 
-<<<<<<< HEAD
-def rest(seconds: float) -> Iterator[Line]:
-    """Heartbeats, sound, telemetry, commands, one retained value that changes, and lines of the log."""
-    yield Line(0.0, f"{GOOB}/outgoing/capabilities", js(t=ms(0), value={"video": {"available": True}}), 1, retain=True)
-    for number in range(int(seconds * 50)):
-        at = number / 50
-        sound = Sound(Codec.PCM16LE, 1, 16000, 320, number + 1, ms(at), b"\1\2" * 320)
-        yield Line(at, f"{GOOB}/outgoing/audio", sound.pack())
-        if number % 12 == 0:
-            yield Line(at, f"{GOOB}/outgoing/online", js(t=ms(at)), 1, retain=True)
-        if number % 5 == 0:
-            yield Line(at, f"{GOOB}/outgoing/sensors/imu", js(t=ms(at), n=number), 1)
-            yield Line(at, f"{GOOB}/incoming/drive-values", js(x=0.0, z=0.5 * (number % 500 < 250)), 1)
-        if number % 500 == 250:
-            yield Line(at, f"{GOOB}/outgoing/charging-level", js(t=ms(at), value=100 - number // 500), 1, retain=True)
-            yield Line(at, f"{GOOB}/outgoing/logs", js(t=ms(at), level="INFO", message=f"line {number}"), 1)
-
-
 def film(root: Path, encoding: str, seconds: float, *, finished: bool = True) -> Path:
     """A folder as a recorder leaves it: one file of state, one of media, a chunk each second."""
     day = root / "2023/11/14"
     day.mkdir(parents=True)
-    lines = sorted([*rest(seconds), *pictures(encoding, seconds)], key=lambda line: line.at)
-=======
-def film(
-    root: Path,
-    encoding: str,
-    seconds: float,
-    size: tuple[int, int] = SIZE,
-    *,
-    finished: bool = True,
-    times: int = 1,
-    interval: int | None = 2 * FPS,
-) -> Path:
-    """A folder as a recorder leaves it: one file of state, one of media, a chunk each second.
-
-    ``times``: so often the pictures are repeated, because encoding an hour takes long. ``interval``: of key frames, in
-    pictures; None: as robots have it.
-    """
-    day = root / "2023/11/14"
-    day.mkdir(parents=True)
-    once = list(pictures(encoding, seconds / times, size, interval))
-    shown = [line._replace(at=line.at + seconds / times * turn) for turn in range(times) for line in once]
     capabilities = js(t=ms(0), value={"video": {"available": True}})
     offered = Line(0.0, f"{GOOB}/outgoing/capabilities", capabilities, 1, retain=True)
-    lines = sorted([offered, *demo(seconds, [GOOB]), *shown], key=lambda line: line.at)
->>>>>>> wt-t5
+    shown = [offered, *demo(seconds, [GOOB]), *pictures(encoding, seconds)]
+    lines = sorted(shown, key=lambda line: line.at)
     media = [line for line in lines if line.topic in (CAMERA, f"{GOOB}/outgoing/audio")]
     state = [line for line in lines if line.topic not in (CAMERA, f"{GOOB}/outgoing/audio")]
     suffix = ".mcap" if finished else ".mcap.active"
