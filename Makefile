@@ -58,7 +58,7 @@ check: .venv/.ready-dev
 	@echo "pebble: lint, types and imports are in order"
 
 docs: .venv/.ready-dev
-	@$(VENV) -m pebble.contract.docs build/docs
+	@$(VENV) -m pebble.extensions.operator.contract.docs build/docs
 	@$(VENV) -m pebble.config.schema build/docs
 	@$(VENV) -m pebble.extensions.page.messages_docs build/docs
 	@$(VENV) tools/bounds.py build/docs

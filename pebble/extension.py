@@ -125,6 +125,8 @@ class Extension(Struct, frozen=True, kw_only=True, eq=False):
     rules: str = ""  # pairs of a Section and check(reader, section, path), which returns the section
     program: Program | None = None  # runs while the section is enabled, or always where there is none
     programs: str = ""  # a function of the config: its other Programs
+    observer: str = ""  # of config and clock: pebble.forwarding.observer.Observer, which sees what the bridge passes
+    step: str = ""  # a function of the config: pebble.forwarding.observer.Step, which may refuse it
     offers: str = ""  # a function of config and CapabilitiesValue, which it returns completed
     facts: str = ""  # a function of the config: Facts
     checks: str = ""  # a function of the config, for `pebble doctor`: CheckResults
@@ -233,7 +235,7 @@ def _check_parts(extension: Extension, section: type) -> None:
     elif {*extension.motors.values()} - ({program.name} if program else set()):
         raise PebbleError("its motors are of a program that it does not have")
     if program is not None and find_spec(program.module) is None:
-        raise PebbleError(f"there is no module {program.module}, which its program {program.name} runs")
+        raise PebbleError(f"the module of its program, {program.module}, is not installed")
 
 
 def lacking(raw: Any) -> Iterator[Missing]:
@@ -370,7 +372,8 @@ def _at_section(config: Any, key: str) -> Any:
 def _of_package(name: str) -> Extension:
     offered = _offered()
     if name not in offered:
-        raise PebbleError(f"no installed package offers it; known are {', '.join(sorted(offered)) or 'none'}")
+        known = ", ".join(sorted(offered)) or "none"
+        raise PebbleError(f'no installed package offers it (a file is written with ".py"); known are {known}')
     return _checked(part(offered[name]))
 
 

@@ -19,7 +19,7 @@ make long PART=looks      store anew how the page looks, for PART=page to compar
 make long PART=fleet      brokers and hubs that are killed, hung and cut off under driven robots and 300 boards, 16 minutes
 make long PART=brokers    install NATS, RabbitMQ and aedes where possible, test robots with them, judge them, seven minutes
 make long PART=gstreamer  install GStreamer and OpenCV, and have them read the original's local media, three minutes
-make long PART=firmware   measure the firmware's use of each board in the real MicroPython; writes docs/firmware.md
+make long PART=firmware   measure the firmware's use of each board's memory in the real MicroPython
 make long PART=life       install, update, damage and remove packages on machines with a real systemd; root, 15 minutes
 make long PART=packages   known vulnerabilities of all packages, from OSV, and build/sbom.cdx.json
 END
@@ -46,7 +46,7 @@ looks) $python -m tests.ext.page.looks ;;
 fleet) tests --workers 2 --timeout 900 -s tests/ext/fleet ;;
 brokers)
     sh tests/ext/checks/brokers/install.sh
-    $python -m pytest -ra tests/transports/test_brokers.py tests/transports/test_client_ids.py tests/ext/checks/brokers
+    $python -m pytest -ra tests/transports/test_brokers.py tests/ext/checks/brokers
     $python -m pytest -ra -k "(nats or another) and in_python" tests/ext/checks/conform
     ;;
 gstreamer)
@@ -56,7 +56,7 @@ gstreamer)
     /usr/bin/python3 -c "import cv2, paho.mqtt.client" 2>/dev/null || debian =python3-opencv =python3-paho-mqtt
     tests tests/examples/test_gstreamer_sockets.py tests/robot/test_original_media.py
     ;;
-firmware) $python -m tests.firmware.sizes ;;
+firmware) tests --log-cli-level=INFO tests/firmware/test_heap.py ;;
 life)
     debian mosquitto_pub=mosquitto-clients ip=iproute2 systemd-analyze=systemd minisign=minisign
     sh tools/locked.sh robot >.venv/robot.txt

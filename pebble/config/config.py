@@ -16,7 +16,7 @@ from pebble import extension
 from pebble.config import problems
 from pebble.config.home import in_home
 from pebble.config.masking import holds_secret, masked
-from pebble.config.problems import UNKNOWN_UNLIKE, Notes
+from pebble.config.problems import UNKNOWN_UNLIKE, Note, Notes
 from pebble.config.raw import Pairs, decode, plain, read_text, with_instances, without
 from pebble.config.reader import Check, Reader, Rule
 from pebble.config.rules.between_keys import CHECKS
@@ -168,7 +168,7 @@ def _config(
     own = plain(raw, notes)
     found, missing = _extensions(own, folder)
     installed = () if core_only else found
-    lacking, missing = missing, () if core_only else missing
+    absent, missing = missing, () if core_only else missing
     for one in missing:
         note = notes.warning if lenient and not one.drives else notes.problem
         note(tuple(one.key.split(".", 1)), one.reason)
@@ -179,12 +179,13 @@ def _config(
     unread = [*extension.keys_of_missing(installed), *(key for one in found if core_only for key in one.sections)]
     root = reader.section(tree, without(merged, unread))
     notes.forget_inherited(own, merged)
-    if lenient and any(one.key.startswith("extensions.") for one in lacking):
+    if lenient and any(one.key.startswith("extensions.") for one in absent):
         _excuse(notes)
     if path is not None and holds_secret(own):
         warn_if_readable(notes, (), path, "it, and there is a password in it")
     if notes.problems:
-        raise ConfigError(list(dict.fromkeys(map(str, notes.problems))))
+        lacking = [Note(tuple(one.key.split(".", 1)), one.reason) for one in missing]  # unknown sections may be theirs
+        raise ConfigError(list(dict.fromkeys(map(str, (*lacking, *notes.problems)))))
     identity = Identity(root.robot.system, root.robot.type, root.robot.id)
     config: Config = kind(
         **asdict(root),

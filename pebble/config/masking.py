@@ -47,6 +47,8 @@ def masked(value: Any, key: str = "") -> Any:
     if isinstance(value, dict):
         variables = key == "env" or key.endswith("_env")  # whatever they are called
         return dict.fromkeys(value, HIDDEN) if variables else _object(value)
+    if isinstance(value, tuple | list) and (key == "command" or key.endswith("_command")):
+        return [masked(word) if number == 0 else HIDDEN for number, word in enumerate(value)]  # any may be a secret
     if isinstance(value, tuple | list):
         return [
             HIDDEN

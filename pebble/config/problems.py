@@ -91,5 +91,7 @@ def nearest(key: str, known: Iterable[str]) -> str:
     names = sorted(known)
     if close := get_close_matches(key, names, n=1):
         return f'did you mean "{close[0]}"?'
+    if len(names) == 1:
+        return f'the only one is "{names[0]}"'
     best = get_close_matches(key, names, n=1, cutoff=0.0)
     return f'the nearest is "{best[0]}" of {", ".join(names)}'

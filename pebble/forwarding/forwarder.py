@@ -23,6 +23,7 @@ from pebble.forwarding.admission import Admission
 from pebble.forwarding.command_ages import STAMP, STAMP_LETTER, CommandAges, ends_something
 from pebble.forwarding.cycles import Cycles, Finding
 from pebble.forwarding.names import Names, Signed
+from pebble.forwarding.observer import Step
 from pebble.forwarding.publisher import Publisher
 from pebble.forwarding.retained_topics import RetainedTopics
 from pebble.forwarding.routing import Drop, Forward, Rules, Side, route
@@ -87,7 +88,8 @@ class Forwarder:
     ``names`` knows the senders of messages on the remote side, where they are checked.
     ``on_value(subject, payload)`` is called, on any thread and with a lock held, with each new value of a two-way
     retained topic.
-    ``pass_stop(side, payload)`` returns what passes of a stop that was received there.
+    ``pass_stop(side, payload)`` returns what passes of a stop that was received there. ``steps`` are those of
+    extensions, by their names.
     """
 
     def __init__(
@@ -100,9 +102,10 @@ class Forwarder:
         names: Names | None = None,
         on_value: Callable[[Subject, bytes], None] = lambda _subject, _payload: None,
         pass_stop: Callable[[Side, bytes], Iterable[bytes]] = lambda _side, payload: (payload,),
+        steps: Mapping[str, Step] = {},
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        self.counters = Counters()
+        self.counters, self._steps = Counters(), steps
         self._subjects, self._rules, self._names, self._clock = subjects, rules, names, clock
         self._pass_stop = pass_stop
         self.sides = Sides(
@@ -266,9 +269,16 @@ class Forwarder:
         finding = self.cycles.examine(here.side, subject, message)
         return None if finding is Finding.PASS else self._act_on(finding, here.side, subject, message, forward)
 
+    def _refused_by_step(self, here: SideState, subject: Subject, message: Message, *_: object) -> Drop | None:
+        for name, step in self._steps.items():
+            if not subject.is_stop and (why := step(here.side, subject, message)):
+                self._quiet_log.warning(name, "%s is not forwarded: %s: %s", message.topic[:_LOGGED], name, why)
+                return Drop.REFUSED
+        return None
+
     #: Why a message that has a route does not pass, in this order: nothing beyond a bound is compared with what we have
-    #: sent or looked at for cycles, and an echo is no cycle.
-    _ADMISSION = (_beyond_bound, _echo, _cycle)
+    #: sent or looked at for cycles, an echo is no cycle, and extensions are asked last.
+    _ADMISSION = (_beyond_bound, _echo, _cycle, _refused_by_step)
 
     def _pass(
         self, here: SideState, subject: Subject, message: Message, forward: Forward, account: str = ""

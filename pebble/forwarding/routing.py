@@ -50,6 +50,7 @@ class Drop(Enum):
     CLOSED = "nothing is forwarded now"
     LATE = "waited too long, here or at the broker"
     RESET = "a copy of a stop that was reset since"
+    REFUSED = "an extension refuses it"
     SIGNED = "only programs on the robot may sign as a script"
     # found in its topic, where names are checked (see .names)
     UNNAMED = "has no name of a sender"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from functools import partial
 from typing import Any, ClassVar
 
@@ -13,6 +13,7 @@ from pebble.contract import BRIDGE_PROBE, INCOMING, OUTGOING
 from pebble.forwarding.cycles import PROBE_PERIOD_S
 from pebble.forwarding.forwarder import Forwarder
 from pebble.forwarding.names import Names
+from pebble.forwarding.observer import Step
 from pebble.forwarding.retained_window import INITIAL_SYNC_S, QUIET_S
 from pebble.forwarding.routing import Rules, Side
 from pebble.forwarding.side import Gate
@@ -61,6 +62,7 @@ class ForwardingService(Service, ABC):
             names=self.names,
             on_value=self.on_value,
             pass_stop=self.pass_stop,
+            steps=self.make_steps(),
             clock=self.clock,
         )
         self.epoch = 0  # grows whenever the remote side is not connected: what carries an older one is dropped
@@ -93,6 +95,10 @@ class ForwardingService(Service, ABC):
     def make_names(self) -> Names | None:
         """What checks the names of senders on the remote side; None: nothing does."""
         return None
+
+    def make_steps(self) -> Mapping[str, Step]:
+        """Return the steps that extensions add, by their names."""
+        return {}
 
     def on_value(self, subject: Subject, payload: bytes) -> None:
         """React to the value on which both sides agree; on any thread, with a lock held."""

@@ -86,10 +86,6 @@ class PassedStops:
         self._lock = threading.Lock()
         self._passed: dict[str, float] = {}  # by name, when it was passed first; the oldest first
 
-    def __len__(self) -> int:
-        """Return how many names are remembered."""
-        return len(self._passed)
-
     @property
     def pending(self) -> dict[str, Pending]:
         """The stops that are not confirmed, by owner."""

@@ -1,6 +1,6 @@
 """The bridge as a process: forwarding, heartbeat, same-broker probe, system actions and media requests."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from functools import partial
 from typing import TYPE_CHECKING, Any
@@ -24,8 +24,10 @@ from pebble.contract.levels import LEVELS
 from pebble.contract.names import with_name
 from pebble.contract.payloads import ControlState
 from pebble.errors import PayloadError
+from pebble.extension import part
 from pebble.forwarding.forwarder import Routed, barrier
 from pebble.forwarding.names import Names
+from pebble.forwarding.observer import ROBOT, Observer, Step
 from pebble.forwarding.retained_window import INITIAL_SYNC_S
 from pebble.forwarding.routing import TABLE_A1, Drop, Forward, Side
 from pebble.forwarding.service import CHECK_SOON_S, ForwardingService
@@ -36,7 +38,6 @@ from pebble.runtime.parent import Notifier
 from pebble.runtime.service import every
 from pebble.runtime.timers import Timer
 from pebble.services.mqtt_bridge.actions import ACTIONS
-from pebble.services.mqtt_bridge.audit import ROBOT, Audit
 from pebble.services.mqtt_bridge.heartbeat import Heartbeat
 from pebble.services.mqtt_bridge.leftovers import Leftovers
 from pebble.services.mqtt_bridge.media import MEDIA
@@ -88,7 +89,8 @@ class MqttBridge(ForwardingService):
         notifier = Notifier()
         self._owners = MotorOwners(self.config.base, self.config.motor_owners, notifier)
         self._passed_stops = PassedStops(self.config.motor_owners, self.clock)
-        self._audit = Audit(self.config, self.clock)
+        observers = (part(one.observer) for one in self.config.installed if one.observer)
+        self._observers: list[Observer] = [make(self.config, self.clock) for make in observers]
         decides = min(self.config.motor_owners, default="")
         self._control_topic = CONTROL_STATE.topic(self.config.base, owner=decides) if decides else ""
         self._private = PrivateTopics(self.config.base)
@@ -123,6 +125,9 @@ class MqttBridge(ForwardingService):
         section = self.config.services.mqtt_bridge
         return section.remote_mqtt.silence_seconds if section.remote is None else section.remote.lease_ms / 1000
 
+    def make_steps(self) -> Mapping[str, Step]:
+        return {one.name: part(one.step)(self.config) for one in self.config.installed if one.step}
+
     def make_names(self) -> Names | None:
         security = self.config.security
         return Names(self.config.base, self.subjects, security.unnamed) if security.named else None
@@ -152,8 +157,9 @@ class MqttBridge(ForwardingService):
         if self._stops is not None:
             self.on_stop(self._stops.close)
             self.timers.add(self.clock(), self._stops.check, period=_CHECK_STOPS_S)
-        self._audit.start()
-        self.on_stop(self._audit.close)
+        for observer in self._observers:
+            observer.start()
+            self.on_stop(observer.close)
         if self._heartbeat is not None:
             interval = self.config.services.mqtt_bridge.heartbeat.interval_seconds
             self.timers.add(self.clock(), self._publish_heartbeat, period=interval)
@@ -312,7 +318,8 @@ class MqttBridge(ForwardingService):
         self._owners.check(self.clock())
         for owner, stop in self._passed_stops.give_up():
             self.log.error("an emergency stop is not confirmed by %s, which has withdrawn its own", owner)
-            self._audit.note("stop-not-confirmed", owner=owner, stop=str(stop.stop))
+            for observer in self._observers:
+                observer.unconfirmed(owner, stop)
 
     @every(REPEAT_S)
     def _repeat_stops(self) -> None:
@@ -351,7 +358,8 @@ class MqttBridge(ForwardingService):
         with suppress(PayloadError):
             state: ControlState = codec.decode(CONTROL_STATE, payload)
             keys = frozenset([state.key.encode()]) - {b""}
-            self._audit.control(state)
+            for observer in self._observers:
+                observer.control(state)
         self.forwarder.ages.keys = keys
 
     def _on_probe(self, message: Message) -> None:
@@ -399,7 +407,8 @@ class MqttBridge(ForwardingService):
         channel = routed.subject.channel if routed.subject is not None else None
         local = side is Side.LOCAL
         if not local and isinstance(routed.outcome, Drop):
-            self._audit.refused(routed.outcome, channel, routed.by)
+            for observer in self._observers:
+                observer.refused(routed.outcome, channel, routed.by)
         if routed.outcome is Drop.STALE:
             self.refusals.stale("a command" if channel is None else channel.metric)
             return
@@ -409,7 +418,8 @@ class MqttBridge(ForwardingService):
             return
         if not message.retain and routed.outcome is not Drop.KNOWN:
             own = local and self.forwarder.gate is Gate.OPEN
-            self._audit.passed(channel, ROBOT if own else routed.by, message.payload)
+            for observer in self._observers:
+                observer.passed(channel, ROBOT if own else routed.by, message.payload)
         self._requests.message(channel, message.payload)
 
     def on_value(self, subject: Subject, payload: bytes) -> None:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from pebble.runtime.places import Places
+from pebble.extensions.operator.places import Places
 from tests.kit.slots import ID, TRIAL, Seen, Slots
 
 UNPROVEN = "0.3.0 it was not proven in its starts"

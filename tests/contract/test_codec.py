@@ -55,6 +55,111 @@ def decoded_exactly(channel: Channel, raw: bytes) -> Any:
         return REFUSED
 
 
+# -- tables
+
+FOLLOW = b'{"action": "start", "file": "follow", "config": {"tag_id": 13, "deep": [1, {"a": null}]}}'
+FOLLOWS = AutonomyCommand(action="start", file="follow", config={"tag_id": 13, "deep": [1, {"a": None}]})
+NO_SWITCH = [b"1", b"null", b"[]", b'"play"', b'{"enabled": 1}', b'{"file": 3}', b'{"action": true}']
+#: Commands to the soundboard, and their fields.
+SOUNDS: dict[bytes, dict[str, Any]] = {
+    b"true": {"enabled": True},
+    b"false": {"enabled": False},
+    b'{"action": "play", "file": "a.wav"}': {"action": "play", "file": "a.wav"},
+    b'{"enabled": true, "file": "a.wav"}': {"enabled": True, "file": "a.wav"},
+    b'{"value": true, "file": "a.wav"}': {"enabled": True, "file": "a.wav"},
+    b'{"value": {"action": "play"}, "file": "a.wav"}': {"action": "play", "file": "a.wav"},
+    b'{"value": {"action": "play", "file": "b"}, "file": "a"}': {"action": "play", "file": "b"},
+    b'{"action": "stop", "timestamp": 1.5e9}': {"action": "stop"},
+    b'{"action": "play", "file": "a.wav", "repeat": true}': {"action": "play", "file": "a.wav", "repeat": True},
+    b'{"value": {"action": "play", "file": "b", "repeat": 3}}': {"action": "play", "file": "b", "repeat": 3},
+    b'{"value": true, "file": "b", "repeat": 3}': {"enabled": True, "file": "b", "repeat": 3},
+    b'{"value": {"action": "play"}, "repeat": null}': {"action": "play", "repeat": None},
+}
+#: What a payload means.
+MEANINGS: list[tuple[Channel, bytes, Any]] = [
+    # white space may follow a value: a bridge's probe on a flag's topic is the flag's value
+    (c.MQTT_VIDEO, b'{"value": true}' + b" \t\n" * 8, True),
+    (c.MQTT_VIDEO, b'{"value": false, "enabled": true}', False),
+    # drive values: bare or wrapped numbers, or numeric strings
+    (c.DRIVE, b'{"x": 0.2, "z": 0.5}', Drive(x=0.2, z=0.5)),
+    (c.DRIVE, b'{"value": {"x": 0.2, "z": 0.5}}', Drive(x=0.2, z=0.5)),
+    (c.DRIVE, b'{"x": 0.2, "z": 0.5, "y": -1}', Drive(x=0.2, z=0.5, y=-1)),
+    (c.DRIVE, b'{"z": 1}', Drive(z=1)),
+    (c.DRIVE, b'{"x": 1}', Drive(x=1)),
+    (c.DRIVE, b"{}", Drive()),
+    (c.DRIVE, b'{"value": {}}', Drive()),
+    (c.DRIVE, b'{"x": "0.25", "z": " -1e-1 "}', Drive(x=0.25, z=-0.1)),
+    (c.DRIVE, b'{"value": {"x": 1}, "x": -1, "z": 1}', Drive(x=1)),
+    (c.DRIVE, b'{"value": null, "x": 0.5}', Drive(x=0.5)),
+    (c.DRIVE, b'{"x": 7, "z": -7, "y": "1e9"}', Drive(x=1, z=-1, y=1)),
+    (c.DRIVE, b'{"x": 123456789012345678901234567890}', Drive(x=1)),
+    (c.DRIVE, b'{"x": -1, "x": 1}', Drive(x=1)),
+    (c.DRIVE, b'{"x": 1, "t": 1710969600123, "origin": {"a": [1]}}', Drive(x=1, t=1710969600123)),
+    # their source, their run, and how long they are valid
+    (c.DRIVE, b'{"z": 1, "source": "autonomy", "run": 17}', Drive(z=1, source="autonomy", run=17)),
+    (c.DRIVE, b'{"value": {"z": 1, "source": "autonomy", "run": 17}}', Drive(z=1, source="autonomy", run=17)),
+    (c.DRIVE, b'{"z": 1, "source": "joystick", "valid_ms": 400}', Drive(z=1, source="joystick", valid_ms=400)),
+    (c.DRIVE, b'{"z": 1, "source": null, "run": null, "valid_ms": null}', Drive(z=1)),
+    (c.DRIVE, b'{"z": 1, "valid_ms": 250.9}', Drive(z=1, valid_ms=250)),
+    (c.DRIVE, b'{"z": 1, "key": "0badf00d", "by": "otto"}', Drive(z=1, key="0badf00d", by="otto")),
+    (c.DRIVE, b'{"z": "1", "key": "0badf00d", "t": 1, "group": true}', Drive(z=1, key="0badf00d", t=1, group=True)),
+    (c.DRIVE, b'{"z": 1, "key": null, "t": -1, "by": 5, "group": "a"}', Drive(z=1)),
+    (c.DRIVE, b'{"z": 0, "key": 5}', Drive()),
+    (c.DRIVE, b'{"z": 0, "valid_ms": 0}', Drive(valid_ms=0)),
+    (c.DRIVE, b'{"source": "autonomy", "run": 17}', Drive(source="autonomy", run=17)),
+    # brackets in strings and side by side are not depth
+    (c.DRIVE, json.dumps({"x": 1, "k": '\\"[{' * 100, "wide": [[]] * 100}).encode(), Drive(x=1)),
+    # lights are clamped, missing colours are dark, and what is no period is the usual one
+    (c.LIGHTS_SOLID, b'{"b": 2, "g": -1}', LightsSolid(b=1.0, g=0.0, r=0.0)),
+    (c.LIGHTS_SOLID, b'{"value": {"r": 0.5}}', LightsSolid(r=0.5)),
+    (c.LIGHTS_FLASH, b'{"b": 1, "period": 0}', LightsFlash(b=1.0, period=0.05)),
+    (c.LIGHTS_FLASH, b"{}", LightsFlash(period=2.0)),
+    (c.LIGHTS_FLASH, b'{"period": "3"}', LightsFlash(period=3.0)),
+    (c.LIGHTS_FLASH, b'{"period": null}', LightsFlash(period=2.0)),
+    (c.LIGHTS_FLASH, b'{"period": "fast"}', LightsFlash(period=2.0)),
+    (c.LIGHTS_FLASH, b'{"period": "-1"}', LightsFlash(period=0.05)),
+    (c.LIGHTS_FLASH, b'{"period": [], "b": "no"}', LightsFlash(period=2.0)),
+    # a soundboard command is a boolean or an object
+    *((c.SOUNDBOARD_COMMAND, raw, SoundboardCommand(**fields)) for raw, fields in SOUNDS.items()),
+    (c.AUTONOMY_COMMAND, FOLLOW, FOLLOWS),
+    (c.AUTONOMY_COMMAND, b'{"value": ' + FOLLOW + b"}", FOLLOWS),
+    (c.AUTONOMY_COMMAND, b"false", AutonomyCommand(enabled=False)),
+    (c.OUTLET_COMMAND, b'{"value": {"on": false}}', OutletCommand(on=False)),
+    (c.ESTOP_RESET, b'{"boot": "a1b2c3d4", "count": 3}', EstopReset(boot="a1b2c3d4", count=3)),
+    (c.AUDIO_STREAM, b"PBAT\xff\x00", b"PBAT\xff\x00"),  # it is not looked into
+]
+
+
+@pytest.mark.parametrize(("channel", "raw", "value"), MEANINGS)
+def test_what_a_payload_means(channel: Channel, raw: bytes, value: Any) -> None:
+    assert codec.decode(channel, raw) == value
+
+
+#: Payloads that mean nothing.
+REFUSALS: dict[Channel, list[bytes]] = {
+    c.REBOOT: [b"1", b"0", b'"true"', b"null", b"[true]", b"{}", b'{"value": 1}', b'{"enabled": "on"}', b'{"on": true}',
+               b'{"value": {"value": true}}', b"TRUE", b"true false", b""],
+    c.DRIVE: [b"", b" ", b"null", b"[]", b"1", b'"x"', b"true", b'{"x": 1', b'{"x": 1}}', b"{'x': 1}"],
+    c.LIGHTS_FLASH: [b'{"period": 1e999}', b'{"b": 1, "period": "inf"}', b"[1, 1, 1]", b'"1"'],
+    c.SOUNDBOARD_COMMAND: [
+        *(b'{"action": "play", "file": "a", "repeat": ' + number + b"}" for number in (b"-1", b'"yes"', b"0.5", b"[]")),
+        *NO_SWITCH,
+    ],
+    c.AUTONOMY_COMMAND: NO_SWITCH,
+    c.OUTLET_COMMAND: [b'{"on": "false"}', b'{"on": 1}', b'{"on": null}', b"{}", b"true"],
+    c.ESTOP_RESET: [b"", b"{}", b'{"boot": "a"}', b'{"boot": 1, "count": 1}', b'{"boot": "a", "count": true}'],
+    c.CONTROL: [
+        *(b"{}", b'{"id": ""}', b'{"id": "3f2a91c"}', b'{"id": "3f2a91c0\\n"}', b'{"id": 1}', b'{"id": "3f2a91cg"}'),
+        *(b'{"id": "3f2a91c0", "want": "drive"}', b'{"id": "3f2a91c0", "for_ms": "1"}', b'{"id": "3f2a91c0", "by": 1}'),
+    ],
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("channel", "raw"), [(channel, raw) for channel, raws in REFUSALS.items() for raw in raws])
+def test_what_a_payload_does_not_mean(channel: Channel, raw: bytes) -> None:
+    assert channel.metric in refused(channel, raw)
+
+
 # -- boolean controls
 
 
@@ -65,67 +170,7 @@ def test_a_boolean_control_has_three_forms(channel: Channel, value: bool, form: 
     assert codec.decode(channel, form.format(json.dumps(value)).encode()) is value
 
 
-def test_white_space_may_follow_a_value() -> None:
-    """A bridge's probe on a flag's topic is the flag's value."""
-    assert codec.decode(c.MQTT_VIDEO, b'{"value": true}' + b" \t\n" * 8) is True
-
-
-def test_value_wins_over_enabled() -> None:
-    assert codec.decode(c.MQTT_VIDEO, b'{"value": false, "enabled": true}') is False
-
-
-@pytest.mark.parametrize(
-    "raw", [b"1", b"0", b'"true"', b"null", b"[true]", b"{}", b'{"value": 1}', b'{"enabled": "on"}', b'{"on": true}',
-            b'{"value": {"value": true}}', b"TRUE", b"true false", b""],
-)  # fmt: skip
-def test_nothing_else_switches_a_boolean_control(raw: bytes) -> None:
-    assert "flags/reboot" in refused(c.REBOOT, raw)
-
-
 # -- drive values
-
-
-@pytest.mark.parametrize(
-    ("raw", "drive"),
-    [
-        (b'{"x": 0.2, "z": 0.5}', Drive(x=0.2, z=0.5)),
-        (b'{"value": {"x": 0.2, "z": 0.5}}', Drive(x=0.2, z=0.5)),
-        (b'{"x": 0.2, "z": 0.5, "y": -1}', Drive(x=0.2, z=0.5, y=-1)),
-        (b'{"z": 1}', Drive(z=1)),
-        (b'{"x": 1}', Drive(x=1)),
-        (b"{}", Drive()),
-        (b'{"value": {}}', Drive()),
-        (b'{"x": "0.25", "z": " -1e-1 "}', Drive(x=0.25, z=-0.1)),
-        (b'{"value": {"x": 1}, "x": -1, "z": 1}', Drive(x=1)),
-        (b'{"value": null, "x": 0.5}', Drive(x=0.5)),
-        (b'{"x": 7, "z": -7, "y": "1e9"}', Drive(x=1, z=-1, y=1)),
-        (b'{"x": 123456789012345678901234567890}', Drive(x=1)),
-        (b'{"x": -1, "x": 1}', Drive(x=1)),
-        (b'{"x": 1, "t": 1710969600123, "origin": {"a": [1]}}', Drive(x=1, t=1710969600123)),
-    ],
-)
-def test_drive_values_are_bare_or_wrapped_numbers_or_numeric_strings(raw: bytes, drive: Drive) -> None:
-    assert codec.decode(c.DRIVE, raw) == drive
-
-
-@pytest.mark.parametrize(
-    ("raw", "drive"),
-    [
-        (b'{"z": 1, "source": "autonomy", "run": 17}', Drive(z=1, source="autonomy", run=17)),
-        (b'{"value": {"z": 1, "source": "autonomy", "run": 17}}', Drive(z=1, source="autonomy", run=17)),
-        (b'{"z": 1, "source": "joystick", "valid_ms": 400}', Drive(z=1, source="joystick", valid_ms=400)),
-        (b'{"z": 1, "source": null, "run": null, "valid_ms": null}', Drive(z=1)),
-        (b'{"z": 1, "valid_ms": 250.9}', Drive(z=1, valid_ms=250)),
-        (b'{"z": 1, "key": "0badf00d", "by": "otto"}', Drive(z=1, key="0badf00d", by="otto")),
-        (b'{"z": "1", "key": "0badf00d", "t": 1, "group": true}', Drive(z=1, key="0badf00d", t=1, group=True)),
-        (b'{"z": 1, "key": null, "t": -1, "by": 5, "group": "a"}', Drive(z=1)),
-        (b'{"z": 0, "key": 5}', Drive()),
-        (b'{"z": 0, "valid_ms": 0}', Drive(valid_ms=0)),
-        (b'{"source": "autonomy", "run": 17}', Drive(source="autonomy", run=17)),
-    ],
-)
-def test_a_drive_command_may_name_its_source_its_run_and_how_long_it_is_valid(raw: bytes, drive: Drive) -> None:
-    assert codec.decode(c.DRIVE, raw) == drive
 
 
 def test_absent_fields_are_not_written() -> None:
@@ -246,13 +291,6 @@ def test_a_command_that_names_an_axis_needs_no_remark(raw: bytes) -> None:
     codec.decode(c.DRIVE, raw, lambda *remark: pytest.fail(str(remark)))
 
 
-@pytest.mark.parametrize(
-    "raw", [b"", b" ", b"null", b"[]", b"1", b'"x"', b"true", b'{"x": 1', b'{"x": 1}}', b"{'x': 1}"]
-)
-def test_drive_values_must_be_an_object(raw: bytes) -> None:
-    refused(c.DRIVE, raw)
-
-
 def test_a_long_string_of_digits_costs_no_time() -> None:
     assert not codec.decode(c.DRIVE, b'{"x": "' + b"1" * 60_000 + b'!"}').moves
 
@@ -260,88 +298,9 @@ def test_a_long_string_of_digits_costs_no_time() -> None:
 # -- other commands
 
 
-def test_lights_are_clamped_and_missing_colours_are_dark() -> None:
-    assert codec.decode(c.LIGHTS_SOLID, b'{"b": 2, "g": -1}') == LightsSolid(b=1.0, g=0.0, r=0.0)
-    assert codec.decode(c.LIGHTS_SOLID, b'{"value": {"r": 0.5}}') == LightsSolid(r=0.5)
-    assert codec.decode(c.LIGHTS_FLASH, b'{"b": 1, "period": 0}') == LightsFlash(b=1.0, period=0.05)
-    assert codec.decode(c.LIGHTS_FLASH, b"{}").period == 2.0
-
-
-@pytest.mark.parametrize(
-    ("raw", "period"), [(b'{"period": "3"}', 3.0), (b'{"period": null}', 2.0), (b'{"period": "fast"}', 2.0),
-                        (b'{"period": "-1"}', 0.05), (b'{"period": [], "b": "no"}', 2.0)],
-)  # fmt: skip
-def test_a_period_may_be_text_and_what_is_none_is_the_usual_one(raw: bytes, period: float) -> None:
-    assert codec.decode(c.LIGHTS_FLASH, raw) == LightsFlash(period=period)
-
-
-@pytest.mark.parametrize("raw", [b'{"period": 1e999}', b'{"b": 1, "period": "inf"}', b"[1, 1, 1]", b'"1"'])
-def test_lights_that_are_no_object_or_not_finite_are_refused(raw: bytes) -> None:
-    refused(c.LIGHTS_FLASH, raw)
-
-
-@pytest.mark.parametrize(
-    ("raw", "command"),
-    [
-        (b"true", SoundboardCommand(enabled=True)),
-        (b"false", SoundboardCommand(enabled=False)),
-        (b'{"action": "play", "file": "a.wav"}', SoundboardCommand(action="play", file="a.wav")),
-        (b'{"enabled": true, "file": "a.wav"}', SoundboardCommand(enabled=True, file="a.wav")),
-        (b'{"value": true, "file": "a.wav"}', SoundboardCommand(enabled=True, file="a.wav")),
-        (b'{"value": {"action": "play"}, "file": "a.wav"}', SoundboardCommand(action="play", file="a.wav")),
-        (b'{"value": {"action": "play", "file": "b"}, "file": "a"}', SoundboardCommand(action="play", file="b")),
-        (b'{"action": "stop", "timestamp": 1.5e9}', SoundboardCommand(action="stop")),
-        (
-            b'{"action": "play", "file": "a.wav", "repeat": true}',
-            SoundboardCommand(action="play", file="a.wav", repeat=True),
-        ),
-        (
-            b'{"value": {"action": "play", "file": "b", "repeat": 3}}',
-            SoundboardCommand(action="play", file="b", repeat=3),
-        ),
-        (b'{"value": true, "file": "b", "repeat": 3}', SoundboardCommand(enabled=True, file="b", repeat=3)),
-        (b'{"value": {"action": "play"}, "repeat": null}', SoundboardCommand(action="play", repeat=None)),
-    ],
-)
-def test_a_soundboard_command_is_a_boolean_or_an_object(raw: bytes, command: SoundboardCommand) -> None:
-    assert codec.decode(c.SOUNDBOARD_COMMAND, raw) == command
-
-
 def test_a_soundboard_command_that_does_not_repeat_has_no_such_field() -> None:
     assert b"repeat" not in codec.encode(c.SOUNDBOARD_COMMAND, SoundboardCommand(action="play", file="a.wav"))
     assert b'"repeat":2' in codec.encode(c.SOUNDBOARD_COMMAND, SoundboardCommand(action="play", file="a", repeat=2))
-
-
-@pytest.mark.parametrize("repeat", [b"-1", b'"yes"', b"0.5", b"[]"])
-def test_a_sound_is_repeated_by_count_or_without_end(repeat: bytes) -> None:
-    refused(c.SOUNDBOARD_COMMAND, b'{"action": "play", "file": "a.wav", "repeat": ' + repeat + b"}")
-
-
-def test_an_autonomy_command_carries_a_config() -> None:
-    bare = b'{"action": "start", "file": "follow", "config": {"tag_id": 13, "deep": [1, {"a": null}]}}'
-    wanted = AutonomyCommand(action="start", file="follow", config={"tag_id": 13, "deep": [1, {"a": None}]})
-    assert codec.decode(c.AUTONOMY_COMMAND, bare) == wanted
-    assert codec.decode(c.AUTONOMY_COMMAND, b'{"value": ' + bare + b"}") == wanted
-    assert codec.decode(c.AUTONOMY_COMMAND, b"false") == AutonomyCommand(enabled=False)
-
-
-@pytest.mark.parametrize("channel", [c.SOUNDBOARD_COMMAND, c.AUTONOMY_COMMAND], ids=lambda channel: channel.metric)
-@pytest.mark.parametrize(
-    "raw", [b"1", b"null", b"[]", b'"play"', b'{"enabled": 1}', b'{"file": 3}', b'{"action": true}']
-)
-def test_switching_commands_refuse_other_types(channel: Channel, raw: bytes) -> None:
-    refused(channel, raw)
-
-
-@pytest.mark.parametrize("raw", [b'{"on": "false"}', b'{"on": 1}', b'{"on": null}', b"{}", b"true"])
-def test_only_a_json_boolean_switches_an_outlet(raw: bytes) -> None:
-    assert codec.decode(c.OUTLET_COMMAND, b'{"value": {"on": false}}') == OutletCommand(on=False)
-    refused(c.OUTLET_COMMAND, raw)
-
-
-def test_binary_channels_are_not_looked_into() -> None:
-    assert codec.decode(c.AUDIO_STREAM, b"PBAT\xff\x00") == b"PBAT\xff\x00"
-    assert codec.encode(c.AUDIO, bytearray(b"PBAT")) == b"PBAT"
 
 
 # -- limits that hold for every command
@@ -393,12 +352,6 @@ def test_an_empty_payload_is_no_stop() -> None:
     assert "empty" in refused(c.ESTOP, b"")
 
 
-@pytest.mark.parametrize("raw", ["", "{}", '{"boot": "a"}', '{"boot": 1, "count": 1}', '{"boot": "a", "count": true}'])
-def test_a_reset_names_the_boot_and_the_count_of_the_state_it_ends(raw: str) -> None:
-    assert codec.decode(c.ESTOP_RESET, b'{"boot": "a1b2c3d4", "count": 3}') == EstopReset(boot="a1b2c3d4", count=3)
-    refused(c.ESTOP_RESET, raw.encode())
-
-
 @pytest.mark.parametrize(
     ("raw", "request_"),
     [
@@ -413,24 +366,10 @@ def test_a_request_for_control_is_within_limits(raw: bytes, request_: ControlReq
     assert codec.decode(c.CONTROL, raw) == codec.decode(c.CONTROL_TAKE, raw) == request_
 
 
-@pytest.mark.parametrize(
-    "raw",
-    [b"{}", b'{"id": ""}', b'{"id": "3f2a91c"}', b'{"id": "3f2a91c0\\n"}', b'{"id": 1}', b'{"id": "3f2a91cg"}',
-     b'{"id": "3f2a91c0", "want": "drive"}', b'{"id": "3f2a91c0", "for_ms": "1"}', b'{"id": "3f2a91c0", "by": 1}'],
-)  # fmt: skip
-def test_what_is_no_request_for_control_is_refused(raw: bytes) -> None:
-    refused(c.CONTROL, raw)
-
-
 @pytest.mark.parametrize("raw", [b"[" * 60_000, b'{"x":' * 9_000 + b"1" + b"}" * 9_000])
 def test_what_is_nested_too_deep_is_refused_and_stops(raw: bytes) -> None:
     assert "nested too deep" in refused(c.DRIVE, raw)
     assert codec.decode(c.ESTOP, raw) == EstopCommand()
-
-
-def test_brackets_in_strings_and_side_by_side_are_not_depth() -> None:
-    text = json.dumps({"x": 1, "k": '\\"[{' * 100, "wide": [[]] * 100}).encode()
-    assert codec.decode(c.DRIVE, text) == Drive(x=1)
 
 
 def test_a_command_has_at_most_64_kb() -> None:
@@ -451,6 +390,7 @@ def test_what_a_robot_publishes_may_be_larger() -> None:
 
 def test_encoding_spells_the_wire_form() -> None:
     assert json.loads(codec.encode(c.MQTT_VIDEO, True)) == {"value": True}
+    assert codec.encode(c.AUDIO, bytearray(b"PBAT")) == b"PBAT"
     assert json.loads(codec.encode(c.ONLINE, Heartbeat(t=1710969600123))) == {"t": 1710969600123}
     assert json.loads(codec.encode(c.ONLINE, Heartbeat(t=1, online=False))) == {"t": 1, "online": False}
     assert json.loads(codec.encode(c.CHARGING_LEVEL, ChargingLevel(value=7.4))) == {"value": 7.4, "unit": "v"}

@@ -49,12 +49,6 @@ def test_every_wrong_level_is_reported() -> None:
     assert [line.split(":")[0] for line in caught.value.problems] == ["robot.system", "robot.type", "robot.id"]
 
 
-def test_an_identity_is_a_value() -> None:
-    assert {GOOB: 1}[Identity("pebble", "robots", "goob")] == 1
-    with pytest.raises(AttributeError):
-        GOOB.id = "fred"  # type: ignore[misc]
-
-
 _levels = st.text(st.characters(codec="utf-8"), min_size=1, max_size=70)
 
 

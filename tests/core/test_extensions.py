@@ -191,10 +191,14 @@ OBJECT = "from pebble.extension import *\nEXTENSION = Extension(name='lamp', pac
         (OBJECT % "sections={'services.lamp': 'json:dumps'}", 'its section "services.lamp" is no Section'),
         (OBJECT % "sections={'x.y': 'pebble.config.types:Section'}", 'its section "x.y" is no Section'),
         (OBJECT % "rules='lamp:Extension'", "TypeError: "),
-        (OBJECT % "program=Program('lamp', 'absent')", "there is no module absent, which its program lamp runs"),
+        (OBJECT % "program=Program('lamp', 'absent')", "the module of its program, absent, is not installed"),
         (OBJECT % "motors={'legs': 'absent'}", "its motors are of a program that it does not have"),
         (OBJECT % "motors={'a/b': 'absent'}", "its name 'a/b' is not a topic level"),
         (LAMP % {"name": "absent", "drives": False}, "ModuleNotFoundError: No module named 'absent'"),
+        (
+            (LAMP % {"name": "lamp", "drives": False}).replace('("lamp", "lamp"', '("lamp", "absent"'),
+            "the module of its program, absent, is not installed",
+        ),
     ],
 )
 @pytest.mark.parametrize("drives", [False, True])
@@ -248,10 +252,21 @@ def test_a_section_that_is_nearly_one_of_ours_keeps_a_robot_from_starting(tmp_pa
         load(path, lenient=True)
 
 
+def test_of_a_refused_config_it_says_what_is_missing(tmp_path: Path) -> None:
+    path = write(tmp_path, {"lamp": {}}, {"hz": 2})
+    with pytest.raises(ConfigError, match=r"(?s)extensions.lamp: no installed package.*services.lamp: unknown key"):
+        load(path)
+
+
 def test_the_core_alone_reads_a_config_with_sections_of_extensions() -> None:
     config = load(ROOT / "configs" / "goob.json", core_only=True)
     names = [program.name for program in programs(config)]
     assert names == ["zenoh_hub", "announcer", "serial_mcu_bridge", "mqtt_bridge"]
+
+
+def test_a_robot_starts_though_a_section_of_what_is_missing_is_there(tmp_path: Path) -> None:
+    path = write(tmp_path, {"lamp": {}}, {"enabled": True})
+    assert load(path, lenient=True).warnings[0].startswith("extensions.lamp: no installed package offers it")
 
 
 def test_what_owns_motors_is_listed_as_such(tmp_path: Path) -> None:

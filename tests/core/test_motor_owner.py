@@ -1,4 +1,4 @@
-"""An extension that owns motors: what the guard of every motor owner promises holds for it, over a real robot."""
+"""An extension that owns motors, refuses a command and sees the others, as a part of a real robot."""
 
 from __future__ import annotations
 
@@ -22,10 +22,30 @@ import sys
 from pathlib import Path
 
 from pebble.extension import Extension, Program, Stage
+from pebble.forwarding.observer import Observer
 from pebble.motors.motor_owner import MotorOwner
 from pebble.runtime.process import run
 
-MOVES = Path(__file__).with_name("moves")
+MOVES, SEEN = Path(__file__).with_name("moves"), Path(__file__).with_name("seen")
+
+
+class Seen(Observer):
+    def __init__(self, _config, _clock):
+        SEEN.touch()
+
+    def passed(self, channel, by, payload):
+        self.write("passed", channel, payload)
+
+    def refused(self, drop, channel, by):
+        self.write(drop.value, channel, b"")
+
+    def write(self, what, channel, payload):
+        with SEEN.open("a") as file:
+            file.write(f"{what} {channel.metric} {payload.decode()}\\n")
+
+
+def step(_config):
+    return lambda _side, _subject, message: "it is night" if b"horn" in message.payload else ""
 
 
 class Legs(MotorOwner):
@@ -53,6 +73,8 @@ EXTENSION = Extension(
     package="legs.py",
     program=Program("legs", "legs", stage=Stage.DEVICE, preloaded=False),
     motors={"legs": "legs"},
+    observer="legs:Seen",
+    step="legs:step",
 )
 
 if __name__ == "__main__":
@@ -63,7 +85,7 @@ if __name__ == "__main__":
 @pytest.mark.parametrize("kind", ["mqtt", "zenoh"])
 def test_legs_of_an_owner_are_driven_stopped_and_reset(kind: str, tmp_path: Path) -> None:
     (tmp_path / "legs.py").write_text(LEGS)
-    moves, broker = tmp_path / "moves", Broker(tmp_path)
+    moves, seen, broker = tmp_path / "moves", tmp_path / "seen", Broker(tmp_path)
     path = tmp_path / "robot.json"
     path.write_text(
         json.dumps(
@@ -103,6 +125,12 @@ def test_legs_of_an_owner_are_driven_stopped_and_reset(kind: str, tmp_path: Path
         assert (absent["state"], absent["last_exit"]) == ("failed", "not installed")
         offer = state("capabilities")["value"]
         assert (offer["drive"]["available"], offer["estop"]["owners"]) == (True, ["legs"])
+        if kind == "zenoh":  # the other robot has one broker, so nothing is forwarded
+            for sound in ("horn", "bell"):
+                send("soundboard-command", {"action": "play", "file": sound})
+            assert until(lambda: "bell" in seen.read_text(), 5)
+            assert "an extension refuses it soundboard-command \n" in seen.read_text()
+            assert '"horn"' not in seen.read_text()
         assert moved()
         assert until(lambda: moves.read_text().endswith("halt\n"), 3)  # no further command has come
         assert moved()

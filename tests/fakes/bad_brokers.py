@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import socket
-import ssl
 import struct
 import threading
 import time
@@ -53,17 +52,6 @@ def _dripping(connection: socket.socket) -> None:
         connection.sendall(bytes((byte,)))
         time.sleep(0.1)
     mute(connection)
-
-
-def showing(certificate: Path) -> Behaviour:
-    """Speaks TLS with the ``server.pem`` and ``server.key`` in this folder, and says nothing."""
-    context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
-    context.load_cert_chain(certificate / "server.pem", certificate / "server.key")
-
-    def serve(connection: socket.socket) -> None:
-        mute(context.wrap_socket(connection, server_side=True))
-
-    return serve
 
 
 #: None: nothing listens there.

@@ -12,8 +12,7 @@ import time
 from pathlib import Path
 
 from pebble.config import config_of_process
-from pebble.runtime import notes
-from pebble.runtime.parent import NOTIFY_FD, Notifier, ProgramRequest, earlier_requests, requested_encoding
+from pebble.runtime.parent import NOTIFY_FD, Notifier, ProgramRequest, earlier_requests
 
 WORDS = """12:00:00 [WARNING] mind the gap
 just a print
@@ -49,8 +48,7 @@ def live(notify: Notifier, *, alive: bool = True) -> None:
 def ask(notify: Notifier) -> None:
     """Send the requests that a test appends to the file ``JOURNAL.orders.NAME``: ``media 1 h264``.
 
-    ``half media 1`` sends it in two pieces, ``noise media 1`` after 100 kB of anything. ``lacks estop`` and
-    ``has estop`` are reports; ``hold media 1`` lets it wait.
+    ``lacks estop`` and ``has estop`` are reports; ``hold media 1`` lets it wait.
     """
     orders = Path(f"{sys.argv[3]}.orders.{sys.argv[1]}")
     orders.write_text("")  # those of the previous process are old
@@ -61,9 +59,7 @@ def ask(notify: Notifier) -> None:
         while True:
             for line in lines:
                 first, *rest = line.split()
-                if first in ("half", "noise"):
-                    blurt(first, notes.encode(notes.Wanted(rest[0], rest[1] == "1", *rest[2:])) + b"\n")
-                elif first in ("lacks", "has"):
+                if first in ("lacks", "has"):
                     notify.feature(rest[0], first == "has")
                 elif first == "hold":
                     notify.hold(rest[0], rest[1] == "1")
@@ -71,15 +67,6 @@ def ask(notify: Notifier) -> None:
                     notify.request(first, ProgramRequest(rest[0] == "1", *rest[1:]))
             notify.alive()
             time.sleep(0.01)
-
-
-def blurt(how: str, note_: bytes) -> None:
-    pipe = int(os.environ[NOTIFY_FD])
-    os.set_blocking(pipe, True)
-    for piece in (note_[:6], note_[6:]) if how == "half" else (b"x" * 100_000 + b"\n", note_):
-        os.write(pipe, piece)
-        time.sleep(0.05)
-    os.set_blocking(pipe, False)
 
 
 def end(how: str) -> None:
@@ -123,8 +110,6 @@ def main() -> None:
         os._exit(1)
     if behaviour == "asker":
         ask(Notifier())
-    if behaviour == "curious about itself":
-        note(f"env:{os.environ.get('MARK', '')}:{Path.cwd().name.replace(' ', '-')}:{requested_encoding()}")
     if behaviour == "environment":
         note("systemd:" + str("NOTIFY_SOCKET" in os.environ))
     if behaviour == "configured":

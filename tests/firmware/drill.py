@@ -1,8 +1,8 @@
 """A robot with Wi-Fi in virtual time, an operator that drives it, faults at random times, and one rule that must hold.
 
 The rule: motors only run as requested by a command that is fresh, not retained, and reached the board in the last
-second. It is checked at every event, also while the firmware blocks. The motors are read from the pins and the bus, not
-from the simulated body.
+second, and never while a stop is latched, also after a power cut. It is checked at every event, also while the firmware
+blocks. The motors are read from the pins and the bus, not from the simulated body.
 """
 
 from __future__ import annotations
@@ -16,18 +16,11 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Final
 
-from msgspec import UNSET
-from msgspec.structs import replace
-
-from pebble import contract as c
-from pebble.contract import codec
-from pebble.contract.payloads import Drive
 from pebble.extensions.lab.simulation.micropython.board import Board
 from pebble.extensions.lab.simulation.micropython.clock import VirtualClock
 from pebble.extensions.lab.simulation.micropython.ports import OF_ROBOT
-from tests.ext.lab.simulation.virtual_broker import Command, VirtualBroker
+from tests.ext.lab.simulation.virtual_broker import VirtualBroker
 from tests.ext.lab.simulation.virtual_network import VirtualNetwork
-from tests.firmware.rules import FREE, Rules
 
 START_S: Final = 1000.0  # of the clock, when a drill begins
 BUSY_S: Final = 0.01
@@ -41,11 +34,8 @@ NAME: Final = "00000000000000aa"  # of a stop
 ESTOP, RESET, STATE = f"{BASE}/incoming/estop", f"{BASE}/incoming/estop-reset", f"{BASE}/outgoing/estop/mcu"
 
 CONTROL, HOLDER = f"{BASE}/incoming/control", f"{BASE}/outgoing/control/mcu"
-ACCOUNTS: Final = {"a": "ann", "b": "bob"}  # by the first letter of an id
 
 _WRAP_MS = 1 << 30
-_FILE = "/estop.json"
-
 Outputs = tuple[float, ...]
 
 
@@ -83,16 +73,11 @@ class Shield:
 
 @dataclass
 class Arrived:
-    """A command that asks for ``wish``: when it left the broker, reached the board, and was followed by another.
-
-    It moves the motors for ``valid_s`` after it was read.
-    """
+    """A command that asks for ``wish``: when it left the broker, reached the board, and was followed by another."""
 
     sent: float
     arrived: float
     wish: Outputs
-    read: float
-    valid_s: float
     superseded: float = math.inf
 
 
@@ -102,18 +87,14 @@ class Seen:
 
     longest_run: float = 0.0  # motors on, after the last command that arrived
     oldest: float = 0.0  # on its way, from the broker to the motors that it moved
-    back: float = 0.0  # from the end of all faults to two heartbeats
     moves: int = 0
 
 
 class Drill:
-    """One robot and its environment; ``seed`` is that of all randomness.
+    """One robot and its environment; ``seed`` is that of all randomness."""
 
-    ``named``: the board checks names; its operators are of the accounts ann, who drives, and bob.
-    """
-
-    def __init__(self, kind: str, seed: int, *, named: bool = False) -> None:
-        self.kind, self.random, self.named = kind, random.Random(f"{kind} {seed}"), named
+    def __init__(self, kind: str, seed: int) -> None:
+        self.kind, self.random = kind, random.Random(f"{kind} {seed}")
         self.clock = WatchedClock(START_S)
         self.broker = VirtualBroker(self.clock.now)
         port = OF_ROBOT[kind]
@@ -140,8 +121,7 @@ class Drill:
         self._before: Outputs = ()
         self._commands: list[Arrived] = []
         self._arrived: dict[int, float] = {}  # of each command on its way through the board's buffers, by its id
-        self._meant: dict[tuple[str, bytes], Drive] = {}
-        self.rules = Rules(START_S)
+        self._meant: dict[bytes, Outputs] = {}
         self._events: list[tuple[float, int, Callable[[], object]]] = []
         self._count = itertools.count()
         self.robot = self._boot()
@@ -165,22 +145,20 @@ class Drill:
         self._pairs = [getattr(pins, name, None) for name in ("LEFT", "RIGHT", "GROUSERS")]
         host = self.random.choice(("10.0.0.2", "broker.test", "broker.local"))
         settings = {"robot": {"id": "rover"}, "wifi": {"ssid": "home", "password": "secret"}, "mqtt": {"host": host}}
-        settings["security"] = {"level": "named" if self.named else "open", "strangers": "drive"}
-        return self.board.load(self.kind, settings)
+        return self.board.load(self.kind, {**settings, "security": {"level": "open", "strangers": "drive"}})
 
     def cut_power(self) -> None:
         """Off, and on again at once: only the board's files survive."""
-        self._take_reads()
-        newest, rules = self.state(), self.rules
-        current = {"latched": True, "boot": self.robot.stops.latch.boot, "count": rules.count, "persisted": True}
-        promised = rules.latched and current.items() <= {key: newest.get(key) for key in current}.items()
-        saved = self.board.files.get(_FILE, FREE)
+        newest, latch = self.state(), self.robot.stops.latch
+        current = {"latched": latch.latched, "boot": latch.boot, "count": latch.count, "persisted": True}
+        promised = latch.latched and current.items() <= newest.items()
         self._commands.clear()
         self._arrived.clear()
-        rules.restart(self.clock.now(), saved, promised=promised)
         self.network.power_off()
         self.shield.speeds = [0.0, 0.0]
         self.robot = self._boot()
+        if promised and not self.robot.stops.latch.latched:
+            raise ViolatedError(f"{self.seconds:.3f} s: a power cut has freed a robot that was said to be stopped")
 
     # -- time
 
@@ -225,44 +203,23 @@ class Drill:
 
     # -- the operator
 
-    def command(
-        self,
-        x: float,
-        z: float,
-        y: float = 0.0,
-        *,
-        account: str = "ann",
-        qos: int = 1,
-        retain: bool = False,
-        **more: Any,
-    ) -> None:
-        payload, topic = json.dumps({"x": x, "z": z, "y": y, **more}).encode(), self.topic("drive-values", account)
-        drive = codec.decode(c.DRIVE, payload)
-        elsewhere = self.named and drive.signed and drive.key is UNSET  # a script of which only a zero counts
-        if not elsewhere:
-            self._meant[topic, payload] = drive
-        elif not drive.moves:
-            self._meant[topic, payload] = replace(drive, source=UNSET, run=UNSET)
-        self.broker.publish(topic, payload, qos=qos, retain=retain)
+    def command(self, x: float, z: float, y: float = 0.0, *, qos: int = 1, retain: bool = False, **more: Any) -> None:
+        payload = json.dumps({"x": x, "z": z, "y": y, **more}).encode()
+        self._meant[payload] = wanted(self.kind, x, z, y)
+        self.broker.publish(DRIVE, payload, qos=qos, retain=retain)
 
-    def nonsense(self, payload: bytes, *, account: str = "bob", qos: int = 1, retain: bool = False) -> None:
+    def nonsense(self, payload: bytes, *, qos: int = 1, retain: bool = False) -> None:
         """Publish a command that must not move a robot."""
-        self.broker.publish(self.topic("drive-values", account), payload, qos=qos, retain=retain)
-
-    def topic(self, metric: str, account: str) -> str:
-        """Where this account publishes; "": under no name."""
-        return f"{BASE}/incoming/{f'by/{account}/' if self.named and account else ''}{metric}"
+        self.broker.publish(DRIVE, payload, qos=qos, retain=retain)
 
     def stop(self, name: str = NAME, **more: str) -> None:
-        """One in two has a name where names are checked: both forms stop."""
-        payload = json.dumps({"stop": name, "by": "drill", **more}).encode()
-        self.broker.publish(self.topic("estop", ("", "bob")[name[-1:] in "13579bdf"]), payload, qos=1)
+        self.broker.publish(ESTOP, json.dumps({"stop": name, "by": "drill", **more}).encode(), qos=1)
 
     def reset(self, *, behind: int = 0, **changes: Any) -> None:
         """Reset by the newest state that arrived, or one that is so many stops older, or with other ``changes``."""
         if state := self.state():
             order = {"boot": state["boot"], "count": state["count"] - behind, "by": "drill", **changes}
-            self.broker.publish(self.topic("estop-reset", "ann"), json.dumps(order).encode(), qos=1)
+            self.broker.publish(RESET, json.dumps(order).encode(), qos=1)
 
     def state(self) -> dict[str, Any]:
         """The newest state of the emergency stop that arrived; empty: none."""
@@ -271,8 +228,7 @@ class Drill:
         return state
 
     def request(self, name: str = "aaaaaaaa", *, take: bool = False, **more: Any) -> None:
-        """Request control, as ann or bob."""
-        topic = self.topic("control/take" if take else "control", ACCOUNTS.get(name[:1], "ann"))
+        topic = f"{CONTROL}/take" if take else CONTROL
         self.broker.publish(topic, json.dumps({"id": name, "by": f"drill-{name[0]}", **more}).encode(), qos=1)
 
     def control(self) -> dict[str, Any]:
@@ -280,23 +236,6 @@ class Drill:
         payloads = self.received(HOLDER)
         state: dict[str, Any] = json.loads(payloads[-1]) if payloads else {}
         return state
-
-    def by_key(self, x: float, z: float, y: float) -> None:
-        """A command of who has control, if anybody has; and one by a key of before, which must not move anything.
-
-        Nor must the key of now under another's name.
-        """
-        states = [json.loads(payload) for payload in self.received(HOLDER)]
-        keys = [state["key"] for state in states]
-        newest = keys[-1] if keys else ""
-        holder = states[-1]["by"].partition("/")[0] if newest else "ann"
-        self.command(x, z, y, **({"key": newest} if newest else {}), account=holder)
-        if self.named and newest:
-            other = "bob" if holder == "ann" else "ann"
-            self.nonsense(json.dumps({"x": -x, "z": 0.76, "y": 1, "key": newest}).encode(), account=other)
-            self.broker.publish(DRIVE, json.dumps({"x": -x, "z": 0.75, "y": 1, "key": newest}).encode(), qos=1)
-        old = [key for key in keys if key not in (newest, "")] or ["0badf00d"]
-        self.nonsense(json.dumps({"x": -z, "z": 0.77, "y": 1, "key": self.random.choice(old)}).encode())
 
     # -- faults
 
@@ -334,14 +273,15 @@ class Drill:
     def check(self) -> None:
         outputs, now = self.outputs(), self.clock.now()
         self._take_reads()
-        self.rules.tick(now)
         if any(outputs) and now > self._rests_until:
+            if self.robot.stops.latch.latched:
+                raise ViolatedError(f"{self.seconds:.3f} s: the motors are at {outputs} though a stop is latched")
             self._check_motion(now, outputs)
         self._before = outputs
 
     def _check_motion(self, now: float, outputs: Outputs) -> None:
         asked = [one for one in self._commands if now - one.arrived <= LIMIT_S and one.wish == outputs]
-        asked = [one for one in asked if now - one.superseded <= TURN_S and now - one.read <= one.valid_s + TURN_S]
+        asked = [one for one in asked if now - one.superseded <= TURN_S]
         if not asked:
             raise ViolatedError(
                 f"{self.seconds:.3f} s: the motors are at {outputs}, without a command for it in the last second"
@@ -362,30 +302,12 @@ class Drill:
         now = self.clock.now()
         for command in self.network.reads:
             arrived = self._arrived.pop(id(command), now)
-            if command.retained:
-                continue
-            metric = command.topic.rpartition("/")[2]
-            if metric == "drive-values":
-                self._take_drive(command, arrived, now)
-            elif metric == "estop" and self.rules.stop(command.payload):
-                self._supersede(arrived)
-            elif metric == "estop-reset":
-                self.rules.reset(command.payload, self.robot.stops.latch.boot, now)
+            wish = None if command.retained or command.topic != DRIVE else self._meant.get(command.payload)
+            if wish is not None:
+                for one in self._commands[-1:]:
+                    one.superseded = min(one.superseded, arrived)
+                self._commands.append(Arrived(command.left_at, arrived, wish))
         self.network.reads.clear()
-
-    def _take_drive(self, command: Command, arrived: float, now: float) -> None:
-        drive = self._meant.get((command.topic, command.payload))
-        if drive is not None and drive.key and drive.key != self.robot.stops.lease.key:
-            return  # control has passed on meanwhile
-        valid_s = self.rules.admits(drive, now) if drive is not None else None
-        if drive is not None and valid_s is not None:
-            self._supersede(arrived)
-            wish = wanted(self.kind, drive.x, drive.z, drive.y)
-            self._commands.append(Arrived(command.left_at, arrived, wish, now, valid_s))
-
-    def _supersede(self, arrived: float) -> None:
-        for one in self._commands[-1:]:
-            one.superseded = min(one.superseded, arrived)
 
 
 def wanted(kind: str, x: float, z: float, y: float) -> Outputs:

@@ -40,16 +40,8 @@ def compile_all(target: Path) -> Path:
 
 
 def run(
-    root: Path, script: Path, *, heap: int = 1024 * 1024, capped: bool = False, timeout_s: float = 60.0
+    root: Path, script: Path, *, heap: int = 1024 * 1024, timeout_s: float = 60.0
 ) -> subprocess.CompletedProcess[str]:
-    """``script`` in MicroPython, which sees ``root`` as its file system. ``capped``: the heap does not grow."""
-    command = [
-        "node",
-        str(SCRIPTS / "run.mjs"),
-        str(VM),
-        str(root),
-        str(script),
-        str(heap),
-        *(["cap"] if capped else []),
-    ]
+    """``script`` in MicroPython, which sees ``root`` as its file system."""
+    command = ["node", str(SCRIPTS / "run.mjs"), str(VM), str(root), str(script), str(heap)]
     return subprocess.run(command, capture_output=True, text=True, timeout=timeout_s, check=False)

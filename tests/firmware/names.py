@@ -19,7 +19,7 @@ _NAME = 7  # bytes in a pool: address, hash, length
 _BLOCK = 16  # the heap gives nothing smaller
 
 
-def cost(compiled: list[Path], port: str, *, in_place: bool = False) -> int:
+def cost(compiled: list[Path], port: str, in_place: bool) -> int:
     """Bytes of heap for the names in these .mpy files on a board of this port.
 
     ``in_place``: the files are in a ROM file system, and names stay there; only their addresses are in RAM.

@@ -12,7 +12,7 @@ from tests.ext.lab.simulation.virtual_network import Answers
 from tests.firmware.drill import LIMIT_S, ONLINE, RESENT_S, Drill, ViolatedError
 
 _NETWORK: Final = ("wifi", "broker", "hole", "dns", "ntp", "frozen", "mute")
-_COMMANDS: Final = ("quiet", "flood", "retained", "stale", "limits", "script", "stops", "control")
+_COMMANDS: Final = ("quiet", "flood", "retained", "stale", "stops")
 FAULTS: Final = (*_NETWORK, *_COMMANDS, "i2c", "power", "disk")
 ACT_S: Final = 8.0  # so long an operator drives and things go wrong
 #: Then a connection is not about to be given up, and a board hears all again: after a flood at first only stops.
@@ -99,13 +99,12 @@ def _come_back(drill: Drill) -> None:
             raise ViolatedError(
                 f"not online {BACK_S:.0f} s after the last fault: {drill.robot.session.connection.reason}"
             )
-    drill.seen.back = drill.seconds - since
 
 
 def _obey_again(drill: Drill) -> None:
     """A robot that is stopped is reset; then it executes commands, and stops by itself."""
     since = drill.seconds
-    while drill.rules.latched or drill.state()["latched"]:
+    while drill.robot.stops.latch.latched or drill.state()["latched"]:
         drill.reset()
         drill.run(drill.seconds + 1.0)
         if drill.seconds > since + BACK_S:
@@ -201,51 +200,6 @@ def _mute(drill: Drill, start: float, length: float) -> None:
     drill.at(start + length, lambda: setattr(drill.network.conditions, "mute", False))
 
 
-def _limits(drill: Drill, start: float, length: float) -> None:
-    """Commands that are valid for a short time, and after each of them a pause."""
-    _quiet(drill, start, length)
-    at = start
-    while at < start + length:
-        valid_ms, axes = drill.random.choice((50, 200, 400, 700, 5000)), (_wish(drill), _wish(drill), _wish(drill))
-        drill.at(at, partial(drill.command, *axes, valid_ms=valid_ms))
-        at += drill.random.uniform(0.1, 1.2)
-
-
-def _script(drill: Drill, start: float, _length: float) -> None:
-    """A script drives while the operator is silent; some stops, other runs, and commands of the operator beside it."""
-    random = drill.random
-    _quiet(drill, start, ACT_S)
-    run, at = random.randrange(1, 1000), start
-    while at < ACT_S:
-        axes = (_wish(drill), _wish(drill), _wish(drill))
-        event = random.random()
-        if event < 0.02:
-            drill.at(at, lambda: drill.command(0.0, 0.0))
-        elif event < 0.03:
-            drill.at(at, lambda: drill.command(0.0, 0.0, valid_ms=0))
-        elif event < 0.04:
-            drill.at(at, partial(drill.command, *axes))
-        elif event < 0.06:
-            run += random.choice((1, 1, 5))
-        sent = run - 1 if random.random() < 0.05 else run
-        drill.at(at, partial(drill.command, *axes, source="autonomy", run=sent, valid_ms=400))
-        at += random.uniform(0.03, 0.1)
-
-
-def _control(drill: Drill, start: float, _length: float) -> None:
-    """Two people take control from one another, let it go and come back; who has it drives, and a key of before."""
-    random, at = drill.random, start
-    while at < ACT_S:
-        name, event = random.choice(("aaaaaaaa", "bbbbbbbb")), random.random()
-        if event < 0.1:
-            drill.at(at, partial(drill.request, name, take=random.random() < 0.3, for_ms=random.choice((0, 3000))))
-        elif event < 0.12:
-            drill.at(at, partial(drill.request, name, want="release"))
-        else:
-            drill.at(at, partial(drill.by_key, _wish(drill), _wish(drill), _wish(drill)))
-        at += random.uniform(0.03, 0.1)
-
-
 def _stops(drill: Drill, start: float, length: float) -> None:
     """Presses, each repeated; then resets, of which some are made from an older state."""
     random = drill.random
@@ -274,9 +228,6 @@ def _disk(drill: Drill, start: float, length: float) -> None:
 
 
 _EVENTS: Final = {
-    "limits": _limits,
-    "script": _script,
-    "control": _control,
     "stops": _stops,
     "power": _power,
     "disk": _disk,

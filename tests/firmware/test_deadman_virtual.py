@@ -4,8 +4,7 @@ Checked: motors are off at most 1.0 s after the last command that arrived; they 
 retained messages and nonsense never move them; no command moves them that left the broker more than 2.45 s ago (the
 time in the broker's own queue is unknown); no turn of the loop blocks; after the faults the robot is online again
 within 30 s and executes commands. While it is stopped nothing moves, also after a power cut once its state says that
-this is saved; a script moves nothing while a person drives, nor ever again once it is barred; no command moves anything
-for longer than it is valid.
+this is saved.
 """
 
 from __future__ import annotations
@@ -36,7 +35,6 @@ def test_motors_obey_the_newest_fresh_command_and_stop_without_one(kind: str) ->
     )  # and often stopped by the dead-man's switch only
     assert sum(drill.robot.refused for drill in drills) > MIXED
     assert sum(drill.robot.stops.latch.count for drill in drills) > MIXED // 10
-    assert sum(drill.robot.stops.arbiter.barred > 0 for drill in drills) >= MIXED // 20
 
 
 @pytest.mark.parametrize("fault", FAULTS)
@@ -47,7 +45,7 @@ def test_each_fault_alone(kind: str, fault: str) -> None:
 
 
 def _performed(kind: str, seed: int, *faults: str) -> Drill:
-    drill = Drill(kind, seed, named=seed % 2 == 1)
+    drill = Drill(kind, seed)
     try:
         perform(drill, *([faults] if faults else []))
     except ViolatedError as error:

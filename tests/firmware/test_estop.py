@@ -5,7 +5,6 @@ from __future__ import annotations
 import errno
 import json
 from itertools import pairwise
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -90,20 +89,6 @@ def test_a_reset_of_another_state_is_refused(changes: dict[str, Any], why: str) 
     assert (drill.state()["latched"], drill.state()["reset_refused"]) == (True, why)
 
 
-def test_a_stop_that_is_repeated_changes_nothing_and_is_confirmed_again() -> None:
-    drill = stopped()
-    drill.reset()
-    wait(drill, 1.0)
-    drill.command(0.0, 0.5)
-    wait(drill)
-    count = len(states(drill))
-    drill.stop()
-    wait(drill, 0.5)
-    assert any(drill.outputs())
-    assert len(states(drill)) == count + 1
-    assert not drill.state()["latched"]
-
-
 @pytest.mark.parametrize(
     "payload",
     [b"{}", b'{"stop": "<16 hex digits>"}', b"x", b"[" * 400, b'{"stop": "', b"\xff", b"x" * 700, b"x" * 5000],
@@ -164,13 +149,6 @@ def test_a_zero_counts_though_a_newer_command_replaces_it() -> None:
     wait(drill)
     assert not any(drill.outputs())
     assert drill.state()["barred"] == 17
-    wait(drill, 2.5)
-    signed(drill, 17)
-    wait(drill)
-    assert not any(drill.outputs())
-    signed(drill, 18)
-    wait(drill)
-    assert any(drill.outputs())
 
 
 @pytest.mark.parametrize(("valid_ms", "runs_s"), [(300, 0.3), (5000, 0.9)])
@@ -318,15 +296,3 @@ def test_the_refusal_of_the_drive_topic_is_fatal() -> None:
     drill.run(8.0)
     assert drill.robot.session.connection.reason == "subscription refused"
     assert not drill.received(f"{BASE}/outgoing/online", START_S)
-
-
-def test_the_simulated_robot_keeps_its_files_in_a_folder(tmp_path: Path) -> None:
-    from pebble.extensions.lab.simulation.micropython.files import Files
-
-    files = Files(tmp_path / "board")
-    with files.open("/estop.new", "w") as file:
-        file.write("{}")  # type: ignore[call-overload]
-    files.rename("/estop.new", FILE)
-    assert dict(Files(tmp_path / "board")) == {FILE: b"{}"}
-    files.remove(FILE)
-    assert dict(Files(tmp_path / "board")) == {}

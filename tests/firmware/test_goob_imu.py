@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import random
 from itertools import pairwise
 
 import pytest
@@ -11,7 +10,6 @@ from pebble.services.serial_mcu_bridge.pebble_serial_v1.frame import Frame, Type
 from pebble.services.serial_mcu_bridge.pebble_serial_v1.manifest import parse_describe, parse_hello
 from pebble.services.serial_mcu_bridge.pebble_serial_v1.struct_v1 import unpack
 from tests.firmware.benches import ASK, Bench, of
-from tests.support import cases
 
 
 @pytest.fixture
@@ -99,14 +97,6 @@ def test_a_lost_mpu_is_reported_and_found_again(bench: Bench) -> None:
     assert samples[-1].sequence - samples[0].sequence == len(samples) - 1
 
 
-def test_an_mpu_that_lost_its_settings_gets_them_again(bench: Bench) -> None:
-    bench.frames(0.5)
-    bench.body.imu.reset()
-    frames = bench.frames(1.5)
-    assert [frame.payload for frame in of(frames, Type.LOG)] == [b"imu_read_failed", b"imu_reinit"]
-    assert unpack(bench.manifest().interfaces[0].fields, of(frames, Type.SAMPLE)[-1].payload)["az"] > 9.0
-
-
 def test_it_describes_itself_though_its_loop_is_slow() -> None:
     """Every turn brings a sample then."""
     bench = Bench("goob_imu", turn_ms=12)
@@ -114,13 +104,6 @@ def test_it_describes_itself_though_its_loop_is_slow() -> None:
     frames = bench.frames(0.24)
     assert len(of(frames, Type.DESCRIBE)) == 1
     assert len(of(frames, Type.SAMPLE)) >= 18
-
-
-def test_a_board_without_an_mpu_reports_it_every_second(bench: Bench) -> None:
-    bench.board.bus.detach(0x68)
-    frames = bench.frames(3.5)
-    assert [frame.payload for frame in of(frames, Type.LOG)] == [b"imu_init_failed"] * 4
-    assert of(bench.asked(Type.DESCRIBE_REQ), Type.DESCRIBE)
 
 
 def test_a_host_that_did_not_read_gets_the_number_of_lost_frames(bench: Bench) -> None:
@@ -141,21 +124,3 @@ def test_a_host_that_did_not_read_gets_the_number_of_lost_frames(bench: Bench) -
 def test_ctrl_c_is_a_byte_like_any_other(bench: Bench) -> None:
     bench.board.type(b"\x03\x03\x00" + ASK)
     assert of(bench.frames(0.1), Type.DESCRIBE)
-
-
-def test_milliseconds_go_on_when_the_ticks_wrap() -> None:
-    bench = Bench("goob_imu", turn_ms=2, ticks_at_boot_ms=(1 << 30) - 500)
-    samples = of(bench.frames(1.0), Type.SAMPLE)
-    steps = {(later.timestamp - one.timestamp) % (1 << 30) for one, later in pairwise(samples)}
-    assert steps == {10}
-
-
-def test_hostile_input(bench: Bench) -> None:
-    noise = random.Random(4)
-    for _ in range(cases(5_000, 20_000)):
-        bench.board.type(noise.randbytes(noise.randrange(12)) + b"\0")
-        bench.robot.step()
-    bench.board.type(b"\0")
-    bench.frames(1.0)
-    assert (bench.damaged, bench.board.console.unread) == (0, 0)
-    assert of(bench.asked(Type.DESCRIBE_REQ), Type.DESCRIBE)

@@ -1,10 +1,12 @@
-"""What a robot must not do for whatever arrives on its topics: move, crash, or let its heartbeat stop."""
+"""Real sockets and a real broker: whatever arrives or fails, motors are off in time and heartbeats go on."""
 
 from __future__ import annotations
 
 import json
 import time
 from collections.abc import Iterator
+from contextlib import ExitStack
+from pathlib import Path
 
 import pytest
 
@@ -12,6 +14,7 @@ from pebble.extensions.lab.simulation.wireless import KINDS
 from tests.firmware.schedules import HOSTILE
 from tests.firmware.wireless_rig import Operator, Robots
 from tests.support import Broker, until
+from tests.tcp_proxy import TcpProxy
 
 HUGE = (
     b'{"x": 0, "z": 1, "pad": "' + b"x" * 100_000 + b'"}',
@@ -25,136 +28,132 @@ HUGE = (
     b'\xef\xbb\xbf{"z": 1',
     b"\x00" * 1000,
 )
-RATE_HZ, EVERY_S = 4.0, 0.05
+LIMIT_S, RATE_HZ, EVERY_S = 1.0, 4.0, 0.05
+
+
+class Hall:
+    """A broker, a link to one robot of each kind, and an operator; while they connect, a command is retained."""
+
+    def __init__(self, folder: Path, stack: ExitStack) -> None:
+        self.broker = Broker(folder)
+        stack.callback(self.broker.kill)
+        self.link = stack.enter_context(TcpProxy(self.broker.port))
+        self.operator = stack.enter_context(Operator(self.broker.port))
+        for info in [self.operator.send(kind, b'{"x": 0, "z": 1}', retain=True) for kind in KINDS]:
+            assert info is not None
+            info.wait_for_publish(5)
+        self.robots = stack.enter_context(Robots("127.0.0.1", self.link.port))
+        self.robots.wait_online()
+        assert self.beating(time.monotonic())
+        self.have_not_moved()
+
+    def moving(self) -> bool:
+        return all(map(self.robots.moving, KINDS))
+
+    def resting(self) -> bool:
+        return not any(map(self.robots.moving, KINDS))
+
+    def drive(self, z: float = 0.8) -> float:
+        """Return when the broker had it."""
+        for info in [self.operator.drive(kind, 0.0, z) for kind in KINDS]:
+            assert info is not None
+            info.wait_for_publish(5)
+        return time.monotonic()
+
+    def beating(self, since: float, count: float = 2.0) -> bool:
+        return until(lambda: all(self.operator.beating(kind, since) > count for kind in KINDS))
+
+    def have_not_moved(self) -> None:
+        assert [self.robots.moves[kind] for kind in KINDS] == [[], []]
 
 
 @pytest.fixture(scope="module")
-def broker(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Broker]:
-    broker = Broker(tmp_path_factory.mktemp("broker"))
-    yield broker
-    broker.kill()
-
-
-@pytest.fixture(scope="module")
-def operator(broker: Broker) -> Iterator[Operator]:
-    with Operator(broker.port) as operator:
-        yield operator
-
-
-@pytest.fixture(scope="module")
-def running(broker: Broker, operator: Operator) -> Iterator[Robots]:
-    """While they connect for the first time there is a retained command."""
-    for kind in KINDS:
-        info = operator.send(kind, b'{"x": 0, "z": 1}', retain=True)
-        assert info is not None
-        info.wait_for_publish(5)
-    with Robots("127.0.0.1", broker.port) as robots:
-        robots.wait_online()
-        assert beating_again(operator, time.monotonic())
-        assert [robots.moves[kind] for kind in KINDS] == [[], []]
-        yield robots
+def running(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Hall]:
+    with ExitStack() as stack:
+        yield Hall(tmp_path_factory.mktemp("hall"), stack)
 
 
 @pytest.fixture
-def robots(running: Robots) -> Robots:
-    """Online, free and at rest."""
-    running.wait_online()
-    assert until(lambda: not any(map(running.moving, KINDS)))
-    for moves in running.moves.values():
+def hall(running: Hall) -> Hall:
+    """With robots online, free and at rest."""
+    running.robots.wait_online()
+    assert until(running.resting)
+    for moves in running.robots.moves.values():
         moves.clear()
     return running
 
 
-def beating_again(operator: Operator, since: float, count: float = 2.0) -> bool:
-    return until(lambda: all(operator.beating(kind, since) > count for kind in KINDS))
-
-
-def reset(robots: Robots, operator: Operator) -> None:
-    for kind, robot in robots.robots.items():
-        latch = robot.firmware.stops.latch
-        operator.send(kind, json.dumps({"boot": latch.boot, "count": latch.count}), metric="estop-reset")
-    assert until(lambda: not any(robot.firmware.stops.latch.latched for robot in robots.robots.values()))
-
-
-def test_a_retained_command_moves_no_robot_that_connects_or_reconnects(robots: Robots, operator: Operator) -> None:
-    for robot in robots.robots.values():
-        robot.network.radio.lose()
-    assert until(lambda: not any(robot.online for robot in robots.robots.values()))
-    for robot in robots.robots.values():
-        robot.network.radio.restore()
-    robots.wait_online()
-    assert beating_again(operator, time.monotonic())
-    assert [robots.moves[kind] for kind in KINDS] == [[], []]
-    assert all(robot.refused >= 2 for robot in robots.firmware())
-
-
-def test_nothing_hostile_moves_a_robot_or_stops_its_heartbeat(robots: Robots, operator: Operator) -> None:
+def test_nothing_hostile_moves_a_robot_or_stops_its_heartbeat(hall: Hall) -> None:
     began = time.monotonic()
     for number, payload in enumerate((*HOSTILE, *HUGE)):
         for kind in KINDS:
-            operator.send(kind, payload, qos=number % 2)
+            hall.operator.send(kind, payload, qos=number % 2)
         time.sleep(EVERY_S)
-    assert beating_again(operator, began, 2.5 * RATE_HZ)
+    assert hall.beating(began, 2.5 * RATE_HZ)
+    hall.have_not_moved()
     for kind in KINDS:
-        assert robots.moves[kind] == []
-        stamps = [body["t"] for at, body in operator.heartbeats[kind] if at > began]
+        stamps = [body["t"] for at, body in hall.operator.heartbeats[kind] if at > began]
         assert (len(stamps) - 1) / (stamps[-1] - stamps[0]) * 1000 == pytest.approx(RATE_HZ, rel=0.1)
-        assert robots.robots[kind].online
-        operator.drive(kind, 0.0, 0.8)
-    assert until(lambda: all(map(robots.moving, KINDS)))
-    assert until(lambda: not any(map(robots.moving, KINDS)))
-    assert robots.alive
+        assert hall.robots.robots[kind].online
+    hall.drive()
+    assert until(hall.moving)
+    assert hall.robots.alive
 
 
-def test_nothing_hostile_on_the_topics_of_stops_frees_a_robot_or_stops_its_heartbeat(
-    robots: Robots, operator: Operator
-) -> None:
-    """What cannot be read stops it, and it is reset and driven afterwards."""
+def test_nothing_hostile_frees_a_robot_and_what_cannot_be_read_stops_it(hall: Hall) -> None:
     began = time.monotonic()
     for number, payload in enumerate((*HOSTILE, *HUGE)):
         for kind in KINDS:
             for metric in ("estop", "estop-reset"):
-                operator.send(kind, payload, qos=number % 2, metric=metric)
+                hall.operator.send(kind, payload, qos=number % 2, metric=metric)
         time.sleep(EVERY_S)
-    assert beating_again(operator, began, 2.5 * RATE_HZ)
-    for kind, robot in robots.robots.items():
-        latch = robot.firmware.stops.latch
+    assert hall.beating(began, 2.5 * RATE_HZ)
+    hall.drive()
+    latches = {kind: robot.firmware.stops.latch for kind, robot in hall.robots.robots.items()}
+    for kind, latch in latches.items():
         assert latch.latched
         assert latch.count >= len((*HOSTILE, *HUGE)) - 1  # an empty one is none
-        operator.drive(kind, 0.0, 0.8)
-    reset(robots, operator)
-    assert [robots.moves[kind] for kind in KINDS] == [[], []]
-    for kind in KINDS:
-        operator.drive(kind, 0.0, 0.0)
-        operator.drive(kind, 0.0, 0.8)
-    assert until(lambda: all(map(robots.moving, KINDS)))
-    assert robots.alive
+        hall.operator.send(kind, json.dumps({"boot": latch.boot, "count": latch.count}), metric="estop-reset")
+    assert until(lambda: not any(latch.latched for latch in latches.values()))
+    hall.have_not_moved()
+    hall.drive(0.0)
+    hall.drive()
+    assert until(hall.moving)
+    assert hall.robots.alive
 
 
-def test_messages_without_end_do_not_keep_the_motors_on(robots: Robots, operator: Operator) -> None:
+def test_messages_without_end_do_not_keep_the_motors_on(hall: Hall) -> None:
     """Nonsense at a high rate feeds no dead-man, and a stop is obeyed in the middle of it."""
-    for kind in KINDS:
-        operator.drive(kind, 0.0, 0.8)
-    assert until(lambda: all(map(robots.moving, KINDS)))
+    hall.drive()
+    assert until(hall.moving)
     end = time.monotonic() + 1.5
     while time.monotonic() < end:
         for kind in KINDS:
-            operator.send(kind, b'{"x": 0, "z": NaN}')
+            hall.operator.send(kind, b'{"x": 0, "z": NaN}')
         time.sleep(0.003)
-    assert not any(map(robots.moving, KINDS))
-    assert robots.alive
+    assert hall.resting()
+    assert hall.robots.alive
 
 
-def test_a_stop_survives_a_power_cut_on_a_real_broker(robots: Robots, operator: Operator) -> None:
-    before = robots.firmware()
-    for kind, robot in robots.robots.items():
-        operator.send(kind, b'{"stop": "00000000000000aa"}', metric="estop")
-        assert until(lambda robot=robot: robot.firmware.stops.latch.latched)  # type: ignore[misc]
-        robot.cut_power()
-    assert until(lambda: not any(one is other for one, other in zip(before, robots.firmware(), strict=True)))
-    robots.wait_online()
-    for kind, robot in robots.robots.items():
-        assert robot.firmware.stops.latch.latched
-        operator.drive(kind, 0.0, 0.8)
-    assert beating_again(operator, time.monotonic())
-    assert [robots.moves[kind] for kind in KINDS] == [[], []]
+@pytest.mark.parametrize("fault", ["black hole", "Wi-Fi lost", "broker killed"])
+def test_motors_are_off_within_a_second_and_no_retained_command_moves_them_afterwards(hall: Hall, fault: str) -> None:
+    radios = [robot.network.radio for robot in hall.robots.robots.values()]
+    begin, end = {
+        "black hole": (hall.link.blackhole, hall.link.resume),
+        "Wi-Fi lost": (lambda: [radio.lose() for radio in radios], lambda: [radio.restore() for radio in radios]),
+        "broker killed": (hall.broker.kill, hall.broker.start),
+    }[fault]
+    last = hall.drive()
+    assert until(hall.moving)
+    begin()
+    assert until(hall.resting, 3.0)
+    for kind in KINDS:
+        assert hall.robots.stopped_at(kind) - last <= LIMIT_S, kind
+    assert until(lambda: not any(robot.online for robot in hall.robots.robots.values()))
+    end()
+    moves = {kind: len(moves) for kind, moves in hall.robots.moves.items()}
+    hall.robots.wait_online(20.0)
+    assert hall.beating(time.monotonic())
+    assert {kind: len(moves) for kind, moves in hall.robots.moves.items()} == moves
+    assert until(lambda: [hall.operator.drive(kind, 0.0, 0.8) for kind in KINDS] and hall.moving(), step=EVERY_S)
+    assert hall.robots.alive

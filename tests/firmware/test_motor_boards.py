@@ -145,17 +145,6 @@ def test_lights_glow(kind: str, line: bytes, shown: tuple[float, float, float]) 
     assert (light.blue, light.green, light.red) == pytest.approx(shown, abs=0.001)
 
 
-def test_lights_fade(bench: Bench) -> None:
-    bench.send(b"F 0 0 1 1")
-    seen = []
-    for _ in range(40):
-        bench.turn(0.05)
-        seen.append(bench.body.light().red)
-    assert max(seen) > 0.9
-    assert min(seen) < 0.1
-    assert seen[:20] == pytest.approx(seen[20:], abs=0.1)
-
-
 def test_freds_motors_and_lights_share_no_signal() -> None:
     """Seven signals on six timer channels: a motor's two pins take turns on one."""
     bench = Bench("fred")

@@ -12,7 +12,6 @@ from typing import Any
 import pytest
 
 from tests.ext.lab.simulation.virtual_broker import Session, VirtualBroker
-from tests.ext.lab.simulation.virtual_network import Answers
 from tests.firmware.drill import BASE, DRIVE, LIMIT_S, ONLINE, STALE_S, START_S, Drill
 from wifi import sockets
 
@@ -26,14 +25,11 @@ def online(
     kind: str,
     seed: int = 1,
     *,
-    time: Answers = "answers",
     refused: Iterable[str] = (),
-    named: bool = False,
     **settings: Any,
 ) -> Drill:
     """A robot that is connected; ``refused`` topics cannot be subscribed to, ``settings`` change those of its board."""
-    drill = Drill(kind, seed, named=named)
-    drill.network.conditions.ntp = time
+    drill = Drill(kind, seed)
     drill.broker.refused = set(refused)
     if settings:
         base = {"robot": {"id": "rover"}, "wifi": {"ssid": "home"}, "mqtt": {"host": "10.0.0.2"}}
@@ -113,18 +109,6 @@ def test_the_heartbeat_is_stamped_in_real_milliseconds(kind: str) -> None:
         assert abs(EPOCH_MS + at * 1000 - t) < 150  # the way of the message and half of the time server's
 
 
-def test_without_a_time_server_it_counts_from_its_start() -> None:
-    drill = online("benjr", time="silent")
-    assert all(heartbeat["t"] < 60_000 for heartbeat in published(drill, "online"))
-
-
-def test_a_time_server_that_cannot_be_asked_disturbs_nothing() -> None:
-    drill = online("benjr", ntp="no..name")
-    drill.run(10)
-    assert drill.robot.session.connection.state == "online"
-    assert drill.robot.session.connection.losses == 0
-
-
 @pytest.mark.parametrize("kind", KINDS)
 def test_the_battery_every_five_seconds_and_not_retained(kind: str) -> None:
     drill = Drill(kind, 1)
@@ -196,20 +180,6 @@ def test_of_a_burst_only_the_newest_acts(kind: str) -> None:
     drill.run(drill.seconds + 0.3)
     assert drill.outputs() == AHEAD[kind]
     assert drill.seen.moves == moves + 1
-
-
-@pytest.mark.parametrize("kind", KINDS)
-def test_a_command_right_behind_the_subscription_acts_at_once_or_never(kind: str) -> None:
-    drill = online(kind)
-    drill.drop_robot()
-    while drill.robot.session.connection.state != "connecting":
-        drill.turn(0.01)
-    start = drill.seconds
-    while drill.robot.session.connection.state != "online":
-        drill.command(0.0, 0.5)
-        drill.turn(0.005)
-    drill.run(start + 5)  # the rule is checked at every turn
-    assert not any(drill.outputs())
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -313,12 +283,6 @@ def test_only_who_was_asked_may_answer(
 ) -> None:
     FakeSocket(monkeypatch, datagrams=(b"answer", (answers, 53)))
     assert sockets.Query(asked, 53, b"question", 0).step(0) == received
-
-
-def test_the_end_of_a_connection_has_a_readable_reason(monkeypatch: pytest.MonkeyPatch) -> None:
-    FakeSocket(monkeypatch, reads=0)
-    with pytest.raises(OSError, match="closed by the broker"):
-        sockets.Stream("10.0.0.2", 1883, None).read(memoryview(bytearray(1)))
 
 
 def test_what_tls_could_not_send_comes_again_as_it_was(monkeypatch: pytest.MonkeyPatch) -> None:

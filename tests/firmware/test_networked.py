@@ -10,23 +10,20 @@ import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from threading import Thread
-from types import SimpleNamespace
 from typing import Any
 
 import msgspec
 import pytest
 
 from pebble.commands import app
-from pebble.errors import PebbleError
-from pebble.extensions.lab.simulation import networked
+from pebble.errors import ConfigError, PebbleError
+from pebble.extensions.lab.simulation.fleet import members
 from pebble.extensions.lab.simulation.mcu import Snapshot
 from pebble.extensions.lab.simulation.trace import read_trace
 from pebble.extensions.lab.simulation.wireless import KINDS
-from tests.firmware.wireless_rig import Operator, Robots
+from tests.firmware.wireless_rig import Operator
 from tests.support import ROOT, Broker, Child, free_port, until
 
-TLS = ROOT / "tests" / "data" / "tls"
 END_S = 1.0
 NAME = 'The "lamp", naïve'  # as JSON must escape it
 
@@ -37,7 +34,7 @@ class Program:
     def __init__(self, folder: Path, kind: str, broker: str, *options: str, **environment: str) -> None:
         self._files = folder / f"{kind}.out", folder / f"{kind}.err"
         out, err = (path.open("wb") for path in self._files)
-        command = [sys.executable, "-m", "pebble.cli", "sim", kind, "--broker", f"mqtt://{broker}", *options]
+        command = [sys.executable, "-m", "pebble.cli", "sim", kind, "--broker", broker, *options]
         with out, err:
             self.process = Child(
                 command, cwd=ROOT, stdin=subprocess.DEVNULL, stdout=out, stderr=err, env={**os.environ, **environment}
@@ -84,8 +81,9 @@ def test_both_are_driven_report_their_state_and_end_at_once_by_a_signal_with_mot
     start: Any, broker: Broker, tmp_path: Path
 ) -> None:
     address = f"127.0.0.1:{broker.port}"
+    url = f"mqtt://{address}"
     traces = {kind: tmp_path / f"{kind}.jsonl" for kind in KINDS}
-    programs = {kind: start(kind, address, "--name", NAME, "--report", "--trace", str(traces[kind])) for kind in KINDS}
+    programs = {kind: start(kind, url, "--name", NAME, "--report", "--trace", str(traces[kind])) for kind in KINDS}
 
     def motors(kind: str) -> list[Any]:
         return [entry.motors for entry in read_trace(traces[kind])]
@@ -118,7 +116,7 @@ def test_both_are_driven_report_their_state_and_end_at_once_by_a_signal_with_mot
 def test_its_files_survive_a_killed_program_which_is_published_as_offline(
     start: Any, broker: Broker, tmp_path: Path
 ) -> None:
-    arguments = ("benjr", f"127.0.0.1:{broker.port}", "--files", str(tmp_path / "board"))
+    arguments = ("benjr", f"mqtt://127.0.0.1:{broker.port}", "--files", str(tmp_path / "board"))
     topic, online = (f"pebble/robots/benjr/outgoing/{metric}" for metric in ("estop/mcu", "online"))
     program = start(*arguments)
     assert until(lambda: (retained(broker.port, topic) or {}).get("latched") is False, 15), program.err
@@ -136,83 +134,49 @@ def test_its_files_survive_a_killed_program_which_is_published_as_offline(
     assert retained(broker.port, topic)["recent"] == ["00000000000000aa"]
 
 
-class Running:
-    """The same program on threads of this process; ``err`` is what all of them write."""
-
-    def __init__(self, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-        self.signal = SimpleNamespace(received=False)
-        monkeypatch.setattr(networked, "StopSignal", lambda: self.signal)
-        self._capsys, self._written = capsys, ""
-        self._threads: list[Thread] = []
-
-    def start(self, kind: str, broker: str, *options: str) -> None:
-        arguments = ["sim", kind, "--broker", broker, *options]
-        self._threads.append(Thread(target=app.run, args=(arguments,), daemon=True))
-        self._threads[-1].start()
-
-    @property
-    def err(self) -> str:
-        self._written += self._capsys.readouterr().err
-        return self._written
-
-    def end(self) -> None:
-        self.signal.received = True
-        for thread in self._threads:
-            thread.join(10)
+def test_kinds_of_a_fleet_take_turns_and_are_counted() -> None:
+    assert [(kind, identity.base) for kind, identity in members(3)] == [
+        ("minilamp", "pebble/robots/minilamp-001"),
+        ("benjr", "pebble/robots/benjr-001"),
+        ("minilamp", "pebble/robots/minilamp-002"),
+    ]
+    assert [identity.id for _, identity in members(2, ["benjr"])] == ["benjr-001", "benjr-002"]
+    with pytest.raises(ConfigError, match="0"):
+        list(members(0))
 
 
-@pytest.fixture
-def running(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Iterator[Running]:
-    made = Running(monkeypatch, capsys)
-    yield made
-    made.end()
+def test_a_fleet_shows_its_status_and_ends_in_order(start: Any, broker: Broker) -> None:
+    program = start("fleet", f"mqtt://127.0.0.1:{broker.port}", "-n", "3")
+    assert until(lambda: b"3 robots: connected" in program.out, 20), program.err
+    program.process.send_signal(signal.SIGTERM)
+    began = time.monotonic()
+    assert program.process.wait(10) == 0
+    assert time.monotonic() - began < 2.0
+    assert "3 of 3 online" in program.err + program.out.decode()
+    assert "Traceback" not in program.err
 
 
-def test_a_broker_that_is_not_there_is_named_and_waited_for(running: Running, tmp_path: Path) -> None:
-    port = free_port()
-    running.start("minilamp", f"mqtt://localhost:{port}")
-    wanted = f"minilamp: cannot reach the broker at localhost:{port}: Connection refused; it keeps trying"
-    assert until(lambda: wanted in running.err, 15), running.err
-    broker = Broker(tmp_path, port=port)
-    try:
-        assert until(lambda: "connected to the broker" in running.err, 20), running.err
-    finally:
-        broker.kill()
-
-
-def test_a_login_that_is_refused_is_named(running: Running, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    passwords, wrong = tmp_path / "passwords", tmp_path / "wrong"
-    subprocess.run(["mosquitto_passwd", "-b", "-c", str(passwords), "ann", "right"], check=True, capture_output=True)
-    passwords.chmod(0o644)
-    wrong.write_text("wrong")
-    monkeypatch.setenv("PEBBLE_PASSWORD", "right")
-    broker = Broker(tmp_path, "allow_anonymous false", f"password_file {passwords}")
-    address = f"mqtt://ann@127.0.0.1:{broker.port}"
-    try:
-        running.start("benjr", address, "--password-file", str(wrong))
-        running.start("minilamp", address)
-        assert until(lambda: "minilamp: connected to" in running.err, 15), running.err
-        assert until(lambda: "benjr: cannot reach" in running.err, 15), running.err
-        assert "refused" in running.err
-    finally:
-        broker.kill()
-
-
-def test_tls(running: Running, tmp_path: Path) -> None:
-    broker = Broker(tmp_path, f"certfile {TLS / 'server.crt'}", f"keyfile {TLS / 'server.key'}")
-    try:
-        for name, ca in (("trusting", "ca.crt"), ("doubting", "other-ca.crt")):
-            running.start("minilamp", f"mqtts://localhost:{broker.port}", name, "--ca-cert", str(TLS / ca))
-        assert until(lambda: "connected to" in running.err, 20), running.err
-        assert until(lambda: "cannot reach" in running.err, 20), running.err
-        assert "CERTIFICATE_VERIFY_FAILED" in running.err
-    finally:
-        broker.kill()
+def test_a_config_names_a_broker_that_is_waited_for(start: Any, tmp_path: Path) -> None:
+    where = {"host": "127.0.0.1", "port": free_port()}
+    config = tmp_path / "lamp.json"
+    config.write_text(json.dumps({"robot": {"id": "lamp", "type": "towers"}, "local_mqtt": where}))
+    program, refused = start("minilamp", str(config)), f"127.0.0.1:{where['port']}: Connection refused; it keeps trying"
+    assert until(lambda: refused in program.err, 15), program.err
+    assert f"pebble/towers/lamp connects to the broker at 127.0.0.1:{where['port']}".encode() in program.out
+    broker = Broker(tmp_path, port=int(where["port"]))
+    assert until(lambda: "connected to the broker" in program.err, 20), program.err
+    broker.kill()
 
 
 @pytest.mark.parametrize(
     ("options", "named"),
     [
+        (("fleet", "http://x"), "--broker must be mqtt://"),
+        (("minilamp", "mqtt://ann:secret@x"), "holds a password"),
+        (("minilamp", "zenoh:/tmp"), "--broker must be mqtt://"),
+        (("benjr", "nowhere.json"), "nowhere.json"),
+        (("fleet", "mqtt://127.0.0.1", "-n", "1001"), "1000"),
+        (("fleet", "mqtt://127.0.0.1", "--kind", "goob"), "goob"),
         (("minilamp", "mqtt://127.0.0.1:port"), "--broker"),
         (("minilamp", "mqtt://127.0.0.1", "a/b"), "robot.id"),
         (("minilamp", "mqtt://ann@127.0.0.1", "--password-file", "/nowhere"), "--password-file"),
@@ -225,51 +189,5 @@ def test_what_makes_no_sense_is_one_line(options: tuple[str, ...], named: str) -
     with pytest.raises(PebbleError) as error:
         app.run(["sim", kind, "--broker", broker, *more])
     assert named in str(error.value)
+    assert "secret" not in str(error.value)
     assert len(str(error.value).splitlines()) == 1
-
-
-def test_firmware_that_fails_stops_its_motors_and_boots_anew(broker: Broker) -> None:
-    with Robots("127.0.0.1", broker.port) as robots, Operator(broker.port) as operator:
-        robots.wait_online()
-        operator.drive("benjr", 0.0, 0.8)
-        assert until(lambda: robots.moving("benjr"))
-        failing = robots.robots["benjr"]
-        before = failing.firmware
-        before.step = lambda: 1 // 0
-        assert until(lambda: failing.board.resets == 1)
-        assert until(lambda: not robots.moving("benjr"))
-        assert until(lambda: failing.firmware is not before and failing.online, 15), failing.problem
-        assert robots.robots["minilamp"].board.resets == 0
-        operator.drive("benjr", 0.0, 0.8)
-        assert until(lambda: robots.moving("benjr"))
-
-
-def test_two_drivers_of_a_board_and_only_the_key_of_now_moves_it(start: Any, broker: Broker) -> None:
-    program = start("benjr", f"127.0.0.1:{broker.port}", "--report")
-    base = "pebble/robots/benjr"
-
-    def state() -> dict[str, Any]:
-        found: dict[str, Any] = retained(broker.port, f"{base}/outgoing/control/mcu") or {}
-        return found
-
-    def turns() -> bool:
-        snapshots = program.snapshots()
-        return bool(snapshots) and any(snapshots[-1].board.motors)
-
-    def moves(operator: Operator, key: str) -> bool:
-        operator.send("benjr", json.dumps({"z": 0.5, "key": key}))
-        return turns()
-
-    with Operator(broker.port) as operator:
-        assert until(lambda: state().get("key") == "", 15)
-        operator.send("benjr", '{"id": "aaaaaaaa", "by": "otto", "for_ms": 10000}', metric="control")
-        assert until(lambda: state().get("by") == "otto", 5)
-        old = state()["key"]
-        assert until(lambda: moves(operator, old), 5, step=0.05)
-        operator.send("benjr", '{"id": "bbbbbbbb", "by": "mia", "for_ms": 10000}', metric="control/take")
-        assert until(lambda: state().get("by") == "mia" and not turns(), 5)
-        for _ in range(20):
-            assert not moves(operator, old)
-            time.sleep(0.05)
-        new = state()["key"]
-        assert until(lambda: moves(operator, new), 5, step=0.05)

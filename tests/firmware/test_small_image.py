@@ -59,9 +59,3 @@ def test_nothing_that_a_small_image_lacks(robot: str) -> None:
         tree = ast.parse((firmware_folder() / module).read_text())
         assert imported(tree) <= HAS, module
         assert not LACKS & set(names(tree)), module
-
-
-def test_there_is_something_to_look_for() -> None:
-    tree = ast.parse((firmware_folder() / "common" / "usb.py").read_text())
-    assert "select" in imported(tree) - HAS
-    assert "buffer" in LACKS & set(names(tree))

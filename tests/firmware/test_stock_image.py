@@ -74,14 +74,6 @@ def test_it_obeys_answers_and_stops_in_silence(kind: str) -> None:
     assert bench.board.resets == 0
 
 
-@pytest.mark.parametrize(("kind", "rate_hz"), [("goob", 50), ("fred", 2)])
-def test_it_reports_on_time(kind: str, rate_hz: int) -> None:
-    bench = Endless(kind)
-    bench.run(11.0, main=True)
-    reports = bench.lines(rb"T [at]0=.*")
-    assert len([when for when in reports if when > 1.0]) == pytest.approx(rate_hz * 10, abs=2)
-
-
 def test_a_host_that_does_not_read_does_not_keep_the_motors_running() -> None:
     bench = Endless()
     bench.board.console.reading = False
@@ -89,15 +81,6 @@ def test_a_host_that_does_not_read_does_not_keep_the_motors_running() -> None:
     bench.run(6.0)
     assert bench.motors[-1][1] == (0.0, 0.0)
     assert bench.motors[-1][0] - 3.1 <= 1.6, "one wait of half a second may come in between"
-
-
-def test_it_speaks_again_when_the_host_reads_again() -> None:
-    bench = Endless()
-    console = bench.board.console
-    bench.plan = [(at, lambda on=on: setattr(console, "reading", on)) for at, on in ((2.0, False), (4.0, True))]  # type: ignore[misc]
-    bench.run(6.6)
-    assert len([when for when in bench.lines(rb"T a0=.*") if when > 5.6]) >= 49
-    assert not any(b"\r\r" in data for _, data in bench.output)
 
 
 def test_a_flood_does_not_keep_the_motors_running() -> None:

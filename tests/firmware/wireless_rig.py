@@ -61,10 +61,6 @@ class Robots:
         assert not any(motors), f"{kind} runs on"
         return at
 
-    def firmware(self) -> list[Any]:
-        """The Robot objects of the firmware."""
-        return [robot.firmware for robot in self.robots.values()]
-
     @property
     def alive(self) -> bool:
         return self._thread.is_alive() and all(robot.board.resets == 0 for robot in self.robots.values())

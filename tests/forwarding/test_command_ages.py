@@ -1,7 +1,4 @@
-"""Drive commands and requests for control that tell their own age; and random schedules of them.
-
-``python -m tests.kit.schedules ages`` performs thousands.
-"""
+"""Drive commands and requests for control that tell their own age."""
 
 from __future__ import annotations
 
@@ -14,13 +11,10 @@ from pebble.forwarding.command_ages import MOST, CommandAges, ends_something
 from pebble.forwarding.routing import TABLE_A1, Forward, Side, route
 from pebble.forwarding.subjects import Subjects
 from pebble.transports import Message, QoS, clock
-from tests.forwarding.age_schedules import ENGINE
 from tests.services.mqtt_bridge.bridge_rig import BASE, make_config
-from tests.support import cases
 
 pytestmark = pytest.mark.computing
 
-SCHEDULES = cases(30, 600)
 MOVES, ZERO = {"z": 0.5}, {"z": 0}
 HOLD = {"id": "3f2a91c0"}
 
@@ -157,9 +151,3 @@ def test_a_request_for_control(monkeypatch: pytest.MonkeyPatch, metric: str, pro
     late += [robot.is_late(metric, stamped, ago_s=ago_s, pings_s=60.0) for ago_s in (limit_s, limit_s + 0.2)]
     late += [robot.is_late(metric, stamped | {"want": "release"}, ago_s=90.0, pings_s=90.0)]
     assert late == [False, True, False, True, False]
-
-
-def test_no_schedule_violates_a_rule() -> None:
-    found = list(ENGINE.run("", 0, range(SCHEDULES)))
-    assert not any(one.problems for one in found), "python -m tests.kit.schedules ages --seed 0 shows it"
-    assert sum(one.counts["passed by t"] for one in found) > SCHEDULES

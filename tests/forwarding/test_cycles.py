@@ -99,40 +99,8 @@ class TestCommands:
         assert world.arrives(world.robot, DRIVE, b"again")
         assert sum("everything is forwarded again" in info for info in infos(caplog)) == circulate
 
-    def test_a_way_that_comes_while_a_key_is_held(
-        self, world: World, caplog: pytest.LogCaptureFixture, direction: str, carried: str, mirroring: bool
-    ) -> None:
-        world.bridge(mirroring=mirroring)
-        for _ in range(40):
-            world.send(world.operator, DRIVE, MOVE)
-            world.network.now += 0.05
-            assert world.rests()
-        assert world.robot.payloads(DRIVE) == [MOVE] * 40
-        Way(world.local, world.remote, direction, carried)
-        began = world.network.now
-        world.send(world.operator, DRIVE, MOVE)
-        assert world.rests()
-        assert world.network.now - began < 0.5
-        assert len(errors(caplog)) == (mirroring or direction != "in")
-
 
 class TestOthers:
-    @pytest.mark.parametrize("suffix", ["incoming/dance", "incoming/lights-solid", "incoming/flags/reboot"])
-    def test_what_is_not_probed_at_the_start(self, world: World, suffix: str) -> None:
-        Way(world.local, world.remote, "both", suffix)
-        world.bridge(probe=False)
-        world.send(world.operator, suffix, b"true", b"2")
-        assert world.rests(200)
-
-    def test_what_is_not_probed_at_the_start_while_another_circulates(self, world: World) -> None:
-        Way(world.local, world.remote, "out", "incoming/#")
-        world.bridge()
-        assert world.rests()
-        world.send(world.operator, "incoming/dance", b"1")
-        assert world.rests()
-        assert world.robot.payloads("incoming/dance") == [b"1"]
-        assert world.operator.payloads("incoming/dance") == [b"1"]
-
     @pytest.mark.parametrize("carried", ["", "incoming/#"], ids=["one topic", "all topics"])
     @pytest.mark.parametrize("begins", ["before", "at rest", "after one"])
     @pytest.mark.parametrize(
@@ -158,20 +126,6 @@ class TestOthers:
             world.network.now += 3
         assert max(runs) <= at_most, runs
         assert runs[2:] == [1, 1]
-
-    @pytest.mark.parametrize("direction", ["in", "out", "both"])
-    @pytest.mark.parametrize("probe", [True, False])
-    def test_flags(self, world: World, direction: str, probe: bool) -> None:
-        Way(world.local, world.remote, direction, "incoming/#")
-        world.bridge(probe=probe)
-        for suffix in (FLAG, "incoming/flags/party"):
-            world.send(world.operator, suffix, b"true", b"false", b"true", retain=True)
-            assert world.rests(300)
-        before = len(world.robot.payloads(FLAG))
-        world.network.now += 3
-        world.send(world.operator, FLAG, b"false", retain=True)
-        assert world.rests()
-        assert set(world.robot.payloads(FLAG)[before:]) == {b"false"}
 
     @pytest.mark.parametrize("suffix", ["outgoing/status", "outgoing/weather", "outgoing/touch-sensors"])
     def test_outgoing(self, world: World, caplog: pytest.LogCaptureFixture, suffix: str) -> None:
@@ -226,32 +180,6 @@ class TestSeveralBridges:
         other.shut()
         world.wait(5)
         assert world.arrives(world.robot, DRIVE, b"again")
-
-    @pytest.mark.parametrize("direction", ["in", "out"])
-    def test_two_other_ways(self, world: World, direction: str) -> None:
-        """Each copy becomes two."""
-        for _ in range(2):
-            Way(world.local, world.remote, direction, "incoming/#")
-            Way(world.local, world.remote, "in", "outgoing/#")
-        world.bridge(mirroring=True)
-        world.send(world.operator, DRIVE, MOVE, ZERO)
-        world.send(world.robot, DRIVE, MOVE, ZERO)
-        world.send(world.operator, FLAG, b"true", b"false", retain=True)
-        world.send(world.robot, "outgoing/status", b"1", b"2", retain=True)
-        assert world.rests(5_000)
-
-    def test_commands_are_probed_again_once_something_circulates(self, world: World) -> None:
-        """The other way is younger than the connection, at whose begin they were probed."""
-        world.bridge()
-        assert world.rests()
-        Way(world.local, world.remote, "both", "incoming/#")
-        for _ in range(10):
-            world.send(world.operator, FLAG, b"true", retain=True)
-            assert world.rests()
-        world.wait(1)
-        world.send(world.operator, DRIVE, MOVE)
-        assert world.rests()
-        assert world.robot.payloads(DRIVE) == [MOVE]  # by the other way only
 
     def test_a_mirror_and_a_way_from_its_broker(self, world: World, caplog: pytest.LogCaptureFixture) -> None:
         mirrored = Node(world.network)

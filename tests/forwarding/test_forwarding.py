@@ -19,7 +19,7 @@ from pebble.forwarding.admission import MAX_ACTIONS, MAX_UNKNOWN_COMMANDS, MAX_U
 from pebble.forwarding.event_buffer import RESEND_S, EventBuffer
 from pebble.forwarding.forwarder import Forwarder
 from pebble.forwarding.loopback_filter import EXPIRY_S, LoopbackFilter
-from pebble.forwarding.probes import PROBE_REQUEST, Probes, new_probe
+from pebble.forwarding.probes import Probes, new_probe
 from pebble.forwarding.reconciliation import TOPICS, Reconciliation, Resolution
 from pebble.forwarding.routing import MIRROR, TABLE_A1, Drop, Forward, Rules, Side
 from pebble.forwarding.subjects import Subjects
@@ -87,19 +87,6 @@ class TestLoopbackFilter:
             loopback.is_echo(f"flag{number}", b"1")
             for number in range(loopback_filter.TOPICS, 2 * loopback_filter.TOPICS)
         )
-        assert len(loopback) == 0
-
-    def test_large_payloads_and_many_messages_take_little_memory(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        monkeypatch.setattr(loopback_filter, "MESSAGES", 500)
-        loopback = LoopbackFilter(Clock())
-        tracemalloc.start()
-        for number in range(1000):
-            loopback.expect(f"flag{number // 100}", bytes(10_000 + number))
-        used, _ = tracemalloc.get_traced_memory()
-        tracemalloc.stop()
-        assert used < 200_000
-        assert not loopback.is_echo("flag0", bytes(10_099))
-        assert all(loopback.is_echo(f"flag{number // 100}", bytes(10_000 + number)) for number in range(500, 1000))
         assert len(loopback) == 0
 
 
@@ -259,38 +246,33 @@ class TestReconciliation:
             given.append(resolution)
         assert given == [Resolution[name.upper()] for name in resolutions]
 
-    def test_held_copies_fill_what_the_winner_does_not_know(self) -> None:
-        reconciliation = Reconciliation(REMOTE)
-        reconciliation.receive(LOCAL, "known", b"local", retained=True)
-        reconciliation.receive(LOCAL, "unknown", b"local", retained=True)
-        reconciliation.receive(REMOTE, "known", b"remote", retained=True)
-        reconciliation.note_published(LOCAL, "known", b"remote")
-        assert reconciliation.synchronize(REMOTE) == [(REMOTE, "unknown", b"local")]
-        assert reconciliation.value("unknown") == b"local"
-        assert reconciliation.synchronize(LOCAL) == []
-
-    def test_a_side_that_lost_a_value_receives_it(self) -> None:
-        reconciliation = Reconciliation(REMOTE)
-        reconciliation.receive(REMOTE, "t", b"new", retained=False)
-        reconciliation.begin(REMOTE)
-        assert reconciliation.synchronize(REMOTE) == [(REMOTE, "t", b"new")]
-        reconciliation.begin(REMOTE)
-        reconciliation.receive(REMOTE, "t", b"new", retained=True)
-        assert reconciliation.synchronize(REMOTE) == []
-
-    def test_a_side_that_missed_a_removal_receives_it(self) -> None:
-        reconciliation = Reconciliation(LOCAL)
-        reconciliation.receive(LOCAL, "t", b"a", retained=False)
-        reconciliation.note_published(REMOTE, "t", b"a")
-        reconciliation.receive(LOCAL, "t", b"", retained=False)
-        assert reconciliation.synchronize(REMOTE) == [(REMOTE, "t", b"")]
-
-    def test_a_removed_topic_is_not_brought_back(self) -> None:
-        reconciliation = Reconciliation(REMOTE)
-        reconciliation.receive(LOCAL, "t", b"a", retained=False)
-        reconciliation.receive(LOCAL, "t", b"", retained=False)
-        reconciliation.begin(REMOTE)
-        assert reconciliation.synchronize(REMOTE) == []
+    @pytest.mark.parametrize(
+        ("winner", "history", "side", "sent"),
+        [
+            (REMOTE, "L:a", REMOTE, ["a"]),  # a held copy fills what the winner does not know
+            (REMOTE, "L:a R:b to-L:b", REMOTE, []),
+            (REMOTE, "L:a R:b to-L:b", LOCAL, []),
+            (REMOTE, "r:new begin", REMOTE, ["new"]),  # a side that lost a value receives it
+            (REMOTE, "r:new begin R:new", REMOTE, []),
+            (LOCAL, "l:a to-R:a l:", REMOTE, [""]),  # and so does one that missed a removal
+            (REMOTE, "l:a l: begin", REMOTE, []),  # what was removed is not brought back
+        ],
+    )
+    def test_what_a_side_receives_when_it_is_there_again(
+        self, winner: Side, history: str, side: Side, sent: list[str]
+    ) -> None:
+        """to-L, to-R: what was published there. begin: the remote connection begins anew."""
+        reconciliation = Reconciliation(winner)
+        for word in history.split():
+            who, _, payload = word.partition(":")
+            place = REMOTE if who[-1] in "Rr" else LOCAL
+            if who == "begin":
+                reconciliation.begin(REMOTE)
+            elif who.startswith("to-"):
+                reconciliation.note_published(place, "t", payload.encode())
+            else:
+                reconciliation.receive(place, "t", payload.encode(), retained=who.isupper())
+        assert reconciliation.synchronize(side) == [(side, "t", payload.encode()) for payload in sent]
 
     def test_its_memory_is_bounded(self) -> None:
         reconciliation = Reconciliation(REMOTE)
@@ -325,17 +307,6 @@ class TestProbes:
         assert first != second
         assert [probes.announce(first), probes.see(first)] == [False, True]
         assert [probes.see(second), probes.announce(second)] == [False, True]
-
-    @pytest.mark.parametrize(
-        "payload",
-        [b"", b"x", PROBE_REQUEST, new_probe(1), b"x" * 100_000],
-        ids=["empty", "x", "question", "probe", "long"],
-    )
-    def test_others_are_not(self, payload: bytes) -> None:
-        probes = Probes()
-        probes.announce(new_probe(1))
-        assert not probes.see(payload)
-        assert not probes.announce(new_probe(1))
 
     def test_memory_is_bounded(self) -> None:
         probes = Probes()
@@ -385,10 +356,6 @@ class TestEventBuffer:
     def publish(self, events: EventBuffer, *numbers: int) -> None:
         for number in numbers:
             events.send(Message("t", b"%d" % number, QoS.DELIVERED))
-
-    def test_passes_on_at_once_and_in_order(self, events: EventBuffer, wire: Wire) -> None:
-        self.publish(events, 1, 2, 3)
-        assert wire.sent == [b"1", b"2", b"3"]
 
     def test_keeps_the_newest_of_an_outage(self, events: EventBuffer, counters: Counters, wire: Wire) -> None:
         wire.up = False
@@ -510,33 +477,25 @@ class TestSignatures:
     """A script's signature counts only from programs on the robot."""
 
     PERSONS = (
-        *(b'{"z":0.5}', b'{"z":0.5,"source":"page"}', b'{"z":0.5,"source":"autonomy-page","run":7}', b"{", b""),
-        *(b'{"z":0.5,"note":"autonomy"}', b'{"z":0.5,"run":1073741823}', b'{"z":0.5,"source":"p\\u0061ge"}'),
-        *(b'{"z":0.5,"source":"Autonomy"}', b'{"z":0.5,"source":"autonomy ","run":1}', b'{"z":0,"source":null}'),
+        *(b'{"z":0.5}', b'{"z":0.5,"source":"autonomy-page","run":7}', b"{", b'{"z":0.5,"source":"p\\u0061ge"}'),
+        *(b'{"z":0.5,"run":1073741823}', b'{"z":0.5,"source":"autonomy ","run":1}', b'{"z":0.5,"source":"Autonomy"}'),
         b'{"z":0.5,"value":{"z":0.1,"source":"page"},"source":"autonomy"}',
         b'{"z":0.5,"source":"autonomy","source":"page","run":1}',
-        b'{"value":{"z":0,"source":7,"run":"autonomy"}}',
     )
     MOVING = (
-        *(b"1", b"536870911", b"536870912", b"536870913", b"1073741823", b"1073741824", b"-1", b"0", b"1e999"),
-        *(b"true", b"1.5", b'"7"', b"null", b"[1]", b"{}", b"1,1", b'1,"x":NaN', b'1,"value":7', b'1,"valid_ms":9'),
-    )
-    HIDDEN = (
-        *(b'{"z":0.5,"source":"autonomy"}', b'{"z":"0.5","source":"autonomy","run":1}'),
-        *(b'{"y":1e-9,"source":"autonomy","run":1}', b'{"z":0.5,"source":"\\u0061utonomy","run":1}'),
+        *(
+            b'{"z":0.5,"source":"autonomy","run":1}',
+            b'{"z":0.5,"source":"autonomy","run":1',
+            b'{"z":0.5,"source":"autonomy"}',
+        ),
+        *(b'{"y":1e-9,"source":"autonomy","run":"7"}', b'{"z":0.5,"source":"\\u0061utonomy","run":1}'),
         *(b'{"z":0.5,"\\u0073ource":"autonomy","run":1}', b'{"z":0.5,"source":"page","source":"autonomy","run":1}'),
-        b'{"z":0.5,"s\\u006furce":"\\u0061\\u0075tonom\\u0079","run":1}',
-        b'{"value":{"z":0.5,"source":"autonomy","run":1}}',
-        b'{"value":{"z":0.5,"source":"\\u0061utonomy","run":1},"z":0,"source":"page"}',
-        b'{"value":{"z":0},"value":{"z":0.5,"source":"autonomy","run":1}}',
+        b'{"value":{"z":0},"value":{"z":0.5,"source":"\\u0061utonomy","run":1},"source":"page"}',
         b'{"v\\u0061lue":{"z":0.5,"source":"autonomy","run":1}}',
         *(b'{"z":0.5,"sour\\ce":"autonom\\y","run":1}', b'{"z":0.5,"source":"autonomy","run":1}\0'),  # boards read it
-        *(b'\xef\xbb\xbf{"z":0.5,"source":"autonomy","run":1}', b' \r\n{"z":0.5,"source":"autonomy","run":1}\t'),
+        b'\xef\xbb\xbf{"z":0.5,"source":"autonomy","run":1}',
     )
-    ZEROS = (
-        *(b"1", b"536870912", b"1073741823", b"1073741824", b"-1", b"true", b"1.5", b'"7"', b"null"),
-        *(b'1,"valid_ms":0', b'1,"valid_ms":400', b'1,"x":"0"', b'1,"x":-0.0', b'1,"value":{"source":"autonomy"}'),
-    )
+    ZEROS = (b"1", b"-1", b'"7"', b'1,"valid_ms":0', b'1,"x":"0"', b'1,"value":{"source":"autonomy"}')
 
     @pytest.fixture(params=[{}, {"drive_values": "else/where"}], ids=["usual", "renamed"])
     def subjects(self, request: pytest.FixtureRequest) -> Subjects:
@@ -561,10 +520,7 @@ class TestSignatures:
     def test_a_persons_command_passes_as_it_is(self, subjects: Subjects, payload: bytes) -> None:
         assert self.passed(subjects, payload)[0] == [payload, payload]
 
-    @pytest.mark.parametrize(
-        "payload",
-        [*HIDDEN, *(b'{"z":0.5,"source":"autonomy","run":' + run + end for run in MOVING for end in (b"}", b""))],
-    )
+    @pytest.mark.parametrize("payload", MOVING)
     def test_what_moves_anything_does_not_pass(self, subjects: Subjects, payload: bytes) -> None:
         sent, forwarder = self.passed(subjects, payload)
         assert (sent, forwarder.dropped()["signed"]) == ([], 2)

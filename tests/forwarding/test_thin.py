@@ -9,15 +9,13 @@ import pytest
 
 from pebble.contract import LINK, codec
 from pebble.contract.payloads import LinkState
-from pebble.forwarding.event_buffer import LIMIT
-from pebble.forwarding.sieve import TOPICS
 from pebble.services.mqtt_bridge.uplink import RENEW_S
-from pebble.transports import Message, Outgoing, QoS
+from pebble.transports import Outgoing, QoS
 from tests.forwarding.virtual import World
 from tests.services.mqtt_bridge.bridge_rig import BASE
 
 LINK_STATE, ONLINE = "outgoing/link", "outgoing/online"
-IMU, TOUCH, LOGS = "outgoing/sensors/imu", "outgoing/touch-sensors", "outgoing/logs"
+IMU, LOGS = "outgoing/sensors/imu", "outgoing/logs"
 STATUS, STOPPED, CONTROL = "outgoing/status", "outgoing/estop/serial", "outgoing/control/serial"
 EVENT, DRIVE, STOP, FLAG = (
     "outgoing/somebody/happened",
@@ -113,11 +111,6 @@ class TestLevels:
         world.run(60)
         assert world.retained(LINK_STATE) == (None, None)
 
-    def test_one_that_is_not_keeps_it(self, start: Start) -> None:
-        world = start()
-        world.run(120)
-        assert world.retained(LINK_STATE)[1]
-
 
 class TestHeartarrived:
     @pytest.mark.parametrize(
@@ -162,29 +155,6 @@ class TestStreams:
         assert numbers[-1] == last, "and the very last one"
         assert numbers == sorted(numbers)
 
-    def test_each_has_its_own_turn(self, start: Start) -> None:
-        world = start()
-        for number in range(500):
-            for suffix in (IMU, TOUCH):
-                world.local.publish(suffix, b"%d" % number)
-            world.run(0.02)
-        assert {len(world.remote.on(suffix)) for suffix in (IMU, TOUCH)} <= {10, 11}
-
-    def test_more_topics_than_are_remembered_lose_streams_and_no_state(self, start: Start) -> None:
-        world = start()
-        world.uplink.way = FULL
-        world.run(0.2)
-        for number in range(TOPICS + 100):
-            world.local.publish(f"outgoing/programs/reading{number}", b"1", qos=0)
-        world.local.publish(STATUS, b"last", retain=True)
-        world.run(1)
-        assert world.retained(STATUS)[1] == b"last"
-        world.uplink.way = FREE
-        world.run(5)
-        arrived = {message.topic for message in world.remote.seen if "reading" in message.topic}
-        assert len(arrived) == TOPICS
-        assert world.service.dropped()["shed"] >= 100
-
     def test_at_a_level_that_is_wide_again_all_pass_at_once(self, start: Start) -> None:
         world = start("auto")
         for trip_s, pings in ((0.02, 5), (0.5, 4)):
@@ -226,20 +196,6 @@ class TestNoRoom:
         passed = {suffix: world.remote.payloads(suffix) for suffix in (STATUS, IMU, EVENT)}
         assert passed == {STATUS: [b"0", b"3"], IMU: [b"3"], EVENT: numbers}, "the newest value, and each event"
 
-    def test_states_go_first(self, start: Start) -> None:
-        world = start()
-        world.uplink.way = FULL
-        world.run(0.2)
-        for suffix in (IMU, STATUS):
-            world.local.publish(suffix, b"1", retain=suffix == STATUS)
-        world.run(0.5)
-        world.uplink.way = FREE
-        world.run(0.5)
-        assert [message.topic for message in world.remote.seen if message.topic.endswith(("imu", "status"))] == [
-            f"{BASE}/{STATUS}",
-            f"{BASE}/{IMU}",
-        ]
-
     def test_it_is_counted_and_logged_once_a_minute(self, start: Start, caplog: pytest.LogCaptureFixture) -> None:
         caplog.set_level(logging.WARNING)
         world = start()
@@ -248,17 +204,6 @@ class TestNoRoom:
         assert world.service.dropped()["shed"] > 400
         assert world.service.status.counts["shed"] == world.service.dropped()["shed"]
         assert len([line for line in caplog.messages if "has no room" in line]) == 1
-
-    def test_events_have_a_bound(self, start: Start) -> None:
-        world = start()
-        world.uplink.way = FULL
-        world.run(0.2)
-        for number in range(LIMIT + 50):
-            world.local.publish(EVENT, b"%d" % number)
-            world.run(0.01)
-        world.uplink.way = FREE
-        world.run(0.5)
-        assert [int(payload) for payload in world.remote.payloads(EVENT)] == list(range(50, LIMIT + 50))
 
     def test_what_is_lost_with_a_connection_comes_with_the_next(self, start: Start) -> None:
         world = start()
@@ -325,31 +270,3 @@ def flood(world: World, history: str) -> None:
             for payload in COMMANDS[word]:
                 world.remote.publish("incoming/drive-values", payload)
             world.run(0.05)
-
-
-def sent(world: World) -> list[tuple[str, bytes, int, bool]]:
-    """What the bridge has published on the remote side, without what differs at each run."""
-    own = (ONLINE, "outgoing/bridge-probe")
-    return [
-        (one.topic, one.payload, int(one.qos), bool(one.retain_requested))
-        for one in world.remote.seen
-        if not one.topic.endswith(own)
-    ]
-
-
-def test_on_a_wide_link_the_bridge_sends_what_it_receives(start: Start) -> None:
-    """All of it, in order, at once, with the same bytes; and no state of the link."""
-    world = start("wide")
-    world.uplink.way = FULL
-    expected: list[Message] = []
-    for number in range(200):
-        for suffix, qos, retain in ((IMU, 1, False), (LOGS, 0, False), (STATUS, 1, True), (EVENT, 1, False)):
-            message = Message(f"{BASE}/{suffix}", b"%d" % number, QoS(qos), retain)
-            expected.append(message)
-            world.local.publish(suffix, message.payload, qos=qos, retain=retain)
-        world.run(0.01)
-    assert sent(world) == [(one.topic, one.payload, int(one.qos), one.retain) for one in expected]
-    assert not world.remote.on(LINK_STATE)
-    arrived = len(world.remote.on(ONLINE))
-    world.run(10)
-    assert len(world.remote.on(ONLINE)) - arrived == 40

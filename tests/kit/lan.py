@@ -11,7 +11,7 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
-from pebble.runtime.places import SBIN
+from pebble.extensions.operator.places import SBIN
 from tests.support import ROOT, Child, until
 
 NET = "10.78.0"

@@ -7,7 +7,7 @@ import subprocess
 from dataclasses import dataclass
 from pathlib import Path
 
-from pebble.runtime.places import Places
+from pebble.extensions.operator.places import Places
 from tests.support import ROOT
 
 SCRIPT = ROOT / "configs" / "slot" / "pebble-slot"

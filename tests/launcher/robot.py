@@ -44,12 +44,6 @@ class Robot:
         self._environment = {**os.environ, "PYTHONPATH": str(FAKES), **env}
         self.process = self._start(self.errors)
 
-    def second(self) -> subprocess.CompletedProcess[str]:
-        """Another launcher for the same robot."""
-        return subprocess.run(
-            self._command, cwd=self._folder, env=self._environment, capture_output=True, text=True, timeout=20
-        )
-
     def _start(self, errors: Path) -> subprocess.Popen[bytes]:
         with errors.open("wb") as out:
             return subprocess.Popen(self._command, cwd=self._folder, env=self._environment, stderr=out)

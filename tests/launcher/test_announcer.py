@@ -91,15 +91,6 @@ def test_records_are_published_only_once(connected: ConnectedAnnouncer) -> None:
     assert becomes(lambda: connected.sent("logs"), [1, 3])
 
 
-def test_what_is_still_in_the_pipe_is_published_before_the_end(connected: ConnectedAnnouncer) -> None:
-    connected.state(7)
-    connected.record(8)
-    connected.announcer.stop()
-    connected.join()
-    assert (connected.sent("status")[-1], connected.sent("logs")) == (7, [8])
-    assert connected.transport.state is State.CLOSED
-
-
 def test_it_ends_with_the_launcher(connected: ConnectedAnnouncer) -> None:
     connected.state(7)
     connected.pipe.close()

@@ -1,45 +1,42 @@
 from __future__ import annotations
 
+import json
+from collections.abc import Collection
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from pebble.config import parse
+from pebble.contract import CHANNELS
 from pebble.launcher.capabilities import capabilities
 from pebble.runtime.addresses import Addresses
 
 BASE = "pebble/robots/rover"
 MOTOR = {"enabled": True, "serial": {"port": "/dev/ttyACM0"}}
 BRIDGE = {"enabled": True, "remote_mqtt": {"host": "far"}}
+ON, OFF = {"enabled": True}, {"enabled": False}
 
 
-def of(kind: str = "mqtt", **services: Any) -> dict[str, Any]:
-    raw = {"robot": {"id": "rover"}, "transport": {"kind": kind}, "services": services}
-    config = parse(raw, folder=Path("/robots"), env={})
-    return capabilities(config, Addresses(config))
+def of(
+    kind: str = "mqtt",
+    *,
+    robot: dict[str, Any] | None = None,
+    level: str = "open",
+    lacking: Collection[str] = (),
+    found: Collection[str] = (),
+    **services: Any,
+) -> dict[str, Any]:
+    raw = {"robot": {"id": "rover", **(robot or {})}, "transport": {"kind": kind}, "security": {"level": level}}
+    config = parse({**raw, "services": services}, folder=Path("/robots"), env={})
+    return capabilities(config, Addresses(config), lacking, found)
 
 
-def test_people_see_it_as_its_config_describes_it() -> None:
-    looks = {"name": "Goob", "description": "Rover", "colour": "blue", "picture": "goob", "battery_cells": 2}
-    config = parse({"robot": {"id": "rover", **looks}}, folder=Path("/robots"), env={})
-    assert capabilities(config, Addresses(config))["identity"] == {
-        "system": "pebble",
-        "type": "robots",
-        "id": "rover",
-        **looks,
-    }
-
-
-def test_a_robot_that_reads_names_lists_it() -> None:
-    raw = {
-        "robot": {"id": "rover"},
-        "transport": {"kind": "zenoh"},
-        "security": {"level": "named"},
-        "services": {"mqtt_bridge": {"enabled": True, "remote_mqtt": {"host": "127.0.0.1"}}},
-    }
-    config = parse(raw, folder=Path("/robots"), env={})
-    assert capabilities(config, Addresses(config))["named"] is True
+def at(tree: Any, path: str) -> Any:
+    """Return the value at a path of keys; None if there is none."""
+    for key in path.split("."):
+        tree = tree.get(key)
+    return tree
 
 
 def test_a_robot_without_services_still_lists_everything() -> None:
@@ -123,37 +120,112 @@ def test_a_robot_without_services_still_lists_everything() -> None:
     }
 
 
-def test_what_processes_report_is_listed() -> None:
-    config = parse({"robot": {"id": "rover"}}, folder=Path("/robots"), env={})
-    found = {"outlets/o2/status", "outlets/o1/power", "outlets/o1/status"}
-    value = capabilities(config, Addresses(config), found=found)
-    o1 = {"status_topic": f"{BASE}/outgoing/outlets/o1/status", "command_topic": f"{BASE}/incoming/outlets/o1/power"}
-    o2 = {"status_topic": f"{BASE}/outgoing/outlets/o2/status"}
-    assert value["outlets"] == {
-        "available": True,
-        "controls": True,
-        "outlets": [{"name": "o1", "controls": True, **o1}, {"name": "o2", "controls": False, **o2}],
-    }
+LOOKS = {"name": "Goob", "description": "Rover", "colour": "blue", "picture": "goob", "battery_cells": 2}
+MOVES = {"drive.available": True, "drive.controls": True}
+LAMPS = {"name": "o1", "controls": True, "status_topic": f"{BASE}/outgoing/outlets/o1/status",
+         "command_topic": f"{BASE}/incoming/outlets/o1/power"}  # fmt: skip
+SENSOR = {"name": "o2", "controls": False, "status_topic": f"{BASE}/outgoing/outlets/o2/status"}
+WHEELS = {"instances": {name: {"enabled": True, "serial": {"port": f"/dev/{name}"}} for name in ("left", "right")}}
+ARM = {
+    "enabled": False,
+    "topics": {"drive_values": f"{BASE}/incoming/of-the-root"},
+    "instances": {"base": {**MOTOR, "topics": {"drive_values": f"{BASE}/incoming/of-the-instance"}}},
+}
+STREAM = {"enabled": True, "command": ["mediamtx"]}
+#: What a robot has, and what is listed of it.
+OFFERS: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
+    "looks": ({"robot": LOOKS}, {"identity": {"system": "pebble", "type": "robots", "id": "rover", **LOOKS}}),
+    "names that it reads": (
+        {"level": "named", "kind": "zenoh", "mqtt_bridge": {"enabled": True, "remote_mqtt": {"host": "127.0.0.1"}}},
+        {"named": True},
+    ),
+    "its transport": ({"kind": "zenoh"}, {"transport": {"kind": "zenoh"}}),
+    "outlets that its processes report": (
+        {"found": {"outlets/o2/status", "outlets/o1/power", "outlets/o1/status"}},
+        {"outlets": {"available": True, "controls": True, "outlets": [LAMPS, SENSOR]}},
+    ),
+    "a motor line": (
+        {"serial_mcu_bridge": MOTOR},
+        {**MOVES, "drive.arbitrates": True, "drive.control": True, "drive.axes": ["x", "z"], "estop.available": True,
+         "estop.owners": ["serial"], "estop.status_topics": [f"{BASE}/outgoing/estop/serial"], "lights.solid": True,
+         "lights.flash": True, "telemetry.charging_status": True, "telemetry.touch_sensors": False,
+         "estop.zeros": None},
+    ),
+    "no control": ({"serial_mcu_bridge": MOTOR, "lacking": {"control"}}, {**MOVES, "drive.control": None}),
+    "touch sensors, when they are published": (
+        {"serial_mcu_bridge": {**MOTOR, "telemetry": {"publish_touch_sensors": True}}},
+        {"telemetry.touch_sensors": True, "telemetry.wheel_odometry": False},
+    ),
+    "odometry, with scripts": (
+        {"serial_mcu_bridge": {**MOTOR, "telemetry": {"publish_touch_sensors": True}}, "autonomy_manager": ON},
+        {"telemetry.wheel_odometry": True},
+    ),
+    "a motor that is an instance": (
+        {"serial_mcu_bridge": ARM}, {"drive.topic": f"{BASE}/incoming/of-the-instance", "estop.owners": ["base"]},
+    ),
+    "two motors": ({"serial_mcu_bridge": WHEELS}, {**MOVES, "estop.owners": ["left", "right"]}),
+    "no emergency stop": (
+        {"serial_mcu_bridge": WHEELS, "lacking": {"estop"}},
+        {**MOVES, "estop": {"available": False, "topic": f"{BASE}/incoming/estop", "owners": [], "status_topics": [],
+                            "reset_topic": f"{BASE}/incoming/estop-reset"}},
+    ),
+    "ROS": ({"ros1_bridge": OFF}, {"drive.available": False, "estop.zeros": None}),
+    "ROS that drives nothing": (
+        {"ros1_bridge": {"enabled": True, "drive": OFF}}, {"drive.available": False, "estop.zeros": None},
+    ),
+    "ROS that drives": (
+        {"ros1_bridge": ON},
+        {**MOVES, "drive.arbitrates": None, "estop.owners": [], "estop.zeros": [f"{BASE}/incoming/drive-values"]},
+    ),
+    "ROS that drives elsewhere": (
+        {"ros1_bridge": {"enabled": True, "topics": {"drive_values": "a/b"}}},
+        {**MOVES, "drive.topic": "a/b", "estop.zeros": ["a/b"]},
+    ),
+    "ROS beside a motor": (
+        {"serial_mcu_bridge": MOTOR, "ros1_bridge": ON},
+        {**MOVES, "estop.owners": ["serial"], "estop.zeros": [f"{BASE}/incoming/drive-values"]},
+    ),
+    "sounds": ({"soundboard_handler": ON}, {"soundboard.available": True, "soundboard.controls": True}),
+    "scripts": ({"autonomy_manager": ON}, {"autonomy.available": True, "autonomy.controls": True}),
+    "camera and microphone": (
+        {"av_daemon": ON},
+        {"video.available": True, "video.controls": False, "audio.available": True, "audio.controls": False},
+    ),
+    "and a bridge that requests them": (
+        {"av_daemon": ON, "mqtt_bridge": BRIDGE}, {"video.controls": True, "audio.controls": True},
+    ),
+    "no camera": (
+        {"av_daemon": {"enabled": True, "video": OFF}, "mqtt_bridge": BRIDGE},
+        {"video.available": False, "video.controls": False, "audio.available": True},
+    ),
+    "no microphone": (
+        {"av_daemon": {"enabled": True, "audio": OFF}, "mqtt_bridge": BRIDGE},
+        {"audio.available": False, "audio.controls": False, "video.available": True},
+    ),
+    "neither": ({"av_daemon": OFF, "mqtt_bridge": BRIDGE}, {"video.available": False, "audio.available": False}),
+    "a foreign streaming program": (
+        {"mqtt_bridge": BRIDGE, "video_stream": STREAM}, {"video.available": True, "video.controls": True},
+    ),
+    "that nothing requests": ({"video_stream": STREAM}, {"video.available": False}),
+    "encodings": (
+        {"mqtt_bridge": {"media": {"video_publisher": {"encoding": "pbvd"}, "audio_publisher": {"encoding": "opus"}}}},
+        {"video.encoding": "pbvd", "audio.encoding": "opus"},
+    ),
+    "sound as it is captured": (
+        {"av_daemon": {"audio": {"rate": 48000, "channels": 2}}}, {"audio.rate": 48000, "audio.channels": 2},
+    ),
+    "sound as it is published": (
+        {"av_daemon": {"audio": {"rate": 48000, "channels": 2}},
+         "mqtt_bridge": {"media": {"audio_publisher": {"rate": 8000}}}},
+        {"audio.rate": 8000, "audio.channels": 2},
+    ),
+}  # fmt: skip
 
 
-def test_the_transport_shows() -> None:
-    assert of("zenoh")["transport"] == {"kind": "zenoh"}
-
-
-def test_a_motor_line_offers_driving_lights_and_telemetry() -> None:
-    value = of(serial_mcu_bridge=MOTOR)
-    assert value["drive"]["available"]
-    assert value["drive"]["controls"]
-    assert value["drive"]["arbitrates"]
-    assert value["drive"]["axes"] == ["x", "z"]
-    assert value["estop"]["available"]
-    assert value["estop"]["owners"] == ["serial"]
-    assert value["estop"]["status_topics"] == [f"{BASE}/outgoing/estop/serial"]
-    assert value["lights"]["solid"]
-    assert value["lights"]["flash"]
-    assert value["telemetry"]["charging_status"]
-    assert not value["telemetry"]["touch_sensors"], "only when it is published"
-    assert of(serial_mcu_bridge={**MOTOR, "telemetry": {"publish_touch_sensors": True}})["telemetry"]["touch_sensors"]
+@pytest.mark.parametrize(("robot", "listed"), OFFERS.values(), ids=OFFERS)
+def test_what_a_robot_has_is_listed(robot: dict[str, Any], listed: dict[str, Any]) -> None:
+    value = of(**robot)
+    assert {path: at(value, path) for path in listed} == listed
 
 
 @pytest.mark.parametrize(
@@ -187,35 +259,7 @@ def test_a_system_action_can_be_asked_for_where_a_command_is_set(name: str) -> N
     assert not of(mqtt_bridge={"enabled": False, **control})["system"][name]["controls"]
 
 
-@pytest.mark.parametrize("enabled", [True, False])
-def test_sounds_are_offered_where_the_soundboard_is_enabled(enabled: bool) -> None:
-    soundboard = of(soundboard_handler={"enabled": enabled})["soundboard"]
-    assert (soundboard["available"], soundboard["controls"]) == (enabled, enabled)
-
-
-@pytest.mark.parametrize("enabled", [True, False])
-def test_scripts_are_there_where_they_are_enabled(enabled: bool) -> None:
-    value = of(autonomy_manager={"enabled": enabled})["autonomy"]
-    assert (value["available"], value["controls"]) == (enabled, enabled)
-
-
-@pytest.mark.parametrize(("section", "device"), [("video", "video"), ("audio", "audio")])
-def test_pictures_and_sound_are_there_with_their_device_and_on_request_with_a_bridge(section: str, device: str) -> None:
-    def offered(**services: Any) -> tuple[bool, bool]:
-        value = of(**services)[section]
-        return value["available"], value["controls"]
-
-    on, off = {"enabled": True}, {"enabled": True, device: {"enabled": False}}
-    assert offered(av_daemon=on, mqtt_bridge=BRIDGE) == (True, True)
-    assert offered(av_daemon=on) == (True, False)
-    assert offered(av_daemon=off, mqtt_bridge=BRIDGE) == (False, False)
-    assert offered(av_daemon={"enabled": False}, mqtt_bridge=BRIDGE) == (False, False)
-
-
 def test_encodings_are_those_of_this_installation(monkeypatch: pytest.MonkeyPatch) -> None:
-    publishers = {"video_publisher": {"encoding": "pbvd"}, "audio_publisher": {"encoding": "opus"}}
-    value = of(mqtt_bridge={"media": publishers})
-    assert (value["video"]["encoding"], value["audio"]["encoding"]) == ("pbvd", "opus")
     monkeypatch.setattr("pebble.runtime.pyav.find_spec", lambda _name: None)
     value = of()
     assert (value["video"]["encodings"], value["audio"]["encodings"]) == (["json", "pbvd"], ["pcm"])
@@ -236,120 +280,16 @@ def test_picture_size_and_rate(publisher: Any, captured: Any, expected: tuple[in
     assert (video["width"], video["height"], video["fps"]) == expected
 
 
-def test_sound_format() -> None:
-    assert of(av_daemon={"audio": {"rate": 48000, "channels": 2}})["audio"]["rate"] == 48000
-    audio = of(
-        mqtt_bridge={"media": {"audio_publisher": {"rate": 8000}}}, av_daemon={"audio": {"rate": 48000, "channels": 2}}
-    )["audio"]
-    assert (audio["rate"], audio["channels"]) == (8000, 2)
-
-
-#: Where a config renames a channel, and where capabilities show it.
-OVERRIDES = [
-    ("mqtt_bridge.topics.mqtt_audio", "audio.flag_topic"),
-    ("mqtt_bridge.topics.mqtt_video", "video.flag_topic"),
-    ("mqtt_bridge.topics.reboot", "system.reboot.flag_topic"),
-    ("mqtt_bridge.topics.service_restart", "system.service_restart.flag_topic"),
-    ("mqtt_bridge.topics.git_pull", "system.git_pull.flag_topic"),
-    ("mqtt_bridge.topics.audio_control", "audio.command_topic"),
-    ("mqtt_bridge.topics.video_control", "video.command_topic"),
-    ("mqtt_bridge.media.video_publisher.topic", "video.topic"),
-    ("mqtt_bridge.media.video_publisher.overlays_topic", "video.overlays_topic"),
-    ("mqtt_bridge.media.audio_publisher.topic", "audio.topic"),
-    ("mqtt_bridge.media.audio_receiver.topic", "audio.uplink_topic"),
-    ("soundboard_handler.topics.command", "soundboard.command_topic"),
-    ("soundboard_handler.topics.files", "soundboard.files_topic"),
-    ("soundboard_handler.topics.status", "soundboard.status_topic"),
-    ("autonomy_manager.topics.command", "autonomy.command_topic"),
-    ("autonomy_manager.topics.files", "autonomy.files_topic"),
-    ("autonomy_manager.topics.status", "autonomy.status_topic"),
-    ("serial_mcu_bridge.topics.drive_values", "drive.topic"),
-    ("serial_mcu_bridge.topics.lights_solid", "lights.solid_topic"),
-    ("serial_mcu_bridge.topics.lights_flash", "lights.flash_topic"),
-    ("serial_mcu_bridge.topics.touch_sensors", "telemetry.touch_topic"),
-    ("serial_mcu_bridge.topics.charging_status", "telemetry.charging_topic"),
-    ("serial_mcu_bridge.topics.charging_level", "telemetry.charging_level_topic"),
-    ("serial_mcu_bridge.topics.low_rate", "telemetry.imu_topic"),
-]
-
-
-def nested(path: str, value: str) -> dict[str, Any]:
-    tree: Any = value
-    for key in reversed(path.split(".")):
-        tree = {key: tree}
-    result: dict[str, Any] = tree
-    return result
-
-
-def at(tree: Any, path: str) -> Any:
-    for key in path.split("."):
-        tree = tree[key]
-    return tree
-
-
-@pytest.mark.parametrize(("path", "shown"), OVERRIDES, ids=[path for path, _ in OVERRIDES])
-def test_a_renamed_channel_is_advertised_under_its_new_name(path: str, shown: str) -> None:
-    assert at(of(**nested(path, f"{BASE}/other/name")), shown) == f"{BASE}/other/name"
-    assert at(of(), shown) != f"{BASE}/other/name"
-
-
-def test_a_motor_that_is_an_instance_is_advertised_under_its_own_names() -> None:
-    value = of(
-        serial_mcu_bridge={
-            "enabled": False,
-            "topics": {"drive_values": f"{BASE}/incoming/of-the-root"},
-            "instances": {"base": {**MOTOR, "topics": {"drive_values": f"{BASE}/incoming/of-the-instance"}}},
-        }
-    )
-    assert value["drive"]["topic"] == f"{BASE}/incoming/of-the-instance"
-    assert value["estop"]["owners"] == ["base"]
-
-
-@pytest.mark.parametrize(
-    ("services", "moves", "owners", "zeros"),
-    [
-        ({}, False, [], None),
-        ({"ros1_bridge": {"enabled": False}}, False, [], None),
-        ({"ros1_bridge": {"enabled": True, "drive": {"enabled": False}}}, False, [], None),
-        ({"ros1_bridge": {"enabled": True}}, True, [], [f"{BASE}/incoming/drive-values"]),
-        ({"ros1_bridge": {"enabled": True, "topics": {"drive_values": "a/b"}}}, True, [], ["a/b"]),
-        ({"serial_mcu_bridge": MOTOR}, True, ["serial"], None),
-        (
-            {"serial_mcu_bridge": MOTOR, "ros1_bridge": {"enabled": True}},
-            True,
-            ["serial"],
-            [f"{BASE}/incoming/drive-values"],
-        ),
-    ],
-)
-def test_what_ros_moves_drives_and_gets_zeros_at_a_stop(
-    services: dict[str, Any], moves: bool, owners: list[str], zeros: list[str] | None
-) -> None:
-    value = of(**services)
-    assert (value["drive"]["available"], value["estop"]["owners"], value["estop"].get("zeros")) == (
-        moves,
-        owners,
-        zeros,
-    )
-
-
-def test_without_an_emergency_stop_no_owner_is_listed() -> None:
-    wheels = {name: {"enabled": True, "serial": {"port": f"/dev/{name}"}} for name in ("left", "right")}
-    raw = {"robot": {"id": "rover"}, "services": {"serial_mcu_bridge": {"instances": wheels}}}
-    config = parse(raw, folder=Path("/robots"), env={})
-    assert capabilities(config, Addresses(config))["estop"]["owners"] == ["left", "right"]
-    value = capabilities(config, Addresses(config), {"estop"})
-    assert value["estop"] == {
-        "available": False,
-        "topic": f"{BASE}/incoming/estop",
-        "reset_topic": f"{BASE}/incoming/estop-reset",
-        "owners": [],
-        "status_topics": [],
-    }
-    assert value["drive"] == capabilities(config, Addresses(config))["drive"]
-
-
-def test_a_foreign_streaming_program_can_be_asked_for() -> None:
-    stream = {"enabled": True, "command": ["mediamtx"]}
-    assert of(mqtt_bridge=BRIDGE, video_stream=stream)["video"]["controls"]
-    assert not of(video_stream=stream)["video"]["available"]
+def test_a_renamed_channel_is_advertised_under_its_new_name() -> None:
+    services: dict[str, Any] = {}
+    expected = json.dumps(of())
+    for channel in CHANNELS:
+        if channel.override is not None:
+            _, *folders, key = channel.override.split(".")
+            section = services
+            for folder in folders:
+                section = section.setdefault(folder, {})
+            section[key] = f"site/{channel.suffix}"
+            expected = expected.replace(f'"{BASE}/{channel.suffix}"', f'"site/{channel.suffix}"')
+    assert of(**services) == json.loads(expected)
+    assert expected.count('"site/') == 24

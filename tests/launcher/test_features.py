@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import os
+import re
 import signal
+
+import pytest
 
 from pebble.launcher.features import Features
 from pebble.runtime import notes
@@ -11,55 +14,41 @@ from pebble.runtime.notes import Feature
 from tests.launcher.robot import CONNECTION, Launch
 from tests.support import until
 
-
-class Recorder:
-    """`Features`, and what is lacking or found after each change."""
-
-    def __init__(self) -> None:
-        self.changes: list[set[str]] = []
-        self.features = Features(self._changed)
-
-    def _changed(self) -> None:
-        self.changes.append({*self.features.lacking, *self.features.found})
+#: Who lacks (-) or has (+) a feature or ends (.), and what is lacking and found after each change.
+HISTORIES: dict[str, tuple[str, list[set[str]]]] = {
+    "lacking while any lacks it": ("l-estop l-estop r-estop l+estop other+estop r+estop", [{"-estop"}, set()]),
+    "the end of a process": ("l-estop r. l.", [{"-estop"}, set()]),
+    "found while any has it": ("a-outlets/o/power a+outlets/o/power b+outlets/o/power a-outlets/o/power b.",
+                               [{"+outlets/o/power"}, set()]),
+    "what is lacked is not found": ("a-outlets/o/power", []),
+}  # fmt: skip
 
 
-def test_a_feature_is_lacking_while_any_process_lacks_it() -> None:
-    recorder = Recorder()
-    for program, has in [("left", False), ("left", False), ("right", False), ("left", True), ("other", True)]:
-        recorder.features.receive(program, Feature("estop", has))
-    assert recorder.changes == [{"estop"}]
-    recorder.features.receive("right", Feature("estop", True))
-    assert recorder.changes == [{"estop"}, set()]
+@pytest.mark.parametrize(("history", "changes"), HISTORIES.values(), ids=HISTORIES)
+def test_what_processes_report(history: str, changes: list[set[str]]) -> None:
+    seen: list[set[str]] = []
 
+    def changed() -> None:
+        seen.append({f"-{name}" for name in features.lacking} | {f"+{name}" for name in features.found})
 
-def test_the_end_of_a_process_ends_what_it_reported() -> None:
-    recorder = Recorder()
-    recorder.features.receive("left", Feature("estop", False))
-    recorder.features.ended("right")
-    assert recorder.features.lacking == {"estop"}
-    recorder.features.ended("left")
-    assert recorder.changes == [{"estop"}, set()]
-
-
-def test_what_is_not_expected_is_there_while_any_process_has_it() -> None:
-    recorder = Recorder()
-    for program, has in [("a", False), ("a", True), ("b", True), ("a", False)]:
-        recorder.features.receive(program, Feature("outlets/o/power", has))
-    assert recorder.features.found == {"outlets/o/power"}
-    assert not recorder.features.lacking
-    recorder.features.ended("b")
-    assert recorder.changes == [{"outlets/o/power"}, set()]
+    features = Features(changed)
+    for program, mark, name in re.findall(r"(\w+)([-+.])(\S*)", history):
+        if mark == ".":
+            features.ended(program)
+        else:
+            features.receive(program, Feature(name, mark == "+"))
+    assert seen == changes
 
 
 def test_an_outlet_may_have_any_name_and_there_are_limits() -> None:
-    recorder = Recorder()
+    features = Features(lambda: None)
     for name in ("Küche 1/power", *(f"{number}/status" for number in range(300))):
         note = notes.decode(notes.encode(Feature(f"outlets/{name}", True)))
         assert isinstance(note, Feature)
-        recorder.features.receive("a", note)
-    assert len(recorder.features.found) == 256
-    recorder.features.receive("a", Feature("outlets/1/status", False))
-    assert len(recorder.features.found) == 255
+        features.receive("a", note)
+    assert len(features.found) == 256
+    features.receive("a", Feature("outlets/1/status", False))
+    assert len(features.found) == 255
 
 
 def test_capabilities_are_published_again_when_a_process_reports_and_when_it_ends(launch: Launch) -> None:

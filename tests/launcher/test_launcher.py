@@ -17,11 +17,9 @@ import pytest
 
 from pebble.config import Config, load, parse
 from pebble.errors import ConfigError
-from pebble.extension import Program, Stage
+from pebble.extension import Stage
 from pebble.launcher.launcher import Launcher
 from pebble.launcher.programs import programs, shared_modules
-from pebble.launcher.run_lock import RunLock
-from pebble.runtime.parent import NOTIFY_FD
 from tests.fakes.seccomp import CALLS
 from tests.launcher.robot import BASE, CONNECTION, DEVICE, LOCAL_TRANSPORT, Launch, lines_of
 from tests.support import ROOT, gone, until
@@ -70,17 +68,6 @@ def test_a_stop_signal_while_starting_starts_no_further_child(launch: Launch) ->
     robot = launch(("hub", "good", LOCAL_TRANSPORT), ("serial", "good", DEVICE), options=("signal",))
     assert robot.process.wait(20) == 0
     assert robot.stderr().count("spawned a child") == 1
-
-
-def test_a_second_launcher_for_the_same_robot_is_refused(launch: Launch) -> None:
-    robot = launch(("bridge", "good", CONNECTION))
-    assert robot.ready("bridge")
-    second = robot.second()
-    assert second.returncode == 1
-    expected = f"refused: {BASE} already runs: process {robot.process.pid} holds {robot.run_dir}/launcher.lock"
-    assert second.stderr.strip() == f"{expected}; end it there with Ctrl-C"
-    assert robot.run_dir.stat().st_mode & 0o777 == 0o700
-    assert len(robot.events("bridge", "start")) == 1
 
 
 def test_microcontroller_robots_are_refused(tmp_path: Path) -> None:
@@ -275,20 +262,6 @@ def test_threads_are_waited_for_before_the_exit_functions_run(launch: Launch) ->
     assert [line.split()[1] for line in lines_of(robot.journal)][:3] == ["start", "thread", "atexit"]
 
 
-def test_the_lock_of_a_killed_launcher_is_free_at_once(launch: Launch) -> None:
-    robot = launch(("bridge", "stubborn", CONNECTION))
-    assert robot.ready("bridge")
-    pid = robot.events("bridge", "start")[0]
-    robot.process.kill()
-    robot.process.wait(10)
-    try:
-        assert not gone(pid)
-        with RunLock(robot.run_dir, BASE, robot.run_dir / "state.lock"):
-            pass
-    finally:
-        os.kill(pid, signal.SIGKILL)
-
-
 def test_restarts_leave_no_descriptors_behind(launch: Launch) -> None:
     robot = launch(("serial", "crash", DEVICE), options=("tireless",), restart_delay_seconds=0)
     assert robot.ready("announcer")
@@ -432,46 +405,103 @@ def test_systemd_is_notified_of_readiness_life_and_end(launch: Launch, tmp_path:
 
 # -- the table
 
+ON, OFF = {"enabled": True}, {"enabled": False}
+UPLINK = {"enabled": True, "remote_mqtt": {"host": "far"}}
+ARM = {"arm": {"serial": {"port": "/dev/ttyACM1"}}, "off": OFF}
+LINES = {"enabled": True, "serial": {"port": "/dev/ttyACM0"}, "instances": ARM}
+ZENOH = {"kind": "zenoh", "journal": "kept", "lease_ms": 700, "mqtt_mirror": {}}
+MQTT = {"kind": "mqtt"}
+STREAM = {"enabled": True, "command": ["mediamtx"]}
+#: The services of a config, its transport, and the programs in their order; those on demand have a "+".
+TABLES: dict[str, tuple[dict[str, Any], dict[str, Any], str]] = {
+    "serial lines": (
+        *({"mqtt_bridge": UPLINK, "serial_mcu_bridge": LINES}, MQTT),
+        "announcer serial_mcu_bridge serial_mcu_bridge:arm mqtt_bridge",
+    ),
+    "zenoh": ({"mqtt_bridge": UPLINK}, ZENOH, "zenoh_hub announcer mqtt_bridge mqtt_mirror"),
+    "camera and microphone": (
+        *({"av_daemon": ON, "mqtt_bridge": UPLINK}, MQTT),
+        "announcer av_daemon mqtt_bridge +camera_publisher +audio_publisher +audio_receiver",
+    ),
+    "no microphone": (
+        *({"av_daemon": {**ON, "audio": OFF}, "mqtt_bridge": UPLINK}, MQTT),
+        "announcer av_daemon mqtt_bridge +camera_publisher",
+    ),
+    "no camera": (
+        *({"av_daemon": {**ON, "video": OFF}, "mqtt_bridge": UPLINK}, MQTT),
+        "announcer av_daemon mqtt_bridge +audio_publisher +audio_receiver",
+    ),
+    "no bridge": ({"av_daemon": ON, "mqtt_bridge": OFF}, MQTT, "announcer av_daemon"),
+    "no devices": ({"av_daemon": OFF, "mqtt_bridge": UPLINK}, MQTT, "announcer mqtt_bridge"),
+    "a foreign streaming program": (
+        *({"mqtt_bridge": UPLINK, "video_stream": STREAM}, MQTT),
+        "announcer mqtt_bridge +video_stream",
+    ),
+    "a page": ({"web_handler": ON}, MQTT, "announcer web_handler"),
+    "no page": ({"web_handler": OFF}, MQTT, "announcer"),
+}
+#: Of a program: its module, arguments and stage, whether it may request others, and whether it is imported beforehand.
+PROGRAMS: dict[str, tuple[str, tuple[str, ...], Stage, bool, bool]] = {
+    "serial_mcu_bridge:arm": ("pebble.services.serial_mcu_bridge", ("None", "arm"), Stage.DEVICE, False, True),
+    "mqtt_bridge": ("pebble.services.mqtt_bridge", ("None",), Stage.CONNECTION, True, True),
+    "av_daemon": ("pebble.services.av_daemon", ("None",), Stage.DEVICE, False, False),
+    "camera_publisher": ("pebble.services.camera_publisher", ("None",), Stage.CONNECTION, False, False),
+    "video_stream": ("pebble.services.video_stream", ("None",), Stage.CONNECTION, False, True),
+    "web_handler": ("pebble.extensions.page.run", ("None",), Stage.CONNECTION, False, False),
+}
 
-def _table(**sections: Any) -> list[tuple[str, str, tuple[str, ...], Stage]]:
-    config = _parsed(**sections)
-    return [(one.name, one.module, one.arguments, one.stage) for one in programs(config)]
 
-
-def _parsed(**sections: Any) -> Config:
-    raw = {"robot": {"id": "rover"}, **sections}
-    raw["transport"] = {"run_dir": "/run/rover", **raw.get("transport", {"kind": "mqtt"})}
+def _parsed(services: dict[str, Any], transport: dict[str, Any] = MQTT) -> Config:
+    raw = {"robot": {"id": "rover"}, "transport": {"run_dir": "/run/rover", **transport}, "services": services}
     return parse(raw, folder=Path("/robots"), env={})
 
 
-def test_an_mqtt_robot_has_no_hub() -> None:
-    services = {
-        "mqtt_bridge": {"enabled": True, "remote_mqtt": {"host": "far"}},
-        "serial_mcu_bridge": {
-            "enabled": True,
-            "serial": {"port": "/dev/ttyACM0"},
-            "instances": {"arm": {"serial": {"port": "/dev/ttyACM1"}}, "off": {"enabled": False}},
-        },
-    }
-    assert [row[0] for row in _table(services=services)] == [
-        "announcer",
-        "serial_mcu_bridge",
-        "serial_mcu_bridge:arm",
-        "mqtt_bridge",
-    ]
-    arm = _table(services=services)[2]
-    assert arm == ("serial_mcu_bridge:arm", "pebble.services.serial_mcu_bridge", ("None", "arm"), Stage.DEVICE)
+@pytest.mark.parametrize(("services", "transport", "names"), TABLES.values(), ids=TABLES)
+def test_a_robot_has_the_programs_of_its_config(
+    services: dict[str, Any], transport: dict[str, Any], names: str
+) -> None:
+    assert ["+" * one.on_demand + one.name for one in programs(_parsed(services, transport))] == names.split()
 
 
-DEVICES = {"enabled": True}
+def test_a_program_is_started_as_the_table_says() -> None:
+    services = {"serial_mcu_bridge": LINES, "mqtt_bridge": UPLINK, "av_daemon": ON, "video_stream": STREAM}
+    table = {one.name: one for one in programs(_parsed({**services, "web_handler": ON}, ZENOH))}
+    for name, row in PROGRAMS.items():
+        program = table[name]
+        assert (program.module, program.arguments, program.stage, program.may_request, program.preloaded) == row
+    hub = table["zenoh_hub"]
+    assert (hub.module, hub.stage) == ("pebble.runtime.hub", Stage.LOCAL_TRANSPORT)
+    settings = json.loads(hub.arguments[0])
+    assert (settings["run_dir"], settings["lease_ms"], settings["journal"]) == ("/run/rover", 700, "/robots/kept")
 
 
 MEDIA_MODULES = {"pebble.transports.frames", "pebble.extensions.media.sound"}
+
+
+@pytest.mark.parametrize(
+    ("services", "transport", "kinds", "media"),
+    [
+        ({}, MQTT, {"mqtt"}, set()),
+        ({}, {"kind": "zenoh"}, {"zenoh"}, set()),
+        ({}, {"kind": "zenoh", "mqtt_mirror": {}}, {"zenoh", "mqtt"}, set()),
+        ({"mqtt_bridge": UPLINK}, {"kind": "zenoh"}, {"zenoh", "mqtt"}, set()),
+        ({}, {"kind": "somebodys", "settings": {}}, set(), set()),
+        ({"mqtt_bridge": UPLINK, "video_stream": STREAM}, MQTT, {"mqtt"}, set()),
+        ({"mqtt_bridge": UPLINK, "av_daemon": ON}, MQTT, {"mqtt"}, MEDIA_MODULES),
+    ],
+)
+def test_what_several_programs_share_is_known_beforehand(
+    services: dict[str, Any], transport: dict[str, Any], kinds: set[str], media: set[str]
+) -> None:
+    expected = {f"pebble.transports.{kind}.transport" for kind in kinds} | media
+    assert {*shared_modules(_parsed(services, transport), ())} == expected
+
+
 #: Of a robot with a camera, a text protocol on its serial line, and the security level `open`.
 NEEDED = [
     "numpy",
     "pebble.runtime.process",
-    "pebble.services.mqtt_bridge.audit",
+    "pebble.extensions.fleet.robot_audit",
     "pebble.services.serial_mcu_bridge.text.motor_bridge",
 ]
 NOT_NEEDED = [
@@ -481,41 +511,10 @@ NOT_NEEDED = [
 ]
 
 
-def _programs(devices: dict[str, Any], **bridge: Any) -> dict[str, Program]:
-    services = {"av_daemon": devices, "mqtt_bridge": {"enabled": True, "remote_mqtt": {"host": "far"}, **bridge}}
-    return {program.name: program for program in programs(_parsed(services=services))}
-
-
-def test_camera_and_microphone_start_with_the_robot_and_media_only_when_they_are_requested() -> None:
-    table = _programs(DEVICES)
-    assert list(table) == [
-        *("announcer", "av_daemon", "mqtt_bridge"),
-        *("camera_publisher", "audio_publisher", "audio_receiver"),
-    ]
-    assert [name for name, program in table.items() if program.on_demand] == list(table)[3:]
-    assert [name for name, program in table.items() if program.may_request] == ["mqtt_bridge"]
-    assert [name for name, program in table.items() if program.preloaded] == ["announcer", "mqtt_bridge"]
-    assert (table["av_daemon"].stage, table["camera_publisher"].stage) == (Stage.DEVICE, Stage.CONNECTION)
-
-
-@pytest.mark.parametrize(
-    ("devices", "bridge", "media"),
-    [
-        ({"enabled": True, "audio": {"enabled": False}}, {}, ["camera_publisher"]),
-        ({"enabled": True, "video": {"enabled": False}}, {}, ["audio_publisher", "audio_receiver"]),
-        ({"enabled": True}, {"enabled": False}, []),
-        ({"enabled": False}, {}, []),
-    ],
-)
-def test_there_are_media_for_what_there_is(devices: dict[str, Any], bridge: dict[str, Any], media: list[str]) -> None:
-    assert [name for name, program in _programs(devices, **bridge).items() if program.on_demand] == media
-
-
 def test_the_launcher_of_a_robot_with_a_camera_imports_only_what_several_share_and_stays_single_threaded() -> None:
-    bridge, line = {"enabled": True, "remote_mqtt": {"host": "far"}}, {"enabled": True, "serial": {"port": "/dev/x"}}
-    config = _parsed(services={"av_daemon": DEVICES, "mqtt_bridge": bridge, "serial_mcu_bridge": line})
+    line = {"enabled": True, "serial": {"port": "/dev/x"}}
+    config = _parsed({"av_daemon": ON, "mqtt_bridge": UPLINK, "serial_mcu_bridge": line})
     shared = shared_modules(config, programs(config))
-    assert {*shared} >= MEDIA_MODULES
     code = f"""
 import os, sys
 from pebble.launcher import launcher
@@ -525,76 +524,3 @@ print([name for name in {(*NEEDED, *NOT_NEEDED)} if name in sys.modules], len(os
 """
     ran = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, timeout=60)
     assert ran.stdout.strip() == f"{NEEDED} 1", ran.stderr
-
-
-def test_a_foreign_streaming_program_is_one_more_program_on_demand() -> None:
-    services = {
-        "mqtt_bridge": {"enabled": True, "remote_mqtt": {"host": "far"}},
-        "video_stream": {"enabled": True, "command": ["mediamtx"]},
-    }
-    table = _table(services=services)
-    assert [row[:2] for row in table][-1] == ("video_stream", "pebble.services.video_stream")
-    assert {one.name for one in programs(_parsed(services=services)) if one.on_demand} == {"video_stream"}
-    assert not MEDIA_MODULES & {*shared_modules(_parsed(services=services), ())}
-
-
-def test_the_launcher_of_a_robot_without_media_carries_nothing_for_them() -> None:
-    config = _parsed(services={"mqtt_bridge": {"enabled": True, "remote_mqtt": {"host": "far"}}})
-    assert not MEDIA_MODULES & {*shared_modules(config, programs(config))}
-
-
-def test_the_operator_page_is_one_more_connection_and_is_imported_by_its_own_process_only() -> None:
-    services = {"web_handler": {"enabled": True}}
-    page = programs(_parsed(services=services))[-1]
-    assert (page.name, page.module, page.arguments) == ("web_handler", "pebble.extensions.page.run", ("None",))
-    assert (page.stage, page.on_demand) == (Stage.CONNECTION, False)
-    assert page.module not in shared_modules(_parsed(services=services), [page])
-    assert "web_handler" not in [row[0] for row in _table(services={"web_handler": {"enabled": False}})]
-
-
-def test_a_zenoh_robot_starts_its_hub_first() -> None:
-    services = {"mqtt_bridge": {"enabled": True, "remote_mqtt": {"host": "far"}}}
-    transport = {"kind": "zenoh", "journal": "kept", "lease_ms": 700, "mqtt_mirror": {}}
-    table = _table(services=services, transport=transport)
-    assert [row[0] for row in table] == ["zenoh_hub", "announcer", "mqtt_bridge", "mqtt_mirror"]
-    name, module, (settings,), stage = table[0]
-    assert (name, module, stage) == ("zenoh_hub", "pebble.runtime.hub", Stage.LOCAL_TRANSPORT)
-    decoded = json.loads(settings)
-    assert (decoded["run_dir"], decoded["lease_ms"], decoded["journal"]) == ("/run/rover", 700, "/robots/kept")
-
-
-@pytest.mark.parametrize(
-    ("sections", "modules"),
-    [
-        ({}, {"mqtt"}),
-        ({"transport": {"kind": "zenoh"}}, {"zenoh"}),
-        ({"transport": {"kind": "zenoh", "mqtt_mirror": {}}}, {"zenoh", "mqtt"}),
-        (
-            {
-                "transport": {"kind": "zenoh"},
-                "services": {"mqtt_bridge": {"enabled": True, "remote_mqtt": {"host": "far"}}},
-            },
-            {"zenoh", "mqtt"},
-        ),
-        ({"transport": {"kind": "somebodys", "settings": {}}}, set()),
-    ],
-)
-def test_the_transports_a_robot_uses_are_known_beforehand(sections: dict[str, Any], modules: set[str]) -> None:
-    assert {*shared_modules(_parsed(**sections), ())} == {f"pebble.transports.{kind}.transport" for kind in modules}
-
-
-def test_the_hub_process_notifies_that_it_is_ready_and_stops_when_asked(tmp_path: Path) -> None:
-    settings = json.dumps({"run_dir": str(tmp_path / "run")})
-    read_end, notes = os.pipe()
-    environment = {**os.environ, NOTIFY_FD: str(notes)}
-    command = [sys.executable, "-m", "pebble.runtime.hub", settings]
-    with subprocess.Popen(command, cwd=ROOT, env=environment, pass_fds=(notes,)) as hub, os.fdopen(read_end) as signs:
-        try:
-            os.close(notes)
-            assert json.loads(signs.readline()) == {"note": "ready"}
-            assert (tmp_path / "run" / "hub.sock").exists()
-            assert json.loads(signs.readline()) == {"note": "alive"}
-            hub.terminate()
-            assert hub.wait(10) == 0
-        finally:
-            hub.kill()

@@ -141,16 +141,18 @@ def test_writing_never_waits_for_a_reader() -> None:
 # -- levels
 
 
-def test_a_line_becomes_text_without_its_end() -> None:
-    assert [text_of(line) for line in (b"two\r", b"", b"  three  ")] == ["two", "", "  three"]
-
-
-def test_what_a_program_writes_does_not_steer_the_terminal() -> None:
-    assert text_of(b"\x1b[2Jgone\x07 \xe2\x80\xae.\r\n") == "\\u001b[2Jgone\\u0007 \\u202e."
-
-
-def test_bytes_that_are_no_text_are_replaced() -> None:
-    assert text_of(b"a\xff\xfeb") == "a\ufffd\ufffdb"
+@pytest.mark.parametrize(
+    ("line", "text"),
+    [
+        (b"two\r", "two"),
+        (b"", ""),
+        (b"  three  ", "  three"),
+        (b"\x1b[2Jgone\x07 \xe2\x80\xae.\r\n", "\\u001b[2Jgone\\u0007 \\u202e."),  # it does not steer a terminal
+        (b"a\xff\xfeb", "a\ufffd\ufffdb"),
+    ],
+)
+def test_a_line_becomes_text(line: bytes, text: str) -> None:
+    assert text_of(line) == text
 
 
 @pytest.mark.parametrize(
@@ -171,40 +173,33 @@ def test_a_line_of_the_log_format_names_its_level(line: str, level: str, text: s
     assert LevelReader().read(line) == (level, text)
 
 
-def levels(*lines: str) -> list[str]:
+#: Lines, and the first letter of the level that each has.
+LINES = {
+    "a traceback has the level of the line it belongs to": (
+        ("12:00:00 [WARNING] it broke", "W"),
+        ("Traceback (most recent call last):", "W"),
+        ('  File "x.py", line 1', "W"),
+        ("ValueError: no", "W"),
+        ("During handling of the above exception, another exception occurred:", "W"),
+        ("Traceback (most recent call last):", "W"),
+        ("KeyError: 1", "W"),
+        ("12:00:01 [INFO] goes on", "I"),
+        ("a print", "I"),
+    ),
+    "one of its own is an error": (
+        *(("a print", "I"), ("Traceback (most recent call last):", "E"), ("  File", "E"), ("ImportError: no", "E")),
+    ),
+    "indented lines continue, and others do not": (
+        *(("12:00:00 [ERROR] two reasons:", "E"), ("  one", "E"), ("  two", "E")),
+        *(("a print", "I"), ("  of its own", "I")),
+    ),
+}
+
+
+@pytest.mark.parametrize("lines", LINES.values(), ids=LINES)
+def test_the_levels_of_several_lines(lines: tuple[tuple[str, str], ...]) -> None:
     reader = LevelReader()
-    return [reader.read(line)[0] for line in lines]
-
-
-def test_a_traceback_has_the_level_of_the_line_it_belongs_to() -> None:
-    assert (
-        levels(
-            "12:00:00 [WARNING] it broke",
-            "Traceback (most recent call last):",
-            '  File "x.py", line 1',
-            "ValueError: no",
-            "During handling of the above exception, another exception occurred:",
-            "Traceback (most recent call last):",
-            "KeyError: 1",
-            "12:00:01 [INFO] goes on",
-            "a print",
-        )
-        == ["WARNING"] * 7 + ["INFO"] * 2
-    )
-
-
-def test_a_traceback_of_its_own_is_an_error() -> None:
-    assert levels("a print", "Traceback (most recent call last):", "  File", "ImportError: no") == [
-        "INFO",
-        *["ERROR"] * 3,
-    ]
-
-
-def test_indented_lines_continue_and_others_do_not() -> None:
-    assert levels("12:00:00 [ERROR] two reasons:", "  one", "  two", "a print", "  of its own") == [
-        *["ERROR"] * 3,
-        *["INFO"] * 2,
-    ]
+    assert [(line, reader.read(line)[0][0]) for line, _ in lines] == [*lines]
 
 
 def test_cut() -> None:

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import os
 import signal
-import socket
 import time
 from collections.abc import Callable
-from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
 
@@ -21,7 +19,7 @@ from pebble.launcher.process_supervisor import ProcessSupervisor
 from pebble.launcher.reactor import Reactor
 from pebble.runtime import notes
 from pebble.runtime.notes import Held, Wanted
-from tests.launcher.robot import CONNECTION, DEVICE, Launch, Robot, Row, lines_of
+from tests.launcher.robot import CONNECTION, DEVICE, Launch, Robot, Row
 from tests.support import gone, until
 
 ASKER: Row = ("bridge", "asker", CONNECTION, {"may_request": True})
@@ -106,37 +104,6 @@ def test_a_program_runs_if_it_is_requested_and_not_held(
     assert " ".join(found) == states
 
 
-def test_programs_that_are_not_requested_are_left_out_of_the_summary(launch: Launch, tmp_path: Path) -> None:
-    path = tmp_path / "systemd"
-    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as systemd:
-        systemd.bind(str(path))
-        systemd.settimeout(20)
-
-        def received(text: str) -> bool:
-            while systemd.recv(1000).decode() != text:
-                pass
-            return True
-
-        robot = launch(ASKER, media("good"), env={"NOTIFY_SOCKET": str(path)})
-        assert received("READY=1")
-        assert received("STATUS=2 of 2 ready")
-        robot.order("bridge", "media 1")
-        assert received("STATUS=3 of 3 ready")
-        robot.order("bridge", "media 0")
-        assert received("STATUS=2 of 2 ready"), "a program that is not requested is left out"
-
-
-def test_a_requested_program_that_ends_is_started_again_at_once(launch: Launch) -> None:
-    robot = launch(ASKER, media("good"), restart_delay_seconds=600)
-    assert robot.ready("bridge")
-    robot.order("bridge", "media 1")
-    assert robot.ready("media")
-    os.kill(robot.events("media", "start")[0], signal.SIGKILL)
-    assert until(lambda: len(robot.events("media", "ready")) == 2, 20)
-    again = {"state": "ready", "restarts": 1, "last_exit": "signal 9"}
-    assert until(lambda: robot.services()["media"] == again)
-
-
 def test_a_crash_loop_shows_until_the_program_is_released(launch: Launch) -> None:
     robot = launch(ASKER, media("crash"), restart_delay_seconds=0)
     assert robot.ready("bridge")
@@ -189,38 +156,6 @@ def test_rapidly_changing_requests_start_few_processes(launch: Launch) -> None:
     assert len(robot.events("media", "start")) <= 2 + time.monotonic() - began
 
 
-def test_each_start_gets_the_encoding_that_was_requested_last(launch: Launch) -> None:
-    robot = launch(ASKER, media("curious about itself"))
-    assert robot.ready("bridge")
-    robot.order("bridge", "media 1 h264")
-    assert robot.ready("media")
-    robot.order("bridge", "media 1 pbvd")
-    os.kill(robot.events("bridge", "start")[0], signal.SIGKILL)
-    assert until(lambda: robot.events("bridge", "before:media=pbvd") or robot.events("bridge", "before:media=h264"))
-    robot.order("bridge", "media 1 pbvd", "other 1")
-    assert until(lambda: "may not request" in robot.stderr()), "it has been received"
-    os.kill(robot.events("media", "start")[0], signal.SIGKILL)
-    assert until(lambda: len(environment_notes(robot)) == 2)
-    robot.order("bridge", "media 1", "media 0")
-    assert until(lambda: robot.events("media", "stop"))
-    robot.order("bridge", "media 1")
-    assert until(lambda: len(environment_notes(robot)) == 3)
-    assert [note.rpartition(":")[2] for note in environment_notes(robot)] == ["h264", "pbvd", "None"]
-
-
-def environment_notes(robot: Robot) -> list[str]:
-    output = (line.split() for line in lines_of(robot.journal))
-    return [word for name, word, _ in output if name == "media" and word.startswith("env:")]
-
-
-@pytest.mark.parametrize("how", ["half", "noise"])
-def test_a_request_in_pieces_or_after_noise_is_understood(launch: Launch, how: str) -> None:
-    robot = launch(ASKER, media("good"))
-    assert robot.ready("bridge")
-    robot.order("bridge", f"{how} media 1")
-    assert robot.ready("media")
-
-
 def test_only_the_bridge_may_request_and_only_existing_programs(launch: Launch) -> None:
     robot = launch(ASKER, ("other", "asker", CONNECTION), media("good"))
     assert robot.ready("bridge", "other")
@@ -232,18 +167,6 @@ def test_only_the_bridge_may_request_and_only_existing_programs(launch: Launch) 
     assert until(lambda: robot.states() == {"bridge": "ready", "other": "ready", "announcer": "ready"})
     assert robot.stderr().count("may not request") == 2, "one line each"
     assert not robot.events("media", "start")
-
-
-def test_the_robot_stops_with_all_it_has(launch: Launch) -> None:
-    robot = launch(ASKER, media("good"), media("stubborn", "deaf"), media("good", "idle"), shutdown_timeout_seconds=1.5)
-    assert robot.ready("bridge")
-    robot.order("bridge", "media 1", "deaf 1")
-    assert robot.ready("media", "deaf")
-    pids = [robot.events(name, "start")[0] for name in ("media", "deaf", "bridge")]
-    assert robot.stop() == 0
-    assert all(gone(pid) for pid in pids)
-    assert "idle" not in robot.services()
-    assert robot.services()["media"]["state"] == "stopped"
 
 
 class TestBridgeThatDies:
@@ -262,17 +185,6 @@ class TestBridgeThatDies:
         assert robot.states()["media"] == "ready"
         assert len(robot.events("media", "start")) == 1
         assert not robot.events("media", "stop")
-
-    def test_its_requests_last_for_a_while(self, launch: Launch) -> None:
-        robot = launch(ASKER, media("good"), restart_delay_seconds=600)
-        assert robot.ready("bridge")
-        robot.order("bridge", "media 1")
-        assert robot.ready("media")
-        os.kill(robot.events("bridge", "start")[0], signal.SIGKILL)
-        assert until(lambda: len(robot.events("bridge", "ready")) == 2, 20)
-        robot.order("bridge", "media 0")
-        assert until(lambda: robot.events("media", "stop"))
-        assert len(robot.events("media", "start")) == 1
 
     def test_dying_again_and_again_prolongs_nothing(self, monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr(on_demand, "OUTLIVE_S", 0.3)

@@ -15,55 +15,29 @@ def drain(inbox: Inbox) -> None:
         job()
 
 
-def test_jobs_come_out_in_the_order_they_came_in() -> None:
-    inbox, ran = Inbox(), list[int]()
-    for number in range(5):
-        inbox.post(lambda number=number: ran.append(number))  # type: ignore[misc]
+#: What is posted, what runs, and how many are dropped: a number is a job of its own, ``drive.2`` the newest of its
+#: kind, and ``STOP`` ends something.
+POSTS = {
+    "in the order in which they came": ("0 1 2", "0 1 2", 0),
+    "the newest takes the place of the one that waits": ("drive.1 lights drive.2", "drive.2 lights", 0),
+    "beyond the limit the oldest is dropped": ("0 1 2 3 4 5 6 7 8 9 drive.1 drive.2", "8 9 drive.2", 8),
+    "what ends something is not": ("STOP 0 1 2 3 4", "STOP 3 4", 3),
+    "and comes after what it ends": ("0 STOP 1 STOP 2", "1 STOP 2", 1),
+    "nor for the newest of a kind": ("drive.1 STOP 0 1 2", "drive.1 STOP 2", 2),
+    "its newest is the last": ("STOP 0 1 STOP", "0 1 STOP", 0),
+    "of too many the oldest": ("A B C D", "B C D", 1),
+}
+
+
+@pytest.mark.parametrize(("posts", "runs", "dropped"), POSTS.values(), ids=POSTS)
+def test_what_runs_of_what_is_posted(posts: str, runs: str, dropped: int) -> None:
+    inbox, ran = Inbox(limit=3), list[str]()
+    for word in posts.split():
+        kind = word.partition(".")[0]
+        name = {} if kind.isdigit() else {"last_of" if kind.isupper() else "newest_of": kind}
+        inbox.post(lambda word=word: ran.append(word), **name)  # type: ignore[misc]
     drain(inbox)
-    assert ran == [0, 1, 2, 3, 4]
-    assert inbox.take(0) is None
-
-
-def test_the_newest_of_a_kind_takes_the_place_of_the_one_that_waits() -> None:
-    inbox, ran = Inbox(), list[str]()
-    inbox.post(lambda: ran.append("drive 1"), newest_of="drive")
-    inbox.post(lambda: ran.append("lights"))
-    inbox.post(lambda: ran.append("drive 2"), newest_of="drive")
-    drain(inbox)
-    assert ran == ["drive 2", "lights"]
-    assert inbox.dropped == 0, "it was replaced, not lost"
-
-
-def test_beyond_the_limit_the_oldest_is_dropped_and_counted() -> None:
-    inbox, ran = Inbox(limit=3), list[int]()
-    for number in range(10):
-        inbox.post(lambda number=number: ran.append(number))  # type: ignore[misc]
-    inbox.post(lambda: ran.append(100), newest_of="drive")
-    inbox.post(lambda: ran.append(101), newest_of="drive")
-    drain(inbox)
-    assert ran == [8, 9, 101]
-    assert inbox.dropped == 8
-
-
-@pytest.mark.parametrize(
-    ("posts", "expected"),
-    [
-        (["STOP", 0, 1, 2, 3, 4], ["STOP", 3, 4]),
-        ([0, "STOP", 1, "STOP", 2], [1, "STOP", 2]),
-        (["drive", "STOP", 0, 1, 2], ["drive", "STOP", 2]),
-        (["STOP", 0, 1, "STOP"], [0, 1, "STOP"]),
-        (["A", "B", "C", "D"], ["B", "C", "D"]),
-    ],
-)
-def test_what_ends_something_is_not_dropped_for_others_and_comes_after_what_it_ends(
-    posts: list[str | int], expected: list[str | int]
-) -> None:
-    inbox, ran = Inbox(limit=3), list[str | int]()
-    for one in posts:
-        name = {} if isinstance(one, int) else {"last_of" if one.isupper() else "newest_of": one}
-        inbox.post(lambda one=one: ran.append(one), **name)  # type: ignore[misc]
-    drain(inbox)
-    assert ran == expected
+    assert (" ".join(ran), inbox.dropped) == (runs, dropped)
 
 
 def test_internal_jobs_are_first_in_line_and_never_dropped() -> None:

@@ -15,7 +15,6 @@ from pebble.config import parse
 from pebble.contract import (
     CHARGING_STATUS,
     DRIVE,
-    MCU_DESCRIBE,
     MEDIA_REPORT,
     MQTT_VIDEO,
     REBOOT,
@@ -27,7 +26,6 @@ from pebble.contract import (
 from pebble.contract.payloads import (
     ChargingStatus,
     Drive,
-    McuManifest,
     MediaReport,
     SoundboardCommand,
     TouchSensors,
@@ -353,37 +351,6 @@ def test_work_of_another_thread_goes_before_nothing_that_waits(idle: Robot) -> N
     assert order == ["first", "posted", "second"]
 
 
-def test_one_thread_works_at_a_time_and_the_services_own_has_its_turns(idle: Robot) -> None:
-    inside, most, own, ends = [0], [0], [0], threading.Event()
-
-    def work() -> None:
-        inside[0] += 1
-        most[0] = max(most[0], inside[0])
-        time.sleep(0.0001)
-        inside[0] -= 1
-
-    def own_work() -> None:
-        own[0] += 1
-        work()
-
-    def visit() -> None:
-        while not ends.is_set():
-            idle.service.run_if_idle(work)
-
-    visitors = [threading.Thread(target=visit) for _ in range(3)]
-    for visitor in visitors:
-        visitor.start()
-    try:
-        for expected in range(1, 51):
-            idle.service.post(own_work)
-            assert until(lambda expected=expected: own[0] == expected, 5)  # type: ignore[misc]
-    finally:
-        ends.set()
-        for visitor in visitors:
-            visitor.join(5)
-    assert most == [1]
-
-
 def test_a_timer_that_another_thread_sets_wakes_the_services_own(idle: Robot) -> None:
     called: list[int] = []
     due = time.monotonic() + 0.05
@@ -471,15 +438,6 @@ def test_a_command_that_waited_in_the_transport_is_dropped(running: Robot, monke
     assert running.saw(0.25)
 
 
-def test_commands_that_must_all_be_handled_are(running: Robot) -> None:
-    running.service.go_on.clear()
-    running.publish(DRIVE_TOPIC, '{"x": 0.5}')
-    for name in ("a", "b", "c"):
-        running.publish(SOUND, f'{{"action": "play", "file": "{name}"}}')
-    running.service.go_on.set()
-    assert running.saw(0.5, "a", "b", "c")
-
-
 @pytest.mark.parametrize(
     ("topic", "payload"),
     [
@@ -542,10 +500,6 @@ def test_a_renamed_channel_is_received_under_its_new_name() -> None:
     robot.close()
 
 
-def test_what_a_service_handles_can_be_asked() -> None:
-    assert set(Recorder.handles()) == {DRIVE, SOUNDBOARD_COMMAND, MQTT_VIDEO, REBOOT, MEDIA_REPORT}
-
-
 # -- publishing
 
 
@@ -586,21 +540,6 @@ def test_a_pattern_without_its_name_is_refused_and_counted(running: Robot, caplo
     assert running.service.counters["refused"] == 3
     assert running.service.counters["handler_errors"] == 0
     assert len([record for record in caplog.records if record.message.endswith("media-report/' (1 so far)")]) == 1
-
-
-def test_a_pattern_channel_takes_its_names(running: Robot) -> None:
-    manifest = McuManifest(
-        protocol="pebble_serial_v1",
-        schema_version=1,
-        interface_count=0,
-        schema_hash="h",
-        device_uid="imu-1",
-        firmware_version="1",
-        model="nano",
-        interfaces=[],
-    )
-    running.on_service_thread(lambda: running.service.publish(MCU_DESCRIBE, manifest, uid="imu-1"))
-    assert until(lambda: running.received_on(f"{BASE}/outgoing/mcu/imu-1/describe"))
 
 
 LAMP = Channel(metric="lab/lamp", kind=Kind.COMMAND, payload=dict[str, Any], doc="Made while running.")

@@ -19,7 +19,6 @@ from pebble.runtime.connections import local_transport, mirror_transport, remote
 from pebble.transports import MqttSettings, State, create
 from pebble.transports.mqtt.client_ids import unique
 from tests.support import Broker, until
-from tests.transports.brokers import MAKERS
 
 
 @pytest.mark.parametrize(
@@ -82,13 +81,8 @@ class Robot:
         assert attempt(tools[0], login=True).code == 0
 
 
-@pytest.fixture
-def folder(tmp_path: Path) -> Path:
-    return tmp_path
-
-
-def test_every_connection_of_a_robot_begins_with_its_name(folder: Path) -> None:
-    robot = Robot(folder, None, "goob")
+def test_every_connection_of_a_robot_begins_with_its_name(tmp_path: Path) -> None:
+    robot = Robot(tmp_path, None, "goob")
     robot.connect_all()
     own = [one for one in robot.ids() if not one.startswith(("pebble-tool-", "pebble-doctor-"))]
     assert [one[:-17] for one in own if one[0] == "p"] == [
@@ -99,8 +93,8 @@ def test_every_connection_of_a_robot_begins_with_its_name(folder: Path) -> None:
     robot.broker.stop()
 
 
-def test_a_config_sets_the_id_of_the_bridge_and_how_the_others_begin(folder: Path) -> None:
-    robot = Robot(folder, "thing:7/rover")
+def test_a_config_sets_the_id_of_the_bridge_and_how_the_others_begin(tmp_path: Path) -> None:
+    robot = Robot(tmp_path, "thing:7/rover")
     robot.connect_all()
     fixed = ["", "-camera-publisher", "-audio-receiver", "-estop", "-drive", "-tool", "-web", "-estop"]
     assert [one for one in robot.ids() if one.startswith("thing")] == [f"thing:7/rover{end}" for end in fixed]
@@ -108,8 +102,8 @@ def test_a_config_sets_the_id_of_the_bridge_and_how_the_others_begin(folder: Pat
 
 
 @pytest.mark.parametrize("protocol", ["3.1.1", "5"])
-def test_two_with_one_id_are_reported(folder: Path, protocol: str) -> None:
-    robot = Robot(folder, "rover")
+def test_two_with_one_id_are_reported(tmp_path: Path, protocol: str) -> None:
+    robot = Robot(tmp_path, "rover")
     settings = MqttSettings(host="127.0.0.1", port=robot.broker.port, client_id="rover", protocol=protocol)
     first, second = (create("mqtt", name, settings) for name in ("one", "two"))
     seen: list[str] = []
@@ -117,12 +111,3 @@ def test_two_with_one_id_are_reported(folder: Path, protocol: str) -> None:
     with closing(first.open(10)), closing(second.open(0.0)):
         assert until(lambda: any('does another client use the client id "rover"?' in one for one in seen))
     robot.broker.stop()
-
-
-@pytest.mark.skipif(MAKERS["nats"].missing(), reason="needs nats: make long PART=brokers")
-def test_nats_takes_them(folder: Path) -> None:
-    broker = MAKERS["nats"].make(folder)
-    for name in ("a.b", "a b", "a/b", "a>b", "a*b", "größe"):
-        with create("mqtt", name, MqttSettings(host="127.0.0.1", port=broker.port)) as transport:
-            assert transport.state is State.CONNECTED, transport.problem
-    broker.stop()

@@ -4,13 +4,8 @@ from __future__ import annotations
 
 import os
 import socket
-import subprocess
 import time
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack
-from dataclasses import replace
-from itertools import permutations
-from pathlib import Path
 from threading import Event
 from typing import Any
 
@@ -18,27 +13,14 @@ import pytest
 
 from pebble.transports import MqttSettings, QoS, State, Transport, create
 from pebble.transports.hosts import HANDSHAKE_S, STEADY_S, Address, AddressRound, HostPort
-from pebble.transports.settings import TlsSettings
-from tests.fakes.bad_brokers import BEHAVIOURS, mute, serving, showing
-from tests.support import ROOT, Broker, free_port, some, until
+from tests.fakes.bad_brokers import BEHAVIOURS, mute, serving
+from tests.support import Broker, free_port, some
 
 NAME = "fleet.test"
 GOOD, BAD, WORSE = "127.0.0.1", "127.0.0.2", "127.0.0.3"
 #: Fails without a server: no route, no such address of this machine, no such family.
 UNREACHABLE = {"no route": "2001:db8::1", "nobody's": "240.0.0.1", "a network": "0.0.0.0"}
-CERTS = ROOT / "tests" / "data" / "tls"
 Names = Callable[..., None]
-
-
-def certificate_of(host: str, folder: Path) -> Path:
-    """A folder with ``server.pem`` and ``server.key`` of this host."""
-    folder = folder / host
-    folder.mkdir()
-    command = ["openssl", "req", "-x509", "-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:prime256v1", "-nodes"]
-    names = ["-subj", f"/CN={host}", "-addext", f"subjectAltName=DNS:{host}"]
-    files = ["-keyout", folder / "server.key", "-out", folder / "server.pem"]
-    subprocess.run([*command, *names, *files], check=True, capture_output=True)
-    return folder
 
 
 @pytest.fixture(scope="module")
@@ -72,31 +54,8 @@ def names(monkeypatch: pytest.MonkeyPatch) -> Names:
     return give
 
 
-@pytest.fixture(params=["3.1.1", "5"])
-def made(request: pytest.FixtureRequest) -> Iterator[Callable[[MqttSettings], Transport]]:
-    with ExitStack() as closing:
-
-        def make(settings: MqttSettings) -> Transport:
-            transport = create("mqtt", "tool", replace(settings, protocol=request.param))
-            closing.callback(transport.close)
-            return transport
-
-        yield make
-
-
 def works(transport: Transport) -> bool:
     return transport.publish("addresses/works", b"1", qos=QoS.DELIVERED)
-
-
-@pytest.mark.parametrize("order", some(permutations((GOOD, BAD, WORSE)), 4), ids=" ".join)
-def test_a_living_address_is_found_among_dead_ones_in_any_order(
-    broker: Broker, names: Names, made: Callable[[MqttSettings], Transport], order: tuple[str, ...]
-) -> None:
-    names(*order)
-    with serving(BAD, broker.port, mute), serving(WORSE, broker.port, BEHAVIOURS["closing"]):
-        transport = made(MqttSettings(host=NAME, port=broker.port, reconnect_max_s=20)).open(0.01)
-    assert transport.state is State.CONNECTED, transport.problem
-    assert works(transport)
 
 
 #: Each way to fail, for plain connections and those of a bridge in turns; then the other one.
@@ -115,27 +74,6 @@ def test_whatever_way_the_first_one_fails(
         assert works(transport)
 
 
-@pytest.mark.parametrize("failing", ["stalled handshake", "wrong name", "closing", "no TLS"])
-def test_tls_checks_the_name_at_every_address(
-    tmp_path: Path, names: Names, monkeypatch: pytest.MonkeyPatch, failing: str
-) -> None:
-    """The broker's certificate names localhost, whose addresses are these."""
-    wrong = certificate_of("elsewhere", tmp_path)
-    behaviour = {"stalled handshake": mute, "wrong name": showing(wrong), "no TLS": BEHAVIOURS["no MQTT"]}
-    files = [f"cafile {CERTS}/ca.crt", f"certfile {CERTS}/server.crt", f"keyfile {CERTS}/server.key"]
-    secured = Broker(tmp_path, *files)
-    names(BAD, GOOD, name="localhost")
-    monkeypatch.setattr("pebble.transports.hosts.CONNECT_TIMEOUT_S", 1.0)
-    trusted = tmp_path / "both.crt"
-    trusted.write_text((CERTS / "ca.crt").read_text() + (wrong / "server.pem").read_text())
-    settings = MqttSettings(host="localhost", port=secured.port, tls=TlsSettings(ca_cert=trusted))
-    failing_server = serving(BAD, secured.port, behaviour.get(failing, BEHAVIOURS["closing"]))
-    with failing_server, create("mqtt", "tool", settings) as transport:
-        assert transport.state is State.CONNECTED, transport.problem
-        assert works(transport)
-    secured.stop()
-
-
 def test_when_all_fail_one_line_names_each_address_and_its_reason(
     names: Names, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -150,28 +88,6 @@ def test_when_all_fail_one_line_names_each_address_and_its_reason(
     )
     assert transport.problem.endswith("; and 6 more")
     assert [record.getMessage() for record in caplog.records] == [f"tool: {transport.problem}"]
-
-
-def test_which_addresses_failed_is_logged_once_another_works(
-    broker: Broker, names: Names, caplog: pytest.LogCaptureFixture
-) -> None:
-    names(BAD, GOOD)
-    caplog.set_level("INFO")
-    with create("mqtt", "tool", MqttSettings(host=NAME, port=broker.port)) as transport:
-        assert transport.problem == ""
-    why = f"connected to broker {NAME}:{broker.port} at {GOOD}; before it {BAD} cannot be reached"
-    assert [record.getMessage()[: len(why) + 6] for record in caplog.records] == [f"tool: {why}"]
-
-
-def test_a_connection_that_is_lost_is_made_at_another_address(tmp_path: Path, broker: Broker, names: Names) -> None:
-    first = Broker(tmp_path, port=broker.port, host=BAD)
-    names(BAD, GOOD)
-    with create("mqtt", "tool", MqttSettings(host=NAME, port=broker.port, silence_s=0.5)) as transport:
-        first.freeze()
-        assert until(lambda: transport.counters["connected"] == 2)
-        assert works(transport)
-        first.thaw()
-    first.stop()
 
 
 def test_close_does_not_wait_for_a_resolver(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -123,23 +123,3 @@ def test_messages_pass_both_ways_and_one_warning_names_what_is_lost(
         robot.close()
         operator.close()
         broker.stop()
-
-
-def test_losses_of_the_link_take_nothing_away(tmp_path: Path) -> None:
-    broker = Broker(tmp_path)
-    will = Message("robot/online", b"gone", QoS.DELIVERED, retain=True)
-    robot = MqttTransport("robot", MqttSettings(host="127.0.0.1", port=broker.port), will=will).open()
-    late = MqttTransport("late", MqttSettings(host="127.0.0.1", port=broker.port))
-    try:
-        for number in range(14):
-            robot.publish("robot/state", b"%d" % number, qos=QoS.DELIVERED, retain=True)
-            broker.kill()
-            broker.start()
-        assert until(lambda: robot.state is State.CONNECTED)
-        seen = Received()
-        late.open()
-        assert until(lambda: late.subscribe("robot/state", seen) and seen.payloads[-1:] == [b"13"])
-    finally:
-        robot.close()
-        late.close()
-        broker.stop()

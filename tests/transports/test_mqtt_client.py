@@ -17,8 +17,9 @@ from pebble.transports.hosts import addresses_of
 from pebble.transports.mqtt import packets
 from pebble.transports.mqtt.client import Client, Opening
 from pebble.transports.mqtt.packets import Filter
+from tests.kit.mqtt_bytes import packet
 from tests.support import until
-from tests.transports.test_mqtt_packets import Noted, packet
+from tests.transports.test_mqtt_packets import Noted
 
 RECEIVE_MAXIMUM_2 = packet(0x20, b"\0\0\3\x21\0\2")
 

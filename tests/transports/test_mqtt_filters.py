@@ -111,14 +111,6 @@ def test_a_new_value_that_overtakes_a_due_repeat_is_delivered() -> None:
     assert not own_filter.is_repeat(retained(b"1", "elsewhere"))
 
 
-def test_a_new_connection_starts_afresh() -> None:
-    own_filter = OwnMessageFilter()
-    own_filter.is_repeat(retained(b"1"))
-    own_filter.subscribe_again("#")
-    own_filter.begin()
-    assert not own_filter.is_repeat(retained(b"1"))
-
-
 def test_large_payloads_and_many_topics_take_little_memory(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(filters, "_LIMIT", 100)
     own_filter = OwnMessageFilter()

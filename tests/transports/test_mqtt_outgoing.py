@@ -13,13 +13,6 @@ def drain(backlog: Backlog) -> list[bytes]:
     return taken
 
 
-def test_the_oldest_gives_way() -> None:
-    backlog = Backlog()
-    dropped = sum(backlog.put(Message("a", b"%d" % number)) for number in range(BACKLOG_MESSAGES + 10))
-    assert dropped == 10
-    assert drain(backlog) == [b"%d" % number for number in range(10, BACKLOG_MESSAGES + 10)]
-
-
 def test_bytes_are_bounded_but_one_message_may_always_wait() -> None:
     backlog = Backlog()
     assert backlog.put(Message("a", b"1" * BACKLOG_BYTES * 3)) == 0
@@ -103,25 +96,6 @@ def test_an_answered_ping_proves_what_was_sent_before_it() -> None:
     in_flight.ping(0.2, None)
     in_flight.pong(0.3)
     assert in_flight.unconfirmed_retained() == [waiting]
-
-
-def test_unproven_messages_come_oldest_first() -> None:
-    in_flight = InFlightTable()
-    for number, topic in enumerate(["a", "b", "a"]):
-        send(in_flight, retained(topic), number)
-    assert [message.topic for message in in_flight.unconfirmed_retained()] == ["b", "a"]
-
-
-def test_the_shortest_round_trip_of_late_counts() -> None:
-    in_flight = InFlightTable()
-    assert in_flight.round_trip_s == 0.0
-    for round_trip in (0.5, 2.0, 0.5):
-        in_flight.ping(10.0, None)
-        in_flight.pong(10.0 + round_trip)
-    assert in_flight.round_trip_s == 0.5
-    for _ in range(8):
-        in_flight.measured(1.0)
-    assert in_flight.round_trip_s == 1.0
 
 
 def test_the_end_ends_every_wait() -> None:

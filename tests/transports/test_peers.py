@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import errno
 import os
-import subprocess
-import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -16,17 +14,6 @@ from pebble.transports import ZenohSettings, create
 from pebble.transports.frames import FrameReader, FrameWriter
 from pebble.transports.peers import FileLock, PeerRegistry, prepare_run_dir
 from pebble.transports.zenoh.hub import ZenohHub
-from tests.support import ROOT
-
-SIT = """
-import sys, pathlib
-from pebble.transports.peers import PeerRegistry
-lock = PeerRegistry(pathlib.Path(sys.argv[1])).register("sitter")
-lock.socket.touch()
-lock.ready()
-print(lock.name, flush=True)
-sys.stdin.readline()
-"""
 
 
 def test_newcomers_are_connected_to_at_once_and_waited_for_when_ready(tmp_path: Path) -> None:
@@ -43,20 +30,6 @@ def test_newcomers_are_connected_to_at_once_and_waited_for_when_ready(tmp_path: 
     assert list(tmp_path.iterdir()) == []
 
 
-def test_the_dead_are_cleared_away(tmp_path: Path) -> None:
-    sitter = subprocess.Popen(
-        [sys.executable, "-c", SIT, str(tmp_path)], cwd=ROOT, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
-    )
-    assert sitter.stdout is not None
-    name = sitter.stdout.readline().strip()
-    (tmp_path / f"{name}.sock.lock").touch()
-    assert PeerRegistry(tmp_path).ready() == {name: "sitter"}
-    sitter.kill()
-    sitter.communicate(timeout=10)
-    assert PeerRegistry(tmp_path).ready() == {}
-    assert list(tmp_path.iterdir()) == []
-
-
 def test_a_lock_has_one_owner_and_comes_back(tmp_path: Path) -> None:
     first = FileLock.take(tmp_path / "lock")
     assert first is not None
@@ -67,21 +40,14 @@ def test_a_lock_has_one_owner_and_comes_back(tmp_path: Path) -> None:
     again.release()
 
 
-def folder_for_socket_path(tmp_path: Path, length: int) -> Path:
-    return tmp_path / ("x" * (length - len(f"{tmp_path}//12345678.sock")))
-
-
-def test_the_longest_socket_path(tmp_path: Path) -> None:
-    run_dir = folder_for_socket_path(tmp_path, 107)
-    prepare_run_dir(run_dir)
-    assert run_dir.stat().st_mode & 0o777 == 0o700
-
-
-def test_a_longer_socket_path_is_an_error_that_names_the_setting(tmp_path: Path) -> None:
-    run_dir = folder_for_socket_path(tmp_path, 108)
+def test_a_socket_path_that_is_too_long_is_an_error_that_names_the_setting(tmp_path: Path) -> None:
+    longest = tmp_path / ("x" * (107 - len(f"{tmp_path}//12345678.sock")))
+    prepare_run_dir(longest)
+    assert longest.stat().st_mode & 0o777 == 0o700
+    longer = tmp_path / f"{longest.name}x"
     with pytest.raises(TransportError, match=r"too long for a unix socket .*transport.run_dir"):
-        prepare_run_dir(run_dir)
-    assert not run_dir.exists()
+        prepare_run_dir(longer)
+    assert not longer.exists()
 
 
 USERS: dict[str, Callable[[Path], object]] = {

@@ -14,6 +14,7 @@ from pebble.extensions.fleet import certificates
 from pebble.transports import MqttSettings, State, TlsSettings, create
 from pebble.transports.renewed import Renewed
 from tests.support import Broker, until
+from tests.transports.test_tls import shake_hands
 
 
 def _number(file: Path) -> int:
@@ -63,23 +64,6 @@ def test_a_change_is_taken_up_and_what_cannot_be_used_is_not(
     file.parent.mkdir()
     file.write_text("3")
     assert value.get() == 3
-
-
-def test_a_file_that_may_be_read_again_is_read(tmp_path: Path) -> None:
-    file, allowed = tmp_path / "number", [True]
-    file.write_text("1")
-
-    def read() -> int:
-        if not allowed[0]:
-            raise PermissionError("not now")
-        return _number(file)
-
-    value = Renewed([file], read)
-    file.write_text("2")
-    allowed[0] = False
-    assert value.get() == 1
-    allowed[0] = True
-    assert value.get() == 2
 
 
 def test_a_robot_is_back_after_its_authority_its_certificate_and_its_password_were_renewed(tmp_path: Path) -> None:
@@ -137,13 +121,6 @@ def test_the_page_shows_a_renewed_certificate_to_new_connections(tmp_path: Path)
 
 
 def _shown(listening: ssl.SSLContext, authority: Path) -> bytes | None:
-    """The certificate that a new connection gets; in memory."""
-    there, back = ssl.MemoryBIO(), ssl.MemoryBIO()
-    client = ssl.create_default_context(cafile=str(authority)).wrap_bio(back, there, server_hostname="localhost")
-    server = listening.wrap_bio(there, back, server_side=True)
-    for end in (client, server, client, server) * 2:
-        try:
-            end.do_handshake()
-        except ssl.SSLWantReadError:
-            continue
+    """Return the certificate that a new connection gets."""
+    client = shake_hands(ssl.create_default_context(cafile=str(authority)), listening)
     return client.getpeercert(binary_form=True)

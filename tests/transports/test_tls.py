@@ -7,41 +7,39 @@ import ssl
 import threading
 import time
 from contextlib import closing, nullcontext, suppress
-from itertools import cycle, islice
-from pathlib import Path
 from unittest import mock
 
 import pytest
 
 from pebble.extensions.paho.client import PahoClient
-from pebble.transports import create
 from pebble.transports.hosts import CONNECT_TIMEOUT_S, Address
 from pebble.transports.mqtt.client import Client, Opening
 from pebble.transports.settings import MqttSettings, TlsSettings
 from pebble.transports.tls import make_context
-from tests.support import ROOT, Broker, until
-from tests.tcp_proxy import TcpProxy
+from tests.support import ROOT
 
 CERTS = ROOT / "tests" / "data" / "tls"
 EVERY_CIPHER = "ALL:@SECLEVEL=0"
 
 
-def agreed(version: ssl.TLSVersion) -> str | None:
-    """What a connection agrees on with a server that speaks only ``version``; in memory."""
-    with_server = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
-    with_server.load_cert_chain(CERTS / "server.crt", CERTS / "server.key")
-    with_server.set_ciphers(EVERY_CIPHER)
-    with_server.minimum_version = with_server.maximum_version = version
-    with_client = make_context(TlsSettings(ca_cert=CERTS / "ca.crt"))
+def shake_hands(ours: ssl.SSLContext, theirs: ssl.SSLContext) -> ssl.SSLObject:
+    """Return our end of a connection to localhost; in memory."""
     there, back = ssl.MemoryBIO(), ssl.MemoryBIO()
-    client = with_client.wrap_bio(back, there, server_hostname="localhost")
-    server = with_server.wrap_bio(there, back, server_side=True)
-    for end in islice(cycle((client, server)), 8):
-        try:
+    client = ours.wrap_bio(back, there, server_hostname="localhost")
+    server = theirs.wrap_bio(there, back, server_side=True)
+    for end in (client, server) * 4:
+        with suppress(ssl.SSLWantReadError):
             end.do_handshake()
-        except ssl.SSLWantReadError:
-            continue
-    return client.version()
+    return client
+
+
+def agreed(version: ssl.TLSVersion) -> str | None:
+    """Return what a connection agrees on with a server that speaks only ``version``."""
+    theirs = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+    theirs.load_cert_chain(CERTS / "server.crt", CERTS / "server.key")
+    theirs.set_ciphers(EVERY_CIPHER)
+    theirs.minimum_version = theirs.maximum_version = version
+    return shake_hands(make_context(TlsSettings(ca_cert=CERTS / "ca.crt")), theirs).version()
 
 
 @pytest.mark.parametrize("version", [ssl.TLSVersion.TLSv1, ssl.TLSVersion.TLSv1_1])
@@ -87,39 +85,6 @@ class SlowServer:
                     sock.sendall(piece)
                     self._left -= 1
                     self.ended.wait(_PIECE_S)
-
-
-class SlowHello(TcpProxy):
-    """Holds the first bytes of a handshake, as a modem does whose queue is full of something else."""
-
-    def __init__(self, target: int) -> None:
-        self.held = 0
-        super().__init__(target)
-
-    def passes(self, data: bytes) -> bool:
-        is_hello = data[:1] == b"\x16" and data[5:6] == b"\1"
-        self.held += is_hello
-        time.sleep(_HELD_S * is_hello)
-        return True
-
-
-_HELD_S = 1.3
-
-
-def test_what_is_slow_is_remembered(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The first attempt ends before an answer can be there; the next one waits, and so does each that follows."""
-    monkeypatch.setattr("pebble.transports.hosts.CONNECT_TIMEOUT_S", 1.0)
-    files = [f"cafile {CERTS}/ca.crt", f"certfile {CERTS}/server.crt", f"keyfile {CERTS}/server.key"]
-    broker = Broker(tmp_path, *files)
-    with SlowHello(broker.port) as proxy:
-        settings = MqttSettings(host="localhost", port=proxy.port, tls=TlsSettings(ca_cert=CERTS / "ca.crt"))
-        with create("mqtt", "tool", settings) as transport:
-            assert until(lambda: transport.counters["connected"] == 1, 30)
-            first = proxy.held
-            proxy.drop()
-            assert until(lambda: transport.counters["connected"] == 2, 30)
-            assert (first, proxy.held) == (2, 3)
-    broker.stop()
 
 
 _PIECE, _PIECE_S = 150, 0.4  # bytes at 3 kbit/s

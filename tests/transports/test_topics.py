@@ -34,30 +34,6 @@ def test_matches_agrees_with_paho_on_random_pairs() -> None:
     assert 0.025 < hits / TRIED < 0.975  # the pairs are neither all misses nor all hits
 
 
-@pytest.mark.parametrize(
-    ("filter_", "topic", "wanted"),
-    [
-        ("a/#", "a", True),
-        ("a/#", "a/", True),
-        ("a/#", "ab", False),
-        ("#", "a/b", True),
-        ("#", "$SYS/a", False),
-        ("+/a", "$SYS/a", False),
-        ("$SYS/#", "$SYS/a", True),
-        ("$SYS/+", "$SYS/a", True),
-        ("+", "a/b", False),
-        ("+/+", "/a", True),
-        ("/+", "/a", True),
-        ("+", "/a", False),
-        ("a/+", "a", False),
-        ("a/+/b", "a//b", True),
-        ("a", "A", False),
-    ],
-)
-def test_matches_follows_the_standards_examples(filter_: str, topic: str, wanted: bool) -> None:
-    assert matches(filter_, topic) is wanted
-
-
 def test_errors_name_what_is_wrong() -> None:
     with pytest.raises(TransportError, match="wildcard"):
         check_topic("a/+/b")

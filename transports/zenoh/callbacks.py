@@ -63,16 +63,6 @@ class Guard:
         self._calls: list[Calls] = []
         self._sessions: list[zenoh.Session] = []
 
-    @property
-    def watched(self) -> int:
-        """How many threads it looks at."""
-        return len(self._calls)
-
-    @property
-    def sessions(self) -> int:
-        """How many sessions there are to help with."""
-        return len(self._sessions)
-
     def use(self, session: zenoh.Session) -> None:
         """Any session will do: Zenoh's threads belong to all of them."""
         with self._lock:

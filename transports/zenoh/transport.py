@@ -12,14 +12,14 @@ import logging
 import os
 import threading
 import time
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 
 import zenoh
 
 from pebble.errors import TransportError
 from pebble.transports import clock
 from pebble.transports.ages import MessageAges
-from pebble.transports.base import Message, QoS, State, Subscription, Transport
+from pebble.transports.base import Message, State, Subscription, Transport
 from pebble.transports.peers import PeerRegistry, PresenceLock, new_name, prepare_run_dir
 from pebble.transports.settings import ZenohSettings
 from pebble.transports.topics import is_pattern
@@ -75,11 +75,6 @@ class ZenohTransport(Transport):
     @property
     def session(self) -> zenoh.Session | None:
         return self._session
-
-    @property
-    def publishers(self) -> Collection[tuple[str, QoS]]:
-        """The topics and qualities for which a publisher is declared."""
-        return self._publishers.declared.keys()
 
     # -- opening and closing
 

@@ -5,6 +5,7 @@ from pebble.extension import Command, Extension
 EXTENSION = Extension(
     name="fleet",
     needs=("operator", "neighbours"),
+    observer="pebble.extensions.fleet.robot_audit:Audit",
     commands={
         "fleet": Command(
             "pebble.extensions.fleet.commands.group", "give robots and people accounts at a broker", "share", 10

@@ -9,8 +9,9 @@ from contextlib import suppress
 from pathlib import Path
 
 from pebble.extensions.fleet import broker_files, certificates
+from pebble.extensions.fleet.as_owner import as_before
 from pebble.extensions.fleet.folder import ACL, CONF, PASSWORDS, PID, ZENOH, Fleet, FleetError, Server, save
-from pebble.runtime.whole_file import write
+from pebble.runtime.whole_file import is_root, write
 
 _LOOPBACK = "127.0.0.1"
 _PLUGIN = "dynamic_security"  # in the name of its library
@@ -107,10 +108,12 @@ def pid_of(folder: Path) -> int | None:
     """Return the process of this folder's mosquitto on this machine; None: it does not run."""
     try:
         pid = int((folder / PID).read_text(encoding="utf-8"))
+        program = Path(f"/proc/{pid}/exe").readlink() if is_root() else None  # others see that of their own only
         name = Path(f"/proc/{pid}/cmdline").read_bytes()
+        is_broker = b"mosquitto" in name if program is None else program.name.startswith("mosquitto")
     except (OSError, ValueError):
         return None
-    return pid if b"mosquitto" in name else None
+    return pid if is_broker else None
 
 
 def obeys_plugin(folder: Path) -> bool:
@@ -148,8 +151,9 @@ def _reload(folder: Path) -> str:
     if pid is None:
         return f"in {folder / ACL}: mosquitto does not run"
     try:
-        _await_handler(pid)
-        os.kill(pid, signal.SIGHUP)
+        with as_before():  # the broker may run as another user than the folder's
+            _await_handler(pid)
+            os.kill(pid, signal.SIGHUP)
     except OSError as error:
         raise FleetError(f"mosquitto (process {pid}): {error.strerror}; send it SIGHUP: sudo kill -HUP {pid}") from None
     return "at once"

@@ -9,8 +9,8 @@ from typing import Final
 from msgspec import Struct
 
 from pebble.extensions.fleet.database import Database
+from pebble.extensions.fleet.row_writer import DIFFERENT, OF_STRANGERS, Row, RowWriter
 from pebble.extensions.fleet.tries import network_of
-from pebble.runtime.row_writer import DIFFERENT, OF_STRANGERS, Row, RowWriter
 
 #: What anybody can cause, without a right and without a login.
 REFUSED: Final = ("login-refused", "login-limited")

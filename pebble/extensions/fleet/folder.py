@@ -14,7 +14,7 @@ from msgspec.structs import replace
 from pebble.contract.identity import SERVERS, Identity
 from pebble.contract.names import NAME
 from pebble.errors import ConfigError, PebbleError
-from pebble.extensions.fleet.roles import GATEWAYS, Account, Extra, ProgramRole, Rule, add_up, rules
+from pebble.extensions.fleet.roles import GATEWAYS, Account, Extra, ProgramRole, Right, Rule, add_up, covered, rules
 from pebble.runtime.whole_file import write
 
 FLEET, CONF, PID, ACL, PASSWORDS = "fleet.json", "mosquitto.conf", "mosquitto.pid", "acl", "passwords"
@@ -91,9 +91,12 @@ def load(folder: Path) -> Fleet:
     for name, account in fleet.accounts.items():
         if why := refused(fleet.without(name), name, account):
             raise FleetError(f"{file}: accounts.{name}: {why}")
-    for metric in (*fleet.extra.look, *fleet.extra.drive, *fleet.extra.system):
-        if not all(map(_METRIC.fullmatch, metric.split("/"))) or metric.startswith(("by/", "estop")):
-            raise FleetError(f"{file}: extra: {metric!r} is no metric: write what follows incoming/, such as arm/+")
+    for right in (Right.LOOK, Right.DRIVE, Right.SYSTEM):
+        for metric in getattr(fleet.extra, right):
+            if not all(map(_METRIC.fullmatch, metric.split("/"))) or metric.startswith(("by/", "estop")):
+                raise FleetError(f"{file}: extra: {metric!r} is no metric: write what follows incoming/, such as arm/+")
+            if other := covered(right, metric):
+                raise FleetError(f"{file}: extra.{right}: {metric!r} covers {other} as well: write a narrower one")
     return fleet
 
 
@@ -134,8 +137,8 @@ def _refused_base(base: str, *, several: bool) -> str:
         Identity(*(one if one != "+" or not several else "any" for one in levels))
     except (ConfigError, TypeError):
         return f"{base!r} is no base: write SYSTEM/TYPE/ID, such as pebble/robots/goob"
-    if any(character.isspace() for character in base):
-        return f"{base!r} has a blank, which the rules of a broker cannot have"
+    if any(character.isspace() or character == "%" for character in base):
+        return f"{base!r} has a blank or %, which the rules of a broker cannot have"
     if levels[1] in (SERVERS, GATEWAYS):
         return f"{base!r} is no robot's base: {levels[1]} are no robots"
     return ""

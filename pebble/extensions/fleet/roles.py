@@ -157,6 +157,23 @@ def metrics(right: Right, extra: Extra | None = None) -> tuple[str, ...]:
     return (*(re.sub(r"{[^}]*}", "+", one) for one in own), *getattr(extra, right, ()))
 
 
+def covered(right: Right, metric: str) -> str:
+    """Return a metric of the contract that a filter of ``extra`` covers, with any name, and another right writes."""
+    for channel in c.CHANNELS:
+        if channel.direction == INCOMING and channel not in WRITES[right]:
+            own = re.sub(r"{[^}]*}", "+", channel.metric)
+            if any(_overlap(metric, known) for known in (own, f"{BY}/+/{own}")):
+                return channel.metric
+    return ""
+
+
+def _overlap(one: str, other: str) -> bool:
+    """True if some topic is covered by both of two filters without #."""
+    levels = one.split("/"), other.split("/")
+    same = all("+" in pair or pair[0] == pair[1] for pair in zip(*levels, strict=False))
+    return len(levels[0]) == len(levels[1]) and same
+
+
 def _of_bases(name: str, account: Account, *, at_hub: bool) -> Iterator[Rule]:
     for base in account.bases:
         if ProgramRole.NEIGHBOUR in account.roles:

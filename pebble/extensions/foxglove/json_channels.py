@@ -7,8 +7,8 @@ import msgspec
 
 from pebble.contract import Channel
 from pebble.contract.payloads import AnyObject
-from pebble.contract.schemas import schemas
 from pebble.extensions.foxglove.server import ChannelSpec
+from pebble.extensions.operator.contract.schemas import schemas
 
 _PLAIN: Final = frozenset({"boolean", "string", "number", "integer"})
 _ANY: Final = "pebble.Any"

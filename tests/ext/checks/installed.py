@@ -18,9 +18,9 @@ from pebble.extensions.fleet.folder import Fleet, Server
 from pebble.extensions.fleet.folder import load as load_fleet
 from pebble.extensions.fleet.people import People
 from pebble.extensions.fleet.roles import Account, Role
+from pebble.extensions.operator.places import Places
 from pebble.motion.latch import Latch
 from pebble.motors.state_file import StateFile
-from pebble.runtime.places import Places
 
 PAGE, MQTT, ROBOT = "sentinel of the page", "sentinel-of-mqtt", "sentinel-of-the-robot"
 BROKER = Path("etc/mosquitto/pebble")

@@ -12,7 +12,7 @@ import pytest
 from pebble.extensions.checks.report import report
 from pebble.extensions.checks.report.report import make
 from pebble.extensions.checks.report.secrets_here import secrets_of, values_in
-from pebble.runtime.places import Places
+from pebble.extensions.operator.places import Places
 from tests.commands.command_line import Run
 from tests.ext.checks.installed import BROKER, MQTT, ROBOT, config_of, installed
 

@@ -21,7 +21,7 @@ from pebble.extensions.checks.check import Check, run
 from pebble.extensions.checks.running.checks import CHECKS, MOVING
 from pebble.extensions.checks.running.robot import RobotUnderTest, reached
 from pebble.extensions.fleet import certificates
-from pebble.runtime.places import Places
+from pebble.extensions.operator.places import Places
 from tests.commands.command_line import running
 from tests.robot.named import Hall, Named
 from tests.robot.operator import Operator, retained_messages

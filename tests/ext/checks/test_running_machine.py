@@ -18,7 +18,7 @@ from pebble.config import parse
 from pebble.extensions.checks.running import machine
 from pebble.extensions.checks.running.robot import RobotUnderTest
 from pebble.extensions.fleet import authority, certificates
-from pebble.runtime.places import Places
+from pebble.extensions.operator.places import Places
 from tests.support import free_port
 
 RUNS = {"LoadState": "loaded", "ActiveState": "active", "SubState": "running", "UnitFileState": "enabled"}

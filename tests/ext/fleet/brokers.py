@@ -18,7 +18,7 @@ from pebble.extensions.fleet.broker_files import new_password
 from pebble.extensions.fleet.certificates import CA_CERT
 from pebble.extensions.fleet.folder import ACL, CONF, PASSWORDS, Fleet, Server, load, save
 from pebble.extensions.fleet.roles import Account
-from pebble.runtime.places import mosquitto_path
+from pebble.extensions.operator.places import mosquitto_path
 from tests.ext.fleet.broker_client import BrokerClient, Place
 from tests.support import Child, free_port, listening, until
 

@@ -15,7 +15,7 @@ import pytest
 from pebble.extensions.fleet import audit as audit_module
 from pebble.extensions.fleet.audit import OTHERS, Audit
 from pebble.extensions.fleet.people import People
-from pebble.runtime.row_writer import DIFFERENT, OF_STRANGERS
+from pebble.extensions.fleet.row_writer import DIFFERENT, OF_STRANGERS
 from tests.support import until
 
 

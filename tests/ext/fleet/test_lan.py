@@ -22,8 +22,8 @@ from pebble.extensions.fleet import applying, certificates
 from pebble.extensions.fleet.folder import ZENOH, Fleet, Server
 from pebble.extensions.fleet.roles import Account
 from pebble.extensions.lab.rig.processes import python
+from pebble.extensions.operator.places import mosquitto_path
 from pebble.extensions.scripts.script import Robot
-from pebble.runtime.places import mosquitto_path
 from pebble.transports import TlsSettings, ZenohSettings, create
 from tests.ext.fleet.test_neighbours import neighbour
 from tests.kit.lan import Lan, Machine

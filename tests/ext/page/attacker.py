@@ -66,9 +66,9 @@ class Hall:
         limits = httpx.Limits(max_keepalive_connections=0)
         return httpx.Client(base_url=self.served.origin, headers=headers, timeout=10, limits=limits)
 
-    def socket(self, path: str, *, cookie: str = "", origin: str | None = "", host: str = "") -> ClientConnection:
+    def socket(self, path: str, *, cookie: str = "", origin: str | None = "") -> ClientConnection:
         """A WebSocket with these headers. Raises InvalidStatus."""
-        headers = {name: value for name, value in (("cookie", cookie), ("host", host)) if value}
+        headers = {"cookie": cookie} if cookie else {}
         url = f"ws://127.0.0.1:{self.served.port}{path}"
         own = self.served.origin if origin == "" else origin
         return connect(url, origin=own, additional_headers=headers, max_size=None)  # type: ignore[arg-type]
@@ -94,15 +94,13 @@ class Hall:
             return refused.response.status_code
         return 101
 
-    def raw(self, request: bytes, *, until_closed: bool = True) -> bytes:
+    def raw(self, request: bytes) -> bytes:
         """The answer to these bytes."""
         with socket.create_connection(("127.0.0.1", self.served.port), 10) as client:
             client.sendall(request)
             answer = b""
             while part := client.recv(65536):
                 answer += part
-                if not until_closed:
-                    break
             return answer
 
     def works(self) -> bool:

@@ -8,33 +8,38 @@ import io
 import sys
 
 from PIL import Image
+from playwright.sync_api import Browser
 
-from tests.ext.page.rig import KEY, ROBOT, Rig, rig
+from tests.ext.page.browser import chromium, tab
+from tests.ext.page.console import console
+from tests.ext.page.stage import Stage
 from tests.support import ROOT
 
 DOCS = ROOT / "docs"
 WIDTH, QUALITY, MOST_BYTES = 1000, 78, 200_000
-SHARP_S, SMALL_PICTURES_S = 4.0, 4.0
+SHARP_S, SMALL_PICTURES_S, HELD_S = 4.0, 4.0, 0.4
 CARDS = {"x": 0, "y": 0, "width": 1280, "height": 580}
 
 
-def driving(made: Rig) -> bytes:
-    """A picture of a robot's page while it drives ahead, with what its camera sees."""
-    page = made.page(ROBOT)
-    made.until(page, "window.pebble?.video?.info", "no picture has arrived")
-    made.pause(page, SHARP_S)
-    made.hold(page, KEY)
-    taken = page.screenshot()
-    page.keyboard.up(KEY)
-    made.stopped(page)
-    return taken
+def driving(browser: Browser, stage: Stage) -> bytes:
+    """Return a picture of a robot's page while it drives ahead, with what its camera sees."""
+    with console(browser, stage, "goob", engineers=False) as robot:
+        assert robot.tab.until("window.pebble?.video?.info", 20), "no picture has arrived"
+        robot.page.wait_for_timeout(1000 * SHARP_S)
+        robot.take()
+        assert robot.drive(), robot.reason
+        robot.page.wait_for_timeout(1000 * HELD_S)
+        taken: bytes = robot.page.screenshot()
+        robot.let_go()
+        assert robot.rests()
+        return taken
 
 
-def fleet(made: Rig) -> bytes:
-    """A picture of all robots of the broker, with small pictures of those that have a camera."""
-    page = made.page()
-    made.pause(page, SMALL_PICTURES_S)
-    return page.screenshot(clip=CARDS)
+def fleet(browser: Browser, stage: Stage) -> bytes:
+    """Return a picture of all robots of the broker, with small pictures of those that have a camera."""
+    with tab(browser, stage.url) as opened:
+        opened.page.wait_for_timeout(1000 * SMALL_PICTURES_S)
+        return opened.page.screenshot(clip=CARDS)
 
 
 def save(name: str, png: bytes) -> int:
@@ -48,8 +53,8 @@ def save(name: str, png: bytes) -> int:
 
 
 def main() -> int:
-    with rig() as made:
-        taken = {"driving": driving(made), "fleet": fleet(made)}
+    with Stage() as stage, chromium() as browser:
+        taken = {"driving": driving(browser, stage), "fleet": fleet(browser, stage)}
     sizes = [save(name, png) for name, png in taken.items()]
     return int(max(sizes) > MOST_BYTES)
 

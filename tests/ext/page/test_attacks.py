@@ -5,13 +5,11 @@ from __future__ import annotations
 import json
 import socket
 import sqlite3
-import struct
 import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import replace
-from itertools import product
 from pathlib import Path
 from typing import Any, get_args
 from urllib.parse import quote
@@ -22,7 +20,7 @@ from starlette.routing import Route, WebSocketRoute
 from websockets.exceptions import ConnectionClosed
 
 from pebble.extensions.fleet.roles import Role
-from pebble.extensions.page import control, serve
+from pebble.extensions.page import control
 from pebble.extensions.page import messages as m
 from tests.ext.page.attacker import PASSWORDS, Everything, Hall
 from tests.ext.page.served import Page, Served, now_ms
@@ -66,19 +64,7 @@ def driver(hall: Hall, goob: RecordingRobot) -> Iterator[Page]:
 # -- other sites
 
 
-def foreign(hall: Hall) -> list[str | None]:
-    port = hall.served.port
-    return [
-        None,
-        "null",
-        "http://evil.test",
-        f"http://127.0.0.1:{port + 1}",
-        "http://127.0.0.1",
-        f"https://127.0.0.1:{port}",
-        f"http://localhost:{port}",
-        f"http://127.0.0.1:{port}.evil.test",
-        f"http://evil.test/http://127.0.0.1:{port}",
-    ]
+FOREIGN = (None, "http://evil.test")  # test_guard has more
 
 
 def test_a_page_of_another_site_opens_no_socket(hall: Hall, driver: Page) -> None:
@@ -88,7 +74,7 @@ def test_a_page_of_another_site_opens_no_socket(hall: Hall, driver: Page) -> Non
     assert len(paths) >= 2
     for path in paths:
         assert hall.refusal(path, cookie=cookie) == 101, path
-        for origin in foreign(hall):
+        for origin in FOREIGN:
             assert hall.refusal(path, cookie=cookie, origin=origin) == 403, (path, origin)
 
 
@@ -98,7 +84,7 @@ def test_it_posts_nothing(hall: Hall, driver: Page, everything: Everything) -> N
     body = {"ref": GOOB, "stop": "0123456789abcdef", "op": "estop", "user": "admin", "password": PASSWORDS["admin"]}
     with hall.client("admin") as client:
         for path in paths:
-            for origin in foreign(hall):
+            for origin in FOREIGN:
                 headers = {} if origin is None else {"origin": origin}
                 for answer in (
                     client.post(path, json=body, headers=headers),
@@ -114,24 +100,13 @@ def test_it_posts_nothing(hall: Hall, driver: Page, everything: Everything) -> N
     assert not {topic for topic in everything.incoming() if topic.endswith("/estop")}
 
 
-def test_it_reads_nothing(hall: Hall, driver: Page) -> None:
-    with hall.client("admin") as client:
-        for path in hall.routes(Route, "GET"):
-            answer = client.get(path, headers={"origin": "http://evil.test"})
-            assert not [name for name in answer.headers if name.startswith("access-control")], path
-            assert answer.headers["cross-origin-resource-policy"] == "same-origin"
-            assert client.options(path, headers={"origin": "http://evil.test"}).status_code == 405
-
-
-@pytest.mark.parametrize("host", ["evil.test", "evil.test:{port}", "a@127.0.0.1", "127.0.0.1.evil.test:{port}", ""])
-def test_a_name_that_was_bent_to_this_machine_is_refused(hall: Hall, driver: Page, host: str) -> None:
-    name = host.format(port=hall.served.port)
+def test_a_name_that_was_bent_to_this_machine_is_refused(hall: Hall, driver: Page) -> None:
     cookie = hall.cookie("admin")
     for path in ("/", "/login", "/healthz", "/ca.pem", f"/static/{hall.served.version}/main.js"):
-        request = f"GET {path} HTTP/1.1\r\nHost: {name}\r\nCookie: {cookie}\r\nConnection: close\r\n\r\n"
+        request = f"GET {path} HTTP/1.1\r\nHost: evil.test\r\nCookie: {cookie}\r\nConnection: close\r\n\r\n"
         assert hall.raw(request.encode()).startswith(b"HTTP/1.1 421 ")
     upgrade = (
-        f"GET /ws/control HTTP/1.1\r\nHost: {name}\r\nOrigin: http://{name}\r\nCookie: {cookie}\r\n"
+        f"GET /ws/control HTTP/1.1\r\nHost: evil.test\r\nOrigin: http://evil.test\r\nCookie: {cookie}\r\n"
         "Connection: Upgrade\r\nUpgrade: websocket\r\nSec-WebSocket-Version: 13\r\n"
         "Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\n\r\n"
     )
@@ -301,32 +276,10 @@ def test_a_viewer_may_stop_and_is_offered_nothing_else(hall: Hall, broker: Broke
 
 
 TRAVERSALS = [
-    "../server.py",
-    "..%2fserver.py",
-    "%2e%2e/server.py",
-    "%2e%2e%2fserver.py",
-    "..%252fserver.py",
-    "%252e%252e%252fserver.py",
-    "..\\server.py",
-    "..%5cserver.py",
-    "....//server.py",
-    "core/../../server.py",
-    "/etc/passwd",
-    "%2fetc%2fpasswd",
-    "//etc/passwd",
-    "..%00/server.py",
-    "main.js%00.py",
-    "..;/server.py",
-    "..%c0%afserver.py",
-    "..%ef%bc%8fserver.py",
-    "core",
-    "core/",
-    "",
-    ".",
-    "vendor/..",
-    "file:///etc/passwd",
-    "C:%5cWindows%5cwin.ini",
-]
+    "../server.py", "..%2fserver.py", "%2e%2e%2fserver.py", "..%252fserver.py", "..%5cserver.py", "....//server.py",
+    "core/../../server.py", "%2fetc%2fpasswd", "//etc/passwd", "main.js%00.py", "..;/server.py", "..%c0%afserver.py",
+    "core", "", "file:///etc/passwd",
+]  # fmt: skip
 
 
 @pytest.mark.parametrize("path", TRAVERSALS)
@@ -349,21 +302,9 @@ def bad_messages() -> dict[str, str | bytes]:
     drive = '{"op":"drive","ref":"%s","g":1,"t":%s,"x":0,"z":%s}'
     odd: dict[str, str | bytes] = {
         f"z={value}": drive % (GOOB, int(now_ms()), value)
-        for value in (
-            "NaN",
-            "Infinity",
-            "-Infinity",
-            "1e999",
-            "1.001",
-            "-1.001",
-            "1e308",
-            '"0.5"',
-            "null",
-            "[0.5]",
-            "{}",
-        )
+        for value in ("NaN", "-Infinity", "1e999", "1.001", "-1.001", '"0.5"', "null", "[0.5]")
     }
-    odd |= {f"t={value}": drive % (GOOB, value, "0.5") for value in ("NaN", "Infinity", "-1", "1e300", '"1"', "null")}
+    odd |= {f"t={value}": drive % (GOOB, value, "0.5") for value in ("NaN", "Infinity", "-1", '"1"')}
     return odd | {
         "g is huge": drive.replace('"g":1', '"g":1e100') % (GOOB, 1, 0.5),
         "g is negative": drive.replace('"g":1', '"g":-1') % (GOOB, 1, 0.5),
@@ -371,20 +312,13 @@ def bad_messages() -> dict[str, str | bytes]:
         "17 KB": json.dumps({"op": "watch", "ref": GOOB, "more": "x" * 17 * 1024}),
         "ref of 201": json.dumps({"op": "watch", "ref": "x" * 201}),
         "deep list": "[" * 16_000,
-        "deep object": '{"op":' * 2500,
-        "deep unknown field": '{"op":"watch","ref":"","more":' + "[" * 8000 + "]" * 8000 + "}",
         "drive without anything": '{"op":"drive"}',
         "unknown op": '{"op":"reboot","ref":"x"}',
-        "no op": '{"ref":"x"}',
-        "op is a number": '{"op":1}',
         "not JSON": "drive!",
-        "empty": "",
         "not an object": "[]",
         "half a surrogate": '{"op":"watch","ref":"\\ud800"}',
         "hello again": '{"op":"hello","version":"x"}',
         "binary": b'{"op":"stop","ref":"x"}',
-        "binary zero": b"\x00" * 100,
-        "stop without a name": '{"op":"estop","ref":"","stop":"x"}',
         "stop with another line": '{"op":"estop","ref":"","stop":"0123456789abcdef\\n"}',
         "many owners": json.dumps(
             {"op": "estop-reset", "ref": GOOB, "owners": [{"owner": "a", "boot": "b", "count": 1}] * 17}
@@ -410,52 +344,10 @@ def test_what_is_not_understood_ends_the_connection_and_moves_nothing(
     assert not driver.closed
 
 
-FRAMES = {
-    "100 MB": b"\x81\xff" + (100 * 1024 * 1024).to_bytes(8, "big") + bytes(4),
-    "2^63 bytes": b"\x81\xff" + b"\x7f" + b"\xff" * 7 + bytes(4),
-    "compressed": b"\xc1\x85" + bytes(4) + b"hello",
-    "not masked": b"\x81\x05hello",
-    "unknown kind": b"\x83\x85" + bytes(4) + b"hello",
-    "not UTF-8": b"\x81\x82" + bytes(4) + b"\xff\xff",
-    "long ping": b"\x89\xfe\x00\xff" + bytes(4) + b"x" * 255,
-    "many parts": b"\x01\xfe\xea\x60" + bytes(4) + b"x" * 60000 + (b"\x00\xfe\xea\x60" + bytes(4) + b"x" * 60000) * 4,
-}
-
-
-@pytest.mark.parametrize("kind", sorted(FRAMES))
-def test_odd_frames_end_the_connection(hall: Hall, kind: str) -> None:
-    with socket.create_connection(("127.0.0.1", hall.served.port), 5) as client:
-        client.sendall(
-            f"GET /ws/control HTTP/1.1\r\nHost: 127.0.0.1:{hall.served.port}\r\nOrigin: {hall.served.origin}\r\n"
-            f"Cookie: {hall.cookie('admin')}\r\nConnection: Upgrade\r\nUpgrade: websocket\r\n"
-            "Sec-WebSocket-Version: 13\r\nSec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\n\r\n".encode()
-        )
-        assert b" 101 " in client.recv(4096)
-        client.sendall(FRAMES[kind])
-        start = time.monotonic()
-        with suppress(ConnectionError):
-            while client.recv(65536):
-                pass
-        assert time.monotonic() - start < 2
-    assert hall.works()
-
-
 HOSTILE_REFS = [
-    "#",
-    "+/+/+",
-    "pebble/robots/#",
-    "pebble/robots/+",
-    "pebble/robots/goob/incoming/drive-values",
-    "pebble/robots",
-    "$SYS/broker/uptime",
-    "pebble//goob",
-    "/pebble/robots/goob",
-    "pebble/robots/goob/",
-    "pebble/robots/\u0000",
-    "pebble/robots/../../x",
-    "constructor",
-    "__proto__",
-]
+    "#", "+/+/+", "pebble/robots/#", "pebble/robots/goob/incoming/drive-values", "pebble/robots", "$SYS/broker/uptime",
+    "/pebble/robots/goob", "pebble/robots/goob/", "pebble/robots/\u0000", "pebble/robots/../../x", "__proto__",
+]  # fmt: skip
 UNKNOWN_REFS = ["pebble/servers/hall", "pebble/robots/unknown"]  # a robot that is off is stopped when it comes
 
 
@@ -481,36 +373,6 @@ def test_names_of_robots_are_no_topics(hall: Hall, goob: RecordingRobot, everyth
     assert hall.works()
 
 
-#: Of each socket of media: what a page offers, messages that are nonsense, and some that may come at any time.
-NONSENSE: dict[str, tuple[str, list[str | bytes], list[bytes]]] = {
-    "media": (
-        "json",
-        ["text", "", b"", *(b"\x00" * size for size in (4, 6, 60_000, 1_000_000))],
-        [struct.pack(">IB", *one) for one in product((0, 1, 0xFFFFFFFF), (0, 1, 2, 3, 255))],
-    ),
-    "sound": (
-        "opus",
-        ["text", "", b"", *(b"\x00" * size for size in (4, 60_000)), *(b"\x01" * size for size in (648, 650)),
-         b"\x02" * 6, b"\x03" * 5],
-        [struct.pack(">BI", *one) for one in product((0, 2), (0, 1, 0xFFFFFFFF))],
-    ),
-}  # fmt: skip
-
-
-@pytest.mark.parametrize("kind", NONSENSE)
-def test_a_socket_of_media_takes_no_nonsense(hall: Hall, driver: Page, kind: str) -> None:
-    cookie, (can, wrong, allowed) = hall.cookie("viewer"), NONSENSE[kind]
-    for query in ("", "?ref=", "?ref=%23", "?ref=pebble/robots/nobody", f"?ref={GOOB}/incoming"):
-        assert hall.refusal(f"/ws/{kind}{query}", cookie=cookie) == 403
-    path = f"/ws/{kind}?ref={GOOB}&can={f'{can},' * 500}%00'\"<script>"
-    for data in wrong:
-        assert hall.closed_after(path, cookie, data)
-    with hall.socket(path, cookie=cookie) as opened:
-        for data in allowed:
-            opened.send(data)
-    assert hall.works()
-
-
 def test_a_viewer_does_not_talk(hall: Hall, driver: Page) -> None:
     with hall.socket(f"/ws/sound?ref={GOOB}&can=opus", cookie=hall.cookie("viewer")) as talker:
         talker.send(b"\x01" + bytes(648))
@@ -531,35 +393,12 @@ def test_odd_bodies_stop_nothing(hall: Hall, everything: Everything, body: bytes
     assert len(everything.incoming()) == before
 
 
-def test_the_login_leads_back_to_the_page_that_was_asked_for(hall: Hall) -> None:
-    with hall.client() as client:
-        assert client.get(f"/r/{GOOB}").headers["location"] == f"../../../login?next=/r/{GOOB}"
-        assert client.get("/").headers["location"] == "./login"
-        assert client.get("/r/%0d%0aset-cookie:%20x=y").status_code == 404
-        odd = client.get("/r/%22%3E//evil.test?x=y&next=//evil.test")
-        assert odd.headers["location"] == "../../../login?next=/r/%22%3E//evil.test"
-
-
 # -- slow and many
 
 
 def test_a_socket_without_hello_is_closed(hall: Hall, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(control, "HELLO_S", 0.3)
     assert hall.closed_after("/ws/control", hall.cookie("admin"))
-
-
-def test_slow_requests_do_not_keep_others_out(hall: Hall, driver: Page, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(serve, "REQUEST_S", 1.0)
-    before, slow = len(hall.served.open), []
-    for number in range(300):
-        client = socket.create_connection(("127.0.0.1", hall.served.port), 5)
-        client.sendall(b"GET /ws/control HTTP/1.1\r\nX: y\r\n" if number % 2 else b"G")
-        slow.append(client)
-    assert hall.works()
-    assert until(lambda: len(hall.served.open) <= before + 1, 5)
-    assert not driver.closed
-    for client in slow:
-        client.close()
 
 
 def test_a_flood_of_stops_ends_no_other_persons_stop(hall: Hall, everything: Everything) -> None:

@@ -3,24 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack
 from pathlib import Path
-from urllib.parse import urlsplit
 
 import pytest
 from playwright.sync_api import Browser
 
 from tests.ext.page.attacker import PASSWORDS, Hall
 from tests.ext.page.browser import tab
-from tests.ext.page.console import REST, Console, console
-from tests.ext.page.stage import Stage
 from tests.support import Broker
 from tests.tcp_proxy import PrefixProxy
 
 pytestmark = pytest.mark.page
 
 #: Among them some that are paths of the page itself.
-PREFIXES = ["/robots/", "/a/b/c/", "/r/", "/replay/", "/static/", "/p%C3%A4th%20/", "/"]
+PREFIXES = ["/a/b/c/", "/replay/", "/p%C3%A4th%20/"]
 
 #: Shown once the process that reads recordings has been started, which takes long on a busy machine.
 EMPTY = "document.body.innerText.includes('Nothing is recorded yet')"
@@ -66,28 +63,3 @@ def test_a_login_leads_to_the_screen_that_was_asked_for_and_each_screen_leads_on
         one.page.evaluate("() => { pebble.commands.logOut() }")
         assert one.until(lambda: one.page.url == f"{url}login")
         assert proxy.outside == []
-
-
-@contextmanager
-def console_behind(proxy: PrefixProxy, browser: Browser, stage: Stage) -> Iterator[Console]:
-    proxy.lead_to(urlsplit(stage.url).port or 0)
-    with console(browser, stage, "minilamp", url=url_of(proxy)) as one:
-        yield one
-
-
-def test_a_robot_is_driven_and_stopped(browser: Browser) -> None:
-    """The page shows its picture, and all that it fetches later."""
-    with PrefixProxy(1, "/robots/") as proxy:
-        names = ["127.0.0.1", f"127.0.0.1:{proxy.port}"]
-        with Stage("minilamp", names=names) as stage, console_behind(proxy, browser, stage) as one:
-            one.take()
-            assert one.drive()
-            one.let_go()
-            assert one.rests()
-            one.page.evaluate("(ref) => { pebble.connection.socket.restart(); pebble.estop.press(ref) }", one.ref)
-            assert one.because("stopped")
-            assert one.tab.until("pebble.video.canvas.width > 1")
-            assert one.tab.until("performance.getEntriesByType('resource').some((one) => one.name.includes('help.js'))")
-            assert one.wheels == REST
-            assert proxy.outside == []
-            assert one.tab.violations == []

@@ -29,13 +29,6 @@ def test_who_sends_no_request_is_closed(broker: Broker, monkeypatch: pytest.Monk
         assert time.monotonic() - began > 0.4
 
 
-def test_a_page_stays_connected(broker: Broker, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(serve, "REQUEST_S", 0.1)
-    with Served(broker.port) as served, served.page() as page:
-        time.sleep(0.5)
-        assert not page.closed
-
-
 def test_who_reads_nothing_is_closed(broker: Broker, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(serve, "UNREAD_S", 1.0)
     with Served(broker.port) as served, socket.socket() as client:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import itertools
 import time
 
-from tests.ext.page.served import Served
 from tests.kit.played_robot import RecordingRobot
 from tests.support import until
 
@@ -73,16 +72,6 @@ def test_old_commands_move_nothing_and_a_clock_that_jumps_ends_the_connection(pa
     assert until(lambda: not robot.drives() or last(robot) == FINAL)
 
 
-def test_a_page_that_does_not_answer_does_not_drive(page, robot):
-    assert page.take(robot.base)
-    page.answers = False
-    time.sleep(1.3)
-    page.drive(robot.base, 1, z=0.5)
-    assert until(lambda: page.refused)
-    assert "late" in page.refused[0]["why"] or "stalled" in page.refused[0]["why"]
-    assert robot.drives() == []
-
-
 def test_a_broker_that_does_not_answer_ends_the_gesture(broker, page, robot):
     assert page.take(robot.base)
     page.drive(robot.base, 1, z=0.5)
@@ -107,27 +96,6 @@ def test_a_broker_that_does_not_answer_ends_the_gesture(broker, page, robot):
     assert until(lambda: last(robot)["z"] == 0.5)
 
 
-def test_one_robot_has_one_driver(served, page, robot):
-    with served.page(device="phone") as other:
-        assert other.knows(robot.base)
-        assert other.ready()
-        assert page.take(robot.base)
-        page.drive(robot.base, 1, z=0.5)
-        assert until(lambda: robot.drives())
-        other.send("lease", ref=robot.base, take=True)
-        assert until(lambda: other.refused)
-        assert other.refused[0]["why"] == "local is driving"
-        other.refused.clear()
-        assert other.take(robot.base, over=True)
-        assert until(lambda: last(robot) == FINAL)
-        page.drive(robot.base, 1, z=0.5)
-        assert until(lambda: page.refused)
-        assert until(lambda: page.value(robot.base, "web/driver", "device") == "phone")
-        assert page.value(robot.base, "web/driver", "you") is False
-        time.sleep(0.35)
-        assert last(robot) == FINAL
-
-
 def test_a_page_that_connects_again_has_its_lease_but_no_gesture(served, robot):
     first = served.page()
     assert first.knows(robot.base)
@@ -139,20 +107,6 @@ def test_a_page_that_connects_again_has_its_lease_but_no_gesture(served, robot):
         with served.page(token=first.welcome["token"]) as copy:
             time.sleep(0.3)
             assert copy.value(robot.base, "web/driver", "you") is False
-
-
-def test_a_page_that_connects_again_need_not_wait_for_the_end_of_its_stalled_connection(served, robot):
-    with served.page() as first:
-        assert first.knows(robot.base)
-        assert first.ready()
-        assert first.take(robot.base)
-        first.answers = False
-        time.sleep(1.6)  # so long a page waits before it connects anew
-        with served.page(token=first.welcome["token"]) as again:
-            assert until(lambda: again.value(robot.base, "web/driver", "you") is True)
-            first.close()
-            time.sleep(0.2)
-            assert again.value(robot.base, "web/driver", "you") is True
 
 
 def test_space_stops_for_everybody_and_ends_the_gesture(served, page, robot):
@@ -192,72 +146,6 @@ def test_all_are_stopped(broker, page, robot):
         assert until(lambda: robot.latched and second.latched, 3)
         page.send("estop-end", stop="00000000000000cc")  # else it collects further robots for three seconds
         assert until(lambda: page.value(second.base, "web/estop", "sending") == "confirmed")
-
-
-def test_an_old_robot_is_sent_zeros_and_shown_as_old(broker, served):
-    base = f"pebble/robots/old{next(NAMES)}"
-    drive = {"available": True, "controls": True}
-    with RecordingRobot(broker.port, base, capabilities={"drive": drive}) as old, served.page() as page:
-        assert page.knows(base)
-        page.send("estop", ref=base, stop="00000000000000dd")
-        assert until(lambda: len([one for one in old.drives() if one == FINAL]) >= 2, 3)
-        assert page.value(base, "web/estop", "sending") == "old"
-        page.send("estop-end", stop="00000000000000dd")
-        until(lambda: False, 0.3)  # one that is on its way
-        count = len(old.drives())
-        until(lambda: False, 1.0)
-        assert len(old.drives()) == count
-
-
-def test_a_robot_without_drive_is_not_driven(broker, served):
-    base = f"pebble/towers/tower{next(NAMES)}"
-    with RecordingRobot(broker.port, base, capabilities={"identity": {}}) as tower, served.page() as page:
-        assert page.knows(base)
-        assert page.ready()
-        assert page.take(base)
-        page.drive(base, 1, z=0.5)
-        assert until(lambda: page.refused)
-        assert page.refused[0]["why"] == f"{base.rpartition('/')[2]} does not drive"
-        assert tower.drives() == []
-
-
-def test_a_silent_robot_is_shown_as_silent_and_not_driven(page, robot):
-    assert page.take(robot.base)
-    robot.silent()
-    assert until(lambda: page.value(robot.base, "web/liveness", "online") is False, 4)
-    page.drive(robot.base, 1, z=0.5)
-    assert until(lambda: page.refused)
-    assert page.refused[0]["why"].endswith("is silent")
-
-
-def test_a_page_of_another_version_does_not_drive(served, robot):
-    with served.page(version="old") as page:
-        assert page.knows(robot.base)
-        page.send("lease", ref=robot.base, take=True)
-        assert until(lambda: page.refused)
-        assert "load it again" in page.refused[0]["why"]
-
-
-def test_servers_share_a_robot_that_keeps_no_control(broker, page, robot):
-    """Each lets one of its own pages drive; the last command counts, as with programs of the original."""
-    with Served(broker.port, server="attic") as other, other.page() as there:
-        assert there.knows(robot.base)
-        assert there.ready()
-        assert page.take(robot.base)
-        assert there.take(robot.base)
-        page.drive(robot.base, 1, z=0.5)
-        there.drive(robot.base, 1, z=0.25)
-        assert until(lambda: {0.5, 0.25} <= {one["z"] for one in robot.drives()})
-        assert (page.refused, page.value(robot.base, "web/driver", "by")) == ([], "local")
-        assert not any("/servers/" in topic for topic in robot.topics())
-
-
-def test_a_picture_of_another_component_is_remembered(served, page, robot):
-    page.send("watch", ref=robot.base)
-    assert until(lambda: page.value(robot.base, "web/picture-from", "source") == "")
-    other = next(ref for ref, metric in page.state if metric == "web/liveness" and ref != robot.base)
-    page.send("picture-from", ref=robot.base, source=other)
-    assert until(lambda: page.value(robot.base, "web/picture-from", "source") == other)
 
 
 def test_what_is_drawn_over_a_picture_comes_with_it(served, broker, page, robot):

@@ -59,15 +59,6 @@ def test_what_is_removed_is_gone_on_the_page(page: Page, robot: RecordingRobot) 
     assert until(lambda: page.state[BASE, "outlets/o1/status"] is None)
 
 
-def test_commands_go_to_the_components_own_topics(page: Page, robot: RecordingRobot) -> None:
-    page.send("outlet", ref=BASE, outlet="o1", on=True)
-    page.send("mcu", ref=BASE, uid="lamp-1", name="lamp", value={"level": 50, "on": False})
-    topics = {f"{BASE}/incoming/outlets/o1/power", f"{BASE}/incoming/mcu/lamp-1/lamp"}
-    assert until(lambda: topics <= robot.topics())
-    payloads = {topic: payload for _, topic, payload in robot.received if topic in topics}
-    assert list(payloads.values()) == [{"on": True}, {"level": 50, "on": False}]
-
-
 # -- without a broker
 
 

@@ -10,13 +10,12 @@ import socket
 import threading
 import time
 import urllib.request
-from collections.abc import Callable, Iterable, Iterator
-from contextlib import closing, suppress
+from collections.abc import Iterable, Iterator
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
 import pytest
-from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 
 from pebble.extensions.page.robots import MAX_COMPONENTS
@@ -24,7 +23,7 @@ from tests.commands.command_line import program
 from tests.ext.page.attacker import Everything
 from tests.ext.page.served import FREE, Page, Served
 from tests.kit.played_robot import RecordingRobot
-from tests.support import Broker, some, until
+from tests.support import Broker, until
 
 GOOB = "pebble/robots/goob"
 VICTIM = "pebble/robots/victim"
@@ -160,17 +159,9 @@ def test_capabilities_that_name_other_topics(server: ServerProcess, broker: Brok
             f"{VICTIM}/incoming/drive-values",
             f"{VICTIM}/incoming/estop-reset",
             "pebble/robots/evil/incoming/../../victim/incoming/drive-values",
-            "pebble/robots/evil/outgoing/online",
-            "pebble/robots/evil/incoming/",
             "pebble/robots/evil/incoming/#",
-            "pebble/robots/evil/incoming/+",
-            "pebble/robots/evil2/incoming/drive-values",
-            "$SYS/x",
-            "#",
             "+/+/+/incoming/drive-values",
             "",
-            7,
-            ["a"],
             {"a": 1},
         ]
         for number, topic in enumerate(foreign):
@@ -237,23 +228,15 @@ ODD = (
     b"",
     b"{",
     b"\xff\xfe",
-    b'"\xff"',
     b'{"value":"\xff"}',
     b'{"value":NaN}',
-    b'{"t":Infinity,"value":{}}',
     b'{"t":1e999}',
     b'{"value":"\\ud800"}',
-    b'{"value":1}{"value":2}',
-    b'{"value":1} trailing',
     b'{"value":' + b"[" * 30_000 + b"]" * 30_000 + b"}",
     b"[" * 60_000,
-    b'{"value":' * 6000 + b"1" + b"}" * 6000,
     b'{"value":1,"value":{"value":null}}',
     b'{"__proto__":{"x":1}}',
     b"null",
-    b"[]",
-    b"1",
-    b'"<script>alert(1)</script>"',
     b"\x00",
     b'{"value":"\x00"}',
     b"9" * 60_000,
@@ -295,15 +278,9 @@ LARGE = b'{"t":1,"value":{"drive":{"available":true},"estop":{"available":true,"
 #: What strangers publish of each of their 600 components, all the time. Those who publish all that a robot does cannot
 #: be told from one: access lists at the broker are for that.
 STRANGERS = {
-    "heartbeats": ("online", online),
-    "capabilities": ("capabilities", lambda: LARGE % b""),
-    "large capabilities": ("capabilities", lambda: LARGE % (b"x" * 60_000)),
-    "states": ("estop/s", lambda: json.dumps(FREE | {"latched": True, "persisted": True}).encode()),
-    "what is no state": ("estop/s", lambda: b'{"latched":false}'),
-    "pictures": ("front-camera", lambda: b"x"),
+    "capabilities": LARGE % (b"x" * 60_000),
+    "estop/s": json.dumps(FREE | {"latched": True, "persisted": True}).encode(),
 }
-
-
 SHARE = 8  # of the time that the broker is left to others, for each second in which it takes the crowd's messages
 
 
@@ -347,11 +324,11 @@ def is_stopped(page: Page, robot: RecordingRobot, ref: str) -> bool:
     return stopped
 
 
-@pytest.mark.parametrize(("metric", "payload"), some(STRANGERS.values(), 2), ids=some(STRANGERS, 2))
+@pytest.mark.parametrize(("metric", "payload"), STRANGERS.items(), ids=STRANGERS)
 def test_a_crowd_of_strangers_hides_no_robot_that_is_opened_and_keeps_no_stop_from_any(
-    broker: Broker, server: ServerProcess, metric: str, payload: Callable[[], bytes]
+    broker: Broker, server: ServerProcess, metric: str, payload: bytes
 ) -> None:
-    with closing(Crowd(broker.port, metric, payload())), server.page() as page:
+    with closing(Crowd(broker.port, metric, payload)), server.page() as page:
         with new_robot(broker) as robot:
             robot.publish("estop/serial", FREE, retain=True)  # as its motor owner does when it begins
             page.send("watch", ref=robot.base)
@@ -365,13 +342,9 @@ def test_a_crowd_of_strangers_hides_no_robot_that_is_opened_and_keeps_no_stop_fr
             assert is_stopped(page, robot, robot.base), "by its own stop, known or not"
 
 
-#: What strangers have left at the broker for each of 600 components, without being there.
-LEFT = {metric: STRANGERS[name][1] for name, metric in {"capabilities": "capabilities", "states": "estop/s"}.items()}
-
-
 def test_a_robot_is_shown_whole_by_a_server_that_finds_what_strangers_have_left(broker: Broker) -> None:
-    topics = [f"pebble/robots/left{number}/outgoing/{metric}" for number in range(600) for metric in LEFT]
-    flood(broker.port, ((topic, LEFT[topic.split("outgoing/")[1]]()) for topic in topics), retain=True)
+    topics = [f"pebble/robots/left{number}/outgoing/{metric}" for number in range(600) for metric in STRANGERS]
+    flood(broker.port, ((topic, STRANGERS[topic.split("outgoing/")[1]]) for topic in topics), retain=True)
     try:
         with new_robot(broker) as robot, Served(broker.port) as served, served.page() as page:
             assert page.knows(robot.base, PATIENCE_S)
@@ -381,20 +354,6 @@ def test_a_robot_is_shown_whole_by_a_server_that_finds_what_strangers_have_left(
             assert drives(page, robot)
     finally:
         flood(broker.port, ((topic, b"") for topic in topics), retain=True)
-
-
-@pytest.mark.thorough
-def test_a_page_that_opens_thousands_of_components(server: ServerProcess, broker: Broker, log: Path) -> None:
-    with RecordingRobot(broker.port, VICTIM) as robot, server.page() as page, server.page() as mallory:
-        assert drives(page, robot)
-        before = server.memory()
-        with suppress(ConnectionClosed):
-            for number in range(3000):
-                mallory.send("watch", ref=f"pebble/robots/w{number}")
-        time.sleep(1)
-        assert drives(page, robot)
-        assert until(lambda: server.memory() - before < 40 * MB, 10)
-        assert len(subscriptions(log)) < 3000
 
 
 @pytest.mark.thorough

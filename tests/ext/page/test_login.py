@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import asyncio
-import json
 import threading
 import time
-import tracemalloc
 from collections.abc import Awaitable, Callable, Iterator
 from importlib.resources import files
 from pathlib import Path
@@ -21,19 +19,18 @@ from starlette.requests import Request
 from starlette.responses import JSONResponse
 from starlette.routing import Route
 
-from pebble.extensions.fleet.audit import MAX_REFUSED, OTHERS, REFUSED, Audit
+from pebble.extensions.fleet.audit import Audit
 from pebble.extensions.fleet.people import SESSION_S, People
 from pebble.extensions.fleet.roles import Role
+from pebble.extensions.fleet.row_writer import OF_STRANGERS, WINDOW_S
 from pebble.extensions.page.access import login
 from pebble.extensions.page.access.guard import Guard
 from pebble.extensions.page.setting import WebSettings
-from pebble.runtime.row_writer import OF_STRANGERS, WINDOW_S
 from pebble.transports import MqttSettings
 from tests.ext.fleet.conftest import cheap_hashes as cheap_hashes
-from tests.support import cases, until
+from tests.support import until
 
 pytestmark = pytest.mark.usefixtures("cheap_hashes")
-LOGINS = cases(500, 100_000)
 PASSWORD = "correct horse"
 URL = {"http": "http://pebble.test:8080", "https": "https://pebble.test:8080"}
 STATIC = files("pebble.extensions.page") / "static"
@@ -152,72 +149,6 @@ def test_wrong_passwords_and_unknown_names_have_the_same_answer(site: Site) -> N
     assert until(lambda: [(one.what, one.user) for one in site.audit.read(10)] == [("login-refused", "alice")])
 
 
-def test_guessing_is_limited(site: Site) -> None:
-    async def work(client: httpx.AsyncClient) -> list[httpx.Response]:
-        return [await site.log_in(client, "alice", f"wrong horse {number}") for number in range(7)]
-
-    answers = site.run(work)
-    assert [answer.status_code for answer in answers] == [401] * 5 + [429] * 2
-    assert 50 <= int(answers[5].headers["retry-after"]) <= 60
-    assert answers[5].json()["why"].startswith("Too many tries: wait ")
-    assert site.run(site.log_in).status_code == 429
-    assert site.run(site.log_in, address="192.0.2.8").status_code == 429, "the name has its own limit"
-
-
-def test_guessing_by_many_at_once_is_limited_too(site: Site) -> None:
-    async def work(client: httpx.AsyncClient) -> list[int]:
-        tries = [site.log_in(client, "alice", f"wrong horse {number}") for number in range(100)]
-        return [answer.status_code for answer in await asyncio.gather(*tries)]
-
-    codes = site.run(work)
-    assert sorted(set(codes)) == [401, 429]
-    assert codes.count(401) == 5
-
-
-def test_a_flood_of_refused_logins_displaces_no_row_and_grows_nothing(site: Site) -> None:
-    """Each from an address and with a name of its own, so that all get as far as the password."""
-    body = {"content-type": "application/json", "host": "pebble.test:8080", "origin": site.url}
-    headers = [(name.encode(), value.encode()) for name, value in body.items()]
-
-    async def refused(number: int) -> None:
-        raw = json.dumps({"user": f"u{number}", "password": "x"}).encode()
-        client = f"10.{number >> 16}.{number >> 8 & 255}.{number & 255}", 50000
-        scope = {"type": "http", "method": "POST", "path": "/api/login", "raw_path": b"/api/login", "query_string": b""}
-        scope |= {"headers": headers, "client": client, "scheme": "https", "http_version": "1.1", "root_path": ""}
-        answers: list[Any] = []
-
-        async def receive() -> Any:
-            return {"type": "http.request", "body": raw, "more_body": False}
-
-        async def send(message: Any) -> None:
-            answers.append(message)
-
-        await site.app(scope, receive, send)
-        assert answers[0]["status"] == 401
-
-    async def flood(first: int, last: int) -> None:
-        for number in range(first, last):
-            await refused(number)
-
-    site.audit.write("drive", ref="pebble/robots/goob", user="ann")
-    site.run(site.log_in)
-    site.run(lambda client: site.log_in(client, "alice", "typo"), address="198.51.100.9")
-    warm, began = LOGINS // 5, time.monotonic()
-    tracemalloc.start()
-    asyncio.run(flood(0, warm))
-    before = tracemalloc.get_traced_memory()[0]
-    asyncio.run(flood(warm, LOGINS))
-    grown = tracemalloc.get_traced_memory()[0] - before
-    tracemalloc.stop()
-    assert until(lambda: [row.user for row in site.audit.read(MAX_REFUSED)][-1] == OTHERS, 10)
-    rows = site.audit.read(MAX_REFUSED)
-    assert [row.what for row in rows if row.what not in REFUSED] == ["drive", "login"]
-    assert [row.user for row in rows if row.address == "198.51.100.9"] == ["alice"]
-    assert len(rows) <= 2 * (OF_STRANGERS + 1) * (2 + (time.monotonic() - began) // WINDOW_S)
-    assert grown < 8e6, "remembered tries are bounded, too"
-    assert site.run(site.log_in).status_code == 200
-
-
 def test_password_hashes_hold_up_nothing_else(site: Site, monkeypatch: pytest.MonkeyPatch) -> None:
     release = threading.Event()
     monkeypatch.setattr(site.people, "check", lambda *_: release.wait(10) and None)
@@ -242,15 +173,11 @@ def test_password_hashes_hold_up_nothing_else(site: Site, monkeypatch: pytest.Mo
     [
         b"",
         b"{",
-        b"[]",
-        b"null",
         b"{}",
-        b'{"user":"alice"}',
         b'{"user":1,"password":2}',
         b'{"user":["alice"],"password":"correct horse"}',
         b'{"user":"alice","password":"' + b"x" * 600 + b'"}',
         b"[" * 8000,
-        b'{"user":' * 1500,
         b'{"user":"\xff","password":"x"}',
         b'{"user":"\\ud800","password":"x"}',
     ],
@@ -262,26 +189,11 @@ def test_odd_bodies_are_refused(site: Site, body: bytes) -> None:
     assert answer.json() == {"ok": False, "why": "This needs a user and a password"}
 
 
-@pytest.mark.parametrize("user", ["ALICE", " alice", "alice\x00", "' OR 1=1 --", "../alice", "a" * 64, "älice"])
-def test_odd_names_are_unknown(site: Site, user: str) -> None:
-    assert site.run(lambda client: site.log_in(client, user)).status_code == 401
-
-
 @pytest.mark.parametrize("cookie", ["__Host-pebble=", "__Host-pebble=x", "pebble=x", "__Host-pebble", "a=b; c", "\x80"])
 def test_no_other_cookie_is_a_session(site: Site, cookie: str) -> None:
     site.run(site.log_in)
     headers = {"cookie": cookie.encode("latin-1")}
     assert site.run(lambda client: client.get("/who", headers=headers)).json() is None
-
-
-def test_a_session_of_http_is_none_of_https(site: Site) -> None:
-    async def work(client: httpx.AsyncClient) -> None:
-        await site.log_in(client)
-        token = client.cookies["__Host-pebble"]
-        client.cookies.clear()
-        assert (await client.get("/who", headers={"cookie": f"pebble={token}"})).json() is None
-
-    site.run(work)
 
 
 def test_without_login_everybody_is_admin() -> None:
@@ -291,17 +203,6 @@ def test_without_login_everybody_is_admin() -> None:
     assert (answer.status_code, answer.headers["location"]) == (303, "./")
     assert site.run(lambda client: site.post(client, "/api/logout", {})).status_code == 200
     site.close()
-
-
-def test_a_removed_person_is_out_at_once(site: Site) -> None:
-    async def work(client: httpx.AsyncClient) -> None:
-        await site.log_in(client)
-        site.people.set_role("alice", Role.VIEWER)
-        assert (await client.get("/who")).json() == ["alice", "viewer"]
-        site.people.remove("alice")
-        assert (await client.get("/who")).json() is None
-
-    site.run(work)
 
 
 def test_the_page_names_the_server_and_needs_no_session(site: Site) -> None:
@@ -314,20 +215,3 @@ def test_the_page_names_the_server_and_needs_no_session(site: Site) -> None:
     assert "{" not in answer.text
     assert "style=" not in answer.text
     assert answer.text.count("<script") == answer.text.count('<script type="module" src="./static/')
-
-
-def test_who_is_logged_in_goes_to_the_fleet(site: Site) -> None:
-    async def work(client: httpx.AsyncClient) -> httpx.Response:
-        await site.log_in(client)
-        return await client.get("/login")
-
-    answer = site.run(work)
-    assert (answer.status_code, answer.headers["location"]) == (303, "./")
-
-
-def test_logins_by_get_and_from_other_sites_are_refused(site: Site) -> None:
-    assert site.run(lambda client: client.get("/api/login")).status_code == 405
-    headers = {"origin": "https://evil.test"}
-    body = {"user": "alice", "password": PASSWORD}
-    assert site.run(lambda client: client.post("/api/login", json=body, headers=headers)).status_code == 403
-    assert site.run(lambda client: client.post("/api/logout", json={}, headers=headers)).status_code == 403

@@ -16,8 +16,6 @@ from tests.kit.played_robot import RecordingRobot
 from tests.support import Broker, until
 
 NAMES = itertools.count(1)
-DRIVE = {"available": True, "controls": True, "arbitrates": True, "control": True}
-ESTOP = {"available": True, "owners": ["serial"]}
 
 
 def server(broker: Broker, account: str | None) -> Served:
@@ -62,32 +60,6 @@ def test_everything_has_the_servers_account_in_its_topic_and_the_person_beside_i
         assert {one for one in robot.wire if not one.startswith(by_name)} == {f"{ref}/incoming/estop"}
 
 
-def test_two_servers_never_share_a_robot_and_each_shows_who_drives_under_a_checked_name(broker, robot):
-    ref = robot.base
-    with (
-        server(broker, "page-1") as hall,
-        server(broker, "page-2") as attic,
-        hall.page(name="ann") as ann,
-        attic.page(name="otto") as otto,
-    ):
-        for page in (ann, otto):
-            assert page.knows(ref)
-            assert page.ready()
-        assert ann.take(ref)
-        assert until(lambda: otto.value(ref, "web/driver", "by") == "page-1/ann")
-        ann.drive(ref, 1, z=0.5)
-        otto.send("lease", ref=ref, take=True)
-        assert until(lambda: ann.value(ref, "web/driver", "asks") == "page-2/otto")
-        ann.send("lease", ref=ref, take=False)
-        assert until(lambda: otto.value(ref, "web/driver", "you") is True)
-        assert until(lambda: ann.value(ref, "web/driver", "by") == "page-2/otto")
-        assert otto.value(ref, "web/driver", "checked") is True
-        ann.drive(ref, 2, z=0.5)
-        assert until(lambda: "page-2/otto is driving" in [one["why"] for one in ann.refused])
-        assert ann.take(ref, over=True)
-        assert until(lambda: otto.value(ref, "web/driver", "by") == "page-1/ann")
-
-
 def test_a_server_without_an_account_stops_and_else_shows_why_it_may_do_nothing(broker, robot):
     ref = robot.base
     with server(broker, None) as hall, hall.page() as page:
@@ -101,29 +73,6 @@ def test_a_server_without_an_account_stops_and_else_shows_why_it_may_do_nothing(
         page.send("estop", ref=ref, stop="00c0ffee00c0ffee", why="")
         assert until(lambda: page.value(ref, "web/estop", "sending") == "confirmed")
         assert robot.wire == {f"{ref}/incoming/drive-values", f"{ref}/incoming/estop"}
-
-
-def test_the_level_of_a_robot_may_change_while_it_is_driven(broker, robot):
-    ref = robot.base
-    with server(broker, "page-1") as hall, hall.page(name="ann") as page:
-        assert page.knows(ref)
-        assert page.ready()
-        assert page.take(ref)
-        drive = DRIVE | {"topic": f"{ref}/incoming/drive-values"}
-        page.send("lights", ref=ref, r=1.0, n=1)
-        assert until(lambda: f"{ref}/incoming/by/page-1/lights-solid" in robot.wire)
-        robot.named = False
-        robot.publish_capabilities({"drive": drive, "estop": ESTOP})
-        assert until(lambda: page.value(ref, "capabilities")["value"].get("named") is None)
-        page.send("lights", ref=ref, r=1.0, n=2)
-        assert until(lambda: f"{ref}/incoming/lights-solid" in robot.wire)
-        robot.named = True
-        robot.publish_capabilities({"drive": drive, "estop": ESTOP, "named": True})
-        assert until(lambda: page.value(ref, "capabilities")["value"].get("named") is True)
-        robot.wire.clear()
-        page.drive(ref, 1, z=0.5)
-        assert until(lambda: f"{ref}/incoming/by/page-1/drive-values" in robot.wire)
-        assert f"{ref}/incoming/drive-values" not in robot.wire
 
 
 def test_a_robot_that_checks_names_is_reset_only_by_safety_and_admin(broker, robot, tmp_path):

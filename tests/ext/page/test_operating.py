@@ -103,31 +103,6 @@ def test_lines_that_the_server_drops_leave_a_gap(page, robot, broker) -> None:
     assert last["first"] == before["first"] + len(before["lines"]) + 1
 
 
-def test_a_part_of_the_logs_waits_for_an_echo(page, robot) -> None:
-    assert until(lambda: _logged(robot, page, "ready"))
-    for _ in range(60):
-        robot.publish("logs", {"message": "x" * 1000})
-    robot.publish("charging-level", {"value": 3.5})
-    assert until(lambda: page.value(robot.base, "charging-level") is not None)
-    page.answers = False
-    page.send("read-logs", ref=robot.base, on=True)
-    assert until(lambda: page.logs)
-    assert not until(lambda: len(page.logs) > 2, 0.5)  # an answer may have been under way
-    page.answers = True
-    assert until(lambda: len(page.logs) > 3, 4)
-
-
-def test_logs_of_another_component_are_not_sent(page, robot, served, broker) -> None:
-    with RecordingRobot(broker.port, f"{robot.base}b") as other:
-        page.send("read-logs", ref=other.base, on=True)
-        page.send("read-logs", ref=robot.base, on=True)
-        assert until(lambda: _logged(robot, page, "mine"))
-        other.publish("logs", {"message": "theirs"})
-        robot.publish("logs", {"message": "end"})
-        assert until(lambda: {"message": "end"} in lines(page))
-        assert {"message": "theirs"} not in lines(page)
-
-
 # -- flags
 
 
@@ -166,43 +141,6 @@ def test_a_flag_is_read_where_the_capabilities_name_it_but_only_of_the_robot_its
 # -- actions
 
 
-@pytest.mark.parametrize(
-    ("flag", "topic"),
-    [("again", "again"), ("pebble/robots/other/incoming/flags/reboot", "service-restart")],
-    ids=["that the capabilities name", "but never another robot's"],
-)
-def test_an_action_goes_to_the_topic(served, broker, flag: str, topic: str) -> None:
-    base = f"pebble/robots/rig{next(NAMES)}"
-    named = flag if "/" in flag else f"{base}/incoming/flags/{flag}"
-    capabilities = {"system": {"service_restart": {"flag_topic": named}}}
-    with RecordingRobot(broker.port, base, capabilities=capabilities) as robot, Page(served) as page:
-        assert page.knows(base)
-        page.send("action", ref=base, name="service-restart")
-        page.send("action", ref=base, name="reboot")
-        wanted = [(f"{base}/incoming/flags/{name}", {"value": True}) for name in (topic, "reboot")]
-        assert until(lambda: [(topic, value) for _, topic, value in robot.received] == wanted), robot.received
-        assert until(lambda: [one["cmd"] for one in page.done] == ["action", "action"])
-    assert until(lambda: [one.detail for one in _audit(served, base)] == ["name service-restart", "name reboot"])
-
-
-@pytest.mark.parametrize(
-    ("role", "may"),
-    [
-        pytest.param("viewer", set(), marks=pytest.mark.thorough),
-        ("driver", {"mqtt-video"}),
-        pytest.param("maintainer", {"mqtt-video", "reboot"}, marks=pytest.mark.thorough),
-    ],
-)
-def test_what_each_role_may_ask(broker, tmp_path: Path, role: str, may: set[str]) -> None:
-    base = f"pebble/robots/rig{next(NAMES)}"
-    with Hall(broker.port, tmp_path) as hall, RecordingRobot(broker.port, base) as robot, hall.page(role) as page:
-        assert page.knows(base)
-        page.send("flag", ref=base, name="mqtt-video", on=True)
-        page.send("action", ref=base, name="reboot")
-        assert until(lambda: len(page.refused) == 2 - len(may))
-        assert until(lambda: robot.topics() == {f"{base}/incoming/flags/{name}" for name in may})
-
-
 def test_only_who_looks_after_robots_reads_what_was_done(broker, tmp_path: Path) -> None:
     with Hall(broker.port, tmp_path) as hall:
         audit = hall.served.app.state.audit
@@ -218,21 +156,6 @@ def test_only_who_looks_after_robots_reads_what_was_done(broker, tmp_path: Path)
             ("stop", "pebble/robots/goob", "ann", "0", 1),
             ("stop", "all", "ann", "2", 1),
         ]
-
-
-def test_an_answer_has_the_number_of_what_was_asked(page, robot) -> None:
-    page.send("outlet", ref=robot.base, outlet="o1", on=True, n=5)
-    page.send("lights", ref="pebble/robots/nobody", g=0.5, n=6)
-    assert until(lambda: page.done and page.refused)
-    assert page.done == [{"op": "done", "cmd": "outlet", "ref": robot.base, "n": 5}]
-    why = "unknown component"
-    assert page.refused == [
-        {"op": "refused", "cmd": "lights", "ref": "pebble/robots/nobody", "why": why, "g": -1, "n": 6}
-    ]
-
-
-def _audit(served: Served, ref: str) -> list[Any]:
-    return [entry for entry in served.app.state.audit.read(100) if entry.ref == ref and entry.what == "action"]
 
 
 # -- opened and closed
@@ -404,8 +327,3 @@ def test_without_a_login_a_page_gives_its_own_name(served, robot) -> None:
         assert "Alice" in other.value(robot.base, "web/estop", "by")
     audit = served.app.state.audit
     assert until(lambda: ("Alice ?", "stop") in [(entry.user, entry.what) for entry in audit.read(9)])
-
-
-def test_with_a_login_the_name_of_the_user_counts(broker, tmp_path: Path) -> None:
-    with Hall(broker.port, tmp_path) as hall, Page(hall.served, cookie=hall.cookie("driver"), name="Alice") as page:
-        assert page.welcome["user"] == "driver"

@@ -12,7 +12,7 @@ from playwright.sync_api import Browser
 
 from pebble.transports import MqttSettings, create
 from tests.ext.page.browser import Tab, tab
-from tests.ext.page.media.robots import REF, VIDEO, PictureRobot, capabilities
+from tests.ext.page.media.robots import REF, PictureRobot
 from tests.ext.page.served import Served
 from tests.support import Broker
 
@@ -64,15 +64,7 @@ def drawn(one: Tab) -> list[dict[str, Any]]:
     return list(one.page.evaluate("window.drawn"))
 
 
-def test_chromium_decodes_everything(browser: Browser, served: Served, robot: PictureRobot) -> None:
-    with showing(browser, served) as one:
-        assert one.page.evaluate("window.can") == ["h264", "pbvd", "json", "jpeg"]
-        assert one.until("window.drawn.length > 20")
-        assert one.errors + one.violations == []
-    assert robot.requests[0] == {"enabled": True, "encoding": "h264"}
-
-
-@pytest.mark.parametrize("encoding", ["h264", "pbvd", "json"])
+@pytest.mark.parametrize("encoding", ["h264", "pbvd"])
 def test_every_picture_is_drawn_in_order_and_soon(
     browser: Browser, served: Served, robot: PictureRobot, encoding: str
 ) -> None:
@@ -89,25 +81,6 @@ def test_every_picture_is_drawn_in_order_and_soon(
         assert one.errors + one.violations == []
 
 
-def test_a_page_that_decodes_nothing_is_shown_jpegs(browser: Browser, served: Served, robot: PictureRobot) -> None:
-    with showing(browser, served, []) as one:
-        assert one.until("window.drawn.length > 5")
-        assert all(info["rescue"] and info["encoding"] == "jpeg" for info in drawn(one))
-        assert all(0 <= info["age"] < 5000 for info in drawn(one))
-        assert one.page.evaluate("window.pictures.state.rescue")
-
-
-def test_a_slow_page_is_shown_what_is_new(browser: Browser, served: Served, robot: PictureRobot) -> None:
-    """Drawing takes 0.2 s; the robot sends 15 a second."""
-    with showing(browser, served, ["pbvd"]) as one:
-        assert one.until("window.drawn.length > 3")
-        one.page.evaluate("window.delay = 200")
-        one.page.wait_for_timeout(1500)
-        one.page.evaluate("window.drawn.length = 0")
-        assert one.until("window.drawn.length > 8")
-        assert max(info["age"] for info in drawn(one)) < 3000
-
-
 def test_after_a_lost_connection_pictures_come_again(browser: Browser, broker: Broker, robot: PictureRobot) -> None:
     with Served(broker.port) as first, tab(browser, f"{first.origin}/healthz") as one:
         one.page.evaluate(SHOW, [f"/static/{first.version}/media/pictures.js", ["pbvd"]])
@@ -121,49 +94,3 @@ def test_after_a_lost_connection_pictures_come_again(browser: Browser, broker: B
         with Served(broker.port, port=port):
             assert one.until(f"window.drawn.length > {count + 3}", 15)
             assert one.page.evaluate("window.pictures.state.connection") == "open"
-
-
-def test_another_component_and_none(browser: Browser, served: Served, robot: PictureRobot) -> None:
-    with showing(browser, served) as one:
-        assert one.until("window.drawn.length > 3")
-        one.page.evaluate("window.pictures.show('pebble/robots/unknown')")
-        one.page.wait_for_timeout(200)
-        count = one.page.evaluate("window.drawn.length")
-        one.page.wait_for_timeout(500)
-        assert one.page.evaluate("window.drawn.length") == count
-        one.page.evaluate("ref => window.pictures.show(ref)", REF)
-        assert one.until(f"window.drawn.length > {count + 3}")
-        one.page.evaluate("window.pictures.stop()")
-        one.page.wait_for_timeout(200)
-        count = one.page.evaluate("window.drawn.length")
-        one.page.wait_for_timeout(300)
-        assert one.page.evaluate("window.drawn.length") == count
-        assert one.page.evaluate("window.pictures.state.connection") == "off"
-
-
-def test_a_drawing_page_that_throws_goes_on(browser: Browser, served: Served, robot: PictureRobot) -> None:
-    with showing(browser, served) as one:
-        assert one.until("window.drawn.length > 3")
-        one.page.evaluate(
-            "() => { window.pictures.canvasDraw = (_, info) => { window.drawn.push(info); throw Error('x'); } }"
-        )
-        count = one.page.evaluate("window.drawn.length")
-        assert one.until(f"window.drawn.length > {count + 10}")
-
-
-def test_raw_jpegs_of_a_board(browser: Browser, served: Served, broker: Broker) -> None:
-    import cv2
-    import numpy as np
-
-    video = {name: VIDEO[name] for name in ("available", "controls", "topic", "command_topic", "flag_topic")}
-    with filming(broker, video={**video, "encoding": "jpeg"}) as robot:
-        robot.mute = True
-        with showing(browser, served) as one:
-            assert one.until(lambda: robot.requests)
-            for number in range(8):
-                robot.send(cv2.imencode(".jpg", np.full((48, 64, 3), 20 * number, np.uint8))[1].tobytes())
-                one.page.wait_for_timeout(100)
-            assert one.until("window.drawn.length >= 4")  # a page that stands still is shown what is newest
-            assert {info["encoding"] for info in drawn(one)} == {"jpeg"}
-            assert not any(request.get("encoding") for request in robot.requests)
-        robot.transport.publish(f"{REF}/outgoing/capabilities", capabilities(VIDEO), retain=True)

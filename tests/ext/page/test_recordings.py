@@ -30,7 +30,7 @@ from tests.ext.recordings.messages import START_NS
 from tests.ext.recordings.others import DAMAGED
 from tests.ext.recordings.playing import GOOB, ms
 from tests.ext.recordings.seek.filming import film
-from tests.support import Broker, further, gone, until
+from tests.support import Broker, gone, until
 
 SECONDS = 40
 DAY = "2023-11-14"
@@ -101,7 +101,7 @@ def test_a_timeline_that_failed_stays_so_until_a_person_tries_again_and_is_index
     assert time.monotonic() - began < 2.0
 
 
-@pytest.mark.parametrize("form", ["mkv", further("mp4"), "mcap"])
+@pytest.mark.parametrize("form", ["mkv", "mcap"])
 def test_a_stretch_is_exported_and_fetched(archive: Served, tmp_path: Path, form: str) -> None:
     answer = post(archive, "exports", {"robot": GOOB, "since": ms(5), "until": ms(15), "as": form})
     assert answer.status_code == 202, answer.text
@@ -169,24 +169,6 @@ def test_a_bad_question_gets_one_line(archive: Served, parameters: dict[str, Any
     assert "\n" not in answer.text
 
 
-@pytest.mark.parametrize(
-    "body",
-    [
-        {},
-        {"robot": GOOB, "since": 0, "until": 1e12, "as": "mkv"},
-        {"robot": GOOB, "since": 5, "until": 4, "as": "mkv"},
-        7,
-    ],
-)
-def test_a_bad_export_is_refused(archive: Served, body: Any) -> None:
-    assert post(archive, "exports", body).status_code == 400
-
-
-def test_nothing_to_export_is_one_line(archive: Served) -> None:
-    answer = post(archive, "exports", {"robot": "pebble/robots/no", "since": 5, "until": 9, "as": "mkv"})
-    assert (answer.status_code, answer.text) == (422, "nothing is recorded of pebble/robots/no in this time")
-
-
 def test_without_a_folder_and_without_a_session(broker: Broker, folder: Path, tmp_path: Path) -> None:
     with Served(broker.port) as plain:
         answer = get(plain, "days")
@@ -203,12 +185,6 @@ def test_without_a_folder_and_without_a_session(broker: Broker, folder: Path, tm
         paths = [route.path.replace("{id}", "1") for route in routes.routes() if "POST" not in (route.methods or ())]
         assert {httpx.get(closed.origin + path).status_code for path in paths} == {401}
         assert post(closed, "exports", {}).status_code == 401
-
-
-def test_the_page_knows_that_there_are_some(archive: Served) -> None:
-    with archive.page() as page:
-        assert page.welcome["recordings"] is True
-    assert httpx.get(f"{archive.origin}/replay/{GOOB}?at=1").status_code == 200
 
 
 def test_the_process_that_reads_is_replaced_if_it_dies(folder: Path) -> None:

@@ -174,19 +174,6 @@ def test_all_but_seek_play_and_speed_ends_it(served: Served, broker: Broker, tex
     reference.transport.close()
 
 
-def test_recorded_commands_reach_no_robot(viewer: Viewer, broker: Broker) -> None:
-    reference = Reference(broker.port)
-    viewer.seek(1.0)
-    viewer.send(op="speed", speed=8)
-    viewer.send(op="play", on=True)
-    assert viewer.until(lambda: viewer.played["at"] > ms(10))
-    marker = f"{GOOB}/outgoing/marker"
-    reference.transport.publish(marker, b"{}")
-    assert until(lambda: reference.of(marker) == [b"{}"], 5)
-    assert {message.topic for message in reference.received if message.topic.startswith(GOOB)} == {marker}
-    reference.transport.close()
-
-
 def test_processes_are_few_and_end_with_their_sockets(served: Served, monkeypatch: pytest.MonkeyPatch) -> None:
     processes = served.app.state.recordings.viewers.processes
     assert until(lambda: not processes, 10)

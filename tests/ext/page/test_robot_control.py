@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import itertools
-import json
 from collections.abc import Iterator
 from typing import Any
 
 import pytest
 
 from pebble.extensions.fleet.roles import Role, page_rights
-from pebble.transports import MqttSettings, QoS, create
 from tests.ext.page.attacker import Hall
 from tests.ext.page.served import Page, Served
 from tests.kit.played_robot import RecordingRobot
@@ -94,89 +92,6 @@ def test_who_drives_at_another_server_is_asked_and_lets_drive(served, attic, rob
         assert all(one["z"] != 0.9 for one in moving(robot))
         assert until(lambda: acts(served, robot) == ["take", "drive", "release"], 5)
         assert until(lambda: acts(attic, robot)[:2] == ["ask", "take"], 5)
-
-
-def test_who_is_asked_may_keep_it_and_is_taken_over_by_who_has_the_right(served, attic, robot):
-    with ready(served, robot, name="ann") as ann, ready(attic, robot, name="otto") as otto:
-        assert ann.take(robot.base)
-        otto.send("lease", ref=robot.base, take=True)
-        assert until(lambda: view(ann, robot)["asks"] == "otto")
-        otto.send("lease", ref=robot.base, take=False)
-        assert until(lambda: view(ann, robot)["asks"] == "")
-        ann.drive(robot.base, 1, z=0.5)
-        assert until(lambda: moving(robot))
-        assert otto.take(robot.base, over=True)
-        assert until(lambda: view(ann, robot)["by"] == "otto")
-        assert robot.drives()[-1]["valid_ms"] == 0, "the robot halts by itself, and the server stops what it moved"
-        ann.drive(robot.base, 1, z=0.9)
-        assert until(lambda: ann.refused)
-        assert until(lambda: "take over" in acts(attic, robot), 5)
-
-
-def test_two_pages_of_one_server_ask_each_other_by_the_robot(served, robot):
-    with ready(served, robot, name="ann") as ann, ready(served, robot, name="bob") as bob:
-        assert ann.take(robot.base)
-        bob.send("lease", ref=robot.base, take=True)
-        assert until(lambda: view(ann, robot)["asks"] == "bob")
-        assert bob.take(robot.base, over=True)
-        assert until(lambda: view(ann, robot)["you"] is False)
-        assert view(ann, robot)["by"] == "bob"
-        bob.close()
-        assert until(lambda: view(ann, robot)["by"] == "")
-
-
-def test_a_page_that_connects_again_is_given_control_again(served, robot):
-    first = ready(served, robot, name="ann")
-    assert first.take(robot.base)
-    first.close()
-    with served.page(name="ann", token=first.welcome["token"]) as again:
-        assert until(lambda: again.value(robot.base, "web/driver", "you") is True)
-        assert again.ready()
-        again.drive(robot.base, 1, z=0.5)
-        assert until(lambda: moving(robot))
-        assert robot.keeping is not None
-        assert moving(robot)[-1]["key"] == robot.keeping.owners[0].lease.key
-
-
-def test_that_a_robot_does_not_answer_is_shown(served, robot):
-    with ready(served, robot) as page:
-        assert robot.keeping is not None
-        robot.keeping.owners[0].receives = False
-        page.send("lease", ref=robot.base, take=True)
-        assert until(lambda: page.refused, 6)
-        assert (page.refused[0]["cmd"], page.refused[0]["why"]) == (
-            "lease", f"{robot.base.rpartition('/')[2]} does not answer",
-        )  # fmt: skip
-        assert view(page, robot)["asking"] is False
-
-
-def test_a_motor_owner_that_is_started_again_needs_a_new_gesture(served, robot):
-    with ready(served, robot) as page:
-        assert page.take(robot.base)
-        page.drive(robot.base, 1, z=0.5)
-        assert until(lambda: moving(robot))
-        assert robot.keeping is not None
-        robot.keeping.owners[0].start(0.0)
-        robot.publish_states()
-        assert until(lambda: robot.keeping.owners[0].by != "" and view(page, robot)["you"])
-        page.drive(robot.base, 1, z=0.6)
-        assert until(lambda: page.refused)
-        page.drive(robot.base, 2, z=0.7)
-        assert until(lambda: moving(robot)[-1]["z"] == 0.7)
-        assert moving(robot)[-1]["key"] == robot.keeping.owners[0].lease.key
-
-
-def test_what_old_servers_announce_does_not_count_and_strangers_are_shown(served, broker, robot):
-    transport = create("mqtt", "old-server", MqttSettings(host="127.0.0.1", port=broker.port))
-    with ready(served, robot) as page, transport:
-        assert page.take(robot.base)
-        robots = {robot.base: {"by": "eve", "device": "", "since": 9_000_000_000_000}}
-        transport.publish(
-            "pebble/servers/old/outgoing/driving", json.dumps({"t": 1, "robots": robots}).encode(), qos=QoS.DELIVERED
-        )
-        robot.stranger(z=0.3)
-        assert until(lambda: view(page, robot)["others"] is True)
-        assert view(page, robot)["you"] is True
 
 
 def test_only_who_has_the_right_takes_over(broker, robot, tmp_path):

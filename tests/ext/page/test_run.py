@@ -36,21 +36,6 @@ def test_a_page_that_cannot_start_ends_with_one_line(tmp_path: Path, caplog: pyt
     assert [record.message.partition(":")[0] for record in caplog.records] == ["web_interface.mqtt.host"]
 
 
-def test_a_login_needs_a_user(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    config = written(tmp_path, {"host": "0.0.0.0", "plain_http": True, "mqtt": {"host": "127.0.0.1"}})
-    assert run.main([str(config)]) == 1
-    (line,) = [record.message for record in caplog.records]
-    assert line.startswith(
-        f"web_interface.people: {tmp_path}/state/people.sqlite has no user: run `pebble web user add"
-    )
-
-
-def test_everything_that_is_missing_is_named_at_once(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    assert run.main([str(written(tmp_path, {"host": "0.0.0.0", "mqtt": {"host": "127.0.0.1"}}))]) == 1
-    keys = [record.message.partition(":")[0] for record in caplog.records]
-    assert keys == ["web_interface.host", "web_interface.people"]
-
-
 def test_missing_packages_are_named_with_the_command_that_installs_them(
     tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:

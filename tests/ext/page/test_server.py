@@ -36,16 +36,6 @@ def server() -> Iterator[Server]:
     audit.close()
 
 
-def test_what_is_drawn_over_a_picture_of_another_component_follows_its_capabilities(
-    server: Server, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    updated: list[str] = []
-    monkeypatch.setattr(server.open_components, "update", updated.append)
-    server.robots.sources[GOOB] = TOWER
-    server.receive(published(TOWER, "capabilities", {"schema": "pebble-capabilities/v1", "t": 1, "value": {}}), 1.0)
-    assert updated == [TOWER, GOOB]
-
-
 @pytest.mark.parametrize("topic", ["pebble/robots/goob/incoming/\x01", "x" * 1100, "a" + "/b" * 250, "#", ""])
 def test_what_no_topic_may_be_called_is_refused_and_nothing_else(server: Server, topic: str) -> None:
     assert server.broker.publish(topic, b"{}") is False

@@ -12,11 +12,13 @@ from pebble.extensions.fleet.audit import Audit
 from pebble.extensions.fleet.people import People
 from pebble.extensions.operator.client.estop import GIVE_UP_S, StopSender, new_name
 from pebble.extensions.operator.client.robot_estop import RobotEstop
+from pebble.extensions.operator.client.robot_view import RobotView
 from pebble.extensions.page import stops as stops_module
 from pebble.extensions.page.server import Server
 from pebble.extensions.page.setting import WebSettings
 from pebble.extensions.page.stops import Stops
 from pebble.transports import Message, MqttSettings
+from tests.ext.operator.client.estop_robot import Robot
 from tests.support import cases
 
 A, B = "pebble/robots/a", "pebble/robots/b"
@@ -98,6 +100,25 @@ def test_a_newer_stop_of_the_same_takes_the_place_of_the_older(ref: str, users: 
     assert [stops.user(name) for name in names] == [None] * (len(users) - 1) + [may_end]
     assert stops.view(RobotEstop(A)).stop == names[-1]
     assert [one.topic for one in stops.tick(1.6)].count(ESTOP.topic(A)) == 1
+
+
+def test_pages_are_told_of_each_step_of_a_stop_and_of_its_motor_owners() -> None:
+    stops, robot, shown = Stops(), Robot(A, "left", "right"), RobotEstop(A)
+    sent = stops.press(A, FIRST, by="ann", why="", now=1.0, known=[RobotView(B)], user="ann")
+    assert (stops.sends_to(A), stops.sends_to(B), stops.collecting) == (True, False, False)
+    left, right = robot.take(sent)
+    steps = []
+    for message in (robot.capabilities(), left, left, right):
+        stops.view(shown)
+        stops.changed.clear()
+        shown.receive(message)
+        stops.receive(message, 1.1)
+        steps.append((stops.view(shown).sending, set(stops.changed)))
+    assert steps == [("sent", {A}), ("sent", {A}), ("sent", set()), ("confirmed", {A})]
+    assert [(owner.owner, owner.latched) for owner in stops.view(shown).owners] == [("left", True), ("right", True)]
+    assert stops.robots_of(FIRST) == ([A], [])
+    press(stops, "")
+    assert stops.collecting
 
 
 def test_a_stop_that_is_no_longer_confirmed_for_lack_of_room_is_said(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -13,19 +13,6 @@ def online(now: int = 0) -> Connection:
     return connection
 
 
-def test_the_way_there() -> None:
-    connection = Connection()
-    assert connection.step(0, False) == ""
-    assert connection.state == "offline"
-    assert connection.step(10, True) == "resolve"
-    assert connection.state == "resolving"
-    assert connection.step(20, True) == ""
-    connection.move("connecting", 30)
-    assert connection.step(40, True) == ""
-    connection.move("online", 50)
-    assert connection.state == "online"
-
-
 def test_each_step_of_the_way_may_take_so_long_and_no_longer() -> None:
     connection = Connection()
     connection.step(0, True)
@@ -39,13 +26,6 @@ def test_each_step_of_the_way_may_take_so_long_and_no_longer() -> None:
     connection.move("subscribing", 0)
     assert connection.step(1999, True) == ""
     assert connection.step(2000, True) == "drop"  # the first command may be as old as this
-
-
-def test_silence_ends_a_connection() -> None:
-    connection = online()
-    assert connection.step(1999, True) == ""
-    assert connection.step(2000, True) == "drop"
-    assert connection.reason == "silence"
 
 
 def test_answers_hold_the_connection() -> None:
@@ -104,15 +84,6 @@ def test_waiting_doubles_up_to_eight_seconds() -> None:
     assert connection.losses == 6
 
 
-def test_attempts_of_many_robots_are_spread() -> None:
-    def first(noise: int) -> int:
-        connection = Connection()
-        connection.step(0, True)
-        return waits(connection, 0, noise)
-
-    assert (first(0), first(128), first(255)) == (375, 500, 624)
-
-
 def test_a_connection_that_held_makes_the_next_wait_short() -> None:
     connection = Connection()
     connection.step(0, True)
@@ -124,16 +95,3 @@ def test_a_connection_that_held_makes_the_next_wait_short() -> None:
     connection.received(5000)
     connection.step(5000, True)
     assert waits(connection, 5000, 128) == 500
-
-
-def test_that_it_held_is_known_however_long_it_did() -> None:
-    """Ticks a week apart look as if the later ones were the earlier."""
-    connection = online()
-    connection.lost(0, 128)
-    connection.move("online", 0)
-    now = 0
-    while now < 7 * 86_400_000:
-        now += 1_000_000
-        connection.received(now & MASK)
-        assert connection.step(now & MASK, True) == ""
-    assert waits(connection, now, 128) == 500

@@ -136,29 +136,6 @@ def test_attitude_at_once_after_the_start():
         assert near(bench.imu.values[8], degrees * 100, 5)
 
 
-def test_turning_is_followed_at_once_and_gravity_in_the_long_run():
-    bench = Bench()
-    bench.sample(212)
-    bench.device.raw[4] = int(90 * DPS)
-    bench.sample(10)  # a tenth of a second at 90 degrees/s, though gravity is that of lying flat
-    assert 780 < bench.imu.values[7] < 900
-    bench.device.raw[4] = 0
-    bench.sample(50)
-    assert 250 < bench.imu.values[7] < 350
-    bench.sample(400)
-    assert near(bench.imu.values[7], 0, 2)
-
-
-def test_upside_down_does_not_tumble():
-    bench = Bench()
-    bench.device.raw[2] = -G
-    bench.sample(10)
-    for step in range(200):
-        bench.device.raw[1] = 20 if step % 2 else -20
-        bench.sample()
-        assert abs(bench.imu.values[7]) > 17_900
-
-
 def test_free_fall_keeps_the_attitude():
     bench = Bench()
     bench.device.raw = [0, 1000, 1000, 0, 0, 0, 0]
@@ -177,18 +154,6 @@ def test_one_failure_is_logged_and_ignored():
     assert (bench.imu.failed, bench.device.starts) == (1, 1)
 
 
-def test_after_five_failures_it_is_set_up_anew_a_second_later():
-    bench = Bench()
-    bench.sample(10)
-    bench.device.failures = 5
-    assert bench.sample(5 + 99) == 0
-    assert bench.device.starts == 1
-    bench.sample(1)
-    assert bench.device.starts == 2
-    assert bench.sample(10) == 10
-    assert bench.messages == [b"imu_ready", b"imu_read_failed", b"imu_reinit"]
-
-
 def test_a_device_that_fell_asleep_is_set_up_anew():
     bench = Bench()
     bench.sample(10)
@@ -197,14 +162,6 @@ def test_a_device_that_fell_asleep_is_set_up_anew():
     bench.device.raw = [0, 0, G, 0, 0, 0, 0]
     assert bench.sample(11) == 10
     assert bench.messages == [b"imu_ready", b"imu_read_failed", b"imu_reinit"]
-
-
-def test_a_device_that_is_not_there_is_looked_for_every_second():
-    bench = Bench()
-    bench.device.failures = 3
-    assert bench.sample(301) == 0
-    assert bench.messages == [b"imu_init_failed"] * 3 + [b"imu_ready"]
-    assert bench.device.starts == 4
 
 
 def test_another_device_at_its_address_is_refused():

@@ -2,7 +2,7 @@
 
 from common.arbiter import PERSON, REFUSED, Arbiter
 from common.latch import Latch
-from common.lease import Lease, request_of, shown
+from common.lease import Lease, request_of
 from common.ticks import add, diff
 
 NAME = "00000000000000aa"
@@ -117,18 +117,6 @@ def test_a_state_changes_and_the_motors_are_halted_only_where_something_changes(
         assert (own.changed, own.halts) == (changed, halts), events
 
 
-def test_clocks_that_wrap_make_no_client_busy_or_idle() -> None:
-    half = 1 << 29  # a board's clock measures no longer times
-    own = lease()
-    perform(own, (0, "hold", ANN, 9999))
-    for turn in range(1, 400):
-        perform(own, (turn * half // 100, "tick", ANN))
-    assert own.key == ""
-    perform(own, (4 * half, "hold", OTTO))
-    perform(own, (4 * half + 10, "hold", MIA))
-    assert own.holder == OTTO
-
-
 def test_only_the_key_of_now_moves_and_a_zero_needs_none() -> None:
     for strangers, free, held in ((DRIVE, True, True), (FREE, True, False), (REFUSE, False, False)):
         own = lease(strangers)
@@ -142,26 +130,6 @@ def test_only_the_key_of_now_moves_and_a_zero_needs_none() -> None:
             assert not own.refuses(False, False, key, "", WRAPS)
             assert own.refuses(True, False, key, "", WRAPS) is (key != "" or not held)
         assert not own.refuses(True, False, own.key, "", WRAPS)
-
-
-def test_a_command_for_several_owners_has_the_key_of_each() -> None:
-    own = lease()
-    own.hold(ANN, 3000, False, WRAPS)
-    for keys, right in ((f"ffffffff {own.key}", True), (f"{own.key} ffffffff", True), (f"{own.key},", False),
-                        (own.key[1:], False), (own.key + "0", False), (" ".join([own.key] * 10), False)):  # fmt: skip
-        assert own.holds(keys, "") is right, keys
-    own.release(ANN, WRAPS)
-    assert not own.holds("", "")
-    assert not own.holds(" ", "")
-
-
-def test_scripts_need_no_key_but_no_wrong_one_either() -> None:
-    own = lease(REFUSE)
-    assert not own.refuses(True, True, "", "", WRAPS)
-    assert own.refuses(True, True, "00000001", "", WRAPS)
-    own.hold(ANN, 3000, False, WRAPS)
-    assert not own.refuses(True, True, "", "", WRAPS)
-    assert not own.refuses(True, True, own.key, "", WRAPS)
 
 
 def test_with_names_the_account_counts_and_programs_of_the_robot_need_no_key() -> None:
@@ -229,30 +197,6 @@ def test_a_strangers_zero_ends_the_script_and_does_not_let_it_resume() -> None:
     assert judge.judge(True, PERSON, -1, after(4300), own.key) == 900
     assert judge.judge(False, PERSON, -1, after(4400), own.key) == 0
     assert judge.judge(True, 8, -1, after(6400)) == 900  # the holder has let go
-
-
-def test_what_is_refused_neither_holds_nor_bars() -> None:
-    own = lease(REFUSE)
-    judge = arbiter(own)
-    judge.tick(after(2000))
-    own.hold(ANN, 9999, False, after(2000))
-    assert judge.judge(True, 7, -1, after(2000)) == 900
-    assert judge.judge(True, PERSON, -1, after(2010)) == REFUSED
-    assert judge.judge(True, PERSON, -1, after(2020), "ffffffff") == REFUSED
-    assert judge.judge(True, 9, -1, after(2030), "ffffffff") == REFUSED
-    assert judge.judge(True, 7, -1, after(2040)) == 900
-    assert not own.others
-
-
-def test_names_are_shown_in_their_letters_only() -> None:
-    for text, short in (
-        ("page-1/ann", "page-1/ann"),
-        ("Ann B.", "ann_b_"),
-        ('"\\\x00\x7f', "____"),
-        ("\u00e9\u20ac", "__"),
-        ("a" * 50, "a" * 40),
-    ):
-        assert shown(text, 40) == short
 
 
 def test_what_a_request_is() -> None:

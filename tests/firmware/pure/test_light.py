@@ -19,12 +19,6 @@ def test_a_glow_is_steady():
     assert light.level(0) == light.level(777) == 512
 
 
-def test_a_flash_begins_dark():
-    light = Light(0)
-    light.flash(0.0, 1.0, 0.0, 1.0, 700)
-    assert [light.level(700 + into) for into in (0, 250, 500, 750, 1000, 1250)] == [0, 256, 512, 256, 0, 256]
-
-
 def test_periods_have_limits():
     light = Light(0)
     for period_s, period_ms in ((0.0, 50), (0.05, 50), (-3.0, 50), (0.1, 100), (1.2345, 1235), (1e9, 3_600_000)):
@@ -37,12 +31,3 @@ def test_it_goes_on_beyond_the_wrap_of_the_ticks():
     for step in range(100):
         now = (WRAP - 1250 + step * 250) % WRAP
         assert light.level(now) == (0, 128, 256, 384, 512, 384, 256, 128)[step % 8]
-
-
-def test_the_level_is_never_outside():
-    light = Light(0)
-    light.flash(1.0, 1.0, 1.0, 0.333, 0)
-    now = 0
-    for step in range(5000):
-        now += 7 + step % 13
-        assert 0 <= light.level(now) <= 512

@@ -112,11 +112,6 @@ def test_publish_short_and_long() -> None:
     assert sent(client) == b"\x30\xaf\x02\0\1a" + b"x" * 300
 
 
-def test_what_the_broker_answers() -> None:
-    assert receive(subscribed(), b"\x20\2\0\0\x90\4\0\1\1\1\xd0\0") == ["welcome", "subscribed", "pong"]
-    assert receive(client_of(100, 50), b"\x20\2\1\0") == ["welcome"]  # it need not say that there is no session
-
-
 def test_refusals() -> None:
     for code in (1, 2, 3, 4, 5, 99):
         assert error(bytes((0x20, 2, 0, code))) == "refused by the broker: " + str(code)
@@ -127,17 +122,6 @@ def test_each_topic_is_granted_or_refused_by_itself() -> None:
     client = subscribed()
     assert receive(client, b"\x90\4\0\1\x80\1") == ["subscribed"]
     assert bytes(client.data[client.first : client.last]) == b"\x80\1"
-
-
-def test_the_topic_of_a_publication_is_known() -> None:
-    for topic, place in ((STOP, 0), (TOPIC, 1), (TOPIC + b"s", -1), (TOPIC[:-1], -1), (b"", -1)):
-        client = client_of(200, 50)
-        assert receive(client, publication(b"x", topic)) == [(b"x", 0)]
-        assert client.topic == place
-        for step in (1, 7, 200):
-            client = client_of(200, 50)
-            assert receive(client, publication(b"x" * 1000, topic, 0x33), step) == ["too long"]
-            assert (client.topic, client.retained) == (place, 1)
 
 
 def test_the_account_in_a_topic_is_known() -> None:
@@ -203,14 +187,6 @@ def test_the_longest_that_fits_and_one_more() -> None:
     assert sent(client) == b"\x40\2\x12\x34" * 3
 
 
-def test_long_ones_are_skipped_in_pieces_of_any_size() -> None:
-    data = publication(b"y" * 5000) + publication(b"next")
-    for step in (1, 2, 3, 7, 64, 199, 200):
-        client = client_of(200, 50)
-        assert receive(client, data, step) == ["too long", (b"next", 0)], step
-        assert sent(client) == b"\x40\2\x12\x34" * 2
-
-
 def test_a_length_of_256_mb_needs_no_memory() -> None:
     client = client_of(200, 50)
     head = b"\x30\xff\xff\xff\x7f\0\x25" + TOPIC
@@ -232,10 +208,6 @@ def test_what_no_broker_sends() -> None:
         assert error(bytes((first, 2, 0, 0))).startswith("packet"), first
     assert error(b"\xd0\1\0").startswith("packet")
     assert error(b"\x20\xff\x7f" + bytes(300)).startswith("packet")
-
-
-def test_topics_may_hold_any_bytes() -> None:
-    assert receive(client_of(200, 50), publication(b"x", b"\xff\xfe\0")) == [(b"x", 0)]
 
 
 def test_noise_ends_in_an_error_or_in_nothing() -> None:
@@ -276,17 +248,6 @@ def test_a_long_packet_leaves_in_pieces() -> None:
     data = bytes(client.out[:30])
     assert sent(client) == b"x" * (100 - 2)
     assert data[-1:] == b"x"
-
-
-def test_partial_writes_keep_the_order() -> None:
-    client = client_of(200, 30)
-    client.publish(0, b"a", b"0123456789")
-    whole = bytes(client.out[: client.waiting])
-    gone = b""
-    while client.waiting:
-        gone += bytes(client.out[:1])
-        client.sent(1)
-    assert gone == whole
 
 
 def test_commands_wait_while_there_is_no_room_to_acknowledge_them() -> None:

@@ -49,12 +49,6 @@ def test_before_any_answer_it_counts_from_the_start() -> None:
     assert wall.read(750) == 250
 
 
-def test_after_an_answer_it_goes_on_from_there() -> None:
-    wall = WallClock(0)
-    wall.set(1700000000123, 1000)
-    assert wall.read(1250) == 1700000000373
-
-
 def test_ticks_may_wrap_as_often_as_they_like() -> None:
     wall = WallClock(LAST - 1000)
     wall.set(1700000000000, LAST - 1000)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from dataclasses import replace
 from itertools import count
 from pathlib import Path
@@ -25,47 +24,20 @@ LOCAL, REMOTE = Side.LOCAL, Side.REMOTE
 _numbers = count(1)
 
 
-class End(ABC):
-    """One side: a broker or a hub. The service can lose it, and it can lose what it retains, or get an older save back.
+class MqttEnd:
+    """A mosquitto, or another broker of a test's own, and a way to it for the service.
 
-    One that ``survives`` is no way between programs: these and the service reach one another while it is away.
+    The service can lose an end, and that can lose what it retains, or get an older save back.
     """
 
     survives = False
-    section: dict[str, Any]  # of a config
-
-    @abstractmethod
-    def transport(self, name: str) -> Transport: ...
-
-    @abstractmethod
-    def leave(self) -> None: ...
-
-    @abstractmethod
-    def come_back(self) -> None: ...
-
-    @abstractmethod
-    def stop(self) -> None: ...
-
-    @abstractmethod
-    def restore(self) -> None:
-        """Start again, with what was there at the last :meth:`save`; without one with nothing."""
-
-    @abstractmethod
-    def save(self) -> None: ...
-
-    @abstractmethod
-    def close(self) -> None: ...
-
-
-class MqttEnd(End):
-    """A mosquitto, or another broker of a test's own, and a way to it for the service."""
 
     def __init__(
         self, folder: Path, protocol: str = "3.1.1", *, keeps: bool = False, broker: Broker | AmqttBroker | None = None
     ) -> None:
         self.broker = broker or Broker(folder, persistence=keeps)
         self.link = TcpProxy(self.broker.port)
-        self.section = {"host": "127.0.0.1", "port": self.link.port, "protocol": protocol}
+        self.section: dict[str, Any] = {"host": "127.0.0.1", "port": self.link.port, "protocol": protocol}
         self._saved: dict[Path, bytes] = {}
 
     def transport(self, name: str) -> Transport:
@@ -87,6 +59,7 @@ class MqttEnd(End):
         self._saved = {file: file.read_bytes() for file in self.broker.store.glob("*.db")}  # not a half-written .new
 
     def restore(self) -> None:
+        """Start again, with what was there at the last :meth:`save`; without one with nothing."""
         for file, data in self._saved.items():
             file.write_bytes(data)
         self.broker.start()
@@ -96,8 +69,13 @@ class MqttEnd(End):
         self.broker.stop()
 
 
-class ZenohEnd(End):
-    """A hub; ``uplink``: which operators reach over the network."""
+class ZenohEnd:
+    """A hub; ``uplink``: which operators reach over the network.
+
+    One that ``survives`` is no way between programs: these and the service reach one another while it is away.
+    """
+
+    section: dict[str, Any]  # of a config
 
     def __init__(self, folder: Path, *, keeps: bool = False, uplink: bool = False) -> None:
         self.survives = not uplink
@@ -144,6 +122,9 @@ class ZenohEnd(End):
             self._link.stop()
         if self._hub.running:
             self._hub.end()
+
+
+End = MqttEnd | ZenohEnd
 
 
 class Rig:

@@ -12,7 +12,6 @@ from typing import Any
 import pytest
 
 from pebble.forwarding import cycles
-from pebble.forwarding import service as service_module
 from pebble.forwarding.routing import Drop
 from pebble.forwarding.side import Gate
 from tests.forwarding.links.rig import LOCAL, REMOTE, End, MqttEnd, Rig, ZenohEnd
@@ -28,8 +27,8 @@ from tests.forwarding.links.test_table import (
     storm,
 )
 from tests.services.mqtt_bridge.bridge_rig import Client, Quiet
-from tests.support import AmqttBroker, Broker, cases, free_port, until
-from tests.tcp_proxy import BridgelessProxy, TcpProxy
+from tests.support import AmqttBroker, Broker, cases, until
+from tests.tcp_proxy import TcpProxy
 
 LIGHTS, STATUS = "incoming/lights-solid", "outgoing/status"
 MOVE = b'{"z": 0.5}'
@@ -148,30 +147,6 @@ class TestWithoutBridgeMode:
         make("mirror", ZenohEnd(tmp_path), Shared(tmp_path, broker=amqtt)).start(ready=False)
         assert until(lambda: any("bridge mode" in one for one in errors(caplog)))
 
-    def test_it_is_refused_for_one_connection_only_and_not_while_it_is_away_behind_a_proxy(
-        self, make: Make, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-    ) -> None:
-        monkeypatch.setattr(service_module, "CHECK_AGAIN_S", 60.0)
-        end = MqttEnd(tmp_path)
-        with BridgelessProxy(end.broker.port) as way:
-            end.link.lead_to(way.port)
-            rig = make("mirror", ZenohEnd(tmp_path), end)
-            rig.start(ready=False)
-            assert until(lambda: rig.gate is Gate.SHUT)
-            way.bridgeless = False
-            way.drop()
-            assert until(lambda: rig.gate is Gate.OPEN)
-            for more in range(3):
-                way.lead_to(free_port())
-                attempts, before = way.connections + 2 + more, rig.transport(REMOTE).counters["connected"]
-                assert until(lambda: way.connections > attempts)  # noqa: B023
-                way.lead_to(end.broker.port)
-                assert until(lambda: rig.connections(REMOTE) > before and rig.synchronized)  # noqa: B023
-            assert until(lambda: rig.gate is Gate.OPEN)
-            rig.remote.publish(STOP, PRESS)  # which is never late
-            assert until(lambda: rig.local.payloads(STOP) == [PRESS])
-        assert len(errors(caplog)) == 1
-
 
 class Shared(MqttEnd):
     """An end whose broker others go on using."""
@@ -239,18 +214,3 @@ class TestCycles:
             before = self.moves(rig.local)
             rig.remote.publish(DRIVE, MOVE)
             assert until(lambda: self.moves(rig.local) == before + 1)
-
-    def test_two_robots_of_one_id_with_crossed_brokers(
-        self, make: Make, tmp_path: Path, caplog: pytest.LogCaptureFixture
-    ) -> None:
-        here, there = MqttEnd(tmp_path), MqttEnd(tmp_path)
-        one = make("bridge", here, there, robot="twin")
-        for rig in (one, make("bridge", there, here, robot="twin")):
-            rig.start()
-        for _ in range(5):
-            one.remote.publish(DRIVE, MOVE)
-            one.local.publish(STATUS, b"{}", retain=True)
-        assert until(lambda: errors(caplog))
-        Quiet(one.local, one.remote).wait(0.2)
-        assert self.moves(one.local) < 50
-        assert len(errors(caplog)) <= 2  # one of each robot

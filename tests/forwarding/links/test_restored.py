@@ -129,19 +129,6 @@ class TestOperatorsBroker:
         live, removal = rig.local.payloads(STOP)
         assert (b'"stop":' in live, removal) == (True, b"")
 
-    def test_a_value_that_an_operator_chose_again_during_an_outage_is_no_older_one(self, rig: Rig) -> None:
-        rig.start()
-        rig.local.publish(STATUS, b"status", retain=True)
-        self.set_flag(rig, FALSE)
-        self.set_flag(rig, TRUE)
-        before = rig.connections(REMOTE)
-        rig.ends[REMOTE].leave()
-        assert until(lambda: not rig.connections(REMOTE))
-        self.set_flag(rig, FALSE, here=False)
-        rig.ends[REMOTE].come_back()
-        assert until(lambda: rig.connections(REMOTE) > before)
-        assert until(lambda: rig.local.payloads(FLAG) == [FALSE, TRUE, FALSE])
-
     @pytest.mark.parametrize(
         ("late_s", "by_name"), some([(0.0, False), (0.0, True), (0.7, False), (1.5, False), (1.5, True)], 2)
     )

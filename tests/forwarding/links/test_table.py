@@ -20,15 +20,13 @@ from zlib import crc32
 import pytest
 
 from pebble.contract import Kind
-from pebble.forwarding.admission import MAX_UNKNOWN_FLAGS
 from pebble.forwarding.forwarder import barrier
 from pebble.forwarding.side import Gate
-from pebble.services.mqtt_bridge import service as bridge_module
 from pebble.transports import Message, State
 from tests.forwarding.links.rig import LOCAL, REMOTE, End, MqttEnd, Rig, Side, ZenohEnd
 from tests.services.mqtt_bridge.bridge_rig import Client, Quiet
 from tests.support import Broker, until
-from tests.tcp_proxy import BridgelessProxy, TcpProxy
+from tests.tcp_proxy import TcpProxy
 
 STOP, RESET, DRIVE = "incoming/estop", "incoming/estop-reset", "incoming/drive-values"
 VIDEO_FLAG, AUDIO_FLAG = "incoming/flags/mqtt-video", "incoming/flags/mqtt-audio"
@@ -251,7 +249,7 @@ def over(*names: Any) -> pytest.MarkDecorator:
     return pytest.mark.parametrize("ends", names, indirect=True)
 
 
-FIRST, SECOND, THIRD, *FURTHER = LINKS
+FIRST, SECOND, _, *FURTHER = LINKS
 MARKS = {name: [pytest.mark.thorough] for name in FURTHER}
 each_link = over(*(pytest.param(name, marks=MARKS.get(name, ())) for name in LINKS))
 AWAY = [
@@ -366,13 +364,12 @@ def test_a_storm_from_both_sides_comes_through_once_each_in_order_and_nothing_ci
 
 
 @contextmanager
-def slow(rig: Rig, delay_s: float, piece: int = 65536) -> Iterator[None]:
+def slow(rig: Rig, delay_s: float) -> Iterator[None]:
     """The way to the operators' broker is so meanwhile."""
     link = link_of(rig)
-    as_usual = link.delay_s, link.piece
-    link.delay_s, link.piece = delay_s, piece
+    as_usual, link.delay_s = link.delay_s, delay_s
     yield
-    link.delay_s, link.piece = as_usual
+    link.delay_s = as_usual
 
 
 def link_of(rig: Rig) -> TcpProxy:
@@ -390,59 +387,6 @@ def broker_of(rig: Rig) -> Broker:
 
 @over(FIRST)
 class TestBridge:
-    @pytest.fixture
-    def way(self, rig: TableRig) -> Iterator[BridgelessProxy]:
-        """A proxy on the way to the operators' broker."""
-        with BridgelessProxy(broker_of(rig).port) as way:
-            link_of(rig).lead_to(way.port)
-            yield way
-            link_of(rig).lead_to(broker_of(rig).port)
-
-    @pytest.mark.parametrize("bridgeless", [False, True], ids=["bridge mode", "without"])
-    def test_what_the_robot_took_back_while_no_bridge_ran_is_removed_and_what_it_still_has_stays(
-        self, rig: TableRig, monkeypatch: pytest.MonkeyPatch, way: BridgelessProxy, bridgeless: bool
-    ) -> None:
-        """Without bridge mode a broker sends back what the new bridge has just published, too."""
-        monkeypatch.setattr(bridge_module, "LEFTOVERS_AFTER_S", 0.5)
-        gone, stays = ("mcu/m1/describe", "outlets/1/status"), ("mcu/m2/describe", "autonomy-status")
-        way.bridgeless = bridgeless
-        rig.start()
-        assert rig.service.remote.as_published is not bridgeless
-        for name in (*gone, *stays):
-            rig.local.publish(f"outgoing/{name}", b'{"interfaces": []}', retain=True)
-        assert until(lambda: all(rig.remote.on(f"outgoing/{name}") for name in (*gone, *stays)))
-        rig.stop()
-        for name in gone:
-            rig.local.publish(f"outgoing/{name}", b"", retain=True)
-        rig.start()
-        assert until(lambda: {*rig.retained(REMOTE)} == {f"outgoing/{name}" for name in stays}), rig.retained(REMOTE)
-        Quiet(rig.remote).wait(0.5)
-        assert {*rig.retained(REMOTE)} == {f"outgoing/{name}" for name in stays}
-
-    def test_retained_flags_of_strangers_cost_the_robot_neither_memory_nor_its_commands(self, rig: TableRig) -> None:
-        for number in range(3000):
-            rig.remote.publish(f"incoming/flags/f{number}", b"x" * 100, qos=0, retain=True)
-        rig.remote.publish(VIDEO_FLAG, TRUE, retain=True)
-        rig.start()
-        assert until(lambda: rig.local.payloads(VIDEO_FLAG) == [TRUE])
-        rig.remote.publish(DRIVE, b'{"x": 0, "z": 0.5}')
-        assert until(lambda: rig.local.on(DRIVE))
-        assert len({one.topic for one in rig.local.seen if "/flags/f" in one.topic}) == MAX_UNKNOWN_FLAGS
-        assert rig.service.dropped()["too_many"] == 3000 - MAX_UNKNOWN_FLAGS
-
-    @pytest.mark.parametrize(("delay_s", "piece"), [(0.15, 65536), (0.02, 8)])
-    def test_flags_that_differ_at_the_start_of_a_slow_link(self, rig: TableRig, delay_s: float, piece: int) -> None:
-        with slow(rig, delay_s, piece):
-            rig.local.publish(VIDEO_FLAG, TRUE, retain=True)
-            rig.remote.publish(VIDEO_FLAG, FALSE, retain=True)
-            rig.local.publish(AUDIO_FLAG, TRUE, retain=True)
-            rig.start()
-            assert until(lambda: rig.local.payloads(VIDEO_FLAG) == [FALSE])
-            assert until(lambda: rig.remote.payloads(AUDIO_FLAG) == [TRUE])
-            rig.after_all(REMOTE)
-            assert rig.retained(LOCAL) == rig.retained(REMOTE) == {VIDEO_FLAG: FALSE, AUDIO_FLAG: TRUE}
-            assert (rig.local.payloads(VIDEO_FLAG), rig.remote.on(VIDEO_FLAG)) == ([FALSE], [])
-
     def test_a_retained_stop_passes_on_no_slow_link(self, rig: TableRig) -> None:
         """A broker sends few retained messages at a time: the last ones arrive many round trips after the first."""
         others = 300

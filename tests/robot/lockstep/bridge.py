@@ -10,8 +10,9 @@ from unittest.mock import patch
 import msgspec
 
 from pebble.config import Config
+from pebble.extensions.fleet import robot_audit
+from pebble.extensions.fleet.robot_audit import Audit
 from pebble.services.mqtt_bridge import service as bridge_module
-from pebble.services.mqtt_bridge.audit import Audit
 from pebble.services.mqtt_bridge.service import MqttBridge
 from pebble.transports import Answer, Message, clock
 from pebble.transports.mqtt.read_age import BrokerDelay
@@ -128,7 +129,7 @@ class Bridge(ServiceProcess):
             return self.remote
 
         self._local = Connection(self, inside)
-        with patch.object(bridge_module, "remote_transport", remote), patch.object(bridge_module, "Audit", Unwritten):
+        with patch.object(bridge_module, "remote_transport", remote), patch.object(robot_audit, "Audit", Unwritten):
             return MqttBridge(config, self._local, clock=self.scheduler.clock)
 
     def thaw(self) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import tempfile
-import threading
 import time
 from pathlib import Path
 from typing import Any
@@ -14,11 +13,11 @@ import pytest
 from pebble.config import Config, parse
 from pebble.forwarding.routing import Side
 from pebble.forwarding.side import Gate
-from pebble.service import Service
 from pebble.services.mqtt_bridge import service as bridge_module
 from pebble.services.mqtt_bridge.service import MqttBridge
 from pebble.transports import Message, QoS, State, Transport
 from pebble.transports.memory import MemoryHub, MemoryTransport
+from tests.kit.robot import Running as Running
 from tests.support import until
 
 BASE = "pebble/robots/rover"
@@ -89,27 +88,13 @@ def is_probe(payload: bytes) -> bool:
     return payload[-24:].isspace() and len(payload) >= 24
 
 
-class Running:
-    """A service on a thread of its own, as its process would run it."""
-
-    def __init__(self, service: Service) -> None:
-        self.service = service
-        self._thread = threading.Thread(target=service.run, daemon=True)
-        self._thread.start()
-
-    def stop(self) -> None:
-        self.service.quit()
-        self._thread.join(10)
-        assert not self._thread.is_alive(), "the service does not end"
-
-
 class MemoryRig:
     """Two hubs, a client on each, and a bridge, each with threads of its own as in a robot."""
 
-    def __init__(self, monkeypatch: pytest.MonkeyPatch, *, base: str = BASE) -> None:
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.local_hub, self.remote_hub = MemoryHub(), MemoryHub()
-        self.local = Client(MemoryTransport("someone-local", self.local_hub), base)
-        self.remote = Client(MemoryTransport("operator", self.remote_hub), base)
+        self.local = Client(MemoryTransport("someone-local", self.local_hub))
+        self.remote = Client(MemoryTransport("operator", self.remote_hub))
         self.robot_side: MemoryTransport
         self._running: list[Running] = []
         monkeypatch.setattr(bridge_module, "remote_transport", self._remote_transport)

@@ -551,7 +551,7 @@ class World:
                 late = self.bridge.alive and now - max(at, owner.reached_from) > ACCEPTED_MS
                 if late and owner.name not in excused:
                     raise ViolatedError(f"P1: {owner.name} is free {now - at} ms after press {press} was accepted")
-        if self.bridge.alive and len(self.bridge.passed) > passed_stops.NAMES:
+        if self.bridge.alive and len(self.bridge.passed._passed) > passed_stops.NAMES:
             raise ViolatedError("P6: more names are remembered than may be")
         self.time.after(250, self.check)
 

@@ -61,13 +61,6 @@ def test_a_cooldown_begins_with_the_first_run_and_not_with_the_machine(tmp_path:
     assert finished(action)
 
 
-def test_zero_is_a_cooldown(tmp_path: Path) -> None:
-    action = Action(row(REBOOT), control("pass"), folder=tmp_path, clock=Clock())
-    for _ in range(3):
-        assert action.request()
-        assert finished(action)
-
-
 def test_refused_while_it_runs(tmp_path: Path) -> None:
     gate = tmp_path / "gate"
     code = f"import os\nwhile not os.path.exists({str(gate)!r}): pass"

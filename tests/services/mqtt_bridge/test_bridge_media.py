@@ -2,16 +2,10 @@
 
 from __future__ import annotations
 
-import json
 import logging
 import os
-import signal
-import subprocess
-import sys
-import time
 from collections.abc import Iterator
 from contextlib import suppress
-from pathlib import Path
 from typing import Any, get_args, get_type_hints
 
 import pytest
@@ -19,15 +13,12 @@ import pytest
 from pebble.config.media import AudioPublisher, VideoPublisher
 from pebble.contract import AUDIO_CONTROL, MQTT_AUDIO, MQTT_VIDEO, VIDEO_CONTROL
 from pebble.contract.payloads import MediaRequest
-from pebble.extension import Stage
 from pebble.runtime import notes
 from pebble.runtime.notes import Held, Wanted
 from pebble.runtime.parent import NOTIFY_FD, WANTED, ProgramRequest
 from pebble.services.mqtt_bridge.media import MEDIA, Media
-from pebble.transports import Message, MqttSettings, create
 from tests.forwarding.virtual import World
-from tests.services.mqtt_bridge.bridge_rig import BASE, Client
-from tests.support import ROOT, Broker, process_name, until
+from tests.services.mqtt_bridge.bridge_rig import Client
 
 TRUE, FALSE = b'{"value": true}', b'{"value": false}'
 ON, OFF = b'{"enabled": true}', b'{"enabled": false}'
@@ -64,12 +55,6 @@ class TestDecision:
         media.request(VIDEO_CONTROL, MediaRequest(enabled=False, encoding="h264"))
         assert media.requests()[CAMERA] == NO
 
-    def test_sound_goes_both_ways(self) -> None:
-        media = Media(ALL)
-        media.allow(MQTT_AUDIO, True)
-        media.request(AUDIO_CONTROL, ASKED)
-        assert media.requests() == {CAMERA: NO, MICROPHONE: YES, SPEAKER: YES}
-
     @pytest.mark.parametrize(
         ("asked", "encoding"),
         [("h264", "h264"), ("json", "json"), (None, ""), ("opus", ""), ("", ""), ("h264\nWANT", ""), ("ü", "")],
@@ -98,9 +83,6 @@ class TestDecision:
         media = Media(ALL, running={CAMERA: YES})
         media.request(VIDEO_CONTROL, MediaRequest(enabled=False))
         assert media.requests()[CAMERA] == NO
-
-
-RENAMED = {"video_publisher": "outgoing/eye", "audio_publisher": "outgoing/ear", "audio_receiver": "incoming/mouth"}
 
 
 class AskingBridge(World):
@@ -196,22 +178,6 @@ class TestBridge:
         assert (either.wanted(SPEAKER), either.wanted(CAMERA)) == ("1", "0")
         assert either.service.counters["stale"]
 
-    @pytest.mark.parametrize(
-        ("asked", "wanted"),
-        [
-            (b"true", "1"),
-            (TRUE, "1"),
-            (b'{"enabled": true, "encoding": "h264", "keyframe": true}', "1 h264"),
-            (b'{"value": {"enabled": true, "encoding": "pbvd"}}', "1 pbvd"),
-        ],
-    )
-    def test_forms_of_a_request(self, bridge: AskingBridge, asked: bytes, wanted: str) -> None:
-        bridge.begin()
-        bridge.remote.publish(VIDEO_FLAG, TRUE, retain=True)
-        bridge.remote.publish(VIDEO, asked)
-        assert bridge.wanted(CAMERA) == wanted
-        assert bridge.local.payloads(VIDEO) == [asked], "the publisher reads it, too"
-
     @pytest.mark.parametrize("nonsense", [b"", b"1", b'"true"', b"{", b"\xff", b"[true]", b'{"enabled": NaN}'])
     def test_nonsense_starts_and_stops_nothing(self, bridge: AskingBridge, nonsense: bytes) -> None:
         bridge.begin()
@@ -220,15 +186,6 @@ class TestBridge:
             bridge.remote.publish(VIDEO, payload)
             assert bridge.wanted(CAMERA) == wanted
         assert bridge.service.counters["refused"] == 2
-
-    def test_a_robot_without_camera_and_microphone_asks_for_nothing(self, bridge: AskingBridge) -> None:
-        bridge.start()
-        bridge.run()
-        for flag, request in ((VIDEO_FLAG, VIDEO), (AUDIO_FLAG, AUDIO)):
-            bridge.remote.publish(flag, TRUE, retain=True)
-            bridge.remote.publish(request, ON)
-        assert [bridge.wanted(program) for program in ALL] == [""] * 3
-        assert bridge.local.on(AUDIO)
 
     def test_what_a_bridge_before_it_wanted_runs_on(
         self, either: AskingBridge, monkeypatch: pytest.MonkeyPatch
@@ -285,140 +242,3 @@ class TestBridge:
         bridge.remote.publish(VIDEO, ON)
         bridge.run()
         assert sum("there is no launcher" in message for message in caplog.messages) == 1
-
-    @pytest.mark.parametrize("names", [{}, RENAMED], ids=["as usual", "renamed"])
-    def test_pictures_and_sound_never_pass(self, bridge: AskingBridge, names: dict[str, str]) -> None:
-        bridge.begin(media={name: {"topic": f"{BASE}/{topic}"} for name, topic in names.items()})
-        bridge.remote.publish("incoming/flags/remote-mirror", TRUE, retain=True)
-        bridge.run()
-        media = tuple(names.values()) or ("outgoing/front-camera", "outgoing/audio", "incoming/audio-stream")
-        for client in (bridge.local, bridge.remote):
-            for suffix in media:
-                client.publish(suffix, b"\xff\xd8", qos=0)
-        bridge.run()
-        assert bridge.service.status.mirroring
-        seen = [one.topic for one in [*bridge.local.seen, *bridge.remote.seen] if one.topic.endswith(media)]
-        assert seen == [], "no client receives its own messages, and the other side must not"
-        assert not bridge.service.counters["refused"], "nor are they taken for requests, whose names are alike"
-
-
-SILENCE_S = 5.0  # a machine that does too much at once is not a broker that stopped answering
-
-
-class Robot:
-    """A real launcher with a real bridge between real brokers, and a camera publisher that misbehaves."""
-
-    def __init__(self, folder: Path, behaviour: str, *, one: bool) -> None:
-        self.journal, self.errors = folder / "journal", folder / "errors"
-        self._brokers = [Broker(folder)] if one else [Broker(folder), Broker(folder)]
-        self.local, self.remote = (self._client(name, broker) for name, broker in self._sides())
-        config = folder / "rover.json"
-        config.write_text(json.dumps(self._config(folder)))
-        rows = [
-            ("mqtt_bridge", "pebble.services.mqtt_bridge", [str(config)], Stage.CONNECTION, {"may_request": True}),
-            (
-                *(CAMERA, "fake_service", [CAMERA, behaviour, str(self.journal)], Stage.CONNECTION),
-                {"on_demand": True, "preloaded": False, "stop_timeout_s": 3.0},
-            ),
-        ]
-        self.launcher = subprocess.Popen(
-            [sys.executable, "tests/fakes/run_launcher.py", str(ROOT), str(config), json.dumps(rows), folder / "said"],
-            cwd=ROOT,
-            env={**os.environ, "PYTHONPATH": str(ROOT / "tests" / "fakes")},
-            stderr=self.errors.open("wb"),
-        )
-        resolution = "are one broker" if one else "forwarding between"
-        assert until(lambda: resolution in self.errors.read_text(), 20), self.errors.read_text()
-
-    def _sides(self) -> list[tuple[str, Broker]]:
-        return [("somebody", self._brokers[0]), ("operator", self._brokers[-1])]
-
-    def _client(self, name: str, broker: Broker) -> Client:
-        settings = MqttSettings(host="127.0.0.1", port=broker.port, as_published=True)
-        return Client(create("mqtt", name, settings))
-
-    def _config(self, folder: Path) -> dict[str, Any]:
-        return {
-            "robot": {"id": "rover"},
-            "transport": {"kind": "mqtt", "run_dir": str(folder / "run")},
-            "local_mqtt": {"host": "localhost", "port": self._brokers[0].port, "silence_seconds": SILENCE_S},
-            "services": {
-                "launcher": {"shutdown_timeout_seconds": 1.0},
-                "av_daemon": DEVICES,
-                "mqtt_bridge": {
-                    "enabled": True,
-                    "remote_mqtt": {"host": "127.0.0.1", "port": self._brokers[-1].port, "silence_seconds": SILENCE_S},
-                },
-            },
-        }
-
-    def pids(self, event: str) -> list[int]:
-        lines = self.journal.read_text().splitlines() if self.journal.exists() else []
-        return [int(line.split()[2]) for line in lines if line.split()[1] == event]
-
-    def bridge_pid(self) -> int:
-        children = Path(f"/proc/{self.launcher.pid}/task/{self.launcher.pid}/children").read_text().split()
-        return next(int(pid) for pid in children if process_name(int(pid)) == "mqtt_bridge")
-
-    def close(self) -> None:
-        self.launcher.terminate()
-        self.launcher.wait(10)
-        for client in (self.local, self.remote):
-            client.transport.close()
-        for broker in self._brokers:
-            broker.stop()
-
-
-@pytest.fixture(params=[False, pytest.param(True, marks=pytest.mark.thorough)], ids=["two brokers", "one broker"])
-def one(request: pytest.FixtureRequest) -> bool:
-    return bool(request.param)
-
-
-class TestWholeWay:
-    def test_a_media_program_that_does_not_stop_delays_no_drive_command(self, tmp_path: Path, one: bool) -> None:
-        robot = Robot(tmp_path, "stubborn", one=one)
-        try:
-            robot.remote.publish(VIDEO_FLAG, TRUE, retain=True)
-            robot.remote.publish(VIDEO, ON)
-            assert until(lambda: robot.pids("ready"), 20), robot.errors.read_text()
-            delays = drive(robot, seconds=4.0, rate_hz=50)
-            assert until(lambda: "camera_publisher did not stop within 3 s: killed" in robot.errors.read_text())
-            assert max(delays) < 0.5, "seconds; in fact some milliseconds"
-        finally:
-            robot.close()
-
-    def test_a_killed_bridge_does_not_end_what_was_asked_for(self, tmp_path: Path, one: bool) -> None:
-        robot = Robot(tmp_path, "good", one=one)
-        try:
-            robot.remote.publish(VIDEO_FLAG, TRUE, retain=True)
-            robot.remote.publish(VIDEO, ON)
-            assert until(lambda: robot.pids("ready"), 20), robot.errors.read_text()
-            os.kill(robot.bridge_pid(), signal.SIGKILL)
-            assert not until(lambda: robot.pids("stop"), 5.5, step=0.05), "asked for once is enough"
-            assert len(robot.pids("start")) == 1
-            robot.remote.publish(VIDEO, OFF)
-            assert until(lambda: robot.pids("stop"))
-        finally:
-            robot.close()
-
-
-def drive(robot: Robot, *, seconds: float, rate_hz: float) -> list[float]:
-    """Drive while video is switched off; how many seconds each command took from the operator to the robot's side."""
-    arrived: dict[bytes, float] = {}
-
-    def note(message: Message) -> None:
-        if not message.payload.isspace():  # else a probe of the bridge
-            arrived[message.payload] = time.monotonic()
-
-    listener = robot.local.transport.subscribe(f"{BASE}/{DRIVE}", note, echo=False, direct=True)
-    sent: dict[bytes, float] = {}
-    for number in range(int(seconds * rate_hz)):
-        payload = b'{"x": 0, "z": %.4f}' % (number / 10_000)
-        sent[payload] = time.monotonic()
-        robot.remote.publish(DRIVE, payload)
-        if number == int(rate_hz / 2):
-            robot.remote.publish(VIDEO, OFF)
-        time.sleep(1 / rate_hz)
-    assert until(lambda: len(arrived) == len(sent))
-    listener.close()
-    return [arrived[payload] - at for payload, at in sent.items()]

@@ -1,9 +1,9 @@
-"""The level of a link: tables of what is measured, and random walks that keep its rules. Nothing waits."""
+"""The level of a link: tables of what is measured. Nothing waits."""
 
 from __future__ import annotations
 
 import random
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from itertools import pairwise
 
 import pytest
@@ -13,9 +13,6 @@ from pebble.forwarding.sieve import Rank
 from pebble.services.mqtt_bridge.link import LinkMeter, Room
 
 PING_S = 0.5
-LEVELS: list[LinkLevel] = ["wide", "narrow", "thin"]
-WORSE_S = {"wide": 0.15, "narrow": 0.3, "thin": float("inf")}
-RISE_S = {"wide": float("inf"), "narrow": 20.0, "thin": 60.0}
 
 
 class Walk:
@@ -129,46 +126,6 @@ def test_losses_alone_lower_nothing() -> None:
     assert Walk().take((0.05 + chance.random() * 3 * one for one in late), tcp_queue_s=0.04).levels == "wide"
 
 
-def test_a_wide_link_stays_wide() -> None:
-    """Half a day with jitter below the limit, and single late answers."""
-    chance = random.Random(1)
-    trips = (0.01 + 0.14 * chance.random() + (2.0 if number % 7 == 0 else 0.0) for number in range(100_000))
-    assert Walk().take(trips).levels == "wide"
-
-
-def spells(chance: random.Random) -> Iterator[float]:
-    """Round trips of a link that is good and bad for random times."""
-    for _ in range(40):
-        yield 0.02
-        queue_s = chance.choice((0.0, 0.0, 0.03, 0.1, 0.2, 0.5, 2.0))
-        for _ in range(round(chance.choice((1, 3, 10, 25, 70, 200)) / PING_S)):
-            yield 0.02 + max(0.0, queue_s + chance.uniform(-0.02, 0.02))
-
-
-def check_rules(seed: int) -> int:
-    """How often the level has changed; each time as its rules have it."""
-    trips = [0.02, *spells(random.Random(seed))]
-    walk = Walk().take(trips)
-    queues = [trip - 0.02 for trip in trips]
-    waits, risen_at = dict(RISE_S), float("-inf")
-    for (since, level), (at, then) in pairwise(walk.changes):
-        first, last = (round((time - 1000.0) / PING_S) for time in (since, at))
-        assert abs(LEVELS.index(then) - LEVELS.index(level)) == 1
-        if LEVELS.index(then) > LEVELS.index(level):
-            assert sum(queue > WORSE_S[level] for queue in queues[first:last][-3:]) >= 2, seed
-            failed = at - risen_at < max(60.0, waits[then])
-            waits[then] = min(2 * waits[then], 600.0) if failed else RISE_S[then]
-        else:
-            assert at - since > waits[level], f"{seed}: never sooner than this level's time without a queue"
-            assert max(queues[last - round(waits[level] / PING_S) : last]) < 0.05, seed
-            risen_at = at
-    return len(walk.changes)
-
-
-def test_random_walks_keep_the_rules() -> None:
-    assert sum(map(check_rules, range(50))) > 250
-
-
 def test_a_link_that_fails_each_time_changes_ever_more_rarely() -> None:
     walk = Walk().read("20x5")
     while walk.now < 1000.0 + 4 * 3600:
@@ -186,13 +143,6 @@ class TestRoom:
         assert [room.takes(Rank.STREAM, 200, 0.0) for _ in range(4)] == [True, True, True, False]
         assert [room.takes(Rank.STATE, 200, 0.0) for _ in range(4)] == [True, True, True, False]
         assert room.takes(Rank.HEARTBEAT, 200, 0.0)
-
-    def test_has_some_for_a_large_message_as_soon_as_little_is_on_its_way(self) -> None:
-        room = Room(kbit=9.6)
-        assert room.takes(Rank.HEARTBEAT, 80, 0.0)
-        assert not room.takes(Rank.STREAM, 5000, 0.0)
-        assert room.takes(Rank.STATE, 5000, 0.0)
-        assert not room.takes(Rank.HEARTBEAT, 80, 0.0)
 
     def test_is_learned(self) -> None:
         """It grows while what is sent is confirmed without delay, and shrinks when it is not."""

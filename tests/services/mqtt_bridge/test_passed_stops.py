@@ -1,4 +1,4 @@
-"""A stop is passed on until every motor owner has confirmed it: members of that kind as rows, and random schedules.
+"""A stop is passed on until every motor owner has confirmed it: histories as rows.
 
 What becomes of it at whole robots, on both transports, is tried by tests/robot; what an owner obeys in
 tests/services/serial_mcu_bridge/test_control.py.
@@ -13,11 +13,9 @@ from msgspec import UNSET
 
 from pebble.contract import ESTOP, ESTOP_STATE, codec
 from pebble.contract.payloads import EstopCommand, EstopState
-from pebble.services.mqtt_bridge.audit import Audit
+from pebble.extensions.fleet.robot_audit import Audit
 from pebble.services.mqtt_bridge.passed_stops import NAMES, PassedStops, is_named, named
 from tests.forwarding.virtual import World
-from tests.services.mqtt_bridge.stop_schedules import ENGINE, FAULTS
-from tests.support import cases
 
 STOP = "incoming/estop"
 NAME = {letter: letter * 16 for letter in "abc"}
@@ -216,17 +214,3 @@ def test_the_mirror_keeps_a_repetition_for_one_owner_on_the_robots_own_transport
         world.local.publish(STOP, stop)
     world.run()
     assert world.remote.payloads(STOP) == [payload("b"), b"\xff"]
-
-
-# -- random schedules
-
-
-def test_no_schedule_loses_a_stop_or_undoes_a_reset() -> None:
-    broken = [result for result in ENGINE.run("", 1, range(cases(40, 400))) if result.problems]
-    assert not broken, "python -m tests.kit.schedules stops --seed 1"
-
-
-@pytest.mark.parametrize(("fault", "schedules"), [("one owner's confirmation ends it for all", range(10))])
-def test_a_planted_fault_is_found(fault: str, schedules: range) -> None:
-    assert fault in FAULTS
-    assert any(ENGINE.violation(fault, number) for number in schedules)

@@ -25,7 +25,7 @@ STOPPED = "M 0.000 0.000"
 class Bench:
     """The service in a thread of its own, an MCU, and an operator on the same network: in memory, or at a broker.
 
-    Several share a ``hub``: each is one motor owner of the robot, the ``instance``. ``peer`` is listed as another one.
+    It is the motor owner ``instance`` of the robot; ``peer`` is listed as another one.
     """
 
     service: MotorBridge
@@ -37,9 +37,7 @@ class Bench:
         kind: str,
         *,
         broker: Broker | None = None,
-        hub: MemoryHub | None = None,
         instance: str = "",
-        security: Any = None,
         peer: str = "",
         **section: Any,
     ) -> None:
@@ -53,13 +51,15 @@ class Bench:
             lines[peer] = {**serial, "serial": {"port": str(folder / peer)}}
         serial = {"instances": lines} if instance else serial
         transport = {"kind": "mqtt", "state_dir": str(folder / "state"), "run_dir": str(folder / "run")}
-        bridge = {"enabled": True, "remote_mqtt": {"host": "localhost", "port": 1}}  # needed where names are checked
+        bridge = {
+            "enabled": True,
+            "remote_mqtt": {"host": "localhost", "port": 1},
+        }  # beside one, silence alone ends no control
         services = {"serial_mcu_bridge": serial, "mqtt_bridge": bridge}
         raw = {"robot": {"id": ROBOT}, "transport": transport, "services": services}
-        raw |= {"security": security or {}}
         config = parse(raw, folder=folder, env={})
         config = view_of(config, instance) if instance else config
-        settings = hub or MemoryHub() if broker is None else MqttSettings(host="127.0.0.1", port=broker.port)
+        settings = MemoryHub() if broker is None else MqttSettings(host="127.0.0.1", port=broker.port)
         network = "memory" if broker is None else "mqtt"
         self.world = Listener(create(network, "operator", settings))
         self.operator = self.world.transport

@@ -15,7 +15,6 @@ import pytest
 
 from pebble.services.serial_mcu_bridge.text.hall_memory import HallMemory
 from tests.kit.hall_reader import HallReader
-from tests.kit.robot import BASE
 from tests.services.serial_mcu_bridge.motor_rig import Bench
 from tests.support import until
 
@@ -138,12 +137,6 @@ def test_what_is_not_its_own_stays_as_it_is(
     assert [record.message.partition(f"{path} ")[2][: len(text)] for record in caplog.records] == [text], "once"
 
 
-def test_a_ring_of_another_form_begins_anew(path: Path, memory: HallMemory) -> None:
-    path.write_bytes(b"X" * (24 + 32 * SLOTS))
-    fill(memory, 2)
-    assert HallReader(path.name).newest == 2
-
-
 def is_whole(path: Path) -> bool:
     """Programs of the original try again, too, while it is being made."""
     try:
@@ -178,15 +171,3 @@ def test_a_bridge_keeps_every_line_of_its_board(tmp_path: Path, path: Path, ring
             assert bench.payloads("touch-sensors") == []
     finally:
         bench.close()
-
-
-def test_its_usual_name_is_that_of_the_robot(tmp_path: Path) -> None:
-    usual = Path("/dev/shm") / f"{BASE.replace('/', '_')}_odometry_raw"
-    usual.unlink(missing_ok=True)
-    bench = Bench(tmp_path, "goob", odometry_shm={})
-    try:
-        assert until(usual.exists)
-        assert HallReader(usual.name).slots == 2048
-    finally:
-        bench.close()
-        usual.unlink()

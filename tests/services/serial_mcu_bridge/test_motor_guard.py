@@ -4,6 +4,7 @@ import json
 import os
 import shutil
 import threading
+import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing
 from pathlib import Path
@@ -11,10 +12,10 @@ from typing import Any
 
 import msgspec
 import pytest
-from msgspec import structs
+from msgspec import UNSET, structs
 
 from pebble.config import Security
-from pebble.contract.payloads import ControlTurn, Drive, EstopCommand, EstopReset, EstopState
+from pebble.contract.payloads import ControlRequest, ControlTurn, Drive, EstopCommand, EstopReset, EstopState
 from pebble.motors.control import Control
 from pebble.motors.motor_guard import MotorGuard
 from pebble.motors.state_file import StateFile
@@ -99,7 +100,9 @@ def rig(make: Make) -> Rig:
 def test_it_begins_free_and_publishes_that(rig: Rig) -> None:
     (first,) = rig.states
     assert (first.latched, first.count, first.recent, first.persisted) == (False, 0, [], True)
-    assert len(first.boot) == 8
+    assert (len(first.boot), first.barred) == (8, UNSET)
+    rig.guard.save_again()
+    assert (rig.file.busy, rig.barred_file.busy, rig.barred_file.path.exists()) == (False, False, False)
     assert rig.guard.judge(Drive(z=1), rig.now) == 0.75
 
 
@@ -113,12 +116,6 @@ def test_a_zero_of_a_script_that_starts_with_the_robot_bars_older_runs_silently(
     rig.advance(3)
     assert rig.guard.judge(SCRIPT, rig.now) is None
     assert "refused a drive command: run 7 has ended" in caplog.text
-
-
-def test_a_zero_of_a_manager_that_starts_again_stops_the_script_of_its_predecessor(rig: Rig) -> None:
-    assert rig.guard.judge(SCRIPT, rig.now) == 0.75
-    assert rig.guard.judge(Drive(source="autonomy", run=8), rig.now) == 0
-    assert rig.guard.judge(SCRIPT, rig.now) is None
 
 
 def test_what_follows_another_owner_moves_until_1_5_seconds_after_its_turn_and_bars_what_that_bars(
@@ -141,9 +138,12 @@ def test_what_follows_another_owner_moves_until_1_5_seconds_after_its_turn_and_b
         assert rig.guard.barred == 7
 
 
-def test_a_stop_is_published_at_once_and_again_when_it_is_saved(rig: Rig, path: Path) -> None:
+def test_a_stop_is_published_at_once_and_again_when_it_is_saved(
+    rig: Rig, path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     rig.stop(A, by="eve", why="a test")
     assert (rig.states[-1].latched, rig.states[-1].recent, rig.states[-1].persisted) == (True, [A], False)
+    assert rig.states[-1].since == pytest.approx(1000 * time.time(), abs=60_000)
     assert rig.written()
     assert (rig.states[-1].latched, rig.states[-1].persisted, rig.states[-1].by) == (True, True, "eve")
     assert json.loads(path.read_text())["latched"] is True
@@ -152,11 +152,26 @@ def test_a_stop_is_published_at_once_and_again_when_it_is_saved(rig: Rig, path: 
     rig.guard.stop(EstopCommand(), rig.now)
     rig.guard.stop(EstopCommand(), rig.now)
     assert len(set(rig.state.recent)) == rig.state.count == 3, "a stop without a name gets one"
+    assert {len(name) for name in rig.state.recent} == {16}
+    for sender in ("eve (a test)", "an unnamed sender"):
+        assert f"emergency stop by {sender}" in caplog.text
+
+
+def test_the_end_of_an_older_write_is_not_published(rig: Rig) -> None:
+    for name in (A, B):
+        rig.stop(name)
+    rig.advance(1)
+    before = len(rig.states)
+    rig.guard.on_saved(1, True, rig.now)
+    assert (rig.states[before:], rig.state.persisted) == ([], False)
+    rig.guard.on_saved(2, False, rig.now)
+    assert (rig.states[before:], rig.state.persisted) == ([rig.state], False)
 
 
 def test_its_sender_is_published_and_saved_once_that_was_checked(rig: Rig, path: Path) -> None:
     rig.stop(A, by="otto?")
     rig.stop(A, by="ann")
+    assert rig.states[-1].by == "ann"
     assert until(lambda: rig.written() and rig.states[-1].persisted), "each stop is written by itself"
     assert (rig.states[-1].by, rig.state.count, rig.states[-1].persisted) == ("ann", 1, True)
     assert json.loads(path.read_text())["by"] == "ann"
@@ -171,7 +186,7 @@ def test_at_most_four_states_a_second_and_the_last_one_is_published(rig: Rig) ->
     assert rig.guard.due is not None
     rig.advance(1)
     assert rig.states[-1].count == 90
-    assert rig.states[-1].recent[0] == f"{89:016x}"
+    assert rig.states[-1].recent == [f"{number:016x}" for number in range(89, 81, -1)]
 
 
 def test_repetitions_get_the_state_again_and_do_not_delay_what_confirms_a_stop(rig: Rig) -> None:
@@ -180,20 +195,28 @@ def test_repetitions_get_the_state_again_and_do_not_delay_what_confirms_a_stop(r
         rig.advance(0.01)
     assert rig.written()
     assert (rig.states[-1].recent, rig.states[-1].persisted) == ([A], True)
+
+
+def test_a_repetition_is_answered_a_quarter_of_a_second_after_the_last_state(rig: Rig) -> None:
+    rig.stop(A)
+    assert rig.written()
     rig.advance(1)
-    for repeat in (lambda: rig.stop(A), lambda: rig.guard.repeat_state(rig.now)):  # the latter for restored brokers
+    rig.guard.repeat_state(rig.now)  # for brokers that were restored
+    assert rig.states[-1] == rig.state
+    for seconds, answers in ((0.125, []), (0.125, [rig.state]), (0.125, [])):
+        rig.advance(seconds)
         before = len(rig.states)
-        repeat()
-        assert rig.states[before:] == [rig.state]
-        rig.advance(5)
+        rig.stop(A)
+        assert rig.states[before:] == answers
 
 
-def test_a_restart_begins_as_it_was(rig: Rig, path: Path, make: Make) -> None:
+def test_a_restart_begins_as_it_was(rig: Rig, make: Make, caplog: pytest.LogCaptureFixture) -> None:
     rig.stop(A, by="eve", why="a test")
     assert rig.written()
     again = make()
     assert (again.state.latched, again.state.recent, again.state.by, again.state.why) == (True, [A], "eve", "a test")
     assert again.state.boot != rig.state.boot
+    assert "still stopped by eve (a test)" in caplog.text
     assert again.state.persisted is False  # written again: who wrote it may have been killed before it was durable
     assert again.written()
     assert again.states[-1].persisted is True
@@ -209,23 +232,24 @@ def test_a_restart_begins_as_it_was(rig: Rig, path: Path, make: Make) -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "content"),
+    ("name", "content", "barred"),
     [
         *(
-            ("estop-serial.json", text)
+            ("estop-serial.json", text, 0)
             for text in ("", "null", "[]", '{"latched": 1, "recent": []}', '{"latched": false}')
         ),
-        *(("barred.json", text) for text in ("", "{", "[]", "-1", "true", "1.5", "1073741824")),
+        *(("barred.json", text, 0) for text in ("", "{", "[]", "-1", "0", "true", "1.5", "1073741824")),
+        *(("barred.json", str(run), run) for run in (1, 1073741823)),
     ],
 )
 def test_a_file_that_is_none_of_ours_counts_as_a_stop_and_bars_nothing(
-    path: Path, name: str, content: str, make: Make
+    path: Path, name: str, content: str, barred: int, make: Make
 ) -> None:
     path.parent.mkdir()
     path.with_name(name).write_text(content)
     rig = make()
     rig.advance(3)
-    assert rig.state.latched is (name != "barred.json")
+    assert (rig.state.latched, rig.guard.barred) == (name != "barred.json", barred)
     assert rig.guard.judge(SCRIPT, rig.now) == (None if rig.state.latched else 0.75)
 
 
@@ -243,29 +267,46 @@ def test_a_failed_write_is_published_and_repeated(rig: Rig, path: Path) -> None:
     assert rig.guard.persisted
 
 
-def test_a_write_that_takes_long_is_not_repeated_until_it_has_ended(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_write_that_takes_long_is_not_repeated_until_it_has_ended(
+    rig: Rig, path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Else a disk that takes longer than the pause between two attempts would never have the newest state."""
     may_end = threading.Event()
     sync = os.fsync
     monkeypatch.setattr(os, "fsync", lambda file: may_end.wait(10) and sync(file))
     rig.stop()
+    assert until(path.parent.exists)
+    path.write_text("{}")  # nor for what appears meanwhile
     for _ in range(3):
         rig.guard.save_again()
+        assert rig.guard.appeared_stop() is None
     may_end.set()
     assert rig.written()
     assert rig.state.persisted is True
 
 
-def test_a_reset_is_obeyed_only_for_the_newest_state_and_if_it_is_fresh(rig: Rig) -> None:
-    rig.stop(A)
-    seen = rig.state
-    rig.stop(B)
-    rig.reset(seen)
-    assert (rig.state.latched, rig.state.reset_refused) == (True, "count")
-    rig.reset(rig.state, age_s=1.0)
-    assert (rig.state.latched, rig.state.reset_refused) == (True, "old")
-    rig.reset(rig.state, age_s=0.9)
-    assert (rig.state.latched, rig.state.reset_refused) == (False, None)
+#: A reset after two stops: the boot and the count that it names, how old it is, and why it is refused.
+RESETS: dict[str, tuple[str, int, float, str | None]] = {
+    "of the newest state": ("", 2, 0.9995, None),
+    "too old": ("", 2, 1.0, "old"),
+    "of the first stop": ("", 1, 0.0, "count"),
+    "of another life": ("00000000", 2, 0.0, "boot"),
+}
+
+
+@pytest.mark.parametrize(("boot", "count", "age_s", "refused"), RESETS.values(), ids=RESETS)
+def test_a_reset_is_obeyed_or_refused_with_the_reason(
+    rig: Rig, caplog: pytest.LogCaptureFixture, boot: str, count: int, age_s: float, refused: str | None
+) -> None:
+    for name in (A, B):
+        rig.stop(name)
+    rig.advance(1)
+    before = len(rig.states)
+    rig.guard.reset(EstopReset(boot=boot or rig.state.boot, count=count, by="ann"), age_s, rig.now)
+    (state,) = rig.states[before:]
+    assert (state.latched, state.reset_refused) == (refused is not None, refused)
+    assert ("refused a reset" in caplog.text) == state.latched
+    assert ("emergency stop reset by ann" in caplog.text) != state.latched
 
 
 def test_a_barred_run_is_published_and_stays_barred_after_a_restart(rig: Rig, path: Path, make: Make) -> None:
@@ -289,17 +330,10 @@ def test_a_person_who_was_lost_bars_the_run_at_the_end_of_the_hold_without_any_f
     assert rig.guard.due is not None
     rig.advance(1.9)
     assert (rig.state.barred, rig.guard.due) == (6, pytest.approx(rig.now + 0.11))
-    rig.advance(0.2)
-    rig.advance(1)
+    rig.now = rig.guard.due
+    rig.guard.tick(rig.now)
     assert rig.states[-1].barred == 7
     assert rig.guard.due is None
-
-
-def test_a_script_waits_for_two_seconds_after_the_start(make: Make) -> None:
-    rig = make()
-    for seconds, limit in ((1.998, None), (0.001, None), (0.001, 0.75)):
-        rig.now += seconds
-        assert rig.guard.judge(SCRIPT, rig.now) == limit
 
 
 def test_what_is_barred_is_written_again_once_its_file_is_removed(rig: Rig) -> None:
@@ -313,10 +347,13 @@ def test_what_is_barred_is_written_again_once_its_file_is_removed(rig: Rig) -> N
 
 #: What happens before a command that is refused, which one, how it is counted, and what the log says.
 REFUSED: dict[str, tuple[tuple[str, ...], Drive, str, str]] = {
+    "a zero of a script": (("drive",), Drive(source="autonomy", run=7), "overruled", ""),
+    "without a key": (("control", "stop"), Drive(z=1), "stranger", "only who has control may drive"),
     "stopped": (("stop",), Drive(z=1), "latched", "the robot is stopped"),
     "no zero since the reset": (("stop", "reset"), Drive(z=1), "overruled", "after the reset no zero and no pause"),
     "a person drives": (("drive",), SCRIPT, "overruled", "run 7 has to wait"),
-    "its run has ended": (("script", "zero", "wait"), SCRIPT, "overruled", "run 7 has ended"),
+    "its run has ended": (("next",), Drive(z=1, source="autonomy", run=1), "overruled", "run 1 has ended"),
+    "a script beside a person": (("control", "stop"), SCRIPT, "latched", "the robot is stopped"),
     "a key of nobody": ((), Drive(z=1, key="00000000"), "stranger", "its key of control is not the one of now"),
 }
 
@@ -327,33 +364,25 @@ def test_why_a_command_is_refused(
 ) -> None:
     happens: dict[str, Callable[[], object]] = {
         "stop": rig.stop,
+        "control": lambda: rig.control.request(ControlRequest(id="aaaaaaaa", by="ann"), over=False, now=rig.now),
         "reset": lambda: rig.reset(rig.state),
         "drive": lambda: rig.guard.judge(Drive(z=1), rig.now),
-        "script": lambda: rig.guard.judge(SCRIPT, rig.now),
-        "zero": lambda: rig.guard.judge(Drive(valid_ms=0), rig.now),
-        "wait": lambda: rig.advance(3),
+        "next": lambda: rig.guard.judge(Drive(source="autonomy", run=2), rig.now),
     }
     for event in before:
         happens[event]()
     assert rig.guard.judge(drive, rig.now) is None
     assert rig.counters[counted] == 1
-    assert f"refused a drive command: {why}" in caplog.text
+    assert (f"refused a drive command: {why}" in caplog.text) == bool(why)
 
 
 def test_a_program_of_the_robot_is_no_stranger_where_names_are_checked(path: Path) -> None:
     with closing(Rig(path, level="named", strangers="refuse")) as rig:
         rig.stop()
         assert rig.guard.judge(Drive(z=1), rig.now) is None
-        assert (rig.counters["latched"], rig.counters["stranger"]) == (1, 0)
-
-
-@pytest.mark.parametrize(("count", "age_s", "says"), [(7, 0.0, True), (1, 2.0, True), (1, 0.0, False)])
-def test_a_refused_reset_is_logged(
-    rig: Rig, caplog: pytest.LogCaptureFixture, count: int, age_s: float, says: bool
-) -> None:
-    rig.stop()
-    rig.guard.reset(EstopReset(boot=rig.state.boot, count=count), age_s, rig.now)
-    assert ("refused a reset" in caplog.text, rig.state.latched) == (says, says)
+        rig.control.request(ControlRequest(id="aaaaaaaa", by="ann"), over=False, now=rig.now)
+        assert rig.guard.judge(Drive(z=1, key=rig.control.state().key, by="ann"), rig.now) is None
+        assert (rig.counters["latched"], rig.counters["stranger"]) == (2, 0)
 
 
 def test_the_largest_state_has_400_bytes_at_most(rig: Rig) -> None:
@@ -420,7 +449,7 @@ def test_a_stop_in_a_file_that_appears(
     stop = rig.guard.appeared_stop()
     assert bool(stop) == bool(found)
     if stop is not None:
-        assert found in (stop.stop, "a new name")
+        assert (found in (stop.stop, "a new name"), len(stop.stop)) == (True, 16)
         rig.guard.stop(stop, rig.now)
         assert (rig.state.latched, rig.state.by) == (True, "" if content == "{" else "eve")
     elif content is not None:
@@ -431,12 +460,15 @@ def test_a_stop_in_a_file_that_appears(
     assert again.state.latched == (bool(found) or before == "a stop")
 
 
-def test_where_nothing_can_be_saved_persisted_is_null_and_later_it_gets_the_stop(make: Make, tmp_path: Path) -> None:
+def test_where_nothing_can_be_saved_persisted_is_null_and_later_it_gets_the_stop(
+    make: Make, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     (tmp_path / "state").write_text("in the way")
     rig = make(tmp_path / "state" / "estop.json")
+    assert "cannot be written: an emergency stop ends with a power cut" in caplog.text
     rig.stop()
     rig.guard.save_again()
-    assert (rig.states[-1].latched, rig.states[-1].persisted) == (True, None)
+    assert (rig.states[-1].latched, rig.states[-1].persisted, rig.guard.appeared_stop()) == (True, None, None)
     (tmp_path / "state").unlink()
     rig.guard.save_again()
     assert rig.written()

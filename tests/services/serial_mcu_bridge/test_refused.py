@@ -4,19 +4,17 @@ from __future__ import annotations
 
 import json
 import logging
-import os
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from pebble.runtime.parent import NOTIFY_FD
 from pebble.transports import Message, MqttSettings, QoS, State, create
 from tests.services.serial_mcu_bridge.motor_rig import BASE, STOP, STOPPED, Bench
 from tests.support import RefusingBroker, until
 
-ESTOP, ESTOP_RESET, DRIVE = (f"{BASE}/incoming/{metric}" for metric in ("estop", "estop-reset", "drive-values"))
+ESTOP, ESTOP_RESET = (f"{BASE}/incoming/{metric}" for metric in ("estop", "estop-reset"))
 
 
 @pytest.fixture
@@ -98,21 +96,6 @@ def test_a_stop_that_could_not_be_reset_is_a_final_zero(broker: RefusingBroker, 
     assert (granted["latched"], granted["count"], granted["recent"], granted["barred"]) == (False, 0, [], 7)
 
 
-def test_what_waits_with_a_stop_does_not_move_the_motors_after_it(
-    broker: RefusingBroker, start: Callable[[], Bench]
-) -> None:
-    broker.refuse(ESTOP_RESET)
-    bench = start()
-    with bench.occupied():
-        received = bench.service.transport.counters["received"]
-        bench.drive(0.25)
-        bench.send("estop", STOP)
-        bench.drive(0.5)
-        assert until(lambda: bench.service.transport.counters["received"] == received + 3)
-    assert bench.shines(r=1)
-    assert set(bench.lines) == {STOPPED, "L 0.000 0.000 1.000"}
-
-
 def test_a_stop_from_before_the_refusal_stays_and_is_back_when_all_is_granted(
     broker: RefusingBroker, start: Callable[[], Bench], caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -132,41 +115,3 @@ def test_a_stop_from_before_the_refusal_stays_and_is_back_when_all_is_granted(
     assert bench.reset()
     bench.send("drive-values", {})
     assert bench.moves(0.125)
-
-
-def test_the_launcher_is_notified_however_busy_it_is(
-    broker: RefusingBroker, start: Callable[[], Bench], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    notes, end = os.pipe()
-    monkeypatch.setenv(NOTIFY_FD, str(end))
-    os.set_blocking(end, False)
-    os.set_blocking(notes, False)
-    filled = os.write(end, b"." * 1_000_000)
-    broker.refuse(ESTOP)
-    bench = start()
-    assert until(lambda: not bench.service.announced)
-    assert os.read(notes, filled) == b"." * filled
-    assert until(lambda: readable(notes) == b'{"note":"feature","name":"estop","has":false}\n')
-    refuse(broker, bench)
-    assert until(lambda: readable(notes) == b'{"note":"feature","name":"estop","has":true}\n')
-    for descriptor in (notes, end):
-        os.close(descriptor)
-
-
-def readable(descriptor: int) -> bytes:
-    """Without what is reported of the board."""
-    try:
-        lines = os.read(descriptor, 1000).splitlines(keepends=True)
-    except BlockingIOError:
-        return b""
-    return b"".join(line for line in lines if b'"note":"mcu"' not in line)
-
-
-def test_a_refused_drive_topic_ends_the_process_with_what_to_change(
-    broker: RefusingBroker, start: Callable[[], Bench]
-) -> None:
-    bench = start()
-    broker.refuse(DRIVE)
-    assert until(lambda: bench.running.error)
-    assert f"refuses the subscription to {DRIVE}: nothing can drive this robot" in str(bench.running.error)
-    assert "local_mqtt" in str(bench.running.error)

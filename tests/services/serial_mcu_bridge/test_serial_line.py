@@ -1,9 +1,6 @@
 """The serial line against a real pty: the stop first and last, newest lines, unplugged ports, blocked readers."""
 
 import os
-import signal
-import subprocess
-import sys
 import threading
 import time
 import tty
@@ -17,7 +14,7 @@ from pebble.errors import DeviceError
 from pebble.extensions.lab.simulation.pty import PtyMcu
 from pebble.services.serial_mcu_bridge.line.port import Port
 from pebble.services.serial_mcu_bridge.line.serial_line import LineState, SerialLine
-from pebble.services.serial_mcu_bridge.text.goob_base import STOP, drive_line, lights_line
+from pebble.services.serial_mcu_bridge.text.goob_base import STOP, drive_line
 from tests.support import cases, until
 
 STOPPED = "M 0.000 0.000"
@@ -119,15 +116,6 @@ def test_a_command_waits_for_the_boot_and_one_too_old_then_is_a_stop(
     assert until(host.is_ready)
     assert until(lambda: len(mcu.trace.lines()) == 3)
     assert mcu.trace.lines() == [STOPPED, STOPPED, sent]
-
-
-def test_lines_go_down_and_answers_come_up(mcu: PtyMcu, host: Host) -> None:
-    assert host.line.drive(drive_line(1.0, -1.0))
-    assert host.line.send("lights", lights_line(1, 0, 0))
-    assert traced(mcu, "M 1.000 -1.000")
-    assert traced(mcu, "L 1.000 0.000 0.000")
-    assert until(lambda: b"OK L\r\n" in host.received)
-    assert mcu.state().drive == (1.0, -1.0)
 
 
 def test_of_a_burst_the_last_command_is_sent_and_few_before_it(mcu: PtyMcu, host: Host) -> None:
@@ -284,36 +272,3 @@ def test_a_stuck_reader_does_not_delay_the_end_and_finds_the_stop(stuck: StuckDe
     assert host.line.state is LineState.CLOSED
     assert stuck.seen().endswith(b"\n" + STOP)
     assert len(stuck.seen()) < 5000
-
-
-PROGRAM = """
-import signal, sys, time
-from pebble.services.serial_mcu_bridge.text.goob_base import STOP, drive_line
-from pebble.services.serial_mcu_bridge.line.serial_line import SerialLine
-
-ended = []
-signal.signal(signal.SIGTERM, lambda *_: ended.append(True))
-line = SerialLine(sys.argv[1], 460800, stop=STOP, on_bytes=lambda _chunk: None, boot_s=0.05)
-line.open()
-while not ended:
-    line.drive(drive_line(0.6, 0.6))
-    time.sleep(0.01)
-line.close()
-"""
-
-
-def test_a_terminated_program_stops_and_a_killed_one_is_stopped_by_its_successor(mcu: PtyMcu, tmp_path: Path) -> None:
-    command = [sys.executable, "-c", PROGRAM, str(mcu.symlink)]
-    with subprocess.Popen(command) as killed:
-        assert traced(mcu, "M 0.600 0.600")
-        killed.send_signal(signal.SIGKILL)
-    assert until(lambda: not mcu.host)
-    assert mcu.trace.lines()[-1] == "M 0.600 0.600"
-    before = len(mcu.trace.lines())
-    with subprocess.Popen(command) as terminated:
-        assert until(lambda: "M 0.600 0.600" in mcu.trace.lines()[before:])
-        terminated.send_signal(signal.SIGTERM)
-    assert until(lambda: not mcu.host)
-    assert mcu.trace.lines()[before : before + 3] == [STOPPED, STOPPED, "M 0.600 0.600"]
-    assert mcu.trace.lines()[-1] == STOPPED
-    assert terminated.returncode == 0

@@ -27,27 +27,6 @@ def bench(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Bench]:
 
 
 FRED = ("fred", {"telemetry": {"publish_touch_sensors": True}})
-RENAMED = (
-    "fred",
-    {
-        "telemetry": {"publish_touch_sensors": True},
-        "topics": {
-            "drive_values": "elsewhere/drive",
-            "lights_solid": "elsewhere/solid",
-            "lights_flash": "elsewhere/flash",
-            "touch_sensors": f"{BASE}/outgoing/feelers",
-            "charging_status": f"{BASE}/outgoing/dock",
-        },
-    },
-)
-
-
-def test_the_first_and_the_last_line_are_the_stop(bench: Bench) -> None:
-    assert bench.moves(0.5)
-    bench.service.quit()
-    assert until(lambda: bench.mcu.trace.entries()[-1].event == "closed", 5)
-    lines = bench.lines
-    assert lines[0] == lines[1] == lines[-1] == STOPPED
 
 
 @pytest.mark.parametrize("bench", [("goob", {"safety": {"drive_timeout_seconds": 0.2}})], indirect=True)
@@ -87,63 +66,7 @@ def test_every_field_of_a_line_is_published(bench: Bench) -> None:
     assert len(bench.payloads("charging-status")) == 2  # only changes are published
 
 
-def test_voltage_is_published_and_touch_only_if_configured(bench: Bench) -> None:
-    bench.mcu.reset()
-    assert until(lambda: bench.payloads("charging-level"), 8)
-    assert bench.payloads("charging-level")[0]["unit"] == "v"
-    assert bench.payloads("touch-sensors") == []
-
-
-@pytest.mark.parametrize("bench", [RENAMED], indirect=True)
-def test_every_topic_can_be_renamed(bench: Bench) -> None:
-    bench.operator.publish("elsewhere/drive", b'{"z": 0.25}')
-    bench.operator.publish("elsewhere/solid", b'{"r": 0.5}')
-    assert bench.line("M 0.250 0.250")
-    assert bench.line("L 0.000 0.000 0.500")
-    bench.operator.publish("elsewhere/flash", b'{"g": 0.5}')
-    assert bench.line("F 0.000 0.500 0.000 2.000")
-    assert until(lambda: bench.payloads("feelers") and bench.payloads("dock"), 5)
-    bench.drive(1)
-    bench.operator.publish("elsewhere/solid", b'{"b": 1}')
-    assert bench.line("L 1.000 0.000 0.000")
-    assert "M 1.000 1.000" not in bench.lines
-
-
-def test_malformed_commands_are_counted(bench: Bench) -> None:
-    for _ in range(50):
-        bench.operator.publish(f"{BASE}/incoming/drive-values", b'{"z": NaN}')
-    assert bench.shines(r=1)
-    assert bench.service.counters["refused"] == 50
-    assert set(bench.lines) == {STOPPED, "L 0.000 0.000 1.000"}
-
-
 # -- emergency stops and scripts
-
-
-@pytest.mark.parametrize(
-    ("metric", "raw", "line"),
-    [
-        ("drive-values", b'\xef\xbb\xbf{"x":0,"z":0}\r\n\0', STOPPED),
-        ("drive-values", b'{"z":"0","y":"abc"}', STOPPED),
-        ("drive-values", b'{"linear":{"x":0.5},"angular":{"z":0}}', STOPPED),
-        ("drive-values", b'{"z":" 2.5e-1 ","x":null}', "M 0.250 0.250"),
-        ("lights-solid", b'{"value":{"b":-1,"g":2,"r":"0.5"}}\0', "L 0.000 1.000 0.500"),
-        ("lights-flash", b'{"b":"1","g":"no","period":"0"}', "F 1.000 0.000 0.000 0.050"),
-    ],
-)
-def test_commands_as_programs_of_other_languages_write_them(bench: Bench, metric: str, raw: bytes, line: str) -> None:
-    bench.drive(0.5, valid_ms=60_000)
-    assert bench.line("M 0.500 0.500")
-    bench.operator.publish(f"{BASE}/incoming/{metric}", raw)
-    assert until(lambda: bench.lines[-1] == line, 0.6)  # before the watchdog
-
-
-def test_a_command_with_nan_or_infinity_is_refused_whole(bench: Bench) -> None:
-    for metric, first in (("drive-values", '"x":0.5,"z"'), ("lights-solid", '"g":1,"r"')):
-        for number in ('"NaN"', '"-inf"', "NaN", "1e999"):
-            bench.operator.publish(f"{BASE}/incoming/{metric}", f"{{{first}:{number}}}".encode())
-    assert until(lambda: bench.service.counters["refused"] == 8, 5)
-    assert bench.lines == [STOPPED] * 2
 
 
 def test_a_drive_command_without_an_axis_is_logged_once_for_each_sender(
@@ -160,37 +83,6 @@ def test_a_drive_command_without_an_axis_is_logged_once_for_each_sender(
     assert sum("'X'" in line for line in lines) == 1
     assert len(lines) == 17  # 16 senders, and all others together
     assert "'linear', 'source'" in lines[0]
-
-
-def test_after_a_stop_nothing_moves_until_the_reset_also_after_a_restart(bench: Bench) -> None:
-    assert bench.moves(0.5)
-    bench.send("estop", STOP)
-    assert bench.stopped()
-    lines = bench.lines
-    assert lines[-1] == STOPPED
-    for _ in range(3):
-        bench.drive(0.25)
-    assert bench.shines(r=1)  # only motors are stopped
-    bench.restart()
-    assert (bench.state["latched"], bench.state["count"]) == (True, 0)
-    assert bench.state["recent"] == [STOP["stop"]]
-    bench.drive(0.25)
-    assert bench.shines(g=1)
-    assert set(bench.lines) & {"M 0.250 0.250"} == set()
-    assert bench.reset()
-    bench.send("drive-values", {})
-    assert bench.moves(0.125)
-
-
-def test_after_a_reset_a_person_lets_go_first(bench: Bench) -> None:
-    bench.send("estop", STOP)
-    assert bench.stopped()
-    bench.send_reset()
-    bench.drive(0.25)  # at once: after 0.5 s without a command it would be obeyed
-    assert until(lambda: bench.service.counters["overruled"] == 1)
-    bench.drive(0)
-    assert bench.moves(0.125)
-    assert "M 0.250 0.250" not in bench.lines
 
 
 def test_a_retained_stop_and_a_retained_reset_do_nothing(bench: Bench) -> None:
@@ -244,27 +136,6 @@ def test_a_command_is_valid_for_its_valid_ms(bench: Bench) -> None:
     bench.drive(0.375, valid_ms=50)  # a later command may end earlier
     assert bench.line("M 0.375 0.375")
     assert until(lambda: bench.lines[-1] == STOPPED, 2)
-
-
-def test_a_script_waits_for_a_person_who_ends_it_and_moves_nothing_after_a_restart(bench: Bench) -> None:
-    script = {"z": 0.25, "source": "autonomy", "run": 7}
-    time.sleep(2)
-    bench.send("drive-values", script)
-    assert bench.line("M 0.250 0.250")
-    assert bench.moves(0.5)
-    bench.send("drive-values", {**script, "z": 0.75})  # people go before scripts
-    bench.drive(0, valid_ms=0)
-    assert until(lambda: bench.state.get("barred") == 7, 5)
-    bench.restart()
-    before = len(bench.lines)
-    end = time.monotonic() + 2.5
-    while time.monotonic() < end:
-        bench.send("drive-values", script)
-        time.sleep(0.05)
-    bench.send("drive-values", {**script, "run": 8, "z": 0.5})
-    assert bench.line("M 0.500 0.500")
-    assert "M 0.250 0.250" not in bench.lines[before:]
-    assert "M 0.750 0.750" not in bench.lines
 
 
 def test_stops_are_subscribed_to_before_drive_commands() -> None:

@@ -117,14 +117,3 @@ def test_a_place_below_a_file_cannot_be_written(tmp_path: Path) -> None:
     saved = Saved(tmp_path / "file" / "robot" / "estop.json")
     assert not saved.file.can_save()
     assert saved.file.load() is None or isinstance(saved.file.load(), Unreadable)
-
-
-def test_a_leftover_of_a_power_cut_does_not_matter(tmp_path: Path) -> None:
-    path = tmp_path / "estop.json"
-    path.write_text('{"latched": true}')
-    (tmp_path / ".estop.json.new").write_text('{"latched": fal')
-    saved = Saved(path)
-    assert saved.file.load() == {"latched": True}
-    saved.file.save({"latched": False})
-    saved.file.close()
-    assert Saved(path).file.load() == {"latched": False}

@@ -63,14 +63,6 @@ def test_every_reader_gets_whole_frames_through_shared_memory(net: FramesNet, bo
     assert [reader.close() for reader in readers] == [0, 0, 0]
 
 
-def test_without_views_frames_are_copied_twice_and_are_the_same(net: FramesNet) -> None:
-    reader = net.reader(views=True, without_views=True)
-    net.writer(size=VGA, rate=60, without_views=True)
-    seen = reader.has(frames=20, shared=20)
-    assert "0.0.0" in seen["views"]
-    assert seen["wrong"] == 0
-
-
 def test_a_slow_reader_gets_the_newest(net: FramesNet) -> None:
     writer = net.writer(rate=200)
     reader = net.reader(work_s=0.1)
@@ -167,25 +159,6 @@ def test_a_reader_without_shared_memory_gets_bytes_and_reports_it(unprivileged_n
     assert writer.ask()["sharing"]
 
 
-def test_with_too_little_to_lock_both_sides_use_bytes_and_report_it(unprivileged_net: FramesNet) -> None:
-    reader = unprivileged_net.reader(memlock=64 << 10, user=UNPRIVILEGED_USER)
-    writer = unprivileged_net.writer(size=QVGA, memlock=64 << 10, user=UNPRIVILEGED_USER)
-    seen = reader.has(frames=20, copied=20)
-    printed = writer.has(written=20)
-    assert (seen["wrong"], printed["sharing"]) == (0, False)
-    for text in (seen["problem"], printed["problem"]):
-        assert "64 KiB" in text
-        assert "LimitMEMLOCK=" in text
-
-
-def test_a_reader_that_may_lock_too_little_for_this_writer_changes_over(unprivileged_net: FramesNet) -> None:
-    reader = unprivileged_net.reader(memlock=3 << 20, user=UNPRIVILEGED_USER)  # enough for Zenoh itself
-    unprivileged_net.writer(size=QVGA, user=UNPRIVILEGED_USER)
-    seen = reader.has(frames=20, copied=20, reopened=1)
-    assert "LimitMEMLOCK=" in seen["problem"]
-    assert seen["wrong"] == 0
-
-
 def test_a_process_that_ends_with_an_open_writer_or_reader_ends(tmp_path: Path) -> None:
     program = (
         "import sys; from pathlib import Path; from pebble.transports.frames import *\n"
@@ -239,23 +212,6 @@ def test_a_writer_knows_when_its_memory_was_removed(tmp_path: Path) -> None:
         assert not writer.in_place
     with writer:
         assert writer.in_place
-
-
-@needs_root
-@pytest.mark.parametrize("size", some(["ro,size=64k", "size=64k", "size=1400k", "size=2m"], 2))
-def test_without_room_in_shared_memory_frames_are_sent_as_bytes(tmp_path: Path, size: str) -> None:
-    program = (
-        "import sys, time; from pathlib import Path; from pebble.transports.frames import *\n"
-        "with FrameWriter(Path(sys.argv[1]), 'camera', capacity=900_000) as w, "
-        "FrameReader(Path(sys.argv[1]), 'camera') as r:\n"
-        "    while not w.wanted: time.sleep(0.01)\n"
-        "    frame = None\n"
-        "    while frame is None: w.write(b'x' * 900_000, FrameInfo()); frame = r.read(0.2)\n"
-        "    print(frame.data.size, frame.shared, 'as bytes' in w.problem)"
-    )
-    mount = f'mount -t tmpfs -o {size} none /dev/shm && exec "$@"'
-    command = ["unshare", "-m", "sh", "-c", mount, "sh", sys.executable, "-c", program, str(tmp_path)]
-    assert subprocess.check_output(command, timeout=30, text=True) == "900000 False True\n"
 
 
 @needs_root

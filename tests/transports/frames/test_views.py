@@ -6,7 +6,6 @@ import gc
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import numpy as np
@@ -233,25 +232,14 @@ with FrameWriter(folder, "camera", capacity=20_000, slots=16) as writer:
 """
 
 
-def soak(folder: Path, frames: int, *options: str) -> tuple[int, int, int]:
-    """Writer and reader with views in one process; returns wrong frames, lost ones, and growth in kB."""
-    command = tied_to_parent([sys.executable, *options, "-c", SOAK, str(folder), str(frames)])
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=100_000, check=False)
-    assert (done.returncode, done.stderr) == (0, "")
-    wrong, lost, growth = map(int, done.stdout.split())
-    return wrong, lost, growth
-
-
 @pytest.mark.thorough
 @pytest.mark.parametrize(("frames", "options"), [(cases(20_000, 100_000), ()), (5_000, ("-X", "dev"))])
 def test_a_soak(tmp_path: Path, frames: int, options: tuple[str, ...]) -> None:
-    wrong, lost, growth = soak(tmp_path, frames, *options)
+    """Writer and reader with views in one process: wrong frames, lost ones, and growth in kB."""
+    command = tied_to_parent([sys.executable, *options, "-c", SOAK, str(tmp_path), str(frames)])
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (0, "")
+    wrong, lost, growth = map(int, done.stdout.split())
     assert wrong == 0
     assert lost <= frames / 100  # a reader that stood still for a moment; usually none
     assert growth < 5_000
-
-
-if __name__ == "__main__":  # python -m tests.transports.frames.test_views FOLDER FRAMES [-X dev]
-    began = time.monotonic()
-    result = soak(Path(sys.argv[1]), int(sys.argv[2]), *sys.argv[3:])
-    sys.stdout.write(f"wrong, lost, growth in kB: {result} in {time.monotonic() - began:.0f} s\n")

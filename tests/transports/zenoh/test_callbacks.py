@@ -2,7 +2,6 @@ from __future__ import annotations
 
 import subprocess
 import sys
-import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
@@ -14,20 +13,6 @@ from pebble.transports import Message, QoS, create
 from pebble.transports.zenoh import callbacks
 from tests.support import until
 from tests.transports.zenoh_net import HubProcess
-
-SESSIONS, MESSAGES = 4, 50
-FORKED = """
-import os, sys
-from pathlib import Path
-from pebble.transports import ZenohSettings, create
-environment = {name: value for name, value in os.environ.items() if name != "ZENOH_RUNTIME"}
-import pebble.transports.zenoh.transport
-os.environ.clear()
-os.environ.update(environment)
-settings = ZenohSettings(run_dir=Path(sys.argv[1]))
-with create("zenoh", "one", settings), create("zenoh", "other", settings):
-    print(*{(task / "comm").read_text().split("-")[0].strip() for task in Path("/proc/self/task").iterdir()})
-"""
 
 #: Answers with more than the sockets hold: from its handler, or from a thread for which its handler waits meanwhile.
 ANSWERING = """
@@ -119,50 +104,6 @@ def test_the_handlers_of_many_connections_may_wait_at_once(hub: HubProcess) -> N
     assert len(received) == ANSWERS
 
 
-def test_threads_of_python_are_not_watched(hub: HubProcess, monkeypatch: pytest.MonkeyPatch) -> None:
-    """They run callbacks, too: of what they publish to their own session."""
-    guard = callbacks.Guard()
-    monkeypatch.setattr(callbacks, "guard", guard)
-    monkeypatch.setattr(callbacks, "_own", threading.local())
-    received: list[Message] = []
-    with create("zenoh", "own", hub.settings) as transport:
-        transport.subscribe("a", received.append)
-
-        def publish() -> None:
-            transport.publish("a", b"1", qos=QoS.DELIVERED)
-
-        for _ in range(3):
-            thread = threading.Thread(target=publish)
-            thread.start()
-            thread.join()
-        assert until(lambda: len(received) == 3)
-    assert guard.watched <= 2  # of Zenoh's, for the hub's answers
-
-
-def test_without_a_thread_for_the_guard_messages_are_handled(
-    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
-    guard = callbacks.Guard()
-    with monkeypatch.context() as patched:
-        patched.setattr(threading.Thread, "start", _refuse)
-        guard.wake()
-        guard.wake()
-    assert guard.rests
-    assert caplog.text.count("no guard for handlers that wait") == 1  # not once for each message
-    guard.wake()
-    assert not guard.rests
-
-
-def _refuse(_thread: threading.Thread) -> None:
-    raise RuntimeError("can't start new thread")
-
-
-def test_a_closed_session_is_forgotten(hub: HubProcess) -> None:
-    with create("zenoh", "one", hub.settings):
-        sessions = callbacks.guard.sessions
-    assert callbacks.guard.sessions == sessions - 1
-
-
 def test_the_guard_rests_without_callbacks(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(callbacks, "_LOOK_S", 0.001)
     guard, calls = callbacks.Guard(), callbacks.Calls()
@@ -175,39 +116,3 @@ def test_the_guard_rests_without_callbacks(monkeypatch: pytest.MonkeyPatch) -> N
         calls.ended += 1
         assert until(lambda: guard.rests, 5)
         guard.helped = 0
-
-
-@pytest.mark.parametrize("most", [0, 1, callbacks.MOST])
-def test_there_are_few_states_however_many_messages_and_sessions(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, most: int
-) -> None:
-    """Beyond them everything works as well."""
-    made, received, ensure = list[None](), list[Message](), callbacks.ensure_state
-    monkeypatch.setattr(callbacks, "ensure_state", lambda: (made.append(None), ensure()))
-    monkeypatch.setattr(callbacks, "guard", callbacks.Guard())
-    monkeypatch.setattr(callbacks, "_own", threading.local())
-    monkeypatch.setattr(callbacks, "MOST", most)
-    hub = HubProcess(tmp_path).start()
-    try:
-        with create("zenoh", "sender", hub.settings) as sender:
-            for session in range(1, SESSIONS + 1):
-                with create("zenoh", "receiver", hub.settings) as receiver:
-                    receiver.subscribe("a/b", received.append, direct=True)
-                    assert until(
-                        lambda enough=session * MESSAGES: (  # type: ignore[misc]
-                            sender.publish("a/b", b"1", qos=QoS.DELIVERED) and len(received) >= enough
-                        ),
-                        10,
-                    )
-    finally:
-        hub.end()
-    assert min(most, 1) <= len(made) <= most
-
-
-def test_a_service_with_an_environment_of_its_own_reads_on_one_runtime(hub: HubProcess) -> None:
-    """The launcher imports the transport, forks, and sets the service's environment. Else `acc` and `net` wake `rx`."""
-    command = [sys.executable, "-c", FORKED, str(hub.settings.run_dir)]
-    done = subprocess.run(command, check=True, capture_output=True, text=True, timeout=30)
-    runtimes = set(done.stdout.split())
-    assert "rx" in runtimes
-    assert runtimes.isdisjoint({"acc", "net"})

@@ -29,21 +29,12 @@ def report(text: object) -> None:
 
 def talker(client: Transport) -> None:
     """Numbers its messages at 200 Hz; reports how many."""
-    _count_until_stopped(client, "talk", 0.005, retain=False)
-
-
-def retainer(client: Transport) -> None:
-    """Counts in five retained topics at 100 Hz; reports the last number."""
-    _count_until_stopped(client, "kept/{}", 0.01, retain=True)
-
-
-def _count_until_stopped(client: Transport, topic: str, pause: float, *, retain: bool) -> None:
     stop_requested, number = threading.Event(), 0
     threading.Thread(target=_wait_to_be, args=(stop_requested,), daemon=True).start()
     report("up")
-    while not stop_requested.wait(pause):
+    while not stop_requested.wait(0.005):
         number += 1
-        client.publish(topic.format(number % 5), b"%d" % number, qos=DELIVERED, retain=retain)
+        client.publish("talk", b"%d" % number, qos=DELIVERED)
     report(number)
     sys.stdin.readline()
     client.close()
@@ -87,21 +78,6 @@ def killed(client: Transport) -> None:
     with_will.open(5)
     report("up")
     sys.stdin.readline()
-
-
-def returns(client: Transport) -> None:
-    client.subscribe("#", lambda _: None)
-    report("up")
-
-
-def raises(client: Transport) -> None:
-    returns(client)
-    raise RuntimeError("nobody caught this")
-
-
-def exits(client: Transport) -> None:
-    returns(client)
-    sys.exit(3)
 
 
 def forks(client: Transport) -> None:

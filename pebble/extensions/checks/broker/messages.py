@@ -43,6 +43,8 @@ def rights(trial: BrokerTrial) -> CheckResult:
     )
     reader, writer = trial.peer(), trial.peer()
     granted, began = reader.subscribe("#"), time.monotonic()
+    if reader.problem:
+        return failed(f"after {trial.base}/# was subscribed to: {reader.problem}", fix)
     if not granted or granted[0] >= REFUSED:
         return failed(f"this account may not subscribe to {trial.base}/#", fix)
     mid = writer.publish("x", qos=1)

@@ -27,7 +27,7 @@ _QUIET_S = 0.3  # of silence, and four round trips: then nothing more comes
 _STEP_S = 0.001  # between two looks at what has come
 _KEEPALIVE_S = 60
 _AT_ONCE = 1000  # packets
-_MOST = 5_000  # messages that one connection reads; a probe sends a thousand
+_MOST, _MOST_BYTES = 5_000, 20_000_000  # that one connection reads; a probe sends a thousand messages
 _RESET = struct.pack("ii", 1, 0)  # SO_LINGER that turns close() into a reset
 
 NAME = "pebble-doctor-of-a-broker"  # as long as the names of a robot's programs
@@ -60,6 +60,7 @@ class Peer(packets.Listener):
         self.pongs: list[int] = []  # how many messages had been received at each answer to a ping
         self.code: int | None = None  # of CONNACK
         self.problem = ""
+        self._bytes = 0  # received
         self._trial, self.base = trial, base
         self._client = Client(opening, self, bridge=bridge)
         self._client.open()
@@ -128,8 +129,11 @@ class Peer(packets.Listener):
         client = self._client
         try:
             while len(self.received) < _MOST and client.receive():
-                while client.read(_AT_ONCE):
+                while client.read(_AT_ONCE) and self._bytes < _MOST_BYTES:
                     pass
+                if self._bytes >= _MOST_BYTES:
+                    self.problem = f"it sends without end: more than {_MOST_BYTES:,} bytes"
+                    client.close()
         except packets.MalformedError as error:
             self.problem = f"it sends what is no MQTT: {error}"
             client.close()
@@ -147,6 +151,7 @@ class Peer(packets.Listener):
         self.problem = reasons.connection_refused(code)
 
     def on_publication(self, topic: bytes, payload: bytes, first: int) -> None:
+        self._bytes += len(topic) + len(payload)
         below = topic.decode(errors="replace").removeprefix(f"{self.base}/")
         self.received.append(Received(below, payload, bool(first & packets.RETAIN), time.monotonic()))
 

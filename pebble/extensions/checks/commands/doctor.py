@@ -15,8 +15,8 @@ from pebble.errors import PebbleError
 from pebble.extensions.checks.commands.checks import Printer, is_clear
 from pebble.extensions.operator.commands.estop import me
 from pebble.extensions.operator.commands.target import broker_of
+from pebble.extensions.operator.places import Places
 from pebble.runtime.environment import withhold
-from pebble.runtime.places import Places
 from pebble.runtime.signals import interrupted_by_signals
 from pebble.runtime.whole_file import write_new
 from pebble.transports import MqttSettings

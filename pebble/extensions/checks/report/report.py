@@ -27,7 +27,7 @@ from pebble.extensions.checks.machine import output_of
 from pebble.extensions.checks.report.secrets_here import Secrets, secrets_of
 from pebble.extensions.checks.robot import run_checks
 from pebble.extensions.checks.running.robot import user_of
-from pebble.runtime.places import Places
+from pebble.extensions.operator.places import Places
 from pebble.version import __version__
 
 _JOURNAL_LINES = 2000

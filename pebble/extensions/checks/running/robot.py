@@ -21,8 +21,8 @@ from pebble.extensions.checks.observer import Observer
 from pebble.extensions.operator.client.connection import Target, connected, wait_for
 from pebble.extensions.operator.client.names import Names
 from pebble.extensions.operator.client.robot_view import RobotView
+from pebble.extensions.operator.places import Places
 from pebble.runtime.addresses import Addresses
-from pebble.runtime.places import Places
 from pebble.transports import Transport
 
 PATIENCE_S = 3.0

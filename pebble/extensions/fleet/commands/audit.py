@@ -9,8 +9,8 @@ import typer
 from pebble.commands.options import ConfigArgument
 from pebble.config import load
 from pebble.errors import PebbleError
+from pebble.extensions.fleet.robot_audit import files
 from pebble.extensions.operator.commands.show import print_table
-from pebble.services.mqtt_bridge.audit import files
 
 _COLUMNS = ("t", "what", "who", "from", "count")
 

@@ -13,6 +13,7 @@ from msgspec.structs import replace
 from pebble.commands.options import host_of, split_names
 from pebble.errors import PebbleError
 from pebble.extensions.fleet import applying, certificates, check, folder, pieces, plugin
+from pebble.extensions.fleet.as_owner import as_owner
 from pebble.extensions.fleet.broker_files import new_password
 from pebble.extensions.fleet.commands import lan
 from pebble.extensions.fleet.folder import CONF, ZENOH, Fleet, FleetError, Server
@@ -235,6 +236,9 @@ def certificate(
         is_hub = ProgramRole.HUB in account.roles
         if is_hub and not hosts:
             raise FleetError(f"{name} is a hub: name where others reach it, `pebble fleet certificate {name} HOST`")
+        others = {*fleet.accounts, *(() if is_hub else (broker.host for broker in fleet.brokers))} - {name}
+        if taken := others & {*(hosts or ())}:
+            raise FleetError(f"{name} cannot be {min(taken)}: that is a broker of this fleet, or another account")
         files = certificates.of_account(place, name, hosts or ())
     _print_certificate(place, fleet, name, files)
     return 0
@@ -325,11 +329,15 @@ def _init_again(place: Path, host: str | None, level: str | None, plain: bool | 
     return _left(applying.copies(Path(_shown(place)), after))
 
 
+#: What commands import when they need it.
+_LATE = ("pebble.extensions.fleet.authority", "pebble.extensions.fleet.zenoh_rules")
+
+
 @contextmanager
 def _changing(folder_: Path | None, *, any_rules: bool = False) -> Iterator[tuple[Path, Fleet]]:
     """Lock a fleet; one that is still for the plugin only with ``any_rules``. Raises PebbleError."""
     place = _place(folder_)
-    with folder.locked(place):
+    with as_owner(place, *_LATE), folder.locked(place):
         fleet = folder.load(place)
         if fleet.rules == "plugin" and not any_rules:
             shown = _shown(place)

@@ -21,7 +21,7 @@ from pebble.extensions.fleet.broker_files import new_password
 from pebble.extensions.fleet.folder import CONF, Fleet, FleetError, Server
 from pebble.extensions.fleet.roles import Account, ProgramRole
 from pebble.extensions.operator.client.page_packages import require_packages
-from pebble.runtime.places import mosquitto_path
+from pebble.extensions.operator.places import mosquitto_path
 from pebble.runtime.whole_file import write
 
 HUB_FILE, GATEWAY_FILE, ROBOTS = "hub.json", "gateway.json", "robots"

@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from pebble.extensions.operator.client.page_packages import require_packages
-from pebble.runtime.places import Places
+from pebble.extensions.operator.places import Places
 from pebble.runtime.whole_file import write_new
 
 _Answers = Annotated[

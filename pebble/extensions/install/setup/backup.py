@@ -24,10 +24,10 @@ from pebble.config import Config, load
 from pebble.config.masking import values_of
 from pebble.errors import PebbleError
 from pebble.extensions.fleet.folder import FLEET
+from pebble.extensions.operator.places import Places
 from pebble.extensions.page.setting import people_of
 from pebble.extensions.recordings.config import Recorder
 from pebble.extensions.scripts.config import AutonomyManager
-from pebble.runtime.places import Places
 from pebble.services.soundboard_handler.config import SoundboardHandler
 from pebble.version import __version__
 

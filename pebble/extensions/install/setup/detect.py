@@ -14,7 +14,7 @@ import serial
 from pebble.check_result import State
 from pebble.extensions.checks.machine import clock, synchronised
 from pebble.extensions.fleet.folder import PLAIN_PORT, PORT
-from pebble.runtime.places import Places
+from pebble.extensions.operator.places import Places
 from pebble.services.serial_mcu_bridge.pebble_serial_v1.frame import FrameError, decode
 
 DEVICES, SERIAL_PORTS = Path("/dev"), Path("/dev/serial/by-id")

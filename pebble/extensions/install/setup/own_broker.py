@@ -6,7 +6,7 @@ from pebble.extensions.fleet import applying, broker_files, certificates, folder
 from pebble.extensions.fleet.folder import CONF, PID, Fleet, Server
 from pebble.extensions.fleet.roles import Account, ProgramRole
 from pebble.extensions.install.setup.answers import PAGE
-from pebble.runtime.places import Places
+from pebble.extensions.operator.places import Places
 
 _LINKS = {CONF: "../conf.d/pebble.conf", PID: "../../../run/mosquitto/mosquitto.pid"}
 

@@ -9,8 +9,8 @@ from pebble.config.hosts import is_loopback
 from pebble.extensions.fleet import certificates
 from pebble.extensions.fleet.folder import PLAIN_PORT, PORT
 from pebble.extensions.install.setup.answers import HERE, NONE, PAGE, Answers, needs_login
+from pebble.extensions.operator.places import Places
 from pebble.extensions.page.config import WebHandler
-from pebble.runtime.places import Places
 from pebble.services.av_daemon.config import AvDaemon
 
 UNIT = "pebble.service"

@@ -18,8 +18,8 @@ from pebble.extensions.install.setup.robot_config import PAGE_PORT, answers_of
 from pebble.extensions.install.setup.steps import Job, load_config
 from pebble.extensions.install.setup.system import ROBOTS, System
 from pebble.extensions.lab.demo.phone import show_qr
+from pebble.extensions.operator.places import Places
 from pebble.runtime.connections import REMOTE_RECONNECT_S, mqtt_settings
-from pebble.runtime.places import Places
 
 _SUDO = "sudo pebble setup"
 

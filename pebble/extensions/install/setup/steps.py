@@ -14,6 +14,7 @@ from pebble.config.config import parse
 from pebble.contract.identity import Identity
 from pebble.errors import PebbleError
 from pebble.extensions.fleet import certificates
+from pebble.extensions.fleet.as_owner import as_owner
 from pebble.extensions.fleet.broker_files import new_password
 from pebble.extensions.fleet.people import People, has_user
 from pebble.extensions.fleet.roles import Role
@@ -39,10 +40,10 @@ from pebble.extensions.install.setup.robot_config import (
     config_of,
 )
 from pebble.extensions.install.setup.system import MOSQUITTO, ROBOTS, SetupError, System
+from pebble.extensions.operator.places import Places
 from pebble.extensions.page.config import WebHandler, WebInterface
 from pebble.extensions.page.setting import people_of
 from pebble.runtime.connections import check_connections
-from pebble.runtime.places import Places
 
 ROBOT_SERVICE, BROKER_SERVICE = UNIT, "mosquitto.service"
 
@@ -202,7 +203,7 @@ class Job:
             return
 
         def add() -> None:
-            with closing(People(file)) as people:
+            with as_owner(file.parent), closing(People(file)) as people:
                 people.add(str(name), self.secrets.password or "", Role.ADMIN)
 
         yield Step(f"{name} may log in at the page, as admin", lambda: has_user(file, str(name)), add, ())

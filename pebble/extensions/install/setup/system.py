@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from pebble.errors import PebbleError
-from pebble.runtime.places import Places
+from pebble.extensions.operator.places import Places
 from pebble.runtime.whole_file import is_root, write
 
 ROBOTS = "root:pebble"  # what the robot reads, and only root changes

@@ -29,7 +29,7 @@ from pebble.extensions.lab.bench.rounds import Progress, in_turn, measure_rounds
 from pebble.extensions.lab.bench.show import RATIOS, Shown, compared, percentiles, plain_table
 from pebble.extensions.lab.bench.usage import cpu_s, pss_mb
 from pebble.extensions.lab.rig.processes import Processes, python
-from pebble.runtime.places import mosquitto_path
+from pebble.extensions.operator.places import mosquitto_path
 
 VARIANTS: Final = ("zenoh-shm", "mqtt", "gstreamer-shm", "memcpy")
 SIZES: Final = ("640x480", "1280x720", "1920x1080")

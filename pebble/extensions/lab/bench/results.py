@@ -160,7 +160,7 @@ def check_folder(folder: Path) -> None:
 
 def machine() -> dict[str, Value]:
     """Describe the machine and the versions that results depend on; no names of hosts or users."""
-    from pebble.runtime.places import mosquitto_path  # not for the processes that only measure
+    from pebble.extensions.operator.places import mosquitto_path  # not for the processes that only measure
 
     model = re.search(r"^(?:model name|Model).*?: *(.*?) *$", Path("/proc/cpuinfo").read_text(), re.MULTILINE)
     broker = ""

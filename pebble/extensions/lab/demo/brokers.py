@@ -12,7 +12,7 @@ from typing import Any
 
 from pebble.errors import PebbleError
 from pebble.extensions.lab.rig.processes import HOST
-from pebble.runtime.places import mosquitto_path
+from pebble.extensions.operator.places import mosquitto_path
 
 
 class BrokerKind(StrEnum):

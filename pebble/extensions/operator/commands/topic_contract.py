@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from pebble.contract import CHANNELS, INCOMING, OUTGOING, Channel
-from pebble.contract.docs import authority, payload_name, rate, travels
 from pebble.extensions.operator.client.names import base_of
+from pebble.extensions.operator.contract.docs import authority, payload_name, rate, travels
 
 if TYPE_CHECKING:
     pass
@@ -33,7 +33,7 @@ def contract(
     """
     prefix = "" if base is None else f"{base_of(base)}/"
     if json_schema:
-        from pebble.contract.schemas import schemas
+        from pebble.extensions.operator.contract.schemas import schemas
 
         typer.echo(json.dumps(schemas(), indent=2))
     elif as_json:

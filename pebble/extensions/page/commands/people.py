@@ -4,7 +4,7 @@ import os
 import sys
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Annotated
 
@@ -13,12 +13,13 @@ import typer
 from pebble.config import load
 from pebble.config.config import default_state_folder
 from pebble.errors import PebbleError
+from pebble.extensions.fleet.as_owner import as_owner
 from pebble.extensions.fleet.audit import Audit, Entry
 from pebble.extensions.fleet.people import People
 from pebble.extensions.fleet.roles import Role
 from pebble.extensions.operator.commands.show import print_table
+from pebble.extensions.operator.places import Places
 from pebble.extensions.page.config import WebHandler, WebInterface
-from pebble.runtime.places import Places
 
 PEOPLE = "people.sqlite"
 PLACES = Places()
@@ -57,9 +58,8 @@ def audit(
         pebble web audit --limit 200
     """
     file = _file(config, people)
-    log = Audit(file)
-    entries = log.read(limit)
-    log.close()
+    with as_owner(file.parent), closing(Audit(file)) as log:
+        entries = log.read(limit)
     if not entries:
         typer.echo(f"{file} has no entries yet")
         return 0
@@ -163,11 +163,9 @@ def _of_machine() -> Path | None:
 
 @contextmanager
 def opened(file: Path | None) -> Iterator[People]:
-    people = People(file)
-    try:
+    """Open a database of people; by root as the owner of its folder, whose file it is."""
+    with as_owner(Path() if file is None else file.parent), closing(People(file)) as people:
         yield people
-    finally:
-        people.close()
 
 
 def _read_password() -> str:

@@ -13,7 +13,7 @@ from tests.kit.mqtt_bytes import packet
 from tests.sparing_broker import packet_of
 from tests.support import free_port
 
-CONNECT, PUBLISH, PINGRESP, DISCONNECT = 0x10, 0x30, 0xD0, 0xE0
+CONNECT, PUBLISH, SUBSCRIBE, PINGRESP, DISCONNECT = 0x10, 0x30, 0x80, 0xD0, 0xE0
 RETAIN, BRIDGE = 0x01, 0x80
 _LEVEL = 6  # its place in the body of a CONNECT
 _LATE_S = 3.0
@@ -62,6 +62,15 @@ class HidesRetained(Fault):
 class Doubles(Fault):
     def down(self, first: int, body: bytes) -> list[bytes]:
         return super().down(first, body) * (2 if kind(first) == PUBLISH else 1)
+
+
+class Floods(Fault):
+    """Sends 30 MB after each subscription."""
+
+    def up(self, first: int, body: bytes) -> list[bytes]:
+        if kind(first) == SUBSCRIBE:
+            self.answers += [packet(PUBLISH, b"\0\1x" + bytes(1_000_000))] * 30
+        return super().up(first, body)
 
 
 class Mute(Fault):

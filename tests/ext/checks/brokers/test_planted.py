@@ -45,6 +45,7 @@ FAULTS = [
     further(faulty.RetainsNothing, "rights", "it retains nothing"),
     (faulty.HidesRetained, "rights", "without the retain flag"),
     (faulty.Doubles, "overlapping filters", "2 copies"),
+    (faulty.Floods, "rights", "without end"),
     further(faulty.Mute, "answers to pings", "does not answer"),
     (faulty.EagerPongs, "answers to pings", "before it has passed on what came before"),
     (faulty.SendsBack, "bridge mode", "own messages come back"),

@@ -24,7 +24,7 @@ from pebble.extensions.fleet.hub_file import load_hub
 from pebble.extensions.fleet.people import People
 from pebble.extensions.fleet.roles import Role
 from pebble.extensions.lab.rig.processes import python
-from pebble.runtime.places import mosquitto_path
+from pebble.extensions.operator.places import mosquitto_path
 from pebble.transports.zenoh.access import read_access
 from tests.ext.fleet.broker_client import BrokerClient, Place
 from tests.kit.terminal import Terminal

@@ -6,7 +6,7 @@ import json
 from typing import Any
 
 from pebble.extensions.checks.report.secrets_here import secrets_of
-from pebble.runtime.places import Places
+from pebble.extensions.operator.places import Places
 from tests.ext.install.life.robots import BASE, PORT, ROBOT, Robot
 from tests.kit.machine import Machine
 from tests.support import until

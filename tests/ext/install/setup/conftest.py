@@ -8,7 +8,7 @@ import pytest
 
 from pebble.extensions.install.commands import setup as command
 from pebble.extensions.install.setup import system
-from pebble.runtime.places import Places
+from pebble.extensions.operator.places import Places
 from tests.commands.command_line import Run
 from tests.ext.install.setup.rig import machine, machine_root
 

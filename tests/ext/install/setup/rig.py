@@ -18,7 +18,7 @@ from pebble.extensions.install.setup.answers import Answers, Secrets
 from pebble.extensions.install.setup.robot_config import answers_of
 from pebble.extensions.install.setup.steps import Job
 from pebble.extensions.install.setup.system import System
-from pebble.runtime.places import Places
+from pebble.extensions.operator.places import Places
 
 PASSWORD, BROKER_PASSWORD = "sentinel-of-ann-7c1d", "sentinel-of-goob-11fe"
 ANSWERS: dict[str, Any] = {

@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from pebble.runtime.places import Places
+from pebble.extensions.operator.places import Places
 from tests.commands.command_line import Run
 from tests.ext.install.setup.rig import ANSWERS, BROKER_PASSWORD, PASSWORD, answers_in, set_up, tree
 from tests.kit.terminal import Terminal

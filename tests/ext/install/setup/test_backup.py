@@ -20,10 +20,10 @@ from pebble.extensions.fleet.folder import load as load_fleet
 from pebble.extensions.fleet.people import People
 from pebble.extensions.install.commands import setup as command
 from pebble.extensions.install.setup.backup import ABOUT, BackupError, make, packed, read, unpacked
+from pebble.extensions.operator.places import Places
 from pebble.extensions.scripts.perception.camera_model import CameraModel
 from pebble.motion.latch import Latch
 from pebble.motors.state_file import StateFile
-from pebble.runtime.places import Places
 from tests.commands.command_line import Run
 from tests.ext.checks.installed import BROKER, MQTT, PAGE, PEOPLE, ROBOT, config_of, installed
 from tests.support import ROOT
@@ -137,7 +137,7 @@ def test_others_cannot_read_it_from_its_first_byte_on(places: Places, tmp_path: 
     audit = (
         "import sys, os, pathlib\n"
         "from pebble.extensions.install.commands.setup import back_up\n"
-        "from pebble.runtime.places import Places\n"
+        "from pebble.extensions.operator.places import Places\n"
         f"log = open({str(log)!r}, 'w')\n"
         f"sys.addaudithook(lambda name, arguments: name == 'open' and arguments[0] == {str(file)!r}\n"
         "    and print(arguments[2], os.umask(os.umask(0)), os.path.exists(arguments[0]), file=log))\n"

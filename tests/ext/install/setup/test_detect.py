@@ -15,7 +15,7 @@ import pytest
 
 from pebble.extensions.install.setup import detect, system
 from pebble.extensions.install.setup.system import SetupError
-from pebble.runtime.places import Places
+from pebble.extensions.operator.places import Places
 from pebble.services.serial_mcu_bridge.pebble_serial_v1 import frame
 
 _HELLO = frame.encode(frame.Frame(frame.Type.HELLO, b"x"))

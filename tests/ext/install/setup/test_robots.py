@@ -20,9 +20,9 @@ from pebble.extensions.fleet.certificates import CA_CERT
 from pebble.extensions.fleet.people import People
 from pebble.extensions.fleet.roles import Account, Role
 from pebble.extensions.install.setup.backup import make
+from pebble.extensions.operator.places import Places, mosquitto_path
 from pebble.extensions.page.commands import people as web_people
 from pebble.runtime.connections import mqtt_settings
-from pebble.runtime.places import Places, mosquitto_path
 from pebble.transports import MqttSettings
 from pebble.transports.settings import TlsSettings
 from tests.commands.command_line import Run

@@ -12,7 +12,7 @@ import pytest
 from pebble.config import load
 from pebble.extensions.install.setup.robot_config import changed
 from pebble.extensions.install.setup.system import SetupError
-from pebble.runtime.places import Places
+from pebble.extensions.operator.places import Places
 from tests.commands.command_line import Run
 from tests.ext.install.setup.rig import ANSWERS, PASSWORD, answers_in, in_child, machine_root, set_up, tree
 from tests.support import cases

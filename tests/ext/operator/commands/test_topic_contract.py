@@ -7,7 +7,7 @@ import json
 import pytest
 
 from pebble.contract import CHANNELS
-from pebble.contract.schemas import schemas
+from pebble.extensions.operator.contract.schemas import schemas
 from tests.commands.command_line import GOOB, Run
 
 

@@ -142,20 +142,6 @@ def test_whose_people_may_use_the_page_of_a_config(
     assert [settings.people for settings in served] == ([tmp_path / counts / "people.sqlite"] if counts else [])
 
 
-def test_a_folder_without_a_certificate_and_the_missing_user_are_named_at_once(
-    run: Run, served: list[WebSettings], tmp_path: Path, state: Path
-) -> None:
-    assert run("web", "--url", "mqtt://broker.example", "--tls", tmp_path) == 2
-    lines = run.err.splitlines()
-    assert lines[0] == "pebble: a page with --tls has a login, so the page needs a certificate and a user:"
-    assert lines[1].startswith(f"    pebble cert init --folder {tmp_path} ")
-    assert lines[2].startswith("    pebble web user add ")
-    assert lines[3] == f"    pebble web --url mqtt://broker.example --tls {tmp_path}"
-    assert run(*lines[1].split()[1:]) == 0, run.err
-    assert run("web", "--url", "mqtt://broker.example", "--tls", tmp_path) == 2
-    assert run.err.splitlines()[0].endswith("so the page needs a user:")
-
-
 @pytest.mark.parametrize(
     ("arguments", "why"),
     [
@@ -172,13 +158,6 @@ def test_mistakes_are_one_line(run: Run, served: list[WebSettings], arguments: l
     assert run.err.count("\n") == 1
     assert SECRET not in run.err
     assert served == []
-
-
-def test_without_the_extra(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("pebble.extensions.operator.client.page_packages.find_spec", lambda name: None)
-    assert run("web", "--url", "mqtt://a") == 1
-    assert run.err.endswith("pip install 'pebble-robot[web]'\n")
-    assert run.err.count("\n") == 1
 
 
 # -- users
@@ -227,13 +206,6 @@ def test_mistakes_with_users(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
         assert run.err == "pebble: there is no 'bob': `pebble web user list` lists the names\n"
     assert run("web", "user") == 0
     assert "pebble web user add alice --role driver" in run.out
-
-
-def test_users_of_a_robots_own_page(run: Run, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    config = config_file(tmp_path, transport={"kind": "mqtt", "state_dir": str(tmp_path / "robot")})
-    give(monkeypatch, f"{SECRET}\n")
-    assert run("web", "user", "add", "alice", "--config", config) == 0, run.err
-    assert (tmp_path / "robot/people.sqlite").exists()
 
 
 def test_a_terminal_is_asked_twice_without_echo(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:

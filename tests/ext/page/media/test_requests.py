@@ -4,16 +4,12 @@ from __future__ import annotations
 
 import asyncio
 import operator
-import time
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-import msgspec
 import pytest
 
-from pebble.transports import Message
 from tests.ext.page.media.robots import (
-    EVERYTHING,
     REF,
     MediaRobot,
     Page,
@@ -178,39 +174,11 @@ async def test_capabilities_that_change_later_end_the_request(
     assert {message.topic for message in robot.published} == {robot.request, robot.flag}
 
 
-@pytest.mark.parametrize("topic", ["incoming/elsewhere", "incoming/a/../../../victim"])  # ".." means nothing
-async def test_the_request_moves_to_another_topic_of_the_robots_own(
-    kind: Kind, robot: Any, server: Server, topic: str
-) -> None:
-    await opened(server, kind)
-    robot.announce({**robot.section, "command_topic": f"{REF}/{topic}"})
-    await until(lambda: f"{REF}/{topic}" in {message.topic for message in list(robot.published)})
-    assert robot.encodings == [robot.best, None]
-
-
-async def test_a_page_cannot_name_a_filter(kind: Kind, robot: Any, server: Server) -> None:
-    refs = ("+/+/+", "#", "", "pebble/robots/#", "a/b", "a/b/c/d", "$x/y/z")
-    pages = [server.open(kind.page(), ref=ref) for ref in refs]
-    await until(lambda: all(page.closed for page in pages))
-    assert robot.published == []
-
-
 async def test_a_robot_that_lists_no_encodings_sends_what_it_sends(kind: Kind) -> None:
     robot: Any = kind.robot({key: value for key, value in kind.robot.section.items() if key != "encodings"})
     async with serving(robot) as server:
         await opened(server, kind, 4)
         assert robot.encodings == [""]
-
-
-async def test_one_page_that_decodes_less_is_enough_for_another_encoding(
-    kind: Kind, robot: Any, server: Server
-) -> None:
-    await opened(server, kind)
-    plain = server.open(kind.page(), EVERYTHING - {robot.best})
-    await until(lambda: len(plain.received) > 3)
-    plain.leave()
-    await until(lambda: len(robot.encodings) == 3)
-    assert robot.encodings[0] == robot.encodings[2] == robot.best
 
 
 async def test_a_page_that_sends_what_is_not_understood_is_closed(kind: Kind, server: Server) -> None:
@@ -230,24 +198,3 @@ async def test_closing_withdraws_and_closes_the_sockets(kind: Kind, robot: Any, 
     await until(lambda: robot.encodings[-1] is None)
     late = server.open(kind.page())
     await until(lambda: late.closed is not None)
-
-
-async def test_nothing_is_withdrawn_while_there_is_no_broker(kind: Kind, robot: Any, server: Server) -> None:
-    page = await opened(server, kind)
-    robot.hub.stop()
-    await until(lambda: not server.broker.connected)
-    page.leave()
-    await asyncio.sleep(1.2)
-    robot.hub.start()
-    await until(lambda: robot.encodings[-1] is None and robot.flags[-1] is False)
-
-
-async def test_pages_are_shown_that_pictures_and_sound_wait(kind: Kind, robot: Any, server: Server) -> None:
-    program = {"video": "camera_publisher", "audio": "audio_publisher"}[robot.medium]
-    robot.mute = True
-    server.open(kind.page())
-    await until(lambda: server.shows("starting"))
-    for state, shown in (("held", "held"), ("ready", "starting"), (7, "starting")):
-        status = {"t": 1, "value": {"services": {program: {"state": state}}}}
-        server.robots.receive(Message(f"{REF}/outgoing/status", msgspec.json.encode(status)), time.monotonic())
-        await until(lambda shown=shown: server.shows(shown))  # type: ignore[misc]

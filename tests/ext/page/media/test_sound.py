@@ -12,7 +12,6 @@ import pytest
 from pebble.contract import LINK, codec
 from pebble.contract.packets import Codec, Sound
 from pebble.contract.payloads import LinkState
-from pebble.extensions.fleet.roles import Role
 from pebble.extensions.page.media.sound import MAX_PACKETS, WINDOW, SoundQueue
 from pebble.extensions.page.media.talk import LATE_S, PIECE_BYTES, PIECES_PER_S, SILENT_S, Talk, Voice
 from pebble.transports import Message
@@ -102,14 +101,6 @@ async def test_what_is_no_sound_is_not_passed_on(robot: SoundRobot, server: Serv
 # -- talking
 
 
-async def test_a_talk_to_a_robot_without_sound_is_refused() -> None:
-    async with serving(SoundRobot({})) as server:
-        page = server.open(SoundPage())
-        await page.speak(1, 3)
-        await until(lambda: page.talks)
-        assert page.talks == [{"talk": 1, "on": False, "why": "it has no sound"}]
-
-
 async def test_no_voice_takes_the_room_of_commands_on_a_thin_link(robot: SoundRobot, server: Server) -> None:
     link = codec.encode(LINK, LinkState(level="thin", drive_hz=4, rtt_ms=600, queue_ms=0, t=1))
     server.robots.receive(Message(LINK.topic(REF), link), time.monotonic())
@@ -163,16 +154,6 @@ async def test_a_second_talker_is_refused_until_the_first_one_is_done(robot: Sou
     assert server.noted == [(REF, "bob"), (REF, "eve")]
 
 
-async def test_a_viewer_listens_and_does_not_talk(robot: SoundRobot, server: Server) -> None:
-    page = server.open(SoundPage(), role=Role.VIEWER)
-    await until(lambda: page.received)
-    await page.speak(1, 3)
-    await until(lambda: page.talks)
-    assert page.talks == [{"talk": 1, "on": False, "why": "The role viewer may not do this"}]
-    assert robot.voice == []
-    assert UPLINK not in {message.topic for message in robot.published}
-
-
 async def test_a_talk_ends_with_its_socket_and_after_a_second_without_sound(
     robot: SoundRobot, server: Server, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -202,14 +183,6 @@ async def test_a_talk_ends_when_the_robots_sound_is_refused(robot: SoundRobot, s
     await until(lambda: len(page.talks) > 1)
     assert page.talks[1:] == [{"talk": 1, "on": False, "why": "its sound cannot be switched on from here"}]
     await until(lambda: server.view.talker == "")
-
-
-async def test_a_talk_ends_when_the_broker_takes_nothing(robot: SoundRobot, server: Server) -> None:
-    server.broker.publish = lambda *_, **__: False  # type: ignore[method-assign]
-    page = server.open(SoundPage(), NOTHING)
-    await page.speak(1, 50)
-    await until(lambda: len(page.talks) > 1)
-    assert page.talks[1:] == [{"talk": 1, "on": False, "why": "The server cannot reach the broker"}]
 
 
 async def test_the_voice_goes_to_the_robots_own_topic_only() -> None:

@@ -73,8 +73,57 @@ ENDS = [
     "dialog = {}; driver.tick()",
     "socket.roundTripMs = 9999; driver.tick()",
 ]
+#: What has the focus.
+FOCUS = {
+    "": "{}",
+    "a field": "{ matches: (all) => all.includes('textarea') }",
+    "a button": "{ matches: (all) => all.startsWith('button') }",
+    "a slider": "{ matches: (all) => all.startsWith('input[type=range]') }",
+}
+#: Keys, what is held beside them, what has the focus, and what is done.
+PRESSES = [
+    ("Enter", "ctrlKey", "a field", ["estop: Ctrl+Enter", "ended"]),
+    ("NumpadEnter", "metaKey", "", ["estop: Ctrl+Enter", "ended"]),
+    ("Space", "ctrlKey", "a field", ["estop: Ctrl+Space", "ended"]),
+    ("Space", "metaKey", "", ["stop", "ended"]),
+    ("Space", "", "a field", []),
+    ("KeyW", "", "", ["drive"]),
+    ("KeyW", "", "a slider", ["drive"]),
+    ("KeyW", "", "a field", []),
+    ("KeyW", "ctrlKey", "", []),
+    ("ArrowUp", "", "", ["drive"]),
+    ("ArrowUp", "", "a slider", []),
+    ("KeyT", "", "", ["talk down"]),
+    ("KeyT", "", "a field", []),
+    ("KeyT", "altKey", "", []),
+]
+FREE = "store.set(REF, 'web/driver', { you: false, by: '' });"
 # fmt: off
 DRIVER: Rows = {
+    **{f"{beside} {pressed} in {where or 'nothing'}": (
+        f"key('{pressed}', {{ {beside or 'other'}: true, target: {FOCUS[where]} }});", expected)
+        for pressed, beside, where, expected in PRESSES},
+    "Enter takes control that is free": (f"""
+        {FREE} key("Enter", {{ repeat: true }}); key("Enter", {{ target: {FOCUS["a button"]} }}); await null;
+        const before = [...done]; key("Enter"); await null; result = [before, done];""", [[], ["lease", "ended"]]),
+    "a key without control is answered and drives nothing": (f"""
+        {FREE} key("KeyW"); result = [done, Number.isFinite(driver.hintedAt), driver.gestureActive];""",
+        [[], True, False]),
+    "behind a dialog no key is held": (
+        "dialog = {}; key('KeyW'); result = [done, driver.inputs.neutral];", [[], True]),
+    "what is known of an earlier connection allows no driving": ("""
+        socket.outdated = true; result = [driver.reason().code]; socket.state = "lost";
+        result.push(driver.reason().code);""", ["connecting", "server"]),
+    "after a reset a driver pauses": ("""
+        store.set(REF, "web/estop", { latched: true, by: "eve" }); driver.tick(); result = [driver.reason().code];
+        store.set(REF, "web/estop", { latched: false, by: "" }); driver.tick(); result.push(driver.reason().code);
+        driver.latchedAt -= 1000; result.push(driver.reason());""", ["stopped", "reset", None]),
+    "the space bar plays a replay where nothing is driven": (f"""
+        driver.select(""); driver.onSpace = () => done.push("play"); await null; done.length = 0;
+        key("Space"); key("Space", {{ repeat: true }}); key("Space", {{ target: {FOCUS["a button"]} }});""", ["play"]),
+    "watchers are told of changes only": ("""
+        let told = 0; driver.onChange(() => (told += 1)); driver.changed(); driver.changed();
+        driver.sliders.speed = 0.9; driver.changed(); driver.changed(); result = told;""", 1),
     **{f"what ends a gesture lets go of what else is held: {end}": (f"""
         key('KeyW'); key('KeyT'); await null; result = [done.at(-1)]; done.length = 0; {end};
         await null; result.push(['talk up', 'ended'].every((one) => done.includes(one)));""", ["talk down", True])

@@ -18,8 +18,6 @@ from tests.ext.media.test_jitter import play
 from tests.ext.page.in_node import evaluate
 
 EPOCH_MS = 1_700_000_000_000
-COUNTERS = ("packets", "duplicates", "late", "lost", "overflow", "skipped", "underruns", "jumps", "restarts")
-
 Arrival = tuple[float, bytes]
 
 _PLAY = """
@@ -59,7 +57,7 @@ def expected_of(options: dict[str, int], arrivals: list[Arrival]) -> dict[str, A
         [at, chunk.rate, chunk.channels, chunk.concealed, chunk.samples.reshape(-1).tolist()]
         for at, chunk in play(buffer, arrivals).chunks
     ]
-    return {"chunks": chunks, "counters": {name: buffer.counters[name] for name in (*COUNTERS, "refused")}}
+    return {"chunks": chunks, "counters": buffer.counters}
 
 
 def arrivals(randoms: random.Random) -> list[Arrival]:
@@ -118,15 +116,6 @@ def test_the_jitter_buffer_plays_the_same_samples_at_the_same_times(seeds: range
         counters = expected["counters"]
         assert one["chunks"] == expected["chunks"]
         assert (one["lost"], one["refused"]) == (counters["lost"] + counters["overflow"], counters["refused"])
-
-
-def test_the_cases_have_everything_in_them() -> None:
-    cases = [arrivals(random.Random(seed)) for seed in range(12)]
-    total = dict.fromkeys((*COUNTERS, "refused"), 0)
-    for coming in cases:
-        counters = expected_of({"limit": 20, "concealmentMs": 100, "targetMs": 37}, coming)["counters"]
-        total = {name: total[name] + counters[name] for name in total}
-    assert all(total.values()), total
 
 
 @pytest.mark.parametrize(("rate", "rate_out"), [(16000, 48000), (16000, 44100), (48000, 16000), (44100, 16000)])

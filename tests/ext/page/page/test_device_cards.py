@@ -10,7 +10,7 @@ import pytest
 
 from tests.ext.page.browser import PIXELS, Tab
 from tests.ext.page.canned import CannedServer, Show, State, Value
-from tests.ext.page.states import GOOB, STATES, at, changed, devices, liveness, outlet
+from tests.ext.page.states import GOOB, STATES, at, changed, devices, outlet
 
 pytestmark = pytest.mark.page
 
@@ -27,33 +27,11 @@ def cards(show: Show) -> Iterator[Tab]:
         assert opened.complaints() == []
 
 
-def reason(opened: Tab, name: str) -> str:
-    """What describes why a control is off."""
-    ids = opened.test(name).get_attribute("aria-describedby") or ""
-    return " ".join(opened.page.locator(f'[id="{one}"]').inner_text() for one in ids.split())
-
-
 def with_values(*more: Callable[[int], Value], **fields: Any) -> State:
     return replace(STATES["devices"], values=changed(devices, *more), **fields)
 
 
 # -- outlets
-
-
-def test_outlets_have_their_state_and_the_reason_why_they_are_off(cards: Tab) -> None:
-    states = {name: cards.test(f"outlet-state-{name}").inner_text() for name in ("o1", "o2", "o4")}
-    assert states == {"o1": "on", "o2": "off", "o4": "off"}
-    assert "Desk lamp (o1)" in cards.page.locator('[data-card="outlets"]').inner_text()
-    assert [cards.test(f"outlet-{name}").is_disabled() for name in ("o1", "o2", "o3", "o4", "o5")] == [
-        False,
-        False,
-        True,
-        True,
-        True,
-    ]
-    assert reason(cards, "outlet-o4") == "outlet is unreachable"
-    assert reason(cards, "outlet-o5") == "no device is bound to this outlet"
-    assert "no control" in reason(cards, "outlet-o3")
 
 
 def test_what_was_asked_is_shown_until_the_outlet_reports_it(show: Show, server: CannedServer) -> None:
@@ -70,38 +48,6 @@ def test_what_was_asked_is_shown_until_the_outlet_reports_it(show: Show, server:
         assert opened.test("outlet-asked-o2").count() == 0
         opened.test("outlet-o2").click()
         assert opened.until(lambda: [one["on"] for one in server.sent("outlet")] == [True, False])
-
-
-def test_a_refusal_stands_at_what_was_asked(show: Show) -> None:
-    with show(replace(STATES["devices"], refused="No, why")) as opened:
-        opened.test("outlet-o2").click()
-        card = opened.page.locator('[data-card="outlets"]')
-        assert opened.until(lambda: card.get_by_text("not done: No, why").count() == 1)
-        assert "not done" in opened.page.locator("li.outlet", has=opened.test("outlet-o2")).inner_text()
-        assert opened.test("outlet-asked-o2").count() == 0
-        form = opened.test("mcu-in-lamp")
-        form.locator('[data-test="field-level"]').fill("1")
-        opened.test("send-lamp").click()
-        assert opened.until(lambda: "not done: No, why" in form.inner_text())
-        assert "not done" not in opened.test("mcu-in-arm").inner_text()
-
-
-def test_what_is_on_can_be_switched_off_while_the_robot_is_silent(show: Show, server: CannedServer) -> None:
-    silent = at(GOOB, "web/liveness", liveness(online=False, silent_s=9.0, latency_ms=None))
-    with show(with_values(silent)) as opened:
-        assert opened.until(lambda: opened.test("outlet-o2").is_disabled())
-        assert reason(opened, "outlet-o2") == "goob is silent"
-        assert opened.test("outlet-state-o1").inner_text() == "was on"
-        opened.test("outlet-o1").click()
-        assert opened.until(lambda: [one["on"] for one in server.sent("outlet")] == [False])
-
-
-def test_a_viewer_may_look(show: Show) -> None:
-    with show(STATES["devices-viewer"]) as opened:
-        assert opened.until(lambda: opened.test("outlet-o1").is_disabled())
-        assert reason(opened, "outlet-o1") == "Log in as driver to use this"
-        assert opened.test("send-lamp").is_disabled()
-        assert reason(opened, "send-lamp") == "Log in as driver to use this"
 
 
 # -- microcontrollers
@@ -159,19 +105,6 @@ HOSTILE: dict[str, Any] = {
     "twice": {
         "interfaces": [{"name": "x", "dir": "out", "encoding": {"fields": [{"name": "f", "type": "u8"}] * 2}}] * 2
     },
-    "names": {
-        "interfaces": [{"name": "x", "dir": "in", "encoding": {"fields": [{"name": "__proto__", "type": "u8"}]}}]
-    },
-    "huge": {
-        "interfaces": [
-            {
-                "name": f"i{n}",
-                "dir": ("in", "out")[n % 2],
-                "encoding": {"fields": [{"name": "y" * 60, "type": "f32"}] * 9},
-            }
-            for n in range(60)
-        ]
-    },
 }
 
 
@@ -193,17 +126,3 @@ def test_hostile_manifests_reports_and_capabilities_do_no_harm(show: Show, serve
 
 
 # -- all values
-
-
-def test_values_of_a_component_of_any_type_are_shown_in_lines(show: Show) -> None:
-    with show(STATES["satellite"]) as opened:
-        shown = opened.test("value-status")
-        shown.wait_for()
-        assert [" ".join(line.split()) for line in shown.locator("li").all_inner_texts()] == [
-            "lat_deg 52.1",
-            "lon_deg 13.4",
-            "alt_km 412.5",
-            "mode sun pointing",
-        ]
-        assert opened.test("value-charging-level").locator("li").inner_text() == "81 %"
-        assert "ago" in shown.locator("dt").inner_text()

@@ -3,22 +3,15 @@
 import pytest
 from playwright.sync_api import Locator
 
-from tests.ext.page.canned import CannedServer, Show, State
-from tests.ext.page.states import GOOB, STATES, estop, robot
+from tests.ext.page.canned import CannedServer, Show
+from tests.ext.page.states import GOOB, STATES
 
 pytestmark = pytest.mark.page
 
-#: Where the card is pressed, as parts of its width and height.
-PLACES = {"top left": (0.02, 0.02), "centre": (0.5, 0.5), "bottom left": (0.02, 0.98)}
 
-
-@pytest.mark.parametrize("place", PLACES.values(), ids=PLACES)
-def test_the_whole_card_opens_its_robot(show: Show, place: tuple[float, float]) -> None:
+def test_the_whole_card_opens_its_robot(show: Show) -> None:
     with show(STATES["fleet"]) as opened:
-        card = opened.test("card-goob")
-        box = card.bounding_box()
-        assert box is not None
-        card.click(position={"x": place[0] * box["width"], "y": place[1] * box["height"]})
+        opened.test("card-goob").click(position={"x": 4, "y": 4})
         assert opened.until(f"window.pebble.driver.ref === '{GOOB}'", 3)
 
 
@@ -27,20 +20,6 @@ def test_a_stop_of_a_card_opens_nothing(show: Show, server: CannedServer) -> Non
         opened.test("stop-goob").click()
         assert opened.until(lambda: server.sent("estop"))
         assert opened.page.evaluate("location.pathname") == "/"
-
-
-def test_many_robots_are_shown_by_what_they_need(show: Show) -> None:
-    names = [f"pebble/robots/r{number:02}" for number in range(14)]
-
-    def many(now: int) -> list[tuple[str, str, object, int]]:
-        stopped = (names[3], "web/estop", {**estop(now), "latched": True}, 0)
-        return [one for name in names for one in robot(now, name, "mqtt", 7.9)] + [stopped]
-
-    with show(State("/", many)) as opened:
-        group = opened.page.locator("section[aria-label='Need a look'] .fleet-card")
-        assert opened.until(lambda: group.locator("h2").all_inner_texts() == ["r03"])
-        assert opened.page.locator(".fleet-card").count() == 14
-        assert opened.test("stopped").inner_text() == "1 stopped"
 
 
 def test_the_first_steps_are_ticked_and_can_be_hidden(show: Show) -> None:
@@ -55,13 +34,6 @@ def test_the_first_steps_are_ticked_and_can_be_hidden(show: Show) -> None:
         opened.page.reload()
         opened.test("card-goob").wait_for()
         assert steps.count() == 0
-
-
-def test_robots_without_a_camera_show_their_face(show: Show) -> None:
-    with show(STATES["fleet"]) as opened:
-        assert opened.test("card-minilamp").locator(".thumbnail use").get_attribute("href", timeout=3000)
-        assert "no camera" in opened.test("card-minilamp").inner_text()
-        assert opened.test("card-goob").get_by_text("live").is_visible()
 
 
 def shown(cards: Locator) -> list[str]:

@@ -8,16 +8,13 @@ import cv2
 import numpy as np
 import pytest
 
-from tests.ext.page.browser import Size, Theme, answer
+from tests.ext.page.browser import Size, Theme
 from tests.ext.page.canned import CannedServer, Show
 from tests.ext.page.states import FRED, GOOB, LAMP, STATES
 
 pytestmark = pytest.mark.page
 
 SCREEN = "**/ui/robot/robot.js"
-LATER = "fleet", "cards", "drive", "stick", "video", "settings"
-SHOWN = "document.querySelector('.vital .chip:last-child').innerText + document.querySelector('.pad-words').innerText"
-HERE = r"performance.getEntriesByType('resource').map((one) => one.name.match(/(\w+).js$/)?.[1])"
 
 
 def test_a_screen_that_cannot_be_fetched_is_tried_again_while_stop_works(show: Show, server: CannedServer):
@@ -36,45 +33,6 @@ def test_a_screen_that_cannot_be_fetched_is_tried_again_while_stop_works(show: S
             again.click()
         opened.test("why").first.wait_for()
         assert opened.until(lambda: opened.page.locator(".loading").count() == 0)  # those of cards come and go
-
-
-def test_the_other_screens_are_here_without_a_server(show: Show):
-    with show(STATES["fleet"]) as opened:
-        assert opened.until(lambda: set(LATER) <= set(opened.page.evaluate(HERE)))
-        opened.context.set_offline(True)
-        opened.page.locator("[data-test^=card-]", has_text="goob").locator("a").first.click()
-        opened.test("why").first.wait_for()
-        opened.test("settings").click()
-        opened.test("theme-dark").wait_for()
-
-
-def test_only_one_panel_is_open(show: Show) -> None:
-    with show(STATES["driving"]) as opened:
-        opened.test("bell").click()
-        opened.test("panel-notices").wait_for()
-        opened.test("help").click()
-        opened.test("panel-help").wait_for()
-        assert opened.until(lambda: opened.page.locator("dialog").count() == 1)
-        opened.test("bell").click()
-        opened.test("panel-notices").wait_for()
-        assert opened.until(lambda: opened.page.locator("dialog").count() == 1)
-
-
-def test_a_driver_sees_that_the_robot_can_no_longer_be_driven_and_then_that_it_can(show: Show) -> None:
-    with show(STATES["driving"]) as opened:
-        opened.test("bell").wait_for()
-        for state, chip, hint in (
-            ("yes", "You drive", "drag the stick"),
-            ("no", "Not driving", ""),
-            ("unknown", "You drive", "drag the stick"),
-            ("yes", "You drive", "drag the stick"),
-        ):
-            status = {"value": {"services": {}, "driveable": {"state": state, "why": "serial: no board"}}}
-            opened.page.evaluate("([ref, status]) => pebble.store.set(ref, 'status', status)", [GOOB, status])
-            opened.page.wait_for_timeout(300)  # what is replaced before it is drawn nobody sees
-            assert opened.until(f"{SHOWN} === '{chip}{hint}'"), opened.page.evaluate(SHOWN)
-        opened.test("bell").click()
-        assert opened.until("document.querySelector('.notice-driveable')?.innerText.includes('can be driven again')")
 
 
 STOPPED = """(refs) => refs.forEach((ref) => pebble.store.set(
@@ -107,16 +65,6 @@ def test_a_button_that_is_switched_off_while_it_is_held_does_nothing(show: Show,
         assert server.sent("estop-reset") == []
 
 
-def test_the_picture_outlives_what_belongs_to_it(show: Show):
-    """What a robot reports of its own stream is drawn by a part that is fetched later; here that part fails."""
-    broken = "export const Layer = () => { throw new Error('broken'); }; export const Tools = Layer;"
-    extras = {"**/ui/robot/picture-extras.js": answer(broken)}
-    with show(STATES["driving"], routes=extras) as opened:
-        assert opened.until(lambda: opened.page.locator(".failed").count() == 2)
-        assert opened.until(lambda: opened.page.locator(".canvas canvas").is_visible())
-        assert opened.test("video").is_enabled()
-
-
 # -- values that age
 
 SEND = """async ([ref, count]) => {
@@ -140,15 +88,6 @@ def test_a_value_that_stops_becomes_late_and_the_next_one_is_fresh(show: Show) -
         assert opened.until(lambda: level.inner_text() == "7.00 V 0 s old", 3), level.inner_text()
 
 
-def test_the_state_of_an_earlier_connection_allows_no_driving(show: Show, server: CannedServer) -> None:
-    state = replace(STATES["driving"], repeated={})
-    reason = "pebble.driver.reason()?.code"
-    with show(state) as opened:
-        assert opened.until(f"window.pebble && {reason} === undefined", 10)
-        # another server answers, and what it knows comes a moment later
-        assert opened.page.evaluate(f"pebble.driver.socket.welcome(pebble.driver.socket.you), {reason}") == "connecting"
-
-
 # -- colours, and what still loads
 
 #: What is drawn, and how: its pixels are not all of one colour.
@@ -170,8 +109,7 @@ COVERED = """(() => {
 LATE = ("drive-settings.js", "key-hints.js", "telemetry.js", "map.js", "lights.js", "plots.js", "panels.css")
 
 
-@pytest.mark.parametrize("theme", ["light", "dark"])
-@pytest.mark.parametrize("size", ["desktop", "phone"])
+@pytest.mark.parametrize(("size", "theme"), [("desktop", "light"), ("phone", "dark")])
 def test_the_stick_is_seen_in_forced_colours(show: Show, size: Size, theme: Theme) -> None:
     with show(STATES["driving"], size, theme=theme, forced_colors="active") as opened:
         opened.uncover("stick")

@@ -7,12 +7,10 @@ from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
 
-import numpy as np
 import pytest
-from playwright.sync_api import Browser, Route
+from playwright.sync_api import Route
 
-from tests.ext.page import recorded
-from tests.ext.page.browser import PIXELS, Tab
+from tests.ext.page.browser import Tab
 from tests.ext.page.canned import CannedServer, Show
 from tests.ext.page.recorded import DAY, END, GAP, ROBOT, START
 from tests.ext.page.states import STATES
@@ -117,13 +115,6 @@ def test_playing_and_its_keys(replay: Tab):
     assert replay.until(lambda: START <= position(replay) <= START + 10_000)
 
 
-def test_another_day_is_opened(replay: Tab):
-    replay.test("open-days").click()
-    replay.page.locator("[data-test=replay-day] option").nth(1).wait_for(state="attached")
-    replay.test("replay-day").select_option("2026-11-21")
-    assert replay.until("pebble.replay.day.name === '2026-11-21' && !pebble.replay.feed.seeking", 30)
-
-
 @pytest.mark.parametrize("size", ["desktop", "phone"])
 def test_the_bar_shows_what_was_recorded_and_leads_there(show: Show, size) -> None:
     with show(STATES["replay"], size) as opened:
@@ -141,12 +132,6 @@ def test_the_bar_shows_what_was_recorded_and_leads_there(show: Show, size) -> No
         assert opened.page.locator(".player-marks > .gap").count() <= 1
         assert opened.page.locator(".player-marks > .drive").count() == 1
         assert opened.complaints() == []
-
-
-def test_a_key_in_a_list_is_not_the_replays(replay: Tab):
-    replay.test("speed").focus()
-    replay.page.keyboard.press("ArrowRight")
-    assert position(replay) == AT
 
 
 def test_the_cards_show_that_time_and_none_of_them_sends(replay: Tab):
@@ -168,28 +153,6 @@ def test_the_cards_show_that_time_and_none_of_them_sends(replay: Tab):
     assert replay.page.evaluate("pebble.store.get('pebble/robots/goob', 'touch-sensors').value.value.a0") == 512  # live
 
 
-def test_plots_and_the_trail_grow_while_it_plays_and_begin_anew_with_a_seek(replay: Tab):
-    replay.page.evaluate("pebble.replay.feed.setSpeed(8)")
-    replay.test("play").click()
-    trail = """async () => {
-      const { recorderOf } = await import(`/static/${pebble.connection.version}/ui/parts/recorder.js`);
-      return recorderOf(pebble.replay.page, 'pebble/robots/goob').all.get('poses wheel-odometry')?.times ?? []; }"""
-    assert replay.until(lambda: len(replay.page.evaluate(trail)) > 8)
-    replay.test("play").click()
-    seek(replay, START + 5000)
-    assert replay.until(lambda: replay.page.evaluate(trail) in ([START + 5000], [START + 4800]))
-
-
-def test_overlays_are_those_of_that_time(replay: Tab):
-    inked = (
-        f"""(canvas) => {{ {PIXELS} return pixelsOf(canvas).filter((value, i) => i % 4 === 3 && value > 0).length; }}"""
-    )
-    overlays = replay.test("overlays-canvas")
-    assert replay.until(lambda: overlays.evaluate(inked) > 500)
-    replay.test("overlays").uncheck()
-    assert replay.until(lambda: overlays.count() == 0)
-
-
 def test_a_gap_is_left_out_and_explained(replay: Tab):
     seek(replay, GAP[0] - 1200)
     replay.test("play").click()
@@ -199,38 +162,12 @@ def test_a_gap_is_left_out_and_explained(replay: Tab):
     assert replay.until(f"pebble.replay.video.info.receivedMs >= {GAP[1]}")
 
 
-def test_the_end_of_the_recording_is_shown(replay: Tab):
-    seek(replay, END - 700)
-    replay.test("play").click()
-    assert replay.until(lambda: "end of the recording" in replay.test("time").inner_text())
-    assert replay.test("play").inner_text() == "Play"
-
-
 def test_a_time_at_which_nothing_was_recorded(show: Show) -> None:
     with show(STATES["replay-gap"]) as opened:
         assert opened.until(lambda: "No picture was recorded here" in opened.test("cover").inner_text(), 15)
 
 
-def test_a_day_that_is_being_indexed(show: Show) -> None:
-    answers = iter(range(1, 3))
-
-    def indexing(route: Route) -> None:
-        number = next(answers, 0)
-        if number:
-            route.fulfill(status=202, json={"indexing": number / 4})
-        else:
-            route.continue_()
-
-    with show(STATES["replay"], routes={TIMELINE: indexing}) as opened:
-        opened.page.get_by_text("This day is being indexed: 25 %").wait_for()
-        assert opened.until("!!window.pebble?.replay?.day.timeline", 30)
-        opened.page.get_by_text("not recorded (1)").first.wait_for()
-
-
-@pytest.mark.parametrize("size", ["desktop", "phone"])
-def test_a_day_that_cannot_be_indexed_is_tried_again_by_people_only(
-    show: Show, server: CannedServer, browser: Browser, size
-) -> None:
+def test_a_day_that_cannot_be_indexed_is_tried_again_by_people_only(show: Show) -> None:
     asked: list[str] = []
 
     def failing(route: Route) -> None:
@@ -240,7 +177,7 @@ def test_a_day_that_cannot_be_indexed_is_tried_again_by_people_only(
         else:
             route.fulfill(status=422, body='this needs DuckDB: pip install "pebble-robot[archive]"')
 
-    with show(STATES["replay"], size, routes={TIMELINE: failing}) as opened:
+    with show(STATES["replay"], routes={TIMELINE: failing}) as opened:
         opened.page.get_by_text("this needs DuckDB: pip install").wait_for()
         opened.page.wait_for_timeout(1500)  # three questions of a page that would go on
         before = len(asked)
@@ -248,12 +185,6 @@ def test_a_day_that_cannot_be_indexed_is_tried_again_by_people_only(
         opened.test("try-again").click()
         assert opened.until("!!window.pebble?.replay?.day.timeline", 30)
         assert len(asked) == before + 1
-
-
-def test_sessions_lead_to_their_beginning(replay: Tab):
-    replay.test("open-days").click()
-    replay.test("session").last.click()
-    assert replay.until(lambda: GAP[1] - 10_000 <= position(replay) <= GAP[1])
 
 
 def test_a_stretch_is_downloaded_and_a_download_is_cancelled(replay: Tab):
@@ -313,57 +244,6 @@ def test_sound_is_played_at_its_own_speed_only_and_after_a_click(replay: Tab):
     assert replay.until("!pebble.replay.feed.seeking && pebble.replay.sound.stats?.received > 20")
     replay.test("listen").click()
     assert replay.until("pebble.replay.sound.worker === null")
-
-
-#: Records what is played, and when pictures are drawn: of each block its time, and of each picture when it was
-#: received.
-_LISTEN = """async () => { const { sound } = pebble.replay; const { context } = sound;
-  Object.assign(window, { blocks: [], drawn: [] });
-  const { node } = await sound.speaker;
-  node.port.onmessage = ({ data }) => {
-    const { contextTime, performanceTime } = context.getOutputTimestamp();
-    blocks.push([performanceTime + 1000 * (data.at - contextTime), [...data.left]]);
-  };
-  node.port.postMessage({ taps: true });
-  const draw = pebble.replay.pictures.canvasDraw;
-  pebble.replay.pictures.canvasDraw = (bitmap, info) => { draw(bitmap, info);
-    drawn.push([performance.now(), info.capturedMs]); };
-}"""
-
-
-def test_sound_and_pictures_are_together(replay: Tab):
-    """What was captured at one time is heard and seen within 150 ms; on a busy machine not always."""
-    replay.test("play").click()
-    replay.test("listen").click()
-    assert replay.until("pebble.replay.sound.stats?.received > 20")
-    replay.page.evaluate(_LISTEN)
-    assert any(abs(_apart(replay)) < 150 for _ in range(4))
-
-
-def _apart(opened: Tab) -> float:
-    """By how many ms sound is heard later than its picture is drawn."""
-    opened.page.evaluate("() => { blocks.length = drawn.length = 0; }")
-    assert opened.until("blocks.length * 128 > 2.5 * pebble.replay.sound.context.sampleRate", 60)
-    blocks, drawn, rate = opened.page.evaluate("[blocks, drawn, pebble.replay.sound.context.sampleRate]")
-    samples = np.concatenate([samples for _, samples in blocks])
-    first = float(np.median(np.array([at for at, _ in blocks]) - 128_000 / rate * np.arange(len(blocks))))
-    seconds = 2
-    piece = np.interp(
-        np.arange(16_000 * seconds) / 16_000, np.arange(rate * seconds) / rate, samples[-rate * seconds :]
-    )
-    original = recorded.speech().astype(float)
-    spectrum = np.fft.rfft(original) * np.conj(np.fft.rfft(piece, len(original)))
-    captured = START + int(np.argmax(np.fft.irfft(spectrum, len(original)))) / 16 - recorded.SOUND_LATE_MS
-    played_at = first + 1000 * (len(samples) / rate - seconds)
-    loop_ms = len(original) / 16
-    seen = float(np.median([at - captured_ms for at, captured_ms in drawn]))
-    return (played_at - captured - seen + loop_ms / 2) % loop_ms - loop_ms / 2
-
-
-def test_a_snapshot_is_named_after_the_time_at_which_it_was_taken(replay: Tab):
-    with replay.page.expect_download() as download:
-        replay.test("snapshot").click()
-    assert download.value.suggested_filename == "goob-2026-11-22T10-00-29.png"
 
 
 def test_two_hundred_seeks_leave_nothing_behind(show: Show, server: CannedServer) -> None:

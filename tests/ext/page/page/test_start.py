@@ -166,23 +166,10 @@ def _stops(server: LosingServer, page: Page) -> bool:
     return until(lambda: len(server.sent("estop")) + len(server.posted) > before, 3)
 
 
-def table(rows: list[Row]) -> str:
-    """What became of each file, those alike in one line."""
-    alike: dict[tuple[str, str, str, bool], list[str]] = {}
-    for row in rows:
-        shows = row.shows if row.asked else "the page, which does not need it"
-        alike.setdefault((row.fault, shows.replace(row.name, "…"), row.path, row.stops), []).append(row.name)
-    return "".join(
-        f"{fault} | {shows} | {'STOP' if stops else 'NO STOP'} | {len(names)} at {path}: {' '.join(names)}\n"
-        for (fault, shows, path, stops), names in alike.items()
-    )
-
-
 def check(browser: Browser, server: LosingServer, state: str, losses: Iterable[tuple[str, str]]) -> None:
     rows = [Row(STATES[state].path, name, fault) for name, fault in losses]
     server.show(STATES[state])
     fill(browser, server, rows)
-    sys.stdout.write(table(rows))
     assert [row for row in rows if not row.stops] == []
     assert [row for row in rows if row.fault.endswith("once") and row.shows != "the page"] == []
 

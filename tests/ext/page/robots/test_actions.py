@@ -10,7 +10,7 @@ import pytest
 from playwright.sync_api import Browser
 
 from tests.ext.page.browser import Tab, answer, tab
-from tests.ext.page.canned import CannedServer, Show
+from tests.ext.page.canned import CannedServer
 from tests.ext.page.console import FORWARD, LEFT, Console, Wheels, Wire, console, pad, used
 from tests.ext.page.stage import Stage
 from tests.ext.page.states import STATES
@@ -52,20 +52,6 @@ def _calls(robot: Console) -> Any:
 # -- keys
 
 
-def _has_speed(robot: Console, speed: float) -> bool:
-    return robot.tab.until(lambda: robot.speeds == pytest.approx((speed, speed), abs=0.01), 1)
-
-
-@pytest.mark.thorough
-def test_plus_and_minus_change_the_speed_of_the_wheels_while_they_turn(at_benjr: Console) -> None:
-    assert at_benjr.drive()
-    for key, speed in [("+", 0.7), ("+", 0.8), ("-", 0.7), ("-", 0.6)]:
-        at_benjr.page.keyboard.press(key)
-        assert _has_speed(at_benjr, speed)
-    at_benjr.let_go()
-    assert at_benjr.rests()
-
-
 def test_the_help_ends_a_gesture_and_leaves_stop_in_reach(at_benjr: Console, wire: Wire) -> None:
     assert at_benjr.drive()
     at_benjr.page.keyboard.press("?")
@@ -98,40 +84,6 @@ def test_keys_call_what_they_are_for_and_end_no_gesture(at_benjr: Console) -> No
     assert at_benjr.tab.until(lambda: _calls(at_benjr)[-1] == ["talk", False], 1)
 
 
-@pytest.mark.parametrize(
-    "interruption",
-    [
-        "dispatchEvent(new Event('blur'))",
-        "pebble.panels.show('settings')",
-        "pebble.route.go('')",
-    ],
-)
-def test_talking_ends_as_a_gesture_does_and_not_before(at_benjr: Console, interruption: str) -> None:
-    at_benjr.down("KeyT")
-    assert at_benjr.tab.until(lambda: _calls(at_benjr) == [["talk", True]], 1)
-    at_benjr.page.wait_for_timeout(120)
-    assert len(_calls(at_benjr)) == 1
-    at_benjr.page.evaluate(f"() => {{ {interruption} }}")
-    assert at_benjr.tab.until(lambda: _calls(at_benjr) == [["talk", True], ["talk", False]], 1)
-    at_benjr.page.keyboard.down("KeyT")  # it repeats
-    at_benjr.page.evaluate("() => { pebble.panels.show(''); pebble.route.ref || history.back() }")
-    at_benjr.let_go()
-    assert len(_calls(at_benjr)) == 2
-
-
-def test_keys_in_text_and_shortcuts_do_nothing(at_benjr: Console) -> None:
-    at_benjr.page.evaluate("document.body.prepend(document.createElement('input'))")
-    at_benjr.page.locator("body > input").click()
-    at_benjr.page.keyboard.type("fpmt?+-")
-    at_benjr.page.evaluate("document.querySelector('body > input').remove()")
-    for shortcut in ("Control+KeyM", "Alt+KeyT"):
-        at_benjr.page.keyboard.press(shortcut)
-    at_benjr.page.wait_for_timeout(100)
-    assert _calls(at_benjr) == []
-    assert at_benjr.page.evaluate("pebble.driver.sliders.speed") == pytest.approx(0.6)
-    assert at_benjr.test("panel-help").count() == 0
-
-
 # -- gamepads
 
 
@@ -153,15 +105,6 @@ def test_a_gamepad_drives_once_it_was_seen_in_neutral(at_benjr: Console) -> None
     assert _drives(at_benjr, pad(x=-1), wheels=LEFT)
     at_benjr.pads(pad(0.05, -0.05))
     assert at_benjr.rests()
-
-
-def test_a_gamepad_that_is_disconnected_while_it_is_deflected_stops(at_benjr: Console) -> None:
-    assert _drives(at_benjr, pad(z=1))
-    at_benjr.pads(None)
-    assert at_benjr.rests()
-    at_benjr.pads(None, pad(z=1))
-    assert at_benjr.stays_at_rest()
-    assert _drives(at_benjr, pad(z=1))
 
 
 def test_the_buttons_of_a_gamepad_stop(at_benjr: Console, wire: Wire) -> None:
@@ -203,22 +146,6 @@ def test_a_screen_that_only_watches_sends_nothing_but_stops(browser: Browser, se
         assert [message["token"] for message in server.sent("hello")] == [""]
 
 
-def test_it_takes_no_lease_back(show: Show, server: CannedServer) -> None:
-    with show(STATES["driving"]) as opened:
-        assert opened.until(lambda: len(server.sent("hello")) == 1)
-        opened.page.goto(server.url)
-        assert opened.until("window.pebble?.connection.isOpen")
-        assert server.sent("hello")[-1]["token"] == "canned"
-        opened.test("fleet-more").click()
-        opened.test("watch").click()
-        assert opened.until(lambda: opened.page.url == f"{server.url}/?watch")
-        assert opened.until("window.pebble?.connection.isOpen")
-        assert server.sent("hello")[-1]["token"] == ""
-        opened.page.locator("[data-test=card-goob] a").click()
-        assert opened.page.url.endswith("/r/pebble/robots/goob?watch")
-        assert opened.complaints() == []
-
-
 def test_it_stops_robots_and_never_drives(browser: Browser, stage: Stage, wire: Wire) -> None:
     with _watching(browser, stage.robot_url("benjr")) as opened:
         assert opened.until("window.pebble.store.get(pebble.driver.ref, 'web/liveness')?.value.online === true")
@@ -232,11 +159,3 @@ def test_it_stops_robots_and_never_drives(browser: Browser, stage: Stage, wire: 
         assert opened.complaints() == []
     with console(browser, stage, "benjr", engineers=False) as robot:
         robot.take()  # resets it
-
-
-@pytest.mark.thorough
-def test_after_an_update_it_loads_itself_again(browser: Browser, stage: Stage) -> None:
-    with _watching(browser, stage.url) as opened:
-        with opened.page.expect_navigation(timeout=12_000):
-            opened.page.evaluate("() => { window.before = true; pebble.connection.version = 'old' }")
-        assert opened.until("window.before === undefined && !!window.pebble?.connection.you", 12)

@@ -88,16 +88,3 @@ def test_a_robot_shows_the_picture_of_another_which_must_be_new(at_lamp: Console
     assert at_lamp.tab.until("window.pebble.video.info !== null")
     at_lamp.test("picture-from").select_option("")
     assert at_lamp.tab.until("window.pebble.video.ref === ''", 3)
-
-
-def test_full_screen_has_stop_and_can_be_left(browser: Browser, stage: Stage, wire: Wire) -> None:
-    with console(browser, stage, "goob", theme="dark") as robot, used(robot):
-        robot.test("full-screen").click()
-        assert robot.tab.until("document.fullscreenElement !== null", 3)
-        assert robot.drive()
-        robot.test("stop-one").click()
-        assert robot.tab.until(lambda: wire.latched("goob"), 2)
-        assert robot.rests()
-        robot.page.get_by_label("Leave full screen").click()
-        assert robot.tab.until("document.fullscreenElement === null", 3)
-        robot.take()

@@ -23,7 +23,7 @@ from pebble.errors import PebbleError
 from pebble.extensions.lab.bench.impair.conditions import Condition, Shape
 from pebble.extensions.lab.rig.processes import Worker, end_all, python
 from pebble.extensions.lab.rig.worker_end import answer
-from pebble.runtime.places import SBIN
+from pebble.extensions.operator.places import SBIN
 
 ROBOT_HOST, REMOTE_HOST = "10.77.0.1", "10.77.0.2"
 _WIRE = "wire"  # the device of each namespace

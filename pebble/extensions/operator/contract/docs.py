@@ -1,4 +1,4 @@
-"""Writes tables of all topics, payloads.schema.json and asyncapi.yaml: ``python -m pebble.contract.docs FOLDER``."""
+"""Writes tables of all topics, payloads.schema.json and asyncapi.yaml into the folder that its argument names."""
 
 import inspect
 import json
@@ -13,10 +13,11 @@ from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 from msgspec import NODEFAULT, UNSET, UnsetType
 from msgspec.structs import FieldInfo, fields
 
-from pebble.contract import CHANNELS, INCOMING, OUTGOING, Channel, Kind, asyncapi
+from pebble.contract import CHANNELS, INCOMING, OUTGOING, Channel, Kind
 from pebble.contract.capabilities import CapabilitiesValue
 from pebble.contract.payloads import Capabilities, Payload
-from pebble.contract.schemas import schemas
+from pebble.extensions.operator.contract import asyncapi
+from pebble.extensions.operator.contract.schemas import schemas
 
 TOPICS, SCHEMAS, ASYNCAPI = "topics.md", "payloads.schema.json", "asyncapi.yaml"
 

@@ -9,8 +9,8 @@ from typing import Any
 
 import pytest
 
-from pebble.runtime import row_writer
-from pebble.runtime.row_writer import DIFFERENT, WAITING, WINDOW_S, RowWriter
+from pebble.extensions.fleet import row_writer
+from pebble.extensions.fleet.row_writer import DIFFERENT, WAITING, WINDOW_S, RowWriter
 from tests.support import until
 
 

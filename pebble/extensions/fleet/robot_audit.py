@@ -17,14 +17,14 @@ import msgspec
 from pebble.config import Config
 from pebble.contract import AUTONOMY_COMMAND, CONTROL, CONTROL_TAKE, ESTOP, ESTOP_RESET, Channel, Kind, codec
 from pebble.contract.names import NO_ACCOUNT
-from pebble.contract.payloads import ControlState
+from pebble.contract.payloads import ControlState, EstopCommand
 from pebble.errors import PayloadError
+from pebble.extensions.fleet.row_writer import OF_STRANGERS, Row, RowWriter
+from pebble.forwarding.observer import ROBOT, Observer
 from pebble.forwarding.routing import Drop
 from pebble.motion.lease import shown
-from pebble.runtime.row_writer import OF_STRANGERS, Row, RowWriter
 from pebble.version import __version__
 
-ROBOT = "(robot)"  # a program of the robot: no account has such a name
 _UNCHECKED = "?"  # behind a name that the broker has not checked
 _MOST_BYTES = 8_000_000  # of each of two files
 _NAME, _FILE = 40, 64  # characters
@@ -53,7 +53,7 @@ def files(config: Config) -> list[Path]:
     return [path, path.with_suffix(".old.jsonl")]
 
 
-class Audit:
+class Audit(Observer):
     """Notes commands, refusals and who has control. Thread-safe, but for :meth:`control`."""
 
     def __init__(self, config: Config, clock: Callable[[], float] = time.monotonic) -> None:
@@ -75,7 +75,7 @@ class Audit:
         self._writer.add({"t": round(time.time(), 3), "what": what, "who": who, **more})
 
     def passed(self, channel: Channel, by: str | None, payload: bytes) -> None:
-        """Note a command or a changed flag. ``by`` is the sender that the broker has checked, ROBOT, or None."""
+        """Note what it says, without parameters and keys."""
         says = _COMMANDS.get(channel.suffix)
         if says is None and channel.kind not in (Kind.FLAG, Kind.ACTION):
             return
@@ -92,7 +92,7 @@ class Audit:
                     self.note(channel.kind.name.lower(), _sender(by), **_place(by), name=name, on=on)
 
     def refused(self, drop: Drop, channel: Channel | None, by: str | None) -> None:
-        """Note that a message from outside did not pass."""
+        """Note it, so many at most of strangers."""
         if drop in _REFUSED:
             name, who = "" if channel is None else channel.metric, _sender(by)
             row = {"t": round(time.time(), 3), "what": "refused", "who": who, **_place(by), "name": name}
@@ -107,6 +107,9 @@ class Audit:
             if holder.key:
                 who = holder.by if holder.named and holder.by else f"{holder.by}{_UNCHECKED}"
                 self.note(what, who, id=holder.id, device=holder.device)
+
+    def unconfirmed(self, owner: str, stop: EstopCommand) -> None:
+        self.note("stop-not-confirmed", owner=owner, stop=str(stop.stop))
 
     def _is_repeated(self, stop: str, who: str) -> bool:
         """True if a stop of this name and sender has been noted; it may come with a checked name and without one."""

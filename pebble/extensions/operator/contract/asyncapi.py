@@ -7,7 +7,7 @@ from typing import Any, Final
 import msgspec
 
 from pebble.contract import CHANNELS, INCOMING, Channel
-from pebble.contract.schemas import schemas
+from pebble.extensions.operator.contract.schemas import schemas
 
 _DESCRIPTION: Final = (
     "What a component of type robots, or of any other type, sends and receives; docs/topics.md says who decides what, "
@@ -35,7 +35,7 @@ def document() -> str:
         },
     }
     whole = json.loads(json.dumps(described).replace('"#/$defs/', '"#/components/schemas/'))
-    return "# Written by python -m pebble.contract.docs.\n" + msgspec.yaml.encode(whole).decode()
+    return "# Written by python -m pebble.extensions.operator.contract.docs.\n" + msgspec.yaml.encode(whole).decode()
 
 
 def _name(channel: Channel) -> str:

@@ -13,9 +13,9 @@ import pytest
 
 from pebble.contract import AUTONOMY_COMMAND, CONTROL_TAKE, DRIVE, ESTOP, ESTOP_RESET, LIGHTS_SOLID, codec
 from pebble.contract import channels as c
+from pebble.extensions.fleet import robot_audit as audit_module
+from pebble.extensions.fleet.robot_audit import ROBOT, Audit, files
 from pebble.forwarding.routing import Drop
-from pebble.services.mqtt_bridge import audit as audit_module
-from pebble.services.mqtt_bridge.audit import ROBOT, Audit, files
 from tests.commands.command_line import Run
 from tests.services.mqtt_bridge.bridge_rig import MemoryRig, make_config
 from tests.support import until

@@ -1,0 +1,1 @@
+"""The contract for people and other tools: tables, JSON Schema, AsyncAPI."""
