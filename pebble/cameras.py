@@ -113,7 +113,7 @@ def _run_dir(robot: str | Path, env: Mapping[str, str]) -> Path:
     text, path = str(robot), Path(robot)
     if path.is_dir() and (isinstance(robot, Path) or path.is_absolute()):
         return path.absolute()
-    places = [load(path, env).run_dir()] if text.endswith(".json") else _usual_places(text, env)
+    places = [load(path, env, lenient=True).run_dir()] if text.endswith(".json") else _usual_places(text, env)
     for place in places:
         if place.is_dir():
             return place

@@ -9,25 +9,32 @@ from __future__ import annotations
 
 import logging
 import os
+import re
 import sys
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from enum import IntEnum
 from functools import cache, reduce
 from importlib import import_module
 from importlib.util import find_spec, module_from_spec, spec_from_file_location
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, Literal, TypeVar
 
+import msgspec
 from msgspec import Struct
 from msgspec.structs import replace
 
+from pebble.contract.identity import LEVEL, LEVEL_RULE
 from pebble.contract.serial_protocols import SERIAL_PROTOCOLS, SerialProtocol
 from pebble.errors import ConfigError, PebbleError
 
 log = logging.getLogger(__name__)
 
+T = TypeVar("T")
+
 #: The group of entry points by which a package offers an extension.
 ENTRY_POINTS: Final = "pebble.extensions"
+_LONGEST = 1_000_000  # bytes of an owner's file
+_SECTION_KEY = re.compile(r"(services\.)?[A-Za-z]\w*", re.ASCII)
 #: Ours, those first that others use, with the keys of a config that belong to each. It is the order of their sections.
 OURS: Final[Mapping[str, tuple[str, ...]]] = {
     "pebble.extensions.media": (),
@@ -92,7 +99,7 @@ class Command(Struct, frozen=True):
 
     place: str
     help: str
-    group: str = "more"  # the heading in `pebble --help`: use, own, write, share, measure
+    group: Literal["use", "own", "write", "share", "measure", "more"] = "more"  # the heading in `pebble --help`
     rank: int = 100  # its place there
 
 
@@ -169,36 +176,66 @@ def _declared(module: str) -> Extension | None:
     return extension
 
 
-def named(entries: Mapping[str, bool], folder: Path) -> tuple[tuple[Extension, ...], tuple[Missing, ...]]:
+def named(
+    entries: Mapping[str, bool], folder: Path, section: type
+) -> tuple[tuple[Extension, ...], tuple[Missing, ...]]:
     """Return the extensions that a config lists, and what could not be loaded.
 
     ``entries``: the names of entry points, or files such as ``lamp.py``, seen from ``folder``; True: it owns motors.
-    Raises ConfigError where one that owns motors is listed as one that does not.
+    ``section``: what the class of a section extends. Raises ConfigError where one that owns motors is listed as one
+    that does not, or the other way round.
     """
     found, missing = [], []
     for name, drives in entries.items():
         try:
             extension = _of_file(folder / name) if name.endswith(".py") else _of_package(name)
-            _check_parts(extension)
-        except Exception as error:  # noqa: BLE001 - whatever a stranger's module raises when it is imported
-            reason = str(error) if isinstance(error, PebbleError) else f"{type(error).__name__}: {error}"
-            missing.append(Missing(name, f"extensions.{name}", reason, drives))
+            _check_parts(extension, section)
+        except KeyboardInterrupt:
+            raise
+        except BaseException as error:  # noqa: BLE001 - whatever a stranger's module raises, SystemExit for one
+            missing.append(Missing(name, f"extensions.{name}", _reason(error), drives))
             continue
         if extension.motors and not drives:
             raise ConfigError(f'extensions.{name}: it owns motors, write {{"drives": true}}')
-        SERIAL_PROTOCOLS.update(extension.protocols)
+        if drives and not extension.motors:
+            raise ConfigError(
+                f"extensions.{name}: it declares no motors, so no stop would be confirmed: leave out drives"
+            )
         found.append(extension)
     return tuple(found), tuple(missing)
 
 
-def _check_parts(extension: Extension) -> None:
+def _reason(error: BaseException) -> str:
+    """Return one line."""
+    text = str(error) if isinstance(error, PebbleError) else f"{type(error).__name__}: {error}"
+    return " ".join(text.split())
+
+
+def _check_parts(extension: Extension, section: type) -> None:
+    """Raise an error for what would keep the robot from starting, or a stop from being confirmed."""
     lacks = {*extension.needs} - {other.name for other in ours()}
     if lacks:
         raise PebbleError(f"it needs {' and '.join(sorted(lacks))}")
-    for place in filter(None, (*extension.sections.values(), extension.rules, extension.programs)):
-        part(place)
-    if extension.program is not None and find_spec(extension.program.module) is None:
-        raise PebbleError(f"the module of its program, {extension.program.module}, is not installed")
+    program = extension.program
+    for name in (extension.name, *extension.motors, *([program.name] if program else ())):
+        if re.search(LEVEL, name) is None:
+            raise PebbleError(f"its name {name!r} is not {LEVEL_RULE}")
+    for key, place in extension.sections.items():
+        kind = part(place)
+        if not _SECTION_KEY.fullmatch(key) or not (isinstance(kind, type) and issubclass(kind, section)):
+            raise PebbleError(f'its section "{key}" is no Section, or no key of a config')
+        kind()  # every key has a default
+    for kind, check in part(extension.rules) if extension.rules else ():
+        if not (isinstance(kind, type) and issubclass(kind, section) and callable(check)):
+            raise PebbleError("its rules are no pairs of a Section and a function")
+    if len({*extension.motors.values()}) < len(extension.motors):
+        raise PebbleError("two of its motors are of one program, which can own one")
+    if extension.programs:
+        part(extension.programs)
+    elif {*extension.motors.values()} - ({program.name} if program else set()):
+        raise PebbleError("its motors are of a program that it does not have")
+    if program is not None and find_spec(program.module) is None:
+        raise PebbleError(f"the module of its program, {program.module}, is not installed")
 
 
 def lacking(raw: Any) -> Iterator[Missing]:
@@ -238,8 +275,9 @@ def refuse_claims(core: Extension, extensions: Iterable[Extension]) -> None:
 
     ``core``: what the core has of these.
     """
-    owners: dict[tuple[str, str], Extension] = {}
-    for extension in (core, *extensions):
+    owners: dict[tuple[str, str], int] = {}
+    listed = (core, *extensions)
+    for number, extension in enumerate(listed):
         claims: dict[str, Iterable[str]] = {
             "section": extension.sections,
             "command": extension.commands,
@@ -248,8 +286,9 @@ def refuse_claims(core: Extension, extensions: Iterable[Extension]) -> None:
         }
         for kind, names in claims.items():
             for name in names:
-                other = owners.setdefault((kind, name), extension)
-                if other is not extension:
+                first = owners.setdefault((kind, name), number)
+                if first != number:
+                    other = listed[first]
                     pair = f"{other.package} ({other.name}) and {extension.package} ({extension.name})"
                     raise ConfigError(f'extensions: {kind} "{name}" is added by two, {pair}: remove one of them')
 
@@ -259,8 +298,10 @@ def packages() -> Iterator[Extension]:
     for name in _offered():
         try:
             yield _of_package(name)
-        except Exception as error:  # noqa: BLE001 - as in named()
-            log.error("the extension %s cannot be loaded: %s", name, error)
+        except KeyboardInterrupt:
+            raise
+        except BaseException as error:  # noqa: BLE001 - as in named()
+            log.error("the extension %s cannot be loaded: %s", name, _reason(error))
 
 
 def motors_of(extensions: Iterable[Extension], config: Any) -> dict[str, str]:
@@ -273,15 +314,17 @@ def motors_of(extensions: Iterable[Extension], config: Any) -> dict[str, str]:
 def programs_of(extensions: Iterable[Extension], config: Any, core: Iterable[str] = ()) -> list[Program]:
     """Return the processes that extensions add to a robot; ``core``: names that are taken.
 
-    Raises ConfigError for a name that is taken, or that two of them have.
+    What owns motors is of the stage of devices. Raises ConfigError for a name that is taken, or that two of them have.
     """
     owners = dict.fromkeys(core, "the core")
     found = []
     for extension in extensions:
         for program in _programs(extension, config):
-            other = owners.setdefault(program.name, extension.package)
-            if other != extension.package:
+            if other := owners.get(program.name):
                 raise ConfigError(f'extensions: program "{program.name}" is of two, {other} and {extension.package}')
+            owners[program.name] = extension.package
+            if program.name in extension.motors.values():
+                program = replace(program, stage=Stage.DEVICE, on_demand=False)
             found.append(program if program.arguments else replace(program, arguments=(str(config.path),)))
     return found
 
@@ -291,7 +334,35 @@ def _programs(extension: Extension, config: Any) -> Iterator[Program]:
     if extension.program is not None and all(getattr(section, "enabled", True) for section in sections):
         yield extension.program
     if extension.programs:
-        yield from part(extension.programs)(config)
+        yield from items(extension, "programs", Program, config)
+
+
+def items(extension: Extension, hook: str, kind: type[T], *arguments: Any) -> list[T]:
+    """Return the list that a function of an extension returns; errors as in :func:`call`."""
+    found: list[T] = call(extension, hook, list, *arguments, finish=list)
+    for item in found:
+        if not isinstance(item, kind):
+            raise _failed(extension, hook, f"{type(item).__name__} is no {kind.__name__}")
+    return found
+
+
+def call(
+    extension: Extension, hook: str, kind: Any, *arguments: Any, finish: Callable[[Any], Any] = lambda value: value
+) -> Any:
+    """Return what a function of an extension returns. Raises ConfigError, which names both, if it fails."""
+    try:
+        value = finish(part(getattr(extension, hook))(*arguments))
+    except PebbleError:
+        raise
+    except Exception as error:
+        raise _failed(extension, hook, _reason(error)) from error
+    if not isinstance(value, kind):
+        raise _failed(extension, hook, f"{type(value).__name__} is no {kind.__name__}")
+    return value
+
+
+def _failed(extension: Extension, hook: str, why: str) -> ConfigError:
+    return ConfigError(f"extensions: {hook} of {extension.package} ({extension.name}): {why}")
 
 
 def _at_section(config: Any, key: str) -> Any:
@@ -321,18 +392,22 @@ def _of_file(path: Path) -> Extension:
     """
     if not path.is_file():
         raise PebbleError(f"there is no file {path}")
-    if hasattr(os, "getuid") and os.getuid() == 0 != path.stat().st_uid:
-        raise PebbleError(f"{path} belongs to {path.owner()}, and root runs no code of other users: chown root it")
+    state = path.stat()
+    if hasattr(os, "getuid") and os.getuid() == 0 != state.st_uid:
+        raise PebbleError(f"{path} belongs to user {state.st_uid}, and root runs no code of other users: chown root it")
+    if state.st_size > _LONGEST:
+        raise PebbleError(f"{path} has {state.st_size} bytes, and no program has more than {_LONGEST}")
     name = path.stem
+    if "." in name:
+        raise PebbleError(f'a module has no "." in its name: rename the file {path.name}')
     if str(path.parent) not in sys.path:
         sys.path.append(str(path.parent))  # its process runs it by name; last, so that it hides nothing
-    if "EXTENSION" not in path.read_text(encoding="utf-8", errors="replace"):
-        if getattr(find_spec(name), "origin", None) != str(path):
-            raise PebbleError(f"a module is called {name} already: rename the file")
+    origin = Path(getattr(find_spec(name), "origin", None) or "")
+    if not (origin.is_file() and origin.samefile(path)):
+        raise PebbleError(f"a module is called {name} already: rename the file")
+    if not re.search(r"\bEXTENSION\b", path.read_text(encoding="utf-8", errors="replace")):
         return Extension(name=name, package=path.name, program=Program(name, name, plain=True, preloaded=False))
     loaded = sys.modules.get(name)
-    if loaded is not None and getattr(loaded, "__file__", None) != str(path):
-        raise PebbleError(f"a module is called {name} already: rename the file")
     if loaded is None:
         spec = spec_from_file_location(name, path)
         if spec is None or spec.loader is None:
@@ -349,4 +424,8 @@ def _of_file(path: Path) -> Extension:
 def _checked(extension: Any) -> Extension:
     if not isinstance(extension, Extension):
         raise PebbleError("its EXTENSION is no pebble.extension.Extension")
+    try:
+        msgspec.convert(msgspec.to_builtins(extension), Extension)
+    except (TypeError, msgspec.ValidationError) as error:
+        raise PebbleError(f"its EXTENSION is not as pebble.extension has it: {error}") from error
     return extension

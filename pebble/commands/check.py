@@ -17,7 +17,7 @@ from pebble.config.visible import shown
 from pebble.contract import CHANNELS, MEDIA_STATUS, STATUS, TOUCH_SENSORS, Channel
 from pebble.contract.serial_protocols import SERIAL_PROTOCOLS
 from pebble.errors import ConfigError, TransportError
-from pebble.extension import Facts, lacking_packages, part, programs_of
+from pebble.extension import Facts, call, lacking_packages, programs_of
 from pebble.launcher.programs import programs
 from pebble.runtime.addresses import Addresses
 from pebble.runtime.connections import check_connections, tls_settings
@@ -68,6 +68,7 @@ def _check(path: Path, *, as_json: bool, first: bool) -> bool:
         config = load(path)
         check_connections(config)
         _check_certificates(config)
+        added = [call(one, "facts", Facts, config) for one in config.installed if one.facts and not as_json]
     except ConfigError as error:
         for problem in error.problems:
             line = problem if f"{path.name}: " in problem else f"{path.name}: {problem}"
@@ -78,7 +79,7 @@ def _check(path: Path, *, as_json: bool, first: bool) -> bool:
         return True
     if not first:
         typer.echo()
-    _print(config, path, [part(one.facts)(config) for one in config.installed if one.facts])
+    _print(config, path, added)
     return True
 
 

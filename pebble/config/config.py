@@ -3,7 +3,7 @@
 import hashlib
 import os
 import zlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from functools import cache
 from pathlib import Path
 from typing import Any, TypeVar
@@ -13,18 +13,19 @@ from msgspec import defstruct
 from msgspec.structs import asdict, fields, replace
 
 from pebble import extension
+from pebble.config import problems
 from pebble.config.home import in_home
 from pebble.config.masking import holds_secret, masked
-from pebble.config.problems import Note, Notes
+from pebble.config.problems import UNKNOWN_UNLIKE, Note, Notes
 from pebble.config.raw import Pairs, decode, plain, read_text, with_instances, without
-from pebble.config.reader import Reader, Rule
+from pebble.config.reader import Check, Reader, Rule
 from pebble.config.rules.between_keys import CHECKS
 from pebble.config.rules.exposure import warn_if_readable
 from pebble.config.tree import Root, SerialBridge, Services, tree_of
 from pebble.config.types import Section, Topic
 from pebble.contract import DRIVE
 from pebble.contract.identity import Identity
-from pebble.contract.serial_protocols import SERIAL_PROTOCOLS
+from pebble.contract.serial_protocols import OF_CORE, SERIAL_PROTOCOLS
 from pebble.errors import ConfigError
 from pebble.extension import Extension, Missing
 
@@ -84,11 +85,11 @@ class Config(Root, frozen=True, kw_only=True):
         """The enabled serial lines, one process each, by instance name; the service's own entry is ``""``."""
         own = self.services.serial_mcu_bridge
         lines: dict[str, SerialBridge] = {"": own, **own.instances}
-        left_out = {key for one in extension.ours() if one not in self.installed for key in one.protocols}
+        known = {*OF_CORE, *(key for one in self.installed for key in one.protocols)}
         return {
             name: line
             for name, line in lines.items()
-            if line.enabled and line.serial.port is not None and line.protocol not in left_out
+            if line.enabled and line.serial.port is not None and line.protocol in known
         }
 
     def hall_memory(self, line: SerialBridge) -> str | None:
@@ -167,7 +168,7 @@ def _config(
     own = plain(raw, notes)
     found, missing = _extensions(own, folder)
     installed = () if core_only else found
-    missing = () if core_only else missing
+    absent, missing = missing, () if core_only else missing
     for one in missing:
         note = notes.warning if lenient and not one.drives else notes.problem
         note(tuple(one.key.split(".", 1)), one.reason)
@@ -176,10 +177,10 @@ def _config(
     reader.notes = notes
     merged = with_instances(own)
     unread = [*extension.keys_of_missing(installed), *(key for one in found if core_only for key in one.sections)]
-    if lenient and missing:
-        unread += _unknown(merged, tree)  # they may be sections of what is missing
     root = reader.section(tree, without(merged, unread))
     notes.forget_inherited(own, merged)
+    if lenient and any(one.key.startswith("extensions.") for one in absent):
+        _excuse(notes)
     if path is not None and holds_secret(own):
         warn_if_readable(notes, (), path, "it, and there is a password in it")
     if notes.problems:
@@ -204,25 +205,28 @@ def _config(
     return replace(config, motor_owners=owners)
 
 
-def _unknown(raw: Any, tree: type[Root]) -> Iterator[str]:
-    known = {field.encode_name: field for field in fields(tree)}
-    services = {field.encode_name for field in fields(type(known["services"].default))}
-    yield from (key for key in raw if key not in known)
-    written = raw.get("services")
-    yield from (f"services.{key}" for key in (written if isinstance(written, dict) else ()) if key not in services)
-
-
 def _extensions(own: Any, folder: Path) -> tuple[tuple[Extension, ...], tuple[Missing, ...]]:
     """Return ours and those that the file lists, and those of both that this machine lacks."""
     listed = own.get("extensions") if isinstance(own, dict) else None
     entries = listed if isinstance(listed, dict) else {}
     drives = {name: isinstance(entry, dict) and entry.get("drives") is True for name, entry in entries.items()}
-    found, missing = extension.named(drives, folder)
+    found, missing = extension.named(drives, folder, Section)
     installed = (*extension.ours(), *found)
-    sections = [f"services.{name}" for name in Services.__struct_fields__]
-    core = Extension(name="core", package="Pebble", sections=dict.fromkeys([*sections, *Root.__struct_fields__], ""))
+    sections = [*dir(Config), *(f"services.{name}" for name in dir(Services))]  # with the names of methods
+    protocols = {name: SERIAL_PROTOCOLS[name] for name in OF_CORE}
+    core = Extension(name="core", package="Pebble", sections=dict.fromkeys(sections, ""), protocols=protocols)
     extension.refuse_claims(core, installed)
+    for one in found:
+        SERIAL_PROTOCOLS.update(one.protocols)
     return installed, (*missing, *extension.lacking(own))
+
+
+def _excuse(notes: Notes) -> None:
+    """Make warnings of sections that are like none that is known: they may be of the extension that is missing."""
+    for note in list(notes.problems):
+        if note.text.startswith(UNKNOWN_UNLIKE) and note.path[:-1] in ((), ("services",)):
+            notes.problems.remove(note)
+            notes.warning(note.path, "is not read: it is of no extension that is installed")
 
 
 @cache
@@ -234,8 +238,27 @@ def _tree(installed: tuple[Extension, ...]) -> tuple[type[Root], Any, tuple[Rule
     ]
     names = {"__doc__": Config.__doc__, "__module__": __name__}
     kind = defstruct("Config", added, bases=(Config,), namespace=names, frozen=True, kw_only=True)
-    rules = [rule for one in installed if one.rules for rule in extension.part(one.rules)]
+    rules = [(of, _guarded(one, rule)) for one in installed if one.rules for of, rule in extension.part(one.rules)]
     return tree, kind, (*CHECKS, *rules)
+
+
+def _guarded(one: Extension, rule: Check) -> Check:
+    """Return a rule that notes a problem where it fails; ours are as they are."""
+    if one in extension.ours():
+        return rule
+
+    def check(reader: Reader, section: Any, path: problems.Path) -> Any:
+        try:
+            checked = rule(reader, section, path)
+        except Exception as error:  # noqa: BLE001 - a stranger's
+            reader.notes.problem(path, f"a rule of {one.package} failed: {type(error).__name__}: {error}")
+            return section
+        if not isinstance(checked, type(section)):
+            reader.notes.problem(path, f"a rule of {one.package} returned no {type(section).__name__}")
+            return section
+        return checked
+
+    return check
 
 
 def full_tree() -> type[Root]:

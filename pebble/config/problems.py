@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 from pebble.config.secret_text import without_secrets
 
 Path = tuple[str | int, ...]
+UNKNOWN_UNLIKE = "unknown key, the nearest is"  # and none that is alike
 _FEW_REASONS = 2  # why keys are no longer used, that are told; a file of the original has a dozen
 
 

@@ -37,3 +37,4 @@ SERIAL_PROTOCOLS: Final[dict[str, SerialProtocol]] = {
     "goob_base_v1": SerialProtocol(f"{_BRIDGE}.text.motor_bridge:MotorBridge", drives=True),
     "imu_mpu6050_v1": SerialProtocol(f"{_BRIDGE}.text.imu_bridge:ImuBridge", is_imu=True),
 }
+OF_CORE: Final = frozenset(SERIAL_PROTOCOLS)

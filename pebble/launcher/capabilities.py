@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Collection
 from typing import Any
 
@@ -13,10 +14,13 @@ from pebble.config import Config, SystemControl
 from pebble.contract import capabilities as offers
 from pebble.contract.encodings import ALL_SOUND, ALL_VIDEO
 from pebble.contract.serial_protocols import SERIAL_PROTOCOLS
-from pebble.extension import part
+from pebble.errors import PebbleError
+from pebble.extension import call
 from pebble.runtime import pyav
 from pebble.runtime.addresses import Addresses
 from pebble.runtime.process import view_of
+
+log = logging.getLogger(__name__)
 
 
 def capabilities(
@@ -46,7 +50,10 @@ def capabilities(
     )
     for extension in config.installed:
         if extension.offers:
-            value = part(extension.offers)(config, value)
+            try:
+                value = call(extension, "offers", offers.CapabilitiesValue, config, value)
+            except PebbleError as error:  # the rest of the robot has something to offer
+                log.error("%s", error)
     built: dict[str, Any] = msgspec.to_builtins(value)
     return built
 

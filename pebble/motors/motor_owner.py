@@ -67,6 +67,8 @@ class MotorOwner(Service, ABC):
             watchdog_s=self.drive_timeout_s,
             now=self.clock(),
         )
+        self.on_stop(self.state_file.close)  # here, so that what start() adds is called before: a file may be slow
+        self.on_stop(self._barred_file.close)
         self._deadline: Timer | None = None  # stops the motors unless a command arrives; None: they are stopped
         self._guard_timer: Timer | None = None
         self.announced = True  # that it latches, to operators
@@ -96,8 +98,6 @@ class MotorOwner(Service, ABC):
         self.notifier.mcu("ready" if able else "absent", 0 if able else None, why)
 
     def start(self) -> None:
-        self.on_stop(self.state_file.close)
-        self.on_stop(self._barred_file.close)
         self._guard.begin(self.clock())
         self._control.note(self.clock())
         super().start()
@@ -201,8 +201,8 @@ class MotorOwner(Service, ABC):
         if valid_s <= 0:
             self._halt()
             return
+        self._set_deadline(now + valid_s)  # first: it holds even if a subclass fails
         self.move(drive, valid_s)
-        self._set_deadline(now + valid_s)
 
     def _answer(self, received: ReceivedRequest) -> None:
         now = self.clock()
@@ -231,7 +231,7 @@ class MotorOwner(Service, ABC):
 
     @property
     def _latches(self) -> bool:
-        """Whether a stop latches. Without the resets it would have no end, and without the stops it is no promise."""
+        """True if a stop latches. Without the resets it would have no end, and without the stops it is no promise."""
         return not (self.refused(c.ESTOP) or self.refused(c.ESTOP_RESET))
 
     def on_connected(self) -> None:

@@ -32,7 +32,7 @@ class Lan(ZenohClient, frozen=True, kw_only=True):
 
 
 class Neighbours(ServiceSection, frozen=True, kw_only=True):
-    """Scripts of other robots hear and drive this one, as far as it lets them: docs/neighbours.md."""
+    """Scripts of other robots hear and drive this one, as far as it lets them: docs/ext/neighbours.md."""
 
     lan: Annotated[Lan, doc("Where the robots meet.")] = Lan()
     shares: Annotated[

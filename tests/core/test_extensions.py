@@ -14,8 +14,10 @@ import pytest
 from pebble.config import load, parse
 from pebble.config.types import Section
 from pebble.errors import ConfigError
-from pebble.extension import OURS, Extension, lacking_packages, ours, part, programs_of
+from pebble.extension import OURS, Extension, Stage, lacking_packages, ours, part, programs_of
+from pebble.launcher.capabilities import capabilities
 from pebble.launcher.programs import programs
+from pebble.runtime.addresses import Addresses
 from tests.support import ROOT
 
 PLACES = dict(zip([extension.name for extension in ours()], OURS, strict=True))
@@ -167,12 +169,31 @@ def test_a_package_runs_code_where_a_config_names_it(tmp_path: Path) -> None:
     assert "lamp        blink" in pebble("--help", path=site).stdout
 
 
+OBJECT = "from pebble.extension import *\nEXTENSION = Extension(name='lamp', package='lamp.py', %s)\n"
+
+
 @pytest.mark.parametrize(
     ("source", "reason"),
     [
         (None, "there is no file "),
         ("1 / 0  # EXTENSION", "ZeroDivisionError: division by zero"),
         ("EXTENSION = 1", "its EXTENSION is no pebble.extension.Extension"),
+        ("EXTENSION = exit(0)", "SystemExit: 0"),
+        (" " * 1_000_001, "{folder}/lamp.py has 1000001 bytes"),
+        (
+            OBJECT % "sections=['lamp']",
+            "its EXTENSION is not as pebble.extension has it: Expected `object`, got `array`",
+        ),
+        (
+            OBJECT % "commands={'lamp': Command('lamp', '', 'tools')}",
+            "its EXTENSION is not as pebble.extension has it: ",
+        ),
+        (OBJECT % "sections={'services.lamp': 'json:dumps'}", 'its section "services.lamp" is no Section'),
+        (OBJECT % "sections={'x.y': 'pebble.config.types:Section'}", 'its section "x.y" is no Section'),
+        (OBJECT % "rules='lamp:Extension'", "TypeError: "),
+        (OBJECT % "program=Program('lamp', 'absent')", "the module of its program, absent, is not installed"),
+        (OBJECT % "motors={'legs': 'absent'}", "its motors are of a program that it does not have"),
+        (OBJECT % "motors={'a/b': 'absent'}", "its name 'a/b' is not a topic level"),
         (LAMP % {"name": "absent", "drives": False}, "ModuleNotFoundError: No module named 'absent'"),
         (
             (LAMP % {"name": "lamp", "drives": False}).replace('("lamp", "lamp"', '("lamp", "absent"'),
@@ -186,12 +207,49 @@ def test_a_broken_one_is_an_error_and_keeps_a_robot_from_starting_only_if_it_dri
 ) -> None:
     if source is not None:
         (tmp_path / "lamp.py").write_text(source)
-    path = write(tmp_path, {"lamp.py": {"drives": drives}})
+    path, reason = write(tmp_path, {"lamp.py": {"drives": drives}}, {}), reason.format(folder=tmp_path)
     done = pebble("check", str(path))
     assert (done.returncode, done.stderr.startswith(f"pebble: robot.json: extensions.lamp.py: {reason}")) == (1, True)
     code = f"from pebble.config import load; print(load({str(path)!r}, lenient=True).warnings)"
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=False)
     assert (done.returncode == 0, reason in done.stdout) == (not drives, not drives)
+
+
+@pytest.mark.parametrize(
+    ("more", "text"),
+    [
+        ("programs='lamp:fail'", "extensions: programs of lamp.py (lamp): ZeroDivisionError: division by zero"),
+        ("programs='lamp:text'", "extensions: programs of lamp.py (lamp): str is no Program"),
+        ("facts='lamp:fail'", "extensions: facts of lamp.py (lamp): ZeroDivisionError: division by zero"),
+        ("facts='lamp:text'", "extensions: facts of lamp.py (lamp): str is no Facts"),
+        ("rules='lamp:RULES'", "(the whole file): a rule of lamp.py failed: ZeroDivisionError: division by zero"),
+        ("protocols=SERIAL_PROTOCOLS", 'extensions: protocol "goob_base_v1" is added by two, Pebble (core) and '),
+        (
+            "sections={'path': 'pebble.config.types:Section'}",
+            'extensions: section "path" is added by two, Pebble (core)',
+        ),
+    ],
+)
+def test_what_fails_later_is_one_line_that_names_it(more: str, text: str, tmp_path: Path) -> None:
+    source = "from pebble.config.tree import Root\n"
+    source += "def fail(*_): 1 / 0\ndef text(*_): return 'x'\nRULES = [(Root, fail)]\n"
+    (tmp_path / "lamp.py").write_text(source + OBJECT % more)
+    done = pebble("check", str(write(tmp_path, {"lamp.py": {}})))
+    assert (done.returncode, done.stderr.count("\n")) == (1, 1)
+    assert done.stderr.startswith(f"pebble: robot.json: {text}")
+
+
+def test_capabilities_of_the_rest_are_published_without_those_that_fail(tmp_path: Path) -> None:
+    (tmp_path / "lamp.py").write_text("def fail(*_): 1 / 0\n" + OBJECT % "offers='lamp:fail'")
+    config = load(write(tmp_path, {"lamp.py": {}}))
+    assert capabilities(config, Addresses(config))["identity"]["id"] == "goob"
+
+
+def test_a_section_that_is_nearly_one_of_ours_keeps_a_robot_from_starting(tmp_path: Path) -> None:
+    path = write(tmp_path, {"absent.py": {}})
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"securty": {}}))
+    with pytest.raises(ConfigError, match="securty: unknown key, did you mean"):
+        load(path, lenient=True)
 
 
 def test_of_a_refused_config_it_says_what_is_missing(tmp_path: Path) -> None:
@@ -215,6 +273,28 @@ def test_what_owns_motors_is_listed_as_such(tmp_path: Path) -> None:
     lamp_file(tmp_path, "legs", drives=True)
     done = pebble("check", str(write(tmp_path, {"legs.py": {}})))
     assert (done.returncode, 'it owns motors, write {"drives": true}' in done.stderr) == (1, True)
+    lamp_file(tmp_path, "lamp")
+    done = pebble("check", str(write(tmp_path, {"lamp.py": {"drives": True}})))
+    assert (done.returncode, "it declares no motors" in done.stderr) == (1, True)
+
+
+def test_what_owns_motors_is_a_device(tmp_path: Path) -> None:
+    lamp_file(tmp_path, "wheels", drives=True)
+    config = load(write(tmp_path, {"wheels.py": {"drives": True}}, {"enabled": True}))
+    assert [(one.name, one.stage) for one in programs_of(config.installed, config)] == [("lamp", Stage.DEVICE)]
+    assert config.motor_owners == ("lamp",)
+
+
+def test_two_entries_of_one_file_are_refused(tmp_path: Path) -> None:
+    lamp_file(tmp_path, "lamp")
+    done = pebble("check", str(write(tmp_path, {"lamp.py": {}, "./lamp.py": {}})))
+    assert (done.returncode, "is added by two, lamp.py (lamp) and lamp.py (lamp)" in done.stderr) == (1, True)
+
+
+def test_a_file_that_would_hide_a_module_is_refused(tmp_path: Path) -> None:
+    lamp_file(tmp_path, "calendar")
+    done = pebble("check", str(write(tmp_path, {"calendar.py": {}})))
+    assert (done.returncode, "a module is called calendar already" in done.stderr) == (1, True)
 
 
 PROTOCOL = """

@@ -12,7 +12,7 @@ from pebble.config.rules import exposure
 from pebble.config.rules.doors import warning_of_open
 from pebble.contract.levels import LEVELS
 from pebble.errors import PebbleError
-from pebble.extension import part
+from pebble.extension import items
 from pebble.extensions.checks import devices
 from pebble.extensions.checks.broker.account import page_account, robot_account
 from pebble.extensions.checks.broker.login import beyond_loopback, broker, own_addresses
@@ -167,7 +167,11 @@ def page_brokers(config: Config) -> Iterator[CheckResult]:
 def extensions(config: Config) -> Iterator[CheckResult]:
     """Run the checks that extensions add for a robot, each under the extension's name."""
     for extension in config.installed:
-        for result in part(extension.checks)(config) if extension.checks else ():
+        try:
+            results = items(extension, "checks", CheckResult, config) if extension.checks else []
+        except PebbleError as error:
+            results = [failed(str(error), "run it again")]
+        for result in results:
             yield replace(result, what=result.what or extension.name)
 
 

@@ -103,7 +103,7 @@ def resolve(target: Target) -> tuple[str, Any, Names, str]:
     if (target.config is None) == (target.url is None):
         raise PebbleError("where to connect is missing: use either --config CONFIG or --url URL")
     if target.config is not None:
-        return _of_config(load(target.config), target)
+        return _of_config(load(target.config, lenient=True), target)
     url = str(target.url)
     if target.remote:
         raise PebbleError("--remote needs --config; with --url name the remote broker itself")

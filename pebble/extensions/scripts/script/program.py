@@ -144,7 +144,7 @@ class _Program:
 
     def run(self, main: Callable[..., None], config_path: Path, arguments: tuple[msgspec.Struct, ...]) -> None:
         Guard(self._end_on_signal)
-        config = load(config_path)
+        config = load(config_path, lenient=True)  # as the launcher does, which runs the robot
         local = LocalScripts(config)
         local.hold()
         transport = _connected(config, config_path)
