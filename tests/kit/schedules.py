@@ -28,7 +28,6 @@ ENGINES = {
     "lockstep": "tests.robot.lockstep.schedules",
     "owners": "tests.robot.lockstep.two_owners",
     "driving_lockstep": "tests.ext.page.driving_lockstep.schedules",
-    "control": "tests.robot.control_schedules",
     "stops": "tests.services.mqtt_bridge.stop_schedules",
     "ages": "tests.forwarding.age_schedules",
     "thin": "tests.robot.thin_schedules",
