@@ -30,7 +30,6 @@ ENGINES = {
     "driving_lockstep": "tests.ext.page.driving_lockstep.schedules",
     "stops": "tests.services.mqtt_bridge.stop_schedules",
     "ages": "tests.forwarding.age_schedules",
-    "thin": "tests.robot.thin_schedules",
     "robot_scripts": "tests.robot.script_schedules.world",
     "robot_stops": "tests.robot.stop_schedules.performance",
 }

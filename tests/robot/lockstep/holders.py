@@ -12,7 +12,7 @@ import msgspec
 from pebble.contract import CONTROL, CONTROL_TAKE, DRIVE
 from pebble.contract.payloads import ControlTurn, ControlVouched
 from pebble.transports import Message
-from tests.robot.lockstep.drivers import BASE, Driver
+from tests.robot.lockstep.people import BASE, Person
 from tests.robot.lockstep.processes import Process
 from tests.robot.lockstep.scheduler import Scheduler
 
@@ -57,7 +57,7 @@ class Holders:
     def vouched(self, vouched: ControlVouched) -> None:
         self._vouched = [*self._vouched, vouched.end / 1000][-20:]
 
-    def granted(self, turn: ControlTurn, drivers: Mapping[str, Driver]) -> None:
+    def granted(self, turn: ControlTurn, drivers: Mapping[str, Person]) -> None:
         """The first owner shows who has control."""
         now, held = self._scheduler.now, self._held
         if turn.key:
@@ -70,7 +70,7 @@ class Holders:
         if held.key and turn.boot == held.boot and turn.turn == held.turn + 1 and held.id != turn.id:
             self._passed_on(held, since, turn, drivers)
 
-    def _passed_on(self, held: ControlTurn, since: float, turn: ControlTurn, drivers: Mapping[str, Driver]) -> None:
+    def _passed_on(self, held: ControlTurn, since: float, turn: ControlTurn, drivers: Mapping[str, Person]) -> None:
         now = self._scheduler.now
         if now - drivers[held.id].let_go_at < _SETTLED_S:
             return

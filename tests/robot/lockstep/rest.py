@@ -91,34 +91,9 @@ def _ends(world: World, script: Script, error: str | None) -> None:
     world.scheduler.check(known or error in (status.error or ""), "the status does not say why the script has ended")
 
 
-def _halt(world: World, script: Script) -> None:
-    world.people[1].zero(final=True)
-    _ends(world, script, "stopped by an operator")
-
-
-def _zero_while_it_drives(world: World, script: Script) -> None:
-    world.people[1].zero(final=False)
-    _ends(world, script, "stopped by an operator")
-
-
-def _emergency_stop(world: World, script: Script) -> None:
-    world.people[1].stop("ffff0000ffff0000")
-    _ends(world, script, "emergency stop")
-
-
-def _end(world: World, script: Script) -> None:
-    world.people[1].end_script()
-    _ends(world, script, None)
-
-
-def _kill(world: World, script: Script) -> None:
-    script.signal(signal.SIGKILL)
-    _ends(world, script, "ended by signal 9")
-
-
 def _lose(world: World, script: Script) -> None:
     """A person drives, and the connection is lost."""
-    world.people[1].drive()
+    world.people[1].drive("")
     world.scheduler.run(0.75 + _STEP_S)
     world.scheduler.check(not _turning(world), "the wheels turn after a person's command was lost")
     world.scheduler.run(1.2)
@@ -128,7 +103,7 @@ def _lose(world: World, script: Script) -> None:
 
 def _release(world: World, script: Script) -> None:
     """A person drives and lets go: the script goes on, unless the config says that it ends."""
-    world.people[1].steer(0.3, 0, None)
+    world.people[1].steer(0.3, "", end="release")
     world.scheduler.run(0.1)
     command = world.wheel_rules.turning()
     world.scheduler.check(command is not None and command.run == PERSON, "a person does not drive")
@@ -151,12 +126,24 @@ def _halt_before_it_drives(world: World, _: Script) -> None:
     _ends(world, script, "stopped by an operator")
 
 
-def _restart_the_manager(world: World, script: Script) -> None:
-    world.manager.kill(0.05)
-    _ends(world, script, None)
+def _ended_by(act: Callable[[World, Script], object], error: str | None) -> Callable[[World, Script], None]:
+    def end(world: World, script: Script) -> None:
+        act(world, script)
+        _ends(world, script, error)
+
+    return end
 
 
+_BY_PERSON = "stopped by an operator"
 _ENDS: tuple[Callable[[World, Script], None], ...] = (
-    *(_halt, _release, _end, _kill, _lose, _emergency_stop, _zero_while_it_drives, _release, _restart_the_manager),
+    _ended_by(lambda world, _: world.people[1].zero(final=True), _BY_PERSON),
+    _release,
+    _ended_by(lambda world, _: world.people[1].end_script(), None),
+    _ended_by(lambda _, script: script.signal(signal.SIGKILL), "ended by signal 9"),
+    _lose,
+    _ended_by(lambda world, _: world.people[1].press("ffff0000ffff0000"), "emergency stop"),
+    _ended_by(lambda world, _: world.people[1].zero(), _BY_PERSON),
+    _release,
+    _ended_by(lambda world, _: world.manager.kill(0.05), None),
     _halt_before_it_drives,
 )

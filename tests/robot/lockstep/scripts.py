@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import signal
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from itertools import count
 
 from pebble.contract import DRIVE, ESTOP_STATE, codec
@@ -95,7 +96,10 @@ PROGRAMS: dict[str, Callable[[], Doings]] = {
 
 
 class Script(Process):
-    """One process of a script; a parent may hold it as its child."""
+    """A process of a script, which uses the script API: its threads and its transport are simulated.
+
+    A parent may hold it as its child.
+    """
 
     _pids = count(100)
 
@@ -108,10 +112,15 @@ class Script(Process):
         self.running = True  # as its parent knows
         self.alive = True
         self.signalled = False  # it has been sent a signal
+        self.ended = False  # every call on the robot raises from now on
+        self.sender = DriveSender(self.run, self._publish)
+        self.estop = RobotEstop(BASE)
+        self.rules = PublishRules(self.run, self.scheduler)
         self._network, self._commands, self._exited = network, commands, exited
         self._doings = PROGRAMS[file.partition("-")[0]]()
         self._next_at = self.scheduler.now + _BEGIN_S
-        self._wait = 0.0
+        self._busy, self._exit_code = False, 0
+        self._driven = False  # before, nothing ends it but signals
         self.turn_at(self._next_at)
 
     # -- the kernel
@@ -146,109 +155,53 @@ class Script(Process):
 
     def turn(self) -> None:
         now = self.scheduler.now
-        if now >= self._next_at and self.connection is None:
-            self._begin()
-        if self.connection is not None:
+        if now >= self._next_at and self.connection is None and not self.ended:
+            self._connect()
+        elif self.connection is not None and self._driven:
             self._react(now)
         while self.alive and now >= self._next_at:
             doing, wait = next(self._doings, ("return", 0.0))
             self._next_at = now + wait
             self._do(doing, now)
         if self.alive:
-            self.turn_at(min(self._next_at, self._due))
+            due = self.sender.due if self._driven and not self.ended else None
+            self.turn_at(self._next_at if due is None else min(self._next_at, due))
 
-    def _begin(self) -> None:
-        """It has been loaded, and connects."""
-
-    def _react(self, now: float) -> None:
-        """To messages that have arrived, and to time."""
-
-    @property
-    def _due(self) -> float:
-        return float("inf")
-
-    def _do(self, doing: str, now: float) -> None:
-        if doing == "drive":
-            self._drive(now)
-        elif doing == "zero":
-            self._zero(now)
-        elif doing == "crash":
-            self.exit(-signal.SIGSEGV)
-        elif doing in ("return", "raise"):
-            self._close(now)
-            self.exit(0 if doing == "return" else 1)
-
-    def _drive(self, now: float) -> None: ...
-
-    def _zero(self, now: float) -> None: ...
-
-    def _close(self, now: float) -> None: ...
-
-    def _end_on_signal(self, number: signal.Signals) -> None: ...
-
-    def _new_command(self, now: float) -> tuple[float, float]:
-        return self._commands.add(Command(self.run, self.name, now, 5.0, may_move=True))
-
-
-class OwnScript(Script):
-    """Uses the script API; its threads and its transport are simulated, its rules are the real ones."""
-
-    def __init__(self, *arguments: object) -> None:
-        super().__init__(*arguments)  # type: ignore[arg-type]
-        self.sender = DriveSender(self.run, self._publish)
-        self.estop = RobotEstop(BASE)
-        self.ended = False  # every call on the robot raises from now on
-        self._busy = False
-        self._driven = False  # before, nothing ends it but signals
-        self._exit_code = 0
-        self._published: list[Drive] = []
-        self.rules = PublishRules(self.run, self.scheduler)
-
-    def _begin(self) -> None:
-        if self.ended:
-            return
+    def _connect(self) -> None:
         connection = Connection(self, self._network).open(0.0)
         connection.subscribe(ESTOP_STATE.filter(BASE), self._receive_owner, direct=True)
         connection.subscribe(DRIVE.topic(BASE), self._receive_drive, direct=True)
         self._next_at = self.scheduler.now + 0.01
 
     def _react(self, now: float) -> None:
-        if not self._driven:
-            return
+        """To messages that have arrived, and to time."""
         self.sender.owners(self.estop.states, now)
         self.sender.tick(now)
         why = self.sender.ended(now)
         if why and not self.ended:
             self._end(why, EXIT_ENDED)
 
-    @property
-    def _due(self) -> float:
-        due = self.sender.due
-        return float("inf") if due is None or self.ended or not self._driven else due
-
     def _do(self, doing: str, now: float) -> None:
         self._busy = doing == "compute"
-        super()._do(doing, now)
+        if doing in ("drive", "zero") and not self.ended:
+            self._drive(now, moves=doing == "drive")
+        elif doing == "crash":
+            self.exit(-signal.SIGSEGV)
+        elif doing in ("return", "raise"):
+            self._end("it has finished", self._exit_code)
+            self.exit(0 if doing == "return" else 1)
 
-    def _drive(self, now: float) -> None:
-        if self.ended:
-            return
+    def _drive(self, now: float, *, moves: bool) -> None:
         self._driven = True
-        x, z = self._new_command(now)
-        self.rules.wants_to_drive(x, z)
+        command = Drive()
+        if moves:
+            x, z = self._commands.add(Command(self.run, self.name, now, 5.0, may_move=True))
+            self.rules.wants_to_drive(x, z)
+            command = Drive(x=x, z=z)
         self.sender.owners(self.estop.states, now)
-        self.sender.drive(Drive(x=x, z=z), now)
-
-    def _zero(self, now: float) -> None:
-        if self.ended:
-            return
-        self._driven = True
-        self.sender.owners(self.estop.states, now)
-        self.sender.drive(Drive(), now)
-        self.rules.wants_zero(waits=not self.sender.ended(now))
-
-    def _close(self, now: float) -> None:
-        self._end("it has finished", self._exit_code)
+        self.sender.drive(command, now)
+        if not moves:
+            self.rules.wants_zero(waits=not self.sender.ended(now))
 
     def _end_on_signal(self, number: signal.Signals) -> None:
         if self.connection is None:
@@ -278,7 +231,5 @@ class OwnScript(Script):
 
     def _receive_drive(self, message: Message) -> None:
         if not message.retain:
-            try:
+            with suppress(PayloadError):
                 self.sender.receive(codec.decode(DRIVE, message.payload), self.scheduler.now)
-            except PayloadError:
-                return

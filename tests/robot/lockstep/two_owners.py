@@ -30,10 +30,10 @@ from pebble.transports import Message, QoS
 from tests.kit.schedules import Engine, Outcome, RandomSteps, Steps, perform_steps
 from tests.robot.lockstep.bridge import Bridge, Outside
 from tests.robot.lockstep.commands import Command, Commands
-from tests.robot.lockstep.drivers import BASE, SCRIPT, STRANGER, Driver
 from tests.robot.lockstep.holders import Holders
 from tests.robot.lockstep.network import Network
 from tests.robot.lockstep.owner import Disk, Owner, Wheels
+from tests.robot.lockstep.people import BASE, SCRIPT, STRANGER, Person
 from tests.robot.lockstep.processes import Process
 from tests.robot.lockstep.scheduler import Scheduler
 
@@ -90,7 +90,7 @@ class TwoOwners:
         }  # fmt: skip
         away = self.network if self.bridge is None else self.outside
         networks = {"ann": away, "eve": away, STRANGER: self.network}
-        self.drivers = {name: Driver(name, network, self.commands) for name, network in networks.items()}
+        self.drivers = {name: Person(name, network, self.commands) for name, network in networks.items()}
         self.moved: set[tuple[str, str]] = set()  # (owner, driver)
         self._granted: list[tuple[float, str]] = []  # when, and to whose id; what the first tells the second
         self._shown = (0.0, "")  # the same; what it tells everybody: both are lost while it has no connection
@@ -276,10 +276,10 @@ class TwoOwners:
         assert connection is not None
         self.network.publishers[topic] = connection
 
-    def _person(self, a: int) -> Driver:
+    def _person(self, a: int) -> Person:
         return self.drivers[("ann", "eve")[a % 2]]
 
-    def _anybody(self, a: int) -> Driver:
+    def _anybody(self, a: int) -> Person:
         return list(self.drivers.values())[a % 3]
 
     def _owner(self, a: int) -> Owner:

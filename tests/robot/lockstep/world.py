@@ -20,19 +20,20 @@ from tests.robot.lockstep.commands import Commands
 from tests.robot.lockstep.manager import Manager
 from tests.robot.lockstep.network import Network
 from tests.robot.lockstep.owner import Disk, Owner, Wheels
-from tests.robot.lockstep.people import Person, announce
+from tests.robot.lockstep.people import Person
 from tests.robot.lockstep.processes import Process
 from tests.robot.lockstep.rules import WheelRules
 from tests.robot.lockstep.scheduler import Scheduler
 from tests.robot.lockstep.script_rules import ScriptRules
-from tests.robot.lockstep.scripts import OwnScript
+from tests.robot.lockstep.scripts import Script
 
 STOP_TIMEOUT_S = 1.5
 WAITS_S = (0.0, 0.001, 0.005, 0.02, 0.05, 0.1, 0.1, 0.2, 0.3, 0.5, 0.7, 0.76, 1.0, 1.5, 1.99, 2.01, 2.1, 3.0)
 _SECONDS = (0.0, 0.05, 0.15, 0.4, 0.8, 1.2, 2.2, 3.0)
 _DELAYS = (0.0, 0.003, 0.02, 0.1, 0.3, 0.7, 1.9)
 _LATENCIES = (0.0, 0.001, 0.01, 0.1, 0.45)
-_VALID_MS = (None, None, None, 600, 100, 5000)
+_VALID: tuple[dict[str, int], ...] = ({}, {}, {}, {"valid_ms": 600}, {"valid_ms": 100}, {"valid_ms": 5000})
+_ENDS = ("release", "lost", "halt")
 
 FILES = ("steady", "flood", "pulse", "late", "finish", "fail", "crash",
          "busy", "idle", "steady-needs", "nothing")  # fmt: skip
@@ -83,12 +84,12 @@ class World:
         self.manager = Manager(self.network, self.config, self.commands)
         self.script_rules = ScriptRules(self.manager, scheduler)
         self.people = [Person(name, self.network, self.commands) for name in ("anna", "eve")]
-        self.by_hand: list[OwnScript] = []
+        self.by_hand: list[Script] = []
         self._presses = 0
         self.owner.start()
         self.manager.start()
         scheduler.run(0.1)
-        announce(self.people[0])
+        self.people[0].announce()
         scheduler.run(2.2)
 
     def _arrived(self, process: Process, message: Message) -> None:
@@ -109,10 +110,10 @@ class World:
     # -- persons
 
     def do_drive(self, a: int, b: int) -> None:
-        self._person(a).drive(_VALID_MS[b % len(_VALID_MS)])
+        self._person(a).drive("", **_VALID[b % len(_VALID)])
 
     def do_steer(self, a: int, b: int) -> None:
-        self._person(a).steer(_SECONDS[b % 6], b // 6, _VALID_MS[a % len(_VALID_MS)])
+        self._person(a).steer(_SECONDS[b % 6], "", end=_ENDS[b // 6 % 3], **_VALID[a % len(_VALID)])
 
     def do_release(self, a: int, b: int) -> None:
         self._person(a).zero(final=False)
@@ -123,11 +124,11 @@ class World:
     def do_tap(self, a: int, b: int) -> None:
         """A zero, and at once another command."""
         self._person(a).zero(final=b % 2 == 0)
-        self._person(a).drive(_VALID_MS[b % len(_VALID_MS)])
+        self._person(a).drive("", **_VALID[b % len(_VALID)])
 
     def do_press(self, a: int, b: int) -> None:
         self._presses += 1
-        self._person(a).stop(f"{self._presses:016x}")
+        self._person(a).press(f"{self._presses:016x}")
 
     def do_nameless(self, a: int, b: int) -> None:
         self._person(a).stop_namelessly()
@@ -159,7 +160,7 @@ class World:
         """A script started from a shell: it takes the robot from the one that runs."""
         run = next_run(self.config, self.script_rules.newest_run)
         self.script_rules.begins(run)
-        self.by_hand.append(OwnScript(FILES[b % 2], run, self.network, self.commands, lambda code: None))
+        self.by_hand.append(Script(FILES[b % 2], run, self.network, self.commands, lambda code: None))
 
     def do_end_by_hand(self, a: int, b: int) -> None:
         for script in self.by_hand:

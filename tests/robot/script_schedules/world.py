@@ -345,8 +345,8 @@ class World:
         return "" if obeyed else f"{person.name} has control, and the wheels do not obey"
 
     def _use_script(self, person: Person) -> list[str]:
+        began = time.monotonic()
         for _ in range(3):  # a start that a busy machine has held up is dropped
-            began = time.monotonic()
             self.do_start(person, 0)
             if drives := until(lambda: self._script_moves(began), 10.0):
                 break
