@@ -114,9 +114,9 @@ class Rig:
 
     The robot reaches the remote broker through ``uplink``, a proxy that can fail. With ``direct`` it connects without
     the proxy, because a proxy acknowledges TCP segments itself and so changes the timing. ``remote`` and ``local``
-    replace its own brokers; ``login`` is the robot's user name there. ``motors`` replaces its own MCU. ``listens``:
-    what the operator subscribes to, below the robot's base; ``operator`` replaces it. ``scripts``: which of ours it
-    has. ``top``: more sections of the config; others are services'.
+    replace its own brokers, ``motors`` its own MCU. ``listens``: what the operator subscribes to, below the robot's
+    base; ``operator`` replaces it. ``scripts``: which of ours it has. ``top``: more sections of the config; others are
+    services'.
     """
 
     def __init__(
@@ -131,7 +131,6 @@ class Rig:
         direct: bool = False,
         remote: Broker | None = None,
         local: Broker | None = None,
-        login: str | None = None,
         listens: str = "#",
         operator: Operator | None = None,
         scripts: tuple[str, ...] = (),
@@ -139,7 +138,6 @@ class Rig:
         **config: Any,
     ) -> None:
         self.kind, self.name, self._extra, self._direct, self._top = kind, name, config, direct, top or {}
-        self._login = {} if login is None else {"username": login}
         self.charge_later = "charge"  # the MCU command in the middle of a fault
         self._folder = tempfile.TemporaryDirectory(prefix="pbl")
         self.folder = Path(self._folder.name)
@@ -327,7 +325,6 @@ class Rig:
                 "remote_mqtt": {
                     "host": "127.0.0.1",
                     "port": self.remote.port if self._direct else self.uplink.port,
-                    **self._login,
                 },
                 **self._actions(),
             },
@@ -356,7 +353,7 @@ class Rig:
         # localhost here and 127.0.0.1 there: one broker under two names must be recognised
         port = self.remote.port if self.kind == "single" or self.local is None else self.local.port
         return {
-            "local_mqtt": {"host": "localhost", "port": port, **self._login},
+            "local_mqtt": {"host": "localhost", "port": port},
             "transport": {"kind": "mqtt", "run_dir": str(self.folder / "run"), "state_dir": str(self.folder / "state")},
         }
 

@@ -102,7 +102,7 @@ class Sender:
         """``retain``: its stops ask to be retained, which a sender of ours never does."""
         self.name = new_name()
         self.robots = robots
-        self._port, self._history, self._retain = port, history, retain
+        self._history, self._retain = history, retain
         self._core = StopSender(
             self.name, by="test", why="", now=time.monotonic(), robots=[base_of(robot) for robot in robots]
         )
@@ -147,7 +147,7 @@ class Sender:
             at, name = time.monotonic(), base.rpartition("/")[2]
             sent = self._transport.publish(message.topic, message.payload, qos=message.qos, retain=retain, urgent=True)
             if message.topic == DRIVE.topic(base):
-                self._history.add("zero", name, at=at, final=True, sent=sent, sender=self.name, port=self._port)
+                self._history.add("zero", name, at=at, final=True, sent=sent, sender=self.name)
 
     def _note(self) -> None:
         for base, robot in self._core.robots.items():

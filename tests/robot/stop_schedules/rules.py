@@ -27,7 +27,7 @@ def violations(history: History, world: World, until: float) -> list[str]:
 
 class _Rules:
     def __init__(self, history: History, robot: str, world: World, until: float) -> None:
-        self._robot, self._world, self._wheels = robot, world, world.wheels[robot]
+        self._world, self._wheels = world, world.wheels[robot]
         self._until, self._began = until, history.began
         self._events = history.events(robot=robot)
         self._faults = history.events("fault")
@@ -143,7 +143,7 @@ class _Rules:
     def _lost(self, zero: Event) -> bool:
         """Whether it may not have arrived, or its owner may have restarted before the end of the hold."""
         at = zero.at
-        if not zero.details["sent"] or self._world.deaf(self._robot, zero.details.get("port", 0)):
+        if not zero.details["sent"]:
             return True
         arrived = [event.at for event in self._of("online") if at - _HEARTBEAT_S < event.at < at + _HEARTBEAT_S]
         connected = bool(arrived) and arrived[0] < at < arrived[-1]
