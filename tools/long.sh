@@ -35,7 +35,6 @@ stops) $python -m tests.kit.schedules robot_stops --log build/stops ;;
 soak) both tests.robot.soak --minutes "${MINUTES:-5}" ;;
 schedules) # the shortest schedule that violates a rule is printed, or the seed of a sequence that does
     $python -m tests.kit.schedules motion --schedules 10000
-    $python -m tests.kit.schedules lockstep --schedules 10000
     $python -m tests.kit.schedules owners --schedules 20000 --jobs 2
     $python -m tests.kit.schedules robot_scripts
     ;;

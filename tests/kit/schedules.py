@@ -25,7 +25,6 @@ from typing import Any
 #: The modules that declare an ENGINE, by the name on the command line.
 ENGINES = {
     "motion": "tests.motion.histories",
-    "lockstep": "tests.robot.lockstep.schedules",
     "owners": "tests.robot.lockstep.two_owners",
     "driving_lockstep": "tests.ext.page.driving_lockstep.schedules",
     "stops": "tests.services.mqtt_bridge.stop_schedules",

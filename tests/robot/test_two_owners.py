@@ -1,6 +1,6 @@
-"""Two motor owners are one robot: tables of who drives both, and of what is no silence.
+"""Two motor owners are one robot: tables of who drives both, and of what is no silence, and random schedules.
 
-The world in virtual time checks its own rules all the time.
+The world in virtual time checks its own rules all the time. ``python -m tests.kit.schedules owners`` runs thousands.
 """
 
 from __future__ import annotations
@@ -12,7 +12,8 @@ import pytest
 
 from pebble.config import Config
 from tests.robot.lockstep.people import STRANGER
-from tests.robot.lockstep.two_owners import FIRST, SECOND, TwoOwners, configuration
+from tests.robot.lockstep.two_owners import ENGINE, FIRST, SECOND, TwoOwners, configuration
+from tests.support import cases
 
 pytestmark = [pytest.mark.computing, pytest.mark.usefixtures("quiet")]
 
@@ -236,3 +237,8 @@ def test_the_second_shows_what_the_first_does_under_its_own_boot(config: Config)
     assert [getattr(second, field) for field in shown] == [getattr(first, field) for field in shown]
     assert (first.by, first.asks, len(first.key)) == ("ann", "eve", 8)
     assert first.boot != second.boot
+
+
+def test_no_schedule_violates_a_rule() -> None:
+    violated = [rule for result in ENGINE.run("", 1, range(cases(60, 150))) for rule in result.problems]
+    assert not violated, "python -m tests.kit.schedules owners --seed 1 prints the shortest schedule"

@@ -14,12 +14,7 @@ class Command:
 
     run: int
     sender: str
-    published: float
-    valid_s: float
-    may_move: bool  # False: a retained or a malformed one
-    arrived: float = -1.0  # at the motor owner, the newest time
-    order: int = -1  # of that arrival
-    judged: float = -1.0
+    may_move: bool  # False: a malformed one
 
 
 class Commands:
@@ -35,9 +30,6 @@ class Commands:
         left, right = 300 + number % 697, 300 + number // 697  # 697 is a prime: neighbours differ
         self._commands[left, right] = command
         return (left - right) / 2000, (left + right) / 2000
-
-    def find(self, x: float, z: float) -> Command | None:
-        return self._commands.get((round(1000 * (z + x)), round(1000 * (z - x))))
 
     def of(self, speeds: tuple[int, int]) -> Command | None:
         return self._commands.get(speeds)

@@ -138,7 +138,7 @@ class MemoryFile:
 
 
 class Owner(ServiceProcess):
-    """``before`` and ``after`` are called around each turn."""
+    """``after`` is called after each turn."""
 
     def __init__(
         self,
@@ -155,13 +155,7 @@ class Owner(ServiceProcess):
         self.wheels = wheels
         self._instance = instance
         self._token_hex = token_hex or (lambda size: f"{self.lives:0{2 * size}x}")
-        self.before: Callable[[], None] = lambda: None
         self.after: Callable[[], None] = lambda: None
-
-    @property
-    def boot(self) -> str:
-        """The name of this life, as the latch has it."""
-        return f"{self.lives:08x}"
 
     def _service(self, network: Network, config: Config, disk: Disk) -> MotorBridge:
         def file(path: Path, *on_saved: Any) -> MemoryFile:
@@ -181,6 +175,5 @@ class Owner(ServiceProcess):
         return service
 
     def turn(self) -> None:
-        self.before()
         super().turn()
         self.after()

@@ -34,10 +34,6 @@ class Process:
         else:
             job()
 
-    def slow_down(self, latency: float) -> None:
-        self.latency, self.slack = latency, max(self.slack, latency)
-        self.wake()
-
     def wake(self) -> None:
         """There is something to do."""
         self.turn_at(self.scheduler.now + self.latency)

@@ -3,6 +3,8 @@
 Every step is possible at any time, and does nothing where it has no meaning, so steps can be left out of a schedule.
 
 * No two drivers move the two owners at once: persons with a key, and all commands without one as one more.
+* No wheel turns after a stop has been judged, and before a reset comes; nor by what is malformed, after the deadline of
+  its command, or by a script within two seconds of a person's command.
 * The first owner, by name, is moved only by who has control of it, or without a key while nobody has.
 * The second one is moved only by whom the first has named less than 1.5 s ago.
 * In the end, when everything works, who takes control drives both.
@@ -17,6 +19,7 @@ from __future__ import annotations
 
 import json
 import tempfile
+from collections import defaultdict
 from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import partial
@@ -24,12 +27,12 @@ from itertools import count
 from pathlib import Path
 
 from pebble.config import Config, load
-from pebble.contract import CONTROL_STATE, CONTROL_TURN, CONTROL_VOUCHED, codec
+from pebble.contract import CONTROL_STATE, CONTROL_TURN, CONTROL_VOUCHED, ESTOP, ESTOP_RESET, codec
 from pebble.runtime.process import view_of
 from pebble.transports import Message, QoS
 from tests.kit.schedules import Engine, Outcome, RandomSteps, Steps, perform_steps
 from tests.robot.lockstep.bridge import Bridge, Outside
-from tests.robot.lockstep.commands import Command, Commands
+from tests.robot.lockstep.commands import PERSON, Command, Commands
 from tests.robot.lockstep.holders import Holders
 from tests.robot.lockstep.network import Network
 from tests.robot.lockstep.owner import Disk, Owner, Wheels
@@ -39,6 +42,7 @@ from tests.robot.lockstep.scheduler import Scheduler
 
 FIRST, SECOND = "arm", "serial"  # in the config the second comes first
 FOLLOWS_S = 1.5
+HOLD_S, _BOOT_S = 2.0, 1.0
 _MS = 0.0021
 _CHECK_S = 0.05
 
@@ -96,6 +100,10 @@ class TwoOwners:
         self._shown = (0.0, "")  # the same; what it tells everybody: both are lost while it has no connection
         self._recorded: list[Message] = []  # turns of the first
         self._run = 100
+        self._stops: defaultdict[Process, list[tuple[int, str]]] = defaultdict(list)  # not judged: life, and name
+        self._judged: set[tuple[Process, str]] = set()  # stops, by name
+        self._stopped: set[Process] = set()  # owners, until a reset comes
+        self._person_at: dict[Process, float] = {}  # when a person's command last moved an owner
         for owner in self.owners.values():
             owner.after = partial(self._turned, owner)
             owner.start()
@@ -122,13 +130,37 @@ class TwoOwners:
     def _arrived(self, process: Process, message: Message) -> None:
         if process is self.owners[FIRST]:
             self.holders.arrived(message)
+        if message.topic == ESTOP.topic(BASE) and not message.retain:
+            life = process.lives if isinstance(process, Owner) else 0
+            self._stops[process].append((life, json.loads(message.payload)["stop"]))
+        elif message.topic == ESTOP_RESET.topic(BASE):
+            self._stopped.discard(process)
 
     def _turned(self, owner: Owner) -> None:
+        for life, name in self._stops.pop(owner, []):  # what a killed owner had not judged is lost
+            if life == owner.lives and (owner, name) not in self._judged:
+                self._judged.add((owner, name))
+                self._stopped.add(owner)
+        self._check_wheels(owner)
         late = self.scheduler.now > owner.wheels.deadline + owner.slack + _MS
         self.scheduler.check(not late or owner.wheels.speeds is None, "a wheel turns after its command's deadline")
         self.check()
 
+    def _check_wheels(self, owner: Owner) -> None:
+        command = self._command(owner)
+        if command is None:
+            return
+        self.scheduler.check(owner not in self._stopped, "a wheel turns after a stop")
+        self.scheduler.check(command.may_move, "a malformed command moves the wheels")
+        if command.run == PERSON:
+            self._person_at[owner] = owner.wheels.at
+        elif self.scheduler.now - owner.started_at > HOLD_S + _BOOT_S:  # before, lines have waited for the port
+            held = owner.wheels.at - self._person_at.get(owner, -HOLD_S) < HOLD_S - _MS
+            self.scheduler.check(not held, "a script moves the wheels while a person drives")
+
     def _check_again(self) -> None:
+        for owner in self.owners.values():
+            self._check_wheels(owner)
         self.check()
         self.scheduler.after(_CHECK_S, self._check_again)
 
@@ -216,6 +248,9 @@ class TwoOwners:
 
     def do_reset(self, a: int, b: int) -> None:
         self._anybody(a).reset()
+
+    def do_junk(self, a: int, b: int) -> None:
+        self._anybody(a).junk(b)
 
     def do_kill(self, a: int, b: int) -> None:
         owner = self._owner(a)
@@ -316,8 +351,9 @@ class TwoOwners:
 
 
 _ALL = {
-    "wait": 34, "hold": 5, "take": 5, "flood": 3, "let_go": 5, "steer": 12, "stranger": 5, "old_key": 3, "script": 3,
-    "zero": 3, "stop": 1, "reset": 2, "kill": 5, "freeze": 6, "delay": 3, "lose": 2, "repeat": 3, "retain": 2,
+    "wait": 34, "hold": 5, "take": 5, "flood": 3, "let_go": 5, "steer": 12, "stranger": 5, "old_key": 3, "script": 4,
+    "zero": 3, "stop": 2, "reset": 3, "junk": 2, "kill": 5, "freeze": 6, "delay": 3, "lose": 2, "repeat": 3,
+    "retain": 2,
 }  # fmt: skip
 _FLOODED = {
     "wait": 34, "hold": 8, "take": 3, "let_go": 2, "steer": 12, "lag": 8, "stall": 4, "bridge": 5, "freeze": 2,
