@@ -239,20 +239,20 @@ class World:
                 until(lambda: not any(self.rig.alive(pid) for pid in left), 5)
                 self.rig.start(ready=False)
             else:
-                self._signal(which, signal.SIGKILL)
+                _send(self._pids(which), signal.SIGKILL)
 
     def do_freeze(self, _: Person, b: int) -> None:
         which, seconds = _FAULTS[b % 4], _WAITS_S[b % 8]
         with self._fault(f"freeze {which}", seconds + 1.5 * (which != "script")):
-            self._signal(which, signal.SIGSTOP)
-            self._timers.append(threading.Timer(seconds, self._signal, (which, signal.SIGCONT)))
+            pids = self._pids(which)
+            _send(pids, signal.SIGSTOP)
+            self._timers.append(threading.Timer(seconds, _send, (pids, signal.SIGCONT)))
             self._timers[-1].start()
 
-    def _signal(self, which: str, number: signal.Signals) -> None:
-        for pid in list(self.alive.groups) if which == "script" else [self.rig.processes().get(which, 0)]:
-            with suppress(ProcessLookupError):
-                if pid:
-                    os.kill(pid, number)
+    def _pids(self, which: str) -> list[int]:
+        if which == "script":
+            return list(self.alive.groups)
+        return [pid for name, pid in self.rig.processes().items() if name == which]
 
     def do_go_silent(self, _: Person, b: int) -> None:
         with self._fault("the uplink is silent"):
@@ -392,6 +392,12 @@ class World:
         events += [(one.at, f"  control {one.payload!r}") for one in self.watcher.on(STATE, since)]
         lines = [f"{at:.3f} {text}" for at, text in sorted(events, key=lambda event: event[0])]
         return "\n".join([*lines, self.rig.log.read_text()[-3000:]])
+
+
+def _send(pids: list[int], number: signal.Signals) -> None:
+    for pid in pids:
+        with suppress(ProcessLookupError):
+            os.kill(pid, number)
 
 
 def _account(state: ReceivedMessage) -> str:
