@@ -6,16 +6,13 @@ import itertools
 import statistics
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from pebble.config import load
-from pebble.runtime.connections import local_transport
-from pebble.transports import Message
 from tests.ext.fleet.broker_client import BrokerClient, Place
 from tests.ext.fleet.brokers import HOST
 from tests.robot.named import DRIVE, Hall, Named
@@ -25,7 +22,7 @@ from tests.support import beside, cases, until
 
 pytestmark = pytest.mark.alone  # lines are counted
 
-ESTOP, FLAG = "outgoing/estop/serial", "flags/mqtt-video"
+ESTOP = "outgoing/estop/serial"
 FLOOD_S = float(cases(2, 60))
 
 
@@ -127,47 +124,6 @@ class _By:
 
     def send(self, suffix: str, body: Any, **options: Any) -> None:
         self._rig.send(self._name, suffix.removeprefix("incoming/"), body, **options)
-
-
-# -- flags
-
-
-def retained(rig: Named) -> list[bytes]:
-    """What both sides retain of the flag: the robot's own, then its remote broker."""
-    topic = f"{BASE}/incoming/{FLAG}"
-    with ExitStack() as ends:
-        here = ends.enter_context(local_transport(load(rig.config), "flags"))
-        there = ends.enter_context(rig.hall.login("rover"))
-        values: list[Message] = []
-        here.subscribe(topic, values.append, direct=True)
-        there.subscribe([topic])
-        until(lambda: values, 1)
-        until(lambda: there.listen(0.01) or there.received, 1)
-        return [one.payload for one in values[-1:]] + [payload for _, payload in there.received[-1:]]
-
-
-@pytest.mark.parametrize("order", ["bridge, broker", "broker, bridge", "robot, broker", "older"])
-def test_a_flag_by_name_stays_on_both_sides(rig: Named, order: str) -> None:
-    """After restarts in each order; and where the broker retains an older value, as it was killed before it saved."""
-    for value in (b"true", b"false", b"true"):
-        rig.send("mia", FLAG, value)
-        assert until(lambda v=value: retained(rig) == [v, v], 10), retained(rig)
-    rig.person("mia").send(f"incoming/{FLAG}", b"false", retain=True)  # the broker refuses it
-    steps: dict[str, Callable[[], object]] = {
-        "bridge": lambda: rig.kill("mqtt_bridge"),
-        "broker": lambda: (rig.hall.stop(), rig.hall.start()),
-        "robot": lambda: (rig.stop(), rig.start(ready=False)),
-        "older": lambda: (
-            rig.stop(),
-            rig.person("rover").send(f"incoming/{FLAG}", b"false", retain=True),
-            rig.start(ready=False),
-        ),
-    }
-    for step in order.split(", "):
-        began = time.monotonic()
-        steps[step]()
-        rig.wait_until_up(began, 30)
-    assert until(lambda: retained(rig) == [b"true", b"true"], 15), retained(rig)
 
 
 @pytest.fixture
