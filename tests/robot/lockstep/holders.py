@@ -104,6 +104,7 @@ def _moves(fields: dict[str, Any]) -> bool:
 
 
 def _fields(message: Message) -> dict[str, Any]:
-    """What it says; a probe says nothing."""
+    """Return what it says; a probe and what is malformed say nothing."""
     interesting = message.topic in (*_REQUESTS, _DRIVE) and message.payload.strip()
-    return msgspec.json.decode(message.payload) if interesting else {}
+    fields = msgspec.json.decode(message.payload) if interesting else {}
+    return fields if isinstance(fields, dict) else {}
