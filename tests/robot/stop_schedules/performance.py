@@ -16,7 +16,6 @@ from tests.robot.stop_schedules.schedules import BOARD, ROBOTS, ROVER, Schedule,
 from tests.robot.stop_schedules.world import World
 from tests.support import until
 
-_HOLD_S = 2.1  # scripts wait so long after a person's command
 _CONFIRMED_S = 15.0  # after all faults; a killed robot takes some seconds to start
 _UP_S = 15.0
 _ANSWER_S = 1.5
@@ -24,8 +23,6 @@ _MOVES_S = 2.0
 _STILL_S = 1.5
 _REPEATED_S = 6.0  # a broker that was restored may have an older state until its owner repeats it
 _RESETS = 9  # tries of _ANSWER_S: an owner that was killed five times in a minute starts after ten seconds
-
-_runs = iter(range(1, 1_000_000_000))
 
 
 class Performance:
@@ -76,10 +73,8 @@ class Performance:
                 world.persons[robot].zero()
             case "lose":
                 world.persons[robot].lose()
-            case "script":
-                world.scripts[robot].run(next(_runs))
-            case "zero" | "final zero":
-                world.persons[robot].zero(final=step.what == "final zero")
+            case "final zero":
+                world.persons[robot].zero(final=True)
             case "stop":
                 self._stop([*ROBOTS] if robot == "both" else [robot], world.access.port)
             case "stop at the robot":
@@ -92,8 +87,6 @@ class Performance:
                 self._reset(robot)
             case "wait for confirmations":
                 until(lambda: not self._waiting(), step.amount)
-            case "wait for the hold":
-                time.sleep(max(0.0, self.world.person_until + _HOLD_S - time.monotonic()))
             case what if what.startswith("stop, then kill "):
                 victim = what.rpartition(" ")[2]
                 self._stop([BOARD if victim == "board" else ROVER], world.access.port)
@@ -136,11 +129,9 @@ class Performance:
         for sender in self._senders:
             sender.end()
         for robot in ROBOTS:
-            self.world.scripts[robot].lose()
             self.world.persons[robot].zero(final=True)
         for robot in ROBOTS:
             problems += self._end(robot)
-        self.world.person_until = time.monotonic()
         return problems
 
     def _end(self, robot: str) -> list[str]:

@@ -61,7 +61,6 @@ class World:
         self.setup = setup
         self.history = History()
         self.planted: set[str] = set()
-        self.person_until = time.monotonic()  # when persons last drove before the present schedule
         self._saved: bytes | None = None
         self._lock = threading.RLock()  # only one fault at a time restarts something, or cuts the connections
         with ExitStack() as opened:
@@ -89,7 +88,6 @@ class World:
         self.subscriber = opened.enter_context(closing(Subscriber(self.access.port, ROBOTS, "remote")))
         self.local_subscriber = opened.enter_context(closing(Subscriber(self.local_port, (ROVER,), "local")))
         self.persons = {robot: self._driver(robot, opened) for robot in ROBOTS}
-        self.scripts = {robot: self._driver(robot, opened) for robot in ROBOTS}
         if self.setup == "remote-mirror":
             self.rig.operator.send("incoming/flags/remote-mirror", True, retain=True)
         assert self.is_up(time.monotonic(), 20), self.logs()
@@ -105,7 +103,7 @@ class World:
         self.history = History()
         for subscriber in (self.subscriber, self.local_subscriber):
             subscriber.history = self.history
-        for driver in (*self.persons.values(), *self.scripts.values()):
+        for driver in self.persons.values():
             driver.history = self.history
         for wheels in self.wheels.values():
             wheels.forget()
