@@ -55,7 +55,7 @@ def driven(request: pytest.FixtureRequest) -> Iterator[Rig]:
 
 @pytest.fixture
 def quiet() -> Iterator[None]:
-    """Services log nothing, which would take most of the time of what runs in virtual time."""
+    """Let services log nothing, which would take most of the time of what runs in virtual time."""
     logging.disable(logging.CRITICAL)
     yield
     logging.disable(logging.NOTSET)

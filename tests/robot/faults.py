@@ -43,12 +43,13 @@ class Drive:
             raise
 
     def end(self, over: float) -> None:
-        """Commands sent after the fault get through soon; then the driver stops sending."""
+        """Wait until commands sent after the fault get through; then let go."""
         assert until(lambda: self._arrived_after(over), BACK_S), "no driving within 5 s of the fault's end"
         self.back_s = time.monotonic() - over
         self.finish()
 
     def finish(self) -> None:
+        """Let go, and check how the wheels have turned."""
         self.driver.stop()
         assert until(lambda: not self.rig.mcu.moving(self.began), 3)
         assert until(lambda: not self.rig.mcu.turning(), 3)
@@ -101,7 +102,7 @@ def _killed(program: str, rig: Rig) -> Iterator[None]:
 
 @contextmanager
 def _launcher_killed(rig: Rig) -> Iterator[None]:
-    """It is started again, as by systemd."""
+    """Kill the launcher, and start it again, as systemd does."""
     killed, children = time.monotonic(), rig.kill_launcher()
     yield
     assert until(lambda: not any(map(rig.alive, children)), 1.0), "children outlived their launcher by 1 s"
@@ -113,7 +114,7 @@ def _launcher_killed(rig: Rig) -> Iterator[None]:
 
 @contextmanager
 def _run_directory_removed(rig: Rig) -> Iterator[None]:
-    """All programs start again, and the lock is held again."""
+    """Remove it: all programs start again, and the lock is held again."""
     run = rig.folder / "run"
     sockets = len(list(run.glob("*.seat")))
     shutil.rmtree(run)
@@ -123,7 +124,7 @@ def _run_directory_removed(rig: Rig) -> Iterator[None]:
 
 @contextmanager
 def _local_transport_killed(rig: Rig) -> Iterator[None]:
-    """On Zenoh its hub is, whose death must not interrupt driving."""
+    """Kill the local broker, or on Zenoh the hub, whose death must not interrupt driving."""
     if rig.local is not None:
         rig.kill_local_broker()
     else:
@@ -162,7 +163,7 @@ def _unplugged(rig: Rig) -> Iterator[None]:
 
 @contextmanager
 def frozen(*pids: int) -> Iterator[None]:
-    """Processes stand still, as on a machine that swaps."""
+    """Let processes stand still, as on a machine that swaps."""
     for number in (signal.SIGSTOP, signal.SIGCONT):
         for pid in pids:
             with suppress(ProcessLookupError):
@@ -225,7 +226,7 @@ FAULTS = {
 
 
 def at_once(rig: Rig, names: list[str]) -> Fault:
-    """Two or more things stand still at the same time."""
+    """Return a fault in which these stand still at the same time."""
 
     @contextmanager
     def happens(_rig: Rig) -> Iterator[None]:

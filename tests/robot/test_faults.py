@@ -22,7 +22,7 @@ USUAL = [name for name in FAULTS if not any(word in name for word in FURTHER)]
 
 @pytest.fixture(autouse=True)
 def retained_state_is_current_afterwards(driven: Rig) -> Iterator[None]:
-    """After every fault a late subscriber finds all retained state, and all of it is current."""
+    """Check that a late subscriber finds all retained state after every fault, and that all of it is current."""
     charging = (
         driven.operator.last("outgoing/charging-status") or driven.operator.wait_for("outgoing/charging-status")
     ).json
@@ -46,7 +46,7 @@ def _retained_is_current(rig: Rig, charging: bool) -> bool:
 
 
 def changed_state(rig: Rig) -> None:
-    """What the MCU reports changes in the middle of the fault."""
+    """Change what the MCU reports, in the middle of the fault."""
     rig.mcu.command(rig.charge_later)  # type: ignore[attr-defined]
 
 

@@ -62,11 +62,11 @@ class Person(Process):
 
     @property
     def key(self) -> str:
-        """As a page has it: the keys of all owners that show its id."""
+        """Return it as a page has it: the keys of all owners that show its id."""
         return " ".join(state.key for _, state in sorted(self.seen.items()) if state.id == self.id)
 
     def drive(self, key: str | None = None, **fields: Any) -> None:
-        """One command; with ``key``, under that one."""
+        """Publish one command; with ``key``, under that one."""
         key = self.key if key is None else key
         sender = SCRIPT if "run" in fields else self.name if key else STRANGER
         x, z = self._commands.add(Command(fields.get("run", PERSON), sender, may_move=True))
@@ -93,7 +93,7 @@ class Person(Process):
     # -- stopping
 
     def stop(self) -> None:
-        """An emergency stop, sent once; it is named after its time."""
+        """Publish an emergency stop, once; it is named after its time."""
         self._publish(ESTOP, {"stop": f"{self.scheduler.now:016.3f}".replace(".", "a"), "by": self.name})
 
     def reset(self) -> None:
