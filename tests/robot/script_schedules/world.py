@@ -329,12 +329,16 @@ class World:
         time.sleep(_HOLD_S)
         return self._use_script(self.people[0])
 
-    def _drives(self, person: Person) -> str:
-        """Return why not; empty: it gets control and drives, while the other one sends keys of before."""
+    def _drives(self, person: Person, *, zero: bool = True) -> str:
+        """Return why not; empty: it gets control and drives, while the other one sends keys of before.
+
+        ``zero``: after a reset one lets go first; while a script drives, that would end it.
+        """
         person.request("control/take")
         if not until(person.has_control, 15.0):
             return f"{person.name} does not get control"
-        person.drive(0)  # after a reset, and after a zero with which another lets go
+        if zero:
+            person.drive(0)
         self._note("drives", person)
         began, wheels = time.monotonic(), (SPEEDS[person.name],) * 2
         for one in self.people:
@@ -352,7 +356,7 @@ class World:
                 break
         if not drives:
             return [f"a script does not drive: {self.rig.script()}"]
-        if problem := self._drives(person):
+        if problem := self._drives(person, zero=False):
             return [problem]
         released = time.monotonic()
         self.do_let_go(person, 1)
