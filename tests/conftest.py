@@ -63,7 +63,7 @@ _LONG = (
     *(
         "conform/test_conform.py",
         "ext/page/robots/test_controls.py",
-        "robot/test_closed_loop.py",
+        "robot/test_scripts.py",
         "robot/test_media.py",
         "robot/test_driveable.py",
     ),

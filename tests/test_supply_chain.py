@@ -82,14 +82,6 @@ def test_the_lock_has_what_pyproject_asks_for(kind: str) -> None:
                 assert wanted.specifier.contains(version), f"the lock has {wanted.name} {version}, not {wanted}"
 
 
-def test_a_kind_that_is_not_there_is_one_line() -> None:
-    done = subprocess.run(
-        ["sh", str(ROOT / "tools" / "locked.sh"), "robots"], capture_output=True, text=True, check=False
-    )
-    assert (done.returncode, done.stdout) == (1, "")
-    assert done.stderr == "locked.sh: requirements.txt has no packages for 'robots': robot, demo, dev or tools\n"
-
-
 def test_a_slot_without_a_lock_on_32_bits_has_what_the_lock_of_robots_has() -> None:
     assert f"[{','.join(lock.KINDS['robot'])}]" in (ROOT / "configs" / "slot" / "pebble-slot").read_text()
 

@@ -12,7 +12,6 @@ list() {
     cat <<END
 make long PART=stops      400 random schedules of emergency stops and faults with whole robots, 40 minutes
 make long PART=soak       floods, kills, freezes, full disks and more while an operator drives; MINUTES=30 for each transport
-make long PART=floods     60,000 retained flags, 10,000 actions a second and more, also while a robot starts, four minutes
 make long PART=schedules  random schedules in virtual time, with whole robots and scripts, two hours
 make long PART=page       every state, card, interruption and finger at the operator page in Chromium, 25 minutes
 make long PART=looks      store anew how the page looks, for PART=page to compare; look at the pictures, a minute
@@ -26,7 +25,7 @@ END
 }
 
 case "$1" in
-stops | soak | floods | schedules | fleet | brokers | gstreamer | life) debian mosquitto=mosquitto ;;
+stops | soak | schedules | fleet | brokers | gstreamer | life) debian mosquitto=mosquitto ;;
 page) debian mosquitto=mosquitto chromium=chromium ;;
 looks) debian chromium=chromium ;;
 esac
@@ -34,7 +33,6 @@ esac
 case "$1" in
 stops) $python -m tests.kit.schedules robot_stops --log build/stops ;;
 soak) both tests.robot.soak --minutes "${MINUTES:-5}" ;;
-floods) both tests.robot.soak.floods ;;
 schedules) # the shortest schedule that violates a rule is printed, or the seed of a sequence that does
     $python -m tests.kit.schedules motion --schedules 10000
     $python -m tests.kit.schedules lockstep --schedules 10000
@@ -54,7 +52,7 @@ gstreamer)
     { gst-inspect-1.0 --exists shmsrc && gst-inspect-1.0 --exists rawvideoparse; } ||
         debian =gstreamer1.0-plugins-base =gstreamer1.0-plugins-bad
     /usr/bin/python3 -c "import cv2, paho.mqtt.client" 2>/dev/null || debian =python3-opencv =python3-paho-mqtt
-    tests tests/examples/test_gstreamer_sockets.py tests/robot/test_original_media.py
+    tests tests/examples/test_gstreamer_sockets.py
     ;;
 firmware) tests --log-cli-level=INFO tests/firmware/test_heap.py ;;
 life)

@@ -28,9 +28,7 @@ ENGINES = {
     "lockstep": "tests.robot.lockstep.schedules",
     "owners": "tests.robot.lockstep.two_owners",
     "driving_lockstep": "tests.ext.page.driving_lockstep.schedules",
-    "control": "tests.robot.control_schedules",
     "stops": "tests.services.mqtt_bridge.stop_schedules",
-    "thin": "tests.robot.thin_schedules",
     "robot_scripts": "tests.robot.script_schedules.world",
     "robot_stops": "tests.robot.stop_schedules.performance",
 }

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterator
 from dataclasses import dataclass
 
@@ -50,3 +51,11 @@ def driven(request: pytest.FixtureRequest) -> Iterator[Rig]:
     """A robot to break things on."""
     with Rig(request.param, mcu="fred") as rig:
         yield rig
+
+
+@pytest.fixture
+def quiet() -> Iterator[None]:
+    """Let services log nothing, which would take most of the time of what runs in virtual time."""
+    logging.disable(logging.CRITICAL)
+    yield
+    logging.disable(logging.NOTSET)

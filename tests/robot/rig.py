@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -31,6 +32,7 @@ PROGRAMS = (
     *("camera_publisher", "audio_publisher", "audio_receiver", "video_stream"),
     *("soundboard_handler", "autonomy_manager"),
 )
+SCRIPTS = Path(__file__).with_name("scripts")
 #: A camera and a microphone for ``av_daemon``.
 DEVICES = {
     "enabled": True,
@@ -112,9 +114,9 @@ class Rig:
 
     The robot reaches the remote broker through ``uplink``, a proxy that can fail. With ``direct`` it connects without
     the proxy, because a proxy acknowledges TCP segments itself and so changes the timing. ``remote`` and ``local``
-    replace its own brokers; ``login`` is the robot's user name there. ``motors`` replaces its own MCU. ``listens``:
-    what the operator subscribes to, below the robot's base; ``operator`` replaces it. ``top``: more sections of the
-    config; others are services'.
+    replace its own brokers, ``motors`` its own MCU. ``listens``: what the operator subscribes to, below the robot's
+    base; ``operator`` replaces it. ``scripts``: which of ours it has. ``top``: more sections of the config; others are
+    services'.
     """
 
     def __init__(
@@ -129,21 +131,25 @@ class Rig:
         direct: bool = False,
         remote: Broker | None = None,
         local: Broker | None = None,
-        login: str | None = None,
         listens: str = "#",
         operator: Operator | None = None,
+        scripts: tuple[str, ...] = (),
         top: dict[str, Any] | None = None,
         **config: Any,
     ) -> None:
         self.kind, self.name, self._extra, self._direct, self._top = kind, name, config, direct, top or {}
-        self._login = {} if login is None else {"username": login}
         self.charge_later = "charge"  # the MCU command in the middle of a fault
         self._folder = tempfile.TemporaryDirectory(prefix="pbl")
         self.folder = Path(self._folder.name)
         self.remote = remote or Broker(self.folder)
         self.uplink = TcpProxy(self.remote.port)
         self.local = local or Broker(self.folder) if kind == "mqtt" or mirror else None
-        self.mirror = mirror
+        self.mirror, self._scripts = mirror, scripts
+        if scripts:
+            manager = {"enabled": True, "autonomy_root": "autonomy", "stop_timeout_seconds": 2.0}
+            self._extra = config | {"autonomy_manager": manager | config.get("autonomy_manager", {})}
+        for script in scripts:
+            shutil.copytree(SCRIPTS / script, self.folder / "autonomy" / script)
         self.mcu = motors or Mcu(self.folder, mcu)
         self.config = self.folder / "robot.json"
         self.config.write_text(json.dumps(self._config(), indent=1))
@@ -245,6 +251,32 @@ class Rig:
                 time.sleep(seconds)
                 os.kill(pid, signal.SIGCONT)
 
+    # -- its scripts
+
+    def run_script(self, file: str, config: dict[str, Any] | None = None) -> float:
+        """Start a script; returns when the command was sent."""
+        began = time.monotonic()
+        self.operator.send("incoming/autonomy-command", {"action": "start", "file": file, "config": config or {}})
+        return began
+
+    def end_script(self) -> float:
+        """Stop the script; returns when the command was sent."""
+        began = time.monotonic()
+        self.operator.send("incoming/autonomy-command", {"action": "stop"})
+        return began
+
+    def script(self) -> dict[str, Any]:
+        """Return the newest ``autonomy-status``; empty before the first."""
+        seen = self.operator.last("outgoing/autonomy-status")
+        return {} if seen is None else dict(seen.json)
+
+    def lists_scripts(self, since: float = 0.0) -> bool:
+        """True if all of them are in a catalogue that was published after ``since``."""
+        seen = [one for one in self.operator.on("outgoing/autonomy-files", since) if since == 0.0 or not one.retain]
+        return bool(seen) and set(self._scripts) <= {script["file"] for script in seen[-1].json["files"]}
+
+    # -- faults
+
     def kill_local_broker(self) -> None:
         """Kill the robot's own broker; it starts again after a second, without its retained messages."""
         assert self.local is not None
@@ -293,7 +325,6 @@ class Rig:
                 "remote_mqtt": {
                     "host": "127.0.0.1",
                     "port": self.remote.port if self._direct else self.uplink.port,
-                    **self._login,
                 },
                 **self._actions(),
             },
@@ -322,7 +353,7 @@ class Rig:
         # localhost here and 127.0.0.1 there: one broker under two names must be recognised
         port = self.remote.port if self.kind == "single" or self.local is None else self.local.port
         return {
-            "local_mqtt": {"host": "localhost", "port": port, **self._login},
+            "local_mqtt": {"host": "localhost", "port": port},
             "transport": {"kind": "mqtt", "run_dir": str(self.folder / "run"), "state_dir": str(self.folder / "state")},
         }
 

@@ -11,7 +11,6 @@ from typing import Any
 
 import pytest
 
-from tests.robot.control_schedules import ENGINE
 from tests.robot.operator import Operator, driving
 from tests.robot.rig import BASE, STOP, Rig, lines
 from tests.support import beside, cases, until
@@ -103,9 +102,7 @@ def test_a_flood_of_strangers_takes_nothing_from_who_has_control(rig: Rig) -> No
                 assert until(lambda: time.monotonic() > began + FLOOD_S, FLOOD_S + 5)
                 asked = len(driver.sent_at) - before
             assert until(lambda: len(lines(rig, 0.5, began)) >= LEAST * asked, 2), (len(lines(rig, 0.5, began)), asked)
-        gap_s = max(after - line for line, after in itertools.pairwise(lines(rig, 0.5, began)))
-        print(f"{rig.kind}: {len(lines(rig, 0.5, began))} lines of {asked} commands, gap {gap_s:.3f} s")  # noqa: T201
-        assert gap_s <= GAP_S
+        assert max(after - line for line, after in itertools.pairwise(lines(rig, 0.5, began))) <= GAP_S
         assert next(numbers) > 300 * FLOOD_S
         assert lines(rig, -0.9) == []
         assert state(rig)["id"] == OTTO["id"]
@@ -116,7 +113,7 @@ def test_a_flood_of_strangers_takes_nothing_from_who_has_control(rig: Rig) -> No
 def test_a_client_that_knows_nothing_of_control_drives_while_nobody_has_it(rig: Rig) -> None:
     """Each of its commands reaches the line, and its bytes are not changed."""
     began = time.monotonic()
-    wanted = [round(0.1 + number / 1000, 3) for number in range(cases(60, 200))]
+    wanted = [round(0.1 + number / 1000, 3) for number in range(20)]
     for z in wanted:
         rig.operator.send(DRIVE, json.dumps({"x": 0, "z": z, "source": "web", "t": 1}).encode())
         assert until(lambda z=z: lines(rig, z, began), 5), z
@@ -141,11 +138,3 @@ def test_where_strangers_are_refused_only_a_key_moves() -> None:
         rig.operator.send(DRIVE, {"x": 0, "z": 0.5, "key": key})
         assert until(lambda: lines(rig, 0.5), 5)
         assert lines(rig, 0.3) == lines(rig, 0.4) == []
-
-
-@pytest.mark.thorough
-@pytest.mark.parametrize("kind", ENGINE.kinds)
-def test_random_schedules_of_people_a_script_and_faults(kind: str) -> None:
-    """``python -m tests.kit.schedules control`` runs hundreds."""
-    for one in ENGINE.run(kind, 1, range(5)):
-        assert not one.problems, one.log

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import subprocess
 import sys
 import time
@@ -13,26 +12,8 @@ from typing import Any
 import pytest
 
 from pebble.config import LAUNCHER_LOCK
-from tests.robot.rig import Motors, Rig
+from tests.robot.rig import Rig
 from tests.support import ROOT, further, until
-
-
-class Terminal(Motors):
-    """A serial port whose board is this test: it sends only what :meth:`send` sends."""
-
-    def __init__(self, folder: Path) -> None:
-        self._ours, self._theirs = os.openpty()
-        os.set_blocking(self._ours, False)
-        trace = folder / "trace.jsonl"
-        trace.touch()
-        super().__init__(Path(os.ttyname(self._theirs)), trace)
-
-    def send(self, line: bytes) -> None:
-        os.write(self._ours, line)
-
-    def close(self) -> None:
-        os.close(self._ours)
-        os.close(self._theirs)
 
 
 @pytest.fixture(params=["mqtt", "zenoh"])
@@ -93,25 +74,6 @@ def test_siblings_that_do_not_reach_each_other_are_noticed_until_they_do() -> No
         (rig.folder / "run" / LAUNCHER_LOCK).unlink()
         assert until(drives, 40), "all programs start again"
         assert shows(rig, "yes")
-
-
-@pytest.mark.thorough  # in virtual time: tests/services/serial_mcu_bridge/test_silence.py
-def test_what_silence_means_depends_on_what_the_board_did_before(tmp_path: Path) -> None:
-    board = Terminal(tmp_path)
-    with Rig("mqtt", motors=board) as rig:
-        assert shows(rig, "unknown", "its board has sent nothing yet")
-        for noise in (b"\xff\x00\x80\n" * 40, b">>> \n", b"M 0.000 0.000\n", b"T a0=\n"):
-            board.send(noise)
-        assert shows(rig, "unknown", "what its board sends is not understood")
-        assert "heard_ms" not in _mcu(rig)
-        board.send(b"Done!\n")
-        assert shows(rig, "yes")
-        assert shows(rig, "unknown", "its board has sent nothing for 10 s")
-        end = time.monotonic() + 8
-        until(lambda: board.send(b"C chg=0 v=7.5\n") or time.monotonic() > end, 10)  # type: ignore[func-returns-value]
-        assert shows(rig, "yes")
-        assert until(lambda: board.send(b"\xff\xfe\n") or shows(rig, "no", "its board has stopped sending", 0.5), 20)  # type: ignore[func-returns-value]
-        assert _mcu(rig) == {"state": "silent", "heard_ms": 10_000}
 
 
 def _socket_of(pid: int, folder: Path) -> Path:

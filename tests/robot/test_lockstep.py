@@ -1,4 +1,4 @@
-"""Random schedules of persons, scripts and faults in virtual time: of one robot, of two motor owners, on a thin link.
+"""Random schedules of persons, scripts and faults in virtual time: of one robot, and of two motor owners.
 
 ``python -m tests.kit.schedules NAME`` runs thousands.
 """
@@ -11,7 +11,6 @@ from collections.abc import Iterator
 import pytest
 
 from tests.kit.schedules import Engine
-from tests.robot import thin_schedules
 from tests.robot.lockstep import schedules, two_owners
 from tests.support import cases
 
@@ -27,17 +26,13 @@ def quiet() -> Iterator[None]:
 
 
 @pytest.mark.parametrize(
-    ("name", "engine", "seed", "number", "least"),
+    ("name", "engine", "seed", "number"),
     [
-        ("lockstep", schedules.ENGINE, 0, cases(40, 150), {}),
-        ("owners", two_owners.ENGINE, 1, cases(50, 150), {}),
-        ("thin", thin_schedules.ENGINE, 0, cases(12, 1000), {"stops": 10, "confirmations": 10}),
+        ("lockstep", schedules.ENGINE, 0, cases(40, 150)),
+        ("owners", two_owners.ENGINE, 1, cases(50, 150)),
     ],
-    ids=("lockstep", "owners", "thin"),
+    ids=("lockstep", "owners"),
 )
-def test_no_schedule_violates_a_rule(name: str, engine: Engine, seed: int, number: int, least: dict[str, int]) -> None:
-    results = list(engine.run("", seed, range(number)))
-    violated = [rule for result in results for rule in result.problems]
+def test_no_schedule_violates_a_rule(name: str, engine: Engine, seed: int, number: int) -> None:
+    violated = [rule for result in engine.run("", seed, range(number)) for rule in result.problems]
     assert not violated, f"python -m tests.kit.schedules {name} --seed {seed} prints the shortest schedule"
-    counts = {count: sum(result.counts.get(count, 0) for result in results) for count in least}
-    assert all(counts[count] > minimum for count, minimum in least.items()), counts

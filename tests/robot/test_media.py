@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator
-from contextlib import closing
 from itertools import pairwise, product
 from typing import Any
 
@@ -14,8 +13,8 @@ from pebble.extensions.media.decode import Decoded, VideoDecoder
 from pebble.extensions.media.scene import read_counter
 from pebble.extensions.media.sound import SoundDecoder
 from pebble.extensions.media.video import VIDEO_ENCODINGS
-from tests.robot.operator import Operator, ReceivedMessage
-from tests.robot.rig import BASE, DEVICES, Rig
+from tests.robot.operator import ReceivedMessage
+from tests.robot.rig import DEVICES, Rig
 from tests.support import further, until
 
 pytestmark = pytest.mark.alone  # deadlines are checked
@@ -139,19 +138,6 @@ def test_a_killed_media_process_is_back_while_it_is_wanted(rig: Rig, program: st
 
 
 @two_kinds
-def test_a_retained_request_starts_nothing(rig: Rig) -> None:
-    rig.operator.send(VIDEO_FLAG, True, retain=True)
-    rig.operator.send(ASK_VIDEO, {"enabled": True}, retain=True)
-    assert until(lambda: rig.operator.on(ASK_VIDEO), 5)
-    rig.kill("mqtt_bridge")  # after its restart it receives the request as a retained message
-    began = time.monotonic()
-    try:
-        assert not until(lambda: rig.operator.on(CAMERA, began + 1.0), 4.0)
-    finally:
-        rig.operator.send(ASK_VIDEO, b"", retain=True)
-
-
-@two_kinds
 def test_stopping_media_does_not_delay_driving(rig: Rig) -> None:
     began = want_video(rig)
     rig.operator.send(AUDIO_FLAG, True, retain=True)
@@ -167,22 +153,6 @@ def test_stopping_media_does_not_delay_driving(rig: Rig) -> None:
     moves = [at for at, wheels in rig.mcu.drives(drive_from) if wheels != (0.0, 0.0)]
     assert len(moves) > 35
     assert max(later - earlier for earlier, later in pairwise(moves)) < 0.5
-
-
-@pytest.mark.parametrize("rig", ["mqtt"], indirect=True)
-def test_media_do_not_pass_the_robots_own_side(rig: Rig) -> None:
-    assert rig.local is not None
-    with closing(Operator(rig.local.port, BASE)) as inside:
-        assert pictures_come(rig, want_video(rig))
-        assert until(lambda: {"camera", "camera_publisher"} <= status(inside).keys(), 10)
-        assert until(lambda: status(rig.operator).keys() == status(inside).keys(), 10)
-        assert not inside.on(CAMERA)
-
-
-def status(operator: Operator) -> dict[str, Any]:
-    """The value of media-status now."""
-    last = operator.last("outgoing/media-status")
-    return {} if last is None else dict(last.json["value"])
 
 
 @pytest.mark.parametrize("rig", ["mqtt", further("zenoh")], indirect=True)

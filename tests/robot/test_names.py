@@ -3,34 +3,26 @@
 from __future__ import annotations
 
 import itertools
-import json
 import statistics
-import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack, closing
+from collections.abc import Iterator
+from contextlib import ExitStack
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import pytest
-from msgspec.structs import replace
 
-from pebble.config import load
-from pebble.forwarding.retained_window import INITIAL_SYNC_S
-from pebble.runtime.connections import local_transport
-from pebble.transports import Message
 from tests.ext.fleet.broker_client import BrokerClient, Place
 from tests.ext.fleet.brokers import HOST
-from tests.kit.terminal import Terminal
-from tests.robot.named import CONTROL, DRIVE, Hall, Named
-from tests.robot.operator import Operator, driving
+from tests.robot.named import DRIVE, Hall, Named
+from tests.robot.operator import driving
 from tests.robot.rig import BASE, STOP, lines
 from tests.support import beside, cases, until
 
 pytestmark = pytest.mark.alone  # lines are counted
 
-ESTOP, FLAG = "outgoing/estop/serial", "flags/mqtt-video"
+ESTOP = "outgoing/estop/serial"
 FLOOD_S = float(cases(2, 60))
 
 
@@ -89,32 +81,6 @@ def test_who_takes_control_over_drives_and_only_they_start_scripts(rig: Named) -
                 assert rig.sends(name, "autonomy-command", start, found), error
 
 
-def test_a_terminal_takes_control_by_its_account_is_asked_and_is_taken_over(rig: Named, tmp_path: Path) -> None:
-    password = tmp_path / "otto-password"
-    password.write_text(rig.hall.passwords["otto"])
-    password.chmod(0o600)
-    url = f"mqtt://otto@127.0.0.1:{rig.hall.plain_port}"
-    drive = [sys.executable, "-m", "pebble.cli", "drive", "rover", "--url", url, "--password-file", str(password)]
-    with closing(Terminal(*drive)) as console:
-        assert console.sees("ready"), console.shown
-        assert (rig.state()["by"].partition("/")[0], rig.state()["named"]) == ("otto", True)
-        began = time.monotonic()
-        console.hold(b"w")
-        assert until(lambda: rig.mcu.moving(began), 5)
-        asks = {"id": "cccccccc", "for_ms": 10_000}
-        assert rig.sends("mia", CONTROL, asks, lambda: rig.state()["asks_id"] == "cccccccc")
-        assert console.sees("mia asks for control: l lets mia drive"), console.shown
-        with rig.held("boss", "control/take") as key:
-            rig.judged("boss", key, 0.33)
-            taken = time.monotonic()
-            rig.judged("boss", key, 0.34)
-            assert {wheels for _, wheels in rig.mcu.drives(taken)} <= {STOP, (0.33, 0.33), (0.34, 0.34)}, (
-                "the key is held"
-            )
-            assert console.sees("boss (name checked) is driving"), console.shown
-        rig.send("mia", CONTROL, {"id": "cccccccc", "want": "release"})
-
-
 def test_everybody_stops_it_and_only_a_safety_officer_resets_it(rig: Named) -> None:
     with rig.held("otto") as key, driving(_By(rig, "otto"), 0.7, key=key):
         for suffix, by in (("incoming/by/vera/estop", "vera"), ("incoming/estop", "somebody?")):
@@ -135,20 +101,6 @@ def test_everybody_stops_it_and_only_a_safety_officer_resets_it(rig: Named) -> N
 def state_of(rig: Named) -> dict[str, Any]:
     last = rig.operator.last(ESTOP)
     return {} if last is None else last.json
-
-
-def test_wills_move_nothing(rig: Named) -> None:
-    with rig.held("zoe") as old:
-        rig.judged("zoe", old, 0.31)
-    waiting = [
-        rig.hall.client(name, will=(f"incoming/{by}{DRIVE}", {"x": 0, "z": 0.41, "key": old}))
-        for name, by in (("zoe", ""), ("zoe", "by/zoe/"), ("otto", "by/zoe/"), ("rover", ""))
-    ]
-    with rig.held("zoe") as key:
-        for client in waiting:
-            client.drop()
-        rig.judged("zoe", key, 0.42)
-    assert lines(rig, 0.41) == []
 
 
 def test_who_is_removed_while_driving_stands(rig: Named) -> None:
@@ -172,47 +124,6 @@ class _By:
 
     def send(self, suffix: str, body: Any, **options: Any) -> None:
         self._rig.send(self._name, suffix.removeprefix("incoming/"), body, **options)
-
-
-# -- flags
-
-
-def retained(rig: Named) -> list[bytes]:
-    """What both sides retain of the flag: the robot's own, then its remote broker."""
-    topic = f"{BASE}/incoming/{FLAG}"
-    with ExitStack() as ends:
-        here = ends.enter_context(local_transport(load(rig.config), "flags"))
-        there = ends.enter_context(rig.hall.login("rover"))
-        values: list[Message] = []
-        here.subscribe(topic, values.append, direct=True)
-        there.subscribe([topic])
-        until(lambda: values, 1)
-        until(lambda: there.listen(0.01) or there.received, 1)
-        return [one.payload for one in values[-1:]] + [payload for _, payload in there.received[-1:]]
-
-
-@pytest.mark.parametrize("order", ["bridge, broker", "broker, bridge", "robot, broker", "older"])
-def test_a_flag_by_name_stays_on_both_sides(rig: Named, order: str) -> None:
-    """After restarts in each order; and where the broker retains an older value, as it was killed before it saved."""
-    for value in (b"true", b"false", b"true"):
-        rig.send("mia", FLAG, value)
-        assert until(lambda v=value: retained(rig) == [v, v], 10), retained(rig)
-    rig.person("mia").send(f"incoming/{FLAG}", b"false", retain=True)  # the broker refuses it
-    steps: dict[str, Callable[[], object]] = {
-        "bridge": lambda: rig.kill("mqtt_bridge"),
-        "broker": lambda: (rig.hall.stop(), rig.hall.start()),
-        "robot": lambda: (rig.stop(), rig.start(ready=False)),
-        "older": lambda: (
-            rig.stop(),
-            rig.person("rover").send(f"incoming/{FLAG}", b"false", retain=True),
-            rig.start(ready=False),
-        ),
-    }
-    for step in order.split(", "):
-        began = time.monotonic()
-        steps[step]()
-        rig.wait_until_up(began, 30)
-    assert until(lambda: retained(rig) == [b"true", b"true"], 15), retained(rig)
 
 
 @pytest.fixture
@@ -246,76 +157,3 @@ def test_what_another_account_sends_holds_up_no_stop(flooded: Named) -> None:
     assert statistics.median(took) < 1, took
     order = {one: state_of(rig)[one] for one in ("boot", "count")}
     assert rig.sends("boss", "estop-reset", order, lambda: not state_of(rig)["latched"], 30), state_of(rig)
-
-
-# -- from a broker with logins to names, as docs/ext/fleet.md has it
-
-
-class Old(Operator):
-    """A client of the original's shape: it logs in, and knows neither names nor control.
-
-    Its account has all rights of people; the broker has passed on what it sent before the next message is sent.
-    """
-
-    def __init__(self, hall: Hall) -> None:
-        super().__init__(hall.plain_port, BASE, "outgoing/#", login=("boss", hall.passwords["boss"]))
-
-    def send(self, suffix: str, body: Any, *, qos: int = 1, retain: bool = False) -> None:
-        self._client.publish(f"{self.base}/{suffix}", json.dumps(body), qos=qos, retain=retain).wait_for_publish(5)
-
-
-@pytest.mark.thorough
-@pytest.mark.parametrize("kind", ["mqtt", "zenoh"])
-def test_an_original_client_lives_through_the_migration(kind: str, tmp_path: Path) -> None:
-    """Lights, scripts, flags, pictures and wheels: until the robot insists on names, and again when it does not."""
-    with Hall(tmp_path / "hall", "login") as hall, Named(kind, hall, {"level": "login"}) as rig:
-        old, numbers = Old(hall), itertools.count(110)
-
-        def stage(plain: bool, level: Literal["login", "named"], **security: str) -> None:
-            hall.change(replace(hall.fleet, level=level, plain=plain))
-            rig.stop()
-            rig.configure(level=level, **security)
-            rig.start()
-            time.sleep(2 * INITIAL_SYNC_S)  # a flag that comes earlier may be an old one: the robot's value counts
-
-        def has_effect(*expected: str) -> bool:
-            """Whether just this of what an old client sends has an effect on the robot."""
-            number, got = next(numbers), list[Message]()
-            z = number / 1000
-            sent: dict[str, Any] = {
-                "lights-solid": {"r": z}, "flags/mqtt-video": {"value": True, "n": z},
-                "flags/reboot": {"value": True, "n": z},
-                "autonomy-command": {"action": "start", "file": f"s{z}"}, "front-camera": {"enabled": True, "n": z},
-                "control/take": {"id": f"{number:08x}", "n": z}, "estop-reset": {"boot": "", "count": number, "n": z},
-            }  # fmt: skip
-            with local_transport(load(rig.config), "watcher") as here:
-                here.subscribe(f"{BASE}/incoming/#", got.append, direct=True)
-                old.send(f"incoming/{DRIVE}", {"x": 0, "z": z})
-                assert until(lambda: DRIVE not in expected or lines(rig, z), 5)
-                for metric, body in sent.items():  # while it has control, it drives no more: it knows no key
-                    old.send(f"incoming/{metric}", body, retain=metric == "flags/mqtt-video")
-                zeroed = time.monotonic()
-                rig.person("rover").send(f"incoming/{DRIVE}", {"x": 0, "z": 0, "n": number})  # passes always
-                assert until(lambda: any(b'"n":%d' % number in one.payload.replace(b" ", b"") for one in got), 5)
-                assert until(lambda: lines(rig, 0.0, zeroed), 5)
-            found = {one.topic.removeprefix(f"{BASE}/incoming/") for one in got if str(z).encode() in one.payload}
-            found = (found - {DRIVE}) | ({DRIVE} if lines(rig, z) else set())
-            assert found == set(expected)
-            return True
-
-        known = ("lights-solid", "flags/mqtt-video", "autonomy-command", "front-camera")
-        try:
-            assert has_effect(DRIVE, *known, "flags/reboot", "control/take", "estop-reset")
-            stage(True, "named", strangers="free")
-            assert has_effect(DRIVE, *known)
-            with rig.held("mia") as key:
-                rig.judged("mia", key, 0.9)
-                assert has_effect(*known)
-            stage(False, "named")
-            assert has_effect()
-            stage(True, "named", strangers="free")
-            assert has_effect(DRIVE, *known)
-            stage(False, "login")
-            assert has_effect(DRIVE, *known, "flags/reboot", "control/take", "estop-reset")
-        finally:
-            old.close()

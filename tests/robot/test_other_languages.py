@@ -1,4 +1,4 @@
-"""Programs that know only plain MQTT take part on a Zenoh robot: mosquitto's clients in C, and one in JavaScript."""
+"""Programs that know only plain MQTT take part on a Zenoh robot: mosquitto's clients in C."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import json
 import subprocess
 import time
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -15,7 +14,6 @@ from tests.robot.operator import Operator, retained_messages
 from tests.robot.rig import BASE, Rig
 from tests.support import until
 
-CLIENT = Path(__file__).with_name("client.mjs")
 DRIVE = f"{BASE}/incoming/drive-values"
 
 
@@ -84,22 +82,3 @@ def test_a_c_client_sets_a_flag_for_every_client(rig: Rig) -> None:
         ),
         5,
     )
-
-
-def test_a_javascript_program_receives_and_drives(rig: Rig) -> None:
-    began = time.monotonic()
-    program = subprocess.Popen(
-        ["node", str(CLIENT), local_port(rig), f"{BASE}/#", DRIVE, '{"x": -0.1, "z": 0.6}'],
-        stdout=subprocess.PIPE, text=True,
-    )  # fmt: skip
-    try:
-        assert until(lambda: (0.5, 0.7) in [wheels for _, wheels in rig.mcu.drives(began)], 5)
-        time.sleep(0.5)  # some of the stream
-    finally:
-        program.terminate()
-    received = [json.loads(line) for line in program.communicate()[0].splitlines() if line.endswith("}")]
-    retained = {message["topic"] for message in received if message["retain"]}
-    assert {f"{BASE}/outgoing/capabilities", f"{BASE}/outgoing/charging-level"} <= retained
-    assert [m["payload"] for m in received if m["topic"] == DRIVE] == ['{"x": -0.1, "z": 0.6}']
-    touch = next(m for m in received if m["topic"] == f"{BASE}/outgoing/touch-sensors")
-    assert set(json.loads(touch["payload"])["value"]) == {"a0", "a1", "a2"}

@@ -1,4 +1,4 @@
-"""Persons, scripts, senders of stops and those who reset: each with a connection of its own."""
+"""Persons, senders of stops and those who reset: each with a connection of its own."""
 
 from __future__ import annotations
 
@@ -19,7 +19,6 @@ from pebble.transports import Message, MqttSettings, QoS, Transport, create
 from tests.robot.stop_schedules.history import History
 
 _PERIOD_S = 1 / 15
-_PERSON, _SCRIPTS = 0.5, 7  # speeds: persons drive forward, and scripts backward as their run says
 _OPEN_S = 3.0
 
 
@@ -33,15 +32,8 @@ def base_of(robot: str) -> str:
     return f"pebble/robots/{robot}"
 
 
-def speed_of_run(run: int) -> float:
-    return -(0.3 + run % _SCRIPTS / 10)
-
-
 class Driver:
-    """Repeats a drive command on a thread while told to; a person, or a script that goes on whatever happens.
-
-    Unlike other drivers it falls silent without a zero, and writes down what it does.
-    """
+    """Repeats a drive command on a thread while told to. Unlike other drivers it falls silent without a zero."""
 
     def __init__(self, port: int, robot: str, history: History) -> None:
         self.robot, self.history = robot, history
@@ -54,12 +46,8 @@ class Driver:
         self._thread.start()
 
     def drive(self) -> None:
-        self._set({"x": 0, "z": _PERSON, "valid_ms": 600})
+        self._set({"x": 0, "z": 0.5, "valid_ms": 600})
         self.history.add("drives", self.robot)
-
-    def run(self, number: int) -> None:
-        self._set({"x": 0, "z": speed_of_run(number), "source": "autonomy", "run": number, "valid_ms": 600})
-        self.history.add("script", self.robot, run=number)
 
     def lose(self) -> None:
         """Send nothing more, as when a connection is lost."""
@@ -102,7 +90,7 @@ class Sender:
         """``retain``: its stops ask to be retained, which a sender of ours never does."""
         self.name = new_name()
         self.robots = robots
-        self._port, self._history, self._retain = port, history, retain
+        self._history, self._retain = history, retain
         self._core = StopSender(
             self.name, by="test", why="", now=time.monotonic(), robots=[base_of(robot) for robot in robots]
         )
@@ -147,7 +135,7 @@ class Sender:
             at, name = time.monotonic(), base.rpartition("/")[2]
             sent = self._transport.publish(message.topic, message.payload, qos=message.qos, retain=retain, urgent=True)
             if message.topic == DRIVE.topic(base):
-                self._history.add("zero", name, at=at, final=True, sent=sent, sender=self.name, port=self._port)
+                self._history.add("zero", name, at=at, final=True, sent=sent, sender=self.name)
 
     def _note(self) -> None:
         for base, robot in self._core.robots.items():

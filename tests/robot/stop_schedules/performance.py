@@ -16,7 +16,6 @@ from tests.robot.stop_schedules.schedules import BOARD, ROBOTS, ROVER, Schedule,
 from tests.robot.stop_schedules.world import World
 from tests.support import until
 
-_HOLD_S = 2.1  # scripts wait so long after a person's command
 _CONFIRMED_S = 15.0  # after all faults; a killed robot takes some seconds to start
 _UP_S = 15.0
 _ANSWER_S = 1.5
@@ -25,8 +24,6 @@ _STILL_S = 1.5
 _REPEATED_S = 6.0  # a broker that was restored may have an older state until its owner repeats it
 _RESETS = 9  # tries of _ANSWER_S: an owner that was killed five times in a minute starts after ten seconds
 
-_runs = iter(range(1, 1_000_000_000))
-
 
 class Performance:
     """One schedule in one world."""
@@ -34,24 +31,22 @@ class Performance:
     def __init__(self, world: World, schedule: Schedule) -> None:
         self.world, self.schedule = world, schedule
         self.history = world.begin()
-        self._senders: list[tuple[Sender, int]] = []
+        self._senders: list[Sender] = []
         self._faults: list[Future[None]] = []
-        self._looked = {robot: world.watch(robot).look(robot) for robot in ROBOTS}
+        self._looked = {robot: world.subscriber.look(robot) for robot in ROBOTS}
 
     def run(self) -> Outcome:
         try:
             self._perform()
             problems = self._rest()
         finally:
-            for sender, _ in self._senders:
+            for sender in self._senders:
                 sender.end()
         problems = violations(self.history, self.world, self._resting) + problems
         confirmed = self.history.events("confirmed")
-        deaf = [not self.world.confirmable(robot, port) for sender, port in self._senders for robot in sender.robots]
         counts = {
             "stops": len(self.history.events("stop given")),
             "confirmed": len(confirmed),
-            "deaf": sum(deaf),
             "resets": len(self.history.events("reset")),
             "slowest stop": round(max((event.details["took"] for event in confirmed), default=0.0), 3),
         }
@@ -78,10 +73,8 @@ class Performance:
                 world.persons[robot].zero()
             case "lose":
                 world.persons[robot].lose()
-            case "script":
-                world.scripts[robot].run(next(_runs))
-            case "zero" | "final zero":
-                world.persons[robot].zero(final=step.what == "final zero")
+            case "final zero":
+                world.persons[robot].zero(final=True)
             case "stop":
                 self._stop([*ROBOTS] if robot == "both" else [robot], world.access.port)
             case "stop at the robot":
@@ -89,13 +82,11 @@ class Performance:
             case "retained stop":
                 self._stop([robot], world.access.port, retain=True)
             case "look":
-                self._looked[robot] = world.watch(robot).look(robot)
+                self._looked[robot] = world.subscriber.look(robot)
             case "reset":
                 self._reset(robot)
             case "wait for confirmations":
                 until(lambda: not self._waiting(), step.amount)
-            case "wait for the hold":
-                time.sleep(max(0.0, self.world.person_until + _HOLD_S - time.monotonic()))
             case what if what.startswith("stop, then kill "):
                 victim = what.rpartition(" ")[2]
                 self._stop([BOARD if victim == "board" else ROVER], world.access.port)
@@ -105,22 +96,22 @@ class Performance:
                 self._faults.append(world.threads.submit(world.fault, step.what, step.amount))
 
     def _stop(self, robots: list[str], port: int, *, retain: bool = False) -> None:
-        self._senders.append((Sender(port, robots, self.history, retain=retain), port))
+        self._senders.append(Sender(port, robots, self.history, retain=retain))
 
     def _reset(self, robot: str) -> bool:
         """Send what was read by the last look; False if nothing was latched there."""
         looked = self._looked[robot]
         for state, message in zip(looked.shown.values(), looked.messages(), strict=True):
             self.history.add("reset", robot, shown=state)
-            self.world.watch(robot).publish(message)
+            self.world.subscriber.publish(message)
         return bool(looked.shown)
 
     def _waiting(self) -> list[str]:
         """The stops that must be confirmed and are not."""
         return [
             f"stop {sender.name} of {' and '.join(sender.robots)}: {sender.why}"
-            for sender, port in self._senders
-            if not sender.confirmed and all(self.world.confirmable(robot, port) for robot in sender.robots)
+            for sender in self._senders
+            if not sender.confirmed
         ]
 
     # -- the end
@@ -135,18 +126,16 @@ class Performance:
         problems += [f"a sender does not come to rest: {waiting}" for waiting in self._waiting()]
         time.sleep(0.5)  # what is latched is driven a little longer
         self._resting = self.history.add("> people end everything")
-        for sender, _ in self._senders:
+        for sender in self._senders:
             sender.end()
         for robot in ROBOTS:
-            self.world.scripts[robot].lose()
             self.world.persons[robot].zero(final=True)
         for robot in ROBOTS:
             problems += self._end(robot)
-        self.world.person_until = time.monotonic()
         return problems
 
     def _end(self, robot: str) -> list[str]:
-        watch, wheels, person = self.world.watch(robot), self.world.wheels[robot], self.world.persons[robot]
+        watch, wheels, person = self.world.subscriber, self.world.wheels[robot], self.world.persons[robot]
         if not until(lambda: not wheels.speed, _STILL_S):
             return [f"{robot}: the wheels turn on after everybody has let go"]
         for _ in range(_RESETS):

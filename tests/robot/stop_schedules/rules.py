@@ -5,16 +5,14 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from pebble.contract.payloads import EstopState
-from pebble.motion.arbiter import newer
 from tests.robot.stop_schedules.history import Event, History
-from tests.robot.stop_schedules.people import speed_of_run
 from tests.robot.stop_schedules.schedules import ROBOTS
 from tests.robot.stop_schedules.world import World
 
 _REACTION_S = 0.4  # from a state or a zero until the wheels are still, beside other work
 _DEAD_MAN_S = 1.2  # until the MCU stops wheels whose owner was killed or stands still
 _HEARTBEAT_S = 0.6  # they are sent four times a second
-_HOLD_S = 1.8  # of the two seconds for which a person's command holds a script
+_STAYS_S = 1.8  # at rest after a zero
 _FAULT_PAST_S, _FAULT_NEXT_S = 0.5, 0.5  # so long after and before a fault nothing is expected to arrive
 _START_S = 3.0  # an owner that was killed is there again
 _NAMES = 4  # remembered by every owner
@@ -27,7 +25,7 @@ def violations(history: History, world: World, until: float) -> list[str]:
 
 class _Rules:
     def __init__(self, history: History, robot: str, world: World, until: float) -> None:
-        self._robot, self._world, self._wheels = robot, world, world.wheels[robot]
+        self._world, self._wheels = world, world.wheels[robot]
         self._until, self._began = until, history.began
         self._events = history.events(robot=robot)
         self._faults = history.events("fault")
@@ -41,8 +39,6 @@ class _Rules:
 
     def problems(self) -> Iterator[str]:
         yield from self._latched()
-        yield from self._barred()
-        yield from self._starts()
         yield from self._zeros()
         yield from self._copies()
         yield from ("a state cannot be parsed" for _ in self._of("malformed state"))
@@ -85,51 +81,17 @@ class _Rules:
         near = any(begin - _REACTION_S <= at + _REACTION_S and at - _DEAD_MAN_S <= end for begin, end in disturbed)
         return _DEAD_MAN_S if near else _REACTION_S
 
-    # -- scripts
-
-    def _runs(self) -> dict[int, float]:
-        return {event.details["run"]: event.at for event in self._of("script")}
-
-    def _barred(self) -> Iterator[str]:
-        """Within one life of the owner: what is barred is not saved."""
-        for at, state in self._states:
-            barred = [run for run in self._runs() if state.barred and not newer(run, state.barred)]
-            if barred and not any(at - _FAULT_PAST_S < death < at for death in self._deaths):
-                last = min([death for death in self._deaths if death >= at] + [self._until])
-                yield from self._moved_by(barred, at + self._reaction(at), last, "after it is barred")
-
-    def _starts(self) -> Iterator[str]:
-        """A starting owner refuses scripts for two seconds."""
-        for death in self._deaths:
-            yield from self._moved_by(list(self._runs()), death + _DEAD_MAN_S, death + 2.0, "while its owner starts")
-
-    def _moved_by(self, runs: list[int], first: float, last: float, when: str) -> Iterator[str]:
-        speeds = {round(speed_of_run(run), 1): run for run in runs}
-        for at, _, speed in self._wheels.turned(first, last):
-            if round(speed, 1) in speeds:
-                yield f"run {speeds[round(speed, 1)]} moves the wheels {when}, at {at - self._began:.3f}"
-                return
-
     # -- zeros
 
     def _zeros(self) -> Iterator[str]:
-        """A person's zero stops the wheels for the time of the hold; a final one ends the run."""
+        """A person's zero stops the wheels until one drives again."""
         for zero in self._of("zero"):
             driving = self._driving(zero.at)
-            last = min([driving, zero.at + _HOLD_S, self._until])
+            last = min([driving, zero.at + _STAYS_S, self._until])
             if driving <= zero.at or self._lost(zero):
                 continue
             if turned := self._wheels.turned(zero.at + _REACTION_S, last):
                 yield f"wheels turn ({turned[0][2]:+.2f}) {turned[0][0] - zero.at:.2f} s after a zero"
-            if zero.details["final"] or self._script_moves(zero.at):
-                runs = [run for run, began in self._runs().items() if began < zero.at - _REACTION_S]
-                ends = [death for death in self._deaths if death > zero.at]
-                yield from self._moved_by(runs, zero.at + _REACTION_S, min([*ends, self._until]), "after a zero")
-
-    def _script_moves(self, at: float) -> bool:
-        """Whether it does so all the time around ``at``, so that it is what the zero stops."""
-        turned = self._wheels.turned(at - 0.1, at)
-        return len(turned) == 1 and turned[0][2] < 0 and turned[0][0] <= at - 0.1 and turned[0][1] >= at
 
     def _driving(self, at: float) -> float:
         """When a person drives next; ``at`` if one does so."""
@@ -143,12 +105,12 @@ class _Rules:
     def _lost(self, zero: Event) -> bool:
         """Whether it may not have arrived, or its owner may have restarted before the end of the hold."""
         at = zero.at
-        if not zero.details["sent"] or self._world.deaf(self._robot, zero.details.get("port", 0)):
+        if not zero.details["sent"]:
             return True
         arrived = [event.at for event in self._of("online") if at - _HEARTBEAT_S < event.at < at + _HEARTBEAT_S]
         connected = bool(arrived) and arrived[0] < at < arrived[-1]
         near = any(e.at - _FAULT_NEXT_S < at < e.details["until"] + _FAULT_PAST_S for e in self._faults)
-        dead = any(at - _START_S < death < at + _HOLD_S for death in self._deaths)
+        dead = any(at - _START_S < death < at + _STAYS_S for death in self._deaths)
         return near or dead or not connected
 
     # -- retained copies

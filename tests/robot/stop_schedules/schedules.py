@@ -1,4 +1,4 @@
-"""Random schedules of people, scripts, stops, resets and faults, as data: the same seed makes the same schedule."""
+"""Random schedules of people, stops, resets and faults, as data: the same seed makes the same schedule."""
 
 from __future__ import annotations
 
@@ -29,8 +29,8 @@ _COMMON = {
     "power cut board": 0.0,
 }
 _ORDINARY = {
-    *("drive", "let go", "lose", "script", "zero", "final zero", "look", "reset"),
-    *("stop", "stop at the robot", "wait for confirmations", "wait for the hold"),
+    *("drive", "let go", "lose", "final zero", "look", "reset"),
+    *("stop", "stop at the robot", "wait for confirmations"),
 }
 
 
@@ -60,22 +60,16 @@ class Schedule:
 
 
 def setups(transport: str) -> tuple[str, ...]:
-    """How robot, brokers and rights are arranged; each is named after what it adds to the others."""
-    zenoh, mqtt = ("mirror", "mirror is the remote broker"), ("two brokers", "read denied locally")
-    second = zenoh if transport == "zenoh" else mqtt
-    return (
-        *("one broker", *second, "remote-mirror", "failover", "older save", "retained stop"),
-        *("read denied", "SUBACK refused", "killed before the state", "power cut"),
-    )
+    """How robot and brokers are arranged; each is named after what it adds to the others."""
+    second = ("mirror", "mirror is the remote broker") if transport == "zenoh" else ("two brokers",)
+    more = ("remote-mirror", "failover", "older save", "retained stop", "killed before the state", "power cut")
+    return ("one broker", *second, *more)
 
 
 def make(transport: str, setup: str, seed: int) -> Schedule:
     """The schedule with this seed."""
     chance = random.Random(f"{transport} {setup} {seed}")
     steps = [*_driving(chance), *_stops(chance), *_resets(chance)]
-    if chance.random() < 0.35:
-        calm = chance.choice(ROBOTS)
-        steps = [step for step in steps if step.robot not in (calm, "both")] + _person_before_script(chance, calm)
     special = _SPECIAL.get(setup)
     if special is not None:
         steps += special(chance)
@@ -90,31 +84,14 @@ def _at(chance: random.Random, what: str, robot: str = "", *, first: float = 0.2
 
 
 def _driving(chance: random.Random) -> list[Step]:
-    """A person drives each robot most of the time; in half of the schedules a script does so at first."""
+    """A person drives each robot most of the time."""
     steps = []
     for robot in ROBOTS:
-        if chance.random() < 0.5:
-            steps.append(Step(0.0, "script", robot, 1.0 if chance.random() < 0.5 else 0.0))
-            for _ in range(chance.choice((0, 1, 1, 2))):
-                steps.append(_at(chance, chance.choice(("zero", "final zero")), robot))
-            if chance.random() < 0.5:
-                drive = _at(chance, "drive", robot, first=0.5)
-                steps += [drive, Step(round(drive.at + 0.4, 3), chance.choice(("let go", "lose", "drive")), robot)]
-        else:
-            steps.append(Step(0.0, "drive", robot))
-            if chance.random() < 0.4:
-                steps.append(_at(chance, chance.choice(("let go", "lose")), robot, first=0.6))
-                steps.append(_at(chance, "drive", robot, first=1.4))
+        steps.append(Step(0.0, "drive", robot))
+        if chance.random() < 0.4:
+            steps.append(_at(chance, chance.choice(("let go", "lose", "final zero")), robot, first=0.6))
+            steps.append(_at(chance, "drive", robot, first=1.4))
     return steps
-
-
-def _person_before_script(chance: random.Random, robot: str) -> list[Step]:
-    """A person ends a script, or drives for a moment; nothing else happens to this robot until the hold is over."""
-    at = round(chance.uniform(0.3, 0.9), 3)
-    begin, over = [Step(0.0, "wait for the hold"), Step(0.0, "script", robot)], Step(round(at + 2.8, 3), "look", robot)
-    if chance.random() < 0.6:
-        return [*begin, Step(at, chance.choice(("zero", "final zero")), robot), over]
-    return [*begin, Step(at, "drive", robot), Step(round(at + 0.3, 3), "let go", robot), over]
 
 
 def _stops(chance: random.Random) -> list[Step]:

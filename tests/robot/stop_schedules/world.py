@@ -22,22 +22,19 @@ from tests.robot.rig import Rig, descendants
 from tests.robot.stop_schedules.history import History, Wheels
 from tests.robot.stop_schedules.people import Driver, Subscriber, base_of, connect
 from tests.robot.stop_schedules.schedules import BOARD, ROBOTS, ROVER
-from tests.support import ROOT, Broker, Child, refusal, until
+from tests.support import ROOT, Broker, Child, until
 from tests.tcp_proxy import TcpProxy
-
-_ROBOTS_LOGIN = "robot"
 
 
 class BoardProcess:
     """A simulated robot with Wi-Fi; its files survive it."""
 
-    def __init__(self, folder: Path, kind: str, port: int, login: str | None) -> None:
+    def __init__(self, folder: Path, kind: str, port: int) -> None:
         self.trace = folder / "board.jsonl"
         self.trace.touch()
         self.wheels = Wheels(self.trace)
-        broker = f"mqtt://{'' if login is None else f'{login}@'}127.0.0.1:{port}"
         self._command = [
-            *(sys.executable, "-m", "pebble.cli", "sim", kind, BOARD, "--broker", broker),
+            *(sys.executable, "-m", "pebble.cli", "sim", kind, BOARD, "--broker", f"mqtt://127.0.0.1:{port}"),
             *("--trace", str(self.trace), "--files", str(folder / "files")),
         ]
         self._log = (folder / "board.log").open("ab")
@@ -64,7 +61,6 @@ class World:
         self.setup = setup
         self.history = History()
         self.planted: set[str] = set()
-        self.person_until = time.monotonic()  # when persons last drove before the present schedule
         self._saved: bytes | None = None
         self._lock = threading.RLock()  # only one fault at a time restarts something, or cuts the connections
         with ExitStack() as opened:
@@ -75,9 +71,8 @@ class World:
         # Brokers and boards end with the thread that started them: these threads last as long as the world.
         self.threads = opened.enter_context(ThreadPoolExecutor())
         self.folder = Path(opened.enter_context(tempfile.TemporaryDirectory(prefix="pbl")))
-        login = _ROBOTS_LOGIN if self.setup.startswith("read denied") else None
         persistent = self.setup in ("older save", "failover")
-        self.remote = Broker(self.folder, *self._rights(remote=True), persistence=persistent)
+        self.remote = Broker(self.folder, persistence=persistent)
         opened.callback(self.remote.stop)
         self.standby = Broker(self.folder, persistence=True) if self.setup == "failover" else None
         if self.standby is not None:
@@ -85,56 +80,30 @@ class World:
         kind, mirror, local = self._wiring(transport)
         self.access = opened.enter_context(TcpProxy(self.remote.port))  # for people
         self.radio = opened.enter_context(TcpProxy(self.remote.port))  # for the board
-        self.rig = opened.enter_context(Rig(kind, mirror=mirror, remote=self.remote, local=local, login=login))
+        self.rig = opened.enter_context(Rig(kind, mirror=mirror, remote=self.remote, local=local))
         self.local_port = (self.rig.local or self.remote).port
         board = "benjr" if len(self.setup) % 2 else "minilamp"
-        self.board = opened.enter_context(closing(BoardProcess(self.folder, board, self.radio.port, login)))
+        self.board = opened.enter_context(closing(BoardProcess(self.folder, board, self.radio.port)))
         self.wheels = {ROVER: Wheels(self.rig.folder / "trace.jsonl"), BOARD: self.board.wheels}
         self.subscriber = opened.enter_context(closing(Subscriber(self.access.port, ROBOTS, "remote")))
         self.local_subscriber = opened.enter_context(closing(Subscriber(self.local_port, (ROVER,), "local")))
         self.persons = {robot: self._driver(robot, opened) for robot in ROBOTS}
-        self.scripts = {robot: self._driver(robot, opened) for robot in ROBOTS}
         if self.setup == "remote-mirror":
             self.rig.operator.send("incoming/flags/remote-mirror", True, retain=True)
         assert self.is_up(time.monotonic(), 20), self.logs()
 
     def _driver(self, robot: str, opened: ExitStack) -> Driver:
-        return opened.enter_context(closing(Driver(self.people_port(robot), robot, self.history)))
+        return opened.enter_context(closing(Driver(self.access.port, robot, self.history)))
 
     def close(self) -> None:
         self._opened.close()
-
-    # -- what the set-up means
-
-    def people_port(self, robot: str) -> int:
-        """Where persons reach a robot: at the remote broker, unless that refuses everything sent to it."""
-        return self.local_port if robot == ROVER and self.setup == "SUBACK refused" else self.access.port
-
-    def confirmable(self, robot: str, port: int) -> bool:
-        """Whether a stop that is sent to this port arrives."""
-        deaf = {
-            "read denied": {(ROVER, self.access.port), (BOARD, self.access.port)},
-            "read denied locally": {(ROVER, self.access.port), (ROVER, self.local_port)},
-            "SUBACK refused": {(ROVER, self.access.port), (BOARD, self.access.port)},
-        }
-        if self.setup == "SUBACK refused" and self.rig.kind == "mqtt" and robot == ROVER:
-            return False
-        return (robot, port) not in deaf.get(self.setup, ())
-
-    def deaf(self, robot: str, port: int) -> bool:
-        """Whether nothing at all arrives there that is sent to this port."""
-        return self.setup == "SUBACK refused" and robot == ROVER and port == self.access.port
-
-    def watch(self, robot: str) -> Subscriber:
-        """The subscriber whose broker persons of this robot use."""
-        return self.subscriber if self.people_port(robot) == self.access.port else self.local_subscriber
 
     def begin(self) -> History:
         """Start a new schedule."""
         self.history = History()
         for subscriber in (self.subscriber, self.local_subscriber):
             subscriber.history = self.history
-        for driver in (*self.persons.values(), *self.scripts.values()):
+        for driver in self.persons.values():
             driver.history = self.history
         for wheels in self.wheels.values():
             wheels.forget()
@@ -145,7 +114,7 @@ class World:
         """Wait until both robots' heartbeats arrive, and states where persons are, except of a robot without stops."""
 
         def up(robot: str) -> bool:
-            known = self.watch(robot).robot(robot)
+            known = self.subscriber.robot(robot)
             online = self.subscriber.heartbeats.get(robot, 0.0) > max(since, time.monotonic() - 0.6)
             return online and bool(known.states or (known.has_capabilities and not known.available))
 
@@ -329,18 +298,5 @@ class World:
         if self.setup == "one broker":
             return ("single" if transport == "mqtt" else "zenoh"), False, None
         one = self.setup == "mirror is the remote broker"
-        local = self.remote if one else Broker(self.folder, *self._rights(remote=False))
+        local = self.remote if one else Broker(self.folder)
         return transport, transport == "zenoh", local
-
-    def _rights(self, *, remote: bool) -> list[str]:
-        stops = [ESTOP.topic(base_of(robot)) for robot in ROBOTS]
-        if self.setup == ("read denied" if remote else "read denied locally"):
-            everything = "topic readwrite #"
-            rules = [everything, f"user {_ROBOTS_LOGIN}", everything, *(f"topic deny {topic}" for topic in stops)]
-            file = self.folder / "rights.txt"
-            file.write_text("\n".join(rules) + "\n")
-            return [f"acl_file {file}"]
-        if self.setup == "SUBACK refused":
-            filters = [ESTOP.topic(base_of(BOARD)), f"{base_of(ROVER)}/incoming/#"] if remote else stops
-            return refusal(self.folder / f"security-{remote}.json", filters)
-        return []

@@ -1,4 +1,4 @@
-"""What a stranger at the broker may send: ``python -m tests.robot.soak.flood actions --port 1883 --seconds 5``."""
+"""What a stranger at the broker may send: ``python -m tests.robot.flood actions --port 1883 --seconds 5``."""
 
 from __future__ import annotations
 
@@ -42,7 +42,6 @@ FLOODS = {
     "retained flags": Flood("incoming/flags/f{n}", b"x" * 100, 6_000, 60_000, retain=True),
     "retained topics": Flood("incoming/mcu/k/n{n}", b"x" * 20, 10_000, 100_000, retain=True),
     "actions": Flood("incoming/flags/reboot", b"true", 10_000),
-    "commands that are none": Flood("incoming/drive-values", b'{"x": NaN', 5_000),
     "unknown commands": Flood("incoming/unknown/n{n}", b"{}", 5_000, 100_000),
     "60 MB once a second": Flood("incoming/drive-values", bytes(60 << 20), 1),
     "a flag of 2 MB": Flood("incoming/flags/large", bytes(2 << 20), 1, retain=True),
@@ -50,10 +49,10 @@ FLOODS = {
 
 
 @contextmanager
-def flooding(name: str, port: int, seconds: float, *options: str) -> Iterator[Child]:
+def flooding(name: str, port: int, seconds: float) -> Iterator[Child]:
     """Floods from a process of its own, which removes afterwards what was retained; waits for its end."""
-    words = [sys.executable, "-m", "tests.robot.soak.flood", name, "--port", str(port), "--seconds", str(seconds)]
-    process = Child([*words, *options], cwd=ROOT)
+    words = [sys.executable, "-m", "tests.robot.flood", name, "--port", str(port), "--seconds", str(seconds)]
+    process = Child(words, cwd=ROOT)
     yield process
     process.wait(seconds + 60)
 
@@ -70,18 +69,17 @@ def send(broker: socket.socket, flood: Flood, seconds: float) -> int:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(prog="python -m tests.robot.soak.flood", description=__doc__)
+    parser = argparse.ArgumentParser(prog="python -m tests.robot.flood", description=__doc__)
     parser.add_argument("flood", choices=FLOODS)
     parser.add_argument("--port", type=int, required=True)
     parser.add_argument("--seconds", type=float, default=10.0)
-    parser.add_argument("--keep", action="store_true", help="do not remove what is retained")
     options = parser.parse_args()
     chosen = FLOODS[options.flood]
     with suppress(ConnectionError), socket.create_connection(("127.0.0.1", options.port)) as broker:
         broker.sendall(connect(None, None, client_id=f"flood-{secrets.token_hex(4)}"))
         broker.recv(_CONNACK_BYTES)
         sent = send(broker, chosen, options.seconds)
-        for packet in chosen.removals(0 if options.keep else sent):
+        for packet in chosen.removals(sent):
             broker.sendall(packet)
     return 0
 

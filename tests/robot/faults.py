@@ -1,0 +1,238 @@
+"""What can happen to a whole robot while an operator drives it, and what must be true of its wheels then."""
+
+from __future__ import annotations
+
+import itertools
+import os
+import shutil
+import signal
+import time
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, ExitStack, contextmanager, suppress
+from dataclasses import dataclass
+from functools import partial
+
+from pebble.config import LAUNCHER_LOCK
+from tests.robot.flood import FLOODS, flooding
+from tests.robot.operator import Driver, Operator, number_of
+from tests.robot.rig import STOP, Rig
+from tests.support import until
+
+AGE_S = 2.5  # no older command ever reaches the wheels
+BACK_S = 5.0  # after the fault's end commands reach the wheels again
+_TURNS_S = 1.0  # 0.75 after a line, and what a busy machine may add
+_MCU_TURNS_S = 1.6  # where no process is left to send a zero, the MCU stops by itself after a second
+_FIRST_LINE_S = 0.3
+_OWNER = "serial_mcu_bridge"
+
+_numbers = itertools.count(1, 2000)
+
+
+class Drive:
+    """One drive through a fault: ``turns_s`` is how long wheels may turn without another line."""
+
+    def __init__(self, rig: Rig, operator: Operator | None = None, *, turns_s: float = _TURNS_S) -> None:
+        self.rig, self._turns_s = rig, turns_s
+        self.began = time.monotonic()
+        self.back_s = self.age_s = 0.0
+        self.driver = Driver(operator or rig.operator, first=next(_numbers))
+        try:
+            assert until(lambda: rig.mcu.moving(self.began), BACK_S), "the robot did not even start to move"
+        except BaseException:
+            self.driver.stop()
+            raise
+
+    def end(self, over: float) -> None:
+        """Wait until commands sent after the fault get through; then let go."""
+        assert until(lambda: self._arrived_after(over), BACK_S), "no driving within 5 s of the fault's end"
+        self.back_s = time.monotonic() - over
+        self.finish()
+
+    def finish(self) -> None:
+        """Let go, and check how the wheels have turned."""
+        self.driver.stop()
+        assert until(lambda: not self.rig.mcu.moving(self.began), 3)
+        assert until(lambda: not self.rig.mcu.turning(), 3)
+        for at, number in self._commands(self.began):
+            self.age_s = max(self.age_s, at - self.driver.sent_at[number])
+        assert self.age_s <= AGE_S, f"a command moved the wheels {self.age_s:.2f} s after it was sent"
+        turned_s = self._longest_turn()
+        assert turned_s <= self._turns_s, f"the wheels turned for {turned_s:.3f} s without another line"
+        drives = self.rig.mcu.drives(self.began)
+        for entry in self.rig.mcu.entries(self.began):
+            if entry.event == "opened":
+                opened = entry.ns / 1e9
+                first = next((at - opened, wheels) for at, wheels in drives if at >= opened)
+                assert first[1] == STOP, "the first line on an open port is no stop"
+                assert first[0] <= _FIRST_LINE_S
+
+    def _longest_turn(self) -> float:
+        """Return the seconds that motors turned after a line until the next one, or until they stood still."""
+        mcu = self.rig.mcu
+        events = [(at, None) for at, _ in mcu.drives(self.began)]
+        longest, turning, line = 0.0, False, self.began
+        for at, turns in sorted([*events, *((at, wheels != STOP) for at, wheels in mcu.motors(self.began))], key=_at):
+            if turning:
+                longest = max(longest, at - line)
+            if turns is None:
+                line = at
+            else:
+                turning = turns
+        return longest
+
+    def _commands(self, since: float) -> list[tuple[float, int]]:
+        return [(at, number_of(*wheels)) for at, wheels in self.rig.mcu.drives(since) if wheels != STOP]
+
+    def _arrived_after(self, since: float) -> bool:
+        return any(self.driver.sent_at[number] >= since for _, number in self._commands(since))
+
+
+def _at(event: tuple[float, bool | None]) -> float:
+    return event[0]
+
+
+# -- each of them begins, and ends after a while
+
+
+@contextmanager
+def _killed(program: str, rig: Rig) -> Iterator[None]:
+    rig.kill(program)
+    yield
+
+
+@contextmanager
+def _launcher_killed(rig: Rig) -> Iterator[None]:
+    """Kill the launcher, and start it again, as systemd does."""
+    killed, children = time.monotonic(), rig.kill_launcher()
+    yield
+    assert until(lambda: not any(map(rig.alive, children)), 1.0), "children outlived their launcher by 1 s"
+    stopped_at, wheels = rig.mcu.drives(killed)[-1]
+    assert wheels == STOP
+    assert stopped_at - killed <= 1.0
+    rig.start(ready=False)
+
+
+@contextmanager
+def _run_directory_removed(rig: Rig) -> Iterator[None]:
+    """Remove it: all programs start again, and the lock is held again."""
+    run = rig.folder / "run"
+    sockets = len(list(run.glob("*.seat")))
+    shutil.rmtree(run)
+    yield
+    assert until(lambda: (run / LAUNCHER_LOCK).exists() and len(list(run.glob("*.seat"))) >= sockets)
+
+
+@contextmanager
+def _local_transport_killed(rig: Rig) -> Iterator[None]:
+    """Kill the local broker, or on Zenoh the hub, whose death must not interrupt driving."""
+    if rig.local is not None:
+        rig.kill_local_broker()
+    else:
+        rig.kill("zenoh_hub")
+    yield
+
+
+@contextmanager
+def _remote_broker_restarted(rig: Rig) -> Iterator[None]:
+    rig.remote.kill()
+    yield
+    rig.remote.start()
+
+
+@contextmanager
+def silent(rig: Rig) -> Iterator[None]:
+    rig.uplink.blackhole()
+    yield
+    rig.uplink.resume()
+
+
+@contextmanager
+def _lost(rig: Rig) -> Iterator[None]:
+    for _ in range(5):
+        rig.uplink.drop()
+        time.sleep(0.2)
+    yield
+
+
+@contextmanager
+def _unplugged(rig: Rig) -> Iterator[None]:
+    rig.mcu.command("unplug")  # type: ignore[attr-defined]
+    yield
+    rig.mcu.command("replug")  # type: ignore[attr-defined]
+
+
+@contextmanager
+def frozen(*pids: int) -> Iterator[None]:
+    """Let processes stand still, as on a machine that swaps."""
+    for number in (signal.SIGSTOP, signal.SIGCONT):
+        for pid in pids:
+            with suppress(ProcessLookupError):
+                os.kill(pid, number)
+        if number == signal.SIGSTOP:
+            yield
+
+
+def _robot_frozen(rig: Rig) -> AbstractContextManager[None]:
+    return frozen(*rig.processes().values(), rig.launcher_pid)
+
+
+def standing_still(rig: Rig) -> dict[str, Callable[[], AbstractContextManager[None]]]:
+    """Return what can stand still for some seconds, but for the serial bridge: only it can stop the wheels."""
+    pids = {name: pid for name, pid in sorted(rig.processes().items()) if name != _OWNER}
+    pids |= {"remote broker": rig.remote.pid} | ({} if rig.local is None else {"local broker": rig.local.pid})
+    return {"uplink": partial(silent, rig), **{name: partial(frozen, pid) for name, pid in pids.items()}}
+
+
+@dataclass(frozen=True)
+class Fault:
+    """A fault that lasts for some seconds. ``turns_s``: how long wheels may turn without another line."""
+
+    happens: Callable[[Rig], AbstractContextManager[object]]
+    seconds: float = 0.2
+    turns_s: float = _TURNS_S
+
+    def perform(self, rig: Rig, drive: Drive, meanwhile: Callable[[], object] = lambda: None) -> None:
+        try:
+            with self.happens(rig):
+                time.sleep(self.seconds / 2)
+                meanwhile()
+                time.sleep(self.seconds / 2)
+            drive.end(time.monotonic())
+        finally:
+            drive.driver.stop()
+
+
+FAULTS = {
+    "the serial bridge is killed": Fault(partial(_killed, _OWNER), turns_s=_MCU_TURNS_S),
+    "the mqtt bridge is killed": Fault(partial(_killed, "mqtt_bridge")),
+    "the announcer is killed": Fault(partial(_killed, "announcer")),
+    "the launcher is killed": Fault(_launcher_killed, turns_s=_MCU_TURNS_S),
+    "the run directory is removed": Fault(_run_directory_removed, turns_s=_MCU_TURNS_S),
+    "the local transport is killed": Fault(_local_transport_killed),
+    "the remote broker is restarted": Fault(_remote_broker_restarted),
+    "the link is silent": Fault(silent, 3.0),
+    "the link is silent for long": Fault(silent, 10.0),
+    "the link is lost again and again": Fault(_lost),
+    "the board is unplugged": Fault(_unplugged, 3.0, turns_s=_MCU_TURNS_S),
+    "the serial bridge stands still": Fault(
+        lambda rig: frozen(rig.processes()[_OWNER]), 2.8, turns_s=_MCU_TURNS_S
+    ),
+    "the whole robot stands still": Fault(_robot_frozen, 2.8, turns_s=_MCU_TURNS_S),
+    **{
+        f"a flood of {name}": Fault(lambda rig, name=name: flooding(name, rig.remote.port, 3.0), 3.0)  # type: ignore[misc]
+        for name in FLOODS
+    },
+}  # fmt: skip
+
+
+def at_once(rig: Rig, names: list[str]) -> Fault:
+    """Return a fault in which these stand still at the same time."""
+
+    @contextmanager
+    def happens(_rig: Rig) -> Iterator[None]:
+        with ExitStack() as ends:
+            for name in names:
+                ends.enter_context(standing_still(rig)[name]())
+            yield
+
+    return Fault(happens, 2.0)

@@ -1,1 +1,0 @@
-../../../fakes/original_follow.py

@@ -1,1 +1,0 @@
-../../../fakes/original_video_follow.py
