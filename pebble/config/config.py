@@ -125,7 +125,7 @@ def load(
 ) -> Config:
     """Read a config file. Raises ConfigError with every problem in it.
 
-    ``lenient``: an extension that this machine lacks is a warning, unless it owns motors. ``core_only``: without any.
+    ``lenient``: an extension that this machine lacks is a warning. ``core_only``: without any.
     """
     path = Path(path).absolute()
     raw = decode(read_text(path), path.name)
@@ -170,7 +170,7 @@ def _config(
     installed = () if core_only else found
     absent, missing = missing, () if core_only else missing
     for one in missing:
-        note = notes.warning if lenient and not one.drives else notes.problem
+        note = notes.warning if lenient else notes.problem
         note(tuple(one.key.split(".", 1)), one.reason)
     tree, kind, rules = _tree(installed)
     reader = Reader(folder, env, rules)

@@ -270,8 +270,13 @@ class Forwarder:
         return None if finding is Finding.PASS else self._act_on(finding, here.side, subject, message, forward)
 
     def _refused_by_step(self, here: SideState, subject: Subject, message: Message, *_: object) -> Drop | None:
-        for name, step in self._steps.items():
-            if not subject.is_stop and (why := step(here.side, subject, message)):
+        for name, step in () if subject.is_stop else self._steps.items():
+            try:
+                why = step(here.side, subject, message)
+            except Exception as error:  # noqa: BLE001 - whatever a stranger's code raises: then it has nothing against it
+                self._quiet_log.warning(name, "the extension %s failed at %s: %r", name, message.topic[:_LOGGED], error)
+                continue
+            if why:
                 self._quiet_log.warning(name, "%s is not forwarded: %s: %s", message.topic[:_LOGGED], name, why)
                 return Drop.REFUSED
         return None

@@ -3,14 +3,21 @@
 Both are called on the threads that receive: they must not wait. No step is asked about an emergency stop.
 """
 
-from collections.abc import Callable
+import logging
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Final, TypeAlias
 
+from pebble.config import Config
 from pebble.contract import Channel
 from pebble.contract.payloads import ControlState, EstopCommand
+from pebble.extension import part
 from pebble.forwarding.routing import Drop, Side
 from pebble.forwarding.subjects import Subject
+from pebble.runtime.rate_limit import RateLimitedLog
 from pebble.transports import Message
+
+_log = RateLimitedLog(logging.getLogger(__name__), period_s=60.0)
 
 ROBOT: Final = "(robot)"  # a program of the robot: no account has such a name
 
@@ -41,3 +48,55 @@ class Observer:
 
     def unconfirmed(self, owner: str, stop: EstopCommand) -> None:
         """Note a stop that a motor owner has not confirmed, and that is given up."""
+
+
+class Observers(Observer):
+    """Those of all extensions. What one of them raises is logged, and costs the others nothing."""
+
+    def __init__(self, config: Config, clock: Callable[[], float]) -> None:
+        self._found: list[Observer] = []
+        for extension in config.installed:
+            if extension.observer:
+                with _logged(extension.name):
+                    self._found.append(part(extension.observer)(config, clock))
+
+    def start(self) -> None:
+        self._tell("start")
+
+    def close(self) -> None:
+        self._tell("close")
+
+    def passed(self, channel: Channel, by: str | None, payload: bytes) -> None:
+        self._tell("passed", channel, by, payload)
+
+    def refused(self, drop: Drop, channel: Channel | None, by: str | None) -> None:
+        self._tell("refused", drop, channel, by)
+
+    def control(self, state: ControlState) -> None:
+        self._tell("control", state)
+
+    def unconfirmed(self, owner: str, stop: EstopCommand) -> None:
+        self._tell("unconfirmed", owner, stop)
+
+    def _tell(self, method: str, *values: object) -> None:
+        for observer in self._found:
+            with _logged(type(observer).__name__):
+                getattr(observer, method)(*values)
+
+
+def steps_of(config: Config) -> dict[str, Step]:
+    """Return the steps that extensions add, by their names; one that cannot be made is logged, and left out."""
+    found: dict[str, Step] = {}
+    for extension in config.installed:
+        if extension.step:
+            with _logged(extension.name):
+                found[extension.name] = part(extension.step)(config)
+    return found
+
+
+@contextmanager
+def _logged(name: str) -> Iterator[None]:
+    try:
+        yield
+    except Exception as error:  # noqa: BLE001 - whatever a stranger's code raises: it must not end the bridge
+        _log.warning(name, "the extension %s failed at the bridge: %s: %s", name, type(error).__name__, error)

@@ -218,6 +218,8 @@ def _check_runs_here(config: Config) -> None:
         )
     if config.path is None:
         raise ConfigError("the robot's processes know its config by its file, and this one has none")
+    if lost := [f"{one.key}: {one.reason}" for one in config.missing if one.drives]:
+        raise ConfigError(lost)  # it owns motors
     check_connections(config)
 
 

@@ -24,10 +24,9 @@ from pebble.contract.levels import LEVELS
 from pebble.contract.names import with_name
 from pebble.contract.payloads import ControlState
 from pebble.errors import PayloadError
-from pebble.extension import part
 from pebble.forwarding.forwarder import Routed, barrier
 from pebble.forwarding.names import Names
-from pebble.forwarding.observer import ROBOT, Observer, Step
+from pebble.forwarding.observer import ROBOT, Observers, Step, steps_of
 from pebble.forwarding.retained_window import INITIAL_SYNC_S
 from pebble.forwarding.routing import TABLE_A1, Drop, Forward, Side
 from pebble.forwarding.service import CHECK_SOON_S, ForwardingService
@@ -89,8 +88,7 @@ class MqttBridge(ForwardingService):
         notifier = Notifier()
         self._owners = MotorOwners(self.config.base, self.config.motor_owners, notifier)
         self._passed_stops = PassedStops(self.config.motor_owners, self.clock)
-        observers = (part(one.observer) for one in self.config.installed if one.observer)
-        self._observers: list[Observer] = [make(self.config, self.clock) for make in observers]
+        self._observers = Observers(self.config, self.clock)
         decides = min(self.config.motor_owners, default="")
         self._control_topic = CONTROL_STATE.topic(self.config.base, owner=decides) if decides else ""
         self._private = PrivateTopics(self.config.base)
@@ -126,7 +124,7 @@ class MqttBridge(ForwardingService):
         return section.remote_mqtt.silence_seconds if section.remote is None else section.remote.lease_ms / 1000
 
     def make_steps(self) -> Mapping[str, Step]:
-        return {one.name: part(one.step)(self.config) for one in self.config.installed if one.step}
+        return steps_of(self.config)
 
     def make_names(self) -> Names | None:
         security = self.config.security
@@ -157,9 +155,8 @@ class MqttBridge(ForwardingService):
         if self._stops is not None:
             self.on_stop(self._stops.close)
             self.timers.add(self.clock(), self._stops.check, period=_CHECK_STOPS_S)
-        for observer in self._observers:
-            observer.start()
-            self.on_stop(observer.close)
+        self._observers.start()
+        self.on_stop(self._observers.close)
         if self._heartbeat is not None:
             interval = self.config.services.mqtt_bridge.heartbeat.interval_seconds
             self.timers.add(self.clock(), self._publish_heartbeat, period=interval)
@@ -318,8 +315,7 @@ class MqttBridge(ForwardingService):
         self._owners.check(self.clock())
         for owner, stop in self._passed_stops.give_up():
             self.log.error("an emergency stop is not confirmed by %s, which has withdrawn its own", owner)
-            for observer in self._observers:
-                observer.unconfirmed(owner, stop)
+            self._observers.unconfirmed(owner, stop)
 
     @every(REPEAT_S)
     def _repeat_stops(self) -> None:
@@ -358,8 +354,7 @@ class MqttBridge(ForwardingService):
         with suppress(PayloadError):
             state: ControlState = codec.decode(CONTROL_STATE, payload)
             keys = frozenset([state.key.encode()]) - {b""}
-            for observer in self._observers:
-                observer.control(state)
+            self._observers.control(state)
         self.forwarder.ages.keys = keys
 
     def _on_probe(self, message: Message) -> None:
@@ -407,8 +402,7 @@ class MqttBridge(ForwardingService):
         channel = routed.subject.channel if routed.subject is not None else None
         local = side is Side.LOCAL
         if not local and isinstance(routed.outcome, Drop):
-            for observer in self._observers:
-                observer.refused(routed.outcome, channel, routed.by)
+            self._observers.refused(routed.outcome, channel, routed.by)
         if routed.outcome is Drop.STALE:
             self.refusals.stale("a command" if channel is None else channel.metric)
             return
@@ -418,8 +412,7 @@ class MqttBridge(ForwardingService):
             return
         if not message.retain and routed.outcome is not Drop.KNOWN:
             own = local and self.forwarder.gate is Gate.OPEN
-            for observer in self._observers:
-                observer.passed(channel, ROBOT if own else routed.by, message.payload)
+            self._observers.passed(channel, ROBOT if own else routed.by, message.payload)
         self._requests.message(channel, message.payload)
 
     def on_value(self, subject: Subject, payload: bytes) -> None:

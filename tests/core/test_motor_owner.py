@@ -35,6 +35,7 @@ class Seen(Observer):
 
     def passed(self, channel, by, payload):
         self.write("passed", channel, payload)
+        raise ValueError("what it raises ends nothing")
 
     def refused(self, drop, channel, by):
         self.write(drop.value, channel, b"")
