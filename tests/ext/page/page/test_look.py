@@ -306,7 +306,7 @@ def test_screen(show: Show, axe: str, screen: Screen, size: Size) -> None:
 def _wait(opened: Tab, text: str) -> None:
     shown = f"() => !!window.pebble?.connection.you && document.body.innerText.includes({text!r})"
     assert opened.until(shown), f"{text!r} is not shown"
-    opened.until("() => !pebble.replay || pebble.replay.isHere", 10)
+    opened.until("() => !location.pathname.startsWith('/replay/') || pebble.replay?.isHere", 10)
     if text not in ("There is no picture yet", "Pictures wait for driving", "goob is silent since"):
         opened.until("() => !pebble.video.ref || !!pebble.video.info", 5)
 
