@@ -28,13 +28,16 @@ pytestmark = [pytest.mark.page, pytest.mark.timeout(600)]
 
 GOOB = "pebble/robots/goob"
 LONGEST_S = 480.0  # on a busy machine; an idle one takes a quarter of it
-#: Controls in sight, and not scrolled under the bar, whose middle belongs to something else.
+#: Controls in sight, and not scrolled under a bar, whose middle belongs to something else.
 COVERED = """() => [...document.querySelectorAll("button, a[href], input, select, summary")].filter((one) => {
   const box = one.getBoundingClientRect();
   const [x, y] = [box.x + box.width / 2, box.y + box.height / 2];
   if (!one.checkVisibility({ visibilityProperty: true, opacityProperty: true }) || box.width < 4) return false;
-  const bar = document.querySelector("header.top");
-  if (!bar.contains(one) && box.top < bar.getBoundingClientRect().bottom) return false;
+  const isUnder = (bar) => {
+    const { top, bottom } = bar.getBoundingClientRect();
+    return !bar.contains(one) && box.top < bottom && box.bottom > top;
+  };
+  if ([...document.querySelectorAll("header.top, .player")].some(isUnder)) return false;
   if (box.top < 0 || box.bottom > innerHeight || box.left < 0 || box.right > innerWidth) return false;
   const top = document.elementFromPoint(x, y);
   return top && !one.contains(top) && !top.contains(one) && !one.labels?.[0]?.contains(top);

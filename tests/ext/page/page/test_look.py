@@ -273,7 +273,6 @@ SCREENS = [
     Screen("notices", "driving", _trouble_and_press("[data-test=tab-more]", ".wide"), ("phone",)),
     Screen("fleet-notices", "fleet", sizes=("desktop",), hold=_trouble_and_press("[data-test=bell]")),
     Screen("fleet-notices", "fleet", sizes=("phone",), hold=_trouble_and_press(".me")),
-    Screen("limits", "driving", _trouble_and_press("[data-test=bell]", "[data-test=limits]"), ("desktop",)),
     Screen("bell", "driving", _trouble, ("desktop", "phone")),
     Screen("own-name", "operating", _press(".me"), ("desktop",)),
     Screen("replay-timeline", "replay", _timeline, ("desktop", "phone", "landscape", "small")),
@@ -307,6 +306,7 @@ def test_screen(show: Show, axe: str, screen: Screen, size: Size) -> None:
 def _wait(opened: Tab, text: str) -> None:
     shown = f"() => !!window.pebble?.connection.you && document.body.innerText.includes({text!r})"
     assert opened.until(shown), f"{text!r} is not shown"
+    opened.until("() => !location.pathname.startsWith('/replay/') || pebble.replay?.isHere", 10)
     if text not in ("There is no picture yet", "Pictures wait for driving", "goob is silent since"):
         opened.until("() => !pebble.video.ref || !!pebble.video.info", 5)
 

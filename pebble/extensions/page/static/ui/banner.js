@@ -5,7 +5,7 @@ import {
 } from "./parts/hooks.js";
 import { Model } from "./parts/models.js";
 import { nameIn } from "./parts/looks.js";
-import { Drop, HoldButton, Icon, RouteLink, Why, useName } from "./parts/parts.js";
+import { Button, Drop, HoldButton, Icon, RouteLink, Why, useName } from "./parts/parts.js";
 import { clockTime, roughly } from "./parts/words.js";
 
 const NOTICE_MS = 6000;
@@ -61,7 +61,7 @@ const Banner = ({ kind, icon = "warning", button = null, children }) => html`<di
   ${button}
 </div>`;
 
-const Reload = ({ children }) => html`<button type="button" onClick=${() => location.reload()}>${children}</button>`;
+const Reload = ({ children }) => html`<${Button} onPress=${() => location.reload()}>${children}<//>`;
 
 /** No server, no broker, an old page, or no encryption. */
 function ServerBanner({ at }) {
@@ -194,26 +194,15 @@ function StopBanner({ at }) {
     <div class="banner-actions">
       ${latched &&
       !asked &&
-      html`<button
-        type="button"
-        data-test="reset"
-        disabled=${Boolean(why)}
-        aria-describedby=${why ? id : undefined}
-        aria-label=${`Reset ${name}…`}
-        onClick=${() => ask(true)}
-      >
-        Reset…
-      </button>`}
+      html`<${Button} test="reset" label=${`Reset ${name}…`} why=${why} because=${id} onPress=${() => ask(true)}>Reset…<//>`}
       ${asks &&
       html`<${HoldButton} test="reset-hold" disabled=${Boolean(why)} onHeld=${() => commands.reset(at, view.owners)}
           >Hold to reset<//
         >
-        <button type="button" data-test="leave-stopped" onClick=${() => ask(false)}>Leave stopped</button>`}
+        <${Button} test="leave-stopped" onPress=${() => ask(false)}>Leave stopped<//>`}
       ${view.sending === "old" &&
       view.stop &&
-      html`<button type="button" data-test="end-stop" onClick=${() => commands.endStop(view.stop)}>
-        End the stop
-      </button>`}
+      html`<${Button} test="end-stop" onPress=${() => commands.endStop(view.stop)}>End the stop<//>`}
     </div>
   </div>`;
 }

@@ -4,7 +4,7 @@ import * as browser from "../core/browser.js";
 import { StopChip } from "./banner.js";
 import { Boundary, html, styled, useMetric, useModel, useOnline, usePage, usePart, useRefs, useTick, useValue } from "./parts/hooks.js";
 import { nameIn } from "./parts/looks.js";
-import { Charge, Face, Icon, RouteLink, StopButton, useName } from "./parts/parts.js";
+import { Button, Charge, Face, Icon, RouteLink, Select, StopButton, useName } from "./parts/parts.js";
 import { driverName, kindOf, roughly, span, typeOf } from "./parts/words.js";
 
 const LATE_MS = 300; // of the way to the server and back
@@ -25,25 +25,9 @@ export function Header({ at, layout, panel, onPanel, drawer, onDrawer }) {
     ${wide && at && html`<${HelpButton} />`}
     <${Boundary} what="Notices"><${Notices} at=${at} wide=${wide || (layout === "portrait" && at !== "")} room=${wide} /><//>
     ${layout === "immersive" &&
-    html`<button
-        type="button"
-        class="round"
-        data-test="drawer"
-        aria-expanded=${drawer}
-        aria-label="Everything else"
-        onClick=${onDrawer}
-      >
-        <${Icon} name="menu" />
-      </button>
+    html`<${Button} className="round" test="drawer" label="Everything else" aria-expanded=${drawer} icon="menu" onPress=${onDrawer} />
       ${browser.fullScreen.on &&
-      html`<button
-        type="button"
-        class="round"
-        aria-label="Leave full screen"
-        onClick=${() => browser.fullScreen.toggle()}
-      >
-        <${Icon} name="small" />
-      </button>`}`}
+      html`<${Button} className="round" label="Leave full screen" icon="small" onPress=${() => browser.fullScreen.toggle()} />`}`}
     ${(wide || !at) && html`<${Me} at=${at} panel=${panel} onPanel=${onPanel} wide=${wide} />`}
     ${at &&
     html`<${StopButton}
@@ -73,15 +57,13 @@ function AllButton({ outlined = false }) {
 
 function HelpButton() {
   const { panels } = usePage();
-  return html`<button
-    type="button"
-    class="quiet round-icon"
-    aria-label="Keys, and how stopping works"
-    data-test="open-help"
-    onClick=${() => panels.toggle("help")}
-  >
-    <${Icon} name="help" />
-  </button>`;
+  return html`<${Button}
+    className="quiet round-icon"
+    test="open-help"
+    label="Keys, and how stopping works"
+    icon="help"
+    onPress=${() => panels.toggle("help")}
+  />`;
 }
 
 const Brand = () => html`<span class="brand"><${Icon} name="logo" /><span>Pebble</span></span>`;
@@ -98,18 +80,13 @@ function Picker({ at }) {
     <${Face} at=${at} />
     <span class="picker-name"><b>${name}</b><${Icon} name="down" /></span>
     <span class="picker-state"><${IsStopped} at=${at} /><${Liveness} at=${at} /><${Volts} at=${at} /></span>
-    <select
-      data-test="picker"
-      aria-label="Choose a robot"
+    <${Select}
+      test="picker"
+      label="Choose a robot"
       value=${at}
-      onChange=${(event) => route.go(event.currentTarget.value)}
-    >
-      ${refs.map(
-        (ref) => html`<option key=${ref} value=${ref}>
-          ${nameIn(store, ref)}${typeOf(ref) === "robots" ? "" : ` (${kindOf(ref)})`}
-        </option>`,
-      )}
-    </select>
+      choices=${refs.map((ref) => [ref, nameIn(store, ref) + (typeOf(ref) === "robots" ? "" : ` (${kindOf(ref)})`)])}
+      onChoose=${(ref) => route.go(ref)}
+    />
   </label>`;
 }
 
@@ -189,15 +166,15 @@ function Me({ at, panel, onPanel, wide }) {
   const { you } = connection;
   const user = you?.login ? `${you.user} (${you.role})` : "Settings";
   const text = connection.unread && !wide ? `${user}, ${connection.unread} new notices` : user;
-  return html`<button
-    type="button"
-    class="quiet me"
-    data-test="settings"
+  return html`<${Button}
+    className="quiet me"
+    test="settings"
+    label=${text}
     aria-expanded=${panel}
-    aria-label=${text}
-    onClick=${onPanel}
+    icon=${you?.login ? "person" : "settings"}
+    onPress=${onPanel}
   >
-    <${Icon} name=${you?.login ? "person" : "settings"} />${wide && !at && you?.login && html`<span>${you.user}</span>`}
+    ${wide && !at && you?.login && html`<span>${you.user}</span>`}
     ${!wide && connection.unread > 0 && html`<b class="unread" aria-hidden="true">${connection.unread}</b>`}
-  </button>`;
+  <//>`;
 }

@@ -6,7 +6,7 @@ import { filled, lastScript, moreWords, remember, remembered, scripts } from "./
 import { Form } from "./form.js";
 import { html, useMetric, useOnline, useState, useTick, useValue } from "../parts/hooks.js";
 import { Nothing } from "../parts/nothing.js";
-import { Icon, Why, useName } from "../parts/parts.js";
+import { Button, Icon, Why, useName } from "../parts/parts.js";
 import { refuses } from "../parts/typed.js";
 import { useReasons, whyNotEnd } from "../parts/why-not.js";
 import { plain } from "../parts/more-words.js";
@@ -49,16 +49,10 @@ export function Autonomy({ at }) {
 function Row({ script, isOpen, onOpen, ...parts }) {
   const { file, label, summary } = script;
   return html`<li class=${isOpen ? "open" : ""}>
-    <button
-      type="button"
-      class="quiet script-row"
-      data-test=${`script-${file}`}
-      aria-expanded=${isOpen}
-      onClick=${() => onOpen(file)}
-    >
+    <${Button} className="quiet script-row" test=${`script-${file}`} aria-expanded=${isOpen} onPress=${() => onOpen(file)}>
       <span><b>${plain(label)}</b>${summary && html`<small>${plain(summary)}</small>`}</span>
       <${Icon} name=${isOpen ? "up" : "down"} />
-    </button>
+    <//>
     ${isOpen && html`<${Starter} ...${parts} script=${script} />`}
   </li>`;
 }
@@ -88,15 +82,7 @@ function Running({ at, page, entry, status, script }) {
           : html`<span class="dim">No script runs.</span>`}
       </p>
       ${(status.running || !entry) &&
-      html`<button
-        type="button"
-        data-test="end-script"
-        disabled=${Boolean(why)}
-        aria-describedby=${why ? "why-end-script" : undefined}
-        onClick=${() => page.commands.stopScript(at)}
-      >
-        <${Icon} name="halt" />Stop script
-      </button>`}
+      html`<${Button} test="end-script" why=${why} icon="halt" onPress=${() => page.commands.stopScript(at)}>Stop script<//>`}
     </div>
     ${why && (status.running || !entry) && html`<${Why} id="why-end-script">${why}<//>`}
     ${status.error && html`<p class="bad" data-test="script-error">✖ ${plain(status.error)}</p>`}
@@ -174,9 +160,7 @@ function Starter({ at, page, entry, status, script }) {
         >${isAsked && startedWords(answer, name)}</span
       >
       ${texts.size > 0 &&
-      html`<button type="button" data-test="restore-all" onClick=${restore}>
-        All defaults
-      </button>`}
+      html`<${Button} test="restore-all" onPress=${restore}>All defaults<//>`}
       <${Why} id="why-start">${why || note}<//>
     </div>
   </form>`;

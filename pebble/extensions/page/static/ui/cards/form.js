@@ -1,6 +1,7 @@
 // A form made of what a robot lists: one field for each setting of a script. The browser checks what is typed.
 
 import { html } from "../parts/hooks.js";
+import { Button } from "../parts/parts.js";
 import { hint, isMissing, option, usual } from "./form-model.js";
 import { plain } from "../parts/more-words.js";
 
@@ -37,14 +38,13 @@ function FormField({ id, field, text, onText }) {
       <${Input} id=${id} data-test=${`set-${field.key}`} title=${hint(field)} required=${isMissing(field)} field=${field} text=${text} onText=${onText} />
       ${text !== undefined &&
       field.default !== null &&
-      html`<button
-        type="button"
-        data-test=${`restore-${field.key}`}
-        aria-label=${`Restore the default of ${name}: ${option(field.type, usual(field))}`}
-        onClick=${restore}
+      html`<${Button}
+        test=${`restore-${field.key}`}
+        label=${`Restore the default of ${name}: ${option(field.type, usual(field))}`}
+        onPress=${restore}
       >
         Default
-      </button>`}
+      <//>`}
     </div>
   </div>`;
 }

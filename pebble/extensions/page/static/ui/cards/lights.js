@@ -2,7 +2,7 @@
 
 import { html, useModel } from "../parts/hooks.js";
 import { LONGEST_S, SHORTEST_S, lightsOf, toggleFlash, whyNotLights } from "./lights-model.js";
-import { Why, useName } from "../parts/parts.js";
+import { Button, Why, useName } from "../parts/parts.js";
 import { Typed } from "../parts/typed.js";
 import { useReasons, whyNotEnd } from "../parts/why-not.js";
 
@@ -69,18 +69,12 @@ export function Lights({ at }) {
   </div>`;
 }
 
-function ModeButton({ lights, mode, why, onPress, children }) {
-  return html`<button
-    type="button"
-    data-test=${`lights-${mode}`}
-    aria-pressed=${lights.mode === mode}
-    aria-describedby=${why ? "why-lights" : undefined}
-    disabled=${Boolean(why)}
-    onClick=${onPress}
-  >
-    ${children}
-  </button>`;
-}
+const ModeButton = ({ lights, mode, ...more }) => html`<${Button}
+  test=${`lights-${mode}`}
+  aria-pressed=${lights.mode === mode}
+  because="why-lights"
+  ...${more}
+/>`;
 
 function Period({ page, lights, why }) {
   const done = (text) => {

@@ -4,7 +4,7 @@ import * as more from "../../core/browser-more.js";
 import { LEVELS } from "../../core/logs.js";
 import { html, useEffect, useModel, usePage, useRef, useState, useValue } from "../parts/hooks.js";
 import { logViewOf } from "../parts/log-view.js";
-import { Why } from "../parts/parts.js";
+import { Button, Check, Select, Why } from "../parts/parts.js";
 import { exactTime } from "../parts/more-words.js";
 import { inner, isObject } from "../parts/words.js";
 
@@ -45,31 +45,32 @@ function Tools({ at, view, lines }) {
   const listed = inner(useValue(at, "status"))?.services;
   const known = isObject(listed) ? Object.keys(listed).slice(0, SERVICES) : [];
   const services = [...new Set([...known, ...view.book.services, filter.service])].filter(Boolean).sort();
-  const on = (name) => (event) => view.choose({ [name]: event.currentTarget.value });
   return html`<div class="log-tools">
-    <select
-      data-test="log-level"
-      aria-label="Least level"
+    <${Select}
+      test="log-level"
+      label="Least level"
       value=${String(filter.rank)}
-      onChange=${(event) => view.choose({ rank: Number(event.currentTarget.value) })}
-    >
-      ${LEVELS.map((level, rank) => html`<option key=${level} value=${rank}>${rank ? `${level} and above` : "All levels"}</option>`)}
-    </select>
-    <select data-test="log-service" aria-label="Service" value=${filter.service} onChange=${on("service")}>
-      <option value="">All services</option>
-      ${services.map((name) => html`<option key=${name} value=${name}>${name}</option>`)}
-    </select>
+      choices=${LEVELS.map((level, rank) => [rank, rank ? `${level} and above` : "All levels"])}
+      onChoose=${(rank) => view.choose({ rank: Number(rank) })}
+    />
+    <${Select}
+      test="log-service"
+      label="Service"
+      value=${filter.service}
+      choices=${[["", "All services"], ...services.map((name) => [name, name])]}
+      onChoose=${(service) => view.choose({ service })}
+    />
     <input
       type="search"
       data-test="log-search"
       placeholder="Search"
       aria-label="Search in log lines"
       value=${filter.search}
-      onInput=${on("search")}
+      onInput=${(event) => view.choose({ search: event.currentTarget.value })}
     />
     <span class="log-buttons">
       <${CopyButton} lines=${lines} />
-      <button type="button" data-test="log-clear" onClick=${() => view.clear()}>Clear</button>
+      <${Button} test="log-clear" onPress=${() => view.clear()}>Clear<//>
     </span>
   </div>`;
 }
@@ -86,16 +87,9 @@ function CopyButton({ lines }) {
       () => show(`${lines.length} lines copied`),
       () => show("The browser refused it"),
     );
-  const can = more.clipboard.possible;
-  return html`<button
-      type="button"
-      data-test="log-copy"
-      disabled=${!can}
-      aria-describedby=${can ? undefined : "log-copy-why"}
-      onClick=${copy}
-    >
-      Copy</button
-    >${!can && html`<${Why} id="log-copy-why">Copying needs https<//>`}
+  const why = more.clipboard.possible ? "" : "Copying needs https";
+  return html`<${Button} test="log-copy" why=${why} onPress=${copy}>Copy<//>
+    ${why && html`<${Why} id="why-log-copy">${why}<//>`}
     <span class="log-note" role="status">${done}</span>`;
 }
 
@@ -154,14 +148,7 @@ function Empty({ view }) {
 function Foot({ view, lines }) {
   const count = view.book.lines.length;
   return html`<div class="log-foot">
-    <label class="check"
-      ><input
-        type="checkbox"
-        data-test="log-follow"
-        checked=${view.follows}
-        onChange=${(event) => view.follow(event.currentTarget.checked)}
-      /><span>Follow the newest line</span></label
-    >
+    <${Check} test="log-follow" checked=${view.follows} onChange=${(follows) => view.follow(follows)}>Follow the newest line<//>
     <span class="dim" role="status">${view.follows ? "" : "Not following: you look at older lines"}</span>
     <span class="dim log-count">${lines.length === count ? `${count}` : `${lines.length} of ${count}`} lines</span>
   </div>`;

@@ -5,7 +5,7 @@ import * as more from "../../core/browser-more.js";
 import { differs, pieces, poseOf, poseWords } from "../../core/trail.js";
 import { html, useEffect, useMetrics, useOnline, usePage, useRef, useState, useTick } from "../parts/hooks.js";
 import { Nothing } from "../parts/nothing.js";
-import { Gone, Icon, isGone } from "../parts/parts.js";
+import { Button, Gone, Icon, Select, isGone } from "../parts/parts.js";
 import { recorderOf } from "../parts/recorder.js";
 
 const ARROWS = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, -1], ArrowDown: [0, 1] };
@@ -57,17 +57,18 @@ export function Odometry({ at, offers }) {
     offers.section("telemetry").touch_sensors === false &&
     html`<p class="map-words" data-test="map-lacks"><${Icon} name="plug" /> ${NO_SAMPLES}</p>`}
     <div class="map-tools" hidden=${!series.newest && sources.length < 2}>
-      <button type="button" data-test="map-in" aria-label="Zoom in" onClick=${() => view.current?.zoom(1.5)}>+</button>
-      <button type="button" data-test="map-out" aria-label="Zoom out" onClick=${() => view.current?.zoom(1 / 1.5)}>−</button>
-      <button type="button" data-test="map-centre" onClick=${() => view.current?.follow()}>Centre</button>
-      <button type="button" data-test="map-clear" onClick=${() => series.clear(page.store.clock())}>Clear trail</button>
+      <${Button} test="map-in" label="Zoom in" onPress=${() => view.current?.zoom(1.5)}>+<//>
+      <${Button} test="map-out" label="Zoom out" onPress=${() => view.current?.zoom(1 / 1.5)}>−<//>
+      <${Button} test="map-centre" onPress=${() => view.current?.follow()}>Centre<//>
+      <${Button} test="map-clear" onPress=${() => series.clear(page.store.clock())}>Clear trail<//>
       ${sources.length > 1 &&
-      html`<label class="field"
-        ><span>Position</span
-        ><select data-test="map-source" value=${source} onChange=${(event) => choose(event.currentTarget.value)}>
-          ${sources.map((one) => html`<option key=${one} value=${one}>${SOURCES[one]}</option>`)}
-        </select></label
-      >`}
+      html`<${Select}
+        test="map-source"
+        title="Position"
+        value=${source}
+        choices=${sources.map((name) => [name, SOURCES[name]])}
+        onChoose=${choose}
+      />`}
     </div>
   </div>`;
 }

@@ -3,7 +3,7 @@
 import { isLevel, useAnswer } from "../parts/asking.js";
 import { html, useMetric, useOnline, usePage, useState, useTick, useValue } from "../parts/hooks.js";
 import { command, fieldOf, range, step, unsendable } from "./manifest.js";
-import { Icon, Why, isGone } from "../parts/parts.js";
+import { Button, Check, Icon, Why, isGone } from "../parts/parts.js";
 import { Lines } from "./plot.js";
 import { recorderOf } from "../parts/recorder.js";
 import { refuses } from "../parts/typed.js";
@@ -92,15 +92,9 @@ function Reading({ field, value, gone, series }) {
   const shown = html`<span class=${gone ? "dim" : ""}>${words}</span>`;
   if (!isDrawable(value)) return html`<li class="reading">${name}${shown}</li>`;
   return html`<li>
-    <button
-      type="button"
-      class="reading quiet"
-      data-test=${`reading-${field.name}`}
-      aria-expanded=${String(open)}
-      onClick=${() => show(!open)}
-    >
+    <${Button} className="reading quiet" test=${`reading-${field.name}`} aria-expanded=${String(open)} onPress=${() => show(!open)}>
       ${name}${shown}<${Icon} name=${open ? "up" : "plot"} />
-    </button>
+    <//>
     ${open && html`<${Minute} series=${series} name=${field.name} unit=${unit} />`}
   </li>`;
 }
@@ -160,15 +154,8 @@ function Entry({ field, entered, change }) {
   const label = html`<span>${field.name}${field.unit && html` <small>${field.unit}</small>`}</span>`;
   const test = `field-${field.name}`;
   if (field.type === "bool") {
-    return html`<label class="check"
-      ><input
-        type="checkbox"
-        role="switch"
-        data-test=${test}
-        checked=${value === true}
-        onChange=${(event) => change(field.name, event.currentTarget.checked)}
-      />${label}</label
-    >`;
+    const set = (on) => change(field.name, on);
+    return html`<${Check} test=${test} role="switch" checked=${value === true} onChange=${set}>${label}<//>`;
   }
   const [least, most] = range(field) ?? [undefined, undefined];
   return html`<label class="mcu-number"

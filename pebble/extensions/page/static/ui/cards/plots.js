@@ -5,7 +5,7 @@ import { USUAL, fieldsOf, limitsOf, nameOfLine, plotsOf } from "../../core/plot-
 import { html, useMetrics, useOnline, usePage, useState, useTick } from "../parts/hooks.js";
 import { read, write } from "../parts/models.js";
 import { Nothing } from "../parts/nothing.js";
-import { Gone, Icon, isGone } from "../parts/parts.js";
+import { Button, Gone, Select, isGone } from "../parts/parts.js";
 import { Lines } from "./plot.js";
 import { recorderOf } from "../parts/recorder.js";
 import { plain } from "../parts/more-words.js";
@@ -37,13 +37,11 @@ export function Plots({ at }) {
     ${[...usual, ...whole].map((plot) => html`<${Figure} key=${plot.id} plot=${plot} at=${at} paused=${paused} />`)}
     <div class="plot-tools">
       ${(known.length > 0 || chosen) &&
-      html`<button type="button" data-test="plots-pause" onClick=${() => pause(!paused)}>
-        <${Icon} name=${paused ? "play" : "halt"} />${paused ? "Go on" : "Pause"}
-      </button>`}
+      html`<${Button} test="plots-pause" icon=${paused ? "play" : "halt"} onPress=${() => pause(!paused)}>
+        ${paused ? "Go on" : "Pause"}
+      <//>`}
       ${more > 0 &&
-      html`<button type="button" data-test="plots-all" aria-expanded=${all} onClick=${toggle}>
-        ${all ? `Hide ${more}` : `${more} more`}
-      </button>`}
+      html`<${Button} test="plots-all" aria-expanded=${all} onPress=${toggle}>${all ? `Hide ${more}` : `${more} more`}<//>`}
       <${Choose} at=${at} metrics=${metrics} chosen=${chosen} onChoose=${change} />
     </div>
   </div>`;
@@ -100,11 +98,6 @@ function Choose({ at, metrics, chosen, onChoose }) {
   const having = metrics.filter((metric) => !metric.startsWith("web/") && numbers(store.get(at, metric)?.value));
   const listed = [...new Set([...having.sort().slice(0, MOST_METRICS), chosen])].filter(Boolean);
   if (!listed.length) return null;
-  return html`<label class="field"
-    ><span>All numbers of</span>
-    <select data-test="plots-of" value=${chosen} onChange=${(event) => onChoose(event.currentTarget.value)}>
-      <option value="">choose…</option>
-      ${listed.map((metric) => html`<option key=${metric} value=${metric}>${metric}</option>`)}
-    </select></label
-  >`;
+  const choices = [["", "choose…"], ...listed.map((metric) => [metric, metric])];
+  return html`<${Select} test="plots-of" title="All numbers of" value=${chosen} choices=${choices} onChoose=${onChoose} />`;
 }

@@ -1,6 +1,7 @@
 // The services of a robot: which are well, which restart, and where their log lines are.
 
 import { html, useOnline, usePage, useValue } from "../parts/hooks.js";
+import { Button } from "../parts/parts.js";
 import { logViewOf } from "../parts/log-view.js";
 import { plain } from "../parts/more-words.js";
 import { inner, isObject } from "../parts/words.js";
@@ -60,9 +61,7 @@ function Service({ at, view, name, online, one }) {
     <i aria-hidden="true">${Object.hasOwn(SIGNS, state) ? SIGNS[state] : "○"}</i>
     <span class="services-name">${name.replaceAll("_", " ")}</span>
     <span class="services-state">${online ? "" : "was "}${state}</span>
-    <button type="button" class="quiet" aria-label=${`Logs of ${name}`} data-test=${`logs-of-${name}`} onClick=${logs}>
-      Logs
-    </button>
+    <${Button} className="quiet" test=${`logs-of-${name}`} label=${`Logs of ${name}`} onPress=${logs}>Logs<//>
     ${words && html`<span class="services-more">${words}</span>`}
   </li>`;
 }

@@ -1,7 +1,7 @@
 // The clips that a robot can play.
 
 import { html, useModel, useOnline, useValue } from "../parts/hooks.js";
-import { Icon, Why, useName } from "../parts/parts.js";
+import { Button, Check, Why, useName } from "../parts/parts.js";
 import { grouped, play, repeatLast, soundsOf } from "./sounds-model.js";
 import { useReasons, whyNot, whyNotEnd } from "../parts/why-not.js";
 import { plain } from "../parts/more-words.js";
@@ -18,23 +18,10 @@ export function Sounds({ at }) {
   return html`<div class="sounds">
     <${NowPlaying} at=${at} page=${page} />
     <div class="ask-row">
-      <button
-        type="button"
-        data-test="repeat-last"
-        disabled=${Boolean(whyNotAgain)}
-        aria-describedby=${whyNotAgain ? "why-again" : undefined}
-        onClick=${() => repeatLast(page, at)}
-      >
-        <${Icon} name="play" />Again <kbd aria-hidden="true">P</kbd>
-      </button>
-      <label class="check"
-        ><input
-          type="checkbox"
-          data-test="repeat"
-          checked=${sounds.repeat}
-          onChange=${(event) => sounds.set({ repeat: event.currentTarget.checked })}
-        /><span>repeat until stopped</span></label
-      >
+      <${Button} test="repeat-last" why=${whyNotAgain} because="why-again" icon="play" onPress=${() => repeatLast(page, at)}>
+        Again <kbd aria-hidden="true">P</kbd>
+      <//>
+      <${Check} test="repeat" checked=${sounds.repeat} onChange=${(repeat) => sounds.set({ repeat })}>repeat until stopped<//>
     </div>
     ${whyNotAgain && html`<${Why} id="why-again">${whyNotAgain}<//>`}
     <${Clips} at=${at} page=${page} sounds=${sounds} why=${why} />
@@ -49,15 +36,7 @@ function NowPlaying({ at, page }) {
       <p role="status" data-test="playing">
         ${playing ? html`<b>♪ ${plain(file ?? "a clip")}</b> ${was}` : html`<span class="dim">Nothing ${was}.</span>`}
       </p>
-      <button
-        type="button"
-        data-test="stop-sound"
-        disabled=${Boolean(why)}
-        aria-describedby=${why ? "why-stop-sound" : undefined}
-        onClick=${() => page.commands.stopSound(at)}
-      >
-        <${Icon} name="halt" />Stop sound
-      </button>
+      <${Button} test="stop-sound" why=${why} icon="halt" onPress=${() => page.commands.stopSound(at)}>Stop sound<//>
     </div>
     ${why && html`<${Why} id="why-stop-sound">${why}<//>`}
     ${error && html`<p class="bad" data-test="sound-error">✖ ${plain(error)}</p>`}`;
@@ -108,15 +87,15 @@ function Clip({ at, page, file, folder, plays, why: whyNotPlay }) {
     if (problem) page.connection.show(problem);
     else if (plays) page.commands.stopSound(at);
   };
-  return html`<button
-    type="button"
-    class=${`clip ${plays ? "on" : ""}`}
-    data-test="clip"
-    disabled=${Boolean(why)}
-    aria-describedby=${why ? (plays ? "why-stop-sound" : "why-again") : undefined}
-    aria-label=${`${plays ? "Stop" : "Play"} ${plain(file)}`}
-    onClick=${press}
+  return html`<${Button}
+    className=${`clip ${plays ? "on" : ""}`}
+    test="clip"
+    label=${`${plays ? "Stop" : "Play"} ${plain(file)}`}
+    why=${why}
+    because=${plays ? "why-stop-sound" : "why-again"}
+    icon=${plays ? "halt" : "play"}
+    onPress=${press}
   >
-    <${Icon} name=${plays ? "halt" : "play"} /><span>${called(file.slice(folder.length) || file)}</span>
-  </button>`;
+    <span>${called(file.slice(folder.length) || file)}</span>
+  <//>`;
 }

@@ -4,7 +4,7 @@ import { useAnswer, useWish } from "../parts/asking.js";
 import { html, useEffect, usePage, useState, useValue } from "../parts/hooks.js";
 import { logViewOf } from "../parts/log-view.js";
 import { Panel } from "../panels/panel.js";
-import { HoldButton, Icon, Why, useName } from "../parts/parts.js";
+import { Button, Check, HoldButton, Why, useName } from "../parts/parts.js";
 import { useReasons, whyNot, whyNotEnd } from "../parts/why-not.js";
 import { plain } from "../parts/more-words.js";
 import { clockTime, driverName } from "../parts/words.js";
@@ -54,15 +54,9 @@ export function System({ at, offers, view }) {
         const why = whyNotAct(page, at, offers, action);
         const id = `why-${action}`;
         return html`<div key=${action}>
-          <button
-            type="button"
-            data-test=${action}
-            disabled=${Boolean(why)}
-            aria-describedby=${why ? id : undefined}
-            onClick=${() => ask(/** @type {Action} */ (action))}
-          >
+          <${Button} test=${action} why=${why} because=${id} onPress=${() => ask(/** @type {Action} */ (action))}>
             ${ACTIONS[action].title}…
-          </button>
+          <//>
           ${why && html`<${Why} id=${id}>${why}<//>`}
         </div>`;
       })}
@@ -85,9 +79,7 @@ function AuditButton({ at }) {
   };
   const why = whyNotEnd(page, "system");
   return html`<div>
-    <button type="button" data-test="audit" disabled=${Boolean(why)} aria-describedby=${why ? "why-audit" : undefined} onClick=${open}>
-      <${Icon} name="list" />Who did what…
-    </button>
+    <${Button} test="audit" why=${why} icon="list" onPress=${open}>Who did what…<//>
     ${why && html`<${Why} id="why-audit">${why}<//>`}
     ${part && html`<${part} at=${at} onClose=${() => show(null)} />`}
   </div>`;
@@ -113,7 +105,7 @@ function Ask({ at, action, offers, onHeld, onClose }) {
         >Hold 1 s: ${title}<//
       >
       ${why && html`<${Why} id="ask-why">${why}<//>`}
-      <button type="button" data-test="ask-leave" onClick=${onClose}>Leave it</button>
+      <${Button} test="ask-leave" onPress=${onClose}>Leave it<//>
     </div>
   <//>`;
 }
@@ -137,7 +129,7 @@ function Asked({ at, asked: { action, n, at: time }, view }) {
   };
   return html`<div class="system-outcome" data-test="outcome">
     <p role="status"><b>${ACTIONS[action].title}:</b> ${refused ? `not asked: ${refused}` : `asked ${clockTime(time)}`}</p>
-    <button type="button" data-test="outcome-logs" onClick=${logs}><${Icon} name="list" />Its log lines</button>
+    <${Button} test="outcome-logs" icon="list" onPress=${logs}>Its log lines<//>
   </div>`;
 }
 
@@ -189,20 +181,19 @@ function Flag({ at, name, title, meaning, value, known }) {
   const { wish, waits, late, refused, ask } = useWish(value, ECHO_MS);
   const pending = waits && !late ? wish : null;
   const why = whyNotEnd(page, name === "remote-mirror" ? "system" : "drive") || (known ? "" : "Not received yet");
-  const change = ({ currentTarget: { checked } }) => ask(checked, page.commands.setFlag(at, name, checked));
+  const change = (on) => ask(on, page.commands.setFlag(at, name, on));
   const id = `flag-${name}`;
   return html`<div class="flag">
-    <label class="check"
-      ><input
-        type="checkbox"
-        role="switch"
-        data-test=${id}
-        checked=${pending ? pending.on : value === true}
-        disabled=${Boolean(why)}
-        aria-describedby=${`${id}-why`}
-        onChange=${change}
-      /><span>${title}</span></label
+    <${Check}
+      test=${id}
+      role="switch"
+      checked=${pending ? pending.on : value === true}
+      why=${why}
+      aria-describedby=${`${id}-why`}
+      onChange=${change}
     >
+      ${title}
+    <//>
     <span class="flag-state" role="status">${flagWords(late, pending, value, refused)}</span>
     <${Why} id=${`${id}-why`}>${why || meaning}<//>
   </div>`;

@@ -21,7 +21,7 @@ import {
 import { Offers, Route, WATCHES } from "../parts/models.js";
 import { charge, hasFace, looksOf, nameIn } from "../parts/looks.js";
 import { plain, shortTime } from "../parts/more-words.js";
-import { Charge, Drawing, Drop, Icon, RouteLink, StopButton } from "../parts/parts.js";
+import { Button, Charge, Check, Drawing, Drop, Icon, RouteLink, Select, StopButton } from "../parts/parts.js";
 import { RecordingsLink } from "./recordings-link.js";
 import { battery, driverName, inner, isObject, kindOf, nameOf, roughly, typeOf } from "../parts/words.js";
 
@@ -32,7 +32,7 @@ const MANY = 100; // beyond, cards have no pictures, and only those near the scr
 const NEEDS_MS = 10_000; // so long a card stays among those that need a look
 const LOW_PERCENT = 20;
 const isRobot = (ref) => typeOf(ref) === "robots";
-const SORTS = { name: "name", type: "type", battery: "battery" };
+const SORTS = ["name", "type", "battery"];
 
 const kept = { filter: "" }; // while a robot is looked at
 
@@ -164,31 +164,18 @@ function FleetTools({ filter, onFilter, many }) {
       onInput=${(event) => onFilter(event.currentTarget.value)}
     />
     <${RecordingsLink} />
-    <button type="button" class="to-phone" data-test="phone" onClick=${() => panels.show("phone")}>
-      <${Icon} name="phone" />Open on a phone
-    </button>
+    <${Button} className="to-phone" test="phone" icon="phone" onPress=${() => panels.show("phone")}>Open on a phone<//>
     <${Drop} test="fleet-more" look="button" summary="More">
-        <label class="field"
-          ><span>Sort by</span>
-          <select
-            data-test="sort"
-            aria-label="Sort by"
-            value=${settings.sort}
-            onChange=${(event) => settings.set("sort", event.currentTarget.value)}
-          >
-            ${Object.entries(SORTS).map(([value, words]) => html`<option key=${value} value=${value}>${words}</option>`)}
-          </select></label
-        >
+        <${Select}
+          test="sort"
+          title="Sort by"
+          value=${settings.sort}
+          choices=${SORTS.map((name) => [name, name])}
+          onChoose=${(name) => settings.set("sort", name)}
+        />
         ${!WATCHES &&
         !many &&
-        html`<label class="check"
-          ><input
-            type="checkbox"
-            data-test="thumbnails"
-            checked=${settings.thumbnails}
-            onChange=${(event) => settings.set("thumbnails", event.currentTarget.checked)}
-          /><span>Thumbnails</span></label
-        >`}
+        html`<${Check} test="thumbnails" checked=${settings.thumbnails} onChange=${(on) => settings.set("thumbnails", on)}>Thumbnails<//>`}
         <a class="button" data-test="watch" href=${Route.path("", !WATCHES)}
           >${WATCHES ? "Show all controls" : "Only watch"}</a
         >
@@ -218,7 +205,7 @@ function FirstTime({ refs }) {
   return html`<section class="first-time" aria-labelledby="first-time" data-test="first-time">
     <div class="first-time-head">
       <h2 id="first-time">First time here?</h2>
-      <button type="button" class="quiet" data-test="hide-first-time" onClick=${() => settings.begin("hidden")}>Hide</button>
+      <${Button} className="quiet" test="hide-first-time" onPress=${() => settings.begin("hidden")}>Hide<//>
     </div>
     <ul>
       ${items.map(
@@ -227,9 +214,9 @@ function FirstTime({ refs }) {
         </li>`,
       )}
       <li>
-        <button type="button" class="try" onClick=${() => (settings.begin("phone"), panels.show("phone"))}>
+        <${Button} className="try" onPress=${() => (settings.begin("phone"), panels.show("phone"))}>
           ${number("phone", items.length + 1)}<span><b>Open it on your phone</b><small>Scan one code</small></span>
-        </button>
+        <//>
       </li>
     </ul>
   </section>`;
@@ -439,14 +426,7 @@ function AwayRow({ at }) {
       ><${RouteLink} to=${at}>${looks.name}<//> <span class="dim">${since}</span> ${level &&
       html`<span class="dim">${battery(level.value)} then</span>`}</span
     >
-    <button
-      type="button"
-      data-test="forget"
-      aria-label=${`Forget ${looks.name}`}
-      onClick=${() => settings.forget(at)}
-    >
-      Forget
-    </button>
+    <${Button} test="forget" label=${`Forget ${looks.name}`} onPress=${() => settings.forget(at)}>Forget<//>
   </div>`;
 }
 

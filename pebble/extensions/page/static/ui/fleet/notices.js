@@ -6,7 +6,7 @@ import { html, useCalm, useEffect, useModel, usePage, useState } from "../parts/
 import { Model } from "../parts/models.js";
 import { Panel } from "../panels/panel.js";
 import { charge, looksOf, nameIn } from "../parts/looks.js";
-import { Icon, RouteLink, useName } from "../parts/parts.js";
+import { Button, RouteLink, useName } from "../parts/parts.js";
 import { RecordingsLink } from "./recordings-link.js";
 import { shortTime } from "../parts/more-words.js";
 import { inner } from "../parts/words.js";
@@ -101,16 +101,16 @@ export function Bell({ at, wide, room = wide }) {
     ${at && html`<${DoubtMark} at=${at} />`}
     ${room && at && html`<${RecordingsLink} at=${at} className="button quiet" />`}
     ${wide &&
-    html`<button
-      type="button"
-      class="quiet bell"
-      data-test="bell"
+    html`<${Button}
+      className="quiet bell"
+      test="bell"
+      label=${unread ? `Notices, ${unread} new` : "Notices"}
       aria-expanded=${open}
-      aria-label=${unread ? `Notices, ${unread} new` : "Notices"}
-      onClick=${toggle}
+      icon="bell"
+      onPress=${toggle}
     >
-      <${Icon} name="bell" />${unread > 0 && html`<b class="unread" aria-hidden="true">${unread}</b>`}
-    </button>`}
+      ${unread > 0 && html`<b class="unread" aria-hidden="true">${unread}</b>`}
+    <//>`}
     ${wide &&
     open &&
     html`<${Panel} id="notices" title="Notices" onClose=${() => show(false)}>

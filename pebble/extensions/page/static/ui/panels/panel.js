@@ -1,7 +1,7 @@
 // The frame of all panels: no modal dialogs, because STOP stays in reach. While one is open, nothing is driven.
 
 import { html, useEffect, usePage, useRef } from "../parts/hooks.js";
-import { Icon } from "../parts/parts.js";
+import { Button } from "../parts/parts.js";
 
 /** @param {{id: string, title: string, onClose: () => void, className?: string, children?: any}} props */
 export function Panel({ id, title, onClose, className = "", children }) {
@@ -30,15 +30,7 @@ export function Panel({ id, title, onClose, className = "", children }) {
   >
     <div class="card-head">
       <h2 id=${`${id}-title`}>${title}</h2>
-      <button
-        type="button"
-        class="quiet"
-        data-test=${`close-${id}`}
-        aria-label=${`Close ${title.toLowerCase()}`}
-        onClick=${onClose}
-      >
-        <${Icon} name="close" />
-      </button>
+      <${Button} className="quiet" test=${`close-${id}`} label=${`Close ${title.toLowerCase()}`} icon="close" onPress=${onClose} />
     </div>
     ${children}
   </dialog>`;

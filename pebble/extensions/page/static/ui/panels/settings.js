@@ -4,7 +4,7 @@ import { html, useModel, usePage } from "../parts/hooks.js";
 import { lacks } from "../parts/lacks.js";
 import { NoticeList } from "../fleet/notices.js";
 import { Panel } from "./panel.js";
-import { Icon, useName } from "../parts/parts.js";
+import { Button, Check, Icon, useName } from "../parts/parts.js";
 import { Typed } from "../parts/typed.js";
 import { RecordingsLink } from "../fleet/recordings-link.js";
 
@@ -58,15 +58,15 @@ export function SettingsPanel({ onClose }) {
     <div class="panel-links">
       <div onClick=${onClose}><${RecordingsLink} at=${driver.ref} className="button wide" /></div>
       ${MORE.map(
-        ({ name, icon, text }) => html`<button
+        ({ name, icon, text }) => html`<${Button}
           key=${name}
-          type="button"
-          class="wide"
-          data-test=${`open-${name}`}
-          onClick=${() => panels.show(name)}
+          className="wide"
+          test=${`open-${name}`}
+          icon=${icon}
+          onPress=${() => panels.show(name)}
         >
-          <${Icon} name=${icon} />${text}
-        </button>`,
+          ${text}
+        <//>`,
       )}
     </div>
   <//>`;
@@ -92,15 +92,6 @@ function Choice({ name, title, choices }) {
   </fieldset>`;
 }
 
-const Check = ({ test, checked, onChange, children }) => html`<label class="check"
-  ><input
-    type="checkbox"
-    data-test=${test}
-    checked=${checked}
-    onChange=${(event) => onChange(event.currentTarget.checked)}
-  /><span>${children}</span></label
->`;
-
 function WhoAmI() {
   const { connection, commands } = usePage();
   useModel(connection);
@@ -114,7 +105,7 @@ function WhoAmI() {
       <span class="dim">${you.role} at ${you.server}. May ${["stop", ...rights].join(", ")}.</span>
     </p>
     ${you.login
-      ? html`<button type="button" onClick=${() => commands.logOut()}><${Icon} name="out" />Log out</button>`
+      ? html`<${Button} icon="out" onPress=${() => commands.logOut()}>Log out<//>`
       : html`<${OwnName} you=${you} />`}
   </section>`;
 }

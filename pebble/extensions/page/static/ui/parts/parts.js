@@ -13,6 +13,53 @@ const LATE_MS = 250; // beyond two periods
 /** @param {{name: string}} props */
 export const Icon = ({ name }) => html`<svg class="icon" aria-hidden="true"><use href=${`${ICONS}#${name}`} /></svg>`;
 
+/**
+ * A button. ``why`` it is off now; "" it is not. ``because``: the id of where that is said.
+ * @param {any} props
+ */
+export const Button = ({ test, className, label, why = "", because = `why-${test}`, icon, onPress, children, ...more }) => html`<button
+  type="button"
+  class=${className}
+  data-test=${test}
+  aria-label=${label}
+  aria-describedby=${why ? because : undefined}
+  disabled=${Boolean(why)}
+  onClick=${onPress}
+  ...${more}
+>
+  ${icon && html`<${Icon} name=${icon} />`}${children}
+</button>`;
+
+/** A box to tick; ``why`` it is off now. @param {any} props */
+export const Check = ({ test, className = "", checked, why = "", onChange, children, ...more }) => html`<label class=${`check ${className}`}
+  ><input
+    type="checkbox"
+    data-test=${test}
+    checked=${checked}
+    disabled=${Boolean(why)}
+    onChange=${(event) => onChange(event.currentTarget.checked)}
+    ...${more}
+  /><span>${children}</span></label
+>`;
+
+/**
+ * A list to choose from. ``choices``: values and words. ``title``: beside it; ``label``: where there is none. The rest is as of Button.
+ * @param {any} props
+ */
+export function Select({ test, title, label, value, choices, why = "", because, onChoose }) {
+  const list = html`<select
+    data-test=${test}
+    aria-label=${label}
+    aria-describedby=${why ? because : undefined}
+    disabled=${Boolean(why)}
+    value=${value}
+    onChange=${(event) => onChoose(event.currentTarget.value)}
+  >
+    ${choices.map(([one, words]) => html`<option key=${one} value=${one}>${words}</option>`)}
+  </select>`;
+  return title ? html`<label class="field"><span>${title}</span>${list}</label>` : list;
+}
+
 /** A button that stops at the first touch, not when the finger is lifted, and with any finger. */
 export function StopButton({ onStop, label, children, className = "", describedBy, test }) {
   const touchedAt = useRef(-Infinity);
@@ -136,18 +183,14 @@ export function Card({ title, id, icon, aside, view, isFirst = false, className 
       <h2 id=${`${id}-title`}>${title}</h2>
       ${aside}
       ${view &&
-      html`<button type="button" class="quiet" data-test=${`hide-${id}`} aria-label=${`Hide ${title}`} onClick=${() => view.hide(id)}>
-        <${Icon} name="close" />
-      </button>
-      <button
-        type="button"
-        class="quiet"
+      html`<${Button} className="quiet" test=${`hide-${id}`} label=${`Hide ${title}`} icon="close" onPress=${() => view.hide(id)} />
+      <${Button}
+        className="quiet"
+        label=${`${closed ? "Open" : "Close"} ${title}`}
         aria-expanded=${!closed}
-        aria-label=${`${closed ? "Open" : "Close"} ${title}`}
-        onClick=${() => view.toggle(id, isFirst)}
-      >
-        <${Icon} name=${closed ? "down" : "up"} />
-      </button>`}
+        icon=${closed ? "down" : "up"}
+        onPress=${() => view.toggle(id, isFirst)}
+      />`}
     </header>
     ${!closed && html`<div class="card-body">${children}</div>`}
   </section>`;
@@ -179,7 +222,7 @@ export function Part({ part, now = false, lines = 3, ...props }) {
   if (!failed) return html`<${Skeleton} lines=${lines} />`;
   return html`<p class="failed" role="alert">
     A part of this page could not be fetched.
-    <button type="button" onClick=${() => location.reload()}>Try again</button>
+    <${Button} onPress=${() => location.reload()}>Try again<//>
   </p>`;
 }
 

@@ -5,7 +5,7 @@ import { holding } from "../../core/replay/timeline.js";
 import { Bands } from "../banner.js";
 import { ROOT } from "../../core/browser.js";
 import { html, useEffect, usePage, useState } from "../parts/hooks.js";
-import { Icon, RouteLink } from "../parts/parts.js";
+import { Button, Icon, RouteLink, Select } from "../parts/parts.js";
 import { recordingsOf } from "../fleet/recordings-link.js";
 import { iconOf } from "../fleet/fleet.js";
 import { nameIn } from "../parts/looks.js";
@@ -66,7 +66,7 @@ export function Choose() {
     <div class="screen-title"><h1>Recordings</h1><${Bands} at="" /></div>
     ${problem &&
     html`<p class="failed" role="alert">
-      The recordings cannot be listed: ${problem} <button type="button" onClick=${again}>Try again</button>
+      The recordings cannot be listed: ${problem} <${Button} onPress=${again}>Try again<//>
     </p>`}
     ${(shown || (!days && !problem)) &&
     html`<div class="loading bones" role="status"><span class="sr">Looking for recordings…</span><i></i><i></i><i></i></div>`}
@@ -115,24 +115,21 @@ export function Elsewhere({ at, replay }) {
   const known = days ?? [];
   const robots = [...new Set([at, ...(known.find(({ day }) => day === name)?.robots ?? [])])].sort();
   const others = [...new Set([name, ...known.filter((day) => day.robots.includes(at)).map(({ day }) => day)])].filter(Boolean);
-  const go = (path) => route.open(path);
   return html`<div class="replay-elsewhere">
-    <label class="field"
-      ><span>Robot</span
-      ><select
-        data-test="replay-robot"
-        value=${at}
-        onChange=${(event) => go(`${recordingsOf(event.currentTarget.value)}?at=${Math.round(replay.feed.position)}`)}
-      >
-        ${robots.map((ref) => html`<option key=${ref} value=${ref}>${nameIn(store, ref)}</option>`)}
-      </select></label
-    >
-    <label class="field"
-      ><span>Day</span
-      ><select data-test="replay-day" value=${name} onChange=${(event) => replay.openDay(event.currentTarget.value)}>
-        ${others.map((day) => html`<option key=${day} value=${day}>${longDay(day)}</option>`)}
-      </select></label
-    >
+    <${Select}
+      test="replay-robot"
+      title="Robot"
+      value=${at}
+      choices=${robots.map((ref) => [ref, nameIn(store, ref)])}
+      onChoose=${(ref) => route.open(`${recordingsOf(ref)}?at=${Math.round(replay.feed.position)}`)}
+    />
+    <${Select}
+      test="replay-day"
+      title="Day"
+      value=${name}
+      choices=${others.map((day) => [day, longDay(day)])}
+      onChoose=${(day) => replay.openDay(day)}
+    />
     <${RouteLink} path=${ALL_DAYS} className="button" label="All days with recordings">All days<//>
   </div>`;
 }
@@ -145,14 +142,9 @@ export function Sessions({ replay }) {
   return html`<ol class="sessions">
     ${day.sessions.map(
       (session) => html`<li key=${session.since}>
-        <button
-          type="button"
-          data-test="session"
-          aria-current=${session === now ? "true" : undefined}
-          onClick=${() => replay.seek(session.since)}
-        >
+        <${Button} test="session" aria-current=${session === now ? "true" : undefined} onPress=${() => replay.seek(session.since)}>
           <span>${clockTime(session.since)} – ${clockTime(session.until)}</span> <small>${span(session.until - session.since)}</small>
-        </button>
+        <//>
       </li>`,
     )}
   </ol>`;

@@ -2,7 +2,7 @@
 
 import { Archive, delay } from "../../core/replay/archive.js";
 import { html, useEffect, useRef, useState } from "../parts/hooks.js";
-import { Icon, Why } from "../parts/parts.js";
+import { Button, Select, Why } from "../parts/parts.js";
 import { clockTime } from "../parts/words.js";
 import { sizeWords } from "./choose.js";
 
@@ -58,42 +58,32 @@ export function Download({ replay }) {
   const lasts = stretch.until - stretch.since;
   const running = job?.state === "running";
   const why = feed.seeks ? (lasts > LONGEST_MS ? "At most one hour: mark a shorter stretch" : "") : "Nothing is open yet";
+  const off = why || (running ? "One download is being made" : "");
   return html`<div class="download">
     <p>
       <b data-test="stretch">${feed.seeks ? `${clockTime(stretch.since)} – ${clockTime(stretch.until)}` : "–"}</b>
       <span class="dim"> ${feed.seeks && long(lasts)}</span>
     </p>
     <div class="download-marks">
-      <button type="button" data-test="mark-in" onClick=${() => replay.mark("since", feed.position)}>Begin here</button>
-      <button type="button" data-test="mark-out" onClick=${() => replay.mark("until", feed.position)}>End here</button>
+      <${Button} test="mark-in" onPress=${() => replay.mark("since", feed.position)}>Begin here<//>
+      <${Button} test="mark-out" onPress=${() => replay.mark("until", feed.position)}>End here<//>
       ${marked.any &&
-      html`<button
-        type="button"
-        class="quiet"
-        data-test="mark-clear"
-        onClick=${() => {
+      html`<${Button}
+        className="quiet"
+        test="mark-clear"
+        onPress=${() => {
           replay.mark("since", null);
           replay.mark("until", null);
         }}
       >
         Clear
-      </button>`}
+      <//>`}
     </div>
     <div class="download-marks">
-      <select data-test="download-as" aria-label="Form of the download" value=${as} onChange=${(event) => choose(event.currentTarget.value)}>
-        ${Object.entries(FORMS).map(([value, words]) => html`<option key=${value} value=${value}>${words}</option>`)}
-      </select>
-      <button
-        type="button"
-        data-test="download"
-        disabled=${running || why !== ""}
-        aria-describedby=${running || why ? "why-download" : undefined}
-        onClick=${() => begin(stretch, as)}
-      >
-        <${Icon} name="save" />Make it
-      </button>
+      <${Select} test="download-as" label="Form of the download" value=${as} choices=${Object.entries(FORMS)} onChoose=${choose} />
+      <${Button} test="download" why=${off} icon="save" onPress=${() => begin(stretch, as)}>Make it<//>
     </div>
-    ${(running || why) && html`<${Why} id="why-download">${why || "One download is being made"}<//>`}
+    ${off && html`<${Why} id="why-download">${off}<//>`}
     ${job && html`<${Job} job=${job} onEnd=${end} />`}
   </div>`;
 }
@@ -105,13 +95,13 @@ function Job({ job, onEnd }) {
       <a class="button primary" data-test="download-file" href=${Archive.file(job.id)} download=${job.name}>Save ${job.name}</a>
       <span class="dim">${sizeWords(job.bytes)}</span>
       ${job.why && html`<span class="bad">Not all could be read: ${job.why}</span>`}
-      <button type="button" class="quiet" data-test="download-end" onClick=${onEnd}>Remove</button>
+      <${Button} className="quiet" test="download-end" onPress=${onEnd}>Remove<//>
     </p>`;
   }
   const share = Math.round(100 * (job.done ?? 0));
   return html`<p class="download-job">
     <progress max="100" value=${share} aria-label="Progress of the download"></progress>
     <span data-test="download-share">${share} %</span>
-    <button type="button" data-test="download-end" onClick=${onEnd}>Cancel</button>
+    <${Button} test="download-end" onPress=${onEnd}>Cancel<//>
   </p>`;
 }

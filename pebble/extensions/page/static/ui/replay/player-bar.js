@@ -3,7 +3,7 @@
 import { SPEEDS } from "../../core/replay/feed.js";
 import { MARKS, extentOf, holding, stretchesOf, whyOf } from "../../core/replay/timeline.js";
 import { html, useMemo, useModel, useState, useTick } from "../parts/hooks.js";
-import { Icon } from "../parts/parts.js";
+import { Button, Select } from "../parts/parts.js";
 import { exactTime, shortTime } from "../parts/more-words.js";
 import { clockTime } from "../parts/words.js";
 import { Elsewhere, Sessions } from "./choose.js";
@@ -36,34 +36,29 @@ export function PlayerBar({ at, replay }) {
     </p>`}
     ${seen ? html`<${Marks} replay=${replay} marks=${marks} seen=${seen} />` : html`<${NoDay} replay=${replay} />`}
     <div class="player-keys" role="group" aria-label="Play">
-      <button type="button" data-test="back-10" aria-label="Back: −10 s" onClick=${() => replay.step(-10_000)}>−10 s</button>
-      <button type="button" class="primary" data-test="play" onClick=${() => replay.toggle()}>
-        <${Icon} name=${on ? "pause" : "play"} />${on ? "Pause" : "Play"}
-      </button>
-      <button type="button" data-test="on-10" aria-label="Forward: +10 s" onClick=${() => replay.step(10_000)}>+10 s</button>
-      <select
-        data-test="speed"
-        aria-label="Speed"
+      <${Button} test="back-10" label="Back: −10 s" onPress=${() => replay.step(-10_000)}>−10 s<//>
+      <${Button} className="primary" test="play" icon=${on ? "pause" : "play"} onPress=${() => replay.toggle()}>${on ? "Pause" : "Play"}<//>
+      <${Button} test="on-10" label="Forward: +10 s" onPress=${() => replay.step(10_000)}>+10 s<//>
+      <${Select}
+        test="speed"
+        label="Speed"
         value=${String(speed)}
-        onChange=${(event) => feed.setSpeed(Number(event.currentTarget.value))}
-      >
-        ${SPEEDS.map((one) => html`<option key=${one} value=${one}>×${one}</option>`)}
-      </select>
+        choices=${SPEEDS.map((factor) => [factor, `×${factor}`])}
+        onChoose=${(factor) => feed.setSpeed(Number(factor))}
+      />
       <output class="player-time" data-test="time">${feed.seeks ? exactTime(feed.position) : "–"} <small>${words}</small></output>
       ${session &&
-      html`<button type="button" data-test="near" aria-pressed=${isNear} onClick=${() => setNear(!isNear)}>
-        <${Icon} name="full" />Session
-      </button>`}
+      html`<${Button} test="near" aria-pressed=${isNear} icon="full" onPress=${() => setNear(!isNear)}>Session<//>`}
       ${Object.entries(PANELS).map(
-        ([name, [title, icon]]) => html`<button
+        ([name, [title, icon]]) => html`<${Button}
           key=${name}
-          type="button"
-          data-test=${`open-${name}`}
+          test=${`open-${name}`}
           aria-expanded=${open === name}
-          onClick=${() => show(open === name ? "" : name)}
+          icon=${icon}
+          onPress=${() => show(open === name ? "" : name)}
         >
-          <${Icon} name=${icon} />${title}
-        </button>`,
+          ${title}
+        <//>`,
       )}
     </div>
   </section>`;
@@ -123,6 +118,6 @@ function NoDay({ replay }) {
   const again = () => (day.name ? day.open(day.name, day.then, true) : replay.start());
   return html`<div class="player-scale" role="status">
     <span>${day.problem ? `✖ ${day.problem}` : words}</span>
-    ${day.problem && html`<button type="button" data-test="try-again" onClick=${again}>Try again</button>`}
+    ${day.problem && html`<${Button} test="try-again" onPress=${again}>Try again<//>`}
   </div>`;
 }

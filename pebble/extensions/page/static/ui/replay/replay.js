@@ -63,6 +63,7 @@ function press(replay, event) {
 function Shown({ at, replay }) {
   const { panels } = usePage();
   const narrow = useMedia("(max-width: 760px)"); // as the page's own layout
+  const name = useName(at);
   useModel(replay);
   return html`<div class="replay">
     <${Boundary} what="The time"><${Badge} at=${at} replay=${replay} /><//>
@@ -75,7 +76,7 @@ function Shown({ at, replay }) {
             stage=${RecordedStage}
             watches
         /><//>`
-      : html`<div class="empty"><p role="status">${replay.feed.problem || "Loading the recording…"}</p></div>`}
+      : html`<div class="empty"><h1 class="sr">${name}</h1><p role="status">${replay.feed.problem || "Loading the recording…"}</p></div>`}
     <${Boundary} what="What plays it"><${PlayerBar} at=${at} replay=${replay} /><//>
   </div>`;
 }

@@ -3,7 +3,7 @@
 import { ROOT } from "../../core/browser.js";
 import { DRIVE, KEYS } from "../cards/cards.js";
 import { html, useCalm, useLater, useModel, usePage, useValue } from "../parts/hooks.js";
-import { Card, HoldButton, Part, Slider, set, useName } from "../parts/parts.js";
+import { Button, Card, HoldButton, Part, Slider, set, useName } from "../parts/parts.js";
 import { Stick } from "./stick.js";
 import { driverName } from "../parts/words.js";
 
@@ -58,11 +58,11 @@ export function Slot({ at }) {
       <${ReasonAction} action=${reason?.action} />
       ${reason?.also && html`<${ReasonAction} action=${reason.also} />`}
       ${asks
-        ? html`<button type="button" data-test="let" class="primary" title=${`Let ${asks} drive`} onClick=${() => driver.release()}>
+        ? html`<${Button} className="primary" test="let" title=${`Let ${asks} drive`} onPress=${() => driver.release()}>
               Let ${person.length > LONG ? "them" : person} drive
-            </button>
-            <button type="button" data-test="keep" onClick=${() => driver.keep()}>Keep</button>`
-        : mine && html`<button type="button" data-test="release" onClick=${() => driver.release()}>Release</button>`}
+            <//>
+            <${Button} test="keep" onPress=${() => driver.keep()}>Keep<//>`
+        : mine && html`<${Button} test="release" onPress=${() => driver.release()}>Release<//>`}
     </div>
     ${reason?.code === "lease" && view?.by && html`<p class="sr">${driverName(view)} has control.</p>`}
   </div>`;
@@ -103,31 +103,28 @@ function ReasonAction({ action }) {
   useLater(hinted ? FLASH_MS - (performance.now() - hintedAt) : Infinity);
   switch (action?.kind) {
     case "take":
-      return html`<button
+      return html`<${Button}
         key=${hinted ? hintedAt : "take"}
-        type="button"
-        class=${`primary ${hinted ? "flash" : ""}`}
-        data-test="take"
-        onClick=${() => commands.take(false)}
+        className=${`primary ${hinted ? "flash" : ""}`}
+        test="take"
+        onPress=${() => commands.take(false)}
       >
         ${action.label}<kbd>Enter</kbd>
-      </button>`;
+      <//>`;
     case "ask":
-      return html`<button type="button" data-test="ask" onClick=${() => commands.take(false)}>${action.label}</button>`;
+      return html`<${Button} test="ask" onPress=${() => commands.take(false)}>${action.label}<//>`;
     case "give-up":
-      return html`<button type="button" data-test="give-up" onClick=${() => driver.release()}>${action.label}</button>`;
+      return html`<${Button} test="give-up" onPress=${() => driver.release()}>${action.label}<//>`;
     case "take-over":
       return html`<${HoldButton} test="take-over" onHeld=${() => commands.take(true)}>${action.label}<//>`;
     case "see":
-      return html`<button type="button" data-test="see" onClick=${() => see(driver)}>${action.label}</button>`;
+      return html`<${Button} test="see" onPress=${() => see(driver)}>${action.label}<//>`;
     case "stop-script":
-      return html`<button type="button" data-test="stop-script" onClick=${() => commands.stopScript(driver.ref)}>
-        ${action.label}
-      </button>`;
+      return html`<${Button} test="stop-script" onPress=${() => commands.stopScript(driver.ref)}>${action.label}<//>`;
     case "login":
       return html`<a class="button" href=${`${ROOT}login`}>${action.label}</a>`;
     case "reload":
-      return html`<button type="button" onClick=${() => location.reload()}>${action.label}</button>`;
+      return html`<${Button} onPress=${() => location.reload()}>${action.label}<//>`;
     default:
       return null;
   }

@@ -4,7 +4,7 @@ import { DOWN, UP } from "../../core/inputs.js";
 import { useExtraAxis } from "../parts/axes.js";
 import { html, useModel, usePage } from "../parts/hooks.js";
 import { useKeyNames } from "../parts/keyboard.js";
-import { Icon } from "../parts/parts.js";
+import { Button } from "../parts/parts.js";
 
 const GRID = ["KeyQ", "KeyW", "KeyE", "KeyA", "KeyS", "KeyD"];
 
@@ -23,8 +23,6 @@ export function KeyHints() {
       )}
     </div>
     <p aria-hidden="true">or arrows drive,<br /><b>Space</b> halts,<br /><b>Esc Esc</b> is STOP</p>
-    <button type="button" class="quiet" data-test="help" aria-label="All keys, and how stopping works" onClick=${() => panels.show("help")}>
-      <${Icon} name="help" />
-    </button>
+    <${Button} className="quiet" test="help" label="All keys, and how stopping works" icon="help" onPress=${() => panels.show("help")} />
   </div>`;
 }

@@ -4,7 +4,7 @@ import * as more from "../../core/browser-more.js";
 import { MIXED, refusal } from "../../core/stream.js";
 import { html, useEffect, useMetrics, useModel, usePage, useRef, useValue } from "../parts/hooks.js";
 import { Model, read, write } from "../parts/models.js";
-import { Icon, Why, useName, useStream } from "../parts/parts.js";
+import { Button, Check, Why, useName, useStream } from "../parts/parts.js";
 import { NewestOverlays, STALE_MS, contained, drawOverlays } from "../../media/overlays.js";
 import { nameOf, visible } from "../parts/words.js";
 
@@ -105,14 +105,8 @@ export const Tools = ({ source, wanted }) => html`<${Marks} source=${source} />
 export function Marks({ source }) {
   useModel(switches);
   if (!useMetrics(source).includes(OVERLAYS)) return null;
-  return html`<label class="check overlay-switch"
-    ><input
-      type="checkbox"
-      data-test="overlays"
-      checked=${switches.isOn(source)}
-      onChange=${(event) => switches.set(source, event.currentTarget.checked)}
-    /><span>Marks of scripts</span></label
-  >`;
+  const set = (on) => switches.set(source, on);
+  return html`<${Check} className="overlay-switch" test="overlays" checked=${switches.isOn(source)} onChange=${set}>Marks of scripts<//>`;
 }
 
 /** Save what is on the canvas, under the time at which it was taken; returns the file's name. */
@@ -144,9 +138,7 @@ function Stream({ source, wanted }) {
   if (!address && !video.stream) return null;
   if (video.stream) {
     return html`<div class="stream-tools">
-      <button type="button" data-test="close-stream" onClick=${() => show(video, driver, "")}>
-        <${Icon} name="close" />Close the stream
-      </button>
+      <${Button} test="close-stream" icon="close" onPress=${() => show(video, driver, "")}>Close the stream<//>
       <p class="why">
         After a click on the stream, keys go to it: click beside it to drive. How old its picture is, is not known.
       </p>
@@ -155,15 +147,9 @@ function Stream({ source, wanted }) {
   const refused = refusal(address, location);
   const why = refused || (wanted ? "" : "Start video first: the robot streams while video is wanted");
   return html`<div class="stream-tools">
-    <button
-      type="button"
-      data-test="open-stream"
-      disabled=${why !== ""}
-      aria-describedby=${why ? "why-stream" : undefined}
-      onClick=${() => show(video, driver, address)}
-    >
-      <${Icon} name="play" />Open the robot's own stream
-    </button>
+    <${Button} test="open-stream" why=${why} because="why-stream" icon="play" onPress=${() => show(video, driver, address)}>
+      Open the robot's own stream
+    <//>
     ${why && html`<${Why} id="why-stream">${why}<//>`}
     ${refused === MIXED &&
     html`<a class="button" href=${address} target="_blank" rel="noopener noreferrer">Open it in another tab</a>`}

@@ -3,7 +3,7 @@
 import { refusal } from "../../core/stream.js";
 import { html, usePage, useRefs, useState, useTick, useValue } from "../parts/hooks.js";
 import { Offers, write } from "../parts/models.js";
-import { Extra, Face, Why, useEntered, useName } from "../parts/parts.js";
+import { Button, Extra, Face, Select, Why, useEntered, useName } from "../parts/parts.js";
 import { useReasons, whyNotEnd } from "../parts/why-not.js";
 import { nameIn } from "../parts/looks.js";
 
@@ -52,19 +52,16 @@ function PictureFrom({ at, source, offers }) {
   const cameras = useCameras(at);
   const whyShown = why && html`<${Why} id="why-picture">${why}<//>`;
   if (!cameras.length) return whyShown;
-  return html`<label class="field"
-    ><span>Picture from</span>
-    <select
-      data-test="picture-from"
+  const none = ["", offers.hasVideo ? "its own camera" : "nowhere"];
+  return html`<${Select}
+      test="picture-from"
+      title="Picture from"
       value=${source === at ? "" : source}
-      disabled=${Boolean(why)}
-      aria-describedby=${why ? "why-picture" : undefined}
-      onChange=${(event) => commands.setPictureFrom(at, event.currentTarget.value)}
-    >
-      <option value="">${offers.hasVideo ? "its own camera" : "nowhere"}</option>
-      ${cameras.map((ref) => html`<option key=${ref} value=${ref}>${nameIn(store, ref)}</option>`)}
-    </select></label
-    >${whyShown}`;
+      choices=${[none, ...cameras.map((ref) => [ref, nameIn(store, ref)])]}
+      why=${why}
+      because="why-picture"
+      onChoose=${(ref) => commands.setPictureFrom(at, ref)}
+    />${whyShown}`;
 }
 
 /** Enter the address of a stream, for this browser: of a camera that is beside the robot, for example. */
@@ -102,7 +99,7 @@ function StreamAddress({ source }) {
       /></label>
       <button data-test="set-stream" disabled=${Boolean(why) || !address || address === current}>Use it</button>
       ${current &&
-      html`<button type="button" data-test="unset-stream" onClick=${() => set("")}>Use it no more</button>`}
+      html`<${Button} test="unset-stream" onPress=${() => set("")}>Use it no more<//>`}
       ${why && html`<${Why} id="why-stream-address">${why}<//>`}
     </form>
   </details>`;

@@ -10,7 +10,7 @@ import {
 } from "../parts/hooks.js";
 import { CardView, Offers, WATCHES } from "../parts/models.js";
 import { hasFace } from "../parts/looks.js";
-import { Card, Face, Icon, Part, StopButton, useName, useStream } from "../parts/parts.js";
+import { Button, Card, Face, Icon, Part, StopButton, useName, useStream } from "../parts/parts.js";
 import { Stage, useVideo } from "./video.js";
 import { typeOf } from "../parts/words.js";
 
@@ -167,16 +167,15 @@ function Portrait({ at, offers, view, video, source, stage, watches, onPanel }) 
     </div>
     <nav class="tabs" aria-label="Parts of this page">
       ${tabs.map(
-        ({ id, title, icon }) => html`<button
+        ({ id, title, icon }) => html`<${Button}
           key=${id}
-          type="button"
-          data-test=${`tab-${id}`}
+          test=${`tab-${id}`}
           aria-current=${id === tab ? "page" : undefined}
-          onClick=${() => choose(id)}
+          icon=${id === "drive" && !offers.drives ? "camera" : icon}
+          onPress=${() => choose(id)}
         >
-          <${Icon} name=${id === "drive" && !offers.drives ? "camera" : icon} />
           <span>${id === "drive" && !offers.drives ? "Picture" : title}</span>
-        </button>`,
+        <//>`,
       )}
     </nav>
   </div>`;
@@ -221,13 +220,11 @@ function Extras({ at, offers }) {
   );
 }
 
-const MoreSettings = ({ onPanel }) => html`<button type="button" class="wide" data-test="settings" onClick=${onPanel}>
-    <${Icon} name="settings" /><${SettingsWords} />
-  </button>
+const MoreSettings = ({ onPanel }) => html`<${Button} className="wide" test="settings" icon="settings" onPress=${onPanel}>
+  <${SettingsWords} />
+<//>
   ${browser.fullScreen.on &&
-  html`<button type="button" class="wide" onClick=${() => browser.fullScreen.toggle()}>
-    <${Icon} name="small" />Leave full screen
-  </button>`}
+  html`<${Button} className="wide" icon="small" onPress=${() => browser.fullScreen.toggle()}>Leave full screen<//>`}
   <${StopAll} />`;
 
 /** Far from all else, as all that stops. */
@@ -286,7 +283,7 @@ function Hidden({ cards, view }) {
   if (!cards.length) return null;
   return html`<div class="missing">
     ${cards.map(
-      ({ id, title }) => html`<button key=${id} type="button" onClick=${() => view.show(id)}>Show ${title}</button>`,
+      ({ id, title }) => html`<${Button} key=${id} onPress=${() => view.show(id)}>Show ${title}<//>`,
     )}
   </div>`;
 }

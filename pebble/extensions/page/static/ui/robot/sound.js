@@ -2,7 +2,7 @@
 
 import * as browser from "../../core/browser.js";
 import { html, useCalm, useEffect, useModel, usePage, useValue } from "../parts/hooks.js";
-import { Icon, useName } from "../parts/parts.js";
+import { Button, Icon, useName } from "../parts/parts.js";
 import { Sound } from "./sound-model.js";
 
 /** @param {{at: string, place?: "card" | "bar" | "short" | "over"}} props "short": in a bar with little room */
@@ -27,22 +27,21 @@ export function SoundControls({ at, place = "card" }) {
   const title = isHeard ? numbers(sound) : text || noListening || noTalking;
   return html`<div class=${`sound ${inBar ? "in-bar" : ""}`} role="group" aria-label="Sound">
     <div class="sound-buttons">
-      <button
-        type="button"
-        data-test="listen"
-        disabled=${noListening !== ""}
-        aria-describedby=${noListening ? "why-listen" : undefined}
-        onClick=${() => (listening ? sound.stopListening() : sound.listen())}
+      <${Button}
+        test="listen"
+        why=${noListening}
+        icon=${listening ? "halt" : "sound"}
+        onPress=${() => (listening ? sound.stopListening() : sound.listen())}
       >
-        <${Icon} name=${listening ? "halt" : "sound"} /><span>${listening ? (inBar ? "Silence" : "Stop listening") : "Listen"}</span>
-      </button>
+        <span>${listening ? (inBar ? "Silence" : "Stop listening") : "Listen"}</span>
+      <//>
       ${!page.recording &&
       html`<${TalkButton} sound=${sound} why=${noTalking} isSame=${noTalking === noListening} short=${place === "short"} />`}
       ${listening &&
       (place === "bar" || !inBar) &&
-      html`<button type="button" data-test="mute" aria-pressed=${muted} onClick=${() => sound.toggleMute()}>
-        <${Icon} name=${muted ? "muted" : "sound"} /><span>${muted ? "Muted" : "Mute"}</span><kbd>M</kbd>
-      </button>`}
+      html`<${Button} test="mute" aria-pressed=${muted} icon=${muted ? "muted" : "sound"} onPress=${() => sound.toggleMute()}>
+        <span>${muted ? "Muted" : "Mute"}</span><kbd>M</kbd>
+      <//>`}
     </div>
     <div class=${inBar ? "bar-note" : "sound-lines"} title=${title}>
       <span class="sound-state" data-test=${inBar ? "sound-note" : "sound-state"} title=${isHeard ? title : undefined}>${said}</span>

@@ -4,7 +4,7 @@ import * as browser from "../../core/browser.js";
 import { Bands } from "../banner.js";
 import { EXTRAS, PICTURE, SOUND_FACTS, VOICE } from "../cards/cards.js";
 import { Boundary, html, useEffect, useLayoutEffect, useModel, usePage, useRef, useState, useTick, useValue } from "../parts/hooks.js";
-import { Extra, Face, Icon, Part, useName } from "../parts/parts.js";
+import { Button, Extra, Face, Icon, Part, useName } from "../parts/parts.js";
 import { span } from "../parts/words.js";
 
 /** Show pictures of ``source`` as long as this is on the page. @param {string} at @param {string} source "": none */
@@ -96,33 +96,37 @@ function Bar({ at, control, source, offers, view, short, wide }) {
     return () => removeEventListener("keydown", end);
   }, [open]);
   return html`<div class="picture-bar" role="group" aria-label="Picture and sound">
-      <button type="button" data-test="video" onClick=${control.toggle}>
-        <${Icon} name=${control.wanted ? "pause" : "play"} /><span>${control.wanted ? "Pause" : "Play"}</span>
-      </button>
-      <button type="button" data-test="full-screen" hidden=${!possible} aria-label=${full} onClick=${() => browser.fullScreen.toggle()}>
-        <${Icon} name=${on ? "small" : "full"} /><span>${short ? "Full" : full}</span>
-      </button>
+      <${Button} test="video" icon=${control.wanted ? "pause" : "play"} onPress=${control.toggle}>
+        <span>${control.wanted ? "Pause" : "Play"}</span>
+      <//>
+      <${Button}
+        test="full-screen"
+        label=${full}
+        hidden=${!possible}
+        icon=${on ? "small" : "full"}
+        onPress=${() => browser.fullScreen.toggle()}
+      >
+        <span>${short ? "Full" : full}</span>
+      <//>
       <${SnapshotButton} source=${source} short=${short} />
       ${offers.has("audio") &&
       html`<${Boundary} what="Sound"><${Part} part=${VOICE} lines=${0} at=${at} place=${short ? "short" : "bar"} /><//>`}
-      <button
-        type="button"
-        class="gear"
-        data-test="gear"
+      <${Button}
+        className="gear"
+        test="gear"
+        label="Settings of the picture"
         aria-expanded=${wide ? open : undefined}
-        aria-label="Settings of the picture"
-        onClick=${() => (wide ? show(!open) : view?.reveal("picture"))}
+        icon="gear"
+        onPress=${() => (wide ? show(!open) : view?.reveal("picture"))}
       >
-        <${Icon} name="gear" />${short && html`<span>Picture</span>`}
-      </button>
+        ${short && html`<span>Picture</span>`}
+      <//>
     </div>
     ${wide &&
     html`<section class="gear-panel" aria-label="Settings of the picture" data-test="gear-panel" hidden=${!open}>
       <div class="card-head">
         <h2>Picture</h2>
-        <button type="button" class="quiet" aria-label="Close the settings of the picture" onClick=${() => show(false)}>
-          <${Icon} name="close" />
-        </button>
+        <${Button} className="quiet" label="Close the settings of the picture" icon="close" onPress=${() => show(false)} />
       </div>
       ${offers.has("audio") && html`<${Part} part=${SOUND_FACTS} lines=${0} at=${at} />`}
       <${Part} part=${PICTURE} at=${at} source=${source} offers=${offers} video=${control} extras=${EXTRAS} />
