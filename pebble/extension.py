@@ -72,7 +72,7 @@ class Stage(IntEnum):
 
 
 class Program(Struct, frozen=True):
-    """One process: its name in logs and status, and the module that it runs with ``arguments``, as ``python -m`` would.
+    """A process: its name in logs and status, and the module that it runs with ``arguments``, as ``python -m`` would.
 
     The launcher imports the module, or ``entry``, before it forks: importing must do nothing. What that module imports
     later, because only some robots need it, is in the memory of those robots only.
@@ -104,14 +104,14 @@ class Command(Struct, frozen=True):
 
 
 class Facts(Struct, frozen=True):
-    """What an extension adds to the summary of ``pebble check``: lines of a name and a text."""
+    """Lines that an extension adds to the summary of ``pebble check``: a name and a text each."""
 
     lines: tuple[tuple[str, str], ...] = ()  # beside those of the connections
     table: tuple[tuple[str, ...], ...] = ()  # below the table of topics
 
 
 class Extension(Struct, frozen=True, kw_only=True, eq=False):
-    """What an extension adds. Parts are written ``module:name``; an empty one adds nothing.
+    """Declaration of what an extension adds. Parts are written ``module:name``; an empty one adds nothing.
 
     A robot whose config lists one with ``motors`` does not start without it.
     """

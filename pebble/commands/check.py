@@ -147,7 +147,7 @@ def _print(config: Config, path: Path, added: list[Facts]) -> None:
 
 
 def _packages(config: Config) -> Iterator[str]:
-    """What the programs of this robot cannot do without, and this Python lacks."""
+    """Yield what programs of this robot cannot do without, and this Python lacks."""
     for extension in config.installed:
         if missing := lacking_packages(extension) if programs_of([extension], config) else []:
             install = f'pip install "{extension.package}[{extension.extra}]"'

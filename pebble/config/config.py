@@ -166,25 +166,22 @@ def _config(
 ) -> Config:
     notes = Notes()
     own = plain(raw, notes)
-    found, missing = _extensions(own, folder)
-    installed = () if core_only else found
-    absent, missing = missing, () if core_only else missing
-    for one in missing:
-        note = notes.warning if lenient else notes.problem
-        note(tuple(one.key.split(".", 1)), one.reason)
+    found, lost = _extensions(own, folder)
+    installed, missing = ((), ()) if core_only else (found, lost)
+    lacking = [Note(tuple(one.key.split(".", 1)), one.reason) for one in missing]
+    (notes.warnings if lenient else notes.problems).extend(lacking)
     tree, kind, rules = _tree(installed)
-    reader = Reader(folder, env, rules)
-    reader.notes = notes
+    reader = Reader(folder, env, rules, notes)
     merged = with_instances(own)
     unread = [*extension.keys_of_missing(installed), *(key for one in found if core_only for key in one.sections)]
     root = reader.section(tree, without(merged, unread))
     notes.forget_inherited(own, merged)
-    if lenient and any(one.key.startswith("extensions.") for one in absent):
+    if lenient and any(one.key.startswith("extensions.") for one in lost):
         _excuse(notes)
     if path is not None and holds_secret(own):
         warn_if_readable(notes, (), path, "it, and there is a password in it")
     if notes.problems:
-        lacking = [Note(tuple(one.key.split(".", 1)), one.reason) for one in missing]  # unknown sections may be theirs
+        # What is missing is said first: unknown sections may be its own.
         raise ConfigError(list(dict.fromkeys(map(str, (*lacking, *notes.problems)))))
     identity = Identity(root.robot.system, root.robot.type, root.robot.id)
     config: Config = kind(

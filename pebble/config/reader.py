@@ -33,8 +33,10 @@ def _known(kind: type[Section]) -> dict[str, FieldInfo]:
 class Reader:
     """Reads one file. Relative paths start at ``folder``; ``env`` is the environment for secrets."""
 
-    def __init__(self, folder: Path, env: Mapping[str, str], rules: Sequence[Rule]) -> None:
-        self.folder, self.env, self.notes = folder, env, problems.Notes()
+    def __init__(
+        self, folder: Path, env: Mapping[str, str], rules: Sequence[Rule], notes: problems.Notes | None = None
+    ) -> None:
+        self.folder, self.env, self.notes = folder, env, notes or problems.Notes()
         self.password_variables: dict[str, None] = {}  # those that were read, in order
         self._rules = rules
 

@@ -253,7 +253,7 @@ class SerialBridge(ServiceSection, frozen=True, kw_only=True):
 
 
 class Services(Section, frozen=True, kw_only=True):
-    """One section per service; extensions add theirs."""
+    """Sections of services, one each; extensions add theirs."""
 
     defaults: Annotated[Defaults, doc("Values for several services.")] = Defaults()
     launcher: Annotated[Launcher, doc("Starts the others.")] = Launcher()

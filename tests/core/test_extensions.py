@@ -18,7 +18,7 @@ from pebble.extension import OURS, Extension, Stage, lacking_packages, ours, par
 from pebble.launcher.capabilities import capabilities
 from pebble.launcher.programs import programs
 from pebble.runtime.addresses import Addresses
-from tests.support import ROOT
+from tests.support import ROOT, needs_root
 
 PLACES = dict(zip([extension.name for extension in ours()], OURS, strict=True))
 #: What a section needs besides being enabled.
@@ -334,7 +334,7 @@ def test_what_is_of_the_core_is_no_extensions(tmp_path: Path) -> None:
     assert (done.returncode, text in done.stderr) == (1, True)
 
 
-@pytest.mark.skipif(os.getuid() != 0, reason="not root")
+@needs_root
 def test_root_runs_no_code_of_other_users(tmp_path: Path) -> None:
     lamp_file(tmp_path, "lamp")
     os.chown(tmp_path / "lamp.py", 65534, 65534)

@@ -7,7 +7,6 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 from typing import Any
 
@@ -143,7 +142,6 @@ def test_legs_of_an_owner_are_driven_stopped_and_reset(kind: str, tmp_path: Path
         send("estop-reset", {"boot": stopped["boot"], "count": stopped["count"]})
         assert until(lambda: not state("estop/legs")["latched"], 5)
         assert until(moved, 5)
-        time.sleep(0.1)
     finally:
         process.send_signal(signal.SIGTERM)
         code = process.wait(20)

@@ -1,4 +1,4 @@
-"""What the security level of a config refuses: ways to the robot without a login."""
+"""Refusals of the security level: ways to the robot without a login."""
 
 import re
 from collections.abc import Iterator
