@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Final
 import typer
 from typer.core import TyperCommand, TyperGroup
 
+from pebble.errors import PebbleError
 from pebble.extension import Command as Offered
 from pebble.extension import Extension, ours, packages, part, refuse_claims
 from pebble.version import __version__
@@ -131,6 +132,12 @@ def _run(arguments: list[str]) -> int:
         wrong = without_secrets(message).replace("float range", "number").replace("int range", "whole number")
         sys.stderr.write(f"pebble: {wrong}; see {context.command_path if context else 'pebble'} --help\n")
         return 2
+    except ModuleNotFoundError as error:
+        package = (error.name or "").partition(".")[0]
+        if package in ("", "pebble"):
+            raise
+        install = 'pip install "pebble-robot[all]"'
+        raise PebbleError(f"{arguments[0]} needs the package {package}, which is not installed: {install}") from None
     except typer.Abort as error:  # Ctrl-C
         raise KeyboardInterrupt from error
     return code if isinstance(code, int) else 0

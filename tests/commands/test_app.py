@@ -199,3 +199,11 @@ def test_sim_is_there_until_ctrl_c(tmp_path: Path) -> None:
     assert (process.returncode, err) == (0, "")
     assert str(link) in out
     assert not link.exists()
+
+
+def test_a_command_whose_package_is_missing_says_what_to_install() -> None:
+    code = "import sys; sys.modules['cv2'] = None; sys.argv = ['pebble', 'demo'];"
+    code += "from pebble import cli; sys.exit(cli.main())"
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=False)
+    needs = 'pebble: demo needs the package cv2, which is not installed: pip install "pebble-robot[all]"\n'
+    assert (done.returncode, done.stderr) == (1, needs)
