@@ -10,8 +10,11 @@ from __future__ import annotations
 import logging
 import os
 import re
+import signal
 import sys
+import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from enum import IntEnum
 from functools import cache, reduce
 from importlib import import_module
@@ -34,6 +37,7 @@ T = TypeVar("T")
 #: The group of entry points by which a package offers an extension.
 ENTRY_POINTS: Final = "pebble.extensions"
 _LONGEST = 1_000_000  # bytes of an owner's file
+_IMPORT_S = 60.0  # for a stranger's module: large libraries take half of it on a small board
 _SECTION_KEY = re.compile(r"(services\.)?[A-Za-z]\w*", re.ASCII)
 #: Ours, those first that others use, with the keys of a config that belong to each. It is the order of their sections.
 OURS: Final[Mapping[str, tuple[str, ...]]] = {
@@ -188,8 +192,9 @@ def named(
     found, missing = [], []
     for name, drives in entries.items():
         try:
-            extension = _of_file(folder / name) if name.endswith(".py") else _of_package(name)
-            _check_parts(extension, section)
+            with _in_time():
+                extension = _of_file(folder / name) if name.endswith(".py") else _of_package(name)
+                _check_parts(extension, section)
         except KeyboardInterrupt:
             raise
         except BaseException as error:  # noqa: BLE001 - whatever a stranger's module raises, SystemExit for one
@@ -203,6 +208,25 @@ def named(
             )
         found.append(extension)
     return tuple(found), tuple(missing)
+
+
+@contextmanager
+def _in_time() -> Iterator[None]:
+    """Raise PebbleError in a block that imports a stranger's module and does not end; in the main thread only."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+
+    def late(*_: object) -> None:
+        raise PebbleError(f"it was not imported within {_IMPORT_S:g} s")
+
+    before = signal.signal(signal.SIGALRM, late)
+    signal.setitimer(signal.ITIMER_REAL, _IMPORT_S)
+    try:
+        yield
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0.0)
+        signal.signal(signal.SIGALRM, before)
 
 
 def _reason(error: BaseException) -> str:
@@ -297,7 +321,9 @@ def packages() -> Iterator[Extension]:
     """Yield those of installed packages, for the command line; what cannot be loaded adds no command, and is logged."""
     for name in _offered():
         try:
-            yield _of_package(name)
+            with _in_time():
+                extension = _of_package(name)
+            yield extension
         except KeyboardInterrupt:
             raise
         except BaseException as error:  # noqa: BLE001 - as in named()

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Final
 import typer
 from typer.core import TyperCommand, TyperGroup
 
-from pebble.errors import PebbleError
+from pebble.errors import ConfigError, PebbleError
 from pebble.extension import Command as Offered
 from pebble.extension import Extension, ours, packages, part, refuse_claims
 from pebble.version import __version__
@@ -19,6 +19,8 @@ from pebble.version import __version__
 if TYPE_CHECKING:
     from typer._click.core import Command, Context
     from typer._click.formatting import HelpFormatter
+
+log = logging.getLogger(__name__)
 
 #: Ours that are of no extension.
 _CORE: Final = {
@@ -37,7 +39,13 @@ def commands(words: Sequence[str] = ()) -> dict[str, Offered]:
     offered = {**_CORE, **{name: row for one in ours() for name, row in one.commands.items()}}
     if not words or words[0] not in offered:
         foreign = list(packages())
-        refuse_claims(Extension(name="core", package="Pebble", commands=_CORE), [*ours(), *foreign])
+        try:
+            refuse_claims(Extension(name="core", package="Pebble", commands=_CORE), [*ours(), *foreign])
+        except ConfigError as error:
+            if words and not words[0].startswith("-"):
+                raise
+            log.error("%s", error)  # and help has ours
+            foreign = []
         offered |= {name: row for one in foreign for name, row in one.commands.items()}
     return dict(sorted(offered.items(), key=lambda item: (_GROUPS.index(item[1].group), item[1].rank)))
 

@@ -196,6 +196,9 @@ def _config(
         state_folder=root.transport.state_dir or default_state_folder(identity.base, env),
         password_variables=tuple(reader.password_variables),
     )
+    if lenient:
+        config = _without_broken(config)
+        installed = config.installed
     owners = (*map(config.motor_owner, config.motor_lines()), *extension.motors_of(installed, config))
     if len(owners) > len(set(owners)):
         raise ConfigError("extensions: two motor owners have one name; serial lines are called as their instances")
@@ -216,6 +219,19 @@ def _extensions(own: Any, folder: Path) -> tuple[tuple[Extension, ...], tuple[Mi
     for one in found:
         SERIAL_PROTOCOLS.update(one.protocols)
     return installed, (*missing, *extension.lacking(own))
+
+
+def _without_broken(config: Config) -> Config:
+    """Return the config without extensions whose programs cannot be told: the rest of the robot starts."""
+    for one in config.installed:
+        try:
+            extension.programs_of([one], config)
+        except ConfigError as error:
+            lost = Missing(one.name, f"extensions.{one.name}", str(error), drives=bool(one.motors))
+            installed = tuple(other for other in config.installed if other is not one)
+            warnings = (*config.warnings, str(error))
+            config = replace(config, installed=installed, missing=(*config.missing, lost), warnings=warnings)
+    return config
 
 
 def _excuse(notes: Notes) -> None:

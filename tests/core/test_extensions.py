@@ -11,10 +11,11 @@ from typing import Any
 
 import pytest
 
+from pebble.commands import app
 from pebble.config import load, parse
 from pebble.config.types import Section
 from pebble.errors import ConfigError
-from pebble.extension import OURS, Extension, Stage, lacking_packages, ours, part, programs_of
+from pebble.extension import OURS, Command, Extension, Stage, lacking_packages, ours, part, programs_of
 from pebble.launcher.capabilities import capabilities
 from pebble.launcher.programs import programs
 from pebble.runtime.addresses import Addresses
@@ -238,6 +239,37 @@ def test_what_fails_later_is_one_line_that_names_it(more: str, text: str, tmp_pa
     done = pebble("check", str(write(tmp_path, {"lamp.py": {}})))
     assert (done.returncode, done.stderr.count("\n")) == (1, 1)
     assert done.stderr.startswith(f"pebble: robot.json: {text}")
+
+
+@pytest.mark.parametrize(("name", "drives"), [("torch", False), ("arm", True)])
+def test_a_robot_starts_without_programs_that_cannot_be_told_unless_they_drive(
+    name: str, drives: bool, tmp_path: Path
+) -> None:
+    more = "programs='lamp:fail'" + (", motors={'lamp': 'lamp'}" if drives else "")
+    (tmp_path / f"{name}.py").write_text(("def fail(*_): 1 / 0\n" + OBJECT % more).replace("lamp", name))
+    config = load(write(tmp_path, {f"{name}.py": {"drives": drives}}), lenient=True)
+    assert "ZeroDivisionError" in str(config.warnings)
+    assert [(lost.name, lost.drives) for lost in config.missing] == [(name, drives)]
+    assert name not in [program.name for program in programs(config)]
+
+
+def test_a_file_whose_import_does_not_end_is_a_broken_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("pebble.extension._IMPORT_S", 0.3)
+    (tmp_path / "endless.py").write_text("EXTENSION = None\nwhile True: pass\n")
+    with pytest.raises(ConfigError, match=r"extensions.endless.py: it was not imported within 0.3 s"):
+        load(write(tmp_path, {"endless.py": {}}))
+
+
+def test_help_is_there_although_two_packages_have_one_command(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    commands = {"lamp": Command("lamp:lamp", "")}
+    pair = [Extension(name=name, package=name, commands=commands) for name in ("lamps", "lights")]
+    monkeypatch.setattr(app, "packages", lambda: iter(pair))
+    assert "up" in app.commands(["--help"])
+    assert 'command "lamp" is added by two, lamps (lamps) and lights (lights)' in caplog.text
+    with pytest.raises(ConfigError, match="added by two"):
+        app.commands(["lamp"])
 
 
 def test_capabilities_of_the_rest_are_published_without_those_that_fail(tmp_path: Path) -> None:
