@@ -6,7 +6,7 @@ DEBIAN := sh tools/debian-packages.sh
 
 .DEFAULT_GOAL := help
 unexport PYTHONDONTWRITEBYTECODE  # every test starts programs: compiling them each time would cost a third of the time
-.PHONY: help demo test check docs long report lock release clean
+.PHONY: help demo test check docs site long report lock release clean
 
 help:
 	@echo "make demo              four simulated robots, on Zenoh, on MQTT and on MCUs, driven through a broker; Ctrl-C ends it"
@@ -16,6 +16,7 @@ help:
 	@echo "make test QUICK=1      what to run before each commit: lint, types, contract, bridge, transports, motion; a minute and a half"
 	@echo "make check             lint, types and imports only"
 	@echo "make docs              write build/docs: tables of all topics, config keys, web messages, words and bounds; schemas"
+	@echo "make site              write build/site: the documents and the API as a web site, its links checked; a minute"
 	@echo "make long PART=stops   one of the parts that take long; make long lists them"
 	@echo "make report            run every comparison, 95 minutes; writes build/report; QUICK=1: fewer cases, six minutes"
 	@echo "make lock              write requirements.txt anew from pyproject.toml; UPGRADE=1: with the newest versions"
@@ -77,6 +78,9 @@ report: .venv/.ready-dev
 
 lock: .venv/.ready-tools
 	@PYTHONPATH=.venv/tools $(VENV) tools/lock.py $(if $(UPGRADE),--upgrade)
+
+site: docs .venv/.ready-tools
+	@PYTHONPATH=.venv/tools:. $(VENV) tools/site.py
 
 release: .venv/.ready-dev .venv/.ready-tools
 	@$(DEBIAN) dpkg-deb=dpkg
