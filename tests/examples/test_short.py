@@ -28,7 +28,7 @@ def test_subscribe_prints_what_a_robot_publishes(broker: Broker) -> None:
         program.kill()
 
 
-def test_drive_turns_for_a_second_and_stops(broker: Broker) -> None:
+def test_drive_goes_ahead_for_a_second_and_stops(broker: Broker) -> None:
     received: list[Message] = []
     with create("mqtt", "robot", MqttSettings(host="127.0.0.1", port=broker.port)) as robot:
         robot.subscribe(f"{GOOB}/incoming/drive-values", received.append)
