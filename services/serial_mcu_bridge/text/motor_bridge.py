@@ -27,6 +27,7 @@ from pebble.services.serial_mcu_bridge.text.device_log import DeviceLogLine, is_
 from pebble.services.serial_mcu_bridge.text.goob_base import Charging, Level, Report, Touch
 from pebble.services.serial_mcu_bridge.text.hall_memory import HallMemory
 
+_AGAIN_S = 0.5  # while motors run, for an odometry that began after them
 _LIGHTS = "lights"  # a steady colour and a fade replace one another
 
 
@@ -58,7 +59,7 @@ class MotorBridge(MotorOwner, SerialService):
     def __init__(self, *arguments: Any, **options: Any) -> None:
         super().__init__(*arguments, **options)
         self._publishes_touch = self.options.telemetry.publish_touch_sensors
-        self._power = (0.0, 0.0)  # of the left and the right wheel, as published
+        self._power, self._again_at = (0.0, 0.0), 0.0  # of the left and the right wheel, as published; and when again
         self._charging: ChargingStatus | None = None
         self._hall = self._make_hall_memory()
         self._splitter = LineSplitter()
@@ -92,9 +93,10 @@ class MotorBridge(MotorOwner, SerialService):
         self._show_power(0.0, 0.0)
 
     def _show_power(self, left: float, right: float) -> None:
-        """Publish what the wheels are commanded, if it has changed and what their sensors say is published."""
-        if self._publishes_touch and (left, right) != self._power:
-            self._power = left, right
+        """Publish what the wheels are commanded, beside their sensors: each change, and again while they run."""
+        now = self.clock()
+        if self._publishes_touch and ((left, right) != self._power or ((left or right) and now >= self._again_at)):
+            self._power, self._again_at = (left, right), now + _AGAIN_S
             self.publish(c.MOTOR_POWER, MotorPower(left=left, right=right), owner=self.owner)
 
     # -- lights

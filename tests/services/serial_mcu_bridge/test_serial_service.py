@@ -66,6 +66,14 @@ def test_every_field_of_a_line_is_published(bench: Bench) -> None:
     assert len(bench.payloads("charging-status")) == 2  # only changes are published
 
 
+@pytest.mark.parametrize("bench", [FRED], indirect=True)
+def test_what_the_motors_get_is_published_again_while_they_run(bench: Bench) -> None:
+    """An odometry that begins while a robot drives steadily learns in which direction."""
+    assert until(lambda: bench.drive(0.5) or len(bench.payloads("motor-power/serial")) >= 3, 5)
+    assert {tuple(power.values()) for power in bench.payloads("motor-power/serial")} == {(0.5, 0.5)}
+    assert until(lambda: bench.payloads("motor-power/serial")[-1] == {"left": 0.0, "right": 0.0}, 5)
+
+
 # -- emergency stops and scripts
 
 
