@@ -46,7 +46,7 @@ def check_kind(kind: str) -> None:
 
 
 def module_of(kind: str) -> str | None:
-    """The module of one of our own transports; None if ``kind`` is not one of them."""
+    """Return the module of one of our own transports; None if ``kind`` is not one of them."""
     return f"{__name__}.{kind}.transport" if kind in _own_kinds() else None
 
 

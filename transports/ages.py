@@ -74,7 +74,7 @@ class SenderClocks(Generic[K]):
         return len(self._clocks)
 
     def age_s(self, key: K, sent: float, waited_s: float, now: float, late_s: float) -> float:
-        """Seconds for which a message that is stamped ``sent`` has waited at ``now``; more than ``late_s`` is late.
+        """Return how many seconds a message stamped ``sent`` has waited at ``now``; more than ``late_s`` is late.
 
         ``waited_s`` is what is known without the stamp: at most so long. It counts as well until the clock is two
         seconds old, and until one of its messages was not late by that.
@@ -92,13 +92,13 @@ class SenderClocks(Generic[K]):
             return age if now - clock.began >= _YOUNG_S else max(age, waited_s)
 
     def is_passed(self, key: K, sent: float) -> bool:
-        """Whether a message of this sender with a newer stamp was received; if much newer, its clock was set back."""
+        """True if a message of this sender with a newer stamp was received; if much newer, its clock was set back."""
         with self._lock:
             clock = self._clocks.get(key)
             return clock is not None and clock.newest - _JUMP_S < sent < clock.newest
 
     def pass_over(self, key: K, sent: float, now: float) -> None:
-        """A message that is not judged was stamped ``sent``: what its sender stamped before it comes too late."""
+        """Note the stamp of a message that is not judged: what its sender stamped before it comes too late."""
         with self._lock:
             clock = self._clocks.get(key)
             if clock is not None and sent - clock.newest < now - clock.received_at + _JUMP_S:
@@ -114,7 +114,7 @@ class SenderClocks(Generic[K]):
         return clock
 
     def _believed(self, key: K, clock: _Clock, sent: float, now: float, late_s: float) -> _Clock:
-        """The clock that counts for this message: while all seem late, perhaps another than before."""
+        """Return the clock that counts for this message: while all seem late, perhaps another than before."""
         if now - sent - clock.least <= late_s:
             clock.other = None
             return clock
@@ -143,7 +143,7 @@ class MessageAges:
         self._clocks = SenderClocks[tuple[int, str]](_CLOCKS, Patience(believed_s=5.0, set_back_s=5.0, gap_s=1.0))
 
     def __len__(self) -> int:
-        """How many clocks are remembered."""
+        """Return how many clocks are remembered."""
         return len(self._clocks)
 
     def age_s(self, boot: int, topic: str, sent: float, now: float) -> float:

@@ -88,7 +88,7 @@ class Subscription:
 
     @property
     def direct(self) -> bool:
-        """Whether the handler runs on the receiving thread."""
+        """True if the handler runs on the receiving thread."""
         return self._thread is None
 
     def close(self) -> None:
@@ -172,7 +172,7 @@ class Subscriptions:
         self._all: list[Subscription] = []
 
     def __iter__(self) -> Iterator[Subscription]:
-        """Those of this moment."""
+        """Return those of this moment."""
         with self.lock:
             return iter(list(self._all))
 
@@ -182,7 +182,7 @@ class Subscriptions:
             self.matched.clear()
 
     def remove(self, subscription: Subscription) -> bool:
-        """Whether it was one of them."""
+        """True if it was one of them."""
         with self.lock:
             if subscription not in self._all:
                 return False
@@ -281,7 +281,7 @@ class Transport(ABC):
 
     @property
     def untried(self) -> bool:
-        """Whether the name of the broker has addresses that have not had their first turn yet."""
+        """True if the name of the broker has addresses that have not had their first turn yet."""
         return False
 
     @property
@@ -410,7 +410,7 @@ class Transport(ABC):
         direct: bool = False,
         limit: int = QUEUE_LIMIT,
     ) -> list[Subscription]:
-        """As :meth:`subscribe`, for each filter and its handler; waits once for all of them."""
+        """Subscribe to each filter with its handler; wait once for all of them."""
         for filter_ in handlers:
             check_filter(filter_)
             if self.as_published and echo:
@@ -492,7 +492,7 @@ class Transport(ABC):
         """Send one message within a bounded time; False if it cannot be sent now."""
 
     def _declare_all(self, subscriptions: Sequence[Subscription]) -> None:
-        """As :meth:`_declare` for each; a backend may wait once for all."""
+        """Declare each; a backend may wait once for all."""
         for subscription in subscriptions:
             self._declare(subscription)
 

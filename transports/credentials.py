@@ -19,7 +19,7 @@ class Credentials:
             self._password_file = Renewed([file], lambda: _password(file), self._password)
 
     def context(self) -> ssl.SSLContext | None:
-        """None: without TLS."""
+        """Return the context, or None without TLS."""
         return None if self._tls is None else self._tls.get()
 
     def password(self) -> str | None:
@@ -27,7 +27,7 @@ class Credentials:
 
 
 def renewed_context(tls: TlsSettings) -> Renewed[ssl.SSLContext]:
-    """The context of these certificates, or of the system's authorities. Raises TransportError if there is none now."""
+    """Return the context of these certificates, or of the system's authorities. Raises TransportError without any."""
     system = ssl.get_default_verify_paths()
     trusted = (system.cafile, system.capath) if tls.ca_cert is None else (tls.ca_cert,)
     files = [Path(file) for file in (*trusted, tls.client_cert, tls.client_key) if file is not None]

@@ -33,14 +33,14 @@ class Address(NamedTuple):
 
 
 def addresses_of(host: str, port: int) -> list[Address]:
-    """All addresses of ``host``, each once. Raises OSError; ValueError for a host that cannot be a name."""
+    """Return all addresses of ``host``, each once. Raises OSError; ValueError for a host that cannot be a name."""
     name = host.encode() if host.isascii() else host  # for text Python loads what only other names need, 0.3 MB
     found = socket.getaddrinfo(name, port, type=socket.SOCK_STREAM)
     return list(dict.fromkeys(Address(family, place) for family, _type, _protocol, _name, place in found))
 
 
 def dial(address: Address, timeout: float | None = None, *, max_segment: int = 0) -> socket.socket:
-    """A TCP connection; the same ``timeout`` goes on for what follows, TLS. Raises OSError.
+    """Return a TCP connection; the same ``timeout`` goes on for what follows, TLS. Raises OSError.
 
     ``max_segment``: bytes of one segment; 0: the system's.
     """
@@ -57,7 +57,7 @@ def dial(address: Address, timeout: float | None = None, *, max_segment: int = 0
 
 
 def described(failures: dict[str, str]) -> str:
-    """One line of bounded length that names addresses and why each failed."""
+    """Return one line of bounded length that names addresses and why each failed."""
     some = [f"{address} {why}" for address, why in list(failures.items())[:_LONGEST]]
     more = len(failures) - len(some)
     return "; ".join(some) + (f"; and {more} more" if more else "")
@@ -79,7 +79,7 @@ class AddressRound:
         self._slow: set[Address] = set()  # where TLS took long, or was not there in time
 
     def address(self) -> Address:
-        """The address whose turn it is; may wait for a resolver. Raises OSError, ValueError."""
+        """Return the address whose turn it is; may wait for a resolver. Raises OSError, ValueError."""
         if not self._left:
             found = self._resolve(*self.host_port)
             if not found:
@@ -97,7 +97,7 @@ class AddressRound:
 
     @property
     def untried(self) -> bool:
-        """Whether one of several addresses has not had its first turn yet."""
+        """True if one of several addresses has not had its first turn yet."""
         return self._is_first and self.several
 
     @property
@@ -114,12 +114,12 @@ class AddressRound:
         self._slow.add(self._left[0])
 
     def succeeded(self) -> str:
-        """The address has a connection; returns which ones failed before it, and how."""
+        """Note that the address has a connection, and return which ones failed before it, and how."""
         failed, self._failures, self._is_first = described(self._failures), {}, False
         return failed
 
     def failed(self, why: str, held_s: float = 0.0) -> str:
-        """The connection at the address was not made, or is lost after ``held_s``. Returns how each address failed."""
+        """Note a connection that was not made, or is lost after ``held_s``; return how each address failed."""
         if not self._left:  # the name was not resolved
             return why
         address = self._left.pop(0)

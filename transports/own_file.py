@@ -13,17 +13,17 @@ class OwnFile:
 
     @property
     def in_place(self) -> bool:
-        """Whether others that open its path still reach this process."""
+        """True if others that open its path still reach this process."""
         return self._made is not None and identity(self._path) == self._made
 
     @property
     def replaced(self) -> bool:
-        """Whether another file is at its path."""
+        """True if another file is at its path."""
         return identity(self._path) not in (None, self._made)
 
 
 def identity(file: Path | int) -> tuple[int, int] | None:
-    """What tells a file from one that has taken its place; None if there is none."""
+    """Return what tells a file from one that has taken its place; None if there is none."""
     try:
         found = os.stat(file)  # noqa: PTH116 - of a descriptor as well
     except (FileNotFoundError, NotADirectoryError):

@@ -41,7 +41,7 @@ class OwnRetained(BoundedTable[Message]):
         return True
 
     def send_again(self, known: Collection[str], send: Callable[[Message], bool]) -> None:
-        """The pending ones, then the others that are not in ``known``."""
+        """Send the pending ones, then the others that are not in ``known``."""
         changed = [self[topic] for topic in self.pending]
         others = [m for topic, m in self.items() if topic not in self.pending and topic not in known]
         self.syncing = True

@@ -27,7 +27,7 @@ _RESERVED = "?#;"  # these separate the parts of a Zenoh endpoint
 
 
 def prepare_run_dir(run_dir: Path) -> None:
-    """As :func:`make_private`, for a folder of sockets. Raises TransportError also if it cannot contain one."""
+    """Make a folder of sockets private. Raises TransportError, also if it cannot contain one."""
     check_socket_path(run_dir / f"{new_name()}.sock")
     if any(character in str(run_dir) for character in _RESERVED):
         raise TransportError(f"transport.run_dir {run_dir} must not contain any of {_RESERVED}")
@@ -103,7 +103,7 @@ class FileLock:
 
     @property
     def in_place(self) -> bool:
-        """Whether others that open its path find this lock: the file, or its folder, may have been removed."""
+        """True if others that open its path find this lock: the file, or its folder, may have been removed."""
         return _is_at(self.path, self._descriptor)
 
     def write(self, text: bytes) -> None:
@@ -157,11 +157,11 @@ class PeerRegistry:
         return PresenceLock(self._run_dir, name, owner, FileLock.wait(self._run_dir / f"{name}.seat"))
 
     def sockets(self, *, but: str = "") -> list[Path]:
-        """The sockets where running processes listen or are about to, without the one called ``but``."""
+        """Return the sockets where running processes listen or are about to, without the one called ``but``."""
         return [self._run_dir / f"{name}.sock" for name in self._running() if name != but]
 
     def ready(self, *, but: str = "") -> dict[str, str]:
-        """The owners of all processes that are surely reachable, by name, without the one called ``but``."""
+        """Return the owners of all processes that are surely reachable, by name, without the one called ``but``."""
         return {name: owner for name, owner in self._running().items() if owner and name != but}
 
     def _running(self) -> dict[str, str]:
@@ -175,7 +175,7 @@ class PeerRegistry:
 
 
 def new_name() -> str:
-    """A unique name; short, because it becomes part of a socket's path."""
+    """Return a unique name; short, because it becomes part of a socket's path."""
     return os.urandom(4).hex()
 
 
@@ -194,7 +194,7 @@ def _open_lock(path: Path) -> int:
 
 
 def _owner_if_running(path: Path) -> str | None:
-    """What the owner of the lock file wrote; None, and its files removed, if it does not run any more."""
+    """Return what the owner of the lock file wrote; None, and its files removed, if it does not run any more."""
     try:
         descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)
     except OSError:  # removed meanwhile, or no lock file

@@ -15,7 +15,7 @@ def sweep(folder: Path = SHM) -> int:
 
 
 def has_room(size: int, folder: Path = SHM) -> bool:
-    """Whether a segment of ``size`` bytes may be made now."""
+    """True if a segment of ``size`` bytes may be made now."""
     try:
         found = os.statvfs(folder)
     except OSError:
@@ -24,7 +24,7 @@ def has_room(size: int, folder: Path = SHM) -> bool:
 
 
 def mappings() -> list[tuple[int, int, str]]:
-    """The mapped segments of this process: first address, the one after the last, and the file."""
+    """Return the mapped segments of this process: first address, the one after the last, and the file."""
     found = []
     for line in Path("/proc/self/maps").read_text(encoding="utf-8").splitlines():
         place, *_, path = line.split(maxsplit=5)
@@ -35,7 +35,7 @@ def mappings() -> list[tuple[int, int, str]]:
 
 
 def mapped() -> int:
-    """How many bytes of shared memory this process has mapped."""
+    """Return how many bytes of shared memory this process has mapped."""
     return sum(end - start for start, end, _ in mappings())
 
 

@@ -22,7 +22,7 @@ def _processes_with(inodes: Collection[str]) -> Iterator[tuple[Path, set[str]]]:
 
 
 def _command_of(process: int) -> str:
-    """Its command, safe to print: a process may choose any bytes."""
+    """Return its command, safe to print: a process may choose any bytes."""
     try:
         words = Path(f"/proc/{process}/cmdline").read_text(encoding="utf-8", errors="replace")
     except OSError:
@@ -31,7 +31,7 @@ def _command_of(process: int) -> str:
 
 
 def why_not(error: OSError, port: int) -> str:
-    """Why this TCP port could not be listened at, and for one that is taken, by which process, if it can be found."""
+    """Return why this TCP port could not be listened at; for one that is taken by which process, if that is found."""
     return f"{error.strerror}{port_holder(port)}" if error.errno == errno.EADDRINUSE else str(error.strerror)
 
 

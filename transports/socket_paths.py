@@ -12,7 +12,7 @@ _LIMIT = 108  # bytes, sizeof(sun_path): a longer path cannot be bound
 
 
 def fits_socket(path: Path) -> bool:
-    """Whether a unix socket can have this path."""
+    """True if a unix socket can have this path."""
     return len(os.fsencode(path)) < _LIMIT
 
 

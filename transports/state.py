@@ -33,7 +33,7 @@ class StateChanges:
         return self._connected.wait(timeout)
 
     def notify(self, state: State) -> None:
-        """The state is another one now. Call it with :attr:`lock` held."""
+        """Tell watchers that the state is another one now. Call it with :attr:`lock` held."""
         if state is State.CONNECTED:
             self._connected.set()
         else:

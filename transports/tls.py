@@ -28,7 +28,7 @@ def make_context(tls: TlsSettings) -> ssl.SSLContext:
 
 
 def make_server_context(certificate: Path, key: Path | None) -> ssl.SSLContext:
-    """The context of a server with this certificate; raises TransportError that names the file."""
+    """Return the context of a server with this certificate; raises TransportError that names the file."""
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
     _try(f"the certificate {certificate}", lambda: context.load_cert_chain(certificate, key, _no_password))
     return context

@@ -78,7 +78,7 @@ def is_pattern(filter_: str) -> bool:
 
 @remembered
 def beginning(filter_: str) -> str:
-    """What every topic that ``filter_`` matches begins with. Of hundreds of filters it soon shows those that do not."""
+    """Return what every topic that ``filter_`` matches begins with: of hundreds of filters it soon rules most out."""
     return _WILDCARD.split(filter_, maxsplit=1)[0]
 
 

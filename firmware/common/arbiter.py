@@ -17,7 +17,7 @@ REFUSED = -1
 
 
 def newer(run: int, last: int) -> bool:
-    """Whether ``run`` began after ``last``: it is ahead by less than half of all numbers. 0, or less, is no run."""
+    """True if ``run`` began after ``last``: it is ahead by less than half of all numbers. 0, or less, is no run."""
     return run > 0 and (last == 0 or 0 < (run - last) & LAST_RUN < 1 << 29)
 
 
@@ -100,7 +100,7 @@ class Arbiter:
                 self.bar(self._newest)
 
     def _take(self, moves: bool, final: bool, now: int) -> None:
-        """A person's command: scripts wait, or end.
+        """Take a person's command: scripts wait, or end.
 
         After the first command of a person no script is in effect: a zero then is the end of the person's own driving.
         """
@@ -112,7 +112,7 @@ class Arbiter:
         self._held_from = now
 
     def bar(self, run: int) -> None:
-        """From now on no run up to this one moves anything."""
+        """Bar all runs up to this one: none moves anything from now on."""
         if newer(run, self.barred):
             self.barred = run
             if newer(run, self._newest):

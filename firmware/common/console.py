@@ -53,7 +53,7 @@ class Port:
             machine.reset()
 
     def read(self) -> int:
-        """The next byte from the host, -1 if there is none. A CR arrives as LF."""
+        """Return the next byte from the host, -1 if there is none. A CR arrives as LF."""
         if self._got == self._put:
             return -1
         byte = self._ring[self._got]

@@ -97,7 +97,7 @@ class EmergencyStop:
     # -- the state
 
     def request(self, raw: memoryview, by: str, urgent: bool, now: int) -> None:
-        """A request for control, or the end of it; ``urgent``: without asking."""
+        """Take a request for control, or the end of it; ``urgent``: without asking."""
         try:
             order = request_of(fields(self._load(raw, by)))
         except (ValueError, OverflowError, MemoryError):
@@ -110,7 +110,7 @@ class EmergencyStop:
                 self.lease.release((by, name), now)
 
     def state(self) -> bytes:
-        """The payload of what is ``due``, at most 300 bytes: the reason of a stop is cut."""
+        """Return the payload of what is ``due``, at most 300 bytes: the reason of a stop is cut."""
         if self.due == _CONTROL:
             lease = self.lease
             _, name, by, device = lease.holder or ("", "", "", "")

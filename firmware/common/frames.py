@@ -88,7 +88,7 @@ class Decoder:
         self._length = 0
 
     def take(self, byte: int) -> bool:
-        """Whether ``byte`` completes a valid frame of at most 160 bytes and of our version."""
+        """True if ``byte`` completes a valid frame of at most 160 bytes and of our version."""
         length = self._length
         if byte:
             if length < _LIMIT:

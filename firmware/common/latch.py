@@ -40,11 +40,11 @@ class Latch:
             self.why = "the saved state cannot be read"
 
     def saved(self) -> dict:
-        """What ``restore`` needs."""
+        """Return what ``restore`` needs."""
         return self._fields("latched", "recent", "by", "why", "since")
 
     def state(self, persisted: bool | None) -> dict:
-        """The payload of outgoing/estop/{owner}; ``persisted`` None: nothing can be saved."""
+        """Return the payload of outgoing/estop/{owner}; ``persisted`` None: nothing can be saved."""
         state = self._fields("latched", "boot", "count", "recent", "by", "why", "since", "reset_refused")
         state["persisted"] = persisted
         return state
@@ -102,7 +102,7 @@ class Latch:
         return True
 
     def refuses(self, moves: bool, script: bool, now: int) -> bool:
-        """Whether a drive command has no effect. While latched a zero passes: it may end the run of a script."""
+        """True if a drive command has no effect. While latched a zero passes: it may end the run of a script."""
         if self.latched:
             return moves
         if not self._waits or script:
@@ -119,7 +119,7 @@ class Latch:
 
 
 def is_name(name: object) -> bool:
-    """Whether this names a stop: 16 hex digits. A stop with any other name has none."""
+    """True if this names a stop: 16 hex digits. A stop with any other name has none."""
     return isinstance(name, str) and len(name) == 16 and not name.strip("0123456789abcdefABCDEF")
 
 
@@ -141,7 +141,7 @@ def reset_of(body: object) -> tuple[str, int] | None:
 
 
 def fields(body: object) -> dict:
-    """What a command contains, bare or wrapped."""
+    """Return what a command contains, bare or wrapped."""
     inner = body.get("value") if isinstance(body, dict) else None
     if isinstance(inner, dict):
         return inner

@@ -52,13 +52,13 @@ class Lease:
             self.changed = True
 
     def holds(self, key: str, by: str) -> bool:
-        """Whether a command of this account is from who has control; its key has those of several motor owners."""
+        """True if a command of this account is from who has control; its key has those of several motor owners."""
         own = self.key
         # no client can try many keys at once
         return own != "" and (key == own or (len(key) < 80 and own in key.split(" "))) and self.holder[:1] == (by,)
 
     def refuses(self, moves: bool, script: bool, key: str, by: str, now: int) -> bool:
-        """Whether a drive command has no effect; one of who has control renews it. A zero always has an effect.
+        """True if a drive command has no effect; one of who has control renews it. A zero always has an effect.
 
         ``script``: this sender needs no key. Call ``tick`` before.
         """

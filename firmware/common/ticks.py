@@ -17,7 +17,7 @@ def diff(now: int, since: int) -> int:
 
 
 def add(since: int, ms: int) -> int:
-    """The time ``ms`` after ``since``."""
+    """Return the time ``ms`` after ``since``."""
     return (since + ms) & _MASK
 
 

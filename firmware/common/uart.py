@@ -17,7 +17,7 @@ class Port:
         self._uart = UART(_SERCOM, _BAUD, tx=Pin("PB08"), rx=Pin("PB09"), timeout=0, rxbuf=_BUFFER, txbuf=2 * _BUFFER)
 
     def read(self) -> int:
-        """The next byte from the host, -1 if there is none."""
+        """Return the next byte from the host, -1 if there is none."""
         if not self._uart.any():
             return -1
         self._uart.readinto(self._byte)

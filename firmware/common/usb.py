@@ -28,7 +28,7 @@ class Port:
         self._writable.register(sys.stdout, POLLOUT)
 
     def read(self) -> int:
-        """The next byte from the host, -1 if there is none."""
+        """Return the next byte from the host, -1 if there is none."""
         for _ in self._readable.ipoll(0):
             sys.stdin.buffer.readinto(self._byte)
             return self._byte[0]

@@ -123,7 +123,7 @@ class Imu:
                 self.bias[axis] = (self._sums[axis] + _CALIBRATION // 2) // _CALIBRATION
 
     def _tilt(self, ms: int) -> None:
-        """A complementary filter of angular rate and gravity; ``ms`` is the time since the last sample."""
+        """Filter angular rate and gravity, which complement each other; ``ms`` is the time since the last sample."""
         values = self.values
         ax, ay, az = values[0], values[1], values[2]
         across = sqrt(ay * ay + az * az)

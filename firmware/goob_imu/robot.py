@@ -43,7 +43,7 @@ class Robot(Described):
         self.port.send()
 
     def stop(self) -> None:
-        """Nothing: the board has no motors."""
+        """Do nothing: the board has no motors."""
 
     def _sample(self) -> None:
         imu = self.imu

@@ -35,7 +35,7 @@ class Body:
             motor.stop()
 
     def refresh(self) -> None:
-        """Nothing: the motors need no refresh."""
+        """Do nothing: the motors need no refresh."""
 
     def report(self, publish) -> None:
         volts = self._battery.read_u16() * (pins.BATTERY_FULL_V / 65535)

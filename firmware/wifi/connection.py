@@ -55,11 +55,11 @@ class Connection:
         self.received(now)
 
     def received(self, now: int) -> None:
-        """The broker has answered. Other bytes do not count, because their delay is unknown."""
+        """Note that the broker has answered. Other bytes do not count, because their delay is unknown."""
         self._received = now
 
     def lost(self, now: int, random: int) -> None:
-        """The connection was lost or not made; ``random`` 0..255 spreads the next attempts of many robots."""
+        """Note a connection that was lost or not made; ``random`` 0..255 spreads the next attempts of many robots."""
         self.losses += 1
         if self.state != "offline" and (self.state != "online" or self._next_wait != _FIRST_WAIT_MS):
             self.failures += 1

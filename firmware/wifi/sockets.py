@@ -37,7 +37,7 @@ class Stream:
         self._poll.register(self.socket, select.POLLOUT)
 
     def ready(self) -> bool:
-        """Whether the connection is made."""
+        """True if the connection is made."""
         if self._poll:
             if not self._poll.poll(0):
                 return False

@@ -92,19 +92,19 @@ class Channel(Struct, frozen=True, kw_only=True, dict=True):
         return f"{self.direction}/{self.metric}"
 
     def topic(self, base: str, **names: str) -> str:
-        """The default topic of a robot, for example ``topic("pebble/robots/goob")``."""
+        """Return the default topic of a robot, for example ``topic("pebble/robots/goob")``."""
         return f"{base}/{self.suffix.format(**names)}" if names else f"{base}/{self.suffix}"
 
     def filter(self, base: str) -> str:
-        """What to subscribe to in order to receive this channel of ``base`` (which may hold ``+`` levels)."""
+        """Return what to subscribe to in order to receive this channel of ``base`` (which may hold ``+`` levels)."""
         return f"{base}/{re.sub(r'{[^}]*}', '+', self.suffix)}"
 
     def ends(self, value: Any) -> bool:
-        """Whether ``value``, a payload of this channel, can only bring something to rest."""
+        """True if ``value``, a payload of this channel, can only bring something to rest."""
         return issubclass(self.payload, p.Payload) and value.ends()
 
     def names(self, topic: str) -> dict[str, str]:
-        """The names in one of this pattern's topics: ``{"program": "camera_publisher"}``."""
+        """Return the names in one of this pattern's topics: ``{"program": "camera_publisher"}``."""
         found = re.search(re.sub(r"{([^}]*)}", r"(?P<\1>[^/]+)", self.suffix) + r"\Z", topic)
         return found.groupdict() if found is not None else {}
 
@@ -280,7 +280,7 @@ def is_reserved(metric: str) -> bool:
 
 
 def channel_of(suffix: str) -> Channel | None:
-    """The channel whose default topic ends in ``suffix`` (``incoming/drive-values``), or None."""
+    """Return the channel whose default topic ends in ``suffix`` (``incoming/drive-values``), or None."""
     exact = _EXACT.get(suffix)
     if exact is not None:
         return exact

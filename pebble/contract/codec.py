@@ -40,7 +40,7 @@ _decoder = msgspec.json.Decoder()
 
 
 def encode(channel: Channel, value: Any) -> bytes:
-    """The wire form of ``value``: JSON, or the bytes themselves on binary channels."""
+    """Return the wire form of ``value``: JSON, or the bytes themselves on binary channels."""
     if channel.payload is bytes:
         return bytes(value)
     if channel.payload is bool:
@@ -53,7 +53,7 @@ Remark = Callable[[Channel, str, str], None]
 
 
 def decode(channel: Channel, raw: bytes, remark: Remark | None = None) -> Any:
-    """The payload struct (or bool, or bytes) in ``raw``. Raises PayloadError that describes the problem.
+    """Return the payload struct (or bool, or bytes) in ``raw``. Raises PayloadError that describes the problem.
 
     Commands may be bare or wrapped in ``{"value": …}``; boolean controls are ``true``, ``{"value": true}`` or
     ``{"enabled": true}`` and nothing else. Numbers of drive and light commands may be text.
@@ -76,7 +76,7 @@ def decode(channel: Channel, raw: bytes, remark: Remark | None = None) -> Any:
 
 
 def plain(channel: Channel, raw: bytes) -> Any:
-    """The JSON value in ``raw``, of any shape. Raises PayloadError if it is invalid or beyond the limits."""
+    """Return the JSON value in ``raw``, of any shape. Raises PayloadError if it is invalid or beyond the limits."""
     if channel.kind.direction == INCOMING and len(raw) > MAX_COMMAND_BYTES:
         raise PayloadError(f"{channel.metric}: {len(raw)} bytes, more than {MAX_COMMAND_BYTES}")
     text = trim(raw)
@@ -103,7 +103,7 @@ def trim(raw: bytes) -> bytes:
 
 
 def _stop(channel: Channel, raw: bytes) -> EstopCommand:
-    """What cannot be read is a stop without a name; only an empty payload, of a removed retained one, is none."""
+    """Read a stop: what cannot be read is one without a name; an empty payload, of a removed retained one, is none."""
     if not raw:
         raise PayloadError(f"{channel.metric}: empty")
     try:
@@ -116,7 +116,7 @@ def _stop(channel: Channel, raw: bytes) -> EstopCommand:
 
 
 def is_blank(raw: bytes) -> bool:
-    """Whether ``raw`` is white space only: by such payloads bridges look for cycles, and everybody ignores them."""
+    """True if ``raw`` is white space only: by such payloads bridges look for cycles, and everybody ignores them."""
     return bool(raw) and raw.isspace()
 
 
@@ -131,7 +131,7 @@ def _boolean(channel: Channel, plain: Any) -> bool:
 
 
 def _ignore(_channel: Channel, _sender: str, _text: str) -> None:
-    """The caller wants no remarks."""
+    """Do nothing: the caller wants no remarks."""
 
 
 def _unwrap(channel: Channel, plain: Any, remark: Remark) -> Any:
@@ -161,13 +161,13 @@ def _switch(plain: Any) -> Any:
 
 
 def _request(channel: Channel, plain: Any) -> Any:
-    """A boolean control in any of its forms, with optional further fields."""
+    """Return a boolean control in any of its forms, with optional further fields."""
     inner = plain["value"] if isinstance(plain, dict) and isinstance(plain.get("value"), dict) else plain
     return {**(inner if isinstance(inner, dict) else {}), "enabled": _boolean(channel, inner)}
 
 
 def _drive(channel: Channel, plain: dict[str, Any], remark: Remark) -> dict[str, Any]:
-    """A wrong ``source``, ``run``, ``valid_ms`` or ``key`` refuses a command that moves anything, but never a stop."""
+    """Check a drive command: wrong ``source``, ``run``, ``valid_ms`` or ``key`` refuse what moves, never a stop."""
     axes = _numbers(channel, plain, remark)
     if not axes:
         found = ", ".join([_shown(key) for key in plain][:_KEYS_SHOWN]) or "nothing"
@@ -212,7 +212,7 @@ _NUMBERS: dict[Any, dict[str, float]] = {
 
 
 def _numbers(channel: Channel, plain: dict[str, Any], remark: Remark) -> dict[str, float]:
-    """Those that are given, as the original reads them: also from text, and a default for what is no number.
+    """Return those that are given, as the original reads them: also from text, and a default for what is no number.
 
     NaN and infinity refuse the command.
     """
@@ -228,7 +228,7 @@ def _numbers(channel: Channel, plain: dict[str, Any], remark: Remark) -> dict[st
 
 
 def _number(channel: Channel, name: str, value: Any) -> float | None:
-    """None: it is none. Firmware reads the same (firmware/common/payload.py)."""
+    """Return a number, or None for what is none. Firmware reads the same (firmware/common/payload.py)."""
     if isinstance(value, str):
         if "nan" in (word := value.lower()) or "inf" in word:
             raise PayloadError(f"{channel.metric}: {name} is not a finite number")
@@ -260,7 +260,7 @@ def _name_of(value: Any) -> str:
 
 
 def stamp_of(plain: Any) -> float | None:
-    """The time stamp of a JSON payload in epoch seconds: ``t`` in ms or ``timestamp`` in s, distinguished by size.
+    """Return a JSON payload's time stamp in epoch seconds: ``t`` in ms or ``timestamp`` in s, distinguished by size.
 
     Readings of 1e11 and more are milliseconds, 1e9 and more are seconds (the readers' rule, paper A.4.2); else None.
     """

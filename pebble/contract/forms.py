@@ -48,7 +48,7 @@ class Setting(Struct, frozen=True, kw_only=True):
 
     @property
     def names_file(self) -> bool:
-        """Whether its value is the name of a file or folder: a command must not choose one on the robot."""
+        """True if its value is the name of a file or folder: a command must not choose one on the robot."""
         words = re.split(r"[^a-z]+", f"{self.key} {self.arg or ''}".lower())
         free_text = self.type == "string" or (self.type == "enum" and not self.options)
         return free_text and not _FILE_WORDS.isdisjoint(words)
@@ -82,12 +82,12 @@ def listed(configs: object) -> list[Setting]:
 
 
 def form(settings: Sequence[Setting]) -> list[dict[str, Any]]:
-    """The entries that operators may set."""
+    """Return the entries that operators may set."""
     return [setting.entry() for setting in settings if not setting.names_file]
 
 
 def effective(settings: Sequence[Setting], wanted: Mapping[str, Any]) -> dict[str, Value]:
-    """The value of every setting: the wanted one, else its default. Unknown keys are ignored, as are names of files.
+    """Return each setting's wanted value, else its default. Unknown keys are ignored, as are names of files.
 
     Raises SettingError.
     """
@@ -102,7 +102,7 @@ def effective(settings: Sequence[Setting], wanted: Mapping[str, Any]) -> dict[st
 
 
 def arguments(settings: Sequence[Setting], values: Mapping[str, Value]) -> list[str]:
-    """The command line for the effective ``values``: an option and its value are two words."""
+    """Return the command line for the effective ``values``: an option and its value are two words."""
     words: list[str] = []
     for setting in settings:
         value = values[setting.key]
@@ -175,7 +175,7 @@ def _option(setting: Setting, raw: Any) -> str:
 
 
 def _text(key: str, raw: Any) -> str:
-    """A word of the command line: never an option of its own."""
+    """Return a word of the command line: never an option of its own."""
     if isinstance(raw, bool) or not isinstance(raw, str | int | float):
         raise SettingError(f"{key} must be text")
     text = str(raw)

@@ -64,15 +64,15 @@ class Identity(Struct, frozen=True):
 
     @property
     def is_server(self) -> bool:
-        """Whether it is an operators' server or a gateway: nothing that drives, is stopped or is listed with robots."""
+        """True if it is an operators' server or a gateway: nothing that drives, is stopped or is listed with robots."""
         return self.type in (SERVERS, GATEWAYS)
 
     def incoming(self, metric: str) -> str:
-        """A topic that this component subscribes to; ``metric`` may have several levels."""
+        """Return a topic that this component subscribes to; ``metric`` may have several levels."""
         return f"{self.base}/{Direction.INCOMING}/{metric}"
 
     def outgoing(self, metric: str) -> str:
-        """A topic that this component publishes; ``metric`` may have several levels."""
+        """Return a topic that this component publishes; ``metric`` may have several levels."""
         return f"{self.base}/{Direction.OUTGOING}/{metric}"
 
 
@@ -114,7 +114,7 @@ def parse_topic(topic: str) -> ParsedTopic | None:
 
 
 def is_of_another(topic: str, base: str) -> bool:
-    """Whether ``topic`` begins as the topics of another component do.
+    """True if ``topic`` begins as the topics of another component do.
 
     Capabilities may name any topic, and whoever publishes them need not be allowed to publish on it: a client that
     believed them would drive another robot.

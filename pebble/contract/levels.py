@@ -48,7 +48,7 @@ LEVELS: Mapping[LinkLevel, Level] = {
 
 
 def silent_after(interval_s: float = INTERVAL_S, link: LinkLevel = "wide", late_s: float = 0.0) -> float:
-    """Seconds without a heartbeat after which a robot counts as silent.
+    """Return seconds without a heartbeat after which a robot counts as silent.
 
     ``interval_s`` is between its heartbeats, which come ``late_s`` late; ``link`` is what it publishes. Who has not
     heard of its link takes the default.
@@ -57,7 +57,7 @@ def silent_after(interval_s: float = INTERVAL_S, link: LinkLevel = "wide", late_
 
 
 def link_of(payload: bytes) -> LinkState | None:
-    """What a message on ``outgoing/link`` reports; None where it is removed, or cannot be read."""
+    """Return what a message on ``outgoing/link`` reports; None where it is removed, or cannot be read."""
     try:
         return codec.decode(LINK, payload) if payload else None
     except PayloadError:

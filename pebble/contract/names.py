@@ -34,17 +34,17 @@ def with_name(topic: str, account: str) -> str:
 
 
 def without_name(topic: str) -> Named | None:
-    """The parts of a topic with a name; None: it has none, or more than one, or one that no account can have."""
+    """Return the parts of a topic with a name; None: it has none, or more than one, or one that no account can have."""
     found = _NAMED.fullmatch(topic)
     return None if found is None else Named(found[2], found[1] + found[3])
 
 
 def stop_topic(topic: str) -> str | None:
-    """The topic of stops, if this one is that behind any names, also such as no account can have."""
+    """Return the topic of stops, if this one is that behind any names, also such as no account can have."""
     found = _STOP.fullmatch(topic)
     return None if found is None else found[1] + found[2]
 
 
 def unchecked(claim: str) -> str:
-    """What is shown of the sender of a stop that claims to be this one. No account's name has the mark."""
+    """Return what is shown of the sender of a stop that claims to be this one. No account's name has the mark."""
     return claim[: _LONGEST - 1].rstrip(_UNCHECKED) + _UNCHECKED

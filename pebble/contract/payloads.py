@@ -24,7 +24,7 @@ class Payload(Struct, frozen=True, kw_only=True, omit_defaults=False):
                 raise ValueError(f"{name} is not a finite number")
 
     def ends(self) -> bool:
-        """Whether it can only bring something to rest: a zero, and the end of a script, a sound or a picture."""
+        """True if it can only bring something to rest: a zero, and the end of a script, a sound or a picture."""
         return False
 
 
@@ -70,7 +70,7 @@ class Drive(Payload, frozen=True, kw_only=True):
 
     @property
     def moves(self) -> bool:
-        """Whether any axis is not 0; a command without is called a zero."""
+        """True if any axis is not 0; a command without is called a zero."""
         return self.x != 0.0 or self.z != 0.0 or self.y != 0.0
 
     def ends(self) -> bool:
@@ -78,7 +78,7 @@ class Drive(Payload, frozen=True, kw_only=True):
 
     @property
     def signed(self) -> bool:
-        """Whether it is a script's."""
+        """True if it is a script's."""
         return self.source == SCRIPT
 
 

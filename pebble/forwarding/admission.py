@@ -31,7 +31,7 @@ class Admission:
         return len(self._flags)
 
     def refuse(self, side: Side, subject: Subject, message: Message, topic: str, *, named: bool = True) -> Drop | None:
-        """Why this message may not pass to ``topic``; None if it may. Hot.
+        """Return why this message may not pass to ``topic``; None if it may. Hot.
 
         ``named`` False: it has no name where others have one. Such messages take no places of those.
         """
@@ -55,7 +55,7 @@ class Admission:
         return None
 
     def refuses_flag(self, topic: bytes) -> bool:
-        """Whether this flag, which the contract does not know, would be one too many."""
+        """True if this flag, which the contract does not know, would be one too many."""
         return len(self._flags) >= MAX_UNKNOWN_FLAGS and topic.decode(errors="replace") not in self._flags
 
     def _is_too_often(self, subject: Subject, message: Message, named: bool) -> bool:

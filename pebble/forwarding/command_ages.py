@@ -51,7 +51,7 @@ class CommandAges:
         self._asking = SenderClocks[tuple[str, str]](MOST, _PATIENCE)
 
     def waited_s(self, subject: Subject, message: Message, account: str) -> float:
-        """Seconds for which a message has waited that has a STAMP: by that, if it counts.
+        """Return seconds for which a message has waited that has a STAMP: by that, if it counts.
 
         A key, or an id, counts for the ``account`` that uses it.
         """
@@ -75,7 +75,7 @@ class CommandAges:
         return clocks.age_s((account, key), command.t / 1000, waited_s, clock.since_boot(), subject.waits_s)
 
     def _key(self, command: Drive) -> str:
-        """The key by which its sender is known; empty: none that counts."""
+        """Return the key by which its sender is known; empty: none that counts."""
         found = command.key
         if not isinstance(found, str) or len(found) > _LONGEST:
             return ""
@@ -86,7 +86,7 @@ class CommandAges:
 
 
 def ends_something(subject: Subject, message: Message) -> bool:
-    """Whether a late message passes, because it can only bring something to rest."""
+    """True if a late message passes, because it can only bring something to rest."""
     if subject.channel is None:
         return False
     try:

@@ -118,7 +118,7 @@ class Cycles:
             return Finding.SUSPECT if suspicious and due else Finding.PASS
 
     def _repeats_stop(self, side: Side, topic: str, payload: bytes) -> bool:
-        """Whether an emergency stop returns too fast for its sender. Stops are not probed: any payload is one."""
+        """True if an emergency stop returns too fast for its sender. Stops are not probed: any payload is one."""
         with self._lock:
             now, key = self._clock(), (side, payload)
             often = self._way(side, topic).count(payload, now) > SUSPICIOUS
@@ -128,7 +128,7 @@ class Cycles:
             return False
 
     def probe(self, side: Side, topic: str) -> bytes:
-        """The white space of a new probe about ``topic`` from ``side``, which is to be published on the other one."""
+        """Return the white space of a new probe about ``topic`` from ``side``, to be published on the other one."""
         number = bytes(_DIGITS[byte % len(_DIGITS)] for byte in secrets.token_bytes(_LENGTH))
         with self._lock:
             way = self._way(side, topic)
@@ -213,7 +213,7 @@ class Cycles:
 
 
 def _after(subject: Subject) -> int:
-    """How many equal messages within 2 s are not suspicious: of what runs something, none that could run it twice.
+    """Return how many equal messages within 2 s are not suspicious; of what runs something, none that runs it twice.
 
     Actions are probed at once. Programs of others need to know of probes on those topics already; on those of other
     commands they see one only after a repetition.
@@ -226,7 +226,7 @@ def _after(subject: Subject) -> int:
 
 
 def _number_of(payload: bytes) -> bytes | None:
-    """The white space that makes ``payload`` a probe."""
+    """Return the white space that makes ``payload`` a probe."""
     text = payload.rstrip(_DIGITS)
     return payload[-_LENGTH:] if len(payload) - len(text) == _LENGTH else None
 

@@ -131,7 +131,7 @@ class Forwarder:
         return self.sides.gate
 
     def dropped(self) -> dict[str, int]:
-        """How many messages did not pass, here or in a transport, because of a bound; by reason, like ``too_many``."""
+        """Return how many messages did not pass because of a bound, here or in a transport; by reason: ``too_many``."""
         found = Counter(bounds_reached(*(one.transport.counters for one in self.sides.values())))
         for one, side in itertools.product(_BOUNDS, Side):
             found[one.name.lower()] += self.counters[f"{side.value}: {one.value}"]
@@ -170,7 +170,7 @@ class Forwarder:
     # -- the receiving threads
 
     def skips_retained(self, side: Side, topic: bytes) -> bool:
-        """Whether a retained message of ``topic`` does not pass, whatever it is: for TopicPolicy.skips_retained."""
+        """True if a retained message of ``topic`` does not pass, whatever it is: for TopicPolicy.skips_retained."""
         kind = self._subjects.invented(topic)
         if self._names is not None and topic.endswith(_STOP) and self._is_stop(topic.decode(errors="replace")):
             return False  # it may be a live one
@@ -199,7 +199,7 @@ class Forwarder:
         return routed
 
     def _receive_named(self, here: SideState, names: Names, message: Message) -> Routed:
-        """What arrives where names are checked: it passes on the topic without the name, with its sender in it."""
+        """Return a message with a checked name as it passes: on the topic without the name, with its sender in it."""
         sender = names[message.topic]
         subject, by = sender.subject, sender.account
         outcome = self._admit(here, subject, message, sender.topic, by != NO_ACCOUNT)
@@ -348,7 +348,7 @@ class Forwarder:
     def _act_on(
         self, finding: Finding, side: Side, subject: Subject, message: Message, forward: Forward
     ) -> Drop | None:
-        """Why a message that is suspicious, or a probe, does not pass; None if it does."""
+        """Return why a message that is suspicious, or a probe, does not pass; None if it does."""
         match finding:
             case Finding.CIRCULATES:
                 return Drop.CIRCULATES
@@ -386,4 +386,4 @@ def barrier(transport: Transport, filter_: str) -> None:
 
 
 def _ignore(_message: Message) -> None:
-    """A barrier has to subscribe to something."""
+    """Do nothing: a barrier has to subscribe to something."""

@@ -37,7 +37,7 @@ class LoopbackFilter:
                 self._messages -= len(self._out.pop(next(iter(self._out))))
 
     def forget(self, topic: str) -> None:
-        """The newest message on ``topic`` was not sent after all."""
+        """Forget the newest message on ``topic``: it was not sent after all."""
         with self._lock:
             if self._out.get(topic):
                 self._out[topic].pop()
@@ -45,7 +45,7 @@ class LoopbackFilter:
                 self._tidy(topic)
 
     def is_echo(self, topic: str, payload: bytes) -> bool:
-        """Whether this message is ours. A broker keeps the order of a topic, so earlier ones will not come back."""
+        """True if this message is ours. A broker keeps the order of a topic, so earlier ones will not come back."""
         with self._lock:
             out = self._out.get(topic)
             if not out:

@@ -116,7 +116,7 @@ def _moved(message: Message, topic: str, payload: bytes) -> Message:
 
 
 def _doubted(payload: bytes) -> bytes:
-    """A stop without a name: who it claims to be from is marked. What cannot be read names no sender to its readers."""
+    """Mark who a stop without a name claims to be from. What cannot be read names no sender to its readers."""
     found = _object(payload)
     body = {} if found is None else _body(found)
     claim = body.get("by")
@@ -127,7 +127,7 @@ def _doubted(payload: bytes) -> bytes:
 
 
 def _body(command: dict[str, Any]) -> dict[str, Any]:
-    """The object that holds the fields."""
+    """Return the object that holds the fields."""
     return inner if isinstance(inner := command.get("value"), dict) else command
 
 
@@ -139,7 +139,7 @@ def _is_zero(channel: Channel, payload: bytes) -> bool:
 
 
 def _object(payload: bytes) -> dict[str, Any] | None:
-    """The JSON object in ``payload``, as all readers of the contract find it; None: they find none."""
+    """Return the JSON object in ``payload``, as all readers of the contract find it; None: they find none."""
     try:
         usual = payload[:1] == b"{" and payload[-1:] == b"}" and len(payload) <= _USUAL_BYTES
         if usual and payload.isascii() and b"\0" not in payload:  # else there may be something around it

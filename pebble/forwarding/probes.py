@@ -39,12 +39,12 @@ class Probes:
         self._seen: deque[bytes] = deque(maxlen=_REMEMBERED)
 
     def announce(self, payload: bytes) -> bool:
-        """The bridge has announced ``payload``; returns whether the broker has sent it already."""
+        """Note that the bridge has announced ``payload``; True if the broker has sent it already."""
         with self._lock:
             return _match(payload, self._seen, self._announced)
 
     def see(self, payload: bytes) -> bool:
-        """The broker has sent ``payload``; returns whether the bridge has announced it."""
+        """Note that the broker has sent ``payload``; True if the bridge has announced it."""
         if len(payload) > _MAX_BYTES:
             return False
         with self._lock:

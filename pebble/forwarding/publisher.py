@@ -62,7 +62,7 @@ class Publisher:
             self._sides[origin].returns.expect(message.topic, message.payload)
 
     def is_echo(self, here: SideState, subject: Subject, message: Message) -> bool:
-        """Whether ``message`` is one of ours, that came back."""
+        """True if ``message`` is one of ours, that came back."""
         topic, payload = message.topic, message.payload
         if (here.side, topic) in self._cycles.closed_ways and here.returns.is_echo(topic, payload):
             return True
@@ -101,7 +101,7 @@ class Publisher:
 
 
 def _is_json(value: bytes) -> bool:
-    """Whether white space may follow ``value`` without changing it."""
+    """True if white space may follow ``value`` without changing it."""
     try:
         msgspec.json.decode(codec.trim(value))
     except msgspec.DecodeError:

@@ -105,16 +105,16 @@ class Reconciliation:
         self._overtaken: set[str] = set()  # changed by the loser while the winner was away
 
     def has_synchronized(self, *sides: Side) -> bool:
-        """Whether the retained messages of ``sides`` have arrived."""
+        """True if the retained messages of ``sides`` have arrived."""
         return all(self._synchronized[side] for side in sides)
 
     def value(self, topic: str) -> bytes | None:
-        """The newest value; None if there is none."""
+        """Return the newest value; None if there is none."""
         last = self._last.get(topic)
         return None if last is None else last.payload
 
     def begin(self, side: Side) -> None:
-        """The connection of ``side`` was lost, or is new: its retained messages will arrive again."""
+        """Begin anew with ``side``, whose connection was lost or is new: its retained messages will arrive again."""
         self._received[side].clear()
         if side is self._winner:
             self._offered.clear()
@@ -122,7 +122,7 @@ class Reconciliation:
         self._synchronized[side] = False
 
     def has_received(self, side: Side, topic: str) -> bool:
-        """Whether ``side`` has published on ``topic`` since its connection began."""
+        """True if ``side`` has published on ``topic`` since its connection began."""
         return topic in self._received[side]
 
     def receive(
@@ -164,7 +164,7 @@ class Reconciliation:
         self._published[side][topic] = payload
 
     def synchronize(self, side: Side) -> list[tuple[Side, str, bytes]]:
-        """The retained messages of ``side`` have arrived: returns what is to be published now, and to which side."""
+        """Return what is to be published now that the retained messages of ``side`` have arrived, and to which side."""
         self._synchronized[side] = True
         due: list[tuple[Side, str, bytes]] = []
         if side is self._winner:
@@ -198,9 +198,9 @@ class Reconciliation:
         )
 
     def _may_come_late(self, topic: str) -> bool:
-        """Whether the winner may still have an old value: silence does not mean that it has none."""
+        """True if the winner may still have an old value: silence does not mean that it has none."""
         return self._synchronized[self._winner] and topic not in self._received[self._winner]
 
     def _is_missing(self, side: Side, topic: str, last: LastValue) -> bool:
-        """Whether ``side`` lacks the newest value; it lacks no removal of what it never received."""
+        """True if ``side`` lacks the newest value; it lacks no removal of what it never received."""
         return topic not in self._received[side] and self._published[side].get(topic, b"") != last.payload

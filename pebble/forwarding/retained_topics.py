@@ -83,7 +83,7 @@ class RetainedTopics:
         self._waiting = {}
 
     def synchronize(self, side: Side) -> None:
-        """The retained messages of ``side`` have arrived: publish what they have left open."""
+        """Publish what the retained messages of ``side``, which have all arrived, have left open."""
         with self._lock:
             self._begin_restarted()
             self._sides[side].arrived()
@@ -94,13 +94,13 @@ class RetainedTopics:
                 self._publish_value(to, topic, payload)
 
     def synchronized(self, *sides: Side) -> bool:
-        """Whether the retained messages of ``sides`` have arrived."""
+        """True if the retained messages of ``sides`` have arrived."""
         with self._lock:
             self._begin_restarted()
             return self._reconciliation.has_synchronized(*sides)
 
     def value(self, topic: str) -> bytes | None:
-        """The newest value of a two-way topic."""
+        """Return the newest value of a two-way topic."""
         return self._reconciliation.value(topic)
 
     def remove(self, side: Side, topic: str, *, unless: Callable[[str], bool]) -> bool:
@@ -117,7 +117,7 @@ class RetainedTopics:
     # -- with the lock held
 
     def _reconcile(self, here: SideState, subject: Subject, message: Message, *, old: bool) -> Drop | None:
-        """Why a two-way message must not pass; None if it may."""
+        """Return why a two-way message must not pass; None if it may."""
         side, topic, payload, transport = here.side, message.topic, message.payload, here.transport
         if message.retain and topic in here.seen and transport.policy.delivers_late and not transport.as_published:
             return Drop.KNOWN  # older than what was seen
@@ -149,7 +149,7 @@ class RetainedTopics:
 
     @property
     def _own_return(self) -> bool:
-        """Whether no side distinguishes our own messages exactly."""
+        """True if no side distinguishes our own messages exactly."""
         return not any(one.transport.exact_echo for one in self._sides.values())
 
     def _is_retained(self, here: SideState, message: Message) -> bool:

@@ -28,22 +28,22 @@ class RetainedWindow:
 
     @property
     def is_arriving(self) -> bool:
-        """Whether retained messages have come until just now."""
+        """True if retained messages have come until just now."""
         return self._clock() - self._newest_at < QUIET_S
 
     def subscribing(self) -> None:
-        """Its retained messages arrive from now on."""
+        """Note that its retained messages arrive from now on."""
         self._newest_at = float("-inf")
         self._until = self._stops_until = float("inf")
 
     def subscribed(self) -> None:
-        """The subscription is complete, and its retained messages have arrived."""
+        """Note that the subscription is complete, and its retained messages have arrived."""
         self._subscribed_at = now = self._clock()
         self._until = now + _RETAINED_S
         self._stops_until = max(self._until, self._newest_at + INITIAL_SYNC_S)
 
     def note(self) -> None:
-        """A message with the retain flag has arrived: while such come, a stop may be an old one."""
+        """Note a message with the retain flag: while such come, a stop may be an old one."""
         now, until = self._clock(), self._stops_until
         if now >= until:
             return
@@ -56,5 +56,5 @@ class RetainedWindow:
         return message.retain and (not self._transport.as_published or self._clock() < self._stops_until)
 
     def may_be_old(self, message: Message) -> bool:
-        """Whether ``message``, if it is the first of its topic, is an old one, where live ones have the flag, too."""
+        """True if ``message``, if it is the first of its topic, is an old one, where live ones have the flag, too."""
         return message.retain and self._clock() < self._until

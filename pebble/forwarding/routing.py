@@ -79,7 +79,7 @@ class Rules:
     stored: bool = True  # what is retained is sent again after an outage, because no other program forwards it
 
     def both_ways(self, kind: Kind) -> bool:
-        """Whether both sides may be the origin of such messages."""
+        """True if both sides may be the origin of such messages."""
         return all(kind in self.passes[side] for side in Side)
 
 
@@ -108,7 +108,7 @@ GATEWAY: Final = Rules(
 
 
 def route(rules: Rules, side: Side, subject: Subject | None, message: Message, *, mirroring: bool) -> Forward | Drop:
-    """How to forward ``message``, received on ``side``, or why not. Pure."""
+    """Return how to forward ``message``, received on ``side``, or why not. Pure."""
     if subject is None:
         return Drop.FOREIGN
     if not subject.bridged and not rules.media:
@@ -133,7 +133,7 @@ def route(rules: Rules, side: Side, subject: Subject | None, message: Message, *
 
 
 def _qos(subject: Subject, message: Message) -> QoS:
-    """The QoS as received; *to* a robot at least that of the channel: one QoS per topic keeps the order."""
+    """Return the QoS as received; *to* a robot at least that of the channel: one QoS per topic keeps the order."""
     if subject.kind.direction == INCOMING:
         return message.qos if message.qos >= subject.qos else QoS(subject.qos)
     return message.qos

@@ -85,7 +85,7 @@ class ForwardingService(Service, ABC):
 
     @abstractmethod
     def make_remote(self) -> Transport:
-        """The remote side's transport, not yet open; called while the service is made."""
+        """Return the remote side's transport, not yet open; called while the service is made."""
 
     @property
     @abstractmethod
@@ -93,7 +93,7 @@ class ForwardingService(Service, ABC):
         """The side whose retained messages count where those of the two differ."""
 
     def make_names(self) -> Names | None:
-        """What checks the names of senders on the remote side; None: nothing does."""
+        """Return what checks the names of senders on the remote side; None: nothing does."""
         return None
 
     def make_steps(self) -> Mapping[str, Step]:
@@ -223,7 +223,7 @@ class ForwardingService(Service, ABC):
         self.post(partial(self.disconnected, side))
 
     def shut(self) -> None:
-        """The two sides may be one broker: forward nothing from now on, and do the rest on the service's thread."""
+        """Forward nothing from now on, as the two sides may be one broker, and do the rest on the service's thread."""
         if self.forwarder.gate is not Gate.SHUT:
             self.forwarder.shut()
             self.post_message(BRIDGE_PROBE, self.found_one_broker)

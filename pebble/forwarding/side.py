@@ -48,7 +48,7 @@ class SideState:
         return self.transport.state is State.CONNECTED
 
     def subscribing(self) -> None:
-        """The owner is about to subscribe: retained messages arrive from now on."""
+        """Note that the owner is about to subscribe: retained messages arrive from now on."""
         self.window.subscribing()
         self.seen.clear()
 
@@ -66,13 +66,13 @@ class SideState:
 
     @property
     def has_gone_back(self) -> bool:
-        """Whether an earlier value that it retains is an old one: no program can have chosen it again."""
+        """True if an earlier value that it retains is an old one: no program can have chosen it again."""
         if self._wins or not self._went_back:
             return self._went_back
         return self._was_brief or self.transport.was_ended
 
     def arrived(self) -> None:
-        """What it retains has arrived: an earlier value from now on was chosen again."""
+        """Note that what it retains has arrived: an earlier value from now on was chosen again."""
         self._went_back = False
 
     @property

@@ -62,7 +62,7 @@ class Sieve:
         return len(self._waiting)
 
     def takes_event(self, message: Message) -> bool:
-        """Whether an event is sent now. Each counts, so they wait elsewhere, in order."""
+        """True if an event is sent now. Each counts, so they wait elsewhere, in order."""
         overdue = self._event_is_overdue
         if (overdue or Rank.STATE not in self._short) and self._takes(Rank.STATE, _size(message)):
             self._event_since = inf
@@ -71,7 +71,7 @@ class Sieve:
         return False
 
     def keeps(self, subject: Subject, message: Message, forward: Forward) -> bool:
-        """Whether ``message`` waits here, for itself or in vain; else it is sent now."""
+        """True if ``message`` waits here, for itself or in vain; else it is sent now."""
         rank, topic = _rank(subject, message), message.topic
         if rank is None:
             return False
@@ -91,7 +91,7 @@ class Sieve:
         return True
 
     def due(self, rank: Rank) -> Iterator[Waiting]:
-        """What of this rank is sent now, one after the other; of states none while an event is overdue."""
+        """Yield what of this rank is sent now, one after the other; of states none while an event is overdue."""
         if rank is Rank.STATE and self._event_is_overdue:
             asked, self._event_asked = self._event_asked, False
             if asked:  # since the last time: else it has gone
@@ -109,7 +109,7 @@ class Sieve:
                 yield one
 
     def empty(self) -> Iterator[Waiting]:
-        """All that waits: there is room enough from now on."""
+        """Yield all that waits: there is room enough from now on."""
         self._short.clear()
         while self._waiting:
             yield self._waiting.pop(next(iter(self._waiting)))
@@ -119,18 +119,18 @@ class Sieve:
         return self._clock() - self._event_since >= OVERDUE_S
 
     def _is_turn(self, rank: Rank, topic: str) -> bool:
-        """Whether the last message of a stream is long enough ago."""
+        """True if the last message of a stream is long enough ago."""
         return rank is Rank.STATE or self._clock() - self._sent_at.get(topic, -inf) >= self.stream_s
 
     def _passes(self, rank: Rank, message: Message) -> bool:
-        """Whether there is room, and none of this rank waits for it."""
+        """True if there is room, and none of this rank waits for it."""
         if rank in self._short or not self._takes(rank, _size(message)):
             self._short.add(rank)
             return False
         return True
 
     def _note(self, rank: Rank, topic: str) -> None:
-        """It is sent: a stream's next turn is later."""
+        """Note that it is sent: a stream's next turn is later."""
         if rank is not Rank.STREAM:
             return
         self._sent_at.pop(topic, None)
@@ -144,7 +144,7 @@ def _size(message: Message) -> int:
 
 
 def _rank(subject: Subject, message: Message) -> Rank | None:
-    """None: it never waits."""
+    """Return the rank in which it waits; None: it never does."""
     if subject.kind is Kind.STREAM or (subject.kind is Kind.EVENT and message.qos is QoS.LATEST):
         return Rank.STREAM
     return Rank.STATE if subject.kind is Kind.STATE else None

@@ -23,7 +23,7 @@ class Sifter:
         self.forward = pass_
 
     def use(self, sieve: Sieve | None) -> None:
-        """From now on what leaves the robot passes ``sieve``, whose owner calls :meth:`send_waiting`; None: no more."""
+        """Pass what leaves the robot through ``sieve``, whose owner calls :meth:`send_waiting`; None: no more."""
         with self._lock:
             before, self._sieve = self._sieve, sieve
             self.forward = self._pass if sieve is None else self._sift

@@ -38,12 +38,12 @@ class Subject:
 
     @cached_property
     def stays(self) -> bool:
-        """Whether it never leaves the robot."""
+        """True if it never leaves the robot."""
         return self.channel is not None and not self.channel.remote
 
     @cached_property
     def bridged(self) -> bool:
-        """Whether it is forwarded with other messages; media has connections of its own."""
+        """True if it is forwarded with other messages; media has connections of its own."""
         return self.channel is None or self.channel.bridged
 
     @cached_property
@@ -58,7 +58,7 @@ class Subject:
 
     @cached_property
     def prompt(self) -> bool:
-        """Whether it never waits for room on a thin link."""
+        """True if it never waits for room on a thin link."""
         return self.channel is not None and self.channel.prompt
 
     @cached_property
@@ -71,22 +71,22 @@ class Subject:
 
     @cached_property
     def stamped(self) -> bool:
-        """Whether its messages may carry their sender's clock and a key, by which their age is known."""
+        """True if its messages may carry their sender's clock and a key, by which their age is known."""
         return self.channel is not None and self.channel.payload in (Drive, ControlRequest)
 
     @cached_property
     def runs(self) -> bool:
-        """Whether the robot does something because of one message: once, although it may circulate."""
+        """True if the robot does something because of one message: once, although it may circulate."""
         return self.kind in (Kind.COMMAND, Kind.ACTION) and not self.drives and not self.is_stop
 
     @cached_property
     def counted(self) -> bool:
-        """Whether a robot takes a bounded number: of actions, and of what is not in the contract."""
+        """True if a robot takes a bounded number: of actions, and of what is not in the contract."""
         return self.channel is None or self.kind is Kind.ACTION
 
     @cached_property
     def is_two_way(self) -> bool:
-        """Whether it is forwarded both ways even while remote-mirror is off, so that a broker may send it back."""
+        """True if it is forwarded both ways even while remote-mirror is off, so that a broker may send it back."""
         return self.kind in (Kind.FLAG, Kind.ACTION)
 
 
@@ -119,7 +119,7 @@ class Subjects(dict[str, Subject | None]):
         return subject
 
     def invented(self, topic: bytes) -> Kind | None:
-        """The kind of an incoming topic that the contract does not name, as UTF-8; found out quickly."""
+        """Return the kind of an incoming topic that the contract does not name, as UTF-8; found out quickly."""
         if not topic.startswith(self._incoming):
             return None
         metric = topic[len(self._incoming) :]
@@ -128,7 +128,7 @@ class Subjects(dict[str, Subject | None]):
         return Kind.FLAG if metric.startswith(b"flags/") else Kind.COMMAND
 
     def filters(self, *directions: str) -> list[str]:
-        """What to subscribe to for everything of ``directions``: no two of the filters overlap."""
+        """Return what to subscribe to for everything of ``directions``: no two of the filters overlap."""
         families = [f"{self._base}/{direction}/#" for direction in directions]
         renamed = (
             addresses[channel].topic
@@ -140,7 +140,7 @@ class Subjects(dict[str, Subject | None]):
         return [*families, *dict.fromkeys(outside)]
 
     def topics(self, *channels: Channel) -> list[str]:
-        """The topics of ``channels``, those of every serial instance included."""
+        """Return the topics of ``channels``, those of every serial instance included."""
         return list(dict.fromkeys(addresses[channel].topic for addresses in self._addresses for channel in channels))
 
     @cached_property

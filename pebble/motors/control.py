@@ -60,16 +60,16 @@ class Control:
         )  # fmt: skip
 
     def holds(self, drive: Drive) -> bool:
-        """Whether this command is from who has control. Any thread may ask."""
+        """True if this command is from who has control. Any thread may ask."""
         return isinstance(drive.key, str) and self.lease.holds(drive.key, self.account(drive) or "")
 
     def knows(self, request: ControlRequest) -> bool:
-        """Whether this one has control, or is the first who asks for it. Any thread may ask."""
+        """True if this one has control, or is the first who asks for it. Any thread may ask."""
         client = self.sender(request)
         return client == self.lease.holder[:2] or client == self.lease.asker[:2]
 
     def sender(self, request: ControlRequest) -> tuple[str, str]:
-        """What the lease tells clients apart by: the account and the id. Any thread may ask."""
+        """Return what the lease tells clients apart by: the account and the id. Any thread may ask."""
         return self._client(request)[:2]
 
     def request(self, request: ControlRequest, over: bool, now: float) -> None:

@@ -122,7 +122,7 @@ class MotionInbox:
             return was_empty
 
     def note_state(self, state: State) -> None:
-        """A connection that is lost loses messages; nothing is to be done until others have come."""
+        """Note that a connection is lost, and messages with it; nothing is to be done until others have come."""
         if state is not State.CONNECTED:
             with self._lock:
                 self._lost = True
@@ -163,7 +163,7 @@ class MotionInbox:
 
 
 def run_of(drive: Drive) -> int:
-    """The run of a script's command; PERSON, or UNKNOWN_RUN."""
+    """Return the run of a script's command; PERSON, or UNKNOWN_RUN."""
     if drive.source != SCRIPT:
         return PERSON
     return drive.run if isinstance(drive.run, int) else UNKNOWN_RUN

@@ -112,7 +112,7 @@ class MotorGuard:
         self._state.changed(now)
 
     def judge(self, drive: Drive, now: float) -> float | None:
-        """Seconds from now for which this command moves the motors, 0: it stops them; None: it has no effect."""
+        """Return seconds from now for which this command moves the motors, 0: it stops them; None: it has no effect."""
         valid_ms = drive.valid_ms if isinstance(drive.valid_ms, int) else -1
         run = run_of(drive)
         key = drive.key if isinstance(drive.key, str) else ""
@@ -159,7 +159,7 @@ class MotorGuard:
         self._state.tick(now)
 
     def on_saved(self, number: int, succeeded: bool, now: float) -> None:
-        """A write has ended."""
+        """Take note that a write has ended."""
         if succeeded:
             self._saved = number
         if number == self._saving:
@@ -176,7 +176,7 @@ class MotorGuard:
             self._barred_file.save(self._barred)
 
     def appeared_stop(self) -> EstopCommand | None:
-        """A stop that is in a file that has just appeared, as its folder was mounted late, and is not known here."""
+        """Return a stop that is not known here, of a file that has just appeared: its folder was mounted late."""
         saved = None if self._file.busy or not self._can_save else self._file.appeared()
         if saved is None:
             return None
@@ -221,7 +221,7 @@ class MotorGuard:
 
 
 def _described(by: str, why: str) -> str:
-    """Who and why, of a stop or a reset, fit for a log."""
+    """Return who and why, of a stop or a reset, fit for a log."""
     _, by, why = stop_of({"by": by, "why": why})
     return f"{by or 'an unnamed sender'}{f' ({why})' if why else ''}"
 

@@ -314,7 +314,7 @@ class MotorOwner(Service, ABC):
             self.publish(c.CONTROL_TURN, turn, owner=self.owner)
 
     def _on_saved(self, number: int, succeeded: bool) -> None:
-        """On the file's thread."""
+        """Pass the result on, on the file's thread."""
 
         def note() -> None:
             self._guard.on_saved(number, succeeded, self.clock())

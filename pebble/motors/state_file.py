@@ -50,12 +50,12 @@ class StateFile:
             return True
 
     def can_save(self) -> bool:
-        """Whether the folder can be written, or made."""
+        """True if the folder can be written, or made."""
         existing = next(folder for folder in self.path.parents if os.access(folder, os.F_OK))
         return existing.is_dir() and os.access(existing, os.W_OK | os.X_OK)
 
     def load(self) -> Any:
-        """What was saved last; None without a file, Unreadable() if it is damaged."""
+        """Return what was saved last; None without a file, Unreadable() if it is damaged."""
         try:
             file = os.open(self.path, os.O_RDONLY | os.O_NONBLOCK)  # else a FIFO in its place waits for ever
             try:
@@ -70,7 +70,7 @@ class StateFile:
             return Unreadable()
 
     def appeared(self) -> Any:
-        """As :meth:`load`, of a file that is not from this process; None without one, or if that cannot be seen."""
+        """Load a file that is not from this process; None without one, or if that cannot be seen."""
         try:
             return None if self._own is not None and not self._own.replaced else self.load()
         except OSError:
@@ -89,7 +89,7 @@ class StateFile:
 
     @property
     def busy(self) -> bool:
-        """Whether a value waits or is being written: its result follows."""
+        """True if a value waits or is being written: its result follows."""
         with self._changed:
             return self._newest is not None or self._writing
 

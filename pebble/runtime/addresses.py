@@ -29,12 +29,12 @@ class Addresses:
         self._channels = {address.topic: channel for channel, address in self._of.items() if not channel.is_pattern}
 
     def __getitem__(self, channel: Channel) -> Address:
-        """A channel that is not in the contract, but made while running, has its own defaults."""
+        """Return where a channel travels; one that is made while running, in no contract, has its own defaults."""
         found = self._of.get(channel)
         return found if found is not None else _default(channel, self.base)
 
     def channel(self, topic: str) -> Channel | None:
-        """The channel that travels under ``topic``, renamed or not; None for topics the contract does not know."""
+        """Return the channel that travels under ``topic``, renamed or not; None for one the contract does not know."""
         renamed = self._channels.get(topic)
         if renamed is not None or not topic.startswith(self.base + "/"):
             return renamed
@@ -53,7 +53,7 @@ def _default(channel: Channel, base: str) -> Address:
 
 
 def _at(config: Config, path: str) -> str | None:
-    """The topic at a dotted path of the config tree; None where the key was not set."""
+    """Return the topic at a dotted path of the config tree; None where the key was not set."""
     value: Any = config
     for name in path.split("."):
         value = getattr(value, name, None)  # an extension's section is missing with it

@@ -33,7 +33,7 @@ _EXPEDITED, _ASSURED = 46, 10
 
 
 def local_transport(config: Config, name: str, *, will: Message | None = None, as_published: bool = False) -> Transport:
-    """The local transport of the process called ``name``, not yet opened."""
+    """Return the local transport of the process called ``name``, not yet opened."""
     kind = config.transport.kind
     return create(kind, _name(config, kind, name), local_settings(config, as_published), will=will)
 
@@ -61,7 +61,7 @@ def check_connections(config: Config) -> None:
 
 
 def local_settings(config: Config, as_published: bool = False) -> Any:
-    """The settings of the local transport, by its kind; a third party's gets ``transport.settings`` as it is."""
+    """Return the settings of the local transport, by its kind; a third party's gets ``transport.settings`` as it is."""
     kind = config.transport.kind
     if kind == "mqtt":
         settings = mqtt_settings(config.local_mqtt, as_published=as_published, reconnect_max_s=LOCAL_RECONNECT_S)
@@ -72,7 +72,7 @@ def local_settings(config: Config, as_published: bool = False) -> Any:
 
 
 def remote_transport(config: Config, name: str, *, will: Message | None = None) -> Transport:
-    """The bridge's connection to operators, not yet opened: ``remote`` where it is set, else ``remote_mqtt``."""
+    """Return the bridge's connection to operators, not yet opened: ``remote`` where it is set, else ``remote_mqtt``."""
     bridge = config.services.mqtt_bridge
     if bridge.remote is None:
         remote, program = bridge.remote_mqtt, "" if name == _BRIDGE else name
@@ -86,7 +86,7 @@ def remote_transport(config: Config, name: str, *, will: Message | None = None) 
 
 
 def stops_transport(config: Config) -> Transport | None:
-    """The bridge's second connection to operators, on which only stops are received; None: it has none.
+    """Return the bridge's second connection to operators, on which only stops are received; None: it has none.
 
     Where the broker knows no accounts one connection is as good as another, unless the link may be thin: a client that
     sends more than it carries fills it without meaning to. It receives the retain flag of old messages only: this is no
@@ -109,18 +109,18 @@ def live_only(settings: MqttSettings) -> MqttSettings:
 
 
 def mirror_transport(config: Config, mirror: Mqtt, name: str) -> Transport:
-    """The mirror's connection to the broker on the robot, not yet opened."""
+    """Return the mirror's connection to the broker on the robot, not yet opened."""
     settings = mqtt_settings(mirror, as_published=True, reconnect_max_s=LOCAL_RECONNECT_S)
     return create("mqtt", _name(config, "mqtt", name), settings)
 
 
 def _name(config: Config, kind: str, name: str) -> str:
-    """What the transport of the robot's program ``name`` is called in logs, and of MQTT in client ids."""
+    """Return what the transport of the robot's program ``name`` is called in logs, and of MQTT in client ids."""
     return f"{config.base}/{name.replace('-', '_')}" if kind == "mqtt" else f"{config.base}-{name}"
 
 
 def _remote_settings(config: Config, remote: RemoteConnection) -> Any:
-    """A Zenoh uplink is a client of a hub elsewhere, separate from the robot's local transport."""
+    """Return the settings of an uplink; Zenoh's is a client of a hub elsewhere, apart from the local transport."""
     if remote.kind != "zenoh":
         return remote.settings
     return client_of_hub(config.run_dir() / "remote", remote, remote.lease_ms, remote.account)
@@ -139,12 +139,12 @@ def client_of_hub(run_dir: Path, hub: ZenohClient, lease_ms: int, account: str) 
 
 
 def zenoh_settings(config: Config, *, client: bool = False) -> ZenohSettings:
-    """A peer of this robot's processes; ``client`` for a short-lived tool. Only the hub connects to other machines."""
+    """Return a peer of this robot's processes; ``client`` for a short tool. Only the hub leaves the machine."""
     return ZenohSettings(run_dir=config.run_dir(), lease_ms=config.transport.lease_ms, client=client)
 
 
 def hub_settings(config: Config) -> ZenohSettings:
-    """The hub of this robot's local transport, with its endpoints for other machines and its journal."""
+    """Return the hub of this robot's local transport, with its endpoints for other machines and its journal."""
     transport = config.transport
     return ZenohSettings(
         run_dir=config.run_dir(),
@@ -161,7 +161,7 @@ def hub_settings(config: Config) -> ZenohSettings:
 
 
 def _renamed_wills(config: Config) -> Iterator[tuple[str, bool]]:
-    """Whether the hub takes wills on the topics that this config renames."""
+    """Yield the topics that this config renames, and True if the hub takes wills there."""
     for channel, topic in _renamed(config):
         if channel.direction == c.INCOMING:
             yield topic, channel.kind is c.Kind.FLAG
@@ -173,7 +173,7 @@ def _renamed_vital(config: Config) -> tuple[str, ...]:
 
 
 def _renamed(config: Config) -> Iterator[tuple[c.Channel, str]]:
-    """The channels that this config renames, and their topics, those of every serial line included."""
+    """Yield the channels that this config renames, and their topics, those of every serial line included."""
     own = config.services.serial_mcu_bridge  # in the process of one line: that one
     for line in (own, *config.serial_instances().values()):
         addresses = Addresses(replace(config, services=replace(config.services, serial_mcu_bridge=line)))
@@ -186,7 +186,7 @@ def _renamed(config: Config) -> Iterator[tuple[c.Channel, str]]:
 def mqtt_settings(
     mqtt: Mqtt, *, as_published: bool = False, reconnect_max_s: float, program: str = "tool"
 ) -> MqttSettings:
-    """One broker's section of a config as connection settings.
+    """Return one broker's section of a config as connection settings.
 
     If it sets a client id that is the bridge's (``program=""``), and others have one of their own that begins with it.
     """

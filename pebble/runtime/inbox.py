@@ -71,7 +71,7 @@ class Inbox:
         return bool(self._internal or self._jobs)
 
     def take(self, timeout: float | None = 0.0) -> Job | None:
-        """The next job, waiting up to ``timeout`` seconds for one; None when there was none, or on `wake`."""
+        """Return the next job, waiting up to ``timeout`` seconds for one; None when there was none, or on `wake`."""
         if timeout != 0.0:
             self.wait(timeout)
         if self._internal:

@@ -57,7 +57,7 @@ def _logs_from(level: str) -> bool:
 
 
 def tagged(part: str, pid: int, line: bytes) -> bytes:
-    """A line that a process of this process wrote, for stderr: the launcher logs it under ``part`` and ``pid``.
+    """Return a line that a process of this process wrote, for stderr: the launcher logs it under ``part`` and ``pid``.
 
     ``part`` contains no ``]``.
     """
@@ -93,7 +93,7 @@ def tied_to_parent(command: Sequence[str], number: signal.Signals | None = None)
 
 
 def launcher_runs(run_dir: Path) -> bool:
-    """Whether the newest launcher of the robot with this run directory is still a running process."""
+    """True if the newest launcher of the robot with this run directory is still a running process."""
     try:
         pid = int((run_dir / LAUNCHER_LOCK).read_text(encoding="utf-8").partition("\n")[0])
         os.kill(pid, 0)
@@ -110,13 +110,13 @@ class ProgramRequest(NamedTuple):
 
 
 def earlier_requests() -> dict[str, ProgramRequest]:
-    """The on-demand programs that run because a predecessor of this process requested them."""
+    """Return the on-demand programs that run because a predecessor of this process requested them."""
     words = (word.partition("=") for word in os.environ.get(WANTED, "").split())
     return {name: ProgramRequest(on=True, encoding=encoding) for name, _, encoding in words}
 
 
 def requested_encoding() -> str | None:
-    """The encoding in the request that started this program; None: as configured. Later requests it receives itself."""
+    """Return the encoding in the request that started this program; None: as configured. Later ones it hears itself."""
     return os.environ.get(ENCODING) or None
 
 
@@ -181,7 +181,7 @@ class Notifier:
 
 
 def _one_line(text: str) -> str:
-    """The text for an operator: on one line, without passwords, not too long."""
+    """Return the text for an operator: on one line, without passwords, not too long."""
     return "".join(one if one.isprintable() else " " for one in without_secrets(text))[:_WHY].strip()
 
 

@@ -83,7 +83,7 @@ def _serve(service_class: type[Service], config: Config, instance: str) -> int:
 
 
 def view_of(config: Config, instance: str) -> Config:
-    """The config of one serial instance: its merged entry replaces the shared one."""
+    """Return the config of one serial instance: its merged entry replaces the shared one."""
     if not instance:
         return config
     instances = config.serial_instances()

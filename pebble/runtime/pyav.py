@@ -18,12 +18,12 @@ def installed() -> bool:
 
 
 def available(encodings: tuple[str, ...]) -> tuple[str, ...]:
-    """Those of ``encodings`` that this installation can make."""
+    """Return those of ``encodings`` that this installation can make."""
     return tuple(name for name in encodings if name not in NEED_PYAV or installed())
 
 
 def load(codec: str) -> Any:
-    """The module ``av``; raises PebbleError where it is missing."""
+    """Return the module ``av``; raises PebbleError where it is missing."""
     try:
         import av
         import av.error

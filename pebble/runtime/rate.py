@@ -50,11 +50,11 @@ class InFlight:
         return acknowledged
 
     def age_s(self, now: float) -> float:
-        """Seconds since the oldest message was sent; 0 without one."""
+        """Return seconds since the oldest message was sent; 0 without one."""
         return now - self._messages[0].at if self._messages else 0.0
 
     def clear(self) -> None:
-        """The connection is lost, and all messages with it."""
+        """Forget all: the connection is lost, and all messages with it."""
         self._messages.clear()
 
 
@@ -69,7 +69,7 @@ class Rests:
         self._until = float("-inf")
 
     def note(self, took_s: float, now: float) -> None:
-        """What was confirmed just now has kept the connection busy for so long."""
+        """Note for how long what was confirmed just now has kept the connection busy."""
         if self.on and took_s > SLOW_S:
             self._until = max(self._until, now + min(_TIMES * took_s, _LONGEST_S))
 

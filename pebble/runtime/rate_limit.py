@@ -36,12 +36,12 @@ class RateLimitedLog:
             self._log.log(level, text, *values)
 
     def totals(self) -> dict[str, int]:
-        """How often each subject came up, logged or not."""
+        """Return how often each subject came up, logged or not."""
         with self._lock:
             return dict(self._totals)
 
     def _count(self, subject: str, times: int = 1) -> int:
-        """How often ``subject`` has come up if it may be logged now, else 0."""
+        """Return how often ``subject`` has come up if it may be logged now, else 0."""
         now = time.monotonic()
         with self._lock:
             if self._most is not None and subject not in self._windows and len(self._windows) >= self._most:

@@ -30,7 +30,7 @@ class Refusals:
         self._log.warning(channel.metric, "refused a message: %s", error)
 
     def reader(self, channel: Channel, deliver: Deliver, remark: codec.Remark | None = None) -> Handler:
-        """What a subscription to ``channel`` is to call: it passes what is valid to ``deliver``."""
+        """Return what a subscription to ``channel`` is to call: it passes what is valid to ``deliver``."""
         one_shot, is_pattern = channel.one_shot, channel.is_pattern
 
         def receive(message: Message) -> None:

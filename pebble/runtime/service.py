@@ -61,7 +61,7 @@ def _fail(failure: Exception) -> None:
 
 
 def _marked(cls: type, mark: str) -> list[str]:
-    """Names of the methods that carry ``mark``, in the order of their definition, base classes first."""
+    """Return names of the methods that carry ``mark``, in the order of their definition, base classes first."""
     names = dict.fromkeys(name for base in reversed(cls.__mro__) for name in vars(base))
     return [name for name in names if mark in getattr(getattr(cls, name), "__dict__", ())]
 
@@ -133,7 +133,7 @@ class Service:
         self._on_stop.callback(callback)
 
     def dropped(self) -> dict[str, int]:
-        """How many messages were dropped since the start because a bound was reached, by reason: for the log."""
+        """Return how many messages were dropped since the start because a bound was reached, by reason: for the log."""
         return bounds_reached(self.transport.counters) | {"late": self.counters["late"]}
 
     def publish(self, channel: Channel, value: Any, **names: str) -> bool:
@@ -171,7 +171,7 @@ class Service:
         return self.transport.subscribe(topic, receive, qos=QoS(channel.default_qos), direct=True)
 
     def refused(self, channel: Channel) -> bool:
-        """Whether the other end refuses to deliver ``channel`` to its ``@on`` method (T21)."""
+        """True if the other end refuses to deliver ``channel`` to its ``@on`` method (T21)."""
         return channel in self._handled and self._handled[channel].refused
 
     def post(self, job: Callable[[], None], *, newest_of: str | None = None) -> None:
@@ -233,7 +233,7 @@ class Service:
 
     @classmethod
     def handles(cls) -> tuple[Channel, ...]:
-        """The channels this service subscribes to."""
+        """Return the channels this service subscribes to."""
         return tuple(getattr(cls, name).channel for name in _marked(cls, "channel"))
 
     # -- the service's thread
@@ -308,7 +308,7 @@ class Service:
         self._attempt(channel, method)
 
     def _attempt(self, channel: Channel, method: Callable[[], None]) -> None:
-        """What fails on a message is counted, and the service goes on: a retained one would end it again and again."""
+        """Try a message, and count what fails: a retained one would end the service again and again."""
         try:
             method()
         except Exception:  # a message comes from another process, and must not end this one

@@ -34,7 +34,7 @@ class EndSignal:
         self._wakeup.set()
 
     def wait(self, timeout: float | None = None) -> bool:
-        """Whether it is set within ``timeout`` seconds."""
+        """True if it is set within ``timeout`` seconds."""
         return bool(select.select([self._wakeup], [], [], timeout)[0])
 
 

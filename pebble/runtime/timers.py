@@ -41,7 +41,7 @@ class Timers:
         return heap[0][0] if heap else inf
 
     def wait(self, now: float) -> float | None:
-        """Seconds until the next timer is due; None without timers."""
+        """Return seconds until the next timer is due; None without timers."""
         due = self.next_due
         return None if due == inf else max(0.0, due - now)
 

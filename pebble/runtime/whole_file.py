@@ -7,7 +7,7 @@ from pebble.errors import PebbleError
 
 
 def is_root() -> bool:
-    """Whether this process may give files away; on Windows none does."""
+    """True if this process may give files away; on Windows none does."""
     return hasattr(os, "geteuid") and os.geteuid() == 0
 
 

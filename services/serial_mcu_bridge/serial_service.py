@@ -105,7 +105,7 @@ class SerialService(Service, ABC):
         self._misread = misread  # a line may be under way
 
     def _queue_input(self, chunk: bytes) -> None:
-        """On the reading thread, which also parses it if the service is idle.
+        """Queue input on the reading thread, which also parses it if the service is idle.
 
         At most one job waits, however much the MCU sends: commands are not delayed.
         """

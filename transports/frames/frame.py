@@ -33,7 +33,7 @@ _decode = msgspec.msgpack.Decoder(FrameInfo).decode
 
 
 def decode(attachment: bytes) -> FrameInfo | None:
-    """The metadata in ``attachment``; None if it is not a FrameInfo."""
+    """Return the metadata in ``attachment``; None if it is not a FrameInfo."""
     try:
         return _decode(attachment)
     except (msgspec.DecodeError, UnicodeDecodeError):
@@ -70,7 +70,7 @@ class Frame:
         return picture(self.data, self.info, width)
 
     def valid(self) -> bool:
-        """Whether the memory still holds this frame. False: what was read may be wrong and must be discarded."""
+        """True if the memory still holds this frame. False: what was read may be wrong and must be discarded."""
         if self._data is None:
             return False
         return self._buffer is None or bool(self._buffer.is_valid())
@@ -114,7 +114,7 @@ def _opencv(what: str) -> Any:
 
 
 def _rows(data: Bytes, info: FrameInfo, rows: int, row_bytes: int) -> Bytes:
-    """The rows of pixels without the padding of the stride."""
+    """Return the rows of pixels without the padding of the stride."""
     stride = info.stride or row_bytes
     fits = 0 < info.width <= _LARGEST and 0 < info.height <= _LARGEST and stride >= row_bytes
     if not fits or data.size < stride * (rows - 1) + row_bytes:

@@ -140,7 +140,7 @@ class FrameReader:
         return len(self.running)
 
     def read(self, timeout: float | None = None) -> Frame | None:
-        """The newest frame not yet returned (with ``depth``: the oldest of those waiting).
+        """Return the newest frame not yet returned (with ``depth``: the oldest of those waiting).
 
         None after ``timeout`` seconds without one, and when the reader is closed.
         """
@@ -287,7 +287,7 @@ class _LatestFrames(Generic[_T]):
         return thrown
 
     def take(self, end: float | None) -> _T | None:
-        """The oldest item; None at ``end`` (monotonic seconds) or when woken."""
+        """Return the oldest item; None at ``end`` (monotonic seconds) or when woken."""
         items, wakeup = self._items, self._wakeup
         while True:
             try:

@@ -42,16 +42,16 @@ class StreamNames:
         return self.readers.replace("*", name)
 
     def writer(self, writer_id: int, size: int, segment: str) -> str:
-        """The token of a running writer: it includes how many bytes it shares, and in which segment."""
+        """Return the token of a running writer: it includes how many bytes it shares, and in which segment."""
         return f"{self.writers.removesuffix('*/*/*')}{writer_id:x}/{size}/{segment or '-'}"
 
     def writer_of(self, token: str) -> tuple[int, int, str]:
-        """The id of the writer with this token, how many bytes it shares, and in which segment. Raises ValueError."""
+        """Return a writer's id by its token, how many bytes it shares, and in which segment. Raises ValueError."""
         *_, writer_id, size, segment = token.split("/")
         return int(writer_id, 16), int(size), segment
 
     def lock_path(self, writer_id: int) -> Path:
-        """The file that this writer locks while it is open."""
+        """Return the file that this writer locks while it is open."""
         return self.folder / self._lock_name.format(f"{writer_id:x}")
 
     def lock_paths(self) -> list[Path]:

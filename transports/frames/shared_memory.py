@@ -37,7 +37,7 @@ class SharedPool:
         self.reclaimed = 0  # how often slots were taken from readers that died or stopped
 
     def segment(self) -> str:
-        """The name of its file in /dev/shm; "" if Zenoh does not report it."""
+        """Return the name of its file in /dev/shm; "" if Zenoh does not report it."""
         found = _segment(repr(self._provider.alloc(1, policy=self._policy)))
         return f"{found[1]}.zenoh" if found else ""
 
@@ -59,7 +59,7 @@ class SharedPool:
         return None
 
     def _starving(self) -> bool:
-        """Whether no slot was free for STARVED_S; then the time starts again."""
+        """True if no slot was free for STARVED_S; then the time starts again."""
         now = time.monotonic()
         if self._starved_since is None:
             self._starved_since = now
@@ -79,7 +79,7 @@ class Chunk:
         self._view: Bytes | None = None
 
     def view(self) -> Bytes:
-        """The memory as an array; it keeps the provider alive, so that the memory stays mapped after sending."""
+        """Return the memory as an array; it keeps the provider alive, so that the memory stays mapped after sending."""
         if self._view is None:
             self._view = views.array(self._buffer, self._size, writable=True, owner=self._provider)
             if self._view is None:
@@ -97,7 +97,7 @@ class Chunk:
 
 
 def lockable(size: int) -> bool:
-    """Whether this process may lock ``size`` bytes in addition to those it has locked already.
+    """True if this process may lock ``size`` bytes in addition to those it has locked already.
 
     Zenoh locks what it shares; a reader that may not lock loses every shared frame without an error.
     """
@@ -113,7 +113,7 @@ def lockable(size: int) -> bool:
 
 
 def memlock_problem(size: int, what: str) -> str:
-    """The error text for when ``lockable(size)`` is false: ``what`` cannot share memory, and which limit to raise."""
+    """Return the text for a false ``lockable(size)``: ``what`` cannot share memory, and which limit to raise."""
     limit = resource.getrlimit(resource.RLIMIT_MEMLOCK)[0]
     return (
         f"{what} cannot use shared memory, frames are sent as bytes: this process may lock {limit >> 10} KiB "

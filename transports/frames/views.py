@@ -68,12 +68,12 @@ self_test = SelfTest()
 
 
 def why_unavailable() -> str:
-    """Why views do not work in this process; "" if they do. The first call tests it, which takes milliseconds."""
+    """Return why views do not work in this process; "" if they do. The first call takes milliseconds to test it."""
     return self_test.test()
 
 
 def array(buffer: Buffer, size: int, *, writable: bool = False, owner: object = None) -> Bytes | None:
-    """The ``size`` bytes of a `ZShm` or `ZShmMut` as an array; None if views do not work here.
+    """Return the ``size`` bytes of a `ZShm` or `ZShmMut` as an array; None if views do not work here.
 
     The array and its slices keep ``buffer`` and ``owner`` alive. Unless ``writable`` it cannot be made writable either.
     A `ZShmMut` that was sent does not own its bytes any more: ``owner`` must then be the provider, so that the memory
@@ -98,7 +98,7 @@ def _read_word(buffer: Buffer, offset: int) -> int:
 
 
 def _calibrate() -> int:
-    """Where in a buffer object the address of its bytes is. Raises UnexpectedLayoutError if that is not certain."""
+    """Return where the address of its bytes is in a buffer object. Raises UnexpectedLayoutError if uncertain."""
     if sys.implementation.name != "cpython":
         raise UnexpectedLayoutError(f"id() is not an address in {sys.implementation.name}")
     if (version := zenoh_version()) not in KNOWN_VERSIONS:
@@ -119,7 +119,7 @@ def zenoh_version() -> str:
 
 
 def _offsets(buffer: Buffer) -> set[int]:
-    """The offsets at which the address that Zenoh prints is found."""
+    """Return the offsets at which the address that Zenoh prints is found."""
     address = _printed(buffer)
     words = range(_HEAD, type(buffer).__basicsize__ - _WORD + 1, _WORD)
     return {offset for offset in words if _read_word(buffer, offset) == address}

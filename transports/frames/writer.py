@@ -108,7 +108,7 @@ class FrameWriter:
 
     @property
     def may_share(self) -> bool:
-        """Whether there was no room in shared memory when this writer was opened, and there is now."""
+        """True if there was no room in shared memory when this writer was opened, and there is now."""
         return time.monotonic() >= self._retry_at and self._has_room()
 
     def _has_room(self) -> bool:
@@ -282,7 +282,7 @@ class Slot:
 
 
 def _flat(data: Data) -> Bytes:
-    """The same bytes as a one-dimensional array; a copy only if they are not contiguous."""
+    """Return the same bytes as a one-dimensional array; a copy only if they are not contiguous."""
     if isinstance(data, np.ndarray):
         return np.ascontiguousarray(data).reshape(-1).view(np.uint8)
     return np.frombuffer(data, np.uint8)

@@ -84,7 +84,7 @@ class MemoryHub:
                 client.receive(_Delivery(live, publisher))
 
     def now(self) -> float | None:
-        """The time at which messages are handed over; None in a simulated time."""
+        """Return the time at which messages are handed over; None in a simulated time."""
         return clock.since_boot()
 
     def _wake_all(self) -> None:
@@ -160,7 +160,7 @@ class MemoryTransport(Transport):
                 self._send_retained(subscription)
 
     def _undeclare(self, subscription: Subscription) -> None:
-        """The hub knows no filters: nothing to undo."""
+        """Do nothing: the hub knows no filters."""
 
     @property
     def _present(self) -> bool:

@@ -31,7 +31,7 @@ class BridgeMode:
         self._lacking = False  # a broker at this address has no bridge mode: one hang-up is enough
 
     def note(self, result: Result) -> None:
-        """The next attempt has ended with ``result``."""
+        """Note that the next attempt has ended with ``result``."""
         attempt, self.next_attempt = self.next_attempt, Attempt.BRIDGE
         if attempt is Attempt.PROBE:
             self._probed = result is Result.ACCEPTED

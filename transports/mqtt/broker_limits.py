@@ -78,21 +78,21 @@ class BrokerLimits:
 
     @property
     def wants_probe(self) -> bool:
-        """Whether a CONNECT without a will is to be tried first."""
+        """True if a CONNECT without a will is to be tried first."""
         return self._asking is Asking.WITHOUT_WILL
 
     @property
     def asks_again(self) -> bool:
-        """Whether the same broker is to be asked once more, in another way."""
+        """True if the same broker is to be asked once more, in another way."""
         return self._asking is not Asking.NOTHING
 
     def begin(self, now: float) -> None:
-        """A connection is about to be made."""
+        """Note that a connection is about to be made."""
         if self._asking is not Asking.AGAIN and now - self._since > _VALID_S:
             self.limits = EVERYTHING
 
     def note_probe(self, result: Result) -> None:
-        """A CONNECT without a will has ended."""
+        """Note how a CONNECT without a will has ended."""
         self._asking = Asking.AGAIN if result is Result.ACCEPTED else Asking.NOTHING
 
     def note_connect(self, result: Result, now: float) -> None:

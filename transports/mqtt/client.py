@@ -41,7 +41,7 @@ class Opening(NamedTuple):
 
 
 def is_hang_up(error: OSError | None) -> bool:
-    """Whether the other side has closed the connection, by FIN (None) or RST, rather than the network between."""
+    """True if the other side has closed the connection, by FIN (None) or RST, rather than the network between."""
     return error is None or isinstance(error, ConnectionError | ssl.SSLEOFError)
 
 
@@ -63,7 +63,7 @@ def begin_tls(plain: socket.socket, opening: Opening) -> ssl.SSLSocket:
 
 
 def _shake_hands(sock: ssl.SSLSocket, patience_s: float) -> None:
-    """It ends after a silence of ``patience_s``, and after HANDSHAKE_S at any rate. Raises OSError."""
+    """Shake hands, for HANDSHAKE_S at most and as long as no silence lasts ``patience_s``. Raises OSError."""
     end = time.monotonic() + HANDSHAKE_S
     with closing(SocketPoll()) as poll:
         poll.register(sock)
@@ -90,7 +90,7 @@ class SendQuota:
         self._left = self._most = most
 
     def takes(self, packet: bytes) -> bool:
-        """Whether ``packet`` may be sent now; else it is sent later."""
+        """True if ``packet`` may be sent now; else it is sent later."""
         if self._left <= 0:
             self._held.append(packet)
             return False
@@ -217,7 +217,7 @@ class Client:
 
     @property
     def owes(self) -> bool:
-        """Whether there are messages to `acknowledge`."""
+        """True if there are messages to `acknowledge`."""
         return bool(self._reader.acks)
 
     def acknowledge(self) -> None:

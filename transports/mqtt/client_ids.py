@@ -8,7 +8,7 @@ _OTHER = re.compile(r"[^A-Za-z0-9_-]")  # some brokers refuse dots, blanks or sl
 
 
 def unique(name: str) -> str:
-    """An id that cannot be guessed and begins with ``name``: ``pebble_robots_goob_remote_bridge-0123456789abcdef``.
+    """Return an id that cannot be guessed: ``name`` (``pebble_robots_goob_remote_bridge``) and 16 random digits.
 
     A broker closes the connection of a client when another one connects with its id (MQTT-3.1.4-2).
     """
@@ -16,7 +16,7 @@ def unique(name: str) -> str:
 
 
 def _escaped(name: str) -> str:
-    """Names that differ in more than slashes give results that differ, too: by a hash."""
+    """Return the name without slashes; names that differ in more give results that differ, too: by a hash."""
     text = _OTHER.sub("_", name)
     if text == name.replace("/", "_"):
         return text

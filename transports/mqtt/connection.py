@@ -51,7 +51,7 @@ class Owner(Sink, Protocol):
     """The transport of a connection."""
 
     def note_answers(self, refused: Mapping[str, bool]) -> None:
-        """The broker has answered these filters; each is refused or not (T21). Called on the network thread."""
+        """Note the broker's answers to these filters; each is refused or not (T21). Called on the network thread."""
 
 
 def ignore(_messages: list[Message]) -> None:
@@ -289,7 +289,7 @@ class Connection:
         return True
 
     def takes(self, message: Message) -> bool:
-        """Whether the broker has not said that ``message`` is too large."""
+        """True if the broker has not said that ``message`` is too large."""
         if self.max_packet is None:
             return True
         return _OVERHEAD + len(message.topic.encode()) + len(message.payload) <= self.max_packet
@@ -348,7 +348,7 @@ class Connection:
 
     @property
     def drained(self) -> bool:
-        """Whether everything accepted is written, and acknowledged where that is due."""
+        """True if everything accepted is written, and acknowledged where that is due."""
         with self._lock:
             return not (self._in_flight.unacked or self._backlog.waiting or self._client.waiting)
 
@@ -397,7 +397,7 @@ class Connection:
         return self._in_flight.has_confirmed
 
     def written_before_loss(self) -> dict[str, int] | None:
-        """What the other side may have closed the connection for; None: it has not, or for another reason."""
+        """Return what the other side may have closed the connection for; None: it has not, or for another reason."""
         with self._lock:
             incoming = self.incoming
             if not (incoming.may_concern_message or (self._client.hung_up and not incoming.reason)):

@@ -66,7 +66,7 @@ class Dialler:
         return self.addresses.where
 
     def connect(self, owner: Owner, counters: Counters, stopping: threading.Event) -> Connection:
-        """A connection that is accepted. Raises Lost."""
+        """Return a connection that is accepted. Raises Lost."""
         if self.limits.wants_probe or (self._asks_for_bridge_mode and self._bridge_mode.next_attempt is Attempt.PROBE):
             self._probe(owner, counters, stopping)
         plain = self._asks_for_bridge_mode and self._bridge_mode.next_attempt is Attempt.PLAIN
@@ -180,7 +180,7 @@ class Dialler:
         return was_ended
 
     def failed(self, problem: str, held_s: float) -> tuple[str, bool]:
-        """The turn of the address is over, unless its broker is to be asked once more in another way.
+        """End the turn of the address, unless its broker is to be asked once more in another way.
 
         Returns the problem in words, empty if it is none yet, and whether it is worth a line in the log.
         """

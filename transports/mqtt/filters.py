@@ -18,7 +18,7 @@ _BYTES = 8 << 20  # the same, for their names and digests
 
 
 def overlap(one: str, other: str) -> bool:
-    """Whether there is a topic that both filters match."""
+    """True if there is a topic that both filters match."""
     begin, other_begin = beginning(one), beginning(other)
     if not (begin.startswith(other_begin) or other_begin.startswith(begin)):
         return False
@@ -36,7 +36,7 @@ def overlap(one: str, other: str) -> bool:
 
 
 def cover(one: str, other: str) -> str:
-    """A filter that matches everything that either of two overlapping filters matches, level by level."""
+    """Return a filter that matches everything that either of two overlapping filters matches, level by level."""
     left, right = one.split("/"), other.split("/")
     levels: list[str] = []
     for a, b in zip(left, right, strict=False):
@@ -111,7 +111,7 @@ class OwnMessageFilter:
         self._repeats.update(topic for topic in seen if overlap(topic, filter_))
 
     def is_echo(self, message: Message) -> bool:
-        """Whether this is our own retained message, sent back because we subscribed."""
+        """True if this is our own retained message, sent back because we subscribed."""
         if message.topic not in self._own:
             return False
         if self._own.get(message.topic) == _digest(message):
@@ -120,7 +120,7 @@ class OwnMessageFilter:
         return False
 
     def is_repeat(self, message: Message) -> bool:
-        """Whether this is a retained message that the broker sends again because of `subscribe_again`."""
+        """True if this is a retained message that the broker sends again because of `subscribe_again`."""
         seen, digest = self._seen.get(message.topic), _digest(message)
         self._seen[message.topic] = digest
         if seen != digest or message.topic not in self._repeats:

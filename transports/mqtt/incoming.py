@@ -32,7 +32,7 @@ class Sink(Protocol):
     policy: TopicPolicy
 
     def note_refusal(self, topic: str, why: str) -> None:
-        """The broker does not take a message of this topic (MQTT 5)."""
+        """Note that the broker does not take a message of this topic (MQTT 5)."""
 
 
 class Incoming:

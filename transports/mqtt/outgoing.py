@@ -191,7 +191,7 @@ class InFlightTable:
         return sent_at
 
     def topic_of(self, mid: int) -> str | None:
-        """The topic of a DELIVERED message that is not acknowledged; None: there is no such message."""
+        """Return the topic of a DELIVERED message that is not acknowledged; None: there is no such message."""
         return self._unacked[mid][0] if mid in self._unacked else None
 
     def first_written(self, now: float) -> dict[str, int]:
@@ -259,7 +259,7 @@ class InFlightTable:
         return min(self._round_trips, default=0.0)
 
     def newest_answer(self, now: float) -> tuple[int, float]:
-        """How many pings were answered, and how long the newest answer took; or the next one, if that is longer."""
+        """Return how many pings were answered, and how long the newest answer took, or the next one if longer."""
         waits = now - self._pings[0][0] if self._pings else 0.0
         return self._pong_number, max(self._newest_s, waits)
 
@@ -282,7 +282,7 @@ def _note(table: dict[str, tuple[float, int]], topic: str, at: float, size: int)
 
 
 def unconfirmed_bytes(sock: socket.socket) -> int:
-    """Bytes the kernel has accepted and the other side's TCP has not acknowledged, sent or not (SIOCOUTQ).
+    """Return bytes the kernel has accepted and the other side's TCP has not acknowledged, sent or not (SIOCOUTQ).
 
     0 where the system does not say.
     """
@@ -290,7 +290,7 @@ def unconfirmed_bytes(sock: socket.socket) -> int:
 
 
 def readable_bytes(sock: socket.socket | None) -> int:
-    """Bytes that the kernel has received and we have not read (FIONREAD); 0 where the system does not say."""
+    """Return bytes that the kernel has received and we have not read (FIONREAD); 0 where the system does not say."""
     return 0 if sock is None else _kernel_bytes(sock, "FIONREAD")
 
 
@@ -304,12 +304,12 @@ def _kernel_bytes(sock: socket.socket, request: str) -> int:
 
 
 def shortest_round_trip_s(sock: socket.socket) -> float:
-    """The kernel's own measurement over the last minutes; 0 where it has none."""
+    """Return the kernel's own measurement over the last minutes; 0 where it has none."""
     return _round_trip_s(sock, _MIN_RTT_AT)
 
 
 def present_round_trip_s(sock: socket.socket) -> float:
-    """The kernel's own measurement, smoothed; 0 where it has none."""
+    """Return the kernel's own measurement, smoothed; 0 where it has none."""
     return _round_trip_s(sock, _RTT_AT)
 
 

@@ -125,7 +125,7 @@ def _bytes(data: bytes) -> bytes:
 
 
 def _variable(size: int) -> bytes:
-    """A length of one to four bytes, seven bits in each."""
+    """Return a length of one to four bytes, seven bits in each."""
     parts = bytearray()
     while size > 127:
         parts.append(size & 127 | 128)
@@ -153,7 +153,7 @@ class Listener(Protocol):
     def on_accepted(self, accepted: Accepted) -> None: ...
 
     def on_refused(self, code: int) -> None:
-        """A CONNACK with an error; ``code`` is 3.1.1's or MQTT 5's, each as the broker sent it."""
+        """Take a CONNACK with an error; ``code`` is 3.1.1's or MQTT 5's, each as the broker sent it."""
 
     def on_publication(self, topic: bytes, payload: bytes, first: int) -> None:
         """``first`` is the first byte of the packet, with QoS and retain."""
@@ -162,24 +162,24 @@ class Listener(Protocol):
         """``code`` is MQTT 5's; from 128 on it is a refusal."""
 
     def on_answer(self, mid: int, codes: bytes) -> None:
-        """A SUBACK, with a code for each filter, or an UNSUBACK; from 128 on a code is a refusal."""
+        """Take a SUBACK, with a code for each filter, or an UNSUBACK; from 128 on a code is a refusal."""
 
     def on_pong(self) -> None: ...
 
     def on_disconnect(self, code: int) -> None: ...
 
     def on_too_long(self, topic: bytes, length: int) -> None:
-        """A PUBLISH of ``length`` bytes was discarded."""
+        """Note that a PUBLISH of ``length`` bytes was discarded."""
 
     def skips(self, topic: bytes) -> bool:
-        """Whether a retained message of this topic is not wanted."""
+        """True if a retained message of this topic is not wanted."""
 
 
 class Quota(Protocol):
     """Counts the messages that the broker has not acknowledged; it is called before the listener."""
 
     def begin(self, most: int) -> None:
-        """The broker takes so many of them."""
+        """Note how many of them the broker takes."""
 
     def acknowledged(self) -> None: ...
 
@@ -302,7 +302,7 @@ class Reader:
             self._listener.on_disconnect(body[0] if body else 0)
 
     def _properties_size(self, body: bytes) -> int:
-        """Bytes of the properties behind the first two bytes, with their length; 0 on 3.1.1."""
+        """Return bytes of the properties behind the first two bytes, with their length; 0 on 3.1.1."""
         if not self._modern:
             return 0
         size, start = _read_variable(body, 2)
@@ -350,7 +350,7 @@ _SHORTEST = {_CONNACK: 2, _PUBACK: 2, _PUBREL: 2, _SUBACK: 3, _UNSUBACK: 2, _PIN
 
 
 def _read_variable(data: bytes, at: int) -> tuple[int, int]:
-    """A length, and where what it counts begins; -1: its end is missing. Raises MalformedError."""
+    """Return a length, and where what it counts begins; -1: its end is missing. Raises MalformedError."""
     value = shift = 0
     for byte in data[at : at + 4]:
         at += 1
@@ -364,7 +364,7 @@ def _read_variable(data: bytes, at: int) -> tuple[int, int]:
 
 
 def properties(data: bytes) -> dict[int, int]:
-    """The properties of MQTT 5 whose values are numbers, by their own numbers. ``data`` begins with their length."""
+    """Return MQTT 5's properties with numbers as values, by their own numbers. ``data`` begins with their length."""
     found = dict[int, int]()
     if not data:
         return found

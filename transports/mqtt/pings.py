@@ -31,11 +31,11 @@ class Pings:
         )  # when the last time without reading began, for which a ping was sent
 
     def joins(self, now: float) -> bool:
-        """Whether a ping goes along with the message that is sent at ``now``."""
+        """True if a ping goes along with the message that is sent at ``now``."""
         return self.is_thin and now >= self.due_at - _EARLY_S
 
     def begin(self, now: float) -> None:
-        """The broker has accepted us."""
+        """Note that the broker has accepted us."""
         self.due_at = now + self._interval_s
 
     def send(self, client: Client, ack: PendingAck | None = None) -> None:

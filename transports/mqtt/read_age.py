@@ -29,7 +29,7 @@ class WaitingTime:
         self._counted = 0
 
     def empty(self, now: float) -> None:
-        """The socket was empty at ``now``."""
+        """Note that the socket was empty at ``now``."""
         self.checked_at, self._counted = now, 0
 
     def found(self, size: int, now: float) -> None:
@@ -68,19 +68,19 @@ class BrokerDelay:
         self._prompt = 0  # answers in a row that came right after the newest of several pings
 
     def usual(self, seconds: float) -> None:
-        """An answer took so long that waited for nothing."""
+        """Note how long an answer took that waited for nothing."""
         self._shortest = min(self._shortest, seconds)
 
     def asked(self, now: float, *, clear: bool) -> None:
-        """A ping was sent; ``clear``: nothing of ours was on its way."""
+        """Note that a ping was sent; ``clear``: nothing of ours was on its way."""
         self._asked.append((now, now, clear))
 
     def stalled(self, since: float, now: float) -> None:
-        """A ping was sent after nothing was read ``since`` then: what fits into no socket has waited at the broker."""
+        """Note a ping after nothing was read ``since`` then: what fits into no socket has waited at the broker."""
         self._asked.append((since, now, True))
 
     def answered(self, now: float) -> None:
-        """The oldest ping was answered."""
+        """Note that the oldest ping was answered."""
         if self._asked:
             _, sent_at, clear = self._asked.popleft()
             self._read = sent_at, now - sent_at
@@ -94,17 +94,17 @@ class BrokerDelay:
             self._newest = 0.0
 
     def acknowledged(self, sent_at: float, now: float) -> None:
-        """What was sent at ``sent_at`` was answered: so were all pings before it, or their answers are lost."""
+        """Note an answer to what was sent at ``sent_at``: all pings before it have theirs, or these are lost."""
         while self._asked and self._asked[0][1] < sent_at:
             self._asked.popleft()
         self._newest = min(self._newest, now - sent_at)
 
     def delivered(self) -> None:
-        """All that was read has been delivered."""
+        """Note that all that was read has been delivered."""
         self._delivered = self._read
 
     def delivery(self, now: float) -> tuple[float, float]:
-        """How long ago the newest answer was asked for before which all is delivered; how late it or the next is."""
+        """Return how long ago the newest answer was asked for before which all is delivered, and how late it is."""
         sent_at, took = self._delivered
         waits = now - self._asked[0][1] if self._asked else 0.0
         return now - sent_at, max(took, waits) - self._shortest

@@ -53,17 +53,17 @@ _WORDS = {
 
 
 def words(code: int) -> str:
-    """The name of a reason code of MQTT 5, or of a SUBACK of 3.1.1."""
+    """Return the name of a reason code of MQTT 5, or of a SUBACK of 3.1.1."""
     return _WORDS.get(code, "normal disconnection" if code == 0 else f"code {code}")
 
 
 def may_concern_message(code: int) -> bool:
-    """Whether a DISCONNECT with this code may be the answer to a message."""
+    """True if a DISCONNECT with this code may be the answer to a message."""
     return code not in _OF_NO_MESSAGE
 
 
 def connection_refused(code: int) -> str:
-    """Why a CONNACK, of either version, refuses."""
+    """Return why a CONNACK, of either version, refuses."""
     code = _OF_3_1_1.get(code, code)
     if code == 0x87:  # mosquitto's answer to a wrong password on 3.1.1
         return "not authorized (bad user name or password?)"

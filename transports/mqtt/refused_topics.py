@@ -81,7 +81,7 @@ class RefusedTopics:
                 return
 
     def note_loss(self, where: str, written: Mapping[str, int] | None, now: float) -> None:
-        """The connection is lost. ``written``: bytes by topic, just before; None: for no message's sake."""
+        """Note a lost connection. ``written``: bytes by topic, just before; None: for no message's sake."""
         written, trial, self._trial = written or {}, self._trial, None
         self._quiet_at = now + QUIET_S
         if trial is not None and {topic for topic in written if not self._is_vital(topic)} == {trial.topic}:

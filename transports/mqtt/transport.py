@@ -182,7 +182,7 @@ class MqttTransport(Transport):
                 self._connection.unsubscribe(idle)
 
     def _no_local(self, filter_: str) -> bool:
-        """Whether the broker may leave out our own messages for this filter (MQTT 5)."""
+        """True if the broker may leave out our own messages for this filter (MQTT 5)."""
         echo_options = {other.echo for other in self._subscriptions if overlap(other.filter, filter_)}
         if len(echo_options) == 2 and self.exact_echo:
             self.exact_echo = False
@@ -337,7 +337,7 @@ class MqttTransport(Transport):
         return found.keys() - older
 
     def _find(self, connection: Connection, topics: list[str], stopping: threading.Event) -> dict[str, bytes]:
-        """What the broker has retained on these topics."""
+        """Return what the broker has retained on these topics."""
         found: dict[str, bytes] = {}
         if not topics:
             return found
@@ -351,7 +351,7 @@ class MqttTransport(Transport):
         return found
 
     def _accepts(self, connection: Connection, message: Message) -> bool:
-        """Whether the broker has, as far as is known, accepted this retained message."""
+        """True if the broker has, as far as is known, accepted this retained message."""
         return connection.takes(message) and self._refused.accepts(message)
 
     def _await(

@@ -109,7 +109,7 @@ class Guard:
             self.rests, quiet = False, 0
 
     def _look(self) -> bool:
-        """Whether a callback has begun since the last time, or is still running."""
+        """True if a callback has begun since the last time, or is still running."""
         found = self._suspects = False
         for calls in self._calls:
             begun, runs = calls.begun, calls.begun != calls.ended
@@ -140,7 +140,7 @@ use, forget = guard.use, guard.forget
 
 
 def _begin() -> Calls:
-    """The first callback on this thread since it has its state."""
+    """Begin with the first callback on this thread, and return its state."""
     calls = _own.calls = Calls()
     # A thread of Python's has its state, and waits for no sockets: it publishes to a handler of its own session.
     if isinstance(threading.current_thread(), threading._DummyThread) and guard.watch(calls):

@@ -39,11 +39,11 @@ class HubConnection:
         self._connection = 0
 
     def open(self) -> None:
-        """The client opens, once more perhaps."""
+        """Begin when the client opens, once more perhaps."""
         self.name, self.watch = "", HubWatch()
 
     def renew(self) -> None:
-        """A new connection begins: no answer to an older query is offered any more. The lock is held."""
+        """Begin a new connection: no answer to an older query is offered any more. The lock is held."""
         self._connection += 1
 
     # -- sending

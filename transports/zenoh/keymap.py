@@ -17,20 +17,20 @@ _EMPTY = "%"  # no escaped level looks like this
 
 @remembered
 def topic_to_key(topic: str) -> str:
-    """The key of a checked topic (see topics.check_topic)."""
+    """Return the key of a checked topic (see topics.check_topic)."""
     return _join([_level(level) for level in topic.split("/")])
 
 
 @remembered
 def filter_to_key(filter_: str) -> str:
-    """The key expression of a checked filter (see topics.check_filter)."""
+    """Return the key expression of a checked filter (see topics.check_filter)."""
     wildcards = {"+": "*", "#": "**"}
     return _join([wildcards[level] if level in wildcards else _level(level) for level in filter_.split("/")])
 
 
 @remembered
 def key_to_topic(key: str) -> str:
-    """The topic that ``topic_to_key`` made ``key`` from."""
+    """Return the topic that ``topic_to_key`` made ``key`` from."""
     chunks = ("" if chunk == _EMPTY else chunk for chunk in key.removeprefix("@").split("/"))
     return "/".join(_ESCAPE.sub(lambda found: chr(int(found.group(1), 16)), chunk) for chunk in chunks)
 

@@ -49,7 +49,7 @@ class HubWatch:
         session.info.declare_transport_events_listener(connections, history=True)
 
     def wait(self, seen: int, timeout: float | None) -> HubView | None:
-        """The view, as soon as its version is not ``seen`` or after ``timeout`` seconds; None once closed."""
+        """Wait at most ``timeout`` seconds for a version that is not ``seen``, and return the view; None if closed."""
         with self._changed:
             self._changed.wait_for(lambda: self.closed or self._view.version != seen, timeout)
             return None if self.closed else self._view
@@ -72,7 +72,7 @@ class HubWatch:
                 self._change(hubs=self._view.hubs - {name})
 
     def _on_connection(self, event: zenoh.TransportEvent) -> None:
-        """A session that comes back under the same id was running all the time, and we have missed its messages."""
+        """Reconnect to a session that comes back under its id: it was running, and we have missed its messages."""
         session = str(event.transport.zid)
         with self._changed:
             if event.kind == zenoh.SampleKind.DELETE:

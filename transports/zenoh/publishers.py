@@ -64,7 +64,7 @@ class Publishers:
 
 
 def remember_first(by_topic: dict[str, _V], topic: str, value: _V) -> _V:
-    """The first value ever given for ``topic``; the oldest topic is forgotten when there are too many."""
+    """Return the first value ever given for ``topic``; the oldest topic is forgotten when there are too many."""
     if topic not in by_topic and len(by_topic) >= _TOPIC_LIMIT:
         by_topic.pop(next(iter(by_topic)))
     return by_topic.setdefault(topic, value)

@@ -51,7 +51,7 @@ def unix_endpoint(socket: Path) -> str:
 def session_config(
     settings: ZenohSettings, mode: str, *, listen: list[Path], connect: list[Path], access: "Access | None" = None
 ) -> str:
-    """The configuration of a ``mode`` (router, peer or client) on unix sockets plus the settings' own endpoints.
+    """Return the configuration of a ``mode`` (router, peer or client) on unix sockets plus the settings' own endpoints.
 
     ``access``: of a hub, what certificates allow. Raises TransportError for endpoints or certificates that can never
     work.
@@ -130,7 +130,7 @@ def _check_endpoint(name: str, endpoint: str, tls: TlsSettings | None) -> None:
 
 
 def _tls(tls: TlsSettings | None) -> dict[str, Any]:
-    """One certificate for both directions. With a configured CA both sides must present one that it signed."""
+    """Return Zenoh's settings of TLS, with one certificate for both directions; a configured CA signs both sides'."""
     if tls is None:
         return {}
     link: dict[str, Any] = {"verify_name_on_connect": not tls.insecure}

@@ -337,7 +337,7 @@ class ZenohTransport(Transport):
         )
 
     def _is_late(self, sample: zenoh.Sample, stamp: wire.LiveStamp, now: float) -> bool:
-        """Whether it waited in a socket while this process was stopped, longer than the lease of a connection (T19).
+        """True if it waited in a socket while this process was stopped, longer than the lease of a connection (T19).
 
         Retained messages are accepted in any case, because they are not sent again; and stops: none is ever too late.
         """

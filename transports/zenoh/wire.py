@@ -146,7 +146,7 @@ decode_counts = msgspec.msgpack.Decoder(dict[str, int]).decode
 
 
 def asked(what: str, account: str) -> str:
-    """The key of a query to the hub, from an account or from this machine."""
+    """Return the key of a query to the hub, from an account or from this machine."""
     return f"{what}/{account}" if account else what
 
 
@@ -174,7 +174,7 @@ def ask(session: zenoh.Session, key: str, payload: bytes, timeout: float) -> byt
 
 
 def account_of(key: str, what: str) -> str:
-    """The account that a query to the hub is of; empty: this machine. Raises ValueError for what no account asks."""
+    """Return the account that asks the hub; empty: this machine. Raises ValueError for what no account asks."""
     account = key.removeprefix(what).removeprefix("/")
     if not key.startswith(what) or "*" in account or "/" in account or OF in account:
         raise ValueError(f"{key} is no query of an account")

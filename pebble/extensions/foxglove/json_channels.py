@@ -16,7 +16,7 @@ _DEEPEST: Final = 8
 
 
 def json_spec(topic: str, channel: Channel | None) -> ChannelSpec:
-    """The channel for this topic.
+    """Return the channel for this topic.
 
     Foxglove plots only fields that a schema names, so one that cannot name all of them is left out: then the channel
     holds any JSON.
@@ -35,7 +35,7 @@ def _schema_of(suffix: str, payload: type) -> tuple[str, bytes]:
 
 
 def _value(schema: dict[str, Any], definitions: dict[str, Any], depth: int) -> dict[str, Any] | None:
-    """The same in what Foxglove reads: plain types, objects with known fields, arrays of these. None: it cannot."""
+    """Return the same in what Foxglove reads: plain types, objects with known fields, arrays of these; None if none."""
     if depth > _DEEPEST:
         return None
     if "$ref" in schema:

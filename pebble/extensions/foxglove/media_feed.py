@@ -110,7 +110,7 @@ class MediaFeed:
             self.wants_keyframe = True
 
     def encoding(self) -> str | None:
-        """The encoding to request: H.264 where a client wants it as it is, else what any viewer already gets."""
+        """Return the encoding to request: H.264 where a client wants it as it is, else what any viewer already gets."""
         known = offered(self._robot.capabilities, self._medium)
         if self._subscribed(VIDEO[1]) and "h264" in known:
             return "h264"

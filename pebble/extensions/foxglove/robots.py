@@ -26,7 +26,7 @@ _MEDIA: Final[tuple[Medium, ...]] = ("video", "audio")
 
 
 def filters(base: str) -> list[str]:
-    """What to subscribe to: the telemetry of these robots, without pictures and sound."""
+    """Return what to subscribe to: the telemetry of these robots, without pictures and sound."""
     every = list(dict.fromkeys(channel.filter(base) for channel in (*FLEET, *WATCHED, *SYNONYMS)))
     return [one for one in every if not any(other != one and matches(other, one) for other in every)]
 
@@ -55,7 +55,7 @@ class Robots:
         return self._refused + sum(feed.refused for feed in self._feeds.values())
 
     def receive(self, message: Message, at: float) -> None:
-        """A message that arrived at ``at`` (monotonic)."""
+        """Take a message that arrived at ``at`` (monotonic)."""
         address = parse_topic(message.topic)
         if address is None or address.identity.is_server or not message.payload:
             return
@@ -73,7 +73,7 @@ class Robots:
         self._publish(channel, message, time.time_ns() - round((time.monotonic() - at) * 1e9))
 
     def wake(self, topic: str, *, subscribed: bool) -> None:
-        """A client has subscribed to this channel, or unsubscribed."""
+        """Note that a client has subscribed to this channel, or unsubscribed."""
         feed = self._by_channel.get(topic)
         if feed is not None:
             feed.wake(topic.rpartition("/")[2], subscribed=subscribed)
@@ -94,7 +94,7 @@ class Robots:
     # -- telemetry
 
     def _publish(self, channel: Channel | None, message: Message, at_ns: int) -> None:
-        """What Foxglove has a schema for, by that; other JSON as it is. The last value of a state is remembered."""
+        """Publish by Foxglove's schema what it has one for, other JSON as it is; remember the last value of a state."""
         topic, payload = message.topic, message.payload
         remember = message.retain or (channel is not None and channel.default_retain)
         converted = self._telemetry.convert(topic, payload)

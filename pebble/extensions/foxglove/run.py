@@ -87,6 +87,6 @@ def _signalled() -> Iterator[asyncio.Event]:
 
 
 def _call(loop: asyncio.AbstractEventLoop, robots: Robots, topic: str, on: bool) -> None:
-    """On a thread of the SDK. The loop may have ended meanwhile."""
+    """Call the loop from a thread of the SDK; it may have ended meanwhile."""
     with contextlib.suppress(RuntimeError):
         loop.call_soon_threadsafe(lambda: robots.wake(topic, subscribed=on))

@@ -34,7 +34,7 @@ class ChannelSpec(NamedTuple):
 
 
 def protobuf_spec(topic: str, message: Any, schemas: Schemas) -> ChannelSpec:
-    """The channel for messages of this kind."""
+    """Return the channel for messages of this kind."""
     return ChannelSpec(topic, "protobuf", message.DESCRIPTOR.full_name, "protobuf", schemas.descriptors(message))
 
 
@@ -102,7 +102,7 @@ class Server:
             time.sleep(_PAUSE_S)
 
     def subscribed(self, topic: str) -> bool:
-        """Whether any client has subscribed to this channel."""
+        """True if any client has subscribed to this channel."""
         with self._lock:
             return bool(self._subscribers.get(topic))
 

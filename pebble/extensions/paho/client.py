@@ -50,7 +50,7 @@ class _Paho(paho.Client):
 
     @property
     def _too_long(self) -> bool:
-        """Whether the packet that arrives is discarded, but for its head."""
+        """True if the packet that arrives is discarded, but for its head."""
         return bool(self._in_packet["have_remaining"]) and self._in_packet["remaining_length"] > MAX_PACKET
 
     def _handle_publish(self) -> MQTTErrorCode:
@@ -63,7 +63,7 @@ class _Paho(paho.Client):
         return self._send_puback(int.from_bytes(packet[end : end + 2])) if first & ANY_QOS else MQTTErrorCode(0)
 
     def _skips_retained(self, packet: bytearray, end: int, start: int) -> bool:
-        """Whether the retained PUBLISH that arrived, whose topic ends at ``end``, is not wanted. Removals are."""
+        """True if the retained PUBLISH that arrived, whose topic ends at ``end``, is not wanted. Removals are."""
         if self._protocol == MQTTProtocolVersion.MQTTv5 and start < len(packet):
             start += 1 + packet[start]  # of properties, of which nobody needs 128 bytes
         return len(packet) > start and self.listener.skips(bytes(packet[2:end]))
@@ -161,7 +161,7 @@ class PahoClient:
         return self.unread
 
     def acknowledge(self) -> None:
-        """Nothing is owed."""
+        """Do nothing: no acknowledgement is owed."""
 
     # -- writing
 

@@ -306,7 +306,7 @@ class DescribedBridge(SerialService):
         self.transport.subscribe(self.addresses[MCU_DESCRIBE].topic, self._on_manifest, echo=False, direct=True)
 
     def _on_manifest(self, message: Message) -> None:
-        """On the transport's thread."""
+        """Take a manifest, on the transport's thread."""
         uid = MCU_DESCRIBE.names(message.topic).get("uid")
         if uid is None:  # the filter's + also matches an empty level
             self.counters.add("refused")

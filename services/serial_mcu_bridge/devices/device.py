@@ -55,7 +55,7 @@ class Device:
 
     @property
     def has_motion(self) -> bool:
-        """Whether there is an inertial sensor, which sends continuously."""
+        """True if there is an inertial sensor, which sends continuously."""
         return any(route.interface.profile == imu.MOTION for route in self.routes.values())
 
     @property

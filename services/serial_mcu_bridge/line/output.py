@@ -28,7 +28,7 @@ class Output:
         self.sending, self._blocked_since = self._end + self.stop, None
 
     def is_free(self, port: Port, now: float) -> bool:
-        """Whether the device has sent all that was written to it."""
+        """True if the device has sent all that was written to it."""
         return now >= self.sent_until and not port.queued()
 
     def write(self, port: Port, now: float, *, ready: bool) -> None:

@@ -22,7 +22,7 @@ class Silence:
         self._in_row = 0
 
     def check(self, state: LineState, opened: int, received: int, now: float, *, idle: bool) -> tuple[str, int | None]:
-        """The state of the line, and how long ago its board was heard: 0, 1000 or 10000 ms, at least.
+        """Return the state of the line, and how long ago its board was heard: 0, 1000 or 10000 ms, at least.
 
         ``opened`` counts openings, ``received`` what of the board's protocol was received since the last one; ``idle``:
         nothing was sent to the board for a second.

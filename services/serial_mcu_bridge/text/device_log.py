@@ -18,7 +18,7 @@ class DeviceLogLine:
 
 
 def is_known(report: object) -> bool:
-    """Whether a report of a text protocol shows that the board speaks it."""
+    """True if a report of a text protocol shows that the board speaks it."""
     return not isinstance(report, DeviceLogLine) or report.known
 
 

@@ -117,7 +117,7 @@ def _level(fields: dict[bytes, bytes]) -> list[Report]:
 
 
 def _shares(*parts: float) -> tuple[float, ...]:
-    """Each within 0..1. Raises PayloadError."""
+    """Return the parts if each is within 0..1. Raises PayloadError."""
     if not all(map(isfinite, parts)):
         raise _not_finite(*parts)
     return tuple([max(0.0, min(1.0, part)) for part in parts])

@@ -102,7 +102,7 @@ class HallMemory:
         return descriptor, memory, memoryview(memory).cast("Q")
 
     def _mapped(self, descriptor: int) -> mmap.mmap:
-        """The memory behind ``descriptor``, if it is ours alone. Raises OSError."""
+        """Return the memory behind ``descriptor``, if it is ours alone. Raises OSError."""
         try:
             fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:

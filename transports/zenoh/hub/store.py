@@ -45,13 +45,13 @@ class HubStore:
         return self._wills.get(name)
 
     def records(self) -> Iterator[Record]:
-        """The records that make an equal store."""
+        """Yield the records that make an equal store."""
         yield from self._retained.values()
         for name, will in self._wills.items():
             yield StoredWill(name, will)
 
     def lacks(self, hello: Hello) -> list[str]:
-        """The keys this client should send: those missing here, and those it wrote itself that differ now.
+        """Return the keys this client should send: those missing here, and those it wrote itself that differ now.
 
         A value that another client wrote later stays, and so does that another one has removed it.
         """

@@ -18,11 +18,11 @@ class WaitingQueries:
         self._looks = False  # whether some of them may wait no longer
 
     def count_from(self, client: str, count: int) -> None:
-        """All that this client has retained until now is here: ``count`` messages."""
+        """Note that all that this client has retained until now is here: ``count`` messages."""
         self._received[client] = count
 
     def received(self, client: str, count: int) -> None:
-        """A message has come, which is the ``count``-th that this client has retained; 0: it does not count them."""
+        """Note a message, the ``count``-th that this client has retained; 0: it does not count them."""
         if count and client in self._received:
             self._received[client] = max(count, self._received[client])
             self._looks = self._looks or client in self._awaited
@@ -42,13 +42,13 @@ class WaitingQueries:
         return True
 
     def due(self) -> float:
-        """When to :meth:`take`; infinite if nothing waits."""
+        """Return when to :meth:`take`; infinite if nothing waits."""
         if not self._waiting:
             return float("inf")
         return float("-inf") if self._looks else self._waiting[0][0]
 
     def take(self, now: float) -> list[zenoh.Query]:
-        """Those that have waited for long enough, or for nothing more."""
+        """Return those that have waited for long enough, or for nothing more."""
         due = []
         while self._waiting and now >= self._waiting[0][0]:
             due.append(self._waiting.popleft())

@@ -13,14 +13,14 @@ class WillTimes:
         self._due: dict[str, float] = {}
 
     def on_hello(self, name: str, now: float, *, alive: bool, has_will: bool) -> None:
-        """A client has told its will. If its token never comes, it has died meanwhile."""
+        """Note a client's will. If its token never comes, it has died meanwhile."""
         if alive:
             self._due.pop(name, None)
         elif has_will:
             self._due[name] = now + RETURN_S
 
     def on_gone(self, name: str, now: float) -> None:
-        """The token of a client that has left a will is gone."""
+        """Note that the token of a client that has left a will is gone."""
         self._due[name] = now + GONE_S
 
     def on_restart(self, names: Iterable[str], now: float) -> None:
@@ -29,7 +29,7 @@ class WillTimes:
             self._due.setdefault(name, now + RETURN_S)
 
     def forget(self, name: str) -> None:
-        """The client is there, or has no will any more."""
+        """Forget the will of a client that is there, or has none any more."""
         self._due.pop(name, None)
 
     @property
@@ -37,7 +37,7 @@ class WillTimes:
         return min(self._due.values(), default=float("inf"))
 
     def take_due(self, now: float) -> list[str]:
-        """The clients whose wills are due; each is returned once."""
+        """Return the clients whose wills are due; each is returned once."""
         taken = [name for name, due in self._due.items() if now >= due]
         for name in taken:
             del self._due[name]

@@ -213,7 +213,7 @@ class HubWorker:
                 self._do(partial(self._publish_will, name, will))
 
     def forget_will(self, name: str) -> None:
-        """The client ``name`` has no will any more."""
+        """Forget the will of the client ``name``."""
         self._wills.forget(name)
         self.apply(StoredWill(name, None))
 
