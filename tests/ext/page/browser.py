@@ -165,14 +165,14 @@ def tab(
     *,
     script: str = "",
     engineers: bool = True,
+    here: Literal["commit", "domcontentloaded"] = "domcontentloaded",
     routes: Mapping[Any, Callable[[Route], object]] | None = None,
     **options: Any,
 ) -> Iterator[Tab]:
     """Open ``url`` in a context of its own; ``script`` runs before the page's; ``options`` are those of a context.
 
-    ``engineers``: the cards for engineers are open, and all plots are shown.
-
-    ``routes`` answer requests instead of the server, by what their addresses match.
+    ``engineers``: the cards for engineers are open, and all plots are shown. ``here``: until when it waits for the
+    page. ``routes`` answer requests instead of the server, by what their addresses match.
     """
     width, height = SIZES[size]
     touch = size != "desktop"
@@ -182,7 +182,7 @@ def tab(
         for pattern, answer in (routes or {}).items():
             context.route(pattern, answer)
         opened = _prepared(context, (_ENGINEERS if engineers else "") + script)
-        opened.page.goto(url, timeout=1000 * _OPEN_S, wait_until="domcontentloaded")
+        opened.page.goto(url, timeout=1000 * _OPEN_S, wait_until=here)
         yield opened
     finally:
         context.close()

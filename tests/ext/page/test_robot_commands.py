@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import itertools
 import json
-from functools import partial
-from pathlib import Path
 from typing import Any
 
 import msgspec
@@ -18,7 +16,6 @@ from pebble.extensions.page import messages as m
 from pebble.extensions.page import robot_commands
 from pebble.extensions.page.robots import Interest, Robots
 from pebble.transports import Message, MqttSettings, QoS, create
-from tests.ext.page.attacker import Hall
 from tests.ext.page.served import Page, Served, now_ms
 from tests.kit.played_robot import RecordingRobot
 from tests.support import Broker, until
@@ -294,36 +291,6 @@ def test_a_silent_robot_is_asked_nothing_but_to_end_and_its_flags(page: Page, ro
     assert set(refusals(page, len(PUBLISHED) - 6)) == {f"{robot.base.rpartition('/')[2]} is silent"}
 
 
-def test_clips_and_scripts_on_topics_that_the_robot_names(
-    broker: Broker, served: Served, robot: RecordingRobot
-) -> None:
-    base = f"pebble/robots/asked{next(NUMBERS)}"
-    own = f"{base}/outgoing/renamed"
-    named = {"soundboard": {"files_topic": f"{own}/clips", "status_topic": f"{robot.base}/outgoing/soundboard-status"}}
-    named["autonomy"] = {"files_topic": f"{own}/scripts", "status_topic": f"{own}/script"}
-    with RecordingRobot(broker.port, base, capabilities=named) as one, served.page() as page:
-        assert page.knows(base)
-        page.send("watch", ref=base)
-        robot.publish("soundboard-status", {"playing": True, "file": "foreign"}, retain=True)
-        values = {
-            "clips": ("soundboard-files", {"files": ["a.wav"]}),
-            "scripts": ("autonomy-files", {"files": []}),
-            "script": ("autonomy-status", {"running": True, "file": "follow"}),
-        }
-        for topic, (metric, value) in values.items():
-            one.publish(f"renamed/{topic}", value, retain=True)
-            assert until(partial(page.value, base, metric), 3), metric
-            assert value.items() <= page.value(base, metric).items()
-        assert page.value(base, "soundboard-status") is None
-
-
-def test_a_long_list_of_clips_is_passed_on(page: Page, robot: RecordingRobot) -> None:
-    files = [f"speech/number {number}, spoken by a person.wav" for number in range(6000)]  # 256 KiB of names
-    page.send("watch", ref=robot.base)
-    robot.publish("soundboard-files", {"files": files, "timestamp": 1.0}, retain=True)
-    assert until(lambda: page.value(robot.base, "soundboard-files", "files") == files, 5)
-
-
 def test_large_values_are_sent_one_at_a_time() -> None:
     robots, interest = Robots(), Interest(lambda: None)
     robots.join(interest)
@@ -396,34 +363,3 @@ BEYOND: list[Fields] = [
 def test_what_is_beyond_the_limits_is_not_understood(fields: Fields) -> None:
     with pytest.raises(msgspec.ValidationError):
         op(**fields)
-
-
-def test_the_broker_is_down(broker: Broker, page: Page, robot: RecordingRobot) -> None:
-    broker.freeze()
-    ask(page, robot.base, **SOLID)  # accepted, and never acknowledged
-    assert until(lambda: page.value("", "web/broker", "problem"), 5)
-    ask(page, robot.base, **START)
-    assert refusals(page)[0].startswith("The server cannot reach the broker: ")
-    broker.thaw()
-
-
-def test_who_may_what(broker: Broker, tmp_path: Path) -> None:
-    with (
-        Hall(broker.port, tmp_path) as hall,
-        RecordingRobot(broker.port, f"pebble/robots/asked{next(NUMBERS)}") as robot,
-    ):
-        actions = [fields for fields, *_ in PUBLISHED if fields["tag"] == "action"]
-        with hall.page("driver") as page:
-            assert page.knows(robot.base)
-            for fields in actions:
-                ask(page, robot.base, **fields)
-            assert refusals(page, len(actions)) == ["The role driver may not do this"] * len(actions)
-            assert asked_of(robot) == []
-            ask(page, robot.base, **SOLID)
-            assert until(lambda: asked_of(robot))
-        with hall.page("maintainer") as page:
-            assert page.knows(robot.base)
-            ask(page, robot.base, **actions[0])
-            assert until(lambda: asked_of(robot)[-1] == ("flags/reboot", {"value": True}))
-        audit = hall.served.app.state.audit
-        assert until(lambda: [(one.what, one.user) for one in audit.read(10) if one.ref] == [("action", "maintainer")])

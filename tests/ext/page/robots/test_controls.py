@@ -11,8 +11,10 @@ import pytest
 from playwright.sync_api import Browser, Locator
 
 from tests.ext.page.browser import tab
-from tests.ext.page.console import BACK, FORWARD, KEYS, LEFT, REST, RIGHT, Console, Wheels, Wire, console, used
+from tests.ext.page.canned import CannedServer
+from tests.ext.page.console import BACK, FORWARD, KEYS, LEFT, RIGHT, Console, Wheels, Wire, console, pad, used
 from tests.ext.page.stage import Stage
+from tests.ext.page.states import STATES
 
 pytestmark = pytest.mark.alone  # deadlines are checked
 
@@ -83,9 +85,15 @@ def test_the_space_bar_ends_the_gesture_and_latches_nothing(at_lamp: Console, wi
     assert at_lamp.press_anew()
 
 
-def _escape_twice(element: Locator) -> None:
-    element.press("Escape")
-    element.press("Escape")
+def _in_help(robot: Console) -> None:
+    """It ends a gesture, moves nothing, and leaves STOP in reach."""
+    robot.page.keyboard.press("?")
+    assert robot.rests()
+    robot.let_go()
+    robot.down("KeyW")
+    assert robot.stays_at_rest()
+    robot.test("stop-one").click()
+    robot.page.keyboard.press("?")
 
 
 def _touch(element: Locator) -> None:
@@ -95,10 +103,8 @@ def _touch(element: Locator) -> None:
 
 STOPS: dict[str, Callable[[Console], None]] = {
     "Ctrl+Space": lambda robot: robot.page.keyboard.press("Control+Space"),
-    "Escape twice": lambda robot: _escape_twice(robot.page.locator("body")),
-    "Escape twice, in a list": lambda robot: _escape_twice(robot.test("picker")),
     "STOP": lambda robot: robot.test("stop-one").click(),
-    "STOP, by key": lambda robot: robot.test("stop-one").press("Enter"),
+    "STOP beside the help": lambda robot: _in_help(robot),
     "STOP, as soon as it is touched": lambda robot: _touch(robot.test("stop-one")),
 }
 
@@ -133,6 +139,29 @@ def test_stop_all_latches_every_robot_and_each_is_reset_by_itself(stage: Stage, 
     assert at_lamp.press_anew()
     at_lamp.reset("benjr")
     assert at_lamp.tab.until(lambda: not wire.latched("benjr"), 3)
+
+
+def test_a_gamepad_drives_and_its_buttons_stop(at_benjr: Console, wire: Wire) -> None:
+    def drives() -> bool:
+        """Show it in neutral, then pushed."""
+
+        def neutral() -> None:
+            at_benjr.pads(pad())
+            at_benjr.page.wait_for_timeout(120)
+
+        neutral()
+        return at_benjr.persists(lambda: at_benjr.pads(pad(z=1)), lambda: at_benjr.wheels == FORWARD, neutral)
+
+    assert drives()
+    at_benjr.pads(pad(0, 1, 0))
+    assert at_benjr.rests()
+    assert at_benjr.stays_at_rest()
+    assert not wire.latched("benjr")
+    assert drives()
+    at_benjr.pads(pad(0, 1, 8, 9))
+    assert at_benjr.tab.until(lambda: wire.latched("benjr"), 2)
+    assert at_benjr.rests()
+    assert at_benjr.because("stopped", within=2)  # else the next test would not see what it has to reset
 
 
 # -- control
@@ -193,7 +222,7 @@ def test_the_fleet_stops_robots(browser: Browser, stage: Stage, wire: Wire) -> N
 
 
 @pytest.mark.page
-def test_the_tab_key_reaches_every_control_and_space_on_a_button_also_stops(at_lamp: Console) -> None:
+def test_the_tab_key_reaches_every_control(at_lamp: Console) -> None:
     at_lamp.page.evaluate("document.activeElement.blur()")
     focusable = "a[href], button:enabled, input:enabled, select:enabled, summary, [tabindex='0']"
     count = at_lamp.page.evaluate(
@@ -205,9 +234,20 @@ def test_the_tab_key_reaches_every_control_and_space_on_a_button_also_stops(at_l
         at_lamp.page.evaluate("window.reached.add(document.activeElement)")
     assert at_lamp.page.evaluate("window.reached.delete(document.body) || true")
     assert at_lamp.page.evaluate("window.reached.size") == count
-    at_lamp.test("release").focus()
-    assert at_lamp.drive()
-    at_lamp.page.keyboard.press("Space")
-    assert at_lamp.rests()
-    assert at_lamp.because("free", within=2)
-    assert at_lamp.wheels == REST
+
+
+def test_a_screen_that_only_watches_sends_nothing_but_stops(browser: Browser, server: CannedServer) -> None:
+    server.show(STATES["driving"])
+    with tab(browser, f"{server.url}{server.state.path}?watch") as opened:
+        assert opened.until("!!window.pebble?.connection.you && document.documentElement.hasAttribute('data-watch')")
+        for key in ("KeyW", "KeyA", "KeyQ", "KeyF", "KeyP", "KeyT", "KeyM", "Minus", "Space"):
+            opened.page.keyboard.press(key, delay=60)
+        opened.page.evaluate(
+            "() => { for (const one of document.querySelectorAll('main button, .banners button')) one.click() }"
+        )
+        assert opened.until("!!pebble.commands.act"), "the rest of the page has come"
+        opened.page.evaluate("() => { pebble.commands.take(true); pebble.commands.act(pebble.driver.ref, 'reboot') }")
+        opened.page.keyboard.press("Control+Space")
+        assert opened.until(lambda: bool(server.sent("estop")), 2)
+        assert {message["op"] for message in server.received} <= {"hello", "watch", "read-logs", "stop", "estop"}
+        assert [message["token"] for message in server.sent("hello")] == [""]

@@ -131,30 +131,3 @@ def test_what_takes_the_finger_away_stops(at_lamp: Phone, what: str) -> None:
     at_lamp.fingers.lift()
     assert at_lamp.test("stop-one").is_visible()
     assert at_lamp.drive_by_stick()
-
-
-# -- buttons
-
-
-def test_control_and_reset_by_finger(browser: Browser, stage: Stage, wire: Wire) -> None:
-    with phone(browser, stage, theme="dark") as robot:
-        robot.test("release").tap()
-        assert robot.because("free", within=3)
-        robot.stick()
-        assert robot.stays_at_rest()
-        robot.fingers.lift()
-        robot.test("take").tap()
-        assert robot.because("", within=3)
-        robot.touch("stop-one")
-        assert robot.tab.until(lambda: wire.latched("minilamp"), 2)
-        robot.fingers.up(2)
-        robot.test("reset").tap()
-        robot.test("reset-hold").tap()
-        robot.touch("reset-hold")
-        robot.page.wait_for_timeout(400)
-        assert wire.latched("minilamp")
-        robot.page.wait_for_timeout(900)
-        robot.fingers.up(2)
-        assert robot.tab.until(lambda: not wire.latched("minilamp"), 3)
-        assert robot.because("", within=3)
-        assert robot.drive_by_stick()
