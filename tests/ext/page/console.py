@@ -252,9 +252,6 @@ class Wire:
         """The newest payload below ``pebble/robots``."""
         return self._last.get(f"pebble/robots/{topic}")
 
-    def all(self, topic: str) -> list[Any]:
-        return [payload for one, payload in list(self.received) if one == f"pebble/robots/{topic}"]
-
     def publish(self, topic: str, value: object, *, retain: bool = False) -> None:
         payload = b"" if value is None else msgspec.json.encode(value)
         self._transport.publish(f"pebble/robots/{topic}", payload, qos=QoS.DELIVERED, retain=retain)

@@ -143,34 +143,27 @@ def moving(page: Page, robot: RecordingRobot) -> bool:
     return False
 
 
-@pytest.mark.parametrize("how", ["removed", "password", "role", "logout"])
-def test_a_session_that_is_revoked_while_driving_ends(
-    hall: Hall, broker: Broker, how: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+@pytest.mark.parametrize("how", ["removed", "role", "logout"])
+def test_a_session_that_is_revoked_while_driving_ends(hall: Hall, broker: Broker, how: str) -> None:
     base = f"pebble/robots/revoked-{how}"
-    hall.people.add("mallory", "sentinel of mallory", Role.DRIVER)
-    cookie = hall.cookie("mallory")
+    hall.people.add(f"mallory-{how}", "sentinel of mallory", Role.DRIVER)
+    cookie = hall.cookie(f"mallory-{how}")
     with RecordingRobot(broker.port, base) as robot, Page(hall.served, cookie=cookie) as page:
         assert page.knows(base)
         assert page.ready()
         pictures = hall.socket(f"/ws/media?ref={base}&can=json", cookie=cookie)
         assert moving(page, robot)
-        match how:
-            case "removed":
-                hall.people.remove("mallory")
-            case "password":
-                hall.people.set_password("mallory", "another sentinel")
-            case "role":
-                hall.people.set_role("mallory", Role.VIEWER)
-            case "logout":
-                headers = {"cookie": cookie, "origin": hall.served.origin}
-                assert httpx.post(f"{hall.served.origin}/api/logout", json={}, headers=headers).status_code == 200
+        if how == "removed":
+            hall.people.remove("mallory-removed")
+        elif how == "role":
+            hall.people.set_role("mallory-role", Role.VIEWER)
+        else:
+            headers = {"cookie": cookie, "origin": hall.served.origin}
+            assert httpx.post(f"{hall.served.origin}/api/logout", json={}, headers=headers).status_code == 200
         end = time.monotonic() + 3
         while time.monotonic() < end and not page.closed:
-            try:
+            with suppress(ConnectionClosed):
                 page.drive(base, int(now_ms()), z=0.5)
-            except ConnectionClosed:
-                break
             time.sleep(0.05)
         assert until(lambda: page.closed, 1)
         assert page.bye["why"]
@@ -180,8 +173,6 @@ def test_a_session_that_is_revoked_while_driving_ends(
                 pictures.recv(timeout=3)
             assert hall.refusal("/ws/control", cookie=cookie) == 403
         pictures.close()
-    if how != "removed":
-        hall.people.remove("mallory")
 
 
 # -- roles
@@ -374,27 +365,22 @@ def test_a_socket_without_hello_is_closed(hall: Hall, monkeypatch: pytest.Monkey
     assert hall.closed_after("/ws/control", hall.cookie("admin"))
 
 
-def test_a_flood_of_stops_ends_no_other_persons_stop(hall: Hall, everything: Everything) -> None:
+def test_a_viewer_ends_no_other_persons_stop(hall: Hall, everything: Everything) -> None:
     def count() -> int:
         return len([one for one in everything.messages if one.topic == "pebble/robots/off/incoming/estop"])
 
     with hall.page("driver") as page, hall.page("viewer") as mallory:
         page.send("estop", ref="pebble/robots/off", stop="00000000000000ff")
         assert until(count)
-        with suppress(ConnectionClosed):
-            for number in range(300):
-                mallory.send("estop", ref=f"pebble/robots/w{number}", stop=f"{number:016x}")
-            mallory.send("estop-end", stop="00000000000000ff")
-        time.sleep(1)
+        mallory.send("estop-end", stop="00000000000000ff")
+        assert until(lambda: [one["why"] for one in mallory.refused] == ["The role viewer may not do this"])
         before = count()
         assert until(lambda: count() >= before + 2, 3), "it is no longer sent"
-        assert until(lambda: [one["why"] for one in mallory.refused] == ["The role viewer may not do this"])
         page.send("estop-end", stop="00000000000000ff")
         time.sleep(0.7)
         before = count()
         time.sleep(0.7)
         assert count() == before
-    assert hall.works()
 
 
 # -- guessing

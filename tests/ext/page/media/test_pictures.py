@@ -35,10 +35,6 @@ def robot() -> PictureRobot:
     return PictureRobot()
 
 
-def jpeg(number: int = 0) -> bytes:
-    return cv2.imencode(".jpg", np.full((48, 64, 3), 40 + number % 150, np.uint8))[1].tobytes()
-
-
 def encoding_of(payload: bytes) -> str | None:
     header = read_header(payload)
     return header and header.encoding
@@ -67,18 +63,6 @@ async def test_another_operators_encoding_is_forwarded_as_it_is(robot: PictureRo
         await asyncio.sleep(1.5)
     assert encoding_of(page.direct()[-1]) == "pbvd"
     assert [request.get("encoding") for request in robot.requests if "keyframe" not in request].count("h264") == 1
-
-
-async def test_raw_jpegs_flow() -> None:
-    robot = PictureRobot({**{name: VIDEO[name] for name in ("available", "controls", "topic")}, "encoding": "jpeg"})
-    robot.mute = True
-    async with serving(robot) as server:
-        page = server.open(PicturePage(), frozenset({"jpeg"}))
-        await until(lambda: robot.requests)
-        for number in range(5):
-            robot.send(jpeg(number))
-            await until(lambda number=number: page.direct() == [jpeg(one) for one in range(number + 1)])
-        await until(lambda: server.view.state == "flowing" and server.view.encoding == "jpeg")
 
 
 # -- forwarding

@@ -18,24 +18,21 @@ from tests.kit.played_robot import RecordingRobot
 Lose = Callable[[Route], object]
 
 
-def cut_off(route: Route) -> None:
-    """Answer with the first half, which is no program."""
-    answer = route.fetch()
-    route.fulfill(response=answer, body=answer.body()[: len(answer.body()) // 2])
-
-
-def lost_once() -> Lose:
+def lost_once(_: bytes, _kind: str) -> Lose:
     left = iter([True])
     return lambda route: route.abort() if next(left, False) else route.fallback()
 
 
-#: What happens to a file each time that it is asked for.
-FAULTS: dict[str, Callable[[], Lose]] = {
+_UNANSWERED: list[Route] = []  # until the page has stopped robots
+
+
+#: What happens to a file of this content and kind each time that it is asked for.
+FAULTS: dict[str, Callable[[bytes, str], Lose]] = {
     "lost once": lost_once,
-    "lost for ever": lambda: lambda route: route.abort(),
-    "cut off": lambda: cut_off,
-    "an error page": lambda: lambda route: route.fulfill(status=502, body="<h1>502 Bad Gateway</h1>"),
-    "never answered": lambda: lambda _: None,
+    "lost for ever": lambda *_: lambda route: route.abort(),
+    "cut off": lambda file, kind: lambda route: route.fulfill(body=file[: len(file) // 2], content_type=kind),
+    "an error page": lambda *_: lambda route: route.fulfill(status=502, body="<h1>502 Bad Gateway</h1>"),
+    "not answered": lambda *_: _UNANSWERED.append,
 }
 #: Of the start, fetched by that, fetched by the screen, looks, a worker.
 SAMPLE = {
@@ -64,7 +61,8 @@ def check(browser: Browser, server: CannedServer, state: str, losses: Iterator[t
     server.show(STATES[state])
     for name, fault in losses:
         before = len(server.sent("estop")) + len(server.posted)
-        lost = {re.compile(f"/static/.*{re.escape(name)}"): FAULTS[fault]()}
+        kind = "text/css" if name.endswith(".css") else "text/javascript"
+        lost = {re.compile(f"/static/.*/{re.escape(name)}"): FAULTS[fault](server.static.files[name], kind)}
         with tab(browser, server.url + STATES[state].path, script=_SOON, here="commit", routes=lost) as opened:
             assert opened.until(_SHOWS, 20), (name, fault)
             assert fault != "lost once" or opened.until(_WHOLE, 20), name
@@ -72,6 +70,8 @@ def check(browser: Browser, server: CannedServer, state: str, losses: Iterator[t
             opened.page.evaluate(_PRESS)
             stopped = lambda before=before: len(server.sent("estop")) + len(server.posted) > before
             assert opened.until(stopped, 5), (name, fault)
+            while _UNANSWERED:
+                _UNANSWERED.pop().abort()
 
 
 @pytest.mark.parametrize("state", SAMPLE)

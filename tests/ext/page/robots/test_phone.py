@@ -86,16 +86,6 @@ def test_a_second_finger_on_stop_latches(at_lamp: Phone, wire: Wire) -> None:
     assert at_lamp.drive_by_stick()
 
 
-def test_a_second_finger_on_the_stick_ends_the_gesture(at_lamp: Phone) -> None:
-    assert at_lamp.drive_by_stick()
-    at_lamp.touch("stick")
-    assert at_lamp.rests()
-    at_lamp.fingers.up(2)
-    assert at_lamp.stays_at_rest()
-    at_lamp.fingers.up(1)
-    assert at_lamp.drive_by_stick()
-
-
 # -- what takes the finger away
 
 

@@ -47,6 +47,14 @@ def test_the_camera_runs_while_its_picture_is_shown(browser: Browser, stage: Sta
         assert wire.last("fred/incoming/flags/mqtt-video") == {"value": True}
 
 
+def test_after_a_lost_server_pictures_come_again(browser: Browser, stage: Stage) -> None:
+    with console(browser, stage, "fred") as robot:
+        assert robot.tab.until("window.pebble?.video.info")
+        stage.restart_server()
+        assert robot.tab.until("window.pebble.video.age().ms > 1500", 5)
+        assert robot.tab.until("window.pebble.video.age().ms < 1000", 20)
+
+
 def test_a_robot_shows_the_picture_of_another_which_must_be_new(at_lamp: Console, stage: Stage, wire: Wire) -> None:
     at_lamp.page.evaluate(
         "([ref, source]) => window.pebble.commands.setPictureFrom(ref, source)", [at_lamp.ref, stage.ref("goob")]
