@@ -49,18 +49,6 @@ def publish(broker: Broker, topic: str, payload: bytes, *, retain: bool = False)
     transport.close()
 
 
-def retained(broker: Broker, topic: str) -> bytes:
-    """What a new subscriber receives."""
-    received: list[Message] = []
-    transport = create("mqtt", "reader", MqttSettings(host="127.0.0.1", port=broker.port))
-    transport.open()
-    transport.subscribe(topic, received.append, direct=True)
-    assert until(lambda: received)
-    transport.close()
-    assert received[0].retain
-    return received[0].payload
-
-
 # -- logs
 
 
@@ -100,7 +88,6 @@ def test_flags_are_those_of_the_broker(page, robot, broker) -> None:
     assert flags() == {"remote_mirror": None, "mqtt_audio": None, "mqtt_video": None}
     page.send("flag", ref=robot.base, name="mqtt-video", on=True)
     assert until(lambda: flags()["mqtt_video"] is True)
-    assert retained(broker, f"{robot.base}/incoming/flags/mqtt-video") == b'{"value":true}'
     publish(broker, f"{robot.base}/incoming/flags/mqtt-audio", b'{"enabled": false}', retain=True)
     assert until(lambda: flags()["mqtt_audio"] is False)
     publish(broker, f"{robot.base}/incoming/flags/mqtt-video", b'"odd"')

@@ -214,8 +214,11 @@ def whys(functions: Iterable[Callable[..., None]]) -> list[str]:
     return asyncio.run(run())
 
 
+KILLED = "its process was killed, as it is where memory runs out: end other programs, or choose less"
+
+
 def test_a_job_that_is_killed_has_a_reason() -> None:
-    assert whys([failing_jobs.killed]) == ["its process was killed, as it is where memory runs out"]
+    assert whys([failing_jobs.killed]) == [KILLED]
 
 
 def test_a_job_that_gives_no_sign_of_life_is_ended(monkeypatch: pytest.MonkeyPatch) -> None:

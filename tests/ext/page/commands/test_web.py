@@ -12,7 +12,6 @@ import subprocess
 import urllib.request
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -189,16 +188,6 @@ def test_mistakes_with_users(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
         assert run.err == "pebble: there is no 'bob': `pebble web user list` lists the names\n"
     assert run("web", "user") == 0
     assert "pebble web user add alice --role driver" in run.out
-
-
-def test_a_terminal_is_asked_twice_without_echo(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
-    asked: list[dict[str, Any]] = []
-    give(monkeypatch, "")
-    monkeypatch.setattr("sys.stdin.isatty", lambda: True, raising=False)
-    monkeypatch.setattr("typer.prompt", lambda text, **options: asked.append(options) or SECRET)
-    assert run("web", "user", "add", "alice") == 0, run.err
-    assert asked == [{"hide_input": True, "confirmation_prompt": True, "err": True}]
-    assert SECRET not in run.out + run.err
 
 
 def test_audit(run: Run, state: Path) -> None:

@@ -151,28 +151,6 @@ def test_a_time_at_which_nothing_was_recorded(show: Show) -> None:
         assert opened.until(lambda: "No picture was recorded here" in opened.test("cover").inner_text(), 15)
 
 
-def test_a_stretch_is_downloaded_and_a_download_is_cancelled(replay: Tab):
-    replay.test("open-download").click()
-    replay.test("mark-in").click()
-    seek(replay, AT + 4000)
-    replay.test("mark-out").click()
-    assert replay.test("stretch").inner_text() == "10:00:30 – 10:00:34"
-    replay.test("download-as").select_option("mcap")
-    replay.test("download").click()
-    replay.test("download-file").wait_for(timeout=60_000)
-    with replay.page.expect_download() as download:
-        replay.test("download-file").click()
-    assert download.value.suggested_filename.endswith(".mcap")
-    assert download.value.path().read_bytes()[:5] == b"\x89MCAP"
-    replay.test("download-end").click()
-    assert replay.until(lambda: replay.test("download-file").count() == 0)
-    replay.test("mark-clear").click()
-    replay.test("download-as").select_option("mp4")
-    replay.test("download").click()
-    replay.test("download-end").click()
-    assert replay.until(lambda: replay.test("download").is_enabled())
-
-
 def test_stop_all_works_here_as_everywhere(show: Show, server: CannedServer) -> None:
     with show(STATES["replay"]) as opened:
         assert shown(opened, AT)

@@ -32,7 +32,7 @@ FAULTS: dict[str, Callable[[bytes, str], Lose]] = {
     "lost for ever": lambda *_: lambda route: route.abort(),
     "cut off": lambda file, kind: lambda route: route.fulfill(body=file[: len(file) // 2], content_type=kind),
     "an error page": lambda *_: lambda route: route.fulfill(status=502, body="<h1>502 Bad Gateway</h1>"),
-    "not answered": lambda *_: _UNANSWERED.append,
+    "not answered": lambda *_: lambda route: _UNANSWERED.append(route),
 }
 #: Of the start, fetched by that, fetched by the screen, looks, a worker.
 SAMPLE = {
