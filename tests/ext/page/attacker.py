@@ -13,7 +13,7 @@ from typing import Any, Self
 
 import httpx
 from starlette.routing import Route, WebSocketRoute
-from websockets.exceptions import ConnectionClosed, InvalidStatus
+from websockets.exceptions import InvalidStatus
 from websockets.sync.client import ClientConnection, connect
 
 from pebble.extensions.fleet.people import People, User
@@ -72,19 +72,6 @@ class Hall:
         url = f"ws://127.0.0.1:{self.served.port}{path}"
         own = self.served.origin if origin == "" else origin
         return connect(url, origin=own, additional_headers=headers, max_size=None)  # type: ignore[arg-type]
-
-    def closed_after(self, path: str, cookie: str, *messages: str | bytes) -> bool:
-        """Whether the server closes a WebSocket on which these messages were sent."""
-        with self.socket(path, cookie=cookie) as opened:
-            try:
-                for message in messages:
-                    opened.send(message)
-                while True:
-                    opened.recv(timeout=3)
-            except ConnectionClosed:
-                return True
-            except TimeoutError:
-                return False
 
     def refusal(self, path: str, **options: Any) -> int:
         """The status with which a WebSocket is refused; 101 if it is not."""

@@ -32,13 +32,6 @@ _COVERS = (
 _LOOK_MS = 20  # between two looks: each costs three programs a millisecond
 _VIOLATIONS = """addEventListener("securitypolicyviolation", (event) =>
   pebbleViolation(`${event.violatedDirective} ${event.blockedURI}`))"""
-#: The pixels of a canvas, RGBA. Of a copy: Chromium complains of a canvas that is drawn on and often read.
-PIXELS = """const pixelsOf = (canvas) => {
-  const { width, height } = canvas;
-  const copy = new OffscreenCanvas(width, height).getContext("2d", { willReadFrequently: true });
-  copy.drawImage(canvas, 0, 0);
-  return copy.getImageData(0, 0, width, height).data;
-};"""
 #: As if a viewer had opened the cards for engineers, and all plots: most tests look at one of them.
 _ENGINEERS = """try {
   const key = `pebble cards ${decodeURIComponent(location.pathname.split("/r/")[1])}`;

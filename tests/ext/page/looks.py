@@ -46,12 +46,6 @@ UNANSWERED = """window.WebSocket = class extends EventTarget {
 };"""
 #: What is fetched without a server, too.
 _PARTS = "!document.querySelector('.loading') && Boolean(document.querySelector('.key-place'))"
-#: A style sheet of its own: the page's policy allows no style element.
-_STYLED = """(rules) => {
-  const sheet = new CSSStyleSheet();
-  sheet.replaceSync(rules);
-  document.adoptedStyleSheets = [sheet];
-}"""
 _HERE = """!document.querySelector('.loading') && document.fonts.status === 'loaded' &&
   [...document.images].every((one) => one.complete || one.hidden) &&
   (!pebble.video.ref || Boolean(pebble.video.info))"""
@@ -114,8 +108,8 @@ LOOKS: dict[str, Look] = {
 }
 
 
-def taken(server: CannedServer, browser: Browser, look: Look, style: str = "") -> Pixels:
-    """The page as it looks, at half size; ``style``: with these rules besides its own."""
+def taken(server: CannedServer, browser: Browser, look: Look) -> Pixels:
+    """The page as it looks, at half size."""
     state = replace(look.state, at=AT, still=True, repeated={})
     width, height = SIZES[look.size]
     options = {"reduced_motion": "reduce", "timezone_id": "UTC", "locale": "en-GB", "engineers": False}
@@ -131,7 +125,6 @@ def taken(server: CannedServer, browser: Browser, look: Look, style: str = "") -
     ) as opened:
         assert opened.until(look.here, 60), f"{state.path} is not shown"
         look.act(opened.page)
-        opened.page.evaluate(_STYLED, style)
         return _at_rest(opened)
 
 

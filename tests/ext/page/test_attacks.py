@@ -362,7 +362,10 @@ def test_odd_bodies_stop_nothing(hall: Hall, everything: Everything, body: bytes
 
 def test_a_socket_without_hello_is_closed(hall: Hall, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(control, "HELLO_S", 0.3)
-    assert hall.closed_after("/ws/control", hall.cookie("admin"))
+    with hall.socket("/ws/control", cookie=hall.cookie("admin")) as silent:
+        assert json.loads(silent.recv(timeout=3))["why"] == "no hello"
+        with pytest.raises(ConnectionClosed):
+            silent.recv(timeout=3)
 
 
 def test_a_viewer_ends_no_other_persons_stop(hall: Hall, everything: Everything) -> None:

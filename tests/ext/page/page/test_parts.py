@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import pytest
 
-from tests.ext.page.browser import Size
 from tests.ext.page.canned import CannedServer, Show
 from tests.ext.page.states import FRED, GOOB, LAMP, STATES
 
@@ -59,30 +58,3 @@ def test_a_button_that_is_switched_off_while_it_is_held_does_nothing(show: Show,
         opened.page.evaluate("delete pebble.connection.may; pebble.connection.changed()")
         assert opened.until("performance.now() - pebble.pressedAt > 1500")
         assert server.sent("estop-reset") == []
-
-
-# -- colours, and what still loads
-
-#: How many texts say that a part loads; how many of them lie over a control, and how many leave their card.
-COVERED = """(() => {
-  const place = (one) => one.getBoundingClientRect();
-  const texts = [...document.querySelectorAll(".loading")]
-    .filter((one) => one.checkVisibility() && place(one).height > 0);
-  const controls = [...document.querySelectorAll("button, a, input, select, .stick")]
-    .filter((one) => !one.closest(".tabs, header, .skip")); // the page scrolls below these
-  const wide = (a, b) => Math.min(a.right, b.right) - Math.max(a.left, b.left);
-  const over = (a, b) => wide(a, b) > 1 && Math.min(a.bottom, b.bottom) - Math.max(a.top, b.top) > 1;
-  const covers = (one) => controls.some((two) => over(place(one), place(two)));
-  const leaves = (one) => place(one).bottom > place(one.closest(".card") ?? document.documentElement).bottom + 1;
-  return [texts.length, texts.filter(covers).length, texts.filter(leaves).length];
-})()"""
-#: Among them the settings below the stick, and a sheet of theirs.
-LATE = ("drive-settings.js", "key-hints.js", "telemetry.js", "map.js", "lights.js", "plots.js", "panels.css")
-
-
-@pytest.mark.parametrize("size", ["desktop", "phone"])
-def test_what_still_loads_lies_over_nothing(show: Show, size: Size) -> None:
-    late = {f"**/{name}": lambda _: None for name in LATE}  # they never come
-    with show(STATES["driving"], size, routes=late) as opened:
-        assert opened.until(f"{COVERED}[0] > 0", 20)
-        assert opened.until(f"{COVERED}.slice(1).join() === '0,0'", 5), opened.page.evaluate(COVERED)

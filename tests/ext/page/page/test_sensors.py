@@ -15,9 +15,8 @@ import pytest
 from PIL import Image
 from playwright.sync_api import Browser
 
-from tests.ext.page.browser import PIXELS, Tab
+from tests.ext.page.browser import Tab
 from tests.ext.page.canned import CannedServer, Show, showing
-from tests.ext.page.fingers import Fingers
 from tests.ext.page.states import (
     MINE,
     SENSORS,
@@ -53,12 +52,15 @@ def see(opened: Tab, name: str) -> None:
 
 
 #: How many pixels of a canvas have a colour of its style: all, in the last fifth, and in the middle.
-_INKED = """([place, ink]) => { PIXELS
+#: Of a copy: Chromium complains of a canvas that is drawn on and often read.
+_INKED = """([place, ink]) => {
   const canvas = document.querySelector(place);
   const wanted = getComputedStyle(canvas).getPropertyValue(ink).trim();
   const [r, g, b] = [1, 3, 5].map((at) => parseInt(wanted.slice(at, at + 2), 16));
   const { width, height } = canvas;
-  const data = pixelsOf(canvas);
+  const copy = new OffscreenCanvas(width, height).getContext("2d", { willReadFrequently: true });
+  copy.drawImage(canvas, 0, 0);
+  const { data } = copy.getImageData(0, 0, width, height);
   const found = { all: 0, late: 0, middle: 0 };
   for (let i = 0; i < data.length; i += 4) {
     const away = Math.abs(data[i] - r) + Math.abs(data[i + 1] - g) + Math.abs(data[i + 2] - b);
@@ -69,7 +71,7 @@ _INKED = """([place, ink]) => { PIXELS
     found.middle += Math.hypot(x - width / 2, y - height / 2) < 14;
   }
   return found;
-}""".replace("PIXELS", PIXELS)
+}"""
 
 
 def inked(opened: Tab, place: str, ink: str, part: str) -> int:
@@ -101,32 +103,6 @@ def test_the_map_has_the_trail_and_the_component_in_its_middle(sensors: Tab) -> 
     sensors.test("map-clear").click()
     assert sensors.until(lambda: trail(sensors, "all") < 250)
     assert trail(sensors, "middle") > 30
-
-
-def test_one_finger_scrolls_the_page_and_two_zoom_the_map(show: Show) -> None:
-    with show(SENSORS, "phone") as opened:
-        opened.test("tab-sensors").click()
-        opened.test("map").wait_for()
-        assert opened.until(lambda: opened.page.locator(".loading").count() == 0)  # a card above it would move it
-        see(opened, "map")
-        box = opened.test("map").bounding_box()
-        assert box is not None
-        x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
-        scale = lambda: float(opened.page.evaluate("document.querySelector('.map canvas').dataset.scale ?? NaN"))
-        assert opened.until(lambda: scale() > 0)
-        before, fingers = scale(), Fingers(opened)
-        for finger, side in ((1, -1), (2, 1)):
-            fingers.down(finger, x + 30 * side, y)
-        for apart in (40, 50, 60):
-            for finger, side in ((1, -1), (2, 1)):
-                fingers.move(finger, x + apart * side, y)
-        fingers.lift()
-        assert opened.until(lambda: scale() == pytest.approx(2 * before, rel=0.01))
-        assert opened.page.evaluate("visualViewport.scale") == 1
-        top = opened.page.evaluate("scrollY")
-        scroll = {"x": x, "y": y, "yDistance": 150 if top > 150 else -150}
-        opened.cdp().send("Input.synthesizeScrollGesture", scroll)
-        assert opened.until(lambda: abs(opened.page.evaluate("scrollY") - top) > 60)
 
 
 # -- over the picture

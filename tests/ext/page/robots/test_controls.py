@@ -1,6 +1,6 @@
 """Every control of the fleet and of a robot's page, used in a browser; what it does is asserted at the robot.
 
-The robots are microcontrollers; those with pictures are in test_pictures_of_robots.
+The robots are microcontrollers; those with pictures are in test_whole_robots.
 """
 
 from __future__ import annotations
