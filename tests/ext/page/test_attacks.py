@@ -343,16 +343,21 @@ def test_a_viewer_does_not_talk(hall: Hall, driver: Page) -> None:
         assert json.loads(talker.recv(timeout=5)) == {"talk": 0, "on": False, "why": "The role viewer may not do this"}
 
 
-@pytest.mark.parametrize(
-    "body", [b"", b"\xff", b"{", b"[" * 16_000, b"null", b'{"op":"estop","ref":"\xff"}', b"x" * 17_000]
-)
+ODD_BODIES = [
+    *(b"", b"\xff", b"{", b"[" * 16_000, b"null", b'{"op":"estop","ref":"\xff"}', b"x" * 17_000),
+    *(b'{"user":1,"password":2}', b'{"user":["admin"],"password":"x"}', b'{"user":"\\ud800","password":"x"}'),
+    b'{"user":"x","password":"' + b"x" * 600 + b'"}',
+]
+
+
+@pytest.mark.parametrize("body", ODD_BODIES, ids=lambda body: repr(body[:30]))
 def test_odd_bodies_stop_nothing(hall: Hall, everything: Everything, body: bytes) -> None:
     headers = {"origin": hall.served.origin, "content-type": "application/json"}
     before = len(everything.incoming())
     with hall.client("admin") as client:
         for path in hall.routes(Route, "POST"):
             if path != "/api/logout":
-                expected = (400, 413, 429, *(404,) * ("{" in path))
+                expected = (400, 413, *(404,) * ("{" in path))
                 assert client.post(path, content=body, headers=headers).status_code in expected, path
     assert len(everything.incoming()) == before
 
@@ -390,25 +395,19 @@ def test_a_viewer_ends_no_other_persons_stop(hall: Hall, everything: Everything)
 
 
 def test_passwords_cannot_be_guessed(broker: Broker, tmp_path: Path) -> None:
+    """How often one may try is tested where people are kept; which address counts is decided here."""
     with Hall(broker.port, tmp_path) as hall, hall.client() as client:
-        headers = {"origin": hall.served.origin}
 
-        def log_in(user: str, password: str) -> httpx.Response:
-            return client.post("/api/login", json={"user": user, "password": password}, headers=headers)
+        def log_in(user: str, password: str, **forwarded: str) -> int:
+            headers = {"origin": hall.served.origin, **forwarded}
+            return client.post("/api/login", json={"user": user, "password": password}, headers=headers).status_code
 
-        answers = [log_in("admin" if number % 2 else f"x{number}", f"guess {number}") for number in range(12)]
-        assert [answer.status_code for answer in answers] == [401] * 5 + [429] * 7
-        assert len({answer.content for answer in answers[:5]}) == 1
-        assert log_in("admin", PASSWORDS["admin"]).status_code == 429, "also for the right one"
-        for forwarded in ("x-forwarded-for", "forwarded", "x-real-ip", "x-client-ip"):
-            answer = client.post(
-                "/api/login",
-                json={"user": "driver", "password": PASSWORDS["driver"]},
-                headers={**headers, forwarded: "192.0.2.1"},
-            )
-            assert answer.status_code == 429, f"{forwarded} is not believed"
+        assert [log_in(f"x{number}", f"guess {number}") for number in range(7)] == [401] * 5 + [429] * 2
+        assert log_in("admin", PASSWORDS["admin"]) == 429, "also for the right one"
+        for name in ("x-forwarded-for", "forwarded", "x-real-ip", "x-client-ip"):
+            assert log_in("driver", PASSWORDS["driver"], **{name: "192.0.2.1"}) == 429, f"{name} is not believed"
         audit = hall.served.app.state.audit
-        assert until(lambda: {one.what for one in audit.read(9)} == {"login-refused", "login-limited"})
+        assert until(lambda: "login-limited" in {one.what for one in audit.read(9)})
 
 
 # -- secrets

@@ -182,14 +182,6 @@ def test_what_ends_a_drive_stops_the_robot_at_once(drive: Drive, lamp: Lamp, end
     assert until(lambda: [command for _, command in lamp.commands[-3:]] == [FINAL] * 3), lamp.commands[-8:]
 
 
-def test_a_terminal_that_is_closed_stops_the_robot_at_once(drive: Drive, lamp: Lamp) -> None:
-    console = drive()
-    driving(console, lamp)
-    console.hang_up()
-    assert lamp.halted_after(time.monotonic()) < BUSY_S
-    assert console.process.wait(5) == 1
-
-
 @pytest.mark.parametrize("stall", some([2.0, 0.6], 2))
 def test_after_a_stall_a_key_that_is_still_held_moves_nothing(drive: Drive, lamp: Lamp, stall: float) -> None:
     console = drive()

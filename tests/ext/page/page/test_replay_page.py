@@ -76,12 +76,6 @@ def test_the_way_to_a_day_and_a_robot(show: Show) -> None:
         assert [one for one in opened.complaints() if "closed before the connection is established" not in one] == []
 
 
-def test_no_way_leads_there_without_recordings(show: Show) -> None:
-    with show(STATES["fleet"]) as opened:
-        opened.test("phone").wait_for()
-        assert opened.page.locator("a[href^='/replay']").count() == 0
-
-
 def test_a_time_in_the_address_is_shown_and_follows_seeks(replay: Tab):
     assert "Recording of 22 Nov, 10:00:30" in replay.test("badge").inner_text()
     assert replay.test("time").inner_text().startswith("10:00:30.000")
@@ -89,23 +83,6 @@ def test_a_time_in_the_address_is_shown_and_follows_seeks(replay: Tab):
     seek(replay, AT + 12_345)
     assert shown(replay, AT + 12_300)
     assert replay.until(lambda: replay.page.url.endswith(f"/replay/{ROBOT}?at={AT + 12_345}"))
-
-
-def test_playing_and_its_keys(replay: Tab):
-    keys = replay.page.keyboard
-    keys.press("Space")
-    assert replay.until("pebble.replay.feed.played.on")
-    assert replay.until(lambda: position(replay) > AT + 1500)
-    assert replay.until("pebble.replay.video.info.receivedMs > pebble.replay.feed.position - 400")
-    keys.press("Space")
-    assert replay.until("!pebble.replay.feed.played.on")
-    before = position(replay)
-    keys.press("ArrowRight")
-    assert position(replay) == pytest.approx(before + 10_000, abs=1)
-    keys.press("+")
-    assert replay.until("pebble.replay.feed.played.speed === 2")
-    keys.press("Home")
-    assert replay.until(lambda: START <= position(replay) <= START + 10_000)
 
 
 @pytest.mark.parametrize("size", ["desktop", "phone"])
@@ -144,11 +121,6 @@ def test_the_cards_show_that_time_and_none_of_them_sends(replay: Tab):
     assert replay.until(lambda: "line 3" in replay.test("log-lines").inner_text())
     assert "line 10" not in replay.test("log-lines").inner_text()
     assert replay.page.evaluate("pebble.store.get('pebble/robots/goob', 'touch-sensors').value.value.a0") == 512  # live
-
-
-def test_a_time_at_which_nothing_was_recorded(show: Show) -> None:
-    with show(STATES["replay-gap"]) as opened:
-        assert opened.until(lambda: "No picture was recorded here" in opened.test("cover").inner_text(), 15)
 
 
 def test_stop_all_works_here_as_everywhere(show: Show, server: CannedServer) -> None:

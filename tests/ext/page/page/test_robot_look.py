@@ -66,21 +66,6 @@ def _notice(page: Page) -> None:
     page.evaluate("pebble.connection.show('Saved as goob.png')")
 
 
-def _lost(page: Page) -> None:
-    page.evaluate("pebble.connection.socket.socket.close()")
-    page.context.set_offline(True)
-
-
-#: Places of all that can be pressed in the fleet.
-CARDS_OF_FLEET = """() => Object.fromEntries([...document.querySelectorAll(".fleet-card, main button, .top .stop")]
-  .map((one, n) => [one.dataset.test ?? one.textContent.trim(), one.getBoundingClientRect()])
-  .map(([name, { x, y, width, height }]) => [name, [x, y, width, height].map(Math.round)]))"""
-#: Controls of the fleet of which a band over the title has any part.
-UNDER_BANDS = """() => [...document.querySelectorAll(".screen-title .banner")].flatMap((band) =>
-  [...document.querySelectorAll("main button, main input, main a")].filter((one) => {
-    const [a, b] = [band.getBoundingClientRect(), one.getBoundingClientRect()];
-    return !band.contains(one) && a.bottom > b.top && b.bottom > a.top && a.right > b.left && b.right > a.left;
-  })).map((one) => one.outerHTML.slice(0, 120))"""
 TROUBLE: dict[str, Callable[[Page], None]] = {
     "a stop": _stopped,
     "a question before the reset": _asks_to_reset,
@@ -104,21 +89,6 @@ def test_trouble_moves_nothing_that_works_a_robot(show: Show, size: Size, what: 
         assert len(before) >= 5
         if size != "landscape":  # there a band may lie over what is off meanwhile, which is hidden
             assert opened.page.evaluate(COVERED) == []
-
-
-@pytest.mark.parametrize("size", ["desktop", "phone"])
-@pytest.mark.parametrize("what", [_stopped, _notice, _lost], ids=lambda one: one.__name__)
-def test_trouble_moves_nothing_in_the_fleet(show: Show, size: Size, what: Callable[[Page], None]) -> None:
-    with show(replace(STATES["fleet"], repeated={"online": 1.0}), size) as opened:
-        assert opened.until("document.querySelectorAll('.fleet-card').length >= 5")
-        opened.page.wait_for_timeout(800)
-        before = opened.page.evaluate(CARDS_OF_FLEET)
-        what(opened.page)
-        opened.page.wait_for_timeout(1300)
-        after = opened.page.evaluate(CARDS_OF_FLEET)
-        assert {name: place for name, place in after.items() if before.get(name, place) != place} == {}
-        assert opened.page.evaluate(COVERED) == []
-        assert opened.page.evaluate(UNDER_BANDS) == []
 
 
 def test_cards_stay_in_their_places(show: Show) -> None:
