@@ -166,9 +166,6 @@ class Console:
     def speeds(self) -> tuple[float, float]:
         return self.stage.motors(self.name)[-1][1]
 
-    def turns(self, wheels: Wheels, within: float = 2.0) -> bool:
-        return self.tab.until(lambda: self.wheels == wheels, within)
-
     def rests(self, within: float = REST_S) -> bool:
         return self.tab.until(lambda: self.wheels == REST, within)
 

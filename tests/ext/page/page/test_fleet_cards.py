@@ -9,6 +9,20 @@ from tests.ext.page.states import STATES
 pytestmark = pytest.mark.page
 
 
+def test_the_first_steps_are_ticked_and_can_be_hidden(show: Show) -> None:
+    with show(STATES["fleet"]) as opened:
+        steps = opened.test("first-time")
+        steps.get_by_text("Drive").click()
+        assert opened.until("location.pathname !== '/'", 3)
+        opened.page.go_back()
+        assert opened.until(lambda: steps.locator(".step.done").count() == 1)
+        opened.test("hide-first-time").click()
+        assert steps.count() == 0
+        opened.page.reload()
+        opened.test("card-goob").wait_for()
+        assert steps.count() == 0
+
+
 def shown(cards: Locator) -> list[str]:
     return cards.locator("h2").all_inner_texts()
 

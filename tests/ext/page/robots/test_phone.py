@@ -62,7 +62,7 @@ def test_the_stick_follows_a_finger_until_it_is_lifted(
             assert robot.rests()
         assert robot.drive_by_stick()
         robot.fingers.move(1, robot.place("stick")[0], 1)  # far above the stick
-        assert robot.turns(FORWARD)
+        assert robot.tab.until(lambda: robot.wheels == FORWARD, 2)
         robot.fingers.up(1)
         assert robot.rests()
 
