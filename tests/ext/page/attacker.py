@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import socket
-import time
 from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
@@ -80,21 +78,6 @@ class Hall:
         except InvalidStatus as refused:
             return refused.response.status_code
         return 101
-
-    def raw(self, request: bytes) -> bytes:
-        """The answer to these bytes."""
-        with socket.create_connection(("127.0.0.1", self.served.port), 10) as client:
-            client.sendall(request)
-            answer = b""
-            while part := client.recv(65536):
-                answer += part
-            return answer
-
-    def works(self) -> bool:
-        """Whether it still serves, quickly."""
-        with self.client("viewer") as client:
-            start = time.monotonic()
-            return client.get("/").status_code == 200 and time.monotonic() - start < 5
 
     def routes(self, kind: type[Route] | type[WebSocketRoute], method: str = "") -> Iterator[str]:
         """The paths that the server has, with something in place of parameters."""

@@ -128,9 +128,6 @@ class Page:
     def close(self) -> None:
         self._socket.close()
 
-    def abort(self) -> None:
-        """Vanish without a goodbye."""
-        self._socket.socket.close()
 
     def __enter__(self) -> Self:
         return self

@@ -49,17 +49,6 @@ def test_a_silent_page_is_stopped_and_its_gesture_is_over(page, robot):
     assert until(lambda: last(robot)["z"] == 0.5)
 
 
-def test_a_lost_page_is_stopped(served, robot):
-    page = served.page()
-    assert page.knows(robot.base)
-    assert page.ready()
-    assert page.take(robot.base)
-    page.drive(robot.base, 1, z=0.5)
-    assert until(lambda: robot.drives())
-    page.abort()
-    assert until(lambda: last(robot) == FINAL, 1)
-
-
 def test_a_clock_that_jumps_ends_the_connection(page, robot):
     assert page.take(robot.base)
     page.drive(robot.base, 2, z=0.5, age_ms=-5000)
@@ -90,18 +79,6 @@ def test_a_broker_that_does_not_answer_ends_the_gesture(broker, page, robot):
     assert last(robot) == FINAL
     page.drive(robot.base, 3, z=0.5)
     assert until(lambda: last(robot)["z"] == 0.5)
-
-
-def test_space_stops_for_everybody_and_ends_the_gesture(served, page, robot):
-    assert page.take(robot.base)
-    page.drive(robot.base, 1, z=0.5)
-    with served.page() as other:
-        assert other.knows(robot.base)
-        other.send("stop", ref=robot.base)
-        assert until(lambda: last(robot) == FINAL)
-        page.drive(robot.base, 1, z=0.5)
-        assert until(lambda: page.refused)
-        assert last(robot) == FINAL
 
 
 def test_an_emergency_stop_is_repeated_until_the_robot_confirms_and_a_reset_names_what_was_shown(page, robot):

@@ -20,6 +20,7 @@ import pytest
 from pebble.extensions.page.robots import MAX_COMPONENTS
 from tests.commands.command_line import program
 from tests.ext.page.served import FREE, Page
+from tests.kit import mqtt_bytes
 from tests.kit.played_robot import RecordingRobot
 from tests.support import Broker, until
 
@@ -70,28 +71,18 @@ def server(broker: Broker, tmp_path_factory: pytest.TempPathFactory) -> Iterator
     assert "Traceback" not in written, written
 
 
-def flood(port: int, messages: Iterable[tuple[str, bytes]], *, retain: bool = False) -> int:
+def flood(port: int, messages: Iterable[tuple[str, bytes]]) -> int:
     """Publish everything with QoS 0, as fast as the broker takes it."""
     count = 0
     with socket.create_connection(("127.0.0.1", port), 30) as client:
-        client.sendall(b"\x10\x10\x00\x04MQTT\x04\x02\x00\x00\x00\x04evil")
+        client.sendall(mqtt_bytes.connect(None, None))
         assert client.recv(4) == b"\x20\x02\x00\x00"
         for topic, payload in messages:
-            body = len(topic).to_bytes(2, "big") + topic.encode() + payload
-            client.sendall((b"\x31" if retain else b"\x30") + _length(len(body)) + body)
+            client.sendall(mqtt_bytes.publish(topic, payload))
             count += 1
-        client.sendall(b"\xc0\x00")
+        client.sendall(mqtt_bytes.packet(0xC0, b""))
         assert client.recv(2) == b"\xd0\x00", "the broker has taken everything"
     return count
-
-
-def _length(number: int) -> bytes:
-    """MQTT's: seven bits in a byte."""
-    encoded = b""
-    while number > 127:
-        encoded += bytes([number % 128 | 128])
-        number //= 128
-    return encoded + bytes([number])
 
 
 def drives(page: Page, robot: RecordingRobot) -> bool:

@@ -14,7 +14,6 @@ from tests.ext.page.states import ASKED, GOOB, MINE, STATES, at, changed, device
 pytestmark = pytest.mark.page
 
 FORM = {"tag_id": 7, "search": False, "family": "APRILTAG_36H11"}
-LEASE: dict[str, Any] = {"op": "lease", "ref": GOOB}
 #: State, what is done with controls by their names ("name=text" is filled in, "name!" is held), what is sent: an op of
 #: this kind, each time with these fields.
 SENDS: dict[str, tuple[str, str, str, list[dict[str, Any]]]] = {
