@@ -128,7 +128,6 @@ class Page:
     def close(self) -> None:
         self._socket.close()
 
-
     def __enter__(self) -> Self:
         return self
 

@@ -108,15 +108,6 @@ async def test_a_page_that_reloads_does_not_restart_the_request(kind: Kind, robo
     assert robot.encodings == [robot.best]
 
 
-async def test_a_flag_that_was_up_stays_up(kind: Kind, robot: Any) -> None:
-    robot.raise_flag()
-    async with serving(robot) as server:
-        page = await opened(server, kind)
-        page.leave()
-        await until(lambda: server.shows("rest"))
-    assert robot.flags == []
-
-
 async def test_it_is_requested_again_while_nothing_comes(kind: Kind, robot: Any, server: Server) -> None:
     await opened(server, kind)
     robot.mute = True
@@ -160,13 +151,6 @@ async def test_capabilities_that_change_later_end_the_request(
     await until(lambda: server.shows("refused"))
     await until(lambda: robot.encodings == [robot.best, None] and robot.flags == [True, False])
     assert {message.topic for message in robot.published} == {robot.request, robot.flag}
-
-
-async def test_a_robot_that_lists_no_encodings_sends_what_it_sends(kind: Kind) -> None:
-    robot: Any = kind.robot({key: value for key, value in kind.robot.section.items() if key != "encodings"})
-    async with serving(robot) as server:
-        await opened(server, kind, 4)
-        assert robot.encodings == [""]
 
 
 async def test_a_page_that_sends_what_is_not_understood_is_closed(kind: Kind, server: Server) -> None:
