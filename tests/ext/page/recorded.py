@@ -37,6 +37,7 @@ DRIVEN: Final = range(START + 20_000, START + 50_000)
 PICTURE_MS, SOUND_MS = 100, 20
 PICTURE_LATE_MS, SOUND_LATE_MS = 40, 30  # from its capture to its reception
 SPEECH: Final = 160_000  # samples
+SQUARE: Final = [[0.25, 0.25], [0.6, 0.25], [0.6, 0.7], [0.25, 0.7]]
 CAMERA, MICROPHONE = f"{ROBOT}/outgoing/front-camera", f"{ROBOT}/outgoing/audio"
 
 
@@ -72,9 +73,9 @@ STREAMS: Final[list[tuple[str, int, Callable[[int], Any]]]] = [
     ("charging-level", 5000, lambda at: {"value": 7.92 - (at - START) / 4e6, "unit": "v"}),
     ("charging-status", 20_000, lambda _at: {"value": False}),
     ("sensors/imu", 200, states.attitude),
-    ("touch-sensors", 200, states.touch),
+    ("touch-sensors", 200, lambda at: {"value": {"a0": at // 200 % 900, "a1": 498, "a2": 730}, "unit": "adc"}),
     ("wheel-odometry", 200, lambda at: states.odometry((at - START) / 1000)),
-    ("video-overlays", 100, lambda _at: states.OVERLAYS),
+    ("video-overlays", 100, lambda _at: {"source": "tags", "shapes": [SQUARE], "labels": []}),
     ("logs", 3000, _log),
 ]
 

@@ -99,7 +99,6 @@ class MediaRobot(ABC):
     def announce(self, section: dict[str, Any]) -> None:
         self.transport.publish(CAPABILITIES, capabilities(section, self.medium), qos=QoS.DELIVERED, retain=True)
 
-
     def send(self, payload: bytes) -> None:
         self.transport.publish(self.section["topic"], payload)
 
