@@ -74,6 +74,7 @@ def check(browser: Browser, server: CannedServer, state: str, losses: Iterator[t
                 _UNANSWERED.pop().abort()
 
 
+@pytest.mark.timeout(300)
 @pytest.mark.parametrize("state", SAMPLE)
 def test_a_page_that_loses_a_file_stops_robots(browser: Browser, server: CannedServer, state: str) -> None:
     faults = itertools.cycle(FAULTS)
