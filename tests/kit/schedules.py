@@ -27,7 +27,6 @@ ENGINES = {
     "motion": "tests.motion.histories",
     "lockstep": "tests.robot.lockstep.schedules",
     "owners": "tests.robot.lockstep.two_owners",
-    "driving_lockstep": "tests.ext.page.driving_lockstep.schedules",
     "stops": "tests.services.mqtt_bridge.stop_schedules",
     "robot_scripts": "tests.robot.script_schedules.world",
     "robot_stops": "tests.robot.stop_schedules.performance",

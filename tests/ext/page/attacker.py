@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import socket
-import time
 from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
@@ -13,7 +11,7 @@ from typing import Any, Self
 
 import httpx
 from starlette.routing import Route, WebSocketRoute
-from websockets.exceptions import ConnectionClosed, InvalidStatus
+from websockets.exceptions import InvalidStatus
 from websockets.sync.client import ClientConnection, connect
 
 from pebble.extensions.fleet.people import People, User
@@ -73,19 +71,6 @@ class Hall:
         own = self.served.origin if origin == "" else origin
         return connect(url, origin=own, additional_headers=headers, max_size=None)  # type: ignore[arg-type]
 
-    def closed_after(self, path: str, cookie: str, *messages: str | bytes) -> bool:
-        """Whether the server closes a WebSocket on which these messages were sent."""
-        with self.socket(path, cookie=cookie) as opened:
-            try:
-                for message in messages:
-                    opened.send(message)
-                while True:
-                    opened.recv(timeout=3)
-            except ConnectionClosed:
-                return True
-            except TimeoutError:
-                return False
-
     def refusal(self, path: str, **options: Any) -> int:
         """The status with which a WebSocket is refused; 101 if it is not."""
         try:
@@ -93,21 +78,6 @@ class Hall:
         except InvalidStatus as refused:
             return refused.response.status_code
         return 101
-
-    def raw(self, request: bytes) -> bytes:
-        """The answer to these bytes."""
-        with socket.create_connection(("127.0.0.1", self.served.port), 10) as client:
-            client.sendall(request)
-            answer = b""
-            while part := client.recv(65536):
-                answer += part
-            return answer
-
-    def works(self) -> bool:
-        """Whether it still serves, quickly."""
-        with self.client("viewer") as client:
-            start = time.monotonic()
-            return client.get("/").status_code == 200 and time.monotonic() - start < 5
 
     def routes(self, kind: type[Route] | type[WebSocketRoute], method: str = "") -> Iterator[str]:
         """The paths that the server has, with something in place of parameters."""

@@ -32,13 +32,6 @@ _COVERS = (
 _LOOK_MS = 20  # between two looks: each costs three programs a millisecond
 _VIOLATIONS = """addEventListener("securitypolicyviolation", (event) =>
   pebbleViolation(`${event.violatedDirective} ${event.blockedURI}`))"""
-#: The pixels of a canvas, RGBA. Of a copy: Chromium complains of a canvas that is drawn on and often read.
-PIXELS = """const pixelsOf = (canvas) => {
-  const { width, height } = canvas;
-  const copy = new OffscreenCanvas(width, height).getContext("2d", { willReadFrequently: true });
-  copy.drawImage(canvas, 0, 0);
-  return copy.getImageData(0, 0, width, height).data;
-};"""
 #: As if a viewer had opened the cards for engineers, and all plots: most tests look at one of them.
 _ENGINEERS = """try {
   const key = `pebble cards ${decodeURIComponent(location.pathname.split("/r/")[1])}`;
@@ -165,14 +158,14 @@ def tab(
     *,
     script: str = "",
     engineers: bool = True,
+    here: Literal["commit", "domcontentloaded"] = "domcontentloaded",
     routes: Mapping[Any, Callable[[Route], object]] | None = None,
     **options: Any,
 ) -> Iterator[Tab]:
     """Open ``url`` in a context of its own; ``script`` runs before the page's; ``options`` are those of a context.
 
-    ``engineers``: the cards for engineers are open, and all plots are shown.
-
-    ``routes`` answer requests instead of the server, by what their addresses match.
+    ``engineers``: the cards for engineers are open, and all plots are shown. ``here``: until when it waits for the
+    page. ``routes`` answer requests instead of the server, by what their addresses match.
     """
     width, height = SIZES[size]
     touch = size != "desktop"
@@ -182,7 +175,7 @@ def tab(
         for pattern, answer in (routes or {}).items():
             context.route(pattern, answer)
         opened = _prepared(context, (_ENGINEERS if engineers else "") + script)
-        opened.page.goto(url, timeout=1000 * _OPEN_S, wait_until="domcontentloaded")
+        opened.page.goto(url, timeout=1000 * _OPEN_S, wait_until=here)
         yield opened
     finally:
         context.close()

@@ -44,7 +44,6 @@ from pebble.extensions.page.setting import WebSettings
 from pebble.extensions.page.shown import shown
 from pebble.extensions.page.static_files import StaticFiles
 from pebble.transports import MqttSettings
-from tests.ext.page import recorded
 from tests.ext.page.browser import Size, Tab, tab
 from tests.support import ROOT, free_port, until
 
@@ -136,7 +135,9 @@ class CannedServer:
         """What pages that connect from now on are shown."""
         self.state = state
         if state.recordings and self._app.state.recordings is None:
-            self._app.state.recordings = recordings.Recordings(recorded.folder())
+            from tests.ext.page.recorded import folder  # which needs the states, and these this module
+
+            self._app.state.recordings = recordings.Recordings(folder())
         self.received.clear()
         self.posted.clear()
 

@@ -166,9 +166,6 @@ class Console:
     def speeds(self) -> tuple[float, float]:
         return self.stage.motors(self.name)[-1][1]
 
-    def turns(self, wheels: Wheels, within: float = 2.0) -> bool:
-        return self.tab.until(lambda: self.wheels == wheels, within)
-
     def rests(self, within: float = REST_S) -> bool:
         return self.tab.until(lambda: self.wheels == REST, within)
 
@@ -251,9 +248,6 @@ class Wire:
     def last(self, topic: str) -> Any:
         """The newest payload below ``pebble/robots``."""
         return self._last.get(f"pebble/robots/{topic}")
-
-    def all(self, topic: str) -> list[Any]:
-        return [payload for one, payload in list(self.received) if one == f"pebble/robots/{topic}"]
 
     def publish(self, topic: str, value: object, *, retain: bool = False) -> None:
         payload = b"" if value is None else msgspec.json.encode(value)

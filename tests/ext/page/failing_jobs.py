@@ -7,22 +7,7 @@ import signal
 import sys
 import threading
 from multiprocessing.connection import Connection
-from pathlib import Path
 from typing import Any
-
-from pebble.extensions.recordings.seek import questions
-from tests.ext.recordings.playing import GOOB, ms
-
-
-def without(package: str, kind: str, answer: Connection, archive: Path, scratch: Path) -> None:
-    """A real job where this package is not installed."""
-    sys.modules[package] = None  # type: ignore[assignment]
-    paths = [str(path) for path in archive.rglob("*.mcap")]
-    stretch = ms(5) * 10**6, ms(6) * 10**6
-    if kind == "timeline":
-        questions.make_timeline_job(answer, paths, scratch / package, GOOB, stretch)
-    else:
-        questions.export_job(answer, paths, scratch / f"{package}.mkv", GOOB, stretch, "mkv")
 
 
 def killed(answer: Connection, *_: Any) -> None:

@@ -11,7 +11,6 @@ import io
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -47,12 +46,6 @@ UNANSWERED = """window.WebSocket = class extends EventTarget {
 };"""
 #: What is fetched without a server, too.
 _PARTS = "!document.querySelector('.loading') && Boolean(document.querySelector('.key-place'))"
-#: A style sheet of its own: the page's policy allows no style element.
-_STYLED = """(rules) => {
-  const sheet = new CSSStyleSheet();
-  sheet.replaceSync(rules);
-  document.adoptedStyleSheets = [sheet];
-}"""
 _HERE = """!document.querySelector('.loading') && document.fonts.status === 'loaded' &&
   [...document.images].every((one) => one.complete || one.hidden) &&
   (!pebble.video.ref || Boolean(pebble.video.info))"""
@@ -115,15 +108,8 @@ LOOKS: dict[str, Look] = {
 }
 
 
-class Difference(NamedTuple):
-    """``share`` of the pixels that differ; ``marks``: a picture of where, or of both sizes that are not the same."""
-
-    share: float
-    marks: Pixels
-
-
-def taken(server: CannedServer, browser: Browser, look: Look, style: str = "") -> Pixels:
-    """The page as it looks, at half size; ``style``: with these rules besides its own."""
+def taken(server: CannedServer, browser: Browser, look: Look) -> Pixels:
+    """The page as it looks, at half size."""
     state = replace(look.state, at=AT, still=True, repeated={})
     width, height = SIZES[look.size]
     options = {"reduced_motion": "reduce", "timezone_id": "UTC", "locale": "en-GB", "engineers": False}
@@ -139,7 +125,6 @@ def taken(server: CannedServer, browser: Browser, look: Look, style: str = "") -
     ) as opened:
         assert opened.until(look.here, 60), f"{state.path} is not shown"
         look.act(opened.page)
-        opened.page.evaluate(_STYLED, style)
         return _at_rest(opened)
 
 
@@ -152,7 +137,7 @@ def _at_rest(opened: Tab) -> Pixels:
         half = picture.resize((picture.width // 2, picture.height // 2), Image.Resampling.BOX)
         seen.append(np.asarray(half))
         opened.page.wait_for_timeout(500)
-        return len(seen) > 3 and all(difference(one, seen[-1]).share == 0 for one in seen[-3:])
+        return len(seen) > 3 and all(difference(one, seen[-1]) == 0 for one in seen[-3:])
 
     assert opened.until(same, 90), "the page does not come to rest"
     return seen[-1]
@@ -162,31 +147,22 @@ def stored(name: str) -> Pixels:
     return np.asarray(Image.open(STORED / f"{name}.webp").convert("RGB"))
 
 
-def difference(one: Pixels, other: Pixels) -> Difference:
+def difference(one: Pixels, other: Pixels) -> float:
+    """Return the share of the pixels that differ."""
     if one.shape != other.shape:
-        size = tuple(max(a, b) for a, b in zip(one.shape, other.shape, strict=True))
-        marks = np.zeros(size, np.uint8)
-        for picture in (one, other):
-            marks[: picture.shape[0], : picture.shape[1]] += picture // 2
-        return Difference(1.0, marks)
-    differs = (np.abs(one.astype(np.int16) - other.astype(np.int16)) > LEVELS).any(axis=2)
-    marks = one // 4
-    marks[differs] = (255, 0, 90)
-    return Difference(float(differs.mean()), marks)
+        return 1.0
+    return float((np.abs(one.astype(np.int16) - other.astype(np.int16)) > LEVELS).any(axis=2).mean())
 
 
 def check(name: str, found: Pixels) -> None:
-    """An AssertionError names the pictures that show what is not as it is stored."""
-    share, marks = difference(found, stored(name))
+    """An AssertionError names the picture that is not as it is stored."""
+    share = difference(found, stored(name))
     if share <= SHARE:
         return
     FAILED.mkdir(parents=True, exist_ok=True)
-    paths = [FAILED / f"{name}.{what}.png" for what in ("actual", "difference")]
-    for path, picture in zip(paths, (found, marks), strict=True):
-        Image.fromarray(picture).save(path)
-    shown = " and ".join(str(path.relative_to(ROOT)) for path in paths)
+    Image.fromarray(found).save(actual := FAILED / f"{name}.png")
     raise AssertionError(
-        f"{name} looks different in {share:.2%} of its pixels: see {shown}. If it is meant to, "
+        f"{name} looks different in {share:.2%} of its pixels: see {actual.relative_to(ROOT)}. If it is meant to, "
         f"`make long PART=looks` renews {STORED.relative_to(ROOT)}"
     )
 

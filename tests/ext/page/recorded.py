@@ -22,14 +22,14 @@ from PIL import Image
 
 from pebble.contract.packets import Codec, Picture, PictureKind, Sound
 from pebble.extensions.media.speech import Speech
-from pebble.extensions.recordings.files.writer import RecordingWriter
 from pebble.extensions.recordings.recorder.intake import EVENTS
+from tests.ext.page import states
+from tests.ext.page.states import GAP, START
+from tests.ext.recordings import playing
 from tests.support import ROOT
 
 ROBOT: Final = "pebble/robots/goob"
 DAY: Final = "2026-11-22"
-START: Final = 1_795_305_600_000 + 36_000_000  # 10:00 UTC
-GAP: Final = (START + 90_000, START + 290_000)
 END: Final = START + 380_000
 STRETCHES: Final = [(START, GAP[0]), (GAP[1], END)]
 BEFORE: Final = (START - 86_400_000, START - 86_390_000)
@@ -37,42 +37,28 @@ DRIVEN: Final = range(START + 20_000, START + 50_000)
 PICTURE_MS, SOUND_MS = 100, 20
 PICTURE_LATE_MS, SOUND_LATE_MS = 40, 30  # from its capture to its reception
 SPEECH: Final = 160_000  # samples
+SQUARE: Final = [[0.25, 0.25], [0.6, 0.25], [0.6, 0.7], [0.25, 0.7]]
 CAMERA, MICROPHONE = f"{ROBOT}/outgoing/front-camera", f"{ROBOT}/outgoing/audio"
-
-SQUARE = [[0.25, 0.25], [0.6, 0.25], [0.6, 0.7], [0.25, 0.7]]
 
 
 class Recorded(NamedTuple):
-    """One message."""
+    """One message of a recording."""
 
     at: int
     topic: str
     payload: bytes
 
+    @property
+    def log_ns(self) -> int:
+        return self.at * 10**6
+
+    @property
+    def metadata(self) -> dict[str, str]:
+        return {"qos": "0", "retain": "0"}
+
 
 def _json(value: Any) -> bytes:
     return json.dumps(value).encode()
-
-
-def _imu(at: int) -> dict[str, Any]:
-    seconds = at / 1000
-    value = {
-        "gyro_dps": {"x": 2 * math.sin(seconds), "y": math.cos(2 * seconds), "z": 20 * math.sin(seconds / 5)},
-        "orientation_deg": {"roll": 3 * math.sin(seconds / 7), "pitch": -2 * math.cos(seconds / 9)},
-        "accel_norm_g": 1 + 0.05 * math.sin(3 * seconds),
-    }
-    return {"t": at, "seq": at // 200, "mcu_ms": at % 1_000_000, "value": value}
-
-
-def _odometry(at: int) -> dict[str, Any]:
-    angle = (at - START) / 8000
-    value = {
-        "x_mm": 800 * math.sin(angle),
-        "y_mm": 500 * math.sin(2 * angle),
-        "heading_rad": math.atan2(1000 * math.cos(2 * angle), 800 * math.cos(angle)),
-        "distance_mm": abs(at - START) / 10,
-    }
-    return {"value": value, "unit": "mm", "source": "wheel-odometry", "timestamp": at / 1000}
 
 
 def _log(at: int) -> dict[str, Any]:
@@ -80,25 +66,15 @@ def _log(at: int) -> dict[str, Any]:
     return {"t": at, "level": level, "service": "mqtt_bridge", "message": f"line {(at - START) // 3000}"}
 
 
-def _capabilities(_at: int) -> dict[str, Any]:
-    value = {
-        "transport": {"kind": "zenoh"},
-        "video": {"available": True, "controls": True, "encodings": ["pbvd"]},
-        "audio": {"available": True, "controls": True, "encodings": ["pcm"]},
-        "drive": {"available": True, "controls": True},
-    }
-    return {"t": 0, "schema": "pebble-capabilities/v1", "value": value}
-
-
 #: Metric, ms between two messages, what they hold.
 STREAMS: Final[list[tuple[str, int, Callable[[int], Any]]]] = [
     ("online", 250, lambda at: {"t": at - 42}),
-    ("capabilities", 60_000, _capabilities),
+    ("capabilities", 60_000, lambda _at: states.capabilities("zenoh")),
     ("charging-level", 5000, lambda at: {"value": 7.92 - (at - START) / 4e6, "unit": "v"}),
     ("charging-status", 20_000, lambda _at: {"value": False}),
-    ("sensors/imu", 200, _imu),
+    ("sensors/imu", 200, states.attitude),
     ("touch-sensors", 200, lambda at: {"value": {"a0": at // 200 % 900, "a1": 498, "a2": 730}, "unit": "adc"}),
-    ("wheel-odometry", 200, _odometry),
+    ("wheel-odometry", 200, lambda at: states.odometry((at - START) / 1000)),
     ("video-overlays", 100, lambda _at: {"source": "tags", "shapes": [SQUARE], "labels": []}),
     ("logs", 3000, _log),
 ]
@@ -158,31 +134,17 @@ def _media(since: int, until: int) -> list[Recorded]:
     return sorted(found + [Recorded(at, MICROPHONE, _sound(at)) for at in _times(SOUND_MS, since, until)])
 
 
-def _write(path: Path, messages: list[Recorded]) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with path.open("wb", buffering=0) as file:
-        writer = RecordingWriter(file, library="pebble test")
-        channels: dict[str, int] = {}
-        second = 0
-        for at, topic, payload in messages:
-            if at // 1000 != second:  # a chunk for each second
-                second = at // 1000
-                writer.flush()
-            if topic not in channels:
-                channels[topic] = writer.channel(topic, "json", {"qos": "0", "retain": "0"})
-            writer.add(channels[topic], at * 10**6, payload)
-        writer.flush()
-        writer.finish()
-
-
 def write(root: Path) -> Path:
     """A folder as a recorder leaves it: files of state and of media."""
     names = ("20261122T100000Z", "20261122T100450Z")
+    day, before = root / "2026/11/22", root / "2026/11/21"
+    for folder in (day, before):
+        folder.mkdir(parents=True)
     for number, (name, (since, until)) in enumerate(zip(names, STRETCHES, strict=True)):
-        _write(root / f"2026/11/22/{name}-{2 * number + 2:06}.state.mcap", _state(since, until))
+        playing.write(day / f"{name}-{2 * number + 2:06}.state.mcap", _state(since, until), chunk_ns=10**9)
         media = f"{name}-{2 * number + 3:06}.media.{ROBOT.replace('/', '.')}.mcap"
-        _write(root / "2026/11/22" / media, _media(since, until))
-    _write(root / "2026/11/21/20261121T100000Z-000001.state.mcap", _state(*BEFORE))
+        playing.write(day / media, _media(since, until), chunk_ns=10**9)
+    playing.write(before / "20261121T100000Z-000001.state.mcap", _state(*BEFORE), chunk_ns=10**9)
     return root
 
 

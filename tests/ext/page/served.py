@@ -128,10 +128,6 @@ class Page:
     def close(self) -> None:
         self._socket.close()
 
-    def abort(self) -> None:
-        """Vanish without a goodbye."""
-        self._socket.socket.close()
-
     def __enter__(self) -> Self:
         return self
 
@@ -141,7 +137,7 @@ class Page:
     def _read(self) -> None:
         try:
             for text in self._socket:
-                self._take(json.loads(text))
+                self._take(json.loads(text, parse_constant=_refuse, parse_int=_whole))
         except (ConnectionClosed, OSError):
             pass
         self.closed = True
@@ -166,6 +162,16 @@ class Page:
                 self.welcome = message
             case "bye":
                 self.bye = message
+
+
+def _refuse(constant: str) -> None:
+    """Browsers read no NaN and no Infinity."""
+    raise ValueError(f"{constant} is no JSON")
+
+
+def _whole(digits: str) -> int | str:
+    """Python reads no number of thousands of digits."""
+    return int(digits) if len(digits) < 1000 else digits
 
 
 def now_ms() -> float:

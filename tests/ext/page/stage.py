@@ -44,9 +44,6 @@ class Stage(Testbed):
     def ref(self, name: str) -> str:
         return Identity("pebble", "robots", name).base
 
-    def robot_url(self, name: str) -> str:
-        return f"{self.url}r/{self.ref(name)}"
-
     def motors(self, name: str) -> list[tuple[int, tuple[float, float]]]:
         """Every change of its motors, oldest first: monotonic ns, left and right."""
         return [(entry.ns, entry.motors) for entry in self.robots[name].entries() if entry.motors is not None]
@@ -71,10 +68,6 @@ class Stage(Testbed):
         self.end(self.remote_broker)
         self.remote_broker = self.broker("remote-broker", port=self.broker_port)
         self.remote_broker.wait()
-
-    def turned_s(self, name: str, since_ns: int) -> float:
-        """How long its motors have run since then, in seconds."""
-        return sum(max(0, end - max(since_ns, begin)) for begin, end in self.motions(name)) / 1e9
 
     def lines(self, name: str) -> list[Entry]:
         """What its MCU received, oldest first."""

@@ -12,11 +12,13 @@ import msgspec
 from pebble.services.serial_mcu_bridge.pebble_serial_v1.manifest import parse_describe
 from tests.ext.boards import mcu_wire as wire
 from tests.ext.page.canned import State, Value
-from tests.ext.page.recorded import GAP, START
 
 GOOB, FRED, LAMP, BENJR = (f"pebble/robots/{name}" for name in ("goob", "fred", "minilamp", "benjr"))
 TOWER, EVE, SAT = "pebble/towers/tower-1", "pebble/people/eve", "pebble/satellites/cube-3"
 GOOB_PATH = f"/r/{GOOB}"
+#: When recordings of goob begin, 10:00 UTC of 22 November 2026, and the time between them.
+START = 1_795_341_600_000
+GAP = (START + 90_000, START + 290_000)
 
 #: What arrives again and again, and how often in seconds.
 LIVE = {"web/liveness": 1.0, "online": 1.0, "position": 1.0, "charging-level": 5.0, "sensors/imu": 0.2}

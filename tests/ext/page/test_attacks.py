@@ -61,56 +61,48 @@ def driver(hall: Hall, goob: RecordingRobot) -> Iterator[Page]:
         yield page
 
 
+def raw(hall: Hall, request: bytes) -> bytes:
+    """The answer to these bytes."""
+    with socket.create_connection(("127.0.0.1", hall.served.port), 10) as client:
+        client.sendall(request)
+        return b"".join(iter(lambda: client.recv(65536), b""))
+
+
+def works(hall: Hall) -> bool:
+    """Whether it still serves, quickly."""
+    with hall.client("viewer") as client:
+        start = time.monotonic()
+        return client.get("/").status_code == 200 and time.monotonic() - start < 5
+
+
 # -- other sites
 
 
-FOREIGN = (None, "http://evil.test")  # test_guard has more
+FOREIGN = (None, "http://evil.test")
 
 
-def test_a_page_of_another_site_opens_no_socket(hall: Hall, driver: Page) -> None:
-    cookie = hall.cookie("admin")
-    of_robots = [path for path in hall.routes(WebSocketRoute) if path != "/ws/replay"]  # here are no recordings
-    paths = [f"{path}?ref={GOOB}&can=json" for path in of_robots]
-    assert len(paths) >= 2
-    for path in paths:
-        assert hall.refusal(path, cookie=cookie) == 101, path
+def test_another_site_opens_no_socket_posts_nothing_and_is_served_nothing(
+    hall: Hall, driver: Page, everything: Everything
+) -> None:
+    """The guard, which test_guard has, stands before every route."""
+    cookie, body = hall.cookie("admin"), {"ref": GOOB, "stop": "0123456789abcdef", "op": "estop"}
+    for path in hall.routes(WebSocketRoute):
         for origin in FOREIGN:
-            assert hall.refusal(path, cookie=cookie, origin=origin) == 403, (path, origin)
-
-
-def test_it_posts_nothing(hall: Hall, driver: Page, everything: Everything) -> None:
-    paths = list(hall.routes(Route, "POST"))
-    assert {"/api/estop", "/api/login", "/api/logout"} <= set(paths)
-    body = {"ref": GOOB, "stop": "0123456789abcdef", "op": "estop", "user": "admin", "password": PASSWORDS["admin"]}
+            assert hall.refusal(f"{path}?ref={GOOB}&can=json", cookie=cookie, origin=origin) == 403, (path, origin)
+    paths = set(hall.routes(Route, "POST"))
+    assert {"/api/estop", "/api/login", "/api/logout"} <= paths
     with hall.client("admin") as client:
         for path in paths:
             for origin in FOREIGN:
-                headers = {} if origin is None else {"origin": origin}
-                for answer in (
-                    client.post(path, json=body, headers=headers),
-                    client.post(path, data=body, headers=headers),
-                ):
+                for content in ({"json": body}, {"data": body}):
+                    answer = client.post(path, headers={"origin": origin} if origin else {}, **content)
                     assert (answer.status_code, answer.text) == (403, "this request comes from another site\n"), path
                     assert "set-cookie" not in answer.headers
-            form = {"origin": hall.served.origin}
-            assert client.post(path, files={"a": b"b"}, headers=form).status_code == 415
-        for path in {*paths} - {"/api/estop"}:
-            assert client.post(path, data=body, headers=form).status_code == 415
         assert client.get("/").status_code == 200, "the session has ended"
-    assert not {topic for topic in everything.incoming() if topic.endswith("/estop")}
-
-
-def test_a_name_that_was_bent_to_this_machine_is_refused(hall: Hall, driver: Page) -> None:
-    cookie = hall.cookie("admin")
     for path in ("/", "/login", "/healthz", "/ca.pem", f"/static/{hall.served.version}/main.js"):
         request = f"GET {path} HTTP/1.1\r\nHost: evil.test\r\nCookie: {cookie}\r\nConnection: close\r\n\r\n"
-        assert hall.raw(request.encode()).startswith(b"HTTP/1.1 421 ")
-    upgrade = (
-        f"GET /ws/control HTTP/1.1\r\nHost: evil.test\r\nOrigin: http://evil.test\r\nCookie: {cookie}\r\n"
-        "Connection: Upgrade\r\nUpgrade: websocket\r\nSec-WebSocket-Version: 13\r\n"
-        "Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\n\r\n"
-    )
-    assert hall.raw(upgrade.encode()).startswith(b"HTTP/1.1 403 ")
+        assert raw(hall, request.encode()).startswith(b"HTTP/1.1 421 ")
+    assert not {topic for topic in everything.incoming() if topic.endswith("/estop")}
 
 
 # -- without a session
@@ -165,34 +157,27 @@ def moving(page: Page, robot: RecordingRobot) -> bool:
     return False
 
 
-@pytest.mark.parametrize("how", ["removed", "password", "role", "logout"])
-def test_a_session_that_is_revoked_while_driving_ends(
-    hall: Hall, broker: Broker, how: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+@pytest.mark.parametrize("how", ["removed", "role", "logout"])
+def test_a_session_that_is_revoked_while_driving_ends(hall: Hall, broker: Broker, how: str) -> None:
     base = f"pebble/robots/revoked-{how}"
-    hall.people.add("mallory", "sentinel of mallory", Role.DRIVER)
-    cookie = hall.cookie("mallory")
+    hall.people.add(f"mallory-{how}", "sentinel of mallory", Role.DRIVER)
+    cookie = hall.cookie(f"mallory-{how}")
     with RecordingRobot(broker.port, base) as robot, Page(hall.served, cookie=cookie) as page:
         assert page.knows(base)
         assert page.ready()
         pictures = hall.socket(f"/ws/media?ref={base}&can=json", cookie=cookie)
         assert moving(page, robot)
-        match how:
-            case "removed":
-                hall.people.remove("mallory")
-            case "password":
-                hall.people.set_password("mallory", "another sentinel")
-            case "role":
-                hall.people.set_role("mallory", Role.VIEWER)
-            case "logout":
-                headers = {"cookie": cookie, "origin": hall.served.origin}
-                assert httpx.post(f"{hall.served.origin}/api/logout", json={}, headers=headers).status_code == 200
+        if how == "removed":
+            hall.people.remove("mallory-removed")
+        elif how == "role":
+            hall.people.set_role("mallory-role", Role.VIEWER)
+        else:
+            headers = {"cookie": cookie, "origin": hall.served.origin}
+            assert httpx.post(f"{hall.served.origin}/api/logout", json={}, headers=headers).status_code == 200
         end = time.monotonic() + 3
         while time.monotonic() < end and not page.closed:
-            try:
+            with suppress(ConnectionClosed):
                 page.drive(base, int(now_ms()), z=0.5)
-            except ConnectionClosed:
-                break
             time.sleep(0.05)
         assert until(lambda: page.closed, 1)
         assert page.bye["why"]
@@ -202,8 +187,6 @@ def test_a_session_that_is_revoked_while_driving_ends(
                 pictures.recv(timeout=3)
             assert hall.refusal("/ws/control", cookie=cookie) == 403
         pictures.close()
-    if how != "removed":
-        hall.people.remove("mallory")
 
 
 # -- roles
@@ -241,22 +224,24 @@ def test_every_op_is_attacked() -> None:
     assert set(ops(GOOB)) == {kind.__struct_config__.tag for kind in get_args(m.FromPage)}
 
 
-def test_a_viewer_may_not(hall: Hall, broker: Broker, driver: Page, everything: Everything) -> None:
-    base, asked = "pebble/robots/viewed", sorted(set(ops(GOOB)) - FOR_VIEWERS)
-    with RecordingRobot(broker.port, base) as robot, hall.page("viewer") as page:
+@pytest.mark.parametrize(("role", "may"), [("viewer", FOR_VIEWERS), ("driver", set(ops("")) - {"action"})])
+def test_what_a_role_may_not(
+    hall: Hall, broker: Broker, driver: Page, everything: Everything, role: str, may: set[str]
+) -> None:
+    base, asked = f"pebble/robots/seen-by-{role}", sorted(set(ops(GOOB)) - may)
+    with RecordingRobot(broker.port, base) as robot, hall.page(role) as page:
         assert page.knows(base)
         assert page.ready()
-        before = dict(driver.state)
         for op in asked:
             page.send(op, **ops(base)[op])
         assert until(lambda: len(page.refused) >= len(asked)), page.refused
-        why = "The role viewer may not do this"
+        why = f"The role {role} may not do this"
         assert [(one["cmd"], one["why"]) for one in page.refused] == [(op, why) for op in asked]
         assert not page.closed
         time.sleep(0.2)
         assert robot.received == []
         assert everything.incoming(base) == set()
-        assert driver.value(base, "web/driver") == before.get((base, "web/driver"))
+        assert driver.value(base, "web/driver", "by") == ""
 
 
 def test_a_viewer_may_stop_and_is_offered_nothing_else(hall: Hall, broker: Broker) -> None:
@@ -288,7 +273,7 @@ def test_nothing_but_the_pages_files_is_served(hall: Hall, path: str) -> None:
     versions = (hall.served.version, "..", "%2e%2e", "x")
     for place in [f"/static/{version}/{path}" for version in versions] + [f"/static/{path}", f"/r/{path}", f"/{path}"]:
         request = f"GET {place} HTTP/1.1\r\nHost: 127.0.0.1:{hall.served.port}\r\nConnection: close\r\n\r\n"
-        answer = hall.raw(request.encode("latin-1", "replace"))
+        answer = raw(hall, request.encode("latin-1", "replace"))
         assert answer.split(b" ", 2)[1] in (b"303", b"307", b"400", b"404"), (place, answer[:100])
         assert secret not in answer
         assert b"root:" not in answer
@@ -299,30 +284,23 @@ def test_nothing_but_the_pages_files_is_served(hall: Hall, path: str) -> None:
 
 
 def bad_messages() -> dict[str, str | bytes]:
-    drive = '{"op":"drive","ref":"%s","g":1,"t":%s,"x":0,"z":%s}'
-    odd: dict[str, str | bytes] = {
-        f"z={value}": drive % (GOOB, int(now_ms()), value)
-        for value in ("NaN", "-Infinity", "1e999", "1.001", "-1.001", '"0.5"', "null", "[0.5]")
-    }
-    odd |= {f"t={value}": drive % (GOOB, value, "0.5") for value in ("NaN", "Infinity", "-1", '"1"')}
-    return odd | {
-        "g is huge": drive.replace('"g":1', '"g":1e100') % (GOOB, 1, 0.5),
-        "g is negative": drive.replace('"g":1', '"g":-1') % (GOOB, 1, 0.5),
-        "g is a fraction": drive.replace('"g":1', '"g":1.5') % (GOOB, 1, 0.5),
+    drive = '{"op":"drive","ref":"%s","g":%s,"t":%s,"x":0,"z":%s}'
+    values = ("NaN", "-Infinity", "1e999", "1.001", '"0.5"')
+    return {
+        **{f"z={value}": drive % (GOOB, 1, int(now_ms()), value) for value in values},
+        "t is infinite": drive % (GOOB, 1, "Infinity", "0.5"),
+        "g is huge": drive % (GOOB, "1e100", 1, 0.5),
+        "g is negative": drive % (GOOB, -1, 1, 0.5),
         "17 KB": json.dumps({"op": "watch", "ref": GOOB, "more": "x" * 17 * 1024}),
         "ref of 201": json.dumps({"op": "watch", "ref": "x" * 201}),
         "deep list": "[" * 16_000,
-        "drive without anything": '{"op":"drive"}',
         "unknown op": '{"op":"reboot","ref":"x"}',
         "not JSON": "drive!",
-        "not an object": "[]",
         "half a surrogate": '{"op":"watch","ref":"\\ud800"}',
         "hello again": '{"op":"hello","version":"x"}',
         "binary": b'{"op":"stop","ref":"x"}',
         "stop with another line": '{"op":"estop","ref":"","stop":"0123456789abcdef\\n"}',
-        "many owners": json.dumps(
-            {"op": "estop-reset", "ref": GOOB, "owners": [{"owner": "a", "boot": "b", "count": 1}] * 17}
-        ),
+        "many owners": json.dumps({"op": "estop-reset", "ref": GOOB, "owners": [OWNER] * 17}),
     }
 
 
@@ -340,7 +318,7 @@ def test_what_is_not_understood_ends_the_connection_and_moves_nothing(
         assert page.bye["why"]
         assert "Traceback" not in page.bye["why"]
         assert not [one for one in goob.drives(since) if one["x"] or one["z"]]
-    assert hall.works()
+    assert works(hall)
     assert not driver.closed
 
 
@@ -370,7 +348,7 @@ def test_names_of_robots_are_no_topics(hall: Hall, goob: RecordingRobot, everyth
             assert sent <= {f"{one}/incoming/{metric}" for one in named for metric in ("estop", "drive-values")}, ref
             page.send("estop-end", stop="0123456789abcdef")
             assert hall.refusal(f"/ws/media?ref={quote(ref)}", cookie=cookie) == 403, ref
-    assert hall.works()
+    assert works(hall)
 
 
 def test_a_viewer_does_not_talk(hall: Hall, driver: Page) -> None:
@@ -379,16 +357,21 @@ def test_a_viewer_does_not_talk(hall: Hall, driver: Page) -> None:
         assert json.loads(talker.recv(timeout=5)) == {"talk": 0, "on": False, "why": "The role viewer may not do this"}
 
 
-@pytest.mark.parametrize(
-    "body", [b"", b"\xff", b"{", b"[" * 16_000, b"null", b'{"op":"estop","ref":"\xff"}', b"x" * 17_000]
-)
+ODD_BODIES = [
+    *(b"", b"\xff", b"{", b"[" * 16_000, b"null", b'{"op":"estop","ref":"\xff"}', b"x" * 17_000),
+    *(b'{"user":1,"password":2}', b'{"user":["admin"],"password":"x"}', b'{"user":"\\ud800","password":"x"}'),
+    b'{"user":"x","password":"' + b"x" * 600 + b'"}',
+]
+
+
+@pytest.mark.parametrize("body", ODD_BODIES, ids=lambda body: repr(body[:30]))
 def test_odd_bodies_stop_nothing(hall: Hall, everything: Everything, body: bytes) -> None:
     headers = {"origin": hall.served.origin, "content-type": "application/json"}
     before = len(everything.incoming())
     with hall.client("admin") as client:
         for path in hall.routes(Route, "POST"):
             if path != "/api/logout":
-                expected = (400, 413, 429, *(404,) * ("{" in path))
+                expected = (400, 413, *(404,) * ("{" in path))
                 assert client.post(path, content=body, headers=headers).status_code in expected, path
     assert len(everything.incoming()) == before
 
@@ -398,55 +381,47 @@ def test_odd_bodies_stop_nothing(hall: Hall, everything: Everything, body: bytes
 
 def test_a_socket_without_hello_is_closed(hall: Hall, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(control, "HELLO_S", 0.3)
-    assert hall.closed_after("/ws/control", hall.cookie("admin"))
+    with hall.socket("/ws/control", cookie=hall.cookie("admin")) as silent:
+        assert json.loads(silent.recv(timeout=3))["why"] == "no hello"
+        with pytest.raises(ConnectionClosed):
+            silent.recv(timeout=3)
 
 
-def test_a_flood_of_stops_ends_no_other_persons_stop(hall: Hall, everything: Everything) -> None:
+def test_a_viewer_ends_no_other_persons_stop(hall: Hall, everything: Everything) -> None:
     def count() -> int:
         return len([one for one in everything.messages if one.topic == "pebble/robots/off/incoming/estop"])
 
     with hall.page("driver") as page, hall.page("viewer") as mallory:
         page.send("estop", ref="pebble/robots/off", stop="00000000000000ff")
         assert until(count)
-        with suppress(ConnectionClosed):
-            for number in range(300):
-                mallory.send("estop", ref=f"pebble/robots/w{number}", stop=f"{number:016x}")
-            mallory.send("estop-end", stop="00000000000000ff")
-        time.sleep(1)
+        mallory.send("estop-end", stop="00000000000000ff")
+        assert until(lambda: [one["why"] for one in mallory.refused] == ["The role viewer may not do this"])
         before = count()
         assert until(lambda: count() >= before + 2, 3), "it is no longer sent"
-        assert until(lambda: [one["why"] for one in mallory.refused] == ["The role viewer may not do this"])
         page.send("estop-end", stop="00000000000000ff")
         time.sleep(0.7)
         before = count()
         time.sleep(0.7)
         assert count() == before
-    assert hall.works()
 
 
 # -- guessing
 
 
 def test_passwords_cannot_be_guessed(broker: Broker, tmp_path: Path) -> None:
+    """How often one may try is tested where people are kept; which address counts is decided here."""
     with Hall(broker.port, tmp_path) as hall, hall.client() as client:
-        headers = {"origin": hall.served.origin}
 
-        def log_in(user: str, password: str) -> httpx.Response:
-            return client.post("/api/login", json={"user": user, "password": password}, headers=headers)
+        def log_in(user: str, password: str, **forwarded: str) -> int:
+            headers = {"origin": hall.served.origin, **forwarded}
+            return client.post("/api/login", json={"user": user, "password": password}, headers=headers).status_code
 
-        answers = [log_in("admin" if number % 2 else f"x{number}", f"guess {number}") for number in range(12)]
-        assert [answer.status_code for answer in answers] == [401] * 5 + [429] * 7
-        assert len({answer.content for answer in answers[:5]}) == 1
-        assert log_in("admin", PASSWORDS["admin"]).status_code == 429, "also for the right one"
-        for forwarded in ("x-forwarded-for", "forwarded", "x-real-ip", "x-client-ip"):
-            answer = client.post(
-                "/api/login",
-                json={"user": "driver", "password": PASSWORDS["driver"]},
-                headers={**headers, forwarded: "192.0.2.1"},
-            )
-            assert answer.status_code == 429, f"{forwarded} is not believed"
+        assert [log_in(f"x{number}", f"guess {number}") for number in range(7)] == [401] * 5 + [429] * 2
+        assert log_in("admin", PASSWORDS["admin"]) == 429, "also for the right one"
+        for name in ("x-forwarded-for", "forwarded", "x-real-ip", "x-client-ip"):
+            assert log_in("driver", PASSWORDS["driver"], **{name: "192.0.2.1"}) == 429, f"{name} is not believed"
         audit = hall.served.app.state.audit
-        assert until(lambda: {one.what for one in audit.read(9)} == {"login-refused", "login-limited"})
+        assert until(lambda: "login-limited" in {one.what for one in audit.read(9)})
 
 
 # -- secrets

@@ -1,4 +1,4 @@
-"""The page below a path of a reverse proxy: all that browsers ask for lies below it, and works as it does without."""
+"""The login in a browser, and the page below a path of a reverse proxy: all that browsers ask for lies below it."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import pytest
 from playwright.sync_api import Browser
 
 from tests.ext.page.attacker import PASSWORDS, Hall
-from tests.ext.page.browser import tab
+from tests.ext.page.browser import Tab, tab
 from tests.support import Broker
 from tests.tcp_proxy import PrefixProxy
 
@@ -38,6 +38,33 @@ def url_of(proxy: PrefixProxy) -> str:
     return f"http://127.0.0.1:{proxy.port}{proxy.prefix.decode()}"
 
 
+def log_in(opened: Tab, user: str, password: str) -> None:
+    opened.page.get_by_label("User").fill(user)
+    opened.page.get_by_label("Password").fill(password)
+    opened.page.get_by_role("button", name="Log in").click()
+
+
+def test_a_wrong_password_is_shown_and_no_login_leads_to_another_site(
+    broker: Broker, browser: Browser, tmp_path: Path
+) -> None:
+    with Hall(broker.port, tmp_path) as hall, tab(browser, f"{hall.served.origin}/login", "small") as opened:
+        why = lambda: opened.page.get_by_role("alert").inner_text()
+        assert opened.page.evaluate("() => document.documentElement.scrollWidth <= innerWidth")
+        log_in(opened, "viewer", "a wrong one")
+        assert opened.until(lambda: why() == "User or password is wrong")
+        opened.context.set_offline(True)
+        log_in(opened, "viewer", PASSWORDS["viewer"])
+        assert opened.until(lambda: why() == "No connection to the server")
+        opened.context.set_offline(False)
+        for target in ("//evil.test", "https://evil.test", "/r/\\\\evil.test", "javascript:alert(1)", "/login", ""):
+            opened.page.goto("about:blank")  # what is open would notice that it is logged out, and go to the login
+            opened.context.clear_cookies()
+            opened.page.goto(f"{hall.served.origin}/login?next={target}")
+            log_in(opened, "viewer", PASSWORDS["viewer"])
+            assert opened.until(lambda: opened.page.url == f"{hall.served.origin}/"), target
+        assert opened.page.evaluate("() => document.cookie") == "", "scripts do not see the session"
+
+
 def test_a_login_leads_to_the_screen_that_was_asked_for_and_each_screen_leads_on(
     broker: Broker, browser: Browser, tmp_path: Path, proxy: PrefixProxy
 ) -> None:
@@ -47,9 +74,7 @@ def test_a_login_leads_to_the_screen_that_was_asked_for_and_each_screen_leads_on
         proxy.lead_to(hall.served.port)
         one = opened.enter_context(tab(browser, f"{url}r/pebble/robots/goob"))
         assert one.page.url == f"{url}login?next=/r/pebble/robots/goob"
-        one.page.get_by_label("User").fill("driver")
-        one.page.get_by_label("Password").fill(PASSWORDS["driver"])
-        one.page.get_by_role("button", name="Log in").click()
+        log_in(one, "driver", PASSWORDS["driver"])
         assert one.until(lambda: one.page.url == f"{url}r/pebble/robots/goob")
         assert one.until("window.pebble?.route.ref === 'pebble/robots/goob'")
         one.page.goto(url)

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-import itertools
 import time
 
+from pebble.extensions.fleet.roles import Role, page_rights
+from tests.ext.page.attacker import Hall
 from tests.kit.played_robot import RecordingRobot
 from tests.support import until
 
 ZERO = {"x": 0.0, "z": 0.0, "y": 0.0}
 FINAL = {**ZERO, "valid_ms": 0}
-NAMES = itertools.count(1)
 
 
 def last(robot: RecordingRobot):
@@ -49,23 +49,8 @@ def test_a_silent_page_is_stopped_and_its_gesture_is_over(page, robot):
     assert until(lambda: last(robot)["z"] == 0.5)
 
 
-def test_a_lost_page_is_stopped(served, robot):
-    page = served.page()
-    assert page.knows(robot.base)
-    assert page.ready()
+def test_a_clock_that_jumps_ends_the_connection(page, robot):
     assert page.take(robot.base)
-    page.drive(robot.base, 1, z=0.5)
-    assert until(lambda: robot.drives())
-    page.abort()
-    assert until(lambda: last(robot) == FINAL, 1)
-
-
-def test_old_commands_move_nothing_and_a_clock_that_jumps_ends_the_connection(page, robot):
-    assert page.take(robot.base)
-    page.drive(robot.base, 1, z=0.5, age_ms=900)
-    assert until(lambda: page.refused)
-    assert page.refused[0]["why"] == "Commands are late"
-    assert robot.drives() == []
     page.drive(robot.base, 2, z=0.5, age_ms=-5000)
     assert until(lambda: page.closed)
     assert "jumped" in page.bye["why"]
@@ -96,31 +81,6 @@ def test_a_broker_that_does_not_answer_ends_the_gesture(broker, page, robot):
     assert until(lambda: last(robot)["z"] == 0.5)
 
 
-def test_a_page_that_connects_again_has_its_lease_but_no_gesture(served, robot):
-    first = served.page()
-    assert first.knows(robot.base)
-    assert first.ready()
-    assert first.take(robot.base)
-    first.close()
-    with served.page(token=first.welcome["token"]) as again:
-        assert until(lambda: again.value(robot.base, "web/driver", "you") is True)
-        with served.page(token=first.welcome["token"]) as copy:
-            time.sleep(0.3)
-            assert copy.value(robot.base, "web/driver", "you") is False
-
-
-def test_space_stops_for_everybody_and_ends_the_gesture(served, page, robot):
-    assert page.take(robot.base)
-    page.drive(robot.base, 1, z=0.5)
-    with served.page() as other:
-        assert other.knows(robot.base)
-        other.send("stop", ref=robot.base)
-        assert until(lambda: last(robot) == FINAL)
-        page.drive(robot.base, 1, z=0.5)
-        assert until(lambda: page.refused)
-        assert last(robot) == FINAL
-
-
 def test_an_emergency_stop_is_repeated_until_the_robot_confirms_and_a_reset_names_what_was_shown(page, robot):
     page.send("estop", ref=robot.base, stop="00000000000000aa", why="button")
     assert until(lambda: page.value(robot.base, "web/estop", "sending") == "confirmed")
@@ -137,15 +97,6 @@ def test_an_emergency_stop_is_repeated_until_the_robot_confirms_and_a_reset_name
     assert robot.latched
     page.send("estop-reset", ref=robot.base, owners=[shown])
     assert until(lambda: page.value(robot.base, "web/estop", "latched") is False)
-
-
-def test_all_are_stopped(broker, page, robot):
-    with RecordingRobot(broker.port, f"pebble/robots/rover{next(NAMES)}") as second:
-        assert page.knows(second.base)
-        page.send("estop", ref="", stop="00000000000000cc")
-        assert until(lambda: robot.latched and second.latched, 3)
-        page.send("estop-end", stop="00000000000000cc")  # else it collects further robots for three seconds
-        assert until(lambda: page.value(second.base, "web/estop", "sending") == "confirmed")
 
 
 def test_what_is_drawn_over_a_picture_comes_with_it(served, broker, page, robot):
@@ -168,3 +119,17 @@ def test_what_is_drawn_over_a_picture_comes_with_it(served, broker, page, robot)
         eye.publish("charging-level", {"value": 7.0})
         assert until(lambda: page.value(eye.base, "charging-level"))
         assert page.value(eye.base, "video-overlays") is None
+
+
+def test_only_who_has_the_right_takes_control_over(broker, tmp_path):
+    with (
+        Hall(broker.port, tmp_path) as hall,
+        RecordingRobot(broker.port, "pebble/robots/keeping", keeps=True) as robot,
+        hall.page("admin") as admin,
+    ):
+        assert admin.knows(robot.base)
+        assert admin.take(robot.base)
+        for role in Role:
+            with hall.page(role.value) as page:
+                assert page.knows(robot.base)
+                assert page.take(robot.base, over=True) is ("take" in page_rights(role)), role

@@ -4,21 +4,18 @@ from __future__ import annotations
 
 import json
 import signal
-import subprocess
 import sys
-import threading
 import time
 from collections.abc import Callable, Iterator
-from pathlib import Path
 from typing import Any
 
 import pytest
 
-from pebble.extensions.lab.simulation.trace import complete_lines, read_trace
-from pebble.transports import Message, MqttSettings, QoS, create
+from pebble.transports import Message, MqttSettings, create
 from tests.commands.command_line import Run
+from tests.ext.page.stage import Stage
 from tests.kit.terminal import Terminal
-from tests.support import ROOT, Broker, Child, gone, some, until
+from tests.support import some, until
 
 BASE = "pebble/robots/minilamp"
 VALID_S = 0.4  # of a command
@@ -27,39 +24,29 @@ ZERO, FINAL = {"x": 0, "z": 0, "y": 0}, {"x": 0, "z": 0, "y": 0, "valid_ms": 0}
 
 
 class Lamp:
-    """A simulated MiniLAMP: its own firmware, and what its motors really do."""
+    """MiniLAMP's own firmware on simulated motors: what these really do, and what reaches its broker."""
 
-    def __init__(self, folder: Path, broker: Broker) -> None:
+    def __init__(self, stage: Stage) -> None:
         self.commands: list[tuple[float, Any]] = []  # when they reached the broker
         self.control: dict[str, Any] = {}  # who has it
         self.stops = 0
-        self._trace, self._begin = folder / "trace", 0
-        self._transport = create("mqtt", "observer", MqttSettings(host="127.0.0.1", port=broker.port)).open()
-        self.capabilities = threading.Event()
+        self._stage, self._since_ns = stage, 0
+        self.url = f"mqtt://127.0.0.1:{stage.broker_port}"
+        self._transport = create("mqtt", "observer", MqttSettings(host="127.0.0.1", port=stage.broker_port)).open()
         self._transport.subscribe(f"{BASE}/#", self._take)
-        command = [sys.executable, "-m", "pebble.cli", "sim", "minilamp"]
-        address = [*("--broker", f"mqtt://127.0.0.1:{broker.port}"), *("--trace", str(self._trace))]
-        self._process = Child([*command, *address], cwd=ROOT, stderr=subprocess.DEVNULL)
-        assert self.capabilities.wait(20)
 
     def close(self) -> None:
-        self._process.terminate()
-        self._process.wait(10)
         self._transport.close()
 
     def forget(self) -> None:
         """Forget what was recorded, while the motors rest."""
         self.commands.clear()
-        self.stops = 0
-        self._begin = complete_lines(self._trace, self._begin)[1]
-
-    def publish(self, topic: str, body: object) -> None:
-        assert self._transport.publish(topic, json.dumps(body).encode(), qos=QoS.DELIVERED)
+        self.stops, self._since_ns = 0, time.monotonic_ns()
 
     @property
     def motors(self) -> list[tuple[float, tuple[float, float]]]:
         """When the motors changed, by the monotonic clock, and to what."""
-        return [(one.ns / 1e9, one.motors) for one in read_trace(self._trace, self._begin) if one.motors is not None]
+        return [(ns / 1e9, speeds) for ns, speeds in self._stage.motors("minilamp") if ns > self._since_ns]
 
     @property
     def moving(self) -> bool:
@@ -84,16 +71,20 @@ class Lamp:
             self.control = json.loads(message.payload)
         elif message.topic.endswith("incoming/estop"):
             self.stops += 1
-        elif metric == "capabilities":
-            self.capabilities.set()
 
 
 Drive = Callable[..., Terminal]
 
 
 @pytest.fixture(scope="module")
-def one_lamp(tmp_path_factory: pytest.TempPathFactory, broker: Broker) -> Iterator[Lamp]:
-    lamp = Lamp(tmp_path_factory.mktemp("lamp"), broker)
+def stage() -> Iterator[Stage]:
+    with Stage("minilamp", room=False) as running:
+        yield running
+
+
+@pytest.fixture(scope="module")
+def one_lamp(stage: Stage) -> Iterator[Lamp]:
+    lamp = Lamp(stage)
     yield lamp
     lamp.close()
 
@@ -107,12 +98,11 @@ def lamp(one_lamp: Lamp) -> Lamp:
 
 
 @pytest.fixture
-def drive(broker: Broker, lamp: Lamp) -> Iterator[Drive]:
+def drive(lamp: Lamp) -> Iterator[Drive]:
     consoles: list[Terminal] = []
 
     def start(*options: str, shell: bool = False, shows: str = "ready") -> Terminal:
-        url = f"mqtt://127.0.0.1:{broker.port}"
-        command = [sys.executable, "-m", "pebble", "drive", "minilamp", "--url", url, *options]
+        command = [sys.executable, "-m", "pebble", "drive", "minilamp", "--url", lamp.url, *options]
         if shell:
             consoles.append(Terminal("bash", "--norc", "-i"))
             consoles[-1].type(" ".join(command).encode() + b"\n")
@@ -192,14 +182,6 @@ def test_what_ends_a_drive_stops_the_robot_at_once(drive: Drive, lamp: Lamp, end
     assert until(lambda: [command for _, command in lamp.commands[-3:]] == [FINAL] * 3), lamp.commands[-8:]
 
 
-def test_a_terminal_that_is_closed_stops_the_robot_at_once(drive: Drive, lamp: Lamp) -> None:
-    console = drive()
-    driving(console, lamp)
-    console.hang_up()
-    assert lamp.halted_after(time.monotonic()) < BUSY_S
-    assert console.process.wait(5) == 1
-
-
 @pytest.mark.parametrize("stall", some([2.0, 0.6], 2))
 def test_after_a_stall_a_key_that_is_still_held_moves_nothing(drive: Drive, lamp: Lamp, stall: float) -> None:
     console = drive()
@@ -243,7 +225,7 @@ def test_ctrl_z_stops_the_robot_and_what_follows_needs_a_new_key(drive: Drive, l
 
 
 @pytest.mark.parametrize("keys", some([b"\x1b\x1b", b"!"], 2))
-def test_an_emergency_stop_latches(drive: Drive, lamp: Lamp, run: Run, broker: Broker, keys: bytes) -> None:
+def test_an_emergency_stop_latches(drive: Drive, lamp: Lamp, run: Run, keys: bytes) -> None:
     console = drive()
     driving(console, lamp)
     console.type(keys)
@@ -253,64 +235,30 @@ def test_an_emergency_stop_latches(drive: Drive, lamp: Lamp, run: Run, broker: B
     time.sleep(1.0)
     assert (lamp.moved_since(pressed + BUSY_S), console.process.poll()) == (False, None)
     console.hold(b"")
-    url = f"--url=mqtt://127.0.0.1:{broker.port}"
-    assert run("estop", "reset", "minilamp", url) == 0
+    assert run("estop", "reset", "minilamp", "--url", lamp.url) == 0
     console.forget()
     assert console.sees("ready"), console.shown
     driving(console, lamp)
 
 
-def test_an_emergency_stop_is_sent_on_after_the_terminal_has_ended(
-    drive: Drive, lamp: Lamp, run: Run, broker: Broker
-) -> None:
+def test_an_emergency_stop_is_sent_on_after_the_terminal_has_ended(drive: Drive, lamp: Lamp, run: Run) -> None:
     console = drive()
     console.type(b"!\x04")
     assert console.process.wait(10) == 0
     assert lamp.stops >= 1
     assert "NOT CONFIRMED" not in console.shown.rpartition("\n")[2]
-    assert run("estop", "reset", "minilamp", f"--url=mqtt://127.0.0.1:{broker.port}") == 0, run.err
+    assert run("estop", "reset", "minilamp", "--url", lamp.url) == 0, run.err
 
 
-def test_a_driver_elsewhere_is_respected_until_it_is_taken_over(drive: Drive, lamp: Lamp) -> None:
-    bob = {"id": "b0b0b0b0", "by": "bob", "device": "phone"}
-    control, ending = f"{BASE}/incoming/control", threading.Event()
-
-    def repeat() -> None:
-        while not ending.wait(0.5):
-            lamp.publish(control, bob)
-
-    thread = threading.Thread(target=repeat, daemon=True)
-    thread.start()
-    try:
-        lamp.publish(f"{control}/take", bob)
-        assert until(lambda: lamp.control.get("by") == "bob")
-        console = drive(shows="is driving")
-        console.type(b"o")
-        assert console.sees("ready")
-        driving(console, lamp)
-        console.hold(b"")
-        console.forget()
-        lamp.publish(f"{control}/take", bob)
-        assert console.sees("bob (phone, name not checked) is driving")
-        resumed = time.monotonic()
-        time.sleep(0.6)
-        console.hold(b"w")
-        time.sleep(0.6)
-        assert not lamp.moved_since(resumed + VALID_S)
-    finally:
-        ending.set()
-        thread.join()
-
-
-def test_a_broker_that_is_gone_and_comes_back(drive: Drive, lamp: Lamp, broker: Broker) -> None:
+def test_a_broker_that_is_gone_and_comes_back(drive: Drive, lamp: Lamp, stage: Stage) -> None:
     console = drive()
     driving(console, lamp)
     console.forget()
-    broker.stop()
+    stage.remote_broker.kill()
     assert console.sees("no connection: ")
     assert lamp.halted_after(time.monotonic()) < VALID_S + 1.0
     console.hold(b"")
-    broker.start()
+    stage.restart_broker()
     console.forget()
     assert console.sees("ready", 30)
     driving(console, lamp)
@@ -320,14 +268,3 @@ def test_without_a_terminal_there_is_one_line(run: Run) -> None:
     assert run("drive", "minilamp", "--url", "mqtt://127.0.0.1") == 1
     assert run.err.startswith("pebble: driving by keys needs a terminal of Linux or macOS: use `pebble web`, ")
     assert run.err.count("\n") == 1
-
-
-def test_an_unreachable_broker_is_reported_before_the_terminal_is_changed() -> None:
-    console = Terminal(sys.executable, "-m", "pebble", "drive", "minilamp", "--url", "mqtt://127.0.0.1:1")
-    try:
-        assert console.process.wait(20) == 1
-        assert console.sees("cannot connect to mqtt://127.0.0.1:1")
-        assert console.restored
-    finally:
-        console.close()
-    assert gone(console.process.pid)

@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-import re
 import secrets
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager, suppress
-from dataclasses import replace
-from pathlib import Path
-from typing import Any
+from contextlib import contextmanager, suppress
 
 import numpy as np
 import pytest
@@ -18,13 +14,11 @@ from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 
 from pebble.contract import CAMERA
-from pebble.extensions.fleet.roles import Account
 from pebble.extensions.media.video import make_encoder
 from pebble.transports import MqttSettings, QoS, create
-from tests.ext.fleet.brokers import FleetBroker
 from tests.ext.page.served import FREE, Page, Served
 from tests.kit.played_robot import RecordingRobot
-from tests.support import Broker, free_port, until
+from tests.support import Broker, until
 from tests.tcp_proxy import SlowTcpProxy, TcpProxy
 
 GOOB = "pebble/robots/goob"
@@ -129,39 +123,3 @@ def test_driving_goes_on_where_the_second_connection_is_refused(broker: Broker, 
             page.drive(GOOB, 1, z=0.5)
             assert until(lambda: any(one["z"] for one in robot.drives()))
             assert stop_s(page) < 4
-
-
-def test_at_named_it_has_the_servers_account_and_asks_only_for_pictures(tmp_path: Path) -> None:
-    """And when another client takes it away, the page drives and stops, and the pictures come again."""
-    people = {"page-1": Account(roles=("page",)), "goob": Account(roles=("robot",), bases=(GOOB,))}
-    with ExitStack() as ending:
-        broker = ending.enter_context(FleetBroker(tmp_path / "fleet", people, level="named", unencrypted=free_port()))
-        port = broker.unencrypted or 0
-        page_login, robot_login = ({"username": name, "password": broker.passwords[name]} for name in people)
-        ending.enter_context(RecordingRobot(port, GOOB, capabilities=CAN, keeps=True, named=True, **robot_login))
-        account = MqttSettings(host="127.0.0.1", port=port, **page_login)
-        served = ending.enter_context(Served(port, broker=account))
-        page = ending.enter_context(served.page(name="ann"))
-        ending.enter_context(filming(port, **robot_login))
-        assert page.knows(GOOB)
-        ending.enter_context(watching(served))
-        assert until(lambda: page.value(GOOB, "web/picture", "state") == "flowing", 30)
-
-        def logged(pattern: str) -> list[Any]:
-            return re.findall(pattern, (broker.folder / "log").read_text())
-
-        login = r"as (pebble-web-media-\S+) \(p\d, c1, k\d+, u'page-1'\)\.\n\d+: No will message specified"
-        (client_id,) = logged(login)
-        with create("mqtt", "thief", replace(account, client_id=client_id)):
-            assert until(lambda: len(logged(login)) > 2), "it was not ended"
-            assert page.take(GOOB)
-            assert stop_s(page) < 4
-        assert until(lambda: page.value(GOOB, "web/picture", "state") == "flowing", 30)
-        assert set(logged(r"\d: pebble-web-media-\S+ (\d \S+)")) == {
-            "1 pebble/robots/goob/outgoing/front-camera",
-            "1 pebble/robots/goob/incoming/flags/mqtt-video",
-        }
-        assert set(logged(r"Received PUBLISH from pebble-web-media-\S+ \(d\d, (q\d, r\d), m\d+, '(\S+)'")) == {
-            ("q1, r0", "pebble/robots/goob/incoming/by/page-1/front-camera"),
-            ("q1, r0", "pebble/robots/goob/incoming/by/page-1/flags/mqtt-video"),
-        }

@@ -49,18 +49,6 @@ def publish(broker: Broker, topic: str, payload: bytes, *, retain: bool = False)
     transport.close()
 
 
-def retained(broker: Broker, topic: str) -> bytes:
-    """What a new subscriber receives."""
-    received: list[Message] = []
-    transport = create("mqtt", "reader", MqttSettings(host="127.0.0.1", port=broker.port))
-    transport.open()
-    transport.subscribe(topic, received.append, direct=True)
-    assert until(lambda: received)
-    transport.close()
-    assert received[0].retain
-    return received[0].payload
-
-
 # -- logs
 
 
@@ -92,17 +80,6 @@ def _logged(robot: RecordingRobot, page: Page, text: str) -> bool:
     return page.value(robot.base, "status", "value") == {"text": text}
 
 
-def test_lines_that_the_server_drops_leave_a_gap(page, robot, broker) -> None:
-    page.send("read-logs", ref=robot.base, on=True)
-    assert until(lambda: _logged(robot, page, "ready"))
-    publish(broker, f"{robot.base}/outgoing/logs", b"x" * 20_000)
-    robot.publish("logs", {"message": "last"})
-    assert until(lambda: lines(page)[-1:] == [{"message": "last"}])
-    last = page.logs[-1]
-    before = page.logs[-2]
-    assert last["first"] == before["first"] + len(before["lines"]) + 1
-
-
 # -- flags
 
 
@@ -111,31 +88,12 @@ def test_flags_are_those_of_the_broker(page, robot, broker) -> None:
     assert flags() == {"remote_mirror": None, "mqtt_audio": None, "mqtt_video": None}
     page.send("flag", ref=robot.base, name="mqtt-video", on=True)
     assert until(lambda: flags()["mqtt_video"] is True)
-    assert retained(broker, f"{robot.base}/incoming/flags/mqtt-video") == b'{"value":true}'
     publish(broker, f"{robot.base}/incoming/flags/mqtt-audio", b'{"enabled": false}', retain=True)
     assert until(lambda: flags()["mqtt_audio"] is False)
     publish(broker, f"{robot.base}/incoming/flags/mqtt-video", b'"odd"')
     publish(broker, f"{robot.base}/incoming/flags/mqtt-audio", b"", retain=True)
     assert until(lambda: flags()["mqtt_audio"] is None)
     assert flags()["mqtt_video"] is True
-
-
-def test_a_flag_is_read_where_the_capabilities_name_it_but_only_of_the_robot_itself(served, broker) -> None:
-    base = f"pebble/robots/rig{next(NAMES)}"
-    named = {
-        "video": {"available": True, "flag_topic": f"{base}/incoming/flags/eye"},
-        "audio": {"available": True, "flag_topic": "pebble/robots/other/incoming/flags/mqtt-audio"},
-    }
-    publish(broker, f"{base}/incoming/flags/eye", b"true", retain=True)
-    publish(broker, f"{base}/incoming/flags/mqtt-audio", b"true", retain=True)
-    publish(broker, "pebble/robots/other/incoming/flags/mqtt-audio", b"false", retain=True)
-    with RecordingRobot(broker.port, base, capabilities=named) as robot, Page(served) as page:
-        assert page.knows(base)
-        page.send("watch", ref=base)
-        wanted = {"remote_mirror": None, "mqtt_audio": True, "mqtt_video": True}
-        assert until(lambda: page.value(base, "web/flags") == wanted), page.value(base, "web/flags")
-        page.send("flag", ref=base, name="mqtt-video", on=False)
-        assert until(lambda: f"{base}/incoming/flags/eye" in robot.topics())
 
 
 # -- actions

@@ -2,29 +2,29 @@
 
 from __future__ import annotations
 
-import itertools
 import json
-from functools import partial
-from pathlib import Path
+import time
+from types import SimpleNamespace
 from typing import Any
 
 import msgspec
 import pytest
 
-from pebble.contract import CAPABILITIES, codec
+from pebble.contract import CAPABILITIES, ESTOP, ESTOP_STATE, codec
 from pebble.contract.payloads import Capabilities
 from pebble.extensions.fleet.roles import Role, page_rights
+from pebble.extensions.operator.client.robot_view import RobotView
 from pebble.extensions.page import messages as m
 from pebble.extensions.page import robot_commands
+from pebble.extensions.page.drive.refusals import Refusals
 from pebble.extensions.page.robots import Interest, Robots
 from pebble.transports import Message, MqttSettings, QoS, create
-from tests.ext.page.attacker import Hall
-from tests.ext.page.served import Page, Served, now_ms
+from tests.ext.operator.client.estop_robot import Robot
+from tests.ext.page.served import Page, Served
 from tests.kit.played_robot import RecordingRobot
 from tests.support import Broker, until
 
 BASE = "pebble/robots/goob"
-NUMBERS = itertools.count(1)
 _decoder = msgspec.json.Decoder(m.FromPage)
 
 
@@ -207,6 +207,50 @@ def test_what_capabilities_rule_out(fields: dict[str, Any], capabilities: dict[s
     assert why == (refused and f"goob takes no {refused} commands")
 
 
+def why_not(fields: Fields, *, silent: bool = False, stopped: bool = False, by: str = "", **more: Any) -> str:
+    """Why this is not asked of a robot in this state; it ``arbitrates``, unless it is said, and there is no problem."""
+    view, robot, problem = RobotView(BASE), Robot(BASE, "serial"), more.get("problem", "")
+    view.capabilities = {"drive": {"available": True, "arbitrates": more.get("arbitrates", True)}}
+    for ago_s in (0.6, 0.4, 0.2):
+        view.liveness.heartbeat(time.monotonic() - ago_s, 0.0, online=not silent)
+    for state in robot.take([Message(ESTOP.topic(BASE), b'{"stop":"00000000000000a1"}')] * stopped):
+        view.receive(ESTOP_STATE, state, 0.0, 0.0)
+    broker: Any = SimpleNamespace(problem=problem, connected=not problem, names=SimpleNamespace(account=""))
+    return Refusals(broker, lambda _: by, {BASE: view}.get).of_op(op(**fields))
+
+
+BEGINS = [fields for fields, *_ in PUBLISHED if not robot_commands.ends(op(**fields))]
+ENDS = [fields for fields, *_ in PUBLISHED if robot_commands.ends(op(**fields))]
+FLAGS = [fields for fields in BEGINS if fields["tag"] == "flag"]
+OTHERS = [fields for fields in BEGINS if fields not in FLAGS]
+NO_BROKER = "The server cannot reach the broker"
+#: What is asked, of a robot in which state, and why it is not.
+WHYS: list[tuple[list[Fields], dict[str, Any], str]] = [
+    (BEGINS + ENDS, {}, ""),
+    (ENDS + FLAGS, {"silent": True}, ""),
+    (OTHERS, {"silent": True}, "goob is silent"),
+    (BEGINS, {"problem": "refused"}, f"{NO_BROKER}: refused"),
+    (ENDS, {"problem": "refused"}, NO_BROKER),
+    ([START], {"stopped": True}, "Stopped: reset it first"),
+    ([{"tag": "autonomy", "file": ""}, SOLID, HORN], {"stopped": True}, ""),
+    ([START], {"by": "bob"}, ""),
+    ([START], {"by": "bob", "arbitrates": False}, "bob is driving"),
+    ([START], {"arbitrates": False}, ""),
+]
+
+
+@pytest.mark.parametrize(("asked", "state", "why"), WHYS)
+def test_what_the_state_of_a_robot_rules_out(asked: list[Fields], state: dict[str, Any], why: str) -> None:
+    assert {why_not(fields, **state) for fields in asked} == {why}
+
+
+def test_nothing_is_asked_of_an_unknown_component_and_no_command_passes_for_a_question_of_the_bridges() -> None:
+    unknown = Refusals(SimpleNamespace(), lambda _: "", lambda _: None)  # type: ignore[arg-type]
+    assert {unknown.of_op(op(**fields)) for fields in BEGINS + ENDS} == {"unknown component"}
+    question = {"tag": "mcu", "uid": "u1", "name": "describe", "value": {"has": True, "from": True}}
+    assert "no command" in why_not(question)
+
+
 # -- at a server
 
 
@@ -253,16 +297,6 @@ def refusals(page: Page, expected: int = 1) -> list[str]:
     return [one["why"] for one in page.refused]
 
 
-def test_nothing_is_asked_of_an_unknown_component(page: Page, robot: RecordingRobot) -> None:
-    for number, (fields, *_) in enumerate(PUBLISHED):
-        ask(page, "pebble/robots/unheard", **fields)
-        assert refusals(page, number + 1)[-1] == "unknown component"
-    for ref in ("", "pebble/robots/+", "#", robot.base + "/incoming"):
-        ask(page, ref, **SOLID)
-    assert refusals(page, len(PUBLISHED) + 4)[-4:] == ["unknown component"] * 4
-    assert asked_of(robot) == []
-
-
 def test_without_driving_nothing_is_moved_or_switched_on(served: Served, robot: RecordingRobot) -> None:
     moving = [fields for fields, *_ in PUBLISHED if robot_commands.moves(op(**fields))]
     assert {fields["tag"] for fields in moving} == {"autonomy", "mcu", "outlet"}
@@ -274,54 +308,6 @@ def test_without_driving_nothing_is_moved_or_switched_on(served: Served, robot: 
         ask(page, robot.base, "autonomy", file="")
         ask(page, robot.base, "outlet", outlet="o1", on=False)
         assert until(lambda: len(asked_of(robot)) == 2, 3), asked_of(robot)
-
-
-def test_no_command_passes_for_a_question_of_the_bridges(page: Page, robot: RecordingRobot) -> None:
-    ask(page, robot.base, "mcu", uid="u1", name="describe", value={"has": True, "from": True})
-    assert "no command" in refusals(page)[0]
-    assert asked_of(robot) == []
-
-
-def test_a_silent_robot_is_asked_nothing_but_to_end_and_its_flags(page: Page, robot: RecordingRobot) -> None:
-    robot.silent()
-    assert until(lambda: page.value(robot.base, "web/liveness", "online") is False, 4)
-    for fields, *_ in PUBLISHED:
-        ask(page, robot.base, **fields)
-    assert until(lambda: len(asked_of(robot)) == 6, 3), asked_of(robot)
-    assert [value for _, value in asked_of(robot)[:3]] == [
-        {"b": 0.0, "g": 0.0, "r": 0.0}, {"action": "stop", "enabled": False, "file": None}, {"action": "stop"},
-    ]  # fmt: skip
-    assert set(refusals(page, len(PUBLISHED) - 6)) == {f"{robot.base.rpartition('/')[2]} is silent"}
-
-
-def test_clips_and_scripts_on_topics_that_the_robot_names(
-    broker: Broker, served: Served, robot: RecordingRobot
-) -> None:
-    base = f"pebble/robots/asked{next(NUMBERS)}"
-    own = f"{base}/outgoing/renamed"
-    named = {"soundboard": {"files_topic": f"{own}/clips", "status_topic": f"{robot.base}/outgoing/soundboard-status"}}
-    named["autonomy"] = {"files_topic": f"{own}/scripts", "status_topic": f"{own}/script"}
-    with RecordingRobot(broker.port, base, capabilities=named) as one, served.page() as page:
-        assert page.knows(base)
-        page.send("watch", ref=base)
-        robot.publish("soundboard-status", {"playing": True, "file": "foreign"}, retain=True)
-        values = {
-            "clips": ("soundboard-files", {"files": ["a.wav"]}),
-            "scripts": ("autonomy-files", {"files": []}),
-            "script": ("autonomy-status", {"running": True, "file": "follow"}),
-        }
-        for topic, (metric, value) in values.items():
-            one.publish(f"renamed/{topic}", value, retain=True)
-            assert until(partial(page.value, base, metric), 3), metric
-            assert value.items() <= page.value(base, metric).items()
-        assert page.value(base, "soundboard-status") is None
-
-
-def test_a_long_list_of_clips_is_passed_on(page: Page, robot: RecordingRobot) -> None:
-    files = [f"speech/number {number}, spoken by a person.wav" for number in range(6000)]  # 256 KiB of names
-    page.send("watch", ref=robot.base)
-    robot.publish("soundboard-files", {"files": files, "timestamp": 1.0}, retain=True)
-    assert until(lambda: page.value(robot.base, "soundboard-files", "files") == files, 5)
 
 
 def test_large_values_are_sent_one_at_a_time() -> None:
@@ -342,37 +328,6 @@ def test_large_values_are_sent_one_at_a_time() -> None:
     assert taken(large=False) == (set(), False)
     assert (first | taken(large=True)[0], len(first)) == ({"a", "b"}, 1)
     assert taken(large=True) == (set(), False)
-
-
-def test_a_stopped_robot_starts_no_script_but_may_end_one(page: Page, robot: RecordingRobot) -> None:
-    page.send("estop", ref=robot.base, stop="00000000000000a1")
-    assert until(lambda: page.value(robot.base, "web/estop", "latched") is True)
-    before = len(asked_of(robot))
-    ask(page, robot.base, **START)
-    assert refusals(page) == ["Stopped: reset it first"]
-    for fields in ({"tag": "autonomy", "file": ""}, SOLID, HORN):
-        ask(page, robot.base, **fields)
-    assert until(lambda: len(asked_of(robot)) >= before + 3)
-    assert [metric for metric, _ in asked_of(robot)[-3:]] == ["autonomy-command", "lights-solid", "soundboard-command"]
-
-
-@pytest.mark.parametrize("arbitrates", [True, False])
-def test_a_script_starts_beside_a_person_only_where_it_gives_way(
-    broker: Broker, served: Served, arbitrates: bool
-) -> None:
-    base = f"pebble/robots/asked{next(NUMBERS)}"
-    capabilities = {"drive": {"available": True, "controls": True, "arbitrates": arbitrates}}
-    with RecordingRobot(broker.port, base, capabilities=capabilities) as robot, served.page() as page:
-        assert page.knows(base)
-        assert page.ready()
-        assert page.take(base)
-        page.send("drive", ref=base, g=1, t=now_ms(), z=0.5)
-        ask(page, base, **START)
-        assert until(lambda: asked_of(robot) or page.refused)
-        assert [one["why"] for one in page.refused] == ([] if arbitrates else ["local is driving"])
-        page.send("drive", ref=base, g=1, t=now_ms())
-        ask(page, base, **START)
-        assert until(lambda: len(asked_of(robot)) == (2 if arbitrates else 1), 3)
 
 
 BEYOND: list[Fields] = [
@@ -396,34 +351,3 @@ BEYOND: list[Fields] = [
 def test_what_is_beyond_the_limits_is_not_understood(fields: Fields) -> None:
     with pytest.raises(msgspec.ValidationError):
         op(**fields)
-
-
-def test_the_broker_is_down(broker: Broker, page: Page, robot: RecordingRobot) -> None:
-    broker.freeze()
-    ask(page, robot.base, **SOLID)  # accepted, and never acknowledged
-    assert until(lambda: page.value("", "web/broker", "problem"), 5)
-    ask(page, robot.base, **START)
-    assert refusals(page)[0].startswith("The server cannot reach the broker: ")
-    broker.thaw()
-
-
-def test_who_may_what(broker: Broker, tmp_path: Path) -> None:
-    with (
-        Hall(broker.port, tmp_path) as hall,
-        RecordingRobot(broker.port, f"pebble/robots/asked{next(NUMBERS)}") as robot,
-    ):
-        actions = [fields for fields, *_ in PUBLISHED if fields["tag"] == "action"]
-        with hall.page("driver") as page:
-            assert page.knows(robot.base)
-            for fields in actions:
-                ask(page, robot.base, **fields)
-            assert refusals(page, len(actions)) == ["The role driver may not do this"] * len(actions)
-            assert asked_of(robot) == []
-            ask(page, robot.base, **SOLID)
-            assert until(lambda: asked_of(robot))
-        with hall.page("maintainer") as page:
-            assert page.knows(robot.base)
-            ask(page, robot.base, **actions[0])
-            assert until(lambda: asked_of(robot)[-1] == ("flags/reboot", {"value": True}))
-        audit = hall.served.app.state.audit
-        assert until(lambda: [(one.what, one.user) for one in audit.read(10) if one.ref] == [("action", "maintainer")])

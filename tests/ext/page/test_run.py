@@ -4,9 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import re
-import signal
-import subprocess
 import sys
 import urllib.request
 from pathlib import Path
@@ -16,7 +13,7 @@ import pytest
 
 from pebble.extensions.operator.client import page_packages
 from pebble.extensions.page import run
-from tests.support import ROOT, Broker, Child, free_port, until
+from tests.support import ROOT, Broker, Child, free_port
 
 
 def written(folder: Path, web: dict[str, Any], **services: Any) -> Path:
@@ -66,28 +63,3 @@ def test_it_reports_that_it_is_ready_and_alive_and_ends_by_a_signal(tmp_path: Pa
             assert answer.status == 200
         page.terminate()
         assert page.wait(5) == 0
-
-
-def test_the_status_of_the_robot_shows_a_page_that_crashes_again_and_again(tmp_path: Path, broker: Broker) -> None:
-    """Nothing else of the robot is affected."""
-    bridge = {"enabled": True, "remote_mqtt": {"host": "127.0.0.1", "port": broker.port}}
-    own = {"launcher": {"restart_delay_seconds": 0.1}, "mqtt_bridge": bridge}
-    config = written(tmp_path, {"host": "0.0.0.0"}, **own)
-    raw = json.loads(config.read_text()) | {"local_mqtt": {"port": broker.port}}
-    config.write_text(json.dumps(raw))
-    errors = tmp_path / "errors"
-    with errors.open("wb") as out:
-        robot = Child([sys.executable, "-m", "pebble", "up", str(config)], cwd=ROOT, stderr=out)
-    try:
-        assert until(lambda: len(re.findall(r"web_interface\.host: other machines reach", errors.read_text())) >= 3, 20)
-        with subprocess.Popen(
-            [sys.executable, "-m", "pebble", "topic", "echo", "status", "-c", str(config), "--raw", "-n", "1"],
-            cwd=ROOT, stdout=subprocess.PIPE, text=True,
-        ) as echo:  # fmt: skip
-            services = json.loads(echo.communicate(timeout=20)[0])["value"]["services"]
-        assert services["web_handler"]["state"] in ("restarting", "failed")
-        assert services["web_handler"]["last_exit"] == "exit code 1"
-        assert services["mqtt_bridge"] == {"state": "ready", "restarts": 0, "last_exit": None}
-    finally:
-        robot.send_signal(signal.SIGTERM)
-        assert robot.wait(15) == 0

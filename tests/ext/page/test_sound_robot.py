@@ -141,7 +141,7 @@ def test_a_page_plays_the_robots_sound_and_the_robot_the_voice_until_the_page_st
         time.sleep(SILENT_S)  # not the page's wait: it is frozen
         return len(played(goob)) == before
 
-    with tab(browser, goob.robot_url("goob"), script=PLAIN_MICROPHONE) as opened:
+    with tab(browser, f"{goob.url}r/{goob.ref('goob')}", script=PLAIN_MICROPHONE) as opened:
         opened.uncover("listen").click()
         opened.uncover("sound-state")
         assert opened.until(lambda: "ms buffered · opus" in state(opened), 20)

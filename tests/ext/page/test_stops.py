@@ -133,18 +133,6 @@ def test_a_stop_that_is_no_longer_confirmed_for_lack_of_room_is_said(monkeypatch
     assert (stops.view(RobotEstop(A)).sending, stops.omitted(1.0), stops.omitted(99.0)) == ("", True, False)
 
 
-@pytest.mark.parametrize("topic", [f"{B}/incoming/drive-values", f"{A}/outgoing/status"])
-def test_a_stop_sends_zeros_only_to_topics_of_its_own_robot(topic: str) -> None:
-    value = {"estop": {"available": True, "owners": ["motion"]}, "drive": {"available": True, "topic": topic}}
-    capabilities = codec.encode(CAPABILITIES, Capabilities(t=1, value=value))
-    stops = Stops()
-    stops.press(A, FIRST, by="ann", why="", now=0.0, known=[])
-    stops.receive(Message(CAPABILITIES.topic(A), capabilities), 0.0)
-    topics = {message.topic for now in (0.0, 1.0) for message in stops.tick(now)}
-    assert ESTOP.topic(A) in topics
-    assert topic not in topics
-
-
 def test_a_component_that_was_forgotten_is_shown_again_by_its_heartbeat() -> None:
     server = Server(WebSettings(broker=MqttSettings(host="127.0.0.1")), People(None), Audit(None))
     heartbeat = Message(ONLINE.topic(A), codec.encode(ONLINE, Heartbeat(t=int(1000 * time.time()))))

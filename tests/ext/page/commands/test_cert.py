@@ -27,31 +27,19 @@ def test_init_prints_what_to_type_next_and_how_phones_trust_it(run: Run, state: 
     assert stat.S_IMODE((state / "ca.key").stat().st_mode) == 0o600
 
 
-def test_init_overwrites_nothing(run: Run, tmp_path: Path) -> None:
-    assert run("cert", "init", "--folder", tmp_path / "a", "lab-pc.local") == 0
-    before = (tmp_path / "a/ca.pem").read_bytes()
-    assert run("cert", "init", "--folder", tmp_path / "a", "lab-pc.local") == 1
-    assert run.err.startswith(f"pebble: {tmp_path}/a/ca.pem exists: `pebble cert renew --folder {tmp_path}/a`")
-    assert (tmp_path / "a/ca.pem").read_bytes() == before
-
-
 def test_show_and_renew(run: Run, tmp_path: Path) -> None:
+    """The certificates themselves are tested where they are made."""
     folder = tmp_path / "tls"
     run("cert", "init", "--folder", folder, "lab-pc.local", "::1")
     assert run("cert", "show", "--folder", folder) == 0
-    before = run.out
-    assert f"{folder}/ca.pem\n    authority\n" in before
-    assert f"{folder}/server.pem\n    for lab-pc.local, ::1\n" in before
+    assert f"{folder}/ca.pem\n    authority\n" in run.out
+    assert f"{folder}/server.pem\n    for lab-pc.local, ::1\n" in run.out
     assert run("cert", "renew", "--folder", folder) == 0
     assert run.out.startswith(f"{folder}/server.pem is for lab-pc.local, ::1 until ")
     assert run("cert", "renew", "--folder", folder, "other.local") == 0
     assert "is for other.local until" in run.out
-    run("cert", "show", "--folder", folder)
-    fingerprints = [
-        [line for line in text.splitlines() if line.startswith("    SHA-256")] for text in (before, run.out)
-    ]
-    assert fingerprints[0][0] == fingerprints[1][0]
-    assert fingerprints[0][1] != fingerprints[1][1]
+    assert run("cert", "init", "--folder", folder, "lab-pc.local") == 1
+    assert run.err.startswith(f"pebble: {folder}/ca.pem exists: `pebble cert renew --folder {folder}`")
 
 
 def test_mistakes(run: Run, tmp_path: Path) -> None:

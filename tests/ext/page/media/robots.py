@@ -99,11 +99,6 @@ class MediaRobot(ABC):
     def announce(self, section: dict[str, Any]) -> None:
         self.transport.publish(CAPABILITIES, capabilities(section, self.medium), qos=QoS.DELIVERED, retain=True)
 
-    def raise_flag(self) -> None:
-        """Raise the flag as another operator did before."""
-        self._raised = True
-        self.transport.publish(self.flag, b'{"value":true}', qos=QoS.DELIVERED, retain=True)
-
     def send(self, payload: bytes) -> None:
         self.transport.publish(self.section["topic"], payload)
 

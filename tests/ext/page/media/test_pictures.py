@@ -35,26 +35,9 @@ def robot() -> PictureRobot:
     return PictureRobot()
 
 
-def jpeg(number: int = 0) -> bytes:
-    return cv2.imencode(".jpg", np.full((48, 64, 3), 40 + number % 150, np.uint8))[1].tobytes()
-
-
 def encoding_of(payload: bytes) -> str | None:
     header = read_header(payload)
     return header and header.encoding
-
-
-# -- the encoding
-
-
-async def test_the_encoding_is_one_that_all_pages_decode(robot: PictureRobot, server: Server) -> None:
-    first = server.open(PicturePage())
-    await until(lambda: len(first.frames) > 3)
-    second = server.open(PicturePage(), PLAIN)
-    await until(lambda: len(second.direct()) > 3)
-    assert {encoding_of(body) for body in second.direct()} == {"pbvd"}
-    assert encoding_of(first.direct()[-1]) == "pbvd"
-    assert robot.encodings == ["h264", "pbvd"]
 
 
 async def test_another_operators_encoding_is_forwarded_as_it_is(robot: PictureRobot, server: Server) -> None:
@@ -67,18 +50,6 @@ async def test_another_operators_encoding_is_forwarded_as_it_is(robot: PictureRo
         await asyncio.sleep(1.5)
     assert encoding_of(page.direct()[-1]) == "pbvd"
     assert [request.get("encoding") for request in robot.requests if "keyframe" not in request].count("h264") == 1
-
-
-async def test_raw_jpegs_flow() -> None:
-    robot = PictureRobot({**{name: VIDEO[name] for name in ("available", "controls", "topic")}, "encoding": "jpeg"})
-    robot.mute = True
-    async with serving(robot) as server:
-        page = server.open(PicturePage(), frozenset({"jpeg"}))
-        await until(lambda: robot.requests)
-        for number in range(5):
-            robot.send(jpeg(number))
-            await until(lambda number=number: page.direct() == [jpeg(one) for one in range(number + 1)])
-        await until(lambda: server.view.state == "flowing" and server.view.encoding == "jpeg")
 
 
 # -- forwarding
@@ -105,16 +76,11 @@ async def test_payloads_arrive_unchanged_and_decodable(
 async def test_a_page_that_wants_a_key_frame_gets_one(robot: PictureRobot, server: Server) -> None:
     page = server.open(PicturePage())
     await until(lambda: len(page.frames) > 5)
-    await asyncio.sleep(1.0)
-    count, began = len(page.frames), time.monotonic() - 2
+    await asyncio.sleep(1.0)  # one is requested once a second
+    count = len(page.frames)
     page.acknowledge(NO_FRAME, 1)
     await until(lambda: any(request.get("keyframe") for request in robot.requests))
     await until(lambda: len(page.frames) > count + 3)
-    for _ in range(20):
-        page.acknowledge(NO_FRAME, 1)
-        await asyncio.sleep(0.05)
-    elapsed = time.monotonic() - began
-    assert sum(request.get("keyframe", False) for request in robot.requests) <= 2 + elapsed
 
 
 # -- rescue

@@ -60,8 +60,8 @@ window.compare = async (payloadsPath, expectedPath) => {
   return { shown, wants };
 };
 
-/** Decode everything, and post the pictures' pixels, RGBA behind width and height. */
-window.post = async (payloadsPath, target) => {
+/** Decode everything: what went wrong, and the pictures' pixels, RGBA behind width and height, as base64. */
+window.pixels = async (payloadsPath) => {
   const decoder = new PictureDecoder();
   const parts = [];
   for (const payload of await list(payloadsPath)) {
@@ -71,8 +71,10 @@ window.post = async (payloadsPath, target) => {
     made.bitmap.close();
   }
   decoder.h264.close();
-  await fetch(target, { method: "POST", body: new Blob(parts) });
-  return decoder.sequence.problem;
+  const bytes = new Uint8Array(await new Blob(parts).arrayBuffer());
+  let text = "";
+  for (let at = 0; at < bytes.length; at += 32_768) text += String.fromCharCode(...bytes.subarray(at, at + 32_768));
+  return [decoder.sequence.problem, btoa(text)];
 };
 
 window.ready = true;

@@ -3,23 +3,10 @@
 import pytest
 from playwright.sync_api import Locator
 
-from tests.ext.page.canned import CannedServer, Show
-from tests.ext.page.states import GOOB, STATES
+from tests.ext.page.canned import Show
+from tests.ext.page.states import STATES
 
 pytestmark = pytest.mark.page
-
-
-def test_the_whole_card_opens_its_robot(show: Show) -> None:
-    with show(STATES["fleet"]) as opened:
-        opened.test("card-goob").click(position={"x": 4, "y": 4})
-        assert opened.until(f"window.pebble.driver.ref === '{GOOB}'", 3)
-
-
-def test_a_stop_of_a_card_opens_nothing(show: Show, server: CannedServer) -> None:
-    with show(STATES["fleet"]) as opened:
-        opened.test("stop-goob").click()
-        assert opened.until(lambda: server.sent("estop"))
-        assert opened.page.evaluate("location.pathname") == "/"
 
 
 def test_the_first_steps_are_ticked_and_can_be_hidden(show: Show) -> None:

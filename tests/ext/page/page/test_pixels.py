@@ -6,17 +6,16 @@ import base64
 import json
 import random
 import struct
-import threading
 import zlib
 from collections.abc import Iterator, Sequence
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
+from urllib.parse import urlsplit
 
 import cv2
 import numpy as np
 import pytest
-from playwright.sync_api import Browser
+from playwright.sync_api import Browser, Route
 
 from pebble.contract.packets import Picture, PictureKind
 from pebble.extensions.media.decode import VideoDecoder
@@ -30,49 +29,23 @@ STATIC = ROOT / "pebble/extensions/page/static"
 PAGE = Path(__file__).with_name("pixels.js")
 
 
-class MediaPages:
-    """Serves the page's modules, the test's pages, and byte strings; takes byte strings that a page posts."""
+class Files:
+    """What the browser asks for: the page's modules, the test's program, and byte strings."""
 
     def __init__(self) -> None:
-        self.posted: dict[str, bytes] = {}
-        self._data = {"/": b'<!doctype html><script type="module" src="/pixels.js"></script>'}
-        pages = self
-
-        class Handler(BaseHTTPRequestHandler):
-            def do_GET(self) -> None:
-                pages.answer(self)
-
-            def do_POST(self) -> None:
-                pages.posted[self.path] = self.rfile.read(int(self.headers["content-length"]))
-                self.send_response(204)
-                self.end_headers()
-
-            def log_message(self, *_args: object) -> None:
-                """Log nothing."""
-
-        self._server = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
-        self.url = f"http://127.0.0.1:{self._server.server_address[1]}"
-        threading.Thread(target=self._server.serve_forever, daemon=True).start()
+        program = b'<!doctype html><script type="module" src="/pixels.js"></script>'
+        self._data = {"/": program, "/pixels.js": PAGE.read_bytes()}
 
     def offer(self, parts: Sequence[bytes]) -> str:
-        """Serve byte strings, each behind its length; returns their path."""
+        """Have byte strings, each behind its length; returns their path."""
         name = f"/data/{len(self._data)}"
         self._data[name] = b"".join(struct.pack(">I", len(part)) + part for part in parts)
         return name
 
-    def close(self) -> None:
-        self._server.shutdown()
-        self._server.server_close()
-
-    def answer(self, request: BaseHTTPRequestHandler) -> None:
-        path = request.path
-        file = PAGE if path == "/pixels.js" else STATIC / path.lstrip("/")
-        data = self._data.get(path) or (file.read_bytes() if file.is_file() else b"")
-        request.send_response(200)
-        request.send_header("content-type", "text/html" if path == "/" else "text/javascript")
-        request.send_header("content-length", str(len(data)))
-        request.end_headers()
-        request.wfile.write(data)
+    def answer(self, route: Route) -> None:
+        path = urlsplit(route.request.url).path
+        data = self._data[path] if path in self._data else (STATIC / path.lstrip("/")).read_bytes()
+        route.fulfill(body=data, content_type="text/html" if path == "/" else "text/javascript")
 
 
 EXACT = ("json", "pbvd")
@@ -80,21 +53,19 @@ T0 = 1_710_969_600_000
 
 
 @pytest.fixture(scope="module")
-def pages() -> Iterator[MediaPages]:
-    pages = MediaPages()
-    yield pages
-    pages.close()
+def pages() -> Files:
+    return Files()
 
 
 @pytest.fixture(scope="module")
-def page(pages: MediaPages, browser: Browser) -> Iterator[Any]:
-    with tab(browser, f"{pages.url}/") as one:
+def page(pages: Files, browser: Browser) -> Iterator[Any]:
+    with tab(browser, "http://localhost/", routes={"**/*": lambda route: pages.answer(route)}) as one:
         assert one.until("window.ready === true")
         yield one.page
 
 
 @pytest.fixture
-def check(page: Any, pages: MediaPages) -> Any:
+def check(page: Any, pages: Files) -> Any:
     """Feed payloads to both decoders; returns what was shown, which must be the same."""
 
     def compare(payloads: Sequence[bytes]) -> list[Any]:
@@ -246,30 +217,30 @@ def test_limits_of_zlib(check: Any) -> None:
     assert [one is not None for one in shown] == [True, *[False] * 7]
 
 
-def counters(posted: bytes) -> list[int | None]:
-    """The numbers in the pictures that a page has posted."""
+def counters(decoded: bytes) -> list[int | None]:
+    """The numbers in pictures as the page has decoded them."""
     found, at = [], 0
-    while at < len(posted):
-        width, height = struct.unpack_from("<II", posted, at)
+    while at < len(decoded):
+        width, height = struct.unpack_from("<II", decoded, at)
         size = width * height * 4
-        pixels = np.frombuffer(posted, np.uint8, size, at + 8).reshape(height, width, 4)
+        pixels = np.frombuffer(decoded, np.uint8, size, at + 8).reshape(height, width, 4)
         found.append(read_counter(np.ascontiguousarray(pixels[..., :3])))
         at += 8 + size
     return found
 
 
-def h264_counters(page: Any, pages: MediaPages, payloads: Sequence[bytes]) -> list[int | None]:
-    problem = page.evaluate("paths => window.post(...paths)", [pages.offer(payloads), "/posted"])
+def h264_counters(page: Any, pages: Files, payloads: Sequence[bytes]) -> list[int | None]:
+    problem, pixels = page.evaluate("(path) => window.pixels(path)", pages.offer(payloads))
     assert problem == "" or len(payloads) > 0
-    return counters(pages.posted["/posted"])
+    return counters(base64.b64decode(pixels))
 
 
-def test_h264_shows_every_picture_in_order(page: Any, pages: MediaPages) -> None:
+def test_h264_shows_every_picture_in_order(page: Any, pages: Files) -> None:
     packets = stream("h264", 30, size=(320, 240), interval=15, quality=40)
     assert h264_counters(page, pages, packets) == list(range(30))
 
 
-def test_h264_after_faults(page: Any, pages: MediaPages) -> None:
+def test_h264_after_faults(page: Any, pages: Files) -> None:
     packets = stream("h264", 30, size=(320, 240), interval=10, quality=40)
     assert h264_counters(page, pages, [*packets[:4], *packets[5:12]]) == [0, 1, 2, 3, 10, 11]
     assert h264_counters(page, pages, [*packets[:3], packets[2], *packets[3:12]]) == [0, 1, 2, 10, 11]

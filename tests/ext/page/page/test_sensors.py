@@ -15,7 +15,7 @@ import pytest
 from PIL import Image
 from playwright.sync_api import Browser
 
-from tests.ext.page.browser import PIXELS, Tab
+from tests.ext.page.browser import Tab
 from tests.ext.page.canned import CannedServer, Show, showing
 from tests.ext.page.states import (
     MINE,
@@ -28,21 +28,6 @@ from tests.ext.page.states import (
 
 pytestmark = pytest.mark.page
 
-#: Counts how often each canvas is drawn: before anything is drawn, it is cleared.
-COUNT = """
-window.drawn = { plots: 0, map: 0 };
-const clear = CanvasRenderingContext2D.prototype.clearRect;
-CanvasRenderingContext2D.prototype.clearRect = function (...area) {
-  if (this.canvas.closest(".plot-lines")) window.drawn.plots++;
-  return clear.apply(this, area);
-};
-const write = CanvasRenderingContext2D.prototype.fillText;
-CanvasRenderingContext2D.prototype.fillText = function (...text) {
-  if (this.canvas.closest(".map")) window.drawn.map++;
-  return write.apply(this, text);
-};
-"""
-
 
 @pytest.fixture(scope="module")
 def show(server: CannedServer, browser: Browser) -> Show:
@@ -51,7 +36,7 @@ def show(server: CannedServer, browser: Browser) -> Show:
 
 @pytest.fixture(scope="module")
 def _sensors(show: Show) -> Iterator[Tab]:
-    with show(SENSORS, script=COUNT) as opened:
+    with show(SENSORS) as opened:
         yield opened
 
 
@@ -66,152 +51,58 @@ def see(opened: Tab, name: str) -> None:
     opened.test(name).first.scroll_into_view_if_needed()
 
 
-def drawings(opened: Tab, what: str, ms: int) -> int:
-    """How many there are within so many milliseconds."""
-    before = opened.page.evaluate(f"window.drawn.{what}")
-    opened.page.wait_for_timeout(ms)
-    return int(opened.page.evaluate(f"window.drawn.{what}") - before)
-
-
-# -- plots
-
-#: Columns of a plot with its first line's colour, as shares of the width.
-_LINE = """(name) => { PIXELS
-  const figure = document.querySelector(`[data-test="${name}"]`);
-  const canvas = figure?.querySelector("canvas");
-  if (!canvas) return [];
-  const wanted = getComputedStyle(figure).getPropertyValue("--line-0").trim();
+#: How many pixels of a canvas have a colour of its style: all, in the last fifth, and in the middle.
+#: Of a copy: Chromium complains of a canvas that is drawn on and often read.
+_INKED = """([place, ink]) => {
+  const canvas = document.querySelector(place);
+  const wanted = getComputedStyle(canvas).getPropertyValue(ink).trim();
   const [r, g, b] = [1, 3, 5].map((at) => parseInt(wanted.slice(at, at + 2), 16));
-  const [data, width] = [pixelsOf(canvas), canvas.width];
-  const columns = new Set();
+  const { width, height } = canvas;
+  const copy = new OffscreenCanvas(width, height).getContext("2d", { willReadFrequently: true });
+  copy.drawImage(canvas, 0, 0);
+  const { data } = copy.getImageData(0, 0, width, height);
+  const found = { all: 0, late: 0, middle: 0 };
   for (let i = 0; i < data.length; i += 4) {
-    const near = Math.abs(data[i] - r) + Math.abs(data[i + 1] - g) + Math.abs(data[i + 2] - b) < 90;
-    if (near && data[i + 3] > 128) columns.add(((i / 4) % width) / width);
+    const away = Math.abs(data[i] - r) + Math.abs(data[i + 1] - g) + Math.abs(data[i + 2] - b);
+    if (away > 60 || data[i + 3] < 128) continue;
+    const [x, y] = [(i / 4) % width, Math.floor(i / 4 / width)];
+    found.all++;
+    found.late += x > 0.8 * width;
+    found.middle += Math.hypot(x - width / 2, y - height / 2) < 14;
   }
-  return [...columns].sort((a, b) => a - b);
-}""".replace("PIXELS", PIXELS)
+  return found;
+}"""
 
 
-def line(opened: Tab, name: str, begin: float = 0.2, end: float = 1.0) -> int:
-    return sum(begin <= column < end for column in opened.page.evaluate(_LINE, name))
+def inked(opened: Tab, place: str, ink: str, part: str) -> int:
+    return int(opened.page.evaluate(_INKED, [place, ink])[part])
+
+
+def trail(opened: Tab, part: str) -> int:
+    return inked(opened, "[data-test=map]", "--accent", part)
+
+
+# -- plots and map
 
 
 def test_a_plot_is_drawn_up_to_now_and_its_newest_value_is_text(sensors: Tab) -> None:
     for name in ("battery", "attitude", "touch"):
         see(sensors, f"plot-{name}")
-        assert sensors.until(lambda name=name: line(sensors, f"plot-{name}", 0.8, 1) > 5)  # type: ignore[misc]
+        canvas = f"[data-test=plot-{name}] canvas"
+        assert sensors.until(lambda canvas=canvas: inked(sensors, canvas, "--line-0", "late") > 5)  # type: ignore[misc]
     texts = sensors.test("plot-battery").locator("li").all_inner_texts()
     assert [" ".join(text.split()) for text in texts] == ["battery 7.92 V"]
 
 
-def test_only_what_is_seen_is_drawn_and_not_often(sensors: Tab) -> None:
-    sensors.page.evaluate("scrollTo(0, 0)")
-    sensors.page.wait_for_timeout(300)
-    assert drawings(sensors, "plots", 700) == 0
-    see(sensors, "plot-touch")
-    assert sensors.until("window.drawn.plots > 0")
-    seen = sensors.page.locator("figure.plot").count()
-    assert 0 < drawings(sensors, "plots", 1000) <= 11 * seen
-    sensors.hide()
-    sensors.page.wait_for_timeout(150)
-    assert drawings(sensors, "plots", 700) == 0
-    sensors.hide(hidden=False)
-    assert sensors.until(lambda: drawings(sensors, "plots", 100) > 0)
-
-
-SET = "([metric, value]) => pebble.store.set(pebble.route.ref, metric, value)"
-NASTY: list[Any] = [
-    None,
-    7,
-    "x" * 5000,
-    [],
-    {"value": {"a" * 5000: 1}},
-    {"value": {"x_mm": "1", "y_mm": []}},
-    {"value": {str(number): number for number in range(500)}},
-    {"shapes": 7, "labels": {}},
-    {"shapes": [[[1e300, None]] * 900] * 900},
-    {"value": {"orientation_deg": {"roll": "<img src=x>", "pitch": None}}},
-]
-
-
-def test_no_payload_breaks_a_card(show: Show) -> None:
-    with show(SENSORS) as opened:
-        opened.test("plot-battery").wait_for()
-        for metric in ("sensors/imu", "wheel-odometry", "video-overlays", "status", "charging-level"):
-            for payload in NASTY:
-                opened.page.evaluate(SET, [metric, payload])
-                opened.page.wait_for_timeout(120)
-            see(opened, "map")
-            assert opened.page.locator(".failed").count() == 0, metric
-            assert opened.page.evaluate("document.documentElement.scrollWidth <= innerWidth"), metric
-        assert opened.errors == []
-
-
-# -- map
-
-#: Where the component's arrow and its trail are drawn: counts of the accent colour in the middle, and everywhere.
-_TRAIL = """() => { PIXELS
-  const canvas = document.querySelector("[data-test=map]");
-  const wanted = getComputedStyle(canvas).getPropertyValue("--accent").trim();
-  const [r, g, b] = [1, 3, 5].map((at) => parseInt(wanted.slice(at, at + 2), 16));
-  const { width, height } = canvas;
-  const data = pixelsOf(canvas);
-  const found = { middle: 0, all: 0 };
-  for (let i = 0; i < data.length; i += 4) {
-    if (Math.abs(data[i] - r) + Math.abs(data[i + 1] - g) + Math.abs(data[i + 2] - b) > 60) continue;
-    found.all++;
-    const [x, y] = [((i / 4) % width) - width / 2, Math.floor(i / 4 / width) - height / 2];
-    if (Math.hypot(x, y) < 14) found.middle++;
-  }
-  return found;
-}""".replace("PIXELS", PIXELS)
-
-
-def trail(opened: Tab) -> dict[str, int]:
-    found: dict[str, int] = opened.page.evaluate(_TRAIL)
-    return found
-
-
 def test_the_map_has_the_trail_and_the_component_in_its_middle(sensors: Tab) -> None:
     see(sensors, "map")
-    assert sensors.until(lambda: trail(sensors)["middle"] > 30)
-    assert sensors.until(lambda: trail(sensors)["all"] > 300)
+    assert sensors.until(lambda: trail(sensors, "middle") > 30)
+    assert sensors.until(lambda: trail(sensors, "all") > 300)
     words = sensors.test("map-pose").inner_text()
     assert re.fullmatch(r"x -?\d\.\d\d m · y -?\d\.\d\d m · heading -?\d+°", words)
-    assert drawings(sensors, "map", 1000) <= 11
     sensors.test("map-clear").click()
-    assert sensors.until(lambda: trail(sensors)["all"] < 250)
-    assert trail(sensors)["middle"] > 30
-
-
-def test_one_finger_scrolls_the_page_and_two_zoom_the_map(show: Show) -> None:
-    with show(SENSORS, "phone") as opened:
-        opened.test("tab-sensors").click()
-        opened.test("map").wait_for()
-        assert opened.until(lambda: opened.page.locator(".loading").count() == 0)  # a card above it would move it
-        see(opened, "map")
-        box = opened.test("map").bounding_box()
-        assert box is not None
-        x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
-        cdp = opened.cdp()
-
-        def fingers(kind: str, *points: tuple[float, float]) -> None:
-            cdp.send("Input.dispatchTouchEvent", {
-                "type": kind, "touchPoints": [{"x": x, "y": y, "id": number} for number, (x, y) in enumerate(points)],
-            })  # fmt: skip
-
-        scale = lambda: float(opened.page.evaluate("document.querySelector('.map canvas').dataset.scale ?? NaN"))
-        assert opened.until(lambda: scale() > 0)
-        before = scale()
-        fingers("touchStart", (x - 30, y), (x + 30, y))
-        for apart in (40, 50, 60):
-            fingers("touchMove", (x - apart, y), (x + apart, y))
-        fingers("touchEnd")
-        assert opened.until(lambda: scale() == pytest.approx(2 * before, rel=0.01))
-        assert opened.page.evaluate("visualViewport.scale") == 1
-        top = opened.page.evaluate("scrollY")
-        cdp.send("Input.synthesizeScrollGesture", {"x": x, "y": y, "yDistance": 150 if top > 150 else -150})
-        assert opened.until(lambda: abs(opened.page.evaluate("scrollY") - top) > 60)
+    assert sensors.until(lambda: trail(sensors, "all") < 250)
+    assert trail(sensors, "middle") > 30
 
 
 # -- over the picture
@@ -329,10 +220,6 @@ def test_a_robots_own_stream_is_shown_in_a_frame_and_never_called_live(show: Sho
         assert "own stream" in text.inner_text(timeout=5000)
         assert opened.until(f"{reason} === 'picture'")
         assert "not known" in opened.test("why").inner_text()
-        opened.page.keyboard.down("KeyW")
-        opened.page.wait_for_timeout(300)
-        opened.page.keyboard.up("KeyW")
-        assert not [one for one in server.sent("drive") if one["x"] or one["z"]]
         opened.test("see").click()
         assert opened.until(f"{reason} === ''")
         opened.page.keyboard.down("KeyW")

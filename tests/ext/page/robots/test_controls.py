@@ -1,33 +1,22 @@
 """Every control of the fleet and of a robot's page, used in a browser; what it does is asserted at the robot.
 
-The robots are microcontrollers; those with pictures are in test_pictures_of_robots.
+The robots are microcontrollers; those with pictures are in test_whole_robots.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 
 import pytest
 from playwright.sync_api import Browser, Locator
 
 from tests.ext.page.browser import tab
-from tests.ext.page.console import BACK, FORWARD, KEYS, LEFT, REST, RIGHT, Console, Wheels, Wire, console, used
+from tests.ext.page.canned import CannedServer
+from tests.ext.page.console import FORWARD, KEYS, Console, Wire, console, pad
 from tests.ext.page.stage import Stage
+from tests.ext.page.states import STATES
 
 pytestmark = pytest.mark.alone  # deadlines are checked
-
-
-@pytest.fixture(scope="module")
-def _benjr_page(browser: Browser, stage: Stage) -> Iterator[Console]:
-    with console(browser, stage, "benjr", theme="dark", engineers=False) as opened:
-        yield opened
-
-
-@pytest.fixture
-def at_benjr(_benjr_page: Console) -> Iterator[Console]:
-    """Benjr's page, in the dark: its motors have more speeds than on and off."""
-    with used(_benjr_page) as ready:
-        yield ready
 
 
 # -- keys
@@ -38,37 +27,6 @@ def test_each_key_turns_the_wheels_while_it_is_held(at_lamp: Console) -> None:
         assert at_lamp.drive(key, wheels=wheels), (key, at_lamp.wheels, at_lamp.reason)
         at_lamp.let_go()
         assert at_lamp.rests(), key
-
-
-# -- sliders and stick
-
-
-def test_a_slider_scales_what_the_wheels_do(at_benjr: Console) -> None:
-    at_benjr.uncover("balance").fill("50")
-    assert at_benjr.drive()
-    assert at_benjr.tab.until(lambda: at_benjr.speeds == pytest.approx((0.6, 0.3), abs=0.01), 1), at_benjr.speeds
-    at_benjr.let_go()
-    at_benjr.test("balance").fill("0")
-
-
-@pytest.mark.parametrize(("x", "y", "wheels"), [(0, -1, FORWARD), (0, 1, BACK), (-1, 0, LEFT), (1, 0, RIGHT)])
-def test_the_stick_follows_the_mouse(at_benjr: Console, x: int, y: int, wheels: Wheels) -> None:
-    left, top, size = at_benjr.place("stick")
-    mouse = at_benjr.page.mouse
-
-    def drag() -> None:
-        mouse.move(left, top)
-        mouse.down()
-        mouse.move(left + 0.4 * x * size, top + 0.4 * y * size, steps=3)
-
-    assert at_benjr.persists(drag, lambda: at_benjr.wheels == wheels, mouse.up)
-    mouse.move(left + 3 * x * size, top + 3 * y * size)
-    assert at_benjr.wheels == wheels
-    mouse.up()
-    assert at_benjr.rests()
-    mouse.move(left, top)
-    mouse.down()
-    assert at_benjr.stays_at_rest(0.1)
 
 
 # -- stops
@@ -83,9 +41,15 @@ def test_the_space_bar_ends_the_gesture_and_latches_nothing(at_lamp: Console, wi
     assert at_lamp.press_anew()
 
 
-def _escape_twice(element: Locator) -> None:
-    element.press("Escape")
-    element.press("Escape")
+def _in_help(robot: Console) -> None:
+    """It ends a gesture, moves nothing, and leaves STOP in reach."""
+    robot.page.keyboard.press("?")
+    assert robot.rests()
+    robot.let_go()
+    robot.down("KeyW")
+    assert robot.stays_at_rest()
+    robot.test("stop-one").click()
+    robot.page.keyboard.press("?")
 
 
 def _touch(element: Locator) -> None:
@@ -95,10 +59,8 @@ def _touch(element: Locator) -> None:
 
 STOPS: dict[str, Callable[[Console], None]] = {
     "Ctrl+Space": lambda robot: robot.page.keyboard.press("Control+Space"),
-    "Escape twice": lambda robot: _escape_twice(robot.page.locator("body")),
-    "Escape twice, in a list": lambda robot: _escape_twice(robot.test("picker")),
     "STOP": lambda robot: robot.test("stop-one").click(),
-    "STOP, by key": lambda robot: robot.test("stop-one").press("Enter"),
+    "STOP beside the help": lambda robot: _in_help(robot),
     "STOP, as soon as it is touched": lambda robot: _touch(robot.test("stop-one")),
 }
 
@@ -133,6 +95,29 @@ def test_stop_all_latches_every_robot_and_each_is_reset_by_itself(stage: Stage, 
     assert at_lamp.press_anew()
     at_lamp.reset("benjr")
     assert at_lamp.tab.until(lambda: not wire.latched("benjr"), 3)
+
+
+def test_a_gamepad_drives_and_its_buttons_stop(at_lamp: Console, wire: Wire) -> None:
+    def drives() -> bool:
+        """Show it in neutral, then pushed."""
+
+        def neutral() -> None:
+            at_lamp.pads(pad())
+            at_lamp.page.wait_for_timeout(120)
+
+        neutral()
+        return at_lamp.persists(lambda: at_lamp.pads(pad(z=1)), lambda: at_lamp.wheels == FORWARD, neutral)
+
+    assert drives()
+    at_lamp.pads(pad(0, 1, 0))
+    assert at_lamp.rests()
+    assert at_lamp.stays_at_rest()
+    assert not wire.latched("minilamp")
+    assert drives()
+    at_lamp.pads(pad(0, 1, 8, 9))
+    assert at_lamp.tab.until(lambda: wire.latched("minilamp"), 2)
+    assert at_lamp.rests()
+    assert at_lamp.because("stopped", within=2)  # else the next test would not see what it has to reset
 
 
 # -- control
@@ -177,13 +162,6 @@ def test_the_fleet_stops_robots(browser: Browser, stage: Stage, wire: Wire) -> N
         fleet.test("stop-benjr").click()
         assert fleet.until(lambda: wire.latched("benjr"), 2)
         assert not wire.latched("minilamp")
-        names = "[...document.querySelectorAll('.fleet-card h2')].map((one) => one.textContent).join()"
-        assert fleet.page.evaluate(names) == "BenJr,MiniLAMP"
-        fleet.test("fleet-more").click()
-        fleet.test("sort").select_option("battery")
-        assert fleet.until(f"{names} === 'MiniLAMP,BenJr'", 2)
-        fleet.test("filter").fill("LAMP")
-        assert fleet.until(f"{names} === 'MiniLAMP'", 2)
         fleet.test("card-minilamp").click(position={"x": 4, "y": 4})  # the whole card is the link, but for its Stop
         assert fleet.until("window.pebble.driver.ref === 'pebble/robots/minilamp'", 2)
         assert fleet.complaints() == []
@@ -193,7 +171,7 @@ def test_the_fleet_stops_robots(browser: Browser, stage: Stage, wire: Wire) -> N
 
 
 @pytest.mark.page
-def test_the_tab_key_reaches_every_control_and_space_on_a_button_also_stops(at_lamp: Console) -> None:
+def test_the_tab_key_reaches_every_control(at_lamp: Console) -> None:
     at_lamp.page.evaluate("document.activeElement.blur()")
     focusable = "a[href], button:enabled, input:enabled, select:enabled, summary, [tabindex='0']"
     count = at_lamp.page.evaluate(
@@ -205,9 +183,20 @@ def test_the_tab_key_reaches_every_control_and_space_on_a_button_also_stops(at_l
         at_lamp.page.evaluate("window.reached.add(document.activeElement)")
     assert at_lamp.page.evaluate("window.reached.delete(document.body) || true")
     assert at_lamp.page.evaluate("window.reached.size") == count
-    at_lamp.test("release").focus()
-    assert at_lamp.drive()
-    at_lamp.page.keyboard.press("Space")
-    assert at_lamp.rests()
-    assert at_lamp.because("free", within=2)
-    assert at_lamp.wheels == REST
+
+
+def test_a_screen_that_only_watches_sends_nothing_but_stops(browser: Browser, server: CannedServer) -> None:
+    server.show(STATES["driving"])
+    with tab(browser, f"{server.url}{server.state.path}?watch") as opened:
+        assert opened.until("!!window.pebble?.connection.you && document.documentElement.hasAttribute('data-watch')")
+        for key in ("KeyW", "KeyA", "KeyQ", "KeyF", "KeyP", "KeyT", "KeyM", "Minus", "Space"):
+            opened.page.keyboard.press(key, delay=60)
+        opened.page.evaluate(
+            "() => { for (const one of document.querySelectorAll('main button, .banners button')) one.click() }"
+        )
+        assert opened.until("!!pebble.commands.act"), "the rest of the page has come"
+        opened.page.evaluate("() => { pebble.commands.take(true); pebble.commands.act(pebble.driver.ref, 'reboot') }")
+        opened.page.keyboard.press("Control+Space")
+        assert opened.until(lambda: bool(server.sent("estop")), 2)
+        assert {message["op"] for message in server.received} <= {"hello", "watch", "read-logs", "stop", "estop"}
+        assert [message["token"] for message in server.sent("hello")] == [""]

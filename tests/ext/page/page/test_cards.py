@@ -1,0 +1,169 @@
+"""Controls of a robot's page in a browser: each opens, sends what it is for, and nothing is complained of."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import pytest
+
+from tests.ext.page.browser import Tab
+from tests.ext.page.canned import CannedServer, Show, State
+from tests.ext.page.states import ASKED, GOOB, MINE, STATES, at, changed, devices, outlet, setting
+
+pytestmark = [pytest.mark.page, pytest.mark.timeout(180)]
+
+FORM = {"tag_id": 7, "search": False, "family": "APRILTAG_36H11"}
+#: State, what is done with controls by their names ("name=text" is filled in, "name!" is held), what is sent: an op of
+#: this kind, each time with these fields.
+SENDS: dict[str, tuple[str, str, str, list[dict[str, Any]]]] = {
+    "lights": (
+        "asked", "colour-blue lights-flash lights-off", "lights",
+        [{"b": 1}, {"b": 1, "period": 2}, {"r": 0, "g": 0, "b": 0}],
+    ),
+    "a clip": ("asked", "sound-filter=99 clip", "soundboard", [{"file": "speech/number 99.wav"}]),
+    "a clip that plays": ("asked-busy", "stop-sound", "soundboard", [{"file": ""}]),
+    "a script": (
+        "asked", "script-apriltag-follow set-tag_id=7 set-search more-settings set-family=APRILTAG_36H11 start-script",
+        "autonomy", [{"file": "apriltag-follow", "config": FORM}],
+    ),
+    "a script that runs": ("asked-busy", "end-script", "autonomy", [{"file": ""}]),
+    "a script that drives": ("script-drives", "stop-script", "autonomy", [{"file": ""}]),
+    "an outlet": ("devices", "outlet-o2", "outlet", [{"outlet": "o2", "on": True}]),
+    "a microcontroller": (
+        "devices", "field-level=62.5 send-lamp field-angle=-12 field-k=1e-3 send-arm", "mcu",
+        [{"uid": "lamp-1", "name": "lamp", "value": {"level": 62.5, "on": False}},
+         {"uid": "lamp-1", "name": "arm", "value": {"angle": -12, "k": 0.001}}],
+    ),
+    "a restart": ("operating", "service-restart ask-hold!", "action", [{"name": "service-restart"}]),
+    "taking control": ("free", "take", "lease", [{"take": True}]),
+    "releasing it": ("driving", "release", "lease", [{"take": False}]),
+    "asking for it": ("kept", "ask", "lease", [{"take": True, "over": False}]),
+    "asking no more": ("kept-and-asked", "give-up", "lease", [{"take": False}]),
+    "letting another drive": ("others-ask", "let", "lease", [{"take": False}]),
+    "taking over": ("kept", "take-over!", "lease", [{"take": True, "over": True}]),
+    "a stop": ("driving", "stop-one", "estop", [{"ref": GOOB}]),
+    "a stop of all": ("driving", "stop-all", "estop", [{"ref": ""}]),
+    "a stop in the fleet": ("fleet", "stop-goob", "estop", [{"ref": GOOB}]),
+    "a reset": ("stopped", "reset reset-hold!", "estop-reset", [{"ref": GOOB}]),
+}  # fmt: skip
+
+
+def do(opened: Tab, what: str) -> None:
+    """Use one control."""
+    name, filled, text = what.rstrip("!").partition("=")
+    control = opened.uncover(name).first
+    if what.endswith("!"):
+        control.hover()
+        opened.page.mouse.down()
+        opened.page.wait_for_timeout(1200)
+        opened.page.mouse.up()
+    elif not filled:
+        control.click()
+    elif control.evaluate("(one) => one.localName") == "select":
+        control.select_option(text)
+    else:
+        control.fill(text)
+
+
+@pytest.mark.parametrize("name", SENDS)
+def test_a_control_sends_what_it_is_for(show: Show, server: CannedServer, name: str) -> None:
+    state, steps, op, expected = SENDS[name]
+    with show(STATES[state]) as opened:
+        for step in steps.split():
+            do(opened, step)
+        assert opened.until(lambda: len(server.sent(op)) == len(expected), 5), server.received
+        sent = [{key: one[key] for key in fields} for one, fields in zip(server.sent(op), expected, strict=True)]
+        assert sent == expected
+        assert opened.complaints() == []
+
+
+def test_a_form_is_sent_once_the_browser_finds_no_mistake_and_what_it_refuses_is_in_sight(
+    show: Show, server: CannedServer
+) -> None:
+    def refuses(name: str) -> bool:
+        opened.test("start-script").click()
+        return bool(opened.page.evaluate("document.activeElement.dataset.test") == f"set-{name}")
+
+    many = [setting(f"n{number}", f"Setting {number}", "float", 0.5, min=0, max=1) for number in range(1, 6)]
+    many = [setting("n0", "Setting 0", "int", required=True, min=0, max=34), *many]
+    scripts = at(GOOB, "autonomy-files", {"files": [{"file": "follow", "main": ["n0"], "configs": many}]})
+    with show(replace(STATES["asked"], values=changed(ASKED, MINE, scripts))) as opened:
+        do(opened, "script-follow")
+        assert refuses("n0")  # it is required
+        do(opened, "set-n0=35")
+        assert refuses("n0")
+        do(opened, "set-n0=7")
+        do(opened, "more-settings")
+        do(opened, "set-n5=-5")
+        opened.page.evaluate("document.querySelector('.script-more').open = false")
+        assert refuses("n5")
+        do(opened, "restore-n5")
+        assert opened.test("set-n5").input_value() == "0.5"
+        assert server.sent("autonomy") == []
+
+
+def test_what_was_asked_is_shown_until_the_outlet_reports_it(show: Show, server: CannedServer) -> None:
+    metric, report = "outlets/o2/status", outlet("o2")
+    state = replace(STATES["devices"], values=changed(devices, lambda _now: (GOOB, metric, report, 0.0)))
+    with show(replace(state, repeated={metric: 0.1})) as opened:
+        do(opened, "outlet-o2")
+        assert opened.test("outlet-asked-o2").inner_text() == "asked: on"
+        assert opened.test("outlet-o2").get_attribute("aria-checked") == "false"
+        assert opened.until(lambda: opened.test("outlet-asked-o2").inner_text() == "asked: on, not confirmed")
+        report["value"]["on"] = True
+        assert opened.until(lambda: opened.test("outlet-o2").get_attribute("aria-checked") == "true")
+        assert opened.test("outlet-asked-o2").count() == 0
+        do(opened, "outlet-o2")
+        assert opened.until(lambda: [one["on"] for one in server.sent("outlet")] == [True, False])
+
+
+# -- robots that write anything
+
+MARKUP, LONG = "<img src=x onerror=alert(1)>", "long " * 400
+FIELDS = [{"name": "f", "type": "u8"}] * 2
+NASTY: list[Any] = [None, 7, LONG, [], {"value": {MARKUP: 1}}, {"value": []}, {"shapes": [[[1e300, None]] * 300] * 50}]
+NASTY += [{"value": {"a": {"b": {"c": {"d": {"e": [1]}}}}}}, {"value": {str(number): number for number in range(500)}}]
+#: What of it the server lets pass: of each metric, payloads of any shape, and forms, manifests and texts.
+HOSTILE = {
+    "soundboard-files": {"files": [MARKUP, LONG]},
+    "soundboard-status": {"playing": True, "file": LONG, "error": MARKUP},
+    "autonomy-files": {
+        "files": [{"file": MARKUP, "label": LONG, "configs": [setting(MARKUP, MARKUP, "string", MARKUP)]}]
+    },
+    "autonomy-status": {"running": True, "file": LONG, "error": MARKUP, "config": {MARKUP: LONG}},
+    "mcu/lamp-1/describe": {
+        "model": MARKUP,
+        "interfaces": [{"name": MARKUP, "dir": "out", "encoding": {"fields": FIELDS}}] * 2,
+    },
+}
+ANY = (
+    "sensors/imu",
+    "wheel-odometry",
+    "video-overlays",
+    "status",
+    "charging-level",
+    "outlets/o1/status",
+    "mcu/lamp-1/lamp",
+)
+
+
+def test_what_a_robot_writes_is_only_text_and_breaks_no_card(show: Show, server: CannedServer) -> None:
+    state: State = replace(
+        STATES["full"], values=changed(STATES["full"].values, *(at(GOOB, *one) for one in HOSTILE.items()))
+    )
+    with show(state) as opened:
+        assert opened.until(lambda: MARKUP in opened.test("script-error").inner_text())
+        opened.page.locator(".script-row").click()
+        opened.page.locator(".ask-field").wait_for()
+        for payload in NASTY:
+            opened.page.evaluate(
+                "([metrics, value]) => metrics.forEach((one) => pebble.store.set(pebble.route.ref, one, value))",
+                [ANY, payload],
+            )
+            opened.page.wait_for_timeout(300)
+            assert opened.page.locator(".failed, main img[src=x]").count() == 0, str(payload)[:40]
+            assert opened.page.evaluate("document.documentElement.scrollWidth <= innerWidth"), str(payload)[:40]
+        assert opened.errors == []
+        do(opened, "stop-one")
+        assert opened.until(lambda: server.sent("estop"))
