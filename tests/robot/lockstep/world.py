@@ -25,7 +25,7 @@ from tests.robot.lockstep.processes import Process
 from tests.robot.lockstep.rules import WheelRules
 from tests.robot.lockstep.scheduler import Scheduler
 from tests.robot.lockstep.script_rules import ScriptRules
-from tests.robot.lockstep.scripts import OwnScript
+from tests.robot.lockstep.scripts import Script
 
 STOP_TIMEOUT_S = 1.5
 WAITS_S = (0.0, 0.001, 0.005, 0.02, 0.05, 0.1, 0.1, 0.2, 0.3, 0.5, 0.7, 0.76, 1.0, 1.5, 1.99, 2.01, 2.1, 3.0)
@@ -83,7 +83,7 @@ class World:
         self.manager = Manager(self.network, self.config, self.commands)
         self.script_rules = ScriptRules(self.manager, scheduler)
         self.people = [Person(name, self.network, self.commands) for name in ("anna", "eve")]
-        self.by_hand: list[OwnScript] = []
+        self.by_hand: list[Script] = []
         self._presses = 0
         self.owner.start()
         self.manager.start()
@@ -159,7 +159,7 @@ class World:
         """A script started from a shell: it takes the robot from the one that runs."""
         run = next_run(self.config, self.script_rules.newest_run)
         self.script_rules.begins(run)
-        self.by_hand.append(OwnScript(FILES[b % 2], run, self.network, self.commands, lambda code: None))
+        self.by_hand.append(Script(FILES[b % 2], run, self.network, self.commands, lambda code: None))
 
     def do_end_by_hand(self, a: int, b: int) -> None:
         for script in self.by_hand:
