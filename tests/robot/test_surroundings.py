@@ -7,9 +7,7 @@ import os
 import resource
 import signal
 import subprocess
-import sys
 import time
-from collections.abc import Callable
 from contextlib import ExitStack
 from typing import Any
 
@@ -101,28 +99,6 @@ def remains(rig: Rig) -> list[str]:
     """Programs of this robot that run."""
     found = subprocess.run(["pgrep", "-f", str(rig.config)], capture_output=True, text=True, check=False)
     return found.stdout.split()
-
-
-def test_of_four_starts_at_once_one_runs() -> None:
-    with Rig("zenoh", start=False) as rig:
-        command = [sys.executable, "-m", "pebble.cli", "up", str(rig.config)]
-        others = [
-            subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
-            for _ in range(3)
-        ]
-        rig.start(ready=False)
-        everybody: list[Callable[[], bool]] = [lambda pid=one.pid: gone(pid) for one in others]  # type: ignore[misc]
-        everybody.append(lambda: gone(rig.launcher_pid))
-        assert until(lambda: sum(ended() for ended in everybody) == 3)
-        time.sleep(1.0)
-        assert sum(ended() for ended in everybody) == 3
-        for one in others:
-            if gone(one.pid):
-                assert "already runs" in one.communicate()[0]
-            else:
-                one.terminate()
-                assert one.wait(20) == 0
-        rig.ensure_stopped()
 
 
 @pytest.mark.parametrize(

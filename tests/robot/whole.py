@@ -339,15 +339,18 @@ class World:
         yield
         self.rig.uplink.mend()
 
+    def _broker(self, b: int) -> Broker:
+        """The remote one, or the robot's own."""
+        return self.rig.local if b % 2 and self.rig.local is not None else self.rig.remote
+
     def do_restart_broker(self, _: Person, b: int) -> None:
-        with self._fault("the broker is away", 1.5):
-            self.rig.remote.kill()
+        with self._fault("a broker is away", 1.5):
+            self._broker(b).kill()
             time.sleep(_WAITS_S[b % 8])
-            self.rig.remote.start()
+            self._broker(b).start()
 
     def do_freeze_broker(self, _: Person, b: int) -> None:
-        """The remote one, or the robot's own."""
-        broker = self.rig.local if b % 2 and self.rig.local is not None else self.rig.remote
+        broker = self._broker(b)
         if isinstance(broker, Broker):
             with self._fault("a broker is frozen", 1.5):
                 broker.freeze()

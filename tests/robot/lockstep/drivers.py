@@ -71,7 +71,9 @@ class Driver(Process):
         """One command; with ``key``, under that one."""
         key = self.key if key is None else key
         sender = SCRIPT if "run" in fields else self.name if key else STRANGER
-        command = Command(fields.get("run", PERSON), sender, self.scheduler.now, 5.0, may_move=True)
+        command = Command(
+            fields.get("run", PERSON), sender, self.scheduler.now, fields.get("valid_ms", 5000) / 1000, may_move=True
+        )
         x, z = self._commands.add(command)
         self._publish(DRIVE.topic(BASE), {"x": x, "z": z} | ({"key": key} if key else {}) | fields)
 

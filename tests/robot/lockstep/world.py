@@ -109,28 +109,28 @@ class World:
     # -- persons
 
     def do_drive(self, a: int, b: int) -> None:
-        self._person(a).drive(_VALID_MS[b % len(_VALID_MS)])
+        self._person(a).command(_VALID_MS[b % len(_VALID_MS)])
 
     def do_steer(self, a: int, b: int) -> None:
-        self._person(a).steer(_SECONDS[b % 6], b // 6, _VALID_MS[a % len(_VALID_MS)])
+        self._person(a).steer_to(_SECONDS[b % 6], b // 6, _VALID_MS[a % len(_VALID_MS)])
 
     def do_release(self, a: int, b: int) -> None:
-        self._person(a).zero(final=False)
+        self._person(a).let_go_of_the_stick(final=False)
 
     def do_halt(self, a: int, b: int) -> None:
-        self._person(a).zero(final=True)
+        self._person(a).let_go_of_the_stick(final=True)
 
     def do_tap(self, a: int, b: int) -> None:
         """A zero, and at once another command."""
-        self._person(a).zero(final=b % 2 == 0)
-        self._person(a).drive(_VALID_MS[b % len(_VALID_MS)])
+        self._person(a).let_go_of_the_stick(final=b % 2 == 0)
+        self._person(a).command(_VALID_MS[b % len(_VALID_MS)])
 
     def do_press(self, a: int, b: int) -> None:
         self._presses += 1
-        self._person(a).stop(f"{self._presses:016x}")
+        self._person(a).press(f"{self._presses:016x}")
 
     def do_nameless(self, a: int, b: int) -> None:
-        self._person(a).stop_namelessly()
+        self._person(a).stop(named=False)
 
     def do_reset(self, a: int, b: int) -> None:
         self._person(a).reset()
