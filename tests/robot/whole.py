@@ -373,7 +373,9 @@ class World:
 
     def do_plant_stop(self, _: Person, b: int) -> None:
         """A stop reaches the broker while the robot is away, retained: it receives only the copy."""
-        if not isinstance(self.rig.remote, Broker):
+        if (
+            not isinstance(self.rig.remote, Broker) or self.rig.local is None
+        ):  # its programs are not away from their own
             return
         with self._fault("the uplink is cut for a retained stop", 1.0), self._away():
             name = new_name()

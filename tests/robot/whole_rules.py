@@ -74,7 +74,7 @@ class Seen:
             *self._beside_persons(),
             *self._after_stops(faults, stalls),
             *self._while_latched(faults, stalls),
-            *(f"{at:.3f}: a retained stop was obeyed" for at, state in self.states if self.planted & {*state.recent}),
+            *[f"{at:.3f}: a retained stop was obeyed" for at, s in self.states if self.planted & {*s.recent}][:1],
         ]
 
     def _too_long(self, faults: list[Event], stalls: Sequence[Stall]) -> Iterator[str]:

@@ -129,8 +129,9 @@ class StopRules:
             self._scheduler.now - since < _REPEAT_S, "a stop is repeated to an owner that has withdrawn its own"
         )
         came = self._first.setdefault(name, self._scheduler.now)  # if nothing passed: it had no connection to the robot
-        newer = [other for other, first in self._first.items() if first > came]
-        missed = [other for other in newer if (owner, other) not in self._shown]
+        shown = (first for other, first in self._first.items() if (owner, other) in self._shown)
+        newest = max(came, *shown, 0.0)
+        missed = any(first > newest for first in self._first.values())
         self._check(not missed, "an older stop is repeated in place of a newer one")
 
     # -- what must hold at any time
