@@ -5,14 +5,13 @@ python=.venv/bin/python
 
 debian() { sh tools/debian-packages.sh "$@"; }
 tests() { PEBBLE_THOROUGH=1 $python -m pytest "$@"; }
-both() { for transport in zenoh mqtt; do $python -m "$@" --transport $transport; done; }
 tool() { PYTHONPATH=.venv/tools $python "$@"; }
 
 list() {
     cat <<END
-make long PART=stops      400 random schedules of emergency stops and faults with whole robots, 40 minutes
+make long PART=stops      400 random schedules of people, stops, scripts and faults with whole robots, two hours
 make long PART=soak       floods, kills, freezes, full disks and more while an operator drives; MINUTES=30 for each transport
-make long PART=schedules  random schedules in virtual time, with whole robots and scripts, two hours
+make long PART=schedules  random schedules in virtual time, an hour
 make long PART=page       every state, card, interruption and finger at the operator page in Chromium, 25 minutes
 make long PART=looks      store anew how the page looks, for PART=page to compare; look at the pictures, a minute
 make long PART=fleet      brokers and hubs that are killed, hung and cut off under driven robots and 300 boards, 16 minutes
@@ -31,13 +30,11 @@ looks) debian chromium=chromium ;;
 esac
 
 case "$1" in
-stops) $python -m tests.kit.schedules robot_stops --log build/stops ;;
+stops) $python -m tests.kit.schedules robot --log build/stops ;;
 soak) both tests.robot.soak --minutes "${MINUTES:-5}" ;;
 schedules) # the shortest schedule that violates a rule is printed, or the seed of a sequence that does
     $python -m tests.kit.schedules motion --schedules 10000
-    $python -m tests.kit.schedules lockstep --schedules 10000
-    $python -m tests.kit.schedules owners --schedules 20000 --jobs 2
-    $python -m tests.kit.schedules robot_scripts
+    $python -m tests.kit.schedules services --schedules 20000 --jobs 2
     ;;
 page) $python -m pytest --workers 8 -m page tests/ext/page ;;
 looks) $python -m tests.ext.page.looks ;;

@@ -81,14 +81,6 @@ def test_a_reset_of_the_newest_state_frees_once_the_stick_was_released(kind: str
     assert drill.outputs() == AHEAD[kind]
 
 
-@pytest.mark.parametrize(("changes", "why"), [({"boot": "00000000"}, "boot"), ({"count": 0}, "count")])
-def test_a_reset_of_another_state_is_refused(changes: dict[str, Any], why: str) -> None:
-    drill = stopped()
-    drill.reset(**changes)
-    wait(drill, 0.5)
-    assert (drill.state()["latched"], drill.state()["reset_refused"]) == (True, why)
-
-
 @pytest.mark.parametrize(
     "payload",
     [b"{}", b'{"stop": "<16 hex digits>"}', b"x", b"[" * 400, b'{"stop": "', b"\xff", b"x" * 700, b"x" * 5000],
@@ -124,17 +116,6 @@ def test_retained_copies_do_nothing() -> None:
     wait(drill, 1.0)
     assert [(state["latched"], state["count"]) for state in states(drill)] == [(False, 0)]
     assert drill.robot.refused == 2
-
-
-@pytest.mark.parametrize("order", ["before", "after", "around"])
-def test_a_stop_voids_all_commands_of_its_batch(order: str) -> None:
-    drill = online("benjr")
-    for step in range(3):
-        if step == {"before": 2, "after": 0, "around": 1}[order]:
-            drill.stop()
-        drill.nonsense(b'{"z": 0.5}')
-    wait(drill)
-    assert drill.seen.moves == 0
 
 
 def test_a_zero_counts_though_a_newer_command_replaces_it() -> None:
@@ -178,14 +159,6 @@ def test_latched_survives_a_power_cut_and_so_does_free(kind: str) -> None:
     wait(drill, 0.5)
     reconnect(drill)
     assert (drill.state()["latched"], drill.state()["recent"]) == (False, [A])
-
-
-@pytest.mark.parametrize("content", [b"", b'{"latched":false,"rec', b"[]", b"\xff\xff", b'{"latched":0,"recent":[]}'])
-def test_a_file_that_cannot_be_read_is_a_stop(content: bytes) -> None:
-    drill = online("benjr")
-    drill.board.files[FILE] = content
-    reconnect(drill)
-    assert (drill.state()["latched"], drill.state()["persisted"]) == (True, True)
 
 
 def test_the_file_is_written_when_latched_changes_and_not_per_stop_with_motors_off() -> None:

@@ -92,15 +92,6 @@ def test_a_host_that_does_not_read_blocks_nothing_and_gets_whole_lines_afterward
     assert {line.count(b"=") for line in lines if line.startswith(b"T")} == {3 if bench.kind == "goob" else 4}
 
 
-def test_ctrl_c_does_not_stop_the_firmware(bench: Bench) -> None:
-    bench.turn(0.01)
-    bench.board.take_output()
-    bench.board.type(b"\x03\x03\nM 0.5 0.5\n")
-    bench.turn(0.05)
-    assert b"ERR unknown command\r\nOK M\r\n" in bench.board.take_output()
-    assert bench.motors[-1][1] != (0.0, 0.0)
-
-
 def test_a_flood_does_not_keep_the_motors_running(bench: Bench) -> None:
     bench.send(b"M 1 1")
     bench.turn(0.05)
@@ -110,23 +101,6 @@ def test_a_flood_does_not_keep_the_motors_running(bench: Bench) -> None:
     (began, _), (stopped, motors) = bench.motors
     assert motors == (0.0, 0.0)
     assert stopped - began == pytest.approx(1.0, abs=0.01)
-
-
-def test_noise_moves_nothing_and_leaves_the_board_listening(bench: Bench) -> None:
-    chance = random.Random(3)
-    for _ in range(5_000):
-        bench.board.type(b"#" + chance.randbytes(chance.randrange(30)).translate(None, b"\n\r") + b"\r\n")
-        bench.robot.step()
-        bench.board.take_output()
-    bench.body.end_turn()
-    assert bench.motors == []
-    bench.board.type(b"\n")
-    while bench.board.unread:
-        bench.robot.step()
-    bench.board.take_output()
-    bench.send(b"M 0.5 0.5")
-    bench.turn(0.02)
-    assert b"OK M\r\n" in bench.board.take_output()
 
 
 @pytest.mark.parametrize(

@@ -3,11 +3,8 @@
 from __future__ import annotations
 
 import json
-import threading
 from pathlib import Path
 from typing import Any
-
-import pytest
 
 from pebble.config import Security
 from pebble.contract.names import with_name
@@ -16,7 +13,7 @@ from pebble.extensions.fleet.roles import Account
 from tests.ext.fleet.broker_client import BrokerClient
 from tests.ext.fleet.brokers import HOST, FleetBroker
 from tests.firmware.wireless_rig import Robots
-from tests.support import beside, until
+from tests.support import until
 
 KIND = "minilamp"
 BASE = f"pebble/robots/{KIND}"
@@ -100,40 +97,3 @@ def test_who_has_control_drives_and_everybody_stops(tmp_path: Path) -> None:
             command(sam, "drive-values", "sam", z=1, key=newest(vera, "control/mcu")["key"])
             assert until(lambda: boards.moving(KIND))
             assert not [at for at in boards.moves[KIND] if min(at[1]) < 0]  # no others' commands
-
-
-@pytest.mark.parametrize(
-    ("account", "size"),
-    [("ann", 0), *(pytest.param(*row, marks=pytest.mark.thorough) for row in (("otto", 0), ("otto", 60_000)))],
-)
-def test_a_flood_keeps_no_stop_away_that_is_repeated(tmp_path: Path, account: str, size: int) -> None:
-    """A driver floods, or the one who has control, whose small commands all move the board."""
-    with FleetBroker(tmp_path / "hall", ACCOUNTS, level="named") as broker:
-        login = {"username": KIND, "password": broker.passwords[KIND], "ca": tmp_path / "hall" / CA_CERT}
-        with (
-            Robots(HOST, broker.port, kinds=[KIND], security=Security(level="named"), **login) as boards,
-            broker.login("ann") as ann,
-            broker.login("vera") as vera,
-        ):
-            boards.wait_online()
-            vera.subscribe([f"{BASE}/outgoing/#"])
-            command(ann, "control", "ann", id="aaaaaaaa", by="ann", for_ms=10_000)
-            key = became(vera, "control/mcu", by="ann/ann")["key"]
-            ending, sent = threading.Event(), threading.Semaphore(0)
-
-            def flood() -> None:
-                text = json.dumps({"z": 1, "key": key}).encode() if not size else b"[" * size
-                with broker.login(account) as flooding:
-                    while not ending.is_set():
-                        flooding.publish(with_name(f"{BASE}/incoming/drive-values", account), text)
-                        sent.release()
-
-            def confirmed() -> bool:
-                command(vera, "estop", "vera", stop="00000000000000f1")
-                vera.listen(0.5)
-                return bool(newest(vera, "estop/mcu").get("latched"))
-
-            with beside(flood, ending):
-                assert all(sent.acquire(timeout=30) for _ in range(2000))
-                assert until(confirmed, 30)
-                assert not boards.moving(KIND)

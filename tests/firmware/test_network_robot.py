@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 
 from tests.ext.lab.simulation.virtual_broker import Session, VirtualBroker
-from tests.firmware.drill import BASE, DRIVE, LIMIT_S, ONLINE, STALE_S, START_S, Drill
+from tests.firmware.drill import BASE, DRIVE, LIMIT_S, STALE_S, Drill
 from wifi import sockets
 
 KINDS = ("minilamp", "benjr")
@@ -96,20 +96,6 @@ def test_its_client_id_is_its_own_and_as_long_as_any_broker_takes(kind: str, mon
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_the_heartbeat_is_stamped_in_real_milliseconds(kind: str) -> None:
-    drill = online(kind)
-    start = drill.seconds
-    drill.run(start + 10)
-    heartbeats = [
-        (one.at, json.loads(one.message.payload)["t"]) for one in drill.broker.received if one.message.topic == ONLINE
-    ]
-    heartbeats = [(at, t) for at, t in heartbeats if at > START_S + start]
-    assert 38 <= len(heartbeats) <= 42
-    for at, t in heartbeats:
-        assert abs(EPOCH_MS + at * 1000 - t) < 150  # the way of the message and half of the time server's
-
-
-@pytest.mark.parametrize("kind", KINDS)
 def test_the_battery_every_five_seconds_and_not_retained(kind: str) -> None:
     drill = Drill(kind, 1)
     drill.board.set_volts(drill.board.firmware.module(f"{kind}.pins").BATTERY, 0.8)
@@ -167,19 +153,6 @@ def test_a_backlog_does_not_drive_a_robot() -> None:
         drill.network.step()
         drill.robot.step()
     assert not any(drill.outputs())
-
-
-@pytest.mark.parametrize("kind", KINDS)
-def test_of_a_burst_only_the_newest_acts(kind: str) -> None:
-    drill = online(kind)
-    moves = drill.seen.moves
-    for z in (1.0, -1.0, 0.3, -0.3, 1.0):
-        drill.command(0.0, z)
-    drill.command(0.0, 0.5)
-    drill.nonsense(b'{"z": NaN}')
-    drill.run(drill.seconds + 0.3)
-    assert drill.outputs() == AHEAD[kind]
-    assert drill.seen.moves == moves + 1
 
 
 @pytest.mark.parametrize("kind", KINDS)

@@ -83,16 +83,6 @@ def test_a_host_that_does_not_read_does_not_keep_the_motors_running() -> None:
     assert bench.motors[-1][0] - 3.1 <= 1.6, "one wait of half a second may come in between"
 
 
-def test_a_flood_does_not_keep_the_motors_running() -> None:
-    bench = Endless()
-    bench.type({1.5: b"M 1 1\n" + b"x" * 100_000})
-    bench.run(2.7)
-    assert bench.board.unread > 0
-    (began, motors), (stopped, off) = bench.motors
-    assert (motors, off) == ((1.0, 1.0), (0.0, 0.0))
-    assert stopped - began < 1.1
-
-
 def test_a_fault_in_a_turn_stops_the_motors_and_resets() -> None:
     """A callback's exception is not propagated."""
     bench = Endless()

@@ -9,11 +9,9 @@ import pytest
 from pebble.contract import CHANNELS, CONTROL, DRIVE, ESTOP, INCOMING, Channel, codec
 from pebble.contract.rights import WRITES, Right
 from pebble.forwarding.names import Names, Signed
-from pebble.forwarding.routing import TABLE_A1, Drop, Side
+from pebble.forwarding.routing import Drop, Side
 from pebble.forwarding.subjects import Subjects
-from pebble.services.mqtt_bridge.actions import Action
 from pebble.transports import Message
-from tests.forwarding.network import Client, Network, Node, Way, bridge
 from tests.forwarding.virtual import World
 from tests.services.mqtt_bridge.bridge_rig import BASE, make_config
 
@@ -202,20 +200,6 @@ def test_what_passes_and_what_does_not(world: World) -> None:
     assert (dropped["unnamed"], dropped["signed"], dropped["misnamed"]) == (2, 1, 0)
 
 
-def test_actions_and_requests_of_the_bridge_itself_need_a_name(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
-    ran: list[str] = []
-    monkeypatch.setattr(Action, "request", lambda action: bool(ran.append(action.name)) or True)
-    start(world)
-    for suffix in (REBOOT, "by/ann/by/otto/flags/reboot", "by/Ann/flags/reboot"):
-        assert received(world, suffix, b"true") == []
-    world.remote.publish("incoming/by/ann/flags/reboot", b"true", retain=True)
-    world.local.publish("incoming/by/ann/flags/reboot", b"true")
-    world.run()
-    assert ran == []
-    assert received(world, "by/ann/flags/reboot", b"true") == [b"true"]
-    assert ran == [REBOOT]
-
-
 @pytest.mark.parametrize(("metric", "most"), [(REBOOT, 10), ("arm/wave", 1000)])
 def test_what_has_no_name_takes_no_place_of_what_has_one(world: World, metric: str, most: int) -> None:
     start(world)
@@ -251,13 +235,6 @@ class TestStops:
             world.remote.publish(suffix, b"old", retain=True)
         start(world)
         assert world.local.payloads("incoming/estop") == []
-
-    def test_many_of_many_accounts_all_arrive(self, world: World) -> None:
-        start(world)
-        for number in range(200):
-            world.remote.publish(f"incoming/by/a{number}/estop", b"{}")
-        world.run(1)
-        assert len(world.local.payloads("incoming/estop")) == 200
 
 
 class TestFlags:
@@ -312,23 +289,3 @@ class TestFlags:
         assert world.retained(FLAG) == (b"false", b"false")
         assert world.retained("incoming/flags/remote-mirror")[0] is None
         assert not world.service.status.mirroring
-
-
-def test_what_leaves_by_another_way_and_comes_back_without_its_name_comes_to_rest() -> None:
-    """Where strangers drive, a command that came with a name returns without one."""
-    network = Network()
-    local, remote = Node(network), Node(network)
-    names = Names(BASE, SUBJECTS, "drive")
-    forwarder = bridge(local, remote, TABLE_A1, names=names)
-    robot, operator = Client(local).listen(f"{BASE}/#"), Client(remote)
-    Way(local, remote, "out", "incoming/#")
-    for _ in range(20):
-        operator.publish(f"{BASE}/incoming/by/ann/drive-values", MOVE)
-        assert network.rests_within(500)
-        network.now += 0.05
-    assert len(robot.payloads("incoming/drive-values")) < 45
-    assert forwarder.cycles.closed_ways
-    for number in range(30):
-        operator.publish(f"{BASE}/incoming/by/a{number}/estop", b"{}")
-    assert network.rests_within(5000)
-    assert len(robot.payloads("incoming/estop")) >= 30

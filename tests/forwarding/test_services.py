@@ -167,16 +167,6 @@ class TestOneShots:
         assert bridge.remote.payloads(DRIVE) == [b"2"]
         assert bridge.service.counters["refused"] == 1
 
-    @pytest.mark.parametrize("true", [b"true", b'{"value": true}', b'{"enabled": true}'])
-    def test_the_mirror_flag_may_come_from_the_remote_side(self, bridge: World, true: bytes) -> None:
-        do(bridge, "start")
-        for flag, payload in ((true, b"2"), (b"", b"3")):  # removed: back to the default
-            bridge.remote.publish(MIRROR_FLAG, flag, retain=True)
-            bridge.run()
-            bridge.local.publish(DRIVE, payload)
-            bridge.run()
-        assert bridge.remote.payloads(DRIVE) == [b"2"]
-
     @pytest.mark.parametrize("side", [0, 1], ids=["local", "remote"])
     @pytest.mark.parametrize("true", [b"true", b'{"value": true}', b'{"enabled": true}'])
     def test_actions_run_once_from_either_side(self, bridge: World, ran: list[str], side: int, true: bytes) -> None:
@@ -187,12 +177,6 @@ class TestOneShots:
         bridge.run()
         assert ran == ["flags/git-pull"]
         assert other.payloads(GIT_PULL)[-1:] == [true]
-
-    def test_actions_from_the_local_side_run_without_uplink(self, bridge: World, ran: list[str]) -> None:
-        do(bridge, "alone")
-        bridge.local.publish(REBOOT, TRUE)
-        bridge.run()
-        assert ran == ["flags/reboot"]
 
 
 class TestStops:
@@ -244,15 +228,6 @@ class TestProbes:
         before = len(world.local.probes)
         do(world, "cut mend")
         assert len(world.local.probes) >= before + 4
-
-    def test_one_of_a_media_request_requests_nothing(self, bridge: World) -> None:
-        do(bridge, "start")
-        for client, _ in sides(bridge):
-            client.publish("incoming/front-camera", b" \t\n" * 8)
-            client.publish("incoming/front-camera", b"  ")
-        bridge.run()
-        assert bridge.local.payloads("incoming/front-camera") == [b"  "]
-        assert bridge.service.counters["refused"] == 0
 
 
 class TestOneBroker:
@@ -307,13 +282,6 @@ class TestOneBroker:
         assert bridge.running[0].gate is Gate.SHUT
         joint.close()
         bridge.run(40)
-        assert bridge.running[0].gate is Gate.OPEN
-
-    def test_a_heartbeat_of_another_program_of_the_same_millisecond_is_no_proof(self, bridge: World) -> None:
-        do(bridge, "start")
-        for heartbeat in bridge.remote.payloads(ONLINE):
-            bridge.local.publish(ONLINE, heartbeat)
-        bridge.run()
         assert bridge.running[0].gate is Gate.OPEN
 
 
@@ -382,13 +350,6 @@ class TestWrongBroker:
         assert waits_s <= mirror.now - began < waits_s + 0.6
         assert waiting.gate is Gate.OPEN
 
-    def test_one_that_later_turns_out_to_be_the_remote_one_too(self, apart: World) -> None:
-        """Its address may lead elsewhere after a reconnect."""
-        assert apart.running[1].gate is Gate.OPEN
-        apart.uplink.lead_to(apart.remote_hub)
-        apart.run()
-        assert not self.is_mirrored(apart)
-
     @pytest.mark.parametrize("retain", [False, True])
     @pytest.mark.parametrize("topic", ["outgoing/bridge-probe", ONLINE])
     def test_no_client_of_it_can_stop_the_mirror(self, apart: World, topic: str, retain: bool) -> None:
@@ -401,23 +362,6 @@ class TestWrongBroker:
         apart.remote.publish(DRIVE, b"after")
         apart.run()
         assert apart.local.payloads(DRIVE) == [b"after"]
-
-    @pytest.mark.parametrize("retain", [False, True])
-    def test_a_copied_probe_stops_it_once_and_for_seconds(self, apart: World, retain: bool) -> None:
-        """A client that reads the operators' broker knows the bridge's probes."""
-        (probe, *_) = [one.payload for one in apart.local.on("outgoing/bridge-probe") if b"nonce" in one.payload]
-        for _ in range(20):
-            apart.remote.publish("outgoing/bridge-probe", probe, retain=retain)
-            apart.run(1)
-        apart.remote.publish(DRIVE, b"after")
-        apart.run()
-        assert apart.local.payloads(DRIVE) == [b"after"]
-
-    def test_a_client_of_it_never_sees_what_would_stop_the_mirror(self, apart: World) -> None:
-        apart.remote.publish(ONLINE, heartbeat())
-        apart.run()
-        assert len(apart.local.on("outgoing/bridge-probe")) >= 3  # questions of the mirror, and answers
-        assert not apart.remote.on("outgoing/bridge-probe")
 
     @pytest.mark.parametrize("history", ["", "cut mend"], ids=["after a while", "at a reconnect"])
     def test_it_is_checked_again(self, mirror: World, history: str) -> None:
@@ -439,20 +383,6 @@ class TestWrongBroker:
         assert self.is_mirrored(mirror)
         assert mirror.retained(STATUS) == (b"new", b"new")
         assert mirror.retained(READING) == (None, None)
-
-    @pytest.mark.parametrize("bridge_lives", [True, False])
-    def test_it_stays_shut_while_the_broker_is_the_remote_one(
-        self, mirror: World, caplog: pytest.LogCaptureFixture, bridge_lives: bool
-    ) -> None:
-        """Also if the bridge cannot be asked: the earlier proof still counts."""
-        for service in ("mirror", "bridge"):
-            mirror.start(service, enabled=True)
-            mirror.run()
-        {True: lambda: None, False: mirror.running[1].uplink.cut}[bridge_lives]()
-        for _ in range(int(20 * CHECK_AGAIN_S)):
-            mirror.run(0.25)
-            assert mirror.running[0].gate is not Gate.OPEN
-        assert len(errors(caplog)) == 1
 
     @pytest.mark.parametrize(
         ("profile", "age_s", "asks"), [("wide", 0.4, 1), ("wide", 1.2, 0), ("thin", 6.0, 1), ("thin", 9.0, 0)]
@@ -537,13 +467,6 @@ class TestHeartbeat:
         assert all(set(stamp) == {"t"} and type(stamp["t"]) is int for stamp in stamps)
         assert all(one.qos == 1 and one.retain_requested for one in heartbeats)
         assert not bridge.local.on(ONLINE)
-
-    def test_again_at_once_after_an_outage(self, bridge: World) -> None:
-        bridge.start(heartbeat={"interval_seconds": 300})
-        bridge.run()
-        before = len(bridge.remote.on(ONLINE))
-        do(bridge, "cut mend")
-        assert len(bridge.remote.on(ONLINE)) == before + 1
 
     @pytest.mark.parametrize("end", ["politely", "in a crash"])
     def test_the_will_is_published_at_its_end(self, bridge: World, end: str) -> None:

@@ -25,11 +25,8 @@ from typing import Any
 #: The modules that declare an ENGINE, by the name on the command line.
 ENGINES = {
     "motion": "tests.motion.histories",
-    "lockstep": "tests.robot.lockstep.schedules",
-    "owners": "tests.robot.lockstep.two_owners",
-    "stops": "tests.services.mqtt_bridge.stop_schedules",
-    "robot_scripts": "tests.robot.script_schedules.world",
-    "robot_stops": "tests.robot.stop_schedules.performance",
+    "services": "tests.robot.lockstep.schedules",
+    "robot": "tests.robot.whole",
 }
 
 Step = tuple[str, int, int]  # the world's method do_<action> is called with two small numbers
@@ -87,11 +84,10 @@ class RandomSteps:
 
 @dataclass
 class Outcome:
-    """What a schedule has shown. ``counts`` and ``tags`` are for the table; ``log`` says what happened."""
+    """What a schedule has shown. ``counts`` are for the table; ``log`` says what happened."""
 
     problems: list[str] = field(default_factory=list)
     counts: dict[str, float] = field(default_factory=dict)
-    tags: set[str] = field(default_factory=set)
     log: Callable[[], str] = str
 
 
@@ -104,7 +100,6 @@ class Result:
     seconds: float
     problems: list[str]
     counts: dict[str, float]
-    tags: set[str]
     log: str
 
     def __str__(self) -> str:
@@ -134,7 +129,7 @@ class Engine:
                     began = time.monotonic()
                     one = self._outcome(world, self.draw(kind, seed, number))
                     log = one.log() if one.problems or verbose else ""
-                    yield Result(kind, number, time.monotonic() - began, one.problems, one.counts, one.tags, log)
+                    yield Result(kind, number, time.monotonic() - began, one.problems, one.counts, log)
                     if one.problems:
                         break
 
@@ -259,12 +254,10 @@ def _map(jobs: int, work: Callable[..., Any], *arguments: Iterable[Any]) -> Iter
 
 
 def table(results: list[Result]) -> str:
-    """One line for each kind of world, one for all, and one for each tag; of counts the sums, or of the slowest one."""
+    """Return a line for each kind of world and one for all; of counts the sums, or of the slowest one."""
     groups: dict[str, list[Result]] = {}
     for name, one in [(one.kind, one) for one in results if one.kind] + [("all", one) for one in results]:
         groups.setdefault(name, []).append(one)
-    for tag in sorted({tag for one in results for tag in one.tags}):
-        groups[f"with {tag}"] = [one for one in results if tag in one.tags]
     names = list(dict.fromkeys(name for one in results for name in one.counts))
     rows = [("", "schedules", *names, "violations", "slowest")]
     for name, group in groups.items():

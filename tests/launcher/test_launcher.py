@@ -43,16 +43,6 @@ def test_children_start_in_order_and_their_readiness_is_published(launch: Launch
     assert (message["qos"], message["retain"]) == (1, True)
 
 
-def test_retained_state_is_published_again_on_its_interval(launch: Launch) -> None:
-    robot = launch(
-        ("bridge", "good", CONNECTION),
-        republish_s=0.1,
-    )
-    assert until(lambda: len(robot.published("status")) > 10 and len(robot.published("capabilities")) > 5)
-    stamps = [one["payload"]["t"] for one in robot.published("capabilities")]
-    assert stamps == sorted(set(stamps))
-
-
 def test_what_is_switched_off_is_not_published(launch: Launch) -> None:
     robot = launch(
         ("bridge", "talker", CONNECTION),
@@ -198,12 +188,6 @@ def test_supervision_does_not_wait_for_a_transport(launch: Launch, trouble: str)
     assert len(robot.events("serial", "stop")) == 1
 
 
-def test_the_reason_why_nothing_is_published_is_logged(launch: Launch) -> None:
-    robot = launch(("serial", "good", DEVICE), options=("broken",))
-    line = "[ERROR] [announcer] the launcher publishes nothing: no such certificate"
-    assert until(lambda: line in robot.stderr(), 20)
-
-
 def test_a_killed_announcer_is_started_again_and_receives_what_it_missed(launch: Launch) -> None:
     robot = launch(("serial", "good", DEVICE), republish_s=600)
     assert robot.ready("serial", "announcer")
@@ -211,16 +195,6 @@ def test_a_killed_announcer_is_started_again_and_receives_what_it_missed(launch:
     assert until(lambda: robot.services()["announcer"] == {"state": "ready", "restarts": 1, "last_exit": "signal 9"})
     assert len(robot.published("capabilities")) >= 2
     assert len(robot.events("serial", "start")) == 1
-
-
-def test_a_stopped_announcer_delays_nothing_and_is_replaced(launch: Launch) -> None:
-    robot = launch(("serial", "good", DEVICE), options=("hasty",))
-    assert robot.ready("serial", "announcer")
-    os.kill(robot.children()["announcer"], signal.SIGSTOP)
-    os.kill(robot.events("serial", "start")[0], signal.SIGKILL)
-    assert until(lambda: len(robot.events("serial", "ready")) == 2, 20)
-    assert until(lambda: "announcer gives no sign of life: killed" in robot.stderr(), 20)
-    assert until(lambda: robot.services()["serial"]["restarts"] == 1, 20)
 
 
 # -- a forked process
@@ -336,43 +310,7 @@ def test_what_ends_while_the_robot_stops_is_not_started_again(launch: Launch) ->
     assert len(robot.events("hub", "start")) == 1
 
 
-def test_a_second_signal_ends_everything_at_once(launch: Launch) -> None:
-    robot = launch(("bridge", "stubborn", CONNECTION), shutdown_timeout_seconds=600)
-    assert robot.ready("bridge")
-    robot.process.send_signal(signal.SIGINT)
-    assert until(lambda: "[launcher] stopping" in robot.stderr())
-    robot.process.send_signal(signal.SIGINT)
-    assert robot.process.wait(20) == 1
-    assert gone(robot.events("bridge", "start")[0])
-
-
 # -- telling
-
-
-def test_childrens_lines_become_records(launch: Launch) -> None:
-    robot = launch(("serial_mcu_bridge:imu", "talker", DEVICE))
-    assert until(lambda: any(record["level"] == "ERROR" for record in robot.logs()), 20)
-    assert until(lambda: any("tail" in record["message"] for record in robot.logs()), 20)
-    records = [record for record in robot.logs() if record["service"] == "serial_mcu_bridge:imu"]
-    first = records[0]["pid"]
-    assert first == robot.events("serial_mcu_bridge:imu", "start")[0]
-    texts = [(r["level"], r["message"].removeprefix("[serial_mcu_bridge:imu] ")) for r in records if r["pid"] == first]
-    assert texts == [
-        ("WARNING", "mind the gap"),
-        ("INFO", "just a print"),
-        ("ERROR", "it broke"),
-        ("ERROR", "Traceback (most recent call last):"),
-        ("ERROR", '  File "somewhere.py", line 1, in <module>'),
-        ("ERROR", "ValueError: seven"),
-        ("INFO", "and goes on"),
-        ("INFO", "x" * (2045 - len("[serial_mcu_bridge:imu] ")) + "..."),
-        ("INFO", "caf\ufffd and a tail without newline"),
-    ]
-    assert {"t", "level", "service", "message", "logger", "pid"} == set(records[0])
-    line = robot.published("logs")[0]
-    assert (line["qos"], line["retain"]) == (0, False)
-    assert "[DEBUG] [serial_mcu_bridge:imu] not for the public" in robot.stderr()
-    assert "[ERROR] [serial_mcu_bridge:imu] ValueError: seven" in robot.stderr()
 
 
 def test_systemd_is_notified_of_readiness_life_and_end(launch: Launch, tmp_path: Path) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import signal
-import time
 from collections.abc import Callable
 from types import SimpleNamespace
 from typing import Any, cast
@@ -104,18 +103,6 @@ def test_a_program_runs_if_it_is_requested_and_not_held(
     assert " ".join(found) == states
 
 
-def test_a_crash_loop_shows_until_the_program_is_released(launch: Launch) -> None:
-    robot = launch(ASKER, media("crash"), restart_delay_seconds=0)
-    assert robot.ready("bridge")
-    robot.order("bridge", "media 1")
-    assert until(lambda: state_of(robot) == "failed", 20)
-    assert len(robot.events("media", "start")) == 5
-    robot.order("bridge", "media 0")
-    assert until(lambda: state_of(robot) == "stopped")
-    assert robot.states()["bridge"] == "ready"
-    assert len(robot.events("bridge", "ready")) == 1
-
-
 def test_a_released_program_that_does_not_stop_is_killed_without_a_wait(launch: Launch) -> None:
     robot = launch(ASKER, media("stubborn", stop_timeout_s=2.0), ("serial", "good", DEVICE))
     assert robot.ready("bridge", "serial")
@@ -147,15 +134,6 @@ def test_a_program_requested_again_while_it_stops_is_started_after_its_exit(laun
     assert robot.stop() == 0
 
 
-def test_rapidly_changing_requests_start_few_processes(launch: Launch) -> None:
-    robot = launch(ASKER, media("good"))
-    assert robot.ready("bridge")
-    began = time.monotonic()
-    robot.order("bridge", *["media 1", "media 0"] * 200, "media 1")
-    assert robot.ready("media")
-    assert len(robot.events("media", "start")) <= 2 + time.monotonic() - began
-
-
 def test_only_the_bridge_may_request_and_only_existing_programs(launch: Launch) -> None:
     robot = launch(ASKER, ("other", "asker", CONNECTION), media("good"))
     assert robot.ready("bridge", "other")
@@ -185,18 +163,6 @@ class TestBridgeThatDies:
         assert robot.states()["media"] == "ready"
         assert len(robot.events("media", "start")) == 1
         assert not robot.events("media", "stop")
-
-    def test_dying_again_and_again_prolongs_nothing(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        monkeypatch.setattr(on_demand, "OUTLIVE_S", 0.3)
-        reactor, supervisor = Reactor(), StandIn()
-        bridge = Program("bridge", "bridge", (), Stage.CONNECTION, may_request=True)
-        programs = OnDemand(reactor, [cast(ProcessSupervisor, supervisor)])
-        programs.want(bridge, Wanted("media", True))
-        reactor.every(0.1, lambda: programs.ended(bridge))
-        assert reactor.run_until(lambda: not supervisor.requested, 10)
-        programs.want(bridge, Wanted("media", True))
-        assert not reactor.run_until(lambda: not supervisor.requested, 0.2), "that was another request"
-        reactor.close()
 
 
 @pytest.mark.parametrize(("state", "releases"), [("init", 1), ("ready", 0)])

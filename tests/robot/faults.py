@@ -8,12 +8,11 @@ import shutil
 import signal
 import time
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, ExitStack, contextmanager, suppress
+from contextlib import AbstractContextManager, contextmanager, suppress
 from dataclasses import dataclass
 from functools import partial
 
 from pebble.config import LAUNCHER_LOCK
-from tests.robot.flood import FLOODS, flooding
 from tests.robot.operator import Driver, Operator, number_of
 from tests.robot.rig import STOP, Rig
 from tests.support import until
@@ -176,13 +175,6 @@ def _robot_frozen(rig: Rig) -> AbstractContextManager[None]:
     return frozen(*rig.processes().values(), rig.launcher_pid)
 
 
-def standing_still(rig: Rig) -> dict[str, Callable[[], AbstractContextManager[None]]]:
-    """Return what can stand still for some seconds, but for the serial bridge: only it can stop the wheels."""
-    pids = {name: pid for name, pid in sorted(rig.processes().items()) if name != _OWNER}
-    pids |= {"remote broker": rig.remote.pid} | ({} if rig.local is None else {"local broker": rig.local.pid})
-    return {"uplink": partial(silent, rig), **{name: partial(frozen, pid) for name, pid in pids.items()}}
-
-
 @dataclass(frozen=True)
 class Fault:
     """A fault that lasts for some seconds. ``turns_s``: how long wheels may turn without another line."""
@@ -218,21 +210,4 @@ FAULTS = {
         lambda rig: frozen(rig.processes()[_OWNER]), 2.8, turns_s=_MCU_TURNS_S
     ),
     "the whole robot stands still": Fault(_robot_frozen, 2.8, turns_s=_MCU_TURNS_S),
-    **{
-        f"a flood of {name}": Fault(lambda rig, name=name: flooding(name, rig.remote.port, 3.0), 3.0)  # type: ignore[misc]
-        for name in FLOODS
-    },
 }  # fmt: skip
-
-
-def at_once(rig: Rig, names: list[str]) -> Fault:
-    """Return a fault in which these stand still at the same time."""
-
-    @contextmanager
-    def happens(_rig: Rig) -> Iterator[None]:
-        with ExitStack() as ends:
-            for name in names:
-                ends.enter_context(standing_still(rig)[name]())
-            yield
-
-    return Fault(happens, 2.0)

@@ -25,7 +25,9 @@ from subprocess import CalledProcessError
 from rich.console import Console
 
 from tests.own_memory import own_mb
-from tests.robot.faults import FAULTS, Drive, Fault
+from tests.robot import faults
+from tests.robot.faults import Drive, Fault
+from tests.robot.flood import FLOODS, flooding
 from tests.robot.rig import Rig, descendants
 from tests.small_disk import SmallDisk
 from tests.support import Broker, process_name, quarters
@@ -43,6 +45,10 @@ clock, clock_ns = time.time, time.time_ns
 time.time_ns = lambda: clock_ns() + struct.unpack("q", ahead)[0]
 time.time = lambda: clock() + struct.unpack("q", ahead)[0] / 1e9
 """
+FAULTS = faults.FAULTS | {
+    f"a flood of {name}": Fault(lambda rig, name=name: flooding(name, rig.remote.port, 3.0), 3.0)  # type: ignore[misc]
+    for name in FLOODS
+}
 
 
 class Soak:

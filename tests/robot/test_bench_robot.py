@@ -4,9 +4,6 @@ from __future__ import annotations
 
 import io
 import os
-import signal
-import sys
-import tempfile
 from collections.abc import Callable
 from pathlib import Path
 
@@ -18,8 +15,6 @@ from pebble.extensions.lab.bench.impair import trials
 from pebble.extensions.lab.bench.impair.network import why_no_namespaces
 from pebble.extensions.lab.bench.show import Shown, finish
 from pebble.extensions.lab.rig.processes import children
-from tests.robot.rig import Rig, descendants
-from tests.support import ROOT, Child, until
 
 pytestmark = [pytest.mark.alone, pytest.mark.thorough]  # whole robots
 
@@ -47,17 +42,3 @@ def test_it_measures_whole_robots(name: str, tmp_path: Path, monkeypatch: pytest
     measured = [cell for cell in shown.results.cells if cell.samples]
     assert len(measured) >= least, [cell.measure for cell in measured]
     assert children(os.getpid()) == []
-
-
-@pytest.mark.parametrize(("comparison", "least"), [("startup", 6), ("bridge", 12)])
-def test_the_end_of_a_command_ends_its_robots(comparison: str, least: int, tmp_path: Path) -> None:
-    command = [sys.executable, "-m", "pebble.cli", "bench", comparison, "--output", str(tmp_path)]
-    with tempfile.TemporaryDirectory(prefix="b-", dir="/tmp") as short:  # as below it are Unix sockets
-        with Child(command, cwd=ROOT, env={**os.environ, "TMPDIR": short}) as bench:
-            assert until(lambda: len(descendants(bench.pid)) > least, 30), "no robot was launched"
-            started = descendants(bench.pid)
-            bench.send_signal(signal.SIGINT)
-            assert bench.wait(60) == 130
-        assert until(lambda: not any(map(Rig.alive, started)), 10)
-        assert list(Path(short).iterdir()) == []
-    assert not (tmp_path / f"{comparison}.json").exists()

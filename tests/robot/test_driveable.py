@@ -51,14 +51,6 @@ def test_an_unplugged_board_is_named_everywhere_until_it_is_back(rig: Rig) -> No
     assert _mcu(rig) == {"state": "ready", "heard_ms": 0}
 
 
-def test_a_motor_owner_that_ends_drives_nothing_until_it_is_back(rig: Rig) -> None:
-    assert shows(rig, "yes")
-    before = len(_reasons(rig))
-    rig.kill("serial_mcu_bridge")
-    assert until(lambda: any("serial" in why for why in _reasons(rig)[before:]), 10), _reasons(rig)
-    assert shows(rig, "yes")
-
-
 def test_siblings_that_do_not_reach_each_other_are_noticed_until_they_do() -> None:
     with Rig("zenoh") as rig:
         assert shows(rig, "yes")

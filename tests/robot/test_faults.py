@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import json
-import random
 import time
 from collections.abc import Iterator
 
 import pytest
 
-from tests.robot.faults import FAULTS, Drive, at_once, silent, standing_still
+from tests.robot.faults import FAULTS, Drive, silent
 from tests.robot.operator import Operator, retained_messages
 from tests.robot.rig import BASE, Rig
 from tests.support import further, until
@@ -17,8 +16,7 @@ from tests.support import further, until
 pytestmark = pytest.mark.alone  # deadlines are checked
 
 KINDS, FURTHER = ("mqtt", "zenoh"), ("for long", "again and again", "whole robot")
-NAMES = [name for name in FAULTS if "flood" not in name]  # what a flood holds up is measured by tests/robot/soak.py
-USUAL = [name for name in NAMES if not any(word in name for word in FURTHER)]
+USUAL = [name for name in FAULTS if not any(word in name for word in FURTHER)]
 
 
 @pytest.fixture(autouse=True)
@@ -56,18 +54,13 @@ def changed_state(rig: Rig) -> None:
     [
         (kind, name) if name in USUAL and (USUAL.index(name) + at) % 2 else further(kind, name)
         for at, kind in enumerate(KINDS)
-        for name in NAMES
+        for name in FAULTS
     ],
     indirect=["driven"],
 )
 def test_a_fault_while_an_operator_drives(driven: Rig, name: str) -> None:
     drive = Drive(driven, turns_s=FAULTS[name].turns_s)
     FAULTS[name].perform(driven, drive, lambda: changed_state(driven))
-
-
-def test_two_things_at_once_stand_still(driven: Rig) -> None:
-    names = random.Random(20).sample(sorted(standing_still(driven)), 2)
-    at_once(driven, names).perform(driven, Drive(driven), lambda: changed_state(driven))
 
 
 def test_an_operator_dies_while_the_link_is_silent(driven: Rig) -> None:

@@ -1,38 +1,21 @@
-"""Random schedules of persons, scripts and faults in virtual time: of one robot, and of two motor owners.
+"""Random schedules of persons, scripts, stops and faults in virtual time, of one motor owner and of two.
 
-``python -m tests.kit.schedules NAME`` runs thousands.
+``python -m tests.kit.schedules services`` runs thousands.
 """
 
 from __future__ import annotations
 
-import logging
-from collections.abc import Iterator
-
 import pytest
 
-from tests.kit.schedules import Engine
-from tests.robot.lockstep import schedules, two_owners
+from tests.robot.lockstep.schedules import ENGINE
 from tests.support import cases
 
-pytestmark = pytest.mark.computing
+pytestmark = [pytest.mark.computing, pytest.mark.usefixtures("quiet")]
 
 
-@pytest.fixture(autouse=True)
-def quiet() -> Iterator[None]:
-    """What services log would take most of the time."""
-    logging.disable(logging.CRITICAL)
-    yield
-    logging.disable(logging.NOTSET)
-
-
-@pytest.mark.parametrize(
-    ("name", "engine", "seed", "number"),
-    [
-        ("lockstep", schedules.ENGINE, 0, cases(40, 150)),
-        ("owners", two_owners.ENGINE, 1, cases(50, 150)),
-    ],
-    ids=("lockstep", "owners"),
-)
-def test_no_schedule_violates_a_rule(name: str, engine: Engine, seed: int, number: int) -> None:
-    violated = [rule for result in engine.run("", seed, range(number)) for rule in result.problems]
-    assert not violated, f"python -m tests.kit.schedules {name} --seed {seed} prints the shortest schedule"
+@pytest.mark.parametrize(("kind", "seed", "number"), [("scripts", 0, cases(40, 150)), ("owners", 1, cases(60, 200))])
+def test_no_schedule_violates_a_rule(kind: str, seed: int, number: int) -> None:
+    violated = [rule for result in ENGINE.run(kind, seed, range(number)) for rule in result.problems]
+    assert not violated, (
+        f"python -m tests.kit.schedules services --kind {kind} --seed {seed} prints the shortest schedule"
+    )

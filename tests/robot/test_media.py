@@ -153,18 +153,3 @@ def test_stopping_media_does_not_delay_driving(rig: Rig) -> None:
     moves = [at for at, wheels in rig.mcu.drives(drive_from) if wheels != (0.0, 0.0)]
     assert len(moves) > 35
     assert max(later - earlier for earlier, later in pairwise(moves)) < 0.5
-
-
-@pytest.mark.parametrize("rig", ["mqtt", further("zenoh")], indirect=True)
-def test_after_an_uplink_outage_pictures_are_new_ones(rig: Rig) -> None:
-    began = want_video(rig, encoding="pbvd")
-    assert pictures_come(rig, began)
-    rig.uplink.blackhole()
-    time.sleep(3)
-    rig.uplink.resume()
-    back = time.monotonic()
-    assert pictures_come(rig, back + 1.0)
-    late = rig.operator.on(CAMERA, back + 1.0)
-    decoder, offset = VideoDecoder(), time.time() - time.monotonic()
-    decoded = [(one.at + offset, picture) for one in late if (picture := decoder.feed(one.payload)) is not None]
-    assert max(at - (picture.captured_ms or 0) / 1000 for at, picture in decoded) < 2.0, "an old picture came late"

@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-import shutil
 import time
 from collections.abc import Callable
-from pathlib import Path
 
 import pytest
 
 from tests.ext.page.served import Page, Served
 from tests.robot.rig import STOP, Rig
-from tests.support import ROOT, until
+from tests.support import until
 
 PERIOD_S = 0.05
 HALF, FAST, OLD, SCRIPT = (0.5, 0.5), (0.7, 0.7), (0.9, 0.9), (-0.3, -0.3)
@@ -86,55 +84,3 @@ def test_one_person_at_a_time_moves_the_motors(kind: str) -> None:
         assert ann.drive(0.5, lambda: HALF in driven(since))
         first.close()
         assert until(lambda: otto.view["by"] == "")
-
-
-@pytest.mark.parametrize("files", [[], ["cruise"]], ids=["without a script", "beside a script"])
-def test_the_originals_page_ranks_below_who_has_control_and_above_a_script(files: list[str], tmp_path: Path) -> None:
-    """It drives, is ranked below a person who takes control, stops, resets, and drives again after that."""
-    shutil.copytree(ROOT / "tests" / "robot" / "scripts" / "cruise", tmp_path / "cruise")
-    scripts = {"enabled": True, "autonomy_root": str(tmp_path)}
-    with (
-        Rig("mqtt", autonomy_manager=scripts) as rig,
-        Served(rig.remote.port) as hall,
-        hall.page(name="ann") as page,
-    ):
-        ann = Person(page, f"pebble/robots/{rig.name}")
-
-        def driven(since: float) -> list[tuple[float, float]]:
-            return [drive for _, drive in rig.mcu.drives(since)]
-
-        def original(z: float) -> bool:
-            """Send what the original's page sends; whether it has moved the robot so."""
-            rig.operator.send("incoming/drive-values", {"x": 0, "z": z, "y": 0})
-            return (z, z) in driven(since)
-
-        def latched() -> bool:
-            return bool(rig.operator.last("outgoing/estop/serial").json["latched"])  # type: ignore[union-attr]
-
-        since = time.monotonic()
-        for file in files:
-            assert until(lambda: rig.operator.last("outgoing/autonomy-files"), 20)
-            command = {"action": "start", "file": file, "config": {"x": 0.0, "z": -0.3}}
-            rig.operator.send("incoming/autonomy-command", command)
-            assert until(lambda: SCRIPT in driven(since), 20)
-        assert until(lambda: original(0.7), 5, step=0.25)
-        since = time.monotonic()
-        assert until(lambda: original(0.0), 5, step=0.25)
-        for _ in files:
-            assert until(lambda: SCRIPT in driven(since), 5), "it does not go on after the person has let go"
-        ann.ask()
-        assert until(lambda: ann.view["you"])
-        since = time.monotonic()
-        assert ann.drive(0.5, lambda: HALF in driven(since))
-        assert not ann.drive(0.5, lambda: original(0.9), 0.5)
-        assert ann.drive(0.5, lambda: original(0.0))
-        rig.operator.send("incoming/estop", {"by": "eve"})
-        assert until(latched, 5)
-        state = rig.operator.last("outgoing/estop/serial").json  # type: ignore[union-attr]
-        rig.operator.send("incoming/estop-reset", {"boot": state["boot"], "count": state["count"]})
-        assert until(lambda: not latched(), 5)
-        ann.release()
-        assert until(lambda: not ann.view["by"])
-        since = time.monotonic()
-        assert until(lambda: original(0.7), 5, step=1.0)
-        assert SCRIPT not in driven(since)

@@ -98,17 +98,6 @@ def test_telemetry(station: Station) -> None:
     assert station.operator.wait_for("outgoing/charging-status").json == {"value": None}
 
 
-@pytest.mark.parametrize("station", ["mqtt", "zenoh", "mirror"], indirect=True)  # one plain broker alone hides the flag
-def test_a_retained_drive_command_never_moves_the_robot(station: Station) -> None:
-    stop_and_wait(station)
-    began = time.monotonic()
-    station.operator.send(DRIVE, {"x": 0, "z": 0.9}, retain=True)
-    station.operator.send(DRIVE, b"", retain=True)
-    station.operator.send("incoming/lights-solid", {"r": 0.321})
-    assert until(lambda: any(entry.line == "L 0.000 0.000 0.321" for entry in station.rig.mcu.entries(began)), 3)
-    assert not station.rig.mcu.moving(began)
-
-
 def test_actions_run_once_and_only_for_true(station: Station) -> None:
     before = len(station.rig.recorded())
     for body in (False, {"value": False}, 1, "true", {"value": 1}, None, {"on": True}, b"true\xff"):

@@ -2,28 +2,24 @@
 
 from __future__ import annotations
 
-import json
 import math
 import os
 import signal
 import time
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack
 from functools import cache
 from typing import Any
 
 import pytest
 
-from pebble.config import load
-from pebble.runtime.connections import local_transport
-from pebble.transports import QoS
 from tests.robot.rig import STOP, Rig
 from tests.support import further, gone, until
 
 pytestmark = pytest.mark.alone  # deadlines are checked
 
 DRIVE, CONTROL = "incoming/drive-values", "incoming/control"
-CRUISE, CRUISES = {"x": 0.0, "z": -0.3}, (-0.3, -0.3)
+CRUISE = {"x": 0.0, "z": -0.3}
 DRIVEN, WHEELS = {"x": 0, "z": 0.4}, (0.4, 0.4)  # by a person
 MIA = {"id": "aaaaaaaa", "by": "mia", "for_ms": 3000}
 REST_S = 0.5  # without a motion the wheels are at rest
@@ -114,39 +110,6 @@ def test_the_wheels_rest_however_a_script_ends(rig: Rig, ending: str) -> None:
         assert until(lambda: rig.lists_scripts(began), 60)
     else:
         assert until(lambda: not rig.script()["running"], 10)
-
-
-@contextmanager
-def from_outside(rig: Rig) -> Iterator[Callable[[dict[str, Any]], object]]:
-    yield lambda body: rig.operator.send(DRIVE, body)
-
-
-@contextmanager
-def on_the_robot(rig: Rig) -> Iterator[Callable[[dict[str, Any]], object]]:
-    with local_transport(load(rig.config), "person") as transport:
-        topic = f"{rig.operator.base}/{DRIVE}"
-        yield lambda body: transport.publish(topic, json.dumps(body).encode(), qos=QoS.DELIVERED)
-
-
-@pytest.mark.parametrize(("rig", "person"), [("zenoh", from_outside), ("mqtt", on_the_robot)], indirect=["rig"])
-def test_a_person_goes_first_and_the_script_resumes(rig: Rig, person: Any) -> None:
-    driving(rig, config=CRUISE)
-    with person(rig) as send:
-        began = time.monotonic()
-        while time.monotonic() < began + 1.0:
-            send(DRIVEN)
-            time.sleep(0.05)
-        send({"x": 0, "z": 0})
-    released = time.monotonic()
-    resumed = until(lambda: CRUISES in [speeds for _, speeds in rig.mcu.drives(released + 0.2)], 5)
-    lines = rig.mcu.drives(began)
-    idle(rig)
-    assert resumed
-    first = next(index for index, (_, speeds) in enumerate(lines) if speeds == WHEELS)
-    assert lines[first][0] - began < AT_ONCE_S
-    resumed_at = next(at for at, speeds in lines[first:] if speeds == CRUISES)
-    assert {speeds for at, speeds in lines[first:] if at < resumed_at} == {WHEELS, STOP}
-    assert 1.9 <= resumed_at - released <= 4.0
 
 
 @pytest.mark.parametrize("rig", ["zenoh", further("mqtt")], indirect=True)

@@ -7,18 +7,15 @@ import os
 import resource
 import signal
 import subprocess
-import sys
 import time
-from collections.abc import Callable
 from contextlib import ExitStack
-from pathlib import Path
 from typing import Any
 
 import pytest
 
 from tests.fakes.bad_brokers import BEHAVIOURS, mute, resolving, serving
 from tests.robot.rig import STOP, Rig, descendants
-from tests.support import ROOT, cases, further, gone, some, until
+from tests.support import ROOT, further, gone, some, until
 
 pytestmark = pytest.mark.alone
 
@@ -69,15 +66,6 @@ def test_a_robot_runs_where_some_addresses_of_its_brokers_are_dead(kind: str) ->
         drives_and_stops(rig)
 
 
-def test_a_robot_runs_in_a_folder_that_was_deleted(tmp_path: Path) -> None:
-    folder = tmp_path / "deleted"
-    folder.mkdir()
-    with Rig("zenoh", start=False) as rig:
-        began = rig.start(ready=False, cwd=folder, env={**os.environ, **ENVIRONMENT}, preexec_fn=folder.rmdir)
-        rig.wait_until_up(began)
-        drives_and_stops(rig)
-
-
 @pytest.mark.parametrize("kind", ["mqtt", "zenoh"])
 @pytest.mark.parametrize("files", [further(12), 20, further(40)])
 def test_too_few_descriptors_are_an_error_or_enough(kind: str, files: int) -> None:
@@ -111,37 +99,6 @@ def remains(rig: Rig) -> list[str]:
     """Programs of this robot that run."""
     found = subprocess.run(["pgrep", "-f", str(rig.config)], capture_output=True, text=True, check=False)
     return found.stdout.split()
-
-
-def test_a_robot_whose_launcher_is_killed_starts_again_at_once() -> None:
-    with Rig("zenoh") as rig:
-        for _ in range(cases(2, 5)):
-            children = rig.kill_launcher()
-            rig.start()
-            assert until(lambda pids=children: all(map(gone, pids)))  # type: ignore[misc]
-        drives_and_stops(rig)
-
-
-def test_of_four_starts_at_once_one_runs() -> None:
-    with Rig("zenoh", start=False) as rig:
-        command = [sys.executable, "-m", "pebble.cli", "up", str(rig.config)]
-        others = [
-            subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
-            for _ in range(3)
-        ]
-        rig.start(ready=False)
-        everybody: list[Callable[[], bool]] = [lambda pid=one.pid: gone(pid) for one in others]  # type: ignore[misc]
-        everybody.append(lambda: gone(rig.launcher_pid))
-        assert until(lambda: sum(ended() for ended in everybody) == 3)
-        time.sleep(1.0)
-        assert sum(ended() for ended in everybody) == 3
-        for one in others:
-            if gone(one.pid):
-                assert "already runs" in one.communicate()[0]
-            else:
-                one.terminate()
-                assert one.wait(20) == 0
-        rig.ensure_stopped()
 
 
 @pytest.mark.parametrize(

@@ -5,8 +5,6 @@ The world in virtual time checks its own rules all the time.
 
 from __future__ import annotations
 
-import logging
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -16,15 +14,7 @@ from pebble.config import Config
 from tests.robot.lockstep.drivers import STRANGER
 from tests.robot.lockstep.two_owners import FIRST, SECOND, TwoOwners, configuration
 
-pytestmark = pytest.mark.computing
-
-
-@pytest.fixture(autouse=True)
-def quiet() -> Iterator[None]:
-    """What services log would take most of the time."""
-    logging.disable(logging.CRITICAL)
-    yield
-    logging.disable(logging.NOTSET)
+pytestmark = [pytest.mark.computing, pytest.mark.usefixtures("quiet")]
 
 
 @pytest.fixture(scope="module")

@@ -206,17 +206,6 @@ def test_a_message_that_a_handler_fails_on_is_counted_and_ends_nothing(caplog: p
     assert robot.error is None
 
 
-def test_what_a_message_requires_ends_nothing_either(running: Robot, caplog: pytest.LogCaptureFixture) -> None:
-    def fail() -> None:
-        raise RuntimeError("the reaction failed")
-
-    running.service.post_message(MQTT_VIDEO, fail, newest_of="reaction")
-    assert until(lambda: running.service.counters["handler_errors"] == 1)
-    running.service.post_message(MQTT_VIDEO, lambda: running.service.seen.append("reacted"))
-    assert running.saw("reacted")
-    assert [record.message for record in caplog.records] == ["failed on a message on flags/mqtt-video (1 so far)"]
-
-
 @pytest.mark.parametrize("timer", ["every", "call_at", "post"])
 def test_a_timer_or_a_reader_that_fails_ends_the_service_safely(timer: str) -> None:
     def fail() -> None:
@@ -427,15 +416,6 @@ def test_a_flood_of_commands_that_wait_does_not_push_out_the_one_that_ends_somet
     running.service.go_on.set()
     assert until(lambda: running.service.seen[-1] == "1499")
     assert running.service.seen[1:3] == ["the end", "501"]
-
-
-def test_a_command_that_waited_in_the_transport_is_dropped(running: Robot, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(running.hub, "now", lambda: clock.since_boot() - 0.6)
-    running.publish(DRIVE_TOPIC, '{"x": 0.5}')
-    assert until(lambda: running.service.counters["late"] == 1)
-    monkeypatch.undo()
-    running.publish(DRIVE_TOPIC, '{"x": 0.25}')
-    assert running.saw(0.25)
 
 
 @pytest.mark.parametrize(

@@ -21,7 +21,6 @@ from paho.mqtt.enums import CallbackAPIVersion
 from pebble.errors import TransportError
 from pebble.transports import Message, MqttSettings, QoS, State, TlsSettings, Transport, clock, create
 from pebble.transports.mqtt import refused_topics
-from pebble.transports.mqtt import transport as transport_module
 from pebble.transports.mqtt.client import Client
 from pebble.transports.mqtt.connection import UNACKED_LIMIT, UNACKED_RESERVE
 from pebble.transports.mqtt.packets import MAX_PACKET
@@ -147,22 +146,6 @@ def test_as_published_shows_what_was_published_with_retain(
     other.publish(topic, b"kept", qos=DELIVERED, retain=True)
     assert received.until(b"fleeting", b"kept")
     assert [(one.retain, one.retain_requested) for one in received.messages] == [(False, False), (True, True)]
-
-
-@both_protocols
-def test_as_published_drops_own_retained_messages_but_not_those_of_others(
-    broker: Broker, clients: Clients, topic: str, protocol: str
-) -> None:
-    bridge = clients(broker.port, "bridge", as_published=True, protocol=protocol)
-    other, received = clients(broker.port), Received()
-    other.publish(f"{topic}/theirs", b"theirs", qos=DELIVERED, retain=True)
-    bridge.publish(f"{topic}/flag", b"true", qos=DELIVERED, retain=True)
-    assert until(lambda: bridge.counters["sent"] == 1)
-    bridge.subscribe(f"{topic}/#", received, echo=False)
-    assert received.until(b"theirs")
-    for value in (b"false", b"true", b"false"):  # "true" is our own value, but not the newest
-        other.publish(f"{topic}/flag", value, qos=DELIVERED, retain=True)
-    assert received.until(b"theirs", b"false", b"true", b"false")
 
 
 @both_protocols
@@ -316,24 +299,6 @@ def test_what_waited_at_the_broker_or_on_the_way_is_no_younger(
     assert until(lambda: len(waited) == 3)
     assert waited[2] < 0.4
     assert robot.counters["connected"] == 1
-
-
-@pytest.mark.parametrize(("count", "size"), [(40, 1000), (1, 40_000)], ids=["many", "a large one"])
-def test_retained_messages_may_take_longer_than_an_answer(
-    broker: Broker, clients: Clients, topic: str, count: int, size: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(transport_module, "_ANSWER_S", 0.3)
-    planter, received = clients(broker.port, "planter"), Received()
-    for number in range(count):
-        assert planter.publish(f"{topic}/{number}", bytes(size), qos=DELIVERED, retain=True)
-    with TcpProxy(broker.port, delay_s=0.01, piece=300) as slow:
-        robot = clients(slow.port, "robot", silence_s=0.3, opened=False)
-        robot.open(0.0)
-        robot.subscribe(f"{topic}/#", received)
-        assert until(lambda: robot.state is State.CONNECTED), robot.problem
-        assert received.until(*[bytes(size)] * count)
-        assert robot.counters["connected"] == 1
-        assert robot.counters["silences"] == 0
 
 
 @any_protocol
@@ -491,19 +456,6 @@ def test_close_does_not_wait_for_a_silent_broker(clients: Clients, proxy: TcpPro
     client.close()
     assert time.monotonic() - began < 1.0
     assert until(lambda: not threads & set(threading.enumerate()))
-
-
-@any_protocol
-def test_a_client_that_connects_with_our_name_does_not_disturb_us(
-    broker: Broker, clients: Clients, topic: str, protocol: str
-) -> None:
-    name = "pebble/robots/goob-remote-bridge"
-    robot, received = clients(broker.port, name, protocol=protocol), Received()
-    robot.subscribe(topic, received)
-    with stock_client(broker, name) as other:
-        other.publish(topic, b"after", qos=1).wait_for_publish(10)
-        assert received.until(b"after")
-    assert robot.counters["connected"] == 1
 
 
 def test_a_client_has_one_id_for_all_its_connections(tmp_path: Path, clients: Clients) -> None:

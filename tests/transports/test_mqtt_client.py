@@ -16,7 +16,6 @@ from pebble.transports import MqttSettings
 from pebble.transports.hosts import addresses_of
 from pebble.transports.mqtt import packets
 from pebble.transports.mqtt.client import Client, Opening
-from pebble.transports.mqtt.packets import Filter
 from tests.kit.mqtt_bytes import packet
 from tests.support import until
 from tests.transports.test_mqtt_packets import Noted
@@ -123,48 +122,6 @@ def test_what_the_socket_does_not_take_is_written_later_and_in_order(pairs: Any,
     assert bytes(arrived) == b"".join(expected) + packets.PINGREQ
     assert not pair.client.waiting
     assert pair.client.unwritten == 0
-
-
-def test_message_ids_begin_anew(pairs: Any) -> None:
-    pair = pairs("3.1.1")
-    ids = [pair.client.subscribe([]) for _ in range(65_537)]
-    assert ids == [*range(1, 65_536), 1, 2]
-
-
-def test_acknowledgements_of_unknown_messages_allow_no_more(pairs: Any) -> None:
-    pair = pairs("5")
-    pair.sends(RECEIVE_MAXIMUM_2 + 5 * packet(0x40, b"\0\1"))
-    for number in range(5):
-        publish(pair.client, number)
-    assert pair.written().count(b"a\0") == 2
-
-
-def test_acknowledgements_of_what_was_read_together_are_written_together(pairs: Any) -> None:
-    pair = pairs("3.1.1")
-    pair.sends(b"".join(packet(0x32, b"\0\1a" + bytes((0, number)) + b"x") for number in (1, 2, 3)))
-    assert pair.client.owes
-    pair.client.acknowledge()
-    assert not pair.client.owes
-    assert pair.written() == b"\x40\2\0\1\x40\2\0\2\x40\2\0\3"
-    assert [seen[0] for seen in pair.noted.seen] == [b"a"] * 3
-
-
-@pytest.mark.parametrize("reset", [False, True])
-def test_a_connection_that_the_other_side_ends_has_no_socket(pairs: Any, reset: bool) -> None:
-    pair = pairs("3.1.1")
-    pair.other.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, b"\1\0\0\0\0\0\0\0" if reset else bytes(8))
-    pair.other.close()
-
-    def ended() -> bool:
-        pair.client.receive()
-        return pair.client.socket is None
-
-    assert until(ended)
-    publish(pair.client, 1)
-    pair.client.subscribe([Filter("a", 1)])
-    pair.client.ping()
-    assert not pair.client.waiting
-    assert pair.client.receive() == 0
 
 
 def test_a_client_that_leaves_closes_after_the_other_side(pairs: Any) -> None:

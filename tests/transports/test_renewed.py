@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shutil
-import ssl
 import subprocess
 from collections.abc import Callable
 from pathlib import Path
@@ -14,7 +13,6 @@ from pebble.extensions.fleet import certificates
 from pebble.transports import MqttSettings, State, TlsSettings, create
 from pebble.transports.renewed import Renewed
 from tests.support import Broker, until
-from tests.transports.test_tls import shake_hands
 
 
 def _number(file: Path) -> int:
@@ -103,24 +101,3 @@ def test_a_robot_is_back_after_its_authority_its_certificate_and_its_password_we
             assert until(lambda: client.state is State.CONNECTED), client.problem
     finally:
         broker.stop()
-
-
-def test_the_page_shows_a_renewed_certificate_to_new_connections(tmp_path: Path) -> None:
-    from pebble.extensions.page.serve import renew_certificate
-
-    certificates.init(tmp_path, ["localhost"])
-    authority, files = tmp_path / "ca.pem", (tmp_path / "server.pem", tmp_path / "server.key")
-    listening = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
-    listening.load_cert_chain(*files)
-    renew_certificate(listening, *files)
-    first = _shown(listening, authority)
-    certificates.renew(tmp_path)
-    second = _shown(listening, authority)
-    files[1].write_text("half writt")
-    assert first != second == _shown(listening, authority)
-
-
-def _shown(listening: ssl.SSLContext, authority: Path) -> bytes | None:
-    """Return the certificate that a new connection gets."""
-    client = shake_hands(ssl.create_default_context(cafile=str(authority)), listening)
-    return client.getpeercert(binary_form=True)

@@ -2,8 +2,6 @@
 
 from wifi.connection import Connection
 
-MASK = (1 << 30) - 1
-
 
 def online(now: int = 0) -> Connection:
     connection = Connection()

@@ -13,29 +13,6 @@ def stopped(*names: str) -> Latch:
     return latch
 
 
-def test_it_begins_free() -> None:
-    latch = stopped()
-    assert not latch.latched
-    assert not latch.refuses(True, False, 0)
-    assert latch.state(None)["persisted"] is None
-    assert "barred" not in latch.state(True)
-
-
-def test_a_stop_latches_and_its_repetition_changes_nothing() -> None:
-    latch = stopped()
-    assert latch.stop(A, "ann", "test", 5)
-    assert (latch.latched, latch.count, latch.recent, latch.by, latch.why, latch.since) == (
-        True,
-        1,
-        [A],
-        "ann",
-        "test",
-        5,
-    )
-    assert not latch.stop(A, "bob", "again", 9)
-    assert (latch.count, latch.by, latch.since) == (1, "ann", 5)
-
-
 def test_a_sender_that_was_not_checked_gives_way_to_one_that_was() -> None:
     latch = stopped(B)
     for by, shown in (
@@ -65,42 +42,6 @@ def test_the_name_of_a_stop_stays_while_another_sender_floods() -> None:
     vera, claimed = "e0000000000003e7", ["f0000000000003e7", "f0000000000003e6"]
     assert latch.recent == [claimed[0], vera, claimed[1], A]
     assert latch.count == 2001
-
-
-def test_a_reset_must_know_the_newest_state() -> None:
-    latch = stopped(A, B)
-    for boot, count, age, why in (
-        ("0badcaff", 2, 0, "boot"),
-        ("0badcafe", 1, 0, "count"),
-        ("0badcafe", 3, 0, "count"),
-        ("0badcafe", 2, 1000, "old"),
-    ):
-        assert not latch.reset(boot, count, age, 0)
-        assert (latch.latched, latch.reset_refused) == (True, why)
-    assert latch.reset("0badcafe", 2, 999, 0)
-    assert (latch.latched, latch.reset_refused, latch.count) == (False, None, 2)
-    assert not latch.reset("0badcafe", 2, 0, 0)  # there is nothing to reset
-
-
-def test_after_a_reset_a_held_stick_moves_nothing_until_it_is_released() -> None:
-    latch = stopped(A)
-    latch.reset("0badcafe", 1, 0, 1000)
-    for now in (1010, 1400, 1800, 2200):  # never 0.5 s without a command
-        assert latch.refuses(True, False, now)
-    assert not latch.refuses(True, True, 2210)  # scripts are none of its business
-    assert not latch.refuses(False, False, 2250)
-    assert not latch.refuses(True, False, 2260)
-
-
-def test_after_a_reset_half_a_second_of_silence_is_a_release() -> None:
-    latch = stopped(A)
-    latch.reset("0badcafe", 1, 0, 1000)
-    assert latch.refuses(True, False, 1499)
-    assert not latch.refuses(True, False, 1999)
-    late = stopped(A)
-    late.reset("0badcafe", 1, 0, (1 << 30) - 100)  # ticks wrap
-    late.tick(400)
-    assert not late.refuses(True, False, 1 << 29)
 
 
 def test_what_is_saved_restores_all_but_boot_and_count() -> None:

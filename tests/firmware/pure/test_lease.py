@@ -1,12 +1,10 @@
 """Who has control: the table of states, one row each, and what a drive command with or without a key may do."""
 
-from common.arbiter import PERSON, REFUSED, Arbiter
-from common.latch import Latch
 from common.lease import Lease, request_of
 from common.ticks import add, diff
 
 NAME = "00000000000000aa"
-DRIVE, FREE, REFUSE = 0, 1, 2
+DRIVE = 0
 ANN, OTTO, MIA = ("", "aaaaaaaa", "ann", "phone"), ("", "00000001", "otto", ""), ("", "00000002", "mia", "")
 WRAPS = (1 << 30) - 4000  # of a board's clock, within each test
 
@@ -117,36 +115,6 @@ def test_a_state_changes_and_the_motors_are_halted_only_where_something_changes(
         assert (own.changed, own.halts) == (changed, halts), events
 
 
-def test_only_the_key_of_now_moves_and_a_zero_needs_none() -> None:
-    for strangers, free, held in ((DRIVE, True, True), (FREE, True, False), (REFUSE, False, False)):
-        own = lease(strangers)
-        assert own.refuses(True, False, "", "", WRAPS) is not free
-        assert own.refuses(True, False, "00000001", "", WRAPS)  # it is free yet
-        own.hold(ANN, 3000, False, WRAPS)
-        old = own.key
-        assert own.refuses(True, False, "", "", WRAPS) is not held
-        own.hold(OTTO, 3000, True, WRAPS)
-        for key in (old, "", "x", "00000003"):
-            assert not own.refuses(False, False, key, "", WRAPS)
-            assert own.refuses(True, False, key, "", WRAPS) is (key != "" or not held)
-        assert not own.refuses(True, False, own.key, "", WRAPS)
-
-
-def test_with_names_the_account_counts_and_programs_of_the_robot_need_no_key() -> None:
-    own = lease(REFUSE)
-    judge = arbiter(own)
-    own.hold(("page-1", "aaaaaaaa", "page-1/ann", ""), 3000, False, WRAPS)
-    for by, moves in (("page-1", True), ("page-2", False), ("-", False), ("", False)):
-        assert own.refuses(True, False, own.key, by, WRAPS) is not moves, by
-    assert judge.judge(True, PERSON, -1, WRAPS, "", "-") == REFUSED
-    assert judge.judge(True, PERSON, -1, WRAPS, "", None) == 900
-    assert judge.judge(True, PERSON, -1, WRAPS, own.key, None) == REFUSED
-    own.release(("page-2", "aaaaaaaa", "page-2/ann", ""), WRAPS)
-    assert own.key
-    own.release(("page-1", "aaaaaaaa", "page-1/bob", ""), WRAPS)
-    assert own.key == ""
-
-
 def test_it_shows_that_others_drive_too_for_a_while() -> None:
     own = lease()
     assert not own.refuses(True, False, "", "", WRAPS)
@@ -160,43 +128,6 @@ def test_it_shows_that_others_drive_too_for_a_while() -> None:
     own.tick(after(3999))
     assert own.changed
     assert not own.others
-
-
-def arbiter(own: Lease) -> Arbiter:
-    return Arbiter(Latch("0badcafe", 4, diff), own, WRAPS, diff, 900)
-
-
-def test_a_strangers_zero_after_a_reset_is_nobodys_letting_go() -> None:
-    own = lease()
-    judge = arbiter(own)
-    own.hold(ANN, 9999, False, WRAPS)
-    judge.stop(NAME, "ann", "", 0)
-    assert judge.latch.reset("0badcafe", 1, 0, WRAPS)
-    assert judge.judge(True, PERSON, -1, after(100), own.key) == REFUSED
-    assert judge.judge(False, PERSON, -1, after(200)) == 0  # it stops all the same
-    assert judge.judge(False, PERSON, -1, after(250), "ffffffff") == 0
-    assert judge.judge(True, PERSON, -1, after(300), own.key) == REFUSED
-    assert judge.judge(True, PERSON, -1, after(350), "ffffffff") == REFUSED  # and does not make the pause longer
-    assert judge.judge(True, PERSON, -1, after(800), own.key) == 900
-    judge.stop("00000000000000bb", "ann", "", 0)
-    assert judge.latch.reset("0badcafe", 2, 0, after(900))
-    assert judge.judge(False, PERSON, -1, after(950), own.key) == 0
-    assert judge.judge(True, PERSON, -1, after(960), own.key) == 900
-
-
-def test_a_strangers_zero_ends_the_script_and_does_not_let_it_resume() -> None:
-    own = lease()
-    judge = arbiter(own)
-    judge.tick(after(2000))
-    assert judge.judge(True, 7, -1, after(2000)) == 900
-    own.hold(ANN, 9999, False, after(2000))
-    assert judge.judge(True, PERSON, -1, after(2100), own.key) == 900
-    assert judge.judge(False, PERSON, -1, after(2200)) == 0
-    assert judge.barred == 7
-    assert judge.judge(True, 8, -1, after(4200)) == 900
-    assert judge.judge(True, PERSON, -1, after(4300), own.key) == 900
-    assert judge.judge(False, PERSON, -1, after(4400), own.key) == 0
-    assert judge.judge(True, 8, -1, after(6400)) == 900  # the holder has let go
 
 
 def test_what_a_request_is() -> None:

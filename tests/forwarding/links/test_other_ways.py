@@ -13,7 +13,6 @@ import pytest
 
 from pebble.forwarding import cycles
 from pebble.forwarding.routing import Drop
-from pebble.forwarding.side import Gate
 from tests.forwarding.links.rig import LOCAL, REMOTE, End, MqttEnd, Rig, ZenohEnd
 from tests.forwarding.links.test_table import (
     AUDIO_FLAG,
@@ -62,42 +61,6 @@ def amqtt() -> Iterator[AmqttBroker]:
     broker.stop()
 
 
-class TestOneBroker:
-    def test_nothing_circulates_with_one_broker_for_both_sides(self, make: Make, tmp_path: Path) -> None:
-        end = MqttEnd(tmp_path)
-        rig = make("bridge", end, end)
-        rig.remote.publish(MIRROR_FLAG, TRUE, retain=True)
-        rig.remote.publish(STATUS, b"{}", retain=True)
-        rig.start()
-        assert rig.gate is Gate.SHUT
-        rig.remote.publish(STOP, PRESS)
-        rig.remote.publish(STOP, PRESS, retain=True)
-        storm((rig.local, VIDEO_FLAG, [TRUE, FALSE] * 100), (rig.local, STATUS, [TRUE] * 200), seconds=0.5, retain=True)
-        Quiet(rig.local, rig.remote).wait(0.5)
-        assert rig.local.payloads(STOP) == [PRESS] * 2
-        assert rig.remote.payloads(VIDEO_FLAG) == [TRUE, FALSE] * 100
-        assert len(rig.remote.on(STATUS)) == 200
-        assert rig.remote.on("outgoing/online")
-
-    def test_a_mirror_of_the_bridges_broker_is_refused(
-        self, make: Make, tmp_path: Path, caplog: pytest.LogCaptureFixture
-    ) -> None:
-        remote, local = MqttEnd(tmp_path), ZenohEnd(tmp_path)
-        mirror = make("mirror", local, remote)
-        mirror.start()
-        mirrored = {**local.section, "mqtt_mirror": remote.section}
-        make("bridge", local, remote, robot=mirror.robot, transport=mirrored).start()
-        assert until(lambda: mirror.gate is Gate.SHUT)
-        mirror.remote.publish("outgoing/programs/reading", b"1", retain=True)
-        mirror.remote.publish(DRIVE, b"1")
-        assert until(lambda: mirror.local.on(DRIVE))
-        Quiet(mirror.local, mirror.remote).wait(0.3)
-        assert mirror.local.payloads(DRIVE) == [b"1"]  # by the bridge
-        assert not mirror.local.on("outgoing/programs/reading")
-        (error,) = errors(caplog)
-        assert f"127.0.0.1:{remote.link.port}" in error
-
-
 class TestWithoutBridgeMode:
     """amqtt sends our own messages back and hides the retain flag of live ones."""
 
@@ -126,26 +89,6 @@ class TestWithoutBridgeMode:
         assert (rig.remote.payloads(VIDEO_FLAG)[-1], rig.local.payloads(AUDIO_FLAG)[-1]) == (FALSE, TRUE)
         too_late = rig.service.forwarder.counters[f"remote: {Drop.LATE.value}"]  # on a busy machine, behind the flags
         assert len(rig.local.on("incoming/flags/git-pull")) + too_late == 1
-
-    def test_mirroring_is_refused_with_one_clear_error(self, rig: Rig, caplog: pytest.LogCaptureFixture) -> None:
-        rig.start()
-        rig.local.publish(MIRROR_FLAG, TRUE, retain=True)
-        assert until(lambda: rig.remote.on(MIRROR_FLAG))
-        for number in range(1, 21):
-            rig.local.publish(DRIVE, b'{"x": 0, "z": 1}')
-            assert until(lambda number=number: len(rig.local.on(DRIVE)) >= number)  # type: ignore[misc]
-        rig.remote.publish(LIGHTS, b"{}")
-        assert until(lambda: rig.local.on(LIGHTS))
-        Quiet(rig.local, rig.remote).wait()
-        assert not rig.remote.on(DRIVE)
-        assert len(rig.local.on(LIGHTS)) == 1
-        assert len([one for one in errors(caplog) if "remote-mirror is refused" in one]) == 1
-
-    def test_no_mirror_takes_such_a_broker(
-        self, make: Make, amqtt: AmqttBroker, tmp_path: Path, caplog: pytest.LogCaptureFixture
-    ) -> None:
-        make("mirror", ZenohEnd(tmp_path), Shared(tmp_path, broker=amqtt)).start(ready=False)
-        assert until(lambda: any("bridge mode" in one for one in errors(caplog)))
 
 
 class Shared(MqttEnd):

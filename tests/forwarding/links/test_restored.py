@@ -12,8 +12,6 @@ import pytest
 from pebble.forwarding import side as side_module
 from pebble.services.mqtt_bridge.media import Media
 from tests.forwarding.links.rig import LOCAL, REMOTE, End, MqttEnd, Rig, Side, ZenohEnd
-from tests.services.mqtt_bridge.bridge_rig import Quiet
-from tests.sparing_broker import SparingBroker
 from tests.support import some, until
 
 FLAG, STATUS = "incoming/flags/mqtt-audio", "outgoing/autonomy-status"
@@ -92,59 +90,3 @@ def test_a_microphone_that_was_switched_off_stays_off_when_a_side_is_restored(
         assert until(lambda: rig.connections(restored) > before and rig.synchronized)
     assert until(lambda: {rig.retained(side).get(FLAG) for side in Side} == {FALSE})
     assert (True in allowed, TRUE in operator.payloads(FLAG)[seen:]) == (False, False)
-
-
-class TestOperatorsBroker:
-    """Over a bridge between the robot's broker and the operators', which saves."""
-
-    @pytest.fixture
-    def rig(self, make: Make, tmp_path: Path) -> Rig:
-        return make("bridge", MqttEnd(tmp_path), MqttEnd(tmp_path, keeps=True))
-
-    def set_flag(self, rig: Rig, value: bytes, *, here: bool = True) -> None:
-        """By an operator, who is not asked to repeat it; ``here``: it arrives at the robot now."""
-        before = len(rig.local.on(FLAG))
-        rig.remote.publish(FLAG, value, retain=True, remember=False)
-        assert not here or until(lambda: rig.local.payloads(FLAG)[before:] == [value])
-
-    def test_it_gets_the_newest_values_and_its_old_stop_stops_nothing(self, rig: Rig) -> None:
-        rig.start()
-        for stop, state, flag in ((b"{}", b"latched", FALSE), (b"", b"free", TRUE)):
-            for suffix in (STATUS, STATE):
-                rig.local.publish(suffix, state, retain=True)
-            rig.remote.publish(STOP, stop, retain=True, remember=False)
-            self.set_flag(rig, flag)
-            assert until(lambda state=state: rig.remote.payloads(STATE)[-1:] == [state])  # type: ignore[misc]
-            if stop:
-                rig.ends[REMOTE].save()
-        before = rig.connections(REMOTE)
-        rig.ends[REMOTE].stop()
-        rig.ends[REMOTE].restore()
-        assert until(lambda: rig.connections(REMOTE) > before and rig.synchronized)
-        newest = {STATUS: b"free", STATE: b"free", FLAG: TRUE, STOP: b"{}"}
-        assert until(lambda: rig.retained(REMOTE) == newest, 5), rig.retained(REMOTE)
-        rig.after_all(REMOTE)
-        assert rig.retained(LOCAL)[FLAG] == TRUE
-        assert rig.local.payloads(FLAG) == [FALSE, TRUE]
-        live, removal = rig.local.payloads(STOP)
-        assert (b'"stop":' in live, removal) == (True, b"")
-
-    @pytest.mark.parametrize(
-        ("late_s", "by_name"), some([(0.0, False), (0.0, True), (0.7, False), (1.5, False), (1.5, True)], 2)
-    )
-    def test_an_operators_flag_counts_however_late_the_broker_sends_it(
-        self, rig: Rig, monkeypatch: pytest.MonkeyPatch, late_s: float, by_name: bool
-    ) -> None:
-        """Silence does not mean that the broker has no value."""
-        end = rig.ends[REMOTE]
-        assert isinstance(end, MqttEnd)
-        front = SparingBroker(end.broker.port, late_s=late_s, by_name=by_name)
-        end.link.lead_to(front.port)
-        rig.local.publish(FLAG, TRUE, retain=True)
-        rig.remote.publish(FLAG, FALSE, retain=True)
-        for client in (rig.local, rig.remote):
-            client.transport.close()
-        rig.start(ready=False)
-        Quiet(rig.client(LOCAL)).wait(2.0)
-        assert {rig.retained(side).get(FLAG) for side in Side} == {FALSE}
-        front.close()

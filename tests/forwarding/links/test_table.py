@@ -293,40 +293,6 @@ def test_one_side_is_away(rig: TableRig, away: Side) -> None:
     rig.crosses_once("after")
 
 
-@over("bridge to zenoh")
-def test_what_changed_while_an_uplink_over_zenoh_was_away_reaches_operators_who_stayed(rig: TableRig) -> None:
-    rig.start()
-    rig.ends[REMOTE].leave()
-    assert until(lambda: rig.transport(REMOTE).state is State.CONNECTING)
-    rig.local.publish("outgoing/navigation-goal", b"new", retain=True)
-    rig.ends[REMOTE].come_back()
-    assert until(lambda: rig.retained(REMOTE) == {"outgoing/navigation-goal": b"new"})
-    assert until(lambda: rig.remote.payloads("outgoing/navigation-goal") == [b"new"], 1)
-
-
-@over(FIRST, SECOND)
-@pytest.mark.parametrize("forgetful", [LOCAL, REMOTE], ids=lambda side: f"{side.value} forgets")
-def test_a_side_that_forgot_everything_gets_the_current_state(rig: TableRig, forgetful: Side) -> None:
-    """Also what changed meanwhile, and what its own clients had set, who are gone."""
-    state, other = "outgoing/capabilities", forgetful.other
-    rig.local.publish(state, b"old", retain=True, remember=forgetful is REMOTE)
-    rig.start()
-    rig.clients[other].publish(VIDEO_FLAG, TRUE, retain=True)
-    assert until(lambda: rig.clients[forgetful].on(VIDEO_FLAG) and rig.remote.on(state))
-    rig.clients[forgetful].publish(VIDEO_FLAG, FALSE, retain=True)
-    assert until(lambda: rig.clients[other].on(VIDEO_FLAG))
-    rig.clients[forgetful].transport.close()  # it would publish its own retained messages again
-    rig.ends[forgetful].stop()
-    rig.clients[other].publish(AUDIO_FLAG, TRUE, retain=True)
-    expected = {VIDEO_FLAG: FALSE, AUDIO_FLAG: TRUE}
-    if forgetful is REMOTE:
-        rig.local.publish(state, b"new", retain=True)
-        expected[state] = b"new"
-    rig.ends[forgetful].restore()
-    assert until(lambda: rig.retained(forgetful).items() >= expected.items(), 10, step=0.3), rig.retained(forgetful)
-    assert rig.retained(other).items() >= expected.items()
-
-
 def storm(*voices: tuple[Client, str, list[bytes]], seconds: float, retain: bool = False) -> None:
     """Every client publishes all of it, evenly spread and in turns."""
     began = time.monotonic()
@@ -421,35 +387,6 @@ class TestBridge:
         rig.after_all(LOCAL)
         assert rig.local.payloads(STOP) == [PRESS]  # the live one
         assert not rig.remote.on(STOP)
-
-    def test_an_uplink_that_goes_silent(self, rig: TableRig) -> None:
-        """Messages that were sent before the loss was detected count as well."""
-        happened, state = "outgoing/somebody/happened", "outgoing/capabilities"
-        rig.remote.publish(VIDEO_FLAG, TRUE, retain=True)
-        rig.start()
-        assert until(lambda: rig.local.on(VIDEO_FLAG))
-        rig.local.publish(state, b"old", retain=True)
-        assert until(lambda: rig.remote.on(state))
-        link = link_of(rig)
-        link.blackhole()
-        rig.local.publish(VIDEO_FLAG, FALSE, retain=True)
-        rig.local.publish(state, b"new", retain=True)
-        rig.local.publish(happened, b"1")
-        rig.local.publish("outgoing/touch-sensors", b"stream")
-        rig.remote.publish(AUDIO_FLAG, TRUE, retain=True)
-        rig.remote.publish(DRIVE, b"old")
-        assert until(lambda: rig.service.remote.state is State.CONNECTING, 10)
-        rig.local.publish(happened, b"2")
-        link.resume()
-        assert until(lambda: rig.remote.payloads(happened)[-1:] == [b"2"])
-        assert until(lambda: rig.local.on(AUDIO_FLAG))
-        Quiet(rig.local, rig.remote).wait(0.3)
-        expected = {VIDEO_FLAG: FALSE, AUDIO_FLAG: TRUE, state: b"new"}
-        assert rig.retained(LOCAL) == rig.retained(REMOTE) == expected
-        assert rig.remote.payloads(happened) == [b"1", b"2"]
-        assert rig.local.payloads(VIDEO_FLAG) == [TRUE]
-        assert not rig.local.on(DRIVE)
-        assert not rig.remote.on("outgoing/touch-sensors")
 
     def test_a_frozen_remote_broker_does_not_delay_local_traffic(
         self, make: Callable[..., TableRig], tmp_path: Path

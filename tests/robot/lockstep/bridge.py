@@ -25,11 +25,20 @@ _PING_S = 0.45
 
 
 class Outside(Network):
-    """The operators' broker: all that it has for the bridge waits in one queue; ``heard(sender, message)``."""
+    """The operators' broker: all that it has for the bridge waits in one queue, but for the connection of stops.
 
-    def __init__(self, scheduler: Scheduler, heard: Callable[[Process, Message], None]) -> None:
-        super().__init__(scheduler, lambda _process, _message: None, lambda _process, _message: None)
-        self._heard = heard
+    ``heard(sender, message)``: it has a message; ``comes(message)``: the bridge has it.
+    """
+
+    def __init__(
+        self,
+        scheduler: Scheduler,
+        heard: Callable[[Process, Message], None],
+        sent: Callable[[Process, Message], None],
+        comes: Callable[[Message], None],
+    ) -> None:
+        super().__init__(scheduler, lambda _process, _message: None, sent)
+        self._heard, self.comes = heard, comes
         self._floods: list[tuple[float, float]] = []  # until when what comes has to wait so long
         self._stalled_until = self._free_at = 0.0
 
@@ -52,7 +61,7 @@ class Outside(Network):
         return self._free_at
 
     def _send(self, delivery: Any, client: Connection, number: int, sender: Process | None) -> None:
-        if not isinstance(client, Remote) or sender is None:
+        if not isinstance(client, Remote) or client.of_stops or sender is None:
             super()._send(delivery, client, number, sender)
             return
         at = max(self.scheduler.now + _TRAVEL_S + sender.delay, self._last.get((sender, client), 0.0))
@@ -72,11 +81,21 @@ class Outside(Network):
 
 
 class Remote(Connection):
-    """The bridge's connection to the operators' broker, which answers pings behind what waits there."""
+    """A connection of the bridge to the operators' broker, which answers pings behind what waits there.
 
-    def __init__(self, process: Process, network: Outside) -> None:
+    ``of_stops``: the one of stops alone. While it is ``deaf`` it is lost, and that has not been noticed.
+    """
+
+    def __init__(self, process: Process, network: Outside, *, of_stops: bool = False) -> None:
         super().__init__(process, network)
         self._outside, self._delay, self._answers = network, BrokerDelay(), 0
+        self.of_stops, self.deaf = of_stops, False
+
+    def arrive(self, delivery: Any, number: int) -> None:
+        if self.deaf or number != self.number or not self._present:
+            return
+        self._outside.comes(delivery.message)
+        super().arrive(delivery, number)
 
     @property
     def answer(self) -> Answer | None:
@@ -121,20 +140,28 @@ class Bridge(ServiceProcess):
     def __init__(self, inside: Network, outside: Outside, config: Config) -> None:
         super().__init__("bridge", inside.scheduler, lambda process: self._service(inside, outside, config))
         self.remote: Remote | None = None
+        self.stops: Remote | None = None
         self._local: Connection | None = None
 
     def _service(self, inside: Network, outside: Outside, config: Config) -> MqttBridge:
-        def remote(*_arguments: Any, **_options: Any) -> Remote:
-            self.remote = Remote(self, outside)
-            return self.remote
-
         self._local = Connection(self, inside)
-        with patch.object(bridge_module, "remote_transport", remote), patch.object(robot_audit, "Audit", Unwritten):
+        remote, stops = Remote(self, outside), Remote(self, outside, of_stops=True)
+        self.remote, self.stops = remote, stops
+        with (
+            patch.object(bridge_module, "remote_transport", lambda *_arguments, **_options: remote),
+            patch.object(bridge_module, "stops_transport", lambda _config: stops),
+            patch.object(robot_audit, "Audit", Unwritten),
+        ):
             return MqttBridge(config, self._local, clock=self.scheduler.clock)
 
+    @property
+    def _connections(self) -> list[Connection]:
+        return [one for one in (self._local, self.remote, self.stops) if one is not None]
+
     def thaw(self) -> None:
-        if self.frozen and self._local is not None:
-            self._local.silent(self.scheduler.now - self.frozen_at)
+        frozen_s = self.scheduler.now - self.frozen_at
+        for connection in self._connections if self.frozen else ():
+            connection.silent(frozen_s)
         super().thaw()
 
     def lose(self, seconds: float, *, local: bool) -> None:
@@ -143,13 +170,24 @@ class Bridge(ServiceProcess):
         assert connection is not None
         connection.lose(seconds)
 
+    def lose_stops(self, noticed_s: float, seconds: float) -> None:
+        """Lose the connection of stops; that is noticed after a while, and it is made again."""
+        stops = self.stops
+        assert stops is not None
+        stops.deaf = True
+
+        def notice() -> None:
+            stops.deaf = False
+            stops.lose(seconds)
+
+        self.scheduler.after(noticed_s, notice)
+
     def find(self) -> None:
         """Find what was lost."""
-        for connection in (self._local, self.remote):
-            if connection is not None:
-                connection.find()
+        for connection in self._connections:
+            connection.find()
 
     def leave(self) -> None:
         super().leave()
-        if self._local is not None:
-            self._local.network.crash(self._local)
+        for connection in self._connections:
+            connection.network.crash(connection)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import count
 from typing import Any
 
 import msgspec
@@ -27,6 +28,8 @@ class Driver(Process):
         self.id = (name.encode().hex() * 8)[:8]
         self.seen: dict[str, Any] = {}  # the newest state of control, by owner
         self.old_keys: list[str] = []  # under which it had control once
+        self.old_stops: list[dict[str, str]] = []
+        self._stop_numbers = count(int.from_bytes(name.encode()) << 16)
         self._stops: dict[str, Any] = {}
         self._commands = commands
         self._wants = self._gesture = 0
@@ -68,7 +71,9 @@ class Driver(Process):
         """One command; with ``key``, under that one."""
         key = self.key if key is None else key
         sender = SCRIPT if "run" in fields else self.name if key else STRANGER
-        command = Command(fields.get("run", PERSON), sender, self.scheduler.now, 5.0, may_move=True)
+        command = Command(
+            fields.get("run", PERSON), sender, self.scheduler.now, fields.get("valid_ms", 5000) / 1000, may_move=True
+        )
         x, z = self._commands.add(command)
         self._publish(DRIVE.topic(BASE), {"x": x, "z": z} | ({"key": key} if key else {}) | fields)
 
@@ -89,8 +94,17 @@ class Driver(Process):
     def zero(self, *, final: bool = False) -> None:
         self._publish(DRIVE.topic(BASE), {"x": 0, "z": 0} | ({"valid_ms": 0} if final else {}))
 
-    def stop(self) -> None:
-        self._publish(ESTOP.topic(BASE), {"stop": f"{self.scheduler.now:016.3f}".replace(".", "a"), "by": self.name})
+    def stop(self, *, named: bool = True) -> None:
+        """Stop once, with a name of its own or without one."""
+        fields = {"stop": f"{next(self._stop_numbers):016x}"} if named else {}
+        if named:
+            self.old_stops.append(fields)
+        self._publish(ESTOP.topic(BASE), fields)
+
+    def stop_again(self, number: int) -> None:
+        """Repeat a stop of before, as who has seen no answer does."""
+        if self.old_stops:
+            self._publish(ESTOP.topic(BASE), self.old_stops[-1 - number % len(self.old_stops)])
 
     def reset(self) -> None:
         for state in self._stops.values():
@@ -98,8 +112,11 @@ class Driver(Process):
 
     # -- parts
 
+    def publish_raw(self, topic: str, payload: bytes, *, retain: bool = False) -> None:
+        self._connection.publish(topic, payload, qos=QoS.DELIVERED, retain=retain)
+
     def _publish(self, topic: str, fields: dict[str, Any]) -> None:
-        self._connection.publish(topic, msgspec.json.encode(fields), qos=QoS.DELIVERED)
+        self.publish_raw(topic, msgspec.json.encode(fields))
 
     def _receive(self, message: Message) -> None:
         owner = message.topic.rpartition("/")[2]

@@ -15,7 +15,7 @@ from pebble.services.autonomy_manager.service import AutonomyManager
 from tests.robot.lockstep.commands import Commands
 from tests.robot.lockstep.network import Connection, Network
 from tests.robot.lockstep.processes import ServiceProcess
-from tests.robot.lockstep.scripts import OwnScript, Script
+from tests.robot.lockstep.scripts import Script
 
 _GUARD_S = 0.4  # after the manager's end, what is left of its scripts is killed
 _LOCK_S = 0.02
@@ -53,7 +53,7 @@ class Manager(ServiceProcess):
         """The kernel and the manager's guard end its scripts."""
         if self.alive:
             for script in self.alive_scripts:
-                script.signal(signal.SIGTERM if isinstance(script, OwnScript) else signal.SIGKILL)
+                script.signal(signal.SIGTERM)
                 self.scheduler.after(_GUARD_S, lambda script=script: script.signal(signal.SIGKILL))  # type: ignore[misc]
         super().kill(restart_s)
 
@@ -79,7 +79,7 @@ class Manager(ServiceProcess):
                 self.wake()
 
         run = int(launch.environment[RUN])
-        script = OwnScript(launch.file, run, self._network, self._commands, on_end)
+        script = Script(launch.file, run, self._network, self._commands, on_end)
         self.scripts.append(script)
         self.newest = script
         self.spawned(script)

@@ -101,14 +101,19 @@ class RecordedLine:
 
 
 class MemoryFile:
-    """Stands in for StateFile: what is saved is on the disk at once, and known to be there a little later."""
+    """Stands in for StateFile: what is saved is on the disk ``writes_s`` later, and known to be there after that."""
 
     def __init__(
-        self, disk: Disk, process: Process, path: Path, on_saved: Callable[[int, bool], None] = lambda _n, _ok: None
+        self,
+        disk: Disk,
+        process: Process,
+        writes_s: float,
+        path: Path,
+        on_saved: Callable[[int, bool], None] = lambda _n, _ok: None,
     ) -> None:
         self.path = path
         self.busy, self.in_place = False, True
-        self._disk, self._process, self._on_saved = disk, process, on_saved
+        self._disk, self._process, self._writes_s, self._on_saved = disk, process, writes_s, on_saved
         self._number = 0
 
     def can_save(self) -> bool:
@@ -122,15 +127,24 @@ class MemoryFile:
 
     def save(self, value: Any) -> int:
         self._number += 1
-        number, life = self._number, self._process.connection
-        self._disk[self.path] = msgspec.json.encode(value)
+        number, life, written = self._number, self._process.connection, msgspec.json.encode(value)
+
+        def write() -> None:
+            if self._process.connection is life:
+                self._disk[self.path] = written
+                self._process.scheduler.after(_SAVED_S, lambda: self._process.do(saved))
 
         def saved() -> None:
             if self._process.connection is life:
+                self.busy = number < self._number
                 self._on_saved(number, True)
                 self._process.wake()
 
-        self._process.scheduler.after(_SAVED_S, lambda: self._process.do(saved))
+        if self._writes_s:
+            self.busy = True
+            self._process.scheduler.after(self._writes_s, lambda: self._process.do(write))
+        else:
+            write()
         return number
 
     def close(self) -> None:
@@ -149,11 +163,12 @@ class Owner(ServiceProcess):
         *,
         instance: str = "",
         token_hex: Callable[[int], str] | None = None,
+        writes_s: float = 0.0,
     ) -> None:
-        """``token_hex``: of each boot and key; without it they are the number of the life."""
+        """``token_hex``: of each boot and key; without it they are the number of the life. ``writes_s``: to disk."""
         super().__init__("owner" + instance, network.scheduler, lambda process: self._service(network, config, disk))
         self.wheels = wheels
-        self._instance = instance
+        self._instance, self._writes_s = instance, writes_s
         self._token_hex = token_hex or (lambda size: f"{self.lives:0{2 * size}x}")
         self.before: Callable[[], None] = lambda: None
         self.after: Callable[[], None] = lambda: None
@@ -165,7 +180,7 @@ class Owner(ServiceProcess):
 
     def _service(self, network: Network, config: Config, disk: Disk) -> MotorBridge:
         def file(path: Path, *on_saved: Any) -> MemoryFile:
-            return MemoryFile(disk, self, path, *on_saved)
+            return MemoryFile(disk, self, self._writes_s, path, *on_saved)
 
         random = SimpleNamespace(token_hex=self._token_hex)
         with (

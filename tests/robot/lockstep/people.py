@@ -7,49 +7,36 @@ from typing import Any
 
 import msgspec
 
-from pebble.contract import AUTONOMY_COMMAND, AUTONOMY_STATUS, CAPABILITIES, DRIVE, ESTOP, codec
+from pebble.contract import AUTONOMY_COMMAND, AUTONOMY_STATUS, CAPABILITIES, DRIVE, codec
 from pebble.contract.payloads import AutonomyStatus
 from pebble.extensions.operator.client.estop import StopSender
-from pebble.extensions.operator.client.estop_states import Reset, RobotEstop
 from pebble.transports import Message, QoS
 from tests.robot.lockstep.commands import PERSON, Command, Commands
-from tests.robot.lockstep.network import Connection, Network
-from tests.robot.lockstep.processes import Process
+from tests.robot.lockstep.drivers import BASE, PERIOD_S, Driver
+from tests.robot.lockstep.network import Network
 
-BASE = "pebble/robots/goob"
-PERIOD_S = 0.1  # of a person's commands
 _ENDS = ("release", "lost", "halt")
 
 
-class Person(Process):
-    """A page or a program of a person, on the network of the robot: in virtual time, and not always by the contract."""
+class Person(Driver):
+    """A person without control, who also stops, starts scripts, and does not always keep to the contract."""
 
     def __init__(self, name: str, network: Network, commands: Commands) -> None:
-        super().__init__(name, network.scheduler)
-        self.alive = True
-        self.robot = RobotEstop(BASE)
+        super().__init__(name, network, commands)
         self.status: AutonomyStatus | None = None
-        self.starts = 0  # live ones that were published
-        self._commands = commands
-        self._gesture = 0
         self._sender: StopSender | None = None
-        self._connection = Connection(self, network).open(0.0)
-        self._connection.subscribe(f"{BASE}/outgoing/#", self._receive, direct=True)
 
     # -- driving
 
-    def drive(self, valid_ms: int | None = None, *, retain: bool = False) -> None:
-        """One command."""
-        valid_s = 5.0 if valid_ms is None else valid_ms / 1000
-        command = Command(PERSON, self.name, self.scheduler.now, valid_s, may_move=True)
-        x, z = self._commands.add(command)
-        self._publish(DRIVE.topic(BASE), _drive(x, z, valid_ms=valid_ms), retain=retain)
+    def command(self, valid_ms: int | None = None) -> None:
+        """One command without a key."""
+        self.drive("", **({} if valid_ms is None else {"valid_ms": valid_ms}))
 
-    def zero(self, *, final: bool) -> None:
+    def let_go_of_the_stick(self, *, final: bool) -> None:
         self._gesture += 1
-        self._publish(DRIVE.topic(BASE), _drive(0, 0, valid_ms=0 if final else None))
+        self.zero(final=final)
 
-    def steer(self, seconds: float, end: int, valid_ms: int | None) -> None:
+    def steer_to(self, seconds: float, end: int, valid_ms: int | None) -> None:
         """Drive for so long, then let go, lose the connection, or halt."""
         self._gesture += 1
         gesture, until = self._gesture, self.scheduler.now + seconds
@@ -58,45 +45,36 @@ class Person(Process):
             if gesture != self._gesture:
                 return
             if self.scheduler.now < until:
-                self.drive(valid_ms)
+                self.command(valid_ms)
                 self.scheduler.after(PERIOD_S, go_on)
             elif _ENDS[end % 3] != "lost":
-                self.zero(final=_ENDS[end % 3] == "halt")
+                self.let_go_of_the_stick(final=_ENDS[end % 3] == "halt")
 
-        self.drive(valid_ms)
+        self.command(valid_ms)
         self.scheduler.after(PERIOD_S, go_on)
 
     # -- stopping
 
-    def stop(self, name: str) -> None:
+    def press(self, name: str) -> None:
         """An emergency stop, sent until it is confirmed."""
         self._sender = StopSender(name, by=self.name, why="", now=self.scheduler.now, robots=[BASE])
         for message in self._connection._hub.retained.values():
             self._sender.receive(msgspec.structs.replace(message, retain=True), self.scheduler.now)
         self._send_stop(self._sender)
 
-    def stop_namelessly(self) -> None:
-        self._publish(ESTOP.topic(BASE), b"{}")
-
-    def reset(self) -> None:
-        """End what this person has seen."""
-        for message in Reset(self.robot, self.name).messages():
-            self._publish(message.topic, message.payload)
-
     def _send_stop(self, sender: StopSender) -> None:
         for message in sender.tick(self.scheduler.now):
-            self._publish(message.topic, message.payload)
+            self.publish_raw(message.topic, message.payload)
         if sender is self._sender and sender.due is not None:
             self.scheduler.at(max(sender.due, self.scheduler.now + 0.01), lambda: self._send_stop(sender))
 
     # -- scripts
 
-    def start(self, file: str, *, retain: bool = False) -> None:
-        self.starts += 1
-        self._publish(AUTONOMY_COMMAND.topic(BASE), _json({"action": "start", "file": file}), retain=retain)
+    def start(self, file: str) -> None:
+        self._publish(AUTONOMY_COMMAND.topic(BASE), {"action": "start", "file": file})
 
     def end_script(self) -> None:
-        self._publish(AUTONOMY_COMMAND.topic(BASE), _json({"action": "stop"}))
+        self._publish(AUTONOMY_COMMAND.topic(BASE), {"action": "stop"})
 
     # -- what is malformed, retained or pretended
 
@@ -105,7 +83,7 @@ class Person(Process):
         command = Command(run or -1, self.name, self.scheduler.now, 5.0, may_move=run is not None)
         x, z = self._commands.add(command)
         fields = {"x": x, "z": z, "source": "autonomy"} | ({} if run is None else {"run": run})
-        self._publish(DRIVE.topic(BASE), _json(fields))
+        self._publish(DRIVE.topic(BASE), fields)
 
     def junk(self, kind: int) -> None:
         """Something malformed."""
@@ -118,15 +96,15 @@ class Person(Process):
             {"x": "nan", "z": z},
             [x, z],
         )
-        self._publish(DRIVE.topic(BASE), _json(bodies[kind % len(bodies)]))
-        self._publish(AUTONOMY_COMMAND.topic(BASE), _json((7, {"action": "dance"}, {"action": "start"})[kind % 3]))
+        self.publish_raw(DRIVE.topic(BASE), _json(bodies[kind % len(bodies)]))
+        self.publish_raw(AUTONOMY_COMMAND.topic(BASE), _json((7, {"action": "dance"}, {"action": "start"})[kind % 3]))
 
     def retain_command(self, kind: int) -> None:
         """A broker has retained a command from earlier: only its copies arrive."""
         hub = self._connection._hub
         x, z = self._commands.add(Command(PERSON, self.name, self.scheduler.now, 0.0, may_move=False))
         topic, payload = (
-            (DRIVE.topic(BASE), _drive(x, z)),
+            (DRIVE.topic(BASE), _json({"x": x, "z": z})),
             (AUTONOMY_COMMAND.topic(BASE), _json({"action": "start", "file": "steady"})),
             (DRIVE.topic(BASE), _json({"x": x, "z": z, "source": "autonomy", "run": 1 << 20})),
         )[kind % 3]
@@ -135,11 +113,8 @@ class Person(Process):
 
     # -- parts
 
-    def _publish(self, topic: str, payload: bytes, *, retain: bool = False) -> None:
-        self._connection.publish(topic, payload, qos=QoS.DELIVERED, retain=retain)
-
     def _receive(self, message: Message) -> None:
-        self.robot.receive(message)
+        super()._receive(message)
         if message.topic == AUTONOMY_STATUS.topic(BASE):
             self.status = codec.decode(AUTONOMY_STATUS, message.payload)
         if self._sender is not None:
@@ -149,11 +124,7 @@ class Person(Process):
 def announce(person: Person) -> None:
     """What a launcher's announcer publishes: the robot has one motor owner, which can be stopped."""
     estop = {"available": True, "owners": ["serial"]}
-    person._publish(CAPABILITIES.topic(BASE), _json({"t": 1, "value": {"estop": estop}}), retain=True)
-
-
-def _drive(x: float, z: float, *, valid_ms: int | None = None) -> bytes:
-    return _json({"x": x, "z": z} | ({} if valid_ms is None else {"valid_ms": valid_ms}))
+    person.publish_raw(CAPABILITIES.topic(BASE), _json({"t": 1, "value": {"estop": estop}}), retain=True)
 
 
 _json: Callable[[Any], bytes] = msgspec.json.encode

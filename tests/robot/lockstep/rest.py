@@ -93,17 +93,17 @@ def _ends(world: World, script: Script, error: str | None) -> None:
 
 
 def _halt(world: World, script: Script) -> None:
-    world.people[1].zero(final=True)
+    world.people[1].let_go_of_the_stick(final=True)
     _ends(world, script, "stopped by an operator")
 
 
 def _zero_while_it_drives(world: World, script: Script) -> None:
-    world.people[1].zero(final=False)
+    world.people[1].let_go_of_the_stick(final=False)
     _ends(world, script, "stopped by an operator")
 
 
 def _emergency_stop(world: World, script: Script) -> None:
-    world.people[1].stop("ffff0000ffff0000")
+    world.people[1].press("ffff0000ffff0000")
     _ends(world, script, "emergency stop")
 
 
@@ -119,7 +119,7 @@ def _kill(world: World, script: Script) -> None:
 
 def _lose(world: World, script: Script) -> None:
     """A person drives, and the connection is lost."""
-    world.people[1].drive()
+    world.people[1].command()
     world.scheduler.run(0.75 + _STEP_S)
     world.scheduler.check(not _turning(world), "the wheels turn after a person's command was lost")
     world.scheduler.run(1.2)
@@ -129,7 +129,7 @@ def _lose(world: World, script: Script) -> None:
 
 def _release(world: World, script: Script) -> None:
     """A person drives and lets go: the script goes on, unless the config says that it ends."""
-    world.people[1].steer(0.3, 0, None)
+    world.people[1].steer_to(0.3, 0, None)
     world.scheduler.run(0.1)
     command = world.wheel_rules.turning()
     world.scheduler.check(command is not None and command.run == PERSON, "a person does not drive")
@@ -148,7 +148,7 @@ def _halt_before_it_drives(world: World, _: Script) -> None:
     world.scheduler.run(_SHORT_S)
     script = world.manager.newest
     assert script is not None
-    world.people[1].zero(final=True)
+    world.people[1].let_go_of_the_stick(final=True)
     _ends(world, script, "stopped by an operator")
 
 

@@ -1,9 +1,18 @@
-"""Random schedules of a robot, persons and scripts in virtual time: ``python -m tests.kit.schedules lockstep``."""
+"""Random schedules of real services in virtual time: ``python -m tests.kit.schedules services``.
+
+Of one motor owner, persons and scripts; and of two owners, drivers, a bridge and stops.
+"""
 
 from __future__ import annotations
 
-from tests.kit.schedules import Engine, Outcome, RandomSteps, Steps, perform_steps, shared
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+from tests.kit.schedules import Engine, Outcome, RandomSteps, Steps, perform_steps
+from tests.robot.lockstep import two_owners
 from tests.robot.lockstep.rest import rest
+from tests.robot.lockstep.two_owners import TwoOwners
 from tests.robot.lockstep.world import Folder, World
 
 _PEOPLE = {
@@ -24,21 +33,39 @@ _STARTS = {
 }  # fmt: skip
 
 
-def _perform(folder: Folder, schedule: Steps) -> Outcome:
+_SCRIPTS = RandomSteps(
+    *(_PEOPLE, _FAULTS, _DELAYS, _STARTS),
+    length=30,
+    layouts=72,  # ends times configs
+    begin=[("start", 4, None), ("wait", 0, 9)],
+)
+
+
+@contextmanager
+def _shared(kind: str) -> Iterator[tuple[str, Any]]:
+    """What schedules share: parsed configs."""
+    if kind == "scripts":
+        yield kind, Folder()
+    else:
+        with two_owners.configs() as configs:
+            yield kind, configs
+
+
+def _perform(made: tuple[str, Any], schedule: Steps) -> Outcome:
+    kind, configs = made
     layout, steps = schedule
-    world = World(layout, folder)
+    world = World(layout, configs) if kind == "scripts" else TwoOwners(layout, configs)
     perform_steps(world, steps)
-    rest(world)
+    if isinstance(world, World):
+        rest(world)
+    else:
+        world.rest()
     return Outcome()
 
 
 ENGINE = Engine(
-    draw=RandomSteps(
-        *(_PEOPLE, _FAULTS, _DELAYS, _STARTS),
-        length=30,
-        layouts=72,  # ends times configs
-        begin=[("start", 4, None), ("wait", 0, 9)],
-    ),
-    world=lambda _kind: shared(Folder()),
+    draw=lambda kind, seed, number: (_SCRIPTS if kind == "scripts" else two_owners.STEPS)(kind, seed, number),
+    world=_shared,
     perform=_perform,
+    kinds=("scripts", "owners"),
 )

@@ -95,7 +95,10 @@ PROGRAMS: dict[str, Callable[[], Doings]] = {
 
 
 class Script(Process):
-    """One process of a script; a parent may hold it as its child."""
+    """One process of a script; a parent may hold it as its child.
+
+    It uses the script API, whose threads and transport are simulated, and whose rules are the real ones.
+    """
 
     _pids = count(100)
 
@@ -111,7 +114,13 @@ class Script(Process):
         self._network, self._commands, self._exited = network, commands, exited
         self._doings = PROGRAMS[file.partition("-")[0]]()
         self._next_at = self.scheduler.now + _BEGIN_S
-        self._wait = 0.0
+        self.sender = DriveSender(self.run, self._publish)
+        self.estop = RobotEstop(BASE)
+        self.ended = False  # every call on the robot raises from now on
+        self._busy = False
+        self._driven = False  # before, nothing ends it but signals
+        self._exit_code = 0
+        self.rules = PublishRules(self.run, self.scheduler)
         self.turn_at(self._next_at)
 
     # -- the kernel
@@ -159,52 +168,6 @@ class Script(Process):
 
     def _begin(self) -> None:
         """It has been loaded, and connects."""
-
-    def _react(self, now: float) -> None:
-        """To messages that have arrived, and to time."""
-
-    @property
-    def _due(self) -> float:
-        return float("inf")
-
-    def _do(self, doing: str, now: float) -> None:
-        if doing == "drive":
-            self._drive(now)
-        elif doing == "zero":
-            self._zero(now)
-        elif doing == "crash":
-            self.exit(-signal.SIGSEGV)
-        elif doing in ("return", "raise"):
-            self._close(now)
-            self.exit(0 if doing == "return" else 1)
-
-    def _drive(self, now: float) -> None: ...
-
-    def _zero(self, now: float) -> None: ...
-
-    def _close(self, now: float) -> None: ...
-
-    def _end_on_signal(self, number: signal.Signals) -> None: ...
-
-    def _new_command(self, now: float) -> tuple[float, float]:
-        return self._commands.add(Command(self.run, self.name, now, 5.0, may_move=True))
-
-
-class OwnScript(Script):
-    """Uses the script API; its threads and its transport are simulated, its rules are the real ones."""
-
-    def __init__(self, *arguments: object) -> None:
-        super().__init__(*arguments)  # type: ignore[arg-type]
-        self.sender = DriveSender(self.run, self._publish)
-        self.estop = RobotEstop(BASE)
-        self.ended = False  # every call on the robot raises from now on
-        self._busy = False
-        self._driven = False  # before, nothing ends it but signals
-        self._exit_code = 0
-        self._published: list[Drive] = []
-        self.rules = PublishRules(self.run, self.scheduler)
-
-    def _begin(self) -> None:
         if self.ended:
             return
         connection = Connection(self, self._network).open(0.0)
@@ -213,6 +176,7 @@ class OwnScript(Script):
         self._next_at = self.scheduler.now + 0.01
 
     def _react(self, now: float) -> None:
+        """To messages that have arrived, and to time."""
         if not self._driven:
             return
         self.sender.owners(self.estop.states, now)
@@ -228,13 +192,21 @@ class OwnScript(Script):
 
     def _do(self, doing: str, now: float) -> None:
         self._busy = doing == "compute"
-        super()._do(doing, now)
+        if doing == "drive":
+            self._drive(now)
+        elif doing == "zero":
+            self._zero(now)
+        elif doing == "crash":
+            self.exit(-signal.SIGSEGV)
+        elif doing in ("return", "raise"):
+            self._end("it has finished", self._exit_code)
+            self.exit(0 if doing == "return" else 1)
 
     def _drive(self, now: float) -> None:
         if self.ended:
             return
         self._driven = True
-        x, z = self._new_command(now)
+        x, z = self._commands.add(Command(self.run, self.name, now, 5.0, may_move=True))
         self.rules.wants_to_drive(x, z)
         self.sender.owners(self.estop.states, now)
         self.sender.drive(Drive(x=x, z=z), now)
@@ -247,10 +219,7 @@ class OwnScript(Script):
         self.sender.drive(Drive(), now)
         self.rules.wants_zero(waits=not self.sender.ended(now))
 
-    def _close(self, now: float) -> None:
-        self._end("it has finished", self._exit_code)
-
-    def _end_on_signal(self, number: signal.Signals) -> None:
+    def _end_on_signal(self, number: int) -> None:
         if self.connection is None:
             self.exit(128 + number)
         else:

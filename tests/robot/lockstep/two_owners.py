@@ -11,6 +11,7 @@ Every other layout has a bridge, persons are beyond it, and floods hold up what 
 
 * Nobody loses control by silence or idleness, unless the operators' broker had nothing of theirs for so long.
 * Control ends 30 s after the last message of its holder that the first owner was sent.
+* The rules of stops: :mod:`tests.robot.lockstep.stop_rules`.
 """
 
 from __future__ import annotations
@@ -24,10 +25,10 @@ from itertools import count
 from pathlib import Path
 
 from pebble.config import Config, load
-from pebble.contract import CONTROL_STATE, CONTROL_TURN, CONTROL_VOUCHED, codec
+from pebble.contract import CONTROL_STATE, CONTROL_TURN, CONTROL_VOUCHED, ESTOP_STATE, codec
 from pebble.runtime.process import view_of
 from pebble.transports import Message, QoS
-from tests.kit.schedules import Engine, Outcome, RandomSteps, Steps, perform_steps
+from tests.kit.schedules import RandomSteps
 from tests.robot.lockstep.bridge import Bridge, Outside
 from tests.robot.lockstep.commands import Command, Commands
 from tests.robot.lockstep.drivers import BASE, SCRIPT, STRANGER, Driver
@@ -36,6 +37,7 @@ from tests.robot.lockstep.network import Network
 from tests.robot.lockstep.owner import Disk, Owner, Wheels
 from tests.robot.lockstep.processes import Process
 from tests.robot.lockstep.scheduler import Scheduler
+from tests.robot.lockstep.stop_rules import StopRules
 
 FIRST, SECOND = "arm", "serial"  # in the config the second comes first
 FOLLOWS_S = 1.5
@@ -51,6 +53,7 @@ _STEERS_S = (0.3, 1.0, 2.0, 4.0, 8.0)
 _LOST_S = (*_DOWN_S, 40.0)
 _FLOODS_S = (1.5, 4.0, 9.0, 34.0)
 _LAGS_S = (0.6, 0.8, 1.5, 2.5, 4.0)
+_WRITES_S = (1.2, 0.05, 0.005)  # to a disk
 
 
 def configuration(folder: Path, strangers: str, *, bridged: bool = False) -> Config:
@@ -77,7 +80,7 @@ class TwoOwners:
         self.commands = Commands()
         self.network = Network(self.scheduler, self._arrived, self._published)
         self.holders = Holders(self.scheduler, FIRST)
-        self.outside = Outside(self.scheduler, self.holders.heard)
+        self.outside = Outside(self.scheduler, self.holders.heard, self._sent, self._comes)
         self.bridge = Bridge(self.network, self.outside, config) if config.services.mqtt_bridge.enabled else None
         numbers = count(1)
         disk: Disk = {}
@@ -85,9 +88,11 @@ class TwoOwners:
             name: Owner(
                 self.network, view_of(config, name.replace(SECOND, "")), disk, Wheels(self.scheduler),
                 instance=name.replace(SECOND, ""), token_hex=lambda size: f"{next(numbers):0{2 * size}x}",
+                writes_s=_WRITES_S[layout % len(_WRITES_S)] if self.bridge is not None else 0.0,
             )
             for name in (FIRST, SECOND)
         }  # fmt: skip
+        self.stops = None if self.bridge is None else StopRules(self.scheduler, self.bridge, self.owners)
         away = self.network if self.bridge is None else self.outside
         networks = {"ann": away, "eve": away, STRANGER: self.network}
         self.drivers = {name: Driver(name, network, self.commands) for name, network in networks.items()}
@@ -107,7 +112,27 @@ class TwoOwners:
 
     # -- rules
 
+    def _sent(self, _process: Process, message: Message) -> None:
+        if self.stops is not None and _process is not self.bridge:
+            self.stops.sent(message)
+
+    def _comes(self, message: Message) -> None:
+        if self.stops is not None:
+            self.stops.comes(message)
+
+    def _stops_published(self, process: Process, message: Message) -> None:
+        assert self.stops is not None
+        if process is self.bridge:
+            self.stops.passes(message)
+        elif process in self.drivers.values():
+            self.stops.sent(message)
+        for name, owner in self.owners.items():
+            if process is owner and message.topic == ESTOP_STATE.topic(BASE, owner=name):
+                self.stops.shows(name, message.payload)
+
     def _published(self, process: Process, message: Message) -> None:
+        if self.stops is not None:
+            self._stops_published(process, message)
         if process is self.owners[FIRST] and message.topic == CONTROL_TURN.topic(BASE, owner=FIRST):
             turn = codec.decode(CONTROL_TURN, message.payload)
             self._recorded = [*self._recorded, message][-8:]
@@ -122,6 +147,8 @@ class TwoOwners:
     def _arrived(self, process: Process, message: Message) -> None:
         if process is self.owners[FIRST]:
             self.holders.arrived(message)
+        elif self.stops is not None and process is self.bridge:
+            self.stops.learns(message)
 
     def _turned(self, owner: Owner) -> None:
         late = self.scheduler.now > owner.wheels.deadline + owner.slack + _MS
@@ -130,6 +157,8 @@ class TwoOwners:
 
     def _check_again(self) -> None:
         self.check()
+        if self.stops is not None:
+            self.stops.check()
         self.scheduler.after(_CHECK_S, self._check_again)
 
     @property
@@ -212,7 +241,31 @@ class TwoOwners:
         self._anybody(a).zero(final=b % 2 == 0)
 
     def do_stop(self, a: int, b: int) -> None:
-        self._anybody(a).stop()
+        self._anybody(a).stop(named=b % 8 != 7)
+
+    def do_stop_again(self, a: int, b: int) -> None:
+        self._person(a).stop_again(b // 2)
+
+    def do_nameless(self, a: int, b: int) -> None:
+        self._person(a).stop(named=False)
+
+    def do_many(self, a: int, b: int) -> None:
+        """More stops than an owner remembers."""
+        for number in range(10):
+            self.scheduler.after(0.02 * number, lambda: self._person(a).stop(named=b % 4 != 0))
+
+    def do_withdraw(self, a: int, b: int) -> None:
+        """The second owner ends, and its emergency stop is withdrawn, as by a launcher; it is back later, or not."""
+        second = self.owners[SECOND]
+        if second.alive and not second.frozen:
+            second.kill(20.0 if b % 2 else None)
+            topic = ESTOP_STATE.topic(BASE, owner=SECOND)
+            self.drivers[STRANGER].publish_raw(topic, b"", retain=True)
+
+    def do_lose_stops(self, a: int, b: int) -> None:
+        if self.bridge is not None and self.bridge.alive and self.stops is not None:
+            self.stops.doubtful = True
+            self.bridge.lose_stops(_LAGS_S[a % 4], _DOWN_S[b % len(_DOWN_S)] + 0.4)
 
     def do_reset(self, a: int, b: int) -> None:
         self._anybody(a).reset()
@@ -242,11 +295,17 @@ class TwoOwners:
         if self.bridge is None or not self.bridge.alive or self.bridge.frozen:
             return
         if a % 4 == 0:
-            self.bridge.kill(_DOWN_S[b % len(_DOWN_S)])
+            self.kill_bridge(_DOWN_S[b % len(_DOWN_S)])
         elif a % 4 == 1:
             self.freeze(self.bridge, _FROZEN_S[b % len(_FROZEN_S)])
         else:
             self.bridge.lose(_LOST_S[b % len(_LOST_S)], local=a % 8 == 2)
+
+    def kill_bridge(self, seconds: float) -> None:
+        assert self.bridge is not None
+        assert self.stops is not None
+        self.bridge.kill(seconds)
+        self.stops.begin()
 
     def do_delay(self, a: int, b: int) -> None:
         process: Process = self._anybody(a) if a % 2 else self._owner(a // 2)
@@ -300,7 +359,15 @@ class TwoOwners:
         for driver in self.drivers.values():
             driver.let_go(release=driver.name != STRANGER)
         self.scheduler.run(0.2)
+        for owner in self.owners.values():
+            owner.start()
         ann = self.drivers["ann"]
+        if self.stops is not None:
+            ann.stop()
+            self.scheduler.run(4.0)
+            repeats = self.stops.repeated_at > self.scheduler.now - 1.0
+            self.scheduler.check(self.stops.all_latched, "a motor owner cannot be stopped any more")
+            self.scheduler.check(not repeats, "the repetition of a stop does not end")
         for _ in range(3):
             ann.reset()
             self.scheduler.run(0.3)
@@ -329,28 +396,23 @@ _HANDOVERS = {
 }  # fmt: skip
 
 
-@contextmanager
-def _configs(_kind: str) -> Iterator[tuple[Config, ...]]:
-    with tempfile.TemporaryDirectory(prefix="pbl") as folder:
-        kinds = [(strangers, bridged) for bridged in (False, True) for strangers in ("free", "refuse")]
-        yield tuple(configuration(Path(folder), strangers, bridged=bridged) for strangers, bridged in kinds)
+_STOPPED = {
+    "wait": 34, "stop": 10, "stop_again": 8, "nameless": 4, "many": 1, "reset": 12, "kill": 6, "freeze": 8, "lag": 2,
+    "bridge": 1, "lose_stops": 1, "withdraw": 1, "delay": 2, "repeat": 1,
+}  # fmt: skip
 
 
-def _perform(configs: tuple[Config, ...], schedule: Steps) -> Outcome:
-    layout, steps = schedule
-    world = TwoOwners(layout, configs)
-    perform_steps(world, steps)
-    world.rest()
-    return Outcome()
-
-
-ENGINE = Engine(
-    draw=RandomSteps(
-        *(_ALL, _HANDOVERS, _FLOODED),
-        length=36,
-        layouts=4,
-        begin=[("take", 0, None), ("steer", 0, None), ("wait", 0, None)],
-    ),
-    world=_configs,
-    perform=_perform,
+MIXES = 4
+STEPS = RandomSteps(
+    *(_ALL, _HANDOVERS, _FLOODED, _STOPPED),
+    length=36,
+    layouts=18,
+    begin=[("take", 0, None), ("steer", 0, None), ("wait", 0, None)],
 )
+
+
+@contextmanager
+def configs() -> Iterator[tuple[Config, ...]]:
+    with tempfile.TemporaryDirectory(prefix="pbl") as folder:
+        kinds = [(strangers, bridged) for bridged in (False, True, True) for strangers in ("free", "refuse")]
+        yield tuple(configuration(Path(folder), strangers, bridged=bridged) for strangers, bridged in kinds)

@@ -25,7 +25,7 @@ from tests.robot.lockstep.processes import Process
 from tests.robot.lockstep.rules import WheelRules
 from tests.robot.lockstep.scheduler import Scheduler
 from tests.robot.lockstep.script_rules import ScriptRules
-from tests.robot.lockstep.scripts import OwnScript
+from tests.robot.lockstep.scripts import Script
 
 STOP_TIMEOUT_S = 1.5
 WAITS_S = (0.0, 0.001, 0.005, 0.02, 0.05, 0.1, 0.1, 0.2, 0.3, 0.5, 0.7, 0.76, 1.0, 1.5, 1.99, 2.01, 2.1, 3.0)
@@ -83,7 +83,7 @@ class World:
         self.manager = Manager(self.network, self.config, self.commands)
         self.script_rules = ScriptRules(self.manager, scheduler)
         self.people = [Person(name, self.network, self.commands) for name in ("anna", "eve")]
-        self.by_hand: list[OwnScript] = []
+        self.by_hand: list[Script] = []
         self._presses = 0
         self.owner.start()
         self.manager.start()
@@ -109,28 +109,28 @@ class World:
     # -- persons
 
     def do_drive(self, a: int, b: int) -> None:
-        self._person(a).drive(_VALID_MS[b % len(_VALID_MS)])
+        self._person(a).command(_VALID_MS[b % len(_VALID_MS)])
 
     def do_steer(self, a: int, b: int) -> None:
-        self._person(a).steer(_SECONDS[b % 6], b // 6, _VALID_MS[a % len(_VALID_MS)])
+        self._person(a).steer_to(_SECONDS[b % 6], b // 6, _VALID_MS[a % len(_VALID_MS)])
 
     def do_release(self, a: int, b: int) -> None:
-        self._person(a).zero(final=False)
+        self._person(a).let_go_of_the_stick(final=False)
 
     def do_halt(self, a: int, b: int) -> None:
-        self._person(a).zero(final=True)
+        self._person(a).let_go_of_the_stick(final=True)
 
     def do_tap(self, a: int, b: int) -> None:
         """A zero, and at once another command."""
-        self._person(a).zero(final=b % 2 == 0)
-        self._person(a).drive(_VALID_MS[b % len(_VALID_MS)])
+        self._person(a).let_go_of_the_stick(final=b % 2 == 0)
+        self._person(a).command(_VALID_MS[b % len(_VALID_MS)])
 
     def do_press(self, a: int, b: int) -> None:
         self._presses += 1
-        self._person(a).stop(f"{self._presses:016x}")
+        self._person(a).press(f"{self._presses:016x}")
 
     def do_nameless(self, a: int, b: int) -> None:
-        self._person(a).stop_namelessly()
+        self._person(a).stop(named=False)
 
     def do_reset(self, a: int, b: int) -> None:
         self._person(a).reset()
@@ -159,7 +159,7 @@ class World:
         """A script started from a shell: it takes the robot from the one that runs."""
         run = next_run(self.config, self.script_rules.newest_run)
         self.script_rules.begins(run)
-        self.by_hand.append(OwnScript(FILES[b % 2], run, self.network, self.commands, lambda code: None))
+        self.by_hand.append(Script(FILES[b % 2], run, self.network, self.commands, lambda code: None))
 
     def do_end_by_hand(self, a: int, b: int) -> None:
         for script in self.by_hand:

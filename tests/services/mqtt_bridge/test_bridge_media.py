@@ -2,21 +2,19 @@
 
 from __future__ import annotations
 
-import logging
 import os
 from collections.abc import Iterator
 from contextlib import suppress
-from typing import Any, get_args, get_type_hints
+from typing import Any
 
 import pytest
 
-from pebble.config.media import AudioPublisher, VideoPublisher
 from pebble.contract import AUDIO_CONTROL, MQTT_AUDIO, MQTT_VIDEO, VIDEO_CONTROL
 from pebble.contract.payloads import MediaRequest
 from pebble.runtime import notes
 from pebble.runtime.notes import Held, Wanted
 from pebble.runtime.parent import NOTIFY_FD, WANTED, ProgramRequest
-from pebble.services.mqtt_bridge.media import MEDIA, Media
+from pebble.services.mqtt_bridge.media import Media
 from tests.forwarding.virtual import World
 from tests.services.mqtt_bridge.bridge_rig import Client
 
@@ -33,14 +31,6 @@ YES, NO = ProgramRequest(on=True), ProgramRequest(on=False)
 
 
 class TestDecision:
-    def test_every_program_has_a_row(self) -> None:
-        programs = [name for row in MEDIA for name in row.programs]
-        assert programs == ["camera_publisher", "video_stream", "audio_publisher", "audio_receiver"]
-
-    def test_the_encodings_are_those_a_config_may_name(self) -> None:
-        for row, section in zip(MEDIA, (VideoPublisher, AudioPublisher), strict=True):
-            assert row.encodings == get_args(get_type_hints(section)["encoding"])
-
     def test_nothing_is_wanted_unless_it_is_allowed_and_asked_for(self) -> None:
         media = Media(ALL)
         assert media.requests() == dict.fromkeys(ALL, NO)
@@ -152,22 +142,6 @@ class TestBridge:
         assert not any("audio" in note.program and note.on for note in either.asked if isinstance(note, Wanted))
 
     @each_side
-    def test_either_side_may_set_the_flag_and_ask(self, either: AskingBridge, side: str) -> None:
-        either.begin()
-        client: Client = getattr(either, side)
-        client.publish(AUDIO_FLAG, TRUE, retain=True)
-        for request, wanted in ((ON, "1"), (OFF, "0")):
-            client.publish(AUDIO, request)
-            assert [either.wanted(MICROPHONE), either.wanted(SPEAKER)] == [wanted] * 2
-
-    @each_side
-    def test_a_retained_flag_counts(self, either: AskingBridge, side: str) -> None:
-        getattr(either, side).publish(VIDEO_FLAG, TRUE, retain=True)
-        either.begin()
-        either.remote.publish(VIDEO, ON)
-        assert either.wanted(CAMERA) == "1"
-
-    @each_side
     def test_a_retained_request_never_does(self, either: AskingBridge, side: str) -> None:
         client: Client = getattr(either, side)
         client.publish(VIDEO, ON, retain=True)
@@ -177,15 +151,6 @@ class TestBridge:
         client.publish(AUDIO, ON)
         assert (either.wanted(SPEAKER), either.wanted(CAMERA)) == ("1", "0")
         assert either.service.counters["stale"]
-
-    @pytest.mark.parametrize("nonsense", [b"", b"1", b'"true"', b"{", b"\xff", b"[true]", b'{"enabled": NaN}'])
-    def test_nonsense_starts_and_stops_nothing(self, bridge: AskingBridge, nonsense: bytes) -> None:
-        bridge.begin()
-        bridge.remote.publish(VIDEO_FLAG, TRUE, retain=True)
-        for payload, wanted in ((nonsense, "0"), (ON, "1"), (nonsense, "1")):
-            bridge.remote.publish(VIDEO, payload)
-            assert bridge.wanted(CAMERA) == wanted
-        assert bridge.service.counters["refused"] == 2
 
     def test_what_a_bridge_before_it_wanted_runs_on(
         self, either: AskingBridge, monkeypatch: pytest.MonkeyPatch
@@ -217,11 +182,6 @@ class TestBridge:
         assert bridge.wanted(CAMERA, Held, after=3.1) == held
         assert bridge.wanted(CAMERA, Held, after=1.2) == held.replace("1", "0")
 
-    def test_what_a_script_drives_holds_nothing_up(self, bridge: AskingBridge) -> None:
-        bridge.begin(link={"profile": "thin"})
-        bridge.local.publish(DRIVE, b'{"z": 0.5, "source": "autonomy", "run": 1}')
-        assert bridge.wanted(CAMERA, Held) == ""
-
     def test_a_request_is_sent_again_to_a_busy_launcher(self, bridge: AskingBridge) -> None:
         bridge.begin()
         assert bridge.wanted(CAMERA) == "0"
@@ -231,14 +191,3 @@ class TestBridge:
         assert bridge.wanted(CAMERA) == "0"
         assert bridge.local.on(VIDEO)
         assert bridge.wanted(CAMERA) == "1"
-
-    def test_without_a_launcher_it_logs_that_once(
-        self, bridge: AskingBridge, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-    ) -> None:
-        caplog.set_level(logging.INFO)
-        monkeypatch.delenv(NOTIFY_FD)
-        bridge.begin()
-        bridge.remote.publish(VIDEO_FLAG, TRUE, retain=True)
-        bridge.remote.publish(VIDEO, ON)
-        bridge.run()
-        assert sum("there is no launcher" in message for message in caplog.messages) == 1

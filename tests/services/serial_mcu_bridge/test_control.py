@@ -5,13 +5,12 @@ from __future__ import annotations
 import logging
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import pytest
 
 from pebble.config import Security
 from pebble.contract import CONTROL_STATE, codec
-from pebble.contract.payloads import ControlRequest, ControlState, ControlVouched, Drive
+from pebble.contract.payloads import ControlRequest, ControlState
 from pebble.motors.control import Control
 from tests.services.serial_mcu_bridge.motor_rig import STOPPED, Bench
 from tests.support import until
@@ -58,50 +57,6 @@ def test_a_state_is_short() -> None:
     assert codec.decode(CONTROL_STATE, raw) == states[-1]
 
 
-def test_where_names_are_checked_the_key_counts_with_its_account() -> None:
-    control = Control(Security(level="named"), lambda _state: None, 0.0)
-    control.request(ControlRequest(id="aaaaaaaa", by="page-1/ann"), over=False, now=0.0)
-    state = control.state()
-    assert (state.by, state.named) == ("page-1/ann", True)
-    senders = {"page-1/ann": True, "page-1/bob": True, "page-1": True, "ann": False, "otto/page-1": False, "-": False}
-    assert {by: control.holds(Drive(z=0.5, key=state.key, by=by)) for by in senders} == senders
-    assert not control.holds(Drive(z=0.5, key=state.key))  # of a program of the robot
-    control.request(ControlRequest(id="aaaaaaaa", by="otto", want="release"), over=False, now=0.0)  # another's id
-    assert control.state().key == state.key
-
-
-@pytest.mark.parametrize(
-    ("strangers", "moves"),
-    [(None, [True, False]), ("free", [True, False]), ("drive", [True, True]), ("refuse", [False, False])],
-)
-def test_what_a_sender_without_a_key_may_do(strangers: Any, moves: list[bool]) -> None:
-    """While control is free, and while a person has it; the rule itself: tests/firmware/pure."""
-    control = Control(Security(strangers=strangers), lambda _state: None, 0.0)
-    refused = [control.lease.refuses(True, False, "", "", 0)]
-    control.request(ControlRequest(id="aaaaaaaa", by="ann"), over=False, now=0.0)
-    refused.append(control.lease.refuses(True, False, "", "", 0))
-    assert refused == [not one for one in moves]
-
-
-def run_down(control: Control) -> float:
-    """Do what is due until nothing is; when that was."""
-    now = 0.0
-    while control.due is not None:
-        now = control.due
-        control.tick(now)
-        control.note(now)
-    return now
-
-
-def test_that_others_drive_is_shown_until_two_seconds_later() -> None:
-    states: list[ControlState] = []
-    control = Control(Security(), states.append, 0.0)
-    control.lease.refuses(True, False, "", "", 0)
-    control.note(0.0)
-    assert run_down(control) == pytest.approx(2.0, abs=0.3)
-    assert [state.others for state in states] == [True, False]
-
-
 def test_a_state_is_repeated() -> None:
     states: list[ControlState] = []
     control = Control(Security(), states.append, 0.0)
@@ -119,24 +74,6 @@ ENDS: dict[str, tuple[bool, float | None, float | None, float]] = {
     "a bridge that vouches for too little": (True, 2.9, None, 30.0),
     "something was lost": (True, 3.0, 2.0, 30.0),
 }
-
-
-@pytest.mark.parametrize(("bridged", "vouched_s", "lost_s", "ends_s"), ENDS.values(), ids=ENDS)
-def test_when_control_ends(bridged: bool, vouched_s: float | None, lost_s: float | None, ends_s: float) -> None:
-    control = Control(Security(), lambda _state: None, 0.0, bridged=bridged)
-    control.request(ControlRequest(id="aaaaaaaa", by="ann"), over=False, now=0.0)
-    control.note(0.0)
-    if lost_s is not None:
-        control.doubt(lost_s)
-    now = 0.0
-    while control.lease.key:
-        assert control.due is not None
-        now = control.due
-        if vouched_s is not None and now >= 10.0:
-            control.vouch(ControlVouched(begin=0, end=round(1000 * vouched_s)), now)
-        control.tick(now)
-        control.note(now)
-    assert now == pytest.approx(ends_s, abs=0.3)
 
 
 # -- a service, an MCU and operators

@@ -12,10 +12,10 @@ from typing import Any
 
 import msgspec
 import pytest
-from msgspec import UNSET, structs
+from msgspec import structs
 
 from pebble.config import Security
-from pebble.contract.payloads import ControlRequest, ControlTurn, Drive, EstopCommand, EstopReset, EstopState
+from pebble.contract.payloads import ControlRequest, Drive, EstopCommand, EstopReset, EstopState
 from pebble.motors.control import Control
 from pebble.motors.motor_guard import MotorGuard
 from pebble.motors.state_file import StateFile
@@ -97,15 +97,6 @@ def rig(make: Make) -> Rig:
     return rig
 
 
-def test_it_begins_free_and_publishes_that(rig: Rig) -> None:
-    (first,) = rig.states
-    assert (first.latched, first.count, first.recent, first.persisted) == (False, 0, [], True)
-    assert (len(first.boot), first.barred) == (8, UNSET)
-    rig.guard.save_again()
-    assert (rig.file.busy, rig.barred_file.busy, rig.barred_file.path.exists()) == (False, False, False)
-    assert rig.guard.judge(Drive(z=1), rig.now) == 0.75
-
-
 def test_a_zero_of_a_script_that_starts_with_the_robot_bars_older_runs_silently(
     path: Path, caplog: pytest.LogCaptureFixture, make: Make
 ) -> None:
@@ -116,26 +107,6 @@ def test_a_zero_of_a_script_that_starts_with_the_robot_bars_older_runs_silently(
     rig.advance(3)
     assert rig.guard.judge(SCRIPT, rig.now) is None
     assert "refused a drive command: run 7 has ended" in caplog.text
-
-
-def test_what_follows_another_owner_moves_until_1_5_seconds_after_its_turn_and_bars_what_that_bars(
-    path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
-    with closing(Rig(path, owners=("arm", "serial"))) as rig:
-        assert rig.guard.judge(Drive(z=1), rig.now) is None
-        assert rig.guard.judge(Drive(), rig.now) == 0  # a zero waits for nothing
-        assert rig.counters["handover"] == 1
-        assert "the robot's motor owners do not follow the same holder yet" in caplog.text
-        rig.control.receive_turn("arm", ControlTurn(boot="b", turn=0, t=100_000), rig.now)
-        assert rig.guard.judge(Drive(z=1), rig.now) == 0.75
-        rig.advance(1.25)
-        assert rig.guard.judge(Drive(z=1), rig.now) == 0.25
-        rig.advance(0.25)
-        assert rig.guard.judge(Drive(z=1), rig.now) is None
-        rig.guard.bar(7, rig.now)
-        assert (rig.guard.barred, rig.state.barred) == (7, 7)
-        rig.guard.bar(6, rig.now)
-        assert rig.guard.barred == 7
 
 
 def test_a_stop_is_published_at_once_and_again_when_it_is_saved(
@@ -283,30 +254,6 @@ def test_a_write_that_takes_long_is_not_repeated_until_it_has_ended(
     may_end.set()
     assert rig.written()
     assert rig.state.persisted is True
-
-
-#: A reset after two stops: the boot and the count that it names, how old it is, and why it is refused.
-RESETS: dict[str, tuple[str, int, float, str | None]] = {
-    "of the newest state": ("", 2, 0.9995, None),
-    "too old": ("", 2, 1.0, "old"),
-    "of the first stop": ("", 1, 0.0, "count"),
-    "of another life": ("00000000", 2, 0.0, "boot"),
-}
-
-
-@pytest.mark.parametrize(("boot", "count", "age_s", "refused"), RESETS.values(), ids=RESETS)
-def test_a_reset_is_obeyed_or_refused_with_the_reason(
-    rig: Rig, caplog: pytest.LogCaptureFixture, boot: str, count: int, age_s: float, refused: str | None
-) -> None:
-    for name in (A, B):
-        rig.stop(name)
-    rig.advance(1)
-    before = len(rig.states)
-    rig.guard.reset(EstopReset(boot=boot or rig.state.boot, count=count, by="ann"), age_s, rig.now)
-    (state,) = rig.states[before:]
-    assert (state.latched, state.reset_refused) == (refused is not None, refused)
-    assert ("refused a reset" in caplog.text) == state.latched
-    assert ("emergency stop reset by ann" in caplog.text) != state.latched
 
 
 def test_a_barred_run_is_published_and_stays_barred_after_a_restart(rig: Rig, path: Path, make: Make) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -14,7 +13,7 @@ from pebble.contract import CONTROL, CONTROL_TAKE, DRIVE, ESTOP, ESTOP_RESET
 from pebble.contract.payloads import Drive
 from pebble.services.serial_mcu_bridge.text.motor_bridge import MotorBridge
 from pebble.transports.memory import MemoryHub, MemoryTransport
-from tests.services.serial_mcu_bridge.motor_rig import BASE, STOP, STOPPED, Bench
+from tests.services.serial_mcu_bridge.motor_rig import STOPPED, Bench
 from tests.support import until
 
 
@@ -91,48 +90,6 @@ def test_a_drive_command_without_an_axis_is_logged_once_for_each_sender(
     assert sum("'X'" in line for line in lines) == 1
     assert len(lines) == 17  # 16 senders, and all others together
     assert "'linear', 'source'" in lines[0]
-
-
-def test_a_retained_stop_and_a_retained_reset_do_nothing(bench: Bench) -> None:
-    bench.operator.publish(f"{BASE}/incoming/estop", json.dumps(STOP).encode(), retain=True)
-    assert bench.stopped()  # asked to be retained, but live
-    assert bench.reset()
-    bench.restart()
-    assert until(lambda: bench.service.counters["stale"] == 1)
-    assert not bench.state["latched"]
-
-
-def test_what_waits_with_a_stop_does_not_move_the_motors_after_it(bench: Bench) -> None:
-    """The service is busy while a drive command, a stop and another drive command arrive."""
-    delivered = bench.service.transport.counters["delivered"]
-    with bench.occupied():
-        bench.drive(0.25)
-        bench.send("estop", STOP)
-        bench.drive(0.5)
-        assert until(lambda: bench.service.transport.counters["delivered"] == delivered + 3)
-    assert bench.stopped()
-    assert bench.shines(r=1)
-    assert set(bench.lines) == {STOPPED, "L 0.000 0.000 1.000"}
-
-
-def test_a_stop_does_not_wait_behind_a_full_inbox(bench: Bench) -> None:
-    with bench.occupied():
-        for _ in range(2000):
-            bench.service.post(lambda: time.sleep(0.001))
-        bench.send("estop", STOP)
-        began = time.monotonic()
-    assert bench.stopped()
-    assert time.monotonic() - began < 5
-    assert bench.state["count"] == 1
-
-
-def test_a_command_that_waited_for_too_long_moves_nothing(bench: Bench) -> None:
-    with bench.occupied():
-        bench.drive(0.5)
-        time.sleep(0.6)
-    assert bench.shines(r=1)
-    assert bench.service.counters["late"] == 1
-    assert set(bench.lines) == {STOPPED, "L 0.000 0.000 1.000"}
 
 
 def test_a_command_is_valid_for_its_valid_ms(bench: Bench) -> None:

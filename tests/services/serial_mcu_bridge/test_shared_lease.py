@@ -94,33 +94,6 @@ def test_the_first_moves_nothing_until_all_others_follow_its_newest_turn() -> No
     assert not first.moves()
 
 
-def test_the_first_waits_for_1_6_seconds_at_most() -> None:
-    first = Owner("arm", strangers="drive")
-    for at, moves in ((100.0, False), (101.599, False), (101.6, True)):
-        first.tick(at)
-        assert first.moves() is moves
-    first.request()
-    for at, moves in ((101.7, False), (103.199, False), (103.2, True)):
-        first.tick(at)
-        assert first.moves(first.turn.key) is moves
-
-
-def test_the_first_repeats_its_turn_twice_a_second_and_shows_each_change_at_once() -> None:
-    first = Owner("arm")
-    for tenth in range(16):
-        first.tick(START_S + tenth / 10)
-    assert [at for at, _ in first.sent] == [100.0, 100.5, 101.0, 101.5]
-    first.request()
-    first.request("eve")
-    assert [(at, turn.by, turn.asks, turn.asks_id) for at, turn in first.sent[4:] if turn is not None] == [
-        (101.5, "ann", "", ""),
-        (101.5, "ann", "eve", "65766565"),
-    ]
-    first.tick(101.9)
-    first.tick(102.0)
-    assert [at for at, _ in first.sent[6:]] == [102.0]
-
-
 def test_a_flood_of_handovers_sends_20_turns_a_second_and_the_newest_one() -> None:
     first = Owner("arm")
     for number in range(300):
@@ -174,16 +147,6 @@ def test_a_turn_that_is_older_or_to_come_is_not_followed(turn: ControlTurn, halt
     assert {one: second.moves(one) for one in ("k", "l", "")} == {one: one == key for one in ("k", "l", "")}
 
 
-def test_another_owner_publishes_its_state_when_what_it_shows_changes() -> None:
-    second = Owner("serial")
-    for tenth, fields in enumerate(({}, {}, {"asks": "eve", "asks_id": "b"}, {"others": True}, {"others": True}), 1):
-        second.now = START_S + tenth
-        second.receive("arm", granted(**{"t": 100_000 + tenth} | fields))
-    assert [(state.key, state.asks, state.others) for state in second.states] == [
-        *(("k", "", False), ("k", "eve", False), ("k", "", True)),
-    ]
-
-
 def test_another_owner_answers_nobody_and_ends_nothing() -> None:
     second = Owner("serial")
     second.receive("arm", granted(asks="eve", asks_id="bbbbbbbb", others=True))
@@ -199,17 +162,6 @@ def test_another_owner_answers_nobody_and_ends_nothing() -> None:
     assert second.control.state() == shown
 
 
-def test_another_owner_shows_what_it_follows_at_once_and_then_twice_a_second() -> None:
-    second = Owner("serial")
-    second.tick(100.0)
-    second.now = 100.2
-    second.receive("arm", granted())
-    for tenth in range(3, 10):
-        second.tick(START_S + tenth / 10)
-    shown = ControlTurn(boot="b", turn=1)
-    assert second.sent == [(100.0, None), (100.2, shown), (100.7, shown)]
-
-
 def test_where_names_are_checked_the_account_of_the_holder_counts_at_all() -> None:
     first, second = (Owner(name, ("arm", "serial"), level="named") for name in ("arm", "serial"))
     first.request("page-1/ann")
@@ -222,18 +174,3 @@ def test_where_names_are_checked_the_account_of_the_holder_counts_at_all() -> No
 
 
 # -- one alone
-
-
-def test_one_owner_has_no_peers_waits_for_nobody_and_sends_nothing() -> None:
-    for owners in ((), ("serial",)):
-        owner = Owner("serial", owners, strangers="drive")
-        assert owner.moves()
-        owner.request()
-        for tenth in range(30):
-            owner.tick(START_S + tenth / 10)
-        assert owner.moves(owner.control.state().key)
-        assert (owner.control.peers, owner.sent, owner.control.turn(0, owner.now)) == (frozenset(), [], None)
-        assert not owner.control.waits(owner.now)
-        assert owner.control.left_ms(owner.now) > 60_000
-        owner.control.receive_turn("arm", granted(), owner.now)
-        assert owner.control.state().by == "ann"

@@ -14,10 +14,9 @@ import zenoh
 import zenoh.shm
 
 from pebble.errors import TransportError
-from pebble.runtime.parent import tied_to_parent
 from pebble.transports.frames import FrameInfo, FrameReader, FrameWriter, views
 from tests.locking import needs_shared_memory
-from tests.support import ROOT, Child, cases, until
+from tests.support import ROOT, Child, until
 
 LARGE = 500_000  # bytes: the allocator's margin holds no such frame
 
@@ -198,48 +197,3 @@ def test_a_frame_that_was_held_too_long_is_invalid(tmp_path: Path) -> None:
         finally:
             holder.kill()
             holder.wait()
-
-
-SOAK = """
-import sys; from pathlib import Path; import numpy as np
-from pebble.transports.frames import *
-from pebble.transports.frames import views
-folder, frames = Path(sys.argv[1]), int(sys.argv[2])
-status = Path("/proc/self/status")
-def rss(): return int(next(line.split()[1] for line in status.read_text().splitlines() if line.startswith("VmRSS")))
-assert views.why_unavailable() == "", views.why_unavailable()
-with FrameWriter(folder, "camera", capacity=20_000, slots=16) as writer:
-    with FrameReader(folder, "camera", views=True, depth=5) as reader:
-        while not writer.wanted: pass
-        held, wrong, late, warm, info, spare = [], 0, 0, 0, FrameInfo(format="bgr24"), np.zeros(17_000, np.uint8)
-        for number in range(0, frames, 5):
-            for step in range(5):
-                slot = writer.slot(17_000)
-                array = spare if slot is None else slot.array
-                array[0] = array[-1] = (number + step) % 251
-                writer.write(spare, info) if slot is None else slot.send(info)
-            for step in range(5):
-                frame = reader.read(0.01)
-                if frame is None:  # Zenoh drops a few of 10,000 in bursts
-                    continue
-                good = frame.data[0] == frame.data[-1] == (frame.info.sequence - 1) % 251
-                valid = frame.valid()  # False: this process stood still, and the writer took the memory back
-                wrong += valid and not good
-                late += not valid
-                held = held[-2:] + [frame.data[5:]]  # arrays that outlive their frames
-            if number == frames // 10: warm = rss()
-        print(wrong, reader.counters["missed"] + late, rss() - warm, flush=True)
-"""
-
-
-@pytest.mark.thorough
-@pytest.mark.parametrize(("frames", "options"), [(cases(20_000, 100_000), ()), (5_000, ("-X", "dev"))])
-def test_a_soak(tmp_path: Path, frames: int, options: tuple[str, ...]) -> None:
-    """Writer and reader with views in one process: wrong frames, lost ones, and growth in kB."""
-    command = tied_to_parent([sys.executable, *options, "-c", SOAK, str(tmp_path), str(frames)])
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
-    assert (done.returncode, done.stderr) == (0, "")
-    wrong, lost, growth = map(int, done.stdout.split())
-    assert wrong == 0
-    assert lost <= frames / 100  # a reader that stood still for a moment; usually none
-    assert growth < 5_000

@@ -27,8 +27,6 @@ from pebble.transports import Message, QoS, State, TlsSettings, Transport, Zenoh
 from pebble.transports.zenoh import publishers, wire
 from pebble.transports.zenoh import session as zenoh_session
 from pebble.transports.zenoh.hub import ZenohHub
-from pebble.transports.zenoh.hub import journal as hub_journal
-from pebble.transports.zenoh.hub import store as hub_store
 from tests.support import ROOT, free_port, until
 from tests.transports.forked import Forked
 from tests.transports.received import Received
@@ -211,15 +209,6 @@ def test_peers_that_open_at_the_same_instant_receive_each_other(robot: Robot) ->
             client.close()
 
 
-def test_subscribe_returns_when_every_sibling_knows(robot: Robot) -> None:
-    client, sibling = robot.client("client"), robot.actor("pinger")
-    sibling.stop()
-    before = time.monotonic()
-    threading.Timer(0.2, sibling.resume).start()
-    client.subscribe("a", print)
-    assert time.monotonic() - before >= 0.2
-
-
 def test_what_is_published_right_after_open_arrives_without_a_hub(robot: Robot) -> None:
     client = robot.client("client")
     received: list[Message] = []
@@ -335,19 +324,6 @@ def _links(transport: Any) -> int:
 # -- one topic, one order
 
 
-def test_urgent_and_other_messages_of_one_topic_keep_their_order(robot: Robot) -> None:
-    received: list[int] = []
-    sender, client = robot.client("sender"), robot.client("client")
-    for topic in ("urgent-first", "urgent-later"):
-        client.subscribe(topic, lambda message: received.append(int(message.payload)), limit=10_000)
-        for number in range(3000):
-            urgent = (number % 2 == 0) == (topic == "urgent-first")
-            sender.publish(topic, b"%d" % number, qos=DELIVERED, urgent=urgent)
-        assert until(lambda: len(received) == 3000)
-        assert received == list(range(3000))
-        received.clear()
-
-
 # -- wills and the journal
 
 
@@ -378,50 +354,6 @@ def test_the_will_of_one_who_died_with_the_hub_is_spoken_after_its_restart(remem
     remembering.hub.kill()
     remembering.hub.start()
     assert until(lambda: [(m.payload, m.retain) for m in received] == [(b"dead", False), (b"dead", True)], 8)
-
-
-def test_a_hub_starts_without_its_journal_and_tries_again(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
-    monkeypatch.setattr(hub_journal, "RETRY_S", 0.2)
-    caplog.set_level("INFO")
-    disk = tmp_path / "disk"
-    settings = ZenohSettings(run_dir=tmp_path / "run", journal=disk / "journal")
-    with contextlib.closing(ZenohHub(settings).open()) as hub, create("zenoh", "writer", settings) as writer:
-        for topic in ("old", "state"):
-            assert writer.publish(topic, b"1", qos=DELIVERED, retain=True)
-        assert until(lambda: hub.retained == {"old": b"1", "state": b"1"})
-    disk.rename(tmp_path / "away")
-    disk.touch()
-    with contextlib.closing(ZenohHub(settings).open()) as hub, create("zenoh", "writer", settings) as writer:
-        assert writer.publish("state", b"2", qos=DELIVERED, retain=True)
-        assert until(lambda: hub.retained == {"state": b"2"})
-        disk.unlink()
-        (tmp_path / "away").rename(disk)
-        assert until(lambda: "is written again" in caplog.text)
-    assert [record.levelname for record in caplog.records].count("ERROR") == 1
-    with contextlib.closing(ZenohHub(settings).open()) as hub:
-        assert hub.retained == {"old": b"1", "state": b"2"}
-
-
-def test_a_client_connects_to_a_hub_that_has_no_room_for_all_it_retains(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    settings = ZenohSettings(run_dir=tmp_path)
-    hub = ZenohHub(settings).open()
-    try:
-        with create("zenoh", "client", settings) as client:
-            for topic, size in (("robot/incoming/x", 5000), ("robot/outgoing/x", 4000)):
-                assert client.publish(topic, bytes(size), qos=DELIVERED, retain=True)
-            assert until(lambda: len(hub.retained) == 2)
-            hub.close()
-            assert until(lambda: client.state is not State.CONNECTED)
-            monkeypatch.setattr(hub_store, "MAX_BYTES", 5_000)
-            hub = ZenohHub(settings).open()
-            assert until(lambda: client.state is State.CONNECTED)
-            assert hub.retained.keys() == {"robot/outgoing/x"}
-    finally:
-        hub.close()
 
 
 # -- nothing open to the world
@@ -616,13 +548,6 @@ def test_a_second_hub_is_refused(robot: Robot) -> None:
     assert second.wait(20) == 1
     assert "there is a hub for " in second.printed
     assert robot.client("client").state is State.CONNECTED
-
-
-def test_the_hub_explains_its_arguments() -> None:
-    for arguments in ([], ["a", "b"], ["{"], ["{}"], ['{"run_dir": 1}']):
-        hub = Forked("pebble.runtime.hub", arguments)
-        assert hub.wait(20) == 1
-        assert "Traceback" not in hub.printed
 
 
 def test_a_tool_waits_for_a_hub(robot: Robot) -> None:

@@ -1,8 +1,7 @@
-"""Random schedules of two people who take control of a whole robot from each other, of its scripts, and of faults.
+"""Random schedules of a whole robot: two people who take control of it from each other, its scripts, stops and faults.
 
-``python -m tests.kit.schedules robot_scripts`` runs hundreds. Whose a line of the MCU is shows in its speed: people
-drive forward, scripts backward. The robot refuses strangers, so that each line of a person had a key. At the level
-named each person also commands by the other's name and with the other's key, which must move nothing.
+``python -m tests.kit.schedules robot`` runs hundreds. The robot refuses strangers, so that each line of a person had a
+key. At the level named each person also commands by the other's name and with the other's key, which must move nothing.
 """
 
 from __future__ import annotations
@@ -19,18 +18,20 @@ from itertools import groupby
 from pathlib import Path
 from typing import Any
 
-from pebble.extensions.operator.client.estop import new_name
+from pebble.contract import ESTOP, ESTOP_STATE, codec
+from pebble.contract.payloads import EstopState
+from pebble.extensions.operator.client.estop import StopSender, new_name
+from pebble.transports import Message
 from tests.kit.schedules import Engine, Outcome, RandomSteps, Steps
 from tests.kit.stalls import Stalls, lost_s
+from tests.robot.alive import Alive
 from tests.robot.named import Hall, Named
 from tests.robot.operator import Operator, ReceivedMessage
-from tests.robot.rig import BASE, Rig
-from tests.robot.script_schedules.alive import Alive
-from tests.robot.script_schedules.rules import by_script, problems
-from tests.robot.stop_schedules.history import History
-from tests.support import until
+from tests.robot.rig import BASE, Rig, descendants
+from tests.robot.whole_rules import History, Seen, by_script
+from tests.support import Broker, until
 
-STATE = "outgoing/control/serial"
+STATE, STOPPED = "outgoing/control/serial", "outgoing/estop/serial"
 SPEEDS = {"ann": 0.3, "otto": 0.5}
 FORGED = 0.7  # the speed of what has another's name or key
 FILES = ("cruise", "cruise", "busy", "stubborn")
@@ -39,25 +40,39 @@ _PERIOD_S = 0.06
 _ANSWER_S = 0.5
 _HOLD_S = 2.2  # a person's command holds a script
 _GONE_S = _STOP_TIMEOUT_S + 3.0
+_CONFIRMED_S = 15.0  # after all faults; a killed robot takes some seconds to start
 _WAITS_S = (0.02, 0.05, 0.1, 0.1, 0.2, 0.3, 0.5, 1.0)
-_FAULTS = ("serial_mcu_bridge", "mqtt_bridge", "script", "autonomy_manager", "launcher")
+_FROZEN_S = (0.1, 0.3, 0.5, 1.0, 1.5, 2.5)
+_FAULTS = (
+    "serial_mcu_bridge",
+    "mqtt_bridge",
+    "script",
+    "zenoh_hub",
+    "mqtt_mirror",
+    "autonomy_manager",
+    "launcher",
+    "power",
+)
 _ROLES = "driver,safety,maintainer"
 _WEIGHTS = {
-    "hold": 4, "take": 4, "release": 2, "drive": 6, "let_go": 3, "lose": 1, "stop": 1, "reset": 2, "start": 4, "end": 2,
-    "kill": 2, "freeze": 2, "go_silent": 1, "restart_broker": 1,
+    "hold": 4, "take": 4, "release": 2, "drive": 6, "let_go": 3, "lose": 1, "stop": 3, "look": 2, "reset": 3,
+    "start": 4, "end": 2, "kill": 3, "freeze": 2, "go_silent": 1, "cut": 1, "restart_broker": 1, "freeze_broker": 1,
+    "restore_broker": 1, "plant_stop": 1,
 }  # fmt: skip
 
 
 class Person:
-    """Repeats a request for control and a drive command, each while it is wanted; a key is used for ever.
+    """Repeats a request for control, a drive command and stops, each while it is wanted; a key is used for ever.
 
-    ``by``: what the topics of its commands have before the metric.
+    ``by``: what the topics of its commands have before the metric. ``heard``: what its robot has published.
     """
 
-    def __init__(self, name: str, operator: Operator, by: str = "") -> None:
-        self.name, self.id, self.operator, self._by = name, secrets.token_hex(4), operator, by
+    def __init__(self, name: str, operator: Operator, heard: list[ReceivedMessage], by: str = "") -> None:
+        self.name, self.id, self.operator, self._by, self._heard = name, secrets.token_hex(4), operator, by, heard
         self.key = ""
         self.wants = self.drives = False
+        self.stops: list[StopSender] = []
+        self._heard_up_to: dict[str, int] = {}  # by stop
         self._changed, self._ended = threading.Event(), False
         self._thread = threading.Thread(target=self._run, daemon=True)
         self._thread.start()
@@ -68,7 +83,7 @@ class Person:
         self._thread.join()
         self.operator.close()
 
-    def send(self, metric: str, body: dict[str, Any]) -> None:
+    def send(self, metric: str, body: Any) -> None:
         self.operator.send(f"incoming/{self._by}{metric}", body)
 
     def request(self, topic: str = "control", want: str = "hold") -> None:
@@ -80,6 +95,10 @@ class Person:
 
     def drive(self, speed: float) -> None:
         self.send("drive-values", {"x": 0, "z": speed, "key": self.key})
+
+    def stop(self, name: str) -> None:
+        """Send an emergency stop until it is confirmed."""
+        self.stops = [*self.stops, StopSender(name, by=self.name, why="", now=time.monotonic(), robots=[BASE])]
 
     def has_control(self) -> bool:
         """True if it has control; notes the key."""
@@ -93,6 +112,8 @@ class Person:
         asked = 0.0
         while not self._ended:
             self.has_control()
+            for stop in self.stops:
+                self._repeat(stop)
             if self.wants and time.monotonic() > asked + 1.0:
                 asked = time.monotonic()
                 self._request("control", "hold")
@@ -100,33 +121,50 @@ class Person:
                 self.drive(SPEEDS[self.name])
             self._changed.wait(_PERIOD_S)
 
+    def _repeat(self, stop: StopSender) -> None:
+        known, first = len(self._heard), self._heard_up_to.get(stop.order.name, 0)
+        self._heard_up_to[stop.order.name] = known
+        for seen in self._heard[first:known]:
+            stop.receive(Message(seen.topic, seen.payload, retain=seen.retain or not first), time.monotonic())
+        for message in stop.tick(time.monotonic()):
+            if message.topic == ESTOP.topic(BASE):
+                self.send("estop", message.payload)
+
 
 class World:
     """A robot, its brokers and two people; ``history`` is that of the present schedule."""
 
     def __init__(self, kind: str) -> None:
-        self.history = History()
-        transport = kind.split()[0]
+        self.history, self.kind = History(), kind
+        transport, *named = kind.split()
         manager = {"stop_timeout_seconds": _STOP_TIMEOUT_S}
-        options = {"mirror": transport == "zenoh", "scripts": tuple(set(FILES)), "autonomy_manager": manager}
+        options: dict[str, Any] = {"mirror": transport == "zenoh", "scripts": tuple(set(FILES))}
+        options["autonomy_manager"] = manager
         with ExitStack() as opened:
-            if kind == transport:
-                strangers = {"security": {"strangers": "refuse"}}
-                self.rig = opened.enter_context(Rig(transport, top=strangers, **options))
-                people = [Person(name, Operator(self.rig.remote.port, BASE, STATE)) for name in SPEEDS]
-            else:
-                folder = Path(opened.enter_context(tempfile.TemporaryDirectory(prefix="pbls")))
+            folder = Path(opened.enter_context(tempfile.TemporaryDirectory(prefix="pbls")))
+            if named:
                 hall = opened.enter_context(Hall(folder / "hall", people=dict.fromkeys(("boss", *SPEEDS), _ROLES)))
-                self.rig = opened.enter_context(Named(transport, hall, {"level": "named"}, direct=False, **options))
-                people = [Person(name, hall.client(name, STATE), f"by/{name}/") for name in SPEEDS]
+                self.rig: Rig = opened.enter_context(
+                    Named(transport, hall, {"level": "named"}, direct=False, **options)
+                )
+                people = [(name, hall.client(name, STATE), f"by/{name}/") for name in SPEEDS]
                 self.thief = opened.enter_context(closing(hall.client("rover", STATE)))
-            self.people = [opened.enter_context(closing(person)) for person in people]
-            assert self.rig.local is not None
-            self.watcher = opened.enter_context(closing(Operator(self.rig.local.port, BASE, "outgoing/+/serial")))
+            else:
+                remote = Broker(folder, persistence=True, autosave=False)
+                strangers = {"security": {"strangers": "refuse"}}
+                self.rig = opened.enter_context(Rig(transport, remote=remote, top=strangers, **options))
+                people = [(name, Operator(remote.port, BASE, STATE), "") for name in SPEEDS]
+            heard = self.rig.operator.seen
+            self.people = [opened.enter_context(closing(Person(name, own, heard, by))) for name, own, by in people]
+            local = (self.rig.local or self.rig.remote).port
+            self.watcher = opened.enter_context(closing(Operator(local, BASE, "outgoing/+/serial")))
             assert until(lambda: self.watcher.last(STATE) is not None, 15), "nothing is mirrored"
             self.alive = opened.enter_context(closing(Alive(self.rig.folder)))
             self._stalls = opened.enter_context(closing(Stalls()))
             self._timers: list[threading.Timer] = []
+            self._planted: set[str] = set()
+            self._looked: EstopState | None = None
+            self._older: dict[Path, bytes] = {}
             assert until(self.rig.lists_scripts, 20), self.rig.log.read_text()
             self._opened = opened.pop_all()
 
@@ -136,21 +174,28 @@ class World:
     def perform(self, schedule: Steps) -> Outcome:
         self.history = History()
         self.alive.overlaps.clear()
+        self._looked, self._older = None, {}
+        for person in self.people:
+            person.stops = []
         began = self.history.began
         for action, a, b in schedule[1]:
             getattr(self, "do_" + action)(self.people[a % 2], b)
             time.sleep(_WAITS_S[b % len(_WAITS_S)])
         ended = time.monotonic()
         left = self._rest()
-        lines = self.rig.mcu.drives(began)
-        seen = (self.history, lines, self.rig.mcu.motors(began), list(self.alive.overlaps))
+        lines, motors = self.rig.mcu.drives(began), self.rig.mcu.motors(began)
+        states = [
+            (seen.at, _state(seen)) for seen in self.watcher.on(STOPPED, began) if seen.payload and not seen.retain
+        ]
+        seen = Seen(self.history, lines, motors, states, list(self.alive.overlaps), SPEEDS, self._planted)
         stalls = [*self._stalls.found, *self.rig.mcu.late(began)]
-        found = problems(*seen, stalls)
-        allowed = len(problems(*seen)) - len(found)
+        found = seen.problems(stalls)
+        allowed = len(seen.problems()) - len(found)
         found += [*self._out_of_turn(began), *self._by_another_name(began)]
         counts = {
             "lines": float(len(lines)),
             "passed on": float(len(self._holders(began, ended))),
+            "stops": float(len(self.history.events("estop"))),
             "stalled s": round(lost_s(stalls, began, ended), 2),
             "allowed": float(allowed),
         }
@@ -176,24 +221,37 @@ class World:
 
     def do_let_go(self, person: Person, b: int) -> None:
         person.drives = False
-        self.history.add("zero", final=b % 3 == 0, by=person.name)
+        self._note("zero", person, final=b % 3 == 0)
         person.send("drive-values", {"x": 0, "z": 0, **({"valid_ms": 0} if b % 3 == 0 else {})})
 
     def do_lose(self, person: Person, _: int) -> None:
         self._note("lose", person)
         person.drives = person.wants = False
 
-    def do_stop(self, person: Person, _: int) -> None:
-        for one in self.people:
-            one.drives = False
-        self._note("estop", person)
-        person.send("estop", {"stop": new_name(), "by": person.name})
+    def do_stop(self, person: Person, b: int) -> None:
+        """Most people drive on: what is latched must not move. A quarter of all stops is sent once, at the robot."""
+        if b % 3 == 0:
+            for driver in self.people:
+                driver.drives = False
+        name = new_name()
+        self._note("estop", person, name=name)
+        if b % 4 == 3:
+            self.watcher.send("incoming/estop", {"stop": name, "by": person.name})
+        else:
+            person.stop(name)
 
-    def do_reset(self, person: Person, _: int) -> None:
-        state = self.watcher.last("outgoing/estop/serial")
-        if state is not None and state.payload:
-            shown = {"boot": state.json["boot"], "count": state.json["count"]}
-            person.send("estop-reset", {**shown, "by": person.name})
+    def do_look(self, _: Person, __: int) -> None:
+        """What a later reset may be made of."""
+        seen = self.watcher.last(STOPPED)
+        self._looked = None if seen is None or not seen.payload else _state(seen)
+
+    def do_reset(self, person: Person, b: int) -> None:
+        if b % 3 or self._looked is None:
+            self.do_look(person, b)
+        shown = self._looked
+        if shown is not None:
+            self._note("reset", person, shown=shown)
+            person.send("estop-reset", {"boot": shown.boot, "count": shown.count, "by": person.name})
 
     def do_start(self, person: Person, b: int) -> None:
         self._note("start", person)
@@ -222,7 +280,7 @@ class World:
             (self.thief, "drive-values", drive),
             (self.thief, "control/take", taken),
         ]
-        self.history.add(f"poses, way {b % len(ways)}", by=person.name)
+        self._note(f"poses, way {b % len(ways)}", person)
         operator, metric, body = ways[b % len(ways)]
         for _ in range(5):
             operator.send(f"incoming/{metric}", body)
@@ -232,17 +290,28 @@ class World:
     def do_kill(self, _: Person, b: int) -> None:
         which = _FAULTS[b % len(_FAULTS)]
         with self._fault(f"kill {which}", 1.5):
-            if which in ("autonomy_manager", "launcher"):
+            if which in ("autonomy_manager", "launcher", "power"):
                 self.history.add("manager killed")
-            if which == "launcher":
-                left = self.rig.kill_launcher()
-                until(lambda: not any(self.rig.alive(pid) for pid in left), 5)
-                self.rig.start(ready=False)
+            if which in ("launcher", "power"):
+                self._start_again(self._power_cut() if which == "power" else self.rig.kill_launcher())
             else:
                 _send(self._pids(which), signal.SIGKILL)
 
+    def _power_cut(self) -> list[int]:
+        """Every process of the robot ends at the same time; what is on disk stays."""
+        launcher = self.rig.launcher_pid
+        _send([launcher], signal.SIGSTOP)
+        pids = descendants(launcher)
+        _send(pids, signal.SIGKILL)
+        self.rig.kill_launcher()
+        return pids
+
+    def _start_again(self, left: list[int]) -> None:
+        until(lambda: not any(self.rig.alive(pid) for pid in left), 5)
+        self.rig.start(ready=False)
+
     def do_freeze(self, _: Person, b: int) -> None:
-        which, seconds = _FAULTS[b % 4], _WAITS_S[b % 8]
+        which, seconds = _FAULTS[b % 5], _FROZEN_S[b % len(_FROZEN_S)]
         with self._fault(f"freeze {which}", seconds + 1.5 * (which != "script")):
             pids = self._pids(which)
             _send(pids, signal.SIGSTOP)
@@ -257,14 +326,62 @@ class World:
     def do_go_silent(self, _: Person, b: int) -> None:
         with self._fault("the uplink is silent"):
             self.rig.uplink.blackhole()
-            time.sleep(_WAITS_S[b % 8])
+            time.sleep(_FROZEN_S[b % len(_FROZEN_S)])
             self.rig.uplink.resume()
 
-    def do_restart_broker(self, _: Person, b: int) -> None:
-        with self._fault("the broker is away", 1.5):
-            self.rig.remote.kill()
+    def do_cut(self, _: Person, b: int) -> None:
+        with self._fault("the uplink is cut", 1.0), self._away():
             time.sleep(_WAITS_S[b % 8])
+
+    @contextmanager
+    def _away(self) -> Iterator[None]:
+        self.rig.uplink.cut()
+        yield
+        self.rig.uplink.mend()
+
+    def _broker(self, b: int) -> Broker:
+        """The remote one, or the robot's own."""
+        return self.rig.local if b % 2 and self.rig.local is not None else self.rig.remote
+
+    def do_restart_broker(self, _: Person, b: int) -> None:
+        with self._fault("a broker is away", 1.5):
+            self._broker(b).kill()
+            time.sleep(_WAITS_S[b % 8])
+            self._broker(b).start()
+
+    def do_freeze_broker(self, _: Person, b: int) -> None:
+        broker = self._broker(b)
+        if isinstance(broker, Broker):
+            with self._fault("a broker is frozen", 1.5):
+                broker.freeze()
+                time.sleep(_FROZEN_S[b % len(_FROZEN_S)])
+                broker.thaw()
+
+    def do_restore_broker(self, _: Person, __: int) -> None:
+        """The first time its memory is saved; later it is killed, and has its older memory."""
+        if not isinstance(self.rig.remote, Broker):
+            return
+        if not self._older:
+            self.rig.remote.save()
+            self._older = {file: file.read_bytes() for file in self.rig.remote.store.iterdir()}
+            return
+        with self._fault("a broker of before", 1.5):
+            self.rig.remote.kill()
+            for file, saved in self._older.items():
+                file.write_bytes(saved)
             self.rig.remote.start()
+
+    def do_plant_stop(self, _: Person, b: int) -> None:
+        """A stop reaches the broker while the robot is away, retained: it receives only the copy."""
+        if (
+            not isinstance(self.rig.remote, Broker) or self.rig.local is None
+        ):  # its programs are not away from their own
+            return
+        with self._fault("the uplink is cut for a retained stop", 1.0), self._away():
+            name = new_name()
+            self._planted.add(name)
+            self.rig.operator.send("incoming/estop", {"stop": name, "by": "old"}, retain=True)
+            time.sleep(0.1 + _WAITS_S[b % 8])
 
     @contextmanager
     def _fault(self, which: str, after: float = 0.0) -> Iterator[None]:
@@ -272,8 +389,8 @@ class World:
         yield
         self.history.add("fault", at=began, which=which, until=time.monotonic() + after)
 
-    def _note(self, what: str, person: Person) -> None:
-        self.history.add(what, by=person.name)
+    def _note(self, what: str, person: Person, **details: Any) -> None:
+        self.history.add(what, by=person.name, **details)
 
     # -- rules
 
@@ -304,7 +421,7 @@ class World:
                 yield f"control by another's name: {state.json}"
                 return
 
-    # -- the end: each of the two gets control and drives, the other does not; and a script can be used
+    # -- the end: stops are confirmed, each of the two gets control and drives alone, and a script can be used
 
     def _rest(self) -> list[str]:
         for person in self.people:
@@ -313,6 +430,11 @@ class World:
             timer.join()
         if not until(self._up, 20.0):
             return ["the robot does not come back"]
+        if not until(lambda: all(stop.confirmed for person in self.people for stop in person.stops), _CONFIRMED_S):
+            why = [robot.why for person in self.people for stop in person.stops for robot in stop.robots.values()]
+            return [f"a stop is not confirmed: {why}"]
+        for person in self.people:
+            person.stops = []
         if not until(self._ended, _GONE_S, step=0.5):
             return ["a script does not end"]
         time.sleep(_ANSWER_S)  # the state after the last stop may still be on its way
@@ -386,14 +508,16 @@ class World:
         return seen is not None and now - seen.at < 0.6 and {"autonomy_manager", *_FAULTS[:2]} <= running
 
     def _is_reset(self) -> bool:
-        state = self.watcher.last("outgoing/estop/serial")
-        self.do_reset(self.people[0], 0)
+        state = self.watcher.last(STOPPED)
+        self.do_reset(self.people[0], 1)
         return state is not None and bool(state.payload) and not state.json["latched"]
 
     def _log(self, since: float) -> str:
         events = [(event.at, f"{event.what} {event.details or ''}") for event in self.history.events()]
         events += [(at, f"    M {wheels}") for at, wheels in self.rig.mcu.drives(since)]
-        events += [(one.at, f"  control {one.payload!r}") for one in self.watcher.on(STATE, since)]
+        events += [
+            (one.at, f"  {name} {one.payload!r}") for name in (STATE, STOPPED) for one in self.watcher.on(name, since)
+        ]
         lines = [f"{at:.3f} {text}" for at, text in sorted(events, key=lambda event: event[0])]
         return "\n".join([*lines, self.rig.log.read_text()[-3000:]])
 
@@ -404,6 +528,11 @@ def _send(pids: list[int], number: signal.Signals) -> None:
             os.kill(pid, number)
 
 
+def _state(seen: ReceivedMessage) -> EstopState:
+    state: EstopState = codec.decode(ESTOP_STATE, seen.payload)
+    return state
+
+
 def _account(state: ReceivedMessage) -> str:
     """Return who has control; a name that is checked has the account before the person."""
     name: str = state.json["by"]
@@ -411,15 +540,15 @@ def _account(state: ReceivedMessage) -> str:
 
 
 _BEGIN = (("start", 0, None), ("take", 0, None), ("drive", 0, None))
-_AS_THEMSELVES = RandomSteps(_WEIGHTS, length=22, layouts=1, begin=_BEGIN)
-_AS_OTHERS = RandomSteps(_WEIGHTS | {"pose": 6}, length=26, layouts=1, begin=_BEGIN)
+_AS_THEMSELVES = RandomSteps(_WEIGHTS, length=24, layouts=1, begin=_BEGIN)
+_AS_OTHERS = RandomSteps(_WEIGHTS | {"pose": 6}, length=28, layouts=1, begin=_BEGIN)
 
 ENGINE = Engine(
     draw=lambda kind, seed, number: (_AS_OTHERS if "named" in kind else _AS_THEMSELVES)(kind, seed, number),
     world=lambda kind: closing(World(kind)),
     perform=lambda world, schedule: world.perform(schedule),
-    kinds=("zenoh", "mqtt", "zenoh named", "mqtt named"),
-    schedules=200,
+    kinds=("zenoh", "mqtt", "single", "zenoh named", "mqtt named"),
+    schedules=400,
     per_world=20,
     repeats=False,
 )
