@@ -4,11 +4,12 @@ import logging
 import time
 from typing import Any
 
-from pebble.contract import IMU, IMU_FAST
+from pebble.contract import DRIVE, IMU, IMU_FAST
+from pebble.contract.payloads import Drive
 from pebble.errors import DeviceError
 from pebble.runtime.lines import LineSplitter
-from pebble.runtime.service import every
-from pebble.services.serial_mcu_bridge.imu import ImuReports, ImuWatchdog
+from pebble.runtime.service import every, on
+from pebble.services.serial_mcu_bridge.imu import ImuReports, ImuWatchdog, measured
 from pebble.services.serial_mcu_bridge.line.serial_line import LineState
 from pebble.services.serial_mcu_bridge.serial_service import SerialService
 from pebble.services.serial_mcu_bridge.text.device_log import DeviceLogLine, is_known
@@ -18,7 +19,7 @@ _WATCH_S = 0.5
 
 
 class ImuBridge(SerialService):
-    """Receives only: nothing is ever sent to the sensor."""
+    """Sends nothing to the sensor. From drive commands it knows when the sensor must not repeat itself."""
 
     publishes = (IMU_FAST, IMU)
     receive_only = True
@@ -47,6 +48,10 @@ class ImuBridge(SerialService):
                 self._report(report)
         self.count_discarded(self._splitter.discarded_lines)
 
+    @on(DRIVE)
+    def drive(self, drive: Drive) -> None:
+        self.follow(drive)
+
     @every(_WATCH_S)
     def watch(self) -> None:
         if self._watchdog.expired(self.clock()):
@@ -57,6 +62,7 @@ class ImuBridge(SerialService):
         match report:
             case Motion(number, mcu_ms, values):
                 self._watchdog.sample(self.clock())
+                self.sensors.take(measured(values), self.clock())
                 self.publish(IMU_FAST, self._reports.motion(now_ms, number, mcu_ms, values))
             case Summary(number, mcu_ms, values):
                 summary = self._reports.summary(now_ms, number, mcu_ms, values)
