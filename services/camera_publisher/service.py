@@ -230,7 +230,7 @@ class CameraPublisher(Service):
 
     @property
     def _black(self) -> str | None:
-        return f"its pictures are black since {self._seen.same_s:.0f} s" if self._seen.repeats else None
+        return f"shows only black since {self._seen.same_s:.0f} s" if self._seen.repeats else None
 
 
 def is_black(picture: Pixels) -> bool:
