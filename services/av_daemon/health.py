@@ -14,6 +14,7 @@ from pebble.transports.frames import FrameInfo
 _OPENING_S = 15.0  # a device that takes longer to open hangs
 _SILENCE_S = 4.0  # as does one without a frame for so long; a second more than the sources' own timeout
 FIRST_DELAY_S, _LONGEST_DELAY_S = 2.0, 30.0  # before a device that failed is opened again
+_REMEMBERED = 8  # frames: a driver that hangs may give its buffers in turn
 _GOOD_RUN_S = 10.0  # after which a failure is the first again
 
 
@@ -34,7 +35,7 @@ class Health:
     def __init__(self, first_delay_s: float = FIRST_DELAY_S, asked: Asked | None = None) -> None:
         """``asked`` is None for a device that is computed: it may repeat itself."""
         self._first_delay_s, self._asked = first_delay_s, asked
-        self._check = SourceCheck(asked.rate if asked else 0.0)
+        self._check = SourceCheck(asked.rate if asked else 0.0, remembered=_REMEMBERED)
         self._doing = "starts"
         self._deadline: float | None = None  # for the next frame; None: none is expected
         self._opened_at = 0.0
@@ -95,7 +96,11 @@ class Health:
     def _problems(self, info: FrameInfo, asked: Asked) -> Iterator[tuple[str, str]]:
         check, sound, wrong_hz = self._check, info.rate > 0, self._check.wrong_hz
         if check.repeats:
-            what = "gives the same sound" if sound else "shows the same picture"
+            what = (
+                "gives the same sound"
+                if sound
+                else f"shows the same {'few pictures' if check.alternates else 'picture'}"
+            )
             silent = "gives only zeros, as one that is muted or unplugged,"
             yield "repeats", f"{silent if check.content == NOTHING else what} since {check.same_s:.0f} s"
         if wrong_hz is not None and sound:

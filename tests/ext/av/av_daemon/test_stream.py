@@ -285,6 +285,7 @@ class TestHealth:
         [
             (PICTURE, Asked(15, 640, 480), 15, None, None),
             (PICTURE, Asked(15, 640, 480), 14, 7, "shows the same picture since 11 s"),
+            (PICTURE, Asked(15, 640, 480), 15, [1, 2, 3, 4], "shows the same few pictures since 11 s"),
             (PICTURE, None, 10, 7, None),
             (PICTURE, Asked(15, 480, 640), 15, None, "gives pictures of 640x480 where 480x640 were asked"),
             (PICTURE, Asked(15, 640, 480), 7, None, "gives 7.0 pictures a second where 15 were asked"),
@@ -296,12 +297,13 @@ class TestHealth:
         ],
     )
     def test_frames_that_come_in_time_may_show_nothing(
-        self, info: FrameInfo, asked: Asked | None, hz: int, content: int | str | None, problem: str | None
+        self, info: FrameInfo, asked: Asked | None, hz: int, content: int | str | list[int] | None, problem: str | None
     ) -> None:
         device = Health(2.0, asked)
         device.opening(100.0)
         for number in range(11 * hz + 2):
-            device.frame(info, 100 + number / hz, content=1000 + number if content is None else content)
+            new = content[number % len(content)] if isinstance(content, list) else content
+            device.frame(info, 100 + number / hz, content=1000 + number if new is None else new)
         found = device.report(111.0)
         assert (found.problem, found.last_error, found.doing) == (problem, problem, "runs")
         device.failed("unplugged")
