@@ -26,6 +26,7 @@ class BoundedOutput:
 
     def __init__(self, write: Callable[[bytes], None], longest: int, now: float, *, rate: float = LINES_PER_S) -> None:
         """``longest``: bytes of a line; the rest of a longer one is left out."""
+        self.flooded = False  # by the newest chunk: the reader may take its time
         self._write, self._rate, self._most = write, rate, rate * _BURST_S
         self._lines = LineSplitter(longest, truncate=True)
         self._tokens, self._filled_at = self._most, now
@@ -33,8 +34,6 @@ class BoundedOutput:
         self._kept: deque[bytes] = deque(maxlen=KEPT)
         self._left_out = 0
         self._suppressed_at = self._said_at = now
-
-    flooded = False  # by the newest chunk: the reader may take its time
 
     @property
     def waits(self) -> bool:

@@ -96,13 +96,12 @@ class Health:
     def _problems(self, info: FrameInfo, asked: Asked) -> Iterator[tuple[str, str]]:
         check, sound, wrong_hz = self._check, info.rate > 0, self._check.wrong_hz
         if check.repeats:
-            what = (
-                "gives the same sound"
-                if sound
-                else f"shows the same {'few pictures' if check.alternates else 'picture'}"
-            )
-            silent = "gives only zeros, as one that is muted or unplugged,"
-            yield "repeats", f"{silent if check.content == NOTHING else what} since {check.same_s:.0f} s"
+            what = "gives the same sound" if sound else "shows the same picture"
+            if check.content == NOTHING:
+                what = "gives only zeros, as one that is muted or unplugged,"
+            elif check.alternates:
+                what += "s again and again"
+            yield "repeats", f"{what} since {check.same_s:.0f} s"
         if wrong_hz is not None and sound:
             yield "rate", f"gives {wrong_hz / asked.rate * info.rate:.0f} samples a second where {info.rate} were asked"
         elif wrong_hz is not None:

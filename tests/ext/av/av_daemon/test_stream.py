@@ -285,7 +285,7 @@ class TestHealth:
         [
             (PICTURE, Asked(15, 640, 480), 15, None, None),
             (PICTURE, Asked(15, 640, 480), 14, 7, "shows the same picture since 11 s"),
-            (PICTURE, Asked(15, 640, 480), 15, [1, 2, 3, 4], "shows the same few pictures since 11 s"),
+            (PICTURE, Asked(15, 640, 480), 15, [1, 2, 3, 4], "shows the same pictures again and again since 11 s"),
             (PICTURE, None, 10, 7, None),
             (PICTURE, Asked(15, 480, 640), 15, None, "gives pictures of 640x480 where 480x640 were asked"),
             (PICTURE, Asked(15, 640, 480), 7, None, "gives 7.0 pictures a second where 15 were asked"),
