@@ -11,7 +11,7 @@ from pebble.runtime.lines import LineSplitter
 LINES_PER_S: Final = 100.0
 _BURST_S = 2.0  # so many seconds' lines at once, after a silence
 KEPT: Final = 10  # of the lines that are left out, the last ones: a program that fails says why at its end
-PAUSE_S: Final = 0.05  # between two reads of a program that floods, which waits meanwhile
+PAUSE_S: Final = 0.02  # between two reads of a program that floods, which waits meanwhile
 _SKIM = 4096  # bytes of a chunk that are read of a flood
 _REPEATS_S = 1.0  # within which the same line again is a repetition
 _QUIET_S, _REPORT_S = 0.5, 5.0  # what was left out is said when the flood has ended so long ago, or goes on
