@@ -33,7 +33,7 @@ class BoundedOutput:
         self._newest, self._newest_at, self._repeats = b"", now, 0
         self._kept: deque[bytes] = deque(maxlen=KEPT)
         self._left_out = 0
-        self._suppressed_at = self._said_at = now
+        self._suppressed_at, self._said_at = float("-inf"), now
 
     @property
     def waits(self) -> bool:
@@ -42,16 +42,13 @@ class BoundedOutput:
 
     def feed(self, data: bytes, now: float) -> None:
         self.tick(now)
-        before = self._left_out + self._repeats
         if self.flooded and len(data) > 2 * _SKIM and (end := data.rfind(b"\n", 0, -_SKIM)) >= 0:
-            self._left_out += data.count(b"\n", 0, end + 1)
+            self._left_out, self._suppressed_at = self._left_out + data.count(b"\n", 0, end + 1), now
             self._lines.reset()
             data = data[end + 1 :]
         for line in self._lines.feed(data):
             self._line(line.rstrip(), now)
-        self.flooded = self._left_out + self._repeats > before
-        if self.flooded:
-            self._suppressed_at = now
+        self.flooded = self._suppressed_at == now
 
     def tick(self, now: float) -> None:
         """Say what was left out, if it is time."""
@@ -74,19 +71,19 @@ class BoundedOutput:
         if not text:
             return
         if text == self._newest and now - self._newest_at < _REPEATS_S:
-            self._repeats += 1
+            self._repeats, self._suppressed_at = self._repeats + 1, now
         else:
             self._say_repeats()
             self._newest = text
-            self._pass(line)
+            self._pass(line, now)
         self._newest_at = now
 
-    def _pass(self, line: bytes) -> None:
+    def _pass(self, line: bytes, now: float) -> None:
         if self._tokens >= 1 and not self._left_out:
             self._tokens -= 1
             self._write(line)
         else:
-            self._left_out += 1
+            self._left_out, self._suppressed_at = self._left_out + 1, now
             self._kept.append(line)
 
     def _say(self) -> None:
