@@ -7,6 +7,7 @@ from importlib import import_module
 from typing import Any, ClassVar
 
 from pebble.config import Config, SerialBridge
+from pebble.contract import DRIVE
 from pebble.contract.payloads import Drive
 from pebble.contract.serial_protocols import SERIAL_PROTOCOLS
 from pebble.errors import ConfigError, DeviceError
@@ -16,6 +17,7 @@ from pebble.runtime.service import Service, every
 from pebble.services.serial_mcu_bridge.line.serial_line import LineState, SerialLine
 from pebble.services.serial_mcu_bridge.line.silence import CHECK_S, Silence
 from pebble.services.serial_mcu_bridge.moving_sensors import MovingSensors
+from pebble.transports import Subscription
 
 _MISREAD = "what its board sends is not understood: another baud rate or firmware, or noise"
 _INPUT_LIMIT = 65_536  # bytes waiting for the service's thread; 1.4 s of a full 460,800 baud line
@@ -66,9 +68,13 @@ class SerialService(Service, ABC):
         """The config section of this serial line; with instances, the merged one of this instance."""
         return self.config.services.serial_mcu_bridge
 
-    def follow(self, drive: Drive) -> None:
-        """Note a drive command, for the sensors of a board that does not move the wheels itself."""
-        self.sensors.drive(self.clock() + self.options.safety.drive_timeout_seconds if drive.moves else 0.0)
+    def follow_driving(self) -> Subscription:
+        """Receive drive commands, for the sensors of a board that does not move the wheels itself."""
+
+        def note(drive: Drive) -> None:
+            self.sensors.drive(self.clock() + self.options.safety.drive_timeout_seconds if drive.moves else 0.0)
+
+        return self.listen(DRIVE, note)
 
     # -- to override
 

@@ -6,18 +6,7 @@ import time
 from functools import partial
 from typing import Any
 
-from pebble.contract import (
-    DRIVE,
-    IMU,
-    IMU_FAST,
-    MCU_COMMAND,
-    MCU_DESCRIBE,
-    MCU_LOCAL_ONLY,
-    MCU_VALUE,
-    Channel,
-    Kind,
-    codec,
-)
+from pebble.contract import IMU, IMU_FAST, MCU_COMMAND, MCU_DESCRIBE, MCU_LOCAL_ONLY, MCU_VALUE, Channel, Kind, codec
 from pebble.contract.payloads import McuManifest, McuSample
 from pebble.errors import DeviceError, PayloadError
 from pebble.runtime.parent import Notifier, ProvidedFeatures
@@ -243,7 +232,7 @@ class DescribedBridge(SerialService):
         for subscription in subscriptions:
             subscription.close()
         if device.has_motion:
-            self._generic.append(self.listen(DRIVE, self.follow))
+            self._generic.append(self.follow_driving())
         self._listen_generic(device, private=False)  # a reader of the manifest may send commands at once
         self.publish(MCU_LOCAL_ONLY, device.local_only, uid=device.uid)
         self.publish(MCU_DESCRIBE, device.payload, uid=device.uid)

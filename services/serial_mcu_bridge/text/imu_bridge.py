@@ -4,11 +4,10 @@ import logging
 import time
 from typing import Any
 
-from pebble.contract import DRIVE, IMU, IMU_FAST
-from pebble.contract.payloads import Drive
+from pebble.contract import IMU, IMU_FAST
 from pebble.errors import DeviceError
 from pebble.runtime.lines import LineSplitter
-from pebble.runtime.service import every, on
+from pebble.runtime.service import every
 from pebble.services.serial_mcu_bridge.imu import ImuReports, ImuWatchdog, measured
 from pebble.services.serial_mcu_bridge.line.serial_line import LineState
 from pebble.services.serial_mcu_bridge.serial_service import SerialService
@@ -32,6 +31,10 @@ class ImuBridge(SerialService):
             device=str(self.options.serial.port), protocol=self.options.protocol, instance=self.instance
         )
 
+    def set_up(self) -> None:
+        super().set_up()
+        self.follow_driving()
+
     def on_line_state(self, state: LineState) -> None:
         if state is LineState.BOOTING:
             self._splitter.reset()
@@ -47,10 +50,6 @@ class ImuBridge(SerialService):
                 self.note_report(is_known(report))
                 self._report(report)
         self.count_discarded(self._splitter.discarded_lines)
-
-    @on(DRIVE)
-    def drive(self, drive: Drive) -> None:
-        self.follow(drive)
 
     @every(_WATCH_S)
     def watch(self) -> None:
