@@ -245,7 +245,8 @@ def _first_seen(script: Script, configs: Iterable[Mapping[str, object]]) -> dict
     """What operators read of it before its settings, and which of these they see first; only what it says itself."""
     keys = {setting["key"] for setting in configs}
     first = {"summary": script.summary, "main": [key for key in script.main if key in keys]}
-    return {name: value for name, value in first.items() if value}
+    unasked = {} if script.asked else {"asked": False}
+    return unasked | {name: value for name, value in first.items() if value}
 
 
 def _inside(root: Path) -> list[Path]:
