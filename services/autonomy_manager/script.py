@@ -19,6 +19,10 @@ class UnknownScriptError(StartError):
     """It names a script that is not listed, or not yet."""
 
 
+class UnaskedScriptError(StartError):
+    """It is listed, and what it needs will be known soon."""
+
+
 class Dependency(Struct, frozen=True, forbid_unknown_fields=True):
     """Another script that runs while a script runs, and its settings."""
 
@@ -79,8 +83,10 @@ def _dependency(scripts: Mapping[str, Script], file: str, dependency: Dependency
 
 
 def _check(script: Script, failed: str) -> None:
-    if script.broken or not script.asked:
-        raise StartError(f"{failed}: {script.broken or 'it is still asked what it needs, try again'}")
+    if script.broken:
+        raise StartError(f"{failed}: {script.broken}")
+    if not script.asked:
+        raise UnaskedScriptError(f"{failed}: it is still asked what it needs, try again")
 
 
 def _step(script: Script, config: Mapping[str, Any], failed: str) -> tuple[Step, dict[str, Value]]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -34,12 +35,20 @@ from pebble.services.autonomy_manager.child import Processes, Spawn
 from pebble.services.autonomy_manager.motor_owners import OVERRIDDEN, Baseline, MotorOwners
 from pebble.services.autonomy_manager.offer import Offer
 from pebble.services.autonomy_manager.runner import Runner
-from pebble.services.autonomy_manager.script import Plan, Script, StartError, UnknownScriptError, plan
+from pebble.services.autonomy_manager.script import (
+    Plan,
+    Script,
+    StartError,
+    UnaskedScriptError,
+    UnknownScriptError,
+    plan,
+)
 
 _START = frozenset(("start", "run", "play", "enable", "enabled", "on"))
 _HALTS_S = (0.1, 0.3)  # after the first one
 _HOLD_S = HOLD_MS / 1000
 _SCAN_S = 5.0  # between two looks into the folder of scripts
+_UNASKED_S, _AGAIN_S = 3.0, 0.1  # a start waits so long for what its script needs, and looks so often
 _CLOSE_S = 1.0  # for scripts to end after SIGTERM when this process ends; it is killed after 3 s
 
 
@@ -65,6 +74,7 @@ class AutonomyManager(Service):
         self._overridden_until = self._refused_until = float("-inf")
         self._status: AutonomyStatus | None = None
         self._connected_before = False
+        self._waiting: Callable[[], None] | None = None  # a start, until what its script needs is known
         self._signs = True  # the newest run's script signs what it drives; else its commands look like a person's
         self._moves = False  # what looks like a person's has moved the wheels: perhaps a script that does not sign
         self._person_moves = False  # the newest command that is certainly a person's
@@ -93,16 +103,18 @@ class AutonomyManager(Service):
     def command(self, command: AutonomyCommand) -> None:
         word = (command.action or "").strip().lower()
         begin = True if word in _START else False if word in STOP_WORDS else command.enabled
+        self._waiting = None
         if begin is None:
             self.log_limited.warning("command", "ignored a command that neither starts nor stops a script")
         elif begin:
             by = command.by if isinstance(command.by, str) else None
-            self._start_script((command.file or "").strip(), command.config or {}, by)
+            start = partial(self._start_script, (command.file or "").strip(), command.config or {}, by)
+            start(self.clock() + _UNASKED_S)
         else:
             self._runner.stop()
 
-    def _start_script(self, file: str, config: Mapping[str, Any], by: str | None) -> None:
-        """``by`` None: a program of the robot asks, which needs no control."""
+    def _start_script(self, file: str, config: Mapping[str, Any], by: str | None, until: float) -> None:
+        """Start it, if that is possible before ``until``. ``by`` None: a program of the robot asks, without control."""
         try:
             if by is not None and self.config.security.named and (holder := self._owners.holder_beside(by)):
                 raise StartError(f"{holder} has control, and starts scripts")
@@ -111,10 +123,23 @@ class AutonomyManager(Service):
             wanted = self._plan(file, config)
             self._check(wanted)
         except StartError as error:
+            if isinstance(error, UnaskedScriptError) and self.clock() < until:
+                self._wait(partial(self._start_script, file, config, by, until))
+                return
             self.log_limited.log("refused", logging.WARNING, "%s", error)
             self._runner.refuse(str(error))
         else:
             self._runner.start(wanted)
+
+    def _wait(self, start: Callable[[], None]) -> None:
+        """Try again soon, unless anybody commands or drives meanwhile, or stops the robot."""
+
+        def again() -> None:
+            if self._waiting is start:
+                start()
+
+        self._waiting = start
+        self.later(_AGAIN_S, again)
 
     def _plan(self, file: str, config: Mapping[str, Any]) -> Plan:
         try:
@@ -137,6 +162,8 @@ class AutonomyManager(Service):
     @on(ESTOP_STATE)
     def motor_owner(self, state: EstopState, owner: str) -> None:
         self._owners.receive(owner, state)
+        if state.latched:
+            self._waiting = None
         run = self._runner.unfinished
         if run is not None and (why := self._owners.ending(run.number, run.baseline, self._signs)):
             self._runner.stop(why)
@@ -161,7 +188,7 @@ class AutonomyManager(Service):
             self._moves = drive.moves
 
     def _person_drives(self) -> None:
-        now = self.clock()
+        now, self._waiting = self.clock(), None
         if self._runner.active is not None and self._section.on_override == "stop":
             self._runner.stop(OVERRIDDEN)
         if now >= self._overridden_until:

@@ -145,7 +145,7 @@ def _content(info: FrameInfo, data: Bytes) -> int | str:
     """Return what differs for frames with other bytes; of a large one some are looked at: all of a camera's change."""
     if info.rate and not data.any():
         return NOTHING
-    return crc32(np.ascontiguousarray(data[:: data.size // _LOOKED_AT + 1]))
+    return crc32(data[:: data.size // _LOOKED_AT + 1].tobytes())
 
 
 def _stamped(capture: Capture, info: FrameInfo) -> FrameInfo:

@@ -30,7 +30,7 @@ class Touch:
     a0: int
     a1: int
     a2: int
-    of_wheels: bool = field(default=False, compare=False)
+    of_wheels: bool = field(default=False, compare=False, kw_only=True)
 
 
 @dataclass(frozen=True, slots=True)
