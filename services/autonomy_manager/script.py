@@ -16,11 +16,7 @@ class StartError(PebbleError):
 
 
 class UnknownScriptError(StartError):
-    """It names a script that is not listed, or not yet."""
-
-
-class UnaskedScriptError(StartError):
-    """It is listed, and what it needs will be known soon."""
+    """It names a script that is not listed, or of which is not known yet what it needs."""
 
 
 class Dependency(Struct, frozen=True, forbid_unknown_fields=True):
@@ -86,7 +82,7 @@ def _check(script: Script, failed: str) -> None:
     if script.broken:
         raise StartError(f"{failed}: {script.broken}")
     if not script.asked:
-        raise UnaskedScriptError(f"{failed}: it is still asked what it needs, try again")
+        raise UnknownScriptError(f"{failed}: it is still asked what it needs")
 
 
 def _step(script: Script, config: Mapping[str, Any], failed: str) -> tuple[Step, dict[str, Value]]:

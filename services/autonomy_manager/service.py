@@ -35,20 +35,13 @@ from pebble.services.autonomy_manager.child import Processes, Spawn
 from pebble.services.autonomy_manager.motor_owners import OVERRIDDEN, Baseline, MotorOwners
 from pebble.services.autonomy_manager.offer import Offer
 from pebble.services.autonomy_manager.runner import Runner
-from pebble.services.autonomy_manager.script import (
-    Plan,
-    Script,
-    StartError,
-    UnaskedScriptError,
-    UnknownScriptError,
-    plan,
-)
+from pebble.services.autonomy_manager.script import Plan, Script, StartError, UnknownScriptError, plan
 
 _START = frozenset(("start", "run", "play", "enable", "enabled", "on"))
 _HALTS_S = (0.1, 0.3)  # after the first one
 _HOLD_S = HOLD_MS / 1000
 _SCAN_S = 5.0  # between two looks into the folder of scripts
-_UNASKED_S, _AGAIN_S = 3.0, 0.1  # a start waits so long for what its script needs, and looks so often
+_LISTED_S, _AGAIN_S = 3.0, 0.1  # a start waits so long until its script is listed, and looks so often
 _CLOSE_S = 1.0  # for scripts to end after SIGTERM when this process ends; it is killed after 3 s
 
 
@@ -74,7 +67,7 @@ class AutonomyManager(Service):
         self._overridden_until = self._refused_until = float("-inf")
         self._status: AutonomyStatus | None = None
         self._connected_before = False
-        self._waiting: Callable[[], None] | None = None  # a start, until what its script needs is known
+        self._waiting: Callable[[], None] | None = None  # a start, until its script is listed
         self._signs = True  # the newest run's script signs what it drives; else its commands look like a person's
         self._moves = False  # what looks like a person's has moved the wheels: perhaps a script that does not sign
         self._person_moves = False  # the newest command that is certainly a person's
@@ -109,7 +102,7 @@ class AutonomyManager(Service):
         elif begin:
             by = command.by if isinstance(command.by, str) else None
             start = partial(self._start_script, (command.file or "").strip(), command.config or {}, by)
-            start(self.clock() + _UNASKED_S)
+            start(self.clock() + _LISTED_S)
         else:
             self._runner.stop()
 
@@ -120,19 +113,21 @@ class AutonomyManager(Service):
                 raise StartError(f"{holder} has control, and starts scripts")
             if not file:
                 raise StartError("Start command missing file")
-            wanted = self._plan(file, config)
+            wanted = plan(self._offer.scripts, file, config)
             self._check(wanted)
         except StartError as error:
-            if isinstance(error, UnaskedScriptError) and self.clock() < until:
+            listing = isinstance(error, UnknownScriptError) and not self._offer.complete
+            if listing and self.clock() < until:
                 self._wait(partial(self._start_script, file, config, by, until))
                 return
-            self.log_limited.log("refused", logging.WARNING, "%s", error)
-            self._runner.refuse(str(error))
+            why = f"{error}: scripts are still being listed, try again" if listing else str(error)
+            self.log_limited.log("refused", logging.WARNING, "%s", why)
+            self._runner.refuse(why)
         else:
             self._runner.start(wanted)
 
     def _wait(self, start: Callable[[], None]) -> None:
-        """Try again soon, unless anybody commands or drives meanwhile, or stops the robot."""
+        """Try again soon, unless another command, a person's driving or an emergency stop comes first."""
 
         def again() -> None:
             if self._waiting is start:
@@ -140,14 +135,6 @@ class AutonomyManager(Service):
 
         self._waiting = start
         self.later(_AGAIN_S, again)
-
-    def _plan(self, file: str, config: Mapping[str, Any]) -> Plan:
-        try:
-            return plan(self._offer.scripts, file, config)
-        except UnknownScriptError as error:
-            if self._offer.complete:
-                raise
-            raise StartError(f"{error}: scripts are still being listed, try again") from None
 
     def _check(self, wanted: Plan) -> None:
         """Raise StartError if this robot cannot run ``wanted`` at present."""

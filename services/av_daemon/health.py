@@ -58,7 +58,7 @@ class Health:
         self._deadline = now + _OPENING_S
 
     def frame(self, info: FrameInfo, now: float, *, skipped: int = 0, content: int | str | None = None) -> None:
-        """``content`` differs from that of a frame with other bytes; None: nobody has looked at them."""
+        """``content`` differs from that of a frame with other bytes; None: it was not looked at."""
         self._dropped += skipped
         if content is not None or self._info is None:
             self._info = info

@@ -35,7 +35,7 @@ class LoginAttempt:
 
     @property
     def refuses_login(self) -> bool:
-        """True if the broker answers that nobody with this login, or without one, may enter."""
+        """True if the broker refuses this login, or a client without one, and not the connection for another reason."""
         return self.code is not None and reasons.concerns_login(self.code)
 
 

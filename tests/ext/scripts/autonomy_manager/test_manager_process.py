@@ -168,7 +168,8 @@ def test_scripts_are_listed_at_once_and_started_when_it_is_known_what_they_need(
         ("needs", "Failed to start needs: slow"),
     ):
         mqtt.launch(file)
-        assert mqtt.becomes(error=f"{why}: it is still asked what it needs, try again"), mqtt.status
+        why += ": it is still asked what it needs: scripts are still being listed, try again"
+        assert mqtt.becomes(error=why), mqtt.status
     assert mqtt.newest("autonomy-files")["files"][-1] == {
         "file": "slow",
         "label": "slow",
