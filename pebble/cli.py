@@ -28,6 +28,8 @@ def main() -> int:
         sys.stdout.flush()
     except PebbleError as error:
         code = _fail(*_without_secrets(str(error)).splitlines())
+    except UnicodeEncodeError as error:
+        code = _fail(f"a name that is no UTF-8 cannot be used here, rename it: {error.object[:300]}")
     except KeyboardInterrupt:
         code = 130
     except BrokenPipeError:  # the reader has ended (`pebble topic contract | head`)

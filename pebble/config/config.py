@@ -23,6 +23,7 @@ from pebble.config.rules.between_keys import CHECKS
 from pebble.config.rules.exposure import warn_if_readable
 from pebble.config.tree import Root, SerialBridge, Services, tree_of
 from pebble.config.types import Section, Topic
+from pebble.config.visible import is_text, shown
 from pebble.contract import DRIVE
 from pebble.contract.identity import Identity
 from pebble.contract.serial_protocols import OF_CORE, SERIAL_PROTOCOLS
@@ -199,6 +200,9 @@ def _config(
     if lenient:
         config = _without_broken(config)
         installed = config.installed
+    if not is_text(str(config.run_dir())):
+        why = "is no UTF-8, and sockets below it have to be: set it to another folder"
+        raise ConfigError(f"transport.run_dir: {shown(str(config.run_dir()))}: {why}")
     owners = (*map(config.motor_owner, config.motor_lines()), *extension.motors_of(installed, config))
     if len(owners) > len(set(owners)):
         raise ConfigError("extensions: two motor owners have one name; serial lines are called as their instances")
@@ -289,9 +293,10 @@ def default_run_folder(base: str, env: Mapping[str, str]) -> Path:
     if _is_run_from(RUN_DIR_OF_UNIT, base):
         return RUN_DIR_OF_UNIT
     robot = f"{zlib.crc32(base.encode()):08x}"
-    if by_login := env.get("XDG_RUNTIME_DIR"):
+    if (by_login := env.get("XDG_RUNTIME_DIR")) and is_text(by_login):
         return Path(by_login, "pebble", robot)
-    return Path(env.get("TMPDIR", "/tmp"), f"pebble-{_user_id()}", robot)  # noqa: S108 - 0700 and checked when made
+    temporary = next(name for name in (env.get("TMPDIR"), "/tmp") if name and is_text(name))  # noqa: S108
+    return Path(temporary, f"pebble-{_user_id()}", robot)  # 0700, and checked when made
 
 
 def _is_run_from(folder: Path, base: str) -> bool:

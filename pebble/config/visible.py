@@ -21,6 +21,11 @@ def hidden(text: str, *, words: bool = False) -> str:
     return "" if words or text == text.strip() else "starts or ends with a blank: remove it"
 
 
+def is_text(text: str) -> bool:
+    """True if ``text``, perhaps a name of a file, is UTF-8: all can be written that is not the code of a lost byte."""
+    return re.search("[\ud800-\udfff]", text) is None
+
+
 def shown(text: str) -> str:
     """Return ``text`` for a terminal or a log: what is not seen, or steers what shows it, is its code: ``\\u202e``.
 

@@ -40,12 +40,25 @@ _decoder = msgspec.json.Decoder()
 
 
 def encode(channel: Channel, value: Any) -> bytes:
-    """Return the wire form of ``value``: JSON, or the bytes themselves on binary channels."""
+    """Return the wire form of ``value``: JSON, or the bytes themselves on binary channels.
+
+    A name of the file system or of a user may be no UTF-8: what is none is written as a code, ``\\udce9``.
+    """
     if channel.payload is bytes:
         return bytes(value)
-    if channel.payload is bool:
-        return _encoder.encode({"value": value})
-    return _encoder.encode(value)
+    body = {"value": value} if channel.payload is bool else value
+    try:
+        return _encoder.encode(body)
+    except UnicodeEncodeError:
+        return _encoder.encode(_encodable(msgspec.to_builtins(body)))
+
+
+def _encodable(plain: Any) -> Any:
+    if isinstance(plain, dict):
+        return {_encodable(key): _encodable(value) for key, value in plain.items()}
+    if isinstance(plain, list):
+        return [_encodable(value) for value in plain]
+    return plain.encode(errors="backslashreplace").decode() if isinstance(plain, str) else plain
 
 
 #: Receives a command's channel, its sender as far as that is in it, and what it does that may not be meant.

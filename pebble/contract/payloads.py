@@ -386,7 +386,8 @@ class MediaReport(Payload, frozen=True, kw_only=True, omit_defaults=True):
     dropped: int | None = None  # frames or packets dropped because a reader or the connection was too slow
     restarts: int | None = None  # how often the device was opened again
     reduced: str | None = None  # how it is adapted to a slow connection: "quality 6", "size 1/2", "rate 1/2"
-    last_error: str | None = None
+    problem: str | None = None  # what is wrong with what comes at present: "shows the same picture since 7 s"
+    last_error: str | None = None  # this, or why there was nothing the last time
 
 
 class MediaStatus(Payload, frozen=True, kw_only=True):

@@ -14,8 +14,11 @@ from pebble.launcher.pipes import Pipes
 from pebble.launcher.reactor import Reactor
 from pebble.launcher.restart_policy import LOOP_EXITS, LOOP_WINDOW_S, RestartPolicy
 from pebble.runtime import notes
+from pebble.runtime.bounded_output import LINES_PER_S
 from pebble.runtime.exits import ASKS_S, has_ended
 from pebble.runtime.timers import Timer
+
+_SCRIPTS_LINES_PER_S = 10 * LINES_PER_S  # it bounds each of them
 
 log = logging.getLogger(__name__)
 
@@ -130,7 +133,8 @@ class ProcessSupervisor:
             self._restart(f"could not start: {error}")
             return
         self.state = ProgramState.RUNNING
-        self._pipes = Pipes(child, self._reactor, partial(self._printed, child.pid), self._noted)
+        rate = _SCRIPTS_LINES_PER_S if self.program.runs_scripts else LINES_PER_S
+        self._pipes = Pipes(child, self._reactor, partial(self._printed, child.pid), self._noted, rate=rate)
         self._watch_exit(child)
         if not self.program.plain:
             self._check_at(self.policy.stuck_at)

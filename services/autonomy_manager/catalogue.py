@@ -6,7 +6,6 @@ import logging
 import os
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -37,6 +36,7 @@ from pebble.services.autonomy_manager.script import Dependency, Script
 MAX_SCRIPTS = 256  # that are listed
 _LONGEST_NAME = 100
 _LONGEST_FILES = 256 * 1024  # bytes of all forms together
+_TELL_S = 1.0  # between two lists while scripts are asked
 _RETRY_S = 60.0  # after a failure: it may have been a busy machine's
 _OWN_SCRIPTS = Path(pebble.__file__).parent / "extensions" / "scripts" / "shipped"
 
@@ -65,6 +65,7 @@ class _Answer(NamedTuple):
     ours: bool = False
     problem: str = ""
     broken: bool = False
+    asked: bool = True  # False: what it says itself is not known yet
 
 
 class Catalogue:
@@ -77,26 +78,30 @@ class Catalogue:
         self._clock = clock
         #: By name: the version of its files, what they say, and until when that counts.
         self._answers: dict[str, tuple[object, _Answer, float]] = {}
-        self._scanned = False
         self._complained: set[str] = set()  # names with a warning in the log
 
     def scan(self, found: Callable[[dict[str, Script]], object]) -> None:
-        """Call ``found`` with all scripts; the first time also with those so far, before one is asked."""
+        """Call ``found`` with all scripts: at once, and again when those that have to be asked have answered."""
         folders = dict(self._folders())
-        scripts: dict[str, Script] = {}
-        for name, places in folders.items():
-            before_asking = partial(self._before_asking, scripts, found)
-            for folder in places:
-                if (script := self._script(name, folder, before_asking)) is not None:
-                    scripts[name] = script
-                    break
+        scripts = self._scripts(folders, asks=False)
+        if self._asks:
+            found(dict(scripts))
+            told_at = self._clock()
+            for name, places in folders.items():
+                scripts.update(self._scripts({name: places}, asks=True))
+                if self._clock() - told_at >= _TELL_S:
+                    found(dict(scripts))
+                    told_at = self._clock()
         self._answers = {name: answer for name, answer in self._answers.items() if name in folders}
-        self._scanned = True
         found(scripts)
 
-    def _before_asking(self, scripts: dict[str, Script], found: Callable[[dict[str, Script]], object]) -> None:
-        if not self._scanned:
-            found(dict(scripts))
+    def _scripts(self, folders: Mapping[str, list[Path]], *, asks: bool) -> dict[str, Script]:
+        scripts = {}
+        for name, places in folders.items():
+            candidates = (self._script(name, folder, asks=asks) for folder in places)
+            if (script := next(filter(None, candidates), None)) is not None:
+                scripts[name] = script
+        return scripts
 
     def _folders(self) -> Iterator[tuple[str, list[Path]]]:
         names: dict[str, list[Path]] = {}
@@ -121,10 +126,10 @@ class Catalogue:
         sections = self._section.scripts
         return sections.get(meant(sections, name), ScriptSection())
 
-    def _script(self, name: str, folder: Path, before_asking: Callable[[], object]) -> Script | None:
+    def _script(self, name: str, folder: Path, *, asks: bool) -> Script | None:
         section = self._section_of(name)
         entry = folder / section.entrypoint
-        answer = self._answer(name, folder, entry, section, before_asking)
+        answer = self._answer(name, folder, entry, section, asks=asks)
         described = answer.description
         if not described.command and not entry.is_file():
             return None
@@ -140,25 +145,26 @@ class Catalogue:
             environment={**self._login, **section.env},
             ours=answer.ours,
             broken=answer.problem if answer.broken else "",
+            asked=answer.asked,
         )
 
-    def _answer(
-        self, name: str, folder: Path, entry: Path, section: ScriptSection, before_asking: Callable[[], object]
-    ) -> _Answer:
+    def _answer(self, name: str, folder: Path, entry: Path, section: ScriptSection, *, asks: bool) -> _Answer:
         """Return what its files say; remembered until they change, a failure for a minute."""
         version = entry, stamp(entry), stamp(folder / MANIFEST)
         known, before, until = self._answers.get(name, (None, _Answer(Description()), 0.0))
-        if known == version and self._clock() < until:
+        if (known == version and self._clock() < until) or (known is not None and not asks):
             return before
-        answer = self._asked(folder, entry, section, before_asking)
+        answer = self._asked(folder, entry, section, asks=asks)
+        if not answer.asked:
+            return answer
         if answer.problem and answer.problem != before.problem:
             what = "cannot be started" if answer.broken else "is offered without settings"
             log.warning("%s %s: %s", name, what, answer.problem)
         self._answers[name] = version, answer, self._clock() + _RETRY_S if answer.problem else float("inf")
         return answer
 
-    def _asked(self, folder: Path, entry: Path, section: ScriptSection, before_asking: Callable[[], object]) -> _Answer:
-        """Read the files, and ask the script if it is one of ours: that takes up to 20 s."""
+    def _asked(self, folder: Path, entry: Path, section: ScriptSection, *, asks: bool) -> _Answer:
+        """Read the files, and ask the script if ``asks`` and it is one of ours: that takes up to 20 s."""
         described, problem = Description(), ""
         try:
             described = read_manifest(folder / MANIFEST) or described
@@ -174,7 +180,8 @@ class Catalogue:
             return _Answer(described, problem=str(error), broken=True)
         if not ours or not self._asks:
             return _Answer(described, ours, problem)
-        before_asking()
+        if not asks:
+            return _Answer(described, True, problem, asked=False)
         command = self._command(folder, entry, section, described, ours=True)
         try:
             return _Answer(_merged(described, ask(command, folder, environment(section.env))), True, problem)
@@ -238,7 +245,8 @@ def _first_seen(script: Script, configs: Iterable[Mapping[str, object]]) -> dict
     """What operators read of it before its settings, and which of these they see first; only what it says itself."""
     keys = {setting["key"] for setting in configs}
     first = {"summary": script.summary, "main": [key for key in script.main if key in keys]}
-    return {name: value for name, value in first.items() if value}
+    unasked = {} if script.asked else {"asked": False}
+    return unasked | {name: value for name, value in first.items() if value}
 
 
 def _inside(root: Path) -> list[Path]:

@@ -16,15 +16,15 @@ from pathlib import Path
 from msgspec import Struct
 
 from pebble.errors import PebbleError
+from pebble.runtime.bounded_output import PAUSE_S, BoundedOutput
 from pebble.runtime.child import Child
 from pebble.runtime.exits import ASKS_S, exit_descriptor, has_ended
 from pebble.runtime.parent import tagged
 from pebble.services.autonomy_manager.guard import Guard
-from pebble.services.autonomy_manager.output import Output
 
 _READ_BYTES = 65_536
 _LAST_READS = 16  # of what it left in its pipe when it ended
-_FLOOD_PAUSE_S = 0.01
+_LONGEST_LINE = 3500  # bytes; with its tag it fits into one write that no other can interrupt (PIPE_BUF)
 _TICK_MS = 500
 _LONGEST_FIRST_LINE = 256  # bytes that the kernel reads of it
 
@@ -111,7 +111,8 @@ class Process:
 
     def _read_until_exit(self) -> None:
         """Return when the process has ended and its output is read; it is not reaped yet."""
-        pipe, output = self._child.pipe("stdout").fileno(), Output(self._write, self._warn, time.monotonic())
+        pipe = self._child.pipe("stdout").fileno()
+        output = BoundedOutput(self._write, _LONGEST_LINE, time.monotonic())
         os.set_blocking(pipe, False)
         exited = exit_descriptor(self.pid)
         poll = select.poll()
@@ -128,7 +129,7 @@ class Process:
                 if pipe in ready and not _read(pipe, output):
                     poll.unregister(pipe)  # it closed its stdout and stderr
                 if output.flooded:
-                    time.sleep(_FLOOD_PAUSE_S)
+                    time.sleep(PAUSE_S)
             for _ in range(_LAST_READS):
                 if not _read(pipe, output):
                     break
@@ -136,9 +137,6 @@ class Process:
         finally:
             if exited is not None:
                 os.close(exited)
-
-    def _warn(self, text: str) -> None:
-        self._write(f"{time.strftime('%H:%M:%S')} [WARNING] {text}".encode())
 
     def _write(self, line: bytes) -> None:
         sys.stderr.flush()
@@ -159,7 +157,7 @@ def _check_program(path: Path) -> None:
             raise PebbleError(f"{path}: there is no {interpreter!r}, which its first line names")
 
 
-def _read(pipe: int, output: Output) -> bool:
+def _read(pipe: int, output: BoundedOutput) -> bool:
     """Read what there is; False: nothing, or the end."""
     try:
         data = os.read(pipe, _READ_BYTES)

@@ -16,7 +16,7 @@ class StartError(PebbleError):
 
 
 class UnknownScriptError(StartError):
-    """It names a script that is not listed, or not yet."""
+    """It names a script that is not listed, or of which is not known yet what it needs."""
 
 
 class Dependency(Struct, frozen=True, forbid_unknown_fields=True):
@@ -40,6 +40,7 @@ class Script(Struct, frozen=True, kw_only=True):
     environment: dict[str, str] = {}
     ours: bool = False  # it uses pebble.script, which signs its drive commands and stops the wheels at its end
     broken: str = ""  # why it cannot be started
+    asked: bool = True  # False: its settings and what it needs are not known yet
 
 
 class Step(Struct, frozen=True):
@@ -62,8 +63,7 @@ def plan(scripts: Mapping[str, Script], file: str, config: Mapping[str, Any]) ->
     script = scripts.get(meant(scripts, file))
     if script is None:
         raise UnknownScriptError(f"Unknown autonomy file: {shown(file)}")
-    if script.broken:
-        raise StartError(f"Failed to start {file}: {script.broken}")
+    _check(script, f"Failed to start {file}")
     step, values = _step(script, config, f"Invalid config for {file}")
     needed = tuple(_dependency(scripts, file, dependency) for dependency in script.dependencies)
     return Plan(step, needed, values)
@@ -74,9 +74,15 @@ def _dependency(scripts: Mapping[str, Script], file: str, dependency: Dependency
     script = scripts.get(meant(scripts, dependency.file))
     if script is None:
         raise UnknownScriptError(f"{failed}: Dependency script not found: {shown(dependency.file)}")
-    if script.broken:
-        raise StartError(f"{failed}: {dependency.file}: {script.broken}")
+    _check(script, f"{failed}: {dependency.file}")
     return _step(script, dependency.config, f"{failed}: Invalid config for {dependency.file}")[0]
+
+
+def _check(script: Script, failed: str) -> None:
+    if script.broken:
+        raise StartError(f"{failed}: {script.broken}")
+    if not script.asked:
+        raise UnknownScriptError(f"{failed}: it is still asked what it needs")
 
 
 def _step(script: Script, config: Mapping[str, Any], failed: str) -> tuple[Step, dict[str, Value]]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -40,6 +41,7 @@ _START = frozenset(("start", "run", "play", "enable", "enabled", "on"))
 _HALTS_S = (0.1, 0.3)  # after the first one
 _HOLD_S = HOLD_MS / 1000
 _SCAN_S = 5.0  # between two looks into the folder of scripts
+_LISTED_S, _AGAIN_S = 3.0, 0.1  # a start waits so long until its script is listed, and looks so often
 _CLOSE_S = 1.0  # for scripts to end after SIGTERM when this process ends; it is killed after 3 s
 
 
@@ -65,6 +67,7 @@ class AutonomyManager(Service):
         self._overridden_until = self._refused_until = float("-inf")
         self._status: AutonomyStatus | None = None
         self._connected_before = False
+        self._waiting: Callable[[], None] | None = None  # a start, until its script is listed
         self._signs = True  # the newest run's script signs what it drives; else its commands look like a person's
         self._moves = False  # what looks like a person's has moved the wheels: perhaps a script that does not sign
         self._person_moves = False  # the newest command that is certainly a person's
@@ -93,36 +96,45 @@ class AutonomyManager(Service):
     def command(self, command: AutonomyCommand) -> None:
         word = (command.action or "").strip().lower()
         begin = True if word in _START else False if word in STOP_WORDS else command.enabled
+        self._waiting = None
         if begin is None:
             self.log_limited.warning("command", "ignored a command that neither starts nor stops a script")
         elif begin:
             by = command.by if isinstance(command.by, str) else None
-            self._start_script((command.file or "").strip(), command.config or {}, by)
+            start = partial(self._start_script, (command.file or "").strip(), command.config or {}, by)
+            start(self.clock() + _LISTED_S)
         else:
             self._runner.stop()
 
-    def _start_script(self, file: str, config: Mapping[str, Any], by: str | None) -> None:
-        """``by`` None: a program of the robot asks, which needs no control."""
+    def _start_script(self, file: str, config: Mapping[str, Any], by: str | None, until: float) -> None:
+        """Start it, if that is possible before ``until``. ``by`` None: a program of the robot asks, without control."""
         try:
             if by is not None and self.config.security.named and (holder := self._owners.holder_beside(by)):
                 raise StartError(f"{holder} has control, and starts scripts")
             if not file:
                 raise StartError("Start command missing file")
-            wanted = self._plan(file, config)
+            wanted = plan(self._offer.scripts, file, config)
             self._check(wanted)
         except StartError as error:
-            self.log_limited.log("refused", logging.WARNING, "%s", error)
-            self._runner.refuse(str(error))
+            listing = isinstance(error, UnknownScriptError) and not self._offer.complete
+            if listing and self.clock() < until:
+                self._wait(partial(self._start_script, file, config, by, until))
+                return
+            why = f"{error}: scripts are still being listed, try again" if listing else str(error)
+            self.log_limited.log("refused", logging.WARNING, "%s", why)
+            self._runner.refuse(why)
         else:
             self._runner.start(wanted)
 
-    def _plan(self, file: str, config: Mapping[str, Any]) -> Plan:
-        try:
-            return plan(self._offer.scripts, file, config)
-        except UnknownScriptError as error:
-            if self._offer.complete:
-                raise
-            raise StartError(f"{error}: scripts are still being listed, try again") from None
+    def _wait(self, start: Callable[[], None]) -> None:
+        """Try again soon, unless another command, a person's driving or an emergency stop comes first."""
+
+        def again() -> None:
+            if self._waiting is start:
+                start()
+
+        self._waiting = start
+        self.later(_AGAIN_S, again)
 
     def _check(self, wanted: Plan) -> None:
         """Raise StartError if this robot cannot run ``wanted`` at present."""
@@ -137,6 +149,8 @@ class AutonomyManager(Service):
     @on(ESTOP_STATE)
     def motor_owner(self, state: EstopState, owner: str) -> None:
         self._owners.receive(owner, state)
+        if state.latched:
+            self._waiting = None
         run = self._runner.unfinished
         if run is not None and (why := self._owners.ending(run.number, run.baseline, self._signs)):
             self._runner.stop(why)
@@ -161,7 +175,7 @@ class AutonomyManager(Service):
             self._moves = drive.moves
 
     def _person_drives(self) -> None:
-        now = self.clock()
+        now, self._waiting = self.clock(), None
         if self._runner.active is not None and self._section.on_override == "stop":
             self._runner.stop(OVERRIDDEN)
         if now >= self._overridden_until:

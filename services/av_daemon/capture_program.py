@@ -50,6 +50,8 @@ class CaptureProgram:
         while True:
             left = deadline - time.monotonic()
             if left <= 0:
+                if self._child.wait(0.0) is not None:  # and what it left behind holds its output open
+                    raise DeviceError(self._end())
                 raise DeviceError(f"{self.name} hangs: nothing came for {self._silence_s:.0f} s{self._last_error()}")
             ready = dict(self._poll.poll(left * 1000))
             if self._err in ready:

@@ -4,17 +4,20 @@ import logging
 import threading
 import time
 from collections.abc import Callable
+from zlib import crc32
 
 import numpy as np
 from msgspec.structs import replace
 
-from pebble.errors import NotRunningError, PebbleError
-from pebble.services.av_daemon.health import Health
+from pebble.errors import NotRunningError, PayloadError, PebbleError
+from pebble.extensions.media.jpeg import jpeg_size
+from pebble.services.av_daemon.health import NOTHING, Health
 from pebble.services.av_daemon.source import Bytes, Capture, Source
 from pebble.transports.frames import FrameInfo, FrameWriter
 
 log = logging.getLogger(__name__)
 
+_LOOKED_AT = 1 << 18  # bytes of a frame
 _POLL_S = 0.1  # how soon the first reader is noticed
 
 
@@ -97,20 +100,22 @@ class Capturer:
             self._deliver(source.grab())
 
     def _deliver(self, capture: Capture) -> None:
-        if self._writer.wanted:
-            self._write(capture)
+        info, content = self._write(capture) if self._writer.wanted else (capture.info, None)
         if not self._ended.is_set():
-            self._health.frame(capture.info, time.monotonic(), skipped=capture.skipped)
+            self._health.frame(info, time.monotonic(), skipped=capture.skipped, content=content)
 
-    def _write(self, capture: Capture) -> None:
+    def _write(self, capture: Capture) -> tuple[FrameInfo, int | str | None]:
+        """Return the frame's metadata, and its content as far as its health goes by it."""
         slot = self._writer.slot(capture.size) if capture.draw is not None else None
         pixels = capture.pixels(self._room(capture) if slot is None else slot.array)
+        info, content = _as_it_is(capture.info, pixels), _content(capture.info, pixels)
         if self._ended.is_set():  # the device answered after another thread had taken over
-            return
+            return info, None
         if slot is None:
-            self._writer.write(pixels, _stamped(capture))
+            self._writer.write(pixels, _stamped(capture, info))
         else:
-            slot.send(_stamped(capture))
+            slot.send(_stamped(capture, info))
+        return info, content
 
     def _room(self, capture: Capture) -> Bytes:
         if capture.draw is not None and len(self._scratch) != capture.size:
@@ -125,7 +130,25 @@ class Capturer:
         self._ended.wait(delay)
 
 
-def _stamped(capture: Capture) -> FrameInfo:
+def _as_it_is(info: FrameInfo, data: Bytes) -> FrameInfo:
+    """Return ``info`` with the size that stands in a JPEG, whatever its camera was asked for."""
+    if info.format != "mjpeg":
+        return info
+    try:
+        width, height = jpeg_size(data.tobytes())
+    except PayloadError:  # its readers refuse it
+        return info
+    return info if (width, height) == (info.width, info.height) else replace(info, width=width, height=height)
+
+
+def _content(info: FrameInfo, data: Bytes) -> int | str:
+    """Return what differs for frames with other bytes; of a large one some are looked at: all of a camera's change."""
+    if info.rate and not data.any():
+        return NOTHING
+    return crc32(data[:: data.size // _LOOKED_AT + 1].tobytes())
+
+
+def _stamped(capture: Capture, info: FrameInfo) -> FrameInfo:
     now_ns = time.monotonic_ns()
     at_ns = capture.at_ns or now_ns
-    return replace(capture.info, captured_ns=at_ns, captured_ms=(time.time_ns() - (now_ns - at_ns)) // 1_000_000)
+    return replace(info, captured_ns=at_ns, captured_ms=(time.time_ns() - (now_ns - at_ns)) // 1_000_000)

@@ -1,22 +1,41 @@
 """The health of one device: written by its thread, reported by the service. Times are passed in."""
 
+from collections.abc import Iterator
+from typing import Final
+
+from msgspec import Struct
 from msgspec.structs import replace
 
 from pebble.contract.payloads import MediaReport
 from pebble.extensions.media.rate_meter import RateMeter
+from pebble.runtime.source_check import SourceCheck
 from pebble.transports.frames import FrameInfo
 
 _OPENING_S = 15.0  # a device that takes longer to open hangs
 _SILENCE_S = 4.0  # as does one without a frame for so long; a second more than the sources' own timeout
 FIRST_DELAY_S, _LONGEST_DELAY_S = 2.0, 30.0  # before a device that failed is opened again
+_REMEMBERED = 8  # frames: a driver that hangs may give its buffers in turn
 _GOOD_RUN_S = 10.0  # after which a failure is the first again
+
+
+NOTHING: Final = ""  # the content of sound that is zeros
+
+
+class Asked(Struct, frozen=True):
+    """The frames in a second, and the width and height of pictures, that a device was asked for; 0: any."""
+
+    rate: float = 0.0
+    width: int = 0
+    height: int = 0
 
 
 class Health:
     """Written by one thread at a time, read by any. The delay before a failed device is opened again doubles."""
 
-    def __init__(self, first_delay_s: float = FIRST_DELAY_S) -> None:
-        self._first_delay_s = first_delay_s
+    def __init__(self, first_delay_s: float = FIRST_DELAY_S, asked: Asked | None = None) -> None:
+        """``asked`` is None for a device that is computed: it may repeat itself."""
+        self._first_delay_s, self._asked = first_delay_s, asked
+        self._check = SourceCheck(asked.rate if asked else 0.0, remembered=_REMEMBERED)
         self._doing = "starts"
         self._deadline: float | None = None  # for the next frame; None: none is expected
         self._opened_at = 0.0
@@ -38,9 +57,15 @@ class Health:
         self._opened_at = now
         self._deadline = now + _OPENING_S
 
-    def frame(self, info: FrameInfo, now: float, *, skipped: int = 0) -> None:
+    def frame(self, info: FrameInfo, now: float, *, skipped: int = 0, content: int | str | None = None) -> None:
+        """``content`` differs from that of a frame with other bytes; None: it was not looked at."""
         self._dropped += skipped
-        self._info, self._doing = info, "runs"
+        if content is not None or self._info is None:
+            self._info = info
+        if content is not None:
+            self._check.take(content, now)
+        self._check.count(1 + skipped, now)
+        self._doing = "runs"
         self._meter.add(now)
         self._deadline = now + _SILENCE_S
         if now - self._opened_at >= _GOOD_RUN_S:
@@ -62,14 +87,39 @@ class Health:
         deadline = self._deadline
         return deadline is not None and now > deadline
 
+    @property
+    def problems(self) -> dict[str, str]:
+        """What is wrong with the frames that come, by kind."""
+        info, asked = self._info, self._asked
+        return {} if info is None or asked is None else dict(self._problems(info, asked))
+
+    def _problems(self, info: FrameInfo, asked: Asked) -> Iterator[tuple[str, str]]:
+        check, sound, wrong_hz = self._check, info.rate > 0, self._check.wrong_hz
+        if check.repeats:
+            what = "gives the same sound" if sound else "shows the same picture"
+            if check.content == NOTHING:
+                what = "gives only zeros, as one that is muted or unplugged,"
+            elif check.alternates:
+                what += "s again and again"
+            yield "repeats", f"{what} since {check.same_s:.0f} s"
+        if wrong_hz is not None and sound:
+            yield "rate", f"gives {wrong_hz / asked.rate * info.rate:.0f} samples a second where {info.rate} were asked"
+        elif wrong_hz is not None:
+            yield "rate", f"gives {wrong_hz:.1f} pictures a second where {asked.rate:g} were asked"
+        if asked.width and (info.width, info.height) != (asked.width, asked.height):
+            sizes = f"{info.width}x{info.height} where {asked.width}x{asked.height} were asked"
+            yield "size", f"gives pictures of {sizes}"
+
     def report(self, now: float) -> MediaReport:
         info = self._info
+        problem = "; ".join(self.problems.values()) or None
         report = MediaReport(
             running=info is not None,
             doing=self._doing,
             restarts=self._restarts,
             dropped=self._dropped,
-            last_error=self._last_error,
+            problem=problem,
+            last_error=problem or self._last_error,
         )
         if info is None:
             return report
@@ -79,3 +129,4 @@ class Health:
     def _no_frames(self, doing: str) -> None:
         self._doing, self._info, self._deadline = doing, None, None
         self._meter.clear()
+        self._check.clear()

@@ -8,7 +8,7 @@ from msgspec.structs import replace
 
 from pebble.contract.payloads import MediaReport
 from pebble.services.av_daemon.capturer import Capturer
-from pebble.services.av_daemon.health import FIRST_DELAY_S, Health
+from pebble.services.av_daemon.health import FIRST_DELAY_S, Asked, Health
 from pebble.services.av_daemon.source import Source
 from pebble.transports.frames import FrameWriter
 
@@ -29,14 +29,17 @@ class Stream:
         *,
         first_delay_s: float = FIRST_DELAY_S,
         rest_s: float = REST_S,
+        asked: Asked | None = None,
     ) -> None:
         self.name, self._writer, self._open_source, self._rest_s = name, writer, open_source, rest_s
-        self._health = Health(first_delay_s)
+        self._health = Health(first_delay_s, asked)
+        self._told: frozenset[str] = frozenset()  # kinds of problems
         self._capturer = self._start(0.0)
         self._hung: list[Capturer] = []
 
     def poll(self, now: float) -> None:
-        """Abandon a device that is overdue, and open it again in another thread."""
+        """Abandon a device that is overdue, and open it again in another thread; log what is wrong with its frames."""
+        self._tell(self._health.problems)
         self._hung = [capturer for capturer in self._hung if capturer.alive]
         if len(self._hung) >= _HUNG_LIMIT or not self._health.overdue(now):
             return
@@ -45,6 +48,13 @@ class Stream:
         delay = self._health.failed("the device does not answer")
         log.warning("%s: the device does not answer; it is opened again in %g s", self.name, delay)
         self._capturer = self._start(delay)
+
+    def _tell(self, problems: dict[str, str]) -> None:
+        for kind in problems.keys() - self._told:
+            log.warning("%s: it %s", self.name, problems[kind])
+        if self._told and not problems:
+            log.info("%s: what it gives is as it should be again", self.name)
+        self._told = frozenset(problems)
 
     def report(self, now: float) -> MediaReport:
         report = self._health.report(now)

@@ -55,9 +55,8 @@ class V4l2Camera:
 
     def _open(self, video: CameraCapture) -> Any:
         cv2, device = self._cv2, self._device
-        is_device = device.isdecimal() or device.startswith("/dev/")
         name = int(device) if device.isdecimal() else device
-        capture = cv2.VideoCapture(name, cv2.CAP_V4L2 if is_device else cv2.CAP_ANY)
+        capture = cv2.VideoCapture(name, cv2.CAP_V4L2 if is_device(device) else cv2.CAP_ANY)
         if not capture.isOpened():
             raise DeviceError(f"cannot open {self._name}: not there, in use, or no camera")
         if video.capture_format != "auto":
@@ -112,6 +111,11 @@ class V4l2Camera:
             raise DeviceError(f"{self._name} changed the size of its pictures")
         if not np.shares_memory(got, wanted):  # not every backend of OpenCV writes into the array given to it
             np.copyto(wanted, got)
+
+
+def is_device(name: str) -> bool:
+    """True for a camera of this machine; other names are of files and network streams."""
+    return name.isdecimal() or name.startswith("/dev/")
 
 
 def _without_secrets(device: str) -> str:

@@ -5,6 +5,7 @@ import os
 import threading
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
@@ -19,7 +20,9 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-_NEW_FILE: Final = os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC | os.O_NOFOLLOW
+_NEW_FILE: Final = os.O_RDWR | os.O_CREAT | os.O_TRUNC | os.O_APPEND | os.O_CLOEXEC | os.O_NOFOLLOW
+_MOST, _KEPT = 1 << 20, 1 << 16  # bytes of output: with more the file begins anew with the last ones
+_LOOK_S = 0.2
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,7 +83,7 @@ class Action:
         import subprocess  # 0.4 MB of every robot's memory, for a command that few robots run
 
         self._log.log("running", logging.WARNING, "%s: running its command", self.name)
-        output, where = subprocess.DEVNULL, f"is in {self._output}"
+        output, where = None, f"is in {self._output}"
         try:
             self._output.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
             output = os.open(self._output, _NEW_FILE, 0o600)
@@ -92,25 +95,39 @@ class Action:
                 cwd=self.control.cwd,
                 env=child_environment(self.control.env),
                 stdin=subprocess.DEVNULL,
-                stdout=output,
+                stdout=subprocess.DEVNULL if output is None else output,
                 stderr=subprocess.STDOUT,
                 start_new_session=True,  # a command that restarts this process must survive its end
             )
         except OSError as error:
             self._log.log("failed", logging.ERROR, "%s failed: its command or cwd: %s", self.name, error.strerror)
-            return False
-        finally:
-            if output != subprocess.DEVNULL:
+            if output is not None:
                 os.close(output)
-        name = f"action {self.name}"
-        threading.Thread(target=self._follow, args=(self._process, where), name=name, daemon=True).start()
+            return False
+        arguments, name = (self._process, output, where), f"action {self.name}"
+        threading.Thread(target=self._follow, args=arguments, name=name, daemon=True).start()
         return True
 
-    def _follow(self, process: "subprocess.Popen[bytes]", where: str) -> None:
-        """Log the command's exit code."""
-        code = process.wait()
+    def _follow(self, process: "subprocess.Popen[bytes]", output: int | None, where: str) -> None:
+        """Keep the file small while the command runs, and log its exit code."""
+        while (code := process.poll()) is None:
+            time.sleep(_LOOK_S)
+            if output is not None:
+                shorten(output)
+        if output is not None:
+            os.close(output)
         level = logging.INFO if code == 0 else logging.ERROR
         self._log.log("ended", level, "%s ended with exit code %d, its output %s", self.name, code, where)
+
+
+def shorten(file: int) -> None:
+    """Cut a file, to which a program appends, to its end if it is long."""
+    size = os.fstat(file).st_size
+    if size > _MOST:
+        with suppress(OSError):  # a full disk
+            end = os.pread(file, _KEPT, size - _KEPT)
+            os.ftruncate(file, 0)
+            os.write(file, b"(%d bytes are left out)\n%b" % (size - _KEPT, end))
 
 
 def system_actions(section: MqttBridge, folder: Path, clock: Callable[[], float]) -> dict[Channel, Action]:

@@ -28,6 +28,12 @@ _FIELDS = {
 Values = Mapping[str, Any]
 
 
+def measured(values: Values) -> dict[str, tuple[Any, ...]]:
+    """Return a sample's values by the sensor that gave them; noise alone makes each differ from the one before."""
+    axes = {"acceleration": ("ax", "ay", "az"), "rotation": ("gx", "gy", "gz")}
+    return {name: tuple(values[axis] for axis in names) for name, names in axes.items()}
+
+
 def fits(profile: str, names: Collection[str]) -> bool:
     """Return whether fields of these names include all fields of the profile."""
     return _FIELDS[profile] <= set(names)

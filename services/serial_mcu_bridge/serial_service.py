@@ -7,6 +7,8 @@ from importlib import import_module
 from typing import Any, ClassVar
 
 from pebble.config import Config, SerialBridge
+from pebble.contract import DRIVE
+from pebble.contract.payloads import Drive
 from pebble.contract.serial_protocols import SERIAL_PROTOCOLS
 from pebble.errors import ConfigError, DeviceError
 from pebble.runtime.parent import Notifier, Reported
@@ -14,6 +16,8 @@ from pebble.runtime.rate_limit import RateLimitedLog
 from pebble.runtime.service import Service, every
 from pebble.services.serial_mcu_bridge.line.serial_line import LineState, SerialLine
 from pebble.services.serial_mcu_bridge.line.silence import CHECK_S, Silence
+from pebble.services.serial_mcu_bridge.moving_sensors import MovingSensors
+from pebble.transports import Subscription
 
 _MISREAD = "what its board sends is not understood: another baud rate or firmware, or noise"
 _INPUT_LIMIT = 65_536  # bytes waiting for the service's thread; 1.4 s of a full 460,800 baud line
@@ -38,6 +42,8 @@ class SerialService(Service, ABC):
         self._input = bytearray()
         self._input_lock = threading.Lock()
         self._silence = Silence()
+        self.sensors = MovingSensors()
+        self._still = ""  # what was logged of them
         self._misread = False
         self._understood = (0, 0)  # which opening of the line, and how often its board was heard since
         self._reported = Reported(Notifier().mcu)
@@ -61,6 +67,14 @@ class SerialService(Service, ABC):
     def options(self) -> SerialBridge:
         """The config section of this serial line; with instances, the merged one of this instance."""
         return self.config.services.serial_mcu_bridge
+
+    def follow_driving(self) -> Subscription:
+        """Receive drive commands, for the sensors of a board that does not move the wheels itself."""
+
+        def note(drive: Drive) -> None:
+            self.sensors.drive(self.clock() + self.options.safety.drive_timeout_seconds if drive.moves else 0.0)
+
+        return self.listen(DRIVE, note)
 
     # -- to override
 
@@ -101,7 +115,11 @@ class SerialService(Service, ABC):
         number = number if opened == line.opened else 0
         state, silent_ms = self._silence.check(line.state, line.opened, number, now, idle=idle)
         misread = silent_ms is None and line.state is LineState.READY and line.received > 0
-        self._reported.report(state, silent_ms, _MISREAD if misread and self._misread else line.problem)
+        still = self.sensors.problem
+        if still and not self._still:
+            self.log.warning("%s", still)
+        self._still = still
+        self._reported.report(state, silent_ms, _MISREAD if misread and self._misread else line.problem or still)
         self._misread = misread  # a line may be under way
 
     def _queue_input(self, chunk: bytes) -> None:

@@ -3,20 +3,19 @@
 from __future__ import annotations
 
 import os
-import re
 from collections.abc import Iterator
 from itertools import accumulate, islice
 from pathlib import Path
 
 from msgspec import Struct
 
+from pebble.config.visible import is_text
 from pebble.runtime import pyav
 
 _WAV = ".wav"
 _NEED_PYAV = (".mp3", ".ogg", ".flac")
 _MOST = 100_000  # files that a scan looks at: the folder may be / by mistake
 _LONGEST_LIST = 256 * 1024  # bytes of all names: the list is published again and again, to every operator
-_no_utf8 = re.compile("[\ud800-\udfff]").search
 
 
 class Clip(Struct, frozen=True):
@@ -62,7 +61,10 @@ class Clips:
             found = path.is_relative_to(root) and path.suffix.lower() in self._endings and path.is_file()
         except (OSError, RuntimeError, ValueError):  # too long, links in a circle, no text of a path
             return None
-        return Clip(path.relative_to(root).as_posix(), path) if found else None
+        if not found:
+            return None
+        inside = path.relative_to(root).as_posix()
+        return Clip(inside if is_text(inside) else name, path)  # a link may have a name that can be published
 
     def _files(self, root: Path) -> Iterator[str]:
         def failed(error: OSError) -> None:
@@ -81,7 +83,7 @@ class Clips:
 
     def _can_be_named(self, name: str) -> bool:
         """Commands are UTF-8, and a backslash in them is a slash."""
-        if "\\" not in name and not _no_utf8(name):
+        if "\\" not in name and is_text(name):
             return True
         self.problem = self.problem or f"{name!r} cannot be named in commands: rename it"
         return False

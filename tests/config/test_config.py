@@ -826,6 +826,7 @@ class TestRunDirectory:
             ({"XDG_RUNTIME_DIR": "/run/user/7", "TMPDIR": "/t"}, "/run/user/7/pebble"),
             ({"TMPDIR": "/t"}, "/t/pebble-"),
             ({}, "/tmp/pebble-"),
+            ({"XDG_RUNTIME_DIR": "/run/caf\udce9", "TMPDIR": "/t\udce9"}, "/tmp/pebble-"),  # sockets need UTF-8
         ],
     )
     def test_each_robot_has_its_own(self, env: dict[str, str], parent: str) -> None:
@@ -854,6 +855,8 @@ class TestRunDirectory:
     def test_the_configs_own_comes_before_all(self, tmp_path: Path) -> None:
         raw = at("transport", {"kind": "zenoh", "run_dir": "run"})
         assert read(raw, {"RUNTIME_DIRECTORY": "/run/pebble"}, tmp_path).run_dir() == tmp_path / "run"
+        with pytest.raises(ConfigError, match=r"transport.run_dir: /caf\\udce9/run: is no UTF-8"):
+            read(raw, {}, Path("/caf\udce9"))
 
 
 class TestStateDirectory:

@@ -31,6 +31,7 @@ from pebble.contract.payloads import (
     LightsSolid,
     OutletCommand,
     SoundboardCommand,
+    SoundboardStatus,
 )
 from pebble.errors import PayloadError
 from tests.support import cases
@@ -168,6 +169,11 @@ def test_what_a_payload_does_not_mean(channel: Channel, raw: bytes) -> None:
 @pytest.mark.parametrize("form", ["{}", '{{"value": {}}}', '{{"enabled": {}}}', '{{"value": 1, "enabled": {}}}'])
 def test_a_boolean_control_has_three_forms(channel: Channel, value: bool, form: str) -> None:
     assert codec.decode(channel, form.format(json.dumps(value)).encode()) is value
+
+
+def test_a_name_that_is_no_utf8_is_written_with_its_codes() -> None:
+    state = SoundboardStatus(playing=True, timestamp=1.5, file="caf\udce9 ö.wav")
+    assert json.loads(codec.encode(c.SOUNDBOARD_STATUS, state))["file"] == "caf\\udce9 ö.wav"
 
 
 # -- drive values

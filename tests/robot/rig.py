@@ -273,7 +273,9 @@ class Rig:
     def lists_scripts(self, since: float = 0.0) -> bool:
         """True if all of them are in a catalogue that was published after ``since``."""
         seen = [one for one in self.operator.on("outgoing/autonomy-files", since) if since == 0.0 or not one.retain]
-        return bool(seen) and set(self._scripts) <= {script["file"] for script in seen[-1].json["files"]}
+        return bool(seen) and set(self._scripts) <= {
+            script["file"] for script in seen[-1].json["files"] if script.get("asked", True)
+        }
 
     # -- faults
 

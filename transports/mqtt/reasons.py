@@ -13,6 +13,8 @@ _OF_NO_MESSAGE = frozenset({0x00, 0x88, 0x89, 0x8A, 0x8B, 0x8D, TAKEN_OVER, 0x96
 
 _OF_3_1_1 = {1: 0x84, 2: 0x85, 3: 0x88, 4: 0x86, 5: 0x87}  # CONNACK's codes as those of MQTT 5
 
+_OF_LOGIN = frozenset({0x86, 0x87, 0x8C})
+
 _WORDS = {
     0x80: "unspecified error",
     0x81: "malformed packet",
@@ -60,6 +62,11 @@ def words(code: int) -> str:
 def may_concern_message(code: int) -> bool:
     """True if a DISCONNECT with this code may be the answer to a message."""
     return code not in _OF_NO_MESSAGE
+
+
+def concerns_login(code: int) -> bool:
+    """True if a CONNACK, of either version, or another answer refuses who asks, and nothing else about it."""
+    return _OF_3_1_1.get(code, code) in _OF_LOGIN
 
 
 def connection_refused(code: int) -> str:

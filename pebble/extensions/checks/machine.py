@@ -9,6 +9,7 @@ from typing import Any
 from pebble.check_result import CheckResult, failed, ok, warn
 from pebble.errors import PebbleError
 from pebble.extensions.checks.check import Check
+from pebble.runtime.child import run
 
 _ENOUGH_LOCKED = 64 * 1024 * 1024  # a camera's pool of frames at 1080p
 _BUILT = 1735689600  # 2025: a clock before this has not been set
@@ -44,14 +45,14 @@ def output_of(program: str, *arguments: str, seconds: float = 5.0, **user: Any) 
     """Return what a program of the system prints; ``user`` is as whom it runs. Raises PebbleError."""
     command: tuple[str, ...] = (program, *arguments)
     try:
-        done = subprocess.run(command, capture_output=True, timeout=seconds, check=False, cwd="/", **user)
+        done = run(command, seconds, cwd="/", **user)
     except FileNotFoundError:
         raise PebbleError(f"{program} is not installed") from None
     except (OSError, subprocess.TimeoutExpired) as error:
         raise PebbleError(str(error)) from None
-    if done.returncode and not done.stdout:
-        raise PebbleError(f"{program} ended with {done.returncode}: {done.stderr.decode(errors='replace')[-300:]}")
-    return str(done.stdout, errors="replace")
+    if done.code and not done.output:
+        raise PebbleError(f"{program} ended with {done.code}: {done.errors[-300:]}")
+    return done.output
 
 
 def printed(*command: str) -> str:

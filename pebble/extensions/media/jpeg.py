@@ -2,7 +2,6 @@
 
 from typing import Final, TypeAlias, cast
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -26,6 +25,8 @@ def decode_jpeg(jpeg: bytes) -> Pixels:
 
     Bits flipped within the coefficients go undetected: JPEG has no checksum; TCP and zlib have.
     """
+    import cv2  # 16 MB, of which the size of a JPEG needs none
+
     width, height = jpeg_size(jpeg)
     # The picture as it was sent: turned as EXIF says, it would not fit the differences that follow.
     flags = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION

@@ -50,6 +50,7 @@ class _Script(Struct):
 class _Medium(Struct):
     running: bool = False
     doing: str | None = None
+    problem: str | None = None
     last_error: str | None = None
 
 

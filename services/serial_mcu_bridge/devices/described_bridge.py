@@ -16,7 +16,7 @@ from pebble.services.serial_mcu_bridge.devices.alias_use import AliasUse
 from pebble.services.serial_mcu_bridge.devices.aliases import claims, outlet_feature
 from pebble.services.serial_mcu_bridge.devices.device import Alias, Device, Route
 from pebble.services.serial_mcu_bridge.devices.peers import PeerDevices
-from pebble.services.serial_mcu_bridge.imu import FAMILY, MOTION, ImuReports, ImuWatchdog
+from pebble.services.serial_mcu_bridge.imu import FAMILY, MOTION, ImuReports, ImuWatchdog, measured
 from pebble.services.serial_mcu_bridge.line.serial_line import LineState
 from pebble.services.serial_mcu_bridge.pebble_serial_v1.frame import END
 from pebble.services.serial_mcu_bridge.pebble_serial_v1.host import (
@@ -155,6 +155,8 @@ class DescribedBridge(SerialService):
         device, now_ms = self.device, _now_ms()
         if device is None or not device.has_motion or reading.interface.profile == MOTION:
             self.watchdog.sample(self.clock())
+        if reading.interface.profile == MOTION:
+            self.sensors.take(measured(reading.values), self.clock())
         if reading.interface.kind is InterfaceKind.STATE:
             self._published_states[reading.interface.id] = reading, now_ms
         if device is not None:
@@ -229,6 +231,8 @@ class DescribedBridge(SerialService):
         subscriptions, self._generic = self._generic, []
         for subscription in subscriptions:
             subscription.close()
+        if device.has_motion:
+            self._generic.append(self.follow_driving())
         self._listen_generic(device, private=False)  # a reader of the manifest may send commands at once
         self.publish(MCU_LOCAL_ONLY, device.local_only, uid=device.uid)
         self.publish(MCU_DESCRIBE, device.payload, uid=device.uid)

@@ -7,7 +7,7 @@ A line ends with LF, a CR before it is ignored.
 
 import logging
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from math import isfinite
 from typing import TypeAlias
 
@@ -16,7 +16,8 @@ from pebble.services.serial_mcu_bridge.text.device_log import DeviceLogLine, pri
 
 SHORTEST_FLASH_S, LONGEST_FLASH_S = 0.05, 3600.0  # one full fade in and out
 
-_TOUCH_NAMES = ((b"a0", b"a1", b"a2"), (b"t0", b"t1", b"t2"))  # Goob's and Fred's spelling
+_HALL_NAMES = (b"a0", b"a1", b"a2")  # Goob's
+_TOUCH_NAMES = (_HALL_NAMES, (b"t0", b"t1", b"t2"))  # Fred's
 _INTEGER = re.compile(rb"[+-]?[0-9]{1,6}\Z")  # an ADC has at most 16 bits
 _DECIMAL = re.compile(rb"[+-]?[0-9]{1,6}(?:\.[0-9]{0,9})?\Z")  # what printf("%.3f") makes; never nan or inf
 _LEVELS = {b"OK": logging.DEBUG, b"WARN": logging.WARNING, b"ERR": logging.ERROR, b"Done!": logging.INFO}
@@ -29,6 +30,7 @@ class Touch:
     a0: int
     a1: int
     a2: int
+    of_wheels: bool = field(default=False, compare=False, kw_only=True)
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,7 +101,7 @@ def _touch(fields: dict[bytes, bytes]) -> list[Report]:
     for names in _TOUCH_NAMES:
         values = [fields.get(name, b"") for name in names]
         if all(map(_INTEGER.match, values)):
-            return [Touch(*map(int, values))]
+            return [Touch(*map(int, values), of_wheels=names is _HALL_NAMES)]
     return []
 
 

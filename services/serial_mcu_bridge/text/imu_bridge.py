@@ -8,7 +8,7 @@ from pebble.contract import IMU, IMU_FAST
 from pebble.errors import DeviceError
 from pebble.runtime.lines import LineSplitter
 from pebble.runtime.service import every
-from pebble.services.serial_mcu_bridge.imu import ImuReports, ImuWatchdog
+from pebble.services.serial_mcu_bridge.imu import ImuReports, ImuWatchdog, measured
 from pebble.services.serial_mcu_bridge.line.serial_line import LineState
 from pebble.services.serial_mcu_bridge.serial_service import SerialService
 from pebble.services.serial_mcu_bridge.text.device_log import DeviceLogLine, is_known
@@ -18,7 +18,7 @@ _WATCH_S = 0.5
 
 
 class ImuBridge(SerialService):
-    """Receives only: nothing is ever sent to the sensor."""
+    """Sends nothing to the sensor. From drive commands it knows when the sensor must not repeat itself."""
 
     publishes = (IMU_FAST, IMU)
     receive_only = True
@@ -30,6 +30,10 @@ class ImuBridge(SerialService):
         self._reports = ImuReports(
             device=str(self.options.serial.port), protocol=self.options.protocol, instance=self.instance
         )
+
+    def set_up(self) -> None:
+        super().set_up()
+        self.follow_driving()
 
     def on_line_state(self, state: LineState) -> None:
         if state is LineState.BOOTING:
@@ -57,6 +61,7 @@ class ImuBridge(SerialService):
         match report:
             case Motion(number, mcu_ms, values):
                 self._watchdog.sample(self.clock())
+                self.sensors.take(measured(values), self.clock())
                 self.publish(IMU_FAST, self._reports.motion(now_ms, number, mcu_ms, values))
             case Summary(number, mcu_ms, values):
                 summary = self._reports.summary(now_ms, number, mcu_ms, values)

@@ -86,10 +86,12 @@ class MotorBridge(MotorOwner, SerialService):
     def move(self, drive: Drive, valid_s: float) -> None:
         power = self.protocol.mix(drive.x, drive.z)
         self.line.drive(self.protocol.drive_line(*power), valid_s)
+        self.sensors.drive(self.clock() + valid_s if all(power) else 0.0)
         self._show_power(*power)
 
     def halt(self) -> None:
         self.line.halt()
+        self.sensors.drive(0.0)
         self._show_power(0.0, 0.0)
 
     def _show_power(self, left: float, right: float) -> None:
@@ -133,7 +135,9 @@ class MotorBridge(MotorOwner, SerialService):
 
     def _report(self, report: Report) -> None:
         match report:
-            case Touch(a0, a1, a2):
+            case Touch(a0, a1, a2, of_wheels=of_wheels):
+                if of_wheels:
+                    self.sensors.take({"hall sensor a0": a0, "hall sensor a1": a1, "hall sensor a2": a2}, self.clock())
                 if self._publishes_touch:
                     self.publish(c.TOUCH_SENSORS, TouchSensors(value=TouchValues(a0=a0, a1=a1, a2=a2)))
             case Charging(value):

@@ -122,7 +122,7 @@ SHOWN: list[tuple[str, Any, Any]] = [
     ("outlets/o1/status", {"value": {"on": True}, "label": "Lamp"}, {"value": {"on": True}, "label": "Lamp"}),
     *[("outlets/o1/status", value, {}) for value in (7, {"value": []}, {"value": {"on": "yes"}})],
     ("media-status", {"t": 1, "value": {"camera": {"running": True}}}, {"camera": {"running": True}}),
-    ("media-status", {"t": 1, "value": {"camera": "x"}}, {}),
+    *[("media-status", {"t": 1, "value": {"camera": value}}, {}) for value in ("x", {"running": True, "problem": 7})],
     ("neighbours", {"receives": ["x"]}, {}),
     *[("capabilities", value, {}) for value in (7, [], {"t": 1, "value": 7})],
     ("capabilities", {"t": 1, "value": {"drive": {}, "mine": 7}}, {"t": 1, "value": {"drive": {}, "mine": 7}}),

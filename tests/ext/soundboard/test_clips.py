@@ -75,7 +75,12 @@ def test_what_cannot_be_read_or_named_is_left_out_and_reported(tmp_path: Path) -
     Path(os.fsdecode(os.fsencode(tmp_path) + b"/latin\xe4.wav")).touch()
     assert clips.scan() == ["good.wav"]
     assert clips.problem == "'latin\\udce4.wav' cannot be named in commands: rename it"
-    Path(os.fsdecode(os.fsencode(tmp_path) + b"/latin\xe4.wav")).unlink()
+    (tmp_path / "link.wav").symlink_to(Path(os.fsdecode(os.fsencode(tmp_path) + b"/latin\xe4.wav")))
+    assert clips.scan() == ["good.wav", "link.wav"]
+    link = clips.find("link.wav")
+    assert link is not None
+    assert (link.name, link.path.name) == ("link.wav", "latin\udce4.wav")
+    link.path.unlink()
     assert clips.scan() == ["good.wav"]
     assert clips.problem == ""
 

@@ -103,6 +103,22 @@ def test_its_words_and_its_output_stay_in_a_file_on_the_robot(tmp_path: Path, ca
     assert output.stat().st_mode & 0o777 == 0o600
 
 
+def test_the_file_of_a_command_that_floods_stays_small_and_has_its_last_words(tmp_path: Path) -> None:
+    code = "import sys, time; print('y' * 3_000_000, flush=True); time.sleep(0.6); sys.exit('fatal')"
+    action = Action(row(GIT_PULL), control(code), folder=tmp_path, clock=Clock())
+    assert action.request()
+    assert finished(action)
+    text = (tmp_path / "git-pull.log").read_text()
+    assert (len(text) < 100_000, text[:8], text[-6:]) == (True, "(2934465", "fatal\n")
+
+
+def test_its_end_is_logged_whatever_it_leaves_behind(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level(logging.INFO)
+    code = "import subprocess; subprocess.Popen(['sleep', '10'])"
+    assert Action(row(GIT_PULL), control(code), folder=tmp_path, clock=Clock()).request()
+    assert until(lambda: "git-pull ended with exit code 0" in caplog.text)
+
+
 def test_runs_also_where_no_file_can_be_written(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level(logging.INFO)
     (tmp_path / "state").touch()  # a file where the folder is expected

@@ -19,6 +19,7 @@ from pebble.extensions.checks.broker.messages import REFUSED, held_back
 from pebble.extensions.checks.broker.peer import BrokerTrial, Peer
 from pebble.forwarding.probes import new_probe
 from pebble.transports import MqttSettings
+from pebble.transports.mqtt import reasons
 
 _LARGE = 1000  # bytes of a nonce, written as 2 kB: more than a packet carries
 _MATTERS_S = 0.02  # a shorter round trip delays nothing that people notice: our own programs acknowledge at once
@@ -41,8 +42,10 @@ def robot_account(
         with reached(settings, "") as trial:
             trial.patience_s = answer_s
             peer = trial.peer(protocol=settings.protocol)
-            if reads and (peer.subscribe(reads) or b"\xff")[0] >= REFUSED:
-                text = f"a page with this account does not hear robots: the broker refuses it {reads}"
+            granted = peer.subscribe(reads) if reads else b"\0"
+            if not granted or granted[0] >= REFUSED:
+                why = "the broker refuses it" if granted else "the broker does not answer its subscription to"
+                text = f"a page with this account does not hear robots: {why} {reads}"
                 yield failed(text, "pebble fleet check; its role is page", what)
                 return
             topic = BRIDGE_PROBE.topic(base)
@@ -79,7 +82,7 @@ def _echo(trial: BrokerTrial, peer: Peer, topic: str, nonce_bytes: int = 8) -> t
 
     def refusal() -> str:
         if peer.acks.get(mid, 0) >= REFUSED:
-            return f"the broker refuses it (code {peer.acks[mid]})"
+            return f"the broker refuses it ({reasons.words(peer.acks[mid])})"
         return "the broker hangs up on it" if peer.closed else ""
 
     is_back = trial.wait(lambda: payload in peer.payloads() or refusal()) and payload in peer.payloads()
@@ -92,11 +95,14 @@ def _rules(what: str, trial: BrokerTrial, peer: Peer, topic: str) -> CheckResult
     other = BRIDGE_PROBE.topic(f"pebble/robots/doctor-{secrets.token_hex(4)}")
     peer.subscribe(other)
     payload = new_probe(time.time_ns() // 1_000_000)
-    peer.publish(other, payload, qos=1)
+    mid = peer.publish(other, payload, qos=1)
     is_back, _ = _echo(trial, peer, topic)  # what was let through has come before it
     if payload in peer.payloads():
         fix = "start it with the files of `pebble fleet init`, see docs/ext/fleet.md"
         return failed("has no rules: with this account one can pose as any robot, and drive it", fix, what)
+    code = peer.acks.get(mid, 0)
+    if code >= REFUSED and not reasons.concerns_login(code):
+        return warn(f"refuses a message to another robot, but not for that: {reasons.words(code)}", what=what)
     if not is_back and not peer.closed:
         return warn("does not answer in time: whether it has rules is not known", what=what)
     return ok("keeps this account from posing as another robot", what=what)

@@ -17,6 +17,7 @@ from pebble.transports.settings import MqttSettings
 
 SMALLER_PACKETS = "set a smaller MTU at its network card, or let ICMP pass"  # the way loses large ones
 _REFUSED_ID = 2  # a return code of CONNACK (MQTT 3.1.1, table 3.1)
+_UNKNOWN = "does not tell whether it lets in who has no login"
 _HERE_S = 1.0  # within which an address of this machine answers
 
 
@@ -56,6 +57,8 @@ def _own_login(settings: MqttSettings, answer: LoginAttempt) -> CheckResult:
     why = answer.refusal
     if answer.code == _REFUSED_ID:
         return failed(why, "let it admit any client id, or set remote_mqtt.client_id to one that it knows")
+    if not answer.refuses_login:
+        return failed(f"refuses the connection: {why}", "its log says why")
     if settings.username is None:
         return failed(f"refuses the login: {why}", "set username and password_file of this broker")
     user = shown_user(settings.username)
@@ -64,8 +67,10 @@ def _own_login(settings: MqttSettings, answer: LoginAttempt) -> CheckResult:
 
 
 def _anonymous_login(answer: LoginAttempt, level: SecurityLevel, *, is_here: bool) -> CheckResult:
-    if answer.code != 0:
+    if answer.refuses_login:
         return ok("refuses anonymous logins")
+    if answer.code != 0:
+        return warn(f"{_UNKNOWN}: {answer.refusal}")
     if is_here:
         return ok("accepts anonymous logins: every program on this machine can drive the robot")
     return (warn if level == "open" else failed)(
@@ -90,22 +95,24 @@ def _encryption(settings: MqttSettings, answer: LoginAttempt, *, is_here: bool) 
 def beyond_loopback(name: str, settings: MqttSettings, addresses: Iterable[str]) -> Iterator[CheckResult]:
     """Try the port of a broker that is meant for its machine alone at each of ``addresses``."""
     tls = None if settings.tls is None else replace(settings.tls, insecure=True)  # its certificate names the loopback
-    codes = {
-        address: attempt(replace(settings, host=address, tls=tls), login=False, timeout_s=_HERE_S).code
+    answers = {
+        address: attempt(replace(settings, host=address, tls=tls), login=False, timeout_s=_HERE_S)
         for address in addresses
     }
     what = f"{name} {settings.host}:{settings.port}"
-    answering = [address for address, code in codes.items() if code is not None]
-    if anonymous := [address for address, code in codes.items() if code == 0]:
+    answering = {address: answer for address, answer in answers.items() if answer.code is not None}
+    if anonymous := [address for address, answer in answering.items() if answer.code == 0]:
         yield warn(
             f"also answers at {', '.join(anonymous)} and accepts anonymous logins: the network can drive the robot",
             f"{MOSQUITTO}listener {settings.port} 127.0.0.1, or allow_anonymous false and a password_file",
             what,
         )
+    elif why := [answer.refusal for answer in answering.values() if not answer.refuses_login]:
+        yield warn(f"also answers at {', '.join(answering)}, but {_UNKNOWN}: {why[0]}", what=what)
     elif answering:
         yield ok(f"also answers at {', '.join(answering)}, and refuses anonymous logins there", what=what)
-    elif codes:
-        yield ok(f"does not answer at {', '.join(codes)}", what=what)
+    elif answers:
+        yield ok(f"does not answer at {', '.join(answers)}", what=what)
 
 
 def own_addresses() -> list[str]:

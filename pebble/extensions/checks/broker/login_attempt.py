@@ -33,6 +33,11 @@ class LoginAttempt:
         """Return why there was no login; empty: it was accepted."""
         return self.problem if self.code is None else reasons.connection_refused(self.code) * bool(self.code)
 
+    @property
+    def refuses_login(self) -> bool:
+        """True if the broker refuses this login, or a client without one, and not the connection for another reason."""
+        return self.code is not None and reasons.concerns_login(self.code)
+
 
 def attempt(settings: MqttSettings, *, login: bool, timeout_s: float = TIMEOUT_S) -> LoginAttempt:
     """Connect and disconnect, with the settings' user and password or (``login=False``) anonymously.

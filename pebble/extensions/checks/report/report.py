@@ -62,7 +62,7 @@ class Report:
         output = io.BytesIO()
         with zipfile.ZipFile(output, "w", zipfile.ZIP_DEFLATED) as packed:
             for name, text in self.parts.items():
-                packed.writestr(name, text)
+                packed.writestr(name, text.encode(errors="backslashreplace"))
         return output.getvalue()
 
 

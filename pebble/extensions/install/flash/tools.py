@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from importlib.util import find_spec
 
 from pebble.errors import PebbleError
+from pebble.runtime.child import Finished, run
 
 INSTALL = "pip install 'pebble-robot[flash]'"
 _LAST_LINES = 12
@@ -43,23 +44,17 @@ class Tools:
     def run(self, command: Command, timeout_s: float = 300.0) -> str:
         """Return the tool's output. Raises PebbleError with its last lines if it fails. Commands contain no secrets."""
         line = [*self._programs[command.tool], *command.arguments]
-        output = None if command.loud else subprocess.PIPE
         try:
-            done = subprocess.run(
-                line,
-                stdin=subprocess.DEVNULL,
-                stdout=output,
-                stderr=subprocess.STDOUT if output else None,
-                text=True,
-                errors="replace",
-                timeout=timeout_s,
-                check=False,
-            )
+            if command.loud:
+                quiet = subprocess.DEVNULL
+                done = Finished(subprocess.run(line, stdin=quiet, timeout=timeout_s, check=False).returncode, "", "")
+            else:
+                done = run(line, timeout_s, stderr=subprocess.STDOUT)
         except subprocess.TimeoutExpired:
             raise PebbleError(f"{command}: timed out after {timeout_s:g} s") from None
         except OSError as error:
             raise PebbleError(f"{command}: {error.strerror}") from None
-        if done.returncode != 0:
-            last_lines = "\n".join((done.stdout or "").rstrip().splitlines()[-_LAST_LINES:])
+        if done.code != 0:
+            last_lines = "\n".join(done.output.rstrip().splitlines()[-_LAST_LINES:])
             raise PebbleError(f"{command}: failed\n{last_lines}".rstrip())
-        return done.stdout or ""
+        return done.output

@@ -15,6 +15,7 @@ from pebble.check_result import State
 from pebble.extensions.checks.machine import clock, synchronised
 from pebble.extensions.fleet.folder import PLAIN_PORT, PORT
 from pebble.extensions.operator.places import Places
+from pebble.runtime.child import run
 from pebble.services.serial_mcu_bridge.pebble_serial_v1.frame import FrameError, decode
 
 DEVICES, SERIAL_PORTS = Path("/dev"), Path("/dev/serial/by-id")
@@ -110,12 +111,10 @@ def cameras(devices: Path) -> Iterator[str]:
     program = next((name for name in _LIBCAMERA if shutil.which(name)), None)
     if program is not None:
         try:
-            done = subprocess.run(
-                [program, "--list-cameras"], capture_output=True, text=True, check=False, timeout=_CAMERA_S
-            )
+            done = run([program, "--list-cameras"], _CAMERA_S)
         except (OSError, subprocess.TimeoutExpired):
             return
-        if re.search(r"^\s*\d+ : ", done.stdout + done.stderr, re.M):
+        if re.search(r"^\s*\d+ : ", done.output + done.errors, re.M):
             yield "libcamera"
 
 

@@ -11,6 +11,7 @@ from pathlib import Path
 
 from pebble.errors import PebbleError
 from pebble.extensions.operator.places import Places
+from pebble.runtime.child import run
 from pebble.runtime.whole_file import is_root, write
 
 ROBOTS = "root:pebble"  # what the robot reads, and only root changes
@@ -28,13 +29,13 @@ def run_command(command: Sequence[str]) -> None:
     """Run a program of the system. Raises SetupError with its first line of complaint."""
     line = " ".join(command)
     try:
-        done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=_COMMAND_S)
+        done = run(command, _COMMAND_S)
     except OSError as error:
         raise SetupError(f"`{line}`: {error.strerror}") from None
     except subprocess.TimeoutExpired:
         raise SetupError(f"`{line}` did not end within {_COMMAND_S:g} s") from None
-    if done.returncode != 0:
-        complaint = (done.stderr.strip() or done.stdout.strip() or "it failed").splitlines()[0]
+    if done.code != 0:
+        complaint = (done.errors.strip() or done.output.strip() or "it failed").splitlines()[0]
         raise SetupError(f"`{line}`: {complaint}")
 
 

@@ -63,6 +63,8 @@ class RobotScripts:
         if file not in self.files:
             known = ", ".join(self.files) or "none"
             raise PebbleError(f"there is no script {file}, only: {known}; just after the robot's start, try again")
+        if self.files[file].get("asked") is False:
+            raise PebbleError(f"the robot has just started, and still asks {file} what it needs: try again")
         chosen = settings(self.files[file], words)
         return self._publish(transport, AutonomyCommand(action="start", file=file, config=chosen))
 

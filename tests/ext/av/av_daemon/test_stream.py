@@ -12,7 +12,7 @@ from pebble.contract.payloads import MediaReport
 from pebble.errors import DeviceError
 from pebble.extensions.media.scene import read_counter
 from pebble.services.av_daemon import health, sources
-from pebble.services.av_daemon.health import Health
+from pebble.services.av_daemon.health import NOTHING, Asked, Health
 from pebble.services.av_daemon.service import Reports
 from pebble.services.av_daemon.source import Capture, Source
 from pebble.services.av_daemon.stream import Stream
@@ -22,6 +22,7 @@ from tests.ext.av.av_daemon.av_rig import Remembering, options
 from tests.support import until
 
 SMALL = {"width": 320, "height": 240, "fps": 30}
+PICTURE, SOUND = FrameInfo(format="mjpeg", width=640, height=480), FrameInfo(format="s16le", rate=16_000, channels=1)
 
 
 class Streams:
@@ -278,6 +279,35 @@ class TestHealth:
         assert [device.overdue(123.0), device.overdue(125.0)] == [False, True]
         device.idle()
         assert not device.overdue(1e9)
+
+    @pytest.mark.parametrize(
+        ("info", "asked", "hz", "content", "problem"),
+        [
+            (PICTURE, Asked(15, 640, 480), 15, None, None),
+            (PICTURE, Asked(15, 640, 480), 14, 7, "shows the same picture since 11 s"),
+            (PICTURE, Asked(15, 640, 480), 15, [1, 2, 3, 4], "shows the same pictures again and again since 11 s"),
+            (PICTURE, None, 10, 7, None),
+            (PICTURE, Asked(15, 480, 640), 15, None, "gives pictures of 640x480 where 480x640 were asked"),
+            (PICTURE, Asked(15, 640, 480), 7, None, "gives 7.0 pictures a second where 15 were asked"),
+            (PICTURE, Asked(), 99, None, None),
+            (SOUND, Asked(50), 50, None, None),
+            (SOUND, Asked(50), 50, NOTHING, "gives only zeros, as one that is muted or unplugged, since 11 s"),
+            (SOUND, Asked(50), 50, 7, "gives the same sound since 11 s"),
+            (SOUND, Asked(50), 138, None, "gives 44160 samples a second where 16000 were asked"),
+        ],
+    )
+    def test_frames_that_come_in_time_may_show_nothing(
+        self, info: FrameInfo, asked: Asked | None, hz: int, content: int | str | list[int] | None, problem: str | None
+    ) -> None:
+        device = Health(2.0, asked)
+        device.opening(100.0)
+        for number in range(11 * hz + 2):
+            new = content[number % len(content)] if isinstance(content, list) else content
+            device.frame(info, 100 + number / hz, content=1000 + number if new is None else new)
+        found = device.report(111.0)
+        assert (found.problem, found.last_error, found.doing) == (problem, problem, "runs")
+        device.failed("unplugged")
+        assert device.report(111.0).problem is None
 
 
 class TestReports:

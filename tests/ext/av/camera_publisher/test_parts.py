@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterator
 from fractions import Fraction
 from itertools import product
@@ -213,6 +214,19 @@ def test_after_a_bad_frame_comes_a_full_picture(
     pictures = [decoder.feed(payload) for payload in bench.pictures]
     assert [picture is not None and picture.captured_ms for picture in pictures] == [1, 2, 4, 5]
     assert [picture is not None and picture.keyframe for picture in pictures][2]
+
+
+@pytest.mark.parametrize(("level", "black"), [(0, True), (12, True), (60, False)])
+def test_pictures_that_are_only_black_are_a_problem(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch, level: int, black: bool
+) -> None:
+    monkeypatch.setattr("pebble.runtime.source_check.REPEATS_S", 0.01)
+    for _ in range(3):
+        bench.show(data=np.full(48 * 64 * 3, level, np.uint8))
+        time.sleep(0.01)
+    report = "media-report/camera_publisher"
+    assert until(lambda: "json 64x48" in bench.robot.newest(report).get("doing", ""))
+    assert bench.robot.newest(report).get("problem") == ("shows only black since 0 s" if black else None)
 
 
 def test_without_h264_there_is_a_problem_and_json_is_sent(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:

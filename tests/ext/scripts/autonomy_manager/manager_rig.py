@@ -69,9 +69,9 @@ class ManagerRig(ProgramRobot):
             process.wait(10)
 
     def listed(self) -> bool:
-        """Whether every script is in the published list."""
-        files = self.newest("autonomy-files")
-        return bool(files) and {entry["file"] for entry in files["files"]} >= set(self.section["scripts"])
+        """True if every script is in the published list, and was asked what it needs."""
+        asked = {entry["file"] for entry in self.newest("autonomy-files").get("files", ()) if entry.get("asked", True)}
+        return bool(self.newest("autonomy-files")) and asked >= set(self.section["scripts"])
 
     def newest(self, metric: str) -> Any:
         return self.world.newest(metric)

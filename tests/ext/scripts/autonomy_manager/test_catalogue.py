@@ -101,9 +101,9 @@ def test_one_of_ours_is_asked_once_and_no_other(tmp_path: Path) -> None:
     write(tmp_path, "walk", PRETENDS)
     write(tmp_path, "foreign", "open('asked', 'a').write('x')")
     catalogue = Catalogue(config(tmp_path))
-    partial: list[list[str]] = []
-    catalogue.scan(lambda found: partial.append(list(found)))
-    assert partial == [["foreign"], ["foreign", "walk"]]
+    listed: list[dict[str, bool]] = []
+    catalogue.scan(lambda found: listed.append({name: script.asked for name, script in found.items()}))
+    assert listed == [{"foreign": True, "walk": False}, {"foreign": True, "walk": True}]
     found = scanned(catalogue)
     assert (tmp_path / "walk/asked").read_text() == "x"
     assert not (tmp_path / "foreign/asked").exists()

@@ -156,7 +156,7 @@ def test_scripts_inherit_nothing_of_the_launchers(mqtt: ManagerRig, monkeypatch:
     assert (leads_group, stdin) == (True, "")
 
 
-def test_a_start_before_all_scripts_are_listed_is_refused_with_the_reason(mqtt: ManagerRig) -> None:
+def test_scripts_are_listed_at_once_and_started_when_it_is_known_what_they_need(mqtt: ManagerRig) -> None:
     mqtt.script("first")
     slow = mqtt.root / "slow"
     slow.mkdir()
@@ -164,11 +164,17 @@ def test_a_start_before_all_scripts_are_listed_is_refused_with_the_reason(mqtt: 
     mqtt.script("needs", dependencies=[{"file": "slow"}])
     mqtt.start()
     for file, why in (
-        ("slow", "Unknown autonomy file: slow"),
-        ("needs", "Failed to start needs: Dependency script not found: slow"),
+        ("slow", "Failed to start slow"),
+        ("needs", "Failed to start needs: slow"),
     ):
         mqtt.launch(file)
-        assert mqtt.becomes(error=f"{why}: scripts are still being listed, try again"), mqtt.status
+        why += ": it is still asked what it needs: scripts are still being listed, try again"
+        assert mqtt.becomes(error=why), mqtt.status
+    assert mqtt.newest("autonomy-files")["files"][-1] == {
+        "file": "slow",
+        "label": "slow",
+        "configs": [],
+        "asked": False,
+    }
     (slow / "go").touch()
-    assert until(lambda: len(mqtt.newest("autonomy-files")["files"]) == 3)
     mqtt.run_script("slow")

@@ -22,6 +22,7 @@ def script(file: str, *dependencies: Dependency) -> Script:
 SCRIPTS = {
     "walk": script("walk", Dependency("eyes", {"speed": 1})),
     "eyes": script("eyes"),
+    "new": structs.replace(script("new"), asked=False),
     "lost": script("lost", Dependency("nose")),
     "torn": structs.replace(script("torn"), broken="run.py, line 3: invalid syntax"),
     "needy": script("needy", Dependency("torn")),
@@ -53,6 +54,7 @@ def test_a_script_is_started_by_a_name_that_looks_the_same(there: str, typed: st
         ("lost", {}, "Failed to start lost: Dependency script not found: nose"),
         ("torn", {"speed": 2}, "Failed to start torn: run.py, line 3: invalid syntax"),
         ("needy", {}, "Failed to start needy: torn: run.py, line 3: invalid syntax"),
+        ("new", {}, "Failed to start new: it is still asked what it needs"),
         ("fast", {}, "Failed to start fast: Invalid config for eyes: speed above maximum 1"),
     ],
 )

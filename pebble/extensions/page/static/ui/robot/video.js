@@ -36,8 +36,12 @@ export function Stage({ at, video: control, source, offers, view, layout }) {
   const cover = useCover(control, source);
   const info = video.stream ? null : video.info;
   const name = useName(source);
+  const { camera, camera_publisher: sender } = useValue(source, "media-status") ?? {};
+  const problem = camera?.problem ?? sender?.problem;
   const over = html`${info &&
-    html`<span class=${`tag tag-age ${cover ? "bad" : ""}`} data-test="age"><${Age} video=${video} /></span>`}
+    html`<span class=${`tag tag-age ${cover || problem ? "bad" : ""}`} data-test="age">
+      <${Age} video=${video} />${problem && html`<span data-test="picture-problem">· the camera ${problem.slice(0, 100)}</span>`}
+    </span>`}
     ${source !== at && html`<span class="tag tag-from">seen from ${name}</span>`}
     <${Bands} at=${at} />`;
   return html`<${Frame} label="Live picture" alt=${`What ${name} sees`} part="Layer" source=${source} cover=${cover} face=${!info} over=${over}>

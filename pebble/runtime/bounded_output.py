@@ -1,0 +1,106 @@
+"""The output of one program as lines for a log: bounded in length and number, and what is left out is counted."""
+
+import re
+import time
+from collections import deque
+from collections.abc import Callable
+from typing import Final
+
+from pebble.runtime.lines import LineSplitter
+
+LINES_PER_S: Final = 100.0
+_BURST_S = 2.0  # so many seconds' lines at once, after a silence
+KEPT: Final = 10  # of the lines that are left out, the last ones: a program that fails says why at its end
+PAUSE_S: Final = 0.02  # between two reads of a program that floods, which waits meanwhile
+_SKIM = 4096  # bytes of a chunk that are read of a flood
+_REPEATS_S = 1.0  # within which the same line again is a repetition
+_QUIET_S, _REPORT_S = 0.5, 5.0  # what was left out is said when the flood has ended so long ago, or goes on
+_clock = re.compile(rb"\d\d:\d\d:\d\d(?:[.,]\d+)? ").match
+
+
+class BoundedOutput:
+    """Takes chunks of a program's output, and passes ``rate`` lines a second to ``write``. Times are passed in.
+
+    A line that is repeated at once is written once. Lines that say how many are missing begin as those of our programs.
+    """
+
+    def __init__(self, write: Callable[[bytes], None], longest: int, now: float, *, rate: float = LINES_PER_S) -> None:
+        """``longest``: bytes of a line; the rest of a longer one is left out."""
+        self.flooded = False  # by the newest chunk: the reader may take its time
+        self._write, self._rate, self._most = write, rate, rate * _BURST_S
+        self._lines = LineSplitter(longest, truncate=True)
+        self._tokens, self._filled_at = self._most, now
+        self._newest, self._newest_at, self._repeats = b"", now, 0
+        self._kept: deque[bytes] = deque(maxlen=KEPT)
+        self._left_out = 0
+        self._suppressed_at, self._said_at = float("-inf"), now
+
+    @property
+    def waits(self) -> bool:
+        """True if something is to be said: call :meth:`tick` in time."""
+        return self._left_out + self._repeats > 0
+
+    def feed(self, data: bytes, now: float) -> None:
+        self.tick(now)
+        if self.flooded and len(data) > 2 * _SKIM and (end := data.rfind(b"\n", 0, -_SKIM)) >= 0:
+            self._left_out, self._suppressed_at = self._left_out + data.count(b"\n", 0, end + 1), now
+            self._lines.reset()
+            data = data[end + 1 :]
+        for line in self._lines.feed(data):
+            self._line(line.rstrip(), now)
+        self.flooded = self._suppressed_at == now
+
+    def tick(self, now: float) -> None:
+        """Say what was left out, if it is time."""
+        self._tokens = min(self._most, self._tokens + (now - self._filled_at) * self._rate)
+        self._filled_at = now
+        quiet = now - self._suppressed_at >= _QUIET_S
+        if self.waits and (quiet or now - self._said_at >= _REPORT_S):
+            self._said_at = now
+            self._say()
+
+    def end(self) -> None:
+        """Pass on the last ones of the lines that were left out, and the unfinished line."""
+        self._say()
+        if rest := self._lines.rest().rstrip():
+            self._write(rest)
+
+    def _line(self, line: bytes, now: float) -> None:
+        clock = _clock(line)
+        text = line[clock.end() :] if clock else line
+        if not text:
+            return
+        if text == self._newest and now - self._newest_at < _REPEATS_S:
+            self._repeats, self._suppressed_at = self._repeats + 1, now
+        else:
+            self._say_repeats()
+            self._newest = text
+            self._pass(line, now)
+        self._newest_at = now
+
+    def _pass(self, line: bytes, now: float) -> None:
+        if self._tokens >= 1 and not self._left_out:
+            self._tokens -= 1
+            self._write(line)
+        else:
+            self._left_out, self._suppressed_at = self._left_out + 1, now
+            self._kept.append(line)
+
+    def _say(self) -> None:
+        self._say_repeats()
+        if missing := self._left_out - len(self._kept):
+            self._log("WARNING", f"{missing} lines are left out: {self._rate:g} a second are logged")
+        for line in self._kept:
+            self._write(line)
+        self._left_out = 0
+        self._kept.clear()
+
+    def _say_repeats(self) -> None:
+        repeats, self._repeats = self._repeats, 0
+        if self._left_out:
+            self._left_out += repeats
+        elif repeats:
+            self._log("INFO", f"the line before came {repeats} more times")
+
+    def _log(self, level: str, text: str) -> None:
+        self._write(f"{time.strftime('%H:%M:%S')} [{level}] {text}".encode())

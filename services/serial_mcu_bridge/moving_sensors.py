@@ -1,0 +1,33 @@
+"""Sensors whose values change while the wheels turn: one that then repeats itself shows nothing. Pure."""
+
+from collections import defaultdict
+from collections.abc import Hashable, Mapping
+
+from pebble.runtime.source_check import REPEATS_S, SourceCheck
+
+
+class MovingSensors:
+    """The sensors of one board, by their names. At rest, one may repeat itself."""
+
+    def __init__(self) -> None:
+        self._checks: dict[str, SourceCheck] = defaultdict(SourceCheck)
+        self._drives_until = float("-inf")
+
+    def drive(self, until: float) -> None:
+        """Note that the wheels are commanded until then; an earlier time ends that."""
+        self._drives_until = until
+
+    def take(self, values: Mapping[str, Hashable], now: float) -> None:
+        for name, value in values.items():
+            self._checks[name].take(value, now, counts=now < self._drives_until)
+
+    @property
+    def problem(self) -> str:
+        """What is wrong; empty if nothing is. One that never changes may not be there, unless no other does."""
+        still = [name for name, check in self._checks.items() if check.repeats]
+        if len(still) < len(self._checks):
+            still = [name for name in still if self._checks[name].changes]
+        if not still:
+            return ""
+        verb = "repeats its value" if len(still) == 1 else "repeat their values"
+        return f"{', '.join(still)} {verb} while the wheels are commanded for {REPEATS_S:g} s and more"
