@@ -22,6 +22,7 @@ _IN_A_ROW = 10  # heartbeats in a row
 _LONGEST_GAP = 2.5  # times the interval that its config has
 _JUDGED_S = 6.0  # motor owners repeat every 5 s what the others must receive of them
 _VOLTS_S = 6.0  # boards report it every five seconds
+_LOW_S = 2 * _VOLTS_S  # one reading is no empty battery
 _LEAST_CELL_V = 3.4  # of a lithium cell: below, a robot has minutes
 _SHOWN = 5  # names in one line
 _LOG = "journalctl -u pebble -n 50"
@@ -164,9 +165,10 @@ def battery(robot: RobotUnderTest) -> CheckResult:
     if volts is None:
         return skipped("it reports no voltage")
     charging = ", on the charger" if robot.view.charging else ""
-    if cells and volts / cells < _LEAST_CELL_V and not robot.view.charging:
+    if cells and not charging and not robot.wait(lambda: (robot.view.volts or 0.0) >= cells * _LEAST_CELL_V, _LOW_S):
+        volts = robot.view.volts or 0.0
         return failed(f"{volts:.2f} V, {volts / cells:.2f} V a cell: it is nearly empty", "charge it")
-    return ok(f"{volts:.2f} V{charging}")
+    return ok(f"{robot.view.volts:.2f} V{charging}")
 
 
 def leftovers(robot: RobotUnderTest) -> CheckResult:
