@@ -272,8 +272,10 @@ class ProcessSupervisor:
         wait_s = self.policy.exited(self._reactor.now(), how)
         self._start_in(wait_s)
         name = self.program.name
+        times = self.policy.exits_within_a_minute(self._reactor.now())
         if not self.policy.in_crash_loop:
-            log.warning("%s ended (%s): starting it again in %.1f s", name, how, wait_s)
+            often = f", for the {times}th time within a minute" if times >= notes.OFTEN else ""
+            log.warning("%s ended (%s)%s: starting it again in %.1f s", name, how, often, wait_s)
         elif not was_in_crash_loop:
             log.error(
                 "%s ended %d times within %d s, last: %s. Trying again every %d s",
