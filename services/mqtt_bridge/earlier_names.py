@@ -1,0 +1,156 @@
+"""Removes what brokers retain under the names that this robot had before: its identity in the config was changed.
+
+Nothing else ever would, and operators would see a robot that is off for ever.
+"""
+
+import json
+import logging
+import re
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+
+from pebble.config import Config
+from pebble.config.config import file_name
+from pebble.contract import ONLINE
+from pebble.contract.levels import LEVELS
+from pebble.errors import PebbleError
+from pebble.runtime.timers import Timer
+from pebble.runtime.whole_file import make_folder, write
+from pebble.transports import Message, QoS, State, Subscription, Transport
+
+log = logging.getLogger(__name__)
+
+WATCH_S = LEVELS["thin"].silent_s + 1.0  # in which another robot of that name would send a heartbeat
+_ARRIVE_S = 2.0  # for what a broker retains
+_OFFLINE = re.compile(rb'"online"\s*:\s*false')
+_NAMES = 16  # that are remembered
+_TOPICS = 1000  # that are removed of one name
+_LISTED = 3
+
+
+class EarlierNames:
+    """The names that were used with the same config file. Transports call its handlers on their threads.
+
+    ``call_in(seconds, action)`` calls an action later on the service's thread.
+    """
+
+    def __init__(self, config: Config, sides: list[Transport], call_in: Callable[[float, Callable[[], None]], Timer]):
+        self._base, self._sides, self._call_in = config.base, sides, call_in
+        self._file: Path | None = None
+        if config.path is not None:  # several robots may share a state directory, but not a config
+            self._file = config.state_dir() / f"names-{file_name(str(config.path.resolve()))}.json"
+        self._names: list[str] = []
+        self._begun = False
+
+    def begin(self) -> None:
+        """Remember the robot's name, and look for what is left of earlier ones; once both sides are connected."""
+        if self._begun or self._file is None:
+            return
+        self._begun = True
+        try:
+            names = json.loads(self._file.read_bytes())
+            self._names = [name for name in names if isinstance(name, str) and name.count("/") == 2][-_NAMES:]
+        except (OSError, ValueError, TypeError, RecursionError):  # most often it is the first start
+            self._names = []
+        earlier = [name for name in self._names if name != self._base]
+        self._save([*earlier, self._base])
+        for name in earlier:
+            log.info("its name was %s before: what a broker retains under it is removed unless a robot has it", name)
+            _Removal(name, self._sides, self._call_in, partial(self._forget, name)).begin()
+
+    def _forget(self, name: str) -> None:
+        self._save([other for other in self._names if other != name])
+
+    def _save(self, names: list[str]) -> None:
+        if names == self._names or self._file is None:
+            return
+        self._names = names
+        try:
+            make_folder(self._file.parent)
+            write(self._file, json.dumps(names).encode(), 0o600, PebbleError)
+        except (PebbleError, OSError) as error:
+            log.warning("its name cannot be remembered: %s", error)
+
+
+class _Removal:
+    """Watches for a robot of one name; if there is none, removes what is retained, and looks whether it has gone."""
+
+    def __init__(
+        self,
+        name: str,
+        sides: list[Transport],
+        call_in: Callable[[float, Callable[[], None]], Timer],
+        done: Callable[[], None],
+    ) -> None:
+        self._name, self._sides, self._call_in, self._done = name, sides, call_in, done
+        self._subscriptions: list[Subscription] = []
+        self._found: list[set[str]] = [set() for _ in sides]  # of each side: heartbeats, later topics
+        self._removed = 0
+
+    def begin(self) -> None:
+        self._subscribe(ONLINE.topic(self._name), lambda found: partial(self._note_heartbeat, found))
+        self._call_in(WATCH_S, self._look)
+
+    def _look(self) -> None:
+        self._end()
+        if any(len(heartbeats) > 1 for heartbeats in self._found):  # the first one may be retained
+            log.info("%s is another robot now: what is retained under this name is its own", self._name)
+            self._done()
+            return
+        if self._ask():
+            self._call_in(_ARRIVE_S, self._remove)
+
+    def _remove(self) -> None:
+        self._end()
+        self._removed = sum(map(len, self._found))
+        for transport, topics in zip(self._sides, self._found, strict=True):
+            for topic in sorted(topics):
+                transport.publish(topic, b"", qos=QoS.DELIVERED, retain=True)
+        if self._ask():
+            self._call_in(_ARRIVE_S, self._check)
+
+    def _check(self) -> None:
+        left, is_refused = sorted(set().union(*self._found)), any(one.refused for one in self._subscriptions)
+        self._end()
+        if is_refused or left:
+            some = ", ".join(left[:_LISTED]) or f"{self._name}/#"
+            log.warning(
+                "this account may not remove what is retained under its earlier name: %s; "
+                "pebble topic pub TOPIC '' --retain removes one, by an account that may",
+                some,
+            )
+            return
+        if self._removed:  # the next start looks again: a broker may publish a will later
+            log.info("removed %d retained messages of its earlier name %s", self._removed, self._name)
+        else:
+            self._done()
+
+    def _ask(self) -> bool:
+        """Ask for what is retained; False without a connection: the next start tries it again."""
+        self._found = [set() for _ in self._sides]
+        if any(transport.state is not State.CONNECTED for transport in self._sides):
+            return False
+        self._subscribe(f"{self._name}/#", lambda found: partial(self._note_retained, found))
+        return True
+
+    def _subscribe(self, filter_: str, handler: Callable[[set[str]], Callable[[Message], None]]) -> None:
+        self._subscriptions = [
+            transport.subscribe(filter_, handler(found), echo=False, direct=True)
+            for transport, found in zip(self._sides, self._found, strict=True)
+        ]
+
+    @staticmethod
+    def _note_heartbeat(found: set[str], message: Message) -> None:
+        if len(found) < _TOPICS and _OFFLINE.search(message.payload) is None:
+            found.add(message.payload.hex())
+
+    @staticmethod
+    def _note_retained(found: set[str], message: Message) -> None:
+        if message.retain and message.payload and len(found) < _TOPICS:
+            found.add(message.topic)
+
+    def _end(self) -> None:
+        subscriptions, self._subscriptions = self._subscriptions, []
+        for subscription in subscriptions:
+            subscription.close()
