@@ -39,7 +39,10 @@ class EarlierNames:
         self._base, self._sides, self._call_in = config.base, sides, call_in
         self._file: Path | None = None
         if config.path is not None:  # several robots may share a state directory, but not a config
-            self._file = config.state_dir() / f"names-{file_name(str(config.path.resolve()))}.json"
+            folder = config.state_dir()
+            if folder.name == file_name(config.base):  # by default each name has one of its own
+                folder = folder.parent
+            self._file = folder / f"names-{file_name(str(config.path.resolve()))}.json"
         self._names: list[str] = []
         self._begun = False
 

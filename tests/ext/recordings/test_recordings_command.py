@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import errno
 import json
+import os
 import re
 from pathlib import Path
 
@@ -14,6 +16,7 @@ from pebble.extensions.recordings.recorder.recorder import Recorder
 from pebble.extensions.recordings.recorder.settings import Options
 from tests.commands.command_line import Run
 from tests.ext.recordings.messages import START_NS
+from tests.support import refused
 
 GOOB, FRED = "pebble/robots/goob", "pebble/robots/fred"
 
@@ -113,6 +116,25 @@ def test_what_a_recorder_uses_is_left_alone(folder: Path, run: Run) -> None:
     finally:
         recorder.stop()
     assert messages(folder) == 201
+
+
+@pytest.mark.parametrize("number", [errno.ENOLCK, errno.EOPNOTSUPP])
+def test_a_share_without_locks_is_recorded_to(
+    folder: Path, run: Run, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, number: int
+) -> None:
+    left = folder / "2026/11/20/20261120T232921Z-000999.state.mcap.active"
+    left.parent.mkdir(parents=True, exist_ok=True)
+    left.write_bytes(b"")
+    monkeypatch.setattr("fcntl.flock", refused(number))
+    recorder = Recorder(folder, Options(free_bytes=0))
+    recorder.start()
+    recorder.receive(f"{GOOB}/outgoing/online", b'{"t":1}', 1, retain=False)
+    recorder.stop()
+    assert f"recorder.lock cannot be locked ({os.strerror(number)})" in caplog.text
+    assert (messages(folder), left.exists()) == (202, True)  # what may be another recorder's stays
+    assert run("recordings", "rm", left, "--yes") == 1
+    assert run("recordings", "rm", folder, "--robot", "fred", "--yes") == 1
+    assert messages(folder) == 102
 
 
 READING = [

@@ -125,7 +125,7 @@ def _delete_whole(path: Path, *, yes: bool) -> int:
     if not path.is_file() or not path.name.endswith((SUFFIX, ACTIVE, DAMAGED)):
         raise PebbleError(f"{path}: there is no such folder or recording")
     if path.name.endswith(ACTIVE) and Folder.is_in_use(_archive_of(path)):
-        raise PebbleError(f"{path}: is being written: stop the recorder first")
+        raise PebbleError(f"{path}: is being written: stop the recorder first; what one has left, mend finishes")
     if not yes and not typer.confirm(f"Delete {path}?"):
         return 1
     path.unlink()
