@@ -17,14 +17,15 @@ from pebble.extension import Extension, ours, packages, part, refuse_claims
 from pebble.version import __version__
 
 if TYPE_CHECKING:
-    from typer._click.core import Command, Context
-    from typer._click.formatting import HelpFormatter
+    from pebble.commands.completion import Command
 
 #: Ours that are of no extension.
 _CORE: Final = {
     "up": Offered("pebble.commands.up:up", "run a robot", "own", 20),
     "check": Offered("pebble.commands.check:check", "validate configs and summarise them", "own", 30),
 }
+#: What a wrong command line raises: typer 0.27 has no public name for all of it.
+_WRONG: Final = getattr(typer, "TyperException", typer.BadParameter.__base__)
 #: The headings of the help, in their order; other packages' commands stand last.
 _GROUPS: Final = ("use", "own", "write", "share", "measure", "more")
 
@@ -73,7 +74,7 @@ class _Pebble(TyperGroup):
         self._offered = offered
         self.commands = {words: _Listed(words, offered) for words in offered if " " not in words}
 
-    def format_help(self, ctx: Context, formatter: HelpFormatter) -> None:
+    def format_help(self, ctx: Any, formatter: Any) -> None:
         formatter.write(
             f"Usage: {ctx.command_path} COMMAND …  (also: --version, COMMAND --help, --install-completion)\n"
         )
@@ -91,7 +92,7 @@ class _Listed(TyperCommand):
         super().__init__(words.split()[-1], help=offered[words].help)
         self._words, self._offered = words, offered
 
-    def make_context(self, info_name: str | None, args: list[str], parent: Context | None = None, **extra: Any) -> Any:
+    def make_context(self, info_name: str | None, args: list[str], parent: Any = None, **extra: Any) -> Any:
         command = self._command(args)
         if extra.get("resilient_parsing"):  # for Tab
             from pebble.commands.completion import complete_values
@@ -122,7 +123,7 @@ class _Listed(TyperCommand):
 def _run(arguments: list[str]) -> int:
     try:
         code = application(arguments).main(arguments, prog_name="pebble", standalone_mode=False)
-    except typer.TyperException as error:
+    except _WRONG as error:
         context, message = getattr(error, "ctx", None), error.format_message().rstrip(".")
         if context is not None and message == "Missing command":
             typer.echo(context.get_help())

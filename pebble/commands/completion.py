@@ -7,19 +7,25 @@ from collections.abc import Callable, Iterator
 from functools import partial
 from itertools import islice
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import Final, NamedTuple, TypeAlias
 
-from typer._click.shell_completion import CompletionItem
-from typer.core import TyperGroup
+from typer import Context
+from typer.core import TyperCommand, TyperGroup
 
 from pebble.extension import ours, part
 
-if TYPE_CHECKING:
-    from typer._click.core import Command, Context
-
+Command: TypeAlias = TyperCommand | TyperGroup
 _PLACES = (Path(), Path("/etc/pebble"))
 _FILES = 200  # that are looked into
 _LONGEST = 1_000_000  # bytes of a config
+
+
+class Completion(NamedTuple):
+    """A value, as a shell gets it."""
+
+    value: str
+    type: str = "plain"
+    help: str | None = None
 
 
 def complete_values(command: Command) -> None:
@@ -33,8 +39,8 @@ def complete_values(command: Command) -> None:
         complete_values(below)
 
 
-def _items(values: Callable[[Context], list[str]], context: Context, incomplete: str) -> list[CompletionItem]:
-    return [CompletionItem(value) for value in values(context) if value.startswith(incomplete)]
+def _items(values: Callable[[Context], list[str]], context: Context, incomplete: str) -> list[Completion]:
+    return [Completion(value) for value in values(context) if value.startswith(incomplete)]
 
 
 def configs(context: Context) -> list[str]:
