@@ -9,33 +9,33 @@ import re
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
+from typing import TypeAlias
 
 from pebble.config import Config
 from pebble.config.config import file_name
 from pebble.contract import ONLINE
+from pebble.contract.identity import Identity
 from pebble.contract.levels import LEVELS
-from pebble.errors import PebbleError
+from pebble.errors import ConfigError, PebbleError
 from pebble.runtime.timers import Timer
 from pebble.runtime.whole_file import make_folder, write
 from pebble.transports import Message, QoS, State, Subscription, Transport
 
 log = logging.getLogger(__name__)
 
+CallIn: TypeAlias = Callable[[float, Callable[[], None]], Timer]  # calls later, on the service's thread
+
 WATCH_S = LEVELS["thin"].silent_s + 1.0  # in which another robot of that name would send a heartbeat
 _ARRIVE_S = 2.0  # for what a broker retains
 _OFFLINE = re.compile(rb'"online"\s*:\s*false')
 _NAMES = 16  # that are remembered
 _TOPICS = 1000  # that are removed of one name
-_LISTED = 3
 
 
 class EarlierNames:
-    """The names that were used with the same config file. Transports call its handlers on their threads.
+    """The names that were used with the same config file."""
 
-    ``call_in(seconds, action)`` calls an action later on the service's thread.
-    """
-
-    def __init__(self, config: Config, sides: list[Transport], call_in: Callable[[float, Callable[[], None]], Timer]):
+    def __init__(self, config: Config, sides: list[Transport], call_in: CallIn) -> None:
         self._base, self._sides, self._call_in = config.base, sides, call_in
         self._file: Path | None = None
         if config.path is not None:  # several robots may share a state directory, but not a config
@@ -53,8 +53,15 @@ class EarlierNames:
         self._begun = True
         try:
             names = json.loads(self._file.read_bytes())
-            self._names = [name for name in names if isinstance(name, str) and name.count("/") == 2][-_NAMES:]
-        except (OSError, ValueError, TypeError, RecursionError):  # most often it is the first start
+            self._names = [Identity(*name.split("/")).base for name in names][-_NAMES:]
+        except (
+            OSError,
+            ValueError,
+            TypeError,
+            AttributeError,
+            RecursionError,
+            ConfigError,
+        ):  # or it is the first start
             self._names = []
         earlier = [name for name in self._names if name != self._base]
         self._save([*earlier, self._base])
@@ -77,83 +84,69 @@ class EarlierNames:
 
 
 class _Removal:
-    """Watches for a robot of one name; if there is none, removes what is retained, and looks whether it has gone."""
+    """Watches for a robot of one name; if there is none, removes what brokers retain, and checks that it has gone."""
 
-    def __init__(
-        self,
-        name: str,
-        sides: list[Transport],
-        call_in: Callable[[float, Callable[[], None]], Timer],
-        done: Callable[[], None],
-    ) -> None:
+    def __init__(self, name: str, sides: list[Transport], call_in: CallIn, done: Callable[[], None]) -> None:
         self._name, self._sides, self._call_in, self._done = name, sides, call_in, done
         self._subscriptions: list[Subscription] = []
-        self._found: list[set[str]] = [set() for _ in sides]  # of each side: heartbeats, later topics
+        self._found: list[set[str]] = []  # on each side: heartbeats, then topics
         self._removed = 0
 
     def begin(self) -> None:
-        self._subscribe(ONLINE.topic(self._name), lambda found: partial(self._note_heartbeat, found))
+        self._subscribe(ONLINE.topic(self._name), _note_heartbeat)
         self._call_in(WATCH_S, self._look)
 
     def _look(self) -> None:
-        self._end()
-        if any(len(heartbeats) > 1 for heartbeats in self._found):  # the first one may be retained
+        if any(len(heartbeats) > 1 for heartbeats in self._found):  # one may be retained
             log.info("%s is another robot now: what is retained under this name is its own", self._name)
+            self._end()
             self._done()
-            return
-        if self._ask():
+        elif all(transport.state is State.CONNECTED for transport in self._sides):  # else at the next start
+            self._subscribe(f"{self._name}/#", _note_retained)
             self._call_in(_ARRIVE_S, self._remove)
+        else:
+            self._end()
 
     def _remove(self) -> None:
-        self._end()
         self._removed = sum(map(len, self._found))
         for transport, topics in zip(self._sides, self._found, strict=True):
             for topic in sorted(topics):
                 transport.publish(topic, b"", qos=QoS.DELIVERED, retain=True)
-        if self._ask():
-            self._call_in(_ARRIVE_S, self._check)
+        self._call_in(_ARRIVE_S, self._check)
 
     def _check(self) -> None:
-        left, is_refused = sorted(set().union(*self._found)), any(one.refused for one in self._subscriptions)
+        left = [topic for topics in self._found for topic in topics]
+        left += [one.filter for one in self._subscriptions if one.refused]
         self._end()
-        if is_refused or left:
-            some = ", ".join(left[:_LISTED]) or f"{self._name}/#"
-            log.warning(
-                "this account may not remove what is retained under its earlier name: %s; "
-                "pebble topic pub TOPIC '' --retain removes one, by an account that may",
-                some,
-            )
-            return
-        if self._removed:  # the next start looks again: a broker may publish a will later
+        if left:
+            text = "%s, its earlier name, stays at a broker: this account may not remove %s and %d more topics"
+            log.warning(text, self._name, min(left), len(left) - 1)
+        elif self._removed:  # the next start looks again: a broker may publish a will later
             log.info("removed %d retained messages of its earlier name %s", self._removed, self._name)
         else:
             self._done()
 
-    def _ask(self) -> bool:
-        """Ask for what is retained; False without a connection: the next start tries it again."""
+    def _subscribe(self, filter_: str, note: Callable[[set[str], Message], None]) -> None:
+        self._end()
         self._found = [set() for _ in self._sides]
-        if any(transport.state is not State.CONNECTED for transport in self._sides):
-            return False
-        self._subscribe(f"{self._name}/#", lambda found: partial(self._note_retained, found))
-        return True
-
-    def _subscribe(self, filter_: str, handler: Callable[[set[str]], Callable[[Message], None]]) -> None:
         self._subscriptions = [
-            transport.subscribe(filter_, handler(found), echo=False, direct=True)
+            transport.subscribe(filter_, partial(note, found), direct=True)
             for transport, found in zip(self._sides, self._found, strict=True)
         ]
-
-    @staticmethod
-    def _note_heartbeat(found: set[str], message: Message) -> None:
-        if len(found) < _TOPICS and _OFFLINE.search(message.payload) is None:
-            found.add(message.payload.hex())
-
-    @staticmethod
-    def _note_retained(found: set[str], message: Message) -> None:
-        if message.retain and message.payload and len(found) < _TOPICS:
-            found.add(message.topic)
 
     def _end(self) -> None:
         subscriptions, self._subscriptions = self._subscriptions, []
         for subscription in subscriptions:
             subscription.close()
+
+
+def _note_heartbeat(found: set[str], message: Message) -> None:
+    if len(found) < _TOPICS and _OFFLINE.search(message.payload) is None:
+        found.add(message.payload.hex())
+
+
+def _note_retained(found: set[str], message: Message) -> None:
+    if not message.payload:
+        found.discard(message.topic)
+    elif message.retain and len(found) < _TOPICS:
+        found.add(message.topic)

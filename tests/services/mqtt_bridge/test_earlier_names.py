@@ -105,6 +105,16 @@ def test_without_a_connection_it_is_tried_at_the_next_start(robot: Named) -> Non
     assert robot.left == []
 
 
+@pytest.mark.parametrize("text", ['["+/+/+"]', '["pebble/#/x"]', "[7]", "{", '["pebble/robots"]'])
+def test_a_damaged_file_removes_nothing(robot: Named, text: str) -> None:
+    robot.start("rover")
+    robot.leave()
+    (file,) = robot.state.iterdir()
+    file.write_text(text)
+    robot.start("rover-two")
+    assert (robot.left, robot.known) == (sorted(LEFT), ["rover-two"])
+
+
 def test_a_name_that_comes_back_is_the_robots_own(robot: Named) -> None:
     for name in ("rover", "rover-two", "rover"):
         robot.start(name)
