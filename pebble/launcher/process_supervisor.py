@@ -274,7 +274,7 @@ class ProcessSupervisor:
         name = self.program.name
         times = self.policy.exits_within_a_minute(self._reactor.now())
         if not self.policy.in_crash_loop:
-            often = f", for the {times}th time within a minute" if times >= notes.OFTEN else ""
+            often = f", {times} times within a minute" if times >= notes.OFTEN else ""
             log.warning("%s ended (%s)%s: starting it again in %.1f s", name, how, often, wait_s)
         elif not was_in_crash_loop:
             log.error(
