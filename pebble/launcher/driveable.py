@@ -21,7 +21,8 @@ def _shown(mcu: Mcu) -> dict[str, Any]:
 
 
 def _starts(mcu: Mcu) -> str:
-    return f"its board has started again {mcu.starts} times within a minute" if mcu.starts else ""
+    times = "once" if mcu.starts == 1 else f"{mcu.starts} times"
+    return f"its board has started again {times} within a minute" if mcu.starts else ""
 
 
 def _drives(mcu: Mcu) -> tuple[str, str]:
