@@ -48,10 +48,10 @@ def set_mode(file: Path, mode: int, opened: Path | int | None = None) -> None:
             log.warning("%s: others can read it, which cannot be changed here: %s", file, error.strerror)
 
 
-def sync_file(descriptor: int) -> None:
-    """Make a file durable, where its file system can. Raises OSError for what is lost."""
+def sync_file(descriptor: int, *, data: bool = False) -> None:
+    """Make a file durable, or its ``data`` alone, where its file system can. Raises OSError for what is lost."""
     try:
-        os.fsync(descriptor)
+        (os.fdatasync if data else os.fsync)(descriptor)
     except OSError as error:
         if error.errno not in _NOT_HERE:
             raise

@@ -16,7 +16,7 @@ from pebble.config.config import file_name
 from pebble.contract import ONLINE
 from pebble.contract.identity import Identity
 from pebble.contract.levels import LEVELS
-from pebble.errors import ConfigError, PebbleError
+from pebble.errors import ConfigError, PebbleError, TransportError
 from pebble.runtime.timers import Timer
 from pebble.runtime.whole_file import make_folder, write
 from pebble.transports import Message, QoS, State, Subscription, Transport
@@ -93,8 +93,7 @@ class _Removal:
         self._removed = 0
 
     def begin(self) -> None:
-        self._subscribe(ONLINE.topic(self._name), _note_heartbeat)
-        self._call_in(WATCH_S, self._look)
+        self._ask(ONLINE.topic(self._name), _note_heartbeat, WATCH_S, self._look)
 
     def _look(self) -> None:
         if any(len(heartbeats) > 1 for heartbeats in self._found):  # one may be retained
@@ -102,8 +101,7 @@ class _Removal:
             self._end()
             self._done()
         elif all(transport.state is State.CONNECTED for transport in self._sides):  # else at the next start
-            self._subscribe(f"{self._name}/#", _note_retained)
-            self._call_in(_ARRIVE_S, self._remove)
+            self._ask(f"{self._name}/#", _note_retained, _ARRIVE_S, self._remove)
         else:
             self._end()
 
@@ -112,7 +110,8 @@ class _Removal:
         for transport, topics in zip(self._sides, self._found, strict=True):
             for topic in sorted(topics):
                 transport.publish(topic, b"", qos=QoS.DELIVERED, retain=True)
-        self._call_in(_ARRIVE_S, self._check)
+        again = partial(self._ask, f"{self._name}/#", _note_retained, _ARRIVE_S, self._check)
+        self._call_in(_ARRIVE_S, again)
 
     def _check(self) -> None:
         left = [topic for topics in self._found for topic in topics]
@@ -126,13 +125,21 @@ class _Removal:
         else:
             self._done()
 
-    def _subscribe(self, filter_: str, note: Callable[[set[str], Message], None]) -> None:
+    def _ask(
+        self, filter_: str, note: Callable[[set[str], Message], None], wait_s: float, then: Callable[[], None]
+    ) -> None:
+        """Subscribe on all sides, and go on once what they have has arrived; nothing of this ends the bridge."""
         self._end()
         self._found = [set() for _ in self._sides]
-        self._subscriptions = [
-            transport.subscribe(filter_, partial(note, found), direct=True)
-            for transport, found in zip(self._sides, self._found, strict=True)
-        ]
+        try:
+            for transport, found in zip(self._sides, self._found, strict=True):
+                received = partial(note, found)
+                self._subscriptions.append(transport.subscribe(filter_, received, echo=False, direct=True))
+        except TransportError as error:
+            log.warning("what is left of its earlier name %s stays: %s", self._name, error)
+            self._end()
+            return
+        self._call_in(wait_s, then)
 
     def _end(self) -> None:
         subscriptions, self._subscriptions = self._subscriptions, []
@@ -146,7 +153,5 @@ def _note_heartbeat(found: set[str], message: Message) -> None:
 
 
 def _note_retained(found: set[str], message: Message) -> None:
-    if not message.payload:
-        found.discard(message.topic)
-    elif message.retain and len(found) < _TOPICS:
+    if message.retain and message.payload and len(found) < _TOPICS:
         found.add(message.topic)

@@ -132,7 +132,7 @@ class Audit(Observer):
                 lines = b"\n" + lines
             if os.write(file, lines) != len(lines):
                 raise OSError(errno.ENOSPC, "No space left on device")
-            sync_file(file)
+            sync_file(file, data=True)
         except OSError:
             os.ftruncate(file, size)
             raise

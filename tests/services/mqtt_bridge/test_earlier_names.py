@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
 
 from pebble.config import load
 from pebble.services.mqtt_bridge.earlier_names import EarlierNames
+from pebble.transports import MqttSettings, Transport, create
 from pebble.transports.memory import MemoryHub, MemoryTransport
 from tests.services.mqtt_bridge.bridge_rig import Client
-from tests.support import until
+from tests.support import Broker, until
 
 OLD = "pebble/robots/rover"
 _ARRIVES_S = 0.1  # what a hub of memory distributes
@@ -22,10 +23,10 @@ LEFT = ("outgoing/online", "outgoing/capabilities", "outgoing/mcu/x/value", "inc
 class Named:
     """A robot that is started again and again under names, at one broker."""
 
-    def __init__(self, folder: Path) -> None:
-        self.hub, self.config = MemoryHub(), folder / "robot.json"
+    def __init__(self, folder: Path, make: Callable[[str], Transport]) -> None:
+        self.make, self.config = make, folder / "robot.json"
         self.state = folder / "state"
-        self.client = Client(MemoryTransport("operator", self.hub), OLD, listen=False)
+        self.client = Client(make("operator"), OLD, listen=False)
 
     def start(self, name: str, meanwhile: Callable[[], None] = lambda: None, *, connected: bool = True) -> None:
         """``meanwhile`` happens after it has begun to watch."""
@@ -34,11 +35,11 @@ class Named:
         robots_own = MemoryHub()
         if not connected:
             robots_own.stop()
-        sides = [MemoryTransport(f"{name}-{side}", hub) for side, hub in enumerate((self.hub, robots_own))]
+        sides = [self.make(name), MemoryTransport(f"{name}-local", robots_own)]
         for side in sides:
             side.open(5 if connected else 0.5)
         jobs: list[Callable[[], None]] = [meanwhile]
-        names = EarlierNames(load(self.config), [*sides], lambda _seconds, job: jobs.append(job))  # type: ignore[arg-type]
+        names = EarlierNames(load(self.config), sides, lambda _seconds, job: jobs.append(job))  # type: ignore[arg-type]
         names.begin()
         while jobs:
             jobs.pop(0)()
@@ -52,7 +53,7 @@ class Named:
 
     @property
     def left(self) -> list[str]:
-        looker = Client(MemoryTransport("looker", self.hub), OLD)
+        looker = Client(self.make("looker"), OLD)
         until(lambda: False, _ARRIVES_S)
         found = sorted(message.topic.removeprefix(f"{OLD}/") for message in looker.seen)
         looker.transport.close()
@@ -64,9 +65,21 @@ class Named:
         return [name.rpartition("/")[2] for name in json.loads(file.read_text())]
 
 
-@pytest.fixture
-def robot(tmp_path: Path) -> Named:
-    return Named(tmp_path)
+@pytest.fixture(params=["memory", "mqtt"])
+def robot(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Named]:
+    if request.param == "memory":
+        hub = MemoryHub()
+        yield Named(tmp_path, lambda name: MemoryTransport(name, hub))
+        return
+    broker = Broker(tmp_path)
+
+    def make(name: str) -> Transport:  # a bridge's connection tells its own messages from others, and what is retained
+        return create(
+            "mqtt", name, MqttSettings(host="127.0.0.1", port=broker.port, as_published=name.startswith("rover"))
+        )
+
+    yield Named(tmp_path, make)
+    broker.stop()
 
 
 def test_what_was_retained_under_an_earlier_name_is_removed(robot: Named) -> None:

@@ -56,7 +56,7 @@ class Background:
         except (OSError, ValueError):  # closed meanwhile
             return
         try:
-            sync_file(descriptor)
+            sync_file(descriptor, data=True)
         except OSError as error:
             log.error("%s cannot be made durable: %s", file.path.name, error.strerror)
         finally:
