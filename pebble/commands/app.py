@@ -6,7 +6,7 @@ import logging
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Annotated, Any, Final
+from typing import Annotated, Any, Final
 
 import typer
 from typer.core import TyperCommand, TyperGroup
@@ -16,16 +16,13 @@ from pebble.extension import Command as Offered
 from pebble.extension import Extension, ours, packages, part, refuse_claims
 from pebble.version import __version__
 
-if TYPE_CHECKING:
-    from pebble.commands.completion import Command
-
 #: Ours that are of no extension.
 _CORE: Final = {
     "up": Offered("pebble.commands.up:up", "run a robot", "own", 20),
     "check": Offered("pebble.commands.check:check", "validate configs and summarise them", "own", 30),
 }
 #: What a wrong command line raises: typer 0.27 has no public name for all of it.
-_WRONG: Final = getattr(typer, "TyperException", typer.BadParameter.__base__)
+_WRONG: Any = getattr(typer, "TyperException", typer.BadParameter.__base__)
 #: The headings of the help, in their order; other packages' commands stand last.
 _GROUPS: Final = ("use", "own", "write", "share", "measure", "more")
 
@@ -54,7 +51,7 @@ def run(arguments: list[str]) -> int:
         return _run(arguments)
 
 
-def application(words: Sequence[str] = ()) -> Command:
+def application(words: Sequence[str] = ()) -> Any:
     """Build the command line for such words; what is below a command is imported when it is needed."""
     app = typer.Typer(cls=_Pebble, rich_markup_mode=None)
     app.callback()(_options)
@@ -100,8 +97,8 @@ class _Listed(TyperCommand):
             complete_values(command)
         return command.make_context(info_name, args, parent, **extra)
 
-    def _command(self, arguments: list[str]) -> Command:
-        below: dict[str, Command] = {
+    def _command(self, arguments: list[str]) -> Any:
+        below: dict[str, Any] = {
             words.split()[1]: _Listed(words, self._offered)
             for words in self._offered
             if words.startswith(f"{self._words} ")

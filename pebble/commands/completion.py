@@ -7,14 +7,13 @@ from collections.abc import Callable, Iterator
 from functools import partial
 from itertools import islice
 from pathlib import Path
-from typing import Final, NamedTuple, TypeAlias
+from typing import Any, Final, NamedTuple
 
 from typer import Context
-from typer.core import TyperCommand, TyperGroup
+from typer.core import TyperGroup
 
 from pebble.extension import ours, part
 
-Command: TypeAlias = TyperCommand | TyperGroup
 _PLACES = (Path(), Path("/etc/pebble"))
 _FILES = 200  # that are looked into
 _LONGEST = 1_000_000  # bytes of a config
@@ -28,13 +27,13 @@ class Completion(NamedTuple):
     help: str | None = None
 
 
-def complete_values(command: Command) -> None:
+def complete_values(command: Any) -> None:
     """Let a command, and those below it, complete the values of arguments and options that ``VALUES`` has."""
     for parameter in command.params:
         name = parameter.metavar or ""
         added = next((one.completions[name] for one in ours() if name in one.completions), "")
         if values := part(added) if added else VALUES.get(name):
-            parameter.shell_complete = partial(_items, values)  # type: ignore[method-assign]
+            parameter.shell_complete = partial(_items, values)
     for below in command.commands.values() if isinstance(command, TyperGroup) else ():
         complete_values(below)
 
