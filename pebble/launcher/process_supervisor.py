@@ -271,6 +271,7 @@ class ProcessSupervisor:
         was_in_crash_loop = self.policy.in_crash_loop
         wait_s = self.policy.exited(self._reactor.now(), how)
         self._start_in(wait_s)
+        self._reactor.after(LOOP_WINDOW_S + 1.0, self._on_change)  # then this exit is not of the last minute any more
         name = self.program.name
         times = self.policy.exits_within_a_minute(self._reactor.now())
         if not self.policy.in_crash_loop:
