@@ -258,3 +258,12 @@ class AmqttBroker:
             self._process.kill()
             self._process.wait(10)
             self._process = None
+
+
+def refused(number: int) -> Callable[..., Any]:
+    """Return a call that a file system refuses with this error."""
+
+    def refuse(*_arguments: Any) -> None:
+        raise OSError(number, os.strerror(number))
+
+    return refuse

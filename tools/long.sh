@@ -19,12 +19,13 @@ make long PART=brokers    install NATS, RabbitMQ and aedes where possible, test 
 make long PART=gstreamer  install GStreamer and OpenCV, and have them read the original's local media, three minutes
 make long PART=firmware   measure the firmware's use of each board's memory in the real MicroPython
 make long PART=life       install, update, damage and remove packages on machines with a real systemd; root, 15 minutes
+make long PART=lowest     core, films, Foxglove and the demo with the lowest versions that pyproject.toml admits, ten minutes
 make long PART=packages   known vulnerabilities of all packages, from OSV, and build/sbom.cdx.json
 END
 }
 
 case "$1" in
-stops | soak | schedules | fleet | brokers | gstreamer | life) debian mosquitto=mosquitto ;;
+stops | soak | schedules | fleet | brokers | gstreamer | life | lowest) debian mosquitto=mosquitto ;;
 page) debian mosquitto=mosquitto chromium=chromium ;;
 looks) debian chromium=chromium ;;
 esac
@@ -62,6 +63,23 @@ life)
         cp .venv/robot.txt .venv/wheels/robot.txt
     }
     tests --timeout=900 -ra tests/configs/test_slot.py tests/ext/install/update tests/ext/install/life
+    ;;
+lowest)
+    sh tools/setup.sh tools
+    tool -m uv pip compile --no-config --quiet --resolution lowest-direct --all-extras --no-header --no-annotate \
+        --python "$python" --output-file .venv/lowest.txt pyproject.toml
+    tool -m uv venv --no-config --quiet --clear --python "$python" .venv/lowest
+    in_lowest() { tool -m uv pip install --no-config --quiet --python .venv/lowest/bin/python "$@"; }
+    in_lowest --requirement .venv/lowest.txt
+    in_lowest --no-deps --no-build-isolation --editable .
+    .venv/lowest/bin/lint-imports --no-logo
+    python=.venv/lowest/bin/python
+    $python tools/imports.py
+    # Other versions of msgspec list the alternatives of a schema in another order.
+    $python -m pytest --workers 4 -m "not page and not thorough" --ignore tests/ext \
+        --deselect tests/config/test_schema.py::test_the_schema_is_up_to_date tests
+    $python -m pytest --workers 2 -m "not page and not thorough" tests/ext/recordings tests/ext/foxglove tests/ext/operator
+    $python -m pebble.cli demo --seconds 26
     ;;
 packages)
     sh tools/setup.sh tools

@@ -94,9 +94,11 @@ class FileLock:
             descriptor = _open_lock(path)
             try:
                 fcntl.flock(descriptor, how)
-            except BlockingIOError:
+            except OSError as error:
                 os.close(descriptor)
-                raise
+                if isinstance(error, BlockingIOError):
+                    raise
+                raise _no_lock(path, error) from None
             if _is_at(path, descriptor):
                 return cls(path, descriptor)
             os.close(descriptor)  # removed between open and flock
@@ -187,10 +189,13 @@ def _open_lock(path: Path) -> int:
     try:
         return os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o600)
     except OSError as error:
-        remedy = "remove it" if os.path.lexists(path) else "make room there"
-        raise TransportError(
-            f"{path} cannot be locked: {error.strerror}; {remedy}, or set transport.run_dir to another folder"
-        ) from None
+        remedy = "remove it, or " if os.path.lexists(path) else "make room there, or "
+        raise _no_lock(path, error, remedy) from None
+
+
+def _no_lock(path: Path, error: OSError, remedy: str = "") -> TransportError:
+    text = f"{path} cannot be locked: {error.strerror}; {remedy}set transport.run_dir to another folder"
+    return TransportError(text)
 
 
 def _owner_if_running(path: Path) -> str | None:
@@ -201,7 +206,7 @@ def _owner_if_running(path: Path) -> str | None:
         return None
     try:
         fcntl.flock(descriptor, fcntl.LOCK_SH | fcntl.LOCK_NB)
-    except BlockingIOError:
+    except OSError:  # it runs; or there are no locks here, and nothing of it may be removed
         text = os.pread(descriptor, _OWNER_BYTES, 0)
         return (text.strip(b"\0") or (text[:1] and b"?")).decode(errors="replace")
     else:

@@ -25,8 +25,8 @@ def _command_of(process: int) -> str:
     """Return its command, safe to print: a process may choose any bytes."""
     try:
         words = Path(f"/proc/{process}/cmdline").read_text(encoding="utf-8", errors="replace")
-    except OSError:
-        return "its command is hidden from this user"
+    except OSError as error:
+        return f"its command cannot be seen: {error.strerror}"
     return ascii(words.replace("\0", " ").strip()[:_SHOWN])
 
 

@@ -6,7 +6,7 @@ import logging
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Annotated, Any, Final
+from typing import Annotated, Any, Final
 
 import typer
 from typer.core import TyperCommand, TyperGroup
@@ -16,10 +16,6 @@ from pebble.extension import Command as Offered
 from pebble.extension import Extension, ours, packages, part, refuse_claims
 from pebble.version import __version__
 
-if TYPE_CHECKING:
-    from typer._click.core import Command, Context
-    from typer._click.formatting import HelpFormatter
-
 log = logging.getLogger(__name__)
 
 #: Ours that are of no extension.
@@ -27,6 +23,8 @@ _CORE: Final = {
     "up": Offered("pebble.commands.up:up", "run a robot", "own", 20),
     "check": Offered("pebble.commands.check:check", "validate configs and summarise them", "own", 30),
 }
+#: What a wrong command line raises: typer 0.27 has no public name for all of it.
+_WRONG: Any = getattr(typer, "TyperException", typer.BadParameter.__base__)
 #: The headings of the help, in their order; other packages' commands stand last.
 _GROUPS: Final = ("use", "own", "write", "share", "measure", "more")
 
@@ -61,7 +59,7 @@ def run(arguments: list[str]) -> int:
         return _run(arguments)
 
 
-def application(words: Sequence[str] = ()) -> Command:
+def application(words: Sequence[str] = ()) -> Any:
     """Build the command line for such words; what is below a command is imported when it is needed."""
     app = typer.Typer(cls=_Pebble, rich_markup_mode=None)
     app.callback()(_options)
@@ -81,7 +79,7 @@ class _Pebble(TyperGroup):
         self._offered = offered
         self.commands = {words: _Listed(words, offered) for words in offered if " " not in words}
 
-    def format_help(self, ctx: Context, formatter: HelpFormatter) -> None:
+    def format_help(self, ctx: Any, formatter: Any) -> None:
         formatter.write(
             f"Usage: {ctx.command_path} COMMAND …  (also: --version, COMMAND --help, --install-completion)\n"
         )
@@ -99,7 +97,7 @@ class _Listed(TyperCommand):
         super().__init__(words.split()[-1], help=offered[words].help)
         self._words, self._offered = words, offered
 
-    def make_context(self, info_name: str | None, args: list[str], parent: Context | None = None, **extra: Any) -> Any:
+    def make_context(self, info_name: str | None, args: list[str], parent: Any = None, **extra: Any) -> Any:
         command = self._command(args)
         if extra.get("resilient_parsing"):  # for Tab
             from pebble.commands.completion import complete_values
@@ -107,8 +105,8 @@ class _Listed(TyperCommand):
             complete_values(command)
         return command.make_context(info_name, args, parent, **extra)
 
-    def _command(self, arguments: list[str]) -> Command:
-        below: dict[str, Command] = {
+    def _command(self, arguments: list[str]) -> Any:
+        below: dict[str, Any] = {
             words.split()[1]: _Listed(words, self._offered)
             for words in self._offered
             if words.startswith(f"{self._words} ")
@@ -130,7 +128,7 @@ class _Listed(TyperCommand):
 def _run(arguments: list[str]) -> int:
     try:
         code = application(arguments).main(arguments, prog_name="pebble", standalone_mode=False)
-    except typer.TyperException as error:
+    except _WRONG as error:
         context, message = getattr(error, "ctx", None), error.format_message().rstrip(".")
         if context is not None and message == "Missing command":
             typer.echo(context.get_help())

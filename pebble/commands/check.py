@@ -21,6 +21,7 @@ from pebble.extension import Facts, call, lacking_packages, programs_of
 from pebble.launcher.programs import programs
 from pebble.runtime.addresses import Addresses
 from pebble.runtime.connections import check_connections, tls_settings
+from pebble.runtime.output import console
 from pebble.runtime.process import view_of
 
 SCHEMA = "schema.json"  # in the folder of configs, so `configs/*.json` includes it
@@ -110,21 +111,20 @@ def _check_certificates(config: Config) -> None:
 
 
 def _print(config: Config, path: Path, added: list[Facts]) -> None:
-    from rich.console import Console
     from rich.padding import Padding
     from rich.table import Table
     from rich.text import Text
 
-    console = Console(highlight=False)
+    output = console()
 
     def print_grid(name_style: str, rows: Iterable[tuple[str, ...]], above: int = 1) -> None:
         grid = Table.grid(padding=(0, 2))
         for name, *more in rows:
             grid.add_row(Text(name, style=name_style), *map(Text, more))
         if grid.row_count:
-            console.print(Padding(grid, (above, 0, 0, 2)))
+            output.print(Padding(grid, (above, 0, 0, 2), expand=False))
 
-    console.print(Text.assemble((config.base, "bold"), f"  {path}"))
+    output.print(Text.assemble((config.base, "bold"), f"  {path}"))
     print_grid("dim", facts(config, added), above=0)
     if config.robot.platform == "linux":
         table = Table(box=None, pad_edge=False, header_style="dim", padding=(0, 1, 0, 0))
@@ -141,7 +141,7 @@ def _print(config: Config, path: Path, added: list[Facts]) -> None:
                     str(line.qos),
                     "yes" if line.retained else "",
                 )
-        console.print(Padding(table, (1, 0, 0, 2)))
+        output.print(Padding(table, (1, 0, 0, 2), expand=False))
     print_grid("dim", [tuple(map(shown, line)) for one in added for line in one.table])
     print_grid("yellow", [("warning", warning) for warning in (*config.warnings, *_packages(config))])
 

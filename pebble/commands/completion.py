@@ -7,34 +7,39 @@ from collections.abc import Callable, Iterator
 from functools import partial
 from itertools import islice
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import Any, Final, NamedTuple
 
-from typer._click.shell_completion import CompletionItem
+from typer import Context
 from typer.core import TyperGroup
 
 from pebble.extension import ours, part
-
-if TYPE_CHECKING:
-    from typer._click.core import Command, Context
 
 _PLACES = (Path(), Path("/etc/pebble"))
 _FILES = 200  # that are looked into
 _LONGEST = 1_000_000  # bytes of a config
 
 
-def complete_values(command: Command) -> None:
+class Completion(NamedTuple):
+    """A value, as a shell gets it."""
+
+    value: str
+    type: str = "plain"
+    help: str | None = None
+
+
+def complete_values(command: Any) -> None:
     """Let a command, and those below it, complete the values of arguments and options that ``VALUES`` has."""
     for parameter in command.params:
         name = parameter.metavar or ""
         added = next((one.completions[name] for one in ours() if name in one.completions), "")
         if values := part(added) if added else VALUES.get(name):
-            parameter.shell_complete = partial(_items, values)  # type: ignore[method-assign]
+            parameter.shell_complete = partial(_items, values)
     for below in command.commands.values() if isinstance(command, TyperGroup) else ():
         complete_values(below)
 
 
-def _items(values: Callable[[Context], list[str]], context: Context, incomplete: str) -> list[CompletionItem]:
-    return [CompletionItem(value) for value in values(context) if value.startswith(incomplete)]
+def _items(values: Callable[[Context], list[str]], context: Context, incomplete: str) -> list[Completion]:
+    return [Completion(value) for value in values(context) if value.startswith(incomplete)]
 
 
 def configs(context: Context) -> list[str]:

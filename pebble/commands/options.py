@@ -24,10 +24,11 @@ RobotArgument = Annotated[
     ),
 ]
 UrlOption = Annotated[
-    str | None, typer.Option(help="mqtt://[USER@]HOST[:PORT], mqtts://… or zenoh:RUN_DIR.", metavar="URL")
+    str | None, typer.Option("--url", help="mqtt://[USER@]HOST[:PORT], mqtts://… or zenoh:RUN_DIR.", metavar="URL")
 ]
 BrokerUrl = Annotated[
-    str | None, typer.Option(help="mqtt://[USER@]HOST[:PORT] or mqtts://… of the robots' broker.", metavar="URL")
+    str | None,
+    typer.Option("--url", help="mqtt://[USER@]HOST[:PORT] or mqtts://… of the robots' broker.", metavar="URL"),
 ]
 RemoteOption = Annotated[
     bool, typer.Option("--remote", help="With --config: the operators' remote broker, not the robot's local transport.")

@@ -12,6 +12,7 @@ from pebble.errors import PebbleError
 
 _LABEL = re.compile(r"[A-Za-z0-9_]([A-Za-z0-9_-]{0,61}[A-Za-z0-9_])?").fullmatch  # LANs have names with _
 _NUMBER = re.compile(r"[0-9]+|0[xX][0-9A-Fa-f]*").fullmatch  # as a last label: resolvers take the whole for an address
+_ZONE = re.compile(r"\[([0-9A-Fa-f:.]+)%25([^]]+)\]")  # of a URL, where % is written so (RFC 6874)
 _ZENOH = ("tcp", "tls", "quic", "udp", "ws", "wss")  # protocols whose address is a host and a port
 _RULE = 'must be a name or a whole address, such as "broker.lan" or "192.168.1.7": port, login and tls have own keys'
 
@@ -36,7 +37,7 @@ def host(text: str) -> str:
     if flaw := hidden(text):
         raise HostError(flaw)
     try:
-        return str(IPv6Address(text)) if ":" in text else _name(text)
+        return _address(text) if ":" in text else _name(text)
     except ValueError:
         raise HostError(_RULE) from None
 
@@ -59,6 +60,7 @@ def name_of_page(text: str) -> str:
 
 def endpoint(text: str) -> str:
     """Return a Zenoh endpoint. Raises HostError."""
+    text = _with_zone(text)
     protocol, _, place = text.partition("/")
     if "@" in place:
         raise HostError("holds a login, which Zenoh takes from no endpoint: remove it")
@@ -106,6 +108,7 @@ def split(text: str) -> UrlParts:
         raise HostError(flaw)
     if "://" not in text:
         text = f"//[{text}]" if text.count(":") > 1 and "[" not in text else f"//{text}"
+    text = _with_zone(text)
     try:
         parts = urlsplit(text)
         port = parts.port
@@ -129,6 +132,17 @@ def _only_place(text: str) -> UrlParts:
     if address.scheme or address.rest or address.user is not None:
         raise HostError("must be HOST or HOST:PORT alone")
     return address
+
+
+def _address(text: str) -> str:
+    """Return an IPv6 address, written with or without brackets. Raises ValueError."""
+    bare = text[1:-1] if text.startswith("[") and text.endswith("]") else text
+    return str(IPv6Address(_with_zone(f"[{bare}]")[1:-1]))
+
+
+def _with_zone(text: str) -> str:
+    """Return a text with ``[fe80::1%eth0]`` in place of ``[fe80::1%25eth0]``."""
+    return _ZONE.sub(lambda found: f"[{found[1]}%{unquote(found[2])}]", text)
 
 
 def _name(text: str) -> str:

@@ -359,6 +359,7 @@ class ServiceState(Payload, frozen=True, kw_only=True):
     state: Literal["init", "ready", "restarting", "failed", "stopped", "held"]  # held: it waits while people drive
     restarts: int = 0
     last_exit: str | None = None  # for example "exit code 1" or "signal 9"
+    restarts_per_minute: int | UnsetType = UNSET  # unexpected exits within the last minute, if there were any
 
 
 class Status(Payload, frozen=True, kw_only=True):

@@ -5,7 +5,7 @@ from typing import Any
 
 from msgspec.structs import replace
 
-from pebble.runtime.notes import Local, Mcu, Reach
+from pebble.runtime.notes import OFTEN, Local, Mcu, Reach
 
 _NO, _UNKNOWN, _YES = "no", "unknown", "yes"  # the worst one first
 
@@ -15,7 +15,14 @@ _WORDS = {"init": "starting"}  # of a process's state
 def _shown(mcu: Mcu) -> dict[str, Any]:
     """Return the line as the status has it."""
     age = {} if mcu.silent_ms is None else {"heard_ms": mcu.silent_ms}
-    return {"state": mcu.state, **age, **({"why": mcu.why} if mcu.why else {})}
+    starts = {"starts_per_minute": mcu.starts} if mcu.starts else {}
+    why = mcu.why or _starts(mcu)
+    return {"state": mcu.state, **age, **starts, **({"why": why} if why else {})}
+
+
+def _starts(mcu: Mcu) -> str:
+    times = "once" if mcu.starts == 1 else f"{mcu.starts} times"
+    return f"its board has started again {times} within a minute" if mcu.starts else ""
 
 
 def _drives(mcu: Mcu) -> tuple[str, str]:
@@ -30,6 +37,8 @@ def _drives(mcu: Mcu) -> tuple[str, str]:
             return _NO, "its board has stopped sending: it hangs, or has lost its power"
         case "booting":
             return _UNKNOWN, "its board is starting"
+    if mcu.starts >= OFTEN:
+        return _UNKNOWN, _starts(mcu)
     if mcu.silent_ms is None:
         return _UNKNOWN, mcu.why or "its board has sent nothing yet"
     return (_YES, "") if mcu.silent_ms < 10_000 else (_UNKNOWN, "its board has sent nothing for 10 s")

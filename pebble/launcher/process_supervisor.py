@@ -275,9 +275,12 @@ class ProcessSupervisor:
         was_in_crash_loop = self.policy.in_crash_loop
         wait_s = self.policy.exited(self._reactor.now(), how)
         self._start_in(wait_s)
+        self._reactor.after(LOOP_WINDOW_S + 1.0, self._on_change)  # then this exit is not of the last minute any more
         name = self.program.name
+        times = self.policy.exits_within_a_minute(self._reactor.now())
         if not self.policy.in_crash_loop:
-            log.warning("%s ended (%s): starting it again in %.1f s", name, how, wait_s)
+            often = f", {times} times within a minute" if times >= notes.OFTEN else ""
+            log.warning("%s ended (%s)%s: starting it again in %.1f s", name, how, often, wait_s)
         elif not was_in_crash_loop:
             log.error(
                 "%s ended %d times within %d s, last: %s. Trying again every %d s",

@@ -38,6 +38,10 @@ class RestartPolicy:
         """True if the last exits came faster than another start is worth."""
         return len(self._exits) == LOOP_EXITS and self._exits[-1] - self._exits[0] <= LOOP_WINDOW_S
 
+    def exits_within_a_minute(self, now: float) -> int:
+        """Count unexpected exits, up to those of a crash loop."""
+        return sum(now - at <= LOOP_WINDOW_S for at in self._exits)
+
     def request_delay_s(self, now: float) -> float:
         """Seconds to wait before an on-demand program that was released is started on a new request."""
         return max(0.0, self._started + START_INTERVAL_S - now)

@@ -5,6 +5,8 @@ import time
 from collections.abc import Sequence
 from typing import Any
 
+from msgspec import UNSET
+
 from pebble.config import Config
 from pebble.contract import CAPABILITIES, LOGS, STATUS, Channel, codec
 from pebble.contract.payloads import Capabilities, LogRecord, ServiceState, Status
@@ -123,6 +125,7 @@ class StatusPublisher:
             state="held" if supervisor.held else policy.state,
             restarts=policy.restarts,
             last_exit=policy.last_exit,
+            restarts_per_minute=policy.exits_within_a_minute(self._reactor.now()) or UNSET,
         )
 
     def _publish_capabilities(self) -> None:

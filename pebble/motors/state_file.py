@@ -66,7 +66,9 @@ class StateFile:
             return Unreadable() if value is None else value
         except FileNotFoundError:
             return None
-        except (OSError, ValueError, RecursionError):
+        except (OSError, ValueError, RecursionError) as error:
+            why = getattr(error, "strerror", None) or "it is damaged"
+            self._log.log("unreadable", logging.ERROR, "%s cannot be read: %s", self.path, why)
             return Unreadable()
 
     def appeared(self) -> Any:

@@ -5,6 +5,8 @@ from typing import Annotated, Literal, TypeAlias
 import msgspec
 from msgspec import Meta, Struct
 
+OFTEN = 3  # starts within a minute with which nothing that moves or senses is well, whatever it does in between
+
 _Name: TypeAlias = Annotated[str, Meta(min_length=1, max_length=64)]
 _Why: TypeAlias = Annotated[str, Meta(max_length=200)]
 
@@ -52,6 +54,7 @@ class Mcu(Struct, frozen=True, tag_field="note", tag="mcu"):
     state: Literal["absent", "booting", "ready", "silent"]
     silent_ms: Literal[0, 1000, 10000] | None  # how long ago its board sent, at least; None: never since opening
     why: _Why = ""  # it is absent, or was never heard
+    starts: Annotated[int, Meta(ge=0)] = 0  # how often the board has started again within the last minute
 
 
 class Reach(Struct, frozen=True, tag_field="note", tag="reach"):

@@ -1,7 +1,23 @@
-"""What is left of an output that nobody reads."""
+"""The output of commands: as wide as a terminal, without an end in a pipe, and discarded where nobody reads it."""
+
+from __future__ import annotations
 
 import os
-from typing import TextIO
+import sys
+from typing import TYPE_CHECKING, TextIO
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+_UNFOLDED = 10_000  # columns
+
+
+def console() -> Console:
+    """Return a console for tables. In a pipe no line is folded or cut, unless COLUMNS says how wide it is."""
+    from rich.console import Console
+
+    is_wide = not sys.stdout.isatty() and "COLUMNS" not in os.environ
+    return Console(highlight=False, width=_UNFOLDED if is_wide else None)
 
 
 def discard_output(stream: TextIO) -> None:

@@ -161,9 +161,10 @@ class Notifier:
         """Report whether this process is connected to its siblings. False: the launcher was too busy, repeat it."""
         return self._write(notes.Local(connected, _one_line(why)))
 
-    def mcu(self, state: str, silent_ms: int | None, why: str = "") -> bool:
+    def mcu(self, state: str, silent_ms: int | None, why: str = "", starts: int = 0) -> bool:
         """Report on this process's serial line, as :class:`notes.Mcu` has it. False: repeat it."""
-        return self._write(notes.Mcu(state, silent_ms, _one_line(why)))  # type: ignore[arg-type]  # the launcher checks
+        note = notes.Mcu(state, silent_ms, _one_line(why), starts)  # type: ignore[arg-type]  # the launcher checks
+        return self._write(note)
 
     def reaches(self, owner: str, reached: bool) -> bool:
         """Report whether what a motor owner publishes arrives here. False: the launcher was too busy, repeat it."""

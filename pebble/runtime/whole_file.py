@@ -1,9 +1,17 @@
 """Files that are there whole or not at all, also after a power cut, and may hold secrets."""
 
+import errno
+import logging
 import os
 from pathlib import Path
 
 from pebble.errors import PebbleError
+
+log = logging.getLogger(__name__)
+
+#: Errors of calls that a file system does not have (FAT, SMB, 9p), rather than of a file.
+_NOT_HERE = (errno.EINVAL, errno.ENOSYS, errno.ENOTSUP, errno.EOPNOTSUPP)
+_IN_USE = (errno.EACCES, errno.EPERM, errno.EBUSY, errno.ETXTBSY)  # a mount point, or open where that counts
 
 
 def is_root() -> bool:
@@ -15,7 +23,38 @@ def give_as(new: Path | int, model: Path) -> None:
     """Give a file to the owner of ``model``, if that is there and we are root. Raises OSError."""
     if is_root() and model.exists():
         found = model.stat()
-        os.chown(new, found.st_uid, found.st_gid)
+        _give(new, (found.st_uid, found.st_gid))
+
+
+def _give(file: Path | int, owner: tuple[int, int]) -> None:
+    """Change the owner, but not where all files have that one anyway. Raises OSError."""
+    found = os.stat(file)  # noqa: PTH116
+    if (found.st_uid, found.st_gid) != owner:
+        os.chown(file, *owner)
+
+
+def set_mode(file: Path, mode: int, opened: Path | int | None = None) -> None:
+    """Set who may use ``file``, where its file system has that; else log that others can read it. Raises OSError.
+
+    ``opened`` is what has its content now.
+    """
+    opened = file if opened is None else opened
+    try:
+        os.chmod(opened, mode)  # noqa: PTH101
+    except OSError as error:
+        if error.errno not in (errno.EPERM, *_NOT_HERE):
+            raise
+        if os.stat(opened).st_mode & 0o077 & ~mode:  # noqa: PTH116
+            log.warning("%s: others can read it, which cannot be changed here: %s", file, error.strerror)
+
+
+def sync_file(descriptor: int, *, data: bool = False) -> None:
+    """Make a file durable, or its ``data`` alone, where its file system can. Raises OSError for what is lost."""
+    try:
+        (os.fdatasync if data else os.fsync)(descriptor)
+    except OSError as error:
+        if error.errno not in _NOT_HERE:
+            raise
 
 
 def write(
@@ -35,15 +74,31 @@ def write(
             if owner is None:
                 give_as(open_file, file)
             else:
-                os.chown(open_file, *owner)
-            os.chmod(open_file, mode)  # noqa: PTH101
+                _give(open_file, owner)
+            set_mode(file, mode, open_file)
             output.write(content)
             output.flush()
-            os.fsync(output.fileno())
-        temporary.replace(file)
+            sync_file(output.fileno())
+        try:
+            temporary.replace(file)
+        except OSError as why:
+            if why.errno not in _IN_USE or not file.is_file():
+                raise
+            _write_in_place(file, content, mode)
         sync_folder(file.parent)
     except OSError as why:
         raise error(f"{file}: {why.strerror}") from None
+
+
+def _write_in_place(file: Path, content: bytes, mode: int) -> None:
+    """Write into a file whose name cannot be given to another, as of one in a container's mount. Raises OSError."""
+    with os.fdopen(os.open(file, os.O_WRONLY | getattr(os, "O_NOFOLLOW", 0)), "wb") as output:
+        set_mode(file, mode)
+        output.write(content)
+        output.truncate()
+        output.flush()
+        sync_file(output.fileno())
+    file.with_name(f".{file.name}.new").unlink()
 
 
 def write_new(file: Path, content: bytes) -> None:
@@ -76,6 +131,6 @@ def sync_folder(folder: Path) -> None:
         return
     descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
     try:
-        os.fsync(descriptor)
+        sync_file(descriptor)
     finally:
         os.close(descriptor)

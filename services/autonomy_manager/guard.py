@@ -87,4 +87,6 @@ class Guard:
             fcntl.flock(self._locked, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             return False
+        except OSError as error:  # a file system without locks
+            log.warning("%s cannot be locked: %s", self._path, error.strerror)
         return True

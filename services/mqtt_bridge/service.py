@@ -37,6 +37,7 @@ from pebble.runtime.parent import Notifier
 from pebble.runtime.service import every
 from pebble.runtime.timers import Timer
 from pebble.services.mqtt_bridge.actions import ACTIONS
+from pebble.services.mqtt_bridge.earlier_names import EarlierNames
 from pebble.services.mqtt_bridge.heartbeat import Heartbeat
 from pebble.services.mqtt_bridge.leftovers import Leftovers
 from pebble.services.mqtt_bridge.media import MEDIA
@@ -99,6 +100,9 @@ class MqttBridge(ForwardingService):
         own, sparing = ((), False) if self._uplink is None else ((LINK,), True)
         self._leftovers = Leftovers(self.config.base, self.subjects, self.remote, *own, sparing=sparing)
         self._leftover_timer: Timer | None = None
+        self._earlier_names = EarlierNames(
+            self.config, [self.remote, self.transport], lambda seconds, job: self.call_at(self.clock() + seconds, job)
+        )
         asks = section.remote is None or section.remote.kind == "mqtt"
         self._vouching = Vouching(self.remote, self.clock(), None if asks else self._silence_s)
         self._local_changes = 0  # of the connection
@@ -277,6 +281,7 @@ class MqttBridge(ForwardingService):
             self.forwarder.subscribed(Side.LOCAL)
         self.subscribe_remote()
         self.log.info("forwarding between the robot and its remote side")
+        self._earlier_names.begin()
 
     def found_one_broker(self) -> None:
         self.forward_nothing(CHECK_SOON_S)

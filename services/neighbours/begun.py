@@ -24,8 +24,9 @@ def begin(path: Path, names: Collection[str], name: str, run: int) -> str:
         newest = _decode(path.read_bytes())
     except FileNotFoundError:
         newest = {}
-    except (OSError, msgspec.MsgspecError):
-        return f"{path} cannot be read: delete it while the scripts of other robots are stopped"
+    except (OSError, msgspec.MsgspecError) as error:
+        why = getattr(error, "strerror", None) or "it is damaged"
+        return f"{path} cannot be read ({why}): delete it while the scripts of other robots are stopped"
     if not newer(run, newest.get(name, 0)):
         return "it was ended here: start it again"
     newest = {other: last for other, last in newest.items() if other in names} | {name: run}

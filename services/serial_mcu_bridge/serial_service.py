@@ -11,15 +11,18 @@ from pebble.contract import DRIVE
 from pebble.contract.payloads import Drive
 from pebble.contract.serial_protocols import SERIAL_PROTOCOLS
 from pebble.errors import ConfigError, DeviceError
+from pebble.runtime.notes import OFTEN
 from pebble.runtime.parent import Notifier, Reported
 from pebble.runtime.rate_limit import RateLimitedLog
 from pebble.runtime.service import Service, every
 from pebble.services.serial_mcu_bridge.line.serial_line import LineState, SerialLine
 from pebble.services.serial_mcu_bridge.line.silence import CHECK_S, Silence
+from pebble.services.serial_mcu_bridge.line.starts import Starts
 from pebble.services.serial_mcu_bridge.moving_sensors import MovingSensors
 from pebble.transports import Subscription
 
 _MISREAD = "what its board sends is not understood: another baud rate or firmware, or noise"
+_WARN_S = 60.0
 _INPUT_LIMIT = 65_536  # bytes waiting for the service's thread; 1.4 s of a full 460,800 baud line
 
 
@@ -41,9 +44,10 @@ class SerialService(Service, ABC):
         self.device_log = RateLimitedLog(self.log, burst=20)
         self._input = bytearray()
         self._input_lock = threading.Lock()
-        self._silence = Silence()
+        self._silence, self._starts = Silence(), Starts()
         self.sensors = MovingSensors()
         self._still = ""  # what was logged of them
+        self._warned_at = float("-inf")  # that the board starts again and again
         self._misread = False
         self._understood = (0, 0)  # which opening of the line, and how often its board was heard since
         self._reported = Reported(Notifier().mcu)
@@ -105,6 +109,16 @@ class SerialService(Service, ABC):
             opened, times = self._understood
             self._understood = self.line.opened, times + 1 if opened == self.line.opened else 1
 
+    def note_start(self) -> None:
+        """The board says that it has started: again, if that is not the first thing heard since the line was opened."""
+        opened, times = self._understood
+        if opened == self.line.opened and times > 1:
+            self._starts.began(time.monotonic())
+
+    def note_clock(self, mcu_ms: int) -> None:
+        """The board's clock shows ``mcu_ms``, of 32 bits."""
+        self._starts.sent(self.line.opened, mcu_ms, time.monotonic())
+
     @every(CHECK_S)
     def report_mcu(self) -> None:
         """Report to the launcher what has changed of the MCU."""
@@ -119,7 +133,13 @@ class SerialService(Service, ABC):
         if still and not self._still:
             self.log.warning("%s", still)
         self._still = still
-        self._reported.report(state, silent_ms, _MISREAD if misread and self._misread else line.problem or still)
+        starts = self._starts.within_a_minute(line.opened, now)
+        problem = _MISREAD if misread and self._misread else line.problem or still
+        self._reported.report(state, silent_ms, problem, starts)
+        if starts >= OFTEN and now - self._warned_at >= _WARN_S:
+            self._warned_at = now
+            text = "the board has started again %d times within a minute: its supply breaks down, or its cable is loose"
+            self.log.warning(text, starts)
         self._misread = misread  # a line may be under way
 
     def _queue_input(self, chunk: bytes) -> None:

@@ -19,6 +19,8 @@ from pebble.services.video_stream.config import VideoStream
     [
         *((same, same) for same in ("broker.example", "mqtt_broker", "7up", "192.0.2.7", "::1", "fe80::1%eth0", "::")),
         ("Broker.LAN.", "Broker.LAN"),
+        ("[::1]", "::1"),
+        *((same, "fe80::1%eth0.5") for same in ("fe80::1%25eth0.5", "[fe80::1%25eth0.5]", "[FE80::1%25eth0%2E5]")),
         ("bröker.example", "xn--brker-kua.example"),
         ("bro\u0308ker.example", "xn--brker-kua.example"),
     ],
@@ -31,9 +33,10 @@ def test_what_is_understood(text: str, host: str) -> None:
     ("text", "instead"),
     [
         *((text, "must be a name or a whole address, such as") for text in (
-            "mqtt://broker.example", "b:1883", "[::1]", "b/", "u:s3cr3t@b", "mqtt://u:s3/cr3t@b", "1883:s3cr3t", "*",
-            "1.2.3", "999.1.1.1", "127.1", "2130706433", "0x7f.1", "010.0.0.1", "a b", "a..b", "-a", ".", "b\\c", "",
-            "/run/m.sock", "u" * 64, "u." * 130, "a,b", "fe80::1%", "straße.example", "\uff11\uff12\uff17.0.0.1",
+            "mqtt://broker.example", "b:1883", "[b]", "[::1]:1883", "b/", "u:s3cr3t@b", "mqtt://u:s3/cr3t@b",
+            "1883:s3cr3t", "*", "1.2.3", "999.1.1.1", "127.1", "2130706433", "0x7f.1", "010.0.0.1", "a b", "a..b",
+            "-a", ".", "b\\c", "", "/run/m.sock", "u" * 64, "u." * 130, "a,b", "fe80::1%", "straße.example",
+            "\uff11\uff12\uff17.0.0.1",
         )),
         ("fe80::1", 'names no network card: write "fe80::1%eth0"'),
         *((text, "starts or ends with a blank") for text in ("b ", " b")),

@@ -25,6 +25,11 @@ CASES = {
         {"board": (OWNER, Mcu("silent", 10000))},
         "no serial: its board has stopped sending: it hangs, or has lost its power",
     ),
+    "starts again and again": (
+        {"board": (OWNER, Mcu("ready", 0, "", 3))},
+        "unknown serial: its board has started again 3 times within a minute",
+    ),
+    "started again twice": ({"board": (OWNER, Mcu("ready", 0, "", 2))}, "yes"),
     "booting": ({"board": (OWNER, Mcu("booting", None))}, "unknown serial: its board is starting"),
     "never heard": ({"board": (OWNER, Mcu("ready", None))}, "unknown serial: its board has sent nothing yet"),
     "silent by design": (

@@ -48,7 +48,8 @@ def test_an_unplugged_board_is_named_everywhere_until_it_is_back(rig: Rig) -> No
     assert f"serial: cannot open {rig.mcu.port}" in " ".join(pebble("estop", "status", rig.config, "--remote").split())
     rig.mcu.command("replug")  # type: ignore[attr-defined]
     assert shows(rig, "yes")
-    assert _mcu(rig) == {"state": "ready", "heard_ms": 0}
+    again = {"starts_per_minute": 1, "why": "its board has started again once within a minute"}
+    assert _mcu(rig) == {"state": "ready", "heard_ms": 0, **again}
 
 
 def test_siblings_that_do_not_reach_each_other_are_noticed_until_they_do() -> None:

@@ -14,6 +14,7 @@ from pebble.transports import ZenohSettings, create
 from pebble.transports.frames import FrameReader, FrameWriter
 from pebble.transports.peers import FileLock, PeerRegistry, prepare_run_dir
 from pebble.transports.zenoh.hub import ZenohHub
+from tests.support import refused
 
 
 def test_newcomers_are_connected_to_at_once_and_waited_for_when_ready(tmp_path: Path) -> None:
@@ -103,6 +104,13 @@ def test_a_lock_that_cannot_be_made_is_one_line_with_a_remedy(tmp_path: Path) ->
         FileLock.take(tmp_path / "lock")
     with pytest.raises(TransportError, match="File name too long; make room there, or set "):
         FileLock.take(tmp_path / ("x" * 300))
+
+
+def test_where_there_are_no_locks_the_reason_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("fcntl.flock", refused(errno.ENOLCK))
+    for take in (FileLock.take, FileLock.wait):
+        with pytest.raises(TransportError, match="cannot be locked: No locks available; set "):
+            take(tmp_path / "lock")
 
 
 def test_a_presence_that_was_released_stays_so(tmp_path: Path) -> None:

@@ -52,7 +52,8 @@ class TlsLateError(TimeoutError):
 def begin_tls(plain: socket.socket, opening: Opening) -> ssl.SSLSocket:
     """Returns a socket that does not block; takes ``plain`` and closes it if it fails. Raises OSError."""
     assert opening.context is not None  # noqa: S101 - else there is no TLS
-    sock = opening.context.wrap_socket(plain, server_hostname=opening.settings.host, do_handshake_on_connect=False)
+    name = opening.settings.host.partition("%")[0]  # certificates have addresses without a network card
+    sock = opening.context.wrap_socket(plain, server_hostname=name, do_handshake_on_connect=False)
     try:
         sock.setblocking(False)
         _shake_hands(sock, opening.patience_s)

@@ -6,6 +6,7 @@ Zenoh's defaults are not used: they listen on all interfaces and join multicast 
 import json
 import os
 import signal
+import socket
 import threading
 import weakref
 from pathlib import Path
@@ -44,8 +45,18 @@ class _Closable(Protocol):
     def close(self) -> None: ...
 
 
-def unix_endpoint(socket: Path) -> str:
-    return f"unixsock-stream/{socket}"
+def unix_endpoint(path: Path) -> str:
+    return f"unixsock-stream/{path}"
+
+
+def _numbered(endpoint: str) -> str:
+    """Return an endpoint with the number of a network card in place of its name, which Zenoh does not know."""
+    start, zone, rest = endpoint.partition("%")
+    name, bracket, port = rest.partition("]")
+    try:
+        return f"{start}%{socket.if_nametoindex(name)}]{port}" if zone and bracket else endpoint
+    except OSError:  # it is a number, or there is no such card, as Zenoh says
+        return endpoint
 
 
 def session_config(
@@ -91,8 +102,8 @@ def close_session(session: zenoh.Session) -> None:
 def _config(settings: ZenohSettings, mode: str, listen: list[Path], connect: list[Path]) -> dict[str, Any]:
     return {
         "mode": mode,
-        "listen": {"endpoints": [*map(unix_endpoint, listen), *settings.listen]},
-        "connect": {"endpoints": [*map(unix_endpoint, connect), *settings.connect], "retry": _RETRY},
+        "listen": {"endpoints": [*map(unix_endpoint, listen), *map(_numbered, settings.listen)]},
+        "connect": {"endpoints": [*map(unix_endpoint, connect), *map(_numbered, settings.connect)], "retry": _RETRY},
         # How long a router or peer waits for scouting before open() returns; 500 ms by default.
         # Gossip would announce our unix sockets to programs connected by TLS: on one machine, one connection between
         # two robots made all their processes connect to each other, without TLS. Every process connects to every

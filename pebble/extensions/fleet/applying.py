@@ -11,7 +11,7 @@ from pathlib import Path
 from pebble.extensions.fleet import broker_files, certificates
 from pebble.extensions.fleet.as_owner import as_before
 from pebble.extensions.fleet.folder import ACL, CONF, PASSWORDS, PID, ZENOH, Fleet, FleetError, Server, save
-from pebble.runtime.whole_file import is_root, write
+from pebble.runtime.whole_file import is_root, set_mode, write
 
 _LOOPBACK = "127.0.0.1"
 _PLUGIN = "dynamic_security"  # in the name of its library
@@ -28,7 +28,7 @@ def make(folder: Path, fleet: Fleet, passwords: Mapping[str, str] | None = None,
         raise FleetError(f"{folder / CONF} exists already: name another folder")
     server = fleet.brokers[0]
     certificates.init(folder, [*names_of(server), *others])
-    folder.chmod(0o700)
+    set_mode(folder, 0o700)
     write_rules(folder, fleet, {name: broker_files.hashed(password) for name, password in (passwords or {}).items()})
     if not server.included:
         write_conf(folder, fleet)

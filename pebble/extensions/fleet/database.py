@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from pebble.errors import PebbleError
-from pebble.runtime.whole_file import give_as
+from pebble.runtime.whole_file import give_as, set_mode
 from pebble.transports.own_file import OwnFile
 
 _BUSY_S = 5.0  # another process may be writing
@@ -110,7 +110,7 @@ def _connection(path: Path | None, tables: str) -> sqlite3.Connection:
     if path is not None:
         if path.is_dir():
             raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
-        path.chmod(0o600)
+        set_mode(path, 0o600)
     where = ":memory:" if path is None else str(path)
     connection = sqlite3.connect(where, timeout=_BUSY_S, isolation_level=None, check_same_thread=False)
     connection.execute("PRAGMA journal_mode = WAL")

@@ -1,5 +1,6 @@
 """The folder of one broker, and `fleet.json` in it: who has an account, as what. There is no secret in that file."""
 
+import logging
 import os
 import re
 from collections.abc import Iterator, Sequence
@@ -16,6 +17,8 @@ from pebble.contract.names import NAME
 from pebble.errors import ConfigError, PebbleError
 from pebble.extensions.fleet.roles import GATEWAYS, Account, Extra, ProgramRole, Right, Rule, add_up, covered, rules
 from pebble.runtime.whole_file import write
+
+log = logging.getLogger(__name__)
 
 FLEET, CONF, PID, ACL, PASSWORDS = "fleet.json", "mosquitto.conf", "mosquitto.pid", "acl", "passwords"
 ZENOH = "zenoh.json"
@@ -154,7 +157,10 @@ def locked(folder: Path) -> Iterator[None]:
     try:
         import fcntl  # the command explains itself where there is none
 
-        fcntl.flock(descriptor, fcntl.LOCK_EX)
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX)
+        except OSError as error:
+            log.warning("%s cannot be locked (%s): let no other command change it meanwhile", folder, error.strerror)
         yield
     finally:
         os.close(descriptor)

@@ -23,6 +23,7 @@ from pebble.extensions.fleet.row_writer import OF_STRANGERS, Row, RowWriter
 from pebble.forwarding.observer import ROBOT, Observer
 from pebble.forwarding.routing import Drop
 from pebble.motion.lease import shown
+from pebble.runtime.whole_file import sync_file
 from pebble.version import __version__
 
 _UNCHECKED = "?"  # behind a name that the broker has not checked
@@ -131,7 +132,7 @@ class Audit(Observer):
                 lines = b"\n" + lines
             if os.write(file, lines) != len(lines):
                 raise OSError(errno.ENOSPC, "No space left on device")
-            os.fdatasync(file)
+            sync_file(file, data=True)
         except OSError:
             os.ftruncate(file, size)
             raise

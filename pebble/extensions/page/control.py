@@ -369,7 +369,7 @@ class Control:
             await self._websocket.close(4001)
 
     def _ping(self) -> m.Ping:
-        round_trip = self._tab.clock.round_trip_s
+        round_trip = self._tab.clock.shown_round_trip_s
         number = self._tab.clock.ping(clock())
         return m.Ping(n=number, now=1000 * time.time(), round_trip_ms=-1 if round_trip is None else 1000 * round_trip)
 

@@ -238,7 +238,7 @@ class Welcome(_ToPage, frozen=True, kw_only=True, tag="welcome"):
 
 
 class Ping(_ToPage, frozen=True, kw_only=True, tag="ping"):
-    """Twice a second. ``round_trip_ms`` is that of the last one; -1: not known yet."""
+    """Twice a second. ``round_trip_ms`` is what the newest took; -1: not known yet."""
 
     n: int
     now: float

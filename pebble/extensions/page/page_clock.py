@@ -16,6 +16,7 @@ _ECHO_S = 1.0  # without an echo for so long nothing is known any more
 _JUMP_S = 1.0
 _ANSWERS = 20  # ten seconds of them: clocks drift apart by less than a millisecond
 _UNANSWERED = 32
+_JUDGED = 4  # answers by which people are told that a connection is slow
 
 
 class ClockJumpError(PebbleError):
@@ -31,6 +32,14 @@ class PageClock:
         self._sent: dict[int, float] = {}
         self._echoed_at = float("-inf")
         self._bounds: deque[tuple[float, float, float]] = deque(maxlen=_ANSWERS)  # of the offset, and the round trip
+
+    @property
+    def shown_round_trip_s(self) -> float | None:
+        """The second longest of the newest four: one slow answer is no slow connection. The last one if it is late."""
+        if self.round_trip_s is None or self.round_trip_s >= LATE_S:
+            return self.round_trip_s
+        newest = sorted(round_trip for _, _, round_trip in list(self._bounds)[-_JUDGED:])
+        return newest[-2:][0]
 
     def ping(self, now: float) -> int:
         if len(self._sent) >= _UNANSWERED:

@@ -10,7 +10,7 @@ from typing import Any, Final
 from pebble.config.visible import shown
 from pebble.extensions.recordings.files.reader import DAMAGE, RecordingFile, missing_before
 from pebble.extensions.recordings.files.recorded import Channel, Recorded, RecordingError
-from pebble.extensions.recordings.library import ACTIVE, merged, robot_of
+from pebble.extensions.recordings.library import ACTIVE, FOREVER_NS, merged, robot_of
 from pebble.extensions.recordings.recorder.intake import EVENTS
 from pebble.transports.topics import matches
 
@@ -41,16 +41,20 @@ class FileInfo:
         return self.path.name.endswith(ACTIVE)
 
 
-def look_at(path: Path, *, whole: bool = False) -> FileInfo:
-    """What a file holds, by its summary; one without, or ``whole``, is read completely. Raises RecordingError."""
+def look_at(path: Path, *, whole: bool = False, since_ns: int = 0, until_ns: int = FOREVER_NS) -> FileInfo:
+    """What a file holds, by its summary; one without, or ``whole``, is read completely. Raises RecordingError.
+
+    Only messages from ``since_ns`` to before ``until_ns`` count.
+    """
     try:
         size = path.stat().st_size
     except OSError as error:
         raise RecordingError(f"{path}: {error.strerror}") from None
     info = FileInfo(path, size)
     with RecordingFile(path) as file:
-        if file.statistics is None or whole:
-            _read_all(info, file)
+        is_inside = not file.chunks or (file.first_ns >= since_ns and file.last_ns < until_ns)
+        if file.statistics is None or whole or not is_inside:
+            _read_all(info, file, since_ns, until_ns)
         else:
             _take_over(info, file)
         metadata = file.metadata()
@@ -70,11 +74,14 @@ def _take_over(info: FileInfo, file: RecordingFile) -> None:
             counted.message_end_time,
         )
         for number, count in counted.channel_message_counts.items():
-            _count(info, file.channels[number], count)
+            if count:
+                _count(info, file.channels[number], count)
 
 
-def _read_all(info: FileInfo, file: RecordingFile) -> None:
-    for message in file.read():
+def _read_all(info: FileInfo, file: RecordingFile, since_ns: int, until_ns: int) -> None:
+    for message in file.read(since_ns=since_ns, until_ns=until_ns):
+        if not since_ns <= message.log_ns < until_ns:
+            continue
         info.first_ns = message.log_ns if not info.messages else info.first_ns
         info.last_ns = message.log_ns
         info.messages += 1

@@ -4,6 +4,7 @@ from collections.abc import Iterable, Iterator
 from functools import partial
 from pathlib import Path
 
+from pebble.contract.identity import parse_topic
 from pebble.extensions.recordings.files.reader import Chooses, RecordingFile, in_time_order
 from pebble.extensions.recordings.files.recorded import ACTIVE as ACTIVE
 from pebble.extensions.recordings.files.recorded import FOREVER_NS as FOREVER_NS
@@ -100,5 +101,5 @@ def robot_of(channel: Channel) -> str | None:
 
 
 def robot_in(topic: str) -> str | None:
-    levels = topic.split("/", 4)
-    return "/".join(levels[:3]) if len(levels) == 5 and levels[3] in ("incoming", "outgoing") else None
+    parsed = parse_topic(topic)
+    return None if parsed is None else parsed.identity.base

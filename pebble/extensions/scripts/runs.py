@@ -16,6 +16,7 @@ from pebble.config import Config
 from pebble.contract.payloads import LAST_RUN
 from pebble.errors import PebbleError
 from pebble.motion.arbiter import newer
+from pebble.runtime.whole_file import sync_file
 
 log = logging.getLogger(__name__)
 
@@ -66,8 +67,10 @@ class LocalScripts:
             return
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
+        except OSError as error:
             os.close(file)
+            if not isinstance(error, BlockingIOError):
+                log.warning("%s cannot be locked (%s): no neighbour drives", self._path, error.strerror)
             yield False
             return
         try:
@@ -109,7 +112,7 @@ def _next(path: Path, barred: int, wall_clock: Callable[[], float], received: in
         _lock(file, path)
         number = _above(barred, received, _read(file, path, wall_clock))
         os.pwrite(file, f"{number:0{_DIGITS}d}\n".encode(), 0)
-        os.fsync(file)
+        sync_file(file)
     except OSError as error:
         log.warning("%s cannot be written (%s): the run's number is made from the clock", path, error.strerror)
         number = _above(barred, received, _from_clock(wall_clock))

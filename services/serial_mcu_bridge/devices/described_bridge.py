@@ -99,6 +99,8 @@ class DescribedBridge(SerialService):
         before = self._session.frames
         self._handle_events(self._session.feed(chunk, self.clock()))
         self.note_report(self._session.frames != before)
+        if self._session.frames != before and self._session.mcu_ms is not None:
+            self.note_clock(self._session.mcu_ms)
         self._arm()
 
     @every(_WATCH_S)

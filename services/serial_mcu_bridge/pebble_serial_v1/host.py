@@ -117,6 +117,7 @@ class Session:
         """``base`` is what the robot's topics begin with."""
         self.manifest: Manifest | None = None
         self.frames = 0  # valid ones from a device
+        self.mcu_ms: int | None = None  # what its clock showed when it sent something of its own accord
         self._base = base
         self._splitter = LineSplitter(FRAME_LIMIT, END)
         self._too_long = 0
@@ -196,6 +197,8 @@ class Session:
             self._received_at = now
             yield from self._understand(frame, now)
             self.frames += 1
+            if frame.type in (Type.HELLO, Type.SAMPLE, Type.STATE):
+                self.mcu_ms = frame.timestamp
         except FrameError as error:
             yield RefusedInput(error.subject, str(error))
         except PayloadError as error:

@@ -16,11 +16,12 @@ from pebble.services.serial_mcu_bridge.text.device_log import DeviceLogLine, pri
 
 SHORTEST_FLASH_S, LONGEST_FLASH_S = 0.05, 3600.0  # one full fade in and out
 
+STARTED = "Done!"  # the first word of what a board logs when it has started
 _HALL_NAMES = (b"a0", b"a1", b"a2")  # Goob's
 _TOUCH_NAMES = (_HALL_NAMES, (b"t0", b"t1", b"t2"))  # Fred's
 _INTEGER = re.compile(rb"[+-]?[0-9]{1,6}\Z")  # an ADC has at most 16 bits
 _DECIMAL = re.compile(rb"[+-]?[0-9]{1,6}(?:\.[0-9]{0,9})?\Z")  # what printf("%.3f") makes; never nan or inf
-_LEVELS = {b"OK": logging.DEBUG, b"WARN": logging.WARNING, b"ERR": logging.ERROR, b"Done!": logging.INFO}
+_LEVELS = {b"OK": logging.DEBUG, b"WARN": logging.WARNING, b"ERR": logging.ERROR, STARTED.encode(): logging.INFO}
 
 
 @dataclass(frozen=True, slots=True)

@@ -62,6 +62,7 @@ class ImuBridge(SerialService):
             case Motion(number, mcu_ms, values):
                 self._watchdog.sample(self.clock())
                 self.sensors.take(measured(values), self.clock())
+                self.note_clock(mcu_ms)
                 self.publish(IMU_FAST, self._reports.motion(now_ms, number, mcu_ms, values))
             case Summary(number, mcu_ms, values):
                 summary = self._reports.summary(now_ms, number, mcu_ms, values)

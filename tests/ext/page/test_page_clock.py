@@ -115,3 +115,20 @@ def test_an_echo_of_no_ping_is_ignored() -> None:
     page.clock.echo(999, 0.0, page.now)
     page.clock.echo(1, 0.0, page.now)
     assert not page.late(0.003)
+
+
+@pytest.mark.parametrize(
+    ("took", "shown"),
+    [
+        ([0.1, 0.1, 0.5, 0.1], 0.1),  # one slow answer
+        ([0.29, 0.31, 0.29, 0.31], 0.31),  # at the limit it does not change
+        ([0.31, 0.29, 0.31, 0.29], 0.31),
+        ([0.5, 0.5, 0.1, 0.1, 0.1], 0.1),
+        ([0.1, 0.1, 0.7], 0.7),  # late: commands are refused
+    ],
+)
+def test_people_are_told_of_a_connection_that_stays_slow(took: list[float], shown: float) -> None:
+    page = Page(0.0, 0.0)
+    for page.up in took:
+        page.ping()
+    assert page.clock.shown_round_trip_s == pytest.approx(shown)

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import errno
 import json
+import os
 import re
 from pathlib import Path
 
@@ -14,6 +16,7 @@ from pebble.extensions.recordings.recorder.recorder import Recorder
 from pebble.extensions.recordings.recorder.settings import Options
 from tests.commands.command_line import Run
 from tests.ext.recordings.messages import START_NS
+from tests.support import refused
 
 GOOB, FRED = "pebble/robots/goob", "pebble/robots/fred"
 
@@ -45,6 +48,26 @@ def test_list_and_info(folder: Path, run: Run) -> None:
     assert "pebble/robots/goob: 101 messages" in run.out
     assert "100  outgoing/online" in run.out
     assert "gap: why no connection, lasted 60.0 s" in run.out
+
+
+def test_info_counts_what_is_in_the_period(folder: Path, run: Run) -> None:
+    assert run("recordings", "info", folder, "--since", "2000-01-01", "--until", "2000-01-02") == 0
+    assert "goob" not in run.out
+    topics = "a/b/c/outgoing/", "/b/c/outgoing/online", "a/b/c/outgoing/online"
+    with (folder / "other.mcap").open("wb", buffering=0) as file:
+        writer = RecordingWriter(file, library="other")
+        for topic in topics:
+            writer.add(writer.channel(topic, "json", {}), START_NS, b"{}")
+        writer.channel("a/b/unused/outgoing/online", "json", {})
+        writer.finish()
+    assert run("recordings", "info", folder / "other.mcap") == 0
+    assert re.findall(r"^(\S+): 1 messages", run.out, re.M) == ["a/b/c"]
+
+
+def test_a_period_is_shown_before_it_is_deleted(folder: Path, run: Run) -> None:
+    period = ("--since", "2026-07-01 10:00 UTC", "--until", "+1h")
+    assert run("recordings", "rm", folder, *period, "--yes") == 0
+    assert "2026-07-01 10:00:00 UTC to 2026-07-01 11:00:00 UTC" in run.out
 
 
 def test_search(folder: Path, run: Run) -> None:
@@ -93,6 +116,25 @@ def test_what_a_recorder_uses_is_left_alone(folder: Path, run: Run) -> None:
     finally:
         recorder.stop()
     assert messages(folder) == 201
+
+
+@pytest.mark.parametrize("number", [errno.ENOLCK, errno.EOPNOTSUPP])
+def test_a_share_without_locks_is_recorded_to(
+    folder: Path, run: Run, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, number: int
+) -> None:
+    left = folder / "2026/11/20/20261120T232921Z-000999.state.mcap.active"
+    left.parent.mkdir(parents=True, exist_ok=True)
+    left.write_bytes(b"")
+    monkeypatch.setattr("fcntl.flock", refused(number))
+    recorder = Recorder(folder, Options(free_bytes=0))
+    recorder.start()
+    recorder.receive(f"{GOOB}/outgoing/online", b'{"t":1}', 1, retain=False)
+    recorder.stop()
+    assert f"recorder.lock cannot be locked ({os.strerror(number)})" in caplog.text
+    assert (messages(folder), left.exists()) == (202, True)  # what may be another recorder's stays
+    assert run("recordings", "rm", left, "--yes") == 1
+    assert run("recordings", "rm", folder, "--robot", "fred", "--yes") == 1
+    assert messages(folder) == 102
 
 
 READING = [

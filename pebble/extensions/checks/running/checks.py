@@ -17,11 +17,13 @@ from pebble.extensions.operator.client.names import id_of
 from pebble.extensions.operator.client.robot_topics import section_of
 from pebble.launcher.capabilities import capabilities as expected_capabilities
 from pebble.runtime.addresses import Addresses
+from pebble.runtime.notes import OFTEN
 
 _IN_A_ROW = 10  # heartbeats in a row
 _LONGEST_GAP = 2.5  # times the interval that its config has
 _JUDGED_S = 6.0  # motor owners repeat every 5 s what the others must receive of them
 _VOLTS_S = 6.0  # boards report it every five seconds
+_LOW_S = 2 * _VOLTS_S  # one reading is no empty battery
 _LEAST_CELL_V = 3.4  # of a lithium cell: below, a robot has minutes
 _SHOWN = 5  # names in one line
 _LOG = "journalctl -u pebble -n 50"
@@ -62,7 +64,15 @@ def processes(robot: RobotUnderTest) -> CheckResult:
         return failed(why, "sudo systemctl start pebble, or pebble up CONFIG; and test it as the robot's user or root")
     if not robot.wait(lambda: _unready(robot) == [], robot.patience_s):
         return failed(", ".join(_unready(robot)), _LOG)
+    services = section_of(robot.own_side.status, "services")
+    if often := [name for name in services if _often(section_of(services, name), "restarts")]:
+        return failed(f"{', '.join(often)} ended {OFTEN} times within a minute, or more often", _LOG)
     return ok(f"{len(_states(robot))} are ready")
+
+
+def _often(section: dict[str, object], what: str) -> bool:
+    count = section.get(f"{what}_per_minute")
+    return isinstance(count, int) and count >= OFTEN
 
 
 def _states(robot: RobotUnderTest) -> dict[str, str]:
@@ -139,6 +149,8 @@ def boards(robot: RobotUnderTest) -> CheckResult:
         why = mcu.get("why") or _MCU_STATES.get(str(mcu.get("state")), "its state is not known")
         return failed(f"{names[0]} ({lines[names[0]]}): {why}", f"plug it in, then: ls -l /dev/serial/by-id/; {_LOG}")
     robot.wait(lambda: robot.view.driveable is None or robot.view.driveable.state != "unknown", _JUDGED_S)
+    if often := [f"{name}: {mcu.get('why')}" for name in lines if _often(mcu := _mcu(robot, name), "starts")]:
+        return failed(", ".join(often), "look at its supply while motors start, and at its cable")
     drives = robot.view.driveable
     if drives is not None and drives.state == "no":
         return failed(f"its motors are not reached: {drives.why}", _LOG)
@@ -164,9 +176,10 @@ def battery(robot: RobotUnderTest) -> CheckResult:
     if volts is None:
         return skipped("it reports no voltage")
     charging = ", on the charger" if robot.view.charging else ""
-    if cells and volts / cells < _LEAST_CELL_V and not robot.view.charging:
+    if cells and not charging and not robot.wait(lambda: (robot.view.volts or 0.0) >= cells * _LEAST_CELL_V, _LOW_S):
+        volts = robot.view.volts or 0.0
         return failed(f"{volts:.2f} V, {volts / cells:.2f} V a cell: it is nearly empty", "charge it")
-    return ok(f"{volts:.2f} V{charging}")
+    return ok(f"{robot.view.volts:.2f} V{charging}")
 
 
 def leftovers(robot: RobotUnderTest) -> CheckResult:

@@ -42,8 +42,9 @@ def check(port: str) -> None:
     path = Path(port)
     try:
         found = path.stat()
-    except OSError:
-        raise DeviceError(f"--port {port}: does not exist; {hint()}") from None
+    except OSError as error:
+        why = "does not exist" if isinstance(error, FileNotFoundError) else f"cannot be used: {error.strerror}"
+        raise DeviceError(f"--port {port}: {why}; {hint()}") from None
     if not stat.S_ISCHR(found.st_mode):
         raise DeviceError(f"--port {port}: is not a serial port; {hint()}")
     if not os.access(path, os.R_OK | os.W_OK):

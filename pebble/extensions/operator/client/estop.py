@@ -4,15 +4,18 @@
 so after a power cut. The sender repeats the stop until both hold, or an owner says that it cannot save.
 """
 
+import json
 import secrets
 from collections.abc import Callable, Collection, Iterable
+from contextlib import suppress
 from enum import Enum
 from typing import NamedTuple
 
-from pebble.contract import AUTONOMY_COMMAND, DRIVE, ESTOP, STATUS, Channel, codec
+from pebble.contract import AUTONOMY_COMMAND, DRIVE, ESTOP, ONLINE, STATUS, Channel, codec
 from pebble.contract.identity import Direction, parse_topic
 from pebble.contract.levels import silent_after
 from pebble.contract.payloads import AutonomyCommand, Drive, EstopCommand
+from pebble.errors import PayloadError
 from pebble.extensions.operator.client.driveable import Driveable, driveable_of
 from pebble.extensions.operator.client.estop_states import RobotEstop
 from pebble.motion.latch import is_name, stop_of
@@ -22,6 +25,7 @@ REPEAT_S = 0.5
 COLLECT_S = silent_after(link="thin")  # so long a stop of all is sent to further robots, which may be at any level
 GIVE_UP_S = 60.0
 MAX_ROBOTS = 2000  # to which a stop of all is repeated; one beyond gets it whenever anything arrives from it
+_STAMPED_BYTES = 64 * 1024  # of a message whose stamp is read
 
 _ZERO = codec.encode(DRIVE, Drive(valid_ms=0))
 _ZEROS = "it has motors that no stop can hold: they get zeros"
@@ -66,7 +70,9 @@ class RobotStop:
         self._script_ended = False
         self._given_up = False
         self._names_due = False  # it was sent before it was known that the robot reads topics with a name
-        self._status_topic = STATUS.topic(base)
+        self._status_topic, self._online_topic = STATUS.topic(base), ONLINE.topic(base)
+        self._is_offline = False  # as its broker has called it
+        self.stamp = 0.0  # the newest one of what its broker retains, in epoch seconds
         self._boots: dict[str, str] = {}  # by owner, the newest one in which it has listed this stop
         self._settled = False  # each owner that had listed it has saved it, cannot save anything, or was reset
 
@@ -80,6 +86,11 @@ class RobotStop:
         if self.estop.old:
             return Progress.OLD
         return Progress.NOT_CONFIRMED if self._given_up else Progress.WAITING
+
+    @property
+    def is_gone(self) -> bool:
+        """True if there is nothing of it but what its broker retains, which says that it is offline."""
+        return self._is_offline and not self.live
 
     @property
     def saved(self) -> bool:
@@ -123,7 +134,9 @@ class RobotStop:
         return not self._given_up and is_due
 
     def receive(self, message: Message, now: float) -> None:
-        self.live = self.live or not message.retain
+        self.live = self.live or not (message.retain or codec.is_blank(message.payload))
+        if message.retain and len(message.payload) <= _STAMPED_BYTES:
+            self._take_retained(message)
         if message.topic == self._status_topic:
             self.driveable = driveable_of(message.payload)
             return
@@ -144,6 +157,12 @@ class RobotStop:
             self.next = max(now, self._sent_at + REPEAT_S)
         if self.confirmed_s is not None and not self._settled:
             self._settled = all(map(self._survives, self.estop.owners))
+
+    def _take_retained(self, message: Message) -> None:
+        with suppress(PayloadError, ValueError, RecursionError):
+            self.stamp = max(self.stamp, codec.stamp_of(json.loads(message.payload)) or 0.0)
+            if message.topic == self._online_topic:
+                self._is_offline = codec.decode(ONLINE, message.payload).online is False
 
     def tick(self, now: float, *, again: bool = True) -> list[Message]:
         if now < self.next or not self.sending or not (again or self._sent_at == float("-inf")):

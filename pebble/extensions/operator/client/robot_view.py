@@ -20,6 +20,7 @@ from pebble.transports import Message
 
 MAX_REMEMBERED = 64  # topics of one robot
 _HISTORY = 10
+_COMES_AND_GOES_S = 60.0
 _STAMPS = 5  # heartbeats by which a clock of whole seconds is recognised
 
 
@@ -34,11 +35,15 @@ class Liveness:
         self._latencies: deque[float] = deque(maxlen=_HISTORY)
         self._stamps: deque[int] = deque(maxlen=_STAMPS)
         self.latency_s: float | None = None  # of the newest heartbeat; None if its clock is wrong
+        self._returns: deque[float] = deque(maxlen=2)  # when a heartbeat came after people had been told of a silence
 
     def heartbeat(self, now: float, latency_s: float, *, online: bool = True, t: int = 1) -> None:
         """Take note of a heartbeat with the time ``t``, in milliseconds of its own clock."""
         self._stamps.append(t)
-        if self.received_at is not None and 0.05 <= now - self.received_at <= 10.0:
+        is_gap = self.received_at is not None and 0.05 <= now - self.received_at <= 10.0
+        if is_gap and not self.reported_offline and self.online_to_people(now) is False:
+            self._returns.append(now)
+        if self.received_at is not None and is_gap:
             self._intervals.append(now - self.received_at)
         self.latency_s = max(0.0, latency_s) if -1.0 <= latency_s <= 10.0 else None
         if self.latency_s is not None:
@@ -72,6 +77,11 @@ class Liveness:
             return None
         age = now - self.received_at
         return age <= silent_after(interval, self.link, self.average_latency_s or 0.0) or age < at_least_s
+
+    def online_to_people(self, now: float) -> bool | None:
+        """As :meth:`online`, but not silent after less than 1.5 s: longer while its heartbeats come and go."""
+        returns = sum(now - at < _COMES_AND_GOES_S for at in self._returns)
+        return self.online(now, SILENT_S * (1 + returns))
 
 
 def _mean(values: deque[float]) -> float | None:
@@ -238,8 +248,8 @@ class RobotView:
         return self.topic(c.DRIVE) is not None and self.liveness.online(now) is True
 
     def online(self, now: float) -> bool | None:
-        """Whether people are told that it is there: as its heartbeats say, but not silent after less than 1.5 s."""
-        return self.liveness.online(now, SILENT_S)
+        """Whether people are told that it is there."""
+        return self.liveness.online_to_people(now)
 
     def situation(self, now: float) -> Situation:
         """What speaks for and against driving it, as far as it says so itself."""

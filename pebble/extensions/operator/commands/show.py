@@ -20,6 +20,7 @@ from pebble.extensions.media.rate_meter import RateMeter
 from pebble.extensions.operator.client.discovery import Discovery
 from pebble.extensions.operator.client.estop_states import RobotEstop
 from pebble.extensions.operator.client.names import Names, id_of
+from pebble.runtime.output import console
 from pebble.runtime.output import discard_output as discard_output
 from pebble.transports import Message
 
@@ -41,7 +42,6 @@ def print_table(
     right: Container[str] = (),
 ) -> None:
     """Print rows of text that may come from anybody; columns in ``whole`` and ``right`` are never folded."""
-    from rich.console import Console
     from rich.table import Table
     from rich.text import Text
 
@@ -52,7 +52,7 @@ def print_table(
         table.add_column(column, justify=justify, no_wrap=is_number or column in whole, overflow="fold")
     for row in rows:
         table.add_row(*(Text(shown(cell).replace("\n", "\\u000a")) if isinstance(cell, str) else cell for cell in row))
-    Console(highlight=False).print(table)
+    console().print(table)
 
 
 def body(payload: bytes, width: int) -> str:

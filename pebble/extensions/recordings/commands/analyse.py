@@ -78,7 +78,7 @@ def _print(traffic: Traffic, written: list[Path]) -> None:
 
     columns = ("robot", "messages", "sessions", "outages", "latency", "video", "audio")
     rows = ((robot.robot.rpartition("/")[2], *_cells(robot)) for robot in traffic.robots)
-    print_table(columns, rows, whole=("robot",), right=columns[1:])
+    print_table(columns, rows, whole=(), right=columns[1:])
     typer.secho("Medians: latency of heartbeats in ms, video and audio in kbit/s.", dim=True)
     for remark in remarks(traffic):
         typer.echo(shown(remark))

@@ -14,11 +14,11 @@ from pebble.extensions.operator.client.names import base_of
 from pebble.extensions.recordings.catalogue import Query, check_names
 from pebble.extensions.recordings.commands.options import RobotOption, Since, Until, period
 from pebble.extensions.recordings.commands.progress import progress
-from pebble.extensions.recordings.commands.report import report_left, report_unread
+from pebble.extensions.recordings.commands.report import period_words, report_left, report_unread
 from pebble.extensions.recordings.files.reader import RecordingFile
 from pebble.extensions.recordings.files.recorded import Recorded, RecordingError
 from pebble.extensions.recordings.files.rewrite import Keeps, rewrite
-from pebble.extensions.recordings.library import ACTIVE, SUFFIX, files, robot_of
+from pebble.extensions.recordings.library import ACTIVE, FOREVER_NS, SUFFIX, files, robot_of
 from pebble.extensions.recordings.recorder.finisher import mend as mend_leftover
 from pebble.extensions.recordings.recorder.folder import DAMAGED, Folder, finished_path
 from pebble.extensions.recordings.traffic.index import index_path
@@ -79,6 +79,8 @@ def _rm(owner: Folder, base: str | None, period_ns: tuple[int, int], keeps: Keep
         check_names(Query(base), finished, [folder])
     due = [path for path in finished if _reaches_into(path, *period_ns)]
     what = f"{shown(base)} " if base else "everything "
+    if period_ns != (0, FOREVER_NS):
+        typer.echo(f"{what}{period_words(*period_ns)}")
     if not yes and not typer.confirm(f"Delete {what}from {len(due)} files in {folder}?"):
         return 1
     deleted = 0
@@ -123,7 +125,7 @@ def _delete_whole(path: Path, *, yes: bool) -> int:
     if not path.is_file() or not path.name.endswith((SUFFIX, ACTIVE, DAMAGED)):
         raise PebbleError(f"{path}: there is no such folder or recording")
     if path.name.endswith(ACTIVE) and Folder.is_in_use(_archive_of(path)):
-        raise PebbleError(f"{path}: is being written: stop the recorder first")
+        raise PebbleError(f"{path}: is being written: stop the recorder first; what one has left, mend finishes")
     if not yes and not typer.confirm(f"Delete {path}?"):
         return 1
     path.unlink()

@@ -41,7 +41,7 @@ def list_(places: RecordingsArgument, since: Since = None, until: Until = None, 
 
 def info(places: RecordingsArgument, since: Since = None, until: Until = None, check: Check = False) -> int:
     """Show robots, topics, and what happened to the recording."""
-    looked, unread = _looked_at(places, since, until, check=check)
+    looked, unread = _looked_at(places, since, until, check=check, inside=True)
     topics, sizes = Counter[str](), sum(one.size for one in looked)
     for one in looked:
         topics.update(one.topics)
@@ -55,10 +55,9 @@ def info(places: RecordingsArgument, since: Since = None, until: Until = None, c
     if missing:
         typer.echo(f"{missing:,} messages are missing: files were damaged")
     for robot in sorted(set().union(*(one.robots for one in looked))):
-        count = sum(number for topic, number in topics.items() if topic.startswith(f"{robot}/"))
-        typer.echo(f"\n{one_line(shown(robot))}: {count:,} messages")
-        own = Counter({topic[len(robot) + 1 :]: n for topic, n in topics.items() if topic.startswith(f"{robot}/")})
-        _print_topics(own)
+        counts = Counter({topic[len(robot) + 1 :]: n for topic, n in topics.items() if robot_in(topic) == robot})
+        typer.echo(f"\n{one_line(shown(robot))}: {counts.total():,} messages")
+        _print_topics(counts)
     encodings = {topic: name for one in looked for topic, name in one.encodings.items() if robot_in(topic) is None}
     named = ((topic, name) for topic, name in encodings.items() if not topic.startswith("$recorder/"))
     others = Counter({f"{topic} {name}": topics[topic] for topic, name in named})
@@ -105,20 +104,22 @@ def _print_topics(counts: Counter[str]) -> None:
 
 
 def _looked_at(
-    places: list[Path], since: str | None, until: str | None, *, check: bool
+    places: list[Path], since: str | None, until: str | None, *, check: bool, inside: bool = False
 ) -> tuple[list[FileInfo], list[str]]:
     """The files of a period by their times, and a line for each that cannot be read completely.
 
     They are read as a whole with ``check``, or if that takes no more than seconds; else their summaries count.
+    ``inside``: only messages of the period count, for which files that reach beyond it are read.
     """
     since_ns, until_ns = period(since, until)
+    counted_ns = {"since_ns": since_ns, "until_ns": until_ns} if inside else {}
     paths = files(places)
     looked, unread = [], []
     size = sum(path.stat().st_size for path in paths if path.exists())
     with progress("reading", len(paths)) as advance:
         for number, path in enumerate(paths, 1):
             try:
-                one = catalogue.look_at(path, whole=check or size <= _CHECKED)
+                one = catalogue.look_at(path, whole=check or size <= _CHECKED, **counted_ns)
             except RecordingError as error:
                 if not path.exists():  # finished, renamed or deleted meanwhile
                     continue

@@ -43,7 +43,10 @@ RecordingsArgument = Annotated[
     list[Path], typer.Argument(help="Recordings, or folders of them.", metavar="FILE|FOLDER…", show_default=False)
 ]
 UrlOption = Annotated[
-    str, typer.Option(help="mqtt://[USER@]HOST[:PORT], mqtts://… or zenoh:RUN_DIR.", metavar="URL", show_default=False)
+    str,
+    typer.Option(
+        "--url", help="mqtt://[USER@]HOST[:PORT], mqtts://… or zenoh:RUN_DIR.", metavar="URL", show_default=False
+    ),
 ]
 
 

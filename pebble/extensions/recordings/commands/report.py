@@ -2,13 +2,14 @@
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from datetime import UTC, datetime
+from datetime import UTC, datetime, tzinfo
 from pathlib import Path
 
 import typer
 
 from pebble.config.visible import shown
 from pebble.errors import PebbleError
+from pebble.extensions.recordings.library import FOREVER_NS
 
 
 @contextmanager
@@ -36,6 +37,20 @@ def local_time(ns: int, *, fraction: bool = False) -> str:
     moment = datetime.fromtimestamp(ns / 1e9, UTC).astimezone()
     text = moment.strftime("%Y-%m-%d %H:%M:%S")
     return f"{text}.{ns // 10**6 % 1000:03d}" if fraction else text
+
+
+def period_words(since_ns: int, until_ns: int) -> str:
+    """A period in local time with its zone, and in UTC."""
+    local, utc = (
+        f"from {_end(since_ns, zone, 'the beginning')} to {_end(until_ns, zone, 'the end')}" for zone in (None, UTC)
+    )
+    return local if local == utc else f"{local}, that is {utc}"
+
+
+def _end(ns: int, zone: tzinfo | None, name: str) -> str:
+    if not 0 < ns < FOREVER_NS:
+        return name
+    return f"{datetime.fromtimestamp(ns // 10**9, UTC).astimezone(zone):%Y-%m-%d %H:%M:%S %Z}"
 
 
 def one_line(text: str) -> str:

@@ -25,6 +25,7 @@ _MILLISECOND: Final = Fraction(1, 1000)
 _KEYFRAME_INTERVAL: Final = 60  # pictures: how far a player jumps
 _NOMINAL_FPS: Final = 15  # for the encoder; each picture has its own time
 _OPTIONS: Final = {"crf": "23", "preset": "veryfast"}
+_MUXER: Final = {"mp4": {"movflags": "+faststart"}}  # its index comes first, so that a browser plays it while it loads
 _BITRATE: Final = 64_000  # bits per second of each channel
 
 
@@ -61,7 +62,7 @@ def write_film(
                 for at_ms, payload in _media(read(), robot, lambda _log_ns: on_time(0)):
                     if not is_picture(payload):
                         sound.add(payload, at_ms)
-            with av.open(str(path), "w", format=container) as out:
+            with av.open(str(path), "w", format=container, options=_MUXER.get(container, {})) as out:
                 pictures = _Pictures(av, out)
                 media = _media(read(), robot, on_time)
                 tracks = [pictures.packets((at_ms, payload) for at_ms, payload in media if is_picture(payload))]

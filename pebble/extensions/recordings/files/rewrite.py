@@ -3,6 +3,7 @@
 import errno
 import os
 import shutil
+import stat
 from collections.abc import Callable, Container, Iterable
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,6 +12,7 @@ from typing import Final
 from pebble.extensions.recordings.files.reader import DAMAGE, MISSING, OLD_COPY, RecordingFile, missing_before
 from pebble.extensions.recordings.files.recorded import Channel, Recorded, RecordingError, Schema, number_in
 from pebble.extensions.recordings.files.writer import MOST_CHANNELS, File, RecordingWriter
+from pebble.runtime.whole_file import set_mode, sync_file
 
 PART: Final = ".part"  # the end of a copy's name while it is written
 _ABOUT: Final = "pebble.recording"  # metadata of each file that is not a copy
@@ -51,11 +53,21 @@ def rewrite(source: Path, target: Path, *, keeps: Keeps = lambda _message: True)
             raise RecordingError(f"{source}: was changed meanwhile")
         if target.exists() != in_place:
             raise RecordingError(f"{target}: was changed meanwhile")
-        shutil.copystat(source, part)  # its age and who may read it
+        _copy_state(source, part)
         part.replace(target)
     finally:
         part.unlink(missing_ok=True)
     return made
+
+
+def _copy_state(source: Path, part: Path) -> None:
+    """Give the copy the age of the source, and its readers where the file system has that. Raises OSError."""
+    try:
+        shutil.copystat(source, part)
+    except OSError:
+        found = source.stat()
+        set_mode(part, stat.S_IMODE(found.st_mode))
+        os.utime(part, ns=(found.st_atime_ns, found.st_mtime_ns))
 
 
 def copy_beside(source: RecordingFile, writer: RecordingWriter, without: Container[str] = (DAMAGE, OLD_COPY)) -> int:
@@ -142,7 +154,7 @@ def _copy(source: Path, part: Path, keeps: Keeps, *, complete: bool) -> Rewritte
         if missing or damage.parts:
             writer.metadata(DAMAGE, {MISSING: str(missing)})
         writer.finish()
-        os.fsync(out.fileno())
+        sync_file(out.fileno())
     is_whole = not (damage.parts or damage.missing or damage.unnamed) and is_cut_off
     is_empty = not (writer.messages or attachments)
     return Rewritten(writer.messages, left_out, missing, damage.report(), is_whole, is_empty)

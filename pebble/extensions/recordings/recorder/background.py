@@ -9,6 +9,7 @@ from typing import Final
 
 from pebble.extensions.recordings.recorder.lane import OpenFile
 from pebble.extensions.recordings.recorder.memory import return_free_pages
+from pebble.runtime.whole_file import sync_file
 
 log = logging.getLogger(__name__)
 
@@ -55,7 +56,7 @@ class Background:
         except (OSError, ValueError):  # closed meanwhile
             return
         try:
-            os.fdatasync(descriptor)
+            sync_file(descriptor, data=True)
         except OSError as error:
             log.error("%s cannot be made durable: %s", file.path.name, error.strerror)
         finally:

@@ -1,6 +1,7 @@
 """The folder of recordings: names and numbers of its files, its lock, and what may be deleted. One recorder uses it."""
 
 import errno
+import logging
 import os
 import re
 import stat
@@ -16,6 +17,8 @@ from pebble.extensions.recordings.files.rewrite import PART
 from pebble.extensions.recordings.library import ACTIVE, SUFFIX
 from pebble.runtime.whole_file import sync_folder
 from pebble.transports.own_file import OwnFile
+
+log = logging.getLogger(__name__)
 
 STATE: Final = "state"
 MEDIA: Final = "media."
@@ -56,6 +59,7 @@ class Folder:
 
     def __init__(self, root: Path) -> None:
         self.root = root
+        self.is_locked = False  # also where there are no locks: another recorder may write here
         self._number = 0
         self._lock = ExitStack()
         self._own = OwnFile(root / LOCK)
@@ -67,9 +71,9 @@ class Folder:
         except OSError as error:
             raise RecordingError(f"{self.root}: {error.strerror}: name another folder") from None
         used = f"{self.root}: a recorder writes here: stop it first, or name another folder"
-        self._lock.enter_context(_locked(self.root / LOCK, used))
+        self.is_locked = self._lock.enter_context(_locked(self.root / LOCK, used))
         self._own = OwnFile(self.root / LOCK)
-        for path in self._files():
+        for path in self._files() if self.is_locked else ():
             if _COPY.fullmatch(path.name):  # was being written when its process was killed
                 path.unlink(missing_ok=True)
         self._number = max((self._number, *(entry.number for entry in self.entries())))
@@ -93,12 +97,12 @@ class Folder:
 
     @classmethod
     def is_in_use(cls, root: Path) -> bool:
-        """Whether a recorder writes there."""
+        """Whether a recorder writes there, or may without being noticed."""
         if not (root / LOCK).exists():
             return False
         try:
-            with _locked(root / LOCK, ""):
-                return False
+            with _locked(root / LOCK, "") as is_locked:
+                return not is_locked
         except RecordingError:
             return True
 
@@ -134,8 +138,8 @@ class Folder:
 
 
 @contextmanager
-def _locked(path: Path, used: str) -> Iterator[None]:
-    """Raises RecordingError(used) if another process holds it."""
+def _locked(path: Path, used: str) -> Iterator[bool]:
+    """False where the file system has no locks. Raises RecordingError(used) if another process holds it."""
     try:
         import fcntl
     except ImportError:  # Windows
@@ -147,9 +151,14 @@ def _locked(path: Path, used: str) -> Iterator[None]:
     with file:
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError:
+            is_locked = True
+        except BlockingIOError:
             raise RecordingError(used) from None
-        yield
+        except OSError as error:
+            text = "%s cannot be locked (%s): see that nothing else records into its folder, which is not noticed"
+            log.warning(text, path, error.strerror)
+            is_locked = False
+        yield is_locked
 
 
 def finished_path(path: Path) -> Path:

@@ -8,6 +8,7 @@ from typing import BinaryIO, Final, NamedTuple
 from pebble.extensions.recordings.files.writer import RecordingWriter
 from pebble.extensions.recordings.recorder.folder import MEDIA, STATE, Folder, finished_path, rename
 from pebble.extensions.recordings.stamps import stamp_ns
+from pebble.runtime.whole_file import sync_file
 
 #: Of a retained value that is written again at the begin of a file.
 CARRIED: Final = "carried"
@@ -89,7 +90,8 @@ class OpenFile:
         """Write the summary, make all durable and give the file its final name. Raises OSError."""
         try:
             self.writer.finish()
-            os.fsync(self.file.fileno())
+            sync_file(self.file.fileno())
+            self.file.close()  # some file systems rename no open file
             rename(self.path, finished_path(self.path))
         finally:
             self.file.close()

@@ -71,10 +71,13 @@ class Writing:
         return "" if self._blocked is None else self._blocked.why
 
     def mend_leftovers(self) -> int:
-        """Finish what a recorder before this one has left; returns how many files."""
+        """Finish what a recorder before this one has left; returns how many files.
+
+        Without a lock they may be another recorder's, and stay as they are.
+        """
         ours = self._files.paths
         left = [entry.path for entry in self._folder.entries() if entry.is_active and entry.path not in ours]
-        for path in left:
+        for path in left if self._folder.is_locked else ():
             self._finisher.mend(path)
         return len(left)
 

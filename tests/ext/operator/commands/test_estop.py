@@ -186,6 +186,20 @@ def test_all_robots_are_stopped_and_others_spared(run: Run, robot_on: Make, url:
     assert f"{outlet.id}: does not drive" in run.out
 
 
+def test_a_stop_of_all_waits_no_minute_for_a_name_that_is_gone(
+    run: Run, robot_on: Make, url: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(estop, "GONE_S", 1.0)
+    gone, robot = robot_on("serial"), robot_on("serial")
+    gone.deaf = True
+    gone.publish("online", {"t": 1_700_000_000_000, "online": False}, retain=True)
+    began = time.monotonic()
+    assert run("estop", "--all", url) == 1
+    assert (robot.latched, time.monotonic() - began < 20) == (True, True)
+    assert f"{gone.id}: NOT CONFIRMED, no longer sent: it was last seen under this name" in run.out
+    assert gone.count("estop") > 1
+
+
 def test_no_robot_at_all_is_a_failure(run: Run, tmp_path: Path) -> None:
     empty = Broker(tmp_path)
     try:

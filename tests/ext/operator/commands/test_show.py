@@ -38,3 +38,10 @@ def test_a_thin_link_is_listed() -> None:
     for name, value in (("goob", link), ("fred", link | {"level": "wide"}), ("eve", 7)):
         listing.add(Message(f"pebble/robots/{name}/outgoing/link", msgspec.json.encode(value), retain=True), 0.0)
     assert show.remarks(listing, 0.0) == ["goob has a slow connection: commands take 0.3 s"]
+
+
+def test_a_table_in_a_pipe_cuts_no_name(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("COLUMNS", raising=False)
+    names = [f"{'goob-of-the-long-corridor-' * 3}{number}" for number in range(3)]
+    show.print_table(("robot", "why"), [(name, "x" * 60) for name in names], whole=("robot",))
+    assert [line.split()[0] for line in capsys.readouterr().out.splitlines()[1:]] == names

@@ -132,10 +132,13 @@ NOTICES: Rows = {
         see("a", "script", { error: "old" }); see("a", "script", { running: true, file: "follow", error: null });
         see("a", "script", { running: false, file: "follow", error: { code: 1, toString: 1 } });""",
         ['a script follow failed: {"code":1,"toString":1}']),
-    "a battery that stays low is listed once, and again once it was higher": ("""
+    "a battery that hovers around the limit is listed once, and again once it was charged": ("""
         level([50], [19.5], [20.5], [18]); result = [...texts(), notices.fresh.length];
-        level([30], [12]); result.push(notices.fresh.length); level([30], [12, true], [null]);
-        result.push(notices.fresh.length);""", ["a has a low battery: 20 %", 1, 2, 2]),
+        level([30], [12], [21], [19], [21], [19]); result.push(notices.fresh.length);
+        level([30, true], [12], [11]); level([90], [12], [11]); level([30], [12, true], [null]);
+        result.push(notices.fresh.length);""", ["a has a low battery: 18 %", 1, 1, 3]),
+    "one reading of a battery is no event": ("level([80], [0], [80], [19], [26], [19], [80], [0]);", []),
+    "a battery that is low from the begin is listed": ("level([19], [19]);", ["a has a low battery: 19 %"]),
     "a service that ends again and again": ("""
         const services = (state, restarts, last_exit) => see("a", "service", { imu: { state, restarts, last_exit } });
         const nine = "signal 9";

@@ -185,6 +185,8 @@ def test_encodings_and_sizes_that_change(tmp_path: Path) -> None:
     result = write_film(lambda: in_order(*parts, sound("pcm", 16_000, 3.0)), tmp_path / "walk.mp4", ROBOT)
     film = opened(tmp_path / "walk.mp4")
     assert (result.pictures, film.size) == (45, (160, 120))
+    raw = (tmp_path / "walk.mp4").read_bytes()
+    assert raw.index(b"moov") < raw.index(b"mdat")  # so that a browser plays it while it loads
     times = [at_ms for at_ms, _, _ in film.shown]
     assert times == pytest.approx([number * STEP_MS for number in range(45)], abs=1)
     assert [number for _, number, _ in film.shown[:20]] == list(range(20))

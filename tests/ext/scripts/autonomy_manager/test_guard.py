@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import signal
 import sys
 import threading
@@ -13,7 +14,7 @@ from pebble.errors import PebbleError
 from pebble.services.autonomy_manager import guard
 from pebble.services.autonomy_manager.child import Launch, Processes
 from pebble.services.autonomy_manager.guard import Guard
-from tests.support import ROOT, Child, gone, until
+from tests.support import ROOT, Child, gone, refused, until
 
 #: Starts a script that ignores SIGTERM, leaves its number in a file, and waits to be killed.
 MANAGER = """
@@ -58,3 +59,13 @@ def test_a_lock_that_stays_taken_is_an_error_that_names_it(tmp_path: Path, monke
     first.close()
     second.begin()
     second.close()
+
+
+def test_without_locks_scripts_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr("fcntl.flock", refused(errno.ENOLCK))
+    unlocked = Guard(tmp_path / "lock")
+    unlocked.begin()
+    unlocked.close()
+    assert "lock cannot be locked: No locks available" in caplog.text

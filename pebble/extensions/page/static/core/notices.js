@@ -6,6 +6,9 @@ export const MOST = 50; // in the list
 const ALOUD = 4; // sentences at once
 const COMPONENTS = 2000; // whose last states are remembered, as many as the server has
 const LOW_PERCENT = 20;
+const MARGIN = 5; // per cent, more than one step of what measures a battery: within it a reading counts for nothing
+const READINGS = 2; // below, of which the last one is told
+const CHARGED_PERCENT = 50; // also where nothing tells that it is charged
 const LONGEST = 160; // characters of what a robot reports of itself
 
 /** @typedef {{ref: string, kind: string, text: string, at: number, unread: boolean}} Notice  ``at`` is epoch ms */
@@ -53,11 +56,13 @@ const EVENTS = {
     const what = service.state === "failed" ? "fails again and again" : "has ended, and is started again";
     return { state, text: `service ${short(name)} ${what}${service.last_exit ? ` (${short(service.last_exit)})` : ""}` };
   },
-  /** Of a battery that is not charged. */
-  battery(before, percent, charging) {
+  /** Of a battery that is not charged: once, and again only after it was. The state is how many readings were below. */
+  battery(before = 0, percent, charging) {
     if (percent === null) return null;
-    const state = !charging && percent < LOW_PERCENT + Number(before === true);
-    return { state, text: state ? `has a low battery: ${Math.round(percent)} %` : "" };
+    const isAbove = before < READINGS && percent >= LOW_PERCENT + MARGIN;
+    if (charging || isAbove || percent >= CHARGED_PERCENT) return { state: 0 };
+    const state = Math.min(READINGS, before + Number(percent < LOW_PERCENT));
+    return { state, text: state === READINGS ? `has a low battery: ${Math.round(percent)} %` : "" };
   },
 };
 

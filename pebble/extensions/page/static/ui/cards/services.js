@@ -85,5 +85,6 @@ function SerialLine({ name, online, line }) {
 /** @param {Record<string, any>} one @returns {string} */
 function restartWords(one) {
   if (!(one.restarts > 0)) return "";
-  return [`restarted ${plain(one.restarts)}×`, one.last_exit && `last exit: ${plain(one.last_exit)}`].filter(Boolean).join("; ");
+  const often = one.restarts_per_minute > 0 && `${plain(one.restarts_per_minute)}× within a minute`;
+  return [`restarted ${plain(one.restarts)}×`, often, one.last_exit && `last exit: ${plain(one.last_exit)}`].filter(Boolean).join("; ");
 }

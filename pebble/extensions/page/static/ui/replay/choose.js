@@ -13,19 +13,13 @@ import { shortTime } from "../parts/more-words.js";
 import { clockTime, span } from "../parts/words.js";
 
 const short = new Intl.DateTimeFormat("en-GB", { day: "numeric", month: "short" });
-const utc = new Intl.DateTimeFormat("en-GB", {
-  weekday: "long",
-  day: "numeric",
-  month: "long",
-  year: "numeric",
-  timeZone: "UTC",
-});
+const long = new Intl.DateTimeFormat("en-GB", { weekday: "long", day: "numeric", month: "long", year: "numeric" });
 
 /** @param {number} ms epoch @returns {string} 22 Nov, 10:03:12 */
 export const timeWords = (ms) => `${short.format(ms)}, ${clockTime(ms)}`;
 
-/** @param {string} day "2026-11-22" @returns {string} Sunday 22 November 2026 */
-const longDay = (day) => utc.format(Date.parse(`${day}T00:00:00Z`));
+/** A recorder's day is one of UTC: here it may be of two dates. @returns {string} Sunday 22 – Monday 23 November 2026 */
+const longDay = ({ first, last }) => long.formatRange(first, last);
 
 /** @param {number} bytes @returns {string} 12 kB, 3.4 MB, 1.2 GB */
 export function sizeWords(bytes) {
@@ -86,19 +80,20 @@ export function Choose() {
 /** @param {import("../../core/replay/archive.js").Day} day @returns {string} */
 const mostDriven = ({ robots, driven = {} }) => [...robots].sort((a, b) => (driven[b] ?? 0) - (driven[a] ?? 0))[0];
 
-function Day({ one: { day, robots, bytes, first, last, gaps, unread } }) {
+function Day({ one }) {
+  const { day, robots, bytes, first, last, gaps, unread } = one;
   const { store } = usePage();
   const facts = [`${shortTime(first)} to ${shortTime(last)}`, sizeWords(bytes), gaps ? `${gaps} ${gaps === 1 ? "gap" : "gaps"}` : ""];
   return html`<li class="replay-day" data-test=${`day-${day}`}>
     <div>
-      <h2>${longDay(day)}</h2>
+      <h2>${longDay(one)}</h2>
       <p class="dim">${facts.filter(Boolean).join(" · ")}</p>
       ${unread?.map((line) => html`<p key=${line} class="failed">Not all can be read of ${line}</p>`)}
     </div>
     <ul class="replay-robots">
       ${robots.map(
         (ref) => html`<li key=${ref}>
-          <${RouteLink} path=${addressOf(ref, day)} className="button" label=${`${nameIn(store, ref)} on ${longDay(day)}`}
+          <${RouteLink} path=${addressOf(ref, day)} className="button" label=${`${nameIn(store, ref)} on ${longDay(one)}`}
             ><${Icon} name=${iconOf(ref)} />${nameIn(store, ref)}<//
           >
         </li>`,
@@ -114,7 +109,7 @@ export function Elsewhere({ at, replay }) {
   const { name } = replay.day;
   const known = days ?? [];
   const robots = [...new Set([at, ...(known.find(({ day }) => day === name)?.robots ?? [])])].sort();
-  const others = [...new Set([name, ...known.filter((day) => day.robots.includes(at)).map(({ day }) => day)])].filter(Boolean);
+  const others = known.filter(({ day, robots }) => day === name || robots.includes(at));
   return html`<div class="replay-elsewhere">
     <${Select}
       test="replay-robot"
@@ -127,7 +122,7 @@ export function Elsewhere({ at, replay }) {
       test="replay-day"
       title="Day"
       value=${name}
-      choices=${others.map((day) => [day, longDay(day)])}
+      choices=${others.length ? others.map((one) => [one.day, longDay(one)]) : [[name, name]]}
       onChoose=${(day) => replay.openDay(day)}
     />
     <${RouteLink} path=${ALL_DAYS} className="button" label="All days with recordings">All days<//>

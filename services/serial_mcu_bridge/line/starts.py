@@ -1,0 +1,39 @@
+"""How often the board on a serial line starts again, by what it sends and by the line itself. Pure."""
+
+from collections import deque
+
+_MINUTE_S = 60.0
+_ONE_START_S = 2.0  # a board that starts may say so, set its clock back and be opened again: that is one start
+_CLOCK_BITS, _LEAST_MS = 32, 1000  # of a board's clock; samples that overtake one another set it back by less
+
+
+class Starts:
+    """Starts of a board after the first one. ``now`` is a monotonic clock's."""
+
+    def __init__(self) -> None:
+        self._starts: deque[float] = deque(maxlen=1000)
+        self._opened = 0
+        self._clock: tuple[int, int] | None = None  # the opening, and the newest milliseconds of the board's clock
+
+    def began(self, now: float) -> None:
+        """Note that the board has started again."""
+        if not self._starts or now - self._starts[-1] >= _ONE_START_S:
+            self._starts.append(now)
+
+    def sent(self, opened: int, mcu_ms: int, now: float) -> None:
+        """Note the board's clock, which begins anew when it starts; ``opened`` counts openings of the line."""
+        before, self._clock = self._clock, (opened, mcu_ms)
+        if before is not None and before[0] == opened:
+            back_ms = (before[1] - mcu_ms) % (1 << _CLOCK_BITS)
+            if _LEAST_MS <= back_ms < 1 << (_CLOCK_BITS - 1):
+                self.began(now)
+
+    def within_a_minute(self, opened: int, now: float) -> int:
+        """Count them; each opening of the line but the first is one."""
+        if opened != self._opened:
+            if self._opened:
+                self.began(now)
+            self._opened = opened
+        while self._starts and now - self._starts[0] > _MINUTE_S:
+            self._starts.popleft()
+        return len(self._starts)
