@@ -49,7 +49,6 @@ _ON_ITS_WAY_S = 0.05  # between the thread that has received a message and this 
 _REPORT_PERIOD_S = 0.05
 _QUICK_S = 1.0  # an answer within this time needs no line before it
 _ANSWER_S = LEVELS["wide"].answer_s  # longest wait for what the broker has of a robot
-GONE_S = 15.0  # a robot that has lost its network is back by then, or it takes long
 _BATCH = 1000  # messages that are handled before the next stop is due
 
 
@@ -140,7 +139,7 @@ def _stop(target: Target, why: str, *, every: bool, hold: bool) -> int:
         try:
             with _heartbeats(target, every=every) as heartbeats, listening(target, transport) as second:
                 listener, subscribing = _listen(second, _filters(names.base))
-                while not sender.finished and not _waits_for_gone_ones(sender, report.lasts_s):
+                while not sender.finished:
                     for message in heartbeats.take() if heartbeats else ():
                         sender.receive(message, time.monotonic())
                     outbox.publish()
@@ -154,17 +153,9 @@ def _stop(target: Target, why: str, *, every: bool, hold: bool) -> int:
                 wait_for(lambda: second.state is State.CONNECTED, _ANSWER_S)
                 _receive(listener, sender, _ON_ITS_WAY_S)
         except KeyboardInterrupt:
-            pass
-        sender.end()
+            sender.end()
         report.end()
     return 0 if sender.confirmed else 1
-
-
-def _waits_for_gone_ones(sender: StopSender, lasts_s: float) -> bool:
-    """True if a stop of all is repeated only for robots that the broker has called offline, for long enough."""
-    if sender.order.named or sender.order.hold or lasts_s < GONE_S:
-        return False
-    return all(robot.is_gone for robot in sender.robots.values() if robot.sending)
 
 
 @contextmanager
@@ -256,11 +247,6 @@ class _Report:
         if now - self._updated >= _REPORT_PERIOD_S:
             self._updated = now
             self._print(patient=now - self._began < _QUICK_S)
-
-    @property
-    def lasts_s(self) -> float:
-        """How long the stop has been sent."""
-        return time.monotonic() - self._began
 
     def end(self) -> None:
         sender = self._sender

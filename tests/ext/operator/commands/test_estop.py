@@ -186,16 +186,15 @@ def test_all_robots_are_stopped_and_others_spared(run: Run, robot_on: Make, url:
     assert f"{outlet.id}: does not drive" in run.out
 
 
-def test_a_stop_of_all_waits_no_minute_for_a_name_that_is_gone(
+def test_a_stop_of_all_says_when_a_name_may_be_gone(
     run: Run, robot_on: Make, url: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(estop, "GONE_S", 1.0)
+    monkeypatch.setattr("pebble.extensions.operator.client.estop.GIVE_UP_S", 3.0)
     gone, robot = robot_on("serial"), robot_on("serial")
     gone.deaf = True
     gone.publish("online", {"t": 1_700_000_000_000, "online": False}, retain=True)
-    began = time.monotonic()
     assert run("estop", "--all", url) == 1
-    assert (robot.latched, time.monotonic() - began < 20) == (True, True)
+    assert robot.latched
     assert f"{gone.id}: NOT CONFIRMED, no longer sent: it was last seen under this name" in run.out
     assert gone.count("estop") > 1
 
