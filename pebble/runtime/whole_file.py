@@ -1,7 +1,10 @@
 """Files that are there whole or not at all, also after a power cut, and may hold secrets."""
 
+import errno
 import os
+import stat
 from pathlib import Path
+from typing import BinaryIO
 
 from pebble.errors import PebbleError
 
@@ -11,11 +14,19 @@ def is_root() -> bool:
     return hasattr(os, "geteuid") and os.geteuid() == 0
 
 
-def give_as(new: Path | int, model: Path) -> None:
-    """Give a file to the owner of ``model``, if that is there and we are root. Raises OSError."""
-    if is_root() and model.exists():
-        found = model.stat()
-        os.chown(new, found.st_uid, found.st_gid)
+def open_plain(file: Path) -> BinaryIO:
+    """Open a file to read it; a FIFO or a device might never end. Raises OSError."""
+    opened = open(file, "rb", opener=lambda path, flags: os.open(path, flags | getattr(os, "O_NONBLOCK", 0)))  # noqa: SIM115
+    if stat.S_ISREG(os.fstat(opened.fileno()).st_mode):
+        return opened
+    opened.close()
+    raise OSError(errno.EINVAL, "is no plain file", str(file))
+
+
+def read_plain(file: Path) -> bytes:
+    """Return what is in such a file. Raises OSError."""
+    with open_plain(file) as opened:
+        return opened.read()
 
 
 def write(
@@ -32,9 +43,10 @@ def write(
         with os.fdopen(os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "wb") as output:
             # By the descriptor: in a folder of somebody else's its name may be a link by now.
             open_file = output.fileno() if os.chmod in os.supports_fd else temporary
-            if owner is None:
-                give_as(open_file, file)
-            else:
+            if owner is None and is_root() and file.exists():
+                found = file.lstat()
+                owner = found.st_uid, found.st_gid
+            if owner is not None:
                 os.chown(open_file, *owner)
             os.chmod(open_file, mode)  # noqa: PTH101
             output.write(content)
@@ -49,16 +61,22 @@ def write(
 def write_new(file: Path, content: bytes) -> None:
     """Write a file for people that was not there before, where others cannot read it. Raises PebbleError."""
     try:
-        file.touch(0o600, exist_ok=False)
+        descriptor = os.open(file, os.O_WRONLY | os.O_CREAT | os.O_EXCL | getattr(os, "O_BINARY", 0), 0o600)
     except OSError as error:
         raise PebbleError(f"{file}: cannot be written: {error.strerror}") from None
     try:
-        if file.stat().st_mode & 0o077:
-            why = "others can read every file on its file system: name one on another, or mount it umask=077"
-            raise PebbleError(f"{file}: {why}")
-        write(file, content, 0o600, PebbleError)
-    except BaseException:
+        with os.fdopen(descriptor, "wb") as output:
+            if os.fstat(descriptor).st_mode & 0o077:
+                why = "others can read every file on its file system: name one on another, or mount it umask=077"
+                raise PebbleError(f"{file}: {why}")
+            output.write(content)
+            output.flush()
+            os.fsync(descriptor)
+        sync_folder(file.parent)
+    except BaseException as error:
         file.unlink(missing_ok=True)
+        if isinstance(error, OSError):
+            raise PebbleError(f"{file}: {error.strerror}") from None
         raise
 
 

@@ -13,7 +13,7 @@ from cryptography.hazmat.primitives.hashes import SHA256
 from cryptography.hazmat.primitives.serialization import Encoding, NoEncryption, PrivateFormat, load_pem_private_key
 
 from pebble.extensions.fleet.certificates import CertificateError
-from pebble.runtime.whole_file import write
+from pebble.runtime.whole_file import read_plain, write
 
 SERVER_DAYS = 397  # the longest that browsers accept
 _AUTHORITY_DAYS = 3650
@@ -63,7 +63,7 @@ def read(file: Path, key_file: Path) -> Authority:
     """Return the authority of two files. Raises CertificateError."""
     certificate = certificate_in(file)
     try:
-        key: Any = load_pem_private_key(key_file.read_bytes(), None)
+        key: Any = load_pem_private_key(read_plain(key_file), None)
     except (OSError, ValueError, TypeError) as error:
         raise CertificateError(f"{key_file}: {getattr(error, 'strerror', error)}") from None
     if key.public_key() != certificate.public_key():
@@ -74,7 +74,7 @@ def read(file: Path, key_file: Path) -> Authority:
 def certificate_in(file: Path) -> x509.Certificate:
     """Return the certificate of a file. Raises CertificateError."""
     try:
-        return x509.load_pem_x509_certificate(file.read_bytes())
+        return x509.load_pem_x509_certificate(read_plain(file))
     except OSError as error:
         raise CertificateError(f"{file}: {error.strerror}; `pebble cert init` makes certificates") from None
     except ValueError:

@@ -15,7 +15,7 @@ from pebble.contract.identity import SERVERS, Identity
 from pebble.contract.names import NAME
 from pebble.errors import ConfigError, PebbleError
 from pebble.extensions.fleet.roles import GATEWAYS, Account, Extra, ProgramRole, Right, Rule, add_up, covered, rules
-from pebble.runtime.whole_file import write
+from pebble.runtime.whole_file import read_plain, write
 
 FLEET, CONF, PID, ACL, PASSWORDS = "fleet.json", "mosquitto.conf", "mosquitto.pid", "acl", "passwords"
 ZENOH = "zenoh.json"
@@ -79,7 +79,7 @@ def load(folder: Path) -> Fleet:
     """Raises FleetError with the mistake in it."""
     file = folder / FLEET
     try:
-        fleet = msgspec.json.decode(file.read_bytes(), type=Fleet)
+        fleet = msgspec.json.decode(read_plain(file), type=Fleet)
     except FileNotFoundError:
         raise FleetError(f"there is no {file}: `pebble fleet init {folder} --host NAME` makes a fleet") from None
     except OSError as error:

@@ -10,8 +10,9 @@ from tempfile import TemporaryDirectory
 import pytest
 
 from pebble.errors import PebbleError
-from pebble.extensions.fleet.as_owner import as_before, as_owner
+from pebble.extensions.fleet.people import People
 from pebble.extensions.page.commands.people import opened
+from pebble.runtime.as_owner import as_before, as_owner
 from tests.support import needs_root
 
 NOBODY = 65534
@@ -31,12 +32,16 @@ def people(folder: Path) -> None:
         database.list()
 
 
+def page(folder: Path) -> None:
+    People(folder / "file").close()
+
+
 def text(folder: Path) -> None:
     with as_owner(folder):
         (folder / "file").write_text("written")
 
 
-@pytest.mark.parametrize("write", [people, text])
+@pytest.mark.parametrize("write", [people, page, text])
 @pytest.mark.parametrize("there", [False, True])
 def test_a_link_leads_it_nowhere(write: Callable[[Path], None], there: bool, place: Path) -> None:
     roots, folder = place / "roots", place / "theirs"
@@ -63,5 +68,36 @@ def test_what_it_writes_is_theirs_and_a_link_is_no_folder(place: Path) -> None:
         assert os.geteuid() == 0
     assert (folder / "people.sqlite").stat().st_uid == NOBODY
     (place / "link").symlink_to(folder)
-    with pytest.raises(PebbleError, match="link is a link"), as_owner(place / "link"):
+    with as_owner(place / "link"):
+        assert os.geteuid() == NOBODY, "a link of root's is followed"
+    assert os.geteuid() == 0
+
+
+def linked(theirs: Path) -> Path:
+    (theirs / "link").symlink_to(theirs.parent / "roots")
+    return theirs / "link" / "deeper"
+
+
+def of_root(theirs: Path) -> Path:
+    (theirs / "roots").mkdir()
+    return theirs / "roots"
+
+
+def shared(theirs: Path) -> Path:
+    (theirs.parent / "roots").chmod(0o777)
+    return theirs.parent / "roots" / "new"
+
+
+@pytest.mark.parametrize(
+    ("path_of", "why"),
+    [(linked, "is a link of user 65534"), (of_root, "lies in a folder of user 65534"), (shared, "others may write")],
+)
+def test_where_others_could_put_a_folder_it_does_nothing(
+    path_of: Callable[[Path], Path], why: str, place: Path
+) -> None:
+    roots, folder = place / "roots", place / "theirs"
+    roots.mkdir(0o755)
+    folder.mkdir()
+    os.chown(folder, NOBODY, NOBODY)
+    with pytest.raises(PebbleError, match=why), as_owner(path_of(folder)):
         pass

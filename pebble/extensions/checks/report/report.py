@@ -28,6 +28,8 @@ from pebble.extensions.checks.report.secrets_here import Secrets, secrets_of
 from pebble.extensions.checks.robot import run_checks
 from pebble.extensions.checks.running.robot import user_of
 from pebble.extensions.operator.places import Places
+from pebble.runtime.as_owner import as_owner
+from pebble.runtime.whole_file import read_plain
 from pebble.version import __version__
 
 _JOURNAL_LINES = 2000
@@ -158,7 +160,8 @@ def _described(path: Path) -> str:
     if path.is_symlink():
         return f"# {path} -> {path.readlink()}"
     if path.is_file():
-        return f"# {path}\n{path.read_text(encoding='utf-8', errors='replace').strip()}"
+        with as_owner(path.parent):
+            return f"# {path}\n{read_plain(path).decode(errors='replace').strip()}"
     return f"# {path}/"
 
 

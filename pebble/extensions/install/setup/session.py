@@ -2,12 +2,13 @@
 
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import typer
 from rich.console import Console
 
+from pebble.config.visible import shown
 from pebble.extensions.checks.broker.login_attempt import attempt
 from pebble.extensions.fleet import certificates
 from pebble.extensions.install.setup import detect
@@ -33,7 +34,7 @@ def set_up(system: System, answers_file: Path | None, backup_file: Path | None) 
     system.owner(ROBOTS)
     given, secrets = ({}, Secrets()) if answers_file is None else read_file(answers_file)
     if backup_file is not None:
-        say(f"The files of {restore(system, backup_file)} are in their places.")
+        say(f"The files of {restore(system, backup_file, _agree)} are in their places.")
     config = load_config(places)
     answers = Answers() if config is None else answers_of(config, places)
     job = Job(system, config, answers, secrets).with_answers(given)
@@ -62,6 +63,14 @@ def set_up(system: System, answers_file: Path | None, backup_file: Path | None) 
         typer.echo()
         show_qr(_url(places), Console())
     return 1 if failures else 0
+
+
+def _agree(lines: Sequence[str]) -> None:
+    """Show what a restored config runs and names. Raises Abort."""
+    say("The config of this backup runs programs, or names what is not the robot's own:")
+    for line in lines:
+        say(shown(line), 2)
+    typer.confirm("Shall the robot have these?", default=False, abort=True)
 
 
 def _failures(job: Job, *, is_started: bool) -> Iterator[str]:

@@ -12,6 +12,7 @@ import typer
 from pebble.commands.options import Output
 from pebble.extensions.recordings.commands.options import RecordingsArgument, Since, Until, period
 from pebble.extensions.recordings.commands.report import errors_of_files
+from pebble.runtime.as_owner import require_own
 
 if TYPE_CHECKING:
     from pebble.extensions.recordings.traffic.results import RobotTraffic, Traffic
@@ -55,6 +56,7 @@ def analyse(
 
     since_ns, until_ns = period(since, until)
     bases = [base_of(name) for name in robot or ()]
+    require_own(output)
     with errors_of_files():
         output.mkdir(parents=True, exist_ok=True)  # before the work, not after it
     with tempfile.TemporaryDirectory(prefix="pebble-analyse-") as folder, progress_of_steps() as progress:

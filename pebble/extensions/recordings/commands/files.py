@@ -22,6 +22,7 @@ from pebble.extensions.recordings.library import ACTIVE, SUFFIX, files, robot_of
 from pebble.extensions.recordings.recorder.finisher import mend as mend_leftover
 from pebble.extensions.recordings.recorder.folder import DAMAGED, Folder, finished_path
 from pebble.extensions.recordings.traffic.index import index_path
+from pebble.runtime.as_owner import require_own
 
 _DATE = re.compile(r"\d{2}|\d{4}", re.ASCII)
 
@@ -37,6 +38,7 @@ def mend(
     """
     if not source.is_dir():
         return _mend_file(source, target)
+    require_own(source)
     owner = Folder(source)
     with owner.taken():
         return _mend_all(owner)
@@ -55,6 +57,7 @@ def rm(
 
     A file that cannot be read completely stays as it is. One that is named is deleted, whatever is in it.
     """
+    require_own(folder.parent if folder.is_file() else folder)
     if not folder.is_dir() and robot is None and since is None and until is None:
         return _delete_whole(folder, yes=yes)
     if robot is None and since is None and until is None:

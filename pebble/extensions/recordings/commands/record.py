@@ -20,6 +20,7 @@ from pebble.extensions.recordings.recorder.recorder import Recorder
 from pebble.extensions.recordings.recorder.settings import EVERYTHING, Options
 from pebble.extensions.recordings.recorder.source import Source
 from pebble.launcher.sd_notify import SystemdNotifier
+from pebble.runtime.as_owner import require_own
 from pebble.runtime.signals import interrupted_by_signals
 from pebble.transports.topics import check_filter
 
@@ -58,6 +59,7 @@ def record(
         pebble recordings list recordings
     """
     into = into or Path("recordings")
+    require_own(into)
     options = Options(
         rotate_seconds=seconds(rotate),
         keep_bytes=size(keep),

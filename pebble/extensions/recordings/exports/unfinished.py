@@ -6,6 +6,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from pebble.extensions.recordings.files.recorded import RecordingError
+from pebble.runtime.as_owner import require_own
 
 
 @contextmanager
@@ -18,6 +19,7 @@ def unfinished(target: Path) -> Iterator[Path]:
         raise RecordingError(f"{target} exists already")
     if not target.parent.is_dir():
         raise RecordingError(f"{target.parent}: there is no such folder")
+    require_own(target.parent)
     path = target.with_name(f".{target.name}.{os.getpid()}")
     try:
         yield path
