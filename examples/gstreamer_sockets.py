@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from pebble.config import load
-from pebble.config.ownership import others_in
+from pebble.ownership import others_in
 from pebble.services.av_daemon.config import AvDaemon
 from pebble.transports.frames import Frame, FrameReader
 from pebble.transports.segments import SHM

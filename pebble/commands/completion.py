@@ -13,6 +13,7 @@ from typer._click.shell_completion import CompletionItem
 from typer.core import TyperGroup
 
 from pebble.extension import ours, part
+from pebble.runtime.whole_file import read_plain
 
 if TYPE_CHECKING:
     from typer._click.core import Command, Context
@@ -52,7 +53,7 @@ def _ids() -> Iterator[str]:
     for file in islice((file for place in _PLACES for file in place.glob("*.json")), _FILES):
         try:
             if file.stat().st_size <= _LONGEST:
-                yield str(json.loads(file.read_bytes())["robot"]["id"])
+                yield str(json.loads(read_plain(file))["robot"]["id"])
         except (OSError, ValueError, LookupError, TypeError):  # no config of a robot
             continue
 

@@ -8,8 +8,8 @@ from contextlib import contextmanager, suppress
 from importlib import import_module
 from pathlib import Path
 
-from pebble.config.ownership import Owner, owner_of
 from pebble.errors import PebbleError
+from pebble.ownership import Owner, owner_of
 from pebble.runtime.whole_file import is_root
 
 
@@ -47,7 +47,7 @@ def as_before() -> Iterator[None]:
 
 def require_own(folder: Path) -> None:
     """Raise PebbleError for root in a folder of another user, where a program runs for long, or with threads."""
-    if is_root() and (uid := owner_of(folder).uid):
+    if is_root() and (uid := owner_of(folder, nameless=False).uid):
         raise PebbleError(
             f"{folder} belongs to user {uid}, so root does not write there: run it as that user, or name another folder"
         )

@@ -140,6 +140,7 @@ class Catalogue:
             environment={**self._login, **section.env},
             ours=answer.ours,
             broken=answer.problem if answer.broken else "",
+            own_program=bool(described.command),
         )
 
     def _answer(

@@ -40,6 +40,7 @@ class Script(Struct, frozen=True, kw_only=True):
     environment: dict[str, str] = {}
     ours: bool = False  # it uses pebble.script, which signs its drive commands and stops the wheels at its end
     broken: str = ""  # why it cannot be started
+    own_program: bool = False  # its manifest names what runs it
 
 
 class Step(Struct, frozen=True):

@@ -6,7 +6,6 @@ from typing import Annotated, Any, ClassVar, Literal
 from msgspec import field
 
 from pebble.config import problems
-from pebble.config.ownership import others_in
 from pebble.config.reader import Reader, Rule
 from pebble.config.types import (
     ONE_VALUE,
@@ -21,6 +20,7 @@ from pebble.config.types import (
     ServiceSection,
     doc,
 )
+from pebble.ownership import others_in
 from pebble.transports.socket_paths import fits_socket
 
 _SOCKET = "examples/gstreamer_sockets.py chooses them"

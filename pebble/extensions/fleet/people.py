@@ -254,8 +254,11 @@ def has_user(path: Path | None, name: str = "") -> bool:
     """Return True if the database knows this person, or without a name anybody. Raises DatabaseError."""
     if path is None:
         return False
-    with as_owner(path.parent):
-        return path.is_file() and _has_user(path, name)
+    try:
+        with as_owner(path.parent):
+            return path.exists() and _has_user(path, name)
+    except OSError as error:
+        raise DatabaseError(path, error) from None
 
 
 def _has_user(path: Path, name: str) -> bool:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -10,10 +11,12 @@ from tempfile import TemporaryDirectory
 import pytest
 
 from pebble.errors import PebbleError
+from pebble.extensions.fleet.applying import pid_of
+from pebble.extensions.fleet.folder import PID
 from pebble.extensions.fleet.people import People
 from pebble.extensions.page.commands.people import opened
 from pebble.runtime.as_owner import as_before, as_owner
-from tests.support import needs_root
+from tests.support import Child, needs_root
 
 NOBODY = 65534
 pytestmark = needs_root
@@ -71,6 +74,12 @@ def test_what_it_writes_is_theirs_and_a_link_is_no_folder(place: Path) -> None:
     with as_owner(place / "link"):
         assert os.geteuid() == NOBODY, "a link of root's is followed"
     assert os.geteuid() == 0
+
+
+def test_a_number_in_a_folder_of_others_aims_no_signal(place: Path) -> None:
+    with Child([sys.executable, "-c", "import time; time.sleep(60)", "/etc/mosquitto.conf"]) as process:
+        (place / PID).write_text(str(process.pid))
+        assert pid_of(place) is None
 
 
 def linked(theirs: Path) -> Path:

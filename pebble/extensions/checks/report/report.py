@@ -125,7 +125,7 @@ def _status(here: Here) -> str:
     user, file = user_of(here.config.run_dir()), str(here.file.absolute())
     who: dict[str, Any] = {} if user is None else {"user": user.pw_uid, "group": user.pw_gid, "extra_groups": []}
     topics = f"{here.config.base}/{OUTGOING}/#"
-    echo = ("-m", "pebble.cli", "topic", "echo", topics, "--seconds", str(_STATES_S), "--config", file)
+    echo = ("-Pm", "pebble.cli", "topic", "echo", topics, "--seconds", str(_STATES_S), "--config", file)
     return output_of(sys.executable, *echo, seconds=_PROGRAM_S, **who)
 
 

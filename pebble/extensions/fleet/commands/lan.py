@@ -119,7 +119,7 @@ def up(folder_: Annotated[Path, typer.Argument(metavar="FOLDER", help="Of the fl
 
 def _commands(place: Path) -> dict[str, list[str]]:
     """What runs here, by its name; nothing for what this LAN does not have. Raises PebbleError."""
-    pebble = [sys.executable, "-m", "pebble"]
+    pebble = [sys.executable, "-Pm", "pebble"]  # nothing of the folder that we are in
     found = {"hub": [*pebble, "fleet", "hub", str(place / HUB_FILE)]}
     if not (place / GATEWAY_FILE).exists():
         return found

@@ -51,7 +51,7 @@ def restore(system: System, file: Path, agree: Callable[[Sequence[str]], None]) 
             raise SetupError(f"the backup would write {name!r}, which is no file of a robot")
         target = places.root / name
         with as_owner(target.parent):
-            if target.exists() and read_plain(target) != files[name].content:
+            if os.path.lexists(target) and _content(target) != files[name].content:
                 why = "is there already, with other content: only a blank machine becomes this robot"
                 raise SetupError(f"{target} {why}")
     if beyond := [*_beyond(plain(decode(text_of(files[config].content), config), Notes()))]:
@@ -76,6 +76,13 @@ def restore(system: System, file: Path, agree: Callable[[Sequence[str]], None]) 
     return backup.about.id
 
 
+def _content(file: Path) -> bytes:
+    try:
+        return read_plain(file)
+    except OSError as error:
+        raise SetupError(f"{file}: {error.strerror}") from None
+
+
 def _allowed(files: dict[str, Saved], places: Places) -> dict[str, Saved]:
     """Return the files without those of mosquitto that setup makes itself, or that are not the robot's."""
     folder = f"{places.broker_folder.relative_to(places.root)}/"
@@ -89,7 +96,7 @@ def _allowed(files: dict[str, Saved], places: Places) -> dict[str, Saved]:
     if broker in files:
         kept[broker] = Saved(own_broker.conf_text(places, own_broker.fleet_of("robot", "", places.people)), 0o644)
     if any(name.startswith(folder) for name in kept) and f"{folder}{FLEET}" not in kept:
-        raise SetupError(f"the backup has files of a broker, and no {folder}{FLEET}: restore an older one")
+        raise SetupError(f"the backup has files of a broker, and no {folder}{FLEET}: it was changed")
     return kept
 
 
@@ -98,7 +105,7 @@ def _beyond(value: Any, *keys: str) -> Iterator[str]:
     key = keys[-1] if keys else ""
     is_run = key in _RUNS or key.endswith(("_command", "_env"))
     if (value and value not in COMMANDS) if is_run else (isinstance(value, str) and _is_beyond(value)):
-        yield f"{'.'.join(keys)}: {value if isinstance(value, str) else ' '.join(map(str, value))}"
+        yield f"{'.'.join(keys)}: {' '.join(map(str, value)) if isinstance(value, list | dict) else value}"
     if isinstance(value, dict):
         for name, item in value.items():
             yield from _beyond(item, *keys, str(name))

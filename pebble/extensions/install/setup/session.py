@@ -81,7 +81,7 @@ def _failures(job: Job, *, is_started: bool) -> Iterator[str]:
     if job.answers.remote is not None and (why := _refusal(places)):
         yield f"the broker {job.answers.broker} does not let the robot in: {why}; the robot tries it again and again"
     if is_started:
-        command = [sys.executable, "-m", "pebble", "doctor", str(places.config), "--running"]
+        command = [sys.executable, "-Pm", "pebble", "doctor", str(places.config), "--running"]
         if code := subprocess.run(command, check=False).returncode:
             yield f"the self-test ended with {code}: pebble doctor {places.config} --running"
 

@@ -67,7 +67,7 @@ class System:
         """Replace a file at once. Raises SetupError."""
         ids = self.owner(owner)
         with as_owner(file.parent):
-            write(file, content, mode, SetupError, ids)
+            write(file, content, mode, SetupError, ids if is_root() else None)
 
     def make_folder(self, folder: Path, mode: int, owner: str, fill: Callable[[Path], None] | None = None) -> None:
         """Make a folder, filled beside its place, so that it is there whole or not at all. Raises SetupError."""
@@ -80,7 +80,7 @@ class System:
                 if fill is not None:
                     fill(new)
                 new.chmod(mode)
-                if ids is not None:  # last of all: then it is theirs
+                if ids is not None and is_root():  # last of all: then it is theirs
                     for path in (*new.iterdir(), new):
                         os.chown(path, *ids, follow_symlinks=False)
                 new.rename(folder)

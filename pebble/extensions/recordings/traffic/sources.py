@@ -111,4 +111,4 @@ def _may_write(folder: Path) -> bool:
         require_own(folder)
     except PebbleError:
         return False
-    return os.access(folder, os.W_OK)
+    return os.access(folder, os.W_OK, effective_ids=os.access in os.supports_effective_ids)

@@ -15,10 +15,11 @@ class Owner(NamedTuple):
     gid: int
 
 
-def owner_of(folder: Path) -> Owner:
+def owner_of(folder: Path, *, nameless: bool = True) -> Owner:
     """Return the one user besides root who may change what lies in ``folder``, or root; it need not be there yet.
 
-    Raises PebbleError where several users may, and for a link on the way that a user besides root can change.
+    ``nameless``: users without an entry count, too; in a container they are those of the machine around it. Raises
+    PebbleError where several users may, and for a link on the way that a user besides root can change.
     """
     place, owner = Path("/"), Owner(0, 0)
     system = place.lstat().st_uid  # in a user namespace root's files may seem to be of another user
@@ -29,11 +30,11 @@ def owner_of(folder: Path) -> Owner:
             found = place.lstat()
         except OSError:  # it is missing, or not to be seen by this user
             break
-        uid = 0 if found.st_uid == system else found.st_uid
+        uid = 0 if found.st_uid == system or not (nameless or _has_name(found.st_uid)) else found.st_uid
         if stat.S_ISLNK(found.st_mode):
             if owner.uid or uid:
                 raise PebbleError(f"{place} is a link of user {uid or owner.uid}: name the folder itself")
-            return owner_of(place.parent.joinpath(place.readlink(), *names))
+            return owner_of(place.parent.joinpath(place.readlink(), *names), nameless=nameless)
         if owner.uid not in (0, uid):
             raise PebbleError(f"{place} belongs to user {uid}, and lies in a folder of user {owner.uid}: move it")
         if uid == 0 and _is_shared(found):
@@ -49,6 +50,12 @@ def others_in(folder: Path) -> str:
     except PebbleError as error:
         return str(error)
     return f"{folder} belongs to user {uid}" if uid and os.geteuid() not in (0, uid) else ""
+
+
+def _has_name(uid: int) -> bool:
+    import pwd  # which Windows lacks
+
+    return any(user.pw_uid == uid for user in pwd.getpwall())
 
 
 def _is_shared(found: os.stat_result) -> bool:
