@@ -54,8 +54,8 @@ def init(names: _Names, folder: _Folder = None) -> int:
     """
     with _opened(folder, make=True) as place:
         certificates.init(place, names)
-        names = certificates.show(place / certificates.SERVER_CERT).names
-        typer.echo(f"{place} has a certificate for {', '.join(names)}.")
+        signed = certificates.show(place / certificates.SERVER_CERT).names
+        typer.echo(f"{place} has a certificate for {', '.join(signed)}.")
         typer.echo(f"Next:\n    pebble web CONFIG --host 0.0.0.0 --tls {place}")
         _print_trust(place)
     return 0
