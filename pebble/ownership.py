@@ -1,9 +1,10 @@
-"""Who may change what lies at a path: whoever owns a folder on the way can put another one, or a link, in its place."""
+"""Files that others may have made: who may put another one, or a link, in the place of a path; and reading them."""
 
+import errno
 import os
 import stat
 from pathlib import Path
-from typing import NamedTuple
+from typing import BinaryIO, NamedTuple
 
 from pebble.errors import PebbleError
 
@@ -55,10 +56,29 @@ def others_in(folder: Path) -> str:
 def _has_name(uid: int) -> bool:
     import pwd  # which Windows lacks
 
-    return any(user.pw_uid == uid for user in pwd.getpwall())
+    try:
+        pwd.getpwuid(uid)
+    except KeyError:
+        return False
+    return True
 
 
 def _is_shared(found: os.stat_result) -> bool:
     """True if others than the owner can replace what is in a folder; where it is sticky they cannot."""
     writers = stat.S_IWOTH | (stat.S_IWGRP if found.st_gid else 0)
     return bool(found.st_mode & writers) and stat.S_ISDIR(found.st_mode) and not found.st_mode & stat.S_ISVTX
+
+
+def open_plain(file: Path) -> BinaryIO:
+    """Open a file to read it; a FIFO or a device might never end. Raises OSError."""
+    opened = open(file, "rb", opener=lambda path, flags: os.open(path, flags | getattr(os, "O_NONBLOCK", 0)))  # noqa: SIM115
+    if stat.S_ISREG(os.fstat(opened.fileno()).st_mode):
+        return opened
+    opened.close()
+    raise OSError(errno.EINVAL, "is no plain file", str(file))
+
+
+def read_plain(file: Path) -> bytes:
+    """Return what is in such a file. Raises OSError."""
+    with open_plain(file) as opened:
+        return opened.read()

@@ -13,7 +13,7 @@ from typer._click.shell_completion import CompletionItem
 from typer.core import TyperGroup
 
 from pebble.extension import ours, part
-from pebble.runtime.whole_file import read_plain
+from pebble.ownership import read_plain
 
 if TYPE_CHECKING:
     from typer._click.core import Command, Context

@@ -1,10 +1,7 @@
 """Files that are there whole or not at all, also after a power cut, and may hold secrets."""
 
-import errno
 import os
-import stat
 from pathlib import Path
-from typing import BinaryIO
 
 from pebble.errors import PebbleError
 
@@ -12,21 +9,6 @@ from pebble.errors import PebbleError
 def is_root() -> bool:
     """Whether this process may give files away; on Windows none does."""
     return hasattr(os, "geteuid") and os.geteuid() == 0
-
-
-def open_plain(file: Path) -> BinaryIO:
-    """Open a file to read it; a FIFO or a device might never end. Raises OSError."""
-    opened = open(file, "rb", opener=lambda path, flags: os.open(path, flags | getattr(os, "O_NONBLOCK", 0)))  # noqa: SIM115
-    if stat.S_ISREG(os.fstat(opened.fileno()).st_mode):
-        return opened
-    opened.close()
-    raise OSError(errno.EINVAL, "is no plain file", str(file))
-
-
-def read_plain(file: Path) -> bytes:
-    """Return what is in such a file. Raises OSError."""
-    with open_plain(file) as opened:
-        return opened.read()
 
 
 def write(

@@ -9,8 +9,9 @@ from pathlib import Path
 
 from pebble.extensions.fleet import broker_files, certificates
 from pebble.extensions.fleet.folder import ACL, CONF, PASSWORDS, PID, ZENOH, Fleet, FleetError, Server, save
+from pebble.ownership import read_plain
 from pebble.runtime.as_owner import as_before
-from pebble.runtime.whole_file import is_root, read_plain, write
+from pebble.runtime.whole_file import is_root, write
 
 _LOOPBACK = "127.0.0.1"
 _PLUGIN = "dynamic_security"  # in the name of its library

@@ -12,8 +12,10 @@ from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.hazmat.primitives.hashes import SHA256
 from cryptography.hazmat.primitives.serialization import Encoding, NoEncryption, PrivateFormat, load_pem_private_key
 
+from pebble.config.visible import shown
 from pebble.extensions.fleet.certificates import CertificateError
-from pebble.runtime.whole_file import read_plain, write
+from pebble.ownership import read_plain
+from pebble.runtime.whole_file import write
 
 SERVER_DAYS = 397  # the longest that browsers accept
 _AUTHORITY_DAYS = 3650
@@ -84,7 +86,7 @@ def certificate_in(file: Path) -> x509.Certificate:
 def names_of(certificate: x509.Certificate) -> tuple[str, ...]:
     """Return the hosts that a certificate is for."""
     found = [one.value for one in certificate.extensions if isinstance(one.value, x509.SubjectAlternativeName)]
-    return tuple(str(name.value) for names in found for name in names)
+    return tuple(shown(str(name.value)) for names in found for name in names)
 
 
 def fingerprint(certificate: x509.Certificate) -> str:

@@ -7,7 +7,7 @@ from pebble.extensions.fleet import certificates
 from pebble.extensions.fleet.applying import conf_differences, passwords_of, zenoh_differences
 from pebble.extensions.fleet.broker_files import acl_text, rules_in
 from pebble.extensions.fleet.folder import ACL, Fleet, FleetError
-from pebble.runtime.whole_file import read_plain
+from pebble.ownership import read_plain
 
 _SOON_DAYS = 30
 

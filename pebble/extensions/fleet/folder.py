@@ -15,7 +15,8 @@ from pebble.contract.identity import SERVERS, Identity
 from pebble.contract.names import NAME
 from pebble.errors import ConfigError, PebbleError
 from pebble.extensions.fleet.roles import GATEWAYS, Account, Extra, ProgramRole, Right, Rule, add_up, covered, rules
-from pebble.runtime.whole_file import read_plain, write
+from pebble.ownership import read_plain
+from pebble.runtime.whole_file import write
 
 FLEET, CONF, PID, ACL, PASSWORDS = "fleet.json", "mosquitto.conf", "mosquitto.pid", "acl", "passwords"
 ZENOH = "zenoh.json"

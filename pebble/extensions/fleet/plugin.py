@@ -10,7 +10,7 @@ from msgspec.structs import replace
 from pebble.extensions.fleet.applying import write_rules
 from pebble.extensions.fleet.broker_files import Hashed
 from pebble.extensions.fleet.folder import Fleet, FleetError, save
-from pebble.runtime.whole_file import read_plain
+from pebble.ownership import read_plain
 
 SECURITY = "dynamic-security.json"
 

@@ -10,7 +10,7 @@ from pebble.extensions.recordings.files.recorded import FOREVER_NS as FOREVER_NS
 from pebble.extensions.recordings.files.recorded import SUFFIX as SUFFIX
 from pebble.extensions.recordings.files.recorded import Channel, Damage, Recorded, RecordingError
 from pebble.extensions.recordings.files.records import MAGIC
-from pebble.runtime.whole_file import open_plain
+from pebble.ownership import open_plain
 
 #: What is wrong with each file that was read.
 Damages = dict[Path, Damage]

@@ -28,8 +28,8 @@ from pebble.extensions.checks.report.secrets_here import Secrets, secrets_of
 from pebble.extensions.checks.robot import run_checks
 from pebble.extensions.checks.running.robot import user_of
 from pebble.extensions.operator.places import Places
+from pebble.ownership import read_plain
 from pebble.runtime.as_owner import as_owner
-from pebble.runtime.whole_file import read_plain
 from pebble.version import __version__
 
 _JOURNAL_LINES = 2000

@@ -16,7 +16,7 @@ from pebble.config.masking import values_of
 from pebble.config.secret_text import HIDDEN
 from pebble.config.types import Secret
 from pebble.extensions.operator.places import Places
-from pebble.runtime.whole_file import read_plain
+from pebble.ownership import read_plain
 
 _SHORTEST = 4  # characters: a shorter one is in every text
 _LARGEST = 1 << 20  # bytes of a file of passwords; others are no such files

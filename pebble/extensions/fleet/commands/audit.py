@@ -11,8 +11,8 @@ from pebble.config import load
 from pebble.errors import PebbleError
 from pebble.extensions.fleet.robot_audit import files
 from pebble.extensions.operator.commands.show import print_table
+from pebble.ownership import read_plain
 from pebble.runtime.as_owner import as_owner
-from pebble.runtime.whole_file import read_plain
 
 _COLUMNS = ("t", "what", "who", "from", "count")
 

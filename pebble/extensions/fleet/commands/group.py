@@ -10,6 +10,7 @@ import typer
 from msgspec.structs import replace
 
 from pebble.commands.options import host_of, split_names
+from pebble.config.visible import shown
 from pebble.errors import PebbleError
 from pebble.extensions.fleet import applying, certificates, check, folder, pieces, plugin
 from pebble.extensions.fleet.broker_files import new_password
@@ -414,7 +415,7 @@ def _left(lines: Iterable[str]) -> int:
     """Print where a change does not count yet; the command's exit code."""
     code = 0
     for line in lines:
-        typer.echo(f"pebble: {line}", err=True)
+        typer.echo(f"pebble: {shown(line)}", err=True)
         code = 1
     return code
 

@@ -22,8 +22,9 @@ from pebble.extensions.fleet.folder import CONF, Fleet, FleetError, Server
 from pebble.extensions.fleet.roles import Account, ProgramRole
 from pebble.extensions.operator.client.page_packages import require_packages
 from pebble.extensions.operator.places import mosquitto_path
+from pebble.ownership import read_plain
 from pebble.runtime.as_owner import as_owner, require_own
-from pebble.runtime.whole_file import read_plain, write
+from pebble.runtime.whole_file import write
 
 HUB_FILE, GATEWAY_FILE, ROBOTS = "hub.json", "gateway.json", "robots"
 _LOCK = ".up"

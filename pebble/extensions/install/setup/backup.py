@@ -28,8 +28,8 @@ from pebble.extensions.operator.places import Places
 from pebble.extensions.page.setting import people_of
 from pebble.extensions.recordings.config import Recorder
 from pebble.extensions.scripts.config import AutonomyManager
+from pebble.ownership import read_plain
 from pebble.runtime.as_owner import as_owner
-from pebble.runtime.whole_file import read_plain
 from pebble.services.soundboard_handler.config import SoundboardHandler
 from pebble.version import __version__
 

@@ -19,8 +19,8 @@ from pebble.extensions.install.setup.backup import Saved
 from pebble.extensions.install.setup.robot_config import COMMANDS
 from pebble.extensions.install.setup.system import MOSQUITTO, ROBOT, ROBOTS, SetupError, System
 from pebble.extensions.operator.places import Places
+from pebble.ownership import read_plain
 from pebble.runtime.as_owner import as_owner
-from pebble.runtime.whole_file import read_plain
 
 #: What a backup may hold, below the root: who owns it there, and the mode of its folders.
 _PLACES = {

@@ -18,7 +18,7 @@ from cryptography.exceptions import InvalidSignature
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PublicKey
 
 from pebble.errors import PebbleError
-from pebble.runtime.whole_file import open_plain
+from pebble.ownership import open_plain
 from pebble.version import __version__
 
 MANIFEST, SIGNATURE = "RELEASE.json", "RELEASE.json.minisig"

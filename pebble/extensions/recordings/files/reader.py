@@ -47,7 +47,7 @@ from pebble.extensions.recordings.files.records import (
     with_own_topic,
 )
 from pebble.extensions.recordings.files.scan import Found, Scan
-from pebble.runtime.whole_file import open_plain
+from pebble.ownership import open_plain
 
 if TYPE_CHECKING:
     from mcap.records import Attachment, ChunkIndex, McapRecord, Metadata, Statistics
