@@ -17,6 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from pebble.config import load
+from pebble.ownership import others_in
 from pebble.services.av_daemon.config import AvDaemon
 from pebble.transports.frames import Frame, FrameReader
 from pebble.transports.segments import SHM
@@ -32,14 +33,15 @@ def picture(size: tuple[int, int], frame: Frame) -> bytes:
 
 def sound(form: tuple[str, int, int], frame: Frame) -> bytes:
     """Return interleaved samples of 16 bits."""
-    sent = frame.info.format, frame.info.rate, frame.info.channels
-    if sent != form:
+    if (sent := (frame.info.format, frame.info.rate, frame.info.channels)) != form:
         sys.exit(f"the microphone sends {sent}, and the config says {form}")
     return frame.data.tobytes()
 
 
 def offer(path: Path, parser: str, reader: FrameReader, data: Callable[[Frame], bytes]) -> None:
     """Pass frames to GStreamer until ``reader`` is closed. Raises OSError when GStreamer has ended."""
+    if why := others_in(path.parent):
+        sys.exit(f"{path}: {why}")
     if path.is_socket():
         path.unlink()  # of a run that was killed: shmsink would choose another name
     sink = f"shmsink socket-path={path} shm-size={64 << 20} wait-for-connection=false sync=false"

@@ -29,6 +29,7 @@ from msgspec.structs import replace
 from pebble.contract.identity import LEVEL, LEVEL_RULE
 from pebble.contract.serial_protocols import SERIAL_PROTOCOLS, SerialProtocol
 from pebble.errors import ConfigError, PebbleError
+from pebble.ownership import owner_of
 
 log = logging.getLogger(__name__)
 
@@ -419,8 +420,11 @@ def _of_file(path: Path) -> Extension:
     if not path.is_file():
         raise PebbleError(f"there is no file {path}")
     state = path.stat()
-    if hasattr(os, "getuid") and os.getuid() == 0 != state.st_uid:
-        raise PebbleError(f"{path} belongs to user {state.st_uid}, and root runs no code of other users: chown root it")
+    if hasattr(os, "getuid") and os.getuid() == 0:
+        folders = (path.parent, path.resolve().parent)
+        if uid := state.st_uid or max(owner_of(folder, nameless=False).uid for folder in folders):
+            why = "and root runs no code of other users: chown root it, in a folder of root's"
+            raise PebbleError(f"{path} belongs to user {uid}, {why}")
     if state.st_size > _LONGEST:
         raise PebbleError(f"{path} has {state.st_size} bytes, and no program has more than {_LONGEST}")
     name = path.stem

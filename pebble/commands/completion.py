@@ -13,6 +13,7 @@ from typer import Context
 from typer.core import TyperGroup
 
 from pebble.extension import ours, part
+from pebble.ownership import read_plain
 
 _PLACES = (Path(), Path("/etc/pebble"))
 _FILES = 200  # that are looked into
@@ -57,7 +58,7 @@ def _ids() -> Iterator[str]:
     for file in islice((file for place in _PLACES for file in place.glob("*.json")), _FILES):
         try:
             if file.stat().st_size <= _LONGEST:
-                yield str(json.loads(file.read_bytes())["robot"]["id"])
+                yield str(json.loads(read_plain(file))["robot"]["id"])
         except (OSError, ValueError, LookupError, TypeError):  # no config of a robot
             continue
 

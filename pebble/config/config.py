@@ -29,6 +29,7 @@ from pebble.contract.identity import Identity
 from pebble.contract.serial_protocols import OF_CORE, SERIAL_PROTOCOLS
 from pebble.errors import ConfigError
 from pebble.extension import Extension, Missing
+from pebble.ownership import read_plain
 
 #: In the run directory: the process id of the robot's newest launcher, and on a second line the robot's base topic.
 LAUNCHER_LOCK = "launcher.lock"
@@ -302,7 +303,7 @@ def default_run_folder(base: str, env: Mapping[str, str]) -> Path:
 def _is_run_from(folder: Path, base: str) -> bool:
     """Whether the newest launcher in this run directory, if we may read it, was that of this robot."""
     try:
-        return (folder / LAUNCHER_LOCK).read_text(errors="replace", encoding="utf-8").splitlines()[1:2] == [base]
+        return read_plain(folder / LAUNCHER_LOCK).decode(errors="replace").splitlines()[1:2] == [base]
     except OSError:
         return False
 

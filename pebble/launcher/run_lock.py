@@ -7,6 +7,7 @@ from typing import Self
 
 from pebble.config import LAUNCHER_LOCK
 from pebble.errors import PebbleError, TransportError
+from pebble.runtime.as_owner import require_own
 from pebble.transports.peers import FileLock, make_private
 
 log = logging.getLogger(__name__)
@@ -31,6 +32,7 @@ class RunLock:
         make_private(self._run_dir, close=True)
         self._lock = self._taken(self.path)
         try:
+            require_own(self._state_path.parent)
             self._state_path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
             self._state_lock = self._taken(self._state_path)
         except (OSError, TransportError) as error:

@@ -15,6 +15,7 @@ from typing import NamedTuple
 from pebble.config import LAUNCHER_LOCK
 from pebble.config.secret_text import without_secrets
 from pebble.config.visible import shown
+from pebble.ownership import read_plain
 from pebble.runtime import notes
 
 #: A pipe to the launcher, for the notes of :class:`Notifier`.
@@ -95,7 +96,7 @@ def tied_to_parent(command: Sequence[str], number: signal.Signals | None = None)
 def launcher_runs(run_dir: Path) -> bool:
     """True if the newest launcher of the robot with this run directory is still a running process."""
     try:
-        pid = int((run_dir / LAUNCHER_LOCK).read_text(encoding="utf-8").partition("\n")[0])
+        pid = int(read_plain(run_dir / LAUNCHER_LOCK).partition(b"\n")[0])
         os.kill(pid, 0)
     except (OSError, ValueError, OverflowError):
         return False

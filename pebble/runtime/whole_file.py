@@ -19,13 +19,6 @@ def is_root() -> bool:
     return hasattr(os, "geteuid") and os.geteuid() == 0
 
 
-def give_as(new: Path | int, model: Path) -> None:
-    """Give a file to the owner of ``model``, if that is there and we are root. Raises OSError."""
-    if is_root() and model.exists():
-        found = model.stat()
-        _give(new, (found.st_uid, found.st_gid))
-
-
 def _give(file: Path | int, owner: tuple[int, int]) -> None:
     """Change the owner, but not where all files have that one anyway. Raises OSError."""
     found = os.stat(file)  # noqa: PTH116
@@ -71,9 +64,10 @@ def write(
         with os.fdopen(os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "wb") as output:
             # By the descriptor: in a folder of somebody else's its name may be a link by now.
             open_file = output.fileno() if os.chmod in os.supports_fd else temporary
-            if owner is None:
-                give_as(open_file, file)
-            else:
+            if owner is None and is_root() and file.exists():
+                found = file.lstat()
+                owner = found.st_uid, found.st_gid
+            if owner is not None:
                 _give(open_file, owner)
             set_mode(file, mode, open_file)
             output.write(content)
@@ -93,7 +87,7 @@ def write(
 def _write_in_place(file: Path, content: bytes, mode: int) -> None:
     """Write into a file whose name cannot be given to another, as of one in a container's mount. Raises OSError."""
     with os.fdopen(os.open(file, os.O_WRONLY | getattr(os, "O_NOFOLLOW", 0)), "wb") as output:
-        set_mode(file, mode)
+        set_mode(file, mode, output.fileno())
         output.write(content)
         output.truncate()
         output.flush()
@@ -104,16 +98,22 @@ def _write_in_place(file: Path, content: bytes, mode: int) -> None:
 def write_new(file: Path, content: bytes) -> None:
     """Write a file for people that was not there before, where others cannot read it. Raises PebbleError."""
     try:
-        file.touch(0o600, exist_ok=False)
+        descriptor = os.open(file, os.O_WRONLY | os.O_CREAT | os.O_EXCL | getattr(os, "O_BINARY", 0), 0o600)
     except OSError as error:
         raise PebbleError(f"{file}: cannot be written: {error.strerror}") from None
     try:
-        if file.stat().st_mode & 0o077:
-            why = "others can read every file on its file system: name one on another, or mount it umask=077"
-            raise PebbleError(f"{file}: {why}")
-        write(file, content, 0o600, PebbleError)
-    except BaseException:
+        with os.fdopen(descriptor, "wb") as output:
+            if os.fstat(descriptor).st_mode & 0o077:
+                why = "others can read every file on its file system: name one on another, or mount it umask=077"
+                raise PebbleError(f"{file}: {why}")
+            output.write(content)
+            output.flush()
+            os.fsync(descriptor)
+        sync_folder(file.parent)
+    except BaseException as error:
         file.unlink(missing_ok=True)
+        if isinstance(error, OSError):
+            raise PebbleError(f"{file}: {error.strerror}") from None
         raise
 
 

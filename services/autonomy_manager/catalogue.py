@@ -146,6 +146,7 @@ class Catalogue:
             ours=answer.ours,
             broken=answer.problem if answer.broken else "",
             asked=answer.asked,
+            own_program=bool(described.command),
         )
 
     def _answer(self, name: str, folder: Path, entry: Path, section: ScriptSection, *, asks: bool) -> _Answer:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -46,8 +47,20 @@ def _fitness(script: Script) -> str:
     from pebble.services.autonomy_manager.environment import environment
     from pebble.services.autonomy_manager.interpreter import lacking
 
-    missing = lacking(script.command, script.folder, environment(script.environment))
+    is_asked = not script.own_program and _may_run(script.command[0])
+    missing = lacking(script.command, script.folder, environment(script.environment)) if is_asked else []
     return f"runs with {script.command[0]}" + (f", which lacks {', '.join(missing)}" if missing else "")
+
+
+def _may_run(program: str) -> bool:
+    """True unless this is root, and the program is of another user."""
+    from pebble.runtime.as_owner import require_own
+
+    try:
+        require_own(Path(shutil.which(program) or program).parent)
+    except PebbleError:
+        return False
+    return True
 
 
 def complete_scripts(context: Any) -> list[str]:

@@ -11,7 +11,9 @@ SYSTEM = Path("/usr/bin/python3")  # has what Debian's packages install, such as
 _PARENTS = 3  # folders above a script from which it may import: scripts of the original do from two above
 _GSTREAMER = "cv2 with GStreamer"
 _PROBE = """
-import importlib.util, sys
+import sys
+del sys.path[0]  # the folder of the script: a check runs nothing of it
+import importlib.util
 for name in sys.argv[1:]:
     there = importlib.util.find_spec(name.partition(" ")[0])
     if there and " " in name:

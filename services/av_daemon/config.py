@@ -20,6 +20,7 @@ from pebble.config.types import (
     ServiceSection,
     doc,
 )
+from pebble.ownership import others_in
 from pebble.transports.socket_paths import fits_socket
 
 _SOCKET = "examples/gstreamer_sockets.py chooses them"
@@ -99,6 +100,9 @@ def _check(reader: Reader, devices: AvDaemon, path: problems.Path) -> AvDaemon:
     for section, file in sockets.items():
         if not file.parent.is_dir():
             text = f"there is no folder {file.parent}: until there is, no program finds this socket"
+            reader.notes.warning((*path, section, "socket_path"), text)
+        elif why := others_in(file.parent):
+            text = f"{why}: others can offer their pictures there: name a folder of the robot's user"
             reader.notes.warning((*path, section, "socket_path"), text)
         if not fits_socket(file):
             text = f"{file} is too long for a socket, write a shorter one"

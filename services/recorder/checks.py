@@ -13,6 +13,7 @@ from pebble.errors import PebbleError
 from pebble.extensions.recordings.config import Recorder
 from pebble.extensions.recordings.recorder.folder import Entry, Folder
 from pebble.extensions.recordings.recorder.metrics import STATUS
+from pebble.ownership import read_plain
 
 _SILENT_S: Final = 30.0  # it writes its numbers every ten seconds
 
@@ -59,7 +60,7 @@ def _running(folder: Path, entries: list[Entry]) -> CheckResult:
 
 def _status(folder: Path) -> dict[str, Any]:
     try:
-        status = json.loads((folder / STATUS).read_bytes())
+        status = json.loads(read_plain(folder / STATUS))
     except (OSError, ValueError):
         return {}
     return status if isinstance(status, dict) else {}

@@ -187,6 +187,13 @@ def test_check_lists_every_script_and_whether_it_runs(run: Run, tmp_path: Path) 
     for name, text in {"apriltag-locations": "import cv3", "patrol": "", "torn": "def main(:"}.items():
         (tmp_path / "autonomy" / name).mkdir(parents=True)
         (tmp_path / "autonomy" / name / "run.py").write_text(text)
+    ran, own = tmp_path / "ran", tmp_path / "autonomy" / "apriltag-locations"
+    (own / "importlib.py").write_text(f"open({str(ran)!r}, 'w')")
+    (other := tmp_path / "autonomy" / "other").mkdir()
+    (other / "run.py").write_text("import cv3")
+    (other / "program").write_text(f"#!/bin/sh\ntouch {ran}\n")
+    (other / "program").chmod(0o755)
+    (other / "script.json").write_text(json.dumps({"command": ["./program", str(other / "run.py")]}))
     manager = {"enabled": True, "scripts": {"patrol": {"python": sys.executable}}}
     assert run("check", config_file(tmp_path, services={"autonomy_manager": manager}), columns=300) == 0
     lines = [" ".join(line.split()) for line in run.out.splitlines()]
@@ -196,4 +203,5 @@ def test_check_lists_every_script_and_whether_it_runs(run: Run, tmp_path: Path) 
         "wheel-odometry runs, Pebble's own",
     ):
         assert f"script {expected}" in lines
+    assert not ran.exists(), "a check runs nothing of a script"
     assert any(line.startswith("script torn does not run: run.py, line 1: ") for line in lines)

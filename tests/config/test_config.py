@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import subprocess
 import sys
 from collections.abc import Mapping
@@ -22,6 +23,7 @@ from pebble.extensions.recordings.config import Recorder
 from pebble.runtime.connections import hub_settings
 from pebble.services.video_stream.config import VideoStream
 from pebble.transports.topics import check_topic
+from tests.support import needs_root
 
 ROOT = Path(__file__).resolve().parents[2]
 ORIGINAL = ROOT / "tests" / "data" / "original-shaped-config.json"
@@ -506,6 +508,14 @@ class TestMistakes:
         assert warning.startswith(f"services.av_daemon.audio.socket_path: there is no folder {tmp_path / 'none'}")
         for unused in ({"audio": socket}, {"enabled": True, "audio": {"enabled": False, **socket}}):
             assert read(at("services.av_daemon", unused)).warnings == ()
+
+    @needs_root
+    def test_a_socket_behind_a_link_of_another_user_is_warned_of(self, tmp_path: Path) -> None:
+        (link := tmp_path / "link").symlink_to(tmp_path)
+        os.chown(link, 65534, 65534, follow_symlinks=False)
+        socket = {"socket_path": str(link / "a.sock")}
+        (warning,) = read(at("services.av_daemon", {"enabled": True, "audio": socket})).warnings
+        assert f"{link} is a link of user 65534" in warning
 
     def test_a_zenoh_uplink_needs_no_remote_broker(self) -> None:
         remote = {"kind": "zenoh", "connect": ["tls/base.example:7447"]}

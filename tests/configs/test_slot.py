@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import os
 import random
 import stat
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -78,6 +80,18 @@ def test_back_and_forth(tmp_path: Path) -> None:
     (Places(tmp_path).slots / "b" / ".complete").unlink()
     done = slots.run("back")
     assert (done.returncode, done.stderr) == (1, "pebble-slot: slot b is not whole, so a stays\n")
+
+
+@pytest.mark.parametrize("make", [os.mkfifo, lambda path: path.symlink_to("/etc/hostname"), Path.mkdir])
+def test_a_release_has_plain_files_only(tmp_path: Path, make: Callable[[Path], object]) -> None:
+    slots, release = Slots(tmp_path), tmp_path / "release"
+    release.mkdir()
+    for name in ("RELEASE.json", "pebble_robot-1-py3-none-any.whl"):
+        (release / name).touch()
+    make(release / "robot.txt")
+    done = slots.run("take", str(release))
+    assert (done.returncode, "has more than plain files" in done.stderr) == (1, True), done.stderr
+    assert not (Places(tmp_path).slots / "release.new").exists()
 
 
 def test_commands_run_from_the_active_slot_or_the_one_that_is_whole(tmp_path: Path) -> None:

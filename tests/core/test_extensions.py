@@ -367,9 +367,10 @@ def test_what_is_of_the_core_is_no_extensions(tmp_path: Path) -> None:
 
 
 @needs_root
-def test_root_runs_no_code_of_other_users(tmp_path: Path) -> None:
+@pytest.mark.parametrize("name", ["lamp.py", "."])
+def test_root_runs_no_code_of_other_users(name: str, tmp_path: Path) -> None:
     lamp_file(tmp_path, "lamp")
-    os.chown(tmp_path / "lamp.py", 65534, 65534)
+    os.chown(tmp_path / name, 65534, 65534)
     done = pebble("check", str(write(tmp_path, {"lamp.py": {}})))
     assert (done.returncode, "root runs no code of other users" in done.stderr) == (1, True)
 

@@ -1,6 +1,5 @@
 """Changes of a fleet: its table becomes the files of its brokers and hubs, and mosquitto reads them again."""
 
-import getpass
 import os
 import signal
 import time
@@ -9,8 +8,9 @@ from contextlib import suppress
 from pathlib import Path
 
 from pebble.extensions.fleet import broker_files, certificates
-from pebble.extensions.fleet.as_owner import as_before
 from pebble.extensions.fleet.folder import ACL, CONF, PASSWORDS, PID, ZENOH, Fleet, FleetError, Server, save
+from pebble.ownership import read_plain
+from pebble.runtime.as_owner import as_before
 from pebble.runtime.whole_file import is_root, set_mode, write
 
 _LOOPBACK = "127.0.0.1"
@@ -41,7 +41,7 @@ def names_of(server: Server) -> list[str]:
 
 
 def write_conf(folder: Path, fleet: Fleet) -> None:
-    text = broker_files.conf_text(fleet, folder, getpass.getuser())
+    text = broker_files.conf_text(fleet, folder, folder.owner())
     write(folder / CONF, text.encode(), 0o644, FleetError)
 
 
@@ -52,7 +52,7 @@ def conf_differences(folder: Path, fleet: Fleet) -> Iterator[str]:
     """
     file = folder / CONF
     try:
-        lines = file.read_text(encoding="utf-8").splitlines()
+        lines = read_plain(file).decode().splitlines()
     except OSError as error:
         raise FleetError(f"{file}: {error.strerror}") from None
     user = next((line.split()[1] for line in lines if line.startswith("user ")), "")
@@ -100,30 +100,39 @@ def zenoh_differences(folder: Path, fleet: Fleet) -> Iterator[str]:
     from pebble.extensions.fleet.zenoh_rules import zenoh_text
 
     file = folder / ZENOH
-    if fleet.hubs != "none" and not (file.is_file() and file.read_bytes() == zenoh_text(fleet)):
+    if fleet.hubs != "none" and not (file.is_file() and read_plain(file) == zenoh_text(fleet)):
         yield f"{file} does not hold the rules of the table"
 
 
 def pid_of(folder: Path) -> int | None:
     """Return the process of this folder's mosquitto on this machine; None: it does not run."""
     try:
-        pid = int((folder / PID).read_text(encoding="utf-8"))
-        program = Path(f"/proc/{pid}/exe").readlink() if is_root() else None  # others see that of their own only
-        name = Path(f"/proc/{pid}/cmdline").read_bytes()
-        is_broker = b"mosquitto" in name if program is None else program.name.startswith("mosquitto")
+        pid = int(read_plain(folder / PID))
     except (OSError, ValueError):
         return None
-    return pid if is_broker else None
+    with as_before():
+        return pid if _is_broker(pid) else None
+
+
+def _is_broker(pid: int) -> bool:
+    """True if this program is mosquitto: the owner of a folder writes any number into its file."""
+    try:
+        if is_root():  # others see that of their own only; " (deleted)" is behind it after an upgrade
+            return bytes(Path(f"/proc/{pid}/exe").readlink()).removesuffix(b" (deleted)").endswith(b"/mosquitto")
+        return b"mosquitto" in Path(f"/proc/{pid}/cmdline").read_bytes()
+    except OSError:
+        return False
 
 
 def obeys_plugin(folder: Path) -> bool:
     """Return True if mosquitto has the dynamic-security plugin: by its configuration, or in the process that runs."""
-    found = ""
+    found, pid = "", pid_of(folder)
     with suppress(FileNotFoundError):
-        lines = (folder / CONF).read_text(encoding="utf-8").splitlines()
+        lines = read_plain(folder / CONF).decode().splitlines()
         found = "\n".join(line for line in lines if line.startswith("plugin "))
-    with suppress(OSError):  # it does not run, or as somebody else, whom SIGHUP by this process does not reach either
-        found += Path(f"/proc/{pid_of(folder)}/maps").read_text(encoding="utf-8")
+    # Where it runs as somebody else this may fail, and SIGHUP by this process does not reach it either.
+    with suppress(OSError), as_before():
+        found += Path(f"/proc/{pid}/maps").read_text(encoding="utf-8")
     return _PLUGIN in found
 
 
@@ -131,7 +140,7 @@ def passwords_of(folder: Path) -> dict[str, broker_files.Hashed]:
     """Return the passwords that the broker's file has, by account. Raises FleetError."""
     file = folder / PASSWORDS
     try:
-        return broker_files.passwords_in(file.read_text(encoding="utf-8"))
+        return broker_files.passwords_in(read_plain(file).decode())
     except OSError as error:
         raise FleetError(f"{file}: {error.strerror}") from None
     except ValueError:
@@ -152,8 +161,13 @@ def _reload(folder: Path) -> str:
         return f"in {folder / ACL}: mosquitto does not run"
     try:
         with as_before():  # the broker may run as another user than the folder's
-            _await_handler(pid)
-            os.kill(pid, signal.SIGHUP)
+            process = os.pidfd_open(pid)
+            try:
+                if _is_broker(pid):  # still
+                    _await_handler(pid)
+                    signal.pidfd_send_signal(process, signal.SIGHUP)
+            finally:
+                os.close(process)
     except OSError as error:
         raise FleetError(f"mosquitto (process {pid}): {error.strerror}; send it SIGHUP: sudo kill -HUP {pid}") from None
     return "at once"

@@ -12,7 +12,9 @@ from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.hazmat.primitives.hashes import SHA256
 from cryptography.hazmat.primitives.serialization import Encoding, NoEncryption, PrivateFormat, load_pem_private_key
 
+from pebble.config.visible import shown
 from pebble.extensions.fleet.certificates import CertificateError
+from pebble.ownership import read_plain
 from pebble.runtime.whole_file import write
 
 SERVER_DAYS = 397  # the longest that browsers accept
@@ -63,7 +65,7 @@ def read(file: Path, key_file: Path) -> Authority:
     """Return the authority of two files. Raises CertificateError."""
     certificate = certificate_in(file)
     try:
-        key: Any = load_pem_private_key(key_file.read_bytes(), None)
+        key: Any = load_pem_private_key(read_plain(key_file), None)
     except (OSError, ValueError, TypeError) as error:
         raise CertificateError(f"{key_file}: {getattr(error, 'strerror', error)}") from None
     if key.public_key() != certificate.public_key():
@@ -74,7 +76,7 @@ def read(file: Path, key_file: Path) -> Authority:
 def certificate_in(file: Path) -> x509.Certificate:
     """Return the certificate of a file. Raises CertificateError."""
     try:
-        return x509.load_pem_x509_certificate(file.read_bytes())
+        return x509.load_pem_x509_certificate(read_plain(file))
     except OSError as error:
         raise CertificateError(f"{file}: {error.strerror}; `pebble cert init` makes certificates") from None
     except ValueError:
@@ -84,7 +86,7 @@ def certificate_in(file: Path) -> x509.Certificate:
 def names_of(certificate: x509.Certificate) -> tuple[str, ...]:
     """Return the hosts that a certificate is for."""
     found = [one.value for one in certificate.extensions if isinstance(one.value, x509.SubjectAlternativeName)]
-    return tuple(str(name.value) for names in found for name in names)
+    return tuple(shown(str(name.value)) for names in found for name in names)
 
 
 def fingerprint(certificate: x509.Certificate) -> str:

@@ -7,6 +7,7 @@ from pebble.extensions.fleet import certificates
 from pebble.extensions.fleet.applying import conf_differences, passwords_of, zenoh_differences
 from pebble.extensions.fleet.broker_files import acl_text, rules_in
 from pebble.extensions.fleet.folder import ACL, Fleet, FleetError
+from pebble.ownership import read_plain
 
 _SOON_DAYS = 30
 
@@ -35,7 +36,7 @@ def _certificates(folder: Path, fleet: Fleet) -> Iterator[str]:
 
 def _of_acl(folder: Path, fleet: Fleet) -> Iterator[str]:
     try:
-        there = dict.fromkeys(rules_in((folder / ACL).read_text(encoding="utf-8")))
+        there = dict.fromkeys(rules_in(read_plain(folder / ACL).decode()))
     except OSError as error:
         raise FleetError(f"{error.filename}: {error.strerror}") from None
     wanted = dict.fromkeys(rules_in(acl_text(fleet)))

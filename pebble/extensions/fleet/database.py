@@ -9,7 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from pebble.errors import PebbleError
-from pebble.runtime.whole_file import give_as, set_mode
+from pebble.runtime.as_owner import require_own
+from pebble.runtime.whole_file import set_mode
 from pebble.transports.own_file import OwnFile
 
 _BUSY_S = 5.0  # another process may be writing
@@ -21,15 +22,6 @@ class DatabaseError(PebbleError):
     def __init__(self, path: Path | None, error: Exception) -> None:
         self.why = (error.strerror or str(error)) if isinstance(error, OSError) else str(error)
         super().__init__(f"{path}: {self.why}")
-
-
-def _create(path: Path) -> None:
-    """Make an empty file. By root it is the folder's owner's: a robot could not read one of root's."""
-    descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o600)
-    try:
-        give_as(descriptor, path.parent)
-    finally:
-        os.close(descriptor)
 
 
 class Database:
@@ -45,11 +37,14 @@ class Database:
         self, path: Path | None, tables: str, upgrade: Callable[[sqlite3.Connection], None] = lambda _connection: None
     ) -> None:
         self._path = path
+        if path is not None:
+            require_own(path.parent)
         try:
             if path is not None:
                 path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+                require_own(path.parent)  # another user may have been faster
                 if not path.exists():
-                    _create(path)
+                    os.close(os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600))
             self._connection = _connection(path, tables)
             upgrade(self._connection)
             self._own = None if path is None else OwnFile(path)

@@ -16,6 +16,7 @@ from pebble.contract.identity import SERVERS, Identity
 from pebble.contract.names import NAME
 from pebble.errors import ConfigError, PebbleError
 from pebble.extensions.fleet.roles import GATEWAYS, Account, Extra, ProgramRole, Right, Rule, add_up, covered, rules
+from pebble.ownership import read_plain
 from pebble.runtime.whole_file import write
 
 log = logging.getLogger(__name__)
@@ -82,7 +83,7 @@ def load(folder: Path) -> Fleet:
     """Raises FleetError with the mistake in it."""
     file = folder / FLEET
     try:
-        fleet = msgspec.json.decode(file.read_bytes(), type=Fleet)
+        fleet = msgspec.json.decode(read_plain(file), type=Fleet)
     except FileNotFoundError:
         raise FleetError(f"there is no {file}: `pebble fleet init {folder} --host NAME` makes a fleet") from None
     except OSError as error:

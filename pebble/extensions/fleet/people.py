@@ -20,6 +20,7 @@ from pebble.errors import PebbleError
 from pebble.extensions.fleet.database import Database, DatabaseError
 from pebble.extensions.fleet.roles import Role, Session
 from pebble.extensions.fleet.tries import Tries, network_of
+from pebble.runtime.as_owner import as_owner
 from pebble.runtime.rate_limit import RateLimitedLog
 from pebble.transports.bounds import BoundedTable
 
@@ -251,8 +252,16 @@ def _exists(name: str) -> PeopleError:
 
 def has_user(path: Path | None, name: str = "") -> bool:
     """Return True if the database knows this person, or without a name anybody. Raises DatabaseError."""
-    if path is None or not path.exists():
+    if path is None:
         return False
+    try:
+        with as_owner(path.parent):
+            return path.exists() and _has_user(path, name)
+    except OSError as error:
+        raise DatabaseError(path, error) from None
+
+
+def _has_user(path: Path, name: str) -> bool:
     # Writes nothing. What is in a write-ahead log is read, too, which needs a file of SQLite's that only then is there
     unchanged = "" if path.with_name(f"{path.name}-wal").exists() else "&immutable=1"
     try:

@@ -10,6 +10,7 @@ from msgspec.structs import replace
 from pebble.extensions.fleet.applying import write_rules
 from pebble.extensions.fleet.broker_files import Hashed
 from pebble.extensions.fleet.folder import Fleet, FleetError, save
+from pebble.ownership import read_plain
 
 SECURITY = "dynamic-security.json"
 
@@ -21,7 +22,7 @@ def convert(folder: Path, fleet: Fleet) -> tuple[Fleet, list[str]]:
     """
     file = folder / SECURITY
     try:
-        clients = {client["username"]: client for client in json.loads(file.read_text(encoding="utf-8"))["clients"]}
+        clients = {client["username"]: client for client in json.loads(read_plain(file))["clients"]}
     except OSError as error:
         raise FleetError(f"{file}: {error.strerror}") from None
     except (ValueError, KeyError, TypeError):

@@ -11,6 +11,7 @@ from pebble.extensions.recordings.files.recorded import FOREVER_NS as FOREVER_NS
 from pebble.extensions.recordings.files.recorded import SUFFIX as SUFFIX
 from pebble.extensions.recordings.files.recorded import Channel, Damage, Recorded, RecordingError
 from pebble.extensions.recordings.files.records import MAGIC
+from pebble.ownership import open_plain
 
 #: What is wrong with each file that was read.
 Damages = dict[Path, Damage]
@@ -89,7 +90,7 @@ def _messages(path: Path, since_ns: int, until_ns: int, chooses: Chooses, damage
 
 def _begins_as_mcap(path: Path) -> bool:
     try:
-        with path.open("rb") as file:
+        with open_plain(path) as file:
             return file.read(len(MAGIC)) == MAGIC
     except OSError as error:
         raise RecordingError(f"{path}: {error.strerror or error}") from None

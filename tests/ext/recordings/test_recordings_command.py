@@ -148,6 +148,7 @@ NO_ROBOT = f"no robot pebble/robots/nosuch in {{rec}}; there are: {FRED}, {GOOB}
     [
         (("list", "nowhere"), "nowhere: No such file or directory"),
         (("info", "{tmp}"), "there is no recording"),
+        (("info", "{tmp}/pipe.mcap"), "pipe.mcap: is no plain file"),
         (("list", "{tmp}/text"), "is not a recording (MCAP)"),
         (("export", "{rec}", "{tmp}/a.xyz"), "add --as"),
         (("export", "{rec}", "{tmp}/a.mkv"), "add --robot (pebble/robots/fred, pebble/robots/goob)"),
@@ -164,6 +165,7 @@ def test_mistakes_are_one_line(
     folder: Path, tmp_path: Path, run: Run, arguments: tuple[str, ...], problem: str
 ) -> None:
     (tmp_path / "text").write_text("text")
+    os.mkfifo(tmp_path / "pipe.mcap")
     empty = tmp_path / "empty"
     empty.mkdir()
 

@@ -28,6 +28,8 @@ from pebble.extensions.checks.report.secrets_here import Secrets, secrets_of
 from pebble.extensions.checks.robot import run_checks
 from pebble.extensions.checks.running.robot import user_of
 from pebble.extensions.operator.places import Places
+from pebble.ownership import read_plain
+from pebble.runtime.as_owner import as_owner
 from pebble.version import __version__
 
 _JOURNAL_LINES = 2000
@@ -123,7 +125,7 @@ def _status(here: Here) -> str:
     user, file = user_of(here.config.run_dir()), str(here.file.absolute())
     who: dict[str, Any] = {} if user is None else {"user": user.pw_uid, "group": user.pw_gid, "extra_groups": []}
     topics = f"{here.config.base}/{OUTGOING}/#"
-    echo = ("-m", "pebble.cli", "topic", "echo", topics, "--seconds", str(_STATES_S), "--config", file)
+    echo = ("-Pm", "pebble.cli", "topic", "echo", topics, "--seconds", str(_STATES_S), "--config", file)
     return output_of(sys.executable, *echo, seconds=_PROGRAM_S, **who)
 
 
@@ -158,7 +160,8 @@ def _described(path: Path) -> str:
     if path.is_symlink():
         return f"# {path} -> {path.readlink()}"
     if path.is_file():
-        return f"# {path}\n{path.read_text(encoding='utf-8', errors='replace').strip()}"
+        with as_owner(path.parent):
+            return f"# {path}\n{read_plain(path).decode(errors='replace').strip()}"
     return f"# {path}/"
 
 

@@ -16,6 +16,7 @@ from pebble.config.masking import values_of
 from pebble.config.secret_text import HIDDEN
 from pebble.config.types import Secret
 from pebble.extensions.operator.places import Places
+from pebble.ownership import read_plain
 
 _SHORTEST = 4  # characters: a shorter one is in every text
 _LARGEST = 1 << 20  # bytes of a file of passwords; others are no such files
@@ -65,7 +66,7 @@ def secrets_of(places: Places, config: Config | None, more: Collection[Path] = (
     for file in dict.fromkeys(_walk([*folders, *more], unread)):
         try:
             if file.is_file() and file.stat().st_size <= _LARGEST:
-                values += [(value, str(file)) for value in values_in(file.name, file.read_bytes())]
+                values += [(value, str(file)) for value in values_in(file.name, read_plain(file))]
         except OSError:
             unread.add(str(file))
     known = frozenset(value for value, _ in values if len(value) >= _SHORTEST)

@@ -11,6 +11,8 @@ from pebble.config import load
 from pebble.errors import PebbleError
 from pebble.extensions.fleet.robot_audit import files
 from pebble.extensions.operator.commands.show import print_table
+from pebble.ownership import read_plain
+from pebble.runtime.as_owner import as_owner
 
 _COLUMNS = ("t", "what", "who", "from", "count")
 
@@ -28,7 +30,8 @@ def audit(
     """
     newer, older = files(load(config))
     try:
-        lines = [line for file in (older, newer) if file.exists() for line in file.read_bytes().splitlines() if line]
+        with as_owner(newer.parent):
+            lines = [line for file in (older, newer) if file.exists() for line in read_plain(file).splitlines() if line]
     except OSError as error:
         raise PebbleError(f"{error.filename}: {error.strerror}; run it as the robot's user") from None
     rows = [row for line in lines[-limit:] if (row := _row(line))]

@@ -1,9 +1,8 @@
 """``pebble fleet``: the accounts of a broker, and what each of them may do."""
 
 import json
-import os
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -11,15 +10,17 @@ import typer
 from msgspec.structs import replace
 
 from pebble.commands.options import host_of, split_names
+from pebble.config.visible import shown
 from pebble.errors import PebbleError
 from pebble.extensions.fleet import applying, certificates, check, folder, pieces, plugin
-from pebble.extensions.fleet.as_owner import as_owner
 from pebble.extensions.fleet.broker_files import new_password
 from pebble.extensions.fleet.commands import lan
+from pebble.extensions.fleet.commands.lan import LATE
 from pebble.extensions.fleet.folder import CONF, ZENOH, Fleet, FleetError, Server
-from pebble.extensions.fleet.people import People
+from pebble.extensions.fleet.people import People, has_user
 from pebble.extensions.fleet.roles import Account, ProgramRole, Role
 from pebble.extensions.operator.client.page_packages import require_packages
+from pebble.runtime.as_owner import as_before, as_owner
 
 _HELP = """The accounts of a broker: robots, people and page servers, and what each may do.
 
@@ -87,10 +88,11 @@ def init(
     first, *others = (host_of("--host", one) for one in split_names(host))
     server = Server(host=first, port=port, unencrypted=unencrypted)
     fleet = Fleet(level=_LEVELS[level or "login"], brokers=(server,), plain=bool(plain))
-    applying.make(place, fleet, others=others)
+    with as_owner(place, *LATE, make=True):
+        applying.make(place, fleet, others=others)
     typer.echo(f"{_shown(place)} has all files of a broker at {server.host}:{server.port}, level {fleet.level}.")
     typer.echo(f"Start it:\n    mosquitto -c {_shown(place / CONF)}")
-    if os.geteuid() == 0:
+    if place.stat().st_uid == 0:
         typer.echo("It will run as root, as whom these files were made: a user of its own would do.")
     typer.echo(f"Keep {_shown(place)} secret, and a copy of it: its keys are in it.")
     return 0
@@ -142,9 +144,9 @@ def add(
             after = replace(after, hubs="here" if fleet.hubs == "none" else fleet.hubs)
         how = applying.apply(place, after, {name: secret})
         files = certificates.of_account(place, name, ()) if is_neighbour else None
-    _print_account(place, after, name, secret, how, board=board)
-    if files is not None:
-        _print_certificate(place, after, name, files)
+        _print_account(place, after, name, secret, how, board=board)
+        if files is not None:
+            _print_certificate(place, after, name, files)
     return 0
 
 
@@ -240,14 +242,15 @@ def certificate(
         if taken := others & {*(hosts or ())}:
             raise FleetError(f"{name} cannot be {min(taken)}: that is a broker of this fleet, or another account")
         files = certificates.of_account(place, name, hosts or ())
-    _print_certificate(place, fleet, name, files)
+        _print_certificate(place, fleet, name, files)
     return 0
 
 
 def list_(folder_: _Folder = None) -> int:
     """Print the accounts and what each is."""
     place = _place(folder_)
-    fleet = folder.load(place)
+    with as_owner(place):
+        fleet = folder.load(place)
     typer.echo(
         f"{_shown(place)}: level {fleet.level}, broker " + ", ".join(f"{s.host}:{s.port}" for s in fleet.brokers)
     )
@@ -329,15 +332,11 @@ def _init_again(place: Path, host: str | None, level: str | None, plain: bool | 
     return _left(applying.copies(Path(_shown(place)), after))
 
 
-#: What commands import when they need it.
-_LATE = ("pebble.extensions.fleet.authority", "pebble.extensions.fleet.zenoh_rules")
-
-
 @contextmanager
 def _changing(folder_: Path | None, *, any_rules: bool = False) -> Iterator[tuple[Path, Fleet]]:
     """Lock a fleet; one that is still for the plugin only with ``any_rules``. Raises PebbleError."""
     place = _place(folder_)
-    with as_owner(place, *_LATE), folder.locked(place):
+    with as_owner(place, *LATE), folder.locked(place):
         fleet = folder.load(place)
         if fleet.rules == "plugin" and not any_rules:
             shown = _shown(place)
@@ -416,7 +415,7 @@ def _left(lines: Iterable[str]) -> int:
     """Print where a change does not count yet; the command's exit code."""
     code = 0
     for line in lines:
-        typer.echo(f"pebble: {line}", err=True)
+        typer.echo(f"pebble: {shown(line)}", err=True)
         code = 1
     return code
 
@@ -429,13 +428,11 @@ def _remove_from_pages(fleet: Fleet, name: str) -> Iterator[str]:
         if not account.people:
             yield f"{page} has people of its own: if {name} is one, `pebble web user remove {name}` on its machine"
             continue
-        if not Path(account.people).is_file():
-            yield f"{page}: {account.people} is not there: who is in it may still get in by that page"
-            continue
-        people = People(Path(account.people))
-        try:
-            if any(user.name == name for user in people.list()):
-                people.remove(name)
+        file = Path(account.people)
+        with as_before(), as_owner(file.parent):  # its owner is not the fleet's
+            if not file.is_file():
+                yield f"{page}: {file} is not there: who is in it may still get in by that page"
+            elif has_user(file, name):
+                with closing(People(file)) as people:
+                    people.remove(name)
                 typer.echo(f"{name} is removed from the people of {page} and logged out there")
-        finally:
-            people.close()

@@ -23,11 +23,14 @@ def hub(file: FileArgument) -> int:
         pebble fleet hub hub1.json
     """
     from pebble.extensions.fleet.hub_file import load_hub, settings_of
+    from pebble.runtime.as_owner import require_own
     from pebble.runtime.hub import run_hub  # of Linux only
     from pebble.runtime.parent import set_up_logging
     from pebble.runtime.signals import EndSignal
 
     settings = settings_of(*load_hub(file))
+    if settings.journal is not None:
+        require_own(settings.journal.parent)
     set_up_logging("INFO")
     stop = EndSignal()
     here = f"on this machine --url zenoh:{settings.run_dir}"

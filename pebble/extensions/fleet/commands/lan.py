@@ -22,10 +22,14 @@ from pebble.extensions.fleet.folder import CONF, Fleet, FleetError, Server
 from pebble.extensions.fleet.roles import Account, ProgramRole
 from pebble.extensions.operator.client.page_packages import require_packages
 from pebble.extensions.operator.places import mosquitto_path
+from pebble.ownership import read_plain
+from pebble.runtime.as_owner import as_owner, require_own
 from pebble.runtime.whole_file import write
 
 HUB_FILE, GATEWAY_FILE, ROBOTS = "hub.json", "gateway.json", "robots"
 _LOCK = ".up"
+#: What commands import when they need it.
+LATE = ("pebble.extensions.fleet.authority", "pebble.extensions.fleet.zenoh_rules")
 GATEWAY = "lan-gateway"  # the account of the boards' gateway
 _SHARED = ("online",)  # what all receive of each other until their configs say more
 _LOOK_S, _END_S = 0.5, 5.0
@@ -61,15 +65,16 @@ def lan(
     server = Server(host=host_of("--host", host), port=port)
     fleet = _accounts(Fleet(level="login", brokers=(server,), hubs="here"), robots, boards)
     passwords = {name: new_password() for name in fleet.accounts}
-    applying.make(place, fleet, passwords)
-    applying.write_zenoh(place, folder.load(place))
-    for name in (*robots, *boards):
-        certificates.of_account(place, _neighbour(name), ())
-    _write(place / HUB_FILE, pieces.hub_file(certificates.SERVER_CERT.removesuffix(".pem")))
-    for name in robots:
-        _write_robot(place, fleet, name, [other for other in (*robots, *boards) if other != name])
-    if boards:
-        _write_boards(place, fleet, boards, passwords)
+    with as_owner(place, *LATE, make=True):
+        applying.make(place, fleet, passwords)
+        applying.write_zenoh(place, folder.load(place))
+        for name in (*robots, *boards):
+            certificates.of_account(place, _neighbour(name), ())
+        _write(place / HUB_FILE, pieces.hub_file(certificates.SERVER_CERT.removesuffix(".pem")))
+        for name in robots:
+            _write_robot(place, fleet, name, [other for other in (*robots, *boards) if other != name])
+        if boards:
+            _write_boards(place, fleet, boards, passwords)
     typer.echo(f"{shown} has all files of a LAN with {', '.join((*robots, *boards))}. On this machine, {server.host}:")
     typer.echo(f"    pebble fleet up {shown}")
     typer.echo(f"On each robot, with a copy of its folder in {shown}/{ROBOTS}; what it has of its own, add there:")
@@ -93,6 +98,7 @@ def up(folder_: Annotated[Path, typer.Argument(metavar="FOLDER", help="Of the fl
     from pebble.transports.peers import FileLock
 
     place = folder_.absolute()
+    require_own(place)
     if not (place / HUB_FILE).is_file():
         raise FleetError(f"{folder_ / HUB_FILE} is missing: name a folder that `pebble fleet lan` has made")
     commands = {name: command for name, command in _commands(place).items() if command}
@@ -114,7 +120,7 @@ def up(folder_: Annotated[Path, typer.Argument(metavar="FOLDER", help="Of the fl
 
 def _commands(place: Path) -> dict[str, list[str]]:
     """What runs here, by its name; nothing for what this LAN does not have. Raises PebbleError."""
-    pebble = [sys.executable, "-m", "pebble"]
+    pebble = [sys.executable, "-Pm", "pebble"]  # nothing of the folder that we are in
     found = {"hub": [*pebble, "fleet", "hub", str(place / HUB_FILE)]}
     if not (place / GATEWAY_FILE).exists():
         return found
@@ -180,14 +186,14 @@ def _write_robot(place: Path, fleet: Fleet, name: str, others: list[str]) -> Non
     )
     for suffix, mode in ((".pem", 0o644), (".key", 0o600)):
         file = place / certificates.ACCOUNTS / f"{_neighbour(name)}{suffix}"
-        write(its / file.name, file.read_bytes(), mode, FleetError)
+        write(its / file.name, read_plain(file), mode, FleetError)
 
 
 def _folder_of(place: Path, name: str) -> Path:
     """The folder that is copied to a robot."""
     its = place / ROBOTS / name
     its.mkdir(parents=True, exist_ok=True)
-    write(its / certificates.CA_CERT, (place / certificates.CA_CERT).read_bytes(), 0o644, FleetError)
+    write(its / certificates.CA_CERT, read_plain(place / certificates.CA_CERT), 0o644, FleetError)
     return its
 
 

@@ -31,7 +31,7 @@ class Tools:
     """Starts each tool as a module of this Python, independently of PATH; ``programs`` replaces some of them."""
 
     def __init__(self, programs: dict[str, Sequence[str]] | None = None) -> None:
-        own: dict[str, Sequence[str]] = {name: (sys.executable, "-m", module) for name, module in _MODULES.items()}
+        own: dict[str, Sequence[str]] = {name: (sys.executable, "-Pm", module) for name, module in _MODULES.items()}
         self._programs = own | (programs or {})
         self._given = set(programs or {})
 

@@ -9,6 +9,7 @@ from pathlib import Path
 import serial
 
 from pebble.errors import DeviceError
+from pebble.runtime.as_owner import as_owner
 
 _INFO = "INFO_UF2.TXT"  # every UF2 boot loader has it: github.com/microsoft/uf2
 _MOUNTS = Path("/proc/self/mounts")
@@ -42,7 +43,7 @@ def wait_for_drive(ask: Callable[[str], None], mounts: Path = _MOUNTS, timeout_s
 def copy(image: Path, drive: Path) -> None:
     """Copy the image; errors are ignored once the board has started MicroPython, which removes the drive."""
     try:
-        with image.open("rb") as source, (drive / image.name).open("wb") as target:
+        with image.open("rb") as source, as_owner(drive), (drive / image.name).open("wb") as target:
             shutil.copyfileobj(source, target)
     except OSError as error:
         if drive.exists() and _is_boot_loader(drive):

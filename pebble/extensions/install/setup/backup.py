@@ -28,6 +28,8 @@ from pebble.extensions.operator.places import Places
 from pebble.extensions.page.setting import people_of
 from pebble.extensions.recordings.config import Recorder
 from pebble.extensions.scripts.config import AutonomyManager
+from pebble.ownership import read_plain
+from pebble.runtime.as_owner import as_owner
 from pebble.services.soundboard_handler.config import SoundboardHandler
 from pebble.version import __version__
 
@@ -95,7 +97,8 @@ def make(places: Places) -> Backup:
     plain = {file.resolve() for file in files if not file.is_symlink()}
     for file in files:
         if not (file.is_symlink() and file.resolve() in plain):  # setup makes such a link again
-            _add(backup, places.root, file)
+            with as_owner(file.parent):
+                _add(backup, places.root, file)
     for what, folder in _left_out(config):
         if (place := _here(places, folder)).exists():
             backup.left_out[str(place)] = what
@@ -151,14 +154,16 @@ def _add(backup: Backup, root: Path, file: Path) -> None:
         if (size := file.stat().st_size) > _LARGEST:
             backup.left_out[str(file)] = f"{size / 1e6:.0f} MB are too large"
             return
-        content = file.read_bytes()
+        content = read_plain(file)
         if content.startswith(_SQLITE):
             content = _database(file)
         backup.files[name] = Saved(content, file.stat().st_mode & 0o777)
     except FileNotFoundError:  # removed meanwhile
         return
     except OSError as error:
-        raise BackupError(f"{file}: cannot be read: {error.strerror}; run it as root") from None
+        raise BackupError(
+            f"{file}: cannot be read: {error.strerror}; run it as root, or remove it if it is a link"
+        ) from None
 
 
 def _database(file: Path) -> bytes:
@@ -199,7 +204,7 @@ def read(file: Path) -> Backup:
         size = file.stat().st_size
         if size > _MOST + _LARGEST:
             raise BackupError(f"{file}: is too large for a backup of Pebble")
-        return unpacked(file.read_bytes(), str(file))
+        return unpacked(read_plain(file), str(file))
     except OSError as error:
         raise BackupError(f"{file}: {error.strerror}") from None
 
@@ -238,7 +243,13 @@ def _about(tar: tarfile.TarFile, member: tarfile.TarInfo | None, name: str) -> A
 def _path(member: tarfile.TarInfo, backup: Backup, name: str) -> str:
     """Return the path of a member, by which nothing outside the root can be written."""
     path = PurePosixPath(member.name)
-    if not member.isfile() or path.is_absolute() or ".." in path.parts or str(path) != member.name:
+    if (
+        not member.isfile()
+        or path.is_absolute()
+        or ".." in path.parts
+        or str(path) != member.name
+        or "\0" in member.name
+    ):
         raise BackupError(f"{name}: {member.name!r} is not what a backup has: it was changed, or is of another program")
     if member.name in backup.files:
         raise BackupError(f"{name}: {member.name!r} is in it twice: it was changed")

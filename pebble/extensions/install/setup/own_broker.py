@@ -7,8 +7,9 @@ from pebble.extensions.fleet.folder import CONF, PID, Fleet, Server
 from pebble.extensions.fleet.roles import Account, ProgramRole
 from pebble.extensions.install.setup.answers import PAGE
 from pebble.extensions.operator.places import Places
+from pebble.runtime.as_owner import as_owner
 
-_LINKS = {CONF: "../conf.d/pebble.conf", PID: "../../../run/mosquitto/mosquitto.pid"}
+LINKS = {CONF: "../conf.d/pebble.conf", PID: "../../../run/mosquitto/mosquitto.pid"}
 
 
 def fleet_of(account: str, base: str, people: Path) -> Fleet:
@@ -36,22 +37,23 @@ def make(new: Path, fleet: Fleet, passwords: dict[str, str]) -> None:
 
 def link(place: Path) -> None:
     """Make links to what mosquitto has elsewhere, relative so that they mean the same below another root."""
-    for name, target in _LINKS.items():
+    for name, target in LINKS.items():
         if not (place / name).is_symlink():
             (place / name).symlink_to(target)
 
 
 def knows(place: Path, wanted: Fleet, passwords: dict[str, str]) -> bool:
     """Return True if these accounts are there as they should be, with these passwords."""
-    fleet = folder.load(place)
-    stored = applying.passwords_of(place)
+    with as_owner(place):
+        fleet = folder.load(place)
+        stored = applying.passwords_of(place)
     known = all(fleet.accounts.get(name) == account for name, account in wanted.accounts.items())
     return known and all(name in stored and stored[name].is_of(password) for name, password in passwords.items())
 
 
 def change(place: Path, wanted: Fleet, passwords: dict[str, str]) -> None:
     """Let the broker know these accounts, at once where it runs."""
-    with folder.locked(place):
+    with as_owner(place), folder.locked(place):
         fleet = folder.load(place)
         for name, account in wanted.accounts.items():
             fleet = fleet.without(name).with_account(name, account)

@@ -1,10 +1,26 @@
-"""Puts the files of a backup in their places on a machine that is no robot yet; nothing is overwritten."""
+"""Puts the files of a backup in their places on a machine that is no robot yet; nothing is overwritten.
 
+Whoever made the file may have changed it, so it says nothing about what root runs, reads, deletes or lets in.
+"""
+
+import os
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
+from pebble.config.problems import Notes
+from pebble.config.raw import decode, plain
+from pebble.config.text_files import text_of
+from pebble.extensions.fleet import applying
+from pebble.extensions.fleet.folder import FLEET, load
 from pebble.extensions.install.setup import backup as backups
 from pebble.extensions.install.setup import own_broker
+from pebble.extensions.install.setup.backup import Saved
+from pebble.extensions.install.setup.robot_config import COMMANDS
 from pebble.extensions.install.setup.system import MOSQUITTO, ROBOT, ROBOTS, SetupError, System
+from pebble.extensions.operator.places import Places
+from pebble.ownership import read_plain
+from pebble.runtime.as_owner import as_owner
 
 #: What a backup may hold, below the root: who owns it there, and the mode of its folders.
 _PLACES = {
@@ -13,26 +29,33 @@ _PLACES = {
     "etc/mosquitto/pebble": (MOSQUITTO, 0o700),
     "etc/mosquitto": ("root:root", 0o755),
 }
+_RUNS = ("command", "extensions", "env")  # keys of programs, and of what these are told
+_OWN = ("/etc/pebble/", "/var/lib/pebble/", "/dev/")  # what a robot may name without a question
 
 
-def restore(system: System, file: Path) -> str:
+def restore(system: System, file: Path, agree: Callable[[Sequence[str]], None]) -> str:
     """Write the files of a backup, the config last, and return the robot's name.
 
     Before anything is written, raises BackupError for what is no whole backup, and SetupError for one that would write
-    elsewhere, and for a machine that has other files in these places.
+    elsewhere, and for a machine that has other files in these places. ``agree`` is called with what its config runs
+    and names beyond its own files, and raises if that should not be.
     """
     backup, places = backups.read(file), system.places
     config, manifest = (str(file.relative_to(places.root)) for file in (places.config, places.manifest))
-    files = {name: saved for name, saved in backup.files.items() if name not in (config, manifest)}
+    files = {name: saved for name, saved in _allowed(backup.files, places).items() if name not in (config, manifest)}
     if config not in backup.files:
         raise SetupError(f"{file}: has no {config}: it is no backup of a robot that is installed")
     files[config] = backup.files[config]
     for name in reversed(files):
         if not _place(name):
-            raise SetupError(f"the backup would write {name}, which is no file of a robot")
+            raise SetupError(f"the backup would write {name!r}, which is no file of a robot")
         target = places.root / name
-        if target.exists() and target.read_bytes() != files[name].content:
-            raise SetupError(f"{target} is there already, with other content: only a blank machine becomes this robot")
+        with as_owner(target.parent):
+            if os.path.lexists(target) and _content(target) != files[name].content:
+                why = "is there already, with other content: only a blank machine becomes this robot"
+                raise SetupError(f"{target} {why}")
+    if beyond := [*_beyond(plain(decode(text_of(files[config].content), config), Notes()))]:
+        agree(beyond)
     for place in {_place(name) for name in files}:
         system.owner(_PLACES[place][0])  # without mosquitto the robot's broker has no owner
     for name, saved in files.items():
@@ -45,9 +68,58 @@ def restore(system: System, file: Path) -> str:
             system.write(places.unfinished, b"")
         if not target.exists():
             system.write(target, saved.content, saved.mode & 0o755, owner)
-    if places.broker_folder.is_dir():
-        own_broker.link(places.broker_folder)
+    if (places.broker_folder / FLEET).is_file():
+        with as_owner(places.broker_folder):  # its rules follow from its table, and from nothing else
+            own_broker.link(places.broker_folder)
+            fleet, passwords = load(places.broker_folder), applying.passwords_of(places.broker_folder)
+            applying.write_rules(places.broker_folder, fleet, passwords)
     return backup.about.id
+
+
+def _content(file: Path) -> bytes:
+    try:
+        return read_plain(file)
+    except OSError as error:
+        raise SetupError(f"{file}: {error.strerror}") from None
+
+
+def _allowed(files: dict[str, Saved], places: Places) -> dict[str, Saved]:
+    """Return the files without those of mosquitto that setup makes itself, or that are not the robot's."""
+    folder = f"{places.broker_folder.relative_to(places.root)}/"
+    made = [f"{folder}{name}" for name in own_broker.LINKS]
+    broker = str(places.broker.relative_to(places.root))
+    kept = {
+        name: saved
+        for name, saved in files.items()
+        if name not in made and (name.startswith(folder) or not name.startswith("etc/mosquitto/"))
+    }
+    if broker in files:
+        kept[broker] = Saved(own_broker.conf_text(places, own_broker.fleet_of("robot", "", places.people)), 0o644)
+    if any(name.startswith(folder) for name in kept) and f"{folder}{FLEET}" not in kept:
+        raise SetupError(f"the backup has files of a broker, and no {folder}{FLEET}: it was changed")
+    return kept
+
+
+def _beyond(value: Any, *keys: str) -> Iterator[str]:
+    """Yield the programs in a config, but setup's own, and files beyond the robot's, each with its key."""
+    key = keys[-1] if keys else ""
+    is_run = key in _RUNS or key.endswith(("_command", "_env"))
+    if (value and value not in COMMANDS) if is_run else (isinstance(value, str) and _is_beyond(value)):
+        yield f"{'.'.join(keys)}: {' '.join(map(str, value)) if isinstance(value, list | dict) else value}"
+    if isinstance(value, dict):
+        for name, item in value.items():
+            yield from _beyond(item, *keys, str(name))
+    elif isinstance(value, list) and not is_run:
+        for item in value:
+            yield from _beyond(item, *keys)
+
+
+def _is_beyond(text: str) -> bool:
+    """True if a text may be the path of a file that is not the robot's."""
+    if not text.startswith(("/", "~")) and ".." not in text.split("/"):
+        return False
+    path = os.path.normpath(text if text[0] in "/~" else f"/etc/pebble/{text}")
+    return not f"{path}/".startswith(_OWN)
 
 
 def _place(name: str) -> str:

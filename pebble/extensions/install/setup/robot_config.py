@@ -17,6 +17,12 @@ UNIT = "pebble.service"
 PAGE_PORT = 8080
 BROKER_PASSWORD, PAGE_PASSWORD, BROKER_CA = "broker.password", "page.password", "broker-ca.pem"
 _SYSTEMCTL = ["systemctl", "--no-ask-password"]
+#: What polkit lets a robot ask of its system: a reboot, a restart, an update.
+COMMANDS = (
+    [*_SYSTEMCTL, "reboot"],
+    [*_SYSTEMCTL, "--no-block", "restart", UNIT],
+    [*_SYSTEMCTL, "start", "pebble-update.service"],
+)
 
 
 def answers_of(config: Config, places: Places) -> Answers:
@@ -76,8 +82,8 @@ def config_of(answers: Answers, places: Places) -> dict[str, Any]:
         services["mqtt_bridge"] = {
             "enabled": True,
             "remote_mqtt": _broker(answers),
-            "reboot_control": {"command": [*_SYSTEMCTL, "reboot"]},
-            "service_restart_control": {"command": [*_SYSTEMCTL, "--no-block", "restart", UNIT]},
+            "reboot_control": {"command": COMMANDS[0]},
+            "service_restart_control": {"command": COMMANDS[1]},
         }
     config: dict[str, Any] = {
         "//": "Written by `pebble setup`. What is changed here by hand stays; `pebble check --keys` lists all keys.",

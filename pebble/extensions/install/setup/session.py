@@ -2,12 +2,13 @@
 
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import typer
 from rich.console import Console
 
+from pebble.config.visible import shown
 from pebble.extensions.checks.broker.login_attempt import attempt
 from pebble.extensions.fleet import certificates
 from pebble.extensions.install.setup import detect
@@ -33,7 +34,7 @@ def set_up(system: System, answers_file: Path | None, backup_file: Path | None) 
     system.owner(ROBOTS)
     given, secrets = ({}, Secrets()) if answers_file is None else read_file(answers_file)
     if backup_file is not None:
-        say(f"The files of {restore(system, backup_file)} are in their places.")
+        say(f"The files of {restore(system, backup_file, _agree)} are in their places.")
     config = load_config(places)
     answers = Answers() if config is None else answers_of(config, places)
     job = Job(system, config, answers, secrets).with_answers(given)
@@ -64,6 +65,14 @@ def set_up(system: System, answers_file: Path | None, backup_file: Path | None) 
     return 1 if failures else 0
 
 
+def _agree(lines: Sequence[str]) -> None:
+    """Show what a restored config runs and names. Raises Abort."""
+    say("The config of this backup runs programs, or names what is not the robot's own:")
+    for line in lines:
+        say(shown(line), 2)
+    typer.confirm("Shall the robot have these?", default=False, abort=True)
+
+
 def _failures(job: Job, *, is_started: bool) -> Iterator[str]:
     """Yield what keeps the robot from being driven; a robot that was started tests itself."""
     places = job.places
@@ -72,7 +81,7 @@ def _failures(job: Job, *, is_started: bool) -> Iterator[str]:
     if job.answers.remote is not None and (why := _refusal(places)):
         yield f"the broker {job.answers.broker} does not let the robot in: {why}; the robot tries it again and again"
     if is_started:
-        command = [sys.executable, "-m", "pebble", "doctor", str(places.config), "--running"]
+        command = [sys.executable, "-Pm", "pebble", "doctor", str(places.config), "--running"]
         if code := subprocess.run(command, check=False).returncode:
             yield f"the self-test ended with {code}: pebble doctor {places.config} --running"
 

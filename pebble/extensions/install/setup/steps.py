@@ -14,7 +14,6 @@ from pebble.config.config import parse
 from pebble.contract.identity import Identity
 from pebble.errors import PebbleError
 from pebble.extensions.fleet import certificates
-from pebble.extensions.fleet.as_owner import as_owner
 from pebble.extensions.fleet.broker_files import new_password
 from pebble.extensions.fleet.people import People, has_user
 from pebble.extensions.fleet.roles import Role
@@ -43,6 +42,7 @@ from pebble.extensions.install.setup.system import MOSQUITTO, ROBOTS, SetupError
 from pebble.extensions.operator.places import Places
 from pebble.extensions.page.config import WebHandler, WebInterface
 from pebble.extensions.page.setting import people_of
+from pebble.runtime.as_owner import as_owner
 from pebble.runtime.connections import check_connections
 
 ROBOT_SERVICE, BROKER_SERVICE = UNIT, "mosquitto.service"

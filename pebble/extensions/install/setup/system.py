@@ -11,6 +11,7 @@ from pathlib import Path
 
 from pebble.errors import PebbleError
 from pebble.extensions.operator.places import Places
+from pebble.runtime.as_owner import as_owner
 from pebble.runtime.child import run
 from pebble.runtime.whole_file import is_root, write
 
@@ -65,21 +66,24 @@ class System:
 
     def write(self, file: Path, content: bytes, mode: int = 0o640, owner: str = ROBOTS) -> None:
         """Replace a file at once. Raises SetupError."""
-        write(file, content, mode, SetupError, self.owner(owner))
+        ids = self.owner(owner)
+        with as_owner(file.parent):
+            write(file, content, mode, SetupError, ids if is_root() else None)
 
     def make_folder(self, folder: Path, mode: int, owner: str, fill: Callable[[Path], None] | None = None) -> None:
         """Make a folder, filled beside its place, so that it is there whole or not at all. Raises SetupError."""
         ids = self.owner(owner)
         new = folder.with_name(f".{folder.name}.new")
         try:
-            shutil.rmtree(new, ignore_errors=True)
-            new.mkdir(mode=0o700)
-            if fill is not None:
-                fill(new)
-            if ids is not None:
-                for path in (*new.iterdir(), new):
-                    os.chown(path, *ids, follow_symlinks=False)
-            new.chmod(mode)
-            new.rename(folder)
+            with as_owner(folder.parent):
+                shutil.rmtree(new, ignore_errors=True)
+                new.mkdir(mode=0o700)
+                if fill is not None:
+                    fill(new)
+                new.chmod(mode)
+                if ids is not None and is_root():  # last of all: then it is theirs
+                    for path in (*new.iterdir(), new):
+                        os.chown(path, *ids, follow_symlinks=False)
+                new.rename(folder)
         except OSError as error:
             raise SetupError(f"{folder}: {error.strerror}") from None

@@ -18,6 +18,7 @@ from cryptography.exceptions import InvalidSignature
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PublicKey
 
 from pebble.errors import PebbleError
+from pebble.ownership import open_plain
 from pebble.version import __version__
 
 MANIFEST, SIGNATURE = "RELEASE.json", "RELEASE.json.minisig"
@@ -107,7 +108,7 @@ def _check_files(folder: Path, release: Release) -> None:
 def _read(path: Path) -> bytes:
     most = _MOST_BYTES.get(path.name, _MOST_BYTES[""])
     try:
-        with path.open("rb") as file:
+        with open_plain(path) as file:
             data = file.read(most + 1)
     except OSError as error:
         raise ReleaseError(f"{path}: {error.strerror}") from error

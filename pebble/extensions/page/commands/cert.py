@@ -1,5 +1,7 @@
 """``pebble cert``: certificates of one's own for the operator page."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated
 
@@ -9,6 +11,7 @@ from pebble.errors import PebbleError
 from pebble.extensions.fleet import certificates
 from pebble.extensions.operator.client.page_packages import require_packages
 from pebble.extensions.page.commands.people import TLS, default_folder
+from pebble.runtime.as_owner import as_owner
 
 _HELP = """Certificates of one's own, for the operator page by https.
 
@@ -49,34 +52,32 @@ def init(names: _Names, folder: _Folder = None) -> int:
     \b
         pebble cert init lab-pc.local 192.168.1.20
     """
-    require_packages()
-    place = _place(folder)
-    certificates.init(place, names)
-    typer.echo(f"{place} has a certificate for {', '.join(certificates.show(place / certificates.SERVER_CERT).names)}.")
-    typer.echo(f"Next:\n    pebble web CONFIG --host 0.0.0.0 --tls {place}")
-    _print_trust(place)
+    with _opened(folder, make=True) as place:
+        certificates.init(place, names)
+        signed = certificates.show(place / certificates.SERVER_CERT).names
+        typer.echo(f"{place} has a certificate for {', '.join(signed)}.")
+        typer.echo(f"Next:\n    pebble web CONFIG --host 0.0.0.0 --tls {place}")
+        _print_trust(place)
     return 0
 
 
 def renew(names: _NewNames = None, folder: _Folder = None) -> int:
     """Make a new server certificate by the same authority, which browsers trust already; restart `pebble web` then."""
-    require_packages()
-    place = _place(folder)
-    certificates.renew(place, names or ())
-    shown = certificates.show(place / certificates.SERVER_CERT)
+    with _opened(folder) as place:
+        certificates.renew(place, names or ())
+        shown = certificates.show(place / certificates.SERVER_CERT)
     typer.echo(f"{shown.file} is for {', '.join(shown.names)} until {shown.until:%Y-%m-%d}; restart `pebble web`")
     return 0
 
 
 def show(folder: _Folder = None) -> int:
     """Print names, dates and fingerprints, and how browsers trust the authority."""
-    require_packages()
-    place = _place(folder)
-    for file in (certificates.CA_CERT, certificates.SERVER_CERT):
-        shown = certificates.show(place / file)
-        typer.echo(f"{shown.file}\n    {'for ' + ', '.join(shown.names) if shown.names else 'authority'}")
-        typer.echo(f"    until {shown.until:%Y-%m-%d}\n    SHA-256 {shown.sha256}")
-    _print_trust(place)
+    with _opened(folder) as place:
+        for file in (certificates.CA_CERT, certificates.SERVER_CERT):
+            shown = certificates.show(place / file)
+            typer.echo(f"{shown.file}\n    {'for ' + ', '.join(shown.names) if shown.names else 'authority'}")
+            typer.echo(f"    until {shown.until:%Y-%m-%d}\n    SHA-256 {shown.sha256}")
+        _print_trust(place)
     return 0
 
 
@@ -88,8 +89,12 @@ def register(app: typer.Typer) -> None:
     app.add_typer(group, name="cert")
 
 
-def _place(folder: Path | None) -> Path:
-    return (folder or default_folder() / TLS).absolute()
+@contextmanager
+def _opened(folder: Path | None, *, make: bool = False) -> Iterator[Path]:
+    require_packages()
+    place = (folder or default_folder() / TLS).absolute()
+    with as_owner(place, "pebble.extensions.fleet.authority", make=make):
+        yield place
 
 
 def _print_trust(place: Path) -> None:

@@ -13,13 +13,13 @@ import typer
 from pebble.config import load
 from pebble.config.config import default_state_folder
 from pebble.errors import PebbleError
-from pebble.extensions.fleet.as_owner import as_owner
 from pebble.extensions.fleet.audit import Audit, Entry
 from pebble.extensions.fleet.people import People
 from pebble.extensions.fleet.roles import Role
 from pebble.extensions.operator.commands.show import print_table
 from pebble.extensions.operator.places import Places
 from pebble.extensions.page.config import WebHandler, WebInterface
+from pebble.runtime.as_owner import as_owner
 
 PEOPLE = "people.sqlite"
 PLACES = Places()

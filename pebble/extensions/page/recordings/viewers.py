@@ -31,7 +31,7 @@ class Viewers:
             await _close(websocket, f"{MOST} pages look at recordings already: close one, then reload")
             return
         ours, theirs = socket.socketpair()
-        command = [sys.executable, "-m", playing.__name__, str(theirs.fileno()), str(self._folder), ref, str(at_ms)]
+        command = [sys.executable, "-Pm", playing.__name__, str(theirs.fileno()), str(self._folder), ref, str(at_ms)]
         try:
             with theirs:
                 process = subprocess.Popen(command, stdin=subprocess.DEVNULL, pass_fds=[theirs.fileno()])

@@ -12,6 +12,7 @@ import typer
 from pebble.commands.options import Output
 from pebble.extensions.recordings.commands.options import RecordingsArgument, Since, Until, period
 from pebble.extensions.recordings.commands.report import errors_of_files
+from pebble.runtime.as_owner import as_owner
 
 if TYPE_CHECKING:
     from pebble.extensions.recordings.traffic.results import RobotTraffic, Traffic
@@ -55,9 +56,13 @@ def analyse(
 
     since_ns, until_ns = period(since, until)
     bases = [base_of(name) for name in robot or ()]
-    with errors_of_files():
+    with as_owner(output), errors_of_files():
         output.mkdir(parents=True, exist_ok=True)  # before the work, not after it
-    with tempfile.TemporaryDirectory(prefix="pebble-analyse-") as folder, progress_of_steps() as progress:
+    with (
+        as_owner(output),
+        tempfile.TemporaryDirectory(prefix="pebble-analyse-") as folder,
+        progress_of_steps() as progress,
+    ):
         scratch = Path(folder)
         with errors_of_files():
             found = sources(places, scratch, progress)

@@ -22,6 +22,7 @@ from pebble.extensions.recordings.library import ACTIVE, FOREVER_NS, SUFFIX, fil
 from pebble.extensions.recordings.recorder.finisher import mend as mend_leftover
 from pebble.extensions.recordings.recorder.folder import DAMAGED, Folder, finished_path
 from pebble.extensions.recordings.traffic.index import index_path
+from pebble.runtime.as_owner import as_owner
 
 _DATE = re.compile(r"\d{2}|\d{4}", re.ASCII)
 
@@ -38,7 +39,7 @@ def mend(
     if not source.is_dir():
         return _mend_file(source, target)
     owner = Folder(source)
-    with owner.taken():
+    with as_owner(source), owner.taken():
         return _mend_all(owner)
 
 
@@ -56,7 +57,8 @@ def rm(
     A file that cannot be read completely stays as it is. One that is named is deleted, whatever is in it.
     """
     if not folder.is_dir() and robot is None and since is None and until is None:
-        return _delete_whole(folder, yes=yes)
+        with as_owner(folder.parent):
+            return _delete_whole(folder, yes=yes)
     if robot is None and since is None and until is None:
         raise PebbleError("what to delete is missing: name --robot, --since or --until")
     since_ns, until_ns = period(since, until)
@@ -67,7 +69,7 @@ def rm(
         return not inside or (base is not None and robot_of(message.channel) != base)
 
     owner = Folder(_existing(folder))
-    with owner.taken():  # a recorder would write retained values again
+    with as_owner(folder), owner.taken():  # a recorder would write retained values again
         return _rm(owner, base, (since_ns, until_ns), keeps, yes=yes)
 
 

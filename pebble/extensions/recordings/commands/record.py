@@ -20,6 +20,7 @@ from pebble.extensions.recordings.recorder.recorder import Recorder
 from pebble.extensions.recordings.recorder.settings import EVERYTHING, Options
 from pebble.extensions.recordings.recorder.source import Source
 from pebble.launcher.sd_notify import SystemdNotifier
+from pebble.runtime.as_owner import as_owner
 from pebble.runtime.signals import interrupted_by_signals
 from pebble.transports.topics import check_filter
 
@@ -70,7 +71,8 @@ def record(
     for filter_ in chosen:
         check_filter(filter_)
     recorder = Recorder(into, options, {"filters": " ".join(chosen)})
-    _run(recorder, Source(recorder, kind, transport, chosen), where, length)
+    with as_owner(into):
+        _run(recorder, Source(recorder, kind, transport, chosen), where, length)
     _print_end(recorder, into)
     return 0
 

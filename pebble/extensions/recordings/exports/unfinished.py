@@ -6,6 +6,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from pebble.extensions.recordings.files.recorded import RecordingError
+from pebble.runtime.as_owner import as_owner
 
 
 @contextmanager
@@ -20,11 +21,13 @@ def unfinished(target: Path) -> Iterator[Path]:
         raise RecordingError(f"{target.parent}: there is no such folder")
     path = target.with_name(f".{target.name}.{os.getpid()}")
     try:
-        yield path
-        if target.exists():
-            raise RecordingError(f"{target} exists already")
-        path.replace(target)
+        with as_owner(target.parent):
+            try:
+                yield path
+                if target.exists():
+                    raise RecordingError(f"{target} exists already")
+                path.replace(target)
+            finally:
+                path.unlink(missing_ok=True)
     except OSError as error:
         raise RecordingError(f"{target}: {error.strerror or error}") from None
-    finally:
-        path.unlink(missing_ok=True)

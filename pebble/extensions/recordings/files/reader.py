@@ -47,6 +47,7 @@ from pebble.extensions.recordings.files.records import (
     with_own_topic,
 )
 from pebble.extensions.recordings.files.scan import Found, Scan
+from pebble.ownership import open_plain
 
 if TYPE_CHECKING:
     from mcap.records import Attachment, ChunkIndex, McapRecord, Metadata, Statistics
@@ -93,7 +94,7 @@ class RecordingFile:
         self._indexed_to = 0  # where these end
         self._looked_everywhere = False
         try:
-            self._file = path.open("rb")
+            self._file = open_plain(path)
         except OSError as error:
             raise RecordingError(f"{path}: {error.strerror or error}") from None
         try:

@@ -15,6 +15,7 @@ from typing import BinaryIO, Final
 from pebble.extensions.recordings.files.recorded import RecordingError
 from pebble.extensions.recordings.files.rewrite import PART
 from pebble.extensions.recordings.library import ACTIVE, SUFFIX
+from pebble.runtime.as_owner import as_owner
 from pebble.runtime.whole_file import sync_folder
 from pebble.transports.own_file import OwnFile
 
@@ -97,14 +98,15 @@ class Folder:
 
     @classmethod
     def is_in_use(cls, root: Path) -> bool:
-        """Whether a recorder writes there, or may without being noticed."""
-        if not (root / LOCK).exists():
-            return False
-        try:
-            with _locked(root / LOCK, "") as is_locked:
-                return not is_locked
-        except RecordingError:
-            return True
+        """True if a recorder writes there, or may without being noticed."""
+        with as_owner(root):
+            if not (root / LOCK).exists():
+                return False
+            try:
+                with _locked(root / LOCK, "") as is_locked:
+                    return not is_locked
+            except RecordingError:
+                return True
 
     def create(self, lane: str, now_ns: int) -> tuple[BinaryIO, Path]:
         """A new file that is being written. Raises OSError."""

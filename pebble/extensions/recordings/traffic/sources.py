@@ -11,11 +11,13 @@ from typing import TYPE_CHECKING, Final
 
 from msgspec import Struct, field
 
+from pebble.errors import PebbleError
 from pebble.extensions.recordings.files.recorded import SUFFIX, RecordingError
 from pebble.extensions.recordings.library import ACTIVE, files
 from pebble.extensions.recordings.recorder.folder import finished_path
 from pebble.extensions.recordings.traffic.duck import connected, parquet
 from pebble.extensions.recordings.traffic.index import INDEX, about, index_path, is_of, write_index
+from pebble.runtime.as_owner import require_own
 
 if TYPE_CHECKING:
     from duckdb import DuckDBPyConnection
@@ -99,6 +101,14 @@ def _index(path: Path, spare: Path, connection: DuckDBPyConnection, advance: Cal
     index = index_path(path)
     if not is_active and is_of(index, path, connection):
         return index
-    index = spare if is_active or not os.access(path.parent, os.W_OK) else index
+    index = spare if is_active or not _may_write(path.parent) else index
     write_index(path, index, spare.parent, advance)
     return index
+
+
+def _may_write(folder: Path) -> bool:
+    try:
+        require_own(folder)
+    except PebbleError:
+        return False
+    return os.access(folder, os.W_OK, effective_ids=os.access in os.supports_effective_ids)

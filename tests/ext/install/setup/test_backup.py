@@ -115,6 +115,7 @@ FOREIGN: dict[str, tuple[bytes, str]] = {
     "beyond the root": (tar_of(ABOUT_IT, ("etc/../../x", b"x")), "is not what a backup has"),
     "a link": (tar_of(ABOUT_IT, ("etc/x", b""), kind=tarfile.SYMTYPE), "is not what a backup has"),
     "a device": (tar_of(ABOUT_IT, ("etc/x", b""), kind=tarfile.CHRTYPE), "is not what a backup has"),
+    "a broken name": (tar_of(ABOUT_IT, ("etc/./x", b"x")), "is not what a backup has"),
     "twice": (tar_of(ABOUT_IT, ("etc/x", b"1"), ("etc/x", b"2")), "is in it twice"),
 }
 

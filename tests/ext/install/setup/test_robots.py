@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import os
 import re
@@ -9,6 +10,7 @@ import threading
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -19,7 +21,7 @@ from pebble.extensions.fleet import certificates
 from pebble.extensions.fleet.certificates import CA_CERT
 from pebble.extensions.fleet.people import People
 from pebble.extensions.fleet.roles import Account, Role
-from pebble.extensions.install.setup.backup import make
+from pebble.extensions.install.setup.backup import Saved, make
 from pebble.extensions.operator.places import Places, mosquitto_path
 from pebble.extensions.page.commands import people as web_people
 from pebble.runtime.connections import mqtt_settings
@@ -181,6 +183,54 @@ def test_a_machine_with_other_files_takes_no_backup(
         == f"pebble: {other / name} is there already, with other content: only a blank machine becomes this robot\n"
     )
     assert tree(other) == before
+
+
+def changed(files: dict[str, Saved], more: dict[str, bytes], keys: dict[str, Any]) -> bytes:
+    """Return a backup as an attacker may have it: with other files, and other keys of its config."""
+    config = json.loads(files["etc/pebble/robot.json"].content)
+    config["services"]["mqtt_bridge"] |= keys
+    members = {name: saved.content for name, saved in files.items()} | more
+    members["etc/pebble/robot.json"] = json.dumps(config).encode()
+    return tar_of(HEAD, *members.items())
+
+
+@pytest.mark.parametrize(
+    ("keys", "shown"),
+    [
+        ({"git_pull_control": {"command": ["sh", "-c", "evil"]}}, "mqtt_bridge.git_pull_control.command: sh -c evil"),
+        ({"remote_mqtt": {"password_file": "/etc/shadow"}}, "remote_mqtt.password_file: /etc/shadow"),
+        ({"remote_mqtt": {"password_file": "../shadow"}}, "remote_mqtt.password_file: ../shadow"),
+    ],
+)
+def test_what_a_restored_config_runs_and_names_is_asked_for_first(
+    keys: dict[str, Any], shown: str, root: Path, tmp_path: Path, run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    set_up(root)
+    (tmp_path / "evil.tar").write_bytes(changed(make(Places(root)).files, {}, keys))
+    other = machine_root(tmp_path / "other")
+    at(other, monkeypatch)
+    monkeypatch.setattr("sys.stdin", io.StringIO("\n"))
+    before = tree(other)
+    assert run("setup", "--from", tmp_path / "evil.tar") == 130
+    assert shown in run.out
+    assert tree(other) == before
+
+
+def test_a_restored_broker_lets_in_whom_its_table_names_and_has_no_other_listener(
+    root: Path, tmp_path: Path, run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    set_up(root)
+    wanted, other = tree(root), machine_root(tmp_path / "other")
+    folder, rules = "etc/mosquitto", b"user eve\ntopic readwrite #\n"
+    evil = {"conf.d/a.conf": b"listener 1999", "conf.d/pebble.conf": b"allow_anonymous true", "mosquitto.conf": b"x"}
+    evil |= {"pebble/acl": rules, "pebble/mosquitto.conf": b"x", "pebble/mosquitto.pid": b"1"}
+    more = {f"{folder}/{name}": content for name, content in evil.items()}
+    (tmp_path / "evil.tar").write_bytes(changed(make(Places(root)).files, more, {}))
+    at(other, monkeypatch)
+    run("setup", "--from", tmp_path / "evil.tar")
+    there = tree(other)
+    assert there.keys() == wanted.keys()
+    assert [name for name in wanted if name.startswith(folder) and there[name][1] != wanted[name][1]] == []
 
 
 @needs_root

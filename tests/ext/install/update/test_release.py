@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
 import subprocess
 from collections.abc import Callable
@@ -61,6 +62,7 @@ def test_one_flipped_bit_in_any_byte_is_refused(tmp_path: Path) -> None:
     [
         (lambda folder: (folder / SIGNATURE).unlink(), "RELEASE.json.minisig: No such file"),
         (lambda folder: (folder / "robot.txt").unlink(), "robot.txt: No such file"),
+        (lambda folder: [(folder / MANIFEST).unlink(), os.mkfifo(folder / MANIFEST)], "json: is no plain file"),
         (lambda folder: (folder / SIGNATURE).write_bytes(bytes(2000)), "minisig has more than 1024 bytes"),
         (lambda folder: (folder / SIGNATURE).write_text("a\nb\n"), "is no signature by minisign"),
         (lambda folder: (folder / "other.whl").touch(), "has more than RELEASE.json names: other.whl"),

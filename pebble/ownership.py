@@ -1,0 +1,84 @@
+"""Files that others may have made: who may put another one, or a link, in the place of a path; and reading them."""
+
+import errno
+import os
+import stat
+from pathlib import Path
+from typing import BinaryIO, NamedTuple
+
+from pebble.errors import PebbleError
+
+
+class Owner(NamedTuple):
+    """A user and a group, by their numbers."""
+
+    uid: int
+    gid: int
+
+
+def owner_of(folder: Path, *, nameless: bool = True) -> Owner:
+    """Return the one user besides root who may change what lies in ``folder``, or root; it need not be there yet.
+
+    ``nameless``: users without an entry count, too; in a container they are those of the machine around it. Raises
+    PebbleError where several users may, and for a link on the way that a user besides root can change.
+    """
+    place, owner = Path("/"), Owner(0, 0)
+    system = place.lstat().st_uid  # in a user namespace root's files may seem to be of another user
+    names = list(folder.absolute().parts[1:])
+    while names:
+        place /= names.pop(0)
+        try:
+            found = place.lstat()
+        except OSError:  # it is missing, or not to be seen by this user
+            break
+        uid = 0 if found.st_uid == system or not (nameless or _has_name(found.st_uid)) else found.st_uid
+        if stat.S_ISLNK(found.st_mode):
+            if owner.uid or uid:
+                raise PebbleError(f"{place} is a link of user {uid or owner.uid}: name the folder itself")
+            return owner_of(place.parent.joinpath(place.readlink(), *names), nameless=nameless)
+        if owner.uid not in (0, uid):
+            raise PebbleError(f"{place} belongs to user {uid}, and lies in a folder of user {owner.uid}: move it")
+        if uid == 0 and _is_shared(found):
+            raise PebbleError(f"{place} belongs to root, and others may write there: chmod go-w it, or chown it")
+        owner = Owner(uid, found.st_gid)
+    return owner
+
+
+def others_in(folder: Path) -> str:
+    """Return why another user than this one and root may change what lies in ``folder``; empty: none may."""
+    try:
+        uid = owner_of(folder).uid
+    except PebbleError as error:
+        return str(error)
+    return f"{folder} belongs to user {uid}" if uid and os.geteuid() not in (0, uid) else ""
+
+
+def _has_name(uid: int) -> bool:
+    import pwd  # which Windows lacks
+
+    try:
+        pwd.getpwuid(uid)
+    except KeyError:
+        return False
+    return True
+
+
+def _is_shared(found: os.stat_result) -> bool:
+    """True if others than the owner can replace what is in a folder; where it is sticky they cannot."""
+    writers = stat.S_IWOTH | (stat.S_IWGRP if found.st_gid else 0)
+    return bool(found.st_mode & writers) and stat.S_ISDIR(found.st_mode) and not found.st_mode & stat.S_ISVTX
+
+
+def open_plain(file: Path) -> BinaryIO:
+    """Open a file to read it; a FIFO or a device might never end. Raises OSError."""
+    opened = open(file, "rb", opener=lambda path, flags: os.open(path, flags | getattr(os, "O_NONBLOCK", 0)))  # noqa: SIM115
+    if stat.S_ISREG(os.fstat(opened.fileno()).st_mode):
+        return opened
+    opened.close()
+    raise OSError(errno.EINVAL, "is no plain file", str(file))
+
+
+def read_plain(file: Path) -> bytes:
+    """Return what is in such a file. Raises OSError."""
+    with open_plain(file) as opened:
+        return opened.read()
