@@ -24,6 +24,7 @@ class Tls(Section, frozen=True, kw_only=True):
     """Encryption of one connection."""
 
     retired: ClassVar = {"ciphers": "OpenSSL's own are used, of TLS 1.2 or newer"}
+    other_names: ClassVar = {"ca_certs": "ca_cert", "certfile": "client_cert", "keyfile": "client_key"}  # paho's
 
     enabled: Annotated[bool, doc("Encrypt the connection; otherwise the other keys have no effect.")] = False
     ca_cert: Annotated[File | None, doc("Authority to trust; unset: those of the system.")] = None

@@ -4,15 +4,15 @@ import os
 import re
 from pathlib import Path as FilePath
 
-from msgspec.structs import replace
+from msgspec.structs import asdict, replace
 
-from pebble.config.problems import Path
+from pebble.config.problems import Notes, Path
 from pebble.config.reader import Reader, Rule
 from pebble.config.rules.doors import check_doors
 from pebble.config.rules.exposure import warn_if_readable, warn_of_known_id, warn_of_logins_in_clear
 from pebble.config.rules.shared_topics import shared_topics
 from pebble.config.text_files import NotTextError, read_text
-from pebble.config.transport import Mqtt, Tls, TransportSection
+from pebble.config.transport import Mqtt, RemoteMqtt, Tls, TransportSection
 from pebble.config.tree import MqttBridge, Root, SerialBridge, Services
 from pebble.config.types import Secret
 from pebble.contract.identity import GATEWAYS, SERVERS
@@ -24,6 +24,7 @@ _INSTANCE_NAME = re.compile(r"[A-Za-z0-9_.-]{1,32}").fullmatch  # it becomes par
 
 
 def _root(reader: Reader, root: Root, _path: Path) -> Root:
+    root = _without_uplink(reader.notes, root)
     kind, platform = root.transport.kind, root.robot.platform
     if root.transport.mqtt_mirror is not None and kind != "zenoh":
         reader.notes.doubt(
@@ -91,9 +92,29 @@ def _bridge(reader: Reader, bridge: MqttBridge, path: Path) -> MqttBridge:
             notes.problem((*path, "remote", "listen"), "an uplink only connects: leave it out")
         if remote.account and (not remote.tls.enabled or remote.tls.client_cert is None):
             notes.problem((*path, "remote", "account"), "needs tls.client_cert, in which it is the name")
-    elif bridge.enabled and not bridge.remote_mqtt.host:
-        notes.doubt((*path, "remote_mqtt", "host"), "is missing, write the name of the remote broker")
     return bridge
+
+
+def _without_uplink(notes: Notes, root: Root) -> Root:
+    """Let a bridge whose remote host is empty, as in the original's examples, serve the robot's own broker.
+
+    Operators connect to that; a Zenoh robot has none, and runs without a bridge.
+    """
+    bridge, transport = root.services.mqtt_bridge, root.transport
+    if not bridge.enabled or bridge.remote_mqtt.host or (bridge.remote is not None and bridge.remote.kind != "mqtt"):
+        return root
+    path = ("services", "mqtt_bridge", "remote_mqtt", "host")
+    if root.robot.platform != "linux":
+        notes.doubt(path, "is missing, write the name of the remote broker")
+        return root
+    own = root.local_mqtt if transport.kind == "mqtt" else transport.mqtt_mirror
+    if own is None:
+        notes.warning(path, "is empty: there is no uplink, so no operator sees or drives this robot")
+        bridge = replace(bridge, enabled=False)
+    else:
+        notes.warning(path, f"is empty: there is no uplink, operators connect to the robot's own broker, {own.host}")
+        bridge = replace(bridge, remote_mqtt=RemoteMqtt(**asdict(own), client_id=bridge.remote_mqtt.client_id))
+    return replace(root, services=replace(root.services, mqtt_bridge=bridge))
 
 
 def _serial(reader: Reader, serial: SerialBridge, path: Path) -> SerialBridge:
