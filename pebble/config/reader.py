@@ -78,7 +78,9 @@ class Reader:
         """Return what a value means where an object is expected: it is on or off, or empty."""
         if self._other_forms and "enabled" in known and (enabled := switch(raw)) is not None:
             return {"enabled": enabled}
-        instead: dict[str, Any] = self._unfit(f"must be an object {{…}}, not {_shown(raw)}", raw, path, {} if path else NODEFAULT)
+        instead: dict[str, Any] = self._unfit(
+            f"must be an object {{…}}, not {_shown(raw)}", raw, path, {} if path else NODEFAULT
+        )
         return {} if instead is _WRONG else instead
 
     def _key(self, kind: type[Section], known: Mapping[str, Any], key: str, path: problems.Path) -> str:

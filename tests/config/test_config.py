@@ -836,10 +836,8 @@ class TestWebInterface:
         [
             ({"mqtt": {"port": 8883}}, "mqtt: not used: it has no host"),
             ({"mqtt_history": {"enabled": True}}, "mqtt_history: no longer used, `services.recorder` records into"),
-            (
-                {"robots": [{"id": "goob", "name": "Goob"}]},
-                "robots: no longer used, robots are found by",
-            ),
+            ({"robots": [{"id": "goob", "video": {"controls": True}}]}, "robots[0].video: no longer used, robots say"),
+            ({"robots": [{"name": "Goob"}]}, "robots[0]: has no id, so it is none"),
         ],
     )
     def test_keys_without_an_effect_are_reported(self, keys: dict[str, Any], expected: str) -> None:
