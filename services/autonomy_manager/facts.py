@@ -46,7 +46,7 @@ def _fitness(script: Script) -> str:
     from pebble.services.autonomy_manager.environment import environment
     from pebble.services.autonomy_manager.interpreter import lacking
 
-    missing = lacking(script.command, script.folder, environment(script.environment))
+    missing = lacking(script.command, script.folder, environment(script.environment, ours=False))
     return f"runs with {script.command[0]}" + (f", which lacks {', '.join(missing)}" if missing else "")
 
 
