@@ -12,10 +12,12 @@ from pebble.errors import ConfigError, DeviceError
 from pebble.runtime.parent import Notifier, Reported
 from pebble.runtime.rate_limit import RateLimitedLog
 from pebble.runtime.service import Service, every
+from pebble.services.serial_mcu_bridge.line.holders import holders
 from pebble.services.serial_mcu_bridge.line.serial_line import LineState, SerialLine
 from pebble.services.serial_mcu_bridge.line.silence import CHECK_S, Silence
 
 _MISREAD = "what its board sends is not understood: another baud rate or firmware, or noise"
+HOLDERS_S = 5.0  # between two looks for other programs at the device
 _INPUT_LIMIT = 65_536  # bytes waiting for the service's thread; 1.4 s of a full 460,800 baud line
 
 
@@ -38,6 +40,7 @@ class SerialService(Service, ABC):
         self._input = bytearray()
         self._input_lock = threading.Lock()
         self._silence = Silence()
+        self._holders: list[str] = []  # other programs at the device
         self._misread = False
         self._understood = (0, 0)  # which opening of the line, and how often its board was heard since
         self._reported = Reported(Notifier().mcu)
@@ -103,6 +106,19 @@ class SerialService(Service, ABC):
         misread = silent_ms is None and line.state is LineState.READY and line.received > 0
         self._reported.report(state, silent_ms, _MISREAD if misread and self._misread else line.problem)
         self._misread = misread  # a line may be under way
+
+    @every(HOLDERS_S)
+    def name_holders(self) -> None:
+        """Warn of other programs at this device: they need not ask for it alone, as we do."""
+        if self.line.state in (LineState.BOOTING, LineState.READY):
+            threading.Thread(target=self._name_holders, name="holders", daemon=True).start()  # it takes a while
+
+    def _name_holders(self) -> None:
+        path, found = str(self.options.serial.port), holders(str(self.options.serial.port))
+        if found and found != self._holders:
+            text = "%s is open in another program, too: %s; two confuse the board: end that one"
+            self.log.warning(text, path, ", ".join(found))
+        self._holders = found
 
     def _queue_input(self, chunk: bytes) -> None:
         """On the reading thread, which also parses it if the service is idle.

@@ -292,6 +292,27 @@ class TestOriginal:
         assert only_problem(board) == f"{place}: is missing, write the name of the remote broker"
 
     @pytest.mark.parametrize(
+        ("section", "command", "expected"),
+        [
+            ("service_restart_control", ["sudo", "-n", "systemctl", "restart", "pebble-control.service"],
+             "starts the original, too, at the same serial port and needs a right that our unit denies: "
+             "write `systemctl --no-block restart pebble.service`"),
+            ("service_restart_control", "service pebble-control restart", "starts the original, too"),
+            ("reboot_control", "/usr/bin/sudo -n /sbin/reboot", "needs a right that our unit denies: write"),
+            ("git_pull_control", "git -C /opt/pebble pull --ff-only", "updates the original, which does not"),
+            ("git_pull_control", ["sh", "-c", "cd /opt/pebble && git pull"], "updates the original"),
+            ("reboot_control", "systemctl --no-ask-password reboot", ""),
+            ("git_pull_control", "/opt/pseudo/digit pull", ""),
+        ],
+    )  # fmt: skip
+    def test_commands_of_the_original_are_pointed_out(self, section: str, command: Any, expected: str) -> None:
+        bridge = {"enabled": True, "remote_mqtt": {"host": "a"}, section: {"command": command}}
+        (warning,) = read(at("services.mqtt_bridge", bridge)).warnings or ("",)
+        assert warning.removeprefix(f"services.mqtt_bridge.{section}.command: ").startswith(expected)
+        assert bool(warning) == bool(expected)
+        assert read(at("services.mqtt_bridge", {**bridge, "enabled": False})).warnings == ()
+
+    @pytest.mark.parametrize(
         ("place", "value", "way_out"),
         [
             ("local_mqtt.keepalive", 60, "one value serves all robots"),

@@ -18,6 +18,18 @@ from pebble.config.types import Secret
 from pebble.contract.identity import GATEWAYS, SERVERS
 
 _TLS = ("tls/", "quic/")  # endpoints of Zenoh that are encrypted
+#: Words of commands as the original's configs have them, and why they do harm, or nothing, here.
+_OF_ORIGINAL = (
+    (re.compile(r"\bpebble-control\b").search, "starts the original, too, at the same serial port"),
+    (re.compile(r"(?:^|[\s/])(?:sudo|doas|pkexec)\b").search, "needs a right that our unit denies"),
+    (re.compile(r"\bgit\b.*\bpull\b").search, "updates the original, which does not run here"),
+)
+#: What belongs there, with our unit.
+_INSTEAD = {
+    "reboot_control": "systemctl --no-ask-password reboot",
+    "service_restart_control": "systemctl --no-block restart pebble.service",
+    "git_pull_control": "systemctl --no-ask-password start pebble-update.service",
+}
 _LONGEST_TEXT = 65535  # bytes of a user name or password (MQTT 3.1.1, section 1.5.3)
 _VARIABLE = re.compile("[A-Z_][A-Z0-9_]*").fullmatch  # as they are usually written; else it may be a password
 _INSTANCE_NAME = re.compile(r"[A-Za-z0-9_.-]{1,32}").fullmatch  # it becomes part of a process's name and client id
@@ -76,6 +88,10 @@ def _services(reader: Reader, services: Services, path: Path) -> Services:
 
 def _bridge(reader: Reader, bridge: MqttBridge, path: Path) -> MqttBridge:
     notes, remote, link = reader.notes, bridge.remote, bridge.link
+    for section, instead in _INSTEAD.items():
+        words = " ".join(getattr(bridge, section).command)
+        if bridge.enabled and (reasons := [reason for names, reason in _OF_ORIGINAL if names(words)]):
+            notes.warning((*path, section, "command"), f"{' and '.join(reasons)}: write `{instead}`")
     if link.kbit is not None and link.profile == "wide":
         notes.problem(
             (*path, "link", "kbit"), 'has no effect at profile "wide": write "thin" or "auto", or leave it out'
