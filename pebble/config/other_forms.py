@@ -13,7 +13,7 @@ class Reading(NamedTuple):
     """What is used for a value that is not as expected; ``differs``: it is more than another form of the same."""
 
     value: Any
-    differs: bool = False
+    differs: bool = True
 
 
 def switch(raw: Any) -> bool | None:
@@ -24,48 +24,45 @@ def switch(raw: Any) -> bool | None:
 def reading_of(annotation: Any, kind: Any, metas: list[Meta], raw: Any, default: Any) -> Reading | None:
     """Return what to use for ``raw``, which is no value of this key; None: it is a mistake.
 
-    ``kind`` and ``metas`` are the parts of ``annotation``; ``default`` is that of the key, perhaps NODEFAULT. Numbers
-    may be text, and are brought within their limits unless the key has ``exact``. A key with ``synonyms`` has other
-    names of its values, one with ``circle`` starts anew there, and one with ``unlike`` takes that for any mistake.
+    ``kind`` and ``metas`` are the parts of ``annotation``; ``default`` is that of the key, perhaps NODEFAULT. What is
+    empty, 0 or merely true is the default, and numbers are brought within their limits: with ``exact`` only 0. A key
+    with ``synonyms`` has other names of its values, one with ``circle`` starts anew there, and one with ``unlike``
+    takes that for any mistake.
     """
     extra = {key: value for meta in metas for key, value in (meta.extra or {}).items()}
-    if kind is bool:
-        return None if (value := switch(raw)) is None else Reading(value)
     number = _number(raw)
     for form in _forms(kind, extra, raw, number):
         try:
             value = msgspec.convert(form, annotation, strict=False)
-        except msgspec.ValidationError:
+        except (msgspec.ValidationError, TypeError):
             continue
         if not isinstance(value, float) or math.isfinite(value):
-            return Reading(value)
+            return Reading(value, differs=False)
     if "unlike" in extra:
-        return Reading(extra["unlike"], differs=True)
-    if (not raw or number == 0) and default is not NODEFAULT:
-        return Reading(default, differs=True)
+        return Reading(extra["unlike"])
+    is_empty = not raw or (raw is True and kind not in (int, float))
+    if default is not NODEFAULT and (number == 0 or (is_empty and "exact" not in extra)):
+        return Reading(default)
     if kind not in (int, float) or number is None or "exact" in extra:
         return None
-    return _within_limits(kind(number), metas, default)
+    for meta in metas:
+        if meta.gt is not None and number <= meta.gt:
+            return None if default is NODEFAULT else Reading(default)
+        number = number if meta.ge is None else max(meta.ge, number)
+        number = number if meta.le is None else min(meta.le, number)
+    return Reading(int(number) if kind is int else number)
 
 
 def _forms(kind: Any, extra: dict[str, Any], raw: Any, number: float | None) -> list[Any]:
-    """Return what may be meant."""
-    forms = [raw]
+    """Return what may be meant; msgspec reads numbers in texts."""
+    if kind is bool:
+        return [switch(raw)]
+    forms = [raw] if isinstance(raw, str | int | float) else []
     if isinstance(raw, int) and number is not None and (kind is str or get_origin(kind) is Literal):
         forms.append(str(raw))
-    if number is not None and "circle" in extra:
-        forms.append(int(number % extra["circle"]) if number.is_integer() else raw)
-    forms += [value for key, value in extra.get("synonyms", {}).items() if key == str(raw).upper()]
-    return forms
-
-
-def _within_limits(number: Any, metas: list[Meta], default: Any) -> Reading | None:
-    for meta in metas:
-        if meta.gt is not None and number <= meta.gt:
-            return None if default is NODEFAULT else Reading(default, differs=True)
-        number = number if meta.ge is None else max(meta.ge, number)
-        number = number if meta.le is None else min(meta.le, number)
-    return Reading(number, differs=True)
+    if number is not None and "circle" in extra and number.is_integer():
+        forms.append(int(number % extra["circle"]))
+    return forms + [value for key, value in extra.get("synonyms", {}).items() if key == str(raw).upper()]
 
 
 def _number(raw: Any) -> float | None:

@@ -55,9 +55,10 @@ class Reader:
         """A section of ``kind``. Refused values are noted and replaced by their defaults (missing ones by None)."""
         known = _known(kind)
         if not isinstance(raw, dict):
-            raw = self._instead_of_object(known, raw, path)
+            is_switch = self._other_forms and "enabled" in known and switch(raw) is not None
+            raw = {"enabled": raw} if is_switch else self._otherwise(kind, raw, path, {} if path else NODEFAULT)
         values: dict[str, Any] = {}
-        for written, value in raw.items():
+        for written, value in () if raw is _WRONG else raw.items():
             key = self._key(kind, known, written, (*path, written))
             if key in known and value not in ("", None) and not (value == [] and known[key].default):
                 read = self._value(known[key].type, value, (*path, written), _default(known[key]))
@@ -73,15 +74,6 @@ class Reader:
             if isinstance(section, kind):
                 section = check(self, section, path)
         return section
-
-    def _instead_of_object(self, known: Mapping[str, Any], raw: Any, path: problems.Path) -> dict[str, Any]:
-        """Return what a value means where an object is expected: it is on or off, or empty."""
-        if self._other_forms and "enabled" in known and (enabled := switch(raw)) is not None:
-            return {"enabled": enabled}
-        instead: dict[str, Any] = self._unfit(
-            f"must be an object {{…}}, not {_shown(raw)}", raw, path, {} if path else NODEFAULT
-        )
-        return {} if instead is _WRONG else instead
 
     def _key(self, kind: type[Section], known: Mapping[str, Any], key: str, path: problems.Path) -> str:
         """Return the key, or the one of which it is another name. One that is not known is noted."""
@@ -110,30 +102,45 @@ class Reader:
         if _is_section(kind):
             return self.section(kind, raw, path)
         if get_origin(kind) is tuple:
-            return self._list(get_args(kind)[0], raw, path, default)
-        if get_origin(kind) is dict:
-            name, item = get_args(kind)
-            return self._map(name, item, raw, path, default)
-        if kind is Path:
-            must_be = f"must be {expected(kind, metas)}, not {_shown(raw)}"
-            return self._path(raw, metas, path) if isinstance(raw, str) else self._unfit(must_be, raw, path, default)
+            listed = self._words(raw, path) if isinstance(raw, str) and unwrap(get_args(kind)[0])[0] is str else raw
+            if isinstance(listed, list):
+                return self._list(get_args(kind)[0], listed, path)
+        elif get_origin(kind) is dict and isinstance(raw, dict):
+            return self._map(*get_args(kind), raw, path)
+        elif kind is Path and isinstance(raw, str):
+            return self._path(raw, metas, path)
+        elif get_origin(kind) is not dict and kind is not Path:
+            return self._plain(annotation, raw, path, default)
+        return self._otherwise(annotation, raw, path, default)
+
+    def _plain(self, annotation: Any, raw: Any, path: problems.Path, default: Any) -> Any:
+        kind, metas = unwrap(annotation)
         choices = _choices(kind, metas)
         if choices and isinstance(raw, str):
             raw = next((choice for choice in choices if str(choice).lower() == raw.lower()), raw)
         try:
             value = msgspec.convert(raw, annotation)
         except msgspec.ValidationError:
-            reading = reading_of(annotation, kind, metas, raw, default) if self._other_forms else None
-            if reading is None:
-                return self._refuse(kind, metas, raw, path)
-            value = reading.value
-            if reading.differs:
-                used = "it counts as not set" if value is None else f"{_shown(value, text=True)} is used"
-                self.notes.warning(path, f"{_must_be(kind, metas, raw)}; {used}")
-                return value
+            return self._otherwise(annotation, raw, path, default)
         if choices and value not in choices:
-            return self._refuse(kind, metas, raw, path)
+            return self._otherwise(annotation, raw, path, default)
         return Secret(value) if _extra(metas, "secret") else self._parsed(metas, value, path)
+
+    def _otherwise(self, annotation: Any, raw: Any, path: problems.Path, default: Any) -> Any:
+        """Return what is used for a value that is not as expected, and note where that is another one."""
+        kind, metas = unwrap(annotation)
+        shown = "a value of another kind" if _extra(metas, "secret") else _shown(raw)
+        instead = "" if shown == "text" and (get_origin(kind) is Literal or kind in (str, Path)) else f", not {shown}"
+        must_be = f"must be {expected(kind, metas)}{instead}"
+        reading = reading_of(annotation, kind, metas, raw, default) if self._other_forms else None
+        if reading is None or (not reading.differs and (type(reading.value), reading.value) == (type(raw), raw)):
+            self.notes.problem(path, must_be)
+            return _WRONG
+        if not reading.differs:
+            return self._plain(annotation, reading.value, path, NODEFAULT)
+        used = f"{msgspec.json.encode(reading.value).decode()} is used" if reading.value or reading.value == 0 else ""
+        self.notes.warning(path, f"{must_be}; {used or 'it counts as not set'}")
+        return reading.value
 
     def _parsed(self, metas: list[Meta], value: Any, path: problems.Path) -> Any:
         parse = _extra(metas, "parse")
@@ -152,11 +159,7 @@ class Reader:
             self.notes.problem(path, "names a home folder that is not known, write the whole path")
             return _WRONG
 
-    def _list(self, item: Any, raw: Any, path: problems.Path, default: Any) -> Any:
-        if isinstance(raw, str) and unwrap(item)[0] is str:
-            raw = self._words(raw, path)
-        if not isinstance(raw, list):
-            return self._unfit(f"must be a list […], not {_shown(raw)}", raw, path, default)
+    def _list(self, item: Any, raw: list[Any], path: problems.Path) -> Any:
         items = [self._value(item, value, (*path, index)) for index, value in enumerate(raw)]
         return tuple(value for value in items if value is not _WRONG)
 
@@ -169,30 +172,10 @@ class Reader:
             self.notes.problem(path, f"cannot be split into words: {error}; write a list of words")
             return []
 
-    def _map(self, name: Any, item: Any, raw: Any, path: problems.Path, default: Any) -> Any:
-        if not isinstance(raw, dict):
-            return self._unfit(f"must be an object {{…}}, not {_shown(raw)}", raw, path, default)
+    def _map(self, name: Any, item: Any, raw: dict[str, Any], path: problems.Path) -> Any:
         items = {key: self._value(item, value, (*path, key)) for key, value in raw.items()}
         named = {key: self._value(name, key, path) for key in raw}
         return {key: value for key, value in items.items() if _WRONG not in (value, named[key])}
-
-    def _unfit(self, must_be: str, raw: Any, path: problems.Path, default: Any) -> Any:
-        """Note a value of another kind; one that is empty, or merely true, counts as not set."""
-        if not self._other_forms or (raw and raw is not True) or default is NODEFAULT:
-            self.notes.problem(path, must_be)
-            return _WRONG
-        self.notes.warning(path, f"{must_be}; it counts as not set")
-        return default
-
-    def _refuse(self, kind: Any, metas: list[Meta], raw: Any, path: problems.Path) -> Any:
-        self.notes.problem(path, _must_be(kind, metas, raw))
-        return _WRONG
-
-
-def _must_be(kind: Any, metas: list[Meta], raw: Any) -> str:
-    shown = "a value of another kind" if _extra(metas, "secret") else _shown(raw)
-    instead = "" if shown == "text" and (get_origin(kind) is Literal or kind in (str, Path)) else f", not {shown}"
-    return f"must be {expected(kind, metas)}{instead}"
 
 
 def _default(field: FieldInfo) -> Any:
@@ -221,6 +204,10 @@ def expected(kind: Any, metas: list[Meta]) -> str:
     if choices := _choices(kind, metas):
         *most, last = (msgspec.json.encode(choice).decode() for choice in choices)
         return f"{', '.join(most)} or {last}" if most else last
+    if get_origin(kind) is tuple:
+        return "a list […]"
+    if get_origin(kind) is dict or _is_section(kind):
+        return "an object {…}"
     if get_origin(kind) in (Union, types.UnionType):
         return " or ".join(expected(member, []) for member in get_args(kind))
     name = {bool: "true or false", int: "a whole number", float: "a number", str: "text"}[kind]
@@ -254,12 +241,9 @@ def _is_section(kind: Any) -> bool:
     return isinstance(kind, type) and issubclass(kind, Section)
 
 
-def _shown(raw: Any, *, text: bool = False) -> str:
-    """What was written, in words; of a text only a number, because a secret may have been written in a wrong place.
-
-    ``text``: it is a value of ours, which may be shown.
-    """
-    if isinstance(raw, str) and not text:
+def _shown(raw: Any) -> str:
+    """What was written, in words; of a text only a number, because a secret may have been written in a wrong place."""
+    if isinstance(raw, str):
         return f'the text "{raw}"' if _NUMBER(raw) else "text"  # 1883 and "1883" look alike
     if isinstance(raw, dict):
         return "an object"

@@ -11,6 +11,7 @@ from pebble.config.transport import Mqtt, RemoteConnection, RemoteMqtt, Transpor
 from pebble.config.types import (
     BY_CONTRACT,
     EMPTY,
+    EXACT,
     ONE_VALUE,
     Cells,
     Command,
@@ -179,10 +180,9 @@ class SerialPort(Section, frozen=True, kw_only=True):
     port: Annotated[Device | None, doc("Device: `ls /dev/serial/by-id/*`; required where the bridge is enabled.")] = (
         None
     )
-    baud: Annotated[
-        int,
-        Meta(ge=50, le=12_000_000, description="Bits per second; must be the firmware's.", extra={"exact": True}),
-    ] = 115200
+    baud: Annotated[int, Meta(ge=50, le=12_000_000, description="Bits per second; must be the firmware's."), EXACT] = (
+        115200
+    )
 
 
 class SerialTelemetry(Section, frozen=True, kw_only=True):

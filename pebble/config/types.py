@@ -64,7 +64,9 @@ _LEVELS = {"WARN": "WARNING", "FATAL": "CRITICAL", "NOTSET": "DEBUG"}
 LogLevel = Annotated[
     Literal["DEBUG", "INFO", "WARNING", "ERROR", "CRITICAL"], Meta(extra={"synonyms": _LEVELS, "unlike": "INFO"})
 ]
-Port = Annotated[int, Meta(ge=1, le=65535, extra={"exact": True})]
+#: A value that is not replaced by another one: it is an address, or says who may do what.
+EXACT = Meta(extra={"exact": True})
+Port = Annotated[int, Meta(ge=1, le=65535), EXACT]
 Count = Annotated[int, Meta(ge=1, le=1_000_000_000)]
 # A wait beyond 100 days is a typing mistake, and some clocks and locks of the system refuse it.
 Seconds = Annotated[float, Meta(ge=0, le=10_000_000)]
