@@ -101,17 +101,9 @@ def _needs(tree: ast.Module, text: bytes) -> Iterator[str]:
         elif isinstance(node, ast.ImportFrom) and node.module:
             modules |= {alias.asname or alias.name: f"{node.module}.{alias.name}" for alias in node.names}
     for node in ast.walk(tree):
-        name = _dotted(node, modules) if isinstance(node, ast.Attribute) else ""
-        if name.startswith(tuple(f"{module}." for module in _ARRAYS)):
-            yield name
-
-
-def _dotted(node: ast.expr, modules: Mapping[str, str]) -> str:
-    """Return ``cv2.aruco.detectMarkers`` of what is written so, or by the name that an import gave; else ""."""
-    if isinstance(node, ast.Name):
-        return modules.get(node.id, "")
-    base = _dotted(node.value, modules) if isinstance(node, ast.Attribute) else ""
-    return f"{base}.{node.attr}" if isinstance(node, ast.Attribute) and base else ""
+        first, _, rest = ast.unparse(node).partition(".") if isinstance(node, ast.Attribute) else ("", "", "")
+        if modules.get(first, "").partition(".")[0] in _ARRAYS:
+            yield f"{modules[first]}.{rest}"
 
 
 def _imported(node: ast.stmt) -> list[str]:

@@ -13,9 +13,7 @@ import msgspec
 from msgspec import Struct
 
 from pebble.contract import DRIVE
-from pebble.contract.identity import parse_topic
 from pebble.errors import PebbleError
-from pebble.extensions.fleet.database import DatabaseError
 from pebble.extensions.fleet.people import People
 from pebble.extensions.operator.client.assumed import AXES, HEARD_S, PARKED, RISK
 from pebble.extensions.operator.client.broker import Broker
@@ -42,35 +40,45 @@ class Permission(Struct, frozen=True):
     at: float = 0.0
 
 
-class _Board:
-    """One that is silent; its drive topic is received, because a command that is retained there moves it."""
+class _Board(Struct):
+    """A silent one. Its drive topic is received before anything is sent there: what is retained there moves it."""
 
-    def __init__(self, heard_at: float) -> None:
-        self.heard_at = heard_at
-        self.permission: Permission | None = None  # not read yet
-        self.subscription: Subscription | None = None
-        self.is_asking = False
+    heard_at: float
+    permission: Permission | None = None  # it has not been heard for long enough
+    subscription: Subscription | None = None
 
 
 class SilentBoards:
     """It belongs to one server. Only the event loop calls it."""
 
-    def __init__(self, broker: Broker, robots: Robots, drivers: Drivers, people: People, settings: WebSettings) -> None:
-        self._broker, self._robots, self._drivers, self._people = broker, robots, drivers, people
+    def __init__(
+        self,
+        broker: Broker,
+        robots: Robots,
+        drivers: Drivers,
+        people: People,
+        settings: WebSettings,
+        spawn: Callable[[Coroutine[Any, Any, None]], None],
+    ) -> None:
+        self._broker, self._robots, self._drivers, self._people, self._spawn = broker, robots, drivers, people, spawn
         self._listed, self._is_named = settings.listed, settings.level == "named"
         robots.names = {ref: listed.name[:32] for ref, listed in settings.listed.items() if listed.name}
         self._boards: dict[str, _Board] = {}
 
-    def refresh(self, now: float, spawn: Callable[[Coroutine[Any, Any, None]], None]) -> None:
+    def refresh(self, now: float) -> None:
         """Look for boards that are silent, or no longer; to be called a few times a second."""
-        for ref in self._boards.keys() - {ref for ref, one in self._robots.components.items() if one.robot.silent}:
+        silent = {ref: component for ref, component in self._robots.components.items() if component.robot.silent}
+        for ref in self._boards.keys() - silent:
             if (subscription := self._boards.pop(ref).subscription) is not None:
-                spawn(self._broker.unsubscribe(subscription))
+                self._spawn(self._broker.unsubscribe(subscription))
             if ref in self._robots.components:
                 self._robots.set_server_metric(ref, _METRIC, m.BoardView(silent=False))
-        for ref, component in self._robots.components.items():
-            if component.robot.silent and _is_robot(ref):
-                self._follow(component, now, spawn)
+        for ref, component in silent.items():
+            is_new = ref not in self._boards and ref.split("/")[1] == "robots" and not self._robots.omitted
+            if is_new and component.robot.online(now):
+                self._boards[ref] = _Board(now)
+            if ref in self._boards:
+                self._follow(component, self._boards[ref], now)
 
     def ask(self, op: m.BoardOp, user: str) -> str:
         """Do what a page asks; return why not. Raises DatabaseError."""
@@ -84,48 +92,46 @@ class SilentBoards:
             return why
         axes = (*AXES, *["y"] * op.extra) if op.do == "allow" else ()
         permission = Permission(user, axes, time.time())
-        self._people.set(_SETTING + op.ref, msgspec.json.encode(permission).decode() if axes else "")
+        self._people.set(_SETTING + op.ref, msgspec.json.encode(permission).decode())
         board.permission = permission
         if not axes:
             self._drivers.stop(op.ref, user)
         return ""
 
-    def _follow(self, component: Component, now: float, spawn: Callable[[Coroutine[Any, Any, None]], None]) -> None:
+    def _follow(self, component: Component, board: _Board, now: float) -> None:
         ref, robot = component.ref, component.robot
-        board = self._boards.get(ref)
-        if board is None and robot.online(now) and not self._robots.omitted:  # of a crowd none is taken for one
-            board = self._boards[ref] = _Board(now)
-        if board is None:
-            return
         if board.permission is None:
             if not robot.online(now):
                 del self._boards[ref]
             elif now - board.heard_at >= HEARD_S:
-                self._read(ref, board)
-            return
-        if board.permission.axes and board.subscription is None:
-            if not board.is_asking:
-                board.is_asking = True
-                spawn(self._subscribe(ref, board))
-            return
-        if robot.assume(board.permission.axes, self._robots.names.get(ref, "")):
-            self._robots.show_offer(component, now)
-        self._show(ref, board, parked=robot.parked)
+                board.permission = self._permission(ref)
+                self._spawn(self._subscribe(ref, board))
+        elif board.subscription is not None:
+            if robot.assume(board.permission.axes, self._robots.names.get(ref, "")):
+                self._robots.show_offer(component, now)
+            view = m.BoardView(
+                silent=True,
+                allowed=bool(board.permission.axes),
+                by=board.permission.by,
+                refused=self._refusal(ref),
+                parked=PARKED if robot.parked else "",
+                risk=RISK,
+            )
+            self._robots.set_server_metric(ref, _METRIC, view)
 
-    def _read(self, ref: str, board: _Board) -> None:
-        """Take what the config says, else what a person has said."""
+    def _permission(self, ref: str) -> Permission:
+        """Return what the config says, else what a person has said."""
         listed = self._listed.get(ref, ListedRobot())
         if self._is_named and not listed.plain:
-            board.permission = Permission()
-        elif listed.drive is not None:
-            board.permission = Permission("the config", listed.axes if listed.drive else ())
-        else:
-            try:
-                said = self._people.get(_SETTING + ref)
-                board.permission = msgspec.json.decode(said, type=Permission) if said else Permission()
-            except (DatabaseError, msgspec.MsgspecError) as error:
-                board.heard_at += HEARD_S  # then it is tried again
-                log.warning("whether pages may drive %s is not known: %s", ref, error)
+            return Permission()
+        if listed.drive is not None:
+            return Permission("the config", listed.axes if listed.drive else ())
+        try:
+            said = self._people.get(_SETTING + ref)
+            return msgspec.json.decode(said, type=Permission) if said else Permission()
+        except (PebbleError, msgspec.MsgspecError) as error:
+            log.warning("whether pages may drive %s is not known: %s", ref, error)
+            return Permission()
 
     def _refusal(self, ref: str) -> str:
         """Why a person cannot change what counts."""
@@ -134,21 +140,7 @@ class SilentBoards:
             return _NAMED
         return "" if listed.drive is None else f"{_CONFIG} decides that: change it there"
 
-    def _show(self, ref: str, board: _Board, *, parked: bool) -> None:
-        permission = board.permission or Permission()
-        view = m.BoardView(
-            silent=True,
-            allowed=bool(permission.axes),
-            by=permission.by,
-            refused=self._refusal(ref),
-            parked=PARKED if parked else "",
-            risk=RISK,
-        )
-        self._robots.set_server_metric(ref, _METRIC, view)
-
     async def _subscribe(self, ref: str, board: _Board) -> None:
-        """Receive what is retained on its drive topic, before anything is sent there."""
-
         def take(message: Message, now: float) -> None:
             if (robot := self._robots.view(ref)) is not None:
                 robot.receive(DRIVE, message, now, 0.0)
@@ -157,10 +149,3 @@ class SilentBoards:
             board.subscription = await self._broker.subscribe(DRIVE.topic(ref), take)
         except PebbleError as error:
             log.warning("%s is not driven: %s", ref, error)
-        finally:
-            board.is_asking = False
-
-
-def _is_robot(ref: str) -> bool:
-    address = parse_topic(f"{ref}/{DRIVE.direction}/{DRIVE.metric}")
-    return address is not None and address.identity.type == "robots"
