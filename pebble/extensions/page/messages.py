@@ -425,8 +425,7 @@ class BoardView(Struct, frozen=True, kw_only=True):
     """``web/board``: a component that sends heartbeats, and does not say what it can do."""
 
     silent: bool  # False: it says so now
-    allowed: bool = False  # pages drive it
-    by: str = ""  # who allows it
+    by: str = ""  # who lets pages drive it; "" nobody does
     refused: str = ""  # why nobody can allow it, or withdraw that
     parked: str = ""  # why it is not driven although that is allowed
     risk: str = ""  # what people have to know who allow it

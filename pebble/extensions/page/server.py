@@ -65,7 +65,7 @@ class Server:
         self.open_components = OpenComponents(self.broker, self.robots, self.spawn)
         # What is drawn over the picture comes from there.
         self.sources = ChosenSources(people, self.robots, self.open_components.update)
-        self.boards = SilentBoards(self.broker, self.robots, self.drivers, people, settings, self.spawn)
+        self.boards = SilentBoards(self.broker, self.robots, self.drivers, people, settings)
         self.drivers.refusals.is_stopping = self.stops.holds
         self.robots.is_wanted = self._is_wanted
         self.robots.is_kept = lambda ref: self._is_wanted(ref) or self.stops.sends_to(ref)
@@ -223,7 +223,7 @@ class Server:
                 if now >= refresh_at:
                     refresh_at = now + _REFRESH_S
                     self.robots.refresh(time.monotonic())
-                    self.boards.refresh(time.monotonic())
+                    self.boards.refresh(time.monotonic(), self.spawn)
                     self._show_broker()
             except (
                 Exception

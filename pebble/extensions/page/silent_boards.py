@@ -26,6 +26,8 @@ from pebble.transports import Message, Subscription
 
 log = logging.getLogger(__name__)
 
+Spawn = Callable[[Coroutine[Any, Any, None]], None]
+
 _SETTING = "assumes "  # what a setting of the server begins with; then the component
 _METRIC = "web/board"
 _CONFIG = "web_interface.robots"
@@ -51,26 +53,18 @@ class _Board(Struct):
 class SilentBoards:
     """It belongs to one server. Only the event loop calls it."""
 
-    def __init__(
-        self,
-        broker: Broker,
-        robots: Robots,
-        drivers: Drivers,
-        people: People,
-        settings: WebSettings,
-        spawn: Callable[[Coroutine[Any, Any, None]], None],
-    ) -> None:
-        self._broker, self._robots, self._drivers, self._people, self._spawn = broker, robots, drivers, people, spawn
+    def __init__(self, broker: Broker, robots: Robots, drivers: Drivers, people: People, settings: WebSettings) -> None:
+        self._broker, self._robots, self._drivers, self._people = broker, robots, drivers, people
         self._listed, self._is_named = settings.listed, settings.level == "named"
         robots.names = {ref: listed.name[:32] for ref, listed in settings.listed.items() if listed.name}
         self._boards: dict[str, _Board] = {}
 
-    def refresh(self, now: float) -> None:
+    def refresh(self, now: float, spawn: Spawn) -> None:
         """Look for boards that are silent, or no longer; to be called a few times a second."""
         silent = {ref: component for ref, component in self._robots.components.items() if component.robot.silent}
         for ref in self._boards.keys() - silent:
             if (subscription := self._boards.pop(ref).subscription) is not None:
-                self._spawn(self._broker.unsubscribe(subscription))
+                spawn(self._broker.unsubscribe(subscription))
             if ref in self._robots.components:
                 self._robots.set_server_metric(ref, _METRIC, m.BoardView(silent=False))
         for ref, component in silent.items():
@@ -78,7 +72,7 @@ class SilentBoards:
             if is_new and component.robot.online(now):
                 self._boards[ref] = _Board(now)
             if ref in self._boards:
-                self._follow(component, self._boards[ref], now)
+                self._follow(component, self._boards[ref], now, spawn)
 
     def ask(self, op: m.BoardOp, user: str) -> str:
         """Do what a page asks; return why not. Raises DatabaseError."""
@@ -98,37 +92,29 @@ class SilentBoards:
             self._drivers.stop(op.ref, user)
         return ""
 
-    def _follow(self, component: Component, board: _Board, now: float) -> None:
+    def _follow(self, component: Component, board: _Board, now: float, spawn: Spawn) -> None:
         ref, robot = component.ref, component.robot
         if board.permission is None:
             if not robot.online(now):
                 del self._boards[ref]
             elif now - board.heard_at >= HEARD_S:
                 board.permission = self._permission(ref)
-                self._spawn(self._subscribe(ref, board))
+                spawn(self._subscribe(ref, board))
         elif board.subscription is not None:
             if robot.assume(board.permission.axes, self._robots.names.get(ref, "")):
                 self._robots.show_offer(component, now)
-            view = m.BoardView(
-                silent=True,
-                allowed=bool(board.permission.axes),
-                by=board.permission.by,
-                refused=self._refusal(ref),
-                parked=PARKED if robot.parked else "",
-                risk=RISK,
-            )
+            by, parked = board.permission.by if board.permission.axes else "", PARKED if robot.parked else ""
+            view = m.BoardView(silent=True, by=by, refused=self._refusal(ref), parked=parked, risk=RISK)
             self._robots.set_server_metric(ref, _METRIC, view)
 
     def _permission(self, ref: str) -> Permission:
         """Return what the config says, else what a person has said."""
         listed = self._listed.get(ref, ListedRobot())
-        if self._is_named and not listed.plain:
-            return Permission()
-        if listed.drive is not None:
-            return Permission("the config", listed.axes if listed.drive else ())
+        if self._refusal(ref):
+            is_allowed = listed.drive and (listed.plain or not self._is_named)
+            return Permission("the config", listed.axes) if is_allowed else Permission()
         try:
-            said = self._people.get(_SETTING + ref)
-            return msgspec.json.decode(said, type=Permission) if said else Permission()
+            return msgspec.json.decode(self._people.get(_SETTING + ref) or "{}", type=Permission)
         except (PebbleError, msgspec.MsgspecError) as error:
             log.warning("whether pages may drive %s is not known: %s", ref, error)
             return Permission()

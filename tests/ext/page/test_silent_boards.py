@@ -50,7 +50,7 @@ def test_a_maintainer_lets_it_be_driven_over_a_restart_until_it_says_what_it_can
     ref = board.base
     with Hall(broker.port, tmp_path) as hall, hall.page("driver") as driver, hall.page("maintainer") as maintainer:
         assert until(lambda: view(driver, ref).get("silent") is True)
-        assert (view(driver, ref)["allowed"], drives(driver, ref)) == (False, False)
+        assert (view(driver, ref)["by"], drives(driver, ref)) == ("", False)
         assert driver.ready()
         driver.send("board", ref=ref, do="allow")
         assert until(lambda: refusals(driver) == ["The role driver may not do this"])

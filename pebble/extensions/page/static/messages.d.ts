@@ -322,7 +322,6 @@ export interface FlagsView {
 
 export interface BoardView {
   silent: boolean;
-  allowed?: boolean;
   by?: string;
   refused?: string;
   parked?: string;

@@ -15,8 +15,8 @@ export function Board({ at, board }) {
   const why = board.refused || whyNotEnd(page, "system");
   const ask = (what) => set(page.commands.askBoard(at, what, extra));
   return html`<div data-test="board">
-    <p>${name} does not say what it can do. ${board.allowed ? `${board.by} lets pages drive it.` : "Allow driving?"} ${board.risk}</p>
-    ${board.allowed
+    <p>${name} does not say what it can do. ${board.by ? `${board.by} lets pages drive it.` : "Allow driving?"} ${board.risk}</p>
+    ${board.by
       ? html`<${Button} test="board-withdraw" why=${why} because="board-why" onPress=${() => ask("withdraw")}>No longer<//>`
       : html`<${Check} test="board-extra" checked=${extra} why=${why} onChange=${setExtra}>It has an extra axis (grousers)<//>
           <${Button} test="board-allow" why=${why} because="board-why" onPress=${() => ask("allow")}>Allow driving<//>`}
