@@ -53,7 +53,8 @@ def _unused(retired: list[Note]) -> Iterator[str]:
     """Example: ``video.{shm_size, io_mode}: no longer used, …``; of many keys only the ends of their paths."""
     reasons = dict.fromkeys(note.text for note in retired)
     if len(reasons) > _FEW_REASONS:
-        names = ", ".join(dict.fromkeys(show_path(note.path[-2:]) for note in retired))
+        paths = (tuple(step for step in note.path if isinstance(step, str)) for note in retired)
+        names = ", ".join(dict.fromkeys(show_path(path[-2:]) for path in paths))
         yield without_secrets(f"no longer used, delete them: {names}; `pebble check --keys` says what replaces each")
         return
     for text in reasons:

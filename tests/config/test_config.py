@@ -295,7 +295,7 @@ class TestOriginal:
         ("section", "command", "expected"),
         [
             ("service_restart_control", ["sudo", "-n", "systemctl", "restart", "pebble-control.service"],
-             "starts the original, too, at the same serial port and needs a right that our unit denies: "
+             "starts the original, too, at the same serial port, and needs a right that our unit denies: "
              "write `systemctl --no-block restart pebble.service`"),
             ("service_restart_control", "service pebble-control restart", "starts the original, too"),
             ("reboot_control", "/usr/bin/sudo -n /sbin/reboot", "needs a right that our unit denies: write"),

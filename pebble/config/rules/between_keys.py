@@ -91,7 +91,7 @@ def _bridge(reader: Reader, bridge: MqttBridge, path: Path) -> MqttBridge:
     for section, instead in _INSTEAD.items():
         words = " ".join(getattr(bridge, section).command)
         if bridge.enabled and (reasons := [reason for names, reason in _OF_ORIGINAL if names(words)]):
-            notes.warning((*path, section, "command"), f"{' and '.join(reasons)}: write `{instead}`")
+            notes.warning((*path, section, "command"), f"{', and '.join(reasons)}: write `{instead}`")
     if link.kbit is not None and link.profile == "wide":
         notes.problem(
             (*path, "link", "kbit"), 'has no effect at profile "wide": write "thin" or "auto", or leave it out'

@@ -12,7 +12,7 @@ from playwright.sync_api import Page
 from tests.ext.page.browser import Size, Tab
 from tests.ext.page.canned import CannedServer, Show
 from tests.ext.page.looks import UNANSWERED
-from tests.ext.page.states import FRED, GOOB, STATES, at, changed, driver, estop
+from tests.ext.page.states import FRED, GOOB, MAY_TAKE, STATES, at, changed, driver, estop
 
 pytestmark = pytest.mark.page
 
@@ -191,6 +191,25 @@ def test_a_finger_on_the_stick_without_control_is_answered(show: Show) -> None:
         opened.test("stick").tap(force=True)  # it says that it is off
         opened.test("hint").wait_for()
         assert opened.page.locator(".flash").count() == 1
+
+
+def test_driving_of_a_board_that_says_nothing_is_allowed_and_withdrawn_on_its_page(
+    show: Show, server: CannedServer
+) -> None:
+    view = {"silent": True, "by": "", "refused": "", "parked": "", "risk": "It may roll on."}
+    with show(replace(FREE, welcome=MAY_TAKE)) as opened:
+        _ready(opened)
+        opened.page.evaluate(SET, [GOOB, "capabilities", {"value": {"announced": True, "assumed": True}}])
+        opened.page.evaluate(SET, [GOOB, "web/board", view])
+        opened.test("board-extra").click()
+        opened.test("board-allow").click()
+        opened.page.evaluate(SET, [GOOB, "web/board", {**view, "by": "ann", "parked": "Clear it first"}])
+        opened.test("board-clear").click()
+        opened.test("board-withdraw").click()
+        asked = [(one["do"], one["extra"]) for one in server.received if one.get("op") == "board"]
+        assert asked == [("allow", True), ("clear", True), ("withdraw", True)]
+        opened.page.evaluate(SET, [GOOB, "web/board", {**view, "refused": "The config decides that"}])
+        assert opened.until("document.querySelector('[data-test=board-allow]').disabled")
 
 
 # -- columns
