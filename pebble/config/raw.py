@@ -70,7 +70,7 @@ def plain(raw: Any, notes: problems.Notes, path: problems.Path = ()) -> Any:
 def _object(pairs: Pairs, notes: problems.Notes, path: problems.Path) -> dict[str, Any]:
     data: dict[str, Any] = {}
     for key, value in pairs:
-        if key.startswith("//") or (key.startswith("_") and path[-1:] not in ((name,) for name in _OF_NAMES)):
+        if key.startswith("//") or (key.startswith("_") and not (path and path[-1] in _OF_NAMES)):
             continue
         if flaw := hidden(key):
             notes.problem(path, f'has a key "{shown(key)}" that {flaw}')

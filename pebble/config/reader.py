@@ -106,7 +106,8 @@ class Reader:
             if isinstance(listed, list):
                 return self._list(get_args(kind)[0], listed, path)
         elif get_origin(kind) is dict and isinstance(raw, dict):
-            return self._map(*get_args(kind), raw, path)
+            name, item = get_args(kind)
+            return self._map(name, item, raw, path)
         elif kind is Path and isinstance(raw, str):
             return self._path(raw, metas, path)
         elif get_origin(kind) is not dict and kind is not Path:

@@ -1,7 +1,7 @@
 """The config sections of the operator page: where it listens, who may use it, and the robot's service that runs it."""
 
 from collections.abc import Iterator
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, ClassVar
 
 from pebble.config.hosts import is_loopback
 from pebble.config.problems import Path
@@ -19,7 +19,7 @@ from pebble.config.types import (
     ServiceSection,
     doc,
 )
-from pebble.extensions.operator.client.assumed import AXES
+from pebble.extensions.operator.client.assumed import AXES, Axis
 
 
 class WebHandler(ServiceSection, frozen=True, kw_only=True):
@@ -55,7 +55,7 @@ class ListedRobot(Section, frozen=True, kw_only=True):
             "Whether pages drive it although it does not say what it can do; unset: people may allow that on the page."
         ),
     ] = None
-    axes: Annotated[tuple[Literal["x", "z", "y"], ...], doc("The axes by which it is driven then.")] = AXES
+    axes: Annotated[tuple[Axis, ...], doc("The axes by which it is driven then.")] = AXES
     plain: Annotated[
         bool, doc('At level named: its account in fleet.json has `"plain": true`, so it takes commands without a name.')
     ] = False

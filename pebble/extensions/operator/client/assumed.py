@@ -1,7 +1,7 @@
 """What a silent board offers: one that obeys drive commands, as two of the original do, and never says so. Pure."""
 
 from collections.abc import Collection
-from typing import Any
+from typing import Any, Final, Literal
 
 import msgspec
 
@@ -9,7 +9,8 @@ from pebble.contract import DRIVE
 from pebble.contract.payloads import Drive
 from pebble.extensions.operator.client.announced import announced
 
-AXES = ("x", "z")  # unless more are known
+Axis = Literal["x", "z", "y"]
+AXES: Final[tuple[Axis, ...]] = ("x", "z")  # unless more are known
 HEARD_S = 5.0  # so long it has sent heartbeats: a robot that starts has said by then what it can do
 #: After the zero at the end of a gesture: while such a board connects anew, nothing but a later zero stops it.
 REPEATS_S = (0.15, 0.45)

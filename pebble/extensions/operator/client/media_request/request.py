@@ -30,7 +30,7 @@ class ViewerRequest:
 
     def __init__(self, base: str, medium: Medium, capabilities: dict[str, Any], *, shares: bool = False) -> None:
         self._shares = shares
-        self._sent: deque[bytes] = deque(maxlen=_SENT)  # own requests: what else arrives on their topic is of others
+        self.sent: deque[bytes] = deque(maxlen=_SENT)  # own requests: what else arrives on their topic is of others
         self._others: MediaRequest | None = None  # what others request; None: nothing, as far as is known
         self.settled = False  # it was sent, or nothing has to be: else call :meth:`tick` often
         topics = (topic_of(base, capabilities, channel) for channel in CHANNELS[medium])
@@ -70,8 +70,8 @@ class ViewerRequest:
 
     def _receive_request(self, message: Message) -> None:
         """Take a request: one's own, or the newest of others, which counts as a whole."""
-        if message.payload in self._sent:
-            self._sent.remove(message.payload)
+        if message.payload in self.sent:
+            self.sent.remove(message.payload)
         elif not message.retain:
             with suppress(PayloadError):
                 request = codec.decode(self._control, message.payload)
@@ -135,7 +135,7 @@ class ViewerRequest:
 
     def _message(self, request: MediaRequest) -> Message:
         payload = codec.encode(self._control, request)
-        self._sent.append(payload)
+        self.sent.append(payload)
         return Message(self.control_topic, payload, QoS.DELIVERED)
 
     def _flag_message(self, *, up: bool) -> Message:
