@@ -209,7 +209,7 @@ def test_driving_of_a_board_that_says_nothing_is_allowed_and_withdrawn_on_its_pa
         asked = [(one["do"], one["extra"]) for one in server.received if one.get("op") == "board"]
         assert asked == [("allow", True), ("clear", True), ("withdraw", True)]
         opened.page.evaluate(SET, [GOOB, "web/board", {**view, "refused": "The config decides that"}])
-        assert opened.until("document.querySelector('[data-test=board-allow]').disabled")
+        opened.page.locator("[data-test=board-allow]:disabled").wait_for()
 
 
 # -- columns
