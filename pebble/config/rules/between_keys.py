@@ -22,7 +22,7 @@ _TLS = ("tls/", "quic/")  # endpoints of Zenoh that are encrypted
 _OF_ORIGINAL = (
     (re.compile(r"\bpebble-control\b").search, "starts the original, too, at the same serial port"),
     (re.compile(r"(?:^|[\s/])(?:sudo|doas|pkexec)\b").search, "needs a right that our unit denies"),
-    (re.compile(r"\bgit\b.*\bpull\b").search, "updates the original, which does not run here"),
+    (re.compile(r"\bgit\b.*\b(?:pull|fetch|merge|reset)\b").search, "updates Pebble only if it runs from that folder"),
 )
 #: What belongs there, with our unit.
 _INSTEAD = {
