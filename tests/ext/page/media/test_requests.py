@@ -173,6 +173,17 @@ async def test_a_stream_that_others_have_ended_is_withdrawn(kind: Kind, robot: A
     assert robot.encodings == ["", None, robot.best, None]
 
 
+async def test_who_only_looks_on_does_not_keep_a_stream(kind: Kind, robot: Any) -> None:
+    """Another server, which asks for a key frame: it would ask for the stream, were that to end."""
+    other = Operator(robot)
+    async with serving(robot) as server:
+        page = await opened(server, kind, 4)
+        other.ask(enabled=True, encoding=robot.best, keyframe=True)
+        await until(lambda: any(request.get("keyframe") for request in robot.requests))
+        page.leave()
+        await until(lambda: robot.encodings == [robot.best, None])
+
+
 async def _still_sends(robot: Any) -> None:
     count = len(robot.sent)
     await until(lambda: len(robot.sent) > count + 3)
@@ -188,8 +199,8 @@ class Operator:
         self._transport.publish(self._robot.flag, b'{"value": true}', qos=QoS.DELIVERED, retain=True)
         self.ask(enabled=True)
 
-    def ask(self, *, enabled: bool) -> None:
-        payload = json.dumps({"enabled": enabled}).encode()
+    def ask(self, *, enabled: bool, **more: Any) -> None:
+        payload = json.dumps({"enabled": enabled, **more}).encode()
         self._transport.publish(self._robot.request, payload, qos=QoS.DELIVERED)
 
 

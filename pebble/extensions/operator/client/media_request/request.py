@@ -69,13 +69,14 @@ class ViewerRequest:
         return False
 
     def _receive_request(self, message: Message) -> None:
-        """Take a request: one's own, or the newest of others, which counts as a whole."""
+        """Take a request: one's own, or the newest of others. One of a key frame is of who looks on, as this does."""
         if message.payload in self.sent:
             self.sent.remove(message.payload)
         elif not message.retain:
             with suppress(PayloadError):
                 request = codec.decode(self._control, message.payload)
-                self._others = request if request.enabled else None
+                if not request.keyframe:
+                    self._others = request if request.enabled else None
 
     def tick(self, now: float) -> list[Message]:
         """Return what to send now; without a payload the request is repeated."""
